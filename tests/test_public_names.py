@@ -16,9 +16,10 @@ from agalign.config import JointSettings, Settings
 from agalign.values.issues import BLANK_MOVING, Issue
 from agalign.values.mapping import PixelMapping
 
-FUNCTIONS = "align align_capture align_folder discover open_capture open_flight read_alignment warp_onto"
+FUNCTIONS = "align align_capture align_folder discover mosaic open_capture open_flight plot_statistics read_alignment"
+FUNCTIONS += " warp_onto"
 SETTINGS = "CheckSettings FlightSettings JointSettings ReliefSettings SeedSettings Settings WriteSettings"
-RESULTS = "Alignment CaptureReport FlightReports FolderScan Prediction Residual Seed"
+RESULTS = "Alignment CaptureReport FlightReports FolderScan MosaicReport PlotReport Prediction Residual Seed"
 OPTIONS_AND_UNITS = "DiscoverOptions RunOptions FixedFilePx FixedImagePx MovingFilePx"
 ERRORS = """AgalignError ConfigurationError GeometryError InputError NoContrastError NoSuchBandError MemoryLimitError
 NotEnoughTextureError OutputError SidecarError UnreadableFileError WorkerError"""

@@ -18,6 +18,7 @@ EXTRAS = {
     "dask": "captures on the workers of a Dask cluster (--dask)",
     "evaluate": "elastix in comparison with learned descriptors (agalign evaluate)",
     "indices": "more spectral indices by name (agalign indices --index)",
+    "plots": "statistics of plots (agalign plots)",
     "stac": "STAC items and collections (--stac)",
     "xarray": "a flight as one lazily read Dataset (agalign.open_flight)",
 }

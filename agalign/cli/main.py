@@ -18,6 +18,7 @@ from agalign._version import __version__
 from agalign.cli.align import align, demo, onto
 from agalign.cli.doctor import doctor
 from agalign.cli.evaluate import evaluate, learn, surface
+from agalign.cli.field import mosaic, plots
 from agalign.cli.info import info
 from agalign.cli.results import export, indices, report, verify
 from agalign.cli.terminal import ExitCode, Terminal, examples, printed
@@ -32,6 +33,8 @@ COMMANDS = {
     "indices": indices,
     "ndvi": replace(indices, hidden=True),
     "export": export,
+    "mosaic": mosaic,
+    "plots": plots,
     "onto": onto,
     "doctor": doctor,
     "evaluate": evaluate,

@@ -85,16 +85,21 @@ def _export(
     run_folder = out.resolve()
     folder = target or run_folder.parent / f"{run_folder.name}-{program}"
     report = run_export(out, folder, program, copy=copy, source=source)
-    for label, reason in report.left_out[:MAX_LISTED]:
-        terminal.problem(f"{label}: left out: {reason}", capture=label)
-    if len(report.left_out) > MAX_LISTED:
-        terminal.problem(f"{len(report.left_out) - MAX_LISTED} more captures are left out")
+    print_left_out(report.left_out, terminal)
     for line in report.notes:
         terminal.result(line)
     text = f"{report.captures} captures, {len(report.files)} files in {folder}"
     terminal.event("export", captures=report.captures, files=len(report.files), folder=str(folder))
     terminal.result(text)
     return ExitCode.PARTIAL if report.left_out else ExitCode.OK
+
+
+def print_left_out(left_out: Sequence[tuple[str, str]], terminal: Terminal) -> None:
+    """Print what is left out of a result, from (capture, reason)."""
+    for label, reason in left_out[:MAX_LISTED]:
+        terminal.problem(f"{label}: left out: {reason}", capture=label)
+    if len(left_out) > MAX_LISTED:
+        terminal.problem(f"{len(left_out) - MAX_LISTED} more captures are left out")
 
 
 report = Command(_report)

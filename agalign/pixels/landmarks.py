@@ -48,7 +48,7 @@ class Landmarks:
         return Landmarks(lens.undistort(model, self.xy), self.descriptors)
 
 
-def landmarks(raster: Raster, view: LandmarkInput) -> Landmarks:
+def landmarks(raster: Raster, view: LandmarkInput, max_keypoints: int = _MAX_KEYPOINTS) -> Landmarks:
     """Detect the strongest landmarks in the mean of an image's channels."""
     width, height = raster.size_px
     scale = min(1.0, _LONGEST_SIDE_PX / max(width, height))
@@ -59,7 +59,7 @@ def landmarks(raster: Raster, view: LandmarkInput) -> Landmarks:
         image = np.sqrt(gradient_magnitude(*(cv2.Sobel(smooth, cv2.CV_32F, *order) for order in ((1, 0), (0, 1)))))
         without_edges = np.ones((7, 7), np.uint8)  # of invalid areas, in the smoothed gradient
         valid = cv2.erode(valid.astype(np.uint8), without_edges, borderValue=1) > 0
-    sift = cv2.SIFT.create(nfeatures=_MAX_KEYPOINTS)
+    sift = cv2.SIFT.create(nfeatures=max_keypoints)
     keypoints, descriptors = sift.detectAndCompute(eight_bit(image, valid), valid.view("u1"))
     if descriptors is None:
         return Landmarks(np.empty((0, 2)), np.empty((0, 128), np.float32))
@@ -74,16 +74,22 @@ def matched_homography(fixed: Landmarks, moving: Landmarks, size_px: tuple[int, 
 
     `size_px` is (width, height) of the fixed image.
     """
-    if min(len(fixed.xy), len(moving.xy)) < _MIN_INLIERS:
+    rows, columns = matches(fixed, moving)
+    if len(rows) < _MIN_INLIERS:
         return None
+    inlier_px = _INLIER_PX * max(1.0, max(size_px) / _LONGEST_SIDE_PX)
+    return robust_homography(fixed.xy[rows], moving.xy[columns], inlier_px, _MIN_INLIERS)
+
+
+def matches(fixed: Landmarks, moving: Landmarks) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Return the indices (n,) of mutual nearest neighbours that pass the ratio test, in `fixed` and in `moving`."""
+    if min(len(fixed.xy), len(moving.xy)) < 2:
+        return np.empty(0, np.intp), np.empty(0, np.intp)
     similarity = fixed.descriptors @ moving.descriptors.T
     forward, backward = similarity.argmax(axis=1), similarity.argmax(axis=0)
     second, first = np.sqrt(np.maximum(2 - 2 * np.partition(similarity, -2, axis=1)[:, -2:], 0)).T
     rows = np.flatnonzero((first < _MAX_RATIO * second) & (backward[forward] == np.arange(len(forward))))
-    if len(rows) < _MIN_INLIERS:
-        return None
-    inlier_px = _INLIER_PX * max(1.0, max(size_px) / _LONGEST_SIDE_PX)
-    return robust_homography(fixed.xy[rows], moving.xy[forward[rows]], inlier_px, _MIN_INLIERS)
+    return rows, forward[rows]
 
 
 def robust_homography(fixed_xy: Points, moving_xy: Points, inlier_px: float, min_inliers: int) -> Matrix | None:

@@ -62,7 +62,7 @@ class FlightMap:
         Captures of earlier runs whose sidecars are still in the folder are kept, as in the report. Index rasters that
         `agalign indices` wrote in earlier commands are linked too.
         """
-        by_label = {f["id"]: f for f in _features_in(self._out) if _has_sidecar(f, self._out)} | self._features
+        by_label = {f["id"]: f for f in features_in(self._out) if _has_sidecar(f, self._out)} | self._features
         features = [by_label[label] for label in sorted(by_label)]
         if not any(f.get("geometry") for f in features):
             return None
@@ -75,11 +75,11 @@ def link_indices(out: Path, rows: Iterable[IndexRow]) -> None:
 
     Without the file, or with a file that a run did not write, nothing is changed.
     """
-    if features := _features_in(out):
+    if features := features_in(out):
         _write(out, features, rows)
 
 
-def _features_in(out: Path) -> list[dict[str, Any]]:
+def features_in(out: Path) -> list[dict[str, Any]]:
     """The features of OUT/flight.geojson; none if there is no such file, or if a run did not write it."""
     try:
         features = json.loads((out / FLIGHT_MAP_FILE).read_text(encoding="utf-8"))["features"]

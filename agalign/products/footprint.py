@@ -2,7 +2,7 @@
 
 import math
 from dataclasses import replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +17,19 @@ _MAX_TILT_DEG = 45.0
 """The footprint of a camera with a larger tilt is not useful, and the tag is often wrong."""
 _MAX_ASSUMED_HEIGHT_M = 120.0
 """Legal limit of the height above ground of drones in most countries."""
+
+
+class PoseErrors(NamedTuple):
+    """Standard errors of the pose of a camera by its tags."""
+
+    position_m: float
+    """Of a GPS receiver without corrections."""
+    height: float
+    """Relative to the height above ground."""
+    heading: float
+    """Radians, as of the compass of an aircraft."""
+    tilt: float
+    """Radians."""
 
 
 def footprint(capture: Capture, grid: OutputGrid) -> NDArray[np.float64] | None:
@@ -97,8 +110,7 @@ def with_approximate_georeference(capture: Capture) -> Capture:
     offsets_m = ground_m(capture, corners - 0.5)
     if reference.georeference is not None or offsets_m is None or position is None:
         return capture
-    zone = min(int((position.longitude + 180) // 6), 59) + 1
-    crs = crs_wkt(f"EPSG:{(32600 if position.latitude >= 0 else 32700) + zone}")
+    crs = utm_wkt(position.longitude, position.latitude)
     try:
         on_map = transformed(offsets_m, _local_crs(position), crs)
     except GeometryError:
@@ -115,6 +127,13 @@ def with_approximate_georeference(capture: Capture) -> Capture:
     return replace(capture, bands=bands)
 
 
+def pose_errors(height_m: float | None, height_from: str | None, *, has_tilt: bool = False) -> PoseErrors:
+    """Return the standard errors of a camera's pose. Without a height, that of the height is zero."""
+    # Assumed height; barometric height over uneven ground. Gimbal or attitude sensor; camera fixed to an aircraft.
+    height = 0.5 if height_from == "assumed" else 5.0 / height_m if height_m else 0.0
+    return PoseErrors(3.0, height, math.radians(5.0), math.radians(2.0 if has_tilt else 7.0))
+
+
 def accuracy_of_footprint_m(capture: Capture) -> float | None:
     """Return the standard error, metres, of the farthest corner of a footprint by `ground_m`, from the errors of the
     camera's position, heading, tilt and height. None if `ground_m` returns None.
@@ -126,15 +145,16 @@ def accuracy_of_footprint_m(capture: Capture) -> float | None:
         return None
     distance_m = float(np.linalg.norm(offsets_m, axis=1).max())
     tangent = distance_m / pose.height_m  # of the corner's angle from the vertical
-    position_m = 3.0  # GPS receiver without corrections
-    heading_deg = 5.0  # compass of an aircraft
-    # Gimbal or attitude sensor; tilt of a camera that is fixed to an aircraft.
-    tilt_deg = 2.0 if pose.pitch_deg or pose.roll_deg else 7.0
-    # Assumed height; barometric height over uneven ground.
-    height_m = 0.5 * pose.height_m if pose.height_from == "assumed" else 5.0
-    tilted_m = math.radians(tilt_deg) * pose.height_m * (1 + tangent**2)
-    errors_m = position_m, math.radians(heading_deg) * distance_m, tilted_m, height_m * tangent
+    errors = pose_errors(pose.height_m, pose.height_from, has_tilt=bool(pose.pitch_deg or pose.roll_deg))
+    tilted_m = errors.tilt * pose.height_m * (1 + tangent**2)
+    errors_m = errors.position_m, errors.heading * distance_m, tilted_m, errors.height * pose.height_m * tangent
     return round(math.hypot(*errors_m), 1)
+
+
+def utm_wkt(longitude: float, latitude: float) -> str:
+    """Return the WKT of the UTM zone of a position, degrees."""
+    zone = min(int((longitude + 180) // 6), 59) + 1
+    return crs_wkt(f"EPSG:{(32600 if latitude >= 0 else 32700) + zone}")
 
 
 def _altitude_m(capture: Capture) -> float:

@@ -137,13 +137,13 @@ def write_rasters(
         for index in indices:
             target = base.with_name(f"{base.name}_{index.name}.tif")
             try:
-                chosen = _chosen(bands, index)
+                chosen = chosen_bands(bands, index)
                 source = _fingerprint(index, chosen)
                 earlier = None if overwrite else _finished_before(target, source)
                 if earlier is not None:
                     reports.append(IndexReport(label, index.name, target, earlier, kept=True))
                     continue
-                unit = _unit(index, chosen, reader)
+                unit = common_unit(index, chosen, reader)
                 for band in chosen:
                     if band.quality is not None:
                         reader.file(*band.quality[:2])
@@ -163,8 +163,8 @@ def outdated_rasters(base: Path) -> Iterator[Path]:
             yield from (path, path.with_suffix(".png"))
 
 
-def _chosen(bands: Sequence[IndexBand], index: Index) -> list[IndexBand]:
-    """The bands of an index. Raises InputError if one is missing or not delivered."""
+def chosen_bands(bands: Sequence[IndexBand], index: Index) -> list[IndexBand]:
+    """Return the bands of an index. Raises InputError if one is missing or not delivered."""
     chosen = [bands[i] for i in bands_for(index, [b.name for b in bands], [b.wavelength_nm for b in bands])]
     for band in chosen:
         if band.problem:
@@ -201,8 +201,8 @@ def _finished_before(target: Path, source: str) -> IndexStatistics | None:
     return statistics_in(tags) if tags.get("INDEX_MADE_FROM") == source else None
 
 
-def _unit(index: Index, bands: Sequence[IndexBand], reader: BandReader) -> str:
-    """The unit of the bands. Raises InputError if they differ or if the index needs another one."""
+def common_unit(index: Index, bands: Sequence[IndexBand], reader: BandReader) -> str:
+    """Return the unit of the bands of an index. Raises InputError if they differ or if the index needs another one."""
     units = {unit for band in bands for unit in reader.units(band)}
     if len(units) > 1:
         raise InputError(f"{index.name} is left out: its bands are in different units ({', '.join(sorted(units))})")

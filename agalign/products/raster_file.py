@@ -89,7 +89,7 @@ def write_raster(
         if tags is not None:
             add_directories(partial, tags.first, tags.exif, tags.gps)
         if settings.format == "cog":
-            _to_cog(partial, compression)
+            to_cog(partial, compression)
 
     profile = grid_profile(grid, capture.reference.georeference, len(layers), dtype.name, **options)
     blocks = _blocks(layers, grid, dtype, nodata, settings)
@@ -211,7 +211,8 @@ def _compression(settings: WriteSettings, *, all_bands: bool) -> str:
     return "zstd" if all_bands and settings.layout != "bands" else "deflate"
 
 
-def _to_cog(path: Path, compression: str) -> None:
+def to_cog(path: Path, compression: str) -> None:
+    """Replace a GeoTIFF by a cloud-optimised one with overviews. Errors are those of rasterio."""
     cog = path.with_name(f"{path.name}.cog")
     options = {"blocksize": 512, "bigtiff": "if_safer"}  # GDAL's default size of blocks
     if compression != "none":

@@ -36,10 +36,10 @@ def make_aligned(
             dataset.descriptions = tuple(levels)
             if not raw:
                 dataset.update_tags(RADIOMETRY="reflectance")
-        write_sidecar(target / f"{name}.json", _sidecar(name, number, size_px, raw=raw))
+        write_sidecar(target / f"{name}.json", sidecar_of(name, number, size_px, raw=raw))
 
 
-def _sidecar(name: str, number: int, size_px: tuple[int, int], *, raw: bool) -> Sidecar:
+def sidecar_of(name: str, number: int, size_px: tuple[int, int], *, raw: bool) -> Sidecar:
     """The sidecar of aligned.json with another name, time, place and size."""
     width, height = size_px
     text = (Path(__file__).parent / "aligned.json").read_text(encoding="utf-8").replace("IMG_0001", name)

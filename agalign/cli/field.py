@@ -1,0 +1,101 @@
+"""The commands for a whole field: `mosaic` and `plots`."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from agalign.cli.command import Command
+from agalign.cli.results import Out, chosen_indices, print_left_out
+from agalign.cli.terminal import RAW_NUMBERS, ExitCode, Terminal, examples
+
+IndexNames = Annotated[str | None, typer.Option("--index", "-i", help="Names of indices separated by commas.")]
+
+
+def _mosaic(
+    terminal: Terminal,
+    out: Out,
+    target: Annotated[Path | None, typer.Option("-o", "--out", help="By default OUT/mosaic.tif.")] = None,
+    index: IndexNames = None,
+    gsd: Annotated[float | None, typer.Option(min=1e-4, help="Pixel size, m; by default that of the captures.")] = None,
+) -> int:
+    """Join the aligned captures of a flight into a quick mosaic for viewing.
+
+    Tie points between overlapping captures refine the georeference from GPS and attitude. The ground is assumed to be
+    a horizontal plane: the mosaic shows a field and its zones, and replaces neither an orthomosaic (OpenDroneMap) nor
+    ground control.
+    """
+    from agalign.products.mosaic import mosaic as make_mosaic
+
+    chosen = [] if index is None else [one.name for one in chosen_indices(index, [])]
+    path = target or out / "mosaic.tif"
+    report = make_mosaic(out, path, indices=chosen, gsd_m=gsd)
+    left_out = [*report.left_out, *((path.name, r.problem) for r in report.indices if r.problem)]
+    print_left_out(left_out, terminal)
+    if untied := report.captures - report.tied:
+        keep = f"have no tie points, and keep their georeference, accurate to {report.accuracy_m:.0f} m"
+        terminal.problem(f"{untied} of {report.captures} captures {keep}")
+    if report.height_is_assumed:
+        terminal.problem("the height above ground is assumed, so the scale is uncertain; align with --ground-elevation")
+    if any(r.raw_numbers for r in report.indices):
+        terminal.problem(RAW_NUMBERS)
+    terminal.event("mosaic", **{k: v for k, v in vars(report).items() if k not in ("left_out", "indices")})
+    if report.pairs:
+        ties = f"{report.pairs} overlaps, {report.tie_points} tie points that were not used"
+        for source, (median_m, p95_m) in (
+            (ties, report.misfit_m),
+            ("by the georeference", report.georeference_misfit_m),
+        ):
+            terminal.result(f"Misfit, {source}: median {median_m:.2f} m, p95 {p95_m:.2f} m")
+    files = [path, *(r.path for r in report.indices if r.path is not None)]
+    terminal.result(f"Mosaic of {report.captures} captures: {', '.join(map(str, files))}")
+    return ExitCode.PARTIAL if left_out else ExitCode.OK
+
+
+mosaic = Command(
+    _mosaic,
+    {"Output": "target index gsd", "Running": "quiet log_json"},
+    epilog=examples(("agalign mosaic aligned/ -o field.tif --index ndvi", "field.tif, all bands, and field_ndvi.tif")),
+)
+
+
+def _plots(
+    terminal: Terminal,
+    rasters: Annotated[list[Path], typer.Argument(help="Georeferenced rasters, and output folders of runs.")],
+    plots: Annotated[Path, typer.Argument(help="Vector file with the outlines of the plots.", show_default=False)],
+    target: Annotated[Path, typer.Option("-o", "--out", help=".csv, .geojson or .parquet.")] = Path("plots.csv"),
+    index: IndexNames = None,
+    id_column: Annotated[str | None, typer.Option("--id", help="Attribute with the names of the plots.")] = None,
+) -> int:
+    """Calculate statistics of spectral indices in the plots of a field trial.
+
+    The table has a row for each raster or capture, plot and index: date, mean, median, standard deviation, 5th and 95th
+    percentile, share of valid pixels, expected error of the alignment (with --error-map) and of the georeference.
+    """
+    from agalign.products.index_bands import RAW
+    from agalign.products.plots import check_table, plot_statistics, write_plots
+
+    check_table(target, [plots, *rasters])
+    report = plot_statistics(rasters, plots, [one.name for one in chosen_indices(index, [])], id_column=id_column)
+    print_left_out(report.problems, terminal)
+    table = report.table
+    if (table["unit"] == RAW).any():
+        terminal.problem(RAW_NUMBERS)
+    write_plots(table, target)
+    counts = {name: int(table[name].nunique()) for name in ("plot", "capture", "index")}
+    terminal.event("plots", rows=len(table), **counts, path=str(target))
+    accuracy_m = table["georeference_accuracy_m"].max()
+    known = f"; georeference accurate to {accuracy_m:.1f} m" if accuracy_m > 0 else ""
+    sums = f"plots: {counts['plot']}, captures: {counts['capture']}, indices: {counts['index']}"
+    terminal.result(f"{len(table)} rows ({sums}) in {target}{known}")
+    return ExitCode.PARTIAL if report.problems else ExitCode.OK
+
+
+plots = Command(
+    _plots,
+    {"Output": "target index id_column", "Running": "quiet log_json"},
+    epilog=examples(
+        ("agalign plots field.tif plots.geojson --index ndvi,ndre", "two indices of a mosaic"),
+        ("agalign plots may.tif june.tif plots.geojson -o season.parquet", "two dates in one table"),
+    ),
+)

@@ -1,0 +1,226 @@
+"""A quick mosaic of a run: aligned captures on a horizontal plane, refined by tie points, with feathered seams.
+
+It is for viewing: terrain is not corrected, which takes photogrammetry.
+"""
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from agalign.errors import ConfigurationError
+from agalign.pixels.raster import open_raster
+from agalign.products.adjustment import adjusted, misfit_m, tie_pairs
+from agalign.products.checked_raster import Block, LayerDescription, georeference_tags, grid_profile, write_layers
+from agalign.products.index_bands import BandReader, IndexBand
+from agalign.products.index_rasters import write_rasters
+from agalign.products.index_table import IndexReport
+from agalign.products.indices import Index, index_named
+from agalign.products.placement import Placement, place_captures
+from agalign.products.raster_file import to_cog, with_nodata
+from agalign.values import geometry
+from agalign.values.capture import Georeference
+from agalign.values.choices import MAX_PIXELS
+from agalign.values.geometry import Matrix
+from agalign.values.image import FloatImage, Mask, OutputGrid, Tile
+from agalign.values.mapping import PixelMapping
+from agalign.values.pixel_units import Size
+from agalign.values.resample import resample, source_window, tiles
+
+_TILE_PX = 512
+"""Side of the tiles that are composed at once."""
+_FEATHER = 0.1
+"""Width of a seam, as a share of half of the shorter side of a capture."""
+_COMPRESSION = "zstd"
+_COPIED_TAGS = "CAMERA", "TIFFTAG_DATETIME", "REFERENCE_BAND", "RADIOMETRY", "RADIOMETRY_SOURCE"
+_PURPOSE = "quick mosaic on a horizontal plane, for viewing; not an orthomosaic"
+
+
+@dataclass(frozen=True)
+class MosaicReport:
+    """Result of a mosaic."""
+
+    path: Path
+    captures: int
+    tied: int
+    """Captures with tie points; the others keep their georeference."""
+    pairs: int
+    """Overlapping captures with tie points."""
+    tie_points: int
+    """Tie points that took no part in the adjustment: the misfits are measured on them."""
+    misfit_m: tuple[float, float]
+    """Distances of the tie points on the ground after the adjustment: median and p95; nan without tie points."""
+    georeference_misfit_m: tuple[float, float]
+    """The same by the georeference alone."""
+    accuracy_m: float
+    """Standard error of the georeference of the captures (median): the mosaic has no ground control."""
+    height_is_assumed: bool
+    """True if the scale is only known from the GPS positions."""
+    left_out: Sequence[tuple[str, str]]
+    """(label of a capture, reason why it is left out)."""
+    indices: Sequence[IndexReport] = ()
+
+
+def mosaic(
+    out: str | Path, target: str | Path, *, indices: Sequence[str] = (), gsd_m: float | None = None
+) -> MosaicReport:
+    """Write a mosaic of the captures with status `ok` of a run as a cloud-optimised GeoTIFF, with all bands.
+
+    Tie points between overlapping captures refine their georeference. Indices, given by name, are written next to the
+    mosaic, <target>_<index>.tif. `gsd_m` is the pixel size, by default the median of the captures. The ground
+    is assumed to be a horizontal plane: for maps and measurements use photogrammetry.
+    Raises InputError if no capture can be placed or read, ConfigurationError for too many pixels, an unknown index or a
+    target that is an input or not a .tif, OutputError.
+    """
+    chosen, path = [index_named(name) for name in indices], Path(target)
+    flight = place_captures(Path(out))
+    stacks = {band.file.resolve() for capture in flight.captures for band in capture.bands}
+    if path.suffix.lower() not in (".tif", ".tiff") or path.resolve() in stacks:
+        raise ConfigurationError(f"{path}: give the mosaic a new file that ends in .tif")
+    pairs = [pair.split() for pair in tie_pairs(flight.captures)]
+    checks = [check for _, check in pairs]
+    placed = adjusted(flight.captures, [used for used, _ in pairs])
+    grid = _Grid.of(placed, gsd_m)
+    accuracy_m = float(np.median([c.accuracy_m for c in placed]))
+    misfit = misfit_m(checks, placed)
+    tags = {"MOSAIC": _PURPOSE, "MOSAIC_MISFIT_M": "" if not checks else f"{misfit[0]:.3f}"}
+    # Geotransforms count from the corner of a pixel.
+    on_map = geometry.translation(*flight.origin_m) @ grid.to_ground @ geometry.translation(-0.5, -0.5)
+    _write(path, placed, grid, Georeference(on_map, flight.crs_wkt, accuracy_m), tags)
+    return MosaicReport(
+        path,
+        len(placed),
+        len({k for check in checks for k in (check.first, check.second)}),
+        len(pairs),
+        sum(map(len, checks)),
+        misfit,
+        misfit_m(checks, flight.captures),
+        accuracy_m,
+        any(c.height_is_assumed for c in placed),
+        flight.left_out,
+        _write_indices(path, placed[0].bands, chosen),
+    )
+
+
+@dataclass(frozen=True)
+class _Grid:
+    """A north-up grid; `to_ground` maps its pixels to metres from the origin of the flight."""
+
+    size_px: Size
+    to_ground: Matrix
+
+    @classmethod
+    def of(cls, captures: Sequence[Placement], gsd_m: float | None) -> "_Grid":
+        """Return the grid that covers the captures. Raises ConfigurationError for too many pixels."""
+        step_m = gsd_m or float(np.median([c.gsd_m for c in captures]))
+        outline_m = np.concatenate([c.outline_m for c in captures])
+        (west, south), (east, north) = outline_m.min(axis=0), outline_m.max(axis=0)
+        width, height = math.ceil((east - west) / step_m), math.ceil((north - south) / step_m)
+        if width * height > MAX_PIXELS:
+            raise ConfigurationError(f"the mosaic has {width} x {height} pixels, which is too many; increase --gsd")
+        scaled = np.diag((step_m, -step_m, 1.0)) @ geometry.translation(0.5, 0.5)
+        return cls((width, height), geometry.translation(west, north) @ scaled)
+
+    def may_overlap(self, capture: Placement, tile: Tile) -> bool:
+        """Return False if a capture is outside of a tile."""
+        outline_px = geometry.apply(geometry.invert(self.to_ground), capture.outline_m) - (tile.x0, tile.y0)
+        return bool((outline_px.max(axis=0) > 0).all() and (outline_px.min(axis=0) < (tile.width, tile.height)).all())
+
+    def positions_in(self, capture: Placement, tile: Tile) -> FloatImage:
+        """Return the position (height, width, 2) of each pixel of a tile in the rasters of a capture."""
+        from_tile = self.to_ground @ geometry.translation(tile.x0, tile.y0)
+        mapping = PixelMapping(geometry.invert(capture.to_ground) @ from_tile, moving_lens=capture.lens)
+        return np.asarray(mapping.positions(Tile(0, 0, tile.width, tile.height), np.float32), np.float32)
+
+
+def _write(
+    path: Path, captures: Sequence[Placement], grid: _Grid, georeference: Georeference, tags: dict[str, str]
+) -> None:
+    """Write the mosaic of all bands."""
+    dtype, layers, copied = _like(captures[0].bands)
+    nodata = math.nan if dtype.kind == "f" else 0.0
+    options = {"compress": _COMPRESSION, "nodata": nodata, "interleave": "band"}
+    profile = grid_profile(OutputGrid(0, 0, *grid.size_px), georeference, len(layers), dtype.name, **options)
+
+    def blocks() -> Iterator[Block]:
+        for tile in tiles(Tile(0, 0, *grid.size_px), _TILE_PX):
+            pixels, valid = _composed(captures, grid, tile)
+            for number, band in enumerate(pixels, start=1):
+                values = band if dtype.kind == "f" else np.rint(band)
+                yield with_nodata(values.astype(dtype), valid, nodata), number, tile.x0, tile.y0
+
+    tags = copied | tags | georeference_tags(georeference)
+    write_layers(path, profile, layers, tags, blocks(), lambda partial: to_cog(partial, _COMPRESSION))
+
+
+def _like(bands: Sequence[IndexBand]) -> tuple[np.dtype[Any], list[LayerDescription], dict[str, str]]:
+    """(type, layers, tags) of the files of a capture; float32 for numbers that the files scale."""
+    layers, dtypes, tags = [], [], {}
+    for band in bands:
+        with open_raster(band.file) as source:
+            k = band.band_index
+            scaled = (source.scales[k - 1], source.offsets[k - 1]) != (1.0, 0.0)
+            dtypes.append("float32" if scaled else source.dtypes[k - 1])
+            tags = {"TIFFTAG_SOFTWARE": "agalign"} | {t: v for t, v in source.tags().items() if t in _COPIED_TAGS}
+            imagery, colour = source.tags(k, ns="IMAGERY"), source.colorinterp[k - 1]
+            own = {t: v for t, v in source.tags(k).items() if not t.startswith("STATISTICS_")}
+            layers.append(LayerDescription(band.name, source.units[k - 1] or "", own, imagery, colour=colour))
+    return np.result_type(*dtypes), layers, tags
+
+
+def _composed(captures: Sequence[Placement], grid: _Grid, tile: Tile) -> tuple[FloatImage, Mask]:
+    """The pixels of a tile (bands, height, width) and their mask: of the capture that has a pixel nearest to its
+    centre, blended with the others within the width of a seam.
+    """
+    shape = tile.height, tile.width
+    views = [(c, grid.positions_in(c, tile)) for c in captures if grid.may_overlap(c, tile)]
+    central = [_centrality(positions, c.size_px) for c, positions in views]
+    best = np.max([np.zeros(shape, np.float32), *central], axis=0)
+    total, weight = np.zeros((len(captures[0].bands), *shape), np.float32), np.zeros(shape, np.float32)
+    for is_filling in (False, True):  # occluded pixels of one capture with those of others
+        for view, one in zip(views, central, strict=True):
+            share = weight == 0 if is_filling else np.clip(1 - (best - one) / _FEATHER, 0, 1)
+            share = np.where(one > 0, share, np.float32(0))
+            if share.any():
+                pixels, valid = _warped(*view)
+                total += np.where(valid, pixels, 0) * share
+                weight += np.where(valid, share, 0)
+    return np.asarray(total / np.where(weight > 0, weight, 1), np.float32), weight > 0
+
+
+def _centrality(positions: FloatImage, size_px: Size) -> FloatImage:
+    """Distance (height, width) of positions in an image from its edge: 1 at its centre, negative outside."""
+    inside_px = [np.minimum(positions[..., k], size_px[k] - 1 - positions[..., k]) for k in (0, 1)]
+    return np.asarray(2 * np.minimum(*inside_px) / min(size_px), np.float32)
+
+
+def _warped(capture: Placement, positions: FloatImage) -> tuple[FloatImage, Mask]:
+    """All bands of a capture (bands, height, width) at positions in its rasters, and where all of them are valid.
+
+    Bilinear: wider kernels overshoot at edges, and the bands are resampled for the second time.
+    """
+    valid = np.ones(positions.shape[:2], bool)
+    result = np.zeros((len(capture.bands), *valid.shape), np.float32)
+    source = source_window(positions, capture.size_px, is_smooth=True)
+    if source is None:
+        return result, ~valid
+    with BandReader() as reader:
+        for k, band in enumerate(capture.bands):
+            pixels = reader.values(band, source)
+            one, inside = resample(pixels, np.isfinite(pixels), positions, source, capture.size_px, "bilinear")
+            result[k] = one
+            valid &= inside
+    return result, valid
+
+
+def _write_indices(path: Path, bands: Sequence[IndexBand], indices: Sequence[Index]) -> Sequence[IndexReport]:
+    """Write indices of the mosaic as cloud-optimised GeoTIFFs."""
+    of_mosaic = [IndexBand(b.name, b.wavelength_nm, path, number) for number, b in enumerate(bands, start=1)]
+    reports = write_rasters(of_mosaic, indices, path.with_suffix(""), path.stem)
+    for report in reports:
+        if report.path is not None:
+            to_cog(report.path, _COMPRESSION)
+    return reports

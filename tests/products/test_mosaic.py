@@ -1,0 +1,263 @@
+"""Mosaics of captures whose true positions on one ground are known."""
+
+import shutil
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import rasterio
+from synthetic_flights.aligned import make_aligned
+from synthetic_flights.overlapping import LATITUDE, LONGITUDE, Survey, make_overlapping
+
+import agalign
+from agalign.pixels.raster import transformed
+from agalign.products import adjustment
+from agalign.products.adjustment import adjusted, misfit_m, tie_pairs
+from agalign.products.footprint import utm_wkt
+from agalign.products.placement import PlacedFlight, Placement, place_captures
+from agalign.products.sidecar_file import read_sidecar, write_sidecar
+from agalign.values import geometry, lens
+
+from ..conftest import Shared
+from ..program import agalign_here
+
+SURVEY = Survey()
+
+
+@pytest.fixture(scope="module")
+def survey(shared: Shared) -> Path:
+    """Nine overlapping captures, with the errors of GPS and attitude."""
+    return shared("survey", lambda folder: np.savez(folder / "truth.npz", **make_overlapping(folder, SURVEY)))
+
+
+def truth_of(folder: Path) -> dict[str, np.ndarray]:
+    """{label: pixels to metres east and north of the survey's origin}."""
+    return dict(np.load(folder / "truth.npz"))
+
+
+def errors_m(flight: PlacedFlight, captures: list[Placement], truth: dict[str, np.ndarray]) -> np.ndarray:
+    """Distances of points of all captures from the truth, after the similarity of all captures that fits best."""
+    px = geometry.lattice(*SURVEY.size_px, 4, 4)
+    placed = np.concatenate([c.on_ground(px) for c in captures]) @ (1, 1j)
+    undistorted = lens.undistort(SURVEY.lens, px)
+    true = np.concatenate([geometry.apply(truth[c.label], undistorted) for c in captures]) @ (1, 1j)
+    design = np.stack([placed, np.ones_like(placed)], axis=1)
+    return np.abs(design @ np.linalg.lstsq(design, true)[0] - true)
+
+
+def test_tie_points_place_captures_to_a_pixel(survey: Path) -> None:
+    flight, truth = place_captures(survey), truth_of(survey)
+    pairs = [pair.split() for pair in tie_pairs(flight.captures)]
+    placed = adjusted(flight.captures, [used for used, _ in pairs])
+    assert np.percentile(errors_m(flight, list(flight.captures), truth), 95) > 1.5
+    assert np.percentile(errors_m(flight, placed, truth), 95) < SURVEY.gsd_m
+    checks = [check for _, check in pairs]
+    assert misfit_m(checks, placed)[0] < 0.2 * SURVEY.gsd_m
+    assert misfit_m(checks, flight.captures)[0] > 1.0
+    # No tie point is both used and a check.
+    for used, check in pairs:
+        assert not set(map(tuple, used.first_px)) & set(map(tuple, check.first_px))
+
+
+def test_the_georeference_holds_the_position_of_the_whole(survey: Path) -> None:
+    """Tie points are relative: the mean of the GPS positions stays."""
+    flight, truth = place_captures(survey), truth_of(survey)
+    placed = adjusted(flight.captures, [pair.split()[0] for pair in tie_pairs(flight.captures)])
+    centre = (np.array([SURVEY.size_px], float) - 1) / 2
+    origin_m = transformed(np.array([[LONGITUDE, LATITUDE]]), "EPSG:4326", utm_wkt(LONGITUDE, LATITUDE))[0]
+    off_m = [
+        c.on_ground(centre)[0] + flight.origin_m - origin_m - geometry.apply(truth[c.label], centre)[0] for c in placed
+    ]
+    assert np.linalg.norm(np.mean(off_m, axis=0)) < 2 * SURVEY.gps_error_m
+
+
+def test_the_positions_determine_the_scale_if_the_height_is_assumed(survey: Path) -> None:
+    flight = place_captures(survey)
+    double = [
+        replace(
+            c,
+            to_ground=geometry.translation(*c.camera_m)
+            @ np.diag((2, 2, 1))
+            @ geometry.translation(*-c.camera_m)
+            @ c.to_ground,
+            height_m=2 * c.height_m,
+            accuracy_m=30.0,
+            pose_std=(*c.pose_std[:2], 0.5, *c.pose_std[3:]),
+        )
+        for c in flight.captures
+    ]
+    placed = adjusted(double, [pair.split()[0] for pair in tie_pairs(double)])
+    assert np.median([c.gsd_m for c in placed]) == pytest.approx(SURVEY.gsd_m, rel=0.35)
+    assert np.percentile(errors_m(flight, placed, truth_of(survey)), 95) < SURVEY.gsd_m
+
+
+def test_wrong_matches_of_a_pair_do_not_move_the_others(survey: Path) -> None:
+    flight = place_captures(survey)
+    pairs = [pair.split()[0] for pair in tie_pairs(flight.captures)]
+    wrong = replace(pairs[0], second_px=pairs[0].second_px + np.array([25.0, -15.0]))
+    placed = adjusted(flight.captures, [wrong, *pairs[1:]])
+    assert np.percentile(errors_m(flight, placed, truth_of(survey)), 95) < SURVEY.gsd_m
+
+
+@pytest.fixture(scope="module")
+def written(survey: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, agalign.MosaicReport]:
+    path = tmp_path_factory.mktemp("mosaic") / "field.tif"
+    return path, agalign.mosaic(survey, path, indices=["ndvi"])
+
+
+def test_the_mosaic_is_a_cog_with_all_bands(written: tuple[Path, agalign.MosaicReport]) -> None:
+    path, report = written
+    assert (report.captures, report.tied, report.left_out) == (9, 9, [])
+    with rasterio.open(path) as field:
+        assert field.tags(ns="IMAGE_STRUCTURE")["LAYOUT"] == "COG"
+        assert field.overviews(1)
+        assert field.descriptions == ("Green", "Red", "NIR", "Red edge")
+        assert (field.tags(3)["wavelength"], field.tags()["RADIOMETRY"]) == ("842", "reflectance")
+        assert field.crs.to_epsg() == 32631
+        assert field.transform.a == -field.transform.e == pytest.approx(SURVEY.gsd_m, rel=0.03)
+        assert np.isnan(field.nodata)
+        assert float(field.tags()["MOSAIC_MISFIT_M"]) == pytest.approx(report.misfit_m[0], abs=1e-3)
+        bands = field.read()
+    assert np.isfinite(bands).all(axis=0).mean() > 0.8
+    with rasterio.open(path.with_name("field_ndvi.tif")) as index:
+        assert index.tags(ns="IMAGE_STRUCTURE")["LAYOUT"] == "COG"
+        ndvi = index.read(1)
+    np.testing.assert_allclose(ndvi, (bands[2] - bands[1]) / (bands[2] + bands[1]), rtol=1e-5)
+
+
+def test_the_mosaic_shows_the_ground(written: tuple[Path, agalign.MosaicReport], survey: Path) -> None:
+    """Each capture, resampled to the mosaic by its refined placement, has the values of the mosaic, seams included."""
+    path, _ = written
+    flight = place_captures(survey)
+    placed = adjusted(flight.captures, [pair.split()[0] for pair in tie_pairs(flight.captures)])
+    with rasterio.open(path) as field:
+        bands = field.read()
+        to_px = np.array(~field.transform).reshape(3, 3)
+    for capture in placed:
+        px = geometry.lattice(*SURVEY.size_px, 30, 20).round()
+        x, y = np.floor(geometry.apply(to_px, capture.on_ground(px) + flight.origin_m)).astype(int).T
+        with rasterio.open(capture.bands[0].file) as stack:
+            own = stack.read()[:, *px.astype(int).T[::-1]]
+        inside = (x >= 0) & (y >= 0) & (x < bands.shape[2]) & (y < bands.shape[1])
+        own, of_mosaic = own[:, inside], bands[:, y[inside], x[inside]]
+        known = np.isfinite(of_mosaic).all(axis=0)
+        assert known.mean() > 0.9
+        correlation = [np.corrcoef(a, b)[0, 1] for a, b in zip(own[:, known], of_mosaic[:, known], strict=True)]
+        assert min(correlation) > 0.9
+
+
+def test_whole_numbers_keep_their_type_and_unused_pixels_are_nodata(survey: Path, tmp_path: Path) -> None:
+    shutil.copytree(survey, tmp_path, dirs_exist_ok=True)
+    for path in (tmp_path / "0000SET").glob("*.tif"):
+        with rasterio.open(path) as stack:
+            values, names = stack.read(), stack.descriptions
+        profile = {"driver": "GTiff", "width": values.shape[2], "height": values.shape[1], "count": 4, "nodata": 0}
+        with rasterio.open(path, "w", dtype="uint16", **profile) as stack:
+            stack.write((values * 40000).astype(np.uint16))
+            stack.descriptions = names
+    done = agalign_here("mosaic", tmp_path, "-o", tmp_path / "field.tif", "--gsd", "0.2", "-i", "ndvi")
+    assert done.returncode == 0, done.stderr
+    assert "raw numbers" in done.stderr
+    with rasterio.open(tmp_path / "field.tif") as field:
+        assert (field.dtypes[0], field.nodata, field.transform.a) == ("uint16", 0, 0.2)
+        values = field.read(1)
+    assert 0 < (values == 0).mean() < 0.3
+    assert values[values > 0].min() > 3000
+
+
+def test_a_hole_of_one_capture_is_filled_by_another(survey: Path, tmp_path: Path) -> None:
+    shutil.copytree(survey, tmp_path, dirs_exist_ok=True)
+    with rasterio.open(tmp_path / "0000SET" / "IMG_0005.tif", "r+") as stack:
+        values = stack.read()
+        values[2, 100:140, 140:180] = np.nan
+        stack.write(values)
+    report = agalign.mosaic(tmp_path, tmp_path / "field.tif")
+    with rasterio.open(report.path) as field:
+        bands = field.read()
+    height, width = bands.shape[1:]
+    assert np.isfinite(bands[:, height // 3 : -height // 3, width // 3 : -width // 3]).all()
+
+
+def test_the_command_states_the_misfit(survey: Path, tmp_path: Path) -> None:
+    done = agalign_here("mosaic", survey, "-o", tmp_path / "field.tif")
+    assert done.returncode == 0, done.stderr
+    assert done.stderr == ""
+    text = " ".join(done.stdout.split())
+    assert "tie points that were not used: median 0.0" in text
+    assert "Misfit, by the georeference: median" in text
+    assert "Mosaic of 9 captures" in text
+    assert [p.name for p in tmp_path.iterdir()] == ["field.tif"]
+
+
+def without_positions(out: Path) -> None:
+    (out / "flight.geojson").unlink()
+
+
+def with_another_band(out: Path) -> None:
+    sidecar = read_sidecar(out / "0000SET" / "IMG_0009.json")
+    bands = [b.model_copy(update={"band": "Blue"}) if b.band == "Red" else b for b in sidecar.bands]
+    write_sidecar(out / "0000SET" / "IMG_0009.json", sidecar.model_copy(update={"bands": bands}))
+
+
+@pytest.mark.parametrize(
+    ("change", "arguments", "code", "said"),
+    [
+        (without_positions, (), 1, "no capture can be placed, because flight.geojson has no footprints"),
+        (with_another_band, (), 3, "IMG_0009: left out: it has other bands than 0000SET/IMG_0001"),
+        (None, ("--gsd", "0.0001"), 2, "pixels, which is too many; increase --gsd"),
+        (None, ("-i", "nonsense"), 2, "unknown index 'nonsense'"),
+        (None, ("-o", "0000SET/IMG_0001.tif"), 2, "give the mosaic a new file that ends in .tif"),
+        (None, ("-o", "field.png"), 2, "give the mosaic a new file that ends in .tif"),
+    ],
+)
+def test_what_cannot_be_done_is_one_line(
+    survey: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    change: Callable[[Path], None] | None,
+    arguments: tuple[str, ...],
+    code: int,
+    said: str,
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    shutil.copytree(survey, tmp_path, dirs_exist_ok=True)
+    if change is not None:
+        change(tmp_path)
+    before = (tmp_path / "0000SET" / "IMG_0001.tif").read_bytes()
+    done = agalign_here("mosaic", ".", *arguments)
+    assert done.returncode == code, done.stderr
+    (line,) = done.stderr.splitlines()
+    assert said in line
+    assert (tmp_path / "0000SET" / "IMG_0001.tif").read_bytes() == before
+    assert (tmp_path / "mosaic.tif").exists() == (code == 3)
+
+
+def test_captures_that_do_not_match_keep_their_georeference(
+    survey: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(adjustment, "_MIN_TIE_POINTS", 10**6)
+    done = agalign_here("mosaic", survey, "-o", tmp_path / "field.tif")
+    assert done.returncode == 0
+    assert "9 of 9 captures have no tie points, and keep their georeference, accurate to" in done.stderr
+    assert "Misfit" not in done.stdout
+
+
+def test_a_run_without_a_map_names_what_is_missing(tmp_path: Path) -> None:
+    make_aligned(tmp_path, 1)
+    with pytest.raises(agalign.InputError, match="they need position, altitude, yaw and focal length in the tags"):
+        agalign.mosaic(tmp_path, tmp_path / "x.tif")
+
+
+@pytest.mark.real
+@pytest.mark.slow
+def test_a_real_strip_has_a_fifth_of_the_misfit(real_data: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    flight = real_data / "flights" / "rededge_m_rowcrop"
+    done = agalign_here("align", flight, "-o", out, "--ground-elevation", "92", "--relief", "never")
+    assert done.returncode == 0, done.stderr
+    report = agalign.mosaic(out, tmp_path / "field.tif")
+    assert report.pairs >= 3
+    assert report.misfit_m[0] < 0.2 * report.georeference_misfit_m[0]
+    assert report.misfit_m[0] < 0.06
