@@ -32,6 +32,7 @@ from agalign.values import geometry
 from agalign.values.alignment import MIN_RETRIEVAL, Alignment, JointResult, Residual, Seed
 from agalign.values.choices import Geometry, ReliefUse
 from agalign.values.displacement import DisplacementField
+from agalign.values.geometry import Matrix
 from agalign.values.image import Raster
 from agalign.values.mapping import PixelMapping
 from agalign.values.pixel_units import FixedImagePx
@@ -79,6 +80,8 @@ class ReliefCandidate:
     seed: Seed
     joint: JointResult[FixedImagePx]
     warped: WarpedPair
+    by_halves: tuple[Matrix, Matrix] | None = None
+    """Homographies from half of the windows (`WarpedPair.cross_validated`)."""
 
     def fit_residual(self, mapping: PixelMapping) -> Residual[FixedImagePx]:
         """Measure the windows of the fit with a mapping."""

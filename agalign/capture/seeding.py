@@ -72,20 +72,21 @@ def find_seed(pair: BandPair, settings: SeedSettings, model: FlightModel | None 
         return best
     if not best.trusted and not _WITH_SCALE & pair.candidates.keys():
         best = max((best, *_at_other_scales(pair)), key=lambda seed: seed.score)
-    residual = _residual_of(pair, best.fixed_to_moving)
-    # A peak at the mapping of the tags confirms the image centre, the windows confirm the corners.
-    if best.trusted and pair.is_expected(best.fixed_to_moving) and seed_fits(residual):
-        return best
-    return _best_match(pair, model, best, residual)
+    return _best_match(pair, model, best)
 
 
-def _best_match(pair: BandPair, model: FlightModel | None, best: Seed, residual: Residual[FixedImagePx]) -> Seed:
+def _best_match(pair: BandPair, model: FlightModel | None, best: Seed) -> Seed:
     """Return a match with a smaller residual than the best seed, or that seed.
 
-    If the tags and the windows confirm the seed, a match also needs a higher correlation peak: equal plants in a square
-    grid match after a quarter turn too, with a smaller residual where there is parallax.
+    No match is needed if images, tags and windows confirm the seed. If tags and windows confirm it, a match also needs
+    a higher correlation peak: equal plants in a square grid match after a quarter turn too, with a smaller residual
+    where there is parallax.
     """
+    residual = _residual_of(pair, best.fixed_to_moving)
+    # The mapping of the tags confirms the image centre, the windows confirm the corners.
     is_confirmed = pair.is_expected(best.fixed_to_moving) and seed_fits(residual)
+    if best.trusted and is_confirmed:
+        return best
     for mapping in _matches(pair, model, by_learned_descriptors=not best.trusted):
         for match, match_residual in _with_corrected(pair, mapping):
             if not seed_fits(match_residual) or not match_residual.is_better_than(residual):
