@@ -102,11 +102,11 @@ def _from_bands(rig: Rig, band: str, known: Observation) -> Prediction:
     capture that the rig does not describe.
     """
     others = [b for b in rig.mean if b != band]
-    mean_and_mapping = [(rig.mean[b], known.mappings.get(b, rig.mean[b])) for b in others]
     std_px = [known.std_px[b] if b in known.mappings else math.inf for b in others]
     design, designs = rig.design(band), np.stack([rig.design(b) for b in others])
     expected_px = np.array([rig.from_bands_px[b] for b in others])
-    differences = np.stack([affine_difference(*pair, rig.size_px) for pair in mean_and_mapping])
+    mappings = {**rig.mean, **known.mappings}
+    differences = np.stack([affine_difference(rig.mean[b], mappings[b], rig.size_px) for b in others])
     weights = mapping_weight(np.stack([std_px, np.full(len(others), MIN_STD_PX)]), expected_px)
     solutions, (covariance, complete) = least_squares(designs, np.stack([differences, 0 * differences]), weights)
     excess_px2 = ((differences - designs @ solutions[0]) ** 2).sum(axis=(1, 2)) - expected_px**2

@@ -117,7 +117,6 @@ def learn(
 ) -> tuple[int, float]:
     """Learn theta and every psi of all groups, coarse to fine; theta is carried from level to level.
 
-    Images with a trusted seed take part at the finest level only.
     The homographies are written into the groups. `threads` groups update their psi at the same time; the result does
     not depend on it. Returns the number of steps on theta and the last loss, NaN without a step. Raises
     NoContrastError.
@@ -135,7 +134,7 @@ def learn(
             at_level = [
                 _GroupAtLevel(own_state, net, group, bands, own_state.level(group, scale, bands), schedule)
                 for own_state, group in zip(states, groups, strict=True)
-                if (bands := [b for b in group.active if scale == scales[-1] or not group.trusted[b]])
+                if (bands := _learned_bands(group, is_finest=scale == scales[-1]))
             ]
             if not at_level:
                 continue
@@ -147,6 +146,11 @@ def learn(
             for group in at_level:
                 group.store()
     return steps, loss
+
+
+def _learned_bands(group: ImageGroup, *, is_finest: bool) -> list[int]:
+    """Return the moving images that take part at a level; those with a trusted seed do so at the finest level only."""
+    return [b for b in group.active if is_finest or not group.trusted[b]]
 
 
 def learn_scales(longer_side_px: int) -> list[float]:
