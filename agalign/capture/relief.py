@@ -37,19 +37,14 @@ from agalign.values.image import Raster
 from agalign.values.mapping import PixelMapping
 from agalign.values.pixel_units import FixedImagePx
 from agalign.values.relief import Parallax, Relief
-from agalign.verify.displacement_field import robust_loss
+from agalign.verify.displacement_field import MIN_GAIN_SIGMA, MIN_WINDOWS, robust_loss
 from agalign.verify.residuals import decrease_sigma
 from agalign.verify.window_fit import fit_windows
 
 _MIN_BANDS = 2
 """Minimum number of moving lenses: a relief is verified with the other lenses."""
-_MIN_WINDOWS = 24
-"""Minimum number of measured windows in each band, for the test for parallax and for fits."""
 _MIN_PARALLAX_PX = 0.3
 """Minimum p95 of the parallax of windows for a relief; windows of flat fields have up to 0.2 px, mostly noise."""
-_MIN_GAIN_SIGMA = 4.0
-"""Minimum decrease of the squared shifts of a band by the parallax from the others, in standard errors; below 3 by
-chance."""
 _FAR_PX, _MAX_FAR_SHARE = 1.0, 0.05
 """A relief is also tried if more than this share of the windows has shifts above _FAR_PX: windows across depth edges
 may contain the parallax of neither side, so that the squared shifts do not decrease."""
@@ -139,7 +134,7 @@ def _comparable(candidates: Sequence[ReliefCandidate]) -> list[list[ReliefCandid
     groups: dict[tuple[int, str], list[ReliefCandidate]] = {}
     for candidate in candidates:
         pair, residual = candidate.pair, candidate.warped.residual
-        is_reliable = candidate.joint.retrieval >= MIN_RETRIEVAL and len(residual.measured_px) >= _MIN_WINDOWS
+        is_reliable = candidate.joint.retrieval >= MIN_RETRIEVAL and len(residual.measured_px) >= MIN_WINDOWS
         if is_reliable and not pair.is_coarse:
             groups.setdefault((id(pair.reference), pair.space), []).append(candidate)
     return list(groups.values())
@@ -161,7 +156,7 @@ def _common_parallax_px(group: Sequence[ReliefCandidate]) -> tuple[float, bool]:
         return 0.0, False
     bands, model = consistent
     far_share = max(_far_share(residuals[band]) for band in bands)
-    if far_share <= _MAX_FAR_SHARE and _gain_by_others_sigma(windows.of_bands(bands), model, size_px) < _MIN_GAIN_SIGMA:
+    if far_share <= _MAX_FAR_SHARE and _gain_by_others_sigma(windows.of_bands(bands), model, size_px) < MIN_GAIN_SIGMA:
         return 0.0, False
     parallax_px = float(np.percentile(np.abs(model.parallax_px), 95))
     return parallax_px, _layout(group, bands) is None and are_on_a_line(model.baselines)
@@ -177,7 +172,7 @@ def _gain_by_others_sigma(windows: WindowShifts, model: Adjustment, size_px: tup
         after_px = shifts_px[:, band] - parallax[:, None] * model.baselines[band]
         before, after = (np.linalg.norm(s, axis=1) for s in (shifts_px[:, band], after_px))
         measured = np.isfinite(before) & np.isfinite(after)
-        enough = measured.sum() >= _MIN_WINDOWS
+        enough = measured.sum() >= MIN_WINDOWS
         gains.append(decrease_sigma(before[measured], after[measured]) if enough else 0.0)
     return float(np.median(gains))
 
@@ -225,7 +220,7 @@ def _consistent(
 
     def adjusted(bands: Sequence[int], *, fields: bool) -> Adjustment | None:
         layout, some = _layout(group, bands), windows.of_bands(bands)
-        model = adjust(some, size_px, layout, with_fields=fields) if some.are_enough(_MIN_WINDOWS) else None
+        model = adjust(some, size_px, layout, with_fields=fields) if some.are_enough(MIN_WINDOWS) else None
         return model if model is not None and are_of_lenses(model.baselines, layout) else None
 
     def median_scale_px(bands: Sequence[int]) -> float:
@@ -357,7 +352,7 @@ class _Estimate:
         for _ in range(_ROUNDS):
             mapping = band.mapping(self.relief)
             residual = candidate.fit_residual(mapping)
-            if len(residual.measured_px) < _MIN_WINDOWS:
+            if len(residual.measured_px) < MIN_WINDOWS:
                 return None
             windows = WindowShifts.of([residual], [mapping])
             corners_px, change = windows.fit_baseline(self.relief(windows.centres_px), candidate.pair.fixed.size_px)

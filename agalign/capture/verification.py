@@ -20,9 +20,6 @@ from agalign.verify.displacement_field import DisplacementResult
 from agalign.verify.extrapolation import points_in_frame, unobserved_quarters
 from agalign.verify.residuals import residual_under
 
-_SEEDS_OF_ALIGNED_INPUT: tuple[SeedKind, ...] = ("geo", "identity")
-"""Seeds of input that may be aligned already; it is then returned unchanged instead of resampled by a small shift."""
-
 _MAX_CONVERTED_PX = 0.15
 """Maximum difference of two mappings for which the residual is converted instead of measured again; the error is about
 0.01 px, because interpolation changes shifts by 0.1 to 0.25 of their distance from whole pixels."""
@@ -222,8 +219,12 @@ def with_metrics(
 
 
 def _unchanged_if_aligned(joint: JointResult[FixedImagePx], pair: BandPair) -> JointResult[FixedImagePx]:
-    """Replace the mapping by the one given by the files if it does not differ significantly."""
-    for given in (pair.candidates[kind] for kind in _SEEDS_OF_ALIGNED_INPUT if kind in pair.candidates):
+    """Replace the mapping by the one given by the files if it does not differ significantly.
+
+    Input that is aligned already is returned unchanged instead of resampled by a small shift.
+    """
+    kinds: tuple[SeedKind, ...] = ("geo", "identity")
+    for given in (pair.candidates[kind] for kind in kinds if kind in pair.candidates):
         if pair.mapping(given).is_curved:
             continue  # with lens distortion the files are not aligned
         if is_unchanged(joint, given, pair.fixed.size_px, max(pair.scales.fixed)):

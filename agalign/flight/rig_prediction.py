@@ -37,8 +37,6 @@ _MAX_MEDIAN_RATIO, _MIN_MEDIAN_PX = 6.0, 3.0
 """A capture is an outlier if a factor exceeds the ratio times the flight's median, or times the minimum median."""
 _MAX_GAP_RATIO = 2.0
 """An estimate is validated on captures with a gap of at most this ratio to the gap of the predicted capture."""
-_OF_MOTION = np.array([0, 0, 0, 1, 1])
-"""1 for the factors that depend on the image motion."""
 _MIN_CAPTURES_FOR_ALTITUDE = 6
 """With fewer captures, the estimator with the smallest error would be selected by chance."""
 
@@ -155,7 +153,8 @@ def _at_motion(captures: Captures, motion: tuple[float, float] | None) -> tuple[
     x = np.array([(1.0, *(c.motion or ())) for c in known])
     # Captures of similar speed do not determine the slope: `rcond` selects the solution of minimum norm.
     scale = np.abs(x).max(axis=0) + 1e-12
-    slope = np.linalg.lstsq(x / scale, np.array([c.factors for c in known]), rcond=1e-3)[0] * _OF_MOTION
+    slope = np.linalg.lstsq(x / scale, np.array([c.factors for c in known]), rcond=1e-3)[0]
+    slope = slope * [0, 0, 0, 1, 1]  # only w depends on the motion
     change = (np.array([1.0, *motion]) - x) / scale @ slope
     moved = [replace(c, factors=tuple(np.add(c.factors, d).tolist())) for c, d in zip(known, change, strict=True)]
     return moved, np.array([1.0, *motion]) / scale @ slope

@@ -32,8 +32,6 @@ from agalign.method.refine import (
 from agalign.method.state import ImageGroup, JointState
 from agalign.values.alignment import MIN_RETRIEVAL
 
-_BETA_1, _BETA_2, _EPSILON = 0.9, 0.999, 1e-8
-
 
 class Adam:
     """Optimiser of a network's weights, tensors of any shape."""
@@ -53,14 +51,15 @@ class Adam:
         for weight in self.weights:
             weight.grad = None
         torch.autograd.backward(loss)
+        beta_1, beta_2, epsilon = 0.9, 0.999, 1e-8  # as in torch.optim
         for i, (weight, (first, second)) in enumerate(zip(self.weights, self._moments, strict=True)):
             if weight.grad is None:
                 continue
             self._steps[i] += 1
-            first.lerp_(weight.grad, 1 - _BETA_1)
-            second.mul_(_BETA_2).addcmul_(weight.grad, weight.grad, value=1 - _BETA_2)
-            denominator = (second / (1 - _BETA_2 ** self._steps[i])).sqrt_().add_(_EPSILON)
-            weight.addcdiv_(first, denominator, value=-self.learning_rate / (1 - _BETA_1 ** self._steps[i]))
+            first.lerp_(weight.grad, 1 - beta_1)
+            second.mul_(beta_2).addcmul_(weight.grad, weight.grad, value=1 - beta_2)
+            denominator = (second / (1 - beta_2 ** self._steps[i])).sqrt_().add_(epsilon)
+            weight.addcdiv_(first, denominator, value=-self.learning_rate / (1 - beta_1 ** self._steps[i]))
 
 
 BATCH = 128
