@@ -89,12 +89,16 @@ class _FlightLearner:
             refined = self._refined_by(self.start)
             if refined is not None:
                 return replace(self.start, refined=refined)
-        camera, start_rig = flight_camera(self.captures), None if self.start is None else self.start.rig
-        if len(self.captures) < MIN_CAPTURES:
-            # Learning takes as long as aligning one or two captures, and those that need it are learned from alone.
-            net = initial_network(self._bands, self.settings, self.start)
-            known_mappings = {} if start_rig is None else start_rig.mean
-            return FlightModel(net, camera, self._bands, known_mappings, "", start_rig) if net.is_trained else None
+        if len(self.captures) >= MIN_CAPTURES:
+            return self._from_captures()
+        # Learning takes as long as aligning one or two captures, and those that need it are learned from alone.
+        net, rig = initial_network(self._bands, self.settings, self.start), self._start_rig
+        known_mappings = {} if rig is None else rig.mean
+        camera = flight_camera(self.captures)
+        return FlightModel(net, camera, self._bands, known_mappings, "", rig) if net.is_trained else None
+
+    def _from_captures(self) -> FlightModel | None:
+        """Learn the network and the rig, from at least MIN_CAPTURES captures."""
         network = self._network()
         if network is None:
             return None
@@ -106,9 +110,9 @@ class _FlightLearner:
         if not mappings:
             return None
         medians = {name: median_mapping(of, self._size_px) for name, of in mappings.items()}
-        model = FlightModel(net, camera, self._bands, medians, "")
+        model = FlightModel(net, flight_camera(self.captures), self._bands, medians, "")
         observations = self._observations(model, known)
-        rig = self._rig(list(observations.values())) or start_rig
+        rig = self._rig(list(observations.values())) or self._start_rig
         if rig is None:
             # A second refinement from the medians reduces the errors.
             return model
@@ -119,6 +123,10 @@ class _FlightLearner:
     @property
     def _bands(self) -> tuple[str, ...]:
         return flight_lenses(self.captures)
+
+    @property
+    def _start_rig(self) -> Rig | None:
+        return None if self.start is None else self.start.rig
 
     @property
     def _size_px(self) -> tuple[int, int]:
@@ -144,16 +152,7 @@ class _FlightLearner:
 
     def _network(self) -> tuple[Descriptor, list[LearningCapture]] | None:
         """Return (the network, captures with mappings refined by it); None if learning fails."""
-        # Each capture takes seconds. A third one mostly shows the structure that two lack.
-        network_captures = 3
-        parts = np.array_split(np.arange(len(self.captures)), network_captures)
-        stretches = [
-            tuple(self.captures[part[k]] for k in dict.fromkeys((len(part) // 2, 0, len(part) - 1))) for part in parts
-        ]
-        # The rig needs further captures; refined at the same time, they occupy all workers.
-        first = {stretch[0].label for stretch in stretches}
-        spread = [c for c in _spread(self.captures, _MIN_RIG_CAPTURES) if c.label not in first]
-        others = [(c,) for c in spread[: _MIN_RIG_CAPTURES - len(stretches)]]
+        stretches, others = _stretches_and_others(self.captures)
         start = None if self.start is None else portable(self.start)
         task = partial(choose_and_refine, self._bands, self.settings, start)
         refined = []
@@ -196,21 +195,27 @@ class _FlightLearner:
         result = {one.capture.label: one.observation for one in known if one.observation is not None}
         again = [c for c in self.captures if c.label in result and result[c.label].misaligned]
         waiting = [*again, *(c for c in _spread(self.captures, count) if c.label not in result)]
-        task = partial(observe_rig, portable(model), self.settings)
-        while waiting:
-            counts = Counter(band for o in result.values() for band in o.residuals)
-            missing = count - min(counts.values(), default=0)
-            if missing <= 0:
-                break
+        model = portable(model)
+        while waiting and (missing := count - _min_observations(result.values())) > 0:
             some, waiting = waiting[:missing], waiting[missing:]
-            # The model's mappings are better initial alignments than the seeds of the misaligned bands.
-            arguments = [(c, result[c.label].misaligned if c.label in result else None) for c in some]
-            for capture, observation in zip(some, self.apply(task, arguments), strict=True):
-                if observation is not None:
-                    earlier = result.get(capture.label)
-                    result[capture.label] = observation if earlier is None else earlier.updated(observation)
-                self.progress("the rig", min(1.0, len(result) / count))
+            self._observe(some, model, result, count)
         return {c.label: result[c.label] for c in self.captures if c.label in result}
+
+    def _observe(
+        self, captures: Sequence[Capture], model: FlightModel, result: dict[str, RigObservation], count: int
+    ) -> None:
+        """Add observations of captures to `result`, which `count` of them complete.
+
+        Of captures that it contains, only the misaligned bands are observed again.
+        """
+        # The model's mappings are better initial alignments than the seeds of the misaligned bands.
+        arguments = [(c, result[c.label].misaligned if c.label in result else None) for c in captures]
+        observations = self.apply(partial(observe_rig, model, self.settings), arguments)
+        for capture, observation in zip(captures, observations, strict=True):
+            if observation is not None:
+                earlier = result.get(capture.label)
+                result[capture.label] = observation if earlier is None else earlier.updated(observation)
+            self.progress("the rig", min(1.0, len(result) / count))
 
     def _rig(self, observations: Sequence[RigObservation]) -> Rig | None:
         """Return the rig, with the displacement fields of the lenses; None if the captures do not determine it."""
@@ -230,6 +235,12 @@ class _FlightLearner:
         return replace(rig, extrapolation_px=extrapolation_px, fields=known)
 
 
+def _min_observations(observations: Iterable[RigObservation]) -> int:
+    """Return the number of observations of the aligned band with the fewest."""
+    counts = Counter(band for o in observations for band in o.residuals)
+    return min(counts.values(), default=0)
+
+
 def _extrapolation_px(
     rig: Rig, residuals: Mapping[str, Sequence[Residual[FixedFilePx]]], *, calibrated: bool
 ) -> dict[str, MovingFilePx]:
@@ -245,6 +256,21 @@ def _extrapolation_px(
             std_px = unmodelled_std_px(centres_px, rig.size_px, calibrated=calibrated)
             result[band] = MovingFilePx(std_px * ratio)
     return result
+
+
+def _stretches_and_others(captures: Sequence[Capture]) -> tuple[list[tuple[Capture, ...]], list[tuple[Capture, ...]]]:
+    """Return captures to learn the network from and other captures for the rig, each with its alternatives.
+
+    The network is learned from the middle of each stretch of the flight, or from its start or end.
+    """
+    # Each capture takes seconds. A third one mostly shows the structure that two lack.
+    parts = np.array_split(np.arange(len(captures)), 3)
+    places = [dict.fromkeys(part[[len(part) // 2, 0, -1]].tolist()) for part in parts]
+    stretches = [tuple(captures[i] for i in of_part) for of_part in places]
+    # Refined at the same time as those of the network, the others occupy all workers.
+    first = {stretch[0].label for stretch in stretches}
+    spread = [c for c in _spread(captures, _MIN_RIG_CAPTURES) if c.label not in first]
+    return stretches, [(c,) for c in spread[: _MIN_RIG_CAPTURES - len(stretches)]]
 
 
 def _spread(captures: Sequence[Capture], count: int) -> list[Capture]:

@@ -158,16 +158,15 @@ def load_capture(
     bands: Sequence[str],
     settings: Settings,
     start: FlightModel | None,
-    known: Mapping[str, RefinedPair] | None = None,
+    known: Mapping[str, RefinedPair],
 ) -> LoadedCapture | None:
     """Read a capture and find its seeds, or use those of the `known` pairs by band; None if no band can be used.
 
     Bands have their index in `bands` as index in the network. Seeds of kind `match` use the network of `start`.
     """
-    seeds_known = {} if known is None else {name: pair.seed for name, pair in known.items()}
     with logged_failure(f"{capture.label} cannot be learned from"):
         pairs = [p for p in read_pairs(capture, settings.seed)[0] if p.has_rig_pixels]
-        seeds_of = [(p, seeds_known.get(p.name) or find_seed(p, settings.seed, start)) for p in pairs]
+        seeds_of = [(p, known[p.name].seed if p.name in known else find_seed(p, settings.seed, start)) for p in pairs]
         result = [(p, seed) for p, seed in seeds_of if isinstance(seed, Seed)]
         if result:
             usable, seeds = [p for p, _ in result], [seed for _, seed in result]
@@ -197,7 +196,7 @@ def choose_and_refine(
     start = None if start is None else _on_device(start, settings)
     best: LoadedCapture | None = None
     for capture in captures:
-        loaded = load_capture(capture, bands, settings, start)
+        loaded = load_capture(capture, bands, settings, start, known={})
         if loaded is not None and (best is None or loaded.similarity_sigma > best.similarity_sigma):
             best = loaded
         if best is not None and best.is_trusted:

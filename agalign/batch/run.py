@@ -45,6 +45,10 @@ _MAX_THREADS = 4
 """Maximum number of threads that train a network or process captures; more wait for the interpreter's lock."""
 
 
+_UnfinishedFlight = tuple[Sequence[Capture], str, Sequence[Capture]]
+"""Captures of a flight, name of its model, and those captures that must be processed."""
+
+
 @dataclass(frozen=True)
 class Listener:
     """Events of a run."""
@@ -202,17 +206,11 @@ class _FlightRun:
         """Yield the report of each capture; add the time of learning to the record."""
         out, settings, flight_map = self.out, self.settings, FlightMap(self.out)
         sky, panels, captures = self.selected()
-        for excluded, facts in zip(sky, write_sky(sky, out), strict=True):
-            discard_outputs(excluded.capture, out, settings.write)
-            flight_map.add(excluded.capture, "sky")
-            yield CaptureReport(excluded.capture.label, "sky", sky=facts.sentence)
-        for reading, part in zip(panels, write_panels(panels, out), strict=True):
-            if reading.capture.is_of_a_panel:
-                discard_outputs(reading.capture, out, settings.write)
-                flight_map.add(reading.capture, "panel")
-                yield CaptureReport(reading.capture.label, "panel", panel=part.sentence)
-        # Captures of each flight, name of its model, and those captures that must be processed.
-        unfinished: list[tuple[Sequence[Capture], str, list[Capture]]] = []
+        for report, capture in self._excluded(sky, panels):
+            discard_outputs(capture, out, settings.write)
+            flight_map.add(capture, report.state)
+            yield report
+        unfinished: list[_UnfinishedFlight] = []
         groups = flights_of(captures)
         for group, name in zip(groups, model_names(groups), strict=True):
             pending = []
@@ -225,22 +223,38 @@ class _FlightRun:
                     yield CaptureReport(capture.label, "kept", kept, CapturePaths.of(capture, out).sidecar)
             if pending:
                 unfinished.append((group, name, pending))
-        on_cpu = choose_device(settings.joint.device).type == "cpu"
-        cores = self.options.jobs or (usable_cores() if on_cpu else 1)
-        with _chosen_run(sum(len(pending) for _, _, pending in unfinished), cores, self.options) as run:
-            tasks: list[Task] = []
-            learn = partial(learn_flight, apply=partial(in_order, run), threads=min(_MAX_THREADS, cores))
-            for of_flight, name, pending in unfinished:
-                path = self._model(of_flight, out / "models" / name, learn, record)
-                tasks += [Task(c, out, settings, path, preview_bytes(len(self.flight.captures))) for c in pending]
-            by_label = {c.label: c for c in captures}
-            for report in capture_reports(run, tasks, self.listener, self.options.timeout_s):
-                status = "failed" if report.result is None else report.result.status
-                flight_map.add(by_label[report.label], status, report.result)
-                yield report
+        by_label = {c.label: c for c in captures}
+        for report in self._processed(unfinished, record):
+            status = "failed" if report.result is None else report.result.status
+            flight_map.add(by_label[report.label], status, report.result)
+            yield report
         flight_map.write()
         if settings.write.stac:
             write_collections(captures, out)
+
+    def _excluded(
+        self, sky: Sequence[SkyCapture], panels: Sequence[PanelReading]
+    ) -> Iterator[tuple[CaptureReport, Capture]]:
+        """Write the records of the sky and of the panels; yield the captures that are not aligned, with reports."""
+        for excluded, facts in zip(sky, write_sky(sky, self.out), strict=True):
+            yield CaptureReport(excluded.capture.label, "sky", sky=facts.sentence), excluded.capture
+        for reading, part in zip(panels, write_panels(panels, self.out), strict=True):
+            if reading.capture.is_of_a_panel:
+                yield CaptureReport(reading.capture.label, "panel", panel=part.sentence), reading.capture
+
+    def _processed(self, flights: Sequence[_UnfinishedFlight], record: RunPart) -> Iterator[CaptureReport]:
+        """Learn the model of each flight and process its captures; yield their reports as they complete."""
+        on_cpu = choose_device(self.settings.joint.device).type == "cpu"
+        cores = self.options.jobs or (usable_cores() if on_cpu else 1)
+        with _chosen_run(sum(len(pending) for _, _, pending in flights), cores, self.options) as run:
+            tasks: list[Task] = []
+            learn = partial(learn_flight, apply=partial(in_order, run), threads=min(_MAX_THREADS, cores))
+            for captures, name, pending in flights:
+                path = self._model(captures, self.out / "models" / name, learn, record)
+                tasks += [
+                    Task(c, self.out, self.settings, path, preview_bytes(len(self.flight.captures))) for c in pending
+                ]
+            yield from capture_reports(run, tasks, self.listener, self.options.timeout_s)
 
     def _model(
         self, captures: Sequence[Capture], path: Path, learn: Callable[..., FlightModel | None], record: RunPart

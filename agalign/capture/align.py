@@ -12,7 +12,14 @@ from agalign.capture.map_estimate import map_estimate
 from agalign.capture.prediction import bands_to_learn, with_predictions
 from agalign.capture.relief import ReliefCandidate, aligned_by_relief
 from agalign.capture.seeding import find_seed, image_groups
-from agalign.capture.verification import WarpedPair, predicted_by_windows, verified, with_metrics, without_result
+from agalign.capture.verification import (
+    WarpedPair,
+    at_seed,
+    predicted_by_windows,
+    verified,
+    with_metrics,
+    without_result,
+)
 from agalign.config import Settings
 from agalign.flight.fingerprint import refinement_key
 from agalign.flight.model import FlightModel
@@ -21,7 +28,7 @@ from agalign.method.joint import Results, align_from_scratch, refine_with
 from agalign.method.refine import FLIGHT_PATCHES, PATCHES
 from agalign.method.state import ImageGroup
 from agalign.values import geometry
-from agalign.values.alignment import Alignment, JointResult, RefinedPair, Residual, Seed
+from agalign.values.alignment import Alignment, JointResult, RefinedPair, Seed
 from agalign.values.capture import Capture
 from agalign.values.issues import OTHER_GEOMETRY, SEED_ASKED_FOR, Issue
 from agalign.values.mapping import PixelMapping
@@ -200,7 +207,7 @@ class PairAligner:
         """Use the seeds as results, as the user requested."""
         for pair, seed in starts:
             with self.timer.measure([pair.name]):
-                self.result[pair.name] = verified(pair, seed, Issue(SEED_ASKED_FOR), "never", seed_only=True)
+                self.result[pair.name] = at_seed(pair, seed, (Issue(SEED_ASKED_FOR),), seed_only=True)
 
     def refine(self, starts: Sequence[Start]) -> None:
         """Align the pairs of the bands that the flight's network contains with this network."""
@@ -283,44 +290,50 @@ def verify_together(
     by a relief or a displacement field.
     """
     timer = timer or _Timer()
-    relief_use = settings.relief.use if _may_be_homography(settings) else "never"
+    use = settings.relief.use if _may_be_homography(settings) else "never"
     with timer.measure([pair.name for pair, _ in starts]):
-        warped_pairs = [
-            WarpedPair.of(pair, pair.mapping(result.fixed_to_moving)) if isinstance(result, JointResult) else None
-            for (pair, _), result in zip(starts, results, strict=True)
-        ]
-        residuals = {p.name: w.residual for (p, _), w in zip(starts, warped_pairs, strict=True) if w is not None}
-        estimates = _map_estimates(starts, results, residuals, model, settings)
-        black, white = (
-            {name: r.where(r.is_black == is_black) for name, r in residuals.items()} for is_black in (True, False)
-        )
-        halves = [_map_estimates(starts, results, half, model, settings) for half in (black, white)]
+        candidates = _candidates(starts, results, model, settings)
         progress(starts[0][0].name if starts else "", "relief", 0.0)
-        candidates = _relief_candidates(starts, estimates, warped_pairs)
-        relief = aligned_by_relief(candidates, relief_use, is_observation=is_observation)
+        relief = aligned_by_relief(list(candidates.values()), use, is_observation=is_observation)
     alignments = relief.alignments
-    for (pair, seed), result, warped_pair, *by_half in zip(starts, estimates, warped_pairs, *halves, strict=True):
+    for (pair, seed), result in zip(starts, results, strict=True):
         if pair.name in alignments:
             continue
-        first, second = (r.fixed_to_moving if isinstance(r, JointResult) else None for r in by_half)
-        by_halves = None if first is None or second is None else (first, second)
         progress(pair.name, "checking", 0.0)
         with timer.measure([pair.name]):
-            use = relief_use if not is_observation and pair.name not in relief.along_a_line else "never"
-            alignment = verified(pair, seed, result, use, warped_pair, by_halves, seed_only=settings.seed.only)
-            is_mixed = pair.name in relief.others and alignment.status == "aligned"
-            alignments[pair.name] = predicted_by_windows(alignment, pair, OTHER_GEOMETRY) if is_mixed else alignment
+            if isinstance(result, Issue):
+                alignments[pair.name] = at_seed(pair, seed, (result,))
+            else:
+                field_use = "never" if is_observation or pair.name in relief.along_a_line else use
+                each = candidates[pair.name]
+                alignment = verified(pair, seed, each.joint, field_use, each.warped, each.by_halves)
+                is_mixed = pair.name in relief.others and alignment.status == "aligned"
+                alignments[pair.name] = predicted_by_windows(alignment, pair, OTHER_GEOMETRY) if is_mixed else alignment
     return alignments
 
 
-def _relief_candidates(
-    starts: Sequence[Start], results: Results, warped_pairs: Sequence[WarpedPair | None]
-) -> list[ReliefCandidate]:
-    return [
-        ReliefCandidate(pair, seed, result, warped)
-        for (pair, seed), result, warped in zip(starts, results, warped_pairs, strict=True)
-        if isinstance(result, JointResult) and warped is not None
+def _candidates(
+    starts: Sequence[Start], results: Results, model: FlightModel | None, settings: Settings
+) -> dict[str, ReliefCandidate]:
+    """Return the pairs with a result, by name, after the MAP estimation of all bands of the capture."""
+    measured = [
+        ReliefCandidate(pair, seed, result, WarpedPair.of(pair, pair.mapping(result.fixed_to_moving)))
+        for (pair, seed), result in zip(starts, results, strict=True)
+        if isinstance(result, JointResult)
     ]
+    pairs, joint = [c.pair for c in measured], {c.pair.name: c.joint for c in measured}
+    residuals = {c.pair.name: c.warped.residual for c in measured}
+    halves = ({name: r.where(r.is_black == is_black) for name, r in residuals.items()} for is_black in (True, False))
+    # The MAP estimate is a homography, which may not be of the family that the user chose.
+    rig = None if model is None else model.rig
+    estimates, black, white = (
+        map_estimate(pairs, joint, some, rig) if _may_be_homography(settings) else joint
+        for some in (residuals, *halves)
+    )
+    return {
+        name: replace(c, joint=estimates[name], by_halves=(black[name].fixed_to_moving, white[name].fixed_to_moving))
+        for name, c in zip(joint, measured, strict=True)
+    }
 
 
 def _results(
@@ -338,20 +351,3 @@ def _results(
         report("refining", 0.0)
         result |= dict(zip(indices, align(group, report), strict=True))
     return [result[i] for i in range(len(starts))]
-
-
-def _map_estimates(
-    starts: Sequence[Start],
-    results: Results,
-    residuals: Mapping[str, Residual[FixedImagePx]],
-    model: FlightModel | None,
-    settings: Settings,
-) -> list[JointResult[FixedImagePx] | Issue]:
-    """Return the results after the MAP estimation of all bands of the capture."""
-    if not _may_be_homography(settings):
-        return list(results)  # the estimate is a homography, not of the family that the user chose
-    names = [pair.name for pair, _ in starts]
-    joint = {name: r for name, r in zip(names, results, strict=True) if isinstance(r, JointResult)}
-    rig = None if model is None else model.rig
-    estimates = map_estimate([pair for pair, _ in starts], joint, residuals, rig)
-    return [estimates[name] if isinstance(r, JointResult) else r for name, r in zip(names, results, strict=True)]

@@ -24,9 +24,6 @@ from agalign.verify.checks import BY_WINDOWS, MAX_ALIAS_PEAK, alias_peak, seed_f
 from agalign.verify.extrapolation import issues_of_extrapolation, points_in_frame
 from agalign.verify.window_fit import WindowFit, fit_in_rounds, lens_std_px
 
-_DESCRIPTORS_FAILED = frozenset({RETRIEVAL, FEW_KEYPOINTS, NO_CONTRAST, CORNERS_UNKNOWN})
-"""Issues for which windows are tried. With other issues, the descriptors of sharp images have a result that may
-contradict them."""
 _MAX_STEP_PX = 16.0
 """Maximum displacement of a corner; larger ones contradict the seed."""
 _MIN_COARSE_WINDOWS = 16
@@ -55,7 +52,9 @@ def from_windows(pair: BandPair, alignment: Alignment[FixedImagePx]) -> Alignmen
 
 
 def _aligned(pair: BandPair, alignment: Alignment[FixedImagePx]) -> Alignment[FixedImagePx] | None:
-    descriptors_failed = pair.is_blurred or any(issue.kind in _DESCRIPTORS_FAILED for issue in alignment.issues)
+    # With other issues, the descriptors of sharp images have a result that may contradict the windows.
+    of_descriptors = {RETRIEVAL, FEW_KEYPOINTS, NO_CONTRAST, CORNERS_UNKNOWN}
+    descriptors_failed = pair.is_blurred or any(issue.kind in of_descriptors for issue in alignment.issues)
     if not descriptors_failed or alignment.residual is None or not seed_fits(alignment.residual):
         return None
     max_step_px = min(_MAX_STEP_PX, pair.max_shift_px)

@@ -25,16 +25,12 @@ from agalign.values import geometry
 from agalign.values.alignment import JointResult, Residual
 from agalign.values.geometry import Matrix
 from agalign.values.pixel_units import FixedImagePx
-from agalign.verify.window_fit import fit_windows
+from agalign.verify.window_fit import REWEIGHTINGS, fit_windows
 
 Array = NDArray[np.float64]
 
-_CORNERS = [0, 6, 34, 28]
-"""Indices of the image's corners in `flight.rig.lattice`, clockwise from the top left."""
 _MAX_CORRECTION_PX = 1.0
 """Maximum displacement of a corner by windows; larger ones contradict the mapping and are ignored."""
-_REWEIGHTINGS = 6
-"""Iterations after which the weights have converged."""
 _DEGREES_OF_FREEDOM = 4.0
 """Of the t distribution of a band's distance from the rig; heavy tails, as a lens may have moved."""
 
@@ -82,7 +78,7 @@ def _solve(
     """Return delta (8,) and its covariance (8, 8) of each band."""
     factors = 8 * len(likelihoods) + np.arange(len(FACTOR_STD_PX))
     weights = np.ones(len(likelihoods))
-    for _ in range(_REWEIGHTINGS):
+    for _ in range(REWEIGHTINGS):
         normal = np.zeros((factors[-1] + 1, factors[-1] + 1))
         right_side = np.zeros(len(normal))
         normal[factors, factors] = 1 / np.square(FACTOR_STD_PX)
@@ -138,9 +134,10 @@ def expected_corners(rig: Rig, band: str, fixed_to_moving: Matrix, scale: Sequen
     the cross-validated error over all homographies: those with equal mean square are equally likely.
     """
     (points, g), up = lattice(rig.size_px), np.tile(scale, 4)
-    corners, to_fixed = points[_CORNERS], geometry.invert(fixed_to_moving)
+    at_corners = [0, 6, 34, 28]  # of the lattice, clockwise from the top left
+    corners, to_fixed = points[at_corners], geometry.invert(fixed_to_moving)
     # (5, 4, 2) changes of the corners in the moving image by 1 px of each factor.
-    changes_px = np.einsum("nk,akf->fna", g[_CORNERS], rig.design(band))
+    changes_px = np.einsum("nk,akf->fna", g[at_corners], rig.design(band))
     moving = geometry.apply(rig.mean[band], corners) + np.concatenate([np.zeros((1, 4, 2)), changes_px])
     moved = up[:, None] * (geometry.apply(to_fixed, moving) - corners).reshape(-1, 8).T
     over = geometry.over_corners(points, *rig.size_px)

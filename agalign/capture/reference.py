@@ -10,7 +10,7 @@ from agalign.values.image import Raster
 from agalign.values.pixel_units import PixelScale
 from agalign.verify.displacement_field import DisplacementEstimator
 from agalign.verify.metrics import FixedSimilarity
-from agalign.verify.residuals import FixedWindows
+from agalign.verify.residuals import MIN_WINDOW_PX, FixedWindows
 
 _SEED_LONGEST_PX = 384
 """Longer side of the images on which seeds are scored; large shifts are found quickly at this resolution."""
@@ -21,8 +21,6 @@ _HELD_OUT_PX = 64
 """Side of the windows that verify a relief; larger, because their shifts have less noise."""
 _LARGE_WINDOW_PX = 168
 """Side of windows in blurred images: 15 x 10 blurs of 3 px."""
-_SMALL_WINDOW_PX = 32
-"""Side of windows between saturated areas: the smallest with a clear correlation peak."""
 
 
 class Reference:
@@ -102,7 +100,7 @@ class Reference:
     @cached_property
     def small_windows(self) -> FixedWindows:
         """Windows for images with small valid areas."""
-        return FixedWindows(self.grey.valid, self.structure, _SMALL_WINDOW_PX)
+        return FixedWindows(self.grey.valid, self.structure, MIN_WINDOW_PX)
 
     @cached_property
     def tie_windows(self) -> FixedWindows:

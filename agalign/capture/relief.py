@@ -32,23 +32,19 @@ from agalign.values import geometry
 from agalign.values.alignment import MIN_RETRIEVAL, Alignment, JointResult, Residual, Seed
 from agalign.values.choices import Geometry, ReliefUse
 from agalign.values.displacement import DisplacementField
+from agalign.values.geometry import Matrix
 from agalign.values.image import Raster
 from agalign.values.mapping import PixelMapping
 from agalign.values.pixel_units import FixedImagePx
 from agalign.values.relief import Parallax, Relief
-from agalign.verify.displacement_field import robust_loss
+from agalign.verify.displacement_field import MIN_GAIN_SIGMA, MIN_WINDOWS, robust_loss
 from agalign.verify.residuals import decrease_sigma
 from agalign.verify.window_fit import fit_windows
 
 _MIN_BANDS = 2
 """Minimum number of moving lenses: a relief is verified with the other lenses."""
-_MIN_WINDOWS = 24
-"""Minimum number of measured windows in each band, for the test for parallax and for fits."""
 _MIN_PARALLAX_PX = 0.3
 """Minimum p95 of the parallax of windows for a relief; windows of flat fields have up to 0.2 px, mostly noise."""
-_MIN_GAIN_SIGMA = 4.0
-"""Minimum decrease of the squared shifts of a band by the parallax from the others, in standard errors; below 3 by
-chance."""
 _FAR_PX, _MAX_FAR_SHARE = 1.0, 0.05
 """A relief is also tried if more than this share of the windows has shifts above _FAR_PX: windows across depth edges
 may contain the parallax of neither side, so that the squared shifts do not decrease."""
@@ -79,6 +75,8 @@ class ReliefCandidate:
     seed: Seed
     joint: JointResult[FixedImagePx]
     warped: WarpedPair
+    by_halves: tuple[Matrix, Matrix] | None = None
+    """Homographies from half of the windows (`WarpedPair.cross_validated`)."""
 
     def fit_residual(self, mapping: PixelMapping) -> Residual[FixedImagePx]:
         """Measure the windows of the fit with a mapping."""
@@ -136,7 +134,7 @@ def _comparable(candidates: Sequence[ReliefCandidate]) -> list[list[ReliefCandid
     groups: dict[tuple[int, str], list[ReliefCandidate]] = {}
     for candidate in candidates:
         pair, residual = candidate.pair, candidate.warped.residual
-        is_reliable = candidate.joint.retrieval >= MIN_RETRIEVAL and len(residual.measured_px) >= _MIN_WINDOWS
+        is_reliable = candidate.joint.retrieval >= MIN_RETRIEVAL and len(residual.measured_px) >= MIN_WINDOWS
         if is_reliable and not pair.is_coarse:
             groups.setdefault((id(pair.reference), pair.space), []).append(candidate)
     return list(groups.values())
@@ -153,15 +151,15 @@ def _common_parallax_px(group: Sequence[ReliefCandidate]) -> tuple[float, bool]:
     if max(_p95_px(residual) for residual in residuals) < _MIN_PARALLAX_PX:
         return 0.0, False
     windows = WindowShifts.of(residuals, [c.warped.mapping for c in group])
-    consistent = _consistent(windows, _layouts(group), size_px, with_fields=False)
+    consistent = _consistent(windows, group, with_fields=False)
     if consistent is None:
         return 0.0, False
     bands, model = consistent
     far_share = max(_far_share(residuals[band]) for band in bands)
-    if far_share <= _MAX_FAR_SHARE and _gain_by_others_sigma(windows.of_bands(bands), model, size_px) < _MIN_GAIN_SIGMA:
+    if far_share <= _MAX_FAR_SHARE and _gain_by_others_sigma(windows.of_bands(bands), model, size_px) < MIN_GAIN_SIGMA:
         return 0.0, False
     parallax_px = float(np.percentile(np.abs(model.parallax_px), 95))
-    return parallax_px, _layout(_layouts(group), bands) is None and are_on_a_line(model.baselines)
+    return parallax_px, _layout(group, bands) is None and are_on_a_line(model.baselines)
 
 
 def _gain_by_others_sigma(windows: WindowShifts, model: Adjustment, size_px: tuple[int, int]) -> float:
@@ -174,7 +172,7 @@ def _gain_by_others_sigma(windows: WindowShifts, model: Adjustment, size_px: tup
         after_px = shifts_px[:, band] - parallax[:, None] * model.baselines[band]
         before, after = (np.linalg.norm(s, axis=1) for s in (shifts_px[:, band], after_px))
         measured = np.isfinite(before) & np.isfinite(after)
-        enough = measured.sum() >= _MIN_WINDOWS
+        enough = measured.sum() >= MIN_WINDOWS
         gains.append(decrease_sigma(before[measured], after[measured]) if enough else 0.0)
     return float(np.median(gains))
 
@@ -205,30 +203,24 @@ def _far_share(residual: Residual[FixedImagePx]) -> float:
     return float((lengths[measured] > _FAR_PX).mean()) if measured.any() else 0.0
 
 
-_Layouts = Sequence[tuple[float, float] | None]
-
-
-def _layouts(group: Sequence[ReliefCandidate]) -> _Layouts:
-    return [c.pair.layout for c in group]
-
-
-def _layout(layouts: _Layouts, bands: Sequence[int]) -> NDArray[np.float64] | None:
+def _layout(group: Sequence[ReliefCandidate], bands: Sequence[int]) -> NDArray[np.float64] | None:
     """Return the layouts (bands, 2) of some bands; None if the tags lack one."""
-    some = [layouts[band] for band in bands]
-    return None if any(layout is None for layout in some) else np.array(some, float)
+    layouts = [group[band].pair.layout for band in bands]
+    return None if any(layout is None for layout in layouts) else np.array(layouts, float)
 
 
 def _consistent(
-    windows: WindowShifts, layouts: _Layouts, size_px: tuple[int, int], *, with_fields: bool
+    windows: WindowShifts, group: Sequence[ReliefCandidate], *, with_fields: bool
 ) -> tuple[list[int], Adjustment] | None:
     """Adjust the model to the bands with common parallax; return their indices and the model, or None.
 
     A band that the parallax of the others does not explain is left out, one after another.
     """
+    size_px = group[0].pair.fixed.size_px
 
     def adjusted(bands: Sequence[int], *, fields: bool) -> Adjustment | None:
-        layout, some = _layout(layouts, bands), windows.of_bands(bands)
-        model = adjust(some, size_px, layout, with_fields=fields) if some.are_enough(_MIN_WINDOWS) else None
+        layout, some = _layout(group, bands), windows.of_bands(bands)
+        model = adjust(some, size_px, layout, with_fields=fields) if some.are_enough(MIN_WINDOWS) else None
         return model if model is not None and are_of_lenses(model.baselines, layout) else None
 
     def median_scale_px(bands: Sequence[int]) -> float:
@@ -263,10 +255,6 @@ class _Band:
         """Name of the pair."""
         return self.candidate.pair.name
 
-    def view(self) -> View:
-        """Return the band as input of dense matching."""
-        return View(channel_mean(self.candidate.pair.moving_image), self.plane, self.baseline)
-
     def mapping(self, relief: Relief, *, with_occlusions: bool = False) -> PixelMapping:
         """Return the mapping with a relief; verification excludes occluded pixels, robust fits do not need to."""
         hidden = occluded(relief, self.baseline) if with_occlusions else None
@@ -287,11 +275,6 @@ class _Band:
         x, y = baseline.tolist()
         return replace(self, plane=replace(plane, fixed_to_moving=matrix, local=local), baseline=(x, y))
 
-    @property
-    def negated(self) -> "_Band":
-        """The band for a relief of the opposite sign."""
-        return replace(self, baseline=(-self.baseline[0], -self.baseline[1]))
-
 
 def _aligned_group(
     group: Sequence[ReliefCandidate], *, is_requested: bool, is_observation: bool
@@ -305,10 +288,7 @@ def _aligned_group(
         checked = [estimate.checked(band) for band in estimate.bands]
         if not _is_chosen(checked) or (with_fields and not is_requested and not estimate.beats_fields(checked)):
             return {}
-        names = {band.name for band in estimate.bands}
-        for candidate in (c for c in group if c.pair.name not in names):
-            band = estimate.fitted(candidate)
-            checked += [] if band is None else [estimate.checked(band)]
+        checked += estimate.checked_others(group)
     except GeometryError:
         return {}
     return {c.name: c.alignment for c in checked if c.alignment is not None}
@@ -331,37 +311,33 @@ class _Estimate:
 
         It has the full resolution if it `is_refined`, else half. Raises GeometryError.
         """
-        pair = group[0].pair
-        bands = [_Band(c, c.warped.mapping, (0.0, 0.0)) for c in group]
-        windows = WindowShifts.of(_fit_residuals(bands, [b.plane for b in bands]), [b.plane for b in bands])
-        consistent = _consistent(windows, _layouts(group), pair.fixed.size_px, with_fields=with_fields)
+        planes = [_Band(c, c.warped.mapping, (0.0, 0.0)) for c in group]
+        consistent = _consistent(_window_shifts(planes), group, with_fields=with_fields)
         if consistent is None:
             return None
         kept, model = consistent
-        layout = _layout(_layouts(group), kept)
-        bands = _applied([bands[k] for k in kept], model)
+        layout = _layout(group, kept)
+        bands = _applied([planes[k] for k in kept], model)
         low, high = np.percentile(model.parallax_px, _RANGE_PERCENTILES).tolist()
-        matching = DenseMatching(pair.reference.grey, [b.view() for b in bands], (low, high))
+        matching = DenseMatching(group[0].pair.reference.grey, _views(bands), (low, high))
         matched = matching.matched(range(len(bands)))
-        mappings = [b.mapping(matched) for b in bands]
-        windows = WindowShifts.of(_fit_residuals(bands, mappings), mappings)
-        baselines = np.array([b.baseline for b in bands])
-        # The parallax of the windows is a free parameter: noise of the relief would otherwise shorten the baselines.
-        total = windows.plus(matched(windows.centres_px), baselines)
-        refitted = adjust(total, pair.fixed.size_px, baselines, with_fields=with_fields)
-        bands = bands if refitted is None else _applied(bands, refitted)
+        bands = _refitted(bands, matched, with_fields=with_fields)
         baselines = np.array([b.baseline for b in bands])
         if not are_of_lenses(baselines, layout) or (layout is None and are_on_a_line(baselines)):
             return None
         selections = [range(len(bands)), *_verifying(range(len(bands)))]
-        relief, *others = (
-            matching.refined([b.view() for b in bands], selections)
-            if is_refined
-            else [matching.matched(selection) for selection in selections]
-        )
-        if layout is None and nearer_sign(matched, baselines) < 0:
-            bands, relief, others = [b.negated for b in bands], relief.negated, [r.negated for r in others]
-        return cls(bands, relief, others, with_fields)
+        if is_refined:
+            relief, *others = matching.refined(_views(bands), selections)
+        else:
+            relief, *others = (matching.matched(selection) for selection in selections)
+        result = cls(bands, relief, others, with_fields)
+        return result.negated if layout is None and nearer_sign(matched, baselines) < 0 else result
+
+    @property
+    def negated(self) -> "_Estimate":
+        """The estimate with the opposite sign of reliefs and baselines, which has the same parallax."""
+        bands = [replace(b, baseline=(-b.baseline[0], -b.baseline[1])) for b in self.bands]
+        return replace(self, bands=bands, relief=self.relief.negated, others=[r.negated for r in self.others])
 
     def verifying(self, band: _Band) -> Relief:
         """Return the relief of other bands than this one."""
@@ -376,12 +352,18 @@ class _Estimate:
         for _ in range(_ROUNDS):
             mapping = band.mapping(self.relief)
             residual = candidate.fit_residual(mapping)
-            if len(residual.measured_px) < _MIN_WINDOWS:
+            if len(residual.measured_px) < MIN_WINDOWS:
                 return None
             windows = WindowShifts.of([residual], [mapping])
             corners_px, change = windows.fit_baseline(self.relief(windows.centres_px), candidate.pair.fixed.size_px)
             band = band.corrected(corners_px, np.add(band.baseline, change))
         return band
+
+    def checked_others(self, group: Sequence[ReliefCandidate]) -> list["_Checked"]:
+        """Fit and verify the bands of a group that are not part of the estimate. Raises GeometryError."""
+        names = {band.name for band in self.bands}
+        fitted = [self.fitted(c) for c in group if c.pair.name not in names]
+        return [self.checked(band) for band in fitted if band is not None]
 
     def beats_fields(self, checked: Sequence["_Checked"]) -> bool:
         """Return True if the relief explains windows better than displacement fields without it.
@@ -483,5 +465,21 @@ def _applied(bands: Sequence[_Band], model: Adjustment) -> list[_Band]:
     return [band.corrected(corners_px, baseline, lens_field) for band, corners_px, baseline, lens_field in by_band]
 
 
-def _fit_residuals(bands: Sequence[_Band], mappings: Sequence[PixelMapping]) -> list[Residual[FixedImagePx]]:
-    return [b.candidate.fit_residual(m) for b, m in zip(bands, mappings, strict=True)]
+def _refitted(bands: Sequence[_Band], relief: Relief, *, with_fields: bool) -> list[_Band]:
+    """Fit planes and baselines again under a relief; the bands are unchanged if that fails. Raises GeometryError."""
+    windows, baselines = _window_shifts(bands, relief), np.array([b.baseline for b in bands])
+    # The parallax of the windows is a free parameter: noise of the relief would otherwise shorten the baselines.
+    total = windows.plus(relief(windows.centres_px), baselines)
+    model = adjust(total, bands[0].candidate.pair.fixed.size_px, baselines, with_fields=with_fields)
+    return list(bands) if model is None else _applied(bands, model)
+
+
+def _window_shifts(bands: Sequence[_Band], relief: Relief | None = None) -> WindowShifts:
+    """Measure the windows of the fit with the planes of the bands, or with a relief."""
+    mappings = [b.plane if relief is None else b.mapping(relief) for b in bands]
+    return WindowShifts.of([b.candidate.fit_residual(m) for b, m in zip(bands, mappings, strict=True)], mappings)
+
+
+def _views(bands: Sequence[_Band]) -> list[View]:
+    """Return the bands as input of dense matching."""
+    return [View(channel_mean(b.candidate.pair.moving_image), b.plane, b.baseline) for b in bands]

@@ -1,6 +1,6 @@
 """Initial alignment (seed) of a pair: candidates from tags, flight and landmarks are scored on the images."""
 
-from collections.abc import Iterator, Sequence, Set
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -42,8 +42,6 @@ _CLOSE_PX = 3.0
 """p95 of the residual of a match at which the search ends."""
 _MAX_ROTATION_DEGREES, _MAX_SCALE_CHANGE = 1.0, 0.02
 """Maximum deviation of a band from its rig by temperature and mounting."""
-_WITH_SCALE: Set[SeedKind] = frozenset({"rig", "centre", "geo", "model", "user"})
-"""Candidates with a known scale."""
 _SCALES = tuple(1.02**k for k in range(-18, 19) if k)
 """Scales relative to the overlay of the two images, 0.7 to 1.4. An error of 2 % reduces the correlation peak of a
 thermal and a blue image to three quarters."""
@@ -70,22 +68,24 @@ def find_seed(pair: BandPair, settings: SeedSettings, model: FlightModel | None 
     is_given = force is not None or pair.has_rig or "user" in pair.candidates
     if best.score >= _CERTAIN_SIGMA or is_given:
         return best
-    if not best.trusted and not _WITH_SCALE & pair.candidates.keys():
+    has_scale = bool(pair.candidates.keys() & {"rig", "centre", "geo", "model", "user"})
+    if not best.trusted and not has_scale:
         best = max((best, *_at_other_scales(pair)), key=lambda seed: seed.score)
-    residual = _residual_of(pair, best.fixed_to_moving)
-    # A peak at the mapping of the tags confirms the image centre, the windows confirm the corners.
-    if best.trusted and pair.is_expected(best.fixed_to_moving) and seed_fits(residual):
-        return best
-    return _best_match(pair, model, best, residual)
+    return _best_match(pair, model, best)
 
 
-def _best_match(pair: BandPair, model: FlightModel | None, best: Seed, residual: Residual[FixedImagePx]) -> Seed:
+def _best_match(pair: BandPair, model: FlightModel | None, best: Seed) -> Seed:
     """Return a match with a smaller residual than the best seed, or that seed.
 
-    If the tags and the windows confirm the seed, a match also needs a higher correlation peak: equal plants in a square
-    grid match after a quarter turn too, with a smaller residual where there is parallax.
+    No match is needed if images, tags and windows confirm the seed. If tags and windows confirm it, a match also needs
+    a higher correlation peak: equal plants in a square grid match after a quarter turn too, with a smaller residual
+    where there is parallax.
     """
+    residual = _residual_of(pair, best.fixed_to_moving)
+    # The mapping of the tags confirms the image centre, the windows confirm the corners.
     is_confirmed = pair.is_expected(best.fixed_to_moving) and seed_fits(residual)
+    if best.trusted and is_confirmed:
+        return best
     for mapping in _matches(pair, model, by_learned_descriptors=not best.trusted):
         for match, match_residual in _with_corrected(pair, mapping):
             if not seed_fits(match_residual) or not match_residual.is_better_than(residual):

@@ -12,9 +12,6 @@ from agalign.values.capture import Band
 from agalign.values.choices import SeedKind
 from agalign.values.geometry import Matrix
 
-_FROM_TAGS: tuple[SeedKind, ...] = ("rig", "geo", "identity")
-"""Kinds that the user can force and tags provide."""
-
 
 def seed_candidates(reference: Band, moving: Band, settings: SeedSettings) -> dict[SeedKind, Matrix]:
     """Return fixed_to_moving between undistorted px of the files by kind, in order of preference, identity last.
@@ -33,7 +30,7 @@ def seed_candidates(reference: Band, moving: Band, settings: SeedSettings) -> di
             if matrix is not None:
                 candidates[kind] = matrix
     candidates["identity"] = geometry.overlay(reference.size_px, moving.size_px)
-    if settings.force in _FROM_TAGS:
+    if settings.force in ("rig", "geo", "identity"):
         return {kind: matrix for kind, matrix in candidates.items() if kind == settings.force}
     return candidates
 

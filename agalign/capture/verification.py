@@ -15,22 +15,10 @@ from agalign.values.image import Raster
 from agalign.values.issues import SEED_DOES_NOT_FIT, Issue, IssueKind
 from agalign.values.mapping import PixelMapping
 from agalign.values.pixel_units import FixedImagePx, PixelScale
-from agalign.verify.checks import (
-    CLOSE_WINDOWS,
-    CLUSTER,
-    RESIDUAL_PX,
-    Evidence,
-    is_unchanged,
-    issues_of,
-    seed_fits,
-    status_of,
-)
+from agalign.verify.checks import CLOSE_WINDOWS, CLUSTER, RESIDUAL_PX, Evidence, is_unchanged, issues_of, status_of
 from agalign.verify.displacement_field import DisplacementResult
 from agalign.verify.extrapolation import points_in_frame, unobserved_quarters
 from agalign.verify.residuals import residual_under
-
-_SEEDS_OF_ALIGNED_INPUT: tuple[SeedKind, ...] = ("geo", "identity")
-"""Seeds of input that may be aligned already; it is then returned unchanged instead of resampled by a small shift."""
 
 _MAX_CONVERTED_PX = 0.15
 """Maximum difference of two mappings for which the residual is converted instead of measured again; the error is about
@@ -122,48 +110,40 @@ def verified(
     use: ReliefUse,
     warped_pair: WarpedPair | None = None,
     by_halves: tuple[Matrix, Matrix] | None = None,
-    *,
-    seed_only: bool = False,
 ) -> Alignment[FixedImagePx]:
     """Verify a result; return its alignment with status, px of the images. With issues it has the mapping of the seed.
 
     `use` is "never" for no displacement field. `warped_pair` is the pair with a mapping close to the result's, if
     available; it avoids measuring again. `by_halves` are homographies from half of the windows (`cross_validated`).
     """
-    joint: JointResult[FixedImagePx] | None = None
-    local: DisplacementResult | None = None
-    issues: tuple[Issue, ...] = ()
-    is_displaced = False
-    if isinstance(result, JointResult):
-        joint = _unchanged_if_aligned(result, pair)
-        mapping = pair.mapping(joint.fixed_to_moving)
-        warped_pair = WarpedPair.of(pair, mapping) if warped_pair is None else warped_pair.with_mapping(mapping)
-        if by_halves is not None and joint is result:
-            warped_pair = warped_pair.cross_validated(by_halves)
-        warped_pair, issues, local = _verified(warped_pair, joint, use)
-        is_displaced = local is not None and local.field is not None
-    else:
-        issues = (result,)
-    if warped_pair is None or (issues and not is_displaced):
-        warped_pair = WarpedPair.of(pair, pair.mapping(seed.fixed_to_moving))
-    usable = seed.trusted or seed_only
-    status = status_of(issues, warped_pair.residual, seed=usable)
-    if usable and issues and not is_displaced and not seed_fits(warped_pair.residual):
-        issues = (*issues, Issue(SEED_DOES_NOT_FIT))
+    if isinstance(result, Issue):
+        return at_seed(pair, seed, (result,))
+    joint = _unchanged_if_aligned(result, pair)
+    mapping = pair.mapping(joint.fixed_to_moving)
+    warped_pair = WarpedPair.of(pair, mapping) if warped_pair is None else warped_pair.with_mapping(mapping)
+    if by_halves is not None and joint is result:
+        warped_pair = warped_pair.cross_validated(by_halves)
+    warped_pair, issues, local = _verified(warped_pair, joint, use)
     candidates: dict[Geometry, FixedImagePx] = {}
     if local is not None:
         candidates = {"homography": local.before_p95_px, "field": local.after_p95_px}
-    alignment = Alignment(
-        warped_pair.mapping,
-        pair.fixed.size_px,
-        status,
-        issues,
-        seed,
-        joint,
-        warped_pair.residual,
-        candidates=candidates,
-    )
-    return predicted_by_windows(alignment, pair) if issues and is_displaced else alignment
+    if issues and (local is None or local.field is None):
+        return replace(at_seed(pair, seed, issues), joint=joint, candidates=candidates)
+    size_px, residual = pair.fixed.size_px, warped_pair.residual
+    alignment = Alignment(warped_pair.mapping, size_px, "aligned", issues, seed, joint, residual, candidates=candidates)
+    return predicted_by_windows(alignment, pair) if issues else alignment
+
+
+def at_seed(
+    pair: BandPair, seed: Seed, issues: tuple[Issue, ...], *, seed_only: bool = False
+) -> Alignment[FixedImagePx]:
+    """Return an alignment with the mapping of the seed, which is usable if it is trusted or with `seed_only`."""
+    mapping = pair.mapping(seed.fixed_to_moving)
+    residual, is_usable = WarpedPair.of(pair, mapping).residual, seed.trusted or seed_only
+    status = status_of(issues, residual, seed=is_usable)
+    if is_usable and status == "failed":
+        issues = (*issues, Issue(SEED_DOES_NOT_FIT))
+    return Alignment(mapping, pair.fixed.size_px, status, issues, seed, residual=residual)
 
 
 def predicted_by_windows(
@@ -239,8 +219,12 @@ def with_metrics(
 
 
 def _unchanged_if_aligned(joint: JointResult[FixedImagePx], pair: BandPair) -> JointResult[FixedImagePx]:
-    """Replace the mapping by the one given by the files if it does not differ significantly."""
-    for given in (pair.candidates[kind] for kind in _SEEDS_OF_ALIGNED_INPUT if kind in pair.candidates):
+    """Replace the mapping by the one given by the files if it does not differ significantly.
+
+    Input that is aligned already is returned unchanged instead of resampled by a small shift.
+    """
+    kinds: tuple[SeedKind, ...] = ("geo", "identity")
+    for given in (pair.candidates[kind] for kind in kinds if kind in pair.candidates):
         if pair.mapping(given).is_curved:
             continue  # with lens distortion the files are not aligned
         if is_unchanged(joint, given, pair.fixed.size_px, max(pair.scales.fixed)):

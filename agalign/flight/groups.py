@@ -115,8 +115,8 @@ class CameraOverview:
         if self.gsd_m is not None and self.height_m is not None:
             parts.append(f"GSD {100 * self.gsd_m:.1f} cm from {self.height_m:.0f} m above the ground")
         elif self.altitude_m is not None:
-            low, high = (f"{a:.0f}" for a in self.altitude_m)
-            parts.append(f"altitude {low if low == high else f'{low} to {high}'} m, height above the ground unknown")
+            bounds_m = dict.fromkeys(f"{a:.0f}" for a in self.altitude_m)
+            parts.append(f"altitude {' to '.join(bounds_m)} m, height above the ground unknown")
         if self.gsd_m is None and self.gsd_per_height is not None:
             parts.append(f"GSD {1e4 * self.gsd_per_height:.1f} cm at a height of 100 m")
         kinds = {"camera": "radiance by calibration", "sun": "reflectance by light sensor"}
@@ -134,13 +134,9 @@ def camera_overviews(captures: Sequence[Capture]) -> list[CameraOverview]:
 
 
 def _overview(name: str, serial: str, captures: Sequence[Capture]) -> CameraOverview:
-    poses = [c.pose for c in captures if c.pose is not None and c.pose.height_m is not None]
-    heights_m = [p.height_m for p in poses if p.height_m is not None]
-    gsds_m = [p.height_m / p.focal_length_px for p in poses if p.height_m is not None and p.focal_length_px]
+    height_m, gsd_m = _median_height_and_gsd_m(captures)
     altitudes_m = [a for c in captures if c.position is not None and (a := c.position.altitude_m) is not None]
-    times = sorted(c.captured_at for c in captures if c.captured_at) or [""]
-    lens, pose = captures[0].reference.lens, captures[0].pose
-    focal_px = lens.fx_px if lens is not None else None if pose is None else pose.focal_length_px
+    times = sorted({c.captured_at for c in captures} - {""}) or [""]
     choices: tuple[RadiometryChoice, ...] = ("camera", "sun")
     return CameraOverview(
         camera=name,
@@ -150,12 +146,26 @@ def _overview(name: str, serial: str, captures: Sequence[Capture]) -> CameraOver
         size_px=captures[0].reference.size_px,
         first_at=times[0],
         last_at=times[-1],
-        height_m=median(heights_m) if heights_m else None,
+        height_m=height_m,
         altitude_m=(min(altitudes_m), max(altitudes_m)) if altitudes_m else None,
-        gsd_m=median(gsds_m) if gsds_m else None,
-        gsd_per_height=1 / focal_px if focal_px else None,
+        gsd_m=gsd_m,
+        gsd_per_height=_gsd_per_height(captures[0]),
         radiometry=tuple(choice for choice in choices if all(_supports(c, choice) for c in captures)),
     )
+
+
+def _median_height_and_gsd_m(captures: Sequence[Capture]) -> tuple[float | None, float | None]:
+    """Return the medians of the heights and of the ground sample distances; None if all are unknown."""
+    poses = [(c.pose.height_m, c.pose.focal_length_px) for c in captures if c.pose and c.pose.height_m is not None]
+    heights_m = [height_m for height_m, _ in poses]
+    gsds_m = [height_m / focal_px for height_m, focal_px in poses if focal_px]
+    return median(heights_m) if heights_m else None, median(gsds_m) if gsds_m else None
+
+
+def _gsd_per_height(capture: Capture) -> float | None:
+    lens, pose = capture.reference.lens, capture.pose
+    focal_px = lens.fx_px if lens is not None else None if pose is None else pose.focal_length_px
+    return 1 / focal_px if focal_px else None
 
 
 def _supports(capture: Capture, choice: RadiometryChoice) -> bool:

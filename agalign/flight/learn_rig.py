@@ -51,19 +51,15 @@ def learn_rig(
     if not bands:
         return None
     table = _Table(captures, bands, size_px, layout)
-    candidates = _FACTOR_SETS if len(bands) > 1 else _FACTOR_SETS[:1]
-    (factors, errors_px), *others = zip(candidates, apply(table.cross_validated_px, candidates), strict=True)
-    for candidate, candidate_px in others:
-        if np.linalg.norm(candidate_px) < _MAX_ERROR_RATIO * np.linalg.norm(errors_px):
-            factors, errors_px = candidate, candidate_px
-    fitted, t_std, nu_w = table.fit(np.ones(len(captures)), factors or ("distance",))
-    offsets, lenses = fitted[:, :6].reshape(-1, 2, 3), dict(zip(bands, fitted[:, 6:].tolist(), strict=True))
+    factors, errors_px = table.selected_factors(apply)
+    fitted, t_std, nu_w = table.fit(np.ones(len(captures)), factors)
+    offsets, lenses = fitted[:, :6].reshape(-1, 2, 3), zip(bands, fitted[:, 6:8].tolist(), strict=True)
     by_capture = zip(captures, nu_w.tolist(), strict=True)
     return Rig(
         size_px=size_px,
         mean={b: rig.displaced(m, o, size_px) for b, m, o in zip(bands, table.median, offsets, strict=True)},
-        baselines={b: (x, y) for b, (x, y, _) in lenses.items()},
-        delays={b: delay for b, (_, _, delay) in lenses.items()},
+        baselines={b: (x, y) for b, (x, y) in lenses},
+        delays=dict(zip(bands, fitted[:, 8].tolist(), strict=True)),
         baseline_std=dict(zip(bands, t_std.tolist(), strict=True)),
         factors=factors,
         captures=tuple(CaptureFactors(c.seconds, c.altitude_m, c.motion, tuple(f)) for c, f in by_capture),
@@ -91,12 +87,23 @@ class _Table:
         self.layout = _unit(known) if np.linalg.norm(known) > 0 else None
         """(bands, 2) baselines of the known lens layout, of norm 1 together; None if unknown."""
 
+    def selected_factors(self, apply: Apply) -> tuple[tuple[Factor, ...], Array]:
+        """Return the factors with the smallest cross-validated errors, and these errors (bands,)."""
+        candidates = _FACTOR_SETS if len(self.median) > 1 else _FACTOR_SETS[:1]
+        (factors, errors_px), *others = zip(candidates, apply(self.cross_validated_px, candidates), strict=True)
+        for candidate, candidate_px in others:
+            if np.linalg.norm(candidate_px) < _MAX_ERROR_RATIO * np.linalg.norm(errors_px):
+                factors, errors_px = candidate, candidate_px
+        return factors, errors_px
+
     def fit(self, is_used: Array, factors: Sequence[Factor]) -> tuple[Array, Array, Array]:
         """Fit the model by alternating least squares: the factors of captures, then the parameters of bands.
 
+        Without factors, the distance is fitted.
         `is_used` (captures,) is 0 for captures that are left out. Return (bands, 9) the coefficients of the means minus
         the medians, px, t and d, (bands,) the standard error of each coordinate of t, and (captures, 5) the factors.
         """
+        factors = factors or ("distance",)
         weights, tensor = self.weights * is_used[:, None], design_tensor(factors)
         bands = np.hstack([np.zeros((len(self.median), 6)), self._initial(weights, factors)])
         of_offset = np.broadcast_to(np.eye(6).reshape(2, 3, 6), (len(weights), 2, 3, 6))
@@ -130,7 +137,7 @@ class _Table:
             if (~left_out @ self.weights > 0).all():
                 break
         for is_left_out in left_out:
-            bands, *_ = self.fit(~is_left_out * 1.0, factors or ("distance",))
+            bands, *_ = self.fit(~is_left_out * 1.0, factors)
             design = np.tensordot(bands[:, 6:], design_tensor(factors), 1)
             differences = self.differences[is_left_out] - bands[:, :6].reshape(-1, 2, 3)
             for j in range(len(design)):

@@ -31,6 +31,7 @@ from agalign.values.displacement import DisplacementField
 from agalign.values.geometry import Matrix, Points
 from agalign.values.pixel_units import MovingFilePx
 from agalign.values.robust import cauchy_weights
+from agalign.verify.window_fit import REWEIGHTINGS
 
 Array = NDArray[np.float64]
 Factor = Literal["distance", "tilt", "motion", "reference"]
@@ -44,12 +45,8 @@ FACTOR_STD_PX = (20.0, 3.0, 3.0, 20.0, 20.0)
 _FACTOR_PRIOR = np.zeros((1, FACTORS)), np.array(FACTOR_STD_PX)
 MIN_STD_PX = 0.05
 """Added in quadrature to the standard error of a mapping, which does not contain all errors."""
-_COLUMNS: dict[Factor, tuple[int, ...]] = {"distance": (0,), "tilt": (1, 2), "motion": (3, 4), "reference": (3, 4)}
-"""Columns of the factors (5,). `reference` is a motion of all moving bands relative to the reference."""
-_LATTICE = 7, 5
-"""Columns and rows of the points at which mappings are compared."""
-_OUTLIER_PX, _REWEIGHTINGS = 0.3, 6
-"""Residual of a band at which its robust weight is one half, and iterations after which it has converged."""
+_OUTLIER_PX = 0.3
+"""Residual of a band at which its robust weight is one half."""
 
 
 @dataclass(frozen=True)
@@ -124,7 +121,9 @@ def design_tensor(factors: Sequence[Factor]) -> Array:
     result = np.zeros((3, 2, 3, FACTORS))
     result[0, 0, range(3), range(3)] = result[1, 1, range(3), range(3)] = 1.0
     result[2, (0, 1), 0, (3, 4)] = 1.0
-    return result * np.isin(range(FACTORS), [column for factor in factors for column in _COLUMNS[factor]])
+    # `reference` is a motion of all moving bands relative to the reference.
+    columns: dict[Factor, tuple[int, ...]] = {"distance": (0,), "tilt": (1, 2), "motion": (3, 4), "reference": (3, 4)}
+    return result * np.isin(range(FACTORS), [column for factor in factors for column in columns[factor]])
 
 
 def least_squares(
@@ -141,7 +140,7 @@ def least_squares(
     mean, information = prior[0], 1 / prior[1] ** 2
     squares, products = x.swapaxes(1, 2) @ x, np.einsum("nkr,krp->nkp", y, x)
     inlier = np.ones_like(weights)
-    for _ in range(_REWEIGHTINGS if robust else 1):
+    for _ in range(REWEIGHTINGS if robust else 1):
         covariance = np.linalg.inv(np.tensordot(weights * inlier, squares, 1) + np.diag(information))
         right_side = ((weights * inlier)[:, None] @ products)[:, 0] + mean * information
         result = (covariance @ right_side[..., None])[..., 0]
@@ -159,7 +158,7 @@ def lattice(size_px: tuple[int, int]) -> tuple[Points, Array]:
 
     u and v have mean 0 and variance 1.
     """
-    points = geometry.lattice(*size_px, *_LATTICE)
+    points = geometry.lattice(*size_px, 7, 5)
     return points, np.column_stack([np.ones(len(points)), (points - points.mean(axis=0)) / points.std(axis=0)])
 
 

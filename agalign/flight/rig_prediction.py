@@ -37,8 +37,6 @@ _MAX_MEDIAN_RATIO, _MIN_MEDIAN_PX = 6.0, 3.0
 """A capture is an outlier if a factor exceeds the ratio times the flight's median, or times the minimum median."""
 _MAX_GAP_RATIO = 2.0
 """An estimate is validated on captures with a gap of at most this ratio to the gap of the predicted capture."""
-_OF_MOTION = np.array([0, 0, 0, 1, 1])
-"""1 for the factors that depend on the image motion."""
 _MIN_CAPTURES_FOR_ALTITUDE = 6
 """With fewer captures, the estimator with the smallest error would be selected by chance."""
 
@@ -102,11 +100,11 @@ def _from_bands(rig: Rig, band: str, known: Observation) -> Prediction:
     capture that the rig does not describe.
     """
     others = [b for b in rig.mean if b != band]
-    mean_and_mapping = [(rig.mean[b], known.mappings.get(b, rig.mean[b])) for b in others]
     std_px = [known.std_px[b] if b in known.mappings else math.inf for b in others]
     design, designs = rig.design(band), np.stack([rig.design(b) for b in others])
     expected_px = np.array([rig.from_bands_px[b] for b in others])
-    differences = np.stack([affine_difference(*pair, rig.size_px) for pair in mean_and_mapping])
+    mappings = {**rig.mean, **known.mappings}
+    differences = np.stack([affine_difference(rig.mean[b], mappings[b], rig.size_px) for b in others])
     weights = mapping_weight(np.stack([std_px, np.full(len(others), MIN_STD_PX)]), expected_px)
     solutions, (covariance, complete) = least_squares(designs, np.stack([differences, 0 * differences]), weights)
     excess_px2 = ((differences - designs @ solutions[0]) ** 2).sum(axis=(1, 2)) - expected_px**2
@@ -155,7 +153,8 @@ def _at_motion(captures: Captures, motion: tuple[float, float] | None) -> tuple[
     x = np.array([(1.0, *(c.motion or ())) for c in known])
     # Captures of similar speed do not determine the slope: `rcond` selects the solution of minimum norm.
     scale = np.abs(x).max(axis=0) + 1e-12
-    slope = np.linalg.lstsq(x / scale, np.array([c.factors for c in known]), rcond=1e-3)[0] * _OF_MOTION
+    slope = np.linalg.lstsq(x / scale, np.array([c.factors for c in known]), rcond=1e-3)[0]
+    slope = slope * [0, 0, 0, 1, 1]  # only w depends on the motion
     change = (np.array([1.0, *motion]) - x) / scale @ slope
     moved = [replace(c, factors=tuple(np.add(c.factors, d).tolist())) for c, d in zip(known, change, strict=True)]
     return moved, np.array([1.0, *motion]) / scale @ slope

@@ -20,8 +20,8 @@ LOOK_PX = 64
 """Longest side to which images are averaged: it suppresses noise and keeps textures of one hundredth of the image."""
 _DEGREE = 4
 """Degree of the polynomial that models vignetting and the gradient of the sky."""
-_MIN_VALID_SHARE = 0.5
-"""Minimum share of valid pixels for a texture."""
+_MIN_SHARE = 0.5
+"""Minimum share of valid pixels for a texture, and of unsaturated ones for the median radiance."""
 
 
 def relative_texture(image: Raster, black_level: float = 0.0) -> float | None:
@@ -31,7 +31,7 @@ def relative_texture(image: Raster, black_level: float = 0.0) -> float | None:
     not above the black level.
     """
     pixels, valid = image.pixels, image.valid
-    if pixels.ndim != 2 or valid.mean() < _MIN_VALID_SHARE:
+    if pixels.ndim != 2 or valid.mean() < _MIN_SHARE:
         return None
     mean = float(pixels[valid].mean()) - black_level
     if mean <= 0:
@@ -48,11 +48,8 @@ def relative_texture(image: Raster, black_level: float = 0.0) -> float | None:
 
 _MIN_ELEVATION_DEG = 20.0
 """Minimum elevation of the optical axis: half the field of view is about 20 degrees."""
-_MIN_UNSATURATED_SHARE = 0.5
-"""Minimum share of unsaturated pixels for the median radiance."""
 _MIN_CUES = 2
 """A single cue also occurs in other captures."""
-_SKY_NAME = re.compile(r"(?:^|[-_. ])sky(?:$|[-_. ])", re.IGNORECASE)
 
 
 @dataclass(frozen=True)
@@ -72,7 +69,8 @@ def sky_cues(capture: Capture) -> tuple[str, ...]:
     cues = []
     if capture.elevation_deg is not None and capture.elevation_deg > _MIN_ELEVATION_DEG:
         cues.append(f"its tags point the camera {capture.elevation_deg:.0f} degrees above the horizon")
-    if any(_SKY_NAME.search(part) for part in (*capture.folder.parts, capture.name)):
+    names = *capture.folder.parts, capture.name
+    if any(re.search(r"(?:^|[-_. ])sky(?:$|[-_. ])", name, re.IGNORECASE) for name in names):
         cues.append("its folder or name contains 'sky'")
     # The sky has little signal in thermal bands.
     bands = [b for b in capture.bands if not is_thermal(b) and not b.companion]
@@ -98,7 +96,7 @@ def sky_radiance(band: Band) -> float | None:
     pixels, valid = read_tile(band, Tile(0, 0, *band.size_px))
     if band.saturation_value is not None:
         valid &= pixels.astype(np.float64) < band.saturation_value
-    if valid.mean() < _MIN_UNSATURATED_SHARE:
+    if valid.mean() < _MIN_SHARE:
         return None
     return float(np.median(calibrated(pixels, band.radiometry, 0, 0)[valid]))
 

@@ -117,9 +117,6 @@ class Descriptor(nn.Module):
         return [nn.functional.normalize(f, dim=1) for f in result] if self.unit_length else result
 
 
-_FILE = "starter.safetensors"
-
-
 def start_from(net: Descriptor, weights: Mapping[str, Tensor], sides: Sequence[int] | None = None) -> None:
     """Initialise a network with the weights (state_dict) of another.
 
@@ -154,5 +151,5 @@ def save_starter(net: Descriptor, path: Path) -> None:
 
 @cache
 def _weights() -> dict[str, Tensor]:
-    result: dict[str, Tensor] = load(resources.files("agalign.method").joinpath(_FILE).read_bytes())
+    result: dict[str, Tensor] = load(resources.files("agalign.method").joinpath("starter.safetensors").read_bytes())
     return {name: value.to(torch.float32) for name, value in result.items()}

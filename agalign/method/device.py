@@ -100,12 +100,6 @@ def limit_threads(count: int) -> None:
     cv2.setNumThreads(count)
 
 
-_M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD = -1, -3
-"""Parameters of mallopt(3)."""
-_MMAP_THRESHOLD_BYTES, _TRIM_THRESHOLD_BYTES = 32 << 20, 256 << 20
-"""Arrays below the first are allocated on the heap, which keeps up to the second of free memory."""
-
-
 @cache
 def keep_freed_memory() -> None:
     """Let glibc reuse the memory of freed arrays in this process; no effect with other allocators.
@@ -113,10 +107,12 @@ def keep_freed_memory() -> None:
     By default glibc returns large arrays to the system at once. A new array then costs one page fault per 4 KB, which
     takes longer than filling it.
     """
+    m_trim_threshold, m_mmap_threshold = -1, -3  # of mallopt(3)
     with suppress(OSError, AttributeError, TypeError):
         allocator = ctypes.CDLL(None)
-        allocator.mallopt(_M_MMAP_THRESHOLD, _MMAP_THRESHOLD_BYTES)
-        allocator.mallopt(_M_TRIM_THRESHOLD, _TRIM_THRESHOLD_BYTES)
+        # Arrays below 32 MiB are allocated on the heap, which keeps up to 256 MiB of free memory.
+        allocator.mallopt(m_mmap_threshold, 32 << 20)
+        allocator.mallopt(m_trim_threshold, 256 << 20)
 
 
 _lock = threading.Lock()

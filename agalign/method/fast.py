@@ -32,8 +32,6 @@ from agalign.method.refine import (
 from agalign.method.state import ImageGroup, JointState
 from agalign.values.alignment import MIN_RETRIEVAL
 
-_BETA_1, _BETA_2, _EPSILON = 0.9, 0.999, 1e-8
-
 
 class Adam:
     """Optimiser of a network's weights, tensors of any shape."""
@@ -53,14 +51,15 @@ class Adam:
         for weight in self.weights:
             weight.grad = None
         torch.autograd.backward(loss)
+        beta_1, beta_2, epsilon = 0.9, 0.999, 1e-8  # as in torch.optim
         for i, (weight, (first, second)) in enumerate(zip(self.weights, self._moments, strict=True)):
             if weight.grad is None:
                 continue
             self._steps[i] += 1
-            first.lerp_(weight.grad, 1 - _BETA_1)
-            second.mul_(_BETA_2).addcmul_(weight.grad, weight.grad, value=1 - _BETA_2)
-            denominator = (second / (1 - _BETA_2 ** self._steps[i])).sqrt_().add_(_EPSILON)
-            weight.addcdiv_(first, denominator, value=-self.learning_rate / (1 - _BETA_1 ** self._steps[i]))
+            first.lerp_(weight.grad, 1 - beta_1)
+            second.mul_(beta_2).addcmul_(weight.grad, weight.grad, value=1 - beta_2)
+            denominator = (second / (1 - beta_2 ** self._steps[i])).sqrt_().add_(epsilon)
+            weight.addcdiv_(first, denominator, value=-self.learning_rate / (1 - beta_1 ** self._steps[i]))
 
 
 BATCH = 128
@@ -117,7 +116,6 @@ def learn(
 ) -> tuple[int, float]:
     """Learn theta and every psi of all groups, coarse to fine; theta is carried from level to level.
 
-    Images with a trusted seed take part at the finest level only.
     The homographies are written into the groups. `threads` groups update their psi at the same time; the result does
     not depend on it. Returns the number of steps on theta and the last loss, NaN without a step. Raises
     NoContrastError.
@@ -135,7 +133,7 @@ def learn(
             at_level = [
                 _GroupAtLevel(own_state, net, group, bands, own_state.level(group, scale, bands), schedule)
                 for own_state, group in zip(states, groups, strict=True)
-                if (bands := [b for b in group.active if scale == scales[-1] or not group.trusted[b]])
+                if (bands := _learned_bands(group, is_finest=scale == scales[-1]))
             ]
             if not at_level:
                 continue
@@ -147,6 +145,11 @@ def learn(
             for group in at_level:
                 group.store()
     return steps, loss
+
+
+def _learned_bands(group: ImageGroup, *, is_finest: bool) -> list[int]:
+    """Return the moving images that take part at a level; those with a trusted seed do so at the finest level only."""
+    return [b for b in group.active if is_finest or not group.trusted[b]]
 
 
 def learn_scales(longer_side_px: int) -> list[float]:

@@ -27,7 +27,6 @@ _MAX_CORNER_STD_PX = 0.5
 """Above this standard error of the least certain corner, px of the level, a simpler family has a smaller error."""
 _MAX_STEP_PX = 4.0
 """Maximum step, px of the level: the descriptors are approximately linear in a shift of up to this length."""
-FAMILIES: tuple[ModelFamily, ...] = ("homography", "affine", "translation")
 """Model families, most parameters first."""
 
 
@@ -122,10 +121,10 @@ def solve(
 ) -> Step:
     """Solve for the step by iteratively reweighted least squares; it is cut to `max_step_px`.
 
-    With `family` None, select the first of FAMILIES with a standard error of the corners of at most
+    With `family` None, select the first of FAMILY_PARAMETERS with a standard error of the corners of at most
     `max_corner_std_px`, else the last.
     """
-    families = FAMILIES if family is None else (family,)
+    families = tuple(FAMILY_PARAMETERS) if family is None else (family,)
     step = first = _solve_family(equations, families[0], max_step_px)
     for simpler in families[1:]:
         if step.corner_std_px <= max_corner_std_px:

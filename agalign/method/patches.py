@@ -27,7 +27,7 @@ FAMILY_PARAMETERS: dict[ModelFamily, tuple[int, ...]] = {
     "affine": (0, 1, 2, 3, 4, 5),
     "translation": (4, 5),
 }
-"""Indices of the elements of psi that are free parameters of a model family."""
+"""Indices of the elements of psi that are free parameters of a model family, in the order of preference."""
 
 
 def homography_from_psi(psi: Tensor, width_px: int, height_px: int) -> Tensor:

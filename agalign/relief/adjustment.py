@@ -29,14 +29,13 @@ from agalign.values.geometry import Points
 from agalign.values.mapping import PixelMapping
 from agalign.values.pixel_units import FixedImagePx
 from agalign.values.robust import MIN_SHIFT_SCALE_PX, cauchy_weights, shift_scale_px
+from agalign.verify.window_fit import CAUCHY_SCALES, NODE_STEP_PX
 
 Array = NDArray[np.float64]
 
 _ITERATIONS = 12
 """Enough for the baselines to converge to a relative change of 0.001."""
 
-_CAUCHY_SCALES = 2.0
-"""Residual at which the robust weight is one half, in residual scales."""
 _PLANE_PX = 0.5
 """Distance from the reference plane at which the robust weight of a window is one half."""
 _MAX_WEIGHT = 2.0
@@ -60,8 +59,6 @@ _SMOOTHNESS = 3.0
 """Weight of the second differences of a lens field, relative to one window."""
 _FIELD_DAMPING = 0.01
 """Weight of the length of a lens field, relative to one window."""
-_FIELD_STEP_PX = 48
-"""Spacing of the nodes of the resulting displacement field."""
 _MIN_WIDTH = 0.15
 """Minimum ratio of the singular values of baselines that are not on one line: 0.22 to 0.5 for cameras."""
 
@@ -86,7 +83,7 @@ class LensBasis:
 
     def field(self, coefficients_px: Array) -> DisplacementField:
         """Return the field with coefficients (k, 2)."""
-        return DisplacementField.sampled(lambda nodes: self(nodes) @ coefficients_px, _FIELD_STEP_PX, self.size_px)
+        return DisplacementField.sampled(lambda nodes: self(nodes) @ coefficients_px, NODE_STEP_PX, self.size_px)
 
     def _along(self, positions_px: Array, axis: int) -> Array:
         end, count = self.size_px[axis] - 1, self.counts[axis]
@@ -171,7 +168,7 @@ class WindowShifts:
             predicted = design @ corners[0] + parallax_px[:, None] * baseline[0]
             residuals = np.linalg.norm(shifts[:, 0] - predicted, axis=1)
             scale = shift_scale_px(residuals[self.weights[:, 0] > 0])
-            weights = self.weights * cauchy_weights(residuals, _CAUCHY_SCALES * scale)[:, None]
+            weights = self.weights * cauchy_weights(residuals, CAUCHY_SCALES * scale)[:, None]
         return corners[0], baseline[0]
 
     def plus(self, parallax: Array, baselines: Array) -> "WindowShifts":
@@ -212,7 +209,7 @@ def adjust(
         predicted = np.einsum("nki,bi->nbk", design, smooth) + parallax[:, None, None] * baselines
         residuals = np.where(windows.weights > 0, np.linalg.norm(shifts - predicted, axis=2), np.nan)
         scales = _scales_px(residuals)
-        weights = windows.weights * np.nan_to_num(cauchy_weights(residuals, _CAUCHY_SCALES * scales))
+        weights = windows.weights * np.nan_to_num(cauchy_weights(residuals, CAUCHY_SCALES * scales))
         # Inverse variance of bands worse than the median, so that an inconsistent band does not determine the parallax.
         # The fit of a band does not use it: its priors are relative to windows of weight 1.
         precisions = np.minimum(1, (np.median(scales) / scales) ** 2)

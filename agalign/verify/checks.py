@@ -235,9 +235,10 @@ CHECKS = (
 )
 """In the order in which their issues are listed; the first issue is the reason in the sidecar."""
 
-_OF_CHECKS = tuple(kind for check in CHECKS for kind in check.kinds)
 KINDS: Mapping[str, IssueKind] = {
-    kind.code: kind for kind in (*issues.KINDS, *_OF_CHECKS, EXTRAPOLATED, issues.SEED_DOES_NOT_FIT)
+    kind.code: kind
+    for kinds in (issues.KINDS, *(check.kinds for check in CHECKS), (EXTRAPOLATED, issues.SEED_DOES_NOT_FIT))
+    for kind in kinds
 }
 """Every kind of issue that a sidecar may contain, by code."""
 

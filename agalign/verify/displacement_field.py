@@ -24,6 +24,7 @@ from agalign.values.image import Mask, Raster
 from agalign.values.mapping import PixelMapping
 from agalign.values.pixel_units import FixedImagePx
 from agalign.verify.residuals import FixedWindows, Shifts, in_standard_errors
+from agalign.verify.window_fit import NODE_STEP_PX
 
 _WINDOW_PX, _STEP_PX = 40, 20
 """Side and spacing of the windows in which shifts are measured. On reference tie points of three cameras, smaller ones
@@ -44,11 +45,12 @@ converge in this number of iterations."""
 _MIN_ROUNDS, _MAX_ROUNDS, _CONVERGED_PX = 2, 4, 0.2
 """Shifts are measured again with the field of the previous round until their median is at most 0.2 px, because large
 shifts are measured in steps."""
-_MIN_WINDOWS = 24
-"""Minimum number of windows with a shift; a fit without one fold may have half as many."""
-_MIN_GAIN_SIGMA, _MAX_P95_GROWTH = 4.0, 1.05
-"""Minimum decrease of the loss of held-out windows, in standard errors of the decrease: 4 to 8 for lenses and canopies,
-up to 3 for edges of shadows in blurred bands. Maximum ratio of their p95 with and without a field, which is noisy."""
+MIN_WINDOWS = 24
+"""Minimum number of windows with a shift for a field or a relief; a fit without one fold may have half as many."""
+MIN_GAIN_SIGMA, _MAX_P95_GROWTH = 4.0, 1.05
+"""Minimum decrease of the loss of held-out windows by a field, or of the shifts of a band by the parallax from others,
+in standard errors: 4 to 8 for lenses and canopies, up to 3 by chance and for edges of shadows in blurred bands. Maximum
+ratio of the p95 of held-out windows with and without a field, which is noisy."""
 _LOSS_SCALE_PX = 0.1
 """Scale of the robust loss by which fields are compared: several times the noise of a shift."""
 _FOLDS, _GAIN_FOLDS = 4, (0, 2, 8, 10)
@@ -59,9 +61,8 @@ _SAME_WINDOW_PX = 1.0
 _MIN_WEIGHT = 0.1
 """Windows with a lower relative weight are excluded from the comparison of fields: parallax within a window lowers its
 peak."""
-_COMMON_LATTICE_PX, _COMMON_SMOOTHNESS = 48, (1.0, 4.0, 16.0, 64.0)
-"""Spacing of the nodes of a field that captures have in common, as the distortion of lenses varies over hundreds of
-pixels, and its smoothness, relative to one window of each capture."""
+_COMMON_SMOOTHNESS = (1.0, 4.0, 16.0, 64.0)
+"""Of a field that captures have in common, relative to one window of each capture."""
 _MIN_CAPTURES, _COMMON_FOLDS, _MIN_COMMON_GAIN_SIGMA = 3, 4, 2.5
 """Minimum number of captures for a common field, folds of its cross-validation, and minimum decrease of the loss: less
 than within one capture, as captures that are left out have only their lenses in common with the others."""
@@ -99,7 +100,7 @@ class DisplacementEstimator:
         shifts = self._measure(moving, mapping)
         gain = self._best_gain(shifts)
         without = DisplacementResult(None, gain.before_p95_px, gain.after_p95_px)
-        if not gain.is_significant(_MIN_GAIN_SIGMA):
+        if not gain.is_significant(MIN_GAIN_SIGMA):
             return without
         field = None if mapping.local is None else mapping.local.on_lattice(self.lattice_px, self.size_px)
         for number in range(_MAX_ROUNDS):
@@ -139,13 +140,13 @@ class DisplacementEstimator:
 
     def _best_gain(self, shifts: Shifts) -> "_Gain":
         """Return the gain of the least smooth field with a significant gain, else that of the smoothest field."""
-        if len(shifts.weights) < _MIN_WINDOWS:
+        if len(shifts.weights) < MIN_WINDOWS:
             return _Gain(_SMOOTHNESS[-1])
         best = min(_SMOOTHNESS, key=lambda s: self._gain(shifts, s, _SAME_WINDOW_PX).loss)
         # Held-out windows at a larger distance from those of the fit may require a smoother field.
         for smoothness in (s for s in _SMOOTHNESS if s >= best):
             gain = self._gain(shifts, smoothness, self.windows.side)
-            if gain.is_significant(_MIN_GAIN_SIGMA):
+            if gain.is_significant(MIN_GAIN_SIGMA):
                 break
         return gain
 
@@ -172,7 +173,7 @@ class DisplacementEstimator:
         for k in folds:
             is_held_out = fold == k
             is_fitted = ~_near(shifts.centres_px, centres_px[is_held_out], min_distance_px)
-            if is_fitted.sum() >= _MIN_WINDOWS // 2:
+            if is_fitted.sum() >= MIN_WINDOWS // 2:
                 field = self._field(weighted.subset(is_fitted), smoothness, reweightings=1)
                 result[is_held_out] = field(centres_px[is_held_out])
         return result
@@ -249,7 +250,7 @@ def common_field(residuals: Sequence[Residual[FixedImagePx]], size_px: tuple[int
     every = [c for fold in folds for c in fold]
 
     def fitted(some: Sequence[Shifts], smoothness: float) -> DisplacementField:
-        return fitted_field(Shifts.joined(some), smoothness * len(some), _COMMON_LATTICE_PX, size_px)
+        return fitted_field(Shifts.joined(some), smoothness * len(some), NODE_STEP_PX, size_px)
 
     def gain(smoothness: float) -> _Gain:
         predicted_px = []

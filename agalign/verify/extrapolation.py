@@ -30,8 +30,6 @@ _MIN_WINDOWS = 2
 """Minimum number of measured windows in a quarter; a single one may be a wrong peak."""
 _MIN_SHARE_IN_FRAME, _LATTICE = 0.5, (24, 18)
 """Quarters are only checked if the moving image covers at least this share of their points, of columns and rows."""
-_QUARTERS = (("top left", -1, -1), ("top right", 1, -1), ("bottom right", 1, 1), ("bottom left", -1, 1))
-"""Names, and signs of x and y relative to the centre."""
 _NEAREST_WINDOWS, _FAR_SPACINGS = 8, 3.0
 """Number of windows from which the error at a point is estimated, weighted by their distance, and range of distances
 beyond one spacing of windows over which p95 replaces their residuals."""
@@ -54,6 +52,8 @@ def unobserved_quarters(centres_px: Points, size_px: tuple[int, int], in_frame_p
     """
     lattice = geometry.lattice(*size_px, *_LATTICE)
     covered = lattice if in_frame_px is None else in_frame_px
+    # Names, and signs of x and y relative to the centre.
+    quarters = (("top left", -1, -1), ("top right", 1, -1), ("bottom right", 1, 1), ("bottom left", -1, 1))
 
     def count(points_px: Points, *signs: int) -> int:
         size = np.array(size_px, dtype=np.float64)
@@ -62,7 +62,7 @@ def unobserved_quarters(centres_px: Points, size_px: tuple[int, int], in_frame_p
 
     return [
         name
-        for name, *signs in _QUARTERS
+        for name, *signs in quarters
         if count(covered, *signs) >= _MIN_SHARE_IN_FRAME * count(lattice, *signs)
         and count(centres_px, *signs) < _MIN_WINDOWS
     ]

@@ -25,8 +25,6 @@ _MIN_STD = 1e-9
 """Smaller standard deviations are rounding errors of constant images."""
 _SSIM_WINDOW_PX = 11
 """Side of the Gaussian window (Wang et al. 2004)."""
-_C1, _C2 = np.float32(0.01**2), np.float32(0.03**2)
-"""Constants of SSIM for a range of 1."""
 
 
 class FixedSimilarity:
@@ -184,7 +182,8 @@ def _ssim(fixed: _Gradient, moving: _Gradient, valid: NDArray[np.intp], complete
     covariance = (scale_a * scale_b) * (product - a * b)
     a, b = scale_a * (a - mean_a), scale_b * (b - mean_b)
     variances = scale_a**2 * fixed.local_variance[complete] + scale_b**2 * moving.local_variance[complete]
-    ssim = (2 * a * b + _C1) * (2 * covariance + _C2) / ((a * a + b * b + _C1) * (variances + _C2))
+    c1, c2 = np.float32(0.01**2), np.float32(0.03**2)  # constants of SSIM for a range of 1
+    ssim = (2 * a * b + c1) * (2 * covariance + c2) / ((a * a + b * b + c1) * (variances + c2))
     return float(ssim.mean(dtype=np.float64))
 
 

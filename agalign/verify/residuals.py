@@ -28,8 +28,8 @@ _Element = TypeVar("_Element", bound=np.generic)
 
 _WINDOW_PX = 112
 """Side of the windows: large enough for a clear peak over crops, small enough to localise misalignment."""
-_MIN_WINDOW_PX = 32
-"""Minimum side of the windows in small images; smaller windows have no reliable peak."""
+MIN_WINDOW_PX = 32
+"""Side of windows between saturated areas, and minimum in small images; smaller windows have no reliable peak."""
 _MIN_STRENGTH = 0.05
 """Minimum mean amplitude of the structure field, which is at most 1; weaker windows contain only noise."""
 _MIN_PEAK_SIGMA = 7.0
@@ -58,7 +58,7 @@ class FixedWindows:
         """
         self.valid = valid
         height, width = valid.shape
-        self.side = max(_MIN_WINDOW_PX, min(side_px, width // 4, height // 4))
+        self.side = max(MIN_WINDOW_PX, min(side_px, width // 4, height // 4))
         if origins is None:
             origins = _grid(*(_starts(length, self.side, step_px) for length in (width, height)))
         inside = origins[(origins + self.side <= (width, height)).all(axis=1)]

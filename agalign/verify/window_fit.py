@@ -39,8 +39,9 @@ _CORNER_STD_PX = 5.0
 """Standard deviation of the prior of a corner, with lens shapes only: the error of an extrapolated affine mapping."""
 _MIN_INFORMATION_SHARE = 1e-12
 """Share of the total information that is added to directions that no window determines, as with windows on a line."""
-_CAUCHY_SCALES, _REWEIGHTINGS = 2.0, 6
-"""Residual at which the robust weight is one half, in residual scales, and iterations after which it has converged."""
+CAUCHY_SCALES, REWEIGHTINGS = 2.0, 6
+"""Residual at which the robust weight is one half, in residual scales, and iterations after which it has converged;
+also of fits of the relief, of the rig and of the MAP estimate."""
 _AXIS_SHARE = 1 / 3
 """Variance along one axis over the square of the scale of lengths: normally distributed vectors have 1 / 3.05."""
 _EXTRAPOLATION_FACTOR = 12.0
@@ -51,8 +52,8 @@ _COMMON_STD_PX = 0.01
 _ROUNDS, _CONVERGED_PX = 4, 0.02
 """Rounds of warping and fitting, until no corner moves by more than the noise of the windows: peaks are sharper when
 windows overlap better, and a correction is accurate to first order."""
-_NODE_STEP_PX = 48
-"""Spacing of the nodes of a displacement field."""
+NODE_STEP_PX = 48
+"""Spacing of the nodes of a displacement field of lenses, as their distortion varies over hundreds of pixels."""
 
 
 @dataclass(frozen=True)
@@ -87,7 +88,7 @@ class WindowFit:
         def lens_px(points_px: Points) -> Points:
             return np.asarray(lens_shapes(points_px, self.size_px) @ self.mean_px[8:])
 
-        return replace(corrected, local=DisplacementField.sampled(lens_px, _NODE_STEP_PX, self.size_px))
+        return replace(corrected, local=DisplacementField.sampled(lens_px, NODE_STEP_PX, self.size_px))
 
 
 def lens_shapes(points_px: Points, size_px: tuple[int, int]) -> Array:
@@ -139,13 +140,13 @@ def fit_windows(
         std_px, factor = np.r_[np.full(8, _CORNER_STD_PX), lens_std_px], _EXTRAPOLATION_FACTOR
     design = jacobian(points_px, size_px, len(std_px))
     weighted, scale_px = shifts, MIN_SHIFT_SCALE_PX
-    for _ in range(_REWEIGHTINGS):
+    for _ in range(REWEIGHTINGS):
         information = weighted.weights / (factor * _AXIS_SHARE * scale_px**2 + MIN_SHIFT_SCALE_PX**2)
         normal = np.einsum("n,nki,nkj->ij", information, design, design) + np.diag(std_px**-2.0)
         covariance = np.linalg.inv(normal + _MIN_INFORMATION_SHARE * np.trace(normal) * np.eye(len(normal)))
         mean = covariance @ np.einsum("n,nki,nk->i", information, design, shifts.shifts_px)
         scale_px = shift_scale_px(shifts.distances_px(design @ mean))
-        weighted = shifts.reweighted(design @ mean, _CAUCHY_SCALES)
+        weighted = shifts.reweighted(design @ mean, CAUCHY_SCALES)
     covariance += _COMMON_STD_PX**2 * np.eye(len(mean))
     return WindowFit(mean, covariance, shifts.distances_px(design @ mean), size_px)
 

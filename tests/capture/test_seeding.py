@@ -164,9 +164,9 @@ def test_a_match_with_a_lower_peak_does_not_replace_a_seed_that_the_tags_and_win
     centres_px = np.argwhere(np.ones((6, 6))) * 60.0
     small, large = (residual_of(centres_px, np.array([shift_px, 0.0])) for shift_px in (0.2, 0.4))
     monkeypatch.setattr(seeding, "_matches", lambda *_, **__: iter([turned]))
-    monkeypatch.setattr(seeding, "_residual_of", lambda *_: small)
     seed = Seed("structure", np.eye(3), 33.0, 33.0, 25.0)
-    chosen = seeding._best_match(pair, None, seed, large)
+    monkeypatch.setattr(seeding, "_residual_of", lambda _, m: large if m is seed.fixed_to_moving else small)
+    chosen = seeding._best_match(pair, None, seed)
     assert (chosen is seed) == is_confirmed
 
 
