@@ -1,13 +1,16 @@
 """The commands for a whole field: `mosaic` and `plots`."""
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from agalign.cli.command import Command
 from agalign.cli.results import Out, chosen_indices, print_left_out
 from agalign.cli.terminal import RAW_NUMBERS, ExitCode, Terminal, examples
+
+if TYPE_CHECKING:
+    from agalign.products.mosaic import MosaicReport
 
 IndexNames = Annotated[str | None, typer.Option("--index", "-i", help="Names of indices separated by commas.")]
 
@@ -32,6 +35,23 @@ def _mosaic(
     report = make_mosaic(out, path, indices=chosen, gsd_m=gsd)
     left_out = [*report.left_out, *((path.name, r.problem) for r in report.indices if r.problem)]
     print_left_out(left_out, terminal)
+    _print_doubts(report, terminal)
+    terminal.event("mosaic", **{k: v for k, v in vars(report).items() if k not in ("left_out", "indices")})
+    if report.pairs:
+        ties = f"{report.pairs} overlaps, {report.tie_points} tie points that were not used"
+        _print_misfit(ties, report.misfit_m, terminal)
+        _print_misfit("by the georeference", report.georeference_misfit_m, terminal)
+    files = [path, *(r.path for r in report.indices if r.path is not None)]
+    terminal.result(f"Mosaic of {report.captures} captures: {', '.join(map(str, files))}")
+    return ExitCode.PARTIAL if left_out else ExitCode.OK
+
+
+def _print_misfit(source: str, misfit_m: tuple[float, float], terminal: Terminal) -> None:
+    terminal.result(f"Misfit, {source}: median {misfit_m[0]:.2f} m, p95 {misfit_m[1]:.2f} m")
+
+
+def _print_doubts(report: "MosaicReport", terminal: Terminal) -> None:
+    """Say what makes the place, the scale or the indices of a mosaic uncertain."""
     if untied := report.captures - report.tied:
         keep = f"have no tie points, and keep their georeference, accurate to {report.accuracy_m:.0f} m"
         terminal.problem(f"{untied} of {report.captures} captures {keep}")
@@ -39,17 +59,6 @@ def _mosaic(
         terminal.problem("the height above ground is assumed, so the scale is uncertain; align with --ground-elevation")
     if any(r.raw_numbers for r in report.indices):
         terminal.problem(RAW_NUMBERS)
-    terminal.event("mosaic", **{k: v for k, v in vars(report).items() if k not in ("left_out", "indices")})
-    if report.pairs:
-        ties = f"{report.pairs} overlaps, {report.tie_points} tie points that were not used"
-        for source, (median_m, p95_m) in (
-            (ties, report.misfit_m),
-            ("by the georeference", report.georeference_misfit_m),
-        ):
-            terminal.result(f"Misfit, {source}: median {median_m:.2f} m, p95 {p95_m:.2f} m")
-    files = [path, *(r.path for r in report.indices if r.path is not None)]
-    terminal.result(f"Mosaic of {report.captures} captures: {', '.join(map(str, files))}")
-    return ExitCode.PARTIAL if left_out else ExitCode.OK
 
 
 mosaic = Command(

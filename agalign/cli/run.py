@@ -324,18 +324,7 @@ def _print_pair(capture: str, band: BandResult, terminal: Terminal) -> None:
 def conclude(totals: RunTotals, out: Path, terminal: Terminal) -> int:
     """Print the table of bands and the failures; return the exit code."""
     counts = Counter(status for pairs in totals.bands.values() for status, _, _ in pairs)
-    lost = totals.states["error"]
-    if totals.bands:
-        missing = f"; {counted(lost, 'capture')} not written" if lost else ""
-        _print_table(totals, f"{counts['aligned']} of {counts.total()} band pairs aligned{missing}", terminal)
-    explain(totals.failures.groups(), terminal)
-    if lost:
-        terminal.problem(
-            f"{lost} of {counted(totals.states.total(), 'capture')} could not be written, for the reasons above; "
-            "the same command tries again"
-        )
-    for quantity, count in totals.radiometry.items():
-        terminal.result(f"Written as {quantity}: {counted(count, 'capture')}")
+    _print_totals(totals, counts, terminal)
     terminal.result(f"Report: {out / REPORT_FILE}")
     if totals.states and set(totals.states) <= {"panel", "sky"}:
         or_sky = " or the sky" if totals.states["sky"] else ""
@@ -345,6 +334,19 @@ def conclude(totals: RunTotals, out: Path, terminal: Terminal) -> int:
         terminal.problem("no band pair could be aligned" if totals.bands else "no capture could be processed")
         return ExitCode.PARTIAL if totals.bands else ExitCode.NOTHING
     return ExitCode.OK if totals.good else ExitCode.PARTIAL
+
+
+def _print_totals(totals: RunTotals, counts: Counter[str], terminal: Terminal) -> None:
+    lost = totals.states["error"]
+    if totals.bands:
+        missing = f"; {counted(lost, 'capture')} not written" if lost else ""
+        _print_table(totals, f"{counts['aligned']} of {counts.total()} band pairs aligned{missing}", terminal)
+    explain(totals.failures.groups(), terminal)
+    if lost:
+        of_all = f"{lost} of {counted(totals.states.total(), 'capture')}"
+        terminal.problem(f"{of_all} could not be written, for the reasons above; the same command tries again")
+    for quantity, count in totals.radiometry.items():
+        terminal.result(f"Written as {quantity}: {counted(count, 'capture')}")
 
 
 def explain(failures: Sequence[FailureGroup], terminal: Terminal) -> None:

@@ -77,9 +77,7 @@ def mosaic(
     """
     chosen, path = [index_named(name) for name in indices], Path(target)
     flight = place_captures(Path(out))
-    stacks = {band.file.resolve() for capture in flight.captures for band in capture.bands}
-    if path.suffix.lower() not in (".tif", ".tiff") or path.resolve() in stacks:
-        raise ConfigurationError(f"{path}: give the mosaic a new file that ends in .tif")
+    _check_target(path, flight.captures)
     pairs = [pair.split() for pair in tie_pairs(flight.captures)]
     checks = [check for _, check in pairs]
     placed = adjusted(flight.captures, [used for used, _ in pairs])
@@ -103,6 +101,13 @@ def mosaic(
         flight.left_out,
         _write_indices(path, placed[0].bands, chosen),
     )
+
+
+def _check_target(path: Path, captures: Sequence[Placement]) -> None:
+    """Raise ConfigurationError for a target that is an input or not a .tif."""
+    stacks = {band.file.resolve() for capture in captures for band in capture.bands}
+    if path.suffix.lower() not in (".tif", ".tiff") or path.resolve() in stacks:
+        raise ConfigurationError(f"{path}: give the mosaic a new file that ends in .tif")
 
 
 @dataclass(frozen=True)

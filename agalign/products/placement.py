@@ -65,12 +65,22 @@ class Placement:
 class PlacedFlight:
     """The captures of a run on one ground plane."""
 
-    captures: Sequence[Placement]
+    captures: list[Placement]
     origin_m: Points
     """(2,) map coordinates of the origin."""
     crs_wkt: str
-    left_out: Sequence[tuple[str, str]]
+    left_out: list[tuple[str, str]]
     """(label of a capture, reason)."""
+
+    def add(self, out: Path, feature: dict[str, Any]) -> None:
+        """Place the capture of a feature of the flight map, or leave it out."""
+        try:
+            one = _placed(out, feature, self.origin_m, self.crs_wkt)
+            if [b.name for b in one.bands] != [b.name for b in (self.captures or [one])[0].bands]:
+                raise InputError(f"it has other bands than {self.captures[0].label}")
+            self.captures.append(one)
+        except (AgalignError, KeyError, TypeError, ValueError) as error:
+            self.left_out.append((feature["capture"], str(error)))
 
 
 def place_captures(out: Path) -> PlacedFlight:
@@ -89,19 +99,13 @@ def place_captures(out: Path) -> PlacedFlight:
     corner = np.array(shown[0]["geometry"]["coordinates"][0][:1], np.float64)
     crs = utm_wkt(*corner[0].tolist())
     origin_m = transformed(corner, _WGS84, crs)[0]
-    captures: list[Placement] = []
     left_out = [(f["capture"], "it has no footprint") for f in features if f.get("sidecar") and f not in shown]
+    flight = PlacedFlight([], origin_m, crs, left_out)
     for feature in shown:
-        try:
-            one = _placed(out, feature, origin_m, crs)
-            if [b.name for b in one.bands] != [b.name for b in (captures or [one])[0].bands]:
-                raise InputError(f"it has other bands than {captures[0].label}")
-            captures.append(one)
-        except (AgalignError, KeyError, TypeError, ValueError) as error:
-            left_out.append((feature["capture"], str(error)))
-    if not captures:
+        flight.add(out, feature)
+    if not flight.captures:
         raise InputError(f"{out}: no capture can be used; {left_out[0][0]}: {left_out[0][1]}")
-    return PlacedFlight(captures, origin_m, crs, left_out)
+    return flight
 
 
 def _placed(out: Path, feature: dict[str, Any], origin_m: Points, crs: str) -> Placement:

@@ -1,7 +1,7 @@
 """Statistics of spectral indices in the plots of a field trial: a row for each plot, index, and raster or capture."""
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
@@ -39,6 +39,12 @@ class _Source:
     date: str
     bands: Sequence[IndexBand]
     error_map: Path
+
+    def facts(self, tags: Mapping[str, str]) -> dict[str, Any]:
+        """The columns that all rows of the source have in common, by the tags of its raster."""
+        date = self.date or tags.get("TIFFTAG_DATETIME", "").replace(":", "-", 2).replace(" ", "T")
+        accuracy_m = float(tags.get("GEOREFERENCE_ACCURACY_M", "nan"))
+        return {"date": date, "capture": self.label, "georeference_accuracy_m": accuracy_m}
 
 
 @dataclass(frozen=True)
@@ -119,20 +125,27 @@ def _libraries() -> Any:
 
 def _polygons(geopandas: Any, path: Path, id_column: str | None) -> "tuple[GeoSeries, list[str]]":
     """(polygons, their names)."""
-    try:
-        frame = geopandas.read_file(path)
-    except Exception as error:  # pyogrio's errors have no common public class
-        raise InputError(f"{path}: cannot be read as a vector file ({innermost_cause(error)})") from None
+    frame = _read_vectors(geopandas, path)
     is_area = frame.geometry.notna() & frame.geometry.geom_type.isin(("Polygon", "MultiPolygon"))
-    if frame.crs is None or not is_area.any():
-        missing = "a coordinate reference system" if frame.crs is None else "polygons"
-        raise InputError(f"{path}: has no {missing}; give a file with the outlines of the plots")
+    if not is_area.any():
+        raise InputError(f"{path}: has no polygons; give a file with the outlines of the plots")
     columns = {str(name).lower(): name for name in frame.columns if name != "geometry"}
     if id_column is not None and id_column.lower() not in columns:
         raise ConfigurationError(f"{path}: has no attribute '{id_column}'; choose from {', '.join(columns.values())}")
     wanted = _IDS if id_column is None else (id_column.lower(),)
     names = next((frame[columns[name]] for name in wanted if name in columns), range(1, len(frame) + 1))
     return frame.geometry[is_area], [str(name) for name, keep in zip(names, is_area, strict=True) if keep]
+
+
+def _read_vectors(geopandas: Any, path: Path) -> Any:
+    """The data frame of a vector file with a coordinate reference system. Raises InputError."""
+    try:
+        frame = geopandas.read_file(path)
+    except Exception as error:  # pyogrio's errors have no common public class
+        raise InputError(f"{path}: cannot be read as a vector file ({innermost_cause(error)})") from None
+    if frame.crs is None:
+        raise InputError(f"{path}: has no coordinate reference system; give a file with the outlines of the plots")
+    return frame
 
 
 def _sources(path: Path) -> Iterator[_Source]:
@@ -158,9 +171,7 @@ def _rows(
         like = reader.file(next((b for b in source.bands if not b.problem), source.bands[0]).file, 1)
         if like.crs is None or like.transform.is_identity:
             raise InputError("has no georeference; align with --georeference, or use 'agalign mosaic'")
-        date = source.date or like.tags().get("TIFFTAG_DATETIME", "").replace(":", "-", 2).replace(" ", "T")
-        accuracy_m = float(like.tags().get("GEOREFERENCE_ACCURACY_M", "nan"))
-        of_source = {"date": date, "capture": source.label, "georeference_accuracy_m": accuracy_m}
+        of_source = source.facts(like.tags())
         # exactextract counts y upwards. Rounding: a pixel that a plot only touches would change its percentiles.
         a, b, c, d, e, f = (~like.transform)[:6]
         in_pixels = polygons.to_crs(like.crs).affine_transform([a, b, -d, -e, c, -f]).set_precision(_STEP_PX)
@@ -172,17 +183,25 @@ def _rows(
             except InputError as error:
                 problems.append((source.label, str(error)))
                 continue
+            of_bands = [errors[band.name] for band in bands if band.name in errors]
             for name, polygon, shape in zip(ids, polygons, in_pixels, strict=True):
                 tile = _tile(shape.bounds, like.width, like.height)
-                if tile is None:
-                    continue
-                values = _statistics(compute(index, [reader.values(band, tile) for band in bands]), tile, shape)
-                if not values.pop("count"):
-                    continue
-                of_bands = [errors[band.name] for band in bands if band.name in errors]
-                means_px = [_statistics(reader.values(e, tile), tile, shape)["mean"] for e in of_bands]
-                expected = {"expected_error_px": max(means_px, default=math.nan), "unit": unit}
-                yield of_source | {"plot": name, "index": index.name, **values, **expected, "geometry": polygon}
+                values = {} if tile is None else _of_plot(index, bands, of_bands, reader, tile, shape)
+                if values:
+                    yield of_source | {"plot": name, "index": index.name, **values, "unit": unit, "geometry": polygon}
+
+
+def _of_plot(
+    index: Index, bands: Sequence[IndexBand], errors: Sequence[IndexBand], reader: BandReader, tile: Tile, shape: Any
+) -> dict[str, float]:
+    """The statistics of an index in a polygon inside a tile, and the largest mean of the bands' expected errors; empty
+    without a pixel.
+    """
+    values = _statistics(compute(index, [reader.values(band, tile) for band in bands]), tile, shape)
+    if not values.pop("count"):
+        return {}
+    means_px = [_statistics(reader.values(error, tile), tile, shape)["mean"] for error in errors]
+    return values | {"expected_error_px": max(means_px, default=math.nan)}
 
 
 def _error_layers(path: Path, reader: BandReader) -> dict[str, IndexBand]:
