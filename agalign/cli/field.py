@@ -51,7 +51,7 @@ def _print_misfit(source: str, misfit_m: tuple[float, float], terminal: Terminal
 
 
 def _print_doubts(report: "MosaicReport", terminal: Terminal) -> None:
-    """Say what makes the place, the scale or the indices of a mosaic uncertain."""
+    """Print what makes the place, the scale or the indices of a mosaic uncertain."""
     if untied := report.captures - report.tied:
         keep = f"have no tie points, and keep their georeference, accurate to {report.accuracy_m:.0f} m"
         terminal.problem(f"{untied} of {report.captures} captures {keep}")
