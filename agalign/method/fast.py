@@ -100,8 +100,9 @@ class Schedule:
     learning_rate: float = LEARNING_RATE
     max_steps: int = 150
     """Per capture."""
-    enough_retrieval: float = 0.5
-    """Held-out retrieval above which learning stops once psi has converged."""
+    enough_retrieval: float = 0.6
+    """Held-out retrieval above which learning stops once psi has converged. With 0.5, fields and trees are as accurate,
+    but captures of water no longer determine the rig of their flight."""
 
 
 DEFAULT_SCHEDULE = Schedule()
