@@ -13,13 +13,13 @@ import numpy as np
 
 from agalign.errors import ConfigurationError
 from agalign.pixels.raster import open_raster
-from agalign.products.adjustment import adjusted, misfit_m, tie_pairs
 from agalign.products.checked_raster import Block, LayerDescription, georeference_tags, grid_profile, write_layers
 from agalign.products.index_bands import BandReader, IndexBand
 from agalign.products.index_rasters import write_rasters
 from agalign.products.index_table import IndexReport
 from agalign.products.indices import Index, index_named
-from agalign.products.placement import Placement, place_captures
+from agalign.products.mosaic_adjustment import adjusted, misfit_m, tie_pairs
+from agalign.products.mosaic_placement import Placement, place_captures
 from agalign.products.raster_file import to_cog, with_nodata
 from agalign.values import geometry
 from agalign.values.capture import Georeference

@@ -14,9 +14,9 @@ from synthetic_flights.overlapping import LATITUDE, LONGITUDE, Survey, make_over
 import agalign
 from agalign.pixels.raster import transformed
 from agalign.products import adjustment
-from agalign.products.adjustment import adjusted, misfit_m, tie_pairs
 from agalign.products.footprint import utm_wkt
-from agalign.products.placement import PlacedFlight, Placement, place_captures
+from agalign.products.mosaic_adjustment import adjusted, misfit_m, tie_pairs
+from agalign.products.mosaic_placement import PlacedFlight, Placement, place_captures
 from agalign.products.sidecar_file import read_sidecar, write_sidecar
 from agalign.values import geometry, lens
 

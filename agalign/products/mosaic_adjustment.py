@@ -21,7 +21,7 @@ from scipy.sparse.linalg import spsolve
 
 from agalign.pixels.landmarks import Landmarks, landmarks, matches, robust_homography
 from agalign.products.index_bands import BandReader
-from agalign.products.placement import Placement
+from agalign.products.mosaic_placement import Placement
 from agalign.values import geometry
 from agalign.values.cores import usable_cores
 from agalign.values.geometry import Points
