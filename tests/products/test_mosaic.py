@@ -13,7 +13,7 @@ from synthetic_flights.overlapping import LATITUDE, LONGITUDE, Survey, make_over
 
 import agalign
 from agalign.pixels.raster import transformed
-from agalign.products import adjustment
+from agalign.products import mosaic_adjustment
 from agalign.products.footprint import utm_wkt
 from agalign.products.mosaic_adjustment import adjusted, misfit_m, tie_pairs
 from agalign.products.mosaic_placement import PlacedFlight, Placement, place_captures
@@ -237,7 +237,7 @@ def test_what_cannot_be_done_is_one_line(
 def test_captures_that_do_not_match_keep_their_georeference(
     survey: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(adjustment, "_MIN_TIE_POINTS", 10**6)
+    monkeypatch.setattr(mosaic_adjustment, "_MIN_TIE_POINTS", 10**6)
     done = agalign_here("mosaic", survey, "-o", tmp_path / "field.tif")
     assert done.returncode == 0
     assert "9 of 9 captures have no tie points, and keep their georeference, accurate to" in done.stderr
