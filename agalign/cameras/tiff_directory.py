@@ -180,7 +180,7 @@ def _read_directory(file: BinaryIO, layout: _Layout, at: int) -> tuple[Directory
         length, value = _SIZE.get(kind, 0) * number, raw[start + head.size : start + size]
         declared += length
         if declared > max_bytes:
-            raise ValueError(f"its tags declare {declared >> 20} MB")
+            raise ValueError(f"its tags declare more than {max_bytes >> 20} MB")
         if length > layout.inline_bytes:
             file.seek(struct.unpack(layout.order + layout.offset, value)[0])
             value = file.read(length)

@@ -54,4 +54,4 @@ def test_a_watched_process_has_its_children() -> None:
     assert run.code == 0
     assert run.samples[:, 4].max() == 2
     assert not run.left
-    assert 0 < run.largest_gb < 1
+    assert 0 < run.largest_gb < 10  # of a child, it starts at that of this process
