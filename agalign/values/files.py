@@ -12,6 +12,7 @@ from io import BufferedReader
 from pathlib import Path, PurePosixPath, PureWindowsPath
 
 from agalign.errors import OutputError
+from agalign.values.processes import is_running
 
 RUN_FILE = "agalign-run.json"
 """Name of the run record. It is written first, and identifies an output folder."""
@@ -94,20 +95,7 @@ def _is_left_over(partial: str) -> bool:
     process = rest.partition("-")[0]
     if host != _host() or not process.isdigit():
         return False
-    return int(process) == os.getpid() or not _is_alive(int(process))
-
-
-def _is_alive(process: int) -> bool:
-    """True if a process of this machine runs; False on Windows, where open files cannot be removed anyway."""
-    if os.name == "nt":
-        return False
-    try:
-        os.kill(process, 0)
-    except ProcessLookupError:
-        return False
-    except OSError:
-        return True
-    return True
+    return int(process) == os.getpid() or not is_running(int(process))
 
 
 def _host() -> str:

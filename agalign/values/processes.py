@@ -17,6 +17,7 @@ from enum import Enum, IntEnum
 from multiprocessing import current_process, get_all_start_methods, get_context, parent_process, resource_tracker
 from multiprocessing.connection import Connection, wait
 from multiprocessing.context import BaseContext
+from pathlib import Path
 from typing import Any
 
 from agalign.values.cores import THREAD_VARIABLES
@@ -34,6 +35,25 @@ def follow_parent() -> None:
         os._exit(1)
 
     threading.Thread(target=end_with_parent, daemon=True).start()
+
+
+def is_running(process: int) -> bool:
+    """True if a process of this machine runs. A zombie does not run: it waits for its parent, which may be slow.
+
+    False on Windows, where open files cannot be removed anyway.
+    """
+    if os.name == "nt":
+        return False
+    try:
+        os.kill(process, 0)
+        state = Path(f"/proc/{process}/stat").read_text(encoding="utf-8", errors="replace")
+    except ProcessLookupError:
+        return False
+    except FileNotFoundError:
+        return not Path("/proc/self").exists()
+    except OSError:  # another user's process
+        return True
+    return state.rpartition(")")[2].split()[0] not in "ZX"
 
 
 class ExitCode(IntEnum):
@@ -264,7 +284,7 @@ class Worker:
         if self._launched:
             self.process.kill()
             pid = self.process.pid
-            if pid is not None and self.exit_code(0) == ExitCode.LOST_SERVER and not self._is_at_end():
+            if pid is not None and self._reported_code() == ExitCode.LOST_SERVER and not self._is_at_end():
                 with suppress(OSError):
                     os.kill(pid, signal.SIGKILL)
         self.pipe.close()
@@ -277,8 +297,19 @@ class Worker:
 
     def exit_code(self, within_s: float = ENDS_WITHIN_S) -> int | None:
         """Return the exit code, -n for signal n; None if the process was not started or does not end in time."""
+        until_s = time.monotonic() + within_s
         if not self._launched or not wait([self.process.sentinel], within_s):
             return None
+        code = self._reported_code()
+        if code == ExitCode.LOST_SERVER:  # of the server; the process itself may still be ending
+            while is_running(self.process.pid or 0):
+                if time.monotonic() >= until_s:
+                    return None
+                time.sleep(0.01)
+        return code
+
+    def _reported_code(self) -> int | None:
+        """Return the exit code that the fork server has reported, if any."""
         if not _PROCESS_LOCK.acquire(timeout=ENDS_WITHIN_S):
             return None
         try:

@@ -1,6 +1,8 @@
 import errno
 import os
 import stat
+import subprocess
+import sys
 import threading
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -104,6 +106,21 @@ def test_what_a_killed_process_left_is_removed(tmp_path: Path) -> None:
     (tmp_path / "sub" / "b.tif").write_text("whole")
     remove_partial_files(tmp_path)
     assert [p.name for p in (tmp_path / "sub").iterdir()] == ["b.tif"]
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="the state of a process is read from /proc")
+def test_a_zombie_does_not_keep_its_partial_file(tmp_path: Path) -> None:
+    """Workers whose fork server ends at the same time are zombies until the first process of the system waits."""
+    with subprocess.Popen([sys.executable, "-c", "input()"], stdin=subprocess.PIPE) as process:
+        with scratch_file(tmp_path / "a.tif") as own:
+            partial = tmp_path / own.name.replace(str(os.getpid()), str(process.pid))
+        partial.touch()
+        remove_partial_files(tmp_path)
+        assert partial.exists()
+        process.kill()
+        os.waitid(os.P_PID, process.pid, os.WEXITED | os.WNOWAIT)
+        remove_partial_files(tmp_path)
+        assert not partial.exists()
 
 
 def test_what_another_process_writes_stays(tmp_path: Path) -> None:
