@@ -1,8 +1,8 @@
-"""The figures of docs/paper.md, from the synthetic flight: matches, a picture before and after, the loss surface.
+"""The figures of docs/paper.md, from the synthetic flight: matches and the loss surface.
 
     python benchmarks/figures.py [FOLDER]
 
-Writes matches.jpg, aligned.jpg and loss-surface.png to FOLDER, by default docs/figures.
+Writes matches.jpg and loss-surface.png to FOLDER, by default docs/figures.
 """
 
 import tempfile
@@ -16,7 +16,6 @@ import typer
 from common import read_ties, run
 from numpy.typing import NDArray
 
-import agalign
 from agalign.config import JointSettings
 from agalign.evaluation.image_pairs import read_image
 from agalign.evaluation.methods import PairTask, method_named
@@ -78,20 +77,12 @@ def draw_matches(fixed: Raster, moving: Raster, here: Points, there: Points, rig
     return sheet
 
 
-def before_and_after(folder: Path) -> NDArray[np.uint8]:
-    """Align a flight and return the preview of its first capture."""
-    reports = agalign.align_folder(folder / "0000SET", folder / "aligned")
-    assert all(r.good for r in reports)
-    return cv2.imread(str(next((folder / "aligned").rglob("IMG_*.png"))))
-
-
 def main(out: Annotated[Path, typer.Argument()] = Path("docs/figures")) -> None:
     with tempfile.TemporaryDirectory() as temporary:
         folder = Path(temporary)
         fixed, moving, truth = straight_pair(folder)
         drawn = cv2.resize(matches(fixed, moving, truth), None, fx=0.75, fy=0.75, interpolation=cv2.INTER_AREA)
         cv2.imwrite(str(out / "matches.jpg"), drawn, [cv2.IMWRITE_JPEG_QUALITY, 40])
-        cv2.imwrite(str(out / "aligned.jpg"), before_and_after(folder), [cv2.IMWRITE_JPEG_QUALITY, 65])
         offsets = np.linspace(-100, 100, 17)
         settings = JointSettings(recipe="paper")
         surface = loss_surface(fixed, moving, truth, offsets, settings, Training(epochs=2))

@@ -1,10 +1,11 @@
-"""The pictures of the README: before and after of the demo and of a real capture, and the report in a browser.
+"""The pictures of the README and of docs/recipes/field.md: before and after of the demo and of a real capture, the
+report in a browser, and a mosaic.
 
     python tools/readme_figures.py [DEMO [ALIGNED]]
 
 DEMO is the output of an earlier `agalign demo`, else one is run. ALIGNED is the output of a run on the row crop
-(`DATA/flights/rededge_m_rowcrop`). Writes demo.jpg, report.jpg and, with ALIGNED, row-crop.jpg to docs/figures; the
-report wants playwright and a Chromium.
+(`DATA/flights/rededge_m_rowcrop`, --ground-elevation 92). Writes demo.jpg, report.jpg and, with ALIGNED, row-crop.jpg
+and mosaic.jpg to docs/figures. The report needs playwright and a Chromium.
 """
 
 import shutil
@@ -13,8 +14,12 @@ import sys
 import tempfile
 from pathlib import Path
 
+import numpy as np
+import rasterio
 from PIL import Image
 from playwright.sync_api import sync_playwright
+
+import agalign
 
 FIGURES = Path(__file__).resolve().parents[1] / "docs" / "figures"
 WIDTH_PX, SCREEN_PX = 880, (1100, 1150)
@@ -31,6 +36,8 @@ def main() -> None:
         if len(sys.argv) > 2:
             real = Image.open(Path(sys.argv[2]) / "IMG_0009.png").convert("RGB")
             smaller(real).save(FIGURES / "row-crop.jpg", quality=78, optimize=True)
+            report = agalign.mosaic(sys.argv[2], Path(folder) / "field.tif")
+            smaller(false_colour(report.path)).save(FIGURES / "mosaic.jpg", quality=72, optimize=True)
         with sync_playwright() as playwright:
             path = shutil.which("chromium") or shutil.which("google-chrome")
             browser = playwright.chromium.launch(executable_path=path, args=["--no-sandbox"])
@@ -42,6 +49,16 @@ def main() -> None:
         smaller(Image.open(Path(folder) / "report.png").convert("RGB")).save(
             FIGURES / "report.jpg", quality=72, optimize=True
         )
+
+
+def false_colour(mosaic: Path) -> Image.Image:
+    """NIR, red and green between their 1st and 99th percentiles; white outside."""
+    with rasterio.open(mosaic) as source:
+        bands = source.read([source.descriptions.index(name) + 1 for name in ("NIR", "Red", "Green")])
+        valid = source.dataset_mask() > 0
+    low, high = np.percentile(bands[:, valid], (1, 99), axis=1)[..., None, None]
+    shown = np.where(valid, np.clip((bands - low) / (high - low), 0, 1), 1)
+    return Image.fromarray((255 * np.moveaxis(shown, 0, -1)).astype(np.uint8))
 
 
 def smaller(picture: Image.Image) -> Image.Image:

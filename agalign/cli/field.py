@@ -53,7 +53,7 @@ def _print_misfit(source: str, misfit_m: tuple[float, float], terminal: Terminal
 def _print_doubts(report: "MosaicReport", terminal: Terminal) -> None:
     """Print what makes the place, the scale or the indices of a mosaic uncertain."""
     if untied := report.captures - report.tied:
-        keep = f"have no tie points, and keep their georeference, accurate to {report.accuracy_m:.0f} m"
+        keep = f"without tie points: placed by the georeference alone, accurate to {report.accuracy_m:.0f} m"
         terminal.problem(f"{untied} of {report.captures} captures {keep}")
     if report.height_is_assumed:
         terminal.problem("the height above ground is assumed, so the scale is uncertain; align with --ground-elevation")

@@ -240,7 +240,7 @@ def test_captures_that_do_not_match_keep_their_georeference(
     monkeypatch.setattr(mosaic_adjustment, "_MIN_TIE_POINTS", 10**6)
     done = agalign_here("mosaic", survey, "-o", tmp_path / "field.tif")
     assert done.returncode == 0
-    assert "9 of 9 captures have no tie points, and keep their georeference, accurate to" in done.stderr
+    assert "9 of 9 captures without tie points: placed by the georeference alone, accurate to" in done.stderr
     assert "Misfit" not in done.stdout
 
 
