@@ -52,6 +52,7 @@ if TYPE_CHECKING:
     from agalign.values.alignment import Prediction as Prediction
     from agalign.values.alignment import Residual as Residual
     from agalign.values.alignment import Seed as Seed
+    from agalign.values.capture import Capture as Capture
     from agalign.values.pixel_units import FixedFilePx as FixedFilePx
     from agalign.values.pixel_units import FixedImagePx as FixedImagePx
     from agalign.values.pixel_units import MovingFilePx as MovingFilePx
@@ -69,6 +70,7 @@ _NAMES = {
     "products.plots": "PlotReport plot_statistics",
     "products.read_alignment": "read_alignment",
     "values.alignment": "Alignment Prediction Residual Seed",
+    "values.capture": "Capture",
     "values.pixel_units": "FixedFilePx FixedImagePx MovingFilePx",
 }
 """Public names by module. A module is imported at the first use of one of its names (PEP 562): torch takes seconds."""

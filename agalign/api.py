@@ -56,7 +56,12 @@ def align(
     fixed_valid, moving_valid
         (H, W), False where pixels must not be used.
 
-    Returns an Alignment on the grid of `fixed`. `warp` resamples `moving` to it, `map` maps pixels of `fixed` to pixels
+    settings
+        By default `Settings()`; `settings.write` has no effect.
+
+    The method is that of docs/method.md: a descriptor learned on both images while the homography is optimised by the
+    same loss, then refined and verified by windows. Returns an Alignment on the grid of `fixed`; its matrices are
+    float64. `warp` resamples `moving` to it, `map` maps pixels of `fixed` to pixels
     of `moving`, `inverse` maps back: x right, y down, (0, 0) the centre of the top-left pixel. Check its `status`: only
     `aligned` has passed verification. With `predicted`, the mapping is extrapolated over a part of the image without
     measurements, with the standard error `prediction.std_px`. With `seed_only` and `failed`, the mapping is that of the
@@ -85,8 +90,12 @@ def warp_onto(
 ) -> tuple[NDArray[np.generic], Mask]:
     """Resample an image to a grid of (width, height) pixels by a homography (3x3) that maps its pixels to the image.
 
-    An alignment may have lenses, a displacement field or a relief in addition: use `Alignment.warp` for it. Arguments
-    and results are those of `Alignment.warp`. Raises InputError, also for an Alignment, and GeometryError.
+    moving, valid
+        (H, W), (H, W, C) or (C, H, W) of any numeric type, and (H, W), False for pixels that must not be used.
+
+    Returns the pixels in the layout and type of `moving`, NaN or 0 where they are unknown, and their mask (height,
+    width). An alignment may have lenses, a displacement field or a relief in addition: use `Alignment.warp` for it.
+    Raises InputError, also for an Alignment, and GeometryError.
     """
     if isinstance(fixed_to_moving, Alignment):
         raise InputError("an alignment is more than a homography; use its method warp(moving)")
@@ -98,9 +107,11 @@ def warp_onto(
 
 
 def align_capture(capture: Capture, out: str | Path, *, settings: Settings | None = None) -> CaptureReport:
-    """Align a capture that `discover` returned, and write its stack and sidecar below `out`.
+    """Align a capture that `discover` returned (an element of `FolderScan.captures`), and write its stack and sidecar
+    below `out`.
 
-    Raises UnreadableFileError if its reference band cannot be read, and OutputError.
+    Returns a CaptureReport with the state `done`; bands that are not aligned are in its `result`, not raised. Raises
+    UnreadableFileError if its reference band cannot be read, and OutputError.
     """
     settings = settings or Settings()
     return process_capture(with_radiometry(capture, settings.write.radiometry, {}), Path(out), settings)

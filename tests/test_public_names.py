@@ -1,9 +1,11 @@
 """The names that `import agalign` offers, and what its objects print."""
 
+import ast
 import re
 import subprocess
 import sys
 import typing
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -19,7 +21,7 @@ from agalign.values.mapping import PixelMapping
 FUNCTIONS = "align align_capture align_folder discover mosaic open_capture open_flight plot_statistics read_alignment"
 FUNCTIONS += " warp_onto"
 SETTINGS = "CheckSettings FlightSettings JointSettings ReliefSettings SeedSettings Settings WriteSettings"
-RESULTS = "Alignment CaptureReport FlightReports FolderScan MosaicReport PlotReport Prediction Residual Seed"
+RESULTS = "Alignment Capture CaptureReport FlightReports FolderScan MosaicReport PlotReport Prediction Residual Seed"
 OPTIONS_AND_UNITS = "DiscoverOptions RunOptions FixedFilePx FixedImagePx MovingFilePx"
 ERRORS = """AgalignError ConfigurationError GeometryError InputError NoContrastError NoSuchBandError MemoryLimitError
 NotEnoughTextureError OutputError SidecarError UnreadableFileError WorkerError"""
@@ -42,7 +44,7 @@ def test_all_errors_and_settings_are_public() -> None:
     assert stages | {"Settings"} == set(SETTINGS.split())
 
 
-@pytest.mark.parametrize("name", ["align", "align_folder"])
+@pytest.mark.parametrize("name", ["align", "align_capture", "align_folder"])
 def test_types_in_the_signatures_are_public(name: str) -> None:
     hints = typing.get_type_hints(getattr(api, name))
     own = {t for hint in hints.values() for t in (hint, *typing.get_args(hint)) if hasattr(t, "__module__")}
@@ -103,3 +105,27 @@ def test_every_setting_has_an_option() -> None:
     settings.remove("flight.start")  # the fingerprint of a given model: set by the run
     assert settings == set(re.findall(r"\| `([a-z_]+\.[a-z_]+)`", text))
     assert 15 < len(settings) <= 30
+
+
+BARE_ARRAY = re.compile(r"\b(?:NDArray|ArrayLike|Tensor|Field|FloatImage)\b")
+"""Types of arrays that do not name a shape; aliases such as `Points` have theirs in their docstrings."""
+SHAPE = re.compile(r"\([^()]*,[^()]*\)|\b3x3\b|\bscalar\b|\bstate_dict\b")
+
+
+def public_functions(body: Sequence[ast.stmt]) -> Iterator[ast.FunctionDef]:
+    for node in body:
+        if isinstance(node, ast.ClassDef | ast.FunctionDef) and not node.name.startswith("_"):
+            yield from public_functions(node.body) if isinstance(node, ast.ClassDef) else [node]
+
+
+def test_functions_of_arrays_name_a_shape() -> None:
+    without, count = [], 0
+    for path in sorted(Path(agalign.__file__).parent.rglob("*.py")):
+        for function in public_functions(ast.parse(path.read_text(encoding="utf-8")).body):
+            hints = [a.annotation for a in (*function.args.args, *function.args.kwonlyargs)] + [function.returns]
+            if any(BARE_ARRAY.search(ast.unparse(hint)) for hint in hints if hint):
+                count += 1
+                if not SHAPE.search(ast.get_docstring(function) or ""):
+                    without.append(f"{path}:{function.lineno}: {function.name}")
+    assert count > 100
+    assert not without, "\n".join(without)

@@ -20,6 +20,7 @@ class CaptureReport:
     """State and result of one capture."""
 
     label: str
+    """Folder and number of the capture, as 0000SET/000/IMG_0001."""
     state: Literal["done", "kept", "error", "panel", "sky"]
     """`kept`: an earlier run with the same settings has finished the capture. `panel` and `sky`: the capture shows a
     calibration panel or the sky, and is not aligned.
@@ -29,6 +30,7 @@ class CaptureReport:
     path: Path | None = None
     """Path of the sidecar."""
     error: str | None = None
+    """Why the capture has no result, one line."""
     panel: str | None = None
     """Description of the calibration panel."""
     sky: str | None = None

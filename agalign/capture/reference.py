@@ -61,7 +61,7 @@ class Reference:
 
     @cached_property
     def seed_spectrum(self) -> Field:
-        """Windowed spectrum of the structure of the reduced image."""
+        """(height, width) windowed spectrum of the structure field of the reduced image, packed as by `cv2.dft`."""
         return windowed_spectra(structure_field(shrink(self.grey, self.seed_size_px)))
 
     def landmarks(self, source: LandmarkInput) -> Landmarks:
@@ -74,7 +74,7 @@ class Reference:
 
     @cached_property
     def structure(self) -> Field:
-        """Structure field of the image."""
+        """(height, width) structure field of the image."""
         return structure_field(self.grey)
 
     @cached_property

@@ -50,7 +50,7 @@ def loss_surface(
 
 
 def draw_surface(surface: NDArray[np.float64], offsets_px: NDArray[np.float64], path: Path) -> None:
-    """Write a picture of a loss surface, dark where the loss is low, with axes in px. Raises OutputError."""
+    """Write a picture of a loss surface (n, n) over offsets (n,), dark where the loss is low. Raises OutputError."""
     side, margin = 440, 56
     low, high = np.nanmin(surface), np.nanmax(surface)
     shade = np.nan_to_num((surface - low) / max(high - low, 1e-12), nan=1.0) * 255

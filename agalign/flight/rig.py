@@ -149,7 +149,7 @@ def least_squares(
 
 
 def mapping_weight(std_px: ArrayLike, model_error_px: ArrayLike = 0.0) -> Array:
-    """Return the weight, 1 / px^2, of a mapping from its standard error and the error of the model."""
+    """Return the weights (n,), 1 / px^2, of mappings from their standard errors (n,) and the error of the model."""
     return np.asarray(1 / (np.square(std_px) + np.square(model_error_px) + MIN_STD_PX**2))
 
 

@@ -107,7 +107,7 @@ class Descriptor(nn.Module):
         return self.describe([patches], [side])[0]
 
     def describe(self, patches: Sequence[Tensor], sides: Sequence[int]) -> list[Tensor]:
-        """Describe the patches of several sides in one batch; the result equals `forward` for each side."""
+        """Describe patches (N, C, rows, columns) of each side in one batch; returns what `forward` returns for each."""
         responses = [self.first[min(side, len(self.first) - 1)](x) for x, side in zip(patches, sides, strict=True)]
         if len(self.trunk) == 1:
             joined: Tensor = self.trunk[0](torch.cat(responses))

@@ -86,7 +86,7 @@ def _problem(name: str) -> str:
 
 
 def to_float64(tensor: Tensor) -> Tensor:
-    """Return the tensor as float64, on the CPU if its device (Apple's MPS) has no float64."""
+    """Return a tensor of any shape (...,) as float64, on the CPU if its device (Apple's MPS) has no float64."""
     return (tensor if _has_float64(tensor.device) else tensor.cpu()).double()
 
 

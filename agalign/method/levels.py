@@ -130,7 +130,7 @@ class Level:
         return torch.tensor(scaled, dtype=torch.float32, device=self.fixed.image.device)
 
     def full_matrix(self, homography: Tensor, band: int) -> Matrix:
-        """Convert fixed_to_moving of a moving image from px of the level to full resolution.
+        """Convert fixed_to_moving (3, 3) of a moving image from px of the level to full resolution.
 
         Raises GeometryError for a matrix that cannot be inverted.
         """

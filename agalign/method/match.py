@@ -80,9 +80,10 @@ def starter_for_matching(channels: tuple[int, int]) -> Descriptor:
 
 @torch.no_grad()
 def match_seed(net: Descriptor, fixed: Raster, moving: Raster, maximum: int = MAX_KEYPOINTS) -> Matrix | None:
-    """Return fixed_to_moving between undistorted px from at most `maximum` keypoints per image.
+    """Return fixed_to_moving (3, 3) between undistorted px from at most `maximum` keypoints per image.
 
-    `net` is a `matching_network`. None if a homography has fewer than _MIN_MATCHES inliers.
+    `net` is a `matching_network`. Mutual nearest descriptors, then a robust homography: None if it has fewer than
+    _MIN_MATCHES inliers.
     """
     device = next(net.parameters()).device
     (image, keypoints), (image_prime, keypoints_prime) = (_keypoints(r, device, maximum) for r in (fixed, moving))

@@ -100,7 +100,7 @@ class Keypoints:
 
 
 def warp_keypoints(keypoints: Keypoints, homography: Tensor) -> Keypoints:
-    """Map keypoints of the fixed image to the moving image (the paper's w_k).
+    """Map N keypoints of the fixed image to the moving image (the paper's w_k) by H (3, 3), fixed to moving px.
 
     v = s (cos phi, sin phi); v' = [h11 v0 + h12 v1, h21 v0 + h22 v1] / (h31 x + h32 y + 1);
     phi' = atan2(v1', v0'), s' = |v'|.
@@ -141,7 +141,7 @@ def bilinear(image: Tensor, positions: Tensor) -> Tensor:
 
 
 def footprint_radius(scale: Tensor) -> Tensor:
-    """Return the distance in px from a keypoint to the farthest sample of its patch."""
+    """Return the distances (N,), px, from keypoints of scales (N,) to the farthest samples of their patches."""
     return scale * FOOTPRINT_PX
 
 

@@ -126,7 +126,10 @@ class Solver:
 
     @torch.no_grad()
     def step(self, band: MovingBand, homography: Tensor, reference_patches: ReferencePatches) -> Step:
-        """Compute one Gauss-Newton step. Raises NotEnoughTextureError if too few patches are inside both images."""
+        """Compute one Gauss-Newton step from H (3, 3), fixed to moving px.
+
+        Raises NotEnoughTextureError if too few patches are inside both images.
+        """
         rows = band.visible_rows(reference_patches.keypoints, homography)
         if len(rows) < MIN_KEYPOINTS:
             raise NotEnoughTextureError(len(rows), MIN_KEYPOINTS)

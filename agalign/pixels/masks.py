@@ -53,7 +53,7 @@ def undeclared_fill(pixels: ArrayLike) -> Mask:
 
 
 def learnable(valid: Mask, pixels: ArrayLike, saturation_value: float | None) -> Mask:
-    """Return the valid pixels outside of saturated areas and their direct neighbours.
+    """Return (height, width) True for valid pixels outside of saturated areas and their direct neighbours.
 
     Saturated spots narrower than _MIN_SATURATED_PX, such as glint, are kept.
     """

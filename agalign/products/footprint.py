@@ -55,7 +55,7 @@ def footprint(capture: Capture, grid: OutputGrid) -> NDArray[np.float64] | None:
 def geojson_geometry(
     ring: NDArray[np.float64] | None, position: Position | None, decimals: int
 ) -> dict[str, Any] | None:
-    """Return the GeoJSON geometry of a footprint with these decimals, else of the camera's position; None for None."""
+    """Return the GeoJSON geometry of a footprint (n, 2) with these decimals, else of the camera's position, or None."""
     if ring is not None:
         return {"type": "Polygon", "coordinates": [ring.round(decimals).tolist()]}
     if position is not None:

@@ -75,7 +75,10 @@ def symbols_of(formula: str) -> tuple[str, ...]:
 
 
 def evaluate(formula: str, values: Mapping[str, FloatImage]) -> FloatImage:
-    """Return the value of a formula, float32, given an array for each name; not finite where it is undefined."""
+    """Return the value (height, width) of a formula, given an array of that shape for each name.
+
+    Not finite where it is undefined.
+    """
     with np.errstate(all="ignore"):
         return np.asarray(_value(_parsed(formula), values), np.float32)
 

@@ -197,7 +197,7 @@ def _with_occluded(pixels: Pixels, valid: Mask, occluded: Mask) -> tuple[Pixels,
 
 
 def as_type(values: FloatImage, dtype: np.dtype[Any]) -> Pixels:
-    """Return values in another type, rounded and limited to its range if it is an integer type."""
+    """Return values (...,) in another type, rounded and limited to its range if it is an integer type."""
     if dtype.kind != "f":
         limits = np.iinfo(str(dtype))
         values = np.clip(np.rint(values), limits.min, limits.max)

@@ -24,7 +24,8 @@ def nearer_sign(relief: Relief, baselines: NDArray[np.float64]) -> int:
     """Return 1 if positive parallax is nearer to the camera, -1 if negative parallax is, 0 if unknown.
 
     Where two surfaces are displaced to the same position, only pixels of the nearer one match. With the wrong sign,
-    pixels with a high correlation would be occluded.
+    pixels with a high correlation would be occluded. `baselines` (bands, 2): displacement (x, y) of each band, px, by a
+    parallax of 1.
     """
     means = []
     for sign, signed_relief in ((1, relief), (-1, relief.negated)):

@@ -85,7 +85,9 @@ def paint_ground(
 
 
 def reflectance(ground: Ground, band: BandSpec) -> Field:
-    """Return the reflectance of the ground in a band; vigour of crops raises it in infrared, lowers it in visible."""
+    """Return the reflectance (height, width) of the ground in a band: vigour raises it in infrared, lowers it in
+    visible light.
+    """
     bright = 1 if band.wavelength_nm > 700 else -0.5
     crop = band.crop * (1 + 0.35 * bright * ground.vigour)
     soil = band.soil * ground.brightness

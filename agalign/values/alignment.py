@@ -32,6 +32,7 @@ class Seed:
 
     kind: SeedKind
     fixed_to_moving: Matrix
+    """Between undistorted px if both lenses are known, else between raw px."""
     score: float
     """Height of the correlation at this mapping, in standard deviations; candidates are compared by it."""
     peak_sigma: float = 0.0
@@ -110,6 +111,7 @@ class Residual(Generic[FixedPx]):
     shifts_px: NDArray[np.float64]
     """(n, 2) position of the moving band's structure minus that of the reference's; nan where not measured."""
     median_px: FixedPx
+    """Of the lengths of the shifts; infinite if none was measured."""
     p95_px: FixedPx
     coverage: float
     """Share of the textured windows in which a shift could be measured."""
@@ -203,15 +205,20 @@ class Alignment(Generic[FixedPx]):
     size_px: Size
     """(width, height) of the reference; `warp` resamples to its grid."""
     status: PairStatus
+    """aligned: passed verification; predicted: by rig or extrapolation; seed_only, failed: the seed unchanged."""
     issues: tuple[Issue, ...]
     """Reasons against accepting the alignment, the most important first; empty if it is `aligned`."""
     seed: Seed
     joint: JointResult[FixedPx] | None = None
+    """Result of the optimisation with its standard error; None if it was not run or failed."""
     residual: Residual[FixedPx] | None = None
     """Of windows that took no part in the estimation."""
     seconds: float = 0.0
+    """Processing time of the pair."""
     before: Mapping[str, float] = dataclasses.field(default_factory=dict)
+    """Comparison metrics by name under the seed, such as mutual information."""
     after: Mapping[str, float] = dataclasses.field(default_factory=dict)
+    """The same under the mapping."""
     candidates: Mapping[Geometry, FixedPx] = dataclasses.field(default_factory=dict)
     """p95 of the shifts of held-out windows by each geometry that was fitted; empty if only a homography was."""
     prediction: Prediction | None = None

@@ -13,7 +13,9 @@ from agalign.errors import GeometryError
 from agalign.values.pixel_units import PixelScale, Size
 
 Matrix = NDArray[np.float64]
+"""(3, 3) homography."""
 Points = NDArray[np.float64]
+"""(..., 2) positions (x, y), px unless stated otherwise."""
 
 
 def identity() -> Matrix:

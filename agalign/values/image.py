@@ -9,7 +9,9 @@ from agalign.values.lens import Lens
 from agalign.values.pixel_units import SAME_PIXELS, PixelScale
 
 FloatImage = NDArray[np.float32]
+"""(height, width), or (bands, height, width) where it is stated."""
 Mask = NDArray[np.bool_]
+"""(height, width), True for the pixels that it selects."""
 
 
 def reduced_size_px(size_px: tuple[int, int], reduction: float) -> tuple[int, int]:

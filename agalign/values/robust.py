@@ -16,7 +16,7 @@ def shift_scale_px(lengths_px: NDArray[np.float64]) -> float:
 
 
 def cauchy_weights(residuals: ArrayLike, scale: float | NDArray[np.float64]) -> NDArray[np.float64]:
-    """Cauchy weights 1 / (1 + (r / scale)^2), the shape of `residuals` (Holland & Welsch 1977).
+    """Return Cauchy weights 1 / (1 + (r / scale)^2) of residuals (...,), in their shape (Holland & Welsch 1977).
 
     `residuals` are lengths in the unit of `scale`, which must be positive. A residual of 0 has weight 1, one of `scale`
     has 0.5, an infinite one has 0. NaN stays NaN.

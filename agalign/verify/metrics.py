@@ -75,7 +75,7 @@ def _eroded(valid: Mask, side_px: int) -> Mask:
 
 
 def fixed_bins(fixed: NDArray[np.float32], limits: tuple[float, float]) -> NDArray[np.int32]:
-    """Return the bin of each fixed value; `limits` are the minimum and maximum of the image."""
+    """Return the bins (n,) of fixed values (n,); `limits` are the minimum and maximum of the image."""
     # The cast truncates, which is floor for positive values.
     return (_bin_position(fixed, limits, padding=0) + 0.5).astype(np.int32)
 
@@ -119,13 +119,16 @@ def _bin_position(values: NDArray[np.float32], limits: tuple[float, float], padd
 
 
 def cubic_spline(x: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Evaluate the B-spline: (4 - 6 x^2 + 3 |x|^3) / 6 for |x| < 1, (2 - |x|)^3 / 6 for 1 <= |x| < 2, else 0."""
+    """Evaluate the cubic B-spline at x (...,).
+
+    (4 - 6 x^2 + 3 |x|^3) / 6 for |x| < 1, (2 - |x|)^3 / 6 for 1 <= |x| < 2, else 0.
+    """
     a = np.abs(x)
     return np.where(a < 1, (4 - 6 * a**2 + 3 * a**3) / 6, np.where(a < 2, (2 - a) ** 3 / 6, 0.0))
 
 
 def mutual_information(joint: NDArray[np.float64]) -> float:
-    """Return the sum of p log(p / (p_fixed p_moving)), in nats."""
+    """Return the sum of p log(p / (p_fixed p_moving)), in nats, of a joint histogram (bins, bins)."""
     of_each, of_both = _entropies(joint)
     return of_each - of_both
 

@@ -69,7 +69,7 @@ class FixedWindows:
 
     @classmethod
     def on_chessboard(cls, valid: Mask, structure: Field, side_px: int, *, white: bool) -> "FixedWindows":
-        """Create 3 x 3 windows in each of the black or white fields of a chessboard.
+        """Create 3 x 3 windows in each of the black or white fields of a chessboard over a mask (height, width).
 
         Windows of different colours share no pixels, so those of one colour can verify a fit to the other.
         """
@@ -140,6 +140,7 @@ class Shifts(NamedTuple):
         return cls(*map(np.concatenate, zip(*several, strict=True)))
 
     def subset(self, mask: NDArray[np.bool_]) -> "Shifts":
+        """Return the shifts where a mask (n,) is True."""
         return Shifts(*(values[mask] for values in self))
 
     def distances_px(self, predicted_px: Points | float = 0.0) -> NDArray[np.float64]:
@@ -154,7 +155,7 @@ class Shifts(NamedTuple):
 
 
 def in_standard_errors(decreases: NDArray[np.float64]) -> float:
-    """Return the mean of n decreases relative to its standard error."""
+    """Return the mean of decreases (n,) relative to its standard error."""
     return float(decreases.mean() / max(decreases.std() / math.sqrt(len(decreases)), 1e-12))
 
 
