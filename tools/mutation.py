@@ -5,9 +5,9 @@
                              [--results FILE] [--mypy]
 
 The mutants are a random sample of those that mutmut's operators make (mutants.py). Each one runs the tests of its
-package, first the file named after its module, and stops at the first failure. The work tree is not touched: two copies
-of it in a temporary folder take the mutants in turn. Results are appended to FILE, one JSON object a line; mutants with
-a result there are not run again. `--mypy` runs mypy on each survivor.
+package, first the file named after its module, then those of the callers, and stops at the first failure. The work
+tree is not touched: two copies of it in a temporary folder take the mutants in turn. Results are appended to FILE, one
+JSON object a line; mutants with a result there are not run again. `--mypy` runs mypy on each survivor.
 """
 
 import argparse
@@ -28,18 +28,8 @@ from mutants import Mutant, sample
 
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGES = ("verify", "capture", "flight", "values")
-ELSEWHERE = {
-    "agalign/capture/align.py": ("tests/test_api.py",),
-    "agalign/capture/reference.py": ("tests/test_api.py",),
-    "agalign/flight/model.py": ("tests/batch/test_flight.py",),
-    "agalign/values/alignment.py": ("tests/capture/test_band_pair.py", "tests/products/test_sidecar.py"),
-    "agalign/values/capture.py": ("tests/cameras/test_cameras.py", "tests/cameras/test_discover.py"),
-    "agalign/values/issues.py": ("tests/verify/test_checks.py", "tests/products/test_failures.py"),
-    "agalign/values/image.py": ("tests/pixels/test_masks.py", "tests/pixels/test_resample.py"),
-    "agalign/values/mapping.py": ("tests/pixels/test_resample.py",),
-    "agalign/values/text.py": ("tests/products/test_failures.py",),
-}
-"""Modules that are also tested outside tests/<package>; those tests run after the package's own."""
+CALLERS = "batch", "cameras", "capture", "flight", "pixels", "test_api.py", "products/test_sidecar.py"
+"""Tests of the callers, relative to tests/."""
 NOT_COPIED = (".git", ".*_cache", "__pycache__", ".hypothesis", ".venv", "build", "dist", "site", "*.egg-info")
 TIMEOUT_FACTOR, TIMEOUT_S = 3.0, 30.0
 """A mutant times out after this many times the duration of its tests on unchanged code, plus this many seconds."""
@@ -59,10 +49,13 @@ class Result:
 
 
 def files_with_tests(path: str) -> list[str]:
-    """The tests of a module, relative to the root: the file named after it first."""
-    own = f"test_{Path(path).name}"
-    files = {p.relative_to(ROOT).as_posix() for p in (ROOT / "tests" / Path(path).parts[1]).glob("test_*.py")}
-    return sorted({*files, *ELSEWHERE.get(path, ())}, key=lambda file: (Path(file).name != own, file))
+    """The tests of a module, relative to the root: the file named after it first, those of the callers last."""
+    package = Path(path).parts[1]
+    files = sorted(
+        (ROOT / "tests" / package).glob("test_*.py"), key=lambda file: file.name != f"test_{Path(path).name}"
+    )
+    callers = [f"tests/{name}" for name in CALLERS if name != package]
+    return [*(file.relative_to(ROOT).as_posix() for file in files), *callers]
 
 
 def status_of(tests: list[str], copy: Path, limit_s: float | None) -> str:
@@ -103,9 +96,9 @@ def limits_s(paths: set[str], copy: Path) -> dict[str, float]:
     """Longest duration of the tests of each package of these modules, which must pass on the unchanged code."""
     result = {}
     for package in sorted({Path(path).parts[1] for path in paths}):
-        tests = {file for path in paths if Path(path).parts[1] == package for file in files_with_tests(path)}
+        tests = next(files_with_tests(path) for path in sorted(paths) if Path(path).parts[1] == package)
         began = time.monotonic()
-        if status_of(sorted(tests), copy, None) != "survived":
+        if status_of(tests, copy, None) != "survived":
             sys.exit(f"the tests of {package} do not pass on the unchanged code")
         result[package] = TIMEOUT_FACTOR * (time.monotonic() - began) + TIMEOUT_S
     return result
@@ -132,9 +125,6 @@ def main() -> None:
     parser.add_argument("--results", type=Path, metavar="FILE", default=Path("mutation.jsonl"))
     parser.add_argument("--mypy", action="store_true", help="run mypy on survivors")
     asked = parser.parse_args()
-    missing = [name for row in ELSEWHERE.items() for name in (row[0], *row[1]) if not (ROOT / name).is_file()]
-    if missing:
-        sys.exit(f"ELSEWHERE names files that do not exist: {', '.join(missing)}")
     mutants, candidates = sample(ROOT, asked.packages, asked.count, asked.seed)
     print(f"{len(mutants)} of {candidates} mutants, seed {asked.seed}", flush=True)
     if asked.list:
