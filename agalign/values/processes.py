@@ -283,11 +283,15 @@ class Worker:
         self._launching.join(within_s)
         if self._launched:
             self.process.kill()
-            pid = self.process.pid
-            if pid is not None and self._reported_code() == ExitCode.LOST_SERVER and not self._is_at_end():
-                with suppress(OSError):
-                    os.kill(pid, signal.SIGKILL)
+            if self._reported_code() == ExitCode.LOST_SERVER:
+                self._kill_without_server()
         self.pipe.close()
+
+    def _kill_without_server(self) -> None:
+        """Kill the process if its fork server was killed: `multiprocessing` then takes it for ended."""
+        if self.process.pid is not None and not self._is_at_end():
+            with suppress(OSError):
+                os.kill(self.process.pid, signal.SIGKILL)
 
     def _is_at_end(self) -> bool:
         """True if no process has the other end of the pipe open."""
@@ -296,12 +300,16 @@ class Worker:
         return self.pipe.closed or self.at_end
 
     def exit_code(self, within_s: float = ENDS_WITHIN_S) -> int | None:
-        """Return the exit code, -n for signal n; None if the process was not started or does not end in time."""
+        """Return the exit code, -n for signal n; None if the process was not started or does not end in time.
+
+        A process whose fork server was killed is killed, and its end waited for.
+        """
         until_s = time.monotonic() + within_s
         if not self._launched or not wait([self.process.sentinel], within_s):
             return None
         code = self._reported_code()
-        if code == ExitCode.LOST_SERVER:  # of the server; the process itself may still be ending
+        if code == ExitCode.LOST_SERVER:
+            self._kill_without_server()
             while is_running(self.process.pid or 0):
                 if time.monotonic() >= until_s:
                     return None

@@ -19,7 +19,7 @@ import pytest
 from agalign.errors import WorkerError
 from agalign.values import process_pool
 from agalign.values.process_pool import Outcome, ProcessPool
-from agalign.values.processes import Worker
+from agalign.values.processes import ENDS_WITHIN_S, Worker
 
 from ..builders import in_full_run
 from . import pool_tasks as tasks
@@ -276,6 +276,17 @@ def test_workers_killed_together_do_not_end_the_run() -> None:
         for worker in worker_processes():
             worker.kill()
         assert all(o.value() == 0.3 for o in outcomes)
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="other systems have no fork server here")
+def test_tasks_are_tried_again_if_the_fork_server_is_killed() -> None:
+    with pool(tasks.sleep, 2) as workers:
+        outcomes = workers.run([0.0, *[0.3] * 6])
+        next(outcomes)
+        began = time.monotonic()
+        psutil.Process(worker_processes()[0].ppid()).kill()
+        assert all(o.value() == 0.3 for o in outcomes)
+        assert time.monotonic() - began < ENDS_WITHIN_S
 
 
 # ---- ends
