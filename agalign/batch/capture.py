@@ -7,8 +7,6 @@ from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
 
-import cv2
-
 from agalign.batch.report import CaptureReport, StageClock
 from agalign.batch.workers import failure_text
 from agalign.capture.align import PairProgress, align_capture_bands
@@ -26,8 +24,6 @@ from agalign.products.sidecar_file import read_result, write_sidecar
 from agalign.values.capture import Capture
 from agalign.values.choices import RadiometryChoice
 from agalign.values.image import OutputGrid
-
-_FAULTS = (ValueError, TypeError, LookupError, ArithmeticError, AttributeError, RuntimeError, OSError, cv2.error)
 
 
 def quiet(*_: object) -> None:
@@ -164,7 +160,7 @@ def do_capture(task: Task, on_pair: PairProgress = quiet) -> CaptureReport:
         model = None if task.model is None else loaded_model(task.model, task.settings.joint.device)
         with one_thread(), one_memory_error():
             report = process_capture(task.capture, task.out, task.settings, clock, model, task.max_preview_bytes)
-    except (AgalignError, MemoryError, *_FAULTS) as error:
+    except Exception as error:
         # A defect of agalign in one capture must not stop the others.
         report = CaptureReport(label, "error", error=failure_text(error))
         logging.getLogger(__name__).debug("%s: %s", label, report.error, exc_info=True)
