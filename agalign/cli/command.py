@@ -18,6 +18,7 @@ import typer
 from typer.core import TyperCommand
 
 from agalign.cli.terminal import Terminal, exits
+from agalign.values.files import read_regular
 
 if TYPE_CHECKING:
     from agalign.config import Option
@@ -206,11 +207,13 @@ def _read_toml(path: Path) -> dict[str, Any]:
     import tomllib
 
     try:
-        return tomllib.loads(path.read_text(encoding="utf-8"))
+        return tomllib.loads(read_regular(path).decode())
     except FileNotFoundError:
         raise typer.BadParameter(f"{path} does not exist") from None
-    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
-        raise typer.BadParameter(f"{path} cannot be read as TOML ({error})") from None
+    except (OSError, ValueError, RecursionError) as error:
+        raise typer.BadParameter(
+            f"{path} cannot be read as TOML ({getattr(error, 'strerror', None) or error})"
+        ) from None
 
 
 def config_text(command: Any) -> str:

@@ -6,12 +6,14 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
+from pydantic_core import from_json
+
 from agalign.products.footprint import accuracy_of_footprint_m, footprint, geojson_geometry, with_assumed_height
 from agalign.products.index_table import IndexRow, read_table
 from agalign.products.product import CapturePaths
 from agalign.products.sidecar import BandResult, CaptureResult
 from agalign.values.capture import Capture, Pose
-from agalign.values.files import write_text
+from agalign.values.files import read_regular, write_text
 from agalign.values.image import OutputGrid
 
 FLIGHT_MAP_FILE = "flight.geojson"
@@ -82,7 +84,7 @@ def link_indices(out: Path, rows: Iterable[IndexRow]) -> None:
 def features_in(out: Path) -> list[dict[str, Any]]:
     """The features of OUT/flight.geojson; none if there is no such file, or if a run did not write it."""
     try:
-        features = json.loads((out / FLIGHT_MAP_FILE).read_text(encoding="utf-8"))["features"]
+        features = from_json(read_regular(out / FLIGHT_MAP_FILE))["features"]
         is_of_a_run = all(
             isinstance(f["id"], str)
             and f["id"] == f["properties"]["capture"]

@@ -14,6 +14,7 @@ from agalign.pixels.raster import open_raster
 from agalign.products.index_bands import RAW
 from agalign.products.sidecar import CaptureResult
 from agalign.products.text_files import write_csv
+from agalign.values.files import read_regular
 from agalign.values.text import without_formula
 
 STATISTICS_TAG = "INDEX_STATISTICS"
@@ -137,7 +138,7 @@ def rows_of_run(sidecar: CaptureResult, folder: str, out: Path) -> list[IndexRow
 def read_table(out: Path) -> list[IndexRow]:
     """Return the rows of OUT/indices.csv whose rasters still exist; empty if there is no table."""
     try:
-        text = (out / INDICES_FILE).read_text(encoding="utf-8")
+        text = read_regular(out / INDICES_FILE).decode()
         rows = [_row(line) for line in csv.DictReader(io.StringIO(text))]
     except (OSError, ValueError, KeyError, TypeError, AttributeError):  # lines with too few or too many cells
         return []

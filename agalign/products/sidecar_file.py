@@ -11,7 +11,7 @@ from pydantic import ValidationError
 from agalign.errors import InputError, SidecarError
 from agalign.products.sidecar import SCHEMA, CaptureResult, Sidecar
 from agalign.products.text_files import compact_lists
-from agalign.values.files import file_checksum, open_regular, write_text
+from agalign.values.files import file_checksum, open_regular, read_regular, write_text
 
 _MAX_BYTES = 1 << 26
 """Limit of a file that is read: ten times the sidecar of many bands."""
@@ -98,15 +98,9 @@ Model = TypeVar("Model", bound=CaptureResult)
 
 def _read(path: Path, model: type[Model]) -> Model:
     try:
-        with open_regular(path) as file:
-            contents = file.read(_MAX_BYTES + 1)
-        if len(contents) > _MAX_BYTES:
-            raise SidecarError(
-                f"{path}: over {_MAX_BYTES >> 20} MB are too many for a sidecar; delete it and run again"
-            )
-        return model.model_validate_json(contents)
+        return model.model_validate_json(read_regular(path, _MAX_BYTES))
     except OSError as error:
-        raise SidecarError(f"{path}: cannot be read ({error.strerror or error})") from None
+        raise SidecarError(f"{path}: cannot be read ({error.strerror or error}); delete it and run again") from None
     except ValidationError as error:
         raise SidecarError(f"{path}: {_problem(error)}") from None
 
@@ -141,9 +135,7 @@ def verify_outputs(out: Path) -> Iterator[tuple[Path, list[str]]]:
 
 def _problems_of_outputs(path: Path) -> Iterator[str]:
     sidecar = read_result(path)
-    with open_regular(path) as file:
-        text = file.read()
-    if sidecar.checksum is not None and sidecar.checksum != content_checksum(text):
+    if sidecar.checksum is not None and sidecar.checksum != content_checksum(read_regular(path, _MAX_BYTES)):
         yield f"{path}: was changed after it was written; run again with --overwrite"
     for kind in sidecar.not_written:
         yield f"{path}: its {kind} could not be written; run again"

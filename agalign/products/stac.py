@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from pydantic_core import from_json
 
 from agalign.cameras.base import is_thermal
 from agalign.errors import ConfigurationError, OutputError
@@ -25,7 +26,7 @@ from agalign.products.pan_sharpen import panchromatic
 from agalign.products.product import CapturePaths, Product, ProductContext, WrittenFile
 from agalign.products.raster_file import UNITS
 from agalign.values.capture import Band, Capture
-from agalign.values.files import write_text
+from agalign.values.files import read_regular, write_text
 from agalign.values.image import OutputGrid
 
 if TYPE_CHECKING:
@@ -93,7 +94,7 @@ def _read_item(path: Path) -> "pystac.Item":
     import pystac
 
     try:
-        return pystac.Item.from_dict(json.loads(path.read_text(encoding="utf-8")))
+        return pystac.Item.from_dict(from_json(read_regular(path)))
     except (OSError, ValueError, KeyError, pystac.STACError) as error:
         raise OutputError(f"{path}: cannot be read as a STAC item ({error}); run again with --overwrite") from None
 

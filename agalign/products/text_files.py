@@ -11,10 +11,7 @@ from typing import TypeVar
 from pydantic import BaseModel, ValidationError
 
 from agalign.errors import SidecarError
-from agalign.values.files import write_text
-
-_MAX_BYTES = 1 << 28
-"""Limit of a file that is read: ten times the record of a run of 100,000 captures."""
+from agalign.values.files import read_regular, write_text
 
 Model = TypeVar("Model", bound=BaseModel)
 
@@ -39,13 +36,12 @@ def write_model(path: Path, model: BaseModel | None) -> None:
 def read_model(path: Path, model: type[Model]) -> Model | None:
     """Return the model in a file, or None if the file does not exist. Raises SidecarError for any other content."""
     try:
-        if path.stat().st_size > _MAX_BYTES:
-            raise SidecarError(f"{path}: over {_MAX_BYTES >> 20} MB are too many for this file; run again")
-        return model.model_validate_json(path.read_bytes())
+        return model.model_validate_json(read_regular(path))
     except FileNotFoundError:
         return None
-    except (OSError, ValidationError):
-        raise SidecarError(f"{path}: cannot be read; run again") from None
+    except (OSError, ValidationError) as error:
+        reason = f" ({error.strerror})" if isinstance(error, OSError) else ""
+        raise SidecarError(f"{path}: cannot be read{reason}; delete it and run again") from None
 
 
 def write_csv(path: Path, columns: Sequence[str], rows: Iterable[Sequence[object]]) -> None:

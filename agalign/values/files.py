@@ -77,6 +77,17 @@ def open_regular(path: Path) -> BufferedReader:
     return open(descriptor, "rb")  # noqa: PTH123 - the descriptor that was checked
 
 
+def read_regular(path: Path, max_bytes: int = 1 << 28) -> bytes:
+    """Return the contents of a regular file. Raises OSError, also for a file with more bytes than that: the default is
+    ten times the record of a run of 100,000 captures.
+    """
+    with open_regular(path) as file:
+        contents = file.read(max_bytes + 1)
+    if len(contents) > max_bytes:
+        raise OSError(errno.EFBIG, f"over {max_bytes >> 20} MB are too many for this file")
+    return contents
+
+
 def remove_partial_files(folder: Path) -> None:
     """Remove partial files below a folder, from this process and from processes of this machine that have ended.
 

@@ -149,7 +149,7 @@ def test_info_names_the_sky(with_sky: Path) -> None:
 
 def test_a_damaged_record_is_one_line(tmp_path: Path) -> None:
     (tmp_path / SKY_FILE).write_text('{"schema": "agalign-sky/1"')
-    with pytest.raises(SidecarError, match=r"sky\.json: cannot be read; run again"):
+    with pytest.raises(SidecarError, match=r"sky\.json: cannot be read; delete it and run again"):
         read_sky(tmp_path)
     problems: list[str] = []
     write_pages(tmp_path, problems.append)

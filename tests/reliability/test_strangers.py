@@ -1,0 +1,60 @@
+"""Folders, options and tags from strangers: each fault is one line with the file, and nothing is lost silently."""
+
+import os
+import re
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from agalign.batch import capture as batch
+from agalign.cameras.discover import discover
+from agalign.errors import SidecarError
+from agalign.products.flight_map import FLIGHT_MAP_FILE, features_in
+from agalign.products.index_table import INDICES_FILE, read_table
+from agalign.products.panels import PANELS_FILE, SKY_FILE, read_panels, read_sky
+from agalign.products.run_record import read_run_record
+from agalign.values.files import RUN_FILE
+
+from ..conftest import raising, seeded
+from ..program import agalign_here
+
+
+@pytest.fixture(params=["pipe", "folder"])
+def irregular(request: pytest.FixtureRequest) -> Callable[[Path], None]:
+    """Make a pipe, which blocks those that open it, or a folder, where a file is expected."""
+    return os.mkfifo if request.param == "pipe" else Path.mkdir
+
+
+@pytest.mark.parametrize(
+    ("name", "read"), [(RUN_FILE, read_run_record), (PANELS_FILE, read_panels), (SKY_FILE, read_sky)]
+)
+def test_a_record_that_is_not_a_regular_file_is_an_error(
+    tmp_path: Path, irregular: Callable[[Path], None], name: str, read: Callable[[Path], object]
+) -> None:
+    irregular(tmp_path / name)
+    with pytest.raises(SidecarError, match=re.escape(f"{name}: cannot be read (it is not a regular file); delete it")):
+        read(tmp_path)
+
+
+def test_a_table_or_map_that_is_not_a_regular_file_is_empty(tmp_path: Path, irregular: Callable[[Path], None]) -> None:
+    for name, read in ((INDICES_FILE, read_table), (FLIGHT_MAP_FILE, features_in)):
+        irregular(tmp_path / name)
+        assert read(tmp_path) == []
+
+
+def test_options_that_are_not_a_regular_file_are_an_error(tmp_path: Path, irregular: Callable[[Path], None]) -> None:
+    irregular(tmp_path / "a.toml")
+    done = agalign_here("align", "x", "--config", tmp_path / "a.toml")
+    assert done.returncode == 2
+    assert "a.toml cannot be read as TOML (it is not a regular file)" in done.stderr
+
+
+@pytest.mark.parametrize("error", [ImportError("libx.so"), AssertionError("x"), StopIteration(), EOFError("x")])
+def test_any_error_fails_one_capture_only(
+    flight: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, error: Exception
+) -> None:
+    monkeypatch.setattr(batch, "process_capture", raising(error))
+    report = batch.do_capture(batch.Task(discover(flight).captures[0], tmp_path, seeded(), None))
+    assert report.state == "error"
+    assert report.error.startswith(f"agalign failed on it ({type(error).__name__}: ")
