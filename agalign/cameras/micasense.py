@@ -61,7 +61,7 @@ class MicaSense(Camera):
             to_rig=rays_to_rig(lens, rotation(*pix4d.rig_degrees(tags))),
             parallax=parallax,
             radiometry=centikelvin if is_thermal(band) else _radiometry(tags),
-            lens_offset_m=pix4d.lens_offset_m(tags),
+            lens_offset=pix4d.lens_offset(tags),
         )
         return (band,)
 

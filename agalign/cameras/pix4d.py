@@ -4,7 +4,7 @@
 """
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 
 from agalign.cameras.metadata import Tags
@@ -86,15 +86,18 @@ def parallax_of(tags: Tags) -> tuple[float, float] | None:
     return (-position[0], -position[1]) if len(position) == 3 else None
 
 
-def lens_offset_m(tags: Tags) -> tuple[float, float] | None:
-    """Return the position (right, down) of a band's lens in the rig from Camera:RigTranslations, which is in m or mm;
-    None if that is missing.
+def lens_offset(tags: Tags) -> tuple[float, float] | None:
+    """Return the position (right, down) of a band's lens in the rig from Camera:RigTranslations, in the unit of
+    `rig_unit_m`; None if that is missing.
     """
     position = tags.numbers(NAMESPACE, "RigTranslations")
-    if len(position) != 3:
-        return None
-    scale = 1.0 if max(map(abs, position)) < _MAX_OFFSET_M else 1e-3
-    return position[0] * scale, position[1] * scale
+    return (position[0], position[1]) if len(position) == 3 else None
+
+
+def rig_unit_m(bands: Iterable[Band]) -> float:
+    """Return the unit of `lens_offset` in all bands of a camera, metres: firmware writes m or mm."""
+    offsets = (abs(v) for band in bands for v in band.lens_offset or ())
+    return 1.0 if max(offsets, default=0.0) < _MAX_OFFSET_M else 1e-3
 
 
 def with_wavelength(band: Band, tags: Tags) -> Band:

@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agalign.cameras import rig_seed
+from agalign.cameras.pix4d import rig_unit_m
 from agalign.errors import GeometryError
 from agalign.products.checked_raster import LayerDescription
 from agalign.products.product import GEOTIFF, Product, ProductContext, StacAsset, WrittenFile
@@ -79,6 +80,7 @@ def _range_m(
 ) -> NDArray[np.float32]:
     """Range (height, width), nan if baselines, focal length or the orientation of the lenses are unknown."""
     reference, at_infinity, baselines_m, mappings = capture.reference, [], [], []
+    unit_m = rig_unit_m(capture.bands)
     for band in capture.moving:
         alignment = alignments.get(band.name)
         if alignment is None or alignment.mapping.parallax is None or alignment.space != "undistorted":
@@ -87,10 +89,10 @@ def _range_m(
             homography_at_infinity = rig_seed(reference, band)
         except GeometryError:
             continue
-        if homography_at_infinity is None or band.lens_offset_m is None or reference.lens_offset_m is None:
+        if homography_at_infinity is None or band.lens_offset is None or reference.lens_offset is None:
             continue
         at_infinity.append(homography_at_infinity)
-        baselines_m.append(np.subtract(reference.lens_offset_m, band.lens_offset_m))
+        baselines_m.append(np.subtract(reference.lens_offset, band.lens_offset) * unit_m)
         mappings.append(alignment.mapping)
     if not mappings or reference.lens is None:
         return np.full(parallax_px.shape, np.nan, np.float32)

@@ -100,8 +100,9 @@ class Band:
     parallax: tuple[float, float] | None = None
     """Direction (right, down) in which its pixels move as the range decreases, relative to the other bands of the rig,
     in any unit."""
-    lens_offset_m: tuple[float, float] | None = None
-    """Position of the lens right of and below the rig's origin, metres; None if the tags do not contain it."""
+    lens_offset: tuple[float, float] | None = None
+    """Position of the lens right of and below the rig's origin, in the unit of `cameras.pix4d.rig_unit_m`; None if the
+    tags do not contain it."""
     one_lens: bool = False
     """The bands of the file share one lens and are aligned as one."""
     companion: bool = False

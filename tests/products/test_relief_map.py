@@ -1,6 +1,6 @@
 """What is written of a capture with a relief: the rasters, the sidecar and the dataset, from the true geometry."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -136,7 +136,7 @@ def test_without_a_request_it_has_the_parallax_alone(run: Run, written: tuple[Pa
 
 
 def test_without_places_of_lenses_there_is_no_range(run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    unknown = replace(run.capture, bands=tuple(replace(b, lens_offset_m=None) for b in run.capture.bands))
+    unknown = replace(run.capture, bands=tuple(replace(b, lens_offset=None) for b in run.capture.bands))
     monkeypatch.setattr(run, "capture", unknown)
     layers = layers_of(*run.write(tmp_path, relief_map=True))
     assert np.isnan(layers["range"]).all()
@@ -224,13 +224,15 @@ def test_occluded_pixels_are_filled_on_request(run: Run, written: tuple[Path, Si
 
 
 @pytest.mark.parametrize(
-    ("numbers", "place_m"),
-    [("0.03,-0.021,0", (0.03, -0.021)), ("-15,10.5,0.2", (-0.015, 0.0105)), ("0,0,0", (0.0, 0.0))],
+    ("numbers", "unit_m"),
+    [(("0.03,-0.021,0", "0,0,0"), 1.0), (("-15,10.5,0.2", "0.2,0.1,0"), 1e-3), (("0,0,0",), 1.0), (("1,2",), 1.0)],
 )
-def test_places_are_in_metres_or_millimetres(numbers: str, place_m: tuple[float, float]) -> None:
-    tags = Tags(xmp={(pix4d.NAMESPACE, "RigTranslations"): (numbers,)})
-    assert pix4d.lens_offset_m(tags) == pytest.approx(place_m)
-    assert pix4d.lens_offset_m(Tags(xmp={(pix4d.NAMESPACE, "RigTranslations"): ("1,2",)})) is None
+def test_the_bands_of_a_camera_have_one_unit(numbers: Sequence[str], unit_m: float) -> None:
+    """A lens at 0.2 mm is not at 0.2 m."""
+    offsets = [pix4d.lens_offset(Tags(xmp={(pix4d.NAMESPACE, "RigTranslations"): (text,)})) for text in numbers]
+    bands = [Band("", Path(), 1, 1, 1, "uint8", lens_offset=offset) for offset in offsets]
+    assert pix4d.rig_unit_m(bands) == unit_m
+    assert offsets[0] == (None if numbers == ("1,2",) else tuple(map(float, numbers[0].split(",")[:2])))
 
 
 FILE_PX = 1280, 960
