@@ -8,11 +8,14 @@ between the two halves of a dual camera because of the longer baseline.
 import math
 import re
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import replace
+from datetime import datetime
 from pathlib import Path
 
 from agalign.cameras import pix4d
 from agalign.cameras.base import FULL_SCALE, Camera, is_thermal, rays_to_rig, rotation
+from agalign.cameras.light_sensor import horizontal_irradiance, sun_position
 from agalign.cameras.metadata import Tags, finite
 from agalign.cameras.xmp import names_in
 from agalign.values.capture import Band, Pose, Radiometry
@@ -28,6 +31,9 @@ _REDEDGE_M_PARALLAX = {
 """Direction in which the bands of a RedEdge-M, which has no tag for it, move relative to green as the distance of the
 ground decreases. Two flights with two cameras agree within 5 %.
 """
+
+_MAX_HORIZONTAL_ERROR = 0.01
+"""Of HorizontalIrradiance: correct firmware differs from its own components by 0.03 %, from refraction."""
 
 
 class _TagTransfer(pix4d.TagTransfer):
@@ -67,8 +73,7 @@ class MicaSense(Camera):
 
     def pose(self, tags: Tags) -> Pose | None:
         """Return the pose in the camera's tags, else the attitude of the light sensor on the same aircraft."""
-        yaw, pitch, roll = (math.degrees(tags.number(_DLS, name) or 0.0) for name in ("Yaw", "Pitch", "Roll"))
-        by_sensor = Pose(yaw, pitch, roll, focal_length_px=pix4d.focal_length_px(tags))
+        by_sensor = Pose(*_sensor_attitude_deg(tags), focal_length_px=pix4d.focal_length_px(tags))
         return pix4d.pose_of(tags) or (None if tags.number(_DLS, "Yaw") is None else by_sensor)
 
     def capture_name(self, path: Path) -> str:
@@ -101,14 +106,39 @@ def _radiometry(tags: Tags) -> Radiometry | None:
 
 
 def _irradiance(tags: Tags) -> float | None:
-    """HorizontalIrradiance, W / m^2 / nm; else the irradiance that an older light sensor measured in its own plane."""
+    """Irradiance on a horizontal plane, W / m^2 / nm; None if there is no plausible one.
+
+    Older sensors measure only in their own plane: the time, the place and the attitude then give the horizontal one.
+    """
+    sun = None
+    with suppress(ValueError):
+        sun = None if tags.position is None else sun_position(tags.position, datetime.fromisoformat(tags.captured_at))
     scale = tags.number(_DLS, "IrradianceScaleToSIUnits")
-    candidates = [
-        (tags.number(_DLS, "HorizontalIrradiance"), scale or 0.01),  # the unit without a tag
-        (tags.number(_DLS, "SpectralIrradiance"), scale or 1.0),
-        (tags.number(pix4d.NAMESPACE, "Irradiance"), scale or 1.0),
-    ]
-    return next((value * unit for value, unit in candidates if value is not None and value * unit > 0), None)
+    value, unit = _measured_horizontal(tags, sun), scale or 0.01  # the unit without a tag
+    if value is None or value <= 0:
+        value, unit = tags.number(_DLS, "SpectralIrradiance"), scale or 1.0
+        value = tags.number(pix4d.NAMESPACE, "Irradiance") if value is None else value
+        if value is not None and sun is not None:
+            value = horizontal_irradiance(value, _sensor_attitude_deg(tags), sun)
+    return None if value is None or not value > 0 else value * unit
+
+
+def _measured_horizontal(tags: Tags, sun: tuple[float, float] | None) -> float | None:
+    """HorizontalIrradiance, in the unit of the tag; from its direct and diffuse components where it contradicts them,
+    because early firmware of the DLS 2 calculates only them correctly.
+    """
+    names = "HorizontalIrradiance", "DirectIrradiance", "ScatteredIrradiance"
+    horizontal, direct, diffuse = (tags.number(_DLS, name) for name in names)
+    if sun is None or horizontal is None or not direct or not diffuse:
+        return horizontal
+    calculated = direct * math.sin(sun[0]) + diffuse
+    return horizontal if abs(horizontal / calculated - 1) < _MAX_HORIZONTAL_ERROR else calculated
+
+
+def _sensor_attitude_deg(tags: Tags) -> tuple[float, float, float]:
+    """(yaw, pitch, roll) of the light sensor; zeros if they are missing, as in MicaSense's library."""
+    yaw, pitch, roll = (math.degrees(tags.number(_DLS, name) or 0.0) for name in ("Yaw", "Pitch", "Roll"))
+    return yaw, pitch, roll
 
 
 def _index_in_name(path: Path) -> str:
