@@ -138,7 +138,7 @@ class RunOptions:
     """Command line, for run record and report."""
 
 
-class Stage(BaseModel):
+class SettingsModel(BaseModel):
     """Base of the settings: immutable, and an unknown name is an error."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", use_attribute_docstrings=True)
@@ -150,7 +150,7 @@ class Stage(BaseModel):
                 yield name, value
 
 
-class JointSettings(Stage):
+class JointSettings(SettingsModel):
     """Joint optimisation of the descriptor and the homographies."""
 
     recipe: Recipe = "fast"
@@ -165,16 +165,16 @@ class JointSettings(Stage):
     """Seed of all random numbers; the same seed gives the same result."""
 
 
-class FlightSettings(Stage):
+class FlightSettings(SettingsModel):
     """One network for many captures."""
 
     together: Annotated[bool, Option("each_alone", default=False, parse=not_)] = True
     """Learn a network per capture instead of one per flight."""
-    start: str = ""
+    start_model: str = ""
     """Fingerprint of the model that a run starts from, set by `run_flight`; runs with another one repeat a capture."""
 
 
-class SeedSettings(Stage):
+class SeedSettings(SettingsModel):
     """Initial alignment."""
 
     force: Annotated[
@@ -186,14 +186,14 @@ class SeedSettings(Stage):
     """Stop after the initial alignment."""
 
 
-class CheckSettings(Stage):
+class CheckSettings(SettingsModel):
     """Acceptance of predicted bands. The limits of the checks are in their modules in `verify`."""
 
     accept_predicted_px: Annotated[float, Field(ge=0), Option("accept_predicted")] = 1.0
     """Largest standard error, px, at which a predicted band counts as usable."""
 
 
-class ReliefSettings(Stage):
+class ReliefSettings(SettingsModel):
     """Correction of parallax over trees, terraces, buildings and benches."""
 
     # A single moving lens gets a smooth displacement field instead, if left-out windows confirm it: no other band can
@@ -205,7 +205,7 @@ class ReliefSettings(Stage):
     windows show parallax. --relief alone means always."""
 
 
-class WriteSettings(Stage):
+class WriteSettings(SettingsModel):
     """Output files."""
 
     # RMS error on a random image of waves of up to 0.25 cycles/px, relative to its standard deviation: Lanczos 1.4 %,
@@ -264,7 +264,7 @@ class WriteSettings(Stage):
     this option, panels without tags and code are recognised too."""
 
 
-class Settings(Stage):
+class Settings(SettingsModel):
     """All settings that change results."""
 
     seed: SeedSettings = SeedSettings()

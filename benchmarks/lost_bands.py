@@ -17,7 +17,7 @@ import rasterio
 from common import BandError, align, band_errors, flight_and_out, print_head, print_row, read_ties, run
 
 
-def spoil(path: Path, how: str, rng: np.random.Generator) -> None:
+def degrade(path: Path, how: str, rng: np.random.Generator) -> None:
     """Replace a file's pixels, and leave its tags."""
     with rasterio.open(path, "r+") as dataset:
         pixels = dataset.read(1)
@@ -25,8 +25,8 @@ def spoil(path: Path, how: str, rng: np.random.Generator) -> None:
         if how == "water":
             glitter = cv2.GaussianBlur(noise.astype(np.float32), (0, 0), 3.0)
             noise = 0.3 * noise + glitter / glitter.std()
-        spoilt = (np.median(pixels) + 0.5 * pixels.std() * noise).clip(1, 65000)
-        dataset.write(spoilt.astype(pixels.dtype), 1)
+        degraded = (np.median(pixels) + 0.5 * pixels.std() * noise).clip(1, 65000)
+        dataset.write(degraded.astype(pixels.dtype), 1)
 
 
 def run_without(flight: Path, lost: set[str], how: str, rng: np.random.Generator) -> list[BandError]:
@@ -36,7 +36,7 @@ def run_without(flight: Path, lost: set[str], how: str, rng: np.random.Generator
         for path in copy.rglob("*"):
             path.chmod(0o755 if path.is_dir() else 0o644)
         for name in sorted(lost):
-            spoil(next(copy.rglob(name)), how, rng)
+            degrade(next(copy.rglob(name)), how, rng)
         align(copy, out)
         truth = read_ties(flight / "ties.json")
         return band_errors(out, {name: entry for name, entry in truth.items() if name in lost})

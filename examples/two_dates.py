@@ -23,8 +23,8 @@ with tempfile.TemporaryDirectory() as folder:
     moving = report.sidecar.bands[1]
     if moving.status != "aligned":
         sys.exit(f"{later} cannot be aligned to {earlier}: {moving.reason}")
-    apart_px = np.subtract(moving.grid.moving_px, moving.grid.reference_px)
-    print(f"offset before alignment: {np.hypot(*np.median(apart_px, axis=0)):.1f} px")
+    offsets_px = np.subtract(moving.grid.moving_px, moving.grid.reference_px)
+    print(f"offset before alignment: {np.hypot(*np.median(offsets_px, axis=0)):.1f} px")
     with rasterio.open(report.path.with_suffix(".tif")) as both:
         change = both.read(moving.place.band_index, masked=True).astype("float32") - both.read(1, masked=True)
         profile = both.profile | {"count": 1, "dtype": "float32", "nodata": np.nan}

@@ -57,15 +57,15 @@ def process_capture(
     progress(capture.reference.name, "writing", 0.0)
     rig, whole = None if model is None else model.rig, OutputGrid(0, 0, *capture.reference.size_px)
     context = ProductContext(capture, paths, settings, alignments, (), whole, rig, max_preview_bytes)
-    if context.usable:
-        layers, grid = output_layers(capture, context.usable, settings.write, rig)
+    if context.with_pixels:
+        layers, grid = output_layers(capture, context.with_pixels, settings.write, rig)
         context = replace(context, layers=layers, grid=grid)
     discard_outputs(capture, out, settings.write)
     failures = _write_products(context)
     sidecar = write_sidecar(paths.sidecar, sidecar_of(context, list(failures)))
     # Products that need the same file fail with the same message.
-    shortcomings = tuple(dict.fromkeys(failures.values()))
-    return CaptureReport(capture.label, "done", sidecar.result(), paths.sidecar, shortcomings=shortcomings)
+    failed_products = tuple(dict.fromkeys(failures.values()))
+    return CaptureReport(capture.label, "done", sidecar.result(), paths.sidecar, failed_products=failed_products)
 
 
 def _write_products(context: ProductContext) -> dict[str, str]:

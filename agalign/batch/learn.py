@@ -283,10 +283,11 @@ def _layout(captures: Iterable[Capture]) -> dict[str, tuple[float, float]]:
     """Return the positions of the lenses relative to the reference's, where the metadata contains them."""
     result: dict[str, tuple[float, float]] = {}
     for capture in captures:
-        reference = capture.reference.parallax
+        reference = capture.reference.parallax_direction
         for band in capture.moving:
-            if reference is not None and band.parallax is not None:
-                result.setdefault(band.name, (band.parallax[0] - reference[0], band.parallax[1] - reference[1]))
+            if reference is not None and band.parallax_direction is not None:
+                x, y = band.parallax_direction
+                result.setdefault(band.name, (x - reference[0], y - reference[1]))
     return result
 
 

@@ -35,7 +35,7 @@ class CaptureReport:
     """Description of the calibration panel."""
     sky: str | None = None
     """Why the capture counts as sky."""
-    shortcomings: tuple[str, ...] = ()
+    failed_products: tuple[str, ...] = ()
     """Products that could not be written, and why."""
     seconds: float = 0.0
     """Processing time in this run."""
@@ -48,17 +48,17 @@ class CaptureReport:
         return None if self.path is None else read_sidecar(self.path)
 
     @property
-    def good(self) -> bool:
+    def is_complete(self) -> bool:
         """True if every band pair is aligned or predicted accurately enough, none is missing, and all products are
         written; also for panels and the sky.
         """
-        done = self.result is not None and self.result.status == "ok" and not self.shortcomings
+        done = self.result is not None and self.result.status == "ok" and not self.failed_products
         return self.state in ("panel", "sky") or done
 
     @property
     def problems(self) -> tuple[str, ...]:
         """Errors, except bands that are not aligned; those are in the sidecar."""
-        return self.shortcomings if self.error is None else (self.error, *self.shortcomings)
+        return self.failed_products if self.error is None else (self.error, *self.failed_products)
 
     @property
     def summary(self) -> str:
@@ -82,11 +82,6 @@ class CaptureReport:
         )
         head = "<tr><th>band</th><th>status</th><th>residual, px</th><th>reason</th></tr>"
         return f"<p><b>{escape(self.label)}</b>: {self.result.status}</p><table>{head}{rows}</table>"
-
-    @property
-    def useful(self) -> bool:
-        """True if at least one band pair is aligned or predicted."""
-        return self.result is not None and any(b.status in ("aligned", "predicted") for b in self.result.bands)
 
 
 class FlightReports(list[CaptureReport]):

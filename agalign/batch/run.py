@@ -162,7 +162,7 @@ class _FlightRun:
         if flights and not any(is_flight_of(captures, model.camera) for captures in flights):
             here = flight_camera(flights[0])
             raise ConfigurationError(f"{path}: was learned for {model.camera}; the images here are of {here}")
-        flight_settings = settings.flight.model_copy(update={"start": model.fingerprint})
+        flight_settings = settings.flight.model_copy(update={"start_model": model.fingerprint})
         return replace(self, given=model, settings=settings.model_copy(update={"flight": flight_settings}))
 
     def selected(self) -> tuple[list[SkyCapture], list[PanelReading], list[Capture]]:

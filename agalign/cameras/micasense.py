@@ -65,7 +65,7 @@ class MicaSense(Camera):
             saturation_value=max_twelve_bit_value if band.dtype == "uint16" else band.saturation_value,
             lens=lens,
             to_rig=rays_to_rig(lens, rotation(*pix4d.rig_degrees(tags))),
-            parallax=parallax,
+            parallax_direction=parallax,
             radiometry=centikelvin if is_thermal(band) else _radiometry(tags),
             lens_offset=pix4d.lens_offset(tags),
         )

@@ -109,7 +109,7 @@ class BandPair:
         return min(*self.scales.moving, *(() if self.is_coarse else self.scales.fixed)) < _MAX_REDUCED_SCALE
 
     @property
-    def file_px(self) -> float:
+    def file_pixel_size_px(self) -> float:
         """Size of a pixel of the reference's file, px of the fixed image; 1 for a coarse band, which has lower
         resolution.
         """
@@ -159,11 +159,11 @@ class BandPair:
         return self.moving_image if self.space == "undistorted" else replace(self.moving_image, lens=None)
 
     def mapping(
-        self, fixed_to_moving: Matrix, local: DisplacementField | None = None, parallax: Parallax | None = None
+        self, fixed_to_moving: Matrix, field: DisplacementField | None = None, parallax: Parallax | None = None
     ) -> PixelMapping:
-        """Return the complete mapping between raw pixels of the images; `local` replaces the rig's field."""
+        """Return the complete mapping between raw pixels of the images; `field` replaces the rig's field."""
         lenses = self.fixed.lens, self.moving.lens
-        return PixelMapping(fixed_to_moving, *lenses, local=local or self.field, parallax=parallax)
+        return PixelMapping(fixed_to_moving, *lenses, field=field or self.field, parallax=parallax)
 
     def warped_moving(self, mapping: PixelMapping) -> Raster:
         """Warp the channel mean of the moving image to the grid of the reference."""
@@ -278,9 +278,10 @@ def _pair(
 
 def _layout(reference: Band, moving: Band) -> tuple[float, float] | None:
     """Return the difference of the directions of parallax of two bands; None if unknown."""
-    if reference.parallax is None or moving.parallax is None:
+    if reference.parallax_direction is None or moving.parallax_direction is None:
         return None
-    return moving.parallax[0] - reference.parallax[0], moving.parallax[1] - reference.parallax[1]
+    (x, y), (reference_x, reference_y) = moving.parallax_direction, reference.parallax_direction
+    return x - reference_x, y - reference_y
 
 
 def longest_for(reference: Band, fixed_to_moving: Matrix) -> int:

@@ -118,7 +118,7 @@ def _predicted(
     """Return the alignment as `predicted` by a homography and lens shapes, which replace the field of `start`."""
     size_px, to_file = pair.fixed.size_px, pair.scales.fixed.inverse
     fitted = fit_in_rounds(
-        replace(start, local=None),
+        replace(start, field=None),
         lambda mapping: _measured(pair, mapping),
         size_px,
         is_accepted,

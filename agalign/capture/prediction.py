@@ -54,7 +54,11 @@ def _with_prediction(
         off_px = distance_px(known.mappings[pair.name], prediction.fixed_to_moving, rig.size_px)
         prediction = replace(prediction, off_px=off_px)
         evidence = Evidence(
-            alignment.joint, alignment.residual, pair.fixed.size_px, prediction=prediction, file_px=pair.file_px
+            alignment.joint,
+            alignment.residual,
+            pair.fixed.size_px,
+            prediction=prediction,
+            file_pixel_size_px=pair.file_pixel_size_px,
         )
         issues = issues_of(evidence)
         if not issues:

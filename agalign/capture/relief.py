@@ -269,11 +269,11 @@ class _Band:
         """Apply corrections of the corners (8,) and of the lens field; replace the baseline. Raises GeometryError."""
         plane, size_px = self.plane, self.candidate.pair.fixed.size_px
         matrix = geometry.compose(plane.fixed_to_moving, geometry.moving_corners(corners_px, *size_px))
-        local = plane.local
+        field = plane.field
         if lens_field is not None:
-            local = lens_field if local is None else lens_field.plus(local.on_lattice(lens_field.step_px, size_px))
+            field = lens_field if field is None else lens_field.plus(field.on_lattice(lens_field.step_px, size_px))
         x, y = baseline.tolist()
-        return replace(self, plane=replace(plane, fixed_to_moving=matrix, local=local), baseline=(x, y))
+        return replace(self, plane=replace(plane, fixed_to_moving=matrix, field=field), baseline=(x, y))
 
 
 def _aligned_group(
@@ -408,11 +408,11 @@ class _Estimate:
         if self.with_fields:
             result = pair.reference.displacement_field.refine(channel_mean(pair.moving_image), complete, verifying)
             if result.field is not None and result.held_out is not None:
-                complete, held_out = replace(complete, local=result.field), result.held_out
+                complete, held_out = replace(complete, field=result.field), result.held_out
         issues = WarpedPair(pair, complete, pair.warped_moving(complete), held_out).issues(joint)
         if issues:
             return replace(rejected, held_out=held_out)
-        kind: Geometry = "relief" if complete.local is None else "relief and field"
+        kind: Geometry = "relief" if complete.field is None else "relief and field"
         candidates = {"homography": plane.p95_px, kind: held_out.p95_px}
         alignment = Alignment(
             complete, pair.fixed.size_px, "aligned", (), candidate.seed, joint, held_out, candidates=candidates

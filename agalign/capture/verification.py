@@ -51,7 +51,7 @@ class WarpedPair:
 
     def with_mapping(self, mapping: PixelMapping) -> "WarpedPair":
         """Return the pair with another mapping; the residual is converted if the mappings are nearly equal."""
-        if mapping.local is self.mapping.local:
+        if mapping.field is self.mapping.field:
             corners = geometry.corners(*self.pair.fixed.size_px)
             difference_px = float(np.linalg.norm(mapping(corners) - self.mapping(corners), axis=1).max())
             if difference_px <= _MAX_CONVERTED_PX:
@@ -87,8 +87,9 @@ class WarpedPair:
 
     def issues(self, joint: JointResult[FixedImagePx]) -> tuple[Issue, ...]:
         """Return the issues of the result with this mapping."""
-        file_px = self.pair.file_px
-        return issues_of(Evidence(joint, self.residual, self.pair.fixed.size_px, images=self, file_px=file_px))
+        pair = self.pair
+        size_px, pixel_px = pair.fixed.size_px, pair.file_pixel_size_px
+        return issues_of(Evidence(joint, self.residual, size_px, images=self, file_pixel_size_px=pixel_px))
 
 
 def _residual_of(pair: BandPair, mapping: PixelMapping, warped: Raster) -> Residual[FixedImagePx]:
@@ -123,11 +124,11 @@ def verified(
     warped_pair = WarpedPair.of(pair, mapping) if warped_pair is None else warped_pair.with_mapping(mapping)
     if by_halves is not None and joint is result:
         warped_pair = warped_pair.cross_validated(by_halves)
-    warped_pair, issues, local = _verified(warped_pair, joint, use)
+    warped_pair, issues, displacement = _verified(warped_pair, joint, use)
     candidates: dict[Geometry, FixedImagePx] = {}
-    if local is not None:
-        candidates = {"homography": local.before_p95_px, "field": local.after_p95_px}
-    if issues and (local is None or local.field is None):
+    if displacement is not None:
+        candidates = {"homography": displacement.before_p95_px, "field": displacement.after_p95_px}
+    if issues and (displacement is None or displacement.field is None):
         return replace(at_seed(pair, seed, issues), joint=joint, candidates=candidates)
     size_px, residual = pair.fixed.size_px, warped_pair.residual
     alignment = Alignment(warped_pair.mapping, size_px, "aligned", issues, seed, joint, residual, candidates=candidates)
@@ -173,16 +174,16 @@ def _verified(
     pair, issues = plane.pair, plane.issues(joint)
     if not _needs_field(use, issues, has_rig=pair.has_rig):
         return plane, issues, None
-    local = pair.reference.displacement_field.refine(channel_mean(pair.moving_image), plane.mapping)
-    if local.field is not None:
-        displaced = WarpedPair.of(pair, replace(plane.mapping, local=local.field))
-        held_out = displaced if local.held_out is None else replace(displaced, residual=local.held_out)
+    displacement = pair.reference.displacement_field.refine(channel_mean(pair.moving_image), plane.mapping)
+    if displacement.field is not None:
+        displaced = WarpedPair.of(pair, replace(plane.mapping, field=displacement.field))
+        held_out = displaced if displacement.held_out is None else replace(displaced, residual=displacement.held_out)
         # All checks run again, those of windows on all windows and on the held-out ones.
         remaining = held_out.issues(joint)
         by_parallax = all(issue.kind in _PARALLAX_ISSUES for issue in remaining)
         if not displaced.issues(joint) and by_parallax and (issues or not remaining):
-            return held_out, remaining, local
-    return plane, issues, replace(local, field=None)
+            return held_out, remaining, displacement
+    return plane, issues, replace(displacement, field=None)
 
 
 def _needs_field(use: ReliefUse, issues: tuple[Issue, ...], *, has_rig: bool) -> bool:

@@ -77,11 +77,11 @@ def field_options() -> dict[str, FieldOption]:
 
 
 def _options_of(owner: str, value: Any, path: tuple[str, ...]) -> Iterator[FieldOption]:
-    from agalign.config import Option, Stage
+    from agalign.config import Option, SettingsModel
 
     for name, of_field in type(value).__pydantic_fields__.items():
         default = getattr(value, name)
-        if isinstance(default, Stage):
+        if isinstance(default, SettingsModel):
             yield from _options_of(owner, default, (*path, name))
             continue
         option = next((m for m in of_field.metadata if isinstance(m, Option)), Option())

@@ -100,7 +100,7 @@ def print_plan(flight: FolderScan, out: Path, settings: Settings, options: RunOp
 class RunTotals:
     """Totals of a run so far; reports are not kept, which limits memory."""
 
-    good: bool
+    is_complete: bool
     """All captures are good, no file has a problem, and the report is written."""
     failures: FailureGroups
     states: Counter[str] = field(default_factory=Counter)
@@ -112,7 +112,7 @@ class RunTotals:
     def add(self, report: "CaptureReport") -> None:
         """Add the report of a capture."""
         self.states[report.state] += 1
-        self.good &= report.good
+        self.is_complete &= report.is_complete
         if report.result is None:
             return
         self.failures.add(report.label, report.result)
@@ -185,11 +185,11 @@ def run(
             if not totals.states:
                 raise
             terminal.problem(str(error))
-            totals.good = False
+            totals.is_complete = False
         finally:
             # Also after an interruption.
             if totals.states:
-                totals.good &= _write_pages(out, terminal, changed=set(totals.states) != {"kept"})
+                totals.is_complete &= _write_pages(out, terminal, changed=set(totals.states) != {"kept"})
     seconds = time.monotonic() - started
     terminal.event("finished", seconds=round(seconds, 1), captures=totals.states.total(), **totals.states)
     return totals
@@ -333,7 +333,7 @@ def conclude(totals: RunTotals, out: Path, terminal: Terminal) -> int:
     if not counts["aligned"] + counts["predicted"]:
         terminal.problem("no band pair could be aligned" if totals.bands else "no capture could be processed")
         return ExitCode.PARTIAL if totals.bands else ExitCode.NOTHING
-    return ExitCode.OK if totals.good else ExitCode.PARTIAL
+    return ExitCode.OK if totals.is_complete else ExitCode.PARTIAL
 
 
 def _print_totals(totals: RunTotals, counts: Counter[str], terminal: Terminal) -> None:

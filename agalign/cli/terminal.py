@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from agalign.errors import AgalignError, ConfigurationError, is_out_of_memory
-from agalign.values.text import harmless
+from agalign.values.text import escape_controls
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -58,7 +58,7 @@ def shown(text: str) -> str:
     """Return an external text for rich, with markup and control characters escaped."""
     from rich.markup import escape
 
-    return escape(harmless(text))
+    return escape(escape_controls(text))
 
 
 def in_json(value: Any) -> Any:

@@ -44,7 +44,7 @@ def loss_surface(
                 level = state.level(ImageGroup.of_one(fixed, moving, start), scale, [0])
                 net = state.paper_descriptor([fixed.channels, moving.channels])
                 pool = level.trainable
-                result[row, column] = descend(state, net, level, pool, start, training, move=False).loss
+                result[row, column] = descend(state, net, level, pool, start, training, update_psi=False).loss
         progress((row + 1) / len(offsets_px))
     return result
 

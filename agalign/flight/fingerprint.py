@@ -9,14 +9,14 @@ from pathlib import Path
 import numpy as np
 
 from agalign._version import __version__
-from agalign.config import Settings, Stage
+from agalign.config import Settings, SettingsModel
 from agalign.values.capture import Capture
 from agalign.values.lens import Lens
 
 Fact = str | int | float | bool | None | np.ndarray | Lens | Iterable["Fact"]
 
 
-def fingerprint(capture: Capture, *stages: Stage) -> str:
+def fingerprint(capture: Capture, *stages: SettingsModel) -> str:
     """Return the hash of the files of a capture, the metadata of its bands, settings and the version of agalign.
 
     It does not depend on the other captures of the flight, so results remain valid when captures are added.

@@ -93,7 +93,7 @@ def align_by_paper(
         descent = descend(state, net, level, pool, group.mappings[0], training, report=report)
         group.mappings[0] = descent.fixed_to_moving
         steps += descent.steps
-    result = refine(state, net, group, move=False)[0]
+    result = refine(state, net, group, update_psi=False)[0]
     if isinstance(result, Issue):
         return net, result
     return net, replace(
@@ -128,17 +128,17 @@ def descend(
     training: Training = DEFAULT_TRAINING,
     *,
     report: Callable[[float], None] = lambda _: None,
-    move: bool = True,
+    update_psi: bool = True,
 ) -> Descent:
     """Minimise sum L0(x; psi, theta) + sum L1(x, x'; theta) over theta and psi (paper, Eq. 5).
 
-    Keypoints x are drawn from `pool`. Without `move`, psi is constant and only theta is learned (paper, Eq. 3). Raises
+    Keypoints x are drawn from `pool`. Without `update_psi`, only theta is learned (paper, Eq. 3). Raises
     NotEnoughTextureError.
     """
     size_px = level.fixed.size_px
     psi = psi_from_homography(to_float64(level.homography(start, 0)), *size_px).to(level.fixed.image).requires_grad_()
     is_free = torch.zeros_like(psi)
-    if move:
+    if update_psi:
         is_free[list(FAMILY_PARAMETERS[state.family or "homography"])] = 1.0
     keypoints = _draw(state, level, pool, homography_from_psi(psi.detach(), *size_px), training.keypoints)
 

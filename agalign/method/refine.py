@@ -229,12 +229,12 @@ def _shifted_losses(band: MovingBand, homography: Tensor, keypoints: Keypoints, 
 
 @torch.no_grad()
 def refine(
-    state: JointState, net: Descriptor, group: ImageGroup, *, move: bool = True, patches: int = PATCHES
+    state: JointState, net: Descriptor, group: ImageGroup, *, update_psi: bool = True, patches: int = PATCHES
 ) -> list[JointResult[FixedImagePx] | Issue]:
     """Refine every psi of a capture at full resolution with theta frozen.
 
     Returns a result per moving image, or the issue that prevents one. A step uses up to `patches` patches. Without
-    `move`, psi is not changed and only its retrieval and standard errors are computed. Raises NoContrastError.
+    `update_psi`, psi is not changed and only its retrieval and standard errors are computed. Raises NoContrastError.
     """
     level = state.level(group, 1.0, range(len(group.moving)))
     h = [level.homography(matrix, b) for b, matrix in enumerate(group.mappings)]
@@ -248,7 +248,7 @@ def refine(
 
     def result(band: MovingBand, start: Tensor) -> JointResult[FixedImagePx] | Issue:
         try:
-            if move:
+            if update_psi:
                 homography, step = solver.converge(band, start, reference_patches)
             else:
                 homography, step = start, solver.step(band, start, reference_patches)

@@ -13,7 +13,7 @@ from agalign.flight.fingerprint import fingerprint
 from agalign.products.aligned_files import BandFiles, Stack
 from agalign.products.product import ProductContext, WrittenFile
 from agalign.products.relief_map import ReliefMap
-from agalign.products.sidecar import BandPart, Sidecar, is_delivered
+from agalign.products.sidecar import BandPart, Sidecar, is_usable
 from agalign.values import geometry
 from agalign.values.alignment import Alignment
 from agalign.values.capture import Band
@@ -32,9 +32,9 @@ errors are at the border, where the derivatives are estimated from one side."""
 
 
 def capture_status(bands: Iterable[BandPart], accept_predicted_px: float) -> CaptureStatus:
-    """Return `ok` if every moving band is delivered, `failed` if all failed, else `degraded`."""
+    """Return `ok` if every moving band is usable, `failed` if all failed, else `degraded`."""
     moving = [b for b in bands if b.status != "reference"]
-    if all(is_delivered(b.status, b.prediction, accept_predicted_px) for b in moving):
+    if all(is_usable(b.status, b.prediction, accept_predicted_px) for b in moving):
         return "ok"
     return "failed" if all(b.status == "failed" for b in moving) else "degraded"
 
@@ -115,7 +115,7 @@ def _band_part(context: ProductContext, band: Band) -> BandPart:
     mapping, size_px = alignment.mapping, context.capture.reference.size_px
     grid_px = _grid_px(mapping.of_the_plane, size_px)
     lenses = (mapping.fixed_lens, mapping.moving_lens)
-    field = mapping.local
+    field = mapping.field
     if field is not None:
         field = field.on_lattice(field.step_px / field.scale.mean, size_px)
     facts |= {

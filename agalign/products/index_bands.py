@@ -13,7 +13,7 @@ from rasterio.windows import Window
 from agalign.config import CheckSettings
 from agalign.errors import InputError
 from agalign.pixels.raster import OpenRaster, innermost_cause, open_raster
-from agalign.products.sidecar import BandResult, CaptureResult, is_delivered
+from agalign.products.sidecar import BandResult, CaptureResult, is_usable
 from agalign.values.image import FloatImage, Tile, reduced_size_px
 from agalign.values.quality import UNUSABLE
 
@@ -64,7 +64,7 @@ def bands_of(sidecar: CaptureResult, folder: Path, *, mask_qa: bool = False) -> 
 
 def _problem_of(band: BandResult, limit_px: float) -> str:
     """The reason why a band cannot be used; empty if it can."""
-    if is_delivered(band.status, band.prediction, limit_px) and band.place is not None:
+    if is_usable(band.status, band.prediction, limit_px) and band.place is not None:
         return ""
     error = "" if band.prediction is None else f" to {band.prediction.std_px:.1f} px, not {limit_px:g}"
     return f"{band.band} is {band.status}{error} ({band.reason})"

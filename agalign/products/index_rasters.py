@@ -60,7 +60,7 @@ class IndexRasters(Product):
         return [paths.file(f"_{name}{suffix}") for name in names for suffix in (".tif", ".png")]
 
     def write(self, context: ProductContext) -> list[WrittenFile]:
-        """Write the indices whose bands the capture has and that are delivered.
+        """Write the indices whose bands the capture has and that are usable.
 
         Raises InputError if bands are in the wrong unit, OutputError.
         """
@@ -112,7 +112,7 @@ def _has_bands(bands: Sequence[Band], name: str) -> bool:
 
 def _bands(context: ProductContext) -> list[IndexBand]:
     places, result = context.places, []
-    usable = {context.capture.reference.name, *context.delivered} & set(places)
+    usable = {context.capture.reference.name, *context.usable} & set(places)
     for band in context.capture.bands:
         if band.name in usable:
             file, index = places[band.name]
@@ -129,7 +129,7 @@ def write_rasters(
     """Write `base`_<index>.tif and .png of a capture's bands, each atomically.
 
     Without `overwrite`, rasters that an earlier command wrote from the same bands with the same formula are kept. If a
-    band of an index is missing, not delivered or not in the unit that the index needs, the report has the problem.
+    band of an index is missing, not usable or not in the unit that the index needs, the report has the problem.
     Raises OutputError, or InputError for a file that cannot be read.
     """
     reports = []
@@ -164,7 +164,7 @@ def outdated_rasters(base: Path) -> Iterator[Path]:
 
 
 def chosen_bands(bands: Sequence[IndexBand], index: Index) -> list[IndexBand]:
-    """Return the bands of an index. Raises InputError if one is missing or not delivered."""
+    """Return the bands of an index. Raises InputError if one is missing or not usable."""
     chosen = [bands[i] for i in bands_for(index, [b.name for b in bands], [b.wavelength_nm for b in bands])]
     for band in chosen:
         if band.problem:

@@ -42,7 +42,7 @@ the image from which the weights are fitted.
 
 
 class PanSharpened(Product):
-    """The delivered multispectral bands at the resolution of the panchromatic band."""
+    """The usable multispectral bands at the resolution of the panchromatic band."""
 
     kind = "pan_sharpened"
     suffix = ".pan.tif"
@@ -57,7 +57,7 @@ class PanSharpened(Product):
             )
 
     def write(self, context: ProductContext) -> list[WrittenFile]:
-        """Write <capture>.pan.tif; nothing if the panchromatic band is not delivered."""
+        """Write <capture>.pan.tif; nothing if the panchromatic band is not usable."""
         fine = {"resolution": "finest", "format": "gtiff", "compression": "none"}
         settings, path = context.write_settings.model_copy(update=fine), context.paths.file(self.suffix)
         sources = _sources(context, settings)
@@ -87,11 +87,11 @@ class _Sources:
 
 
 def _sources(context: ProductContext, settings: WriteSettings) -> _Sources | None:
-    """None if the panchromatic band is not delivered, or no band is within its spectral range."""
-    pan, delivered = panchromatic(context.capture), context.delivered
-    if not pan or not {b.name for b in pan} <= {context.capture.reference.name, *delivered}:
+    """None if the panchromatic band is not usable, or no band is within its spectral range."""
+    pan, usable = panchromatic(context.capture), context.usable
+    if not pan or not {b.name for b in pan} <= {context.capture.reference.name, *usable}:
         return None
-    layers, grid = output_layers(context.capture, delivered, settings, context.rig)
+    layers, grid = output_layers(context.capture, usable, settings, context.rig)
     bands = [layer for layer in layers if _is_multispectral(layer, pan)]
     is_sharpened = [_is_in_range(layer.band, pan) for layer in bands]
     if not any(is_sharpened):

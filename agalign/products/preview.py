@@ -79,7 +79,7 @@ class Preview(Product):
         """Write <capture>.preview.jpg."""
         path, size_px = context.paths.file(self.suffix), context.capture.reference.size_px
         bands = [b.name for b in context.capture.bands]
-        mapped = context.usable if context.write_settings.error_map else {}
+        mapped = context.with_pixels if context.write_settings.error_map else {}
         errors_px = {name: error_lattice_px(a, size_px, context.grid) for name, a in mapped.items()}
         part = write_preview(
             context.reduced_bands, bands, errors_px, path, context.max_preview_bytes, relief_view(context)
@@ -89,12 +89,12 @@ class Preview(Product):
 
 def relief_view(context: ProductContext) -> ReliefView | None:
     """Return the reduced relief of a capture; None if no band is displaced by one."""
-    relief = relief_of(context.usable)
+    relief = relief_of(context.with_pixels)
     if relief is None:
         return None
     reduction = max(1.0, max(context.grid.width, context.grid.height) / _MAX_TILE_PX)
     size_px = reduced_size_px((context.grid.width, context.grid.height), reduction)
-    layers = relief_layers(context.capture, context.usable, relief, context.grid, size_px)
+    layers = relief_layers(context.capture, context.with_pixels, relief, context.grid, size_px)
     range_m = layers["range"][np.isfinite(layers["range"])]
     if range_m.size == 0:
         return ReliefView(layers["parallax"], None)
@@ -210,7 +210,7 @@ class BeforeAfterPicture(Product):
     def write(self, context: ProductContext) -> list[WrittenFile]:
         """Write <capture>.png."""
         path, reference = context.paths.file(self.suffix), context.capture.reference
-        chosen = choose_bands([b for b in context.capture.moving if b.name in context.usable], reference)
+        chosen = choose_bands([b for b in context.capture.moving if b.name in context.with_pixels], reference)
         write_picture(context.reduced_bands, [b.name for b in chosen], path)
         return [WrittenFile(self.kind, path, StacAsset("picture", "image/png", ("thumbnail",)))]
 

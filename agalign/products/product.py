@@ -19,7 +19,7 @@ from agalign.products.checked_raster import (
 )
 from agalign.products.drawing import ReducedBands, read_reduced_bands
 from agalign.products.layout import Layer
-from agalign.products.sidecar import PreviewPart, is_delivered
+from agalign.products.sidecar import PreviewPart, is_usable
 from agalign.values.alignment import Alignment
 from agalign.values.capture import Capture
 from agalign.values.files import file_checksum
@@ -111,15 +111,15 @@ class ProductContext:
         return self.settings.write
 
     @property
-    def usable(self) -> dict[str, Alignment[FixedFilePx]]:
+    def with_pixels(self) -> dict[str, Alignment[FixedFilePx]]:
         """The alignments that did not fail, by band, in the order of the capture's bands."""
         return {b.name: a for b in self.capture.moving if (a := self.alignments[b.name]).status != "failed"}
 
     @property
-    def delivered(self) -> dict[str, Alignment[FixedFilePx]]:
+    def usable(self) -> dict[str, Alignment[FixedFilePx]]:
         """The alignments of the aligned bands, and of predicted bands whose standard error is accepted."""
         limit_px = self.settings.check.accept_predicted_px
-        return {name: a for name, a in self.usable.items() if is_delivered(a.status, a.prediction, limit_px)}
+        return {name: a for name, a in self.with_pixels.items() if is_usable(a.status, a.prediction, limit_px)}
 
     @property
     def places(self) -> dict[str, tuple[WrittenFile, int]]:

@@ -37,12 +37,12 @@ class ErrorMap(Product):
 
     def write(self, context: ProductContext) -> list[WrittenFile]:
         """Write <capture>.error.tif: float32, px of the reference's file, a layer for each moving band."""
-        usable, size_px, grid = context.usable, context.capture.reference.size_px, context.grid
+        with_pixels, size_px, grid = context.with_pixels, context.capture.reference.size_px, context.grid
         layers = [
             LayerDescription(name, tags={"units": "px of the reference", "STATUS": alignment.status})
-            for name, alignment in usable.items()
+            for name, alignment in with_pixels.items()
         ]
-        blocks = ((_error_px(a, size_px, grid), index, 0, 0) for index, a in enumerate(usable.values(), start=1))
+        blocks = ((_error_px(a, size_px, grid), index, 0, 0) for index, a in enumerate(with_pixels.values(), start=1))
         return self.write_layers(context, layers, blocks, StacAsset("error", GEOTIFF, ("metadata",)))
 
 
@@ -84,9 +84,9 @@ class QualityRaster(Product):
     def write(self, context: ProductContext) -> list[WrittenFile]:
         """Write <capture>.qa.tif. Raises OutputError, or UnreadableFileError for an input."""
         grid, size_px = context.grid, context.capture.reference.size_px
-        nodes = {name: error_lattice_px(a, size_px, grid) for name, a in context.usable.items()}
+        nodes = {name: error_lattice_px(a, size_px, grid) for name, a in context.with_pixels.items()}
         water = _water_bands(context.layers)
-        predicted = {name for name, alignment in context.usable.items() if alignment.status == "predicted"}
+        predicted = {name for name, alignment in context.with_pixels.items() if alignment.status == "predicted"}
 
         def flags_on(tile: Tile) -> list[Flags]:
             bands = [

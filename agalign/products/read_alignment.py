@@ -43,7 +43,7 @@ def read_alignment(sidecar: str | Path, band: str) -> Alignment[FixedFilePx]:
         raise SidecarError(f"{path}: has no mapping of the band {band!r}")
     fixed, moving = (None, None) if part.lenses is None else (Lens(**dict(one)) for one in part.lenses)
     field = None if part.field is None else DisplacementField(part.field.step_px, np.array(part.field.displacements_px))
-    mapping = PixelMapping(np.array(part.homography.fixed_to_moving), fixed, moving, local=field)
+    mapping = PixelMapping(np.array(part.homography.fixed_to_moving), fixed, moving, field=field)
     if part.relief is not None:
         mapping = mapping.with_parallax(_parallax(path, content, part.relief, fixed))
     peaks = part.seed.peak_sigma, part.seed.runner_up_sigma

@@ -30,10 +30,10 @@ class ReliefMap(Product):
 
     def write(self, context: ProductContext) -> list[WrittenFile]:
         """Write <capture>.relief.tif."""
-        relief = relief_of(context.usable)
+        relief = relief_of(context.with_pixels)
         if relief is None:
             return []
-        layers = relief_layers(context.capture, context.usable, relief, context.grid)
+        layers = relief_layers(context.capture, context.with_pixels, relief, context.grid)
         if not context.write_settings.relief_map:
             layers = {"parallax": layers["parallax"]}
         descriptions = [LayerDescription(name, RELIEF_UNITS[name]) for name in layers]

@@ -17,7 +17,7 @@ from agalign.products.text_files import read_model, write_model
 from agalign.values.capture import Capture
 from agalign.values.cores import usable_cores
 from agalign.values.files import RUN_FILE
-from agalign.values.text import harmless
+from agalign.values.text import escape_controls
 
 _LIBRARIES = ("torch", "numpy", "rasterio", "opencv-python-headless", "tifffile", "pydantic")
 
@@ -87,7 +87,7 @@ class RunPart(_Part):
 
     def add_problem(self, what: str, text: str) -> None:
         """Add a problem of a file or capture; characters that are not printable are escaped."""
-        self.problems.append(ProblemPart(of=harmless(what), problem=harmless(text)))
+        self.problems.append(ProblemPart(of=escape_controls(what), problem=escape_controls(text)))
 
     def add_seconds(self, stage: str, seconds: float) -> None:
         """Add processing time of a stage."""
@@ -107,8 +107,8 @@ def begun(folder: Path, settings: Settings, captures: Sequence[Capture] = (), co
         state="running",
         started_at=datetime.now(UTC).isoformat(timespec="seconds"),
         seconds=0.0,
-        input=harmless(str(folder)),
-        command=harmless(command),
+        input=escape_controls(str(folder)),
+        command=escape_controls(command),
         cameras=camera_overviews(captures),
         versions=_versions(),
         machine=_machine(settings),

@@ -571,9 +571,7 @@ class Sidecar(CaptureResult):
         return CaptureResult.model_validate(self.model_dump(by_alias=True, exclude={"bands": {"__all__": tables}}))
 
 
-def is_delivered(
-    status: PairStatus, prediction: Prediction | PredictionPart | None, accept_predicted_px: float
-) -> bool:
+def is_usable(status: PairStatus, prediction: Prediction | PredictionPart | None, accept_predicted_px: float) -> bool:
     """Return True for the reference, an aligned band, or a predicted band whose standard error is accepted."""
     if status == "predicted":
         return prediction is not None and prediction.std_px <= accept_predicted_px

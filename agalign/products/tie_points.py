@@ -23,7 +23,7 @@ from agalign.values.capture import Band, Capture, Georeference
 from agalign.values.choices import PairStatus
 from agalign.values.files import write_text
 from agalign.values.pixel_units import FixedFilePx
-from agalign.values.text import harmless
+from agalign.values.text import escape_controls
 
 
 @dataclass(frozen=True)
@@ -54,7 +54,7 @@ class TiePoints(Product):
     def write(self, context: ProductContext) -> list[WrittenFile]:
         """Write <capture>.ties.csv and <capture>.ties.geojson."""
         table, features = self.paths(context.capture, context.paths, context.write_settings)
-        ties = ((b, a) for b in context.capture.moving if (a := context.usable.get(b.name)) is not None and a.ties)
+        ties = ((b, a) for b in context.capture.moving if (a := context.with_pixels.get(b.name)) is not None and a.ties)
         points = [point for band, alignment in ties for point in tie_points(band, alignment)]
         positions = [f"{side}_{axis}_px" for side in ("reference", "moving") for axis in "xy"]
         write_csv(table, ("band", "status", *positions, "residual_px", "weight"), map(_cells, points))
@@ -86,7 +86,7 @@ def tie_points(band: Band, alignment: Alignment[FixedFilePx]) -> Iterator[TiePoi
 
 def _cells(point: TiePoint) -> list[str]:
     numbers = (*point.reference_px, *point.moving_px, point.residual_px, point.weight)
-    return [harmless(point.band), point.status, *(f"{n:.4f}" for n in numbers)]
+    return [escape_controls(point.band), point.status, *(f"{n:.4f}" for n in numbers)]
 
 
 def _geojson(points: Sequence[TiePoint], georeference: Georeference | None) -> str:
@@ -104,5 +104,5 @@ def _geojson(points: Sequence[TiePoint], georeference: Georeference | None) -> s
         rounded = {k: v if isinstance(v, str) else np.round(v, 4).tolist() for k, v in vars(point).items()}
         coordinates = [round(v, 8) for v in place.tolist()]  # 1e-8 degrees are a millimetre
         feature = {"type": "Feature", "geometry": {"type": "Point", "coordinates": coordinates}}
-        features.append(feature | {"properties": rounded | {"band": harmless(point.band)}})
+        features.append(feature | {"properties": rounded | {"band": escape_controls(point.band)}})
     return json.dumps({"type": "FeatureCollection", "coordinates_in": unit, "features": features}) + "\n"

@@ -31,7 +31,7 @@ VIGNETTING = 0.35
 """Relative decrease of the light from the centre to the corners."""
 
 
-Spoil = Callable[[Field, np.random.Generator], Field]
+Degrade = Callable[[Field, np.random.Generator], Field]
 """Changes the light (height, width), 0 to 1, that reaches a sensor."""
 
 
@@ -41,9 +41,9 @@ class Shot:
 
     pose: Pose
     ground: Ground
-    spoil: Spoil | None = None
-    spoilt: tuple[str, ...] | None = None
-    """Names of the bands that `spoil` changes; None for all."""
+    degrade: Degrade | None = None
+    degraded_bands: tuple[str, ...] | None = None
+    """Names of the bands that `degrade` changes; None for all."""
     without: tuple[str, ...] = ()
     """Bands without a file."""
     trouble: str = ""
@@ -102,9 +102,9 @@ def _write(
         for number, shot in enumerate(shots, start=before + 1):
             if shot.ground is not ground:
                 ground, painted = shot.ground, reflectance(shot.ground, band)
-            spoil = shot.spoil if shot.spoilt is None or band.name in shot.spoilt else None
+            degrade = shot.degrade if shot.degraded_bands is None or band.name in shot.degraded_bands else None
             light = painted if band.sees == "heat" else painted * np.float32(shot.sun * shot.shutter)
-            pixels = recorded(view(light, shot.ground, band, shot.pose, size_px), band, rng, spoil)
+            pixels = recorded(view(light, shot.ground, band, shot.pose, size_px), band, rng, degrade)
             if band.name not in shot.without:
                 path = images / camera.file_name(band, number)
                 path.parent.mkdir(parents=True, exist_ok=True)
@@ -189,13 +189,15 @@ def view(painted: Field, ground: Ground, band: BandSpec, pose: Pose, size_px: tu
     return np.asarray(image, np.float32)
 
 
-def recorded(scene: Field, band: BandSpec, rng: np.random.Generator, spoil: Spoil | None = None) -> NDArray[np.uint16]:
+def recorded(
+    scene: Field, band: BandSpec, rng: np.random.Generator, degrade: Degrade | None = None
+) -> NDArray[np.uint16]:
     """Return the sensor values (height, width) for a view of reflectances, with vignetting and noise; for heat,
     hundredths of a kelvin.
     """
     if band.sees == "heat":
         warmest_c, noise_c = 50.0, 0.05
-        celsius = warmest_c * (scene if spoil is None else spoil(scene, rng))
+        celsius = warmest_c * (scene if degrade is None else degrade(scene, rng))
         celsius = celsius + rng.normal(0, noise_c, scene.shape)
         return np.asarray(np.rint(100 * (celsius + 273.15)).astype(np.uint16))
     height, width = scene.shape
@@ -203,7 +205,7 @@ def recorded(scene: Field, band: BandSpec, rng: np.random.Generator, spoil: Spoi
     radius2 = ((x - width / 2) ** 2)[None, :] + ((y - height / 2) ** 2)[:, None]
     vignetting = 1 - VIGNETTING * radius2 / ((width / 2) ** 2 + (height / 2) ** 2)
     light = np.asarray(scene * band.exposure, np.float32)
-    signal = np.clip((light if spoil is None else spoil(light, rng)) * vignetting, 0, 1)
+    signal = np.clip((light if degrade is None else degrade(light, rng)) * vignetting, 0, 1)
     electrons = signal * 4000
     noisy = electrons + rng.normal(size=signal.shape) * np.sqrt(electrons + 60)
     levels = BLACK_LEVEL + noisy / 4000 * (WHITE_LEVEL - BLACK_LEVEL)

@@ -283,8 +283,8 @@ class Alignment(Generic[FixedPx]):
     def geometry(self) -> Geometry:
         """What the mapping has in addition to the homography and the lenses of the tags."""
         if self.mapping.parallax is not None:
-            return "relief" if self.mapping.local is None else "relief and field"
-        return "homography" if self.mapping.local is None else "field"
+            return "relief" if self.mapping.field is None else "relief and field"
+        return "homography" if self.mapping.field is None else "field"
 
     @property
     def space(self) -> Space:

@@ -97,7 +97,7 @@ class Band:
     rig share, from the tags."""
     other_to_rig: Matrix | None = None
     """The same from other tags of the file, if the maker writes both."""
-    parallax: tuple[float, float] | None = None
+    parallax_direction: tuple[float, float] | None = None
     """Direction (right, down) in which its pixels move as the range decreases, relative to the other bands of the rig,
     in any unit."""
     lens_offset: tuple[float, float] | None = None

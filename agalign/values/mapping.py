@@ -32,7 +32,7 @@ class PixelMapping:
     moving_lens: Lens | None = None
     pre_distortion: Lens | None = None
     """Lens that distorts the given positions first, if these are undistorted px of the reference."""
-    local: DisplacementField | None = None
+    field: DisplacementField | None = None
     """Displacements of raw reference px, applied first."""
     parallax: Parallax | None = None
     """Displacements of undistorted reference px, by the parallax at the raw ones."""
@@ -44,7 +44,7 @@ class PixelMapping:
     def undistorted(self, reference_px: ArrayLike) -> Points:
         """(..., 2) raw reference pixels to those that the homography maps: displaced, undistorted, with parallax."""
         raw = lens.distort(self.pre_distortion, reference_px)
-        displaced = raw if self.local is None else raw + self.local(raw)
+        displaced = raw if self.field is None else raw + self.field(raw)
         undistorted = lens.undistort(self.fixed_lens, displaced)
         return undistorted if self.parallax is None else undistorted + self.parallax.displacements(raw)
 
@@ -60,7 +60,7 @@ class PixelMapping:
         for _ in range(max_iterations):
             of_plane = undistorted if self.parallax is None else undistorted - self.parallax.displacements(raw)
             displaced = lens.distort(self.fixed_lens, of_plane)
-            result = displaced if self.local is None else displaced - self.local(raw)
+            result = displaced if self.field is None else displaced - self.field(raw)
             change_px, raw = np.abs(result - raw).max(axis=-1, keepdims=True), result
             if not (change_px > tolerance_px).any():
                 break
@@ -79,7 +79,7 @@ class PixelMapping:
 
     def from_undistorted(self, reference_lens: Lens) -> "PixelMapping":
         """The mapping for undistorted pixels of the reference instead of its raw ones."""
-        if self.fixed_lens is not None and self.local is None and self.parallax is None:
+        if self.fixed_lens is not None and self.field is None and self.parallax is None:
             return replace(self, fixed_lens=None)
         return replace(self, pre_distortion=reference_lens)
 
@@ -90,7 +90,7 @@ class PixelMapping:
             lens.rescaled(self.fixed_lens, fixed_scale),
             lens.rescaled(self.moving_lens, moving_scale),
             lens.rescaled(self.pre_distortion, fixed_scale),
-            None if self.local is None else self.local.rescaled(fixed_scale),
+            None if self.field is None else self.field.rescaled(fixed_scale),
             None if self.parallax is None else self.parallax.rescaled(fixed_scale),
         )
 
@@ -98,7 +98,7 @@ class PixelMapping:
     def is_curved(self) -> bool:
         """True where the mapping is not just a homography: a lens model or displacements take part."""
         return (
-            self.local is not None
+            self.field is not None
             or self.parallax is not None
             or any(map(lens.is_distorting, (self.fixed_lens, self.moving_lens, self.pre_distortion)))
         )
@@ -157,9 +157,9 @@ class PixelMapping:
 
     @property
     def _knot_step_px(self) -> int:
-        if self.local is None:
+        if self.field is None:
             return _KNOT_STEP_PX
-        return int(np.clip(self.local.step_px / 4, _FIELD_KNOT_STEP_PX, _KNOT_STEP_PX))
+        return int(np.clip(self.field.step_px / 4, _FIELD_KNOT_STEP_PX, _KNOT_STEP_PX))
 
 
 def _along(start: int, length: int) -> Points:

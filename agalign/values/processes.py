@@ -302,7 +302,7 @@ class Worker:
     def exit_code(self, within_s: float = ENDS_WITHIN_S) -> int | None:
         """Return the exit code, -n for signal n; None if the process was not started or does not end in time.
 
-        A process whose fork server was killed is killed, and its end waited for.
+        If its fork server was killed, the process is killed first.
         """
         until_s = time.monotonic() + within_s
         if not self._launched or not wait([self.process.sentinel], within_s):

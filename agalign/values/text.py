@@ -8,7 +8,7 @@ def counted(number: int, what: str) -> str:
     return f"{number:,} {what}{'' if number == 1 else 's'}"
 
 
-def harmless(text: str) -> str:
+def escape_controls(text: str) -> str:
     r"""Return the text on one line, with control characters (terminal escapes, changes of text direction) escaped as
     `\x1b`.
     """
@@ -28,5 +28,5 @@ def without_formula(value: object) -> object:
     """Return a value for a table; a text that a spreadsheet would evaluate as a formula is quoted."""
     if not isinstance(value, str):
         return value
-    text = harmless(value)
+    text = escape_controls(value)
     return f"'{text}" if text.startswith(("=", "+", "-", "@")) else text

@@ -119,7 +119,7 @@ class Evidence(Generic[FixedPx]):
     """None omits the checks that use pixels."""
     prediction: Prediction | None = None
     """Prediction by the rig, with the distance `off_px` of the result; None without a rig."""
-    file_px: float = 1.0
+    file_pixel_size_px: float = 1.0
     """Size of a pixel of the reference's file on this grid; the limits of residual shifts are in px of the file."""
 
 
@@ -154,7 +154,7 @@ def _window_issues(evidence: Evidence[FixedPx]) -> Iterator[Issue]:
         yield Issue(COVERAGE, residual.coverage, _MIN_COVERAGE)
     measured = len(residual.measured_px)
     count = max(measured, 1)
-    is_far = np.linalg.norm(np.nan_to_num(residual.shifts_px), axis=1) > _MAX_SHIFT_PX * evidence.file_px
+    is_far = np.linalg.norm(np.nan_to_num(residual.shifts_px), axis=1) > _MAX_SHIFT_PX * evidence.file_pixel_size_px
     close = 1 - float(is_far.sum()) / count
     if not close >= _MIN_CLOSE_SHARE:
         yield Issue(CLOSE_WINDOWS, close, _MIN_CLOSE_SHARE, f"{_MAX_SHIFT_PX:g} px")
@@ -162,7 +162,7 @@ def _window_issues(evidence: Evidence[FixedPx]) -> Iterator[Issue]:
     limit = max(_MIN_CLUSTER, round(_MAX_CLUSTER_SHARE * measured))
     if not cluster < limit:
         yield Issue(CLUSTER, cluster / count, limit / count)
-    median_px = residual.median_px / evidence.file_px
+    median_px = residual.median_px / evidence.file_pixel_size_px
     if not median_px <= _MAX_SHIFT_PX:
         yield Issue(RESIDUAL_PX, median_px, _MAX_SHIFT_PX)
 

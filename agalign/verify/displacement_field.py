@@ -102,10 +102,10 @@ class DisplacementEstimator:
         without = DisplacementResult(None, gain.before_p95_px, gain.after_p95_px)
         if not gain.is_significant(MIN_GAIN_SIGMA):
             return without
-        field = None if mapping.local is None else mapping.local.on_lattice(self.lattice_px, self.size_px)
+        field = None if mapping.field is None else mapping.field.on_lattice(self.lattice_px, self.size_px)
         for number in range(_MAX_ROUNDS):
             if number > 0:
-                shifts = self._measure(moving, replace(mapping, local=field))
+                shifts = self._measure(moving, replace(mapping, field=field))
             before_px = 0.0 if field is None else field(shifts.centres_px)
             total = shifts._replace(shifts_px=shifts.shifts_px + before_px)
             field = self._field(total, gain.smoothness)
@@ -114,7 +114,7 @@ class DisplacementEstimator:
             if number + 1 >= _MIN_ROUNDS and len(shifts.weights) and np.median(shifts.distances_px()) <= _CONVERGED_PX:
                 break
         assert field is not None
-        held_out = self._held_out(moving, replace(verified or mapping, local=field), total, gain.smoothness)
+        held_out = self._held_out(moving, replace(verified or mapping, field=field), total, gain.smoothness)
         return replace(without, field=field, held_out=held_out)
 
     def _measure(self, moving: Raster, mapping: PixelMapping) -> Shifts:
@@ -131,11 +131,11 @@ class DisplacementEstimator:
         The shifts are measured with the complete mapping, for which correlation is sharp. The total shift of each
         window is compared with a field fitted to windows that share no pixels with it.
         """
-        assert mapping.local is not None
+        assert mapping.field is not None
         residual = self.verification.residuals(warped(moving, mapping, self.size_px))
         min_distance_px = (self.windows.side + self.verification.side) / 2
         predicted_px = self._cross_predicted(total, residual.centres_px, min_distance_px, smoothness)
-        remaining_px = residual.shifts_px + mapping.local(residual.centres_px) - predicted_px
+        remaining_px = residual.shifts_px + mapping.field(residual.centres_px) - predicted_px
         return Residual.of(residual.centres_px, remaining_px, residual.peaks_sigma)
 
     def _best_gain(self, shifts: Shifts) -> "_Gain":

@@ -88,7 +88,7 @@ class WindowFit:
         def lens_px(points_px: Points) -> Points:
             return np.asarray(lens_shapes(points_px, self.size_px) @ self.mean_px[8:])
 
-        return replace(corrected, local=DisplacementField.sampled(lens_px, NODE_STEP_PX, self.size_px))
+        return replace(corrected, field=DisplacementField.sampled(lens_px, NODE_STEP_PX, self.size_px))
 
 
 def lens_shapes(points_px: Points, size_px: tuple[int, int]) -> Array:
@@ -175,5 +175,5 @@ def fit_in_rounds(
             return None
         if fit.max_px <= _CONVERGED_PX:
             break
-        mapping = replace(result[0], local=mapping.local)
+        mapping = replace(result[0], field=mapping.field)
     return result

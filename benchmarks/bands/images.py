@@ -56,7 +56,7 @@ def read(path: Path) -> Image:
     return np.asarray(image if image.ndim == 2 else image[..., 2::-1])
 
 
-def spoilt(image: Image, pair: Pair, variant: str) -> Image:
+def degraded(image: Image, pair: Pair, variant: str) -> Image:
     """Return the moving image of a pair in a variant; the same in every run."""
     seed = zlib.crc32("/".join((*pair.key, variant)).encode())
     if variant in LIGHT:

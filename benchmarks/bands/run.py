@@ -37,7 +37,7 @@ from agalign.products.sidecar_file import find_sidecars
 from agalign.values import geometry, lens
 from agalign.values.capture import Band
 from agalign.values.mapping import PixelMapping
-from bands.images import LENS_CORRECTED, VARIANTS, Image, Paths, locate, read, spoilt
+from bands.images import LENS_CORRECTED, VARIANTS, Image, Paths, degraded, locate, read
 from bands.report import draw, tables
 from bands.score import AS_IT_IS, Pair, pairs_of, read_sets, score_pairs, summary, write_csv
 
@@ -65,7 +65,7 @@ def by_command_line(method: str, paths: Paths, pairs: Sequence[Pair], variant: s
         for name, path in paths.items():
             shutil.copyfile(path, flight / name)
         for pair in pairs if variant != AS_IT_IS else ():
-            pixels = spoilt(read(paths[pair.file]), pair, variant)
+            pixels = degraded(read(paths[pair.file]), pair, variant)
             with without_warnings(), rasterio.open(flight / pair.file, "r+") as dataset:
                 dataset.write(pixels, 1)
         seconds = align(flight, out, *WHOLE[method]) / (len(paths) - len({p.reference for p in pairs}))
@@ -119,7 +119,7 @@ def asked(method: Align, pair: Pair, variant: str, paths: Paths, bands: Mapping[
     """Return the mapping of a pair by a pair method; an exception is a refusal."""
     fixed, moving = read(paths[pair.reference]), read(paths[pair.file])
     if variant != LENS_CORRECTED:
-        moving = spoilt(moving, pair, variant)
+        moving = degraded(moving, pair, variant)
     began = time.perf_counter()
     try:
         if variant == LENS_CORRECTED:

@@ -48,7 +48,7 @@ def make_two_headings(
     after another; with `lakes` the captures before and after each turn are over water.
     """
     rng = np.random.default_rng(rng_seed)
-    plain, lake = _capture(camera=camera), _capture("a lake", camera=camera, spoil=water)
+    plain, lake = _capture(camera=camera), _capture("a lake", camera=camera, degrade=water)
     shots = []
     for number in range(captures):
         speed = float(rng.normal(_SPEED_M_S, 0.5)) * (-1) ** (number // line)
@@ -65,11 +65,11 @@ def _plan(captures: int) -> list[Make]:
     start = [panel, panel, *(_capture("take-off", height_m) for height_m in (4.0, 8.0, 13.0, 19.0))]
     end = [*(_capture("landing", height_m) for height_m in (15.0, 6.0)), panel]
     twice = {"a lake": water, "fog": fog, "blur, 3 px": blur, "motion, 25 px": motion, "noise, 30 %": noise}
-    between = [_capture(name, spoil=spoil) for name, spoil in twice.items() for _ in range(1 + (spoil is not motion))]
-    between += [_capture("half saturated", spoil=half_saturated)]
+    between = [_capture(name, degrade=by) for name, by in twice.items() for _ in range(1 + (by is not motion))]
+    between += [_capture("half saturated", degrade=half_saturated)]
     between += [_capture("planted grid", change=_orchard)] * 3 + [_capture("terraces", relief_m=1.5)] * 2
     between += [_capture("no NIR", without=("NIR",))]
-    between += [_capture(f"{band} lost", spoil=nothing, spoilt=(band,)) for band in ("NIR", "Blue")]
+    between += [_capture(f"{band} lost", degrade=nothing, degraded_bands=(band,)) for band in ("NIR", "Blue")]
     plain = [_capture()] * max(0, captures - len(start) - len(end) - len(between))
     # One of every few captures is degraded, the first few being good.
     until = np.linspace(0, len(between), len(plain) + 1).astype(int).tolist()

@@ -89,7 +89,7 @@ def test_a_model_is_used_again(
         monkeypatch.setattr(module, "learn", partial(learn, schedule=Schedule(max_steps=1)))
     assert states(run(flight, aligned_copy)) == ["kept", "kept"]
     reports = run(flight, aligned_copy, model=model_path)
-    assert [(r.state, r.good) for r in reports] == [("done", True)] * 2
+    assert [(r.state, r.is_complete) for r in reports] == [("done", True)] * 2
     assert states(run(flight, aligned_copy, model=model_path)) == ["kept", "kept"]
 
 
@@ -121,7 +121,7 @@ def test_a_second_run_learns_nothing_and_retries_failed_captures_where_asked(fli
     second.write_text(second.read_text().replace('"status": "ok"', '"status": "degraded"', 1))
     assert sorted(states(run(flight, aligned_copy))) == ["done", "kept"]
     again = run(flight, aligned_copy, options=RunOptions(retry_failed=True))
-    assert sorted((r.state, r.good) for r in again) == [("done", True), ("kept", True)]
+    assert sorted((r.state, r.is_complete) for r in again) == [("done", True), ("kept", True)]
     assert path.stat().st_mtime_ns == before
 
 
@@ -154,7 +154,7 @@ def test_a_model_is_learnt_again_where_what_it_depends_on_has_changed(flight: Pa
     assert learning_fingerprint(agalign.discover(flight).captures, SETTINGS) == before
     no_lens = [replace(c, bands=tuple(replace(b, lens=None) for b in c.bands)) for c in captures]
     other_reference = [replace(c, reference_index=0) for c in captures]
-    elsewhere = agalign.Settings(flight=agalign.FlightSettings(start="another network"))
+    elsewhere = agalign.Settings(flight=agalign.FlightSettings(start_model="another network"))
     assert len({learning_fingerprint(c, SETTINGS) for c in (captures, no_lens, other_reference)}) == 3
     assert learning_fingerprint(captures, elsewhere) != before
 
@@ -163,7 +163,7 @@ def test_any_executor_will_do(flight: Path, out_with_model: Path) -> None:
     with ThreadPoolExecutor(1) as executor:
         reports = agalign.align_folder(flight, out_with_model, settings=SETTINGS, run=RunOptions(executor=executor))
     assert sorted(r.label for r in reports) == ["0000SET/000/IMG_0001", "0000SET/000/IMG_0002"]
-    assert [r.good for r in reports] == [True, True]
+    assert [r.is_complete for r in reports] == [True, True]
 
 
 def test_one_broken_reference_stops_neither_learning_nor_the_others(flight: Path, tmp_path: Path) -> None:
@@ -206,7 +206,7 @@ def test_a_fault_while_learning_costs_the_flights_network_and_nothing_else(
 ) -> None:
     monkeypatch.setattr(learning_tasks, "refine_with", raising(fault))
     reports = list(run_flight(agalign.discover(learned_flight, TWO_PAIRS), tmp_path, SETTINGS))
-    assert [r.good for r in reports] == [True] * MIN_CAPTURES
+    assert [r.is_complete for r in reports] == [True] * MIN_CAPTURES
     assert {b.joint.recipe for r in reports for b in r.sidecar.bands if b.joint} == {"fast"}
 
 
@@ -266,11 +266,11 @@ def test_a_picture_that_fails_is_reported_and_costs_no_more(
 ) -> None:
     monkeypatch.setattr(preview, "write_picture", raising(agalign.OutputError("a.png: cannot be written")))
     for report in run(flight, out_with_model):
-        assert report.shortcomings == ("a.png: cannot be written",)
-        assert not report.good
+        assert report.failed_products == ("a.png: cannot be written",)
+        assert not report.is_complete
         assert (report.result.status, report.result.not_written) == ("ok", ["picture"])
     monkeypatch.undo()
-    assert [(r.state, r.shortcomings) for r in run(flight, out_with_model)] == [("done", ())] * 2
+    assert [(r.state, r.failed_products) for r in run(flight, out_with_model)] == [("done", ())] * 2
     assert len(list(out_with_model.rglob("*.png"))) == 2
 
 
@@ -303,4 +303,4 @@ def test_a_first_capture_that_lacks_a_band_belongs_to_its_flight(flight: Path, t
     for band in captures[1].bands:
         band.path.unlink()
     (report,) = run(folder, tmp_path / "again", model=path)
-    assert report.useful
+    assert {b.status for b in report.sidecar.bands} <= {"reference", "aligned", "predicted"}

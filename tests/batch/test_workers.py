@@ -46,7 +46,7 @@ def test_a_dask_cluster_does_the_captures(flight: Path, aligned_flight: Path, tm
         result = [next(reports)]
         processes[0].kill()
         result += reports
-    assert [r.good for r in result] == [True, True]
+    assert [r.is_complete for r in result] == [True, True]
     alone = [read_result(path) for path in find_sidecars(aligned_flight)]
     by_name = sorted((r.result for r in result if r.result is not None), key=lambda r: r.capture)
     assert [without_seconds(r) for r in by_name] == [without_seconds(r) for r in alone]

@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 import pytest
 from bands import score
-from bands.images import VARIANTS, locate, read, spoilt
+from bands.images import VARIANTS, degraded, locate, read
 from bands.run import asked, claim, lens_corrected, write_said
 from peers import UnavailableError, identity, method_named
 
@@ -114,7 +114,7 @@ def test_an_image_moves_as_its_truth_does(sets: dict[str, Any], variant: str) ->
     pair = score.pairs_of(sets["field"])[0]
     y, x = np.mgrid[:480, :640]
     image = (60000 * np.exp(-((x - 400.0) ** 2 + (y - 150.0) ** 2) / 50)).astype(np.uint16)
-    result = spoilt(image, pair, variant).astype(float)
+    result = degraded(image, pair, variant).astype(float)
     centre = np.array([(result * x).sum(), (result * y).sum()]) / result.sum()
     (there,) = score.apply(score.movement(variant, (640, 480)), np.array([[400.0, 150.0]]))
     assert centre == pytest.approx(there, abs=0.02)
@@ -125,7 +125,7 @@ def test_variants_are_the_same_in_every_run_and_keep_size_and_type(sets: dict[st
     pair = score.pairs_of(sets["field"])[0]
     image = np.random.default_rng(1).integers(1, 60000, (480, 640)).astype(np.uint16)
     image[:50] = 0
-    one, other = (spoilt(image, pair, variant) for _ in range(2))
+    one, other = (degraded(image, pair, variant) for _ in range(2))
     assert np.array_equal(one, other)
     assert (one.shape, one.dtype) == (image.shape, image.dtype)
     assert np.array_equal(one, image) == (variant in ("as it is", "lens-corrected"))

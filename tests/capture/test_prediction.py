@@ -38,9 +38,9 @@ def five(tmp_path_factory: pytest.TempPathFactory) -> Path:
     make_flight(folder, captures=5, size_px=(400, 300), rng_seed=5, altitude_m=(12.0, 30.0))
     rng = np.random.default_rng(0)
     images = folder / "0000SET" / "000"
-    spoilt = [images / "IMG_0003_4.tif", *images.glob("IMG_0005_*.tif")]
-    assert len(spoilt) == 6
-    for path in spoilt:
+    lost = [images / "IMG_0003_4.tif", *images.glob("IMG_0005_*.tif")]
+    assert len(lost) == 6
+    for path in lost:
         with rasterio.open(path, "r+") as dataset:
             dataset.write((20_000 + 1500 * rng.normal(size=(1, 300, 400))).astype(np.uint16))
     return folder
@@ -82,8 +82,8 @@ def test_a_valid_model_is_kept(five: Path, model: FlightModel) -> None:
 
 @pytest.mark.full
 def test_an_outdated_model_is_learned_again(five: Path, model: FlightModel) -> None:
-    apart_px = dict(zip(model.bands, (12.0, -12.0, 9.0, -9.0), strict=True))
-    elsewhere = {b: geometry.translation(apart_px[b], apart_px[b] / 3) @ m for b, m in model.rig.mean.items()}
+    offsets_px = dict(zip(model.bands, (12.0, -12.0, 9.0, -9.0), strict=True))
+    elsewhere = {b: geometry.translation(offsets_px[b], offsets_px[b] / 3) @ m for b, m in model.rig.mean.items()}
     moved = replace(model, rig=replace(model.rig, mean=elsewhere), mappings=elsewhere)
     assert learned(five, moved).rig is not moved.rig
 

@@ -101,14 +101,14 @@ def test_residuals_of_a_reduced_image_are_in_px_of_the_file() -> None:
     assert (residual.median_px, residual.shifts_px[0, 0]) == (2.0, 2.0)
 
 
-def displaced_pair(height_px: float, apart_px: float | None = None) -> BandPair:
+def displaced_pair(height_px: float, wavelength_px: float | None = None) -> BandPair:
     """A pair with a smooth bump in the centre or waves everywhere, which no homography represents."""
 
     def displacement(points: np.ndarray) -> np.ndarray:
-        if apart_px is None:
+        if wavelength_px is None:
             fall = np.exp(-(((points - (320, 240)) / 110) ** 2).sum(-1))
         else:
-            fall = np.prod(np.sin(2 * np.pi * points / apart_px), axis=-1)
+            fall = np.prod(np.sin(2 * np.pi * points / wavelength_px), axis=-1)
         return height_px * fall[..., None] * np.array([1.0, -0.6])
 
     return pair_of(*displaced_views(displacement), {"rig": np.eye(3)})
@@ -123,7 +123,7 @@ def test_a_field_is_fitted_where_a_part_of_the_image_is_misaligned(use: ReliefUs
 @pytest.mark.slow
 def test_a_field_follows_quickly_varying_parallax() -> None:
     """Waves of 300 px. Shorter ones are not predicted without the windows that overlap one of verification."""
-    results = verified(displaced_pair(2.5, apart_px=300.0), CENTRED, joint_result(), "auto")
+    results = verified(displaced_pair(2.5, wavelength_px=300.0), CENTRED, joint_result(), "auto")
     assert (results.status, results.geometry) == ("aligned", "field")
     # The residual is that of held-out windows.
     assert results.residual.median_px < 0.4

@@ -107,10 +107,10 @@ def test_a_known_layout_predicts_captures_at_an_unseen_height() -> None:
 def test_an_aliased_band_does_not_bias_the_others(rig: Rig) -> None:
     known = observation(9.0, 1.0)
     wrong = geometry.compose(geometry.translation(40.0, 0.0), known.mappings["Blue"])
-    spoiled = Observation(9.0, {**known.mappings, "Blue": wrong}, known.std_px)
+    outlier = Observation(9.0, {**known.mappings, "Blue": wrong}, known.std_px)
     for band in ("Red", "NIR", "Red edge"):
-        assert error_px(rig, band, spoiled, mappings(1.0)[band])[0] < 1.0
-    assert error_px(rig, "Blue", spoiled, wrong)[0] > 35
+        assert error_px(rig, band, outlier, mappings(1.0)[band])[0] < 1.0
+    assert error_px(rig, "Blue", outlier, wrong)[0] > 35
 
 
 @pytest.mark.slow

@@ -111,7 +111,7 @@ def calibrated(shared: Shared, tmp_path: Path) -> Path:
     def fill(folder: Path) -> None:
         synthetic.make_flight(folder / "in", 1, (480, 360), rng_seed=3)
         write = agalign.WriteSettings(radiometry="auto", error_map=True, indices=("ndvi", "savi"))
-        assert written(folder, agalign.Settings(write=write)).good
+        assert written(folder, agalign.Settings(write=write)).is_complete
 
     return shutil.copytree(shared("calibrated", fill), tmp_path / "calibrated")
 

@@ -77,7 +77,7 @@ def test_the_picture_shows_both_sides_of_what_changed_its_unit(by_panel: Path) -
 @pytest.mark.slow
 def test_another_run_keeps_results_and_can_align_panels(between_panels: Path, tmp_path: Path) -> None:
     first, *_ = agalign.align_folder(between_panels, tmp_path, settings=seeded())
-    assert first.good
+    assert first.is_complete
     assert first.panel.startswith("calibration panel RP04-0000001-SY (reflectance 0.51; recognised by its QR code)")
     again = agalign.align_folder(between_panels, tmp_path, settings=seeded())
     assert [r.state for r in again] == ["panel", "panel", "kept", "kept"]
@@ -121,7 +121,7 @@ def test_the_sky_is_left_out_and_named(with_sky: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
     reports = agalign.align_folder(with_sky, out, settings=seeded())
     assert {r.label: r.state for r in reports} == {"sky/S1": "sky", "IMG_0001": "done"}
-    assert next(r for r in reports if r.state == "sky").good
+    assert next(r for r in reports if r.state == "sky").is_complete
     (part,) = read_sky(out)
     assert (part.folder, part.capture, [b.band for b in part.bands]) == ("sky", "S1", ["Blue", "Green", "NIR"])
     assert part.cues == ["its folder or name contains 'sky'", "no band has texture"]

@@ -31,7 +31,7 @@ class Histogram(Product):
 
     def write(self, context: ProductContext) -> list[WrittenFile]:
         path = context.paths.file(self.suffix)
-        write_text(path, json.dumps(sorted(context.usable)))
+        write_text(path, json.dumps(sorted(context.with_pixels)))
         return [WrittenFile(self.kind, path, StacAsset("histogram", "application/json", ("metadata",)))]
 
 
@@ -122,7 +122,7 @@ def test_a_required_product_that_fails_costs_the_capture(align: Align, monkeypat
     assert (report.state, report.error) == ("error", "f.histogram.json: cannot be written")
     monkeypatch.setattr(Histogram, "is_required", False)
     report = align()
-    assert (report.state, report.shortcomings) == ("done", ("f.histogram.json: cannot be written",))
+    assert (report.state, report.failed_products) == ("done", ("f.histogram.json: cannot be written",))
     assert report.result.not_written == ["histogram"]
     monkeypatch.setattr(batch_capture, "PRODUCTS", PRODUCTS)
     assert [align().state for _ in range(2)] == ["done", "kept"]

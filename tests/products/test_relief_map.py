@@ -82,7 +82,7 @@ class Run:
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr(batch, "align_capture_bands", lambda *_: self.alignments)
             outcome = batch.process_capture(self.capture, out, chosen)
-        assert outcome.shortcomings == ()
+        assert outcome.failed_products == ()
         assert read_result(outcome.path) == outcome.result
         return out / self.capture.folder, outcome.sidecar
 
@@ -252,7 +252,7 @@ def rebuilt(alignment: Alignment, folder: Path) -> Alignment:
 
 @pytest.mark.parametrize(
     "mapping",
-    [PixelMapping(H), PixelMapping(H, *LENSES), PixelMapping(H, local=FIELD), PixelMapping(H, *LENSES, local=FIELD)],
+    [PixelMapping(H), PixelMapping(H, *LENSES), PixelMapping(H, field=FIELD), PixelMapping(H, *LENSES, field=FIELD)],
     ids=["homography", "lenses", "field", "lenses and field"],
 )
 def test_mappings_of_files_are_rebuilt(mapping: PixelMapping, tmp_path: Path) -> None:
@@ -267,7 +267,7 @@ def test_a_field_of_reduced_images_is_rebuilt(tmp_path: Path) -> None:
     """Its nodes are not at pixels of the file."""
     nodes = gaussian_filter(FIELD.displacements_px[:11, :15], (1.0, 1.0, 0.0))
     field = DisplacementField(48.0, nodes / nodes.std())
-    on_images = Alignment(PixelMapping(H, local=field), (640, 480), "aligned", (), Seed("rig", H, 30.0))
+    on_images = Alignment(PixelMapping(H, field=field), (640, 480), "aligned", (), Seed("rig", H, 30.0))
     alignment = on_images.in_file_px(REDUCED, FILE_PX)
     assert np.abs(rebuilt(alignment, tmp_path).map(POINTS) - alignment.map(POINTS)).max() < 0.02
 

@@ -51,8 +51,8 @@ def test_the_page_has_the_facts_of_every_capture(flight: Path, aligned_flight: P
                 continue
             # The initial offset of the files is known exactly here.
             known = np.asarray(ties[part["file"]]["ties"])
-            apart_px = np.median(np.linalg.norm(known[:, 2:] - known[:, :2], axis=1))
-            assert pair["apart_px"] == pytest.approx(apart_px, abs=0.3)
+            offset_length_px = np.median(np.linalg.norm(known[:, 2:] - known[:, :2], axis=1))
+            assert pair["offset_length_px"] == pytest.approx(offset_length_px, abs=0.3)
             tiles = part["metrics"]["tiles"]
             shifts = [None if v is None else v * facts["shift_step_px"] for v in pair["shifts"]]
             assert shifts == [v if v is None else pytest.approx(v, abs=0.006) for t in tiles for v in t["shift_px"]]

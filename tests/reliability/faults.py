@@ -78,7 +78,7 @@ class Scene:
         return [str(self.folder), "-o", str(out), "-j", "1", *self.options]
 
 
-Spoil = Callable[[Scene], object]
+Inject = Callable[[Scene], object]
 """Does a fault to a flight or to a run."""
 
 
@@ -100,7 +100,7 @@ class Fault:
     """Something that is wrong."""
 
     name: str
-    spoil: Spoil
+    inject: Inject
     ends: Ends
 
 
@@ -146,7 +146,7 @@ def run_fault(fault: Fault, folder: Path, model: Path | None = None) -> Seen:
     if model is not None:
         scene.options = ("--relief", "never", "--model", str(model))
     make_flight(scene.folder)
-    fault.spoil(scene)
+    fault.inject(scene)
     command = scene.command or scene.run_of(scene.out)
     began = time.monotonic()
     try:
@@ -212,31 +212,31 @@ def run_outside(arguments: list[str], scene: Scene) -> tuple[int, str]:
 # ---- what is done to files
 
 
-def edited(change: Callable[[bytes], bytes]) -> Spoil:
-    def spoil(scene: Scene) -> None:
+def edited(change: Callable[[bytes], bytes]) -> Inject:
+    def inject(scene: Scene) -> None:
         path = scene.file()
         path.write_bytes(change(path.read_bytes()))
 
-    return spoil
+    return inject
 
 
-def extra(name: str, data: bytes) -> Spoil:
+def extra(name: str, data: bytes) -> Inject:
     return lambda scene: (scene.folder / name).write_bytes(data)
 
 
-def tagged(packet: str | None = None, *tags: tuple[int, int, int, str, bool]) -> Spoil:
+def tagged(packet: str | None = None, *tags: tuple[int, int, int, str, bool]) -> Inject:
     """Both files of b with an XMP packet and other tags."""
 
-    def spoil(scene: Scene) -> None:
+    def inject(scene: Scene) -> None:
         data = (packet or "").encode()
         extratags = [(XMP, 1, len(data), data, True), *tags] if data else tags
         for path in (scene.file("b_green.tif"), scene.file()):
             tifffile.imwrite(path, tifffile.imread(path), extratags=extratags)
 
-    return spoil
+    return inject
 
 
-def xmp(values: str) -> Spoil:
+def xmp(values: str) -> Inject:
     return tagged(_PACKET.format(values))
 
 
@@ -327,15 +327,15 @@ def without_permission(scene: Scene, target: Path, mode: int) -> None:
     scene.undo = lambda: target.chmod(0o755)
 
 
-def forbidden(path: Callable[[Scene], Path], name: str = "", mode: int = 0) -> Spoil:
+def forbidden(path: Callable[[Scene], Path], name: str = "", mode: int = 0) -> Inject:
     """A file or folder that whoever runs the program may not read."""
 
-    def spoil(scene: Scene) -> None:
+    def inject(scene: Scene) -> None:
         if name:
             path(scene).mkdir()
         without_permission(scene, path(scene), mode)
 
-    return spoil
+    return inject
 
 
 def read_only(scene: Scene) -> None:
@@ -362,13 +362,13 @@ def killed_inside_the_input(scene: Scene) -> None:
     assert (earlier / RUN_FILE).is_file()
 
 
-def with_sidecar(change: Callable[[Scene, str], str]) -> Spoil:
-    def spoil(scene: Scene) -> None:
+def with_sidecar(change: Callable[[Scene, str], str]) -> Inject:
+    def inject(scene: Scene) -> None:
         first_run(scene)
         path = scene.out / "b.json"
         path.write_text(change(scene, path.read_text()))
 
-    return spoil
+    return inject
 
 
 def learning(scene: Scene) -> None:
@@ -386,16 +386,16 @@ def damaged_model(scene: Scene) -> None:
     scene.arguments = ["--overwrite"]
 
 
-def given_model(make: Callable[[Path], object]) -> Spoil:
-    def spoil(scene: Scene) -> None:
+def given_model(make: Callable[[Path], object]) -> Inject:
+    def inject(scene: Scene) -> None:
         path = scene.folder.parent / "m.safetensors"
         make(path)
         scene.arguments = ["--model", str(path)]
 
-    return spoil
+    return inject
 
 
-def output_is_a_folder(name: str) -> Spoil:
+def output_is_a_folder(name: str) -> Inject:
     return lambda scene: (scene.out / name / "below").mkdir(parents=True)
 
 
@@ -441,10 +441,10 @@ Act = Callable[["subprocess.Popen[str]", Scene], object]
 """Is done to a run."""
 
 
-def when(ready: Act, act: Act, *arguments: str) -> Spoil:
+def when(ready: Act, act: Act, *arguments: str) -> Inject:
     """Something happens to a run once `ready` returns something true."""
 
-    def spoil(scene: Scene) -> None:
+    def inject(scene: Scene) -> None:
         scene.arguments = list(arguments)
 
         def watch(process: "subprocess.Popen[str]") -> None:
@@ -453,15 +453,15 @@ def when(ready: Act, act: Act, *arguments: str) -> Spoil:
 
         scene.watch = watch
 
-    return spoil
+    return inject
 
 
-def with_captures(names: str) -> Spoil:
+def with_captures(names: str) -> Inject:
     """More captures."""
     return lambda scene: [write_capture(scene.folder, name, place % 3) for place, name in enumerate(names)]
 
 
-def when_begun(act: Act, *arguments: str) -> Spoil:
+def when_begun(act: Act, *arguments: str) -> Inject:
     """Something happens to a run of twelve captures once the first of them is done."""
     return both(with_captures(ALL[2:]), when(lambda _, scene: any(scene.out.glob("?.json")), act, *arguments))
 
@@ -568,7 +568,7 @@ def many_files(scene: Scene) -> None:
             os.link(scene.file(f"a_{band}.tif"), scene.file(f"x{number_}_{band}.tif"))
 
 
-def with_environment(**variables: str) -> Spoil:
+def with_environment(**variables: str) -> Inject:
     return lambda scene: scene.process.update(env={**os.environ, **variables})
 
 
@@ -577,7 +577,7 @@ def standard_output_full(scene: Scene) -> None:
         scene.process = {"stdout": os.dup(full.fileno())}
 
 
-def asking(*options: str) -> Spoil:
+def asking(*options: str) -> Inject:
     return lambda scene: scene.arguments.extend(options)
 
 
@@ -596,11 +596,11 @@ def endless_number(scene: Scene) -> None:
     commanding("report {out}")(scene)
 
 
-def without_streams(*numbers: int) -> Spoil:
-    def spoil(scene: Scene) -> None:
+def without_streams(*numbers: int) -> Inject:
+    def inject(scene: Scene) -> None:
         scene.process = {"preexec_fn": lambda: [os.close(n) for n in numbers] and None}
 
-    return spoil
+    return inject
 
 
 def unread_errors(scene: Scene) -> None:
@@ -634,12 +634,12 @@ def no_locks(scene: Scene) -> None:
     scene.undo = undo
 
 
-def commanding(command: str) -> Spoil:
+def commanding(command: str) -> Inject:
     return lambda scene: setattr(scene, "command", command.format(folder=scene.folder, out=scene.out).split(" "))
 
 
-def both(*spoils: Spoil) -> Spoil:
-    return lambda scene: [spoil(scene) for spoil in spoils]
+def both(*injections: Inject) -> Inject:
+    return lambda scene: [inject(scene) for inject in injections]
 
 
 def colliding(scene: Scene) -> None:
@@ -668,7 +668,7 @@ _OUTSIDE = '<!DOCTYPE l [<!ENTITY a SYSTEM "file:///etc/passwd">]>' + _PACKET.fo
     "<Camera:BandName>&a;</Camera:BandName>"
 )
 
-ALL_FINISHED: dict[str, Spoil] = {
+ALL_FINISHED: dict[str, Inject] = {
     "a folder named .tif": lambda s: (s.folder / "c_nir.tif").mkdir(),
     "the system's folder on a card": forbidden(lambda s: s.folder / "lost+found", "new"),
     "an input that may only be read": read_only,
@@ -712,7 +712,7 @@ ALL_FINISHED: dict[str, Spoil] = {
     ),
 }
 """After these, both captures are aligned, without a complaint."""
-B_IS_LOST: dict[str, tuple[Spoil, str]] = {
+B_IS_LOST: dict[str, tuple[Inject, str]] = {
     "a TIFF cut short": (edited(lambda data: data[: len(data) // 2]), r"b_nir\.tif: .*copy it from the card"),
     "half of a TIFF zeros": (edited(lambda data: data[:2000] + bytes(len(data) - 2000)), r"^b nir: "),
     "wrong magic": (edited(lambda data: b"XX" + data[2:]), "b_nir.tif: is not a TIFF, JPEG or PNG"),
@@ -743,7 +743,7 @@ B_IS_LOST: dict[str, tuple[Spoil, str]] = {
     "images of a line of 100,000 pixels": (lines, "^b nir: "),
 }
 """After these, the other capture is aligned; with a pattern of the complaint."""
-FILE_IS_NAMED: dict[str, tuple[Spoil, str]] = {
+FILE_IS_NAMED: dict[str, tuple[Inject, str]] = {
     "a text named .tif": (extra("c_nir.tif", b"hello"), "c_nir.tif: is not a TIFF"),
     "a pipe named .tif": (lambda s: os.mkfifo(s.folder / "c_nir.tif"), "c_nir.tif: is not a regular file"),
     "a folder without permission": (
@@ -765,7 +765,7 @@ FILE_IS_NAMED: dict[str, tuple[Spoil, str]] = {
     ),
 }
 """After these, both captures are aligned, and another file is complained of."""
-REFUSED: dict[str, tuple[Spoil, int, str]] = {
+REFUSED: dict[str, tuple[Inject, int, str]] = {
     "an output that may not be written": (
         forbidden(lambda s: s.out, "new", 0o555),
         1,
@@ -837,11 +837,11 @@ FULL = {
 }
 """Only in the full tests: these take long, and others are like them."""
 FAULTS = (
-    *(Fault(name, spoil, Ends(0, "", "ab")) for name, spoil in ALL_FINISHED.items()),
-    *(Fault(name, spoil, Ends(3, says)) for name, (spoil, says) in B_IS_LOST.items()),
-    *(Fault(name, spoil, Ends(3, says, "ab")) for name, (spoil, says) in FILE_IS_NAMED.items()),
-    *(Fault(name, spoil, Ends(code, says, "")) for name, (spoil, code, says) in REFUSED.items()),
-    *(Fault(name, spoil, ends) for name, (spoil, ends) in OTHERS.items()),
+    *(Fault(name, inject, Ends(0, "", "ab")) for name, inject in ALL_FINISHED.items()),
+    *(Fault(name, inject, Ends(3, says)) for name, (inject, says) in B_IS_LOST.items()),
+    *(Fault(name, inject, Ends(3, says, "ab")) for name, (inject, says) in FILE_IS_NAMED.items()),
+    *(Fault(name, inject, Ends(code, says, "")) for name, (inject, code, says) in REFUSED.items()),
+    *(Fault(name, inject, ends) for name, (inject, ends) in OTHERS.items()),
 )
 
 

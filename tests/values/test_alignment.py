@@ -47,7 +47,7 @@ def test_the_standard_errors_of_corners_are_scaled_axis_by_axis() -> None:
 def test_an_alignment_between_images_is_the_same_between_files() -> None:
     seed = Seed("rig", geometry.translation(5, -3), 30.0)
     facts = seed, JOINT, residual_of(POINTS, (0.1, 0.1)), 1.5, {"ncc": 0.1}, {"ncc": 0.9}
-    mapping, candidates = PixelMapping(H, local=FIELD), {"homography": FixedImagePx(0.5), "field": FixedImagePx(0.25)}
+    mapping, candidates = PixelMapping(H, field=FIELD), {"homography": FixedImagePx(0.5), "field": FixedImagePx(0.25)}
     between_images = Alignment(mapping, (150, 100), "aligned", (), *facts, candidates)
     between_files = between_images.in_file_px(SCALES, (300, 400))
     mapped = between_images.map(SCALES.fixed.positions(POINTS))

@@ -138,7 +138,7 @@ def test_a_relief_of_fewer_pixels_is_one_of_the_whole_image() -> None:
 def test_the_displacement_field_of_lenses_and_the_parallax_add_up() -> None:
     """The parallax is that of the raw pixel, not of the displaced one."""
     field = DisplacementField(96.0, np.broadcast_to(np.float64([0.7, -0.4]), (6, 8, 2)).copy())
-    mapping = replace(MAPPING, local=field)
+    mapping = replace(MAPPING, field=field)
     edge = np.array([160.0, 200.0])  # the left edge of the box
     expected = lens.undistort(FIXED, edge + np.array([0.7, -0.4])) + 12 * np.array(BASELINE)
     np.testing.assert_allclose(mapping(edge), lens.distort(MOVING, geometry.apply(H, expected)), atol=1e-6)

@@ -38,9 +38,9 @@ FIELD, HILL = waves(1.5, 160.0), Parallax(hill(8.0), (0.8, -0.6))
 MAPPINGS = {
     "homography": PixelMapping(H),
     "lenses": PixelMapping(H, FIXED, MOVING),
-    "field": PixelMapping(H, FIXED, MOVING, local=FIELD),
+    "field": PixelMapping(H, FIXED, MOVING, field=FIELD),
     "relief": PixelMapping(H, FIXED, MOVING, parallax=HILL),
-    "relief and field": PixelMapping(H, FIXED, MOVING, local=FIELD, parallax=HILL),
+    "relief and field": PixelMapping(H, FIXED, MOVING, field=FIELD, parallax=HILL),
 }
 
 
@@ -204,7 +204,7 @@ def test_the_inverse_is_nan_where_it_does_not_converge() -> None:
     """Waves of 12 px with a period of 40 px fold the image; the upper quarter has none."""
     field = waves(12.0, 40.0, step_px=8.0)
     field.displacements_px[:14] = 0
-    result = alignment(PixelMapping(geometry.identity(), local=field))
+    result = alignment(PixelMapping(geometry.identity(), field=field))
     inverted = result.inverse(pixels())
     known = np.isfinite(inverted).all(axis=-1)
     assert known[:60].all()

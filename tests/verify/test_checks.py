@@ -114,7 +114,7 @@ def test_a_result_far_from_the_rig_is_an_issue(off_px: float | None, std_px: flo
 def test_the_limit_is_a_pixel_of_the_file_where_the_images_are_reduced() -> None:
     within = replace(GOOD, residual=shifted(11, 0.7))
     assert codes(within) == []
-    assert codes(replace(within, file_px=0.65)) == ["close_windows"]
+    assert codes(replace(within, file_pixel_size_px=0.65)) == ["close_windows"]
 
 
 # ---- clusters of misaligned windows

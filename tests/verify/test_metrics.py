@@ -67,9 +67,9 @@ def test_similarity_uses_only_valid_pixels() -> None:
     fixed, moving = (view.pixels for view in two_views(np.eye(3)))
     valid = np.ones(fixed.shape, bool)
     valid[:, :100] = False
-    spoiled = fixed.copy()
-    spoiled[:, :100] = 1e6
-    whole = similarity(spoiled, moving, valid)
+    outlier = fixed.copy()
+    outlier[:, :100] = 1e6
+    whole = similarity(outlier, moving, valid)
     assert whole["overlap"] == pytest.approx(0.75)
     crop = similarity(fixed[:, 100:].copy(), moving[:, 100:].copy())
     assert whole["mattes_mi"] == pytest.approx(crop["mattes_mi"], abs=1e-6)

@@ -48,12 +48,12 @@ def test_the_windows_correct_the_homography_through_the_displacement_field() -> 
     nodes = np.zeros((22, 28, 2))
     nodes[..., 0] = 0.2 * 48.0 * np.arange(28)
     plain = PixelMapping(geometry.translation(5.0, 3.0))
-    stretched = PixelMapping(geometry.translation(5.0, 3.0), local=DisplacementField(48.0, nodes))
+    stretched = PixelMapping(geometry.translation(5.0, 3.0), field=DisplacementField(48.0, nodes))
     for mapping, expected_px in ((plain, 1.0), (stretched, 1.2)):
         fit = fitted(windows(np.tile([1.0, -0.5], 4), noise_px=0.0), mapping=mapping)
         np.testing.assert_allclose(fit.mean_px, np.tile([expected_px, -0.5], 4), atol=0.01)
         corrected = fit.applied_to(mapping)
-        assert corrected.local is mapping.local
+        assert corrected.field is mapping.field
         moved = geometry.apply(corrected.fixed_to_moving, [300.0, 200.0])
         np.testing.assert_allclose(moved, [305.0 + expected_px, 202.5], atol=0.02)
 
@@ -141,7 +141,7 @@ def test_more_windows_leave_less_error_and_none_leave_the_prior() -> None:
     assert unknown.std_px(EVERYWHERE) > 5
     assert not unknown.mean_px.any()
     mapping, inside = many.applied_to(IDENTITY), EVERYWHERE[(EVERYWHERE > 50).all(axis=1)]
-    np.testing.assert_allclose(mapping.local(inside), lens_shapes(inside, SIZE) @ many.mean_px[8:], atol=0.02)
+    np.testing.assert_allclose(mapping.field(inside), lens_shapes(inside, SIZE) @ many.mean_px[8:], atol=0.02)
 
 
 # ---- quarters of the image without a measured window

@@ -115,7 +115,7 @@ class BandRow:
 
 
 @dataclass
-class Facts:
+class FlightFacts:
     """The data of the captures below an output folder, which are added one by one."""
 
     captures: list[dict[str, Any]] = field(default_factory=list)
@@ -186,7 +186,7 @@ class Facts:
             pairs = [b for b in self.bands if b.band == name]
             residuals_px = _residuals_px(pairs)
             facts = (b for c in self.captures for b in c["bands"] if b["band"] == name)
-            offsets_px = [b["apart_px"] for b in facts if b["apart_px"] is not None]
+            offsets_px = [b["offset_length_px"] for b in facts if b["offset_length_px"] is not None]
             row = BandRow(
                 name,
                 aligned=sum(b.status == "aligned" for b in pairs),
@@ -212,13 +212,13 @@ class Facts:
         metrics, tiles = band.metrics, [] if band.metrics is None else band.metrics.tiles
         similarity = {name: (row[f"{name}_before"], row[f"{name}_after"]) for name in _SIMILARITY}
         lattice = tuple(v for t in tiles for v in t.centre_px)
-        offset_px, apart_px = _band_offset(band.grid, sidecar)
+        offset_px, offset_length_px = _band_offset(band.grid, sidecar)
         # The first nine columns of the table have the same names here.
         return {name: row[name] for name in tuple(BAND_COLUMNS)[:9]} | {
             "seconds": round(band.seconds, 2),
             "written": band.place is not None,
             "offset_px": offset_px,
-            "apart_px": apart_px,
+            "offset_length_px": offset_length_px,
             "coverage": row["residual_coverage"],
             "similarity": None if metrics is None else similarity,
             "prediction": _fields_of(band.prediction),

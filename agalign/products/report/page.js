@@ -10,7 +10,7 @@
  * @typedef {{from: string, std_px: number, off_px: number | null}} Prediction
  * @typedef {{kind: string, held_out_p95_px: Record<string, number | null>}} Geometry
  * @typedef {{band: string, wavelength_nm: number | null, status: string, reason: string | null, seed: string | null,
- *   seconds: number, written: boolean, offset_px: [number, number] | null, apart_px: number | null,
+ *   seconds: number, written: boolean, offset_px: [number, number] | null, offset_length_px: number | null,
  *   residual_px: number | null, residual_p95_px: number | null, coverage: number | null, retrieval: number | null,
  *   corner_std_px: number | null, similarity: Record<string, [number | null, number | null]> | null,
  *   prediction: Prediction | null, geometry: Geometry | null, occluded: number | null, lattice: number, shifts: (number | null)[]}} Pair
@@ -24,12 +24,12 @@
  *   crop: [number, number, number, number], scale: [number, number], stack: string | null, sidecar: string,
  *   relief: string | null,
  *   picture: string | null, preview: Preview | null, bands: Pair[], indices: Index[]}} Capture
- * @typedef {{schema: string, captures: Capture[], shift_step_px: number, lattices: number[][]}} Facts
+ * @typedef {{schema: string, captures: Capture[], shift_step_px: number, lattices: number[][]}} FlightFacts
  * @typedef {{column: number, colour: string, inverted?: boolean}} Channel
  * @typedef {"before" | "after"} When
  */
 
-/** @type {Facts} */
+/** @type {FlightFacts} */
 const facts = JSON.parse(byId("facts").textContent ?? "");
 const captures = facts.captures;
 
@@ -971,7 +971,7 @@ function words(capture) {
  * @param {Pair} pair @param {string} reference
  */
 function sentence(pair, reference) {
-  const offset = pair.apart_px === null || pair.apart_px < 0.05 ? "" : `had an offset of ${fixed(pair.apart_px, pair.apart_px < 10 ? 1 : 0)} px from ${reference} and `;
+  const offset = pair.offset_length_px === null || pair.offset_length_px < 0.05 ? "" : `had an offset of ${fixed(pair.offset_length_px, pair.offset_length_px < 10 ? 1 : 0)} px from ${reference} and `;
   if (pair.status === "aligned") {
     const left = pair.residual_px;
     if (left === null) return `${offset}is aligned; no window could measure a residual.`;

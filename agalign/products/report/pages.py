@@ -20,7 +20,7 @@ from agalign.config import Settings
 from agalign.errors import SidecarError
 from agalign.products.index_table import IndexRow, rows_of_run, update_table
 from agalign.products.panels import PANELS_FILE, SKY_FILE, PanelPart, SkyPart, read_panels, read_sky
-from agalign.products.report.facts import BAND_COLUMNS, Facts, FailureGroup
+from agalign.products.report.facts import BAND_COLUMNS, FailureGroup, FlightFacts
 from agalign.products.report.rigs import drifts_of, rig_views
 from agalign.products.run_record import RunPart, read_run_record
 from agalign.products.sidecar_file import find_sidecars, read_sidecar
@@ -53,7 +53,7 @@ def write_pages(out: Path, on_problem: Callable[[str], None]) -> Pages:
     """
     indices: list[IndexRow] = []
     unreadable: list[str] = []
-    facts = Facts()
+    facts = FlightFacts()
     for path in find_sidecars(out):
         folder = path.parent.relative_to(out).as_posix()
         try:
@@ -112,7 +112,7 @@ def _rows_not_aligned(part: PanelPart | SkyPart, status: str) -> list[dict[str, 
 
 def _page(
     out: Path,
-    facts: Facts,
+    facts: FlightFacts,
     panels: Sequence[PanelPart],
     sky: Sequence[SkyPart],
     run: RunPart | None,
