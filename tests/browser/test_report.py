@@ -324,7 +324,7 @@ def test_the_table_sorts_and_filters(page: Any) -> None:
         return page.locator("#table tbody th").all_inner_texts()
 
     def residuals() -> list[float]:
-        cells = page.locator("#table tbody tr td:nth-child(3)").all_inner_texts()
+        cells = page.locator("#table tbody tr td:nth-child(4)").all_inner_texts()
         return [float(text) for text in cells if text[0].isdigit()]
 
     assert len(labels()) == 3
@@ -383,7 +383,8 @@ def test_in_words_and_in_numbers(page: Any) -> None:
     words = page.locator(".words").inner_text()
     assert "suitable for indices of single plants" in words
     assert "NIR failed" in words
-    assert "→" in page.locator("#capture table").inner_text()
+    page.locator("details.more summary").click()
+    assert "→" in page.locator("details.more table").inner_text()
 
 
 @pytest.mark.parametrize("scheme", ["light", "dark"])
@@ -425,9 +426,15 @@ def test_it_prints_and_fits_a_telephone(browser: Any, out: Path) -> None:
     page.goto((out / "index.html").as_uri())
     assert page.evaluate("document.documentElement.scrollWidth") <= 390
     heads = page.locator("#table thead th").all_inner_texts()
-    assert [head.split(" ")[0] for head in heads[:3]] == ["Capture", "Status", "Largest"]
-    status = page.locator("#table tbody td").nth(1).bounding_box()
-    assert status["x"] + status["width"] <= 390, "the residual is seen without scrolling"
+    assert [head.split(" ")[0] for head in heads[:3]] == ["Capture", "Status", "Bands"]
+    chip = page.locator("#table .chip", has_text="NIR").first.bounding_box()
+    assert chip["x"] + chip["width"] <= 390, "the bands are seen without scrolling"
+    assert not page.get_by_label("Composite", exact=True).is_visible(), "folded"
+    assert page.locator("#view-tools").bounding_box()["height"] < 40, "one row"
+    assert page.locator(".hint.touch").is_visible()
+    texts = page.locator("#map text")
+    heights_px = [texts.nth(i).bounding_box()["height"] for i in range(texts.count())]
+    assert min(heights_px) >= 12
     page.emulate_media(media="print")
     page.wait_for_timeout(200)
     assert not page.locator("#find").is_visible()
@@ -437,6 +444,39 @@ def test_it_prints_and_fits_a_telephone(browser: Any, out: Path) -> None:
     page.emulate_media(media="screen")
     page.wait_for_timeout(200)
     assert page.locator("#table tbody th").count() == 3
+    page.close()
+
+
+def test_no_table_is_cut_on_a_screen(browser: Any, out: Path) -> None:
+    page = browser.new_page(viewport={"width": 1400, "height": 900})
+    page.goto((out / "index.html").as_uri() + "#capture=0000SET%2F000%2FIMG_0001")
+    page.locator("details").evaluate_all("all => all.forEach((d) => { d.open = true; })")
+    cut = "[...document.querySelectorAll('#capture .scroll')].filter((s) => s.scrollWidth > s.clientWidth).length"
+    assert page.evaluate(cut) == 0
+    before, after = page.locator("details.more tbody tr").first.locator("td").first.inner_text().split(" → ")
+    assert float(after) > float(before) >= 0, "mutual information: higher is better"
+    page.close()
+
+
+def test_the_composite_returns_after_a_capture_without_its_bands(page: Any) -> None:
+    look_at(page, "IMG_0002")
+    assert "NIR was not written" in page.locator("#over-note").inner_text()
+    page.get_by_label("Composite", exact=True).select_option("true colour")
+    look_at(page, "a'b&c")  # its red band has another name
+    assert "because Red is missing" in page.locator("#over-note").inner_text()
+    look_at(page, "IMG_0001")
+    assert "Shown: Red, Green, Blue" in page.locator("#over-note").inner_text()
+
+
+def test_a_clock_that_was_not_set(browser: Any, out: Path, tmp_path: Path) -> None:
+    sidecar = json.loads((out / "0000SET" / "000" / "IMG_0001.json").read_text())
+    (tmp_path / "a.json").write_text(json.dumps(sidecar | {"capture": "a", "captured_at": "1970-01-01T00:03:10"}))
+    write_pages(tmp_path, pytest.fail)
+    page = browser.new_page()
+    page.goto((tmp_path / "index.html").as_uri())
+    text = page.locator("main").inner_text()
+    assert "unknown time" in text
+    assert "1970" not in text
     page.close()
 
 

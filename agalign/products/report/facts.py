@@ -69,7 +69,7 @@ class FailureGroup:
 
 @dataclass
 class FailureGroups:
-    """The groups of a run, whose captures are added one by one."""
+    """The groups of a run. Captures are added one by one."""
 
     _by_cause: dict[tuple[str, Remedy], FailureGroup] = field(default_factory=dict)
 
@@ -200,12 +200,12 @@ class FlightFacts:
         return rows
 
     def as_json(self) -> dict[str, Any]:
-        """Return the data of the schema `agalign-report/1`, whose types the script of the page declares."""
+        """Return the data of the schema `agalign-report/1`. The script of the page declares their types."""
         facts = {"schema": "agalign-report/1", "captures": self.captures, "shift_step_px": _SHIFT_STEP_PX}
         return facts | {"lattices": [list(centres) for centres in self._lattices]}
 
     def _pair(self, band: BandPart, sidecar: Sidecar, folder: str) -> dict[str, Any]:
-        """The data of a band, whose row is added unless it is the reference."""
+        """The data of a band. Its row is added unless it is the reference."""
         row = {column: value_at(band, path) for column, path in BAND_COLUMNS.items()}
         if band.status != "reference":
             self.rows.append({"folder": folder, "capture": sidecar.capture, **row})

@@ -101,6 +101,11 @@ function worst(capture, what) {
   return known.length ? Math.max(...known) : null;
 }
 
+/** @param {string} captured_at Cameras count from 1970 until their clock is set. */
+function taken(captured_at) {
+  return captured_at < "1971" ? "unknown time" : captured_at.slice(0, 19).replace("T", " ");
+}
+
 /** @param {Capture} capture */
 function address(capture) {
   return `#capture=${encodeURIComponent(capture.label)}`;
@@ -112,10 +117,10 @@ function address(capture) {
 const columns = [
   { title: "Capture", numeric: false, value: (c) => c.label, cell: (c) => el("a", { href: address(c) }, c.label) },
   { title: "Status", numeric: false, value: (c) => ["failed", "degraded", "ok"].indexOf(c.status), cell: (c) => badge(c.status) },
-  { title: "Largest residual, px", numeric: true, value: (c) => worst(c, "residual_px"), cell: (c) => fixed(worst(c, "residual_px"), 3) },
   { title: "Bands", numeric: true, value: (c) => moving(c).filter((b) => b.status === "aligned").length / Math.max(1, moving(c).length + c.missing.length), cell: chips },
+  { title: "Largest residual, px", numeric: true, value: (c) => worst(c, "residual_px"), cell: (c) => fixed(worst(c, "residual_px"), 3) },
   { title: "Corner error, px", numeric: true, value: (c) => worst(c, "corner_std_px"), cell: (c) => fixed(worst(c, "corner_std_px"), 3) },
-  { title: "Taken", numeric: false, value: (c) => c.captured_at, cell: (c) => c.captured_at.slice(0, 19).replace("T", " ") },
+  { title: "Taken", numeric: false, value: (c) => c.captured_at, cell: (c) => taken(c.captured_at) },
   { title: "Seconds", numeric: true, value: (c) => c.seconds, cell: (c) => c.seconds.toFixed(1) },
 ];
 const table = { sorted: 0, up: true, /** @type {Map<Capture, HTMLTableRowElement>} */ rows: new Map() };
@@ -367,6 +372,7 @@ const NOTES = {
   relief: "Parallax relative to the plane that most of the scene is on: the lighter, the nearer.",
 };
 const BLINK_MS = 700;
+const NARROW_PX = 640; // as in page.css
 const SCREEN_SHARE = 78; // of its height, at most, for a picture
 const CLOSE_ENOUGH = 1.5; // as wide as the small picture has pixels, the detail is drawn over it
 
@@ -374,7 +380,8 @@ const CLOSE_ENOUGH = 1.5; // as wide as the small picture has pixels, the detail
 const look = {
   /** @type {Capture | null} */ capture: null,
   /** @type {HTMLImageElement | null} */ sheet: null,
-  /** @type {[string, string, string] | null} */ bands: null,
+  /** @type {[string, string, string] | null} */ wanted: null, // kept for the captures that have these bands
+  /** @type {[string, string, string]} */ bands: ["", "", ""],
   /** @type {"swipe" | "blink" | "side"} */ mode: "swipe",
   split: 0.5,
   /** @type {When} */ blinking: "before",
@@ -400,7 +407,8 @@ function show(capture) {
   look.indices = {};
   if (look.overlay.startsWith("index:") && !indexOf(capture)) look.overlay = "none";
   const names = capture.bands.map((b) => b.band);
-  if (look.bands === null || look.bands.some((b) => !names.includes(b))) look.bands = presets(capture)[0].bands;
+  look.wanted ??= presets(captures.find((c) => c.missing.length === 0) ?? capture)[0].bands;
+  look.bands = look.wanted.every((b) => names.includes(b)) ? look.wanted : presets(capture)[0].bands;
   if (!names.includes(look.overlayBand)) look.overlayBand = moving(capture)[0]?.band ?? "";
   table.rows.get(capture)?.classList.add("open");
   const dot = dots.get(capture);
@@ -408,7 +416,7 @@ function show(capture) {
   dot?.parentNode?.append(dot); // drawn on top
   const place = byId("capture");
   place.hidden = false;
-  place.replaceChildren(...heading(capture), ...pictures(capture), ...indexTable(capture), words(capture), numbers(capture));
+  place.replaceChildren(...heading(capture), ...pictures(capture), ...indexTable(capture), words(capture), numbers(capture), similarities(capture));
   paint();
 }
 
@@ -429,7 +437,7 @@ function heading(capture) {
   }
   return [
     el("div", { class: "heading" }, el("h2", { id: "capture-title" }, capture.label, " ", badge(capture.status)), step("Previous", at < 0 ? undefined : order[at - 1]), step("Next", at < 0 ? undefined : order[at + 1])),
-    el("p", { class: "soft" }, `${capture.camera} · ${capture.captured_at.slice(0, 19).replace("T", " ")}${where} · reference ${capture.reference}`, files),
+    el("p", { class: "soft" }, `${capture.camera} · ${taken(capture.captured_at)}${where} · reference ${capture.reference}`, files),
   ];
 }
 
@@ -467,7 +475,10 @@ function pictures(capture) {
     look.split = Number(swipe.value) / 1000;
     setMode("swipe");
   });
-  return [compositeTools(capture), viewTools(capture), el("div", { id: "viewer" }, frame, swipe), el("p", { class: "soft", id: "over-note" }), el("p", { class: "soft hint" }, "Drag the line, or drag the picture; the wheel zooms. The thin frame is the detail, which is shown at full resolution. On the picture the keys + and − zoom, arrows move, 0 shows all, the space bar changes between before and after.")];
+  const folded = el("details", { class: "controls", open: window.innerWidth > NARROW_PX }, el("summary", {}, "Bands and overlay"), compositeTools(capture), overlayTools(capture));
+  return [folded, viewTools(), el("div", { id: "viewer" }, frame, swipe), el("p", { class: "soft", id: "over-note" }),
+    el("p", { class: "soft hint mouse" }, "Drag the line, or drag the picture; the wheel zooms. The thin frame is the detail, which is shown at full resolution. On the picture the keys + and − zoom, arrows move, 0 shows all, the space bar changes between before and after."),
+    el("p", { class: "soft hint touch" }, "Drag the white line with a finger to compare before and after; + and − zoom, and a finger then moves the picture; All shows all of it again. The thin frame is the detail, which is shown at full resolution.")];
 }
 
 /**
@@ -483,7 +494,7 @@ function choice(label, options, value, then, spoken = label) {
 /** @param {Capture} capture */
 function compositeTools(capture) {
   const known = presets(capture);
-  const bands = look.bands ?? known[0].bands;
+  const bands = look.bands;
   const named = known.find((p) => p.bands.every((b, i) => b === bands[i]))?.name ?? "other";
   const line = el("div", { class: "tools" });
   const again = () => {
@@ -493,12 +504,12 @@ function compositeTools(capture) {
   };
   line.append(
     choice("Composite", [...known.map((p) => [p.name, p.name]), ...(named === "other" ? [["other", "other"]] : [])], named, (name) => {
-      look.bands = known.find((p) => p.name === name)?.bands ?? bands;
+      look.bands = look.wanted = known.find((p) => p.name === name)?.bands ?? bands;
       again();
     }),
     ...["Red", "Green", "Blue"].map((channel, i) =>
       choice(channel, capture.bands.map((b) => [b.band, b.band]), bands[i], (name) => {
-        look.bands = /** @type {[string, string, string]} */ (bands.map((b, k) => (k === i ? name : b)));
+        look.bands = look.wanted = /** @type {[string, string, string]} */ (bands.map((b, k) => (k === i ? name : b)));
         again();
       }, `${channel} channel`),
     ),
@@ -506,8 +517,7 @@ function compositeTools(capture) {
   return line;
 }
 
-/** @param {Capture} capture */
-function viewTools(capture) {
+function viewTools() {
   const line = el("div", { class: "tools", id: "view-tools" });
   /** @param {string} text @param {() => void} then @param {string} [mode] */
   const button = (text, then, mode) => {
@@ -528,6 +538,12 @@ function viewTools(capture) {
     if (b.textContent === "−") set(b, { "aria-label": "Zoom out" });
     if (b.textContent === "+") set(b, { "aria-label": "Zoom in" });
   });
+  return line;
+}
+
+/** @param {Capture} capture */
+function overlayTools(capture) {
+  const line = el("div", { class: "tools" });
   const overlays = [["none", "nothing"], ["vectors", "residual vectors"], ["heat", "residual heat map"]];
   if (capture.preview?.error_full_px) overlays.push(["error", "error to be expected"]);
   if (capture.preview?.relief) overlays.push(["relief", "relief of all bands"]);
@@ -677,12 +693,23 @@ function paint() {
     pen.fillStyle = "#fff";
     pen.fillRect(middle - 1, 0, 2, high);
   }
-  byId("over-note").replaceChildren(NOTES[look.overlay] ?? "", " ", ...legend(preview));
+  byId("over-note").replaceChildren(channelNote(capture), " ", NOTES[look.overlay] ?? "", " ", ...legend(preview));
+  stage.style.touchAction = look.zoom > 1 ? "none" : "pan-y"; // all is seen: the page scrolls
   const now = look.mode === "blink" ? look.blinking : "";
   byId("tag-left").textContent = now || "before";
   byId("tag-right").textContent = capture.bands.some((b) => b.written) ? "after" : "after: nothing was written";
   byId("tag-right").hidden = Boolean(now);
   stage.dataset["blinking"] = now;
+}
+
+/**
+ * Which bands are shown, and which of them differ from other captures.
+ * @param {Capture} capture
+ */
+function channelNote(capture) {
+  const black = capture.bands.filter((b) => look.bands.includes(b.band) && !b.written).map((b) => b.band);
+  const absent = (look.wanted ?? []).filter((b) => !capture.bands.some((one) => one.band === b));
+  return `Shown: ${look.bands.join(", ")} as red, green, blue.` + (black.length ? ` ${black.join(", ")} was not written: black after, and the colours differ from those of other captures.` : "") + (absent.length ? ` Other bands than for other captures, because ${absent.join(", ")} is missing.` : "");
 }
 
 /**
@@ -719,7 +746,7 @@ function inMetres(range_m) {
 function picture(pen, capture, when, origin, from, width) {
   const preview = /** @type {Preview} */ (capture.preview);
   const [frame, high] = [frameWidth(), stage.height];
-  const columns = (look.bands ?? []).map((name, i) => ({ column: capture.bands.findIndex((b) => b.band === name), colour: CHANNELS[i] }));
+  const columns = look.bands.map((name, i) => ({ column: capture.bands.findIndex((b) => b.band === name), colour: CHANNELS[i] }));
   const line = when === "before" ? 0 : 1;
   /** @param {number} u @param {number} v Shares of the picture's sides. @returns {[number, number]} */
   const at = (u, v) => [origin + (u - look.x) * look.zoom * frame, (v - look.y) * look.zoom * high];
@@ -992,23 +1019,33 @@ function sentence(pair, reference) {
 
 /** @param {Capture} capture */
 function numbers(capture) {
-  const heads = ["Band", "Status", "Seed", "Residual, px", "95 %, px", "Coverage", "Corner error, px", "Retrieval", "Mattes MI", "NMI", "NCC", "Gradients", "SSIM", "Geometry, 95 %", "Relief, occluded", "Seconds"];
+  const heads = ["Band", "Status", "Seed", "Residual, px", "95 %, px", "Coverage", "Corner error, px", "Retrieval", "Geometry, 95 %", "Relief, occluded", "Seconds"];
   const body = moving(capture).map((pair) => {
-    /** @param {string} name @param {number} [digits] */
-    const change = (name, digits = 3) => {
-      const [before, after] = pair.similarity?.[name] ?? [null, null];
-      return before === null && after === null ? "–" : `${fixed(before, digits)} → ${fixed(after, digits)}`;
-    };
     const heldOut = pair.geometry === null ? {} : pair.geometry.held_out_p95_px;
     const geometry = pair.geometry === null ? "–" : `${pair.geometry.kind}${Object.keys(heldOut).length > 1 ? ` (${Object.entries(heldOut).map(([kind, px]) => `${kind} ${fixed(px)}`).join(", ")})` : ""}`;
     const cells = [
       pair.seed ?? "–", fixed(pair.residual_px, 3), fixed(pair.residual_p95_px, 3), pair.coverage === null ? "–" : `${Math.round(pair.coverage * 100)} %`,
-      fixed(pair.corner_std_px, 3), fixed(pair.retrieval), change("mattes_mi"), change("nmi"), change("ncc", 2), change("gradient_correlation", 2), change("structure_ssim", 2), geometry, pair.occluded === null ? "–" : percent(pair.occluded), pair.seconds.toFixed(1),
+      fixed(pair.corner_std_px, 3), fixed(pair.retrieval), geometry, pair.occluded === null ? "–" : percent(pair.occluded), pair.seconds.toFixed(1),
     ];
     return el("tr", {}, el("th", { scope: "row" }, pair.band), el("td", {}, badge(pair.status)), ...cells.map((text, i) => el("td", { class: i === 0 ? "" : "n" }, text)));
   });
   const head = el("tr", {}, ...heads.map((text, i) => el("th", { scope: "col", class: i < 3 ? "" : "n" }, text)));
   return el("div", { class: "scroll" }, el("table", {}, el("thead", {}, head), el("tbody", {}, ...body)));
+}
+
+/** @type {[string, string, number][]} Name, column, and the sign that makes higher better. */
+const SIMILARITIES = [["mattes_mi", "Mutual information", -1], ["nmi", "NMI", 1], ["ncc", "NCC", 1], ["gradient_correlation", "Gradients", 1], ["structure_ssim", "SSIM", 1]];
+
+/** @param {Capture} capture */
+function similarities(capture) {
+  /** @param {number | null | undefined} value @param {number} sign */
+  const signed = (value, sign) => (value === null || value === undefined ? "–" : fixed(sign * value || 0, 3));
+  const body = moving(capture).map((pair) => el("tr", {}, el("th", { scope: "row" }, pair.band), ...SIMILARITIES.map(([name, , sign]) => {
+    const [before, after] = pair.similarity?.[name] ?? [null, null];
+    return el("td", { class: "n" }, `${signed(before, sign)} → ${signed(after, sign)}`);
+  })));
+  const head = el("tr", {}, el("th", { scope: "col" }, "Band"), ...SIMILARITIES.map(([, title]) => el("th", { scope: "col", class: "n" }, title)));
+  return el("details", { class: "more" }, el("summary", {}, "Similarity of the images before → after alignment"), el("div", { class: "scroll" }, el("table", {}, el("thead", {}, head), el("tbody", {}, ...body))));
 }
 
 // ---- what happens
