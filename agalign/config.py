@@ -117,18 +117,17 @@ class DiscoverOptions:
 
 @validated.dataclass(frozen=True, config=ConfigDict(use_attribute_docstrings=True, arbitrary_types_allowed=True))
 class RunOptions:
-    """How to run; no option changes the result of a capture."""
+    """How to run. Only `align_panels` changes results: with it, calibration panels give no reflectance."""
 
     overwrite: bool = False
     """Process finished captures again."""
-    jobs: Annotated[int, Field(ge=0), Option(short="-j", default=0, show_default=False)] = 1
-    """Captures processed at the same time; by default one per core."""  # 0 is one per core
+    jobs: Annotated[int, Field(ge=0), Option(short="-j", default=0)] = 1
+    """Captures processed at the same time; 0 is one per core."""
     align_panels: bool = False
-    """Also align captures of calibration panels and of the sky."""
+    """Also align captures of calibration panels and of the sky, and use no panel for reflectance."""
     # Any executor in Python, such as `dask_executor`.
     executor: Annotated[Executor | None, Option("dask", type=str | None)] = None
-    """Address of a Dask scheduler, as tcp://host:8786; its workers need the same folders. 'local' starts worker
-    processes on this machine."""
+    """Address of a Dask scheduler, as tcp://host:8786; 'local' starts workers on this machine."""
     retry_failed: bool = False
     """Process captures again if a band is not aligned or missing."""
     # An `executor` of the caller ignores it; `dask_executor` has its own.
@@ -169,7 +168,7 @@ class FlightSettings(SettingsModel):
     """One network for many captures."""
 
     together: Annotated[bool, Option("each_alone", default=False, parse=not_)] = True
-    """Learn a network per capture instead of one per flight."""
+    """Learn a network for each capture, not one for a flight."""
     start_model: str = ""
     """Fingerprint of the model that a run starts from, set by `run_flight`; runs with another one repeat a capture."""
 
@@ -181,7 +180,7 @@ class SeedSettings(SettingsModel):
         SeedKind | None,
         Option("seed", type=SeedChoice, default="auto", parse=lambda kind: None if kind == "auto" else kind),
     ] = None
-    """Use only this kind of initial alignment; by default the best of all."""
+    """Use only this kind of initial alignment; auto is the best of all."""
     only: Annotated[bool, Option("only_seed")] = False
     """Stop after the initial alignment."""
 
@@ -190,7 +189,7 @@ class CheckSettings(SettingsModel):
     """Acceptance of predicted bands. The limits of the checks are in their modules in `verify`."""
 
     accept_predicted_px: Annotated[float, Field(ge=0), Option("accept_predicted")] = 1.0
-    """Largest standard error, px, at which a predicted band counts as usable."""
+    """Largest standard error, px, at which indices may use a predicted band."""
 
 
 class ReliefSettings(SettingsModel):
@@ -201,8 +200,8 @@ class ReliefSettings(SettingsModel):
     use: Annotated[ReliefUse, _yes_or_no("always", "never"), Option("relief", alone="always", former="--local")] = (
         "auto"
     )
-    """Correct parallax (trees, terraces, buildings, close range) by one relief for all bands of a capture. auto: if
-    windows show parallax. --relief alone means always."""
+    """Correct parallax (trees, terraces, close range) by one relief for all bands of a capture. auto: if windows show
+    parallax. --relief alone means always."""
 
 
 class WriteSettings(SettingsModel):
@@ -213,8 +212,8 @@ class WriteSettings(SettingsModel):
     interpolation: Interpolation = "lanczos"
     """Resampling of the moving bands."""
     crop: Crop = "flight"
-    """Area to write. flight: shared by all bands of all captures; common: shared by all bands of the capture; none: the
-    whole frame of the reference."""
+    """Area to write: shared by all bands of all captures (flight) or of the capture (common), or the whole reference
+    (none)."""
     format: RasterFormat = "gtiff"
     """Write tiled GeoTIFF or cloud-optimised GeoTIFF."""
     compression: Compression = "auto"
@@ -228,8 +227,8 @@ class WriteSettings(SettingsModel):
     georeference: bool = False
     """Write an approximate georeference from GPS, altitude and yaw; a tag has its expected error."""
     ground_elevation_m: Annotated[float | None, Option("ground_elevation", show_default=False)] = None
-    """Elevation of the ground, m, in the height system of the camera's GPS; for footprints, if the tags contain no
-    height above ground."""
+    """Elevation of the ground, m, in the height system of the GPS; for footprints, if the tags lack the height above
+    ground."""
     statistics: bool = False
     """Store minimum, maximum, mean and standard deviation in aligned bands (gdalinfo -stats)."""
     qa: bool = False
@@ -242,7 +241,7 @@ class WriteSettings(SettingsModel):
     ] = ()
     """Also write spectral indices, names separated by commas: ndvi, ndre …; 'agalign indices' adds others."""
     pan_sharpen: bool = False
-    """Also write the bands at the resolution of the panchromatic band, or of the colour photograph with --with-rgb:
+    """Also write bands at the resolution of the panchromatic band, or with --with-rgb of the photograph:
     <capture>.pan.tif."""
     error_map: bool = False
     """Write a raster of the expected error at every pixel, <capture>.error.tif."""
@@ -256,12 +255,12 @@ class WriteSettings(SettingsModel):
     """Write float32. camera: radiance by the camera's calibration; sun, panel: reflectance by light sensor or
     calibration panel; auto (--radiometry alone): panel if available for all bands, else sun, else camera. Thermal bands
     are written in degrees C."""
-    # (band in lower case, reflectance); an empty name stands for all other bands.
+    # (band in lower case, reflectance); an empty name means all other bands.
     panel_albedo: Annotated[
         tuple[tuple[str, Annotated[float, Field(gt=0, le=1)]], ...], Option(type=str | None, parse=albedos)
     ] = ()
-    """Reflectance of the calibration panel, as 0.51 or as Blue=0.51,NIR=0.49; by default from tags or QR code. With
-    this option, panels without tags and code are recognised too."""
+    """Reflectance of the calibration panel, as 0.51 or Blue=0.51,NIR=0.49; by default from tags or QR code. Also
+    recognises panels without either."""
 
 
 class Settings(SettingsModel):

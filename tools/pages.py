@@ -1,9 +1,10 @@
-"""Write the tables of docs/ that repeat the program (options, sidecar fields, reasons), or check that they are current.
+"""Write the schema of the sidecar and the parts of docs/ that repeat the program (options, sidecar fields, reasons), or
+check that they are current.
 
     python tools/pages.py [--check]
 
-Options come from `agalign/config.py` and the command `align`, fields from `agalign/sidecar.schema.json`, reasons from
-`agalign/values/issues.py` and the checks in `agalign/verify`. Each table is between two comments in its page.
+Options come from `agalign/config.py` and the command `align`, fields from `agalign/products/sidecar.py`, reasons from
+`agalign/values/issues.py` and the checks in `agalign/verify`. Each part is between two comments in its page.
 """
 
 import json
@@ -16,9 +17,10 @@ from pathlib import Path
 from typing import Any
 
 import agalign
-from agalign.cli.command import field_options
+from agalign.cli.command import FieldOption, field_options
 from agalign.cli.main import COMMANDS
 from agalign.config import DiscoverOptions, RunOptions, Settings
+from agalign.products.sidecar import Sidecar
 from agalign.values.issues import Issue, sentence
 from agalign.verify.checks import KINDS
 
@@ -27,23 +29,34 @@ SCHEMA = Path(agalign.__file__).parent / "sidecar.schema.json"
 
 
 def options(owner: str) -> str:
-    """One row per option of an owner in `Given`: its name, the Python name, type, default in Python, and help text.
+    """One row per option of an owner in `Given`: its name, the Python name, type and default, and help text.
 
     Options of the command line only are in the table of `run`.
     """
-    rows = [("option", "Python", "type", "default", "effect")]
+    rows = [("option", "Python", "value", "effect")]
     defaults = {"settings": Settings(), "discover": DiscoverOptions(), "run": RunOptions()}[owner]
     for parameter in COMMANDS["align"].parameters():
         option = field_options().get(parameter.name)
-        if owner != (option.owner if option else "run") or parameter.name in ("folder", "out"):
+        if owner != (option.owner if option else "run") or parameter.name == "folder":
             continue
         kind, info = typing.get_args(parameter.annotation)
-        python, default = "argument `model`" if parameter.name == "model" else "", ""
+        python, value = f"argument `{parameter.name}`" if parameter.name in ("model", "out") else "", type_name(kind)
         if option is not None:
             name, opposite = ".".join(option.path), " (opposite)" if option.option.parse is not_ else ""
-            python, default = f"`{name}`{opposite}", f"`{attrgetter(name)(defaults)}`"
-        rows.append((f"`--{parameter.name.replace('_', '-')}`", python, type_name(kind), default, effect(info.help)))
+            python = f"`{name}`{opposite}"
+            value = with_default(value, option, parameter.default, attrgetter(name)(defaults))
+        rows.append((f"`--{parameter.name.replace('_', '-')}`", python, value, effect(info.help)))
     return table(rows)
+
+
+def with_default(values: str, option: FieldOption, given: Any, in_python: Any) -> str:
+    """Return the values of an option with its default in bold, and that of its field if it gives another result."""
+    if given is None or given is False:
+        return values
+    if f"`{given}`" in values:
+        return values.replace(f"`{given}`", f"**`{given}`**")
+    differs = option.option.parse(given) != in_python
+    return f"{values}, **`{given}`**" + (f" (in Python **`{in_python}`**)" if differs else "")
 
 
 def effect(text: str) -> str:
@@ -59,20 +72,28 @@ def type_name(kind: Any) -> str:
     if typing.get_origin(kinds[0]) is typing.Literal or isinstance(kinds[0], str):
         values = kinds if isinstance(kinds[0], str) else typing.get_args(kinds[0])
         return ", ".join(f"`{value}`" for value in values)
-    return {bool: "flag", int: "integer", float: "number", str: "text", Path: "file"}.get(kinds[0], "text")
+    return {bool: "flag", int: "integer", float: "number", str: "text", Path: "path"}.get(kinds[0], "text")
 
 
 def fields() -> str:
-    """A table for the sidecar and for each of its parts, with the descriptions of the schema."""
-    schema = json.loads(SCHEMA.read_text(encoding="utf-8"))
-    tables = []
+    """A list of fields for the sidecar and for each of its parts, with the descriptions of the schema."""
+    schema = sidecar_schema()
+    parts = []
     for name, part in [("Sidecar", schema), *schema["$defs"].items()]:
-        rows = [("field", "type", "meaning")]
-        for field, of_field in part["properties"].items():
-            rows.append((f"`{field}`", json_type(of_field), " ".join(of_field["description"].split())))
         title = "The file" if name == "Sidecar" else name.removesuffix("Part")
-        tables.append(f"### {title}\n\n{' '.join(part['description'].split())}\n\n{table(rows)}")
-    return "\n".join(tables)
+        parts += [f"### {title}", " ".join(part["description"].split())]
+        parts.append("\n".join(field_line(name, field) for name, field in part["properties"].items()))
+    return "\n\n".join(parts) + "\n"
+
+
+def field_line(name: str, field: dict[str, Any]) -> str:
+    """Return a field of the sidecar as an item of a list."""
+    return f"* `{name}` ({json_type(field)}): {' '.join(field['description'].split())}"
+
+
+def sidecar_schema() -> dict[str, Any]:
+    """Return the JSON Schema of the sidecar."""
+    return Sidecar.model_json_schema(mode="serialization")
 
 
 def json_type(field: dict[str, Any]) -> str:
@@ -122,21 +143,27 @@ TABLES: dict[str, dict[str, Callable[[], str]]] = {
 
 
 def main() -> None:
-    """Write the pages, or check them with --check."""
+    """Write the schema and the pages, or check them with --check."""
+    write_or_check(SCHEMA, json.dumps(sidecar_schema(), indent=1) + "\n")
     for name, tables in TABLES.items():
         page = DOCS / name
-        old = new = page.read_text(encoding="utf-8")
+        text = page.read_text(encoding="utf-8")
         for mark, content in tables.items():
             begin, end = f"<!-- {mark} -->\n", f"<!-- end of {mark} -->"
-            head, found, rest = new.partition(begin)
+            head, found, rest = text.partition(begin)
             if not found or end not in rest:
                 sys.exit(f"{page}: has no section {begin.strip()}")
-            new = head + begin + content() + end + rest.partition(end)[2]
-        if new == old:
-            continue
-        if "--check" in sys.argv[1:]:
-            sys.exit(f"{name}: a table is out of date; run python tools/pages.py")
-        page.write_text(new, encoding="utf-8", newline="\n")
+            text = head + begin + content() + end + rest.partition(end)[2]
+        write_or_check(page, text)
+
+
+def write_or_check(path: Path, text: str) -> None:
+    """Write a file that has changed; with --check, end with exit code 1 instead."""
+    if text == path.read_text(encoding="utf-8"):
+        return
+    if "--check" in sys.argv[1:]:
+        sys.exit(f"{path.name}: is out of date; run python tools/pages.py")
+    path.write_text(text, encoding="utf-8", newline="\n")
 
 
 if __name__ == "__main__":

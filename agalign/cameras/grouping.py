@@ -39,8 +39,8 @@ def group_files(files: Iterable[ImageFile]) -> list[list[ImageFile]]:
 
 
 def _add_files_without_id(groups: dict[_GroupKey, list[ImageFile]]) -> None:
-    """Move files without a capture id to the group with one and the same capture name: files whose id is damaged, then
-    single bands whose tags another program removed.
+    """Move files without a capture id to the group with one and the same capture name: files with a damaged id, then
+    single bands without tags, which another program removed.
     """
     by_name: dict[_GroupKey, list[_GroupKey]] = defaultdict(list)
     for key, group in groups.items():

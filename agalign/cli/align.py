@@ -150,7 +150,10 @@ def _onto(
     band: Annotated[
         str | None,
         typer.Option(
-            "--reference", "--band", show_default=False, help="Band of REFERENCE to compare; by default green."
+            "--reference",
+            "--band",
+            show_default=False,
+            help="Band of the mosaic REFERENCE to compare with; by default green.",
         ),
     ] = None,
 ) -> int:
@@ -196,7 +199,7 @@ onto = Command(
         "format": {"help": "Tiled GeoTIFF or cloud-optimised GeoTIFF."},
         "compression": {"help": "Lossless compression."},
         "device": {"help": "auto, cpu, cuda, cuda:1 …"},
-        "jobs": {"default": 1},
+        "jobs": {"default": 1, "help": "Mosaics processed at the same time; 0 is one per core."},
         "overwrite": {"help": "Process finished mosaics again."},
         "max_pixels": {
             "default": MAX_MOSAIC_PIXELS,

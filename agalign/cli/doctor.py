@@ -20,7 +20,7 @@ EXTRAS = {
     "indices": "more spectral indices by name (agalign indices --index)",
     "plots": "statistics of plots (agalign plots)",
     "stac": "STAC items and collections (--stac)",
-    "xarray": "a flight as one lazily read Dataset (agalign.open_flight)",
+    "xarray": "captures and flights as xarray datasets (agalign.open_capture, agalign.open_flight)",
 }
 _MIN_FREE_DISK_GB = 5.0
 

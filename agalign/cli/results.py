@@ -95,7 +95,7 @@ def _export(
 
 
 def print_left_out(left_out: Sequence[tuple[str, str]], terminal: Terminal) -> None:
-    """Print what is left out of a result, from (capture, reason)."""
+    """Print the captures that a result omits, from (capture, reason)."""
     for label, reason in left_out[:MAX_LISTED]:
         terminal.problem(f"{label}: left out: {reason}", capture=label)
     if len(left_out) > MAX_LISTED:
@@ -246,7 +246,7 @@ def _rebuild_report(out: Path, terminal: Terminal) -> None:
 
 
 def _warn_of_masks(written: "Sequence[IndexReport]", terminal: Terminal) -> None:
-    """Name the captures of which the quality flags mask more than a third."""
+    """Name the captures with more than a third of the pixels masked by quality flags."""
     captures = sorted({r.capture for r in written if r.statistics.masked_share > 1 / 3})
     if captures:
         more = f" and {len(captures) - 1} more captures" if captures[1:] else ""

@@ -132,7 +132,7 @@ def descend(
 ) -> Descent:
     """Minimise sum L0(x; psi, theta) + sum L1(x, x'; theta) over theta and psi (paper, Eq. 5).
 
-    Keypoints x are drawn from `pool`. Without `update_psi`, only theta is learned (paper, Eq. 3). Raises
+    Keypoints x are drawn from `pool`. Without `update_psi`, only theta is learned (paper, Eq. 4). Raises
     NotEnoughTextureError.
     """
     size_px = level.fixed.size_px
@@ -194,7 +194,7 @@ def _draw(state: JointState, level: Level, pool: Pool, h: Tensor, count: int) ->
 
 
 def _loss(net: Descriptor, level: Level, batch: _Samples, h: Tensor) -> Tensor:
-    """Return the sum of L0(x, w_k(x; psi)) and of L1(x, x') (paper, Eq. 4)."""
+    """Return the sum of L0(x, w_k(x; psi)) and of L1(x, x') (paper, Eq. 3)."""
     fixed, moving = level.fixed, level.moving[0]
     f = net(fixed.patches(patch_positions(batch.x)), REFERENCE)
     f_true = net(moving.patches(patch_positions(warp_keypoints(batch.x, h))), _MOVING)
@@ -203,7 +203,7 @@ def _loss(net: Descriptor, level: Level, batch: _Samples, h: Tensor) -> Tensor:
 
 
 def contrastive_loss(positive: Tensor, negative: Tensor) -> Tensor:
-    """Return the contrastive loss (paper, Eq. 2), a scalar.
+    """Return the contrastive loss (paper, Eq. 3), a scalar.
 
     The sum of L0 over positive pairs and of L1 = max(0, margin - L0) over negative pairs. `positive` (P,) and
     `negative` (N,) are distances of descriptors.

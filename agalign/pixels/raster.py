@@ -47,7 +47,7 @@ _MAX_MICROMETRES = 20.0
 
 
 def suffix_format(path: Path) -> Literal["TIFF", "JPEG", "PNG"] | None:
-    """Return the format that the suffix of a file stands for; None for other files.
+    """Return the format of a file by its suffix; None for other files.
 
     JPEG and PNG are photographs, or bands exported by other software, mostly in 8 bits.
     """

@@ -1,4 +1,4 @@
-"""GeoTIFFs that appear complete or not at all: each finished file is read back and compared with what was written."""
+"""GeoTIFFs that never appear incomplete: each finished file is read back and compared with what was written."""
 
 import errno
 import math

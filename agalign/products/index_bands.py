@@ -10,7 +10,6 @@ import numpy as np
 from rasterio.errors import RasterioError
 from rasterio.windows import Window
 
-from agalign.config import CheckSettings
 from agalign.errors import InputError
 from agalign.pixels.raster import OpenRaster, innermost_cause, open_raster
 from agalign.products.sidecar import BandResult, CaptureResult, is_usable
@@ -48,8 +47,6 @@ def bands_of(sidecar: CaptureResult, folder: Path, *, mask_qa: bool = False) -> 
     flags = next((part for part in sidecar.products if part.kind == "qa"), None)
     if mask_qa and flags is None:
         raise InputError(f"{sidecar.capture}: has no quality raster, which --mask-qa needs; align with --qa")
-    given = sidecar.accept_predicted_px
-    limit_px = CheckSettings().accept_predicted_px if given is None else given
     checksums = {part.file: part.sha256 for part in sidecar.products}
     result = []
     # Layer 1 of the quality raster is that of all bands together.
@@ -57,7 +54,7 @@ def bands_of(sidecar: CaptureResult, folder: Path, *, mask_qa: bool = False) -> 
         file, index = ("", 1) if part.place is None else (part.place.file, part.place.band_index)
         quality = (folder / flags.file, layer, flags.sha256) if mask_qa and flags is not None else None
         checksum = checksums.get(file, "")
-        problem = _problem_of(part, limit_px)
+        problem = _problem_of(part, sidecar.max_predicted_px)
         result.append(IndexBand(part.band, part.wavelength_nm, folder / file, index, checksum, problem, quality))
     return result
 

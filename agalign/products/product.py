@@ -117,7 +117,7 @@ class ProductContext:
 
     @property
     def usable(self) -> dict[str, Alignment[FixedFilePx]]:
-        """The alignments of the aligned bands, and of predicted bands whose standard error is accepted."""
+        """The alignments of the aligned bands, and of predicted bands with an accepted standard error."""
         limit_px = self.settings.check.accept_predicted_px
         return {name: a for name, a in self.with_pixels.items() if is_usable(a.status, a.prediction, limit_px)}
 

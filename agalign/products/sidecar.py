@@ -13,6 +13,7 @@ import numpy as np
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, GetCoreSchemaHandler
 from pydantic_core import CoreSchema, core_schema
 
+from agalign.config import CheckSettings
 from agalign.values.alignment import Prediction
 from agalign.values.choices import CaptureStatus, Geometry, ModelFamily, PairStatus, PredictionSource, SeedKind, Space
 from agalign.values.files import is_inside
@@ -186,9 +187,9 @@ class FieldPart(_Part):
 
 
 class GridPart(_Part):
-    """The complete mapping, lenses and displacement field included, sampled so that cubic interpolation (scipy's
-    CloughTocher2DInterpolator or RectBivariateSpline) reproduces it to 0.02 px: 17 x 13 points, or up to 129 x 97 if it
-    is more curved. If there is a `relief`, use that instead.
+    """The complete mapping, lenses and displacement field included, sampled at 17 x 13 points,
+    or at up to 129 x 97 points if cubic interpolation (scipy's CloughTocher2DInterpolator or RectBivariateSpline) of
+    fewer has errors above 0.02 px (p99). If there is a `relief`, use that instead.
     """
 
     reference_px: PointsPx
@@ -269,9 +270,9 @@ class SimilarityPart(_Part):
     overlap: Fraction6 = None
     """Share of the image in which both bands are valid."""
     residual_px: Fraction6 = None
-    """Median length of the local shifts of the windows, px; after alignment only."""
+    """Median length of the shifts of the windows, px of the reference; after alignment only."""
     residual_p95_px: Fraction6 = None
-    """Their 95th percentile, px."""
+    """Their 95th percentile, px of the reference."""
     residual_coverage: Fraction6 = None
     """Share of the textured windows in which a shift was measured."""
 
@@ -282,7 +283,7 @@ class ResidualTile(_Part):
     centre_px: tuple[Annotated[float, _measured(2)], Annotated[float, _measured(2)]]
     """Centre of the window, px of the reference."""
     shift_px: tuple[Fraction4, Fraction4]
-    """Shift along x and y, px; null if none could be measured."""
+    """Shift along x and y, px of the reference; null if none could be measured."""
 
 
 class MetricsResult(_Result):
@@ -473,7 +474,7 @@ class ProductPart(_Part):
 
 
 class ReliefPreviewPart(_Part):
-    """Picture of the relief in the preview: first column, row 5."""
+    """Picture of the relief in the preview: first column, last row."""
 
     parallax_px: tuple[float, float]
     """Parallax shown as black and as white (nearest), px."""
@@ -483,13 +484,13 @@ class ReliefPreviewPart(_Part):
 
 class PreviewPart(_Part):
     """Pictures for the report, a column for each of `bands`. Rows 0 and 1 show input and output, rows 2 and 3 a detail
-    of each, row 4 the expected error, row 5 the relief.
+    of each. Then come a row of expected errors (if `error_full_px` is not null) and one of the relief (if any).
     """
 
     file: RelativeFile
     """Relative to the folder of the sidecar."""
     tile_px: tuple[Count, Count]
-    """Width and height of a picture in rows 0, 1, 4 and 5."""
+    """Width and height of a picture in all other rows."""
     detail_px: tuple[Count, Count]
     """Width and height of a detail in rows 2 and 3."""
     detail: tuple[float, float, float, float]
@@ -520,8 +521,8 @@ class CaptureResult(_Result):
     camera: CameraPart
     """Camera."""
     status: CaptureStatus
-    """`ok`: every moving band is aligned, or predicted within `accept_predicted_px`, and none is missing. `failed`: no
-    moving band is usable. Else `degraded`.
+    """`ok`: every moving band is aligned, or predicted within `accept_predicted_px`, and none is missing. `failed`: all
+    moving bands are `failed`. Else `degraded`.
     """
     missing_bands: list[str]
     """Bands that other captures of this camera have."""
@@ -530,11 +531,11 @@ class CaptureResult(_Result):
     bands: Sequence[BandResult]
     """One entry per band, the reference included."""
     output: OutputPart | None
-    """Written rasters; null if no moving band is usable."""
+    """Written rasters; null if all moving bands are `failed`."""
     preview: PreviewPart | None = None
     """Preview image."""
     accept_predicted_px: float | None = None
-    """Standard error up to which a predicted band counts as usable, px; null in older sidecars."""
+    """Standard error up to which indices may use a predicted band, px; null in older sidecars."""
     products: list[ProductPart] = []
     """All files written for the capture except the sidecar."""
     not_written: list[str] = []
@@ -545,6 +546,12 @@ class CaptureResult(_Result):
     """SHA-256 of the content as canonical JSON (sorted keys, no spaces) without `checksum` and `seconds`; `agalign
     verify OUT` compares it.
     """
+
+    @property
+    def max_predicted_px(self) -> float:
+        """Standard error up to which indices may use a predicted band, px; the default in older sidecars."""
+        given = self.accept_predicted_px
+        return CheckSettings().accept_predicted_px if given is None else given
 
     @property
     def files(self) -> dict[str, int]:
@@ -572,7 +579,7 @@ class Sidecar(CaptureResult):
 
 
 def is_usable(status: PairStatus, prediction: Prediction | PredictionPart | None, accept_predicted_px: float) -> bool:
-    """Return True for the reference, an aligned band, or a predicted band whose standard error is accepted."""
+    """Return True for the reference, an aligned band, or a predicted band with an accepted standard error."""
     if status == "predicted":
         return prediction is not None and prediction.std_px <= accept_predicted_px
     return status in ("reference", "aligned")

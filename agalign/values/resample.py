@@ -114,7 +114,7 @@ def resample(
 ) -> tuple[NDArray[np.generic], Mask]:
     """Resample pixels (h, w) of a window of an image of `size_px` (width, height) at positions (H, W, 2) in the image.
 
-    Values are limited to the range of the pixels under the kernel: wide kernels ring beside saturated pixels. Returns
+    Values are limited to the range of the pixels under the kernel: wide kernels ring next to saturated pixels. Returns
     (H, W) pixels of the same type, with integers rounded and clipped, and their mask.
     """
     start = window.x0, window.y0

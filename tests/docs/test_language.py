@@ -21,7 +21,7 @@ DISCOURAGED = re.compile(
     re.IGNORECASE | re.VERBOSE,
 )
 MAX_IN_DOCUMENTS = 5
-MAX_IN_PACKAGE = 30
+MAX_IN_PACKAGE = 20
 
 
 def count(paths: list[Path]) -> tuple[int, str]:

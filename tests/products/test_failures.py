@@ -28,5 +28,7 @@ def test_bands_of_one_cause_and_status_are_one_group_and_the_gravest_comes_first
     assert sum("no reason" in g.remedy.cause for g in groups) == 1
     assert [b.capture for b in groups[-1].bands] == ["one", "two"]
     assert groups[-1].captures == 2
-    assert groups[-1].advice.startswith("use those with a standard error of at most 1 px")
+    assert groups[-1].advice.startswith(
+        "indices use those with a standard error (prediction.std_px) within --accept-predicted"
+    )
     assert "card" in groups[0].advice

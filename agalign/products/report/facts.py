@@ -58,7 +58,7 @@ class FailureGroup:
         """The remedy; for predicted bands, also when they may be used as they are."""
         if self.status != "predicted":
             return self.remedy.advice
-        usable = "use those with a standard error of at most 1 px (prediction.std_px in the sidecar), as indices do"
+        usable = "indices use those with a standard error (prediction.std_px) within --accept-predicted"
         return f"{usable}; {self.remedy.advice}"
 
     @property
@@ -149,6 +149,7 @@ class FlightFacts:
             "missing": sidecar.missing_bands,
             "reference": sidecar.reference.band,
             "seconds": round(sum(b.seconds for b in moving), 2),
+            "max_predicted_px": sidecar.max_predicted_px,
             "crop": grid.crop,
             "scale": grid.scale,
             "radiometry": grid.radiometry,

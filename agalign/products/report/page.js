@@ -20,6 +20,7 @@
  *   detail: [number, number, number, number], error_full_px: number | null,
  *   relief: {parallax_px: [number, number], range_m: [number, number] | null} | null}} Preview
  * @typedef {{label: string, captured_at: string, camera: string, status: string, position: [number, number] | null,
+ *   max_predicted_px: number,
  *   radiometry: string | null, altitude_m: number | null, missing: string[], reference: string, seconds: number,
  *   crop: [number, number, number, number], scale: [number, number], stack: string | null, sidecar: string,
  *   relief: string | null,
@@ -988,17 +989,17 @@ function indexTable(capture) {
 /** @param {Capture} capture */
 function words(capture) {
   const list = el("ul", { class: "words" });
-  for (const pair of moving(capture)) list.append(el("li", {}, el("b", {}, pair.band), ` ${sentence(pair, capture.reference)}`));
+  for (const pair of moving(capture)) list.append(el("li", {}, el("b", {}, pair.band), ` ${sentence(pair, capture)}`));
   for (const name of capture.missing) list.append(el("li", {}, el("b", {}, name), " is missing: other captures of this camera have it."));
   return list;
 }
 
 /**
- * What became of a band, for who delivers the map.
- * @param {Pair} pair @param {string} reference
+ * What became of a band, for the user of the map.
+ * @param {Pair} pair @param {Capture} capture
  */
-function sentence(pair, reference) {
-  const offset = pair.offset_length_px === null || pair.offset_length_px < 0.05 ? "" : `had an offset of ${fixed(pair.offset_length_px, pair.offset_length_px < 10 ? 1 : 0)} px from ${reference} and `;
+function sentence(pair, capture) {
+  const offset = pair.offset_length_px === null || pair.offset_length_px < 0.05 ? "" : `had an offset of ${fixed(pair.offset_length_px, pair.offset_length_px < 10 ? 1 : 0)} px from ${capture.reference} and `;
   if (pair.status === "aligned") {
     const left = pair.residual_px;
     if (left === null) return `${offset}is aligned; no window could measure a residual.`;
@@ -1009,7 +1010,7 @@ function sentence(pair, reference) {
   }
   if (pair.status === "predicted") {
     const std = pair.prediction?.std_px ?? Infinity;
-    const use = std <= 1 ? "suitable for indices within that error" : "not suitable for indices";
+    const use = std <= capture.max_predicted_px ? "suitable for indices within that error" : "not suitable for indices";
     const how = pair.prediction?.from === "windows" ? "is predicted by its windows" : "is predicted by the rig of the flight";
     return `${offset}${how}, standard error ${fixed(std)} px (${use}): ${pair.reason ?? "no reason was recorded"}.`;
   }
