@@ -11,7 +11,7 @@ from agalign.batch.report import CaptureReport, StageClock
 from agalign.batch.workers import failure_text
 from agalign.capture.align import PairProgress, align_capture_bands
 from agalign.config import Settings, WriteSettings
-from agalign.errors import AgalignError, ConfigurationError, InputError, SidecarError
+from agalign.errors import AgalignError, ConfigurationError, InputError, OutputError, SidecarError
 from agalign.flight.model import FlightModel, load_model
 from agalign.method.device import choose_device, keep_freed_memory, one_memory_error, one_thread
 from agalign.products.fill_sidecar import sidecar_of
@@ -23,6 +23,7 @@ from agalign.products.registry import PRODUCTS
 from agalign.products.sidecar_file import read_result, write_sidecar
 from agalign.values.capture import Capture
 from agalign.values.choices import RadiometryChoice
+from agalign.values.files import check_inside
 from agalign.values.image import OutputGrid
 
 
@@ -97,7 +98,7 @@ def refuse_to_overwrite(captures: Sequence[Capture], out: Path, settings: WriteS
     for capture in captures:
         for path in paths_written(capture, out, settings):
             if path.parent not in resolved:
-                resolved[path.parent] = path.parent.resolve()
+                resolved[path.parent] = check_inside(path.parent, out).resolve()
             if resolved[path.parent] / path.name in sources:
                 raise ConfigurationError(f"{path}: is an image to be aligned; choose another output folder")
             other = written.setdefault(str(path).lower(), capture)
@@ -119,7 +120,8 @@ def discard_outputs(capture: Capture, out: Path, settings: WriteSettings) -> Non
         old += [paths.folder / name for name in read_result(paths.sidecar).files]
         old += outdated_rasters(paths.file(""))
     for path in old:
-        with suppress(OSError):
+        with suppress(OSError, OutputError):
+            check_inside(path.parent, out)
             path.unlink(missing_ok=True)
 
 

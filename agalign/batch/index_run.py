@@ -17,6 +17,7 @@ from agalign.products.index_table import IndexReport, IndexRow, row_of, update_t
 from agalign.products.indices import Index
 from agalign.products.sidecar_file import read_result, run_sidecars, update_products
 from agalign.values.cores import usable_cores
+from agalign.values.files import check_inside
 
 _CAPTURES_WORTH_A_PROCESS = 8
 """Starting a process takes as long as the indices of this many captures."""
@@ -121,6 +122,7 @@ def do_indices(task: IndexTask) -> CaptureIndices:
     except AgalignError as error:
         return _failed(task, str(error))
     try:
+        check_inside(base.parent, task.target)
         bands = bands_of(sidecar, task.sidecar.parent, mask_qa=task.mask_qa)
         reports = write_rasters(bands, task.indices, base, task.label, overwrite=task.overwrite)
         if task.target == task.out:

@@ -39,6 +39,7 @@ from agalign.products.sidecar_file import read_result
 from agalign.products.stac import write_collections
 from agalign.values.capture import Capture
 from agalign.values.cores import usable_cores
+from agalign.values.files import check_inside
 from agalign.values.processes import CAPTURES_WORTH_A_PROCESS
 
 _MAX_THREADS = 4
@@ -149,6 +150,7 @@ class _FlightRun:
         if self.out.resolve() == self.flight.folder.resolve():
             raise ConfigurationError(f"{self.out}: is the folder of the images; choose another output folder with -o")
         refuse_to_overwrite(self.flight.captures, self.out, self.settings.write)
+        check_inside(self.out / "models", self.out)
 
     def starting_from(self, path: Path) -> Self:
         """Return the run with a model. Raises ConfigurationError if it does not fit the settings or the cameras."""

@@ -1,6 +1,5 @@
 """Captures of one camera and flight: grouping, the file names of their models, an overview of each camera."""
 
-import re
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from statistics import median
@@ -8,9 +7,7 @@ from statistics import median
 from agalign.pixels.radiometry import with_radiometry
 from agalign.values.capture import Band, Capture
 from agalign.values.choices import RadiometryChoice
-
-_MAX_STEM_CHARACTERS = 60
-"""File names may have 255 bytes, and a character may take four."""
+from agalign.values.files import file_name
 
 
 def camera_key(capture: Capture) -> str:
@@ -72,8 +69,7 @@ def model_names(groups: Sequence[Sequence[Capture]]) -> list[str]:
     used: set[str] = set()
     for group in groups:
         camera = group[0].camera
-        stem = re.sub(r"[^\w.+-]+", "_", f"{camera.model} {camera.serial}".strip())
-        stem = stem.lstrip(".")[:_MAX_STEM_CHARACTERS] or "camera"
+        stem = file_name(f"{camera.model} {camera.serial}".strip() or "camera")
         name, count = stem, 1
         while name.lower() in used:
             count += 1

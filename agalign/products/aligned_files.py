@@ -16,6 +16,7 @@ from agalign.products.product import CapturePaths, Product, ProductContext, Stac
 from agalign.products.raster_file import media_type, write_raster
 from agalign.values import geometry
 from agalign.values.capture import Capture
+from agalign.values.files import file_name
 from agalign.values.image import OutputGrid
 from agalign.values.mapping import PixelMapping
 
@@ -66,8 +67,9 @@ def band_file_names(capture: Capture) -> dict[str, Path]:
     by_folder = _has_namesakes_in_folders([*bands_per_file])
     names: dict[str, Path] = {}
     taken: dict[Path, Path] = {}
+    band_names: dict[str, str] = {}
     for band in capture.bands:
-        stem = f"{band.path.stem}_{_safe_name(band.name)}" if band.path in split else band.path.stem
+        stem = f"{band.path.stem}_{file_name(band.name, band_names)}" if band.path in split else band.path.stem
         folder = band.path.parent.name if by_folder else ""
         suffix = band.path.suffix if suffix_format(band.path) == "TIFF" else ".tif"
         name = Path(folder, f"{stem}{suffix}")
@@ -82,10 +84,6 @@ def band_file_names(capture: Capture) -> dict[str, Path]:
 def _has_namesakes_in_folders(files: Sequence[Path]) -> bool:
     """True if files of the same name are in several folders."""
     return len({p.stem for p in files}) < len(files) and len({p.parent for p in files}) > 1
-
-
-def _safe_name(text: str) -> str:
-    return "".join(c if c.isalnum() or c in "-." else "_" for c in text)
 
 
 def _from_source(layer: Layer, grid: OutputGrid) -> FromSource:

@@ -27,7 +27,7 @@ from agalign.products.sidecar_file import read_sidecar, run_sidecars
 from agalign.products.text_files import write_csv
 from agalign.values import geometry, lens
 from agalign.values.choices import ExportProgram
-from agalign.values.files import complete_file, write_text
+from agalign.values.files import check_inside, complete_file, file_name, write_text
 from agalign.values.geometry import Matrix, Points
 from agalign.values.lens import Lens
 
@@ -74,16 +74,13 @@ class AlignedCapture:
     """Path of the sidecar."""
     folder: Path
     """Its folder, relative to the output folder of the run."""
+    flat_name: str
+    """The label as a single file name: the folders of a memory card contain captures of the same name."""
 
     @property
     def label(self) -> str:
         """The capture's name below the output folder."""
-        return (self.folder / self.sidecar.capture).as_posix()
-
-    @property
-    def flat_name(self) -> str:
-        """The label as a single file name: the folders of a memory card contain captures of the same name."""
-        return "_".join((*self.folder.parts, self.sidecar.capture))
+        return (self.folder / self.path.stem).as_posix()
 
     @property
     def bands(self) -> list[BandPart]:
@@ -118,7 +115,7 @@ def export(
     Raises InputError if there is no run or nothing to export, ConfigurationError if the run wrote no band files,
     OutputError if `target` is not empty or cannot be written.
     """
-    captures = [AlignedCapture(read_sidecar(path), path, path.parent.relative_to(out)) for path in run_sidecars(out)]
+    captures = _captures(out)
     _check_empty(target)
     report = ExportReport(target)
     good = [c for c in captures if c.sidecar.status == "ok"]
@@ -143,6 +140,16 @@ def export(
     return report
 
 
+def _captures(out: Path) -> list[AlignedCapture]:
+    """The captures of a run. Raises InputError."""
+    result = []
+    taken: dict[str, str] = {}
+    for path in run_sidecars(out):
+        label = path.relative_to(out).with_suffix("").as_posix()
+        result.append(AlignedCapture(read_sidecar(path), path, path.parent.relative_to(out), file_name(label, taken)))
+    return result
+
+
 def _check_empty(target: Path) -> None:
     """Raise OutputError if the target folder is not empty."""
     try:
@@ -154,7 +161,8 @@ def _check_empty(target: Path) -> None:
 
 def _band_files(captures: Sequence[AlignedCapture], out: Path, images: Path, *, copy: bool) -> list[Path]:
     """Link or copy the band files. Raises ConfigurationError and OutputError."""
-    written = []
+    written: dict[Path, None] = {}
+    taken: dict[str, str] = {}
     for capture in captures:
         output = capture.sidecar.output
         if output is None or not output.band_files:
@@ -162,9 +170,11 @@ def _band_files(captures: Sequence[AlignedCapture], out: Path, images: Path, *, 
                 f"{out}: has stacks only; run 'agalign' with --layout bands or both into it, and export again"
             )
         for part in output.band_files:
-            name = "_".join((*capture.folder.parts, *Path(part.file).parts))
-            written.append(_placed(capture.path.parent / part.file, images / name, copy=copy))
-    return written
+            source = check_inside(capture.path.parent / part.file, out)
+            target = images / file_name((capture.folder / part.file).as_posix(), taken)
+            if target not in written:
+                written[_placed(source, target, copy=copy)] = None
+    return [*written]
 
 
 def _placed(source: Path, target: Path, *, copy: bool) -> Path:
@@ -238,9 +248,10 @@ def write_micasense(
         stacked = np.stack([matrix for matrix, _ in results])
         by_camera[images[0].tags.serial or "camera"].append(stacked)
         files.append(_write_npy(target / f"{capture.flat_name}_warp_matrices.npy", stacked))
+    taken: dict[str, str] = {}
     for serial, of_camera in by_camera.items():
         matrices_of_camera = _nearest_to_median(of_camera, captures[0].sidecar.reference.size_px)
-        files.append(_write_npy(target / f"{serial}_warp_matrices_opencv.npy", matrices_of_camera))
+        files.append(_write_npy(target / f"{file_name(serial, taken)}_warp_matrices_opencv.npy", matrices_of_camera))
     return files, rows
 
 
@@ -297,7 +308,7 @@ def _new_camera_matrix(band_lens: Lens, image: ImageFile) -> Matrix:
 
 
 def _nearest_to_median(captures: Sequence[NDArray[np.float64]], size_px: tuple[int, int]) -> NDArray[np.float64]:
-    """The matrices (bands, 3, 3) of the capture whose mapped corners are nearest to the median of all captures with as
+    """The matrices (bands, 3, 3) of the capture with the mapped corners nearest to the median of all captures with as
     many bands as the first.
     """
     complete = [matrices for matrices in captures if matrices.shape == captures[0].shape]

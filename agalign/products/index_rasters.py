@@ -34,6 +34,7 @@ from agalign.products.index_table import STATISTICS_TAG, IndexReport, IndexStati
 from agalign.products.indices import Index, bands_for, compute, index_named
 from agalign.products.product import GEOTIFF, CapturePaths, Product, ProductContext, StacAsset, WrittenFile
 from agalign.values.capture import Band, Capture
+from agalign.values.files import file_name
 from agalign.values.image import Tile, reduced_size_px
 from agalign.values.resample import tiles
 
@@ -56,7 +57,7 @@ class IndexRasters(Product):
 
     def paths(self, capture: Capture, paths: CapturePaths, settings: WriteSettings) -> list[Path]:  # noqa: ARG002
         """Return <capture>_<index>.tif and .png."""
-        names = [name.strip().lower() for name in settings.indices]
+        names = [file_name(name.strip().lower()) for name in settings.indices]
         return [paths.file(f"_{name}{suffix}") for name in names for suffix in (".tif", ".png")]
 
     def write(self, context: ProductContext) -> list[WrittenFile]:
@@ -135,7 +136,7 @@ def write_rasters(
     reports = []
     with BandReader() as reader:
         for index in indices:
-            target = base.with_name(f"{base.name}_{index.name}.tif")
+            target = base.with_name(f"{base.name}_{file_name(index.name)}.tif")
             try:
                 chosen = chosen_bands(bands, index)
                 source = _fingerprint(index, chosen)

@@ -7,6 +7,7 @@ import ast
 import json
 import math
 import re
+import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache, cached_property, lru_cache
@@ -88,7 +89,9 @@ def _parsed(formula: str) -> ast.expr:
     if len(formula) > _MAX_LENGTH:
         raise ConfigurationError(f"the formula has {len(formula)} characters; at most {_MAX_LENGTH} are allowed")
     try:
-        return ast.parse(formula.strip().replace("^", "**"), mode="eval").body
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # of Python, such as that a number is not callable
+            return ast.parse(formula.strip().replace("^", "**"), mode="eval").body
     except (SyntaxError, ValueError, RecursionError, MemoryError):
         raise ConfigurationError(f"'{formula}' is not a formula; write one like (N-R)/(N+R)") from None
 
@@ -134,18 +137,23 @@ def _value(node: ast.expr, values: Mapping[str, FloatImage]) -> Any:
 
 def _denominator(node: ast.expr, values: Mapping[str, FloatImage]) -> Any:
     """Return the value of a denominator; nan where one of bands is not positive beyond the noise of its terms."""
-    value = _value(node, values)
+    value, magnitude = _sum(node, values)
     if not any(isinstance(part, ast.Name) for part in ast.walk(node)):
         return value
-    return np.where(value > _NOISE * _magnitude(node, values), value, np.float32(np.nan))
+    return np.where(value > _NOISE * magnitude, value, np.float32(np.nan))
 
 
-def _magnitude(node: ast.expr, values: Mapping[str, FloatImage]) -> Any:
-    """Return the sum of the absolute values of the terms of a sum."""
+def _sum(node: ast.expr, values: Mapping[str, FloatImage]) -> tuple[Any, Any]:
+    """Return the value of a sum, and the sum of the absolute values of its terms.
+
+    Each term is calculated once: the time of nested denominators would otherwise double with each level.
+    """
     match node:
-        case ast.BinOp(left=left, op=ast.Add() | ast.Sub(), right=right):
-            return _magnitude(left, values) + _magnitude(right, values)
-    return np.abs(_value(node, values))
+        case ast.BinOp(left=left, op=(ast.Add() | ast.Sub()) as op, right=right):
+            one, other = _sum(left, values), _sum(right, values)
+            return _OPERATORS[type(op)](one[0], other[0]), one[1] + other[1]
+    value = _value(node, values)
+    return value, np.abs(value)
 
 
 @dataclass(frozen=True)

@@ -16,6 +16,7 @@ from agalign.pixels.raster import read_preview
 from agalign.products.drawing import Picture, side_by_side, titled, write_png
 from agalign.products.text_files import read_model, write_model
 from agalign.values.capture import Band, Capture, PanelSource
+from agalign.values.files import check_inside
 from agalign.values.pixel_units import PixelScale
 
 PANELS_FILE, SKY_FILE = "panels.json", "sky.json"
@@ -111,7 +112,7 @@ def write_panels(readings: Sequence[PanelReading], out: Path) -> list[PanelPart]
     """
     parts = []
     for reading in readings:
-        picture = out / reading.capture.folder / f"{reading.capture.name}.panel.png"
+        picture = check_inside(out / reading.capture.folder, out) / f"{reading.capture.name}.panel.png"
         write_png(side_by_side([_tile(b) for b in reading.bands], gap_px=6), picture)
         panel, bands = reading.panel, [_panel_band(b) for b in reading.bands]
         facts = {"seen_by": panel.seen_by, "serial": panel.serial, "picture": picture.relative_to(out).as_posix()}

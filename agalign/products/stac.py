@@ -4,7 +4,6 @@ electro-optical, raster and projection.
 
 import json
 import math
-import re
 from collections.abc import Sequence
 from contextlib import suppress
 from datetime import UTC, datetime
@@ -26,7 +25,7 @@ from agalign.products.pan_sharpen import panchromatic
 from agalign.products.product import CapturePaths, Product, ProductContext, WrittenFile
 from agalign.products.raster_file import UNITS
 from agalign.values.capture import Band, Capture
-from agalign.values.files import read_regular, write_text
+from agalign.values.files import file_name, read_regular, write_text
 from agalign.values.image import OutputGrid
 
 if TYPE_CHECKING:
@@ -105,9 +104,7 @@ def _collection_id(capture: Capture) -> str:
     It depends only on tags of the capture, so that captures of one flight in several runs have the same collection.
     """
     camera = f"{capture.camera.model} {capture.camera.serial}".strip()
-    name = re.sub(r"[^\w.-]+", "_", capture.flight_id or camera or "flight")
-    # A file name has at most 255 bytes, and up to 4 bytes per character.
-    return f"{name[:60]}-{hashed(*flight_key(capture))[:8]}"
+    return f"{file_name(capture.flight_id or camera or 'flight')}-{hashed(*flight_key(capture))[:8]}"
 
 
 def _item(context: ProductContext) -> "pystac.Item":

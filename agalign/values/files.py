@@ -4,9 +4,11 @@ import errno
 import hashlib
 import os
 import platform
+import re
 import secrets
 import stat
-from collections.abc import Iterator
+import unicodedata
+from collections.abc import Iterator, MutableMapping
 from contextlib import contextmanager, suppress
 from io import BufferedReader
 from pathlib import Path, PurePosixPath, PureWindowsPath
@@ -18,6 +20,10 @@ RUN_FILE = "agalign-run.json"
 """Name of the run record. It is written first, and identifies an output folder."""
 _PARTIAL = ".agalign-part-"
 """Prefix of partial files; host, process id and a random part follow."""
+_MAX_NAME_BYTES, _MAX_SUFFIX = 120, 12
+"""File names have at most 255 bytes: a checksum, and what the writer adds, follow."""
+_RESERVED = re.compile(r"(con|prn|aux|nul|(com|lpt)[0-9])(\..*)?", re.IGNORECASE)
+"""Names of devices on Windows."""
 
 
 @contextmanager
@@ -119,6 +125,31 @@ def is_inside(name: str) -> bool:
     posix, windows = PurePosixPath(name), PureWindowsPath(name)
     anchored = posix.is_absolute() or bool(windows.drive or windows.root)
     return bool(name) and not anchored and ".." not in windows.parts and "\0" not in name
+
+
+def file_name(text: str, taken: MutableMapping[str, str] | None = None) -> str:
+    """Return a text from a file as (a part of) a file name: letters, digits and `._-`, of bounded length, without a dot
+    at its ends, not a name that Windows reserves, and not empty. A suffix is kept.
+
+    `taken` has the text of each name, in lower case, that was given in a folder: another text gets another name, which
+    ends in a checksum.
+    """
+    allowed = re.sub(r"[^\w.-]+", "_", unicodedata.normalize("NFKC", text)).strip(".")
+    stem, suffix = os.path.splitext(allowed)  # noqa: PTH122 - a path would be empty without text
+    stem = stem.encode()[:_MAX_NAME_BYTES].decode(errors="ignore").strip(".") or "_"
+    suffix = suffix[:_MAX_SUFFIX]
+    if _RESERVED.fullmatch(stem + suffix):
+        stem = f"_{stem}"
+    while taken is not None and taken.setdefault(f"{stem}{suffix}".lower(), text) != text:
+        stem += f"-{hashlib.sha256(text.encode(errors='surrogatepass')).hexdigest()[:8]}"
+    return stem + suffix
+
+
+def check_inside(path: Path, folder: Path) -> Path:
+    """Return a path below a folder. Raises OutputError if a symbolic link leads out of the folder."""
+    if not Path(os.path.realpath(path)).is_relative_to(os.path.realpath(folder)):
+        raise OutputError(f"{path}: a link leads out of {folder}; remove the link, or choose another folder with -o")
+    return path
 
 
 def _flush_to_disk(path: Path) -> None:

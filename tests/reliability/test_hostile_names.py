@@ -1,0 +1,212 @@
+"""Texts from files in the names of outputs, and links in output folders: no writer leaves its folder."""
+
+import json
+import os
+import re
+import shutil
+from html import escape
+from pathlib import Path
+
+import pytest
+from PIL.ExifTags import Base
+from synthetic_flights.aligned import make_aligned
+
+import agalign
+from agalign.batch.index_run import index_tasks, run_indices
+from agalign.cameras.tiff_directory import EXIF, GPS, XMP, add_directories, byte_string, read_directories, text
+from agalign.flight.groups import model_names
+from agalign.products.export import export
+from agalign.products.indices import index_named
+from agalign.products.sidecar_file import content_checksum, find_sidecars
+from agalign.values.capture import CameraIdentity, Capture
+from agalign.values.files import file_name
+from agalign.values.text import without_controls
+
+from ..conftest import Shared, read_json, seeded
+from ..program import agalign_here
+
+HOSTILE = (
+    "../../pwn",
+    "/tmp/pwn",
+    "..",
+    "a\r\n\x1b[31mb",
+    "x" * 300,
+    "CON",
+    "",
+    ".hidden",
+    "a/b",
+    "a:b",
+    "C:\\b",
+    "é‮/",
+)
+
+
+def renamed_tags(path: Path, hostile: str) -> None:
+    """Make every text of a file's tags that can become part of a path this one."""
+    directories = read_directories(path)
+    packet = directories[0][XMP].data.decode()
+    in_xml = escape(without_controls(hostile))
+    for old in ("RedEdge-M", "syntheticflight00001"):
+        packet = packet.replace(old, in_xml)
+    packet = packet.replace("<Camera:BandName>", f"<Camera:BandName>{in_xml}").replace("synthetic0", f"{in_xml}0")
+    first = {XMP: byte_string(packet.encode()), Base.Model: text(hostile)}
+    add_directories(path, first, directories[EXIF] | {Base.BodySerialNumber: text(hostile)}, directories[GPS])
+
+
+@pytest.fixture
+def hostile_run(flight: Path, shared: Shared) -> Path:
+    """A folder with `in`, a capture for each text, and `out`, its run with every output; all captures count as `ok`."""
+
+    def fill(folder: Path) -> None:
+        for number, hostile in enumerate(HOSTILE):
+            for band in (2, 3, 4):
+                path = folder / "in" / f"IMG_{number:04d}_{band}.tif"
+                path.parent.mkdir(exist_ok=True)
+                shutil.copyfile(flight / "0000SET" / "000" / f"IMG_0001_{band}.tif", path)
+                renamed_tags(path, hostile)
+        outputs = {"layout": "both", "stac": True, "tie_points": True, "georeference": True, "qa": True}
+        write = outputs | {"error_map": True, "ground_elevation_m": 0.0}
+        reports = agalign.align_folder(folder / "in", folder / "deep" / "er" / "out", settings=seeded("rig", **write))
+        assert [r.error for r in reports] == [None] * len(HOSTILE)
+        for path in find_sidecars(folder / "deep"):
+            content = path.read_text().replace('"degraded"', '"ok"').replace('"seed_only"', '"aligned"')
+            checksum = content_checksum(content)
+            path.write_text(json.dumps(json.loads(content) | {"checksum": checksum}))
+
+    return shared("hostile", fill)
+
+
+def is_plain(name: str) -> bool:
+    """True for a name that every file system accepts: letters, digits, `._-`; no leading dot, no device of Windows."""
+    return len(name.encode()) < 200 and bool(re.fullmatch(r"(?!con(\.|$)|\.)[\w.-]+", name, re.IGNORECASE))
+
+
+def files_in(folder: Path) -> set[Path]:
+    return {p for p in folder.rglob("*") if not p.is_dir()}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "command",
+    [
+        *(f"export {{out}} -o {{new}} --for {name}" for name in ("odm", "metashape", "pix4d", "micasense", "opencv")),
+        "report {out}",
+        "verify {out}",
+        "indices {out} --index ndvi --formula con=(N-R)/(N+R)",
+        "indices {out} --index ndvi -o {new}",
+        "mosaic {out} -o {new}/field.tif --index ndvi",
+        "plots {out} {plots} -o {new}.csv --index ndvi",
+        "info {in} --json",
+        "evaluate {pairs} -m sift -o {new}.csv",
+    ],
+)
+def test_every_writer_stays_in_its_folder(hostile_run: Path, tmp_path: Path, command: str) -> None:
+    """The files of the run, those of the command, and no others."""
+    root = tmp_path / "a" / "b"
+    shutil.copytree(hostile_run, root)
+    square = [[5.0, 51.9], [5.1, 51.9], [5.1, 52.1], [5.0, 52.1], [5.0, 51.9]]
+    feature = {"type": "Feature", "properties": {"name": "../../pwn"}}
+    feature |= {"geometry": {"type": "Polygon", "coordinates": [square]}}
+    (root / "plots.json").write_text(json.dumps({"type": "FeatureCollection", "features": [feature]}))
+    images = ",".join(str(root / "in" / f"IMG_0000_{band}.tif") for band in (2, 3))
+    (root / "pairs.csv").write_text(f"fixed,moving,name,homography\n{images},../../pwn,1 0 0 0 1 0 0 0 1\n")
+    out, new, before = root / "deep" / "er" / "out", root / "some" / "where" / "new", files_in(tmp_path)
+    places = {"out": out, "new": new, "plots": root / "plots.json", "in": root / "in", "pairs": root / "pairs.csv"}
+    result = agalign_here(*(part.format_map(places) for part in command.split()))
+    assert result.returncode == (3 if "mosaic" in command else 0), result.stderr  # a mosaic is of equal bands
+    written = files_in(tmp_path) - before
+    assert all(p.is_relative_to(out) or p.is_relative_to(new) or p.parent == new.parent for p in written), written
+    assert all(is_plain(p.name) for p in written)
+    if "export" in command:
+        per_capture = 3 if "images" in {p.parent.name for p in written} else 1
+        of_cameras = len(HOSTILE) if "micasense" in command else 0
+        extra = {"README.txt", "matrices.csv"} & {p.name for p in written}
+        assert len(written) == per_capture * len(HOSTILE) + of_cameras + len(extra)
+
+
+@pytest.mark.slow
+def test_a_run_writes_plain_names_inside(hostile_run: Path) -> None:
+    assert {p.name for p in hostile_run.iterdir()} == {"in", "deep"}
+    written = files_in(hostile_run / "deep")
+    assert all(p.is_relative_to(hostile_run / "deep" / "er" / "out") and is_plain(p.name) for p in written)
+    assert len([p for p in written if p.name.endswith(".collection.json")]) >= len(HOSTILE) - 2
+
+
+def test_names_of_files_are_plain_and_different() -> None:
+    taken: dict[str, str] = {}
+    names = [file_name(text, taken) for text in (*HOSTILE, "A", "a", "a_b")]
+    assert len({name.lower() for name in names}) == len(names)
+    assert names == [file_name(text, taken) for text in (*HOSTILE, "A", "a", "a_b")]
+    assert all(map(is_plain, names))
+    assert [file_name(t) for t in ("IMG_0001_2.tif", "nul.TIF", "x" * 300 + ".tif")] == [
+        "IMG_0001_2.tif",
+        "_nul.TIF",
+        "x" * 120 + ".tif",
+    ]
+    captures = [[Capture("x", Path(), (), 0, CameraIdentity("", "", t))] for t in (*HOSTILE, *HOSTILE)]
+    models = model_names(captures)
+    assert len(set(models)) == len(models)
+    assert all(map(is_plain, models))
+
+
+def test_equal_names_do_not_overwrite_each_other(tmp_path: Path) -> None:
+    """Labels of captures that are equal as one name, and a name that is the checksummed one of another text."""
+    out = tmp_path / "out"
+    make_aligned(out, 1)
+    for folder, name in (("0000SET/x", "y"), ("0000SET", "x_y"), ("0000SET_x", "y")):
+        content = read_json(out / "0000SET" / "IMG_0001.json") | {"capture": name, "status": "ok"}
+        content["bands"][0]["place"] = None
+        content["output"]["band_files"] = [{"file": f"{name}.tif", "bytes": 1}]
+        (out / folder).mkdir(exist_ok=True)
+        (out / folder / f"{name}.tif").write_text(folder)
+        (out / folder / f"{name}.json").write_text(json.dumps(content))
+    (out / "0000SET" / "IMG_0001.json").unlink()
+    report = export(out, tmp_path / "images", "odm")
+    assert sorted(p.read_text() for p in report.files) == ["0000SET", "0000SET/x", "0000SET_x"]
+    assert sorted(p.read_text() for p in out.rglob("*.tif") if p.stem != "IMG_0001") == [
+        "0000SET",
+        "0000SET/x",
+        "0000SET_x",
+    ]
+    assert len({p.name for p in export(out, tmp_path / "matrices", "opencv").files}) == 4
+
+
+@pytest.mark.skipif(os.name == "nt", reason="links need a privilege on Windows")
+def test_links_are_not_followed_out_of_the_folder(flight: Path, tmp_path: Path) -> None:
+    outside, out = tmp_path / "outside", tmp_path / "out"
+    outside.mkdir()
+    (outside / "IMG_0001.json").write_text("{}")
+    out.mkdir()
+    (out / "0000SET").symlink_to(outside)
+    with pytest.raises(agalign.OutputError, match=r"out/0000SET/000: a link leads out of .*/out; remove the link"):
+        agalign.align_folder(flight, out, settings=seeded("rig"))
+    (out / "0000SET").unlink()
+    (out / "models").symlink_to(outside)
+    with pytest.raises(agalign.OutputError, match="a link leads out"):
+        agalign.align_folder(flight, out, settings=seeded("rig"))
+    (out / "models").unlink()
+    (out / ".agalign.lock").symlink_to(outside / "IMG_0001.json")
+    with pytest.raises(agalign.OutputError, match=r"\.agalign\.lock: "):
+        agalign.align_folder(flight, out, settings=seeded("rig"))
+    assert [(p.name, p.read_text()) for p in outside.iterdir()] == [("IMG_0001.json", "{}")]
+
+
+@pytest.mark.skipif(os.name == "nt", reason="links need a privilege on Windows")
+def test_an_export_does_not_read_through_links_and_indices_do_not_write_through_them(tmp_path: Path) -> None:
+    out, secret = tmp_path / "out", tmp_path / "secret"
+    secret.mkdir()
+    (secret / "key").write_text("secret")
+    make_aligned(out, 1)
+    sidecar = out / "0000SET" / "IMG_0001.json"
+    content = read_json(sidecar) | {"status": "ok"}
+    content["output"]["band_files"] = [{"file": "link/key", "bytes": 1}]
+    sidecar.write_text(json.dumps(content))
+    (out / "0000SET" / "link").symlink_to(secret)
+    with pytest.raises(agalign.OutputError, match="link/key: a link leads out of"):
+        export(out, tmp_path / "to", "odm")
+    target = tmp_path / "indices"
+    target.mkdir()
+    (target / "0000SET").symlink_to(secret)
+    (result,) = run_indices(index_tasks(out, [index_named("ndvi")], target))
+    assert "a link leads out" in result.reports[0].problem
+    assert [p.name for p in secret.iterdir()] == ["key"]
