@@ -52,7 +52,7 @@ def _trunk() -> nn.Sequential:
 
 
 def distance(f: Tensor, f_prime: Tensor) -> Tensor:
-    """Return ||f(x) - f(x')||_2 row by row (the paper's L0), (N, D) x (N, D) -> (N,). The gradient at 0 is 0."""
+    """Return ||f(x) - f(x')||_2 row by row (paper, Eq. 3), (N, D) x (N, D) -> (N,). The gradient at 0 is 0."""
     return (f - f_prime).square().sum(dim=1).clamp_min(1e-12).sqrt()
 
 

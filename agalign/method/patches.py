@@ -113,7 +113,7 @@ def warp_keypoints(keypoints: Keypoints, homography: Tensor) -> Keypoints:
 
 
 def patch_positions(keypoints: Keypoints, side: int = PATCH_PX) -> Tensor:
-    """Return the sample positions of each keypoint's patch, (N, side, side, 2) px, centred on the keypoint.
+    """Return the sample positions of each keypoint's patch, (N, side, side, 2) px (paper, Eq. 6), centred on it.
 
     The patch has the same extent for every `side`; only the number of samples differs.
     """
@@ -128,7 +128,7 @@ def patch_positions(keypoints: Keypoints, side: int = PATCH_PX) -> Tensor:
 
 
 def bilinear(image: Tensor, positions: Tensor) -> Tensor:
-    """Sample an image (C, H, W) at positions (N, n, n, 2) px -> (N, C, n, n) (the paper's B(p; I)).
+    """Sample an image (C, H, W) at positions (N, n, n, 2) px -> (N, C, n, n) (B(p; I) of the paper, Eq. 6).
 
     Positions outside have the value of the nearest border pixel.
     """

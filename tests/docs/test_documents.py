@@ -223,15 +223,6 @@ def test_links_lead_somewhere(page: Path) -> None:
             assert anchor in {re.sub(r"[^\w -]", "", h).strip().lower().replace(" ", "-") for h in heads}, target
 
 
-@pytest.mark.parametrize("name", ["README.md", "docs/options.md", "docs/quickstart.md", "docs/troubleshooting.md"])
-def test_options_in_the_documents_exist(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("COLUMNS", "300")
-    helps = agalign_here("--help").stdout + agalign_here("align", "--help").stdout
-    named = set(re.findall(r"[` ](--[a-z][\w-]+)", (ROOT / name).read_text(encoding="utf-8")))
-    assert named
-    assert named <= set(re.findall(r"--[a-z][\w-]+", helps))
-
-
 def python(*arguments: str | Path) -> None:
     """Run a program of Python in a process of its own; it must succeed."""
     variables = os.environ | {"PYTHONPATH": str(ROOT)}

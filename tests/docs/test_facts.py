@@ -1,0 +1,205 @@
+"""Facts that pages state are those of the program: messages, options, exit codes, events, stages, limits, paths."""
+
+import ast
+import importlib
+import inspect
+import re
+import signal
+import tomllib
+from collections.abc import Iterator
+from functools import cache
+from pathlib import Path
+
+import pytest
+
+from agalign.capture import band_pair, reference, relief
+from agalign.cli.main import COMMANDS
+from agalign.cli.terminal import ExitCode
+from agalign.flight import panels
+from agalign.method import refine
+from agalign.pixels import raster
+from agalign.products.registry import PRODUCTS
+from agalign.products.sidecar import ProductPart
+from agalign.relief import dense
+from agalign.values.alignment import MIN_RETRIEVAL, MIN_TIMES_CHANCE
+from agalign.verify import checks, displacement_field, residuals
+
+from ..program import agalign_here
+from .blocks import PAGES, ROOT
+
+EACH_PAGE = pytest.mark.parametrize("page", PAGES, ids=[p.relative_to(ROOT).as_posix() for p in PAGES])
+PACKAGE = ROOT / "agalign"
+OPTIONS_OF_OTHERS = {
+    "--cpus", "--gpus", "--read-only", "--tmpfs", "--user",  # docker run
+    "--extra-index-url",  # pip
+    "--kinds", "--markdown", "--pairs", "--plot", "--ranges", "--scenes",  # benchmarks
+    "--strict",  # mypy
+}  # fmt: skip
+"""Options in the text of pages that are not those of agalign."""
+WORDS_OF_A_MESSAGE = 4
+"""Code of as many words is a quoted message, if it is none of these."""
+NOT_A_MESSAGE = re.compile(r"(agalign|python3?|pip|docker|sphinx-build|if __name__) |--|x ↦")
+
+
+def text_of(page: Path) -> str:
+    """The text of a page without blocks."""
+    return re.sub(r"```.*?```", "", page.read_text(encoding="utf-8"), flags=re.DOTALL)
+
+
+def code_in(page: Path) -> list[str]:
+    """The code in the text of a page."""
+    return re.findall(r"`([^`]+)`", re.sub(r"\s+", " ", text_of(page)))
+
+
+def table(page: str, head: str) -> list[list[str]]:
+    """The cells of the rows of the table with the head that begins so."""
+    rows = text_of(ROOT / "docs" / page).partition(f"\n| {head} |")[2].partition("\n\n")[0].splitlines()[2:]
+    assert rows, f"{page}: has no table '{head}'"
+    return [[cell.strip() for cell in row.strip("| ").split(" | ")] for row in rows]
+
+
+def template(text: str) -> str:
+    """A text with a placeholder for each quoted name, number, field and dots, which differ between messages."""
+    text = re.sub(r"\{[^{}]*\}|'[^']*'|\d[\d.,]*|…", "\0", text)
+    return re.sub("\0%?", "\0", " ".join(text.split()))
+
+
+@cache
+def strings_of_the_program() -> tuple[str, ...]:
+    """The templates of all texts in the package."""
+    parts: list[str] = []
+    for path in PACKAGE.rglob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.JoinedStr):
+                parts.append("".join(v.value if isinstance(v, ast.Constant) else "{}" for v in node.values))
+            elif isinstance(node, ast.Constant) and isinstance(node.value, str):
+                parts.append(node.value)
+    return tuple(map(template, parts))
+
+
+@EACH_PAGE
+def test_quoted_messages_are_printed_by_the_program(page: Path) -> None:
+    for code in code_in(page):
+        if len(code.split()) >= WORDS_OF_A_MESSAGE and not NOT_A_MESSAGE.match(code):
+            # `FILE: reason` begins with a name.
+            message = template(code.removeprefix("FILE: "))
+            assert any(message in text for text in strings_of_the_program()), code
+
+
+@cache
+def options_of_the_program() -> frozenset[str]:
+    helps = (agalign_here(*command, "--help").stdout for command in ([], *([c] for c in COMMANDS)))
+    return frozenset(re.findall(r"--[a-z][\w-]+", "".join(helps)))
+
+
+@EACH_PAGE
+def test_options_in_the_text_exist(page: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("COLUMNS", "300")
+    named = set(re.findall(r"(?<![\w-])--[a-z][\w-]+", text_of(page)))
+    assert named <= options_of_the_program() | OPTIONS_OF_OTHERS
+
+
+def test_exit_codes() -> None:
+    signals = {int(ExitCode.SIGNAL + n) for n in (signal.SIGHUP, signal.SIGINT, signal.SIGTERM)}
+    codes = {int(c) for c in ExitCode if c is not ExitCode.SIGNAL} | signals
+    listed = {int(code) for codes_of_a_row, _ in table("batch.md", "exit code") for code in codes_of_a_row.split(", ")}
+    assert listed == codes
+    for page in PAGES:
+        named = re.findall(r"exit code[s]? (\d+)", text_of(page), re.IGNORECASE)
+        assert set(map(int, named)) <= codes, page
+
+
+def calls(module: str, function: str) -> Iterator[ast.Call]:
+    """The calls of a function or method of this name in a module."""
+    for node in ast.walk(ast.parse((PACKAGE / module).read_text(encoding="utf-8"))):
+        name = getattr(node.func, "attr", getattr(node.func, "id", "")) if isinstance(node, ast.Call) else ""
+        if isinstance(node, ast.Call) and name == function:
+            yield node
+
+
+def test_events_of_a_run_and_their_fields() -> None:
+    fields: dict[str, set[str]] = {}
+    for call in calls("cli/run.py", "event"):
+        if isinstance(call.args[0], ast.Constant):
+            names = {k.arg for k in call.keywords if k.arg is not None}
+            fields.setdefault(str(call.args[0].value), set()).update(names)
+    listed = {row[0].strip("`"): set(re.findall(r"`(\w+)`", row[1])) for row in table("batch.md", "event")}
+    # Their names are in a loop; a problem is an event of the terminal.
+    assert set(listed) == {*fields, "panel", "sky", "problem"}
+    for event, names in fields.items():
+        assert names <= listed[event], event
+
+
+def test_stages_of_a_capture() -> None:
+    stages = set()
+    for path in (*(PACKAGE / "capture").glob("*.py"), *(PACKAGE / "method").glob("*.py"), PACKAGE / "batch/capture.py"):
+        for name in ("progress", "report"):
+            for call in calls(str(path.relative_to(PACKAGE)), name):
+                stages |= {str(a.value) for a in call.args if isinstance(a, ast.Constant) and isinstance(a.value, str)}
+    row = next(row for row in table("batch.md", "event") if row[0] == "`stage`")
+    assert set(re.findall(r"`(\w+)`", row[1].partition("`stage` (")[2].partition(")")[0])) == stages - {""}
+
+
+LIMITS = {
+    "method.md": (
+        f"| at least {MIN_RETRIEVAL:g}, and {MIN_TIMES_CHANCE:g} times chance |",
+        f"| {checks._MAX_CORNER_STD_PX:g} px |",
+        f"the textured windows ({residuals._WINDOW_PX} px)",
+        f"| {checks._MIN_COVERAGE:.0%} ({checks._MIN_HELD_OUT_COVERAGE:.0%} if".replace("%", " %"),
+        f"| {checks._MIN_CLOSE_SHARE:.0%}; adjacent windows beyond {checks._MAX_SHIFT_PX:g} px: fewer than "
+        f"{checks._MIN_CLUSTER}, or than {checks._MAX_CLUSTER_SHARE:.0%} of the windows |".replace("%", " %"),
+        f"| {checks.MAX_ALIAS_PEAK:.0%} of the first".replace("%", " %"),
+        f"| the larger of {checks.MAX_UNEXPECTED_PX:g} px and {checks._MAX_UNEXPECTED_STD:g} standard errors |",
+        f"in blurred images they have {reference._LARGE_WINDOW_PX} px",
+        f"by more than {refine._FINAL_CONVERGED_PX:g} px",
+        f"the p95 of the parallax is at least {relief._MIN_PARALLAX_PX:g} px",
+        f"more than {relief._MAX_FAR_SHARE:.0%} of the windows".replace("%", " %"),
+        f"nodes every {displacement_field._LATTICE_PX} px",
+        f"fitted to windows of {displacement_field._WINDOW_PX} px",
+        f"Images above {band_pair._LONGEST_SIDE_PX} px",
+        f"fewer than {band_pair._COARSE_RATIO:g} pixels per reference pixel",
+    ),
+    "benchmarks.md": (
+        f"The largest parallax is {dense._SEARCH_NEARER:.0%} of".replace("%", " %"),
+        f"and {dense._SEARCH_FARTHER:.0%} behind it".replace("%", " %"),
+    ),
+    "radiometry.md": (f"calibration panels at most {panels._MAX_TIME_DIFFERENCE_S / 3600:g} hours away",),
+    "reliability.md": (f"{raster._MAX_BANDS} bands per file",),
+}
+"""{page: sentences with a limit of the program}."""
+
+
+@pytest.mark.parametrize("page", LIMITS)
+def test_limits(page: str) -> None:
+    text = re.sub(r"[\s*]+", " ", text_of(ROOT / "docs" / page))
+    assert [limit for limit in LIMITS[page] if limit not in text] == []
+
+
+@EACH_PAGE
+def test_files_in_the_text_exist(page: Path) -> None:
+    for code in code_in(page):
+        if re.fullmatch(r"[a-z_./]+/\w+\.(py|sh|j2|js)", code):
+            assert any((folder / code).is_file() for folder in (ROOT, PACKAGE)), code
+
+
+def test_equations_of_the_paper() -> None:
+    """The docstring of a function names the equation that the page assigns to it."""
+    found = set()
+    for row in table("paper.md", "the paper"):
+        equations = re.findall(r"Eq\. \d+", row[0])
+        for module, names in re.findall(r"`([\w/]+)\.py`: ((?:`[\w()=]+`(?:, )?)+)", row[1]) if equations else ():
+            code = importlib.import_module(f"agalign.{module.replace('/', '.')}")
+            for name in re.findall(r"`(\w+)", names):
+                found.add(name)
+                assert equations[0] in (inspect.getdoc(getattr(code, name)) or ""), name
+    assert {"contrastive_loss", "descend", "bilinear"} <= found
+
+
+def test_extras() -> None:
+    extras = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]["optional-dependencies"]
+    assert {name for row in table("install.md", "extra") for name in re.findall(r"`(\w+)`", row[0])} == set(extras)
+
+
+def test_kinds_of_products() -> None:
+    listed = re.findall(r"`(\w+)`", ProductPart.model_fields["kind"].description or "")
+    assert set(listed) == {p.kind for p in PRODUCTS}
