@@ -151,15 +151,17 @@ def main(
         fuzz(target, corpus, [f"-runs={inputs}", *(libfuzzer or ())])
     with tempfile.TemporaryDirectory() as folder:
         seeds(Path(folder))
-        rows = [("what is fuzzed", "inputs", "failures", "slowest, whole seconds", "most memory, MB", "seconds")]
+        parts = []
         errors = []
         for one, share in SHARES.items() if target is None else {target: 1.0}.items():
             began = time.monotonic()
             (count, slowest, memory), error = fuzz_in_process(one, round(inputs * share), Path(folder, one))
             errors += [error] if error else []
-            numbers = count, int(bool(error)), slowest, memory, round(time.monotonic() - began)
-            rows.append((one, *map(str, numbers)))
-        Section("fuzz", markdown).table(rows)
+            seconds = round(time.monotonic() - began)
+            parts.append(
+                f"{one} {count} in {seconds} s ({int(bool(error))} failures, slowest {slowest} s, {memory} MB)"
+            )
+        Section("fuzz", markdown).say(f"Inputs: {', '.join(parts)}.")
         if errors:
             raise SystemExit("\n".join(errors))
 

@@ -136,10 +136,10 @@ def main(kills: int = 50, rng_seed: int = 0, markdown: Path | None = None) -> No
         section.say(
             f"{kills} kills of a run of {seconds:.0f} s over {CAPTURES} captures ({hit} while it was running; "
             f"between {min(kept)} and {max(kept)} captures were finished by then), each followed by the same command: "
-            f"{kills - result['bad exit codes']} exit codes 0."
+            f"{kills - result['bad exit codes']} exit codes 0. Files after the kill: {result['torn sidecars']} torn "
+            f"sidecars, {result['torn captures']} torn captures; after resuming: {result['missing']} missing, "
+            f"{result['left over']} left over, {result['corrupt']} corrupt, {result['different']} different."
         )
-        kinds = ("torn sidecars", "torn captures", "missing", "left over", "corrupt", "different")
-        section.table([("after the kill, and after resuming", "files"), *((k, str(result[k])) for k in kinds)])
 
 
 if __name__ == "__main__":

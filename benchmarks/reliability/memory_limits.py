@@ -64,7 +64,7 @@ def main(
     markdown: Path | None = None,
 ) -> None:
     section = Section("memory limits", markdown)
-    rows: dict[tuple[int, str, str], list[tuple[float, float]]] = defaultdict(list)
+    rows: dict[tuple[str, str], list[tuple[float, float]]] = defaultdict(list)
     with tempfile.TemporaryDirectory() as name:
         flight = Path(name, "flight")
         synthetic.make_flight(flight, CAPTURES, SIZE_PX, rng_seed=4)
@@ -77,12 +77,12 @@ def main(
                 # The limit itself is in the line.
                 line = re.sub(r"limited to [0-9.]+ GB", "limited to … GB", line)
                 print(f"-j {jobs} {limit_gb:.2f} GB: {how}, {seconds:.1f} s: {line}", flush=True)
-                rows[jobs, how, line].append((limit_gb, seconds))
-    table = [("jobs", "limit, GB", "runs", "slowest, s", "how it ended", "first line")]
-    for (jobs, how, line), seen in rows.items():
+                rows[how, line].append((limit_gb, seconds))
+    table = [("limit, GB", "runs", "slowest, s", "how it ended", "first line")]
+    for (how, line), seen in rows.items():
         limits_gb, seconds_of = zip(*seen, strict=True)
         ends = dict.fromkeys(f"{gb:.2f}" for gb in (min(limits_gb), max(limits_gb)))
-        table.append((str(jobs), " to ".join(ends), str(len(seen)), f"{max(seconds_of):.0f}", how, line))
+        table.append((" to ".join(ends), str(len(seen)), f"{max(seconds_of):.0f}", how, line))
     section.table(table)
 
 

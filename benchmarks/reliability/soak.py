@@ -35,13 +35,13 @@ def main(captures: int = 1000, jobs: int = 2, markdown: Path | None = None) -> N
         count = process.samples[:, 4]
         working = process.samples[count == np.median(count)]  # neither while processes start nor while they end
         half = working[working[:, 0] > working[-1, 0] / 2]
-        table = [("while all processes work, second half of the run", "mean", "growth", "scatter")]
+        parts = []
         for name, column in QUANTITIES.items():
             t_s, y = half[:, 0], half[:, column]
             line = np.polyfit(t_s, y, 1)
             growth, scatter = line[0] * (t_s[-1] - t_s[0]), (y - np.polyval(line, t_s)).std()
-            table.append((name, f"{y.mean():.0f}", f"{growth:+.1f}", f"{scatter:.1f}"))
-        section.table(table)
+            parts.append(f"{name} {y.mean():.0f} (growth {growth:+.1f}, scatter {scatter:.1f})")
+        section.say(f"Second half of the run, while all processes work: {', '.join(parts)}.")
         process = watched(command(flight, out, "-j", str(jobs)))
         mb = process.samples[:, 2].max()
         section.say(
