@@ -33,7 +33,7 @@ from agalign.products.index_rasters import check_indices
 from agalign.products.panels import write_panels, write_sky
 from agalign.products.preview import preview_bytes
 from agalign.products.product import CapturePaths
-from agalign.products.run_record import RunPart, RunState, begun
+from agalign.products.run_record import ExclusionPart, RunPart, RunState, begun
 from agalign.products.sidecar import CaptureResult
 from agalign.products.sidecar_file import read_result
 from agalign.products.stac import write_collections
@@ -87,6 +87,7 @@ def run_flight(
     with locked(out), _recorded(run) as record:
         for report in run.reports(record):
             record.add(report.label, report.state, report.result, report.problems)
+            record.excluded += [report.exclusion] if report.exclusion is not None else []
             if report.state == "done":
                 record.capture_seconds[report.label] = report.seconds
             for (_, stage), seconds in report.stages.items():
@@ -239,10 +240,14 @@ class _FlightRun:
     ) -> Iterator[tuple[CaptureReport, Capture]]:
         """Write the records of the sky and of the panels; yield the captures that are not aligned, with reports."""
         for excluded, facts in zip(sky, write_sky(sky, self.out), strict=True):
-            yield CaptureReport(excluded.capture.label, "sky", sky=facts.sentence), excluded.capture
+            exclusion = ExclusionPart(capture=excluded.capture.label, kind="sky", evidence=facts.cues)
+            report = CaptureReport(excluded.capture.label, "sky", sky=facts.sentence, exclusion=exclusion)
+            yield report, excluded.capture
         for reading, part in zip(panels, write_panels(panels, self.out), strict=True):
             if reading.capture.is_of_a_panel:
-                yield CaptureReport(reading.capture.label, "panel", panel=part.sentence), reading.capture
+                exclusion = ExclusionPart(capture=reading.capture.label, kind="panel", evidence=part.cues)
+                report = CaptureReport(reading.capture.label, "panel", panel=part.sentence, exclusion=exclusion)
+                yield report, reading.capture
 
     def _processed(self, flights: Sequence[_UnfinishedFlight], record: RunPart) -> Iterator[CaptureReport]:
         """Learn the model of each flight and process its captures; yield their reports as they complete."""

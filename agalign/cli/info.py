@@ -101,7 +101,7 @@ def _show_captures(rows: Sequence[dict[str, Any]], problems: int, terminal: Term
     terminal.table(headers, table)
     for row in rows:
         if row["panel"] is not None:
-            where = " in a scene that is aligned" if row["panel_in_scene"] else ""
+            where = ", aligned as well" if row["panel_in_scene"] else ""
             terminal.result(f"{row['label']}: calibration panel {row['panel']}".rstrip() + where)
         if row["sky"]:
             terminal.result(f"{row['label']}: shows the sky ({', '.join(row['sky'])}); not aligned")

@@ -22,6 +22,7 @@ from agalign.errors import InputError, NoSuchBandError, OutputError, WorkerError
 from agalign.flight.groups import camera_overviews
 from agalign.products.report import REPORT_FILE, pages_exist, write_pages
 from agalign.products.report.facts import FailureGroup, FailureGroups
+from agalign.products.run_record import ExclusionPart, exclusion_lines
 from agalign.products.sidecar import BandResult, CaptureResult
 from agalign.values.capture import Capture
 from agalign.values.text import counted
@@ -106,6 +107,7 @@ class RunTotals:
     states: Counter[str] = field(default_factory=Counter)
     bands: dict[str, list[tuple[str, float | None, float]]] = field(default_factory=dict)
     """(status, median residual in px if it is known, seconds) of the pairs of each band."""
+    excluded: list[ExclusionPart] = field(default_factory=list)
     radiometry: Counter[str] = field(default_factory=Counter)
     """Number of captures by the quantity that raw numbers were converted to."""
 
@@ -113,6 +115,7 @@ class RunTotals:
         """Add the report of a capture."""
         self.states[report.state] += 1
         self.is_complete &= report.is_complete
+        self.excluded += [report.exclusion] if report.exclusion is not None else []
         if report.result is None:
             return
         self.failures.add(report.label, report.result)
@@ -325,6 +328,8 @@ def conclude(totals: RunTotals, out: Path, terminal: Terminal) -> int:
     """Print the table of bands and the failures; return the exit code."""
     counts = Counter(status for pairs in totals.bands.values() for status, _, _ in pairs)
     _print_totals(totals, counts, terminal)
+    for line in exclusion_lines(totals.excluded):
+        terminal.result(line)
     terminal.result(f"Report: {out / REPORT_FILE}")
     if totals.states and set(totals.states) <= {"panel", "sky"}:
         or_sky = " or the sky" if totals.states["sky"] else ""

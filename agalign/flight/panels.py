@@ -1,6 +1,7 @@
 """Detection of captures of calibration panels, and reflectance factors from them."""
 
 import math
+import re
 from collections.abc import Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
@@ -9,7 +10,7 @@ import numpy as np
 
 from agalign.errors import AgalignError
 from agalign.flight.groups import camera_key, flights_of
-from agalign.pixels.panel import DetectedPanel, albedo_of, find_panel, inside
+from agalign.pixels.panel import DetectedPanel, albedo_of, find_panel, inside, is_homogeneous
 from agalign.pixels.radiometry import calibrated
 from agalign.pixels.raster import read_for_alignment, read_tile, without_warnings
 from agalign.values.capture import Band, Capture, Panel, PanelSource
@@ -32,6 +33,8 @@ _PANEL_HEIGHT_M = 1.0
 """Height of the camera above a panel when it is recorded."""
 _MIN_HEIGHT_M = 3.0
 """Lower heights are within the error of the altitudes."""
+_MIN_CUES = 2
+"""A single cue also occurs in other captures."""
 
 
 @dataclass(frozen=True)
@@ -71,13 +74,67 @@ def with_panels(captures: Sequence[Capture], *, without_code: bool = False) -> l
     """Return the captures with their panels.
 
     Panels are known from the tags or detected in the first and last captures of each flight by their QR code; with
-    `without_code` also by their appearance.
+    `without_code` also by their appearance. Captures in which fewer than two cues indicate a panel are aligned as well.
     """
-    ends = [end for flight in flights_of(captures) for end in _from_both_ends(flight)]
+    flights = flights_of(captures)
+    ends = [end for flight in flights for end in _from_both_ends(flight)]
+    medians_m = {c.label: median_m for flight in flights for median_m in [_median_altitude_m(flight)] for c in flight}
     with without_warnings(), ThreadPoolExecutor(_READERS) as pool:
         results = pool.map(lambda end: _captures_of_panels(end, without_code), ends)
-        of_panels = {c.label: c for result in results for c in result}
-    return [of_panels.get(c.label, c) for c in captures]
+        of_panels = [c for result in results for c in result]
+        judged = pool.map(lambda c: with_cues(c, medians_m[c.label]), of_panels)
+        by_label = {c.label: c for c in judged}
+    return [by_label.get(c.label, c) for c in captures]
+
+
+def with_cues(capture: Capture, flight_altitude_m: float) -> Capture:
+    """Return a capture of a panel with its cues, given the median altitude of its flight (nan if unknown).
+
+    A single cue does not exclude it: tags and names can be wrong, a QR code may belong to a marker in the field, and
+    roofs and sheets are bright squares.
+    """
+    cues = _panel_cues(capture, flight_altitude_m)
+    is_single = len(cues) < _MIN_CUES
+    bands = (
+        b if b.panel is None else replace(b, panel=replace(b.panel, cues=cues, in_scene=b.panel.in_scene or is_single))
+        for b in capture.bands
+    )
+    return replace(capture, bands=tuple(bands))
+
+
+def _panel_cues(capture: Capture, flight_altitude_m: float) -> tuple[str, ...]:
+    seen_by = {b.panel.seen_by for b in capture.bands if b.panel is not None}
+    cues = ["its tags"] if "tags" in seen_by else []
+    cues += ["a QR code"] if "QR code" in seen_by else []
+    if sum(map(_shows_square, capture.bands)) > len(capture.bands) / 2:
+        cues.append("a homogeneous square in most bands")
+    altitude_m = None if capture.position is None else capture.position.altitude_m
+    if altitude_m is not None and altitude_m < flight_altitude_m - _MIN_HEIGHT_M:
+        cues.append(f"an altitude more than {_MIN_HEIGHT_M:.0f} m below the median of the flight")
+    if any(re.search("panel|calib", name, re.IGNORECASE) for name in (*capture.folder.parts, capture.name)):
+        cues.append("'panel' or 'calib' in its folder or name")
+    return tuple(cues)
+
+
+def _shows_square(band: Band) -> bool:
+    """Return True if the area of the panel was detected in the pixels of a band, or is homogeneous there."""
+    panel = band.panel
+    if panel is None or panel.seen_by != "tags":
+        return panel is not None and len(panel.corners_px) > 0
+    if not panel.corners_px:
+        detected = _detect(band, without_code=True)
+        return detected is not None and len(detected.area_px) > 0
+    try:
+        pixels, valid = read_tile(band, Tile(0, 0, *band.size_px))
+    except AgalignError:
+        return False
+    return is_homogeneous(pixels[inside(panel.corners_px, pixels.shape) & valid].astype(np.float64))
+
+
+def _median_altitude_m(flight: Sequence[Capture]) -> float:
+    """Return the median altitude of the captures; nan if none is known."""
+    altitudes_m = [a for c in flight if c.position is not None and (a := c.position.altitude_m) is not None]
+    return float(np.median(altitudes_m)) if altitudes_m else math.nan
 
 
 def read_panel(capture: Capture, albedos: Albedos) -> PanelReading:

@@ -68,7 +68,7 @@ def sky_cues(capture: Capture) -> tuple[str, ...]:
     """
     cues = []
     if capture.elevation_deg is not None and capture.elevation_deg > _MIN_ELEVATION_DEG:
-        cues.append(f"its tags point the camera {capture.elevation_deg:.0f} degrees above the horizon")
+        cues.append(f"its tags point the camera more than {_MIN_ELEVATION_DEG:.0f} degrees above the horizon")
     names = *capture.folder.parts, capture.name
     if any(re.search(r"(?:^|[-_. ])sky(?:$|[-_. ])", name, re.IGNORECASE) for name in names):
         cues.append("its folder or name contains 'sky'")

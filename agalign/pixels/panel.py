@@ -2,7 +2,7 @@
 
 import re
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -158,8 +158,12 @@ def _is_panel(image: NDArray[np.uint8], square: Corners) -> bool:
     area, ring = image[inner].astype(np.float64), image[outer & ~edge]
     if not len(area) or not len(ring):
         return False
-    is_bright = area.mean() >= _LIMITS.contrast * np.median(ring)
-    return bool(is_bright and area.std() <= _LIMITS.relative_std * area.mean())
+    return bool(area.mean() >= _LIMITS.contrast * np.median(ring)) and is_homogeneous(area)
+
+
+def is_homogeneous(values: NDArray[np.floating[Any]]) -> bool:
+    """Return True if pixels (n,) vary as little as those of a panel."""
+    return len(values) > 0 and bool(values.std() <= _LIMITS.relative_std * values.mean())
 
 
 def _is_next_to(square: Corners, code: Corners) -> bool:

@@ -148,7 +148,7 @@ def read_table(out: Path) -> list[IndexRow]:
 def write_table(out: Path, rows: Iterable[IndexRow]) -> None:
     """Write OUT/indices.csv. Raises OutputError."""
     of_capture = "folder", "capture", "captured_at", "latitude", "longitude"
-    of_index = "index", "median", "p5", "p95", "valid_share", "input", "low", "high", "file", "problem"
+    of_index = "index", "median", "p5", "p95", "valid_share", "masked_share", "input", "low", "high", "file", "problem"
     columns, in_order = of_capture + of_index, sorted(rows, key=lambda row: row.key)
     cells = [vars(row) | row.statistics.as_json() | {"input": row.statistics.unit} for row in in_order]
     write_csv(out / INDICES_FILE, columns, ([without_formula(one[name]) for name in columns] for one in cells))
@@ -171,6 +171,7 @@ def _row(cells: Mapping[str, str]) -> IndexRow:
     numbers = {k: float(cells[k] or "nan") for k in ("median", "p5", "p95", "valid_share", "low", "high")}
     latitude, longitude = (float(cells[k]) if cells[k] else None for k in ("latitude", "longitude"))
     of_capture = cells["folder"], cells["capture"], cells["captured_at"], latitude, longitude
+    numbers["masked_share"] = float(cells.get("masked_share") or 0)  # older tables do not have it
     statistics = IndexStatistics(unit=cells["input"], **numbers)
     return IndexRow(*of_capture, cells["index"], cells["file"], statistics, cells["problem"])
 

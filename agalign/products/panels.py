@@ -64,7 +64,9 @@ class PanelPart(_CapturePart):
     serial: str
     picture: str
     in_scene: bool = False
-    """The capture shows a scene that contains the panel, and is aligned."""
+    """The capture shows a scene that contains the panel, or only one cue indicates it: it is aligned."""
+    cues: list[str] = []
+    """Evidence that the capture shows a panel, in words."""
     bands: list[PanelBandPart]
 
     @property
@@ -74,8 +76,8 @@ class PanelPart(_CapturePart):
         # The smallest and the largest value, or the only one.
         reflectance = " to ".join(dict.fromkeys((albedos[0], albedos[-1]))) if albedos else "not known"
         name = f"calibration panel {self.serial}".strip()
-        use = "part of a scene that is aligned" if self.in_scene else "not aligned"
-        return f"{name} (reflectance {reflectance}; recognised by its {self.seen_by}): {use}"
+        use = "aligned, as it shows a scene or by one cue only" if self.in_scene else "not aligned"
+        return f"{name} (reflectance {reflectance}; recognised by {', '.join(self.cues) or self.seen_by}): {use}"
 
 
 class SkyPart(_CapturePart):
@@ -116,7 +118,7 @@ def write_panels(readings: Sequence[PanelReading], out: Path) -> list[PanelPart]
         write_png(side_by_side([_tile(b) for b in reading.bands], gap_px=6), picture)
         panel, bands = reading.panel, [_panel_band(b) for b in reading.bands]
         facts = {"seen_by": panel.seen_by, "serial": panel.serial, "picture": picture.relative_to(out).as_posix()}
-        facts |= _identity(reading.capture) | {"in_scene": panel.in_scene, "bands": bands}
+        facts |= _identity(reading.capture) | {"in_scene": panel.in_scene, "cues": panel.cues, "bands": bands}
         parts.append(PanelPart.model_validate(facts))
     write_model(out / PANELS_FILE, PanelsFile(panels=parts) if parts else None)
     return parts

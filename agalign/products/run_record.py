@@ -1,6 +1,7 @@
 """OUT/agalign-run.json: command, settings, versions, machine and results of a run; the first file that a run writes."""
 
 import platform
+from collections import Counter
 from collections.abc import Iterable, Sequence
 from datetime import UTC, datetime
 from importlib import metadata
@@ -17,7 +18,7 @@ from agalign.products.text_files import read_model, write_model
 from agalign.values.capture import Capture
 from agalign.values.cores import usable_cores
 from agalign.values.files import RUN_FILE
-from agalign.values.text import escape_controls
+from agalign.values.text import counted, escape_controls
 
 _LIBRARIES = ("torch", "numpy", "rasterio", "opencv-python-headless", "tifffile", "pydantic")
 
@@ -42,6 +43,15 @@ class ProblemPart(_Part):
 
     of: str
     problem: str
+
+
+class ExclusionPart(_Part):
+    """A capture that is not aligned because of what it shows."""
+
+    capture: str
+    kind: Literal["panel", "sky"]
+    evidence: list[str]
+    """Independent cues, in words: at least two."""
 
 
 class RunPart(_Part):
@@ -71,6 +81,7 @@ class RunPart(_Part):
     """Processing time by capture."""
     refused: list[RefusalPart] = []
     problems: list[ProblemPart] = []
+    excluded: list[ExclusionPart] = []
 
     def add(self, label: str, state: str, result: CaptureResult | None, problems: Iterable[str]) -> None:
         """Add the result of a capture."""
@@ -99,6 +110,18 @@ class RunPart(_Part):
         for name in ("stage_seconds", "capture_seconds"):
             facts[name] = {k: round(v, 3) for k, v in sorted(getattr(self, name).items())}
         write_model(out / RUN_FILE, self.model_copy(update=facts))
+
+
+def exclusion_lines(excluded: Sequence[ExclusionPart]) -> list[str]:
+    """Return a line for each kind of exclusion: number of captures, and of those with each cue."""
+    lines = []
+    for kind, shows in (("panel", "a calibration panel"), ("sky", "the sky")):
+        of_kind = [part for part in excluded if part.kind == kind]
+        counts = Counter(cue for part in of_kind for cue in part.evidence)
+        if of_kind:
+            evidence = ", ".join(f"{cue} ({number})" for cue, number in counts.items())
+            lines.append(f"Left out: {counted(len(of_kind), 'capture')} of {shows}, by {evidence}")
+    return lines
 
 
 def begun(folder: Path, settings: Settings, captures: Sequence[Capture] = (), command: str = "") -> RunPart:

@@ -70,7 +70,10 @@ class Panel:
     corners_px: tuple[tuple[float, float], ...] = ()
     """Corners of an area within it, raw px of the file; empty if it was not found."""
     in_scene: bool = False
-    """The image shows a scene that contains the panel, instead of the panel alone."""
+    """The image shows a scene that contains the panel, instead of the panel alone, or only one cue indicates a panel:
+    it is aligned."""
+    cues: tuple[str, ...] = ()
+    """Evidence that the image shows a panel, in words."""
 
 
 @dataclass(frozen=True)
@@ -229,7 +232,7 @@ class Capture:
 
     @property
     def is_of_a_panel(self) -> bool:
-        """True for an image of a calibration panel alone; False for a scene that contains one."""
+        """True for an image that is left out because it shows a calibration panel; False for a scene with one."""
         return self.panel is not None and not self.panel.in_scene
 
     @property

@@ -5,7 +5,15 @@ import numpy as np
 import pytest
 import tifffile
 
-from agalign.flight.panels import BandReading, PanelReading, read_panel, reflectance_factors, with_height, with_panels
+from agalign.flight.panels import (
+    BandReading,
+    PanelReading,
+    read_panel,
+    reflectance_factors,
+    with_cues,
+    with_height,
+    with_panels,
+)
 from agalign.pixels.panel import DetectedPanel
 from agalign.values.capture import Band, CameraIdentity, Capture, Panel, Pose, Position, Radiometry
 
@@ -117,12 +125,40 @@ def test_without_a_time_no_panel_is_of_the_same_hours() -> None:
 
 @pytest.mark.parametrize(
     ("code", "in_scene", "expected"),
-    [("RP04", False, (True, True)), ("RP04", True, (True, False)), ("", False, (True, True)), ("", True, (False,) * 2)],
+    [
+        ("RP04", False, (True, True)),
+        ("RP04", True, (True, False)),
+        ("", False, (True, False)),
+        ("", True, (False,) * 2),
+    ],
 )
-def test_a_square_in_a_scene_is_a_panel_only_with_a_code(
+def test_a_square_alone_leaves_nothing_out(
     monkeypatch: pytest.MonkeyPatch, code: str, in_scene: bool, expected: tuple[bool, bool]
 ) -> None:
-    """A roof resembles a panel. Only captures of a panel are excluded."""
+    """A roof resembles a panel: without a code it is measured, but the capture is aligned."""
     monkeypatch.setattr("agalign.flight.panels._detect", lambda *_, **__: DetectedPanel(code, AREA, in_scene))
     (result,) = with_panels([capture(GREEN)], without_code=True)
     assert (result.panel is not None, result.is_of_a_panel) == expected
+
+
+@pytest.mark.parametrize(
+    ("panel", "level", "altitude_m", "name", "cues"),
+    [
+        (Panel("tags", corners_px=AREA), 33768, 112.0, "IMG_0001", ["tags", "square"]),
+        (Panel("tags", corners_px=((40.0, 5.0), (60.0, 5.0), (60.0, 40.0), (40.0, 40.0))), 33768, 112.0, "1", ["tags"]),
+        (Panel("tags", corners_px=AREA), 2000, 93.0, "IMG_0001", ["tags", "square", "altitude"]),
+        (Panel("QR code"), 33768, 112.0, "IMG_0001", ["QR"]),
+        (Panel("QR code"), 33768, 93.0, "IMG_0001", ["QR", "altitude"]),
+        (Panel("look", corners_px=AREA), 33768, 112.0, "IMG_0001", ["square"]),
+        (Panel("look", corners_px=AREA), 33768, 112.0, "panel_1", ["square", "name"]),
+    ],
+)
+def test_two_cues_leave_out_a_capture_of_a_panel(
+    tmp_path: Path, panel: Panel, level: int, altitude_m: float, name: str, cues: list[str]
+) -> None:
+    band = replace(panel_file(tmp_path / "a.tif", level), panel=panel)
+    one = replace(capture(band, position=Position(52.0, 5.0, altitude_m)), name=name)
+    result = with_cues(one, 112.0)
+    assert len(result.panel.cues) == len(cues)
+    assert all(cue in text for cue, text in zip(cues, result.panel.cues, strict=True))
+    assert result.is_of_a_panel is (len(cues) > 1)

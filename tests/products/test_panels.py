@@ -3,6 +3,7 @@
 import csv
 import json
 import shutil
+from html import unescape
 from pathlib import Path
 
 import numpy as np
@@ -64,6 +65,10 @@ def test_panels_are_named_and_drawn_and_kept_out(by_panel: Path) -> None:
     page = (by_panel / "index.html").read_text()
     assert "Calibration panels" in page
     assert "IMG_0001.panel.png" in page
+    excluded = read_json(by_panel / "agalign-run.json")["excluded"]
+    assert [part["capture"] for part in excluded] == ["0000SET/000/IMG_0001", "0000SET/000/IMG_0004"]
+    assert excluded[0]["evidence"][:2] == ["a QR code", "a homogeneous square in most bands"]
+    assert "Left out: 2 captures of a calibration panel, by a QR code (2), a homogeneous square" in unescape(page)
 
 
 @pytest.mark.slow
@@ -78,7 +83,7 @@ def test_the_picture_shows_both_sides_of_what_changed_its_unit(by_panel: Path) -
 def test_another_run_keeps_results_and_can_align_panels(between_panels: Path, tmp_path: Path) -> None:
     first, *_ = agalign.align_folder(between_panels, tmp_path, settings=seeded())
     assert first.is_complete
-    assert first.panel.startswith("calibration panel RP04-0000001-SY (reflectance 0.51; recognised by its QR code)")
+    assert first.panel.startswith("calibration panel RP04-0000001-SY (reflectance 0.51; recognised by a QR code, a ")
     again = agalign.align_folder(between_panels, tmp_path, settings=seeded())
     assert [r.state for r in again] == ["panel", "panel", "kept", "kept"]
     every = agalign.align_folder(between_panels, tmp_path, settings=seeded(), run=RunOptions(align_panels=True))
@@ -145,6 +150,9 @@ def test_info_names_the_sky(with_sky: Path) -> None:
     assert line == "sky/S1: shows the sky (its folder or name contains 'sky', no band has texture); not aligned"
     rows = json.loads(agalign_here("info", with_sky, "--json").stdout)["captures"]
     assert {row["label"]: bool(row["sky"]) for row in rows} == {"IMG_0001": False, "sky/S1": True}
+    done = agalign_here("align", with_sky, "-o", with_sky.parent / "out", "--relief", "never")
+    line = "Left out: 1 capture of the sky, by its folder or name contains 'sky' (1), no band has texture (1)"
+    assert line in done.stdout.splitlines()
 
 
 def test_a_damaged_record_is_one_line(tmp_path: Path) -> None:

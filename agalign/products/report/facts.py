@@ -171,6 +171,7 @@ class FlightFacts:
                 statistics = row.statistics.as_json()
                 facts = {name: rounded(statistics[name]) for name in ("median", "p5", "p95")}
                 facts |= {"name": row.index, "valid": row.statistics.valid_share, "unit": row.statistics.unit}
+                facts |= {"masked": row.statistics.masked_share}
                 facts |= {"span": (statistics["low"], statistics["high"]), "raw": row.statistics.unit == RAW}
                 picture = Path(row.file).with_suffix(".png").as_posix()
                 by_label[row.label].append(facts | {"file": quote(row.file), "picture": quote(picture)})
@@ -228,6 +229,13 @@ class FlightFacts:
             "lattice": self._lattices.setdefault(lattice, len(self._lattices)),
             "shifts": [None if v is None else round(v / _SHIFT_STEP_PX) for t in tiles for v in t.shift_px],
         }
+
+
+def masked_shares(captures: Sequence[dict[str, Any]]) -> list[tuple[str, list[float]]]:
+    """Return (index, sorted shares of pixels that only the quality flags mask), given the captures of the report."""
+    indices = [index for capture in captures for index in capture["indices"] if index["masked"] > 0]
+    names = dict.fromkeys(index["name"] for index in indices)
+    return [(name, sorted(index["masked"] for index in indices if index["name"] == name)) for name in names]
 
 
 def value_at(part: object, path: str) -> Any:

@@ -14,7 +14,7 @@
  *   residual_px: number | null, residual_p95_px: number | null, coverage: number | null, retrieval: number | null,
  *   corner_std_px: number | null, similarity: Record<string, [number | null, number | null]> | null,
  *   prediction: Prediction | null, geometry: Geometry | null, occluded: number | null, lattice: number, shifts: (number | null)[]}} Pair
- * @typedef {{name: string, median: number | null, p5: number | null, p95: number | null, valid: number,
+ * @typedef {{name: string, median: number | null, p5: number | null, p95: number | null, valid: number, masked: number,
  *   span: [number, number], unit: string, raw: boolean, file: string, picture: string}} Index
  * @typedef {{file: string, tile_px: [number, number], detail_px: [number, number],
  *   detail: [number, number, number, number], error_full_px: number | null,
@@ -978,9 +978,9 @@ function listenToStage() {
 /** @param {Capture} capture */
 function indexTable(capture) {
   if (!capture.indices.length) return [];
-  const head = el("tr", {}, ...["Index", "Median", "5th percentile", "95th percentile", "Valid pixels", "Of"].map((text, i) => el("th", { scope: "col", class: i > 0 && i < 5 ? "n" : "" }, text)));
+  const head = el("tr", {}, ...["Index", "Median", "5th percentile", "95th percentile", "Valid pixels", "Masked by flags", "Of"].map((text, i) => el("th", { scope: "col", class: i > 0 && i < 6 ? "n" : "" }, text)));
   const body = capture.indices.map((index) => {
-    const cells = [fixed(index.median, 3), fixed(index.p5, 3), fixed(index.p95, 3), percent(index.valid)];
+    const cells = [fixed(index.median, 3), fixed(index.p5, 3), fixed(index.p95, 3), percent(index.valid), percent(index.masked)];
     return el("tr", {}, el("th", { scope: "row" }, el("a", { href: index.file }, index.name.toUpperCase())), ...cells.map((text) => el("td", { class: "n" }, text)), el("td", {}, index.unit));
   });
   return [el("div", { class: "scroll", id: "indices" }, el("table", {}, el("thead", {}, head), el("tbody", {}, ...body)))];

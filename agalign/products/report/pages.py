@@ -20,9 +20,9 @@ from agalign.config import Settings
 from agalign.errors import SidecarError
 from agalign.products.index_table import IndexRow, rows_of_run, update_table
 from agalign.products.panels import PANELS_FILE, SKY_FILE, PanelPart, SkyPart, read_panels, read_sky
-from agalign.products.report.facts import BAND_COLUMNS, FailureGroup, FlightFacts
+from agalign.products.report.facts import BAND_COLUMNS, FailureGroup, FlightFacts, masked_shares
 from agalign.products.report.rigs import drifts_of, rig_views
-from agalign.products.run_record import RunPart, read_run_record
+from agalign.products.run_record import RunPart, exclusion_lines, read_run_record
 from agalign.products.sidecar_file import find_sidecars, read_sidecar
 from agalign.products.text_files import write_csv
 from agalign.values.files import write_text
@@ -148,6 +148,8 @@ def _page(
         bands=facts.by_band(),
         rigs=rig_views(out, on_problem),
         drifts=drifts_of(facts.captures),
+        exclusions=[] if run is None else exclusion_lines(run.excluded),
+        masked=masked_shares(facts.captures),
         panels=panels,
         sky=sky,
         mapped=sum(c["position"] is not None for c in facts.captures),
