@@ -11,7 +11,7 @@ import json
 import re
 import sys
 import typing
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Container, Iterable
 from operator import attrgetter, not_
 from pathlib import Path
 from typing import Any
@@ -77,18 +77,19 @@ def type_name(kind: Any) -> str:
 
 def fields() -> str:
     """A list of fields for the sidecar and for each of its parts, with the descriptions of the schema."""
-    schema = sidecar_schema()
-    parts = []
+    schema, parts = sidecar_schema(), []
+    of_types = {part["description"] for part in schema["$defs"].values()}
     for name, part in [("Sidecar", schema), *schema["$defs"].items()]:
         title = "The file" if name == "Sidecar" else name.removesuffix("Part")
         parts += [f"### {title}", " ".join(part["description"].split())]
-        parts.append("\n".join(field_line(name, field) for name, field in part["properties"].items()))
+        parts.append("\n".join(field_line(name, field, of_types) for name, field in part["properties"].items()))
     return "\n\n".join(parts) + "\n"
 
 
-def field_line(name: str, field: dict[str, Any]) -> str:
-    """Return a field of the sidecar as an item of a list."""
-    return f"* `{name}` ({json_type(field)}): {' '.join(field['description'].split())}"
+def field_line(name: str, field: dict[str, Any], of_types: Container[str]) -> str:
+    """Return a field of the sidecar as an item of a list, without a description that is that of its type."""
+    text = field.get("description", "")
+    return f"* `{name}` ({json_type(field)})" + ("" if not text or text in of_types else f": {' '.join(text.split())}")
 
 
 def sidecar_schema() -> dict[str, Any]:
@@ -97,17 +98,18 @@ def sidecar_schema() -> dict[str, Any]:
 
 
 def json_type(field: dict[str, Any]) -> str:
-    """Short: `number`, `Seed or null`, `list of Band`."""
+    """Short: `number`, `Seed?` if it may be null, `list of Band`."""
     if "$ref" in field:
         name = field["$ref"].rpartition("/")[2].removesuffix("Part")
         return f"[{name}](#{name.lower()})"
     if "anyOf" in field:
-        return " or ".join(json_type(one) for one in field["anyOf"])
+        kinds = [json_type(one) for one in field["anyOf"] if one.get("type") != "null"]
+        return " or ".join(kinds) + ("?" if len(kinds) < len(field["anyOf"]) else "")
     if field.get("type") == "array":
         if "prefixItems" in field:
             count = len(field["prefixItems"])
-            item, either, rest = json_type(field["prefixItems"][0]).partition(" or ")
-            return f"{count} x {item}" if item[0].isdigit() else f"{count} {item}s{either}{rest}"
+            item, null, _ = json_type(field["prefixItems"][0]).partition("?")
+            return f"{count} x {item}" if item[0].isdigit() else f"{count} {item}s{null}"
         return f"list of {json_type(field['items'])}"
     return str(field.get("type", "text")).replace("string", "text")
 

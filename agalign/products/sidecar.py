@@ -90,14 +90,14 @@ class _Result(_Part):
 
 
 class CameraPart(_Part):
-    """Camera that took the capture, from its tags."""
+    """From the tags."""
 
     make: str
     """Manufacturer."""
     model: str
     """Model."""
     serial: str
-    """Serial numbers, joined by `+` if there are several."""
+    """Serial numbers, joined by `+`."""
 
     @property
     def name(self) -> str:
@@ -113,11 +113,11 @@ class PositionPart(_Part):
     longitude: float
     """Degrees, WGS 84."""
     altitude_m: float | None
-    """Altitude as the camera writes it, m."""
+    """Altitude in the tags, m."""
 
 
 class ReferencePart(_Part):
-    """Reference band: all bands are aligned to its pixel grid."""
+    """Reference band."""
 
     band: str
     """Name of the band."""
@@ -137,13 +137,13 @@ class ReferencePart(_Part):
 
 
 class HomographyPart(_Part):
-    """Homography between reference and moving band."""
+    """Homography."""
 
     fixed_to_moving: Matrix3x3
-    """Maps a pixel of the reference to a pixel of the moving band."""
+    """Maps a pixel of the reference to one of the moving band."""
     space: Space
-    """`pixel`: between raw pixels of the files. `undistorted`: between the pixels that both cameras would have without
-    lens distortion (same focal length and principal point).
+    """`pixel`: between raw pixels. `undistorted`: between pixels without lens distortion (same focal length and
+    principal point).
     """
 
 
@@ -157,7 +157,7 @@ class SeedPart(_Part):
     fixed_to_moving: Matrix3x3
     """As in `homography`."""
     peak_sigma: float
-    """Height of its correlation peak above the mean, in standard deviations."""
+    """Height of its correlation peak, in standard deviations."""
     runner_up_sigma: float
     """The same for the second highest peak."""
 
@@ -178,12 +178,12 @@ class LensPart(_Part):
 
 
 class FieldPart(_Part):
-    """Displacement field: raw pixels of the reference are displaced first, then undistorted and mapped."""
+    """Displacement field of the raw pixels of the reference."""
 
     step_px: float
-    """Spacing of the nodes; the first one is the centre of the top-left pixel."""
+    """Spacing of the nodes, from the centre of the top-left pixel."""
     displacements_px: Annotated[list[list[PointPx]], _FromProgram(_from_array)]
-    """Displacements (x, y) by row and column of the nodes; cubic splines between them."""
+    """(x, y) by row and column; cubic splines between the nodes."""
 
 
 class GridPart(_Part):
@@ -193,9 +193,9 @@ class GridPart(_Part):
     """
 
     reference_px: PointsPx
-    """Raw pixels of the reference file, row by row."""
+    """Raw pixels of the reference, row by row."""
     moving_px: PointsPx
-    """The corresponding raw pixels of the band's file."""
+    """The corresponding raw pixels of the band."""
 
 
 def _known_kind(code: str) -> str:
@@ -214,7 +214,7 @@ IssueCode = Annotated[
 
 
 class IssuePart(_Part):
-    """A reason against accepting the alignment."""
+    """A reason for not accepting the alignment."""
 
     kind: IssueCode
     """Code of the reason."""
@@ -228,11 +228,11 @@ class JointPart(_Part):
     """Result of the joint optimisation of descriptor and mapping."""
 
     accepted: bool = True
-    """False if the result was rejected: `homography` and `grid` are then those of the seed or the prediction."""
+    """False if `homography` and `grid` are those of the seed or the prediction."""
     loss: Finite
     """Final loss; null if nothing was learned."""
     retrieval: float
-    """Share of held-out patches with their true counterpart as nearest descriptor in the other band."""
+    """Share of held-out patches with the true counterpart as nearest descriptor."""
     chance: float
     """Retrieval expected by chance."""
     iterations: int
@@ -246,7 +246,7 @@ class JointPart(_Part):
     model_family: ModelFamily
     """Mapping that was fitted."""
     last_step_px: float
-    """Largest movement of a corner in the last step, px."""
+    """Movement of a corner in the last step, px."""
     corner_std_px: Annotated[float, _measured(6)]
     """Standard error of the least certain corner, px of the reference."""
     corner_std_xy_px: PointsPx
@@ -255,7 +255,7 @@ class JointPart(_Part):
 
 
 class SimilarityPart(_Part):
-    """Similarity of the pixels that are valid in both bands; of large images a regular sample of 250,000 or more."""
+    """Similarity of pixels that are valid in both bands; in large images of a sample of at least 250,000."""
 
     mattes_mi: Fraction6 = None
     """Negative mutual information by Mattes, nats, 32 bins, as in elastix: lower is better."""
@@ -270,7 +270,7 @@ class SimilarityPart(_Part):
     overlap: Fraction6 = None
     """Share of the image in which both bands are valid."""
     residual_px: Fraction6 = None
-    """Median length of the shifts of the windows, px of the reference; after alignment only."""
+    """Median length of the shifts of the windows, px of the reference."""
     residual_p95_px: Fraction6 = None
     """Their 95th percentile, px of the reference."""
     residual_coverage: Fraction6 = None
@@ -278,12 +278,12 @@ class SimilarityPart(_Part):
 
 
 class ResidualTile(_Part):
-    """Local shift of one window after alignment."""
+    """Shift of a window after alignment."""
 
     centre_px: tuple[Annotated[float, _measured(2)], Annotated[float, _measured(2)]]
     """Centre of the window, px of the reference."""
     shift_px: tuple[Fraction4, Fraction4]
-    """Shift along x and y, px of the reference; null if none could be measured."""
+    """Shift, px of the reference; null if none could be measured."""
 
 
 class MetricsResult(_Result):
@@ -296,23 +296,23 @@ class MetricsResult(_Result):
 
 
 class MetricsPart(MetricsResult):
-    """Similarity before and after alignment, with local shifts."""
+    """Similarity before and after alignment."""
 
     model_config = ConfigDict(extra="forbid")
 
     tiles: list[ResidualTile]
-    """Local shifts of the windows; with recipe `windows`, of those left out of the fit."""
+    """Shifts of the windows; with recipe `windows`, of those left out of the fit."""
 
 
 class GeometryPart(_Part):
-    """What the mapping has in addition to homography and lens models, and how the alternatives compare."""
+    """What the mapping has in addition to homography and lens models."""
 
     kind: Geometry
     """`homography`: nothing; `field`: a smooth displacement field; `relief`: the parallax of the capture;
     `relief and field`: both.
     """
     held_out_p95_px: dict[Geometry, Fraction4]
-    """p95 of the shifts of windows that were left out of the fits, px, for each geometry that was fitted."""
+    """p95 of the shifts of held-out windows, px, for each geometry that was fitted."""
 
     @property
     def homography_p95_px(self) -> float | None:
@@ -326,44 +326,42 @@ class GeometryPart(_Part):
 
 
 class ReliefPart(_Part):
-    """Displacement of this band by the relief of the capture: a pixel x of the reference with parallax z maps to
-    plane_px(x) + z slope(x), both interpolated by cubic splines between their nodes.
+    """Displacement by the parallax of the capture: a pixel x of the reference with parallax z maps to plane_px(x) + z
+    slope(x), interpolated by cubic splines.
     """
 
     file: RelativeFile | None
-    """Raster with the parallax, on the grid of the aligned files; null if nothing was written."""
+    """[Raster](#the-relief-raster) with the parallax."""
     baseline: PointPx
-    """Displacement per px of parallax, undistorted px of the reference; the longest baseline of the capture has length
-    1.
-    """
+    """Displacement per px of parallax, undistorted px of the reference; the longest baseline has length 1."""
     occluded: Annotated[float, _measured(4)]
-    """Share of the reference pixels that are occluded in this band."""
+    """Share of the reference pixels that are occluded in the band."""
     reference_px: PointsPx
-    """Nodes on the reference file, row by row: those of `grid`."""
+    """Nodes: those of `grid`."""
     plane_px: PointsPx
-    """Where the reference plane maps the nodes, raw px of the moving file."""
+    """Where the reference plane maps them, raw px of the moving file."""
     slope: PointsPx
-    """Px of the moving file per px of parallax, at the nodes."""
+    """Px of the moving file per px of parallax."""
 
 
 class PredictionPart(_Part):
-    """Position of the band, predicted without its own image or extrapolated from a part of it."""
+    """Mapping that is predicted without the image of the band, or extrapolated from a part of it."""
 
     source: Annotated[PredictionSource, Field(alias="from")]
-    """`bands` (other bands of the capture), `neighbours` (other captures), `flight` (mean), or `windows` (extrapolated
-    from the windows of a part of the image).
+    """`bands` (other bands of the capture), `neighbours` (other captures), `flight` (mean), or `windows` (a part of the
+    image).
     """
     std_px: Annotated[float, _measured(4)]
     """Standard error over the image (root mean square), px of the band's own file."""
     off_px: Fraction4
-    """Distance of the image's own alignment from the prediction, px of the band's own file; null if there is none."""
+    """Distance of the image's own alignment from the prediction, px of the band's own file."""
 
 
 class PlacePart(_Part):
     """Where the aligned pixels of the band are."""
 
     file: RelativeFile
-    """File, relative to the folder of the sidecar."""
+    """Path."""
     band_index: Count
     """Band in that file, from 1."""
 
@@ -384,23 +382,23 @@ class BandResult(_Result):
     reason: str | None
     """Why the band is not aligned, in words."""
     issues: list[IssuePart] = Field(default=[], alias="doubts")
-    """All reasons against accepting the alignment; `reason` is the first in words."""
+    """All reasons for not accepting the alignment; `reason` is the first."""
     homography: HomographyPart | None = None
     """Mapping without lenses and displacements."""
     seed: SeedPart | None = None
-    """Initial alignment."""
+    """Initial alignment, in the same space as the homography."""
     joint: JointPart | None = None
-    """Result of the optimisation."""
+    """Result of the joint optimisation of descriptor and mapping."""
     metrics: MetricsResult | None = None
     """Similarity before and after."""
     geometry: GeometryPart | None = None
-    """Kind of the mapping, and the alternatives."""
+    """What the mapping has in addition to homography and lens models."""
     prediction: PredictionPart | None = None
-    """Prediction by the rig of the flight, or by extrapolation."""
+    """Prediction."""
     place: PlacePart | None = None
-    """Where the aligned pixels are."""
+    """Where the aligned pixels of the band are."""
     seconds: Annotated[float, _measured(3)]
-    """Processing time of the band pair."""
+    """Processing time."""
 
 
 class BandPart(BandResult):
@@ -409,22 +407,22 @@ class BandPart(BandResult):
     model_config = ConfigDict(extra="forbid")
 
     metrics: MetricsPart | None = None
-    """Similarity before and after, and local shifts."""
+    """Similarity and shifts."""
     lenses: tuple[LensPart, LensPart] | None = None
-    """Lens models of the reference and the band, if the homography is between undistorted pixels."""
+    """Of the reference and the band, if the homography is between undistorted pixels."""
     field: FieldPart | None = None
-    """Displacement field of the mapping."""
+    """Displacement field of the raw pixels of the reference."""
     grid: GridPart | None = None
     """The complete mapping, sampled."""
     relief: ReliefPart | None = None
-    """Displacement by the relief that all bands of the capture share; null if none is used."""
+    """Displacement by parallax."""
 
 
 class FilePart(_Part):
     """File of a single band."""
 
     file: RelativeFile
-    """Relative to the folder of the sidecar."""
+    """Path."""
     bytes: int
     """Size."""
     nodata: float | str | None = None
@@ -435,22 +433,22 @@ class OutputPart(_Part):
     """Written rasters."""
 
     file: RelativeFile | None
-    """The stack, relative to the folder of the sidecar; null with `--layout bands`."""
+    """The stack; null with `--layout bands`."""
     bytes: int | None
-    """Size of the stack; null with `--layout bands`."""
+    """Its size."""
     band_files: list[FilePart] = []
     """Files of single bands."""
     radiometry: str | None = None
-    """Conversion of raw numbers, such as `reflectance by panel`; null for raw numbers."""
+    """Conversion of raw numbers, such as `reflectance by panel`."""
     crop: tuple[int, int, int, int]
-    """x0, y0, width, height on the reference grid, multiplied by `scale`."""
+    """x0, y0, width, height on the reference grid times `scale`."""
     scale: tuple[float, float] = (1.0, 1.0)
     """Output pixels per reference pixel along x and y."""
     undistorted: bool = False
     """True for the lens-corrected grid of the reference."""
     nodata: float | str | None
-    """Nodata value of the stack, or of all single bands; null if they differ; `"nan"` for NaN. Integers without a
-    nodata value in the input: 0, or another value that no valid pixel has.
+    """Nodata value of the stack, or of all single bands; null if they differ. Integers without one in the input: 0,
+    or another value that no valid pixel has.
     """
 
     @property
@@ -466,15 +464,15 @@ class ProductPart(_Part):
     """`stack`, `band`, `pan_sharpened`, `relief`, `error_map`, `qa`, `tie_points`, `index`, `picture`,
     `preview` or `stac_item`."""
     file: RelativeFile
-    """Relative to the folder of the sidecar."""
+    """Path."""
     bytes: int
     """Size."""
     sha256: str
-    """Checksum, as `sha256sum` prints it."""
+    """Checksum."""
 
 
 class ReliefPreviewPart(_Part):
-    """Picture of the relief in the preview: first column, last row."""
+    """Picture of the parallax: first column, last row."""
 
     parallax_px: tuple[float, float]
     """Parallax shown as black and as white (nearest), px."""
@@ -488,11 +486,11 @@ class PreviewPart(_Part):
     """
 
     file: RelativeFile
-    """Relative to the folder of the sidecar."""
+    """Path."""
     tile_px: tuple[Count, Count]
-    """Width and height of a picture in all other rows."""
+    """Width and height of a whole picture."""
     detail_px: tuple[Count, Count]
-    """Width and height of a detail in rows 2 and 3."""
+    """Width and height of a detail."""
     detail: tuple[float, float, float, float]
     """x0, y0, width, height of the detail, as shares of the image."""
     error_full_px: float | None = None
@@ -509,7 +507,7 @@ class CaptureResult(_Result):
     agalign: str
     """Version of the program."""
     capture: RelativeFile
-    """Common part of the file names."""
+    """Name of the capture."""
     capture_id: str
     """Capture id in the tags."""
     flight_id: str
@@ -517,15 +515,15 @@ class CaptureResult(_Result):
     captured_at: str
     """Time in the tags, ISO 8601."""
     position: PositionPart | None = None
-    """GPS position."""
+    """GPS position of the reference band."""
     camera: CameraPart
-    """Camera."""
+    """From the tags."""
     status: CaptureStatus
-    """`ok`: every moving band is aligned, or predicted within `accept_predicted_px`, and none is missing. `failed`: all
+    """`ok`: every band is there, and aligned or predicted within `accept_predicted_px`. `failed`: all
     moving bands are `failed`. Else `degraded`.
     """
     missing_bands: list[str]
-    """Bands that other captures of this camera have."""
+    """Bands that only other captures have."""
     reference: ReferencePart
     """Reference band."""
     bands: Sequence[BandResult]
@@ -535,17 +533,15 @@ class CaptureResult(_Result):
     preview: PreviewPart | None = None
     """Preview image."""
     accept_predicted_px: float | None = None
-    """Standard error up to which indices may use a predicted band, px; null in older sidecars."""
+    """Standard error up to which indices may use a predicted band, px."""
     products: list[ProductPart] = []
-    """All files written for the capture except the sidecar."""
+    """All other files of the capture."""
     not_written: list[str] = []
-    """Kinds of products that could not be written; the next run repeats the capture."""
+    """Kinds of products that could not be written."""
     settings: str
-    """Fingerprint of options, input files and version; a run with the same fingerprint skips the capture."""
+    """Fingerprint of options, input and version; a run with the same one skips the capture."""
     checksum: str | None = None
-    """SHA-256 of the content as canonical JSON (sorted keys, no spaces) without `checksum` and `seconds`; `agalign
-    verify OUT` compares it.
-    """
+    """SHA-256 of the content as JSON with sorted keys and no spaces, without `checksum` and `seconds`."""
 
     @property
     def max_predicted_px(self) -> float:

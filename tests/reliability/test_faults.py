@@ -29,6 +29,7 @@ def test_fault(fault: Fault, model: Path, tmp_path: Path) -> None:
 
 def test_the_document_has_the_exit_codes_of_the_most_common_faults() -> None:
     text = DOCUMENT.read_text()
+    assert f"injects {len(FAULTS)} faults" in text
     section = text.partition("<!-- faults -->")[2].partition("<!-- end of faults -->")[0]
     rows = [line.split(" | ") for line in section.splitlines() if line.startswith("| ")][2:]
     reported = [(f.name, str(f.ends.code)) for f in FAULTS if f.name in IN_THE_DOCUMENT]
