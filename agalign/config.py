@@ -252,9 +252,9 @@ class WriteSettings(SettingsModel):
     fill_occluded: bool = False
     """Interpolate pixels that are occluded in a band; by default they are nodata."""
     radiometry: Annotated[RadiometryChoice, _yes_or_no("auto", "off"), Option(alone="auto")] = "off"
-    """Write float32. camera: radiance by the camera's calibration; sun, panel: reflectance by light sensor or
-    calibration panel; auto (--radiometry alone): panel if available for all bands, else sun, else camera. Thermal bands
-    are written in degrees C."""
+    """Write float32. camera: radiance by the camera's calibration; sun: reflectance by light sensor; panel: by
+    calibration panel, and light sensor if there is one; auto (--radiometry alone): panel if available for all bands,
+    else sun, else camera. Thermal bands are written in degrees C."""
     # (band in lower case, reflectance); an empty name means all other bands.
     panel_albedo: Annotated[
         tuple[tuple[str, Annotated[float, Field(gt=0, le=1)]], ...], Option(type=str | None, parse=albedos)

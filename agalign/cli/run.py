@@ -30,6 +30,9 @@ from agalign.values.text import counted
 if TYPE_CHECKING:
     from agalign.batch import CaptureReport
 
+_MAX_PANEL_AGE_S = 30 * 60.0
+"""Under a clear sky with the sun above 40 degrees, the irradiance changes by up to 10 % in half an hour."""
+
 
 def find_captures(folder: Path, options: DiscoverOptions, terminal: Terminal) -> FolderScan:
     """Return the captures below a folder, and print them. Raises InputError or NoSuchBandError if there are none."""
@@ -110,6 +113,8 @@ class RunTotals:
     excluded: list[ExclusionPart] = field(default_factory=list)
     radiometry: Counter[str] = field(default_factory=Counter)
     """Number of captures by the quantity that raw numbers were converted to."""
+    panel_age_s: dict[str, float] = field(default_factory=dict)
+    """Longest time between a capture and the nearest panel, by the same quantity."""
 
     def add(self, report: "CaptureReport") -> None:
         """Add the report of a capture."""
@@ -119,8 +124,12 @@ class RunTotals:
         if report.result is None:
             return
         self.failures.add(report.label, report.result)
-        if report.result.output is not None and report.result.output.radiometry is not None:
-            self.radiometry[report.result.output.radiometry] += 1
+        output = report.result.output
+        if output is not None and output.radiometry is not None:
+            self.radiometry[output.radiometry] += 1
+            if output.panel_age_s is not None:
+                longest_s = self.panel_age_s.get(output.radiometry, 0.0)
+                self.panel_age_s[output.radiometry] = max(longest_s, output.panel_age_s)
         for band in report.result.bands:
             if band.status != "reference":
                 residual_px = band.metrics.after.residual_px if band.metrics else None
@@ -351,7 +360,14 @@ def _print_totals(totals: RunTotals, counts: Counter[str], terminal: Terminal) -
         of_all = f"{lost} of {counted(totals.states.total(), 'capture')}"
         terminal.problem(f"{of_all} could not be written, for the reasons above; the same command tries again")
     for quantity, count in totals.radiometry.items():
-        terminal.result(f"Written as {quantity}: {counted(count, 'capture')}")
+        age_s = totals.panel_age_s.get(quantity)
+        age = "" if age_s is None else f", at most {age_s / 60:.0f} min from a panel"
+        terminal.result(f"Written as {quantity}: {counted(count, 'capture')}{age}")
+        if age_s is not None and age_s > _MAX_PANEL_AGE_S and "light sensor" not in quantity:
+            terminal.problem(
+                f"{quantity}: the light may have changed in {age_s / 60:.0f} min; record a panel before and after each "
+                "flight, or use a light sensor (--radiometry sun)"
+            )
 
 
 def explain(failures: Sequence[FailureGroup], terminal: Terminal) -> None:

@@ -13,7 +13,7 @@ from agalign.flight.groups import camera_key, flights_of
 from agalign.pixels.panel import DetectedPanel, albedo_of, find_panel, inside, is_homogeneous
 from agalign.pixels.radiometry import calibrated
 from agalign.pixels.raster import read_for_alignment, read_tile, without_warnings
-from agalign.values.capture import Band, Capture, Panel, PanelSource
+from agalign.values.capture import Band, Capture, Panel, PanelFactor, PanelSource
 from agalign.values.image import Tile
 from agalign.values.pixel_units import PixelScale
 
@@ -29,6 +29,8 @@ _MAX_TIME_DIFFERENCE_S = 6 * 3600.0
 """A panel does not represent the illumination many hours later."""
 _MAX_SATURATED_SHARE = 0.01
 """Maximum share of saturated pixels, which bias the mean radiance."""
+_MAX_SENSOR_SCALE = 1.3
+"""Calibrated light sensors agree with panels within 20 %, except if a person, an aircraft or a cloud shades one."""
 _PANEL_HEIGHT_M = 1.0
 """Height of the camera above a panel when it is recorded."""
 _MIN_HEIGHT_M = 3.0
@@ -55,6 +57,12 @@ class BandReading:
             return None
         return self.albedo / self.radiance
 
+    @property
+    def sensor_scale(self) -> float | None:
+        """Irradiance on the panel divided by that of the light sensor, in any unit; None if either is unknown."""
+        sun = None if self.band.radiometry is None else self.band.radiometry.by_sun
+        return sun[0] / self.factor if sun and self.factor else None
+
 
 @dataclass(frozen=True)
 class PanelReading:
@@ -62,6 +70,22 @@ class PanelReading:
 
     capture: Capture
     bands: tuple[BandReading, ...]
+
+    @property
+    def sensor_scale(self) -> float | None:
+        """Irradiance on the panel divided by that of the light sensor, the median of the bands; None if either is
+        unknown, or relative.
+        """
+        known = [b.band.radiometry for b in self.bands if b.band.radiometry is not None]
+        if any(r.by_sun is not None and r.by_sun[1] != "reflectance" for r in known):
+            return None
+        scales = [b.sensor_scale for b in self.bands if b.sensor_scale]
+        return float(np.median(scales)) if scales else None
+
+    @property
+    def fits_sensor(self) -> bool:
+        """False if the panel and the light sensor cannot have been in the same light."""
+        return 1 / _MAX_SENSOR_SCALE < (self.sensor_scale or 1.0) < _MAX_SENSOR_SCALE
 
     @property
     def panel(self) -> Panel:
@@ -142,18 +166,30 @@ def read_panel(capture: Capture, albedos: Albedos) -> PanelReading:
     return PanelReading(capture, tuple(_read(b, albedos) for b in capture.bands))
 
 
-def reflectance_factors(capture: Capture, readings: Iterable[PanelReading]) -> dict[str, float]:
-    """Return the reflectance per radiance of a capture by band.
+def reflectance_factors(capture: Capture, readings: Iterable[PanelReading]) -> dict[str, PanelFactor]:
+    """Return the factor from radiance to reflectance of a capture by band.
 
-    The illumination is interpolated linearly in time between the panels of the camera and constant outside. Empty if
-    the time of the capture or of all panels is unknown.
+    The panel gives the scale of the light sensor, with the irradiances E of the capture and E_p of the panel's capture:
+
+        factor = albedo / (radiance of the panel) * E_p / E
+
+    E_p / E is 1 without a sensor, and if the sensor was not in the same light as one of the panels. Between the panels
+    of the camera, the reciprocals are interpolated linearly in time; they are constant outside. Empty if the time of
+    the capture or of all panels is unknown.
     """
-    illumination: dict[str, list[tuple[float, float]]] = {}
-    for later_s, reading in _within_hours(readings, capture):
-        for band in reading.bands if camera_key(reading.capture) == camera_key(capture) else ():
-            if band.factor is not None:
-                illumination.setdefault(band.band.name, []).append((later_s, 1 / band.factor))
-    return {name: 1 / _interpolated(samples) for name, samples in illumination.items()}
+    near = [(s, r) for s, r in _within_hours(readings, capture) if camera_key(r.capture) == camera_key(capture)]
+    age_s = min((abs(later_s) for later_s, _ in near), default=0.0)
+    fits_sensor, result = all(r.fits_sensor for _, r in near), {}
+    for band in capture.bands:
+        samples = [(s, b) for s, r in near for b in r.bands if b.band.name == band.name]
+        scales = [(s, b.sensor_scale) for s, b in samples if b.sensor_scale]
+        light = [(s, 1 / b.factor) for s, b in samples if b.factor]
+        sun = None if band.radiometry is None else band.radiometry.by_sun
+        if sun and scales and fits_sensor:
+            result[band.name] = PanelFactor(sun[0] / _interpolated(scales), "panel and light sensor", age_s)
+        elif light:
+            result[band.name] = PanelFactor(1 / _interpolated(light), "panel", age_s)
+    return result
 
 
 def with_height(capture: Capture, readings: Iterable[PanelReading]) -> Capture:

@@ -14,7 +14,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from agalign.values.capture import Capture, Quantity, Radiometry, RadiometrySource
+from agalign.values.capture import Capture, PanelFactor, Quantity, Radiometry, RadiometrySource
 from agalign.values.choices import RadiometryChoice
 from agalign.values.image import FloatImage
 
@@ -45,15 +45,18 @@ def is_physical(radiometry: Radiometry, size_px: tuple[int, int]) -> bool:
     )
 
 
-def with_radiometry(capture: Capture, choice: RadiometryChoice, by_panel: Mapping[str, float]) -> Capture:
+def with_radiometry(capture: Capture, choice: RadiometryChoice, by_panel: Mapping[str, PanelFactor]) -> Capture:
     """Return the capture with the conversion of each band to the chosen quantity; None if it is not available.
 
-    `by_panel` has the reflectance per radiance of each band that was measured on a panel. `auto` is by panel if
-    available for all bands, else by light sensor, else by the camera's calibration; RGB companions are ignored.
+    `by_panel` has the factors of the bands that were measured on a panel. `auto` is by panel if available for all
+    bands, else by light sensor, else by the camera's calibration. If both exist, but could not be combined, it is by
+    light sensor. RGB companions are ignored.
     """
     if choice == "off":
         return capture
     candidates: Sequence[RadiometryChoice] = ("panel", "sun", "camera") if choice == "auto" else (choice,)
+    if choice == "auto" and any(factor.source == "panel" for factor in by_panel.values()):
+        candidates = "sun", "panel", "camera"
     for candidate in candidates:
         result = {b.name: _converted(b.radiometry, candidate, by_panel.get(b.name)) for b in capture.bands}
         if all(result[b.name] is not None for b in capture.bands if not b.companion):
@@ -61,12 +64,17 @@ def with_radiometry(capture: Capture, choice: RadiometryChoice, by_panel: Mappin
     return replace(capture, bands=tuple(replace(b, radiometry=result[b.name]) for b in capture.bands))
 
 
-def _converted(of_camera: Radiometry | None, choice: RadiometryChoice, by_panel: float | None) -> Radiometry | None:
+def _converted(
+    of_camera: Radiometry | None, choice: RadiometryChoice, by_panel: PanelFactor | None
+) -> Radiometry | None:
     if of_camera is None or not of_camera.is_of_light or choice == "camera":
         return of_camera
     if choice == "sun":
         return to_reflectance(of_camera)
-    return None if by_panel is None else _reflectance(of_camera, by_panel, "reflectance", "panel")
+    if by_panel is None:
+        return None
+    result = _reflectance(of_camera, by_panel.value, "reflectance", by_panel.source)
+    return replace(result, panel_age_s=by_panel.age_s)
 
 
 def to_reflectance(radiometry: Radiometry) -> Radiometry | None:
@@ -79,7 +87,7 @@ def to_reflectance(radiometry: Radiometry) -> Radiometry | None:
 
 
 def _reflectance(radiance: Radiometry, factor: float, quantity: Quantity, source: RadiometrySource) -> Radiometry:
-    return replace(radiance, gain=radiance.gain * factor, quantity=quantity, source=source, by_sun=None)
+    return replace(radiance, gain=radiance.gain * factor, quantity=quantity, source=source, factor=factor)
 
 
 def calibrated(pixels: NDArray[np.generic], radiometry: Radiometry, x0: int, y0: int) -> FloatImage:

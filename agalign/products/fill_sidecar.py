@@ -16,7 +16,7 @@ from agalign.products.relief_map import ReliefMap
 from agalign.products.sidecar import BandPart, Sidecar, is_usable
 from agalign.values import geometry
 from agalign.values.alignment import Alignment
-from agalign.values.capture import Band
+from agalign.values.capture import Band, Radiometry
 from agalign.values.choices import CaptureStatus
 from agalign.values.geometry import Points
 from agalign.values.mapping import PixelMapping
@@ -79,15 +79,27 @@ def _output(context: ProductContext) -> dict[str, Any]:
     stack: dict[str, Any] = stacks[0] if stacks else {"file": None, "bytes": None}
     values = {part["nodata"] for part in stacks or band_files}
     grid, capture = context.grid, context.capture
-    names = dict.fromkeys(f"{b.radiometry.quantity} by {b.radiometry.source}" for b in capture.bands if b.radiometry)
+    is_raw = context.write_settings.radiometry == "off"
+    radiometry = {b.name: b.radiometry for b in capture.bands if b.radiometry is not None and not is_raw}
+    names = dict.fromkeys(f"{r.quantity} by {r.source}" for r in radiometry.values())
     return stack | {
         "band_files": band_files,
-        "radiometry": None if context.write_settings.radiometry == "off" else " and ".join(names) or None,
+        "radiometry": " and ".join(names) or None,
+        "panel_age_s": next((r.panel_age_s for r in radiometry.values() if r.panel_age_s is not None), None),
+        "illumination": [_illumination(n, r) for n, r in radiometry.items() if "reflectance" in r.quantity],
         "crop": (grid.x0, grid.y0, grid.width, grid.height),
         "scale": grid.scale,
         "undistorted": grid.undistorted,
         "nodata": values.pop() if len(values) == 1 else None,
     }
+
+
+def _illumination(band: str, radiometry: Radiometry) -> dict[str, Any]:
+    irradiance = None
+    if radiometry.by_sun is not None:
+        by_sun, quantity = radiometry.by_sun
+        irradiance = (math.pi if quantity == "reflectance" else 1.0) / by_sun
+    return {"band": band, "irradiance": irradiance, "reflectance_per_radiance": radiometry.factor}
 
 
 def _file(file: WrittenFile, context: ProductContext) -> dict[str, Any]:

@@ -67,6 +67,10 @@ class PanelPart(_CapturePart):
     """The capture shows a scene that contains the panel, or only one cue indicates it: it is aligned."""
     cues: list[str] = []
     """Evidence that the capture shows a panel, in words."""
+    sensor_scale: float | None = None
+    """Irradiance on the panel divided by that of the light sensor, the median of the bands."""
+    fits_sensor: bool = True
+    """False if the scale is implausible; the panel is then not combined with the light sensor."""
     bands: list[PanelBandPart]
 
     @property
@@ -77,7 +81,12 @@ class PanelPart(_CapturePart):
         reflectance = " to ".join(dict.fromkeys((albedos[0], albedos[-1]))) if albedos else "not known"
         name = f"calibration panel {self.serial}".strip()
         use = "aligned, as it shows a scene or by one cue only" if self.in_scene else "not aligned"
-        return f"{name} (reflectance {reflectance}; recognised by {', '.join(self.cues) or self.seen_by}): {use}"
+        recognised = ", ".join(self.cues) or self.seen_by
+        scale = self.sensor_scale
+        sensor = "" if scale is None else f"; irradiance {scale:.2f} times that of the light sensor"
+        if not self.fits_sensor:
+            sensor += ", which was in other light: they are not combined"
+        return f"{name} (reflectance {reflectance}; recognised by {recognised}): {use}{sensor}"
 
 
 class SkyPart(_CapturePart):
@@ -117,8 +126,13 @@ def write_panels(readings: Sequence[PanelReading], out: Path) -> list[PanelPart]
         picture = check_inside(out / reading.capture.folder, out) / f"{reading.capture.name}.panel.png"
         write_png(side_by_side([_tile(b) for b in reading.bands], gap_px=6), picture)
         panel, bands = reading.panel, [_panel_band(b) for b in reading.bands]
-        facts = {"seen_by": panel.seen_by, "serial": panel.serial, "picture": picture.relative_to(out).as_posix()}
+        facts: dict[str, Any] = {
+            "seen_by": panel.seen_by,
+            "serial": panel.serial,
+            "picture": picture.relative_to(out).as_posix(),
+        }
         facts |= _identity(reading.capture) | {"in_scene": panel.in_scene, "cues": panel.cues, "bands": bands}
+        facts |= {"sensor_scale": reading.sensor_scale, "fits_sensor": reading.fits_sensor}
         parts.append(PanelPart.model_validate(facts))
     write_model(out / PANELS_FILE, PanelsFile(panels=parts) if parts else None)
     return parts

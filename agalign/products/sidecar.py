@@ -429,6 +429,17 @@ class FilePart(_Part):
     """Nodata value; `"nan"` for NaN."""
 
 
+class IlluminationPart(_Part):
+    """Illumination of a band."""
+
+    band: str
+    """Its name."""
+    irradiance: float | None = None
+    """Light on a horizontal plane by the light sensor, W / m^2 / nm (DJI: relative)."""
+    reflectance_per_radiance: float
+    """Factor by which radiance was multiplied."""
+
+
 class OutputPart(_Part):
     """Written rasters."""
 
@@ -439,7 +450,11 @@ class OutputPart(_Part):
     band_files: list[FilePart] = []
     """Files of single bands."""
     radiometry: str | None = None
-    """Conversion of raw numbers, such as `reflectance by panel`."""
+    """Conversion of raw numbers, such as `reflectance by panel and light sensor`."""
+    panel_age_s: float | None = None
+    """Time between the capture and the nearest panel, if one was used."""
+    illumination: list[IlluminationPart] = []
+    """Bands that were converted to reflectance."""
     crop: tuple[int, int, int, int]
     """x0, y0, width, height on the reference grid times `scale`."""
     scale: tuple[float, float] = (1.0, 1.0)

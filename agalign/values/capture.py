@@ -4,7 +4,7 @@ from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Literal
+from typing import Literal, NamedTuple
 
 from agalign.values.geometry import Matrix
 from agalign.values.lens import Lens
@@ -28,7 +28,7 @@ all bands share.
 """
 
 
-RadiometrySource = Literal["camera calibration", "light sensor", "panel"]
+RadiometrySource = Literal["camera calibration", "light sensor", "panel", "panel and light sensor"]
 
 
 @dataclass(frozen=True)
@@ -49,11 +49,24 @@ class Radiometry:
     """Factor from radiance to reflectance by the light sensor, and the resulting quantity."""
     source: RadiometrySource = "camera calibration"
     """Source of the factor from radiance to reflectance."""
+    factor: float = 1.0
+    """The factor from radiance to reflectance, which `gain` includes."""
+    panel_age_s: float | None = None
+    """Time between the capture and the nearest panel, if `source` includes a panel."""
 
     @property
     def is_of_light(self) -> bool:
         """True for radiance, which can be converted to reflectance."""
         return self.quantity in ("radiance", "relative radiance")
+
+
+class PanelFactor(NamedTuple):
+    """Reflectance per radiance of a band by panels."""
+
+    value: float
+    source: RadiometrySource
+    age_s: float
+    """Time between the capture and the nearest panel."""
 
 
 PanelSource = Literal["tags", "QR code", "look"]

@@ -9,16 +9,19 @@ import pytest
 import typer
 
 import agalign
+from agalign.batch import CaptureReport
 from agalign.cameras.discover import DiscoverOptions, FolderScan, Problem, discover
 from agalign.cli import main
-from agalign.cli.run import print_problems
+from agalign.cli.run import RunTotals, conclude, print_problems
 from agalign.cli.terminal import Terminal, exits, shown
 from agalign.errors import ConfigurationError, InputError, UnreadableFileError
 from agalign.flight.groups import camera_overviews
 from agalign.method.device import choose_device
+from agalign.products.report.facts import FailureGroups
 from agalign.synthetic import flight as synthetic
 
 from ..conftest import write_capture
+from ..products.test_sidecar import example
 from ..program import agalign_here
 
 
@@ -207,3 +210,26 @@ def test_many_files_with_one_problem_are_counted(capsys: pytest.CaptureFixture[s
     ]
     print_problems(scan, Terminal(quiet=False, verbose=False, log_json=True))
     assert len(capsys.readouterr().err.splitlines()) == 4001
+
+
+@pytest.mark.parametrize(
+    ("radiometry", "age_s", "text"),
+    [
+        ("reflectance by panel", 3180.0, "1 capture, at most 53 min from a panel"),
+        ("reflectance by panel", 1700.0, "1 capture, at most 28 min from a panel"),
+        ("reflectance by panel and light sensor", 3180.0, "1 capture, at most 53 min from a panel"),
+        ("reflectance by light sensor", None, "1 capture"),
+    ],
+)
+def test_the_age_of_a_panel_is_printed_and_warned_of(
+    radiometry: str, age_s: float | None, text: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    output = {"file": None, "bytes": None, "crop": (0, 0, 10, 8), "nodata": None, "radiometry": radiometry}
+    totals = RunTotals(True, FailureGroups())
+    sidecar = example(output=output | {"panel_age_s": age_s})
+    totals.add(CaptureReport("IMG_1", "done", sidecar.result()))
+    conclude(totals, Path("out"), Terminal(quiet=False, verbose=False, log_json=False))
+    printed = capsys.readouterr()
+    assert printed.out.splitlines()[0] == f"Written as {radiometry}: {text}"
+    is_warned = "the light may have changed in 53 min; record a panel before and after" in printed.err
+    assert is_warned == (radiometry == "reflectance by panel" and age_s == 3180.0)

@@ -15,7 +15,8 @@ from agalign.flight.panels import (
     with_panels,
 )
 from agalign.pixels.panel import DetectedPanel
-from agalign.values.capture import Band, CameraIdentity, Capture, Panel, Pose, Position, Radiometry
+from agalign.pixels.radiometry import with_radiometry
+from agalign.values.capture import Band, CameraIdentity, Capture, Panel, Pose, Position, Quantity, Radiometry
 
 AREA = ((20.0, 10.0), (39.0, 10.0), (39.0, 29.0), (20.0, 29.0))
 PLAIN = Radiometry("radiance", 1000.0, 65536.0, 2.0)
@@ -60,10 +61,53 @@ def test_a_panel_that_cannot_be_measured_has_no_factor(tmp_path: Path, level: in
 
 def test_illumination_is_interpolated_in_time_and_constant_outside() -> None:
     panels = [reading("2026-06-21T10:00:00", 2.0), reading("2026-06-21T11:00:00", 4.0)]
-    for hour, factor in (("09:00", 2.0), ("10:30", 1 / 0.375), ("12:00", 4.0)):
-        assert reflectance_factors(capture(GREEN, f"2026-06-21T{hour}:00"), panels) == {"Green": pytest.approx(factor)}
+    for hour, factor, age_s in (("09:00", 2.0, 3600), ("10:30", 1 / 0.375, 1800), ("12:00", 4.0, 3600)):
+        result = reflectance_factors(capture(GREEN, f"2026-06-21T{hour}:00"), panels)
+        assert result == {"Green": (pytest.approx(factor), "panel", age_s)}
     assert reflectance_factors(capture(GREEN, "2026-06-23T10:30:00"), panels) == {}
     assert reflectance_factors(replace(capture(GREEN), camera=CameraIdentity("a", "b", "2")), panels) == {}
+
+
+def lit(irradiance: float, quantity: Quantity = "reflectance") -> Band:
+    """A band with a light sensor that measures an irradiance."""
+    return replace(GREEN, radiometry=replace(PLAIN, by_sun=(np.pi / irradiance, quantity)))
+
+
+def lit_panel(moment: str, irradiance: float, measured: float, quantity: Quantity = "reflectance") -> PanelReading:
+    """A panel of reflectance 0.5 under an irradiance of which the light sensor measures `measured`."""
+    band = lit(measured, quantity)
+    return PanelReading(capture(band, moment), (BandReading(band, 0.5, 0.5 * irradiance / np.pi),))
+
+
+def test_the_panel_scales_the_light_sensor_which_follows_the_light() -> None:
+    """53 minutes after the panel, the sensor measures 15 % more light; it shows 0.9 of the light on the panel."""
+    panel, later = lit_panel("2026-06-21T15:04:00", 1.0, 0.9), capture(lit(0.9 * 1.15), "2026-06-21T15:57:00")
+    result = reflectance_factors(later, [panel])
+    assert result == {"Green": (pytest.approx(np.pi / 1.15), "panel and light sensor", 53 * 60)}
+    (band,) = with_radiometry(later, "auto", result).bands
+    assert (band.radiometry.source, band.radiometry.panel_age_s) == ("panel and light sensor", 53 * 60)
+    assert band.radiometry.gain == pytest.approx(PLAIN.gain * np.pi / 1.15)
+    # Between two panels, the scale of the sensor is interpolated.
+    two = [panel, lit_panel("2026-06-21T16:50:00", 1.0, 1.0)]
+    scale = (1 / 0.9 + 1.0) / 2
+    assert reflectance_factors(later, two)["Green"].value == pytest.approx(np.pi / (0.9 * 1.15) / scale)
+
+
+def test_a_light_sensor_that_was_shaded_at_the_panel_is_not_combined_with_it() -> None:
+    later = capture(lit(1.2), "2026-06-21T10:30:00")
+    shaded, good = lit_panel("2026-06-21T10:00:00", 1.0, 0.6), lit_panel("2026-06-21T11:00:00", 1.0, 1.0)
+    assert shaded.sensor_scale == pytest.approx(1 / 0.6)
+    assert [r.fits_sensor for r in (shaded, good)] == [False, True]
+    for panels in ([shaded], [shaded, good]):
+        factors = reflectance_factors(later, panels)
+        assert factors == {"Green": (pytest.approx(np.pi), "panel", 1800)}
+        sources = [with_radiometry(later, c, factors).bands[0].radiometry.source for c in ("auto", "panel", "sun")]
+        assert sources == ["light sensor", "panel", "light sensor"]
+    # A sensor with an unknown unit has any scale.
+    relative = lit_panel("2026-06-21T10:00:00", 1.0, 3000.0, "relative reflectance")
+    assert (relative.sensor_scale, relative.fits_sensor) == (None, True)
+    in_same_unit = capture(lit(3300.0, "relative reflectance"), "2026-06-21T10:30:00")
+    assert reflectance_factors(in_same_unit, [relative])["Green"].value == pytest.approx(np.pi / 1.1)
 
 
 def test_a_panel_on_the_ground_gives_the_height_of_other_captures() -> None:
@@ -114,7 +158,7 @@ def test_without_a_time_no_panel_is_of_the_same_hours() -> None:
     assert reflectance_factors(capture(GREEN, ""), [of_1970]) == {}
     assert reflectance_factors(of_1970.capture, [undated]) == {}
     assert reflectance_factors(undated.capture, [undated]) == {}
-    assert reflectance_factors(of_1970.capture, [undated, of_1970]) == {"Green": pytest.approx(2.0)}
+    assert reflectance_factors(of_1970.capture, [undated, of_1970]) == {"Green": (2.0, "panel", 0.0)}
     # Nor is one at the height of the ground.
     ground = PanelReading(capture(HELD, "1970-01-01T01:00:00", position=GROUND), ())
     high = capture(GREEN, "", position=HIGH, pose=Pose(30.0))

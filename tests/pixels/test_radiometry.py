@@ -13,7 +13,7 @@ from agalign.pixels.raster import probe
 from agalign.synthetic import cameras, rig
 from agalign.synthetic import flight as synthetic
 from agalign.synthetic.ground import paint_ground
-from agalign.values.capture import Band, Capture, Radiometry
+from agalign.values.capture import Band, Capture, PanelFactor, Radiometry
 from agalign.values.choices import RadiometryChoice
 
 
@@ -89,9 +89,10 @@ def test_without_a_plausible_light_sensor_it_is_radiance(blue: Path, value: str 
 
 
 def by(path: Path, choice: RadiometryChoice, factors: dict[str, float] | None = None) -> Band:
-    """Return the band of a file with the chosen radiometry."""
+    """Return the band of a file with the chosen radiometry, by these factors of a panel and the light sensor."""
+    by_panel = {name: PanelFactor(value, "panel and light sensor", 60.0) for name, value in (factors or {}).items()}
     bands = MicaSense().bands(path, read_tags(path), probe(path))
-    return with_radiometry(Capture("IMG_0001", Path(), bands, 0), choice, factors or {}).bands[0]
+    return with_radiometry(Capture("IMG_0001", Path(), bands, 0), choice, by_panel).bands[0]
 
 
 def test_the_chosen_radiometry_is_applied(blue: Path) -> None:
@@ -101,7 +102,7 @@ def test_the_chosen_radiometry_is_applied(blue: Path) -> None:
     assert (camera.source, sun.source) == ("camera calibration", "light sensor")
     assert sun.gain == pytest.approx(camera.gain * np.pi / 0.8)
     panel = by(blue, "panel", {"Blue": 2.5}).radiometry
-    assert panel.source == "panel"
+    assert (panel.source, panel.panel_age_s) == ("panel and light sensor", 60.0)
     assert (panel.quantity, panel.gain) == ("reflectance", pytest.approx(2.5 * camera.gain))
     assert by(blue, "panel", {"Green": 2.5}).radiometry is None
     assert by(blue, "auto", {"Blue": 2.5}).radiometry == panel
@@ -111,7 +112,9 @@ def test_the_chosen_radiometry_is_applied(blue: Path) -> None:
 def test_rgb_companions_do_not_prevent_reflectance() -> None:
     green = Band("Green", Path("g.tif"), 1, 64, 48, "uint16", radiometry=Radiometry("radiance", 0.0, 1.0, 2.0))
     colour = Band("RGB Red", Path("c.jpg"), 1, 64, 48, "uint8", companion=True)
-    capture = with_radiometry(Capture("a", Path(), (green, colour), 0), "auto", {"Green": 3.0})
+    capture = with_radiometry(
+        Capture("a", Path(), (green, colour), 0), "auto", {"Green": PanelFactor(3.0, "panel", 0.0)}
+    )
     assert [b.radiometry and b.radiometry.gain for b in capture.bands] == [6.0, None]
     assert (WriteSettings(radiometry=True).radiometry, WriteSettings(radiometry=False).radiometry) == ("auto", "off")
 
