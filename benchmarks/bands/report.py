@@ -27,7 +27,7 @@ def overview(scored: Sequence[Scored]) -> str:
     def cell(score: Score, pairs: int) -> str:
         # The number of pairs, if the method was not run on all.
         of = "" if score.pairs == pairs else f" of {score.pairs}"
-        return f"{round(score.under_half_px * score.pairs)}{of} / **{score.wrong_claims}**"
+        return f"{round(score.under_half_px * score.pairs)}{of}/**{score.wrong_claims}**"
 
     return _by_method("", {(s.method, s.variant): s for s in summary(scored, ALL_SETS)}, cell)
 
@@ -37,7 +37,7 @@ def by_set(scored: Sequence[Scored]) -> str:
 
     def cell(score: Score, _pairs: int) -> str:
         median = "-" if np.isnan(score.median_px) else f"{score.median_px:.3f}"
-        return f"{median} / **{score.wrong_claims}**"
+        return f"{median}/**{score.wrong_claims}**"
 
     scores = summary([s for s in scored if s.variant == AS_IT_IS])
     return _by_method("method", {(s.method, s.set): s for s in scores}, cell)

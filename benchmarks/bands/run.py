@@ -5,7 +5,7 @@
 
 DATA is any folder: images are recognised by their checksums, and missing sets are listed with their publisher. Each
 method runs in a process of its own with as many threads as it takes; one that raises has refused the pair. Scores are
-written to -o, and as tables next to it (.md); the mapping of each pair to --said, in the format that score.py reads.
+written to -o, and as tables next to it (.md); the mapping of each pair to --mappings, in the format of score.py.
 """
 
 import csv
@@ -154,10 +154,10 @@ def run_method(name: str, located: Mapping[str, Paths], sets: dict[str, Any], va
             if not applies(name, variant, pairs, bands, paths):
                 continue
             if method is None:
-                said = by_command_line(name, paths, pairs, variant)
+                mapped = by_command_line(name, paths, pairs, variant)
             else:
-                said = [asked(method, pair, variant, paths, bands) for pair in pairs]
-            for pair, row in zip(pairs, said, strict=True):
+                mapped = [asked(method, pair, variant, paths, bands) for pair in pairs]
+            for pair, row in zip(pairs, mapped, strict=True):
                 key = dict(zip(("set", "capture", "file"), pair.key, strict=True))
                 rows.append({"method": name, "variant": variant, **key, **row})
     return rows
@@ -183,7 +183,7 @@ def print_missing(missing: Mapping[str, Sequence[str]], sets: dict[str, Any]) ->
         print(f"{name}: left out, {count} files are missing ({where})", file=sys.stderr)
 
 
-def write_said(rows: Iterable[Row], path: Path) -> None:
+def write_mappings(rows: Iterable[Row], path: Path) -> None:
     """Write the rows in the format that score.py reads."""
     with path.open("w", newline="", encoding="utf-8") as file:
         writer = csv.DictWriter(file, _FIELDS, lineterminator="\n")
@@ -199,7 +199,7 @@ def main(
     sets: Annotated[str, typer.Option(help="separated by commas; by default all")] = "",
     variants: Annotated[str, typer.Option(help="separated by commas")] = ",".join(VARIANTS),
     jobs: Annotated[int, typer.Option(help="methods at a time; above one, seconds mean little")] = 1,
-    said: Path | None = None,
+    mappings: Path | None = None,
     plot: Path | None = None,
     only: Annotated[str, typer.Option(hidden=True)] = "",
 ) -> None:
@@ -224,8 +224,8 @@ def main(
     with ThreadPoolExecutor(jobs) as pool:
         result = dict(zip(names, pool.map(lambda name: child(name, arguments), names), strict=True))
     rows = [row for some, _ in result.values() for row in some]
-    if said:
-        write_said(rows, said)
+    if mappings:
+        write_mappings(rows, mappings)
     scored = score_pairs(rows, known)
     write_csv(summary(scored), output)
     text = tables(scored, {name: gigabytes for name, (some, gigabytes) in result.items() if some})

@@ -220,15 +220,15 @@ def score_pairs(rows: Iterable[Mapping[str, Any]], sets: Mapping[str, Mapping[st
 
     Raises ValueError for rows of unknown pairs, for two rows of one pair, and for mappings that are none.
     """
-    said: dict[tuple[str, str, str], dict[tuple[str, str, str], Mapping[str, Any]]] = {}
+    groups: dict[tuple[str, str, str], dict[tuple[str, str, str], Mapping[str, Any]]] = {}
     for row in rows:
-        group = said.setdefault((row["set"], row.get("variant", AS_IT_IS), row["method"]), {})
+        group = groups.setdefault((row["set"], row.get("variant", AS_IT_IS), row["method"]), {})
         key = row["set"], str(row["capture"]), row["file"]
         if key in group:
             raise ValueError(f"{row['method']}: two rows for {key}")
         group[key] = row
     scored = []
-    for (name, variant, method), group in said.items():
+    for (name, variant, method), group in groups.items():
         if name not in sets:
             raise ValueError(f"{method}: there is no set {name}")
         pairs = pairs_of(sets[name], variant)

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from bands import score
 from bands.images import VARIANTS, degraded, locate, read
-from bands.run import asked, claim, lens_corrected, write_said
+from bands.run import asked, claim, lens_corrected, write_mappings
 from peers import UnavailableError, identity, method_named
 
 from agalign.cameras.discover import discover
@@ -41,8 +41,8 @@ def sets() -> dict[str, Any]:
     return {"field": {"set": "field", "files": files, "captures": captures}}
 
 
-def row(file: str, **said: Any) -> dict[str, Any]:
-    return {"method": "m", "set": "field", "capture": file[0], "file": file, **said}
+def row(file: str, **values: Any) -> dict[str, Any]:
+    return {"method": "m", "set": "field", "capture": file[0], "file": file, **values}
 
 
 def test_the_error_of_a_known_homography_and_of_its_grid_is_exact(sets: dict[str, Any]) -> None:
@@ -95,7 +95,7 @@ def test_what_is_written_is_read_again(sets: dict[str, Any], tmp_path: Path, suf
     path = tmp_path / f"mine{suffix}"
     rows = [row("1_r.png", homography=shifted(0, 0.25).tolist(), variant="turn 10", seconds=0.5), row("1_n.png")]
     if suffix == ".csv":
-        write_said(rows, path)
+        write_mappings(rows, path)
     else:
         path.write_text(json.dumps(rows))
     turned, plain = score.summary(score.score_pairs(score.read_results(path), sets))
@@ -180,8 +180,8 @@ def test_a_method_that_raises_has_refused(
     def dies(_fixed: np.ndarray, _moving: np.ndarray) -> None:
         raise RuntimeError("out of luck")
 
-    said = asked(dies, pair, score.AS_IT_IS, paths, {})
-    assert set(said) == {"seconds"}
+    result = asked(dies, pair, score.AS_IT_IS, paths, {})
+    assert set(result) == {"seconds"}
     assert "refused (RuntimeError: out of luck)" in capsys.readouterr().err
     assert asked(identity, pair, score.AS_IT_IS, paths, {})["homography"] == np.eye(3).tolist()
 
@@ -197,9 +197,9 @@ def test_anyones_method_is_taken_from_a_file(tmp_path: Path) -> None:
 
 def test_only_what_is_called_aligned_is_claimed() -> None:
     grid = {"reference_px": [[0, 0], [1, 0], [0, 1]], "moving_px": [[0, 0], [1, 0], [0, 1]]}
-    said = {s: claim({"status": s, "grid": grid}) for s in ("aligned", "predicted", "seed_only", "failed")}
-    assert (said["aligned"]["claimed"], said["predicted"]["claimed"]) == ("yes", "no")
-    assert said["seed_only"] == said["failed"] == claim(None) == {}
+    claims = {s: claim({"status": s, "grid": grid}) for s in ("aligned", "predicted", "seed_only", "failed")}
+    assert (claims["aligned"]["claimed"], claims["predicted"]["claimed"]) == ("yes", "no")
+    assert claims["seed_only"] == claims["failed"] == claim(None) == {}
 
 
 def test_lens_corrected_images_are_scored_between_raw_pixels(flight: Path) -> None:
@@ -208,7 +208,7 @@ def test_lens_corrected_images_are_scored_between_raw_pixels(flight: Path) -> No
     file = "IMG_0001_4.tif"
     both = [(read(bands[name].path), bands[name]) for name in (truth["reference"], file)]
     known = truth["bands"][file]
-    said = lens_corrected(lambda _f, _m: np.array(known["fixed_to_moving"]), *both)
+    result = lens_corrected(lambda _f, _m: np.array(known["fixed_to_moving"]), *both)
     here, there = np.hsplit(np.array(known["ties"]), 2)
     pair = score.Pair("synthetic", "1", truth["reference"], file, here, there, bands[file].size_px)
-    assert np.median(score.errors_px(said, pair)) < 0.02
+    assert np.median(score.errors_px(result, pair)) < 0.02
