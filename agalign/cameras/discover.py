@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from fnmatch import fnmatchcase
 from pathlib import Path
 
+from agalign.cameras.generic import Generic
 from agalign.cameras.grouping import (
     band_file_owners,
     capture_of,
@@ -93,11 +94,16 @@ def _read(
 ) -> list[ImageFile]:
     """The files that contain a band; files that cannot be read are added to `problems`."""
     files: list[ImageFile] = []
+    generic = Generic(options.pattern)
     for number, result in enumerate(read_files(paths, options), start=1):
         if isinstance(result, ImageFile):
             files += [result] if result.bands else []
         # An unreadable colour photograph is a problem only if photographs take part.
-        elif options.with_rgb or suffix_format(result.path) == "TIFF":
+        elif (
+            options.with_rgb
+            or suffix_format(result.path) not in ("JPEG", "PNG")
+            or generic.is_named_as_band(result.path)
+        ):
             problems.append(result)
         if progress is not None:
             progress(number, len(paths))

@@ -51,11 +51,16 @@ class Generic(Camera):
 
         A number in the name of a picture is not a band. If a band is stored as three equal channels, the first is read.
         """
-        name = self.split(path)[1]
-        is_spectral = re.fullmatch(rf"(?!rgb|vis|ms)(?:{_BAND}|re|[bgrn])", name, re.IGNORECASE)  # no photograph
-        if name and (self._patterns or is_spectral):
+        if self.is_named_as_band(path):
+            name = self.split(path)[1]
             return (replace(stored[0], name=name, wavelength_nm=_wavelength_in(name)),)
         return colour_bands(stored) if suffix_format(path) == "JPEG" else ()
+
+    def is_named_as_band(self, path: Path) -> bool:
+        """Return True for a picture with the name of a band, and not of a photograph."""
+        name = self.split(path)[1]
+        is_spectral = re.fullmatch(rf"(?!rgb|vis|ms)(?:{_BAND}|re|[bgrn])", name, re.IGNORECASE)
+        return bool(name and (self._patterns or is_spectral))
 
     def capture_key(self, path: Path, tags: Tags) -> str:
         return self.split(path)[0]

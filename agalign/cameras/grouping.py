@@ -102,12 +102,12 @@ def _with_camera(file: ImageFile, camera: Camera) -> ImageFile:
 
 
 def _drop_copies(groups: dict[_GroupKey, list[ImageFile]]) -> None:
-    """Drop JPEG and PNG copies of bands, which programs leave as quick looks: next to the TIFFs of a capture, and alone
-    if there are other captures.
+    """Drop JPEG and PNG copies of bands, which programs leave as quick looks: next to the TIFFs of the same bands, and
+    alone if there are other captures.
     """
     for key, group in list(groups.items()):
-        if any(_is_tiff(f) for f in group):
-            groups[key] = [f for f in group if not _is_picture_band(f)]
+        in_tiff = {f.camera.split(f.path)[1].lower() for f in group if _is_tiff(f) and isinstance(f.camera, Generic)}
+        groups[key] = [f for f in group if not (_is_picture_band(f) and f.bands[0].name.lower() in in_tiff)]
     alone = {k for k, group in groups.items() if len(group) == 1 and _is_picture_band(group[0])}
     if len(alone) < len(groups):
         for key in alone:

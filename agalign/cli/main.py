@@ -1,6 +1,5 @@
 """The application: its commands, its help, its usage errors and its entry point."""
 
-import logging
 import os
 import re
 import sys
@@ -23,6 +22,7 @@ from agalign.cli.info import info
 from agalign.cli.results import export, indices, report, verify
 from agalign.cli.terminal import ExitCode, Terminal, examples, printed
 from agalign.values.cores import limit_default_threads
+from agalign.values.processes import silence_libraries
 
 COMMANDS = {
     "align": align,
@@ -164,8 +164,7 @@ def main() -> None:
     # The matrices here are small: a second BLAS thread only spins.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     limit_default_threads()
-    logging.getLogger("rasterio").setLevel(logging.CRITICAL)
-    logging.getLogger("tifffile").setLevel(logging.CRITICAL)
+    silence_libraries()
     with printed():
         app(args=arguments, prog_name="agalign")
 

@@ -21,14 +21,14 @@ _MIN_SATURATED_PX = 7
 def data_mask(pixels: NDArray[np.generic], nodata: float | None) -> Mask:
     """Return (height, width) False where pixels are nodata or not finite.
 
-    Without a declared nodata value, common fill values of floating-point images are also False.
+    Without a declared nodata value, common fill values of floating-point and 64-bit images are also False.
     """
     valid: Mask = np.isfinite(pixels) if pixels.dtype.kind == "f" else np.ones(pixels.shape, dtype=bool)
     if nodata is not None and np.isfinite(nodata):
         valid &= pixels != nodata
-    if nodata is None and pixels.dtype.kind == "f":
+    if nodata is None and (pixels.dtype.kind == "f" or pixels.dtype.itemsize == 8):
         common_fill = -9999.0, -99999.0, -32767.0, -32768.0
-        valid &= (np.abs(pixels) < _MAX_MEASURED) & ~np.isin(pixels, common_fill)
+        valid &= (np.fabs(pixels) < _MAX_MEASURED) & ~np.isin(pixels, common_fill)
     return valid
 
 

@@ -46,10 +46,10 @@ _MAX_MICROMETRES = 20.0
 """Wavelengths without a unit are in micrometres below this: thermal bands end at 14 um, and none is below 100 nm."""
 
 
-def suffix_format(path: Path) -> Literal["TIFF", "JPEG", "PNG"] | None:
+def suffix_format(path: Path) -> Literal["TIFF", "JPEG", "PNG", "JPEG 2000"] | None:
     """Return the format of a file by its suffix; None for other files.
 
-    JPEG and PNG are photographs, or bands exported by other software, mostly in 8 bits.
+    JPEG and PNG are photographs, or bands exported by other software, mostly in 8 bits. JPEG 2000 is refused.
     """
     match path.suffix.lower():
         case ".tif" | ".tiff":
@@ -58,6 +58,8 @@ def suffix_format(path: Path) -> Literal["TIFF", "JPEG", "PNG"] | None:
             return "JPEG"
         case ".png":
             return "PNG"
+        case ".jp2" | ".j2k":
+            return "JPEG 2000"
     return None
 
 
@@ -145,6 +147,8 @@ def _driver_of(path: Path) -> str:
         return "JPEG"
     if magic == b"\x89PNG":
         return "PNG"
+    if suffix_format(path) == "JPEG 2000":
+        raise UnreadableFileError(f"{path}: JPEG 2000 is not supported; convert it to TIFF (gdal_translate)")
     problem = "is empty" if not magic else "is not a TIFF, JPEG or PNG"
     raise UnreadableFileError(f"{path}: {problem}; copy it from the card again")
 
@@ -222,7 +226,8 @@ def read_for_alignment(band: Band, longest_side_px: int) -> Raster:
 
 def _reduced(dataset: rasterio.DatasetReader, band: Band, shape: tuple[int, int]) -> NDArray[np.generic]:
     """Read a band reduced to `shape` (height, width) by averaging."""
-    all_valid = band.nodata is None and not band.has_mask and np.dtype(band.dtype).kind == "u"
+    # OpenCV resizes no integers of 32 or 64 bits.
+    all_valid = band.nodata is None and not band.has_mask and band.dtype in ("uint8", "uint16")
     if all_valid and band.width_px * band.height_px <= _READ_WHOLE_PX:
         # GDAL's averaging decodes a JPEG repeatedly, which takes seconds per band.
         return np.asarray(cv2.resize(dataset.read(band.band_index), shape[::-1], interpolation=cv2.INTER_AREA))

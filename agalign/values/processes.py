@@ -4,6 +4,7 @@ A message is sent in chunks that fit the buffer of a pipe, so the parent never b
 requests each further chunk of a task, and the parent reads a chunk of a result only after all of it has arrived.
 """
 
+import logging
 import os
 import pickle
 import signal
@@ -23,8 +24,15 @@ from typing import Any
 from agalign.values.cores import THREAD_VARIABLES
 
 
+def silence_libraries() -> None:
+    """Drop what libraries log about damaged files: it is raised as an error too, or the file can be used."""
+    for name in ("rasterio", "tifffile"):
+        logging.getLogger(name).setLevel(logging.CRITICAL)
+
+
 def follow_parent() -> None:
     """In a worker process: ignore SIGINT, and end when the parent process ends."""
+    silence_libraries()
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     parent = parent_process()
     if parent is None:

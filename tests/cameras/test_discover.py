@@ -128,6 +128,22 @@ def test_quick_looks_among_tiffs_take_no_part(tmp_path: Path) -> None:
     assert (result.problems, result.eight_bit) == ((), ())
 
 
+def test_a_picture_of_a_band_without_a_tiff_takes_part(tmp_path: Path) -> None:
+    write_all(tmp_path, "a_red", "a_green")
+    for name in ("a_red.jpg", "a_nir.png", "b_red.png", "b_nir.jpg"):
+        write_picture(tmp_path / name)
+    assert found(tmp_path) == {"a": ["green", "nir", "red"], "b": ["nir", "red"]}
+
+
+def test_images_that_cannot_be_read_are_problems_but_for_photographs(tmp_path: Path) -> None:
+    write_all(tmp_path, "a_red", "a_nir")
+    for name in ("b_red.png", "c_nir.jpg", "d_red.jp2", "photo_1.jpg", "chart.png"):
+        (tmp_path / name).write_bytes(b"damaged")
+    problems = {p.path.name: p.text for p in discover(tmp_path).problems}
+    assert sorted(problems) == ["b_red.png", "c_nir.jpg", "d_red.jp2"]
+    assert "convert it to TIFF" in problems["d_red.jp2"]
+
+
 def test_a_multiband_file_is_a_capture(tmp_path: Path) -> None:
     write(tmp_path / "stack.tif", bands=4)
     (capture,) = discover(tmp_path).captures

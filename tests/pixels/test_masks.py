@@ -17,6 +17,7 @@ def test_data_mask() -> None:
     assert data_mask(np.array([[0, 5]], np.uint8), 0).tolist() == [[False, True]]
     assert data_mask(np.array([[0, 5]], np.uint8), None).all()
     assert data_mask(np.array([[1.0, np.nan]]), float("nan")).tolist() == [[True, False]]
+    assert data_mask(np.array([[2**62, -(2**63), -9999, 7]]), None).tolist() == [[False, False, False, True]]
 
 
 def test_only_constant_areas_at_the_border_are_fill() -> None:

@@ -11,7 +11,7 @@ from agalign.errors import GeometryError
 from agalign.pixels.raster import crs_code, open_raster, probe, read_for_alignment, transformed
 from agalign.values.capture import Band
 
-from ..conftest import textured_image
+from ..conftest import textured_image, write_band
 
 pytestmark = pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
 
@@ -29,6 +29,17 @@ def test_a_photograph_is_reduced_by_averaging(tmp_path: Path) -> None:
     # GDAL averages images with a mask; it uses the reductions of the JPEG decoder, which differ slightly.
     masked = read_for_alignment(replace(band, has_mask=True), 320)
     assert np.abs(half.pixels - masked.pixels).mean() < 1.5
+
+
+@pytest.mark.parametrize("dtype", ["uint8", "int8", "uint16", "int16", "uint32", "int32", "uint64", "int64", "float64"])
+def test_images_of_each_type_are_reduced(tmp_path: Path, dtype: str) -> None:
+    pixels = np.full((48, 64), 100, dtype)
+    pixels[:, ::2] = 50
+    write_band(tmp_path / "a.tif", pixels)
+    (band,) = probe(tmp_path / "a.tif")
+    half = read_for_alignment(band, 32)
+    assert half.valid.all()
+    np.testing.assert_allclose(half.pixels, 75, atol=1)
 
 
 def test_codes_of_coordinate_systems() -> None:

@@ -51,6 +51,8 @@ def test_a_formula_has_the_value_of_its_arithmetic() -> None:
     assert value[0, 0] == pytest.approx(-(0.4**2) / 0.6 + 3, rel=1e-6)
     assert not np.isfinite(value[0, 1:]).any()
     assert np.isinf(evaluate("9**9**9 + 0*N", {"N": n})).all(), "and takes no time"
+    golden_ratio = evaluate("1/(1+" * 40 + "N" + ")" * 40, {"N": n})
+    np.testing.assert_allclose(golden_ratio[0, ::2], (5**0.5 - 1) / 2, rtol=1e-6)
 
 
 @pytest.mark.parametrize(

@@ -1,5 +1,6 @@
 """What the workers of test_process_pool.py do: it loads no library that takes time."""
 
+import logging
 import os
 import pickle
 import signal
@@ -33,6 +34,10 @@ def size(data: bytes) -> int:
 
 def zeros(count: int) -> bytes:
     return bytes(count)
+
+
+def log_level(logger: str) -> str:
+    return logging.getLevelName(logging.getLogger(logger).level)
 
 
 def process_id(_: int) -> int:

@@ -19,7 +19,7 @@ import pytest
 from agalign.errors import WorkerError
 from agalign.values import process_pool
 from agalign.values.process_pool import Outcome, ProcessPool
-from agalign.values.processes import ENDS_WITHIN_S, Worker
+from agalign.values.processes import ENDS_WITHIN_S, Worker, follow_parent
 
 from ..builders import in_full_run
 from . import pool_tasks as tasks
@@ -287,6 +287,12 @@ def test_tasks_are_tried_again_if_the_fork_server_is_killed() -> None:
         psutil.Process(worker_processes()[0].ppid()).kill()
         assert all(o.value() == 0.3 for o in outcomes)
         assert time.monotonic() - began < ENDS_WITHIN_S
+
+
+def test_libraries_log_nothing_in_workers() -> None:
+    with pool(tasks.log_level, 1, initializer=follow_parent) as workers:
+        levels = [o.value() for o in workers.run(["rasterio", "tifffile"])]
+    assert levels == ["CRITICAL", "CRITICAL"]
 
 
 # ---- ends
