@@ -121,7 +121,7 @@ class RunOptions:
 
     overwrite: bool = False
     """Process finished captures again."""
-    jobs: Annotated[int, Field(ge=0), Option(short="-j", default=0)] = 1
+    jobs: Annotated[int, Field(ge=0, le=4096), Option(short="-j", default=0)] = 1
     """Captures processed at the same time; 0 is one per core."""
     align_panels: bool = False
     """Also align captures of calibration panels and of the sky, and use no panel for reflectance."""
@@ -131,7 +131,7 @@ class RunOptions:
     retry_failed: bool = False
     """Process captures again if a band is not aligned or missing."""
     # An `executor` of the caller ignores it; `dask_executor` has its own.
-    timeout_s: Annotated[float | None, Field(ge=1), Option("timeout")] = None
+    timeout_s: Annotated[float | None, Field(ge=1, le=1e6), Option("timeout")] = None
     """Seconds after which a capture is abandoned; by default unlimited."""
     command: str = ""
     """Command line, for run record and report."""
@@ -226,7 +226,9 @@ class WriteSettings(SettingsModel):
     """Pixel size of the output: that of the reference, or of the finest band."""
     georeference: bool = False
     """Write an approximate georeference from GPS, altitude and yaw; a tag has its expected error."""
-    ground_elevation_m: Annotated[float | None, Option("ground_elevation", show_default=False)] = None
+    ground_elevation_m: Annotated[
+        float | None, Field(ge=-1000, le=9000), Option("ground_elevation", show_default=False)
+    ] = None
     """Elevation of the ground, m, in the height system of the GPS; for footprints, if the tags lack the height above
     ground."""
     statistics: bool = False

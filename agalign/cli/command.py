@@ -195,10 +195,15 @@ def load_config(ctx: typer.Context, path: Path | None) -> Path | None:
         if name not in options:
             near = get_close_matches(name, options, 1)
             raise typer.BadParameter(f"{path}: no option '{key}'" + (f"; did you mean '{near[0]}'?" if near else ""))
-        if isinstance(value, dict) or (isinstance(value, list) and not options[name].multiple):
+        option = options[name]
+        values = value if isinstance(value, list) and option.multiple else [value]
+        if isinstance(value, (dict, list)) and values is not value:
             raise typer.BadParameter(f"{path}: '{key}' takes one value")
-        single = options[name].multiple and not isinstance(value, list)
-        defaults[options[name].name] = [value] if single else value
+        if not all(type(one) in ((bool,) if option.is_flag else (str, int, float)) for one in values):
+            raise typer.BadParameter(
+                f"{path}: '{key}' takes {'true or false' if option.is_flag else 'a text or number'}"
+            )
+        defaults[option.name] = values if option.multiple else value
     ctx.default_map = {**(ctx.default_map or {}), **defaults}
     return path
 
@@ -207,7 +212,7 @@ def _read_toml(path: Path) -> dict[str, Any]:
     import tomllib
 
     try:
-        return tomllib.loads(read_regular(path).decode())
+        return tomllib.loads(read_regular(path).decode("utf-8-sig"))
     except FileNotFoundError:
         raise typer.BadParameter(f"{path} does not exist") from None
     except (OSError, ValueError, RecursionError) as error:

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from agalign.cameras import known_cameras
 from agalign.cameras.read_files import ImageFile, natural_order, read_file
 from agalign.config import DiscoverOptions
-from agalign.errors import ConfigurationError, InputError, OutputError
+from agalign.errors import ConfigurationError, InputError, OutputError, SidecarError
 from agalign.products.run_record import read_run_record
 from agalign.products.sidecar import BandPart, Sidecar
 from agalign.products.sidecar_file import read_sidecar, run_sidecars
@@ -242,7 +242,9 @@ def write_micasense(
     by_camera: dict[str, list[NDArray[np.float64]]] = defaultdict(list)
     for capture in captures:
         images = [_original(folder / capture.folder / band.file) for band in capture.bands]
-        reference = next(i for i, b in zip(images, capture.bands, strict=True) if b.status == "reference")
+        reference = next((i for i, b in zip(images, capture.bands, strict=True) if b.status == "reference"), None)
+        if reference is None:
+            raise SidecarError(f"{capture.path}: has no reference band; run again with --overwrite")
         results = [_in_notebook_px(band, reference, image) for band, image in zip(capture.bands, images, strict=True)]
         rows += capture.rows([error_px for _, error_px in results])
         stacked = np.stack([matrix for matrix, _ in results])

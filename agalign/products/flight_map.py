@@ -84,7 +84,7 @@ def link_indices(out: Path, rows: Iterable[IndexRow]) -> None:
 def features_in(out: Path) -> list[dict[str, Any]]:
     """The features of OUT/flight.geojson; none if there is no such file, or if a run did not write it."""
     try:
-        features = from_json(read_regular(out / FLIGHT_MAP_FILE))["features"]
+        features = from_json(read_regular(out / FLIGHT_MAP_FILE), allow_inf_nan=False)["features"]
         is_of_a_run = all(
             isinstance(f["id"], str)
             and f["id"] == f["properties"]["capture"]

@@ -1,6 +1,7 @@
 """The captures of a run on the ground plane: their footprints in OUT/flight.geojson, with the lens of the reference."""
 
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -21,6 +22,8 @@ from agalign.values.lens import Lens
 from agalign.values.pixel_units import PixelScale, Size
 
 _WGS84 = "EPSG:4326"
+_MAX_LENGTH_M = 1e5
+"""Of a height above the ground and of its error: no aircraft with a camera is higher."""
 
 
 @dataclass(frozen=True)
@@ -72,15 +75,19 @@ class PlacedFlight:
     left_out: list[tuple[str, str]]
     """(label of a capture, reason)."""
 
-    def add(self, out: Path, feature: dict[str, Any]) -> None:
-        """Place the capture of a feature of the flight map, or leave it out."""
+    def add(self, label: str, path: Path, feature: dict[str, Any]) -> None:
+        """Place the capture of a sidecar by its entry in the flight map, or leave it out."""
         try:
-            one = _placed(out, feature, self.origin_m, self.crs_wkt)
+            one = _placed(label, path, feature, self.origin_m, self.crs_wkt)
             if [b.name for b in one.bands] != [b.name for b in (self.captures or [one])[0].bands]:
                 raise InputError(f"it has other bands than {self.captures[0].label}")
+            if not np.isfinite([*one.outline_m.ravel(), *one.camera_m]).all() or not one.gsd_m > 0:
+                raise InputError("its place on the ground is not finite; run again with --overwrite")
             self.captures.append(one)
-        except (AgalignError, KeyError, TypeError, ValueError) as error:
-            self.left_out.append((feature["capture"], str(error)))
+        except AgalignError as error:
+            self.left_out.append((label, str(error)))
+        except (LookupError, TypeError, ValueError, ArithmeticError):
+            self.left_out.append((label, f"its entry in {FLIGHT_MAP_FILE} is damaged; run again with --overwrite"))
 
 
 def place_captures(out: Path) -> PlacedFlight:
@@ -88,29 +95,37 @@ def place_captures(out: Path) -> PlacedFlight:
 
     Raises InputError if `out` has no sidecars, or if no capture can be placed.
     """
-    run_sidecars(out)
-    features = [f["properties"] | {"geometry": f.get("geometry")} for f in features_in(out)]
-    shown = [f for f in features if f.get("sidecar") and (f["geometry"] or {}).get("type") == "Polygon"]
+    sidecars = {path.relative_to(out).with_suffix("").as_posix(): path for path in run_sidecars(out)}
+    features = {str(f["properties"].get("sidecar")): f for f in features_in(out)}
+    entries = {label: features.get(f"{label}.json", {}) for label in sidecars}
+    shown = {label: ring for label, entry in entries.items() if (ring := _ring(entry)) is not None}
     if not shown:
         raise InputError(
             f"{out}: no capture can be placed, because {FLIGHT_MAP_FILE} has no footprints; they need position, "
             "altitude, yaw and focal length in the tags: align the files as the camera wrote them"
         )
-    corner = np.array(shown[0]["geometry"]["coordinates"][0][:1], np.float64)
+    corner = next(iter(shown.values()))[:1]
     crs = utm_wkt(*corner[0].tolist())
     origin_m = transformed(corner, _WGS84, crs)[0]
-    left_out = [(f["capture"], "it has no footprint") for f in features if f.get("sidecar") and f not in shown]
+    left_out = [(label, f"it has no footprint in {FLIGHT_MAP_FILE}") for label in sidecars if label not in shown]
     flight = PlacedFlight([], origin_m, crs, left_out)
-    for feature in shown:
-        flight.add(out, feature)
+    for label, ring in shown.items():
+        flight.add(label, sidecars[label], entries[label]["properties"] | {"ring": ring})
     if not flight.captures:
         raise InputError(f"{out}: no capture can be used; {left_out[0][0]}: {left_out[0][1]}")
     return flight
 
 
-def _placed(out: Path, feature: dict[str, Any], origin_m: Points, crs: str) -> Placement:
+def _ring(feature: dict[str, Any]) -> Points | None:
+    """The footprint of a feature: (5, 2) of longitude and latitude, closed, counter-clockwise; None without one."""
+    with suppress(LookupError, TypeError, ValueError):
+        ring = np.array(feature["geometry"]["coordinates"][0], np.float64)
+        return ring if ring.shape == (5, 2) and (abs(ring) <= (180.0, 90.0)).all() else None
+    return None
+
+
+def _placed(label: str, path: Path, feature: dict[str, Any], origin_m: Points, crs: str) -> Placement:
     """The placement by a feature's properties. Raises AgalignError, and KeyError or others for a damaged map."""
-    path = out / feature["sidecar"]
     sidecar = read_sidecar(path)
     bands = bands_of(sidecar, path.parent)
     problems = [b.problem for b in bands if b.problem]
@@ -118,17 +133,16 @@ def _placed(out: Path, feature: dict[str, Any], origin_m: Points, crs: str) -> P
         raise InputError("; ".join(problems) or "it has no aligned bands")
     grid = OutputGrid(*sidecar.output.crop, PixelScale(*sidecar.output.scale), sidecar.output.undistorted)
     # From counter-clockwise to the order of `geometry.corners`.
-    ring = np.array(feature["geometry"]["coordinates"][0], np.float64)[[0, 3, 2, 1]]
-    corners_m = transformed(ring, _WGS84, crs) - origin_m
+    corners_m = transformed(feature["ring"][[0, 3, 2, 1]], _WGS84, crs) - origin_m
     edge_px = geometry.corners(grid.width + 1, grid.height + 1) - 0.5
-    height_m, accuracy_m = feature["height_m"], feature["accuracy_m"]
+    height_m, accuracy_m = (_positive(feature[name]) for name in ("height_m", "accuracy_m"))
     camera_m = corners_m.mean(axis=0)
     if height_m is not None:
         camera_m = transformed(np.array([[feature["longitude"], feature["latitude"]]]), _WGS84, crs)[0] - origin_m
     position_m, height, heading, tilt = pose_errors(height_m, feature["height_from"])
-    reference = next(b for b in bands if b.name == sidecar.reference.band)
+    reference = bands[[b.name for b in bands].index(sidecar.reference.band)]
     return Placement(
-        feature["capture"],
+        label,
         bands,
         reference,
         (grid.width, grid.height),
@@ -137,9 +151,16 @@ def _placed(out: Path, feature: dict[str, Any], origin_m: Points, crs: str) -> P
         camera_m,
         height_m,
         feature["height_from"] == "assumed",
-        position_m if accuracy_m is None else float(accuracy_m),
+        position_m if accuracy_m is None else accuracy_m,
         (position_m, position_m, height, heading, tilt, tilt),
     )
+
+
+def _positive(value: Any) -> float | None:
+    """A length, m, or None. Raises ValueError for others than a drone's."""
+    if value is not None and not 0 < float(value) < _MAX_LENGTH_M:
+        raise ValueError(value)
+    return None if value is None else float(value)
 
 
 def _lens_of_output(sidecar: Sidecar, grid: OutputGrid) -> Lens | None:

@@ -7,10 +7,10 @@ the reference to a pixel of the moving band; `grid` samples the complete mapping
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, Self, TypeVar
 
 import numpy as np
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, GetCoreSchemaHandler
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, GetCoreSchemaHandler, model_validator
 from pydantic_core import CoreSchema, core_schema
 
 from agalign.config import CheckSettings
@@ -23,8 +23,10 @@ from agalign.values.pixel_units import PixelScale
 from agalign.verify.checks import KINDS
 
 SCHEMA = "agalign/1"
-Row = tuple[float, float, float]
-PointPx = tuple[float, float]
+Number = Annotated[float, Field(ge=-1e30, le=1e30)]
+"""Sums and squares of such numbers are finite."""
+Row = tuple[Number, Number, Number]
+PointPx = tuple[Number, Number]
 Count = Annotated[int, Field(gt=0)]
 
 
@@ -57,9 +59,9 @@ def _from_array(positions_px: object) -> object:
 
 Matrix3x3 = Annotated[tuple[Row, Row, Row], _FromProgram(lambda matrix: np.asarray(matrix).tolist())]
 PointsPx = Annotated[list[PointPx], _FromProgram(_from_array)]
-Finite = Annotated[float | None, _measured()]
-Fraction4 = Annotated[float | None, _measured(4)]
-Fraction6 = Annotated[float | None, _measured(6)]
+Finite = Annotated[Number | None, _measured()]
+Fraction4 = Annotated[Number | None, _measured(4)]
+Fraction6 = Annotated[Number | None, _measured(6)]
 """Digits beyond the sixth depend on the order in which threads add up."""
 
 
@@ -75,12 +77,23 @@ it lists.
 """
 
 
+Part = TypeVar("Part", bound="_Part")
+
+
 class _Part(BaseModel):
     """Validated from the JSON of a sidecar, or from the program's record with attributes of these names."""
 
     model_config = ConfigDict(
         extra="forbid", allow_inf_nan=False, populate_by_name=True, use_attribute_docstrings=True, from_attributes=True
     )
+
+
+def _with_equal_lengths(part: Part, *lists: Sequence[PointPx]) -> Part:
+    """Return the part. Raises ValueError for lists of points that are empty or of different lengths."""
+    lengths = {len(one) for one in lists}
+    if len(lengths) != 1 or 0 in lengths:
+        raise ValueError("its lists of points are empty or of different lengths")
+    return part
 
 
 class _Result(_Part):
@@ -108,11 +121,11 @@ class CameraPart(_Part):
 class PositionPart(_Part):
     """GPS position of the reference band."""
 
-    latitude: float
+    latitude: Number
     """Degrees, WGS 84."""
-    longitude: float
+    longitude: Number
     """Degrees, WGS 84."""
-    altitude_m: float | None
+    altitude_m: Number | None
     """Altitude in the tags, m."""
 
 
@@ -156,34 +169,38 @@ class SeedPart(_Part):
     """
     fixed_to_moving: Matrix3x3
     """As in `homography`."""
-    peak_sigma: float
+    peak_sigma: Number
     """Height of its correlation peak, in standard deviations."""
-    runner_up_sigma: float
+    runner_up_sigma: Number
     """The same for the second highest peak."""
 
 
 class LensPart(_Part):
     """Lens model of a camera, Brown-Conrady in OpenCV's convention, raw pixels of the file."""
 
-    fx_px: float
+    fx_px: Number
     """Focal length along x."""
-    fy_px: float
+    fy_px: Number
     """Focal length along y."""
-    cx_px: float
+    cx_px: Number
     """Optical centre, x."""
-    cy_px: float
+    cy_px: Number
     """Optical centre, y."""
-    distortion: tuple[float, ...]
+    distortion: tuple[Number, ...]
     """k1, k2, p1, p2, k3, k4, k5, k6; omitted ones are 0."""
 
 
 class FieldPart(_Part):
     """Displacement field of the raw pixels of the reference."""
 
-    step_px: float
+    step_px: Annotated[Number, Field(gt=0)]
     """Spacing of the nodes, from the centre of the top-left pixel."""
     displacements_px: Annotated[list[list[PointPx]], _FromProgram(_from_array)]
     """(x, y) by row and column; cubic splines between the nodes."""
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        return _with_equal_lengths(self, *self.displacements_px)
 
 
 class GridPart(_Part):
@@ -196,6 +213,10 @@ class GridPart(_Part):
     """Raw pixels of the reference, row by row."""
     moving_px: PointsPx
     """The corresponding raw pixels of the band."""
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        return _with_equal_lengths(self, self.reference_px, self.moving_px)
 
 
 def _known_kind(code: str) -> str:
@@ -231,13 +252,13 @@ class JointPart(_Part):
     """False if `homography` and `grid` are those of the seed or the prediction."""
     loss: Finite
     """Final loss; null if nothing was learned."""
-    retrieval: float
+    retrieval: Number
     """Share of held-out patches with the true counterpart as nearest descriptor."""
-    chance: float
+    chance: Number
     """Retrieval expected by chance."""
     iterations: int
     """Steps; 0 if nothing was learned."""
-    levels: list[float]
+    levels: list[Number]
     """Scales of the images used; 1 is full resolution."""
     recipe: str
     """`flight` (frozen network of the flight), `fast` (learned on this capture), `paper`, or `windows` (windows
@@ -245,9 +266,9 @@ class JointPart(_Part):
     """
     model_family: ModelFamily
     """Mapping that was fitted."""
-    last_step_px: float
+    last_step_px: Number
     """Movement of a corner in the last step, px."""
-    corner_std_px: Annotated[float, _measured(6)]
+    corner_std_px: Annotated[Number, _measured(6)]
     """Standard error of the least certain corner, px of the reference."""
     corner_std_xy_px: PointsPx
     """Standard errors along x and y at the corners of the reference, clockwise from the top left, px of the reference.
@@ -280,7 +301,7 @@ class SimilarityPart(_Part):
 class ResidualTile(_Part):
     """Shift of a window after alignment."""
 
-    centre_px: tuple[Annotated[float, _measured(2)], Annotated[float, _measured(2)]]
+    centre_px: tuple[Annotated[Number, _measured(2)], Annotated[Number, _measured(2)]]
     """Centre of the window, px of the reference."""
     shift_px: tuple[Fraction4, Fraction4]
     """Shift, px of the reference; null if none could be measured."""
@@ -334,7 +355,7 @@ class ReliefPart(_Part):
     """[Raster](#the-relief-raster) with the parallax."""
     baseline: PointPx
     """Displacement per px of parallax, undistorted px of the reference; the longest baseline has length 1."""
-    occluded: Annotated[float, _measured(4)]
+    occluded: Annotated[Number, _measured(4)]
     """Share of the reference pixels that are occluded in the band."""
     reference_px: PointsPx
     """Nodes: those of `grid`."""
@@ -342,6 +363,10 @@ class ReliefPart(_Part):
     """Where the reference plane maps them, raw px of the moving file."""
     slope: PointsPx
     """Px of the moving file per px of parallax."""
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        return _with_equal_lengths(self, self.reference_px, self.plane_px, self.slope)
 
 
 class PredictionPart(_Part):
@@ -351,7 +376,7 @@ class PredictionPart(_Part):
     """`bands` (other bands of the capture), `neighbours` (other captures), `flight` (mean), or `windows` (a part of the
     image).
     """
-    std_px: Annotated[float, _measured(4)]
+    std_px: Annotated[Number, _measured(4)]
     """Standard error over the image (root mean square), px of the band's own file."""
     off_px: Fraction4
     """Distance of the image's own alignment from the prediction, px of the band's own file."""
@@ -371,7 +396,7 @@ class BandResult(_Result):
 
     band: str
     """Name of the band."""
-    wavelength_nm: float | None
+    wavelength_nm: Number | None
     """Centre wavelength, nm."""
     file: str
     """Image file."""
@@ -397,7 +422,7 @@ class BandResult(_Result):
     """Prediction."""
     place: PlacePart | None = None
     """Where the aligned pixels of the band are."""
-    seconds: Annotated[float, _measured(3)]
+    seconds: Annotated[Number, _measured(3)]
     """Processing time."""
 
 
@@ -451,13 +476,13 @@ class OutputPart(_Part):
     """Files of single bands."""
     radiometry: str | None = None
     """Conversion of raw numbers, such as `reflectance by panel and light sensor`."""
-    panel_age_s: float | None = None
+    panel_age_s: Number | None = None
     """Time between the capture and the nearest panel, if one was used."""
     illumination: list[IlluminationPart] = []
     """Bands that were converted to reflectance."""
-    crop: tuple[int, int, int, int]
+    crop: tuple[int, int, Count, Count]
     """x0, y0, width, height on the reference grid times `scale`."""
-    scale: tuple[float, float] = (1.0, 1.0)
+    scale: tuple[Annotated[Number, Field(gt=0)], Annotated[Number, Field(gt=0)]] = (1.0, 1.0)
     """Output pixels per reference pixel along x and y."""
     undistorted: bool = False
     """True for the lens-corrected grid of the reference."""
@@ -489,9 +514,9 @@ class ProductPart(_Part):
 class ReliefPreviewPart(_Part):
     """Picture of the parallax: first column, last row."""
 
-    parallax_px: tuple[float, float]
+    parallax_px: tuple[Number, Number]
     """Parallax shown as black and as white (nearest), px."""
-    range_m: tuple[float, float] | None
+    range_m: tuple[Number, Number] | None
     """1st and 99th percentile of the range, m; null if unknown."""
 
 
@@ -506,9 +531,9 @@ class PreviewPart(_Part):
     """Width and height of a whole picture."""
     detail_px: tuple[Count, Count]
     """Width and height of a detail."""
-    detail: tuple[float, float, float, float]
+    detail: tuple[Number, Number, Number, Number]
     """x0, y0, width, height of the detail, as shares of the image."""
-    error_full_px: float | None = None
+    error_full_px: Number | None = None
     """Expected error shown as white, px."""
     relief: ReliefPreviewPart | None = None
     """Picture of the relief."""
@@ -541,13 +566,13 @@ class CaptureResult(_Result):
     """Bands that only other captures have."""
     reference: ReferencePart
     """Reference band."""
-    bands: Sequence[BandResult]
+    bands: Annotated[Sequence[BandResult], Field(min_length=1)]
     """One entry per band, the reference included."""
     output: OutputPart | None
     """Written rasters; null if all moving bands are `failed`."""
     preview: PreviewPart | None = None
     """Preview image."""
-    accept_predicted_px: float | None = None
+    accept_predicted_px: Number | None = None
     """Standard error up to which indices may use a predicted band, px."""
     products: list[ProductPart] = []
     """All other files of the capture."""
@@ -580,7 +605,7 @@ class Sidecar(CaptureResult):
 
     model_config = ConfigDict(extra="forbid")
 
-    bands: list[BandPart]
+    bands: Annotated[list[BandPart], Field(min_length=1)]
     """One entry per band, the reference included."""
 
     def result(self) -> CaptureResult:

@@ -118,7 +118,7 @@ def _problem(error: ValidationError) -> str:
         value = repr(None if schema["type"] == "missing" else schema["input"])
         quoted = value if len(value) <= _MAX_QUOTED else f"{value[:_MAX_QUOTED]}…"
         return f"schema is {quoted}, not {SCHEMA!r}; run again with --overwrite"
-    return f"{field}: {first['msg']}; run again with --overwrite"
+    return f"{field}: {first['msg'].removeprefix('Value error, ')}; run again with --overwrite"
 
 
 def verify_outputs(out: Path) -> Iterator[tuple[Path, list[str]]]:

@@ -41,8 +41,8 @@ def seen(monkeypatch: pytest.MonkeyPatch) -> Seen:
 def test_a_file_sets_options_and_the_command_line_comes_first(tmp_path: Path, seen: Seen) -> None:
     config = tmp_path / "agalign.toml"
     config.write_text(
-        'radiometry = "sun"\nerror-map = true\naccept_predicted = 0.5\nindex = "ndvi,NDRE"\nexclude = ["*a*", "*b*"]\n'
-        'include = "*c*"\nrng-seed = 3\n'
+        '\ufeffradiometry = "sun"\nerror-map = true\naccept_predicted = 0.5\nindex = "ndvi,NDRE"\n'
+        'exclude = ["*a*", "*b*"]\ninclude = "*c*"\nrng-seed = 3\n'
     )
     done = agalign_here("align", "x", "--config", config, "--rng-seed", "4")
     assert done.returncode == 0, done.stderr
@@ -61,6 +61,16 @@ def test_a_file_sets_options_and_the_command_line_comes_first(tmp_path: Path, se
         ('crop = "round"', "'round' is unknown; choose from flight"),
         ("[align]\njobs = 1", "no option 'align'"),
         ("jobs = [1, 2]", "'jobs' takes one value"),
+        ("jobs = {a = 1}", "'jobs' takes one value"),
+        ("jobs = true", "'jobs' takes a text or number"),
+        ("exclude = [true]", "'exclude' takes a text or number"),
+        ("out = 1979-05-27", "'out' takes a text or number"),
+        ("stac = ''", "'stac' takes true or false"),
+        ("timeout = inf", "--timeout: "),
+        ("ground-elevation = nan", "--ground-elevation: "),
+        (f"jobs = {2**63}", "--jobs: "),
+        ("x = " + "[" * 9999 + "]" * 9999, "cannot be read as TOML"),
+        ("x = " + "9" * 9999, "cannot be read as TOML"),
         ('jobs = "many"', "--jobs: give a whole number"),
         ("dry-run = true", "no option 'dry-run'"),
         (None, "agalign.toml does not exist"),

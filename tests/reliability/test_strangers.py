@@ -1,8 +1,11 @@
 """Folders, options and tags from strangers: each fault is one line with the file, and nothing is lost silently."""
 
+import json
 import os
 import re
 from collections.abc import Callable
+from functools import reduce
+from operator import getitem
 from pathlib import Path
 
 import pytest
@@ -14,9 +17,10 @@ from agalign.products.flight_map import FLIGHT_MAP_FILE, features_in
 from agalign.products.index_table import INDICES_FILE, read_table
 from agalign.products.panels import PANELS_FILE, SKY_FILE, read_panels, read_sky
 from agalign.products.run_record import read_run_record
+from agalign.products.sidecar_file import find_sidecars, read_sidecar
 from agalign.values.files import RUN_FILE
 
-from ..conftest import raising, seeded
+from ..conftest import raising, read_json, seeded
 from ..program import agalign_here
 
 
@@ -48,6 +52,33 @@ def test_options_that_are_not_a_regular_file_are_an_error(tmp_path: Path, irregu
     done = agalign_here("align", "x", "--config", tmp_path / "a.toml")
     assert done.returncode == 2
     assert "a.toml cannot be read as TOML (it is not a regular file)" in done.stderr
+
+
+@pytest.mark.parametrize(
+    ("field", "value", "said"),
+    [
+        ("bands.0.grid.reference_px", [], "bands.0.grid: its lists of points are empty or of different lengths"),
+        ("bands.0.grid.moving_px", [[0, 0]], "bands.0.grid: its lists of points are empty or of different lengths"),
+        ("bands.0.seconds", 1e308, "bands.0.seconds: Input should be less than or equal to 1"),
+        ("bands.0.metrics.tiles.0.shift_px.0", -1e200, "shift_px.0: Input should be greater than or equal to -1"),
+        ("bands", [], "bands: List should have at least 1 item"),
+        ("output.crop", [0, 0, 0, 9], "output.crop.2: Input should be greater than 0"),
+        ("output.scale", [0, 1], "output.scale.0: Input should be greater than 0"),
+    ],
+)
+def test_values_of_a_sidecar_that_no_run_writes_are_an_error(
+    aligned_flight: Path, tmp_path: Path, field: str, value: object, said: str
+) -> None:
+    """Commands that calculate with them would fail."""
+    content = read_json(find_sidecars(aligned_flight)[0])
+    *parents, last = (int(part) if part.isdigit() else part for part in field.split("."))
+    reduce(getitem, parents, content)[last] = value
+    (tmp_path / "a.json").write_text(json.dumps(content))
+    with pytest.raises(SidecarError, match=re.escape(said)):
+        read_sidecar(tmp_path / "a.json")
+    done = agalign_here("report", tmp_path)
+    assert done.returncode == 3
+    assert said in done.stderr
 
 
 @pytest.mark.parametrize("error", [ImportError("libx.so"), AssertionError("x"), StopIteration(), EOFError("x")])
