@@ -459,9 +459,9 @@ class IlluminationPart(_Part):
 
     band: str
     """Its name."""
-    irradiance: float | None = None
+    irradiance: Number | None = None
     """Light on a horizontal plane by the light sensor, W / m^2 / nm (DJI: relative)."""
-    reflectance_per_radiance: float
+    reflectance_per_radiance: Number
     """Factor by which radiance was multiplied."""
 
 
