@@ -144,10 +144,10 @@ def write_rasters(
                 if earlier is not None:
                     reports.append(IndexReport(label, index.name, target, earlier, kept=True))
                     continue
+                if target.resolve() in {band.file.resolve() for band in bands}:
+                    raise InputError(f"{target}: is the file of a band; give the formula '{index.name}' another name")
                 unit = common_unit(index, chosen, reader)
-                for band in chosen:
-                    if band.quality is not None:
-                        reader.file(*band.quality[:2])
+                _check_sizes(chosen, reader)
             except InputError as error:
                 reports.append(IndexReport(label, index.name, problem=str(error)))
                 continue
@@ -211,6 +211,16 @@ def common_unit(index: Index, bands: Sequence[IndexBand], reader: BandReader) ->
     if not index.any_unit and unit != "reflectance":
         raise InputError(f"{index.name} needs reflectance, and the bands are {unit}; align with --radiometry")
     return unit
+
+
+def _check_sizes(bands: Sequence[IndexBand], reader: BandReader) -> None:
+    """Raise InputError if files of bands or their quality flags, which are opened here, differ in size."""
+    files = [(band.file, band.band_index) for band in bands]
+    files += [band.quality[:2] for band in bands if band.quality is not None]
+    expected = reader.file(*files[0]).shape
+    for path, layer in files:
+        if reader.file(path, layer).shape != expected:
+            raise InputError(f"{path}: differs in size from {files[0][0].name}; run again")
 
 
 def _write(

@@ -10,7 +10,8 @@ from synthetic_flights.aligned import make_aligned
 
 from agalign.batch.index_run import index_tasks, run_indices, unit_of_run
 from agalign.errors import ConfigurationError, InputError
-from agalign.products.index_bands import RAW
+from agalign.products.index_bands import RAW, IndexBand
+from agalign.products.index_rasters import write_rasters
 from agalign.products.index_table import IndexReport, IndexRow, IndexStatistics, read_table, update_table
 from agalign.products.indices import (
     INDICES,
@@ -25,6 +26,8 @@ from agalign.products.indices import (
 from agalign.products.report import write_pages
 from agalign.products.sidecar import ProductPart
 from agalign.products.sidecar_file import read_sidecar, verify_outputs, write_sidecar
+
+from ..conftest import write_band
 
 NDVI, NDRE = INDICES["ndvi"], INDICES["ndre"]
 
@@ -165,6 +168,21 @@ def test_one_damaged_stack_costs_only_its_own_indices(tmp_path: Path) -> None:
     bad, good = run(tmp_path)
     assert "IMG_0001.tif" in bad.problem
     assert good.path is not None
+
+
+@pytest.mark.parametrize(("name", "problem"), [("green", "file of a band"), ("mine", "differs in size")])
+def test_an_index_neither_replaces_a_band_nor_reads_one_of_another_size(
+    tmp_path: Path, name: str, problem: str
+) -> None:
+    bands = []
+    for band, size_px in (("green", (160, 120)), ("red", (320, 240))):
+        path = tmp_path / f"a_{band}.tif"
+        write_band(path, np.full(size_px[::-1], 0.1, np.float32))
+        bands.append(IndexBand(band, None, path, 1))
+    (report,) = write_rasters(bands, [index_of_formula(f"{name}=(G-R)/(G+R)")], tmp_path / "a", "a")
+    assert report.path is None
+    assert problem in report.problem
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["a_green.tif", "a_red.tif"]
 
 
 @pytest.mark.slow
