@@ -27,34 +27,36 @@ SPELT = {
 }
 """Names of licences in classifiers, in short."""
 NOT_PERMISSIVE = re.compile(r"GPL|General Public|MPL|Mozilla|EUPL|Proprietary|Commercial")
-COLUMNS = "| library | versions | licence | for |\n| --- | --- | --- | --- |\n"
+HEAD = "| licence | every run | extras |\n| --- | --- | --- |\n"
 
 
 def main() -> None:
     """Write the table, or check it."""
-    wanted = requirements()
+    needed = requirements()
     before, rest = PAGE.read_text(encoding="utf-8").split(BEGIN)
-    stands, after = rest.split(END)
+    table, after = rest.split(END)
     if "--check" in sys.argv[1:]:
-        problems = check(wanted, stands)
-        print("\n".join(problems) or f"licences: {len(wanted)} libraries, as docs/licences.md says")
+        problems = check(needed, table)
+        print("\n".join(problems) or f"licences: {len(needed)} libraries, as in docs/licences.md")
         sys.exit(1 if problems else 0)
-    rows = [f"| {name} | {versions} | {licence(name)} | {groups} |\n" for name, (versions, groups) in wanted.items()]
-    PAGE.write_text(f"{before}{BEGIN}{COLUMNS}{''.join(rows)}{END}{after}", encoding="utf-8", newline="\n")
+    columns: dict[str, tuple[list[str], list[str]]] = {}
+    for name, is_extra in needed.items():
+        columns.setdefault(licence(name), ([], []))[is_extra].append(name)
+    rows = [
+        f"| {text} | {', '.join(every_run)} | {', '.join(extras)} |\n"
+        for text, (every_run, extras) in sorted(columns.items())
+    ]
+    PAGE.write_text(f"{before}{BEGIN}{HEAD}{''.join(rows)}{END}{after}", encoding="utf-8", newline="\n")
 
 
-def requirements() -> dict[str, tuple[str, str]]:
-    """Return {library: (versions, purpose)} from pyproject.toml."""
+def requirements() -> dict[str, bool]:
+    """Return the libraries in pyproject.toml, and whether only extras need them."""
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
-    versions: dict[str, str] = {}
-    groups: dict[str, list[str]] = {}
-    for group, texts in {"every run": project["dependencies"], **project["optional-dependencies"]}.items():
-        for one in map(Requirement, texts):
-            # Extras may require different versions: the table has the first.
-            versions.setdefault(one.name.lower(), str(one.specifier))
-            groups.setdefault(one.name.lower(), []).append(group if group == "every run" else f"`{group}`")
-    names = sorted(versions, key=lambda name: ("every run" not in groups[name], name))
-    return {name: (versions[name], ", ".join(groups[name])) for name in names}
+    extras = [text for texts in project["optional-dependencies"].values() for text in texts]
+    every_run, of_extras = (
+        {Requirement(text).name.lower() for text in texts} for texts in (project["dependencies"], extras)
+    )
+    return {name: name not in every_run for name in sorted(every_run | of_extras)}
 
 
 def licence(name: str) -> str:
@@ -64,26 +66,28 @@ def licence(name: str) -> str:
     facts = distribution(name).metadata
     classifiers = [c.rpartition(" :: ")[2] for c in facts.get_all("Classifier", []) if c.startswith("License ::")]
     short = " and ".join(SPELT.get(c, c) for c in classifiers)
-    return facts.get("License-Expression") or short or (facts.get("License") or "not said").strip().splitlines()[0]
+    return facts.get("License-Expression") or short or (facts.get("License") or "unknown").strip().splitlines()[0]
 
 
-def check(wanted: dict[str, tuple[str, str]], table: str) -> list[str]:
-    """Return the libraries that the table lacks or lists with another licence."""
-    listed = {row.split(" | ")[0].removeprefix("| "): row for row in table.splitlines()[2:]}
-    problems = [f"docs/licences.md lacks {name}: python tools/licences.py" for name in wanted if name not in listed]
-    problems += [f"docs/licences.md has {name}, which nothing needs" for name in listed if name not in wanted]
-    for name, (versions, groups) in wanted.items():
-        row = listed.get(name, "")
-        if row and not (row.startswith(f"| {name} | {versions} |") and row.endswith(f"| {groups} |")):
-            problems.append(f"docs/licences.md says otherwise of {name}: python tools/licences.py")
+def check(needed: dict[str, bool], table: str) -> list[str]:
+    """Return the libraries that the table lacks or has in a wrong column, and those with other licences."""
+    listed: dict[str, bool] = {}
+    for row in table.splitlines()[2:]:
+        _, every_run, extras = row.strip("|").split("|")
+        listed |= {
+            name: is_extra for is_extra, cell in enumerate((every_run, extras)) for name in re.findall(r"[\w.-]+", cell)
+        }
+    problems = [
+        f"docs/licences.md: {name}: run python tools/licences.py" for name, _ in needed.items() ^ listed.items()
+    ]
     page = PAGE.read_text(encoding="utf-8").lower()
     for result in sorted({d.name.lower() for d in distributions()}):
         try:
-            said = licence(result)
+            text = licence(result)
         except PackageNotFoundError:
             continue
-        if NOT_PERMISSIVE.search(said) and result not in page:
-            problems.append(f"{result} is under {said}: add it to docs/licences.md")
+        if NOT_PERMISSIVE.search(text) and result not in page:
+            problems.append(f"{result} is under {text}: add it to docs/licences.md")
     return problems
 
 
