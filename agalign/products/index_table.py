@@ -139,8 +139,9 @@ def read_table(out: Path) -> list[IndexRow]:
     """Return the rows of OUT/indices.csv whose rasters still exist; empty if there is no table."""
     try:
         text = read_regular(out / INDICES_FILE).decode()
+        # Lines may have too few or too many cells.
         rows = [_row(line) for line in csv.DictReader(io.StringIO(text))]
-    except (OSError, ValueError, KeyError, TypeError, AttributeError):  # lines with too few or too many cells
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, csv.Error):
         return []
     return [row for row in rows if not row.file or (out / row.file).is_file()]
 
@@ -151,7 +152,7 @@ def write_table(out: Path, rows: Iterable[IndexRow]) -> None:
     of_index = "index", "median", "p5", "p95", "valid_share", "masked_share", "input", "low", "high", "file", "problem"
     columns, in_order = of_capture + of_index, sorted(rows, key=lambda row: row.key)
     cells = [vars(row) | row.statistics.as_json() | {"input": row.statistics.unit} for row in in_order]
-    write_csv(out / INDICES_FILE, columns, ([without_formula(one[name]) for name in columns] for one in cells))
+    write_csv(out / INDICES_FILE, columns, ([one[name] for name in columns] for one in cells))
 
 
 def update_table(out: Path, rows: Sequence[IndexRow]) -> list[IndexRow]:

@@ -16,7 +16,6 @@ from agalign.products.sidecar_file import read_result, run_sidecars
 from agalign.products.text_files import write_csv
 from agalign.values.files import complete_file
 from agalign.values.image import FloatImage, Tile
-from agalign.values.text import without_formula
 
 if TYPE_CHECKING:
     from geopandas import GeoDataFrame, GeoSeries
@@ -79,7 +78,7 @@ def plot_statistics(
     polygons = _polygons(geopandas, Path(plots), id_column)
     rows: list[dict[str, Any]] = []
     problems: list[tuple[str, str]] = []
-    for source in [source for raster in rasters for source in _sources(Path(raster))]:
+    for source in [source for raster in rasters for source in _sources(Path(raster), problems)]:
         try:
             rows += _rows(source, polygons, chosen, problems)
         except AgalignError as error:
@@ -99,7 +98,7 @@ def write_plots(table: "GeoDataFrame", path: Path) -> None:
     check_table(path)
     if path.suffix == ".csv":
         columns = [name for name in table.columns if name != "geometry"]
-        cells = (["" if v is None or v != v else without_formula(v) for v in row] for row in table[columns].values)
+        cells = (["" if v is None or v != v else v for v in row] for row in table[columns].values)
         write_csv(path, columns, cells)
         return
     with complete_file(path) as partial:
@@ -148,16 +147,20 @@ def _read_vectors(geopandas: Any, path: Path) -> Any:
     return frame
 
 
-def _sources(path: Path) -> Iterator[_Source]:
-    """The captures of a run, or a raster. Raises InputError."""
+def _sources(path: Path, problems: list[tuple[str, str]]) -> Iterator[_Source]:
+    """The captures of a run, or a raster. Captures without aligned bands are added to the problems.
+
+    Raises InputError.
+    """
     if not path.is_dir():
         bands = [IndexBand(b.name or f"band {b.band_index}", b.wavelength_nm, path, b.band_index) for b in probe(path)]
         yield _Source(path.stem, "", bands, path.with_suffix(".error.tif"))
         return
     for sidecar_path in run_sidecars(path):
-        sidecar = read_result(sidecar_path)
-        if sidecar.output is not None:
-            label = (sidecar_path.parent.relative_to(path) / sidecar_path.stem).as_posix()
+        sidecar, label = read_result(sidecar_path), sidecar_path.relative_to(path).with_suffix("").as_posix()
+        if sidecar.output is None:
+            problems.append((label, "it has no aligned bands"))
+        else:
             bands = bands_of(sidecar, sidecar_path.parent)
             yield _Source(label, sidecar.captured_at, bands, sidecar_path.with_suffix(".error.tif"))
 

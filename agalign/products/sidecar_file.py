@@ -74,7 +74,7 @@ def find_sidecars(folder: Path) -> list[Path]:
     result = []
     for path in sorted(folder.rglob("*.json")):
         try:
-            if not path.is_file():
+            if path.is_dir():
                 continue
             with open_regular(path) as file:
                 if b'"agalign/' not in file.read(200):  # a sidecar starts with its schema

@@ -12,6 +12,7 @@ from pydantic import BaseModel, ValidationError
 
 from agalign.errors import SidecarError
 from agalign.values.files import read_regular, write_text
+from agalign.values.text import without_formula
 
 Model = TypeVar("Model", bound=BaseModel)
 
@@ -45,9 +46,9 @@ def read_model(path: Path, model: type[Model]) -> Model | None:
 
 
 def write_csv(path: Path, columns: Sequence[str], rows: Iterable[Sequence[object]]) -> None:
-    """Write a table atomically; None becomes an empty cell. Raises OutputError."""
+    """Write a table atomically; None becomes an empty cell, and formulas are quoted. Raises OutputError."""
     table = io.StringIO()
     writer = csv.writer(table, lineterminator="\n")
     writer.writerow(columns)
-    writer.writerows(rows)
+    writer.writerows(map(without_formula, row) for row in rows)
     write_text(path, table.getvalue())

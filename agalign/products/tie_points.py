@@ -86,7 +86,7 @@ def tie_points(band: Band, alignment: Alignment[FixedFilePx]) -> Iterator[TiePoi
 
 def _cells(point: TiePoint) -> list[str]:
     numbers = (*point.reference_px, *point.moving_px, point.residual_px, point.weight)
-    return [escape_controls(point.band), point.status, *(f"{n:.4f}" for n in numbers)]
+    return [point.band, point.status, *(f"{n:.4f}" for n in numbers)]
 
 
 def _geojson(points: Sequence[TiePoint], georeference: Georeference | None) -> str:

@@ -1,6 +1,7 @@
 """Escaping of texts from files for terminals and spreadsheets."""
 
 import unicodedata
+from contextlib import suppress
 
 
 def counted(number: int, what: str) -> str:
@@ -20,8 +21,9 @@ def escape_controls(text: str) -> str:
 
 
 def without_controls(text: str) -> str:
-    """Return the text of a tag without control characters."""
-    return text if text.isprintable() else "".join(c for c in text if unicodedata.category(c) not in ("Cc", "Cs"))
+    """Return the text of a tag without control characters, changes of text direction and ends of lines."""
+    dropped = "Cc", "Cf", "Cs", "Zl", "Zp"
+    return text if text.isprintable() else "".join(c for c in text if unicodedata.category(c) not in dropped)
 
 
 def without_formula(value: object) -> object:
@@ -29,4 +31,7 @@ def without_formula(value: object) -> object:
     if not isinstance(value, str):
         return value
     text = escape_controls(value)
+    with suppress(ValueError):
+        float(text)  # a number may have a sign
+        return text
     return f"'{text}" if text.startswith(("=", "+", "-", "@")) else text

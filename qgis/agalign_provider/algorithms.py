@@ -23,7 +23,7 @@ from qgis.core import (
     QgsProcessingParameterString,
 )
 
-from .command import EXIT_PARTIAL, Command, CommandError, find_executable
+from .command import EXIT_PARTIAL, Command, CommandError, find_executable, sidecars_below
 from .layers import styling
 
 _RADIOMETRY = ("off", "auto", "camera", "sun", "panel")
@@ -286,19 +286,6 @@ class InspectFolder(AgalignAlgorithm):
 def file_of(layer):
     """Return the path of a raster layer's file, without the options of GDAL after a '|'."""
     return layer.source().split("|")[0]
-
-
-def sidecars_below(folder):
-    """Return (path, content) of every sidecar below a folder, sorted."""
-    result = []
-    for path in sorted(folder.rglob("*.json")):
-        try:
-            content = json.loads(path.read_text(encoding="utf-8"))
-        except (OSError, ValueError):
-            continue
-        if isinstance(content, dict) and str(content.get("schema", "")).startswith("agalign/") and "status" in content:
-            result.append((path, content))
-    return result
 
 
 def _line(event):

@@ -62,6 +62,20 @@ def environment():
     return {k: v for k, v in os.environ.items() if k not in _QGIS_VARIABLES}
 
 
+def sidecars_below(folder):
+    """Return (path, content) of every sidecar below a folder, sorted."""
+    result = []
+    for path in sorted(folder.rglob("*.json")):
+        try:
+            # Reading a pipe would block, and deep nesting is a RecursionError.
+            content = json.loads(path.read_text(encoding="utf-8")) if path.is_file() else None
+        except (OSError, ValueError, RecursionError):
+            continue
+        if isinstance(content, dict) and str(content.get("schema", "")).startswith("agalign/") and "status" in content:
+            result.append((path, content))
+    return result
+
+
 class Command:
     """A run of agalign. `is_canceled()` is polled; `on_event(dict)` is called with each line of `--log-json`, and with
     other lines as the event `text`.

@@ -13,6 +13,7 @@ from synthetic_flights.aligned import make_aligned
 
 import agalign
 from agalign.products.plots import write_plots
+from agalign.products.sidecar_file import read_sidecar, write_sidecar
 
 from ..program import agalign_here
 
@@ -182,14 +183,16 @@ def test_what_cannot_be_used_is_one_line(
 
 def test_captures_of_a_run_are_rows_with_their_times(tmp_path: Path) -> None:
     out, outlines = tmp_path / "out", write_outlines(tmp_path / "plots.geojson")
-    make_aligned(out, 2)
-    with pytest.raises(agalign.InputError, match="align with --georeference"):
+    make_aligned(out, 3)
+    failed = read_sidecar(out / "0000SET" / "IMG_0003.json").model_copy(update={"output": None})
+    write_sidecar(out / "0000SET" / "IMG_0003.json", failed)
+    with pytest.raises(agalign.InputError, match=r"align with --georeference|has no aligned bands"):
         agalign.plot_statistics([out], outlines)
     with rasterio.open(out / "0000SET" / "IMG_0002.tif", "r+") as stack:
         stack.crs, stack.transform = CRS, NORTH_UP
         nir, red = stack.read(3).astype(float), stack.read(2).astype(float)
     report = agalign.plot_statistics([out], outlines)
-    assert [label for label, _ in report.problems] == ["0000SET/IMG_0001"]
+    assert sorted(label for label, _ in report.problems) == ["0000SET/IMG_0001", "0000SET/IMG_0003"]
     table = report.table
     assert set(table["capture"]) == {"0000SET/IMG_0002"}
     assert set(table["date"]) == {"2026-06-21T10:00:02"}

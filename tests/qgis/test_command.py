@@ -35,6 +35,13 @@ def script(path: Path, text: str) -> Path:
     return path
 
 
+def test_only_readable_sidecars_are_listed(tmp_path: Path) -> None:
+    (tmp_path / "a.json").write_text('{"schema": "agalign/1", "status": "ok"}')
+    (tmp_path / "b.json").write_text("[" * 100_000)
+    os.mkfifo(tmp_path / "c.json")
+    assert [path.name for path, _ in command.sidecars_below(tmp_path)] == ["a.json"]
+
+
 def test_executable_of_the_setting_or_environment(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     there = script(tmp_path / "venv" / "bin" / "agalign", "")
     assert command.find_executable(str(there)) == str(there)

@@ -18,7 +18,9 @@ from agalign.products.index_table import INDICES_FILE, read_table
 from agalign.products.panels import PANELS_FILE, SKY_FILE, read_panels, read_sky
 from agalign.products.run_record import read_run_record
 from agalign.products.sidecar_file import find_sidecars, read_sidecar
+from agalign.products.text_files import write_csv
 from agalign.values.files import RUN_FILE
+from agalign.values.text import without_controls
 
 from ..conftest import raising, read_json, seeded
 from ..program import agalign_here
@@ -45,6 +47,31 @@ def test_a_table_or_map_that_is_not_a_regular_file_is_empty(tmp_path: Path, irre
     for name, read in ((INDICES_FILE, read_table), (FLIGHT_MAP_FILE, features_in)):
         irregular(tmp_path / name)
         assert read(tmp_path) == []
+
+
+def test_a_sidecar_that_is_a_pipe_is_reported(tmp_path: Path) -> None:
+    """Passing it over would lose its capture without a word."""
+    os.mkfifo(tmp_path / "a.json")
+    done = agalign_here("report", tmp_path)
+    assert done.returncode == 3
+    assert "a.json: cannot be read (it is not a regular file)" in done.stderr
+
+
+def test_no_table_has_a_formula(tmp_path: Path) -> None:
+    write_csv(
+        tmp_path / "a.csv", ("x",), [["=1+1"], ["-1+1"], ["@x"], ["\t=1"], ["-1.5"], [-2.5], [None], ["a\x1b\u202e"]]
+    )
+    expected = ["x", "'=1+1", "'-1+1", "'@x", "\\t=1", "-1.5", "-2.5", '""', "a\\x1b\\u202e"]
+    assert (tmp_path / "a.csv").read_text().splitlines() == expected
+
+
+def test_a_table_with_a_huge_cell_is_empty(tmp_path: Path) -> None:
+    (tmp_path / INDICES_FILE).write_text(f"folder,capture\n{'x' * 200_000},y\n")
+    assert read_table(tmp_path) == []
+
+
+def test_tags_have_no_character_that_changes_other_text() -> None:
+    assert without_controls("Ca\x1b[2Jm\u202e\u2066e\u2028ra\x00 é\u3000") == "Ca[2Jmera é\u3000"
 
 
 def test_options_that_are_not_a_regular_file_are_an_error(tmp_path: Path, irregular: Callable[[Path], None]) -> None:

@@ -26,7 +26,6 @@ from agalign.products.run_record import RunPart, exclusion_lines, read_run_recor
 from agalign.products.sidecar_file import find_sidecars, read_sidecar
 from agalign.products.text_files import write_csv
 from agalign.values.files import write_text
-from agalign.values.text import without_formula
 
 SUMMARY_COLUMNS = ("folder", "capture", *BAND_COLUMNS)
 REPORT_FILE, SUMMARY_FILE = "index.html", "summary.csv"
@@ -100,7 +99,7 @@ def _write_summary(
     all_rows = [*rows]
     all_rows += [row for panel in panels if not panel.in_scene for row in _rows_not_aligned(panel, "panel")]
     all_rows += [row for part in sky for row in _rows_not_aligned(part, "sky")]
-    cells = ([without_formula(row.get(name)) for name in SUMMARY_COLUMNS] for row in all_rows)
+    cells = ([row.get(name) for name in SUMMARY_COLUMNS] for row in all_rows)
     write_csv(path, SUMMARY_COLUMNS, cells)
 
 
