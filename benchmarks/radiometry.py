@@ -1,0 +1,185 @@
+"""Radiance, irradiance and reflectance against the formulas that MicaSense publishes, and between overlapping captures.
+
+python benchmarks/radiometry.py FOLDER
+
+The formulas of github.com/micasense/imageprocessing are written here again: image.py, dls.py, and the tutorials on
+panels and the light sensor. The position of the sun is that of agalign, which a test compares with NREL's example.
+Every capture of a MicaSense camera below FOLDER is used. A panel is compared with the captures of its camera, also
+where agalign does not combine it with the light sensor.
+"""
+
+import itertools
+import math
+from dataclasses import replace
+from datetime import UTC, datetime
+from pathlib import Path
+
+import cv2
+import numpy as np
+from common import print_head, print_row, run
+
+from agalign.cameras.discover import discover
+from agalign.cameras.light_sensor import horizontal_irradiance, sun_position
+from agalign.cameras.metadata import Tags, read_tags
+from agalign.flight import panels
+from agalign.flight.groups import camera_key
+from agalign.pixels.landmarks import landmarks, matched_homography, matches
+from agalign.pixels.radiometry import calibrated, with_radiometry
+from agalign.pixels.raster import read_for_alignment, read_tile
+from agalign.values import geometry
+from agalign.values.capture import Band, Capture
+from agalign.values.image import Tile
+
+CAMERA, DLS, PIX4D = "micasense.com/MicaSense", "micasense.com/DLS", "pix4d.com"
+MIN_TIES, MAX_ERROR_PX = 30, 4.0
+PATCH_PX = 31
+"""Radiance is averaged over squares, because ties are accurate to a pixel."""
+Image = np.ndarray
+
+
+# ---- the published formulas
+
+
+def published_radiance(raw: Image, tags: Tags) -> Image:
+    a1, a2, a3 = tags.numbers(CAMERA, "RadiometricCalibration")
+    centre, k = tags.numbers(PIX4D, "VignettingCenter"), tags.numbers(PIX4D, "VignettingPolynomial")
+    exposure_s, gain = tags.exif["ExposureTime"], tags.exif.get("ISOSpeed", tags.exif.get("ISOSpeedRatings")) / 100
+    y, x = np.mgrid[: raw.shape[0], : raw.shape[1]]
+    vignette = 1 / np.polyval([*k[::-1], 1.0], np.hypot(x - centre[0], y - centre[1]))
+    by_row = 1 / (1 + a2 * y / exposure_s - a3 * y)
+    return vignette * by_row * (raw - tags.black_level) / (gain * exposure_s) * a1 / 2**16
+
+
+def published_irradiance(tags: Tags) -> float:
+    """Horizontal irradiance: HorizontalIrradiance of a DLS 2, else SpectralIrradiance by the model of the DLS 1."""
+    horizontal, scale = tags.number(DLS, "HorizontalIrradiance"), tags.number(DLS, "IrradianceScaleToSIUnits")
+    if horizontal is not None:
+        return horizontal * (scale or 0.01)
+    elevation, azimuth = sun_position(tags.position, moment(tags))
+    angle = phi = sensor_to_sun(tags, elevation, azimuth)
+    light = tags.number(DLS, "SpectralIrradiance") * (scale or 1.0)
+    for n1, n2 in ((1.000277, 1.6), (1.6, 1.38)):
+        phi = np.arcsin(np.sin(phi) / n1)
+        f1, f2 = np.cos(phi), np.sqrt(1 - (n1 / n2 * np.sin(phi)) ** 2)
+        rs, rp = ((n1 * f1 - n2 * f2) / (n1 * f1 + n2 * f2)) ** 2, ((n1 * f2 - n2 * f1) / (n1 * f2 + n2 * f1)) ** 2
+        light /= 1 - 0.5 * rs - 0.5 * rp
+    direct = light / (1 / 6 + np.cos(angle))
+    return float(direct * np.sin(elevation) + direct / 6)
+
+
+def sensor_to_sun(tags: Tags, elevation: float, azimuth: float) -> float:
+    """The angle between the axis of the light sensor and the sun, radians."""
+    sun = np.array([np.cos(azimuth) * np.cos(elevation), np.sin(azimuth) * np.cos(elevation), -np.sin(elevation)])
+    (s1, c1), (s2, c2), (s3, c3) = ((np.sin(-v), np.cos(-v)) for v in attitude(tags))
+    yaw, pitch = np.array([[c1, s1, 0], [-s1, c1, 0], [0, 0, 1]]), np.array([[c2, 0, -s2], [0, 1, 0], [s2, 0, c2]])
+    roll = np.array([[1, 0, 0], [0, c3, s3], [0, -s3, c3]])
+    return float(np.arccos(sun @ yaw @ pitch @ roll @ [0, 0, -1]))
+
+
+def attitude(tags: Tags) -> list[float]:
+    """(yaw, pitch, roll) of the light sensor, radians."""
+    return [tags.number(DLS, name) or 0.0 for name in ("Yaw", "Pitch", "Roll")]
+
+
+def moment(tags: Tags) -> datetime:
+    return datetime.fromisoformat(tags.captured_at).replace(tzinfo=UTC)
+
+
+# ---- tables
+
+
+def main(folder: Path) -> None:
+    found = panels.with_panels(discover(folder).captures)
+    captures = [c for c in found if all(b.radiometry and b.radiometry.quantity == "radiance" for b in c.bands)]
+    captures = [c for c in captures if all(b.radiometry.by_sun for b in c.bands)]
+    panels._MAX_SENSOR_SCALE = math.inf  # the formula of both is compared also for a shaded sensor
+    readings = [panels.read_panel(c, {}) for c in captures if c.panel is not None]
+    print("Largest difference from the published formulas, relative to the median of the band:\n")
+    print_head("captures", "camera", "radiance", "light sensor", "panel", "panel and light sensor")
+    for name, group in itertools.groupby(captures, lambda c: c.reference.path.parent):
+        of_group = list(group)
+        errors = np.array([largest_differences(c, readings) for c in of_group]).max(axis=0)
+        camera = f"{of_group[0].camera.make} {of_group[0].camera.model}"
+        print_row(name.name, camera, *("-" if math.isnan(e) else f"{e:.1e}" for e in errors))
+    print(
+        "\nLight in the plane of the sensor and after correction of its tilt, divided by the sensor's own horizontal:\n"
+    )
+    print_head("capture", "sensor to sun, degrees", "zenith angle of the sun", "measured", "corrected")
+    for capture in captures:
+        tags = read_tags(capture.reference.path)
+        if tags.number(DLS, "HorizontalIrradiance") and attitude(tags)[0]:
+            print_row(f"{capture.reference.path.parent.name} {capture.name}", *tilt_facts(tags))
+    print("\nDifference of reflectance between overlapping captures, median of tie points:\n")
+    print_head("captures", "ties", "constant light (one panel)", "light sensor as measured", "light sensor")
+    scenes = [c for c in captures if not c.is_of_a_panel]
+    for a, b in itertools.combinations(scenes, 2):
+        if a.reference.path.parent == b.reference.path.parent:
+            rows = np.concatenate([differences(x, y) for x, y in zip(a.bands, b.bands, strict=True)])
+            if len(rows) >= MIN_TIES:
+                print_row(f"{a.name} {b.name}", len(rows), *(f"{v:.1%}" for v in np.median(np.abs(rows), axis=0)))
+
+
+def largest_differences(capture: Capture, readings: list[panels.PanelReading]) -> Image:
+    """Of radiance and reflectance by light sensor, panel, and both; nan without a panel of the camera."""
+    without_sensor = [replace(b, radiometry=replace(b.radiometry, by_sun=None)) for b in capture.bands]
+    alone = panels.reflectance_factors(replace(capture, bands=tuple(without_sensor)), readings)
+    ways = ("camera", {}), ("sun", {}), ("panel", alone), ("panel", panels.reflectance_factors(capture, readings))
+    panel = next((r.capture for r in readings if camera_key(r.capture) == camera_key(capture)), None)
+    result = np.full((len(ways), len(capture.bands)), np.nan)
+    for i, band in enumerate(capture.bands):
+        tags, raw = read_tags(band.path), pixels(band)
+        radiance, light = published_radiance(raw, tags), published_irradiance(tags)
+        lights = [math.pi, light]
+        if panel is not None:
+            panel_light, at_panel = published_panel_light(panel.bands[i])
+            lights += [panel_light, light * panel_light / at_panel]
+        for way, irradiance in enumerate(lights):
+            theirs = radiance * math.pi / irradiance
+            ours = calibrated(raw, with_radiometry(capture, *ways[way]).bands[i].radiometry, 0, 0)
+            result[way, i] = np.abs(ours - theirs).max() / np.median(theirs)
+    return result.max(axis=1)
+
+
+def published_panel_light(band: Band) -> tuple[float, float]:
+    """The irradiance on a panel, and by the light sensor at that time."""
+    tags, area = read_tags(band.path), np.zeros(band.size_px[::-1], np.uint8)
+    cv2.fillPoly(area, [np.reshape(tags.numbers(PIX4D, "ReflectArea"), (4, 2)).round().astype(np.int32)], 1)
+    radiance = published_radiance(pixels(band), tags)[area > 0].mean()
+    return math.pi * radiance / tags.number(PIX4D, "Albedo"), published_irradiance(tags)
+
+
+def tilt_facts(tags: Tags) -> tuple[str, ...]:
+    """Angles, and the measured and the corrected irradiance relative to HorizontalIrradiance."""
+    sun, horizontal = sun_position(tags.position, moment(tags)), tags.number(DLS, "HorizontalIrradiance")
+    measured = tags.number(DLS, "SpectralIrradiance")
+    corrected = horizontal_irradiance(measured, tuple(np.degrees(attitude(tags))), sun)
+    angles = math.degrees(sensor_to_sun(tags, *sun)), 90 - math.degrees(sun[0])
+    return *(f"{v:.1f}" for v in angles), *(f"{v / horizontal:.2f}" for v in (measured, corrected))
+
+
+def differences(a: Band, b: Band) -> Image:
+    """(ties, 3) logarithmic differences of radiance, and of reflectance by the light sensor before and after."""
+    marks = [landmarks(read_for_alignment(band, max(band.size_px)), "image") for band in (a, b)]
+    homography = matched_homography(*marks, a.size_px)
+    if homography is None:
+        return np.zeros((0, 3))
+    at_a, at_b = (mark.xy[chosen] for mark, chosen in zip(marks, matches(*marks), strict=True))
+    inliers = np.hypot(*(geometry.apply(homography, at_a) - at_b).T) < MAX_ERROR_PX
+    logarithms, measured, corrected = [], [], []
+    for band, at in ((a, at_a), (b, at_b)):
+        x, y = at[inliers].round().astype(int).T
+        radiance = cv2.blur(calibrated(pixels(band), band.radiometry, 0, 0), (PATCH_PX, PATCH_PX))
+        logarithms.append(np.log(radiance[y, x]))
+        tags = read_tags(band.path)
+        measured.append(tags.number(DLS, "HorizontalIrradiance") or tags.number(DLS, "SpectralIrradiance"))
+        corrected.append(1 / band.radiometry.by_sun[0])
+    change = logarithms[1] - logarithms[0]
+    return np.stack([change, *(change - math.log(e[1] / e[0]) for e in (measured, corrected))], axis=1)
+
+
+def pixels(band: Band) -> Image:
+    return read_tile(band, Tile(0, 0, *band.size_px))[0].astype(np.float64)
+
+
+if __name__ == "__main__":
+    run(main)
