@@ -90,6 +90,18 @@ def pyplot() -> Any:
     return plt
 
 
+def heat_map(axis: Any, values: NDArray[np.float64], rows: Sequence[str], columns: Sequence[str], **style: Any) -> Any:
+    """Draw shares (rows, columns) as coloured cells with percentages, - for nan. `style` has options of imshow."""
+    image = axis.imshow(np.nan_to_num(values), vmin=0, vmax=1, aspect="auto", **style)
+    for (row, column), value in np.ndenumerate(values):
+        is_dark = not np.isnan(value) and np.mean(image.cmap(value)[:3]) < 0.4
+        text, colour = "-" if np.isnan(value) else f"{value:.0%}", "white" if is_dark else "black"
+        axis.text(column, row, text, ha="center", va="center", fontsize=8, color=colour)
+    axis.set_xticks(range(len(columns)), columns, rotation=40, ha="right")
+    axis.set_yticks(range(len(rows)), rows)
+    return image
+
+
 # ---- decisions on pairs of images
 
 

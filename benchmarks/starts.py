@@ -2,27 +2,30 @@
 
     pip install -e '.[bench]' && python benchmarks/starts.py DATA... [--pairs 3] [--plot FILE]
 
-DATA holds folders of bands with `ties.json` or `truth.json` (benchmarks/accuracy.py says how); of each so many pairs
-are taken, and a synthetic flight's. The moving band is shifted within its frame by a share of its width, then turned
-and scaled about its centre on a canvas that holds all of it. A pair is found where the median error is at most 0.3 px
-of the moving file. Prints a table, and draws a heat map.
+DATA holds flights with `ties.json` or `truth.json` (benchmarks/accuracy.py says how); of each, and of a synthetic
+flight, so many pairs are taken. The moving band is shifted within its frame by a share of its width, then turned and
+scaled about its centre on a canvas that holds all of it. A pair is found where the median error is at most 0.3 px of
+the moving file. Prints a table, and draws a heat map.
 """
 
 import tempfile
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from itertools import product
 from pathlib import Path
 
 import cv2
 import numpy as np
-from cases import Case, cases
-from common import WRONG_PX, print_head, print_row, pyplot, run
+from bands.images import straightened
+from common import WRONG_PX, heat_map, print_head, print_row, pyplot, read_ties, run
+from numpy.typing import NDArray
 from peers import elastix, sift
 
 import agalign
+from agalign.cameras.discover import discover
+from agalign.pixels.raster import read_for_alignment
 from agalign.synthetic import flight as synthetic
-from agalign.values import geometry
+from agalign.values import geometry, lens
 from agalign.values.geometry import Matrix
 from agalign.values.image import Raster
 
@@ -70,20 +73,27 @@ def by_elastix(fixed: Raster, moving: Raster) -> tuple[Matrix | None, bool]:
 METHODS: dict[str, Aligner] = {"agalign": ours, "SIFT + RANSAC": by_sift, "elastix affine": by_elastix}
 
 
-def error_px(case: Case, to_moved: Matrix, result: Matrix | None) -> float:
-    """Return the median error, px of the moving file, of tie points inside the transformed image."""
+def error_px(ties: NDArray[np.float64], to_moved: Matrix, result: Matrix | None) -> float:
+    """Return the median error, px of the moving file, of tie points (n, 4) inside the transformed image."""
     if result is None:
         return float("inf")
-    there = geometry.apply(to_moved, case.ties[:, 2:])
-    off = np.linalg.norm(geometry.apply(result, case.ties[:, :2]) - there, axis=1)
+    there = geometry.apply(to_moved, ties[:, 2:])
+    off = np.linalg.norm(geometry.apply(result, ties[:, :2]) - there, axis=1)
     return float(np.median(off) / np.sqrt(abs(np.linalg.det(to_moved[:2, :2]))))
 
 
-def chosen(folders: Sequence[Path], pairs: int) -> Iterator[Case]:
-    """Return this number of pairs of each set, evenly spread."""
-    for folder in folders:
-        some = list(cases(folder))
-        yield from (some[i] for i in np.unique(np.linspace(0, len(some) - 1, pairs).round().astype(int)))
+def chosen(folder: Path, count: int) -> Iterator[tuple[Raster, Raster, NDArray[np.float64]]]:
+    """Yield this number of pairs of a flight, evenly spread: two images without lens distortion, and (n, 4) tie points
+    in their pixels.
+    """
+    truth = read_ties(next(path for name in ("ties.json", "truth.json") if (path := folder / name).is_file()))
+    captures = discover(folder).captures
+    pairs = [(c.reference, band) for c in captures for band in c.moving if band.path.name in truth]
+    for index in np.unique(np.linspace(0, len(pairs) - 1, count).round().astype(int)):
+        fixed, moving = (straightened(read_for_alignment(band, 4096)) for band in pairs[index])
+        raw_px = np.hsplit(np.array(truth[pairs[index][1].path.name]["ties"]), 2)
+        ties = [lens.undistort(band.lens, px) for band, px in zip(pairs[index], raw_px, strict=True)]
+        yield fixed, moving, np.hstack(ties)
 
 
 def main(data: list[Path], pairs: int = 3, methods: str = ";".join(METHODS), plot: Path | None = None) -> None:
@@ -92,15 +102,14 @@ def main(data: list[Path], pairs: int = 3, methods: str = ";".join(METHODS), plo
     print_head(*head)
     with tempfile.TemporaryDirectory() as folder:
         synthetic.make_flight(Path(folder), captures=2, rng_seed=11)
-        tried = list(chosen([*data, Path(folder)], pairs))
+        tried = [pair for flight in (*data, Path(folder)) for pair in chosen(flight, pairs)]
     for start, (name, of_method) in product(STARTS, shares.items()):
         rows = []
-        for case in tried:
-            fixed, moving = case.straight()
+        for fixed, moving, ties in tried:
             image, to_moved = moved(moving, *start)
             began = time.perf_counter()
             result, is_sure = METHODS[name](fixed, image)
-            rows.append((error_px(case, to_moved, result), is_sure, time.perf_counter() - began))
+            rows.append((error_px(ties, to_moved, result), is_sure, time.perf_counter() - began))
         off, seconds = (np.array([row[k] for row in rows]) for k in (0, 2))
         sure = np.array([row[1] for row in rows])
         hit = off <= FOUND_PX
@@ -121,11 +130,7 @@ def draw(shares: dict[str, dict[tuple[float, float, float], float]], path: Path)
     figure, axes = pyplot().subplots(1, len(shares), figsize=size, sharey=True, squeeze=False)
     for axis, (name, result) in zip(axes[0], shares.items(), strict=True):
         table = np.array([[result[shift, turn, scale] for shift, scale in across] for turn in TURNS])
-        image = axis.imshow(table, cmap="RdYlGn", vmin=0, vmax=1, aspect="auto")
-        for (row, column), share in np.ndenumerate(table):
-            axis.text(column, row, f"{share:.0%}", ha="center", va="center", fontsize=7)
-        axis.set_xticks(range(len(labels)), labels, fontsize=8)
-        axis.set_yticks(range(len(TURNS)), [f"{turn:g}°" for turn in TURNS])
+        image = heat_map(axis, table, [f"{turn:g}°" for turn in TURNS], labels, cmap="RdYlGn")
         axis.axvline(len(SHIFTS) - 0.5, color="white", linewidth=3)
         axis.set_title(name)
         axis.set_xlabel("shift of the width        scale")

@@ -10,8 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 from synthetic_flights import troubles
 
+from agalign.pixels.resample import warped
 from agalign.synthetic.ground import Field
+from agalign.values import lens
 from agalign.values.files import file_checksum
+from agalign.values.image import Raster
+from agalign.values.mapping import PixelMapping
 from bands.score import AS_IT_IS, LOST, Pair, movement
 
 Image = NDArray[Any]
@@ -54,6 +58,13 @@ def read(path: Path) -> Image:
     if image is None:
         raise OSError(f"{path}: cannot be read as an image")
     return np.asarray(image if image.ndim == 2 else image[..., 2::-1])
+
+
+def straightened(raster: Raster) -> Raster:
+    """Return an image without lens distortion."""
+    if not lens.is_distorting(raster.lens):
+        return raster
+    return warped(raster, PixelMapping(np.eye(3), None, raster.lens), raster.size_px)
 
 
 def degraded(image: Image, pair: Pair, variant: str) -> Image:

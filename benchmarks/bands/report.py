@@ -4,7 +4,7 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
-from common import pyplot
+from common import heat_map, pyplot
 
 from bands.images import VARIANTS
 from bands.score import AS_IT_IS, Score, Scored, markdown, summary, table
@@ -58,18 +58,12 @@ def draw(scored: Sequence[Scored], path: Path) -> None:
     """Two heat maps, methods by variants: the share of pairs claimed to half a px, and of wrong claims."""
     scores = {(s.method, s.variant): s for s in summary(scored, ALL_SETS)}
     methods, variants = (list(dict.fromkeys(key[k] for key in scores)) for k in (0, 1))
-    figure, axes = pyplot().subplots(
-        1, 2, figsize=(13, 0.5 + 0.42 * len(methods) + 1.2), sharey=True, layout="constrained"
-    )
-    shares = {key: (100 * s.under_half_px, 100 * s.wrong_claims / s.pairs) for key, s in scores.items()}
+    size = 13, 1.7 + 0.42 * len(methods)
+    figure, axes = pyplot().subplots(1, 2, figsize=size, sharey=True, layout="constrained")
+    shares = {key: (s.under_half_px, s.wrong_claims / s.pairs) for key, s in scores.items()}
     titles = "claimed, and within 0.5 px: % of pairs", "wrong claims, more than 1 px off: % of pairs"
     for k, (axis, title, colours) in enumerate(zip(axes, titles, ("Greens", "Reds"), strict=True)):
         grid = np.array([[shares.get((m, v), (np.nan, np.nan))[k] for v in variants] for m in methods])
-        axis.imshow(np.nan_to_num(grid), cmap=colours, vmin=0, vmax=100, aspect="auto")
-        for (row, column), value in np.ndenumerate(grid):
-            text = "-" if np.isnan(value) else f"{value:.0f}"
-            axis.text(column, row, text, ha="center", va="center", color="white" if value > 60 else "black", fontsize=9)
-        axis.set_xticks(range(len(variants)), variants, rotation=40, ha="right")
-        axis.set_yticks(range(len(methods)), methods)
+        heat_map(axis, grid, methods, variants, cmap=colours)
         axis.set_title(title, fontsize=11)
     figure.savefig(path, dpi=85)

@@ -27,7 +27,6 @@ import typer
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # run as a file, its package is not found
 
-from cases import straightened
 from common import align, run, watched
 from peers import METHODS, Align, UnavailableError, grey_raster, method_named
 
@@ -37,7 +36,7 @@ from agalign.products.sidecar_file import find_sidecars
 from agalign.values import geometry, lens
 from agalign.values.capture import Band
 from agalign.values.mapping import PixelMapping
-from bands.images import LENS_CORRECTED, VARIANTS, Image, Paths, degraded, locate, read
+from bands.images import LENS_CORRECTED, VARIANTS, Image, Paths, degraded, locate, read, straightened
 from bands.report import draw, tables
 from bands.score import AS_IT_IS, Pair, pairs_of, read_sets, score_pairs, summary, write_csv
 
