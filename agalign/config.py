@@ -112,7 +112,7 @@ class DiscoverOptions:
     include: Annotated[tuple[str, ...], _GLOBS] = ()
     """Use only files that match this glob by path or name; repeatable."""
     exclude: Annotated[tuple[str, ...], _GLOBS] = ()
-    """Ignore files that match this glob, such as '*/test/*'; repeatable."""
+    """Ignore files that match this glob; repeatable."""
 
 
 @validated.dataclass(frozen=True, config=ConfigDict(use_attribute_docstrings=True, arbitrary_types_allowed=True))
@@ -124,12 +124,12 @@ class RunOptions:
     jobs: Annotated[int, Field(ge=0, le=4096), Option(short="-j", default=0)] = 1
     """Captures processed at the same time; 0 is one per core."""
     align_panels: bool = False
-    """Also align captures of calibration panels and of the sky, and use no panel for reflectance."""
+    """Also align captures of panels and of the sky, and use no panel for reflectance."""
     # Any executor in Python, such as `dask_executor`.
     executor: Annotated[Executor | None, Option("dask", type=str | None)] = None
     """Address of a Dask scheduler, as tcp://host:8786; 'local' starts workers on this machine."""
     retry_failed: bool = False
-    """Process captures again if a band is not aligned or missing."""
+    """Process captures with bands that are missing or not aligned again."""
     # An `executor` of the caller ignores it; `dask_executor` has its own.
     timeout_s: Annotated[float | None, Field(ge=1, le=1e6), Option("timeout")] = None
     """Seconds after which a capture is abandoned; by default unlimited."""
@@ -161,7 +161,7 @@ class JointSettings(SettingsModel):
     device: str = "auto"
     """Torch device: auto, cpu, cuda, cuda:1 …"""
     rng_seed: Annotated[int, Field(ge=0, le=MAX_RNG_SEED)] = 0
-    """Seed of all random numbers; the same seed gives the same result."""
+    """Seed of all random numbers."""
 
 
 class FlightSettings(SettingsModel):
@@ -223,16 +223,15 @@ class WriteSettings(SettingsModel):
     layout: Layout = "stack"
     """Write one stack per capture, one file with tags per input file, or both."""
     resolution: Resolution = "reference"
-    """Pixel size of the output: that of the reference, or of the finest band."""
+    """Pixel size of the output: of the reference or of the finest band."""
     georeference: bool = False
-    """Write an approximate georeference from GPS, altitude and yaw; a tag has its expected error."""
+    """Write an approximate georeference from GPS, altitude and yaw."""
     ground_elevation_m: Annotated[
         float | None, Field(ge=-1000, le=9000), Option("ground_elevation", show_default=False)
     ] = None
-    """Elevation of the ground, m, in the height system of the GPS; for footprints, if the tags lack the height above
-    ground."""
+    """Elevation of the ground, m, in the height system of the GPS, if the tags lack the height above ground."""
     statistics: bool = False
-    """Store minimum, maximum, mean and standard deviation in aligned bands (gdalinfo -stats)."""
+    """Store minimum, maximum, mean and standard deviation of aligned bands."""
     qa: bool = False
     """Write a raster of quality flags (saturated, occluded, glint …), <capture>.qa.tif."""
     stac: bool = False
@@ -248,15 +247,15 @@ class WriteSettings(SettingsModel):
     error_map: bool = False
     """Write a raster of the expected error at every pixel, <capture>.error.tif."""
     tie_points: bool = False
-    """Write the measured tie points of each band with residual and weight: <capture>.ties.csv and .ties.geojson."""
+    """Write the tie points of each band with residual and weight: <capture>.ties.csv and .ties.geojson."""
     relief_map: bool = False
     """Add confidence and range (m) to the raster of a capture's relief."""
     fill_occluded: bool = False
     """Interpolate pixels that are occluded in a band; by default they are nodata."""
     radiometry: Annotated[RadiometryChoice, _yes_or_no("auto", "off"), Option(alone="auto")] = "off"
-    """Write float32. camera: radiance by the camera's calibration; sun: reflectance by light sensor; panel: by
-    calibration panel, and light sensor if there is one; auto (--radiometry alone): panel if available for all bands,
-    else sun, else camera. Thermal bands are written in degrees C."""
+    """Write float32: radiance by the camera's calibration (camera), reflectance by light sensor (sun) or by calibration
+    panel and light sensor if any (panel), or panel, sun, camera, the first that is available (auto; --radiometry
+    alone). Thermal bands: degrees C."""
     # (band in lower case, reflectance); an empty name means all other bands.
     panel_albedo: Annotated[
         tuple[tuple[str, Annotated[float, Field(gt=0, le=1)]], ...], Option(type=str | None, parse=albedos)

@@ -72,7 +72,7 @@ def type_name(kind: Any) -> str:
     if typing.get_origin(kinds[0]) is typing.Literal or isinstance(kinds[0], str):
         values = kinds if isinstance(kinds[0], str) else typing.get_args(kinds[0])
         return ", ".join(f"`{value}`" for value in values)
-    return {bool: "flag", int: "integer", float: "number", str: "text", Path: "path"}.get(kinds[0], "text")
+    return {bool: "", int: "integer", float: "number", str: "text", Path: "path"}.get(kinds[0], "text")
 
 
 def fields() -> str:
@@ -122,8 +122,8 @@ def reasons() -> str:
         text = sentence(Issue(kind, 0.0, 0.0, detail))
         text = re.sub(r"\d+(\.\d+)?", "…", text.replace("\0", "…"))
         grouped.setdefault(kind.remedy, []).append(f"`{text}`")
-    rows = [("reason", "usual cause", "remedy")]
-    rows += [("; ".join(texts), remedy.cause, remedy.advice) for remedy, texts in grouped.items()]
+    rows = [("reason", "usual cause: remedy")]
+    rows += [("; ".join(texts), f"{remedy.cause}: {remedy.advice}") for remedy, texts in grouped.items()]
     return table(rows)
 
 

@@ -27,9 +27,7 @@ def _align(
         Path | None,
         typer.Option(help="Reuse the network and rig of an earlier flight of the same camera: OUT/models/…."),
     ] = None,
-    out: Annotated[
-        Path | None, typer.Option("-o", "--out", help="Output folder; by default FOLDER with '-aligned' added.")
-    ] = None,
+    out: Annotated[Path | None, typer.Option("-o", "--out", help="Output folder; by default FOLDER-aligned.")] = None,
     dry_run: Annotated[bool, typer.Option("--dry-run", help="Print what would be done, and write nothing.")] = False,
     config: Annotated[  # noqa: ARG001 - its callback applies the file
         Path | None,

@@ -55,21 +55,20 @@ def explanation(issues: Sequence[Issue]) -> str | None:
 
 TEXTURELESS = Remedy(
     "too little common structure: water, fog, blur or noise in one of the bands",
-    "align all bands together, with the default reference: such bands are predicted if three captures of the flight "
-    "have texture; otherwise give --model OUT/models/… of an earlier flight",
+    "align all bands together: such bands are predicted if three captures of the flight have texture; otherwise give "
+    "--model OUT/models/… of an earlier flight",
 )
 UNLIKE = Remedy(
     "the bands do not show the same scene",
-    "look at the picture: did the scene move between the exposures, is a band blurred or from another place? "
-    "--seed match finds images that are far apart; --model OUT/models/… uses the rig of an earlier flight",
+    "look at the picture: did the scene move, is a band blurred or from another place? --seed match finds large "
+    "offsets; --model OUT/models/… uses the rig of an earlier flight",
 )
 MISSING_BAND = Remedy("a band is missing that other captures of this camera have", "copy the files from the card again")
 
 # ---- kinds of issues that reading, seeding and estimation report; a check defines its own
 
 _BLANK = Remedy(
-    "a band is blank: its pixels are constant or invalid",
-    "look at the file: covered lens, defective sensor or wrong exposure; --bands omits a band",
+    "a blank band", "look at the file (covered lens, defective sensor, wrong exposure); --bands omits a band"
 )
 _ASKED = Remedy("only the seed was requested", "omit --seed and --only-seed")
 

@@ -61,8 +61,8 @@ _MAX_UNCHANGED_PX, _MAX_UNCHANGED_STD = 0.25, 3.0
 input to be returned unchanged: resampling would cost more sharpness than the correction gains."""
 
 _PARALLAX = Remedy(
-    "parallax (trees, buildings or terraces near the camera), or motion between the exposures",
-    "fly higher or slower, and do not use --relief never; --bands omits a band",
+    "parallax (trees, buildings, terraces), or motion between the exposures",
+    "fly higher or slower, do not use --relief never; --bands omits a band",
 )
 FOLDS = IssueKind("folds", "the mapping folds or stretches the image", UNLIKE)
 CORNER_STD_PX = IssueKind(
@@ -85,9 +85,8 @@ REPEATS = IssueKind(
     "repeats",
     "the scene repeats: a shift of {value:.0f} px fits nearly as well, and no prior information decides",
     Remedy(
-        "the scene repeats, and no prior information decides which shift is right",
-        "keep the camera's metadata in the files (no --ignore-metadata), or give --model OUT/models/… of an earlier "
-        "flight",
+        "a repetitive scene (plant rows, solar panels)",
+        "keep the metadata of the camera, without --ignore-metadata, or give --model OUT/models/… of an earlier flight",
     ),
 )
 

@@ -17,9 +17,9 @@ EXTRAPOLATED = IssueKind(
     "extrapolated",
     "the bands show no common structure at the {detail} of the image; the mapping is extrapolated there",
     Remedy(
-        "a part of the image is saturated, masked or without texture, and no rig of the flight is known there",
-        "expose for the brightest band; or give --model OUT/models/… of a flight that shows the whole image. "
-        "--error-map writes the expected error of each pixel",
+        "a part of the image is saturated, masked or without texture",
+        "expose for the brightest band, or give --model OUT/models/… of a flight that shows the whole image; "
+        "--error-map writes the expected error",
     ),
 )
 """Not in `checks.CHECKS`: the result is kept as a prediction with the error of the extrapolation."""
