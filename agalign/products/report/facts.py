@@ -14,6 +14,7 @@ from pydantic import BaseModel
 
 from agalign.products.index_bands import RAW
 from agalign.products.index_table import IndexRow
+from agalign.products.report.light import CaptureLight, light_of
 from agalign.products.run_record import RefusalPart
 from agalign.products.sidecar import BandPart, BandResult, CaptureResult, GridPart, OutputPart, PreviewPart, Sidecar
 from agalign.values.issues import MISSING_BAND, Remedy
@@ -125,6 +126,8 @@ class FlightFacts:
     rows: list[dict[str, Any]] = field(default_factory=list)
     """Their rows in OUT/summary.csv."""
     failures: FailureGroups = field(default_factory=FailureGroups)
+    light: list[CaptureLight] = field(default_factory=list)
+    """The light of all captures."""
     _lattices: dict[tuple[float, ...], int] = field(default_factory=dict)
     """Centres of windows, which many pairs share, and their index in the data of the report."""
 
@@ -135,6 +138,7 @@ class FlightFacts:
         moving = [b for b in result.bands if b.status != "reference"]
         self.bands += moving
         self.failures.add(label, result)
+        self.light.append(light_of(label, sidecar))
         output, position, path = sidecar.output, sidecar.position, Path(folder)
         grid = output or OutputPart(file=None, bytes=None, crop=(0, 0, *sidecar.reference.size_px), nodata=None)
         files = {part.kind: part.file for part in sidecar.products}

@@ -21,6 +21,7 @@ from agalign.errors import SidecarError
 from agalign.products.index_table import IndexRow, rows_of_run, update_table
 from agalign.products.panels import PANELS_FILE, SKY_FILE, PanelPart, SkyPart, read_panels, read_sky
 from agalign.products.report.facts import BAND_COLUMNS, FailureGroup, FlightFacts, masked_shares
+from agalign.products.report.light import light_charts
 from agalign.products.report.rigs import drifts_of, rig_views
 from agalign.products.run_record import RunPart, exclusion_lines, read_run_record
 from agalign.products.sidecar_file import find_sidecars, read_sidecar
@@ -147,6 +148,7 @@ def _page(
         bands=facts.by_band(),
         rigs=rig_views(out, on_problem),
         drifts=drifts_of(facts.captures),
+        light=light_charts(facts.light),
         exclusions=[] if run is None else exclusion_lines(run.excluded),
         masked=masked_shares(facts.captures),
         panels=panels,

@@ -34,7 +34,7 @@ class RigView:
 
 @dataclass(frozen=True)
 class Line:
-    """One band over a flight: the difference of its offset from the median, along the direction of largest variance."""
+    """One band over a flight, as drawn in a chart."""
 
     name: str
     hue: float
@@ -126,12 +126,16 @@ def _lines(captures: Sequence[dict[str, Any]], names: Sequence[str]) -> tuple[tu
     # The sign of a principal component is arbitrary: choose that of the first band.
     differences = [d if np.nansum(differences[0] * d) >= 0 else -d for d in differences]
     full = max(0.2, float(np.nanmax(np.abs(differences))))  # smaller drifts are noise
-    step = max(1, math.ceil(len(captures) / 400))  # more points than that are not distinguishable
-    lines = tuple(
-        Line(name, hue_of(number, len(names)), _polylines(values, full, step))
-        for number, (name, values) in enumerate(zip(names, differences, strict=True))
+    return lines_of(names, np.array(differences), full), full
+
+
+def lines_of(names: Sequence[str], values: NDArray[np.float64], full: float) -> tuple[Line, ...]:
+    """Return a line for each band, given values (bands, captures) from -full to full; nan breaks a line."""
+    step = max(1, math.ceil(values.shape[1] / 400))  # more points than that are not distinguishable
+    return tuple(
+        Line(name, hue_of(number, len(names)), _polylines(of_band, full, step))
+        for number, (name, of_band) in enumerate(zip(names, values, strict=True))
     )
-    return lines, full
 
 
 def _principal_component(offsets_px: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -1,0 +1,69 @@
+"""Charts of the light over a flight: the irradiance by the light sensor, and the factors by panels."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from agalign.products.report.rigs import Line, lines_of
+from agalign.products.sidecar import Sidecar
+
+_MIN_CAPTURES = 3
+
+
+@dataclass(frozen=True)
+class CaptureLight:
+    """The light of a capture by band."""
+
+    order: tuple[str, str, str]
+    """Camera, time and label of the capture."""
+    irradiance: Mapping[str, float]
+    """By the light sensor, in its unit."""
+    by_panel: Mapping[str, float]
+    """Radiance of a white panel at the time of the capture, as it was used; empty without a panel."""
+
+
+@dataclass(frozen=True)
+class LightChart:
+    """The change of the light of a camera's captures, in the order of time."""
+
+    camera: str
+    caption: str
+    full: float
+    """The largest difference from the median, as a part of it."""
+    lines: tuple[Line, ...]
+    first: str
+    """Label of the first capture."""
+    last: str
+
+
+def light_of(label: str, sidecar: Sidecar) -> CaptureLight:
+    """Return the light of a capture from its sidecar."""
+    output = sidecar.output
+    bands = [] if output is None else output.illumination
+    has_panel = output is not None and output.panel_age_s is not None
+    return CaptureLight(
+        (sidecar.camera.name or "unknown camera", sidecar.captured_at, label),
+        {b.band: b.irradiance for b in bands if b.irradiance is not None},
+        {b.band: 1 / b.reflectance_per_radiance for b in bands if has_panel},
+    )
+
+
+def light_charts(captures: Sequence[CaptureLight]) -> list[LightChart]:
+    """Return the charts of each camera with three captures or more whose light is known."""
+    charts = []
+    for camera in sorted({c.order[0] for c in captures}):
+        of_camera = sorted((c for c in captures if c.order[0] == camera), key=lambda c: c.order)
+        for caption, values in (
+            ("Irradiance on a horizontal plane by the light sensor", [(c, c.irradiance) for c in of_camera]),
+            ("Light by panels, at the time of each capture", [(c, c.by_panel) for c in of_camera]),
+        ):
+            known = [(c, light) for c, light in values if light]
+            if len(known) >= _MIN_CAPTURES:
+                names = list(dict.fromkeys(name for _, light in known for name in light))
+                light = np.array([[light.get(name, np.nan) for _, light in known] for name in names])
+                changes = light / np.nanmedian(light, axis=1, keepdims=True) - 1
+                full = max(0.01, float(np.nanmax(np.abs(changes))))  # smaller changes are noise
+                first, last = known[0][0].order[2], known[-1][0].order[2]
+                charts.append(LightChart(camera, caption, full, lines_of(names, changes, full), first, last))
+    return charts
