@@ -49,8 +49,8 @@ def process_capture(
     """
     paths = CapturePaths.of(capture, out)
     refuse_to_overwrite([capture], out, settings.write)
-    if settings.write.radiometry != "off":
-        _require_radiometry(capture, settings.write.radiometry)
+    if missing := missing_radiometry(capture, settings.write.radiometry):
+        raise InputError(f"{capture.reference.path}: {missing}")
     for product in PRODUCTS:
         if product.is_enabled(settings.write):
             product.check(capture)
@@ -125,17 +125,19 @@ def discard_outputs(capture: Capture, out: Path, settings: WriteSettings) -> Non
             path.unlink(missing_ok=True)
 
 
-def _require_radiometry(capture: Capture, choice: RadiometryChoice) -> None:
+def missing_radiometry(capture: Capture, choice: RadiometryChoice) -> str:
+    """Return what the bands of a capture lack for the radiometry of a run, and the remedy; empty if nothing."""
     bands = ", ".join(b.name for b in capture.bands if b.radiometry is None and not b.companion)
-    if bands:
-        remedies = {
-            "auto": f"no tags that agalign can turn into radiance or reflectance in {bands}; leave --radiometry out",
-            "camera": f"no tags that agalign can turn into radiance in {bands}; leave --radiometry out",
-            "sun": f"no tags of a light sensor in {bands}; choose --radiometry camera or panel",
-            "panel": f"no calibration panel of the same hours says how bright {bands} is, or its reflectance is not "
-            "known (--panel-albedo); choose --radiometry camera or sun",
-        }
-        raise InputError(f"{capture.reference.path}: {remedies[choice]}")
+    if choice == "off" or not bands:
+        return ""
+    missing = {
+        "auto": f"no tags for radiance or reflectance in {bands}; leave --radiometry out",
+        "camera": f"no tags for radiance in {bands}; leave --radiometry out",
+        "sun": f"no tags of a light sensor in {bands}; choose --radiometry camera or panel",
+        "panel": f"no calibration panel of known reflectance was recorded within hours for {bands}; give "
+        "--panel-albedo for a panel without QR code, or choose --radiometry sun or camera",
+    }
+    return missing[choice]
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,15 @@ from functools import partial
 from pathlib import Path
 from typing import Self
 
-from agalign.batch.capture import Task, discard_outputs, do_capture, loaded_model, quiet, refuse_to_overwrite
+from agalign.batch.capture import (
+    Task,
+    discard_outputs,
+    do_capture,
+    loaded_model,
+    missing_radiometry,
+    quiet,
+    refuse_to_overwrite,
+)
 from agalign.batch.learn import learn_flight, learning_fingerprint
 from agalign.batch.output_folder import is_full, locked
 from agalign.batch.report import CaptureReport
@@ -20,7 +28,7 @@ from agalign.capture.align import PairProgress
 from agalign.config import RunOptions, Settings, WriteSettings
 from agalign.errors import AgalignError, ConfigurationError, OutputError, SidecarError
 from agalign.flight.fingerprint import fingerprint
-from agalign.flight.groups import flight_camera, flights_of, is_flight_of, model_names
+from agalign.flight.groups import difference, flight_camera, flights_of, is_flight_of, model_names
 from agalign.flight.model import FlightModel, load_model, save_model
 from agalign.flight.panels import PanelReading, read_panel, reflectance_factors, with_height, with_panels
 from agalign.flight.sky import SkyCapture, sky_captures
@@ -78,7 +86,7 @@ def run_flight(
     in OUT/agalign-run.json.
     Raises OutputError if the output folder cannot be used, another run writes there or the disk is full, WorkerError if
     no worker process can be started or worker processes end one after another, InputError or ConfigurationError for
-    `model`, ConfigurationError for a device.
+    `model`, ConfigurationError for a device, and for a radiometry or georeference that no capture has the tags for.
     """
     run = _FlightRun(flight, out, settings, options or RunOptions(), listener or Listener())
     run.check()
@@ -163,8 +171,8 @@ class _FlightRun:
             raise ConfigurationError(f"{path}: was learned unshared; add --sharing unshared")
         flights = flights_of(self.flight.captures)
         if flights and not any(is_flight_of(captures, model.camera) for captures in flights):
-            here = flight_camera(flights[0])
-            raise ConfigurationError(f"{path}: was learned for {model.camera}; the images here are of {here}")
+            what = difference(model.camera, flight_camera(flights[0]))
+            raise ConfigurationError(f"{path}: {what}; leave --model out")
         flight_settings = settings.flight.model_copy(update={"start_model": model.fingerprint})
         return replace(self, given=model, settings=settings.model_copy(update={"flight": flight_settings}))
 
@@ -184,6 +192,9 @@ class _FlightRun:
             panels = [read_panel(c, albedos) for c in captures if c.panel is not None]
             captures = [c for c in captures if not c.is_of_a_panel]
         captures = [_calibrated(capture, panels, write) for capture in captures]
+        missing = [missing_radiometry(capture, write.radiometry) for capture in captures]
+        if captures and all(missing):
+            raise ConfigurationError(f"--radiometry {write.radiometry}: {missing[0]}")
         if write.georeference and captures and all(c.reference.georeference is None for c in captures):
             raise ConfigurationError(
                 "--georeference: no capture has position, altitude, yaw and focal length in its tags, and a height "

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from fnmatch import fnmatchcase
 from pathlib import Path
 
-from agalign.cameras.generic import Generic
+from agalign.cameras.generic import Generic, compile_pattern
 from agalign.cameras.grouping import (
     band_file_owners,
     capture_of,
@@ -23,6 +23,7 @@ from agalign.errors import ConfigurationError, InputError, NoSuchBandError
 from agalign.pixels.raster import suffix_format
 from agalign.values.capture import Capture
 from agalign.values.files import RUN_FILE
+from agalign.values.text import did_you_mean
 
 __all__ = ["DiscoverOptions", "FolderScan", "Problem", "discover"]
 
@@ -61,14 +62,17 @@ def discover(
     paths, problems = _chosen_images(folder, options)
     files = _read(paths, options, progress, problems)
     captures: list[Capture] = []
-    for group in group_files(files):
+    groups = group_files(files)
+    _check_bands(groups, options, folder)
+    for group in groups:
         if options.pattern is not None:
             problems += pattern_clashes(group, options.pattern)
         try:
             captures.append(capture_of(group, folder, options))
         except (InputError, NoSuchBandError) as error:
             problems.append(Problem(group[0].path, error))
-    _check_bands_exist(files, options.bands, folder)
+    if not captures:
+        _check_pattern(options.pattern, paths, folder)
     captures.sort(key=lambda c: (c.folder.as_posix(), c.name))
     captures = with_missing_bands(with_unique_capture_names(captures, band_file_owners(captures)))
     return FolderScan(folder, tuple(captures), tuple(problems))
@@ -81,7 +85,9 @@ def _chosen_images(folder: Path, options: DiscoverOptions) -> tuple[list[Path], 
     if not paths and problems:
         raise problems[0].error
     if images and not paths:
-        raise InputError(f"{folder}: has {len(images)} images, and --include and --exclude leave none")
+        globs = " and ".join(f"--{name} '{glob}'" for name in ("include", "exclude") for glob in getattr(options, name))
+        such_as = images[0].relative_to(folder).as_posix()
+        raise InputError(f"{folder}: none of {len(images)} images, such as {such_as}, passes {globs}")
     if not paths:
         others = ", ".join(f"{count} {suffix}" for suffix, count in other_files(folder).most_common(5))
         only = f"; there are only {others}" if others else ""
@@ -110,12 +116,29 @@ def _read(
     return files
 
 
-def _check_bands_exist(files: Sequence[ImageFile], names: Sequence[str], folder: Path) -> None:
-    """Raises ConfigurationError if no file has a band of one of these names."""
-    known = {b.name.lower() for file in files for b in file.bands}
-    unknown = [name for name in names if name.lower() not in known]
-    if unknown and files:
-        raise ConfigurationError(f"{folder}: no capture has a band {' or '.join(map(repr, unknown))}, as --bands asks")
+def _check_bands(groups: Sequence[Sequence[ImageFile]], options: DiscoverOptions, folder: Path) -> None:
+    """Raise ConfigurationError for a band of the options that no capture has, and if --bands leaves less than two."""
+    by_capture = [[b.name for file in group for b in file.bands] for group in groups]
+    known = {name.lower(): name for names in by_capture for name in names}
+    chosen = {name.lower() for name in options.bands}
+    reference = options.reference or "auto"
+    references = () if reference.lower() == "auto" else (reference,)
+    for option, wanted in (("--bands", options.bands), ("--reference", references)):
+        usable = {k: name for k, name in known.items() if option == "--bands" or not chosen or k in chosen}
+        for name in wanted if known else ():
+            if name.lower() not in usable:
+                what = f"no capture has a band '{name}', as {option} asks{did_you_mean(name, usable.values())}"
+                raise NoSuchBandError(f"{folder}: {what}; choose from {', '.join(usable.values())}")
+    if chosen and all(sum(name.lower() in chosen for name in names) < 2 for names in by_capture):
+        what = f"--bands {','.join(options.bands)}: leaves less than the two bands of a capture that alignment needs"
+        raise ConfigurationError(f"{folder}: {what}; choose from {', '.join(known.values())}")
+
+
+def _check_pattern(pattern: str | None, paths: Sequence[Path], folder: Path) -> None:
+    """Raise ConfigurationError if a pattern matches no file."""
+    if pattern is not None and not any(one.fullmatch(p.name) for one in compile_pattern(pattern) for p in paths):
+        what = f"--pattern '{pattern}' matches none of {len(paths)} images, such as {paths[0].name}"
+        raise ConfigurationError(f"{folder}: {what}")
 
 
 IMAGE_KINDS = ".tif, .tiff, .jpg, .jpeg or .png"
@@ -132,10 +155,10 @@ def check_folder(folder: Path) -> None:
     try:
         if folder.is_dir():
             return
-        what = "is a file; give the folder it is in" if folder.exists() else "does not exist"
+        what = "is a file" if folder.exists() else "does not exist"
     except OSError as error:
         what = f"cannot be looked into ({error.strerror or error})"
-    raise InputError(f"{folder}: {what}")
+    raise InputError(f"{folder}: {what}; give the folder of the images")
 
 
 def image_files(folder: Path, skip: Sequence[Path]) -> tuple[list[Path], list[Problem]]:

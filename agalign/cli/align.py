@@ -42,6 +42,7 @@ def _align(
     """Align every capture below FOLDER."""
     check_address_space()
     from agalign.config import DiscoverOptions, RunOptions, Settings
+    from agalign.products.indices import index_named
     from agalign.products.stac import need_stac
     from agalign.values.processes import start_server_ahead
 
@@ -53,6 +54,8 @@ def _align(
     cores = options.jobs or usable_cores()
     if settings.write.stac:
         need_stac()
+    for name in settings.write.indices:
+        index_named(name)
     load_ahead()
     from agalign.cli.run import conclude, find_captures, print_plan, run
 

@@ -8,7 +8,6 @@ import json
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
-from difflib import get_close_matches
 from functools import cache
 from itertools import pairwise
 from pathlib import Path
@@ -19,6 +18,7 @@ from typer.core import TyperCommand
 
 from agalign.cli.terminal import Terminal, exits
 from agalign.values.files import read_regular
+from agalign.values.text import did_you_mean
 
 if TYPE_CHECKING:
     from agalign.config import Option
@@ -175,9 +175,14 @@ def _completed(args: list[str], one: FieldOption) -> list[str]:
             Terminal(log_json="--log-json" in args).problem(f"{name} is deprecated; use {one.flag}")
             name = one.flag
         result.append(f"{name}{equals}{value}")
-        if name == one.flag and not equals and following not in get_args(one.kind):
+        if name == one.flag and not equals and not _is_value(following, one):
             result.append(one.option.alone)
     return result
+
+
+def _is_value(text: str, one: FieldOption) -> bool:
+    """Return True for a choice of an option, and for a word that is neither an option nor a path: a misspelt choice."""
+    return text in get_args(one.kind) or (text.isalnum() and not Path(text).exists())
 
 
 def load_config(ctx: typer.Context, path: Path | None) -> Path | None:
@@ -193,8 +198,7 @@ def load_config(ctx: typer.Context, path: Path | None) -> Path | None:
     for key, value in _read_toml(path).items():
         name = key.replace("_", "-")
         if name not in options:
-            near = get_close_matches(name, options, 1)
-            raise typer.BadParameter(f"{path}: no option '{key}'" + (f"; did you mean '{near[0]}'?" if near else ""))
+            raise typer.BadParameter(f"{path}: no option '{key}'{did_you_mean(name, options)}")
         option = options[name]
         values = value if isinstance(value, list) and option.multiple else [value]
         if isinstance(value, (dict, list)) and values is not value:

@@ -6,7 +6,6 @@ import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
-from difflib import get_close_matches
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -23,6 +22,7 @@ from agalign.cli.results import export, indices, report, verify
 from agalign.cli.terminal import ExitCode, Terminal, examples, printed
 from agalign.values.cores import limit_default_threads
 from agalign.values.processes import silence_libraries
+from agalign.values.text import did_you_mean
 
 COMMANDS = {
     "align": align,
@@ -108,6 +108,8 @@ def _reworded(error: Any) -> str:
     if type(error).__name__ == "MissingParameter" and param is not None:
         return f"{param.name} is missing"
     text = str(error.message)
+    if type(error).__name__ == "NoSuchOption":
+        text += did_you_mean(error.option_name, error.possibilities or ())
     for pattern, words in (
         (r"Value error, ", ""),
         (r"Input should be a valid integer.*", "give a whole number"),
@@ -179,9 +181,9 @@ def _problem_of_folder(arguments: Sequence[str]) -> str:
     files = [Path(a) for a in arguments if not a.startswith("-") and Path(a).is_file()]
     if len(files) > 1 and Path(first) == files[0]:
         return f"{files[0]}, …: give the folder of the images, not the files: agalign {files[0].parent}"
-    similar = get_close_matches(first, COMMANDS, 1, cutoff=0.7)
+    similar = did_you_mean(first, COMMANDS)
     if similar and not Path(first).exists():
-        return f"'{first}' is neither a command nor a folder; did you mean '{similar[0]}'?"
+        return f"'{first}' is neither a command nor a folder{similar}"
     return ""
 
 

@@ -26,12 +26,10 @@ def _report(
     """Rebuild the report and the summary from the sidecars."""
     from agalign.batch.output_folder import locked
     from agalign.cli.run import explain
-    from agalign.errors import InputError
     from agalign.products.report import write_pages
-    from agalign.products.sidecar_file import find_sidecars
+    from agalign.products.sidecar_file import run_sidecars
 
-    if not out.is_dir() or not find_sidecars(out):
-        raise InputError(f"{out}: no sidecars there; give the output folder of a run")
+    run_sidecars(out)
     unreadable: list[str] = []
     with locked(out):
         pages = write_pages(out, unreadable.append)

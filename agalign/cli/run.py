@@ -18,7 +18,7 @@ from agalign.batch.workers import dask_executor
 from agalign.cameras.discover import FolderScan, discover
 from agalign.cli.terminal import MAX_LISTED, ExitCode, Terminal, shown
 from agalign.config import DiscoverOptions, RunOptions, Settings
-from agalign.errors import InputError, NoSuchBandError, OutputError, WorkerError
+from agalign.errors import InputError, OutputError, WorkerError
 from agalign.flight.groups import camera_overviews
 from agalign.products.report import REPORT_FILE, pages_exist, write_pages
 from agalign.products.report.facts import FailureGroup, FailureGroups
@@ -40,8 +40,6 @@ def find_captures(folder: Path, options: DiscoverOptions, terminal: Terminal) ->
     print_found(flight, terminal)
     if flight.captures:
         return flight
-    if any(isinstance(p.error, NoSuchBandError) for p in flight.problems):
-        raise NoSuchBandError(f"{folder}: no capture has a band '{options.reference}'")
     raise InputError(
         f"{folder}: no capture of two or more bands in it; 'agalign info {folder}' lists its files, and why each "
         "kind is not used"

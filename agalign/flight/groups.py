@@ -42,6 +42,21 @@ def is_flight_of(captures: Sequence[Capture], camera: str) -> bool:
     return camera.startswith(reference) and {_with_size(b) for b in _bands_of(captures)[1:]} <= set(model_bands)
 
 
+def difference(learned: str, here: str) -> str:
+    """Return in words what distinguishes two values of `flight_camera`: that of a model, and that of the images."""
+    (camera, bands), (own_camera, own_bands) = map(_camera_and_bands, (learned, here))
+    if camera != own_camera:
+        return f"was learned for {camera}; the images here are of {own_camera}"
+    if bands[0] != own_bands[0]:
+        return f"was learned with the reference {bands[0]}; the reference here is {own_bands[0]}"
+    return f"was learned without {', '.join(b for b in own_bands if b not in bands)}"
+
+
+def _camera_and_bands(text: str) -> tuple[str, list[str]]:
+    camera, _, bands = text.removesuffix("]").partition("[")
+    return camera.strip() or "a camera without tags", bands.split(", ")
+
+
 def flights_of(captures: Iterable[Capture]) -> list[list[Capture]]:
     """Group captures by camera and flight, in their order.
 

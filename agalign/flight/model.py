@@ -91,8 +91,11 @@ def load_model(path: Path, device: Callable[[], torch.device]) -> FlightModel:
     except Exception as error:  # damaged files raise errors of many classes
         if is_out_of_memory(error):
             raise MemoryError(str(error)) from None
-        reason = next(iter(str(error).splitlines()), type(error).__name__)
-        raise InputError(f"{path}: cannot be read as a model ({reason})") from None
+        text = error.strerror if isinstance(error, OSError) else str(error)
+        reason = next(iter((text or "").splitlines()), type(error).__name__)
+        raise InputError(
+            f"{path}: cannot be read as a model ({reason}); give a file of an earlier run's models folder"
+        ) from None
     return replace(model, net=model.net.to(device()))
 
 

@@ -20,6 +20,7 @@ import numpy as np
 from agalign.errors import ConfigurationError, InputError
 from agalign.values.capture import Band
 from agalign.values.image import FloatImage
+from agalign.values.text import did_you_mean
 
 _MAX_LENGTH = 300
 """Characters of a formula: longer ones could exhaust Python's recursion limit."""
@@ -219,7 +220,8 @@ def index_named(name: str) -> Index:
     more = (
         "or a name in the catalogue of spyndex" if catalogue else "or install more with pip install 'agalign[indices]'"
     )
-    raise ConfigurationError(f"unknown index '{name}'; choose from {', '.join(INDICES)}, {more}")
+    similar = did_you_mean(wanted, [*INDICES, *catalogue])
+    raise ConfigurationError(f"unknown index '{name}'{similar}; choose from {', '.join(INDICES)}, {more}")
 
 
 def index_of_formula(text: str) -> Index:

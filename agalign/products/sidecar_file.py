@@ -89,7 +89,8 @@ def run_sidecars(out: Path) -> list[Path]:
     """Return the sidecars below the output folder of a run. Raises InputError if there are none."""
     sidecars = find_sidecars(out) if out.is_dir() else []
     if not sidecars:
-        raise InputError(f"{out}: no sidecars there; give the output folder of a run")
+        what = "no sidecars there" if out.is_dir() else "is not a folder" if out.exists() else "does not exist"
+        raise InputError(f"{out}: {what}; give the output folder of a run")
     return sidecars
 
 

@@ -1,12 +1,28 @@
 """Escaping of texts from files for terminals and spreadsheets."""
 
 import unicodedata
+from collections.abc import Iterable
 from contextlib import suppress
+from difflib import SequenceMatcher
+
+_MIN_SIMILARITY = 0.7
+"""Of a suggestion: a quarter of the letters of a word of four may differ."""
 
 
 def counted(number: int, what: str) -> str:
     """Return a number with its noun: 1 capture, 2 captures."""
     return f"{number:,} {what}{'' if number == 1 else 's'}"
+
+
+def did_you_mean(text: str, choices: Iterable[str]) -> str:
+    """Return " (did you mean 'x'?)" with the choice that is most similar, ignoring case; empty if none is similar."""
+
+    def similarity(choice: str) -> float:
+        return SequenceMatcher(None, text.lower(), choice.lower()).ratio()
+
+    # `difflib.get_close_matches` returns the last of equally similar words: ndwi for nvdi.
+    best = max(choices, key=similarity, default="")
+    return f" (did you mean '{best}'?)" if best and similarity(best) >= _MIN_SIMILARITY else ""
 
 
 def escape_controls(text: str) -> str:

@@ -95,9 +95,20 @@ def test_a_model_is_used_again(
 
 def test_a_model_of_another_camera_or_of_no_use_is_refused(flight: Path, model: FlightModel, tmp_path: Path) -> None:
     path = tmp_path / "m.safetensors"
-    save_model(replace(model, camera="Another 1 [Green 10x10]"), path)
-    with pytest.raises(agalign.ConfigurationError, match=r"m\.safetensors: was learned for Another 1"):
-        run(flight, tmp_path / "out", model=path)
+    camera, _, bands = model.camera.removesuffix("]").partition(" [")
+    reference, first, *others = bands.split(", ")
+    for other, difference in (
+        ("Another 1 [Green 10x10]", f"was learned for Another 1; the images here are of {camera}"),
+        (
+            f"{camera} [{first}, {reference}]",
+            f"was learned with the reference {first}; the reference here is {reference}",
+        ),
+        (f"{camera} [{reference}, {first}]", f"was learned without {', '.join(others)}"),
+    ):
+        save_model(replace(model, camera=other), path)
+        with pytest.raises(agalign.ConfigurationError) as refused:
+            run(flight, tmp_path / "out", model=path)
+        assert str(refused.value) == f"{path}: {difference}; leave --model out"
     alone = agalign.Settings(flight=agalign.FlightSettings(together=False))
     with pytest.raises(agalign.ConfigurationError, match="needs one network per flight"):
         run(flight, tmp_path / "out", alone, model=path)

@@ -56,7 +56,7 @@ def test_a_file_sets_options_and_the_command_line_comes_first(tmp_path: Path, se
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        ('radiometri = "sun"', "no option 'radiometri'; did you mean 'radiometry'?"),
+        ('radiometri = "sun"', "no option 'radiometri' (did you mean 'radiometry'?)"),
         ("x =", "cannot be read as TOML"),
         ('crop = "round"', "'round' is unknown; choose from flight"),
         ("[align]\njobs = 1", "no option 'align'"),
