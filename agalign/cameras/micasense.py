@@ -17,7 +17,7 @@ from agalign.cameras import pix4d
 from agalign.cameras.base import FULL_SCALE, Camera, is_thermal, rays_to_rig, rotation
 from agalign.cameras.light_sensor import horizontal_irradiance, sun_position
 from agalign.cameras.metadata import Tags, finite
-from agalign.cameras.xmp import names_in
+from agalign.cameras.xmp import Packet, names_in
 from agalign.values.capture import Band, Pose, Radiometry
 
 _MICASENSE, _DLS = "micasense.com/MicaSense", "micasense.com/DLS"
@@ -38,6 +38,16 @@ _MAX_HORIZONTAL_ERROR = 0.01
 
 class _TagTransfer(pix4d.TagTransfer):
     radiometry = pix4d.TagTransfer.radiometry | names_in(_MICASENSE, "RadiometricCalibration DarkRowValue")
+
+    def put_radiometry(
+        self, packet: Packet, tags: Tags, vignetting: pix4d.GridVignetting | None, *, radiometry: bool
+    ) -> None:
+        """Also add the horizontal irradiance under the names that OpenDroneMap reads, with its unit."""
+        super().put_radiometry(packet, tags, vignetting, radiometry=radiometry)
+        irradiance = None if radiometry else _irradiance(tags)
+        if irradiance is not None:
+            packet.add((pix4d.NAMESPACE, "HorizontalIrradiance"), pix4d.number_text(irradiance[0]))
+            packet.add((pix4d.NAMESPACE, "IrradianceScaleToSIUnits"), pix4d.number_text(irradiance[1]))
 
 
 class MicaSense(Camera):
@@ -101,12 +111,13 @@ def _radiometry(tags: Tags) -> Radiometry | None:
         k if has_vignetting else (),
         True,
         a[1] / exposure_s - a[2],
-        (math.pi / irradiance, "reflectance") if irradiance else None,
+        (math.pi / math.prod(irradiance), "reflectance") if irradiance else None,
     )
 
 
-def _irradiance(tags: Tags) -> float | None:
-    """Irradiance on a horizontal plane, W / m^2 / nm; None if there is no plausible one.
+def _irradiance(tags: Tags) -> tuple[float, float] | None:
+    """(irradiance on a horizontal plane in the unit of the tags, this unit in W / m^2 / nm); None if there is no
+    plausible one.
 
     Older sensors measure only in their own plane: the time, the place and the attitude then give the horizontal one.
     """
@@ -120,7 +131,7 @@ def _irradiance(tags: Tags) -> float | None:
         value = tags.number(pix4d.NAMESPACE, "Irradiance") if value is None else value
         if value is not None and sun is not None:
             value = horizontal_irradiance(value, _sensor_attitude_deg(tags), sun)
-    return None if value is None or not value > 0 else value * unit
+    return None if value is None or not value > 0 else (value, unit)
 
 
 def _measured_horizontal(tags: Tags, sun: tuple[float, float] | None) -> float | None:

@@ -3,13 +3,16 @@
 `TagTransfer` converts them for a band that is written on the reference's grid; vendors with other tags subclass it.
 """
 
-import math
-from collections.abc import Callable, Iterable, Sequence
-from dataclasses import replace
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
 
 from agalign.cameras.metadata import Tags
 from agalign.cameras.xmp import Name, Packet, names_in
-from agalign.values.capture import Band, Panel, Pose
+from agalign.pixels.radiometry import is_physical
+from agalign.values.capture import Band, Panel, Pose, Radiometry
+from agalign.values.geometry import Points
 from agalign.values.image import OutputGrid
 from agalign.values.lens import Lens
 
@@ -20,11 +23,6 @@ _MAX_FOCAL_LENGTH_MM = 100.0
 """Larger numbers are px: lenses of drone cameras have 2 to 50 mm, or 300 px and more."""
 _MAX_OFFSET_M = 0.5
 """Larger numbers are mm: no rig of a drone is half a metre wide."""
-_MAX_MAGNIFICATION = 1.02
-"""Vignetting is removed if the bands' scales differ by more: its polynomial in r would be wrong at the corners."""
-
-FromSource = Callable[[float, float], tuple[float, float]]
-"""Maps a pixel (x, y) of the band's own file to the reference's pixels; nan if the mapping has no inverse there."""
 
 
 # ---- reading
@@ -146,6 +144,47 @@ def _panel_corners(tags: Tags, size_px: tuple[int, int]) -> tuple[tuple[float, f
 # ---- writing on the reference's grid
 
 
+@dataclass(frozen=True)
+class GridVignetting:
+    """Vignetting 1 + k1 r + k2 r^2 + … of a band as a polynomial on the output grid."""
+
+    centre_px: tuple[float, float]
+    """r is the distance from this pixel of the output."""
+    coefficients: tuple[float, ...]
+    error: float
+    """p95 of its relative error."""
+
+
+def vignetting_of(tags: Tags, size_px: tuple[int, int]) -> Radiometry | None:
+    """Return the correction of the vignetting alone, of values above the black level, by Camera:VignettingCenter and
+    VignettingPolynomial of a band of (width, height); None if they are missing or damaged.
+    """
+    centre, k = tags.numbers(NAMESPACE, "VignettingCenter"), tags.numbers(NAMESPACE, "VignettingPolynomial")
+    if len(centre) != 2 or not k or not all(0 <= c <= size for c, size in zip(centre, size_px, strict=True)):
+        return None
+    result = Radiometry("relative radiance", tags.black_level or 0.0, 1.0, 1.0, (centre[0], centre[1]), k)
+    return result if is_physical(result, size_px) else None
+
+
+def vignetting_on_grid(vignetting: Radiometry, output_px: Points, positions_px: Points) -> GridVignetting:
+    """Return the polynomial of a band's vignetting on the output grid, fitted by least squares to pixels (n, 2) of the
+    output and their positions (n, 2) in the band's file; n is at least 3.
+    """
+    to_output, *_ = np.linalg.lstsq(np.column_stack([positions_px, np.ones(len(positions_px))]), output_px)
+    centre_px = np.append(vignetting.vignetting_centre_px, 1.0) @ to_output
+    r, own_r = (
+        np.linalg.norm(points - centre, axis=-1)
+        for points, centre in ((output_px, centre_px), (positions_px, vignetting.vignetting_centre_px))
+    )
+    falloff = np.polynomial.polynomial.polyval(own_r, (1.0, *vignetting.vignetting))
+    exponents = np.arange(1, len(vignetting.vignetting) + 1)
+    # In units of the largest r, relative to the falloff: errors of corrected pixels.
+    terms, wanted = (r[:, None] / r.max()) ** exponents / falloff[:, None], 1.0 - 1.0 / falloff
+    k, *_ = np.linalg.lstsq(terms, wanted)
+    error = float(np.percentile(np.abs(terms @ k - wanted), 95))
+    return GridVignetting((centre_px[0], centre_px[1]), tuple((k / r.max() ** exponents).tolist()), error)
+
+
 class TagTransfer:
     """Conversion of XMP values for a band that is written on the reference's grid."""
 
@@ -197,28 +236,19 @@ class TagTransfer:
             point_px = grid.px(*point_px)
         packet.put((NAMESPACE, "PrincipalPoint"), [number_text(v / (density * grid.scale.mean)) for v in point_px])
 
-    def put_vignetting(
-        self, packet: Packet, tags: Tags, grid: OutputGrid, from_source: FromSource, *, radiometry: bool
+    def put_radiometry(
+        self, packet: Packet, tags: Tags, vignetting: GridVignetting | None, *, radiometry: bool
     ) -> None:
-        """Convert the centre and polynomial of the vignetting to output pixels; `tags` are the band's own.
-
-        With `radiometry` they are removed, because the pixels have been corrected.
+        """Replace the vignetting; `tags` are the band's own. None removes it, and `radiometry` also the other values
+        that have been applied to the pixels.
         """
-        centre, k = tags.numbers(NAMESPACE, "VignettingCenter"), tags.numbers(NAMESPACE, "VignettingPolynomial")
         if radiometry:
             packet.remove(self.radiometry)
-            return
-        if len(centre) != 2:
-            return
-        new_centre, next_pixel = from_source(*centre), from_source(centre[0] + 1, centre[1])
-        magnification = math.dist(new_centre, next_pixel)
-        # The condition is also true for nan.
-        if not 1 / _MAX_MAGNIFICATION < magnification < _MAX_MAGNIFICATION:
+        elif vignetting is None:
             packet.remove(names_in(NAMESPACE, "VignettingCenter VignettingPolynomial"))
-            return
-        packet.put((NAMESPACE, "VignettingCenter"), [number_text(v) for v in grid.px(*new_centre)])
-        scaled = [v / (grid.scale.mean * magnification) ** i for i, v in enumerate(k, start=1)]
-        packet.put((NAMESPACE, "VignettingPolynomial"), [f"{v:.9e}" for v in scaled])
+        else:
+            packet.put((NAMESPACE, "VignettingCenter"), [number_text(v) for v in vignetting.centre_px])
+            packet.put((NAMESPACE, "VignettingPolynomial"), [f"{v:.9e}" for v in vignetting.coefficients])
 
     def is_rotated(self, tags: Tags) -> bool:
         """Return True if the principal point refers to the image rotated by 180 degrees: Orientation 3 of Exif."""

@@ -11,7 +11,7 @@ from PIL.ExifTags import Base
 
 from agalign.cameras import camera_of
 from agalign.cameras.metadata import finite, read_tags
-from agalign.cameras.pix4d import FromSource
+from agalign.cameras.pix4d import GridVignetting
 from agalign.cameras.tiff_directory import (
     EXIF,
     GPS,
@@ -58,11 +58,12 @@ def capture_tags(reference: Band, grid: OutputGrid) -> TransferredTags:
 
 
 def band_tags(
-    source: Path, reference: Band, grid: OutputGrid, from_source: FromSource, *, radiometry: bool = False
+    source: Path, reference: Band, grid: OutputGrid, vignetting: GridVignetting | None, *, radiometry: bool = False
 ) -> TransferredTags:
     """Return the tags for a file with aligned bands from the file `source`.
 
-    With `radiometry` the pixels are corrected for black level, vignetting and exposure, and their tags are left out.
+    `vignetting` is that of the band; None if the pixels are corrected for it. With `radiometry` they are also corrected
+    for black level and exposure, and all their tags are left out.
     """
     own, of_reference = _directories(source), _directories(reference.path)
     black_level: set[int] = set() if radiometry else {Base.BlackLevelRepeatDim, Base.BlackLevel}
@@ -76,7 +77,7 @@ def band_tags(
         transfer = camera_of(reference_tags).tag_transfer
         transfer.put_geometry(packet, reference_packet, reference, reference_tags, grid)
         transfer = camera_of(own_tags).tag_transfer
-        transfer.put_vignetting(packet, own_tags, grid, from_source, radiometry=radiometry)
+        transfer.put_radiometry(packet, own_tags, vignetting, radiometry=radiometry)
         if serialised := packet.serialised():
             first[XMP] = byte_string(serialised)
     return TransferredTags(first, _on_grid(exif, of_reference[EXIF], grid), own[GPS])

@@ -1,24 +1,31 @@
 """The rasters of the aligned bands: a stack, or a file for each input file for photogrammetry programs."""
 
-import math
 from collections import Counter
 from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
-from agalign.cameras.pix4d import FromSource
+from agalign.cameras.metadata import read_tags
+from agalign.cameras.pix4d import GridVignetting, vignetting_of, vignetting_on_grid
 from agalign.cameras.tag_transfer import band_tags, capture_tags
 from agalign.config import WriteSettings
+from agalign.errors import UnreadableFileError
 from agalign.pixels.raster import suffix_format
-from agalign.products.layout import Layer
+from agalign.products.layout import Layer, is_inside
 from agalign.products.product import CapturePaths, Product, ProductContext, StacAsset, WrittenFile
 from agalign.products.raster_file import media_type, write_raster
 from agalign.values import geometry
-from agalign.values.capture import Capture
+from agalign.values.capture import Band, Capture, Radiometry
 from agalign.values.files import file_name
 from agalign.values.image import OutputGrid
-from agalign.values.mapping import PixelMapping
+
+_MAX_VIGNETTING_ERROR = 0.01
+"""Limit for the tags of aligned files, p95 of corrected pixels: a fifth of the accuracy of the cameras' calibration."""
+_MIN_POINTS = 30
+"""Pixels of the lattice of 25 x 19 that must be inside a band: a polynomial has six coefficients."""
 
 
 class BandFiles(Product):
@@ -38,21 +45,31 @@ class BandFiles(Product):
     def write(self, context: ProductContext) -> list[WrittenFile]:
         """Write the files of all bands with pixels."""
         names = band_file_names(context.capture)
+        layers = [layer for layer in context.layers if not layer.is_gap]
+        vignettings = {} if context.write_settings.radiometry != "off" else _vignettings(layers, context.grid)
+        if any(v.error > _MAX_VIGNETTING_ERROR for v in vignettings.values()):
+            # A program that corrects some bands of a capture only would change its indices.
+            layers = [replace(layer, vignetting=_correction(layer.band)) for layer in layers]
+            vignettings = {}
         by_file: dict[Path, list[Layer]] = {}
-        for layer in context.layers:
-            if not layer.is_gap:
-                by_file.setdefault(names[layer.band.name], []).append(layer)
+        for layer in layers:
+            by_file.setdefault(names[layer.band.name], []).append(layer)
         return [
-            self._write_file(context, name, by_file[name]) for name in dict.fromkeys(names.values()) if name in by_file
+            self._write_file(context, name, by_file[name], vignettings.get(by_file[name][0].band.path))
+            for name in dict.fromkeys(names.values())
+            if name in by_file
         ]
 
-    def _write_file(self, context: ProductContext, name: Path, layers: list[Layer]) -> WrittenFile:
+    def _write_file(
+        self, context: ProductContext, name: Path, layers: list[Layer], vignetting: GridVignetting | None
+    ) -> WrittenFile:
         settings, grid, path = context.write_settings, context.grid, context.paths.folder / name
-        reference, from_source = context.capture.reference, _from_source(layers[0], grid)
-        tags = band_tags(layers[0].band.path, reference, grid, from_source, radiometry=settings.radiometry != "off")
+        reference, is_raw = context.capture.reference, settings.radiometry == "off"
+        tags = band_tags(layers[0].band.path, reference, grid, vignetting, radiometry=not is_raw)
         nodata = write_raster(context.capture, layers, grid, path, settings, tags)
         asset = StacAsset(name.as_posix(), media_type(settings), ("data",))
-        return WrittenFile(self.kind, path, asset, tuple(layer.band.name for layer in layers), nodata)
+        bands, is_flat = tuple(layer.band.name for layer in layers), any(layer.vignetting for layer in layers)
+        return WrittenFile(self.kind, path, asset, bands, nodata, is_flat=is_flat)
 
 
 def band_file_names(capture: Capture) -> dict[str, Path]:
@@ -86,26 +103,24 @@ def _has_namesakes_in_folders(files: Sequence[Path]) -> bool:
     return len({p.stem for p in files}) < len(files) and len({p.parent for p in files}) > 1
 
 
-def _from_source(layer: Layer, grid: OutputGrid) -> FromSource:
-    """Return the mapping from pixels of the layer's file to pixels of the reference, inverted by Newton's method."""
-    to_file = PixelMapping(geometry.identity()) if layer.mapping is None else layer.mapping
-    centre = np.array([grid.x0 + grid.width / 2, grid.y0 + grid.height / 2])
+def _vignettings(layers: Sequence[Layer], grid: OutputGrid) -> dict[Path, GridVignetting]:
+    """The vignetting of the files of layers on the output grid; none for files without its tags and without pixels."""
+    result = {}
+    for layer in layers:
+        correction = _correction(layer.band)
+        output_px = geometry.lattice(grid.width, grid.height, 25, 19)
+        positions_px = layer.positions(output_px, grid)
+        inside = is_inside(positions_px, layer.band)
+        if correction is not None and np.count_nonzero(inside) >= _MIN_POINTS:
+            result[layer.band.path] = vignetting_on_grid(correction, output_px[inside], positions_px[inside])
+    return result
 
-    def from_source(x: float, y: float) -> tuple[float, float]:
-        position = centre
-        try:
-            for _ in range(20):  # it converges in 3 to 5 steps through a lens model
-                mapped = to_file(position)
-                jacobian = np.stack([to_file(position + d) - mapped for d in np.eye(2)], axis=-1)
-                position = position + np.linalg.solve(jacobian, np.array([x, y]) - mapped)
-        except np.linalg.LinAlgError:
-            return math.nan, math.nan
-        if not np.abs(to_file(position) - (x, y)).max() < 0.1:  # it did not converge; nan fails too
-            return math.nan, math.nan
-        x_px, y_px = grid.scale.inverse.positions(position).tolist()
-        return x_px, y_px
 
-    return from_source
+def _correction(band: Band) -> Radiometry | None:
+    """The correction of a band's vignetting by its tags."""
+    with suppress(UnreadableFileError):
+        return vignetting_of(read_tags(band.path), band.size_px)
+    return None
 
 
 class Stack(Product):

@@ -17,7 +17,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from agalign.cameras import known_cameras
+from agalign.cameras import known_cameras, pix4d
+from agalign.cameras.metadata import read_tags
 from agalign.cameras.read_files import ImageFile, natural_order, read_file
 from agalign.config import DiscoverOptions
 from agalign.errors import ConfigurationError, InputError, OutputError, SidecarError
@@ -30,6 +31,7 @@ from agalign.values.choices import ExportProgram
 from agalign.values.files import check_inside, complete_file, file_name, write_text
 from agalign.values.geometry import Matrix, Points
 from agalign.values.lens import Lens
+from agalign.values.text import counted
 
 _NOTES: dict[ExportProgram, str] = {
     "odm": """\
@@ -135,7 +137,7 @@ def export(
         cells = ((*row[:3], f"{row[3]:.4f}") for row in rows)
         write_csv(report.files[-1], ("capture", "band", "status", "max_error_px"), cells)
     report.captures = len(good)
-    report.notes = _notes(program, good[0].sidecar, rows)
+    report.notes = _notes(program, good, report.files, rows)
     write_text(target / "README.txt", "\n".join(report.notes) + "\n")
     return report
 
@@ -192,18 +194,39 @@ def _placed(source: Path, target: Path, *, copy: bool) -> Path:
     return target
 
 
-def _notes(program: ExportProgram, sidecar: Sidecar, rows: Sequence[_Row]) -> list[str]:
-    radiometry = None if sidecar.output is None else sidecar.output.radiometry
-    calibration, contents = "none", f"{radiometry}: OpenDroneMap must not calibrate them again."
-    if radiometry is None:
-        calibration = "camera+sun"
-        contents = "raw numbers: camera+sun needs the light sensor's tags; without them use camera."
-    facts = {"reference": sidecar.reference.band, "calibration": calibration, "contents": contents}
+def _notes(
+    program: ExportProgram, captures: Sequence[AlignedCapture], files: Sequence[Path], rows: Sequence[_Row]
+) -> list[str]:
+    first, outputs = captures[0].sidecar, [c.sidecar.output for c in captures if c.sidecar.output is not None]
+    facts = {"reference": first.reference.band}
+    if program == "odm":
+        radiometry = None if first.output is None else first.output.radiometry
+        facts |= _of_raw_numbers(files[: len(first.bands)]) if radiometry is None else _of_calibrated(radiometry)
     if rows:
         capture, band, _, error_px = max(rows, key=lambda row: row[3])
         largest = f"Largest distance from the complete mapping: {error_px:.2f} px ({capture} {band})."
         facts["largest_distance"] = largest
-    return _NOTES[program].format(**facts).splitlines()
+    notes = _NOTES[program].format(**facts).splitlines()
+    flat = sum(output.vignetting_corrected for output in outputs)
+    if flat and not rows:
+        notes.append(f"The vignetting of {counted(flat, 'capture')} is corrected in the pixels of all bands.")
+    return notes
+
+
+def _of_calibrated(radiometry: str) -> dict[str, str]:
+    return {"calibration": "none", "contents": f"{radiometry}: OpenDroneMap must not calibrate them again."}
+
+
+def _of_raw_numbers(files: Sequence[Path]) -> dict[str, str]:
+    """The option of OpenDroneMap for files with raw numbers. It reads the irradiance of a light sensor under this name
+    only, and without its unit as W / m^2 / nm.
+    """
+    names = (pix4d.NAMESPACE, "HorizontalIrradiance"), (pix4d.NAMESPACE, "IrradianceScaleToSIUnits")
+    tags = (read_tags(path) for path in files)
+    if all(t.number(*name) for t in tags for name in names if t.text(pix4d.NAMESPACE, "BandName") != "LWIR"):
+        return {"calibration": "camera+sun", "contents": "raw numbers, and the irradiance of the light sensor."}
+    contents = "raw numbers without an irradiance; for reflectance align with --radiometry auto or panel."
+    return {"calibration": "camera", "contents": contents}
 
 
 def write_opencv(captures: Sequence[AlignedCapture], target: Path) -> tuple[list[Path], list[_Row]]:

@@ -90,6 +90,7 @@ def _output(context: ProductContext) -> dict[str, Any]:
         "crop": (grid.x0, grid.y0, grid.width, grid.height),
         "scale": grid.scale,
         "undistorted": grid.undistorted,
+        "vignetting_corrected": any(file.is_flat for file in context.written),
         "nodata": values.pop() if len(values) == 1 else None,
     }
 

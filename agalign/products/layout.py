@@ -13,7 +13,8 @@ from agalign.flight.rig import Rig
 from agalign.flight.rig_prediction import extreme_mappings
 from agalign.values import geometry
 from agalign.values.alignment import Alignment
-from agalign.values.capture import Band, Capture
+from agalign.values.capture import Band, Capture, Radiometry
+from agalign.values.geometry import Points
 from agalign.values.image import Mask, OutputGrid, Tile
 from agalign.values.mapping import PixelMapping
 from agalign.values.pixel_units import SAME_PIXELS, FixedFilePx, PixelScale
@@ -34,6 +35,8 @@ class Layer:
     moving band without pixels.
     """
     is_reference: bool = False
+    vignetting: Radiometry | None = None
+    """Correction of the vignetting of raw numbers, if their file has no tags for it."""
 
     @property
     def is_gap(self) -> bool:
@@ -43,7 +46,12 @@ class Layer:
     @property
     def is_copied(self) -> bool:
         """True if the pixels are copied from the file."""
-        return self.mapping is None and self.is_reference
+        return self.mapping is None and self.is_reference and self.vignetting is None
+
+    def positions(self, output_px: Points, grid: OutputGrid) -> Points:
+        """Return the positions (n, 2) in the layer's file of pixels (n, 2) of the output."""
+        on_frame = np.add(output_px, (grid.x0, grid.y0))
+        return on_frame if self.mapping is None else self.mapping(on_frame)
 
 
 def output_layers(

@@ -79,6 +79,8 @@ class WrittenFile:
     """Nodata value of a file of aligned pixels."""
     preview: PreviewPart | None = None
     """Layout of the preview; None for other files."""
+    is_flat: bool = False
+    """The vignetting of raw numbers is corrected in the pixels."""
 
     @cached_property
     def sha256(self) -> str:

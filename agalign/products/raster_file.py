@@ -113,6 +113,7 @@ def _tags(capture: Capture, layers: Sequence[Layer], *, raw: bool) -> dict[str, 
         "REFERENCE_BAND": capture.reference.name,
         "RADIOMETRY": " and ".join(dict.fromkeys(r.quantity for r in known)),
         "RADIOMETRY_SOURCE": " and ".join(dict.fromkeys(r.source for r in known)),
+        "VIGNETTING": "corrected" if any(layer.vignetting for layer in layers) else "",
     }
     return tags | georeference_tags(capture.reference.georeference)
 
@@ -167,8 +168,10 @@ def _tile_of(layer: Layer, tile: Tile, settings: WriteSettings) -> tuple[Pixels 
     """A layer's pixels (height, width) on a tile and their mask; no pixels for a layer without any."""
     if layer.is_gap:
         return None, np.zeros((tile.height, tile.width), dtype=bool)
-    radiometry = None if settings.radiometry == "off" else layer.band.radiometry
+    radiometry = layer.vignetting if settings.radiometry == "off" else layer.band.radiometry
     pixels, valid = layer_pixels(layer, tile, settings.interpolation, radiometry)
+    if layer.vignetting is not None:
+        pixels = as_type(pixels.astype(np.float32) + layer.vignetting.black_level, np.dtype(layer.band.dtype))
     if settings.fill_occluded and layer.mapping is not None:
         positions = layer.mapping.positions(tile)
         fillable = layer.mapping.hidden(tile) & is_inside(positions, layer.band)

@@ -486,6 +486,8 @@ class OutputPart(_Part):
     """Output pixels per reference pixel along x and y."""
     undistorted: bool = False
     """True for the lens-corrected grid of the reference."""
+    vignetting_corrected: bool = False
+    """True if vignetting is corrected in the files of single bands, as no polynomial on their grid describes it."""
     nodata: float | str | None
     """Nodata value of the stack, or of all single bands; null if they differ. Integers without one in the input: 0,
     or another value that no valid pixel has.

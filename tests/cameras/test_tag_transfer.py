@@ -1,7 +1,6 @@
 """Aligned bands as other programs see them."""
 
 import json
-import math
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,7 +12,7 @@ from agalign.cameras.base import Camera
 from agalign.cameras.metadata import Tags, read_tags
 from agalign.cameras.micasense import MicaSense
 from agalign.cameras.parrot import Sequoia
-from agalign.cameras.pix4d import NAMESPACE
+from agalign.cameras.pix4d import NAMESPACE, GridVignetting, vignetting_of
 from agalign.cameras.tag_transfer import band_tags
 from agalign.cameras.tiff_directory import (
     EXIF,
@@ -87,7 +86,7 @@ UNCHANGED = OutputGrid(0, 0, *SIZE)
 def transferred(source: Path, reference: Band | Path, grid: OutputGrid, out: str = "out.tif", **options: bool) -> Path:
     """Write a file with the tags of the source on a grid of the reference."""
     band = Band("reference", reference, 1, *SIZE, "uint16") if isinstance(reference, Path) else reference
-    tags = band_tags(source, band, grid, lambda x, y: (x, y), **options)
+    tags = band_tags(source, band, grid, GridVignetting((80, 60), (1e-4,), 0), **options)
     path = write_file(source.parent / out, shape=(grid.height, grid.width))
     add_directories(path, tags.first, tags.exif, tags.gps)
     return path
@@ -149,7 +148,7 @@ def test_radiometry_takes_what_it_used(tmp_path: Path) -> None:
 def test_a_source_that_cannot_be_followed_gives_nothing(tmp_path: Path) -> None:
     (tmp_path / "broken.tif").write_bytes(b"II*\0\xff\xff\xff\xff")
     band = Band("broken", tmp_path / "broken.tif", 1, 9, 9, "uint16")
-    tags = band_tags(tmp_path / "broken.tif", band, OutputGrid(0, 0, 9, 9), lambda x, y: (x, y))
+    tags = band_tags(tmp_path / "broken.tif", band, OutputGrid(0, 0, 9, 9), None)
     assert (tags.first, tags.exif, tags.gps) == ({}, {}, {})
     assert text("x").count == 2
 
@@ -181,6 +180,6 @@ def test_a_centre_of_vignetting_that_lies_nowhere_is_left_out(tmp_path: Path, ce
     values = {(NAMESPACE, "VignettingCenter"): centre, (NAMESPACE, "VignettingPolynomial"): ("1e-4",)}
     first = {271: text("MicaSense"), XMP: byte_string(packet(values, "elements"))}
     path = write_file(tmp_path / "IMG_0001_2.tif", first)
-    band = Band("Green", path, 1, *SIZE, "uint16")
-    tags = band_tags(path, band, OutputGrid(0, 0, *SIZE), lambda x, y: (math.nan, math.nan))
-    assert b"VignettingCenter" not in tags.first[XMP].data or centre[0] == "nan"
+    assert vignetting_of(read_tags(path), SIZE) is None
+    tags = band_tags(path, Band("Green", path, 1, *SIZE, "uint16"), OutputGrid(0, 0, *SIZE), None)
+    assert b"Vignetting" not in tags.first[XMP].data

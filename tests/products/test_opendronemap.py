@@ -1,0 +1,122 @@
+"""Exports as OpenDroneMap reads them: `tests/odm.py` follows its rules."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from synthetic_flights.cameras import MAVIC, MAVIC_3M, SENTERA_6X
+from synthetic_flights.troubles import make_two_headings
+
+import agalign
+from agalign.cameras.pix4d import vignetting_on_grid
+from agalign.products import aligned_files
+from agalign.products.export import export
+from agalign.products.sidecar_file import find_sidecars
+from agalign.synthetic.cameras import REDEDGE
+from agalign.synthetic.rig import CameraSpec
+from agalign.values import geometry
+from agalign.values.capture import Radiometry
+from agalign.values.choices import ExportProgram
+
+from ..conftest import Shared, seeded
+from ..odm import OdmPhoto, pixels_in
+
+CAMERAS = {"RedEdge": REDEDGE, "M3M calibrated": MAVIC, "M3M": MAVIC_3M, "6X": SENTERA_6X}
+IRRADIANCE = 0.8
+"""Of the synthetic flight, W / m^2 / nm."""
+
+
+def exported(camera: CameraSpec, shared: Shared, out: Path, program: ExportProgram, **write: object) -> list[OdmPhoto]:
+    """The files of an export of one capture, the reference first."""
+    name = next(name for name, one in CAMERAS.items() if one is camera)
+    images = shared(
+        f"odm {name}", lambda folder: make_two_headings(folder, 1, (480, 360), camera=camera, line=1, lakes=False)
+    )
+    agalign.align_folder(images, out / "out", settings=seeded(layout="bands", **write))
+    for path in find_sidecars(out / "out"):
+        path.write_text(path.read_text().replace('"degraded"', '"ok"'))
+    report = export(out / "out", out / "export", program)
+    return [OdmPhoto(path) for path in report.files]
+
+
+def option(out: Path) -> str:
+    """The value of --radiometric-calibration that the export recommends."""
+    return (out / "export" / "README.txt").read_text().partition("--radiometric-calibration ")[2].split()[0]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", list(CAMERAS))
+def test_bands_are_one_camera_and_one_capture(name: str, shared: Shared, tmp_path: Path) -> None:
+    photos = exported(CAMERAS[name], shared, tmp_path, "odm")
+    assert len(photos) >= 4
+    assert len({p.camera_id for p in photos}) == 1
+    assert len({p.capture_uuid for p in photos}) == 1
+    assert len({p.band_name for p in photos}) == len(photos)
+    assert len({len(p.vignetting[1]) for p in photos}) == 1
+    with_sun = option(tmp_path) == "camera+sun"
+    assert with_sun == all(p.horizontal_irradiance is not None for p in photos) == (name == "RedEdge")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("program", ["odm", "metashape", "pix4d"])
+def test_its_reflectance_is_that_of_this_program(program: ExportProgram, shared: Shared, tmp_path: Path) -> None:
+    """Vignetting on the aligned grid, black level, exposure, gain, calibration and irradiance."""
+    photos = exported(REDEDGE, shared, tmp_path, program)
+    expected = exported(REDEDGE, shared, tmp_path / "by agalign", program, radiometry="sun")
+    check_reflectance(photos, expected)
+    assert all(p.vignetting[1] for p in photos)
+    assert not any(p.vignetting[1] or p.xmp("Camera:HorizontalIrradiance") for p in expected)
+
+
+@pytest.mark.slow
+def test_vignetting_follows_pixels_without_distortion(shared: Shared, tmp_path: Path) -> None:
+    photos = exported(REDEDGE, shared, tmp_path, "odm", undistort=True)
+    assert all(p.vignetting[1] for p in photos)
+    check_reflectance(photos, exported(REDEDGE, shared, tmp_path / "r", "odm", undistort=True, radiometry="sun"))
+
+
+@pytest.mark.slow
+def test_vignetting_that_no_polynomial_follows_is_corrected_in_all_bands(
+    shared: Shared, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(aligned_files, "_MAX_VIGNETTING_ERROR", 1e-7)  # of the reference, which is not moved: 1e-16
+    photos = exported(REDEDGE, shared, tmp_path, "odm")
+    assert not any(p.vignetting[1] or b"Vignetting" in p.path.read_bytes() for p in photos)
+    check_reflectance(photos, exported(REDEDGE, shared, tmp_path / "r", "odm", radiometry="sun"))
+    notes = (tmp_path / "export" / "README.txt").read_text()
+    assert "The vignetting of 1 capture is corrected in the pixels of all bands." in notes
+    assert {pixels_in(p.path).dtype.name for p in photos} == {"uint16"}
+
+
+def check_reflectance(photos: list[OdmPhoto], expected: list[OdmPhoto]) -> None:
+    assert [p.path.name for p in photos] == [p.path.name for p in expected]
+    for photo, other in zip(photos, expected, strict=True):
+        assert photo.horizontal_irradiance == pytest.approx(IRRADIANCE)
+        values = pixels_in(other.path)
+        valid = (values > 0.02) & (pixels_in(photo.path) > 0)
+        errors = np.abs(photo.reflectance()[valid] / values[valid] - 1)
+        assert np.median(errors) < 0.002, photo.band_name
+        assert np.percentile(errors, 99) < 0.01, photo.band_name
+
+
+OUTPUT_PX = geometry.lattice(480, 360, 25, 19)
+VIGNETTING = Radiometry("relative radiance", 0.0, 1.0, 1.0, (243.0, 176.0), (0.0, -4e-6, 0.0))
+
+
+@pytest.mark.parametrize("bump_px", [0.0, 8.0])
+def test_a_disturbed_centre_does_not_matter(bump_px: float) -> None:
+    """Relief or a field around the centre pixel: a scale there says nothing about the corners."""
+    distance_px = np.linalg.norm(OUTPUT_PX - (240, 180), axis=1, keepdims=True)
+    positions_px = 1.01 * OUTPUT_PX + (5.0, -3.0) + bump_px * np.exp(-((distance_px / 20) ** 2)) * (1.0, 0.3)
+    result = vignetting_on_grid(VIGNETTING, OUTPUT_PX, positions_px)
+    assert result.error < 0.002
+    assert result.centre_px == pytest.approx(((243 - 5) / 1.01, (176 + 3) / 1.01), abs=0.3)
+    at_px = 250.0
+    falloff = np.polynomial.polynomial.polyval(at_px, (1.0, *result.coefficients))
+    assert falloff == pytest.approx(1 - 4e-6 * (1.01 * at_px) ** 2, abs=0.002)
+
+
+def test_large_relief_is_no_polynomial() -> None:
+    rng = np.random.default_rng(0)
+    positions_px = OUTPUT_PX + rng.normal(0, 15, OUTPUT_PX.shape)
+    assert vignetting_on_grid(VIGNETTING, OUTPUT_PX, positions_px).error > 0.01
