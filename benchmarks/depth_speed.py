@@ -7,12 +7,10 @@ one, and again with the learned model. A second table has degraded versions of t
 aligned without a model, and their time relative to that of the unchanged capture.
 """
 
-import json
 import shutil
-import time
 from pathlib import Path
 from statistics import median
-from typing import Annotated, Any
+from typing import Annotated
 
 import cv2
 import numpy as np
@@ -20,35 +18,14 @@ import rasterio
 import typer
 from bands.images import in_other_light
 from common import command, flight_and_out, print_head, print_row, run
-from peers import sift
-from stages import runs, timed
+from stages import events, read, runs, sift_seconds, timed
 
 from agalign.cameras.discover import discover
-from agalign.pixels.raster import open_raster, without_warnings
-from agalign.values.capture import Band, Capture
+from agalign.pixels.raster import without_warnings
+from agalign.values.capture import Capture
 
 SETS = ("boom_two_depths", "p4m_forest", "p4m_bananas", "rededge_mx_dual", "sentera_d4k")
 DEGRADED = ("unchanged", "blur 3 px", "half saturated", "noise 30 %", "stale")
-
-
-def read(band: Band) -> np.ndarray:
-    with without_warnings(), open_raster(band.path) as source:
-        return np.asarray(source.read(band.band_index))
-
-
-def sift_seconds(capture: Capture) -> float:
-    """Return the seconds of SIFT + RANSAC, 5000 features, on the reference with each other band at full size."""
-    reference, *moving = (read(band) for band in (capture.reference, *capture.moving))
-    began = time.perf_counter()
-    for image in moving:
-        sift(reference, image)
-    return time.perf_counter() - began
-
-
-def events(log: str, name: str) -> list[dict[str, Any]]:
-    """Return the events of a kind in a log in JSON."""
-    every = [json.loads(line) for line in log.splitlines() if line.startswith("{")]
-    return [event for event in every if event["event"] == name]
 
 
 def print_set(folder: Path, captures: list[Capture]) -> None:
@@ -56,7 +33,7 @@ def print_set(folder: Path, captures: list[Capture]) -> None:
     without, with_model = (log for _, log in runs(folder))
     learning_s = sum(event["seconds"] for event in events(without, "learnt")) / len(captures)
     first_s, again_s = (median(e["seconds"] for e in events(log, "capture")) for log in (without, with_model))
-    sift_s = median(sift_seconds(capture) for capture in captures)
+    sift_s = median(sift_seconds(c.reference, c.moving, 5000) for c in captures)
     times_s = learning_s + first_s, again_s, sift_s
     aligned = "{aligned} of {pairs}".format(**events(with_model, "capture")[0])
     cells = [f"{s:.1f}" for s in times_s] + [f"{s / sift_s:.2f}" for s in times_s[:2]]

@@ -1,8 +1,8 @@
-"""The figures of docs/paper.md, from the synthetic flight: matches and the loss surface.
+"""The figures of docs/paper.md and docs/method.md that are made of synthetic images: matches, loss surface, relief.
 
     python benchmarks/figures.py [FOLDER]
 
-Writes matches.jpg and loss-surface.png to FOLDER, by default docs/figures.
+Writes matches.jpg, loss-surface.png and relief.png to FOLDER, by default docs/figures.
 """
 
 import tempfile
@@ -13,8 +13,11 @@ from typing import Annotated
 import cv2
 import numpy as np
 import typer
-from common import read_ties, run
+from common import align, flight_and_out, pyplot, read_ties, run
 from numpy.typing import NDArray
+from relief_score import Sidecar, layer, read_sidecar, written
+from synthetic_flights.depth import write_capture
+from synthetic_flights.relief import make_scene
 
 from agalign.config import JointSettings
 from agalign.evaluation.image_pairs import read_image
@@ -32,6 +35,12 @@ from agalign.values.image import Raster
 SIZE_PX = (800, 600)
 DRAWN = 60
 GREEN, RED = (80, 200, 60), (60, 60, 230)
+SCENE, SCENE_SIZE_PX = 1001, (960, 720)
+"""Boxes on a bench and on the floor next to it, 0.95 to 1.75 m away."""
+DETAIL = np.s_[115:225, 205:381]
+"""Enlarged part of the scene, px of the reference: the upper corner of a box, and the bench's edge."""
+NO_DATA = 90
+"""Grey level of pixels that a band does not show."""
 
 
 def straight_pair(folder: Path) -> tuple[Raster, Raster, Matrix]:
@@ -57,10 +66,9 @@ def matches(fixed: Raster, moving: Raster, truth: Matrix) -> NDArray[np.uint8]:
         right = nearest == np.arange(len(keypoints))
         here = keypoints.xy.numpy().astype(np.float64)[drawn]
         there = geometry.apply(truth, keypoints.xy.numpy().astype(np.float64)[nearest[drawn]])
-        strip = np.full((34, 2 * SIZE_PX[0], 3), 255, np.uint8)
-        rows += [strip, draw_matches(fixed, moving, here, there, right[drawn])]
         text = f"{title}: {right.mean():.0%} of {len(right)} keypoints find their own patch"
-        strip[:] = with_text(strip, text, (6, 24), 20)
+        strip = with_text(np.full((34, 2 * SIZE_PX[0], 3), 255, np.uint8), text, (6, 24), 20)
+        rows += [strip, draw_matches(fixed, moving, here, there, right[drawn])]
     return np.vstack(rows)
 
 
@@ -77,6 +85,50 @@ def draw_matches(fixed: Raster, moving: Raster, here: Points, there: Points, rig
     return sheet
 
 
+def relief(path: Path) -> None:
+    """Draw a scene with depth: reference band, parallax, and three bands by homographies and by the relief."""
+    with flight_and_out() as (flight, out):
+        scene = make_scene("boxes", SCENE, width_px=SCENE_SIZE_PX[0])
+        write_capture(flight, scene, size_px=SCENE_SIZE_PX, rng_seed=SCENE)
+        for use in ("auto", "never"):
+            align(flight, out / use, "--relief", use)
+        aligned, flat = (read_sidecar(out / use) for use in ("auto", "never"))
+        x0, y0, width, height = aligned.content["output"]["crop"]
+        extent = (x0, x0 + width, y0 + height, y0)
+        plt, panels = pyplot(), [["reference", "relief", "before"], ["reference", "relief", "after"]]
+        style = {"figsize": (10.4, 3.0), "width_ratios": (3.6, 3.95, 1.95), "layout": "constrained"}
+        figure, axes = plt.subplot_mosaic(panels, **style)
+        axes["reference"].imshow(stretched(written(aligned, "Green")), cmap="gray", extent=extent)
+        parallax_px = layer(aligned.path.with_suffix(".relief.tif"), "parallax")
+        shown = axes["relief"].imshow(parallax_px, cmap="viridis", extent=extent)
+        axes["before"].imshow(detail(flat))
+        axes["after"].imshow(detail(aligned))
+    figure.colorbar(shown, ax=axes["relief"], fraction=0.05, pad=0.02, label="far → near")
+    titles = "reference band", "relief: parallax, px", "homographies", "with the relief"
+    for axis, title in zip(axes.values(), titles, strict=True):
+        axis.set(xticks=[], yticks=[], title=title)
+    rows, columns = DETAIL
+    corner, size = (columns.start, rows.start), (columns.stop - columns.start, rows.stop - rows.start)
+    for name in ("reference", "relief"):
+        axes[name].add_patch(plt.Rectangle(corner, *size, fill=False, edgecolor="#ff4d4d", linewidth=1.6))
+    figure.savefig(path, dpi=100)
+
+
+def detail(sidecar: Sidecar) -> NDArray[np.uint8]:
+    """Return (height, width, 3) of the enlarged part in false colours; grey where one of the bands has no data."""
+    bands = np.stack([written(sidecar, name) for name in ("NIR", "Red", "Green")], axis=-1)
+    image = np.dstack([stretched(band) for band in np.moveaxis(bands, -1, 0)])
+    image[np.isnan(bands).any(axis=-1)] = NO_DATA
+    whole = np.zeros((*SCENE_SIZE_PX[::-1], 3), np.uint8)
+    whole[sidecar.window] = image
+    return np.asarray(cv2.resize(whole[DETAIL], None, fx=3, fy=3, interpolation=cv2.INTER_NEAREST))
+
+
+def stretched(pixels: NDArray[np.float64]) -> NDArray[np.uint8]:
+    low, high = np.nanpercentile(pixels, (1, 99))
+    return np.asarray(np.nan_to_num((pixels - low) / (high - low)).clip(0, 1) * 255, np.uint8)
+
+
 def main(out: Annotated[Path, typer.Argument()] = Path("docs/figures")) -> None:
     with tempfile.TemporaryDirectory() as temporary:
         folder = Path(temporary)
@@ -87,6 +139,7 @@ def main(out: Annotated[Path, typer.Argument()] = Path("docs/figures")) -> None:
         settings = JointSettings(recipe="paper")
         surface = loss_surface(fixed, moving, truth, offsets, settings, Training(epochs=2))
         draw_surface(surface, offsets, out / "loss-surface.png")
+    relief(out / "relief.png")
 
 
 if __name__ == "__main__":

