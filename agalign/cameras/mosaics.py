@@ -28,7 +28,8 @@ def captures_onto(
     """
     reference_bands = _georeferenced_bands(reference, max_pixels)
     fixed = reference_bands[reference_index(reference_bands, band, reference)]
-    fixed = replace(fixed, name=f"{reference.stem} {fixed.name}")
+    # By its wavelength, it would be displayed, and taken for indices, with the bands of another date.
+    fixed = replace(fixed, name=f"{reference.stem} {fixed.name}", wavelength_nm=None, bandwidth_nm=None)
     captures = []
     for path in moving:
         if path.resolve() == reference.resolve():

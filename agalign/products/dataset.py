@@ -81,9 +81,17 @@ def _captures_with_output(folder: Path) -> list[tuple[Path, Sidecar]]:
     written = [(p, s) for p, s in sidecars if s.output is not None]
     if not written:
         raise InputError(f"{folder}: no aligned captures there; give the output folder of a run")
-    sizes = {s.output.crop[2:]: p.stem for p, s in written if s.output is not None}
+    sizes: dict[tuple[int, ...], list[str]] = {}
+    for path, sidecar in written:
+        if sidecar.output is not None:
+            sizes.setdefault(sidecar.output.crop[2:], []).append(path.relative_to(folder).as_posix())
     if len(sizes) > 1:
-        raise InputError(f"{folder}: its captures differ in size ({', '.join(sizes.values())}); open them one by one")
+        examples = (f"{w} x {h} px: {len(files)}, such as {files[0]}" for (w, h), files in sizes.items())
+        of_one_camera = len({sidecar.reference.size_px for _, sidecar in written}) == 1
+        remedy = "align again with --crop none" if of_one_camera else "align each camera into a folder of its own"
+        raise InputError(
+            f"{folder}: its captures differ in size ({'; '.join(examples)}); {remedy}, or use open_capture"
+        )
     return written
 
 

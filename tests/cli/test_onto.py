@@ -62,6 +62,26 @@ def test_a_mosaic_is_aligned_to_the_grid_of_another(mosaics: Path, tmp_path: Pat
             np.testing.assert_array_equal(out.read(1), reference.read(1))
 
 
+def test_colours_and_indices_are_of_one_date(mosaics: Path, tmp_path: Path) -> None:
+    """All bands of both mosaics have wavelengths; the red of the reference is first in the output."""
+    for name, source, wavelengths_nm in (("old", "spring", (668,)), ("new", "summer", (560, 668, 475, 840))):
+        with rasterio.open(mosaics / f"{source}.tif") as dataset:
+            image, profile = dataset.read(1), dataset.profile | {"count": len(wavelengths_nm)}
+        with rasterio.open(tmp_path / f"{name}.tif", "w", **profile) as dataset:
+            for index, wavelength_nm in enumerate(wavelengths_nm, start=1):
+                dataset.write(image * index, index)
+                dataset.update_tags(index, wavelength=str(wavelength_nm))
+    done = agalign_here("onto", tmp_path / "old.tif", tmp_path / "new.tif", "-o", tmp_path / "out", "--relief", "never")
+    assert done.returncode == 0, done.stderr
+    with rasterio.open(tmp_path / "out" / "new.tif") as out:
+        assert [c.name for c in out.colorinterp] == ["undefined", "green", "red", "blue", "undefined"]
+        assert out.descriptions[0] == "old band_1"
+    assert agalign_here("indices", tmp_path / "out", "--index", "ndvi").returncode == 0
+    with rasterio.open(tmp_path / "out" / "new_ndvi.tif") as ndvi, rasterio.open(tmp_path / "out" / "new.tif") as out:
+        red, nir = out.read(3), out.read(5)
+        np.testing.assert_allclose(ndvi.read(1), (nir - red) / (nir + red), atol=1e-6)
+
+
 def test_bad_mosaics_are_told_in_a_line(mosaics: Path, tmp_path: Path) -> None:
     write_mosaic(tmp_path / "nowhere.tif", np.zeros((60, 80), np.float32), None)
     for moving, problem in (

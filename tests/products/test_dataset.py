@@ -1,3 +1,4 @@
+import re
 from pathlib import Path
 
 import numpy as np
@@ -86,5 +87,10 @@ def test_what_cannot_be_opened_is_named(tmp_path: Path) -> None:
     for name, width in (("a", 300), ("b", 320)):
         write_capture(tmp_path / "in", "green", "red", name=name, size_px=(width, 240))
     agalign.align_folder(tmp_path / "in", tmp_path / "out", settings=seeded())
-    with pytest.raises(agalign.InputError, match="differ in size"):
+    sizes = r"differ in size \(300 x 240 px: 1, such as a\.json; 320 x 240 px: 1, such as b\.json\); align each camera"
+    with pytest.raises(agalign.InputError, match=sizes):
+        agalign.open_flight(tmp_path / "out")
+    sidecar = tmp_path / "out" / "b.json"
+    sidecar.write_text(re.sub(r'("width": )320', r"\g<1>300", sidecar.read_text(), count=1))
+    with pytest.raises(agalign.InputError, match=r"align again with --crop none, or use open_capture"):
         agalign.open_flight(tmp_path / "out")
