@@ -146,8 +146,13 @@ def capture_of(files: Sequence[ImageFile], folder: Path, options: DiscoverOption
     first = files[0]
     bands = with_unique_band_names(_bands_to_align(files, options.bands))
     bands = first.camera.with_shared_rig(bands, [f.tags for f in files])
-    if options.ignore_metadata:
-        bands = [replace(b, lens=None, to_rig=None, other_to_rig=None) for b in bands]
+    # Mappings by the lens of damaged tags would not be finite.
+    bands = [
+        replace(b, lens=None, to_rig=None, other_to_rig=None)
+        if options.ignore_metadata or not (b.lens is None or b.lens.is_plausible(b.size_px))
+        else b
+        for b in bands
+    ]
     reference = bands[reference_index(bands, options.reference, first.path)]
     bands = _in_order(bands, options.order)
     tags = _tags_of(reference, files)

@@ -21,6 +21,8 @@ NAMESPACE = "pix4d.com"
 
 _MAX_FOCAL_LENGTH_MM = 100.0
 """Larger numbers are px: lenses of drone cameras have 2 to 50 mm, or 300 px and more."""
+_MAX_FOCAL_LENGTH_PX = 1e6
+"""Larger numbers are from damaged tags."""
 _MAX_OFFSET_M = 0.5
 """Larger numbers are mm: no rig of a drone is half a metre wide."""
 
@@ -63,11 +65,12 @@ def focal_length_is_in_px(tags: Tags) -> bool:
 
 
 def focal_length_px(tags: Tags) -> float | None:
-    """Return Camera:PerspectiveFocalLength in px; None if it is missing or not positive."""
+    """Return Camera:PerspectiveFocalLength in px; None if it is missing, not positive or impossible."""
     focal_length, density = tags.number(NAMESPACE, "PerspectiveFocalLength"), pixels_per_mm(tags)
     if focal_length is None or density is None or focal_length <= 0:
         return None
-    return focal_length if focal_length_is_in_px(tags) else focal_length * density
+    length_px = focal_length if focal_length_is_in_px(tags) else focal_length * density
+    return length_px if length_px < _MAX_FOCAL_LENGTH_PX else None
 
 
 def rig_degrees(tags: Tags) -> tuple[float, ...]:

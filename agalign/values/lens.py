@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from agalign.values.geometry import Matrix, Points
-from agalign.values.pixel_units import SAME_PIXELS, PixelScale
+from agalign.values.pixel_units import SAME_PIXELS, PixelScale, Size
 
 
 @dataclass(frozen=True)
@@ -40,6 +40,15 @@ class Lens:
     def matrix(self) -> Matrix:
         """The 3x3 camera matrix K."""
         return np.array([[self.fx_px, 0.0, self.cx_px], [0.0, self.fy_px, self.cy_px], [0.0, 0.0, 1.0]])
+
+    def is_plausible(self, size_px: Size) -> bool:
+        """Return False for values that no camera has: focal lengths beyond 0.1 to 1000 times the longer side of the
+        image, an optical centre farther from its corner than 100 times that, and coefficients above 1000.
+        """
+        side_px = max(size_px)
+        is_focused = all(0.1 < focal_px / side_px < 1000 for focal_px in (self.fx_px, self.fy_px))
+        is_near = all(abs(position_px) < 100 * side_px for position_px in (self.cx_px, self.cy_px))
+        return is_focused and is_near and all(abs(k) < 1000 for k in self.distortion)
 
 
 def is_distorting(lens: Lens | None) -> bool:

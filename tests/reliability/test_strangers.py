@@ -1,17 +1,24 @@
 """Folders, options and tags from strangers: each fault is one line with the file, and nothing is lost silently."""
 
 import json
+import math
 import os
 import re
 from collections.abc import Callable
+from dataclasses import replace
 from functools import reduce
 from operator import getitem
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from agalign.batch import capture as batch
+from agalign.cameras import known_cameras
 from agalign.cameras.discover import discover
+from agalign.cameras.grouping import capture_of
+from agalign.cameras.read_files import read_file
+from agalign.config import DiscoverOptions
 from agalign.errors import SidecarError
 from agalign.products.flight_map import FLIGHT_MAP_FILE, features_in
 from agalign.products.index_table import INDICES_FILE, read_table
@@ -72,6 +79,18 @@ def test_a_table_with_a_huge_cell_is_empty(tmp_path: Path) -> None:
 
 def test_tags_have_no_character_that_changes_other_text() -> None:
     assert without_controls("Ca\x1b[2Jm\u202e\u2066e\u2028ra\x00 é\u3000") == "Ca[2Jmera é\u3000"
+
+
+@pytest.mark.parametrize(
+    "change", [{"fx_px": 1e308}, {"fy_px": 0.0}, {"cx_px": 1e16}, {"cy_px": math.nan}, {"distortion": (0.0, -1e14)}, {}]
+)
+def test_a_lens_of_damaged_tags_is_not_used(flight: Path, change: dict[str, Any]) -> None:
+    """Mappings by it are not finite, and cannot be written."""
+    files = [read_file(b.path, known_cameras(), DiscoverOptions()) for b in discover(flight).captures[0].bands]
+    (band,) = files[2].bands
+    files[2] = replace(files[2], bands=(replace(band, lens=replace(band.lens, **change)),))
+    result = capture_of(files, flight, DiscoverOptions()).bands[2]
+    assert (result.lens is None, result.to_rig is None) == (bool(change), bool(change))
 
 
 def test_options_that_are_not_a_regular_file_are_an_error(tmp_path: Path, irregular: Callable[[Path], None]) -> None:
