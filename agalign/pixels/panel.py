@@ -12,6 +12,9 @@ from agalign.values.image import Mask, Raster
 
 _AREA_RATIO = 0.5
 """Side of the measured area, relative to that of the panel."""
+_MAX_EDGE_SHARE = 0.4
+"""Maximum share of pixels at an edge in an image that is searched for a code: 0.48 in the sky, up to 0.36 in captures
+of fields, water and panels."""
 
 Corners = NDArray[np.float64]
 """(4, 2) px, in order around the quadrilateral."""
@@ -91,8 +94,8 @@ def _largest_panel(image: NDArray[np.uint8], code: Corners | None) -> Corners | 
         else tuple(share * _area(code) / image.size for share in _LIMITS.code_area_ratios)
     )
     squares = _quadrilaterals(image, limits[0] * image.size, limits[1] * image.size)
-    squares = [s for s in squares if (code is None or _is_next_to(s, code)) and _is_panel(image, s)]
-    return max(squares, key=_area, default=None)
+    squares = [s for s in squares if code is None or _is_next_to(s, code)]
+    return next((s for s in sorted(squares, key=_area, reverse=True) if _is_panel(image, s)), None)
 
 
 def albedo_of(code: str, wavelength_nm: float | None) -> float | None:
@@ -126,6 +129,8 @@ def _stretched(image: Raster) -> NDArray[np.uint8]:
 
 def _code(image: NDArray[np.uint8]) -> tuple[str, Corners | None]:
     """Return the text and the corners of a QR code; codes that cannot be decoded are ignored."""
+    if _is_noise(image):
+        return "", None
     try:
         text, corners, _ = cv2.QRCodeDetector().detectAndDecode(image)
     except cv2.error:  # division by zero inside OpenCV for some false detections
@@ -133,11 +138,22 @@ def _code(image: NDArray[np.uint8]) -> tuple[str, Corners | None]:
     return (text, np.asarray(corners, np.float64).reshape(4, 2)) if text else ("", None)
 
 
+def _is_noise(image: NDArray[np.uint8]) -> bool:
+    """Return True if a code is not readable, as OpenCV sees the image: thresholded locally at 512 px.
+
+    OpenCV would try to decode parts of the noise for seconds.
+    """
+    ratio = min(1.0, 512 / min(image.shape))
+    reduced = cv2.resize(image, None, fx=ratio, fy=ratio)
+    dark = cv2.adaptiveThreshold(reduced, 1, cv2.ADAPTIVE_THRESH_GAUSSIAN_C, cv2.THRESH_BINARY, 83, 2)
+    return bool(np.count_nonzero(dark[:, 1:] != dark[:, :-1]) > _MAX_EDGE_SHARE * dark.size)
+
+
 def _quadrilaterals(image: NDArray[np.uint8], min_area: float, max_area: float) -> list[Corners]:
-    """Return the convex, nearly square contours at twelve thresholds, with areas within the limits."""
+    """Return the convex, nearly square contours at up to twelve thresholds, with areas within the limits."""
     result = []
     low, high = np.percentile(image, (5.0, 99.5)).tolist()
-    for level in np.linspace(low, high, 14)[1:-1]:
+    for level in np.unique(np.linspace(low, high, 14)[1:-1].astype(int)):
         contours, _ = cv2.findContours((image > level).astype(np.uint8), cv2.RETR_LIST, cv2.CHAIN_APPROX_SIMPLE)
         for contour in (c for c in contours if min_area <= cv2.contourArea(c) <= max_area):
             tolerance_px = _LIMITS.corner_tolerance * cv2.arcLength(contour, closed=True)
@@ -152,9 +168,13 @@ def _quadrilaterals(image: NDArray[np.uint8], min_area: float, max_area: float) 
 
 def _is_panel(image: NDArray[np.uint8], square: Corners) -> bool:
     """Return True if a square is homogeneous and brighter than the ring around it."""
-    inner, edge, outer = (
-        inside(_scaled(square, factor), image.shape) for factor in (_AREA_RATIO, *_LIMITS.ring_ratios)
-    )
+    ratios = _AREA_RATIO, *_LIMITS.ring_ratios
+    around = _scaled(square, ratios[-1])
+    # Even, so that halves of pixels are rounded as in the whole image.
+    first = 2 * np.floor(around.min(axis=0).clip(0) / 2).astype(int)
+    last = np.ceil(around.max(axis=0)).astype(int) + 1
+    image, square = image[first[1] : last[1], first[0] : last[0]], square - first
+    inner, edge, outer = (inside(_scaled(square, ratio), image.shape) for ratio in ratios)
     area, ring = image[inner].astype(np.float64), image[outer & ~edge]
     if not len(area) or not len(ring):
         return False

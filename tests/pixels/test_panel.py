@@ -2,6 +2,7 @@ import numpy as np
 import pytest
 from synthetic_flights.panel import PANEL_CODE, with_panel
 
+from agalign.pixels import panel as panels
 from agalign.pixels.panel import albedo_of, find_panel, inside
 from agalign.synthetic.cameras import REDEDGE
 from agalign.synthetic.flight import view
@@ -67,6 +68,20 @@ def test_no_panel_is_detected_in_a_field() -> None:
     fields = [view(reflectance(ground, band), ground, band, pose, SIZE) for band in REDEDGE.bands]
     for pixels in (*fields, 0.2 + 0.05 * textured_image(*SIZE), np.full(SIZE[::-1], 0.3)):
         assert not any(find_panel(raster(pixels), without_code=without_code) for without_code in (False, True))
+
+
+def test_the_search_is_short_in_noise_and_in_a_lattice_of_squares(monkeypatch: pytest.MonkeyPatch) -> None:
+    """OpenCV searches noise for a code, and every square of a lattice would be measured, for seconds."""
+    looked = []
+    for module, name in ((panels, "_is_panel"), (panels.cv2, "QRCodeDetector")):
+        function = getattr(module, name)
+        monkeypatch.setattr(module, name, lambda *a, f=function, n=name: (looked.append(n), f(*a))[1])
+    noise = np.random.default_rng(0).normal(0.5, 0.1, (300, 400))
+    assert find_panel(raster(noise), without_code=True) is None
+    assert looked == []
+    lattice = np.tile(np.pad(np.full((40, 40), 0.5), 8, constant_values=0.1), (6, 8))
+    assert find_panel(raster(lattice), without_code=True) is not None
+    assert looked == ["QRCodeDetector", "_is_panel"]
 
 
 def test_codes_give_reflectance_linear_in_the_wavelength() -> None:
