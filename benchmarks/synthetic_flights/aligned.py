@@ -6,12 +6,14 @@ from pathlib import Path
 import numpy as np
 import rasterio
 
+from agalign.pixels.raster import without_warnings
 from agalign.products.sidecar import Sidecar
 from agalign.products.sidecar_file import write_sidecar
 
-BANDS = {"Green": 560.0, "Red": 668.0, "NIR": 842.0, "Red edge": 717.0}
+BANDS = {"Green": (560, 0.12, 0.1), "Red": (668, 0.2, 0.05), "NIR": (842, 0.3, 0.52), "Red edge": (717, 0.24, 0.3)}
+"""Wavelength in nm, and reflectance of soil and of vegetation."""
 _FULL = 40000
-"""Of a raw number."""
+"""Raw number of a reflectance of 1."""
 
 
 def make_aligned(
@@ -19,24 +21,33 @@ def make_aligned(
 ) -> None:
     """Write captures of a field of rows below `folder`/0000SET, as reflectance or as raw numbers."""
     rng = np.random.default_rng(rng_seed)
-    width, height = size_px
-    crop = (np.sin(np.arange(width) / 3) > 0) * np.ones((height, 1))
+    crop = (np.sin(np.arange(size_px[0]) / 3) > 0) * np.ones((size_px[1], 1))
     target = folder / "0000SET"
     target.mkdir(parents=True)
-    profile = {"driver": "GTiff", "width": width, "height": height, "count": len(BANDS), "compress": "zstd"}
-    profile |= {"dtype": "uint16"} if raw else {"dtype": "float32", "nodata": np.nan}
     for number in range(1, captures + 1):
-        cover = (crop + rng.normal(0, 0.05, crop.shape)).clip(0, 1)
-        levels = {"Green": (0.12, 0.1), "Red": (0.2, 0.05), "NIR": (0.3, 0.52), "Red edge": (0.24, 0.3)}
         name = f"IMG_{number:04d}"
-        with rasterio.open(target / f"{name}.tif", "w", **profile) as dataset:
-            for index, (low, high) in enumerate(levels.values(), start=1):
-                values = low + (high - low) * cover
-                dataset.write((values * _FULL).astype(np.uint16) if raw else values.astype(np.float32), index)
-            dataset.descriptions = tuple(levels)
-            if not raw:
-                dataset.update_tags(RADIOMETRY="reflectance")
+        cover = (crop + rng.normal(0, 0.05, crop.shape)).clip(0, 1)
+        write_stack(target / f"{name}.tif", reflectances(cover), raw=raw)
         write_sidecar(target / f"{name}.json", sidecar_of(name, number, size_px, raw=raw))
+
+
+def reflectances(cover: np.ndarray) -> np.ndarray:
+    """Return (4, height, width) of the bands for shares (height, width) of vegetation."""
+    return np.stack([soil + (vegetation - soil) * cover for _, soil, vegetation in BANDS.values()])
+
+
+def write_stack(path: Path, planes: np.ndarray, *, raw: bool = False) -> None:
+    """Write reflectances (4, height, width) as a stack of agalign, or raw numbers in proportion to them."""
+    count, height, width = planes.shape
+    profile = {"driver": "GTiff", "width": width, "height": height, "count": count, "compress": "zstd"}
+    profile |= {"dtype": "uint16"} if raw else {"dtype": "float32", "nodata": np.nan}
+    with without_warnings(), rasterio.open(path, "w", **profile) as dataset:
+        dataset.write((planes * _FULL if raw else planes).astype(profile["dtype"]))
+        dataset.descriptions = tuple(BANDS)
+        dataset.update_tags(TIFFTAG_DATETIME="2026:06:21 10:00:00", **({} if raw else {"RADIOMETRY": "reflectance"}))
+        for index, (wavelength_nm, *_) in enumerate(BANDS.values(), start=1):
+            quantity = {} if raw else {"QUANTITY": "reflectance"}
+            dataset.update_tags(index, wavelength=wavelength_nm, wavelength_units="nm", **quantity)
 
 
 def sidecar_of(name: str, number: int, size_px: tuple[int, int], *, raw: bool) -> Sidecar:

@@ -7,7 +7,7 @@ Every object of a scene with depth is made of patches: floors, faces of boxes, l
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,7 +31,7 @@ _BENT_SHARE = 0.03
 
 @dataclass(frozen=True)
 class Patch:
-    """A flat rectangle, ellipse or leaf."""
+    """A flat rectangle or leaf."""
 
     centre_m: tuple[float, float, float]
     u_m: tuple[float, float, float]
@@ -39,7 +39,7 @@ class Patch:
     v_m: tuple[float, float, float]
     """From the centre to the middle of the next edge, perpendicular to `u_m`."""
     material: str
-    shape: Literal["rectangle", "ellipse", "leaf"] = "rectangle"
+    shape: Literal["rectangle", "leaf"] = "rectangle"
     texture_m: tuple[float, float] = (0.0, 0.0)
     """Position of the centre on the material's texture."""
     contrast: float = 1.0
@@ -110,11 +110,9 @@ def _rays(band: BandSpec, size_px: tuple[int, int], samples: int) -> tuple[Float
     return x.astype(dtype), y.astype(dtype)
 
 
-@dataclass(frozen=True)
-class Hits:
-    """Where the rays of a box of pixels meet a patch."""
+class Hits(NamedTuple):
+    """Where rays (height, width) meet a patch."""
 
-    box: Box
     depth_m: Floats
     """Along the optical axis; inf where a ray misses."""
     u: Floats
@@ -122,34 +120,22 @@ class Hits:
     """Position on the patch, -1 to 1."""
 
 
-def hits_of(patch: Patch, eye: Eye, x: Floats, y: Floats, box: Box) -> Iterator[Hits]:
-    """The patch as rays (x, y, 1) of the eye meet it, for the rays (height, width) in a box."""
+def hits_of(patch: Patch, eye: Eye, x: Floats, y: Floats) -> Hits:
+    """The patch as rays (x, y, 1) of the eye meet it."""
     u, v = (np.array(axis) @ eye.attitude for axis in (patch.u_m, patch.v_m))
     centre = eye.to_camera(np.array(patch.centre_m))
     normal = np.cross(u, v)
-    left, top, right, bottom = box
-    for first in range(top, bottom, _ROWS):
-        part = left, first, right, min(first + _ROWS, bottom)
-        rows = slice(part[1], part[3]), slice(left, right)
-        some_x, some_y = x[rows], y[rows]
 
-        def along(axis: Points, x: Floats = some_x, y: Floats = some_y) -> Floats:
-            a, b, c = (float(value) for value in axis)
-            return np.asarray(x * a + y * b + c)
+    def along(axis: Points) -> Floats:
+        a, b, c = (float(value) for value in axis)
+        return np.asarray(x * a + y * b + c)
 
-        with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-            depth = float(normal @ centre) / along(normal)
-            at_u, at_v = (depth * along(axis / (axis @ axis)) - float(centre @ axis / (axis @ axis)) for axis in (u, v))
-            inside = _inside(patch.shape, at_u, at_v) & (depth > 0)
-        yield Hits(part, np.where(inside, depth, np.inf), at_u, at_v)
-
-
-def _inside(shape: str, u: Floats, v: Floats) -> NDArray[np.bool_]:
-    if shape == "rectangle":
-        return np.asarray((np.abs(u) <= 1) & (np.abs(v) <= 1))
-    if shape == "ellipse":
-        return np.asarray(u * u + v * v <= 1)
-    return np.asarray(np.abs(v) <= 1 - u * u)
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+        depth = float(normal @ centre) / along(normal)
+        at_u, at_v = (depth * along(axis / (axis @ axis)) - float(centre @ axis / (axis @ axis)) for axis in (u, v))
+        limit = 1 if patch.shape == "rectangle" else 1 - at_u * at_u
+        inside = (np.abs(at_u) <= 1) & (np.abs(at_v) <= limit) & (depth > 0)
+    return Hits(np.where(inside, depth, np.inf), at_u, at_v)
 
 
 def boxes_of(patches: Sequence[Patch], eye: Eye, samples: int = 1, farther_px: float = 0.0) -> list[Box]:
@@ -169,10 +155,10 @@ def nearer(
     """Yield (index of the patch, hits, their rows and columns, where they are nearer than those before) and update
     `depth_m`, which is inf for rays that meet nothing.
     """
-    for index, (patch, box) in enumerate(zip(patches, boxes, strict=True)):
-        for hits in hits_of(patch, eye, x, y, box):
-            left, top, right, bottom = hits.box
-            window = slice(top, bottom), slice(left, right)
+    for index, (patch, (left, top, right, bottom)) in enumerate(zip(patches, boxes, strict=True)):
+        for row in range(top, bottom, _ROWS):
+            window = slice(row, min(row + _ROWS, bottom)), slice(left, right)
+            hits = hits_of(patch, eye, x[window], y[window])
             closer = hits.depth_m < depth_m[window]
             if closer.any():
                 depth_m[window][closer] = hits.depth_m[closer]

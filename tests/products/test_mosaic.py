@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import rasterio
 from synthetic_flights.aligned import make_aligned
-from synthetic_flights.overlapping import LATITUDE, LONGITUDE, Survey, make_overlapping
+from synthetic_flights.overlapping import GPS_ERROR_M, GSD_M, LATITUDE, LENS, LONGITUDE, SIZE_PX, make_overlapping
 
 import agalign
 from agalign.pixels.raster import transformed
@@ -26,13 +26,11 @@ from agalign.values import geometry, lens
 from ..conftest import Shared
 from ..program import agalign_here
 
-SURVEY = Survey()
-
 
 @pytest.fixture(scope="module")
 def survey(shared: Shared) -> Path:
     """Nine overlapping captures, with the errors of GPS and attitude."""
-    return shared("survey", lambda folder: np.savez(folder / "truth.npz", **make_overlapping(folder, SURVEY)))
+    return shared("survey", lambda folder: np.savez(folder / "truth.npz", **make_overlapping(folder)))
 
 
 def truth_of(folder: Path) -> dict[str, np.ndarray]:
@@ -42,9 +40,9 @@ def truth_of(folder: Path) -> dict[str, np.ndarray]:
 
 def errors_m(flight: PlacedFlight, captures: list[Placement], truth: dict[str, np.ndarray]) -> np.ndarray:
     """Distances of points of all captures from the truth, after the similarity of all captures that fits best."""
-    px = geometry.lattice(*SURVEY.size_px, 4, 4)
+    px = geometry.lattice(*SIZE_PX, 4, 4)
     placed = np.concatenate([c.on_ground(px) for c in captures]) @ (1, 1j)
-    undistorted = lens.undistort(SURVEY.lens, px)
+    undistorted = lens.undistort(LENS, px)
     true = np.concatenate([geometry.apply(truth[c.label], undistorted) for c in captures]) @ (1, 1j)
     design = np.stack([placed, np.ones_like(placed)], axis=1)
     return np.abs(design @ np.linalg.lstsq(design, true)[0] - true)
@@ -55,9 +53,9 @@ def test_tie_points_place_captures_to_a_pixel(survey: Path) -> None:
     pairs = [pair.split() for pair in tie_pairs(flight.captures)]
     placed = adjusted(flight.captures, [used for used, _ in pairs])
     assert np.percentile(errors_m(flight, list(flight.captures), truth), 95) > 1.5
-    assert np.percentile(errors_m(flight, placed, truth), 95) < SURVEY.gsd_m
+    assert np.percentile(errors_m(flight, placed, truth), 95) < GSD_M
     checks = [check for _, check in pairs]
-    assert misfit_m(checks, placed)[0] < 0.2 * SURVEY.gsd_m
+    assert misfit_m(checks, placed)[0] < 0.2 * GSD_M
     assert misfit_m(checks, flight.captures)[0] > 1.0
     # No tie point is both used and a check.
     for used, check in pairs:
@@ -68,12 +66,12 @@ def test_the_georeference_holds_the_position_of_the_whole(survey: Path) -> None:
     """Tie points are relative: the mean of the GPS positions stays."""
     flight, truth = place_captures(survey), truth_of(survey)
     placed = adjusted(flight.captures, [pair.split()[0] for pair in tie_pairs(flight.captures)])
-    centre = (np.array([SURVEY.size_px], float) - 1) / 2
+    centre = (np.array([SIZE_PX], float) - 1) / 2
     origin_m = transformed(np.array([[LONGITUDE, LATITUDE]]), "EPSG:4326", utm_wkt(LONGITUDE, LATITUDE))[0]
     off_m = [
         c.on_ground(centre)[0] + flight.origin_m - origin_m - geometry.apply(truth[c.label], centre)[0] for c in placed
     ]
-    assert np.linalg.norm(np.mean(off_m, axis=0)) < 2 * SURVEY.gps_error_m
+    assert np.linalg.norm(np.mean(off_m, axis=0)) < 2 * GPS_ERROR_M
 
 
 def test_the_positions_determine_the_scale_if_the_height_is_assumed(survey: Path) -> None:
@@ -92,8 +90,8 @@ def test_the_positions_determine_the_scale_if_the_height_is_assumed(survey: Path
         for c in flight.captures
     ]
     placed = adjusted(double, [pair.split()[0] for pair in tie_pairs(double)])
-    assert np.median([c.gsd_m for c in placed]) == pytest.approx(SURVEY.gsd_m, rel=0.35)
-    assert np.percentile(errors_m(flight, placed, truth_of(survey)), 95) < SURVEY.gsd_m
+    assert np.median([c.gsd_m for c in placed]) == pytest.approx(GSD_M, rel=0.35)
+    assert np.percentile(errors_m(flight, placed, truth_of(survey)), 95) < GSD_M
 
 
 def test_wrong_matches_of_a_pair_do_not_move_the_others(survey: Path) -> None:
@@ -101,7 +99,7 @@ def test_wrong_matches_of_a_pair_do_not_move_the_others(survey: Path) -> None:
     pairs = [pair.split()[0] for pair in tie_pairs(flight.captures)]
     wrong = replace(pairs[0], second_px=pairs[0].second_px + np.array([25.0, -15.0]))
     placed = adjusted(flight.captures, [wrong, *pairs[1:]])
-    assert np.percentile(errors_m(flight, placed, truth_of(survey)), 95) < SURVEY.gsd_m
+    assert np.percentile(errors_m(flight, placed, truth_of(survey)), 95) < GSD_M
 
 
 @pytest.fixture(scope="module")
@@ -119,7 +117,7 @@ def test_the_mosaic_is_a_cog_with_all_bands(written: tuple[Path, agalign.MosaicR
         assert field.descriptions == ("Green", "Red", "NIR", "Red edge")
         assert (field.tags(3)["wavelength"], field.tags()["RADIOMETRY"]) == ("842", "reflectance")
         assert field.crs.to_epsg() == 32631
-        assert field.transform.a == -field.transform.e == pytest.approx(SURVEY.gsd_m, rel=0.03)
+        assert field.transform.a == -field.transform.e == pytest.approx(GSD_M, rel=0.03)
         assert np.isnan(field.nodata)
         assert float(field.tags()["MOSAIC_MISFIT_M"]) == pytest.approx(report.misfit_m[0], abs=1e-3)
         bands = field.read()
@@ -139,7 +137,7 @@ def test_the_mosaic_shows_the_ground(written: tuple[Path, agalign.MosaicReport],
         bands = field.read()
         to_px = np.array(~field.transform).reshape(3, 3)
     for capture in placed:
-        px = geometry.lattice(*SURVEY.size_px, 30, 20).round()
+        px = geometry.lattice(*SIZE_PX, 30, 20).round()
         x, y = np.floor(geometry.apply(to_px, capture.on_ground(px) + flight.origin_m)).astype(int).T
         with rasterio.open(capture.bands[0].file) as stack:
             own = stack.read()[:, *px.astype(int).T[::-1]]
