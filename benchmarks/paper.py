@@ -4,7 +4,7 @@
     python benchmarks/paper.py FOLDER
     python benchmarks/paper.py RESULTS.csv... --plot robustness.png
 
-The first writes to the current folder: pairs.csv with all pairs, learn.csv with 20 of them, whose homographies are 5 %
+The first writes to the current folder: pairs.csv with all pairs, learn.csv with 20 of them and homographies 5 %
 off, and test.csv with the others. The second draws files of `agalign evaluate --out`: a line for each method of each.
 """
 

@@ -117,7 +117,7 @@ def read_json(path: Path) -> Any:
 
 
 def save_known_model(path: Path, *, has_rig: bool = True) -> None:
-    """Save a model whose rig is learned from four captures at known heights."""
+    """Save a model with a rig that is learned from four captures at known heights."""
     from agalign.flight.learn_rig import learn_rig
     from agalign.flight.model import FlightModel, save_model
     from agalign.flight.rig import Observation

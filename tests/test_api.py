@@ -40,7 +40,7 @@ def test_rgb_in_either_order_of_axes() -> None:
         assert_aligned(agalign.align(image, as_uint8(moving)))
 
 
-def test_what_is_aligned_stays_untouched() -> None:
+def test_aligned_input_is_returned_unchanged() -> None:
     fixed, moving = textured_pair(np.eye(3))
     result = agalign.align(fixed, moving)
     assert result.status == "aligned"
@@ -58,14 +58,14 @@ HOPELESS: dict[str, Callable[[], np.ndarray]] = {
 
 
 @pytest.mark.parametrize("name", HOPELESS)
-def test_what_cannot_be_aligned_has_a_reason(name: str) -> None:
+def test_unaligned_pairs_have_a_reason(name: str) -> None:
     fixed = textured_image(760, 320)[:, :400]
     result = agalign.align(fixed, HOPELESS[name]())
     assert result.status in ("failed", "seed_only")
     assert result.reason
 
 
-def test_bad_arguments_are_told() -> None:
+def test_wrong_arguments_are_named() -> None:
     image = textured_image(100, 80)
     with pytest.raises(agalign.InputError, match="fixed"):
         agalign.align(np.zeros(5), image)

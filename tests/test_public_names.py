@@ -61,7 +61,7 @@ def test_importing_loads_no_heavy_library(tmp_path: Path) -> None:
     assert done.stdout.strip() == "set()"
 
 
-def test_settings_print_what_differs_from_the_defaults() -> None:
+def test_settings_print_values_other_than_defaults() -> None:
     assert repr(agalign.Settings()) == "Settings()"
     changed = agalign.Settings(write=agalign.WriteSettings(layout="both", stac=True))
     assert repr(changed) == "Settings(write=WriteSettings(layout='both', stac=True))"

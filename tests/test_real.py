@@ -135,18 +135,18 @@ def test_sequoia_is_read_oriented_and_seeded(real_data: Path) -> None:
 
 def test_the_panel_of_the_row_crop_is_recognised_with_and_without_its_tags(real_data: Path, tmp_path: Path) -> None:
     (capture,) = discover(real_data / "captures/rededge_panel").captures
-    told = read_panel(capture, {})
-    assert {(b.band.panel.seen_by, b.band.panel.serial) for b in told.bands} == {("tags", "RP04-1826246-SC")}
+    reading = read_panel(capture, {})
+    assert {(b.band.panel.seen_by, b.band.panel.serial) for b in reading.bands} == {("tags", "RP04-1826246-SC")}
     bare = replace(capture, bands=tuple(replace(b, panel=None) for b in capture.bands))
     (seen,) = with_panels([bare])
-    for tags, warped_pair in zip(told.bands, read_panel(seen, {}).bands, strict=True):
+    for tags, warped_pair in zip(reading.bands, read_panel(seen, {}).bands, strict=True):
         assert warped_pair.band.panel.seen_by == "QR code"
         assert warped_pair.albedo == pytest.approx(tags.albedo, abs=1e-6)
         assert warped_pair.radiance == pytest.approx(tags.radiance, rel=0.01)
     assert not any(c.panel for c in with_panels(discover(real_data / "flights/rededge_m_rowcrop").captures))
 
 
-def test_temperature_is_what_the_altum_says_itself(real_data: Path) -> None:
+def test_temperature_is_that_of_the_tags_of_the_altum(real_data: Path) -> None:
     """SceneTemperature, degrees C, is in its tags."""
     paths = sorted((real_data / "captures/altum_lwir").glob("*.tif"))
     assert paths

@@ -28,7 +28,7 @@ def requirements() -> list[str]:
     return [f"python {project['requires-python']}", *(re.sub(r"(?=>=)", " ", d) for d in project["dependencies"])]
 
 
-def test_the_conda_recipe_wants_what_the_project_wants() -> None:
+def test_the_conda_recipe_has_the_dependencies_of_the_project() -> None:
     recipe = yaml.safe_load((ROOT / "recipe" / "recipe.yaml").read_text(encoding="utf-8"))
     wanted = {" ".join([NAMES_ON_CONDA_FORGE.get(d.split()[0], d.split()[0]), *d.split()[1:]]) for d in requirements()}
     assert set(recipe["requirements"]["run"]) == wanted
@@ -70,7 +70,7 @@ def test_every_text_is_read_and_written_in_an_encoding_that_is_said(flight: Path
 
 @pytest.mark.slow
 def test_processes_that_start_from_nothing(flight: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """As they do on Windows and macOS: nothing of this process is there in them."""
+    """As on Windows and macOS: they do not share the memory of this process."""
     monkeypatch.setattr(processes, "get_all_start_methods", lambda: ["spawn"])
     tasks = [Task(c, tmp_path, seeded(), None) for c in discover(flight).captures]
     with own_processes(2, limit_threads) as run:

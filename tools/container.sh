@@ -1,6 +1,6 @@
 #!/usr/bin/env bash
 # Build the image and try it: its size and start time; the demo; a flight mounted read-only, under a read-only root, for
-# a user whom the image does not know; and the cluster of compose.yaml. Prints what each took.
+# a user that the image does not have; and the cluster of compose.yaml. Prints the seconds of each.
 #
 #     tools/container.sh [demo options]
 #
@@ -128,7 +128,7 @@ took "a flight read-only, a root read-only, user $user" \
 test -s "$folder/aligned/index.html"
 
 if said=$(inside "$flight" "$folder/aligned" agalign /data/flight --quiet 2>&1); then
-    echo "an output that cannot be made was not told" >&2
+    echo "an output that cannot be created was not reported" >&2
     exit 1
 fi
 echo "== without -o: $said"

@@ -32,10 +32,10 @@ for name in ("py.typed", "sidecar.schema.json", "products/report/page.html.j2", 
 facts = {f"{stem}.dist-info/{n}" for n in ("METADATA", "WHEEL", "RECORD", "entry_points.txt", "licenses/LICENSE")}
 held = set(zipfile.ZipFile(wheel).namelist())
 assert held == package | facts, held ^ (package | facts)
-beside = {"PKG-INFO", "pyproject.toml", "constraints.txt", ".gitignore"}
-beside |= {"README.md", "LICENSE", "CHANGELOG.md", "CITATION.cff"}
+other_files = {"PKG-INFO", "pyproject.toml", "constraints.txt", ".gitignore"}
+other_files |= {"README.md", "LICENSE", "CHANGELOG.md", "CITATION.cff"}
 held = {m.name.removeprefix(f"{stem}/") for m in tarfile.open(sdist).getmembers() if m.isfile()}
-assert held == package | beside, held ^ (package | beside)
+assert held == package | other_files, held ^ (package | other_files)
 print(f"{Path(wheel).name}: {len(package)} files, {Path(wheel).stat().st_size >> 10} kB")
 PY
 

@@ -1,1 +1,1 @@
-"""What travels between the stages: records of captures, images and alignments, and the geometry they obey."""
+"""Data that stages exchange: captures, images, alignments and geometry; and functions on them."""

@@ -124,7 +124,7 @@ def test_two_captures_at_a_time_give_the_same_numbers(flight: Path, aligned_flig
     assert serial == parallel
 
 
-def test_a_second_run_learns_nothing_and_retries_failed_captures_where_asked(flight: Path, aligned_copy: Path) -> None:
+def test_a_second_run_reuses_the_model_and_retries_failed_captures(flight: Path, aligned_copy: Path) -> None:
     (path,) = (aligned_copy / "models").iterdir()
     before = path.stat().st_mtime_ns
     first, second = find_sidecars(aligned_copy)
@@ -159,7 +159,7 @@ def test_captures_of_one_camera_and_flight_are_a_group_with_a_model_name_of_its_
     assert len(flights_of([replace(captures[1], bands=without), captures[0]])) == 1
 
 
-def test_a_model_is_learnt_again_where_what_it_depends_on_has_changed(flight: Path) -> None:
+def test_a_model_is_learned_again_if_its_input_changed(flight: Path) -> None:
     captures = agalign.discover(flight).captures
     before = learning_fingerprint(captures, SETTINGS)
     assert learning_fingerprint(agalign.discover(flight).captures, SETTINGS) == before
@@ -212,7 +212,7 @@ def test_a_fault_in_one_capture_costs_no_other(
 
 
 @pytest.mark.parametrize("fault", [cv2.error("of OpenCV"), agalign.GeometryError("no homography")])
-def test_a_fault_while_learning_costs_the_flights_network_and_nothing_else(
+def test_a_fault_while_learning_only_loses_the_network_of_the_flight(
     learned_flight: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, fault: Exception
 ) -> None:
     monkeypatch.setattr(learning_tasks, "refine_with", raising(fault))
@@ -241,7 +241,7 @@ def test_an_output_that_cannot_be_made_or_replaced_is_named(flight: Path, tmp_pa
         run(flight, tmp_path / "file" / "out")
 
 
-def test_a_run_records_what_it_was(flight: Path, tmp_path: Path) -> None:
+def test_a_run_writes_its_record(flight: Path, tmp_path: Path) -> None:
     copy, out = shutil.copytree(flight, tmp_path / "in"), tmp_path / "out"
     next(copy.rglob("IMG_0001_5.tif")).write_bytes(b"no image")
     reports = run_flight(agalign.discover(copy, TWO_PAIRS), out, SETTINGS)
@@ -272,9 +272,7 @@ def test_one_run_at_a_time(flight: Path, tmp_path: Path) -> None:
     assert not list(tmp_path.rglob(".agalign*"))
 
 
-def test_a_picture_that_fails_is_reported_and_costs_no_more(
-    flight: Path, out_with_model: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_failed_picture_is_only_reported(flight: Path, out_with_model: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(preview, "write_picture", raising(agalign.OutputError("a.png: cannot be written")))
     for report in run(flight, out_with_model):
         assert report.failed_products == ("a.png: cannot be written",)

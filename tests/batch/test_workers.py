@@ -1,4 +1,4 @@
-"""Processes that do captures, of our own and of a Dask cluster, and what becomes of a capture whose process ends."""
+"""Captures in worker processes, of agalign and of a Dask cluster, and after the end of a worker."""
 
 import os
 import signal
@@ -37,8 +37,8 @@ LOST = "its worker process was killed (signal 9; out of memory?); run again to p
 
 
 @pytest.mark.filterwarnings("ignore:Port .* is already in use", "ignore:unclosed:ResourceWarning")
-def test_a_dask_cluster_does_the_captures(flight: Path, aligned_flight: Path, tmp_path: Path) -> None:
-    """Two worker processes, one of which is killed while it does a capture."""
+def test_a_dask_cluster_processes_captures(flight: Path, aligned_flight: Path, tmp_path: Path) -> None:
+    """Two worker processes; one is killed while it processes a capture."""
     with dask_executor("local", 2) as executor:
         reports = run_flight(discover(flight), tmp_path, Settings(), RunOptions(executor=executor))
         processes = [p for p in psutil.Process().children(recursive=True) if is_worker(p)]

@@ -30,7 +30,7 @@ def shifted(dx: float, dy: float) -> np.ndarray:
 
 @pytest.fixture
 def sets() -> dict[str, Any]:
-    """One set of two captures with two bands each, whose truth is exact."""
+    """One set of two captures with two bands each and exact truth."""
     there = score.apply(TRUE, TIES_PX)
     inside = ((there >= 0) & (there <= (639, 479))).all(axis=1)
     ties = np.hstack([TIES_PX, there])[inside].tolist()
@@ -54,7 +54,7 @@ def test_the_error_of_a_known_homography_and_of_its_grid_is_exact(sets: dict[str
     assert by_grid.median_px == pytest.approx(1.0, abs=1e-3)
 
 
-def test_what_a_grid_leaves_out_it_has_wrong(sets: dict[str, Any]) -> None:
+def test_the_area_outside_a_grid_counts_as_wrong(sets: dict[str, Any]) -> None:
     here = np.array([[0, 0], [200, 0], [200, 200], [0, 200], [100, 100.0]])
     grid = {"reference_px": here.tolist(), "moving_px": score.apply(TRUE, here).tolist()}
     (first, *_) = score.score_pairs([row("1_r.png", grid=grid)], sets)
@@ -76,7 +76,7 @@ def test_wrong_claims_refusals_and_estimates_without_a_claim_are_counted_apart(s
     assert "| m | 4 | 2 | **1** | 1 | 1 (9.00 px) | 25% |" in score.markdown([result])
 
 
-def test_what_is_left_out_is_refused_and_what_is_not_asked_raises(sets: dict[str, Any]) -> None:
+def test_missing_pairs_are_refused_and_unknown_pairs_raise(sets: dict[str, Any]) -> None:
     one = row("1_r.png", homography=TRUE.tolist())
     (result,) = score.summary(score.score_pairs([one], sets))
     assert (result.claimed, result.refused) == (1, 3)
@@ -91,7 +91,7 @@ def test_what_is_left_out_is_refused_and_what_is_not_asked_raises(sets: dict[str
 
 
 @pytest.mark.parametrize("suffix", [".csv", ".json"])
-def test_what_is_written_is_read_again(sets: dict[str, Any], tmp_path: Path, suffix: str) -> None:
+def test_written_mappings_are_read_again(sets: dict[str, Any], tmp_path: Path, suffix: str) -> None:
     path = tmp_path / f"mine{suffix}"
     rows = [row("1_r.png", homography=shifted(0, 0.25).tolist(), variant="turn 10", seconds=0.5), row("1_n.png")]
     if suffix == ".csv":
@@ -103,7 +103,7 @@ def test_what_is_written_is_read_again(sets: dict[str, Any], tmp_path: Path, suf
     assert (plain.variant, plain.refused) == (score.AS_IT_IS, 4)
 
 
-def test_the_scorer_needs_nothing_of_agalign() -> None:
+def test_the_scorer_does_not_import_agalign() -> None:
     code = "import sys, score; print(any(m.split('.')[0] in ('agalign', 'cv2', 'torch') for m in sys.modules))"
     folder = Path(score.__file__).parent
     assert subprocess.run([sys.executable, "-c", code], cwd=folder, capture_output=True, text=True).stdout == "False\n"
@@ -186,11 +186,11 @@ def test_a_method_that_raises_has_refused(
     assert asked(identity, pair, score.AS_IT_IS, paths, {})["homography"] == np.eye(3).tolist()
 
 
-def test_anyones_method_is_taken_from_a_file(tmp_path: Path) -> None:
+def test_a_method_is_loaded_from_a_file(tmp_path: Path) -> None:
     path = tmp_path / "mine.py"
     path.write_text("def align(fixed, moving):\n    return None\n")
     assert method_named(f"{path}:align")(np.eye(3), np.eye(3)) is None
-    for name in ("nothing of the kind", f"{tmp_path}/other.py:align"):
+    for name in ("no such method", f"{tmp_path}/other.py:align"):
         with pytest.raises(UnavailableError):
             method_named(name)
 

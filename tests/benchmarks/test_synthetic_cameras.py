@@ -45,7 +45,7 @@ def test_rig_tags_are_the_truth_from_far_above(tmp_path: Path, name: str) -> Non
         truth = true_homography(camera.bands[camera.reference], spec, pose, SIZE)
         seed = rig_seed(capture.reference, band)
         assert seed is not None
-        # Tags of optical centres know of no angles, and those of the thermal lens are not its true ones.
+        # Tags of optical centres contain no angles, and those of the thermal lens are not its true ones.
         tolerance = 0.7 if not getattr(camera, "calibrated", True) else 3.0 if spec.sees == "heat" else 0.05
         assert geometry.corner_error_px(seed, truth, *SIZE) < tolerance
     assert set(json.loads(path.read_text())[capture.name]["bands"]) == {b.path.name for b in capture.moving}

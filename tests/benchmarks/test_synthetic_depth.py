@@ -95,7 +95,7 @@ def two_layers(near_m: float, far_m: float, half_m: float) -> Scene:
     return Scene("two layers", (floor, square), textures, Pose(far_m, 0, 0, 0, 0, 0))
 
 
-def test_what_a_nearer_square_hides() -> None:
+def test_pixels_behind_a_nearer_square_are_occluded() -> None:
     near_m, far_m, half_m = 0.5, 1.5, 0.05
     truth = truth_of(two_layers(near_m, far_m, half_m), SIZE, STRAIGHT)
     half_px = FOCAL_PX * half_m / near_m

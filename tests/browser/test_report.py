@@ -27,9 +27,7 @@ BROWSERS = ("chromium", "chromium-browser", "google-chrome")
 
 @pytest.fixture(scope="module")
 def out(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Three captures of a flight: one in order, one whose NIR is black, one of which nothing is known but hostile
-    names.
-    """
+    """Three captures of a flight: one unchanged, one with black NIR, one with hostile names."""
     folder = tmp_path_factory.mktemp("report")
     synthetic.make_flight(folder / "in", captures=2, size_px=(480, 360), rng_seed=3)
     black = folder / "in" / "0000SET" / "000" / "IMG_0002_4.tif"
@@ -100,7 +98,7 @@ def look_at(page: Any, label: str) -> None:
     page.wait_for_function("() => document.querySelector('canvas').width > 300")
 
 
-def test_what_fell_short_stands_first(page: Any) -> None:
+def test_failed_captures_are_listed_first(page: Any) -> None:
     """And is shown without being asked for."""
     first = page.locator("section h2").first
     assert first.inner_text() == "Problems"
@@ -176,7 +174,7 @@ def test_both_sides_zoom_in_step(page: Any) -> None:
     page.get_by_role("button", name="All").click()
     whole = drawn(page)
     assert np.abs(whole - zoomed).mean() > 5
-    # The reference lies in both at the same place.
+    # The reference has the same place in both.
     assert np.corrcoef(left[:, : right.shape[1]].ravel(), right[:, : left.shape[1]].ravel())[0, 1] > 0.2
 
 
@@ -207,12 +205,12 @@ def test_blinking_and_the_keys_of_the_picture(page: Any) -> None:
 
 
 @pytest.mark.parametrize("overlay", ["vectors", "heat", "error"])
-def test_what_is_laid_over_the_picture(page: Any, overlay: str) -> None:
+def test_overlays_of_the_picture(page: Any, overlay: str) -> None:
     look_at(page, "IMG_0001")
     press_on_slider(page, "Home")
     bare = drawn(page)
     page.get_by_label("Overlay", exact=True).select_option(overlay)
-    # The errors of this flight are small: what is laid over it for them is faint.
+    # The errors of this flight are small: their overlay is faint.
     assert (np.abs(drawn(page) - bare).max(axis=2) > (5 if overlay == "error" else 40)).sum() > 400
     press_on_slider(page, "End")
     before = drawn(page)
@@ -226,7 +224,7 @@ def test_cells_of_the_heat_map_leave_no_seams(page: Any) -> None:
     show_one_band(page)
     grey = drawn(page)
     page.get_by_label("Overlay", exact=True).select_option("heat")
-    # Of the picture, whose colours add up to a quarter, nothing else may show: no line twice as dark, none bare.
+    # The picture has a weight of a quarter; the grid of the overlay must not show as dark or bare lines.
     cells = (drawn(page) - 0.25 * grey)[80:-20, 20:-60]
     saturation = np.ptp(cells, axis=2)
     lines = np.concatenate([np.median(saturation, axis=0), np.median(saturation, axis=1)])
@@ -254,7 +252,7 @@ def test_an_index_over_the_picture_and_on_the_map(page: Any) -> None:
     page.locator("#map-colour").select_option("index:ndvi")
     assert dots.nth(0).get_attribute("fill") != before
     assert row[1] in page.locator("#map-legend").inner_text()
-    look_at(page, "IMG_0002")  # without NIR there is no index
+    look_at(page, "IMG_0002")  # without NIR an index is missing
     assert page.get_by_label("Overlay", exact=True).input_value() == "none"
 
 

@@ -83,7 +83,7 @@ def test_without_a_lens_there_is_no_rig_seed() -> None:
         (Tags(), "generic"),
     ],
 )
-def test_who_recognises_what(tags: Tags, name: str) -> None:
+def test_which_camera_recognises_which_tags(tags: Tags, name: str) -> None:
     assert next(c for c in known_cameras() if c.recognises(tags)).name == name
 
 

@@ -53,7 +53,7 @@ def test_a_micasense_flight(flight: Path) -> None:
     assert all(b.lens is None and b.to_rig is None for c in without.captures for b in c.bands)
 
 
-def test_missing_bands_and_unreadable_files_are_told(flight: Path, tmp_path: Path) -> None:
+def test_missing_bands_and_unreadable_files_are_reported(flight: Path, tmp_path: Path) -> None:
     shutil.copytree(flight, tmp_path / "f")
     images = tmp_path / "f" / "0000SET" / "000"
     (images / "IMG_0002_3.tif").unlink()
@@ -119,7 +119,7 @@ def test_pictures_one_a_band_by_name_are_a_capture(tmp_path: Path, suffix: str, 
     assert result.problems == ()
 
 
-def test_quick_looks_among_tiffs_take_no_part(tmp_path: Path) -> None:
+def test_previews_next_to_tiffs_are_ignored(tmp_path: Path) -> None:
     write_all(tmp_path, "a_red", "a_nir")
     for name in ("a_red.jpg", "a_nir.jpg", "map_red.png", "chart.png", "photo_1.jpg", "photo_2.jpg"):
         write_picture(tmp_path / name, 3 if "photo" in name else 1)
@@ -128,7 +128,7 @@ def test_quick_looks_among_tiffs_take_no_part(tmp_path: Path) -> None:
     assert (result.problems, result.eight_bit) == ((), ())
 
 
-def test_a_picture_of_a_band_without_a_tiff_takes_part(tmp_path: Path) -> None:
+def test_a_picture_of_a_band_without_a_tiff_is_used(tmp_path: Path) -> None:
     write_all(tmp_path, "a_red", "a_green")
     for name in ("a_red.jpg", "a_nir.png", "b_red.png", "b_nir.jpg"):
         write_picture(tmp_path / name)
@@ -196,7 +196,7 @@ def test_a_panel_of_another_flight_is_a_capture_of_its_own(flight: Path, tmp_pat
     synthetic.make_flight(tmp_path / "other", captures=1, size_px=(480, 360), rng_seed=9)
     for path in (tmp_path / "other" / "0000SET" / "000").iterdir():
         shutil.copy(path, tmp_path / "f" / "0000SET" / "000" / path.name.replace("IMG_0001", "IMG_0000"))
-    # Same CaptureId as IMG_0001 in this folder: real cameras never repeat one, so files are told apart by name.
+    # Same CaptureId as IMG_0001 in this folder: real cameras never repeat one, so names distinguish the files.
     result = discover(tmp_path / "f")
     assert sum(len(c.bands) for c in result.captures) == 15
 
@@ -211,7 +211,7 @@ def test_a_pattern_splits_names_where_the_band_begins(tmp_path: Path) -> None:
     assert found(tmp_path / "b", pattern="{band}-of-{capture}.tif") == {"7": ["A", "B"], "8": ["A", "B"]}
 
 
-def test_a_pattern_that_makes_one_band_of_two_files_is_told(tmp_path: Path) -> None:
+def test_a_pattern_that_gives_two_files_for_a_band_is_reported(tmp_path: Path) -> None:
     write_all(tmp_path, "a_1_red", "a_2_red", "a_1_nir")
     result = discover(tmp_path, DiscoverOptions(pattern="{capture}_*_{band}.tif"))
     (problem,) = result.problems
@@ -234,7 +234,7 @@ def test_digits_that_are_not_numbers_and_a_number_alone_are_names(tmp_path: Path
     assert "capture" in found(tmp_path)  # a name that begins with a dot or is empty would be hidden
 
 
-def test_a_capture_lies_where_its_reference_says(flight: Path, tmp_path: Path) -> None:
+def test_a_capture_has_the_position_of_its_reference(flight: Path, tmp_path: Path) -> None:
     shutil.copytree(flight / "0000SET" / "000", tmp_path / "in")
     path = tmp_path / "in" / "IMG_0001_1.tif"  # blue, the first file
     elsewhere = {1: text("S"), 2: rational(10, 0, 0), 3: text("W"), 4: rational(20, 0, 0)}

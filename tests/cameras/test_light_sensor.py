@@ -14,7 +14,7 @@ DLS, NOON = "micasense.com/DLS", "2003-10-17T19:30:30"
 GOLDEN = Position(39.742476, -105.1786, 1830.14)
 
 
-def test_the_sun_is_where_the_example_of_nrel_has_it() -> None:
+def test_position_of_the_sun_equals_the_example_of_nrel() -> None:
     """Reda & Andreas 2004 (NREL/TP-560-34302), appendix A.5: elevation 39.872046 degrees before refraction."""
     elevation, azimuth = map(math.degrees, sun_position(GOLDEN, datetime.fromisoformat(NOON)))
     assert elevation == pytest.approx(39.872046, abs=0.01)

@@ -94,7 +94,7 @@ def test_reading_a_file(flight: Path) -> None:
 
 
 @pytest.mark.parametrize("content", [b"", b"II*\0", b"hello", b"II*\0\x08\0\0\0\xff\xff"])
-def test_what_is_no_tiff_is_named(tmp_path: Path, content: bytes) -> None:
+def test_other_files_than_tiffs_are_named(tmp_path: Path, content: bytes) -> None:
     path = tmp_path / "broken.tif"
     path.write_bytes(content)
     with pytest.raises(UnreadableFileError, match=r"broken\.tif"):
@@ -122,7 +122,7 @@ def test_taking_anothers_values(dialect: str, theirs: str) -> None:
     }
 
 
-def test_taking_from_one_that_has_none_removes() -> None:
+def test_taking_values_from_a_packet_without_them_removes_them() -> None:
     mine = Packet.parse(packet(VALUES, "elements"))
     mine.take(Packet(), [(NAMESPACE, "PrincipalPoint")])
     assert {name for _, name in mine.values()} == {"BandName"}

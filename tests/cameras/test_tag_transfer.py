@@ -56,7 +56,7 @@ def bands_in(folder: Path) -> dict[str, Band]:
 
 
 @pytest.mark.slow
-def test_vignetting_lies_where_the_band_was_moved_to(flight: Path, both: Path) -> None:
+def test_the_vignetting_centre_moves_with_the_band(flight: Path, both: Path) -> None:
     data = json.loads((both / "IMG_0001.json").read_text())
     truth = json.loads((flight / "truth.json").read_text())["IMG_0001"]["bands"]["IMG_0001_4.tif"]
     centre = np.array(read_tags(flight / "0000SET" / "000" / "IMG_0001_4.tif").numbers(NAMESPACE, "VignettingCenter"))
@@ -71,7 +71,7 @@ def test_vignetting_lies_where_the_band_was_moved_to(flight: Path, both: Path) -
 
 
 @pytest.mark.slow
-def test_the_stack_says_what_is_true_of_all_its_bands(both: Path) -> None:
+def test_the_stack_has_the_tags_that_all_bands_share(both: Path) -> None:
     result = read_directories(both / "IMG_0001.tif")
     assert result[GPS][1].data == b"N\0"
     assert 36867 in result[EXIF]
@@ -132,7 +132,7 @@ def test_undistorted_pixels_have_no_distortion(tmp_path: Path) -> None:
     assert result.numbers(NAMESPACE, "PerspectiveDistortion") == (0.0,) * 5
 
 
-def test_radiometry_takes_what_it_used(tmp_path: Path) -> None:
+def test_tags_of_applied_radiometry_are_removed(tmp_path: Path) -> None:
     write_capture(tmp_path, VENDORS["RedEdge"])
     values = {(NAMESPACE, "VignettingCenter"): ("80", "60"), (NAMESPACE, "BandName"): ("NIR",)}
     values[MICASENSE, "RadiometricCalibration"] = "1", "2", "3"
@@ -164,7 +164,7 @@ def test_an_undistorted_fisheye_is_a_pinhole(tmp_path: Path) -> None:
     assert result.lens.cx_px == pytest.approx(reference.lens.cx_px, abs=1e-3)
 
 
-def test_a_focal_length_in_px_goes_with_the_grid(tmp_path: Path) -> None:
+def test_a_focal_length_in_px_is_scaled_with_the_grid(tmp_path: Path) -> None:
     values = {(NAMESPACE, "PrincipalPoint"): ("2.4", "1.8"), (NAMESPACE, "PerspectiveFocalLength"): ("1451.8",)}
     first = {271: text("MicaSense"), XMP: byte_string(packet(values, "elements"))}
     path = write_file(tmp_path / "IMG_0001_2.tif", first, {37386: rational(5.45)})
@@ -176,7 +176,7 @@ def test_a_focal_length_in_px_goes_with_the_grid(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("centre", [("1e14", "1e14"), ("nan", "0"), ("99999", "99999")])
-def test_a_centre_of_vignetting_that_lies_nowhere_is_left_out(tmp_path: Path, centre: tuple[str, str]) -> None:
+def test_a_centre_of_vignetting_without_position_is_omitted(tmp_path: Path, centre: tuple[str, str]) -> None:
     values = {(NAMESPACE, "VignettingCenter"): centre, (NAMESPACE, "VignettingPolynomial"): ("1e-4",)}
     first = {271: text("MicaSense"), XMP: byte_string(packet(values, "elements"))}
     path = write_file(tmp_path / "IMG_0001_2.tif", first)

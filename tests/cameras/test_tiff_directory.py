@@ -26,7 +26,7 @@ PLACE = {1: text("N"), 2: rational(52, 30, 12.5), 3: text("E"), 4: rational(5, 0
 
 @pytest.mark.parametrize("big", [False, True])
 @pytest.mark.parametrize("order", ["<", ">"])
-def test_what_is_added_is_read_by_others_and_the_pixels_stay(tmp_path: Path, order: str, big: bool) -> None:
+def test_other_libraries_read_added_tags_and_pixels_are_unchanged(tmp_path: Path, order: str, big: bool) -> None:
     path = tmp_path / "x.tif"
     tifffile.imwrite(path, PIXELS, byteorder=order, bigtiff=big, metadata=None)
     add_directories(path, FIRST, {33434: rational(0.0013), 36867: text("2026:06:21 10:00:00")}, PLACE)
@@ -72,7 +72,7 @@ def test_a_jpegs_exif_is_read(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("content", [b"", b"II*\0", b"no tiff at all", struct.pack("<2sHI", b"II", 42, 10**6)])
-def test_what_is_no_tiff_is_a_value_error(tmp_path: Path, content: bytes) -> None:
+def test_other_data_than_tiff_raises_value_error(tmp_path: Path, content: bytes) -> None:
     path = tmp_path / "x.tif"
     path.write_bytes(content)
     with pytest.raises(ValueError, match=r"TIFF|ends"):

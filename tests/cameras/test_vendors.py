@@ -241,7 +241,7 @@ def test_orientation_3_turns_lens_and_rig(tmp_path: Path) -> None:
     assert geometry.corner_error_px(seeds[3], seeds[1], *SIZE) > 0.3
 
 
-def test_mapir_groups_by_what_follows_the_serial(tmp_path: Path) -> None:
+def test_mapir_files_are_grouped_by_the_name_after_the_serial(tmp_path: Path) -> None:
     for serial, nm in (("A1", 450), ("B2", 550), ("C3", 850)):
         name = f"capture_{serial}_0001_20260101_101010_123.tiff"
         write_file(tmp_path / name, {272: text(f"LATT-M3M-L41-F{nm}")})
@@ -258,7 +258,7 @@ def photograph(path: Path, make: str, values: Values | None = None) -> None:
     Image.fromarray(cv2.GaussianBlur(pixels, (0, 0), 2)).save(path, exif=exif, xmp=packet(values or {}, "attributes"))
 
 
-def test_the_colour_photograph_takes_part_where_asked(tmp_path: Path) -> None:
+def test_the_colour_photograph_is_aligned_on_request(tmp_path: Path) -> None:
     write_capture(tmp_path, VENDORS["Phantom 4"])
     values = {"CaptureUUID": "abc", "RelativeOpticalCenterX": "4", "RelativeOpticalCenterY": "6"}
     photograph(tmp_path / "DJI_0010.JPG", "DJI", {(DJI, k): (v,) for k, v in values.items()})
@@ -389,7 +389,7 @@ def test_a_calibrated_mavic_offers_both(tmp_path: Path) -> None:
 
 
 def test_the_mavic_s_colour_photograph_goes_through_the_designed_frame(tmp_path: Path) -> None:
-    """The middle of the bands' frame, (1296, 972), lies at (2639.9, 1978.0) of the photograph."""
+    """The centre of the bands' frame, (1296, 972), maps to (2639.9, 1978.0) in the photograph."""
     colour = Tags(make="DJI", model="M3M", xmp={(DJI, "CaptureUUID"): ("abc",)})
     photo = tmp_path / "DJI_20230607112233_0001_D.JPG"
     cv2.imwrite(str(photo), np.zeros((48, 64, 3), np.uint8))

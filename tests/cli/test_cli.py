@@ -41,7 +41,7 @@ def test_a_flight_is_aligned(flight: Path, aligned_flight: Path, name: str) -> N
         assert band["metrics"]["after"]["residual_px"] < 0.3
 
 
-def test_the_stack_is_what_the_sidecar_says(flight: Path, aligned_flight: Path) -> None:
+def test_the_stack_agrees_with_the_sidecar(flight: Path, aligned_flight: Path) -> None:
     folder = aligned_flight / "0000SET" / "000"
     data = read_json(folder / "IMG_0001.json")
     x0, y0, width, height = data["output"]["crop"]
@@ -81,7 +81,7 @@ def test_log_json_is_a_json_object_a_line(aligned_flight: Path) -> None:
     assert events[-1]["event"] == "finished"
 
 
-def test_a_second_run_keeps_what_is_done(flight: Path, aligned_copy: Path) -> None:
+def test_a_second_run_keeps_finished_captures(flight: Path, aligned_copy: Path) -> None:
     stack = aligned_copy / "0000SET" / "000" / "IMG_0001.tif"
     before = stack.stat().st_mtime_ns
     done = agalign_here(flight, "-o", aligned_copy)

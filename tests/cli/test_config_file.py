@@ -126,7 +126,7 @@ def test_local_is_the_old_name_of_relief_for_onto_too() -> None:
     assert context.params["relief"] == "always"
 
 
-def test_a_dry_run_says_what_would_be_done_and_writes_nothing(tmp_path: Path) -> None:
+def test_a_dry_run_prints_its_plan_and_writes_nothing(tmp_path: Path) -> None:
     synthetic.make_flight(tmp_path / "in", captures=2, size_px=(160, 120))
     before = sorted(tmp_path.rglob("*"))
     done = agalign_here("align", tmp_path / "in", "-o", tmp_path / "out", "--dry-run", "-v")

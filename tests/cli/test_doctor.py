@@ -1,4 +1,4 @@
-"""What `agalign doctor` says of a machine."""
+"""The report of `agalign doctor`."""
 
 import json
 import re
@@ -32,7 +32,7 @@ def test_it_names_every_extra_that_a_user_may_want() -> None:
         assert all(re.fullmatch(r"[\w.-]+", name) for name in doctor._requirements(extra))
 
 
-def test_what_is_in_the_way_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_problems_of_the_machine_are_listed(monkeypatch: pytest.MonkeyPatch) -> None:
     machine = dict.fromkeys(doctor._LIBRARIES, "1")
     well = {"machine": machine, "devices": [], "disk": {"folder": "/data", "writable": True, "free_gb": 100.0}}
     assert doctor._problems(well) == []

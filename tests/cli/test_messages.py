@@ -224,7 +224,7 @@ def test_each_end_has_a_code(error: BaseException, code: int, said: str, capsys:
     assert said in line
 
 
-def test_what_is_shown_does_nothing() -> None:
+def test_text_from_files_is_escaped_in_the_terminal() -> None:
     assert shown("\x1b[31mred\a\n[b]") == "\\x1b[31mred\\x07\\n\\[b]"
     assert shown("Köln, 雨 [1]") == "Köln, 雨 [1]"
 

@@ -82,7 +82,7 @@ def test_colours_and_indices_are_of_one_date(mosaics: Path, tmp_path: Path) -> N
         np.testing.assert_allclose(ndvi.read(1), (nir - red) / (nir + red), atol=1e-6)
 
 
-def test_bad_mosaics_are_told_in_a_line(mosaics: Path, tmp_path: Path) -> None:
+def test_unusable_mosaics_are_one_line(mosaics: Path, tmp_path: Path) -> None:
     write_mosaic(tmp_path / "nowhere.tif", np.zeros((60, 80), np.float32), None)
     for moving, problem in (
         (tmp_path / "nowhere.tif", "has no coordinates"),
@@ -95,7 +95,7 @@ def test_bad_mosaics_are_told_in_a_line(mosaics: Path, tmp_path: Path) -> None:
         assert len(done.stderr.strip().splitlines()) == 1
 
 
-def test_a_mosaic_of_another_place_is_told(mosaics: Path, tmp_path: Path) -> None:
+def test_a_distant_mosaic_is_reported(mosaics: Path, tmp_path: Path) -> None:
     with rasterio.open(mosaics / "summer.tif") as source:
         away = {**source.profile, "transform": Affine.translation(0, 111_000) * source.transform}
         with rasterio.open(tmp_path / "away.tif", "w", **away) as target:

@@ -23,7 +23,7 @@ class Block:
 
     @property
     def where(self) -> str:
-        """For whoever looks for it."""
+        """Page and line."""
         return f"{self.page.relative_to(ROOT)}:{self.line}"
 
 

@@ -107,7 +107,7 @@ def run_page(page: Path) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("page", RUNNABLE, ids=[p.relative_to(ROOT).as_posix() for p in RUNNABLE])
-def test_a_page_does_what_it_says(page: Path, desk: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_blocks_of_a_page_run(page: Path, desk: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(desk)
     run_page(page)
 
@@ -180,15 +180,15 @@ def test_the_python_of_the_readme_aligns_pixels() -> None:
     assert (expected[masked] < 0.2).mean() > 0.99
 
 
-def test_every_block_says_what_it_is() -> None:
-    """One without a kind would be run by nobody."""
+def test_every_block_has_a_kind() -> None:
+    """One without a kind would not be run."""
     blocks = [block for page in PAGES for block in blocks_of(page)]
     assert blocks
     for block in blocks:
         assert block.kind in KINDS, block.where
 
 
-def test_what_is_not_run_here_is_run_elsewhere() -> None:
+def test_blocks_that_are_not_run_here_are_run_by_scripts() -> None:
     seen = set()
     for page in PAGES:
         for block in blocks_of(page):
@@ -199,7 +199,7 @@ def test_what_is_not_run_here_is_run_elsewhere() -> None:
     assert all((ROOT / script).is_file() for script in RUN_BY.values())
 
 
-def test_extras_that_are_named_can_be_had() -> None:
+def test_named_extras_exist() -> None:
     extras = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]["optional-dependencies"]
     text = "".join(page.read_text(encoding="utf-8") for page in PAGES)
     named = {name for names in re.findall(r"agalign\[([\w,]+)\]", text) for name in names.split(",")}
@@ -208,7 +208,7 @@ def test_extras_that_are_named_can_be_had() -> None:
 
 
 @pytest.mark.parametrize("page", PAGES, ids=[p.relative_to(ROOT).as_posix() for p in PAGES])
-def test_links_lead_somewhere(page: Path) -> None:
+def test_links_have_targets(page: Path) -> None:
     text = re.sub(r"```.*?```", "", page.read_text(encoding="utf-8"), flags=re.DOTALL)
     for target in re.findall(r"\]\(([^)\s]+)\)", text):
         if re.match(r"[a-z]+:", target):
@@ -236,7 +236,7 @@ def test_generated_tables_are_current(tool: str) -> None:
 
 
 @pytest.mark.slow
-def test_the_site_is_built(tmp_path: Path) -> None:
+def test_the_site_builds_without_warnings(tmp_path: Path) -> None:
     """Every page, and what the docstrings say, without a warning."""
     pytest.importorskip("sphinx")
     python("-m", "sphinx", "-q", "-W", "--keep-going", ROOT / "docs", tmp_path / "site")

@@ -66,7 +66,7 @@ def test_homography_error_is_the_mean_over_the_matches() -> None:
     assert homography_error_px(geometry.translation(3, 4), np.eye(3), points) == pytest.approx(5)
 
 
-def test_keypoints_whose_patch_leaves_an_image_do_not_count() -> None:
+def test_keypoints_with_a_patch_outside_an_image_do_not_count() -> None:
     fixed, moving = two_views(geometry.translation(120.0, 0.0))
     keypoints = sift_keypoints(fixed)
     kept = visible_in_both(keypoints, geometry.translation(120.0, 0.0), fixed, moving)
@@ -95,7 +95,7 @@ def test_hand_made_descriptors_find_copies_and_nothing_in_unrelated_images(name:
         assert low <= average_precision(*describe(keypoints, np.eye(3))) <= high
 
 
-def test_starts_are_off_by_the_share_asked_for() -> None:
+def test_starts_have_the_requested_error() -> None:
     starts = list(Starts((0.0, 0.1), directions=4).of(TRUTH, 400, np.random.default_rng(0)))
     assert [share for share, _ in starts] == [0.0, 0.1, 0.1, 0.1, 0.1]
     shifts = [geometry.apply(geometry.compose(geometry.invert(TRUTH), m), [[0.0, 0.0]])[0] for _, m in starts]
@@ -112,7 +112,7 @@ def test_names_of_methods(tmp_path: Path) -> None:
             method_named(str(tmp_path / name))
 
 
-def test_a_torchscript_file_takes_part(tmp_path: Path) -> None:
+def test_a_torchscript_descriptor_is_evaluated(tmp_path: Path) -> None:
     path = tmp_path / "flat.pt"
     with torch.no_grad():
         flat = torch.nn.Sequential(torch.nn.AvgPool2d(4), torch.nn.Flatten(), torch.nn.LayerNorm(64))
@@ -126,7 +126,7 @@ def test_a_torchscript_file_takes_part(tmp_path: Path) -> None:
         method_named(f"{path}@64")
 
 
-def test_what_is_learnt_on_a_pair_beats_sift_where_contrast_is_reversed(tmp_path: Path) -> None:
+def test_a_descriptor_learned_on_a_pair_beats_sift_with_reversed_contrast(tmp_path: Path) -> None:
     pair = write_pair(tmp_path, TRUTH, 3)
     methods = {name: method_named(name) for name in ("fast:pseudo-siamese", "sift")}
     results = list(evaluate([pair], methods, Starts((0.05,)), device="cpu"))
@@ -179,7 +179,7 @@ def learnt(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-def test_a_descriptor_learnt_on_pairs_serves_one_that_it_has_not_seen(learnt: Path, tmp_path: Path) -> None:
+def test_a_learned_descriptor_works_on_an_unseen_pair(learnt: Path, tmp_path: Path) -> None:
     pair = write_pair(tmp_path, TRUTH, 9)
     methods = {name: method_named(name) for name in (str(learnt), "sift")}
     ours, sift = evaluate([pair], methods, Starts(), device="cpu")
@@ -205,7 +205,7 @@ def turned(angle_deg: float) -> np.ndarray:
     return about @ geometry.translation(-170, -130)
 
 
-def test_matching_finds_what_is_turned_and_far_away(learnt: Path) -> None:
+def test_matching_finds_rotated_and_distant_images(learnt: Path) -> None:
     truth = turned(25.0)
     fixed, moving = two_views(truth, seed=4)
     model = load_model(learnt, lambda: torch.device("cpu"))
@@ -244,7 +244,7 @@ def test_evaluate_prints_tables_and_writes_rows(tmp_path: Path) -> None:
     assert runner.invoke(app, ["surface", str(table), "-o", "picture"]).exit_code == 2
 
 
-def test_learn_writes_a_network_and_says_what_taught_it(tmp_path: Path) -> None:
+def test_learn_writes_a_network_and_reports_its_pairs(tmp_path: Path) -> None:
     pair = write_pair(tmp_path, TRUTH, 3)
     table, network = tmp_path / "pairs.csv", tmp_path / "net.safetensors"
     table.write_text(f"fixed,moving\n{pair.fixed.name},{pair.moving.name}\n")

@@ -74,7 +74,7 @@ def lit(irradiance: float, quantity: Quantity = "reflectance") -> Band:
 
 
 def lit_panel(moment: str, irradiance: float, measured: float, quantity: Quantity = "reflectance") -> PanelReading:
-    """A panel of reflectance 0.5 under an irradiance of which the light sensor measures `measured`."""
+    """A panel of reflectance 0.5 under an irradiance that the light sensor measures as `measured`."""
     band = lit(measured, quantity)
     return PanelReading(capture(band, moment), (BandReading(band, 0.5, 0.5 * irradiance / np.pi),))
 

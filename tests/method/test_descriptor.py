@@ -103,7 +103,7 @@ def test_recipe_fast_starts_from_the_starter_by_default() -> None:
     assert (first() - first("random")).abs().max() > 0.1
 
 
-def test_each_side_takes_the_chosen_side() -> None:
+def test_a_descriptor_starts_from_the_chosen_branches() -> None:
     learnt = Descriptor("unshared", [1, 1, 1], half_rectified=True, unit_length=True)
     two = Descriptor("unshared", [1, 1], half_rectified=True, unit_length=True)
     start_from(two, learnt.state_dict(), (REFERENCE, 2))

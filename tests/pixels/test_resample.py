@@ -76,7 +76,7 @@ def test_the_type_is_kept_and_integers_are_rounded(tmp_path: Path, dtype: str) -
 
 
 @pytest.mark.parametrize("interpolation", ["cubic", "lanczos"])
-def test_kernels_do_not_ring_beside_saturated_pixels(interpolation: str) -> None:
+def test_kernels_do_not_ring_next_to_saturated_pixels(interpolation: str) -> None:
     pixels = np.random.default_rng(0).uniform(0.02, 0.03, (60, 80)).astype(np.float32)
     pixels[20:40, 30:50] = 1.0
     positions = np.stack(np.meshgrid(np.arange(5, 75) + 0.4, np.arange(5, 55) + 0.3), axis=-1)
@@ -103,7 +103,7 @@ def test_tiles_join_without_a_seam(tmp_path: Path) -> None:
         assert np.abs(part - whole[window])[valid].max() < 0.5  # 0.005 of the contrast: spline knots differ by tile
 
 
-def test_nearest_takes_every_pixel_that_is_nearest() -> None:
+def test_nearest_neighbour_uses_the_nearest_pixel() -> None:
     pixels = np.arange(12, dtype=np.uint8).reshape(3, 4)
     positions = np.stack(np.meshgrid(np.array([-0.4, 0.4, 3.4, 3.6]), np.array([0.0])), axis=-1)
     got, valid = resample(pixels, np.ones((3, 4), bool), positions, Tile(0, 0, 4, 3), (4, 3), "nearest")

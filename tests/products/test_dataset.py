@@ -77,7 +77,7 @@ def test_captures_on_rotated_grids_are_stacked(flight: Path, tmp_path: Path) -> 
     assert "xc" not in stacked.coords
 
 
-def test_what_cannot_be_opened_is_named(tmp_path: Path) -> None:
+def test_unreadable_datasets_are_named(tmp_path: Path) -> None:
     with pytest.raises(agalign.InputError, match="no aligned captures"):
         agalign.open_flight(tmp_path)
     with pytest.raises(agalign.AgalignError, match=r"missing\.json"):

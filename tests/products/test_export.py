@@ -92,7 +92,7 @@ def test_matrices_for_opencv_are_between_raw_pixels(run: Path, tmp_path: Path) -
     assert "Largest distance" in report.notes[-1]
 
 
-def test_what_cannot_be_exported_is_one_line(run: Path, tmp_path: Path) -> None:
+def test_captures_that_cannot_be_exported_are_one_line(run: Path, tmp_path: Path) -> None:
     with pytest.raises(agalign.InputError, match="give the output folder of a run"):
         export(tmp_path, tmp_path / "to", "odm")
     (tmp_path / "full").mkdir()

@@ -15,7 +15,7 @@ def capture(*bands: tuple[str, str, str | None], missing: tuple[str, ...] = ()) 
     return example(bands=parts, missing_bands=missing).result()
 
 
-def test_bands_of_one_cause_and_status_are_one_group_and_the_gravest_comes_first() -> None:
+def test_bands_are_grouped_by_cause_and_status_most_severe_first() -> None:
     result = FailureGroups()
     result.add(
         "one", capture(("Green", "reference", None), ("Blue", "aligned", None), ("NIR", "predicted", "retrieval"))

@@ -99,7 +99,7 @@ def test_bands_place_time_and_camera_are_as_before(aligned: Aligned) -> None:
             assert image.getexif().get_ifd(0x8825)[1] == "N"
 
 
-def test_nobody_aligns_them_once_more(aligned: Aligned) -> None:
+def test_tags_of_aligned_bands_describe_one_camera(aligned: Aligned) -> None:
     """All bands are one camera's now: no angles between them, one principal point, one lens, one homography."""
     camera, _, out = aligned
     packets = [xmp_of(p) for p in bands_of(out)]
@@ -132,7 +132,7 @@ def test_the_principal_point_is_on_the_pixel_that_it_was_on(aligned: Aligned) ->
     assert moved == pytest.approx([x0, y0], abs=0.01)
 
 
-def test_undistorted_pixels_say_so(tmp_path: Path) -> None:
+def test_undistorted_files_have_tags_without_distortion(tmp_path: Path) -> None:
     make_aligned(tmp_path, MAVIC, undistort=True)
     paths = bands_of(tmp_path / "out")
     assert len(paths) == 4

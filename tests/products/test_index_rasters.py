@@ -120,7 +120,7 @@ def test_raw_numbers_are_named_and_drawn_in_neutral_greys(tmp_path: Path) -> Non
     assert np.ptp(grey) > 150, "stretched over all greys"
 
 
-def test_only_what_is_new_is_calculated(tmp_path: Path) -> None:
+def test_only_new_indices_are_calculated(tmp_path: Path) -> None:
     make_aligned(tmp_path, 3)
     assert [r.kept for r in run(tmp_path)] == [False] * 3
     rasters = sorted(tmp_path.rglob("*_ndvi.tif"))
@@ -209,7 +209,7 @@ def test_processes_write_what_one_process_writes(tmp_path: Path) -> None:
     assert one.read_bytes() == other.read_bytes()
 
 
-def test_the_report_knows_the_indices(tmp_path: Path) -> None:
+def test_the_report_has_the_indices(tmp_path: Path) -> None:
     make_aligned(tmp_path, 2)
     run(tmp_path, NDVI, NDRE)
     write_pages(tmp_path, pytest.fail)

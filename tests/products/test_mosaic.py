@@ -1,4 +1,4 @@
-"""Mosaics of captures whose true positions on one ground are known."""
+"""Mosaics of captures with known true positions on one ground."""
 
 import json
 import math
@@ -240,7 +240,7 @@ DAMAGED = "IMG_0009: left out: its entry in flight.geojson is damaged; run again
         (None, ("-o", "field.png"), 2, "give the mosaic a new file that ends in .tif"),
     ],
 )
-def test_what_cannot_be_done_is_one_line(
+def test_errors_are_one_line(
     survey: Path,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,

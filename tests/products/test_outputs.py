@@ -130,7 +130,7 @@ def test_ndvi_of_the_synthetic_flight_is_its_truth(calibrated: Path) -> None:
     assert result.path.with_suffix(".png").read_bytes()[:4] == b"\x89PNG"
 
 
-def test_indices_and_the_error_map_are_outputs_of_the_run_and_go_when_not_asked_for(calibrated: Path) -> None:
+def test_indices_and_error_map_are_removed_if_not_requested(calibrated: Path) -> None:
     out = calibrated / "out"
     sidecar = read_json(next(out.rglob("IMG_0001.json")))
     files = [p["file"] for p in sidecar["products"] if p["kind"] == "index"]
@@ -229,7 +229,7 @@ def test_a_nodata_value_that_a_type_cannot_hold_is_not_declared(tmp_path: Path) 
         assert band.nodata in (None, 0)
 
 
-def test_nothing_of_another_layout_or_of_a_lost_band_stays(tmp_path: Path) -> None:
+def test_files_of_another_layout_or_of_a_lost_band_are_removed(tmp_path: Path) -> None:
     def files() -> list[str]:
         return sorted(p.name for p in (tmp_path / "out").glob("f*.tif"))
 

@@ -49,7 +49,7 @@ def test_weights_are_those_that_the_panchromatic_is_made_with() -> None:
     np.testing.assert_allclose(weights_of(nothing, pan, 2.0), [0.5, 0.5])
 
 
-def test_it_is_what_gdal_computes(tmp_path: Path) -> None:
+def test_the_result_equals_that_of_gdal(tmp_path: Path) -> None:
     bands, pan = scene()
     place = {"crs": "EPSG:32631", "transform": rasterio.Affine(0.1, 0, 5e5, 0, -0.1, 5.8e6)}
     names = {tmp_path / "a.tif": bands[0], tmp_path / "b.tif": bands[1], tmp_path / "pan.tif": pan}
@@ -68,7 +68,7 @@ def test_it_is_what_gdal_computes(tmp_path: Path) -> None:
     np.testing.assert_allclose(np.stack(bands) * ratio, expected, rtol=1e-4)
 
 
-def test_what_is_sharpened_keeps_its_brightness_and_gains_detail(tmp_path: Path) -> None:
+def test_sharpening_keeps_brightness_and_adds_detail(tmp_path: Path) -> None:
     make_two_headings(tmp_path / "in", 1, (640, 480), camera=ALTUM_PT, line=1, lakes=False)
     settings = agalign.Settings(write=agalign.WriteSettings(pan_sharpen=True, crop="none"))
     (report,) = agalign.align_folder(tmp_path / "in", tmp_path / "out", settings=settings)

@@ -139,7 +139,7 @@ def test_the_expected_error_is_that_of_the_worst_band(tmp_path: Path) -> None:
     assert by_index.to_dict() == pytest.approx({"ndvi": 0.3, "ndre": 0.7})
 
 
-def test_what_a_raster_lacks_is_listed(tmp_path: Path) -> None:
+def test_missing_bands_of_a_raster_are_listed(tmp_path: Path) -> None:
     write_field(tmp_path / "field.tif")
     outlines = write_outlines(tmp_path / "plots.geojson")
     done = agalign_here("plots", tmp_path / "field.tif", outlines, "-i", "ndvi,evi", "-o", tmp_path / "t.csv")
@@ -161,7 +161,7 @@ def test_what_a_raster_lacks_is_listed(tmp_path: Path) -> None:
         (("field.tif", "elsewhere.geojson"), 1, "elsewhere.geojson: none of its plots has pixels in the rasters"),
     ],
 )
-def test_what_cannot_be_used_is_one_line(
+def test_unusable_input_is_one_line(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, arguments: tuple[str, ...], code: int, said: str
 ) -> None:
     monkeypatch.chdir(tmp_path)

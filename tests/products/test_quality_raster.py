@@ -143,7 +143,7 @@ def test_a_run_writes_flags_with_their_meaning_for_every_band_of_the_stack(fligh
 
 
 @pytest.mark.slow
-def test_indices_leave_out_what_the_flags_of_their_own_bands_say(flight: Path, tmp_path: Path) -> None:
+def test_indices_omit_pixels_flagged_in_their_own_bands(flight: Path, tmp_path: Path) -> None:
     (report, *_) = agalign.align_folder(flight, tmp_path, settings=seeded(qa=True))
     sidecar = read_result(report.path)
     plain = [replace(b, problem="") for b in bands_of(sidecar, report.path.parent)]

@@ -103,7 +103,7 @@ def test_a_capture_is_kept_only_while_all_its_files_are_there(align: Align, tmp_
     assert [align().state for _ in range(2)] == ["done", "kept"]
 
 
-def test_what_an_earlier_sidecar_lists_is_removed(align: Align, tmp_path: Path) -> None:
+def test_files_of_an_earlier_sidecar_are_removed(align: Align, tmp_path: Path) -> None:
     """Even of a product that this version does not know."""
     align(PLAIN)
     sidecar, old = tmp_path / "out" / "f.json", tmp_path / "out" / "f.depth.tif"

@@ -126,15 +126,15 @@ def test_the_rig_is_read_without_its_network(tmp_path: Path) -> None:
     assert len(said) == 1
 
 
-def told(label: str, offsets: dict[str, tuple[float, float]]) -> dict[str, object]:
+def capture_data(label: str, offsets: dict[str, tuple[float, float]]) -> dict[str, object]:
     bands = [{"band": name, "status": "aligned", "offset_px": offset} for name, offset in offsets.items()]
     return {"label": label, "captured_at": f"2026-06-21T10:00:{label}", "camera": "camera", "bands": bands}
 
 
 @pytest.mark.slow
-def test_drift_is_drawn_along_the_direction_of_change_and_breaks_where_nothing_is_known() -> None:
+def test_drift_is_drawn_along_its_direction_with_gaps_for_missing_bands() -> None:
     captures = [
-        told(f"{i:02d}", {"NIR": (10 + 3 * i, 4 * i), "Blue": (-i, 0)} if i != 3 else {"Blue": (-3, 0)})
+        capture_data(f"{i:02d}", {"NIR": (10 + 3 * i, 4 * i), "Blue": (-i, 0)} if i != 3 else {"Blue": (-3, 0)})
         for i in range(7)
     ]
     (drift,) = drifts_of(captures)
@@ -143,7 +143,7 @@ def test_drift_is_drawn_along_the_direction_of_change_and_breaks_where_nothing_i
     heights = [[float(p.split(",")[1]) for run in line.points for p in run.split()] for line in drift.lines]
     ends = sorted((heights[0][0], heights[0][-1]))
     assert ends == pytest.approx([CHART_HEIGHT / 2 * (1 - 0.92 * s) for s in (1, -1)], abs=0.1)
-    # Along the same baseline in the other direction, a band is drawn beside the first, not against it.
+    # Along the same baseline in the other direction, a band is drawn next to the first, not opposite to it.
     assert np.sign(np.diff(heights[0])).tolist() == np.sign(np.diff(heights[1][:3] + heights[1][4:])).tolist()
     assert drifts_of(captures[:2]) == []
 
@@ -164,11 +164,11 @@ def grey(seed: int, width: int = 640, height: int = 480) -> np.ndarray:
 
 @pytest.fixture
 def views() -> ReducedBands:
-    """Green and NIR, of which only Green was written."""
+    """Green and NIR; only Green was written."""
     return ReducedBands({"Green": grey(1), "NIR": grey(2)}, {"Green": grey(3)}, (640, 480))
 
 
-def test_every_picture_lies_where_the_sidecar_says(views: ReducedBands, tmp_path: Path) -> None:
+def test_every_picture_is_at_the_place_in_the_sidecar(views: ReducedBands, tmp_path: Path) -> None:
     errors = {"NIR": np.full((4, 5), 0.25, np.float32)}
     part = write_preview(views, ["Green", "NIR"], errors, tmp_path / "a.preview.jpg", preview_bytes(1))
     sheet = cv2.imread(str(tmp_path / part.file), cv2.IMREAD_GRAYSCALE)

@@ -105,7 +105,7 @@ def test_other_json_files_are_passed_over(tmp_path: Path) -> None:
     assert find_sidecars(tmp_path) == [tmp_path / "a" / "IMG_1.json"]
 
 
-def test_a_rejected_solution_says_so() -> None:
+def test_a_rejected_result_is_not_accepted_in_the_sidecar() -> None:
     """The homography of a `seed_only` band is the seed's; `joint` describes what was doubted."""
     joint = JointResult(np.eye(3), 0.1, 0.1, 0.004, 75, (1.0,), "fast", "homography", 0.05, ((0.07, 0.07),) * 4)
     residual = Residual(np.zeros((50, 2)), np.zeros((50, 2)), 0.05, 0.2, 1.0)

@@ -1,4 +1,4 @@
-"""Items and collections as STAC's own libraries read and judge them."""
+"""Items and collections as the libraries of STAC read and validate them."""
 
 import json
 from collections.abc import Iterator
@@ -44,7 +44,7 @@ def offline() -> Iterator[None]:
 
 @pytest.fixture
 def run(between_panels: Path, shared: Shared) -> Path:
-    """A flight after a panel, whose captures' height is known by it."""
+    """A flight after a panel, which determines the height of the captures."""
     settings = seeded(stac=True, format="cog", radiometry="auto")
     return shared("stac", lambda out: agalign.align_folder(between_panels, out, settings=settings))
 
@@ -82,7 +82,7 @@ def test_a_wrong_field_is_seen_by_the_schemas(run: Path) -> None:
         broken.validate()
 
 
-def test_assets_say_what_their_bands_are(run: Path) -> None:
+def test_assets_describe_their_bands(run: Path) -> None:
     item = pystac.Item.from_file(str(run / "0000SET" / "000" / "IMG_0002.stac.json"))
     assert item.datetime.isoformat().startswith("2026-06-21T10:00:02")
     stack = item.assets["stack"]
@@ -114,7 +114,7 @@ def test_assets_say_what_their_bands_are(run: Path) -> None:
         (Pose(0.0, height_m=10.0), (0.0, 0.0), None),
     ],
 )
-def test_where_a_pixel_lies_on_the_ground(
+def test_position_of_a_pixel_on_the_ground(
     pose: Pose | None, point_px: tuple[float, float], expected_m: tuple[float, float] | None
 ) -> None:
     result = ground_m(Capture("a", Path(), (GREEN,), 0, pose=pose), np.array([point_px]))

@@ -1,4 +1,4 @@
-"""What can be wrong with a card, a disk, a machine or a file, and what the program must make of it.
+"""Faults of cards, disks, machines and files, and the results that the program must have.
 
 Each fault is done to a small flight of two good captures, `a` and `b`, and the program is run on it. `python -m
 tests.reliability.faults` prints the result of each fault, and with `--markdown docs/reliability.md` writes those of
@@ -61,7 +61,7 @@ class Scene:
     during: Callable[[], None] | None = None
     """Done when the captures are found."""
     watch: Callable[["subprocess.Popen[str]"], None] | None = None
-    """Done beside the program, which then has a process of its own."""
+    """Done while the program runs, in a process of its own."""
     process: dict[str, Any] = field(default_factory=dict)
     """How that process is started, where it must have one."""
     options: tuple[str, ...] = ()
@@ -167,7 +167,7 @@ def make_model(folder: Path) -> None:
 
 
 def aligned(out: Path) -> list[str]:
-    """Captures all of whose bands are aligned."""
+    """Captures with all bands aligned."""
     result = []
     for path in find_sidecars(out) if out.is_dir() else []:
         with contextlib.suppress(SidecarError):
@@ -275,7 +275,7 @@ def long_tags(scene: Scene) -> None:
 
 
 def vrt(scene: Scene) -> str:
-    """What would read another file, or ask a server, were it believed."""
+    """A VRT that would read another file or contact a server."""
     return (
         f'<VRTDataset rasterXSize="{SIZE_PX[0]}" rasterYSize="{SIZE_PX[1]}"><VRTRasterBand dataType="UInt16" band="1">'
         f"<SimpleSource><SourceFilename>{scene.file('a_nir.tif')}</SourceFilename><SourceBand>1</SourceBand>"
@@ -643,7 +643,7 @@ def both(*injections: Inject) -> Inject:
 
 
 def colliding(scene: Scene) -> None:
-    """A multiband file whose capture would take a band's file of another."""
+    """A multiband file with the output name of another capture's band."""
     scene.arguments = ["--layout", "both"]
     image = tifffile.imread(scene.file("a_nir.tif"))
     bands = np.stack([tifffile.imread(scene.file("a_green.tif")), image])
@@ -790,7 +790,7 @@ OTHERS = {
     "the disk full": (full_disk, Ends(3, "the disk is full|cannot be written", "a")),
     "a worker killed by SIGKILL": (when_begun(kill_worker, "-j", "2", "--timeout", "100"), Ends(0, "", ALL)),
     "both workers killed by SIGKILL": (when_begun(kill_all_workers, "-j", "2"), Ends(0, "", ALL)),
-    "a capture whose worker is killed twice": (
+    "a worker killed twice at one capture": (
         both(when_begun(kill_capture, "-j", "1", "--timeout", "100"), larger),
         Ends(3, r"its worker process was killed \(signal 9; ", "", 1),
     ),
@@ -827,7 +827,7 @@ OTHERS = {
 }
 FULL = {
     "both workers killed by SIGKILL",
-    "a capture whose worker is killed twice",
+    "a worker killed twice at one capture",
     "memory short in the workers",
     "the interrupt key while workers start",
     "SIGTERM while files are read",
@@ -844,7 +844,7 @@ IN_THE_DOCUMENT = {
     "a sparse image of 100,000 x 100,000",
     "another run in the same output",
     "the disk full",
-    "a capture whose worker is killed twice",
+    "a worker killed twice at one capture",
     "memory short in the workers",
     "a capture that never ends",
     "the interrupt key",
@@ -871,7 +871,7 @@ def main() -> None:
     for fault in FAULTS:
         with tempfile.TemporaryDirectory() as folder:
             seen = run_fault(fault, Path(folder))
-            row = (fault.name, str(seen.code), told(seen, Path(folder)))
+            row = (fault.name, str(seen.code), first_complaint(seen, Path(folder)))
         if fault.name in IN_THE_DOCUMENT:
             rows.append(row)
         wrong = what_is_wrong(fault, seen)
@@ -883,7 +883,7 @@ def main() -> None:
         raise SystemExit("\n".join(failed))
 
 
-def told(seen: Seen, folder: Path) -> str:
+def first_complaint(seen: Seen, folder: Path) -> str:
     """The first complaint, without its remedy and without this machine's paths."""
     first = re.split("; (?!agalign needs|out of memory)", next(iter(seen.complaints), ""))[0]
     first = re.sub(rf"{re.escape(str(folder))}/(?:flight/|out/)?", "", first)

@@ -57,7 +57,7 @@ def test_a_table_or_map_that_is_not_a_regular_file_is_empty(tmp_path: Path, irre
 
 
 def test_a_sidecar_that_is_a_pipe_is_reported(tmp_path: Path) -> None:
-    """Passing it over would lose its capture without a word."""
+    """Ignoring it would lose its capture silently."""
     os.mkfifo(tmp_path / "a.json")
     done = agalign_here("report", tmp_path)
     assert done.returncode == 3

@@ -86,7 +86,7 @@ def test_bands_are_well_exposed(flight: Path, band: rig.BandSpec) -> None:
     assert raster.pixels[raster.valid].std() > 1000
 
 
-def test_relief_moves_what_stands_up(tmp_path: Path) -> None:
+def test_relief_displaces_raised_objects(tmp_path: Path) -> None:
     truths = {}
     for relief_m in (0.0, 3.0):
         path = synthetic.make_flight(tmp_path / str(relief_m), 1, (320, 240), rng_seed=2, relief_m=relief_m)

@@ -24,7 +24,7 @@ def refuse_after_first(folder: Path) -> None:
         raise ValueError("no room") from None
 
 
-def stop_for_ever() -> None:
+def stop_forever() -> None:
     os.kill(os.getpid(), signal.SIGSTOP)
 
 
@@ -68,7 +68,7 @@ def leave(code: int) -> int:
 
 
 def signal_self(mark: Path, number: int, times: int) -> None:
-    """Send this process a signal, so many times in all: `mark` counts them."""
+    """Send this process a signal, up to a total that `mark` counts."""
     with mark.open("a+b") as counter:
         before = counter.tell() or mark.stat().st_size
         counter.write(b"x")
@@ -89,7 +89,7 @@ class TwoArgumentsError(Exception):
 
 
 class WhenUnpickled:
-    """It sends a signal to the process that unpickles it, so many times in all."""
+    """It sends a signal to the process that unpickles it, up to a total."""
 
     def __init__(self, mark: Path, number: int, times: int) -> None:
         self.what = mark, number, times

@@ -21,7 +21,7 @@ from agalign.values.files import (
 )
 
 
-def test_a_file_is_whole_or_as_it_was(tmp_path: Path) -> None:
+def test_a_file_is_complete_or_unchanged(tmp_path: Path) -> None:
     path = tmp_path / "below" / "a.png"
     write_text(path, "before")
 
@@ -79,7 +79,7 @@ def test_two_threads_at_a_time_do_not_meet(tmp_path: Path) -> None:
     assert [p.name for p in tmp_path.iterdir()] == ["a.txt"]
 
 
-def test_what_cannot_be_written_is_one_line(tmp_path: Path) -> None:
+def test_an_unwritable_file_is_one_line(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     (tmp_path / "folder").mkdir()
     for path, message in (
@@ -98,7 +98,7 @@ def test_names_outside_a_folder(name: str) -> None:
     assert all(map(is_inside, ("a.tif", "red/a.tif", "..a.tif", "with space é.tif")))
 
 
-def test_what_a_killed_process_left_is_removed(tmp_path: Path) -> None:
+def test_partial_files_of_a_killed_process_are_removed(tmp_path: Path) -> None:
     (tmp_path / "sub").mkdir()
     with scratch_file(tmp_path / "sub" / "a.tif") as partial:
         pass
@@ -123,7 +123,7 @@ def test_a_zombie_does_not_keep_its_partial_file(tmp_path: Path) -> None:
         assert not partial.exists()
 
 
-def test_what_another_process_writes_stays(tmp_path: Path) -> None:
+def test_partial_files_of_a_running_process_are_kept(tmp_path: Path) -> None:
     """Of this machine while it lives, and of other machines; and what another run in a folder below left."""
     with scratch_file(tmp_path / "a.tif") as partial:
         pass

@@ -26,7 +26,7 @@ def test_compose_applies_the_last_first(one: np.ndarray, other: np.ndarray) -> N
 
 
 @pytest.mark.parametrize("bad", [np.zeros((3, 3)), np.eye(2), np.full((3, 3), np.nan), np.diag([1.0, 1.0, 0.0])])
-def test_what_is_no_homography_is_refused(bad: np.ndarray) -> None:
+def test_other_matrices_than_homographies_are_refused(bad: np.ndarray) -> None:
     with pytest.raises(GeometryError):
         geometry.normalised(bad)
 
@@ -54,8 +54,8 @@ def test_overlay_matches_the_outlines() -> None:
 
 
 @pytest.mark.parametrize("unit", [1e-9, 1.0, 1e9])
-def test_what_can_be_inverted_does_not_depend_on_the_units(unit: float) -> None:
-    """Geotransforms have centimetres a pixel beside metres in the millions; rays have small numbers throughout."""
+def test_invertibility_does_not_depend_on_the_units(unit: float) -> None:
+    """Geotransforms have centimetres per pixel and offsets of millions of metres; rays have small numbers."""
     on_map = np.array([[0.02, 0.0, 500_000.0], [0.0, -0.02, 5_800_000.0], [0.0, 0.0, 1.0]])
     scaled = np.diag([unit, unit, 1.0]) @ on_map
     np.testing.assert_allclose(geometry.apply(geometry.invert(scaled), geometry.apply(scaled, [[7.0, 9.0]])), [[7, 9]])

@@ -53,7 +53,7 @@ def pool(function: Callable[[Any], Any], processes: int = 1, **more: Any) -> Pro
     return ProcessPool(function, processes, CONTEXT, more.pop("initializer", tasks.nothing), **more)
 
 
-def told(outcome: Outcome[Any, Any]) -> object:
+def value_or_error(outcome: Outcome[Any, Any]) -> object:
     return outcome.result if outcome.error is None else f"{type(outcome.error).__name__}: {outcome.error}"
 
 
@@ -86,10 +86,10 @@ def test_workers_are_replaced_after_their_tasks() -> None:
         (tasks.result_that_cannot_be_read, "UnpicklingError"),
     ],
 )
-def test_what_fails_costs_its_task_and_no_worker(function: Callable[[int], object], said: str) -> None:
+def test_a_failed_task_ends_no_worker(function: Callable[[int], object], said: str) -> None:
     with pool(function) as workers:
         before = workers._workers[0]
-        outcomes = [told(o) for o in workers.run([1, 2])]
+        outcomes = [value_or_error(o) for o in workers.run([1, 2])]
         assert workers._workers[0] is before
     assert all(said in str(o) for o in outcomes)
     assert len(outcomes) == 2
@@ -97,7 +97,7 @@ def test_what_fails_costs_its_task_and_no_worker(function: Callable[[int], objec
 
 def test_an_argument_that_cannot_be_pickled_costs_itself() -> None:
     with pool(tasks.received) as workers:
-        outcomes = {o.number: told(o) for o in workers.run([1, lambda: None, 2])}
+        outcomes = {o.number: value_or_error(o) for o in workers.run([1, lambda: None, 2])}
     assert outcomes[0] == outcomes[2] == "done"
     assert "lambda" in str(outcomes[1])
 
@@ -153,14 +153,14 @@ POINTS = ("receiving", "unpickling", "computing", "sending")
 
 @pytest.mark.parametrize(("kills", "processes"), [(1, 1), (1, 2), (2, 1)])
 @pytest.mark.parametrize("point", POINTS)
-def test_a_worker_killed_once_costs_nothing_and_twice_its_task(
+def test_a_task_is_tried_again_after_one_kill_and_fails_after_two(
     point: str, kills: int, processes: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     function, argument = ended_while(point, signal.SIGKILL, kills, tmp_path, monkeypatch)
     with pool(function, processes) as workers:
         if kills == 2:
             (outcome,) = workers.run([argument])
-            assert told(outcome) == "WorkerDiedError: signal 9"
+            assert value_or_error(outcome) == "WorkerDiedError: signal 9"
         (outcome,) = workers.run([argument])
     assert outcome.value() in ("done", bytes(LARGE))
 
@@ -175,14 +175,14 @@ def test_a_stopped_worker_is_late(point: str, tmp_path: Path, monkeypatch: pytes
         began = time.monotonic()
         outcomes = list(workers.run([argument, *others], timeout_s=2))
         assert time.monotonic() - began < 20
-    assert [told(o) for o in outcomes if o.number == 0] == ["TimeoutError: "]
+    assert [value_or_error(o) for o in outcomes if o.number == 0] == ["TimeoutError: "]
     assert all(o.error is None for o in outcomes if o.number)
     assert len(outcomes) == 6
 
 
-def test_a_worker_that_leaves_costs_its_task_at_once() -> None:
+def test_a_task_fails_at_once_if_its_worker_exits() -> None:
     with pool(tasks.leave) as workers:
-        assert [told(o) for o in workers.run([0, 3, 0])] == [0, "WorkerDiedError: exit code 3", 0]
+        assert [value_or_error(o) for o in workers.run([0, 3, 0])] == [0, "WorkerDiedError: exit code 3", 0]
 
 
 def test_a_result_sent_before_the_kill_counts() -> None:
@@ -206,7 +206,7 @@ def test_time_limits_do_not_run_on_the_clock_of_the_day(step_s: int, monkeypatch
 
 
 @pytest.mark.slow
-def test_what_came_while_nobody_looked_is_not_late() -> None:
+def test_a_result_that_arrived_in_time_is_not_a_timeout() -> None:
     """Whoever asks for the outcomes may take longer over one than the time limit of the next."""
     with pool(tasks.zeros, 2) as workers:
         outcomes = workers.run([1, LARGE, LARGE, LARGE], timeout_s=1)
@@ -243,9 +243,9 @@ def test_a_system_that_is_short_of_something(what: str, monkeypatch: pytest.Monk
             list(workers.run([1]))
 
 
-def test_a_worker_that_stops_while_it_starts(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_worker_that_is_stopped_while_it_starts(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(process_pool, "_START_TIMEOUT_S", 1.0)
-    stopping = pool(tasks.received, initializer=tasks.stop_for_ever)
+    stopping = pool(tasks.received, initializer=tasks.stop_forever)
     with stopping as workers, pytest.raises(WorkerError, match="not ready after 1 s"):
         list(workers.run([1]))
 
@@ -318,10 +318,10 @@ if __name__ == "__main__":
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("whom", ["parent", in_full_run("group")])
+@pytest.mark.parametrize("target", ["parent", in_full_run("group")])
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGKILL, in_full_run(signal.SIGINT)])
 @pytest.mark.parametrize("method", ["forkserver", in_full_run("spawn")])
-def test_no_process_outlives_its_parent(method: str, number: int, whom: str, tmp_path: Path) -> None:
+def test_no_process_outlives_its_parent(method: str, number: int, target: str, tmp_path: Path) -> None:
     script = tmp_path / "script.py"
     script.write_text(SCRIPT)
     command = [sys.executable, str(script), method]
@@ -333,7 +333,7 @@ def test_no_process_outlives_its_parent(method: str, number: int, whom: str, tmp
             assert process.stdout.readline() == b"begun\n"
             children = psutil.Process(process.pid).children(recursive=True)
             assert len(children) >= 4
-            (os.killpg if whom == "group" else os.kill)(process.pid, number)
+            (os.killpg if target == "group" else os.kill)(process.pid, number)
             assert process.wait(20) != 0
         finally:
             process.kill()
