@@ -3,14 +3,19 @@
 import math
 import os
 import sys
+import threading
 from pathlib import Path
 
-from agalign.errors import MemoryLimitError
+from agalign.errors import ConfigurationError, MemoryLimitError
 
 THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 """Environment variables with the number of threads that libraries start; they read them once, at their import."""
 MIN_ADDRESS_SPACE_BYTES = 1_800_000_000
 """Below about 1.6 GB the libraries crash, abort or hang, which cannot be caught."""
+
+
+_MIN_THREADS, _MIN_THREADS_PER_CORE = 16, 4
+"""With fewer, GDAL hangs and OpenMP ends the process. A run on two cores needs 24 processes and threads."""
 
 
 def usable_cores() -> int:
@@ -72,6 +77,26 @@ def _text(path: Path) -> str:
         return path.read_text(encoding="utf-8")
     except OSError:
         return ""
+
+
+def check_threads() -> None:
+    """Raise ConfigurationError if the system allows too few processes (`ulimit -u`, or a container's limit)."""
+    end, started = threading.Event(), list[threading.Thread]()
+    needed = _MIN_THREADS + _MIN_THREADS_PER_CORE * usable_cores()
+    try:
+        for _ in range(needed):
+            thread = threading.Thread(target=end.wait, daemon=True)
+            thread.start()
+            started.append(thread)
+    except RuntimeError:
+        raise ConfigurationError(
+            f"only {len(started)} more processes and threads can be started, and agalign needs {needed}; raise the "
+            "limit of processes (ulimit -u, or that of the container), or end other programs"
+        ) from None
+    finally:
+        end.set()
+        for thread in started:
+            thread.join()
 
 
 def check_address_space() -> None:

@@ -1,12 +1,13 @@
 """Limits of the system and of containers: cores and address space."""
 
+import threading
 from pathlib import Path
 
 import pytest
 
-from agalign.errors import MemoryLimitError, is_out_of_memory
+from agalign.errors import ConfigurationError, MemoryLimitError, is_out_of_memory
 from agalign.values import cores
-from agalign.values.cores import cgroup_quota, check_address_space, limit_default_threads, usable_cores
+from agalign.values.cores import cgroup_quota, check_address_space, check_threads, limit_default_threads, usable_cores
 
 V1 = {"cpu/docker/ab/cpu.cfs_period_us": "100000"}
 
@@ -62,3 +63,18 @@ def test_too_little_address_space_is_refused_with_both_sizes(monkeypatch: pytest
 @pytest.mark.parametrize("text", ["can't start new thread", "could not create a primitive"])
 def test_what_libraries_raise_when_memory_is_short(text: str) -> None:
     assert is_out_of_memory(RuntimeError(text))
+
+
+def test_too_few_threads_are_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
+    check_threads()
+    before, start = threading.active_count(), threading.Thread.start
+
+    def limited(thread: threading.Thread) -> None:
+        if threading.active_count() >= before + 5:
+            raise RuntimeError("can't start new thread")
+        start(thread)
+
+    monkeypatch.setattr(threading.Thread, "start", limited)
+    with pytest.raises(ConfigurationError, match=r"only 5 more processes and threads .* raise the limit .*ulimit -u"):
+        check_threads()
+    assert threading.active_count() == before
