@@ -30,6 +30,8 @@ from agalign.values.text import counted
 if TYPE_CHECKING:
     from agalign.batch import CaptureReport
 
+_MAX_SATURATED_SHARE = 0.005
+"""Sun glint and roofs saturate fewer pixels of most captures."""
 _MAX_PANEL_AGE_S = 30 * 60.0
 """Under a clear sky with the sun above 40 degrees, the irradiance changes by up to 10 % in half an hour."""
 
@@ -109,6 +111,8 @@ class RunTotals:
     bands: dict[str, list[tuple[str, float | None, float]]] = field(default_factory=dict)
     """(status, median residual in px if it is known, seconds) of the pairs of each band."""
     excluded: list[ExclusionPart] = field(default_factory=list)
+    saturated: dict[str, tuple[float, str]] = field(default_factory=dict)
+    """Largest share of saturated pixels, and its capture, of each band."""
     radiometry: Counter[str] = field(default_factory=Counter)
     """Number of captures by the quantity that raw numbers were converted to."""
     panel_age_s: dict[str, float] = field(default_factory=dict)
@@ -129,6 +133,8 @@ class RunTotals:
                 longest_s = self.panel_age_s.get(output.radiometry, 0.0)
                 self.panel_age_s[output.radiometry] = max(longest_s, output.panel_age_s)
         for band in report.result.bands:
+            share = band.saturated or 0.0
+            self.saturated[band.band] = max(self.saturated.get(band.band, (0.0, "")), (share, report.label))
             if band.status != "reference":
                 residual_px = band.metrics.after.residual_px if band.metrics else None
                 self.bands.setdefault(band.band, []).append((band.status, residual_px, band.seconds))
@@ -335,6 +341,10 @@ def conclude(totals: RunTotals, out: Path, terminal: Terminal) -> int:
     """Print the table of bands and the failures; return the exit code."""
     counts = Counter(status for pairs in totals.bands.values() for status, _, _ in pairs)
     _print_totals(totals, counts, terminal)
+    high = [(name, *one) for name, one in totals.saturated.items() if one[0] > _MAX_SATURATED_SHARE]
+    if high:
+        shares = ", ".join(f"{name} up to {share:.1%} ({label})" for name, share, label in high)
+        terminal.result(f"Saturated pixels: {shares}")
     for line in exclusion_lines(totals.excluded):
         terminal.result(line)
     terminal.result(f"Report: {out / REPORT_FILE}")

@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import cv2
@@ -20,6 +20,8 @@ Grey = NDArray[np.uint8]
 """(height, width)"""
 _MAX_SIDE_PX = 2048
 """Longer side of the images: larger than most screens."""
+LEVEL_BLOCKS = 6, 8
+"""Rows and columns: a block of a capture is as large as the error of its georeference."""
 _SAMPLE_PIXELS = 20_000
 """Pixels from which the contrast is calculated: percentiles then have an error of 0.1 %."""
 Picture = NDArray[np.uint8]
@@ -36,18 +38,39 @@ class ReducedBands:
     """The aligned pixels of each band that was written."""
     size_px: tuple[int, int]
     """(width, height) of all images."""
+    levels: Mapping[str, NDArray[np.float32]] = field(default_factory=dict)
+    """Means of the aligned pixels in `LEVEL_BLOCKS` (rows, columns) of each band that was written, in the unit of the
+    output; nan without pixels.
+    """
+    saturated: Mapping[str, float] = field(default_factory=dict)
+    """Share of saturated pixels in the raw file of each band with a known saturation value."""
 
 
 def read_reduced_bands(capture: Capture, places: Mapping[str, tuple[Path, int]], grid: OutputGrid) -> ReducedBands:
     """Read the bands of a capture, given file and index of each written band. Raises UnreadableFileError for those."""
     size_px = reduced_size_px((grid.width, grid.height), max(1.0, max(grid.width, grid.height) / _MAX_SIDE_PX))
-    before = {}
+    before, saturated = {}, {}
     for band in capture.bands:
         with suppress(UnreadableFileError):  # the band pair has failed with this reason
-            before[band.name] = _grey(_before(band, capture.reference, grid, size_px))
-    window = 0, 0, grid.width, grid.height
-    after = {name: _grey(read_preview(*place, window, size_px)) for name, place in places.items()}
-    return ReducedBands(before, after, size_px)
+            plane = _before(band, capture.reference, grid, size_px)
+            before[band.name] = _grey(plane)
+            if band.saturation_value is not None:
+                saturated[band.name] = float((plane >= band.saturation_value).mean())
+    after, levels = {}, {}
+    for name, place in places.items():
+        plane = read_preview(*place, (0, 0, grid.width, grid.height), size_px)
+        after[name], levels[name] = _grey(plane), block_means(plane)
+    return ReducedBands(before, after, size_px, levels, saturated)
+
+
+def block_means(plane: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Return the means of an image (height, width) in `LEVEL_BLOCKS` equal blocks; nan where half is unknown."""
+    is_known = np.isfinite(plane)
+    share, total = (
+        cv2.resize(values, LEVEL_BLOCKS[::-1], interpolation=cv2.INTER_AREA)
+        for values in (is_known.astype(np.float32), np.where(is_known, plane, np.float32(0)))
+    )
+    return np.where(share >= 0.5, total / np.maximum(share, np.float32(0.5)), np.float32(np.nan))
 
 
 def _before(band: Band, reference: Band, grid: OutputGrid, size_px: tuple[int, int]) -> NDArray[np.float32]:

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Iterable, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from typing import Any
 
@@ -9,6 +10,7 @@ import numpy as np
 from scipy.interpolate import CloughTocher2DInterpolator
 
 from agalign._version import __version__
+from agalign.errors import UnreadableFileError
 from agalign.flight.fingerprint import fingerprint
 from agalign.products.aligned_files import BandFiles, Stack
 from agalign.products.product import ProductContext, WrittenFile
@@ -122,6 +124,10 @@ def _band_part(context: ProductContext, band: Band) -> BandPart:
         "wavelength_nm": band.wavelength_nm,
         "place": None if place is None else {"file": context.paths.relative(place[0].path), "band_index": place[1]},
     }
+    with suppress(UnreadableFileError):  # the preview has failed with this reason
+        levels = context.reduced_bands.levels.get(band.name)
+        facts["saturated"] = context.reduced_bands.saturated.get(band.name)
+        facts["levels"] = [] if levels is None else levels.tolist()
     if band is context.capture.reference:
         return BandPart.model_validate(facts | {"status": "reference", "reason": None, "seconds": 0.0})
     alignment = context.alignments[band.name]

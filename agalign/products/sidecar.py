@@ -424,6 +424,8 @@ class BandResult(_Result):
     """Where the aligned pixels of the band are."""
     seconds: Annotated[Number, _measured(3)]
     """Processing time."""
+    saturated: Fraction4 = None
+    """Share of saturated pixels in the file."""
 
 
 class BandPart(BandResult):
@@ -441,6 +443,8 @@ class BandPart(BandResult):
     """The complete mapping, sampled."""
     relief: ReliefPart | None = None
     """Displacement by parallax."""
+    levels: list[list[Fraction6]] = []
+    """Means of the written pixels in 6 rows of 8 equal blocks."""
 
 
 class FilePart(_Part):

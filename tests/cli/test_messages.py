@@ -262,6 +262,17 @@ def test_the_age_of_a_panel_is_printed_and_warned_of(
     totals.add(CaptureReport("IMG_1", "done", sidecar.result()))
     conclude(totals, Path("out"), Terminal(quiet=False, verbose=False, log_json=False))
     printed = capsys.readouterr()
-    assert printed.out.splitlines()[0] == f"Written as {radiometry}: {text}"
+    assert f"Written as {radiometry}: {text}" in printed.out.splitlines()
     is_warned = "the light may have changed in 53 min; record a panel before and after" in printed.err
     assert is_warned == (radiometry == "reflectance by panel" and age_s == 3180.0)
+
+
+@pytest.mark.parametrize(("share", "is_printed"), [(0.031, True), (0.001, False), (None, False)])
+def test_saturated_bands_are_named(share: float | None, is_printed: bool, capsys: pytest.CaptureFixture[str]) -> None:
+    totals = RunTotals(True, FailureGroups())
+    sidecar = example()
+    sidecar.bands[0].saturated = share
+    totals.add(CaptureReport("IMG_1", "done", sidecar.result()))
+    conclude(totals, Path("out"), Terminal(quiet=False, verbose=False, log_json=False))
+    line = f"Saturated pixels: {sidecar.bands[0].band} up to 3.1% (IMG_1)"
+    assert (line in capsys.readouterr().out) is is_printed

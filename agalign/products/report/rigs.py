@@ -155,4 +155,4 @@ def _polylines(values: NDArray[np.float64], full: float, step: int) -> tuple[str
             continue
         x, y = CHART_WIDTH * (i + 0.5) / len(groups), 1 - 0.92 * float(np.nanmean(group)) / full
         lines[-1].append(f"{x:.1f},{CHART_HEIGHT / 2 * y:.1f}")
-    return tuple(" ".join(line) for line in lines if line)
+    return tuple(" ".join(line if line[1:] else line * 2) for line in lines if line)  # a single point is a dot

@@ -1,0 +1,187 @@
+"""Radiometric check of a flight: levels of successive captures in their overlap, and sudden changes of the light.
+
+The previews of two captures are matched, which places the blocks of the one in the other: the full images are not read.
+"""
+
+from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import map_coordinates
+
+from agalign.pixels.landmarks import Landmarks, landmarks, matched_homography
+from agalign.products.drawing import LEVEL_BLOCKS
+from agalign.products.report.rigs import Line, lines_of
+from agalign.products.sidecar import Sidecar
+from agalign.values import geometry
+from agalign.values.cores import usable_cores
+from agalign.values.files import read_regular
+from agalign.values.image import Raster
+from agalign.values.pixel_units import PixelScale
+
+_MIN_BLOCKS = 6
+"""Minimum number of blocks in an overlap."""
+_MAX_CAPTURES = 200
+"""Matching takes 0.1 s a capture; of longer flights, captures at equal distances are compared with their successors."""
+_JUMP = 0.15
+"""Ground seen from opposite sides differs by 9 % in the same light; cloud shadows change all bands by more."""
+_WINDOW = 5
+"""The light is compared with this number of captures before and after."""
+_MIN_FULL = 0.05
+"""Smaller differences do not fill the plot."""
+_KEYPOINTS = 800
+Values = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class CaptureLevels:
+    """The levels of a capture by band, for the check."""
+
+    label: str
+    order: tuple[str, str]
+    """Camera and time."""
+    saturated: Mapping[str, float]
+    levels: Mapping[str, Values]
+    """Means of the written pixels in `LEVEL_BLOCKS` (rows, columns), nan without pixels."""
+    irradiance: Mapping[str, float]
+    """By the light sensor."""
+    preview: Path
+    tile_px: tuple[int, int, int, int]
+    """x, y, width and height of the reference band in the preview."""
+
+    @classmethod
+    def of(cls, path: Path, label: str, sidecar: Sidecar) -> "CaptureLevels | None":
+        """Return the levels in a sidecar; None without preview."""
+        if sidecar.preview is None:
+            return None
+        saturated = {b.band: b.saturated for b in sidecar.bands if b.saturated is not None}
+        levels = {b.band: np.array(b.levels, np.float64) for b in sidecar.bands}
+        levels = {name: values for name, values in levels.items() if values.shape == LEVEL_BLOCKS}
+        light = [] if sidecar.output is None else sidecar.output.illumination
+        irradiance = {part.band: part.irradiance for part in light if part.irradiance}
+        width, height = sidecar.preview.tile_px
+        column = [b.band for b in sidecar.bands].index(sidecar.reference.band)
+        order = f"{sidecar.camera.name} {sidecar.camera.serial}", sidecar.captured_at
+        tile_px = column * width, height, width, height
+        return cls(label, order, saturated, levels, irradiance, path.parent / sidecar.preview.file, tile_px)
+
+
+@dataclass(frozen=True)
+class RadiometricCheck:
+    """The tables and the plot of the check."""
+
+    bands: Sequence[Mapping[str, Any]]
+    """For each band, its `name`, the largest `saturated` share and its `capture`, the number of `overlaps`, and the
+    `median` and `p95` of their differences (relative).
+    """
+    jumps: Sequence[tuple[str, str]]
+    """(label of a capture, its difference from the one before or from the light before and after)."""
+    lines: Sequence[Line]
+    """Change of each capture, in the order of time, from the one before."""
+    full: float
+    """Change at the upper end of the axis."""
+    labels: tuple[str, str]
+    """Of the first and the last capture."""
+
+
+def radiometric_check(captures: Sequence[CaptureLevels]) -> RadiometricCheck | None:
+    """Compare captures with levels; None without any."""
+    captures = sorted(captures, key=lambda c: (c.order, c.label))
+    if not captures:
+        return None
+    names = list(dict.fromkeys(name for c in captures for name in c.levels))
+    changes = _changes(captures, names)
+    light = np.log(np.array([[c.irradiance.get(name, np.nan) for name in names] for c in captures]))
+    sudden = light - [_median(light[max(0, k - _WINDOW) : k + _WINDOW + 1]) for k in range(len(light))]
+    texts = [_jump(names, *rows) for rows in zip(changes, sudden, strict=True)]
+    full = float(np.abs(changes[np.isfinite(changes)]).max(initial=_MIN_FULL))
+    return RadiometricCheck(
+        [_of_band(name, captures, changes[:, k]) for k, name in enumerate(names)],
+        [(c.label, text) for c, text in zip(captures, texts, strict=True) if text],
+        lines_of(names, changes.T, full),
+        full,
+        (captures[0].label, captures[-1].label),
+    )
+
+
+def _changes(captures: Sequence[CaptureLevels], names: Sequence[str]) -> Values:
+    """Logarithms (captures, bands) of the ratio of each capture to the one before, nan without overlap."""
+    pairs = [(k, k - 1) for k, (one, other) in enumerate(pairwise(captures), 1) if one.order[0] == other.order[0]]
+    pairs = pairs[:: -(-len(pairs) // _MAX_CAPTURES)] if pairs else []
+    result = np.full((len(captures), len(names)), np.nan)
+    with ThreadPoolExecutor(usable_cores()) as threads:
+        used = sorted({k for pair in pairs for k in pair})
+        found = dict(zip(used, threads.map(lambda k: _landmarks_of(captures[k]), used), strict=True))
+        ratios = threads.map(lambda p: _ratio(captures[p[0]], captures[p[1]], found[p[0]], found[p[1]], names), pairs)
+        for (k, _), ratio in zip(pairs, ratios, strict=True):
+            result[k] = ratio
+    return result
+
+
+def _landmarks_of(capture: CaptureLevels) -> Landmarks | None:
+    try:
+        sheet = cv2.imdecode(np.frombuffer(read_regular(capture.preview), np.uint8), cv2.IMREAD_GRAYSCALE)
+    except (OSError, cv2.error):
+        return None
+    x, y, width, height = capture.tile_px
+    if sheet is None or sheet.shape[0] < y + height or sheet.shape[1] < x + width:
+        return None
+    tile = np.asarray(sheet[y : y + height, x : x + width], np.float32)
+    return landmarks(Raster(tile, np.ones(tile.shape, bool)), "image", _KEYPOINTS)
+
+
+def _ratio(
+    one: CaptureLevels,
+    before: CaptureLevels,
+    in_one: Landmarks | None,
+    in_before: Landmarks | None,
+    names: Sequence[str],
+) -> Values:
+    """Logarithm (bands,) of the ratio of a capture to the one before, the median over the blocks of the overlap."""
+    unknown, (rows, columns) = np.full(LEVEL_BLOCKS, np.nan), LEVEL_BLOCKS
+    size_px = one.tile_px[2:]
+    mapping = None if in_one is None or in_before is None else matched_homography(in_one, in_before, size_px)
+    if mapping is None:
+        return np.full(len(names), np.nan)
+    scales = [PixelScale(columns / c.tile_px[2], rows / c.tile_px[3]) for c in (one, before)]
+    centres = geometry.lattice(columns, rows, columns, rows)
+    at = geometry.apply(geometry.rescale(mapping, *scales), centres)[:, ::-1].T
+    there = np.array([map_coordinates(before.levels.get(name, unknown), at, order=1, cval=np.nan) for name in names])
+    here = np.array([one.levels.get(name, unknown).ravel() for name in names])
+    with np.errstate(invalid="ignore", divide="ignore"):
+        ratios = np.log(here / there)
+    ratios[np.isfinite(ratios).sum(axis=1) < _MIN_BLOCKS] = np.nan
+    return _median(ratios.T)
+
+
+def _of_band(name: str, captures: Sequence[CaptureLevels], changes: Values) -> dict[str, Any]:
+    saturated, capture = max(
+        ((c.saturated[name], c.label) for c in captures if name in c.saturated), default=(None, "")
+    )
+    known = np.expm1(np.abs(changes[np.isfinite(changes)]))
+    median, p95 = np.percentile(known, (50, 95)).tolist() if len(known) else (None, None)
+    facts = {"name": name, "saturated": saturated, "capture": capture}
+    return facts | {"overlaps": len(known), "median": median, "p95": p95}
+
+
+def _jump(names: Sequence[str], changes: Values, light: Values) -> str:
+    """Describe large changes (bands,) of a capture from the one before, and of its light; empty for none."""
+    parts = zip(names, np.expm1(changes), strict=True)
+    texts = [f"{name} {change:+.0%}" for name, change in parts if abs(change) > _JUMP]
+    cues = {"darker than the capture before": changes, "light sensor": light}
+    known = {cue: values[np.isfinite(values)] for cue, values in cues.items()}
+    dark = [cue for cue, values in known.items() if len(values) and values.max() < np.log(1 - _JUMP)]
+    return ", ".join(texts + [f"cloud shadow suspected ({', '.join(dark)})"] * bool(dark))
+
+
+def _median(values: Values) -> Values:
+    """The median over the rows (n, m), without nan; nan if there is none."""
+    is_known, result = np.isfinite(values).any(axis=0), np.full(values.shape[1], np.nan)
+    result[is_known] = np.nanmedian(values[:, is_known], axis=0)
+    return result

@@ -1,0 +1,83 @@
+"""The radiometric check of the report: levels in sidecars, overlaps, jumps of exposure, light, cloud shadows."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import rasterio
+
+from agalign.products.drawing import LEVEL_BLOCKS, block_means
+from agalign.products.report.radiometric_check import CaptureLevels, radiometric_check
+from agalign.products.sidecar_file import read_sidecar
+
+WIDTH, HEIGHT, STEP_PX = 320, 240, 100
+BANDS = "Green", "NIR"
+
+
+def flight(folder: Path, gains: list[float], nir: list[float] | None = None) -> list[CaptureLevels]:
+    """Captures along a strip over one texture; `gains` multiply the levels of both bands, `nir` that of NIR."""
+    noise = np.random.default_rng(0).random((HEIGHT // 4, (WIDTH + STEP_PX * len(gains)) // 4)).astype(np.float32)
+    ground = cv2.resize(noise, None, fx=4, fy=4, interpolation=cv2.INTER_CUBIC)[:HEIGHT] + 0.5
+    captures = []
+    for k, gain in enumerate(gains):
+        view = ground[:, k * STEP_PX : k * STEP_PX + WIDTH]
+        path = folder / f"{k}.png"
+        cv2.imwrite(str(path), np.vstack([np.zeros_like(view), view * 100]).astype(np.uint8))
+        levels = {"Green": block_means(gain * view), "NIR": block_means(gain * (nir or [1.0] * 9)[k] * view)}
+        tile_px = (0, HEIGHT, WIDTH, HEIGHT)
+        captures.append(CaptureLevels(f"{k}", ("camera", f"{k}"), {"NIR": 0.01 * k}, levels, {}, path, tile_px))
+    return captures
+
+
+def test_levels_of_overlapping_captures_are_compared_on_the_ground(tmp_path: Path) -> None:
+    check = radiometric_check(flight(tmp_path, [1.0, 1.0, 1.05, 1.05]))
+    assert [band["name"] for band in check.bands] == list(BANDS)
+    assert [band["overlaps"] for band in check.bands] == [3, 3]
+    assert check.bands[0]["median"] < 0.02
+    assert check.bands[0]["p95"] == pytest.approx(0.05, abs=0.02)
+    assert (check.bands[1]["saturated"], check.bands[1]["capture"]) == (0.03, "3")
+    assert (check.jumps, len(check.lines), check.full) == ([], 2, 0.05)
+
+
+def test_a_jump_of_one_band_is_no_shadow(tmp_path: Path) -> None:
+    """A shadow darkens all bands."""
+    (jump,) = radiometric_check(flight(tmp_path, [1.0] * 3, nir=[1.0, 1.0, 0.7])).jumps
+    assert jump[0] == "2"
+    assert "NIR -30%" in jump[1].replace("-29", "-30").replace("-31", "-30")
+    assert "shadow" not in jump[1]
+    assert "Green" not in jump[1]
+
+
+def test_the_cues_of_a_shadow_are_named(tmp_path: Path) -> None:
+    captures = flight(tmp_path, [1.0, 1.0, 0.7, 0.7])
+    jumps = dict(radiometric_check(captures).jumps)
+    assert list(jumps) == ["2"]
+    assert "cloud shadow suspected (darker than the capture before)" in jumps["2"]
+    light = [dict.fromkeys(BANDS, 0.7 if k == 2 else 1.0) for k in range(4)]
+    captures = [replace(c, irradiance=one) for c, one in zip(captures, light, strict=True)]
+    check = radiometric_check(captures)
+    assert "(darker than the capture before, light sensor)" in dict(check.jumps)["2"]
+    assert check.full == pytest.approx(-np.log(0.7), abs=0.02)
+
+
+def test_captures_of_other_cameras_and_damaged_previews_are_not_compared(tmp_path: Path) -> None:
+    first, second = flight(tmp_path, [1.0, 0.5])
+    assert radiometric_check([]) is None
+    assert radiometric_check([first, replace(second, order=("other", "1"))]).bands[0]["overlaps"] == 0
+    second.preview.write_bytes(b"no image")
+    assert radiometric_check([first, second]).bands[0]["overlaps"] == 0
+    assert radiometric_check([first, replace(second, preview=tmp_path / "missing")]).jumps == []
+
+
+def test_sidecars_have_the_levels_of_what_was_written(aligned_flight: Path) -> None:
+    path = next(aligned_flight.rglob("IMG_0001.json"))
+    sidecar = read_sidecar(path)
+    with rasterio.open(path.with_suffix(".tif")) as stack:
+        for index, band in enumerate(sidecar.bands, start=1):
+            pixels = np.where(stack.read_masks(index) > 0, stack.read(index), np.nan).astype(np.float32)
+            np.testing.assert_allclose(np.array(band.levels, float), block_means(pixels), rtol=1e-4)
+            assert 0 <= band.saturated < 0.05
+    assert np.shape(sidecar.bands[0].levels) == LEVEL_BLOCKS
+    assert "Radiometric check" in (aligned_flight / "index.html").read_text()
