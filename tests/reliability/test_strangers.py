@@ -11,7 +11,10 @@ from operator import getitem
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
+import torch
+from common import WRONG_PX, band_errors, read_ties
 
 from agalign.batch import capture as batch
 from agalign.cameras import known_cameras
@@ -20,17 +23,21 @@ from agalign.cameras.grouping import capture_of
 from agalign.cameras.read_files import read_file
 from agalign.config import DiscoverOptions
 from agalign.errors import SidecarError
+from agalign.flight.model import FlightModel, load_model, save_model
 from agalign.products.flight_map import FLIGHT_MAP_FILE, features_in
 from agalign.products.index_table import INDICES_FILE, read_table
 from agalign.products.panels import PANELS_FILE, SKY_FILE, read_panels, read_sky
 from agalign.products.run_record import read_run_record
 from agalign.products.sidecar_file import find_sidecars, read_sidecar
 from agalign.products.text_files import write_csv
+from agalign.synthetic import flight as synthetic
+from agalign.values import geometry
+from agalign.values.alignment import RefinedPair
 from agalign.values.files import RUN_FILE
 from agalign.values.text import without_controls
 
-from ..conftest import raising, read_json, seeded
-from ..program import agalign_here
+from ..conftest import Shared, raising, read_json, seeded
+from ..program import agalign, agalign_here
 
 
 @pytest.fixture(params=["pipe", "folder"])
@@ -135,3 +142,86 @@ def test_any_error_fails_one_capture_only(
     report = batch.do_capture(batch.Task(discover(flight).captures[0], tmp_path, seeded(), None))
     assert report.state == "error"
     assert report.error.startswith(f"agalign failed on it ({type(error).__name__}: ")
+
+
+@pytest.fixture(scope="module")
+def learned(shared: Shared) -> Path:
+    """A flight of four captures and its aligned output: the model has a rig, and refined mappings of all captures."""
+
+    def align(folder: Path) -> None:
+        synthetic.make_flight(folder / "in", captures=4, size_px=(480, 360), rng_seed=3)
+        agalign(folder / "in", "-o", folder / "out", "--relief", "never")
+
+    return shared("learned", align)
+
+
+def _shifted(matrix: np.ndarray) -> np.ndarray:
+    return geometry.compose(geometry.translation(4.0, -3.0), matrix)
+
+
+def _with_refined(model: FlightModel, change: Callable[[RefinedPair], RefinedPair]) -> FlightModel:
+    refined = {key: {band: change(one) for band, one in pairs.items()} for key, pairs in model.refined.items()}
+    return replace(model, refined=refined)
+
+
+def with_shifted_results(model: FlightModel) -> FlightModel:
+    """The refined mappings are wrong by 5 px and have tiny errors; their seeds are right."""
+
+    def change(one: RefinedPair) -> RefinedPair:
+        return replace(one, result=one.result.with_homography(_shifted(one.result.fixed_to_moving), 1e-6 * np.eye(8)))
+
+    return _with_refined(model, change)
+
+
+def with_shifted_refinements(model: FlightModel) -> FlightModel:
+    """Seeds and results are wrong by 5 px, and the seeds are said to be certain."""
+
+    def change(one: RefinedPair) -> RefinedPair:
+        seed = replace(one.seed, fixed_to_moving=_shifted(one.seed.fixed_to_moving), trusted=True)
+        return replace(one, seed=seed, result=replace(one.result, fixed_to_moving=_shifted(one.result.fixed_to_moving)))
+
+    return _with_refined(model, change)
+
+
+def with_shifted_rig(model: FlightModel) -> FlightModel:
+    """Rig and mappings are wrong by 5 px and have tiny errors; there are no refined mappings."""
+    rig = model.rig
+    tiny = {
+        "baseline_std": dict.fromkeys(rig.baseline_std, 1e-6),
+        "from_bands_px": dict.fromkeys(rig.from_bands_px, 1e-6),
+    }
+    rig = replace(rig, mean={band: _shifted(matrix) for band, matrix in rig.mean.items()}, **tiny)
+    mappings = {band: _shifted(matrix) for band, matrix in model.mappings.items()}
+    return replace(model, rig=rig, mappings=mappings, refined={})
+
+
+def with_random_network(model: FlightModel) -> FlightModel:
+    """The network describes nothing; there are no refined mappings."""
+    torch.manual_seed(0)
+    with torch.no_grad():
+        for weights in model.net.parameters():
+            weights.normal_()
+    return replace(model, refined={})
+
+
+@pytest.mark.full
+@pytest.mark.parametrize(
+    "change", [with_shifted_results, with_shifted_refinements, with_shifted_rig, with_random_network]
+)
+def test_a_model_changed_by_hand_makes_no_wrong_alignment(
+    learned: Path, tmp_path: Path, change: Callable[[FlightModel], FlightModel]
+) -> None:
+    """It has the right checksum; a band is aligned only where the images confirm that."""
+    (path,) = (learned / "out" / "models").iterdir()
+    model = load_model(path, lambda: torch.device("cpu"))
+    assert model.rig is not None
+    assert len(model.refined) == 4
+    changed = tmp_path / "models" / path.name
+    save_model(change(model), changed)
+    contents = changed.read_bytes()
+    done = agalign(learned / "in", "-o", tmp_path, "--relief", "never")
+    assert done.returncode in (0, 1, 3)
+    assert changed.read_bytes() == contents, "the model was used"
+    errors = band_errors(tmp_path, read_ties(learned / "in" / "truth.json"))
+    assert len(errors) == 16
+    assert [e for e in errors if e.status == "aligned" and not e.p95_px <= WRONG_PX] == []
