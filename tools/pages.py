@@ -87,9 +87,12 @@ def fields() -> str:
 
 
 def field_line(name: str, field: dict[str, Any], of_types: Container[str]) -> str:
-    """Return a field of the sidecar as an item of a list, without a description that is that of its type."""
-    text = field.get("description", "")
-    return f"* `{name}` ({json_type(field)})" + ("" if not text or text in of_types else f": {' '.join(text.split())}")
+    """Return a field of the sidecar as an item of a list, without the type of a text, and without a description that is
+    that of its type.
+    """
+    text, kind = field.get("description", ""), json_type(field)
+    of_kind = "" if kind == "text" else f" ({kind})"
+    return f"* `{name}`{of_kind}" + ("" if not text or text in of_types else f": {' '.join(text.split())}")
 
 
 def sidecar_schema() -> dict[str, Any]:
@@ -98,7 +101,7 @@ def sidecar_schema() -> dict[str, Any]:
 
 
 def json_type(field: dict[str, Any]) -> str:
-    """Short: `number`, `Seed?` if it may be null, `list of Band`."""
+    """Short: `number`, `Seed?` if it may be null, `Band[]` for a list."""
     if "$ref" in field:
         name = field["$ref"].rpartition("/")[2].removesuffix("Part")
         return f"[{name}](#{name.lower()})"
@@ -110,7 +113,8 @@ def json_type(field: dict[str, Any]) -> str:
             count = len(field["prefixItems"])
             item, null, _ = json_type(field["prefixItems"][0]).partition("?")
             return f"{count} x {item}" if item[0].isdigit() else f"{count} {item}s{null}"
-        return f"list of {json_type(field['items'])}"
+        item = json_type(field["items"])
+        return f"({item})[]" if " " in item else f"{item}[]"
     return str(field.get("type", "text")).replace("string", "text")
 
 

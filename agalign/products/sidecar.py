@@ -204,9 +204,9 @@ class FieldPart(_Part):
 
 
 class GridPart(_Part):
-    """The complete mapping, lenses and displacement field included, sampled at 17 x 13 points,
-    or at up to 129 x 97 points if cubic interpolation (scipy's CloughTocher2DInterpolator or RectBivariateSpline) of
-    fewer has errors above 0.02 px (p99). If there is a `relief`, use that instead.
+    """The complete mapping, sampled at 17 x 13 points, or at up to 129 x 97 points if cubic interpolation (scipy's
+    CloughTocher2DInterpolator or RectBivariateSpline) of fewer has errors above 0.02 px (p99). If there is a `relief`,
+    use that instead.
     """
 
     reference_px: PointsPx
@@ -271,7 +271,7 @@ class JointPart(_Part):
     corner_std_px: Annotated[Number, _measured(6)]
     """Standard error of the least certain corner, px of the reference."""
     corner_std_xy_px: PointsPx
-    """Standard errors along x and y at the corners of the reference, clockwise from the top left, px of the reference.
+    """Standard errors (x, y) at the corners, clockwise from the top left, px of the reference.
     """
 
 
@@ -279,7 +279,7 @@ class SimilarityPart(_Part):
     """Similarity of pixels that are valid in both bands; in large images of a sample of at least 250,000."""
 
     mattes_mi: Fraction6 = None
-    """Negative mutual information by Mattes, nats, 32 bins, as in elastix: lower is better."""
+    """Negative Mattes mutual information, nats, 32 bins: lower is better."""
     nmi: Fraction6 = None
     """Normalised mutual information, 1 to 2: higher is better."""
     ncc: Fraction6 = None
@@ -295,7 +295,7 @@ class SimilarityPart(_Part):
     residual_p95_px: Fraction6 = None
     """Their 95th percentile, px of the reference."""
     residual_coverage: Fraction6 = None
-    """Share of the textured windows in which a shift was measured."""
+    """Share of the textured windows with a measured shift."""
 
 
 class ResidualTile(_Part):
@@ -464,7 +464,7 @@ class IlluminationPart(_Part):
     band: str
     """Its name."""
     irradiance: Number | None = None
-    """Light on a horizontal plane by the light sensor, W / m^2 / nm (DJI: relative)."""
+    """By the light sensor, on a horizontal plane, W / m^2 / nm (DJI: relative)."""
     reflectance_per_radiance: Number
     """Factor by which radiance was multiplied."""
 
@@ -481,7 +481,7 @@ class OutputPart(_Part):
     radiometry: str | None = None
     """Conversion of raw numbers, such as `reflectance by panel and light sensor`."""
     panel_age_s: Number | None = None
-    """Time between the capture and the nearest panel, if one was used."""
+    """Time to the nearest panel, if one was used."""
     illumination: list[IlluminationPart] = []
     """Bands that were converted to reflectance."""
     crop: tuple[int, int, Count, Count]
@@ -491,7 +491,7 @@ class OutputPart(_Part):
     undistorted: bool = False
     """True for the lens-corrected grid of the reference."""
     vignetting_corrected: bool = False
-    """True if vignetting is corrected in the files of single bands, as no polynomial on their grid describes it."""
+    """True if vignetting is corrected in the files of single bands."""
     nodata: float | str | None
     """Nodata value of the stack, or of all single bands; null if they differ. Integers without one in the input: 0,
     or another value that no valid pixel has.
@@ -527,8 +527,8 @@ class ReliefPreviewPart(_Part):
 
 
 class PreviewPart(_Part):
-    """Pictures for the report, a column for each of `bands`. Rows 0 and 1 show input and output, rows 2 and 3 a detail
-    of each. Then come a row of expected errors (if `error_full_px` is not null) and one of the relief (if any).
+    """Pictures for the report, a column per band. Rows: input, output, a detail of each, expected errors (if
+    `error_full_px` is not null), relief (if any).
     """
 
     file: RelativeFile
