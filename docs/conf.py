@@ -1,4 +1,4 @@
-"""The site of these pages: pip install 'agalign[docs]' && sphinx-build -W docs site."""
+"""The site of these pages: pip install '.[docs]' && sphinx-build -W docs site."""
 
 from agalign import __version__
 

@@ -1,6 +1,6 @@
 """Read a flight as one lazy xarray Dataset; print the NDVI and position of every capture.
 
-pip install 'agalign[xarray]'
+pip install '.[xarray]'
 python examples/ndvi_over_a_flight.py ALIGNED
 """
 

@@ -1,6 +1,6 @@
 """Align a flight on the workers of a Dask cluster or, without an address, on worker processes of this machine.
 
-pip install 'agalign[dask]'
+pip install '.[dask]'
 python examples/on_dask.py FLIGHT OUT [tcp://SCHEDULER:8786]
 """
 

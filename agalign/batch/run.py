@@ -36,7 +36,7 @@ from agalign.method.device import choose_device, limit_threads
 from agalign.pixels.radiometry import with_radiometry
 from agalign.pixels.raster import without_warnings
 from agalign.products.flight_map import FlightMap
-from agalign.products.footprint import above_elevation, with_approximate_georeference
+from agalign.products.footprint import above_elevation, missing_for_footprint, with_approximate_georeference
 from agalign.products.index_rasters import check_indices
 from agalign.products.panels import write_panels, write_sky
 from agalign.products.preview import preview_bytes
@@ -196,10 +196,7 @@ class _FlightRun:
         if captures and all(missing):
             raise ConfigurationError(f"--radiometry {write.radiometry}: {missing[0]}")
         if write.georeference and captures and all(c.reference.georeference is None for c in captures):
-            raise ConfigurationError(
-                "--georeference: no capture has position, altitude, yaw and focal length in its tags, and a height "
-                "above the ground; where only the height is missing, give --ground-elevation"
-            )
+            raise ConfigurationError(f"--georeference: no capture has {missing_for_footprint(captures[0])}")
         return sky, panels, captures
 
     def kept(self, capture: Capture) -> CaptureResult | None:

@@ -183,7 +183,7 @@ def dask_executor(address: str, jobs: int = 0, timeout_s: float | None = None) -
         import dask
         from distributed import Client, LocalCluster, fire_and_forget
     except ImportError:
-        raise ConfigurationError("Dask is not installed; pip install 'agalign[dask]'") from None
+        raise ConfigurationError("Dask is not installed; in a checkout: pip install '.[dask]'") from None
     with ExitStack() as stack:
         # The run reports a lost scheduler in one line; Dask logs tracebacks.
         for logger in map(logging.getLogger, ("distributed.client", "distributed.deploy.spec", "tornado")):

@@ -131,7 +131,7 @@ def _show(facts: dict[str, Any], terminal: Terminal) -> None:
         rows.append((f"device {device['device']}", device["problem"] or device["what"] + threads))
     terminal.table(("This machine", ""), rows)
     extras = [
-        (row["extra"], row["adds"], f"pip install 'agalign[{row['extra']}]'" if row["missing"] else "installed")
+        (row["extra"], row["adds"], f"pip install '.[{row['extra']}]'" if row["missing"] else "installed")
         for row in facts["extras"]
     ]
-    terminal.table(("Extra", "What it adds", ""), extras)
+    terminal.table(("Extra", "What it adds", "In a checkout"), extras)

@@ -88,7 +88,7 @@ def method_named(name: str) -> Method:
         "elastix": _elastix,
     }
     if name == "elastix" and importlib.util.find_spec("itk") is None:
-        raise ConfigurationError(f"{name} needs more than is installed; pip install 'agalign[evaluate]'")
+        raise ConfigurationError(f"{name} needs more than is installed; in a checkout: pip install '.[evaluate]'")
     if name in fixed_names:
         return fixed_names[name]
     learned = re.fullmatch(r"(fast|paper):([a-z-]+)(:grey)?(:random)?", name)

@@ -109,7 +109,7 @@ def import_xarray() -> Any:
         import xarray as xr
     except ImportError:
         raise ConfigurationError(
-            "xarray, rioxarray and dask are not installed; pip install 'agalign[xarray]'"
+            "xarray, rioxarray and dask are not installed; in a checkout: pip install '.[xarray]'"
         ) from None
     return xr
 

@@ -86,6 +86,23 @@ def ground_m(capture: Capture, points_px: NDArray[np.float64]) -> NDArray[np.flo
     return np.stack([east_m, forward_m * np.cos(heading) - right_m * np.sin(heading)], axis=-1)
 
 
+def missing_for_footprint(capture: Capture) -> str:
+    """Return what `ground_m` lacks of a capture, and the remedy: tags, the height, or a view that is steep enough."""
+    pose, position = capture.pose, capture.position
+    tags = {
+        "a position": position is not None,
+        "a heading": pose is not None,
+        "a focal length": pose is None or pose.focal_length_px is not None,
+    }
+    if lacking := [name for name, known in tags.items() if not known]:
+        return f"{' and '.join(lacking)} in its tags; leave --georeference out"
+    if pose is not None and pose.height_m is not None:
+        return f"a tilt below {_MAX_TILT_DEG:.0f} degrees; leave --georeference out"
+    if position is not None and position.altitude_m is not None:
+        return "a height above the ground; give --ground-elevation, in metres and below the altitude of the camera"
+    return "an altitude or a height above the ground in its tags; leave --georeference out"
+
+
 def above_elevation(capture: Capture, ground_elevation_m: float) -> Capture:
     """Return the capture with the height above ground of this elevation, if neither tags nor a panel give a height."""
     height_m = _altitude_m(capture) - ground_elevation_m

@@ -218,7 +218,9 @@ def index_named(name: str) -> Index:
     if wanted in catalogue:
         return _of_catalogue(wanted, catalogue[wanted])
     more = (
-        "or a name in the catalogue of spyndex" if catalogue else "or install more with pip install 'agalign[indices]'"
+        "or a name in the catalogue of spyndex"
+        if catalogue
+        else "or install more with in a checkout: pip install '.[indices]'"
     )
     similar = did_you_mean(wanted, [*INDICES, *catalogue])
     raise ConfigurationError(f"unknown index '{name}'{similar}; choose from {', '.join(INDICES)}, {more}")

@@ -118,7 +118,7 @@ def _libraries() -> Any:
     try:
         geopandas, *_ = map(import_module, ("geopandas", "exactextract", "pyarrow"))
     except ImportError as error:
-        raise ConfigurationError(f"{error.name} is not installed; pip install 'agalign[plots]'") from None
+        raise ConfigurationError(f"{error.name} is not installed; in a checkout: pip install '.[plots]'") from None
     return geopandas
 
 

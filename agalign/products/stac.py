@@ -57,7 +57,7 @@ def need_stac() -> None:
     try:
         import pystac  # noqa: F401
     except ImportError:
-        raise ConfigurationError("STAC needs more than is installed; pip install 'agalign[stac]'") from None
+        raise ConfigurationError("STAC needs more than is installed; in a checkout: pip install '.[stac]'") from None
 
 
 def write_collections(captures: Sequence[Capture], out: Path) -> list[Path]:

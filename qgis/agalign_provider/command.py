@@ -52,7 +52,8 @@ def find_executable(setting=""):
         if (folder / name).is_file():
             return str(folder / name)
     raise CommandError(
-        "agalign is not installed where QGIS can find it; install it (pipx install agalign), or name its executable "
+        "agalign is not installed where QGIS can find it; install it (pipx install PATH, with the "
+        "path of a checkout or wheel of agalign), or name its executable "
         "under Settings, Options, Processing, Providers, agalign"
     )
 

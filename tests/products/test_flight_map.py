@@ -18,6 +18,7 @@ from agalign.products.footprint import (
     above_elevation,
     accuracy_of_footprint_m,
     ground_m,
+    missing_for_footprint,
     with_approximate_georeference,
     with_assumed_height,
 )
@@ -126,6 +127,20 @@ def test_the_elevation_of_the_ground_gives_the_height_that_tags_lack() -> None:
     assert above_elevation(capture(replace(pose, height_m=7.0)), 100.0).pose == replace(pose, height_m=7.0)
     assert above_elevation(capture(pose), 131.0).pose == pose  # below the ground
     assert with_approximate_georeference(capture(pose)).reference.georeference is None
+
+
+@pytest.mark.parametrize(
+    ("pose", "missing"),
+    [
+        (None, "a heading in its tags; leave"),
+        (Pose(5.0), "a focal length in its tags; leave"),
+        (Pose(5.0, focal_length_px=1000.0), "a height above the ground; give --ground-elevation"),
+        (Pose(5.0, 60.0, focal_length_px=1000.0, height_m=50.0), "a tilt below 45 degrees"),
+    ],
+)
+def test_a_capture_without_footprint_names_what_it_lacks(pose: Pose | None, missing: str) -> None:
+    assert missing_for_footprint(capture(pose)).startswith(missing)
+    assert missing_for_footprint(replace(capture(pose), position=None)).startswith("a position")
 
 
 @pytest.mark.parametrize("heading_deg", [0.0, 37.0, 200.0])

@@ -17,8 +17,8 @@ from agalign.products.sidecar_file import read_sidecar, write_sidecar
 
 from ..program import agalign_here
 
-pytest.importorskip("exactextract", reason="needs pip install 'agalign[plots]'")
-geopandas = pytest.importorskip("geopandas", reason="needs pip install 'agalign[plots]'")
+pytest.importorskip("exactextract", reason="needs pip install '.[plots]'")
+geopandas = pytest.importorskip("geopandas", reason="needs pip install '.[plots]'")
 
 BANDS = {"green": 560, "red": 668, "nir": 842, "red edge": 717}
 NORTH_UP = Affine(0.5, 0, 600000, 0, -0.5, 5761000)

@@ -52,7 +52,7 @@ def test_executable_of_the_setting_or_environment(tmp_path: Path, monkeypatch: p
     monkeypatch.delenv("VIRTUAL_ENV")
     monkeypatch.setattr(sys, "executable", str(tmp_path / "python3"))
     monkeypatch.setenv("HOME", str(tmp_path))
-    with pytest.raises(command.CommandError, match="pipx install agalign"):
+    with pytest.raises(command.CommandError, match="pipx install PATH, with the path of a checkout"):
         command.find_executable()
     with pytest.raises(command.CommandError, match="no executable"):
         command.find_executable(str(tmp_path / "nowhere"))
