@@ -6,7 +6,6 @@ their own places, angles and distortion. A pixel is the mean of several rays, an
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from functools import cached_property
 from pathlib import Path
 
 import cv2
@@ -163,72 +162,49 @@ def _shaded(patch: Patch, hits: Hits, textures: Textures, tile: Field, eye: Eye,
     return np.asarray(result + glint * max(eye.band.soil, eye.band.crop), np.float32)
 
 
-@dataclass(frozen=True)
-class Geometry:
-    """What the reference of a scene sees, for the truth of the other bands."""
-
-    scene: Scene
-    reference: BandSpec
-    size_px: tuple[int, int]
-
-    @cached_property
-    def eye(self) -> Eye:
-        return self.scene.eye(self.reference, self.size_px)
-
-    @cached_property
-    def seen(self) -> tuple[Field, NDArray[np.int32]]:
-        """(range in m, index of the patch) of each pixel."""
-        patches = self.scene.at_exposure_of(self.reference)
-        return nearest(patches, self.eye, *self.eye.rays(), boxes_of(patches, self.eye))
-
-    def band(self, band: BandSpec) -> BandTruth:
-        """The truth of one moving band."""
-        depth, index = self.seen
-        if band.name in self.scene.others:
-            nothing = np.zeros(depth.shape, bool)
-            return BandTruth(np.full((*depth.shape, 2), np.nan, np.float32), ~nothing, nothing, nothing)
-        x, y = self.eye.rays()
-        points = self.eye.to_world(np.stack([x, y, np.ones_like(x)], axis=-1) * depth[..., None])
-        before, after = (np.array([p.centre_m for p in self.scene.at_exposure_of(b)]) for b in (self.reference, band))
-        by = after - before
-        points, moved = points + by[index], np.abs(by).max(axis=1)[index] > 0
-        eye = self.scene.eye(band, self.size_px)
-        there = eye.to_camera(points)
-        there_px = eye.project(there)
-        inside = ((there_px >= 0) & (there_px <= np.subtract(self.size_px, 1))).all(axis=-1)
-        hidden = self._hidden(eye, there)
-        hand = self.scene.hands.get(band.name)
-        if hand is not None:
-            cover = cv2.remap(hand.cover(self.size_px), there_px.astype(np.float32), None, cv2.INTER_LINEAR)
-            hidden |= cover > _SEEN_THROUGH
-        return BandTruth(there_px.astype(np.float32), hidden, inside, moved)
-
-    def _hidden(self, eye: Eye, there_m: Field) -> Mask:
-        """Where the ray from the lens of `eye` to a point (height, width, 3) in its axes meets something nearer."""
-        patches = self.scene.at_exposure_of(eye.band)
-        z = there_m[..., 2]
-        x, y = there_m[..., 0] / z, there_m[..., 1] / z
-        first = nearest(patches, eye, x, y, boxes_of(patches, self.eye, farther_px=self._reach_px(eye)))[0]
-        return np.asarray(first < z * (1 - _SAME_SURFACE))
-
-    def _reach_px(self, eye: Eye) -> float:
-        """Largest distance in the reference's image between a point and what hides it from another lens: the
-        difference of their disparities, and what moved between the exposures.
-        """
-        depth = self.seen[0]
-        focal_px = eye.band.lens(*self.size_px).fx_px
-        moved = [np.linalg.norm(by) for groups in self.scene.moved_m.values() for by in groups.values()]
-        baseline_m = float(np.linalg.norm(eye.place_m - self.eye.place_m)) + 2 * float(max(moved, default=0.0))
-        # A hiding patch may be nearer than anything that the reference sees.
-        return float(focal_px * baseline_m * (1 / (0.7 * depth.min()) - 1 / depth.max()))
-
-
 def truth_of(scene: Scene, size_px: tuple[int, int], camera: CameraSpec = CLOSE_RANGE) -> Truth:
     """The exact geometry of a capture."""
     reference = camera.bands[camera.reference]
-    geometry = Geometry(scene, reference, size_px)
-    bands = {b.name: geometry.band(b) for b in camera.bands if b is not reference}
-    return Truth(scene.kind, np.asarray(geometry.seen[0], np.float32), bands)
+    patches, eye = scene.at_exposure_of(reference), scene.eye(reference, size_px)
+    seen = nearest(patches, eye, *eye.rays(), boxes_of(patches, eye))
+    bands = {b.name: _band_truth(scene, b, eye, *seen) for b in camera.bands if b is not reference}
+    return Truth(scene.kind, np.asarray(seen[0], np.float32), bands)
+
+
+def _band_truth(scene: Scene, band: BandSpec, reference: Eye, depth: Field, index: NDArray[np.int32]) -> BandTruth:
+    """The truth of a moving band; `depth` in m and `index` of the patch are what each pixel of the reference sees."""
+    if band.name in scene.others:
+        nothing = np.zeros(depth.shape, bool)
+        return BandTruth(np.full((*depth.shape, 2), np.nan, np.float32), ~nothing, nothing, nothing)
+    x, y = reference.rays()
+    points = reference.to_world(np.stack([x, y, np.ones_like(x)], axis=-1) * depth[..., None])
+    before, after = (np.array([p.centre_m for p in scene.at_exposure_of(b)]) for b in (reference.band, band))
+    by = after - before
+    points, moved = points + by[index], np.abs(by).max(axis=1)[index] > 0
+    eye = scene.eye(band, reference.size_px)
+    there = eye.to_camera(points)
+    there_px = eye.project(there)
+    inside = ((there_px >= 0) & (there_px <= np.subtract(eye.size_px, 1))).all(axis=-1)
+    # The ray from the band's lens to a point meets something nearer.
+    patches, z = scene.at_exposure_of(band), there[..., 2]
+    boxes = boxes_of(patches, reference, farther_px=_reach_px(scene, reference, eye, depth))
+    hidden = nearest(patches, eye, there[..., 0] / z, there[..., 1] / z, boxes)[0] < z * (1 - _SAME_SURFACE)
+    hand = scene.hands.get(band.name)
+    if hand is not None:
+        cover = cv2.remap(hand.cover(eye.size_px), there_px.astype(np.float32), None, cv2.INTER_LINEAR)
+        hidden |= cover > _SEEN_THROUGH
+    return BandTruth(there_px.astype(np.float32), hidden, inside, moved)
+
+
+def _reach_px(scene: Scene, reference: Eye, eye: Eye, depth: Field) -> float:
+    """Largest distance in the reference's image between a point and what hides it from another lens: the difference of
+    their disparities, and what moved between the exposures.
+    """
+    focal_px = eye.band.lens(*eye.size_px).fx_px
+    moved = [np.linalg.norm(by) for groups in scene.moved_m.values() for by in groups.values()]
+    baseline_m = float(np.linalg.norm(eye.place_m - reference.place_m)) + 2 * float(max(moved, default=0.0))
+    # A hiding patch may be nearer than anything that the reference sees.
+    return float(focal_px * baseline_m * (1 / (0.7 * depth.min()) - 1 / depth.max()))
 
 
 def write_capture(
