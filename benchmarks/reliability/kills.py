@@ -1,22 +1,28 @@
-"""Kill a run at random moments, run the same command again, and compare with an undisturbed run.
+"""Send a signal to a run at random moments, run the same command again, and compare with an undisturbed run.
 
-    python benchmarks/reliability/kills.py [--kills 50] [--markdown FILE]
+    python benchmarks/reliability/kills.py [--kills 50] [--modes "one job,two jobs,Dask,indices"]
+        [--signals SIGKILL,SIGTERM,SIGINT,SIGHUP,SIGSTOP] [--captures 12] [--markdown FILE]
 
-The synthetic flight, `--layout both` with an error map and STAC items, so that every kind of file is at stake. Moments
-are drawn evenly over the time that an undisturbed run takes; SIGKILL goes to the run and, every other time, to its
-workers with it. Compared are all files that a run writes, rasters pixel by pixel, sidecars without the seconds.
+The synthetic flight, `--layout both` with an error map and STAC items, so that every kind of file is at stake; and
+`agalign indices` on five times as many aligned captures. `--kills` is the number for each mode. Moments are drawn
+evenly over the time that an undisturbed run takes. Signals go to the run, its fork server, a worker, or all of them.
+SIGSTOP is followed by SIGCONT. Compared are all files that a run writes, rasters pixel by pixel, sidecars without the
+seconds.
 """
 
 import json
 import random
 import shutil
+import signal
 import subprocess
 import sys
 import tempfile
 import time
-from collections import Counter
+import warnings
+from collections import Counter, defaultdict
 from collections.abc import Callable, Collection
 from contextlib import suppress
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -25,14 +31,24 @@ import rasterio
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from common import Section, align, command, run
+from common import Section, command, run
+from synthetic_flights.aligned import make_aligned
 
 from agalign.products.sidecar_file import find_sidecars
 from agalign.synthetic import flight as synthetic
 from agalign.values.files import RUN_FILE
 
-CAPTURES, SIZE_PX = 12, (480, 360)
-OPTIONS = ("--layout", "both", "--error-map", "--stac", "-j", "2")
+SIZE_PX = 480, 360
+OPTIONS = "--layout", "both", "--error-map", "--stac"
+INDICES = "indices"
+MODES = {"one job": ("-j", "1"), "two jobs": ("-j", "2"), "Dask": ("-j", "2", "--dask", "local"), INDICES: ("-j", "2")}
+TARGETS = "run", "fork server", "worker", "run and workers"
+WRONG = (
+    *("hung", "traceback", "bad exit", "outlived the run", "torn sidecars", "torn captures"),
+    *("missing", "left over", "corrupt", "different"),
+)
+STOPPED_S, HUNG_S = 5.0, 120.0
+"""Seconds for which SIGSTOP stops a process, and after which a run hangs."""
 CHANGING = {RUN_FILE, "summary.csv", "index.html"}
 """These hold seconds."""
 
@@ -92,54 +108,101 @@ def whole_sidecars(out: Path) -> Counter[str]:
     return result
 
 
-def kill_after(seconds: float, argv: list[str], *, workers_too: bool) -> bool:
-    """Return True if the run was still running."""
-    process = subprocess.Popen(argv, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-    time.sleep(seconds)
-    running = process.poll() is None
-    children = psutil.Process(process.pid).children(recursive=True) if running else []
-    process.kill()
-    for child in children if workers_too else ():
-        with suppress(psutil.NoSuchProcess):
-            child.kill()
-    process.wait()
-    psutil.wait_procs(children, timeout=10)
-    left = [c for c in children if c.is_running() and c.status() != psutil.STATUS_ZOMBIE]
-    if left:
-        raise SystemExit(f"processes outlived the run: {left}")
-    return running
+def processes_of(process: "subprocess.Popen[str]", target: str) -> list[psutil.Process]:
+    """Return the running processes that a signal is sent to; the run itself where it has no workers."""
+    here = psutil.Process(process.pid)
+    below = [c for c in here.children(recursive=True) if c.ppid() != here.pid]
+    chosen = {c.parent() for c in below} if target == "fork server" else set(below) if target == "worker" else {here}
+    if target == "run and workers":
+        chosen |= set(here.children(recursive=True))
+    return [c for c in chosen if c is not None] or [here]
 
 
-def main(kills: int = 50, rng_seed: int = 0, markdown: Path | None = None) -> None:
+def strike(argv: list[str], after_s: float, number: signal.Signals, target: str, rng: random.Random) -> Counter[str]:
+    """Send a signal to processes of a run, and return what is wrong with its end; `hit` if it was still running."""
+    result: Counter[str] = Counter()
+    process = subprocess.Popen(argv, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True, errors="replace")
+    children: list[psutil.Process] = []
+    with suppress(subprocess.TimeoutExpired, psutil.NoSuchProcess):
+        process.wait(after_s)
+    with suppress(psutil.NoSuchProcess):
+        children = psutil.Process(process.pid).children(recursive=True)
+        targets = processes_of(process, target)
+        result["hit"] += process.poll() is None
+        for one in targets if target == "run and workers" else [rng.choice(targets)]:
+            one.send_signal(number)
+            if number == signal.SIGSTOP:
+                time.sleep(STOPPED_S)
+                one.send_signal(signal.SIGCONT)
+    try:
+        errors = process.communicate(timeout=HUNG_S)[1]
+    except subprocess.TimeoutExpired:
+        result["hung"] += 1
+        process.kill()
+        errors = process.communicate()[1]
+    _, left = psutil.wait_procs(children, timeout=10)
+    result["outlived the run"] = sum(c.is_running() and c.status() != psutil.STATUS_ZOMBIE for c in left)
+    result["traceback"] = int("Traceback" in errors or "please report" in errors)
+    # A second signal, or one before the program catches it, ends the process at once.
+    result["bad exit"] = int(process.returncode not in (0, 1, 3, 128 + number, -number))
+    if +result - Counter({"hit": 1}):
+        print(process.returncode, errors, [c.pid for c in left], flush=True)
+    return result
+
+
+def main(
+    kills: int = 50,
+    modes: str = ",".join(MODES),
+    signals: str = "SIGKILL",
+    captures: int = 12,
+    rng_seed: int = 0,
+    markdown: Path | None = None,
+) -> None:
     section, rng = Section("kills", markdown), random.Random(rng_seed)
     np.seterr(all="ignore")
+    warnings.simplefilter("ignore")  # of rasters without georeference
+    rows = [("run", "signals to", "signals", "while it ran", "seconds of a run", *WRONG)]
     with tempfile.TemporaryDirectory() as folder:
-        flight, whole, out = Path(folder, "flight"), Path(folder, "whole"), Path(folder, "out")
-        synthetic.make_flight(flight, CAPTURES, SIZE_PX, rng_seed=4)
-        seconds = align(flight, whole, *OPTIONS)
-        expected = snapshot(whole)
-        result: Counter[str] = Counter()
-        hit, kept = 0, []
-        for number in range(kills):
+        flight, aligned, out = Path(folder, "flight"), Path(folder, "aligned"), Path(folder, "out")
+        synthetic.make_flight(flight, captures, SIZE_PX, rng_seed=4)
+        make_aligned(aligned, 5 * captures, SIZE_PX)
+        for mode in modes.split(","):
+            of_indices = mode == INDICES
+            make = [sys.executable, "-m", "agalign", "indices", str(out), "-q", "--index", "ndvi,ndre,savi"]
+            argv = [*(make if of_indices else command(flight, out, *OPTIONS)), *MODES[mode]]
+            start = partial(shutil.copytree, aligned, out) if of_indices else (lambda: None)
             shutil.rmtree(out, ignore_errors=True)
-            at = rng.uniform(0.02, 1.0) * seconds
-            hit += kill_after(at, command(flight, out, *OPTIONS), workers_too=bool(number % 2))
-            torn = whole_sidecars(out)
-            again = command(flight, out, *OPTIONS, "--log-json")
-            done = subprocess.run(again, capture_output=True, text=True, check=False)
-            kept.append(done.stderr.count('"state": "kept"'))
-            here = +(differences(out, expected) + torn + Counter({"bad exit codes": int(done.returncode != 0)}))
-            print(
-                f"{number + 1}: killed after {at:.1f} s, {kept[-1]} captures kept, {dict(here) or 'equal'}", flush=True
-            )
-            result += here
-        section.say(
-            f"{kills} kills of a run of {seconds:.0f} s over {CAPTURES} captures ({hit} while it was running; "
-            f"between {min(kept)} and {max(kept)} captures were finished by then), each followed by the same command: "
-            f"{kills - result['bad exit codes']} exit codes 0. Files after the kill: {result['torn sidecars']} torn "
-            f"sidecars, {result['torn captures']} torn captures; after resuming: {result['missing']} missing, "
-            f"{result['left over']} left over, {result['corrupt']} corrupt, {result['different']} different."
-        )
+            start()
+            began = time.monotonic()
+            if subprocess.run(argv, check=False).returncode != 0:
+                raise SystemExit(f"{mode}: the run without signals failed")
+            seconds, expected = time.monotonic() - began, snapshot(out)
+            targets = TARGETS if mode != "one job" else ("run",)
+            counts: dict[str, Counter[str]] = defaultdict(Counter)
+            for index in range(kills):
+                # Each pair of signal and target in turn.
+                name = signals.split(",")[index % len(signals.split(","))]
+                target = targets[index // len(signals.split(",")) % len(targets)]
+                shutil.rmtree(out, ignore_errors=True)
+                start()
+                at_s = rng.uniform(0.02, 1.0) * seconds
+                here = strike(argv, at_s, signal.Signals[name], target, rng)
+                here += Counter() if of_indices else whole_sidecars(out)
+                again = subprocess.run(argv, capture_output=True, text=True, check=False)
+                here += differences(out, expected)
+                here["bad exit"] += again.returncode != 0
+                wrong = {k: n for k, n in here.items() if n and k != "hit"}
+                print(f"{index + 1}: {mode}: {name} to {target} after {at_s:.1f} s: {wrong or 'equal'}", flush=True)
+                if wrong:
+                    print(again.stderr, flush=True)
+                counts[target] += here + Counter(strikes=1)
+            rows += [
+                (mode, target, *(str(n[k]) for k in ("strikes", "hit")), f"{seconds:.0f}", *(str(n[k]) for k in WRONG))
+                for target, n in counts.items()
+            ]
+    section.table(rows)
+    if any(int(cell) for row in rows[1:] for cell in row[-len(WRONG) :]):
+        raise SystemExit("something is wrong")
 
 
 if __name__ == "__main__":
