@@ -1,0 +1,362 @@
+"""Attack what the program is given: formulas, strange images, rasters that change while they are read, ordinary
+captures that must not be left out, and images that are hard to search for panels and relief.
+
+    python benchmarks/reliability/inputs.py [--formulas 20000] [--images 60] [--changes 40] [--captures 500]
+        [--data FOLDER] [--rng-seed 0] [--markdown FILE]
+
+A formula is refused or gives one value per pixel, within a second. Each file of a strange capture is in a sidecar or in
+a message. An index is that of an undisturbed run, or a message names its capture. The captures of `--data` are cropped,
+darkened and turned, in a folder named after the sky: none is one of the sky or of a panel. A search hangs that takes
+over three times as long as in a texture of the same size.
+"""
+
+import os
+import random
+import re
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+import warnings
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from itertools import chain
+from pathlib import Path
+
+import cv2
+import numpy as np
+import rasterio
+import tifffile
+from numpy.typing import NDArray
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+from common import Section, command, run
+from kills import contents
+from synthetic_flights.aligned import make_aligned
+
+from agalign.cameras.discover import discover
+from agalign.errors import AgalignError
+from agalign.flight.panels import with_panels
+from agalign.flight.sky import sky_captures
+from agalign.pixels.panel import find_panel
+from agalign.products.indices import compute, index_of_formula
+from agalign.products.sidecar_file import find_sidecars
+from agalign.relief.dense import DenseMatching, View
+from agalign.values.capture import Capture
+from agalign.values.image import Raster
+from agalign.values.mapping import PixelMapping
+
+Image = NDArray[np.generic]
+Writer = Callable[[Path, Image], object]
+MAX_FORMULA_S, HUNG_S = 1.0, 120.0
+
+
+@dataclass
+class Attack:
+    """A row of the table."""
+
+    name: str
+    tried: int = 0
+    tracebacks: int = 0
+    lost: int = 0
+    hangs: int = 0
+    worst_s: float = 0.0
+
+    def count(self, kind: str, what: object) -> None:
+        setattr(self, kind, getattr(self, kind) + 1)
+        print(f"{self.name}: {kind}: {what}", flush=True)
+
+    @contextmanager
+    def timed(self) -> Iterator[None]:
+        began = time.perf_counter()
+        yield
+        self.worst_s = max(self.worst_s, time.perf_counter() - began)
+
+    def program(self, argv: list[str], disturb: Callable[[], object] = lambda: None) -> str:
+        """Run the command line, disturbed by a function, and return standard error."""
+        pipes = {"stdout": subprocess.DEVNULL, "stderr": subprocess.PIPE, "text": True, "errors": "replace"}
+        with self.timed(), subprocess.Popen(argv, **pipes) as process:
+            try:
+                disturb()
+                errors = process.communicate(timeout=HUNG_S)[1]
+            except subprocess.TimeoutExpired:
+                process.kill()
+                errors = process.communicate()[1]
+                self.count("hangs", argv)
+        of_libraries = [line for line in errors.splitlines() if not line.startswith(("agalign: ", "{"))]
+        if process.returncode not in (0, 1, 3) or "please report" in errors or of_libraries:
+            self.count("tracebacks", of_libraries or errors)
+        return errors
+
+
+# ---- formulas
+
+BANDS = "B", "G", "R", "RE", "N"
+WORDS = r"""__import__('os') open(R) lambda: [ ] { } R.x R[0] if else not ~ and == < := # ^ ** * / // % + - @ ( ) , . ;
+' f'{R}' 1e400 9**9**9 0x1for 1_0 1j True None nan inf sqrt( log( exp( abs( B G R RE N r ndvi \ \0"""
+SCRAPS = [*re.split(r"\s", WORDS), "\0", "\ud800", "\n"]
+NESTS = [pair.split("|") for pair in ("(|)", "-|", "R/(|)", "R/(N-|)", "sqrt(|)", "N**|", "~|", "[|]", "R+|")]
+
+
+def expression(rng: random.Random, depth: int) -> str:
+    if depth == 0 or rng.random() < 0.2:
+        return rng.choice([*BANDS, f"{rng.uniform(0, 3):.2f}"])
+    one, other = (expression(rng, depth - 1) for _ in range(2))
+    return rng.choice([f"({one}{rng.choice('+-*/^')}{other})", f"{rng.choice(('sqrt', 'log', 'abs', '-'))}({one})"])
+
+
+def formula(rng: random.Random) -> str:
+    """Arithmetic, arithmetic with changed characters, deep nesting, or words of Python."""
+    text = expression(rng, rng.randint(1, 6))
+    match rng.randrange(4):
+        case 1:
+            at = rng.randrange(len(text))
+            text = text[:at] + rng.choice(SCRAPS) + text[at + rng.randint(0, 2) :]
+        case 2:
+            before, after = rng.choice(NESTS)
+            depth = rng.randint(1, 290 // len(before + after))
+            text = before * depth + rng.choice(BANDS) + after * depth
+        case 3:
+            text = "".join(rng.choices(SCRAPS, k=rng.randint(1, 40)))
+    return text
+
+
+def attack_formulas(count: int, rng: random.Random) -> Iterator[Attack]:
+    result = Attack("formulas", count)
+    signal.signal(signal.SIGALRM, signal.default_int_handler)
+    for text in (formula(rng) for _ in range(count)):
+        signal.setitimer(signal.ITIMER_REAL, MAX_FORMULA_S)
+        try:
+            with result.timed(), warnings.catch_warnings(record=True) as warned:
+                index = index_of_formula(text)
+                value = compute(index, [np.full((64, 64), 0.1 * k, np.float32) for k, _ in enumerate(index.symbols, 1)])
+                if value.shape != (64, 64) or warned:
+                    result.count("lost", repr(text))
+        except AgalignError:
+            pass
+        except KeyboardInterrupt:
+            result.count("hangs", repr(text))
+        except Exception as error:
+            result.count("tracebacks", f"{error!r}: {text!r}")
+        signal.setitimer(signal.ITIMER_REAL, 0)
+    yield result
+
+
+# ---- images
+
+
+def texture(rng: np.random.Generator, size_px: tuple[int, int]) -> Image:
+    """Values from 0 to 1."""
+    return cv2.normalize(
+        cv2.GaussianBlur(rng.random(size_px[::-1], np.float32), (0, 0), 2), None, 0, 1, cv2.NORM_MINMAX
+    )
+
+
+def tiff(dtype: str, top: float, bits: int | None = None) -> Writer:
+    def write(path: Path, image: Image) -> None:
+        planes = np.atleast_3d(image).transpose(2, 0, 1)
+        count, height, width = planes.shape
+        profile = {"width": width, "height": height, "count": count, "dtype": dtype, "driver": "GTiff", "nbits": bits}
+        with rasterio.open(path, "w", **{k: v for k, v in profile.items() if v}) as dataset:
+            dataset.write((planes * top).astype(dtype.replace("complex_int16", "complex64")))
+
+    return write
+
+
+def tagged(**options: object) -> Writer:
+    return lambda path, image: tifffile.imwrite(path, (image * 250).astype(np.uint8), **options)
+
+
+def encoded(suffix: str, dtype: type, options: tuple[int, ...] = (), keep: float = 1.0) -> Writer:
+    """A writer of a file that ends after this share of its bytes."""
+
+    def write(path: Path, image: Image) -> None:
+        data = cv2.imencode(suffix, (image * np.iinfo(dtype).max).astype(dtype), options)[1].tobytes()
+        path.with_suffix(suffix).write_bytes(data[: int(keep * len(data))])
+
+    return write
+
+
+USUAL = tiff("uint16", 60000)
+WRITERS = {f"{n} bits": tiff(f"uint{max(8, 1 << (n - 1).bit_length())}", 2**n - 1, n) for n in (1, 2, 4, 7, 12, 24, 32)}
+WRITERS |= {f"{d} to {top:g}": tiff(d, top) for d, top in (("uint64", 2.0**63), ("int8", 127), ("float64", 1e308))}
+WRITERS |= {"half float": tiff("float32", 1, 16), **{d: tiff(d, 999) for d in ("complex64", "complex_int16", "int16")}}
+WRITERS |= {f"orientation {n}": tagged(extratags=[(274, 3, 1, n, True)]) for n in (3, 6, 8, 99)}
+WRITERS["palette"] = tagged(photometric="palette", colormap=np.arange(768, dtype=np.uint16).reshape(3, 256))
+PROGRESSIVE = cv2.IMWRITE_JPEG_PROGRESSIVE, 1
+FORMATS = (".png", np.uint16, ()), (".jp2", np.uint16, ()), (".jpg", np.uint8, ()), (".jpg", np.uint8, PROGRESSIVE)
+for keep in (1.0, 0.95, 0.5, 0.02):
+    WRITERS |= {f"{keep:.0%} of {f[0]} {f[2]}": encoded(*f, keep) for f in (*FORMATS, (".tif", np.uint16, ()))}
+SIZES_PX = (1, 1), (1, 5000), (5000, 1), (2, 2), (16, 16), (33, 700), (7300, 5480)
+
+
+def write_strange(folder: Path, number: int, rng: np.random.Generator) -> None:
+    """Write a capture: bands in a strange format, one of them or all, or one of a strange size, or one file."""
+    write, image = list(WRITERS.values())[number % len(WRITERS)], texture(rng, (320, 240))
+    if number % 9 == 8:
+        USUAL(folder / f"c{number}.tif", np.dstack([image] * (30 if number % 2 else 1)))
+        return
+    for band in ("green", "red", "nir"):
+        size_px = SIZES_PX[rng.integers(len(SIZES_PX))] if band == "red" and number % 4 == 3 else (320, 240)
+        one = write if band == "nir" or number % 2 else USUAL
+        one(folder / f"c{number}_{band}.tif", np.resize(image, size_px[::-1]))
+
+
+def attack_images(count: int, rng: np.random.Generator, folder: Path) -> Iterator[Attack]:
+    result, model = Attack("images", count), []
+    for first in range(-9, count, 9):
+        flight, out = folder / f"flight{first}", folder / f"out{first}"
+        flight.mkdir()
+        for number in range(max(first, 0), min(first + 9, count)):
+            write_strange(flight, number, rng)
+        for band in ("green", "red", "nir"):
+            USUAL(flight / f"usual_{band}.tif", texture(np.random.default_rng(0), (320, 240)))
+        errors = result.program(command(flight, out, "--log-json", "-j", "1", "--qa", "--relief", "never", *model))
+        model = model or ["--model", str(next((out / "models").iterdir()))]
+        known = errors + "".join(p.read_text() for p in find_sidecars(out))
+        failed = re.findall(r'"capture": "(\w+)", "state": "error"', errors)
+        for path in flight.iterdir():
+            if path.name not in known and path.name.split("_")[0] not in failed:
+                result.count("lost", f"{path.name}: {list(WRITERS)[int(path.name[1:].split('_')[0]) % len(WRITERS)]}")
+    yield result
+
+
+# ---- rasters that change
+
+
+def attack_rasters(count: int, rng: random.Random, folder: Path) -> Iterator[Attack]:
+    """Change a third of the stacks at random times of `agalign indices`."""
+    result, captures, seconds = Attack("rasters that change"), 12, 0.0
+    aligned, out, expected = folder / "aligned", folder / "indices", {}
+    make_aligned(aligned, captures, (1600, 1200))
+    while result.tried < count:
+        shutil.rmtree(out, ignore_errors=True)
+        shutil.copytree(aligned, out)
+        stacks = rng.sample(sorted(out.rglob("IMG_????.tif")), captures // 3 if expected else 0)
+
+        def change(stacks: list[Path] = stacks, seconds: float = seconds) -> None:
+            for path in stacks:
+                time.sleep(rng.uniform(0, 2 * seconds / len(stacks)))
+                if rng.random() < 0.5:
+                    os.truncate(path, rng.randrange(path.stat().st_size))
+                else:
+                    path.unlink()
+
+        began = time.monotonic()
+        argv = [sys.executable, "-m", "agalign", "indices", str(out), "--log-json", "-j", "1"]
+        errors = result.program(argv, change)
+        seconds = seconds or time.monotonic() - began
+        written = {path.name: contents(path) for path in out.rglob("*_ndvi.tif")}
+        expected = expected or written
+        result.tried += len(stacks)
+        for name in expected:
+            if written.get(name) != expected[name] and (
+                name in written or name.removesuffix("_ndvi.tif") not in errors
+            ):
+                result.count("lost", name)
+    yield result
+
+
+# ---- exclusions
+
+
+def derived(capture: Capture, folder: Path, rng: np.random.Generator) -> Capture:
+    """Return a capture cropped, darkened and turned alike in all bands, with its tags."""
+    side, gain, turns = rng.uniform(0.3, 1.0), rng.uniform(0.03, 1.0), int(rng.integers(4))
+    at, bands = rng.uniform(0, 1 - side, 2), []
+    for number, band in enumerate(capture.bands):
+        with rasterio.open(band.path) as source:
+            pixels = source.read(band.band_index)
+        (y, x), (height, width) = ((v * pixels.shape).astype(int) for v in (at, np.array((side, side))))
+        black = 0.0 if band.radiometry is None else band.radiometry.black_level
+        dark = np.rot90(black + (pixels[y : y + height, x : x + width].clip(black) - black) * gain, turns)
+        path, (height, width) = folder / f"{number}.tif", dark.shape
+        tifffile.imwrite(path, dark.astype(pixels.dtype))
+        bands.append(replace(band, path=path, band_index=1, width_px=width, height_px=height, panel=None, overviews=()))
+    return replace(capture, folder=Path("Big Sky Farm"), bands=tuple(bands))
+
+
+def attack_exclusions(count: int, rng: np.random.Generator, folder: Path, data: Path) -> Iterator[Attack]:
+    """Derive captures from those of the data that are neither of the sky nor of a panel."""
+    result = Attack("ordinary captures", count)
+    found = [c for part in ("captures", "flights") for c in discover(data / part).captures]
+    ordinary = [c for c in with_panels(sky_captures(found)[1]) if c.panel is None]
+    for number in range(count):
+        capture = derived(ordinary[number % len(ordinary)], folder, rng)
+        with result.timed():
+            sky, others = sky_captures([capture])
+            panels = [c for c in with_panels(others, without_code=True) if c.is_of_a_panel]
+        for name, left_out in (("sky", sky), ("panel", panels)):
+            if left_out:
+                result.count("lost", f"{capture.name} as {name}")
+    print(f"derived from {len(ordinary)} of {len(found)} captures")
+    yield result
+
+
+# ---- searches
+
+
+def hostile(size_px: tuple[int, int], rng: np.random.Generator) -> dict[str, Image]:
+    """Images (height, width) that may be harder to search than a field, after two textures."""
+    width, height = size_px
+    mark, squares = np.pad(np.pad(np.ones((5, 5)), 1, constant_values=0), 1), np.pad(np.ones((100, 100)), 10)
+    mark[3:6, 3:6] = 0
+    tiles = {f"checks of {n} px": np.kron(np.eye(2), np.ones((n, n))) for n in (1, 2, 8)} | {"squares": squares}
+    tiles |= {f"marks of {9 * n} px": np.kron(mark, np.ones((n, n))) for n in (1, 2, 4, 12)}
+    y, x = np.mgrid[-1 : 1 : height * 1j, -1 : 1 : width * 1j]
+    images = {f"texture {k}": texture(rng, size_px) for k in range(2)} | {"noise": rng.random((height, width))}
+    images |= {k: np.tile(t, (height // len(t) + 1, width // len(t) + 1))[:height, :width] for k, t in tiles.items()}
+    images |= {"nested squares": np.maximum(abs(x), abs(y)) * 100 % 2 // 1, "rings": np.hypot(x, y) * 100 % 2 // 1}
+    return images | {"ramp": x + y, "black": 0 * x, "rows": np.sin(x * 300), "infinite": np.where(x > 0, np.inf, 1)}
+
+
+def relief(image: Raster) -> object:
+    moved = Raster(np.roll(image.pixels, 3, axis=1), image.valid, None)
+    views = [View(moved, PixelMapping(np.eye(3)), direction) for direction in ((1.0, 0.0), (0.0, 1.0))]
+    return DenseMatching(image, views, (-4.0, 4.0)).matched(range(2))
+
+
+def attack_searches(rng: np.random.Generator) -> Iterator[Attack]:
+    for name, function in (("search for a panel", lambda i: find_panel(i, without_code=True)), ("relief", relief)):
+        images, seconds = hostile((1600, 1200), rng), {}
+        for kind, pixels in images.items():
+            began = time.perf_counter()
+            function(Raster(np.asarray(pixels, np.float32), np.isfinite(pixels), None))
+            seconds[kind] = time.perf_counter() - began
+        result, normal_s = Attack(name, len(images), worst_s=max(seconds.values())), seconds["texture 1"]
+        for kind, s in seconds.items():
+            if s > 3 * normal_s:
+                result.count("hangs", f"{kind}: {s:.2f} s, {s / normal_s:.1f} times as long as a texture")
+        yield result
+
+
+def main(
+    formulas: int = 20000,
+    images: int = 60,
+    changes: int = 40,
+    captures: int = 500,
+    data: Path | None = None,
+    rng_seed: int = 0,
+    markdown: Path | None = None,
+) -> None:
+    rng, numpy_rng = random.Random(rng_seed), np.random.default_rng(rng_seed)
+    warnings.simplefilter("ignore")
+    np.seterr(all="ignore")
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        attacks = [attack_formulas(formulas, rng), attack_searches(numpy_rng), attack_rasters(changes, rng, folder)]
+        attacks += [attack_images(images, numpy_rng, folder)] if images else []
+        attacks += [attack_exclusions(captures, numpy_rng, folder, data)] if data else []
+        rows = [("attack", "tried", "tracebacks", "silent losses", "hangs", "worst, s")]
+        for row in chain(*attacks):
+            rows.append((row.name, *map(str, (row.tried, row.tracebacks, row.lost, row.hangs)), f"{row.worst_s:.2f}"))
+            print(rows[-1], flush=True)
+    Section("inputs", markdown).table(rows)
+
+
+if __name__ == "__main__":
+    run(main)
