@@ -212,8 +212,8 @@ class WriteSettings(SettingsModel):
     interpolation: Interpolation = "lanczos"
     """Resampling of the moving bands."""
     crop: Crop = "flight"
-    """Area to write: shared by all bands of all captures (flight) or of the capture (common), or the whole reference
-    (none)."""
+    """Area to write: shared by all bands of all captures of a camera (flight) or of the capture (common), or the whole
+    reference (none)."""
     format: RasterFormat = "gtiff"
     """Write tiled GeoTIFF or cloud-optimised GeoTIFF."""
     compression: Compression = "auto"

@@ -16,7 +16,7 @@ from agalign.flight.model import FlightModel, load_model
 from agalign.method.device import choose_device, keep_freed_memory, one_memory_error, one_thread
 from agalign.products.fill_sidecar import sidecar_of
 from agalign.products.index_rasters import outdated_rasters
-from agalign.products.layout import output_layers
+from agalign.products.layout import FlightLimits, output_layers
 from agalign.products.preview import preview_bytes
 from agalign.products.product import CapturePaths, ProductContext
 from agalign.products.registry import PRODUCTS
@@ -38,12 +38,13 @@ def process_capture(
     progress: PairProgress = quiet,
     model: FlightModel | None = None,
     max_preview_bytes: int = preview_bytes(1),
+    limits: FlightLimits = (),
 ) -> CaptureReport:
     """Align a capture, write its products and its sidecar, and return its report, without times.
 
     The other bands are aligned where one cannot be. The bands already have the chosen radiometry (`with_radiometry`).
     With the `model` of the flight, a network is learned from scratch only for bands that the model cannot align. The
-    preview has at most about `max_preview_bytes`.
+    preview has at most about `max_preview_bytes`. The crop follows from the `limits` of the flights of the camera.
     Raises UnreadableFileError if the reference cannot be read, InputError or ConfigurationError if the capture or the
     installation lacks what a product needs, and OutputError.
     """
@@ -56,10 +57,10 @@ def process_capture(
             product.check(capture)
     alignments = align_capture_bands(capture, settings, model, progress)
     progress(capture.reference.name, "writing", 0.0)
-    rig, whole = None if model is None else model.rig, OutputGrid(0, 0, *capture.reference.size_px)
-    context = ProductContext(capture, paths, settings, alignments, (), whole, rig, max_preview_bytes)
+    whole = OutputGrid(0, 0, *capture.reference.size_px)
+    context = ProductContext(capture, paths, settings, alignments, (), whole, max_preview_bytes, limits)
     if context.with_pixels:
-        layers, grid = output_layers(capture, context.with_pixels, settings.write, rig)
+        layers, grid = output_layers(capture, context.with_pixels, settings.write, limits)
         context = replace(context, layers=layers, grid=grid)
     discard_outputs(capture, out, settings.write)
     failures = _write_products(context)
@@ -149,6 +150,7 @@ class Task:
     settings: Settings
     model: Path | None
     max_preview_bytes: int = preview_bytes(1)
+    limits: FlightLimits = ()
 
     def absolute(self) -> "Task":
         """Return the task with absolute paths: workers may have another working folder."""
@@ -163,7 +165,8 @@ def do_capture(task: Task, on_pair: PairProgress = quiet) -> CaptureReport:
     try:
         model = None if task.model is None else loaded_model(task.model, task.settings.joint.device)
         with one_thread(), one_memory_error():
-            report = process_capture(task.capture, task.out, task.settings, clock, model, task.max_preview_bytes)
+            facts = task.max_preview_bytes, task.limits
+            report = process_capture(task.capture, task.out, task.settings, clock, model, *facts)
     except Exception as error:
         # A defect of agalign in one capture must not stop the others.
         report = CaptureReport(label, "error", error=failure_text(error))

@@ -26,11 +26,13 @@ from agalign.batch.workers import Run, failure_text, in_order, on_executor, own_
 from agalign.cameras.discover import FolderScan
 from agalign.capture.align import PairProgress
 from agalign.config import RunOptions, Settings, WriteSettings
-from agalign.errors import AgalignError, ConfigurationError, OutputError, SidecarError
+from agalign.errors import AgalignError, ConfigurationError, InputError, OutputError, SidecarError
 from agalign.flight.fingerprint import fingerprint
-from agalign.flight.groups import difference, flight_camera, flights_of, is_flight_of, model_names
+from agalign.flight.groups import camera_key, difference, flight_camera, flights_of, is_flight_of, model_names
 from agalign.flight.model import FlightModel, load_model, save_model
 from agalign.flight.panels import PanelReading, read_panel, reflectance_factors, with_height, with_panels
+from agalign.flight.rig import Rig
+from agalign.flight.rig_file import read_rig
 from agalign.flight.sky import SkyCapture, sky_captures
 from agalign.method.device import choose_device, limit_threads
 from agalign.pixels.radiometry import with_radiometry
@@ -38,6 +40,7 @@ from agalign.pixels.raster import without_warnings
 from agalign.products.flight_map import FlightMap
 from agalign.products.footprint import above_elevation, missing_for_footprint, with_approximate_georeference
 from agalign.products.index_rasters import check_indices
+from agalign.products.layout import FlightLimits, flight_limits
 from agalign.products.panels import write_panels, write_sky
 from agalign.products.preview import preview_bytes
 from agalign.products.product import CapturePaths
@@ -54,7 +57,7 @@ _MAX_THREADS = 4
 """Maximum number of threads that train a network or process captures; more wait for the interpreter's lock."""
 
 
-_UnfinishedFlight = tuple[Sequence[Capture], str, Sequence[Capture]]
+_Flight = tuple[Sequence[Capture], str, Sequence[Capture]]
 """Captures of a flight, name of its model, and those captures that must be processed."""
 
 
@@ -221,7 +224,7 @@ class _FlightRun:
             discard_outputs(capture, out, settings.write)
             flight_map.add(capture, report.state)
             yield report
-        unfinished: list[_UnfinishedFlight] = []
+        flights: list[_Flight] = []
         groups = flights_of(captures)
         for group, name in zip(groups, model_names(groups), strict=True):
             pending = []
@@ -232,10 +235,9 @@ class _FlightRun:
                 else:
                     flight_map.add(capture, kept.status, kept)
                     yield CaptureReport(capture.label, "kept", kept, CapturePaths.of(capture, out).sidecar)
-            if pending:
-                unfinished.append((group, name, pending))
+            flights.append((group, name, pending))
         by_label = {c.label: c for c in captures}
-        for report in self._processed(unfinished, record):
+        for report in self._processed(flights, record):
             status = "failed" if report.result is None else report.result.status
             flight_map.add(by_label[report.label], status, report.result)
             yield report
@@ -257,18 +259,23 @@ class _FlightRun:
                 report = CaptureReport(reading.capture.label, "panel", panel=part.sentence, exclusion=exclusion)
                 yield report, reading.capture
 
-    def _processed(self, flights: Sequence[_UnfinishedFlight], record: RunPart) -> Iterator[CaptureReport]:
+    def _processed(self, flights: Sequence[_Flight], record: RunPart) -> Iterator[CaptureReport]:
         """Learn the model of each flight and process its captures; yield their reports as they complete."""
         on_cpu = choose_device(self.settings.joint.device).type == "cpu"
         cores = self.options.jobs or (usable_cores() if on_cpu else 1)
         with _chosen_run(sum(len(pending) for _, _, pending in flights), cores, self.options) as run:
-            tasks: list[Task] = []
+            models: list[Path | None] = []
             learn = partial(learn_flight, apply=partial(in_order, run), threads=min(_MAX_THREADS, cores))
             for captures, name, pending in flights:
-                path = self._model(captures, self.out / "models" / name, learn, record)
-                tasks += [
-                    Task(c, self.out, self.settings, path, preview_bytes(len(self.flight.captures))) for c in pending
-                ]
+                path = self.out / "models" / name
+                finished = path if path.is_file() else None
+                models.append(self._model(captures, path, learn, record) if pending else finished)
+            limits, max_bytes = _limits_of_cameras(flights, models), preview_bytes(len(self.flight.captures))
+            tasks = [
+                Task(c, self.out, self.settings, path, max_bytes, limits[camera_key(c)])
+                for (_, _, pending), path in zip(flights, models, strict=True)
+                for c in pending
+            ]
             yield from capture_reports(run, tasks, self.listener, self.options.timeout_s)
 
     def _model(
@@ -292,6 +299,17 @@ class _FlightRun:
             return None
         save_model(model, path)
         return path
+
+
+def _limits_of_cameras(flights: Sequence[_Flight], models: Sequence[Path | None]) -> dict[str, FlightLimits]:
+    """The limits of the flights of each camera, given the file of each flight's model."""
+    by_camera: dict[str, list[tuple[Sequence[Capture], Rig | None]]] = {}
+    for (captures, _, _), path in zip(flights, models, strict=True):
+        rig = None
+        with suppress(InputError):  # of an earlier run
+            rig = None if path is None else read_rig(path)[1]
+        by_camera.setdefault(camera_key(captures[0]), []).append((captures, rig))
+    return {camera: flight_limits(of_camera) for camera, of_camera in by_camera.items()}
 
 
 def _calibrated(capture: Capture, panels: Sequence[PanelReading], settings: WriteSettings) -> Capture:

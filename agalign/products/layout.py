@@ -1,7 +1,7 @@
 """The layers of a capture that are written, and their common pixel grid."""
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -14,7 +14,7 @@ from agalign.flight.rig_prediction import extreme_mappings
 from agalign.values import geometry
 from agalign.values.alignment import Alignment
 from agalign.values.capture import Band, Capture, Radiometry
-from agalign.values.geometry import Points
+from agalign.values.geometry import Matrix, Points
 from agalign.values.image import Mask, OutputGrid, Tile
 from agalign.values.mapping import PixelMapping
 from agalign.values.pixel_units import SAME_PIXELS, FixedFilePx, PixelScale
@@ -54,23 +54,40 @@ class Layer:
         return on_frame if self.mapping is None else self.mapping(on_frame)
 
 
+FlightLimits = Sequence[tuple[Matrix, Band]]
+"""Extreme mappings (3, 3) from undistorted pixels of the reference to those of a moving band."""
+
+
+def flight_limits(flights: Iterable[tuple[Sequence[Capture], Rig | None]]) -> FlightLimits:
+    """Return the limits of flights of one camera, of which the captures may lack bands, given the rig of each."""
+    all_flights = [*flights]
+    bands = {b.name: b for captures, _ in all_flights for c in captures for b in c.moving}
+    rigs = [rig for _, rig in all_flights if rig is not None]
+    mappings = ((matrix, name) for rig in rigs for name in rig.mean for matrix in extreme_mappings(rig, name))
+    return [(matrix, bands[name]) for matrix, name in mappings if name in bands]
+
+
 def output_layers(
-    capture: Capture, alignments: Mapping[str, Alignment[FixedFilePx]], settings: WriteSettings, rig: Rig | None = None
+    capture: Capture,
+    alignments: Mapping[str, Alignment[FixedFilePx]],
+    settings: WriteSettings,
+    limits: FlightLimits = (),
 ) -> tuple[list[Layer], OutputGrid]:
     """Return a layer for each band of a capture, given the alignments of its usable moving bands, and their grid.
 
-    With the `rig` of the flight, all captures of the flight have the same grid.
+    With the `limits` of the flights of a camera, all its captures have the same grid.
     """
     reference = capture.reference
     mappings = {b.name: alignments[b.name].mapping for b in capture.moving if b.name in alignments}
-    frame = _frame(reference, mappings.values(), settings)
+    of_flight = _between_files(limits, reference) if settings.crop == "flight" else []
+    frame = _frame(reference, [mapping for mapping, _ in of_flight] or mappings.values(), settings)
     if frame.undistorted or frame.scale != SAME_PIXELS:
         mappings[reference.name] = PixelMapping(geometry.identity())  # otherwise the reference is copied
     on_frame = {name: _on_frame(mapping, frame, reference) for name, mapping in mappings.items()}
     layers = [Layer(b, on_frame.get(b.name), is_reference=b is reference) for b in capture.bands]
     # The crop is calculated without relief, which may leave pixels of single bands without a value.
     mapped = [(layer.mapping.of_the_plane, layer.band) for layer in layers if layer.mapping is not None]
-    crop = _crop(capture, mapped, frame, settings, rig)
+    crop = _crop(reference, mapped, frame, settings, of_flight)
     has_relief = any(mapping.parallax is not None for mapping in on_frame.values())
     return layers, replace(frame, **vars(crop), has_gaps=has_relief or not _covers(mapped, crop))
 
@@ -91,33 +108,30 @@ def _on_frame(mapping: PixelMapping, frame: OutputGrid, reference: Band) -> Pixe
 
 
 def _crop(
-    capture: Capture,
+    reference: Band,
     mapped: list[tuple[PixelMapping, Band]],
     frame: OutputGrid,
     settings: WriteSettings,
-    rig: Rig | None,
+    of_flight: Sequence[tuple[PixelMapping, Band]],
 ) -> Tile:
     """The rectangle of the output pixels that is written."""
     if settings.crop == "none":
         return frame.tile
-    of_flight = [] if rig is None or settings.crop == "common" else _extremes_of_flight(capture, rig)
     if not of_flight:
         return common_area(mapped, frame.width, frame.height) or frame.tile
-    limits = [(_on_frame(mapping, frame, capture.reference), band) for mapping, band in of_flight]
+    limits = [(_on_frame(mapping, frame, reference), band) for mapping, band in of_flight]
     # A reference that is resampled has a border too.
-    limits += [(mapping, band) for mapping, band in mapped if band is capture.reference]
+    limits += [(mapping, band) for mapping, band in mapped if band is reference]
     area = common_area(limits, frame.width, frame.height)
     return frame.tile if area is None else _inset(area, _FLIGHT_MARGIN_PX)
 
 
-def _extremes_of_flight(capture: Capture, rig: Rig) -> list[tuple[PixelMapping, Band]]:
-    """The mappings of the capture's bands by the rig, for the smallest and the largest distance in the flight."""
-    reference = capture.reference
+def _between_files(limits: FlightLimits, reference: Band) -> list[tuple[PixelMapping, Band]]:
+    """The limits as mappings between raw pixels of the files, and their bands."""
     return [
-        (PixelMapping(matrix, reference.lens, band.lens if reference.lens is not None else None), band)
-        for band in capture.moving
-        if band.name in rig.mean and (band.lens is None) == (reference.lens is None)
-        for matrix in extreme_mappings(rig, band.name)
+        (PixelMapping(matrix, reference.lens, band.lens), band)
+        for matrix, band in limits
+        if (band.lens is None) == (reference.lens is None)
     ]
 
 

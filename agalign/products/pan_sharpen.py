@@ -91,7 +91,7 @@ def _sources(context: ProductContext, settings: WriteSettings) -> _Sources | Non
     pan, usable = panchromatic(context.capture), context.usable
     if not pan or not {b.name for b in pan} <= {context.capture.reference.name, *usable}:
         return None
-    layers, grid = output_layers(context.capture, usable, settings, context.rig)
+    layers, grid = output_layers(context.capture, usable, settings, context.limits)
     bands = [layer for layer in layers if _is_multispectral(layer, pan)]
     is_sharpened = [_is_in_range(layer.band, pan) for layer in bands]
     if not any(is_sharpened):

@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 from agalign.config import Settings, WriteSettings
-from agalign.flight.rig import Rig
 from agalign.products.checked_raster import (
     FLOAT_OPTIONS,
     Block,
@@ -18,7 +17,7 @@ from agalign.products.checked_raster import (
     write_layers,
 )
 from agalign.products.drawing import ReducedBands, read_reduced_bands
-from agalign.products.layout import Layer
+from agalign.products.layout import FlightLimits, Layer
 from agalign.products.sidecar import PreviewPart, is_usable
 from agalign.values.alignment import Alignment
 from agalign.values.capture import Capture
@@ -101,9 +100,9 @@ class ProductContext:
     """One for each band, in their order; empty if no moving band can be written."""
     grid: OutputGrid
     """Grid of all rasters; that of the reference's file if there are no layers."""
-    rig: Rig | None
-    """Rig of the flight, if it is known."""
     max_preview_bytes: int
+    limits: FlightLimits = ()
+    """Limits of all flights of the camera, as far as their rigs are known."""
     written: list[WrittenFile] = field(default_factory=list)
     """Files of the products before this one in `PRODUCTS`."""
 

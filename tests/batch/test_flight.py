@@ -15,9 +15,12 @@ from agalign.batch import CaptureReport, RunOptions, learning_tasks, run_flight
 from agalign.batch import capture as batch_capture
 from agalign.batch import learn as batch_learn
 from agalign.batch.learn import learning_fingerprint
+from agalign.batch.run import _limits_of_cameras
 from agalign.flight.groups import camera_key, flights_of, model_names
 from agalign.flight.model import FlightModel, load_model, save_model
 from agalign.flight.rig import MIN_CAPTURES
+from agalign.flight.rig_file import read_rig
+from agalign.flight.rig_prediction import extreme_mappings
 from agalign.method import joint as method_joint
 from agalign.method.fast import Schedule, learn
 from agalign.method.state import JointState
@@ -27,7 +30,7 @@ from agalign.products.sidecar_file import find_sidecars, read_sidecar
 from agalign.synthetic.flight import make_flight
 from agalign.values.capture import Capture
 
-from ..conftest import Shared, raising, seeded
+from ..conftest import Shared, raising, save_known_model, seeded
 
 # The program itself reads files without a georeference quietly.
 pytestmark = [pytest.mark.slow, pytest.mark.filterwarnings("error:Dataset has no geotransform")]
@@ -157,6 +160,23 @@ def test_captures_of_one_camera_and_flight_are_a_group_with_a_model_name_of_its_
     assert len(flights_of([captures[0], replace(captures[1], bands=smaller)])) == 2
     without = tuple(b for b in captures[1].bands if b.name != "NIR")
     assert len(flights_of([replace(captures[1], bands=without), captures[0]])) == 1
+
+
+def test_flights_of_one_camera_share_the_limits_of_their_crop(flight: Path, tmp_path: Path) -> None:
+    """The rig of a finished flight takes part; a damaged model and a flight without a model do not."""
+    one, other = agalign.discover(flight).captures
+    flights = [([replace(c, flight_id=str(k))], "", []) for k, c in enumerate((one, other, one, other))]
+    flights.append(([replace(one, camera=replace(one.camera, serial="X9"))], "", []))
+    good, bad = tmp_path / "good.safetensors", tmp_path / "bad.safetensors"
+    save_known_model(good)
+    bad.write_text("damaged")
+    models = [good, None, bad, good, None]
+    limits = _limits_of_cameras(flights, models)
+    assert list(limits) == [camera_key(one), camera_key(flights[-1][0][0])]
+    of_first = limits[camera_key(one)]
+    assert {band.name for _, band in of_first} == {"NIR"}
+    assert len(of_first) == 2 * len(extreme_mappings(read_rig(good)[1], "NIR"))
+    assert not limits[camera_key(flights[-1][0][0])]
 
 
 def test_a_model_is_learned_again_if_its_input_changed(flight: Path) -> None:

@@ -148,7 +148,7 @@ def test_a_band_that_is_not_delivered_or_does_not_see_infra_red_sharpens_none(
     alignments = {pan.name: SimpleNamespace(status=status, prediction=prediction)}
     capture, grid = Capture("a", Path("in"), tuple(bands), 0), OutputGrid(0, 0, 64, 48)
     paths = CapturePaths.of(capture, Path("out"))
-    context = ProductContext(capture, paths, agalign.Settings(), alignments, (), grid, None, 0)
+    context = ProductContext(capture, paths, agalign.Settings(), alignments, (), grid, 0)
     assert (_sources(context, agalign.WriteSettings()) is not None) == sharpens
 
 

@@ -56,7 +56,7 @@ def example(**changes: Any) -> Sidecar:
 def context_of(capture: Capture, alignments: dict[str, Alignment]) -> ProductContext:
     """Of a capture for which nothing was written."""
     grid = OutputGrid(0, 0, *capture.reference.size_px)
-    return ProductContext(capture, CapturePaths(Path(), capture.name), Settings(), alignments, (), grid, None, 0)
+    return ProductContext(capture, CapturePaths(Path(), capture.name), Settings(), alignments, (), grid, 0)
 
 
 def test_round_trip(tmp_path: Path) -> None:

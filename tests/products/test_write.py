@@ -14,7 +14,7 @@ from agalign.errors import OutputError
 from agalign.flight.rig import CaptureFactors, Rig
 from agalign.products.aligned_files import BandFiles
 from agalign.products.checked_raster import CheckedRaster, without_libtiff_messages
-from agalign.products.layout import Layer, output_layers
+from agalign.products.layout import Layer, flight_limits, output_layers
 from agalign.products.product import CapturePaths, ProductContext
 from agalign.products.raster_file import write_raster
 from agalign.values import geometry
@@ -195,7 +195,7 @@ def test_files_of_bands_have_each_their_own_nodata(tmp_path: Path) -> None:
     capture, floats = make_capture(tmp_path), make_capture(tmp_path / "floats", "float32").bands[2]
     capture = replace(capture, bands=(*capture.bands[:2], floats))
     paths, settings = CapturePaths(tmp_path / "out", "c"), Settings(write=WriteSettings(layout="bands"))
-    context = ProductContext(capture, paths, settings, {}, layers_of(capture), FRAME, None, 0)
+    context = ProductContext(capture, paths, settings, {}, layers_of(capture), FRAME, 0)
     by_name = {file.path.name: file.nodata for file in BandFiles().write(context)}
     assert by_name["f_0.tif"] == 0
     assert np.isnan(by_name["f_2.tif"])
@@ -263,11 +263,12 @@ def rig_between(low_px: float, high_px: float) -> Rig:
 
 
 def test_all_captures_of_a_flight_have_one_geometry(tmp_path: Path) -> None:
-    capture, rig = capture_of(tmp_path), rig_between(2.0, 12.0)
+    capture = capture_of(tmp_path)
+    limits = flight_limits([([capture], rig_between(2.0, 12.0))])
 
     def grids_of(*shifts_px: float, crop: str = "flight") -> list[OutputGrid]:
         settings = WriteSettings(crop=crop)
-        return [output_layers(capture, {"nir": aligned_by(s)}, settings, rig)[1] for s in shifts_px]
+        return [output_layers(capture, {"nir": aligned_by(s)}, settings, limits)[1] for s in shifts_px]
 
     grids = grids_of(2.0, 7.0, 12.0)
     assert len(set(grids)) == 1
@@ -279,6 +280,23 @@ def test_all_captures_of_a_flight_have_one_geometry(tmp_path: Path) -> None:
     # A capture beyond those of the rig keeps the geometry, and declares nodata.
     (beyond,) = grids_of(30.0)
     assert beyond == replace(grids[0], has_gaps=True)
+
+
+def test_flights_and_captures_without_a_band_have_the_size_of_their_camera(tmp_path: Path) -> None:
+    """Two flights at other heights, one without a rig, captures without a band, and pixels of a finer band."""
+    capture = capture_of(tmp_path)
+    without = replace(capture, bands=(capture.reference,), missing_bands=("nir",))
+    flights = [
+        ([capture, without], rig_between(2.0, 12.0)),
+        ([without, capture], rig_between(6.0, 20.0)),
+        ([capture], None),
+    ]
+    for settings in (WriteSettings(), WriteSettings(resolution="finest")):
+        limits = flight_limits(flights)
+        grids = [output_layers(capture, {"nir": aligned_by(s)}, settings, limits)[1] for s in (3.0, 19.0)]
+        grids.append(output_layers(without, {}, settings, limits)[1])
+        assert len({(g.x0, g.y0, g.width, g.height, g.scale) for g in grids}) == 1
+        assert 120 - (grids[0].x0 + grids[0].width) in range(21, 25)
 
 
 # ---- what libtiff prints without any handler
