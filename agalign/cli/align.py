@@ -12,7 +12,7 @@ import typer
 from agalign.cli.command import Command, Given, load_config
 from agalign.cli.terminal import RAW_NUMBERS, Terminal, command_line, examples
 from agalign.values.choices import MAX_MOSAIC_PIXELS
-from agalign.values.cores import check_address_space, usable_cores
+from agalign.values.cores import usable_cores
 
 _command = partial(
     Command, on_interrupt="interrupted; finished captures are kept, and the same command resumes the run"
@@ -40,7 +40,6 @@ def _align(
     ] = None,
 ) -> int:
     """Align every capture below FOLDER."""
-    check_address_space()
     from agalign.config import DiscoverOptions, RunOptions, Settings
     from agalign.products.indices import index_named
     from agalign.products.stac import need_stac
@@ -109,7 +108,6 @@ def _demo(
     captures: Annotated[int, typer.Option(min=1, max=1000, help="Captures to make.")] = 3,
 ) -> int:
     """Make a synthetic flight, align it, and compare the result with the ground truth."""
-    check_address_space()
     from agalign.batch import CaptureReport, prepare_output
     from agalign.cli.run import conclude, find_captures, run
     from agalign.config import DiscoverOptions, RunOptions, Settings
@@ -163,7 +161,6 @@ def _onto(
     Grids, resolutions and coordinate reference systems may differ. For each MOVING, agalign writes a sidecar and a
     raster on the grid of REFERENCE, with one band of REFERENCE (--reference) and all bands of MOVING.
     """
-    check_address_space()
     from agalign.cameras.discover import FolderScan
     from agalign.cameras.mosaics import captures_onto, distance_km
     from agalign.cli.run import conclude, run

@@ -17,7 +17,7 @@ import typer
 from typer.core import TyperCommand
 
 from agalign.cli.terminal import Terminal, exits
-from agalign.values.cores import check_threads
+from agalign.values.cores import check_address_space, check_threads
 from agalign.values.files import read_regular
 from agalign.values.text import did_you_mean
 
@@ -141,6 +141,7 @@ class Command:
         def call(**values: Any) -> None:
             terminal = Terminal(**{name: values.pop(name, False) for name in _terminal_parameters()})
             with exits(terminal, self.on_interrupt):
+                check_address_space()
                 check_threads()
                 given: Given = defaultdict(dict)
                 for name in fields:

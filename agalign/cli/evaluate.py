@@ -9,7 +9,6 @@ import typer
 from agalign.cli.command import Command, Given
 from agalign.cli.terminal import Terminal
 from agalign.errors import ConfigurationError
-from agalign.values.cores import check_address_space
 
 Pairs = Annotated[
     Path,
@@ -43,7 +42,6 @@ def _evaluate(
     out: Annotated[Path | None, typer.Option("--out", "-o", help="CSV file with a row per pair and method.")] = None,
 ) -> None:
     """Evaluate descriptors and homographies on pairs with ground truth (Dong et al., 2018)."""
-    check_address_space()
     from agalign.evaluation.image_pairs import find_pairs
     from agalign.evaluation.methods import method_named
     from agalign.evaluation.run import Starts, as_csv, error_table, evaluate, precision_table
@@ -77,7 +75,6 @@ def _surface(
     epochs: Annotated[int, typer.Option(min=1, help="Training epochs for each offset.")] = 2,
 ) -> None:
     """Plot the training loss over misalignments of a pair (figure 2 of Dong et al., 2018)."""
-    check_address_space()
     import numpy as np
 
     from agalign.config import JointSettings
@@ -113,7 +110,6 @@ def _learn(
     steps: Annotated[int, typer.Option(min=1, help="Training steps per aligned pair.")] = 200,
 ) -> None:
     """Learn one descriptor from pairs without labels, using those that can be aligned."""
-    check_address_space()
     from agalign.config import Settings
     from agalign.evaluation.learn import learn_descriptor, read_rough_pairs
     from agalign.flight.model import save_model
