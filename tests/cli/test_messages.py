@@ -59,6 +59,7 @@ GREEN = "(did you mean 'Green'?); choose from Blue, Green, Red, NIR, Red edge"
             1,
             "none of 10 images, such as 0000SET/000/IMG_0001_1.tif, passes",
         ),
+        ("align {flight} --dry-run --georeference", 2, "no capture has a height above the ground; give --ground-elev"),
         (
             "align {flight} --dry-run --radiometry panel",
             2,

@@ -202,7 +202,7 @@ def test_blocks_that_are_not_run_here_are_run_by_scripts() -> None:
 def test_named_extras_exist() -> None:
     extras = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]["optional-dependencies"]
     text = "".join(page.read_text(encoding="utf-8") for page in PAGES)
-    named = {name for names in re.findall(r"agalign\[([\w,]+)\]", text) for name in names.split(",")}
+    named = {name for names in re.findall(r"pip install '?\.\[([\w,]+)\]", text) for name in names.split(",")}
     assert named
     assert named <= set(extras)
 
