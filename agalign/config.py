@@ -223,7 +223,7 @@ class WriteSettings(SettingsModel):
     layout: Layout = "stack"
     """Write one stack per capture, one file with tags per input file, or both."""
     resolution: Resolution = "reference"
-    """Pixel size of the output: of the reference or of the finest band."""
+    """Pixel size: of the reference or of the finest band."""
     georeference: bool = False
     """Write an approximate georeference from GPS, altitude and yaw."""
     ground_elevation_m: Annotated[
