@@ -59,7 +59,7 @@ FlightLimits = Sequence[tuple[Matrix, Band]]
 
 
 def flight_limits(flights: Iterable[tuple[Sequence[Capture], Rig | None]]) -> FlightLimits:
-    """Return the limits of flights of one camera, of which the captures may lack bands, given the rig of each."""
+    """Return the limits of flights of one camera, given the rig of each; captures may lack bands."""
     all_flights = [*flights]
     bands = {b.name: b for captures, _ in all_flights for c in captures for b in c.moving}
     rigs = [rig for _, rig in all_flights if rig is not None]
