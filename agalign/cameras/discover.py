@@ -79,7 +79,7 @@ def discover(
 
 
 def _chosen_images(folder: Path, options: DiscoverOptions) -> tuple[list[Path], list[Problem]]:
-    """(the images to read, problems of folders that cannot be listed). Raises InputError if there is no image."""
+    """(the images to read, problems of folders that cannot be listed). Raises InputError without images."""
     images, problems = image_files(folder, options.skip)
     paths = [p for p in images if is_chosen(p.relative_to(folder), options.include, options.exclude)]
     if not paths and problems:
