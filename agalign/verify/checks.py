@@ -31,34 +31,22 @@ MAX_UNEXPECTED_PX = 3.0
 MAX_ALIAS_PEAK = 0.75
 """Ratio of the heights of the next correlation peak and that of the result, above which the scene is repetitive."""
 
-_MAX_STRETCH = 4.0
-"""Maximum ratio of the largest and the smallest magnification: beyond it, a homography is degenerate."""
 _MAX_CORNER_STD_PX = 2.0
 """Maximum standard error of the least certain mapped corner: windows near the centre do not verify the corners."""
-_MIN_HELD_OUT_WINDOWS, _MIN_HELD_OUT_COVERAGE = 12, 0.8
-"""Minimum number and share of held-out windows with a measured shift, if they are the only evidence. In unrelated
-images one in a thousand is within 1 px."""
-_MIN_WINDOWS, _MIN_COVERAGE = 4, 0.6
-"""Minimum number of windows with structure, as fewer cannot cover all corners of the image, and minimum share of them
-with a measured shift, which is small for unrelated images."""
+_MIN_HELD_OUT_COVERAGE = 0.8
+"""Minimum share of held-out windows with a measured shift, if they are the only evidence. In unrelated images one in a
+thousand is within 1 px."""
+_MIN_COVERAGE = 0.6
+"""Minimum share of the windows with structure that have a measured shift; it is small for unrelated images."""
 _MAX_SHIFT_PX = 1.0
 """Maximum residual shift of an aligned window, and of the median: beyond it, a spectral index mixes neighbours."""
 _MIN_CLOSE_SHARE = 0.9
 """Minimum share of aligned windows among the measured ones: a few wrong peaks are normal."""
-_MIN_CLUSTER, _MAX_CLUSTER_SHARE, _MAX_NEIGHBOUR_SPACINGS = 5, 0.04, 1.6
+_MIN_CLUSTER, _MAX_CLUSTER_SHARE = 5, 0.04
 """Size of a cluster of adjacent misaligned windows, as a count and as a share of the measured windows, from which it is
-an issue; both must be reached. Wrong peaks are scattered, windows with parallax are adjacent. Maximum distance of
-adjacent windows in units of their spacing, which includes diagonal neighbours (1.41)."""
+an issue; both must be reached. Wrong peaks are scattered, windows with parallax are adjacent."""
 _MAX_UNEXPECTED_STD = 5.0
 """Distances from the prediction above MAX_UNEXPECTED_PX are accepted up to this multiple of its standard error."""
-_PEAK_RADIUS_PX = 3
-"""Radius of a correlation peak, px of the reduced images."""
-_MIN_SEED_COVERAGE, _MAX_SEED_MEDIAN_PX = 0.3, 8.0
-"""Minimum share of windows with a measured shift and their maximum median for a seed with status `seed_only`: rig tags
-have errors of a few px (docs/cameras.md)."""
-_MAX_UNCHANGED_PX, _MAX_UNCHANGED_STD = 0.25, 3.0
-"""Maximum displacement of a corner, in px of the file and in standard errors of the least certain corner, for aligned
-input to be returned unchanged: resampling would cost more sharpness than the correction gains."""
 
 _PARALLAX = Remedy(
     "parallax (trees, buildings, terraces), or motion between the exposures",
@@ -123,17 +111,19 @@ class Evidence(Generic[FixedPx]):
 
 
 def _mapping_issues(evidence: Evidence[FixedPx]) -> Iterator[Issue]:
+    max_stretch = 4.0  # of the largest magnification relative to the smallest; beyond it, a homography is degenerate
     scale = geometry.local_scale(evidence.joint.fixed_to_moving, *evidence.size_px)
-    if not (scale.min() > 0 and scale.max() <= _MAX_STRETCH * scale.min()):
-        yield Issue(FOLDS, float(scale.max() / scale.min()), _MAX_STRETCH)
+    if not (scale.min() > 0 and scale.max() <= max_stretch * scale.min()):
+        yield Issue(FOLDS, float(scale.max() / scale.min()), max_stretch)
 
 
 def _descriptor_issues(evidence: Evidence[FixedPx]) -> Iterator[Issue]:
     """Retrieval of held-out patches, or held-out windows of a result that is fitted to windows; corner errors."""
     joint, residual = evidence.joint, evidence.residual
+    min_held_out_windows = 12  # with a measured shift, if they are the only evidence
     is_confirmed = (
         joint.recipe == BY_WINDOWS
-        and len(residual.measured_px) >= _MIN_HELD_OUT_WINDOWS
+        and len(residual.measured_px) >= min_held_out_windows
         and residual.coverage >= _MIN_HELD_OUT_COVERAGE
     )
     minimum = max(MIN_RETRIEVAL, MIN_TIMES_CHANCE * joint.chance)
@@ -146,8 +136,9 @@ def _descriptor_issues(evidence: Evidence[FixedPx]) -> Iterator[Issue]:
 def _window_issues(evidence: Evidence[FixedPx]) -> Iterator[Issue]:
     """Residual shifts of windows, which are independent of the estimation."""
     residual = evidence.residual
-    if len(residual.centres_px) < _MIN_WINDOWS:
-        yield Issue(FEW_WINDOWS, len(residual.centres_px), _MIN_WINDOWS)
+    min_windows = 4  # with structure; fewer cannot cover all corners of the image
+    if len(residual.centres_px) < min_windows:
+        yield Issue(FEW_WINDOWS, len(residual.centres_px), min_windows)
         return
     if not residual.coverage >= _MIN_COVERAGE:
         yield Issue(COVERAGE, residual.coverage, _MIN_COVERAGE)
@@ -170,7 +161,8 @@ def _largest_cluster(centres_px: Points, all_px: Points) -> int:
     """Return the size of the largest group of adjacent centres (n, 2) on the grid `all_px` (m, 2)."""
     if len(centres_px) == 0:
         return 0
-    radius_px = _MAX_NEIGHBOUR_SPACINGS * window_spacing_px(all_px)
+    max_neighbour_spacings = 1.6  # includes diagonal neighbours (1.41)
+    radius_px = max_neighbour_spacings * window_spacing_px(all_px)
     adjacent = cKDTree(centres_px).sparse_distance_matrix(cKDTree(centres_px), radius_px)
     _, labels = connected_components(adjacent.tocsr() + identity(len(centres_px)), directed=False)
     return int(np.bincount(labels).max())
@@ -207,8 +199,9 @@ def alias_peak(fixed: Field, moving: Field) -> AliasPeak:
     """Return the highest peak except that at zero shift; `fixed` and `moving` are windowed spectra (height, width)."""
     surface = np.fft.fftshift(correlation_surfaces(fixed, moving))
     height, width = surface.shape
-    row, column, radius = height // 2, width // 2, _PEAK_RADIUS_PX
-    centre = np.s_[row - radius : row + radius + 1, column - radius : column + radius + 1]
+    row, column = height // 2, width // 2
+    radius_px = 3  # of a correlation peak
+    centre = np.s_[row - radius_px : row + radius_px + 1, column - radius_px : column + radius_px + 1]
     centre_peak = float(surface[centre].max())
     surface[centre] = -np.inf
     index = int(surface.argmax())
@@ -257,7 +250,9 @@ def status_of(issues: Sequence[Issue], residual: Residual[FixedImagePx], *, seed
 
 def seed_fits(residual: Residual[FixedImagePx]) -> bool:
     """Return True if the residual of a seed is small enough for the status `seed_only`."""
-    return residual.coverage >= _MIN_SEED_COVERAGE and residual.median_px <= _MAX_SEED_MEDIAN_PX
+    # Rig tags have errors of a few px (docs/cameras.md).
+    min_coverage, max_median_px = 0.3, 8.0
+    return residual.coverage >= min_coverage and residual.median_px <= max_median_px
 
 
 def is_unchanged(joint: JointResult[FixedImagePx], given: Matrix, size_px: tuple[int, int], scale: float = 1.0) -> bool:
@@ -267,4 +262,7 @@ def is_unchanged(joint: JointResult[FixedImagePx], given: Matrix, size_px: tuple
     """
     change = geometry.compose(geometry.invert(given), joint.fixed_to_moving)
     change_px = FixedImagePx(geometry.corner_error_px(change, geometry.identity(), *size_px))
-    return change_px <= min(FixedImagePx(_MAX_UNCHANGED_PX * scale), joint.corner_std_px * _MAX_UNCHANGED_STD)
+    # Px of the file, and standard errors of the least certain corner. Resampling would cost more sharpness than such a
+    # small correction gains.
+    max_unchanged_px, max_unchanged_std = 0.25, 3.0
+    return change_px <= min(FixedImagePx(max_unchanged_px * scale), joint.corner_std_px * max_unchanged_std)

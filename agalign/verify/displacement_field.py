@@ -26,46 +26,20 @@ from agalign.values.pixel_units import FixedImagePx
 from agalign.verify.residuals import FixedWindows, Shifts, in_standard_errors
 from agalign.verify.window_fit import NODE_STEP_PX
 
-_WINDOW_PX, _STEP_PX = 40, 20
-"""Side and spacing of the windows in which shifts are measured. On reference tie points of three cameras, smaller ones
-are as accurate, and larger ones less."""
-_VERIFICATION_PX = 48
-"""Side of the windows in which a field is verified, without overlap; larger ones are farther from those of the fit."""
-_MAX_WINDOWS = 5500
-"""The spacing of the windows grows in images above 2 megapixels, which limits the time."""
-_LATTICE_PX, _MIN_NODE_SPACING = 24, 0.75
-"""Spacing of the field's nodes, px, as leaves and branches near the camera have parallax at this scale, and relative to
-that of the windows, which do not determine more nodes."""
-_SMOOTHNESS, _DAMPING = (0.2, 1.0, 5.0, 25.0, 200.0), 0.003
-"""Weights relative to one window: of the field's second differences, selected by cross-validation, and of its length,
-which matters only far from all windows."""
-_CAUCHY_SCALES, _REWEIGHTINGS = 4.0, 4
-"""Residual at which the robust weight is one half, in residual scales: only wrong peaks have larger ones. The weights
-converge in this number of iterations."""
-_MIN_ROUNDS, _MAX_ROUNDS, _CONVERGED_PX = 2, 4, 0.2
-"""Shifts are measured again with the field of the previous round until their median is at most 0.2 px, because large
-shifts are measured in steps."""
+_WINDOW_PX = 40
+"""Side of the windows in which shifts are measured. On reference tie points of three cameras, smaller ones are as
+accurate, and larger ones less."""
+_LATTICE_PX = 24
+"""Spacing of the field's nodes, as leaves and branches near the camera have parallax at this scale."""
+_CAUCHY_SCALES = 4.0
+"""Residual at which the robust weight is one half, in residual scales: only wrong peaks have larger ones."""
 MIN_WINDOWS = 24
 """Minimum number of windows with a shift for a field or a relief; a fit without one fold may have half as many."""
-MIN_GAIN_SIGMA, _MAX_P95_GROWTH = 4.0, 1.05
+MIN_GAIN_SIGMA = 4.0
 """Minimum decrease of the loss of held-out windows by a field, or of the shifts of a band by the parallax from others,
-in standard errors: 4 to 8 for lenses and canopies, up to 3 by chance and for edges of shadows in blurred bands. Maximum
-ratio of the p95 of held-out windows with and without a field, which is noisy."""
-_LOSS_SCALE_PX = 0.1
-"""Scale of the robust loss by which fields are compared: several times the noise of a shift."""
-_FOLDS, _GAIN_FOLDS = 4, (0, 2, 8, 10)
-"""Every fourth window along both axes is a fold. Without the windows that overlap it, most windows remain. Fields are
-compared in four of the sixteen folds."""
-_SAME_WINDOW_PX = 1.0
-"""Windows of one grid at a smaller distance are identical."""
-_MIN_WEIGHT = 0.1
-"""Windows with a lower relative weight are excluded from the comparison of fields: parallax within a window lowers its
-peak."""
-_COMMON_SMOOTHNESS = (1.0, 4.0, 16.0, 64.0)
-"""Of a field that captures have in common, relative to one window of each capture."""
-_MIN_CAPTURES, _COMMON_FOLDS, _MIN_COMMON_GAIN_SIGMA = 3, 4, 2.5
-"""Minimum number of captures for a common field, folds of its cross-validation, and minimum decrease of the loss: less
-than within one capture, as captures that are left out have only their lenses in common with the others."""
+in standard errors: 4 to 8 for lenses and canopies, up to 3 by chance and for edges of shadows in blurred bands."""
+_FOLDS = 4
+"""Every fourth window along both axes is a fold. Without the windows that overlap it, most windows remain."""
 
 
 @dataclass(frozen=True)
@@ -84,18 +58,22 @@ class DisplacementEstimator:
 
     def __init__(self, valid: Mask, structure: Field) -> None:
         """Cut windows from the structure field (height, width) of the reference with the mask `valid`."""
-        step_px = max(_STEP_PX, round((valid.size / _MAX_WINDOWS) ** 0.5))
+        max_windows = 5500  # limits the time: their spacing grows in images above 2 megapixels
+        step_px = max(_WINDOW_PX // 2, round((valid.size / max_windows) ** 0.5))
+        min_node_spacings = 0.75  # of windows, which do not determine more nodes
         self.size_px = valid.shape[1], valid.shape[0]
-        self.lattice_px = max(_LATTICE_PX, round(_MIN_NODE_SPACING * step_px))
+        self.lattice_px = max(_LATTICE_PX, round(min_node_spacings * step_px))
         self.windows = FixedWindows(valid, structure, _WINDOW_PX, step_px)
-        self.verification = FixedWindows(valid, structure, _VERIFICATION_PX)
+        verification_px = 48  # side of windows without overlap; larger ones are farther from those of the fit
+        self.verification = FixedWindows(valid, structure, verification_px)
 
     def refine(self, moving: Raster, mapping: PixelMapping, verified: PixelMapping | None = None) -> DisplacementResult:
         """Fit the displacement field of a mapping, including the field that the mapping already has.
 
         Returns no field if it does not reduce the residuals of held-out windows significantly. The shifts are measured
-        again with the field of each round, as correlation is sharper and large shifts are measured in steps. The
-        residual of held-out windows is that of the mapping `verified`, by default `mapping`, with the field.
+        again with the field of each round until their median is at most 0.2 px, as correlation is sharper and large
+        shifts are measured in steps. The residual of held-out windows is that of the mapping `verified`, by default
+        `mapping`, with the field.
         """
         shifts = self._measure(moving, mapping)
         gain = self._best_gain(shifts)
@@ -103,7 +81,8 @@ class DisplacementEstimator:
         if not gain.is_significant(MIN_GAIN_SIGMA):
             return without
         field = None if mapping.field is None else mapping.field.on_lattice(self.lattice_px, self.size_px)
-        for number in range(_MAX_ROUNDS):
+        min_rounds, max_rounds, converged_px = 2, 4, 0.2
+        for number in range(max_rounds):
             if number > 0:
                 shifts = self._measure(moving, replace(mapping, field=field))
             before_px = 0.0 if field is None else field(shifts.centres_px)
@@ -111,7 +90,7 @@ class DisplacementEstimator:
             field = self._field(total, gain.smoothness)
             if not _is_one_to_one(field, self.size_px):
                 return without
-            if number + 1 >= _MIN_ROUNDS and len(shifts.weights) and np.median(shifts.distances_px()) <= _CONVERGED_PX:
+            if number + 1 >= min_rounds and len(shifts.weights) and np.median(shifts.distances_px()) <= converged_px:
                 break
         assert field is not None
         held_out = self._held_out(moving, replace(verified or mapping, field=field), total, gain.smoothness)
@@ -120,8 +99,8 @@ class DisplacementEstimator:
     def _measure(self, moving: Raster, mapping: PixelMapping) -> Shifts:
         return Shifts.of(self.windows.residuals(warped(moving, mapping, self.size_px), min_valid=1.0))
 
-    def _field(self, shifts: Shifts, smoothness: float, reweightings: int = _REWEIGHTINGS) -> DisplacementField:
-        return fitted_field(shifts, smoothness, self.lattice_px, self.size_px, reweightings)
+    def _field(self, shifts: Shifts, smoothness: float) -> DisplacementField:
+        return fitted_field(shifts, smoothness, self.lattice_px, self.size_px)
 
     def _held_out(
         self, moving: Raster, mapping: PixelMapping, total: Shifts, smoothness: float
@@ -140,11 +119,13 @@ class DisplacementEstimator:
 
     def _best_gain(self, shifts: Shifts) -> "_Gain":
         """Return the gain of the least smooth field with a significant gain, else that of the smoothest field."""
+        candidates = 0.2, 1.0, 5.0, 25.0, 200.0  # weights of the second differences relative to one window
         if len(shifts.weights) < MIN_WINDOWS:
-            return _Gain(_SMOOTHNESS[-1])
-        best = min(_SMOOTHNESS, key=lambda s: self._gain(shifts, s, _SAME_WINDOW_PX).loss)
+            return _Gain(candidates[-1])
+        same_window_px = 1.0  # windows of one grid at a smaller distance are identical
+        best = min(candidates, key=lambda s: self._gain(shifts, s, same_window_px).loss)
         # Held-out windows at a larger distance from those of the fit may require a smoother field.
-        for smoothness in (s for s in _SMOOTHNESS if s >= best):
+        for smoothness in (s for s in candidates if s >= best):
             gain = self._gain(shifts, smoothness, self.windows.side)
             if gain.is_significant(MIN_GAIN_SIGMA):
                 break
@@ -152,7 +133,8 @@ class DisplacementEstimator:
 
     def _gain(self, shifts: Shifts, smoothness: float, min_distance_px: float) -> "_Gain":
         """Return the cross-validated gain of a field, without windows nearer than `min_distance_px` in the fit."""
-        predicted_px = self._cross_predicted(shifts, shifts.centres_px, min_distance_px, smoothness, _GAIN_FOLDS)
+        folds = 0, 2, 8, 10  # four of the sixteen are enough for a comparison
+        predicted_px = self._cross_predicted(shifts, shifts.centres_px, min_distance_px, smoothness, folds)
         return _Gain.of(shifts, predicted_px, smoothness)
 
     def _cross_predicted(
@@ -174,7 +156,8 @@ class DisplacementEstimator:
             is_held_out = fold == k
             is_fitted = ~_near(shifts.centres_px, centres_px[is_held_out], min_distance_px)
             if is_fitted.sum() >= MIN_WINDOWS // 2:
-                field = self._field(weighted.subset(is_fitted), smoothness, reweightings=1)
+                fitted = weighted.subset(is_fitted)
+                field = fitted_field(fitted, smoothness, self.lattice_px, self.size_px, reweightings=1)
                 result[is_held_out] = field(centres_px[is_held_out])
         return result
 
@@ -193,7 +176,8 @@ class _Gain(NamedTuple):
     @classmethod
     def of(cls, shifts: Shifts, predicted_px: Points, smoothness: float) -> "_Gain":
         """Return the gain from predictions (n, 2) of the shifts, NaN for windows that were not held out."""
-        compared = shifts.weights >= _MIN_WEIGHT
+        min_weight = 0.1  # relative; parallax within a window lowers its peak
+        compared = shifts.weights >= min_weight
         compared &= np.isfinite(predicted_px[:, 0])
         if not compared.any():
             return cls(smoothness)
@@ -206,7 +190,8 @@ class _Gain(NamedTuple):
 
     def is_significant(self, min_sigma: float) -> bool:
         """Return True if a field reduces the shifts significantly without a larger p95."""
-        return self.sigma >= min_sigma and self.after_p95_px <= _MAX_P95_GROWTH * self.before_p95_px
+        max_p95_growth = 1.05  # the p95 of held-out windows is noisy
+        return self.sigma >= min_sigma and self.after_p95_px <= max_p95_growth * self.before_p95_px
 
 
 def robust_loss(residual: Residual[FixedImagePx]) -> float:
@@ -217,7 +202,8 @@ def robust_loss(residual: Residual[FixedImagePx]) -> float:
 
 def _losses(lengths_px: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return log(1 + (length / 0.1 px)^2), which is robust to wrong peaks and depth edges."""
-    return np.asarray(np.log1p((lengths_px / _LOSS_SCALE_PX) ** 2))
+    scale_px = 0.1  # several times the noise of a shift
+    return np.asarray(np.log1p((lengths_px / scale_px) ** 2))
 
 
 def _folds(centres_px: Points) -> NDArray[np.int64]:
@@ -243,9 +229,10 @@ def common_field(residuals: Sequence[Residual[FixedImagePx]], size_px: tuple[int
     None if it does not reduce the residuals of captures that are left out of the fit.
     """
     captures = [s for s in map(Shifts.of, residuals) if len(s.weights)]
-    if len(captures) < _MIN_CAPTURES:
+    min_captures, max_folds = 3, 4
+    if len(captures) < min_captures:
         return None
-    count = min(len(captures), _COMMON_FOLDS)
+    count = min(len(captures), max_folds)
     folds = [captures[k::count] for k in range(count)]
     every = [c for fold in folds for c in fold]
 
@@ -259,22 +246,25 @@ def common_field(residuals: Sequence[Residual[FixedImagePx]], size_px: tuple[int
             predicted_px += [field(c.centres_px) for c in fold]
         return _Gain.of(Shifts.joined(every), np.concatenate(predicted_px), smoothness)
 
-    best = min(map(gain, _COMMON_SMOOTHNESS), key=lambda g: g.loss)
-    if not best.is_significant(_MIN_COMMON_GAIN_SIGMA):
+    candidates = 1.0, 4.0, 16.0, 64.0  # relative to one window of each capture
+    best = min(map(gain, candidates), key=lambda g: g.loss)
+    # Less than within one capture, as captures that are left out have only their lenses in common with the others.
+    min_gain_sigma = 2.5
+    if not best.is_significant(min_gain_sigma):
         return None
     field = fitted(every, best.smoothness)
     return field if _is_one_to_one(field, size_px) else None
 
 
 def fitted_field(
-    shifts: Shifts, smoothness: float, lattice_px: int, size_px: tuple[int, int], reweightings: int = _REWEIGHTINGS
+    shifts: Shifts, smoothness: float, lattice_px: int, size_px: tuple[int, int], reweightings: int = 4
 ) -> DisplacementField:
     """Fit a smooth field d to shifts s at centres x on a grid of nodes:
 
         min sum_i t_i w_i |d(x_i) - s_i|^2 + smoothness |D2 d|^2 + damping |d|^2
 
     t are the weights of the shifts, D2 second differences, and w Cauchy weights, which reduce the influence of wrong
-    peaks. The small damping makes the problem well-posed far from all windows.
+    peaks and converge in four iterations. The small damping makes the problem well-posed far from all windows.
 
     The normal equations couple nodes at most two rows apart. Their banded matrix is filled directly, because the
     construction of sparse matrices takes longer than the solution.
@@ -284,7 +274,8 @@ def fitted_field(
     order = np.argsort(size_px, kind="stable")
     nodes, bilinear = _interpolation(shifts.centres_px[:, order] / lattice_px, columns, rows)
     penalty = smoothness * _second_difference_form(columns, rows)
-    penalty[0] += _DAMPING
+    damping = 0.003  # relative to one window
+    penalty[0] += damping
     first, second = np.triu_indices(len(nodes))
     elements = (nodes[second] - nodes[first]) * (rows * columns) + nodes[first]
     products = bilinear[first] * bilinear[second]

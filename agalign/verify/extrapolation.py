@@ -23,16 +23,8 @@ EXTRAPOLATED = IssueKind(
     ),
 )
 """Not in `checks.CHECKS`: the result is kept as a prediction with the error of the extrapolation."""
-_INNER_SHARE = 1 / 8
-"""Windows within this share of the side from the image's axes are not counted for a quarter, as most of it would still
-be extrapolated."""
-_MIN_WINDOWS = 2
-"""Minimum number of measured windows in a quarter; a single one may be a wrong peak."""
-_MIN_SHARE_IN_FRAME, _LATTICE = 0.5, (24, 18)
-"""Quarters are only checked if the moving image covers at least this share of their points, of columns and rows."""
-_NEAREST_WINDOWS, _FAR_SPACINGS = 8, 3.0
-"""Number of windows from which the error at a point is estimated, weighted by their distance, and range of distances
-beyond one spacing of windows over which p95 replaces their residuals."""
+_LATTICE = 24, 18
+"""Columns and rows of the points of an image at which its coverage and the lens distortion are evaluated."""
 
 
 def points_in_frame(mapping: PixelMapping, size_px: tuple[int, int], moving_size_px: tuple[int, int]) -> Points:
@@ -46,7 +38,7 @@ def points_in_frame(mapping: PixelMapping, size_px: tuple[int, int], moving_size
 
 
 def unobserved_quarters(centres_px: Points, size_px: tuple[int, int], in_frame_px: Points | None = None) -> list[str]:
-    """Return the quarters of an image (width, height) with fewer than _MIN_WINDOWS of the centres (n, 2).
+    """Return the quarters of an image (width, height) with fewer than two of the centres (n, 2).
 
     `in_frame_px` are the points of the image that the moving image covers, all of them by default.
     """
@@ -58,13 +50,17 @@ def unobserved_quarters(centres_px: Points, size_px: tuple[int, int], in_frame_p
     def count(points_px: Points, *signs: int) -> int:
         size = np.array(size_px, dtype=np.float64)
         from_centre = (points_px - (size - 1) / 2) / size * signs
-        return int((from_centre > _INNER_SHARE).all(axis=1).sum())
+        # With windows nearer to the image's axes only, most of a quarter would still be extrapolated.
+        min_share_of_side = 1 / 8
+        return int((from_centre > min_share_of_side).all(axis=1).sum())
 
+    min_share_in_frame = 0.5  # of a quarter's points; others are not checked
+    min_windows = 2  # a single one may be a wrong peak
     return [
         name
         for name, *signs in quarters
-        if count(covered, *signs) >= _MIN_SHARE_IN_FRAME * count(lattice, *signs)
-        and count(centres_px, *signs) < _MIN_WINDOWS
+        if count(covered, *signs) >= min_share_in_frame * count(lattice, *signs)
+        and count(centres_px, *signs) < min_windows
     ]
 
 
@@ -127,10 +123,11 @@ def _windows_px2(residual: Residual[FixedFilePx], points_px: Points) -> NDArray[
         residual.measured_px,
         (residual.shifts_px[np.isfinite(residual.shifts_px[:, 0])] ** 2).sum(axis=1),
     )
-    count = min(_NEAREST_WINDOWS, len(centres))
+    count = min(8, len(centres))  # nearest windows, weighted by their distance
     distance, index = (values.reshape(-1, count) for values in cKDTree(centres).query(points_px, k=count))
     spacing_px = max(window_spacing_px(residual.centres_px), 1.0)
     weight = np.exp(-0.5 * (distance / spacing_px) ** 2) + 1e-12
     local_px2 = (weight * squares[index]).sum(axis=1) / weight.sum(axis=1)
-    far = np.clip((distance[:, 0] / spacing_px - 1) / _FAR_SPACINGS, 0, 1)
+    transition_spacings = 3.0  # beyond the first spacing, over which p95 replaces the residuals of the windows
+    far = np.clip((distance[:, 0] / spacing_px - 1) / transition_spacings, 0, 1)
     return np.asarray((1 - far) * local_px2 + far * max(residual.p95_px**2, float(squares.mean())))

@@ -1,7 +1,7 @@
 """Similarity metrics of two bands on one grid: Mattes mutual information, NMI, NCC, gradient correlation, SSIM.
 
 All are deterministic. Gradients and local moments are computed at full resolution. Sums are over the common valid
-pixels; in large images over those on a regular grid of at least _ENOUGH_PIXELS.
+pixels; in large images over those on a regular grid of at least 250 000 pixels.
 """
 
 from dataclasses import dataclass, replace
@@ -15,14 +15,10 @@ from scipy.special import entr
 from agalign.pixels.structure import gradient_magnitude
 from agalign.values.image import FloatImage, Mask, Raster
 
-_BINS, _RANGE_MARGIN_SHARE = 32, 0.01
-"""Bins of each axis of the joint histogram, and share by which ranges are widened on both sides, as in elastix."""
+_BINS = 32
+"""Bins of each axis of the joint histogram, as in elastix."""
 _SUBBINS = 64
 """Moving values are counted in subdivisions of a bin before the spline is applied; the error is at most 1/128 bin."""
-_MIN_PIXELS, _ENOUGH_PIXELS = 256, 250_000
-"""Minimum number of common pixels for a metric, and of pixels that are sampled from a large image."""
-_MIN_STD = 1e-9
-"""Smaller standard deviations are rounding errors of constant images."""
 _SSIM_WINDOW_PX = 11
 """Side of the Gaussian window (Wang et al. 2004)."""
 
@@ -32,7 +28,8 @@ class FixedSimilarity:
 
     def __init__(self, fixed: Raster) -> None:
         self.fixed = fixed
-        step = max(1, int((fixed.pixels.size / _ENOUGH_PIXELS) ** 0.5))
+        enough_pixels = 250_000
+        step = max(1, int((fixed.pixels.size / enough_pixels) ** 0.5))
         self.grid = np.s_[step // 2 :: step, step // 2 :: step]
         self.gradient = _Gradient.of(fixed.pixels, self.grid)
         self.sampled = fixed.pixels[self.grid].ravel()
@@ -50,7 +47,8 @@ class FixedSimilarity:
         overlap = float(np.count_nonzero(both) / both.size)
         # Indices are faster than boolean masks.
         valid = np.flatnonzero(both[self.grid])
-        if len(valid) < _MIN_PIXELS:
+        min_pixels = 256
+        if len(valid) < min_pixels:
             return {"overlap": overlap}
         fixed_values, moving_values = self.sampled[valid], moving.pixels[self.grid].ravel()[valid]
         joint = joint_histogram(self.bins[valid], moving_values, _range(replace(moving, valid=both)))
@@ -112,7 +110,7 @@ def _range(image: Raster) -> tuple[float, float]:
 def _bin_position(values: NDArray[np.float32], limits: tuple[float, float], padding: int) -> NDArray[np.float32]:
     """Return the positions of values in units of bins, with empty bins (`padding`) at both ends."""
     low, high = limits
-    margin = _RANGE_MARGIN_SHARE * (high - low)
+    margin = 0.01 * (high - low)  # as in elastix
     low, high = low - margin, high + margin
     bin_size = max((high - low) / (_BINS - 2 * padding - 1), 1e-12)
     return np.asarray(values * np.float32(1 / bin_size) - np.float32(low / bin_size - padding))
@@ -193,7 +191,8 @@ def _ssim(fixed: _Gradient, moving: _Gradient, valid: NDArray[np.intp], complete
 def _standardisation(values: NDArray[np.float32]) -> tuple[np.float32, np.float32]:
     """Return the mean and 1 / standard deviation, 0 for constant values."""
     mean, std = values.mean(dtype=np.float64), values.std(dtype=np.float64)
-    return np.float32(mean), np.float32(1 / std if std > _MIN_STD else 0.0)
+    min_std = 1e-9  # smaller ones are rounding errors of constant images
+    return np.float32(mean), np.float32(1 / std if std > min_std else 0.0)
 
 
 def _blur(image: FloatImage) -> FloatImage:

@@ -30,14 +30,6 @@ _WINDOW_PX = 112
 """Side of the windows: large enough for a clear peak over crops, small enough to localise misalignment."""
 MIN_WINDOW_PX = 32
 """Side of windows between saturated areas, and minimum in small images; smaller windows have no reliable peak."""
-_MIN_STRENGTH = 0.05
-"""Minimum mean amplitude of the structure field, which is at most 1; weaker windows contain only noise."""
-_MIN_PEAK_SIGMA = 7.0
-"""Minimum correlation peak of a measured shift, in standard deviations of its surface; lower peaks may be chance."""
-_FIELD_PX = 128
-"""Side of the fields of a chessboard: twice that of a window."""
-_MIN_VALID_SHARE = 0.9
-"""Minimum share of a window's pixels that are valid in both images."""
 
 
 class FixedWindows:
@@ -74,13 +66,14 @@ class FixedWindows:
         Windows of different colours share no pixels, so those of one colour can verify a fit to the other.
         """
         height, width = valid.shape
-        corners = _grid(range(0, width, _FIELD_PX), range(0, height, _FIELD_PX))
-        corners = corners[corners.sum(axis=1) // _FIELD_PX % 2 == int(white)]
-        starts = range(0, _FIELD_PX - side_px + 1, (_FIELD_PX - side_px) // 2)
+        field_px = 128  # twice the side of a window
+        corners = _grid(range(0, width, field_px), range(0, height, field_px))
+        corners = corners[corners.sum(axis=1) // field_px % 2 == int(white)]
+        starts = range(0, field_px - side_px + 1, (field_px - side_px) // 2)
         origins = (corners[:, None] + _grid(starts, starts)).reshape(-1, 2)
         return cls(valid, structure, side_px, origins=origins)
 
-    def residuals(self, moving: Raster, min_valid: float = _MIN_VALID_SHARE) -> Residual[FixedImagePx]:
+    def residuals(self, moving: Raster, min_valid: float = 0.9) -> Residual[FixedImagePx]:
         """Measure the shift of each window in a moving band on the reference grid, px; NaN without a clear peak.
 
         Windows with a smaller share of valid pixels than `min_valid` are omitted: the outline of an invalid area biases
@@ -107,7 +100,8 @@ class FixedWindows:
         The mean orientation of a row crop is the same everywhere and contains no information on the position.
         """
         windows = self._cut(field, origins)
-        is_strong = np.abs(windows[:, ::2, ::2]).mean(axis=(1, 2)) >= _MIN_STRENGTH
+        min_amplitude = 0.05  # of the structure field, at most 1; weaker windows contain only noise
+        is_strong = np.abs(windows[:, ::2, ::2]).mean(axis=(1, 2)) >= min_amplitude
         if not is_strong.all():
             windows = windows[is_strong]
         windows -= windows.mean(axis=(1, 2), keepdims=True)
@@ -204,6 +198,7 @@ def _peaks(cross: Field) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     # Shifts are circular: beyond half a window they are negative.
     coarse = np.stack([(column + width // 2) % width - width // 2, (row + height // 2) % height - height // 2], axis=1)
     shifts_px = np.full((count, 2), np.nan)
-    is_clear = sigma >= _MIN_PEAK_SIGMA
+    min_peak_sigma = 7.0  # lower peaks may be chance
+    is_clear = sigma >= min_peak_sigma
     shifts_px[is_clear] = peak_positions(cross[is_clear], coarse[is_clear].astype(np.float64))
     return shifts_px, sigma.astype(np.float64)

@@ -33,25 +33,9 @@ cameras (RedEdge-3, RedEdge-M, RedEdge-MX dual, Sequoia; calibrations in the tag
 at 800 px from the centre."""
 CALIBRATED = 0.4
 """Factor on LENS_STD if both lenses are calibrated; measured on reference tie points of 45 RedEdge pairs."""
-_MIN_WINDOWS = 12
-"""Minimum number of windows for parameters without a prior: 1.5 times the eight of a homography."""
-_CORNER_STD_PX = 5.0
-"""Standard deviation of the prior of a corner, with lens shapes only: the error of an extrapolated affine mapping."""
-_MIN_INFORMATION_SHARE = 1e-12
-"""Share of the total information that is added to directions that no window determines, as with windows on a line."""
 CAUCHY_SCALES, REWEIGHTINGS = 2.0, 6
 """Residual at which the robust weight is one half, in residual scales, and iterations after which it has converged;
 also of fits of the relief, of the rig and of the MAP estimate."""
-_AXIS_SHARE = 1 / 3
-"""Variance along one axis over the square of the scale of lengths: normally distributed vectors have 1 / 3.05."""
-_EXTRAPOLATION_FACTOR = 12.0
-"""Factor on the variance of windows in a fit with lens shapes: it extrapolates errors by relief, which neighbouring
-windows have in common."""
-_COMMON_STD_PX = 0.01
-"""Standard error along x and y common to all windows, which their residuals do not contain."""
-_ROUNDS, _CONVERGED_PX = 4, 0.02
-"""Rounds of warping and fitting, until no corner moves by more than the noise of the windows: peaks are sharper when
-windows overlap better, and a correction is accurate to first order."""
 NODE_STEP_PX = 48
 """Spacing of the nodes of a displacement field of lenses, as their distortion varies over hundreds of pixels."""
 
@@ -131,23 +115,30 @@ def fit_windows(
     None if fewer than 12 windows are measured. A window's weight is that of its correlation peak times a Cauchy weight.
     """
     centres_px, raw_shifts_px, by_peak = Shifts.of(residual)
-    if lens_std_px is None and len(centres_px) < _MIN_WINDOWS:
+    min_windows = 12  # without a prior: 1.5 times the eight parameters of a homography
+    if lens_std_px is None and len(centres_px) < min_windows:
         return None
     points_px, shifted_px = (mapping.undistorted(p) for p in (centres_px, centres_px + raw_shifts_px))
     shifts = Shifts(points_px, shifted_px - points_px, by_peak)
     std_px, factor = np.full(8, np.inf), 1.0
     if lens_std_px is not None:
-        std_px, factor = np.r_[np.full(8, _CORNER_STD_PX), lens_std_px], _EXTRAPOLATION_FACTOR
+        corner_std_px = 5.0  # error of an extrapolated affine mapping
+        std_px = np.r_[np.full(8, corner_std_px), lens_std_px]
+        # Lens shapes extrapolate errors by relief, which neighbouring windows have in common.
+        factor = 12.0
     design = jacobian(points_px, size_px, len(std_px))
     weighted, scale_px = shifts, MIN_SHIFT_SCALE_PX
+    axis_share = 1 / 3  # variance along one axis over the squared scale of lengths; normally distributed: 1 / 3.05
+    min_information_share = 1e-12  # for directions that no window determines, as with windows on a line
     for _ in range(REWEIGHTINGS):
-        information = weighted.weights / (factor * _AXIS_SHARE * scale_px**2 + MIN_SHIFT_SCALE_PX**2)
+        information = weighted.weights / (factor * axis_share * scale_px**2 + MIN_SHIFT_SCALE_PX**2)
         normal = np.einsum("n,nki,nkj->ij", information, design, design) + np.diag(std_px**-2.0)
-        covariance = np.linalg.inv(normal + _MIN_INFORMATION_SHARE * np.trace(normal) * np.eye(len(normal)))
+        covariance = np.linalg.inv(normal + min_information_share * np.trace(normal) * np.eye(len(normal)))
         mean = covariance @ np.einsum("n,nki,nk->i", information, design, shifts.shifts_px)
         scale_px = shift_scale_px(shifts.distances_px(design @ mean))
         weighted = shifts.reweighted(design @ mean, CAUCHY_SCALES)
-    covariance += _COMMON_STD_PX**2 * np.eye(len(mean))
+    common_std_px = 0.01  # common to all windows; their residuals do not contain it
+    covariance += common_std_px**2 * np.eye(len(mean))
     return WindowFit(mean, covariance, shifts.distances_px(design @ mean), size_px)
 
 
@@ -157,10 +148,11 @@ def fit_in_rounds(
     size_px: tuple[int, int],
     is_accepted: Callable[[WindowFit], bool] = lambda _: True,
     lens_std_px: Array | None = None,
-    rounds: int = _ROUNDS,
+    rounds: int = 4,
 ) -> tuple[PixelMapping, WindowFit] | None:
     """Correct a mapping repeatedly by the residual that `measure` returns for it; return it and the last correction.
 
+    Peaks are sharper when windows overlap better, and a correction is accurate to first order.
     Other arguments are those of `fit_windows`. None if a correction does not exist or is not accepted. Lens shapes are
     always fitted to a mapping with the given displacement field, and replace it in the result.
     """
@@ -173,7 +165,8 @@ def fit_in_rounds(
             result = fit.applied_to(mapping), fit
         except GeometryError:
             return None
-        if fit.max_px <= _CONVERGED_PX:
+        converged_px = 0.02  # noise of the windows
+        if fit.max_px <= converged_px:
             break
         mapping = replace(result[0], field=mapping.field)
     return result
