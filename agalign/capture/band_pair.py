@@ -42,24 +42,12 @@ Candidates = Mapping[SeedKind, Matrix]
 """fixed_to_moving homographies between undistorted pixels, in order of preference."""
 _MAX_ERROR_STD = 3.0
 """Maximum error of a candidate in standard errors."""
-_TAGS_STD_PX = 5.0
-"""Standard error of rig tags: errors on five cameras have a median of 2 px and a maximum of 12 px (docs/cameras.md)."""
-_MIN_MODEL_STD_PX = 1.0
-"""Minimum standard error of a flight's mean mapping: captures differ by this in height and tilt."""
-_MAX_REDUCED_SCALE = 0.7
-"""Scale of the images relative to their files below which the result is refined on the files."""
 _LONGEST_SIDE_PX = 2700
 """Larger images are reduced to this for estimation, which limits memory and time; `full_resolution` refines the result.
 The bands of most cameras have fewer pixels (2592 on the Mavic 3M)."""
-_MAX_SHARP_PX = 2.5
-"""Maximum length at which a sharp image varies (`structure.blur_px`)."""
 _COARSE_RATIO = 0.4
 """A moving band is coarse if its magnification relative to the reference is smaller than this; the reference is reduced
 for it."""
-_COARSE_OVERSAMPLING = 2.0
-"""Pixels of the reduced reference per pixel of a coarse band, along a line; more add no common detail."""
-_COARSE_MIN_PX = 128
-"""Minimum of the longer side of a reduced reference, required by the windows."""
 
 
 @dataclass(frozen=True)
@@ -106,7 +94,8 @@ class BandPair:
     @property
     def is_reduced(self) -> bool:
         """True if a refinement on the files is worthwhile, because they have many more pixels than the images."""
-        return min(*self.scales.moving, *(() if self.is_coarse else self.scales.fixed)) < _MAX_REDUCED_SCALE
+        max_scale = 0.7  # of the images relative to their files
+        return min(*self.scales.moving, *(() if self.is_coarse else self.scales.fixed)) < max_scale
 
     @property
     def file_pixel_size_px(self) -> float:
@@ -136,7 +125,8 @@ class BandPair:
     @cached_property
     def is_blurred(self) -> bool:
         """True if one of the images is blurred: shifts of small windows are then noisy."""
-        return max(self.reference.blur_px, blur_px(channel_mean(self.moving_image))) > _MAX_SHARP_PX
+        max_sharp_px = 2.5
+        return max(self.reference.blur_px, blur_px(channel_mean(self.moving_image))) > max_sharp_px
 
     @property
     def windows(self) -> FixedWindows:
@@ -292,19 +282,23 @@ def longest_for(reference: Band, fixed_to_moving: Matrix) -> int:
     ratio = abs(float(geometry.local_scale(fixed_to_moving, *reference.size_px)[-1]))
     if not 0 < ratio < _COARSE_RATIO:
         return _LONGEST_SIDE_PX
-    side = round(_COARSE_OVERSAMPLING * ratio * max(reference.size_px))
-    return min(_LONGEST_SIDE_PX, max(side, _COARSE_MIN_PX))
+    oversampling = 2.0  # along a line; more pixels of the reference add no common detail
+    min_side_px = 128  # required by the windows
+    side_px = round(oversampling * ratio * max(reference.size_px))
+    return min(_LONGEST_SIDE_PX, max(side_px, min_side_px))
 
 
 def _candidate_std_px(band: str, model: FlightModel | None, scale: PixelScale) -> dict[SeedKind, FixedImagePx]:
     """Return the standard errors of candidates from tags and of the flight's mean; `scale` is of the fixed image."""
-    result: dict[SeedKind, FixedImagePx] = dict.fromkeys(("rig", "centre"), FixedImagePx(_TAGS_STD_PX * scale.x))
+    tags_std_px = 5.0  # errors on five cameras have a median of 2 px and a maximum of 12 px (docs/cameras.md)
+    result: dict[SeedKind, FixedImagePx] = dict.fromkeys(("rig", "centre"), FixedImagePx(tags_std_px * scale.x))
     if model is not None and model.rig is not None and band in model.rig.mean:
         mean, rig = model.rig.mean[band], model.rig
         # The errors of a rig are in px of the band's own file.
         ratio = abs(float(geometry.local_scale(mean, *rig.size_px)[-1]))
         error_px = FixedFilePx(unobserved_error_px(rig, band, by_neighbours=False) / ratio)
-        result["model"] = FixedImagePx(max(error_px, _MIN_MODEL_STD_PX) * scale.x)
+        min_std_px = 1.0  # of the mean: captures differ by this in height and tilt
+        result["model"] = FixedImagePx(max(error_px, min_std_px) * scale.x)
     return result
 
 

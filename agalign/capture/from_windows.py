@@ -26,13 +26,6 @@ from agalign.verify.window_fit import WindowFit, fit_in_rounds, lens_std_px
 
 _MAX_STEP_PX = 16.0
 """Maximum displacement of a corner; larger ones contradict the seed."""
-_MIN_COARSE_WINDOWS = 16
-"""Minimum number of measured windows of a coarse band, which overlap by half: twice the parameters of a homography."""
-_CLOSE_PX = 3.0
-"""Maximum residual of a consistent window, px of the reduced reference: 1.5 px of the band. By chance, one in a hundred
-windows of at least 56 px has a smaller one."""
-_MIN_CLOSE_SHARE = 0.85
-"""Minimum share of consistent windows among the measured ones."""
 
 
 def from_windows(pair: BandPair, alignment: Alignment[FixedImagePx]) -> Alignment[FixedImagePx]:
@@ -83,8 +76,12 @@ def _half(warped_pair: WarpedPair, *, is_black: bool) -> Residual[FixedImagePx]:
 
 
 def _is_consistent(fit: WindowFit) -> bool:
+    """Return True if the windows of a coarse band, which overlap by half, agree with their fit."""
+    min_windows = 16  # twice the parameters of a homography
+    # Px of the reduced reference, 1.5 px of the band. By chance, one in a hundred windows of at least 56 px is closer.
+    max_close_px, min_close_share = 3.0, 0.85
     count = len(fit.residuals_px)
-    return count >= _MIN_COARSE_WINDOWS and bool((fit.residuals_px <= _CLOSE_PX).sum() >= _MIN_CLOSE_SHARE * count)
+    return count >= min_windows and bool((fit.residuals_px <= max_close_px).sum() >= min_close_share * count)
 
 
 def without_extrapolated(

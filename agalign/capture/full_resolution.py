@@ -30,11 +30,6 @@ from agalign.verify.window_fit import fit_in_rounds
 _TILE_PX = 640
 """Side of a tile with 36 windows; an error of a few pixels of the reduced images does not move their content out of
 it."""
-_MIN_CELLS, _MAX_CELLS = (4, 3), (8, 6)
-"""Minimum and maximum (columns, rows) of cells, which contain one tile each: half of them determine eight parameters,
-and all of them fit into memory."""
-_MAX_STEP_PX = 40.0
-"""Maximum displacement of a corner; larger ones contradict the alignment of the reduced images."""
 
 _Tiles = Sequence[tuple[Tile, FixedWindows]]
 """Tiles with the windows of the reference."""
@@ -74,11 +69,12 @@ def _refined(
 
     None if the median shift of that half does not decrease or a check finds an issue. Raises UnreadableFileError.
     """
+    max_step_px = 40.0  # a larger displacement of a corner contradicts the alignment of the reduced images
     fitted = fit_in_rounds(
         alignment.mapping,
         lambda mapping: _residual(moving, mapping, for_fit),
         size_px,
-        lambda fit: fit.max_px <= _MAX_STEP_PX,
+        lambda fit: fit.max_px <= max_step_px,
     )
     if fitted is None or alignment.joint is None:
         return None
@@ -102,7 +98,9 @@ def _tiles(reference: Band, alignment: Alignment[FixedFilePx]) -> tuple[list[Til
     residual, size_px = alignment.residual, reference.size_px
     if residual is None:
         return [], []
-    counts = [min(max(n // _TILE_PX, low), high) for n, low, high in zip(size_px, _MIN_CELLS, _MAX_CELLS, strict=True)]
+    # (columns, rows) of cells with one tile each: half of them determine eight parameters, all of them fit into memory.
+    min_cells, max_cells = (4, 3), (8, 6)
+    counts = [min(max(n // _TILE_PX, low), high) for n, low, high in zip(size_px, min_cells, max_cells, strict=True)]
     best: dict[tuple[int, int], Tile] = {}
     for index in np.argsort(residual.peaks_sigma, kind="stable"):
         if math.isfinite(residual.shifts_px[index, 0]):

@@ -29,11 +29,6 @@ from agalign.verify.window_fit import REWEIGHTINGS, fit_windows
 
 Array = NDArray[np.float64]
 
-_MAX_CORRECTION_PX = 1.0
-"""Maximum displacement of a corner by windows; larger ones contradict the mapping and are ignored."""
-_DEGREES_OF_FREEDOM = 4.0
-"""Of the t distribution of a band's distance from the rig; heavy tails, as a lens may have moved."""
-
 
 @dataclass(frozen=True)
 class Expectation:
@@ -78,6 +73,7 @@ def _solve(
     """Return delta (8,) and its covariance (8, 8) of each band."""
     factors = 8 * len(likelihoods) + np.arange(len(FACTOR_STD_PX))
     weights = np.ones(len(likelihoods))
+    degrees_of_freedom = 4.0  # of the t distribution: heavy tails, as a lens may have moved
     for _ in range(REWEIGHTINGS):
         normal = np.zeros((factors[-1] + 1, factors[-1] + 1))
         right_side = np.zeros(len(normal))
@@ -98,7 +94,7 @@ def _solve(
             if prior is not None:
                 residual = solution[8 * b : 8 * b + 8] - prior.corners - prior.by_factor @ solution[factors]
                 mahalanobis2 = float(residual @ np.linalg.solve(prior.covariance, residual))
-                weights[b] = (_DEGREES_OF_FREEDOM + 8) / (_DEGREES_OF_FREEDOM + mahalanobis2)
+                weights[b] = (degrees_of_freedom + 8) / (degrees_of_freedom + mahalanobis2)
     blocks = [slice(8 * b, 8 * b + 8) for b in range(len(likelihoods))]
     # Rounding removes the last bits, which depend on the machine's order of summation.
     return [(np.round(solution[s], 6), np.round(covariance[s, s], 12)) for s in blocks]
@@ -114,7 +110,8 @@ def _likelihood(
     assert result.corner_covariance_px2 is not None
     information = np.asarray(np.linalg.inv(result.corner_covariance_px2))
     fit = fit_windows(pair.mapping(result.fixed_to_moving), residual, pair.fixed.size_px)
-    if fit is None or not fit.max_px <= _MAX_CORRECTION_PX:
+    max_correction_px = 1.0  # of a corner; larger ones contradict the mapping
+    if fit is None or not fit.max_px <= max_correction_px:
         return information, np.zeros(8)
     of_windows = np.linalg.inv(fit.covariance_px2)
     return information + of_windows, np.asarray(of_windows @ fit.mean_px)

@@ -12,11 +12,6 @@ from agalign.verify.displacement_field import DisplacementEstimator
 from agalign.verify.metrics import FixedSimilarity
 from agalign.verify.residuals import MIN_WINDOW_PX, FixedWindows
 
-_SEED_LONGEST_PX = 384
-"""Longer side of the images on which seeds are scored; large shifts are found quickly at this resolution."""
-
-_FIT_PX = 48
-"""Side of the windows to which planes and baselines are fitted; small, so that most contain a single surface."""
 _HELD_OUT_PX = 64
 """Side of the windows that verify a relief; larger, because their shifts have less noise."""
 _LARGE_WINDOW_PX = 168
@@ -51,7 +46,8 @@ class Reference:
     def seed_size_px(self) -> tuple[int, int]:
         """(width, height) of the reduced images on which seeds are scored."""
         width, height = self.image.size_px
-        scale = min(1.0, _SEED_LONGEST_PX / max(width, height))
+        longest_px = 384  # large shifts are found quickly at this resolution
+        scale = min(1.0, longest_px / max(width, height))
         return max(8, round(width * scale)), max(8, round(height * scale))
 
     @cached_property
@@ -115,7 +111,8 @@ class Reference:
     @cached_property
     def fit_windows(self) -> FixedWindows:
         """Windows in the black fields of a chessboard, for the fit of planes and baselines."""
-        return FixedWindows.on_chessboard(self.grey.valid, self.structure, _FIT_PX, white=False)
+        side_px = 48  # small, so that most windows contain a single surface
+        return FixedWindows.on_chessboard(self.grey.valid, self.structure, side_px, white=False)
 
     @cached_property
     def held_out_windows(self) -> FixedWindows:

@@ -45,26 +45,9 @@ _MIN_BANDS = 2
 """Minimum number of moving lenses: a relief is verified with the other lenses."""
 _MIN_PARALLAX_PX = 0.3
 """Minimum p95 of the parallax of windows for a relief; windows of flat fields have up to 0.2 px, mostly noise."""
-_FAR_PX, _MAX_FAR_SHARE = 1.0, 0.05
-"""A relief is also tried if more than this share of the windows has shifts above _FAR_PX: windows across depth edges
-may contain the parallax of neither side, so that the squared shifts do not decrease."""
-_MAX_LINE_PX = 1.0
-"""Common displacements along one line with a larger p95 are those of shadows or leaves, not of lenses: a displacement
-field would follow them too."""
-_MAX_SCALE_RATIO, _MIN_FOREIGN_PX = 2.0, 0.4
-"""Maximum ratio of the residual of a band to that of the others, for common parallax: up to 1.4 for bands of the same
-time, 2.4 for a photograph of another time. Residuals below the minimum are accepted anyway."""
-_RANGE_PERCENTILES = (1.0, 99.0)
-"""Percentiles of the windows' parallax that limit its range; values beyond are wrong peaks."""
-_MAX_LEFT_OUT_BANDS = 4
-"""Up to this number, each band is verified by all others: the relief of one or two bands is too noisy."""
-_ROUNDS = 3
-"""Rounds of the fit of a band under the relief of the others, as large shifts are measured in steps."""
-_COMPARED_BANDS = 2
-"""Bands with which a relief is compared with displacement fields: a field takes longer than the relief of a band."""
-_CLEAR_GAIN = 2.0
-"""Ratio of the p95 of held-out windows by homography and by relief above which no displacement field is compared: a
-field cannot follow depth edges."""
+_MAX_FAR_SHARE = 0.05
+"""A relief is also tried if more than this share of the windows has shifts above 1 px (`_far_share`): windows across
+depth edges may contain the parallax of neither side, so that the squared shifts do not decrease."""
 
 
 @dataclass(frozen=True)
@@ -113,11 +96,14 @@ def aligned_by_relief(
     result = ReliefResult()
     if use == "never":
         return result
+    # Along one line, larger common displacements are those of shadows or leaves, not of lenses; a displacement field
+    # would follow them too.
+    max_line_px = 1.0
     for group in _comparable(candidates):
         if len(group) < _MIN_BANDS:
             continue
         parallax_px, on_a_line = _common_parallax_px(group)
-        if on_a_line and parallax_px > _MAX_LINE_PX:
+        if on_a_line and parallax_px > max_line_px:
             result.along_a_line |= {c.pair.name for c in group}
         elif use == "always" or parallax_px >= _MIN_PARALLAX_PX:
             aligned = _aligned_group(group, is_requested=use == "always", is_observation=is_observation)
@@ -197,10 +183,10 @@ def _p95_px(residual: Residual[FixedImagePx]) -> float:
 
 
 def _far_share(residual: Residual[FixedImagePx]) -> float:
-    """Return the share of the measured windows with a shift above _FAR_PX."""
+    """Return the share of the measured windows with a shift above 1 px."""
     lengths = np.linalg.norm(residual.shifts_px, axis=1)
     measured = np.isfinite(lengths)
-    return float((lengths[measured] > _FAR_PX).mean()) if measured.any() else 0.0
+    return float((lengths[measured] > 1.0).mean()) if measured.any() else 0.0
 
 
 def _layout(group: Sequence[ReliefCandidate], bands: Sequence[int]) -> NDArray[np.float64] | None:
@@ -217,6 +203,9 @@ def _consistent(
     A band that the parallax of the others does not explain is left out, one after another.
     """
     size_px = group[0].pair.fixed.size_px
+    # Residual of a band relative to that of the others: up to 1.4 for bands of the same time, 2.4 for a photograph of
+    # another time. Residuals below the minimum are accepted anyway.
+    max_scale_ratio, min_foreign_px = 2.0, 0.4
 
     def adjusted(bands: Sequence[int], *, fields: bool) -> Adjustment | None:
         layout, some = _layout(group, bands), windows.of_bands(bands)
@@ -235,7 +224,7 @@ def _consistent(
         else:
             worst = int(model.scales_px.argmax())
             others_px = float(np.median(np.delete(model.scales_px, worst)))
-            if model.scales_px[worst] <= max(_MIN_FOREIGN_PX, _MAX_SCALE_RATIO * others_px):
+            if model.scales_px[worst] <= max(min_foreign_px, max_scale_ratio * others_px):
                 break
         kept.pop(worst)
         model = adjusted(kept, fields=with_fields)
@@ -318,7 +307,7 @@ class _Estimate:
         kept, model = consistent
         layout = _layout(group, kept)
         bands = _applied([planes[k] for k in kept], model)
-        low, high = np.percentile(model.parallax_px, _RANGE_PERCENTILES).tolist()
+        low, high = np.percentile(model.parallax_px, (1.0, 99.0)).tolist()  # values beyond are wrong peaks
         matching = DenseMatching(group[0].pair.reference.grey, _views(bands), (low, high))
         matched = matching.matched(range(len(bands)))
         bands = _refitted(bands, matched, with_fields=with_fields)
@@ -349,7 +338,8 @@ class _Estimate:
         Raises GeometryError.
         """
         band = _Band(candidate, candidate.warped.mapping, (0.0, 0.0))
-        for _ in range(_ROUNDS):
+        rounds = 3  # large shifts are measured in steps
+        for _ in range(rounds):
             mapping = band.mapping(self.relief)
             residual = candidate.fit_residual(mapping)
             if len(residual.measured_px) < MIN_WINDOWS:
@@ -373,10 +363,12 @@ class _Estimate:
         gains: list[float] = []
         confirmed = [(b, c) for b, c in zip(self.bands, checked, strict=True) if c.held_out and c.alignment]
         confirmed.sort(key=lambda pair: -math.hypot(*pair[0].baseline))
-        for band, each in confirmed[:_COMPARED_BANDS]:
+        max_bands = 2  # a field takes longer than the relief of a band
+        clear_gain = 2.0  # of the p95; a field cannot follow depth edges and needs no comparison above
+        for band, each in confirmed[:max_bands]:
             assert each.held_out is not None
             assert each.alignment is not None
-            if each.plane.p95_px >= _CLEAR_GAIN * each.held_out.p95_px:
+            if each.plane.p95_px >= clear_gain * each.held_out.p95_px:
                 gains.append(math.inf)
                 continue
             pair, candidate = band.candidate.pair, band.candidate
@@ -439,7 +431,8 @@ def _verifying(bands: Sequence[int]) -> list[list[int]]:
     With few bands all others, else the bands with odd and those with even index: two reliefs instead of one for
     each band.
     """
-    if len(bands) <= _MAX_LEFT_OUT_BANDS:
+    max_left_out_bands = 4  # one at a time: the relief of one or two bands is too noisy
+    if len(bands) <= max_left_out_bands:
         return [[b for b in bands if b != band] for band in bands]
     return [[b for b in bands if b % 2 != parity] for parity in (0, 1)]
 

@@ -24,29 +24,14 @@ from agalign.values.pixel_units import FixedImagePx
 from agalign.verify.checks import seed_fits
 from agalign.verify.window_fit import fit_in_rounds
 
-_CERTAIN_SIGMA = 120.0
-"""Correlation peak of images that are aligned everywhere; a rotation of 1 degree reduces it to 60 to 120, of 3 degrees
-to 17."""
-_TRUSTED_SIGMA = 12.0
-"""Minimum correlation peak of a trusted seed, with an error of a few pixels. Unrelated images have up to 9."""
-_TRUSTED_RATIO = 1.5
-"""Minimum ratio of a trusted seed's peak and the second highest: a repetitive scene has several similar peaks."""
 _MIN_OVERLAP = 0.2
 """Minimum share of the reference that the moving image covers: the correlation is circular and meaningless for small
 overlaps."""
-_MIN_SHIFT_PX = 0.25
-"""Smaller shifts, px of the reduced images, are noise."""
 _SAME_PEAK_PX = 2.0
 """Maximum distance, px of the reduced images, of a candidate from a peak that it belongs to."""
-_CLOSE_PX = 3.0
-"""p95 of the residual of a match at which the search ends."""
-_MAX_ROTATION_DEGREES, _MAX_SCALE_CHANGE = 1.0, 0.02
-"""Maximum deviation of a band from its rig by temperature and mounting."""
 _SCALES = tuple(1.02**k for k in range(-18, 19) if k)
 """Scales relative to the overlay of the two images, 0.7 to 1.4. An error of 2 % reduces the correlation peak of a
 thermal and a blue image to three quarters."""
-_MAX_KEYPOINTS = 1000
-"""Limits the time of matching by learned descriptors, which is the last step."""
 
 
 def find_seed(pair: BandPair, settings: SeedSettings, model: FlightModel | None = None) -> Seed | Issue:
@@ -66,7 +51,10 @@ def find_seed(pair: BandPair, settings: SeedSettings, model: FlightModel | None 
     best = best_seed(pair, candidates, force)
     # A mapping by the flight or the user or a forced seed excludes other positions.
     is_given = force is not None or pair.has_rig or "user" in pair.candidates
-    if best.score >= _CERTAIN_SIGMA or is_given:
+    # Correlation peak of images that are aligned everywhere. A rotation by 1 degree reduces it to 60 to 120, by 3
+    # degrees to 17.
+    certain_sigma = 120.0
+    if best.score >= certain_sigma or is_given:
         return best
     has_scale = bool(pair.candidates.keys() & {"rig", "centre", "geo", "model", "user"})
     if not best.trusted and not has_scale:
@@ -94,7 +82,8 @@ def _best_match(pair: BandPair, model: FlightModel | None, best: Seed) -> Seed:
             scored = replace(_scored(pair, "match", match)[0], trusted=True)
             if not is_confirmed or scored.score > best.score:
                 best, residual = scored, match_residual
-        if best.kind == "match" and residual.p95_px <= _CLOSE_PX:
+        close_px = 3.0
+        if best.kind == "match" and residual.p95_px <= close_px:
             break
     return best
 
@@ -126,11 +115,12 @@ def find_rotated(pair: BandPair, fixed_to_moving: Matrix, given: Residual[FixedI
 
 def _is_rotated_or_scaled(matrix: Matrix, size_px: tuple[int, int]) -> bool:
     """Return True if a homography rotates or scales the centre of an image (width, height) beyond the limits."""
+    max_rotation_degrees, max_scale_change = 1.0, 0.02  # deviation of a band from its rig by temperature and mounting
     centre = (np.array(size_px) - 1) / 2
     origin, right, down = geometry.apply(matrix, centre + np.array([(0, 0), (1, 0), (0, 1)]))
     angle = np.degrees(np.arctan2(*(right - origin)[::-1]))
     scale = np.sqrt(abs(np.linalg.det([right - origin, down - origin])))
-    return bool(abs(angle) > _MAX_ROTATION_DEGREES or abs(scale - 1) > _MAX_SCALE_CHANGE)
+    return bool(abs(angle) > max_rotation_degrees or abs(scale - 1) > max_scale_change)
 
 
 def _matches(pair: BandPair, model: FlightModel | None, *, by_learned_descriptors: bool) -> Iterator[Matrix]:
@@ -142,7 +132,8 @@ def _matches(pair: BandPair, model: FlightModel | None, *, by_learned_descriptor
         if result is not None:
             yield result
     if by_learned_descriptors:
-        result = match_seed(_network(pair, model), pair.fixed, pair.moving, _MAX_KEYPOINTS)
+        max_keypoints = 1000  # limits the time
+        result = match_seed(_network(pair, model), pair.fixed, pair.moving, max_keypoints)
         if result is not None:
             yield result
 
@@ -234,10 +225,13 @@ def _scored(pair: BandPair, kind: SeedKind, fixed_to_moving: Matrix) -> list[See
         return [Seed(kind, fixed_to_moving, 0.0)]
 
     def seed(kind: SeedKind, matrix: Matrix, sigma: float, runner_up: float) -> Seed:
-        is_trusted = sigma >= max(_TRUSTED_SIGMA, _TRUSTED_RATIO * runner_up)
+        min_sigma = 12.0  # for an error of a few pixels; unrelated images have up to 9
+        min_ratio = 1.5  # a repetitive scene has several similar peaks
+        is_trusted = sigma >= max(min_sigma, min_ratio * runner_up)
         return Seed(kind, matrix, sigma, sigma, runner_up, is_trusted)
 
-    if np.hypot(*peak.shift_px) < _MIN_SHIFT_PX:
+    min_shift_px = 0.25  # of the reduced images; smaller shifts are noise
+    if np.hypot(*peak.shift_px) < min_shift_px:
         return [seed(kind, fixed_to_moving, peak.sigma, peak.runner_up_sigma)]
     # If the unshifted candidate does not belong to the highest peak, that peak is its runner-up.
     runner_up = peak.sigma if np.hypot(*peak.shift_px) > _SAME_PEAK_PX else peak.runner_up_sigma

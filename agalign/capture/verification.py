@@ -20,10 +20,6 @@ from agalign.verify.displacement_field import DisplacementResult
 from agalign.verify.extrapolation import points_in_frame, unobserved_quarters
 from agalign.verify.residuals import residual_under
 
-_MAX_CONVERTED_PX = 0.15
-"""Maximum difference of two mappings for which the residual is converted instead of measured again; the error is about
-0.01 px, because interpolation changes shifts by 0.1 to 0.25 of their distance from whole pixels."""
-
 _PARALLAX_ISSUES = frozenset({CLOSE_WINDOWS, CLUSTER, RESIDUAL_PX})
 """Issues caused by parallax, which a displacement field may remove."""
 
@@ -54,7 +50,10 @@ class WarpedPair:
         if mapping.field is self.mapping.field:
             corners = geometry.corners(*self.pair.fixed.size_px)
             difference_px = float(np.linalg.norm(mapping(corners) - self.mapping(corners), axis=1).max())
-            if difference_px <= _MAX_CONVERTED_PX:
+            # The error of the conversion is then about 0.01 px, because interpolation changes shifts by 0.1 to 0.25 of
+            # their distance from whole pixels.
+            max_converted_px = 0.15
+            if difference_px <= max_converted_px:
                 return replace(self, mapping=mapping, residual=residual_under(self.residual, self.mapping, mapping))
         return WarpedPair.of(self.pair, mapping)
 
