@@ -18,7 +18,13 @@ from agalign._version import __version__
 from agalign.errors import AgalignError, ConfigurationError, WorkerError
 from agalign.values.cores import usable_cores
 from agalign.values.process_pool import A, ProcessPool, R, WorkerDiedError
-from agalign.values.processes import WORKER_MODULE, follow_parent, threads_of_children, worker_context
+from agalign.values.processes import (
+    WORKER_MODULE,
+    follow_parent,
+    threads_of_children,
+    without_interrupt_key,
+    worker_context,
+)
 
 _DASK_TIMEOUT_S = 10
 _POLL_INTERVAL_S = 5.0
@@ -193,9 +199,14 @@ def dask_executor(address: str, jobs: int = 0, timeout_s: float | None = None) -
             if address == "local":
                 # The profile appears on the dashboard only, and takes a few percent of the time.
                 stack.enter_context(dask.config.set({"distributed.worker.profile.enabled": False}))
-                cluster = LocalCluster(
-                    n_workers=jobs or usable_cores(), threads_per_worker=1, processes=True, dashboard_address=None
-                )
+                with without_interrupt_key():  # of a terminal, for all its processes: the workers end with the cluster
+                    cluster = LocalCluster(
+                        n_workers=jobs or usable_cores(),
+                        threads_per_worker=1,
+                        processes=True,
+                        dashboard_address=None,
+                        silence_logs=logging.CRITICAL,
+                    )
                 address = stack.enter_context(cluster).scheduler_address
             client = Client(address, set_as_default=False, timeout=_DASK_TIMEOUT_S)
         except RuntimeError as error:

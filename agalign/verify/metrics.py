@@ -113,7 +113,8 @@ def _bin_position(values: NDArray[np.float32], limits: tuple[float, float], padd
     margin = 0.01 * (high - low)  # as in elastix
     low, high = low - margin, high + margin
     bin_size = max((high - low) / (_BINS - 2 * padding - 1), 1e-12)
-    return np.asarray(values * np.float32(1 / bin_size) - np.float32(low / bin_size - padding))
+    # Subtracted first: of nearly constant images with large values, the quotients exceed float32.
+    return np.asarray((values - np.float32(low - padding * bin_size)) * np.float32(1 / bin_size))
 
 
 def cubic_spline(x: NDArray[np.float64]) -> NDArray[np.float64]:

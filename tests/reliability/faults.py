@@ -810,6 +810,10 @@ OTHERS = {
         Ends(3, "stopped after 4 s", "", 1),
     ),
     "the interrupt key": (when_begun(signalled(signal.SIGINT), "-j", "2"), Ends(130, "interrupted; finished", "")),
+    "the interrupt key, workers of Dask": (
+        when_begun(signalled(signal.SIGINT), "--dask", "local"),
+        Ends(130, "interrupted; finished", ""),
+    ),
     "the interrupt key while workers start": (
         both(with_captures(ALL[2:]), when(has_children(1), signalled(signal.SIGINT), "-j", "2")),
         Ends(130, "interrupted; finished", ""),

@@ -9,7 +9,7 @@ from agalign.pixels.structure import structure_field
 from agalign.values import geometry
 from agalign.values.alignment import Residual
 from agalign.values.image import Raster
-from agalign.verify.metrics import FixedSimilarity, normalised_mutual_information
+from agalign.verify.metrics import FixedSimilarity, fixed_bins, joint_histogram, normalised_mutual_information
 from agalign.verify.residuals import FixedWindows
 
 from ..builders import texture, two_views
@@ -75,6 +75,14 @@ def test_similarity_uses_only_valid_pixels() -> None:
     assert whole["mattes_mi"] == pytest.approx(crop["mattes_mi"], abs=1e-6)
     assert whole["ncc"] == pytest.approx(crop["ncc"], abs=1e-6)
     assert similarity(fixed, moving, np.zeros(fixed.shape, bool)) == {"overlap": 0.0}
+
+
+@pytest.mark.filterwarnings("error")
+def test_large_values_that_hardly_vary_are_binned() -> None:
+    constant = np.full(100, 1e30, np.float32)
+    bins = fixed_bins(constant, (1e30, 1e30))
+    assert set(bins) == {0}
+    assert joint_histogram(bins, constant, (1e30, 1e30)).sum() == pytest.approx(1.0)
 
 
 def residuals(fixed: Raster, moving: Raster) -> Residual:
