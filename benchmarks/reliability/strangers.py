@@ -250,9 +250,14 @@ VALUES = (
     *('"\\u001b[2J\\u202e"', '"../../pwn"', '"/dev/zero"', '"\\u0000"', '["a", 1]', f'"{"x" * 9999}"'),
 )
 FILES = (
-    b"", b"\xef\xbb\xbfjobs = 1", b"jobs = 1\r\n", "jobs = 1".encode("utf-16"), b"\xff", b"jobs = 1\njobs = 2",
-    b"[tool.agalign]\njobs = 1", b"local = true", b"schema = 'agalign-options/2'", b"include = '../../*'\nout = '..'",
-)  # fmt: skip
+    *(b"", b"\xef\xbb\xbfjobs = 1", b"jobs = 1\r\n", "jobs = 1".encode("utf-16"), b"\xff", b"jobs = 1\njobs = 2"),
+    *(
+        b"[tool.agalign]\njobs = 1",
+        b"local = true",
+        b"schema = 'agalign-options/2'",
+        b"include = '../../*'\nout = '..'",
+    ),
+)
 
 
 def attack_options(text: bytes, flight: Path) -> Counter[str]:

@@ -30,11 +30,10 @@ from .blocks import PAGES, ROOT
 EACH_PAGE = pytest.mark.parametrize("page", PAGES, ids=[p.relative_to(ROOT).as_posix() for p in PAGES])
 PACKAGE = ROOT / "agalign"
 OPTIONS_OF_OTHERS = {
-    "--cpus", "--gpus", "--read-only", "--tmpfs", "--user",  # docker run
-    "--extra-index-url",  # pip
-    "--kinds", "--markdown", "--pairs", "--plot", "--ranges", "--scenes",  # benchmarks
-    "--strict",  # mypy
-}  # fmt: skip
+    *("--cpus", "--gpus", "--read-only", "--tmpfs", "--user"),  # docker run
+    *("--kinds", "--markdown", "--pairs", "--plot", "--ranges", "--scenes"),  # benchmarks
+    *("--extra-index-url", "--strict"),  # pip, mypy
+}
 """Options in the text of pages that are not those of agalign."""
 WORDS_OF_A_MESSAGE = 4
 """Code of as many words is a quoted message, if it is none of these."""
