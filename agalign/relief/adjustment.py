@@ -36,31 +36,8 @@ Array = NDArray[np.float64]
 _ITERATIONS = 12
 """Enough for the baselines to converge to a relative change of 0.001."""
 
-_PLANE_PX = 0.5
-"""Distance from the reference plane at which the robust weight of a window is one half."""
-_MAX_WEIGHT = 2.0
-"""Maximum weight by the peak height, so that well-textured parts do not dominate."""
 _DAMPING = 1e-3
 """Weight of zero correction and zero parallax, relative to one window; matters only where no window contributes."""
-_MIN_INFORMATION = 0.2
-"""Minimum sum of weights times squared baselines for the parallax of a window to be known."""
-_CLIP_MEDIANS = 5.0
-"""Shifts are clipped at this multiple of the median for the initial estimate of the baselines."""
-_MIN_LAYOUT_COSINE = 0.8
-"""Minimum cosine similarity of the baselines and the lens layout: 0.998 for scenes with depth, up to 0.55 for noise."""
-_MIN_SPREAD = 0.3
-"""Minimum distance of a baseline from the mean, relative to the longest: at least 0.5 for real cameras, at most 0.2 for
-a blurred reference."""
-
-
-_NODE_SPACING_PX, _MIN_NODES = 200, 4
-"""Spacing of the nodes of a lens field along each axis; distortion varies over hundreds of pixels."""
-_SMOOTHNESS = 3.0
-"""Weight of the second differences of a lens field, relative to one window."""
-_FIELD_DAMPING = 0.01
-"""Weight of the length of a lens field, relative to one window."""
-_MIN_WIDTH = 0.15
-"""Minimum ratio of the singular values of baselines that are not on one line: 0.22 to 0.5 for cameras."""
 
 
 class LensBasis:
@@ -68,12 +45,14 @@ class LensBasis:
 
     def __init__(self, size_px: tuple[int, int]) -> None:
         """Place nodes on an image (width, height)."""
+        spacing_px, min_count = 200, 4  # along each axis; distortion varies over hundreds of pixels
+        smoothness, damping = 3.0, 0.01  # weights of second differences and of the length, relative to one window
         self.size_px = size_px
-        self.counts = [max(_MIN_NODES, round(n / _NODE_SPACING_PX) + 1) for n in size_px]
+        self.counts = [max(min_count, round(n / spacing_px) + 1) for n in size_px]
         columns, rows = (np.diff(np.eye(n), 2, axis=0) for n in self.counts)
         twist = np.kron(*(np.diff(np.eye(n), axis=0) for n in self.counts[::-1]))
         bending = np.kron(np.eye(self.counts[1]), columns.T @ columns) + np.kron(rows.T @ rows, np.eye(self.counts[0]))
-        self.penalty = _SMOOTHNESS * (bending + 2 * twist.T @ twist) + _FIELD_DAMPING * np.eye(len(bending))
+        self.penalty = smoothness * (bending + 2 * twist.T @ twist) + damping * np.eye(len(bending))
         """(k, k) quadratic form of the prior."""
 
     def __call__(self, points_px: Points) -> Array:
@@ -140,7 +119,8 @@ class WindowShifts:
             shifts[rows, band] = mapping.undistorted(xy + residual.shifts_px[measured]) - mapping.undistorted(xy)
             peaks[rows, band] = residual.peaks_sigma[measured]
         positive = peaks[peaks > 0]
-        weights = np.minimum((peaks / np.median(positive)) ** 2, _MAX_WEIGHT) if positive.size else peaks
+        max_weight = 2.0  # so that well-textured parts do not dominate
+        weights = np.minimum((peaks / np.median(positive)) ** 2, max_weight) if positive.size else peaks
         centres_px = np.array(centres).reshape(-1, 2)
         points = mappings[0].of_the_plane.undistorted(centres_px)
         return cls(centres_px, points, shifts, np.where(np.isfinite(shifts[..., 0]), weights, 0.0))
@@ -227,11 +207,13 @@ def are_of_lenses(baselines: Array, layout: Array | None) -> bool:
     lenses on one side of the reference, but it must be more similar to them than their mean is.
     """
     if layout is not None:
+        min_cosine = 0.8  # measured: 0.998 for scenes with depth, up to 0.55 for noise
         of_mean = _cosine(baselines, np.broadcast_to(baselines.mean(axis=0), baselines.shape))
-        return _cosine(baselines, layout) >= max(_MIN_LAYOUT_COSINE, of_mean)
+        return _cosine(baselines, layout) >= max(min_cosine, of_mean)
     lengths = np.linalg.norm(baselines, axis=1)
     from_mean = np.linalg.norm(baselines - baselines.mean(axis=0), axis=1)
-    return bool(from_mean.max() >= _MIN_SPREAD * lengths.max() > 0)
+    min_spread = 0.3  # at least 0.5 for real cameras, at most 0.2 for a blurred reference
+    return bool(from_mean.max() >= min_spread * lengths.max() > 0)
 
 
 def _cosine(baselines: Array, others: Array) -> float:
@@ -247,7 +229,8 @@ def are_on_a_line(baselines: Array) -> bool:
     along one direction, by a different length in each band.
     """
     longest, shortest = np.linalg.svd(baselines, compute_uv=False)[[0, -1]]
-    return bool(shortest < _MIN_WIDTH * longest)
+    min_ratio = 0.15  # of baselines that are not on one line: 0.22 to 0.5 for cameras
+    return bool(shortest < min_ratio * longest)
 
 
 def shifts_by_corners(model: Adjustment, points_px: Points, size_px: tuple[int, int]) -> Array:
@@ -270,7 +253,8 @@ def _initial_baselines(windows: WindowShifts) -> Array | None:
         return None
     shifts = windows.shifts_px[complete].reshape(int(complete.sum()), -1)
     shifts = shifts - np.median(shifts, axis=0)
-    limit = _CLIP_MEDIANS * np.median(np.abs(shifts)) + MIN_SHIFT_SCALE_PX
+    max_medians = 5.0  # larger shifts are clipped, so that outliers do not determine the initial estimate
+    limit = max_medians * np.median(np.abs(shifts)) + MIN_SHIFT_SCALE_PX
     _, _, right = np.linalg.svd(np.clip(shifts, -limit, limit), full_matrices=False)
     return np.asarray(right[0].reshape(-1, 2))
 
@@ -289,10 +273,12 @@ def _parallax(residual_px: Array, baselines: Array, weights: Array) -> tuple[Arr
 
 def _reference_plane(parallax: Array, plane: Array, information: Array) -> Array:
     """Return the coefficients (3,) in (1, u, v) of the plane of most windows: an M-estimate from their median."""
-    known = (information > _MIN_INFORMATION).astype(float)
+    min_information = 0.2  # sum of weights times squared baselines for the parallax of a window to be known
+    half_weight_px = 0.5  # distance from the plane at which the robust weight of a window is one half
+    known = (information > min_information).astype(float)
     result = np.array([np.median(parallax), 0.0, 0.0])
     for _ in range(8):
-        weight = known * cauchy_weights(parallax - plane @ result, _PLANE_PX)
+        weight = known * cauchy_weights(parallax - plane @ result, half_weight_px)
         normal = plane.T @ (weight[:, None] * plane) + 1e-6 * np.eye(3)
         result = np.linalg.solve(normal, plane.T @ (weight * parallax))
     return np.asarray(result)

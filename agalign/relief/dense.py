@@ -30,36 +30,16 @@ from agalign.values.relief import Relief
 Costs = NDArray[np.uint8]
 """(levels, height, width): truncated 1 - correlation of one band, in units of 1 / _UNIT_COST."""
 
-_MAX_REFINED_PX = 3_000_000
-"""Larger references are reduced to this many pixels, which limits memory and time."""
-_SEARCH_SCALE, _MATCH_SCALE = 0.25, 0.5
-"""Resolution of the wide search and of semi-global matching, relative to the final resolution."""
 _SEARCH_NEARER, _SEARCH_FARTHER = 0.06, 0.03
 """Searched parallax as a share of the longer side: for lenses 3 cm apart and a reference plane 1 m away, an object at
 half that range, and the floor."""
 _SEARCH_STEP_PX = 2.0
 """Half a pixel of the reduced images; the correlation peak is about one pixel wide."""
-_MIN_SEARCH_CORRELATION = 0.6
-"""Pixels with a lower correlation in the wide search (occlusions, noise) do not extend the range."""
-_MIN_PIXEL_SHARE = 0.003
-"""Fewer pixels at an extreme parallax are taken for wrong matches."""
-_MARGIN_PX = 4.0
-"""Added to the range of the wide search: twice its resolution."""
-_MAX_LEVELS, _STEPS_PX = 96, (0.5, 1.0)
-"""Maximum number of parallax levels, and the spacings between which _MAX_FINE_LEVELS decides."""
-_MAX_FINE_LEVELS = 48
-"""The smaller spacing is used if it gives at most this many levels."""
-_WINDOW_PX, _FINE_WINDOW_PX = 7, 11
-"""Sides of the correlation windows in semi-global matching and at full resolution."""
-_MIN_CORRELATION = 0.1
-"""Lower correlations are treated as occlusion and do not increase the cost further."""
-_SMALL_STEP, _LARGE_STEP = 0.06, 0.4
-"""Penalties of semi-global matching relative to the cost of zero correlation."""
-_UNIT_COST = int(MAX_LARGE / _LARGE_STEP)
-"""Integer cost of zero correlation, as high as the range of semi-global matching permits."""
-_FINE_STEPS = (-1.5, -0.5, 0.5, 1.5)
-"""Candidates around the result of semi-global matching, in units of its step. A range of 1 step instead of 1.5
-increases the median error by 6 to 18 % (rendered boxes, plants and terraces)."""
+_WINDOW_PX = 7
+"""Side of the correlation windows at reduced resolution."""
+_UNIT_COST = int(MAX_LARGE / 0.4)
+"""Integer cost of zero correlation, as high as the range of semi-global matching permits: large steps of the parallax
+have a penalty of 0.4 of it."""
 _MEDIAN_PX = 5
 """Window of the median filters, which remove isolated wrong pixels."""
 _STRIP_PX = 64
@@ -68,8 +48,6 @@ _NODE_STEP_PX = 8
 """Spacing of the grid on which lenses and homographies are evaluated."""
 _MIN_ENERGY = 1e-3
 """Energy added to that of a window, so that windows without structure have no correlation."""
-_OUTSIDE_ENERGY = 1e3
-"""Energy of windows with centres outside the moving image, so that the part inside has no correlation."""
 
 
 @dataclass(frozen=True)
@@ -90,12 +68,16 @@ class DenseMatching:
     def __init__(self, reference: Raster, views: Sequence[View], window_range_px: tuple[float, float]) -> None:
         """Compute the costs; `reference` has one channel, `window_range_px` is the parallax range of the windows."""
         self.reference, self.views = reference, views
-        self.scale = min(1.0, (_MAX_REFINED_PX / reference.valid.size) ** 0.5)
+        max_refined_px = 3_000_000  # larger references are reduced, which limits memory and time
+        self.scale = min(1.0, (max_refined_px / reference.valid.size) ** 0.5)
         low, high = self._range_px(window_range_px)
-        count = (high - low) / _STEPS_PX[0]
-        self.step_px = max(_STEPS_PX[0] if count <= _MAX_FINE_LEVELS else _STEPS_PX[1], (high - low) / _MAX_LEVELS)
+        # The time is proportional to the number of levels.
+        fine_step_px, coarse_step_px, max_fine_levels, max_levels = 0.5, 1.0, 48, 96
+        is_fine = (high - low) / fine_step_px <= max_fine_levels
+        self.step_px = max(fine_step_px if is_fine else coarse_step_px, (high - low) / max_levels)
         self.levels_px = np.arange(low, high + self.step_px, self.step_px)
-        fixed = _FixedBand(reference, self.scale * _MATCH_SCALE, _WINDOW_PX)
+        relative_scale = 0.5  # of semi-global matching
+        fixed = _FixedBand(reference, self.scale * relative_scale, _WINDOW_PX)
         self.match_scale = fixed.scale
         self.costs = [_MovingBand(fixed, view, (low, high)).costs(self.levels_px) for view in views]
         self._matched: dict[tuple[int, ...], Relief] = {}
@@ -114,9 +96,12 @@ class DenseMatching:
         """
         margin = 2 * self.step_px
         limits = self.levels_px[0] - margin, self.levels_px[-1] + margin
-        fixed = _FixedBand(self.reference, self.scale, _FINE_WINDOW_PX)
+        window_px = 11
+        fixed = _FixedBand(self.reference, self.scale, window_px)
         starts = [np.asarray(cv2.resize(self.matched(bands).parallax_px, fixed.size_px)) for bands in selections]
-        steps_px = [step * self.step_px for step in _FINE_STEPS]
+        # Of the candidates around the result of semi-global matching. A range of 1 step instead of 1.5 increases the
+        # median error by 6 to 18 % (rendered boxes, plants and terraces).
+        steps_px = [step * self.step_px for step in (-1.5, -0.5, 0.5, 1.5)]
         totals = [np.zeros((len(steps_px), *start.shape), np.float32) for start in starts]
         for band, view in enumerate(views):
             moving = _MovingBand(fixed, view, limits)
@@ -136,14 +121,18 @@ class DenseMatching:
         low = min(-_SEARCH_FARTHER * longer_side_px, windows_px[0])
         high = max(_SEARCH_NEARER * longer_side_px, windows_px[1])
         levels = np.arange(low, high + _SEARCH_STEP_PX, _SEARCH_STEP_PX)
-        fixed = _FixedBand(self.reference, self.scale * _SEARCH_SCALE, _WINDOW_PX)
+        relative_scale = 0.25
+        fixed = _FixedBand(self.reference, self.scale * relative_scale, _WINDOW_PX)
         costs = [_MovingBand(fixed, view, (low, levels[-1])).costs(levels) for view in self.views]
         parallax_px, confidence = _semi_global_match(costs, range(len(costs)), levels)
-        reliable = parallax_px[confidence >= _MIN_SEARCH_CORRELATION]
+        min_correlation = 0.6  # pixels with a lower one (occlusions, noise) do not extend the range
+        reliable = parallax_px[confidence >= min_correlation]
         counts = np.bincount(np.rint((reliable - low) / _SEARCH_STEP_PX).astype(int), minlength=len(levels))
-        frequent = levels[np.flatnonzero(counts >= _MIN_PIXEL_SHARE * parallax_px.size)]
+        min_pixel_share = 0.003  # fewer pixels at an extreme parallax are taken for wrong matches
+        frequent = levels[np.flatnonzero(counts >= min_pixel_share * parallax_px.size)]
         occurring = np.array([*windows_px, *frequent])
-        return float(occurring.min() - _MARGIN_PX), float(occurring.max() + _MARGIN_PX)
+        margin_px = 2 * _SEARCH_STEP_PX
+        return float(occurring.min() - margin_px), float(occurring.max() + margin_px)
 
 
 def _semi_global_match(
@@ -151,7 +140,8 @@ def _semi_global_match(
 ) -> tuple[FloatImage, FloatImage]:
     """Return the parallax by semi-global matching and its mean correlation, each (height, width)."""
     mean = _mean_costs([costs[band] for band in bands])
-    labels = sub_label_minimum(aggregated(mean, round(_SMALL_STEP * _UNIT_COST), round(_LARGE_STEP * _UNIT_COST)))
+    small_step = 0.06  # penalty relative to the cost of zero correlation
+    labels = sub_label_minimum(aggregated(mean, round(small_step * _UNIT_COST), MAX_LARGE))
     nearest = np.rint(labels).astype(np.intp)[None]
     confidence = 1 - np.take_along_axis(mean, nearest, axis=0)[0] / np.float32(_UNIT_COST)
     step_px = levels_px[1] - levels_px[0]
@@ -190,8 +180,9 @@ class _FixedBand:
     def correlation(self, warped: FloatImage, rows: slice) -> FloatImage:
         """Return the normalised correlation in windows, (rows, width), with a structure (rows, width, 4).
 
-        It is from _MIN_CORRELATION to 1. Windows across a step of the parallax or the border may exceed 1 otherwise.
+        It is from 0.1 to 1. Windows across a step of the parallax or the border may exceed 1 otherwise.
         """
+        min_correlation = 0.1  # lower ones are treated as occlusion and do not increase the cost further
         real, imaginary, energy = (plane[rows] for plane in self.structure)
         warped_real, warped_imaginary, warped_energy, _ = cv2.split(warped)
         cv2.multiply(real, warped_real, warped_real)
@@ -200,7 +191,7 @@ class _FixedBand:
         norm = cv2.max(cv2.multiply(energy, warped_energy, warped_energy), _MIN_ENERGY, warped_energy)
         mean = cv2.boxFilter(product, -1, (self.window_px, self.window_px), warped_imaginary)
         correlation = np.asarray(cv2.divide(mean, norm, norm))
-        return np.clip(correlation, np.float32(_MIN_CORRELATION), np.float32(1), out=correlation)
+        return np.clip(correlation, np.float32(min_correlation), np.float32(1), out=correlation)
 
 
 class _MovingBand:
@@ -245,7 +236,8 @@ class _MovingBand:
 
     def _correlation(self, positions: FloatImage, rows: slice, extended: slice) -> FloatImage:
         """Return the correlation in some rows from the positions in these and the rows around."""
-        border = (0.0, 0.0, _OUTSIDE_ENERGY, 0.0)
+        outside_energy = 1e3  # of windows with centres outside, so that the part inside has no correlation
+        border = (0.0, 0.0, outside_energy, 0.0)
         warped = np.asarray(cv2.remap(self.structure, positions[0], positions[1], cv2.INTER_LINEAR, borderValue=border))
         return self.fixed.correlation(warped, extended)[rows.start - extended.start :][: rows.stop - rows.start]
 

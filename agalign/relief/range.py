@@ -23,9 +23,6 @@ from agalign.values.mapping import PixelMapping
 
 Array = NDArray[np.float64]
 
-_NODES = 33
-"""Nodes along both axes of the grid on which mappings are evaluated."""
-
 
 def inverse_range(
     mappings: Sequence[PixelMapping],
@@ -44,7 +41,8 @@ def inverse_range(
     focal_px = np.array([reference_lens.fx_px, reference_lens.fy_px])
     weights = directions_m * focal_px
     low, high = points_px.reshape(-1, 2).min(axis=0), points_px.reshape(-1, 2).max(axis=0)
-    x, y = (np.linspace(a, max(b, a + 1), _NODES) for a, b in zip(low, high, strict=True))
+    node_count = 33  # along both axes of the grid on which mappings are evaluated
+    x, y = (np.linspace(a, max(b, a + 1), node_count) for a, b in zip(low, high, strict=True))
     nodes = np.stack(np.meshgrid(x, y), axis=-1)
     levels = float(parallax_px.min()), float(parallax_px.max()) + 1.0
     values = []
