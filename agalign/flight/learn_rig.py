@@ -26,16 +26,6 @@ _FACTOR_SETS: tuple[tuple[Factor, ...], ...] = (
     ("distance", "tilt", "motion"),
 )
 """Candidates in the order of preference: on parallel flight lines, motion alone resembles distance with motion."""
-_LAYOUT_STD = 0.015
-"""Standard error of the lens positions of a camera model, relative to the norm of all baselines."""
-_UNKNOWN_STD = 1000.0
-"""Standard deviation of the prior of parameters that only the captures determine."""
-_MAX_ITERATIONS, _CONVERGED = 20, 1e-4
-"""Of alternating least squares: the maximum change of the means, px, and of the baselines, of norm 1."""
-_MAX_FOLDS = 12
-"""Of the cross-validation: more folds take longer and change the errors little."""
-_MAX_ERROR_RATIO = 0.9
-"""A set of factors is preferred to the previous one if the ratio of the cross-validated errors is smaller."""
 
 
 def learn_rig(
@@ -92,7 +82,8 @@ class _Table:
         candidates = _FACTOR_SETS if len(self.median) > 1 else _FACTOR_SETS[:1]
         (factors, errors_px), *others = zip(candidates, apply(self.cross_validated_px, candidates), strict=True)
         for candidate, candidate_px in others:
-            if np.linalg.norm(candidate_px) < _MAX_ERROR_RATIO * np.linalg.norm(errors_px):
+            max_ratio = 0.9  # another set of factors is only used for a clear improvement
+            if np.linalg.norm(candidate_px) < max_ratio * np.linalg.norm(errors_px):
                 factors, errors_px = candidate, candidate_px
         return factors, errors_px
 
@@ -107,15 +98,18 @@ class _Table:
         weights, tensor = self.weights * is_used[:, None], design_tensor(factors)
         bands = np.hstack([np.zeros((len(self.median), 6)), self._initial(weights, factors)])
         of_offset = np.broadcast_to(np.eye(6).reshape(2, 3, 6), (len(weights), 2, 3, 6))
-        t_std = _UNKNOWN_STD if self.layout is None else _LAYOUT_STD
-        std = np.array([_UNKNOWN_STD] * 6 + [t_std, t_std, _UNKNOWN_STD])
-        for _ in range(_MAX_ITERATIONS):
+        unknown_std = 1000.0  # prior of parameters that only the captures determine
+        layout_std = 0.015  # of the lens positions of a camera model, relative to the norm of all baselines
+        t_std = unknown_std if self.layout is None else layout_std
+        std = np.array([unknown_std] * 6 + [t_std, t_std, unknown_std])
+        max_iterations, max_change = 20, 1e-4  # change of the means, px, and of the baselines, of norm 1
+        for _ in range(max_iterations):
             offset, lens = bands[:, :6].reshape(-1, 2, 3), bands[:, 6:]
             result, _ = least_squares(np.tensordot(lens, tensor, 1), self.differences - offset, weights)
             # The median is robust to a few captures at another height.
             result -= np.median(result[is_used > 0], axis=0)
             # Errors of the baselines displace captures far from the median factors, which therefore have less weight.
-            robust = cauchy_weights(np.linalg.norm(result[:, :3], axis=1), rig.MIN_STD_PX / _LAYOUT_STD)
+            robust = cauchy_weights(np.linalg.norm(result[:, :3], axis=1), rig.MIN_STD_PX / layout_std)
             design = np.concatenate([of_offset, np.moveaxis(tensor @ result.T, (3, 0), (0, 3))], axis=3)
             # Parameters that neither the layout nor the factors determine keep their values.
             known = lens if self.layout is None else np.column_stack([self.layout, lens[:, 2]])
@@ -123,7 +117,7 @@ class _Table:
             by_band = self.differences.swapaxes(0, 1), (weights * robust[:, None]).T
             estimate, _ = least_squares(design, *by_band, (prior, std), robust=False)
             previous, bands = bands, np.hstack([estimate[:, :6], _normalised(estimate[:, 6:], factors)])
-            if np.abs(bands - previous).max() < _CONVERGED:
+            if np.abs(bands - previous).max() < max_change:
                 break
         information = weights.T @ (result[:, :3] ** 2).sum(axis=1) + 1 / t_std**2
         return bands, np.minimum(1 / np.sqrt(information), 1.0), result
@@ -131,7 +125,8 @@ class _Table:
     def cross_validated_px(self, factors: Sequence[Factor]) -> Array:
         """Return (bands,) the RMS error of predictions from the other bands, in captures left out of the fit."""
         squares_px2, count = np.zeros(self.weights.shape), len(self.weights)
-        for folds in (min(count, _MAX_FOLDS), count):
+        max_folds = 12  # more take longer and change the errors little
+        for folds in (min(count, max_folds), count):
             left_out = np.arange(count) % folds == np.arange(folds)[:, None]
             # If a fold would contain all captures of a band, each capture is its own fold.
             if (~left_out @ self.weights > 0).all():

@@ -28,9 +28,6 @@ from agalign.values.files import complete_file, open_regular
 from agalign.values.geometry import Matrix, normalised
 
 _FORMAT = "agalign-model/1"
-_MAX_FILE_BYTES, _MAX_SIDES, _MAX_VALUE = 1 << 28, 512, 1e6
-"""Far above the size of a model, the number of sides of a network and of channels of a side, and its values, as weights
-are below 100 and mappings are in px: larger numbers indicate another or a damaged file."""
 
 
 @dataclass(frozen=True)
@@ -102,7 +99,8 @@ def load_model(path: Path, device: Callable[[], torch.device]) -> FlightModel:
 def _read_model(path: Path) -> FlightModel:
     facts, tensors = _read_contents(path)
     channels = [int(c) for c in json.loads(facts["channels"])]
-    if not 1 < len(channels) <= _MAX_SIDES or not all(0 < c <= _MAX_SIDES for c in channels):
+    max_count = 512  # of sides, and of channels of a side: far above those of a model, so the file is damaged
+    if not 1 < len(channels) <= max_count or not all(0 < c <= max_count for c in channels):
         raise ValueError(f"invalid numbers of channels: {channels[:8]}")
     net = Descriptor(facts["sharing"], channels, half_rectified=True, unit_length=True)
     net.load_state_dict(_with_prefix("theta.", tensors))
@@ -121,9 +119,11 @@ def _read_model(path: Path) -> FlightModel:
 
 def _read_contents(path: Path) -> tuple[dict[str, Any], dict[str, torch.Tensor]]:
     """Return the metadata and the tensors of a file after checking its size, format, checksum and values."""
+    max_mib = 256  # far above the size of a model: larger files are other files
+    max_value = 1e6  # weights are below 100 and mappings are in px
     with open_regular(path) as opened:
-        if os.fstat(opened.fileno()).st_size > _MAX_FILE_BYTES:
-            raise ValueError(f"it is larger than {_MAX_FILE_BYTES >> 20} MiB")
+        if os.fstat(opened.fileno()).st_size > max_mib << 20:
+            raise ValueError(f"it is larger than {max_mib} MiB")
     with safe_open(path, framework="pt") as file:
         facts = dict(file.metadata() or {})
         if facts.get("format") != _FORMAT:
@@ -134,8 +134,8 @@ def _read_contents(path: Path) -> tuple[dict[str, Any], dict[str, torch.Tensor]]
         raise ValueError("it has no checksum")
     if digest != _digest(tensors, facts):
         raise ValueError("it is damaged")
-    if not all((t.abs() <= _MAX_VALUE).all() for t in tensors.values()):  # also False for NaN
-        raise ValueError(f"it has values that are NaN or above {_MAX_VALUE:.0e}")
+    if not all((t.abs() <= max_value).all() for t in tensors.values()):  # also False for NaN
+        raise ValueError(f"it has values that are NaN or above {max_value:.0e}")
     return facts, tensors
 
 

@@ -19,24 +19,10 @@ from agalign.values.pixel_units import PixelScale
 
 Albedos = Mapping[str, float]
 """Reflectance of the panel as the user gives it, by band in lower case; the empty name is the default."""
-_MAX_CAPTURES_WITHOUT_PANEL = 3
-"""The search from either end of a flight stops after this many: panels are recorded before and after a flight."""
-_READERS = 4
-"""Threads that read captures."""
-_DETECTION_PX = 1600
-"""Longer side of the images in which panels are searched."""
 _MAX_TIME_DIFFERENCE_S = 6 * 3600.0
 """A panel does not represent the illumination many hours later."""
-_MAX_SATURATED_SHARE = 0.01
-"""Maximum share of saturated pixels, which bias the mean radiance."""
-_MAX_SENSOR_SCALE = 1.3
-"""Calibrated light sensors agree with panels within 20 %, except if a person, an aircraft or a cloud shades one."""
-_PANEL_HEIGHT_M = 1.0
-"""Height of the camera above a panel when it is recorded."""
 _MIN_HEIGHT_M = 3.0
 """Lower heights are within the error of the altitudes."""
-_MIN_CUES = 2
-"""A single cue also occurs in other captures."""
 
 
 @dataclass(frozen=True)
@@ -85,7 +71,9 @@ class PanelReading:
     @property
     def fits_sensor(self) -> bool:
         """False if the panel and the light sensor cannot have been in the same light."""
-        return 1 / _MAX_SENSOR_SCALE < (self.sensor_scale or 1.0) < _MAX_SENSOR_SCALE
+        # Calibrated sensors agree with panels within 20 %, except if a person, an aircraft or a cloud shades one.
+        max_scale = 1.3
+        return 1 / max_scale < (self.sensor_scale or 1.0) < max_scale
 
     @property
     def panel(self) -> Panel:
@@ -103,7 +91,8 @@ def with_panels(captures: Sequence[Capture], *, without_code: bool = False) -> l
     flights = flights_of(captures)
     ends = [end for flight in flights for end in _from_both_ends(flight)]
     medians_m = {c.label: median_m for flight in flights for median_m in [_median_altitude_m(flight)] for c in flight}
-    with without_warnings(), ThreadPoolExecutor(_READERS) as pool:
+    reader_count = 4  # threads
+    with without_warnings(), ThreadPoolExecutor(reader_count) as pool:
         results = pool.map(lambda end: _captures_of_panels(end, without_code), ends)
         of_panels = [c for result in results for c in result]
         judged = pool.map(lambda c: with_cues(c, medians_m[c.label]), of_panels)
@@ -118,7 +107,7 @@ def with_cues(capture: Capture, flight_altitude_m: float) -> Capture:
     roofs and sheets are bright squares.
     """
     cues = _panel_cues(capture, flight_altitude_m)
-    is_single = len(cues) < _MIN_CUES
+    is_single = len(cues) < 2
     bands = (
         b if b.panel is None else replace(b, panel=replace(b.panel, cues=cues, in_scene=b.panel.in_scene or is_single))
         for b in capture.bands
@@ -202,7 +191,8 @@ def with_height(capture: Capture, readings: Iterable[PanelReading]) -> Capture:
         return capture
     on_ground = [r.capture for _, r in _within_hours(readings, capture) if r.capture.is_of_a_panel]
     altitudes_m = [a for c in on_ground if c.position is not None and (a := c.position.altitude_m) is not None]
-    height_m = position.altitude_m - min(altitudes_m) + _PANEL_HEIGHT_M if altitudes_m else 0.0
+    above_panel_m = 1.0  # of the camera when a panel is recorded
+    height_m = position.altitude_m - min(altitudes_m) + above_panel_m if altitudes_m else 0.0
     if height_m <= _MIN_HEIGHT_M:
         return capture
     return replace(capture, pose=replace(pose, height_m=height_m, height_from="panel"))
@@ -231,6 +221,7 @@ def _from_both_ends(flight: Sequence[Capture]) -> tuple[list[Capture], list[Capt
 
 def _captures_of_panels(half: Sequence[Capture], without_code: bool) -> list[Capture]:
     """Return the captures with a panel, searched until several captures in a row contain none."""
+    max_without_panel = 3  # panels are recorded before and after a flight
     result: list[Capture] = []
     without_panel = 0
     for capture in half:
@@ -239,7 +230,7 @@ def _captures_of_panels(half: Sequence[Capture], without_code: bool) -> list[Cap
         examined = capture if is_known else _with_detected_panel(capture, without_code)
         without_panel = 0 if examined.panel is not None else without_panel + 1
         result += [examined] if examined.panel is not None else []
-        if without_panel == _MAX_CAPTURES_WITHOUT_PANEL:
+        if without_panel == max_without_panel:
             break
     return result
 
@@ -263,8 +254,9 @@ def _with_detected_panel(capture: Capture, without_code: bool) -> Capture:
 
 def _detect(band: Band, *, without_code: bool) -> DetectedPanel | None:
     """Detect the panel in a band; positions are px of the file. None without a panel or if the file is unreadable."""
+    longest_side_px = 1600  # of the image in which the panel is searched
     try:
-        image = read_for_alignment(band, _DETECTION_PX)
+        image = read_for_alignment(band, longest_side_px)
     except AgalignError:
         return None
     result = find_panel(replace(image, lens=None), without_code=without_code)
@@ -290,7 +282,8 @@ def _read(band: Band, albedos: Albedos) -> BandReading:
     except AgalignError as error:
         return BandReading(band, albedo, problem=str(error))
     problem = "it is black" if radiance is not None and not radiance > 0 else ""
-    if saturated > _MAX_SATURATED_SHARE:
+    max_saturated = 0.01  # share of pixels; saturated ones bias the mean radiance
+    if saturated > max_saturated:
         problem = f"{saturated:.0%} of it is saturated"
     return BandReading(band, albedo, radiance, problem)
 

@@ -45,8 +45,6 @@ FACTOR_STD_PX = (20.0, 3.0, 3.0, 20.0, 20.0)
 _FACTOR_PRIOR = np.zeros((1, FACTORS)), np.array(FACTOR_STD_PX)
 MIN_STD_PX = 0.05
 """Added in quadrature to the standard error of a mapping, which does not contain all errors."""
-_OUTLIER_PX = 0.3
-"""Residual of a band at which its robust weight is one half."""
 
 
 @dataclass(frozen=True)
@@ -139,12 +137,13 @@ def least_squares(
     x, y = design.reshape(len(design), 6, design.shape[-1]), target.reshape(*weights.shape, 6)
     mean, information = prior[0], 1 / prior[1] ** 2
     squares, products = x.swapaxes(1, 2) @ x, np.einsum("nkr,krp->nkp", y, x)
+    half_weight_px = 0.3  # residual of a mapping at which its robust weight is one half
     inlier = np.ones_like(weights)
     for _ in range(REWEIGHTINGS if robust else 1):
         covariance = np.linalg.inv(np.tensordot(weights * inlier, squares, 1) + np.diag(information))
         right_side = ((weights * inlier)[:, None] @ products)[:, 0] + mean * information
         result = (covariance @ right_side[..., None])[..., 0]
-        inlier = cauchy_weights(np.linalg.norm(y - np.moveaxis(x @ result.T, 2, 0), axis=2), _OUTLIER_PX)
+        inlier = cauchy_weights(np.linalg.norm(y - np.moveaxis(x @ result.T, 2, 0), axis=2), half_weight_px)
     return np.asarray(result), np.asarray(covariance)
 
 

@@ -29,17 +29,6 @@ Array = NDArray[np.float64]
 Captures = Sequence[CaptureFactors]
 Estimator = Literal["flight", "seconds", "altitude_m"]
 
-_ALTITUDE_SLOPE_STD_PX_PER_M = 1.5
-"""Prior of the change of the distance factor per metre of altitude: a baseline of 0.03 m, 20 m above the ground."""
-_MIN_ALTITUDE_SCATTER_PX = 0.5
-"""Minimum scatter of the distance factor around its linear regression on the altitude."""
-_MAX_MEDIAN_RATIO, _MIN_MEDIAN_PX = 6.0, 3.0
-"""A capture is an outlier if a factor exceeds the ratio times the flight's median, or times the minimum median."""
-_MAX_GAP_RATIO = 2.0
-"""An estimate is validated on captures with a gap of at most this ratio to the gap of the predicted capture."""
-_MIN_CAPTURES_FOR_ALTITUDE = 6
-"""With fewer captures, the estimator with the smallest error would be selected by chance."""
-
 
 def predict_band(rig: Rig, band: str, known: Observation) -> Prediction:
     """Predict the mapping of a band of the rig from the other bands of the capture, or if none is known from others."""
@@ -66,7 +55,8 @@ def extreme_mappings(rig: Rig, band: str) -> list[Matrix]:
         return [rig.mean[band]]
     factors = np.array([c.factors for c in rig.captures])
     median = np.median(np.abs(factors), axis=0)
-    outlyingness = (np.abs(factors) / (_MAX_MEDIAN_RATIO * np.maximum(median, _MIN_MEDIAN_PX))).max(axis=1)
+    max_ratio, min_median_px = 6.0, 3.0  # a capture is an outlier if a factor exceeds this ratio to the median
+    outlyingness = (np.abs(factors) / (max_ratio * np.maximum(median, min_median_px))).max(axis=1)
     # If every capture is an outlier in some factor, keep the least outlying one.
     factors = factors[outlyingness <= max(1.0, float(outlyingness.min()))]
     extremes = {int(i) for column in factors.T for i in (column.argmin(), column.argmax())}
@@ -166,12 +156,14 @@ def _from_captures(rig: Rig, band: str, known: Observation) -> Prediction:
     That is the leave-one-out error of the estimator for learned captures with similar gaps, or the difference between
     the captures used if that is larger.
     """
+    min_for_altitude = 6  # with fewer captures, the estimator with the smallest error would be selected by chance
+    max_gap_ratio = 2.0  # an estimate is validated on captures with at most this ratio to its gap
     design, results = rig.design(band), []
-    for estimator in get_args(Estimator)[: 3 if len(rig.captures) >= _MIN_CAPTURES_FOR_ALTITUDE else 2]:
+    for estimator in get_args(Estimator)[: 3 if len(rig.captures) >= min_for_altitude else 2]:
         estimate, tests = estimated_factors(known, rig.captures, estimator), _leave_one_out(rig, band, estimator)
         if estimate is not None and tests:
             factors, std, gap = estimate
-            similar = [square for other_gap, square in tests if other_gap <= _MAX_GAP_RATIO * gap]
+            similar = [square for other_gap, square in tests if other_gap <= max_gap_ratio * gap]
             squares = similar if len(similar) >= MIN_CAPTURES else [square for _, square in tests[:MIN_CAPTURES]]
             # The mean square of few captures may be small by chance.
             mean_px2 = float(np.mean(squares)) * (len(squares) + 1) / max(len(squares) - 1, 1)
@@ -202,6 +194,8 @@ def _altitude_error_px(rig: Rig, altitude_m: float | None) -> float:
         return 0.0
     x_m, y_px = (known - known.mean(axis=0)).T
     slope = float(x_m @ y_px) / max(float(x_m @ x_m), 1e-9)
-    scatter_px = max(float((y_px - slope * x_m).std()), _MIN_ALTITUDE_SCATTER_PX)
-    slope_std = 1 / np.sqrt(1 / _ALTITUDE_SLOPE_STD_PX_PER_M**2 + x_m @ x_m / scatter_px**2)
+    min_scatter_px = 0.5  # around the regression
+    scatter_px = max(float((y_px - slope * x_m).std()), min_scatter_px)
+    prior_std_px_per_m = 1.5  # a baseline of 0.03 m, 20 m above the ground
+    slope_std = 1 / np.sqrt(1 / prior_std_px_per_m**2 + x_m @ x_m / scatter_px**2)
     return float(np.abs(known[:, 0] - altitude_m).min() * (slope_std + abs(slope)))

@@ -18,8 +18,6 @@ MAX_SKY_TEXTURE = 0.015
 0.1 to 1 for crops, trees and soil."""
 LOOK_PX = 64
 """Longest side to which images are averaged: it suppresses noise and keeps textures of one hundredth of the image."""
-_DEGREE = 4
-"""Degree of the polynomial that models vignetting and the gradient of the sky."""
 _MIN_SHARE = 0.5
 """Minimum share of valid pixels for a texture, and of unsaturated ones for the median radiance."""
 
@@ -38,18 +36,13 @@ def relative_texture(image: Raster, black_level: float = 0.0) -> float | None:
         return None
     height, width = valid.shape
     y, x = np.mgrid[-1 : 1 : height * 1j, -1 : 1 : width * 1j]
-    terms = [x**i * y**j for i in range(_DEGREE + 1) for j in range(_DEGREE + 1 - i)]
+    degree = 4  # of the polynomial that models vignetting and the gradient of the sky
+    terms = [x**i * y**j for i in range(degree + 1) for j in range(degree + 1 - i)]
     basis, values = np.stack([t[valid] for t in terms], axis=-1), (pixels[valid] - black_level) / mean
     if len(values) <= len(terms):
         return None
     surface, *_ = np.linalg.lstsq(basis, values, rcond=None)
     return float((values - basis @ surface).std())
-
-
-_MIN_ELEVATION_DEG = 20.0
-"""Minimum elevation of the optical axis: half the field of view is about 20 degrees."""
-_MIN_CUES = 2
-"""A single cue also occurs in other captures."""
 
 
 @dataclass(frozen=True)
@@ -67,8 +60,9 @@ def sky_cues(capture: Capture) -> tuple[str, ...]:
     has texture, which alone is also true of fog and calm water. Pixels are read only if one of the first two holds.
     """
     cues = []
-    if capture.elevation_deg is not None and capture.elevation_deg > _MIN_ELEVATION_DEG:
-        cues.append(f"its tags point the camera more than {_MIN_ELEVATION_DEG:.0f} degrees above the horizon")
+    min_elevation_deg = 20.0  # half the field of view is about 20 degrees
+    if capture.elevation_deg is not None and capture.elevation_deg > min_elevation_deg:
+        cues.append(f"its tags point the camera more than {min_elevation_deg:.0f} degrees above the horizon")
     names = *capture.folder.parts, capture.name
     if any(re.search(r"(?:^|[-_. ])sky(?:$|[-_. ])", name, re.IGNORECASE) for name in names):
         cues.append("its folder or name contains 'sky'")
@@ -76,7 +70,8 @@ def sky_cues(capture: Capture) -> tuple[str, ...]:
     bands = [b for b in capture.bands if not is_thermal(b) and not b.companion]
     if cues and bands and all(map(_is_smooth, bands)):
         cues.append("no band has texture")
-    return tuple(cues) if len(cues) >= _MIN_CUES else ()
+    # A single cue also occurs in other captures.
+    return tuple(cues) if len(cues) >= 2 else ()
 
 
 def sky_captures(captures: Iterable[Capture]) -> tuple[list[SkyCapture], list[Capture]]:
