@@ -16,8 +16,8 @@ if TYPE_CHECKING:
     from agalign.api import align_capture as align_capture
     from agalign.api import align_folder as align_folder
     from agalign.api import warp_onto as warp_onto
-    from agalign.batch.report import CaptureReport as CaptureReport
-    from agalign.batch.report import FlightReports as FlightReports
+    from agalign.batch.capture_report import CaptureReport as CaptureReport
+    from agalign.batch.capture_report import FlightReports as FlightReports
     from agalign.cameras.discover import FolderScan as FolderScan
     from agalign.cameras.discover import discover as discover
     from agalign.config import CheckSettings as CheckSettings
@@ -59,7 +59,7 @@ if TYPE_CHECKING:
 
 _NAMES = {
     "api": "align align_capture align_folder warp_onto",
-    "batch.report": "CaptureReport FlightReports",
+    "batch.capture_report": "CaptureReport FlightReports",
     "cameras.discover": "FolderScan discover",
     "config": "CheckSettings DiscoverOptions FlightSettings JointSettings ReliefSettings RunOptions SeedSettings "
     "Settings WriteSettings",

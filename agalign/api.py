@@ -7,11 +7,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from agalign.batch.capture import process_capture, quiet
-from agalign.batch.report import CaptureReport, FlightReports
+from agalign.batch.capture_report import CaptureReport, FlightReports
+from agalign.batch.capture_task import process_capture, quiet
 from agalign.batch.run import run_flight
 from agalign.cameras.discover import discover
-from agalign.capture.align import align_pairs
+from agalign.capture.align_bands import align_pairs
 from agalign.capture.band_pair import BandPair, Candidates
 from agalign.capture.from_windows import without_extrapolated
 from agalign.capture.verification import with_metrics

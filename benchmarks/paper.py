@@ -15,8 +15,8 @@ from pathlib import Path
 import numpy as np
 from common import pyplot, run
 
+from agalign.evaluation.evaluate import Starts
 from agalign.evaluation.image_pairs import read_image
-from agalign.evaluation.run import Starts
 
 SPLIT_SEED, LEARNED = 2018, 20
 NAMES = ("VIS_{}.png", "NIR_TF_{}.png", "GT_{}.txt"), ("VI_{}_a.png", "VI_{}_b.png", "VI_{}_fixed_to_moving.txt")

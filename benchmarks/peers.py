@@ -26,8 +26,8 @@ from agalign.capture.seeding import best_seed
 from agalign.errors import AgalignError
 from agalign.evaluation.methods import elastix_affinity
 from agalign.method.match import to_8_bit
+from agalign.pixels.band_resampling import luma, warped
 from agalign.pixels.masks import raster_of
-from agalign.pixels.resample import luma, warped
 from agalign.pixels.structure import structure_field
 from agalign.values import geometry
 from agalign.values.geometry import Matrix

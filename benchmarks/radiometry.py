@@ -21,7 +21,7 @@ from common import print_head, print_row, run
 from agalign.cameras.discover import discover
 from agalign.cameras.light_sensor import horizontal_irradiance, sun_position
 from agalign.cameras.metadata import Tags, read_tags
-from agalign.flight import panels
+from agalign.flight import panel_readings
 from agalign.flight.groups import camera_key
 from agalign.pixels.landmarks import landmarks, matched_homography, matches
 from agalign.pixels.radiometry import calibrated, with_radiometry
@@ -89,11 +89,11 @@ def moment(tags: Tags) -> datetime:
 
 
 def main(folder: Path) -> None:
-    found = panels.with_panels(discover(folder).captures)
+    found = panel_readings.with_panels(discover(folder).captures)
     captures = [c for c in found if all(b.radiometry and b.radiometry.quantity == "radiance" for b in c.bands)]
     captures = [c for c in captures if all(b.radiometry.by_sun for b in c.bands)]
-    panels._MAX_SENSOR_SCALE = math.inf  # the formula of both is compared also for a shaded sensor
-    readings = [panels.read_panel(c, {}) for c in captures if c.panel is not None]
+    panel_readings._MAX_SENSOR_SCALE = math.inf  # the formula of both is compared also for a shaded sensor
+    readings = [panel_readings.read_panel(c, {}) for c in captures if c.panel is not None]
     print("Largest difference from the published formulas, relative to the median of the band:\n")
     print_head("captures", "camera", "radiance", "light sensor", "panel", "panel and light sensor")
     for name, group in itertools.groupby(captures, lambda c: c.reference.path.parent):
@@ -119,11 +119,12 @@ def main(folder: Path) -> None:
                 print_row(f"{a.name} {b.name}", len(rows), *(f"{v:.1%}" for v in np.median(np.abs(rows), axis=0)))
 
 
-def largest_differences(capture: Capture, readings: list[panels.PanelReading]) -> Image:
+def largest_differences(capture: Capture, readings: list[panel_readings.PanelReading]) -> Image:
     """Of radiance and reflectance by light sensor, panel, and both; nan without a panel of the camera."""
     without_sensor = [replace(b, radiometry=replace(b.radiometry, by_sun=None)) for b in capture.bands]
-    alone = panels.reflectance_factors(replace(capture, bands=tuple(without_sensor)), readings)
-    ways = ("camera", {}), ("sun", {}), ("panel", alone), ("panel", panels.reflectance_factors(capture, readings))
+    alone = panel_readings.reflectance_factors(replace(capture, bands=tuple(without_sensor)), readings)
+    both = panel_readings.reflectance_factors(capture, readings)
+    ways = ("camera", {}), ("sun", {}), ("panel", alone), ("panel", both)
     panel = next((r.capture for r in readings if camera_key(r.capture) == camera_key(capture)), None)
     result = np.full((len(ways), len(capture.bands)), np.nan)
     for i, band in enumerate(capture.bands):

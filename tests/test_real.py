@@ -10,13 +10,13 @@ import pytest
 from scipy.interpolate import CloughTocher2DInterpolator
 
 import agalign
-from agalign.batch.capture import process_capture
+from agalign.batch.capture_task import process_capture
 from agalign.cameras import rig_seed
 from agalign.cameras.discover import DiscoverOptions, discover
 from agalign.cameras.metadata import read_tags
 from agalign.cameras.micasense import MicaSense
 from agalign.config import FlightSettings, SeedSettings, Settings
-from agalign.flight.panels import read_panel, with_panels
+from agalign.flight.panel_readings import read_panel, with_panels
 from agalign.pixels.radiometry import calibrated
 from agalign.pixels.raster import open_raster, probe
 from agalign.products.sidecar_file import find_sidecars

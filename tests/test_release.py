@@ -10,7 +10,7 @@ import pytest
 import yaml
 
 from agalign import __version__
-from agalign.batch.capture import Task
+from agalign.batch.capture_task import Task
 from agalign.batch.run import Listener, capture_reports
 from agalign.batch.workers import own_processes
 from agalign.cameras.discover import discover

@@ -10,7 +10,8 @@ from functools import partial
 from pathlib import Path
 from typing import Self
 
-from agalign.batch.capture import (
+from agalign.batch.capture_report import CaptureReport
+from agalign.batch.capture_task import (
     Task,
     discard_outputs,
     do_capture,
@@ -19,29 +20,28 @@ from agalign.batch.capture import (
     quiet,
     refuse_to_overwrite,
 )
-from agalign.batch.learn import learn_flight, learning_fingerprint
+from agalign.batch.flight_learning import learn_flight, learning_fingerprint
 from agalign.batch.output_folder import is_full, locked
-from agalign.batch.report import CaptureReport
 from agalign.batch.workers import Run, failure_text, in_order, on_executor, own_processes, serially
 from agalign.cameras.discover import FolderScan
-from agalign.capture.align import PairProgress
+from agalign.capture.align_bands import PairProgress
 from agalign.config import RunOptions, Settings, WriteSettings
 from agalign.errors import AgalignError, ConfigurationError, InputError, OutputError, SidecarError
 from agalign.flight.fingerprint import fingerprint
 from agalign.flight.groups import camera_key, difference, flight_camera, flights_of, is_flight_of, model_names
 from agalign.flight.model import FlightModel, load_model, save_model
-from agalign.flight.panels import PanelReading, read_panel, reflectance_factors, with_height, with_panels
+from agalign.flight.panel_readings import PanelReading, read_panel, reflectance_factors, with_height, with_panels
 from agalign.flight.rig import Rig
 from agalign.flight.rig_file import read_rig
 from agalign.flight.sky import SkyCapture, sky_captures
 from agalign.method.device import choose_device, limit_threads
 from agalign.pixels.radiometry import with_radiometry
 from agalign.pixels.raster import without_warnings
+from agalign.products.excluded_captures import write_panels, write_sky
 from agalign.products.flight_map import FlightMap
 from agalign.products.footprint import above_elevation, missing_for_footprint, with_approximate_georeference
 from agalign.products.index_rasters import check_indices
 from agalign.products.layout import FlightLimits, flight_limits
-from agalign.products.panels import write_panels, write_sky
 from agalign.products.preview import preview_bytes
 from agalign.products.product import CapturePaths
 from agalign.products.run_record import ExclusionPart, RunPart, RunState, begun

@@ -14,8 +14,8 @@ from agalign.config import SeedSettings
 from agalign.errors import AgalignError
 from agalign.flight.model import FlightModel
 from agalign.flight.rig_prediction import unobserved_error_px
+from agalign.pixels.band_resampling import channel_mean, warped
 from agalign.pixels.raster import read_for_alignment
-from agalign.pixels.resample import channel_mean, warped
 from agalign.pixels.stripes import without_common_stripes
 from agalign.pixels.structure import blur_px
 from agalign.values import geometry
@@ -27,6 +27,7 @@ from agalign.values.geometry import Matrix
 from agalign.values.image import Raster
 from agalign.values.issues import NO_SUCH_SEED, UNREADABLE, Issue
 from agalign.values.mapping import PixelMapping
+from agalign.values.parallax import Parallax
 from agalign.values.pixel_units import (
     FixedFilePx,
     FixedImagePoints,
@@ -35,7 +36,6 @@ from agalign.values.pixel_units import (
     MovingImagePoints,
     PixelScale,
 )
-from agalign.values.relief import Parallax
 from agalign.verify.residuals import FixedWindows
 
 Candidates = Mapping[SeedKind, Matrix]

@@ -13,9 +13,9 @@ import numpy as np
 
 from agalign.errors import UnreadableFileError
 from agalign.flight.rig import distance_px
+from agalign.pixels.band_resampling import resample_tile
 from agalign.pixels.masks import learnable
 from agalign.pixels.raster import OpenRaster, open_raster, read_tile
-from agalign.pixels.resample import resample_tile
 from agalign.pixels.structure import structure_field
 from agalign.values.alignment import Alignment, Residual
 from agalign.values.capture import Band

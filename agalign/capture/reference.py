@@ -3,8 +3,8 @@
 from dataclasses import replace
 from functools import cached_property
 
+from agalign.pixels.band_resampling import channel_mean, shrink, textured
 from agalign.pixels.landmarks import LandmarkInput, Landmarks, landmarks
-from agalign.pixels.resample import channel_mean, shrink, textured
 from agalign.pixels.structure import Field, blur_px, structure_field, windowed_spectra
 from agalign.values.image import Raster
 from agalign.values.pixel_units import PixelScale

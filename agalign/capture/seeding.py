@@ -12,8 +12,8 @@ from agalign.flight.model import FlightModel
 from agalign.method.descriptor import Descriptor
 from agalign.method.match import match_seed, starter_for_matching
 from agalign.method.state import ImageGroup
+from agalign.pixels.band_resampling import channel_mean, textured, warped
 from agalign.pixels.landmarks import LANDMARK_INPUTS, landmarks, matched_homography
-from agalign.pixels.resample import channel_mean, textured, warped
 from agalign.pixels.structure import Peak, correlation_surfaces, find_peak, structure_field, windowed_spectra
 from agalign.values import geometry
 from agalign.values.alignment import Residual, Seed

@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from agalign.capture.band_pair import BandPair
-from agalign.pixels.resample import channel_mean, shrink
+from agalign.pixels.band_resampling import channel_mean, shrink
 from agalign.pixels.structure import Field, structure_field, windowed_spectra
 from agalign.values import geometry
 from agalign.values.alignment import Alignment, JointResult, Prediction, Residual, Seed

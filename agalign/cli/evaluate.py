@@ -42,9 +42,9 @@ def _evaluate(
     out: Annotated[Path | None, typer.Option("--out", "-o", help="CSV file with a row per pair and method.")] = None,
 ) -> None:
     """Evaluate descriptors and homographies on pairs with ground truth (Dong et al., 2018)."""
+    from agalign.evaluation.evaluate import Starts, as_csv, error_table, evaluate, precision_table
     from agalign.evaluation.image_pairs import find_pairs
     from agalign.evaluation.methods import method_named
-    from agalign.evaluation.run import Starts, as_csv, error_table, evaluate, precision_table
     from agalign.values.files import write_text
 
     chosen = methods or ["fast:pseudo-siamese", "fast:siamese", "sift"]
@@ -111,7 +111,7 @@ def _learn(
 ) -> None:
     """Learn one descriptor from pairs without labels, using those that can be aligned."""
     from agalign.config import Settings
-    from agalign.evaluation.learn import learn_descriptor, read_rough_pairs
+    from agalign.evaluation.descriptor_learning import learn_descriptor, read_rough_pairs
     from agalign.flight.model import save_model
     from agalign.values.alignment import Alignment
     from agalign.values.pixel_units import FixedImagePx

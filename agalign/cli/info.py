@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from agalign.cli.align import align
+from agalign.cli.align_commands import align
 from agalign.cli.command import Command, Given, config_text
 from agalign.cli.terminal import MAX_LISTED, ExitCode, Terminal, in_json
 from agalign.errors import ConfigurationError, UnreadableFileError
@@ -50,7 +50,7 @@ info = Command(_info, {"Input": "pattern reference bands order with_rgb ignore_m
 def _show_folder(folder: Path, options: dict[str, Any], terminal: Terminal, *, as_json: bool) -> int:
     """Print the captures of a folder, and return the exit code. Raises InputError if it contains no image."""
     from agalign.cameras.discover import discover
-    from agalign.cli.run import print_found
+    from agalign.cli.align_run import print_found
     from agalign.config import DiscoverOptions
     from agalign.flight.groups import camera_overviews
 
@@ -75,7 +75,7 @@ def _show_folder(folder: Path, options: dict[str, Any], terminal: Terminal, *, a
 
 def _rows(flight: "FolderScan") -> list[dict[str, Any]]:
     """Return what `info` prints about the captures of a folder, as JSON objects."""
-    from agalign.flight.panels import with_panels
+    from agalign.flight.panel_readings import with_panels
     from agalign.flight.sky import sky_captures
 
     sky, others = sky_captures(flight.captures)

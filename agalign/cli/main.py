@@ -13,7 +13,7 @@ import typer
 from typer.core import TyperGroup
 
 from agalign._version import __version__
-from agalign.cli.align import align, demo, onto
+from agalign.cli.align_commands import align, demo, onto
 from agalign.cli.doctor import doctor
 from agalign.cli.evaluate import evaluate, learn, surface
 from agalign.cli.field import mosaic, plots

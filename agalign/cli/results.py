@@ -25,7 +25,7 @@ def _report(
 ) -> int:
     """Rebuild the report and the summary from the sidecars."""
     from agalign.batch.output_folder import locked
-    from agalign.cli.run import explain
+    from agalign.cli.align_run import explain
     from agalign.products.report import write_pages
     from agalign.products.sidecar_file import run_sidecars
 
@@ -144,7 +144,7 @@ def _indices(
     """Compute spectral indices of aligned captures: rasters, pictures and a table of statistics."""
     from agalign.batch.index_run import index_tasks, run_indices, unit_of_run
     from agalign.batch.output_folder import locked
-    from agalign.cli.run import cluster, progress
+    from agalign.cli.align_run import cluster, progress
     from agalign.products.index_bands import RAW
 
     chosen = chosen_indices(index, formula or [])

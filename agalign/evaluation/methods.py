@@ -31,7 +31,7 @@ from agalign.method.paper import align_by_paper, pyramid
 from agalign.method.patches import Keypoints, bilinear, patch_positions, transform
 from agalign.method.refine import MovingBand, describe_fixed, refine
 from agalign.method.state import ImageGroup, JointState, ThetaStart
-from agalign.pixels.resample import channel_mean, luma, warped
+from agalign.pixels.band_resampling import channel_mean, luma, warped
 from agalign.values import geometry
 from agalign.values.alignment import JointResult, Seed
 from agalign.values.choices import Sharing

@@ -13,7 +13,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from agalign.method.patches import FOOTPRINT_PX, Keypoints, bilinear, footprint_radius, transform
-from agalign.pixels.resample import shrink
+from agalign.pixels.band_resampling import shrink
 from agalign.pixels.structure import gradient_magnitude
 from agalign.values import geometry, lens
 from agalign.values.displacement import DisplacementField

@@ -15,8 +15,8 @@ from agalign.errors import GeometryError
 from agalign.method.descriptor import PATCH_PX, REFERENCE, Descriptor, start_from, start_from_starter
 from agalign.method.levels import LevelImage, make_level_image
 from agalign.method.patches import Keypoints, footprint_radius, patch_positions, transform
+from agalign.pixels.band_resampling import eight_bit, luma, shrink
 from agalign.pixels.landmarks import robust_homography
-from agalign.pixels.resample import eight_bit, luma, shrink
 from agalign.values import geometry, lens
 from agalign.values.choices import Sharing
 from agalign.values.geometry import Matrix

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agalign.errors import GeometryError
-from agalign.pixels.resample import channel_mean, eight_bit, shrink
+from agalign.pixels.band_resampling import channel_mean, eight_bit, shrink
 from agalign.pixels.structure import gradient_magnitude
 from agalign.values import geometry, lens
 from agalign.values.geometry import Matrix, Points

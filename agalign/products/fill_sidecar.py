@@ -22,8 +22,8 @@ from agalign.values.capture import Band, Radiometry
 from agalign.values.choices import CaptureStatus
 from agalign.values.geometry import Points
 from agalign.values.mapping import PixelMapping
+from agalign.values.parallax import Relief
 from agalign.values.pixel_units import FixedFilePx
-from agalign.values.relief import Relief
 
 _GRIDS = ((17, 13), (33, 25), (65, 49), (129, 97))
 """Columns and rows of the sampled mapping, each with the points halfway between those of the one before; the first with

@@ -36,7 +36,7 @@ from agalign.products.product import GEOTIFF, CapturePaths, Product, ProductCont
 from agalign.values.capture import Band, Capture
 from agalign.values.files import file_name
 from agalign.values.image import Tile, reduced_size_px
-from agalign.values.resample import tiles
+from agalign.values.interpolation import tiles
 
 _MAX_STATISTICS_PX = 4_000_000
 """Percentiles of larger rasters are calculated from every second, third … row and column."""

@@ -26,9 +26,9 @@ from agalign.values.capture import Georeference
 from agalign.values.choices import MAX_PIXELS
 from agalign.values.geometry import Matrix
 from agalign.values.image import FloatImage, Mask, OutputGrid, Tile
+from agalign.values.interpolation import resample, source_window, tiles
 from agalign.values.mapping import PixelMapping
 from agalign.values.pixel_units import Size
-from agalign.values.resample import resample, source_window, tiles
 
 _TILE_PX = 512
 """Side of the tiles that are composed at once."""

@@ -31,7 +31,7 @@ from agalign.products.raster_file import as_type, with_nodata, write_raster
 from agalign.values.capture import Band, Capture
 from agalign.values.files import scratch_file
 from agalign.values.image import FloatImage, Mask, OutputGrid, Tile
-from agalign.values.resample import tiles
+from agalign.values.interpolation import tiles
 
 _MIN_PAN_WIDTH_NM = 200.0
 """Bandwidth from which a band is panchromatic: multispectral bands have 10 to 60 nm."""

@@ -18,9 +18,9 @@ from agalign.values import geometry
 from agalign.values.alignment import Alignment
 from agalign.values.capture import Radiometry
 from agalign.values.image import FloatImage, Mask, OutputGrid, Tile
+from agalign.values.interpolation import tiles
 from agalign.values.pixel_units import FixedFilePx
 from agalign.values.quality import MEANINGS, Quality
-from agalign.values.resample import tiles
 from agalign.verify.extrapolation import expected_error_px
 
 _LATTICE_PX = 16

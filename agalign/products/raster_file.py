@@ -17,9 +17,9 @@ from rasterio.shutil import copy as copy_dataset
 from agalign.cameras.tag_transfer import TransferredTags
 from agalign.cameras.tiff_directory import add_directories
 from agalign.config import WriteSettings
+from agalign.pixels.band_resampling import resample_tile
 from agalign.pixels.radiometry import calibrated
 from agalign.pixels.raster import GDAL_ENVIRONMENT, open_raster, read_tile, without_warnings
-from agalign.pixels.resample import resample_tile
 from agalign.products.checked_raster import (
     WORK_TILE_PX,
     Block,
@@ -35,7 +35,7 @@ from agalign.products.product import GEOTIFF
 from agalign.values.capture import Band, Capture, Quantity, Radiometry
 from agalign.values.choices import Interpolation
 from agalign.values.image import FloatImage, Mask, OutputGrid, Tile
-from agalign.values.resample import tiles
+from agalign.values.interpolation import tiles
 
 _FILL_DISTANCE_PX = 100.0
 """Search distance of the interpolation of occluded pixels: GDAL's default, wider than any occlusion."""

@@ -20,8 +20,8 @@ from agalign.values.image import OutputGrid
 from agalign.values.issues import Issue
 from agalign.values.lens import Lens
 from agalign.values.mapping import PixelMapping
+from agalign.values.parallax import Parallax, Relief
 from agalign.values.pixel_units import FixedFilePx
-from agalign.values.relief import Parallax, Relief
 from agalign.verify.checks import KINDS
 
 

@@ -15,8 +15,8 @@ from agalign.values import lens
 from agalign.values.alignment import Alignment
 from agalign.values.capture import Capture
 from agalign.values.image import OutputGrid
+from agalign.values.parallax import Relief
 from agalign.values.pixel_units import FixedFilePx
-from agalign.values.relief import Relief
 
 RELIEF_UNITS = {"parallax": "px", "confidence": "1", "range": "m"}
 """Units by layer of the raster."""

@@ -18,14 +18,14 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from agalign.pixels.resample import shrink
+from agalign.pixels.band_resampling import shrink
 from agalign.pixels.structure import structure_field
 from agalign.relief.semi_global import MAX_LARGE, aggregated, sub_label_minimum
 from agalign.values import geometry, lens
 from agalign.values.image import FloatImage, Raster
 from agalign.values.mapping import PixelMapping
+from agalign.values.parallax import Relief
 from agalign.values.pixel_units import PixelScale
-from agalign.values.relief import Relief
 
 Costs = NDArray[np.uint8]
 """(levels, height, width): truncated 1 - correlation of one band, in units of 1 / _UNIT_COST."""

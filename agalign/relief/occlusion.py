@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agalign.values.image import Mask
-from agalign.values.relief import Relief
+from agalign.values.parallax import Relief
 
 
 def nearer_sign(relief: Relief, baselines: NDArray[np.float64]) -> int:

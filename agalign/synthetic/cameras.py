@@ -7,7 +7,7 @@ import tifffile
 from numpy.typing import NDArray
 
 from agalign.cameras.tiff_directory import Directory, Entry, add_directories, byte_string, rational, short, text
-from agalign.synthetic.rig import PIXELS_PER_MM, BandSpec, CameraSpec, Exposure, Pose
+from agalign.synthetic.camera_model import PIXELS_PER_MM, BandSpec, CameraSpec, Exposure, Pose
 
 BLACK_LEVEL, WHITE_LEVEL = 4800.0, 52000.0
 EXPOSURE_S = 1.3e-3

@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import expit
 
+from agalign.synthetic.camera_model import FOCAL_LENGTH_MM, PIXELS_PER_MM, BandSpec, CameraSpec, Pose, place_and_rays
 from agalign.synthetic.cameras import REDEDGE
-from agalign.synthetic.rig import FOCAL_LENGTH_MM, PIXELS_PER_MM, BandSpec, CameraSpec, Pose, place_and_rays
 from agalign.values import lens
 from agalign.values.geometry import Points
 

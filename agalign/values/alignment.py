@@ -14,10 +14,10 @@ from agalign.values import geometry
 from agalign.values.choices import Geometry, Interpolation, ModelFamily, PairStatus, PredictionSource, SeedKind, Space
 from agalign.values.geometry import Matrix, Points
 from agalign.values.image import Mask
+from agalign.values.interpolation import planes_of, resample_planes
 from agalign.values.issues import SEED_DOES_NOT_FIT, Issue, explanation, sentence
 from agalign.values.mapping import PixelMapping
 from agalign.values.pixel_units import SAME_PIXELS, FixedFilePx, FixedImagePx, FixedPx, MovingFilePx, PixelScale, Size
-from agalign.values.resample import planes_of, resample_planes
 
 MIN_RETRIEVAL = 0.2
 """Minimum held-out retrieval: below it psi is not updated and no result is accepted. Chance is below 0.01; unrelated

@@ -14,8 +14,8 @@ from agalign.values.displacement import DisplacementField
 from agalign.values.geometry import Matrix, Points
 from agalign.values.image import Mask, Tile
 from agalign.values.lens import Lens
+from agalign.values.parallax import Parallax, between_levels
 from agalign.values.pixel_units import PixelScale
-from agalign.values.relief import Parallax, between_levels
 
 _KNOT_STEP_PX = 32
 """Distance of the knots of interpolated curved mappings: the error with real lenses is below 0.0001 px."""

@@ -15,7 +15,7 @@ from scipy.linalg import solveh_banded
 from scipy.sparse import diags, identity, kron, vstack
 from scipy.spatial import cKDTree
 
-from agalign.pixels.resample import warped
+from agalign.pixels.band_resampling import warped
 from agalign.pixels.structure import Field
 from agalign.values.alignment import Residual
 from agalign.values.displacement import DisplacementField

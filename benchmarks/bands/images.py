@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from synthetic_flights import troubles
 
-from agalign.pixels.resample import warped
+from agalign.pixels.band_resampling import warped
 from agalign.synthetic.ground import Field
 from agalign.values import lens
 from agalign.values.files import file_checksum

@@ -40,9 +40,9 @@ from synthetic_flights.aligned import make_aligned
 
 from agalign.cameras.discover import discover
 from agalign.errors import AgalignError
-from agalign.flight.panels import with_panels
+from agalign.flight.panel_readings import with_panels
 from agalign.flight.sky import sky_captures
-from agalign.pixels.panel import find_panel
+from agalign.pixels.panel_detection import find_panel
 from agalign.products.indices import compute, index_of_formula
 from agalign.products.sidecar_file import find_sidecars
 from agalign.relief.dense import DenseMatching, View

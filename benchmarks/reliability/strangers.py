@@ -51,7 +51,7 @@ TAG_OPTIONS = (
 )
 PRELOADED = (
     *("geopandas", "exactextract", "agalign.products.plots", "agalign.products.mosaic", "agalign.products.export"),
-    *("agalign.batch", "agalign.cli.run", "agalign.products.stac", "pystac"),
+    *("agalign.batch", "agalign.cli.align_run", "agalign.products.stac", "pystac"),
 )
 MAX_S, MAX_BYTES = 20, 4 << 30
 """Limits of a command: time, and memory beyond that of this process."""

@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from agalign.cameras.tiff_directory import rational
+from agalign.synthetic.camera_model import BandSpec, CameraSpec, Exposure, to_plane
 from agalign.synthetic.cameras import BLACK_LEVEL, EXPOSURE_S, WHITE_LEVEL, MicaSenseCamera, write_tiff
-from agalign.synthetic.rig import BandSpec, CameraSpec, Exposure, to_plane
 from agalign.values import geometry
 
 _HERE = Path(__file__).parent

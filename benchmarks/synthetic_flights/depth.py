@@ -12,10 +12,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from agalign.synthetic.camera_model import BandSpec, CameraSpec, Exposure, Pose
 from agalign.synthetic.cameras import BANDS, REFERENCE, MicaSenseCamera
 from agalign.synthetic.flight import VIGNETTING, recorded
 from agalign.synthetic.ground import Field
-from agalign.synthetic.rig import BandSpec, CameraSpec, Exposure, Pose
 from synthetic_flights.materials import Textures, reflectances, sample
 from synthetic_flights.patches import Eye, Hits, Patch, boxes_of, nearer, nearest
 

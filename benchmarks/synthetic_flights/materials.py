@@ -6,8 +6,8 @@ import cv2
 import numpy as np
 from scipy.special import expit
 
+from agalign.synthetic.camera_model import BandSpec
 from agalign.synthetic.ground import Field
-from agalign.synthetic.rig import BandSpec
 
 _SIDE_IN_WIDTHS = 3.0
 """Texels of a tile for each pixel of the image's width. A texel is half a pixel at the nearest range, so a tile covers

@@ -6,10 +6,10 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from agalign.synthetic.camera_model import Pose
 from agalign.synthetic.cameras import REDEDGE
 from agalign.synthetic.flight import Shot, write_shots
 from agalign.synthetic.ground import Field, Ground, paint_ground
-from agalign.synthetic.rig import Pose
 
 PANEL_CODE, PANEL_ALBEDO = "RP04-0000001-SY_04005101000510", 0.51
 """51.0 % at 400 nm and at 1000 nm."""

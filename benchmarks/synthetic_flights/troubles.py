@@ -9,10 +9,10 @@ import cv2
 import numpy as np
 from scipy.special import expit
 
+from agalign.synthetic.camera_model import CameraSpec, Pose
 from agalign.synthetic.cameras import REDEDGE
 from agalign.synthetic.flight import Shot, write_shots
 from agalign.synthetic.ground import Field, Ground, paint_ground
-from agalign.synthetic.rig import CameraSpec, Pose
 from synthetic_flights.cameras import MAVIC
 
 _HEIGHT_M = 28.0

@@ -12,9 +12,9 @@ import torch
 
 import agalign
 from agalign.batch import CaptureReport, RunOptions, learning_tasks, run_flight
-from agalign.batch import capture as batch_capture
-from agalign.batch import learn as batch_learn
-from agalign.batch.learn import learning_fingerprint
+from agalign.batch import capture_task as batch_capture
+from agalign.batch import flight_learning as batch_learn
+from agalign.batch.flight_learning import learning_fingerprint
 from agalign.batch.run import _limits_of_cameras
 from agalign.flight.groups import camera_key, flights_of, model_names
 from agalign.flight.model import FlightModel, load_model, save_model

@@ -17,8 +17,8 @@ import pytest
 
 import agalign
 from agalign.batch import RunOptions, dask_executor, run_flight, workers
-from agalign.batch.capture import Task
-from agalign.batch.report import CaptureReport
+from agalign.batch.capture_report import CaptureReport
+from agalign.batch.capture_task import Task
 from agalign.batch.run import Listener, capture_reports
 from agalign.batch.workers import DaskExecutor, Run, in_order, on_executor, own_processes
 from agalign.cameras.discover import discover

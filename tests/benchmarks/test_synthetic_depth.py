@@ -14,8 +14,8 @@ from synthetic_flights.relief import make_scene
 from agalign.cameras import rig_seed
 from agalign.cameras.discover import discover
 from agalign.pixels.structure import structure_field
+from agalign.synthetic.camera_model import CameraSpec, Pose, to_plane
 from agalign.synthetic.flight import recorded
-from agalign.synthetic.rig import CameraSpec, Pose, to_plane
 from agalign.values import geometry
 from agalign.values.image import Raster
 from agalign.verify.residuals import FixedWindows

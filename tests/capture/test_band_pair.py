@@ -10,7 +10,7 @@ from synthetic_flights.troubles import make_two_headings
 import agalign
 from agalign.cameras.discover import DiscoverOptions, discover
 from agalign.capture import band_pair
-from agalign.capture.align import align_capture_bands
+from agalign.capture.align_bands import align_capture_bands
 from agalign.capture.band_pair import _candidate_std_px, longest_for, read_pairs
 from agalign.capture.prediction import observed
 from agalign.config import SeedSettings, Settings

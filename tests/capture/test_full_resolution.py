@@ -11,7 +11,7 @@ import tifffile
 
 from agalign.cameras.discover import discover
 from agalign.capture import full_resolution
-from agalign.capture.align import align_capture_bands
+from agalign.capture.align_bands import align_capture_bands
 from agalign.capture.full_resolution import at_full_resolution
 from agalign.config import JointSettings, Settings
 from agalign.errors import UnreadableFileError
@@ -66,7 +66,7 @@ def error_px(result: dict[str, Alignment]) -> float:
 
 def test_a_result_of_reduced_images_is_refined_on_the_files(capture: Capture, monkeypatch: pytest.MonkeyPatch) -> None:
     at_full = error_px(align_reduced(capture, monkeypatch, 400))
-    monkeypatch.setattr("agalign.capture.align.at_full_resolution", lambda _r, _m, alignment: alignment)
+    monkeypatch.setattr("agalign.capture.align_bands.at_full_resolution", lambda _r, _m, alignment: alignment)
     reduced = error_px(align_reduced(capture, monkeypatch, 400))
     assert at_full < 0.05
     assert at_full < 0.5 * reduced

@@ -13,10 +13,10 @@ import torch
 
 import agalign
 from agalign.batch import CaptureReport, learning_tasks
-from agalign.batch.learn import learn_flight
+from agalign.batch.flight_learning import learn_flight
 from agalign.cameras.discover import discover
-from agalign.capture import align
-from agalign.capture.align import align_capture_bands, align_pairs
+from agalign.capture import align_bands
+from agalign.capture.align_bands import align_capture_bands, align_pairs
 from agalign.capture.band_pair import read_pairs
 from agalign.capture.prediction import with_predictions
 from agalign.config import CheckSettings, Settings
@@ -117,7 +117,7 @@ def test_mappings_that_learning_refined_are_verified_and_not_refined_again(
             refined.append(number)
             return refine_with(*arguments)
 
-        monkeypatch.setattr(align, "refine_with", refine)
+        monkeypatch.setattr(align_bands, "refine_with", refine)
         return {a.status for a in bands_of(five, number, model).values()}
 
     assert statuses(0, model) == {"aligned"}

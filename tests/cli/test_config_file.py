@@ -8,9 +8,9 @@ import pytest
 from synthetic_flights.aligned import make_aligned
 
 import agalign
-from agalign.cli import align as cli_align
+from agalign.cli import align_commands as cli_align
+from agalign.cli import align_run as cli_run
 from agalign.cli import main
-from agalign.cli import run as cli_run
 from agalign.synthetic import flight as synthetic
 
 from ..program import agalign_here

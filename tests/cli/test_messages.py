@@ -12,7 +12,7 @@ import agalign
 from agalign.batch import CaptureReport
 from agalign.cameras.discover import DiscoverOptions, FolderScan, Problem, discover
 from agalign.cli import main
-from agalign.cli.run import RunTotals, conclude, print_problems
+from agalign.cli.align_run import RunTotals, conclude, print_problems
 from agalign.cli.terminal import Terminal, exits, shown
 from agalign.errors import ConfigurationError, InputError, UnreadableFileError
 from agalign.flight.groups import camera_overviews

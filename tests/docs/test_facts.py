@@ -12,10 +12,10 @@ from pathlib import Path
 
 import pytest
 
-from agalign.capture import band_pair, reference, relief
+from agalign.capture import band_pair, reference, relief_candidate
 from agalign.cli.main import COMMANDS
 from agalign.cli.terminal import ExitCode
-from agalign.flight import panels
+from agalign.flight import panel_readings
 from agalign.method import refine
 from agalign.pixels import raster
 from agalign.products.registry import PRODUCTS
@@ -118,7 +118,7 @@ def calls(module: str, function: str) -> Iterator[ast.Call]:
 
 def test_events_of_a_run_and_their_fields() -> None:
     fields: dict[str, set[str]] = {}
-    for call in calls("cli/run.py", "event"):
+    for call in calls("cli/align_run.py", "event"):
         if isinstance(call.args[0], ast.Constant):
             names = {k.arg for k in call.keywords if k.arg is not None}
             fields.setdefault(str(call.args[0].value), set()).update(names)
@@ -131,7 +131,8 @@ def test_events_of_a_run_and_their_fields() -> None:
 
 def test_stages_of_a_capture() -> None:
     stages = set()
-    for path in (*(PACKAGE / "capture").glob("*.py"), *(PACKAGE / "method").glob("*.py"), PACKAGE / "batch/capture.py"):
+    paths = *(PACKAGE / "capture").glob("*.py"), *(PACKAGE / "method").glob("*.py"), PACKAGE / "batch/capture_task.py"
+    for path in paths:
         for name in ("progress", "report"):
             for call in calls(str(path.relative_to(PACKAGE)), name):
                 stages |= {str(a.value) for a in call.args if isinstance(a, ast.Constant) and isinstance(a.value, str)}
@@ -151,8 +152,8 @@ LIMITS = {
         f"| the larger of {checks.MAX_UNEXPECTED_PX:g} px and {checks._MAX_UNEXPECTED_STD:g} standard errors |",
         f"in blurred images they have {reference._LARGE_WINDOW_PX} px",
         f"by more than {refine._FINAL_CONVERGED_PX:g} px",
-        f"the p95 of the parallax is at least {relief._MIN_PARALLAX_PX:g} px",
-        f"more than {relief._MAX_FAR_SHARE:.0%} of the windows".replace("%", " %"),
+        f"the p95 of the parallax is at least {relief_candidate._MIN_PARALLAX_PX:g} px",
+        f"more than {relief_candidate._MAX_FAR_SHARE:.0%} of the windows".replace("%", " %"),
         f"nodes every {displacement_field._LATTICE_PX} px",
         f"fitted to windows of {displacement_field._WINDOW_PX} px",
         f"Images above {band_pair._LONGEST_SIDE_PX} px",
@@ -162,7 +163,7 @@ LIMITS = {
         f"The largest parallax is {dense._SEARCH_NEARER:.0%} of".replace("%", " %"),
         f"and {dense._SEARCH_FARTHER:.0%} behind it".replace("%", " %"),
     ),
-    "radiometry.md": (f"calibration panels at most {panels._MAX_TIME_DIFFERENCE_S / 3600:g} hours away",),
+    "radiometry.md": (f"calibration panels at most {panel_readings._MAX_TIME_DIFFERENCE_S / 3600:g} hours away",),
     "reliability.md": (f"{raster._MAX_BANDS} bands per file",),
 }
 """{page: sentences with a limit of the program}."""

@@ -14,8 +14,9 @@ from agalign.capture.seeding import find_seed
 from agalign.cli.main import app
 from agalign.config import JointSettings, SeedSettings, Settings
 from agalign.errors import ConfigurationError, InputError
+from agalign.evaluation.descriptor_learning import learn_descriptor
+from agalign.evaluation.evaluate import Starts, as_csv, error_table, evaluate, precision_table
 from agalign.evaluation.image_pairs import PairFiles
-from agalign.evaluation.learn import learn_descriptor
 from agalign.evaluation.methods import (
     PairTask,
     average_precision,
@@ -25,7 +26,6 @@ from agalign.evaluation.methods import (
     method_named,
     sift_of_patches,
 )
-from agalign.evaluation.run import Starts, as_csv, error_table, evaluate, precision_table
 from agalign.evaluation.surface import draw_surface, loss_surface
 from agalign.flight.model import load_model, save_model
 from agalign.method.descriptor import Descriptor

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 import torch
 
-from agalign.batch.learn import learn_flight
+from agalign.batch.flight_learning import learn_flight
 from agalign.cameras.discover import DiscoverOptions, discover
-from agalign.capture.align import align_capture_bands
+from agalign.capture.align_bands import align_capture_bands
 from agalign.config import JointSettings, SeedSettings, Settings
 from agalign.errors import ConfigurationError
 from agalign.flight.model import load_model, save_model

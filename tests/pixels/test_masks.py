@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from agalign.flight.sky import MAX_SKY_TEXTURE, relative_texture
+from agalign.pixels.band_resampling import channel_mean, eight_bit, luma
 from agalign.pixels.masks import data_mask, learnable, undeclared_fill
-from agalign.pixels.resample import channel_mean, eight_bit, luma
 from agalign.values.image import Raster
 
 from ..builders import whole

@@ -2,7 +2,7 @@ import cv2
 import numpy as np
 import pytest
 
-from agalign.pixels.resample import shrink, textured
+from agalign.pixels.band_resampling import shrink, textured
 from agalign.pixels.structure import (
     correlation_surfaces,
     find_peak,

@@ -12,8 +12,8 @@ from synthetic_flights.troubles import make_two_headings
 
 import agalign
 from agalign.products.sidecar_file import find_sidecars
+from agalign.synthetic.camera_model import CameraSpec
 from agalign.synthetic.cameras import REDEDGE
-from agalign.synthetic.rig import CameraSpec
 
 from ..conftest import Shared, read_json, seeded
 

@@ -12,8 +12,8 @@ from agalign.cameras.pix4d import vignetting_on_grid
 from agalign.products import aligned_files
 from agalign.products.export import export
 from agalign.products.sidecar_file import find_sidecars
+from agalign.synthetic.camera_model import CameraSpec
 from agalign.synthetic.cameras import REDEDGE
-from agalign.synthetic.rig import CameraSpec
 from agalign.values import geometry
 from agalign.values.capture import Radiometry
 from agalign.values.choices import ExportProgram

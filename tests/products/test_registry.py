@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 import agalign
-from agalign.batch import capture as batch_capture
+from agalign.batch import capture_task as batch_capture
 from agalign.products.product import Product, ProductContext, StacAsset, WrittenFile
 from agalign.products.registry import PRODUCTS
 from agalign.values.files import write_text

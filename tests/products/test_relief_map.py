@@ -14,7 +14,7 @@ from synthetic_flights.depth import CLOSE_RANGE, Truth, write_capture
 from synthetic_flights.relief import make_scene
 
 import agalign
-from agalign.batch import capture as batch
+from agalign.batch import capture_task as batch
 from agalign.cameras import pix4d, rig_seed
 from agalign.cameras.metadata import Tags
 from agalign.products.fill_sidecar import sidecar_of
@@ -30,8 +30,8 @@ from agalign.values.displacement import DisplacementField
 from agalign.values.image import OutputGrid, Tile
 from agalign.values.issues import RETRIEVAL, Issue
 from agalign.values.mapping import PixelMapping
+from agalign.values.parallax import Parallax, Relief
 from agalign.values.pixel_units import PixelScale
-from agalign.values.relief import Parallax, Relief
 
 from .test_sidecar import context_of
 

@@ -28,7 +28,7 @@ import numpy as np
 import psutil
 import tifffile
 
-from agalign.cli import run as cli_run
+from agalign.cli import align_run as cli_run
 from agalign.errors import SidecarError
 from agalign.products.sidecar_file import find_sidecars, read_sidecar
 from agalign.values.files import RUN_FILE

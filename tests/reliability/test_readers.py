@@ -25,7 +25,7 @@ from agalign.errors import AgalignError, InputError, SidecarError
 from agalign.flight.model import FlightModel, load_model, save_model
 from agalign.method.descriptor import Descriptor
 from agalign.pixels.raster import probe
-from agalign.products.panels import read_panels
+from agalign.products.excluded_captures import read_panels
 from agalign.products.run_record import read_run_record
 from agalign.products.sidecar_file import read_result, read_sidecar
 from agalign.values.capture import Band

@@ -16,7 +16,7 @@ import pytest
 import torch
 from common import WRONG_PX, band_errors, read_ties
 
-from agalign.batch import capture as batch
+from agalign.batch import capture_task as batch
 from agalign.cameras import known_cameras
 from agalign.cameras.discover import discover
 from agalign.cameras.grouping import capture_of
@@ -24,9 +24,9 @@ from agalign.cameras.read_files import read_file
 from agalign.config import DiscoverOptions
 from agalign.errors import SidecarError
 from agalign.flight.model import FlightModel, load_model, save_model
+from agalign.products.excluded_captures import PANELS_FILE, SKY_FILE, read_panels, read_sky
 from agalign.products.flight_map import FLIGHT_MAP_FILE, features_in
 from agalign.products.index_table import INDICES_FILE, read_table
-from agalign.products.panels import PANELS_FILE, SKY_FILE, read_panels, read_sky
 from agalign.products.run_record import read_run_record
 from agalign.products.sidecar_file import find_sidecars, read_sidecar
 from agalign.products.text_files import write_csv

@@ -17,7 +17,7 @@ from agalign.relief.adjustment import (
 from agalign.synthetic import cameras
 from agalign.values import geometry
 from agalign.values.mapping import PixelMapping
-from agalign.values.relief import Parallax, Relief
+from agalign.values.parallax import Parallax, Relief
 
 from ..builders import residual_of
 

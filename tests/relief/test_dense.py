@@ -10,7 +10,7 @@ from agalign.relief import dense
 from agalign.relief.dense import DenseMatching, View
 from agalign.values.image import Raster
 from agalign.values.mapping import PixelMapping
-from agalign.values.relief import Relief
+from agalign.values.parallax import Relief
 
 from ..builders import whole
 from ..conftest import textured_image

@@ -6,8 +6,8 @@ import pytest
 
 from agalign.relief.occlusion import nearer_sign, occluded
 from agalign.values.image import Mask
+from agalign.values.parallax import Relief
 from agalign.values.pixel_units import SAME_PIXELS, PixelScale
-from agalign.values.relief import Relief
 
 HEIGHT, WIDTH = 60, 90
 BOX = slice(20, 40), slice(30, 55)

@@ -8,7 +8,7 @@ from agalign.relief.range import inverse_range
 from agalign.values import lens
 from agalign.values.lens import Lens
 from agalign.values.mapping import PixelMapping
-from agalign.values.relief import Parallax, Relief
+from agalign.values.parallax import Parallax, Relief
 
 SIZE = 320, 240
 REFERENCE = Lens(400.0, 402.0, 158.0, 121.0)

@@ -10,8 +10,8 @@ from agalign.values import geometry, lens
 from agalign.values.displacement import DisplacementField
 from agalign.values.image import Tile
 from agalign.values.mapping import PixelMapping
+from agalign.values.parallax import Parallax, Relief, between_levels
 from agalign.values.pixel_units import SAME_PIXELS, PixelScale
-from agalign.values.relief import Parallax, Relief, between_levels
 
 SIZE = 640, 480
 H = np.array([[1.01, 0.02, 5.0], [-0.01, 0.99, -3.0], [2e-5, -4e-5, 1.0]])

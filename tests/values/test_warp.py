@@ -14,7 +14,7 @@ from agalign.values.choices import Interpolation
 from agalign.values.displacement import DisplacementField
 from agalign.values.image import Tile
 from agalign.values.mapping import PixelMapping
-from agalign.values.relief import Parallax, Relief
+from agalign.values.parallax import Parallax, Relief
 
 SIZE = 320, 240
 H = np.array([[1.01, 0.02, 5.0], [-0.01, 0.99, -3.0], [2e-5, -4e-5, 1.0]])

@@ -18,8 +18,8 @@ from jinja2 import Environment, PackageLoader, StrictUndefined, select_autoescap
 from agalign._version import __version__
 from agalign.config import Settings
 from agalign.errors import SidecarError
+from agalign.products.excluded_captures import PANELS_FILE, SKY_FILE, PanelPart, SkyPart, read_panels, read_sky
 from agalign.products.index_table import IndexRow, rows_of_run, update_table
-from agalign.products.panels import PANELS_FILE, SKY_FILE, PanelPart, SkyPart, read_panels, read_sky
 from agalign.products.report.facts import BAND_COLUMNS, FailureGroup, FlightFacts, masked_shares
 from agalign.products.report.light import light_charts
 from agalign.products.report.radiometric_check import CaptureLevels, radiometric_check

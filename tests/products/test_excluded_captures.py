@@ -17,7 +17,7 @@ import agalign
 from agalign.batch import RunOptions
 from agalign.config import Settings, WriteSettings
 from agalign.errors import SidecarError
-from agalign.products.panels import PANELS_FILE, SKY_FILE, read_sky
+from agalign.products.excluded_captures import PANELS_FILE, SKY_FILE, read_sky
 from agalign.products.report import write_pages
 
 from ..conftest import Shared, read_json, seeded

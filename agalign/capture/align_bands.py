@@ -10,7 +10,7 @@ from agalign.capture.from_windows import from_windows, without_extrapolated
 from agalign.capture.full_resolution import at_full_resolution
 from agalign.capture.map_estimate import map_estimate
 from agalign.capture.prediction import bands_to_learn, with_predictions
-from agalign.capture.relief import ReliefCandidate, aligned_by_relief
+from agalign.capture.relief_candidate import ReliefCandidate, aligned_by_relief
 from agalign.capture.seeding import find_seed, image_groups
 from agalign.capture.verification import (
     WarpedPair,

@@ -10,7 +10,7 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
 from agalign.errors import AgalignError
-from agalign.flight.panels import BandReading, PanelReading
+from agalign.flight.panel_readings import BandReading, PanelReading
 from agalign.flight.sky import SkyCapture, sky_radiance
 from agalign.pixels.raster import read_preview
 from agalign.products.drawing import Picture, side_by_side, titled, write_png

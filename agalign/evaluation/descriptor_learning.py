@@ -11,7 +11,7 @@ from pathlib import Path
 
 import torch
 
-from agalign.capture.align import align_pairs
+from agalign.capture.align_bands import align_pairs
 from agalign.capture.band_pair import BandPair
 from agalign.config import Settings
 from agalign.errors import InputError, NoContrastError, NotEnoughTextureError

@@ -9,11 +9,11 @@ import pytest
 from synthetic_flights.depth import CLOSE_RANGE, Scene, Truth, truth_of, view
 from synthetic_flights.relief import make_scene
 
-from agalign.capture import align
-from agalign.capture.align import verify_together
+from agalign.capture import align_bands
+from agalign.capture.align_bands import verify_together
 from agalign.capture.band_pair import BandPair
 from agalign.capture.reference import Reference
-from agalign.capture.relief import (
+from agalign.capture.relief_candidate import (
     _MIN_PARALLAX_PX,
     ReliefCandidate,
     ReliefResult,
@@ -25,8 +25,8 @@ from agalign.capture.relief import (
 from agalign.capture.verification import WarpedPair
 from agalign.config import JointSettings, ReliefSettings, Settings
 from agalign.relief.range import inverse_range
+from agalign.synthetic.camera_model import BandSpec, CameraSpec, to_plane
 from agalign.synthetic.flight import recorded
-from agalign.synthetic.rig import BandSpec, CameraSpec, to_plane
 from agalign.values import geometry, lens
 from agalign.values.alignment import Alignment, Seed
 from agalign.values.choices import FamilyChoice, ReliefUse
@@ -219,7 +219,7 @@ def test_a_band_that_the_relief_does_not_align_is_predicted(flat: Rendered, monk
     """Its homography passes all checks, but is another geometry than that of the other bands."""
     candidates = flat.candidates()
     assert {a.status for a in verified_together(candidates, Settings()).values()} == {"aligned"}
-    monkeypatch.setattr(align, "aligned_by_relief", lambda *_, **__: ReliefResult(others={"NIR"}))
+    monkeypatch.setattr(align_bands, "aligned_by_relief", lambda *_, **__: ReliefResult(others={"NIR"}))
     result = verified_together(candidates, Settings())
     assert {name: a.status for name, a in result.items()} == {"Blue": "aligned", "Red": "aligned", "NIR": "predicted"}
     assert result["NIR"].prediction.source == "windows"

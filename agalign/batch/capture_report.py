@@ -9,7 +9,7 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Literal
 
-from agalign.capture.align import PairProgress
+from agalign.capture.align_bands import PairProgress
 from agalign.products.run_record import ExclusionPart
 from agalign.products.sidecar import BandResult, CaptureResult, Sidecar
 from agalign.products.sidecar_file import read_sidecar

@@ -7,9 +7,9 @@ from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
 
-from agalign.batch.report import CaptureReport, StageClock
+from agalign.batch.capture_report import CaptureReport, StageClock
 from agalign.batch.workers import failure_text
-from agalign.capture.align import PairProgress, align_capture_bands
+from agalign.capture.align_bands import PairProgress, align_capture_bands
 from agalign.config import Settings, WriteSettings
 from agalign.errors import AgalignError, ConfigurationError, InputError, OutputError, SidecarError
 from agalign.flight.model import FlightModel, load_model

@@ -10,15 +10,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from agalign.pixels.resample import resample_tile, warped
+from agalign.pixels.band_resampling import resample_tile, warped
 from agalign.products.layout import _largest_rectangle, common_area
 from agalign.synthetic import cameras
 from agalign.values import geometry
 from agalign.values.capture import Band, Radiometry
 from agalign.values.image import Tile
+from agalign.values.interpolation import resample, tiles
 from agalign.values.mapping import PixelMapping
 from agalign.values.pixel_units import PixelScale
-from agalign.values.resample import resample, tiles
 
 from ..builders import texture, two_views
 from ..conftest import textured_image

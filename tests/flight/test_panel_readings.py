@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 import tifffile
 
-from agalign.flight.panels import (
+from agalign.flight.panel_readings import (
     BandReading,
     PanelReading,
     read_panel,
@@ -14,7 +14,7 @@ from agalign.flight.panels import (
     with_height,
     with_panels,
 )
-from agalign.pixels.panel import DetectedPanel
+from agalign.pixels.panel_detection import DetectedPanel
 from agalign.pixels.radiometry import with_radiometry
 from agalign.values.capture import Band, CameraIdentity, Capture, Panel, Pose, Position, Quantity, Radiometry
 
@@ -135,7 +135,7 @@ def test_the_search_for_panels_ends_after_three_captures_without_one(monkeypatch
         looked.append(int(one.name))
         return replace(one, bands=(HELD if int(one.name) in shown else GREEN,))
 
-    monkeypatch.setattr("agalign.flight.panels._with_detected_panel", detected)
+    monkeypatch.setattr("agalign.flight.panel_readings._with_detected_panel", detected)
     assert [int(c.name) for c in with_panels(flight) if c.panel] == list(shown)
     assert sorted(looked) == [0, 1, 2, 3, 4, 5, 6, 7, 8, 15, 16, 17, 18, 19]
     for few in (flight[7:8], flight[7:9], []):
@@ -144,9 +144,8 @@ def test_the_search_for_panels_ends_after_three_captures_without_one(monkeypatch
         assert sorted(looked) == [int(c.name) for c in few]
     # One unknown time leaves the captures in their order.
     looked.clear()
-    monkeypatch.setattr(
-        "agalign.flight.panels._with_detected_panel", lambda one, _without_code: looked.append(int(one.name)) or one
-    )
+    detect = "agalign.flight.panel_readings._with_detected_panel"
+    monkeypatch.setattr(detect, lambda one, _without_code: looked.append(int(one.name)) or one)
     with_panels(captures_in_seconds(undated=10))
     assert sorted(looked) == [0, 1, 2, 17, 18, 19]
 
@@ -180,7 +179,7 @@ def test_a_square_alone_leaves_nothing_out(
     monkeypatch: pytest.MonkeyPatch, code: str, in_scene: bool, expected: tuple[bool, bool]
 ) -> None:
     """A roof resembles a panel: without a code it is measured, but the capture is aligned."""
-    monkeypatch.setattr("agalign.flight.panels._detect", lambda *_, **__: DetectedPanel(code, AREA, in_scene))
+    monkeypatch.setattr("agalign.flight.panel_readings._detect", lambda *_, **__: DetectedPanel(code, AREA, in_scene))
     (result,) = with_panels([capture(GREEN)], without_code=True)
     assert (result.panel is not None, result.is_of_a_panel) == expected
 

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from agalign.capture.band_pair import BandPair
 from agalign.capture.verification import WarpedPair
 from agalign.errors import GeometryError
-from agalign.pixels.resample import channel_mean
+from agalign.pixels.band_resampling import channel_mean
 from agalign.relief.adjustment import (
     Adjustment,
     WindowShifts,
@@ -35,8 +35,8 @@ from agalign.values.displacement import DisplacementField
 from agalign.values.geometry import Matrix
 from agalign.values.image import Raster
 from agalign.values.mapping import PixelMapping
+from agalign.values.parallax import Parallax, Relief
 from agalign.values.pixel_units import FixedImagePx
-from agalign.values.relief import Parallax, Relief
 from agalign.verify.displacement_field import MIN_GAIN_SIGMA, MIN_WINDOWS, robust_loss
 from agalign.verify.residuals import decrease_sigma
 from agalign.verify.window_fit import fit_windows

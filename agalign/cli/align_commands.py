@@ -56,7 +56,7 @@ def _align(
     for name in settings.write.indices:
         index_named(name)
     load_ahead()
-    from agalign.cli.run import conclude, find_captures, print_plan, run
+    from agalign.cli.align_run import conclude, find_captures, print_plan, run
 
     flight = find_captures(folder, DiscoverOptions(**given["discover"], skip=(target,), jobs=cores), terminal)
     if not dask and not dry_run:
@@ -109,7 +109,7 @@ def _demo(
 ) -> int:
     """Make a synthetic flight, align it, and compare the result with the ground truth."""
     from agalign.batch import CaptureReport, prepare_output
-    from agalign.cli.run import conclude, find_captures, run
+    from agalign.cli.align_run import conclude, find_captures, run
     from agalign.config import DiscoverOptions, RunOptions, Settings
     from agalign.synthetic.flight import make_flight, score_against_truth
 
@@ -163,7 +163,7 @@ def _onto(
     """
     from agalign.cameras.discover import FolderScan
     from agalign.cameras.mosaics import captures_onto, distance_km
-    from agalign.cli.run import conclude, run
+    from agalign.cli.align_run import conclude, run
     from agalign.config import RunOptions, Settings
 
     target = out or reference.absolute().parent / f"{reference.stem}-aligned"

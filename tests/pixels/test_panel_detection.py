@@ -2,12 +2,12 @@ import numpy as np
 import pytest
 from synthetic_flights.panel import PANEL_CODE, with_panel
 
-from agalign.pixels import panel as panels
-from agalign.pixels.panel import albedo_of, find_panel, inside
+from agalign.pixels import panel_detection as panels
+from agalign.pixels.panel_detection import albedo_of, find_panel, inside
+from agalign.synthetic.camera_model import Pose
 from agalign.synthetic.cameras import REDEDGE
 from agalign.synthetic.flight import view
 from agalign.synthetic.ground import paint_ground, reflectance
-from agalign.synthetic.rig import Pose
 from agalign.values.image import Raster
 
 from ..builders import whole

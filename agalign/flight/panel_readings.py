@@ -10,7 +10,7 @@ import numpy as np
 
 from agalign.errors import AgalignError
 from agalign.flight.groups import camera_key, flights_of
-from agalign.pixels.panel import DetectedPanel, albedo_of, find_panel, inside, is_homogeneous
+from agalign.pixels.panel_detection import DetectedPanel, albedo_of, find_panel, inside, is_homogeneous
 from agalign.pixels.radiometry import calibrated
 from agalign.pixels.raster import read_for_alignment, read_tile, without_warnings
 from agalign.values.capture import Band, Capture, Panel, PanelFactor, PanelSource
