@@ -19,9 +19,6 @@ from agalign.products.sidecar_file import read_result, run_sidecars, update_prod
 from agalign.values.cores import usable_cores
 from agalign.values.files import check_inside
 
-_CAPTURES_WORTH_A_PROCESS = 8
-"""Starting a process takes as long as the indices of this many captures."""
-
 
 @dataclass(frozen=True)
 class IndexTask:
@@ -104,7 +101,8 @@ def run_indices(
 
 @contextmanager
 def _chosen_run(captures: int, cores: int, executor: Executor | None) -> Iterator[Run]:
-    processes = min(cores, captures // _CAPTURES_WORTH_A_PROCESS)
+    captures_worth_a_process = 8  # starting a process takes as long as the indices of this many captures
+    processes = min(cores, captures // captures_worth_a_process)
     if executor is not None:
         yield on_executor(executor)
     elif processes > 1:

@@ -31,8 +31,6 @@ from agalign.values.lens import Lens
 
 _MAVIC_3_NAME = re.compile(r"^(?P<capture>.*?)_(?:MS_(?P<band>G|RE?|NIR)|D)$", re.IGNORECASE)
 _DJI = "dji.com/drone-dji"
-_MAX_UPRIGHT_ROLL_DEG = 90.0
-"""Larger gimbal rolls mean upside down: gimbals write a roll near 0 or near 180 degrees."""
 
 
 class _TagTransfer(pix4d.TagTransfer):
@@ -122,7 +120,8 @@ def _heading_deg(tags: Tags, yaw_deg: float) -> float:
     """The heading of the image's upper edge. Some gimbals that look down report a roll of 180 degrees and the opposite
     yaw.
     """
-    return yaw_deg + (180 if abs(tags.number(_DJI, "GimbalRollDegree") or 0.0) > _MAX_UPRIGHT_ROLL_DEG else 0)
+    max_upright_roll_deg = 90.0  # larger gimbal rolls mean upside down: gimbals write a roll near 0 or near 180 degrees
+    return yaw_deg + (180 if abs(tags.number(_DJI, "GimbalRollDegree") or 0.0) > max_upright_roll_deg else 0)
 
 
 def _radiometry(tags: Tags) -> Radiometry | None:

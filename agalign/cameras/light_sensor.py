@@ -18,8 +18,6 @@ from numpy.typing import NDArray
 from agalign.cameras.base import rotation
 from agalign.values.capture import Position
 
-DIRECT_PER_DIFFUSE = 6.0
-"""Ratio under a clear sky that MicaSense's library assumes if a sensor does not measure it."""
 _REFRACTIVE_INDICES = 1.000277, 1.6, 1.38
 """Air, polycarbonate and Teflon: the window and the diffuser of the sensor, by the same library."""
 _MAX_CORRECTION = 2.0
@@ -64,7 +62,8 @@ def horizontal_irradiance(measured: float, attitude_deg: tuple[float, float, flo
     horizontal = math.cos(elevation)
     to_sun = math.cos(azimuth) * horizontal, math.sin(azimuth) * horizontal, -math.sin(elevation)
     cos_angle = float(np.clip(axis @ to_sun, -1.0, 1.0))
-    diffuse = 1 / DIRECT_PER_DIFFUSE
+    direct_per_diffuse = 6.0  # ratio under a clear sky that MicaSense's library assumes if a sensor does not measure it
+    diffuse = 1 / direct_per_diffuse
     if elevation <= 0 or cos_angle <= 0:
         return math.nan
     correction = (math.sin(elevation) + diffuse) / (cos_angle + diffuse)

@@ -32,9 +32,6 @@ _REDEDGE_M_PARALLAX = {
 ground decreases. Two flights with two cameras agree within 5 %.
 """
 
-_MAX_HORIZONTAL_ERROR = 0.01
-"""Of HorizontalIrradiance: correct firmware differs from its own components by 0.03 %, from refraction."""
-
 
 class _TagTransfer(pix4d.TagTransfer):
     radiometry = pix4d.TagTransfer.radiometry | names_in(_MICASENSE, "RadiometricCalibration DarkRowValue")
@@ -143,7 +140,9 @@ def _measured_horizontal(tags: Tags, sun: tuple[float, float] | None) -> float |
     if sun is None or horizontal is None or not direct or not diffuse:
         return horizontal
     calculated = direct * math.sin(sun[0]) + diffuse
-    return horizontal if abs(horizontal / calculated - 1) < _MAX_HORIZONTAL_ERROR else calculated
+    # Of HorizontalIrradiance: correct firmware differs from its own components by 0.03 %, from refraction.
+    max_horizontal_error = 0.01
+    return horizontal if abs(horizontal / calculated - 1) < max_horizontal_error else calculated
 
 
 def _sensor_attitude_deg(tags: Tags) -> tuple[float, float, float]:

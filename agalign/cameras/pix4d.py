@@ -19,13 +19,6 @@ from agalign.values.lens import Lens
 NAMESPACE = "pix4d.com"
 """Contains `pix4d.com/camera/1.0`, and `pix4d.com/1.0` of older firmware."""
 
-_MAX_FOCAL_LENGTH_MM = 100.0
-"""Larger numbers are px: lenses of drone cameras have 2 to 50 mm, or 300 px and more."""
-_MAX_FOCAL_LENGTH_PX = 1e6
-"""Larger numbers are from damaged tags."""
-_MAX_OFFSET_M = 0.5
-"""Larger numbers are mm: no rig of a drone is half a metre wide."""
-
 
 # ---- reading
 
@@ -61,7 +54,8 @@ def focal_length_is_in_px(tags: Tags) -> bool:
     """Return True if Camera:PerspectiveFocalLength is in px, which old firmware does not state."""
     units = tags.text(NAMESPACE, "PerspectiveFocalLengthUnits").lower()
     length = tags.number(NAMESPACE, "PerspectiveFocalLength")
-    return "px" in units or "pixel" in units or (length is not None and length > _MAX_FOCAL_LENGTH_MM)
+    max_focal_length_mm = 100.0  # larger numbers are px: lenses of drone cameras have 2 to 50 mm, or 300 px and more
+    return "px" in units or "pixel" in units or (length is not None and length > max_focal_length_mm)
 
 
 def focal_length_px(tags: Tags) -> float | None:
@@ -70,7 +64,8 @@ def focal_length_px(tags: Tags) -> float | None:
     if focal_length is None or density is None or focal_length <= 0:
         return None
     length_px = focal_length if focal_length_is_in_px(tags) else focal_length * density
-    return length_px if length_px < _MAX_FOCAL_LENGTH_PX else None
+    max_focal_length_px = 1e6  # larger numbers are from damaged tags
+    return length_px if length_px < max_focal_length_px else None
 
 
 def rig_degrees(tags: Tags) -> tuple[float, ...]:
@@ -98,7 +93,8 @@ def lens_offset(tags: Tags) -> tuple[float, float] | None:
 def rig_unit_m(bands: Iterable[Band]) -> float:
     """Return the unit of `lens_offset` in all bands of a camera, metres: firmware writes m or mm."""
     offsets = (abs(v) for band in bands for v in band.lens_offset or ())
-    return 1.0 if max(offsets, default=0.0) < _MAX_OFFSET_M else 1e-3
+    max_offset_m = 0.5  # larger numbers are mm: no rig of a drone is half a metre wide
+    return 1.0 if max(offsets, default=0.0) < max_offset_m else 1e-3
 
 
 def with_wavelength(band: Band, tags: Tags) -> Band:

@@ -30,11 +30,6 @@ from agalign.values.text import counted
 if TYPE_CHECKING:
     from agalign.batch import CaptureReport
 
-_MAX_SATURATED_SHARE = 0.005
-"""Sun glint and roofs saturate fewer pixels of most captures."""
-_MAX_PANEL_AGE_S = 30 * 60.0
-"""Under a clear sky with the sun above 40 degrees, the irradiance changes by up to 10 % in half an hour."""
-
 
 def find_captures(folder: Path, options: DiscoverOptions, terminal: Terminal) -> FolderScan:
     """Return the captures below a folder, and print them. Raises InputError or NoSuchBandError if there are none."""
@@ -341,7 +336,8 @@ def conclude(totals: RunTotals, out: Path, terminal: Terminal) -> int:
     """Print the table of bands and the failures; return the exit code."""
     counts = Counter(status for pairs in totals.bands.values() for status, _, _ in pairs)
     _print_totals(totals, counts, terminal)
-    high = [(name, *one) for name, one in totals.saturated.items() if one[0] > _MAX_SATURATED_SHARE]
+    max_saturated_share = 0.005  # sun glint and roofs saturate fewer pixels of most captures
+    high = [(name, *one) for name, one in totals.saturated.items() if one[0] > max_saturated_share]
     if high:
         shares = ", ".join(f"{name} up to {share:.1%} ({label})" for name, share, label in high)
         terminal.result(f"Saturated pixels: {shares}")
@@ -367,11 +363,13 @@ def _print_totals(totals: RunTotals, counts: Counter[str], terminal: Terminal) -
     if lost:
         of_all = f"{lost} of {counted(totals.states.total(), 'capture')}"
         terminal.problem(f"{of_all} could not be written, for the reasons above; the same command tries again")
+    # Under a clear sky with the sun above 40 degrees, the irradiance changes by up to 10 % in half an hour.
+    max_panel_age_s = 30 * 60.0
     for quantity, count in totals.radiometry.items():
         age_s = totals.panel_age_s.get(quantity)
         age = "" if age_s is None else f", at most {age_s / 60:.0f} min from a panel"
         terminal.result(f"Written as {quantity}: {counted(count, 'capture')}{age}")
-        if age_s is not None and age_s > _MAX_PANEL_AGE_S and "light sensor" not in quantity:
+        if age_s is not None and age_s > max_panel_age_s and "light sensor" not in quantity:
             terminal.problem(
                 f"{quantity}: the light may have changed in {age_s / 60:.0f} min; record a panel before and after each "
                 "flight, or use a light sensor (--radiometry sun)"

@@ -22,7 +22,6 @@ EXTRAS = {
     "stac": "STAC items and collections (--stac)",
     "xarray": "captures and flights as xarray datasets (agalign.open_capture, agalign.open_flight)",
 }
-_MIN_FREE_DISK_GB = 5.0
 
 
 def _doctor(
@@ -114,7 +113,8 @@ def _problems(facts: dict[str, Any]) -> list[str]:
     ]
     if not disk["writable"]:
         problems.append(f"{disk['folder']}: may not be written to; choose another folder with -o")
-    if disk["free_gb"] < _MIN_FREE_DISK_GB:
+    min_free_disk_gb = 5.0
+    if disk["free_gb"] < min_free_disk_gb:
         problems.append(f"{disk['folder']}: {disk['free_gb']:.1f} GB are free; a thousand captures take 10 GB or more")
     return problems
 

@@ -68,27 +68,14 @@ LEARNING_RATE = 2e-3
 """Of Adam."""
 _TEMPERATURE = 0.07
 """Temperature of the in-batch loss (He et al. 2020, Sec. 3.3)."""
-_LEARN_PX = 640
-"""Longer side of the images on which theta is learned, but at least half of the full resolution. These weights are also
-used at full resolution; learning there costs four times as much."""
 _COARSEST_PX = 200
 """The longer side of the coarsest level, where an untrusted seed starts, is between this and twice this."""
-_SEARCH_RADIUS_SHARE = 0.22
-"""Radius of the search around an untrusted seed at the coarsest level, as a share of the longer side."""
 _SEARCH_STEP_PX = 3.0
 """Spacing of the translations that are searched, px of that level: a Gauss-Newton step can bridge it."""
-_SEARCH_PATCHES = 64
-"""Patches with which the translations are compared."""
 _OCTAVES = 1.0
 """Patch scales are drawn from [1, 2**_OCTAVES] px between samples."""
-_WARM_UP_STEPS = 50
-"""Steps on random weights before the first step on psi."""
 _FIRST_UPDATES = 5
 """Steps on psi before learned weights are trained further; twice as many if psi converges without training."""
-_STEPS_BETWEEN_UPDATES = 10
-"""Steps on theta per capture between two steps on psi."""
-_MAX_STEPS_WITHOUT_RETRIEVAL = 30
-"""A level is abandoned after this many steps if no held-out patches can be retrieved."""
 _PATCHES = 300
 """Patches in a Gauss-Newton step. Its cost is proportional to their number n, its error to 1 / sqrt(n)."""
 
@@ -155,7 +142,10 @@ def _learned_bands(group: ImageGroup, *, is_finest: bool) -> list[int]:
 
 def learn_scales(longer_side_px: int) -> list[float]:
     """Return the scales of the levels on which theta is learned, coarse to fine; 1 is full resolution."""
-    scales = [min(1.0, max(0.5, _LEARN_PX / longer_side_px))]
+    # Longer side of the images on which theta is learned, but at least half of the full resolution. These weights
+    # are also used at full resolution; learning there costs four times as much.
+    learn_px = 640
+    scales = [min(1.0, max(0.5, learn_px / longer_side_px))]
     while scales[0] * longer_side_px >= 2 * _COARSEST_PX:
         scales.insert(0, scales[0] / 2)
     return scales
@@ -216,11 +206,14 @@ def _search(g: _GroupAtLevel) -> None:
 
     The loss decreases towards the true position (paper, Fig. 2) over a larger distance than a Gauss-Newton step covers.
     """
-    p, _ = g.state.sampler.draw(g.level, g.level.anywhere, g.h, _SEARCH_PATCHES, _OCTAVES)
+    search_patches = 64  # patches with which the translations are compared
+    p, _ = g.state.sampler.draw(g.level, g.level.anywhere, g.h, search_patches, _OCTAVES)
+    # Radius of the search around an untrusted seed at the coarsest level, as a share of the longer side.
+    search_radius_share = 0.22
     for i, band in enumerate(g.bands):
         if g.group.trusted[g.indices[i]]:
             continue
-        radius_px = _SEARCH_RADIUS_SHARE * max(g.level.fixed.size_px)
+        radius_px = search_radius_share * max(g.level.fixed.size_px)
         if g.group.max_shift_px:
             radius_px = min(radius_px, g.group.max_shift_px[g.indices[i]] * g.level.fixed.scale[0])
         shift = best_shift(band, g.h[i], p, radius_px, _SEARCH_STEP_PX)
@@ -249,19 +242,23 @@ def _train(
     """
     loss_value, count = math.nan, len(at_level)
     max_steps = schedule.max_steps * count
-    warm_up = 0 if net.is_trained else _WARM_UP_STEPS
+    warm_up_steps = 50  # steps on random weights before the first step on psi
+    warm_up = 0 if net.is_trained else warm_up_steps
     optimiser = Adam(net.parameters(), schedule.learning_rate)
+    steps_between_updates = 10  # steps on theta per capture between two steps on psi
+    # A level is abandoned after this many steps if no held-out patches can be retrieved.
+    max_steps_without_retrieval = 30
     for step in range(1, max_steps + 1):
         loss = _loss(at_level[step % count])
         if loss is not None:
             optimiser.step(loss)
             loss_value = float(loss.detach())
-        if step < warm_up or step % (_STEPS_BETWEEN_UPDATES * count):
+        if step < warm_up or step % (steps_between_updates * count):
             continue
         state.progress("learning", step / max_steps)
         if all(update_psi(at_level)):
             break
-        if step >= warm_up + _MAX_STEPS_WITHOUT_RETRIEVAL * count and not any(any(g.distinguished) for g in at_level):
+        if step >= warm_up + max_steps_without_retrieval * count and not any(any(g.distinguished) for g in at_level):
             break
     net.is_trained = True
     return step, loss_value

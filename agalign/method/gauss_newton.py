@@ -17,8 +17,6 @@ from agalign.method.patches import ALPHA, FAMILY_PARAMETERS, Keypoints, homograp
 from agalign.values import geometry
 from agalign.values.choices import ModelFamily
 
-_REWEIGHTINGS = 4
-"""Iterations of reweighted least squares."""
 _DAMPING = 1e-4
 """Levenberg-Marquardt damping, as a share of the diagonal of the normal equations."""
 _CELL_PX = 48
@@ -140,7 +138,8 @@ def _solve_family(equations: PatchEquations, family: ModelFamily, max_step_px: f
     patch_normals = torch.einsum("nki,nkl,nlj->nij", j, hessian, j)
     patch_gradients = torch.einsum("nki,nk->ni", j, gradient)
     delta = gradient.new_zeros(len(parameters))
-    for _ in range(_REWEIGHTINGS):
+    reweightings = 4  # iterations of reweighted least squares
+    for _ in range(reweightings):
         shift = torch.einsum("nki,i->nk", j, delta)
         squared = (
             equations.energy - 2 * (shift * gradient).sum(dim=1) + torch.einsum("nk,nkl,nl->n", shift, hessian, shift)

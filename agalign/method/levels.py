@@ -22,18 +22,10 @@ from agalign.values.image import FloatImage, Mask, Raster
 from agalign.values.lens import Lens
 from agalign.values.pixel_units import SAME_PIXELS, PixelScale
 
-_HELD_OUT_CELLS = 8
-"""Cells along the longer side; every fifth cell, in a diagonal pattern, is held out from training."""
 _FIELD_COLUMNS = 65
 """Columns of the grid on which displacement fields are sampled."""
-_MIN_GRADIENT_PER_PX = 0.05
-"""Keypoints are drawn where the gradient of the standardised image is larger than this (paper, Sec. 5.3)."""
-_MIN_CELL_PX = 4 * FOOTPRINT_PX
-"""Minimum width of a cell, so that it can contain the largest patches of recipe fast, 2 px between samples."""
 _MAX_POSITIONS = 16_384
 """Positions in a pool: enough for any run, and each is undistorted only once."""
-_TRIES_PER_KEYPOINT = 4
-"""Keypoints are drawn in excess, because patches that leave the valid area are rejected."""
 
 
 @dataclass(frozen=True)
@@ -174,7 +166,9 @@ def make_level(
         usable = np.isfinite(magnification) and magnification > 0
         views.append(make_level_image(raster, min(1.0, scale / magnification) if usable else scale, device))
     gradient = _gradient_magnitude(fixed_view.image.cpu().numpy())
-    has_texture = (gradient > _MIN_GRADIENT_PER_PX) & (fixed_view.clearance_px.cpu().numpy() > FOOTPRINT_PX)
+    # Keypoints are drawn where the gradient of the standardised image is larger than this (paper, Sec. 5.3).
+    min_gradient_per_px = 0.05
+    has_texture = (gradient > min_gradient_per_px) & (fixed_view.clearance_px.cpu().numpy() > FOOTPRINT_PX)
     trainable, held_out = (
         _pool(has_texture, max_radius_px, fixed_view.lens, generator, device)
         for max_radius_px in _max_radius_in_cells(*fixed_view.size_px)
@@ -205,7 +199,8 @@ class Sampler:
         first. The orientation is uniform in [0, 2 pi], log2(scale / spacing_px) is uniform in [0, octaves] (paper,
         Sec. 5.3). `homographies` are fixed_to_moving in px of the level.
         """
-        tries, device = _TRIES_PER_KEYPOINT * count if len(pool) else 0, pool.xy.device
+        tries_per_keypoint = 4  # keypoints are drawn in excess, because patches that leave the valid area are rejected
+        tries, device = tries_per_keypoint * count if len(pool) else 0, pool.xy.device
         rows = torch.randint(max(1, len(pool)), (tries,), generator=self.generator).to(device)
         angle = torch.rand(tries, generator=self.generator) * (2 * math.pi)
         scale = spacing_px * 2 ** (torch.rand(tries, generator=self.generator) * octaves)
@@ -251,7 +246,11 @@ def _gradient_magnitude(planes: FloatImage) -> FloatImage:
 
 def _held_out_cells(width_px: int, height_px: int) -> Mask:
     """Return (height, width) True in the held-out cells: one cell in five of each row of cells, on diagonals."""
-    cell_px = max(max(width_px, height_px) / _HELD_OUT_CELLS, _MIN_CELL_PX)
+    # Cells along the longer side; every fifth cell, in a diagonal pattern, is held out from training.
+    held_out_cells = 8
+    # Minimum width of a cell, so that it can contain the largest patches of recipe fast, 2 px between samples.
+    min_cell_px = 4 * FOOTPRINT_PX
+    cell_px = max(max(width_px, height_px) / held_out_cells, min_cell_px)
     column, row = (np.arange(n) // cell_px % 5 for n in (width_px, height_px))
     return np.asarray(column[None, :] == (-2 * row % 5)[:, None])
 

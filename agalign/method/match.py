@@ -24,8 +24,6 @@ from agalign.values.image import Raster
 
 MAX_KEYPOINTS = 2000
 """Default number of keypoints per image; matching takes time proportional to its square."""
-_SPACING_PER_SIZE = 6 / PATCH_PX
-"""Patches are as wide as the area that SIFT describes, 6 times the size of the keypoint."""
 
 
 def to_8_bit(raster: Raster) -> NDArray[np.uint8]:
@@ -37,10 +35,12 @@ def sift_keypoints(raster: Raster, maximum: int = MAX_KEYPOINTS) -> Keypoints:
     """Return the `maximum` strongest SIFT keypoints of an image, raw px."""
     detected = cv2.SIFT.create(nfeatures=maximum).detect(to_8_bit(raster), raster.valid.astype(np.uint8))
     strongest = sorted(detected, key=lambda k: -k.response)[:maximum]
+    # Patches are as wide as the area that SIFT describes, 6 times the size of the keypoint.
+    spacing_per_size = 6 / PATCH_PX
     return Keypoints(
         torch.tensor([k.pt for k in strongest], dtype=torch.float32).reshape(-1, 2),
         torch.tensor([math.radians(k.angle) for k in strongest], dtype=torch.float32),
-        torch.tensor([k.size * _SPACING_PER_SIZE for k in strongest], dtype=torch.float32),
+        torch.tensor([k.size * spacing_per_size for k in strongest], dtype=torch.float32),
     )
 
 

@@ -39,17 +39,12 @@ _COARSEST_PX = 80
 """Longer side of the coarsest level."""
 _OCTAVES = 4.0
 """log2 of the patch scale s is uniform in [0, _OCTAVES]."""
-_SPACING_PX = 0.25
-"""Distance between a patch's samples at s = 1: patches are 4 to 64 px wide. Not given in the paper."""
 _MARGIN = 1.0
 """Of the hinge loss L1."""
 _MIN_NEGATIVE_PX = 16.0
 """tau: minimum distance of a negative from the true position. Not given in the paper."""
 _BATCH = 64
 """Keypoints per step of SGD."""
-_MOMENTUM = 0.9
-_LEARNING_RATE = 1e-4
-"""Annealed by a cosine to 0 within each level."""
 
 
 @dataclass(frozen=True)
@@ -144,7 +139,9 @@ def descend(
 
     batches = len(keypoints.x) // _BATCH
     steps = training.epochs * batches
-    optimiser = torch.optim.SGD([*net.parameters(), psi], _LEARNING_RATE, _MOMENTUM)
+    momentum = 0.9
+    learning_rate = 1e-4  # annealed by a cosine to 0 within each level
+    optimiser = torch.optim.SGD([*net.parameters(), psi], learning_rate, momentum)
     annealing = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, steps)
     loss_value, before = float("nan"), psi.detach().clone()
     for _ in range(training.epochs):
@@ -184,7 +181,9 @@ class _Samples:
 
 def _draw(state: JointState, level: Level, pool: Pool, h: Tensor, count: int) -> _Samples:
     """Draw keypoints once for all epochs; a negative is the warped position of another random keypoint."""
-    x, _ = state.sampler.draw(level, pool, [h], count, _OCTAVES, _SPACING_PX)
+    # Distance between a patch's samples at s = 1: patches are 4 to 64 px wide. Not given in the paper.
+    spacing_px = 0.25
+    x, _ = state.sampler.draw(level, pool, [h], count, _OCTAVES, spacing_px)
     if len(x) < _BATCH:
         raise NotEnoughTextureError(len(x), _BATCH)
     order = torch.randperm(len(x), generator=state.sampler.generator).to(state.device)

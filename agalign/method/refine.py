@@ -36,20 +36,14 @@ PATCHES, FLIGHT_PATCHES = 400, 256
 rig contributes to the estimate. Half as many are used while the steps are longer than CONVERGED_PX."""
 _FINAL_OCTAVES = 0.3
 """Range of log2 of their scales: small patches localise better."""
-_MAX_FINAL_STEPS = 10
-"""Maximum number of steps at full resolution."""
 _FINAL_CONVERGED_PX = 0.06
 """psi has converged if a step displaces no corner by more than this, px: steps shrink by more than half, so the
 remaining displacement is smaller than the systematic error."""
 _SYSTEMATIC_STD_PX = 0.035
 """Added in quadrature to the standard errors along x and y: errors that the covariance does not contain, such as a
 bias between two modalities. Measured on synthetic flights."""
-_DIFFERENCE_PX = 0.75
-"""Half the step of the central differences that approximate a descriptor's gradient."""
 _PRESELECTION_PATCHES, _CANDIDATE_SHIFTS = 24, 64
 """Patches with which all shifts of a search are compared, and number of best shifts compared with all patches."""
-_SHIFTS_PER_BATCH = 16
-"""Limits the memory of a search."""
 _MAX_RATIO = 0.6
 """Maximum ratio of successive steps for the extrapolation of a geometric series: above it, errors of the ratio dominate
 the sum."""
@@ -114,7 +108,8 @@ def describe_reference(net: Descriptor, level: Level, keypoints: Keypoints) -> R
     def describe(k: Keypoints) -> Tensor:
         return describe_fixed(net, level, k)
 
-    return ReferencePatches(keypoints, describe(keypoints), shift_gradient(describe, keypoints, _DIFFERENCE_PX))
+    difference_px = 0.75  # half the step of the central differences that approximate a descriptor's gradient
+    return ReferencePatches(keypoints, describe(keypoints), shift_gradient(describe, keypoints, difference_px))
 
 
 @dataclass(frozen=True)
@@ -146,7 +141,8 @@ class Solver:
         not applied: the patches do not determine the mapping.
         """
         h, patches, previous_px = start, reference_patches.head(len(reference_patches.f) // 2), math.inf
-        for _ in range(_MAX_FINAL_STEPS):
+        max_final_steps = 10  # maximum number of steps at full resolution
+        for _ in range(max_final_steps):
             step = self.step(band, h, patches)
             if not math.isfinite(step.length_px):
                 break
@@ -200,7 +196,8 @@ def best_shift(band: MovingBand, homography: Tensor, keypoints: Keypoints, radiu
         few patches are visible.
         """
         p = keypoints[torch.arange(min(count, len(keypoints)), device=homography.device)]
-        batches = torch.split(some, _SHIFTS_PER_BATCH)
+        shifts_per_batch = 16  # limits the memory of a search
+        batches = torch.split(some, shifts_per_batch)
         losses = torch.cat([_shifted_losses(band, homography, p, f[: len(p)], batch) for batch in batches])
         enough = losses.isfinite().sum(dim=1) >= MIN_KEYPOINTS
         return losses, losses.nanmean(dim=1).masked_fill(~enough, float("inf"))

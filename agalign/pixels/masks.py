@@ -10,10 +10,6 @@ from agalign.values.interpolation import planes_of
 
 _MIN_SIDE_PX = 48
 """Smaller images contain too few patches for learning."""
-_MAX_MEASURED = 1e15
-"""Above the values of any sensor, below the fill values of netCDF, GIS and C programs (1e20, 9.97e36, 3.4e38)."""
-_MIN_FILL_SHARE = 0.002
-"""A constant area at the border is fill if it covers at least this share of the image."""
 _MIN_SATURATED_PX = 7
 """Minimum width of a masked saturated area: patches around smaller ones contain enough of their surroundings."""
 
@@ -28,7 +24,10 @@ def data_mask(pixels: NDArray[np.generic], nodata: float | None) -> Mask:
         valid &= pixels != nodata
     if nodata is None and (pixels.dtype.kind == "f" or pixels.dtype.itemsize == 8):
         common_fill = -9999.0, -99999.0, -32767.0, -32768.0
-        valid &= (np.fabs(pixels) < _MAX_MEASURED) & ~np.isin(pixels, common_fill)
+        # Above the values of any sensor, below the fill values of netCDF, GIS and C programs (1e20, 9.97e36,
+        # 3.4e38).
+        max_measured = 1e15
+        valid &= (np.fabs(pixels) < max_measured) & ~np.isin(pixels, common_fill)
     return valid
 
 
@@ -40,6 +39,7 @@ def undeclared_fill(pixels: ArrayLike) -> Mask:
     values = np.asarray(pixels)
     fill = np.zeros(values.shape, dtype=bool)
     constants = [0] if values.dtype.kind in "fb" else [0, np.iinfo(values.dtype).max]
+    min_fill_share = 0.002  # a constant area at the border is fill if it covers at least this share of the image
     for constant in constants:
         equal = (values == constant).astype(np.uint8)
         border = np.concatenate([equal[0], equal[-1], equal[:, 0], equal[:, -1]])
@@ -47,7 +47,7 @@ def undeclared_fill(pixels: ArrayLike) -> Mask:
             continue
         _, labels, stats, _ = cv2.connectedComponentsWithStats(equal, connectivity=4)
         touching = np.unique(np.concatenate([labels[0], labels[-1], labels[:, 0], labels[:, -1]]))
-        large = [k for k in touching if k and stats[k, cv2.CC_STAT_AREA] >= _MIN_FILL_SHARE * values.size]
+        large = [k for k in touching if k and stats[k, cv2.CC_STAT_AREA] >= min_fill_share * values.size]
         fill |= np.isin(labels, large)
     return fill
 

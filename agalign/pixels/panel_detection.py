@@ -12,9 +12,6 @@ from agalign.values.image import Mask, Raster
 
 _AREA_RATIO = 0.5
 """Side of the measured area, relative to that of the panel."""
-_MAX_EDGE_SHARE = 0.4
-"""Maximum share of pixels at an edge in an image that is searched for a code: 0.48 in the sky, up to 0.36 in captures
-of fields, water and panels."""
 
 Corners = NDArray[np.float64]
 """(4, 2) px, in order around the quadrilateral."""
@@ -146,7 +143,10 @@ def _is_noise(image: NDArray[np.uint8]) -> bool:
     ratio = min(1.0, 512 / min(image.shape))
     reduced = cv2.resize(image, None, fx=ratio, fy=ratio)
     dark = cv2.adaptiveThreshold(reduced, 1, cv2.ADAPTIVE_THRESH_GAUSSIAN_C, cv2.THRESH_BINARY, 83, 2)
-    return bool(np.count_nonzero(dark[:, 1:] != dark[:, :-1]) > _MAX_EDGE_SHARE * dark.size)
+    # Maximum share of pixels at an edge in an image that is searched for a code: 0.48 in the sky, up to 0.36 in
+    # captures of fields, water and panels.
+    max_edge_share = 0.4
+    return bool(np.count_nonzero(dark[:, 1:] != dark[:, :-1]) > max_edge_share * dark.size)
 
 
 def _quadrilaterals(image: NDArray[np.uint8], min_area: float, max_area: float) -> list[Corners]:

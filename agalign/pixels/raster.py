@@ -27,8 +27,6 @@ from agalign.values.choices import MAX_PIXELS
 from agalign.values.image import Mask, Raster, Tile, reduced_size_px
 from agalign.values.pixel_units import PixelScale
 
-_READ_WHOLE_PX = 1 << 26
-"""Images up to this size are decoded completely before averaging: 128 MB in 16 bits."""
 GDAL_ENVIRONMENT = {
     "GDAL_PAM_ENABLED": "NO",
     "GDAL_DISABLE_READDIR_ON_OPEN": "EMPTY_DIR",
@@ -42,8 +40,6 @@ description that refers to other files or to a server.
 """
 _MAX_BANDS = 512
 """More than any imager has; a damaged file may declare 65,535."""
-_MAX_MICROMETRES = 20.0
-"""Wavelengths without a unit are in micrometres below this: thermal bands end at 14 um, and none is below 100 nm."""
 
 
 def suffix_format(path: Path) -> Literal["TIFF", "JPEG", "PNG", "JPEG 2000"] | None:
@@ -228,7 +224,8 @@ def _reduced(dataset: rasterio.DatasetReader, band: Band, shape: tuple[int, int]
     """Read a band reduced to `shape` (height, width) by averaging."""
     # OpenCV resizes no integers of 32 or 64 bits.
     all_valid = band.nodata is None and not band.has_mask and band.dtype in ("uint8", "uint16")
-    if all_valid and band.width_px * band.height_px <= _READ_WHOLE_PX:
+    read_whole_px = 1 << 26  # images up to this size are decoded completely before averaging: 128 MB in 16 bits
+    if all_valid and band.width_px * band.height_px <= read_whole_px:
         # GDAL's averaging decodes a JPEG repeatedly, which takes seconds per band.
         return np.asarray(cv2.resize(dataset.read(band.band_index), shape[::-1], interpolation=cv2.INTER_AREA))
     return np.asarray(dataset.read(band.band_index, out_shape=shape, resampling=Resampling.average))
@@ -315,6 +312,9 @@ def _georeference(dataset: rasterio.DatasetReader) -> Georeference | None:
 
 def _wavelength_nm(tags: dict[str, str]) -> float | None:
     """Return the wavelength of a band from the tags of ENVI, GDAL's IMAGERY domain or agalign."""
+    # Wavelengths without a unit are in micrometres below this: thermal bands end at 14 um, and none is below 100
+    # nm.
+    max_micrometres = 20.0
     for name in ("wavelength", "WAVELENGTH", "CENTRAL_WAVELENGTH_NM", "central_wavelength_nm"):
         try:
             value = float(tags[name])
@@ -322,6 +322,6 @@ def _wavelength_nm(tags: dict[str, str]) -> float | None:
             continue
         if not 0 < value < math.inf:
             continue
-        micrometres = value < _MAX_MICROMETRES or "micro" in tags.get("wavelength_units", "").lower()
+        micrometres = value < max_micrometres or "micro" in tags.get("wavelength_units", "").lower()
         return value * 1000 if micrometres else value
     return None

@@ -17,9 +17,6 @@ from agalign.values.image import FloatImage, Raster
 
 Field = NDArray[np.complex64]
 
-_AMPLITUDE_QUANTILE = 0.75
-"""Quantile of the gradient magnitude in the valid area at which the amplitude is clipped."""
-
 
 def structure_field(raster: Raster, smoothing_px: float = 1.0) -> Field:
     """Return z of a raster of one channel, (height, width) complex64, |z| <= 1; 0 at and next to invalid pixels."""
@@ -32,7 +29,8 @@ def structure_field(raster: Raster, smoothing_px: float = 1.0) -> Field:
     magnitude = gradient_magnitude(gx, gy)
     inside = cv2.erode(raster.valid.astype(np.uint8), np.ones((3, 3), np.uint8), borderValue=0) > 0
     sample = magnitude[::3, ::3][inside[::3, ::3]]
-    ceiling = float(np.quantile(sample, _AMPLITUDE_QUANTILE)) if sample.size else 0.0
+    amplitude_quantile = 0.75  # quantile of the gradient magnitude in the valid area at which the amplitude is clipped
+    ceiling = float(np.quantile(sample, amplitude_quantile)) if sample.size else 0.0
     if ceiling <= 0:
         return np.zeros(raster.valid.shape, np.complex64)
     # a ((gx + i gy) / |g|)^2 with a = min(|g| / ceiling, 1)

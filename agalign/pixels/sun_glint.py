@@ -16,8 +16,6 @@ from agalign.values.image import FloatImage, Mask
 
 _BLOCK_PX = 16
 """Side of the blocks for which a dark value is computed."""
-_MIN_GLINT_SHARE = 0.5
-"""Minimum share of glint in the green light."""
 _MIN_PIXEL_NDWI = -0.2
 """Glint is as bright in green as in near infrared; vegetation and soil at a shore are not."""
 _MIN_VARIATION, _MIN_AREA_SHARE = 0.1, 0.5
@@ -50,7 +48,8 @@ def sun_glint(green: FloatImage, nir: FloatImage) -> Mask:
         is_water = cv2.resize(blocks.astype(np.uint8), size_px, interpolation=cv2.INTER_NEAREST) > 0
         glint = nir - cv2.resize(nir_dark, size_px, interpolation=cv2.INTER_NEAREST)
         is_flat = (green - nir) / (green + nir) > _MIN_PIXEL_NDWI
-        is_bright = np.asarray(is_water & is_flat & (glint > _MIN_GLINT_SHARE * green))
+        min_glint_share = 0.5  # minimum share of glint in the green light
+        is_bright = np.asarray(is_water & is_flat & (glint > min_glint_share * green))
     return is_bright & ~_is_uniform(nir, is_bright)
 
 

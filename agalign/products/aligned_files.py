@@ -24,8 +24,6 @@ from agalign.values.image import OutputGrid
 
 _MAX_VIGNETTING_ERROR = 0.01
 """Limit for the tags of aligned files, p95 of corrected pixels: a fifth of the accuracy of the cameras' calibration."""
-_MIN_POINTS = 30
-"""Pixels of the lattice of 25 x 19 that must be inside a band: a polynomial has six coefficients."""
 
 
 class BandFiles(Product):
@@ -106,12 +104,13 @@ def _has_namesakes_in_folders(files: Sequence[Path]) -> bool:
 def _vignettings(layers: Sequence[Layer], grid: OutputGrid) -> dict[Path, GridVignetting]:
     """The vignetting of the files of layers on the output grid; none for files without its tags and without pixels."""
     result = {}
+    min_points = 30  # pixels of the lattice of 25 x 19 that must be inside a band: a polynomial has six coefficients
     for layer in layers:
         correction = _correction(layer.band)
         output_px = geometry.lattice(grid.width, grid.height, 25, 19)
         positions_px = layer.positions(output_px, grid)
         inside = is_inside(positions_px, layer.band)
-        if correction is not None and np.count_nonzero(inside) >= _MIN_POINTS:
+        if correction is not None and np.count_nonzero(inside) >= min_points:
             result[layer.band.path] = vignetting_on_grid(correction, output_px[inside], positions_px[inside])
     return result
 

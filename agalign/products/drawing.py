@@ -18,12 +18,8 @@ from agalign.values.image import OutputGrid, reduced_size_px
 
 Grey = NDArray[np.uint8]
 """(height, width)"""
-_MAX_SIDE_PX = 2048
-"""Longer side of the images: larger than most screens."""
 LEVEL_BLOCKS = 6, 8
 """Rows and columns: a block of a capture is as large as the error of its georeference."""
-_SAMPLE_PIXELS = 20_000
-"""Pixels from which the contrast is calculated: percentiles then have an error of 0.1 %."""
 Picture = NDArray[np.uint8]
 """(height, width, 3) red, green, blue."""
 
@@ -48,7 +44,8 @@ class ReducedBands:
 
 def read_reduced_bands(capture: Capture, places: Mapping[str, tuple[Path, int]], grid: OutputGrid) -> ReducedBands:
     """Read the bands of a capture, given file and index of each written band. Raises UnreadableFileError for those."""
-    size_px = reduced_size_px((grid.width, grid.height), max(1.0, max(grid.width, grid.height) / _MAX_SIDE_PX))
+    max_side_px = 2048  # longer side of the images: larger than most screens
+    size_px = reduced_size_px((grid.width, grid.height), max(1.0, max(grid.width, grid.height) / max_side_px))
     before, saturated = {}, {}
     for band in capture.bands:
         with suppress(UnreadableFileError):  # the band pair has failed with this reason
@@ -81,7 +78,8 @@ def _before(band: Band, reference: Band, grid: OutputGrid, size_px: tuple[int, i
 
 def _grey(plane: NDArray[np.float32]) -> Grey:
     """The grey values between percentiles of the plane itself: raw numbers and reflectance have different ranges."""
-    sample = plane.ravel()[:: max(1, plane.size // _SAMPLE_PIXELS)]
+    sample_pixels = 20_000  # pixels from which the contrast is calculated: percentiles then have an error of 0.1 %
+    sample = plane.ravel()[:: max(1, plane.size // sample_pixels)]
     sample = sample[np.isfinite(sample) & (sample != 0)]
     low, high = np.percentile(sample, (1.5, 98.5)).tolist() if sample.size else (0.0, 1.0)
     scaled = np.subtract(plane, np.float32(low))

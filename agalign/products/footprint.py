@@ -15,8 +15,6 @@ from agalign.values.image import OutputGrid
 
 _MAX_TILT_DEG = 45.0
 """The footprint of a camera with a larger tilt is not useful, and the tag is often wrong."""
-_MAX_ASSUMED_HEIGHT_M = 120.0
-"""Legal limit of the height above ground of drones in most countries."""
 
 
 class PoseErrors(NamedTuple):
@@ -113,7 +111,8 @@ def with_assumed_height(capture: Capture) -> Capture:
     """Return the capture with an upper limit of the height above ground, if no height is known: the altitude above sea
     level, at most the legal limit.
     """
-    return _with_height(capture, min(_altitude_m(capture), _MAX_ASSUMED_HEIGHT_M), "assumed")
+    max_assumed_height_m = 120.0  # legal limit of the height above ground of drones in most countries
+    return _with_height(capture, min(_altitude_m(capture), max_assumed_height_m), "assumed")
 
 
 def with_approximate_georeference(capture: Capture) -> Capture:

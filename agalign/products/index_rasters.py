@@ -38,10 +38,6 @@ from agalign.values.files import file_name
 from agalign.values.image import Tile, reduced_size_px
 from agalign.values.interpolation import tiles
 
-_MAX_STATISTICS_PX = 4_000_000
-"""Percentiles of larger rasters are calculated from every second, third … row and column."""
-_PICTURE_PX = 720
-"""Longer side of the image at the top left of the picture; the report overlays it on the composite."""
 _COLOURS = np.array([(38, 70, 148), (120, 74, 40), (214, 190, 120), (250, 245, 170), (90, 180, 80), (0, 90, 40)], float)
 """Red, green, blue from the low to the high end of the scale: water, soil, sparse to dense vegetation."""
 _NEUTRAL = np.array([(20, 20, 20), (245, 245, 245)], float)
@@ -231,7 +227,9 @@ def _write(
     profile = tiled_profile(like.width, like.height, 1, "float32", **FLOAT_OPTIONS)
     if like.crs is not None and not like.transform.is_identity:
         profile |= {"crs": like.crs, "transform": like.transform}
-    step = max(1, math.ceil(math.sqrt(like.width * like.height / _MAX_STATISTICS_PX)))
+    # Percentiles of larger rasters are calculated from every second, third … row and column.
+    max_statistics_px = 4_000_000
+    step = max(1, math.ceil(math.sqrt(like.width * like.height / max_statistics_px)))
     samples, valid_px, masked_px = [], 0, 0
     unmasked = [replace(band, quality=None) for band in bands]
     with checked_raster(target, profile) as raster:
@@ -284,7 +282,9 @@ def _draw(index: Index, raster: Path, sample: NDArray[np.float32], statistics: I
     """Write the picture of a raster. Raises OutputError."""
     with open_raster(raster) as dataset:
         size_px = dataset.width, dataset.height
-        values = dataset.read(1, out_shape=reduced_size_px(size_px, max(1.0, max(size_px) / _PICTURE_PX))[::-1])
+        # Longer side of the image at the top left of the picture; the report overlays it on the composite.
+        picture_px = 720
+        values = dataset.read(1, out_shape=reduced_size_px(size_px, max(1.0, max(size_px) / picture_px))[::-1])
     note = ": raw numbers, not reflectance" if statistics.unit == RAW else ""
     title = f"{index.name.upper()} of {raster.stem.removesuffix(f'_{index.name}')}{note}"
     write_picture(values, sample, statistics, title, raster.with_suffix(".png"))

@@ -24,8 +24,6 @@ from agalign.values.text import did_you_mean
 
 _MAX_LENGTH = 300
 """Characters of a formula: longer ones could exhaust Python's recursion limit."""
-_MAX_NUMBER = 1e30
-"""Numbers must fit into float32."""
 _OPERATORS: Mapping[type, Callable[..., Any]] = {
     ast.Add: np.add,
     ast.Sub: np.subtract,
@@ -98,10 +96,11 @@ def _parsed(formula: str) -> ast.expr:
 
 
 def _names(node: ast.expr, formula: str) -> Iterator[str]:
+    max_number = 1e30  # numbers must fit into float32
     match node:
         case ast.Name(id=name):
             yield name
-        case ast.Constant(value=int() | float() as value) if abs(value) < _MAX_NUMBER:
+        case ast.Constant(value=int() | float() as value) if abs(value) < max_number:
             pass
         case ast.BinOp(left=left, op=op, right=right) if type(op) in _OPERATORS:
             yield from _names(left, formula)

@@ -19,8 +19,6 @@ from agalign.values.image import Mask, OutputGrid, Tile
 from agalign.values.mapping import PixelMapping
 from agalign.values.pixel_units import SAME_PIXELS, FixedFilePx, PixelScale
 
-_FLIGHT_MARGIN_PX = 2
-"""The crop of a flight is smaller by this: captures that the rig was not learned from may exceed its extremes."""
 _MAX_CELL_PX, _MIN_CELLS = 8, 64
 """The common area is found in cells of at most 8 px, and at least 64 cells along each axis if the image has as many."""
 
@@ -123,7 +121,9 @@ def _crop(
     # A reference that is resampled has a border too.
     limits += [(mapping, band) for mapping, band in mapped if band is reference]
     area = common_area(limits, frame.width, frame.height)
-    return frame.tile if area is None else _inset(area, _FLIGHT_MARGIN_PX)
+    # The crop of a flight is smaller by this: captures that the rig was not learned from may exceed its extremes.
+    flight_margin_px = 2
+    return frame.tile if area is None else _inset(area, flight_margin_px)
 
 
 def _between_files(limits: FlightLimits, reference: Band) -> list[tuple[PixelMapping, Band]]:

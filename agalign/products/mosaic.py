@@ -32,8 +32,6 @@ from agalign.values.pixel_units import Size
 
 _TILE_PX = 512
 """Side of the tiles that are composed at once."""
-_FEATHER = 0.1
-"""Width of a seam, as a share of half of the shorter side of a capture."""
 _COMPRESSION = "zstd"
 _COPIED_TAGS = "CAMERA", "TIFFTAG_DATETIME", "REFERENCE_BAND", "RADIOMETRY", "RADIOMETRY_SOURCE"
 _PURPOSE = "quick mosaic on a horizontal plane, for viewing; not an orthomosaic"
@@ -185,9 +183,10 @@ def _composed(captures: Sequence[Placement], grid: _Grid, tile: Tile) -> tuple[F
     central = [_centrality(positions, c.size_px) for c, positions in views]
     best = np.max([np.zeros(shape, np.float32), *central], axis=0)
     total, weight = np.zeros((len(captures[0].bands), *shape), np.float32), np.zeros(shape, np.float32)
+    feather = 0.1  # width of a seam, as a share of half of the shorter side of a capture
     for is_filling in (False, True):  # occluded pixels of one capture with those of others
         for view, one in zip(views, central, strict=True):
-            share = weight == 0 if is_filling else np.clip(1 - (best - one) / _FEATHER, 0, 1)
+            share = weight == 0 if is_filling else np.clip(1 - (best - one) / feather, 0, 1)
             share = np.where(one > 0, share, np.float32(0))
             if share.any():
                 pixels, valid = _warped(*view)

@@ -34,19 +34,8 @@ _MAX_KEYPOINTS = 2000
 """Of a capture: limits the time of matching."""
 _MIN_TIE_POINTS = 16
 """Of a pair. Unrelated images have up to 8 inliers of a homography, repetitive crops more."""
-_MAX_PRIOR_ERRORS = 3.0
-"""Maximum distance of a pair of captures from its georeference, in standard errors."""
-_SECTORS = 8
-"""A capture is matched with the nearest one in each of these directions: along and across the strips."""
-_CHECK_EVERY = 5
-"""Every fifth tie point of a pair takes no part in the adjustment."""
-_MAX_TIE_POINTS = 50
-"""Of a pair in the adjustment: the residuals of more of them, from relief and lens, are correlated."""
 _TIE_STD_PX = 1.5
 """Standard error of a tie point, with relief and the errors of the lens model."""
-_MAX_ITERATIONS = 40
-_CONVERGED = 1e-3
-"""Of a parameter, in its standard errors."""
 _STEP = 1e-6
 """Of numerical derivatives, in standard errors."""
 _PARAMETERS = 6
@@ -68,8 +57,11 @@ class TiePair:
 
     def split(self) -> tuple["TiePair", "TiePair"]:
         """Return the tie points of the adjustment, and those that check it."""
-        check = np.arange(len(self)) % _CHECK_EVERY == 0
-        used = np.flatnonzero(~check)[:: -(-np.count_nonzero(~check) // _MAX_TIE_POINTS)]
+        check_every = 5  # every fifth tie point of a pair takes no part in the adjustment
+        check = np.arange(len(self)) % check_every == 0
+        # Of a pair in the adjustment: the residuals of more of them, from relief and lens, are correlated.
+        max_tie_points = 50
+        used = np.flatnonzero(~check)[:: -(-np.count_nonzero(~check) // max_tie_points)]
         one, other = (replace(self, first_px=self.first_px[k], second_px=self.second_px[k]) for k in (used, check))
         return one, other
 
@@ -109,9 +101,10 @@ def _neighbours(captures: Sequence[Placement]) -> list[tuple[int, int]]:
     centres = np.array([c.on_ground(np.subtract(c.size_px, 1)[None] / 2)[0] for c in captures])
     reach_m = np.array([np.ptp(c.outline_m, axis=0).max() / 2 + c.pose_std[0] for c in captures])
     pairs = set()
+    sectors = 8  # a capture is matched with the nearest one in each of these directions: along and across the strips
     for i, centre in enumerate(centres):
         east, north = (centres - centre).T
-        distance_m, sector = np.hypot(east, north), np.floor(np.arctan2(north, east) / (2 * np.pi) * _SECTORS)
+        distance_m, sector = np.hypot(east, north), np.floor(np.arctan2(north, east) / (2 * np.pi) * sectors)
         distance_m[i] = np.inf
         for k in np.unique(sector):
             nearest = int(np.where(sector == k, distance_m, np.inf).argmin())
@@ -133,7 +126,8 @@ def _matched(i: int, j: int, captures: Sequence[Placement], found: Sequence[Land
     # SIFT describes a keypoint with two orientations twice.
     inliers = inliers[np.unique(one[inliers], axis=0, return_index=True)[1]]
     pair = TiePair(i, j, one[inliers], other[inliers])
-    limit_m = _MAX_PRIOR_ERRORS * np.hypot(captures[i].accuracy_m, captures[j].accuracy_m)
+    max_prior_errors = 3.0  # maximum distance of a pair of captures from its georeference, in standard errors
+    limit_m = max_prior_errors * np.hypot(captures[i].accuracy_m, captures[j].accuracy_m)
     return pair if np.linalg.norm(pair.distances_m(captures).mean(axis=0)) < limit_m else None
 
 
@@ -148,7 +142,9 @@ def adjusted(captures: Sequence[Placement], pairs: Sequence[TiePair]) -> list[Pl
     tied = np.concatenate([np.tile((p.first, p.second), (len(p), 1)) for p in pairs])
     ties = tied, np.concatenate([np.stack([p.first_px, p.second_px], axis=1) for p in pairs])
     scale = np.inf
-    for _ in range(_MAX_ITERATIONS):
+    max_iterations = 40
+    converged = 1e-3  # of a parameter, in its standard errors
+    for _ in range(max_iterations):
         residuals, derivatives = _linearised(captures, parameters, ties)
         lengths = np.linalg.norm(residuals, axis=1)
         # A small scale at the start would make outliers of all tie points where the georeference is inaccurate.
@@ -157,7 +153,7 @@ def adjusted(captures: Sequence[Placement], pairs: Sequence[TiePair]) -> list[Pl
         normal = (weighted @ derivatives + eye_array(parameters.size)).tocsc()
         step = spsolve(normal, -(weighted @ residuals.ravel() + parameters.ravel()))
         parameters += step.reshape(parameters.shape)
-        if scale == _TIE_STD_PX and np.abs(step).max() < _CONVERGED:
+        if scale == _TIE_STD_PX and np.abs(step).max() < converged:
             break
     return [_corrected(c, p) for c, p in zip(captures, parameters, strict=True)]
 

@@ -22,8 +22,6 @@ from agalign.values.lens import Lens
 from agalign.values.pixel_units import PixelScale, Size
 
 _WGS84 = "EPSG:4326"
-_MAX_LENGTH_M = 1e5
-"""Of a height above the ground and of its error: no aircraft with a camera is higher."""
 
 
 @dataclass(frozen=True)
@@ -158,7 +156,8 @@ def _placed(label: str, path: Path, feature: dict[str, Any], origin_m: Points, c
 
 def _positive(value: Any) -> float | None:
     """A length, m, or None. Raises ValueError for others than a drone's."""
-    if value is not None and not 0 < float(value) < _MAX_LENGTH_M:
+    max_length_m = 1e5  # of a height above the ground and of its error: no aircraft with a camera is higher
+    if value is not None and not 0 < float(value) < max_length_m:
         raise ValueError(value)
     return None if value is None else float(value)
 

@@ -33,8 +33,6 @@ from agalign.values.files import scratch_file
 from agalign.values.image import FloatImage, Mask, OutputGrid, Tile
 from agalign.values.interpolation import tiles
 
-_MIN_PAN_WIDTH_NM = 200.0
-"""Bandwidth from which a band is panchromatic: multispectral bands have 10 to 60 nm."""
 _TILE_PX = 1024
 """Side of the tiles that are sharpened one after another, which limits the memory, and of the square in the middle of
 the image from which the weights are fitted.
@@ -69,8 +67,9 @@ class PanSharpened(Product):
 
 def panchromatic(capture: Capture) -> list[Band]:
     """Return the panchromatic band, else the three bands of the colour photograph; empty if there is neither."""
+    min_pan_width_nm = 200.0  # bandwidth from which a band is panchromatic: multispectral bands have 10 to 60 nm
     broad = [
-        b for b in capture.bands if b.name.lower().startswith("pan") or (b.bandwidth_nm or 0.0) >= _MIN_PAN_WIDTH_NM
+        b for b in capture.bands if b.name.lower().startswith("pan") or (b.bandwidth_nm or 0.0) >= min_pan_width_nm
     ]
     return [b for b in broad if not is_thermal(b)][:1] or [b for b in capture.bands if b.companion]
 

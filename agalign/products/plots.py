@@ -26,7 +26,6 @@ _RENAMED = {"stdev": "std", "quantile_5": "p5", "quantile_95": "p95"}
 """Columns by result of exactextract."""
 _IDS = "plot", "plot_id", "id", "name"
 """Attributes that name the plots, in order of preference."""
-_STEP_PX = 1e-6
 _SUFFIXES = ".csv", ".geojson", ".parquet"
 
 
@@ -177,7 +176,8 @@ def _rows(
         of_source = source.facts(like.tags())
         # exactextract counts y upwards. Rounding: a pixel that a plot only touches would change its percentiles.
         a, b, c, d, e, f = (~like.transform)[:6]
-        in_pixels = polygons.to_crs(like.crs).affine_transform([a, b, -d, -e, c, -f]).set_precision(_STEP_PX)
+        step_px = 1e-6
+        in_pixels = polygons.to_crs(like.crs).affine_transform([a, b, -d, -e, c, -f]).set_precision(step_px)
         errors = _error_layers(source.error_map, reader)
         for index in indices:
             try:

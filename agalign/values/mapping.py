@@ -19,8 +19,6 @@ from agalign.values.pixel_units import PixelScale
 
 _KNOT_STEP_PX = 32
 """Distance of the knots of interpolated curved mappings: the error with real lenses is below 0.0001 px."""
-_FIELD_KNOT_STEP_PX = 12
-"""Minimum distance of the knots with a displacement field, which has four knots per step of its lattice."""
 
 
 @dataclass(frozen=True)
@@ -159,7 +157,10 @@ class PixelMapping:
     def _knot_step_px(self) -> int:
         if self.field is None:
             return _KNOT_STEP_PX
-        return int(np.clip(self.field.step_px / 4, _FIELD_KNOT_STEP_PX, _KNOT_STEP_PX))
+        # Minimum distance of the knots with a displacement field, which has four knots per step of its
+        # lattice.
+        field_knot_step_px = 12
+        return int(np.clip(self.field.step_px / 4, field_knot_step_px, _KNOT_STEP_PX))
 
 
 def _along(start: int, length: int) -> Points:

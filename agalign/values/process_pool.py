@@ -19,14 +19,10 @@ from agalign.values.processes import ENDS_WITHIN_S, ExitCode, Worker
 
 _MAX_DEATHS = 3
 """Maximum number of workers that end in a row without a finished task between them; then the run ends."""
-_MAX_TRIES = 2
-"""A signal may kill a worker for reasons other than its task, such as a lack of memory."""
 _START_TIMEOUT_S = 120.0
 """Importing torch from a network drive takes up to a minute."""
 _POLL_INTERVAL_S = 1.0
 """On Windows, SIGINT is handled only between two waits."""
-_MAX_WINDOWS_PROCESSES = 30
-"""Windows waits for at most 63 objects; a worker has two."""
 
 A = TypeVar("A")
 R = TypeVar("R")
@@ -98,7 +94,8 @@ class ProcessPool(Generic[A, R]):
     ) -> None:
         self._function, self._max_tasks = function, max_tasks_per_worker
         self._worker_arguments = context, initializer, arguments
-        self._size = min(processes, _MAX_WINDOWS_PROCESSES) if sys.platform == "win32" else processes
+        max_windows_processes = 30  # windows waits for at most 63 objects; a worker has two
+        self._size = min(processes, max_windows_processes) if sys.platform == "win32" else processes
         self._workers: list[Worker] = []
         self._leaving: list[Worker] = []
         self._waiting: deque[_Task[A]] = deque()
@@ -253,7 +250,8 @@ class ProcessPool(Generic[A, R]):
         if task is None:
             return []
         task.tries += 1
-        if by_signal and task.tries < _MAX_TRIES:
+        max_tries = 2  # a signal may kill a worker for reasons other than its task, such as a lack of memory
+        if by_signal and task.tries < max_tries:
             self._waiting.append(task)
             return []
         return [Outcome(task.number, task.argument, error=error)]

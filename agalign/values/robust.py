@@ -3,8 +3,6 @@
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-_MAD_TO_STD = 1.4826
-"""Standard deviation of a normal distribution over its median absolute deviation."""
 MIN_SHIFT_SCALE_PX = 0.05
 """Noise of the measured shift of a window: the minimum residual scale of a fit to shifts."""
 
@@ -12,7 +10,8 @@ MIN_SHIFT_SCALE_PX = 0.05
 def shift_scale_px(lengths_px: NDArray[np.float64]) -> float:
     """Return the robust standard deviation of residual shifts with these lengths (n,), at least MIN_SHIFT_SCALE_PX."""
     median_px = float(np.median(lengths_px)) if len(lengths_px) else 0.0
-    return max(_MAD_TO_STD * median_px, MIN_SHIFT_SCALE_PX)
+    mad_to_std = 1.4826  # standard deviation of a normal distribution over its median absolute deviation
+    return max(mad_to_std * median_px, MIN_SHIFT_SCALE_PX)
 
 
 def cauchy_weights(residuals: ArrayLike, scale: float | NDArray[np.float64]) -> NDArray[np.float64]:

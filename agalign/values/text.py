@@ -5,9 +5,6 @@ from collections.abc import Iterable
 from contextlib import suppress
 from difflib import SequenceMatcher
 
-_MIN_SIMILARITY = 0.7
-"""Of a suggestion: a quarter of the letters of a word of four may differ."""
-
 
 def counted(number: int, what: str) -> str:
     """Return a number with its noun: 1 capture, 2 captures."""
@@ -22,7 +19,8 @@ def did_you_mean(text: str, choices: Iterable[str]) -> str:
 
     # `difflib.get_close_matches` returns the last of equally similar words: ndwi for nvdi.
     best = max(choices, key=similarity, default="")
-    return f" (did you mean '{best}'?)" if best and similarity(best) >= _MIN_SIMILARITY else ""
+    min_similarity = 0.7  # of a suggestion: a quarter of the letters of a word of four may differ
+    return f" (did you mean '{best}'?)" if best and similarity(best) >= min_similarity else ""
 
 
 def escape_controls(text: str) -> str:

@@ -8,8 +8,6 @@ import numpy as np
 from agalign.products.report.rigs import Line, lines_of
 from agalign.products.sidecar import Sidecar
 
-_MIN_CAPTURES = 3
-
 
 @dataclass(frozen=True)
 class CaptureLight:
@@ -52,6 +50,7 @@ def light_of(label: str, sidecar: Sidecar) -> CaptureLight:
 def light_charts(captures: Sequence[CaptureLight]) -> list[LightChart]:
     """Return the charts of each camera with three captures or more whose light is known."""
     charts = []
+    min_captures = 3
     for camera in sorted({c.order[0] for c in captures}):
         of_camera = sorted((c for c in captures if c.order[0] == camera), key=lambda c: c.order)
         for caption, values in (
@@ -59,7 +58,7 @@ def light_charts(captures: Sequence[CaptureLight]) -> list[LightChart]:
             ("Light by panels, at the time of each capture", [(c, c.by_panel) for c in of_camera]),
         ):
             known = [(c, light) for c, light in values if light]
-            if len(known) >= _MIN_CAPTURES:
+            if len(known) >= min_captures:
                 names = list(dict.fromkeys(name for _, light in known for name in light))
                 light = np.array([[light.get(name, np.nan) for _, light in known] for name in names])
                 changes = light / np.nanmedian(light, axis=1, keepdims=True) - 1

@@ -25,17 +25,10 @@ from agalign.values.files import read_regular
 from agalign.values.image import Raster
 from agalign.values.pixel_units import PixelScale
 
-_MIN_BLOCKS = 6
-"""Minimum number of blocks in an overlap."""
-_MAX_CAPTURES = 200
-"""Matching takes 0.1 s a capture; of longer flights, captures at equal distances are compared with their successors."""
 _JUMP = 0.15
 """Ground seen from opposite sides differs by 9 % in the same light; cloud shadows change all bands by more."""
 _WINDOW = 5
 """The light is compared with this number of captures before and after."""
-_MIN_FULL = 0.05
-"""Smaller differences do not fill the plot."""
-_KEYPOINTS = 800
 Values = NDArray[np.float64]
 
 
@@ -100,7 +93,8 @@ def radiometric_check(captures: Sequence[CaptureLevels]) -> RadiometricCheck | N
     light = np.log(np.array([[c.irradiance.get(name, np.nan) for name in names] for c in captures]))
     sudden = light - [_median(light[max(0, k - _WINDOW) : k + _WINDOW + 1]) for k in range(len(light))]
     texts = [_jump(names, *rows) for rows in zip(changes, sudden, strict=True)]
-    full = float(np.abs(changes[np.isfinite(changes)]).max(initial=_MIN_FULL))
+    min_full = 0.05  # smaller differences do not fill the plot
+    full = float(np.abs(changes[np.isfinite(changes)]).max(initial=min_full))
     return RadiometricCheck(
         [_of_band(name, captures, changes[:, k]) for k, name in enumerate(names)],
         [(c.label, text) for c, text in zip(captures, texts, strict=True) if text],
@@ -113,7 +107,10 @@ def radiometric_check(captures: Sequence[CaptureLevels]) -> RadiometricCheck | N
 def _changes(captures: Sequence[CaptureLevels], names: Sequence[str]) -> Values:
     """Logarithms (captures, bands) of the ratio of each capture to the one before, nan without overlap."""
     pairs = [(k, k - 1) for k, (one, other) in enumerate(pairwise(captures), 1) if one.order[0] == other.order[0]]
-    pairs = pairs[:: -(-len(pairs) // _MAX_CAPTURES)] if pairs else []
+    # Matching takes 0.1 s a capture; of longer flights, captures at equal distances are compared with their
+    # successors.
+    max_captures = 200
+    pairs = pairs[:: -(-len(pairs) // max_captures)] if pairs else []
     result = np.full((len(captures), len(names)), np.nan)
     with ThreadPoolExecutor(usable_cores()) as threads:
         used = sorted({k for pair in pairs for k in pair})
@@ -133,7 +130,8 @@ def _landmarks_of(capture: CaptureLevels) -> Landmarks | None:
     if sheet is None or sheet.shape[0] < y + height or sheet.shape[1] < x + width:
         return None
     tile = np.asarray(sheet[y : y + height, x : x + width], np.float32)
-    return landmarks(Raster(tile, np.ones(tile.shape, bool)), "image", _KEYPOINTS)
+    keypoints = 800
+    return landmarks(Raster(tile, np.ones(tile.shape, bool)), "image", keypoints)
 
 
 def _ratio(
@@ -156,7 +154,8 @@ def _ratio(
     here = np.array([one.levels.get(name, unknown).ravel() for name in names])
     with np.errstate(invalid="ignore", divide="ignore"):
         ratios = np.log(here / there)
-    ratios[np.isfinite(ratios).sum(axis=1) < _MIN_BLOCKS] = np.nan
+    min_blocks = 6  # minimum number of blocks in an overlap
+    ratios[np.isfinite(ratios).sum(axis=1) < min_blocks] = np.nan
     return _median(ratios.T)
 
 

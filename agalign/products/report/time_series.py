@@ -13,8 +13,6 @@ from agalign.products.report.rigs import CHART_HEIGHT, CHART_WIDTH, Line, hue_of
 from agalign.values.files import read_regular
 
 PLOTS_FILE = "plots.csv"
-_MAX_LINES = 12
-"""More lines cannot be distinguished; the median is of all plots."""
 _MARGIN = 0.04
 """Share of the height above and below the values, where the chart has its lines."""
 
@@ -56,7 +54,8 @@ def _series(index: str, of_plots: dict[str, dict[str, list[float]]]) -> TimeSeri
     if len(days) < 2:
         return None
     on_day = {day: [by_day[day] for by_day in values.values() if day in by_day] for day in days}
-    drawn = dict(list(values.items())[:_MAX_LINES]) | {"median of all": {d: median(v) for d, v in on_day.items()}}
+    max_lines = 12  # more lines cannot be distinguished; the median is of all plots
+    drawn = dict(list(values.items())[:max_lines]) | {"median of all": {d: median(v) for d, v in on_day.items()}}
     shown = [v for by_day in drawn.values() for v in by_day.values()]
     low, high = min(shown), max(shown)
     first, last = (date.fromisoformat(day).toordinal() for day in (days[0], days[-1]))
