@@ -303,6 +303,7 @@ def test_a_failed_picture_is_only_reported(flight: Path, out_with_model: Path, m
     assert len(list(out_with_model.rglob("*.png"))) == 2
 
 
+@pytest.mark.full
 def test_a_forced_seed_is_for_the_captures_that_the_flight_is_learned_from(
     learned_flight: Path, tmp_path: Path
 ) -> None:

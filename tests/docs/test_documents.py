@@ -33,6 +33,8 @@ RUN_BY = {"docker": "tools/container.sh", "dask": "tools/dask_cluster.sh", "pip"
 """What cannot be run inside a test, and the script that runs it and what stands with it in a block."""
 KINDS = {"sh", "python", "text", "{toctree}", "{include} ../CONTRIBUTING.md", "{include} ../CHANGELOG.md"}
 RUNNABLE = [page for page in PAGES if any(b.kind in ("sh", "python") for b in blocks_of(page))]
+LONG = {"benchmark-bands.md"}
+"""Pages with blocks that take more than ten seconds: they are in the full run."""
 
 
 @pytest.fixture(scope="session")
@@ -106,7 +108,13 @@ def run_page(page: Path) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("page", RUNNABLE, ids=[p.relative_to(ROOT).as_posix() for p in RUNNABLE])
+@pytest.mark.parametrize(
+    "page",
+    [
+        pytest.param(p, id=p.relative_to(ROOT).as_posix(), marks=[pytest.mark.full] if p.name in LONG else [])
+        for p in RUNNABLE
+    ],
+)
 def test_the_blocks_of_a_page_run(page: Path, desk: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(desk)
     run_page(page)

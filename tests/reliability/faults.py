@@ -834,6 +834,7 @@ FULL = {
     "a worker killed twice at one capture",
     "memory short in the workers",
     "the interrupt key while workers start",
+    "the interrupt key, workers of Dask",
     "SIGTERM while files are read",
     "a thousand tags of one value of 2 MB",
     "a terminal of ASCII",
