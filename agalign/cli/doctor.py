@@ -113,7 +113,7 @@ def _problems(facts: dict[str, Any]) -> list[str]:
     ]
     if not disk["writable"]:
         problems.append(f"{disk['folder']}: may not be written to; choose another folder with -o")
-    min_free_disk_gb = 5.0
+    min_free_disk_gb = 5.0  # half of what a thousand captures take
     if disk["free_gb"] < min_free_disk_gb:
         problems.append(f"{disk['folder']}: {disk['free_gb']:.1f} GB are free; a thousand captures take 10 GB or more")
     return problems

@@ -24,8 +24,7 @@ def data_mask(pixels: NDArray[np.generic], nodata: float | None) -> Mask:
         valid &= pixels != nodata
     if nodata is None and (pixels.dtype.kind == "f" or pixels.dtype.itemsize == 8):
         common_fill = -9999.0, -99999.0, -32767.0, -32768.0
-        # Above the values of any sensor, below the fill values of netCDF, GIS and C programs (1e20, 9.97e36,
-        # 3.4e38).
+        # Above the values of any sensor, below the fill values of netCDF, GIS and C programs (1e20 and more).
         max_measured = 1e15
         valid &= (np.fabs(pixels) < max_measured) & ~np.isin(pixels, common_fill)
     return valid

@@ -94,7 +94,7 @@ class ProcessPool(Generic[A, R]):
     ) -> None:
         self._function, self._max_tasks = function, max_tasks_per_worker
         self._worker_arguments = context, initializer, arguments
-        max_windows_processes = 30  # windows waits for at most 63 objects; a worker has two
+        max_windows_processes = 30  # Windows waits for at most 63 objects; a worker has two
         self._size = min(processes, max_windows_processes) if sys.platform == "win32" else processes
         self._workers: list[Worker] = []
         self._leaving: list[Worker] = []
