@@ -12,6 +12,7 @@ import traceback
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from enum import IntEnum
+from types import FrameType
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
@@ -151,13 +152,18 @@ class Terminal:
 
     @contextmanager
     def stoppable(self) -> Iterator[None]:
-        """Raise Stopped in the block at the first signal; the second one ends the process at once."""
+        """Raise Stopped in the block at the first signal; the second one ends the process at once.
 
-        def stop(number: int, _frame: object) -> None:
+        While a module is imported, `check` or the end of the block raises it: Python ignores exceptions in callbacks of
+        its import locks, and one of these locks may then be held for ever.
+        """
+
+        def stop(number: int, frame: FrameType | None) -> None:
             if self._stopped_by is not None:
                 os._exit(ExitCode.SIGNAL + number)
             self._stopped_by = number
-            raise Stopped(number)
+            if frame is None or "<frozen importlib" not in frame.f_code.co_filename:
+                raise Stopped(number)
 
         before = {}
         if threading.current_thread() is threading.main_thread():
@@ -168,6 +174,7 @@ class Terminal:
                     before[number] = signal.signal(number, stop)
         try:
             yield
+            self.check()
         finally:
             for number, handler in before.items():
                 signal.signal(number, handler)

@@ -1,6 +1,8 @@
 """What is printed about arguments and files that cannot be used, and at the end: one line in plain words."""
 
 import json
+import os
+import signal
 from pathlib import Path
 
 import cv2
@@ -277,3 +279,14 @@ def test_saturated_bands_are_named(share: float | None, is_printed: bool, capsys
     conclude(totals, Path("out"), Terminal(quiet=False, verbose=False, log_json=False))
     line = f"Saturated pixels: {sidecar.bands[0].band} up to 3.1% (IMG_1)"
     assert (line in capsys.readouterr().out) is is_printed
+
+
+@pytest.mark.skipif(os.name == "nt", reason="signals are POSIX")
+def test_a_signal_during_an_import_ends_the_command_after_it() -> None:
+    """Python ignores exceptions in callbacks of its import locks."""
+    code = "os.kill(os.getpid(), signal.SIGTERM); steps.append('import')"
+    interrupted = compile(code, "<frozen importlib._bootstrap>", "exec")
+    steps: list[str] = []
+    with pytest.raises(typer.Exit) as ended, exits(Terminal(quiet=True, verbose=False, log_json=False)):
+        exec(interrupted, {"os": os, "signal": signal, "steps": steps})
+    assert (ended.value.exit_code, steps) == (128 + signal.SIGTERM, ["import"])
