@@ -25,7 +25,7 @@ class PoseErrors(NamedTuple):
     height: float
     """Relative to the height above ground."""
     heading: float
-    """Radians, as of the compass of an aircraft."""
+    """Radians, of a magnetic heading."""
     tilt: float
     """Radians."""
 

@@ -57,7 +57,7 @@ class IndexRasters(Product):
         return [paths.file(f"_{name}{suffix}") for name in names for suffix in (".tif", ".png")]
 
     def write(self, context: ProductContext) -> list[WrittenFile]:
-        """Write the indices whose bands the capture has and that are usable.
+        """Write the indices of which the capture has all bands, usable.
 
         Raises InputError if bands are in the wrong unit, OutputError.
         """

@@ -27,7 +27,7 @@ def test_irradiance_and_panel_factors_are_drawn_in_the_order_of_time() -> None:
     assert heights(by_sensor.lines[0].points) == [0.0, -0.5, 1.0]
     assert by_panel.caption.startswith("Light by panels")
     assert heights(by_panel.lines[0].points) == [0.0, 0.0, 1.0]
-    # Without a panel there is no such chart, and none of two captures.
+    # No chart without a panel, and no chart of only two captures.
     alone = [light_of("a", lit(m, 1.0, 3.0, None)) for m in range(3)]
     assert len(light_charts(alone)) == 1
     assert light_charts(alone[:2]) == []

@@ -48,7 +48,7 @@ def light_of(label: str, sidecar: Sidecar) -> CaptureLight:
 
 
 def light_charts(captures: Sequence[CaptureLight]) -> list[LightChart]:
-    """Return the charts of each camera with three captures or more whose light is known."""
+    """Return the charts of each camera with known light in at least three captures."""
     charts = []
     min_captures = 3
     for camera in sorted({c.order[0] for c in captures}):
