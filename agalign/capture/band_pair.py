@@ -125,7 +125,7 @@ class BandPair:
     @cached_property
     def is_blurred(self) -> bool:
         """True if one of the images is blurred: shifts of small windows are then noisy."""
-        max_sharp_px = 2.5
+        max_sharp_px = 2.5  # length at which a sharp image varies
         return max(self.reference.blur_px, blur_px(channel_mean(self.moving_image))) > max_sharp_px
 
     @property

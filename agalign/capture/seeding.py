@@ -82,7 +82,7 @@ def _best_match(pair: BandPair, model: FlightModel | None, best: Seed) -> Seed:
             scored = replace(_scored(pair, "match", match)[0], trusted=True)
             if not is_confirmed or scored.score > best.score:
                 best, residual = scored, match_residual
-        close_px = 3.0
+        close_px = 3.0  # the search ends here
         if best.kind == "match" and residual.p95_px <= close_px:
             break
     return best

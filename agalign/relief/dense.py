@@ -121,7 +121,7 @@ class DenseMatching:
         low = min(-_SEARCH_FARTHER * longer_side_px, windows_px[0])
         high = max(_SEARCH_NEARER * longer_side_px, windows_px[1])
         levels = np.arange(low, high + _SEARCH_STEP_PX, _SEARCH_STEP_PX)
-        relative_scale = 0.25
+        relative_scale = 0.25  # of the wide search
         fixed = _FixedBand(self.reference, self.scale * relative_scale, _WINDOW_PX)
         costs = [_MovingBand(fixed, view, (low, levels[-1])).costs(levels) for view in self.views]
         parallax_px, confidence = _semi_global_match(costs, range(len(costs)), levels)

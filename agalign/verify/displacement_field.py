@@ -229,7 +229,7 @@ def common_field(residuals: Sequence[Residual[FixedImagePx]], size_px: tuple[int
     None if it does not reduce the residuals of captures that are left out of the fit.
     """
     captures = [s for s in map(Shifts.of, residuals) if len(s.weights)]
-    min_captures, max_folds = 3, 4
+    min_captures, max_folds = 3, 4  # more folds take longer and change the errors little
     if len(captures) < min_captures:
         return None
     count = min(len(captures), max_folds)

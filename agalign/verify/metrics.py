@@ -47,7 +47,7 @@ class FixedSimilarity:
         overlap = float(np.count_nonzero(both) / both.size)
         # Indices are faster than boolean masks.
         valid = np.flatnonzero(both[self.grid])
-        min_pixels = 256
+        min_pixels = 256  # a joint histogram of fewer is noise
         if len(valid) < min_pixels:
             return {"overlap": overlap}
         fixed_values, moving_values = self.sampled[valid], moving.pixels[self.grid].ravel()[valid]
