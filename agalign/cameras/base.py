@@ -21,6 +21,7 @@ from agalign.values import geometry
 from agalign.values.capture import Band, Pose
 from agalign.values.geometry import Matrix
 from agalign.values.lens import Lens
+from agalign.values.text import did_you_mean
 
 
 class Camera(ABC):
@@ -102,7 +103,8 @@ def reference_index(bands: Sequence[Band], wanted: str | None, path: Path) -> in
     for index, band in enumerate(bands):
         if band.name.lower() == wanted.lower():
             return index
-    raise NoSuchBandError(f"{path}: no band '{wanted}' for the reference; this capture has {listed(bands)}")
+    similar = did_you_mean(wanted, [b.name for b in bands])
+    raise NoSuchBandError(f"{path}: no band '{wanted}', as --reference asks{similar}; choose from {listed(bands)}")
 
 
 def listed(bands: Sequence[Band]) -> str:

@@ -63,7 +63,7 @@ def discover(
     files = _read(paths, options, progress, problems)
     captures: list[Capture] = []
     groups = group_files(files)
-    _check_bands(groups, options, folder)
+    _check_bands(groups, options.bands, folder)
     for group in groups:
         if options.pattern is not None:
             problems += pattern_clashes(group, options.pattern)
@@ -73,6 +73,9 @@ def discover(
             problems.append(Problem(group[0].path, error))
     if not captures:
         _check_pattern(options.pattern, paths, folder)
+        for problem in problems:
+            if isinstance(problem.error, NoSuchBandError):
+                raise problem.error
     captures.sort(key=lambda c: (c.folder.as_posix(), c.name))
     captures = with_missing_bands(with_unique_capture_names(captures, band_file_owners(captures)))
     return FolderScan(folder, tuple(captures), tuple(problems))
@@ -116,21 +119,21 @@ def _read(
     return files
 
 
-def _check_bands(groups: Sequence[Sequence[ImageFile]], options: DiscoverOptions, folder: Path) -> None:
-    """Raise ConfigurationError for a band of the options that no capture has, and if --bands leaves less than two."""
+def _check_bands(groups: Sequence[Sequence[ImageFile]], chosen: Sequence[str], folder: Path) -> None:
+    """Raise NoSuchBandError for a band of --bands that no capture has, ConfigurationError if --bands leaves less than
+    two of each capture.
+    """
     by_capture = [[b.name for file in group for b in file.bands] for group in groups]
     known = {name.lower(): name for names in by_capture for name in names}
-    chosen = {name.lower() for name in options.bands}
-    reference = options.reference or "auto"
-    references = () if reference.lower() == "auto" else (reference,)
-    for option, wanted in (("--bands", options.bands), ("--reference", references)):
-        usable = {k: name for k, name in known.items() if option == "--bands" or not chosen or k in chosen}
-        for name in wanted if known else ():
-            if name.lower() not in usable:
-                what = f"no capture has a band '{name}', as {option} asks{did_you_mean(name, usable.values())}"
-                raise NoSuchBandError(f"{folder}: {what}; choose from {', '.join(usable.values())}")
-    if chosen and all(sum(name.lower() in chosen for name in names) < 2 for names in by_capture):
-        what = f"--bands {','.join(options.bands)}: leaves less than the two bands of a capture that alignment needs"
+    if not chosen or not known:
+        return
+    for name in chosen:
+        if name.lower() not in known:
+            what = f"no capture has a band '{name}', as --bands asks{did_you_mean(name, known.values())}"
+            raise NoSuchBandError(f"{folder}: {what}; choose from {', '.join(known.values())}")
+    wanted = {name.lower() for name in chosen}
+    if all(sum(name.lower() in wanted for name in names) < 2 for names in by_capture):
+        what = f"--bands {','.join(chosen)}: leaves less than the two bands of a capture that alignment needs"
         raise ConfigurationError(f"{folder}: {what}; choose from {', '.join(known.values())}")
 
 

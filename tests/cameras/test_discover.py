@@ -169,8 +169,20 @@ def test_two_captures_of_one_name_do_not_overwrite_each_other(tmp_path: Path) ->
 
 def test_reference_by_name(flight: Path) -> None:
     assert discover(flight, DiscoverOptions(reference="nir")).captures[0].reference.name == "NIR"
-    with pytest.raises(NoSuchBandError, match="no capture has a band 'swir', as --reference asks; choose from"):
+    with pytest.raises(NoSuchBandError, match=r"IMG_0001_1\.tif: no band 'swir', as --reference asks; choose from"):
         discover(flight, DiscoverOptions(reference="swir"))
+
+
+def test_a_reference_by_the_number_of_a_repeated_name(tmp_path: Path) -> None:
+    write_all(tmp_path, "a_1_red", "a_2_red", "a_1_nir")
+    options = DiscoverOptions(pattern="{capture}_*_{band}.tif", reference="RED-2")
+    assert discover(tmp_path, options).captures[0].reference.path.name == "a_2_red.tif"
+
+
+def test_chosen_bands_of_unreadable_files_are_not_called_missing(tmp_path: Path) -> None:
+    for name in ("a_red.tif", "a_nir.tif"):
+        (tmp_path / name).write_bytes(b"damaged")
+    assert len(discover(tmp_path, DiscoverOptions(bands=("red", "nir"))).problems) == 2
 
 
 def test_output_folders_are_not_looked_into(flight: Path, tmp_path: Path) -> None:
