@@ -11,7 +11,6 @@ where agalign does not combine it with the light sensor.
 import itertools
 import math
 from dataclasses import replace
-from datetime import UTC, datetime
 from pathlib import Path
 
 import cv2
@@ -27,7 +26,7 @@ from agalign.pixels.landmarks import landmarks, matched_homography, matches
 from agalign.pixels.radiometry import calibrated, with_radiometry
 from agalign.pixels.raster import read_for_alignment, read_tile
 from agalign.values import geometry
-from agalign.values.capture import Band, Capture
+from agalign.values.capture import Band, Capture, unix_time_s
 from agalign.values.image import Tile
 
 CAMERA, DLS, PIX4D = "micasense.com/MicaSense", "micasense.com/DLS", "pix4d.com"
@@ -55,7 +54,7 @@ def published_irradiance(tags: Tags) -> float:
     horizontal, scale = tags.number(DLS, "HorizontalIrradiance"), tags.number(DLS, "IrradianceScaleToSIUnits")
     if horizontal is not None:
         return horizontal * (scale or 0.01)
-    elevation, azimuth = sun_position(tags.position, moment(tags))
+    elevation, azimuth = sun_position(tags.position, unix_time_s(tags.captured_at))
     angle = phi = sensor_to_sun(tags, elevation, azimuth)
     light = tags.number(DLS, "SpectralIrradiance") * (scale or 1.0)
     for n1, n2 in ((1.000277, 1.6), (1.6, 1.38)):
@@ -79,10 +78,6 @@ def sensor_to_sun(tags: Tags, elevation: float, azimuth: float) -> float:
 def attitude(tags: Tags) -> list[float]:
     """(yaw, pitch, roll) of the light sensor, radians."""
     return [tags.number(DLS, name) or 0.0 for name in ("Yaw", "Pitch", "Roll")]
-
-
-def moment(tags: Tags) -> datetime:
-    return datetime.fromisoformat(tags.captured_at).replace(tzinfo=UTC)
 
 
 # ---- tables
@@ -151,7 +146,10 @@ def published_panel_light(band: Band) -> tuple[float, float]:
 
 def tilt_facts(tags: Tags) -> tuple[str, ...]:
     """Angles, and the measured and the corrected irradiance relative to HorizontalIrradiance."""
-    sun, horizontal = sun_position(tags.position, moment(tags)), tags.number(DLS, "HorizontalIrradiance")
+    sun, horizontal = (
+        sun_position(tags.position, unix_time_s(tags.captured_at)),
+        tags.number(DLS, "HorizontalIrradiance"),
+    )
     measured = tags.number(DLS, "SpectralIrradiance")
     corrected = horizontal_irradiance(measured, tuple(np.degrees(attitude(tags))), sun)
     angles = math.degrees(sensor_to_sun(tags, *sun)), 90 - math.degrees(sun[0])

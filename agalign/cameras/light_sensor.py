@@ -9,7 +9,6 @@ with the angle between the sun and the sensor's axis. Axes are north, east, down
 """
 
 import math
-from datetime import UTC, datetime
 from itertools import pairwise
 
 import numpy as np
@@ -24,14 +23,13 @@ _MAX_CORRECTION = 2.0
 """A sensor that points further from the sun measures too little direct light to calculate it from."""
 
 
-def sun_position(position: Position, moment: datetime) -> tuple[float, float]:
-    """Return (elevation, azimuth clockwise from north) of the sun without refraction; naive moments are UTC.
+def sun_position(position: Position, time_s: float) -> tuple[float, float]:
+    """Return (elevation, azimuth clockwise from north) of the sun without refraction at a Unix time.
 
     Equations of NOAA's solar calculator (gml.noaa.gov/grad/solcalc, after Meeus, Astronomical Algorithms), which are
     accurate to 0.01 degrees.
     """
-    moment = moment if moment.tzinfo else moment.replace(tzinfo=UTC)
-    days = (moment - datetime(2000, 1, 1, 12, tzinfo=UTC)).total_seconds() / 86400
+    days = (time_s - 946728000) / 86400  # since noon on 1 January 2000
     t = days / 36525
     anomaly = math.radians(357.52911 + t * (35999.05029 - 0.0001537 * t))
     centre_deg = math.sin(anomaly) * (1.914602 - 0.004817 * t) + math.sin(2 * anomaly) * 0.019993
@@ -49,7 +47,7 @@ def sun_position(position: Position, moment: datetime) -> tuple[float, float]:
     east = -math.cos(declination) * math.sin(hour_angle)
     up = math.sin(latitude) * math.sin(declination)
     up += math.cos(latitude) * math.cos(declination) * math.cos(hour_angle)
-    return math.asin(up), math.atan2(east, north) % math.tau
+    return math.atan2(up, math.hypot(north, east)), math.atan2(east, north) % math.tau
 
 
 def horizontal_irradiance(measured: float, attitude_deg: tuple[float, float, float], sun: tuple[float, float]) -> float:

@@ -8,9 +8,7 @@ between the two halves of a dual camera because of the longer baseline.
 import math
 import re
 from collections.abc import Sequence
-from contextlib import suppress
 from dataclasses import replace
-from datetime import datetime
 from pathlib import Path
 
 from agalign.cameras import pix4d
@@ -18,7 +16,7 @@ from agalign.cameras.base import FULL_SCALE, Camera, is_thermal, rays_to_rig, ro
 from agalign.cameras.light_sensor import horizontal_irradiance, sun_position
 from agalign.cameras.metadata import Tags, finite
 from agalign.cameras.xmp import Packet, names_in
-from agalign.values.capture import Band, Pose, Radiometry
+from agalign.values.capture import Band, Pose, Radiometry, unix_time_s
 
 _MICASENSE, _DLS = "micasense.com/MicaSense", "micasense.com/DLS"
 _REDEDGE_M_PARALLAX = {
@@ -118,9 +116,8 @@ def _irradiance(tags: Tags) -> tuple[float, float] | None:
 
     Older sensors measure only in their own plane: the time, the place and the attitude then give the horizontal one.
     """
-    sun = None
-    with suppress(ValueError):
-        sun = None if tags.position is None else sun_position(tags.position, datetime.fromisoformat(tags.captured_at))
+    time_s = unix_time_s(tags.captured_at)
+    sun = None if tags.position is None or time_s is None else sun_position(tags.position, time_s)
     scale = tags.number(_DLS, "IrradianceScaleToSIUnits")
     value, unit = _measured_horizontal(tags, sun), scale or 0.01  # the unit without a tag
     if value is None or value <= 0:
@@ -128,7 +125,8 @@ def _irradiance(tags: Tags) -> tuple[float, float] | None:
         value = tags.number(pix4d.NAMESPACE, "Irradiance") if value is None else value
         if value is not None and sun is not None:
             value = horizontal_irradiance(value, _sensor_attitude_deg(tags), sun)
-    return None if value is None or not value > 0 else (value, unit)
+    # Products of damaged tags underflow.
+    return None if value is None or not value * unit > 0 else (value, unit)
 
 
 def _measured_horizontal(tags: Tags, sun: tuple[float, float] | None) -> float | None:

@@ -60,6 +60,14 @@ class Radiometry:
         return self.quantity in ("radiance", "relative radiance")
 
 
+def unix_time_s(text: str) -> float | None:
+    """Return the Unix time of an ISO 8601 text, s; UTC is assumed without a time zone. None for another text."""
+    with suppress(ValueError):
+        moment = datetime.fromisoformat(text)
+        return (moment if moment.tzinfo else moment.replace(tzinfo=UTC)).timestamp()
+    return None
+
+
 class PanelFactor(NamedTuple):
     """Reflectance per radiance of a band by panels."""
 
@@ -250,11 +258,8 @@ class Capture:
 
     @property
     def time_s(self) -> float | None:
-        """Unix time of the capture, s; UTC is assumed if `captured_at` has no time zone. None if it is unknown."""
-        with suppress(ValueError):
-            moment = datetime.fromisoformat(self.captured_at)
-            return (moment if moment.tzinfo else moment.replace(tzinfo=UTC)).timestamp()
-        return None
+        """Unix time of the capture, s, as `unix_time_s`; None if it is unknown."""
+        return unix_time_s(self.captured_at)
 
     @property
     def label(self) -> str:

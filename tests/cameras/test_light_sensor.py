@@ -1,5 +1,4 @@
 import math
-from datetime import datetime
 from pathlib import Path
 
 import pytest
@@ -8,15 +7,16 @@ from agalign.cameras.light_sensor import horizontal_irradiance, sun_position, tr
 from agalign.cameras.metadata import Tags, read_tags
 from agalign.cameras.micasense import MicaSense
 from agalign.pixels.raster import probe
-from agalign.values.capture import Position
+from agalign.values.capture import Position, unix_time_s
 
+SCALE = "IrradianceScaleToSIUnits"
 DLS, NOON = "micasense.com/DLS", "2003-10-17T19:30:30"
 GOLDEN = Position(39.742476, -105.1786, 1830.14)
 
 
 def test_position_of_the_sun_equals_the_example_of_nrel() -> None:
     """Reda & Andreas 2004 (NREL/TP-560-34302), appendix A.5: elevation 39.872046 degrees before refraction."""
-    elevation, azimuth = map(math.degrees, sun_position(GOLDEN, datetime.fromisoformat(NOON)))
+    elevation, azimuth = map(math.degrees, sun_position(GOLDEN, unix_time_s(NOON)))
     assert elevation == pytest.approx(39.872046, abs=0.01)
     assert azimuth == pytest.approx(194.340241, abs=0.01)
 
@@ -51,9 +51,9 @@ def test_a_tilted_sensor_measures_the_light_on_the_horizontal_plane(
 
 def test_a_sensor_that_sees_no_direct_light_measures_nothing() -> None:
     low, night = (math.radians(20), math.pi), (math.radians(-3), math.pi)
-    assert math.isnan(horizontal_irradiance(0.2, (0, -60, 0), low))
+    assert math.isnan(horizontal_irradiance(0.2, (0, -19, 0), low))
     assert math.isnan(horizontal_irradiance(0.2, (0, -180, 0), low))
-    assert math.isnan(horizontal_irradiance(0.2, (0, 0, 0), night))
+    assert math.isnan(horizontal_irradiance(0.2, (180, -5, 0), night))
 
 
 def irradiance(path: Path, values: dict[str, float], position: Position | None = GOLDEN) -> float | None:
@@ -67,7 +67,7 @@ def irradiance(path: Path, values: dict[str, float], position: Position | None =
 
 def test_irradiance_in_the_plane_of_the_sensor_is_corrected_for_its_tilt(flight: Path) -> None:
     path = next(flight.rglob("IMG_0001_1.tif"))
-    elevation, azimuth = sun_position(GOLDEN, datetime.fromisoformat(NOON))
+    elevation, azimuth = sun_position(GOLDEN, unix_time_s(NOON))
     for lean in (0.0, math.radians(19), math.radians(-19)):
         angle = math.pi / 2 - elevation - lean
         measured = (1.2 * math.cos(angle) + 0.2) * transmission(angle)
@@ -75,7 +75,9 @@ def test_irradiance_in_the_plane_of_the_sensor_is_corrected_for_its_tilt(flight:
         assert irradiance(path, tags) == pytest.approx(1.2 * math.sin(elevation) + 0.2)
         # Without a place, the position of the sun is unknown.
         assert irradiance(path, tags, position=None) == pytest.approx(measured)
-    assert irradiance(path, {"SpectralIrradiance": 0.2, "Yaw": azimuth, "Pitch": 2.6}) is None
+    for damaged in ({"SpectralIrradiance": 0.2, "Pitch": 2.6}, {"HorizontalIrradiance": "1e-300", SCALE: "1e-300"}):
+        assert irradiance(path, {"Yaw": azimuth} | damaged) is None
+    assert irradiance(path, {"HorizontalIrradiance": 120.0, SCALE: -0.01}) is None
 
 
 @pytest.mark.parametrize(("error", "expected"), [(1.0, 1.0), (1.004, 1.004), (1.2, 1.0)])
@@ -83,7 +85,7 @@ def test_a_horizontal_irradiance_that_contradicts_its_components_is_replaced(
     flight: Path, error: float, expected: float
 ) -> None:
     path = next(flight.rglob("IMG_0001_1.tif"))
-    elevation, _ = sun_position(GOLDEN, datetime.fromisoformat(NOON))
+    elevation, _ = sun_position(GOLDEN, unix_time_s(NOON))
     horizontal = 120.0 * math.sin(elevation) + 15.0
     tags = {"HorizontalIrradiance": horizontal * error, "DirectIrradiance": 120.0, "ScatteredIrradiance": 15.0}
     assert irradiance(path, tags) == pytest.approx(horizontal / 100 * expected)
