@@ -174,10 +174,10 @@ class Terminal:
                     before[number] = signal.signal(number, stop)
         try:
             yield
-            self.check()
         finally:
             for number, handler in before.items():
                 signal.signal(number, handler)
+            self.check()
 
 
 def examples(*lines: tuple[str, str]) -> str:

@@ -287,6 +287,12 @@ def test_a_signal_during_an_import_ends_the_command_after_it() -> None:
     code = "os.kill(os.getpid(), signal.SIGTERM); steps.append('import')"
     interrupted = compile(code, "<frozen importlib._bootstrap>", "exec")
     steps: list[str] = []
-    with pytest.raises(typer.Exit) as ended, exits(Terminal(quiet=True, verbose=False, log_json=False)):
-        exec(interrupted, {"os": os, "signal": signal, "steps": steps})
+
+    def command() -> None:
+        with exits(Terminal(quiet=True, verbose=False, log_json=False)):
+            exec(interrupted, {"os": os, "signal": signal, "steps": steps})
+            raise typer.Exit(0)
+
+    with pytest.raises(typer.Exit) as ended:
+        command()
     assert (ended.value.exit_code, steps) == (128 + signal.SIGTERM, ["import"])
