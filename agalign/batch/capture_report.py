@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Literal
 
 from agalign.capture.align_bands import PairProgress
-from agalign.products.run_record import ExclusionPart
 from agalign.products.sidecar import BandResult, CaptureResult, Sidecar
 from agalign.products.sidecar_file import read_sidecar
 from agalign.values.text import counted
@@ -36,8 +35,6 @@ class CaptureReport:
     """Description of the calibration panel."""
     sky: str | None = None
     """Why the capture counts as sky."""
-    exclusion: ExclusionPart | None = None
-    """Evidence for the panel or the sky, for which the capture is left out."""
     failed_products: tuple[str, ...] = ()
     """Products that could not be written, and why."""
     seconds: float = 0.0

@@ -98,7 +98,6 @@ def run_flight(
     with locked(out), _recorded(run) as record:
         for report in run.reports(record):
             record.add(report.label, report.state, report.result, report.problems)
-            record.excluded += [report.exclusion] if report.exclusion is not None else []
             if report.state == "done":
                 record.capture_seconds[report.label] = report.seconds
             for (_, stage), seconds in report.stages.items():
@@ -220,7 +219,7 @@ class _FlightRun:
         """Yield the report of each capture; add the time of learning to the record."""
         out, settings, flight_map = self.out, self.settings, FlightMap(self.out)
         sky, panels, captures = self.selected()
-        for report, capture in self._excluded(sky, panels):
+        for report, capture in self._excluded(sky, panels, record):
             discard_outputs(capture, out, settings.write)
             flight_map.add(capture, report.state)
             yield report
@@ -246,18 +245,16 @@ class _FlightRun:
             write_collections(captures, out)
 
     def _excluded(
-        self, sky: Sequence[SkyCapture], panels: Sequence[PanelReading]
+        self, sky: Sequence[SkyCapture], panels: Sequence[PanelReading], record: RunPart
     ) -> Iterator[tuple[CaptureReport, Capture]]:
         """Write the records of the sky and of the panels; yield the captures that are not aligned, with reports."""
         for excluded, facts in zip(sky, write_sky(sky, self.out), strict=True):
-            exclusion = ExclusionPart(capture=excluded.capture.label, kind="sky", evidence=facts.cues)
-            report = CaptureReport(excluded.capture.label, "sky", sky=facts.sentence, exclusion=exclusion)
-            yield report, excluded.capture
+            record.excluded.append(ExclusionPart(capture=excluded.capture.label, kind="sky", evidence=facts.cues))
+            yield CaptureReport(excluded.capture.label, "sky", sky=facts.sentence), excluded.capture
         for reading, part in zip(panels, write_panels(panels, self.out), strict=True):
             if reading.capture.is_of_a_panel:
-                exclusion = ExclusionPart(capture=reading.capture.label, kind="panel", evidence=part.cues)
-                report = CaptureReport(reading.capture.label, "panel", panel=part.sentence, exclusion=exclusion)
-                yield report, reading.capture
+                record.excluded.append(ExclusionPart(capture=reading.capture.label, kind="panel", evidence=part.cues))
+                yield CaptureReport(reading.capture.label, "panel", panel=part.sentence), reading.capture
 
     def _processed(self, flights: Sequence[_Flight], record: RunPart) -> Iterator[CaptureReport]:
         """Learn the model of each flight and process its captures; yield their reports as they complete."""

@@ -22,7 +22,7 @@ from agalign.errors import InputError, OutputError, WorkerError
 from agalign.flight.groups import camera_overviews
 from agalign.products.report import REPORT_FILE, pages_exist, write_pages
 from agalign.products.report.facts import FailureGroup, FailureGroups
-from agalign.products.run_record import ExclusionPart, exclusion_lines
+from agalign.products.run_record import exclusion_lines, read_run_record
 from agalign.products.sidecar import BandResult, CaptureResult
 from agalign.values.capture import Capture
 from agalign.values.text import counted
@@ -105,7 +105,6 @@ class RunTotals:
     states: Counter[str] = field(default_factory=Counter)
     bands: dict[str, list[tuple[str, float | None, float]]] = field(default_factory=dict)
     """(status, median residual in px if it is known, seconds) of the pairs of each band."""
-    excluded: list[ExclusionPart] = field(default_factory=list)
     saturated: dict[str, tuple[float, str]] = field(default_factory=dict)
     """Largest share of saturated pixels, and its capture, of each band."""
     radiometry: Counter[str] = field(default_factory=Counter)
@@ -117,7 +116,6 @@ class RunTotals:
         """Add the report of a capture."""
         self.states[report.state] += 1
         self.is_complete &= report.is_complete
-        self.excluded += [report.exclusion] if report.exclusion is not None else []
         if report.result is None:
             return
         self.failures.add(report.label, report.result)
@@ -341,7 +339,8 @@ def conclude(totals: RunTotals, out: Path, terminal: Terminal) -> int:
     if high:
         shares = ", ".join(f"{name} up to {share:.1%} ({label})" for name, share, label in high)
         terminal.result(f"Saturated pixels: {shares}")
-    for line in exclusion_lines(totals.excluded):
+    record = read_run_record(out)
+    for line in [] if record is None else exclusion_lines(record.excluded):
         terminal.result(line)
     terminal.result(f"Report: {out / REPORT_FILE}")
     if totals.states and set(totals.states) <= {"panel", "sky"}:
