@@ -116,8 +116,9 @@ def _irradiance(tags: Tags) -> tuple[float, float] | None:
 
     Older sensors measure only in their own plane: the time, the place and the attitude then give the horizontal one.
     """
-    time_s = unix_time_s(tags.captured_at)
-    sun = None if tags.position is None or time_s is None else sun_position(tags.position, time_s)
+    time_s = unix_time_s(tags.captured_at) or 0.0
+    is_clock_set = time_s > 366 * 86400.0  # others count from 1970
+    sun = sun_position(tags.position, time_s) if tags.position is not None and is_clock_set else None
     scale = tags.number(_DLS, "IrradianceScaleToSIUnits")
     value, unit = _measured_horizontal(tags, sun), scale or 0.01  # the unit without a tag
     if value is None or value <= 0:
@@ -140,7 +141,7 @@ def _measured_horizontal(tags: Tags, sun: tuple[float, float] | None) -> float |
     calculated = direct * math.sin(sun[0]) + diffuse
     # Of HorizontalIrradiance: correct firmware differs from its own components by 0.03 %, from refraction.
     max_horizontal_error = 0.01
-    return horizontal if abs(horizontal / calculated - 1) < max_horizontal_error else calculated
+    return horizontal if abs(horizontal - calculated) < max_horizontal_error * horizontal else calculated
 
 
 def _sensor_attitude_deg(tags: Tags) -> tuple[float, float, float]:

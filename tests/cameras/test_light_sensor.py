@@ -56,11 +56,13 @@ def test_a_sensor_that_sees_no_direct_light_measures_nothing() -> None:
     assert math.isnan(horizontal_irradiance(0.2, (180, -5, 0), night))
 
 
-def irradiance(path: Path, values: dict[str, float], position: Position | None = GOLDEN) -> float | None:
+def irradiance(
+    path: Path, values: dict[str, float], position: Position | None = GOLDEN, captured_at: str = NOON
+) -> float | None:
     """The irradiance by a file's light sensor, with other values in its tags."""
     tags = vars(read_tags(path))
     xmp = {k: v for k, v in tags["xmp"].items() if k[0] != DLS} | {(DLS, k): (str(v),) for k, v in values.items()}
-    changed = Tags(**tags | {"xmp": xmp, "position": position, "captured_at": NOON})
+    changed = Tags(**tags | {"xmp": xmp, "position": position, "captured_at": captured_at})
     (band,) = MicaSense().bands(path, changed, probe(path))
     return band.radiometry.by_sun and math.pi / band.radiometry.by_sun[0]
 
@@ -73,8 +75,9 @@ def test_irradiance_in_the_plane_of_the_sensor_is_corrected_for_its_tilt(flight:
         measured = (1.2 * math.cos(angle) + 0.2) * transmission(angle)
         tags = {"SpectralIrradiance": measured, "Yaw": azimuth, "Pitch": -lean, "Roll": 0}
         assert irradiance(path, tags) == pytest.approx(1.2 * math.sin(elevation) + 0.2)
-        # Without a place, the position of the sun is unknown.
+        # Without a place or with a clock that was not set, the position of the sun is unknown.
         assert irradiance(path, tags, position=None) == pytest.approx(measured)
+        assert irradiance(path, tags, captured_at="1970-01-01T19:30:30") == pytest.approx(measured)
     for damaged in ({"SpectralIrradiance": 0.2, "Pitch": 2.6}, {"HorizontalIrradiance": "1e-300", SCALE: "1e-300"}):
         assert irradiance(path, {"Yaw": azimuth} | damaged) is None
     assert irradiance(path, {"HorizontalIrradiance": 120.0, SCALE: -0.01}) is None
