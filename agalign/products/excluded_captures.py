@@ -70,7 +70,7 @@ class PanelPart(_CapturePart):
     sensor_scale: float | None = None
     """Irradiance on the panel divided by that of the light sensor, the median of the bands."""
     fits_sensor: bool = True
-    """False if the scale is implausible; the panel is then not combined with the light sensor."""
+    """False if the scale is implausible; panels are then not combined with the light sensor."""
     bands: list[PanelBandPart]
 
     @property
@@ -85,7 +85,7 @@ class PanelPart(_CapturePart):
         scale = self.sensor_scale
         sensor = "" if scale is None else f"; irradiance {scale:.2f} times that of the light sensor"
         if not self.fits_sensor:
-            sensor += ", which was in other light: they are not combined"
+            sensor += ", which was in other light: --radiometry auto uses the sensor alone, panel the panels alone"
         return f"{name} (reflectance {reflectance}; recognised by {recognised}): {use}{sensor}"
 
 

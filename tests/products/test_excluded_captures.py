@@ -17,7 +17,7 @@ import agalign
 from agalign.batch import RunOptions
 from agalign.config import Settings, WriteSettings
 from agalign.errors import SidecarError
-from agalign.products.excluded_captures import PANELS_FILE, SKY_FILE, read_sky
+from agalign.products.excluded_captures import PANELS_FILE, SKY_FILE, PanelPart, read_sky
 from agalign.products.report import write_pages
 
 from ..conftest import Shared, read_json, seeded
@@ -162,3 +162,17 @@ def test_a_damaged_record_is_one_line(tmp_path: Path) -> None:
     problems: list[str] = []
     write_pages(tmp_path, problems.append)
     assert len(problems) == 1
+
+
+def test_a_panel_in_other_light_than_the_sensor_is_described() -> None:
+    facts = {
+        "folder": ".",
+        "capture": "a",
+        "captured_at": "",
+        "seen_by": "tags",
+        "serial": "",
+        "picture": "a.panel.png",
+    }
+    texts = [PanelPart(**facts, bands=[], sensor_scale=1.45, fits_sensor=fits).sentence for fits in (True, False)]
+    assert texts[0].endswith("irradiance 1.45 times that of the light sensor")
+    assert texts[1].endswith("in other light: --radiometry auto uses the sensor alone, panel the panels alone")
