@@ -12,12 +12,14 @@ HEAD = "date,capture,plot,index,mean,median\n"
 
 
 def table(folder: Path, days: tuple[str, ...] = ("2026-05-01", "2026-05-11", "2026-06-10"), plots: int = 20) -> None:
+    """The table of a run, with a mosaic without a date and a camera without a clock."""
     rows = [
         f"{day}T10:0{n}:00,IMG_{n},{plot},ndvi,0,{0.2 * k + 0.01 * plot + 0.1 * n}\n"
         for k, day in enumerate(days)
         for plot in range(plots)
         for n in (0, 2)
     ]
+    rows += [f"{day},a,0,ndvi,0,0.9\n" for day in ("", "1970-01-01T00:00:07")]
     (folder / "plots.csv").write_text(HEAD + "".join(rows))
 
 

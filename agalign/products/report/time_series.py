@@ -39,7 +39,7 @@ def time_series(out: Path) -> list[TimeSeries]:
     samples: defaultdict[str, dict[str, dict[str, list[float]]]] = defaultdict(dict)
     try:
         for row in csv.DictReader(io.StringIO(read_regular(out / PLOTS_FILE).decode())):
-            if row["median"]:
+            if row["median"] and row["date"] >= "1971":  # mosaics may have no date, and cameras without a clock 1970
                 day = date.fromisoformat(row["date"][:10]).isoformat()
                 of_plot = samples[row["index"]].setdefault(row["plot"], {})
                 of_plot.setdefault(day, []).append(float(row["median"]))
