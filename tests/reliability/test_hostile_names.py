@@ -12,13 +12,14 @@ from PIL.ExifTags import Base
 from synthetic_flights.aligned import make_aligned
 
 import agalign
+from agalign.batch.capture_task import discard_outputs
 from agalign.batch.index_run import index_tasks, run_indices
 from agalign.cameras.tiff_directory import EXIF, GPS, XMP, add_directories, byte_string, read_directories, text
 from agalign.flight.groups import model_names
 from agalign.products.export import export
 from agalign.products.indices import index_named
 from agalign.products.sidecar_file import content_checksum, find_sidecars
-from agalign.values.capture import CameraIdentity, Capture
+from agalign.values.capture import Band, CameraIdentity, Capture
 from agalign.values.files import file_name
 from agalign.values.text import without_controls
 
@@ -192,7 +193,7 @@ def test_links_are_not_followed_out_of_the_folder(flight: Path, tmp_path: Path) 
 
 
 @pytest.mark.skipif(os.name == "nt", reason="links need a privilege on Windows")
-def test_an_export_does_not_read_through_links_and_indices_do_not_write_through_them(tmp_path: Path) -> None:
+def test_links_in_an_output_folder_are_not_read_written_or_emptied(tmp_path: Path) -> None:
     out, secret = tmp_path / "out", tmp_path / "secret"
     secret.mkdir()
     (secret / "key").write_text("secret")
@@ -209,4 +210,7 @@ def test_an_export_does_not_read_through_links_and_indices_do_not_write_through_
     (target / "0000SET").symlink_to(secret)
     (result,) = run_indices(index_tasks(out, [index_named("ndvi")], target))
     assert "a link leads out" in result.reports[0].problem
+    band = Band("Green", tmp_path / "IMG_0001_2.tif", 1, 9, 9, "uint16")
+    discard_outputs(Capture("IMG_0001", Path("0000SET"), (band,), 0), out, agalign.WriteSettings())
+    assert not sidecar.exists()
     assert [p.name for p in secret.iterdir()] == ["key"]

@@ -20,6 +20,8 @@ from agalign.batch import capture_task as batch
 from agalign.cameras import known_cameras
 from agalign.cameras.discover import discover
 from agalign.cameras.grouping import capture_of
+from agalign.cameras.metadata import Tags
+from agalign.cameras.pix4d import NAMESPACE, focal_length_px
 from agalign.cameras.read_files import read_file
 from agalign.config import DiscoverOptions
 from agalign.errors import SidecarError
@@ -98,6 +100,11 @@ def test_a_lens_of_damaged_tags_is_not_used(flight: Path, change: dict[str, Any]
     files[2] = replace(files[2], bands=(replace(band, lens=replace(band.lens, **change)),))
     result = capture_of(files, flight, DiscoverOptions()).bands[2]
     assert (result.lens is None, result.to_rig is None) == (bool(change), bool(change))
+
+
+def test_a_focal_length_of_damaged_tags_is_not_used() -> None:
+    values = {(NAMESPACE, "PerspectiveFocalLength"): ("1e9",)}
+    assert focal_length_px(Tags(xmp=values, exif={"FocalLength": 5.4})) is None
 
 
 def test_options_that_are_not_a_regular_file_are_an_error(tmp_path: Path, irregular: Callable[[Path], None]) -> None:
