@@ -75,7 +75,9 @@ class OdmPhoto:
         shape = pixels_in(self.path).shape
         unit_mm = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}
         focal_ratio = 0.85
-        if "EXIF FocalPlaneXResolution" in self.exif:
+        if "EXIF FocalLengthIn35mmFilm" in self.exif:
+            focal_ratio = self.exif_number("EXIF FocalLengthIn35mmFilm") / 36.0
+        elif "EXIF FocalPlaneXResolution" in self.exif:
             unit = unit_mm[int(self.exif_number("EXIF FocalPlaneResolutionUnit"))]
             width_mm = shape[1] / self.exif_number("EXIF FocalPlaneXResolution") * unit
             focal_ratio = self.exif_number("EXIF FocalLength") / width_mm

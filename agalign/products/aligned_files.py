@@ -53,7 +53,7 @@ class BandFiles(Product):
         for layer in layers:
             by_file.setdefault(names[layer.band.name], []).append(layer)
         return [
-            self._write_file(context, name, by_file[name], vignettings.get(by_file[name][0].band.path))
+            self._write_file(context, name, by_file[name], vignettings.get(by_file[name][0].band.name))
             for name in dict.fromkeys(names.values())
             if name in by_file
         ]
@@ -101,17 +101,17 @@ def _has_namesakes_in_folders(files: Sequence[Path]) -> bool:
     return len({p.stem for p in files}) < len(files) and len({p.parent for p in files}) > 1
 
 
-def _vignettings(layers: Sequence[Layer], grid: OutputGrid) -> dict[Path, GridVignetting]:
-    """The vignetting of the files of layers on the output grid; none for files without its tags and without pixels."""
+def _vignettings(layers: Sequence[Layer], grid: OutputGrid) -> dict[str, GridVignetting]:
+    """The vignetting of bands on the output grid; none for bands without its tags or without pixels."""
     result = {}
+    output_px = geometry.lattice(grid.width, grid.height, 25, 19)
     min_points = 30  # pixels of the lattice of 25 x 19 that must be inside a band: a polynomial has six coefficients
     for layer in layers:
         correction = _correction(layer.band)
-        output_px = geometry.lattice(grid.width, grid.height, 25, 19)
         positions_px = layer.positions(output_px, grid)
         inside = is_inside(positions_px, layer.band)
         if correction is not None and np.count_nonzero(inside) >= min_points:
-            result[layer.band.path] = vignetting_on_grid(correction, output_px[inside], positions_px[inside])
+            result[layer.band.name] = vignetting_on_grid(correction, output_px[inside], positions_px[inside])
     return result
 
 

@@ -39,7 +39,7 @@ class ReducedBands:
     output; nan without pixels.
     """
     saturated: Mapping[str, float] = field(default_factory=dict)
-    """Share of saturated pixels in the raw file of each band with a known saturation value."""
+    """Share of saturated pixels in the raw file of each band with a known saturation value, after the reduction."""
 
 
 def read_reduced_bands(capture: Capture, places: Mapping[str, tuple[Path, int]], grid: OutputGrid) -> ReducedBands:

@@ -126,13 +126,9 @@ def write_panels(readings: Sequence[PanelReading], out: Path) -> list[PanelPart]
         picture = check_inside(out / reading.capture.folder, out) / f"{reading.capture.name}.panel.png"
         write_png(side_by_side([_tile(b) for b in reading.bands], gap_px=6), picture)
         panel, bands = reading.panel, [_panel_band(b) for b in reading.bands]
-        facts: dict[str, Any] = {
-            "seen_by": panel.seen_by,
-            "serial": panel.serial,
-            "picture": picture.relative_to(out).as_posix(),
-        }
-        facts |= _identity(reading.capture) | {"in_scene": panel.in_scene, "cues": panel.cues, "bands": bands}
-        facts |= {"sensor_scale": reading.sensor_scale, "fits_sensor": reading.fits_sensor}
+        facts = {"seen_by": panel.seen_by, "serial": panel.serial, "in_scene": panel.in_scene, "cues": panel.cues}
+        facts |= {"sensor_scale": reading.sensor_scale, "fits_sensor": reading.fits_sensor, "bands": bands}
+        facts |= _identity(reading.capture) | {"picture": picture.relative_to(out).as_posix()}
         parts.append(PanelPart.model_validate(facts))
     write_model(out / PANELS_FILE, PanelsFile(panels=parts) if parts else None)
     return parts

@@ -74,15 +74,15 @@ class AlignedCapture:
     sidecar: Sidecar
     path: Path
     """Path of the sidecar."""
-    folder: Path
-    """Its folder, relative to the output folder of the run."""
+    label: str
+    """The capture's name below the output folder of the run."""
     flat_name: str
     """The label as a single file name: the folders of a memory card contain captures of the same name."""
 
     @property
-    def label(self) -> str:
-        """The capture's name below the output folder."""
-        return (self.folder / self.path.stem).as_posix()
+    def folder(self) -> Path:
+        """Its folder, relative to the output folder of the run."""
+        return Path(self.label).parent
 
     @property
     def bands(self) -> list[BandPart]:
@@ -143,12 +143,12 @@ def export(
 
 
 def _captures(out: Path) -> list[AlignedCapture]:
-    """The captures of a run. Raises InputError."""
+    """The captures of a run. Raises InputError and SidecarError."""
     result = []
     taken: dict[str, str] = {}
     for path in run_sidecars(out):
         label = path.relative_to(out).with_suffix("").as_posix()
-        result.append(AlignedCapture(read_sidecar(path), path, path.parent.relative_to(out), file_name(label, taken)))
+        result.append(AlignedCapture(read_sidecar(path), path, label, file_name(label, taken)))
     return result
 
 
@@ -163,7 +163,7 @@ def _check_empty(target: Path) -> None:
 
 def _band_files(captures: Sequence[AlignedCapture], out: Path, images: Path, *, copy: bool) -> list[Path]:
     """Link or copy the band files. Raises ConfigurationError and OutputError."""
-    written: dict[Path, None] = {}
+    written = []
     taken: dict[str, str] = {}
     for capture in captures:
         output = capture.sidecar.output
@@ -174,9 +174,8 @@ def _band_files(captures: Sequence[AlignedCapture], out: Path, images: Path, *, 
         for part in output.band_files:
             source = check_inside(capture.path.parent / part.file, out)
             target = images / file_name((capture.folder / part.file).as_posix(), taken)
-            if target not in written:
-                written[_placed(source, target, copy=copy)] = None
-    return [*written]
+            written.append(_placed(source, target, copy=copy))
+    return written
 
 
 def _placed(source: Path, target: Path, *, copy: bool) -> Path:
@@ -201,7 +200,8 @@ def _notes(
     facts = {"reference": first.reference.band}
     if program == "odm":
         radiometry = None if first.output is None else first.output.radiometry
-        facts |= _of_raw_numbers(files[: len(first.bands)]) if radiometry is None else _of_calibrated(radiometry)
+        again = {"calibration": "none", "contents": f"{radiometry}: OpenDroneMap must not calibrate them again."}
+        facts |= _of_raw_numbers(files[: len(first.bands)]) if radiometry is None else again
     if rows:
         capture, band, _, error_px = max(rows, key=lambda row: row[3])
         largest = f"Largest distance from the complete mapping: {error_px:.2f} px ({capture} {band})."
@@ -211,10 +211,6 @@ def _notes(
     if flat and not rows:
         notes.append(f"The vignetting of {counted(flat, 'capture')} is corrected in the pixels of all bands.")
     return notes
-
-
-def _of_calibrated(radiometry: str) -> dict[str, str]:
-    return {"calibration": "none", "contents": f"{radiometry}: OpenDroneMap must not calibrate them again."}
 
 
 def _of_raw_numbers(files: Sequence[Path]) -> dict[str, str]:

@@ -34,7 +34,6 @@ from agalign.products.index_table import STATISTICS_TAG, IndexReport, IndexStati
 from agalign.products.indices import Index, bands_for, compute, index_named
 from agalign.products.product import GEOTIFF, CapturePaths, Product, ProductContext, StacAsset, WrittenFile
 from agalign.values.capture import Band, Capture
-from agalign.values.files import file_name
 from agalign.values.image import Tile, reduced_size_px
 from agalign.values.interpolation import tiles
 
@@ -53,7 +52,7 @@ class IndexRasters(Product):
 
     def paths(self, capture: Capture, paths: CapturePaths, settings: WriteSettings) -> list[Path]:  # noqa: ARG002
         """Return <capture>_<index>.tif and .png."""
-        names = [file_name(name.strip().lower()) for name in settings.indices]
+        names = [name.strip().lower() for name in settings.indices]
         return [paths.file(f"_{name}{suffix}") for name in names for suffix in (".tif", ".png")]
 
     def write(self, context: ProductContext) -> list[WrittenFile]:
@@ -132,7 +131,7 @@ def write_rasters(
     reports = []
     with BandReader() as reader:
         for index in indices:
-            target = base.with_name(f"{base.name}_{file_name(index.name)}.tif")
+            target = base.with_name(f"{base.name}_{index.name}.tif")
             try:
                 chosen = chosen_bands(bands, index)
                 source = _fingerprint(index, chosen)
@@ -143,7 +142,6 @@ def write_rasters(
                 if target.resolve() in {band.file.resolve() for band in bands}:
                     raise InputError(f"{target}: is the file of a band; give the formula '{index.name}' another name")
                 unit = common_unit(index, chosen, reader)
-                _check_sizes(chosen, reader)
             except InputError as error:
                 reports.append(IndexReport(label, index.name, problem=str(error)))
                 continue
@@ -199,7 +197,16 @@ def _finished_before(target: Path, source: str) -> IndexStatistics | None:
 
 
 def common_unit(index: Index, bands: Sequence[IndexBand], reader: BandReader) -> str:
-    """Return the unit of the bands of an index. Raises InputError if they differ or if the index needs another one."""
+    """Return the unit of the bands of an index.
+
+    Raises InputError if units or sizes differ, also of quality flags, or if the index needs another unit.
+    """
+    files = [(band.file, band.band_index) for band in bands]
+    files += [band.quality[:2] for band in bands if band.quality is not None]
+    expected = reader.file(*files[0]).shape
+    for path, layer in files:
+        if reader.file(path, layer).shape != expected:
+            raise InputError(f"{path}: differs in size from {files[0][0].name}; run again")
     units = {unit for band in bands for unit in reader.units(band)}
     if len(units) > 1:
         raise InputError(f"{index.name} is left out: its bands are in different units ({', '.join(sorted(units))})")
@@ -207,16 +214,6 @@ def common_unit(index: Index, bands: Sequence[IndexBand], reader: BandReader) ->
     if not index.any_unit and unit != "reflectance":
         raise InputError(f"{index.name} needs reflectance, and the bands are {unit}; align with --radiometry")
     return unit
-
-
-def _check_sizes(bands: Sequence[IndexBand], reader: BandReader) -> None:
-    """Raise InputError if files of bands or their quality flags, which are opened here, differ in size."""
-    files = [(band.file, band.band_index) for band in bands]
-    files += [band.quality[:2] for band in bands if band.quality is not None]
-    expected = reader.file(*files[0]).shape
-    for path, layer in files:
-        if reader.file(path, layer).shape != expected:
-            raise InputError(f"{path}: differs in size from {files[0][0].name}; run again")
 
 
 def _write(

@@ -216,13 +216,9 @@ def index_named(name: str) -> Index:
     catalogue = _catalogue()
     if wanted in catalogue:
         return _of_catalogue(wanted, catalogue[wanted])
-    more = (
-        "or a name in the catalogue of spyndex"
-        if catalogue
-        else "or install more with in a checkout: pip install '.[indices]'"
-    )
+    more = "a name in the catalogue of spyndex" if catalogue else "install more in a checkout: pip install '.[indices]'"
     similar = did_you_mean(wanted, [*INDICES, *catalogue])
-    raise ConfigurationError(f"unknown index '{name}'{similar}; choose from {', '.join(INDICES)}, {more}")
+    raise ConfigurationError(f"unknown index '{name}'{similar}; choose from {', '.join(INDICES)}, or {more}")
 
 
 def index_of_formula(text: str) -> Index:

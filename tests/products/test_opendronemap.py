@@ -11,12 +11,15 @@ import agalign
 from agalign.cameras.pix4d import vignetting_on_grid
 from agalign.products import aligned_files
 from agalign.products.export import export
+from agalign.products.layout import Layer
 from agalign.products.sidecar_file import find_sidecars
 from agalign.synthetic.camera_model import CameraSpec
 from agalign.synthetic.cameras import REDEDGE
 from agalign.values import geometry
-from agalign.values.capture import Radiometry
+from agalign.values.capture import Band, Radiometry
 from agalign.values.choices import ExportProgram
+from agalign.values.image import OutputGrid
+from agalign.values.mapping import PixelMapping
 
 from ..conftest import Shared, seeded
 from ..odm import OdmPhoto, pixels_in
@@ -114,6 +117,19 @@ def test_a_disturbed_centre_does_not_matter(bump_px: float) -> None:
     at_px = 250.0
     falloff = np.polynomial.polynomial.polyval(at_px, (1.0, *result.coefficients))
     assert falloff == pytest.approx(1 - 4e-6 * (1.01 * at_px) ** 2, abs=0.002)
+
+
+def test_bands_of_one_file_have_each_their_own_vignetting(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(aligned_files, "_correction", lambda _: VIGNETTING)
+    shifts_px = {"a": (3.0, 0.0), "b": (0.0, -5.0)}
+    layers = [
+        Layer(Band(name, Path("one.tif"), k, 480, 360, "uint16"), PixelMapping(geometry.translation(*shift_px)))
+        for k, (name, shift_px) in enumerate(shifts_px.items(), start=1)
+    ]
+    result = aligned_files._vignettings(layers, OutputGrid(0, 0, 480, 360))
+    assert {k: v.centre_px for k, v in result.items()} == {
+        name: pytest.approx((243 - dx, 176 - dy)) for name, (dx, dy) in shifts_px.items()
+    }
 
 
 def test_large_relief_is_no_polynomial() -> None:
