@@ -10,6 +10,7 @@ import numpy as np
 from scipy.interpolate import CloughTocher2DInterpolator
 
 from agalign._version import __version__
+from agalign.cameras.base import is_thermal
 from agalign.errors import UnreadableFileError
 from agalign.flight.fingerprint import fingerprint
 from agalign.products.aligned_files import BandFiles, Stack
@@ -125,7 +126,8 @@ def _band_part(context: ProductContext, band: Band) -> BandPart:
         "place": None if place is None else {"file": context.paths.relative(place[0].path), "band_index": place[1]},
     }
     with suppress(UnreadableFileError):  # the preview has failed with this reason
-        levels = context.reduced_bands.levels.get(band.name)
+        is_comparable = not (is_thermal(band) or band.companion)  # companions are exposed automatically
+        levels = context.reduced_bands.levels.get(band.name) if is_comparable else None
         facts["saturated"] = context.reduced_bands.saturated.get(band.name)
         facts["levels"] = [] if levels is None else levels.tolist()
     if band is context.capture.reference:

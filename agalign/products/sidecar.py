@@ -444,7 +444,7 @@ class BandPart(BandResult):
     relief: ReliefPart | None = None
     """Displacement by parallax."""
     levels: list[list[Fraction6]] = []
-    """Means of the written pixels in 6 rows of 8 equal blocks."""
+    """Means of the written pixels in 6 rows of 8 equal blocks; empty for thermal bands and RGB companions."""
 
 
 class FilePart(_Part):

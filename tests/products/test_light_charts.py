@@ -22,10 +22,10 @@ def test_irradiance_and_panel_factors_are_drawn_in_the_order_of_time() -> None:
     sidecars = [lit(20, 1.2, 2.5, 600.0), lit(0, 1.0, 4.0, 60.0), lit(10, 0.9, 4.0, 0.0)]
     light = [light_of(f"{k}", s) for k, s in enumerate(sidecars)]
     by_sensor, by_panel = light_charts(light)
-    assert (by_sensor.first, by_sensor.last) == ("1", "0")
+    assert by_sensor.ends == ("1", "0")
     assert round(by_sensor.full, 3) == 0.2
     assert heights(by_sensor.lines[0].points) == [0.0, -0.5, 1.0]
-    assert by_panel.caption.startswith("Light by panels")
+    assert by_panel.title.startswith("Light by panels")
     assert heights(by_panel.lines[0].points) == [0.0, 0.0, 1.0]
     # No chart without a panel, and no chart of only two captures.
     alone = [light_of("a", lit(m, 1.0, 3.0, None)) for m in range(3)]

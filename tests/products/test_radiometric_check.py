@@ -10,6 +10,7 @@ import pytest
 import rasterio
 
 from agalign.products.drawing import LEVEL_BLOCKS, block_means
+from agalign.products.report.light import CaptureLight
 from agalign.products.report.radiometric_check import CaptureLevels, radiometric_check
 from agalign.products.sidecar_file import read_sidecar
 
@@ -18,9 +19,13 @@ BANDS = "Green", "NIR"
 
 
 def flight(folder: Path, gains: list[float], nir: list[float] | None = None) -> list[CaptureLevels]:
-    """Captures along a strip over one texture; `gains` multiply the levels of both bands, `nir` that of NIR."""
+    """Captures along a strip over one texture that becomes brighter by half.
+
+    `gains` multiply the levels of both bands, `nir` those of NIR.
+    """
     noise = np.random.default_rng(0).random((HEIGHT // 4, (WIDTH + STEP_PX * len(gains)) // 4)).astype(np.float32)
     ground = cv2.resize(noise, None, fx=4, fy=4, interpolation=cv2.INTER_CUBIC)[:HEIGHT] + 0.5
+    ground *= np.linspace(1.0, 1.5, ground.shape[1], dtype=np.float32)
     captures = []
     for k, gain in enumerate(gains):
         view = ground[:, k * STEP_PX : k * STEP_PX + WIDTH]
@@ -28,7 +33,8 @@ def flight(folder: Path, gains: list[float], nir: list[float] | None = None) -> 
         cv2.imwrite(str(path), np.vstack([np.zeros_like(view), view * 100]).astype(np.uint8))
         levels = {"Green": block_means(gain * view), "NIR": block_means(gain * (nir or [1.0] * 9)[k] * view)}
         tile_px = (0, HEIGHT, WIDTH, HEIGHT)
-        captures.append(CaptureLevels(f"{k}", ("camera", f"{k}"), {"NIR": 0.01 * k}, levels, {}, path, tile_px))
+        light = CaptureLight("camera", f"{k}", f"{k}", {}, {})
+        captures.append(CaptureLevels(light, {"NIR": 0.01 * k}, levels, path, tile_px))
     return captures
 
 
@@ -39,7 +45,7 @@ def test_levels_of_overlapping_captures_are_compared_on_the_ground(tmp_path: Pat
     assert check.bands[0]["median"] < 0.02
     assert check.bands[0]["p95"] == pytest.approx(0.05, abs=0.02)
     assert (check.bands[1]["saturated"], check.bands[1]["capture"]) == (0.03, "3")
-    assert (check.jumps, len(check.lines), check.full) == ([], 2, 0.05)
+    assert (check.jumps, len(check.chart.lines), check.chart.full) == ([], 2, 0.05)
 
 
 def test_a_jump_of_one_band_is_no_shadow(tmp_path: Path) -> None:
@@ -57,16 +63,20 @@ def test_the_cues_of_a_shadow_are_named(tmp_path: Path) -> None:
     assert list(jumps) == ["2"]
     assert "cloud shadow suspected (darker than the capture before)" in jumps["2"]
     light = [dict.fromkeys(BANDS, 0.7 if k == 2 else 1.0) for k in range(4)]
-    captures = [replace(c, irradiance=one) for c, one in zip(captures, light, strict=True)]
+    captures = [replace(c, light=replace(c.light, irradiance=one)) for c, one in zip(captures, light, strict=True)]
     check = radiometric_check(captures)
     assert "(darker than the capture before, light sensor)" in dict(check.jumps)["2"]
-    assert check.full == pytest.approx(-np.log(0.7), abs=0.02)
+    assert check.chart.full == pytest.approx(-np.log(0.7), abs=0.02)
 
 
 def test_captures_of_other_cameras_and_damaged_previews_are_not_compared(tmp_path: Path) -> None:
     first, second = flight(tmp_path, [1.0, 0.5])
     assert radiometric_check([]) is None
-    assert radiometric_check([first, replace(second, order=("other", "1"))]).bands[0]["overlaps"] == 0
+    # Less light in the flight of another camera indicates no shadow.
+    bright, dark = (dict.fromkeys(BANDS, value) for value in (1.0, 0.3))
+    of_other = replace(second, light=CaptureLight("other", "1", "1", dark, {}))
+    check = radiometric_check([replace(first, light=replace(first.light, irradiance=bright)), of_other])
+    assert (check.bands[0]["overlaps"], check.jumps) == (0, [])
     second.preview.write_bytes(b"no image")
     assert radiometric_check([first, second]).bands[0]["overlaps"] == 0
     assert radiometric_check([first, replace(second, preview=tmp_path / "missing")]).jumps == []

@@ -138,7 +138,7 @@ def test_drift_is_drawn_along_its_direction_with_gaps_for_missing_bands() -> Non
         for i in range(7)
     ]
     (drift,) = drifts_of(captures)
-    assert drift.full_px == pytest.approx(15, abs=0.01)
+    assert drift.full == pytest.approx(15, abs=0.01)
     assert [len(line.points) for line in drift.lines] == [2, 1]
     heights = [[float(p.split(",")[1]) for run in line.points for p in run.split()] for line in drift.lines]
     ends = sorted((heights[0][0], heights[0][-1]))

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from agalign.products.report.rigs import Line, lines_of
+from agalign.products.report.rigs import FlightChart, lines_of
 from agalign.products.sidecar import Sidecar
 
 
@@ -13,26 +13,19 @@ from agalign.products.sidecar import Sidecar
 class CaptureLight:
     """The light of a capture by band."""
 
-    order: tuple[str, str, str]
-    """Camera, time and label of the capture."""
+    camera: str
+    """With its serial number."""
+    captured_at: str
+    label: str
     irradiance: Mapping[str, float]
     """By the light sensor, in its unit."""
     by_panel: Mapping[str, float]
     """Radiance of a white panel at the time of the capture, as it was used; empty without a panel."""
 
-
-@dataclass(frozen=True)
-class LightChart:
-    """The change of the light of a camera's captures, in the order of time."""
-
-    camera: str
-    caption: str
-    full: float
-    """The largest difference from the median, as a part of it."""
-    lines: tuple[Line, ...]
-    first: str
-    """Label of the first capture."""
-    last: str
+    @property
+    def order(self) -> tuple[str, str, str]:
+        """Sort by camera and time."""
+        return self.camera, self.captured_at, self.label
 
 
 def light_of(label: str, sidecar: Sidecar) -> CaptureLight:
@@ -40,19 +33,22 @@ def light_of(label: str, sidecar: Sidecar) -> CaptureLight:
     output = sidecar.output
     bands = [] if output is None else output.illumination
     has_panel = output is not None and output.panel_age_s is not None
+    camera = f"{sidecar.camera.name} {sidecar.camera.serial}".strip() or "unknown camera"
     return CaptureLight(
-        (sidecar.camera.name or "unknown camera", sidecar.captured_at, label),
+        camera,
+        sidecar.captured_at,
+        label,
         {b.band: b.irradiance for b in bands if b.irradiance is not None},
         {b.band: 1 / b.reflectance_per_radiance for b in bands if has_panel},
     )
 
 
-def light_charts(captures: Sequence[CaptureLight]) -> list[LightChart]:
+def light_charts(captures: Sequence[CaptureLight]) -> list[FlightChart]:
     """Return the charts of each camera with known light in at least three captures."""
     charts = []
     min_captures = 3
-    for camera in sorted({c.order[0] for c in captures}):
-        of_camera = sorted((c for c in captures if c.order[0] == camera), key=lambda c: c.order)
+    for camera in sorted({c.camera for c in captures}):
+        of_camera = sorted((c for c in captures if c.camera == camera), key=lambda c: c.order)
         for caption, values in (
             ("Irradiance on a horizontal plane by the light sensor", [(c, c.irradiance) for c in of_camera]),
             ("Light by panels, at the time of each capture", [(c, c.by_panel) for c in of_camera]),
@@ -63,6 +59,6 @@ def light_charts(captures: Sequence[CaptureLight]) -> list[LightChart]:
                 light = np.array([[light.get(name, np.nan) for _, light in known] for name in names])
                 changes = light / np.nanmedian(light, axis=1, keepdims=True) - 1
                 full = max(0.01, float(np.nanmax(np.abs(changes))))  # smaller changes are noise
-                first, last = known[0][0].order[2], known[-1][0].order[2]
-                charts.append(LightChart(camera, caption, full, lines_of(names, changes, full), first, last))
+                ends = known[0][0].label, known[-1][0].label
+                charts.append(FlightChart(f"{caption}: {camera}", full, lines_of(names, changes, full), ends))
     return charts

@@ -65,7 +65,7 @@ def write_pages(out: Path, on_problem: Callable[[str], None]) -> Pages:
             continue
         indices += rows_of_run(sidecar, folder, out)
         facts.add(folder, sidecar)
-        levels.append(CaptureLevels.of(path, facts.captures[-1]["label"], sidecar))
+        levels.append(CaptureLevels.of(path, facts.light[-1], sidecar))
     panels: list[PanelPart] = []
     sky: list[SkyPart] = []
     run: RunPart | None = None

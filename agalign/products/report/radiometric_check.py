@@ -17,7 +17,8 @@ from scipy.ndimage import map_coordinates
 
 from agalign.pixels.landmarks import Landmarks, landmarks, matched_homography
 from agalign.products.drawing import LEVEL_BLOCKS
-from agalign.products.report.rigs import Line, lines_of
+from agalign.products.report.light import CaptureLight
+from agalign.products.report.rigs import FlightChart, lines_of
 from agalign.products.sidecar import Sidecar
 from agalign.values import geometry
 from agalign.values.cores import usable_cores
@@ -36,33 +37,26 @@ Values = NDArray[np.float64]
 class CaptureLevels:
     """The levels of a capture by band, for the check."""
 
-    label: str
-    order: tuple[str, str]
-    """Camera and time."""
+    light: CaptureLight
     saturated: Mapping[str, float]
     levels: Mapping[str, Values]
     """Means of the written pixels in `LEVEL_BLOCKS` (rows, columns), nan without pixels."""
-    irradiance: Mapping[str, float]
-    """By the light sensor."""
     preview: Path
     tile_px: tuple[int, int, int, int]
     """x, y, width and height of the reference band in the preview."""
 
     @classmethod
-    def of(cls, path: Path, label: str, sidecar: Sidecar) -> "CaptureLevels | None":
+    def of(cls, path: Path, light: CaptureLight, sidecar: Sidecar) -> "CaptureLevels | None":
         """Return the levels in a sidecar; None without preview."""
         if sidecar.preview is None:
             return None
         saturated = {b.band: b.saturated for b in sidecar.bands if b.saturated is not None}
         levels = {b.band: np.array(b.levels, np.float64) for b in sidecar.bands}
         levels = {name: values for name, values in levels.items() if values.shape == LEVEL_BLOCKS}
-        light = [] if sidecar.output is None else sidecar.output.illumination
-        irradiance = {part.band: part.irradiance for part in light if part.irradiance}
         width, height = sidecar.preview.tile_px
         column = [b.band for b in sidecar.bands].index(sidecar.reference.band)
-        order = f"{sidecar.camera.name} {sidecar.camera.serial}", sidecar.captured_at
         tile_px = column * width, height, width, height
-        return cls(label, order, saturated, levels, irradiance, path.parent / sidecar.preview.file, tile_px)
+        return cls(light, saturated, levels, path.parent / sidecar.preview.file, tile_px)
 
 
 @dataclass(frozen=True)
@@ -75,40 +69,43 @@ class RadiometricCheck:
     """
     jumps: Sequence[tuple[str, str]]
     """(label of a capture, its difference from the one before or from the light before and after)."""
-    lines: Sequence[Line]
-    """Change of each capture, in the order of time, from the one before."""
-    full: float
-    """Change at the upper end of the axis."""
-    labels: tuple[str, str]
-    """Of the first and the last capture."""
+    chart: FlightChart
+    """Change of each capture from the one before."""
 
 
 def radiometric_check(captures: Sequence[CaptureLevels]) -> RadiometricCheck | None:
     """Compare captures with levels; None without any."""
-    captures = sorted(captures, key=lambda c: (c.order, c.label))
+    captures = sorted(captures, key=lambda c: c.light.order)
     if not captures:
         return None
     names = list(dict.fromkeys(name for c in captures for name in c.levels))
     changes = _changes(captures, names)
-    light = np.log(np.array([[c.irradiance.get(name, np.nan) for name in names] for c in captures]))
-    sudden = light - [_median(light[max(0, k - _WINDOW) : k + _WINDOW + 1]) for k in range(len(light))]
+    light = np.log(np.array([[c.light.irradiance.get(name, np.nan) for name in names] for c in captures]))
+    cameras = np.array([c.light.camera for c in captures])
+    windows = [slice(max(0, k - _WINDOW), k + _WINDOW + 1) for k in range(len(light))]
+    sudden = light - [_median(light[w][cameras[w] == camera]) for w, camera in zip(windows, cameras, strict=True)]
     texts = [_jump(names, *rows) for rows in zip(changes, sudden, strict=True)]
     min_full = 0.05  # smaller differences do not fill the plot
     full = float(np.abs(changes[np.isfinite(changes)]).max(initial=min_full))
     return RadiometricCheck(
         [_of_band(name, captures, changes[:, k]) for k, name in enumerate(names)],
-        [(c.label, text) for c, text in zip(captures, texts, strict=True) if text],
-        lines_of(names, changes.T, full),
-        full,
-        (captures[0].label, captures[-1].label),
+        [(c.light.label, text) for c, text in zip(captures, texts, strict=True) if text],
+        FlightChart(
+            "Radiometric check",
+            full,
+            lines_of(names, changes.T, full),
+            (captures[0].light.label, captures[-1].light.label),
+        ),
     )
 
 
 def _changes(captures: Sequence[CaptureLevels], names: Sequence[str]) -> Values:
     """Logarithms (captures, bands) of the ratio of each capture to the one before, nan without overlap."""
-    pairs = [(k, k - 1) for k, (one, other) in enumerate(pairwise(captures), 1) if one.order[0] == other.order[0]]
+    pairs = [
+        (k, k - 1) for k, (one, other) in enumerate(pairwise(captures), 1) if one.light.camera == other.light.camera
+    ]
     # Matching takes 0.1 s a capture; of longer flights, captures at equal distances are compared with their
-    # successors.
+    # predecessors.
     max_captures = 200
     pairs = pairs[:: -(-len(pairs) // max_captures)] if pairs else []
     result = np.full((len(captures), len(names)), np.nan)
@@ -161,7 +158,7 @@ def _ratio(
 
 def _of_band(name: str, captures: Sequence[CaptureLevels], changes: Values) -> dict[str, Any]:
     saturated, capture = max(
-        ((c.saturated[name], c.label) for c in captures if name in c.saturated), default=(None, "")
+        ((c.saturated[name], c.light.label) for c in captures if name in c.saturated), default=(None, "")
     )
     known = np.expm1(np.abs(changes[np.isfinite(changes)]))
     median, p95 = np.percentile(known, (50, 95)).tolist() if len(known) else (None, None)

@@ -43,18 +43,15 @@ class Line:
 
 
 @dataclass(frozen=True)
-class Drift:
-    """The variation of the offsets of a camera's bands over its captures."""
+class FlightChart:
+    """The differences of the bands of a camera over its captures, in the order of time."""
 
-    camera: str
-    full_px: float
-    """The largest difference."""
-    captures: int
+    title: str
+    full: float
+    """Difference at the upper end of the axis."""
     lines: tuple[Line, ...]
-    first: str
-    """Label of the first capture."""
-    last: str
-    """Label of the last capture."""
+    ends: tuple[str, str]
+    """Labels of the first and the last capture."""
 
 
 def rig_views(out: Path, on_problem: Callable[[str], None]) -> list[RigView]:
@@ -101,8 +98,8 @@ def hue_of(number: int, count: int) -> float:
     return round(205 + 360 * number / max(count, 1)) % 360
 
 
-def drifts_of(captures: Sequence[dict[str, Any]]) -> list[Drift]:
-    """Return a chart, in the order of time, for each camera with three captures or more, given the report's data."""
+def drifts_of(captures: Sequence[dict[str, Any]]) -> list[FlightChart]:
+    """Return a chart of the offsets, px, for each camera with three captures or more, given the report's data."""
     result = []
     for camera in dict.fromkeys(c["camera"] for c in captures):
         in_order = sorted((c for c in captures if c["camera"] == camera), key=lambda c: (c["captured_at"], c["label"]))
@@ -110,7 +107,8 @@ def drifts_of(captures: Sequence[dict[str, Any]]) -> list[Drift]:
         names = list(dict.fromkeys(name for of_capture in offsets_px for name in of_capture))
         if len(in_order) >= 3 and names:
             lines, full_px = _lines(offsets_px, names)
-            result.append(Drift(camera, full_px, len(in_order), lines, in_order[0]["label"], in_order[-1]["label"]))
+            ends = in_order[0]["label"], in_order[-1]["label"]
+            result.append(FlightChart(f"{camera} from capture to capture", full_px, lines, ends))
     return result
 
 
