@@ -14,8 +14,10 @@ import agalign
 from agalign.batch import CaptureReport, RunOptions, learning_tasks, run_flight
 from agalign.batch import capture_task as batch_capture
 from agalign.batch import flight_learning as batch_learn
+from agalign.batch import run as batch_run
 from agalign.batch.flight_learning import learning_fingerprint
 from agalign.batch.run import _limits_of_cameras
+from agalign.cameras.discover import FolderScan
 from agalign.flight.groups import camera_key, flights_of, model_names
 from agalign.flight.model import FlightModel, load_model, save_model
 from agalign.flight.rig import MIN_CAPTURES
@@ -26,7 +28,7 @@ from agalign.method.fast import Schedule, learn
 from agalign.method.state import JointState
 from agalign.products import preview
 from agalign.products.run_record import read_run_record
-from agalign.products.sidecar_file import find_sidecars, read_sidecar
+from agalign.products.sidecar_file import find_sidecars, read_result, read_sidecar
 from agalign.synthetic.flight import make_flight
 from agalign.values.capture import Capture
 
@@ -177,6 +179,37 @@ def test_flights_of_one_camera_share_the_limits_of_their_crop(flight: Path, tmp_
     assert {band.name for _, band in of_first} == {"NIR"}
     assert len(of_first) == 2 * len(extreme_mappings(read_rig(good)[1], "NIR"))
     assert not limits[camera_key(flights[-1][0][0])]
+
+
+def test_the_crop_of_a_new_flight_depends_on_a_finished_one(
+    flight: Path, aligned_flight: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    one, other = agalign.discover(flight).captures
+    captures = one, replace(other, flight_id="another")
+    (tmp_path / "models").mkdir()
+    save_known_model(tmp_path / "models" / model_names(flights_of(captures))[0])
+    earlier = read_result(find_sidecars(aligned_flight)[0])
+    monkeypatch.setattr(batch_run._FlightRun, "kept", lambda _, capture: earlier if capture.name == one.name else None)
+    monkeypatch.setattr(batch_run, "learn_flight", lambda *_, **__: None)
+    limits: list[Any] = []
+
+    def process(*arguments: Any) -> CaptureReport:
+        limits.append(arguments[-1])
+        return CaptureReport(arguments[0].label, "done", earlier)
+
+    monkeypatch.setattr(batch_capture, "process_capture", process)
+    assert states(list(run_flight(FolderScan(flight, captures, ()), tmp_path, SETTINGS))) == ["kept", "done"]
+    assert [{band.name for _, band in of_capture} for of_capture in limits] == [{"NIR"}]
+
+
+def test_radiometry_that_no_capture_has_tags_for_is_refused(flight: Path, tmp_path: Path) -> None:
+    one, other = agalign.discover(flight).captures
+    without = replace(other, bands=tuple(replace(b, radiometry=None) for b in other.bands))
+    settings = agalign.Settings(write=agalign.WriteSettings(radiometry="camera"))
+    plan = batch_run.plan_run(FolderScan(flight, (one, without), ()), tmp_path, settings)
+    assert list(plan.values()) == ["to be aligned"] * 2
+    with pytest.raises(agalign.ConfigurationError, match="--radiometry camera: no tags for radiance in Blue, Green"):
+        batch_run.plan_run(FolderScan(flight, (without,), ()), tmp_path, settings)
 
 
 def test_a_model_is_learned_again_if_its_input_changed(flight: Path) -> None:
