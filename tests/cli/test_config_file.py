@@ -126,6 +126,13 @@ def test_local_is_the_old_name_of_relief_for_onto_too() -> None:
     assert context.params["relief"] == "always"
 
 
+def test_a_folder_after_relief_is_no_choice_of_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "flight").mkdir()
+    context = main.COMMANDS["align"].built("align").make_context("align", ["--relief", "flight"])
+    assert (context.params["relief"], context.params["folder"]) == ("always", Path("flight"))
+
+
 def test_a_dry_run_prints_its_plan_and_writes_nothing(tmp_path: Path) -> None:
     synthetic.make_flight(tmp_path / "in", captures=2, size_px=(160, 120))
     before = sorted(tmp_path.rglob("*"))

@@ -15,6 +15,7 @@ from agalign.values.files import (
     complete_file,
     is_inside,
     open_regular,
+    read_regular,
     remove_partial_files,
     scratch_file,
     write_text,
@@ -39,6 +40,13 @@ def test_a_file_is_complete_or_unchanged(tmp_path: Path) -> None:
         partial.write_text("after")
     assert path.read_text() == "after"
     assert [p.name for p in path.parent.iterdir()] == ["a.png"]
+
+
+def test_a_file_above_the_limit_is_not_read(tmp_path: Path) -> None:
+    (tmp_path / "a.json").write_bytes(b"four")
+    assert read_regular(tmp_path / "a.json", 4) == b"four"
+    with pytest.raises(OSError, match="too many for this file"):
+        read_regular(tmp_path / "a.json", 3)
 
 
 def test_a_text_is_the_same_bytes_on_every_system(tmp_path: Path) -> None:
