@@ -2,6 +2,7 @@
 
 import json
 import os
+import signal
 import subprocess
 import sys
 import tempfile
@@ -150,6 +151,41 @@ def flight_and_out() -> Iterator[tuple[Path, Path]]:
     """Return two names in a temporary folder: of a flight, and of the output of a run."""
     with tempfile.TemporaryDirectory() as folder:
         yield Path(folder) / "flight", Path(folder) / "out"
+
+
+@dataclass(frozen=True)
+class Ending:
+    """How a run ended, and what it printed."""
+
+    code: int | None
+    """None if it was killed after the time limit; negative if a signal ended it."""
+    errors: str
+    out: str = ""
+    seconds: float = np.nan
+
+    @property
+    def has_traceback(self) -> bool:
+        return "Traceback" in self.errors or "please report" in self.errors
+
+    @property
+    def complaints(self) -> list[str]:
+        return [line for line in self.errors.splitlines() if line.startswith("agalign: ")]
+
+
+def ended(
+    argv: Sequence[str], max_s: float, disturb: Callable[[Any], object] = lambda _: None, **options: Any
+) -> Ending:
+    """Run a command, call a function with its process, and kill its process group after the time limit."""
+    pipes = {"stdout": subprocess.DEVNULL, "stderr": subprocess.PIPE, "text": True, "errors": "replace"}
+    began = time.perf_counter()
+    with subprocess.Popen(argv, **pipes, start_new_session=True, **options) as process:
+        disturb(process)
+        try:
+            errors, code = process.communicate(timeout=max_s)[1], process.returncode
+        except subprocess.TimeoutExpired:
+            os.killpg(process.pid, signal.SIGKILL)
+            errors, code = process.communicate()[1], None
+    return Ending(code, errors, seconds=time.perf_counter() - began)
 
 
 @dataclass(frozen=True)

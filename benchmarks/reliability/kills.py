@@ -25,13 +25,12 @@ from contextlib import suppress
 from functools import partial
 from pathlib import Path
 
-import numpy as np
 import psutil
 import rasterio
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from common import Section, command, run
+from common import Section, command, ended, run
 from synthetic_flights.aligned import make_aligned
 
 from agalign.products.sidecar_file import find_sidecars
@@ -121,32 +120,30 @@ def processes_of(process: "subprocess.Popen[str]", target: str) -> list[psutil.P
 def strike(argv: list[str], after_s: float, number: signal.Signals, target: str, rng: random.Random) -> Counter[str]:
     """Send a signal to processes of a run, and return what is wrong with its end; `hit` if it was still running."""
     result: Counter[str] = Counter()
-    process = subprocess.Popen(argv, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True, errors="replace")
     children: list[psutil.Process] = []
-    with suppress(subprocess.TimeoutExpired, psutil.NoSuchProcess):
-        process.wait(after_s)
-    with suppress(psutil.NoSuchProcess):
-        children = psutil.Process(process.pid).children(recursive=True)
-        targets = processes_of(process, target)
-        result["hit"] += process.poll() is None
-        for one in targets if target == "run and workers" else [rng.choice(targets)]:
-            one.send_signal(number)
-            if number == signal.SIGSTOP:
-                time.sleep(STOPPED_S)
-                one.send_signal(signal.SIGCONT)
-    try:
-        errors = process.communicate(timeout=HUNG_S)[1]
-    except subprocess.TimeoutExpired:
-        result["hung"] += 1
-        process.kill()
-        errors = process.communicate()[1]
+
+    def send(process: "subprocess.Popen[str]") -> None:
+        with suppress(subprocess.TimeoutExpired):
+            process.wait(after_s)
+        with suppress(psutil.NoSuchProcess):
+            children.extend(psutil.Process(process.pid).children(recursive=True))
+            targets = processes_of(process, target)
+            result["hit"] += process.poll() is None
+            for one in targets if target == "run and workers" else [rng.choice(targets)]:
+                one.send_signal(number)
+                if number == signal.SIGSTOP:
+                    time.sleep(STOPPED_S)
+                    one.send_signal(signal.SIGCONT)
+
+    ending = ended(argv, HUNG_S, send)
+    result["hung"] = int(ending.code is None)
     _, left = psutil.wait_procs(children, timeout=10)
     result["outlived the run"] = sum(c.is_running() and c.status() != psutil.STATUS_ZOMBIE for c in left)
-    result["traceback"] = int("Traceback" in errors or "please report" in errors)
+    result["traceback"] = int(ending.has_traceback)
     # A second signal, or one before the program catches it, ends the process at once.
-    result["bad exit"] = int(process.returncode not in (0, 1, 3, 128 + number, -number))
+    result["bad exit"] = int(ending.code not in (None, 0, 1, 3, 128 + number, -number))
     if +result - Counter({"hit": 1}):
-        print(process.returncode, errors, [c.pid for c in left], flush=True)
+        print(ending.code, ending.errors, [c.pid for c in left], flush=True)
     return result
 
 
@@ -159,7 +156,6 @@ def main(
     markdown: Path | None = None,
 ) -> None:
     section, rng = Section("kills", markdown), random.Random(rng_seed)
-    np.seterr(all="ignore")
     warnings.simplefilter("ignore")  # of rasters without georeference
     rows = [("run", "signals to", "signals", "while it ran", "seconds of a run", "faults")]
     with tempfile.TemporaryDirectory() as folder:

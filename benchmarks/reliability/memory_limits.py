@@ -8,10 +8,8 @@ A run must finish, or end within a minute with a line that gives the reason. Lin
 import re
 import resource
 import signal
-import subprocess
 import sys
 import tempfile
-import time
 from collections import defaultdict
 from pathlib import Path
 from typing import Annotated
@@ -20,7 +18,7 @@ import typer
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from common import Section, command, run
+from common import Section, command, ended, run
 
 from agalign.synthetic import flight as synthetic
 
@@ -31,30 +29,22 @@ MAX_S = 60
 def run_within(limit_gb: float, flight: Path, out: Path, *options: str) -> tuple[str, str, float]:
     """(how it ended, its first line, seconds) of a run with so much address space."""
     limit = int(limit_gb * 1e9)
-    began = time.monotonic()
-    process = subprocess.Popen(
+    ending = ended(
         command(flight, out, "--bands", "green,red", *options),
-        stdout=subprocess.DEVNULL,
-        stderr=subprocess.PIPE,
-        text=True,
-        errors="replace",
+        MAX_S,
         preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_AS, (limit, limit)),
     )
-    try:
-        _, errors = process.communicate(timeout=MAX_S)
-    except subprocess.TimeoutExpired:
-        process.kill()
-        process.communicate()
-        return f"not ended after {MAX_S} s", "", time.monotonic() - began
-    lines = errors.replace(f"{out}/", "").replace(f"{flight}/", "").splitlines()
+    if ending.code is None:
+        return f"not ended after {MAX_S} s", "", ending.seconds
+    lines = ending.errors.replace(f"{out}/", "").replace(f"{flight}/", "").splitlines()
     line = next((line for line in lines if line.startswith("agalign: ")), lines[-1] if lines else "")
-    code = process.returncode
+    code = ending.code
     how = f"exit code {code}" if code >= 0 else f"ended by {signal.Signals(-code).name}"
-    if "Traceback" in errors or "please report" in errors:
+    if ending.has_traceback:
         how += ", with a traceback or a request for a report"
     elif code and not line.startswith("agalign: "):
         how += ", without a reason"
-    return how, line.removeprefix("agalign: "), time.monotonic() - began
+    return how, line.removeprefix("agalign: "), ending.seconds
 
 
 def main(

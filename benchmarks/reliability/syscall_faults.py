@@ -12,24 +12,20 @@ import os
 import random
 import re
 import shutil
-import signal
-import subprocess
 import sys
 import tempfile
 import time
 import warnings
 from collections import Counter, defaultdict
 from collections.abc import Iterator
-from dataclasses import dataclass
 from itertools import cycle, islice
 from pathlib import Path
 
-import numpy as np
 import tifffile
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from common import Section, run
+from common import Ending, Section, ended, run
 from kills import contents, differences, snapshot, whole_sidecars, without
 
 from agalign.products.report import SUMMARY_FILE
@@ -58,33 +54,13 @@ _SIZES = {"seconds", "bytes", "sha256", "file:size", "file:checksum"}
 _CALL = re.compile(r'^\d+\s+(\w+)\((?:\d+<([^>]*)>|(?:AT_FDCWD[^,]*, )?"([^"]*)")')
 
 
-@dataclass(frozen=True)
-class Ending:
-    """How a run ended, and what it printed to standard error."""
-
-    code: int | None
-    """None where it was still running after `MAX_S`."""
-    errors: str
-    trace: str
-
-    @property
-    def complaints(self) -> list[str]:
-        return [line for line in self.errors.splitlines() if line.startswith("agalign: ")]
-
-
-def run_traced(argv: list[str], folder: Path, *tracing: str) -> Ending:
-    """Run the program; with arguments of strace, traced by it."""
+def run_traced(argv: list[str], folder: Path, *tracing: str) -> tuple[Ending, str]:
+    """Run the program; with arguments of strace, traced by it, and return the trace too."""
     trace = folder / "trace.txt"
     trace.write_text("")
     strace = ["strace", "-f", "-y", *tracing, "-o", str(trace)] if tracing else []
-    pipes = {"stdout": subprocess.DEVNULL, "stderr": subprocess.PIPE, "text": True, "errors": "replace"}
-    process = subprocess.Popen([*strace, sys.executable, "-c", PROGRAM, *argv], start_new_session=True, **pipes)
-    try:
-        errors, code = process.communicate(timeout=MAX_S)[1], process.returncode
-    except subprocess.TimeoutExpired:
-        os.killpg(process.pid, signal.SIGKILL)
-        errors, code = process.communicate()[1], None
-    return Ending(code, errors, trace.read_text(errors="replace"))
+    ending = ended([*strace, sys.executable, "-c", PROGRAM, *argv], MAX_S)
+    return ending, trace.read_text(errors="replace")
 
 
 def calls_in(out: Path, trace: str) -> Iterator[tuple[str, str, bool]]:
@@ -137,7 +113,7 @@ def faults_of(ending: Ending, out: Path, expected: dict[str, object]) -> Counter
         result["hung"] += 1
         return result
     result["torn"] = sum(whole_sidecars(out).values())
-    result["traceback"] = int("Traceback" in ending.errors or "please report" in ending.errors)
+    result["traceback"] = int(ending.has_traceback)
     if ending.code == 0 and not ending.complaints:
         result["unnoticed"] = sum(compared(out, expected).values())
     elif ending.code not in (1, 3) or not ending.complaints:
@@ -151,19 +127,18 @@ def main(faults: int = 200, rng_seed: int = 0, markdown: Path | None = None) -> 
     if shutil.which("strace") is None or sys.platform != "linux":
         raise SystemExit("strace is not installed (apt-get install strace)")
     section, rng = Section("syscall faults", markdown), random.Random(rng_seed)
-    np.seterr(all="ignore")
     warnings.simplefilter("ignore")
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name).resolve()
         flight, out = folder / "flight", folder / "out"
         synthetic.make_flight(flight, CAPTURES, SIZE_PX, rng_seed=4)
         argv = [str(flight), "-o", str(out), *OPTIONS]
-        whole = run_traced(argv, folder, "-e", "trace=" + ",".join(ERRORS))
+        whole, trace = run_traced(argv, folder, "-e", "trace=" + ",".join(ERRORS))
         if whole.code != 0 or whole.complaints:
             raise SystemExit(f"the run without faults ended with {whole.code}: {whole.errors}")
         expected = snapshot(out, strict_contents)
         calls: dict[str, Counter[str]] = defaultdict(Counter)
-        for call, path, _ in calls_in(out, whole.trace):
+        for call, path, _ in calls_in(out, trace):
             calls[call][path] += 1
         print({name: paths.total() for name, paths in calls.items()}, f"{len(expected)} files", flush=True)
         rows: dict[str, Counter[str]] = defaultdict(Counter)
@@ -171,12 +146,12 @@ def main(faults: int = 200, rng_seed: int = 0, markdown: Path | None = None) -> 
             shutil.rmtree(out, ignore_errors=True)
             began = time.monotonic()
             inject = f"inject={call}:error={error}:when={at}"
-            ending = run_traced(argv, folder, "-P", path, "-e", f"trace={call}", "-e", inject)
+            ending, trace = run_traced(argv, folder, "-P", path, "-e", f"trace={call}", "-e", inject)
             here = faults_of(ending, out, expected)
-            again = run_traced(argv, folder)
+            again, _ = run_traced(argv, folder)
             after = compared(out, expected)
             after["bad exit"] = int(again.code != 0 or bool(again.complaints))
-            failed = (os.path.relpath(p, out) for _, p, injected in calls_in(out, ending.trace) if injected)
+            failed = (os.path.relpath(p, out) for _, p, injected in calls_in(out, trace) if injected)
             hit = re.sub(r"part-[\w-]+", "part-*", next(failed, ""))
             row = rows[call]
             row["runs"] += bool(hit)

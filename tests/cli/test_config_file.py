@@ -1,5 +1,6 @@
 """Options of the command line and of a file become settings; what a run would do; facts as JSON."""
 
+import itertools
 import json
 import tomllib
 from pathlib import Path
@@ -84,6 +85,23 @@ def test_a_wrong_file_is_one_line(tmp_path: Path, text: str | None, said: str) -
     assert done.returncode == 2
     (line,) = done.stderr.splitlines()
     assert said in line
+
+
+@pytest.mark.full
+def test_any_value_of_any_option_is_taken_or_one_line(tmp_path: Path) -> None:
+    synthetic.make_flight(tmp_path / "in", captures=1, size_px=(32, 24))
+    config = tmp_path / "agalign.toml"
+    values = ["true", "0", "-1", "1.5", "nan", "-inf", "1e308", str(2**62), "[]", "[[1]]", '["a", 1]', "07:32:00"]
+    values += ['""', '"x"', r'"\u001b[2J\u202e"', '"../../pwn"', '"/dev/zero"', r'"\u0000"', f'"{"x" * 9999}"']
+    parameters = main.COMMANDS["align"].built("align").params
+    options = [max(p.opts, key=len).lstrip("-") for p in parameters if p.param_type_name == "option"]
+    for option, value in itertools.product(options, values):
+        config.write_text(f"{option} = {value}")
+        done = agalign_here("align", tmp_path / "in", "--config", config, "--dry-run")
+        assert done.returncode in (0, 1, 2), config.read_text()
+        assert (done.stdout + done.stderr).replace("\n", "").isprintable(), config.read_text()
+        assert "please report" not in done.stderr, config.read_text()
+    assert set(tmp_path.iterdir()) == {config, tmp_path / "in"}
 
 
 def test_the_printed_file_has_every_option_and_changes_nothing(tmp_path: Path, seen: Seen) -> None:

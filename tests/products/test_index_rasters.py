@@ -1,11 +1,15 @@
 import csv
 import json
 import os
+import re
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
 import pytest
 import rasterio
+from hypothesis import given
+from hypothesis import strategies as st
 from synthetic_flights.aligned import make_aligned
 
 from agalign.batch.index_run import index_tasks, run_indices, unit_of_run
@@ -41,10 +45,35 @@ NO_FORMULAS = """__import__('os').system('true')\nN.real\n(lambda: N)()\nN if R 
 sqrt(N, R)\nopen(N)\nN < R\nf'{N}'\n1e40*N\nN and R"""
 
 
-@pytest.mark.parametrize("text", [*NO_FORMULAS.splitlines(), "", "(" * 200, "N" * 400, "-" * 290 + "("])
+@pytest.mark.parametrize(
+    "text", [*NO_FORMULAS.splitlines(), "", "N\0", "\ud800", "(" * 200, "N" * 400, "-" * 290 + "("]
+)
 def test_a_formula_is_arithmetic_and_nothing_else(text: str) -> None:
     with pytest.raises(ConfigurationError):
         symbols_of(text)
+
+
+ARITHMETIC = st.recursive(
+    st.sampled_from(["B", "G", "R", "RE", "N", "0.5", "9"]),
+    lambda inner: st.tuples(
+        st.sampled_from(["(", "-(", "sqrt(", "log("]),
+        inner,
+        st.sampled_from(["+", "-", "*", "/", "^"]),
+        inner,
+        st.just(")"),
+    ).map("".join),
+)
+SCRAPS = st.sampled_from(
+    [*re.split(r"\s", NO_FORMULAS), *"()[]{}.,;:=#~@%&|<>^'", "**", "//", "1e400", "1j", "\0", "\ud800"]
+)
+
+
+@given(text=ARITHMETIC | st.lists(ARITHMETIC | SCRAPS, max_size=5).map("".join))
+def test_any_formula_is_refused_or_has_one_value_per_pixel(text: str) -> None:
+    with suppress(ConfigurationError):
+        index = index_of_formula(text)
+        bands = [np.full((2, 3), 0.1 * k, np.float32) for k, _ in enumerate(index.symbols)]
+        assert compute(index, bands).shape == (2, 3)
 
 
 def test_a_formula_has_the_value_of_its_arithmetic() -> None:
