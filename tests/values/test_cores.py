@@ -1,13 +1,16 @@
 """Limits of the system and of containers: cores and address space."""
 
+import re
 import threading
 from pathlib import Path
 
 import pytest
 
-from agalign.errors import ConfigurationError, MemoryLimitError, is_out_of_memory
+from agalign.errors import MemoryLimitError, is_out_of_memory
 from agalign.values import cores
 from agalign.values.cores import cgroup_quota, check_address_space, check_threads, limit_default_threads, usable_cores
+
+from ..program import agalign_here
 
 V1 = {"cpu/docker/ab/cpu.cfs_period_us": "100000"}
 
@@ -75,6 +78,7 @@ def test_too_few_threads_are_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
         start(thread)
 
     monkeypatch.setattr(threading.Thread, "start", limited)
-    with pytest.raises(ConfigurationError, match=r"only 5 more processes and threads .* raise the limit .*ulimit -u"):
-        check_threads()
+    done = agalign_here("info", "flight")
+    assert done.returncode == 2
+    assert re.match(r"agalign: only 5 more processes and threads .* raise the limit .*ulimit -u.*\n$", done.stderr)
     assert threading.active_count() == before
