@@ -12,6 +12,7 @@ import itertools
 import math
 from dataclasses import replace
 from pathlib import Path
+from unittest.mock import patch
 
 import cv2
 import numpy as np
@@ -87,7 +88,8 @@ def main(folder: Path) -> None:
     found = panel_readings.with_panels(discover(folder).captures)
     captures = [c for c in found if all(b.radiometry and b.radiometry.quantity == "radiance" for b in c.bands)]
     captures = [c for c in captures if all(b.radiometry.by_sun for b in c.bands)]
-    panel_readings._MAX_SENSOR_SCALE = math.inf  # the formula of both is compared also for a shaded sensor
+    # The formula of both is compared also for a shaded sensor.
+    patch.object(panel_readings.PanelReading, "fits_sensor", new=True).start()
     readings = [panel_readings.read_panel(c, {}) for c in captures if c.panel is not None]
     print("Largest difference from the published formulas, relative to the median of the band:\n")
     print_head("captures", "camera", "radiance", "light sensor", "panel", "panel and light sensor")

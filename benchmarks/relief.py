@@ -60,13 +60,15 @@ def flow_scores(flight: Path, out: Path, truth: Truth, blank: Score) -> list[Sco
     images = {p.name: tifffile.imread(p).astype(np.float32) for p in flight.rglob("*.tif")}
     sidecar, scores = read_sidecar(out), []
     reference = images[sidecar.content["reference"]["file"]]
-    began = time.perf_counter()
+    seconds = 0.0
     for band in sidecar.moving:
         start = mapping_of(sidecar, band)
+        began = time.perf_counter()
         mapping = None if start is None else dis_flow(reference, images[band["file"]], start)
+        seconds += time.perf_counter() - began
         values = residuals(mapping, truth.bands[band["band"]], sidecar.window)
         scores.append(replace(blank, band=band["band"], **values))
-    return [replace(score, seconds=time.perf_counter() - began) for score in scores]
+    return [replace(score, seconds=seconds) for score in scores]
 
 
 def scores_of(scene: Scene, blank: Score, size_px: tuple[int, int], methods: Sequence[str]) -> Iterator[Score]:

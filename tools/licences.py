@@ -77,9 +77,8 @@ def check(needed: dict[str, bool], table: str) -> list[str]:
         listed |= {
             name: is_extra for is_extra, cell in enumerate((every_run, extras)) for name in re.findall(r"[\w.-]+", cell)
         }
-    problems = [
-        f"docs/licences.md: {name}: run python tools/licences.py" for name, _ in needed.items() ^ listed.items()
-    ]
+    wrong = sorted({name for name, _ in needed.items() ^ listed.items()})
+    problems = [f"docs/licences.md: {name}: run python tools/licences.py" for name in wrong]
     page = PAGE.read_text(encoding="utf-8").lower()
     for result in sorted({d.name.lower() for d in distributions()}):
         try:
