@@ -95,8 +95,7 @@ def place_captures(out: Path) -> PlacedFlight:
     """
     sidecars = {path.relative_to(out).with_suffix("").as_posix(): path for path in run_sidecars(out)}
     features = {str(f["properties"].get("sidecar")): f for f in features_in(out)}
-    entries = {label: features.get(f"{label}.json", {}) for label in sidecars}
-    shown = {label: ring for label, entry in entries.items() if (ring := _ring(entry)) is not None}
+    shown = {label: ring for label in sidecars if (ring := _ring(features.get(f"{label}.json", {}))) is not None}
     if not shown:
         raise InputError(
             f"{out}: no capture can be placed, because {FLIGHT_MAP_FILE} has no footprints; they need position, "
@@ -108,7 +107,7 @@ def place_captures(out: Path) -> PlacedFlight:
     left_out = [(label, f"it has no footprint in {FLIGHT_MAP_FILE}") for label in sidecars if label not in shown]
     flight = PlacedFlight([], origin_m, crs, left_out)
     for label, ring in shown.items():
-        flight.add(label, sidecars[label], entries[label]["properties"] | {"ring": ring})
+        flight.add(label, sidecars[label], features[f"{label}.json"]["properties"] | {"ring": ring})
     if not flight.captures:
         raise InputError(f"{out}: no capture can be used; {left_out[0][0]}: {left_out[0][1]}")
     return flight

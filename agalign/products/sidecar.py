@@ -7,7 +7,7 @@ the reference to a pixel of the moving band; `grid` samples the complete mapping
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Annotated, Any, Literal, Self, TypeVar
+from typing import Annotated, Any, Literal, Self
 
 import numpy as np
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, GetCoreSchemaHandler, model_validator
@@ -28,6 +28,7 @@ Number = Annotated[float, Field(ge=-1e30, le=1e30)]
 Row = tuple[Number, Number, Number]
 PointPx = tuple[Number, Number]
 Count = Annotated[int, Field(gt=0)]
+Positive = Annotated[Number, Field(gt=0)]
 
 
 @dataclass(frozen=True)
@@ -77,9 +78,6 @@ it lists.
 """
 
 
-Part = TypeVar("Part", bound="_Part")
-
-
 class _Part(BaseModel):
     """Validated from the JSON of a sidecar, or from the program's record with attributes of these names."""
 
@@ -88,12 +86,21 @@ class _Part(BaseModel):
     )
 
 
-def _with_equal_lengths(part: Part, *lists: Sequence[PointPx]) -> Part:
-    """Return the part. Raises ValueError for lists of points that are empty or of different lengths."""
+def _check_lengths(lists: list[list[PointPx]]) -> list[list[PointPx]]:
+    """Return lists of points. Raises ValueError if they are empty or of different lengths."""
     lengths = {len(one) for one in lists}
     if len(lengths) != 1 or 0 in lengths:
         raise ValueError("its lists of points are empty or of different lengths")
-    return part
+    return lists
+
+
+class _PointLists(_Part):
+    """A part with lists of corresponding points."""
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        _check_lengths([value for value in vars(self).values() if isinstance(value, list)])
+        return self
 
 
 class _Result(_Part):
@@ -193,17 +200,13 @@ class LensPart(_Part):
 class FieldPart(_Part):
     """Displacement field of the raw pixels of the reference."""
 
-    step_px: Annotated[Number, Field(gt=0)]
+    step_px: Positive
     """Spacing of the nodes, from the centre of the top-left pixel."""
-    displacements_px: Annotated[list[list[PointPx]], _FromProgram(_from_array)]
+    displacements_px: Annotated[list[list[PointPx]], AfterValidator(_check_lengths), _FromProgram(_from_array)]
     """(x, y) by row and column; cubic splines between the nodes."""
 
-    @model_validator(mode="after")
-    def _check(self) -> Self:
-        return _with_equal_lengths(self, *self.displacements_px)
 
-
-class GridPart(_Part):
+class GridPart(_PointLists):
     """The complete mapping, sampled at 17 x 13 points, or at up to 129 x 97 points if cubic interpolation (scipy's
     CloughTocher2DInterpolator or RectBivariateSpline) of fewer has errors above 0.02 px (p99). If there is a `relief`,
     use that instead.
@@ -213,10 +216,6 @@ class GridPart(_Part):
     """Raw pixels of the reference, row by row."""
     moving_px: PointsPx
     """The corresponding raw pixels of the band."""
-
-    @model_validator(mode="after")
-    def _check(self) -> Self:
-        return _with_equal_lengths(self, self.reference_px, self.moving_px)
 
 
 def _known_kind(code: str) -> str:
@@ -346,7 +345,7 @@ class GeometryPart(_Part):
         return self.held_out_p95_px.get(self.kind)
 
 
-class ReliefPart(_Part):
+class ReliefPart(_PointLists):
     """Displacement by the parallax of the capture: a pixel x of the reference with parallax z maps to plane_px(x) + z
     slope(x), interpolated by cubic splines.
     """
@@ -363,10 +362,6 @@ class ReliefPart(_Part):
     """Where the reference plane maps them, raw px of the moving file."""
     slope: PointsPx
     """Px of the moving file per px of parallax."""
-
-    @model_validator(mode="after")
-    def _check(self) -> Self:
-        return _with_equal_lengths(self, self.reference_px, self.plane_px, self.slope)
 
 
 class PredictionPart(_Part):
@@ -465,7 +460,7 @@ class IlluminationPart(_Part):
     """Its name."""
     irradiance: Number | None = None
     """By the light sensor, on a horizontal plane, W / m^2 / nm (DJI: relative)."""
-    reflectance_per_radiance: Number
+    reflectance_per_radiance: Positive
     """Factor by which radiance was multiplied."""
 
 
@@ -486,7 +481,7 @@ class OutputPart(_Part):
     """Bands that were converted to reflectance."""
     crop: tuple[int, int, Count, Count]
     """x0, y0, width, height on the reference grid times `scale`."""
-    scale: tuple[Annotated[Number, Field(gt=0)], Annotated[Number, Field(gt=0)]] = (1.0, 1.0)
+    scale: tuple[Positive, Positive] = (1.0, 1.0)
     """Output pixels per reference pixel along x and y."""
     undistorted: bool = False
     """True for the lens-corrected grid of the reference."""

@@ -42,6 +42,7 @@ def test_reflectance_by_panel_is_the_truth(between_panels: Path, by_panel: Path,
     agalign.align_folder(between_panels, tmp_path, settings=Settings(write=WriteSettings(radiometry="sun")))
     sun = np.linspace(*SUN, 4)
     for number in (2, 3):
+        assert read_json(by_panel / "0000SET" / "000" / f"IMG_{number:04d}.json")["output"]["panel_age_s"] == 1.0
         # What the light sensor takes for less reflectance is less light.
         ratio = planes(by_panel, number) / planes(tmp_path, number)
         np.testing.assert_allclose(ratio * sun[number - 1], 1.0, atol=0.02)

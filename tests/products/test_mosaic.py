@@ -202,21 +202,15 @@ def with_another_band(out: Path) -> None:
     write_sidecar(out / "0000SET" / "IMG_0009.json", sidecar.model_copy(update={"bands": bands}))
 
 
-def with_changed_entry(**changes: Any) -> Callable[[Path], None]:
-    """A change of the last capture's properties in the flight map."""
+def with_changed_entry(part: str = "properties", **changes: Any) -> Callable[[Path], None]:
+    """A change of the last capture in the flight map."""
 
     def change(out: Path) -> None:
         content = json.loads((out / "flight.geojson").read_text())
-        content["features"][-1]["properties"].update(changes)
+        content["features"][-1][part].update(changes)
         (out / "flight.geojson").write_text(json.dumps(content))
 
     return change
-
-
-def without_ring(out: Path) -> None:
-    content = json.loads((out / "flight.geojson").read_text())
-    content["features"][-1]["geometry"]["coordinates"] = [[[1e308, 0], [0, 1]]]
-    (out / "flight.geojson").write_text(json.dumps(content))
 
 
 DAMAGED = "IMG_0009: left out: its entry in flight.geojson is damaged; run again with --overwrite"
@@ -230,7 +224,12 @@ DAMAGED = "IMG_0009: left out: its entry in flight.geojson is damaged; run again
         (with_changed_entry(accuracy_m=-1), (), 3, DAMAGED),
         (with_changed_entry(longitude=1e308), (), 3, "IMG_0009: left out: "),
         (with_changed_entry(sidecar="../x.json"), (), 3, "IMG_0009: left out: it has no footprint in flight.geojson"),
-        (without_ring, (), 3, "IMG_0009: left out: it has no footprint in flight.geojson"),
+        (
+            with_changed_entry("geometry", coordinates=[[[1e308, 0]] * 5]),
+            (),
+            3,
+            "IMG_0009: left out: it has no footprint in flight.geojson",
+        ),
         (with_changed_entry(accuracy_m=math.nan), (), 1, "flight.geojson has no footprints"),
         (without_positions, (), 1, "no capture can be placed, because flight.geojson has no footprints"),
         (with_another_band, (), 3, "IMG_0009: left out: it has other bands than 0000SET/IMG_0001"),

@@ -9,10 +9,12 @@ import numpy as np
 import pytest
 import rasterio
 
-from agalign.products.drawing import LEVEL_BLOCKS, block_means
+from agalign.products.drawing import LEVEL_BLOCKS, block_means, read_reduced_bands
 from agalign.products.report.light import CaptureLight
 from agalign.products.report.radiometric_check import CaptureLevels, radiometric_check
 from agalign.products.sidecar_file import read_sidecar
+from agalign.values.capture import Band, Capture
+from agalign.values.image import OutputGrid
 
 WIDTH, HEIGHT, STEP_PX = 320, 240, 100
 BANDS = "Green", "NIR"
@@ -80,6 +82,18 @@ def test_captures_of_other_cameras_and_damaged_previews_are_not_compared(tmp_pat
     second.preview.write_bytes(b"no image")
     assert radiometric_check([first, second]).bands[0]["overlaps"] == 0
     assert radiometric_check([first, replace(second, preview=tmp_path / "missing")]).jumps == []
+
+
+def test_levels_and_saturation_of_a_band(tmp_path: Path) -> None:
+    plane = np.full((60, 80), 3.0, np.float32)
+    plane[:10, :4], plane[:10, 10:16] = np.nan, np.nan  # 40 % and 60 % of a block
+    assert np.isnan(block_means(plane)).nonzero() == (0, 1)
+    assert np.nanmin(block_means(plane)) == np.nanmax(block_means(plane)) == 3.0
+    plane = np.where(np.isnan(plane), 255, plane).astype(np.uint8)
+    cv2.imwrite(str(tmp_path / "a.png"), plane)
+    band = Band("NIR", tmp_path / "a.png", 1, 80, 60, "uint8", saturation_value=255)
+    bands = read_reduced_bands(Capture("a", tmp_path, (band,), 0), {}, OutputGrid(0, 0, 80, 60))
+    assert bands.saturated == {"NIR": pytest.approx(100 / 4800)}
 
 
 def test_sidecars_have_the_levels_of_what_was_written(aligned_flight: Path) -> None:

@@ -297,6 +297,10 @@ def test_flights_and_captures_without_a_band_have_the_size_of_their_camera(tmp_p
         grids.append(output_layers(without, {}, settings, limits)[1])
         assert len({(g.x0, g.y0, g.width, g.height, g.scale) for g in grids}) == 1
         assert 120 - (grids[0].x0 + grids[0].width) in range(21, 25)
+    green, nir = (replace(band, lens=None) for band in capture.bands)
+    finer = replace(capture, bands=(green, replace(nir, width_px=240, height_px=180)))
+    limits = flight_limits([([finer], replace(rig_between(2.0, 12.0), mean={"nir": np.diag([2.0, 2.0, 1.0])}))])
+    assert output_layers(replace(without, bands=(green,)), {}, settings, limits)[1].scale == (2.0, 2.0)
 
 
 # ---- what libtiff prints without any handler
