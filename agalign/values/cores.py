@@ -80,7 +80,12 @@ def _text(path: Path) -> str:
 
 
 def check_threads() -> None:
-    """Raise ConfigurationError if the system allows too few processes (`ulimit -u`, or a container's limit)."""
+    """Raise ConfigurationError if the system allows too few processes (`ulimit -u`, or a container's limit).
+
+    Not checked with a limit of the address space: each thread reserves 64 MB of it for as long as the process runs.
+    """
+    if _address_space_bytes() < math.inf:
+        return
     end, started = threading.Event(), list[threading.Thread]()
     needed = _MIN_THREADS + _MIN_THREADS_PER_CORE * usable_cores()
     try:
@@ -99,14 +104,20 @@ def check_threads() -> None:
             thread.join()
 
 
-def check_address_space() -> None:
-    """Raise MemoryLimitError if the address space (`ulimit -v`) is too small for the libraries."""
+def _address_space_bytes() -> float:
+    """Return the limit of the address space (`ulimit -v`); inf without one."""
     if sys.platform == "win32":
-        return
+        return math.inf
     import resource
 
     limit_bytes, _ = resource.getrlimit(resource.RLIMIT_AS)
-    if limit_bytes != resource.RLIM_INFINITY and limit_bytes < MIN_ADDRESS_SPACE_BYTES:
+    return math.inf if limit_bytes == resource.RLIM_INFINITY else limit_bytes
+
+
+def check_address_space() -> None:
+    """Raise MemoryLimitError if the address space (`ulimit -v`) is too small for the libraries."""
+    limit_bytes = _address_space_bytes()
+    if limit_bytes < MIN_ADDRESS_SPACE_BYTES:
         raise MemoryLimitError(
             f"the address space of this process is limited to {limit_bytes / 1e9:.2f} GB (ulimit -v); agalign needs "
             f"{MIN_ADDRESS_SPACE_BYTES / 1e9:g} GB or more; raise that limit"

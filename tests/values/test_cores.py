@@ -10,6 +10,7 @@ from agalign.errors import MemoryLimitError, is_out_of_memory
 from agalign.values import cores
 from agalign.values.cores import cgroup_quota, check_address_space, check_threads, limit_default_threads, usable_cores
 
+from ..conftest import raising
 from ..program import agalign_here
 
 V1 = {"cpu/docker/ab/cpu.cfs_period_us": "100000"}
@@ -55,6 +56,12 @@ def test_threads_follow_a_quota_and_what_the_user_has_set_stays(monkeypatch: pyt
 
 
 resource = pytest.importorskip("resource", reason="address space is limited on POSIX only")
+
+
+def test_no_threads_are_started_to_check_their_number_in_a_small_address_space(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(resource, "getrlimit", lambda _: (2_000_000_000, 2_000_000_000))
+    monkeypatch.setattr(threading.Thread, "start", raising(RuntimeError()))
+    check_threads()
 
 
 def test_too_little_address_space_is_refused_with_both_sizes(monkeypatch: pytest.MonkeyPatch) -> None:
