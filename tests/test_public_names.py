@@ -18,6 +18,8 @@ from agalign.config import JointSettings, Settings
 from agalign.values.issues import BLANK_MOVING, Issue
 from agalign.values.mapping import PixelMapping
 
+from .builders import residual_of
+
 FUNCTIONS = "align align_capture align_folder discover mosaic open_capture open_flight plot_statistics read_alignment"
 FUNCTIONS += " warp_onto"
 SETTINGS = "CheckSettings FlightSettings JointSettings ReliefSettings SeedSettings Settings WriteSettings"
@@ -70,7 +72,7 @@ def test_settings_print_values_other_than_defaults() -> None:
 def test_an_alignment_prints_one_short_line() -> None:
     seed = agalign.Seed("identity", np.eye(3), 0.0)
     mapping = PixelMapping(np.eye(3))
-    residual = agalign.Residual(np.zeros((44, 2)), np.zeros((44, 2)), 0.0512, 0.1, 0.9)
+    residual = residual_of(np.zeros((44, 2)), np.array([0.0512, 0.0]))
     result = agalign.Alignment(mapping, (640, 480), "aligned", (), seed, residual=residual)
     assert repr(result) == "Alignment(status='aligned', residual_median_px=0.051, corner_std_px=None)"
     failed = agalign.Alignment(mapping, (640, 480), "failed", (Issue(BLANK_MOVING),), seed)

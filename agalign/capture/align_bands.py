@@ -323,7 +323,7 @@ def _candidates(
     ]
     pairs, joint = [c.pair for c in measured], {c.pair.name: c.joint for c in measured}
     residuals = {c.pair.name: c.warped.residual for c in measured}
-    halves = ({name: r.where(r.is_black == is_black) for name, r in residuals.items()} for is_black in (True, False))
+    halves = ({name: r.half(black=is_black) for name, r in residuals.items()} for is_black in (True, False))
     # The MAP estimate is a homography, which may not be of the family that the user chose.
     rig = None if model is None else model.rig
     estimates, black, white = (

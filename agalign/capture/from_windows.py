@@ -51,17 +51,18 @@ def _aligned(pair: BandPair, alignment: Alignment[FixedImagePx]) -> Alignment[Fi
     if not descriptors_failed or alignment.residual is None or not seed_fits(alignment.residual):
         return None
     max_step_px = min(_MAX_STEP_PX, pair.max_shift_px)
+    start = WarpedPair.of(pair, pair.mapping(alignment.fixed_to_moving))
     fitted = fit_in_rounds(
-        pair.mapping(alignment.fixed_to_moving),
-        lambda mapping: _half(WarpedPair.of(pair, mapping), is_black=True),
+        start.mapping,
+        lambda mapping: WarpedPair.of(pair, mapping, start.windows).residual.half(black=True),
         pair.fixed.size_px,
         lambda fit: fit.max_px <= max_step_px,
     )
     if fitted is None:
         return None
     mapping, fit = fitted
-    warped_pair = WarpedPair.of(pair, mapping)
-    held_out = _half(warped_pair, is_black=False)
+    warped_pair = WarpedPair.of(pair, mapping, start.windows)
+    held_out = warped_pair.residual.half(black=False)
     retrieval, chance = (0.0, 0.0) if alignment.joint is None else (alignment.joint.retrieval, alignment.joint.chance)
     joint = JointResult[FixedImagePx](
         mapping.fixed_to_moving, math.nan, retrieval, chance, 0, (1.0,), BY_WINDOWS, "homography", fit.max_px, ()
@@ -69,10 +70,6 @@ def _aligned(pair: BandPair, alignment: Alignment[FixedImagePx]) -> Alignment[Fi
     if replace(warped_pair, residual=held_out).issues(joint):
         return None
     return replace(alignment, mapping=mapping, status="aligned", issues=(), joint=joint, residual=held_out)
-
-
-def _half(warped_pair: WarpedPair, *, is_black: bool) -> Residual[FixedImagePx]:
-    return warped_pair.residual.where(warped_pair.residual.is_black == is_black)
 
 
 def _is_consistent(fit: WindowFit) -> bool:

@@ -120,12 +120,14 @@ def _side(centre_px: float, length_px: int, cells: int) -> tuple[int, int, int]:
 
 def _residual(moving: Band, mapping: PixelMapping, tiles: _Tiles) -> Residual[FixedFilePx]:
     """Measure the residual of the windows of all tiles, px of the reference's file. Raises UnreadableFileError."""
-    parts = [(np.empty((0, 2)), np.empty((0, 2)), np.empty(0))]
+    parts = [(np.empty((0, 2)), np.empty((0, 2)), np.empty(0), np.empty((0, 2), np.int64))]
     with open_raster(moving.path) as source:
         for tile, windows in tiles:
             warped = resample_tile(moving, mapping, tile, "lanczos", dataset=source)
             part = windows.residuals(_raster(*warped, moving))
-            parts.append((part.centres_px + np.array([tile.x0, tile.y0]), part.shifts_px, part.peaks_sigma))
+            origin_px = np.array([tile.x0, tile.y0])
+            cells = part.cells + origin_px // windows.side  # in a grid over the whole file
+            parts.append((part.centres_px + origin_px, part.shifts_px, part.peaks_sigma, cells))
     return Residual[FixedFilePx].of(*map(np.concatenate, zip(*parts, strict=True)))
 
 

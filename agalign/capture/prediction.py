@@ -5,7 +5,7 @@ from dataclasses import replace
 
 from agalign.capture.band_pair import BandPair
 from agalign.capture.seeding import find_rotated
-from agalign.capture.verification import as_predicted
+from agalign.capture.verification import WarpedPair
 from agalign.flight.rig import Observation, Rig, distance_px
 from agalign.flight.rig_prediction import predict_band
 from agalign.values.alignment import MIN_TIMES_CHANCE, Alignment
@@ -68,11 +68,11 @@ def _with_prediction(
         by_windows = pair.scales.between_files(alignment.fixed_to_moving)
         if distance_px(by_windows, prediction.fixed_to_moving, rig.size_px) <= MAX_UNEXPECTED_PX:
             return alignment
-    predicted = as_predicted(alignment, pair, prediction)
-    assert predicted.residual is not None
-    rotated = find_rotated(pair, predicted.fixed_to_moving, predicted.residual)
+    by_rig = WarpedPair.of(pair, pair.mapping(pair.scales.between_images(prediction.fixed_to_moving)))
+    rotated = find_rotated(by_rig)
     if rotated is None:
-        return predicted
+        residual = by_rig.residual
+        return replace(alignment, mapping=by_rig.mapping, status="predicted", residual=residual, prediction=prediction)
     off_px = distance_px(pair.scales.between_files(rotated), prediction.fixed_to_moving, rig.size_px)
     return replace(alignment, issues=(Issue(UNEXPECTED_PX, off_px, MAX_UNEXPECTED_PX), *alignment.issues))
 

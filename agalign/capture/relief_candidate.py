@@ -170,8 +170,7 @@ def _common_residuals(group: Sequence[ReliefCandidate]) -> list[Residual[FixedIm
     reference = group[0].pair.reference
     if any(c.pair.is_blurred for c in group):
         return [reference.large_windows.residuals(c.warped.warped) for c in group]
-    centres_px = {tuple(c) for c in reference.windows.centres_px.tolist()}
-    if all(tuple(c) in centres_px for each in group for c in each.warped.residual.centres_px.tolist()):
+    if all(c.warped.windows is reference.windows for c in group):
         return [c.warped.residual for c in group]
     return [reference.small_windows.residuals(c.warped.warped) for c in group]
 
@@ -401,7 +400,8 @@ class _Estimate:
             result = pair.reference.displacement_field.refine(channel_mean(pair.moving_image), complete, verifying)
             if result.field is not None and result.held_out is not None:
                 complete, held_out = replace(complete, field=result.field), result.held_out
-        issues = WarpedPair(pair, complete, pair.warped_moving(complete), held_out).issues(joint)
+        warped, windows = pair.warped_moving(complete), pair.reference.held_out_windows
+        issues = WarpedPair(pair, complete, warped, windows, held_out).issues(joint)
         if issues:
             return replace(rejected, held_out=held_out)
         kind: Geometry = "relief" if complete.field is None else "relief and field"

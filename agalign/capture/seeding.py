@@ -16,11 +16,10 @@ from agalign.pixels.band_resampling import channel_mean, textured, warped
 from agalign.pixels.landmarks import LANDMARK_INPUTS, landmarks, matched_homography
 from agalign.pixels.structure import Peak, correlation_surfaces, find_peak, structure_field, windowed_spectra
 from agalign.values import geometry
-from agalign.values.alignment import Residual, Seed
+from agalign.values.alignment import Seed
 from agalign.values.choices import SeedKind, Space
 from agalign.values.geometry import Matrix
 from agalign.values.issues import BLANK_MOVING, BLANK_REFERENCE, NO_SUCH_SEED, Issue
-from agalign.values.pixel_units import FixedImagePx
 from agalign.verify.checks import seed_fits
 from agalign.verify.window_fit import fit_in_rounds
 
@@ -69,46 +68,48 @@ def _best_match(pair: BandPair, model: FlightModel | None, best: Seed) -> Seed:
     a higher correlation peak: equal plants in a square grid match after a quarter turn too, with a smaller residual
     where there is parallax.
     """
-    residual = _residual_of(pair, best.fixed_to_moving)
+    given = WarpedPair.of(pair, pair.mapping(best.fixed_to_moving))
     # The mapping of the tags confirms the image centre, the windows confirm the corners.
-    is_confirmed = pair.is_expected(best.fixed_to_moving) and seed_fits(residual)
+    is_confirmed = pair.is_expected(best.fixed_to_moving) and seed_fits(given.residual)
     if best.trusted and is_confirmed:
         return best
     for mapping in _matches(pair, model, by_learned_descriptors=not best.trusted):
-        for match, match_residual in _with_corrected(pair, mapping):
-            if not seed_fits(match_residual) or not match_residual.is_better_than(residual):
+        for match in _with_corrected(pair, mapping):
+            if not seed_fits(match.residual) or not match.is_better_than(given):
                 continue
             # The match has its own score: it is not shifted to the correlation peak.
-            scored = replace(_scored(pair, "match", match)[0], trusted=True)
+            scored = replace(_scored(pair, "match", match.mapping.fixed_to_moving)[0], trusted=True)
             if not is_confirmed or scored.score > best.score:
-                best, residual = scored, match_residual
+                best, given = scored, match
         close_px = 3.0  # the search ends here
-        if best.kind == "match" and residual.p95_px <= close_px:
+        if best.kind == "match" and given.residual.p95_px <= close_px:
             break
     return best
 
 
-def _with_corrected(pair: BandPair, fixed_to_moving: Matrix) -> Iterator[tuple[Matrix, Residual[FixedImagePx]]]:
-    """Yield a mapping, then its correction by its windows if these are enough, with their residuals."""
-    residual = _residual_of(pair, fixed_to_moving)
-    yield fixed_to_moving, residual
-    fitted = fit_in_rounds(pair.mapping(fixed_to_moving), lambda _: residual, pair.fixed.size_px, rounds=1)
+def _with_corrected(pair: BandPair, fixed_to_moving: Matrix) -> Iterator[WarpedPair]:
+    """Yield the pair with a mapping, then with its correction by its windows if these are enough."""
+    warped_pair = WarpedPair.of(pair, pair.mapping(fixed_to_moving))
+    yield warped_pair
+    fitted = fit_in_rounds(warped_pair.mapping, lambda _: warped_pair.residual, pair.fixed.size_px, rounds=1)
     if fitted is not None:
-        yield fitted[0].fixed_to_moving, _residual_of(pair, fitted[0].fixed_to_moving)
+        yield WarpedPair.of(pair, pair.mapping(fitted[0].fixed_to_moving))
 
 
-def find_rotated(pair: BandPair, fixed_to_moving: Matrix, given: Residual[FixedImagePx]) -> Matrix | None:
-    """Return a mapping by landmarks that is rotated or scaled relative to `fixed_to_moving`; None without one.
+def find_rotated(given: WarpedPair) -> Matrix | None:
+    """Return a mapping by landmarks that is rotated or scaled relative to that of the pair; None without one.
 
-    Its residual is better than the residual `given` of `fixed_to_moving`. The bands of a rigid camera are not rotated
-    relative to their rig; a mapping that is only shifted may be an alias in a repetitive scene and is ignored.
+    Its residual is better than the given one. The bands of a rigid camera are not rotated relative to their rig; a
+    mapping that is only shifted may be an alias in a repetitive scene and is ignored.
     """
-    if seed_fits(given):
+    pair = given.pair
+    if seed_fits(given.residual):
         return None
     for result in _matches(pair, None, by_learned_descriptors=False):
-        residual = _residual_of(pair, result)
-        change = geometry.compose(geometry.invert(fixed_to_moving), result)
-        if seed_fits(residual) and residual.is_better_than(given) and _is_rotated_or_scaled(change, pair.fixed.size_px):
+        match = WarpedPair.of(pair, pair.mapping(result))
+        change = geometry.compose(geometry.invert(given.mapping.fixed_to_moving), result)
+        is_moved = _is_rotated_or_scaled(change, pair.fixed.size_px)
+        if is_moved and seed_fits(match.residual) and match.is_better_than(given):
             return result
     return None
 
@@ -136,10 +137,6 @@ def _matches(pair: BandPair, model: FlightModel | None, *, by_learned_descriptor
         result = match_seed(_network(pair, model), pair.fixed, pair.moving, max_keypoints)
         if result is not None:
             yield result
-
-
-def _residual_of(pair: BandPair, fixed_to_moving: Matrix) -> Residual[FixedImagePx]:
-    return WarpedPair.of(pair, pair.mapping(fixed_to_moving)).residual
 
 
 def _network(pair: BandPair, model: FlightModel | None) -> Descriptor:

@@ -18,7 +18,7 @@ from agalign.values.pixel_units import FixedImagePx, PixelScale
 from agalign.verify.checks import CLOSE_WINDOWS, CLUSTER, RESIDUAL_PX, Evidence, is_unchanged, issues_of, status_of
 from agalign.verify.displacement_field import DisplacementResult
 from agalign.verify.extrapolation import points_in_frame, unobserved_quarters
-from agalign.verify.residuals import residual_under
+from agalign.verify.residuals import FixedWindows, residual_under
 
 _PARALLAX_ISSUES = frozenset({CLOSE_WINDOWS, CLUSTER, RESIDUAL_PX})
 """Issues caused by parallax, which a displacement field may remove."""
@@ -37,16 +37,34 @@ class WarpedPair:
     mapping: PixelMapping
     warped: Raster
     """The moving image, one channel, on the grid of the reference."""
+    windows: FixedWindows
     residual: Residual[FixedImagePx]
+    """Of these windows."""
 
     @classmethod
-    def of(cls, pair: BandPair, mapping: PixelMapping) -> "WarpedPair":
-        """Warp the moving image and measure the residual."""
+    def of(cls, pair: BandPair, mapping: PixelMapping, windows: FixedWindows | None = None) -> "WarpedPair":
+        """Warp the moving image and measure the residual of `windows`.
+
+        By default these are those of the pair, or small ones if these cover more quarters of the overlap. A fit and its
+        verification must use the same windows: those of two grids share pixels, whatever their colours.
+        """
         warped = pair.warped_moving(mapping)
-        return cls(pair, mapping, warped, _residual_of(pair, mapping, warped))
+        if windows is not None:
+            return cls(pair, mapping, warped, windows, windows.residuals(warped))
+        usual, size_px = cls(pair, mapping, warped, pair.windows, pair.windows.residuals(warped)), pair.fixed.size_px
+        in_frame_px = points_in_frame(mapping, size_px, pair.moving_image.size_px)
+        if not unobserved_quarters(usual.residual.centres_px, size_px, in_frame_px):
+            return usual
+        small = pair.reference.small_windows
+        smaller = replace(usual, windows=small, residual=small.residuals(warped))
+        counts = [len(unobserved_quarters(p.residual.measured_px, size_px, in_frame_px)) for p in (usual, smaller)]
+        return smaller if counts[1] < counts[0] else usual
 
     def with_mapping(self, mapping: PixelMapping) -> "WarpedPair":
-        """Return the pair with another mapping; the residual is converted if the mappings are nearly equal."""
+        """Return the pair with another mapping; the residual is that of the same windows.
+
+        It is converted if the mappings are nearly equal, else measured.
+        """
         if mapping.field is self.mapping.field:
             corners = geometry.corners(*self.pair.fixed.size_px)
             difference_px = float(np.linalg.norm(mapping(corners) - self.mapping(corners), axis=1).max())
@@ -55,20 +73,25 @@ class WarpedPair:
             max_converted_px = 0.15
             if difference_px <= max_converted_px:
                 return replace(self, mapping=mapping, residual=residual_under(self.residual, self.mapping, mapping))
-        return WarpedPair.of(self.pair, mapping)
+        return WarpedPair.of(self.pair, mapping, self.windows)
+
+    def is_better_than(self, other: "WarpedPair") -> bool:
+        """Return True if the median shift, divided by the coverage, is smaller in the same windows."""
+        compared = other if other.windows is self.windows else WarpedPair.of(other.pair, other.mapping, self.windows)
+        own, others = (r.median_px / max(r.coverage, 1e-6) for r in (self.residual, compared.residual))
+        return own < others
 
     def cross_validated(self, by_halves: tuple[Matrix, Matrix]) -> "WarpedPair":
         """Return the pair with the residual of each window under a mapping that was estimated without it.
 
-        `by_halves` are homographies estimated without the white and without the black windows of a chessboard.
+        `by_halves` are homographies estimated from the black and from the white windows of a chessboard.
         """
-        black, residual = self.residual.is_black, self.residual
-        shifts_px = residual.shifts_px.copy()
-        for of_half, matrix in zip((black, ~black), reversed(by_halves), strict=True):
-            mapping = replace(self.mapping, fixed_to_moving=matrix)
-            shifts_px[of_half] = residual_under(residual.where(of_half), self.mapping, mapping).shifts_px
-        crossed = Residual[FixedImagePx].of(residual.centres_px, shifts_px, residual.peaks_sigma)
-        return replace(self, residual=crossed)
+        by_black_px, by_white_px = (
+            residual_under(self.residual, self.mapping, replace(self.mapping, fixed_to_moving=matrix)).shifts_px
+            for matrix in by_halves
+        )
+        shifts_px = np.where(self.residual.is_black[:, None], by_white_px, by_black_px)
+        return replace(self, residual=self.residual.with_shifts(shifts_px))
 
     @property
     def reduced_scale(self) -> PixelScale:
@@ -89,18 +112,6 @@ class WarpedPair:
         pair = self.pair
         size_px, pixel_px = pair.fixed.size_px, pair.file_pixel_size_px
         return issues_of(Evidence(joint, self.residual, size_px, images=self, file_pixel_size_px=pixel_px))
-
-
-def _residual_of(pair: BandPair, mapping: PixelMapping, warped: Raster) -> Residual[FixedImagePx]:
-    """Measure the residual in windows; in small windows if these cover more quarters of the overlap."""
-    size_px = pair.fixed.size_px
-    residual = pair.windows.residuals(warped)
-    in_frame_px = points_in_frame(mapping, size_px, pair.moving_image.size_px)
-    if not unobserved_quarters(residual.centres_px, size_px, in_frame_px):
-        return residual
-    smaller = pair.reference.small_windows.residuals(warped)
-    counts = [len(unobserved_quarters(r.measured_px, size_px, in_frame_px)) for r in (residual, smaller)]
-    return smaller if counts[1] < counts[0] else residual
 
 
 def verified(
@@ -175,7 +186,7 @@ def _verified(
         return plane, issues, None
     displacement = pair.reference.displacement_field.refine(channel_mean(pair.moving_image), plane.mapping)
     if displacement.field is not None:
-        displaced = WarpedPair.of(pair, replace(plane.mapping, field=displacement.field))
+        displaced = WarpedPair.of(pair, replace(plane.mapping, field=displacement.field), plane.windows)
         held_out = displaced if displacement.held_out is None else replace(displaced, residual=displacement.held_out)
         # All checks run again, those of windows on all windows and on the held-out ones.
         remaining = held_out.issues(joint)
@@ -193,14 +204,6 @@ def _needs_field(use: ReliefUse, issues: tuple[Issue, ...], *, has_rig: bool) ->
     """
     only_parallax = all(issue.kind in _PARALLAX_ISSUES for issue in issues)
     return only_parallax and (use == "always" or (use == "auto" and (bool(issues) or not has_rig)))
-
-
-def as_predicted(alignment: Alignment[FixedImagePx], pair: BandPair, prediction: Prediction) -> Alignment[FixedImagePx]:
-    """Return the alignment, px of the images, with the mapping of a prediction, px of the files."""
-    fixed_to_moving = pair.scales.between_images(prediction.fixed_to_moving)
-    mapping = pair.mapping(fixed_to_moving)
-    residual = WarpedPair.of(pair, mapping).residual
-    return replace(alignment, mapping=mapping, status="predicted", residual=residual, prediction=prediction)
 
 
 def with_metrics(

@@ -167,8 +167,9 @@ def _metrics(alignment: Alignment[FixedFilePx]) -> dict[str, Any]:
         return {"before": before, "after": after, "tiles": []}
     after |= {"residual_px": residual.median_px, "residual_p95_px": residual.p95_px}
     after["residual_coverage"] = residual.coverage
-    windows = zip(residual.centres_px.tolist(), residual.shifts_px.tolist(), strict=True)
-    tiles = [{"centre_px": centre_px, "shift_px": shift_px} for centre_px, shift_px in windows]
+    values = residual.centres_px, residual.shifts_px, residual.peaks_sigma, residual.cells
+    names = "centre_px", "shift_px", "peak_sigma", "cell"
+    tiles = [dict(zip(names, window, strict=True)) for window in zip(*(v.tolist() for v in values), strict=True)]
     return {"before": before, "after": after, "tiles": tiles}
 
 

@@ -67,11 +67,12 @@ def _candidates(part: BandPart) -> dict[Geometry, FixedFilePx]:
 
 
 def _residual(part: BandPart) -> Residual[FixedFilePx] | None:
-    if part.metrics is None:
+    tiles = [] if part.metrics is None else [t for t in part.metrics.tiles if t.cell is not None]
+    if part.metrics is None or len(tiles) < len(part.metrics.tiles):
         return None
-    centres = np.array([t.centre_px for t in part.metrics.tiles], float).reshape(-1, 2)
-    shifts = np.array([t.shift_px for t in part.metrics.tiles], float).reshape(-1, 2)
-    return Residual[FixedFilePx].of(centres, shifts, np.empty(0))
+    centres, shifts = np.array([(t.centre_px, t.shift_px) for t in tiles], float).reshape(-1, 2, 2).swapaxes(0, 1)
+    peaks, cells = np.array([t.peak_sigma for t in tiles], float), np.array([t.cell for t in tiles], np.int64)
+    return Residual[FixedFilePx].of(centres, shifts, peaks, cells.reshape(-1, 2))
 
 
 def _parallax(path: Path, content: Sidecar, part: ReliefPart, fixed: Lens | None) -> Parallax:

@@ -304,6 +304,10 @@ class ResidualTile(_Part):
     """Centre of the window, px of the reference."""
     shift_px: tuple[Fraction4, Fraction4]
     """Shift, px of the reference; null if none could be measured."""
+    peak_sigma: Fraction4 = None
+    """Height of the correlation peak, standard deviations."""
+    cell: tuple[int, int] | None = None
+    """Column and row in the complete grid of windows."""
 
 
 class MetricsResult(_Result):

@@ -77,7 +77,7 @@ def tie_points(band: Band, alignment: Alignment[FixedFilePx]) -> Iterator[TiePoi
     at_px, shifts_px = residual.centres_px[measured], residual.shifts_px[measured]
     moving_px = alignment.map(at_px + shifts_px)
     # The standard error of a shift is proportional to 1 / (height of its correlation peak)^2.
-    sigma = residual.peaks_sigma[measured] if len(residual.peaks_sigma) else np.ones(len(at_px))
+    sigma = residual.peaks_sigma[measured]
     weights = (sigma / np.median(sigma)) ** 4 if len(sigma) else sigma
     rows = zip(at_px.tolist(), moving_px.tolist(), np.hypot(*shifts_px.T).tolist(), weights.tolist(), strict=True)
     for (x, y), (moving_x, moving_y), residual_px, weight in rows:

@@ -106,22 +106,22 @@ class WindowShifts:
 
     @classmethod
     def of(cls, residuals: Sequence[Residual[FixedImagePx]], mappings: Sequence[PixelMapping]) -> "WindowShifts":
-        """Collect the windows of each band, measured with its mapping. Windows are identified by their centres."""
-        centres = sorted({tuple(c) for r in residuals for c in r.centres_px.tolist()})
-        index = {centre: i for i, centre in enumerate(centres)}
-        shifts, peaks = np.full((len(centres), len(residuals), 2), np.nan), np.zeros((len(centres), len(residuals)))
+        """Collect the windows of each band, measured with its mapping; all bands have the same grid of windows."""
+        cells = np.concatenate([r.cells for r in residuals])
+        _, first, index = np.unique(cells, axis=0, return_index=True, return_inverse=True)
+        centres_px = np.concatenate([r.centres_px for r in residuals])[first]
+        index_of_band = np.split(index.reshape(-1), np.cumsum([len(r.cells) for r in residuals])[:-1])
+        shifts, peaks = np.full((len(first), len(residuals), 2), np.nan), np.zeros((len(first), len(residuals)))
         for band, (residual, mapping) in enumerate(zip(residuals, mappings, strict=True)):
             measured = np.isfinite(residual.shifts_px[:, 0])
             if not measured.any():
                 continue
-            xy = residual.centres_px[measured]
-            rows = [index[tuple(c)] for c in xy.tolist()]
+            xy, rows = residual.centres_px[measured], index_of_band[band][measured]
             shifts[rows, band] = mapping.undistorted(xy + residual.shifts_px[measured]) - mapping.undistorted(xy)
             peaks[rows, band] = residual.peaks_sigma[measured]
         positive = peaks[peaks > 0]
         max_weight = 2.0  # so that well-textured parts do not dominate
         weights = np.minimum((peaks / np.median(positive)) ** 2, max_weight) if positive.size else peaks
-        centres_px = np.array(centres).reshape(-1, 2)
         points = mappings[0].of_the_plane.undistorted(centres_px)
         return cls(centres_px, points, shifts, np.where(np.isfinite(shifts[..., 0]), weights, 0.0))
 

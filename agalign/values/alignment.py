@@ -115,48 +115,56 @@ class Residual(Generic[FixedPx]):
     p95_px: FixedPx
     coverage: float
     """Share of the textured windows in which a shift could be measured."""
-    peaks_sigma: NDArray[np.float64] = dataclasses.field(default_factory=lambda: np.empty(0))
+    peaks_sigma: NDArray[np.float64]
     """(n,) height of the correlation peak of each window, in standard deviations; the error of a shift is inversely
     proportional to its square."""
+    cells: NDArray[np.int64]
+    """(n, 2) column and row of each window in the complete grid, whichever windows of it are measured."""
 
     @classmethod
     def of(
-        cls, centres_px: NDArray[np.float64], shifts_px: NDArray[np.float64], peaks_sigma: NDArray[np.float64]
+        cls,
+        centres_px: NDArray[np.float64],
+        shifts_px: NDArray[np.float64],
+        peaks_sigma: NDArray[np.float64],
+        cells: NDArray[np.int64],
     ) -> "Residual[FixedPx]":
         """Return the statistics of shifts (n, 2) with correlation peaks (n,) in standard deviations."""
         measured = np.isfinite(shifts_px[:, 0])
         length = np.linalg.norm(shifts_px[measured], axis=1)
         median, p95 = np.percentile(length, (50, 95)) if len(length) else (np.inf, np.inf)
         coverage = float(measured.mean()) if len(measured) else 0.0
-        return cls(
-            centres_px, shifts_px, cast(FixedPx, float(median)), cast(FixedPx, float(p95)), coverage, peaks_sigma
-        )
+        of_shifts = cast(FixedPx, float(median)), cast(FixedPx, float(p95)), coverage
+        return cls(centres_px, shifts_px, *of_shifts, peaks_sigma, cells)
+
+    def with_shifts(self, shifts_px: NDArray[np.float64]) -> "Residual[FixedPx]":
+        """The same windows with other shifts (n, 2)."""
+        return Residual[FixedPx].of(self.centres_px, shifts_px, self.peaks_sigma, self.cells)
 
     @property
     def is_black(self) -> NDArray[np.bool_]:
         """(n,) True for alternate windows along both axes of their grid, as on a chessboard."""
-        column, row = (np.unique(self.centres_px[:, axis], return_inverse=True)[1] for axis in (0, 1))
-        return np.asarray((column + row) % 2 == 0)
+        return np.asarray(self.cells.sum(axis=1) % 2 == 0)
+
+    def half(self, *, black: bool) -> "Residual[FixedPx]":
+        """The black or the white windows: one half for a fit, the other for its verification."""
+        return self.where(self.is_black == black)
 
     def where(self, selected: NDArray[np.bool_]) -> "Residual[FixedPx]":
         """The windows where a mask (n,) is True."""
-        return Residual[FixedPx].of(self.centres_px[selected], self.shifts_px[selected], self.peaks_sigma[selected])
+        shifts_px, peaks_sigma, cells = self.shifts_px[selected], self.peaks_sigma[selected], self.cells[selected]
+        return Residual[FixedPx].of(self.centres_px[selected], shifts_px, peaks_sigma, cells)
 
     @property
     def measured_px(self) -> NDArray[np.float64]:
         """(m, 2) centres of the windows in which a shift was measured."""
         return self.centres_px[np.isfinite(self.shifts_px[:, 0])]
 
-    def is_better_than(self, other: "Residual[FixedPx]") -> bool:
-        """True if the median shift, divided by the coverage, is smaller."""
-        return self.median_px / max(self.coverage, 1e-6) < other.median_px / max(other.coverage, 1e-6)
-
     def in_file_px(self: "Residual[FixedImagePx]", scales: "PairScales") -> "Residual[FixedFilePx]":
         """The same on the grid of the reference band's file."""
         up = scales.fixed.inverse
-        return Residual[FixedFilePx].of(
-            up.positions(self.centres_px), up.displacements(self.shifts_px), self.peaks_sigma
-        )
+        centres_px, shifts_px = up.positions(self.centres_px), up.displacements(self.shifts_px)
+        return Residual[FixedFilePx].of(centres_px, shifts_px, self.peaks_sigma, self.cells)
 
 
 @dataclass(frozen=True)

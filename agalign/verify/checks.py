@@ -9,20 +9,18 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Generic, NamedTuple, Protocol
 
+import cv2
 import numpy as np
-from scipy.sparse import identity
-from scipy.sparse.csgraph import connected_components
-from scipy.spatial import cKDTree
+from numpy.typing import NDArray
 
 from agalign.pixels.structure import Field, correlation_surfaces
 from agalign.values import geometry, issues
 from agalign.values.alignment import MIN_RETRIEVAL, MIN_TIMES_CHANCE, JointResult, Prediction, Residual
 from agalign.values.choices import PairStatus
-from agalign.values.geometry import Matrix, Points
+from agalign.values.geometry import Matrix
 from agalign.values.issues import RETRIEVAL, TEXTURELESS, UNLIKE, Issue, IssueKind, Remedy
 from agalign.values.pixel_units import FixedImagePx, FixedPx, PixelScale
 from agalign.verify.extrapolation import EXTRAPOLATED
-from agalign.verify.residuals import window_spacing_px
 
 BY_WINDOWS = "windows"
 """Recipe of a result that is fitted to windows; its residual contains the windows that were left out of the fit."""
@@ -148,7 +146,7 @@ def _window_issues(evidence: Evidence[FixedPx]) -> Iterator[Issue]:
     close = 1 - float(is_far.sum()) / count
     if not close >= _MIN_CLOSE_SHARE:
         yield Issue(CLOSE_WINDOWS, close, _MIN_CLOSE_SHARE, f"{_MAX_SHIFT_PX:g} px")
-    cluster = _largest_cluster(residual.centres_px[is_far], residual.centres_px)
+    cluster = _largest_cluster(residual.cells[is_far])
     limit = max(_MIN_CLUSTER, round(_MAX_CLUSTER_SHARE * measured))
     if not cluster < limit:
         yield Issue(CLUSTER, cluster / count, limit / count)
@@ -157,15 +155,14 @@ def _window_issues(evidence: Evidence[FixedPx]) -> Iterator[Issue]:
         yield Issue(RESIDUAL_PX, median_px, _MAX_SHIFT_PX)
 
 
-def _largest_cluster(centres_px: Points, all_px: Points) -> int:
-    """Return the size of the largest group of adjacent centres (n, 2) on the grid `all_px` (m, 2)."""
-    if len(centres_px) == 0:
+def _largest_cluster(cells: NDArray[np.int64]) -> int:
+    """Return the size of the largest group of adjacent windows, also diagonally, with columns and rows (n, 2)."""
+    if len(cells) == 0:
         return 0
-    max_neighbour_spacings = 1.6  # includes diagonal neighbours (1.41)
-    radius_px = max_neighbour_spacings * window_spacing_px(all_px)
-    adjacent = cKDTree(centres_px).sparse_distance_matrix(cKDTree(centres_px), radius_px)
-    _, labels = connected_components(adjacent.tocsr() + identity(len(centres_px)), directed=False)
-    return int(np.bincount(labels).max())
+    occupied = np.zeros(cells.max(axis=0) + 1, np.uint8)
+    occupied[tuple(cells.T)] = 1
+    _, _, statistics, _ = cv2.connectedComponentsWithStats(occupied, connectivity=8)
+    return int(statistics[1:, cv2.CC_STAT_AREA].max())
 
 
 def _rig_issues(evidence: Evidence[FixedPx]) -> Iterator[Issue]:

@@ -113,9 +113,8 @@ class DisplacementEstimator:
         assert mapping.field is not None
         residual = self.verification.residuals(warped(moving, mapping, self.size_px))
         min_distance_px = (self.windows.side + self.verification.side) / 2
-        predicted_px = self._cross_predicted(total, residual.centres_px, min_distance_px, smoothness)
-        remaining_px = residual.shifts_px + mapping.field(residual.centres_px) - predicted_px
-        return Residual.of(residual.centres_px, remaining_px, residual.peaks_sigma)
+        predicted_px = self._cross_predicted(total, residual, min_distance_px, smoothness)
+        return residual.with_shifts(residual.shifts_px + mapping.field(residual.centres_px) - predicted_px)
 
     def _best_gain(self, shifts: Shifts) -> "_Gain":
         """Return the gain of the least smooth field with a significant gain, else that of the smoothest field."""
@@ -133,32 +132,29 @@ class DisplacementEstimator:
 
     def _gain(self, shifts: Shifts, smoothness: float, min_distance_px: float) -> "_Gain":
         """Return the cross-validated gain of a field, without windows nearer than `min_distance_px` in the fit."""
-        folds = 0, 2, 8, 10  # four of the sixteen are enough for a comparison
-        predicted_px = self._cross_predicted(shifts, shifts.centres_px, min_distance_px, smoothness, folds)
+        folds = 5, 7, 13, 15  # four of the sixteen are enough; those of the first column and row are often incomplete
+        predicted_px = self._cross_predicted(shifts, shifts, min_distance_px, smoothness, folds)
         return _Gain.of(shifts, predicted_px, smoothness)
 
     def _cross_predicted(
         self,
         shifts: Shifts,
-        centres_px: Points,
+        windows: Shifts | Residual[FixedImagePx],
         min_distance_px: float,
         smoothness: float,
         folds: Iterable[int] = range(_FOLDS**2),
     ) -> Points:
-        """Predict the shifts (n, 2) at centres (n, 2) by fields fitted to windows at a minimum distance.
+        """Predict the shifts (n, 2) of windows by fields fitted to the shifts of others at a minimum distance.
 
-        The distance is the maximum norm. NaN in other folds and where too few windows are left. The robust weights are
-        those of a fit to all windows.
+        The distance is the maximum norm. NaN in other folds and where too few windows are left.
         """
-        fold, result = _folds(centres_px), np.full((len(centres_px), 2), np.nan)
-        weighted = shifts.reweighted(self._field(shifts, smoothness)(shifts.centres_px), _CAUCHY_SCALES)
+        column, row = windows.cells.T
+        fold, result = column % _FOLDS + _FOLDS * (row % _FOLDS), np.full((len(windows.cells), 2), np.nan)
         for k in folds:
-            is_held_out = fold == k
-            is_fitted = ~_near(shifts.centres_px, centres_px[is_held_out], min_distance_px)
+            held_out_px = windows.centres_px[fold == k]
+            is_fitted = ~_near(shifts.centres_px, held_out_px, min_distance_px)
             if is_fitted.sum() >= MIN_WINDOWS // 2:
-                fitted = weighted.subset(is_fitted)
-                field = fitted_field(fitted, smoothness, self.lattice_px, self.size_px, reweightings=1)
-                result[is_held_out] = field(centres_px[is_held_out])
+                result[fold == k] = self._field(shifts.subset(is_fitted), smoothness)(held_out_px)
         return result
 
 
@@ -204,12 +200,6 @@ def _losses(lengths_px: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return log(1 + (length / 0.1 px)^2), which is robust to wrong peaks and depth edges."""
     scale_px = 0.1  # several times the noise of a shift
     return np.asarray(np.log1p((lengths_px / scale_px) ** 2))
-
-
-def _folds(centres_px: Points) -> NDArray[np.int64]:
-    """Return (n,) the fold of each window of a grid."""
-    column, row = (np.unique(centres_px[:, axis], return_inverse=True)[1] for axis in (0, 1))
-    return np.asarray(column % _FOLDS + _FOLDS * (row % _FOLDS))
 
 
 def _near(centres_px: Points, others_px: Points, distance_px: float) -> NDArray[np.bool_]:

@@ -53,9 +53,11 @@ class FixedWindows:
         self.side = max(MIN_WINDOW_PX, min(side_px, width // 4, height // 4))
         if origins is None:
             origins = _grid(*(_starts(length, self.side, step_px) for length in (width, height)))
-        inside = origins[(origins + self.side <= (width, height)).all(axis=1)]
-        is_strong, windows = self._strong(structure, inside)
-        self.origins = inside[is_strong]
+        # From the complete grid: windows that drop out later must not change the column and row of the others.
+        cells = np.stack([np.unique(along, return_inverse=True)[1] for along in origins.T], axis=1)
+        inside = (origins + self.side <= (width, height)).all(axis=1)
+        is_strong, windows = self._strong(structure, origins[inside])
+        self.origins, self.cells = origins[inside][is_strong], cells[inside][is_strong]
         self.centres_px = self.origins + (self.side - 1) / 2
         self.spectra = windowed_spectra(windows)
 
@@ -85,7 +87,7 @@ class FixedWindows:
         rows = usable[is_strong]
         fixed = self.spectra if len(rows) == len(self.origins) else self.spectra[rows]
         shifts_px, sigma = _peaks(whitened_cross_spectra(fixed, windowed_spectra(windows)))
-        return Residual.of(self.centres_px[rows], shifts_px, sigma)
+        return Residual.of(self.centres_px[rows], shifts_px, sigma, self.cells[rows])
 
     def _cut(self, image: NDArray[_Element], origins: NDArray[np.int64]) -> NDArray[_Element]:
         """Return (n, side, side) the windows with these origins, a copy."""
@@ -115,11 +117,14 @@ def window_spacing_px(centres_px: Points) -> float:
 
 
 class Shifts(NamedTuple):
-    """The measured shifts of windows, (n, 2), and their relative weights (n,), by peak heights with median 1."""
+    """The measured shifts of windows, (n, 2), with the windows' column and row (n, 2), and the relative weights (n,) of
+    the shifts, by peak heights with median 1.
+    """
 
     centres_px: Points
     shifts_px: Points
     weights: NDArray[np.float64]
+    cells: NDArray[np.int64]
 
     @classmethod
     def of(cls, residual: Residual[FixedPx]) -> "Shifts":
@@ -127,7 +132,7 @@ class Shifts(NamedTuple):
         measured = np.isfinite(residual.shifts_px[:, 0])
         peaks_sigma = residual.peaks_sigma[measured]
         weights = (peaks_sigma / np.median(peaks_sigma)) ** 4 if len(peaks_sigma) else peaks_sigma
-        return cls(residual.centres_px[measured], residual.shifts_px[measured], weights)
+        return cls(residual.centres_px[measured], residual.shifts_px[measured], weights, residual.cells[measured])
 
     @classmethod
     def joined(cls, several: Sequence["Shifts"]) -> "Shifts":
@@ -135,7 +140,7 @@ class Shifts(NamedTuple):
 
     def subset(self, mask: NDArray[np.bool_]) -> "Shifts":
         """Return the shifts where a mask (n,) is True."""
-        return Shifts(*(values[mask] for values in self))
+        return Shifts(self.centres_px[mask], self.shifts_px[mask], self.weights[mask], self.cells[mask])
 
     def distances_px(self, predicted_px: Points | float = 0.0) -> NDArray[np.float64]:
         """Return (n,) the lengths of the shifts, minus predicted ones (n, 2)."""
@@ -163,7 +168,7 @@ def residual_under(residual: Residual[FixedPx], before: PixelMapping, after: Pix
     points = residual.centres_px + np.nan_to_num(shifts)
     jacobians = np.stack([before(points + e) - before(points - e) for e in 0.5 * np.eye(2)], axis=-1)
     difference = np.linalg.solve(jacobians, (after(points) - before(points))[..., None])[..., 0]
-    return Residual.of(residual.centres_px, shifts - difference, residual.peaks_sigma)
+    return residual.with_shifts(shifts - difference)
 
 
 def decrease_sigma(before_px: NDArray[np.float64], after_px: NDArray[np.float64]) -> float:

@@ -114,12 +114,12 @@ def fit_windows(
     With the standard deviations `lens_std_px` (4,) of the lens shapes, these are fitted too. Without, the result is
     None if fewer than 12 windows are measured. A window's weight is that of its correlation peak times a Cauchy weight.
     """
-    centres_px, raw_shifts_px, by_peak = Shifts.of(residual)
+    raw = Shifts.of(residual)
     min_windows = 12  # without a prior: 1.5 times the eight parameters of a homography
-    if lens_std_px is None and len(centres_px) < min_windows:
+    if lens_std_px is None and len(raw.centres_px) < min_windows:
         return None
-    points_px, shifted_px = (mapping.undistorted(p) for p in (centres_px, centres_px + raw_shifts_px))
-    shifts = Shifts(points_px, shifted_px - points_px, by_peak)
+    points_px, shifted_px = (mapping.undistorted(p) for p in (raw.centres_px, raw.centres_px + raw.shifts_px))
+    shifts = raw._replace(centres_px=points_px, shifts_px=shifted_px - points_px)
     std_px, factor = np.full(8, np.inf), 1.0
     if lens_std_px is not None:
         corner_std_px = 5.0  # error of an extrapolated affine mapping

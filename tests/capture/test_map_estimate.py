@@ -12,13 +12,13 @@ from agalign.capture.verification import WarpedPair
 from agalign.flight.learn_rig import learn_rig
 from agalign.flight.rig import Observation, Rig
 from agalign.values import geometry
-from agalign.values.alignment import JointResult, Residual
+from agalign.values.alignment import JointResult
 
 from ..builders import joint_result, pair_of, residual_of, two_views, whole
 
 SIZE = 640, 480
 MEAN = geometry.translation(30.0, -12.0)
-NOTHING = Residual(np.empty((0, 2)), np.empty((0, 2)), np.inf, np.inf, 0.0)
+NOTHING = residual_of(np.empty((0, 2)), np.empty((0, 2)))
 
 
 def rig(std_px: float = 0.1) -> Rig:

@@ -279,10 +279,11 @@ def test_parallax_below_the_noise_is_not_relief(flat: Rendered, height_px: float
     """Even if it is consistent between the bands."""
     result = []
     for candidate, band in zip(flat.candidates(), MOVING, strict=True):
-        at = candidate.pair.reference.windows.centres_px
+        windows = candidate.pair.reference.windows
+        at = windows.centres_px
         z = np.where(np.arange(len(at)) % 3 == 0, height_px, 0.0)
         residual = residual_of(at, z[:, None] * np.array(band.baseline_m) / 0.0367)
-        result.append(replace(candidate, warped=replace(candidate.warped, residual=residual)))
+        result.append(replace(candidate, warped=replace(candidate.warped, windows=windows, residual=residual)))
     assert shows_relief(result) == shown
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from agalign.capture import seeding
-from agalign.capture.band_pair import Candidates
+from agalign.capture.band_pair import BandPair, Candidates
 from agalign.capture.seeding import best_seed, find_rotated, find_seed
 from agalign.capture.tag_seeds import geo_seed
 from agalign.capture.verification import WarpedPair
@@ -18,6 +18,8 @@ from agalign.values.alignment import Seed
 from agalign.values.capture import Band, Georeference
 from agalign.values.choices import SeedKind
 from agalign.values.image import Raster
+from agalign.values.mapping import PixelMapping
+from agalign.verify.residuals import FixedWindows
 
 from ..builders import pair_of, residual_of, texture, two_views
 from ..conftest import mean_error_px
@@ -137,7 +139,7 @@ def test_a_rotation_is_distinguished_from_a_shift() -> None:
     pair = pair_of(fixed, image)
 
     def found_rotated(mapping: np.ndarray) -> np.ndarray | None:
-        return find_rotated(pair, mapping, WarpedPair.of(pair, pair.mapping(mapping)).residual)
+        return find_rotated(WarpedPair.of(pair, pair.mapping(mapping)))
 
     assert mean_error_px(found_rotated(np.eye(3)), truth, 640, 480) < 2
     assert found_rotated(truth) is None, "the given mapping is right"
@@ -161,11 +163,15 @@ def test_a_match_with_a_lower_peak_does_not_replace_a_seed_that_the_tags_and_win
     image = texture()
     pair = pair_of(image, image, {"rig": np.eye(3)}, **({"rig": 5.0} if is_confirmed else {}))
     turned = geometry.compose(geometry.translation(40.0, 310.0), np.array([[0.0, 1, 0], [-1, 0, 0], [0, 0, 1]]))
-    centres_px = np.argwhere(np.ones((6, 6))) * 60.0
-    small, large = (residual_of(centres_px, np.array([shift_px, 0.0])) for shift_px in (0.2, 0.4))
     monkeypatch.setattr(seeding, "_matches", lambda *_, **__: iter([turned]))
     seed = Seed("structure", np.eye(3), 33.0, 33.0, 25.0)
-    monkeypatch.setattr(seeding, "_residual_of", lambda _, m: large if m is seed.fixed_to_moving else small)
+
+    def measured(pair: BandPair, mapping: PixelMapping, windows: FixedWindows | None = None) -> WarpedPair:
+        windows = pair.windows if windows is None else windows
+        shift_px = 0.4 if mapping.fixed_to_moving is seed.fixed_to_moving else 0.2
+        return WarpedPair(pair, mapping, image, windows, residual_of(windows.centres_px, np.array([shift_px, 0.0])))
+
+    monkeypatch.setattr(WarpedPair, "of", measured)
     chosen = seeding._best_match(pair, None, seed)
     assert (chosen is seed) == is_confirmed
 

@@ -7,7 +7,7 @@ from agalign.capture import verification
 from agalign.capture.band_pair import BandPair
 from agalign.capture.verification import WarpedPair, verified, with_metrics
 from agalign.values import geometry
-from agalign.values.alignment import PairScales, Residual, Seed
+from agalign.values.alignment import PairScales, Seed
 from agalign.values.choices import ReliefUse
 from agalign.values.displacement import DisplacementField
 from agalign.values.image import Raster
@@ -56,6 +56,21 @@ def test_each_colour_is_verified_by_the_estimate_from_the_other(pair: BandPair) 
     expected_px = np.where(before.is_black[:, None], (0, 0.2), (-0.1, 0))
     np.testing.assert_allclose(crossed.shifts_px - before.shifts_px, expected_px, atol=1e-6)
     assert verified(pair, SEED, GOOD, "never", None, (by_black, by_white)).residual.median_px > 0.08
+
+
+def test_of_two_mappings_the_better_has_smaller_shifts_in_more_of_the_same_windows(pair: BandPair) -> None:
+    given, large = WarpedPair.of(pair, pair.mapping(TRUTH)), pair.reference.large_windows
+
+    def pair_with(shift_px: float, measured: int) -> WarpedPair:
+        shifts = np.where(np.arange(10)[:, None] < measured, (shift_px, 0.0), np.nan)
+        return replace(given, residual=residual_of(np.zeros((10, 2)), shifts))
+
+    assert pair_with(0.5, 10).is_better_than(pair_with(0.6, 10))
+    assert pair_with(0.5, 10).is_better_than(pair_with(0.4, 5))
+    assert not pair_with(0.5, 5).is_better_than(pair_with(0.4, 5))
+    assert not pair_with(0.5, 0).is_better_than(pair_with(3.0, 1))
+    # Residuals of two grids are not compared: the other mapping is measured again, so its 9 px do not count.
+    assert not pair_with(0.5, 10).is_better_than(replace(pair_with(9.0, 10), windows=large))
 
 
 def test_a_result_with_issues_is_replaced_by_the_seed(pair: BandPair) -> None:
@@ -167,7 +182,7 @@ def test_a_field_is_verified_in_held_out_windows(monkeypatch: pytest.MonkeyPatch
     accepted = verified(pair, CENTRED, joint_result(), "always")
     assert accepted.status == "aligned"
     np.testing.assert_array_equal(accepted.residual.shifts_px, good.held_out.shifts_px)
-    misaligned = Residual.of(good.held_out.centres_px, good.held_out.shifts_px + 1.5, good.held_out.peaks_sigma)
+    misaligned = good.held_out.with_shifts(good.held_out.shifts_px + 1.5)
     monkeypatch.setattr(pair.reference.displacement_field, "refine", lambda *_: replace(good, held_out=misaligned))
     refused = verified(pair, CENTRED, joint_result(), "always")
     assert refused.status == "predicted"

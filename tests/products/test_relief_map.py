@@ -24,7 +24,7 @@ from agalign.products.sidecar_file import read_result, read_sidecar, write_sidec
 from agalign.relief.occlusion import occluded
 from agalign.synthetic import cameras
 from agalign.values import geometry, lens
-from agalign.values.alignment import Alignment, PairScales, Residual, Seed
+from agalign.values.alignment import Alignment, PairScales, Seed
 from agalign.values.capture import Band, Capture
 from agalign.values.displacement import DisplacementField
 from agalign.values.image import OutputGrid, Tile
@@ -33,6 +33,7 @@ from agalign.values.mapping import PixelMapping
 from agalign.values.parallax import Parallax, Relief
 from agalign.values.pixel_units import PixelScale
 
+from ..builders import residual_of
 from .test_sidecar import context_of
 
 SIZE = 240, 180
@@ -56,7 +57,7 @@ def alignments_of(capture: Capture, truth: Truth) -> dict[str, Alignment]:
         plane = geometry.compose(rig_seed(reference, band), geometry.translation(*(moved / plane_m)))
         x, y = (moved / unit).tolist()
         parallax = Parallax(relief, (x, y), truth.bands[band.name].hidden)
-        residual = Residual.of(np.array([[50.0, 50.0]]), np.array([[0.1, 0.0]]), np.array([20.0]))
+        residual = residual_of(np.array([[50.0, 50.0]]), np.array([[0.1, 0.0]]))
         seed = Seed("rig", plane, 30.0, 30.0, 5.0)
         mapping = PixelMapping(plane, reference.lens, band.lens, parallax=parallax)
         result[band.name] = Alignment(mapping, reference.size_px, "aligned", (), seed, residual=residual)
@@ -273,7 +274,7 @@ def test_a_field_of_reduced_images_is_rebuilt(tmp_path: Path) -> None:
 
 
 def test_status_seed_and_measurements_are_rebuilt(tmp_path: Path) -> None:
-    residual = Residual.of(np.array([[9.0, 8.0], [50.0, 8.0]]), np.array([[0.25, -0.5], [np.nan] * 2]), np.ones(2))
+    residual = residual_of(np.array([[9.0, 8.0], [50.0, 8.0]]), np.array([[0.25, -0.5], [np.nan] * 2]))
     alignment = Alignment(
         PixelMapping(H),
         FILE_PX,
@@ -289,6 +290,8 @@ def test_status_seed_and_measurements_are_rebuilt(tmp_path: Path) -> None:
     np.testing.assert_array_equal(result.seed.fixed_to_moving, H)
     np.testing.assert_array_equal(result.residual.shifts_px, residual.shifts_px)
     assert (result.residual.p95_px, result.residual.coverage) == (residual.p95_px, 0.5)
+    assert result.residual.peaks_sigma.tolist() == [20.0, 20.0]
+    assert result.residual.half(black=True).centres_px.tolist() == residual.half(black=True).centres_px.tolist()
     assert result.candidates == alignment.candidates
 
 

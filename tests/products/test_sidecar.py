@@ -27,7 +27,7 @@ from agalign.products.sidecar_file import (
     write_sidecar,
 )
 from agalign.values import geometry
-from agalign.values.alignment import Alignment, JointResult, Residual, Seed
+from agalign.values.alignment import Alignment, JointResult, Seed
 from agalign.values.capture import Band, Capture
 from agalign.values.image import OutputGrid
 from agalign.values.issues import RETRIEVAL, Issue
@@ -35,6 +35,7 @@ from agalign.values.lens import Lens
 from agalign.values.mapping import PixelMapping
 from agalign.verify.checks import COVERAGE
 
+from ..builders import residual_of
 from ..conftest import read_json
 
 SHIPPED = Path(agalign.__file__).with_name("sidecar.schema.json")
@@ -108,7 +109,7 @@ def test_other_json_files_are_passed_over(tmp_path: Path) -> None:
 def test_a_rejected_result_is_not_accepted_in_the_sidecar() -> None:
     """The homography of a `seed_only` band is the seed's; `joint` describes what was doubted."""
     joint = JointResult(np.eye(3), 0.1, 0.1, 0.004, 75, (1.0,), "fast", "homography", 0.05, ((0.07, 0.07),) * 4)
-    residual = Residual(np.zeros((50, 2)), np.zeros((50, 2)), 0.05, 0.2, 1.0)
+    residual = residual_of(np.zeros((50, 2)), (0.05, 0.0))
     seed = Seed("rig", geometry.translation(3, 4), 30.0)
     bands = tuple(Band(name, Path(f"{name}.tif"), 1, 64, 48, "uint16") for name in ("green", "nir"))
     capture = Capture("c", Path(), bands, 0)

@@ -177,10 +177,10 @@ def test_parallax_is_the_projection_onto_the_baselines() -> None:
 # ---- windows of several bands
 
 
-def test_windows_are_matched_by_their_centres() -> None:
+def test_windows_are_matched_by_their_cells() -> None:
     at = np.array([[10.0, 20.0], [30.0, 20.0], [50.0, 20.0]])
     one = residual_of(at, np.array([[1.0, 0], [2, 0], [np.nan, np.nan]]))
-    other = residual_of(at[[2, 0]], np.array([[3.0, 0], [4, 0]]), sigma=60.0)
+    other = residual_of(at[[2, 1, 0]], np.array([[3.0, 0], [0, 0], [4, 0]]), sigma=60.0).where(np.array([1, 0, 1]) > 0)
     plain = PixelMapping(np.eye(3))
     windows = WindowShifts.of([one, other], [plain, plain])
     np.testing.assert_array_equal(windows.centres_px, at)

@@ -7,7 +7,7 @@ import pytest
 from numpy.testing import assert_allclose
 
 from agalign.values import geometry
-from agalign.values.alignment import Alignment, PairScales, Residual, Seed
+from agalign.values.alignment import Alignment, PairScales, Seed
 from agalign.values.displacement import DisplacementField
 from agalign.values.mapping import PixelMapping
 from agalign.values.pixel_units import FixedImagePx, PixelScale
@@ -59,14 +59,3 @@ def test_an_alignment_between_images_is_the_same_between_files() -> None:
     kept = ("space", "geometry", "status", "issues", "seconds", "before", "after", "prediction")
     assert [getattr(between_files, k) for k in kept] == [getattr(between_images, k) for k in kept]
     assert PairScales() == PairScales(PixelScale(1.0, 1.0), PixelScale(1.0, 1.0))
-
-
-def test_of_two_residuals_the_better_has_smaller_shifts_in_more_windows() -> None:
-    def residual(shift_px: float, measured: int) -> Residual:
-        shifts = np.where(np.arange(10)[:, None] < measured, (shift_px, 0.0), np.nan)
-        return residual_of(np.zeros((10, 2)), shifts)
-
-    assert residual(0.5, 10).is_better_than(residual(0.6, 10))
-    assert residual(0.5, 10).is_better_than(residual(0.4, 5))
-    assert not residual(0.5, 5).is_better_than(residual(0.4, 5))
-    assert not residual(0.5, 0).is_better_than(residual(3.0, 1))

@@ -13,11 +13,11 @@ from agalign.values.mapping import PixelMapping
 from agalign.verify import checks
 from agalign.verify.checks import CHECKS, KINDS, Check, Evidence, is_unchanged, issues_of, status_of
 
-from ..builders import joint_result
+from ..builders import joint_result, residual_of
 
 SIZE = (1280, 960)
 JOINT = joint_result(std_px=0.07)
-RESIDUAL = Residual(np.zeros((50, 2)), np.zeros((50, 2)), 0.05, 0.2, 1.0)
+RESIDUAL = replace(residual_of(np.zeros((50, 2)), np.zeros((50, 2))), median_px=0.05, p95_px=0.2)
 GOOD = Evidence(JOINT, RESIDUAL, SIZE)
 PREDICTION = Prediction(np.eye(3), "bands", std_px=0.2)
 HALF_WRONG = np.vstack([np.zeros((20, 2)), np.full((30, 2), 5.0)])
@@ -73,7 +73,7 @@ def shifted(count_off: int, off_px: float, total: int = 100) -> Residual:
     centres = np.stack([np.arange(total) * 100.0, np.zeros(total)], axis=1)
     shifts = np.zeros((total, 2))
     shifts[: 3 * count_off : 3, 0] = off_px
-    return Residual(centres, shifts, 0.0, 0.0, 1.0)
+    return replace(residual_of(centres, shifts), median_px=0.0)
 
 
 @pytest.mark.parametrize(
@@ -124,7 +124,7 @@ def windows(off: np.ndarray) -> Residual:
     """12 x 9 windows with a spacing of 112 px, some with a shift of 3 px."""
     centres = np.stack(np.meshgrid(np.arange(12), np.arange(9)), axis=-1).reshape(-1, 2) * 112.0 + 56
     shifts = np.where(off.reshape(-1, 1), [3.0, 0.0], [0.05, 0.0])
-    return Residual(centres, shifts, 0.05, 0.2, 1.0)
+    return replace(residual_of(centres, shifts), median_px=0.05)
 
 
 def test_misaligned_clusters_are_an_issue_but_scattered_and_unmeasured_windows_are_not() -> None:

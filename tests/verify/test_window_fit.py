@@ -89,7 +89,9 @@ def test_windows_with_low_peaks_have_little_weight() -> None:
     shifts, peaks = np.zeros((2400, 2)), np.full(2400, 20.0)
     shifts[::2], peaks[::2] = (0.1, 0.0), 10.0
     # Half the height, a sixteenth of the weight.
-    np.testing.assert_allclose(fitted(Residual.of(centres, shifts, peaks)).mean_px[0::2].mean(), 0.1 / 17, atol=0.002)
+    np.testing.assert_allclose(
+        fitted(replace(residual_of(centres, shifts), peaks_sigma=peaks)).mean_px[0::2].mean(), 0.1 / 17, atol=0.002
+    )
 
 
 def test_the_covariance_equals_the_scatter_of_repeated_fits() -> None:
