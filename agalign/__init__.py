@@ -45,8 +45,6 @@ if TYPE_CHECKING:
     from agalign.products.dataset import open_flight as open_flight
     from agalign.products.mosaic import MosaicReport as MosaicReport
     from agalign.products.mosaic import mosaic as mosaic
-    from agalign.products.plots import PlotReport as PlotReport
-    from agalign.products.plots import plot_statistics as plot_statistics
     from agalign.products.read_alignment import read_alignment as read_alignment
     from agalign.values.alignment import Alignment as Alignment
     from agalign.values.alignment import Prediction as Prediction
@@ -67,7 +65,6 @@ _NAMES = {
     "NoSuchBandError NotEnoughTextureError OutputError SidecarError UnreadableFileError WorkerError",
     "products.dataset": "open_capture open_flight",
     "products.mosaic": "MosaicReport mosaic",
-    "products.plots": "PlotReport plot_statistics",
     "products.read_alignment": "read_alignment",
     "values.alignment": "Alignment Prediction Residual Seed",
     "values.capture": "Capture",

@@ -20,10 +20,9 @@ from agalign.values.mapping import PixelMapping
 
 from .builders import residual_of
 
-FUNCTIONS = "align align_capture align_folder discover mosaic open_capture open_flight plot_statistics read_alignment"
-FUNCTIONS += " warp_onto"
+FUNCTIONS = "align align_capture align_folder discover mosaic open_capture open_flight read_alignment warp_onto"
 SETTINGS = "CheckSettings FlightSettings JointSettings ReliefSettings SeedSettings Settings WriteSettings"
-RESULTS = "Alignment Capture CaptureReport FlightReports FolderScan MosaicReport PlotReport Prediction Residual Seed"
+RESULTS = "Alignment Capture CaptureReport FlightReports FolderScan MosaicReport Prediction Residual Seed"
 OPTIONS_AND_UNITS = "DiscoverOptions RunOptions FixedFilePx FixedImagePx MovingFilePx"
 ERRORS = """AgalignError ConfigurationError GeometryError InputError NoContrastError NoSuchBandError MemoryLimitError
 NotEnoughTextureError OutputError SidecarError UnreadableFileError WorkerError"""

@@ -18,7 +18,6 @@ EXTRAS = {
     "dask": "captures on the workers of a Dask cluster (--dask)",
     "evaluate": "elastix in comparison with learned descriptors (agalign evaluate)",
     "indices": "more spectral indices by name (agalign indices --index)",
-    "plots": "statistics of plots (agalign plots)",
     "stac": "STAC items and collections (--stac)",
     "xarray": "captures and flights as xarray datasets (agalign.open_capture, agalign.open_flight)",
 }

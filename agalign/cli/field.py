@@ -1,4 +1,4 @@
-"""The commands for a whole field: `mosaic` and `plots`."""
+"""The command `agalign mosaic`."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -65,46 +65,4 @@ mosaic = Command(
     _mosaic,
     {"Output": "target index gsd", "Running": "quiet log_json"},
     epilog=examples(("agalign mosaic aligned/ -o field.tif --index ndvi", "field.tif, all bands, and field_ndvi.tif")),
-)
-
-
-def _plots(
-    terminal: Terminal,
-    rasters: Annotated[list[Path], typer.Argument(help="Georeferenced rasters, and output folders of runs.")],
-    plots: Annotated[Path, typer.Argument(help="Vector file with the outlines of the plots.", show_default=False)],
-    target: Annotated[Path, typer.Option("-o", "--out", help=".csv, .geojson or .parquet.")] = Path("plots.csv"),
-    index: IndexNames = None,
-    id_column: Annotated[str | None, typer.Option("--id", help="Attribute with the names of the plots.")] = None,
-) -> int:
-    """Calculate statistics of spectral indices in the plots of a field trial.
-
-    The table has a row for each raster or capture, plot and index: date, mean, median, standard deviation, 5th and 95th
-    percentile, share of valid pixels, expected error of the alignment (with --error-map) and of the georeference.
-    """
-    from agalign.products.index_bands import RAW
-    from agalign.products.plots import check_table, plot_statistics, write_plots
-
-    check_table(target, [plots, *rasters])
-    report = plot_statistics(rasters, plots, [one.name for one in chosen_indices(index, [])], id_column=id_column)
-    print_left_out(report.problems, terminal)
-    table = report.table
-    if (table["unit"] == RAW).any():
-        terminal.problem(RAW_NUMBERS)
-    write_plots(table, target)
-    counts = {name: int(table[name].nunique()) for name in ("plot", "capture", "index")}
-    terminal.event("plots", rows=len(table), **counts, path=str(target))
-    accuracy_m = table["georeference_accuracy_m"].max()
-    known = f"; georeference accurate to {accuracy_m:.1f} m" if accuracy_m > 0 else ""
-    sums = f"plots: {counts['plot']}, captures: {counts['capture']}, indices: {counts['index']}"
-    terminal.result(f"{len(table)} rows ({sums}) in {target}{known}")
-    return ExitCode.PARTIAL if report.problems else ExitCode.OK
-
-
-plots = Command(
-    _plots,
-    {"Output": "target index id_column", "Running": "quiet log_json"},
-    epilog=examples(
-        ("agalign plots field.tif plots.geojson --index ndvi,ndre", "two indices of a mosaic"),
-        ("agalign plots may.tif june.tif plots.geojson -o season.parquet", "two dates in one table"),
-    ),
 )

@@ -16,7 +16,7 @@ from agalign._version import __version__
 from agalign.cli.align_commands import align, demo, onto
 from agalign.cli.doctor import doctor
 from agalign.cli.evaluate import evaluate, learn, surface
-from agalign.cli.field import mosaic, plots
+from agalign.cli.field import mosaic
 from agalign.cli.info import info
 from agalign.cli.results import export, indices, report, verify
 from agalign.cli.terminal import ExitCode, Terminal, examples, printed
@@ -34,7 +34,6 @@ COMMANDS = {
     "ndvi": replace(indices, hidden=True),
     "export": export,
     "mosaic": mosaic,
-    "plots": plots,
     "onto": onto,
     "doctor": doctor,
     "evaluate": evaluate,

@@ -2,7 +2,7 @@
 
     python benchmarks/reliability/strangers.py [--folders 5000] [--listed 1000000] [--tagged 1000]
 
-`report`, `verify`, `export`, `plots` and `mosaic` run on each changed output folder, and on one with a map and a table
+`report`, `verify`, `export` and `mosaic` run on each changed output folder, and on one with a map and a table
 that list very many captures, each in a forked process. Wrong are tracebacks, control characters and NaN in texts, files
 that are written or copied outside of the folders of the command, captures that are missing from a result that is
 reported as complete, and commands that do not end in time or within the memory.
@@ -43,7 +43,7 @@ CAPTURES, SIZE_PX, NAMES = 2, (240, 180), ("IMG_0001", "IMG_0002")
 PLACED = "--georeference", "--ground-elevation=0", "--stac", "--tie-points"
 OPTIONS = *PLACED, "--layout=both", "--error-map", "--qa", "--index=ndvi", "--relief=always", "--relief-map"
 TAG_OPTIONS = *PLACED, "--only-seed", "--bands=green,red", "--relief=never", "-j1", "-v"
-PRELOADED = "geopandas", "exactextract", "pystac", "agalign.cli.align_run", "agalign.products.mosaic"
+PRELOADED = "pystac", "agalign.cli.align_run", "agalign.products.mosaic"
 MAX_S, MAX_BYTES = 60, 4 << 30
 """Limits of a command: time, and memory beyond that of this process."""
 SECRET = "the contents of a file of somebody else"
@@ -169,7 +169,6 @@ COMMAND_LINES = {
     ("verify", "a/b/out"): "",
     ("export", "a/b/out", "--for", "opencv", "-o", "a/b/matrices"): r"\b2 captures, ",
     ("export", "a/b/out", "--for", "odm", "-o", "a/b/files"): r"\b2 captures, ",
-    ("plots", "a/b/out", "plots.geojson", "-o", "a/b/plots.csv"): "captures: 2",
     ("mosaic", "a/b/out", "-o", "a/b/field.tif"): "Mosaic of 2 captures",
 }
 """What a command prints if no capture is missing, by its arguments."""
@@ -187,7 +186,6 @@ def attack_folder(change_folder: Callable[[Path, Path], bool | None], whole: Pat
     """Return the faults of all commands on a changed copy of an output folder."""
     result: Counter[str] = Counter()
     with box_with(whole) as (box, out):
-        shutil.copy(whole / "flight.geojson", box / "plots.geojson")
         secret = box / "secret.txt"
         secret.write_text(SECRET)
         is_changed = change_folder(out, secret)

@@ -1,5 +1,6 @@
 """Every command and every script of the documents is run, every example too, and every link leads somewhere."""
 
+import csv
 import os
 import re
 import runpy
@@ -9,13 +10,19 @@ import subprocess
 import sys
 import tomllib
 import warnings
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import cv2
+import geopandas
 import numpy as np
 import pytest
 import rasterio
+import rioxarray
+from rasterio.enums import ColorInterp
+from rasterio.transform import Affine
+from shapely import Polygon
 from synthetic_flights.cameras import ALTUM
 
 import agalign
@@ -25,7 +32,7 @@ from agalign.values import geometry
 from ..builders import displaced_views
 from ..cli.test_onto import TRUTH as MOVEMENT
 from ..cli.test_onto import write_mosaic
-from ..conftest import REAL_DATA, Shared, textured_pair
+from ..conftest import REAL_DATA, Shared, textured_pair, write_band
 from ..program import agalign_here
 from .blocks import PAGES, ROOT, blocks_of, commands_of, program
 
@@ -35,6 +42,25 @@ KINDS = {"sh", "python", "text", "{toctree}", "{include} ../CONTRIBUTING.md", "{
 RUNNABLE = [page for page in PAGES if any(b.kind in ("sh", "python") for b in blocks_of(page))]
 LONG = {"benchmark-bands.md"}
 """Pages with blocks that take more than ten seconds: they are in the full run."""
+
+
+def write_orthophoto(folder: Path) -> None:
+    """odm_orthophoto.tif with an alpha band, NDVI 0.5 and 0.8, and plots.gpkg: a square in both halves and over the
+    edge, with and without an id, and a self-intersecting outline.
+    """
+    bands = np.full((5, 60, 100), 1000, np.uint16)
+    bands[3, :, :50], bands[3, :, 50:], bands[4] = 3000, 9000, 65535
+    bands[:, :, :10] = 0  # outside of the flight
+    place = {"crs": "EPSG:32633", "transform": Affine(0.1, 0, 500_000, 0, -0.1, 4_000_000)}
+    write_band(folder / "odm_orthophoto.tif", bands, **place)
+    with rasterio.open(folder / "odm_orthophoto.tif", "r+") as orthophoto:
+        orthophoto.colorinterp = [*orthophoto.colorinterp[:4], ColorInterp.alpha]
+    rings = {"A1": ((2, 1), (4, 1), (4, 3), (2, 3)), "": ((6, 1), (8, 1), (8, 3), (6, 3))}
+    rings |= {"edge": ((0, 4), (2, 4), (2, 6), (0, 6)), "bow tie": ((6, 5), (9, 5), (6, 4), (9, 4))}
+    outlines = [Polygon([(500_000 + x, 4_000_000 - y) for x, y in ring]) for ring in rings.values()]
+    ids = {"plot": [name or None for name in rings]}
+    frame = geopandas.GeoDataFrame(ids, geometry=outlines, crs="EPSG:32633")
+    frame.to_crs("EPSG:4326").to_file(folder / "plots.gpkg")
 
 
 @pytest.fixture(scope="session")
@@ -56,6 +82,7 @@ def originals(shared: Shared, flight: Path) -> Path:
                 cv2.imwrite(str(folder / f"{number}{side}.png"), (image * 40 + 128).clip(1, 254).astype(np.uint8))
             np.savetxt(folder / f"{number}.txt", MOVEMENT)
         (folder / "pairs.csv").write_text("fixed,moving,homography\n1a.png,1b.png,1.txt\n2a.png,2b.png,2.txt\n")
+        write_orthophoto(folder)
         for name in ("examples", "benchmarks"):
             (folder / name).symlink_to(ROOT / name)
         if REAL_DATA.is_dir():
@@ -159,6 +186,52 @@ def test_an_example(name: str, desk: Path, monkeypatch: pytest.MonkeyPatch, caps
         with rasterio.open("change.tif") as change, rasterio.open("spring.tif") as first:
             assert (change.shape, change.transform) == (first.shape, first.transform)
             assert np.isfinite(change.read(1)).mean() > 0.8
+
+
+@pytest.fixture
+def plot_statistics(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., Any]:
+    """The function of the recipe, after its script wrote plots.csv from an orthophoto."""
+    monkeypatch.chdir(tmp_path)
+    write_orthophoto(tmp_path)
+    text = next(b.text for b in blocks_of(ROOT / "docs" / "recipes" / "field.md") if "# plots.py" in b.text)
+    names: dict[str, Any] = {}
+    with warnings.catch_warnings(action="ignore"):
+        exec(text.partition("# An index of")[0], names)
+    return names["plot_statistics"]
+
+
+def test_the_recipe_for_plots_has_a_row_of_any_outline(plot_statistics: Callable[..., Any]) -> None:
+    with Path("plots.csv").open(newline="", encoding="utf-8") as file:
+        rows = list(csv.DictReader(file))
+    assert [row["plot"] for row in rows] == ["A1", "", "edge", "bow tie"]
+    assert [float(row["count"]) for row in rows] == pytest.approx([400, 400, 200, 150], abs=0.1)
+    assert [float(row["mean"]) for row in rows] == pytest.approx([0.5, 0.8, 0.5, 0.8], abs=1e-6)
+
+
+@pytest.mark.real
+@pytest.mark.parametrize(
+    ("case", "raster", "outlines", "counts", "means"),
+    [
+        ("invalid-polygon", "ref.tif", "bow.gpkg", [450], {0.05}),
+        ("null-id", "ref.tif", "nullid.gpkg", [1600] * 16, {0.05}),
+        ("single-band", "therm.tif", "p.gpkg", [1600] * 16, {25.3}),
+    ],
+)
+def test_the_recipe_for_plots_on_real_files(
+    real_data: Path,
+    plot_statistics: Callable[..., Any],
+    case: str,
+    raster: str,
+    outlines: str,
+    counts: list[float],
+    means: set[float],
+) -> None:
+    folder = real_data / "cases" / f"plots-{case}"
+    with warnings.catch_warnings(action="ignore"):
+        values = rioxarray.open_rasterio(folder / raster, masked=True).sel(band=1)
+        table = plot_statistics(values, folder / outlines)
+    assert table["count"].tolist() == pytest.approx(counts)
+    assert set(table["mean"].round(4)) == means
 
 
 def test_the_python_of_the_readme_aligns_pixels() -> None:

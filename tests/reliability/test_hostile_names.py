@@ -83,7 +83,6 @@ def files_in(folder: Path) -> set[Path]:
         "indices {out} --index ndvi --formula con=(N-R)/(N+R)",
         "indices {out} --index ndvi -o {new}",
         "mosaic {out} -o {new}/field.tif --index ndvi",
-        "plots {out} {plots} -o {new}.csv --index ndvi",
         "info {in} --json",
         "evaluate {pairs} -m sift -o {new}.csv",
     ],
@@ -92,14 +91,10 @@ def test_every_writer_stays_in_its_folder(hostile_run: Path, tmp_path: Path, com
     """The files of the run, those of the command, and no others."""
     root = tmp_path / "a" / "b"
     shutil.copytree(hostile_run, root)
-    square = [[5.0, 51.9], [5.1, 51.9], [5.1, 52.1], [5.0, 52.1], [5.0, 51.9]]
-    feature = {"type": "Feature", "properties": {"name": "../../pwn"}}
-    feature |= {"geometry": {"type": "Polygon", "coordinates": [square]}}
-    (root / "plots.json").write_text(json.dumps({"type": "FeatureCollection", "features": [feature]}))
     images = ",".join(str(root / "in" / f"IMG_0000_{band}.tif") for band in (2, 3))
     (root / "pairs.csv").write_text(f"fixed,moving,name,homography\n{images},../../pwn,1 0 0 0 1 0 0 0 1\n")
     out, new, before = root / "deep" / "er" / "out", root / "some" / "where" / "new", files_in(tmp_path)
-    places = {"out": out, "new": new, "plots": root / "plots.json", "in": root / "in", "pairs": root / "pairs.csv"}
+    places = {"out": out, "new": new, "in": root / "in", "pairs": root / "pairs.csv"}
     result = agalign_here(*(part.format_map(places) for part in command.split()))
     assert result.returncode == (3 if "mosaic" in command else 0), result.stderr  # a mosaic is of equal bands
     written = files_in(tmp_path) - before

@@ -24,7 +24,6 @@ from agalign.products.report.facts import BAND_COLUMNS, FailureGroup, FlightFact
 from agalign.products.report.light import light_charts
 from agalign.products.report.radiometric_check import CaptureLevels, radiometric_check
 from agalign.products.report.rigs import drifts_of, rig_views
-from agalign.products.report.time_series import time_series
 from agalign.products.run_record import RunPart, exclusion_lines, read_run_record
 from agalign.products.sidecar_file import find_sidecars, read_sidecar
 from agalign.products.text_files import write_csv
@@ -153,7 +152,6 @@ def _page(
         rigs=rig_views(out, on_problem),
         drifts=drifts_of(facts.captures),
         light=light_charts(facts.light),
-        time_series=time_series(out),
         check=radiometric_check([one for one in levels if one is not None and one.levels]),
         exclusions=[] if run is None else exclusion_lines(run.excluded),
         masked=masked_shares(facts.captures),
