@@ -51,6 +51,8 @@ def sidecar_of(context: ProductContext, not_written: Sequence[str] = ()) -> Side
     bands = [_band_part(context, band) for band in capture.bands]
     accept_predicted_px = context.settings.check.accept_predicted_px
     status = capture_status(bands, accept_predicted_px)
+    (width, height), place = reference.size_px, reference.georeference
+    is_mosaic = place is not None and place.accuracy_m is None  # else it was calculated from GPS
     facts = {
         "agalign": __version__,
         "capture": capture.name,
@@ -61,7 +63,7 @@ def sidecar_of(context: ProductContext, not_written: Sequence[str] = ()) -> Side
         "camera": capture.camera,
         "status": "degraded" if status == "ok" and capture.missing_bands else status,
         "missing_bands": capture.missing_bands,
-        "reference": _source(reference) | {"width": reference.width_px, "height": reference.height_px},
+        "reference": _source(reference) | {"width": width, "height": height, "georeferenced": is_mosaic},
         "bands": bands,
         "output": _output(context) if context.layers else None,
         "preview": next((f.preview for f in context.written if f.preview is not None), None),

@@ -149,6 +149,8 @@ class ReferencePart(_Part):
     """Width of the file, px."""
     height: Count
     """Height of the file, px."""
+    georeferenced: bool = False
+    """True if the file has map coordinates, as a mosaic has."""
 
     @property
     def size_px(self) -> tuple[int, int]:

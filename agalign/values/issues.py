@@ -63,6 +63,12 @@ UNLIKE = Remedy(
     "look at the picture: did the scene move, is a band blurred or from another place? --seed match finds large "
     "offsets; --model OUT/models/… uses the rig of an earlier flight",
 )
+MOSAICS = Remedy(
+    "the mosaics differ by more than a pixel of REFERENCE, or show too little in common",
+    "resample both mosaics to the pixel size that you need (gdalwarp -r average -tr 0.1 0.1); compare a band in which "
+    "the field changed little (--reference)",
+)
+"""For georeferenced rasters instead of remedies that concern cameras and flights."""
 MISSING_BAND = Remedy("a band is missing that other captures of this camera have", "copy the files from the card again")
 
 # ---- kinds of issues that reading, seeding and estimation report; a check defines its own

@@ -8,7 +8,9 @@ import rasterio
 from rasterio.transform import Affine
 
 from agalign.values import geometry
+from agalign.values.issues import MOSAICS
 
+from ..builders import displaced_views
 from ..conftest import read_json, textured_pair, write_band
 from ..program import agalign_here
 
@@ -36,8 +38,8 @@ def mosaics(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def onto(mosaics: Path, moving: Path, out: Path) -> subprocess.CompletedProcess[str]:
-    return agalign_here("onto", mosaics / "spring.tif", moving, "-o", out, "--relief", "never")
+def onto(mosaics: Path, moving: Path, out: Path, reference: str = "spring.tif") -> subprocess.CompletedProcess[str]:
+    return agalign_here("onto", mosaics / reference, moving, "-o", out, "--relief", "never")
 
 
 def test_a_mosaic_is_aligned_to_the_grid_of_another(mosaics: Path, tmp_path: Path) -> None:
@@ -102,3 +104,27 @@ def test_a_distant_mosaic_is_reported(mosaics: Path, tmp_path: Path) -> None:
             target.write(source.read())
     done = onto(mosaics, tmp_path / "away.tif", tmp_path / "out")
     assert re.search(r"away\.tif: is 11[01]\.\d km away from the reference", done.stderr)
+
+
+def test_the_limit_is_a_pixel_of_the_reference_and_the_advice_fits_mosaics(tmp_path: Path) -> None:
+    """Leaves and branches that move: 3 px of the files, less than a pixel of mosaics with the size that is needed."""
+    steps = np.random.default_rng(0).normal(size=(12, 16, 2)) * 2
+
+    def displacement_px(points: np.ndarray) -> np.ndarray:
+        column, row = np.moveaxis(np.rint(points).astype(int), -1, 0)
+        return steps[(row // 40).clip(0, 11), (column // 40).clip(0, 15)]
+
+    views = displaced_views(displacement_px)
+    for name, view in zip(("may", "june"), views, strict=True):
+        write_mosaic(tmp_path / f"{name}.tif", view.pixels, (0, 0))
+        mean = view.pixels.reshape(120, 4, 160, 4).mean(axis=(1, 3))
+        write_mosaic(tmp_path / f"{name}_coarse.tif", mean, (0, 0))
+    done = onto(tmp_path, tmp_path / "june.tif", tmp_path / "fine", "may.tif")
+    assert done.returncode == 3
+    text = " ".join(done.stderr.split())
+    assert "windows are aligned within 1 px" in text
+    assert "try: resample both mosaics to the pixel size that you need (gdalwarp -r average -tr 0.1 0.1)" in text
+    assert not re.search(r"fly|--relief|--bands|--model|--seed |card", text)
+    assert MOSAICS.advice in (tmp_path / "fine" / "index.html").read_text()
+    for moving in ("june_coarse.tif", "june.tif"):
+        assert onto(tmp_path, tmp_path / moving, tmp_path / "coarse", "may_coarse.tif").returncode == 0

@@ -17,7 +17,7 @@ from agalign.products.index_table import IndexRow
 from agalign.products.report.light import CaptureLight, light_of
 from agalign.products.run_record import RefusalPart
 from agalign.products.sidecar import BandPart, BandResult, CaptureResult, GridPart, OutputPart, PreviewPart, Sidecar
-from agalign.values.issues import MISSING_BAND, Remedy
+from agalign.values.issues import MISSING_BAND, MOSAICS, UNREADABLE, Remedy
 from agalign.verify.checks import KINDS
 
 _SHIFT_STEP_PX = 0.01
@@ -77,7 +77,8 @@ class FailureGroups:
     def add(self, label: str, result: CaptureResult) -> None:
         """Add the bands of a capture that are missing or not aligned."""
         moving = [b for b in result.bands if b.status not in ("reference", "aligned")]
-        refused = [(b.band, str(b.status), b.reason or "", _remedy_of(b)) for b in moving]
+        is_mosaic = result.reference.georeferenced
+        refused = [(b.band, str(b.status), b.reason or "", _remedy_of(b, is_mosaic=is_mosaic)) for b in moving]
         refused += [(name, "missing", MISSING_BAND.cause, MISSING_BAND) for name in result.missing_bands]
         for band, status, reason, remedy in refused:
             group = self._by_cause.setdefault((status, remedy), FailureGroup(status, remedy))
@@ -89,11 +90,12 @@ class FailureGroups:
         return sorted(self._by_cause.values(), key=lambda g: (severity.index(g.status), -len(g.bands), g.remedy.cause))
 
 
-def _remedy_of(band: BandResult) -> Remedy:
+def _remedy_of(band: BandResult, *, is_mosaic: bool) -> Remedy:
     """The remedy of the first issue, which is the one in `reason`."""
     if not band.issues:
         return Remedy("no reason was recorded", "run again with --overwrite")
-    return KINDS[band.issues[0].kind].remedy
+    kind = KINDS[band.issues[0].kind]
+    return MOSAICS if is_mosaic and kind is not UNREADABLE else kind.remedy
 
 
 @dataclass(frozen=True)
