@@ -1,10 +1,11 @@
-"""Write the schema of the sidecar and the parts of docs/ that repeat the program (options, sidecar fields, reasons), or
-check that they are current.
+"""Write the schema of the sidecar and the parts of docs/ that repeat the program (options, indices, sidecar fields,
+reasons), or check that they are current.
 
     python tools/pages.py [--check]
 
-Options come from `agalign/config.py` and the command `align`, fields from `agalign/products/sidecar.py`, reasons from
-`agalign/values/issues.py` and the checks in `agalign/verify`. Each part is between two comments in its page.
+Options come from `agalign/config.py` and the command `align`, indices from `agalign/products/indices.py`, fields from
+`agalign/products/sidecar.py`, reasons from `agalign/values/issues.py` and the checks in `agalign/verify`. Each part is
+between two comments in its page.
 """
 
 import json
@@ -20,6 +21,7 @@ import agalign
 from agalign.cli.command import FieldOption, field_options
 from agalign.cli.main import COMMANDS
 from agalign.config import DiscoverOptions, RunOptions, Settings
+from agalign.products.indices import INDICES
 from agalign.products.sidecar import Sidecar
 from agalign.values.issues import Issue, sentence
 from agalign.verify.checks import KINDS
@@ -131,6 +133,15 @@ def reasons() -> str:
     return table(rows)
 
 
+def indices() -> str:
+    """Return a table of the built-in spectral indices."""
+    rows = [("index", "formula", "bands", "source")]
+    for index in INDICES.values():
+        unit = "any unit" if index.any_unit else "reflectance"
+        rows.append((index.name, f"`{index.formula}`", unit, index.source))
+    return table(rows)
+
+
 def table(rows: Iterable[tuple[str, ...]]) -> str:
     """Return a Markdown table; the first row is the header."""
     header, *body = ["| " + " | ".join(cell.replace("|", "\\|") for cell in row) + " |" for row in rows]
@@ -143,6 +154,7 @@ TABLES: dict[str, dict[str, Callable[[], str]]] = {
         "DiscoverOptions": lambda: options("discover"),
         "RunOptions": lambda: options("run"),
     },
+    "radiometry.md": {"indices": indices},
     "sidecar.md": {"fields": fields},
     "troubleshooting.md": {"reasons": reasons},
 }

@@ -192,7 +192,7 @@ INDICES: Mapping[str, Index] = {
         Index("cig", "N / G - 1", (0.0, 10.0), "Gitelson et al. 2003"),
         Index("vari", "(G - R) / (G + R - B)", (-0.5, 0.5), "Gitelson et al. 2002"),
         Index("savi", "1.5 * (N - R) / (N + R + 0.5)", (-0.2, 1.0), "Huete 1988", any_unit=False),
-        Index("osavi", "1.16 * (N - R) / (N + R + 0.16)", (-0.2, 1.0), "Rondeaux et al. 1996", any_unit=False),
+        Index("osavi", "(N - R) / (N + R + 0.16)", (-0.2, 1.0), "Rondeaux et al. 1996", any_unit=False),
         Index(
             "msavi",
             "(2 * N + 1 - sqrt((2 * N + 1) ** 2 - 8 * (N - R))) / 2",

@@ -111,6 +111,22 @@ def test_the_catalogue_gives_names_and_constants() -> None:
         index_named("ndbi")
 
 
+@pytest.mark.parametrize("name", INDICES)
+def test_a_built_in_index_has_the_value_of_the_catalogue(name: str) -> None:
+    spyndex = pytest.importorskip("spyndex")
+    entry = spyndex.indices[{"ndre": "NDREI"}.get(name, name.upper())]
+    rng = np.random.default_rng(0)
+    values = {"RE1" if s == "RE" else s: rng.uniform(0.02, 0.3, 50) for s in INDICES[name].symbols}
+    values |= {"N": rng.uniform(0.3, 0.6, 50)} if "N" in values else {}
+    constants = {s: spyndex.constants[s].default for s in entry.bands if s not in values}
+    constants |= {"L": 0.5} if name == "savi" else {}  # Huete's; the catalogue's default of L is that of EVI
+    expected = spyndex.computeIndex(entry.short_name, values | constants)
+    result = compute(INDICES[name], [np.float32(v)[None] for v in values.values()])[0]
+    known = np.isfinite(result)
+    assert known.mean() > 0.7
+    np.testing.assert_allclose(result[known], expected[known], rtol=1e-4, atol=1e-5)
+
+
 def test_values_statistics_and_tags_of_a_raster(tmp_path: Path) -> None:
     make_aligned(tmp_path, 1)
     mine = index_of_formula("mine = (N-RE)/(N+RE)")
