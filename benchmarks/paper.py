@@ -1,10 +1,10 @@
 """Files for the paper's experiments on a folder of aerial RGB/NIR pairs (VIS_1.png, NIR_TF_1.png, GT_1.txt ...), which
 `agalign evaluate` and `agalign learn` run, and a plot of their results.
 
-    python benchmarks/paper.py FOLDER
+    python benchmarks/paper.py NIR-VIS-RS/Dataset/Aerial
     python benchmarks/paper.py RESULTS.csv... --plot robustness.png
 
-The first writes to the current folder: pairs.csv with all pairs, learn.csv with 20 of them and homographies 5 %
+The first writes to the current folder: pairs.csv with the pairs, learn.csv with 20 of them and homographies 5 %
 off, and test.csv with the others. The second draws files of `agalign evaluate --out`: a line for each method of each.
 """
 
@@ -19,12 +19,15 @@ from agalign.evaluation.evaluate import Starts
 from agalign.evaluation.image_pairs import read_image
 
 SPLIT_SEED, LEARNED = 2018, 20
-NAMES = ("VIS_{}.png", "NIR_TF_{}.png", "GT_{}.txt"), ("VI_{}_a.png", "VI_{}_b.png", "VI_{}_fixed_to_moving.txt")
-"""Files of an aerial pair, and of a visible-thermal one."""
+SETS = (
+    (range(1, 50, 2), ("VIS_{}.png", "NIR_TF_{}.png", "GT_{}.txt")),
+    (range(1, 6), ("VI_{}_a.png", "VI_{}_b.png", "VI_{}_fixed_to_moving.txt")),
+)
+"""Numbers and names of the aerial pairs, and of visible-thermal ones."""
 
 
 def write_pairs(folder: Path) -> None:
-    files = [(n, *(folder.resolve() / name.format(n) for name in names)) for n in range(1, 100) for names in NAMES]
+    files = [(n, *(folder.resolve() / name.format(n) for name in names)) for numbers, names in SETS for n in numbers]
     pairs = [row for row in files if row[-1].is_file()]
     mixed = random.Random(SPLIT_SEED).sample(pairs, len(pairs))
     rng, rough = np.random.default_rng(SPLIT_SEED), []

@@ -2,13 +2,14 @@
 
 from functools import partial
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, get_args
 
 import typer
 
 from agalign.cli.command import Command, Given
 from agalign.cli.terminal import Terminal
 from agalign.errors import ConfigurationError
+from agalign.values.choices import Sharing
 
 Pairs = Annotated[
     Path,
@@ -47,7 +48,7 @@ def _evaluate(
     from agalign.evaluation.methods import method_named
     from agalign.values.files import write_text
 
-    chosen = methods or ["fast:pseudo-siamese", "fast:siamese", "sift"]
+    chosen = methods or [*(f"fast:{sharing}" for sharing in get_args(Sharing)), "sift"]
     named = {name: method_named(name) for name in chosen}
     starts = Starts(_shares(shift), directions, seeding)
     results = []
