@@ -43,10 +43,9 @@ def _evaluate(
     out: Annotated[Path | None, typer.Option("--out", "-o", help="CSV file with a row per pair and method.")] = None,
 ) -> None:
     """Evaluate descriptors and homographies on pairs with ground truth (Dong et al., 2018)."""
-    from agalign.evaluation.evaluate import Starts, as_csv, error_table, evaluate, precision_table
+    from agalign.evaluation.evaluate import Starts, error_table, evaluate, precision_table, write_results
     from agalign.evaluation.image_pairs import find_pairs
     from agalign.evaluation.methods import method_named
-    from agalign.values.files import write_text
 
     chosen = methods or [*(f"fast:{sharing}" for sharing in get_args(Sharing)), "sift"]
     named = {name: method_named(name) for name in chosen}
@@ -59,7 +58,7 @@ def _evaluate(
             terminal.event("result", line if terminal.verbose else "", **vars(result))
     finally:
         if out is not None and results:
-            write_text(out, as_csv(results))
+            write_results(out, results)
     for title, rows in (("Mean average precision", precision_table(results)), ("Homography", error_table(results))):
         if len(rows) > 1:
             terminal.table(rows[0], rows[1:], title)

@@ -1,11 +1,10 @@
 """Evaluation of methods on pairs from several initial homographies, and tables of the results."""
 
-import csv
-import io
 import math
 import time
 from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, fields
+from dataclasses import astuple, dataclass, fields
+from pathlib import Path
 from typing import TypeVar
 
 import numpy as np
@@ -16,6 +15,7 @@ from agalign.evaluation.methods import Method, Outcome, PairTask, average_precis
 from agalign.method.device import one_memory_error, one_thread
 from agalign.method.match import sift_keypoints, visible_in_both
 from agalign.method.patches import Keypoints
+from agalign.products.text_files import write_csv
 from agalign.values import geometry
 from agalign.values.geometry import Matrix
 
@@ -98,13 +98,10 @@ def _scores(outcome: Outcome, keypoints: Keypoints, truth: Matrix) -> tuple[floa
     return precision, error_px
 
 
-def as_csv(results: Sequence[Result]) -> str:
-    """Return the results as CSV, one row per result."""
-    text = io.StringIO()
-    writer = csv.DictWriter(text, [f.name for f in fields(Result)], lineterminator="\n")
-    writer.writeheader()
-    writer.writerows({k: f"{v:.5g}" if isinstance(v, float) else v for k, v in asdict(r).items()} for r in results)
-    return text.getvalue()
+def write_results(path: Path, results: Sequence[Result]) -> None:
+    """Write the results as CSV, one row per result. Raises OutputError."""
+    rows = ([f"{v:.5g}" if isinstance(v, float) else v for v in astuple(r)] for r in results)
+    write_csv(path, [f.name for f in fields(Result)], rows)
 
 
 def precision_table(results: Sequence[Result]) -> list[list[str]]:

@@ -1,5 +1,4 @@
 import csv
-import io
 import math
 from pathlib import Path
 
@@ -15,7 +14,7 @@ from agalign.cli.main import app
 from agalign.config import JointSettings, SeedSettings, Settings
 from agalign.errors import ConfigurationError, InputError
 from agalign.evaluation.descriptor_learning import learn_descriptor
-from agalign.evaluation.evaluate import Starts, as_csv, error_table, evaluate, precision_table
+from agalign.evaluation.evaluate import Starts, error_table, evaluate, precision_table, write_results
 from agalign.evaluation.image_pairs import PairFiles
 from agalign.evaluation.methods import (
     PairTask,
@@ -43,9 +42,9 @@ pytestmark = pytest.mark.slow
 TRUTH = np.array([[1.004, 0.006, 6.0], [-0.005, 0.998, -4.0], [4e-6, -6e-6, 1.0]])
 
 
-def write_pair(folder: Path, matrix: np.ndarray, seed: int) -> PairFiles:
+def write_pair(folder: Path, matrix: np.ndarray, seed: int, *size_px: int) -> PairFiles:
     paths = folder / f"{seed}a.png", folder / f"{seed}b.png"
-    for path, one in zip(paths, two_views(matrix, seed=seed), strict=True):
+    for path, one in zip(paths, two_views(matrix, *size_px, seed=seed), strict=True):
         cv2.imwrite(str(path), (np.clip(one.pixels * 40 + 128, 1, 254)).astype(np.uint8))
     return PairFiles(f"pair {seed}", "textures", *paths, matrix)
 
@@ -137,7 +136,8 @@ def test_a_descriptor_learned_on_a_pair_beats_sift_with_reversed_contrast(tmp_pa
     assert math.isnan(sift.error_px)
     assert [row[0] for row in precision_table(results)] == ["method", "fast:pseudo-siamese", "sift"]
     assert error_table(results)[1][:2] == ["fast:pseudo-siamese", "5.0%"]
-    rows = list(csv.DictReader(io.StringIO(as_csv(results))))
+    write_results(tmp_path / "rows.csv", results)
+    rows = list(csv.DictReader((tmp_path / "rows.csv").read_text().splitlines()))
     assert float(rows[0]["error_px"]) == pytest.approx(ours.error_px, rel=1e-3)
 
 
@@ -226,15 +226,17 @@ def test_matching_finds_nothing_in_unrelated_images() -> None:
 
 
 def test_evaluate_prints_tables_and_writes_rows(tmp_path: Path) -> None:
-    pair = write_pair(tmp_path, TRUTH, 3)
+    pair = write_pair(tmp_path, TRUTH, 3, 240, 200)
     table = tmp_path / "pairs.csv"
     numbers = " ".join(f"{v}" for v in TRUTH.ravel())
     table.write_text(f"fixed,moving,homography\n{pair.fixed.name},{pair.moving.name},{numbers}\n")
     runner = CliRunner()
-    done = runner.invoke(app, ["evaluate", str(table), "-m", "sift", "-o", str(tmp_path / "rows.csv")])
+    done = runner.invoke(app, ["evaluate", str(table), "-o", str(tmp_path / "rows.csv")])
     assert done.exit_code == 0
     assert "Mean average precision" in done.stdout
-    assert len((tmp_path / "rows.csv").read_text().splitlines()) == 2
+    methods = [row["method"] for row in csv.DictReader((tmp_path / "rows.csv").read_text().splitlines())]
+    assert methods == ["fast:siamese", "fast:pseudo-siamese", "fast:unshared", "sift"]
+    assert all(done.stdout.count(name) == 2 for name in methods[:3])
     wrong = runner.invoke(app, ["evaluate", str(table), "-m", "surf"])
     assert wrong.exit_code == 2
     assert "unknown method" in wrong.stderr
