@@ -158,7 +158,8 @@ def _onto(
 ) -> int:
     """Align georeferenced mosaics of other dates or sensors to the grid of REFERENCE.
 
-    Grids, resolutions and coordinate reference systems may differ. For each MOVING, agalign writes a sidecar and a
+    Grids, resolutions and coordinate reference systems may differ. A mosaic is aligned if its windows are within a
+    pixel of REFERENCE: resample both to the pixel size that you need. For each MOVING, agalign writes a sidecar and a
     raster on the grid of REFERENCE, with one band of REFERENCE (--reference) and all bands of MOVING.
     """
     from agalign.cameras.discover import FolderScan
