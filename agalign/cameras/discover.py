@@ -16,6 +16,7 @@ from agalign.cameras.grouping import (
     pattern_clashes,
     with_missing_bands,
     with_unique_capture_names,
+    without_copies,
 )
 from agalign.cameras.read_files import ImageFile, Problem, natural_order, read_files
 from agalign.config import DiscoverOptions
@@ -40,6 +41,11 @@ class FolderScan:
     problems: tuple[Problem, ...]
 
     @property
+    def is_complete(self) -> bool:
+        """False if a file or capture is left out that is not an exact copy of another."""
+        return all(p.is_exact_copy for p in self.problems)
+
+    @property
     def eight_bit(self) -> tuple[Capture, ...]:
         """The captures with a file per band and 8 bits per pixel in each band."""
         return tuple(
@@ -60,7 +66,8 @@ def discover(
     folder, options = Path(folder), options or DiscoverOptions()
     check_folder(folder)
     paths, problems = _chosen_images(folder, options)
-    files = _read(paths, options, progress, problems)
+    files, copies = without_copies(_read(paths, options, progress, problems))
+    problems += copies
     captures: list[Capture] = []
     groups = group_files(files)
     _check_bands(groups, options.bands, folder)

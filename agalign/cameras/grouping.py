@@ -4,6 +4,7 @@ import math
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
+from filecmp import cmp as same_bytes
 from itertools import count
 from pathlib import Path
 from types import MappingProxyType
@@ -25,6 +26,41 @@ _GroupKey = tuple[str, str, str]
 _CameraKey = tuple[str, ...]
 _SERIAL_SEPARATOR = "+"
 """Between the serial numbers of the two halves of a dual camera."""
+
+
+def without_copies(files: Sequence[ImageFile]) -> tuple[list[ImageFile], list[Problem]]:
+    """Return the files that are not copies of others, and a problem for each copy.
+
+    A copy agrees with a file of a shorter name in two of three respects: its name contains that of the other file, as
+    file managers and browsers make it in all languages ('IMG_1 - Copy.tif', 'IMG_1 copie 2.tif', 'IMG_1 (1).tif',
+    'Copy of IMG_1.tif'); its bands and capture id in the tags; its bytes.
+    """
+    kept: dict[object, ImageFile] = {}
+    copies: dict[Path, Problem] = {}
+    for file in sorted(files, key=lambda f: (len(f.path.name), natural_order(f.path.name))):
+        capture_id = file.tags.first_text(file.camera.capture_ids)
+        folder, bands = file.camera.capture_folder(file.path), tuple(b.name for b in file.bands)
+        by_tags = (folder, capture_id, bands) if capture_id else file.path
+        for original in (kept[key] for key in (by_tags, *_paths_in_name(file.path)) if key in kept):
+            is_exact = same_bytes(original.path, file.path, shallow=False)
+            if is_exact:
+                text = f"is left out, because it is a copy of {original.path.name}"
+            elif original is kept.get(by_tags) and original.path in _paths_in_name(file.path):
+                text = f"is left out as a changed copy of {original.path.name}: same band and capture; keep one of them"
+            else:
+                continue
+            copies[file.path] = Problem(file.path, InputError(f"{file.path}: {text}"), is_exact_copy=is_exact)
+            break
+        else:
+            kept.setdefault(by_tags, file)
+            kept[file.path] = file
+    return [f for f in files if f.path not in copies], list(copies.values())
+
+
+def _paths_in_name(path: Path) -> list[Path]:
+    """The files that this one may be a copy of: their names are its own before or after a space or bracket."""
+    parts = (part for i, c in enumerate(path.stem) if c in " (" for part in (path.stem[:i], path.stem[i + 1 :]))
+    return [path.with_name(part + path.suffix) for part in parts if part]
 
 
 def group_files(files: Iterable[ImageFile]) -> list[list[ImageFile]]:
@@ -217,7 +253,7 @@ def with_missing_bands(captures: Sequence[Capture]) -> list[Capture]:
     members: dict[_CameraKey, list[Capture]] = defaultdict(list)
     for capture, camera in zip(captures, cameras, strict=True):
         members[camera].append(capture)
-    usual = {camera: _usual_bands(of_camera) for camera, of_camera in members.items()}
+    usual = {camera: usual_bands([c for c in some if c.has_several_files]) for camera, some in members.items()}
     serials = {camera: {c.camera.serial for c in of_camera} for camera, of_camera in members.items()}
     result = []
     for capture, camera in zip(captures, cameras, strict=True):
@@ -228,11 +264,10 @@ def with_missing_bands(captures: Sequence[Capture]) -> list[Capture]:
     return result
 
 
-def _usual_bands(captures: Sequence[Capture]) -> list[str]:
-    """The bands that at least half of the captures of several files have."""
-    several = [c for c in captures if c.has_several_files]
-    counts = Counter(b.name for c in several for b in c.bands)
-    return [name for name, n in counts.items() if 2 * n >= len(several)]
+def usual_bands(captures: Sequence[Capture]) -> list[str]:
+    """Return the names of the bands that at least half of the captures have."""
+    counts = Counter(b.name for c in captures for b in c.bands)
+    return [name for name, n in counts.items() if 2 * n >= len(captures)]
 
 
 def _cameras(captures: Sequence[Capture]) -> list[_CameraKey]:

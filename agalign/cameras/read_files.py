@@ -26,6 +26,8 @@ class Problem:
 
     path: Path
     error: AgalignError
+    is_exact_copy: bool = False
+    """True for a file with the same bytes as another one, which takes part."""
 
     @property
     def text(self) -> str:

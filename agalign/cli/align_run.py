@@ -92,7 +92,7 @@ def print_plan(flight: FolderScan, out: Path, settings: Settings, options: RunOp
         terminal.event("plan", f"{label}: {state}" if terminal.verbose else "", capture=label, state=state)
     text = ", ".join(f"{counted(number, 'capture')} {state}" for state, number in counts.items())
     terminal.result(f"Into {out}: {text}; nothing was written")
-    return ExitCode.PARTIAL if flight.problems else ExitCode.OK
+    return ExitCode.OK if flight.is_complete else ExitCode.PARTIAL
 
 
 @dataclass
@@ -150,7 +150,7 @@ def run(
     """
     from agalign.batch import Listener, run_flight
 
-    totals, pace = RunTotals(not flight.problems, FailureGroups()), _Pace()
+    totals, pace = RunTotals(flight.is_complete, FailureGroups()), _Pace()
     started = time.monotonic()
     with (
         cluster(dask, options.jobs, options.timeout_s) as executor,

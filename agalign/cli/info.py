@@ -70,7 +70,7 @@ def _show_folder(folder: Path, options: dict[str, Any], terminal: Terminal, *, a
         for camera in cameras:
             terminal.result(camera.text)
         _show_captures(rows, len(flight.problems), terminal)
-    return ExitCode.NOTHING if not rows else ExitCode.PARTIAL if flight.problems else ExitCode.OK
+    return ExitCode.NOTHING if not rows else ExitCode.OK if flight.is_complete else ExitCode.PARTIAL
 
 
 def _rows(flight: "FolderScan") -> list[dict[str, Any]]:

@@ -2,8 +2,9 @@
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from statistics import median
+from statistics import median, mode
 
+from agalign.cameras.grouping import usual_bands
 from agalign.pixels.radiometry import with_radiometry
 from agalign.values.capture import Band, Capture
 from agalign.values.choices import RadiometryChoice
@@ -149,18 +150,20 @@ def _overview(name: str, serial: str, captures: Sequence[Capture]) -> CameraOver
     altitudes_m = [a for c in captures if c.position is not None and (a := c.position.altitude_m) is not None]
     times = sorted({c.captured_at for c in captures} - {""}) or [""]
     choices: tuple[RadiometryChoice, ...] = ("camera", "sun")
+    reference = mode(c.reference.name for c in captures)
+    typical = next(c for c in captures if c.reference.name == reference)
     return CameraOverview(
         camera=name,
         serial=serial,
         captures=len(captures),
-        bands=tuple(dict.fromkeys(b.name for c in captures for b in c.bands)),
-        size_px=captures[0].reference.size_px,
+        bands=tuple(usual_bands(captures) or (b.name for b in typical.bands)),
+        size_px=typical.reference.size_px,
         first_at=times[0],
         last_at=times[-1],
         height_m=height_m,
         altitude_m=(min(altitudes_m), max(altitudes_m)) if altitudes_m else None,
         gsd_m=gsd_m,
-        gsd_per_height=_gsd_per_height(captures[0]),
+        gsd_per_height=_gsd_per_height(typical),
         radiometry=tuple(choice for choice in choices if all(_supports(c, choice) for c in captures)),
     )
 

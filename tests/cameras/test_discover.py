@@ -1,6 +1,7 @@
 """Captures of a folder: which files belong together, and what is missing or unusable."""
 
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +16,7 @@ from agalign.cameras.grouping import with_missing_bands, with_unique_band_names
 from agalign.cameras.metadata import read_tags
 from agalign.cameras.tiff_directory import EXIF, add_directories, rational, read_directories, text
 from agalign.errors import InputError, NoSuchBandError
+from agalign.flight.groups import camera_overviews
 from agalign.synthetic import flight as synthetic
 from agalign.values.capture import Band, CameraIdentity, Capture
 
@@ -63,6 +65,84 @@ def test_missing_bands_and_unreadable_files_are_reported(flight: Path, tmp_path:
     assert set(result.captures[1].missing_bands) == {"Red", "Red edge"}
     assert [p.path.name for p in result.problems] == ["IMG_0002_5.tif"]
     assert "IMG_0002_5.tif" in result.problems[0].text
+
+
+COPIES = (
+    *(
+        "{} - Copy",
+        "{} - Copy (2)",
+        "{} - Kopie",
+        "{} \N{EN DASH} copie",
+        "{} - コピー",
+        "{} copy",
+        "{} copy 2",
+        "{} (1)",
+    ),
+    *("{}(1)", "{} (copy)", "Copy of {}", "Kopie von {}", "{} 2"),
+)
+"""Names of copies by Windows, macOS, browsers and others."""
+
+
+@pytest.mark.parametrize("name", COPIES)
+def test_copies_of_files_are_left_out_with_a_line(flight: Path, tmp_path: Path, name: str) -> None:
+    """Of files with a capture id, of those without tags, and of multiband files."""
+    shutil.copytree(flight / "0000SET" / "000", tmp_path / "in")
+    write_all(tmp_path / "in", "plot_red", "plot_nir")
+    write(tmp_path / "in" / "field.tif", bands=3)
+    before, originals = found(tmp_path), ("IMG_0001_2", "plot_red", "field")
+    for original in originals:
+        shutil.copy(tmp_path / "in" / f"{original}.tif", tmp_path / "in" / f"{name.format(original)}.tif")
+    result = discover(tmp_path)
+    assert found(tmp_path) == before
+    assert {p.path.name: p.text.rpartition(" ")[2] for p in result.problems} == {
+        f"{name.format(original)}.tif": f"{original}.tif" for original in originals
+    }
+    assert all("left out, because it is a copy of" in p.text for p in result.problems)
+    assert result.is_complete
+
+
+def test_all_files_of_a_capture_copied_and_a_copy_under_any_name(flight: Path, tmp_path: Path) -> None:
+    """The capture id and the bytes show what the name does not."""
+    images = shutil.copytree(flight / "0000SET" / "000", tmp_path / "in")
+    for path in list(images.glob("IMG_0001_*")):
+        shutil.copy(path, path.with_stem(f"{path.stem} - Copy"))
+    shutil.copy(images / "IMG_0002_4.tif", images / "backup_of_nir_19.tif")
+    assert found(tmp_path / "in") == found(flight / "0000SET" / "000")
+    assert len(discover(tmp_path / "in").problems) == 6
+
+
+def test_a_changed_copy_is_left_out_with_another_line(flight: Path, tmp_path: Path) -> None:
+    images = shutil.copytree(flight / "0000SET" / "000", tmp_path / "in")
+    copy = images / "IMG_0001_2 - Copy.tif"
+    copy.write_bytes((images / "IMG_0001_2.tif").read_bytes() + b"more")
+    result = discover(images)
+    assert found(images) == found(flight / "0000SET" / "000")
+    (problem,) = result.problems
+    assert problem.text.startswith(f"{copy}: is left out as a changed copy of IMG_0001_2.tif: same band and capture")
+    assert not result.is_complete
+
+
+def test_a_copy_is_used_where_its_original_is_missing_or_unreadable(flight: Path, tmp_path: Path) -> None:
+    images = shutil.copytree(flight / "0000SET" / "000", tmp_path / "in")
+    (images / "IMG_0001_2.tif").rename(images / "IMG_0001_2 - Copy.tif")
+    shutil.copy(images / "IMG_0002_2.tif", images / "IMG_0002_2 (1).tif")
+    (images / "IMG_0002_2.tif").write_bytes(b"II*\0 cut short")
+    assert found(images) == found(flight / "0000SET" / "000")
+
+
+def test_files_of_other_names_and_equal_bytes_are_no_copies(tmp_path: Path) -> None:
+    """Two sensors that are covered record the same."""
+    write_all(tmp_path, "IMG_1_1", "IMG_1_10", "field_red", "field_red_edge")
+    assert found(tmp_path) == {"IMG_1": ["1", "10"], "field": ["red", "red_edge"]}
+
+
+def test_the_overview_of_a_camera_is_that_of_most_captures() -> None:
+    """The first one lacks green, and has a band that the others lack."""
+    first = replace(capture("first", "RM01", ("Blue", "Red", "Blue-2")), reference_index=0)
+    bands = tuple(replace(b, width_px=32) for b in first.bands)
+    others = [replace(capture(f"c{k}", "RM01", RED), reference_index=1) for k in range(3)]
+    (overview,) = camera_overviews([replace(first, bands=bands), *others])
+    assert (set(overview.bands), overview.size_px) == (set(RED), (64, 48))
 
 
 def test_one_file_a_band(tmp_path: Path) -> None:
