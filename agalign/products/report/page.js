@@ -200,6 +200,7 @@ function tableBody() {
 
 const MAP = { width: 900, height: 420, few: 230, margin: 34 };
 const ONE_PLACE_M = 0.5;
+const MAP_FULL_PX = 1; // fixed, so that colours mean the same in every report; above it single plants do not match
 const INDEX_STOPS = [[38, 70, 148], [120, 74, 40], [214, 190, 120], [250, 245, 170], [90, 180, 80], [0, 90, 40]];
 const NEUTRAL_STOPS = [[20, 20, 20], [245, 245, 245]];
 const MISSING_COLOUR = "#c9a";
@@ -273,14 +274,12 @@ function colourMap() {
     colourByIndex(what.slice(6), legend);
     return;
   }
-  const values = [...dots.keys()].flatMap((c) => worst(c, /** @type {"residual_px"} */ (what)) ?? []).sort((a, b) => a - b);
-  const full = Math.max(values[Math.floor(0.98 * (values.length - 1))] ?? 1, 0.05);
   for (const [c, dot] of dots) {
     const value = worst(c, /** @type {"residual_px"} */ (what));
-    set(dot, { fill: value === null ? STATUS_COLOURS.failed : ramp(value / full) });
+    set(dot, { fill: value === null ? MISSING_COLOUR : ramp(value / MAP_FULL_PX) });
   }
-  const steps = [0, 0.5, 1].map((s) => el("span", { class: "key", style: `--key:${ramp(s)}` }, `${(s * full).toFixed(2)} px${s === 1 ? " and more" : ""}`));
-  legend.replaceChildren(...steps, el("span", { class: "key", style: `--key:${STATUS_COLOURS.failed}` }, "no band aligned"));
+  const steps = [0, 0.5, 1].map((s) => el("span", { class: "key", style: `--key:${ramp(s)}` }, `${(s * MAP_FULL_PX).toFixed(2)} px${s === 1 ? " and more" : ""}`));
+  legend.replaceChildren(...steps, el("span", { class: "key", style: `--key:${MISSING_COLOUR}` }, "no value"));
 }
 
 /**
