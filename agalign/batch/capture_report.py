@@ -65,7 +65,7 @@ class CaptureReport:
         """The state, with the number of bands by status, or the error."""
         if self.result is None:
             return f"{self.state}: {self.error or self.panel or self.sky}"
-        statuses = Counter(b.status for b in self.result.bands if b.status != "reference")
+        statuses = Counter(status for _, status, _ in self.result.pairs)
         return f"{self.state}, " + ", ".join(f"{number} {status}" for status, number in statuses.items())
 
     def _row(self) -> str:

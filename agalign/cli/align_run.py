@@ -21,7 +21,7 @@ from agalign.config import DiscoverOptions, RunOptions, Settings
 from agalign.errors import InputError, OutputError, WorkerError
 from agalign.flight.groups import camera_overviews
 from agalign.products.report import REPORT_FILE, pages_exist, write_pages
-from agalign.products.report.facts import FailureGroup, FailureGroups
+from agalign.products.report.facts import FailureGroup, PairTotals
 from agalign.products.run_record import exclusion_lines, read_run_record
 from agalign.products.sidecar import BandResult, CaptureResult
 from agalign.values.capture import Capture
@@ -101,10 +101,10 @@ class RunTotals:
 
     is_complete: bool
     """All captures are good, no file has a problem, and the report is written."""
-    failures: FailureGroups
+    unfinished: dict[str, int] = field(default_factory=dict)
+    """Number of band pairs of each capture that has no result yet."""
     states: Counter[str] = field(default_factory=Counter)
-    bands: dict[str, list[tuple[str, float | None, float]]] = field(default_factory=dict)
-    """(status, median residual in px if it is known, seconds) of the pairs of each band."""
+    pairs: PairTotals = field(default_factory=PairTotals)
     saturated: dict[str, tuple[float, str]] = field(default_factory=dict)
     """Largest share of saturated pixels, and its capture, of each band."""
     radiometry: Counter[str] = field(default_factory=Counter)
@@ -116,9 +116,11 @@ class RunTotals:
         """Add the report of a capture."""
         self.states[report.state] += 1
         self.is_complete &= report.is_complete
+        if report.state != "error":
+            self.unfinished.pop(report.label, None)
         if report.result is None:
             return
-        self.failures.add(report.label, report.result)
+        self.pairs.add(report.label, report.result)
         output = report.result.output
         if output is not None and output.radiometry is not None:
             self.radiometry[output.radiometry] += 1
@@ -128,9 +130,6 @@ class RunTotals:
         for band in report.result.bands:
             share = band.saturated or 0.0
             self.saturated[band.band] = max(self.saturated.get(band.band, (0.0, "")), (share, report.label))
-            if band.status != "reference":
-                residual_px = band.metrics.after.residual_px if band.metrics else None
-                self.bands.setdefault(band.band, []).append((band.status, residual_px, band.seconds))
 
 
 def run(
@@ -150,7 +149,8 @@ def run(
     """
     from agalign.batch import Listener, run_flight
 
-    totals, pace = RunTotals(flight.is_complete, FailureGroups()), _Pace()
+    asked = {c.label: len(c.moving) + len(c.missing_bands) for c in flight.captures}
+    totals, pace = RunTotals(flight.is_complete, asked), _Pace()
     started = time.monotonic()
     with (
         cluster(dask, options.jobs, options.timeout_s) as executor,
@@ -291,25 +291,25 @@ def _print_report(report: "CaptureReport", terminal: Terminal, number: int, coun
 
 
 def _print_capture(report: "CaptureReport", result: CaptureResult, heading: str, terminal: Terminal) -> None:
-    pairs = [b for b in result.bands if b.status != "reference"]
-    aligned, predicted = (sum(b.status == status for b in pairs) for status in ("aligned", "predicted"))
+    counts = Counter(status for _, status, _ in result.pairs)
+    aligned, predicted = counts["aligned"], counts["predicted"]
     also = f", {predicted} predicted" if predicted else ""
     how = "kept from an earlier run" if report.state == "kept" else f"{report.seconds:.1f} s"
     # On a terminal, the progress line suffices.
     is_printed = terminal.verbose or not terminal.err.is_terminal
     terminal.event(
         "capture",
-        f"{heading}: {aligned} of {len(pairs)} aligned{also}, {how}" if is_printed else "",
+        f"{heading}: {aligned} of {counts.total()} aligned{also}, {how}" if is_printed else "",
         capture=report.label,
         state=report.state,
         status=result.status,
         aligned=aligned,
         predicted=predicted,
-        pairs=len(pairs),
+        pairs=counts.total(),
         seconds=round(report.seconds, 3),
     )
     if terminal.verbose or terminal.log_json:
-        for band in pairs:
+        for band in (b for b in result.bands if b.status != "reference"):
             _print_pair(report.label, band, terminal)
 
 
@@ -332,8 +332,7 @@ def _print_pair(capture: str, band: BandResult, terminal: Terminal) -> None:
 
 def conclude(totals: RunTotals, out: Path, terminal: Terminal) -> int:
     """Print the table of bands and the failures; return the exit code."""
-    counts = Counter(status for pairs in totals.bands.values() for status, _, _ in pairs)
-    _print_totals(totals, counts, terminal)
+    _print_totals(totals, terminal)
     max_saturated_share = 0.005  # sun glint and roofs saturate fewer pixels of most captures
     high = [(name, *one) for name, one in totals.saturated.items() if one[0] > max_saturated_share]
     if high:
@@ -347,20 +346,22 @@ def conclude(totals: RunTotals, out: Path, terminal: Terminal) -> int:
         or_sky = " or the sky" if totals.states["sky"] else ""
         terminal.problem(f"all captures show calibration panels{or_sky}; --align-panels aligns them like any other")
         return ExitCode.NOTHING
-    if not counts["aligned"] + counts["predicted"]:
-        terminal.problem("no band pair could be aligned" if totals.bands else "no capture could be processed")
-        return ExitCode.PARTIAL if totals.bands else ExitCode.NOTHING
+    statuses = totals.pairs.statuses
+    if not statuses["aligned"] + statuses["predicted"]:
+        terminal.problem("no band pair could be aligned" if statuses else "no capture could be processed")
+        return ExitCode.PARTIAL if statuses else ExitCode.NOTHING
     return ExitCode.OK if totals.is_complete else ExitCode.PARTIAL
 
 
-def _print_totals(totals: RunTotals, counts: Counter[str], terminal: Terminal) -> None:
-    lost = totals.states["error"]
-    if totals.bands:
+def _print_totals(totals: RunTotals, terminal: Terminal) -> None:
+    lost, statuses = len(totals.unfinished), totals.pairs.statuses
+    asked = statuses.total() + sum(totals.unfinished.values())
+    if statuses:
         missing = f"; {counted(lost, 'capture')} not written" if lost else ""
-        _print_table(totals, f"{counts['aligned']} of {counts.total()} band pairs aligned{missing}", terminal)
-    explain(totals.failures.groups(), terminal)
+        _print_table(totals.pairs, f"{statuses['aligned']} of {asked} band pairs aligned{missing}", terminal)
+    explain(totals.pairs.groups(), terminal)
     if lost:
-        of_all = f"{lost} of {counted(totals.states.total(), 'capture')}"
+        of_all = f"{lost} of {counted(totals.states.total() - totals.states['error'] + lost, 'capture')}"
         terminal.problem(f"{of_all} could not be written, for the reasons above; the same command tries again")
     # Under a clear sky with the sun above 40 degrees, the irradiance changes by up to 10 % in half an hour.
     max_panel_age_s = 30 * 60.0
@@ -398,14 +399,15 @@ def explain(failures: Sequence[FailureGroup], terminal: Terminal) -> None:
         )
 
 
-def _print_table(totals: RunTotals, title: str, terminal: Terminal) -> None:
+def _print_table(pairs: PairTotals, title: str, terminal: Terminal) -> None:
     """Print a row per band: number of pairs by status, residuals, time."""
-    headers = ("Band", "Aligned", "Predicted", "Seed only", "Failed", "Residual px, median", "Worst", "Seconds a pair")
+    columns = {"aligned": "Aligned", "predicted": "Predicted", "seed_only": "Seed only", "failed": "Failed"}
+    if pairs.statuses["missing"]:
+        columns["missing"] = "Missing"
     rows = []
-    for name, pairs in totals.bands.items():
-        of_band = Counter(status for status, _, _ in pairs)
-        known = [residual for status, residual, _ in pairs if status == "aligned" and residual is not None]
-        numbers = [str(of_band[status]) for status in ("aligned", "predicted", "seed_only", "failed")]
-        numbers += [f"{median(known):.3f}", f"{max(known):.3f}"] if known else ["-", "-"]
-        rows.append((name, *numbers, f"{median(seconds for _, _, seconds in pairs):.1f}"))
+    for name, band in pairs.bands.items():
+        px, seconds = band.residuals_px, f"{median(band.seconds):.1f}" if band.seconds else "-"
+        residuals = (f"{median(px):.3f}", f"{max(px):.3f}") if px else ("-", "-")
+        rows.append((name, *(str(band.statuses[status]) for status in columns), *residuals, seconds))
+    headers = ("Band", *columns.values(), "Residual px, median", "Worst", "Seconds a pair")
     terminal.table(headers, rows, title, texts=1)

@@ -88,13 +88,10 @@ class RunPart(_Part):
         self.captures[state] = self.captures.get(state, 0) + 1
         for text in problems:
             self.add_problem(label, text)
-        for band in [] if result is None else result.bands:
-            if band.status == "reference":
-                continue
-            self.pairs[band.status] = self.pairs.get(band.status, 0) + 1
-            if band.status != "aligned":
-                refusal = RefusalPart(capture=label, band=band.band, status=band.status, reason=band.reason)
-                self.refused.append(refusal)
+        for band, status, reason in [] if result is None else result.pairs:
+            self.pairs[status] = self.pairs.get(status, 0) + 1
+            if status != "aligned":
+                self.refused.append(RefusalPart(capture=label, band=band, status=status, reason=reason))
 
     def add_problem(self, what: str, text: str) -> None:
         """Add a problem of a file or capture; characters that are not printable are escaped."""

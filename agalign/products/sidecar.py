@@ -18,7 +18,7 @@ from agalign.values.alignment import Prediction
 from agalign.values.choices import CaptureStatus, Geometry, ModelFamily, PairStatus, PredictionSource, SeedKind, Space
 from agalign.values.files import is_inside
 from agalign.values.image import OutputGrid
-from agalign.values.issues import IssueKind
+from agalign.values.issues import MISSING_BAND, IssueKind
 from agalign.values.pixel_units import PixelScale
 from agalign.verify.checks import KINDS
 
@@ -595,6 +595,12 @@ class CaptureResult(_Result):
         """Standard error up to which indices may use a predicted band, px; the default in older sidecars."""
         given = self.accept_predicted_px
         return CheckSettings().accept_predicted_px if given is None else given
+
+    @property
+    def pairs(self) -> list[tuple[str, str, str | None]]:
+        """(band, status, reason) of every band that is to be aligned; missing bands have the status `missing`."""
+        moving = [(b.band, str(b.status), b.reason) for b in self.bands if b.status != "reference"]
+        return [*moving, *((name, "missing", MISSING_BAND.cause) for name in self.missing_bands)]
 
     @property
     def files(self) -> dict[str, int]:

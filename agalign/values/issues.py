@@ -70,6 +70,10 @@ MOSAICS = Remedy(
 )
 """For georeferenced rasters instead of remedies that concern cameras and flights."""
 MISSING_BAND = Remedy("a band is missing that other captures of this camera have", "copy the files from the card again")
+OTHER_REFERENCE = Remedy(
+    "another reference band than in most captures of the flight: pixels are on the grid of that band",
+    "copy missing files from the card again, or give --reference with a band that all captures have",
+)
 
 # ---- kinds of issues that reading, seeding and estimation report; a check defines its own
 

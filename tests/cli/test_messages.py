@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import signal
 from pathlib import Path
 
@@ -19,11 +20,10 @@ from agalign.cli.terminal import Terminal, exits, shown
 from agalign.errors import ConfigurationError, InputError, UnreadableFileError
 from agalign.flight.groups import camera_overviews
 from agalign.method.device import choose_device
-from agalign.products.report.facts import FailureGroups
 from agalign.synthetic import flight as synthetic
 
 from ..conftest import write_capture
-from ..products.test_sidecar import example
+from ..products.test_sidecar import NIR, example
 from ..program import agalign_here
 
 GREEN = "(did you mean 'Green'?); choose from Blue, Green, Red, NIR, Red edge"
@@ -260,7 +260,7 @@ def test_the_age_of_a_panel_is_printed_and_warned_of(
     radiometry: str, age_s: float | None, text: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     output = {"file": None, "bytes": None, "crop": (0, 0, 10, 8), "nodata": None, "radiometry": radiometry}
-    totals = RunTotals(True, FailureGroups())
+    totals = RunTotals(True)
     sidecar = example(output=output | {"panel_age_s": age_s})
     totals.add(CaptureReport("IMG_1", "done", sidecar.result()))
     conclude(totals, Path("out"), Terminal(quiet=False, verbose=False, log_json=False))
@@ -270,9 +270,28 @@ def test_the_age_of_a_panel_is_printed_and_warned_of(
     assert is_warned == (radiometry == "reflectance by panel" and age_s == 3180.0)
 
 
+def test_the_totals_count_missing_bands_and_captures_without_a_result(capsys: pytest.CaptureFixture[str]) -> None:
+    """Of a disk that is full after the second of four captures."""
+    totals = RunTotals(False, {f"IMG_{number}": 2 for number in range(4)})
+    blue = {"band": "Blue", "file": "b.tif", "band_index": 1, "width": 10, "height": 8}
+    aligned = NIR | {"status": "aligned", "reason": None}
+    complete = example(bands=[aligned, aligned | {"band": "Red"}])
+    totals.add(CaptureReport("IMG_0", "done", complete.result()))
+    totals.add(
+        CaptureReport("IMG_1", "done", example(bands=[aligned], missing_bands=["Green"], reference=blue).result())
+    )
+    assert conclude(totals, Path("out"), Terminal(quiet=False, verbose=False, log_json=False)) == 3
+    printed = capsys.readouterr()
+    assert "3 of 8 band pairs aligned; 2 captures not written" in printed.out
+    assert re.search(r"^│ Green +│ +0 │ +0 │ +0 │ +0 │ +1 │ +- │ +- │ +- │$", printed.out, re.MULTILINE)
+    reference = "IMG_1 Blue: other reference: on the grid of Blue; most captures of the flight are on that of Green"
+    assert reference in printed.err
+    assert "2 of 4 captures could not be written" in printed.err
+
+
 @pytest.mark.parametrize(("share", "is_printed"), [(0.031, True), (0.001, False), (None, False)])
 def test_saturated_bands_are_named(share: float | None, is_printed: bool, capsys: pytest.CaptureFixture[str]) -> None:
-    totals = RunTotals(True, FailureGroups())
+    totals = RunTotals(True)
     sidecar = example()
     sidecar.bands[0].saturated = share
     totals.add(CaptureReport("IMG_1", "done", sidecar.result()))

@@ -1,5 +1,6 @@
 """What the report knows and draws, without a browser."""
 
+import csv
 import json
 import re
 import shutil
@@ -57,6 +58,44 @@ def test_the_page_has_the_facts_of_every_capture(flight: Path, aligned_flight: P
             shifts = [None if v is None else v * facts["shift_step_px"] for v in pair["shifts"]]
             assert shifts == [v if v is None else pytest.approx(v, abs=0.006) for t in tiles for v in t["shift_px"]]
             assert facts["lattices"][pair["lattice"]] == [v for t in tiles for v in t["centre_px"]]
+
+
+def headline(out: Path) -> str:
+    """The text of the page's first paragraph, after it is written again."""
+    write_pages(out, pytest.fail)
+    page = (out / "index.html").read_text(encoding="utf-8")
+    return " ".join(re.sub("<[^>]+>", "", page.partition('<p class="verdict">')[2].partition("</p>")[0]).split())
+
+
+def change(path: Path, **changes: Any) -> None:
+    path.write_text(json.dumps(read_json(path) | changes))
+
+
+@pytest.mark.slow
+def test_the_headline_counts_what_was_to_be_aligned(out: Path) -> None:
+    assert headline(out).startswith("Every band of every capture is aligned. The median residual is")
+    record, sidecar = out / "agalign-run.json", out / "0000SET" / "000" / "IMG_0002.json"
+    change(record, problems=[{"of": "IMG_0003_1.tif", "problem": "cannot be read"}])
+    assert headline(out).startswith("8 of 8 band pairs are aligned. 1 file or capture took no part. The median")
+    change(record, problems=[{"of": "0000SET/000/IMG_0002", "problem": "IMG_0002.png: cannot be written"}])
+    assert headline(out).startswith("8 of 8 band pairs are aligned. 1 output was not written. The median")
+    change(record, problems=[], state="interrupted", captures={"found": 4, "done": 2})
+    assert headline(out).startswith("8 of 8 band pairs are aligned.")
+    assert "stopped before its end, 2 of 4 captures were not tried: the same command resumes it" in headline(out)
+    change(record, state="finished", captures={"found": 2, "done": 2})
+    change(sidecar, status="degraded", missing_bands=["Thermal", "Pan"])
+    assert headline(out).startswith("8 of 10 band pairs are aligned, 2 are missing. The median")
+
+
+@pytest.mark.slow
+def test_missing_bands_and_references_are_in_the_summary(out: Path) -> None:
+    change(out / "0000SET" / "000" / "IMG_0002.json", status="degraded", missing_bands=["Thermal"])
+    write_pages(out, pytest.fail)
+    rows = list(csv.DictReader((out / "summary.csv").read_text().splitlines()))
+    assert [r["status"] for r in rows] == ["aligned"] * 8 + ["missing"]
+    assert {r["reference"] for r in rows} == {"Green"}
+    assert (rows[-1]["folder"], rows[-1]["capture"], rows[-1]["band"]) == ("0000SET/000", "IMG_0002", "Thermal")
+    assert "other captures of this camera have" in rows[-1]["reason"]
 
 
 @pytest.mark.slow

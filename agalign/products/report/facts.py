@@ -2,10 +2,10 @@
 aligned, grouped by cause, with a remedy for each cause.
 """
 
-from collections.abc import Iterable, Sequence
+from collections import Counter, defaultdict
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from statistics import median
 from typing import Any
 from urllib.parse import quote
 
@@ -17,7 +17,7 @@ from agalign.products.index_table import IndexRow
 from agalign.products.report.light import CaptureLight, light_of
 from agalign.products.run_record import RefusalPart
 from agalign.products.sidecar import BandPart, BandResult, CaptureResult, GridPart, OutputPart, PreviewPart, Sidecar
-from agalign.values.issues import MISSING_BAND, MOSAICS, UNREADABLE, Remedy
+from agalign.values.issues import MISSING_BAND, MOSAICS, OTHER_REFERENCE, UNREADABLE, Remedy
 from agalign.verify.checks import KINDS
 
 _SHIFT_STEP_PX = 0.01
@@ -69,25 +69,69 @@ class FailureGroup:
 
 
 @dataclass
-class FailureGroups:
-    """The groups of a run. Captures are added one by one."""
+class BandTotals:
+    """One band over all captures."""
 
+    statuses: Counter[str] = field(default_factory=Counter)
+    """Number of captures by the status of the band."""
+    residuals_px: list[float] = field(default_factory=list)
+    """Of the captures in which it is aligned."""
+    offsets_px: list[float] = field(default_factory=list)
+    """Lengths of its offset between the raw files; for the report only."""
+    seconds: list[float] = field(default_factory=list)
+    """Processing times."""
+
+
+@dataclass
+class PairTotals:
+    """The band pairs of a run. Captures are added one by one, and not kept, which limits memory."""
+
+    bands: dict[str, BandTotals] = field(default_factory=lambda: defaultdict(BandTotals))
     _by_cause: dict[tuple[str, Remedy], FailureGroup] = field(default_factory=dict)
+    _references: list[tuple[str, tuple[str, ...], str]] = field(default_factory=list)
+    """(capture, flight, reference band)."""
+    _votes: dict[tuple[str, ...], Counter[str]] = field(default_factory=lambda: defaultdict(Counter))
+    """By flight, the number of captures that have a band as the reference, or lack it."""
 
     def add(self, label: str, result: CaptureResult) -> None:
-        """Add the bands of a capture that are missing or not aligned."""
-        moving = [b for b in result.bands if b.status not in ("reference", "aligned")]
-        is_mosaic = result.reference.georeferenced
-        refused = [(b.band, str(b.status), b.reason or "", _remedy_of(b, is_mosaic=is_mosaic)) for b in moving]
-        refused += [(name, "missing", MISSING_BAND.cause, MISSING_BAND) for name in result.missing_bands]
-        for band, status, reason, remedy in refused:
-            group = self._by_cause.setdefault((status, remedy), FailureGroup(status, remedy))
-            group.bands.append(RefusalPart(capture=label, band=band, status=status, reason=reason))
+        """Add the bands of a capture."""
+        parts, is_mosaic = {b.band: b for b in result.bands}, result.reference.georeferenced
+        for name, status, reason in result.pairs:
+            band, part = self.bands[name], parts.get(name)
+            band.statuses[status] += 1
+            band.seconds += [] if part is None else [part.seconds]
+            if status != "aligned":
+                refusal = RefusalPart(capture=label, band=name, status=status, reason=reason or "")
+                _add_to(self._by_cause, refusal, MISSING_BAND if part is None else _remedy_of(part, is_mosaic=is_mosaic))
+            elif part and part.metrics and (residual_px := part.metrics.after.residual_px) is not None:
+                band.residuals_px.append(residual_px)
+        camera, reference = result.camera, result.reference.band
+        flight = (camera.name, camera.serial, result.flight_id, "" if camera.model else Path(label).parent.as_posix())
+        self._references.append((label, flight, reference))
+        self._votes[flight].update((reference, *result.missing_bands))
+
+    @property
+    def statuses(self) -> Counter[str]:
+        """Number of pairs by status, with those of missing bands."""
+        return sum((band.statuses for band in self.bands.values()), Counter())
 
     def groups(self) -> list[FailureGroup]:
-        """Return the groups, the most severe first, and the largest first of those."""
-        severity = "failed", "seed_only", "missing", "predicted"
-        return sorted(self._by_cause.values(), key=lambda g: (severity.index(g.status), -len(g.bands), g.remedy.cause))
+        """Return the failures by cause, and the captures with another reference than most of their flight; the most
+        severe first, and the largest first of those.
+        """
+        groups = dict(self._by_cause)
+        for label, flight, band in self._references:
+            usual = self._votes[flight].most_common(1)[0][0]
+            if band != usual:
+                reason = f"on the grid of {band}; most captures of the flight are on that of {usual}"
+                refusal = RefusalPart(capture=label, band=band, status="other_reference", reason=reason)
+                _add_to(groups, refusal, OTHER_REFERENCE)
+        severity = "failed", "seed_only", "missing", "other_reference", "predicted"
+        return sorted(groups.values(), key=lambda g: (severity.index(g.status), -len(g.bands), g.remedy.cause))
+
+
+def _add_to(groups: dict[tuple[str, Remedy], FailureGroup], band: RefusalPart, remedy: Remedy) -> None:
+    groups.setdefault((band.status, remedy), FailureGroup(band.status, remedy)).bands.append(band)
 
 
 def _remedy_of(band: BandResult, *, is_mosaic: bool) -> Remedy:
@@ -98,36 +142,15 @@ def _remedy_of(band: BandResult, *, is_mosaic: bool) -> Remedy:
     return MOSAICS if is_mosaic and kind is not UNREADABLE else kind.remedy
 
 
-@dataclass(frozen=True)
-class BandRow:
-    """One band over all captures."""
-
-    name: str
-    aligned: int
-    """Number of captures in which it is aligned."""
-    pairs: int
-    """Number of captures."""
-    offset_px: float | None
-    """Median length of the offset between the raw files."""
-    residual_px: float | None
-    """Median residual after alignment."""
-    worst_px: float | None
-    """Largest residual of a capture."""
-    seconds: float
-    """Median processing time."""
-
-
 @dataclass
 class FlightFacts:
     """The data of the captures below an output folder, which are added one by one."""
 
     captures: list[dict[str, Any]] = field(default_factory=list)
     """As in the data of the report."""
-    bands: list[BandResult] = field(default_factory=list)
-    """All moving bands of all captures."""
+    pairs: PairTotals = field(default_factory=PairTotals)
     rows: list[dict[str, Any]] = field(default_factory=list)
-    """Their rows in OUT/summary.csv."""
-    failures: FailureGroups = field(default_factory=FailureGroups)
+    """The rows of the pairs in OUT/summary.csv."""
     light: list[CaptureLight] = field(default_factory=list)
     """The light of all captures."""
     _lattices: dict[tuple[float, ...], int] = field(default_factory=dict)
@@ -137,14 +160,13 @@ class FlightFacts:
         """Add a capture, given its folder relative to the output folder."""
         result = sidecar.result()
         label = Path(folder, sidecar.capture).as_posix()
-        moving = [b for b in result.bands if b.status != "reference"]
-        self.bands += moving
-        self.failures.add(label, result)
+        self.pairs.add(label, result)
         self.light.append(light_of(label, sidecar))
         output, position, path = sidecar.output, sidecar.position, Path(folder)
         grid = output or OutputPart(file=None, bytes=None, crop=(0, 0, *sidecar.reference.size_px), nodata=None)
         files = {part.kind: part.file for part in sidecar.products}
         relief = next((b.relief.file for b in sidecar.bands if b.relief is not None), None)
+        keys = {"folder": folder, "capture": sidecar.capture, "reference": sidecar.reference.band}
         facts = {
             "label": label,
             "captured_at": sidecar.captured_at,
@@ -154,7 +176,7 @@ class FlightFacts:
             "altitude_m": None if position is None else position.altitude_m,
             "missing": sidecar.missing_bands,
             "reference": sidecar.reference.band,
-            "seconds": round(sum(b.seconds for b in moving), 2),
+            "seconds": round(sum(b.seconds for b in result.bands if b.status != "reference"), 2),
             "max_predicted_px": sidecar.max_predicted_px,
             "crop": grid.crop,
             "scale": grid.scale,
@@ -164,10 +186,12 @@ class FlightFacts:
             "sidecar": _link(path, f"{sidecar.capture}.json"),
             "picture": _link(path, files.get("picture")),
             "preview": _preview(path, sidecar.preview),
-            "bands": [self._pair(b, sidecar, folder) for b in sidecar.bands],
+            "bands": [self._pair(b, sidecar, keys) for b in sidecar.bands],
             "indices": [],
         }
         self.captures.append(facts)
+        missing = keys | {"status": "missing", "reason": MISSING_BAND.cause}
+        self.rows += [missing | {"band": name} for name in sidecar.missing_bands]
 
     def add_indices(self, rows: Sequence[IndexRow]) -> None:
         """Add the spectral indices of captures that were added before."""
@@ -182,45 +206,22 @@ class FlightFacts:
                 picture = Path(row.file).with_suffix(".png").as_posix()
                 by_label[row.label].append(facts | {"file": quote(row.file), "picture": quote(picture)})
 
-    @property
-    def residuals_px(self) -> list[float]:
-        """Residuals of the aligned pairs, sorted."""
-        return sorted(_residuals_px(self.bands))
-
-    def by_band(self) -> list[BandRow]:
-        """Return a row for each band."""
-        rows = []
-        for name in dict.fromkeys(b.band for b in self.bands):
-            pairs = [b for b in self.bands if b.band == name]
-            residuals_px = _residuals_px(pairs)
-            facts = (b for c in self.captures for b in c["bands"] if b["band"] == name)
-            offsets_px = [b["offset_length_px"] for b in facts if b["offset_length_px"] is not None]
-            row = BandRow(
-                name,
-                aligned=sum(b.status == "aligned" for b in pairs),
-                pairs=len(pairs),
-                offset_px=_median(offsets_px),
-                residual_px=_median(residuals_px),
-                worst_px=max(residuals_px, default=None),
-                seconds=median(b.seconds for b in pairs),
-            )
-            rows.append(row)
-        return rows
-
     def as_json(self) -> dict[str, Any]:
         """Return the data of the schema `agalign-report/1`. The script of the page declares their types."""
         facts = {"schema": "agalign-report/1", "captures": self.captures, "shift_step_px": _SHIFT_STEP_PX}
         return facts | {"lattices": [list(centres) for centres in self._lattices]}
 
-    def _pair(self, band: BandPart, sidecar: Sidecar, folder: str) -> dict[str, Any]:
-        """The data of a band. Its row is added unless it is the reference."""
+    def _pair(self, band: BandPart, sidecar: Sidecar, keys: dict[str, Any]) -> dict[str, Any]:
+        """The data of a band. Its row, with `keys`, and its offset are added unless it is the reference."""
         row = {column: value_at(band, path) for column, path in BAND_COLUMNS.items()}
         if band.status != "reference":
-            self.rows.append({"folder": folder, "capture": sidecar.capture, **row})
+            self.rows.append(keys | row)
         metrics, tiles = band.metrics, [] if band.metrics is None else band.metrics.tiles
         similarity = {name: (row[f"{name}_before"], row[f"{name}_after"]) for name in _SIMILARITY}
         lattice = tuple(v for t in tiles for v in t.centre_px)
         offset_px, offset_length_px = _band_offset(band.grid, sidecar)
+        if offset_length_px is not None and band.status != "reference":
+            self.pairs.bands[band.band].offsets_px.append(offset_length_px)
         # The first nine columns of the table have the same names here.
         return {name: row[name] for name in tuple(BAND_COLUMNS)[:9]} | {
             "seconds": round(band.seconds, 2),
@@ -269,16 +270,6 @@ def _preview(folder: Path, preview: PreviewPart | None) -> dict[str, Any] | None
 
 def _fields_of(part: BaseModel | None) -> dict[str, Any] | None:
     return None if part is None else part.model_dump(by_alias=True)
-
-
-def _residuals_px(bands: Iterable[BandResult]) -> list[float]:
-    """The residuals of the aligned bands."""
-    residuals_px = (b.metrics.after.residual_px for b in bands if b.status == "aligned" and b.metrics)
-    return [residual_px for residual_px in residuals_px if residual_px is not None]
-
-
-def _median(values: Sequence[float]) -> float | None:
-    return median(values) if values else None
 
 
 def _band_offset(grid: GridPart | None, sidecar: Sidecar) -> tuple[tuple[float, float] | None, float | None]:

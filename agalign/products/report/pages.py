@@ -29,7 +29,7 @@ from agalign.products.sidecar_file import find_sidecars, read_sidecar
 from agalign.products.text_files import write_csv
 from agalign.values.files import write_text
 
-SUMMARY_COLUMNS = ("folder", "capture", *BAND_COLUMNS)
+SUMMARY_COLUMNS = ("folder", "capture", *BAND_COLUMNS, "reference")
 REPORT_FILE, SUMMARY_FILE = "index.html", "summary.csv"
 
 
@@ -74,7 +74,7 @@ def write_pages(out: Path, on_problem: Callable[[str], None]) -> Pages:
         unreadable.append(str(error))
     _write_summary(out / SUMMARY_FILE, facts.rows, panels, sky)
     facts.add_indices(update_table(out, indices))
-    failures = facts.failures.groups()
+    failures = facts.pairs.groups()
     slowest = sorted(((c["label"], c["seconds"]) for c in facts.captures), key=lambda c: -c[1])[:5]
     write_text(out / REPORT_FILE, _page(out, facts, levels, panels, sky, run, unreadable.append))
     if unreadable:
@@ -128,7 +128,7 @@ def _page(
         lstrip_blocks=True,
         undefined=StrictUndefined,
     )
-    script = _resource("page.js")
+    script, states = _resource("page.js"), Counter({} if run is None else run.captures)
     return environment.get_template("page.html.j2").render(
         version=__version__,
         style=_resource("page.css"),
@@ -137,18 +137,22 @@ def _page(
         facts=_script_json(facts.as_json()),
         captures=facts.captures,
         counts=Counter(c["status"] for c in facts.captures),
-        statuses=Counter(b.status for b in facts.bands),
-        pairs=len(facts.bands),
+        statuses=facts.pairs.statuses,
+        pairs=facts.pairs.statuses.total(),
+        found=states["found"],
+        errors=states["error"],
+        untried=2 * states["found"] - states.total(),  # the other states are of captures that were tried
         cameras=Counter(c["camera"] for c in facts.captures),
-        residuals_px=facts.residuals_px,
+        residuals_px=sorted(px for band in facts.pairs.bands.values() for px in band.residuals_px),
         capture_seconds=median(c["seconds"] for c in facts.captures) if facts.captures else None,
-        run_seconds=run.seconds if run is not None and run.captures.get("done") == len(facts.captures) else None,
-        failures=facts.failures.groups(),
+        run_seconds=run.seconds if run is not None and states["done"] == len(facts.captures) else None,
+        failures=facts.pairs.groups(),
         problems=[] if run is None else run.problems,
         settings=_changed_settings(run),
         run=run,
         unfinished=run is not None and run.state == "interrupted",
-        bands=facts.by_band(),
+        bands=facts.pairs.bands,
+        median=median,
         rigs=rig_views(out, on_problem),
         drifts=drifts_of(facts.captures),
         light=light_charts(facts.light),
