@@ -102,7 +102,8 @@ class PairTotals:
             band.seconds += [] if part is None else [part.seconds]
             if status != "aligned":
                 refusal = RefusalPart(capture=label, band=name, status=status, reason=reason or "")
-                _add_to(self._by_cause, refusal, MISSING_BAND if part is None else _remedy_of(part, is_mosaic=is_mosaic))
+                remedy = MISSING_BAND if part is None else _remedy_of(part, is_mosaic=is_mosaic)
+                _add_to(self._by_cause, refusal, remedy)
             elif part and part.metrics and (residual_px := part.metrics.after.residual_px) is not None:
                 band.residuals_px.append(residual_px)
         camera, reference = result.camera, result.reference.band
