@@ -91,10 +91,10 @@ def originals(shared: Shared, flight: Path) -> Path:
     return shared("desk", fill)
 
 
-@pytest.fixture(scope="module")
-def desk(originals: Path, aligned_flight: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder that all pages use one after another; the flight is aligned."""
-    folder = shutil.copytree(originals, tmp_path_factory.mktemp("desk") / "desk", symlinks=True)
+@pytest.fixture
+def desk(originals: Path, aligned_flight: Path, tmp_path: Path) -> Path:
+    """A folder of one page, so that no page depends on another; the flight is aligned."""
+    folder = shutil.copytree(originals, tmp_path / "desk", symlinks=True)
     shutil.copytree(aligned_flight, folder / "aligned")
     return folder
 
