@@ -9,7 +9,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from agalign.batch.capture_report import CaptureReport, FlightReports
 from agalign.batch.capture_task import process_capture, quiet
-from agalign.batch.run import run_flight
+from agalign.batch.earlier_results import refuse_other_captures
+from agalign.batch.run import Listener, run_flight
 from agalign.cameras.discover import discover
 from agalign.capture.align_bands import align_pairs
 from agalign.capture.band_pair import BandPair, Candidates
@@ -111,9 +112,11 @@ def align_capture(capture: Capture, out: str | Path, *, settings: Settings | Non
     below `out`.
 
     Returns a CaptureReport with the state `done`; bands that are not aligned are in its `result`, not raised. Raises
-    UnreadableFileError if its reference band cannot be read, and OutputError.
+    UnreadableFileError if its reference band cannot be read, ConfigurationError if `out` has the result of another
+    capture in its place, and OutputError.
     """
     settings = settings or Settings()
+    refuse_other_captures([capture], Path(out))
     return process_capture(with_radiometry(capture, settings.write.radiometry, {}), Path(out), settings)
 
 
@@ -135,7 +138,7 @@ def align_folder(
     logger `agalign` logs each capture at the level INFO.
     Returns the reports in the order in which the captures were finished.
     Raises InputError if the folder does not exist, OutputError if `out` cannot be written, ConfigurationError
-    for a model of another camera.
+    for a model of another camera, and if `out` has results of other captures of the same name.
     """
     from agalign.products.report import write_pages
 
@@ -144,7 +147,7 @@ def align_folder(
     result = discover(source, options or DiscoverOptions(skip=(target,)))
     start = None if model is None else Path(model)
     reports = FlightReports()
-    for report in run_flight(result, target, settings or Settings(), run, model=start):
+    for report in run_flight(result, target, settings or Settings(), run, Listener(on_again=_LOG.info), start):
         reports.append(report)
         _LOG.info("%d of %d: %s: %s", len(reports), len(result.captures), report.label, report.summary)
         if progress is not None:

@@ -142,6 +142,12 @@ class SettingsModel(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid", use_attribute_docstrings=True)
 
+    @classmethod
+    def flag(cls, field: str) -> str:
+        """Return the long name of the command-line option of a field, with its dashes."""
+        names = (m.name for m in cls.model_fields[field].metadata if isinstance(m, Option) and m.name)
+        return "--" + next(names, field).replace("_", "-").removeprefix("start-")  # --model sets `start_model`
+
     def __repr_args__(self) -> Iterator[tuple[str | None, Any]]:
         """Return the fields that differ from their defaults."""
         for name, field in type(self).model_fields.items():

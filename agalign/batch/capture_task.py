@@ -1,6 +1,7 @@
 """Align one capture and write its products and its sidecar, also as the task of a worker."""
 
 import logging
+import re
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -14,11 +15,13 @@ from agalign.config import Settings, WriteSettings
 from agalign.errors import AgalignError, ConfigurationError, InputError, OutputError, SidecarError
 from agalign.flight.model import FlightModel, load_model
 from agalign.method.device import choose_device, keep_freed_memory, one_memory_error, one_thread
+from agalign.products.aligned_files import band_file_names
 from agalign.products.fill_sidecar import sidecar_of
 from agalign.products.index_rasters import outdated_rasters
 from agalign.products.layout import FlightLimits, output_layers
 from agalign.products.preview import preview_bytes
 from agalign.products.product import CapturePaths, ProductContext
+from agalign.products.raster_file import is_aligned_raster
 from agalign.products.registry import PRODUCTS
 from agalign.products.sidecar_file import read_result, write_sidecar
 from agalign.values.capture import Capture
@@ -39,12 +42,14 @@ def process_capture(
     model: FlightModel | None = None,
     max_preview_bytes: int = preview_bytes(1),
     limits: FlightLimits = (),
+    common: OutputGrid | None = None,
 ) -> CaptureReport:
     """Align a capture, write its products and its sidecar, and return its report, without times.
 
     The other bands are aligned where one cannot be. The bands already have the chosen radiometry (`with_radiometry`).
     With the `model` of the flight, a network is learned from scratch only for bands that the model cannot align. The
-    preview has at most about `max_preview_bytes`. The crop follows from the `limits` of the flights of the camera.
+    preview has at most about `max_preview_bytes`. The captures of the camera have the `limits` of its flights, and
+    their `common` grid, if any.
     Raises UnreadableFileError if the reference cannot be read, InputError or ConfigurationError if the capture or the
     installation lacks what a product needs, and OutputError.
     """
@@ -60,7 +65,7 @@ def process_capture(
     whole = OutputGrid(0, 0, *capture.reference.size_px)
     context = ProductContext(capture, paths, settings, alignments, (), whole, max_preview_bytes, limits)
     if context.with_pixels:
-        layers, grid = output_layers(capture, context.with_pixels, settings.write, limits)
+        layers, grid = output_layers(capture, context.with_pixels, settings.write, common)
         context = replace(context, layers=layers, grid=grid)
     discard_outputs(capture, out, settings.write)
     failures = _write_products(context)
@@ -113,17 +118,24 @@ def discard_outputs(capture: Capture, out: Path, settings: WriteSettings) -> Non
     """Remove the outputs of an earlier run for a capture, and the indices calculated from them.
 
     Otherwise a sidecar could describe rasters of another run, and bands on an old grid could remain among new ones.
-    Files that cannot be removed are overwritten later, or their writer reports the error.
+    Anyone may have written the sidecar: of its other files, only aligned rasters named as bands of this capture are
+    removed. Files that cannot be removed are overwritten later, or their writer reports the error.
     """
-    paths = CapturePaths.of(capture, out)
+    paths, sources = CapturePaths.of(capture, out), {band.path.resolve() for band in capture.bands}
     old = paths_written(capture, out, settings)
     with suppress(SidecarError):
-        old += [paths.folder / name for name in read_result(paths.sidecar).files]
+        listed = [paths.folder / name for name in read_result(paths.sidecar).files]
+        # Also of a band that this run leaves out; a file with a sidecar is the stack of another capture.
+        pattern = re.compile(rf"{re.escape(capture.name)}(\d|[._].+)\.tiff?", re.IGNORECASE)
+        own = [p for p in listed if pattern.fullmatch(p.name) and not p.with_suffix(".json").exists()]
+        own += [paths.folder / name for name in band_file_names(capture).values()]
+        old += [p for p in own if p in listed and is_aligned_raster(p)]
         old += outdated_rasters(paths.file(""))
     for path in old:
         with suppress(OSError, OutputError):
             check_inside(path.parent, out)
-            path.unlink(missing_ok=True)
+            if path.resolve() not in sources:
+                path.unlink(missing_ok=True)
 
 
 def missing_radiometry(capture: Capture, choice: RadiometryChoice) -> str:
@@ -151,6 +163,7 @@ class Task:
     model: Path | None
     max_preview_bytes: int = preview_bytes(1)
     limits: FlightLimits = ()
+    common: OutputGrid | None = None
 
     def absolute(self) -> "Task":
         """Return the task with absolute paths: workers may have another working folder."""
@@ -165,7 +178,7 @@ def do_capture(task: Task, on_pair: PairProgress = quiet) -> CaptureReport:
     try:
         model = None if task.model is None else loaded_model(task.model, task.settings.joint.device)
         with one_thread(), one_memory_error():
-            facts = task.max_preview_bytes, task.limits
+            facts = task.max_preview_bytes, task.limits, task.common
             report = process_capture(task.capture, task.out, task.settings, clock, model, *facts)
     except Exception as error:
         # A defect of agalign in one capture must not stop the others.

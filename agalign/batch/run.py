@@ -1,8 +1,8 @@
 """A run over many captures: select those to process, learn the model of each flight, process them."""
 
-import stat
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
@@ -20,6 +20,7 @@ from agalign.batch.capture_task import (
     quiet,
     refuse_to_overwrite,
 )
+from agalign.batch.earlier_results import changes, outputs_exist, refuse_other_captures
 from agalign.batch.flight_learning import learn_flight, learning_fingerprint
 from agalign.batch.output_folder import is_full, locked
 from agalign.batch.workers import Run, failure_text, in_order, on_executor, own_processes, serially
@@ -27,11 +28,10 @@ from agalign.cameras.discover import FolderScan
 from agalign.capture.align_bands import PairProgress
 from agalign.config import RunOptions, Settings, WriteSettings
 from agalign.errors import AgalignError, ConfigurationError, InputError, OutputError, SidecarError
-from agalign.flight.fingerprint import fingerprint
 from agalign.flight.groups import camera_key, difference, flight_camera, flights_of, is_flight_of, model_names
 from agalign.flight.model import FlightModel, load_model, save_model
 from agalign.flight.panel_readings import PanelReading, read_panel, reflectance_factors, with_height, with_panels
-from agalign.flight.rig import Rig
+from agalign.flight.rig import MIN_CAPTURES, Rig
 from agalign.flight.rig_file import read_rig
 from agalign.flight.sky import SkyCapture, sky_captures
 from agalign.method.device import choose_device, limit_threads
@@ -41,7 +41,7 @@ from agalign.products.excluded_captures import write_panels, write_sky
 from agalign.products.flight_map import FlightMap
 from agalign.products.footprint import above_elevation, missing_for_footprint, with_approximate_georeference
 from agalign.products.index_rasters import check_indices
-from agalign.products.layout import FlightLimits, flight_limits
+from agalign.products.layout import FlightLimits, common_grid, flight_limits
 from agalign.products.preview import preview_bytes
 from agalign.products.product import CapturePaths
 from agalign.products.run_record import ExclusionPart, RunPart, RunState, begun
@@ -51,7 +51,9 @@ from agalign.products.stac import write_collections
 from agalign.values.capture import Capture
 from agalign.values.cores import usable_cores
 from agalign.values.files import check_inside
+from agalign.values.image import OutputGrid
 from agalign.values.processes import CAPTURES_WORTH_A_PROCESS
+from agalign.values.text import counted
 
 _MAX_THREADS = 4
 """Maximum number of threads that train a network or process captures; more wait for the interpreter's lock."""
@@ -72,6 +74,8 @@ class Listener:
     """Camera of the network that is being learned, and the share that is done."""
     on_learnt: Callable[[str, float], None] = quiet
     """Camera of the network that was learned, and the seconds that it took."""
+    on_again: Callable[[str], object] = quiet
+    """How many finished captures are done again, and what has changed since; called before any is replaced."""
 
 
 def run_flight(
@@ -87,14 +91,16 @@ def run_flight(
     First a model is learned for every camera and flight, starting from `model` if given, and saved below OUT/models. A
     failed capture does not stop the others, and results do not depend on the order of the captures. The run is recorded
     in OUT/agalign-run.json.
-    Raises OutputError if the output folder cannot be used, another run writes there or the disk is full, WorkerError if
-    no worker process can be started or worker processes end one after another, InputError or ConfigurationError for
-    `model`, ConfigurationError for a device, and for a radiometry or georeference that no capture has the tags for.
+    Raises OutputError if the output folder cannot be used, another run writes there, the disk is full or outputs were
+    removed, WorkerError if no worker process can be started or worker processes end one after another, InputError or
+    ConfigurationError for `model`, ConfigurationError for a device, for results of other captures of the same name, and
+    for a radiometry or georeference that no capture has the tags for.
     """
     run = _FlightRun(flight, out, settings, options or RunOptions(), listener or Listener())
     run.check()
     if model is not None:
         run = run.starting_from(model)
+    written: dict[str, tuple[Path, Mapping[str, int]]] = {}  # (sidecar, files) by label
     with locked(out), _recorded(run) as record:
         for report in run.reports(record):
             record.add(report.label, report.state, report.result, report.problems)
@@ -105,6 +111,12 @@ def run_flight(
             yield report
             if report.problems and is_full(out):
                 raise OutputError(f"{out}: the disk is full; free space, then the same command resumes the run")
+            if report.result is not None and report.path is not None:
+                written[report.label] = report.path, report.result.files
+        gone = [label for label, (path, files) in written.items() if not outputs_exist(path, files)]
+        if gone:
+            what = f"outputs of {counted(len(gone), 'capture')} were removed during the run, such as of {gone[0]}"
+            raise OutputError(f"{out}: {what}; the same command writes them again")
 
 
 def plan_run(flight: FolderScan, out: Path, settings: Settings, options: RunOptions | None = None) -> dict[str, str]:
@@ -117,7 +129,10 @@ def plan_run(flight: FolderScan, out: Path, settings: Settings, options: RunOpti
     sky, panels, captures = run.selected()
     states = {s.capture.label: "left out as sky" for s in sky}
     states |= {p.capture.label: "read as calibration panels" for p in panels if p.capture.is_of_a_panel}
-    states |= {c.label: "to be aligned" if run.kept(c) is None else "kept from an earlier run" for c in captures}
+    for capture in captures:
+        kept, changed = run.earlier(capture)
+        again = f"to be done again; changed since: {', '.join(changed)}" if changed else "to be aligned"
+        states[capture.label] = again if kept is None else "kept from an earlier run"
     return {c.label: states[c.label] for c in flight.captures}
 
 
@@ -161,6 +176,7 @@ class _FlightRun:
         if self.out.resolve() == self.flight.folder.resolve():
             raise ConfigurationError(f"{self.out}: is the folder of the images; choose another output folder with -o")
         refuse_to_overwrite(self.flight.captures, self.out, self.settings.write)
+        refuse_other_captures(self.flight.captures, self.out)
         check_inside(self.out / "models", self.out)
 
     def starting_from(self, path: Path) -> Self:
@@ -201,19 +217,19 @@ class _FlightRun:
             raise ConfigurationError(f"--georeference: no capture has {missing_for_footprint(captures[0])}")
         return sky, panels, captures
 
-    def kept(self, capture: Capture) -> CaptureResult | None:
-        """Return the result of an earlier run; None if the capture must be processed (again): settings or bands differ,
-        or an output is missing.
+    def earlier(self, capture: Capture) -> tuple[CaptureResult | None, tuple[str, ...]]:
+        """Return (the result of an earlier run, what has changed since); no result if the capture must be processed
+        (again), also because an output is missing.
         """
         path = CapturePaths.of(capture, self.out).sidecar
         try:
-            earlier = None if self.options.overwrite else read_result(path)
+            earlier = read_result(path)
         except SidecarError:
-            return None
-        if earlier is None or earlier.not_written or (self.options.retry_failed and earlier.status != "ok"):
-            return None
-        is_current = earlier.settings == fingerprint(capture, self.settings) and _outputs_exist(earlier, path.parent)
-        return earlier if is_current else None
+            return None, ()
+        changed = changes(earlier, capture, self.settings)
+        wanted = self.options.overwrite or (self.options.retry_failed and earlier.status != "ok")
+        is_kept = not (changed or wanted or earlier.not_written) and outputs_exist(path, earlier.files)
+        return earlier if is_kept else None, changed
 
     def reports(self, record: RunPart) -> Iterator[CaptureReport]:
         """Yield the report of each capture; add the time of learning to the record."""
@@ -223,20 +239,8 @@ class _FlightRun:
             discard_outputs(capture, out, settings.write)
             flight_map.add(capture, report.state)
             yield report
-        flights: list[_Flight] = []
-        groups = flights_of(captures)
-        for group, name in zip(groups, model_names(groups), strict=True):
-            pending = []
-            for capture in group:
-                kept = self.kept(capture)
-                if kept is None:
-                    pending.append(capture)
-                else:
-                    flight_map.add(capture, kept.status, kept)
-                    yield CaptureReport(capture.label, "kept", kept, CapturePaths.of(capture, out).sidecar)
-            flights.append((group, name, pending))
         by_label = {c.label: c for c in captures}
-        for report in self._processed(flights, record):
+        for report in self._aligned(captures, record):
             status = "failed" if report.result is None else report.result.status
             flight_map.add(by_label[report.label], status, report.result)
             yield report
@@ -256,23 +260,48 @@ class _FlightRun:
                 record.excluded.append(ExclusionPart(capture=reading.capture.label, kind="panel", evidence=part.cues))
                 yield CaptureReport(reading.capture.label, "panel", panel=part.sentence), reading.capture
 
-    def _processed(self, flights: Sequence[_Flight], record: RunPart) -> Iterator[CaptureReport]:
-        """Learn the model of each flight and process its captures; yield their reports as they complete."""
+    def _aligned(self, captures: Sequence[Capture], record: RunPart) -> Iterator[CaptureReport]:
+        """Learn the model of each flight, keep finished captures and process the others; yield their reports as they
+        complete.
+        """
+        grids: dict[str, OutputGrid | None] = {}  # of kept captures; the results of a season would not fit into memory
+        again: dict[str, tuple[str, ...]] = {}
+        for capture in captures:
+            kept, changed = self.earlier(capture)
+            if changed:
+                again[capture.label] = changed
+            if kept is not None:
+                grids[capture.label] = None if kept.output is None else kept.output.grid
+        groups = flights_of(captures)
+        flights = [
+            (group, name, [c for c in group if c.label not in grids])
+            for group, name in zip(groups, model_names(groups), strict=True)
+        ]
         on_cpu = choose_device(self.settings.joint.device).type == "cpu"
         cores = self.options.jobs or (usable_cores() if on_cpu else 1)
         with _chosen_run(sum(len(pending) for _, _, pending in flights), cores, self.options) as run:
             models: list[Path | None] = []
             learn = partial(learn_flight, apply=partial(in_order, run), threads=min(_MAX_THREADS, cores))
-            for captures, name, pending in flights:
+            for group, name, pending in flights:
                 path = self.out / "models" / name
-                finished = path if path.is_file() else None
-                models.append(self._model(captures, path, learn, record) if pending else finished)
-            limits, max_bytes = _limits_of_cameras(flights, models), preview_bytes(len(self.flight.captures))
-            tasks = [
-                Task(c, self.out, self.settings, path, max_bytes, limits[camera_key(c)])
-                for (_, _, pending), path in zip(flights, models, strict=True)
-                for c in pending
-            ]
+                models.append(self._model(group, path, learn, record) if pending else path if path.is_file() else None)
+            crops = _crops_of_cameras(flights, models, grids, self.settings.write)
+            max_bytes = preview_bytes(len(self.flight.captures))
+            tasks = []
+            for (group, _, _), model in zip(flights, models, strict=True):
+                for capture in group:
+                    limits, common = crops[_crop_key(capture)]
+                    if common is not None and grids.get(capture.label) not in (None, common):
+                        again[capture.label] = ("crop of the flight",)
+                    elif capture.label in grids:
+                        sidecar = CapturePaths.of(capture, self.out).sidecar
+                        yield CaptureReport(capture.label, "kept", read_result(sidecar), sidecar)
+                        continue
+                    tasks.append(Task(capture, self.out, self.settings, model, max_bytes, limits, common))
+            if again:
+                names = ", ".join(dict.fromkeys(name for changed in again.values() for name in changed))
+                finished = counted(len(again), "finished capture")
+                self.listener.on_again(f"{finished} to be done again; changed since: {names}")
             yield from capture_reports(run, tasks, self.listener, self.options.timeout_s)
 
     def _model(
@@ -307,6 +336,34 @@ def _limits_of_cameras(flights: Sequence[_Flight], models: Sequence[Path | None]
             rig = None if path is None else read_rig(path)[1]
         by_camera.setdefault(camera_key(captures[0]), []).append((captures, rig))
     return {camera: flight_limits(of_camera) for camera, of_camera in by_camera.items()}
+
+
+def _crop_key(capture: Capture) -> tuple[str, bool]:
+    """The camera, and whether its reference can be undistorted."""
+    return camera_key(capture), capture.reference.lens is None
+
+
+def _crops_of_cameras(
+    flights: Sequence[_Flight],
+    models: Sequence[Path | None],
+    kept: Mapping[str, OutputGrid | None],
+    settings: WriteSettings,
+) -> dict[tuple[str, bool], tuple[FlightLimits, OutputGrid | None]]:
+    """The limits and the common grid of each camera: that of most of its `kept` captures, given by label, if they are
+    enough for a rig, else that of the rigs of its flights.
+    """
+    limits, result = _limits_of_cameras(flights, models), {}
+    captures = [c for captures, _, _ in flights for c in captures]
+    for key, capture in {_crop_key(c): c for c in captures}.items():
+        grid = common_grid(capture.reference, settings, limits[key[0]])
+        earlier = Counter(kept[c.label] for c in captures if _crop_key(c) == key and kept.get(c.label) is not None)
+        if settings.crop == "flight" and earlier:
+            ((most, count),) = earlier.most_common(1)
+            # Without rigs, each capture has its own grid.
+            if count >= MIN_CAPTURES and (grid is not None or len(earlier) == 1):
+                grid = most
+        result[key] = limits[key[0]], grid
+    return result
 
 
 def _calibrated(capture: Capture, panels: Sequence[PanelReading], settings: WriteSettings) -> Capture:
@@ -372,12 +429,3 @@ def _read_ahead(capture: Capture) -> None:
         with suppress(OSError):
             if path.stat().st_size <= max_bytes:
                 path.read_bytes()
-
-
-def _outputs_exist(sidecar: CaptureResult, folder: Path) -> bool:
-    """True if every file that the sidecar lists exists with its size; checksums would take minutes."""
-    try:
-        states = [((folder / name).stat(), size) for name, size in sidecar.files.items()]
-    except OSError:
-        return False
-    return all(stat.S_ISREG(state.st_mode) and state.st_size == size for state, size in states)

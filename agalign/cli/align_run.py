@@ -14,16 +14,19 @@ from pathlib import Path
 from statistics import median
 from typing import TYPE_CHECKING
 
+from agalign.batch.earlier_results import outputs_exist
 from agalign.batch.workers import dask_executor
 from agalign.cameras.discover import FolderScan, discover
 from agalign.cli.terminal import MAX_LISTED, ExitCode, Terminal, shown
 from agalign.config import DiscoverOptions, RunOptions, Settings
-from agalign.errors import InputError, OutputError, WorkerError
+from agalign.errors import InputError, OutputError, SidecarError, WorkerError
 from agalign.flight.groups import camera_overviews
+from agalign.products.product import CapturePaths
 from agalign.products.report import REPORT_FILE, pages_exist, write_pages
 from agalign.products.report.facts import FailureGroup, PairTotals
 from agalign.products.run_record import exclusion_lines, read_run_record
 from agalign.products.sidecar import BandResult, CaptureResult
+from agalign.products.sidecar_file import read_result
 from agalign.values.capture import Capture
 from agalign.values.text import counted
 
@@ -131,6 +134,20 @@ class RunTotals:
             share = band.saturated or 0.0
             self.saturated[band.band] = max(self.saturated.get(band.band, (0.0, "")), (share, report.label))
 
+    def recount(self, captures: Sequence[Capture], out: Path) -> None:
+        """Count the pairs of those captures whose files exist: an error may be that outputs were removed."""
+        self.pairs = PairTotals()
+        for capture in captures:
+            path = CapturePaths.of(capture, out).sidecar
+            try:
+                result = read_result(path)
+            except SidecarError:
+                continue
+            if outputs_exist(path, result.files):
+                self.pairs.add(capture.label, result)
+            else:
+                self.unfinished[capture.label] = len(capture.moving) + len(capture.missing_bands)
+
 
 def run(
     flight: FolderScan,
@@ -174,6 +191,9 @@ def run(
         def on_learnt(camera: str, seconds: float) -> None:
             terminal.event("learnt", camera=camera, seconds=round(seconds, 2))
 
+        def on_again(text: str) -> None:
+            terminal.event("again", text, message=text)
+
         def on_pair(band: str, stage: str, share: float) -> None:
             terminal.check()
             assert current is not None
@@ -183,7 +203,7 @@ def run(
             show(finished / max(len(names), 1), f"{current.label} {band}: {stage}")
 
         try:
-            listener = Listener(on_start, on_pair, on_learning, on_learnt)
+            listener = Listener(on_start, on_pair, on_learning, on_learnt, on_again)
             for report in run_flight(flight, out, settings, options, listener, model):
                 terminal.check()
                 totals.add(report)
@@ -195,6 +215,7 @@ def run(
                 raise
             terminal.problem(str(error))
             totals.is_complete = False
+            totals.recount(flight.captures, out)
         finally:
             # Also after an interruption.
             if totals.states:

@@ -1,6 +1,7 @@
 """Fingerprints: hashes of everything that a result depends on."""
 
 import hashlib
+import os
 import struct
 from collections.abc import Iterable
 from contextlib import suppress
@@ -11,6 +12,7 @@ import numpy as np
 from agalign._version import __version__
 from agalign.config import Settings, SettingsModel
 from agalign.values.capture import Capture
+from agalign.values.files import open_regular
 from agalign.values.lens import Lens
 
 Fact = str | int | float | bool | None | np.ndarray | Lens | Iterable["Fact"]
@@ -39,6 +41,21 @@ def refinement_key(capture: Capture, settings: Settings) -> str:
 def hashed(*facts: Fact) -> str:
     """Return the first 16 hexadecimal digits of the SHA-256 of the facts."""
     return hashlib.sha256(b"".join(map(_canonical, facts))).hexdigest()[:16]
+
+
+def input_samples(capture: Capture) -> dict[str, str]:
+    """Return a hash of the size and of three parts of the file of each band: the images of two captures differ in it.
+
+    Files that cannot be read are left out.
+    """
+    part_bytes = 1 << 14
+    samples: dict[Path, str] = {}
+    for path in {b.path for b in capture.bands}:
+        with suppress(OSError), open_regular(path) as file:
+            size = file.seek(0, os.SEEK_END)
+            parts = [file.read(part_bytes) for k in range(3) if file.seek(k * max(0, size - part_bytes) // 2) >= 0]
+            samples[path] = hashlib.sha256(b"%d " % size + b"".join(parts)).hexdigest()[:16]
+    return {b.name: samples[b.path] for b in capture.bands if b.path in samples}
 
 
 def _canonical(fact: Fact) -> bytes:

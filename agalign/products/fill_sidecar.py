@@ -12,7 +12,7 @@ from scipy.interpolate import CloughTocher2DInterpolator
 from agalign._version import __version__
 from agalign.cameras.base import is_thermal
 from agalign.errors import UnreadableFileError
-from agalign.flight.fingerprint import fingerprint
+from agalign.flight.fingerprint import fingerprint, input_samples
 from agalign.products.aligned_files import BandFiles, Stack
 from agalign.products.product import ProductContext, WrittenFile
 from agalign.products.relief_map import ReliefMap
@@ -71,6 +71,8 @@ def sidecar_of(context: ProductContext, not_written: Sequence[str] = ()) -> Side
         "products": [_file(f, context) | {"kind": f.kind, "sha256": f.sha256} for f in context.written],
         "not_written": not_written,
         "settings": fingerprint(capture, context.settings),
+        "options": context.settings.model_dump(mode="json", exclude_defaults=True),
+        "input_samples": input_samples(capture),
     }
     return Sidecar.model_validate(facts)
 

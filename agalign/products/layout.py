@@ -69,23 +69,23 @@ def output_layers(
     capture: Capture,
     alignments: Mapping[str, Alignment[FixedFilePx]],
     settings: WriteSettings,
-    limits: FlightLimits = (),
+    common: OutputGrid | None = None,
 ) -> tuple[list[Layer], OutputGrid]:
-    """Return a layer for each band of a capture, given the alignments of its usable moving bands, and their grid.
-
-    With the `limits` of the flights of a camera, all its captures have the same grid.
+    """Return a layer for each band of a capture, given the alignments of its usable moving bands, and their grid: the
+    `common` one of the camera, if any.
     """
     reference = capture.reference
     mappings = {b.name: alignments[b.name].mapping for b in capture.moving if b.name in alignments}
-    of_flight = _between_files(limits, reference) if settings.crop == "flight" else []
-    frame = _frame(reference, [mapping for mapping, _ in of_flight] or mappings.values(), settings)
+    frame = common or _frame(reference, mappings.values(), settings)
     if frame.undistorted or frame.scale != SAME_PIXELS:
         mappings[reference.name] = PixelMapping(geometry.identity())  # otherwise the reference is copied
     on_frame = {name: _on_frame(mapping, frame, reference) for name, mapping in mappings.items()}
     layers = [Layer(b, on_frame.get(b.name), is_reference=b is reference) for b in capture.bands]
     # The crop is calculated without relief, which may leave pixels of single bands without a value.
     mapped = [(layer.mapping.of_the_plane, layer.band) for layer in layers if layer.mapping is not None]
-    crop = _crop(reference, mapped, frame, settings, of_flight)
+    crop = frame.tile
+    if common is None and settings.crop != "none":
+        crop = common_area(mapped, frame.width, frame.height) or crop
     has_relief = any(mapping.parallax is not None for mapping in on_frame.values())
     return layers, replace(frame, **vars(crop), has_gaps=has_relief or not _covers(mapped, crop))
 
@@ -105,25 +105,19 @@ def _on_frame(mapping: PixelMapping, frame: OutputGrid, reference: Band) -> Pixe
     return mapping if frame.scale == SAME_PIXELS else mapping.rescaled(frame.scale, SAME_PIXELS)
 
 
-def _crop(
-    reference: Band,
-    mapped: list[tuple[PixelMapping, Band]],
-    frame: OutputGrid,
-    settings: WriteSettings,
-    of_flight: Sequence[tuple[PixelMapping, Band]],
-) -> Tile:
-    """The rectangle of the output pixels that is written."""
-    if settings.crop == "none":
-        return frame.tile
-    if not of_flight:
-        return common_area(mapped, frame.width, frame.height) or frame.tile
-    limits = [(_on_frame(mapping, frame, reference), band) for mapping, band in of_flight]
-    # A reference that is resampled has a border too.
-    limits += [(mapping, band) for mapping, band in mapped if band is reference]
-    area = common_area(limits, frame.width, frame.height)
+def common_grid(reference: Band, settings: WriteSettings, limits: FlightLimits) -> OutputGrid | None:
+    """Return the grid of all captures of a camera, given the limits of its flights; None if each has its own."""
+    of_flight = _between_files(limits, reference)
+    if settings.crop != "flight" or not of_flight:
+        return None
+    frame = _frame(reference, [mapping for mapping, _ in of_flight], settings)
+    mapped = [(_on_frame(mapping, frame, reference), band) for mapping, band in of_flight]
+    if frame.undistorted or frame.scale != SAME_PIXELS:  # a reference that is resampled has a border too
+        mapped.append((_on_frame(PixelMapping(geometry.identity()), frame, reference), reference))
+    area = common_area(mapped, frame.width, frame.height)
     # The crop of a flight is smaller by this: captures that the rig was not learned from may exceed its extremes.
     flight_margin_px = 2
-    return frame.tile if area is None else _inset(area, flight_margin_px)
+    return frame if area is None else replace(frame, **vars(_inset(area, flight_margin_px)))
 
 
 def _between_files(limits: FlightLimits, reference: Band) -> list[tuple[PixelMapping, Band]]:

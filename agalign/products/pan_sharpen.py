@@ -25,7 +25,7 @@ from agalign.errors import InputError
 from agalign.pixels.masks import data_mask
 from agalign.pixels.raster import OpenRaster, open_raster
 from agalign.products.checked_raster import Block, LayerDescription, predictor, write_layers
-from agalign.products.layout import Layer, output_layers
+from agalign.products.layout import Layer, common_grid, output_layers
 from agalign.products.product import GEOTIFF, Product, ProductContext, StacAsset, WrittenFile
 from agalign.products.raster_file import as_type, with_nodata, write_raster
 from agalign.values.capture import Band, Capture
@@ -90,7 +90,8 @@ def _sources(context: ProductContext, settings: WriteSettings) -> _Sources | Non
     pan, usable = panchromatic(context.capture), context.usable
     if not pan or not {b.name for b in pan} <= {context.capture.reference.name, *usable}:
         return None
-    layers, grid = output_layers(context.capture, usable, settings, context.limits)
+    common = common_grid(context.capture.reference, settings, context.limits)
+    layers, grid = output_layers(context.capture, usable, settings, common)
     bands = [layer for layer in layers if _is_multispectral(layer, pan)]
     is_sharpened = [_is_in_range(layer.band, pan) for layer in bands]
     if not any(is_sharpened):

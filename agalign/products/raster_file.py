@@ -17,6 +17,7 @@ from rasterio.shutil import copy as copy_dataset
 from agalign.cameras.tag_transfer import TransferredTags
 from agalign.cameras.tiff_directory import add_directories
 from agalign.config import WriteSettings
+from agalign.errors import AgalignError
 from agalign.pixels.band_resampling import resample_tile
 from agalign.pixels.radiometry import calibrated
 from agalign.pixels.raster import GDAL_ENVIRONMENT, open_raster, read_tile, without_warnings
@@ -95,6 +96,15 @@ def write_raster(
     blocks = _blocks(layers, grid, dtype, nodata, settings)
     write_layers(path, profile, _descriptions(layers, raw=raw), _tags(capture, layers, raw=raw), blocks, finish)
     return nodata
+
+
+def is_aligned_raster(path: Path) -> bool:
+    """Return True for a file that `write_raster` has written."""
+    try:
+        with open_raster(path) as source:
+            return "REFERENCE_BAND" in source.tags()
+    except AgalignError:
+        return False
 
 
 def media_type(settings: WriteSettings) -> str:

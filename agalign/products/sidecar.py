@@ -587,6 +587,10 @@ class CaptureResult(_Result):
     """Kinds of products that could not be written."""
     settings: str
     """Fingerprint of options, input and version; a run with the same one skips the capture."""
+    options: dict[str, dict[str, Any]] | None = None
+    """Settings that differ from the defaults, by stage and name; null in older sidecars."""
+    input_samples: dict[str, str] = {}
+    """Hash of some bytes of the file of each band: it identifies captures without tags."""
     checksum: str | None = None
     """SHA-256 of the content as JSON with sorted keys and no spaces, without `checksum` and `seconds`."""
 

@@ -3,6 +3,7 @@
 import hashlib
 import json
 import os
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 
@@ -104,10 +105,10 @@ def test_a_capture_is_kept_only_while_all_its_files_are_there(align: Align, tmp_
 
 
 def test_files_of_an_earlier_sidecar_are_removed(align: Align, tmp_path: Path) -> None:
-    """Even of a product that this version does not know."""
+    """Also aligned rasters of a product that this version does not know."""
     align(PLAIN)
     sidecar, old = tmp_path / "out" / "f.json", tmp_path / "out" / "f.depth.tif"
-    old.write_bytes(b"x")
+    shutil.copy(tmp_path / "out" / "f.tif", old)
     data = read_json(sidecar)
     data["products"].append({"kind": "depth", "file": old.name, "bytes": 1, "sha256": ""})
     sidecar.write_text(json.dumps(data))

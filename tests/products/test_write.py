@@ -14,7 +14,7 @@ from agalign.errors import OutputError
 from agalign.flight.rig import CaptureFactors, Rig
 from agalign.products.aligned_files import BandFiles
 from agalign.products.checked_raster import CheckedRaster, without_libtiff_messages
-from agalign.products.layout import Layer, flight_limits, output_layers
+from agalign.products.layout import Layer, common_grid, flight_limits, output_layers
 from agalign.products.product import CapturePaths, ProductContext
 from agalign.products.raster_file import write_raster
 from agalign.values import geometry
@@ -268,7 +268,8 @@ def test_all_captures_of_a_flight_have_one_geometry(tmp_path: Path) -> None:
 
     def grids_of(*shifts_px: float, crop: str = "flight") -> list[OutputGrid]:
         settings = WriteSettings(crop=crop)
-        return [output_layers(capture, {"nir": aligned_by(s)}, settings, limits)[1] for s in shifts_px]
+        common = common_grid(capture.reference, settings, limits)
+        return [output_layers(capture, {"nir": aligned_by(s)}, settings, common)[1] for s in shifts_px]
 
     grids = grids_of(2.0, 7.0, 12.0)
     assert len(set(grids)) == 1
@@ -292,15 +293,16 @@ def test_flights_and_captures_without_a_band_have_the_size_of_their_camera(tmp_p
         ([capture], None),
     ]
     for settings in (WriteSettings(), WriteSettings(resolution="finest")):
-        limits = flight_limits(flights)
-        grids = [output_layers(capture, {"nir": aligned_by(s)}, settings, limits)[1] for s in (3.0, 19.0)]
-        grids.append(output_layers(without, {}, settings, limits)[1])
+        common = common_grid(capture.reference, settings, flight_limits(flights))
+        grids = [output_layers(capture, {"nir": aligned_by(s)}, settings, common)[1] for s in (3.0, 19.0)]
+        grids.append(output_layers(without, {}, settings, common)[1])
         assert len({(g.x0, g.y0, g.width, g.height, g.scale) for g in grids}) == 1
         assert 120 - (grids[0].x0 + grids[0].width) in range(21, 25)
     green, nir = (replace(band, lens=None) for band in capture.bands)
     finer = replace(capture, bands=(green, replace(nir, width_px=240, height_px=180)))
     limits = flight_limits([([finer], replace(rig_between(2.0, 12.0), mean={"nir": np.diag([2.0, 2.0, 1.0])}))])
-    assert output_layers(replace(without, bands=(green,)), {}, settings, limits)[1].scale == (2.0, 2.0)
+    common = common_grid(green, settings, limits)
+    assert output_layers(replace(without, bands=(green,)), {}, settings, common)[1].scale == (2.0, 2.0)
 
 
 # ---- what libtiff prints without any handler

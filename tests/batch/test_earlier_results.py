@@ -1,0 +1,297 @@
+"""Results of earlier runs in an output folder: of another capture, of the same one with other options, removed ones."""
+
+import hashlib
+import shutil
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import agalign
+from agalign.batch.earlier_results import is_same
+from agalign.batch.run import _crops_of_cameras, plan_run, run_flight
+from agalign.cli.align_run import conclude
+from agalign.cli.align_run import run as run_command
+from agalign.cli.terminal import ExitCode, Terminal
+from agalign.products.sidecar import CaptureResult
+from agalign.products.sidecar_file import find_sidecars, read_result
+from agalign.synthetic.flight import make_flight
+from agalign.values.image import OutputGrid
+
+from ..conftest import Shared, save_known_model, seeded, textured_image, write_band, write_capture
+from ..program import agalign_here
+
+pytestmark = pytest.mark.slow
+
+SEEDS = seeded("rig")
+THREE = agalign.DiscoverOptions(bands=("Green", "NIR", "Red edge"))
+
+
+@pytest.fixture
+def out(flight: Path, shared: Shared, tmp_path: Path) -> Path:
+    """The output of a run that only finds initial alignments, which a test may change."""
+    done = shared("seeded_flight", lambda folder: agalign.align_folder(flight, folder / "out", settings=SEEDS))
+    return shutil.copytree(done / "out", tmp_path / "out")
+
+
+def contents(folder: Path) -> dict[str, str]:
+    return {str(p): hashlib.sha256(p.read_bytes()).hexdigest() for p in folder.rglob("*") if p.is_file()}
+
+
+def changed_copy(flight: Path, folder: Path, before: bytes, after: bytes) -> Path:
+    """A copy of a flight with other tags of the same length."""
+    shutil.copytree(flight, folder)
+    for path in folder.rglob("*.tif"):
+        data = path.read_bytes()
+        assert before in data
+        path.write_bytes(data.replace(before, after))
+    return folder
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "named"),
+    [
+        (b"2026:06:21", b"2025:06:21", "2025-06-21T10:00:01"),
+        (b"SY01-0000001-AG", b"SY01-0000002-AG", "SY01-0000002-AG"),
+        (b"synthetic00000000001", b"synthetic00000000009", "synthetic00000000009"),
+    ],
+)
+def test_another_capture_of_the_same_name_is_refused_before_anything_is_written(
+    flight: Path, out: Path, tmp_path: Path, before: bytes, after: bytes, named: str
+) -> None:
+    other = tmp_path / "other"
+    if b"synthetic" in before:
+        shutil.copytree(flight, other)
+        for path in other.rglob("IMG_0001_*.tif"):
+            path.write_bytes(path.read_bytes().replace(before, after))
+    else:
+        changed_copy(flight, other, before, after)
+    unchanged = contents(out)
+    for options in ((), ("--dry-run",), ("--overwrite",), ("--align-panels", "--crop", "none")):
+        done = agalign_here(other, "-o", out, "--only-seed", *options)
+        assert done.returncode == ExitCode.USAGE
+        (line,) = [line for line in done.stderr.splitlines() if line.startswith("agalign: ")]
+        for part in ("IMG_0001.json: is of another capture than 0000SET/000/IMG_0001", "RedEdge-M", named, "with -o"):
+            assert part in line
+    with pytest.raises(agalign.ConfigurationError, match="is of another capture"):
+        agalign.align_folder(other, out, settings=SEEDS)
+    with pytest.raises(agalign.ConfigurationError, match="is of another capture"):
+        agalign.align_capture(agalign.discover(other).captures[0], out, settings=SEEDS)
+    assert contents(out) == unchanged
+
+
+@pytest.mark.parametrize("first", ["0000SET", "."])
+def test_a_run_on_a_folder_of_another_depth_is_refused(flight: Path, tmp_path: Path, first: str) -> None:
+    out, second = tmp_path / "out", "." if first == "0000SET" else "0000SET"
+    agalign.align_folder(flight / first, out, settings=SEEDS)
+    unchanged = contents(out)
+    done = agalign_here(flight / second, "-o", out, "--only-seed")
+    assert done.returncode == ExitCode.USAGE
+    assert "is of the same capture as" in done.stderr
+    assert contents(out) == unchanged
+
+
+def test_files_without_tags_are_compared_by_their_contents(tmp_path: Path) -> None:
+    """Images of equal names and sizes in a folder and in a folder in it; a copied flight."""
+    write_capture(tmp_path / "a", "green", "nir")
+    for band in ("green", "nir"):
+        path = tmp_path / "a" / "b" / f"f_{band}.tif"
+        write_band(path, (4000 * textured_image(300, 240, 9) + 20000).clip(1).astype(np.uint16))
+    out = tmp_path / "out"
+    agalign.align_folder(tmp_path / "a", out, settings=SEEDS)
+    unchanged = contents(out)
+    with pytest.raises(agalign.ConfigurationError, match="here without tags"):
+        agalign.align_folder(tmp_path / "a" / "b", out, settings=SEEDS)
+    assert contents(out) == unchanged
+    copy = shutil.copytree(tmp_path / "a", tmp_path / "copy", copy_function=shutil.copyfile)
+    assert [r.state for r in agalign.align_folder(copy, out, settings=SEEDS)] == ["done", "done"]
+
+
+def test_what_identifies_a_capture(flight: Path, out: Path) -> None:
+    capture = agalign.discover(flight).captures[0]
+    earlier = read_result(find_sidecars(out)[0])
+
+    def same(result: dict[str, Any], **tags: Any) -> bool | None:
+        return is_same(earlier.model_copy(update=result), replace(capture, **tags))
+
+    assert same({})
+    other_camera = replace(capture.camera, serial="another")
+    two_serials = replace(capture.camera, serial=f"A+{capture.camera.serial}")
+    assert same({}, camera=other_camera) is False
+    assert same({}, camera=replace(capture.camera, model="Altum")) is False
+    assert same({}, camera=two_serials)  # of a dual camera, --bands left one half
+    assert same({}, camera=replace(capture.camera, serial=""))
+    # The time of the reference, which another option may choose, differs by parts of a second.
+    assert same({}, captured_at="2026-06-21T10:00:01.400000")
+    assert same({}, captured_at="2026-06-21T10:01:01") is False
+    assert same({}, captured_at="", capture_id="")
+    assert same({"input_samples": {"Green": "0"}}, captured_at="", capture_id="") is False
+    assert same({"input_samples": {}}, captured_at="", capture_id="") is None
+
+
+def test_captures_with_other_options_are_done_again_and_this_is_printed_before(flight: Path, out: Path) -> None:
+    first, second = find_sidecars(out)
+    options = "--seed", "rig", "--only-seed", "--crop", "none", "--qa"
+    planned = agalign_here(flight, "-o", out, *options, "--dry-run")
+    assert "2 captures to be done again; changed since: --crop, --qa; nothing was written" in planned.stdout
+    done = agalign_here(flight, "-o", out, *options)
+    lines = done.stderr.splitlines()
+    said = lines.index("2 finished captures to be done again; changed since: --crop, --qa")
+    assert said < next(k for k, line in enumerate(lines) if line.startswith("[1/2]"))
+    assert read_result(first).output.crop == (0, 0, 480, 360)
+    again = agalign_here(flight, "-o", out, *options)
+    assert "done again" not in again.stderr
+    assert again.stderr.count("kept from an earlier run") == 2
+    text = second.read_text().replace(f'"agalign": "{agalign.__version__}"', '"agalign": "0.0.9"')
+    second.write_text(text.replace(f'"settings": "{read_result(second).settings}"', '"settings": "0"'))
+    done = agalign_here(flight, "-o", out, *options)
+    assert "1 finished capture to be done again; changed since: version (agalign 0.0.9 before)" in done.stderr
+
+
+def test_a_flight_that_grows_needs_no_option(flight: Path, tmp_path: Path) -> None:
+    folder, out = shutil.copytree(flight, tmp_path / "in"), tmp_path / "out"
+    later = [*folder.rglob("IMG_0002_*.tif")]
+    for path in later:
+        path.rename(tmp_path / path.name)
+    agalign.align_folder(folder, out, settings=SEEDS)
+    for path in later:
+        (tmp_path / path.name).rename(path)
+    scan = agalign.discover(folder)
+    assert [*plan_run(scan, out, SEEDS).values()] == ["kept from an earlier run", "to be aligned"]
+    assert [r.state for r in agalign.align_folder(folder, out, settings=SEEDS)] == ["kept", "done"]
+
+
+def test_all_captures_of_a_grown_flight_have_one_size(shared: Shared, tmp_path: Path) -> None:
+    """Two captures are too few for a rig, with which the crop of all captures is known."""
+    pytest.importorskip("xarray")
+    flight = shared("four_captures", lambda f: make_flight(f, captures=4, size_px=(480, 360), rng_seed=3))
+    folder, out = shutil.copytree(flight, tmp_path / "in"), tmp_path / "out"
+    later = [p for k in (3, 4) for p in folder.rglob(f"IMG_000{k}_*.tif")]
+    for path in later:
+        path.rename(tmp_path / path.name)
+    agalign.align_folder(folder, out, options=THREE)
+    for path in later:
+        (tmp_path / path.name).rename(path)
+    agalign.align_folder(folder, out, options=THREE)
+    assert agalign.open_flight(out).sizes["capture"] == 4
+    assert {r.state for r in agalign.align_folder(folder, out, options=THREE)} == {"kept"}
+
+
+def test_most_finished_captures_decide_on_the_crop_of_a_camera(flight: Path, tmp_path: Path) -> None:
+    one, other = agalign.discover(flight).captures
+    captures = [replace(c, name=f"{c.name}{k}") for k in range(3) for c in (one, other)]
+    save_known_model(tmp_path / "m.safetensors")
+
+    def grid(model: Path | None, *kept: OutputGrid, crop: str = "flight") -> OutputGrid | None:
+        grids = dict(zip((c.label for c in captures), kept, strict=False))
+        settings = agalign.WriteSettings(crop=crop)
+        ((_, result),) = _crops_of_cameras([(captures, "", [])], [model], grids, settings).values()
+        return result
+
+    model, first, second = tmp_path / "m.safetensors", OutputGrid(4, 4, 400, 300), OutputGrid(5, 4, 400, 301)
+    of_rig = grid(model)
+    assert of_rig not in (None, first, second)
+    assert grid(model, first, first, first, second) == first
+    assert grid(model, first, first, second) == of_rig  # too few for a rig: each has its own
+    assert grid(None, first, first, first) == first
+    assert grid(None, first, first, first, second) is None
+    assert grid(model, first, first, first, crop="common") is None
+
+
+# ---- an edited sidecar
+
+
+def test_a_sidecar_removes_no_file_but_those_of_its_capture(flight: Path, tmp_path: Path) -> None:
+    project = tmp_path / "proj"
+    shutil.copytree(flight / "0000SET" / "000", project / "flight")
+    agalign.align_folder(project / "flight", project, settings=seeded("rig", layout="both"))
+    thesis, raw = project / "thesis.txt", project / "IMG_0001_9.tif"
+    thesis.write_text("years of work")
+    shutil.copy(project / "flight" / "IMG_0002_1.tif", raw)
+    sidecar = project / "IMG_0001.json"
+    listed = ["flight/IMG_0001_1.tif", "flight/IMG_0002_3.tif", "thesis.txt", "IMG_0001_9.tif", "IMG_0002.tif"]
+    files = ", ".join(f'{{"file": "{name}", "bytes": 1}}' for name in [*listed, "IMG_0001_4.tif"])
+    text = sidecar.read_text()
+    start = text.index('"band_files": [')
+    sidecar.write_text(text[:start] + f'"band_files": [{files}]' + text[text.index("]", start) + 1 :])
+    stack = (project / "IMG_0002.tif").stat().st_mtime_ns
+    before = contents(project / "flight")
+    # With the stack alone and two bands, the other files of bands are outdated.
+    chosen = agalign.DiscoverOptions(bands=("Green", "Red"), skip=(project / "none",))
+    capture = agalign.discover(project / "flight", chosen).captures[0]
+    agalign.align_capture(capture, project, settings=seeded("rig", qa=True))
+    assert contents(project / "flight") == before
+    assert thesis.read_text() == "years of work"
+    assert raw.is_file()
+    assert (project / "IMG_0002.tif").stat().st_mtime_ns == stack
+    assert not (project / "IMG_0001_4.tif").exists()
+
+
+# ---- outputs that are removed during the run
+
+
+def removing(out: Path) -> Callable[[agalign.CaptureReport], object]:
+    """Remove the files of the first capture when the second is reported."""
+
+    def each(report: agalign.CaptureReport) -> None:
+        if report.label.endswith("2"):
+            for path in out.rglob("IMG_0001*"):
+                path.unlink()
+
+    return each
+
+
+def test_outputs_removed_during_the_run_are_reported_and_not_counted(
+    flight: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    terminal = Terminal(quiet=False, verbose=False, log_json=False)
+    scan = agalign.discover(flight, THREE)
+    settings, options = agalign.Settings(), agalign.RunOptions()
+    totals = run_command(scan, tmp_path, settings, terminal, options, each=removing(tmp_path))
+    assert conclude(totals, tmp_path, terminal) == ExitCode.PARTIAL
+    printed = capsys.readouterr()
+    removed = f"{tmp_path}: outputs of 1 capture were removed during the run, such as of 0000SET/000/IMG_0001"
+    assert removed in printed.err
+    assert "2 of 4 band pairs aligned; 1 capture not written" in printed.out
+    assert [r.state for r in agalign.align_folder(flight, tmp_path, options=THREE)] == ["kept", "done"]
+
+
+def test_a_run_whose_whole_output_is_removed_fails(flight: Path, tmp_path: Path) -> None:
+    out, terminal = tmp_path / "out", Terminal(quiet=True, verbose=False, log_json=False)
+
+    def remove(report: agalign.CaptureReport) -> None:
+        if report.label.endswith("2"):
+            shutil.rmtree(out)
+
+    totals = run_command(agalign.discover(flight), out, SEEDS, terminal, agalign.RunOptions(), each=remove)
+    assert conclude(totals, out, terminal) == ExitCode.NOTHING
+    reports = run_flight(agalign.discover(flight), out, SEEDS)
+    next(reports)
+    shutil.rmtree(out)
+    with pytest.raises(agalign.OutputError, match="the same command writes them again") as lost:
+        list(reports)
+    assert lost.value.captures == ["0000SET/000/IMG_0001"]
+
+
+def test_a_headline_counts_captures_that_were_not_reached(
+    aligned_flight: Path, flight: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """As after a full disk."""
+    from agalign.batch import CaptureReport
+    from agalign.cli.align_run import RunTotals
+    from agalign.products.report.facts import FailureGroups
+
+    path = find_sidecars(aligned_flight)[0]
+    result: CaptureResult = read_result(path)
+    totals = RunTotals(False, FailureGroups(), {"one": 4, "two": 4, "three": 3, "panel": 4})
+    totals.add(CaptureReport("one", "done", result, path))
+    totals.add(CaptureReport("two", "error", error="no space left"))
+    totals.add(CaptureReport("panel", "panel", panel="a panel"))
+    terminal = Terminal(quiet=False, verbose=False, log_json=False)
+    assert conclude(totals, aligned_flight, terminal) == ExitCode.PARTIAL
+    printed = capsys.readouterr()
+    assert "4 of 11 band pairs aligned; 2 captures not written" in printed.out
+    assert "2 of 3 captures could not be written" in printed.err
