@@ -1,4 +1,4 @@
-"""Results of earlier runs in the output folder: of which capture they are, and what has changed since."""
+"""Results of earlier runs in the output folder: whether they are of the same captures, and what has changed since."""
 
 import stat
 from collections.abc import Mapping, Sequence
@@ -16,7 +16,7 @@ from agalign.products.sidecar_file import read_result
 from agalign.values.capture import Capture, unix_time_s
 
 _MAX_APART_S = 1.0
-"""The bands of a capture, each of which may be the reference, are exposed within 0.3 s."""
+"""The bands of a capture are exposed within 0.3 s, and its time is that of the reference, which an option chooses."""
 
 
 def is_same(earlier: CaptureResult, capture: Capture) -> bool | None:

@@ -357,11 +357,10 @@ def _crops_of_cameras(
     for key, capture in {_crop_key(c): c for c in captures}.items():
         grid = common_grid(capture.reference, settings, limits[key[0]])
         earlier = Counter(kept[c.label] for c in captures if _crop_key(c) == key and kept.get(c.label) is not None)
-        if settings.crop == "flight" and earlier:
-            ((most, count),) = earlier.most_common(1)
-            # Without rigs, each capture has its own grid.
-            if count >= MIN_CAPTURES and (grid is not None or len(earlier) == 1):
-                grid = most
+        most, count = next(iter(earlier.most_common(1)), (None, 0))
+        # Without rigs, each capture has its own grid.
+        if settings.crop == "flight" and count >= MIN_CAPTURES and (grid is not None or len(earlier) == 1):
+            grid = most
         result[key] = limits[key[0]], grid
     return result
 

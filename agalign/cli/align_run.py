@@ -382,7 +382,7 @@ def _print_totals(totals: RunTotals, terminal: Terminal) -> None:
         _print_table(totals.pairs, f"{statuses['aligned']} of {asked} band pairs aligned{missing}", terminal)
     explain(totals.pairs.groups(), terminal)
     if lost:
-        of_all = f"{lost} of {counted(totals.states.total() - totals.states['error'] + lost, 'capture')}"
+        of_all = f"{lost} of {counted(lost + totals.pairs.captures, 'capture')}"
         terminal.problem(f"{of_all} could not be written, for the reasons above; the same command tries again")
     # Under a clear sky with the sun above 40 degrees, the irradiance changes by up to 10 % in half an hour.
     max_panel_age_s = 30 * 60.0

@@ -259,7 +259,7 @@ def test_outputs_removed_during_the_run_are_reported_and_not_counted(
     assert [r.state for r in agalign.align_folder(flight, tmp_path, options=THREE)] == ["kept", "done"]
 
 
-def test_a_run_whose_whole_output_is_removed_fails(flight: Path, tmp_path: Path) -> None:
+def test_a_run_fails_if_its_output_folder_is_removed(flight: Path, tmp_path: Path) -> None:
     out, terminal = tmp_path / "out", Terminal(quiet=True, verbose=False, log_json=False)
 
     def remove(report: agalign.CaptureReport) -> None:

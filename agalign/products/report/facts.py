@@ -116,6 +116,11 @@ class PairTotals:
         """Number of pairs by status, with those of missing bands."""
         return sum((band.statuses for band in self.bands.values()), Counter())
 
+    @property
+    def captures(self) -> int:
+        """Number of captures."""
+        return len(self._references)
+
     def groups(self) -> list[FailureGroup]:
         """Return the failures by cause, and the captures with another reference than most of their flight; the most
         severe first, and the largest first of those.
