@@ -52,6 +52,7 @@ class SidecarError(InputError):
 class OutputError(AgalignError):
     """A result cannot be written (no permission, disk full, a folder where a file should be)."""
 
+
 class WorkerError(AgalignError):
     """The worker processes cannot be started, or end one after another; or the cluster is lost."""
 

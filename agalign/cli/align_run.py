@@ -8,7 +8,7 @@ import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Executor
-from contextlib import AbstractContextManager, contextmanager, nullcontext
+from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from statistics import median
@@ -136,17 +136,17 @@ class RunTotals:
 
     def recount(self, captures: Sequence[Capture], out: Path) -> None:
         """Count the pairs of those captures whose files exist: an error may be that outputs were removed."""
-        self.pairs = PairTotals()
+        added, self.pairs = self.pairs.captures, PairTotals()
         for capture in captures:
-            path = CapturePaths.of(capture, out).sidecar
-            try:
-                result = read_result(path)
-            except SidecarError:
+            if capture.label not in added:
                 continue
-            if outputs_exist(path, result.files):
-                self.pairs.add(capture.label, result)
-            else:
-                self.unfinished[capture.label] = len(capture.moving) + len(capture.missing_bands)
+            path = CapturePaths.of(capture, out).sidecar
+            with suppress(SidecarError):
+                result = read_result(path)
+                if outputs_exist(path, result.files):
+                    self.pairs.add(capture.label, result)
+                    continue
+            self.unfinished[capture.label] = len(capture.moving) + len(capture.missing_bands)
 
 
 def run(
@@ -382,7 +382,7 @@ def _print_totals(totals: RunTotals, terminal: Terminal) -> None:
         _print_table(totals.pairs, f"{statuses['aligned']} of {asked} band pairs aligned{missing}", terminal)
     explain(totals.pairs.groups(), terminal)
     if lost:
-        of_all = f"{lost} of {counted(lost + totals.pairs.captures, 'capture')}"
+        of_all = f"{lost} of {counted(lost + len(totals.pairs.captures), 'capture')}"
         terminal.problem(f"{of_all} could not be written, for the reasons above; the same command tries again")
     # Under a clear sky with the sun above 40 degrees, the irradiance changes by up to 10 % in half an hour.
     max_panel_age_s = 30 * 60.0

@@ -117,9 +117,9 @@ class PairTotals:
         return sum((band.statuses for band in self.bands.values()), Counter())
 
     @property
-    def captures(self) -> int:
-        """Number of captures."""
-        return len(self._references)
+    def captures(self) -> set[str]:
+        """Labels of the captures."""
+        return {label for label, _, _ in self._references}
 
     def groups(self) -> list[FailureGroup]:
         """Return the failures by cause, and the captures with another reference than most of their flight; the most
