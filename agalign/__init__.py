@@ -7,11 +7,13 @@ bands = agalign.open_capture("out/IMG_0007.json")   # an xarray Dataset
 """
 
 from importlib import import_module
-from typing import TYPE_CHECKING, Any
 
 from agalign._version import __version__ as __version__
 
+TYPE_CHECKING = False  # `python -m agalign` would import `typing` from the working folder
 if TYPE_CHECKING:
+    from typing import Any
+
     from agalign.api import align as align
     from agalign.api import align_capture as align_capture
     from agalign.api import align_folder as align_folder
@@ -75,7 +77,7 @@ _MODULES = {name: module for module, names in _NAMES.items() for name in names.s
 __all__ = sorted([*_MODULES, "__version__"])
 
 
-def __getattr__(name: str) -> Any:
+def __getattr__(name: str) -> "Any":
     if name not in _MODULES:
         raise AttributeError(f"module 'agalign' has no attribute '{name}'")
     return getattr(import_module(f"agalign.{_MODULES[name]}"), name)

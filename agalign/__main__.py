@@ -28,4 +28,7 @@ def _open_missing_streams() -> None:
 
 
 if __name__ == "__main__":
+    # `python -m` searches the working folder first, and would run a `rasterio.py` that is there.
+    if not sys.flags.safe_path and sys.path[0] != os.path.dirname(os.path.dirname(__file__)):  # noqa: PTH120
+        del sys.path[0]
     main()

@@ -20,8 +20,8 @@ from agalign.values.cores import usable_cores
 from agalign.values.process_pool import A, ProcessPool, R, WorkerDiedError
 from agalign.values.processes import (
     WORKER_MODULE,
+    environment_of_children,
     follow_parent,
-    threads_of_children,
     without_interrupt_key,
     worker_context,
 )
@@ -71,12 +71,12 @@ def own_processes(
     `initializer` gets the number of threads of a process, and `preload` is a module that imports what it needs. The
     process of a task that exceeds the timeout is killed.
     """
-    threads, context = max(1, usable_cores() // processes), worker_context(preload)
+    threads = max(1, usable_cores() // processes)
     max_tasks = 500  # libraries leak some kilobytes per capture
     with (
-        threads_of_children(threads),
+        environment_of_children(threads),
         ProcessPool[partial[Any], Any](
-            call, processes, context, _start, (initializer, threads), max_tasks_per_worker=max_tasks
+            call, processes, worker_context(preload), _start, (initializer, threads), max_tasks_per_worker=max_tasks
         ) as pool,
     ):
 
@@ -199,6 +199,7 @@ def dask_executor(address: str, jobs: int = 0, timeout_s: float | None = None) -
             if address == "local":
                 # The profile appears on the dashboard only, and takes a few percent of the time.
                 stack.enter_context(dask.config.set({"distributed.worker.profile.enabled": False}))
+                stack.enter_context(environment_of_children(threads=1))
                 with without_interrupt_key():  # of a terminal, for all its processes: the workers end with the cluster
                     cluster = LocalCluster(
                         n_workers=jobs or usable_cores(),

@@ -17,7 +17,7 @@ from agalign.pixels.radiometry import is_physical
 from agalign.pixels.raster import probe, suffix_format
 from agalign.values.capture import Band
 from agalign.values.process_pool import ProcessPool, WorkerDiedError
-from agalign.values.processes import follow_parent
+from agalign.values.processes import environment_of_children, follow_parent
 
 
 @dataclass(frozen=True)
@@ -90,7 +90,7 @@ def _read_in_processes(
     read = partial(_read_task, options=options)
     finished: dict[int, list[ImageFile | Problem]] = {}
     next_task = 0
-    with ProcessPool(read, processes, get_context("spawn"), follow_parent) as pool:
+    with environment_of_children(threads=1), ProcessPool(read, processes, get_context("spawn"), follow_parent) as pool:
         for outcome in pool.run(tasks):
             try:
                 finished[outcome.number] = outcome.value()

@@ -1,4 +1,4 @@
-"""Worker processes: start method, number of threads, SIGINT, end with their parent, and the pipe to one.
+"""Worker processes: start method, environment, SIGINT, end with their parent, and the pipe to one.
 
 A message is sent in chunks that fit the buffer of a pipe, so the parent never blocks if the worker stops: the worker
 requests each further chunk of a task, and the parent reads a chunk of a result only after all of it has arrived.
@@ -12,8 +12,8 @@ import sys
 import tempfile
 import threading
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import AbstractContextManager, contextmanager, suppress
 from enum import Enum, IntEnum
 from multiprocessing import current_process, get_all_start_methods, get_context, parent_process, resource_tracker
 from multiprocessing.connection import Connection, wait
@@ -103,16 +103,23 @@ WORKER_MODULE = "agalign.batch.preload"
 
 
 def worker_context(preload: str) -> BaseContext:
-    """Return the start method of worker processes: forked from a fork server that has imported the module `preload`, or
-    spawned.
+    """Return the start method of worker processes: forked from a fork server, which is started and imports the module
+    `preload`, or spawned. Call it within `environment_of_children`.
 
     Processes are spawned on macOS, where a fork of a process with Apple's libraries may crash or hang, and without a
     temporary folder, in which the fork server needs a socket.
     """
     if sys.platform == "darwin" or "forkserver" not in get_all_start_methods() or not _has_temporary_folder():
         return get_context("spawn")
+    from multiprocessing import forkserver
+
     context = get_context("forkserver")
     context.set_forkserver_preload([preload])
+    # The server imports from where this process does: until Python 3.12.9, `multiprocessing` sends the path to workers
+    # only. If the server cannot be started, the workers report the reason.
+    search_path = {"PYTHONPATH": os.pathsep.join(map(str, sys.path))}
+    with suppress(OSError, RuntimeError), _environment(search_path), without_interrupt_key():
+        forkserver.ensure_running()
     return context
 
 
@@ -125,13 +132,9 @@ def start_server_ahead(captures: int, cores: int) -> None:
     process imports the same.
     """
     processes = min(cores, captures // CAPTURES_WORTH_A_PROCESS)
-    if processes < 2 or worker_context(WORKER_MODULE).get_start_method() != "forkserver":
-        return
-    from multiprocessing import forkserver
-
-    # If it cannot be started, the workers report the reason.
-    with suppress(OSError, RuntimeError), threads_of_children(max(1, cores // processes)), without_interrupt_key():
-        forkserver.ensure_running()
+    if processes > 1:
+        with environment_of_children(cores // processes):
+            worker_context(WORKER_MODULE)
 
 
 def _has_temporary_folder() -> bool:
@@ -142,14 +145,20 @@ def _has_temporary_folder() -> bool:
     return True
 
 
-@contextmanager
-def threads_of_children(count: int) -> Iterator[None]:
-    """Set the number of threads that libraries in child processes start.
+def environment_of_children(threads: int) -> AbstractContextManager[None]:
+    """Set the number of threads that libraries in child processes start, and where these search for modules.
 
-    More threads than cores, over all processes, double the time.
+    More threads than cores, over all processes, double the time. Without PYTHONSAFEPATH, child processes of
+    `multiprocessing` search the working folder first, and run a `rasterio.py` that is there.
     """
-    before = {name: os.environ.get(name) for name in THREAD_VARIABLES}
-    os.environ.update(dict.fromkeys(THREAD_VARIABLES, str(count)))
+    return _environment({**dict.fromkeys(THREAD_VARIABLES, str(threads)), "PYTHONSAFEPATH": "1"})
+
+
+@contextmanager
+def _environment(values: Mapping[str, str]) -> Iterator[None]:
+    """Set environment variables inside the block."""
+    before = {name: os.environ.get(name) for name in values}
+    os.environ.update(values)
     try:
         yield
     finally:
