@@ -1,10 +1,11 @@
 """Reading of rasters: metadata, pixels at any resolution, and validity masks."""
 
+import ctypes
 import math
 import stat
 import warnings
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, Literal
 
@@ -12,7 +13,7 @@ import cv2
 import numpy as np
 import rasterio
 from numpy.typing import NDArray
-from rasterio import warp
+from rasterio import crs, warp
 from rasterio.enums import ColorInterp, MaskFlags, Resampling
 from rasterio.errors import NotGeoreferencedWarning
 from rasterio.transform import Affine
@@ -38,6 +39,10 @@ GDAL_ENVIRONMENT = {
 GDAL neither writes auxiliary files next to the images nor reads them: x.tif.ovr may contain anything, such as a
 description that refers to other files or to a server.
 """
+with suppress(AttributeError, OSError):  # builds of GDAL with a libtiff of their own may hide it
+    # libtiff prints failed reads and writes of files to standard error, past GDAL's and rasterio's handlers. The caller
+    # gets an exception or an incomplete file.
+    ctypes.CDLL(crs.__file__).TIFFSetErrorHandler(None)
 _MAX_BANDS = 512
 """More than any imager has; a damaged file may declare 65,535."""
 

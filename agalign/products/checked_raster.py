@@ -2,9 +2,7 @@
 
 import errno
 import math
-import os
-import re
-import threading
+import struct
 import zlib
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
@@ -16,6 +14,7 @@ import numpy as np
 import rasterio
 import tifffile
 from numpy.typing import NDArray
+from rasterio._err import CPLE_BaseError
 from rasterio.enums import ColorInterp
 from rasterio.errors import RasterioError
 from rasterio.transform import Affine
@@ -31,8 +30,6 @@ from agalign.values.image import OutputGrid
 WORK_TILE_PX = 2048
 """Side of the tiles that are processed one after another: it limits the memory."""
 _INCOMPLETE = "the file came out incomplete; is the disk full?"
-_REDIRECTED = threading.RLock()
-"""File descriptor 2 belongs to the process: one thread redirects it, and others wait before they write."""
 
 FLOAT_OPTIONS: Mapping[str, Any] = {"compress": "deflate", "predictor": 3, "nodata": math.nan}
 """Creation options of layers of float32."""
@@ -106,7 +103,7 @@ def checked_raster(
     Raises OutputError.
     """
     try:
-        with complete_file(path) as partial, without_libtiff_messages():
+        with complete_file(path) as partial:
             with (
                 without_warnings(),
                 rasterio.Env(**GDAL_ENVIRONMENT),
@@ -119,8 +116,10 @@ def checked_raster(
                 finish(partial)
                 check_complete(partial)
             raster.verify(partial)
-    except (RasterioError, tifffile.TiffFileError) as error:
-        raise OutputError(f"{path}: cannot be written ({innermost_cause(error)})") from None
+    except (RasterioError, CPLE_BaseError) as error:
+        raise OutputError(
+            f"{path}: cannot be written ({innermost_cause(error).rstrip('.')}; is the disk full?)"
+        ) from None
 
 
 def write_layers(
@@ -138,38 +137,13 @@ def write_layers(
             raster.write(*block)
 
 
-@contextmanager
-def without_libtiff_messages() -> Iterator[None]:
-    """Drop what libtiff prints to standard error inside the block, such as for a full disk; other text is printed at
-    its end. `checked_raster` detects and reports the incomplete file itself.
-    """
-    with _REDIRECTED:
-        read_end, write_end = os.pipe()
-        os.set_blocking(read_end, False)
-        os.set_blocking(write_end, False)
-        stderr = os.dup(2)
-        os.dup2(write_end, 2)
-        os.close(write_end)
-        try:
-            yield
-        finally:
-            os.dup2(stderr, 2)  # closes the last write end of the pipe in this process
-            os.close(stderr)
-            printed = b""
-            with suppress(BlockingIOError):  # a child process started in the block has the write end open too
-                printed = os.read(read_end, 1 << 16)  # capacity of a pipe on Linux: what exceeds it is lost
-            os.close(read_end)
-            with suppress(OSError):
-                os.write(2, re.sub(rb"^_?(?:tiff|TIFF)\w+: .*\n?", b"", printed, flags=re.MULTILINE))
-
-
 def check_complete(path: Path) -> None:
     """Raise OSError for a TIFF in which a tile or strip is missing or truncated.
 
     GDAL flushes when a file is closed, and a failure at that time, such as a full disk, raises nothing.
     """
-    size = path.stat().st_size
-    with tifffile.TiffFile(path) as tiff:
+    size, segments = path.stat().st_size, []
+    with suppress(tifffile.TiffFileError, struct.error), tifffile.TiffFile(path) as tiff:
         segments = [s for page in tiff.pages for s in zip(page.dataoffsets, page.databytecounts, strict=True)]
     if not segments or any(count == 0 or offset + count > size for offset, count in segments):
         raise OSError(errno.EIO, _INCOMPLETE)

@@ -1,6 +1,6 @@
 import os
 import threading
-import time
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -13,7 +13,7 @@ from agalign.config import Settings, WriteSettings
 from agalign.errors import OutputError
 from agalign.flight.rig import CaptureFactors, Rig
 from agalign.products.aligned_files import BandFiles
-from agalign.products.checked_raster import CheckedRaster, without_libtiff_messages
+from agalign.products.checked_raster import Block, CheckedRaster, LayerDescription, tiled_profile, write_layers
 from agalign.products.layout import Layer, common_grid, flight_limits, output_layers
 from agalign.products.product import CapturePaths, ProductContext
 from agalign.products.raster_file import write_raster
@@ -305,42 +305,43 @@ def test_flights_and_captures_without_a_band_have_the_size_of_their_camera(tmp_p
     assert output_layers(replace(without, bands=(green,)), {}, settings, common)[1].scale == (2.0, 2.0)
 
 
-# ---- what libtiff prints without any handler
+# ---- standard error, and a full disk
 
 
-def test_only_the_lines_of_libtiff_are_kept_back(capfd: pytest.CaptureFixture[str]) -> None:
-    with without_libtiff_messages():
-        os.write(2, b"_tiffWriteProc: No space left on device.\nkept\nTIFFAppendToStrip: Write error.\n")
-    os.write(2, b"after\n")
-    assert capfd.readouterr().err == "kept\nafter\n"
+def test_standard_error_belongs_to_the_caller(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    """Another thread writes more than a pipe holds while a raster is written: all of it arrives, at once."""
+    lines = b"".join(b"line %d\n" % k for k in range(20_000))
 
-
-def test_an_error_inside_gives_the_descriptor_back(capfd: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(OSError, match="full"), without_libtiff_messages():
-        raise OSError("full")
-    os.write(2, b"after\n")
-    assert capfd.readouterr().err == "after\n"
-
-
-def test_the_lines_of_two_threads_are_kept_back(capfd: pytest.CaptureFixture[str]) -> None:
-    first_is_inside = threading.Event()
-
-    def first() -> None:
-        with without_libtiff_messages():
-            first_is_inside.set()
-            time.sleep(0.2)  # the second thread tries to enter
-            os.write(2, b"_tiffWriteProc: File too large.\nkept\n")
-
-    def second() -> None:
-        first_is_inside.wait(10)
-        with without_libtiff_messages(), without_libtiff_messages():
-            time.sleep(0.4)  # the first thread has left
-            os.write(2, b"_tiffWriteProc: File too large.\nalso kept\n")
-
-    threads = [threading.Thread(target=each) for each in (first, second)]
-    for thread in threads:
+    def blocks() -> Iterator[Block]:
+        thread = threading.Thread(target=os.write, args=(2, lines))
         thread.start()
-    for thread in threads:
-        thread.join(10)
-    os.write(2, b"after\n")
-    assert capfd.readouterr().err == "kept\nalso kept\nafter\n"
+        thread.join()
+        assert capfd.readouterr().err == lines.decode()
+        yield np.ones((90, 120), np.uint16), 1, 0, 0
+
+    write_layers(tmp_path / "a.tif", tiled_profile(120, 90, 1, "uint16"), [LayerDescription("a")], {}, blocks())
+
+
+@pytest.mark.skipif(os.name == "nt", reason="limits of POSIX")
+@pytest.mark.parametrize("file_format", ["gtiff", "cog"])
+def test_a_full_disk_is_one_error_at_any_size(
+    file_format: str, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    """libtiff prints nothing, and no file is left."""
+    import resource
+
+    capture, out = make_capture(tmp_path), tmp_path / "out"
+    settings = WriteSettings(statistics=True, format=file_format)
+    write_raster(capture, layers_of(capture), CROP, out / "a.tif", settings)
+    size = (out / "a.tif").stat().st_size
+    (out / "a.tif").unlink()
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    for limit in (0, 1, 7, 8, 100, *range(1000, size, size // 30)):
+        resource.setrlimit(resource.RLIMIT_FSIZE, (limit, before[1]))
+        try:
+            with pytest.raises(OutputError, match=r"a\.tif: cannot be written \(.*; is the disk full\?\)|too large"):
+                write_raster(capture, layers_of(capture), CROP, out / "a.tif", settings)
+        finally:
+            resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    assert not list(out.iterdir())
+    assert capfd.readouterr().err == ""
