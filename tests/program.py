@@ -28,6 +28,6 @@ def agalign_here(*arguments: object) -> subprocess.CompletedProcess[str]:
 def agalign(*arguments: object, **options: Any) -> subprocess.CompletedProcess[str]:
     """Run the command line in a process of its own, with `options` of `subprocess.run`."""
     command = [sys.executable, "-m", "agalign", *map(str, arguments)]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=280, check=False, **options)
+    done = subprocess.run(command, capture_output=True, text=True, check=False, **options)
     assert "Traceback" not in done.stderr, done.stderr
     return done

