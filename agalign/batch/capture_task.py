@@ -2,6 +2,7 @@
 
 import logging
 import re
+import time
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -44,7 +45,7 @@ def process_capture(
     limits: FlightLimits = (),
     common: OutputGrid | None = None,
 ) -> CaptureReport:
-    """Align a capture, write its products and its sidecar, and return its report, without times.
+    """Align a capture, write its products and its sidecar, and return its report, without times of stages.
 
     The other bands are aligned where one cannot be. The bands already have the chosen radiometry (`with_radiometry`).
     With the `model` of the flight, a network is learned from scratch only for bands that the model cannot align. The
@@ -53,7 +54,7 @@ def process_capture(
     Raises UnreadableFileError if the reference cannot be read, InputError or ConfigurationError if the capture or the
     installation lacks what a product needs, and OutputError.
     """
-    paths = CapturePaths.of(capture, out)
+    began_s, paths = time.perf_counter(), CapturePaths.of(capture, out)
     refuse_to_overwrite([capture], out, settings.write)
     if missing := missing_radiometry(capture, settings.write.radiometry):
         raise InputError(f"{capture.reference.path}: {missing}")
@@ -69,10 +70,16 @@ def process_capture(
         context = replace(context, layers=layers, grid=grid)
     discard_outputs(capture, out, settings.write)
     failures = _write_products(context)
-    sidecar = write_sidecar(paths.sidecar, sidecar_of(context, list(failures)))
+    sidecar = sidecar_of(context, list(failures)).model_copy(
+        update={"seconds": round(time.perf_counter() - began_s, 3)}
+    )
+    sidecar = write_sidecar(paths.sidecar, sidecar)
     # Products that need the same file fail with the same message.
     failed_products = tuple(dict.fromkeys(failures.values()))
-    return CaptureReport(capture.label, "done", sidecar.result(), paths.sidecar, failed_products=failed_products)
+    result = sidecar.result()
+    return CaptureReport(
+        capture.label, "done", result, paths.sidecar, failed_products=failed_products, seconds=result.seconds
+    )
 
 
 def _write_products(context: ProductContext) -> dict[str, str]:
@@ -182,9 +189,9 @@ def do_capture(task: Task, on_pair: PairProgress = quiet) -> CaptureReport:
             report = process_capture(task.capture, task.out, task.settings, clock, model, *facts)
     except Exception as error:
         # A defect of agalign in one capture must not stop the others.
-        report = CaptureReport(label, "error", error=failure_text(error))
+        report = CaptureReport(label, "error", error=failure_text(error), seconds=clock.seconds)
         logging.getLogger(__name__).debug("%s: %s", label, report.error, exc_info=True)
-    return replace(report, seconds=clock.seconds, stages=clock.stages())
+    return replace(report, stages=clock.stages())
 
 
 def loaded_model(path: Path, device: str) -> FlightModel:

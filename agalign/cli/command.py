@@ -140,7 +140,7 @@ class Command:
 
         def call(**values: Any) -> None:
             terminal = Terminal(**{name: values.pop(name, False) for name in _terminal_parameters()})
-            with exits(terminal, self.on_interrupt):
+            with exits(terminal, self.on_interrupt, values.get("config")):
                 check_address_space()
                 check_threads()
                 given: Given = defaultdict(dict)

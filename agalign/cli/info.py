@@ -91,13 +91,13 @@ def _rows(flight: "FolderScan") -> list[dict[str, Any]]:
 
 def _show_captures(rows: Sequence[dict[str, Any]], problems: int, terminal: Terminal) -> None:
     """Print the captures of a folder as a table, the calibration panels and sky captures, and a line of totals."""
-    headers = ("Capture", "Camera", "Taken", "Bands (reference in brackets)", "Size", "Seeds", "Missing")
+    headers = ("Capture", "Camera", "Taken", "Bands (reference in brackets)", "Seeds", "Missing")
     table = []
     for row in rows:
         bands = ", ".join(f"[{b['name']}]" if b["reference"] else str(b["name"]) for b in row["bands"])
-        size, seeds = "{width} x {height}".format(**row["bands"][0]), ", ".join(row["seeds"])
+        taken, seeds = row["captured_at"][:19].replace("T", " "), ", ".join(row["seeds"])
         missing = [*row["missing_bands"], *(f"{name} (unreadable)" for name in row["unreadable_files"])]
-        table.append((row["label"], row["camera"], row["captured_at"][:19], bands, size, seeds, ", ".join(missing)))
+        table.append((row["label"], row["camera"], taken, bands, seeds, ", ".join(missing)))
     terminal.table(headers, table)
     for row in rows:
         if row["panel"] is not None:

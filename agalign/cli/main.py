@@ -19,7 +19,7 @@ from agalign.cli.evaluate import evaluate, learn, surface
 from agalign.cli.field import mosaic
 from agalign.cli.info import info
 from agalign.cli.results import export, indices, report, verify
-from agalign.cli.terminal import ExitCode, Terminal, examples, printed
+from agalign.cli.terminal import ExitCode, Terminal, examples, options_from, printed
 from agalign.values.cores import limit_default_threads
 from agalign.values.processes import silence_libraries
 from agalign.values.text import did_you_mean
@@ -94,11 +94,18 @@ def _in_one_line(ctx: Any) -> Iterator[None]:
     try:
         yield
     except _UsageError as error:
-        where = (error.ctx or ctx).command_path
-        text = f"agalign: {_reworded(error)}; '{where} --help' lists the options"
-        # Without any argument, the message is the help.
-        typer.echo(error.message if type(error).__name__ == "NoArgsIsHelpError" else text, err=True)
+        where = error.ctx or ctx
+        if type(error).__name__ == "NoArgsIsHelpError":
+            typer.echo(error.message, err=True)
+        else:
+            text = f"{_reworded(error)}{options_from(where.params.get('config'))}"
+            _usage_problem(f"{text}; '{where.command_path} --help' lists the options")
         raise typer.Exit(ExitCode.USAGE) from None
+
+
+def _usage_problem(text: str) -> None:
+    """Print a problem of the command line, of which --log-json may not be parsed yet."""
+    Terminal(log_json="--log-json" in sys.argv).problem(text)
 
 
 def _reworded(error: Any) -> str:
@@ -157,7 +164,7 @@ def main() -> None:
     root_options = ("--help", "-h", "--version", "--install-completion", "--show-completion")
     if arguments and arguments[0] not in {*COMMANDS, *root_options}:
         if problem := _problem_of_folder(arguments):
-            Terminal().problem(problem)
+            _usage_problem(problem)
             raise SystemExit(ExitCode.USAGE)
         arguments = ["align", *arguments]
     # Threads that spin while they wait slow down other programs on the same cores.

@@ -135,9 +135,9 @@ class Terminal:
         """Print a table like a result; the columns after the first `texts` are aligned to the right."""
         from rich.table import Table
 
-        table = Table(*headers[:texts], title=title)
-        for name in headers[texts:]:
-            table.add_column(name, justify="right")
+        table = Table(title=title)
+        for place, name in enumerate(headers):
+            table.add_column(name, justify="left" if place < texts else "right", overflow="fold")  # nothing is cut
         for row in rows:
             table.add_row(*map(shown, row))
         if not self.quiet and not self.log_json:
@@ -187,8 +187,8 @@ def examples(*lines: tuple[str, str]) -> str:
 
 
 @contextmanager
-def exits(terminal: Terminal, on_interrupt: str = "interrupted") -> Iterator[None]:
-    """Convert exceptions in the block to one line and an exit code."""
+def exits(terminal: Terminal, on_interrupt: str = "interrupted", config: Any = None) -> Iterator[None]:
+    """Convert exceptions in the block to one line and an exit code; usage errors name the file of options."""
     try:
         with terminal.stoppable():
             yield
@@ -198,6 +198,7 @@ def exits(terminal: Terminal, on_interrupt: str = "interrupted") -> Iterator[Non
         code, text = _exit_code(error, on_interrupt)
         if code is None:
             raise
+        text += options_from(config) if code == ExitCode.USAGE else ""
         with suppress(OSError):  # standard error may be a file on a full disk
             if terminal.verbose and code == ExitCode.NOTHING and not isinstance(error, AgalignError):
                 from rich.markup import escape
@@ -205,6 +206,11 @@ def exits(terminal: Terminal, on_interrupt: str = "interrupted") -> Iterator[Non
                 terminal.err.print(escape(traceback.format_exc()))
             terminal.problem(text)
         raise typer.Exit(code) from None
+
+
+def options_from(config: Any) -> str:
+    """Return the end of a message about an option, which may be that of a --config file."""
+    return f" (options also from {config})" if config else ""
 
 
 def _exit_code(error: BaseException, on_interrupt: str) -> tuple[int | None, str]:

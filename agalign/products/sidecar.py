@@ -591,6 +591,8 @@ class CaptureResult(_Result):
     """Settings that differ from the defaults, by stage and name; null in older sidecars."""
     input_samples: dict[str, str] = {}
     """Hash of some bytes of the file of each band: it identifies captures without tags."""
+    seconds: Annotated[Number, _measured(3)] = 0.0
+    """Processing time, with reading and writing."""
     checksum: str | None = None
     """SHA-256 of the content as JSON with sorted keys and no spaces, without `checksum` and `seconds`."""
 

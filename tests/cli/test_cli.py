@@ -81,6 +81,15 @@ def test_log_json_is_a_json_object_a_line(aligned_flight: Path) -> None:
     assert events[-1]["event"] == "finished"
 
 
+def test_log_and_report_have_the_same_time_of_a_capture(aligned_flight: Path, aligned_copy: Path) -> None:
+    events = [json.loads(line) for line in (aligned_flight.parent / "log.jsonl").read_text().splitlines()]
+    reported = json.loads(agalign_here("report", aligned_copy, "--json").stdout)["captures"]
+    seconds = {e["capture"]: e["seconds"] for e in events if e["event"] == "capture"}
+    assert {c["label"]: c["seconds"] for c in reported} == seconds
+    assert len(seconds) == 2
+    assert all(c["seconds"] > sum(b["seconds"] for b in c["bands"]) for c in reported)
+
+
 def test_a_second_run_keeps_finished_captures(flight: Path, aligned_copy: Path) -> None:
     stack = aligned_copy / "0000SET" / "000" / "IMG_0001.tif"
     before = stack.stat().st_mtime_ns

@@ -73,6 +73,7 @@ def test_a_file_sets_options_and_the_command_line_comes_first(tmp_path: Path, se
         ("x = " + "[" * 9999 + "]" * 9999, "cannot be read as TOML"),
         ("x = " + "9" * 9999, "cannot be read as TOML"),
         ('jobs = "many"', "--jobs: give a whole number"),
+        ('index = "nope"', "unknown index 'nope'"),
         ("dry-run = true", "no option 'dry-run'"),
         (None, "agalign.toml does not exist"),
     ],
@@ -85,6 +86,7 @@ def test_a_wrong_file_is_one_line(tmp_path: Path, text: str | None, said: str) -
     assert done.returncode == 2
     (line,) = done.stderr.splitlines()
     assert said in line
+    assert str(config) in line
 
 
 @pytest.mark.full

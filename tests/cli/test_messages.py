@@ -4,6 +4,9 @@ import json
 import os
 import re
 import signal
+import subprocess
+import sys
+from contextlib import suppress
 from pathlib import Path
 
 import cv2
@@ -105,6 +108,37 @@ def test_wrong_arguments_are_one_line(flight: Path, tmp_path: Path, command: str
     assert "nput should" not in only
     assert "Value error" not in only
     assert not (tmp_path / "o").exists()
+
+
+@pytest.mark.parametrize("command", ["align x --nope", "x --jobs y", "align", "mosiac"])
+def test_usage_errors_are_events_of_the_json_log(command: str) -> None:
+    plain, logged = agalign_here(*command.split()), agalign_here(*command.split(), "--log-json")
+    assert plain.returncode == logged.returncode == 2
+    event = json.loads(logged.stderr)
+    assert plain.stderr == f"agalign: {event['message']}\n"
+    assert event == {"event": "problem", "message": event["message"]}
+
+
+@pytest.mark.skipif(os.name == "nt", reason="terminals of POSIX")
+def test_a_narrow_terminal_shows_every_date(flight: Path) -> None:
+    """A table is wrapped, and nothing of it is cut."""
+    import pty
+
+    captures = json.loads(agalign_here("info", flight, "--json").stdout)["captures"]
+    parent, child = pty.openpty()
+    command = [sys.executable, "-m", "agalign", "info", flight]
+    with subprocess.Popen(command, stdout=child, stderr=child, env={**os.environ, "COLUMNS": "80"}):
+        os.close(child)
+        lines: list[str] = []
+        with suppress(OSError), os.fdopen(parent, encoding="utf-8") as terminal:  # Linux reports an error at the end
+            lines += iter(terminal.readline, "")
+    rows = [line for line in lines if line.startswith("│")]
+    assert all(len(row) == len("\n") + 80 for row in rows)
+    assert "…" not in "".join(lines)
+    for capture in captures:
+        date, time = capture["captured_at"][:19].split("T")
+        assert any(date in row for row in rows)
+        assert any(time in row for row in rows)
 
 
 def test_no_argument_prints_the_help() -> None:

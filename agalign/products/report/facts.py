@@ -182,7 +182,7 @@ class FlightFacts:
             "altitude_m": None if position is None else position.altitude_m,
             "missing": sidecar.missing_bands,
             "reference": sidecar.reference.band,
-            "seconds": round(sum(b.seconds for b in result.bands if b.status != "reference"), 2),
+            "seconds": sidecar.seconds,
             "max_predicted_px": sidecar.max_predicted_px,
             "crop": grid.crop,
             "scale": grid.scale,
