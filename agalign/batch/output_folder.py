@@ -13,10 +13,13 @@ from filelock import FileLock, Timeout
 
 from agalign.errors import OutputError
 from agalign.values.files import remove_partial_files
+from agalign.values.text import name_problem
 
 
 def prepare_output(out: Path) -> None:
     """Create the output folder. Raises OutputError if it cannot be created or written to."""
+    if problem := name_problem(out.absolute()):
+        raise OutputError(problem)
     try:
         out.mkdir(parents=True, exist_ok=True)
         if not os.access(out, os.W_OK):

@@ -22,7 +22,7 @@ from agalign.cli.results import export, indices, report, verify
 from agalign.cli.terminal import ExitCode, Terminal, examples, options_from, printed
 from agalign.values.cores import limit_default_threads
 from agalign.values.processes import silence_libraries
-from agalign.values.text import did_you_mean
+from agalign.values.text import did_you_mean, name_problem
 
 COMMANDS = {
     "align": align,
@@ -162,11 +162,13 @@ def main() -> None:
     """Run the application; if the first argument is not a command, it is the folder to align."""
     arguments = sys.argv[1:]
     root_options = ("--help", "-h", "--version", "--install-completion", "--show-completion")
+    problem = next(filter(None, map(name_problem, arguments)), "")
     if arguments and arguments[0] not in {*COMMANDS, *root_options}:
-        if problem := _problem_of_folder(arguments):
-            _usage_problem(problem)
-            raise SystemExit(ExitCode.USAGE)
+        problem = problem or _problem_of_folder(arguments)
         arguments = ["align", *arguments]
+    if problem:
+        _usage_problem(problem)
+        raise SystemExit(ExitCode.USAGE)
     # Threads that spin while they wait slow down other programs on the same cores.
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     # The matrices here are small: a second BLAS thread only spins.

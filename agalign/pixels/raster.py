@@ -27,6 +27,7 @@ from agalign.values.capture import Band, Georeference
 from agalign.values.choices import MAX_PIXELS
 from agalign.values.image import Mask, Raster, Tile, reduced_size_px
 from agalign.values.pixel_units import PixelScale
+from agalign.values.text import name_problem
 
 GDAL_ENVIRONMENT = {
     "GDAL_PAM_ENABLED": "NO",
@@ -101,9 +102,7 @@ def open_raster(path: Path) -> Iterator[rasterio.DatasetReader]:
             ) as north_up:
                 yield north_up
     except UnicodeEncodeError:
-        raise UnreadableFileError(
-            f"{path}: the system encoding cannot represent its name; set LC_ALL=C.UTF-8"
-        ) from None
+        raise UnreadableFileError(name_problem(path)) from None
     except Exception as error:
         # Some classes of rasterio's errors are not public.
         if not isinstance(error, UnicodeDecodeError) and not type(error).__module__.startswith("rasterio."):

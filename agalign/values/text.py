@@ -1,5 +1,6 @@
 """Escaping of texts from files for terminals and spreadsheets."""
 
+import sys
 import unicodedata
 from collections.abc import Iterable
 from contextlib import suppress
@@ -21,6 +22,19 @@ def did_you_mean(text: str, choices: Iterable[str]) -> str:
     best = max(choices, key=similarity, default="")
     min_similarity = 0.7  # of a suggestion: a quarter of the letters of a word of four may differ
     return f" (did you mean '{best}'?)" if best and similarity(best) >= min_similarity else ""
+
+
+def name_problem(path: object) -> str:
+    """Return why libraries cannot open a path, and the remedy: bytes of a name that Python could not decode are
+    surrogates. Empty if there are none.
+    """
+    try:
+        str(path).encode()
+    except UnicodeEncodeError:
+        encoding = sys.getfilesystemencoding()
+        also = "" if encoding == "utf-8" else ", or set LC_ALL=C.UTF-8"
+        return f"{path}: its name is not valid {encoding.upper()}; rename it{also}"
+    return ""
 
 
 def escape_controls(text: str) -> str:

@@ -760,7 +760,7 @@ FILE_IS_NAMED: dict[str, tuple[Inject, str]] = {
     ),
     "a system without letters beyond ASCII": (
         both(strange_names, with_environment(LC_ALL="C", PYTHONUTF8="0", PYTHONCOERCECLOCALE="0")),
-        "the system encoding cannot represent its name",
+        "its name is not valid ASCII; rename it, or set LC_ALL=C.UTF-8",
     ),
 }
 """After these, both captures are aligned, and another file is complained of."""

@@ -4,6 +4,7 @@ import json
 import os
 import re
 import shutil
+import sys
 from html import escape
 from pathlib import Path
 
@@ -24,6 +25,7 @@ from agalign.values.files import file_name
 from agalign.values.text import without_controls
 
 from ..conftest import Shared, read_json, seeded
+from ..program import agalign as run_agalign
 from ..program import agalign_here
 
 HOSTILE = ("../../pwn", "/tmp/p", "..", "a\r\n\x1b[31mb", "x" * 300, "CON", "", ".hidden", "a/b", "a:b", "C:\\b", "é‮/")
@@ -189,3 +191,48 @@ def test_links_in_an_output_folder_are_not_read_written_or_emptied(tmp_path: Pat
     discard_outputs(Capture("IMG_0001", Path("0000SET"), (band,), 0), out, agalign.WriteSettings())
     assert not sidecar.exists()
     assert [p.name for p in secret.iterdir()] == ["key"]
+
+
+BAD = os.fsdecode(b"f\xf6lder")
+"""A name in Latin-1, as old archives have: Python reads its byte outside ASCII as a surrogate."""
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="other systems allow no such names")
+@pytest.mark.parametrize(
+    "command",
+    ["info {bad}", "align {bad}", "align {flight} -o {bad}", "report {bad}", "mosaic {flight} -o {bad}/field.tif"],
+)
+def test_an_argument_that_is_not_utf_8_is_one_line(command: str, flight: Path, tmp_path: Path) -> None:
+    places = {"bad": tmp_path / BAD, "flight": flight}
+    done = agalign_here(*(part.format_map(places) for part in command.split()))
+    assert (done.returncode, done.stdout) == (2, "")
+    assert re.fullmatch(r"agalign: .*/f\\udcf6lder\S*: its name is not valid UTF-8; rename it\n", done.stderr)
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="other systems allow no such names")
+def test_files_and_working_folders_that_are_not_utf_8_are_named(
+    flight: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / BAD).mkdir()
+    for number, image in enumerate(sorted(flight.rglob("IMG_0001_*.tif"))):
+        os.link(image, tmp_path / f"IMG_000{number % 2}{BAD}_{number}.tif")
+        os.link(image, tmp_path / BAD / image.name)
+    done = agalign_here("info", tmp_path, "--exclude", "*/IMG*_1.tif")
+    *problems, last = done.stderr.splitlines()
+    assert all(re.search(r"udcf6lder\S+: its name is not valid UTF-8; rename it$", line) for line in problems)
+    assert "no capture of two or more bands" in last
+    monkeypatch.chdir(tmp_path / BAD)
+    done = agalign_here(".")
+    assert (done.returncode, done.stderr.count("\n")) == (1, 2), done.stderr
+    assert done.stderr.endswith("f\\udcf6lder-aligned: its name is not valid UTF-8; rename it\n")
+    assert not (tmp_path / f"{BAD}-aligned").exists()
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(sys.platform != "linux", reason="other systems decode names as UTF-8")
+def test_a_system_of_ascii_reports_names_outside_it(flight: Path, tmp_path: Path) -> None:
+    environment = {**os.environ, "LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"}
+    done = run_agalign(flight, "-o", tmp_path / "öut", env=environment)
+    assert done.returncode == 2
+    assert done.stderr.endswith("ut: its name is not valid ASCII; rename it, or set LC_ALL=C.UTF-8\n")
