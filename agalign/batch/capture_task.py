@@ -70,16 +70,11 @@ def process_capture(
         context = replace(context, layers=layers, grid=grid)
     discard_outputs(capture, out, settings.write)
     failures = _write_products(context)
-    sidecar = sidecar_of(context, list(failures)).model_copy(
-        update={"seconds": round(time.perf_counter() - began_s, 3)}
-    )
-    sidecar = write_sidecar(paths.sidecar, sidecar)
+    sidecar = write_sidecar(paths.sidecar, sidecar_of(context, list(failures), time.perf_counter() - began_s))
     # Products that need the same file fail with the same message.
-    failed_products = tuple(dict.fromkeys(failures.values()))
-    result = sidecar.result()
-    return CaptureReport(
-        capture.label, "done", result, paths.sidecar, failed_products=failed_products, seconds=result.seconds
-    )
+    lost = tuple(dict.fromkeys(failures.values()))
+    result, path = sidecar.result(), paths.sidecar
+    return CaptureReport(capture.label, "done", result, path, failed_products=lost, seconds=sidecar.seconds)
 
 
 def _write_products(context: ProductContext) -> dict[str, str]:

@@ -42,8 +42,9 @@ def capture_status(bands: Iterable[BandPart], accept_predicted_px: float) -> Cap
     return "failed" if all(b.status == "failed" for b in moving) else "degraded"
 
 
-def sidecar_of(context: ProductContext, not_written: Sequence[str] = ()) -> Sidecar:
-    """Return the sidecar of a capture after its products were written; `not_written` has the kinds that failed.
+def sidecar_of(context: ProductContext, not_written: Sequence[str] = (), seconds: float = 0.0) -> Sidecar:
+    """Return the sidecar of a capture after its products were written; `not_written` has the kinds that failed, and
+    `seconds` is the processing time.
 
     Raises OutputError.
     """
@@ -73,6 +74,7 @@ def sidecar_of(context: ProductContext, not_written: Sequence[str] = ()) -> Side
         "settings": fingerprint(capture, context.settings),
         "options": context.settings.model_dump(mode="json", exclude_defaults=True),
         "input_samples": input_samples(capture),
+        "seconds": seconds,
     }
     return Sidecar.model_validate(facts)
 

@@ -121,7 +121,7 @@ def test_usage_errors_are_events_of_the_json_log(command: str) -> None:
 
 @pytest.mark.skipif(os.name == "nt", reason="terminals of POSIX")
 def test_a_narrow_terminal_shows_every_date(flight: Path) -> None:
-    """A table is wrapped, and nothing of it is cut."""
+    """A table is wrapped, not cut."""
     import pty
 
     captures = json.loads(agalign_here("info", flight, "--json").stdout)["captures"]
