@@ -155,7 +155,7 @@ def accuracy_of_footprint_m(capture: Capture) -> float | None:
     camera's position, heading, tilt and height. None if `ground_m` returns None.
     """
     width, height = capture.reference.size_px
-    offsets_m = ground_m(capture, np.array([[-0.5, -0.5], [width - 0.5, -0.5], [width, height], [-0.5, height]]))
+    offsets_m = ground_m(capture, np.array([[0, 0], [width, 0], [width, height], [0, height]]) - 0.5)
     pose = capture.pose
     if offsets_m is None or pose is None or pose.height_m is None:
         return None

@@ -19,6 +19,7 @@ from agalign.products.footprint import (
     accuracy_of_footprint_m,
     ground_m,
     missing_for_footprint,
+    pose_errors,
     with_approximate_georeference,
     with_assumed_height,
 )
@@ -60,6 +61,15 @@ def test_the_footprint_of_a_camera_that_looks_down_has_the_size_of_its_field_of_
     assert area > 0  # counter-clockwise, as RFC 7946 has outer rings
     facts = {"status": "failed", "height_m": 50.0, "height_from": "tags", "stack": None, "heading_deg": 0.0}
     assert facts.items() <= feature["properties"].items()
+
+
+def test_the_accuracy_is_that_of_the_farthest_corner() -> None:
+    """Two pixels that cover 40 m each: the corner is 40 m east and 20 m north, not half a pixel farther."""
+    tiny = replace(capture(Pose(0.0, height_m=40.0, focal_length_px=1.0)), bands=(Band("G", Path(), 1, 2, 1, "uint8"),))
+    errors, distance_m = pose_errors(40.0, "tags"), math.hypot(40, 20)
+    tilted_m = errors.tilt * 40 * (1 + (distance_m / 40) ** 2)
+    terms_m = errors.position_m, errors.heading * distance_m, tilted_m, errors.height * distance_m
+    assert accuracy_of_footprint_m(tiny) == pytest.approx(math.hypot(*terms_m), abs=0.06)
 
 
 def test_an_unknown_height_is_assumed_and_marked(tmp_path: Path) -> None:
@@ -169,7 +179,7 @@ def test_a_run_writes_the_map_and_georeferenced_rasters_that_agree(between_panel
     assert feature["properties"]["height_from"] == "panel"
     with rasterio.open(tmp_path / feature["properties"]["stack"]) as stack:
         assert stack.crs.to_epsg() == 32631
-        assert float(stack.tags()["GEOREFERENCE_ACCURACY_M"]) == feature["properties"]["accuracy_m"]
+        assert float(stack.tags()["ABSOLUTE_ACCURACY_M"]) == feature["properties"]["accuracy_m"]
         lon, lat = np.array(feature["geometry"]["coordinates"][0]).T
         corners = rasterio.warp.transform("EPSG:4326", stack.crs, lon, lat)
         size = stack.width, stack.height
