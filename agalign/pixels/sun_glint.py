@@ -36,7 +36,6 @@ def sun_glint(green: FloatImage, nir: FloatImage) -> Mask:
     if min(height, width) < 2 * _BLOCK_PX:
         return np.zeros(green.shape, dtype=bool)
     green_dark, nir_dark = (_darkest_nearby(band) for band in (green, nir))
-    size_px = width, height
     with np.errstate(invalid="ignore", divide="ignore"):
         ndwi = (green_dark - nir_dark) / (green_dark + nir_dark)
         is_water_block = ndwi > 0
@@ -45,11 +44,11 @@ def sun_glint(green: FloatImage, nir: FloatImage) -> Mask:
         # Where all pixels nearby are glint, their minimum is above the value of water.
         nir_dark = np.fmin(nir_dark, np.median(nir_dark[is_water_block]))
         blocks = _connected(ndwi > _MIN_PIXEL_NDWI, is_water_block)
-        is_water = cv2.resize(blocks.astype(np.uint8), size_px, interpolation=cv2.INTER_NEAREST) > 0
-        glint = nir - cv2.resize(nir_dark, size_px, interpolation=cv2.INTER_NEAREST)
+        of_water = np.where(blocks, nir_dark, np.nan).repeat(_BLOCK_PX, axis=0).repeat(_BLOCK_PX, axis=1)
+        glint = nir - of_water[:height, :width]
         is_flat = (green - nir) / (green + nir) > _MIN_PIXEL_NDWI
         min_glint_share = 0.5  # minimum share of glint in the green light
-        is_bright = np.asarray(is_water & is_flat & (glint > min_glint_share * green))
+        is_bright = np.asarray(is_flat & (glint > min_glint_share * green))
     return is_bright & ~_is_uniform(nir, is_bright)
 
 
@@ -70,8 +69,8 @@ def _connected(candidates: Mask, seeds: Mask) -> Mask:
 
 def _darkest_nearby(band: FloatImage) -> NDArray[np.float32]:
     """Return the minimum dark value of the blocks nearby for each block, (rows, columns); NaN if all are unknown."""
-    rows, columns = (max(1, n // _BLOCK_PX) for n in band.shape)
-    complete = band[: rows * _BLOCK_PX, : columns * _BLOCK_PX]
+    complete = np.pad(band, [(0, -n % _BLOCK_PX) for n in band.shape], constant_values=np.nan)
+    rows, columns = (n // _BLOCK_PX for n in complete.shape)
     blocks = complete.reshape(rows, _BLOCK_PX, columns, _BLOCK_PX).transpose(0, 2, 1, 3).reshape(rows, columns, -1)
     unknown = np.float32(1e30)  # larger than any reflectance
     known = np.where(np.isfinite(blocks), blocks, unknown)
