@@ -69,8 +69,9 @@ def learnable(valid: Mask, pixels: ArrayLike, saturation_value: float | None) ->
 def raster_of(image: ArrayLike, valid: ArrayLike | None, name: str) -> Raster:
     """Convert an array (H, W), (H, W, C) or (C, H, W) to a raster.
 
-    Constant fill at the border is masked, and saturated areas of 8 and 16 bit integers. Raises InputError, with `name`,
-    if the array is not an image or `valid` has another shape.
+    Constant fill at the border is masked, and saturated areas of 8 and 16 bit integers. A last channel of the lowest
+    and highest value alone, as in RGBA, is alpha: a mask. Raises InputError, with `name`, if the array is not an image
+    or `valid` has another shape.
     """
     planes, _ = planes_of(image, name)
     if min(planes.shape[1:]) < _MIN_SIDE_PX:
@@ -81,6 +82,8 @@ def raster_of(image: ArrayLike, valid: ArrayLike | None, name: str) -> Raster:
     mask = np.ones(planes.shape[1:], bool) if valid is None else np.array(valid, bool)
     if mask.shape != planes.shape[1:]:
         raise InputError(f"{name}_valid is {mask.shape}, the image {planes.shape[1:]}")
+    if len(planes) in (2, 4) and saturation is not None and np.isin(planes[-1], (0, saturation)).all():
+        mask, planes = mask & (planes[-1] > 0), planes[:-1]
     for plane in planes:
         mask &= data_mask(plane, None)
     mask &= ~np.logical_and.reduce([undeclared_fill(plane) for plane in planes])
