@@ -2,6 +2,7 @@
 
 import logging
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -78,7 +79,7 @@ def align(
     seed_std: dict[SeedKind, FixedImagePx] = {} if seed_std_px is None else {"user": FixedImagePx(seed_std_px)}
     pair = BandPair.of_images("moving", fixed_raster, moving_raster, candidates, seed_std)
     result = without_extrapolated([pair], align_pairs([pair], settings, quiet))
-    return with_metrics(result["moving"], pair)
+    return replace(with_metrics(result["moving"], pair), moving_size_px=moving_raster.size_px)
 
 
 def warp_onto(

@@ -77,6 +77,26 @@ def test_wrong_arguments_are_named() -> None:
         agalign.align(image, image, seed=np.zeros((3, 3)))
 
 
+def test_an_alignment_resamples_images_of_the_size_that_was_aligned() -> None:
+    fixed, moving = textured_pair(TRUTH)
+    result = agalign.align(fixed, moving[:300], seed=TRUTH)
+    result.warp(moving[:300])
+    with pytest.raises(agalign.InputError, match=r"400 x 320 px, .* 400 x 300 px"):
+        result.warp(moving)
+
+
+@pytest.mark.parametrize("channels", [(1, 1, 1), (1,)], ids=["RGBA", "grey and alpha"])
+@pytest.mark.parametrize("side", ["fixed", "moving"])
+def test_alpha_is_a_mask_and_not_a_saturated_band(channels: tuple[int, ...], side: str) -> None:
+    images = dict(zip(("fixed", "moving"), map(as_uint8, textured_pair(TRUTH)), strict=True))
+    alpha = np.full_like(images[side], 255)
+    alpha[:40] = 0
+    images[side] = np.dstack([images[side] * k for k in channels] + [alpha])
+    images[side][:40, :, :-1] = 77
+    result = agalign.align(**images, seed=TRUTH)
+    assert_aligned(result)
+
+
 def test_warp_onto() -> None:
     fixed, moving = textured_pair(TRUTH)
     pixels, valid = agalign.warp_onto(moving, TRUTH, (400, 320))

@@ -1,6 +1,7 @@
 """The names that `import agalign` offers, and what its objects print."""
 
 import ast
+import operator
 import re
 import subprocess
 import sys
@@ -18,7 +19,7 @@ from agalign.config import JointSettings, Settings
 from agalign.values.issues import BLANK_MOVING, Issue
 from agalign.values.mapping import PixelMapping
 
-from .builders import residual_of
+from .builders import joint_result, residual_of
 
 FUNCTIONS = "align align_capture align_folder discover mosaic open_capture open_flight read_alignment warp_onto"
 SETTINGS = "CheckSettings FlightSettings JointSettings ReliefSettings SeedSettings Settings WriteSettings"
@@ -73,10 +74,23 @@ def test_an_alignment_prints_one_short_line() -> None:
     mapping = PixelMapping(np.eye(3))
     residual = residual_of(np.zeros((44, 2)), np.array([0.0512, 0.0]))
     result = agalign.Alignment(mapping, (640, 480), "aligned", (), seed, residual=residual)
-    assert repr(result) == "Alignment(status='aligned', residual_median_px=0.051, corner_std_px=None)"
+    assert repr(result) == "Alignment(status='aligned', residual.median_px=0.0512)"
     failed = agalign.Alignment(mapping, (640, 480), "failed", (Issue(BLANK_MOVING),), seed)
-    assert repr(failed).startswith("Alignment(status='failed', residual_median_px=None, corner_std_px=None, reason='")
+    assert repr(failed).startswith("Alignment(status='failed', reason='")
     assert "array" not in repr(failed)
+
+
+def test_names_in_the_text_of_an_alignment_are_attributes() -> None:
+    residual, joint = residual_of(np.zeros((4, 2)), (0.3, 0.4)), joint_result(std_px=0.25)
+    prediction = agalign.Prediction(np.eye(3), "windows", 0.4)
+    facts = {"residual": residual, "joint": joint, "prediction": prediction}
+    seed = agalign.Seed("identity", np.eye(3), 0.0)
+    result = agalign.Alignment(PixelMapping(np.eye(3)), (64, 48), "predicted", (Issue(BLANK_MOVING),), seed, **facts)
+    shown = dict(re.findall(r"([\w.]+)=('[^']*'|[^,)]+)", repr(result)))
+    assert {"status", "residual.median_px", "joint.corner_std_px", "reason"} == set(shown)
+    for name, text in shown.items():
+        value = operator.attrgetter(name)(result)
+        assert text == repr(value) if isinstance(value, str) else float(text) == pytest.approx(value, rel=0.01)
 
 
 ROOT = Path(__file__).parent.parent

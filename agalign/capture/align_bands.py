@@ -27,11 +27,14 @@ from agalign.method.device import one_thread
 from agalign.method.joint import Results, align_from_scratch, refine_with
 from agalign.method.refine import FLIGHT_PATCHES, PATCHES
 from agalign.method.state import ImageGroup
+from agalign.relief.occlusion import occluded
 from agalign.values import geometry
 from agalign.values.alignment import Alignment, JointResult, RefinedPair, Seed
-from agalign.values.capture import Capture
+from agalign.values.capture import Band, Capture
+from agalign.values.choices import PairStatus
 from agalign.values.issues import OTHER_GEOMETRY, SEED_ASKED_FOR, Issue
 from agalign.values.mapping import PixelMapping
+from agalign.values.parallax import Parallax, Relief
 from agalign.values.pixel_units import FixedFilePx, FixedImagePx
 
 PairProgress = Callable[[str, str, float], None]
@@ -76,19 +79,27 @@ def align_capture_bands(
         aligned = without_extrapolated(pairs, aligned, None if model is None else model.rig)
     aligned = _with_metrics(pairs, aligned, progress, with_ties=settings.write.tie_points)
     result: dict[str, Alignment[FixedFilePx]] = {}
-    for band in capture.bands_of_the_references_lens:
-        identity = Seed("identity", geometry.identity(), 0.0)
-        result[band.name] = Alignment(
-            PixelMapping(identity.fixed_to_moving), capture.reference.size_px, "aligned", (), identity
-        )
     for pair in pairs:
         result |= _between_files(capture, pair, aligned[pair.name])
+    size_px = capture.reference.size_px
     for band in capture.moving:
-        if band.name in unusable:
-            overlay = Seed("identity", geometry.overlay(capture.reference.size_px, band.size_px), 0.0)
-            mapping = PixelMapping(overlay.fixed_to_moving)
-            result[band.name] = Alignment(mapping, capture.reference.size_px, "failed", (unusable[band.name],), overlay)
-    return {band.name: result[band.name] for band in capture.moving}
+        if band.name not in result:
+            overlay = Seed("identity", geometry.overlay(size_px, band.size_px), 0.0)
+            issues = (unusable[band.name],) if band.name in unusable else ()  # none in a band of the reference's lens
+            status: PairStatus = "failed" if issues else "aligned"
+            result[band.name] = Alignment(PixelMapping(overlay.fixed_to_moving), size_px, status, issues, overlay)
+    reliefs = (a.mapping.parallax.relief for a in result.values() if a.mapping.parallax is not None)
+    relief = next((relief.on_pixels(size_px) for relief in reliefs), None)  # the same in all bands
+    return {band.name: _as_written(result[band.name], band, relief) for band in capture.moving}
+
+
+def _as_written(alignment: Alignment[FixedFilePx], band: Band, relief: Relief | None) -> Alignment[FixedFilePx]:
+    """Return the alignment of a band with the relief that is written: a reader of the sidecar has the same mapping."""
+    mapping = alignment.mapping
+    if relief is not None and mapping.parallax is not None:
+        baseline = mapping.parallax.baseline
+        mapping = mapping.with_parallax(Parallax(relief, baseline, occluded(relief, baseline)))
+    return replace(alignment, mapping=mapping, moving_size_px=band.size_px)
 
 
 def _between_files(

@@ -14,9 +14,9 @@ from agalign.values import geometry, lens
 from agalign.values.capture import Band, Radiometry
 from agalign.values.choices import Interpolation
 from agalign.values.image import FloatImage, Mask, Raster, Tile
-from agalign.values.interpolation import MIN_VALID_WEIGHT, between, resample, source_window
+from agalign.values.interpolation import MIN_VALID_WEIGHT, between, resample, source_positions
 from agalign.values.mapping import PixelMapping
-from agalign.values.pixel_units import SAME_PIXELS, PixelScale
+from agalign.values.pixel_units import SAME_PIXELS, PixelScale, Size
 
 _MIN_SIDE_PX = 8
 """A moving image is not reduced below this, whatever the scale of the homography."""
@@ -29,16 +29,18 @@ def resample_tile(
     interpolation: Interpolation,
     radiometry: Radiometry | None = None,
     *,
+    size_px: Size | None = None,
     dataset: OpenRaster | None = None,
 ) -> tuple[NDArray[np.generic], Mask]:
     """Resample the moving band to a tile of the reference grid; return pixels and mask, each (height, width).
+
+    `size_px` is (width, height) of that grid, with which a pixel has the same value in any tile.
 
     The type is that of the band, with integers rounded and clipped, or float32 if calibrated with `radiometry`. A pixel
     is valid if its position is inside the moving image and not occluded, and no invalid pixel contributes to it. With
     the open file as `dataset`, GDAL's block cache serves neighbouring tiles. Raises UnreadableFileError.
     """
-    positions = mapping.positions(tile, np.float32)
-    source = source_window(positions, band.size_px, is_smooth=mapping.is_smooth(tile))
+    positions, source = source_positions(mapping, tile, size_px, band.size_px)
     if source is None:
         shape = tile.height, tile.width
         return np.zeros(shape, band.dtype if radiometry is None else np.float32), np.zeros(shape, dtype=bool)

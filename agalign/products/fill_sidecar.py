@@ -3,7 +3,6 @@
 import math
 from collections.abc import Iterable, Sequence
 from contextlib import suppress
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -23,7 +22,6 @@ from agalign.values.capture import Band, Radiometry
 from agalign.values.choices import CaptureStatus
 from agalign.values.geometry import Points
 from agalign.values.mapping import PixelMapping
-from agalign.values.parallax import Relief
 from agalign.values.pixel_units import FixedFilePx
 
 _GRIDS = ((17, 13), (33, 25), (65, 49), (129, 97))
@@ -130,6 +128,7 @@ def _band_part(context: ProductContext, band: Band) -> BandPart:
     facts = _source(band) | {
         "wavelength_nm": band.wavelength_nm,
         "place": None if place is None else {"file": context.paths.relative(place[0].path), "band_index": place[1]},
+        "size_px": band.size_px,
     }
     with suppress(UnreadableFileError):  # the preview has failed with this reason
         is_comparable = not (is_thermal(band) or band.companion)  # companions are exposed automatically
@@ -142,9 +141,6 @@ def _band_part(context: ProductContext, band: Band) -> BandPart:
     mapping, size_px = alignment.mapping, context.capture.reference.size_px
     grid_px = _grid_px(mapping.of_the_plane, size_px)
     lenses = (mapping.fixed_lens, mapping.moving_lens)
-    field = mapping.field
-    if field is not None:
-        field = field.on_lattice(field.step_px / field.scale.mean, size_px)
     facts |= {
         "status": alignment.status,
         "reason": alignment.reason,
@@ -156,7 +152,7 @@ def _band_part(context: ProductContext, band: Band) -> BandPart:
         "metrics": _metrics(alignment),
         "geometry": {"kind": alignment.geometry, "held_out_p95_px": alignment.candidates},
         "lenses": None if None in lenses else lenses,
-        "field": field,
+        "field": mapping.field,
         "relief": _relief(context, mapping, grid_px),
         "prediction": alignment.prediction,
         "seconds": alignment.seconds,
@@ -183,19 +179,21 @@ def _relief(context: ProductContext, mapping: PixelMapping, nodes_px: Points) ->
     parallax = mapping.parallax
     if parallax is None:
         return None
-    # The mapping is linear in the parallax: its values for a parallax of 0 and of 1 px determine it.
-    flat = np.zeros((1, 1), np.float32)
-    at_zero, at_one = (
-        replace(mapping, parallax=replace(parallax, relief=Relief(flat + parallax_px, flat)))(nodes_px)
-        for parallax_px in (0, 1)
-    )
+    # Parabolas through the value at 0 are fitted over the range of the scene: lenses and tilt bend the mapping.
+    z_px = parallax.relief.parallax_px
+    levels_px = np.linspace(min(-1.0, z_px.min()), max(1.0, z_px.max()), 5)
+    plane_px, *others_px = (mapping.at_parallax(nodes_px, parallax.baseline, z) for z in (0, *levels_px))
+    powers = np.stack([levels_px, levels_px**2], axis=-1)
+    moved_px = np.reshape(others_px - plane_px, (len(levels_px), -1))
+    slope, curvature = np.linalg.lstsq(powers, moved_px, rcond=None)[0].reshape(2, *plane_px.shape)
     return {
         "file": next((context.paths.relative(f.path) for f in context.written if f.kind == ReliefMap.kind), None),
         "baseline": parallax.baseline,
         "occluded": 0.0 if parallax.hidden is None else float(parallax.hidden.mean()),
         "reference_px": nodes_px,
-        "plane_px": at_zero,
-        "slope": at_one - at_zero,
+        "plane_px": plane_px,
+        "slope": slope,
+        "curvature": curvature,
     }
 
 

@@ -17,7 +17,7 @@ from agalign.values.capture import Band, Capture, Radiometry
 from agalign.values.geometry import Matrix, Points
 from agalign.values.image import Mask, OutputGrid, Tile
 from agalign.values.mapping import PixelMapping
-from agalign.values.pixel_units import SAME_PIXELS, FixedFilePx, PixelScale
+from agalign.values.pixel_units import SAME_PIXELS, FixedFilePx, PixelScale, Size
 
 _MAX_CELL_PX, _MIN_CELLS = 8, 64
 """The common area is found in cells of at most 8 px, and at least 64 cells along each axis if the image has as many."""
@@ -32,6 +32,8 @@ class Layer:
     """From output pixels, before the crop, to raw pixels of the file. None for a reference that is copied, and for a
     moving band without pixels.
     """
+    size_px: Size | None = None
+    """(width, height) of the output before the crop."""
     is_reference: bool = False
     vignetting: Radiometry | None = None
     """Correction of the vignetting of raw numbers, if their file has no tags for it."""
@@ -80,7 +82,8 @@ def output_layers(
     if frame.undistorted or frame.scale != SAME_PIXELS:
         mappings[reference.name] = PixelMapping(geometry.identity())  # otherwise the reference is copied
     on_frame = {name: _on_frame(mapping, frame, reference) for name, mapping in mappings.items()}
-    layers = [Layer(b, on_frame.get(b.name), is_reference=b is reference) for b in capture.bands]
+    size_px = frame.width, frame.height
+    layers = [Layer(b, on_frame.get(b.name), size_px, is_reference=b is reference) for b in capture.bands]
     # The crop is calculated without relief, which may leave pixels of single bands without a value.
     mapped = [(layer.mapping.of_the_plane, layer.band) for layer in layers if layer.mapping is not None]
     crop = frame.tile

@@ -27,11 +27,11 @@ from agalign.pixels.raster import OpenRaster, open_raster
 from agalign.products.checked_raster import Block, LayerDescription, predictor, write_layers
 from agalign.products.layout import Layer, common_grid, output_layers
 from agalign.products.product import GEOTIFF, Product, ProductContext, StacAsset, WrittenFile
-from agalign.products.raster_file import as_type, with_nodata, write_raster
+from agalign.products.raster_file import with_nodata, write_raster
 from agalign.values.capture import Band, Capture
 from agalign.values.files import scratch_file
 from agalign.values.image import FloatImage, Mask, OutputGrid, Tile
-from agalign.values.interpolation import tiles
+from agalign.values.interpolation import as_type, tiles
 
 _TILE_PX = 1024
 """Side of the tiles that are sharpened one after another, which limits the memory, and of the square in the middle of

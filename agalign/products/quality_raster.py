@@ -16,9 +16,9 @@ from agalign.products.product import GEOTIFF, Product, ProductContext, StacAsset
 from agalign.products.raster_file import layer_pixels
 from agalign.values import geometry
 from agalign.values.alignment import Alignment
-from agalign.values.capture import Radiometry
+from agalign.values.capture import Band, Radiometry
 from agalign.values.image import FloatImage, Mask, OutputGrid, Tile
-from agalign.values.interpolation import tiles
+from agalign.values.interpolation import source_positions, tiles
 from agalign.values.pixel_units import FixedFilePx
 from agalign.values.quality import MEANINGS, Quality
 from agalign.verify.extrapolation import expected_error_px
@@ -37,24 +37,22 @@ class ErrorMap(Product):
 
     def write(self, context: ProductContext) -> list[WrittenFile]:
         """Write <capture>.error.tif: float32, px of the reference's file, a layer for each moving band."""
-        with_pixels, size_px, grid = context.with_pixels, context.capture.reference.size_px, context.grid
+        with_pixels, reference, grid = context.with_pixels, context.capture.reference, context.grid
         layers = [
             LayerDescription(name, tags={"units": "px of the reference", "STATUS": alignment.status})
             for name, alignment in with_pixels.items()
         ]
-        blocks = ((_error_px(a, size_px, grid), index, 0, 0) for index, a in enumerate(with_pixels.values(), start=1))
+        blocks = ((_error_px(a, reference, grid), index, 0, 0) for index, a in enumerate(with_pixels.values(), start=1))
         return self.write_layers(context, layers, blocks, StacAsset("error", GEOTIFF, ("metadata",)))
 
 
-def error_lattice_px(
-    alignment: Alignment[FixedFilePx], size_px: tuple[int, int], grid: OutputGrid
-) -> NDArray[np.float32]:
+def error_lattice_px(alignment: Alignment[FixedFilePx], reference: Band, grid: OutputGrid) -> NDArray[np.float32]:
     """Return the expected error (rows, columns) on a lattice over a grid, px of the reference's file; nan where it is
-    unknown. `size_px` is (width, height) of that file.
+    unknown.
     """
     columns, rows = (max(2, -(-n // _LATTICE_PX)) for n in (grid.width, grid.height))
-    points = grid.reference_positions(geometry.lattice(grid.width, grid.height, columns, rows))
-    nodes = expected_error_px(alignment, size_px, points).reshape(rows, columns)
+    points = grid.reference_positions(geometry.lattice(grid.width, grid.height, columns, rows), reference.lens)
+    nodes = expected_error_px(alignment, reference.size_px, points).reshape(rows, columns)
     return np.where(np.isfinite(nodes), nodes, np.nan).astype(np.float32)
 
 
@@ -68,9 +66,9 @@ def error_on_tile(nodes: NDArray[np.float32], grid: OutputGrid, tile: Tile) -> N
     return np.asarray(cv2.remap(nodes, *positions, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE), np.float32)
 
 
-def _error_px(alignment: Alignment[FixedFilePx], size_px: tuple[int, int], grid: OutputGrid) -> NDArray[np.float32]:
+def _error_px(alignment: Alignment[FixedFilePx], reference: Band, grid: OutputGrid) -> NDArray[np.float32]:
     """Expected error (height, width) on a grid, rounded below its accuracy: the raster compresses better."""
-    result, step_px = error_on_tile(error_lattice_px(alignment, size_px, grid), grid, grid.tile), 0.001
+    result, step_px = error_on_tile(error_lattice_px(alignment, reference, grid), grid, grid.tile), 0.001
     return np.asarray(np.round(result / step_px) * step_px, np.float32)
 
 
@@ -83,19 +81,20 @@ class QualityRaster(Product):
 
     def write(self, context: ProductContext) -> list[WrittenFile]:
         """Write <capture>.qa.tif. Raises OutputError, or UnreadableFileError for an input."""
-        grid, size_px = context.grid, context.capture.reference.size_px
-        nodes = {name: error_lattice_px(a, size_px, grid) for name, a in context.with_pixels.items()}
+        grid, reference = context.grid, context.capture.reference
+        nodes = {name: error_lattice_px(a, reference, grid) for name, a in context.with_pixels.items()}
         water = _water_bands(context.layers)
+        glint = sun_glint(*(_reflectance(*band, grid.tile) for band in water)) if water else None
         predicted = {name for name, alignment in context.with_pixels.items() if alignment.status == "predicted"}
 
         def flags_on(tile: Tile) -> list[Flags]:
             bands = [
                 _flags(layer, tile, grid, nodes, is_predicted=layer.band.name in predicted) for layer in context.layers
             ]
-            if water:
-                glint = sun_glint(*(_reflectance(*band, tile) for band in water))
+            if glint is not None:
+                in_tile = glint[tile.y0 - grid.y0 :, tile.x0 - grid.x0 :][: tile.height, : tile.width]
                 for flags in bands:
-                    flags[glint & (flags & _bit(Quality.MISSING) == 0)] |= _bit(Quality.SUN_GLINT)
+                    flags[in_tile & (flags & _bit(Quality.MISSING) == 0)] |= _bit(Quality.SUN_GLINT)
             return [np.bitwise_or.reduce(bands), *bands]
 
         method = "water by NDWI > 0 (McFeeters 1996), glint by the excess of near infrared (Hedley et al. 2005)"
@@ -147,14 +146,12 @@ def _of_source(layer: Layer, tile: Tile) -> dict[Quality, Mask]:
     if layer.mapping is None:
         pixels, valid = read_tile(band, tile)
         return {Quality.NODATA: ~valid, Quality.SATURATED: _saturated(pixels, valid, band.saturation_value)}
-    positions = layer.mapping.positions(tile, np.float32)
+    positions, source = source_positions(layer.mapping, tile, layer.size_px, band.size_px)
     inside = is_inside(positions, band)
-    if not inside.any():
+    if source is None:
         return {Quality.OUTSIDE: ~inside}
-    x0, y0 = np.floor(positions[inside].min(axis=0)).astype(int).tolist()
-    x1, y1 = np.minimum(np.ceil(positions[inside].max(axis=0)).astype(int) + 1, band.size_px).tolist()
-    pixels, valid = read_tile(band, Tile(x0, y0, x1 - x0, y1 - y0))
-    in_window = (positions - np.array([x0, y0], np.float32)).astype(np.float32)
+    pixels, valid = read_tile(band, source)
+    in_window = (positions - (source.x0, source.y0)).astype(np.float32)
     saturated = _saturated(pixels, valid, band.saturation_value)
     return {
         Quality.OUTSIDE: ~inside,

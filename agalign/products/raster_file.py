@@ -35,8 +35,8 @@ from agalign.products.layout import Layer, is_inside
 from agalign.products.product import GEOTIFF
 from agalign.values.capture import Band, Capture, Quantity, Radiometry
 from agalign.values.choices import Interpolation
-from agalign.values.image import FloatImage, Mask, OutputGrid, Tile
-from agalign.values.interpolation import tiles
+from agalign.values.image import Mask, OutputGrid, Tile
+from agalign.values.interpolation import as_type, can_hold, tiles
 
 _FILL_DISTANCE_PX = 100.0
 """Search distance of the interpolation of occluded pixels: GDAL's default, wider than any occlusion."""
@@ -194,7 +194,7 @@ def layer_pixels(
 ) -> tuple[Pixels, Mask]:
     """Return the pixels of a layer (height, width) on a tile, calibrated if `radiometry` is given, and their mask."""
     if layer.mapping is not None:
-        return resample_tile(layer.band, layer.mapping, tile, interpolation, radiometry)
+        return resample_tile(layer.band, layer.mapping, tile, interpolation, radiometry, size_px=layer.size_px)
     pixels, valid = read_tile(layer.band, tile)
     return pixels if radiometry is None else calibrated(pixels, radiometry, tile.x0, tile.y0), valid
 
@@ -207,14 +207,6 @@ def _with_occluded(pixels: Pixels, valid: Mask, occluded: Mask) -> tuple[Pixels,
     occluded = occluded & (distance_px < _FILL_DISTANCE_PX)
     filled = fillnodata(np.where(valid, pixels, 0).astype(np.float32), valid, _FILL_DISTANCE_PX)
     return np.where(occluded, as_type(filled, pixels.dtype), pixels), valid | occluded
-
-
-def as_type(values: FloatImage, dtype: np.dtype[Any]) -> Pixels:
-    """Return values (...,) in another type, rounded and limited to its range if it is an integer type."""
-    if dtype.kind != "f":
-        limits = np.iinfo(str(dtype))
-        values = np.clip(np.rint(values), limits.min, limits.max)
-    return values.astype(dtype)
 
 
 def _compression(settings: WriteSettings, *, all_bands: bool) -> str:
@@ -244,7 +236,7 @@ def nodata_value(
     if settings.radiometry != "off":
         return math.nan
     declared = capture.reference.nodata
-    if declared is not None and _fits(declared, dtype):
+    if declared is not None and can_hold(dtype, declared):
         return declared
     if dtype.kind == "f":
         return math.nan  # input files may contain nan without declaring it
@@ -289,10 +281,3 @@ def _values_in(band: Band, tile: Tile) -> Pixels:
     with open_raster(band.path) as source:
         result = [np.unique(read_tile(band, t, source)[0]) for t in tiles(tile, WORK_TILE_PX)]
     return np.unique(np.concatenate(result))
-
-
-def _fits(value: float, dtype: np.dtype[Any]) -> bool:
-    if dtype.kind == "f":
-        return True
-    limits = np.iinfo(str(dtype))
-    return float(value).is_integer() and limits.min <= value <= limits.max

@@ -28,8 +28,8 @@ from agalign.verify.checks import KINDS
 def read_alignment(sidecar: str | Path, band: str) -> Alignment[FixedFilePx]:
     """Return the alignment of a moving band as a sidecar and its relief raster store it.
 
-    Its `map`, `inverse` and `warp` are those of the run, between the raw pixels of the files; the relief is known in
-    the area that was written. `joint` and `prediction` are None, `before` and `after` empty.
+    Its `map`, `inverse` and `warp` are those of the run, between the raw pixels of the files; the relief, and occlusion
+    by it, is known in the area that was written. `joint` and `prediction` are None, `before` and `after` empty.
     Raises SidecarError for a file that is not a sidecar or lacks the mapping, NoSuchBandError for a band that is not a
     moving band of the capture, UnreadableFileError for a relief raster that cannot be read.
     """
@@ -58,6 +58,7 @@ def read_alignment(sidecar: str | Path, band: str) -> Alignment[FixedFilePx]:
         residual=_residual(part),
         seconds=part.seconds,
         candidates=_candidates(part),
+        moving_size_px=part.size_px,
     )
 
 

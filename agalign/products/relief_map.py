@@ -11,11 +11,10 @@ from agalign.errors import GeometryError
 from agalign.products.checked_raster import LayerDescription
 from agalign.products.product import GEOTIFF, Product, ProductContext, StacAsset, WrittenFile
 from agalign.relief.range import inverse_range
-from agalign.values import lens
 from agalign.values.alignment import Alignment
 from agalign.values.capture import Capture
 from agalign.values.image import OutputGrid
-from agalign.values.parallax import Relief
+from agalign.values.parallax import Relief, rounded
 from agalign.values.pixel_units import FixedFilePx
 
 RELIEF_UNITS = {"parallax": "px", "confidence": "1", "range": "m"}
@@ -60,14 +59,12 @@ def relief_layers(
     """
     columns, rows = size_px or (grid.width, grid.height)
     x, y = np.meshgrid(np.linspace(0, grid.width - 1, columns), np.linspace(0, grid.height - 1, rows))
-    points = grid.reference_positions(np.stack([x, y], axis=-1))
-    if grid.undistorted:
-        points = lens.distort(capture.reference.lens, points)
+    points = grid.reference_positions(np.stack([x, y], axis=-1), capture.reference.lens)
     parallax_px = relief(points)
     confidence = Relief(relief.confidence, relief.confidence, relief.scale)(points)
     return {
-        "parallax": _rounded(parallax_px),
-        "confidence": _rounded(confidence),
+        "parallax": rounded(parallax_px),
+        "confidence": rounded(confidence),
         "range": _range_m(capture, alignments, points, parallax_px),
     }
 
@@ -101,9 +98,3 @@ def _range_m(
     with np.errstate(divide="ignore"):
         range_m = np.where(inverse_m > 1 / max_range_m, 1 / inverse_m, np.nan)
     return np.asarray(range_m, np.float32)
-
-
-def _rounded(values: NDArray[np.float64]) -> NDArray[np.float32]:
-    """The values, rounded below their errors: the raster compresses better."""
-    step = 0.01
-    return np.asarray(np.round(values / step) * step, np.float32)

@@ -7,6 +7,7 @@ the reference to a pixel of the moving band; `grid` samples the complete mapping
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Annotated, Any, Literal, Self
 
 import numpy as np
@@ -16,6 +17,7 @@ from pydantic_core import CoreSchema, core_schema
 from agalign.config import CheckSettings
 from agalign.values.alignment import Prediction
 from agalign.values.choices import CaptureStatus, Geometry, ModelFamily, PairStatus, PredictionSource, SeedKind, Space
+from agalign.values.displacement import POSITION_DECIMALS
 from agalign.values.files import is_inside
 from agalign.values.image import OutputGrid
 from agalign.values.issues import MISSING_BAND, IssueKind
@@ -54,12 +56,14 @@ def _measured(decimals: int | None = None) -> _FromProgram:
     return _FromProgram(convert)
 
 
-def _from_array(positions_px: object) -> object:
-    return np.round(np.asarray(positions_px), 4).tolist()
+def _from_array(positions_px: object, decimals: int = POSITION_DECIMALS) -> object:
+    return np.round(np.asarray(positions_px), decimals).tolist()
 
 
 Matrix3x3 = Annotated[tuple[Row, Row, Row], _FromProgram(lambda matrix: np.asarray(matrix).tolist())]
 PointsPx = Annotated[list[PointPx], _FromProgram(_from_array)]
+Coefficients = Annotated[list[PointPx], _FromProgram(partial(_from_array, decimals=9))]
+"""Nine decimals: they are multiplied by the square of the parallax, up to hundreds of px."""
 Finite = Annotated[Number | None, _measured()]
 Fraction4 = Annotated[Number | None, _measured(4)]
 Fraction6 = Annotated[Number | None, _measured(6)]
@@ -353,7 +357,7 @@ class GeometryPart(_Part):
 
 class ReliefPart(_PointLists):
     """Displacement by the parallax of the capture: a pixel x of the reference with parallax z maps to plane_px(x) + z
-    slope(x), interpolated by cubic splines.
+    slope(x) + z^2 curvature(x), interpolated by cubic splines.
     """
 
     file: RelativeFile | None
@@ -366,8 +370,10 @@ class ReliefPart(_PointLists):
     """Nodes: those of `grid`."""
     plane_px: PointsPx
     """Where the reference plane maps them, raw px of the moving file."""
-    slope: PointsPx
+    slope: Coefficients
     """Px of the moving file per px of parallax."""
+    curvature: Coefficients | None = None
+    """The same per px of parallax squared; null in files of earlier versions, which are less accurate."""
 
 
 class PredictionPart(_Part):
@@ -444,6 +450,8 @@ class BandPart(BandResult):
     """The complete mapping, sampled."""
     relief: ReliefPart | None = None
     """Displacement by parallax."""
+    size_px: tuple[Count, Count] | None = None
+    """Width and height of the file."""
     levels: list[list[Fraction6]] = []
     """Means of the written pixels in 6 rows of 8 equal blocks; empty for thermal bands and RGB companions."""
 

@@ -14,7 +14,7 @@ from agalign.values import geometry
 from agalign.values.choices import Geometry, Interpolation, ModelFamily, PairStatus, PredictionSource, SeedKind, Space
 from agalign.values.geometry import Matrix, Points
 from agalign.values.image import Mask
-from agalign.values.interpolation import planes_of, resample_planes
+from agalign.values.interpolation import can_hold, planes_of, resample_planes
 from agalign.values.issues import SEED_DOES_NOT_FIT, Issue, explanation, sentence
 from agalign.values.mapping import PixelMapping
 from agalign.values.pixel_units import SAME_PIXELS, FixedFilePx, FixedImagePx, FixedPx, MovingFilePx, PixelScale, Size
@@ -233,6 +233,8 @@ class Alignment(Generic[FixedPx]):
     """Prediction by the rig of the flight; None without a rig."""
     ties: Residual[FixedPx] | None = None
     """Of all windows under this mapping, including those that it was fitted to; None unless they were requested."""
+    moving_size_px: Size | None = None
+    """(width, height) of the moving image; None if it is not known, as in sidecars of earlier versions."""
 
     def map(self, reference_px: ArrayLike) -> Points:
         """Map raw pixels (..., 2) of the reference to raw pixels of the moving image, (0, 0) a pixel's centre."""
@@ -258,16 +260,19 @@ class Alignment(Generic[FixedPx]):
         `valid` (H, W) is False for pixels that must not be used; NaN and `nodata` are never used. Returns the pixels in
         the layout and type of `moving`, and their mask (height, width): True where all channels are known, inside the
         moving image and not occluded. Other pixels are `nodata`, by default NaN or, for integers, 0. Raises InputError
-        for an array that is not an image, or a `nodata` that its type cannot hold.
+        for an array that is not an image or has another size, or a `nodata` that its type cannot hold.
         """
         planes, channels_last = planes_of(moving, "moving")
+        if self.moving_size_px not in (None, planes.shape[:0:-1]):
+            given, aligned = (f"{width} x {height} px" for width, height in (planes.shape[:0:-1], self.moving_size_px))
+            raise InputError(f"moving has {given}, the aligned image {aligned}; give an image of that size")
         mask = np.ones(planes.shape[1:], bool) if valid is None else np.asarray(valid, bool)
         if mask.shape != planes.shape[1:]:
             raise InputError(f"valid is {mask.shape}, the image {planes.shape[1:]}")
         for plane in planes:
             mask = mask & (np.isfinite(plane) if plane.dtype.kind == "f" else True) & (plane != nodata)
         fill = nodata if nodata is not None else math.nan if planes.dtype.kind == "f" else 0
-        if planes.dtype.kind in "ui" and not _is_value_of(str(planes.dtype), fill):
+        if not can_hold(planes.dtype, fill):
             raise InputError(f"nodata is {nodata:g}, which {planes.dtype} cannot hold")
         pixels, known = resample_planes(planes, mask, self.mapping, self.size_px, interpolation, fill)
         if np.ndim(moving) == 2:
@@ -300,11 +305,18 @@ class Alignment(Generic[FixedPx]):
         return "pixel" if self.mapping.fixed_lens is None else "undistorted"
 
     def in_file_px(self: "Alignment[FixedImagePx]", scales: "PairScales", size_px: Size) -> "Alignment[FixedFilePx]":
-        """The same between the files of the two bands; `size_px` is (width, height) of the reference's file."""
+        """The same between the files of the two bands; `size_px` is (width, height) of the reference's file.
+
+        A displacement field gets a lattice on the file, as a sidecar has it.
+        """
         up = scales.fixed.inverse
+        mapping = self.mapping.rescaled(up, scales.moving.inverse)
+        if mapping.field is not None:
+            field = mapping.field.on_lattice(mapping.field.step_px / mapping.field.scale.mean, size_px)
+            mapping = replace(mapping, field=field)
         return replace(
             cast("Alignment[FixedFilePx]", self),
-            mapping=self.mapping.rescaled(up, scales.moving.inverse),
+            mapping=mapping,
             size_px=size_px,
             seed=replace(self.seed, fixed_to_moving=scales.between_files(self.seed.fixed_to_moving)),
             joint=None if self.joint is None else self.joint.in_file_px(scales),
@@ -335,14 +347,8 @@ class Alignment(Generic[FixedPx]):
         return text
 
     def __repr__(self) -> str:
-        """One line without the arrays."""
-        median_px = None if self.residual is None else round(self.residual.median_px, 3)
-        std_px = None if self.joint is None else round(self.joint.corner_std_px, 3)
+        """One line without the arrays; its names are attributes."""
+        residual = "" if self.residual is None else f", residual.median_px={self.residual.median_px:.3g}"
+        std = "" if self.joint is None else f", joint.corner_std_px={self.joint.corner_std_px:.3g}"
         reason = "" if self.reason is None else f", reason={self.reason!r}"
-        return f"Alignment(status={self.status!r}, residual_median_px={median_px}, corner_std_px={std_px}{reason})"
-
-
-def _is_value_of(dtype: str, value: float) -> bool:
-    """True for an integer within the limits of an integer type."""
-    limits = np.iinfo(dtype)
-    return float(value).is_integer() and limits.min <= value <= limits.max
+        return f"Alignment(status={self.status!r}{residual}{std}{reason})"

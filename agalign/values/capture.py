@@ -234,17 +234,9 @@ class Capture:
         """The moving bands grouped by lens, without those that share the lens of the reference."""
         groups: dict[object, list[Band]] = {}
         for index, band in enumerate(self.moving):
-            if not self._is_of_the_references_lens(band):
+            if not (band.one_lens and band.path == self.reference.path):
                 groups.setdefault(band.path if band.one_lens else index, []).append(band)
         return [tuple(group) for group in groups.values()]
-
-    @property
-    def bands_of_the_references_lens(self) -> list[Band]:
-        """Moving bands that share the lens of the reference, and need no alignment."""
-        return [b for b in self.moving if self._is_of_the_references_lens(b)]
-
-    def _is_of_the_references_lens(self, band: Band) -> bool:
-        return band.one_lens and band.path == self.reference.path
 
     @property
     def panel(self) -> Panel | None:

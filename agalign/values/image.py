@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from agalign.values.lens import Lens
+from agalign.values.lens import Lens, distort
 from agalign.values.pixel_units import SAME_PIXELS, PixelScale
 
 FloatImage = NDArray[np.float32]
@@ -81,6 +81,7 @@ class OutputGrid:
         on_grid_x, on_grid_y = self.scale.positions((x, y)).tolist()
         return on_grid_x - self.x0, on_grid_y - self.y0
 
-    def reference_positions(self, positions_px: ArrayLike) -> NDArray[np.float64]:
-        """Positions (..., 2) in the reference's file of positions on this grid."""
-        return self.scale.inverse.positions(np.asarray(positions_px) + np.array([self.x0, self.y0]))
+    def reference_positions(self, positions_px: ArrayLike, reference_lens: Lens | None) -> NDArray[np.float64]:
+        """Raw positions (..., 2) in the reference's file of positions on this grid."""
+        positions = self.scale.inverse.positions(np.asarray(positions_px) + np.array([self.x0, self.y0]))
+        return distort(reference_lens, positions) if self.undistorted else positions

@@ -19,6 +19,8 @@ _SUPPORT_PX = 4
 """Half width of the widest interpolation kernel."""
 MIN_VALID_WEIGHT = 0.999
 """Minimum weight of valid pixels in a valid resampled or reduced pixel: float32 weights do not sum to exactly 1."""
+_MAX_FLOAT32_PX = 1 << 15
+"""Positions in images of longer sides need float64: their last bit in float32 is above 0.002 px."""
 _MAX_CHANNELS = 16
 """Distinguishes (H, W, C) from (C, H, W): images have more rows than this."""
 
@@ -70,8 +72,7 @@ def resample_planes(
     while pending:
         tile = pending.pop()
         at = np.s_[tile.y0 : tile.y0 + tile.height, tile.x0 : tile.x0 + tile.width]
-        positions = mapping.positions(tile)
-        source = source_window(positions, moving_size_px, is_smooth=mapping.is_smooth(tile))
+        positions, source = source_positions(mapping, tile, size_px, moving_size_px)
         if source is None:
             result[:, *at], result_valid[at] = fill, False
             continue
@@ -87,6 +88,19 @@ def resample_planes(
     return result, result_valid
 
 
+def source_positions(
+    mapping: PixelMapping, tile: Tile, size_px: Size | None, moving_size_px: Size
+) -> tuple[NDArray[np.floating], Tile | None]:
+    """Return the positions (height, width, 2) of a tile's pixels in the moving image, and the `source_window` of them.
+
+    With (width, height) `size_px` of the reference they are the same, to the last bit, in any tile: OpenCV's Lanczos
+    kernel rounds them to 1/32 px, so that a difference of rounding may change a pixel by hundreds.
+    """
+    dtype = np.float32 if max(moving_size_px) <= _MAX_FLOAT32_PX else np.float64
+    positions = mapping.positions(tile, dtype, size_px)
+    return positions, source_window(positions, moving_size_px, is_smooth=mapping.is_smooth(tile))
+
+
 def source_window(positions: NDArray[np.floating], size_px: Size, *, is_smooth: bool) -> Tile | None:
     """Return the window of an image (width, height) that interpolation at positions (H, W, 2) reads; None for none.
 
@@ -99,8 +113,9 @@ def source_window(positions: NDArray[np.floating], size_px: Size, *, is_smooth: 
         return None
     # Points near the horizon of a homography are far outside of every image.
     low, high = (np.clip(f(samples, axis=(0, 1)), -(2**30), 2**30) for f in (np.nanmin, np.nanmax))
-    x0, y0 = np.maximum(np.floor(low).astype(int) - _SUPPORT_PX - 1, 0).tolist()
-    x1, y1 = np.minimum(np.ceil(high).astype(int) + _SUPPORT_PX + 2, size_px).tolist()
+    # Twice: pixels under a kernel, and those from which the invalid ones among them are filled.
+    x0, y0 = np.maximum(np.floor(low).astype(int) - 2 * _SUPPORT_PX - 1, 0).tolist()
+    x1, y1 = np.minimum(np.ceil(high).astype(int) + 2 * _SUPPORT_PX + 2, size_px).tolist()
     return Tile(x0, y0, x1 - x0, y1 - y0) if x1 - x0 >= 1 and y1 - y0 >= 1 else None
 
 
@@ -136,7 +151,7 @@ def resample(
         flag = cv2.INTER_NEAREST if interpolation == "nearest" else cv2.INTER_LINEAR
         weight = cv2.remap(valid.astype(np.float32), map_xy, None, flag, borderMode=cv2.BORDER_REPLICATE)
         inside &= weight > MIN_VALID_WEIGHT
-    return _as_type(sampled, pixels.dtype), np.asarray(inside)
+    return as_type(sampled, pixels.dtype), np.asarray(inside)
 
 
 def _range_under_kernel(
@@ -174,7 +189,16 @@ def _filled(pixels: NDArray[np.generic], valid: Mask) -> NDArray[np.generic]:
     return np.where(valid, pixels, mean.astype(pixels.dtype))
 
 
-def _as_type(values: NDArray[np.generic], dtype: np.dtype[np.generic]) -> NDArray[np.generic]:
+def can_hold(dtype: np.dtype[np.generic], value: float) -> bool:
+    """Return True for any value, unless the type is one of integers: then for those within its limits."""
+    if dtype.kind not in "ui":
+        return True
+    limits = np.iinfo(str(dtype))
+    return float(value).is_integer() and limits.min <= value <= limits.max
+
+
+def as_type(values: NDArray[np.generic], dtype: np.dtype[np.generic]) -> NDArray[np.generic]:
+    """Return values (...) in another type, rounded and limited to its range if it is an integer type."""
     if values.dtype == dtype or dtype.kind == "f":
         return values.astype(dtype, copy=False)
     if dtype.kind == "b":

@@ -3,7 +3,7 @@
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import lru_cache
+from functools import lru_cache, partial
 
 import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
@@ -15,8 +15,10 @@ from agalign.values.geometry import Matrix, Points
 from agalign.values.image import Mask, Tile
 from agalign.values.lens import Lens
 from agalign.values.parallax import Parallax, between_levels
-from agalign.values.pixel_units import PixelScale
+from agalign.values.pixel_units import PixelScale, Size
 
+_BLOCK_PX = 256
+"""Side of the blocks of the reference in which positions are interpolated."""
 _KNOT_STEP_PX = 32
 """Distance of the knots of interpolated curved mappings: the error with real lenses is below 0.0001 px."""
 
@@ -38,6 +40,11 @@ class PixelMapping:
     def __call__(self, reference_px: ArrayLike) -> Points:
         """(..., 2) raw reference pixels to raw moving pixels."""
         return lens.distort(self.moving_lens, geometry.apply(self.fixed_to_moving, self.undistorted(reference_px)))
+
+    def at_parallax(self, reference_px: ArrayLike, baseline: tuple[float, float], parallax_px: float) -> Points:
+        """The same with one parallax and baseline for all pixels, instead of those of the mapping."""
+        moved = self.of_the_plane.undistorted(reference_px) + np.array(baseline) * parallax_px
+        return lens.distort(self.moving_lens, geometry.apply(self.fixed_to_moving, moved))
 
     def undistorted(self, reference_px: ArrayLike) -> Points:
         """(..., 2) raw reference pixels to those that the homography maps: displaced, undistorted, with parallax."""
@@ -107,9 +114,16 @@ class PixelMapping:
         depths = self.of_the_plane.undistorted(corners) @ self.fixed_to_moving[2, :2] + self.fixed_to_moving[2, 2]
         return self.parallax is None and bool((depths > 0).all() or (depths < 0).all())
 
-    def positions(self, tile: Tile, dtype: DTypeLike = np.float64) -> Points:
-        """Position of each pixel of a tile in the moving image, (height, width, 2) raw px."""
-        return self.at_crossings(_along(tile.x0, tile.width), _along(tile.y0, tile.height), dtype)
+    def positions(self, tile: Tile, dtype: DTypeLike = np.float64, size_px: Size | None = None) -> Points:
+        """Position of each pixel of a tile in the moving image, (height, width, 2) raw px.
+
+        They are interpolated in blocks of the reference, which end at its (width, height) `size_px`, by default at the
+        tile: with it, a pixel has the same position, to the last bit, in any tile.
+        """
+        width, height = size_px or (tile.x0 + tile.width, tile.y0 + tile.height)
+        (left, columns), (top, rows) = _blocks(tile.x0, tile.width, width), _blocks(tile.y0, tile.height, height)
+        blocks = [np.hstack([self.at_crossings(x_px, y_px, dtype) for x_px in columns]) for y_px in rows]
+        return np.vstack(blocks)[top : top + tile.height, left : left + tile.width]
 
     def at_crossings(self, x_px: Points, y_px: Points, dtype: DTypeLike = np.float64) -> Points:
         """Positions (m, n, 2) in the moving image, raw px, of columns x (n,) and rows y (m,), both ascending."""
@@ -127,13 +141,9 @@ class PixelMapping:
 
     def _with_parallax(self, parallax: Parallax, x_px: Points, y_px: Points, dtype: DTypeLike) -> Points:
         """`at_crossings` with parallax, which is not smooth and cannot be interpolated between knots."""
-        plane, baseline = self.of_the_plane, np.array(parallax.baseline)
 
         def at_level(parallax_px: float) -> Points:
-            def moved(points: Points) -> Points:
-                undistorted = plane.undistorted(points) + baseline * parallax_px
-                return lens.distort(self.moving_lens, geometry.apply(self.fixed_to_moving, undistorted))
-
+            moved = partial(self.at_parallax, baseline=parallax.baseline, parallax_px=parallax_px)
             return splined(moved, x_px, y_px, self._knot_step_px, dtype)
 
         relief = parallax.relief
@@ -167,6 +177,12 @@ def _along(start: int, length: int) -> Points:
     return np.arange(start, start + length, dtype=np.float64)
 
 
+def _blocks(start: int, length: int, side: int) -> tuple[int, list[Points]]:
+    """Return the positions (n,) of the blocks, from 0 to `side`, that contain a range; first its offset in them."""
+    firsts = range(start // _BLOCK_PX * _BLOCK_PX, start + length, _BLOCK_PX)
+    return start % _BLOCK_PX, [_along(n, min(_BLOCK_PX, side - n)) for n in firsts]
+
+
 def splined(
     mapping: Callable[[Points], Points],
     x_px: Points,
@@ -180,9 +196,9 @@ def splined(
     second one, by far the larger, is in `dtype`.
     """
     (knots_x, weights_x), (knots_y, weights_y) = (
-        _spline_weights(np.asarray(at, np.float64).tobytes(), step_px) for at in (x_px, y_px)
+        _spline_weights(np.asarray(at - at[0], np.float64).tobytes(), step_px) for at in (x_px, y_px)
     )
-    values = mapping(np.stack(np.meshgrid(knots_x, knots_y), axis=-1))
+    values = mapping(np.stack(np.meshgrid(x_px[0] + knots_x, y_px[0] + knots_y), axis=-1))
     across = np.ascontiguousarray(weights_x.T, dtype)
     result = np.empty((len(y_px), len(x_px), 2), dtype)
     for k in (0, 1):
@@ -192,11 +208,10 @@ def splined(
 
 @lru_cache(maxsize=32)
 def _spline_weights(at_px: bytes, step_px: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return (knots (k,), weights (n, k)) of cubic interpolation at positions (n,), given as bytes of float64.
+    """Return (knots (k,), weights (n, k)) of cubic interpolation at positions (n,) from 0 on, as bytes of float64.
 
     Cached, because all bands of all captures of a flight have the same positions.
     """
     positions = np.frombuffer(at_px)
-    first, length = positions[0], positions[-1] - positions[0]
-    knots = np.linspace(first, first + max(length, 3), max(4, 1 + math.ceil(length / step_px)))
+    knots = np.linspace(0, max(positions[-1], 3), max(4, 1 + math.ceil(positions[-1] / step_px)))
     return knots, np.asarray(CubicSpline(knots, np.eye(len(knots)))(positions))

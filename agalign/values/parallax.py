@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.ndimage import map_coordinates
 
 from agalign.values.image import FloatImage, Mask
-from agalign.values.pixel_units import SAME_PIXELS, PixelScale
+from agalign.values.pixel_units import SAME_PIXELS, PixelScale, Size
 
 
 @dataclass(frozen=True)
@@ -67,6 +67,12 @@ class Relief:
         """The relief with the opposite sign."""
         return replace(self, parallax_px=-self.parallax_px)
 
+    def on_pixels(self, size_px: Size) -> "Relief":
+        """The same at the pixels of the image on which it is evaluated, of (width, height), as it is written."""
+        x_px, y_px = (np.arange(n, dtype=np.float64) for n in size_px)
+        confidence = replace(self, parallax_px=self.confidence, unit=1.0).at_crossings(x_px, y_px)
+        return Relief(rounded(self.at_crossings(x_px, y_px)), confidence)
+
     def rescaled(self, scale: PixelScale) -> "Relief":
         """The same on an image that is resized by `scale`."""
         return replace(self, scale=self.scale.over(scale), unit=self.unit * scale.mean)
@@ -100,16 +106,27 @@ class Parallax:
         return np.asarray(self.relief(points_px)[..., None] * np.array(self.baseline))
 
 
+def rounded(values: NDArray[np.floating]) -> FloatImage:
+    """Return values of a relief as they are written, rounded below their errors: the raster compresses better."""
+    step = np.float64(0.01)
+    return np.asarray(np.round(values / step) * step, np.float32)
+
+
+_CELL_PX = 32.0
+"""Range of parallax over which a parabola replaces the mapping, to 0.001 px."""
+
+
 def between_levels(at_level: Callable[[float], NDArray[np.floating]], parallax_px: FloatImage) -> NDArray[np.floating]:
     """Return a smooth function of parallax and pixel, (height, width, 2), at the parallax of each pixel.
 
     `at_level` evaluates the function for all pixels at one parallax. It is a homography after a shift, followed by a
-    lens, and a parabola through three levels interpolates it to 0.001 px.
+    lens, and a parabola through three levels interpolates it. The levels do not depend on other pixels.
     """
-    low, high = float(parallax_px.min()), float(parallax_px.max())
-    if high - low < 1e-4:
-        return at_level((low + high) / 2)
-    half = (high - low) / 2
-    before, at, after = (at_level(low + k * half) for k in range(3))
-    u = ((parallax_px - np.float32(low + half)) / np.float32(half))[..., None]
-    return np.asarray(at + u * ((after - before) / 2 + u * ((after + before) / 2 - at)))
+    cells = np.floor(parallax_px / np.float32(_CELL_PX))
+    result = np.empty((*parallax_px.shape, 2), parallax_px.dtype)
+    for cell in range(int(cells.min()), int(cells.max()) + 1):
+        before, at, after = (at_level(_CELL_PX * (cell + k / 2)) for k in range(3))
+        u = (parallax_px * np.float32(2 / _CELL_PX) - np.float32(2 * cell + 1))[..., None]
+        values = at + u * ((after - before) / 2 + u * ((after + before) / 2 - at))
+        np.copyto(result, values, where=(cells == cell)[..., None], casting="same_kind")
+    return result

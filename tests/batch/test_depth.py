@@ -14,6 +14,8 @@ from agalign.cameras.discover import discover
 from agalign.config import Settings, WriteSettings
 from agalign.flight.model import load_model
 
+from ..products.test_relief_map import assert_same_as_stack
+
 pytestmark = [pytest.mark.slow, pytest.mark.full]
 
 SIZE = 480, 360
@@ -45,6 +47,9 @@ def test_captures_with_relief_determine_the_rig_and_have_one_size(close_range: P
     assert set(model.rig.mean) == {"Blue", "Red", "NIR", "Red edge"}
     assert all(b.prediction is not None and b.prediction.std_px < 0.3 for b in bands)
     assert len({r.sidecar.output.crop for r in reports if r.sidecar.output is not None}) == 1
+    for report in reports:
+        inputs = close_range / report.path.parent.relative_to(tmp_path)
+        assert assert_same_as_stack(report.path, inputs, occluded_from_outside=True) == 4
     flight = agalign.open_flight(tmp_path)
     assert flight.sizes["capture"] == CAPTURES
     assert (flight.sizes["x"], flight.sizes["y"]) != SIZE

@@ -3,24 +3,29 @@
 from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 import rasterio
 
 import agalign
 from agalign.pixels.sun_glint import sun_glint
+from agalign.products import quality_raster
 from agalign.products.index_bands import bands_of
 from agalign.products.index_rasters import write_rasters
 from agalign.products.indices import index_named, index_of_formula
 from agalign.products.layout import Layer
-from agalign.products.quality_raster import _flags
+from agalign.products.product import CapturePaths, ProductContext
+from agalign.products.quality_raster import _flags, error_lattice_px, error_on_tile
 from agalign.products.sidecar_file import read_result
-from agalign.values import geometry
-from agalign.values.capture import Band
+from agalign.values import geometry, lens
+from agalign.values.capture import Band, Capture, Radiometry
 from agalign.values.image import OutputGrid
+from agalign.values.lens import Lens
 from agalign.values.mapping import PixelMapping
 from agalign.values.quality import MEANINGS, UNUSABLE, Quality
 
+from ..builders import joint_result, residual_of
 from ..conftest import read_json, seeded, write_band
 
 GRID = OutputGrid(4, 2, 60, 40)
@@ -108,6 +113,73 @@ def test_glint_is_found_where_no_pixel_around_is_free_of_it() -> None:
     green[:, 100:180], nir[:, 100:180] = 0.04, 0.4  # vegetation
     green[:, 180:], nir[:, 180:] = 0.3, 0.32  # a road
     assert not sun_glint(green, nir).any()
+
+
+def scene_with_glint(height: int, width: int) -> tuple[np.ndarray, np.ndarray]:
+    """Water that becomes darker to the left, with waves of glint, and a shore: green and near infrared."""
+    rng = np.random.default_rng(2)
+    green, nir = (level + rng.normal(0, 0.002, (height, width)) for level in (0.08, 0.03))
+    depth = np.linspace(0, 0.04, width)
+    waves = (rng.random((height, width)) < 0.1) * rng.uniform(0.02, 0.2, (height, width))
+    shore = np.arange(width) + 40 * np.sin(np.arange(height) / 30)[:, None] > 0.7 * width
+    return tuple(
+        np.where(shore, land, band + depth + waves).astype(np.float32) for band, land in ((green, 0.1), (nir, 0.4))
+    )
+
+
+def test_glint_does_not_depend_on_the_size_of_the_image() -> None:
+    """Unknown pixels at the right and the bottom complete the blocks of 16 px, and change no other pixel."""
+    bands = scene_with_glint(301, 411)
+    padded = (np.pad(band, ((0, 3), (0, 5)), constant_values=np.nan) for band in bands)
+    result, expected = sun_glint(*bands), sun_glint(*padded)[:301, :411]
+    assert 0.02 < result.mean() < 0.2
+    np.testing.assert_array_equal(result[:-16, :-16], expected[:-16, :-16])
+
+
+def test_glint_does_not_depend_on_the_tile(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    reflectance = Radiometry("reflectance", 0.0, 65535.0, 1.0)
+    bands, values = [], scene_with_glint(301, 411)
+    for name, pixels in zip(("Green", "NIR"), values, strict=True):
+        write_band(tmp_path / f"{name}.tif", np.rint(pixels.clip(0, 1) * 65535).astype(np.uint16))
+        bands.append(Band(name, tmp_path / f"{name}.tif", 1, 411, 301, "uint16", radiometry=reflectance))
+    capture, grid = Capture("c", Path(), tuple(bands), 0), OutputGrid(3, 5, 400, 290)
+    seed = agalign.Seed("identity", geometry.identity(), 0.0)
+    mapping = PixelMapping(geometry.identity())
+    alignment = agalign.Alignment(mapping, (411, 301), "aligned", (), seed)
+    layers = Layer(bands[0], None, is_reference=True), Layer(bands[1], mapping)
+    paths = CapturePaths(tmp_path, "c")
+    context = ProductContext(capture, paths, agalign.Settings(), {"NIR": alignment}, layers, grid, 0)
+    flags = []
+    for tile_px in (1000, 64):
+        monkeypatch.setattr(quality_raster, "WORK_TILE_PX", tile_px)
+        (written,) = quality_raster.QualityRaster().write(context)
+        with rasterio.open(written.path) as raster:
+            flags.append(raster.read(1) & Quality.SUN_GLINT > 0)
+    assert 0.02 < flags[0].mean() < 0.2
+    np.testing.assert_array_equal(*flags)
+
+
+def test_the_error_of_an_undistorted_pixel_is_that_of_its_raw_one() -> None:
+    """At the corner, 12 px from it."""
+    size_px = 640, 480
+    lens_of_reference = Lens(600, 600, 320, 240, (-0.1, 0.0, 0.0, 0.0, 0.0))
+    reference = Band("Green", Path(), 1, *size_px, "uint16", lens=lens_of_reference)
+    joint = joint_result(covariance=np.diag(np.arange(1.0, 9.0)))
+    residual = residual_of(np.array([[100.0, 100.0], [300.0, 200.0], [200.0, 400.0], [500.0, 300.0]]), (0.1, 0.1))
+    seed = agalign.Seed("identity", geometry.identity(), 0.0)
+    mapping = PixelMapping(geometry.identity(), lens_of_reference, lens_of_reference)
+    alignment = agalign.Alignment(mapping, size_px, "aligned", (), seed, joint, residual)
+    raw, undistorted = OutputGrid(0, 0, *size_px), OutputGrid(0, 0, *size_px, undistorted=True)
+    on_raw, on_undistorted = (
+        error_on_tile(error_lattice_px(alignment, reference, g), g, g.tile) for g in (raw, undistorted)
+    )
+    pixels = np.stack(np.meshgrid(*(np.arange(n) for n in size_px)), axis=-1)
+    at = lens.distort(lens_of_reference, pixels).astype(np.float32)
+    inside = ((at > 20) & (at < np.subtract(size_px, 20))).all(axis=-1)
+    assert np.abs(at - pixels)[inside].max() > 10
+    expected = cv2.remap(on_raw, at, None, cv2.INTER_LINEAR)
+    assert np.abs(on_undistorted - on_raw)[inside].max() > 0.05
+    np.testing.assert_allclose(on_undistorted[inside], expected[inside], atol=0.01)
 
 
 def test_a_bright_beach_at_the_water_is_not_glint() -> None:

@@ -3,12 +3,12 @@
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import rasterio
 import tifffile
-from scipy.interpolate import RectBivariateSpline
 from scipy.ndimage import gaussian_filter
 from synthetic_flights.depth import CLOSE_RANGE, Truth, write_capture
 from synthetic_flights.relief import make_scene
@@ -34,6 +34,8 @@ from agalign.values.parallax import Parallax, Relief
 from agalign.values.pixel_units import PixelScale
 
 from ..builders import residual_of
+from ..conftest import read_json
+from ..docs.blocks import ROOT, blocks_of
 from .test_sidecar import context_of
 
 SIZE = 240, 180
@@ -156,25 +158,47 @@ def test_without_a_relief_nothing_is_written(run: Run, tmp_path: Path, monkeypat
 # ---- the sidecar
 
 
-def spline(nodes: np.ndarray, values: np.ndarray) -> Callable[[np.ndarray], np.ndarray]:
-    """Cubic splines through values (n, 2) at the nodes (n, 2) of a lattice, as the sidecar's documentation asks for."""
-    x, y = np.unique(nodes[:, 0]), np.unique(nodes[:, 1])
-    splines = [RectBivariateSpline(y, x, v.reshape(len(y), len(x))) for v in values.T]
-    return lambda points: np.stack([s.ev(points[..., 1], points[..., 0]) for s in splines], axis=-1)
+def documented_reader() -> Callable[..., np.ndarray]:
+    """`mapped` in docs/sidecar.md."""
+    (block,) = (b for b in blocks_of(ROOT / "docs" / "sidecar.md") if "def mapped(" in b.text)
+    names: dict[str, Any] = {}
+    exec(block.text, names)
+    reader: Callable[..., np.ndarray] = names["mapped"]
+    return reader
+
+
+def band_in(path: Path, name: str) -> dict[str, Any]:
+    (part,) = (b for b in read_json(path)["bands"] if b["band"] == name)
+    return dict(part)
+
+
+def test_a_reader_is_accurate_over_the_range_of_the_scene(tmp_path: Path) -> None:
+    """Along a tilted plane, and through lenses, the mapping is not linear in the parallax."""
+    z = np.linspace(-30, 80, FILE_PX[0] * FILE_PX[1], dtype=np.float32).reshape(FILE_PX[::-1])
+    parallax = Parallax(Relief(z, np.ones_like(z)), (0.8, -0.6))
+    alignment = Alignment(PixelMapping(H, *LENSES, parallax=parallax), FILE_PX, "aligned", (), Seed("rig", H, 30.0))
+    path = write_alone(alignment, tmp_path)
+    pixels = geometry.lattice(*FILE_PX, 30, 20).round()
+    z_px = parallax.relief(pixels)
+    assert np.ptp(z_px) > 105
+    band = band_in(path, "nir")
+    assert np.abs(documented_reader()(band, pixels, z_px) - alignment.map(pixels)).max() < 0.02
+    without = band["relief"] | {"curvature": np.zeros_like(band["relief"]["slope"]).tolist()}
+    assert np.abs(documented_reader()({"relief": without}, pixels, z_px) - alignment.map(pixels)).max() > 0.05
 
 
 def test_a_reader_can_rebuild_the_mapping(run: Run, written: tuple[Path, Sidecar]) -> None:
-    """plane_px(x) + z slope(x), with the written parallax."""
+    """With the written parallax."""
     folder, sidecar = written
+    path = folder / f"{sidecar.capture}.json"
     for band in run.capture.moving:
         part = next(b for b in sidecar.bands if b.band == band.name).relief
         assert part.file == f"{sidecar.capture}.relief.tif"
-        z = layers_of(folder, sidecar)["parallax"][..., None]
-        nodes = np.array(part.reference_px)
-        plane, slope = (spline(nodes, np.array(v))(PIXELS) for v in (part.plane_px, part.slope))
+        z = layers_of(folder, sidecar)["parallax"]
+        expected = agalign.read_alignment(path, band.name).map(PIXELS)
+        assert np.abs(documented_reader()(band_in(path, band.name), PIXELS, z) - expected).max() < 0.02
         alignment = run.alignments[band.name]
-        expected = alignment.map(PIXELS)
-        assert np.abs(plane + z * slope - expected).max() < 0.1
+        assert np.abs(alignment.map(PIXELS) - expected).max() < 0.02
         assert part.baseline == pytest.approx(alignment.mapping.parallax.baseline)
         assert part.occluded == pytest.approx(alignment.mapping.parallax.hidden.mean(), abs=1e-4)
     assert next(b for b in sidecar.bands if b.status == "reference").relief is None
@@ -246,9 +270,14 @@ POINTS = geometry.lattice(*FILE_PX, 97, 83)
 
 def rebuilt(alignment: Alignment, folder: Path) -> Alignment:
     """From a written sidecar."""
+    return agalign.read_alignment(write_alone(alignment, folder), "nir")
+
+
+def write_alone(alignment: Alignment, folder: Path) -> Path:
+    """The sidecar of a capture of two bands; no other file."""
     bands = tuple(Band(name, Path(f"{name}.tif"), 1, *FILE_PX, "uint16") for name in ("green", "nir"))
     write_sidecar(folder / "c.json", sidecar_of(context_of(Capture("c", Path(), bands, 0), {"nir": alignment})))
-    return agalign.read_alignment(folder / "c.json", "nir")
+    return folder / "c.json"
 
 
 @pytest.mark.parametrize(
@@ -298,10 +327,11 @@ def test_status_seed_and_measurements_are_rebuilt(tmp_path: Path) -> None:
 # ---- relief
 
 
-def on_hill(alignment: Alignment) -> Alignment:
-    hill = 8 * np.exp(-((PIXELS - np.array(SIZE) / 2) ** 2).sum(axis=-1) / 2 / 40**2).astype(np.float32)
+def on_hill(alignment: Alignment, decimals: int = 6) -> Alignment:
+    hill = 8 * np.exp(-((PIXELS - np.array(SIZE) / 2) ** 2).sum(axis=-1) / 2 / 40**2)
     parallax = alignment.mapping.parallax
-    parallax = replace(parallax, relief=Relief(hill, np.ones_like(hill)), hidden=None)
+    relief = Relief(hill.round(decimals).astype(np.float32), np.ones_like(hill, np.float32))
+    parallax = replace(parallax, relief=relief, hidden=None)
     return replace(alignment, mapping=alignment.mapping.with_parallax(parallax))
 
 
@@ -323,6 +353,62 @@ def test_a_relief_is_rebuilt_where_it_was_written(
         result = agalign.read_alignment(folder / f"{sidecar.capture}.json", name)
         assert result.geometry == "relief"
         assert np.abs(result.map(PIXELS) - alignment.map(PIXELS))[written].max() < 0.02
+
+
+def assert_same_as_stack(sidecar: Path, inputs: Path, *, occluded_from_outside: bool = False) -> int:
+    """`read_alignment(...).warp` gives the bytes of the written bands; return how many there are.
+
+    With `occluded_from_outside`, parts of the scene outside of the stack may occlude pixels in it, which are nodata.
+    """
+    content = read_sidecar(sidecar)
+    area = np.s_[slice(content.output.crop[1], None), slice(content.output.crop[0], None)]
+    with rasterio.open(sidecar.with_suffix(".tif")) as stack:
+        for index, part in enumerate(content.bands, start=1):
+            if part.status == "reference":
+                continue
+            alignment = agalign.read_alignment(sidecar, part.band)
+            with rasterio.open(inputs / part.file) as file:
+                image = file.read(part.band_index)
+            if alignment.mapping.parallax is None:
+                at = geometry.lattice(*content.reference.size_px, 30, 20)
+                assert np.abs(documented_reader()(band_in(sidecar, part.band), at) - alignment.map(at)).max() < 0.02
+            pixels, _ = alignment.warp(image, nodata=stack.nodata)
+            pixels, expected = pixels[area][: stack.height, : stack.width], stack.read(index)
+            if occluded_from_outside:
+                assert (pixels != expected).mean() < 0.002
+                known = (pixels != stack.nodata) & (expected != stack.nodata)
+                pixels, expected = pixels[known], expected[known]
+            np.testing.assert_array_equal(pixels, expected)
+            with pytest.raises(agalign.InputError, match=f"the aligned image {image.shape[1]} x {image.shape[0]} px"):
+                alignment.warp(image[:, 1:])
+    return len(content.bands) - 1
+
+
+def test_an_alignment_warps_to_the_bytes_of_a_stack(aligned_flight: Path, flight: Path) -> None:
+    """Of a run with default settings."""
+    sidecars = [path for path in aligned_flight.rglob("IMG_*.json") if "stac" not in path.name]
+    assert sum(assert_same_as_stack(s, flight / s.parent.relative_to(aligned_flight)) for s in sidecars) == 8
+
+
+@pytest.mark.real
+@pytest.mark.slow
+def test_an_alignment_warps_to_the_bytes_of_a_real_stack(real_data: Path, tmp_path: Path) -> None:
+    """With residual lens distortion of the rig."""
+    source = real_data / "flights" / "rededge_m_rowcrop"
+    agalign.align_folder(source, tmp_path)
+    sidecars = list(tmp_path.glob("IMG_????.json"))
+    assert any(b.field is not None for b in read_sidecar(sidecars[0]).bands)
+    assert sum(assert_same_as_stack(s, source) for s in sidecars) == 16
+
+
+@pytest.mark.parametrize("crop", ["common", "none"])
+def test_an_alignment_with_relief_warps_to_the_bytes_of_a_stack(
+    run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, crop: str
+) -> None:
+    """A hill without occlusions."""
+    monkeypatch.setattr(run, "alignments", {name: on_hill(a, decimals=2) for name, a in run.alignments.items()})
+    folder, sidecar = run.write(tmp_path, crop=crop)
+    assert assert_same_as_stack(folder / f"{sidecar.capture}.json", run.capture.reference.path.parent) == 4
 
 
 def test_a_relief_on_a_finer_grid_is_rebuilt(run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

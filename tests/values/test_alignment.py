@@ -26,7 +26,7 @@ JOINT = joint_result(H, last_step_px=0.02, corner_std_xy_px=((0.3, 0.4), (0.1, 0
 def test_a_field_taken_over_to_another_lattice_keeps_its_values_at_the_nodes() -> None:
     finer = FIELD.rescaled(PixelScale(2.0, 2.0)).on_lattice(10.0, (300, 200))
     nodes = np.array([[0.0, 0.0], [120.0, 40.0], [200.0, 100.0]])
-    assert_allclose(finer(nodes), 2 * FIELD((nodes + 0.5) / 2 - 0.5), atol=1e-9)
+    assert_allclose(finer(nodes), 2 * FIELD((nodes + 0.5) / 2 - 0.5), atol=6e-5)
 
 
 def test_the_standard_errors_of_corners_are_scaled_axis_by_axis() -> None:
@@ -47,11 +47,14 @@ def test_the_standard_errors_of_corners_are_scaled_axis_by_axis() -> None:
 def test_an_alignment_between_images_is_the_same_between_files() -> None:
     seed = Seed("rig", geometry.translation(5, -3), 30.0)
     facts = seed, JOINT, residual_of(POINTS, (0.1, 0.1)), 1.5, {"ncc": 0.1}, {"ncc": 0.9}
-    mapping, candidates = PixelMapping(H, field=FIELD), {"homography": FixedImagePx(0.5), "field": FixedImagePx(0.25)}
+    field = DisplacementField.sampled(lambda xy: np.sin(xy[:, ::-1] / 60), 10.0, (150, 100))
+    mapping, candidates = PixelMapping(H, field=field), {"homography": FixedImagePx(0.5), "field": FixedImagePx(0.25)}
     between_images = Alignment(mapping, (150, 100), "aligned", (), *facts, candidates)
     between_files = between_images.in_file_px(SCALES, (300, 400))
     mapped = between_images.map(SCALES.fixed.positions(POINTS))
-    assert_allclose(SCALES.moving.positions(between_files.map(POINTS)), mapped, atol=1e-9)
+    assert between_files.mapping.field is not None
+    assert between_files.mapping.field.scale == (1, 1)
+    assert_allclose(SCALES.moving.positions(between_files.map(POINTS)), mapped, atol=0.01)
     assert_allclose(between_files.fixed_to_moving, SCALES.between_files(H))
     assert_allclose(between_files.seed.fixed_to_moving, SCALES.between_files(seed.fixed_to_moving))
     assert between_files.candidates == pytest.approx({"homography": 0.5 * np.sqrt(8), "field": 0.25 * np.sqrt(8)})

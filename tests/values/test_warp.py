@@ -184,6 +184,27 @@ def test_what_cannot_be_resampled() -> None:
             result.warp(np.zeros(SIZE[::-1], np.uint8), nodata=nodata)
 
 
+@pytest.mark.parametrize("change", [np.s_[::2, ::2], np.s_[:-1], np.s_[:, 8:]], ids=["half", "height", "width"])
+def test_an_image_of_another_size_is_refused(change: tuple[slice, ...]) -> None:
+    """The mapping has pixels of the image that was aligned, so that others give the wrong part of the scene."""
+    image = scene(pixels())
+    result = replace(alignment(MAPPINGS["field"]), moving_size_px=SIZE)
+    for other in (image[change], np.stack([image[change]] * 3, axis=-1), image.T, np.kron(image, np.ones((2, 2)))):
+        height, width = other.shape[:2]
+        with pytest.raises(InputError, match=f"{width} x {height} px, the aligned image 320 x 240 px"):
+            result.warp(other)
+    assert result.warp(np.stack([image] * 3))[1].mean() > 0.9
+
+
+def test_positions_do_not_depend_on_the_tile() -> None:
+    """To the last bit, because OpenCV's Lanczos kernel rounds them."""
+    for mapping in MAPPINGS.values():
+        whole = mapping.positions(Tile(0, 0, *SIZE), np.float32, SIZE)
+        part = mapping.positions(Tile(34, 2, 229, 201), np.float32, SIZE)
+        np.testing.assert_array_equal(part, whole[2:203, 34:263])
+        assert np.abs(part - mapping(pixels())[2:203, 34:263]).max() < 0.01
+
+
 # ---- inverse
 
 
