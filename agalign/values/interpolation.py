@@ -198,7 +198,7 @@ def can_hold(dtype: np.dtype[np.generic], value: float) -> bool:
 
 
 def as_type(values: NDArray[np.generic], dtype: np.dtype[np.generic]) -> NDArray[np.generic]:
-    """Return values (...) in another type, rounded and limited to its range if it is an integer type."""
+    """Return values (height, width) in another type, rounded and limited to its range if it is an integer type."""
     if values.dtype == dtype or dtype.kind == "f":
         return values.astype(dtype, copy=False)
     if dtype.kind == "b":

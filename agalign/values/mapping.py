@@ -42,7 +42,7 @@ class PixelMapping:
         return lens.distort(self.moving_lens, geometry.apply(self.fixed_to_moving, self.undistorted(reference_px)))
 
     def at_parallax(self, reference_px: ArrayLike, baseline: tuple[float, float], parallax_px: float) -> Points:
-        """The same with one parallax and baseline for all pixels, instead of those of the mapping."""
+        """The same, (..., 2), with one parallax and baseline for all pixels, instead of those of the mapping."""
         moved = self.of_the_plane.undistorted(reference_px) + np.array(baseline) * parallax_px
         return lens.distort(self.moving_lens, geometry.apply(self.fixed_to_moving, moved))
 

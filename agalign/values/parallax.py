@@ -107,7 +107,7 @@ class Parallax:
 
 
 def rounded(values: NDArray[np.floating]) -> FloatImage:
-    """Return values of a relief as they are written, rounded below their errors: the raster compresses better."""
+    """Return values (height, width) of a relief as they are written: rounded below their errors, which compresses."""
     step = np.float64(0.01)
     return np.asarray(np.round(values / step) * step, np.float32)
 
