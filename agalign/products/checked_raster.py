@@ -181,7 +181,7 @@ def georeference_tags(georeference: Georeference | None) -> dict[str, str]:
         return {}
     return {
         "GEOREFERENCE": "approximate, from GPS position, altitude, yaw and focal length; no ground control",
-        "ABSOLUTE_ACCURACY_M": f"{georeference.accuracy_m:g}",
+        "GEOREFERENCE_ACCURACY_M": f"{georeference.accuracy_m:g}",
     }
 
 

@@ -250,7 +250,7 @@ def _write(
 
 def _tags(index: Index, like: OpenRaster, unit: str, source: str) -> dict[str, str]:
     """The tags of a raster, some of which are those of the file of its first band."""
-    copied = "CAPTURE_ID", "CAMERA", "TIFFTAG_DATETIME", "RADIOMETRY", "GEOREFERENCE", "ABSOLUTE_ACCURACY_M"
+    copied = "CAPTURE_ID", "CAMERA", "TIFFTAG_DATETIME", "RADIOMETRY", "GEOREFERENCE", "GEOREFERENCE_ACCURACY_M"
     constants = ", ".join(f"{name} = {value:g}" for name, value in index.constants)
     return {k: v for k, v in like.tags().items() if k in copied} | {
         "TIFFTAG_SOFTWARE": "agalign",

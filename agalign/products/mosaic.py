@@ -82,7 +82,7 @@ def mosaic(
     grid = _Grid.of(placed, gsd_m)
     accuracy_m = float(np.median([c.accuracy_m for c in placed]))
     misfit = misfit_m(checks, placed)
-    tags = {"MOSAIC": _PURPOSE, "MOSAIC_RELATIVE_MISFIT_M": "" if not checks else f"{misfit[0]:.3f}"}
+    tags = {"MOSAIC": _PURPOSE, "MOSAIC_MISFIT_M": "" if not checks else f"{misfit[0]:.3f}"}
     # Geotransforms count from the corner of a pixel.
     on_map = geometry.translation(*flight.origin_m) @ grid.to_ground @ geometry.translation(-0.5, -0.5)
     _write(path, placed, grid, Georeference(on_map, flight.crs_wkt, accuracy_m), tags)

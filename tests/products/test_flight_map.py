@@ -179,7 +179,7 @@ def test_a_run_writes_the_map_and_georeferenced_rasters_that_agree(between_panel
     assert feature["properties"]["height_from"] == "panel"
     with rasterio.open(tmp_path / feature["properties"]["stack"]) as stack:
         assert stack.crs.to_epsg() == 32631
-        assert float(stack.tags()["ABSOLUTE_ACCURACY_M"]) == feature["properties"]["accuracy_m"]
+        assert float(stack.tags()["GEOREFERENCE_ACCURACY_M"]) == feature["properties"]["accuracy_m"]
         lon, lat = np.array(feature["geometry"]["coordinates"][0]).T
         corners = rasterio.warp.transform("EPSG:4326", stack.crs, lon, lat)
         size = stack.width, stack.height

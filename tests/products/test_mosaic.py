@@ -119,7 +119,7 @@ def test_the_mosaic_is_a_cog_with_all_bands(written: tuple[Path, agalign.MosaicR
         assert field.crs.to_epsg() == 32631
         assert field.transform.a == -field.transform.e == pytest.approx(GSD_M, rel=0.03)
         assert np.isnan(field.nodata)
-        assert float(field.tags()["MOSAIC_RELATIVE_MISFIT_M"]) == pytest.approx(report.misfit_m[0], abs=1e-3)
+        assert float(field.tags()["MOSAIC_MISFIT_M"]) == pytest.approx(report.misfit_m[0], abs=1e-3)
         bands = field.read()
     assert np.isfinite(bands).all(axis=0).mean() > 0.8
     with rasterio.open(path.with_name("field_ndvi.tif")) as index:
