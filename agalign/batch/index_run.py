@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator, Sequence
 from concurrent.futures import Executor
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -11,7 +11,7 @@ import cv2
 from agalign.batch.workers import Run, failure_text, on_executor, own_processes, serially
 from agalign.errors import AgalignError
 from agalign.products.flight_map import link_indices
-from agalign.products.index_bands import bands_of, unit_of
+from agalign.products.index_bands import bands_of
 from agalign.products.index_rasters import write_rasters
 from agalign.products.index_table import IndexReport, IndexRow, row_of, update_table
 from agalign.products.indices import Index
@@ -62,15 +62,6 @@ def index_tasks(
 ) -> list[IndexTask]:
     """Return a task for each capture of a run. Raises InputError if the folder contains no run."""
     return [IndexTask(out, path, target, tuple(indices), overwrite, mask_qa) for path in run_sidecars(out)]
-
-
-def unit_of_run(tasks: Sequence[IndexTask]) -> str:
-    """Return the unit of the first capture with aligned bands that can be read; empty if there is none."""
-    for task in tasks:
-        with suppress(AgalignError):
-            if unit := unit_of(bands_of(read_result(task.sidecar), task.sidecar.parent)):
-                return unit
-    return ""
 
 
 def run_indices(

@@ -22,7 +22,6 @@ from agalign.batch.capture_task import (
 )
 from agalign.batch.earlier_results import changes, outputs_exist, refuse_other_captures
 from agalign.batch.flight_learning import learn_flight, learning_fingerprint
-from agalign.batch.output_folder import is_full, locked
 from agalign.batch.workers import Run, failure_text, in_order, on_executor, own_processes, serially
 from agalign.cameras.discover import FolderScan
 from agalign.capture.align_bands import PairProgress
@@ -52,6 +51,7 @@ from agalign.values.capture import Capture
 from agalign.values.cores import usable_cores
 from agalign.values.files import check_inside
 from agalign.values.image import OutputGrid
+from agalign.values.output_folder import is_full, locked
 from agalign.values.processes import CAPTURES_WORTH_A_PROCESS
 from agalign.values.text import counted
 

@@ -112,7 +112,7 @@ def _reworded(error: Any) -> str:
     """Return the message of pydantic or click about a wrong value in plain words, after the name of the parameter."""
     param = getattr(error, "param", None)
     if type(error).__name__ == "MissingParameter" and param is not None:
-        return f"{param.name} is missing"
+        return f"{param.name} is missing" if param.opts[0] != "out" else "give the output folder of a run"
     text = str(error.message)
     if type(error).__name__ == "NoSuchOption":
         text += did_you_mean(error.option_name, error.possibilities or ())

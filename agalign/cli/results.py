@@ -24,10 +24,10 @@ def _report(
     as_json: Annotated[bool, typer.Option("--json", help="Print the content of the report as JSON.")] = False,
 ) -> int:
     """Rebuild the report and the summary from the sidecars."""
-    from agalign.batch.output_folder import locked
     from agalign.cli.align_run import explain
     from agalign.products.report import write_pages
     from agalign.products.sidecar_file import run_sidecars
+    from agalign.values.output_folder import locked
 
     run_sidecars(out)
     unreadable: list[str] = []
@@ -142,31 +142,27 @@ def _indices(
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON to standard output.")] = False,
 ) -> int:
     """Compute spectral indices of aligned captures: rasters, pictures and a table of statistics."""
-    from agalign.batch.index_run import index_tasks, run_indices, unit_of_run
-    from agalign.batch.output_folder import locked
+    from agalign.batch.index_run import index_tasks, run_indices
     from agalign.cli.align_run import cluster, progress
-    from agalign.products.index_bands import RAW
+    from agalign.values.output_folder import locked
 
     chosen = chosen_indices(index, formula or [])
     folder, jobs = target or out, given["run"]["jobs"]
     tasks = index_tasks(out, chosen, folder, overwrite=given["run"]["overwrite"], mask_qa=mask_qa)
     terminal.event("found", captures=len(tasks), indices=len(chosen))
-    announced = unit_of_run(tasks) == RAW
-    if announced:
-        terminal.problem(RAW_NUMBERS)
     dask = given["run"]["executor"]
     with locked(folder), cluster(dask, jobs) as executor, progress(terminal, len(tasks)) as show:
         reports: list[IndexReport] = []
         for number, done in enumerate(run_indices(tasks, jobs, executor), start=1):
             terminal.check()
+            if any(r.raw_numbers for r in done.reports) and not any(r.raw_numbers for r in reports):
+                terminal.problem(RAW_NUMBERS)
             reports += done.reports
             for report in done.reports:
                 _print(report, terminal)
             show(number, 0.0, done.reports[0].capture, "")
         if target is None:
             _rebuild_report(out, terminal)
-    if any(r.raw_numbers for r in reports) and not announced:
-        terminal.problem(RAW_NUMBERS)
     return _conclude([one.name for one in chosen], reports, folder, terminal, as_json=as_json)
 
 
@@ -255,9 +251,15 @@ def _print_table(names: Sequence[str], reports: "Sequence[IndexReport]", termina
     """Print a row per index: statistics of the medians of its captures."""
     from statistics import median
 
+    from agalign.products.run_captures import exceptions
+
     written, rows = [r for r in reports if r.path is not None], []
     for name in names:
-        values = [r.median for r in written if r.index == name and math.isfinite(r.median)]
+        of_index = [r for r in written if r.index == name and math.isfinite(r.median)]
+        differing = dict(exceptions({r.capture: (r.statistics.unit,) for r in of_index}))
+        for label, reason in differing.items():
+            terminal.problem(f"{label} {name}: not in the medians of captures: {reason}", capture=label)
+        values = [r.median for r in of_index if r.capture not in differing]
         if values:
             numbers = (median(values), min(values), max(values))
             masked = median(r.statistics.masked_share for r in written if r.index == name)

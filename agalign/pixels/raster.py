@@ -104,8 +104,7 @@ def open_raster(path: Path) -> Iterator[rasterio.DatasetReader]:
     except UnicodeEncodeError:
         raise UnreadableFileError(name_problem(path)) from None
     except Exception as error:
-        # Some classes of rasterio's errors are not public.
-        if not isinstance(error, UnicodeDecodeError) and not type(error).__module__.startswith("rasterio."):
+        if not isinstance(error, UnicodeDecodeError) and not is_gdal_error(error):
             raise
         text = innermost_cause(error).replace(str(path), "").strip(" :'")
         raise UnreadableFileError(f"{path}: cannot be read ({text}); copy it from the card again") from None
@@ -115,6 +114,11 @@ def _is_south_up(dataset: rasterio.DatasetReader) -> bool:
     """Return True if rows of a map run from south to north: a mirror image, which cannot be aligned as it is."""
     transform = dataset.transform
     return dataset.crs is not None and not transform.is_identity and transform.determinant > 0
+
+
+def is_gdal_error(error: BaseException) -> bool:
+    """Return True for an error of rasterio or GDAL: some of their classes are not public."""
+    return type(error).__module__.startswith("rasterio.")
 
 
 def innermost_cause(error: BaseException) -> str:

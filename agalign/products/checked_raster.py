@@ -14,14 +14,12 @@ import numpy as np
 import rasterio
 import tifffile
 from numpy.typing import NDArray
-from rasterio._err import CPLE_BaseError
 from rasterio.enums import ColorInterp
-from rasterio.errors import RasterioError
 from rasterio.transform import Affine
 from rasterio.windows import Window
 
 from agalign.errors import OutputError
-from agalign.pixels.raster import GDAL_ENVIRONMENT, innermost_cause, without_warnings
+from agalign.pixels.raster import GDAL_ENVIRONMENT, innermost_cause, is_gdal_error, without_warnings
 from agalign.values import geometry
 from agalign.values.capture import Georeference
 from agalign.values.files import complete_file
@@ -116,10 +114,11 @@ def checked_raster(
                 finish(partial)
                 check_complete(partial)
             raster.verify(partial)
-    except (RasterioError, CPLE_BaseError) as error:
-        raise OutputError(
-            f"{path}: cannot be written ({innermost_cause(error).rstrip('.')}; is the disk full?)"
-        ) from None
+    except Exception as error:
+        if not is_gdal_error(error) and not isinstance(error, tifffile.TiffFileError):
+            raise
+        cause = innermost_cause(error).rstrip(".")
+        raise OutputError(f"{path}: cannot be written ({cause}; is the disk full?)") from None
 
 
 def write_layers(

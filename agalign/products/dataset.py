@@ -2,7 +2,8 @@
 
 import math
 import re
-from collections.abc import Hashable, Sequence
+import warnings
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -11,8 +12,9 @@ import numpy as np
 from agalign.errors import ConfigurationError, InputError, UnreadableFileError
 from agalign.pixels.raster import without_warnings
 from agalign.products.relief_map import RELIEF_UNITS
-from agalign.products.sidecar import BandPart, Sidecar
-from agalign.products.sidecar_file import find_sidecars, read_sidecar
+from agalign.products.run_captures import RunCapture, captures_of_run, exceptions, like_most
+from agalign.products.sidecar import BandPart, CaptureResult, Sidecar
+from agalign.products.sidecar_file import read_sidecar
 
 if TYPE_CHECKING:
     import xarray
@@ -43,15 +45,15 @@ def open_flight(out: str | Path, *, masked: bool = True) -> "xarray.Dataset":
     """Return all captures below the output folder of a run, stacked along `capture`, read lazily with dask.
 
     The coordinates of `capture` are its label, `time`, `latitude`, `longitude` and `altitude_m`, as far as the camera
-    wrote them; `status` has the dimensions (capture, band). Bands that some capture lacks are left out.
+    wrote them; `status` has the dimensions (capture, band). So that a variable has one unit, captures with other bands
+    or another quantity than most are left out, as are unreadable ones: a UserWarning names them.
     Raises InputError if there is no run or its captures differ in size (write with crop 'flight'), and the errors of
     `open_capture`.
     """
     xr = import_xarray()
-    folder = Path(out)
-    captures = _captures_with_output(folder)
-    opened = [_dataset(s, p.parent, masked=masked) for p, s in captures]
-    common = _variables_of_all(opened)
+    captures = _captures_with_output(Path(out))
+    opened = [_dataset(read_sidecar(c.path), c.path.parent, masked=masked) for c in captures]
+    common = [name for name in opened[0].data_vars if all(name in one for one in opened)]
     # In pixels: the map coordinates of the captures differ.
     in_pixels = [_in_pixels(one[common]) for one in opened]
     bands = [name for name in common if "status" in opened[0][name].attrs]
@@ -61,8 +63,8 @@ def open_flight(out: str | Path, *, masked: bool = True) -> "xarray.Dataset":
     for name in bands:
         del stacked[name].attrs["status"]
     flight: xarray.Dataset = stacked.assign_coords(
-        capture=[(p.parent / p.stem).relative_to(folder).as_posix() for p, _ in captures],
-        time=("capture", [_time(s) for _, s in captures]),
+        capture=[c.label for c in captures],
+        time=("capture", [_time(c.result) for c in captures]),
         band=bands,
         status=(("capture", "band"), status),
         **{name: ("capture", _coordinates(captures, name)) for name in ("latitude", "longitude", "altitude_m")},
@@ -70,34 +72,24 @@ def open_flight(out: str | Path, *, masked: bool = True) -> "xarray.Dataset":
     return flight
 
 
-def _variables_of_all(datasets: Sequence["xarray.Dataset"]) -> list[Hashable]:
-    """The names of the variables that all datasets have."""
-    return [name for name in datasets[0].data_vars if all(name in one for one in datasets)]
-
-
-def _captures_with_output(folder: Path) -> list[tuple[Path, Sidecar]]:
-    """(path, sidecar) of all captures with rasters, which have one size. Raises InputError."""
-    sidecars = [(p, read_sidecar(p)) for p in find_sidecars(folder)] if folder.is_dir() else []
-    written = [(p, s) for p, s in sidecars if s.output is not None]
-    if not written:
+def _captures_with_output(folder: Path) -> list[RunCapture]:
+    """The captures with rasters, which have one size and the same contents. Raises InputError."""
+    captures, left_out = captures_of_run(folder)
+    crops = [(c, c.result.output.crop) for c in captures if c.result.output is not None]
+    if sizes := exceptions({c.label: (f"{crop[2]} x {crop[3]} px",) for c, crop in crops}):
+        remedy = "align again with --crop none, or each camera into a folder of its own, or use open_capture"
+        raise InputError(f"{folder}: its captures differ in size ({'; '.join(map(': '.join, sizes[:3]))}); {remedy}")
+    alike, differing = like_most([c for c, _ in crops])
+    if lines := [f"{label}: left out: {reason}" for label, reason in [*left_out, *differing]]:
+        warnings.warn("\n".join(lines), stacklevel=3)
+    if not alike:
         raise InputError(f"{folder}: no aligned captures there; give the output folder of a run")
-    sizes: dict[tuple[int, ...], list[str]] = {}
-    for path, sidecar in written:
-        if sidecar.output is not None:
-            sizes.setdefault(sidecar.output.crop[2:], []).append(path.relative_to(folder).as_posix())
-    if len(sizes) > 1:
-        examples = (f"{w} x {h} px: {len(files)}, such as {files[0]}" for (w, h), files in sizes.items())
-        of_one_camera = len({sidecar.reference.size_px for _, sidecar in written}) == 1
-        remedy = "align again with --crop none" if of_one_camera else "align each camera into a folder of its own"
-        raise InputError(
-            f"{folder}: its captures differ in size ({'; '.join(examples)}); {remedy}, or use open_capture"
-        )
-    return written
+    return alike
 
 
-def _coordinates(captures: Sequence[tuple[Path, Sidecar]], name: str) -> list[float]:
+def _coordinates(captures: Sequence[RunCapture], name: str) -> list[float]:
     """A coordinate of the position of each capture; nan if it is unknown."""
-    values = [getattr(sidecar.position, name, None) for _, sidecar in captures]
+    values = [getattr(c.result.position, name, None) for c in captures]
     return [math.nan if value is None else float(value) for value in values]
 
 
@@ -175,7 +167,7 @@ def _in_pixels(dataset: "xarray.Dataset") -> "xarray.Dataset":
     return dataset.drop_vars(["spatial_ref", "xc", "yc"], errors="ignore").assign_coords(px)
 
 
-def _time(sidecar: Sidecar) -> Any:
+def _time(sidecar: CaptureResult) -> Any:
     try:
         return np.datetime64(sidecar.captured_at.partition("+")[0].rstrip("Z"), "us")
     except ValueError:

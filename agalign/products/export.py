@@ -8,8 +8,9 @@ the mapping between undistorted pixels, their matrix is N_band K_band^-1 H K_ref
 
 import os
 import shutil
-from collections import defaultdict
-from collections.abc import Sequence
+from collections import Counter, defaultdict
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -22,13 +23,14 @@ from agalign.cameras.metadata import read_tags
 from agalign.cameras.read_files import ImageFile, natural_order, read_file
 from agalign.config import DiscoverOptions
 from agalign.errors import ConfigurationError, InputError, OutputError, SidecarError
+from agalign.products.run_captures import LeftOut, RunCapture, captures_of_run, like_most
 from agalign.products.run_record import read_run_record
-from agalign.products.sidecar import BandPart, Sidecar
-from agalign.products.sidecar_file import read_sidecar, run_sidecars
+from agalign.products.sidecar import BandPart
+from agalign.products.sidecar_file import read_sidecar
 from agalign.products.text_files import write_csv
 from agalign.values import geometry, lens
 from agalign.values.choices import ExportProgram
-from agalign.values.files import check_inside, complete_file, file_name, write_text
+from agalign.values.files import check_inside, complete_file, file_name, remove_partial_files, scratch_file, write_text
 from agalign.values.geometry import Matrix, Points
 from agalign.values.lens import Lens
 from agalign.values.text import counted
@@ -67,31 +69,9 @@ _Row = tuple[str, str, str, float]
 """Capture, band, status, largest distance of the matrix from the complete mapping, px."""
 
 
-@dataclass(frozen=True)
-class AlignedCapture:
-    """A capture of a run."""
-
-    sidecar: Sidecar
-    path: Path
-    """Path of the sidecar."""
-    label: str
-    """The capture's name below the output folder of the run."""
-    flat_name: str
-    """The label as a single file name: the folders of a memory card contain captures of the same name."""
-
-    @property
-    def folder(self) -> Path:
-        """Its folder, relative to the output folder of the run."""
-        return Path(self.label).parent
-
-    @property
-    def bands(self) -> list[BandPart]:
-        """The bands in the order of their numbers in the file names."""
-        return sorted(self.sidecar.bands, key=lambda b: (natural_order(b.file), b.band_index))
-
-    def rows(self, errors_px: Sequence[float]) -> list[_Row]:
-        """The rows of `bands` in the table of distances."""
-        return [(self.flat_name, b.band, b.status, e) for b, e in zip(self.bands, errors_px, strict=True)]
+def _numbered(capture: RunCapture) -> list[BandPart]:
+    """The bands in the order of their numbers in the file names."""
+    return sorted(read_sidecar(capture.path).bands, key=lambda b: (natural_order(b.file), b.band_index))
 
 
 @dataclass
@@ -101,8 +81,7 @@ class ExportReport:
     target: Path
     captures: int = 0
     files: list[Path] = field(default_factory=list)
-    left_out: list[tuple[str, str]] = field(default_factory=list)
-    """(label of a capture, reason why it is left out)."""
+    left_out: LeftOut = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
     """Instructions for the other program, one per line."""
 
@@ -112,96 +91,96 @@ def export(
 ) -> ExportReport:
     """Export the captures with status `ok` of the output folder of a run into a new folder.
 
-    Band files are hard links if the file system allows that, and copies otherwise or with `copy`. `source` is the
-    folder with the original images, by default the input of the run; only the MicaSense matrices need it.
+    Band files are exported of captures with the same bands and quantities as most. They are hard links if the file
+    system allows that, and copies otherwise or with `copy`. `source` is the folder with the original images, by default
+    the input of the run; only the MicaSense matrices need it.
     Raises InputError if there is no run or nothing to export, ConfigurationError if the run wrote no band files,
     OutputError if `target` is not empty or cannot be written.
     """
-    captures = _captures(out)
-    _check_empty(target)
-    report = ExportReport(target)
-    good = [c for c in captures if c.sidecar.status == "ok"]
+    captures, left_out = captures_of_run(out)
+    good = [c for c in captures if c.result.status == "ok"]
     # A misaligned band harms a reconstruction more than a missing capture.
-    report.left_out += [(c.label, f"its status is {c.sidecar.status}") for c in captures if c not in good]
+    left_out += [(c.label, f"its status is {c.result.status}") for c in captures if c not in good]
+    if program not in ("micasense", "opencv"):
+        good, differing = like_most(good)
+        left_out += differing
     if not good:
-        raise InputError(f"{out}: no capture with status ok; 'agalign report {out}' shows what failed")
+        reason = ": ".join(left_out[0])
+        raise InputError(f"{out}: no capture to export ({reason}); 'agalign report {out}' shows what failed")
+    report = ExportReport(target, len(good), left_out=left_out)
     rows: list[_Row] = []
-    if program == "micasense":
-        report.files, rows = write_micasense(good, out, target, source)
-    elif program == "opencv":
-        report.files, rows = write_opencv(good, target)
-    else:
-        report.files = _band_files(good, out, target / "images", copy=copy)
-    if rows:
-        report.files.append(target / "matrices.csv")
-        cells = ((*row[:3], f"{row[3]:.4f}") for row in rows)
-        write_csv(report.files[-1], ("capture", "band", "status", "max_error_px"), cells)
-    report.captures = len(good)
-    report.notes = _notes(program, good, report.files, rows)
-    write_text(target / "README.txt", "\n".join(report.notes) + "\n")
+    with _complete_folder(target) as folder:
+        if program == "micasense":
+            files, rows = write_micasense(good, out, folder, source)
+        elif program == "opencv":
+            files, rows = write_opencv(good, folder)
+        else:
+            files = _band_files(good, out, folder / "images", copy=copy)
+        if rows:
+            files.append(folder / "matrices.csv")
+            cells = ((*row[:3], f"{row[3]:.4f}") for row in rows)
+            write_csv(files[-1], ("capture", "band", "status", "max_error_px"), cells)
+        report.files = [target / path.relative_to(folder) for path in files]
+        report.notes = _notes(program, good, files, rows)
+        write_text(folder / "README.txt", "\n".join(report.notes) + "\n")
     return report
 
 
-def _captures(out: Path) -> list[AlignedCapture]:
-    """The captures of a run. Raises InputError and SidecarError."""
-    result = []
-    taken: dict[str, str] = {}
-    for path in run_sidecars(out):
-        label = path.relative_to(out).with_suffix("").as_posix()
-        result.append(AlignedCapture(read_sidecar(path), path, label, file_name(label, taken)))
-    return result
+@contextmanager
+def _complete_folder(target: Path) -> Iterator[Path]:
+    """Yield a hidden folder in an empty or new `target`. If the block succeeds, its contents move to `target`.
 
-
-def _check_empty(target: Path) -> None:
-    """Raise OutputError if the target folder is not empty."""
-    try:
-        if target.exists() and any(target.iterdir()):
+    An export that is killed leaves nothing else, and the next one removes it. Raises OutputError.
+    """
+    remove_partial_files(target, below=False)
+    with scratch_file(target / "README.txt") as folder:
+        if any(target.iterdir()):
             raise OutputError(f"{target}: is not empty; choose another folder with -o, or delete it")
-    except OSError as error:
-        raise OutputError(f"{target}: cannot be used ({error.strerror or error})") from None
+        try:
+            yield folder
+        except (OSError, OutputError) as error:
+            reason = f"{target}: cannot be written ({error.strerror})" if isinstance(error, OSError) else str(error)
+            raise OutputError(reason.replace(str(folder), str(target))) from None
+        for path in sorted(folder.iterdir()):
+            path.rename(target / path.name)
 
 
-def _band_files(captures: Sequence[AlignedCapture], out: Path, images: Path, *, copy: bool) -> list[Path]:
+def _band_files(captures: Sequence[RunCapture], out: Path, images: Path, *, copy: bool) -> list[Path]:
     """Link or copy the band files. Raises ConfigurationError and OutputError."""
     written = []
     taken: dict[str, str] = {}
     for capture in captures:
-        output = capture.sidecar.output
+        output = capture.result.output
         if output is None or not output.band_files:
             raise ConfigurationError(
                 f"{out}: has stacks only; run 'agalign' with --layout bands or both into it, and export again"
             )
         for part in output.band_files:
             source = check_inside(capture.path.parent / part.file, out)
-            target = images / file_name((capture.folder / part.file).as_posix(), taken)
+            target = images / file_name((Path(capture.label).parent / part.file).as_posix(), taken)
             written.append(_placed(source, target, copy=copy))
     return written
 
 
 def _placed(source: Path, target: Path, *, copy: bool) -> Path:
-    try:
-        target.parent.mkdir(parents=True, exist_ok=True)
-        if not copy:
-            try:
-                os.link(source, target)
-                return target
-            except OSError:  # another disk, or a file system without hard links
-                pass
-        shutil.copyfile(source, target)
-    except OSError as error:
-        raise OutputError(f"{target}: cannot be written ({error.strerror or error})") from None
+    target.parent.mkdir(parents=True, exist_ok=True)
+    if not copy:
+        with suppress(OSError):  # another disk, or a file system without hard links
+            os.link(source, target)
+            return target
+    shutil.copyfile(source, target)
     return target
 
 
 def _notes(
-    program: ExportProgram, captures: Sequence[AlignedCapture], files: Sequence[Path], rows: Sequence[_Row]
+    program: ExportProgram, captures: Sequence[RunCapture], files: Sequence[Path], rows: Sequence[_Row]
 ) -> list[str]:
-    first, outputs = captures[0].sidecar, [c.sidecar.output for c in captures if c.sidecar.output is not None]
-    facts = {"reference": first.reference.band}
+    outputs = [c.result.output for c in captures if c.result.output is not None]
+    facts = {"reference": Counter(c.result.reference.band for c in captures).most_common(1)[0][0]}
     if program == "odm":
-        radiometry = None if first.output is None else first.output.radiometry
+        radiometry = "; ".join(sorted({output.radiometry or "" for output in outputs}))
         again = {"calibration": "none", "contents": f"{radiometry}: OpenDroneMap must not calibrate them again."}
-        facts |= _of_raw_numbers(files[: len(first.bands)]) if radiometry is None else again
+        facts |= again if radiometry else _of_raw_numbers(files)
     if rows:
         capture, band, _, error_px = max(rows, key=lambda row: row[3])
         largest = f"Largest distance from the complete mapping: {error_px:.2f} px ({capture} {band})."
@@ -221,34 +200,36 @@ def _of_raw_numbers(files: Sequence[Path]) -> dict[str, str]:
     tags = (read_tags(path) for path in files)
     if all(t.number(*name) for t in tags for name in names if t.text(pix4d.NAMESPACE, "BandName") != "LWIR"):
         return {"calibration": "camera+sun", "contents": "raw numbers, and the irradiance of the light sensor."}
-    contents = "raw numbers without an irradiance; for reflectance align with --radiometry auto or panel."
+    contents = "raw numbers, not all with an irradiance; for reflectance align with --radiometry auto or panel."
     return {"calibration": "camera", "contents": contents}
 
 
-def write_opencv(captures: Sequence[AlignedCapture], target: Path) -> tuple[list[Path], list[_Row]]:
+def write_opencv(captures: Sequence[RunCapture], target: Path) -> tuple[list[Path], list[_Row]]:
     """Write <capture>.npz for each capture. Returns the files and the distances from the complete mappings.
 
     Raises OutputError.
     """
     files: list[Path] = []
     rows: list[_Row] = []
+    taken: dict[str, str] = {}
     for capture in captures:
-        grids = [_grid(band) for band in capture.bands]
+        name, bands = file_name(capture.label, taken), _numbered(capture)
+        grids = [_grid(band) for band in bands]
         matrices = [_fitted(*grid) for grid in grids]
         errors_px = [_max_distance_px(matrix, *grid) for matrix, grid in zip(matrices, grids, strict=True)]
-        rows += capture.rows(errors_px)
-        arrays: dict[str, NDArray[np.generic]] = {"bands": np.array([b.band for b in capture.bands])}
+        rows += [(name, b.band, b.status, e) for b, e in zip(bands, errors_px, strict=True)]
+        arrays: dict[str, NDArray[np.generic]] = {"bands": np.array([b.band for b in bands])}
         for k, (points_px, mapped_px) in enumerate(grids):
             arrays |= {f"grid_reference_px_{k}": points_px, f"grid_moving_px_{k}": mapped_px}
         arrays |= {"matrices": np.stack(matrices), "max_error_px": np.array(errors_px)}
-        files.append(target / f"{capture.flat_name}.npz")
+        files.append(target / f"{name}.npz")
         with complete_file(files[-1]) as partial:
             np.savez(partial, allow_pickle=False, **arrays)
     return files, rows
 
 
 def write_micasense(
-    captures: Sequence[AlignedCapture], out: Path, target: Path, source: Path | None
+    captures: Sequence[RunCapture], out: Path, target: Path, source: Path | None
 ) -> tuple[list[Path], list[_Row]]:
     """Write <capture>_warp_matrices.npy for each capture, and <serial>_warp_matrices_opencv.npy for each camera.
 
@@ -259,19 +240,20 @@ def write_micasense(
     files: list[Path] = []
     rows: list[_Row] = []
     by_camera: dict[str, list[NDArray[np.float64]]] = defaultdict(list)
+    taken: dict[str, str] = {}
     for capture in captures:
-        images = [_original(folder / capture.folder / band.file) for band in capture.bands]
-        reference = next((i for i, b in zip(images, capture.bands, strict=True) if b.status == "reference"), None)
+        name, bands = file_name(capture.label, taken), _numbered(capture)
+        images = [_original(folder / Path(capture.label).parent / band.file) for band in bands]
+        reference = next((i for i, b in zip(images, bands, strict=True) if b.status == "reference"), None)
         if reference is None:
             raise SidecarError(f"{capture.path}: has no reference band; run again with --overwrite")
-        results = [_in_notebook_px(band, reference, image) for band, image in zip(capture.bands, images, strict=True)]
-        rows += capture.rows([error_px for _, error_px in results])
+        results = [_in_notebook_px(band, reference, image) for band, image in zip(bands, images, strict=True)]
+        rows += [(name, b.band, b.status, e) for b, (_, e) in zip(bands, results, strict=True)]
         stacked = np.stack([matrix for matrix, _ in results])
         by_camera[images[0].tags.serial or "camera"].append(stacked)
-        files.append(_write_npy(target / f"{capture.flat_name}_warp_matrices.npy", stacked))
-    taken: dict[str, str] = {}
+        files.append(_write_npy(target / f"{name}_warp_matrices.npy", stacked))
     for serial, of_camera in by_camera.items():
-        matrices_of_camera = _nearest_to_median(of_camera, captures[0].sidecar.reference.size_px)
+        matrices_of_camera = _nearest_to_median(of_camera, captures[0].result.reference.size_px)
         files.append(_write_npy(target / f"{file_name(serial, taken)}_warp_matrices_opencv.npy", matrices_of_camera))
     return files, rows
 

@@ -1,6 +1,5 @@
 """The aligned bands that spectral indices are calculated from: where they are, their unit, and their values."""
 
-from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
@@ -67,15 +66,6 @@ def _problem_of(band: BandResult, limit_px: float) -> str:
     return f"{band.band} is {band.status}{error} ({band.reason})"
 
 
-def unit_of(bands: Sequence[IndexBand]) -> str:
-    """Return the unit of the first band that can be used; empty if there is none. Raises InputError."""
-    for band in bands:
-        if not band.problem:
-            with BandReader() as reader:
-                return reader.units(band)[0]
-    return ""
-
-
 class BandReader(ExitStack):
     """Reads bands; opens each file once, and closes all of them at the end of the `with` block."""
 
@@ -91,6 +81,11 @@ class BandReader(ExitStack):
             raise InputError(f"{path}: has no band {index}, as its sidecar says; run again")
         return self._files[path]
 
+    def quantity(self, band: IndexBand) -> str:
+        """Return the quantity of a band's numbers by the tags of its file; empty without any. Raises InputError."""
+        source = self.file(band.file, band.band_index)
+        return str(source.tags(band.band_index).get("QUANTITY") or source.tags().get("RADIOMETRY") or "")
+
     def units(self, band: IndexBand) -> list[str]:
         """Return the units of a band's numbers: one, unless the tag of a stack lists several.
 
@@ -98,9 +93,8 @@ class BandReader(ExitStack):
         Raises InputError.
         """
         source = self.file(band.file, band.band_index)
-        tag = source.tags(band.band_index).get("QUANTITY") or source.tags().get("RADIOMETRY")
-        if tag:
-            return str(tag).split(" and ")
+        if quantity := self.quantity(band):
+            return quantity.split(" and ")
         is_integer = np.dtype(source.dtypes[band.band_index - 1]).kind in "ui"
         if is_integer and source.scales[band.band_index - 1] == 1.0:
             return [RAW]

@@ -33,6 +33,7 @@ from agalign.products.index_bands import RAW, BandReader, IndexBand
 from agalign.products.index_table import STATISTICS_TAG, IndexReport, IndexStatistics, read_statistics, statistics_in
 from agalign.products.indices import Index, bands_for, compute, index_named
 from agalign.products.product import GEOTIFF, CapturePaths, Product, ProductContext, StacAsset, WrittenFile
+from agalign.products.raster_file import to_cog
 from agalign.values.capture import Band, Capture
 from agalign.values.image import Tile, reduced_size_px
 from agalign.values.interpolation import tiles
@@ -229,7 +230,8 @@ def _write(
     step = max(1, math.ceil(math.sqrt(like.width * like.height / max_statistics_px)))
     samples, valid_px, masked_px = [], 0, 0
     unmasked = [replace(band, quality=None) for band in bands]
-    with checked_raster(target, profile) as raster:
+    is_cog = like.tags(ns="IMAGE_STRUCTURE").get("LAYOUT") == "COG"
+    with checked_raster(target, profile, to_cog if is_cog else None) as raster:
         raster.describe([LayerDescription(index.name)], _tags(index, like, unit, source))
         for tile in tiles(Tile(0, 0, like.width, like.height), WORK_TILE_PX):
             values = compute(index, [reader.values(band, tile) for band in bands])

@@ -11,29 +11,33 @@ from typing import Any
 
 import numpy as np
 
-from agalign.errors import ConfigurationError
+from agalign.errors import ConfigurationError, InputError
 from agalign.pixels.raster import open_raster
 from agalign.products.checked_raster import Block, LayerDescription, georeference_tags, grid_profile, write_layers
 from agalign.products.index_bands import BandReader, IndexBand
 from agalign.products.index_rasters import write_rasters
 from agalign.products.index_table import IndexReport
 from agalign.products.indices import Index, index_named
-from agalign.products.mosaic_adjustment import adjusted, misfit_m, tie_pairs
+from agalign.products.mosaic_adjustment import adjusted, misfit_m, tie_pairs, tied_groups
 from agalign.products.mosaic_placement import Placement, place_captures
 from agalign.products.raster_file import to_cog, with_nodata
+from agalign.products.run_captures import LeftOut
 from agalign.values import geometry
 from agalign.values.capture import Georeference
 from agalign.values.choices import MAX_PIXELS
+from agalign.values.files import file_checksum
 from agalign.values.geometry import Matrix
 from agalign.values.image import FloatImage, Mask, OutputGrid, Tile
 from agalign.values.interpolation import resample, source_window, tiles
 from agalign.values.mapping import PixelMapping
+from agalign.values.output_folder import locked
 from agalign.values.pixel_units import Size
 
 _TILE_PX = 512
 """Side of the tiles that are composed at once."""
 _COMPRESSION = "zstd"
 _COPIED_TAGS = "CAMERA", "TIFFTAG_DATETIME", "REFERENCE_BAND", "RADIOMETRY", "RADIOMETRY_SOURCE"
+_UNTIED = "it has no tie points to those of the mosaic; --untied places it by its georeference"
 _PURPOSE = "quick mosaic on a horizontal plane, for viewing; not an orthomosaic"
 
 
@@ -43,62 +47,79 @@ class MosaicReport:
 
     path: Path
     captures: int
-    tied: int
-    """Captures with tie points; the others keep their georeference."""
+    untied: Sequence[str]
+    """Labels of captures without tie points to the others, which their georeference places."""
     pairs: int
     """Overlapping captures with tie points."""
     tie_points: int
     """Tie points that took no part in the adjustment: the misfits are measured on them."""
     misfit_m: tuple[float, float]
-    """Distances of the tie points on the ground after the adjustment: median and p95; nan without tie points."""
+    """Between captures, so relative: distances of the tie points on the ground after the adjustment, median and p95;
+    nan without tie points.
+    """
     georeference_misfit_m: tuple[float, float]
     """The same by the georeference alone."""
     accuracy_m: float
-    """Standard error of the georeference of the captures (median): the mosaic has no ground control."""
+    """On the map, so absolute: standard error of the georeference of a capture (median), without ground control."""
     height_is_assumed: bool
     """True if the scale is only known from the GPS positions."""
-    left_out: Sequence[tuple[str, str]]
-    """(label of a capture, reason why it is left out)."""
+    left_out: LeftOut
     indices: Sequence[IndexReport] = ()
 
 
 def mosaic(
-    out: str | Path, target: str | Path, *, indices: Sequence[str] = (), gsd_m: float | None = None
+    out: str | Path,
+    target: str | Path,
+    *,
+    indices: Sequence[str] = (),
+    gsd_m: float | None = None,
+    untied: bool = False,
 ) -> MosaicReport:
-    """Write a mosaic of the captures with status `ok` of a run as a cloud-optimised GeoTIFF, with all bands.
+    """Write a mosaic of the aligned captures of a run as a cloud-optimised GeoTIFF, with all bands.
 
-    Tie points between overlapping captures refine their georeference. Indices, given by name, are written next to the
+    Captures with other bands or another quantity than most are left out. Tie points between overlapping captures refine
+    their georeference. The largest group of captures that tie points join is written; with `untied` all captures,
+    the others by their georeference. Indices, given by name, are written next to the
     mosaic, <target>_<index>.tif. `gsd_m` is the pixel size, by default the median of the captures. The ground
     is assumed to be a horizontal plane: for maps and measurements use photogrammetry.
-    Raises InputError if no capture can be placed or read, ConfigurationError for too many pixels, an unknown index or a
-    target that is an input or not a .tif, OutputError.
+    Raises InputError if no capture can be placed, read or joined to another, ConfigurationError for too many pixels, an
+    unknown index or a target that is an input or not a .tif, OutputError, also if another process writes to its folder.
     """
-    chosen, path = [index_named(name) for name in indices], Path(target)
+    chosen_indices, path = [index_named(name) for name in indices], Path(target)
     flight = place_captures(Path(out))
     _check_target(path, flight.captures)
-    pairs = [pair.split() for pair in tie_pairs(flight.captures)]
-    checks = [check for _, check in pairs]
-    placed = adjusted(flight.captures, [used for used, _ in pairs])
-    grid = _Grid.of(placed, gsd_m)
-    accuracy_m = float(np.median([c.accuracy_m for c in placed]))
-    misfit = misfit_m(checks, placed)
-    tags = {"MOSAIC": _PURPOSE, "MOSAIC_MISFIT_M": "" if not checks else f"{misfit[0]:.3f}"}
-    # Geotransforms count from the corner of a pixel.
-    on_map = geometry.translation(*flight.origin_m) @ grid.to_ground @ geometry.translation(-0.5, -0.5)
-    _write(path, placed, grid, Georeference(on_map, flight.crs_wkt, accuracy_m), tags)
-    return MosaicReport(
-        path,
-        len(placed),
-        len({k for check in checks for k in (check.first, check.second)}),
-        len(pairs),
-        sum(map(len, checks)),
-        misfit,
-        misfit_m(checks, flight.captures),
-        accuracy_m,
-        any(c.height_is_assumed for c in placed),
-        flight.left_out,
-        _write_indices(path, placed[0].bands, chosen),
-    )
+    with locked(path.parent, below=False):
+        pairs = [pair.split() for pair in tie_pairs(flight.captures)]
+        largest, *others = tied_groups(len(flight.captures), [used for used, _ in pairs])
+        if others and not pairs and not untied:
+            problem = "is not written, because no capture has tie points to another"
+            raise InputError(f"{path}: {problem}; --untied places them by their georeference")
+        apart = [k for group in others for k in group]
+        chosen = sorted([*largest, *apart] if untied else largest)
+        captures = adjusted(flight.captures, [used for used, _ in pairs])
+        placed = [captures[k] for k in chosen]
+        checks = [check for _, check in pairs if untied or check.first in largest]
+        grid = _Grid.of(placed, gsd_m)
+        accuracy_m = float(np.median([c.accuracy_m for c in placed]))
+        misfit = misfit_m(checks, captures)
+        tags = {"MOSAIC": _PURPOSE, "MISFIT_BETWEEN_CAPTURES_M": "" if not checks else f"{misfit[0]:.3f}"}
+        # Geotransforms count from the corner of a pixel.
+        on_map = geometry.translation(*flight.origin_m) @ grid.to_ground @ geometry.translation(-0.5, -0.5)
+        _write(path, placed, grid, Georeference(on_map, flight.crs_wkt, accuracy_m), tags)
+        labels = [captures[k].label for k in apart]
+        return MosaicReport(
+            path,
+            len(placed),
+            labels if untied else [],
+            len(checks),
+            sum(map(len, checks)),
+            misfit,
+            misfit_m(checks, flight.captures),
+            accuracy_m,
+            any(c.height_is_assumed for c in placed),
+            [*flight.left_out, *((label, _UNTIED) for label in labels if not untied)],
+            _write_indices(path, placed[0].bands, chosen_indices),
+        )
 
 
 def _check_target(path: Path, captures: Sequence[Placement]) -> None:
@@ -143,7 +164,7 @@ def _write(
     path: Path, captures: Sequence[Placement], grid: _Grid, georeference: Georeference, tags: dict[str, str]
 ) -> None:
     """Write the mosaic of all bands."""
-    dtype, layers, copied = _like(captures[0].bands)
+    dtype, layers, copied = _like(captures)
     nodata = math.nan if dtype.kind == "f" else 0.0
     options = {"compress": _COMPRESSION, "nodata": nodata, "interleave": "band"}
     profile = grid_profile(OutputGrid(0, 0, *grid.size_px), georeference, len(layers), dtype.name, **options)
@@ -159,19 +180,24 @@ def _write(
     write_layers(path, profile, layers, tags, blocks(), lambda partial: to_cog(partial, _COMPRESSION))
 
 
-def _like(bands: Sequence[IndexBand]) -> tuple[np.dtype[Any], list[LayerDescription], dict[str, str]]:
-    """(type, layers, tags) of the files of a capture; float32 for numbers that the files scale."""
-    layers, dtypes, tags = [], [], {}
-    for band in bands:
+def _like(captures: Sequence[Placement]) -> tuple[np.dtype[Any], list[LayerDescription], dict[str, str]]:
+    """(type, layers, tags) of the files of captures with equal contents; float32 for numbers that the files scale."""
+    layers: dict[str, LayerDescription] = {}
+    dtypes = []
+    values: dict[str, set[str]] = {tag: set() for tag in _COPIED_TAGS}
+    for band in (band for capture in captures for band in capture.bands):
         with open_raster(band.file) as source:
-            k = band.band_index
+            k, tags = band.band_index, source.tags()
             scaled = (source.scales[k - 1], source.offsets[k - 1]) != (1.0, 0.0)
             dtypes.append("float32" if scaled else source.dtypes[k - 1])
-            tags = {"TIFFTAG_SOFTWARE": "agalign"} | {t: v for t, v in source.tags().items() if t in _COPIED_TAGS}
+            for tag in values.keys() & tags.keys():
+                values[tag].add(tags[tag])
             imagery, colour = source.tags(k, ns="IMAGERY"), source.colorinterp[k - 1]
             own = {t: v for t, v in source.tags(k).items() if not t.startswith("STATISTICS_")}
-            layers.append(LayerDescription(band.name, source.units[k - 1] or "", own, imagery, colour=colour))
-    return np.result_type(*dtypes), layers, tags
+            layers[band.name] = LayerDescription(band.name, source.units[k - 1] or "", own, imagery, colour=colour)
+    copied = {tag: " and ".join(sorted(found)) for tag, found in values.items()}
+    copied |= {"TIFFTAG_SOFTWARE": "agalign", "TIFFTAG_DATETIME": min(values["TIFFTAG_DATETIME"], default="")}
+    return np.result_type(*dtypes), [*layers.values()], copied
 
 
 def _composed(captures: Sequence[Placement], grid: _Grid, tile: Tile) -> tuple[FloatImage, Mask]:
@@ -221,10 +247,7 @@ def _warped(capture: Placement, positions: FloatImage) -> tuple[FloatImage, Mask
 
 
 def _write_indices(path: Path, bands: Sequence[IndexBand], indices: Sequence[Index]) -> Sequence[IndexReport]:
-    """Write indices of the mosaic as cloud-optimised GeoTIFFs."""
-    of_mosaic = [IndexBand(b.name, b.wavelength_nm, path, number) for number, b in enumerate(bands, start=1)]
-    reports = write_rasters(of_mosaic, indices, path.with_suffix(""), path.stem)
-    for report in reports:
-        if report.path is not None:
-            to_cog(report.path, _COMPRESSION)
-    return reports
+    """Write indices of the mosaic, in its format."""
+    checksum = file_checksum(path) if indices else ""
+    of_mosaic = [IndexBand(b.name, b.wavelength_nm, path, k, checksum) for k, b in enumerate(bands, start=1)]
+    return write_rasters(of_mosaic, indices, path.with_suffix(""), path.stem)

@@ -17,9 +17,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import coo_array, diags_array, eye_array
+from scipy.sparse.csgraph import connected_components
 from scipy.sparse.linalg import spsolve
 
 from agalign.pixels.landmarks import Landmarks, landmarks, matches, robust_homography
+from agalign.pixels.raster import without_warnings
 from agalign.products.index_bands import BandReader
 from agalign.products.mosaic_placement import Placement
 from agalign.values import geometry
@@ -83,10 +85,17 @@ def tie_pairs(captures: Sequence[Placement]) -> list[TiePair]:
 
     A pair is left out if its homography contradicts the georeference.
     """
-    with ThreadPoolExecutor(usable_cores()) as threads:
+    with without_warnings(), ThreadPoolExecutor(usable_cores()) as threads:
         found = list(threads.map(_landmarks_of, captures))
         results = threads.map(lambda pair: _matched(pair[0], pair[1], captures, found), _neighbours(captures))
         return [pair for pair in results if pair is not None]
+
+
+def tied_groups(captures: int, pairs: Sequence[TiePair]) -> list[list[int]]:
+    """Return the positions of captures that tie points join, directly or by others, in groups: the largest first."""
+    edges = np.ones(len(pairs)), ([pair.first for pair in pairs], [pair.second for pair in pairs])
+    number, group = connected_components(coo_array(edges, (captures, captures)), directed=False)
+    return sorted((np.flatnonzero(group == k).tolist() for k in range(number)), key=len, reverse=True)
 
 
 def _landmarks_of(capture: Placement) -> Landmarks:

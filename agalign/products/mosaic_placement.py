@@ -1,6 +1,6 @@
 """The captures of a run on the ground plane: their footprints in OUT/flight.geojson, with the lens of the reference."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -12,14 +12,15 @@ from agalign.errors import AgalignError, InputError
 from agalign.pixels.raster import transformed
 from agalign.products.flight_map import FLIGHT_MAP_FILE, features_in
 from agalign.products.footprint import pose_errors, utm_wkt
-from agalign.products.index_bands import IndexBand, bands_of
+from agalign.products.index_bands import IndexBand
+from agalign.products.run_captures import LeftOut, RunCapture, captures_of_run, like_most
 from agalign.products.sidecar import Sidecar
-from agalign.products.sidecar_file import read_sidecar, run_sidecars
+from agalign.products.sidecar_file import read_sidecar
 from agalign.values import geometry, lens
 from agalign.values.geometry import Matrix, Points
 from agalign.values.image import OutputGrid
 from agalign.values.lens import Lens
-from agalign.values.pixel_units import PixelScale, Size
+from agalign.values.pixel_units import Size
 
 _WGS84 = "EPSG:4326"
 
@@ -70,47 +71,58 @@ class PlacedFlight:
     origin_m: Points
     """(2,) map coordinates of the origin."""
     crs_wkt: str
-    left_out: list[tuple[str, str]]
-    """(label of a capture, reason)."""
+    left_out: LeftOut
 
-    def add(self, label: str, path: Path, feature: dict[str, Any]) -> None:
-        """Place the capture of a sidecar by its entry in the flight map, or leave it out."""
+    def add(self, capture: RunCapture, feature: dict[str, Any]) -> None:
+        """Place a capture by its entry in the flight map, or leave it out."""
         try:
-            one = _placed(label, path, feature, self.origin_m, self.crs_wkt)
-            if [b.name for b in one.bands] != [b.name for b in (self.captures or [one])[0].bands]:
-                raise InputError(f"it has other bands than {self.captures[0].label}")
+            one = _placed(capture, feature, self.origin_m, self.crs_wkt)
             if not np.isfinite([*one.outline_m.ravel(), *one.camera_m]).all() or not one.gsd_m > 0:
                 raise InputError("its place on the ground is not finite; run again with --overwrite")
             self.captures.append(one)
         except AgalignError as error:
-            self.left_out.append((label, str(error)))
+            self.left_out.append((capture.label, str(error)))
         except (LookupError, TypeError, ValueError, ArithmeticError):
-            self.left_out.append((label, f"its entry in {FLIGHT_MAP_FILE} is damaged; run again with --overwrite"))
+            self.left_out.append(
+                (capture.label, f"its entry in {FLIGHT_MAP_FILE} is damaged; run again with --overwrite")
+            )
 
 
 def place_captures(out: Path) -> PlacedFlight:
-    """Place the captures with status `ok` of the output folder of a run by their footprints in flight.geojson.
+    """Place the captures of a run with all bands aligned, and the same contents as most of them, by their footprints in
+    flight.geojson.
 
     Raises InputError if `out` has no sidecars, or if no capture can be placed.
     """
-    sidecars = {path.relative_to(out).with_suffix("").as_posix(): path for path in run_sidecars(out)}
+    captures, left_out = captures_of_run(out)
     features = {str(f["properties"].get("sidecar")): f for f in features_in(out)}
-    shown = {label: ring for label in sidecars if (ring := _ring(features.get(f"{label}.json", {}))) is not None}
-    if not shown:
+    rings = {c.label: ring for c in captures if (ring := _ring(features.get(f"{c.label}.json", {}))) is not None}
+    if not rings:
         raise InputError(
             f"{out}: no capture can be placed, because {FLIGHT_MAP_FILE} has no footprints; they need position, "
             "altitude, yaw and focal length in the tags: align the files as the camera wrote them"
         )
-    corner = next(iter(shown.values()))[:1]
+    corner = next(iter(rings.values()))[:1]
     crs = utm_wkt(*corner[0].tolist())
     origin_m = transformed(corner, _WGS84, crs)[0]
-    left_out = [(label, f"it has no footprint in {FLIGHT_MAP_FILE}") for label in sidecars if label not in shown]
-    flight = PlacedFlight([], origin_m, crs, left_out)
-    for label, ring in shown.items():
-        flight.add(label, sidecars[label], features[f"{label}.json"]["properties"] | {"ring": ring})
+    left_out += [(c.label, problem) for c in captures if (problem := _problem(c, rings))]
+    alike, differing = like_most([c for c in captures if not _problem(c, rings)])
+    flight = PlacedFlight([], origin_m, crs, [*left_out, *differing])
+    for capture in alike:
+        label = capture.label
+        flight.add(capture, features[f"{label}.json"]["properties"] | {"ring": rings[label]})
     if not flight.captures:
-        raise InputError(f"{out}: no capture can be used; {left_out[0][0]}: {left_out[0][1]}")
+        raise InputError(f"{out}: no capture can be used; {': '.join(flight.left_out[0])}")
     return flight
+
+
+def _problem(capture: RunCapture, rings: Mapping[str, Points]) -> str:
+    """The reason why a capture cannot be placed; empty if it can."""
+    if capture.label not in rings:
+        return f"it has no footprint in {FLIGHT_MAP_FILE}"
+    if capture.result.output is None:
+        return "it has no aligned bands"
+    return "; ".join(band.problem for band in capture.bands if band.problem)
 
 
 def _ring(feature: dict[str, Any]) -> Points | None:
@@ -121,14 +133,12 @@ def _ring(feature: dict[str, Any]) -> Points | None:
     return None
 
 
-def _placed(label: str, path: Path, feature: dict[str, Any], origin_m: Points, crs: str) -> Placement:
+def _placed(capture: RunCapture, feature: dict[str, Any], origin_m: Points, crs: str) -> Placement:
     """The placement by a feature's properties. Raises AgalignError, and KeyError or others for a damaged map."""
-    sidecar = read_sidecar(path)
-    bands = bands_of(sidecar, path.parent)
-    problems = [b.problem for b in bands if b.problem]
-    if sidecar.output is None or problems:
-        raise InputError("; ".join(problems) or "it has no aligned bands")
-    grid = OutputGrid(*sidecar.output.crop, PixelScale(*sidecar.output.scale), sidecar.output.undistorted)
+    sidecar, bands = read_sidecar(capture.path), capture.bands
+    if sidecar.output is None:
+        raise InputError("it has no aligned bands")
+    grid = sidecar.output.grid
     # From counter-clockwise to the order of `geometry.corners`.
     corners_m = transformed(feature["ring"][[0, 3, 2, 1]], _WGS84, crs) - origin_m
     edge_px = geometry.corners(grid.width + 1, grid.height + 1) - 0.5
@@ -139,7 +149,7 @@ def _placed(label: str, path: Path, feature: dict[str, Any], origin_m: Points, c
     position_m, height, heading, tilt = pose_errors(height_m, feature["height_from"])
     reference = bands[[b.name for b in bands].index(sidecar.reference.band)]
     return Placement(
-        label,
+        capture.label,
         bands,
         reference,
         (grid.width, grid.height),

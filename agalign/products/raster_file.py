@@ -216,7 +216,7 @@ def _compression(settings: WriteSettings, *, all_bands: bool) -> str:
     return "zstd" if all_bands and settings.layout != "bands" else "deflate"
 
 
-def to_cog(path: Path, compression: str) -> None:
+def to_cog(path: Path, compression: str = "deflate") -> None:
     """Replace a GeoTIFF by a cloud-optimised one with overviews. Errors are those of rasterio."""
     cog = path.with_name(f"{path.name}.cog")
     options = {"blocksize": 512, "bigtiff": "if_safer"}  # GDAL's default size of blocks

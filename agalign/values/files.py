@@ -6,6 +6,7 @@ import os
 import platform
 import re
 import secrets
+import shutil
 import stat
 import unicodedata
 from collections.abc import Iterator, MutableMapping
@@ -42,7 +43,8 @@ def complete_file(path: Path) -> Iterator[Path]:
 
 @contextmanager
 def scratch_file(neighbour: Path) -> Iterator[Path]:
-    """Yield a temporary path in the folder of `neighbour`, which is created; the file is removed after the block.
+    """Yield a temporary path in the folder of `neighbour`, which is created; the file or folder that the block makes
+    there is removed after it.
 
     The file has the suffix of `neighbour`, because some libraries choose the format by it. Its name is unique among
     processes on all machines that share the folder, and hidden, so that it is not read as an image.
@@ -55,8 +57,7 @@ def scratch_file(neighbour: Path) -> Iterator[Path]:
     except OSError as error:
         raise OutputError(f"{neighbour}: cannot be written ({error.strerror or error})") from None
     finally:
-        with suppress(OSError):
-            scratch.unlink(missing_ok=True)
+        _remove(scratch)
 
 
 def write_text(path: Path, text: str) -> None:
@@ -94,17 +95,24 @@ def read_regular(path: Path, max_bytes: int = 1 << 28) -> bytes:
     return contents
 
 
-def remove_partial_files(folder: Path) -> None:
-    """Remove partial files below a folder, from this process and from processes of this machine that have ended.
+def remove_partial_files(folder: Path, *, below: bool = True) -> None:
+    """Remove partial files and folders in a folder, and in those `below` it, from this process and from processes of
+    this machine that have ended.
 
     Partial files in output folders of other runs, of running processes and of other machines are kept.
     """
     for parent, folders, names in os.walk(folder):
-        folders[:] = [f for f in folders if not Path(parent, f, RUN_FILE).exists()]
-        for name in names:
+        for name in (*folders, *names):
             if name.startswith(_PARTIAL) and _is_left_over(name):
-                with suppress(OSError):
-                    Path(parent, name).unlink()
+                _remove(Path(parent, name))
+        folders[:] = [f for f in folders if below and not Path(parent, f, RUN_FILE).exists()]
+
+
+def _remove(path: Path) -> None:
+    """Remove a file or a folder, if it can be."""
+    with suppress(OSError):
+        path.unlink(missing_ok=True)
+    shutil.rmtree(path, ignore_errors=True)
 
 
 def _is_left_over(partial: str) -> bool:

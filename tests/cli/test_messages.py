@@ -86,6 +86,7 @@ GREEN = "(did you mean 'Green'?); choose from Blue, Green, Red, NIR, Red edge"
         ("info nowhere", 1, "nowhere: does not exist; give the folder of the images"),
         ("report nowhere", 1, "nowhere: does not exist; give the output folder of a run"),
         ("ndvi nowhere", 1, "nowhere: does not exist; give the output folder of a run"),
+        ("mosaic", 2, "give the output folder of a run; 'agalign mosaic --help' lists the options"),
         ("mosaic nowhere", 1, "nowhere: does not exist; give the output folder of a run"),
         ("export nowhere --for odm", 1, "nowhere: does not exist; give the output folder of a run"),
         ("verify {tmp}", 1, "no sidecars there; give the output folder of a run"),

@@ -1,4 +1,3 @@
-import re
 from pathlib import Path
 
 import numpy as np
@@ -78,7 +77,7 @@ def test_captures_on_rotated_grids_are_stacked(flight: Path, tmp_path: Path) -> 
 
 
 def test_unreadable_datasets_are_named(tmp_path: Path) -> None:
-    with pytest.raises(agalign.InputError, match="no aligned captures"):
+    with pytest.raises(agalign.InputError, match="give the output folder of a run"):
         agalign.open_flight(tmp_path)
     with pytest.raises(agalign.AgalignError, match=r"missing\.json"):
         agalign.open_capture(tmp_path / "missing.tif")
@@ -87,10 +86,6 @@ def test_unreadable_datasets_are_named(tmp_path: Path) -> None:
     for name, width in (("a", 300), ("b", 320)):
         write_capture(tmp_path / "in", "green", "red", name=name, size_px=(width, 240))
     agalign.align_folder(tmp_path / "in", tmp_path / "out", settings=seeded())
-    sizes = r"differ in size \(300 x 240 px: 1, such as a\.json; 320 x 240 px: 1, such as b\.json\); align each camera"
+    sizes = r"differ in size \(b: it has 320 x 240 px, and 1 of 2 captures have 300 x 240 px\); align again with"
     with pytest.raises(agalign.InputError, match=sizes):
-        agalign.open_flight(tmp_path / "out")
-    sidecar = tmp_path / "out" / "b.json"
-    sidecar.write_text(re.sub(r'("width": )320', r"\g<1>300", sidecar.read_text(), count=1))
-    with pytest.raises(agalign.InputError, match=r"align again with --crop none, or use open_capture"):
         agalign.open_flight(tmp_path / "out")

@@ -106,7 +106,7 @@ def test_captures_that_cannot_be_exported_are_one_line(run: Path, tmp_path: Path
     content["output"]["band_files"] = []
     for status, error, message in (
         ("ok", agalign.ConfigurationError, "--layout bands or both"),
-        ("degraded", agalign.InputError, "no capture with status ok"),
+        ("degraded", agalign.InputError, "no capture to export .*: its status is degraded"),
     ):
         path.write_text(json.dumps(content | {"status": status}))
         with pytest.raises(error, match=message):

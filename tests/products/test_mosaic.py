@@ -2,7 +2,13 @@
 
 import json
 import math
+import os
+import re
 import shutil
+import subprocess
+import sys
+import time
+import warnings
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -16,12 +22,12 @@ from synthetic_flights.overlapping import GPS_ERROR_M, GSD_M, LATITUDE, LENS, LO
 
 import agalign
 from agalign.pixels.raster import transformed
-from agalign.products import mosaic_adjustment
 from agalign.products.footprint import utm_wkt
 from agalign.products.mosaic_adjustment import adjusted, misfit_m, tie_pairs
 from agalign.products.mosaic_placement import PlacedFlight, Placement, place_captures
 from agalign.products.sidecar_file import read_sidecar, write_sidecar
 from agalign.values import geometry, lens
+from agalign.values.output_folder import locked
 
 from ..conftest import Shared
 from ..program import agalign_here
@@ -110,7 +116,7 @@ def written(survey: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Pat
 
 def test_the_mosaic_is_a_cog_with_all_bands(written: tuple[Path, agalign.MosaicReport]) -> None:
     path, report = written
-    assert (report.captures, report.tied, report.left_out) == (9, 9, [])
+    assert (report.captures, report.untied, report.left_out) == (9, [], [])
     with rasterio.open(path) as field:
         assert field.tags(ns="IMAGE_STRUCTURE")["LAYOUT"] == "COG"
         assert field.overviews(1)
@@ -119,7 +125,7 @@ def test_the_mosaic_is_a_cog_with_all_bands(written: tuple[Path, agalign.MosaicR
         assert field.crs.to_epsg() == 32631
         assert field.transform.a == -field.transform.e == pytest.approx(GSD_M, rel=0.03)
         assert np.isnan(field.nodata)
-        assert float(field.tags()["MOSAIC_MISFIT_M"]) == pytest.approx(report.misfit_m[0], abs=1e-3)
+        assert float(field.tags()["MISFIT_BETWEEN_CAPTURES_M"]) == pytest.approx(report.misfit_m[0], abs=1e-3)
         bands = field.read()
     assert np.isfinite(bands).all(axis=0).mean() > 0.8
     with rasterio.open(path.with_name("field_ndvi.tif")) as index:
@@ -186,8 +192,9 @@ def test_the_command_states_the_misfit(survey: Path, tmp_path: Path) -> None:
     assert done.returncode == 0, done.stderr
     assert done.stderr == ""
     text = " ".join(done.stdout.split())
+    assert "Position on the map: accurate to 6.0 m, as the georeference of a capture; no ground control" in text
     assert "tie points that were not used: median 0.0" in text
-    assert "Misfit, by the georeference: median" in text
+    assert "Misfit between captures, by the georeference: median" in text
     assert "Mosaic of 9 captures" in text
     assert [p.name for p in tmp_path.iterdir()] == ["field.tif"]
 
@@ -197,9 +204,9 @@ def without_positions(out: Path) -> None:
 
 
 def with_another_band(out: Path) -> None:
-    sidecar = read_sidecar(out / "0000SET" / "IMG_0009.json")
+    sidecar = read_sidecar(out / "0000SET" / "IMG_0001.json")
     bands = [b.model_copy(update={"band": "Blue"}) if b.band == "Red" else b for b in sidecar.bands]
-    write_sidecar(out / "0000SET" / "IMG_0009.json", sidecar.model_copy(update={"bands": bands}))
+    write_sidecar(out / "0000SET" / "IMG_0001.json", sidecar.model_copy(update={"bands": bands}))
 
 
 def with_changed_entry(part: str = "properties", **changes: Any) -> Callable[[Path], None]:
@@ -232,7 +239,7 @@ DAMAGED = "IMG_0009: left out: its entry in flight.geojson is damaged; run again
         ),
         (with_changed_entry(accuracy_m=math.nan), (), 1, "flight.geojson has no footprints"),
         (without_positions, (), 1, "no capture can be placed, because flight.geojson has no footprints"),
-        (with_another_band, (), 3, "IMG_0009: left out: it has other bands than 0000SET/IMG_0001"),
+        (with_another_band, (), 3, "IMG_0001: left out: it has bands Green (560 nm), Blue (668 nm), NIR"),
         (None, ("--gsd", "0.0001"), 2, "pixels, which is too many; increase --gsd"),
         (None, ("-i", "nonsense"), 2, "unknown index 'nonsense'"),
         (None, ("-o", "0000SET/IMG_0001.tif"), 2, "give the mosaic a new file that ends in .tif"),
@@ -261,14 +268,113 @@ def test_errors_are_one_line(
     assert (tmp_path / "mosaic.tif").exists() == (code == 3)
 
 
-def test_captures_that_do_not_match_keep_their_georeference(
-    survey: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(mosaic_adjustment, "_MIN_TIE_POINTS", 10**6)
-    done = agalign_here("mosaic", survey, "-o", tmp_path / "field.tif")
+def without_texture(survey: Path, out: Path, *numbers: int) -> Path:
+    """A copy of the survey, in which captures show one colour and so have no tie points."""
+    shutil.copytree(survey, out)
+    for number in numbers:
+        with rasterio.open(out / "0000SET" / f"IMG_{number:04d}.tif", "r+") as stack:
+            stack.write(np.full_like(stack.read(), 0.25))
+    return out
+
+
+def labels(*numbers: int) -> list[str]:
+    return [f"0000SET/IMG_{number:04d}" for number in numbers]
+
+
+def test_a_capture_without_tie_points_is_left_out_by_name(survey: Path, tmp_path: Path) -> None:
+    out = without_texture(survey, tmp_path / "out", 5)
+    done = agalign_here("mosaic", out, "-o", tmp_path / "field.tif")
+    assert done.returncode == 3
+    (line,) = done.stderr.splitlines()
+    assert "0000SET/IMG_0005: left out: it has no tie points to those of the mosaic; --untied places it" in line
+    assert "Mosaic of 8 captures" in done.stdout
+    with rasterio.open(tmp_path / "field.tif") as field:
+        assert not np.isclose(field.read(1), 0.25, atol=1e-4).any()
+    done = agalign_here("mosaic", out, "-o", tmp_path / "field.tif", "--untied")
     assert done.returncode == 0
-    assert "9 of 9 captures without tie points: placed by the georeference alone, accurate to" in done.stderr
+    assert "1 capture without tie points to the others: placed by the georeference, accurate to 6 m" in done.stderr
+    assert done.stderr.split()[-1] == "0000SET/IMG_0005"
+    with rasterio.open(tmp_path / "field.tif") as field:
+        assert np.isclose(field.read(1), 0.25, atol=1e-4).any()
+
+
+def test_the_largest_group_is_written_with_its_own_misfit(survey: Path, tmp_path: Path) -> None:
+    """The contrast of two captures is reversed, so that they match each other only."""
+    out = without_texture(survey, tmp_path / "out", 9)
+    for number in (7, 8):
+        with rasterio.open(out / "0000SET" / f"IMG_000{number}.tif", "r+") as stack:
+            stack.write(0.6 - stack.read())
+    report = agalign.mosaic(out, tmp_path / "field.tif")
+    assert [label for label, _ in report.left_out] == labels(7, 8, 9)
+    assert report.captures == 6
+    both = agalign.mosaic(out, tmp_path / "all.tif", untied=True)
+    assert (both.captures, both.left_out, both.untied) == (9, [], labels(7, 8, 9))
+    # The pair of 7 and 8 is not in the misfit of the six others.
+    assert both.pairs == report.pairs + 1
+    assert both.tie_points > report.tie_points
+
+
+def test_nothing_is_written_of_captures_that_do_not_match(survey: Path, tmp_path: Path) -> None:
+    out = without_texture(survey, tmp_path / "out", *range(1, 10))
+    done = agalign_here("mosaic", out, "-o", tmp_path / "field.tif")
+    assert done.returncode == 1
+    assert "is not written, because no capture has tie points to another; --untied places them" in done.stderr
+    assert not (tmp_path / "field.tif").exists()
+    done = agalign_here("mosaic", out, "-o", tmp_path / "field.tif", "--untied")
+    assert done.returncode == 0
     assert "Misfit" not in done.stdout
+
+
+def test_threads_leave_the_filters_of_warnings_alone(survey: Path) -> None:
+    before = list(warnings.filters)
+    captures = place_captures(survey).captures
+    for _ in range(3):
+        tie_pairs(captures)
+    assert warnings.filters == before
+
+
+@pytest.mark.parametrize("size", ["1600k", "3400k", "5000k"])
+def test_a_full_disk_is_one_line(survey: Path, tmp_path: Path, size: str) -> None:
+    """It is full while the mosaic is written, or its copy as a COG."""
+    mount = ["mount", "-t", "tmpfs", "-o", f"size={size}", "tmpfs", str(tmp_path)]
+    if os.getuid() != 0 or subprocess.run(mount, capture_output=True).returncode != 0:
+        pytest.skip("a file system can be mounted by root only")
+    try:
+        done = agalign_here("mosaic", survey, "-o", tmp_path / "field.tif")
+        left = os.listdir(tmp_path)
+    finally:
+        subprocess.run(["umount", "-l", str(tmp_path)], check=True)
+    assert done.returncode == 1
+    assert re.fullmatch(r"agalign: \S+field\.tif: cannot be written \(.+is the disk full\?\)?\n", done.stderr)
+    assert left == []
+
+
+def test_the_next_mosaic_removes_what_a_killed_one_left(survey: Path, tmp_path: Path) -> None:
+    command = [sys.executable, "-m", "agalign", "mosaic", survey, "-o", tmp_path / "field.tif"]
+    with subprocess.Popen(command) as process:
+        while not any(tmp_path.glob(".agalign-part-*")) and process.poll() is None:
+            time.sleep(0.001)
+        process.kill()
+    assert any(tmp_path.glob(".agalign-part-*"))
+    assert agalign_here("mosaic", survey, "-o", tmp_path / "field.tif").returncode == 0
+    assert os.listdir(tmp_path) == ["field.tif"]
+
+
+def test_two_mosaics_do_not_write_into_one_folder(survey: Path, tmp_path: Path) -> None:
+    with locked(tmp_path):
+        done = agalign_here("mosaic", survey, "-o", tmp_path / "field.tif")
+    assert done.returncode == 1
+    assert f"{tmp_path}: another run writes there (process" in done.stderr
+    assert os.listdir(tmp_path) == []
+
+
+def test_two_mosaics_of_one_run_are_the_same_bytes(
+    written: tuple[Path, agalign.MosaicReport], survey: Path, tmp_path: Path
+) -> None:
+    path, _ = written
+    agalign.mosaic(survey, tmp_path / "field.tif", indices=["ndvi"])
+    for name in ("field.tif", "field_ndvi.tif", "field_ndvi.png"):
+        assert (tmp_path / name).read_bytes() == path.with_name(name).read_bytes(), name
 
 
 def test_a_run_without_a_map_names_what_is_missing(tmp_path: Path) -> None:
@@ -286,6 +392,7 @@ def test_a_real_strip_has_a_fifth_of_the_misfit(real_data: Path, tmp_path: Path)
     done = agalign_here("align", flight, "-o", out, "--ground-elevation", "92", "--relief", "never")
     assert done.returncode == 0, done.stderr
     report = agalign.mosaic(out, tmp_path / "field.tif")
-    assert report.pairs >= 3
+    assert [label for label, _ in report.left_out] == ["IMG_0007"]
+    assert (report.captures, report.pairs) == (3, 3)
     assert report.misfit_m[0] < 0.2 * report.georeference_misfit_m[0]
     assert report.misfit_m[0] < 0.06

@@ -402,7 +402,7 @@ def output_is_a_folder(name: str) -> Inject:
 def held_by_another(scene: Scene) -> None:
     scene.out.mkdir()
     code = (
-        "import sys, time; from pathlib import Path; from agalign.batch.output_folder import locked\n"
+        "import sys, time; from pathlib import Path; from agalign.values.output_folder import locked\n"
         "with locked(Path(sys.argv[1])): print('held', flush=True); time.sleep(60)"
     )
     other = subprocess.Popen([sys.executable, "-c", code, str(scene.out)], stdout=subprocess.PIPE, text=True)
