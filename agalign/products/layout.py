@@ -82,7 +82,7 @@ def output_layers(
     if frame.undistorted or frame.scale != SAME_PIXELS:
         mappings[reference.name] = PixelMapping(geometry.identity())  # otherwise the reference is copied
     on_frame = {name: _on_frame(mapping, frame, reference) for name, mapping in mappings.items()}
-    size_px = frame.width, frame.height
+    size_px = round(reference.width_px * frame.scale.x), round(reference.height_px * frame.scale.y)
     layers = [Layer(b, on_frame.get(b.name), size_px, is_reference=b is reference) for b in capture.bands]
     # The crop is calculated without relief, which may leave pixels of single bands without a value.
     mapped = [(layer.mapping.of_the_plane, layer.band) for layer in layers if layer.mapping is not None]

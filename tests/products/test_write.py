@@ -302,7 +302,9 @@ def test_flights_and_captures_without_a_band_have_the_size_of_their_camera(tmp_p
     finer = replace(capture, bands=(green, replace(nir, width_px=240, height_px=180)))
     limits = flight_limits([([finer], replace(rig_between(2.0, 12.0), mean={"nir": np.diag([2.0, 2.0, 1.0])}))])
     common = common_grid(green, settings, limits)
-    assert output_layers(replace(without, bands=(green,)), {}, settings, common)[1].scale == (2.0, 2.0)
+    layers, grid = output_layers(finer, {"nir": aligned_by(3.0)}, settings, common)
+    assert grid.scale == (2.0, 2.0)
+    assert {layer.size_px for layer in layers} == {(240, 180)}, "the output before the crop"
 
 
 # ---- standard error, and a full disk
