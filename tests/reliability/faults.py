@@ -448,7 +448,7 @@ def when(ready: Act, act: Act, *arguments: str) -> Inject:
         scene.arguments = list(arguments)
 
         def watch(process: "subprocess.Popen[str]") -> None:
-            wait_until(lambda: bool(ready(process, scene)))
+            wait_until(process, lambda: bool(ready(process, scene)))
             act(process, scene)
 
         scene.watch = watch
@@ -484,15 +484,15 @@ def kill_worker(process: "subprocess.Popen[str]", _scene: Scene) -> None:
 def kill_capture(process: "subprocess.Popen[str]", scene: Scene) -> None:
     """Kill the only worker, and again when it tries the same capture once more, which it does last."""
     for finished in (1, len(ALL) - 1):
-        wait_until(lambda finished=finished: len(list(scene.out.glob("?.json"))) >= finished)
+        wait_until(process, lambda finished=finished: len(list(scene.out.glob("?.json"))) >= finished)
         (worker,) = workers(process)
         before_s = worker.cpu_times().user
-        wait_until(lambda worker=worker, before_s=before_s: worker.cpu_times().user > before_s + 0.05)
+        wait_until(process, lambda worker=worker, before_s=before_s: worker.cpu_times().user > before_s + 0.05)
         worker.kill()
 
 
 def kill_workers_as_they_appear(process: "subprocess.Popen[str]", scene: Scene) -> None:
-    wait_until(lambda: some_are_reported(scene))
+    wait_until(process, lambda: some_are_reported(scene))
     while process.poll() is None:
         kill_all_workers(process, scene)
         time.sleep(0.005)
@@ -518,8 +518,9 @@ def workers(process: "subprocess.Popen[str]") -> list[psutil.Process]:
         return []
 
 
-def wait_until(true: Callable[[], bool]) -> None:
+def wait_until(process: "subprocess.Popen[str]", true: Callable[[], bool]) -> None:
     while not true():
+        assert process.poll() is None, "the run ended before the fault"
         time.sleep(0.01)
 
 
@@ -528,7 +529,7 @@ def stop_worker(process: "subprocess.Popen[str]", _scene: Scene) -> None:
 
 
 def starve_workers(process: "subprocess.Popen[str]", scene: Scene) -> None:
-    wait_until(lambda: some_are_reported(scene))
+    wait_until(process, lambda: some_are_reported(scene))
     for worker in workers(process):
         worker.rlimit(psutil.RLIMIT_AS, (1 << 20, 1 << 20))
 
