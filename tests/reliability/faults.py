@@ -520,7 +520,7 @@ def workers(process: "subprocess.Popen[str]") -> list[psutil.Process]:
 
 def wait_until(process: "subprocess.Popen[str]", true: Callable[[], bool]) -> None:
     while not true():
-        assert process.poll() is None, "the run ended before the fault"
+        assert process.poll() is None or true(), "the run ended before the fault"
         time.sleep(0.01)
 
 
