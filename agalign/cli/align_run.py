@@ -135,7 +135,7 @@ class RunTotals:
             self.saturated[band.band] = max(self.saturated.get(band.band, (0.0, "")), (share, report.label))
 
     def recount(self, captures: Sequence[Capture], out: Path) -> None:
-        """Count the pairs of those captures whose files exist: an error may be that outputs were removed."""
+        """Count the pairs of captures that have all their files: outputs may have been removed."""
         added, self.pairs = self.pairs.captures, PairTotals()
         for capture in captures:
             if capture.label not in added:

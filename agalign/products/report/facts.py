@@ -88,8 +88,8 @@ class PairTotals:
 
     bands: dict[str, BandTotals] = field(default_factory=lambda: defaultdict(BandTotals))
     _by_cause: dict[tuple[str, Remedy], FailureGroup] = field(default_factory=dict)
-    _references: list[tuple[str, tuple[str, ...], str]] = field(default_factory=list)
-    """(capture, flight, reference band)."""
+    _references: list[tuple[str, tuple[str, ...], str, set[str]]] = field(default_factory=list)
+    """(capture, flight, reference band, its other bands with the missing ones)."""
     _votes: dict[tuple[str, ...], Counter[str]] = field(default_factory=lambda: defaultdict(Counter))
     """By flight, the number of captures that have a band as the reference, or lack it."""
 
@@ -108,7 +108,7 @@ class PairTotals:
                 band.residuals_px.append(residual_px)
         camera, reference = result.camera, result.reference.band
         flight = (camera.name, camera.serial, result.flight_id, "" if camera.model else Path(label).parent.as_posix())
-        self._references.append((label, flight, reference))
+        self._references.append((label, flight, reference, {name for name, _, _ in result.pairs}))
         self._votes[flight].update((reference, *result.missing_bands))
 
     @property
@@ -119,16 +119,16 @@ class PairTotals:
     @property
     def captures(self) -> set[str]:
         """Labels of the captures."""
-        return {label for label, _, _ in self._references}
+        return {label for label, *_ in self._references}
 
     def groups(self) -> list[FailureGroup]:
         """Return the failures by cause, and the captures with another reference than most of their flight; the most
         severe first, and the largest first of those.
         """
         groups = dict(self._by_cause)
-        for label, flight, band in self._references:
+        for label, flight, band, others in self._references:
             usual = self._votes[flight].most_common(1)[0][0]
-            if band != usual:
+            if usual in others:
                 reason = f"on the grid of {band}; most captures of the flight are on that of {usual}"
                 refusal = RefusalPart(capture=label, band=band, status="other_reference", reason=reason)
                 _add_to(groups, refusal, OTHER_REFERENCE)
