@@ -27,7 +27,7 @@ from agalign.pixels.landmarks import landmarks, matched_homography, matches
 from agalign.pixels.radiometry import calibrated, with_radiometry
 from agalign.pixels.raster import read_for_alignment, read_tile
 from agalign.values import geometry
-from agalign.values.capture import Band, Capture, unix_time_s
+from agalign.values.capture import Band, Capture, CaptureTime
 from agalign.values.image import Tile
 
 CAMERA, DLS, PIX4D = "micasense.com/MicaSense", "micasense.com/DLS", "pix4d.com"
@@ -55,7 +55,7 @@ def published_irradiance(tags: Tags) -> float:
     horizontal, scale = tags.number(DLS, "HorizontalIrradiance"), tags.number(DLS, "IrradianceScaleToSIUnits")
     if horizontal is not None:
         return horizontal * (scale or 0.01)
-    elevation, azimuth = sun_position(tags.position, unix_time_s(tags.captured_at))
+    elevation, azimuth = sun_position(tags.position, CaptureTime.of(tags.captured_at).utc.timestamp())
     angle = phi = sensor_to_sun(tags, elevation, azimuth)
     light = tags.number(DLS, "SpectralIrradiance") * (scale or 1.0)
     for n1, n2 in ((1.000277, 1.6), (1.6, 1.38)):
@@ -149,7 +149,7 @@ def published_panel_light(band: Band) -> tuple[float, float]:
 def tilt_facts(tags: Tags) -> tuple[str, ...]:
     """Angles, and the measured and the corrected irradiance relative to HorizontalIrradiance."""
     sun, horizontal = (
-        sun_position(tags.position, unix_time_s(tags.captured_at)),
+        sun_position(tags.position, CaptureTime.of(tags.captured_at).utc.timestamp()),
         tags.number(DLS, "HorizontalIrradiance"),
     )
     measured = tags.number(DLS, "SpectralIrradiance")

@@ -13,9 +13,10 @@ from agalign.batch.capture_report import CaptureReport, StageClock
 from agalign.batch.workers import failure_text
 from agalign.capture.align_bands import PairProgress, align_capture_bands
 from agalign.config import Settings, WriteSettings
-from agalign.errors import AgalignError, ConfigurationError, InputError, OutputError, SidecarError
+from agalign.errors import AgalignError, ConfigurationError, InputError, OutputError, SidecarError, UnreadableFileError
 from agalign.flight.model import FlightModel, load_model
 from agalign.method.device import choose_device, keep_freed_memory, one_memory_error, one_thread
+from agalign.pixels.radiometry import check_pixels
 from agalign.products.aligned_files import band_file_names
 from agalign.products.fill_sidecar import sidecar_of
 from agalign.products.index_rasters import outdated_rasters
@@ -58,6 +59,9 @@ def process_capture(
     refuse_to_overwrite([capture], out, settings.write)
     if missing := missing_radiometry(capture, settings.write.radiometry):
         raise InputError(f"{capture.reference.path}: {missing}")
+    for band in capture.bands if settings.write.radiometry != "off" else ():
+        with suppress(UnreadableFileError):  # the band pair fails with this reason
+            check_pixels(band)
     for product in PRODUCTS:
         if product.is_enabled(settings.write):
             product.check(capture)
@@ -72,7 +76,7 @@ def process_capture(
     failures = _write_products(context)
     sidecar = write_sidecar(paths.sidecar, sidecar_of(context, list(failures), time.perf_counter() - began_s))
     # Products that need the same file fail with the same message.
-    lost = tuple(dict.fromkeys(failures.values()))
+    lost = (*dict.fromkeys(failures.values()), *lost_reflectance(capture, settings.write.radiometry))
     result, path = sidecar.result(), paths.sidecar
     return CaptureReport(capture.label, "done", result, path, failed_products=lost, seconds=sidecar.seconds)
 
@@ -142,17 +146,24 @@ def discard_outputs(capture: Capture, out: Path, settings: WriteSettings) -> Non
 
 def missing_radiometry(capture: Capture, choice: RadiometryChoice) -> str:
     """Return what the bands of a capture lack for the radiometry of a run, and the remedy; empty if nothing."""
-    bands = ", ".join(b.name for b in capture.bands if b.radiometry is None and not b.companion)
-    if choice == "off" or not bands:
+    lacking = [b for b in capture.bands if b.radiometry is None and not b.companion]
+    if choice == "off" or not lacking:
         return ""
+    bands = ", ".join(b.name for b in lacking) + next((f" ({b.implausible})" for b in lacking if b.implausible), "")
     missing = {
-        "auto": f"no tags for radiance or reflectance in {bands}; leave --radiometry out",
-        "camera": f"no tags for radiance in {bands}; leave --radiometry out",
-        "sun": f"no tags of a light sensor in {bands}; choose --radiometry camera or panel",
-        "panel": f"no calibration panel of known reflectance was recorded within hours for {bands}; give "
+        "auto": f"no usable tags for radiance or reflectance in {bands}; leave --radiometry out",
+        "camera": f"no usable tags for radiance in {bands}; leave --radiometry out",
+        "sun": f"no usable tags of a light sensor in {bands}; choose --radiometry camera or panel",
+        "panel": f"no usable calibration panel of known reflectance was recorded within hours for {bands}; give "
         "--panel-albedo for a panel without QR code, or choose --radiometry sun or camera",
     }
     return missing[choice]
+
+
+def lost_reflectance(capture: Capture, choice: RadiometryChoice) -> tuple[str, ...]:
+    """Return the implausible tag that makes `auto` write radiance instead of reflectance; empty if there is none."""
+    lost = (b for b in capture.bands if b.implausible and b.radiometry is not None and b.radiometry.is_of_light)
+    return tuple(f"not written as reflectance: {b.name}: {b.implausible}" for b in lost if choice == "auto")[:1]
 
 
 @dataclass(frozen=True)

@@ -212,7 +212,8 @@ class _FlightRun:
         captures = [_calibrated(capture, panels, write) for capture in captures]
         missing = [missing_radiometry(capture, write.radiometry) for capture in captures]
         if captures and all(missing):
-            raise ConfigurationError(f"--radiometry {write.radiometry}: {missing[0]}")
+            refused = [f"; {p.capture.label} {b.band.name}: {b.problem}" for p in panels for b in p.bands if b.problem]
+            raise ConfigurationError(f"--radiometry {write.radiometry}: {missing[0]}" + "".join(refused[:1]))
         if write.georeference and captures and all(c.reference.georeference is None for c in captures):
             raise ConfigurationError(f"--georeference: no capture has {missing_for_footprint(captures[0])}")
         return sky, panels, captures

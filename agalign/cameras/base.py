@@ -18,7 +18,7 @@ from agalign.cameras.pix4d import TagTransfer
 from agalign.cameras.xmp import Name
 from agalign.errors import GeometryError, NoSuchBandError
 from agalign.values import geometry
-from agalign.values.capture import Band, Pose
+from agalign.values.capture import Band, CaptureTime, Pose
 from agalign.values.geometry import Matrix
 from agalign.values.lens import Lens
 from agalign.values.text import did_you_mean
@@ -32,6 +32,10 @@ class Camera(ABC):
     """The XMP values that identify a capture, tried in turn."""
     flight_ids: tuple[Name, ...] = ()
     """The XMP values that identify a flight, tried in turn."""
+    clock_is_utc = False
+    """True if its Exif times are in UTC."""
+    utc_times: tuple[Name, ...] = ()
+    """The XMP values of the time in UTC, tried in turn."""
     tag_transfer: TagTransfer = TagTransfer()
     """Conversion of its tags for a band that is written on the reference's grid."""
 
@@ -58,6 +62,11 @@ class Camera(ABC):
     def pose(self, tags: Tags) -> Pose | None:
         """Return the camera's orientation and height; None if the tags lack them."""
         return None
+
+    def captured_at(self, tags: Tags) -> str:
+        """Return the time as `Capture.captured_at`, in UTC if the camera writes that; empty if the tags lack it."""
+        utc = CaptureTime.of(tags.first_text(self.utc_times) or (tags.captured_at if self.clock_is_utc else ""))
+        return tags.captured_at if utc is None else utc.utc.isoformat()
 
     def elevation_deg(self, tags: Tags) -> float | None:
         """Return the angle of the optical axis above the horizon, -90 straight down; None if the tags lack it."""

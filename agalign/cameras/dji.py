@@ -64,6 +64,7 @@ class Dji(Camera):
 
     name = "DJI"
     capture_ids = ((_DJI, "CaptureUUID"),)
+    utc_times = ((_DJI, "UTCAtExposure"),)
     tag_transfer = _TagTransfer()
 
     def recognises(self, tags: Tags) -> bool:
@@ -143,6 +144,7 @@ def _radiometry(tags: Tags) -> Radiometry | None:
         k if centre else (),
         vignetting_divides=False,
         by_sun=(1 / irradiance, "relative reflectance") if irradiance > 0 else None,
+        tags={"sensor gain": gain, "gain adjustment": adjusted, "exposure time (s)": exposure_us / 1e6},
     )
 
 

@@ -202,7 +202,7 @@ def capture_of(files: Sequence[ImageFile], folder: Path, options: DiscoverOption
         camera=CameraIdentity(tags.make, tags.model, _SERIAL_SEPARATOR.join(serials)),
         capture_id=tags.first_text(camera.capture_ids),
         flight_id=tags.first_text(camera.flight_ids),
-        captured_at=tags.captured_at,
+        captured_at=camera.captured_at(tags),
         position=tags.position,
         pose=camera.pose(tags),
         motion=camera.motion(tags),

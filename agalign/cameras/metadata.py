@@ -26,7 +26,7 @@ class Tags:
     serial: str = ""
     position: Position | None = None
     captured_at: str = ""
-    """ISO 8601; without a time zone if the camera writes none."""
+    """ISO 8601; by the camera's clock without an offset from UTC if the camera writes none."""
     orientation: int = 1
     """EXIF Orientation: 1 if the image is stored upright, 3 if it is rotated by 180 degrees."""
     black_level: float | None = None
@@ -100,7 +100,8 @@ def read_tags(path: Path) -> Tags:
         model=_text(first.get("Model")),
         serial=_text(exif.get("BodySerialNumber")),
         position=_position(gps),
-        captured_at=_iso_time(exif, first.get("DateTime")),
+        captured_at=_iso_time(exif, "DateTimeOriginal", "OffsetTimeOriginal")
+        or _iso_time({**exif, **first}, "DateTime", "OffsetTime"),
         orientation=int(orientation) if orientation in range(1, 9) else 1,
         black_level=_mean(first.get("BlackLevel")),
         xmp=Packet.parse(first.get("XMLPacket", b"")).values(),
@@ -156,11 +157,12 @@ def _text(value: Any) -> str:
     return without_controls(str(value)).strip()[:max_length] if isinstance(value, (str, int)) else ""
 
 
-def _iso_time(exif: Mapping[str, Any], fallback: Any) -> str:
-    moment = _text(exif.get("DateTimeOriginal")) or _text(fallback)
-    match = re.fullmatch(r"(\d{4}):(\d\d):(\d\d) (\d\d:\d\d:\d\d)", moment)
+def _iso_time(exif: Mapping[str, Any], time: str, offset: str) -> str:
+    """The time in a tag, with the offset from UTC in another tag if it is plausible; empty without a time."""
+    match = re.fullmatch(r"(\d{4}):(\d\d):(\d\d) (\d\d:\d\d:\d\d)", _text(exif.get(time)))
     if not match:
         return ""
     year, month, day, clock = match.groups()
     fraction = _text(exif.get("SubsecTimeOriginal") or exif.get("SubsecTime"))
-    return f"{year}-{month}-{day}T{clock}" + (f".{fraction}" if fraction.isdigit() else "")
+    zone = re.fullmatch(r"[+-](0\d|1[0-4]):[0-5]\d", _text(exif.get(offset)))
+    return f"{year}-{month}-{day}T{clock}{f'.{fraction}' if fraction.isdigit() else ''}{zone[0] if zone else ''}"

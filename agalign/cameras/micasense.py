@@ -16,7 +16,7 @@ from agalign.cameras.base import FULL_SCALE, Camera, is_thermal, rays_to_rig, ro
 from agalign.cameras.light_sensor import horizontal_irradiance, sun_position
 from agalign.cameras.metadata import Tags, finite
 from agalign.cameras.xmp import Packet, names_in
-from agalign.values.capture import Band, Pose, Radiometry, unix_time_s
+from agalign.values.capture import Band, CaptureTime, Pose, Radiometry
 
 _MICASENSE, _DLS = "micasense.com/MicaSense", "micasense.com/DLS"
 _REDEDGE_M_PARALLAX = {
@@ -51,6 +51,7 @@ class MicaSense(Camera):
     name = "MicaSense"
     capture_ids = ((_MICASENSE, "CaptureId"),)
     flight_ids = ((_MICASENSE, "FlightId"),)
+    clock_is_utc = True
     tag_transfer = _TagTransfer()
 
     def recognises(self, tags: Tags) -> bool:
@@ -60,9 +61,8 @@ class MicaSense(Camera):
         name = tags.text(pix4d.NAMESPACE, "BandName") or _index_in_name(path) or path.stem
         band = replace(pix4d.with_wavelength(stored[0], tags), name=name)
         lens = pix4d.perspective_lens(tags)
-        parallax = pix4d.parallax_of(tags)
-        if parallax is None and tags.model == "RedEdge-M":
-            parallax = _REDEDGE_M_PARALLAX.get(name)
+        offset = pix4d.lens_offset(tags)
+        known_parallax = _REDEDGE_M_PARALLAX.get(name) if tags.model == "RedEdge-M" else None
         centikelvin = Radiometry("temperature", 27315.0, 1.0, 0.01)  # in agreement with the Altum's SceneTemperature
         max_twelve_bit_value = 65520.0  # stored in the upper bits of uint16
         band = replace(
@@ -70,9 +70,9 @@ class MicaSense(Camera):
             saturation_value=max_twelve_bit_value if band.dtype == "uint16" else band.saturation_value,
             lens=lens,
             to_rig=rays_to_rig(lens, rotation(*pix4d.rig_degrees(tags))),
-            parallax_direction=parallax,
+            parallax_direction=known_parallax if offset is None else (-offset[0], -offset[1]),
             radiometry=centikelvin if is_thermal(band) else _radiometry(tags),
-            lens_offset=pix4d.lens_offset(tags),
+            lens_offset=offset,
         )
         return (band,)
 
@@ -107,6 +107,7 @@ def _radiometry(tags: Tags) -> Radiometry | None:
         True,
         a[1] / exposure_s - a[2],
         (math.pi / math.prod(irradiance), "reflectance") if irradiance else None,
+        tags={"calibration coefficient": a[0], "sensor gain": iso / 100, "exposure time (s)": exposure_s},
     )
 
 
@@ -116,9 +117,9 @@ def _irradiance(tags: Tags) -> tuple[float, float] | None:
 
     Older sensors measure only in their own plane: the time, the place and the attitude then give the horizontal one.
     """
-    time_s = unix_time_s(tags.captured_at) or 0.0
-    is_clock_set = time_s > 366 * 86400.0  # others count from 1970
-    sun = sun_position(tags.position, time_s) if tags.position is not None and is_clock_set else None
+    time = CaptureTime.of(tags.captured_at)
+    is_clock_set = time is not None and time.utc.year > 1970  # others count from 1970
+    sun = sun_position(tags.position, time.utc.timestamp()) if tags.position and time and is_clock_set else None
     scale = tags.number(_DLS, "IrradianceScaleToSIUnits")
     value, unit = _measured_horizontal(tags, sun), scale or 0.01  # the unit without a tag
     if value is None or value <= 0:

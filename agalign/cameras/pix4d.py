@@ -10,7 +10,7 @@ import numpy as np
 
 from agalign.cameras.metadata import Tags
 from agalign.cameras.xmp import Name, Packet, names_in
-from agalign.pixels.radiometry import is_physical
+from agalign.pixels.radiometry import plausible
 from agalign.values.capture import Band, Panel, Pose, Radiometry
 from agalign.values.geometry import Points
 from agalign.values.image import OutputGrid
@@ -72,14 +72,6 @@ def rig_degrees(tags: Tags) -> tuple[float, ...]:
     """Return the three angles of Camera:RigRelatives; zeros if they are missing."""
     angles = tags.numbers(NAMESPACE, "RigRelatives")
     return angles if len(angles) == 3 else (0.0, 0.0, 0.0)
-
-
-def parallax_of(tags: Tags) -> tuple[float, float] | None:
-    """Return the direction (x, y) in which a band's pixels move as the distance of the ground decreases, in any unit:
-    opposite to the position of the lens in Camera:RigTranslations. None if that is missing.
-    """
-    position = tags.numbers(NAMESPACE, "RigTranslations")
-    return (-position[0], -position[1]) if len(position) == 3 else None
 
 
 def lens_offset(tags: Tags) -> tuple[float, float] | None:
@@ -162,7 +154,7 @@ def vignetting_of(tags: Tags, size_px: tuple[int, int]) -> Radiometry | None:
     if len(centre) != 2 or not k or not all(0 <= c <= size for c, size in zip(centre, size_px, strict=True)):
         return None
     result = Radiometry("relative radiance", tags.black_level or 0.0, 1.0, 1.0, (centre[0], centre[1]), k)
-    return result if is_physical(result, size_px) else None
+    return plausible(result, size_px)[0]
 
 
 def vignetting_on_grid(vignetting: Radiometry, output_px: Points, positions_px: Points) -> GridVignetting:

@@ -13,7 +13,7 @@ from agalign.cameras.metadata import Tags, read_tags
 from agalign.cameras.pix4d import panel_in
 from agalign.config import DiscoverOptions
 from agalign.errors import AgalignError, UnreadableFileError
-from agalign.pixels.radiometry import is_physical
+from agalign.pixels.radiometry import plausible
 from agalign.pixels.raster import probe, suffix_format
 from agalign.values.capture import Band
 from agalign.values.process_pool import ProcessPool, WorkerDiedError
@@ -78,8 +78,9 @@ def read_file(path: Path, cameras: Iterable[Camera], options: DiscoverOptions) -
     panel = panel_in(tags, stored[0].size_px)
     bands = [replace(b, panel=panel) for b in camera.bands(path, tags, stored) if options.with_rgb or not b.companion]
     for i, band in enumerate(bands):
-        if band.radiometry is not None and not is_physical(band.radiometry, band.size_px):  # damaged tags
-            bands[i] = replace(band, radiometry=None)
+        if band.radiometry is not None:
+            radiometry, implausible = plausible(band.radiometry, band.size_px)
+            bands[i] = replace(band, radiometry=radiometry, implausible=implausible)
     return ImageFile(path, camera, tags, tuple(bands))
 
 

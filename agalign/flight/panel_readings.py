@@ -10,7 +10,7 @@ import numpy as np
 
 from agalign.errors import AgalignError
 from agalign.flight.groups import camera_key, flights_of
-from agalign.pixels.panel_detection import DetectedPanel, albedo_of, find_panel, inside, is_homogeneous
+from agalign.pixels.panel_detection import DetectedPanel, albedo_of, evenly_lit, find_panel, inside, is_homogeneous
 from agalign.pixels.radiometry import calibrated
 from agalign.pixels.raster import read_for_alignment, read_tile, without_warnings
 from agalign.values.capture import Band, Capture, Panel, PanelFactor, PanelSource
@@ -32,7 +32,7 @@ class BandReading:
     band: Band
     albedo: float | None
     radiance: float | None = None
-    """Mean over the panel, in the unit of the camera's calibration."""
+    """Mean over the evenly lit part of the panel, in the unit of the camera's calibration."""
     problem: str = ""
     """Why it cannot be used; empty if it can."""
 
@@ -58,22 +58,21 @@ class PanelReading:
     bands: tuple[BandReading, ...]
 
     @property
-    def sensor_scale(self) -> float | None:
-        """Irradiance on the panel divided by that of the light sensor, the median of the bands; None if either is
-        unknown, or relative.
-        """
+    def sensor_scales(self) -> dict[str, float]:
+        """Irradiance on the panel divided by that of the light sensor by band, if both are known and not relative."""
         known = [b.band.radiometry for b in self.bands if b.band.radiometry is not None]
         if any(r.by_sun is not None and r.by_sun[1] != "reflectance" for r in known):
-            return None
-        scales = [b.sensor_scale for b in self.bands if b.sensor_scale]
-        return float(np.median(scales)) if scales else None
+            return {}
+        return {b.band.name: b.sensor_scale for b in self.bands if b.sensor_scale}
 
     @property
     def fits_sensor(self) -> bool:
-        """False if the panel and the light sensor cannot have been in the same light."""
-        # Calibrated sensors agree with panels within 20 %, except if a person, an aircraft or a cloud shades one.
-        max_scale = 1.3
-        return 1 / max_scale < (self.sensor_scale or 1.0) < max_scale
+        """False if the panel and the light sensor cannot have been in the same light, or one is wrong in some bands."""
+        # Calibrated sensors agree with panels within 20 %, except if a person, an aircraft or a cloud shades one. Bands
+        # of one panel and one sensor that is not calibrated differ by up to 18 % (RedEdge-M, DLS 1).
+        max_scale, scales = 1.3, [*self.sensor_scales.values()] or [1.0]
+        median = float(np.median(scales))
+        return 1 / max_scale < median < max_scale and max(scales) < max_scale * min(scales)
 
     @property
     def panel(self) -> Panel:
@@ -278,24 +277,29 @@ def _read(band: Band, albedos: Albedos) -> BandReading:
     if panel is None or not panel.corners_px:
         return BandReading(band, albedo, problem="it was not found in this band")
     try:
-        radiance, saturated = _radiance(band, panel)
+        return BandReading(band, albedo, *_radiance(band, panel))
     except AgalignError as error:
         return BandReading(band, albedo, problem=str(error))
-    problem = "it is black" if radiance is not None and not radiance > 0 else ""
-    max_saturated = 0.01  # share of pixels; saturated ones bias the mean radiance
-    if saturated > max_saturated:
-        problem = f"{saturated:.0%} of it is saturated"
-    return BandReading(band, albedo, radiance, problem)
 
 
-def _radiance(band: Band, panel: Panel) -> tuple[float | None, float]:
-    """Return the mean radiance over the panel, None without calibration, and the saturated share of its pixels."""
+def _radiance(band: Band, panel: Panel) -> tuple[float | None, str]:
+    """Return the mean radiance over the evenly lit part of the panel, and why it cannot be used, empty if it can. None
+    without calibration.
+    """
     pixels, valid = read_tile(band, Tile(0, 0, *band.size_px))
     within = inside(panel.corners_px, pixels.shape) & valid
-    if not within.any():
-        return None, 0.0
+    if not within.any() or band.radiometry is None or not band.radiometry.is_of_light:
+        return None, ""
     saturation = np.inf if band.saturation_value is None else band.saturation_value
     saturated = float((pixels[within].astype(np.float64) >= saturation).mean())
-    if band.radiometry is None or not band.radiometry.is_of_light:
-        return None, saturated
-    return float(calibrated(pixels, band.radiometry, 0, 0)[within].mean(dtype=np.float64)), saturated
+    image, max_saturated = calibrated(pixels, band.radiometry, 0, 0), 0.01  # share; they bias the mean radiance
+    values = image[within].astype(np.float64)
+    if saturated > max_saturated:
+        return float(values.mean()), f"{saturated:.0%} of it is saturated"
+    if not np.median(values) > 0:
+        return float(values.mean()), "it is black"
+    lit = evenly_lit(image, within)
+    if not lit.any():
+        spread = values.std() / np.median(values)
+        return float(values.mean()), f"its pixels vary by {spread:.0%}: it is shaded, soiled or not in the area"
+    return float(image[lit].mean(dtype=np.float64)), ""

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from agalign.values.image import Mask, Raster
+from agalign.values.image import FloatImage, Mask, Raster
 
 _AREA_RATIO = 0.5
 """Side of the measured area, relative to that of the panel."""
@@ -28,6 +28,12 @@ class _Limits(NamedTuple):
     """Maximum ratio of opposite sides."""
     relative_std: float = 0.06
     """Maximum standard deviation within the measured area, relative to its mean."""
+    lit_tolerance: float = 0.2
+    """Maximum difference of an evenly lit pixel from the median of the panel, relative. If one is brighter, the median
+    may be in the shadow.
+    """
+    lit_share: float = 0.6
+    """Minimum share of evenly lit pixels: of two halves, it is not known which one is in the light."""
     contrast: float = 1.5
     """Minimum ratio of the brightness of a panel and its surroundings."""
     ring_ratios: tuple[float, float] = (1.15, 1.4)
@@ -184,6 +190,19 @@ def _is_panel(image: NDArray[np.uint8], square: Corners) -> bool:
 def is_homogeneous(values: NDArray[np.floating[Any]]) -> bool:
     """Return True if pixels (n,) vary as little as those of a panel."""
     return len(values) > 0 and bool(values.std() <= _LIMITS.relative_std * values.mean())
+
+
+def evenly_lit(image: FloatImage, within: Mask) -> Mask:
+    """Return the pixels (height, width) of a panel without those in a shadow; none if they vary for another reason.
+
+    `within` is True in the panel. Noise is averaged, which does not change the mean.
+    """
+    smooth = cv2.blur(image, (5, 5)).astype(np.float64)
+    ratios = smooth / np.median(smooth[within])
+    lit = within & (np.abs(ratios - 1) <= _LIMITS.lit_tolerance)
+    is_bright = ratios[within].max(initial=0) > 1 + _LIMITS.lit_tolerance
+    is_most = np.count_nonzero(lit) >= _LIMITS.lit_share * np.count_nonzero(within)
+    return lit if is_most and not is_bright and is_homogeneous(smooth[lit]) else np.zeros_like(within)
 
 
 def _is_next_to(square: Corners, code: Corners) -> bool:

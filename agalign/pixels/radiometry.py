@@ -12,37 +12,76 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
-from agalign.values.capture import Capture, PanelFactor, Quantity, Radiometry, RadiometrySource
+from agalign.errors import InputError
+from agalign.pixels.raster import read_for_alignment
+from agalign.values.capture import Band, Capture, PanelFactor, Quantity, Radiometry, RadiometrySource
 from agalign.values.choices import RadiometryChoice
 from agalign.values.image import FloatImage
 
+_PLAUSIBLE: Mapping[str, tuple[float, float]] = {
+    "exposure time (s)": (1e-6, 1.0),  # images of a moving camera are blurred from 0.01 s
+    "sensor gain": (0.1, 1e3),  # ISO / 100
+    "gain adjustment": (0.1, 10.0),  # between the bands of a camera: 0.8 to 2.2 on two Phantom 4
+    "calibration coefficient": (1e-6, 1e-2),  # 0.9e-4 to 3.7e-4 on six RedEdge
+    "black level": (0.0, 2.0**14),  # a quarter of 16 bits; cameras write 4,096 to 5,800
+    "vignetting": (0.05, 20.0),  # anywhere in the image; a wide lens leaves a third of the light in the corners
+    "row gradient": (0.1, 10.0),  # first or last row; up to 1.3
+    "irradiance (W / m^2 / nm)": (0.005, 3.0),  # from sunset (0.6 % of a clear noon) to 1.5 times a clear noon
+    "relative irradiance": (10.0, 1e6),  # 7,000 to 17,000 in the sun
+}
+"""Ranges of the values that radiance and reflectance are calculated from; others are of damaged tags."""
+_MAX_REFLECTANCE = 2.0
+"""Maximum median of a band: fresh snow and panels are below 1, and a tilted sensor measures as little as half of the
+light. Single pixels, as of sun glint, are brighter.
+"""
+_MAX_BELOW_BLACK = 0.01
+"""Minimum median of a band above the black level, negative, relative to the full scale. Water in the near infrared is
+at the black level, which drifts by 0.5 % of the full scale.
+"""
 
-def is_physical(radiometry: Radiometry, size_px: tuple[int, int]) -> bool:
-    """Return True if a calibration is plausible for an image of (width, height); damaged tags are not.
 
-    It is finite, its gain is positive, the corrections of the corners and of the last row are below a factor of 1000,
-    and the values of 16-bit sensors below 1e12, which is above any radiance or reflectance.
+def plausible(radiometry: Radiometry, size_px: tuple[int, int]) -> tuple[Radiometry | None, str]:
+    """Return the calibration of an image (width, height), and the tag that is implausible, in words; empty if none is.
+
+    It is without `by_sun` if only the irradiance is implausible, and None if another tag is.
     """
-    max_correction, max_raw, max_value = 1000.0, 65535.0, 1e12
-    factor, _ = radiometry.by_sun or (1.0, None)
-    positive = radiometry.gain, radiometry.full_scale, factor
-    of_position = radiometry.row_gradient, *radiometry.vignetting, *radiometry.vignetting_centre_px
-    if not np.isfinite([radiometry.black_level, *positive, *of_position]).all() or min(positive) <= 0:
-        return False
-    width, height = size_px
-    cx, cy = radiometry.vignetting_centre_px
+    (width, height), (cx, cy) = size_px, radiometry.vignetting_centre_px
     r = np.linspace(0.0, max(np.hypot(x - cx, y - cy) for x in (0, width) for y in (0, height)), 32)
     with np.errstate(over="ignore", invalid="ignore"):
         falloff = np.polynomial.polynomial.polyval(r, (1.0, *radiometry.vignetting))
-        by_row = 1.0 + radiometry.row_gradient * np.array([0.0, height])
-        brightest = radiometry.gain / radiometry.full_scale * factor * max_raw
-    return bool(
-        (np.abs(np.log(np.clip(falloff, 1e-30, 1e30))) < np.log(max_correction)).all()
-        and (by_row > 1 / max_correction).all()
-        and brightest < max_value
-    )
+    values: dict[str, ArrayLike] = {**radiometry.tags, "black level": radiometry.black_level, "vignetting": falloff}
+    values["row gradient"] = 1.0 + radiometry.row_gradient * np.array([0.0, height])
+    if radiometry.by_sun is not None:
+        kind = "irradiance (W / m^2 / nm)" if radiometry.by_sun[1] == "reflectance" else "relative irradiance"
+        values[kind] = radiometry.irradiance or 0.0
+    for name, value in values.items() if radiometry.is_of_light else ():
+        low, high = _PLAUSIBLE[name]
+        for wrong in (v for v in np.ravel(value).tolist() if not low <= v <= high):
+            rest = replace(radiometry, by_sun=None) if "irradiance" in name else None
+            return rest, f"the {name} of {wrong:g} is not within {low:g} to {high:g}"
+    return radiometry, ""
+
+
+def check_pixels(band: Band) -> None:
+    """Raise InputError if the pixels of a band do not fit its calibration, UnreadableFileError if they cannot be read.
+
+    The corrections by position are left out, which are within a factor of 2.
+    """
+    if band.radiometry is None or band.radiometry.quantity == "temperature":
+        return
+    longest_side_px, radiometry = 256, band.radiometry
+    image = read_for_alignment(band, longest_side_px)
+    raw = float(np.median(image.pixels[image.valid])) if image.valid.any() else radiometry.black_level
+    signal = (raw - radiometry.black_level) / radiometry.full_scale
+    if signal < -_MAX_BELOW_BLACK:
+        problem = f"its black level of {radiometry.black_level:g} is above its pixels (median {raw:.0f})"
+    elif radiometry.quantity == "reflectance" and signal * radiometry.gain > _MAX_REFLECTANCE:
+        problem = f"its median reflectance of {signal * radiometry.gain:.3g} is above {_MAX_REFLECTANCE:g}"
+    else:
+        return
+    raise InputError(f"{band.path}: {problem}; take the capture out, or leave --radiometry out")
 
 
 def with_radiometry(capture: Capture, choice: RadiometryChoice, by_panel: Mapping[str, PanelFactor]) -> Capture:

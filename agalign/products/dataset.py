@@ -15,6 +15,7 @@ from agalign.products.relief_map import RELIEF_UNITS
 from agalign.products.run_captures import RunCapture, captures_of_run, exceptions, like_most
 from agalign.products.sidecar import BandPart, CaptureResult, Sidecar
 from agalign.products.sidecar_file import read_sidecar
+from agalign.values.capture import CaptureTime
 
 if TYPE_CHECKING:
     import xarray
@@ -44,9 +45,10 @@ def open_capture(path: str | Path, *, masked: bool = True) -> "xarray.Dataset":
 def open_flight(out: str | Path, *, masked: bool = True) -> "xarray.Dataset":
     """Return all captures below the output folder of a run, stacked along `capture`, read lazily with dask.
 
-    The coordinates of `capture` are its label, `time`, `latitude`, `longitude` and `altitude_m`, as far as the camera
-    wrote them; `status` has the dimensions (capture, band). So that a variable has one unit, captures with other bands
-    or another quantity than most are left out, as are unreadable ones: a UserWarning names them.
+    The coordinates of `capture` are its label, `time` (UTC, or by the camera's clock, as its attribute `source` says),
+    `latitude`, `longitude` and `altitude_m`, as far as the camera wrote them; `status` has the dimensions (capture,
+    band). So that a variable has one unit, captures with other bands or another quantity than most are left out, as are
+    unreadable ones: a UserWarning names them.
     Raises InputError if there is no run or its captures differ in size (write with crop 'flight'), and the errors of
     `open_capture`.
     """
@@ -64,7 +66,7 @@ def open_flight(out: str | Path, *, masked: bool = True) -> "xarray.Dataset":
         del stacked[name].attrs["status"]
     flight: xarray.Dataset = stacked.assign_coords(
         capture=[c.label for c in captures],
-        time=("capture", [_time(c.result) for c in captures]),
+        time=_times(captures),
         band=bands,
         status=(("capture", "band"), status),
         **{name: ("capture", _coordinates(captures, name)) for name in ("latitude", "longitude", "altitude_m")},
@@ -167,8 +169,7 @@ def _in_pixels(dataset: "xarray.Dataset") -> "xarray.Dataset":
     return dataset.drop_vars(["spatial_ref", "xc", "yc"], errors="ignore").assign_coords(px)
 
 
-def _time(sidecar: CaptureResult) -> Any:
-    try:
-        return np.datetime64(sidecar.captured_at.partition("+")[0].rstrip("Z"), "us")
-    except ValueError:
-        return np.datetime64("NaT", "us")
+def _times(captures: Sequence[RunCapture]) -> tuple[str, list[Any], dict[str, str]]:
+    known = [CaptureTime.of(c.result.captured_at) for c in captures]
+    times = [np.datetime64("NaT" if t is None else t.utc.replace(tzinfo=None), "us") for t in known]
+    return "capture", times, {"source": ", ".join(sorted({t.source for t in known if t is not None}))}

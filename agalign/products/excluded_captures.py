@@ -38,6 +38,8 @@ class PanelBandPart(_Part):
     radiance: float | None
     """Mean over the area, in the unit of the camera's calibration."""
     reflectance_per_radiance: float | None
+    sensor_scale: float | None = None
+    """Irradiance on the panel divided by that of the light sensor."""
     problem: str | None
     """Reason why the band cannot be used."""
 
@@ -70,7 +72,7 @@ class PanelPart(_CapturePart):
     sensor_scale: float | None = None
     """Irradiance on the panel divided by that of the light sensor, the median of the bands."""
     fits_sensor: bool = True
-    """False if the scale is implausible; panels are then not combined with the light sensor."""
+    """False if the scale or its range over the bands is implausible; panels are then not combined with the sensor."""
     bands: list[PanelBandPart]
 
     @property
@@ -85,8 +87,13 @@ class PanelPart(_CapturePart):
         scale = self.sensor_scale
         sensor = "" if scale is None else f"; irradiance {scale:.2f} times that of the light sensor"
         if not self.fits_sensor:
-            sensor += ", which was in other light: --radiometry auto uses the sensor alone, panel the panels alone"
-        return f"{name} (reflectance {reflectance}; recognised by {recognised}): {use}{sensor}"
+            by_band = sorted((b.sensor_scale, b.band) for b in self.bands if b.sensor_scale)
+            extremes = " to ".join(f"{value:.2f} in {band}" for value, band in by_band[:: max(1, len(by_band) - 1)])
+            sensor += f"{extremes and f' ({extremes})'}, which was in other light or is wrong in a band: "
+            sensor += "--radiometry auto uses the sensor alone, panel the panels alone"
+        refused = {b.problem: [o.band for o in self.bands if o.problem == b.problem] for b in self.bands if b.problem}
+        unused = "".join(f"; not used in {', '.join(bands)}: {why}" for why, bands in refused.items() if albedos)
+        return f"{name} (reflectance {reflectance}; recognised by {recognised}): {use}{sensor}{unused}"
 
 
 class SkyPart(_CapturePart):
@@ -125,9 +132,11 @@ def write_panels(readings: Sequence[PanelReading], out: Path) -> list[PanelPart]
     for reading in readings:
         picture = check_inside(out / reading.capture.folder, out) / f"{reading.capture.name}.panel.png"
         write_png(side_by_side([_tile(b) for b in reading.bands], gap_px=6), picture)
-        panel, bands = reading.panel, [_panel_band(b) for b in reading.bands]
+        panel, scales = reading.panel, reading.sensor_scales
+        bands = [_panel_band(b) | {"sensor_scale": scales.get(b.band.name)} for b in reading.bands]
         facts = {"seen_by": panel.seen_by, "serial": panel.serial, "in_scene": panel.in_scene, "cues": panel.cues}
-        facts |= {"sensor_scale": reading.sensor_scale, "fits_sensor": reading.fits_sensor, "bands": bands}
+        facts |= {"sensor_scale": float(np.median([*scales.values()])) if scales else None}
+        facts |= {"fits_sensor": reading.fits_sensor, "bands": bands}
         facts |= _identity(reading.capture) | {"picture": picture.relative_to(out).as_posix()}
         parts.append(PanelPart.model_validate(facts))
     write_model(out / PANELS_FILE, PanelsFile(panels=parts) if parts else None)

@@ -18,7 +18,7 @@ from agalign.products.relief_map import ReliefMap
 from agalign.products.sidecar import BandPart, Sidecar, is_usable
 from agalign.values import geometry
 from agalign.values.alignment import Alignment
-from agalign.values.capture import Band, Radiometry
+from agalign.values.capture import Band
 from agalign.values.choices import CaptureStatus
 from agalign.values.geometry import Points
 from agalign.values.mapping import PixelMapping
@@ -93,21 +93,17 @@ def _output(context: ProductContext) -> dict[str, Any]:
         "band_files": band_files,
         "radiometry": " and ".join(names) or None,
         "panel_age_s": next((r.panel_age_s for r in radiometry.values() if r.panel_age_s is not None), None),
-        "illumination": [_illumination(n, r) for n, r in radiometry.items() if "reflectance" in r.quantity],
+        "illumination": [
+            {"band": name, "irradiance": r.irradiance, "reflectance_per_radiance": r.factor}
+            for name, r in radiometry.items()
+            if "reflectance" in r.quantity
+        ],
         "crop": (grid.x0, grid.y0, grid.width, grid.height),
         "scale": grid.scale,
         "undistorted": grid.undistorted,
         "vignetting_corrected": any(file.is_flat for file in context.written),
         "nodata": values.pop() if len(values) == 1 else None,
     }
-
-
-def _illumination(band: str, radiometry: Radiometry) -> dict[str, Any]:
-    irradiance = None
-    if radiometry.by_sun is not None:
-        by_sun, quantity = radiometry.by_sun
-        irradiance = (math.pi if quantity == "reflectance" else 1.0) / by_sun
-    return {"band": band, "irradiance": irradiance, "reflectance_per_radiance": radiometry.factor}
 
 
 def _file(file: WrittenFile, context: ProductContext) -> dict[str, Any]:

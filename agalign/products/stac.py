@@ -5,7 +5,6 @@ electro-optical, raster and projection.
 import json
 import math
 from collections.abc import Sequence
-from contextlib import suppress
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -24,7 +23,7 @@ from agalign.products.indices import role_of_band
 from agalign.products.pan_sharpen import panchromatic
 from agalign.products.product import CapturePaths, Product, ProductContext, WrittenFile
 from agalign.products.raster_file import UNITS
-from agalign.values.capture import Band, Capture
+from agalign.values.capture import Band, Capture, CaptureTime
 from agalign.values.files import file_name, read_regular, write_text
 from agalign.values.image import OutputGrid
 
@@ -199,9 +198,7 @@ def _common_name(band: Band, capture: Capture) -> str | None:
 
 
 def _moment(capture: Capture) -> tuple[datetime, str]:
-    """(time of the capture, its source). Cameras write no time zone; UTC is assumed."""
-    with suppress(ValueError):
-        moment = datetime.fromisoformat(capture.captured_at)
-        return (moment if moment.tzinfo else moment.replace(tzinfo=UTC)), "camera"
-    # STAC requires a time, which orthomosaics seldom have.
+    """(time of the capture in UTC, its source). STAC requires a time, which orthomosaics seldom have."""
+    if (known := CaptureTime.of(capture.captured_at)) is not None:
+        return known
     return datetime.fromtimestamp(capture.reference.path.stat().st_mtime, UTC), "change of the reference's file"

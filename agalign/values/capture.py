@@ -1,5 +1,7 @@
 """Captures and their bands, with the metadata from the tags of the files."""
 
+import math
+from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
@@ -53,6 +55,16 @@ class Radiometry:
     """The factor from radiance to reflectance, which `gain` includes."""
     panel_age_s: float | None = None
     """Time between the capture and the nearest panel, if `source` includes a panel."""
+    tags: Mapping[str, float] = field(default_factory=dict)
+    """The values of tags that `gain` is calculated from, with the names of `pixels.radiometry`."""
+
+    @property
+    def irradiance(self) -> float | None:
+        """Irradiance by the light sensor, W / m^2 / nm, or relative."""
+        if self.by_sun is None:
+            return None
+        factor, quantity = self.by_sun
+        return (math.pi if quantity == "reflectance" else 1.0) / factor
 
     @property
     def is_of_light(self) -> bool:
@@ -60,12 +72,22 @@ class Radiometry:
         return self.quantity in ("radiance", "relative radiance")
 
 
-def unix_time_s(text: str) -> float | None:
-    """Return the Unix time of an ISO 8601 text, s; UTC is assumed without a time zone. None for another text."""
-    with suppress(ValueError):
-        moment = datetime.fromisoformat(text)
-        return (moment if moment.tzinfo else moment.replace(tzinfo=UTC)).timestamp()
-    return None
+class CaptureTime(NamedTuple):
+    """The time of a capture."""
+
+    utc: datetime
+    """In UTC; the clock of the camera as it is if its time zone is unknown."""
+    source: Literal["camera", "clock of the camera (time zone unknown)"]
+
+    @classmethod
+    def of(cls, captured_at: str) -> "CaptureTime | None":
+        """Return the time in `Capture.captured_at`; None for another text."""
+        with suppress(ValueError, OverflowError):
+            moment = datetime.fromisoformat(captured_at)
+            if moment.tzinfo is None:
+                return cls(moment.replace(tzinfo=UTC), "clock of the camera (time zone unknown)")
+            return cls(moment.astimezone(UTC), "camera")
+        return None
 
 
 class PanelFactor(NamedTuple):
@@ -137,6 +159,8 @@ class Band:
     overviews: tuple[int, ...] = ()
     """Reduction factors of the overviews in the file."""
     radiometry: Radiometry | None = None
+    implausible: str = ""
+    """Tag with an implausible value that leaves out `radiometry`, or its factor to reflectance, in words."""
     panel: Panel | None = None
 
     @property
@@ -202,6 +226,7 @@ class Capture:
     capture_id: str = ""
     flight_id: str = ""
     captured_at: str = ""
+    """ISO 8601, with the offset from UTC if the tags or the camera's maker define it, else by the camera's clock."""
     position: Position | None = None
     pose: Pose | None = None
     motion: tuple[float, float] | None = None
@@ -250,8 +275,9 @@ class Capture:
 
     @property
     def time_s(self) -> float | None:
-        """Unix time of the capture, s, as `unix_time_s`; None if it is unknown."""
-        return unix_time_s(self.captured_at)
+        """Unix time of the capture, s, as `CaptureTime`; None if it is unknown."""
+        moment = CaptureTime.of(self.captured_at)
+        return None if moment is None else moment.utc.timestamp()
 
     @property
     def label(self) -> str:

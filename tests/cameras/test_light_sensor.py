@@ -7,7 +7,7 @@ from agalign.cameras.light_sensor import horizontal_irradiance, sun_position, tr
 from agalign.cameras.metadata import Tags, read_tags
 from agalign.cameras.micasense import MicaSense
 from agalign.pixels.raster import probe
-from agalign.values.capture import Position, unix_time_s
+from agalign.values.capture import CaptureTime, Position
 
 SCALE = "IrradianceScaleToSIUnits"
 DLS, NOON = "micasense.com/DLS", "2003-10-17T19:30:30"
@@ -16,7 +16,7 @@ GOLDEN = Position(39.742476, -105.1786, 1830.14)
 
 def test_position_of_the_sun_equals_the_example_of_nrel() -> None:
     """Reda & Andreas 2004 (NREL/TP-560-34302), appendix A.5: elevation 39.872046 degrees before refraction."""
-    elevation, azimuth = map(math.degrees, sun_position(GOLDEN, unix_time_s(NOON)))
+    elevation, azimuth = map(math.degrees, sun_position(GOLDEN, CaptureTime.of(NOON).utc.timestamp()))
     assert elevation == pytest.approx(39.872046, abs=0.01)
     assert azimuth == pytest.approx(194.340241, abs=0.01)
 
@@ -69,7 +69,7 @@ def irradiance(
 
 def test_irradiance_in_the_plane_of_the_sensor_is_corrected_for_its_tilt(flight: Path) -> None:
     path = next(flight.rglob("IMG_0001_1.tif"))
-    elevation, azimuth = sun_position(GOLDEN, unix_time_s(NOON))
+    elevation, azimuth = sun_position(GOLDEN, CaptureTime.of(NOON).utc.timestamp())
     for lean in (0.0, math.radians(19), math.radians(-19)):
         angle = math.pi / 2 - elevation - lean
         measured = (1.2 * math.cos(angle) + 0.2) * transmission(angle)
@@ -88,7 +88,7 @@ def test_a_horizontal_irradiance_that_contradicts_its_components_is_replaced(
     flight: Path, error: float, expected: float
 ) -> None:
     path = next(flight.rglob("IMG_0001_1.tif"))
-    elevation, _ = sun_position(GOLDEN, unix_time_s(NOON))
+    elevation, _ = sun_position(GOLDEN, CaptureTime.of(NOON).utc.timestamp())
     horizontal = 120.0 * math.sin(elevation) + 15.0
     tags = {"HorizontalIrradiance": horizontal * error, "DirectIrradiance": 120.0, "ScatteredIrradiance": 15.0}
     assert irradiance(path, tags) == pytest.approx(horizontal / 100 * expected)

@@ -1,13 +1,21 @@
 """Tags of files and values of XMP packets."""
 
+import shutil
+from dataclasses import replace
+from datetime import UTC, datetime
 from pathlib import Path
 
 import pytest
+from PIL.ExifTags import Base
 
+from agalign.cameras.dji import Dji
 from agalign.cameras.metadata import Tags, finite, read_tags
+from agalign.cameras.micasense import MicaSense
 from agalign.cameras.pix4d import NAMESPACE
+from agalign.cameras.tiff_directory import EXIF, GPS, add_directories, read_directories, text
 from agalign.cameras.xmp import Packet
 from agalign.errors import UnreadableFileError
+from agalign.values.capture import CaptureTime
 
 from .test_vendors import packet
 
@@ -134,3 +142,42 @@ def test_an_empty_packet_stays_empty() -> None:
     empty.take(Packet.parse(packet(OTHER, "elements")), [(NAMESPACE, "PrincipalPoint")])
     assert empty.serialised() == b""
     assert empty.values() == {}
+
+
+@pytest.mark.parametrize(
+    ("offsets", "expected"),
+    [
+        ({}, "2026-06-21T10:00:02.000000"),
+        ({Base.OffsetTimeOriginal: "+02:00"}, "2026-06-21T10:00:02.000000+02:00"),
+        ({Base.OffsetTime: "+02:00"}, "2026-06-21T10:00:02.000000"),  # of the time of another tag
+        ({Base.OffsetTimeOriginal: "   :  "}, "2026-06-21T10:00:02.000000"),
+        ({Base.OffsetTimeOriginal: "+99:00"}, "2026-06-21T10:00:02.000000"),
+    ],
+)
+def test_the_time_has_the_offset_of_its_own_tag(
+    flight: Path, tmp_path: Path, offsets: dict[int, str], expected: str
+) -> None:
+    path = Path(shutil.copy(flight / "0000SET" / "000" / "IMG_0002_4.tif", tmp_path))
+    directories = read_directories(path)
+    added = {tag: text(value) for tag, value in offsets.items()}
+    add_directories(path, {}, directories[EXIF] | added, directories[GPS])
+    assert read_tags(path).captured_at == expected
+
+
+def test_a_time_is_in_utc_or_by_the_clock_of_the_camera() -> None:
+    ten = datetime(2026, 6, 21, 10, tzinfo=UTC)
+    for moment in ("2026-06-21T12:00:00+02:00", "2026-06-21T10:00:00Z", "2026-06-21T10:00:00+00:00"):
+        assert CaptureTime.of(moment) == (ten, "camera")
+    assert CaptureTime.of("2026-06-21T10:00:00") == (ten, "clock of the camera (time zone unknown)")
+    for moment in ("", "21 June", "2026-13-01T00:00:00", "0001-01-01T00:00:00+05:00"):
+        assert CaptureTime.of(moment) is None
+
+
+def test_cameras_that_write_utc_have_it_in_their_captures() -> None:
+    by_clock = Tags(captured_at="2026-06-21T12:00:00")
+    assert MicaSense().captured_at(by_clock) == "2026-06-21T12:00:00+00:00"
+    assert MicaSense().captured_at(replace(by_clock, captured_at="2026-06-21T12:00:00+02:00"))[11:13] == "10"
+    assert MicaSense().captured_at(Tags()) == ""
+    assert Dji().captured_at(by_clock) == by_clock.captured_at
+    with_utc = replace(by_clock, xmp={("dji.com/drone-dji", "UTCAtExposure"): ("2026-06-21T10:00:00.5",)})
+    assert Dji().captured_at(with_utc) == "2026-06-21T10:00:00.500000+00:00"

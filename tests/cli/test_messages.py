@@ -68,7 +68,7 @@ GREEN = "(did you mean 'Green'?); choose from Blue, Green, Red, NIR, Red edge"
         (
             "align {flight} --dry-run --radiometry panel",
             2,
-            "--radiometry panel: no calibration panel of known reflectance",
+            "--radiometry panel: no usable calibration panel of known reflectance",
         ),
         (
             "align {flight} -o {tmp}/o --model nosuch",

@@ -16,6 +16,7 @@ from agalign.flight.panel_readings import (
 )
 from agalign.pixels.panel_detection import DetectedPanel
 from agalign.pixels.radiometry import with_radiometry
+from agalign.products.excluded_captures import write_panels
 from agalign.values.capture import Band, CameraIdentity, Capture, Panel, Pose, Position, Quantity, Radiometry
 
 AREA = ((20.0, 10.0), (39.0, 10.0), (39.0, 29.0), (20.0, 29.0))
@@ -59,6 +60,56 @@ def test_a_panel_that_cannot_be_measured_has_no_factor(tmp_path: Path, level: in
     assert result.factor is None
 
 
+def panel_in_light(path: Path, light: str) -> Band:
+    """A panel of 80 x 80 px with the noise of a camera, in this light."""
+    rng = np.random.default_rng(1)
+    square = rng.normal(1.0, 0.03, (80, 80))
+    if light.startswith("shadow"):
+        square[:, : int(light.split()[2]) * 80 // 100] *= 0.5
+    elif light == "noise":
+        square = rng.uniform(0.0, 2.0, (80, 80))
+    elif light == "half black":
+        square[:40] = 0.0
+    pixels = np.full((120, 160), 2000, np.uint16)
+    pixels[20:100, 40:120] = np.clip(1000 + 20000 * square, 0, 65000)
+    tifffile.imwrite(path, pixels)
+    area = ((40.0, 20.0), (119.0, 20.0), (119.0, 99.0), (40.0, 99.0))
+    return replace(
+        panel_file(path.with_name("b.tif")),
+        path=path,
+        panel=Panel("tags", "RP04", 0.4, area),
+        width_px=160,
+        height_px=120,
+    )
+
+
+@pytest.mark.parametrize(
+    ("light", "is_measured"),
+    [
+        ("even", True),
+        ("shadow of 30 %", True),
+        ("shadow of 50 %", False),
+        ("shadow of 70 %", False),
+        ("noise", False),
+        ("half black", False),
+    ],
+)
+def test_a_panel_is_measured_where_it_is_evenly_lit(tmp_path: Path, light: str, is_measured: bool) -> None:
+    """A shadow over 30 % of the panel, by half, would make every band 16 % too bright."""
+    (result,) = read_panel(capture(panel_in_light(tmp_path / "a.tif", light)), {}).bands
+    if is_measured:
+        assert (result.problem, result.radiance) == ("", pytest.approx(2.0 * 20000 / 65536, rel=0.03))
+    else:
+        assert "its pixels vary by" in result.problem or result.problem == "it is black"
+        assert result.factor is None
+
+
+def test_a_refused_panel_is_named_with_the_reason(tmp_path: Path) -> None:
+    reading = read_panel(capture(panel_in_light(tmp_path / "a.tif", "noise")), {})
+    (part,) = write_panels([reading], tmp_path)
+    assert "not used in Green: its pixels vary by " in part.sentence
+
+
 def test_illumination_is_interpolated_in_time_and_constant_outside() -> None:
     panels = [reading("2026-06-21T10:00:00", 2.0), reading("2026-06-21T11:00:00", 4.0)]
     for hour, factor, age_s in (("09:00", 2.0, 3600), ("10:30", 1 / 0.375, 1800), ("12:00", 4.0, 3600)):
@@ -96,7 +147,7 @@ def test_the_panel_scales_the_light_sensor_which_follows_the_light() -> None:
 def test_a_light_sensor_that_was_shaded_at_the_panel_is_not_combined_with_it() -> None:
     later = capture(lit(1.2), "2026-06-21T10:30:00")
     shaded, good = lit_panel("2026-06-21T10:00:00", 1.0, 0.6), lit_panel("2026-06-21T11:00:00", 1.0, 1.0)
-    assert shaded.sensor_scale == pytest.approx(1 / 0.6)
+    assert shaded.sensor_scales == {"Green": pytest.approx(1 / 0.6)}
     assert [r.fits_sensor for r in (shaded, good)] == [False, True]
     for panels in ([shaded], [shaded, good]):
         factors = reflectance_factors(later, panels)
@@ -105,9 +156,22 @@ def test_a_light_sensor_that_was_shaded_at_the_panel_is_not_combined_with_it() -
         assert sources == ["light sensor", "panel", "light sensor"]
     # A sensor with an unknown unit has any scale.
     relative = lit_panel("2026-06-21T10:00:00", 1.0, 3000.0, "relative reflectance")
-    assert (relative.sensor_scale, relative.fits_sensor) == (None, True)
+    assert (relative.sensor_scales, relative.fits_sensor) == ({}, True)
     in_same_unit = capture(lit(3300.0, "relative reflectance"), "2026-06-21T10:30:00")
     assert reflectance_factors(in_same_unit, [relative])["Green"].value == pytest.approx(np.pi / 1.1)
+
+
+def test_a_panel_that_differs_from_the_light_sensor_in_one_band_is_not_combined_with_it(tmp_path: Path) -> None:
+    """On a RedEdge-M with a DLS 1, the largest scale of a band is 1.18 times the smallest."""
+    later = capture(lit(1.2), "2026-06-21T10:30:00")
+    for nir, fits in ((1.18, True), (1.4, False)):
+        bands = [replace(lit(1.0), name=name) for name in ("Green", "Red", "NIR")]
+        scales = zip(bands, (1.0, 1.0, nir), strict=True)
+        readings = tuple(BandReading(band, 0.5, 0.5 * scale / np.pi) for band, scale in scales)
+        reading = PanelReading(replace(later, bands=tuple(bands)), readings)
+        assert reading.fits_sensor == fits
+        (factor,) = reflectance_factors(later, [reading]).values()
+        assert factor.source == ("panel and light sensor" if fits else "panel")
 
 
 def test_a_panel_on_the_ground_gives_the_height_of_other_captures() -> None:

@@ -1,20 +1,29 @@
 import math
+import re
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+import rasterio
+import tifffile
 
+import agalign
 from agalign.cameras.metadata import Tags, read_tags
 from agalign.cameras.micasense import MicaSense
+from agalign.cameras.tiff_directory import EXIF, GPS, XMP, add_directories, byte_string, read_directories, short
 from agalign.config import WriteSettings
-from agalign.pixels.radiometry import calibrated, is_physical, with_radiometry
+from agalign.errors import InputError
+from agalign.pixels.radiometry import calibrated, check_pixels, plausible, with_radiometry
 from agalign.pixels.raster import probe
 from agalign.synthetic import camera_model, cameras
 from agalign.synthetic import flight as synthetic
 from agalign.synthetic.ground import paint_ground
-from agalign.values.capture import Band, Capture, PanelFactor, Radiometry
+from agalign.values.capture import Band, Capture, PanelFactor, Quantity, Radiometry
 from agalign.values.choices import RadiometryChoice
+
+from ..conftest import seeded
 
 
 def test_every_term_of_the_calibration_is_applied() -> None:
@@ -128,22 +137,124 @@ def test_thermal_bands_are_not_converted() -> None:
     assert calibrated(np.full((2, 2), 30115, np.uint16), kelvin, 0, 0) == pytest.approx(28.0)
 
 
+GOOD = Radiometry(
+    "radiance",
+    4800.0,
+    65536.0,
+    0.02,
+    (640.0, 480.0),
+    (1e-5, -2e-7),
+    by_sun=(math.pi, "reflectance"),
+    tags={"exposure time (s)": 0.001, "sensor gain": 1.0, "calibration coefficient": 1.5e-4},
+)
+
+
 @pytest.mark.parametrize(
-    "change",
+    ("change", "named"),
     [
-        {"gain": 1e300},
-        {"gain": -1.0},
-        {"gain": math.nan},
-        {"full_scale": 0.0},
-        {"black_level": math.inf},
-        {"by_sun": (-5.0, "reflectance")},
-        {"vignetting": (10.0,)},
-        {"vignetting": (1e300,)},
-        {"vignetting_centre_px": (math.nan, 0.0)},
-        {"row_gradient": -0.01},
+        ({"tags": {"calibration coefficient": 1e300}}, "calibration coefficient of 1e+300"),
+        ({"tags": {"exposure time (s)": 1.44}}, "exposure time (s) of 1.44"),  # of 1.44 ms
+        ({"tags": {"exposure time (s)": math.nan}}, "exposure time (s) of nan"),
+        ({"tags": {"sensor gain": -1.0}}, "sensor gain of -1"),
+        ({"tags": {"gain adjustment": 1e-3}}, "gain adjustment"),
+        ({"black_level": math.inf}, "black level of inf"),
+        ({"black_level": 30000.0}, "black level of 30000"),
+        ({"black_level": -1.0}, "black level of -1"),
+        ({"vignetting": (10.0,)}, "vignetting"),
+        ({"vignetting": (1e300,)}, "vignetting"),
+        ({"vignetting_centre_px": (math.nan, 0.0)}, "vignetting"),
+        ({"row_gradient": -0.01}, "row gradient of -8.6"),
     ],
 )
-def test_implausible_calibrations_are_rejected(change: dict[str, object]) -> None:
-    good = Radiometry("radiance", 4800.0, 65536.0, 0.02, (640.0, 480.0), (1e-5, -2e-7))
-    assert is_physical(good, (1280, 960))
-    assert not is_physical(replace(good, **change), (1280, 960))
+def test_a_calibration_with_an_implausible_tag_is_not_used(change: dict[str, object], named: str) -> None:
+    assert plausible(GOOD, (1280, 960)) == (GOOD, "")
+    result, problem = plausible(replace(GOOD, **change), (1280, 960))
+    assert result is None
+    assert problem.startswith(f"the {named}")
+
+
+@pytest.mark.parametrize(
+    ("irradiance", "quantity", "is_plausible"),
+    [
+        (0.02, "reflectance", True),
+        (1.9, "reflectance", True),
+        (1e-3, "reflectance", False),
+        (1e4, "reflectance", False),
+        (-5.0, "reflectance", False),
+        (500.0, "relative reflectance", True),
+        (1e-3, "relative reflectance", False),
+        (1e7, "relative reflectance", False),
+    ],
+)
+def test_an_implausible_irradiance_leaves_radiance(irradiance: float, quantity: Quantity, is_plausible: bool) -> None:
+    scale = math.pi if quantity == "reflectance" else 1.0
+    radiometry = replace(GOOD, by_sun=(scale / irradiance, quantity))
+    result, problem = plausible(radiometry, (1280, 960))
+    assert result == (radiometry if is_plausible else replace(radiometry, by_sun=None))
+    assert ("irradiance" in problem) == (not is_plausible)
+
+
+@pytest.mark.parametrize(
+    ("scene", "raw", "black", "gain", "message"),
+    [
+        ("crop", 20000, 4800.0, 1.0, None),
+        ("water in the near infrared", 4700, 4800.0, 1.0, None),
+        ("snow", 60000, 4800.0, 1.3, None),
+        ("a black level above the pixels", 9000, 16000.0, 1.0, "black level of 16000 is above its pixels"),
+        ("a shaded light sensor", 30000, 4800.0, 8.0, "median reflectance of 3.0"),
+    ],
+)
+def test_pixels_that_do_not_fit_the_calibration_are_refused(
+    tmp_path: Path, scene: str, raw: int, black: float, gain: float, message: str | None
+) -> None:
+    path = tmp_path / f"{scene}.tif"
+    tifffile.imwrite(path, (raw + np.random.default_rng(0).integers(-50, 50, (60, 80))).astype(np.uint16))
+    (stored,) = probe(path)
+    band = replace(stored, radiometry=Radiometry("reflectance", black, 65536.0, gain))
+    if message is None:
+        check_pixels(band)
+    else:
+        with pytest.raises(InputError, match=message):
+            check_pixels(band)
+
+
+def edited(flight: Path, folder: Path, tag: str) -> Path:
+    """A copy of a flight in which a band of the second capture has a damaged tag."""
+    shutil.copytree(flight, folder)
+    path = folder / "0000SET" / "000" / "IMG_0002_4.tif"
+    directories = read_directories(path)
+    first = {50714: short(16000)} if tag == "black level" else {}
+    if tag == "black level":
+        with rasterio.open(path, "r+") as file:
+            file.write(file.read() // 2)
+    else:
+        packet = re.sub(rb"(?<=<DLS:HorizontalIrradiance>)[^<]+", b"0.001", directories[0][XMP].data)
+        first = {XMP: byte_string(packet)}
+    add_directories(path, first, directories[EXIF], directories[GPS])
+    return folder
+
+
+@pytest.mark.parametrize(
+    ("tag", "choice", "states", "text"),
+    [
+        (
+            "irradiance",
+            "sun",
+            ["done", "error"],
+            r"light sensor in NIR \(the irradiance .* of 1e-05 is not within 0.005",
+        ),
+        ("irradiance", "auto", ["done", "done"], "not written as reflectance: NIR: the irradiance .* of 1e-05"),
+        ("black level", "auto", ["done", "error"], "IMG_0002_4.tif: its black level of 16000 is above its pixels"),
+    ],
+)
+def test_a_capture_with_an_implausible_tag_is_not_written_as_reflectance(
+    flight: Path, tmp_path: Path, tag: str, choice: RadiometryChoice, states: list[str], text: str
+) -> None:
+    folder = edited(flight, tmp_path / "in", tag)
+    reports = agalign.align_folder(folder, tmp_path / "out", settings=seeded(radiometry=choice))
+    assert [r.state for r in reports] == states
+    assert reports[0].problems == ()
+    (problem,) = reports[1].problems
+    assert re.search(text, problem)
+    written = [r.result.output.radiometry for r in reports if r.result]
+    assert written == ["reflectance by light sensor", "radiance by camera calibration"][: len(written)]

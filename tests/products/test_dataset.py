@@ -1,3 +1,6 @@
+import json
+import re
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -37,6 +40,7 @@ def test_a_flight_is_read_when_it_is_asked_for(run: Path) -> None:
     assert flight.NIR.chunks is not None  # dask's: nothing was read
     assert list(flight.capture.values) == ["0000SET/000/IMG_0001", "0000SET/000/IMG_0002"]
     assert str(flight.time.values[1]).startswith("2026-06-21T10:00:02")
+    assert flight.time.attrs == {"source": "camera"}
     assert flight.latitude.values[0] == pytest.approx(52.0)
     one = agalign.open_capture(run / "0000SET" / "000" / "IMG_0002.json")
     np.testing.assert_array_equal(flight.Red.isel(capture=1).values, one.Red.values)
@@ -47,6 +51,17 @@ def test_a_flight_is_read_when_it_is_asked_for(run: Path) -> None:
     assert "status" not in flight.NIR.attrs
     # (0, 0) is the centre of the top-left pixel in both.
     assert (float(one.x[0]), float(flight.x[0])) == (0.0, 0.0)
+
+
+def test_times_of_a_flight_are_in_utc_or_by_the_clock_of_the_camera(run: Path, tmp_path: Path) -> None:
+    out = Path(shutil.copytree(run, tmp_path / "out"))
+    moments = "2026-06-21T12:00:00+02:00", "2026-06-21T05:00:00-05:00"
+    for path, moment in zip(sorted((out / "0000SET" / "000").glob("IMG_*.json")), moments, strict=False):
+        path.write_text(json.dumps(json.loads(path.read_text()) | {"captured_at": moment}))
+    flight = agalign.open_flight(out)
+    assert [str(t)[:19] for t in flight.time.values] == ["2026-06-21T10:00:00"] * 2
+    path.write_text(json.dumps(json.loads(path.read_text()) | {"captured_at": "2026-06-21T10:00:00"}))
+    assert agalign.open_flight(out).time.attrs == {"source": "camera, clock of the camera (time zone unknown)"}
 
 
 def test_a_place_on_the_map_and_masked_pixels_follow(tmp_path: Path) -> None:

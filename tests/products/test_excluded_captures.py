@@ -176,4 +176,10 @@ def test_a_panel_in_other_light_than_the_sensor_is_described() -> None:
     }
     texts = [PanelPart(**facts, bands=[], sensor_scale=1.45, fits_sensor=fits).sentence for fits in (True, False)]
     assert texts[0].endswith("irradiance 1.45 times that of the light sensor")
-    assert texts[1].endswith("in other light: --radiometry auto uses the sensor alone, panel the panels alone")
+    values = {"file": "a", "area_px": [], "albedo": None, "radiance": None, "reflectance_per_radiance": None}
+    bands = [
+        {"band": name, "problem": None, "sensor_scale": scale} | values for name, scale in (("A", 1.6), ("B", 1.0))
+    ]
+    by_band = PanelPart(**facts, bands=bands, sensor_scale=1.3, fits_sensor=False).sentence
+    assert "irradiance 1.30 times that of the light sensor (1.00 in B to 1.60 in A), which was" in by_band
+    assert texts[1].endswith("wrong in a band: --radiometry auto uses the sensor alone, panel the panels alone")

@@ -84,7 +84,8 @@ def test_a_wrong_field_is_seen_by_the_schemas(run: Path) -> None:
 
 def test_assets_describe_their_bands(run: Path) -> None:
     item = pystac.Item.from_file(str(run / "0000SET" / "000" / "IMG_0002.stac.json"))
-    assert item.datetime.isoformat().startswith("2026-06-21T10:00:02")
+    assert item.datetime.isoformat() == "2026-06-21T10:00:02+00:00"
+    assert item.properties["agalign:datetime_source"] == "camera"
     stack = item.assets["stack"]
     assert stack.media_type == pystac.MediaType.COG
     raster, eo = RasterExtension.ext(stack).bands, EOExtension.ext(stack).bands

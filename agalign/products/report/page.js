@@ -102,9 +102,10 @@ function worst(capture, what) {
   return known.length ? Math.max(...known) : null;
 }
 
-/** @param {string} captured_at Cameras count from 1970 until their clock is set. */
+/** @param {string} captured_at Cameras count from 1970 until their clock is set; without an offset, it is that clock. */
 function taken(captured_at) {
-  return captured_at < "1971" ? "unknown time" : captured_at.slice(0, 19).replace("T", " ");
+  const zone = captured_at.slice(19).replace(/^\.\d+/, "").replace("+00:00", "UTC");
+  return captured_at < "1971" ? "unknown time" : `${captured_at.slice(0, 19).replace("T", " ")} ${zone}`.trim();
 }
 
 /** @param {Capture} capture */
