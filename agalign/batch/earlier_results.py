@@ -3,6 +3,7 @@
 import stat
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
+from datetime import timedelta
 from itertools import chain
 from pathlib import Path
 
@@ -13,9 +14,9 @@ from agalign.flight.fingerprint import fingerprint, input_samples
 from agalign.products.product import CapturePaths
 from agalign.products.sidecar import CaptureResult
 from agalign.products.sidecar_file import read_result
-from agalign.values.capture import Capture, unix_time_s
+from agalign.values.capture import Capture, CaptureTime
 
-_MAX_APART_S = 1.0
+_MAX_APART = timedelta(seconds=1)
 """The bands of a capture are exposed within 0.3 s, and its time is that of the reference, which an option chooses."""
 
 
@@ -31,8 +32,8 @@ def is_same(earlier: CaptureResult, capture: Capture) -> bool | None:
     if any(a and b and a != b for a, b in pairs) or (all(serials) and not serials[0] & serials[1]):
         return False
     if earlier.captured_at and capture.captured_at and earlier.captured_at != capture.captured_at:
-        times_s = unix_time_s(earlier.captured_at), capture.time_s
-        return None not in times_s and abs(times_s[0] - times_s[1]) <= _MAX_APART_S  # type: ignore[operator]
+        before, now = CaptureTime.of(earlier.captured_at), CaptureTime.of(capture.captured_at)
+        return before is not None and now is not None and abs(before.utc - now.utc) <= _MAX_APART
     if (earlier.capture_id and capture.capture_id) or (earlier.captured_at and capture.captured_at):
         return True
     if not earlier.input_samples:
