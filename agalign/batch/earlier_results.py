@@ -24,7 +24,7 @@ def is_same(earlier: CaptureResult, capture: Capture) -> bool | None:
     """Return whether a result is of this capture; None if neither tags nor contents decide.
 
     Tags that both have are compared: make, model, serial numbers, capture id, time. If there is no id and no time, the
-    contents of the files are compared, without those of failed bands, which may have been repaired.
+    contents of a file must be equal; others may have been repaired.
     """
     one, other = earlier.camera, capture.camera
     serials = [set(camera.serial.split("+")) - {""} for camera in (one, other)]
@@ -38,9 +38,7 @@ def is_same(earlier: CaptureResult, capture: Capture) -> bool | None:
         return True
     if not earlier.input_samples:
         return None
-    failed, samples = {b.band for b in earlier.bands if b.status == "failed"}, input_samples(capture)
-    both = (earlier.input_samples.keys() & samples.keys()) - failed
-    return bool(both) and all(earlier.input_samples[band] == samples[band] for band in both)
+    return bool(earlier.input_samples.items() & input_samples(capture).items())
 
 
 def refuse_other_captures(captures: Sequence[Capture], out: Path) -> None:

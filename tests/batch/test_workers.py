@@ -59,7 +59,7 @@ def is_worker(process: psutil.Process) -> bool:
 
 def without_seconds(result: CaptureResult) -> CaptureResult:
     bands = [b.model_copy(update={"seconds": 0.0}) for b in result.bands]
-    return result.model_copy(update={"bands": bands, "checksum": None, "settings": ""})
+    return result.model_copy(update={"bands": bands, "seconds": 0.0, "checksum": None, "settings": ""})
 
 
 def test_a_scheduler_that_does_not_answer(monkeypatch: pytest.MonkeyPatch) -> None:

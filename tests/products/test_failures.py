@@ -40,7 +40,9 @@ def test_bands_are_grouped_by_cause_and_status_most_severe_first() -> None:
 
 def with_reference(name: str, missing: tuple[str, ...] = (), flight_id: str = "") -> CaptureResult:
     reference = {"band": name, "file": "x.tif", "band_index": 1, "width": 10, "height": 8}
-    return capture((name, "reference", None), missing=missing, reference=reference, flight_id=flight_id)
+    bands = [(name, "reference", None)]
+    bands += [(b, "aligned", None) for b in ("Blue", "Green") if b != name and b not in missing]
+    return capture(*bands, missing=missing, reference=reference, flight_id=flight_id)
 
 
 @pytest.mark.parametrize(
