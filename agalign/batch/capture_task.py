@@ -17,6 +17,7 @@ from agalign.errors import AgalignError, ConfigurationError, InputError, OutputE
 from agalign.flight.model import FlightModel, load_model
 from agalign.method.device import choose_device, keep_freed_memory, one_memory_error, one_thread
 from agalign.pixels.radiometry import check_pixels
+from agalign.pixels.raster import with_saturation_values
 from agalign.products.aligned_files import band_file_names
 from agalign.products.fill_sidecar import sidecar_of
 from agalign.products.index_rasters import outdated_rasters
@@ -55,7 +56,7 @@ def process_capture(
     Raises UnreadableFileError if the reference cannot be read, InputError or ConfigurationError if the capture or the
     installation lacks what a product needs, and OutputError.
     """
-    began_s, paths = time.perf_counter(), CapturePaths.of(capture, out)
+    began_s, paths, capture = time.perf_counter(), CapturePaths.of(capture, out), with_saturation_values(capture)
     refuse_to_overwrite([capture], out, settings.write)
     if missing := missing_radiometry(capture, settings.write.radiometry):
         raise InputError(f"{capture.reference.path}: {missing}")

@@ -23,6 +23,7 @@ from agalign.method.fast import DEFAULT_SCHEDULE
 from agalign.method.joint import Results, refine_with
 from agalign.method.refine import FLIGHT_PATCHES
 from agalign.method.state import ImageGroup, JointState
+from agalign.pixels.raster import with_saturation_values
 from agalign.values.alignment import MIN_RETRIEVAL, Alignment, JointResult, RefinedPair, Residual, Seed
 from agalign.values.capture import Capture
 from agalign.values.geometry import Matrix
@@ -165,7 +166,7 @@ def load_capture(
     Bands have their index in `bands` as index in the network. Seeds of kind `match` use the network of `start`.
     """
     with logged_failure(f"{capture.label} cannot be learned from"):
-        pairs = [p for p in read_pairs(capture, settings.seed)[0] if p.has_rig_pixels]
+        pairs = [p for p in read_pairs(with_saturation_values(capture), settings.seed)[0] if p.has_rig_pixels]
         seeds_of = [(p, known[p.name].seed if p.name in known else find_seed(p, settings.seed, start)) for p in pairs]
         result = [(p, seed) for p, seed in seeds_of if isinstance(seed, Seed)]
         if result:
@@ -221,7 +222,7 @@ def observe_rig(
     capture, bands = argument
     with logged_failure(f"{capture.label} does not determine the rig"):
         model = _on_device(model, settings)
-        pairs, _ = read_pairs(capture, settings.seed, model)
+        pairs, _ = read_pairs(with_saturation_values(capture), settings.seed, model)
         pairs = [p for p in pairs if p.has_rig_pixels and (bands is None or p.name in bands)]
         aligner = PairAligner(settings, model, quiet, is_observation=True)
         return _observation(pairs, aligner.align(pairs, None, scratch=False), aligner.refined, capture)
@@ -236,7 +237,7 @@ def try_model(model: FlightModel, settings: Settings, capture: Capture) -> tuple
     model = _on_device(model, settings)
     assert model.rig is not None
     with logged_failure(f"{capture.label} is not aligned by the model"):
-        pairs, _ = read_pairs(capture, settings.seed, model)
+        pairs, _ = read_pairs(with_saturation_values(capture), settings.seed, model)
         aligner = PairAligner(settings, model, quiet, is_observation=True)
         result = aligner.align(pairs, None, scratch=False)
         checked = with_predictions(pairs, result, model.rig, capture)

@@ -6,6 +6,7 @@ import stat
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -23,7 +24,7 @@ from rasterio.windows import Window
 from agalign.errors import GeometryError, UnreadableFileError
 from agalign.pixels.masks import data_mask, learnable, undeclared_fill
 from agalign.values import lens
-from agalign.values.capture import Band, Georeference
+from agalign.values.capture import Band, Capture, Georeference
 from agalign.values.choices import MAX_PIXELS
 from agalign.values.image import Mask, Raster, Tile, reduced_size_px
 from agalign.values.pixel_units import PixelScale
@@ -44,6 +45,8 @@ with suppress(AttributeError, OSError):  # builds of GDAL with a libtiff of thei
     # libtiff prints failed reads and writes of files to standard error, past GDAL's and rasterio's handlers. The caller
     # gets an exception or an incomplete file.
     ctypes.CDLL(crs.__file__).TIFFSetErrorHandler(None)
+_MAXIMA = {"uint8": 255.0, "uint16": 65535.0, "int16": 32767.0}
+"""Of the types that sensors deliver."""
 _MAX_BANDS = 512
 """More than any imager has; a damaged file may declare 65,535."""
 
@@ -198,7 +201,7 @@ def _bands(path: Path, dataset: rasterio.DatasetReader, max_pixels: int) -> tupl
             nodata=dataset.nodatavals[i - 1],
             has_mask=has_mask,
             wavelength_nm=_wavelength_nm(dataset.tags(i)),
-            saturation_value={"uint8": 255.0, "uint16": 65535.0, "int16": 32767.0}.get(dataset.dtypes[i - 1]),
+            saturation_value=_full_scale(dataset, i),
             georeference=georeference,
             scale_offset=(dataset.scales[i - 1], dataset.offsets[i - 1]),
             overviews=overviews,
@@ -206,6 +209,41 @@ def _bands(path: Path, dataset: rasterio.DatasetReader, max_pixels: int) -> tupl
         for i in dataset.indexes
         if i != alpha
     )
+
+
+def _full_scale(dataset: rasterio.DatasetReader, index: int) -> float | None:
+    """Return the largest number with the bits of a band, 12 in 16 for example; None for types of no sensor."""
+    bits = dataset.tags(index, ns="IMAGE_STRUCTURE").get("NBITS", "")
+    maximum = _MAXIMA.get(dataset.dtypes[index - 1])
+    return 2.0 ** int(bits) - 1 if maximum and bits.isdecimal() else maximum
+
+
+def with_saturation_values(capture: Capture) -> Capture:
+    """Return the capture with the saturation values that the pixels show: many cameras store 10 or 12 bits in 16.
+
+    Bands with a saturation value by their tags or 8 bits, and those that cannot be read, are unchanged.
+    """
+    return replace(capture, bands=tuple(map(_with_saturation_value, capture.bands)))
+
+
+def _with_saturation_value(band: Band) -> Band:
+    if band.saturation_value not in (_MAXIMA["uint16"], _MAXIMA["int16"]):
+        return band
+    side_px = 2048  # of the middle of the image, which limits the memory
+    width, height = (min(side_px, n) for n in band.size_px)
+    try:
+        tile = Tile((band.width_px - width) // 2, (band.height_px - height) // 2, width, height)
+        pixels, valid = read_tile(band, tile)
+    except UnreadableFileError:
+        return band
+    values = pixels[valid]
+    top = values.max(initial=0)
+    at_top = np.count_nonzero(values == top)
+    _, below = np.unique(values[(values > 0.9 * top) & (values < top)], return_counts=True)
+    # Bright objects have many values; those of a saturated sensor are equal.
+    min_share, min_ratio = 0.002, 10
+    is_saturated = top > 0 and at_top >= max(min_share * values.size, min_ratio * (below.mean() if below.size else 0))
+    return replace(band, saturation_value=float(top)) if is_saturated and at_top < values.size else band
 
 
 def read_for_alignment(band: Band, longest_side_px: int) -> Raster:
