@@ -38,12 +38,15 @@ class Generic(Camera):
     def bands(self, path: Path, tags: Tags, stored: Sequence[Band]) -> tuple[Band, ...]:
         if suffix_format(path) in ("JPEG", "PNG"):
             return self._picture_bands(path, stored)
-        own_name = tags.text(NAMESPACE, "BandName") or self.split(path)[1]
-        file_wavelength_nm = tags.number(NAMESPACE, "CentralWavelength") or _wavelength_in(own_name)
+        # Lists in tags have one item for each channel.
+        names, wavelengths_nm = tags.xmp.get((NAMESPACE, "BandName"), ()), tags.numbers(NAMESPACE, "CentralWavelength")
+        of_file = self.split(path)[1] if len(stored) == 1 else ""
         result = []
-        for band in stored:
-            name = band.name or (own_name if len(stored) == 1 else "") or f"band_{band.band_index}"
-            result.append(replace(band, name=name, wavelength_nm=band.wavelength_nm or file_wavelength_nm))
+        for k, band in enumerate(stored):
+            in_tags = names[k] if len(names) == len(stored) else ""
+            name = band.name or in_tags or of_file or f"band_{band.band_index}"
+            listed_nm = wavelengths_nm[k] if len(wavelengths_nm) == len(stored) else _wavelength_in(name)
+            result.append(replace(band, name=name, wavelength_nm=band.wavelength_nm or listed_nm))
         return tuple(result)
 
     def _picture_bands(self, path: Path, stored: Sequence[Band]) -> tuple[Band, ...]:

@@ -4,7 +4,7 @@ import ctypes
 import math
 import stat
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
@@ -161,8 +161,10 @@ def _driver_of(path: Path) -> str:
 
 
 def probe(path: Path, max_pixels: int = MAX_PIXELS) -> tuple[Band, ...]:
-    """Read the metadata of a raster file: its bands, without an alpha band, with the names in the file or empty ones.
+    """Read the metadata of a raster file: its bands, without an alpha band.
 
+    They have the names in the file, else those of red, green and blue channels, else empty ones. Equal channels of a
+    TIFF are one band.
     Raises UnreadableFileError, also for more than `max_pixels` per band.
     """
     try:
@@ -186,13 +188,21 @@ def _bands(path: Path, dataset: rasterio.DatasetReader, max_pixels: int) -> tupl
         raise UnreadableFileError(f"{path}: declares {count} bands; at most {_MAX_BANDS} can take part")
     if not all(np.dtype(t).kind in "uif" for t in dataset.dtypes):
         raise UnreadableFileError(f"{path}: holds {dataset.dtypes[0]} pixels; bands must be integers or floats")
+    if dataset.tags(ns="IMAGE_STRUCTURE").get("MINISWHITE") == "YES":
+        remedy = "export it with 0 as black (photometric interpretation MinIsBlack)"
+        raise UnreadableFileError(f"{path}: is stored inverted (photometric interpretation MinIsWhite); {remedy}")
     has_alpha = count > 1 and ColorInterp.alpha in dataset.colorinterp
     alpha = dataset.colorinterp.index(ColorInterp.alpha) + 1 if has_alpha else None
+    indices = [i for i in dataset.indexes if i != alpha]
+    colours = [dataset.colorinterp[i - 1].name.capitalize() for i in indices]
+    is_colour = sorted(colours) == ["Blue", "Green", "Red"]
+    if is_colour and suffix_format(path) == "TIFF" and _is_grey(dataset, indices):
+        indices, is_colour = indices[:1], False
     has_mask = MaskFlags.per_dataset in dataset.mask_flag_enums[0]
     georeference, overviews = _georeference(dataset), tuple(dataset.overviews(1))
     return tuple(
         Band(
-            name=dataset.descriptions[i - 1] or "",
+            name=dataset.descriptions[i - 1] or (colour if is_colour else ""),
             path=path,
             band_index=i,
             width_px=width,
@@ -206,9 +216,17 @@ def _bands(path: Path, dataset: rasterio.DatasetReader, max_pixels: int) -> tupl
             scale_offset=(dataset.scales[i - 1], dataset.offsets[i - 1]),
             overviews=overviews,
         )
-        for i in dataset.indexes
-        if i != alpha
+        for i, colour in zip(indices, colours, strict=False)
     )
+
+
+def _is_grey(dataset: rasterio.DatasetReader, indices: Sequence[int]) -> bool:
+    """Return True if all channels of an image are equal in some rows, and these are not constant."""
+    rows = [
+        dataset.read(indices, window=Window(0, (k * dataset.height) // 6, min(dataset.width, 2048), 1))
+        for k in range(1, 6)
+    ]
+    return all((row == row[0]).all() for row in rows) and max(np.ptp(row[0]) for row in rows) > 0
 
 
 def _full_scale(dataset: rasterio.DatasetReader, index: int) -> float | None:
