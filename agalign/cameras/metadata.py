@@ -76,15 +76,15 @@ def finite(value: Any) -> float | None:
     return float(value) if isinstance(value, (int, float)) and math.isfinite(value) else None
 
 
-def read_tags(path: Path) -> Tags:
-    """Return the tags of the first page of a TIFF or of a JPEG; empty for a PNG.
+def read_tags(path: Path, page: int = 0) -> Tags:
+    """Return the tags of a page of a TIFF, by default the first, or of a JPEG; empty for a PNG.
 
     Raises UnreadableFileError if the file is not of the format of its suffix or is truncated.
     """
     if suffix_format(path) == "PNG":
         return Tags()
     try:
-        directories = read_directories(path)
+        directories = read_directories(path, page)
     except Exception as error:  # damaged files cause struct.error, KeyError, MemoryError … in the libraries
         kind = suffix_format(path) or "TIFF"
         raise UnreadableFileError(

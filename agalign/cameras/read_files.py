@@ -2,6 +2,7 @@
 
 import re
 from collections.abc import Iterable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from multiprocessing import get_context
@@ -11,6 +12,7 @@ from agalign.cameras import known_cameras
 from agalign.cameras.base import Camera
 from agalign.cameras.metadata import Tags, read_tags
 from agalign.cameras.pix4d import panel_in
+from agalign.cameras.tiff_directory import image_pages
 from agalign.config import DiscoverOptions
 from agalign.errors import AgalignError, UnreadableFileError
 from agalign.pixels.radiometry import plausible
@@ -70,18 +72,40 @@ def read_files(paths: Sequence[Path], options: DiscoverOptions) -> Iterator[Imag
 
 def read_file(path: Path, cameras: Iterable[Camera], options: DiscoverOptions) -> ImageFile:
     """Return a file with its bands. Raises UnreadableFileError."""
-    stored = probe(path, options.max_pixels)
-    tags = read_tags(path)
+    pages = _stored_pages(path, options.max_pixels)
+    stored = pages[0]
+    tags = read_tags(path, stored[0].page)
     # A stack was made by software, even if its tags name a camera: cameras write single bands and photographs.
     *_, generic = cameras
     camera = generic if _is_stack(stored) else next(c for c in cameras if c.recognises(tags))
     panel = panel_in(tags, stored[0].size_px)
-    bands = [replace(b, panel=panel) for b in camera.bands(path, tags, stored) if options.with_rgb or not b.companion]
+    named = list(camera.bands(path, tags, stored))
+    for page in pages[1:]:
+        named += camera.bands(path, read_tags(path, page[0].page), page)
+    if len(pages) > 1 and len({b.name for b in named}) < len(pages):
+        what = f"has {len(pages)} pages of one size without names of bands"
+        raise UnreadableFileError(f"{path}: {what}; write each page to a file of its own (tiffsplit)")
+    if len(pages) > 1:
+        named = [replace(band, band_index=band.page) for band in named]
+    bands = [replace(b, panel=panel) for b in named if options.with_rgb or not b.companion]
     for i, band in enumerate(bands):
         if band.radiometry is not None:
             radiometry, implausible = plausible(band.radiometry, band.size_px)
             bands[i] = replace(band, radiometry=radiometry, implausible=implausible)
     return ImageFile(path, camera, tags, tuple(bands))
+
+
+def _stored_pages(path: Path, max_pixels: int) -> list[tuple[Band, ...]]:
+    """Return the bands of each page with an image of full size; most files have one. Raises UnreadableFileError."""
+    numbers = [1]
+    if suffix_format(path) == "TIFF":
+        with suppress(ValueError, OSError):  # GDAL says what is wrong with the file
+            numbers = image_pages(path) or numbers
+    if numbers == [1]:
+        return [probe(path, max_pixels)]
+    pages = [probe(path, max_pixels, number) for number in numbers]
+    largest_px = max(page[0].size_px for page in pages)
+    return [page for page in pages if page[0].size_px == largest_px]
 
 
 def _read_in_processes(

@@ -5,7 +5,6 @@ input file, with the lens and rig of the reference instead of the band's own.
 from collections.abc import Iterable
 from contextlib import suppress
 from dataclasses import dataclass
-from pathlib import Path
 
 from PIL.ExifTags import Base
 
@@ -50,7 +49,7 @@ class TransferredTags:
 
 def capture_tags(reference: Band, grid: OutputGrid) -> TransferredTags:
     """Return the tags for a stack: those that apply to all bands of a capture, whose exposures differ."""
-    source = _directories(reference.path)
+    source = _directories(reference)
     first = _some(source[0], _CAPTURE_TAGS | {Base.Orientation})
     times = {tag for tag in Base if tag.name.startswith(("DateTime", "OffsetTime", "SubsecTime"))}
     exif = _some(source[EXIF], times | {Base.ExifVersion, Base.BodySerialNumber, Base.LensModel})
@@ -58,14 +57,14 @@ def capture_tags(reference: Band, grid: OutputGrid) -> TransferredTags:
 
 
 def band_tags(
-    source: Path, reference: Band, grid: OutputGrid, vignetting: GridVignetting | None, *, radiometry: bool = False
+    source: Band, reference: Band, grid: OutputGrid, vignetting: GridVignetting | None, *, radiometry: bool = False
 ) -> TransferredTags:
-    """Return the tags for a file with aligned bands from the file `source`.
+    """Return the tags for a file with aligned bands from the file, or the page, of `source`.
 
     `vignetting` is that of the band; None if the pixels are corrected for it. With `radiometry` they are also corrected
     for black level and exposure, and all their tags are left out.
     """
-    own, of_reference = _directories(source), _directories(reference.path)
+    own, of_reference = _directories(source), _directories(reference)
     black_level: set[int] = set() if radiometry else {Base.BlackLevelRepeatDim, Base.BlackLevel}
     of_file = {Base.ImageDescription, Base.Software, Base.Artist, Base.OriginalRawFileName}
     first = _some(own[0], _CAPTURE_TAGS | black_level | of_file) | _some(of_reference[0], {Base.Orientation})
@@ -73,7 +72,7 @@ def band_tags(
     exif = {tag: entry for tag, entry in own[EXIF].items() if tag not in with_offsets | _GEOMETRIC_EXIF}
     packet, reference_packet = (Packet.parse(d[0][XMP].data if XMP in d[0] else b"") for d in (own, of_reference))
     with suppress(UnreadableFileError):
-        reference_tags, own_tags = read_tags(reference.path), read_tags(source)
+        reference_tags, own_tags = (read_tags(band.path, band.page) for band in (reference, source))
         transfer = camera_of(reference_tags).tag_transfer
         transfer.put_geometry(packet, reference_packet, reference, reference_tags, grid)
         transfer = camera_of(own_tags).tag_transfer
@@ -83,10 +82,10 @@ def band_tags(
     return TransferredTags(first, _on_grid(exif, of_reference[EXIF], grid), own[GPS])
 
 
-def _directories(path: Path) -> dict[int, Directory]:
+def _directories(band: Band) -> dict[int, Directory]:
     """The directories of a file; empty if they are damaged, because the pixels may still be good."""
     try:
-        return read_directories(path)
+        return read_directories(band.path, band.page)
     except Exception:  # a damaged file causes any exception
         return {0: {}, EXIF: {}, GPS: {}}
 

@@ -4,9 +4,10 @@ a finished file. Classic TIFF and BigTIFF in either byte order, by TIFF 6.0 and 
 
 import math
 import struct
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from io import BytesIO
+from itertools import islice
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -80,15 +81,16 @@ def values(entry: Entry) -> Any:
     return result[0] if len(result) == 1 else result
 
 
-def read_directories(path: Path) -> dict[int, Directory]:
+def read_directories(path: Path, page: int = 0) -> dict[int, Directory]:
     """Return {0: the first directory, EXIF: …, GPS: …} of a TIFF, or of the Exif part of a JPEG, with its XMP packet.
 
+    The tags of a `page` of a TIFF, from 1, are added to those of the first directory.
     A file with the suffix of a JPEG is read as one. Raises ValueError, or an error of Pillow, if the file is malformed,
     OSError if it cannot be read.
     """
     if suffix_format(path) != "JPEG":
         with path.open("rb") as file:
-            return _read_all(file)
+            return _read_all(file, page)
     with Image.open(path, formats=("JPEG",)) as image:
         block, packet = image.info.get("exif", b""), image.info.get("xmp", b"")
     result = _read_all(BytesIO(block[6:])) if block.startswith(b"Exif\0\0") else {0: {}, EXIF: {}, GPS: {}}
@@ -135,9 +137,37 @@ class _Layout:
         return Entry(kind, 1, struct.pack("<" + self.offset, offset))
 
 
-def _read_all(file: BinaryIO) -> dict[int, Directory]:
+def image_pages(path: Path) -> list[int]:
+    """Return the numbers, from 1, of the pages of a TIFF that are images: not reduced ones, masks and sub-directories.
+
+    Raises ValueError or OSError like `read_directories`.
+    """
+    with path.open("rb") as file:
+        kinds = [values(page[254]) if 254 in page else 0 for page in _pages(file)]
+    reduced_or_mask = 1 | 4  # of the tag NewSubfileType
+    return [number for number, kind in enumerate(kinds, 1) if not int(kind) & reduced_or_mask]
+
+
+def _pages(file: BinaryIO) -> Iterator[Directory]:
+    layout, at, _ = _header(file)
+    first, following = _read_directory(file, layout, at)
+    yield first
+    max_pages = 512  # offsets of a damaged file may form a circle
+    for _ in range(max_pages):
+        if following == 0:
+            return
+        try:
+            page, following = _read_directory(file, layout, following)
+        except (ValueError, OverflowError, OSError):
+            return  # some cameras write no valid offset after the only page
+        yield page
+
+
+def _read_all(file: BinaryIO, page: int = 0) -> dict[int, Directory]:
     layout, at, _ = _header(file)
     first, _ = _read_directory(file, layout, at)
+    if page > 1:
+        first |= next(islice(_pages(file), page - 1, None))
     result = {0: first, EXIF: Directory(), GPS: Directory()}
     for tag in (EXIF, GPS):
         if tag in first:

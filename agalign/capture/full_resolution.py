@@ -42,7 +42,7 @@ def at_full_resolution(reference: Band, moving: Band, alignment: Alignment[Fixed
     `failed` if a tile of the moving file cannot be read, because its pixels could not be written either. Raises
     UnreadableFileError for the reference.
     """
-    with open_raster(reference.path) as source:
+    with open_raster(reference.path, reference.page) as source:
         for_fit, held_out = (
             [(tile, _windows(source, reference, tile)) for tile in of_colour]
             for of_colour in _tiles(reference, alignment)
@@ -121,7 +121,7 @@ def _side(centre_px: float, length_px: int, cells: int) -> tuple[int, int, int]:
 def _residual(moving: Band, mapping: PixelMapping, tiles: _Tiles) -> Residual[FixedFilePx]:
     """Measure the residual of the windows of all tiles, px of the reference's file. Raises UnreadableFileError."""
     parts = [(np.empty((0, 2)), np.empty((0, 2)), np.empty(0), np.empty((0, 2), np.int64))]
-    with open_raster(moving.path) as source:
+    with open_raster(moving.path, moving.page) as source:
         for tile, windows in tiles:
             warped = resample_tile(moving, mapping, tile, "lanczos", dataset=source)
             part = windows.residuals(_raster(*warped, moving))

@@ -85,14 +85,14 @@ OpenRaster = rasterio.DatasetReader
 
 
 @contextmanager
-def open_raster(path: Path) -> Iterator[rasterio.DatasetReader]:
-    """Open a TIFF, JPEG or PNG for reading; south-up maps are flipped to north-up.
+def open_raster(path: Path, page: int = 0) -> Iterator[rasterio.DatasetReader]:
+    """Open a TIFF, JPEG or PNG, or a page of a TIFF (from 1), for reading; south-up maps are flipped to north-up.
 
     Raises UnreadableFileError for other files and those that GDAL cannot read.
     """
-    driver = _driver_of(path)
+    driver, name = _driver_of(path), f"GTIFF_DIR:{page}:{path}" if page else path
     try:
-        with without_warnings(), rasterio.Env(**GDAL_ENVIRONMENT), rasterio.open(path, driver=driver) as dataset:
+        with without_warnings(), rasterio.Env(**GDAL_ENVIRONMENT), rasterio.open(name, driver=driver) as dataset:
             if not _is_south_up(dataset):
                 yield dataset
                 return
@@ -160,16 +160,16 @@ def _driver_of(path: Path) -> str:
     raise UnreadableFileError(f"{path}: {problem}; copy it from the card again")
 
 
-def probe(path: Path, max_pixels: int = MAX_PIXELS) -> tuple[Band, ...]:
-    """Read the metadata of a raster file: its bands, without an alpha band.
+def probe(path: Path, max_pixels: int = MAX_PIXELS, page: int = 0) -> tuple[Band, ...]:
+    """Read the metadata of a raster file, or of a page of a TIFF (from 1): its bands, without an alpha band.
 
     They have the names in the file, else those of red, green and blue channels, else empty ones. Equal channels of a
     TIFF are one band.
     Raises UnreadableFileError, also for more than `max_pixels` per band.
     """
     try:
-        with open_raster(path) as dataset:
-            return _bands(path, dataset, max_pixels)
+        with open_raster(path, page) as dataset:
+            return tuple(replace(band, page=page) for band in _bands(path, dataset, max_pixels))
     except UnreadableFileError:
         raise
     except Exception as error:  # damaged files raise errors of many classes
@@ -271,10 +271,10 @@ def read_for_alignment(band: Band, longest_side_px: int) -> Raster:
     """
     reduction = max(1.0, max(band.size_px) / longest_side_px)
     shape = reduced_size_px(band.size_px, reduction)[::-1]
-    with open_raster(band.path) as dataset:
-        pixels = _reduced(dataset, band, shape) if reduction > 1 else dataset.read(band.band_index)
+    with open_raster(band.path, band.page) as dataset:
+        pixels = _reduced(dataset, band, shape) if reduction > 1 else dataset.read(band.index_in_page)
         valid = data_mask(pixels, band.nodata)
-        valid &= _dataset_mask(dataset, band.band_index, out_shape=shape, resampling=Resampling.nearest)
+        valid &= _dataset_mask(dataset, band.index_in_page, out_shape=shape, resampling=Resampling.nearest)
     if band.nodata is None:
         valid &= ~undeclared_fill(pixels)
     valid = learnable(valid, pixels, band.saturation_value)
@@ -291,8 +291,8 @@ def _reduced(dataset: rasterio.DatasetReader, band: Band, shape: tuple[int, int]
     read_whole_px = 1 << 26  # images up to this size are decoded completely before averaging: 128 MB in 16 bits
     if all_valid and band.width_px * band.height_px <= read_whole_px:
         # GDAL's averaging decodes a JPEG repeatedly, which takes seconds per band.
-        return np.asarray(cv2.resize(dataset.read(band.band_index), shape[::-1], interpolation=cv2.INTER_AREA))
-    return np.asarray(dataset.read(band.band_index, out_shape=shape, resampling=Resampling.average))
+        return np.asarray(cv2.resize(dataset.read(band.index_in_page), shape[::-1], interpolation=cv2.INTER_AREA))
+    return np.asarray(dataset.read(band.index_in_page, out_shape=shape, resampling=Resampling.average))
 
 
 def read_tile(
@@ -303,23 +303,23 @@ def read_tile(
     `dataset` is the open file, if it is open. Raises UnreadableFileError.
     """
     if dataset is None:
-        with open_raster(band.path) as opened:
+        with open_raster(band.path, band.page) as opened:
             return read_tile(band, tile, opened)
     window = Window(tile.x0, tile.y0, tile.width, tile.height)
-    pixels = dataset.read(band.band_index, window=window)
-    return pixels, data_mask(pixels, band.nodata) & _dataset_mask(dataset, band.band_index, window=window)
+    pixels = dataset.read(band.index_in_page, window=window)
+    return pixels, data_mask(pixels, band.nodata) & _dataset_mask(dataset, band.index_in_page, window=window)
 
 
 def read_preview(
-    path: Path, index: int, window_px: tuple[int, int, int, int], size_px: tuple[int, int]
+    path: Path, index: int, window_px: tuple[int, int, int, int], size_px: tuple[int, int], page: int = 0
 ) -> NDArray[np.float32]:
-    """Read a window (x0, y0, width, height) of a band as (height, width) float32 with NaN for nodata.
+    """Read a window (x0, y0, width, height) of a band, of a page, as (height, width) float32 with NaN for nodata.
 
     It is resampled to `size_px` (width, height). Raises UnreadableFileError.
     """
     x0, y0, width, height = window_px
     resampling = Resampling.average if size_px[0] < width else Resampling.bilinear
-    with open_raster(path) as dataset:
+    with open_raster(path, page) as dataset:
         window = Window(x0, y0, width, height)
         pixels = dataset.read(index, window=window, out_shape=size_px[::-1], resampling=resampling)
         nodata = dataset.nodata

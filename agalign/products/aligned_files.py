@@ -63,7 +63,7 @@ class BandFiles(Product):
     ) -> WrittenFile:
         settings, grid, path = context.write_settings, context.grid, context.paths.folder / name
         reference, is_raw = context.capture.reference, settings.radiometry == "off"
-        tags = band_tags(layers[0].band.path, reference, grid, vignetting, radiometry=not is_raw)
+        tags = band_tags(layers[0].band, reference, grid, vignetting, radiometry=not is_raw)
         nodata = write_raster(context.capture, layers, grid, path, settings, tags)
         asset = StacAsset(name.as_posix(), media_type(settings), ("data",))
         bands, is_flat = tuple(layer.band.name for layer in layers), any(layer.vignetting for layer in layers)
@@ -118,7 +118,7 @@ def _vignettings(layers: Sequence[Layer], grid: OutputGrid) -> dict[str, GridVig
 def _correction(band: Band) -> Radiometry | None:
     """The correction of a band's vignetting by its tags."""
     with suppress(UnreadableFileError):
-        return vignetting_of(read_tags(band.path), band.size_px)
+        return vignetting_of(read_tags(band.path, band.page), band.size_px)
     return None
 
 

@@ -73,7 +73,7 @@ def block_means(plane: NDArray[np.float32]) -> NDArray[np.float32]:
 def _before(band: Band, reference: Band, grid: OutputGrid, size_px: tuple[int, int]) -> NDArray[np.float32]:
     sx, sy = (n / (s * m) for n, s, m in zip(band.size_px, grid.scale, reference.size_px, strict=True))
     window = (round(grid.x0 * sx), round(grid.y0 * sy), max(1, round(grid.width * sx)), max(1, round(grid.height * sy)))
-    return read_preview(band.path, band.band_index, window, size_px)
+    return read_preview(band.path, band.index_in_page, window, size_px, band.page)
 
 
 def _grey(plane: NDArray[np.float32]) -> Grey:

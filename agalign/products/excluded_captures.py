@@ -193,7 +193,7 @@ def _tile(reading: BandReading) -> Picture:
     band = reading.band
     scale = 320 / band.width_px
     size = 320, max(1, round(band.height_px * scale))
-    pixels = read_preview(band.path, band.band_index, (0, 0, *band.size_px), size)
+    pixels = read_preview(band.path, band.index_in_page, (0, 0, *band.size_px), size, band.page)
     # A few hot pixels must not determine the contrast.
     low, high = np.nanpercentile(pixels, (1.0, 99.5)) if np.isfinite(pixels).any() else (0.0, 1.0)
     grey = np.clip(np.nan_to_num((pixels - low) / max(high - low, 1e-9)), 0, 1) * 255

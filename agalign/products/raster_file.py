@@ -278,6 +278,6 @@ def _unused_value(layers: Sequence[Layer], grid: OutputGrid, dtype: np.dtype[Any
 
 def _values_in(band: Band, tile: Tile) -> Pixels:
     """The different values of a band in a rectangle of its file."""
-    with open_raster(band.path) as source:
+    with open_raster(band.path, band.page) as source:
         result = [np.unique(read_tile(band, t, source)[0]) for t in tiles(tile, WORK_TILE_PX)]
     return np.unique(np.concatenate(result))

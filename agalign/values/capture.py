@@ -126,13 +126,15 @@ class Band:
     name: str
     path: Path
     band_index: int
-    """Index within the file, from 1."""
+    """Index within the file, from 1; the page, if each band has a page of its own."""
     width_px: int
     height_px: int
     dtype: str
     nodata: float | None = None
     has_mask: bool = False
     """True if the file has a mask or an alpha band."""
+    page: int = 0
+    """Number of its page in a TIFF with several, from 1; 0 in files with one."""
     wavelength_nm: float | None = None
     bandwidth_nm: float | None = None
     saturation_value: float | None = None
@@ -167,6 +169,11 @@ class Band:
     def size_px(self) -> tuple[int, int]:
         """(width, height) in pixels."""
         return self.width_px, self.height_px
+
+    @property
+    def index_in_page(self) -> int:
+        """Index within the file or the page that `open_raster` opens, from 1."""
+        return 1 if self.page else self.band_index
 
     @property
     def address(self) -> str:

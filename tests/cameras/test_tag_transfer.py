@@ -86,7 +86,7 @@ UNCHANGED = OutputGrid(0, 0, *SIZE)
 def transferred(source: Path, reference: Band | Path, grid: OutputGrid, out: str = "out.tif", **options: bool) -> Path:
     """Write a file with the tags of the source on a grid of the reference."""
     band = Band("reference", reference, 1, *SIZE, "uint16") if isinstance(reference, Path) else reference
-    tags = band_tags(source, band, grid, GridVignetting((80, 60), (1e-4,), 0), **options)
+    tags = band_tags(replace(band, path=source), band, grid, GridVignetting((80, 60), (1e-4,), 0), **options)
     path = write_file(source.parent / out, shape=(grid.height, grid.width))
     add_directories(path, tags.first, tags.exif, tags.gps)
     return path
@@ -148,7 +148,7 @@ def test_tags_of_applied_radiometry_are_removed(tmp_path: Path) -> None:
 def test_a_source_that_cannot_be_followed_gives_nothing(tmp_path: Path) -> None:
     (tmp_path / "broken.tif").write_bytes(b"II*\0\xff\xff\xff\xff")
     band = Band("broken", tmp_path / "broken.tif", 1, 9, 9, "uint16")
-    tags = band_tags(tmp_path / "broken.tif", band, OutputGrid(0, 0, 9, 9), None)
+    tags = band_tags(replace(band, path=tmp_path / "broken.tif"), band, OutputGrid(0, 0, 9, 9), None)
     assert (tags.first, tags.exif, tags.gps) == ({}, {}, {})
     assert text("x").count == 2
 
@@ -181,5 +181,6 @@ def test_a_centre_of_vignetting_without_position_is_omitted(tmp_path: Path, cent
     first = {271: text("MicaSense"), XMP: byte_string(packet(values, "elements"))}
     path = write_file(tmp_path / "IMG_0001_2.tif", first)
     assert vignetting_of(read_tags(path), SIZE) is None
-    tags = band_tags(path, Band("Green", path, 1, *SIZE, "uint16"), OutputGrid(0, 0, *SIZE), None)
+    band = Band("Green", path, 1, *SIZE, "uint16")
+    tags = band_tags(band, band, OutputGrid(0, 0, *SIZE), None)
     assert b"Vignetting" not in tags.first[XMP].data

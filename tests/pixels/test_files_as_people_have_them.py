@@ -1,5 +1,6 @@
 """Full scale, channels and colours of files by other software and of cameras that state little."""
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -98,6 +99,62 @@ def test_colours_without_names_are_named_by_their_interpretation(tmp_path: Path)
     with rasterio.open(tmp_path / "ortho.tif", "r+") as file:
         file.descriptions = ("a", "b", "c", "")
     assert [b.name for b in probe(tmp_path / "ortho.tif")] == ["a", "b", "c"]
+
+
+def packet_of(name: str, wavelength_nm: int) -> bytes:
+    values = f'Camera:BandName="{name}" Camera:CentralWavelength="{wavelength_nm}"'
+    return (
+        '<x:xmpmeta xmlns:x="adobe:ns:meta/"><rdf:RDF xmlns:rdf="http://www.w3.org/1999/02/22-rdf-syntax-ns#">'
+        f'<rdf:Description xmlns:Camera="http://pix4d.com/camera/1.0" {values}/></rdf:RDF></x:xmpmeta>'
+    ).encode()
+
+
+def write_pages(path: Path, bands: Sequence[tuple[str, int]], *, thumbnail: bool = False, mask: bool = False) -> None:
+    """A page for each band, of one scene; a thumbnail is before them, a mask behind."""
+    scene = texture_numbers()
+    with tifffile.TiffWriter(path) as tiff:
+        if thumbnail:
+            tiff.write(scene[::4, ::4], subfiletype=1, metadata=None)
+        for number, (name, nm) in enumerate(bands):
+            xmp = [(700, 1, len(packet_of(name, nm)), packet_of(name, nm), True)] if name else []
+            tiff.write(np.roll(scene, number, axis=1) + number, metadata=None, extratags=xmp)
+        if mask:
+            tiff.write(scene > 0, subfiletype=4, metadata=None)
+
+
+@pytest.mark.parametrize("thumbnail", [False, True])
+@pytest.mark.parametrize("mask", [False, True])
+def test_pages_with_tags_of_their_own_are_bands(tmp_path: Path, thumbnail: bool, mask: bool) -> None:
+    bands = {"Green": 560, "Red": 668, "NIR": 840}
+    (tmp_path / "in").mkdir()
+    write_pages(tmp_path / "in" / "a.tif", [*bands.items()], thumbnail=thumbnail, mask=mask)
+    (capture,) = discover(tmp_path / "in").captures
+    assert {b.name: b.wavelength_nm for b in capture.bands} == bands
+    assert len({b.band_index for b in capture.bands}) == 3
+    settings = agalign.Settings(
+        write=agalign.WriteSettings(layout="both", crop="none"), seed=agalign.SeedSettings(only=True, force="identity")
+    )
+    list(agalign.align_folder(tmp_path / "in", tmp_path / "out", settings=settings))
+    with rasterio.open(tmp_path / "out" / "a.tif") as stack:
+        for number, name in enumerate(bands):
+            expected = np.roll(texture_numbers(), number, axis=1) + number
+            np.testing.assert_array_equal(stack.read(stack.descriptions.index(name) + 1), expected)
+    for name in bands:
+        assert probe(tmp_path / "out" / f"a_{name}.tif")[0].name == name
+
+
+def test_an_image_behind_its_thumbnail_is_read(tmp_path: Path) -> None:
+    write_pages(tmp_path / "f_green.tif", [("", 0)], thumbnail=True)
+    write_pages(tmp_path / "f_red.tif", [("", 0)], mask=True)
+    (capture,) = discover(tmp_path).captures
+    assert {b.name: b.size_px for b in capture.bands} == {"green": (320, 240), "red": (320, 240)}
+
+
+def test_pages_without_names_are_refused(tmp_path: Path) -> None:
+    write_pages(tmp_path / "a.tif", [("", 0), ("", 0)])
+    write_capture(tmp_path, "green", "red")
+    (problem,) = discover(tmp_path).problems
+    assert "a.tif: has 2 pages of one size without names of bands; write each page to a file of its own" in problem.text
 
 
 def test_an_inverted_image_is_refused(tmp_path: Path) -> None:
