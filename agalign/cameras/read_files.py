@@ -99,7 +99,7 @@ def _stored_pages(path: Path, max_pixels: int) -> list[tuple[Band, ...]]:
     """Return the bands of each page with an image of full size; most files have one. Raises UnreadableFileError."""
     numbers = [1]
     if suffix_format(path) == "TIFF":
-        with suppress(ValueError, OSError):  # GDAL says what is wrong with the file
+        with suppress(ValueError, OSError):  # the error of GDAL is reported
             numbers = image_pages(path) or numbers
     if numbers == [1]:
         return [probe(path, max_pixels)]

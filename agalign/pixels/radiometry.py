@@ -27,6 +27,7 @@ _PLAUSIBLE: Mapping[str, tuple[float, float]] = {
     "calibration coefficient": (1e-6, 1e-2),  # 0.9e-4 to 3.7e-4 on six RedEdge
     "black level": (0.0, 2.0**14),  # a quarter of 16 bits; cameras write 4,096 to 5,800
     "vignetting": (0.05, 20.0),  # anywhere in the image; a wide lens leaves a third of the light in the corners
+    "vignetting centre (share of the image)": (0.2, 0.8),  # 1 for tags of an image that was reduced to a half
     "row gradient": (0.1, 10.0),  # first or last row; up to 1.3
     "irradiance (W / m^2 / nm)": (0.005, 3.0),  # from sunset (0.6 % of a clear noon) to 1.5 times a clear noon
     "relative irradiance": (10.0, 1e6),  # 7,000 to 17,000 in the sun
@@ -52,6 +53,8 @@ def plausible(radiometry: Radiometry, size_px: tuple[int, int]) -> tuple[Radiome
     with np.errstate(over="ignore", invalid="ignore"):
         falloff = np.polynomial.polynomial.polyval(r, (1.0, *radiometry.vignetting))
     values: dict[str, ArrayLike] = {**radiometry.tags, "black level": radiometry.black_level, "vignetting": falloff}
+    if radiometry.vignetting:
+        values["vignetting centre (share of the image)"] = np.divide((cx, cy), size_px)
     values["row gradient"] = 1.0 + radiometry.row_gradient * np.array([0.0, height])
     if radiometry.by_sun is not None:
         kind = "irradiance (W / m^2 / nm)" if radiometry.by_sun[1] == "reflectance" else "relative irradiance"

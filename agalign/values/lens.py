@@ -42,12 +42,14 @@ class Lens:
         return np.array([[self.fx_px, 0.0, self.cx_px], [0.0, self.fy_px, self.cy_px], [0.0, 0.0, 1.0]])
 
     def is_plausible(self, size_px: Size) -> bool:
-        """Return False for values that no camera has: focal lengths beyond 0.1 to 1000 times the longer side of the
-        image, an optical centre farther from its corner than 100 times that, and coefficients above 1000.
+        """Return False for values that no camera has, or not for images of this size, as after resizing: focal lengths
+        beyond 0.1 to 1000 times the longer side, an optical centre farther than a quarter of it from the middle of the
+        image, and coefficients above 1000.
         """
         side_px = max(size_px)
         is_focused = all(0.1 < focal_px / side_px < 1000 for focal_px in (self.fx_px, self.fy_px))
-        is_near = all(abs(position_px) < 100 * side_px for position_px in (self.cx_px, self.cy_px))
+        from_middle_px = self.cx_px - size_px[0] / 2, self.cy_px - size_px[1] / 2
+        is_near = all(abs(distance_px) < side_px / 4 for distance_px in from_middle_px)
         return is_focused and is_near and all(abs(k) < 1000 for k in self.distortion)
 
 

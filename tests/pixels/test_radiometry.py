@@ -22,6 +22,7 @@ from agalign.synthetic import flight as synthetic
 from agalign.synthetic.ground import paint_ground
 from agalign.values.capture import Band, Capture, PanelFactor, Quantity, Radiometry
 from agalign.values.choices import RadiometryChoice
+from agalign.values.lens import Lens
 
 from ..conftest import seeded
 
@@ -171,6 +172,16 @@ def test_a_calibration_with_an_implausible_tag_is_not_used(change: dict[str, obj
     result, problem = plausible(replace(GOOD, **change), (1280, 960))
     assert result is None
     assert problem.startswith(f"the {named}")
+
+
+def test_tags_of_an_image_of_another_size_are_not_used() -> None:
+    """As after resizing by other software, which copies the tags."""
+    for size_px in ((640, 480), (320, 240)):
+        result, problem = plausible(GOOD, size_px)
+        assert result is None
+        assert problem.startswith("the vignetting ")
+        assert not Lens(1450.0, 1450.0, 645.0, 470.0).is_plausible(size_px)
+    assert Lens(1450.0, 1450.0, 645.0, 470.0).is_plausible((1280, 960))
 
 
 @pytest.mark.parametrize(
