@@ -68,7 +68,7 @@ def tagged(namespace: str, **values: str) -> Values:
 
 
 def micasense(k: int) -> Values:
-    lens = {"PrincipalPoint": f"{2.4 + 0.01 * k} 1.8", "PerspectiveDistortion": "-0.1 0.1 0 0 0"}
+    lens = {"PrincipalPoint": f"{0.3 + 0.01 * k} 0.22", "PerspectiveDistortion": "-0.1 0.1 0 0 0"}
     lens |= {"PerspectiveFocalLength": "5.45", "PerspectiveFocalLengthUnits": "mm"}
     return {**tagged(MICASENSE, CaptureId="abc"), **tagged(NAMESPACE, RigRelatives=f"{0.1 * k} 0 0.05", **lens)}
 
