@@ -34,7 +34,7 @@ def main(captures: Number = 3) -> None:
         synthetic.make_flight(flight, captures, SIZE_PX)
         poses, ground, _ = synthetic.plan_flight(captures, SIZE_PX)
         agalign.align_folder(flight, out, settings=Settings(write=WriteSettings(radiometry="auto")))
-        reports = [r for done in run_indices(index_tasks(out, [NDVI], out)) for r in done.reports]
+        reports = [r for done in run_indices(index_tasks(out, [NDVI], out)) for r in done]
         painted = [reflectance(ground, band) for band in infrared_and_red]
         for number, (pose, report) in enumerate(zip(poses, reports, strict=True), start=1):
             truth = compute(NDVI, [synthetic.view(p, ground, reference, pose, SIZE_PX) for p in painted])

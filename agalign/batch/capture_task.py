@@ -89,7 +89,9 @@ def _write_products(context: ProductContext) -> dict[str, str]:
         if not product.is_enabled(context.write_settings) or (product.needs_layers and not context.layers):
             continue
         try:
-            context.written.extend(product.write(context))
+            for file in product.write(context):
+                # At once: the sidecar also lists the files before an error, so that they are removed later.
+                context.written.append(file)
         except AgalignError as error:
             if product.is_required:
                 raise

@@ -2,18 +2,17 @@
 
 from collections.abc import Iterator, Sequence
 from concurrent.futures import Executor
-from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import cv2
 
-from agalign.batch.workers import Run, failure_text, on_executor, own_processes, serially
+from agalign.batch.workers import chosen_run, failure_text, serially
 from agalign.errors import AgalignError
 from agalign.products.flight_map import link_indices
 from agalign.products.index_bands import bands_of
 from agalign.products.index_rasters import write_rasters
-from agalign.products.index_table import IndexReport, IndexRow, row_of, update_table
+from agalign.products.index_table import IndexReport, update_table
 from agalign.products.indices import Index
 from agalign.products.sidecar_file import read_result, run_sidecars, update_products
 from agalign.values.cores import usable_cores
@@ -39,22 +38,9 @@ class IndexTask:
         return replace(self, out=self.out.absolute(), sidecar=self.sidecar.absolute(), target=self.target.absolute())
 
     @property
-    def folder(self) -> Path:
-        """Folder of the capture, relative to `out`."""
-        return self.sidecar.parent.relative_to(self.out)
-
-    @property
     def label(self) -> str:
-        """The capture's name, with its folder."""
-        return (self.folder / self.sidecar.stem).as_posix()
-
-
-@dataclass(frozen=True)
-class CaptureIndices:
-    """Reports and table rows of the indices of one capture."""
-
-    reports: Sequence[IndexReport]
-    rows: Sequence[IndexRow] = ()
+        """The capture's name, with its folder relative to `out`."""
+        return self.sidecar.relative_to(self.out).with_suffix("").as_posix()
 
 
 def index_tasks(
@@ -66,7 +52,7 @@ def index_tasks(
 
 def run_indices(
     tasks: Sequence[IndexTask], jobs: int = 0, executor: Executor | None = None
-) -> Iterator[CaptureIndices]:
+) -> Iterator[list[IndexReport]]:
     """Write the indices of all captures, yield the reports of each, and finally write the table indices.csv.
 
     `jobs` is the number of processes, each for one capture at a time; 0 is one per core. An `executor` processes the
@@ -74,53 +60,39 @@ def run_indices(
     A failed capture is reported and does not stop the others. Raises WorkerError if no worker process can be started,
     and OutputError if the table cannot be written.
     """
-    rows: list[IndexRow] = []
+    captures_worth_a_process = 8  # starting a process takes as long as the indices of this many captures
+    processes = min(jobs or usable_cores(), len(tasks) // captures_worth_a_process)
+    rows: list[IndexReport] = []
     try:
-        with _chosen_run(len(tasks), jobs or usable_cores(), executor) as run:
-            absolute = tasks if run is serially else [task.absolute() for task in tasks]
-            for number, result in run(do_indices, absolute, limited=True):
+        with chosen_run(executor, processes, cv2.setNumThreads, preload=__name__) as run:
+            if run is not serially:
+                tasks = [task.absolute() for task in tasks]
+            for number, result in run(do_indices, tasks, limited=True):
                 try:
-                    done = result()
+                    reports = result()
+                    rows += reports
                 except Exception as error:
-                    done = _failed(tasks[number], failure_text(error))
-                rows += done.rows
-                yield done
+                    reports = _failed(tasks[number], failure_text(error))
+                yield reports
     finally:
         if rows:  # also after an interruption
             link_indices(tasks[0].target, update_table(tasks[0].target, rows))
 
 
-@contextmanager
-def _chosen_run(captures: int, cores: int, executor: Executor | None) -> Iterator[Run]:
-    captures_worth_a_process = 8  # starting a process takes as long as the indices of this many captures
-    processes = min(cores, captures // captures_worth_a_process)
-    if executor is not None:
-        yield on_executor(executor)
-    elif processes > 1:
-        with own_processes(processes, cv2.setNumThreads, preload=__name__) as run:
-            yield run
-    else:
-        yield serially
-
-
-def do_indices(task: IndexTask) -> CaptureIndices:
-    """Write the indices of one capture and return the reports, which include errors."""
-    folder, base = task.folder, task.target / task.folder / task.sidecar.stem
-    try:
-        sidecar = read_result(task.sidecar)
-    except AgalignError as error:
-        return _failed(task, str(error))
+def do_indices(task: IndexTask) -> list[IndexReport]:
+    """Write the indices of one capture; the reports include errors. Raises SidecarError."""
+    sidecar, base = read_result(task.sidecar), task.target / task.label
     try:
         check_inside(base.parent, task.target)
         bands = bands_of(sidecar, task.sidecar.parent, mask_qa=task.mask_qa)
-        reports = write_rasters(bands, task.indices, base, task.label, overwrite=task.overwrite)
+        reports = [*write_rasters(bands, task.indices, base, task.label, overwrite=task.overwrite)]
         if task.target == task.out:
             rasters = [r.path for r in reports if r.path is not None and not r.kept]
             update_products(task.sidecar, [p for path in rasters for p in (path, path.with_suffix(".png"))])
     except AgalignError as error:
-        reports = list(_failed(task, str(error)).reports)
-    return CaptureIndices(reports, [row_of(r, sidecar, folder.as_posix(), task.target) for r in reports])
+        reports = _failed(task, str(error))
+    return [report.of(sidecar) for report in reports]
 
 
-def _failed(task: IndexTask, problem: str) -> CaptureIndices:
-    return CaptureIndices([IndexReport(task.label, index.name, problem=problem) for index in task.indices])
+def _failed(task: IndexTask, problem: str) -> list[IndexReport]:
+    return [IndexReport(task.label, index.name, problem=problem) for index in task.indices]

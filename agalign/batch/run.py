@@ -22,7 +22,7 @@ from agalign.batch.capture_task import (
 )
 from agalign.batch.earlier_results import changes, outputs_exist, refuse_other_captures
 from agalign.batch.flight_learning import learn_flight, learning_fingerprint
-from agalign.batch.workers import Run, failure_text, in_order, on_executor, own_processes, serially
+from agalign.batch.workers import Run, chosen_run, failure_text, in_order, serially
 from agalign.cameras.discover import FolderScan
 from agalign.capture.align_bands import PairProgress
 from agalign.config import RunOptions, Settings, WriteSettings
@@ -35,7 +35,6 @@ from agalign.flight.rig_file import read_rig
 from agalign.flight.sky import SkyCapture, sky_captures
 from agalign.method.device import choose_device, limit_threads
 from agalign.pixels.radiometry import with_radiometry
-from agalign.pixels.raster import without_warnings
 from agalign.products.excluded_captures import write_panels, write_sky
 from agalign.products.flight_map import FlightMap
 from agalign.products.footprint import above_elevation, missing_for_footprint, with_approximate_georeference
@@ -280,7 +279,11 @@ class _FlightRun:
         ]
         on_cpu = choose_device(self.settings.joint.device).type == "cpu"
         cores = self.options.jobs or (usable_cores() if on_cpu else 1)
-        with _chosen_run(sum(len(pending) for _, _, pending in flights), cores, self.options) as run:
+        number, timeout_s = sum(len(pending) for _, _, pending in flights), self.options.timeout_s
+        processes = min(cores, number // CAPTURES_WORTH_A_PROCESS if timeout_s is None else number)
+        threads = min(cores, number, _MAX_THREADS)
+        executor = self.options.executor
+        with chosen_run(executor, processes, limit_threads, threads, timeout_s=timeout_s) as run:
             models: list[Path | None] = []
             learn = partial(learn_flight, apply=partial(in_order, run), threads=min(_MAX_THREADS, cores))
             for group, name, pending in flights:
@@ -303,7 +306,7 @@ class _FlightRun:
                 names = ", ".join(dict.fromkeys(name for changed in again.values() for name in changed))
                 finished = counted(len(again), "finished capture")
                 self.listener.on_again(f"{finished} to be done again; changed since: {names}")
-            yield from capture_reports(run, tasks, self.listener, self.options.timeout_s)
+            yield from capture_reports(run, tasks, self.listener, timeout_s)
 
     def _model(
         self, captures: Sequence[Capture], path: Path, learn: Callable[..., FlightModel | None], record: RunPart
@@ -375,29 +378,6 @@ def _calibrated(capture: Capture, panels: Sequence[PanelReading], settings: Writ
         capture = above_elevation(capture, settings.ground_elevation_m)
     capture = with_height(capture, panels)
     return with_approximate_georeference(capture) if settings.georeference else capture
-
-
-@contextmanager
-def _chosen_run(captures: int, cores: int, options: RunOptions) -> Iterator[Run]:
-    """Choose where to process a number of captures.
-
-    They run on the executor if there is one; in processes if there are enough captures for two, or for a timeout
-    (threads cannot be killed); else in threads, or serially with one core or capture.
-    """
-    limited = options.timeout_s is not None and captures > 0
-    processes = min(cores, captures if limited else captures // CAPTURES_WORTH_A_PROCESS)
-    threads = min(cores, captures, _MAX_THREADS)
-    if options.executor is not None:
-        yield on_executor(options.executor)
-    elif processes > 1 or limited:
-        with own_processes(processes, limit_threads, timeout_s=options.timeout_s) as run:
-            yield run
-    elif threads > 1:
-        # Warning filters are global: threads that change and restore them would interfere.
-        with without_warnings(), ThreadPoolExecutor(threads) as executor:
-            yield on_executor(executor)
-    else:
-        yield serially
 
 
 def capture_reports(

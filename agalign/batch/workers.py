@@ -6,7 +6,15 @@ import logging
 import os
 import threading
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, CancelledError, Executor, Future, wait
+from concurrent.futures import (
+    FIRST_COMPLETED,
+    BrokenExecutor,
+    CancelledError,
+    Executor,
+    Future,
+    ThreadPoolExecutor,
+    wait,
+)
 from contextlib import ExitStack, contextmanager
 from functools import partial
 from importlib import import_module
@@ -16,6 +24,7 @@ from typing import Any, Protocol
 
 from agalign._version import __version__
 from agalign.errors import AgalignError, ConfigurationError, WorkerError
+from agalign.pixels.raster import without_warnings
 from agalign.values.cores import usable_cores
 from agalign.values.process_pool import A, ProcessPool, R, WorkerDiedError
 from agalign.values.processes import (
@@ -56,6 +65,32 @@ def serially(
     """Run the tasks in this process and thread: each when its result is requested."""
     for number, task in enumerate(tasks):
         yield number, partial(function, task)
+
+
+@contextmanager
+def chosen_run(
+    executor: Executor | None,
+    processes: int,
+    initializer: Callable[[int], object],
+    threads: int = 1,
+    *,
+    preload: str = WORKER_MODULE,
+    timeout_s: float | None = None,
+) -> Iterator[Run]:
+    """Run tasks on the executor if there is one; else in processes if there are several or there is a timeout (threads
+    cannot be killed); else in threads, or serially.
+    """
+    if executor is not None:
+        yield on_executor(executor)
+    elif processes > 1 or (processes and timeout_s is not None):
+        with own_processes(processes, initializer, preload=preload, timeout_s=timeout_s) as run:
+            yield run
+    elif threads > 1:
+        # Warning filters are global: threads that change and restore them would interfere.
+        with without_warnings(), ThreadPoolExecutor(threads) as pool:
+            yield on_executor(pool)
+    else:
+        yield serially
 
 
 @contextmanager

@@ -155,12 +155,12 @@ def _indices(
         reports: list[IndexReport] = []
         for number, done in enumerate(run_indices(tasks, jobs, executor), start=1):
             terminal.check()
-            if any(r.raw_numbers for r in done.reports) and not any(r.raw_numbers for r in reports):
+            if any(r.raw_numbers for r in done) and not any(r.raw_numbers for r in reports):
                 terminal.problem(RAW_NUMBERS)
-            reports += done.reports
-            for report in done.reports:
+            reports += done
+            for report in done:
                 _print(report, terminal)
-            show(number, 0.0, done.reports[0].capture, "")
+            show(number, 0.0, done[0].capture, "")
         if target is None:
             _rebuild_report(out, terminal)
     return _conclude([one.name for one in chosen], reports, folder, terminal, as_json=as_json)

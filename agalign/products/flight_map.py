@@ -9,7 +9,7 @@ from typing import Any
 from pydantic_core import from_json
 
 from agalign.products.footprint import accuracy_of_footprint_m, footprint, geojson_geometry, with_assumed_height
-from agalign.products.index_table import IndexRow, read_table
+from agalign.products.index_table import IndexReport, read_table
 from agalign.products.product import CapturePaths
 from agalign.products.sidecar import BandResult, CaptureResult
 from agalign.values.capture import Capture, Pose
@@ -72,7 +72,7 @@ class FlightMap:
         return self._out / FLIGHT_MAP_FILE
 
 
-def link_indices(out: Path, rows: Iterable[IndexRow]) -> None:
+def link_indices(out: Path, rows: Iterable[IndexReport]) -> None:
     """Link the rasters of an index table in OUT/flight.geojson. Raises OutputError.
 
     Without the file, or with a file that a run did not write, nothing is changed.
@@ -101,11 +101,11 @@ def _has_sidecar(feature: dict[str, Any], out: Path) -> bool:
     return isinstance(sidecar, str) and (out / sidecar).is_file()
 
 
-def _write(out: Path, features: Sequence[dict[str, Any]], rows: Iterable[IndexRow]) -> None:
+def _write(out: Path, features: Sequence[dict[str, Any]], rows: Iterable[IndexReport]) -> None:
     rasters: dict[str, list[str]] = defaultdict(list)
     for row in rows:
-        if row.file:
-            rasters[row.label].append(row.file)
+        if row.path is not None:
+            rasters[row.capture].append(row.path.relative_to(out).as_posix())
     for feature in features:
         properties = feature["properties"]
         properties["indices"] = list(dict.fromkeys([*properties["indices"], *rasters[properties["capture"]]]))

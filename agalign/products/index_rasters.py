@@ -56,27 +56,22 @@ class IndexRasters(Product):
         names = [name.strip().lower() for name in settings.indices]
         return [paths.file(f"_{name}{suffix}") for name in names for suffix in (".tif", ".png")]
 
-    def write(self, context: ProductContext) -> list[WrittenFile]:
+    def write(self, context: ProductContext) -> Iterator[WrittenFile]:
         """Write the indices of which the capture has all bands, usable.
 
         Raises InputError if bands are in the wrong unit, OutputError.
         """
         bands = _bands(context)
         indices = [index_named(name) for name in context.write_settings.indices]
-        result = []
         problems = []
         for report in write_rasters(bands, indices, context.paths.file(""), context.capture.label):
             if report.path is not None:
-                asset = StacAsset(report.index, GEOTIFF, ("data",))
-                result.append(WrittenFile(self.kind, report.path, asset))
-                result.append(WrittenFile(self.kind, report.path.with_suffix(".png")))
+                yield WrittenFile(self.kind, report.path, StacAsset(report.index, GEOTIFF, ("data",)))
+                yield WrittenFile(self.kind, report.path.with_suffix(".png"))
             elif all(not b.problem for b in bands) and _has_bands(context.capture.bands, report.index):
                 problems.append(report.problem)
         if problems:
-            # The sidecar lists the complete files, so that they are removed before the capture is processed again.
-            context.written.extend(result)
             raise InputError("; ".join(problems))
-        return result
 
 
 def check_indices(captures: Sequence[Capture], settings: WriteSettings) -> None:
@@ -89,14 +84,9 @@ def check_indices(captures: Sequence[Capture], settings: WriteSettings) -> None:
             raise ConfigurationError(
                 f"--index {name}: needs bands {', '.join(index.roles)}, and no capture has them all; there are {names}"
             )
-        raw = settings.radiometry == "off" and _have_raw_numbers(suitable)
-        if suitable and raw and not index.any_unit:
+        are_integers = all(np.dtype(b.dtype).kind in "ui" for c in suitable for b in c.bands)
+        if suitable and settings.radiometry == "off" and are_integers and not index.any_unit:
             raise ConfigurationError(f"--index {name}: needs reflectance; add --radiometry")
-
-
-def _have_raw_numbers(captures: Sequence[Capture]) -> bool:
-    """True if all files have integers."""
-    return all(np.dtype(b.dtype).kind in "ui" for c in captures for b in c.bands)
 
 
 def _has_bands(bands: Sequence[Band], name: str) -> bool:
@@ -108,47 +98,40 @@ def _has_bands(bands: Sequence[Band], name: str) -> bool:
 
 
 def _bands(context: ProductContext) -> list[IndexBand]:
-    places, result = context.places, []
-    usable = {context.capture.reference.name, *context.usable} & set(places)
+    places, usable, result = context.places, {context.capture.reference.name, *context.usable}, []
     for band in context.capture.bands:
-        if band.name in usable:
+        if band.name in usable and band.name in places:
             file, index = places[band.name]
             result.append(IndexBand(band.name, band.wavelength_nm, file.path, index, file.sha256))
         else:
-            problem = f"{band.name} is {context.alignments[band.name].status}"
-            result.append(IndexBand(band.name, band.wavelength_nm, Path(), 1, problem=problem))
+            result.append(IndexBand(band.name, band.wavelength_nm, Path(), 1, problem="not usable"))
     return result
 
 
 def write_rasters(
     bands: Sequence[IndexBand], indices: Sequence[Index], base: Path, label: str, *, overwrite: bool = True
-) -> list[IndexReport]:
+) -> Iterator[IndexReport]:
     """Write `base`_<index>.tif and .png of a capture's bands, each atomically.
 
     Without `overwrite`, rasters that an earlier command wrote from the same bands with the same formula are kept. If a
     band of an index is missing, not usable or not in the unit that the index needs, the report has the problem.
     Raises OutputError, or InputError for a file that cannot be read.
     """
-    reports = []
     with BandReader() as reader:
         for index in indices:
             target = base.with_name(f"{base.name}_{index.name}.tif")
             try:
-                chosen = chosen_bands(bands, index)
+                chosen = _bands_of_index(bands, index)
                 source = _fingerprint(index, chosen)
                 earlier = None if overwrite else _finished_before(target, source)
-                if earlier is not None:
-                    reports.append(IndexReport(label, index.name, target, earlier, kept=True))
-                    continue
-                if target.resolve() in {band.file.resolve() for band in bands}:
+                if earlier is None and target.resolve() in {band.file.resolve() for band in bands}:
                     raise InputError(f"{target}: is the file of a band; give the formula '{index.name}' another name")
-                unit = common_unit(index, chosen, reader)
+                unit = earlier.unit if earlier is not None else _common_unit(index, chosen, reader)
             except InputError as error:
-                reports.append(IndexReport(label, index.name, problem=str(error)))
+                yield IndexReport(label, index.name, problem=str(error))
                 continue
-            statistics = _write(index, chosen, target, unit, source, reader)
-            reports.append(IndexReport(label, index.name, target, statistics))
-    return reports
+            statistics = earlier or _write(index, chosen, target, unit, source, reader)
+            yield IndexReport(label, index.name, target, statistics, kept=earlier is not None)
 
 
 def outdated_rasters(base: Path) -> Iterator[Path]:
@@ -159,7 +142,7 @@ def outdated_rasters(base: Path) -> Iterator[Path]:
             yield from (path, path.with_suffix(".png"))
 
 
-def chosen_bands(bands: Sequence[IndexBand], index: Index) -> list[IndexBand]:
+def _bands_of_index(bands: Sequence[IndexBand], index: Index) -> list[IndexBand]:
     """Return the bands of an index. Raises InputError if one is missing or not usable."""
     chosen = [bands[i] for i in bands_for(index, [b.name for b in bands], [b.wavelength_nm for b in bands])]
     for band in chosen:
@@ -170,18 +153,10 @@ def chosen_bands(bands: Sequence[IndexBand], index: Index) -> list[IndexBand]:
 
 def _fingerprint(index: Index, bands: Sequence[IndexBand]) -> str:
     """Sixteen hexadecimal digits of everything that an index raster depends on."""
-    sources = [(b.sha256 or _size_and_time(b.file), b.band_index) for b in bands]
+    sources = [(b.sha256, b.band_index) for b in bands]
     masks = [(b.quality[2], b.quality[1]) for b in bands if b.quality is not None]
     facts = json.dumps([__version__, index.formula, index.constants, index.span, sources, *([masks] if masks else [])])
     return hashlib.sha256(facts.encode()).hexdigest()[:16]
-
-
-def _size_and_time(path: Path) -> list[int]:
-    try:
-        state = path.stat()
-    except OSError:
-        return []
-    return [state.st_size, state.st_mtime_ns]
 
 
 def _finished_before(target: Path, source: str) -> IndexStatistics | None:
@@ -197,7 +172,7 @@ def _finished_before(target: Path, source: str) -> IndexStatistics | None:
     return statistics_in(tags) if tags.get("INDEX_MADE_FROM") == source else None
 
 
-def common_unit(index: Index, bands: Sequence[IndexBand], reader: BandReader) -> str:
+def _common_unit(index: Index, bands: Sequence[IndexBand], reader: BandReader) -> str:
     """Return the unit of the bands of an index.
 
     Raises InputError if units or sizes differ, also of quality flags, or if the index needs another unit.
@@ -278,24 +253,15 @@ def _statistics(
 
 
 def _draw(index: Index, raster: Path, sample: NDArray[np.float32], statistics: IndexStatistics) -> None:
-    """Write the picture of a raster. Raises OutputError."""
+    """Write the picture of a raster, and the histogram of a sample of its values in the same colours.
+
+    Raw numbers are drawn in greys. Raises OutputError.
+    """
     with open_raster(raster) as dataset:
         size_px = dataset.width, dataset.height
         # Longer side of the image at the top left of the picture; the report overlays it on the composite.
         picture_px = 720
         values = dataset.read(1, out_shape=reduced_size_px(size_px, max(1.0, max(size_px) / picture_px))[::-1])
-    note = ": raw numbers, not reflectance" if statistics.unit == RAW else ""
-    title = f"{index.name.upper()} of {raster.stem.removesuffix(f'_{index.name}')}{note}"
-    write_picture(values, sample, statistics, title, raster.with_suffix(".png"))
-
-
-def write_picture(
-    values: NDArray[np.float32], sample: NDArray[np.float32], statistics: IndexStatistics, title: str, path: Path
-) -> None:
-    """Write an image (height, width) of an index and the histogram of a sample of its values in the same colours.
-
-    Raw numbers are drawn in greys. Raises OutputError.
-    """
     span, neutral = (statistics.low, statistics.high), statistics.unit == RAW
     shape = values.shape
     width, margin, bars, bins = max(shape[1], 360), 24, 90, 120
@@ -314,7 +280,9 @@ def write_picture(
     for value in np.linspace(*span, 5):
         at = round(margin + (value - span[0]) / (span[1] - span[0]) * (width - 2 * margin))
         sheet = with_text(sheet, f"{value:.3g}" if abs(value) >= 100 else f"{value:.2f}", (at, base + 18), anchor="ms")
-    write_png(with_text(sheet, title, (margin, shape[0] + 18), 16), path)
+    note = ": raw numbers, not reflectance" if neutral else ""
+    title = f"{index.name.upper()} of {raster.stem.removesuffix(f'_{index.name}')}{note}"
+    write_png(with_text(sheet, title, (margin, shape[0] + 18), 16), raster.with_suffix(".png"))
 
 
 def _coloured(values: NDArray[Any], span: tuple[float, float], *, neutral: bool) -> NDArray[np.uint8]:

@@ -4,9 +4,9 @@ import csv
 import io
 import json
 import math
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
-from pathlib import Path
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path, PurePosixPath
 from typing import Any
 
 from agalign.errors import AgalignError
@@ -45,16 +45,20 @@ class IndexStatistics:
 
 @dataclass(frozen=True)
 class IndexReport:
-    """The result of one index of one capture."""
+    """One index of one capture."""
 
     capture: str
+    """Label of the capture: its folder, relative to the output folder of the run, and its name."""
     index: str
     path: Path | None = None
     """The raster; None if it could not be written."""
     statistics: IndexStatistics = IndexStatistics()
     problem: str = ""
-    kept: bool = False
+    kept: bool = field(default=False, compare=False)
     """True if an earlier command wrote the raster from the same bands with the same formula."""
+    captured_at: str = ""
+    latitude: float | None = None
+    longitude: float | None = None
 
     @property
     def median(self) -> float:
@@ -65,6 +69,18 @@ class IndexReport:
     def raw_numbers(self) -> bool:
         """True if the bands are neither reflectance nor radiance."""
         return self.statistics.unit == RAW
+
+    @property
+    def key(self) -> tuple[str, str, str]:
+        """Identify the row in the table: (folder, capture, index)."""
+        label = PurePosixPath(self.capture)
+        return label.parent.as_posix(), label.name, self.index
+
+    def of(self, sidecar: CaptureResult) -> "IndexReport":
+        """Return the report with the time and the position of its capture."""
+        place = sidecar.position
+        latitude, longitude = (None, None) if place is None else (place.latitude, place.longitude)
+        return replace(self, captured_at=sidecar.captured_at, latitude=latitude, longitude=longitude)
 
 
 def statistics_in(tags: Mapping[str, str]) -> IndexStatistics | None:
@@ -86,43 +102,8 @@ def read_statistics(path: Path) -> IndexStatistics | None:
         return None
 
 
-@dataclass(frozen=True)
-class IndexRow:
-    """One index of one capture."""
-
-    folder: str
-    capture: str
-    captured_at: str
-    latitude: float | None
-    longitude: float | None
-    index: str
-    file: str
-    """The raster, relative to the folder of the table; empty if it was not written."""
-    statistics: IndexStatistics
-    problem: str = ""
-
-    @property
-    def key(self) -> tuple[str, str, str]:
-        """Identify the row: (folder, capture, index)."""
-        return self.folder, self.capture, self.index
-
-    @property
-    def label(self) -> str:
-        """The capture with its folder."""
-        return Path(self.folder, self.capture).as_posix()
-
-
-def row_of(report: IndexReport, sidecar: CaptureResult, folder: str, out: Path) -> IndexRow:
-    """Return the row of a report; `folder` is the capture's, relative to the output folder of its run."""
-    file = "" if report.path is None else report.path.relative_to(out).as_posix()
-    place = sidecar.position
-    latitude, longitude = (None, None) if place is None else (place.latitude, place.longitude)
-    of_capture = folder, sidecar.capture, sidecar.captured_at, latitude, longitude
-    return IndexRow(*of_capture, report.index, file, report.statistics, report.problem)
-
-
-def rows_of_run(sidecar: CaptureResult, folder: str, out: Path) -> list[IndexRow]:
-    """Return the rows of the indices that the run itself wrote, from the tags of the rasters."""
+def reports_of_run(sidecar: CaptureResult, folder: str, out: Path) -> list[IndexReport]:
+    """Return the indices that the run itself wrote, from the tags of the rasters."""
     result = []
     for part in sidecar.products:
         path = out / folder / part.file
@@ -130,32 +111,23 @@ def rows_of_run(sidecar: CaptureResult, folder: str, out: Path) -> list[IndexRow
             name = path.stem.removeprefix(f"{Path(sidecar.capture).name}_")
             statistics = read_statistics(path)
             if statistics is not None:
-                report = IndexReport("", name, path, statistics)
-                result.append(row_of(report, sidecar, folder, out))
+                label = Path(folder, sidecar.capture).as_posix()
+                result.append(IndexReport(label, name, path, statistics).of(sidecar))
     return result
 
 
-def read_table(out: Path) -> list[IndexRow]:
+def read_table(out: Path) -> list[IndexReport]:
     """Return the rows of OUT/indices.csv whose rasters still exist; empty if there is no table."""
     try:
         text = read_regular(out / INDICES_FILE).decode()
         # Lines may have too few or too many cells.
-        rows = [_row(line) for line in csv.DictReader(io.StringIO(text))]
+        rows = [_row(line, out) for line in csv.DictReader(io.StringIO(text))]
     except (OSError, ValueError, KeyError, TypeError, AttributeError, csv.Error):
         return []
-    return [row for row in rows if not row.file or (out / row.file).is_file()]
+    return [row for row in rows if row.path is None or row.path.is_file()]
 
 
-def write_table(out: Path, rows: Iterable[IndexRow]) -> None:
-    """Write OUT/indices.csv. Raises OutputError."""
-    of_capture = "folder", "capture", "captured_at", "latitude", "longitude"
-    of_index = "index", "median", "p5", "p95", "valid_share", "masked_share", "input", "low", "high", "file", "problem"
-    columns, in_order = of_capture + of_index, sorted(rows, key=lambda row: row.key)
-    cells = [vars(row) | row.statistics.as_json() | {"input": row.statistics.unit} for row in in_order]
-    write_csv(out / INDICES_FILE, columns, ([one[name] for name in columns] for one in cells))
-
-
-def update_table(out: Path, rows: Sequence[IndexRow]) -> list[IndexRow]:
+def update_table(out: Path, rows: Sequence[IndexReport]) -> list[IndexReport]:
     """Add rows to OUT/indices.csv, replacing those of the same capture and index, and return all rows.
 
     An empty table is not written. Raises OutputError.
@@ -163,18 +135,38 @@ def update_table(out: Path, rows: Sequence[IndexRow]) -> list[IndexRow]:
     old = read_table(out)
     result = list({row.key: row for row in [*old, *rows]}.values())
     if result and (result != old or not (out / INDICES_FILE).is_file()):
-        write_table(out, result)
+        of_capture = "folder", "capture", "captured_at", "latitude", "longitude"
+        of_index = "index", "median", "p5", "p95", "valid_share", "masked_share", "input", "low", "high", "file"
+        columns = *of_capture, *of_index, "problem"
+        cells = (_cells(row, out) for row in sorted(result, key=lambda row: row.key))
+        write_csv(out / INDICES_FILE, columns, ([one[name] for name in columns] for one in cells))
     return result
 
 
-def _row(cells: Mapping[str, str]) -> IndexRow:
+def _cells(row: IndexReport, out: Path) -> dict[str, Any]:
+    folder, capture, _ = row.key
+    place = {"folder": folder, "capture": capture, "input": row.statistics.unit}
+    file = "" if row.path is None else row.path.relative_to(out).as_posix()
+    return vars(row) | row.statistics.as_json() | place | {"file": file}
+
+
+def _row(cells: Mapping[str, str], out: Path) -> IndexReport:
     cells = {k: _unquoted(v) for k, v in cells.items()}
     numbers = {k: float(cells[k] or "nan") for k in ("median", "p5", "p95", "valid_share", "low", "high")}
-    latitude, longitude = (float(cells[k]) if cells[k] else None for k in ("latitude", "longitude"))
-    of_capture = cells["folder"], cells["capture"], cells["captured_at"], latitude, longitude
     numbers["masked_share"] = float(cells.get("masked_share") or 0)  # older tables do not have it
-    statistics = IndexStatistics(unit=cells["input"], **numbers)
-    return IndexRow(*of_capture, cells["index"], cells["file"], statistics, cells["problem"])
+    path = out / cells["file"]
+    path.relative_to(out)  # raises ValueError for an absolute path, which no table has
+    latitude, longitude = (float(cells[k]) if cells[k] else None for k in ("latitude", "longitude"))
+    return IndexReport(
+        Path(cells["folder"], cells["capture"]).as_posix(),
+        path=path if cells["file"] else None,
+        statistics=IndexStatistics(unit=cells["input"], **numbers),
+        index=cells["index"],
+        problem=cells["problem"],
+        captured_at=cells["captured_at"],
+        latitude=latitude,
+        longitude=longitude,
+    )
 
 
 def _unquoted(text: str) -> str:

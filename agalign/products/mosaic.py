@@ -250,4 +250,4 @@ def _write_indices(path: Path, bands: Sequence[IndexBand], indices: Sequence[Ind
     """Write indices of the mosaic, in its format."""
     checksum = file_checksum(path) if indices else ""
     of_mosaic = [IndexBand(b.name, b.wavelength_nm, path, k, checksum) for k, b in enumerate(bands, start=1)]
-    return write_rasters(of_mosaic, indices, path.with_suffix(""), path.stem)
+    return [*write_rasters(of_mosaic, indices, path.with_suffix(""), path.stem)]

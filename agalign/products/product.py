@@ -174,7 +174,7 @@ class Product(ABC):
         return [paths.file(self.suffix)]
 
     @abstractmethod
-    def write(self, context: ProductContext) -> list[WrittenFile]:
+    def write(self, context: ProductContext) -> Iterable[WrittenFile]:
         """Write the files, each atomically, and return them; none if the capture lacks the input for them.
 
         Raises OutputError, or UnreadableFileError for an input.

@@ -16,7 +16,7 @@ from agalign.batch.index_run import index_tasks, run_indices
 from agalign.errors import ConfigurationError, InputError
 from agalign.products.index_bands import RAW, IndexBand
 from agalign.products.index_rasters import write_rasters
-from agalign.products.index_table import IndexReport, IndexRow, IndexStatistics, read_table, update_table
+from agalign.products.index_table import IndexReport, IndexStatistics, read_table, update_table
 from agalign.products.indices import (
     INDICES,
     Index,
@@ -38,7 +38,7 @@ NDVI, NDRE = INDICES["ndvi"], INDICES["ndre"]
 
 def run(out: Path, *indices: Index, target: Path | None = None, overwrite: bool = False) -> list[IndexReport]:
     tasks = index_tasks(out, indices or (NDVI,), target or out, overwrite=overwrite)
-    return [r for done in run_indices(tasks, jobs=1) for r in done.reports]
+    return [r for done in run_indices(tasks, jobs=1) for r in done]
 
 
 NO_FORMULAS = """__import__('os').system('true')\nN.real\n(lambda: N)()\nN if R else B\n[N][0]\nN; R\nN @ R\n'a'*N
@@ -201,7 +201,7 @@ def test_the_table_has_a_row_per_capture_and_index(tmp_path: Path) -> None:
 @pytest.mark.parametrize("line", [",,", "," * 40 + "x", "a\0b", "1,2,3"])
 def test_a_damaged_table_is_written_again(tmp_path: Path, line: str) -> None:
     statistics = IndexStatistics(masked_share=0.25)
-    update_table(tmp_path, [IndexRow("", "IMG_0001", "", None, None, "ndvi", "", statistics, "left out")])
+    update_table(tmp_path, [IndexReport("IMG_0001", "ndvi", None, statistics, "left out")])
     assert [row.statistics.masked_share for row in read_table(tmp_path)] == [0.25]
     path = tmp_path / "indices.csv"
     path.write_text(f"{path.read_text()}{line}\n")
@@ -249,7 +249,7 @@ def test_processes_write_what_one_process_writes(tmp_path: Path) -> None:
     make_aligned(tmp_path, 20)
     serial = {r.capture: r.statistics for r in run(tmp_path, target=tmp_path / "a")}
     tasks = index_tasks(tmp_path, [NDVI], tmp_path / "b")
-    parallel = {r.capture: r.statistics for d in run_indices(tasks, jobs=2) for r in d.reports}
+    parallel = {r.capture: r.statistics for d in run_indices(tasks, jobs=2) for r in d}
     assert parallel == serial
     one, other = (tmp_path / n / "0000SET" / "IMG_0007_ndvi.tif" for n in "ab")
     assert one.read_bytes() == other.read_bytes()

@@ -36,7 +36,7 @@ def written(folder: Path, settings: agalign.Settings = ONLY_SEED, **options: Any
 
 def indices_of(out: Path, *names: str) -> list[IndexReport]:
     tasks = index_tasks(out, [INDICES[name] for name in names], out, overwrite=True)
-    return [report for done in run_indices(tasks) for report in done.reports]
+    return [report for done in run_indices(tasks) for report in done]
 
 
 @pytest.fixture
@@ -138,7 +138,7 @@ def test_indices_and_error_map_are_removed_if_not_requested(calibrated: Path) ->
     table = (out / "indices.csv").read_text().splitlines()
     assert [line.split(",")[5] for line in table] == ["index", "ndvi", "savi"]
     (task,) = index_tasks(out, [INDICES["ndvi"]], out)
-    (report,) = do_indices(task).reports
+    (report,) = do_indices(task)
     assert report.kept, "the command does not replace them: their checksums are in the sidecar"
     assert [problems for _, problems in verify_outputs(out)] == [[]]
     (path,) = out.rglob("*.error.tif")

@@ -189,7 +189,7 @@ def test_links_in_an_output_folder_are_not_read_written_or_emptied(tmp_path: Pat
     target.mkdir()
     (target / "0000SET").symlink_to(secret)
     (result,) = run_indices(index_tasks(out, [index_named("ndvi")], target))
-    assert "a link leads out" in result.reports[0].problem
+    assert "a link leads out" in result[0].problem
     band = Band("Green", tmp_path / "IMG_0001_2.tif", 1, 9, 9, "uint16")
     discard_outputs(Capture("IMG_0001", Path("0000SET"), (band,), 0), out, agalign.WriteSettings())
     assert not sidecar.exists()

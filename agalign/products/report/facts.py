@@ -13,7 +13,7 @@ import numpy as np
 from pydantic import BaseModel
 
 from agalign.products.index_bands import RAW
-from agalign.products.index_table import IndexRow
+from agalign.products.index_table import IndexReport
 from agalign.products.report.light import CaptureLight, light_of
 from agalign.products.run_record import RefusalPart
 from agalign.products.sidecar import BandPart, BandResult, CaptureResult, GridPart, OutputPart, PreviewPart, Sidecar
@@ -199,18 +199,19 @@ class FlightFacts:
         missing = keys | {"status": "missing", "reason": MISSING_BAND.cause}
         self.rows += [missing | {"band": name} for name in sidecar.missing_bands]
 
-    def add_indices(self, rows: Sequence[IndexRow]) -> None:
-        """Add the spectral indices of captures that were added before."""
+    def add_indices(self, rows: Sequence[IndexReport], out: Path) -> None:
+        """Add the spectral indices, of files below `out`, of captures that were added before."""
         by_label = {c["label"]: c["indices"] for c in self.captures}
         for row in rows:
-            if row.file and row.label in by_label:
+            if row.path is not None and row.capture in by_label:
                 statistics = row.statistics.as_json()
                 facts = {name: rounded(statistics[name]) for name in ("median", "p5", "p95")}
                 facts |= {"name": row.index, "valid": row.statistics.valid_share, "unit": row.statistics.unit}
                 facts |= {"masked": row.statistics.masked_share}
                 facts |= {"span": (statistics["low"], statistics["high"]), "raw": row.statistics.unit == RAW}
-                picture = Path(row.file).with_suffix(".png").as_posix()
-                by_label[row.label].append(facts | {"file": quote(row.file), "picture": quote(picture)})
+                file = row.path.relative_to(out)
+                links = {"file": quote(file.as_posix()), "picture": quote(file.with_suffix(".png").as_posix())}
+                by_label[row.capture].append(facts | links)
 
     def as_json(self) -> dict[str, Any]:
         """Return the data of the schema `agalign-report/1`. The script of the page declares their types."""

@@ -19,7 +19,7 @@ from agalign._version import __version__
 from agalign.config import Settings
 from agalign.errors import SidecarError
 from agalign.products.excluded_captures import PANELS_FILE, SKY_FILE, PanelPart, SkyPart, read_panels, read_sky
-from agalign.products.index_table import IndexRow, rows_of_run, update_table
+from agalign.products.index_table import IndexReport, reports_of_run, update_table
 from agalign.products.report.facts import BAND_COLUMNS, FailureGroup, FlightFacts, masked_shares
 from agalign.products.report.light import light_charts
 from agalign.products.report.radiometric_check import CaptureLevels, radiometric_check
@@ -52,7 +52,7 @@ def write_pages(out: Path, on_problem: Callable[[str], None]) -> Pages:
     Unreadable files are reported to `on_problem` and left out; the pages then count as outdated in `pages_exist`.
     Raises OutputError.
     """
-    indices: list[IndexRow] = []
+    indices: list[IndexReport] = []
     unreadable: list[str] = []
     facts, levels = FlightFacts(), list[CaptureLevels | None]()
     for path in find_sidecars(out):
@@ -62,7 +62,7 @@ def write_pages(out: Path, on_problem: Callable[[str], None]) -> Pages:
         except SidecarError as error:
             unreadable.append(str(error))
             continue
-        indices += rows_of_run(sidecar, folder, out)
+        indices += reports_of_run(sidecar, folder, out)
         facts.add(folder, sidecar)
         levels.append(CaptureLevels.of(path, facts.light[-1], sidecar))
     panels: list[PanelPart] = []
@@ -73,7 +73,7 @@ def write_pages(out: Path, on_problem: Callable[[str], None]) -> Pages:
     except SidecarError as error:
         unreadable.append(str(error))
     _write_summary(out / SUMMARY_FILE, facts.rows, panels, sky)
-    facts.add_indices(update_table(out, indices))
+    facts.add_indices(update_table(out, indices), out)
     failures = facts.pairs.groups()
     slowest = sorted(((c["label"], c["seconds"]) for c in facts.captures), key=lambda c: -c[1])[:5]
     write_text(out / REPORT_FILE, _page(out, facts, levels, panels, sky, run, unreadable.append))
