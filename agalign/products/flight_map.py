@@ -64,12 +64,16 @@ class FlightMap:
         Captures of earlier runs whose sidecars are still in the folder are kept, as in the report. Index rasters that
         `agalign indices` wrote in earlier commands are linked too.
         """
-        by_label = {f["id"]: f for f in features_in(self._out) if _has_sidecar(f, self._out)} | self._features
+        earlier = {f["id"]: f for f in features_in(self._out) if self._has_sidecar(f["properties"].get("sidecar"))}
+        by_label = earlier | self._features
         features = [by_label[label] for label in sorted(by_label)]
         if not any(f.get("geometry") for f in features):
             return None
         _write(self._out, features, read_table(self._out))
         return self._out / FLIGHT_MAP_FILE
+
+    def _has_sidecar(self, file: object) -> bool:
+        return isinstance(file, str) and (self._out / file).is_file()
 
 
 def link_indices(out: Path, rows: Iterable[IndexReport]) -> None:
@@ -94,11 +98,6 @@ def features_in(out: Path) -> list[dict[str, Any]]:
     except (OSError, ValueError, KeyError, TypeError):
         return []
     return features if is_of_a_run else []
-
-
-def _has_sidecar(feature: dict[str, Any], out: Path) -> bool:
-    sidecar = feature["properties"].get("sidecar")
-    return isinstance(sidecar, str) and (out / sidecar).is_file()
 
 
 def _write(out: Path, features: Sequence[dict[str, Any]], rows: Iterable[IndexReport]) -> None:

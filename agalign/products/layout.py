@@ -110,7 +110,11 @@ def _on_frame(mapping: PixelMapping, frame: OutputGrid, reference: Band) -> Pixe
 
 def common_grid(reference: Band, settings: WriteSettings, limits: FlightLimits) -> OutputGrid | None:
     """Return the grid of all captures of a camera, given the limits of its flights; None if each has its own."""
-    of_flight = _between_files(limits, reference)
+    of_flight = [
+        (PixelMapping(matrix, reference.lens, band.lens), band)
+        for matrix, band in limits
+        if (band.lens is None) == (reference.lens is None)
+    ]
     if settings.crop != "flight" or not of_flight:
         return None
     frame = _frame(reference, [mapping for mapping, _ in of_flight], settings)
@@ -118,24 +122,14 @@ def common_grid(reference: Band, settings: WriteSettings, limits: FlightLimits) 
     if frame.undistorted or frame.scale != SAME_PIXELS:  # a reference that is resampled has a border too
         mapped.append((_on_frame(PixelMapping(geometry.identity()), frame, reference), reference))
     area = common_area(mapped, frame.width, frame.height)
+    if area is None:
+        return frame
     # The crop of a flight is smaller by this: captures that the rig was not learned from may exceed its extremes.
-    flight_margin_px = 2
-    return frame if area is None else replace(frame, **vars(_inset(area, flight_margin_px)))
-
-
-def _between_files(limits: FlightLimits, reference: Band) -> list[tuple[PixelMapping, Band]]:
-    """The limits as mappings between raw pixels of the files, and their bands."""
-    return [
-        (PixelMapping(matrix, reference.lens, band.lens), band)
-        for matrix, band in limits
-        if (band.lens is None) == (reference.lens is None)
-    ]
-
-
-def _inset(tile: Tile, margin_px: int) -> Tile:
-    if 2 * margin_px >= min(tile.width, tile.height) // 2:
-        return tile
-    return Tile(tile.x0 + margin_px, tile.y0 + margin_px, tile.width - 2 * margin_px, tile.height - 2 * margin_px)
+    margin_px = 2
+    if min(area.width, area.height) // 2 > 2 * margin_px:
+        size_px = area.width - 2 * margin_px, area.height - 2 * margin_px
+        area = Tile(area.x0 + margin_px, area.y0 + margin_px, *size_px)
+    return replace(frame, **vars(area))
 
 
 def _covers(mappings: list[tuple[PixelMapping, Band]], tile: Tile) -> bool:

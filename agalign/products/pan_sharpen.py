@@ -61,7 +61,10 @@ class PanSharpened(Product):
         sources = _sources(context, settings)
         if sources is None:
             return []
-        _write(sources, path, context, settings)
+        with scratch_file(path) as unsharpened:
+            write_raster(context.capture, sources.layers, sources.grid, unsharpened, settings)
+            with open_raster(unsharpened) as file:
+                _sharpen(file, path, sources)
         return [WrittenFile(self.kind, path, StacAsset("pan", GEOTIFF, ("data",)))]
 
 
@@ -79,10 +82,26 @@ class _Sources:
     """The layers that a sharpened file is calculated from, all on one grid."""
 
     bands: list[Layer]
-    is_sharpened: list[bool]
-    """For each of `bands`: True if it is within the spectral range of the panchromatic band."""
     pan: list[Layer]
     grid: OutputGrid
+    is_raw: bool = False
+    """The numbers have the sensor's black level."""
+
+    @property
+    def layers(self) -> list[Layer]:
+        """All layers, those of the panchromatic band last."""
+        return [*self.bands, *self.pan]
+
+    @property
+    def is_sharpened(self) -> list[bool]:
+        """For each of `bands`: True if it is within the spectral range of the panchromatic band."""
+        return [_is_in_range(layer.band, [pan.band for pan in self.pan]) for layer in self.bands]
+
+    @property
+    def black_levels(self) -> NDArray[np.float32]:
+        """(n,) of `layers`: Brovey ratios are ratios of light, which is without them."""
+        calibrations = [layer.band.radiometry if self.is_raw else None for layer in self.layers]
+        return np.array([0.0 if c is None else c.black_level for c in calibrations], np.float32)
 
 
 def _sources(context: ProductContext, settings: WriteSettings) -> _Sources | None:
@@ -92,15 +111,9 @@ def _sources(context: ProductContext, settings: WriteSettings) -> _Sources | Non
         return None
     common = common_grid(context.capture.reference, settings, context.limits)
     layers, grid = output_layers(context.capture, usable, settings, common)
-    bands = [layer for layer in layers if _is_multispectral(layer, pan)]
-    is_sharpened = [_is_in_range(layer.band, pan) for layer in bands]
-    if not any(is_sharpened):
-        return None
-    return _Sources(bands, is_sharpened, [layer for layer in layers if layer.band in pan], grid)
-
-
-def _is_multispectral(layer: Layer, pan: Sequence[Band]) -> bool:
-    return not (layer.is_gap or layer.band in pan or layer.band.companion or is_thermal(layer.band))
+    others = [la for la in layers if not (la.is_gap or la.band in pan or la.band.companion or is_thermal(la.band))]
+    sources = _Sources(others, [la for la in layers if la.band in pan], grid, settings.radiometry == "off")
+    return sources if any(sources.is_sharpened) else None
 
 
 def _is_in_range(band: Band, pan: Sequence[Band]) -> bool:
@@ -113,17 +126,6 @@ def _is_in_range(band: Band, pan: Sequence[Band]) -> bool:
         centre, width = pan[0].wavelength_nm, pan[0].bandwidth_nm
         low, high = (-math.inf, math.inf) if not centre or not width else (centre - width / 2, centre + width / 2)
     return low <= band.wavelength_nm <= high
-
-
-def _write(sources: _Sources, path: Path, context: ProductContext, settings: WriteSettings) -> None:
-    """Write the sharpened bands. Raises OutputError, or UnreadableFileError for an input."""
-    layers = [*sources.bands, *sources.pan]
-    # Brovey ratios are ratios of light: without the sensor's black level.
-    black_levels = np.array([_black_level(layer.band, settings) for layer in layers], np.float32)
-    with scratch_file(path) as unsharpened:
-        nodata = write_raster(context.capture, layers, sources.grid, unsharpened, settings)
-        with open_raster(unsharpened) as file:
-            _sharpen(file, path, sources, black_levels, nodata)
 
 
 def weights_of(bands: Sequence[FloatImage], pan: FloatImage, scale: float) -> NDArray[np.float64]:
@@ -151,53 +153,38 @@ def brovey_ratio(bands: Sequence[FloatImage], pan: FloatImage, weights: NDArray[
     return np.asarray(np.clip(np.nan_to_num(ratio, nan=1.0), 1 / max_ratio, max_ratio), np.float32)
 
 
-def _sharpen(
-    file: OpenRaster, target: Path, sources: _Sources, black_levels: NDArray[np.float32], nodata: float | None
-) -> None:
+def _sharpen(file: OpenRaster, target: Path, sources: _Sources) -> None:
     """Write the sharpened bands, given a file of the resampled bands followed by the panchromatic ones."""
-    count, dtype = len(sources.bands), np.dtype(file.dtypes[0])
-    in_range = [k for k, is_sharpened in enumerate(sources.is_sharpened) if is_sharpened]
+    count, dtype, nodata = len(sources.bands), np.dtype(file.dtypes[0]), file.nodata
+    black_levels, is_sharpened = sources.black_levels, sources.is_sharpened
+    in_range = np.flatnonzero(is_sharpened)
+
+    def read(tile: Tile) -> tuple[FloatImage, Mask]:
+        """((bands, height, width) without black level, nan for nodata; mask of valid pixels)."""
+        pixels = file.read(window=Window(tile.x0, tile.y0, tile.width, tile.height)).astype(np.float32)
+        valid = data_mask(pixels, nodata)
+        return np.where(valid, pixels - black_levels[:, None, None], np.float32(np.nan)), valid
+
     width, height = min(file.width, _TILE_PX), min(file.height, _TILE_PX)
-    sample = Tile((file.width - width) // 2, (file.height - height) // 2, width, height)
-    light, _ = _read(file, sample, black_levels, nodata)
-    weights = weights_of([light[k] for k in in_range], light[count:].mean(axis=0), max(sources.grid.scale))
-    profile = file.profile | {"count": count, "compress": "deflate", "predictor": predictor(dtype.kind)}
+    light, _ = read(Tile((file.width - width) // 2, (file.height - height) // 2, width, height))
+    weights = weights_of([*light[in_range]], light[count:].mean(axis=0), max(sources.grid.scale))
 
     def blocks() -> Iterator[Block]:
         for tile in tiles(Tile(0, 0, file.width, file.height), _TILE_PX):
-            light, valid = _read(file, tile, black_levels, nodata)
-            ratio = brovey_ratio([light[k] for k in in_range], light[count:].mean(axis=0), weights)
-            for k, is_sharpened in enumerate(sources.is_sharpened):
-                values = (light[k] * ratio if is_sharpened else light[k]) + black_levels[k]
+            light, valid = read(tile)
+            ratio = brovey_ratio([*light[in_range]], light[count:].mean(axis=0), weights)
+            for k in range(count):
+                values = (light[k] * ratio if is_sharpened[k] else light[k]) + black_levels[k]
                 pixels = as_type(values if dtype.kind == "f" else np.nan_to_num(values), dtype)
                 yield pixels if nodata is None else with_nodata(pixels, valid[k], nodata), k + 1, tile.x0, tile.y0
 
+    pan, texts = sources.pan[0].band, ["no"] * count
+    for k, weight in zip(in_range, weights.tolist(), strict=True):
+        texts[k] = f"weighted Brovey by {'the colour photograph' if pan.companion else pan.name}, weight {weight:.4g}"
+    layers = [
+        LayerDescription(la.band.name, unit or "", file.tags(k) | {"PANSHARPENED": text}, file.tags(k, ns="IMAGERY"))
+        for k, (la, unit, text) in enumerate(zip(sources.bands, file.units, texts, strict=False), start=1)
+    ]
     tags = {k: v for k, v in file.tags().items() if k != "AREA_OR_POINT"}
-    write_layers(target, profile, _descriptions(file, sources, weights), tags, blocks())
-
-
-def _black_level(band: Band, settings: WriteSettings) -> float:
-    if settings.radiometry != "off" or band.radiometry is None:
-        return 0.0
-    return band.radiometry.black_level
-
-
-def _read(
-    file: OpenRaster, tile: Tile, black_levels: NDArray[np.float32], nodata: float | None
-) -> tuple[FloatImage, Mask]:
-    """((bands, height, width) without black level, nan for nodata; mask of valid pixels)."""
-    pixels = file.read(window=Window(tile.x0, tile.y0, tile.width, tile.height)).astype(np.float32)
-    valid = data_mask(pixels, nodata)
-    return np.where(valid, pixels - black_levels[:, None, None], np.float32(np.nan)), valid
-
-
-def _descriptions(source: OpenRaster, sources: _Sources, weights: NDArray[np.float64]) -> list[LayerDescription]:
-    pan = sources.pan[0].band
-    pan_name = "the colour photograph" if pan.companion else pan.name
-    remaining, result = iter(weights.tolist()), []
-    for index, (layer, is_sharpened) in enumerate(zip(sources.bands, sources.is_sharpened, strict=True), start=1):
-        text = f"weighted Brovey by {pan_name}, weight {next(remaining):.4g}" if is_sharpened else "no"
-        tags = source.tags(index) | {"PANSHARPENED": text}
-        unit, imagery = source.units[index - 1] or "", source.tags(index, ns="IMAGERY")
-        result.append(LayerDescription(layer.band.name, unit, tags, imagery))
-    return result
+    profile = file.profile | {"count": count, "compress": "deflate", "predictor": predictor(dtype.kind)}
+    write_layers(target, profile, layers, tags, blocks())

@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agalign.cameras.base import is_thermal
-from agalign.products.drawing import Grey, Picture, ReducedBands, encoded, side_by_side, titled, write_png
+from agalign.products.drawing import Grey, ReducedBands, encoded, side_by_side, titled, write_png
 from agalign.products.indices import ROLES
 from agalign.products.product import Product, ProductContext, StacAsset, WrittenFile
 from agalign.products.quality_raster import error_lattice_px
@@ -143,7 +143,13 @@ def _sheet(
     detail_px = _whole_blocks(tile_px[0] * detail_share, width), _whole_blocks(tile_px[1] * detail_share, height)
     first = next(images[n] for n in bands for images in (views.after, views.before) if n in images)
     x, y = busiest_window(first, detail_px)
-    rows = _rows_of_bands(views, bands, errors_px, tile_px, np.s_[y : y + detail_px[1], x : x + detail_px[0]])
+    black = np.zeros(views.size_px[::-1], np.uint8)
+    before, after = ([images.get(n, black) for n in bands] for images in (views.before, views.after))
+    rows = [[_resized(image, tile_px) for image in images] for images in (before, after)]
+    rows += [[image[y : y + detail_px[1], x : x + detail_px[0]] for image in images] for images in (before, after)]
+    if errors_px:
+        errors = {name: np.nan_to_num(e / ERROR_FULL_PX, nan=1.0).clip(0, 1) * 255 for name, e in errors_px.items()}
+        rows.append([_resized(np.asarray(errors.get(n, black), np.uint8), tile_px) for n in bands])
     if relief is not None:
         rows.append([_resized(relief.grey, tile_px)])
     strips = [np.hstack(row) for row in rows]
@@ -158,24 +164,6 @@ def _sheet(
         relief=None if relief is None else _relief_part(relief),
     )
     return part, np.asarray(sheet, np.uint8)
-
-
-def _rows_of_bands(
-    views: ReducedBands,
-    bands: Sequence[str],
-    errors_px: Mapping[str, NDArray[np.float32]],
-    tile_px: tuple[int, int],
-    detail: tuple[slice, slice],
-) -> list[list[Grey]]:
-    """The rows of the preview that have a picture of each band: all but that of the relief."""
-    greys = views.before, views.after, {name: _as_grey(error_px) for name, error_px in errors_px.items()}
-    black = np.zeros(views.size_px[::-1], np.uint8)
-    before, after, errors = ([images.get(n, black) for n in bands] for images in greys)
-    rows = [[_resized(image, tile_px) for image in images] for images in (before, after)]
-    rows += [[image[detail] for image in images] for images in (before, after)]
-    if errors_px:
-        rows.append([_resized(image, tile_px) for image in errors])
-    return rows
 
 
 def _whole_blocks(length_px: float, max_px: int) -> int:
@@ -194,10 +182,6 @@ def _relief_part(relief: ReliefView) -> ReliefPreviewPart:
     low, high = relief.limits_px
     range_m = None if relief.range_m is None else (round(relief.range_m[0], 3), round(relief.range_m[1], 3))
     return ReliefPreviewPart(parallax_px=(round(low, 2), round(high, 2)), range_m=range_m)
-
-
-def _as_grey(error_px: NDArray[np.float32]) -> Grey:
-    return np.asarray(np.nan_to_num(error_px / ERROR_FULL_PX, nan=1.0).clip(0, 1) * 255, np.uint8)
 
 
 class BeforeAfterPicture(Product):
@@ -228,14 +212,11 @@ def choose_bands(moving: list[Band], reference: Band) -> list[Band]:
 
 
 def write_picture(views: ReducedBands, names: Sequence[str], path: Path) -> None:
-    """Write the picture of three bands as red, green and blue. Raises OutputError."""
+    """Write the picture of three bands as red, green and blue: before and after alignment, each with an overview of
+    480 px and a detail, which is enlarged from 160 px, below it. Raises OutputError.
+    """
     before, after = (np.stack([bands[name] for name in names], axis=-1) for bands in (views.before, views.after))
-    write_png(_before_and_after(before, after, f"before: {', '.join(names)} as red, green, blue", "after"), path)
-
-
-def _before_and_after(before: Picture, after: Picture, title_before: str, title_after: str) -> Picture:
-    """Each with an overview of 480 px and a detail, which is enlarged from 160 px, below it."""
-    height, width = before.shape[:2]
+    width, height = views.size_px
     size_px, gap_px = (480, max(1, round(480 * height / width))), 8
     detail_width = min(width, 160)
     detail_height = max(1, min(height, round(detail_width * height / width)))
@@ -243,14 +224,14 @@ def _before_and_after(before: Picture, after: Picture, title_before: str, title_
     x1, y1 = x0 + detail_width, y0 + detail_height
     scale = size_px[0] / width
     columns = []
-    for image, title in ((before, title_before), (after, title_after)):
+    for image, title in ((before, f"before: {', '.join(names)} as red, green, blue"), (after, "after")):
         overview = cv2.resize(image, size_px, interpolation=cv2.INTER_AREA)
         corners = (round(x0 * scale), round(y0 * scale)), (round(x1 * scale), round(y1 * scale))
         cv2.rectangle(overview, *corners, (255, 255, 255), 1)
         detail = cv2.resize(image[y0:y1, x0:x1], size_px, interpolation=cv2.INTER_NEAREST)
         gap = np.full((gap_px, size_px[0], 3), 255, np.uint8)
         columns.append(titled(np.vstack([overview, gap, detail]), title, height_px=26))
-    return side_by_side(columns, gap_px)
+    write_png(side_by_side(columns, gap_px), path)
 
 
 def busiest_window(image: Grey, size_px: tuple[int, int]) -> tuple[int, int]:

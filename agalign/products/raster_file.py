@@ -70,7 +70,9 @@ def write_raster(
     raw = settings.radiometry == "off"
     dtype = np.result_type(*(layer.band.dtype for layer in layers)) if raw else np.dtype(np.float32)
     nodata = nodata_value(capture, layers, grid, dtype, settings)
-    compression = _compression(settings, all_bands=len(layers) == len(capture.bands))
+    # Many programs that read files of single bands do not support Zstandard.
+    fits_all = "deflate" if settings.layout == "bands" or len(layers) < len(capture.bands) else "zstd"
+    compression = fits_all if settings.compression == "auto" else settings.compression
     options: dict[str, object] = {"interleave": "band", "photometric": "minisblack"}
     if nodata is not None:
         options["nodata"] = nodata
@@ -166,25 +168,24 @@ def _blocks(
 ) -> Iterator[Block]:
     for index, layer in enumerate(layers, start=1):
         for tile in tiles(grid.tile, WORK_TILE_PX):
-            pixels, valid = _tile_of(layer, tile, settings)
-            if pixels is None:
-                pixels = np.full((tile.height, tile.width), 0 if nodata is None else nodata, dtype=dtype)
-            elif nodata is not None and not (valid.all() and layer.is_copied):
-                pixels = with_nodata(pixels.astype(dtype, copy=False), valid, nodata)
-            yield pixels.astype(dtype, copy=False), index, tile.x0 - grid.x0, tile.y0 - grid.y0
+            if layer.is_gap:
+                pixels: Pixels = np.full((tile.height, tile.width), 0 if nodata is None else nodata, dtype=dtype)
+            else:
+                pixels, valid = _tile_of(layer, tile, settings)
+                pixels = pixels.astype(dtype, copy=False)
+                if nodata is not None and not (valid.all() and layer.is_copied):
+                    pixels = with_nodata(pixels, valid, nodata)
+            yield pixels, index, tile.x0 - grid.x0, tile.y0 - grid.y0
 
 
-def _tile_of(layer: Layer, tile: Tile, settings: WriteSettings) -> tuple[Pixels | None, Mask]:
-    """A layer's pixels (height, width) on a tile and their mask; no pixels for a layer without any."""
-    if layer.is_gap:
-        return None, np.zeros((tile.height, tile.width), dtype=bool)
+def _tile_of(layer: Layer, tile: Tile, settings: WriteSettings) -> tuple[Pixels, Mask]:
+    """The pixels (height, width) of a layer that has any on a tile, and their mask."""
     radiometry = layer.vignetting if settings.radiometry == "off" else layer.band.radiometry
     pixels, valid = layer_pixels(layer, tile, settings.interpolation, radiometry)
     if layer.vignetting is not None:
         pixels = as_type(pixels.astype(np.float32) + layer.vignetting.black_level, np.dtype(layer.band.dtype))
     if settings.fill_occluded and layer.mapping is not None:
-        positions = layer.mapping.positions(tile)
-        fillable = layer.mapping.hidden(tile) & is_inside(positions, layer.band)
+        fillable = layer.mapping.hidden(tile) & is_inside(layer.mapping.positions(tile), layer.band)
         return _with_occluded(pixels, valid, fillable)
     return pixels, valid
 
@@ -207,13 +208,6 @@ def _with_occluded(pixels: Pixels, valid: Mask, occluded: Mask) -> tuple[Pixels,
     occluded = occluded & (distance_px < _FILL_DISTANCE_PX)
     filled = fillnodata(np.where(valid, pixels, 0).astype(np.float32), valid, _FILL_DISTANCE_PX)
     return np.where(occluded, as_type(filled, pixels.dtype), pixels), valid | occluded
-
-
-def _compression(settings: WriteSettings, *, all_bands: bool) -> str:
-    """Deflate for files of single bands: many programs that read them do not support Zstandard."""
-    if settings.compression != "auto":
-        return settings.compression
-    return "zstd" if all_bands and settings.layout != "bands" else "deflate"
 
 
 def to_cog(path: Path, compression: str = "deflate") -> None:
@@ -240,7 +234,8 @@ def nodata_value(
         return declared
     if dtype.kind == "f":
         return math.nan  # input files may contain nan without declaring it
-    return _unused_value(layers, grid, dtype) if _has_invalid_pixels(layers, grid) else None
+    may_lack_pixels = any(la.is_gap or la.band.nodata is not None or la.band.has_mask for la in layers)
+    return _unused_value(layers, grid, dtype) if grid.has_gaps or may_lack_pixels else None
 
 
 def with_nodata(pixels: Pixels, valid: Mask, nodata: float) -> Pixels:
@@ -248,20 +243,14 @@ def with_nodata(pixels: Pixels, valid: Mask, nodata: float) -> Pixels:
 
     Valid pixels that equal nodata change by the smallest step of their type.
     """
+    dtype = pixels.dtype
     if not math.isnan(nodata):
-        pixels = np.where(valid & (pixels == nodata), pixels.dtype.type(_next_value(nodata, pixels.dtype)), pixels)
-    return np.where(valid, pixels, pixels.dtype.type(nodata))
-
-
-def _next_value(nodata: float, dtype: np.dtype[Any]) -> float:
-    if dtype.kind == "f":
-        return nodata + float(np.spacing(np.abs(dtype.type(nodata)) + 1))
-    return nodata + 1 if nodata < np.iinfo(str(dtype)).max else nodata - 1
-
-
-def _has_invalid_pixels(layers: Sequence[Layer], grid: OutputGrid) -> bool:
-    masked = (layer.band.nodata is not None or layer.band.has_mask for layer in layers)
-    return grid.has_gaps or any(layer.is_gap for layer in layers) or any(masked)
+        if dtype.kind == "f":
+            step = float(np.spacing(np.abs(dtype.type(nodata)) + 1))
+        else:
+            step = 1 if nodata < np.iinfo(str(dtype)).max else -1
+        pixels = np.where(valid & (pixels == nodata), dtype.type(nodata + step), pixels)
+    return np.where(valid, pixels, dtype.type(nodata))
 
 
 def _unused_value(layers: Sequence[Layer], grid: OutputGrid, dtype: np.dtype[Any]) -> float:

@@ -113,11 +113,14 @@ def test_gaps_keep_nodata_and_unseen_bands_are_not_sharpened(tmp_path: Path, nod
     planes = np.stack([np.full_like(pan, 3000), np.full_like(pan, 2000), pan]).astype(dtype)
     planes[:, :20] = nodata
     write_band(tmp_path / "layers.tif", planes, nodata=nodata)
-    layers = [Layer(Band(n, tmp_path, 1, 320, 240, "uint16"), None) for n in ("Green", "NIR", "Panchro")]
+    bands = [
+        Band(name, tmp_path, 1, 320, 240, "uint16", wavelength_nm=nm, bandwidth_nm=width_nm)
+        for name, nm, width_nm in (("Green", 560.0, 20.0), ("NIR", 900.0, 40.0), ("Panchro", 634.5, 463.0))
+    ]
+    layers = [Layer(band, None) for band in bands]
     grid = OutputGrid(0, 0, 320, 240, PixelScale(2.0, 2.0))
     with open_raster(tmp_path / "layers.tif") as file:
-        sources = _Sources(layers[:2], [True, False], layers[2:], grid)
-        _sharpen(file, tmp_path / "out.tif", sources, np.zeros(3, np.float32), nodata)
+        _sharpen(file, tmp_path / "out.tif", _Sources(layers[:2], layers[2:], grid))
     with rasterio.open(tmp_path / "out.tif") as file:
         result = file.read()
     assert (result[:, :20] == nodata).all()
