@@ -79,7 +79,9 @@ def band_file_names(capture: Capture) -> dict[str, Path]:
     bands_per_file = Counter(b.path for b in capture.bands)
     # Files of several bands with a lens each.
     split = {b.path for b in capture.bands if not b.one_lens and bands_per_file[b.path] > 1}
-    by_folder = _has_namesakes_in_folders([*bands_per_file])
+    files = bands_per_file.keys()
+    has_namesakes = len({p.stem for p in files}) < len(files)
+    by_folder = has_namesakes and len({p.parent for p in files}) > 1
     names: dict[str, Path] = {}
     taken: dict[Path, Path] = {}
     band_names: dict[str, str] = {}
@@ -94,11 +96,6 @@ def band_file_names(capture: Capture) -> dict[str, Path]:
         taken[name] = band.path
         names[band.name] = name
     return names
-
-
-def _has_namesakes_in_folders(files: Sequence[Path]) -> bool:
-    """True if files of the same name are in several folders."""
-    return len({p.stem for p in files}) < len(files) and len({p.parent for p in files}) > 1
 
 
 def _vignettings(layers: Sequence[Layer], grid: OutputGrid) -> dict[str, GridVignetting]:

@@ -12,7 +12,7 @@ from PIL import Image, ImageDraw, ImageFont
 
 from agalign.errors import OutputError, UnreadableFileError
 from agalign.pixels.raster import read_preview
-from agalign.values.capture import Band, Capture
+from agalign.values.capture import Capture
 from agalign.values.files import complete_file
 from agalign.values.image import OutputGrid, reduced_size_px
 
@@ -49,7 +49,9 @@ def read_reduced_bands(capture: Capture, places: Mapping[str, tuple[Path, int]],
     before, saturated = {}, {}
     for band in capture.bands:
         with suppress(UnreadableFileError):  # the band pair has failed with this reason
-            plane = _before(band, capture.reference, grid, size_px)
+            to_band = np.divide(band.size_px, np.multiply(grid.scale, capture.reference.size_px))
+            corner, extent = np.rint(np.array([(grid.x0, grid.y0), (grid.width, grid.height)]) * to_band).astype(int)
+            plane = read_preview(band.path, band.band_index, (*corner.tolist(), *extent.clip(1).tolist()), size_px)
             before[band.name] = _grey(plane)
             if band.saturation_value is not None:
                 saturated[band.name] = float((plane >= band.saturation_value).mean())
@@ -68,12 +70,6 @@ def block_means(plane: NDArray[np.float32]) -> NDArray[np.float32]:
         for values in (is_known.astype(np.float32), np.where(is_known, plane, np.float32(0)))
     )
     return np.where(share >= 0.5, total / np.maximum(share, np.float32(0.5)), np.float32(np.nan))
-
-
-def _before(band: Band, reference: Band, grid: OutputGrid, size_px: tuple[int, int]) -> NDArray[np.float32]:
-    sx, sy = (n / (s * m) for n, s, m in zip(band.size_px, grid.scale, reference.size_px, strict=True))
-    window = (round(grid.x0 * sx), round(grid.y0 * sy), max(1, round(grid.width * sx)), max(1, round(grid.height * sy)))
-    return read_preview(band.path, band.index_in_page, window, size_px, band.page)
 
 
 def _grey(plane: NDArray[np.float32]) -> Grey:

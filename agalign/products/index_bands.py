@@ -11,7 +11,7 @@ from rasterio.windows import Window
 
 from agalign.errors import InputError
 from agalign.pixels.raster import OpenRaster, innermost_cause, open_raster
-from agalign.products.sidecar import BandResult, CaptureResult, is_usable
+from agalign.products.sidecar import CaptureResult, is_usable
 from agalign.values.image import FloatImage, Tile, reduced_size_px
 from agalign.values.quality import UNUSABLE
 
@@ -53,17 +53,13 @@ def bands_of(sidecar: CaptureResult, folder: Path, *, mask_qa: bool = False) -> 
         file, index = ("", 1) if part.place is None else (part.place.file, part.place.band_index)
         quality = (folder / flags.file, layer, flags.sha256) if mask_qa and flags is not None else None
         checksum = checksums.get(file, "")
-        problem = _problem_of(part, sidecar.max_predicted_px)
+        problem = ""
+        if part.place is None or not is_usable(part.status, part.prediction, sidecar.max_predicted_px):
+            limit_px, prediction = sidecar.max_predicted_px, part.prediction
+            error = "" if prediction is None else f" to {prediction.std_px:.1f} px, not {limit_px:g}"
+            problem = f"{part.band} is {part.status}{error} ({part.reason})"
         result.append(IndexBand(part.band, part.wavelength_nm, folder / file, index, checksum, problem, quality))
     return result
-
-
-def _problem_of(band: BandResult, limit_px: float) -> str:
-    """The reason why a band cannot be used; empty if it can."""
-    if is_usable(band.status, band.prediction, limit_px) and band.place is not None:
-        return ""
-    error = "" if band.prediction is None else f" to {band.prediction.std_px:.1f} px, not {limit_px:g}"
-    return f"{band.band} is {band.status}{error} ({band.reason})"
 
 
 class BandReader(ExitStack):

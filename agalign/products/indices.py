@@ -213,7 +213,8 @@ def index_named(name: str) -> Index:
     wanted = name.strip().lower()
     if wanted in INDICES:
         return INDICES[wanted]
-    catalogue = _catalogue()
+    entries = _data_of_spyndex("spectral-indices-dict.json", "SpectralIndices")
+    catalogue = {key.lower(): entry for key, entry in entries.items()}
     if wanted in catalogue:
         return _of_catalogue(wanted, catalogue[wanted])
     more = "a name in the catalogue of spyndex" if catalogue else "install more in a checkout: pip install '.[indices]'"
@@ -232,15 +233,9 @@ def index_of_formula(text: str) -> Index:
     return index
 
 
-def _catalogue() -> Mapping[str, Any]:
-    """The indices of spyndex by name in lower case, read without executing its code; empty if it is not installed."""
-    return {
-        name.lower(): entry for name, entry in _data_of_spyndex("spectral-indices-dict.json", "SpectralIndices").items()
-    }
-
-
 @cache
 def _data_of_spyndex(file: str, key: str) -> Mapping[str, Any]:
+    """The data of spyndex, read without executing its code; empty if it is not installed."""
     try:
         path = Path(str(metadata.distribution("spyndex").locate_file(f"spyndex/data/{file}")))
         data = json.loads(path.read_text(encoding="utf-8"))

@@ -159,7 +159,7 @@ def _finest_scale(mappings: Iterable[PixelMapping], reference: Band) -> float:
 def common_area(mappings: list[tuple[PixelMapping, Band]], width_px: int, height_px: int) -> Tile | None:
     """Return the largest rectangle of a grid of this size that is inside every moving image; None if there is none."""
     step = max(1, min(_MAX_CELL_PX, width_px // _MIN_CELLS, height_px // _MIN_CELLS))
-    x, y = _cell_edges(width_px, step), _cell_edges(height_px, step)
+    x, y = (np.append(np.arange(0.0, n - 1, step), n - 1) for n in (width_px, height_px))
     inside = np.ones((len(y), len(x)), dtype=bool)
     for mapping, band in mappings:
         inside &= is_inside(mapping.at_crossings(x, y), band)
@@ -171,10 +171,6 @@ def common_area(mappings: list[tuple[PixelMapping, Band]], width_px: int, height
     top, bottom, left, right = result
     x0, y0 = int(x[left]), int(y[top])
     return Tile(x0, y0, int(x[right]) - x0 + 1, int(y[bottom]) - y0 + 1)
-
-
-def _cell_edges(length_px: int, step: int) -> NDArray[np.float64]:
-    return np.append(np.arange(0, length_px - 1, step), length_px - 1).astype(np.float64)
 
 
 def _largest_rectangle(

@@ -109,16 +109,16 @@ def mosaic(
         labels = [captures[k].label for k in apart]
         return MosaicReport(
             path,
-            len(placed),
-            labels if untied else [],
-            len(checks),
-            sum(map(len, checks)),
-            misfit,
-            misfit_m(checks, flight.captures),
-            accuracy_m,
-            any(c.height_is_assumed for c in placed),
-            [*flight.left_out, *((label, _UNTIED) for label in labels if not untied)],
-            _write_indices(path, placed[0].bands, chosen_indices),
+            captures=len(placed),
+            untied=labels if untied else [],
+            pairs=len(checks),
+            tie_points=sum(map(len, checks)),
+            misfit_m=misfit,
+            georeference_misfit_m=misfit_m(checks, flight.captures),
+            accuracy_m=accuracy_m,
+            height_is_assumed=any(c.height_is_assumed for c in placed),
+            left_out=[*flight.left_out, *((label, _UNTIED) for label in labels if not untied)],
+            indices=_write_indices(path, placed[0].bands, chosen_indices),
         )
 
 

@@ -73,20 +73,6 @@ class PlacedFlight:
     crs_wkt: str
     left_out: LeftOut
 
-    def add(self, capture: RunCapture, feature: dict[str, Any]) -> None:
-        """Place a capture by its entry in the flight map, or leave it out."""
-        try:
-            one = _placed(capture, feature, self.origin_m, self.crs_wkt)
-            if not np.isfinite([*one.outline_m.ravel(), *one.camera_m]).all() or not one.gsd_m > 0:
-                raise InputError("its place on the ground is not finite; run again with --overwrite")
-            self.captures.append(one)
-        except AgalignError as error:
-            self.left_out.append((capture.label, str(error)))
-        except (LookupError, TypeError, ValueError, ArithmeticError):
-            self.left_out.append(
-                (capture.label, f"its entry in {FLIGHT_MAP_FILE} is damaged; run again with --overwrite")
-            )
-
 
 def place_captures(out: Path) -> PlacedFlight:
     """Place the captures of a run with all bands aligned, and the same contents as most of them, by their footprints in
@@ -107,13 +93,20 @@ def place_captures(out: Path) -> PlacedFlight:
     origin_m = transformed(corner, _WGS84, crs)[0]
     left_out += [(c.label, problem) for c in captures if (problem := _problem(c, rings))]
     alike, differing = like_most([c for c in captures if not _problem(c, rings)])
-    flight = PlacedFlight([], origin_m, crs, [*left_out, *differing])
+    left_out += differing
+    placed = []
     for capture in alike:
-        label = capture.label
-        flight.add(capture, features[f"{label}.json"]["properties"] | {"ring": rings[label]})
-    if not flight.captures:
-        raise InputError(f"{out}: no capture can be used; {': '.join(flight.left_out[0])}")
-    return flight
+        properties = features[f"{capture.label}.json"]["properties"] | {"ring": rings[capture.label]}
+        try:
+            placed.append(_placed(capture, properties, origin_m, crs))
+        except AgalignError as error:
+            left_out.append((capture.label, str(error)))
+        except (LookupError, TypeError, ValueError, ArithmeticError):
+            problem = f"its entry in {FLIGHT_MAP_FILE} is damaged; run again with --overwrite"
+            left_out.append((capture.label, problem))
+    if not placed:
+        raise InputError(f"{out}: no capture can be used; {': '.join(left_out[0])}")
+    return PlacedFlight(placed, origin_m, crs, left_out)
 
 
 def _problem(capture: RunCapture, rings: Mapping[str, Points]) -> str:
@@ -147,20 +140,22 @@ def _placed(capture: RunCapture, feature: dict[str, Any], origin_m: Points, crs:
     if height_m is not None:
         camera_m = transformed(np.array([[feature["longitude"], feature["latitude"]]]), _WGS84, crs)[0] - origin_m
     position_m, height, heading, tilt = pose_errors(height_m, feature["height_from"])
-    reference = bands[[b.name for b in bands].index(sidecar.reference.band)]
-    return Placement(
+    result = Placement(
         capture.label,
         bands,
-        reference,
-        (grid.width, grid.height),
-        _lens_of_output(sidecar, grid),
-        geometry.fit_homography(edge_px, corners_m),
-        camera_m,
-        height_m,
-        feature["height_from"] == "assumed",
-        position_m if accuracy_m is None else accuracy_m,
-        (position_m, position_m, height, heading, tilt, tilt),
+        bands[[b.name for b in bands].index(sidecar.reference.band)],
+        size_px=(grid.width, grid.height),
+        lens=_lens_of_output(sidecar, grid),
+        to_ground=geometry.fit_homography(edge_px, corners_m),
+        camera_m=camera_m,
+        height_m=height_m,
+        height_is_assumed=feature["height_from"] == "assumed",
+        accuracy_m=position_m if accuracy_m is None else accuracy_m,
+        pose_std=(position_m, position_m, height, heading, tilt, tilt),
     )
+    if not np.isfinite([*result.outline_m.ravel(), *camera_m]).all() or not result.gsd_m > 0:
+        raise InputError("its place on the ground is not finite; run again with --overwrite")
+    return result
 
 
 def _positive(value: Any) -> float | None:

@@ -185,8 +185,12 @@ def _tile_of(layer: Layer, tile: Tile, settings: WriteSettings) -> tuple[Pixels,
     if layer.vignetting is not None:
         pixels = as_type(pixels.astype(np.float32) + layer.vignetting.black_level, np.dtype(layer.band.dtype))
     if settings.fill_occluded and layer.mapping is not None:
-        fillable = layer.mapping.hidden(tile) & is_inside(layer.mapping.positions(tile), layer.band)
-        return _with_occluded(pixels, valid, fillable)
+        occluded = layer.mapping.hidden(tile) & is_inside(layer.mapping.positions(tile), layer.band)
+        if occluded.any() and valid.any():  # GDAL's inverse distance weighting
+            distance_px = cv2.distanceTransform((~valid).astype(np.uint8), cv2.DIST_L2, 3)
+            occluded &= distance_px < _FILL_DISTANCE_PX
+            filled = fillnodata(np.where(valid, pixels, 0).astype(np.float32), valid, _FILL_DISTANCE_PX)
+            return np.where(occluded, as_type(filled, pixels.dtype), pixels), valid | occluded
     return pixels, valid
 
 
@@ -198,16 +202,6 @@ def layer_pixels(
         return resample_tile(layer.band, layer.mapping, tile, interpolation, radiometry, size_px=layer.size_px)
     pixels, valid = read_tile(layer.band, tile)
     return pixels if radiometry is None else calibrated(pixels, radiometry, tile.x0, tile.y0), valid
-
-
-def _with_occluded(pixels: Pixels, valid: Mask, occluded: Mask) -> tuple[Pixels, Mask]:
-    """Pixels and their mask, with occluded pixels interpolated from valid ones by GDAL's inverse distance weighting."""
-    if not occluded.any() or not valid.any():
-        return pixels, valid
-    distance_px = cv2.distanceTransform((~valid).astype(np.uint8), cv2.DIST_L2, 3)
-    occluded = occluded & (distance_px < _FILL_DISTANCE_PX)
-    filled = fillnodata(np.where(valid, pixels, 0).astype(np.float32), valid, _FILL_DISTANCE_PX)
-    return np.where(occluded, as_type(filled, pixels.dtype), pixels), valid | occluded
 
 
 def to_cog(path: Path, compression: str = "deflate") -> None:
