@@ -12,7 +12,7 @@ from agalign.cli.terminal import MAX_LISTED, RAW_NUMBERS, ExitCode, Terminal, ex
 from agalign.values.choices import ExportProgram
 
 if TYPE_CHECKING:
-    from agalign.products.index_table import IndexReport
+    from agalign.products.index_rasters import IndexReport
     from agalign.products.indices import Index
 
 Out = Annotated[Path, typer.Argument(help="Output folder of a run.", show_default=False)]
@@ -170,7 +170,7 @@ def _conclude(
     names: Sequence[str], reports: "Sequence[IndexReport]", folder: Path, terminal: Terminal, *, as_json: bool
 ) -> int:
     """Print the statistics of all indices, and return the exit code."""
-    from agalign.products.index_table import INDICES_FILE
+    from agalign.products.index_rasters import INDICES_FILE
 
     written = [r for r in reports if r.path is not None]
     if as_json:

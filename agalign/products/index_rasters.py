@@ -1,14 +1,16 @@
 """Spectral indices of a capture: a float32 raster and a picture of each, with their statistics; as the product of
-`agalign align --index`, and for `agalign indices`.
+`agalign align --index`, and for `agalign indices`. OUT/indices.csv has a row for each.
 """
 
+import csv
 import glob
 import hashlib
+import io
 import json
 import math
-from collections.abc import Iterator, Sequence
-from dataclasses import replace
-from pathlib import Path
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path, PurePosixPath
 from typing import Any
 
 import cv2
@@ -30,18 +32,104 @@ from agalign.products.checked_raster import (
 )
 from agalign.products.drawing import with_text, write_png
 from agalign.products.index_bands import RAW, BandReader, IndexBand
-from agalign.products.index_table import STATISTICS_TAG, IndexReport, IndexStatistics, read_statistics, statistics_in
 from agalign.products.indices import Index, bands_for, compute, index_named
 from agalign.products.product import GEOTIFF, CapturePaths, Product, ProductContext, StacAsset, WrittenFile
 from agalign.products.raster_file import to_cog
+from agalign.products.sidecar import CaptureResult
+from agalign.products.text_files import write_csv
 from agalign.values.capture import Band, Capture
+from agalign.values.files import read_regular
 from agalign.values.image import Tile, reduced_size_px
 from agalign.values.interpolation import tiles
+from agalign.values.text import without_formula
 
+_STATISTICS_TAG = "INDEX_STATISTICS"
+INDICES_FILE = "indices.csv"
 _COLOURS = np.array([(38, 70, 148), (120, 74, 40), (214, 190, 120), (250, 245, 170), (90, 180, 80), (0, 90, 40)], float)
 """Red, green, blue from the low to the high end of the scale: water, soil, sparse to dense vegetation."""
 _NEUTRAL = np.array([(20, 20, 20), (245, 245, 245)], float)
 """Greys for raw numbers, whose values do not distinguish soil and vegetation."""
+
+
+@dataclass(frozen=True)
+class IndexStatistics:
+    """The values of an index raster; nan if no pixel is valid."""
+
+    median: float = math.nan
+    p5: float = math.nan
+    p95: float = math.nan
+    valid_share: float = 0.0
+    unit: str = ""
+    """Unit of the bands: reflectance, radiance, or raw numbers."""
+    low: float = math.nan
+    """Value at the lower end of the colour scale of the picture."""
+    high: float = math.nan
+    """Value at the upper end of the colour scale."""
+    masked_share: float = 0.0
+    """Share of the pixels that only the quality flags mask."""
+
+    def as_json(self) -> dict[str, float | str | None]:
+        """Return the fields by name, with null for nan, which JSON does not have."""
+        return {k: v if isinstance(v, str) or math.isfinite(v) else None for k, v in vars(self).items()}
+
+
+@dataclass(frozen=True)
+class IndexReport:
+    """One index of one capture."""
+
+    capture: str
+    """Label of the capture: its folder, relative to the output folder of the run, and its name."""
+    index: str
+    path: Path | None = None
+    """The raster; None if it could not be written."""
+    statistics: IndexStatistics = IndexStatistics()
+    problem: str = ""
+    kept: bool = field(default=False, compare=False)
+    """True if an earlier command wrote the raster from the same bands with the same formula."""
+    captured_at: str = ""
+    latitude: float | None = None
+    longitude: float | None = None
+
+    @property
+    def median(self) -> float:
+        """Median of the valid pixels."""
+        return self.statistics.median
+
+    @property
+    def raw_numbers(self) -> bool:
+        """True if the bands are neither reflectance nor radiance."""
+        return self.statistics.unit == RAW
+
+    @property
+    def key(self) -> tuple[str, str, str]:
+        """Identify the row in the table: (folder, capture, index)."""
+        label = PurePosixPath(self.capture)
+        return label.parent.as_posix(), label.name, self.index
+
+    def of(self, sidecar: CaptureResult) -> "IndexReport":
+        """Return the report with the time and the position of its capture."""
+        place = sidecar.position
+        latitude, longitude = (None, None) if place is None else (place.latitude, place.longitude)
+        return replace(self, captured_at=sidecar.captured_at, latitude=latitude, longitude=longitude)
+
+
+def _statistics_in(tags: Mapping[str, str]) -> IndexStatistics | None:
+    """Return the statistics in the tags of a raster; None if there are none."""
+    try:
+        fields: dict[str, Any] = json.loads(tags[_STATISTICS_TAG])
+        unit = str(fields.pop("unit"))
+        return IndexStatistics(unit=unit, **{k: math.nan if v is None else float(v) for k, v in fields.items()})
+    except (KeyError, ValueError, TypeError):
+        return None
+
+
+def _read_statistics(path: Path) -> IndexStatistics | None:
+    """Return the statistics of an index raster; None for another file, or one that cannot be read."""
+    try:
+        with open_raster(path) as source:
+            return _statistics_in(source.tags())
+    except AgalignError:
+        return None
 
 
 class IndexRasters(Product):
@@ -123,7 +211,8 @@ def write_rasters(
             try:
                 chosen = _bands_of_index(bands, index)
                 source = _fingerprint(index, chosen)
-                earlier = None if overwrite else _finished_before(target, source)
+                may_be_kept = not overwrite and all(band.sha256 for band in chosen)
+                earlier = _finished_before(target, source) if may_be_kept else None
                 if earlier is None and target.resolve() in {band.file.resolve() for band in bands}:
                     raise InputError(f"{target}: is the file of a band; give the formula '{index.name}' another name")
                 unit = earlier.unit if earlier is not None else _common_unit(index, chosen, reader)
@@ -138,7 +227,7 @@ def outdated_rasters(base: Path) -> Iterator[Path]:
     """Yield the index rasters of a capture, `base`_<index>.tif, and their pictures."""
     for path in base.parent.glob(f"{glob.escape(base.name)}_*.tif"):
         # A file with a sidecar is the stack of another capture.
-        if not path.with_suffix(".json").exists() and read_statistics(path) is not None:
+        if not path.with_suffix(".json").exists() and _read_statistics(path) is not None:
             yield from (path, path.with_suffix(".png"))
 
 
@@ -169,7 +258,7 @@ def _finished_before(target: Path, source: str) -> IndexStatistics | None:
             tags = dataset.tags()
     except (AgalignError, OSError, tifffile.TiffFileError):
         return None
-    return statistics_in(tags) if tags.get("INDEX_MADE_FROM") == source else None
+    return _statistics_in(tags) if tags.get("INDEX_MADE_FROM") == source else None
 
 
 def _common_unit(index: Index, bands: Sequence[IndexBand], reader: BandReader) -> str:
@@ -220,7 +309,7 @@ def _write(
         sample = np.concatenate(samples)
         shares = (pixels / (like.width * like.height) for pixels in (valid_px, masked_px))
         statistics = _statistics(index, unit, sample, *shares)
-        raster.dataset.update_tags(**{STATISTICS_TAG: json.dumps(statistics.as_json())})
+        raster.dataset.update_tags(**{_STATISTICS_TAG: json.dumps(statistics.as_json())})
     _draw(index, target, sample, statistics)
     return statistics
 
@@ -262,17 +351,17 @@ def _draw(index: Index, raster: Path, sample: NDArray[np.float32], statistics: I
         # Longer side of the image at the top left of the picture; the report overlays it on the composite.
         picture_px = 720
         values = dataset.read(1, out_shape=reduced_size_px(size_px, max(1.0, max(size_px) / picture_px))[::-1])
-    span, neutral = (statistics.low, statistics.high), statistics.unit == RAW
+    span, ramp = (statistics.low, statistics.high), _NEUTRAL if statistics.unit == RAW else _COLOURS
     shape = values.shape
     width, margin, bars, bins = max(shape[1], 360), 24, 90, 120
     # In float64: a value clipped in float32 may be just outside the span.
     counts = np.histogram(sample.astype(float).clip(*span), bins, span)[0]
     sheet = np.full((shape[0] + bars + 2 * margin + 8, width, 3), 255, np.uint8)
-    sheet[: shape[0], : shape[1]] = _coloured(values, span, neutral=neutral)
+    sheet[: shape[0], : shape[1]] = _coloured(values, span, ramp)
     base = shape[0] + margin + bars
     edges = np.linspace(margin, width - margin, bins + 1).round().astype(int)
     centres = np.linspace(*span, 2 * bins + 1, dtype=np.float32)[1::2]
-    colours = _coloured(centres[None], span, neutral=neutral)[0]
+    colours = _coloured(centres[None], span, ramp)[0]
     # The first and last bins also contain the values beyond the span.
     heights = (bars * counts / max(int(counts[1:-1].max(initial=1)), 1)).clip(0, bars).round().astype(int)
     for left, right, height, colour in zip(edges, edges[1:], heights.tolist(), colours.tolist(), strict=False):
@@ -280,16 +369,87 @@ def _draw(index: Index, raster: Path, sample: NDArray[np.float32], statistics: I
     for value in np.linspace(*span, 5):
         at = round(margin + (value - span[0]) / (span[1] - span[0]) * (width - 2 * margin))
         sheet = with_text(sheet, f"{value:.3g}" if abs(value) >= 100 else f"{value:.2f}", (at, base + 18), anchor="ms")
-    note = ": raw numbers, not reflectance" if neutral else ""
+    note = ": raw numbers, not reflectance" if statistics.unit == RAW else ""
     title = f"{index.name.upper()} of {raster.stem.removesuffix(f'_{index.name}')}{note}"
     write_png(with_text(sheet, title, (margin, shape[0] + 18), 16), raster.with_suffix(".png"))
 
 
-def _coloured(values: NDArray[Any], span: tuple[float, float], *, neutral: bool) -> NDArray[np.uint8]:
+def _coloured(values: NDArray[Any], span: tuple[float, float], ramp: NDArray[np.float64]) -> NDArray[np.uint8]:
     """Values (height, width) as colours (height, width, 3)."""
-    ramp = _NEUTRAL if neutral else _COLOURS
     share = np.nan_to_num(np.clip((values - span[0]) / (span[1] - span[0]), 0, 1))
     stops = np.linspace(0, 1, len(ramp))
     result = np.stack([np.interp(share, stops, channel) for channel in ramp.T], axis=-1)
     result[~np.isfinite(values)] = (225, 190, 215)
     return np.asarray(result.round(), np.uint8)
+
+
+def reports_of_run(sidecar: CaptureResult, folder: str, out: Path) -> list[IndexReport]:
+    """Return the indices that the run itself wrote, from the tags of the rasters."""
+    result = []
+    for part in sidecar.products:
+        path = out / folder / part.file
+        if part.kind == "index" and path.suffix == ".tif":
+            name = path.stem.removeprefix(f"{Path(sidecar.capture).name}_")
+            statistics = _read_statistics(path)
+            if statistics is not None:
+                label = Path(folder, sidecar.capture).as_posix()
+                result.append(IndexReport(label, name, path, statistics).of(sidecar))
+    return result
+
+
+def read_table(out: Path) -> list[IndexReport]:
+    """Return the rows of OUT/indices.csv whose rasters still exist; empty if there is no table."""
+    try:
+        text = read_regular(out / INDICES_FILE).decode()
+        # Lines may have too few or too many cells.
+        rows = [_row(line, out) for line in csv.DictReader(io.StringIO(text))]
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, csv.Error):
+        return []
+    return [row for row in rows if row.path is None or row.path.is_file()]
+
+
+def update_table(out: Path, rows: Sequence[IndexReport]) -> list[IndexReport]:
+    """Add rows to OUT/indices.csv, replacing those of the same capture and index, and return all rows.
+
+    An empty table is not written. Raises OutputError.
+    """
+    old = read_table(out)
+    result = list({row.key: row for row in [*old, *rows]}.values())
+    if result and (result != old or not (out / INDICES_FILE).is_file()):
+        of_capture = "folder", "capture", "captured_at", "latitude", "longitude"
+        of_index = "index", "median", "p5", "p95", "valid_share", "masked_share", "input", "low", "high", "file"
+        columns = *of_capture, *of_index, "problem"
+        cells = (_cells(row, out) for row in sorted(result, key=lambda row: row.key))
+        write_csv(out / INDICES_FILE, columns, ([one[name] for name in columns] for one in cells))
+    return result
+
+
+def _cells(row: IndexReport, out: Path) -> dict[str, Any]:
+    folder, capture, _ = row.key
+    place = {"folder": folder, "capture": capture, "input": row.statistics.unit}
+    file = "" if row.path is None else row.path.relative_to(out).as_posix()
+    return vars(row) | row.statistics.as_json() | place | {"file": file}
+
+
+def _row(cells: Mapping[str, str], out: Path) -> IndexReport:
+    cells = {k: _unquoted(v) for k, v in cells.items()}
+    numbers = {k: float(cells[k] or "nan") for k in ("median", "p5", "p95", "valid_share", "low", "high")}
+    numbers["masked_share"] = float(cells.get("masked_share") or 0)  # older tables do not have it
+    path = out / cells["file"]
+    path.relative_to(out)  # raises ValueError for an absolute path, which no table has
+    latitude, longitude = (float(cells[k]) if cells[k] else None for k in ("latitude", "longitude"))
+    return IndexReport(
+        Path(cells["folder"], cells["capture"]).as_posix(),
+        path=path if cells["file"] else None,
+        statistics=IndexStatistics(unit=cells["input"], **numbers),
+        index=cells["index"],
+        problem=cells["problem"],
+        captured_at=cells["captured_at"],
+        latitude=latitude,
+        longitude=longitude,
+    )
+
+
+def _unquoted(text: str) -> str:
+    """The text that `without_formula` quoted."""
+    return text[1:] if text.startswith("'") and without_formula(text[1:]) != text[1:] else text

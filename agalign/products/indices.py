@@ -125,7 +125,11 @@ def _value(node: ast.expr, values: Mapping[str, FloatImage]) -> Any:
             # float32 overflows to infinity; Python's integers would grow without limit, as in 9**9**9.
             return np.float32(value)  # type: ignore[arg-type]
         case ast.BinOp(left=left, op=ast.Div(), right=right):
-            return _value(left, values) / _denominator(right, values)
+            # nan where a denominator of bands is not positive beyond the noise of its terms.
+            divisor, magnitude = _sum(right, values)
+            if any(isinstance(part, ast.Name) for part in ast.walk(right)):
+                divisor = np.where(divisor > _NOISE * magnitude, divisor, np.float32(np.nan))
+            return _value(left, values) / divisor
         case ast.BinOp(left=left, op=op, right=right):
             return _OPERATORS[type(op)](_value(left, values), _value(right, values))
         case ast.UnaryOp(op=op, operand=operand):
@@ -133,14 +137,6 @@ def _value(node: ast.expr, values: Mapping[str, FloatImage]) -> Any:
         case ast.Call(func=ast.Name(id=name), args=[argument]):
             return _FUNCTIONS[name](_value(argument, values))
     raise AssertionError(ast.dump(node))  # `_names` has refused it
-
-
-def _denominator(node: ast.expr, values: Mapping[str, FloatImage]) -> Any:
-    """Return the value of a denominator; nan where one of bands is not positive beyond the noise of its terms."""
-    value, magnitude = _sum(node, values)
-    if not any(isinstance(part, ast.Name) for part in ast.walk(node)):
-        return value
-    return np.where(value > _NOISE * magnitude, value, np.float32(np.nan))
 
 
 def _sum(node: ast.expr, values: Mapping[str, FloatImage]) -> tuple[Any, Any]:

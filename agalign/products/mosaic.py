@@ -15,8 +15,7 @@ from agalign.errors import ConfigurationError, InputError
 from agalign.pixels.raster import open_raster
 from agalign.products.checked_raster import Block, LayerDescription, georeference_tags, grid_profile, write_layers
 from agalign.products.index_bands import BandReader, IndexBand
-from agalign.products.index_rasters import write_rasters
-from agalign.products.index_table import IndexReport
+from agalign.products.index_rasters import IndexReport, write_rasters
 from agalign.products.indices import Index, index_named
 from agalign.products.mosaic_adjustment import adjusted, misfit_m, tie_pairs, tied_groups
 from agalign.products.mosaic_placement import Placement, place_captures

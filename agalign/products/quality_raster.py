@@ -124,12 +124,9 @@ def _flags(
     layer: Layer, tile: Tile, grid: OutputGrid, nodes: Mapping[str, NDArray[np.float32]], *, is_predicted: bool
 ) -> Flags:
     """Flags (height, width) of a band on a tile, except sun glint; `nodes` has the expected error by band."""
-    shape = tile.height, tile.width
     if layer.is_gap:
-        return np.full(shape, _bit(Quality.MISSING), np.uint16)
-    result = np.zeros(shape, np.uint16)
-    if is_predicted:
-        result |= _bit(Quality.PREDICTED)
+        return np.full((tile.height, tile.width), _bit(Quality.MISSING), np.uint16)
+    result = np.full((tile.height, tile.width), _bit(Quality.PREDICTED) if is_predicted else 0, np.uint16)
     masks = _of_source(layer, tile)
     if layer.band.name in nodes:
         error_px = error_on_tile(nodes[layer.band.name], grid, tile)

@@ -57,7 +57,9 @@ class TiePoints(Product):
         ties = ((b, a) for b in context.capture.moving if (a := context.with_pixels.get(b.name)) is not None and a.ties)
         points = [point for band, alignment in ties for point in tie_points(band, alignment)]
         positions = [f"{side}_{axis}_px" for side in ("reference", "moving") for axis in "xy"]
-        write_csv(table, ("band", "status", *positions, "residual_px", "weight"), map(_cells, points))
+        numbers = ((*p.reference_px, *p.moving_px, p.residual_px, p.weight) for p in points)
+        rows = ([p.band, p.status, *(f"{n:.4f}" for n in of_p)] for p, of_p in zip(points, numbers, strict=True))
+        write_csv(table, ("band", "status", *positions, "residual_px", "weight"), rows)
         write_text(features, _geojson(points, context.capture.reference.georeference))
         return [
             WrittenFile(self.kind, table, StacAsset("tie_points", "text/csv", ("metadata",))),
@@ -82,11 +84,6 @@ def tie_points(band: Band, alignment: Alignment[FixedFilePx]) -> Iterator[TiePoi
     rows = zip(at_px.tolist(), moving_px.tolist(), np.hypot(*shifts_px.T).tolist(), weights.tolist(), strict=True)
     for (x, y), (moving_x, moving_y), residual_px, weight in rows:
         yield TiePoint(band.name, alignment.status, (x, y), (moving_x, moving_y), residual_px, weight)
-
-
-def _cells(point: TiePoint) -> list[str]:
-    numbers = (*point.reference_px, *point.moving_px, point.residual_px, point.weight)
-    return [point.band, point.status, *(f"{n:.4f}" for n in numbers)]
 
 
 def _geojson(points: Sequence[TiePoint], georeference: Georeference | None) -> str:

@@ -15,8 +15,7 @@ from synthetic_flights.aligned import make_aligned
 from agalign.batch.index_run import index_tasks, run_indices
 from agalign.errors import ConfigurationError, InputError
 from agalign.products.index_bands import RAW, IndexBand
-from agalign.products.index_rasters import write_rasters
-from agalign.products.index_table import IndexReport, IndexStatistics, read_table, update_table
+from agalign.products.index_rasters import IndexReport, IndexStatistics, read_table, update_table, write_rasters
 from agalign.products.indices import (
     INDICES,
     Index,

@@ -13,7 +13,7 @@ import agalign
 from agalign.batch.index_run import do_indices, index_tasks, run_indices
 from agalign.capture.tag_seeds import geo_seed
 from agalign.products.aligned_files import band_file_names
-from agalign.products.index_table import IndexReport
+from agalign.products.index_rasters import IndexReport
 from agalign.products.indices import INDICES
 from agalign.products.sidecar_file import verify_outputs
 from agalign.synthetic import flight as synthetic

@@ -13,7 +13,7 @@ import numpy as np
 from pydantic import BaseModel
 
 from agalign.products.index_bands import RAW
-from agalign.products.index_table import IndexReport
+from agalign.products.index_rasters import IndexReport
 from agalign.products.report.light import CaptureLight, light_of
 from agalign.products.run_record import RefusalPart
 from agalign.products.sidecar import BandPart, BandResult, CaptureResult, GridPart, OutputPart, PreviewPart, Sidecar

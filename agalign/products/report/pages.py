@@ -19,7 +19,7 @@ from agalign._version import __version__
 from agalign.config import Settings
 from agalign.errors import SidecarError
 from agalign.products.excluded_captures import PANELS_FILE, SKY_FILE, PanelPart, SkyPart, read_panels, read_sky
-from agalign.products.index_table import IndexReport, reports_of_run, update_table
+from agalign.products.index_rasters import IndexReport, reports_of_run, update_table
 from agalign.products.report.facts import BAND_COLUMNS, FailureGroup, FlightFacts, masked_shares
 from agalign.products.report.light import light_charts
 from agalign.products.report.radiometric_check import CaptureLevels, radiometric_check
