@@ -51,7 +51,8 @@ def read_reduced_bands(capture: Capture, places: Mapping[str, tuple[Path, int]],
         with suppress(UnreadableFileError):  # the band pair has failed with this reason
             to_band = np.divide(band.size_px, np.multiply(grid.scale, capture.reference.size_px))
             corner, extent = np.rint(np.array([(grid.x0, grid.y0), (grid.width, grid.height)]) * to_band).astype(int)
-            plane = read_preview(band.path, band.band_index, (*corner.tolist(), *extent.clip(1).tolist()), size_px)
+            window_px = (*corner.tolist(), *extent.clip(1).tolist())
+            plane = read_preview(band.path, band.index_in_page, window_px, size_px, band.page)
             before[band.name] = _grey(plane)
             if band.saturation_value is not None:
                 saturated[band.name] = float((plane >= band.saturation_value).mean())
