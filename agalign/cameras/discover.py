@@ -13,8 +13,10 @@ from agalign.cameras.grouping import (
     band_file_owners,
     capture_of,
     group_files,
+    list_problems,
     pattern_clashes,
     with_missing_bands,
+    with_tags_of_flight,
     with_unique_capture_names,
     without_copies,
 )
@@ -43,7 +45,7 @@ class FolderScan:
     @property
     def is_complete(self) -> bool:
         """False if a file or capture is left out that is not an exact copy of another."""
-        return all(p.is_exact_copy for p in self.problems)
+        return all(p.loses_nothing for p in self.problems)
 
     @property
     def eight_bit(self) -> tuple[Capture, ...]:
@@ -67,7 +69,8 @@ def discover(
     check_folder(folder)
     paths, problems = _chosen_images(folder, options)
     files, copies = without_copies(_read(paths, options, progress, problems))
-    problems += copies
+    files, damaged = with_tags_of_flight(files)
+    problems += copies + damaged + list_problems(files)
     captures: list[Capture] = []
     groups = group_files(files)
     _check_bands(groups, options.bands, folder)

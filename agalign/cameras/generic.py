@@ -7,7 +7,7 @@ from pathlib import Path
 
 from agalign.cameras.base import Camera, colour_bands
 from agalign.cameras.metadata import Tags
-from agalign.cameras.pix4d import NAMESPACE
+from agalign.cameras.pix4d import NAMESPACE, listed_bands
 from agalign.errors import ConfigurationError
 from agalign.pixels.raster import suffix_format
 from agalign.values.capture import Band
@@ -38,16 +38,14 @@ class Generic(Camera):
     def bands(self, path: Path, tags: Tags, stored: Sequence[Band]) -> tuple[Band, ...]:
         if suffix_format(path) in ("JPEG", "PNG"):
             return self._picture_bands(path, stored)
-        # Lists in tags have one item for each channel.
-        names, wavelengths_nm = tags.xmp.get((NAMESPACE, "BandName"), ()), tags.numbers(NAMESPACE, "CentralWavelength")
-        of_file = self.split(path)[1] if len(stored) == 1 else ""
-        result = []
-        for k, band in enumerate(stored):
-            in_tags = names[k] if len(names) == len(stored) else ""
-            name = band.name or in_tags or of_file or f"band_{band.band_index}"
-            listed_nm = wavelengths_nm[k] if len(wavelengths_nm) == len(stored) else _wavelength_in(name)
-            result.append(replace(band, name=name, wavelength_nm=band.wavelength_nm or listed_nm))
-        return tuple(result)
+        if len(stored) > 1:
+            listed = listed_bands(tags, stored)
+            return tuple(replace(b, name=b.name or f"band_{b.band_index}") for b in listed)
+        own_name = tags.text(NAMESPACE, "BandName") or self.split(path)[1]
+        file_wavelength_nm = tags.number(NAMESPACE, "CentralWavelength") or _wavelength_in(own_name)
+        (band,) = stored
+        name = band.name or own_name or f"band_{band.band_index}"
+        return (replace(band, name=name, wavelength_nm=band.wavelength_nm or file_wavelength_nm),)
 
     def _picture_bands(self, path: Path, stored: Sequence[Band]) -> tuple[Band, ...]:
         """One band if the file name is that of a band, else the colours of a JPEG; none of another PNG.

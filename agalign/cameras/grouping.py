@@ -13,17 +13,23 @@ from agalign.cameras import camera_of
 from agalign.cameras.base import Camera, listed, reference_index
 from agalign.cameras.generic import Generic
 from agalign.cameras.metadata import Tags
+from agalign.cameras.pix4d import NAMESPACE, listed_names
 from agalign.cameras.read_files import ImageFile, Problem, natural_order
 from agalign.config import DiscoverOptions
 from agalign.errors import InputError
 from agalign.pixels.raster import suffix_format
-from agalign.values.capture import Band, CameraIdentity, Capture
+from agalign.values.capture import Band, CameraIdentity, Capture, unix_time_s
 from agalign.values.choices import BandOrder
 from agalign.values.files import RUN_FILE
+from agalign.values.text import counted
 
 _GroupKey = tuple[str, str, str]
 """(camera, folder of the capture, the camera's capture key)."""
 _CameraKey = tuple[str, ...]
+_MAX_NAMES = 6
+"""Of tags in a message."""
+_MAX_HALVES_APART_S = 1.0
+"""Between the exposures of a dual camera, which are simultaneous; an id may occur again in another flight."""
 _SERIAL_SEPARATOR = "+"
 """Between the serial numbers of the two halves of a dual camera."""
 
@@ -49,7 +55,7 @@ def without_copies(files: Sequence[ImageFile]) -> tuple[list[ImageFile], list[Pr
                 text = f"is left out as a changed copy of {original.path.name}: same band and capture; keep one of them"
             else:
                 continue
-            copies[file.path] = Problem(file.path, InputError(f"{file.path}: {text}"), is_exact_copy=is_exact)
+            copies[file.path] = Problem(file.path, InputError(f"{file.path}: {text}"), loses_nothing=is_exact)
             break
         else:
             kept.setdefault(by_tags, file)
@@ -63,15 +69,77 @@ def _paths_in_name(path: Path) -> list[Path]:
     return [path.with_name(part + path.suffix) for part in parts if part]
 
 
+def with_tags_of_flight(files: Sequence[ImageFile]) -> tuple[list[ImageFile], list[Problem]]:
+    """Return the files, and a problem for each with a damaged XMP packet that lacks tags.
+
+    The tags that a packet should have are those in its own text, and those of an intact file of the same camera and
+    band: one with the same end of the name, such as `_2` or `_NIR`. From this file comes a missing name of a band.
+    """
+    intact = {key: f for f in reversed(files) if f.tags.unread is None for key in _similar(f)}
+    result, problems = list(files), []
+    for i, file in enumerate(files):
+        if file.tags.unread is None:
+            continue
+        of_band, of_camera = (intact.get(key) for key in _similar(file))
+        lacking = dict.fromkeys(file.tags.unread)
+        if similar := of_band or of_camera:
+            lacking |= dict.fromkeys(name for key, name in similar.tags.xmp if (key, name) not in file.tags.xmp)
+        if lacking:
+            some = ", ".join([*lacking][:_MAX_NAMES]) + (", …" if len(lacking) > _MAX_NAMES else "")
+            text = f"{file.path}: its XMP packet is damaged and lacks {some}; copy the file from the card again"
+            problems.append(Problem(file.path, InputError(text), loses_nothing=True))
+        if "BandName" in lacking and of_band is not None and len(file.bands) == len(of_band.bands) == 1:
+            (own,), (band,) = file.bands, of_band.bands
+            own = replace(own, name=band.name, wavelength_nm=band.wavelength_nm, bandwidth_nm=band.bandwidth_nm)
+            result[i] = replace(file, bands=(own,))
+    return result, problems
+
+
+def list_problems(files: Iterable[ImageFile]) -> list[Problem]:
+    """Return a problem for each multiband file with tags that list another number of names or wavelengths."""
+    result = []
+    for file in files:
+        names, wavelengths = len(listed_names(file.tags)), len(file.tags.numbers(NAMESPACE, "CentralWavelength"))
+        bands = len(file.bands)
+        if file.is_whole_capture and isinstance(file.camera, Generic) and not {names, wavelengths} <= {0, bands}:
+            counts = f"{counted(names, 'name')} and {counted(wavelengths, 'wavelength')} of bands"
+            text = f"{file.path}: has {bands} bands, and its tags list {counts}; lists of other lengths are not used"
+            result.append(Problem(file.path, InputError(text), loses_nothing=True))
+    return result
+
+
+def _similar(file: ImageFile) -> tuple[object, object]:
+    """Keys that files of the same camera and band, and of the same camera, share."""
+    camera = file.camera.name, file.tags.make, file.tags.model, suffix_format(file.path)
+    return (*camera, file.path.stem.removeprefix(file.camera.capture_name(file.path))), camera
+
+
 def group_files(files: Iterable[ImageFile]) -> list[list[ImageFile]]:
     """Return the files of each capture: same camera, folder and key. Colour photographs come last."""
     groups: dict[_GroupKey, list[ImageFile]] = defaultdict(list)
     for file in files:
         key = file.path.name if file.is_whole_capture else file.camera.capture_key(file.path, file.tags)
         groups[file.camera.name, str(file.camera.capture_folder(file.path)), key].append(file)
+    _join_folders(groups)
     _add_files_without_id(groups)
     _drop_copies(groups)
     return [sorted(group, key=lambda f: f.bands[0].companion) for group in groups.values()]
+
+
+def _join_folders(groups: dict[_GroupKey, list[ImageFile]]) -> None:
+    """Join groups of different folders with one capture id, the same time, and different bands and names of files: the
+    halves of a dual camera, which write to a card each.
+    """
+    first: dict[tuple[str, str], _GroupKey] = {}
+    for key, group in list(groups.items()):
+        if group[0].is_whole_capture or not group[0].tags.first_text(group[0].camera.capture_ids):
+            continue
+        joined = groups[first.setdefault((key[0], key[2]), key)]
+        names = [{f.path.stem for f in files} | {b.name for f in files for b in f.bands} for files in (joined, group)]
+        times_s = [unix_time_s(files[0].tags.captured_at) or 0.0 for files in (joined, group)]
+        is_now = abs(times_s[0] - times_s[1]) < _MAX_HALVES_APART_S
+        if joined is not group and is_now and names[0].isdisjoint(names[1]):
+            joined += groups.pop(key)
 
 
 def _add_files_without_id(groups: dict[_GroupKey, list[ImageFile]]) -> None:
@@ -214,7 +282,10 @@ def _tags_of(reference: Band, files: Sequence[ImageFile]) -> Tags:
     """The tags that describe the capture: those of the reference, or of the first file if these are damaged."""
     with_tags = [f for f in files if f.tags != Tags()]
     first = with_tags[0].tags if with_tags else files[0].tags
-    return next((f.tags for f in with_tags if f.path == reference.path), first)
+    tags = next((f.tags for f in with_tags if f.path == reference.path), first)
+    if tags.unread is None:
+        return tags
+    return replace(tags, xmp={k: v for f in reversed(files) for k, v in f.tags.xmp.items()} | dict(tags.xmp))
 
 
 def _bands_to_align(files: Sequence[ImageFile], names: Sequence[str]) -> list[Band]:

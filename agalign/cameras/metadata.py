@@ -33,6 +33,8 @@ class Tags:
     """Mean of the values of the TIFF tag BlackLevel."""
     xmp: Mapping[Name, tuple[str, ...]] = field(default_factory=dict)
     exif: Mapping[str, Any] = field(default_factory=dict)
+    unread: tuple[str, ...] | None = None
+    """Names of the values in a damaged XMP packet that could not be read; None for an intact packet."""
 
     def text(self, namespace: str, name: str) -> str:
         """Return an XMP value as text, with the items of a sequence joined by commas; empty if it is missing.
@@ -94,7 +96,7 @@ def read_tags(path: Path, page: int = 0) -> Tags:
         {names.get(tag, str(tag)): values(entry) for tag, entry in directories[key].items()}
         for key, names in ((0, ExifTags.TAGS), (EXIF, ExifTags.TAGS), (GPS, ExifTags.GPSTAGS))
     )
-    orientation = first.get("Orientation", 1)
+    orientation, packet = first.get("Orientation", 1), Packet.parse(first.get("XMLPacket", b""))
     return Tags(
         make=_text(first.get("Make")),
         model=_text(first.get("Model")),
@@ -104,8 +106,9 @@ def read_tags(path: Path, page: int = 0) -> Tags:
         or _iso_time({**exif, **first}, "DateTime", "OffsetTime"),
         orientation=int(orientation) if orientation in range(1, 9) else 1,
         black_level=_mean(first.get("BlackLevel")),
-        xmp=Packet.parse(first.get("XMLPacket", b"")).values(),
+        xmp=packet.values(),
         exif=exif,
+        unread=packet.unread,
     )
 
 

@@ -72,6 +72,7 @@ class MicaSense(Camera):
             to_rig=rays_to_rig(lens, rotation(*pix4d.rig_degrees(tags))),
             parallax_direction=known_parallax if offset is None else (-offset[0], -offset[1]),
             radiometry=centikelvin if is_thermal(band) else _radiometry(tags),
+            uncalibrated="" if is_thermal(band) else _without_calibration(tags),
             lens_offset=offset,
         )
         return (band,)
@@ -109,6 +110,18 @@ def _radiometry(tags: Tags) -> Radiometry | None:
         (math.pi / math.prod(irradiance), "reflectance") if irradiance else None,
         tags={"calibration coefficient": a[0], "sensor gain": iso / 100, "exposure time (s)": exposure_s},
     )
+
+
+def _without_calibration(tags: Tags) -> str:
+    """The tags that radiance needs and the file lacks, in words; empty if it lacks none."""
+    has = {
+        "RadiometricCalibration": tags.text(_MICASENSE, "RadiometricCalibration"),
+        "ExposureTime": tags.exif.get("ExposureTime"),
+        "ISOSpeed": tags.exif.get("ISOSpeed", tags.exif.get("ISOSpeedRatings")),
+        "BlackLevel": tags.black_level is not None,
+    }
+    missing = [name for name, value in has.items() if not value]
+    return f"no tag {', '.join(missing)} for radiance" if missing else ""
 
 
 def _irradiance(tags: Tags) -> tuple[float, float] | None:

@@ -72,7 +72,10 @@ class Sequoia(Camera):
         names = {"GRE": "Green", "RED": "Red", "REG": "Red edge", "NIR": "NIR"}
         named_by_tag = tags.text(pix4d.NAMESPACE, "BandName") or path.stem
         name = names.get(suffix[1].upper(), suffix[1]) if suffix else named_by_tag
-        return (replace(pix4d.with_wavelength(stored[0], tags), name=name, lens=lens, to_rig=to_rig),)
+        band = replace(pix4d.with_wavelength(stored[0], tags), name=name, lens=lens, to_rig=to_rig)
+        # Parrot's formula for them has not been compared with a reference.
+        why = "no tags for radiance (SensorModel and IrradianceList are not used)"
+        return (replace(band, uncalibrated=why if tags.text(pix4d.NAMESPACE, "SensorModel") else ""),)
 
     def capture_name(self, path: Path) -> str:
         return _SUFFIX.sub("", path.stem)

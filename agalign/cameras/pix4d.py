@@ -98,6 +98,28 @@ def with_wavelength(band: Band, tags: Tags) -> Band:
     )
 
 
+def listed_names(tags: Tags) -> list[str]:
+    """Return the items of Camera:BandName, which is a list in files of several bands."""
+    return [name.strip() for name in tags.text(NAMESPACE, "BandName").split(",") if name.strip()]
+
+
+def listed_bands(tags: Tags, stored: Sequence[Band]) -> tuple[Band, ...]:
+    """Return the bands of a file with those of its names, wavelengths and widths that are lists of one item for each
+    band.
+    """
+    names, count = listed_names(tags), len(stored)
+    nm, width_nm = tags.numbers(NAMESPACE, "CentralWavelength"), tags.numbers(NAMESPACE, "WavelengthFWHM")
+    return tuple(
+        replace(
+            band,
+            name=band.name or (names[i] if len(names) == count else ""),
+            wavelength_nm=band.wavelength_nm or (nm[i] if len(nm) == count else None),
+            bandwidth_nm=band.bandwidth_nm or (width_nm[i] if len(width_nm) == count else None),
+        )
+        for i, band in enumerate(stored)
+    )
+
+
 def pose_of(tags: Tags, height_m: float | None = None) -> Pose | None:
     """Return the pose by Camera:Yaw, Pitch and Roll, degrees; None if the yaw is missing. All are 0 for a camera that
     looks straight down with its upper edge to the north.

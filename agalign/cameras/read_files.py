@@ -24,12 +24,12 @@ from agalign.values.processes import environment_of_children, follow_parent
 
 @dataclass(frozen=True)
 class Problem:
-    """A file or capture that is left out, and the reason."""
+    """A file or capture that is left out, or used with fewer tags, and the reason."""
 
     path: Path
     error: AgalignError
-    is_exact_copy: bool = False
-    """True for a file with the same bytes as another one, which takes part."""
+    loses_nothing: bool = False
+    """True for a file with the same bytes as another one, which takes part, and for a file used with fewer tags."""
 
     @property
     def text(self) -> str:
@@ -90,8 +90,10 @@ def read_file(path: Path, cameras: Iterable[Camera], options: DiscoverOptions) -
     bands = [replace(b, panel=panel) for b in named if options.with_rgb or not b.companion]
     for i, band in enumerate(bands):
         if band.radiometry is not None:
-            radiometry, implausible = plausible(band.radiometry, band.size_px)
-            bands[i] = replace(band, radiometry=radiometry, implausible=implausible)
+            radiometry, problem = plausible(band.radiometry, band.size_px)
+            if problem:
+                reason = problem if radiometry is not None else f"no usable tags for radiance ({problem})"
+                bands[i] = replace(band, radiometry=radiometry, uncalibrated=reason)
     return ImageFile(path, camera, tags, tuple(bands))
 
 

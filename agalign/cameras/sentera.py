@@ -76,20 +76,8 @@ def _channel_bands(path: Path, tags: Tags, stored: Sequence[Band]) -> tuple[Band
 
 def _listed_bands(tags: Tags, stored: Sequence[Band]) -> tuple[Band, ...]:
     """The bands of a photograph as its tags list them by channel; a channel without a wavelength is left out."""
-    names = tags.xmp.get((pix4d.NAMESPACE, "BandName"), ())
-    wavelengths, widths = (tags.numbers(pix4d.NAMESPACE, name) for name in ("CentralWavelength", "WavelengthFWHM"))
-    if not len(names) == len(wavelengths) == len(stored):
+    bands, lens = pix4d.listed_bands(tags, stored), pix4d.perspective_lens(tags)
+    if any(not b.name or b.wavelength_nm is None for b in bands):
         return ()
-    lens = pix4d.perspective_lens(tags)
-    return tuple(
-        replace(
-            band,
-            name="Red edge" if name == "RedEdge" else name,
-            wavelength_nm=wavelength,
-            one_lens=True,
-            lens=lens,
-            bandwidth_nm=widths[band.band_index - 1] if len(widths) == len(names) else None,
-        )
-        for band, name, wavelength in zip(stored, names, wavelengths, strict=True)
-        if wavelength > 0
-    )
+    names = {"RedEdge": "Red edge"}
+    return tuple(replace(b, name=names.get(b.name, b.name), one_lens=True, lens=lens) for b in bands if b.wavelength_nm)

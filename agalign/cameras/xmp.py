@@ -1,18 +1,13 @@
 """XMP packets: reading and changing values by namespace, in any of the forms that cameras write."""
 
 import re
-import threading
 from collections.abc import Collection, Iterator, Sequence
-from contextlib import contextmanager
 from copy import deepcopy
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
-from xml.etree import ElementTree
-from xml.etree.ElementTree import Element, ParseError
 
-from defusedxml import DefusedXmlException
-from defusedxml.ElementTree import fromstring
+from lxml import etree
 
 from agalign.values.text import without_controls
 
@@ -28,40 +23,48 @@ def names_in(namespace: str, names: str) -> frozenset[Name]:
 
 
 _RDF = "{http://www.w3.org/1999/02/22-rdf-syntax-ns#}"
-_MAX_DEPTH = 50
-"""Limit of nested elements, which protects the recursive XML library, and of the parts of a namespace; cameras write
-six and three.
-"""
-_NAMESPACES = threading.Lock()
+_MAX_PARTS = 50
+"""Limit of the parts of a namespace; cameras write three."""
+_USUAL = (
+    f'xmlns:x="adobe:ns:meta/" xmlns:rdf="{_RDF[1:-1]}" xmlns:Camera="http://pix4d.com/camera/1.0/" '
+    'xmlns:MicaSense="http://micasense.com/MicaSense/1.0/" xmlns:DLS="http://micasense.com/DLS/1.0/" '
+    'xmlns:drone-dji="http://www.dji.com/drone-dji/1.0/" xmlns:Sentera="https://www.sentera.com/schemas/" '
+    'xmlns:crs="http://ns.adobe.com/camera-raw-settings/1.0/"'
+)
+"""The prefixes that cameras write, for packets that do not declare them, or wrongly."""
+_PREFIXES = dict(re.findall(r'xmlns:([\w-]+)="([^"]+)"', _USUAL))
+_SAFE = {"resolve_entities": False, "no_network": True, "remove_comments": True, "remove_pis": True}
+_STRICT, _RECOVERING = etree.XMLParser(**_SAFE), etree.XMLParser(**_SAFE, recover=True)
+_ENVELOPE = r"(?:\w+:)?(?:xmpmeta|xapmeta|RDF)\b"
 
 
 @dataclass(frozen=True)
 class Packet:
     """One XMP packet; an empty one has no root."""
 
-    root: Element | None = None
-    prefixes: tuple[tuple[str, str], ...] = ()
-    """(prefix, namespace URI) as they were read."""
+    root: Any = None
+    """Element of lxml."""
+    unread: tuple[str, ...] | None = None
+    """Names of the values in a damaged packet that could not be read; None for an intact packet."""
 
     @classmethod
     def parse(cls, packet: Any) -> "Packet":
-        """Parse bytes or text. A malformed packet becomes an empty one, because the image may still be good."""
-        text = packet.decode("utf-8", "replace") if isinstance(packet, bytes) else packet
+        """Parse bytes or text. Of a damaged packet, what can be read is read."""
+        text = packet.decode("utf-8", "replace") if isinstance(packet, bytes) else str(packet)
         max_length = 1 << 22  # cameras write a few thousand characters
-        if not isinstance(text, str) or len(text) > max_length:
-            return cls()
-        start, end = text.find("<x:xmpmeta"), text.rfind("</x:xmpmeta>")
-        if start < 0 or end < 0:
-            return cls()
-        text = text[start : end + len("</x:xmpmeta>")]
+        text = text[:max_length].strip("\0 \n")
+        start = re.search(f"<({_ENVELOPE})", text)
+        if start is None:
+            return _recovered(text) if text else cls()
+        end_tag = f"</{start[1]}>"
+        # Without what is before the first element: no document type, thus no entities.
+        whole = text[start.start() : text.rfind(end_tag) + len(end_tag)]
         try:
-            root = fromstring(text)
-        except (ParseError, DefusedXmlException, ValueError):
-            return cls()
-        if _is_deeper(root, _MAX_DEPTH):
-            return cls()
-        prefixes = re.findall(r"""xmlns:([A-Za-z_][\w.-]*)\s*=\s*["']([^"']+)["']""", text)
-        return cls(root, tuple(p for p in prefixes if not re.fullmatch(r"ns\d+", p[0])))
+            root = etree.fromstring(whole, _STRICT)
+        except (etree.XMLSyntaxError, ValueError):
+            return _recovered(text[start.start() :])
+        declared = re.findall(r"""xmlns:([A-Za-z_][\w.-]*)\s*=\s*["']([^"']+)["']""", whole)
+        return cls(root) if all(_is_usual(*one) for one in declared) else _recovered(whole)
 
     def values(self) -> dict[Name, tuple[str, ...]]:
         """Return {(namespace, name): values} of all rdf:Description elements; the first of two values is used.
@@ -110,52 +113,72 @@ class Packet:
             for tag in [*description.attrib, *(child.tag for child in description)]:
                 uri, _, _ = tag.removeprefix("{").rpartition("}")
                 if name[0] in _namespaces(uri):
-                    ElementTree.SubElement(description, f"{{{uri}}}{name[1]}").text = value
+                    etree.SubElement(description, f"{{{uri}}}{name[1]}").text = value
                     return
 
     def serialised(self) -> bytes:
         """Return the bytes of the packet for a file; empty for an empty packet."""
         if self.root is None:
             return b""
-        with _registered(self.prefixes):
-            body = ElementTree.tostring(self.root, encoding="unicode")
+        # Declared at the root: moved values keep the prefix by which other software finds them.
+        used = {prefix: uri for element in self.root.iter() for prefix, uri in element.nsmap.items()}
+        usual = {prefix: uri for prefix, uri in used.items() if prefix and not re.fullmatch(r"ns\d+", prefix)}
+        etree.cleanup_namespaces(self.root, top_nsmap=usual)
+        body = etree.tostring(self.root, encoding="unicode")
         head, tail = '<?xpacket begin="\ufeff" id="W5M0MpCehiHzreSzNTczkc9d"?>', '<?xpacket end="w"?>'
         return f"{head}\n{body}\n{tail}".encode()
 
-    def _descriptions(self) -> Iterator[Element]:
+    def _descriptions(self) -> Iterator[Any]:
         return iter(()) if self.root is None else self.root.iter(f"{_RDF}Description")
 
 
-@contextmanager
-def _registered(prefixes: Sequence[tuple[str, str]]) -> Iterator[None]:
-    """Serialise with these prefixes. ElementTree has one global table of prefixes, which is restored afterwards so that
-    the prefixes of one file are not used for another.
+def _recovered(text: str) -> Packet:
+    """What can be read of a damaged packet, as an intact one with all values in one description.
+
+    The last value of a packet that is cut is left out, because it may be cut as well.
     """
-    table: dict[str, str] = vars(ElementTree)["_namespace_map"]
-    with _NAMESPACES:
-        before = dict(table)
-        try:
-            for prefix, uri in prefixes:
-                ElementTree.register_namespace(prefix, uri)
-            yield
-        finally:
-            table.clear()
-            table.update(before)
+    text = re.sub(r"[\0-\x08\x0b\x0c\x0e-\x1f\ufffe\uffff]", "", text)
+    is_cut = not re.search(f"</{_ENVELOPE}", text)
+    if is_cut:
+        # Up to the last whole attribute of a start tag that is cut, else up to the last tag.
+        start_tag = re.search(r"""<[\w:-]++(?:\s++[\w:-]++\s*+=\s*+(?:"[^"<]*+"|'[^'<]*+'))*+(?=[^<>]*$)""", text)
+        text = f"{text[: start_tag.end()]}>" if start_tag else text[: text.rfind(">") + 1]
+    prefix = "|".join(_PREFIXES)
+    # Superfluous end tags would close the elements around them, and the usual prefixes are declared here.
+    misleading = rf"""</(?:{_ENVELOPE}|\w+:Description\b)[^<>]*>|\sxmlns:(?:{prefix})\s*=\s*(?:"[^"<>]*"|'[^'<>]*')"""
+    plain = re.sub(r"&(?!(?:amp|lt|gt|quot|apos|#\d+|#x[\da-fA-F]+);)", "&amp;", re.sub(misleading, " ", text))
+    read = etree.fromstring(f"<packet {_USUAL}>{plain}</packet>", _RECOVERING)
+    root = etree.fromstring(f"<x:xmpmeta {_USUAL}><rdf:RDF><rdf:Description/></rdf:RDF></x:xmpmeta>", _STRICT)
+    description = root[0][0]
+    for element in () if read is None else read.iter():
+        for tag, value in [*element.attrib.items(), (element.tag, ",".join(_texts(element)))]:
+            if _names(tag) and value.strip(" \t\r\n,"):
+                etree.SubElement(description, tag, nsmap=element.nsmap).text = value
+    if is_cut and len(description):
+        last = f"{description[-1].prefix}:{etree.QName(description[-1]).localname}"
+        if text.rfind(f"<{last}") > text.rfind(f"</{last}"):
+            description.remove(description[-1])
+    known = Packet(root).values()
+    # Elements and attributes with a value.
+    written = rf"""<({prefix}):([\w-]+)[^<>]*(?<!/)>(?!\s*</)|\s({prefix}):([\w-]+)\s*=\s*(?:"[^"]|'[^'])"""
+    found = ((a or c, b or d) for a, b, c, d in re.findall(written, text))
+    unread = (name for prefix, name in found if not {*_names(f"{{{_PREFIXES[prefix]}}}{name}")} <= known.keys())
+    return Packet(root if len(description) else None, (*(["its end"] if is_cut else ()), *dict.fromkeys(unread)))
 
 
-def _is_deeper(root: Element, depth: int) -> bool:
-    level = [root]
-    for _ in range(depth):
-        level = [child for element in level for child in element]
-    return bool(level)
+@lru_cache(maxsize=256)
+def _is_usual(prefix: str, uri: str) -> bool:
+    """False if a usual prefix has another namespace than in any version of firmware."""
+    theirs, ours = _namespaces(uri), _namespaces(_PREFIXES.get(prefix, uri))
+    return uri == _PREFIXES.get(prefix, uri) if not ours else bool({*theirs[:1]} & {*ours} | {*ours[:1]} & {*theirs})
 
 
-def _texts(element: Element) -> tuple[str, ...]:
-    items = [item.text or "" for item in element.iter(f"{_RDF}li")]
+def _texts(element: Any) -> tuple[str, ...]:
+    items = [item.text or "" for item in element.iterfind(f"*/{_RDF}li")]
     return tuple(items) if items else (element.text or "",)
 
 
-def _put_texts(element: Element, values: Sequence[str]) -> None:
+def _put_texts(element: Any, values: Sequence[str]) -> None:
     """Set the items of a sequence if their number agrees, else one text with the values joined by commas."""
     items = list(element.iter(f"{_RDF}li"))
     if items and len(items) == len(values):
@@ -177,9 +200,9 @@ def _is_one_of(tag: str, names: Collection[Name]) -> bool:
 
 
 def _namespaces(uri: str) -> list[str]:
-    if uri.startswith("http://www.w3.org/"):
+    if uri.startswith(("http://www.w3.org/", "adobe:ns:meta")):
         return []
     scheme_and_version = r"^https?://(?:www\.)?|(?:/\d+(?:\.\d+)*)?/?$"
     path = re.sub(scheme_and_version, "", uri, flags=re.IGNORECASE)
-    parts = path.split("/")[:_MAX_DEPTH]
+    parts = path.split("/")[:_MAX_PARTS]
     return ["/".join(parts[:count]) for count in range(len(parts), 0, -1)] if path else []

@@ -115,6 +115,8 @@ class CameraOverview:
     """Median ground sample distance of the reference."""
     radiometry: tuple[RadiometryChoice, ...]
     """Values of `--radiometry` that the tags of all captures support; panels are not considered."""
+    uncalibrated: str = ""
+    """Why there is no calibration: the tags that are missing or not used."""
     gsd_per_height: float | None = None
     """Ground sample distance per metre of height, from the focal length of the reference."""
 
@@ -132,7 +134,8 @@ class CameraOverview:
         if self.gsd_m is None and self.gsd_per_height is not None:
             parts.append(f"GSD {1e4 * self.gsd_per_height:.1f} cm at a height of 100 m")
         kinds = {"camera": "radiance by calibration", "sun": "reflectance by light sensor"}
-        parts.append(f"radiometry: {', '.join(kinds[r] for r in self.radiometry) or 'none in the tags'}")
+        none = self.uncalibrated or "none in the tags"
+        parts.append(f"radiometry: {', '.join(kinds[r] for r in self.radiometry) or none}")
         return ", ".join(parts)
 
 
@@ -164,6 +167,7 @@ def _overview(name: str, serial: str, captures: Sequence[Capture]) -> CameraOver
         altitude_m=(min(altitudes_m), max(altitudes_m)) if altitudes_m else None,
         gsd_m=gsd_m,
         gsd_per_height=_gsd_per_height(typical),
+        uncalibrated=next((b.uncalibrated for c in captures for b in c.bands if b.uncalibrated), ""),
         radiometry=tuple(choice for choice in choices if all(_supports(c, choice) for c in captures)),
     )
 

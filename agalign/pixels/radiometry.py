@@ -103,7 +103,11 @@ def with_radiometry(capture: Capture, choice: RadiometryChoice, by_panel: Mappin
         result = {b.name: _converted(b.radiometry, candidate, by_panel.get(b.name)) for b in capture.bands}
         if all(result[b.name] is not None for b in capture.bands if not b.companion):
             break
-    return replace(capture, bands=tuple(replace(b, radiometry=result[b.name]) for b in capture.bands))
+    bands = []
+    for b in capture.bands:
+        why = b.uncalibrated or ("no tags for radiance" if b.radiometry is None else "")
+        bands.append(replace(b, radiometry=result[b.name], uncalibrated=why))
+    return replace(capture, bands=tuple(bands))
 
 
 def _converted(

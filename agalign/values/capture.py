@@ -161,8 +161,9 @@ class Band:
     overviews: tuple[int, ...] = ()
     """Reduction factors of the overviews in the file."""
     radiometry: Radiometry | None = None
-    implausible: str = ""
-    """Tag with an implausible value that leaves out `radiometry`, or its factor to reflectance, in words."""
+    uncalibrated: str = ""
+    """Why it has no radiometric calibration, or no factor to reflectance, with the missing or implausible tag; empty if
+    it has both or the camera has none."""
     panel: Panel | None = None
 
     @property

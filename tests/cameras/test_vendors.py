@@ -192,7 +192,9 @@ def test_a_capture_is_grouped_named_and_seeded(tmp_path: Path, name: str, dialec
 def test_damaged_tags_leave_the_names_of_the_files(tmp_path: Path, name: str, damage: str) -> None:
     vendor = VENDORS[name]
     write_capture(tmp_path, vendor, damage=damage)
-    capture = only_capture(tmp_path)
+    scan = discover(tmp_path)
+    (capture,) = scan.captures
+    assert len(scan.problems) == (len(vendor.files) if damage == "malformed" else 0)
     numbered = name == "RedEdge" and damage != "no numbers"  # its files have no names of bands
     named = {f"band_{part}" if numbered else band for part, (band, _) in vendor.bands.items()}
     assert {b.name for b in capture.bands} == named

@@ -1,0 +1,310 @@
+"""Damaged XMP packets, lists of bands in tags, and tags without which there is no radiance."""
+
+import json
+import re
+import shutil
+import subprocess
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from agalign.batch.capture_task import missing_radiometry
+from agalign.cameras.discover import FolderScan, discover
+from agalign.cameras.metadata import read_tags
+from agalign.cameras.pix4d import NAMESPACE
+from agalign.cameras.tiff_directory import byte_string, rational, short, text
+from agalign.cameras.xmp import Packet
+from agalign.flight.groups import camera_overviews, flights_of
+from agalign.pixels.radiometry import with_radiometry
+from agalign.values.capture import Capture
+
+from .test_vendors import SIZE, write_file
+
+PACKET = """<?xpacket begin="" id="W5M0MpCehiHzreSzNTczkc9d"?>
+<x:xmpmeta xmlns:x="adobe:ns:meta/">
+ <rdf:RDF xmlns:rdf="http://www.w3.org/1999/02/22-rdf-syntax-ns#">
+  <rdf:Description rdf:about="" xmlns:Camera="http://pix4d.com/camera/1.0" Camera:RigName="RedEdge-M">
+   <Camera:BandName>{band}</Camera:BandName>
+   <Camera:CentralWavelength>{nm}</Camera:CentralWavelength>
+   <Camera:WavelengthFWHM>20</Camera:WavelengthFWHM>
+   <Camera:PrincipalPoint>{x},1.8165</Camera:PrincipalPoint>
+   <Camera:PerspectiveFocalLength>5.45</Camera:PerspectiveFocalLength>
+   <Camera:PerspectiveFocalLengthUnits>mm</Camera:PerspectiveFocalLengthUnits>
+   <Camera:RigRelatives>0.1, 0.2, 0.3</Camera:RigRelatives>
+   <Camera:VignettingCenter><rdf:Seq><rdf:li>80.0</rdf:li><rdf:li>60.0</rdf:li></rdf:Seq></Camera:VignettingCenter>
+  </rdf:Description>
+  <rdf:Description rdf:about="" xmlns:MicaSense="http://micasense.com/MicaSense/1.0/">
+   <MicaSense:CaptureId>{capture}</MicaSense:CaptureId>
+   <MicaSense:FlightId>flight1</MicaSense:FlightId>
+   <MicaSense:RadiometricCalibration>
+    <rdf:Seq><rdf:li>1e-4</rdf:li><rdf:li>0</rdf:li><rdf:li>0</rdf:li></rdf:Seq>
+   </MicaSense:RadiometricCalibration>
+  </rdf:Description>
+  <rdf:Description rdf:about="" xmlns:DLS="http://micasense.com/DLS/1.0/">
+   <DLS:HorizontalIrradiance>80.0</DLS:HorizontalIrradiance>
+  </rdf:Description>
+ </rdf:RDF>
+</x:xmpmeta>
+<?xpacket end="w"?>"""
+BANDS = {2: ("Green", 560), 3: ("Red", 668), 4: ("NIR", 840)}
+
+
+def replaced(old: str, new: str) -> Callable[[str], str]:
+    def change(packet: str) -> str:
+        assert old in packet
+        return packet.replace(old, new, 1)
+
+    return change
+
+
+def without_wrapper(packet: str) -> str:
+    return re.sub(r"</?x:xmpmeta[^>]*>", "", packet)
+
+
+DAMAGES: dict[str, Callable[[str], str]] = {
+    "two end tags": lambda p: p + "\n</x:xmpmeta>",
+    "an end tag too many in the middle": replaced("</rdf:Description>", "</rdf:Description></rdf:Description>"),
+    "no wrapper": without_wrapper,
+    "xapmeta": lambda p: p.replace("x:xmpmeta", "x:xapmeta"),
+    "undeclared prefix of the camera": replaced(' xmlns:Camera="http://pix4d.com/camera/1.0"', ""),
+    "undeclared prefix of RDF": replaced(' xmlns:rdf="http://www.w3.org/1999/02/22-rdf-syntax-ns#"', ""),
+    "undeclared unknown prefix": replaced("<Camera:Wave", "<foo:Bar>1</foo:Bar><Camera:Wave"),
+    "damaged namespace": replaced("http://pix4d.com/camera", "http://pix4x.com/camera"),
+    "damaged namespace of RDF": replaced("22-rdf-syntax", "22-rdf-syntay"),
+    "ampersand in a text": replaced("<Camera:Wave", "<Camera:Note>R&D & more</Camera:Note><Camera:Wave"),
+    "ampersand in an attribute": replaced("RedEdge-M", "R&D RedEdge-M"),
+    "control characters": replaced("RedEdge-M", "Red\x01Edge\x0b-M"),
+    "control characters between tags": replaced("</Camera:BandName>", "</Camera:BandName>\x02\x1f"),
+    "a tag that is not closed": replaced("</Camera:WavelengthFWHM>", ""),
+    "a list that is not closed": replaced("</Camera:VignettingCenter>", ""),
+    "a band's name that is not closed": replaced("</Camera:BandName>", ""),
+    "a description that is not closed": replaced("</rdf:Description>", ""),
+    "duplicate attribute": replaced(' Camera:RigName="', ' Camera:RigName="x" Camera:RigName="'),
+    "no end of RDF": replaced("</rdf:RDF>", ""),
+}
+"""Damages after which all tags that matter can be read."""
+
+
+def write_capture(
+    folder: Path,
+    number: int = 1,
+    change: Callable[[str], str] = lambda p: p,
+    only: int | None = None,
+    bands: dict[int, tuple[str, int]] | None = None,
+    at: str = "2026:06:21 10:00:00",
+) -> None:
+    """Three bands of a RedEdge-M; `change` is that of the packets of all bands, or of that of one."""
+    for k, (band, nm) in (BANDS if bands is None else bands).items():
+        xmp = PACKET.format(band=band, nm=nm, x=2.37 + k / 100, capture=f"capture{number}")
+        xmp = change(xmp) if only in (None, k) else xmp
+        first = {271: text("MicaSense"), 272: text("RedEdge-M"), 700: byte_string(xmp.encode()), 50714: short(4800)}
+        exif = {0xA20E: rational(266.67), 0xA20F: rational(266.67), 0xA210: short(4), 0x829A: rational(0.001)}
+        exif |= {0x8827: short(100), 0x9003: text(at)}
+        write_file(folder / f"IMG_{number:04d}_{k}.tif", first, exif)
+
+
+def offers(capture: Capture) -> tuple[object, ...]:
+    """What tags give: names, wavelengths, ids, lenses, rig and calibrations."""
+    return (
+        [(b.name, b.wavelength_nm, b.bandwidth_nm, str(b.lens), str(b.to_rig), b.radiometry) for b in capture.bands],
+        (capture.capture_id, capture.flight_id, capture.reference.name),
+    )
+
+
+def intact(folder: Path) -> Capture:
+    write_capture(folder)
+    (capture,) = discover(folder).captures
+    assert [b.name for b in capture.bands] == ["Green", "Red", "NIR"]
+    assert all(b.lens is not None and b.radiometry is not None and b.radiometry.by_sun for b in capture.bands)
+    return capture
+
+
+@pytest.mark.parametrize("name", DAMAGES)
+def test_damaged_packets_give_the_tags_of_intact_ones(tmp_path: Path, name: str) -> None:
+    write_capture(tmp_path / "a", change=DAMAGES[name])
+    scan = discover(tmp_path / "a")
+    (capture,) = scan.captures
+    assert offers(capture) == offers(intact(tmp_path / "b"))
+    assert not [p.text for p in scan.problems if "foo" not in p.text]
+
+
+@pytest.mark.skipif(shutil.which("exiftool") is None, reason="exiftool is not installed")
+@pytest.mark.parametrize("name", DAMAGES)
+def test_exiftool_finds_the_same_band(tmp_path: Path, name: str) -> None:
+    write_capture(tmp_path, change=DAMAGES[name])
+    path = tmp_path / "IMG_0001_2.tif"
+    done = subprocess.run(["exiftool", "-json", "-XMP:BandName", path], capture_output=True, text=True, check=False)
+    theirs = json.loads(done.stdout)[0].get("BandName", "Green")
+    assert read_tags(path).text(NAMESPACE, "BandName") == theirs == "Green"
+
+
+@pytest.mark.parametrize("at", ["<Camera:BandName>Gr", "<Camera:Wave", "<Camera:Pers", "<MicaSense:Fl", "</x:xmpmeta"])
+def test_a_cut_packet_keeps_the_camera_and_names_what_is_missing(tmp_path: Path, at: str) -> None:
+    for number in (1, 2, 3):
+        write_capture(tmp_path, number, lambda p: p[: p.index(at) + len(at)] if number == 2 else p, only=2)  # noqa: B023
+    scan = discover(tmp_path)
+    assert [[b.name for b in c.bands] for c in scan.captures] == [["Green", "Red", "NIR"]] * 3
+    assert {c.reference.name for c in scan.captures} == {"Green"}
+    assert len(flights_of(scan.captures)) == 1
+    assert len(camera_overviews(scan.captures)) == 1
+    assert scan.is_complete
+    if at == "</x:xmpmeta":
+        assert not scan.problems
+        return
+    (problem,) = scan.problems
+    assert "IMG_0002_2.tif: its XMP packet is damaged and lacks its end, " in problem.text
+    assert "BandName" not in problem.text or "BandName" in at
+    assert ("CentralWavelength" in problem.text) == ("BandName" in at)
+    assert ("FlightId" in problem.text) == ("MicaSense" in at)
+
+
+def test_a_cut_value_is_left_out() -> None:
+    values = Packet.parse(PACKET[: PACKET.index("{nm}")].format(band="Green") + "5").values()
+    assert values[NAMESPACE, "BandName"] == ("Green",)
+    assert (NAMESPACE, "CentralWavelength") not in values
+    in_list = PACKET[: PACKET.index("<rdf:li>60.0")].format(band="Green", nm=560, x=1)
+    assert (NAMESPACE, "VignettingCenter") not in Packet.parse(in_list).values()
+    attributes = PACKET[: PACKET.index("RedEdge-M")] + 'Red" Camera:BandName="Green" Camera:RigRelatives="1, 2'
+    values = Packet.parse(attributes).values()
+    assert (values[NAMESPACE, "RigName"], values[NAMESPACE, "BandName"]) == (("Red",), ("Green",))
+    assert (NAMESPACE, "RigRelatives") not in values
+
+
+def test_a_packet_without_any_tag_has_a_line(tmp_path: Path) -> None:
+    write_capture(tmp_path, change=lambda _: "no XML at all", only=3)
+    (problem,) = discover(tmp_path).problems
+    assert "IMG_0001_3.tif: its XMP packet is damaged and lacks its end, " in problem.text
+
+
+def test_a_damaged_packet_is_repaired_for_outputs() -> None:
+    packet = Packet.parse(DAMAGES["a tag that is not closed"](PACKET))
+    again = Packet.parse(packet.serialised())
+    assert again.unread is None
+    assert again.values() == packet.values()
+
+
+def test_hostile_packets_cost_nothing() -> None:
+    entities = '<!DOCTYPE l [<!ENTITY a "b"><!ENTITY c "&a;&a;">]>'
+    assert Packet.parse(entities + PACKET.format(band="&c;", nm=1, x=1, capture=1)).values()[NAMESPACE, "BandName"] == (
+        "&c;",
+    )
+    deep = PACKET.replace("<Camera:BandName>", "<Camera:a>" * 100_000 + "<Camera:BandName>")
+    assert Packet.parse(deep).unread
+    wide = PACKET.replace("rdf:about", " ".join(f'Camera:n{i}="1"' for i in range(20_000)) + " rdf:about")
+    assert len(Packet.parse(wide + "</x>").values()) > 20_000
+
+
+# ---- lists of bands
+
+
+def write_stack(path: Path, names: str, wavelengths: str) -> FolderScan:
+    body = (
+        f"<Camera:BandName>{names}</Camera:BandName><Camera:CentralWavelength>{wavelengths}</Camera:CentralWavelength>"
+    )
+    xmp = (
+        '<x:xmpmeta xmlns:x="adobe:ns:meta/"><rdf:RDF xmlns:rdf="http://www.w3.org/1999/02/22-rdf-syntax-ns#">'
+        f'<rdf:Description xmlns:Camera="http://pix4d.com/camera/1.0">{body}</rdf:Description></rdf:RDF></x:xmpmeta>'
+    )
+    write_file(path, {700: byte_string(xmp.encode())}, shape=(3, *SIZE[::-1]))
+    return discover(path.parent)
+
+
+def listed(*items: object) -> str:
+    return "<rdf:Seq>" + "".join(f"<rdf:li>{item}</rdf:li>" for item in items) + "</rdf:Seq>"
+
+
+@pytest.mark.parametrize("join", [listed, lambda *items: ", ".join(map(str, items))])
+def test_lists_in_tags_have_an_item_for_each_band(tmp_path: Path, join: Callable[..., str]) -> None:
+    scan = write_stack(tmp_path / "field.tif", join("Green", "Red", "NIR"), join(560, 668, 840))
+    (capture,) = scan.captures
+    assert {b.name: b.wavelength_nm for b in capture.bands} == {"Green": 560, "Red": 668, "NIR": 840}
+    assert not scan.problems
+
+
+@pytest.mark.parametrize(
+    ("names", "wavelengths", "counts"),
+    [
+        (listed("Green", "Red"), listed(560, 668, 840), "2 names and 3 wavelengths"),
+        ("Green", "560", "1 name and 1 wavelength of"),
+        (listed("Green", "Red", "NIR"), listed(560, 840), "3 names and 2 wavelengths"),
+    ],
+)
+def test_lists_of_other_lengths_have_a_line(tmp_path: Path, names: str, wavelengths: str, counts: str) -> None:
+    scan = write_stack(tmp_path / "field.tif", names, wavelengths)
+    (capture,) = scan.captures
+    (problem,) = scan.problems
+    assert "field.tif: has 3 bands, and its tags list " + counts in problem.text
+    assert len({b.wavelength_nm for b in capture.bands}) == (3 if counts.startswith("2") else 1)
+    assert len({b.name for b in capture.bands}) == 3
+
+
+# ---- reasons
+
+
+CHOICES = "auto", "camera", "sun", "panel"
+
+
+@pytest.mark.parametrize("choice", CHOICES)
+def test_the_missing_tag_is_the_reason(tmp_path: Path, choice: str) -> None:
+    write_capture(tmp_path, change=lambda p: re.sub(r"(?s)<MicaSense:Radiom.*</MicaSense:Radiom[^>]*>", "", p))
+    (capture,) = discover(tmp_path).captures
+    why = missing_radiometry(with_radiometry(capture, choice, {}), choice)
+    assert why == "no tag RadiometricCalibration for radiance in Green, Red, NIR; leave --radiometry out"
+    (overview,) = camera_overviews([capture])
+    assert overview.text.endswith("radiometry: no tag RadiometricCalibration for radiance")
+
+
+@pytest.mark.parametrize("choice", CHOICES)
+def test_advice_works(tmp_path: Path, choice: str) -> None:
+    """Without any calibration no choice is advised; without a light sensor others are."""
+    for name in ("a_green", "a_red"):
+        write_file(tmp_path / "plain" / f"{name}.tif")
+    (plain,) = discover(tmp_path / "plain").captures
+    why = missing_radiometry(with_radiometry(plain, choice, {}), choice)
+    assert why == "no tags for radiance in green, red; leave --radiometry out"
+    write_capture(tmp_path / "no_sun", change=lambda p: re.sub("<DLS:.*>", "", p))
+    (no_sun,) = discover(tmp_path / "no_sun").captures
+    why = missing_radiometry(with_radiometry(no_sun, choice, {}), choice)
+    assert ("--radiometry" in why) == (choice in ("sun", "panel"))
+    assert ("no tags of a light sensor" in why) == (choice == "sun")
+
+
+def test_the_calibration_of_a_sequoia_is_named(tmp_path: Path) -> None:
+    for part, band in (("GRE", "Green"), ("RED", "Red")):
+        body = PACKET.format(band=band, nm=550, x=2, capture=1).replace("WavelengthFWHM", "SensorModel")
+        body = re.sub("<MicaSense:.*>", "", body)
+        first = {271: text("Parrot"), 272: text("Sequoia"), 700: byte_string(body.encode())}
+        write_file(tmp_path / f"IMG_180413_080658_0000_{part}.TIF", first)
+    (capture,) = discover(tmp_path).captures
+    reason = "no tags for radiance (SensorModel and IrradianceList are not used)"
+    assert camera_overviews([capture])[0].text.endswith(f"radiometry: {reason}")
+    why = missing_radiometry(with_radiometry(capture, "sun", {}), "sun")
+    assert why == f"{reason} in Green, Red; leave --radiometry out"
+
+
+# ---- a card for each half of a dual camera
+
+
+OTHER_HALF = {7: ("Green-531", 531), 8: ("Red-650", 650)}
+
+
+def test_the_halves_of_a_dual_camera_are_joined(tmp_path: Path) -> None:
+    for number in (1, 2):
+        write_capture(tmp_path / "red", number)
+        write_capture(tmp_path / "blue", number, bands=OTHER_HALF)
+    captures = discover(tmp_path).captures
+    names = {"Green", "Red", "NIR", "Green-531", "Red-650"}
+    assert [{b.name for b in c.bands} for c in captures] == [names] * 2
+    assert len({c.capture_id for c in captures}) == 2
+
+
+@pytest.mark.parametrize(
+    ("bands", "at"), [(BANDS, "2026:06:21 10:00:00"), (OTHER_HALF, "2026:06:22 10:00:00")], ids=["copy", "another day"]
+)
+def test_other_folders_with_an_id_are_captures_of_their_own(
+    tmp_path: Path, bands: dict[int, tuple[str, int]], at: str
+) -> None:
+    write_capture(tmp_path / "a")
+    write_capture(tmp_path / "b", bands=bands, at=at)
+    assert sorted(len(c.bands) for c in discover(tmp_path).captures) == sorted([3, len(bands)])
