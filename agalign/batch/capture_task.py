@@ -154,21 +154,19 @@ def missing_radiometry(capture: Capture, choice: RadiometryChoice) -> str:
         return ""
     if uncalibrated := [b for b in lacking if b.uncalibrated]:  # no choice works without a calibration
         return f"{uncalibrated[0].uncalibrated} in {', '.join(b.name for b in uncalibrated)}; leave --radiometry out"
-    bands = ", ".join(b.name for b in lacking)
+    bands = ", ".join(b.name for b in lacking) + next((f" ({b.implausible})" for b in lacking if b.implausible), "")
     missing = {
-        "auto": f"no usable tags for radiance or reflectance in {bands}; leave --radiometry out",
-        "camera": f"no usable tags for radiance in {bands}; leave --radiometry out",
         "sun": f"no usable tags of a light sensor in {bands}; choose --radiometry camera or panel",
         "panel": f"no usable calibration panel of known reflectance was recorded within hours for {bands}; give "
         "--panel-albedo for a panel without QR code, or choose --radiometry sun or camera",
     }
-    return missing[choice]
+    return missing.get(choice, f"no tags for radiance in {bands}; leave --radiometry out")
 
 
 def lost_reflectance(capture: Capture, choice: RadiometryChoice) -> tuple[str, ...]:
     """Return the implausible tag that makes `auto` write radiance instead of reflectance; empty if there is none."""
-    lost = (b for b in capture.bands if b.uncalibrated and b.radiometry is not None and b.radiometry.is_of_light)
-    return tuple(f"not written as reflectance: {b.name}: {b.uncalibrated}" for b in lost if choice == "auto")[:1]
+    lost = (b for b in capture.bands if b.implausible and b.radiometry is not None and b.radiometry.is_of_light)
+    return tuple(f"not written as reflectance: {b.name}: {b.implausible}" for b in lost if choice == "auto")[:1]
 
 
 @dataclass(frozen=True)

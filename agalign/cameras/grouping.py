@@ -4,6 +4,7 @@ import math
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
+from datetime import timedelta
 from filecmp import cmp as same_bytes
 from itertools import count
 from pathlib import Path
@@ -18,7 +19,7 @@ from agalign.cameras.read_files import ImageFile, Problem, natural_order
 from agalign.config import DiscoverOptions
 from agalign.errors import InputError
 from agalign.pixels.raster import suffix_format
-from agalign.values.capture import Band, CameraIdentity, Capture, unix_time_s
+from agalign.values.capture import Band, CameraIdentity, Capture, CaptureTime
 from agalign.values.choices import BandOrder
 from agalign.values.files import RUN_FILE
 from agalign.values.text import counted
@@ -28,7 +29,7 @@ _GroupKey = tuple[str, str, str]
 _CameraKey = tuple[str, ...]
 _MAX_NAMES = 6
 """Of tags in a message."""
-_MAX_HALVES_APART_S = 1.0
+_MAX_HALVES_APART = timedelta(seconds=1)
 """Between the exposures of a dual camera, which are simultaneous; an id may occur again in another flight."""
 _SERIAL_SEPARATOR = "+"
 """Between the serial numbers of the two halves of a dual camera."""
@@ -136,8 +137,8 @@ def _join_folders(groups: dict[_GroupKey, list[ImageFile]]) -> None:
             continue
         joined = groups[first.setdefault((key[0], key[2]), key)]
         names = [{f.path.stem for f in files} | {b.name for f in files for b in f.bands} for files in (joined, group)]
-        times_s = [unix_time_s(files[0].tags.captured_at) or 0.0 for files in (joined, group)]
-        is_now = abs(times_s[0] - times_s[1]) < _MAX_HALVES_APART_S
+        before, now = (CaptureTime.of(files[0].tags.captured_at) for files in (joined, group))
+        is_now = before == now or (before and now and abs(before.utc - now.utc) < _MAX_HALVES_APART)
         if joined is not group and is_now and names[0].isdisjoint(names[1]):
             joined += groups.pop(key)
 

@@ -91,9 +91,8 @@ def read_file(path: Path, cameras: Iterable[Camera], options: DiscoverOptions) -
     for i, band in enumerate(bands):
         if band.radiometry is not None:
             radiometry, problem = plausible(band.radiometry, band.size_px)
-            if problem:
-                reason = problem if radiometry is not None else f"no usable tags for radiance ({problem})"
-                bands[i] = replace(band, radiometry=radiometry, uncalibrated=reason)
+            reason = f"no usable tags for radiance ({problem})" if radiometry is None else ""
+            bands[i] = replace(band, radiometry=radiometry, implausible=problem, uncalibrated=reason)
     return ImageFile(path, camera, tags, tuple(bands))
 
 

@@ -162,8 +162,9 @@ class Band:
     """Reduction factors of the overviews in the file."""
     radiometry: Radiometry | None = None
     uncalibrated: str = ""
-    """Why it has no radiometric calibration, or no factor to reflectance, with the missing or implausible tag; empty if
-    it has both or the camera has none."""
+    """Why it has no radiometric calibration, with the missing tags; empty if it has one or the camera has none."""
+    implausible: str = ""
+    """Tag with an implausible value that leaves out `radiometry`, or its factor to reflectance, in words."""
     panel: Panel | None = None
 
     @property

@@ -211,7 +211,7 @@ def test_radiometry_that_no_capture_has_tags_for_is_refused(flight: Path, tmp_pa
     settings = agalign.Settings(write=agalign.WriteSettings(radiometry="camera"))
     plan = batch_run.plan_run(FolderScan(flight, (one, without), ()), tmp_path, settings)
     assert list(plan.values()) == ["to be aligned"] * 2
-    match = "--radiometry camera: no usable tags for radiance in Blue, Green"
+    match = "--radiometry camera: no tags for radiance in Blue, Green"
     with pytest.raises(agalign.ConfigurationError, match=match):
         batch_run.plan_run(FolderScan(flight, (without,), ()), tmp_path, settings)
 

@@ -28,7 +28,7 @@ PACKET = """<?xpacket begin="" id="W5M0MpCehiHzreSzNTczkc9d"?>
    <Camera:BandName>{band}</Camera:BandName>
    <Camera:CentralWavelength>{nm}</Camera:CentralWavelength>
    <Camera:WavelengthFWHM>20</Camera:WavelengthFWHM>
-   <Camera:PrincipalPoint>{x},1.8165</Camera:PrincipalPoint>
+   <Camera:PrincipalPoint>{x},0.2271</Camera:PrincipalPoint>
    <Camera:PerspectiveFocalLength>5.45</Camera:PerspectiveFocalLength>
    <Camera:PerspectiveFocalLengthUnits>mm</Camera:PerspectiveFocalLengthUnits>
    <Camera:RigRelatives>0.1, 0.2, 0.3</Camera:RigRelatives>
@@ -96,7 +96,7 @@ def write_capture(
 ) -> None:
     """Three bands of a RedEdge-M; `change` is that of the packets of all bands, or of that of one."""
     for k, (band, nm) in (BANDS if bands is None else bands).items():
-        xmp = PACKET.format(band=band, nm=nm, x=2.37 + k / 100, capture=f"capture{number}")
+        xmp = PACKET.format(band=band, nm=nm, x=0.29 + k / 100, capture=f"capture{number}")
         xmp = change(xmp) if only in (None, k) else xmp
         first = {271: text("MicaSense"), 272: text("RedEdge-M"), 700: byte_string(xmp.encode()), 50714: short(4800)}
         exif = {0xA20E: rational(266.67), 0xA20F: rational(266.67), 0xA210: short(4), 0x829A: rational(0.001)}
@@ -267,7 +267,7 @@ def test_advice_works(tmp_path: Path, choice: str) -> None:
     (no_sun,) = discover(tmp_path / "no_sun").captures
     why = missing_radiometry(with_radiometry(no_sun, choice, {}), choice)
     assert ("--radiometry" in why) == (choice in ("sun", "panel"))
-    assert ("no tags of a light sensor" in why) == (choice == "sun")
+    assert ("no usable tags of a light sensor" in why) == (choice == "sun")
 
 
 def test_the_calibration_of_a_sequoia_is_named(tmp_path: Path) -> None:
