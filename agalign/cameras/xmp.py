@@ -2,6 +2,7 @@
 
 import re
 from collections.abc import Collection, Iterator, Sequence
+from contextlib import suppress
 from copy import deepcopy
 from dataclasses import dataclass
 from functools import lru_cache
@@ -123,7 +124,8 @@ class Packet:
         # Declared at the root: moved values keep the prefix by which other software finds them.
         used = {prefix: uri for element in self.root.iter() for prefix, uri in element.nsmap.items()}
         usual = {prefix: uri for prefix, uri in used.items() if prefix and not re.fullmatch(r"ns\d+", prefix)}
-        etree.cleanup_namespaces(self.root, top_nsmap=usual)
+        with suppress(ValueError):  # a malformed namespace
+            etree.cleanup_namespaces(self.root, top_nsmap=usual)
         body = etree.tostring(self.root, encoding="unicode")
         head, tail = '<?xpacket begin="\ufeff" id="W5M0MpCehiHzreSzNTczkc9d"?>', '<?xpacket end="w"?>'
         return f"{head}\n{body}\n{tail}".encode()
@@ -153,15 +155,16 @@ def _recovered(text: str) -> Packet:
     for element in () if read is None else read.iter():
         for tag, value in [*element.attrib.items(), (element.tag, ",".join(_texts(element)))]:
             if _names(tag) and value.strip(" \t\r\n,"):
-                etree.SubElement(description, tag, nsmap=element.nsmap).text = value
+                with suppress(ValueError):  # characters that XML does not allow
+                    etree.SubElement(description, tag).text = value
     if is_cut and len(description):
         last = f"{description[-1].prefix}:{etree.QName(description[-1]).localname}"
         if text.rfind(f"<{last}") > text.rfind(f"</{last}"):
             description.remove(description[-1])
     known = Packet(root).values()
-    # Elements and attributes with a value.
-    written = rf"""<({prefix}):([\w-]+)[^<>]*(?<!/)>(?!\s*</)|\s({prefix}):([\w-]+)\s*=\s*(?:"[^"]|'[^'])"""
-    found = ((a or c, b or d) for a, b, c, d in re.findall(written, text))
+    # Elements and attributes, unless they are empty.
+    written = rf"""[<\s]({prefix}):([\w-]++)(?!\s*=\s*(?:""|'')|[^<>=]*(?:/>|>\s*</))"""
+    found = re.findall(written, text)
     unread = (name for prefix, name in found if not {*_names(f"{{{_PREFIXES[prefix]}}}{name}")} <= known.keys())
     return Packet(root if len(description) else None, (*(["its end"] if is_cut else ()), *dict.fromkeys(unread)))
 
