@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from agalign.products.indices import Index
 
 Out = Annotated[Path, typer.Argument(help="Output folder of a run.", show_default=False)]
+_DEFAULT_INDEX = "ndvi"
 
 
 def _report(
@@ -123,7 +124,7 @@ def _indices(
             "--index",
             "-i",
             show_default=False,
-            help="Names separated by commas: ndvi (the default), ndre, gndvi, ndwi, savi, evi …",
+            help=f"Names separated by commas: {_DEFAULT_INDEX} (the default), ndre, gndvi, ndwi, savi, evi …",
         ),
     ] = None,
     formula: Annotated[
@@ -196,11 +197,11 @@ indices = Command(
 
 
 def chosen_indices(names: str | None, formulas: Sequence[str]) -> "list[Index]":
-    """Return the indices of a list of names and of formulas; ndvi if neither is given. Raises ConfigurationError."""
+    """Return the indices of names and formulas, or the default one. Raises ConfigurationError."""
     from agalign.errors import ConfigurationError
     from agalign.products.indices import index_named, index_of_formula
 
-    requested = (names or ("" if formulas else "ndvi")).split(",")
+    requested = (names or ("" if formulas else _DEFAULT_INDEX)).split(",")
     chosen = [index_named(name) for name in requested if name.strip()] + [index_of_formula(f) for f in formulas]
     repeated = [one.name for i, one in enumerate(chosen) if one.name in [c.name for c in chosen[:i]]]
     if repeated or not chosen:

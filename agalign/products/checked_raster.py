@@ -50,75 +50,63 @@ class LayerDescription:
     colour: ColorInterp | None = None
 
 
-class CheckedRaster:
-    """An open rasterio dataset with the checksums of the pixels that were written to it.
+@contextmanager
+def checked_raster(
+    path: Path,
+    profile: dict[str, Any],
+    layers: Sequence[LayerDescription],
+    tags: Mapping[str, str],
+    finish: Callable[[Path], None] | None = None,
+) -> Iterator[tuple[Any, Callable[[NDArray[Any], int, int, int], None]]]:
+    """Create a GeoTIFF with a rasterio profile; yield the dataset, and a function that writes a `Block` of pixels
+    (height, width). After the `with` block it is closed, changed by `finish`, compared with what was written and
+    renamed to `path`.
 
     GDAL keeps blocks in memory and writes the last ones when it closes a file. Where that write fails once, GDAL
     reports no error and fills the block with zeros.
-    """
-
-    def __init__(self, dataset: Any) -> None:
-        self.dataset = dataset
-        self._written: list[tuple[int, Window, int]] = []
-
-    def describe(self, layers: Sequence[LayerDescription], tags: Mapping[str, str]) -> None:
-        """Set the metadata of all bands, and the tags of the file that are not empty."""
-        dataset = self.dataset
-        dataset.update_tags(**{k: v for k, v in tags.items() if v})
-        if any(layer.scale_offset != (1.0, 0.0) for layer in layers):
-            dataset.scales, dataset.offsets = zip(*(layer.scale_offset for layer in layers), strict=True)
-        if any(layer.unit for layer in layers):
-            dataset.units = [layer.unit for layer in layers]
-        colours = [layer.colour for layer in layers]
-        if None not in colours:
-            dataset.colorinterp = colours
-        for index, layer in enumerate(layers, start=1):
-            dataset.set_band_description(index, layer.name)
-            dataset.update_tags(index, **layer.tags)
-            dataset.update_tags(index, ns="IMAGERY", **layer.imagery)
-
-    def write(self, pixels: NDArray[Any], index: int, x0: int = 0, y0: int = 0) -> None:
-        """Write pixels (height, width) into band `index`, counted from 1, with the top-left pixel at (x0, y0)."""
-        window = Window(x0, y0, pixels.shape[1], pixels.shape[0])
-        self.dataset.write(pixels, index, window=window)
-        self._written.append((index, window, _checksum(pixels)))
-
-    def verify(self, path: Path) -> None:
-        """Raise OSError if the finished file does not contain the pixels that were written."""
-        with without_warnings(), rasterio.Env(**GDAL_ENVIRONMENT), rasterio.open(path) as dataset:
-            for index, window, checksum in self._written:
-                if _checksum(dataset.read(index, window=window)) != checksum:
-                    raise OSError(errno.EIO, _INCOMPLETE)
-
-
-@contextmanager
-def checked_raster(
-    path: Path, profile: dict[str, Any], finish: Callable[[Path], None] | None = None
-) -> Iterator[CheckedRaster]:
-    """Create a GeoTIFF with a rasterio profile. After the block it is closed, changed by `finish`, verified and renamed
-    to `path`.
 
     Raises OutputError.
     """
+    written: list[tuple[int, Window, int]] = []
     try:
         with complete_file(path) as partial:
-            with (
-                without_warnings(),
-                rasterio.Env(**GDAL_ENVIRONMENT),
-                rasterio.open(partial, "w", **profile) as dataset,
-            ):
-                raster = CheckedRaster(dataset)
-                yield raster
+            with without_warnings(), rasterio.Env(**GDAL_ENVIRONMENT), rasterio.open(partial, "w", **profile) as file:
+                _describe(file, layers, tags)
+
+                def write(pixels: NDArray[Any], index: int, x0: int, y0: int) -> None:
+                    window = Window(x0, y0, pixels.shape[1], pixels.shape[0])
+                    file.write(pixels, index, window=window)
+                    written.append((index, window, _checksum(pixels)))
+
+                yield file, write
             check_complete(partial)
             if finish is not None:
                 finish(partial)
                 check_complete(partial)
-            raster.verify(partial)
+            with without_warnings(), rasterio.Env(**GDAL_ENVIRONMENT), rasterio.open(partial) as file:
+                if any(_checksum(file.read(index, window=window)) != known for index, window, known in written):
+                    raise OSError(errno.EIO, _INCOMPLETE)
     except Exception as error:
         if not is_gdal_error(error) and not isinstance(error, tifffile.TiffFileError):
             raise
         cause = innermost_cause(error).rstrip(".")
         raise OutputError(f"{path}: cannot be written ({cause}; is the disk full?)") from None
+
+
+def _describe(dataset: Any, layers: Sequence[LayerDescription], tags: Mapping[str, str]) -> None:
+    """Set the metadata of all bands, and the tags of the file that are not empty."""
+    dataset.update_tags(**{k: v for k, v in tags.items() if v})
+    if any(layer.scale_offset != (1.0, 0.0) for layer in layers):
+        dataset.scales, dataset.offsets = zip(*(layer.scale_offset for layer in layers), strict=True)
+    if any(layer.unit for layer in layers):
+        dataset.units = [layer.unit for layer in layers]
+    colours = [layer.colour for layer in layers]
+    if None not in colours:
+        dataset.colorinterp = colours
+    for index, layer in enumerate(layers, start=1):
+        dataset.set_band_description(index, layer.name)
+        dataset.update_tags(index, **layer.tags)
+        dataset.update_tags(index, ns="IMAGERY", **layer.imagery)
 
 
 def write_layers(
@@ -130,10 +118,9 @@ def write_layers(
     finish: Callable[[Path], None] | None = None,
 ) -> None:
     """Write a raster with these layers and tags block by block, as `checked_raster` does. Raises OutputError."""
-    with checked_raster(path, profile, finish) as raster:
-        raster.describe(layers, tags)
+    with checked_raster(path, profile, layers, tags, finish) as (_, write):
         for block in blocks:
-            raster.write(*block)
+            write(*block)
 
 
 def check_complete(path: Path) -> None:

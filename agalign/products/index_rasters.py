@@ -295,11 +295,11 @@ def _write(
     samples, valid_px, masked_px = [], 0, 0
     unmasked = [replace(band, quality=None) for band in bands]
     is_cog = like.tags(ns="IMAGE_STRUCTURE").get("LAYOUT") == "COG"
-    with checked_raster(target, profile, to_cog if is_cog else None) as raster:
-        raster.describe([LayerDescription(index.name)], _tags(index, like, unit, source))
+    layers, tags = [LayerDescription(index.name)], _tags(index, like, unit, source)
+    with checked_raster(target, profile, layers, tags, to_cog if is_cog else None) as (dataset, write):
         for tile in tiles(Tile(0, 0, like.width, like.height), WORK_TILE_PX):
             values = compute(index, [reader.values(band, tile) for band in bands])
-            raster.write(values, 1, tile.x0, tile.y0)
+            write(values, 1, tile.x0, tile.y0)
             valid = np.isfinite(values)
             valid_px += int(np.count_nonzero(valid))
             if list(bands) != unmasked:
@@ -309,7 +309,7 @@ def _write(
         sample = np.concatenate(samples)
         shares = (pixels / (like.width * like.height) for pixels in (valid_px, masked_px))
         statistics = _statistics(index, unit, sample, *shares)
-        raster.dataset.update_tags(**{_STATISTICS_TAG: json.dumps(statistics.as_json())})
+        dataset.update_tags(**{_STATISTICS_TAG: json.dumps(statistics.as_json())})
     _draw(index, target, sample, statistics)
     return statistics
 

@@ -13,7 +13,7 @@ from agalign.config import Settings, WriteSettings
 from agalign.errors import OutputError
 from agalign.flight.rig import CaptureFactors, Rig
 from agalign.products.aligned_files import BandFiles
-from agalign.products.checked_raster import Block, CheckedRaster, LayerDescription, tiled_profile, write_layers
+from agalign.products.checked_raster import Block, LayerDescription, tiled_profile, write_layers
 from agalign.products.layout import Layer, common_grid, flight_limits, output_layers
 from agalign.products.product import CapturePaths, ProductContext
 from agalign.products.raster_file import write_raster
@@ -203,16 +203,17 @@ def test_files_of_bands_have_each_their_own_nodata(tmp_path: Path) -> None:
 
 def test_a_tile_that_gdal_lost_is_noticed(tmp_path: Path) -> None:
     """A write that fails once while GDAL closes a file leaves a tile of zeros and no error."""
-    path = tmp_path / "a.tif"
     pixels = np.arange(64 * 48, dtype=np.uint16).reshape(48, 64)
-    with rasterio.open(path, "w", driver="GTiff", width=64, height=48, count=1, dtype="uint16") as dataset:
-        raster = CheckedRaster(dataset)
-        raster.write(pixels, 1)
-    raster.verify(path)
-    with rasterio.open(path, "r+") as dataset:
-        dataset.write(np.zeros_like(pixels), 1)
-    with pytest.raises(OSError, match="the file came out incomplete"):
-        raster.verify(path)
+
+    def lose(path: Path) -> None:
+        with rasterio.open(path, "r+") as dataset:
+            dataset.write(np.zeros_like(pixels), 1)
+
+    to_write = tiled_profile(64, 48, 1, "uint16"), [LayerDescription("a")], {}, [(pixels, 1, 0, 0)]
+    write_layers(tmp_path / "a.tif", *to_write)
+    with pytest.raises(OutputError, match="the file came out incomplete"):
+        write_layers(tmp_path / "b.tif", *to_write, lose)
+    assert [p.name for p in tmp_path.iterdir()] == ["a.tif"]
 
 
 LENS = Lens(150.0, 150.0, 59.5, 44.5, (-0.1, 0.05))
