@@ -37,7 +37,12 @@ from agalign.method.device import choose_device, limit_threads
 from agalign.pixels.radiometry import with_radiometry
 from agalign.products.excluded_captures import write_panels, write_sky
 from agalign.products.flight_map import FlightMap
-from agalign.products.footprint import above_elevation, missing_for_footprint, with_approximate_georeference
+from agalign.products.footprint import (
+    above_elevation,
+    missing_for_footprint,
+    utm_of_flights,
+    with_approximate_georeference,
+)
 from agalign.products.index_rasters import check_indices
 from agalign.products.layout import FlightLimits, common_grid, flight_limits
 from agalign.products.preview import preview_bytes
@@ -209,6 +214,9 @@ class _FlightRun:
             panels = [read_panel(c, albedos) for c in captures if c.panel is not None]
             captures = [c for c in captures if not c.is_of_a_panel]
         captures = [_calibrated(capture, panels, write) for capture in captures]
+        if write.georeference:
+            crs = utm_of_flights(captures)
+            captures = [with_approximate_georeference(c, crs[c.label]) if c.label in crs else c for c in captures]
         missing = [missing_radiometry(capture, write.radiometry) for capture in captures]
         if captures and all(missing):
             refused = [f"; {p.capture.label} {b.band.name}: {b.problem}" for p in panels for b in p.bands if b.problem]
@@ -370,14 +378,13 @@ def _crops_of_cameras(
 
 
 def _calibrated(capture: Capture, panels: Sequence[PanelReading], settings: WriteSettings) -> Capture:
-    """Return the capture with its radiometry, its height above the ground if the elevation of the ground or a panel
-    determines it, and its approximate georeference if `settings` ask for it.
+    """Return the capture with its radiometry, and its height above the ground if the elevation of the ground or a panel
+    determines it.
     """
     capture = with_radiometry(capture, settings.radiometry, reflectance_factors(capture, panels))
     if settings.ground_elevation_m is not None:
         capture = above_elevation(capture, settings.ground_elevation_m)
-    capture = with_height(capture, panels)
-    return with_approximate_georeference(capture) if settings.georeference else capture
+    return with_height(capture, panels)
 
 
 def capture_reports(

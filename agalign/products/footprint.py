@@ -1,13 +1,16 @@
 """The footprint of a capture on the ground, by its georeference or the camera's position, height and attitude."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import replace
+from itertools import pairwise
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from agalign.errors import GeometryError
+from agalign.flight.groups import flights_of
 from agalign.pixels.raster import crs_wkt, transformed
 from agalign.values import geometry
 from agalign.values.capture import Capture, Georeference, HeightSource, Position
@@ -53,12 +56,30 @@ def footprint(capture: Capture, grid: OutputGrid) -> NDArray[np.float64] | None:
 def geojson_geometry(
     ring: NDArray[np.float64] | None, position: Position | None, decimals: int
 ) -> dict[str, Any] | None:
-    """Return the GeoJSON geometry of a footprint (n, 2) with these decimals, else of the camera's position, or None."""
+    """Return the GeoJSON geometry of a footprint (n, 2) with these decimals, else of the camera's position, or None.
+
+    A footprint across the 180th meridian is cut there (RFC 7946, 3.1.9).
+    """
+    if ring is not None and np.ptp(ring[:, 0]) > 180:
+        beyond = np.column_stack([ring[:, 0] % 360 - 180, ring[:, 1]])  # degrees east of the meridian
+        parts = [_clipped(beyond, side) - np.array([side * 180.0, 0.0]) for side in (-1, 1)]
+        return {"type": "MultiPolygon", "coordinates": [[part.round(decimals).tolist()] for part in parts]}
     if ring is not None:
         return {"type": "Polygon", "coordinates": [ring.round(decimals).tolist()]}
     if position is not None:
         return {"type": "Point", "coordinates": [position.longitude, position.latitude]}
     return None
+
+
+def _clipped(ring: NDArray[np.float64], side: int) -> NDArray[np.float64]:
+    """Return the part of a closed ring (n, 2) with negative (`side` -1) or positive x."""
+    kept = []
+    for a, b in pairwise(ring):
+        if side * a[0] >= 0:
+            kept.append(a)
+        if a[0] * b[0] < 0:
+            kept.append(a + (b - a) * a[0] / (a[0] - b[0]))
+    return np.array([*kept, kept[0]])
 
 
 def ground_m(capture: Capture, points_px: NDArray[np.float64]) -> NDArray[np.float64] | None:
@@ -115,9 +136,10 @@ def with_assumed_height(capture: Capture) -> Capture:
     return _with_height(capture, min(_altitude_m(capture), max_assumed_height_m), "assumed")
 
 
-def with_approximate_georeference(capture: Capture) -> Capture:
-    """Return the capture with an affine georeference of its reference in UTM, if it has none and its height is known.
+def with_approximate_georeference(capture: Capture, crs: str) -> Capture:
+    """Return the capture with an affine georeference of its reference, if it has none and its height is known.
 
+    `crs` is the WKT of the flight's coordinate system: captures across the border of a UTM zone have one as well.
     The ground is assumed to be a horizontal plane, lens distortion is neglected, and `accuracy_m` is set.
     """
     reference, position = capture.reference, capture.position
@@ -126,7 +148,6 @@ def with_approximate_georeference(capture: Capture) -> Capture:
     offsets_m = ground_m(capture, corners - 0.5)
     if reference.georeference is not None or offsets_m is None or position is None:
         return capture
-    crs = utm_wkt(position.longitude, position.latitude)
     try:
         on_map = transformed(offsets_m, _local_crs(position), crs)
     except GeometryError:
@@ -171,6 +192,16 @@ def utm_wkt(longitude: float, latitude: float) -> str:
     """Return the WKT of the UTM zone of a position, degrees."""
     zone = min(int((longitude + 180) // 6), 59) + 1
     return crs_wkt(f"EPSG:{(32600 if latitude >= 0 else 32700) + zone}")
+
+
+def utm_of_flights(captures: Sequence[Capture]) -> dict[str, str]:
+    """Return the WKT of the UTM zone of each capture's flight, by label: that of the flight's first position."""
+    result: dict[str, str] = {}
+    for flight in flights_of(captures):
+        position = next((c.position for c in flight if c.position is not None), None)
+        if position is not None:
+            result |= dict.fromkeys((c.label for c in flight), utm_wkt(position.longitude, position.latitude))
+    return result
 
 
 def _altitude_m(capture: Capture) -> float:

@@ -17,9 +17,12 @@ from agalign.products.flight_map import FlightMap
 from agalign.products.footprint import (
     above_elevation,
     accuracy_of_footprint_m,
+    geojson_geometry,
     ground_m,
     missing_for_footprint,
     pose_errors,
+    utm_of_flights,
+    utm_wkt,
     with_approximate_georeference,
     with_assumed_height,
 )
@@ -136,7 +139,7 @@ def test_the_elevation_of_the_ground_gives_the_height_that_tags_lack() -> None:
     assert (result.height_m, result.height_from) == (30.0, "ground elevation")
     assert above_elevation(capture(replace(pose, height_m=7.0)), 100.0).pose == replace(pose, height_m=7.0)
     assert above_elevation(capture(pose), 131.0).pose == pose  # below the ground
-    assert with_approximate_georeference(capture(pose)).reference.georeference is None
+    assert with_approximate_georeference(capture(pose), utm_wkt(5.0, 52.0)).reference.georeference is None
 
 
 @pytest.mark.parametrize(
@@ -153,10 +156,43 @@ def test_a_capture_without_footprint_names_what_it_lacks(pose: Pose | None, miss
     assert missing_for_footprint(replace(capture(pose), position=None)).startswith("a position")
 
 
+def test_a_footprint_across_the_180th_meridian_is_cut_there() -> None:
+    """RFC 7946, 3.1.9: two polygons, each on its side; together they have the area of the footprint."""
+    ring = np.array([[179.999, 52.0], [-179.998, 52.001], [-179.999, 52.003], [179.998, 52.002], [179.999, 52.0]])
+    shape = geojson_geometry(ring, None, decimals=7)
+    assert shape["type"] == "MultiPolygon"
+    west, east = (np.array(part[0]) for part in shape["coordinates"])
+    assert (west[:, 0].max(), east[:, 0].min()) == (180.0, -180.0)
+    assert west[:, 0].min() == 179.998
+    assert east[:, 0].max() == -179.998
+
+    def area(ring: np.ndarray) -> float:
+        x, y = ((ring - ring[0]) * 1e4).T
+        return float((x[:-1] * y[1:] - x[1:] * y[:-1]).sum() / 2)
+
+    whole = np.column_stack([ring[:, 0] % 360, ring[:, 1]])
+    assert area(west) + area(east) == pytest.approx(area(whole), rel=1e-3)
+    assert min(area(west), area(east)) > 0, "counter-clockwise"
+    assert geojson_geometry(ring % 90, None, decimals=7)["type"] == "Polygon"
+
+
+def test_a_flight_across_the_border_of_a_utm_zone_has_one_coordinate_system() -> None:
+    pose = Pose(10.0, height_m=50.0, focal_length_px=1000.0)
+    flight = [
+        replace(capture(pose), name=name, position=Position(52.0, longitude, 80.0))
+        for name, longitude in (("a", 5.9995), ("b", 6.0005))
+    ]
+    crs = utm_of_flights(flight)
+    assert len(crs) == 2
+    assert set(crs.values()) == {utm_wkt(5.9, 52.0)}
+    east_m = [with_approximate_georeference(c, crs[c.label]).reference.georeference.transform[0, 2] for c in flight]
+    assert east_m[1] - east_m[0] == pytest.approx(68.7, abs=0.5)
+
+
 @pytest.mark.parametrize("heading_deg", [0.0, 37.0, 200.0])
 def test_the_approximate_georeference_maps_pixels_to_where_the_camera_sees_them(heading_deg: float) -> None:
     known = capture(Pose(heading_deg, height_m=50.0, focal_length_px=1000.0))
-    georeference = with_approximate_georeference(known).reference.georeference
+    georeference = with_approximate_georeference(known, utm_wkt(5.0, 52.0)).reference.georeference
     assert "32631" in georeference.crs_wkt
     assert georeference.accuracy_m is not None
     points_px = np.array([[0.0, 0.0], [1199.0, 0.0], [300.0, 700.0]])
