@@ -72,7 +72,7 @@ def discover(
     files, damaged = with_tags_of_flight(files)
     problems += copies + damaged + list_problems(files)
     captures: list[Capture] = []
-    groups = group_files(files)
+    groups = group_files(files, with_rgb=options.with_rgb)
     _check_bands(groups, options.bands, folder)
     for group in groups:
         if options.pattern is not None:

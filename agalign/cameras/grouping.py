@@ -1,6 +1,7 @@
 """Grouping of image files into captures: its files, reference band, missing bands and unique names."""
 
 import math
+import re
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
@@ -11,7 +12,7 @@ from pathlib import Path
 from types import MappingProxyType
 
 from agalign.cameras import camera_of
-from agalign.cameras.base import Camera, listed, reference_index
+from agalign.cameras.base import Camera, colour_bands, listed, reference_index
 from agalign.cameras.generic import Generic
 from agalign.cameras.metadata import Tags
 from agalign.cameras.pix4d import NAMESPACE, listed_names
@@ -115,16 +116,30 @@ def _similar(file: ImageFile) -> tuple[object, object]:
     return (*camera, file.path.stem.removeprefix(file.camera.capture_name(file.path))), camera
 
 
-def group_files(files: Iterable[ImageFile]) -> list[list[ImageFile]]:
-    """Return the files of each capture: same camera, folder and key. Colour photographs come last."""
+def group_files(files: Iterable[ImageFile], *, with_rgb: bool = False) -> list[list[ImageFile]]:
+    """Return the files of each capture: same camera, folder and key. Colour photographs come last.
+
+    Those in TIFFs next to bands of the same capture are left out unless `with_rgb`, as other photographs are.
+    """
     groups: dict[_GroupKey, list[ImageFile]] = defaultdict(list)
     for file in files:
         key = file.path.name if file.is_whole_capture else file.camera.capture_key(file.path, file.tags)
         groups[file.camera.name, str(file.camera.capture_folder(file.path)), key].append(file)
+    _join_photographs(groups, with_rgb=with_rgb)
     _join_folders(groups)
     _add_files_without_id(groups)
     _drop_copies(groups)
     return [sorted(group, key=lambda f: f.bands[0].companion) for group in groups.values()]
+
+
+def _join_photographs(groups: dict[_GroupKey, list[ImageFile]], *, with_rgb: bool) -> None:
+    """Join colour TIFFs of 8 bits with the single bands whose capture they name, or remove them."""
+    for key, (file, *_) in list(groups.items()):
+        colours = [(b.name, b.dtype) for b in file.bands] == [(c, "uint8") for c in ("Red", "Green", "Blue")]
+        named = re.sub(r"[ _-]?(rgb|vis)$", "", file.path.stem, flags=re.IGNORECASE)
+        if colours and file.is_whole_capture and (bands := groups.get((key[0], key[1], named))):
+            del groups[key]
+            bands += [replace(file, bands=colour_bands(file.bands))] if with_rgb else []
 
 
 def _join_folders(groups: dict[_GroupKey, list[ImageFile]]) -> None:

@@ -177,3 +177,16 @@ def test_lists_in_tags_have_an_item_for_each_channel(
     stored = [Band("", Path("a.tif"), k, 64, 48, "uint16") for k in (1, 2, 3)]
     tags = Tags(xmp={(NAMESPACE, "BandName"): names, (NAMESPACE, "CentralWavelength"): wavelengths})
     assert [(b.name, b.wavelength_nm) for b in Generic().bands(Path("a.tif"), tags, stored)] == expected
+
+
+@pytest.mark.parametrize("name", ["f.tif", "f_RGB.tif"])
+def test_colour_images_of_one_lens_are_companions_of_the_bands(tmp_path: Path, name: str) -> None:
+    write_capture(tmp_path, "green", "red", "nir")
+    colours = np.stack([texture_numbers(seed=k) // 16 for k in range(3)], axis=-1).astype(np.uint8)
+    tifffile.imwrite(tmp_path / name, colours, photometric="rgb")
+    (capture,) = discover(tmp_path).captures
+    assert {b.name for b in capture.bands} == {"green", "red", "nir"}
+    (capture,) = discover(tmp_path, agalign.DiscoverOptions(with_rgb=True)).captures
+    assert {b.name for b in capture.bands if b.companion} == {"RGB Red", "RGB Green", "RGB Blue"}
+    tifffile.imwrite(tmp_path / "ortho_rgb.tif", colours, photometric="rgb")
+    assert {c.name for c in discover(tmp_path).captures} == {"f", "ortho_rgb"}
