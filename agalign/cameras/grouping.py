@@ -133,7 +133,7 @@ def group_files(files: Iterable[ImageFile], *, with_rgb: bool = False) -> list[l
 
 
 def _join_photographs(groups: dict[_GroupKey, list[ImageFile]], *, with_rgb: bool) -> None:
-    """Join colour TIFFs of 8 bits with the single bands whose capture they name, or remove them."""
+    """Join colour TIFFs of 8 bits with the single bands of the same capture name, or remove them."""
     for key, (file, *_) in list(groups.items()):
         colours = [(b.name, b.dtype) for b in file.bands] == [(c, "uint8") for c in ("Red", "Green", "Blue")]
         named = re.sub(r"[ _-]?(rgb|vis)$", "", file.path.stem, flags=re.IGNORECASE)
