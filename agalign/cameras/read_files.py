@@ -98,12 +98,12 @@ def read_file(path: Path, cameras: Iterable[Camera], options: DiscoverOptions) -
 
 def _stored_pages(path: Path, max_pixels: int) -> list[tuple[Band, ...]]:
     """Return the bands of each page with an image of full size; most files have one. Raises UnreadableFileError."""
-    numbers = [1]
+    first, numbers = probe(path, max_pixels), [1]
     if suffix_format(path) == "TIFF":
         with suppress(ValueError, OSError):  # the error of GDAL is reported
             numbers = image_pages(path) or numbers
     if numbers == [1]:
-        return [probe(path, max_pixels)]
+        return [first]
     pages = [probe(path, max_pixels, number) for number in numbers]
     largest_px = max(page[0].size_px for page in pages)
     return [page for page in pages if page[0].size_px == largest_px]
