@@ -40,7 +40,7 @@ class Generic(Camera):
             return self._picture_bands(path, stored)
         if len(stored) > 1:
             listed = listed_bands(tags, stored)
-            return tuple(replace(b, name=b.name or f"band_{b.band_index}") for b in listed)
+            return tuple(replace(b, name=b.name or b.colour or f"band_{b.band_index}") for b in listed)
         own_name = tags.text(NAMESPACE, "BandName") or self.split(path)[1]
         file_wavelength_nm = tags.number(NAMESPACE, "CentralWavelength") or _wavelength_in(own_name)
         (band,) = stored

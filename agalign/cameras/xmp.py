@@ -70,13 +70,14 @@ class Packet:
     def values(self) -> dict[Name, tuple[str, ...]]:
         """Return {(namespace, name): values} of all rdf:Description elements; the first of two values is used.
 
-        A value has a key for its namespace and one for each start of its path.
+        A value has a key for its namespace and one for each start of its path. References to entities, which are not
+        resolved, are no values.
         """
         result: dict[Name, tuple[str, ...]] = {}
         for description in self._descriptions():
             attributes = [(tag, (value,)) for tag, value in description.attrib.items()]
             for tag, raw in [*attributes, *((child.tag, _texts(child)) for child in description)]:
-                cleaned = tuple(without_controls(v).strip() for v in raw)
+                cleaned = tuple("" if re.fullmatch(r"&\w+;", v) else without_controls(v).strip() for v in raw)
                 for name in _names(tag) if any(cleaned) else ():
                     result.setdefault(name, cleaned)
         return result

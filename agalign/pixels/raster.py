@@ -163,8 +163,7 @@ def _driver_of(path: Path) -> str:
 def probe(path: Path, max_pixels: int = MAX_PIXELS, page: int = 0) -> tuple[Band, ...]:
     """Read the metadata of a raster file, or of a page of a TIFF (from 1): its bands, without an alpha band.
 
-    They have the names in the file, else those of red, green and blue channels, else empty ones. Equal channels of a
-    TIFF are one band.
+    They have the names in the file or empty ones. Equal channels of a TIFF are one band.
     Raises UnreadableFileError, also for more than `max_pixels` per band.
     """
     try:
@@ -202,7 +201,8 @@ def _bands(path: Path, dataset: rasterio.DatasetReader, max_pixels: int) -> tupl
     georeference, overviews = _georeference(dataset), tuple(dataset.overviews(1))
     return tuple(
         Band(
-            name=dataset.descriptions[i - 1] or (colour if is_colour else ""),
+            name=dataset.descriptions[i - 1] or "",
+            colour=colour if is_colour else "",
             path=path,
             band_index=i,
             width_px=width,

@@ -133,6 +133,8 @@ class Band:
     nodata: float | None = None
     has_mask: bool = False
     """True if the file has a mask or an alpha band."""
+    colour: str = ""
+    """Red, Green or Blue for the channels of a colour image."""
     page: int = 0
     """Number of its page in a TIFF with several, from 1; 0 in files with one."""
     wavelength_nm: float | None = None

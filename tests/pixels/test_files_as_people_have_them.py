@@ -89,16 +89,22 @@ def test_channels_that_differ_anywhere_are_kept(tmp_path: Path) -> None:
     assert [len(probe(tmp_path / name)) for name in ("a.tif", "b.tif")] == [3, 3]
 
 
+def generic_bands(path: Path, tags: Tags | None = None) -> Sequence[Band]:
+    return Generic().bands(path, tags or Tags(), probe(path))
+
+
 def test_colours_without_names_are_named_by_their_interpretation(tmp_path: Path) -> None:
     planes = np.stack([texture_numbers(seed=k) for k in range(4)])
     planes[3] = 65535
     write_band(tmp_path / "ortho.tif", planes)
     with rasterio.open(tmp_path / "ortho.tif", "r+") as file:
         file.colorinterp = [ColorInterp.red, ColorInterp.green, ColorInterp.blue, ColorInterp.alpha]
-    assert [b.name for b in probe(tmp_path / "ortho.tif")] == ["Red", "Green", "Blue"]
+    assert [b.name for b in generic_bands(tmp_path / "ortho.tif")] == ["Red", "Green", "Blue"]
+    listed = Tags(xmp={(NAMESPACE, "BandName"): ("Green", "Red", "NIR")})
+    assert [b.name for b in generic_bands(tmp_path / "ortho.tif", listed)] == ["Green", "Red", "NIR"]
     with rasterio.open(tmp_path / "ortho.tif", "r+") as file:
         file.descriptions = ("a", "b", "c", "")
-    assert [b.name for b in probe(tmp_path / "ortho.tif")] == ["a", "b", "c"]
+    assert [b.name for b in generic_bands(tmp_path / "ortho.tif")] == ["a", "b", "c"]
 
 
 def packet_of(name: str, wavelength_nm: int) -> bytes:
