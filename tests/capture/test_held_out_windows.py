@@ -21,7 +21,7 @@ from agalign.values.image import Raster
 from agalign.values.issues import RETRIEVAL, Issue
 from agalign.verify.residuals import FixedWindows, Shifts
 
-from ..builders import joint_result, pair_of, texture, two_views, whole
+from ..builders import in_full_run, joint_result, pair_of, texture, two_views, whole
 from ..conftest import textured_image
 
 BLURRED_PX, SHARP_PX = 168, 112
@@ -43,7 +43,7 @@ def by_windows(pair: BandPair) -> tuple[Alignment, Alignment]:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("border_px", BORDERS_PX)
+@pytest.mark.parametrize("border_px", [in_full_run(0), in_full_run(10), 14, in_full_run(17), in_full_run(40)])
 @pytest.mark.parametrize("depth_px", [6.0, -6.0])
 def test_two_depths_as_a_chessboard_of_windows_are_not_aligned(depth_px: float, border_px: int) -> None:
     """Each colour fits a homography that is 12 px off in the other: they must not be exchanged between rounds."""
@@ -75,7 +75,7 @@ def moved_inside(image: np.ndarray, centres_px: Points, side_px: int, off_px: fl
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("border_px", BORDERS_PX)
+@pytest.mark.parametrize("border_px", [0, in_full_run(10), 14, in_full_run(17), in_full_run(40)])
 def test_the_fit_of_an_alignment_by_windows_ignores_those_that_verify_it(border_px: int) -> None:
     truth = geometry.translation(5.0, -3.0)
     views = two_views(truth, 6 * BLURRED_PX, 5 * BLURRED_PX)

@@ -73,7 +73,7 @@ def plant(names: set[str], folder: Path) -> Path:
     return log
 
 
-@pytest.mark.parametrize("command", [CONSOLE_SCRIPT, MODULE])
+@pytest.mark.parametrize("command", [CONSOLE_SCRIPT, pytest.param(MODULE, marks=pytest.mark.full)])
 def test_no_module_is_imported_from_the_working_folder(
     command: list[str], names: set[str], four_captures: Path, tmp_path: Path
 ) -> None:
