@@ -13,6 +13,7 @@ from agalign.cameras.grouping import (
     band_file_owners,
     capture_of,
     group_files,
+    lens_problems,
     list_problems,
     pattern_clashes,
     with_missing_bands,
@@ -70,7 +71,7 @@ def discover(
     paths, problems = _chosen_images(folder, options)
     files, copies = without_copies(_read(paths, options, progress, problems))
     files, damaged = with_tags_of_flight(files)
-    problems += copies + damaged + list_problems(files)
+    problems += copies + damaged + list_problems(files) + lens_problems(files)
     captures: list[Capture] = []
     groups = group_files(files, with_rgb=options.with_rgb)
     _check_bands(groups, options.bands, folder)

@@ -20,9 +20,10 @@ from agalign.cameras.read_files import ImageFile, Problem, natural_order
 from agalign.config import DiscoverOptions
 from agalign.errors import InputError
 from agalign.pixels.raster import suffix_format
-from agalign.values.capture import Band, CameraIdentity, Capture, CaptureTime
+from agalign.values.capture import Band, CameraIdentity, Capture, CaptureTime, Pose
 from agalign.values.choices import BandOrder
 from agalign.values.files import RUN_FILE
+from agalign.values.pixel_units import SAME_PIXELS
 from agalign.values.text import counted
 
 _GroupKey = tuple[str, str, str]
@@ -95,6 +96,17 @@ def with_tags_of_flight(files: Sequence[ImageFile]) -> tuple[list[ImageFile], li
             own = replace(own, name=band.name, wavelength_nm=band.wavelength_nm, bandwidth_nm=band.bandwidth_nm)
             result[i] = replace(file, bands=(own,))
     return result, problems
+
+
+def lens_problems(files: Sequence[ImageFile]) -> list[Problem]:
+    """Return a problem for all files whose tags are of another lens or image size, named by the first of them."""
+    wrong = [file for file in files if file.other_lens]
+    if not wrong:
+        return []
+    others = f", and so in {counted(len(wrong) - 1, 'other file')}" if len(wrong) > 1 else ""
+    advice = "lens, rig and radiometry are not used: give the original images"
+    text = f"{wrong[0].path}: {wrong[0].other_lens}{others}; {advice}"
+    return [Problem(wrong[0].path, InputError(text), loses_nothing=True)]
 
 
 def list_problems(files: Iterable[ImageFile]) -> list[Problem]:
@@ -266,13 +278,8 @@ def capture_of(files: Sequence[ImageFile], folder: Path, options: DiscoverOption
     first = files[0]
     bands = with_unique_band_names(_bands_to_align(files, options.bands))
     bands = first.camera.with_shared_rig(bands, [f.tags for f in files])
-    # Mappings by the lens of damaged tags would not be finite.
-    bands = [
-        replace(b, lens=None, to_rig=None, other_to_rig=None)
-        if options.ignore_metadata or not (b.lens is None or b.lens.is_plausible(b.size_px))
-        else b
-        for b in bands
-    ]
+    if options.ignore_metadata:
+        bands = [replace(b, lens=None, to_rig=None, other_to_rig=None) for b in bands]
     reference = bands[reference_index(bands, options.reference, first.path)]
     bands = _in_order(bands, options.order)
     tags = _tags_of(reference, files)
@@ -288,10 +295,18 @@ def capture_of(files: Sequence[ImageFile], folder: Path, options: DiscoverOption
         flight_id=tags.first_text(camera.flight_ids),
         captured_at=camera.captured_at(tags),
         position=tags.position,
-        pose=camera.pose(tags),
+        pose=_pose(camera, tags, next((f for f in files if f.path == reference.path), first)),
         motion=camera.motion(tags),
         elevation_deg=camera.elevation_deg(tags),
     )
+
+
+def _pose(camera: Camera, tags: Tags, file: ImageFile) -> Pose | None:
+    """The pose by the tags of a file, with the focal length in pixels of its image."""
+    pose = camera.pose(tags)
+    if pose is None or pose.focal_length_px is None or not (file.other_lens or file.scale != SAME_PIXELS):
+        return pose
+    return replace(pose, focal_length_px=None if file.other_lens else pose.focal_length_px * file.scale.mean)
 
 
 def _tags_of(reference: Band, files: Sequence[ImageFile]) -> Tags:

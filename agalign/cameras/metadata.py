@@ -68,6 +68,12 @@ class Tags:
         return resolution / mm if resolution and mm else None
 
     @property
+    def camera_size_px(self) -> tuple[int, int] | None:
+        """(width, height) of the image that the camera wrote, by EXIF; programs that resize images keep these tags."""
+        width, height = (self.exif.get(f"ExifImage{side}") for side in ("Width", "Height"))
+        return (width, height) if isinstance(width, int) and isinstance(height, int) and width and height else None
+
+    @property
     def focal_length_mm(self) -> float | None:
         """EXIF FocalLength."""
         return finite(self.exif.get("FocalLength"))

@@ -17,7 +17,10 @@ from agalign.config import DiscoverOptions
 from agalign.errors import AgalignError, UnreadableFileError
 from agalign.pixels.radiometry import plausible
 from agalign.pixels.raster import probe, suffix_format
+from agalign.values import geometry
 from agalign.values.capture import Band
+from agalign.values.lens import rescaled
+from agalign.values.pixel_units import SAME_PIXELS, PixelScale, Size
 from agalign.values.process_pool import ProcessPool, WorkerDiedError
 from agalign.values.processes import environment_of_children, follow_parent
 
@@ -52,6 +55,10 @@ class ImageFile:
     tags: Tags
     bands: tuple[Band, ...]
     """Empty if the file contains no band that takes part."""
+    scale: PixelScale = SAME_PIXELS
+    """Size of the image relative to that of the camera, by EXIF, from which the tags in pixels were rescaled."""
+    other_lens: str = ""
+    """Why the lens in the tags is not that of the image, in words; it is left out with what depends on it."""
 
     @property
     def is_whole_capture(self) -> bool:
@@ -88,12 +95,43 @@ def read_file(path: Path, cameras: Iterable[Camera], options: DiscoverOptions) -
     if len(pages) > 1:
         named = [replace(band, band_index=band.page) for band in named]
     bands = [replace(b, panel=panel) for b in named if options.with_rgb or not b.companion]
+    scale, other_lens = _scale(tags, stored[0].size_px), ""
+    for i, band in enumerate(bands):
+        bands[i], why = _with_lens_of_image(band, scale)
+        other_lens = other_lens or why
     for i, band in enumerate(bands):
         if band.radiometry is not None:
             radiometry, problem = plausible(band.radiometry, band.size_px)
             reason = f"no usable tags for radiance ({problem})" if radiometry is None else ""
             bands[i] = replace(band, radiometry=radiometry, implausible=problem, uncalibrated=reason)
-    return ImageFile(path, camera, tags, tuple(bands))
+    return ImageFile(path, camera, tags, tuple(bands), scale, other_lens)
+
+
+def _scale(tags: Tags, size_px: Size) -> PixelScale:
+    """The scale of an image of (width, height) that was resized, by the camera's own size in EXIF."""
+    scale = PixelScale.between(tags.camera_size_px or size_px, size_px)
+    is_resized = abs(scale.x - scale.y) * max(size_px) < 2 * max(scale)  # sides of whole pixels
+    return scale if is_resized else SAME_PIXELS
+
+
+def _with_lens_of_image(band: Band, scale: PixelScale) -> tuple[Band, str]:
+    """Return the band with what its tags give in pixels of the camera's image rescaled to the image; without it, and
+    why, if the lens is then not that of the image, as of images that a program resized or cropped.
+    """
+    if scale != SAME_PIXELS:
+        planes = band.to_rig, band.other_to_rig
+        to_rig, other = (None if h is None else geometry.rescale(h, scale, SAME_PIXELS) for h in planes)
+        radiometry = band.radiometry and band.radiometry.rescaled(scale)
+        band = replace(band, lens=rescaled(band.lens, scale), to_rig=to_rig, other_to_rig=other, radiometry=radiometry)
+    if band.lens is None or band.lens.is_plausible(band.size_px):
+        return band, ""
+    (width, height), lens = band.size_px, band.lens
+    at = f"focal length {lens.fx_px:.0f} px, optical centre {lens.cx_px:.0f}, {lens.cy_px:.0f} px"
+    why = f"the lens in the tags ({at}) is not that of an image of {width} x {height} px"
+    band = replace(band, lens=None, to_rig=None, other_to_rig=None)
+    if band.radiometry is not None and band.radiometry.is_of_light:  # its vignetting is of the same image
+        band = replace(band, radiometry=None, uncalibrated=f"no usable tags for radiance ({why})")
+    return band, why
 
 
 def _stored_pages(path: Path, max_pixels: int) -> list[tuple[Band, ...]]:

@@ -27,7 +27,7 @@ _PLAUSIBLE: Mapping[str, tuple[float, float]] = {
     "calibration coefficient": (1e-6, 1e-2),  # 0.9e-4 to 3.7e-4 on six RedEdge
     "black level": (0.0, 2.0**14),  # a quarter of 16 bits; cameras write 4,096 to 5,800
     "vignetting": (0.05, 20.0),  # anywhere in the image; a wide lens leaves a third of the light in the corners
-    "vignetting centre (share of the image)": (0.2, 0.8),  # 1 for tags of an image that was reduced to a half
+    "vignetting centre (share of the image)": (0.3, 0.7),  # cameras have 0.42 to 0.58
     "row gradient": (0.1, 10.0),  # first or last row; up to 1.3
     "irradiance (W / m^2 / nm)": (0.005, 3.0),  # from sunset (0.6 % of a clear noon) to 1.5 times a clear noon
     "relative irradiance": (10.0, 1e6),  # 7,000 to 17,000 in the sun

@@ -10,6 +10,7 @@ from typing import Literal, NamedTuple
 
 from agalign.values.geometry import Matrix
 from agalign.values.lens import Lens
+from agalign.values.pixel_units import PixelScale
 
 
 @dataclass(frozen=True)
@@ -57,6 +58,13 @@ class Radiometry:
     """Time between the capture and the nearest panel, if `source` includes a panel."""
     tags: Mapping[str, float] = field(default_factory=dict)
     """The values of tags that `gain` is calculated from, with the names of `pixels.radiometry`."""
+
+    def rescaled(self, scale: PixelScale) -> "Radiometry":
+        """Return the calibration of the image resized by `scale`, which is nearly the same along both axes."""
+        x, y = scale.positions(self.vignetting_centre_px).tolist()
+        vignetting = tuple(k / scale.mean**power for power, k in enumerate(self.vignetting, start=1))
+        gradient = self.row_gradient / scale.y
+        return replace(self, vignetting_centre_px=(x, y), vignetting=vignetting, row_gradient=gradient)
 
     @property
     def irradiance(self) -> float | None:

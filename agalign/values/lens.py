@@ -43,13 +43,13 @@ class Lens:
 
     def is_plausible(self, size_px: Size) -> bool:
         """Return False for values that no camera has, or not for images of this size, as after resizing: focal lengths
-        beyond 0.1 to 1000 times the longer side, an optical centre farther than a quarter of it from the middle of the
-        image, and coefficients above 1000.
+        beyond 0.1 to 1000 times the longer side, an optical centre farther than a tenth of it from the middle of the
+        image, where cameras have up to 0.02, and coefficients above 1000.
         """
         side_px = max(size_px)
         is_focused = all(0.1 < focal_px / side_px < 1000 for focal_px in (self.fx_px, self.fy_px))
         from_middle_px = self.cx_px - size_px[0] / 2, self.cy_px - size_px[1] / 2
-        is_near = all(abs(distance_px) < side_px / 4 for distance_px in from_middle_px)
+        is_near = all(abs(distance_px) < side_px / 10 for distance_px in from_middle_px)
         return is_focused and is_near and all(abs(k) < 1000 for k in self.distortion)
 
 
