@@ -1,21 +1,30 @@
-"""Files for the paper's experiments on a folder of aerial RGB/NIR pairs (VIS_1.png, NIR_TF_1.png, GT_1.txt ...), which
-`agalign evaluate` and `agalign learn` run, and a plot of their results.
+"""The paper's experiments on a folder of aerial RGB/NIR pairs (VIS_1.png, NIR_TF_1.png, GT_1.txt ...): files for
+`agalign evaluate` and `agalign learn`, long evaluations in pieces, and a plot of their results.
 
     python benchmarks/paper.py NIR-VIS-RS/Dataset/Aerial
+    python benchmarks/paper.py pairs.csv --pieces FOLDER --jobs 2 -m paper:pseudo-siamese --shift 5
     python benchmarks/paper.py RESULTS.csv... --plot robustness.png
 
 The first writes to the current folder: pairs.csv with the pairs, learn.csv with 20 of them and homographies 5 %
-off, and test.csv with the others. The second draws files of `agalign evaluate --out`: a line for each method of each.
+off, and test.csv with the others. The second runs `agalign evaluate` with the options given for each pair alone, in
+--jobs processes, and prints its table for all pairs; results are files in FOLDER, and those which are there are not
+computed again. The third draws results: a line for each method of each file or folder.
 """
 
 import csv
 import random
+import subprocess
+import sys
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import fields
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
-from common import pyplot, run
+import typer
+from common import print_head, print_row, pyplot, run
 
-from agalign.evaluation.evaluate import Starts
+from agalign.evaluation.evaluate import Result, Starts, error_table
 from agalign.evaluation.image_pairs import read_image
 
 SPLIT_SEED, LEARNED = 2018, 20
@@ -40,12 +49,45 @@ def write_pairs(folder: Path) -> None:
             csv.writer(file).writerows([("name", "fixed", "moving", "homography"), *rows])
 
 
+def evaluate(pairs: Path, pieces: Path, jobs: int, options: list[str]) -> None:
+    """Run `agalign evaluate` for each pair alone, at most `jobs` at a time, and print the table of all."""
+    pieces.mkdir(exist_ok=True)
+
+    def one(row: dict[str, str]) -> None:
+        out = pieces / f"{row['name']}.csv"
+        if out.exists():
+            return
+        alone, new = pieces / f"{row['name']}.pair", pieces / f"{row['name']}.new"
+        with alone.open("w", newline="", encoding="utf-8") as file:
+            csv.writer(file).writerows([row.keys(), row.values()])
+        subprocess.run([sys.executable, "-m", "agalign", "evaluate", alone, "-q", "-o", new, *options], check=True)
+        new.rename(out)
+        alone.unlink()
+
+    with ThreadPoolExecutor(jobs) as executor:
+        list(executor.map(one, csv.DictReader(pairs.read_text(encoding="utf-8").splitlines())))
+    head, *body = error_table([_result(row) for row in rows_of(pieces)])
+    print_head(*head)
+    for cells in body:
+        print_row(*cells)
+
+
+def _result(row: dict[str, str]) -> Result:
+    return Result(**{f.name: f.type(row[f.name]) for f in fields(Result)})
+
+
+def rows_of(results: Path) -> list[dict[str, str]]:
+    """Read the results of a file or folder."""
+    files = sorted(results.glob("*.csv")) if results.is_dir() else [results]
+    return [row for file in files for row in csv.DictReader(file.read_text(encoding="utf-8").splitlines())]
+
+
 def draw(results: list[Path], path: Path) -> None:
     """Draw mean homography error and mAP over the start's error."""
     figure, axes = pyplot().subplots(1, 2, figsize=(9, 3.6), layout="constrained")
     lines: dict[str, list[dict[str, str]]] = {}
     for result in results:
-        for row in csv.DictReader(result.read_text(encoding="utf-8").splitlines()):
+        for row in rows_of(result):
             lines.setdefault(f"{row['method']}, {result.stem}", []).append(row)
     for name, rows in lines.items():
         shifts = sorted({float(row["shift"]) for row in rows})
@@ -59,11 +101,15 @@ def draw(results: list[Path], path: Path) -> None:
     figure.savefig(path, dpi=110)
 
 
-def main(paths: list[Path], plot: Path | None = None) -> None:
+def main(
+    paths: list[str], plot: Path | None = None, pieces: Path | None = None, jobs: Annotated[int, typer.Option()] = 1
+) -> None:
     if plot:
-        draw(paths, plot)
+        draw([Path(path) for path in paths], plot)
+    elif pieces:
+        evaluate(Path(paths[0]), pieces, jobs, paths[1:])
     else:
-        write_pairs(paths[0])
+        write_pairs(Path(paths[0]))
 
 
 if __name__ == "__main__":

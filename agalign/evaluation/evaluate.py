@@ -2,6 +2,7 @@
 
 import math
 import time
+import zlib
 from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
 from dataclasses import astuple, dataclass, fields
 from pathlib import Path
@@ -68,14 +69,14 @@ def evaluate(
 
     Raises InputError for a pair without a homography or an image that cannot be read.
     """
-    for number, pair in enumerate(pairs):
+    for pair in pairs:
         truth = pair.fixed_to_moving
         if truth is None:
             raise InputError(f"{pair.fixed}: has no homography to compare with")
         fixed, moving = read_image(pair.fixed), read_image(pair.moving)
         keypoints = visible_in_both(sift_keypoints(fixed), truth, fixed, moving)
         for name, method in methods.items():
-            rng = np.random.default_rng((rng_seed, number))
+            rng = np.random.default_rng((rng_seed, zlib.crc32(pair.name.encode())))
             for shift, start in starts.of(truth, max(fixed.size_px), rng):
                 began = time.perf_counter()
                 with one_thread(), one_memory_error():

@@ -8,6 +8,7 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
+import numpy as np
 import torch
 from torch import Tensor
 from torch.nn import functional
@@ -36,7 +37,7 @@ from agalign.values.pixel_units import FixedImagePx
 _MOVING = 1
 """Side of the network that describes the moving image."""
 _COARSEST_PX = 80
-"""Longer side of the coarsest level."""
+"""Longer side of the coarsest level. With 64, where few patches fit, psi moves half as far (docs/paper.md)."""
 _OCTAVES = 4.0
 """log2 of the patch scale s is uniform in [0, _OCTAVES]."""
 _MARGIN = 1.0
@@ -52,17 +53,22 @@ class Training:
     """How long recipe paper trains at each level."""
 
     keypoints: int = 4000
-    epochs: int = 8
-    """Passes over the keypoints. Not given in the paper."""
+    epochs: int = 100
+    """Passes over the keypoints at the coarsest level, half as many at each next one: psi has farthest to go at the
+    coarsest. Not given in the paper, whose 90 s a pair on a GTX 1080 Ti are about 100 at each level."""
+
+    def at(self, level: int) -> "Training":
+        """Return the training of a level, 0 for the coarsest."""
+        return replace(self, epochs=max(1, self.epochs >> level))
 
 
 DEFAULT_TRAINING = Training()
 
 
 def pyramid(longer_side_px: int) -> tuple[float, ...]:
-    """Return the scales of the levels, coarse to fine, each half of the next; 1 is full resolution."""
-    halvings = max(0, round(math.log2(longer_side_px / _COARSEST_PX)))
-    return tuple(0.5**k for k in range(halvings, -1, -1))
+    """Return the scales of the levels, coarse to fine, each about half of the next; 1 is full resolution."""
+    octaves = max(0.0, math.log2(longer_side_px / _COARSEST_PX))
+    return tuple(np.exp2(np.linspace(-octaves, 0.0, round(octaves) + 1)).tolist()) if round(octaves) else (1.0,)
 
 
 def align_by_paper(
@@ -85,7 +91,7 @@ def align_by_paper(
         def report(share: float, number: int = number) -> None:
             state.progress("learning", (number + share) / len(scales))
 
-        descent = descend(state, net, level, pool, group.mappings[0], training, report=report)
+        descent = descend(state, net, level, pool, group.mappings[0], training.at(number), report=report)
         group.mappings[0] = descent.fixed_to_moving
         steps += descent.steps
     result = refine(state, net, group, update_psi=False)[0]
@@ -196,8 +202,8 @@ def _loss(net: Descriptor, level: Level, batch: _Samples, h: Tensor) -> Tensor:
     """Return the sum of L0(x, w_k(x; psi)) and of L1(x, x') (paper, Eq. 3)."""
     fixed, moving = level.fixed, level.moving[0]
     f = net(fixed.patches(patch_positions(batch.x)), REFERENCE)
-    f_true = net(moving.patches(patch_positions(warp_keypoints(batch.x, h))), _MOVING)
-    f_false = net(moving.patches(patch_positions(batch.x_false)), _MOVING)
+    positions = torch.cat([patch_positions(warp_keypoints(batch.x, h)), patch_positions(batch.x_false)])
+    f_true, f_false = net(moving.patches(positions), _MOVING).chunk(2)
     return contrastive_loss(distance(f, f_true), distance(f, f_false)[batch.is_negative])
 
 
