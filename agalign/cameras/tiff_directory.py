@@ -143,6 +143,9 @@ def image_pages(path: Path) -> list[int]:
     Raises ValueError or OSError like `read_directories`.
     """
     with path.open("rb") as file:
+        layout, at, _ = _header(file)
+        if _raw_entries(file, layout, at)[1] == 0:  # most files: their tags are read only once, by `read_directories`
+            return [1]
         kinds = [values(page[254]) if 254 in page else 0 for page in _pages(file)]
     reduced_or_mask = 1 | 4  # of the tag NewSubfileType
     return [number for number, kind in enumerate(kinds, 1) if not int(kind) & reduced_or_mask]
@@ -194,15 +197,10 @@ def _read_directory(file: BinaryIO, layout: _Layout, at: int) -> tuple[Directory
 
     Raises ValueError if there are more entries, or they declare more bytes, than any camera writes.
     """
-    max_entries, max_bytes = 4096, 1 << 25  # cameras write fewer than 100, with a few thousand bytes
+    max_bytes = 1 << 25  # cameras write a few thousand
     head = struct.Struct(f"{layout.order}HH{layout.offset}")
-    file.seek(at)
-    (count,) = struct.unpack(layout.order + layout.entries, _exactly(file, struct.calcsize(layout.entries)))
-    if count > max_entries:
-        raise ValueError(f"a directory of {count} tags")
     size = head.size + layout.inline_bytes
-    raw = _exactly(file, count * size)
-    (following,) = struct.unpack(layout.order + layout.offset, _exactly(file, layout.inline_bytes))
+    raw, following = _raw_entries(file, layout, at)
     result: Directory = {}
     declared = 0
     for start in range(0, len(raw), size):
@@ -217,6 +215,18 @@ def _read_directory(file: BinaryIO, layout: _Layout, at: int) -> tuple[Directory
         if 0 < length <= len(value):
             result[tag] = Entry(kind, number, _swapped(value[:length], kind, layout.order))
     return result, following
+
+
+def _raw_entries(file: BinaryIO, layout: _Layout, at: int) -> tuple[bytes, int]:
+    """(entries as in the file, offset of the next directory)."""
+    max_entries = 4096  # cameras write fewer than 100
+    file.seek(at)
+    (count,) = struct.unpack(layout.order + layout.entries, _exactly(file, struct.calcsize(layout.entries)))
+    if count > max_entries:
+        raise ValueError(f"a directory of {count} tags")
+    raw = _exactly(file, count * (struct.calcsize(f"{layout.order}HH{layout.offset}") + layout.inline_bytes))
+    (following,) = struct.unpack(layout.order + layout.offset, _exactly(file, layout.inline_bytes))
+    return raw, following
 
 
 def _write_directory(file: BinaryIO, layout: _Layout, entries: Directory, following: int) -> int:

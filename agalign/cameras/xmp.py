@@ -77,7 +77,9 @@ class Packet:
         for description in self._descriptions():
             attributes = [(tag, (value,)) for tag, value in description.attrib.items()]
             for tag, raw in [*attributes, *((child.tag, _texts(child)) for child in description)]:
-                cleaned = tuple("" if re.fullmatch(r"&\w+;", v) else without_controls(v).strip() for v in raw)
+                cleaned = tuple(
+                    "" if v[:1] == "&" and re.fullmatch(r"&\w+;", v) else without_controls(v).strip() for v in raw
+                )
                 for name in _names(tag) if any(cleaned) else ():
                     result.setdefault(name, cleaned)
         return result
@@ -178,7 +180,7 @@ def _is_usual(prefix: str, uri: str) -> bool:
 
 
 def _texts(element: Any) -> tuple[str, ...]:
-    items = [item.text or "" for item in element.iterfind(f"*/{_RDF}li")]
+    items = [item.text or "" for item in element.iterfind(f"*/{_RDF}li")] if len(element) else []
     return tuple(items) if items else (element.text or "",)
 
 
