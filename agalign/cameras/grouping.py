@@ -99,7 +99,7 @@ def with_tags_of_flight(files: Sequence[ImageFile]) -> tuple[list[ImageFile], li
 
 
 def lens_problems(files: Sequence[ImageFile]) -> list[Problem]:
-    """Return a problem for all files whose tags are of another lens or image size, named by the first of them."""
+    """Return a problem for all files with tags of another lens or image size; it names the first of them."""
     wrong = [file for file in files if file.other_lens]
     if not wrong:
         return []

@@ -55,7 +55,7 @@ class Training:
     keypoints: int = 4000
     epochs: int = 100
     """Passes over the keypoints at the coarsest level, half as many at each next one: psi has farthest to go at the
-    coarsest. Not given in the paper, whose 90 s a pair on a GTX 1080 Ti are about 100 at each level."""
+    coarsest. Not given in the paper; its 90 s a pair on a GTX 1080 Ti are about 100 at each level."""
 
     def at(self, level: int) -> "Training":
         """Return the training of a level, 0 for the coarsest."""
