@@ -29,6 +29,8 @@ class Tags:
     """ISO 8601; by the camera's clock without an offset from UTC if the camera writes none."""
     orientation: int = 1
     """EXIF Orientation: 1 if the image is stored upright, 3 if it is rotated by 180 degrees."""
+    size_px: tuple[int, int] | None = None
+    """(width, height) of a TIFF's first page."""
     black_level: float | None = None
     """Mean of the values of the TIFF tag BlackLevel."""
     xmp: Mapping[Name, tuple[str, ...]] = field(default_factory=dict)
@@ -70,8 +72,7 @@ class Tags:
     @property
     def camera_size_px(self) -> tuple[int, int] | None:
         """(width, height) of the image that the camera wrote, by EXIF; programs that resize images keep these tags."""
-        width, height = (self.exif.get(f"ExifImage{side}") for side in ("Width", "Height"))
-        return (width, height) if isinstance(width, int) and isinstance(height, int) and width and height else None
+        return _size(self.exif, "ExifImageWidth", "ExifImageHeight")
 
     @property
     def focal_length_mm(self) -> float | None:
@@ -111,11 +112,17 @@ def read_tags(path: Path, page: int = 0) -> Tags:
         captured_at=_iso_time(exif, "DateTimeOriginal", "OffsetTimeOriginal")
         or _iso_time({**exif, **first}, "DateTime", "OffsetTime"),
         orientation=int(orientation) if orientation in range(1, 9) else 1,
+        size_px=_size(first, "ImageWidth", "ImageLength"),
         black_level=_mean(first.get("BlackLevel")),
         xmp=packet.values(),
         exif=exif,
         unread=packet.unread,
     )
+
+
+def _size(directory: Mapping[str, Any], *sides: str) -> tuple[int, int] | None:
+    width, height = (directory.get(side) for side in sides)
+    return (width, height) if isinstance(width, int) and isinstance(height, int) and width > 0 < height else None
 
 
 def _position(gps: Mapping[str, Any]) -> Position | None:

@@ -43,11 +43,20 @@ def principal_point_px(tags: Tags) -> tuple[float, float] | None:
 
 
 def pixels_per_mm(tags: Tags) -> float | None:
-    """Return EXIF's resolution of the focal plane, else the ratio of the focal length in px to EXIF's in mm."""
+    """Return EXIF's resolution of the focal plane, else the ratio of the focal length in px to EXIF's in mm, else, as
+    in files without EXIF, that with the principal point in the middle of the image.
+    """
     if tags.pixels_per_mm:
         return tags.pixels_per_mm
     focal_px = tags.number(NAMESPACE, "PerspectiveFocalLength") if focal_length_is_in_px(tags) else None
-    return focal_px / tags.focal_length_mm if focal_px and tags.focal_length_mm else None
+    if focal_px and tags.focal_length_mm:
+        return focal_px / tags.focal_length_mm
+    max_ratio = 1.1  # of both axes: principal points are within 0.02 of the longer side of the middle
+    point_mm = tags.numbers(NAMESPACE, "PrincipalPoint")
+    if focal_px or tags.size_px is None or len(point_mm) != 2 or min(point_mm) <= 0:
+        return None
+    low, high = sorted(side_px / 2 / mm for side_px, mm in zip(tags.size_px, point_mm, strict=True))
+    return (low + high) / 2 if high < max_ratio * low else None
 
 
 def focal_length_is_in_px(tags: Tags) -> bool:

@@ -9,7 +9,9 @@ import pytest
 import tifffile
 
 import agalign
+from agalign.cameras import pix4d
 from agalign.cameras.discover import FolderScan, discover
+from agalign.cameras.metadata import Tags
 from agalign.cameras.tiff_directory import EXIF, GPS, add_directories, read_directories, short
 from agalign.pixels.radiometry import calibrated
 from agalign.pixels.raster import probe
@@ -84,3 +86,14 @@ def test_images_reduced_to_a_half_are_aligned_without_reflectance(flight: Path, 
     assert {b.dtype for p in (tmp_path / "out").glob("IMG_*.tif") for b in probe(p)} == {
         "uint16"
     }  # reflectance is float32
+
+
+@pytest.mark.parametrize(("size_px", "focal_px"), [((1280, 960), 1454.4), ((160, 120), 181.8), ((160, 80), None)])
+def test_a_lens_in_mm_without_exif_has_its_centre_near_the_middle(
+    size_px: tuple[int, int], focal_px: float | None
+) -> None:
+    values = {"PrincipalPoint": ("2.3745", "1.8165"), "PerspectiveFocalLength": ("5.45",)}
+    tags = Tags(size_px=size_px, xmp={(pix4d.NAMESPACE, name): value for name, value in values.items()})
+    lens = pix4d.perspective_lens(tags)
+    assert (lens and lens.fx_px) == (focal_px and pytest.approx(focal_px, rel=1e-3))
+    assert lens is None or lens.is_plausible(size_px)
