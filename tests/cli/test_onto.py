@@ -5,6 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import rasterio
+from rasterio.enums import ColorInterp
 from rasterio.transform import Affine
 
 from agalign.values import geometry
@@ -82,6 +83,27 @@ def test_colours_and_indices_are_of_one_date(mosaics: Path, tmp_path: Path) -> N
     with rasterio.open(tmp_path / "out" / "new_ndvi.tif") as ndvi, rasterio.open(tmp_path / "out" / "new.tif") as out:
         red, nir = out.read(3), out.read(5)
         np.testing.assert_allclose(ndvi.read(1), (nir - red) / (nir + red), atol=1e-6)
+
+
+def test_an_orthophoto_of_colours_and_alpha_keeps_them(mosaics: Path, tmp_path: Path) -> None:
+    """As OpenDroneMap writes it: 8 bits, red, green, blue and alpha, without names of bands."""
+    with rasterio.open(mosaics / "summer.tif") as source:
+        image, profile = source.read(1), source.profile | {"count": 4, "dtype": "uint8", "nodata": None}
+    grey = np.uint8(255 * (image - image.min()) / np.ptp(image))
+    alpha = np.full_like(grey, 255)
+    alpha[:100] = 0
+    with rasterio.open(tmp_path / "ortho.tif", "w", **profile) as dataset:
+        dataset.colorinterp = [ColorInterp.red, ColorInterp.green, ColorInterp.blue, ColorInterp.alpha]
+        dataset.write(np.stack([grey, 255 - grey, grey // 2, alpha]))
+    done = onto(mosaics, tmp_path / "ortho.tif", tmp_path / "out")
+    assert done.returncode == 0, done.stderr
+    with rasterio.open(tmp_path / "out" / "ortho.tif") as out:
+        assert [c.name for c in out.colorinterp[1:]] == ["red", "green", "blue"]
+        red, green = out.read(2), out.read(3)
+        is_hidden = out.read_masks(2) == 0
+        assert 0.15 < is_hidden.mean() < 0.5
+        np.testing.assert_allclose(red[~is_hidden], 255 - green[~is_hidden], atol=2)
+    assert agalign_here("indices", tmp_path / "out", "--index", "vari").returncode == 0
 
 
 def test_unusable_mosaics_are_one_line(mosaics: Path, tmp_path: Path) -> None:
