@@ -95,7 +95,7 @@ class _FlightLearner:
         net, rig = initial_network(self._bands, self.settings, self.start), self._start_rig
         known_mappings = {} if rig is None else rig.mean
         camera = flight_camera(self.captures)
-        return FlightModel(net, camera, self._bands, known_mappings, "", rig) if net.is_trained else None
+        return FlightModel(net, camera, self._bands, known_mappings, "", rig)
 
     def _from_captures(self) -> FlightModel | None:
         """Learn the network and the rig, from at least MIN_CAPTURES captures."""

@@ -204,11 +204,10 @@ def choose_and_refine(
             break
     if best is None:
         return None
-    net = initial_network(bands, settings, start)
-    if not (net.is_trained and best.is_trusted):
+    if not best.is_trusted:
         return LearningCapture(best.capture, is_good_enough=False)
     with logged_failure(f"{best.capture.label} cannot be learned from"):
-        return best.refined_by(net, settings, is_final=False)
+        return best.refined_by(initial_network(bands, settings, start), settings, is_final=False)
     return None
 
 

@@ -104,7 +104,6 @@ def _read_model(path: Path) -> FlightModel:
         raise ValueError(f"invalid numbers of channels: {channels[:8]}")
     net = Descriptor(facts["sharing"], channels, half_rectified=True, unit_length=True)
     net.load_state_dict(_with_prefix("theta.", tensors))
-    net.is_trained = True
     fields = {band: values.numpy() for band, values in _with_prefix("field.", tensors).items()}
     return FlightModel(
         net,

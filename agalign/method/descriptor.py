@@ -93,8 +93,6 @@ class Descriptor(nn.Module):
             )
         self.sharing = sharing
         self.channels = tuple(channels)
-        self.is_trained = False
-        """False for random weights, which are trained before the first step on psi."""
         self.unit_length = unit_length
         first_channels = channels if sharing != "siamese" else channels[:1]
         self.first = nn.ModuleList(_FirstLayer(c, half_rectified) for c in first_channels)
@@ -134,7 +132,6 @@ def start_from(net: Descriptor, weights: Mapping[str, Tensor], sides: Sequence[i
             weight = weight.sum(dim=1, keepdim=True).expand_as(value) / value.shape[1]
         state[name] = weight
     net.load_state_dict(state)
-    net.is_trained = True
 
 
 def start_from_starter(net: Descriptor) -> None:

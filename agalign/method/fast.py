@@ -90,9 +90,13 @@ class Schedule:
     enough_retrieval: float = 0.6
     """Held-out retrieval above which learning stops once psi has converged. With 0.5, fields and trees are as accurate,
     but captures of water no longer determine the rig of their flight."""
+    max_steps_without_retrieval: int = 30
+    """Per capture: a level is abandoned after them if no held-out patches can be retrieved."""
 
 
 DEFAULT_SCHEDULE = Schedule()
+FROM_SCRATCH = Schedule(max_steps=600, max_steps_without_retrieval=100)
+"""For random weights."""
 
 
 def learn(
@@ -125,9 +129,9 @@ def learn(
             ]
             if not at_level:
                 continue
-            if scale == scales[0] and net.is_trained:
+            if scale == scales[0]:
                 list(pool.map(_search, at_level))
-            if not net.is_trained or not _converges(at_level, update_psi):
+            if not _converges(at_level, update_psi):
                 level_steps, loss = _train(state, net, at_level, schedule, update_psi)
                 steps += level_steps
             for group in at_level:
@@ -242,25 +246,20 @@ def _train(
     """
     loss_value, count = math.nan, len(at_level)
     max_steps = schedule.max_steps * count
-    warm_up_steps = 50  # steps on random weights before the first step on psi
-    warm_up = 0 if net.is_trained else warm_up_steps
     optimiser = Adam(net.parameters(), schedule.learning_rate)
     steps_between_updates = 10  # steps on theta per capture between two steps on psi
-    # A level is abandoned after this many steps if no held-out patches can be retrieved.
-    max_steps_without_retrieval = 30
     for step in range(1, max_steps + 1):
         loss = _loss(at_level[step % count])
         if loss is not None:
             optimiser.step(loss)
             loss_value = float(loss.detach())
-        if step < warm_up or step % (steps_between_updates * count):
+        if step % (steps_between_updates * count):
             continue
         state.progress("learning", step / max_steps)
         if all(update_psi(at_level)):
             break
-        if step >= warm_up + max_steps_without_retrieval * count and not any(any(g.distinguished) for g in at_level):
+        if step >= schedule.max_steps_without_retrieval * count and not any(any(g.distinguished) for g in at_level):
             break
-    net.is_trained = True
     return step, loss_value
 
 

@@ -141,19 +141,17 @@ def descend(
     is_free = torch.zeros_like(psi)
     if update_psi:
         is_free[list(FAMILY_PARAMETERS[state.family or "homography"])] = 1.0
-    keypoints = _draw(state, level, pool, homography_from_psi(psi.detach(), *size_px), training.keypoints)
-
-    batches = len(keypoints.x) // _BATCH
-    steps = training.epochs * batches
+    steps = 0
     momentum = 0.9
     learning_rate = 1e-4  # annealed by a cosine to 0 within each level
     optimiser = torch.optim.SGD([*net.parameters(), psi], learning_rate, momentum)
-    annealing = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, steps)
+    annealing = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, training.epochs)
     loss_value, before = float("nan"), psi.detach().clone()
-    for _ in range(training.epochs):
-        shuffled = torch.randperm(len(keypoints.x), generator=state.sampler.generator).to(state.device)
+    for epoch in range(training.epochs):
+        keypoints = _draw(state, level, pool, homography_from_psi(psi.detach(), *size_px), training.keypoints)
+        batches = torch.arange(len(keypoints.x) // _BATCH * _BATCH).split(_BATCH)
         pass_loss = 0.0
-        for rows in torch.split(shuffled[: batches * _BATCH], _BATCH):
+        for rows in batches:
             loss = _loss(net, level, keypoints.of(rows), homography_from_psi(psi, *size_px))
             optimiser.zero_grad()
             torch.autograd.backward(loss)
@@ -161,10 +159,11 @@ def descend(
             psi.grad *= is_free
             before = psi.detach().clone()
             optimiser.step()
-            annealing.step()
             pass_loss += float(loss.detach())
-        loss_value = pass_loss / (batches * _BATCH)
-        report(annealing.last_epoch / steps)
+        annealing.step()
+        steps += len(batches)
+        loss_value = pass_loss / (len(batches) * _BATCH)
+        report((epoch + 1) / training.epochs)
     h, h_before = (homography_from_psi(q, *size_px).detach() for q in (psi, before))
     corners = torch.tensor(geometry.corners(*size_px)).to(h)
     last_step = (transform(h, corners) - transform(h_before, corners)).norm(dim=1).max()
@@ -186,7 +185,7 @@ class _Samples:
 
 
 def _draw(state: JointState, level: Level, pool: Pool, h: Tensor, count: int) -> _Samples:
-    """Draw keypoints once for all epochs; a negative is the warped position of another random keypoint."""
+    """Draw the keypoints of a pass; a negative is the warped position of another random keypoint."""
     # Distance between a patch's samples at s = 1: patches are 4 to 64 px wide. Not given in the paper.
     spacing_px = 0.25
     x, _ = state.sampler.draw(level, pool, [h], count, _OCTAVES, spacing_px)

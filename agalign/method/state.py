@@ -8,7 +8,7 @@ import torch
 
 from agalign.config import JointSettings
 from agalign.errors import NoContrastError
-from agalign.method.descriptor import Descriptor, start_from_starter
+from agalign.method.descriptor import Descriptor, start_from, start_from_starter
 from agalign.method.device import choose_device
 from agalign.method.levels import Level, Sampler, make_level
 from agalign.values.displacement import DisplacementField
@@ -79,10 +79,16 @@ class JointState:
         return self._random_descriptor(channels, half_rectified=False, unit_length=False)
 
     def fast_descriptor(self, channels: Sequence[int], start: ThetaStart = "starter") -> Descriptor:
-        """Create the network of recipe fast with the weights in the package or random ones."""
+        """Create the network of recipe fast with the weights in the package or random ones, equal for all sides.
+
+        Responses of equal random filters, of which half ignore the sign of contrast, are similar where bands show the
+        same: enough to search the first translation with them.
+        """
         net = self._random_descriptor(channels, half_rectified=True, unit_length=True)
         if start == "starter":
             start_from_starter(net)
+        else:
+            start_from(net, self._random_descriptor([1], half_rectified=True, unit_length=True).state_dict())
         return net
 
     def _random_descriptor(self, channels: Sequence[int], *, half_rectified: bool, unit_length: bool) -> Descriptor:

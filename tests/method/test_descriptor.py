@@ -79,7 +79,6 @@ def test_every_side_starts_with_equal_weights(sharing: Sharing) -> None:
     net = started(sharing, (1, 1, 1))
     for side in (1, 2):
         torch.testing.assert_close(net(PATCHES, REFERENCE), net(PATCHES, side))
-    assert net.is_trained
 
 
 def test_three_equal_channels_have_the_descriptor_of_one() -> None:
