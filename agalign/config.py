@@ -159,7 +159,7 @@ class JointSettings(SettingsModel):
     """Joint optimisation of the descriptor and the homographies."""
 
     recipe: Recipe = "fast"
-    """Algorithm: fast, or the published one (paper)."""
+    """Algorithm: fast, the same from random weights (scratch), or the published one (paper)."""
     sharing: Sharing = "pseudo-siamese"
     """Layers that the networks of both bands share: all, all but the first, or none."""
     model_family: FamilyChoice = "auto"
@@ -283,4 +283,4 @@ class Settings(SettingsModel):
     @property
     def learns_flights(self) -> bool:
         """True if one network is learned for a flight before its captures are aligned."""
-        return self.joint.recipe == "fast" and self.flight.together and not self.seed.only
+        return self.joint.recipe != "paper" and self.flight.together and not self.seed.only

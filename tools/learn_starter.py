@@ -51,10 +51,10 @@ def main() -> None:
     for rate, steps in SCHEDULE:
         # A retrieval of 1 is never exceeded, so that no level ends before `max_steps`.
         schedule = Schedule(learning_rate=rate, max_steps=steps, enough_retrieval=1.0)
-        settings = JointSettings(sharing="siamese")
+        settings = JointSettings(recipe="scratch", sharing="siamese")
         state = JointState(settings, lambda _, share, rate=rate: print(f"rate {rate:g}: {share:.0%}", flush=True))
         if net is None:
-            net = state.fast_descriptor([1] * (1 + len(groups[0].moving)), "random")
+            net = state.fast_descriptor([1] * (1 + len(groups[0].moving)))
         learn(state, groups, net, schedule=schedule)
     save_starter(net, Path(agalign.__file__).parent / "method" / "starter.safetensors")
 

@@ -91,6 +91,8 @@ class _FlightLearner:
                 return replace(self.start, refined=refined)
         if len(self.captures) >= MIN_CAPTURES:
             return self._from_captures()
+        if self.start is None and self.settings.joint.recipe == "scratch":
+            return None  # a network is learned for each of the few captures
         # Learning takes as long as aligning one or two captures, and those that need it are learned from alone.
         net, rig = initial_network(self._bands, self.settings, self.start), self._start_rig
         known_mappings = {} if rig is None else rig.mean

@@ -187,7 +187,7 @@ class _FlightRun:
         """Return the run with a model. Raises ConfigurationError if it does not fit the settings or the cameras."""
         settings = self.settings
         if not settings.learns_flights:
-            raise ConfigurationError("a model needs one network per flight, which only recipe fast learns")
+            raise ConfigurationError("a model needs one network per flight, which recipe paper does not learn")
         model = load_model(path, lambda: choose_device(settings.joint.device))
         if model.net.sharing == "unshared" and settings.joint.sharing != "unshared":
             raise ConfigurationError(f"{path}: was learned unshared; add --sharing unshared")

@@ -223,7 +223,7 @@ class PairAligner:
     def refine(self, starts: Sequence[Start]) -> None:
         """Align the pairs of the bands that the flight's network contains with this network."""
         model = self.model
-        if model is None or self.settings.joint.recipe != "fast":
+        if model is None or self.settings.joint.recipe == "paper":
             return
         known = [s for s in starts if model.side(s[0].name) is not None]
         sides = [model.side(pair.name) or 0 for pair, _ in known]

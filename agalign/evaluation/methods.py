@@ -30,7 +30,7 @@ from agalign.method.match import matching_network, to_8_bit
 from agalign.method.paper import align_by_paper, pyramid
 from agalign.method.patches import Keypoints, bilinear, patch_positions, transform
 from agalign.method.refine import MovingBand, describe_fixed, refine
-from agalign.method.state import ImageGroup, JointState, ThetaStart
+from agalign.method.state import ImageGroup, JointState
 from agalign.pixels.band_resampling import channel_mean, luma, warped
 from agalign.values import geometry
 from agalign.values.alignment import JointResult, Seed
@@ -73,9 +73,8 @@ Method = Callable[[PairTask], Outcome]
 def method_named(name: str) -> Method:
     """Return the method of a name on the command line.
 
-    * `fast` or `paper`, a colon and the sharing (`siamese`, `pseudo-siamese`, `unshared`): learned on the pair by that
-      recipe. `:grey` added: on grey images; `:random` added: random weights instead of the starter network (recipe
-      paper always uses random weights).
+    * `fast`, `scratch` or `paper`, a colon and the sharing (`siamese`, `pseudo-siamese`, `unshared`): learned on the
+      pair by that recipe. `:grey` added: on grey images.
     * `sift`, `daisy`, `elastix`.
     * FILE.safetensors: a network of this program. FILE.pt: a TorchScript module that takes (N, 1, P, P) in [0, 1]; P is
       32, or what follows an @, as in hardnet.pt@32.
@@ -91,26 +90,25 @@ def method_named(name: str) -> Method:
         raise ConfigurationError(f"{name} needs more than is installed; in a checkout: pip install '.[evaluate]'")
     if name in fixed_names:
         return fixed_names[name]
-    learned = re.fullmatch(r"(fast|paper):([a-z-]+)(:grey)?(:random)?", name)
+    learned = re.fullmatch(r"(fast|scratch|paper):([a-z-]+)(:grey)?", name)
     if learned and learned[2] in get_args(Sharing):
-        start: ThetaStart = "random" if learned[4] else "starter"
         settings = JointSettings.model_validate({"recipe": learned[1], "sharing": learned[2]})
-        return lambda task: _learned_on_pair(task, settings, start, colour=learned[3] is None)
+        return lambda task: _learned_on_pair(task, settings, colour=learned[3] is None)
     if ".safetensors" in name:
         return _saved_network(Path(name))
     if ".pt" in name:
         file, _, side = name.partition("@")
         return _torchscript(Path(file), int(side) if side.isdigit() else 32)
     raise ConfigurationError(
-        f"unknown method '{name}'; choose from sift, daisy, elastix, fast:SHARING, paper:SHARING, or a network file"
+        f"unknown method '{name}'; choose from sift, daisy, elastix, RECIPE:SHARING or a network file"
     )
 
 
 # ---- descriptors of agalign
 
 
-def _learned_on_pair(task: PairTask, settings: JointSettings, start: ThetaStart, *, colour: bool) -> Outcome:
-    """Learn a descriptor and a homography on the pair by recipe fast or paper."""
+def _learned_on_pair(task: PairTask, settings: JointSettings, *, colour: bool) -> Outcome:
+    """Learn a descriptor and a homography on the pair."""
     fixed, moving = task.fixed, task.moving
     if not colour or (settings.sharing == "siamese" and fixed.channels != moving.channels):
         fixed, moving = (_without_colour(r) for r in (fixed, moving))
@@ -124,7 +122,7 @@ def _learned_on_pair(task: PairTask, settings: JointSettings, start: ThetaStart,
         if settings.recipe == "paper":
             net, result = align_by_paper(state, group)
         else:
-            net = state.fast_descriptor([fixed.channels, moving.channels], start)
+            net = state.fast_descriptor([fixed.channels, moving.channels])
             learn(state, [group], net)
             result = refine(state, net, group)[0]
     except (NotEnoughTextureError, NoContrastError, GeometryError):

@@ -31,6 +31,7 @@ from agalign.method.refine import (
 )
 from agalign.method.state import ImageGroup, JointState
 from agalign.values.alignment import MIN_RETRIEVAL
+from agalign.values.choices import Recipe
 
 
 class Adam:
@@ -94,26 +95,23 @@ class Schedule:
     """Per capture: a level is abandoned after them if no held-out patches can be retrieved."""
 
 
-DEFAULT_SCHEDULE = Schedule()
-FROM_SCRATCH = Schedule(max_steps=600, max_steps_without_retrieval=100)
-"""For random weights."""
+SCHEDULES: dict[Recipe, Schedule] = {
+    "fast": Schedule(),
+    "scratch": Schedule(max_steps=600, enough_retrieval=0.9, max_steps_without_retrieval=100),
+}
 
 
 def learn(
-    state: JointState,
-    groups: Sequence[ImageGroup],
-    net: Descriptor,
-    threads: int = 1,
-    schedule: Schedule = DEFAULT_SCHEDULE,
+    state: JointState, groups: Sequence[ImageGroup], net: Descriptor, threads: int = 1, schedule: Schedule | None = None
 ) -> tuple[int, float]:
     """Learn theta and every psi of all groups, coarse to fine; theta is carried from level to level.
 
     The homographies are written into the groups. `threads` groups update their psi at the same time; the result does
-    not depend on it. Returns the number of steps on theta and the last loss, NaN without a step. Raises
-    NoContrastError.
+    not depend on it. `schedule` is by default that of the recipe. Returns the number of steps on theta and the last
+    loss, NaN without a step. Raises NoContrastError.
     """
     scales = learn_scales(max(max(g.fixed.size_px) for g in groups))
-    steps, loss = 0, math.nan
+    steps, loss, schedule = 0, math.nan, schedule or SCHEDULES[state.settings.recipe]
     # Each group has its own random generator, so its samples do not depend on the other groups.
     states = [JointState(state.settings, state.progress) for _ in groups]
     with ThreadPoolExecutor(threads) as pool:

@@ -3,12 +3,13 @@
     argmin over theta and psi of   sum L0(x, w(x; psi); theta) + sum L1(x, x'; theta)
 
 theta are the weights of the descriptor f, psi the parameters of the homography w from I (`fixed`) to I' (`moving`),
-L0 is the distance of two matching descriptors, L1 the hinge loss of non-matching ones. Two recipes share levels,
+L0 is the distance of two matching descriptors, L1 the hinge loss of non-matching ones. The recipes share levels,
 keypoints, patches and networks:
 
 * `paper` (`paper.descend`): SGD on theta and psi together, coarse to fine, one pair at a time, as published.
 * `fast` (`fast.learn`, then `refine.refine`): Adam on theta with in-batch negatives; every few steps, one
   Gauss-Newton step on psi minimises L0 squared. At full resolution theta is frozen and only psi is optimised.
+* `scratch`: the same from random weights.
 
 With the network of a flight, theta is frozen throughout (`refine_with`).
 """
@@ -18,10 +19,10 @@ from dataclasses import replace
 from agalign.config import JointSettings
 from agalign.errors import GeometryError, NoContrastError, NotEnoughTextureError
 from agalign.method.descriptor import Descriptor
-from agalign.method.fast import DEFAULT_SCHEDULE, Schedule, learn
+from agalign.method.fast import Schedule, learn
 from agalign.method.paper import DEFAULT_TRAINING, Training, align_by_paper
 from agalign.method.refine import PATCHES, refine
-from agalign.method.state import ImageGroup, JointState, Progress, ThetaStart
+from agalign.method.state import ImageGroup, JointState, Progress
 from agalign.values.alignment import JointResult
 from agalign.values.issues import FEW_KEYPOINTS, NO_CONTRAST, NOT_INVERTIBLE, Issue
 from agalign.values.pixel_units import FixedImagePx
@@ -35,25 +36,26 @@ def align_from_scratch(
     settings: JointSettings,
     progress: Progress,
     *,
-    start: ThetaStart = "starter",
-    schedule: Schedule = DEFAULT_SCHEDULE,
+    schedule: Schedule | None = None,
     training: Training = DEFAULT_TRAINING,
 ) -> Results:
     """Optimise theta and every psi for one capture alone.
 
-    Only recipe fast uses `start` and `schedule`, only recipe paper uses `training`. Raises ConfigurationError for a
-    device that cannot be used.
+    Only recipe paper uses `training`, and the others `schedule`, by default that of the recipe. Raises
+    ConfigurationError for a device that cannot be used.
     """
     state = JointState(settings, progress)
     if settings.recipe == "paper":
         return [_by_paper(state, group, b, training) for b in range(len(group.moving))]
-    net = state.fast_descriptor([r.channels for r in (group.fixed, *group.moving)], start)
+    net = state.fast_descriptor([r.channels for r in (group.fixed, *group.moving)])
     try:
         steps, loss = learn(state, [group], net, schedule=schedule)
         results = refine(state, net, group)
     except NoContrastError:
         return [Issue(NO_CONTRAST)] * len(group.moving)
-    return [r if isinstance(r, Issue) else replace(r, loss=loss, iterations=steps) for r in results]
+    return [
+        r if isinstance(r, Issue) else replace(r, loss=loss, iterations=steps, recipe=settings.recipe) for r in results
+    ]
 
 
 def refine_with(

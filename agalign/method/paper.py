@@ -149,7 +149,7 @@ def descend(
     loss_value, before = float("nan"), psi.detach().clone()
     for epoch in range(training.epochs):
         keypoints = _draw(state, level, pool, homography_from_psi(psi.detach(), *size_px), training.keypoints)
-        batches = torch.arange(len(keypoints.x) // _BATCH * _BATCH).split(_BATCH)
+        batches = torch.split(torch.arange(len(keypoints.x) // _BATCH * _BATCH), _BATCH)
         pass_loss = 0.0
         for rows in batches:
             loss = _loss(net, level, keypoints.of(rows), homography_from_psi(psi, *size_px))

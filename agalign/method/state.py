@@ -2,7 +2,6 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from typing import Literal
 
 import torch
 
@@ -17,7 +16,6 @@ from agalign.values.image import Raster
 
 Progress = Callable[[str, float], None]
 """Called with the name of a stage and its completed share, 0 to 1."""
-ThetaStart = Literal["starter", "random"]
 
 
 @dataclass
@@ -78,17 +76,17 @@ class JointState:
         """Create the network of recipe paper with random weights; `channels` per side, the reference first."""
         return self._random_descriptor(channels, half_rectified=False, unit_length=False)
 
-    def fast_descriptor(self, channels: Sequence[int], start: ThetaStart = "starter") -> Descriptor:
-        """Create the network of recipe fast with the weights in the package or random ones, equal for all sides.
+    def fast_descriptor(self, channels: Sequence[int]) -> Descriptor:
+        """Create the network of recipe fast with the weights in the package, of recipe scratch with random ones.
 
-        Responses of equal random filters, of which half ignore the sign of contrast, are similar where bands show the
-        same: enough to search the first translation with them.
+        They are equal for all sides. Half of the filters ignore the sign of the contrast, so the responses of equal
+        random filters are similar where bands show the same: enough to search the first translation with them.
         """
         net = self._random_descriptor(channels, half_rectified=True, unit_length=True)
-        if start == "starter":
-            start_from_starter(net)
-        else:
+        if self.settings.recipe == "scratch":
             start_from(net, self._random_descriptor([1], half_rectified=True, unit_length=True).state_dict())
+        else:
+            start_from_starter(net)
         return net
 
     def _random_descriptor(self, channels: Sequence[int], *, half_rectified: bool, unit_length: bool) -> Descriptor:

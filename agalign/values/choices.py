@@ -9,7 +9,7 @@ MAX_MOSAIC_PIXELS = 20_000_000_000
 SeedKind = Literal["user", "match", "model", "rig", "centre", "geo", "structure", "identity"]
 """`centre` is from the optical centres in DJI's tags, `rig` from their calibrated homographies."""
 SeedChoice = Literal["auto", "rig", "geo", "structure", "match", "identity"]
-Recipe = Literal["fast", "paper"]
+Recipe = Literal["fast", "scratch", "paper"]
 Sharing = Literal["siamese", "pseudo-siamese", "unshared"]
 ModelFamily = Literal["homography", "affine", "translation"]
 FamilyChoice = Literal["auto", "homography", "affine", "translation"]

@@ -2,7 +2,7 @@ import os
 import shutil
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
-from functools import partial, partialmethod
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -24,8 +24,8 @@ from agalign.flight.rig import MIN_CAPTURES
 from agalign.flight.rig_file import read_rig
 from agalign.flight.rig_prediction import extreme_mappings
 from agalign.method import joint as method_joint
+from agalign.method import state as method_state
 from agalign.method.fast import Schedule, learn
-from agalign.method.state import JointState
 from agalign.products import preview
 from agalign.products.run_record import read_run_record
 from agalign.products.sidecar_file import find_sidecars, read_result, read_sidecar
@@ -85,11 +85,34 @@ def test_a_frozen_network_aligns_all_captures(aligned_flight: Path, model_path: 
     assert model_path.name == "RedEdge-M_SY01-0000001-AG.safetensors"
 
 
+def forbid_starter(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(method_state, "start_from_starter", raising(AssertionError("the starter network is used")))
+
+
+def test_captures_are_learned_from_random_weights(
+    flight: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    forbid_starter(monkeypatch)
+    settings = agalign.Settings(joint=agalign.JointSettings(recipe="scratch"))
+    list(run_flight(agalign.discover(flight, TWO_PAIRS), tmp_path, settings))
+    bands = [b for path in find_sidecars(tmp_path) for b in read_sidecar(path).bands if b.joint]
+    assert [(b.status, b.joint.recipe) for b in bands if b.joint] == [("aligned", "scratch")] * len(bands)
+    assert all(b.joint.iterations > 0 for b in bands if b.joint)
+
+
+@pytest.mark.full
+def test_a_flight_is_learned_from_random_weights(
+    learned_flight: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    forbid_starter(monkeypatch)
+    run(learned_flight, tmp_path, agalign.Settings(joint=agalign.JointSettings(recipe="scratch")))
+    bands = [b for path in find_sidecars(tmp_path) for b in read_sidecar(path).bands if b.joint]
+    assert {(b.status, b.joint.recipe) for b in bands if b.joint} == {("aligned", "flight")}
+
+
 def test_a_model_is_used_again(
     flight: Path, model_path: Path, aligned_copy: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    # From random weights, nothing could be learnt in one step.
-    monkeypatch.setattr(JointState, "fast_descriptor", partialmethod(JointState.fast_descriptor, start="random"))
     for module in (batch_learn, method_joint):
         monkeypatch.setattr(module, "learn", partial(learn, schedule=Schedule(max_steps=1)))
     assert states(run(flight, aligned_copy)) == ["kept", "kept"]

@@ -12,8 +12,8 @@ from agalign.errors import ConfigurationError
 from agalign.method.descriptor import REFERENCE, Descriptor, distance, retrieval, start_from, start_from_starter
 from agalign.method.fast import Adam, in_batch_loss
 from agalign.method.paper import contrastive_loss
-from agalign.method.state import JointState, ThetaStart
-from agalign.values.choices import Sharing
+from agalign.method.state import JointState
+from agalign.values.choices import Recipe, Sharing
 
 G = torch.Generator().manual_seed(0)
 PATCHES = torch.randn(12, 1, 16, 16, generator=G)
@@ -93,13 +93,15 @@ def test_patches_are_distinguished_despite_reversed_contrast() -> None:
     assert (f - reversed_f).norm(dim=1).median() < d.min(dim=1).values.median()
 
 
-def test_recipe_fast_starts_from_the_starter_by_default() -> None:
-    def first(*start: ThetaStart) -> torch.Tensor:
-        state = JointState(JointSettings(device="cpu"), lambda *_: None)
-        return state.fast_descriptor([1, 1], *start)(PATCHES, 1)
+def test_recipe_fast_starts_from_the_starter_and_scratch_from_random_weights() -> None:
+    def of_side(recipe: Recipe, side: int, rng_seed: int = 0) -> torch.Tensor:
+        state = JointState(JointSettings(recipe=recipe, rng_seed=rng_seed, device="cpu"), lambda *_: None)
+        return state.fast_descriptor([1, 1])(PATCHES, side)
 
-    torch.testing.assert_close(first(), started("pseudo-siamese", (1, 1))(PATCHES, 1))
-    assert (first() - first("random")).abs().max() > 0.1
+    torch.testing.assert_close(of_side("fast", 1), started("pseudo-siamese", (1, 1))(PATCHES, 1))
+    torch.testing.assert_close(of_side("scratch", 1), of_side("scratch", 0))
+    assert (of_side("scratch", 1) - of_side("fast", 1)).abs().max() > 0.1
+    assert (of_side("scratch", 1) - of_side("scratch", 1, rng_seed=1)).abs().max() > 0.1
 
 
 def test_a_descriptor_starts_from_the_chosen_branches() -> None:

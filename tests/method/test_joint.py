@@ -5,13 +5,14 @@ import pytest
 import torch
 
 from agalign.config import JointSettings
-from agalign.method.fast import Schedule, learn, learn_scales
+from agalign.method.fast import learn, learn_scales
 from agalign.method.joint import align_from_scratch
 from agalign.method.paper import Training
 from agalign.method.refine import refine
-from agalign.method.state import ImageGroup, JointState, ThetaStart
+from agalign.method.state import ImageGroup, JointState
 from agalign.values import geometry
 from agalign.values.alignment import JointResult
+from agalign.values.choices import Recipe
 from agalign.values.image import Raster
 from agalign.values.issues import NO_CONTRAST, Issue
 
@@ -35,9 +36,10 @@ def error_px(result: JointResult, truth: np.ndarray = TRUTH) -> float:
     return mean_error_px(result.fixed_to_moving, truth, 400, 320)
 
 
-@pytest.mark.parametrize("start", ["random", "starter"])
-def test_fast_recovers_a_homography_through_reversed_contrast(start: ThetaStart) -> None:
-    result = scratch(*two_views(TRUTH), NEAR, start=start)
+@pytest.mark.parametrize("recipe", ["scratch", "fast"])
+def test_a_homography_is_recovered_through_reversed_contrast(recipe: Recipe) -> None:
+    result = scratch(*two_views(TRUTH), NEAR, JointSettings(recipe=recipe))
+    assert result.recipe == recipe
     assert error_px(result) < 0.08
     assert result.retrieval > 0.8
     assert result.chance < 0.01
@@ -47,8 +49,7 @@ def test_fast_recovers_a_homography_through_reversed_contrast(start: ThetaStart)
 def test_results_depend_on_the_rng_seed_and_leave_the_global_random_state_unchanged() -> None:
     before = torch.get_rng_state()
     one, same, other = (
-        scratch(*two_views(TRUTH), NEAR, JointSettings(rng_seed=k), start="random", schedule=Schedule(max_steps=50))
-        for k in (4, 4, 5)
+        scratch(*two_views(TRUTH), NEAR, JointSettings(recipe="scratch", rng_seed=k)) for k in (4, 4, 5)
     )
     assert torch.equal(before, torch.get_rng_state())
     np.testing.assert_array_equal(one.fixed_to_moving, same.fixed_to_moving)
