@@ -305,7 +305,8 @@ def verify_together(
     with timer.measure([pair.name for pair, _ in starts]):
         candidates = _candidates(starts, results, model, settings)
         progress(starts[0][0].name if starts else "", "relief", 0.0)
-        relief = aligned_by_relief(list(candidates.values()), use, is_observation=is_observation)
+        lost = [start for start, result in zip(starts, results, strict=True) if isinstance(result, Issue)]
+        relief = aligned_by_relief(list(candidates.values()), use, without_result=lost, is_observation=is_observation)
     alignments = relief.alignments
     for (pair, seed), result in zip(starts, results, strict=True):
         if pair.name in alignments:

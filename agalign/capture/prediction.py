@@ -2,15 +2,20 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
 
 from agalign.capture.band_pair import BandPair
 from agalign.capture.seeding import find_rotated
 from agalign.capture.verification import WarpedPair
 from agalign.flight.rig import Observation, Rig, distance_px
 from agalign.flight.rig_prediction import predict_band
+from agalign.relief.occlusion import occluded
 from agalign.values.alignment import MIN_TIMES_CHANCE, Alignment
 from agalign.values.capture import Capture
 from agalign.values.issues import Issue
+from agalign.values.parallax import Parallax
 from agalign.values.pixel_units import FixedImagePx, MovingFilePx
 from agalign.verify.checks import MAX_UNEXPECTED_PX, UNEXPECTED_PX, Evidence, issues_of
 
@@ -39,17 +44,58 @@ def with_predictions(
     """Return the alignments with the rig's predictions, px of the files; the prediction replaces failed alignments.
 
     It also replaces results that contradict the rig, because of aliasing in repetitive scenes. A rotated or scaled
-    image does not fit the rig; its alignment gets an issue and is not replaced.
+    image does not fit the rig; its alignment gets an issue and is not replaced. Predictions follow the relief of the
+    capture, if it has one.
     """
     known = observed([p for p in pairs if p.has_rig_pixels], result, capture)
     covered = [p for p in pairs if p.name in rig.mean and p.has_rig_pixels]
-    return {**result, **{p.name: _with_prediction(p, result[p.name], rig, known) for p in covered}}
+    by_relief = {p.name: p for p in covered if p.name in known.mappings and result[p.name].mapping.parallax is not None}
+    return {
+        **result,
+        **{
+            p.name: _with_prediction(p, result[p.name], rig, known, _parallax_by_rig(p, by_relief, result, rig))
+            for p in covered
+        },
+    }
+
+
+class _ExpectedParallax(NamedTuple):
+    """The relief of a capture as a band should see it."""
+
+    parallax: Parallax
+    std_px: FixedImagePx
+    """Standard error by that of the baseline, and of pixels for which the relief has no value."""
+
+
+def _parallax_by_rig(
+    pair: BandPair, by_relief: Mapping[str, BandPair], result: Mapping[str, Alignment[FixedImagePx]], rig: Rig
+) -> _ExpectedParallax | None:
+    """Return the relief of the other bands with the baseline of the rig, scaled to theirs; None without a relief."""
+    parallaxes = {
+        name: parallax
+        for name, other in by_relief.items()
+        if name != pair.name and other.reference is pair.reference and (parallax := result[name].mapping.parallax)
+    }
+    if not parallaxes:
+        return None
+    relief = next(iter(parallaxes.values())).relief
+    seen = np.array([parallax.baseline for parallax in parallaxes.values()])
+    of_rig = np.array([rig.baselines[name] for name in parallaxes])
+    scale = float((seen * of_rig).sum() / max((of_rig**2).sum(), 1e-12))
+    error = float(np.sqrt(((seen - scale * of_rig) ** 2).sum(axis=1).mean()))
+    x, y = (scale * np.array(rig.baselines[pair.name])).tolist()
+    spread_px = float(np.sqrt(np.mean(np.square(relief.parallax_px)))) * relief.unit
+    return _ExpectedParallax(Parallax(relief, (x, y), occluded(relief, (x, y))), FixedImagePx(error * spread_px))
 
 
 def _with_prediction(
-    pair: BandPair, alignment: Alignment[FixedImagePx], rig: Rig, known: Observation
+    pair: BandPair, alignment: Alignment[FixedImagePx], rig: Rig, known: Observation, expected: _ExpectedParallax | None
 ) -> Alignment[FixedImagePx]:
     prediction = predict_band(rig, pair.name, known)
+    if expected is not None:
+        matrix = pair.scales.between_images(prediction.fixed_to_moving)
+        std_px = np.hypot(prediction.std_px, pair.in_moving_file_px(expected.std_px, matrix))
+        prediction = replace(prediction, std_px=MovingFilePx(std_px))
     if pair.name in known.mappings and alignment.joint is not None and alignment.residual is not None:
         off_px = distance_px(known.mappings[pair.name], prediction.fixed_to_moving, rig.size_px)
         prediction = replace(prediction, off_px=off_px)
@@ -68,7 +114,8 @@ def _with_prediction(
         by_windows = pair.scales.between_files(alignment.fixed_to_moving)
         if distance_px(by_windows, prediction.fixed_to_moving, rig.size_px) <= MAX_UNEXPECTED_PX:
             return alignment
-    by_rig = WarpedPair.of(pair, pair.mapping(pair.scales.between_images(prediction.fixed_to_moving)))
+    mapping = pair.mapping(pair.scales.between_images(prediction.fixed_to_moving))
+    by_rig = WarpedPair.of(pair, mapping.with_parallax(None if expected is None else expected.parallax))
     rotated = find_rotated(by_rig)
     if rotated is None:
         residual = by_rig.residual

@@ -1,12 +1,14 @@
 """Relief of a capture: a candidate for the geometry of all its bands, compared with displacement fields.
 
 The relief of half of the lenses verifies the other half, in windows that took no part in the fit of planes and
-baselines. A band that the relief of the others does not explain, as it was exposed at another time, gets a homography
-and a baseline of its own under that relief. Either all bands of the capture use the relief, or none.
+baselines. A band that the relief of the others does not explain, as it was exposed at another time or is noisy, gets a
+homography and a baseline of its own under that relief, and is predicted by them if they do not pass verification.
+Either all bands of the capture use the relief, or none.
 """
 
 import math
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from statistics import median_high
 
@@ -29,14 +31,17 @@ from agalign.relief.adjustment import (
 from agalign.relief.dense import DenseMatching, View
 from agalign.relief.occlusion import nearer_sign, occluded
 from agalign.values import geometry
-from agalign.values.alignment import MIN_RETRIEVAL, Alignment, JointResult, Residual, Seed
+from agalign.values.alignment import MIN_RETRIEVAL, Alignment, JointResult, Prediction, Residual, Seed
 from agalign.values.choices import Geometry, ReliefUse
 from agalign.values.displacement import DisplacementField
 from agalign.values.geometry import Matrix
 from agalign.values.image import Raster
+from agalign.values.issues import OTHER_GEOMETRY, Issue
 from agalign.values.mapping import PixelMapping
 from agalign.values.parallax import Parallax, Relief
 from agalign.values.pixel_units import FixedImagePx
+from agalign.values.robust import shift_scale_px
+from agalign.verify.checks import BY_WINDOWS, MAX_ALIAS_PEAK, MAX_SHIFT_PX, alias_peak
 from agalign.verify.displacement_field import MIN_GAIN_SIGMA, MIN_WINDOWS, robust_loss
 from agalign.verify.residuals import decrease_sigma
 from agalign.verify.window_fit import fit_windows
@@ -60,6 +65,15 @@ class ReliefCandidate:
     warped: WarpedPair
     by_halves: tuple[Matrix, Matrix] | None = None
     """Homographies from half of the windows (`WarpedPair.cross_validated`)."""
+
+    @classmethod
+    def at_seed(cls, pair: BandPair, seed: Seed) -> "ReliefCandidate":
+        """Return a band without a result: with the mapping of its seed, and without evidence of descriptors."""
+        matrix = seed.fixed_to_moving
+        joint = JointResult[FixedImagePx](
+            matrix, math.nan, 0.0, 0.0, 0, (1.0,), BY_WINDOWS, "homography", 0.0, ((math.inf, math.inf),) * 4
+        )
+        return cls(pair, seed, joint, WarpedPair.of(pair, pair.mapping(matrix)))
 
     def fit_residual(self, mapping: PixelMapping) -> Residual[FixedImagePx]:
         """Measure the windows of the fit with a mapping."""
@@ -86,10 +100,15 @@ class ReliefResult:
 
 
 def aligned_by_relief(
-    candidates: Sequence[ReliefCandidate], use: ReliefUse, *, is_observation: bool = False
+    candidates: Sequence[ReliefCandidate],
+    use: ReliefUse,
+    *,
+    without_result: Sequence[tuple[BandPair, Seed]] = (),
+    is_observation: bool = False,
 ) -> ReliefResult:
     """Align bands by one relief of the capture, with displacement fields where no rig contains them.
 
+    Bands `without_result` of the joint optimisation, and those with another kind of lens model, follow the relief too.
     With `use` "auto" a relief is only estimated if the residuals of the homographies contain common parallax. For an
     observation of the rig, only the homographies matter: there are no fields, and the relief has half the resolution.
     """
@@ -106,9 +125,13 @@ def aligned_by_relief(
         if on_a_line and parallax_px > max_line_px:
             result.along_a_line |= {c.pair.name for c in group}
         elif use == "always" or parallax_px >= _MIN_PARALLAX_PX:
-            aligned = _aligned_group(group, is_requested=use == "always", is_observation=is_observation)
+            estimate, aligned = _aligned_group(group, is_requested=use == "always", is_observation=is_observation)
             result.alignments |= aligned
-            result.others |= {c.pair.name for c in group} - aligned.keys() if aligned else set()
+            if estimate is not None and not is_observation:
+                others = [c for c in candidates if c.pair.name not in aligned]
+                others += [ReliefCandidate.at_seed(*start) for start in without_result]
+                result.alignments |= estimate.for_others(others)
+                result.others |= {c.pair.name for c in group} - result.alignments.keys()
     return result
 
 
@@ -266,20 +289,21 @@ class _Band:
 
 def _aligned_group(
     group: Sequence[ReliefCandidate], *, is_requested: bool, is_observation: bool
-) -> dict[str, Alignment[FixedImagePx]]:
-    """Align the bands of one group by their relief; empty if another geometry explains the capture better."""
+) -> "tuple[_Estimate | None, dict[str, Alignment[FixedImagePx]]]":
+    """Return the relief of a group and the bands that it aligns; (None, {}) if another geometry explains the capture
+    better.
+    """
     with_fields = not is_observation and not group[0].pair.has_rig
     try:
         estimate = _Estimate.of(group, with_fields=with_fields, is_refined=not is_observation)
         if estimate is None:
-            return {}
+            return None, {}
         checked = [estimate.checked(band) for band in estimate.bands]
         if not _is_chosen(checked) or (with_fields and not is_requested and not estimate.beats_fields(checked)):
-            return {}
-        checked += estimate.checked_others(group)
+            return None, {}
     except GeometryError:
-        return {}
-    return {c.name: c.alignment for c in checked if c.alignment is not None}
+        return None, {}
+    return estimate, {c.name: c.alignment for c in checked if c.alignment is not None}
 
 
 @dataclass(frozen=True)
@@ -348,11 +372,44 @@ class _Estimate:
             band = band.corrected(corners_px, np.add(band.baseline, change))
         return band
 
-    def checked_others(self, group: Sequence[ReliefCandidate]) -> list["_Checked"]:
-        """Fit and verify the bands of a group that are not part of the estimate. Raises GeometryError."""
-        names = {band.name for band in self.bands}
-        fitted = [self.fitted(c) for c in group if c.pair.name not in names]
-        return [self.checked(band) for band in fitted if band is not None]
+    def for_others(self, candidates: Sequence[ReliefCandidate]) -> dict[str, Alignment[FixedImagePx]]:
+        """Align or predict bands of the same reference that are not part of the estimate, where windows allow it."""
+        result: dict[str, Alignment[FixedImagePx]] = {}
+        for candidate in candidates:
+            pair = candidate.pair
+            if pair.is_coarse or pair.reference is not self.bands[0].candidate.pair.reference:
+                continue
+            with suppress(GeometryError):
+                band = self.fitted(candidate)
+                alignment = None if band is None else self.checked(band).alignment or self.predicted(band)
+                result |= {} if alignment is None else {pair.name: alignment}
+        return result
+
+    def predicted(self, band: _Band) -> Alignment[FixedImagePx] | None:
+        """Predict a band that does not pass verification, with the robust standard deviation of the shifts of held-out
+        windows as standard error; None if that is above the limit for aligned windows, or the scene repeats.
+        """
+        candidate, pair = band.candidate, band.candidate.pair
+        mapping = band.mapping(self.relief, with_occlusions=True)
+        windows = pair.reference.held_out_windows
+        warped = WarpedPair(pair, mapping, pair.warped_moving(mapping), windows, candidate.held_out_residual(mapping))
+        shifts_px = warped.residual.shifts_px[np.isfinite(warped.residual.shifts_px[:, 0])]
+        std_px = FixedImagePx(shift_scale_px(np.linalg.norm(shifts_px, axis=1)))
+        is_known = len(shifts_px) >= MIN_WINDOWS and std_px <= MAX_SHIFT_PX * pair.file_pixel_size_px
+        if not is_known or alias_peak(*warped.reduced_spectra()).ratio > MAX_ALIAS_PEAK:
+            return None
+        matrix, joint = mapping.fixed_to_moving, None if candidate.joint.recipe == BY_WINDOWS else candidate.joint
+        prediction = Prediction(pair.scales.between_files(matrix), "windows", pair.in_moving_file_px(std_px, matrix))
+        return Alignment(
+            mapping,
+            pair.fixed.size_px,
+            "predicted",
+            (Issue(OTHER_GEOMETRY),),
+            candidate.seed,
+            joint,
+            warped.residual,
+            prediction=prediction,
+        )
 
     def beats_fields(self, checked: Sequence["_Checked"]) -> bool:
         """Return True if the relief explains windows better than displacement fields without it.

@@ -36,7 +36,7 @@ _MIN_HELD_OUT_COVERAGE = 0.8
 thousand is within 1 px."""
 _MIN_COVERAGE = 0.6
 """Minimum share of the windows with structure that have a measured shift; it is small for unrelated images."""
-_MAX_SHIFT_PX = 1.0
+MAX_SHIFT_PX = 1.0
 """Maximum residual shift of an aligned window, and of the median: beyond it, a spectral index mixes neighbours."""
 _MIN_CLOSE_SHARE = 0.9
 """Minimum share of aligned windows among the measured ones: a few wrong peaks are normal."""
@@ -142,17 +142,17 @@ def _window_issues(evidence: Evidence[FixedPx]) -> Iterator[Issue]:
         yield Issue(COVERAGE, residual.coverage, _MIN_COVERAGE)
     measured = len(residual.measured_px)
     count = max(measured, 1)
-    is_far = np.linalg.norm(np.nan_to_num(residual.shifts_px), axis=1) > _MAX_SHIFT_PX * evidence.file_pixel_size_px
+    is_far = np.linalg.norm(np.nan_to_num(residual.shifts_px), axis=1) > MAX_SHIFT_PX * evidence.file_pixel_size_px
     close = 1 - float(is_far.sum()) / count
     if not close >= _MIN_CLOSE_SHARE:
-        yield Issue(CLOSE_WINDOWS, close, _MIN_CLOSE_SHARE, f"{_MAX_SHIFT_PX:g} px")
+        yield Issue(CLOSE_WINDOWS, close, _MIN_CLOSE_SHARE, f"{MAX_SHIFT_PX:g} px")
     cluster = _largest_cluster(residual.cells[is_far])
     limit = max(_MIN_CLUSTER, round(_MAX_CLUSTER_SHARE * measured))
     if not cluster < limit:
         yield Issue(CLUSTER, cluster / count, limit / count)
     median_px = residual.median_px / evidence.file_pixel_size_px
-    if not median_px <= _MAX_SHIFT_PX:
-        yield Issue(RESIDUAL_PX, median_px, _MAX_SHIFT_PX)
+    if not median_px <= MAX_SHIFT_PX:
+        yield Issue(RESIDUAL_PX, median_px, MAX_SHIFT_PX)
 
 
 def _largest_cluster(cells: NDArray[np.int64]) -> int:

@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -12,6 +13,7 @@ from synthetic_flights.relief import make_scene
 from agalign.capture import align_bands
 from agalign.capture.align_bands import verify_together
 from agalign.capture.band_pair import BandPair
+from agalign.capture.prediction import with_predictions
 from agalign.capture.reference import Reference
 from agalign.capture.relief_candidate import (
     _MIN_PARALLAX_PX,
@@ -22,17 +24,21 @@ from agalign.capture.relief_candidate import (
     _is_chosen,
     aligned_by_relief,
 )
-from agalign.capture.verification import WarpedPair
+from agalign.capture.verification import WarpedPair, at_seed
 from agalign.config import JointSettings, ReliefSettings, Settings
+from agalign.flight.rig import Rig
 from agalign.relief.range import inverse_range
 from agalign.synthetic.camera_model import BandSpec, CameraSpec, to_plane
 from agalign.synthetic.flight import recorded
 from agalign.values import geometry, lens
 from agalign.values.alignment import Alignment, Seed
+from agalign.values.capture import Capture
 from agalign.values.choices import FamilyChoice, ReliefUse
 from agalign.values.geometry import Matrix
 from agalign.values.image import Mask, Raster
+from agalign.values.issues import RETRIEVAL, Issue
 from agalign.values.mapping import PixelMapping
+from agalign.values.pixel_units import MovingFilePx
 
 from ..builders import in_full_run, joint_result, residual_of, whole
 from ..conftest import textured_image
@@ -223,6 +229,73 @@ def test_a_band_that_the_relief_does_not_align_is_predicted(flat: Rendered, monk
     result = verified_together(candidates, Settings())
     assert {name: a.status for name, a in result.items()} == {"Blue": "aligned", "Red": "aligned", "NIR": "predicted"}
     assert result["NIR"].prediction.source == "windows"
+
+
+def with_noise(image: np.ndarray, share: float) -> np.ndarray:
+    noise = np.random.default_rng(3).normal(0, share * float(image.mean()), image.shape)
+    return np.asarray((image + noise).clip(1, 65000), np.float32)
+
+
+@pytest.fixture(scope="module")
+def four_lenses() -> Rendered:
+    size_px = 640, 480
+    return Rendered.of(make_scene("boxes", 8, width_px=size_px[0]), size_px, CLOSE_RANGE)
+
+
+@pytest.mark.parametrize("has_result", [True, False])
+@pytest.mark.parametrize(("noise", "status"), [(0.2, "aligned"), (0.31, "predicted")])
+def test_a_noisy_band_follows_the_relief_of_the_others(
+    four_lenses: Rendered, noise: float, status: str, has_result: bool
+) -> None:
+    """With a result of the joint optimisation or only a seed; its claim is at least half of its error."""
+    scene, name = four_lenses, "Red edge"
+    candidates = scene.candidates(instead={name: with_noise(scene.images[name], noise)})
+    noisy = next(c for c in candidates if c.pair.name == name)
+    if has_result:
+        result = aligned_by_relief(candidates, "auto")
+    else:
+        others = [c for c in candidates if c is not noisy]
+        result = aligned_by_relief(others, "auto", without_result=[(noisy.pair, noisy.seed)])
+    alignment = result.alignments[name]
+    assert alignment.status == status
+    assert alignment.geometry.startswith("relief")
+    errors, plane = (scene.error_px(name, m) for m in (alignment.mapping, alignment.mapping.of_the_plane))
+    assert np.percentile(errors, 90) < 1.2
+    assert np.percentile(plane, 90) > 2
+    if status == "predicted":
+        assert 0.5 * np.percentile(errors, 68) < alignment.prediction.std_px <= 1
+
+
+def test_unrelated_images_do_not_follow_a_relief(four_lenses: Rendered) -> None:
+    other = textured_image(*four_lenses.size_px, seed=5)
+    candidates = four_lenses.candidates(instead={"Red edge": (1000 + 100 * other).astype(np.float32)})
+    assert set(aligned_by_relief(candidates, "auto").alignments) == {"Blue", "Red", "NIR"}
+
+
+def test_a_lost_band_is_predicted_with_the_relief(
+    boxes: Rendered, candidates: Sequence[ReliefCandidate], aligned: Mapping[str, Alignment]
+) -> None:
+    """The rig knows planes and baselines, the relief is that of the other bands."""
+    norm = np.linalg.norm([b.baseline_m for b in MOVING])
+    rig = Rig(
+        boxes.size_px,
+        mean={name: a.fixed_to_moving for name, a in aligned.items()},
+        baselines={b.name: (-b.baseline_m[0] / norm, -b.baseline_m[1] / norm) for b in MOVING},
+        delays={b.name: 0.0 for b in MOVING},
+        baseline_std={b.name: 0.0 for b in MOVING},
+        factors=("distance",),
+        captures=(),
+        from_bands_px={b.name: MovingFilePx(0.05) for b in MOVING},
+    )
+    pairs = [c.pair for c in candidates]
+    lost = at_seed(pairs[0], candidates[0].seed, (Issue(RETRIEVAL, 0.0, 0.2),))
+    result = with_predictions(pairs, {**aligned, pairs[0].name: lost}, rig, Capture("a", Path(), (), 0))
+    predicted = result[pairs[0].name]
+    assert (predicted.status, predicted.geometry) == ("predicted", "relief")
+    assert np.percentile(boxes.error_px(pairs[0].name, predicted.mapping), 90) < 0.8
+    assert predicted.prediction.std_px > 0.05
+    # A band whose relief is its own is verified by the rig as before.
+    assert {result[p.name].status for p in pairs[1:]} == {"aligned"}
 
 
 def test_the_sign_is_found_without_a_layout(boxes: Rendered, candidates: Sequence[ReliefCandidate]) -> None:
