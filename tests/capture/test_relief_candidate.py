@@ -294,7 +294,7 @@ def test_a_lost_band_is_predicted_with_the_relief(
     assert (predicted.status, predicted.geometry) == ("predicted", "relief")
     assert np.percentile(boxes.error_px(pairs[0].name, predicted.mapping), 90) < 0.8
     assert predicted.prediction.std_px > 0.05
-    # A band whose relief is its own is verified by the rig as before.
+    # The other bands are verified by the rig as before.
     assert {result[p.name].status for p in pairs[1:]} == {"aligned"}
 
 

@@ -147,7 +147,7 @@ LIMITS = {
         f"| {checks._MAX_CORNER_STD_PX:g} px |",
         f"the textured windows ({residuals._WINDOW_PX} px)",
         f"| {checks._MIN_COVERAGE:.0%} ({checks._MIN_HELD_OUT_COVERAGE:.0%} if".replace("%", " %"),
-        f"| {checks._MIN_CLOSE_SHARE:.0%}; adjacent windows beyond {checks._MAX_SHIFT_PX:g} px: fewer than "
+        f"| {checks._MIN_CLOSE_SHARE:.0%}; adjacent windows beyond {checks.MAX_SHIFT_PX:g} px: fewer than "
         f"{checks._MIN_CLUSTER}, or than {checks._MAX_CLUSTER_SHARE:.0%} of the windows |".replace("%", " %"),
         f"| {checks.MAX_ALIAS_PEAK:.0%} of the first".replace("%", " %"),
         f"| the larger of {checks.MAX_UNEXPECTED_PX:g} px and {checks._MAX_UNEXPECTED_STD:g} standard errors |",
