@@ -17,13 +17,10 @@ import torch
 from common import WRONG_PX, band_errors, read_ties
 
 from agalign.batch import capture_task as batch
-from agalign.cameras import known_cameras
 from agalign.cameras.discover import discover
-from agalign.cameras.grouping import capture_of
 from agalign.cameras.metadata import Tags
 from agalign.cameras.pix4d import NAMESPACE, focal_length_px
-from agalign.cameras.read_files import read_file
-from agalign.config import DiscoverOptions
+from agalign.cameras.read_files import _with_lens_of_image
 from agalign.errors import SidecarError
 from agalign.flight.model import FlightModel, load_model, save_model
 from agalign.products.excluded_captures import PANELS_FILE, SKY_FILE, read_panels, read_sky
@@ -36,6 +33,7 @@ from agalign.synthetic import flight as synthetic
 from agalign.values import geometry
 from agalign.values.alignment import RefinedPair
 from agalign.values.files import RUN_FILE
+from agalign.values.pixel_units import SAME_PIXELS
 from agalign.values.text import without_controls
 
 from ..conftest import Shared, raising, read_json, seeded
@@ -95,11 +93,9 @@ def test_tags_have_no_character_that_changes_other_text() -> None:
 )
 def test_a_lens_of_damaged_tags_is_not_used(flight: Path, change: dict[str, Any]) -> None:
     """Mappings by it are not finite, and cannot be written."""
-    files = [read_file(b.path, known_cameras(), DiscoverOptions()) for b in discover(flight).captures[0].bands]
-    (band,) = files[2].bands
-    files[2] = replace(files[2], bands=(replace(band, lens=replace(band.lens, **change)),))
-    result = capture_of(files, flight, DiscoverOptions()).bands[2]
-    assert (result.lens is None, result.to_rig is None) == (bool(change), bool(change))
+    band = discover(flight).captures[0].bands[2]
+    result, why = _with_lens_of_image(replace(band, lens=replace(band.lens, **change)), SAME_PIXELS)
+    assert (result.lens is None, result.to_rig is None, bool(why)) == (bool(change),) * 3
 
 
 def test_a_focal_length_of_damaged_tags_is_not_used() -> None:
