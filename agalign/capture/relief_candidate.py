@@ -127,9 +127,9 @@ def aligned_by_relief(
         elif use == "always" or parallax_px >= _MIN_PARALLAX_PX:
             estimate, aligned = _aligned_group(group, is_requested=use == "always", is_observation=is_observation)
             result.alignments |= aligned
-            if estimate is not None and not is_observation:
-                others = [c for c in candidates if c.pair.name not in aligned]
-                others += [ReliefCandidate.at_seed(*start) for start in without_result]
+            if estimate is not None:
+                lost = () if is_observation else without_result
+                others = [*(group if is_observation else candidates), *(ReliefCandidate.at_seed(*one) for one in lost)]
                 result.alignments |= estimate.for_others(others)
                 result.others |= {c.pair.name for c in group} - result.alignments.keys()
     return result
@@ -373,11 +373,14 @@ class _Estimate:
         return band
 
     def for_others(self, candidates: Sequence[ReliefCandidate]) -> dict[str, Alignment[FixedImagePx]]:
-        """Align or predict bands of the same reference that are not part of the estimate, where windows allow it."""
+        """Align or predict bands of the same reference where windows allow it, except those of the estimate: a relief
+        does not verify a band that it is estimated from.
+        """
+        names, reference = {band.name for band in self.bands}, self.bands[0].candidate.pair.reference
         result: dict[str, Alignment[FixedImagePx]] = {}
         for candidate in candidates:
             pair = candidate.pair
-            if pair.is_coarse or pair.reference is not self.bands[0].candidate.pair.reference:
+            if pair.name in names or pair.is_coarse or pair.reference is not reference:
                 continue
             with suppress(GeometryError):
                 band = self.fitted(candidate)

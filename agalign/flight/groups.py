@@ -116,7 +116,7 @@ class CameraOverview:
     radiometry: tuple[RadiometryChoice, ...]
     """Values of `--radiometry` that the tags of all captures support; panels are not considered."""
     uncalibrated: str = ""
-    """Why there is no calibration: the tags that are missing or not used."""
+    """Why there is no calibration: the missing or unused tags."""
     gsd_per_height: float | None = None
     """Ground sample distance per metre of height, from the focal length of the reference."""
 

@@ -1,4 +1,4 @@
-"""Damaged XMP packets, lists of bands in tags, and tags without which there is no radiance."""
+"""Damaged XMP packets, lists of bands in tags, and missing tags of the radiance."""
 
 import json
 import re

@@ -21,6 +21,7 @@ from agalign.capture.relief_candidate import (
     ReliefResult,
     _Checked,
     _common_parallax_px,
+    _Estimate,
     _is_chosen,
     aligned_by_relief,
 )
@@ -264,6 +265,18 @@ def test_a_noisy_band_follows_the_relief_of_the_others(
     assert np.percentile(plane, 90) > 2
     if status == "predicted":
         assert 0.5 * np.percentile(errors, 68) < alignment.prediction.std_px <= 1
+
+
+def test_a_relief_does_not_verify_a_band_that_it_is_estimated_from(
+    candidates: Sequence[ReliefCandidate], aligned: Mapping[str, Alignment], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Also if the band does not pass with the relief of the others."""
+    checked = _Estimate.checked
+    fails = lambda estimate, band: replace(checked(estimate, band), alignment=None)  # noqa: E731
+    monkeypatch.setattr(_Estimate, "checked", lambda self, band: (fails if band.name == "NIR" else checked)(self, band))
+    result = aligned_by_relief(candidates, "auto")
+    assert set(result.alignments) == set(aligned) - {"NIR"}
+    assert result.others == {"NIR"}
 
 
 def test_unrelated_images_do_not_follow_a_relief(four_lenses: Rendered) -> None:
