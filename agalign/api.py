@@ -16,7 +16,7 @@ from agalign.cameras.discover import discover
 from agalign.capture.align_bands import align_pairs
 from agalign.capture.band_pair import BandPair, Candidates
 from agalign.capture.from_windows import without_extrapolated
-from agalign.capture.verification import with_metrics
+from agalign.capture.warped_pair import with_metrics
 from agalign.config import DiscoverOptions, RunOptions, Settings
 from agalign.errors import InputError
 from agalign.pixels.masks import raster_of

@@ -6,20 +6,14 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 
 from agalign.capture.band_pair import BandPair, read_pairs
+from agalign.capture.decision import at_seed, decided, predicted_by_windows, verified, without_result
 from agalign.capture.from_windows import from_windows, without_extrapolated
 from agalign.capture.full_resolution import at_full_resolution
 from agalign.capture.map_estimate import map_estimate
 from agalign.capture.prediction import bands_to_learn, with_predictions
 from agalign.capture.relief_candidate import ReliefCandidate, aligned_by_relief
 from agalign.capture.seeding import find_seed, image_groups
-from agalign.capture.verification import (
-    WarpedPair,
-    at_seed,
-    predicted_by_windows,
-    verified,
-    with_metrics,
-    without_result,
-)
+from agalign.capture.warped_pair import WarpedPair, with_metrics
 from agalign.config import Settings
 from agalign.flight.fingerprint import refinement_key
 from agalign.flight.model import FlightModel
@@ -31,7 +25,6 @@ from agalign.relief.occlusion import occluded
 from agalign.values import geometry
 from agalign.values.alignment import Alignment, JointResult, RefinedPair, Seed
 from agalign.values.capture import Band, Capture
-from agalign.values.choices import PairStatus
 from agalign.values.issues import OTHER_GEOMETRY, SEED_ASKED_FOR, Issue
 from agalign.values.mapping import PixelMapping
 from agalign.values.parallax import Parallax, Relief
@@ -86,8 +79,8 @@ def align_capture_bands(
         if band.name not in result:
             overlay = Seed("identity", geometry.overlay(size_px, band.size_px), 0.0)
             issues = (unusable[band.name],) if band.name in unusable else ()  # none in a band of the reference's lens
-            status: PairStatus = "failed" if issues else "aligned"
-            result[band.name] = Alignment(PixelMapping(overlay.fixed_to_moving), size_px, status, issues, overlay)
+            mapping = PixelMapping(overlay.fixed_to_moving)
+            result[band.name] = decided(Alignment(mapping, size_px, "failed", issues, overlay))
     reliefs = (a.mapping.parallax.relief for a in result.values() if a.mapping.parallax is not None)
     relief = next((relief.on_pixels(size_px) for relief in reliefs), None)  # the same in all bands
     return {band.name: _as_written(result[band.name], band, relief) for band in capture.moving}

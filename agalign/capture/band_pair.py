@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
+from numpy.typing import NDArray
 
 from agalign.capture.reference import Reference
 from agalign.capture.tag_seeds import seed_candidates
@@ -19,7 +20,7 @@ from agalign.pixels.raster import read_for_alignment
 from agalign.pixels.stripes import without_common_stripes
 from agalign.pixels.structure import blur_px
 from agalign.values import geometry
-from agalign.values.alignment import SAME_SCALES, PairScales
+from agalign.values.alignment import SAME_SCALES, PairScales, Prediction
 from agalign.values.capture import Band, Capture
 from agalign.values.choices import SeedKind, Space
 from agalign.values.displacement import DisplacementField
@@ -185,6 +186,17 @@ class BandPair:
         """(width, height) of the reference's file."""
         width, height = (round(n / s) for n, s in zip(self.fixed.size_px, self.scales.fixed, strict=True))
         return width, height
+
+    def prediction_by_windows(
+        self, mapping: PixelMapping, std_px: FixedImagePx, covariance_px2: NDArray[np.float64] | None = None
+    ) -> Prediction:
+        """Return the prediction of a mapping between the images with this standard error.
+
+        `covariance_px2` (12, 12) is that of an extrapolated mapping, px of the reference's file.
+        """
+        matrix = mapping.fixed_to_moving
+        error_px = self.in_moving_file_px(std_px, matrix)
+        return Prediction(self.scales.between_files(matrix), "windows", error_px, covariance_px2=covariance_px2)
 
     def in_moving_file_px(self, distance_px: FixedImagePx, fixed_to_moving: Matrix) -> MovingFilePx:
         """Convert a distance in the fixed image to the moving file, for a homography between the images."""

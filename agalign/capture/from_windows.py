@@ -14,12 +14,13 @@ from dataclasses import replace
 import numpy as np
 
 from agalign.capture.band_pair import BandPair
-from agalign.capture.verification import WarpedPair
+from agalign.capture.decision import decided
+from agalign.capture.warped_pair import WarpedPair
 from agalign.flight.rig import Rig
-from agalign.values.alignment import Alignment, JointResult, Prediction, Residual
+from agalign.values.alignment import Alignment, JointResult, Residual
 from agalign.values.issues import CORNERS_UNKNOWN, FEW_KEYPOINTS, NO_CONTRAST, RETRIEVAL
 from agalign.values.mapping import PixelMapping
-from agalign.values.pixel_units import FixedImagePx
+from agalign.values.pixel_units import FixedImagePx, MovingFilePx
 from agalign.verify.checks import BY_WINDOWS, MAX_ALIAS_PEAK, alias_peak, seed_fits
 from agalign.verify.extrapolation import issues_of_extrapolation, points_in_frame
 from agalign.verify.window_fit import WindowFit, fit_in_rounds, lens_std_px
@@ -69,7 +70,7 @@ def _aligned(pair: BandPair, alignment: Alignment[FixedImagePx]) -> Alignment[Fi
     ).with_homography(mapping.fixed_to_moving, fit.covariance_px2)
     if replace(warped_pair, residual=held_out).issues(joint):
         return None
-    return replace(alignment, mapping=mapping, status="aligned", issues=(), joint=joint, residual=held_out)
+    return decided(replace(alignment, mapping=mapping, issues=(), joint=joint, residual=held_out))
 
 
 def _is_consistent(fit: WindowFit) -> bool:
@@ -86,20 +87,29 @@ def without_extrapolated(
 ) -> dict[str, Alignment[FixedImagePx]]:
     """Return the alignments; those `aligned` but extrapolated over a quarter of the image become `predicted`.
 
-    Bands that the rig covers and georeferenced files, which have no lens distortion, are not changed.
+    Bands that the rig covers and georeferenced files, which have no lens distortion, are not changed. A homography does
+    not extrapolate the relief of a flight: its spread is part of the standard error.
     """
     checked = dict(result)
     for pair in pairs:
         alignment, size_px = result[pair.name], pair.fixed.size_px
         is_covered = rig is not None and pair.has_rig_pixels and pair.has_rig and rig.covers(pair.name)
+        of_relief_px = MovingFilePx(0.0)
+        if rig is not None and alignment.mapping.parallax is None:
+            of_relief_px = rig.parallax_px.get(pair.name, MovingFilePx(0.0))
+            is_covered &= of_relief_px <= MovingFilePx(0.0)
         if alignment.status != "aligned" or alignment.residual is None or "geo" in pair.candidates or is_covered:
             continue
         plane = alignment.mapping.of_the_plane
         in_frame_px = points_in_frame(plane, size_px, pair.moving.size_px)
         issues = issues_of_extrapolation(alignment.residual, size_px, in_frame_px)
         if issues:
-            extrapolated = replace(alignment, status="failed", issues=issues)
-            checked[pair.name] = _predicted(pair, extrapolated, plane) or extrapolated
+            extrapolated = decided(replace(alignment, issues=issues, prediction=None))
+            checked[pair.name] = predicted = _predicted(pair, extrapolated, plane) or extrapolated
+            if predicted.prediction is not None and of_relief_px > MovingFilePx(0.0):
+                std_px = MovingFilePx(math.hypot(predicted.prediction.std_px, of_relief_px))
+                prediction = replace(predicted.prediction, std_px=std_px, covariance_px2=None)
+                checked[pair.name] = replace(predicted, prediction=prediction)
     return checked
 
 
@@ -121,16 +131,11 @@ def _predicted(
     if fitted is None:
         return None
     mapping, fit = fitted
-    matrix, to_file_px = mapping.fixed_to_moving, np.r_[np.tile(to_file, 4), np.full(4, to_file.mean)]
+    to_file_px = np.r_[np.tile(to_file, 4), np.full(4, to_file.mean)]
     std_px = FixedImagePx(fit.std_px(points_in_frame(mapping, size_px, pair.moving.size_px)))
-    prediction = Prediction(
-        pair.scales.between_files(matrix),
-        "windows",
-        pair.in_moving_file_px(std_px, matrix),
-        covariance_px2=fit.covariance_px2 * np.outer(to_file_px, to_file_px),
-    )
+    prediction = pair.prediction_by_windows(mapping, std_px, fit.covariance_px2 * np.outer(to_file_px, to_file_px))
     residual = WarpedPair.of(pair, mapping).residual
-    return replace(alignment, mapping=mapping, status="predicted", residual=residual, prediction=prediction)
+    return decided(replace(alignment, mapping=mapping, residual=residual, prediction=prediction))
 
 
 def _measured(pair: BandPair, mapping: PixelMapping) -> Residual[FixedImagePx]:

@@ -11,6 +11,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from agalign.capture.decision import decided
 from agalign.errors import UnreadableFileError
 from agalign.flight.rig import distance_px
 from agalign.pixels.band_resampling import resample_tile
@@ -51,9 +52,8 @@ def at_full_resolution(reference: Band, moving: Band, alignment: Alignment[Fixed
         refined = _refined(alignment, moving, for_fit, held_out, reference.size_px)
     except UnreadableFileError as error:
         issue = Issue(UNREADABLE, detail=str(error))
-        return replace(
-            alignment, mapping=alignment.of_the_seed, status="failed", issues=(issue,), joint=None, residual=None
-        )
+        without = replace(alignment, mapping=alignment.of_the_seed, issues=(issue,), prediction=None)
+        return decided(replace(without, joint=None, residual=None))
     return alignment if refined is None else refined
 
 

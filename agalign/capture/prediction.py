@@ -1,5 +1,6 @@
 """Predictions of the flight's rig for the bands of a capture: checks, replacements, and selection of bands to learn."""
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import NamedTuple
@@ -7,8 +8,9 @@ from typing import NamedTuple
 import numpy as np
 
 from agalign.capture.band_pair import BandPair
+from agalign.capture.decision import decided
 from agalign.capture.seeding import find_rotated
-from agalign.capture.verification import WarpedPair
+from agalign.capture.warped_pair import WarpedPair
 from agalign.flight.rig import Observation, Rig, distance_px
 from agalign.flight.rig_prediction import predict_band
 from agalign.relief.occlusion import occluded
@@ -29,7 +31,17 @@ def observed(pairs: Sequence[BandPair], result: Mapping[str, Alignment[FixedImag
         {name: _std_moving_px(pair, a) for name, (pair, a) in aligned.items()},
         None if capture.position is None else capture.position.altitude_m,
         capture.motion,
+        {
+            name: pair.in_moving_file_px(_rms_px(parallax), a.fixed_to_moving)
+            for name, (pair, a) in aligned.items()
+            if (parallax := a.mapping.parallax) is not None
+        },
     )
+
+
+def _rms_px(parallax: Parallax) -> FixedImagePx:
+    """Return the RMS displacement of a band by a relief."""
+    return FixedImagePx(parallax.relief.rms_px * math.hypot(*parallax.baseline))
 
 
 def _std_moving_px(pair: BandPair, alignment: Alignment[FixedImagePx]) -> MovingFilePx:
@@ -84,18 +96,20 @@ def _parallax_by_rig(
     scale = float((seen * of_rig).sum() / max((of_rig**2).sum(), 1e-12))
     error = float(np.sqrt(((seen - scale * of_rig) ** 2).sum(axis=1).mean()))
     x, y = (scale * np.array(rig.baselines[pair.name])).tolist()
-    spread_px = float(np.sqrt(np.mean(np.square(relief.parallax_px)))) * relief.unit
-    return _ExpectedParallax(Parallax(relief, (x, y), occluded(relief, (x, y))), FixedImagePx(error * spread_px))
+    std_px = FixedImagePx(error * relief.rms_px)
+    return _ExpectedParallax(Parallax(relief, (x, y), occluded(relief, (x, y))), std_px)
 
 
 def _with_prediction(
     pair: BandPair, alignment: Alignment[FixedImagePx], rig: Rig, known: Observation, expected: _ExpectedParallax | None
 ) -> Alignment[FixedImagePx]:
     prediction = predict_band(rig, pair.name, known)
-    if expected is not None:
+    if expected is None:  # a homography does not follow the relief that captures of the flight have
+        of_parallax_px = rig.parallax_px.get(pair.name, MovingFilePx(0.0))
+    else:
         matrix = pair.scales.between_images(prediction.fixed_to_moving)
-        std_px = np.hypot(prediction.std_px, pair.in_moving_file_px(expected.std_px, matrix))
-        prediction = replace(prediction, std_px=MovingFilePx(std_px))
+        of_parallax_px = pair.in_moving_file_px(expected.std_px, matrix)
+    prediction = replace(prediction, std_px=MovingFilePx(np.hypot(prediction.std_px, of_parallax_px)))
     if pair.name in known.mappings and alignment.joint is not None and alignment.residual is not None:
         off_px = distance_px(known.mappings[pair.name], prediction.fixed_to_moving, rig.size_px)
         prediction = replace(prediction, off_px=off_px)
@@ -119,9 +133,10 @@ def _with_prediction(
     rotated = find_rotated(by_rig)
     if rotated is None:
         residual = by_rig.residual
-        return replace(alignment, mapping=by_rig.mapping, status="predicted", residual=residual, prediction=prediction)
+        return decided(replace(alignment, mapping=by_rig.mapping, residual=residual, prediction=prediction))
     off_px = distance_px(pair.scales.between_files(rotated), prediction.fixed_to_moving, rig.size_px)
-    return replace(alignment, issues=(Issue(UNEXPECTED_PX, off_px, MAX_UNEXPECTED_PX), *alignment.issues))
+    issues = Issue(UNEXPECTED_PX, off_px, MAX_UNEXPECTED_PX), *alignment.issues
+    return decided(replace(alignment, mapping=alignment.of_the_seed, issues=issues, prediction=None))
 
 
 def bands_to_learn(

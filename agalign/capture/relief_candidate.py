@@ -12,11 +12,13 @@ from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from statistics import median_high
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from agalign.capture.band_pair import BandPair
-from agalign.capture.verification import WarpedPair
+from agalign.capture.decision import decided, without_result
+from agalign.capture.warped_pair import WarpedPair
 from agalign.errors import GeometryError
 from agalign.pixels.band_resampling import channel_mean
 from agalign.relief.adjustment import (
@@ -31,11 +33,11 @@ from agalign.relief.adjustment import (
 from agalign.relief.dense import DenseMatching, View
 from agalign.relief.occlusion import nearer_sign, occluded
 from agalign.values import geometry
-from agalign.values.alignment import MIN_RETRIEVAL, Alignment, JointResult, Prediction, Residual, Seed
+from agalign.values.alignment import MIN_RETRIEVAL, Alignment, JointResult, Residual, Seed
 from agalign.values.choices import Geometry, ReliefUse
 from agalign.values.displacement import DisplacementField
 from agalign.values.geometry import Matrix
-from agalign.values.image import Raster
+from agalign.values.image import FloatImage, Raster
 from agalign.values.issues import OTHER_GEOMETRY, Issue
 from agalign.values.mapping import PixelMapping
 from agalign.values.parallax import Parallax, Relief
@@ -342,7 +344,7 @@ class _Estimate:
             relief, *others = matching.refined(_views(bands), selections)
         else:
             relief, *others = (matching.matched(selection) for selection in selections)
-        result = cls(bands, relief, others, with_fields)
+        result = cls(bands, replace(relief, std_px=_std_px(others)), others, with_fields)
         return result.negated if layout is None and nearer_sign(matched, baselines) < 0 else result
 
     @property
@@ -401,18 +403,10 @@ class _Estimate:
         is_known = len(shifts_px) >= MIN_WINDOWS and std_px <= MAX_SHIFT_PX * pair.file_pixel_size_px
         if not is_known or alias_peak(*warped.reduced_spectra()).ratio > MAX_ALIAS_PEAK:
             return None
-        matrix, joint = mapping.fixed_to_moving, None if candidate.joint.recipe == BY_WINDOWS else candidate.joint
-        prediction = Prediction(pair.scales.between_files(matrix), "windows", pair.in_moving_file_px(std_px, matrix))
-        return Alignment(
-            mapping,
-            pair.fixed.size_px,
-            "predicted",
-            (Issue(OTHER_GEOMETRY),),
-            candidate.seed,
-            joint,
-            warped.residual,
-            prediction=prediction,
-        )
+        joint = None if candidate.joint.recipe == BY_WINDOWS else candidate.joint
+        without = without_result(pair, candidate.seed, Issue(OTHER_GEOMETRY))
+        prediction, residual = pair.prediction_by_windows(mapping, std_px), warped.residual
+        return decided(replace(without, mapping=mapping, joint=joint, residual=residual, prediction=prediction))
 
     def beats_fields(self, checked: Sequence["_Checked"]) -> bool:
         """Return True if the relief explains windows better than displacement fields without it.
@@ -466,10 +460,9 @@ class _Estimate:
             return replace(rejected, held_out=held_out)
         kind: Geometry = "relief" if complete.field is None else "relief and field"
         candidates = {"homography": plane.p95_px, kind: held_out.p95_px}
-        alignment = Alignment(
-            complete, pair.fixed.size_px, "aligned", (), candidate.seed, joint, held_out, candidates=candidates
-        )
-        return _Checked(pair.name, plane, held_out, alignment)
+        without = without_result(pair, candidate.seed)
+        aligned = replace(without, mapping=complete, joint=joint, residual=held_out, candidates=candidates)
+        return _Checked(pair.name, plane, held_out, decided(aligned))
 
 
 @dataclass(frozen=True)
@@ -495,6 +488,18 @@ def _verifying(bands: Sequence[int]) -> list[list[int]]:
     if len(bands) <= max_left_out_bands:
         return [[b for b in bands if b != band] for band in bands]
     return [[b for b in bands if b % 2 != parity] for parity in (0, 1)]
+
+
+def _std_px(reliefs: Sequence[Relief]) -> FloatImage:
+    """Return the standard error (height, width) of a relief from those of n selections of its bands.
+
+    It is the delete-a-group jackknife, sqrt((n - 1) / n sum |z_i - mean|^2), as RMS over the surroundings: reliefs from
+    different bands differ at depth edges and in areas without texture.
+    """
+    surroundings_px = 17  # the distance of the nodes of an error map
+    values = np.stack([relief.parallax_px for relief in reliefs])
+    square = (len(values) - 1) * np.square(values - values.mean(axis=0)).mean(axis=0)
+    return np.asarray(np.sqrt(cv2.blur(square, (surroundings_px, surroundings_px))))
 
 
 def _is_chosen(checked: Sequence[_Checked]) -> bool:

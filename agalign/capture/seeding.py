@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 
 from agalign.capture.band_pair import BandPair, Candidates
-from agalign.capture.verification import WarpedPair
+from agalign.capture.warped_pair import WarpedPair
 from agalign.config import SeedSettings
 from agalign.flight.model import FlightModel
 from agalign.method.descriptor import Descriptor

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from agalign.flight import rig
 from agalign.flight.rig import MIN_CAPTURES, CaptureFactors, Factor, Observation, Rig, design_tensor, least_squares
+from agalign.values.pixel_units import MovingFilePx
 from agalign.values.process_pool import Apply
 from agalign.values.robust import cauchy_weights
 
@@ -45,6 +46,7 @@ def learn_rig(
     fitted, t_std, nu_w = table.fit(np.ones(len(captures)), factors)
     offsets, lenses = fitted[:, :6].reshape(-1, 2, 3), zip(bands, fitted[:, 6:8].tolist(), strict=True)
     by_capture = zip(captures, nu_w.tolist(), strict=True)
+    squares_px2 = {b: [c.parallax_px.get(b, 0.0) ** 2 for c in captures if b in c.mappings] for b in bands}
     return Rig(
         size_px=size_px,
         mean={b: rig.displaced(m, o, size_px) for b, m, o in zip(bands, table.median, offsets, strict=True)},
@@ -54,6 +56,7 @@ def learn_rig(
         factors=factors,
         captures=tuple(CaptureFactors(c.seconds, c.altitude_m, c.motion, tuple(f)) for c, f in by_capture),
         from_bands_px=dict(zip(bands, errors_px.tolist(), strict=True)),
+        parallax_px={b: MovingFilePx(np.sqrt(np.mean(squares))) for b, squares in squares_px2.items()},
     )
 
 

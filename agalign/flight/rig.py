@@ -61,6 +61,8 @@ class Observation:
     """Altitude in the tags, above any datum; None if unknown."""
     motion: tuple[float, float] | None = None
     """Velocity of the ground in the image (right, down), in any unit; None if unknown."""
+    parallax_px: Mapping[str, MovingFilePx] = field(default_factory=dict)
+    """RMS displacement by the relief of the capture, for bands that have one."""
 
 
 @dataclass(frozen=True)
@@ -97,6 +99,8 @@ class Rig:
     extrapolation_px: Mapping[str, MovingFilePx] = field(default_factory=dict)
     """RMS error by band of the mean mapping, for bands without an observed quarter of the image, into which the
     homography extrapolates differences of lens distortion."""
+    parallax_px: Mapping[str, MovingFilePx] = field(default_factory=dict)
+    """RMS displacement by band by the reliefs of the captures, which a homography does not contain."""
     fields: Mapping[str, DisplacementField] = field(default_factory=dict)
     """Displacement field by band that all captures have in common and no homography represents, raw px of the
     reference's file."""

@@ -22,13 +22,13 @@ from agalign.pixels.band_resampling import shrink
 from agalign.pixels.structure import structure_field
 from agalign.relief.semi_global import MAX_LARGE, aggregated, sub_label_minimum
 from agalign.values import geometry, lens
-from agalign.values.image import FloatImage, Raster
+from agalign.values.image import FloatImage, Mask, Raster
 from agalign.values.mapping import PixelMapping
 from agalign.values.parallax import Relief
 from agalign.values.pixel_units import PixelScale
 
 Costs = NDArray[np.uint8]
-"""(levels, height, width): truncated 1 - correlation of one band, in units of 1 / _UNIT_COST."""
+"""(levels, height, width): truncated 1 - correlation of one band, in units of 1 / _UNIT_COST, or _UNKNOWN."""
 
 _SEARCH_NEARER, _SEARCH_FARTHER = 0.06, 0.03
 """Searched parallax as a share of the longer side: for lenses 3 cm apart and a reference plane 1 m away, an object at
@@ -40,6 +40,12 @@ _WINDOW_PX = 7
 _UNIT_COST = int(MAX_LARGE / 0.4)
 """Integer cost of zero correlation, as high as the range of semi-global matching permits: large steps of the parallax
 have a penalty of 0.4 of it."""
+_UNKNOWN = 255
+"""Cost of a window with invalid, such as saturated, pixels of the moving band: the others determine the parallax."""
+_MAX_INVALID_SHARE = 0.25
+"""Maximum share of invalid pixels in a window with a correlation."""
+_MIN_CORRELATION = 0.1
+"""Lower correlations are treated as occlusion and do not increase the cost further."""
 _MEDIAN_PX = 5
 """Window of the median filters, which remove isolated wrong pixels."""
 _STRIP_PX = 64
@@ -103,16 +109,17 @@ class DenseMatching:
         # median error by 6 to 18 % (rendered boxes, plants and terraces).
         steps_px = [step * self.step_px for step in (-1.5, -0.5, 0.5, 1.5)]
         totals = [np.zeros((len(steps_px), *start.shape), np.float32) for start in starts]
+        counts = [np.zeros(start.shape, np.float32) for start in starts]
         for band, view in enumerate(views):
             moving = _MovingBand(fixed, view, limits)
-            for start, total, bands in zip(starts, totals, selections, strict=True):
+            for start, total, count, bands in zip(starts, totals, counts, selections, strict=True):
                 if band in bands:
-                    moving.subtract_correlations(start, steps_px, total)
+                    moving.subtract_correlations(start, steps_px, total, count)
         result = []
-        for start, total, bands in zip(starts, totals, selections, strict=True):
+        for start, total, count in zip(starts, totals, counts, strict=True):
             offset_px = sub_label_minimum(total) * np.float32(steps_px[1] - steps_px[0]) + np.float32(steps_px[0])
-            parallax_px = np.asarray(cv2.medianBlur(start + offset_px, _MEDIAN_PX))
-            result.append(Relief(parallax_px, total.min(axis=0) / np.float32(-len(bands)), fixed.scale))
+            parallax_px = cv2.medianBlur(np.where(count > 0, start + offset_px, start), _MEDIAN_PX)
+            result.append(Relief(np.asarray(parallax_px), -total.min(axis=0) / np.maximum(count, 1), fixed.scale))
         return result
 
     def _range_px(self, windows_px: tuple[float, float]) -> tuple[float, float]:
@@ -153,10 +160,14 @@ def _mean_costs(costs: Sequence[Costs]) -> Costs:
     """Return the mean over the bands. It has the range of one band, so that no number of bands overflows."""
     result = np.empty_like(costs[0])
     for k, plane in enumerate(result):
-        total = np.zeros(plane.shape, np.float32)
+        total, count = np.zeros(plane.shape, np.float32), np.zeros(plane.shape, np.float32)
         for band in costs:
-            cv2.accumulate(band[k], total)
-        cv2.convertScaleAbs(total, plane, 1 / len(costs))
+            known = (band[k] != _UNKNOWN).view(np.uint8)
+            cv2.accumulate(band[k], total, known)
+            cv2.accumulate(known, count)
+        # Without any band, the cost is that of an occlusion, and the neighbours determine the parallax.
+        np.copyto(total, (1 - _MIN_CORRELATION) * _UNIT_COST, where=count == 0)
+        cv2.convertScaleAbs(total / np.maximum(count, 1), plane)
     return result
 
 
@@ -177,21 +188,22 @@ class _FixedBand:
             stop = min(start + _STRIP_PX, height)
             yield slice(start, stop), slice(max(start - margin, 0), min(stop + margin, height))
 
-    def correlation(self, warped: FloatImage, rows: slice) -> FloatImage:
-        """Return the normalised correlation in windows, (rows, width), with a structure (rows, width, 4).
+    def correlation(self, warped: FloatImage, rows: slice) -> tuple[FloatImage, Mask]:
+        """Return the normalised correlation in windows with a structure (rows, width, 4), and where it is unknown.
 
-        It is from 0.1 to 1. Windows across a step of the parallax or the border may exceed 1 otherwise.
+        Both are (rows, width). It is from _MIN_CORRELATION to 1. Windows across a step of the parallax or the border
+        may exceed 1 otherwise.
         """
-        min_correlation = 0.1  # lower ones are treated as occlusion and do not increase the cost further
         real, imaginary, energy = (plane[rows] for plane in self.structure)
-        warped_real, warped_imaginary, warped_energy, _ = cv2.split(warped)
+        warped_real, warped_imaginary, warped_energy, invalid = cv2.split(warped)
         cv2.multiply(real, warped_real, warped_real)
         cv2.multiply(imaginary, warped_imaginary, warped_imaginary)
         product = cv2.add(warped_real, warped_imaginary, warped_real)
         norm = cv2.max(cv2.multiply(energy, warped_energy, warped_energy), _MIN_ENERGY, warped_energy)
         mean = cv2.boxFilter(product, -1, (self.window_px, self.window_px), warped_imaginary)
         correlation = np.asarray(cv2.divide(mean, norm, norm))
-        return np.clip(correlation, np.float32(min_correlation), np.float32(1), out=correlation)
+        np.clip(correlation, np.float32(_MIN_CORRELATION), np.float32(1), out=correlation)
+        return correlation, np.asarray(invalid > _MAX_INVALID_SHARE)
 
 
 class _MovingBand:
@@ -201,9 +213,9 @@ class _MovingBand:
         self.fixed = fixed
         self.middle_px, self.half_px = sum(range_px) / 2, max((range_px[1] - range_px[0]) / 2, _SEARCH_STEP_PX)
         size_px = self._size_px(view)
-        planes = _structure(shrink(view.image, size_px), fixed.window_px)
-        # cv2.remap is twice as fast for 4 channels as for 3.
-        self.structure = np.asarray(cv2.merge([*planes, np.zeros_like(planes[0])]))
+        image, window = shrink(view.image, size_px), (fixed.window_px, fixed.window_px)
+        invalid = cv2.boxFilter((~image.valid).astype(np.float32), -1, window)
+        self.structure = np.asarray(cv2.merge([*_structure(image, fixed.window_px), invalid]))
         mapping = view.plane.rescaled(fixed.scale, PixelScale.between(view.image.size_px, size_px))
         self.parabola = self._parabola(mapping, fixed.scale.displacements(view.baseline))
 
@@ -213,20 +225,26 @@ class _MovingBand:
         result = np.empty((len(levels_px), height, width), np.uint8)
         for rows, extended in self.fixed.strips():
             for plane, level_px in zip(result[:, rows], levels_px.astype(np.float32), strict=True):
-                correlation = self._correlation(self._positions(level_px, extended), rows, extended)
+                correlation, unknown = self._correlation(self._positions(level_px, extended), rows, extended)
                 cv2.convertScaleAbs(correlation, plane, -_UNIT_COST, _UNIT_COST)
+                plane[unknown] = _UNKNOWN
         return result
 
-    def subtract_correlations(self, parallax_px: FloatImage, steps_px: Sequence[float], total: FloatImage) -> None:
-        """Subtract the correlations at the parallax of each pixel plus each of the steps from `total`.
+    def subtract_correlations(
+        self, parallax_px: FloatImage, steps_px: Sequence[float], total: FloatImage, count: FloatImage
+    ) -> None:
+        """Subtract the correlations at the parallax of each pixel plus each of the steps from `total`, and count them.
 
-        `parallax_px` is (height, width), `total` is (steps, height, width).
+        `parallax_px` and `count` are (height, width), `total` is (steps, height, width).
         """
         for rows, extended in self.fixed.strips():
             start = self._positions(parallax_px[extended], extended)
             derivative = self._positions(parallax_px[extended] + np.float32(1), extended) - start
-            for plane, step_px in zip(total[:, rows], steps_px, strict=True):
-                plane -= self._correlation(start + np.float32(step_px) * derivative, rows, extended)
+            at_steps = [self._correlation(start + np.float32(s) * derivative, rows, extended) for s in steps_px]
+            known = ~np.logical_or.reduce([unknown for _, unknown in at_steps])
+            count[rows] += known
+            for plane, (correlation, _) in zip(total[:, rows], at_steps, strict=True):
+                plane -= correlation * known
 
     def _positions(self, parallax_px: FloatImage | np.float32, rows: slice) -> FloatImage:
         """Return the positions (2, rows, width) in the moving image, x and y, at a parallax."""
@@ -234,12 +252,14 @@ class _MovingBand:
         u = (parallax_px - np.float32(self.middle_px)) / np.float32(self.half_px)
         return np.asarray(a + u * (b + u * c))
 
-    def _correlation(self, positions: FloatImage, rows: slice, extended: slice) -> FloatImage:
-        """Return the correlation in some rows from the positions in these and the rows around."""
+    def _correlation(self, positions: FloatImage, rows: slice, extended: slice) -> tuple[FloatImage, Mask]:
+        """Return `_FixedBand.correlation` in some rows from the positions in these and the rows around."""
         outside_energy = 1e3  # of windows with centres outside, so that the part inside has no correlation
         border = (0.0, 0.0, outside_energy, 0.0)
         warped = np.asarray(cv2.remap(self.structure, positions[0], positions[1], cv2.INTER_LINEAR, borderValue=border))
-        return self.fixed.correlation(warped, extended)[rows.start - extended.start :][: rows.stop - rows.start]
+        own = slice(rows.start - extended.start, rows.stop - extended.start)
+        correlation, unknown = self.fixed.correlation(warped, extended)
+        return correlation[own], unknown[own]
 
     def _size_px(self, view: View) -> tuple[int, int]:
         """Return the size at which the pixels of the moving image are as large as those of the reduced reference."""

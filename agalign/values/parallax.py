@@ -33,6 +33,8 @@ class Relief:
     """Size of this raster relative to the image on which the relief is evaluated."""
     unit: float = 1.0
     """Px of the image on which the relief is evaluated for a px of `parallax_px`."""
+    std_px: FloatImage | None = None
+    """(height, width) standard error of `parallax_px`, in its unit; None if it is not known."""
 
     def __call__(self, points_px: ArrayLike) -> NDArray[np.float64]:
         """Parallax (...) at points (..., 2), px of the image on which it is evaluated.
@@ -63,6 +65,11 @@ class Relief:
         return bool(inside and first == int(first) and last - first == len(positions_px) - 1)
 
     @property
+    def rms_px(self) -> float:
+        """Root mean square of the parallax, px of the image on which it is evaluated."""
+        return float(np.sqrt(np.mean(np.square(self.parallax_px)))) * self.unit
+
+    @property
     def negated(self) -> "Relief":
         """The relief with the opposite sign."""
         return replace(self, parallax_px=-self.parallax_px)
@@ -71,7 +78,8 @@ class Relief:
         """The same at the pixels of the image on which it is evaluated, of (width, height), as it is written."""
         x_px, y_px = (np.arange(n, dtype=np.float64) for n in size_px)
         confidence = replace(self, parallax_px=self.confidence, unit=1.0).at_crossings(x_px, y_px)
-        return Relief(rounded(self.at_crossings(x_px, y_px)), confidence)
+        std_px = None if self.std_px is None else replace(self, parallax_px=self.std_px).at_crossings(x_px, y_px)
+        return Relief(rounded(self.at_crossings(x_px, y_px)), confidence, std_px=std_px)
 
     def rescaled(self, scale: PixelScale) -> "Relief":
         """The same on an image that is resized by `scale`."""
@@ -100,6 +108,14 @@ class Parallax:
         """The same on a reference that is resized by `scale`."""
         baseline = (self.baseline[0] * scale.x / scale.mean, self.baseline[1] * scale.y / scale.mean)
         return replace(self, relief=self.relief.rescaled(scale), baseline=baseline)
+
+    def variance_px2(self, points_px: ArrayLike) -> NDArray[np.float64]:
+        """Variance (...) of the displacement by the error of the relief at raw points (..., 2), 0 if unknown."""
+        relief = self.relief
+        if relief.std_px is None:
+            return np.zeros(np.shape(points_px)[:-1])
+        std_px = replace(relief, parallax_px=relief.std_px)(points_px)
+        return np.asarray((std_px * np.hypot(*self.baseline)) ** 2)
 
     def displacements(self, points_px: ArrayLike) -> NDArray[np.float64]:
         """t_b z (..., 2) at raw points (..., 2), undistorted px."""

@@ -1,11 +1,11 @@
-"""Status of a band pair from the issues of its alignment, and all kinds of issues by code.
+"""Checks of an alignment, which find its issues, and all kinds of issues by code.
 
 A new check is one function, which yields issues, and one line in `CHECKS`. The worst error is a wrong alignment called
 `aligned`. Negated comparisons also reject NaN.
 """
 
 import math
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any, Generic, NamedTuple, Protocol
 
@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 from agalign.pixels.structure import Field, correlation_surfaces
 from agalign.values import geometry, issues
 from agalign.values.alignment import MIN_RETRIEVAL, MIN_TIMES_CHANCE, JointResult, Prediction, Residual
-from agalign.values.choices import PairStatus
 from agalign.values.geometry import Matrix
 from agalign.values.issues import RETRIEVAL, TEXTURELESS, UNLIKE, Issue, IssueKind, Remedy
 from agalign.values.pixel_units import FixedImagePx, FixedPx, PixelScale
@@ -55,8 +54,8 @@ CORNER_STD_PX = IssueKind(
     "corner_std_px", "the standard error at the corners of the image is {value:.1f} px", TEXTURELESS
 )
 FEW_WINDOWS = IssueKind("few_windows", "too little common structure to verify the result", TEXTURELESS)
-COVERAGE = IssueKind("coverage", "a shift can be measured in only {value:.0%} of the windows", UNLIKE)
-CLOSE_WINDOWS = IssueKind("close_windows", "only {value:.0%} of the windows are aligned within {detail}", _PARALLAX)
+COVERAGE = IssueKind("coverage", "a shift can be measured in only {value:.1%} of the windows", UNLIKE)
+CLOSE_WINDOWS = IssueKind("close_windows", "only {value:.1%} of the windows are aligned within {detail}", _PARALLAX)
 CLUSTER = IssueKind("cluster", "an area with {value:.0%} of the windows is misaligned", _PARALLAX)
 RESIDUAL_PX = IssueKind("residual_px", "the median residual shift is {value:.1f} px", UNLIKE)
 UNEXPECTED_PX = IssueKind(
@@ -238,14 +237,7 @@ def issues_of(evidence: Evidence[FixedPx]) -> tuple[Issue, ...]:
     return result or tuple(i for check in CHECKS if check.is_costly for i in check.issues(evidence))
 
 
-def status_of(issues: Sequence[Issue], residual: Residual[FixedImagePx], *, seed: bool) -> PairStatus:
-    """Return `aligned` without issues, else `seed_only` for a usable `seed` with a small `residual`, else `failed`."""
-    if not issues:
-        return "aligned"
-    return "seed_only" if seed and seed_fits(residual) else "failed"
-
-
-def seed_fits(residual: Residual[FixedImagePx]) -> bool:
+def seed_fits(residual: Residual[FixedPx]) -> bool:
     """Return True if the residual of a seed is small enough for the status `seed_only`."""
     # Rig tags have errors of a few px (docs/cameras.md).
     min_coverage, max_median_px = 0.3, 8.0

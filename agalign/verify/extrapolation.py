@@ -90,7 +90,7 @@ def expected_error_px(
 ) -> NDArray[np.float64]:
     """Return the expected RMS error, px, at points (n, 2) of the reference (width, height), raw px.
 
-        error^2 = trace(D(x) C D(x)^T) + (1 - far) * local mean square + far * p95^2
+        error^2 = trace(D(x) C D(x)^T) + (1 - far) * local mean square + far * p95^2 + variance of the parallax
 
     C is the covariance of the corners and D the Jacobian `geometry.over_corners`, with lens shapes if the mapping is
     extrapolated. For a band that is predicted by a rig, the first term is the squared standard error. The local mean
@@ -100,6 +100,8 @@ def expected_error_px(
     square, residual = _mapping_px2(alignment, size_px, points_px), alignment.residual
     if residual is not None and len(residual.measured_px):
         square = square + _windows_px2(residual, points_px)
+    if alignment.mapping.parallax is not None:
+        square = square + alignment.mapping.parallax.variance_px2(points_px)
     return np.asarray(np.sqrt(square))
 
 

@@ -9,9 +9,9 @@ import pytest
 import agalign
 from agalign.capture import from_windows as module
 from agalign.capture.band_pair import BandPair
+from agalign.capture.decision import verified
 from agalign.capture.from_windows import from_windows, without_extrapolated
 from agalign.capture.seeding import find_seed
-from agalign.capture.verification import verified
 from agalign.config import SeedSettings, Settings
 from agalign.flight.rig import Rig
 from agalign.pixels.masks import raster_of

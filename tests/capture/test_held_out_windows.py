@@ -9,9 +9,9 @@ import pytest
 
 from agalign.capture.align_bands import _candidates
 from agalign.capture.band_pair import BandPair
+from agalign.capture.decision import verified
 from agalign.capture.from_windows import from_windows
 from agalign.capture.reference import Reference
-from agalign.capture.verification import verified
 from agalign.config import Settings
 from agalign.pixels.masks import raster_of
 from agalign.values import geometry

@@ -8,7 +8,7 @@ from numpy.typing import ArrayLike
 
 from agalign.capture.band_pair import BandPair
 from agalign.capture.map_estimate import expected_corners, map_estimate
-from agalign.capture.verification import WarpedPair
+from agalign.capture.warped_pair import WarpedPair
 from agalign.flight.learn_rig import learn_rig
 from agalign.flight.rig import Observation, Rig
 from agalign.values import geometry

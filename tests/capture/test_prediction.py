@@ -26,6 +26,8 @@ from agalign.products.fill_sidecar import capture_status
 from agalign.synthetic import make_flight
 from agalign.values import geometry
 from agalign.values.alignment import Alignment, Prediction
+from agalign.values.issues import Issue
+from agalign.verify.checks import CLOSE_WINDOWS
 
 pytestmark = [pytest.mark.slow, pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")]
 Run = tuple[Path, dict[str, CaptureReport]]
@@ -196,7 +198,8 @@ def test_a_more_accurate_prediction_by_windows_is_kept(
     nir = result["NIR"]
     matrix = geometry.compose(geometry.translation(away_px, 0), nir.fixed_to_moving)
     mapping = replace(nir.mapping, fixed_to_moving=matrix)
-    of_windows = replace(nir, status="predicted", mapping=mapping, prediction=Prediction(matrix, "windows", std_px))
+    prediction, issues = Prediction(matrix, "windows", std_px), (Issue(CLOSE_WINDOWS, 0.8, 0.9, "1 px"),)
+    of_windows = replace(nir, status="predicted", mapping=mapping, issues=issues, prediction=prediction)
     assert model.rig is not None
     checked = with_predictions(pairs, {**result, "NIR": of_windows}, model.rig, capture)["NIR"]
     assert (checked.status, checked.prediction.source) == ("predicted", source)

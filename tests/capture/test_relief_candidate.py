@@ -13,6 +13,7 @@ from synthetic_flights.relief import make_scene
 from agalign.capture import align_bands
 from agalign.capture.align_bands import verify_together
 from agalign.capture.band_pair import BandPair
+from agalign.capture.decision import at_seed
 from agalign.capture.prediction import with_predictions
 from agalign.capture.reference import Reference
 from agalign.capture.relief_candidate import (
@@ -25,7 +26,7 @@ from agalign.capture.relief_candidate import (
     _is_chosen,
     aligned_by_relief,
 )
-from agalign.capture.verification import WarpedPair, at_seed
+from agalign.capture.warped_pair import WarpedPair
 from agalign.config import JointSettings, ReliefSettings, Settings
 from agalign.flight.rig import Rig
 from agalign.relief.range import inverse_range

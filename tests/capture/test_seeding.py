@@ -9,7 +9,7 @@ from agalign.capture import seeding
 from agalign.capture.band_pair import BandPair, Candidates
 from agalign.capture.seeding import best_seed, find_rotated, find_seed
 from agalign.capture.tag_seeds import geo_seed
-from agalign.capture.verification import WarpedPair
+from agalign.capture.warped_pair import WarpedPair
 from agalign.config import SeedSettings
 from agalign.errors import GeometryError
 from agalign.pixels.landmarks import LANDMARK_INPUTS, landmarks, matched_homography

@@ -3,15 +3,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from agalign.capture import verification
+from agalign.capture import warped_pair
 from agalign.capture.band_pair import BandPair
-from agalign.capture.verification import WarpedPair, verified, with_metrics
+from agalign.capture.decision import at_seed, decided, verified, without_result
+from agalign.capture.warped_pair import WarpedPair, with_metrics
 from agalign.values import geometry
-from agalign.values.alignment import PairScales, Seed
+from agalign.values.alignment import PairScales, Prediction, Seed
 from agalign.values.choices import ReliefUse
 from agalign.values.displacement import DisplacementField
 from agalign.values.image import Raster
-from agalign.values.issues import FEW_KEYPOINTS, Issue
+from agalign.values.issues import FEW_KEYPOINTS, RETRIEVAL, SEED_DOES_NOT_FIT, Issue
 from agalign.values.pixel_units import PixelScale
 from agalign.verify.displacement_field import DisplacementResult
 
@@ -27,6 +28,40 @@ GOOD = joint_result(TRUTH)
 @pytest.fixture(scope="module")
 def pair() -> BandPair:
     return pair_of(*two_views(TRUTH), RIG)
+
+
+@pytest.mark.parametrize(
+    ("issues", "is_predicted", "is_seed_usable", "median_px", "status"),
+    [
+        ((), True, True, 0.1, "aligned"),
+        ((Issue(RETRIEVAL, 0.1, 0.2),), True, True, 0.1, "predicted"),
+        ((Issue(RETRIEVAL, 0.1, 0.2),), False, True, 0.1, "seed_only"),
+        ((Issue(RETRIEVAL, 0.1, 0.2),), False, False, 0.1, "failed"),
+        ((Issue(RETRIEVAL, 0.1, 0.2),), False, True, 20.0, "failed"),
+    ],
+)
+def test_the_status_is_that_of_the_first_row_that_applies(
+    pair: BandPair, issues: tuple[Issue, ...], is_predicted: bool, is_seed_usable: bool, median_px: float, status: str
+) -> None:
+    residual = replace(residual_of(np.zeros((50, 2)), np.zeros((50, 2))), median_px=median_px)
+    prediction = Prediction(TRUTH, "windows", 0.1) if is_predicted else None
+    alignment = replace(without_result(pair, SEED, *issues), residual=residual, prediction=prediction)
+    result = decided(alignment, is_seed_usable=is_seed_usable)
+    assert result.status == status
+    assert (result.issues[-1:] == (Issue(SEED_DOES_NOT_FIT),)) == (is_seed_usable and status == "failed")
+    if status == "failed" and is_seed_usable:
+        assert "rig seed is used unchanged, but the seed does not fit either" in result.reason
+
+
+def test_a_seed_that_contradicts_the_tags_is_replaced_by_their_mapping(pair: BandPair) -> None:
+    """An image of another capture fits at its own position, far from that of its band."""
+    far = replace(SEED, kind="match", fixed_to_moving=geometry.translation(150, 0))
+    tagged = replace(pair, candidate_std_px={"rig": 5.0})
+    result = at_seed(tagged, far, (Issue(RETRIEVAL),))
+    assert (result.status, result.seed.kind) == ("seed_only", "rig")
+    np.testing.assert_array_equal(result.fixed_to_moving, RIG["rig"])
+    assert at_seed(pair, far, (Issue(RETRIEVAL),)).seed == far
+    assert at_seed(tagged, far, (Issue(RETRIEVAL),), seed_only=True).seed == far
 
 
 def test_a_result_that_passes_is_aligned_and_measured(pair: BandPair) -> None:
@@ -105,7 +140,7 @@ def test_verification_is_repeated_with_a_displacement_field(pair: BandPair, monk
     assert (results.status, results.geometry) == ("aligned", "homography")
     assert results.candidates == {"homography": 1.0, "field": 0.5}
     assert results.residual.median_px < 0.1
-    monkeypatch.setattr(verification, "issues_of", lambda *_: ())
+    monkeypatch.setattr(warped_pair, "issues_of", lambda *_: ())
     assert verified(pair, SEED, GOOD, "always").geometry == "field"
 
 

@@ -1,0 +1,159 @@
+"""The status of a band: the only place that gives one.
+
+| status    | the first row that applies                                                                  |
+|-----------|---------------------------------------------------------------------------------------------|
+| aligned   | no check found an issue                                                                     |
+| predicted | the mapping is a prediction with a standard error: by windows, the capture's relief, the rig |
+| seed_only | the mapping is that of a seed that is confirmed by images or tags and fits the windows       |
+| failed    | otherwise                                                                                   |
+
+A seed that contradicts the tags or the flight is replaced by their mapping: an image of another capture, for example,
+is confirmed at its own position, far from that of its band.
+"""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from agalign.capture.band_pair import BandPair
+from agalign.capture.warped_pair import WarpedPair
+from agalign.pixels.band_resampling import channel_mean
+from agalign.values.alignment import Alignment, JointResult, Seed
+from agalign.values.choices import Geometry, PairStatus, ReliefUse, SeedKind
+from agalign.values.geometry import Matrix
+from agalign.values.issues import SEED_DOES_NOT_FIT, Issue, IssueKind
+from agalign.values.pixel_units import FixedImagePx, FixedPx
+from agalign.verify.checks import CLOSE_WINDOWS, CLUSTER, RESIDUAL_PX, is_unchanged, seed_fits
+from agalign.verify.displacement_field import DisplacementResult
+
+_PARALLAX_ISSUES = frozenset({CLOSE_WINDOWS, CLUSTER, RESIDUAL_PX})
+"""Issues caused by parallax, which a displacement field may remove."""
+
+
+def decided(alignment: Alignment[FixedPx], *, is_seed_usable: bool = False) -> Alignment[FixedPx]:
+    """Return the alignment with its status.
+
+    A `prediction` together with issues is one of the mapping. `is_seed_usable` is for the mapping of a seed.
+    """
+    status: PairStatus = "failed"
+    issues: tuple[Issue, ...] = alignment.issues
+    if not issues:
+        status = "aligned"
+    elif alignment.prediction is not None:
+        status = "predicted"
+    elif is_seed_usable and alignment.residual is not None and seed_fits(alignment.residual):
+        status = "seed_only"
+    if is_seed_usable and status == "failed":
+        issues += (Issue(SEED_DOES_NOT_FIT),)
+    return replace(alignment, status=status, issues=issues)
+
+
+def without_result(pair: BandPair, seed: Seed, *issues: Issue) -> Alignment[FixedImagePx]:
+    """Return a failed alignment with the mapping of a seed."""
+    return decided(Alignment(pair.mapping(seed.fixed_to_moving), pair.fixed.size_px, "failed", issues, seed))
+
+
+def at_seed(pair: BandPair, seed: Seed, issues: Sequence[Issue], *, seed_only: bool = False) -> Alignment[FixedImagePx]:
+    """Return an alignment with the mapping of the seed, which is usable if it is trusted or with `seed_only`."""
+    expected = min(
+        ((std_px, kind) for kind, std_px in pair.candidate_std_px.items() if kind in pair.candidates), default=None
+    )
+    if expected is not None and not seed_only and not pair.is_expected(seed.fixed_to_moving):
+        seed = Seed(expected[1], pair.candidates[expected[1]], 0.0, trusted=True)
+    result = without_result(pair, seed, *issues)
+    result = replace(result, residual=WarpedPair.of(pair, result.mapping).residual)
+    return decided(result, is_seed_usable=seed.trusted or seed_only)
+
+
+def predicted_by_windows(
+    alignment: Alignment[FixedImagePx], pair: BandPair, reason: IssueKind | None = None
+) -> Alignment[FixedImagePx]:
+    """Return as `predicted` an alignment that its windows do not confirm, or another geometry than that of its capture.
+
+    The standard error is the RMS of the shifts of these windows.
+    """
+    assert alignment.residual is not None
+    lengths = np.linalg.norm(alignment.residual.shifts_px, axis=1)
+    std_px = FixedImagePx(np.sqrt(np.nanmean(lengths**2)))
+    issues = alignment.issues if reason is None else (Issue(reason), *alignment.issues)
+    prediction = pair.prediction_by_windows(alignment.mapping, std_px)
+    return decided(replace(alignment, issues=issues, prediction=prediction))
+
+
+def verified(
+    pair: BandPair,
+    seed: Seed,
+    result: JointResult[FixedImagePx] | Issue,
+    use: ReliefUse,
+    warped_pair: WarpedPair | None = None,
+    by_halves: tuple[Matrix, Matrix] | None = None,
+) -> Alignment[FixedImagePx]:
+    """Verify a result; return its alignment with status, px of the images. With issues it has the mapping of the seed.
+
+    `use` is "never" for no displacement field. `warped_pair` is the pair with a mapping close to the result's, if
+    available; it avoids measuring again. `by_halves` are homographies from half of the windows (`cross_validated`).
+    """
+    if isinstance(result, Issue):
+        return at_seed(pair, seed, (result,))
+    joint = _unchanged_if_aligned(result, pair)
+    mapping = pair.mapping(joint.fixed_to_moving)
+    warped_pair = WarpedPair.of(pair, mapping) if warped_pair is None else warped_pair.with_mapping(mapping)
+    if by_halves is not None and joint is result:
+        warped_pair = warped_pair.cross_validated(by_halves)
+    warped_pair, issues, displacement = _verified(warped_pair, joint, use)
+    candidates: dict[Geometry, FixedImagePx] = {}
+    if displacement is not None:
+        candidates = {"homography": displacement.before_p95_px, "field": displacement.after_p95_px}
+    if issues and (displacement is None or displacement.field is None):
+        return replace(at_seed(pair, seed, issues), joint=joint, candidates=candidates)
+    size_px, residual = pair.fixed.size_px, warped_pair.residual
+    alignment = Alignment(warped_pair.mapping, size_px, "failed", issues, seed, joint, residual, candidates=candidates)
+    return predicted_by_windows(alignment, pair) if issues else decided(alignment)
+
+
+def _verified(
+    plane: WarpedPair, joint: JointResult[FixedImagePx], use: ReliefUse
+) -> tuple[WarpedPair, tuple[Issue, ...], DisplacementResult | None]:
+    """Return the pair, with a displacement field if one is accepted, its issues, and the result of the field fit.
+
+    With a field, the residual is that of held-out windows. The field is not accepted with issues that it cannot remove,
+    nor with any if the pair has none without it.
+    """
+    pair, issues = plane.pair, plane.issues(joint)
+    if not _needs_field(use, issues, has_rig=pair.has_rig):
+        return plane, issues, None
+    displacement = pair.reference.displacement_field.refine(channel_mean(pair.moving_image), plane.mapping)
+    if displacement.field is not None:
+        displaced = WarpedPair.of(pair, replace(plane.mapping, field=displacement.field), plane.windows)
+        held_out = displaced if displacement.held_out is None else replace(displaced, residual=displacement.held_out)
+        # All checks run again, those of windows on all windows and on the held-out ones.
+        remaining = held_out.issues(joint)
+        by_parallax = all(issue.kind in _PARALLAX_ISSUES for issue in remaining)
+        if not displaced.issues(joint) and by_parallax and (issues or not remaining):
+            return held_out, remaining, displacement
+    return plane, issues, replace(displacement, field=None)
+
+
+def _needs_field(use: ReliefUse, issues: tuple[Issue, ...], *, has_rig: bool) -> bool:
+    """Return True if a displacement field is fitted for a result with these issues.
+
+    With `auto`, it is fitted if all issues may be caused by parallax, and without issues if no rig contains the
+    residual lens distortion.
+    """
+    only_parallax = all(issue.kind in _PARALLAX_ISSUES for issue in issues)
+    return only_parallax and (use == "always" or (use == "auto" and (bool(issues) or not has_rig)))
+
+
+def _unchanged_if_aligned(joint: JointResult[FixedImagePx], pair: BandPair) -> JointResult[FixedImagePx]:
+    """Replace the mapping by the one given by the files if it does not differ significantly.
+
+    Input that is aligned already is returned unchanged instead of resampled by a small shift.
+    """
+    kinds: tuple[SeedKind, ...] = ("geo", "identity")
+    for given in (pair.candidates[kind] for kind in kinds if kind in pair.candidates):
+        if pair.mapping(given).is_curved:
+            continue  # with lens distortion the files are not aligned
+        if is_unchanged(joint, given, pair.fixed.size_px, max(pair.scales.fixed)):
+            return replace(joint, fixed_to_moving=given)
+    return joint

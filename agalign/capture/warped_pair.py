@@ -1,0 +1,119 @@
+"""A band pair on one grid: the residual of its windows and the issues of an alignment."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from agalign.capture.band_pair import BandPair
+from agalign.pixels.band_resampling import shrink
+from agalign.pixels.structure import Field, structure_field, windowed_spectra
+from agalign.values import geometry
+from agalign.values.alignment import Alignment, JointResult, Residual
+from agalign.values.geometry import Matrix
+from agalign.values.image import Raster
+from agalign.values.issues import Issue
+from agalign.values.mapping import PixelMapping
+from agalign.values.pixel_units import FixedImagePx, PixelScale
+from agalign.verify.checks import Evidence, issues_of
+from agalign.verify.extrapolation import points_in_frame, unobserved_quarters
+from agalign.verify.residuals import FixedWindows, residual_under
+
+
+@dataclass(frozen=True)
+class WarpedPair:
+    """A pair with the warped moving image and the residual of its windows."""
+
+    pair: BandPair
+    mapping: PixelMapping
+    warped: Raster
+    """The moving image, one channel, on the grid of the reference."""
+    windows: FixedWindows
+    residual: Residual[FixedImagePx]
+    """Of these windows."""
+
+    @classmethod
+    def of(cls, pair: BandPair, mapping: PixelMapping, windows: FixedWindows | None = None) -> "WarpedPair":
+        """Warp the moving image and measure the residual of `windows`.
+
+        By default these are those of the pair, or small ones if these cover more quarters of the overlap. A fit and its
+        verification must use the same windows: those of two grids share pixels, whatever their colours.
+        """
+        warped = pair.warped_moving(mapping)
+        if windows is not None:
+            return cls(pair, mapping, warped, windows, windows.residuals(warped))
+        usual, size_px = cls(pair, mapping, warped, pair.windows, pair.windows.residuals(warped)), pair.fixed.size_px
+        in_frame_px = points_in_frame(mapping, size_px, pair.moving_image.size_px)
+        if not unobserved_quarters(usual.residual.centres_px, size_px, in_frame_px):
+            return usual
+        small = pair.reference.small_windows
+        smaller = replace(usual, windows=small, residual=small.residuals(warped))
+        counts = [len(unobserved_quarters(p.residual.measured_px, size_px, in_frame_px)) for p in (usual, smaller)]
+        return smaller if counts[1] < counts[0] else usual
+
+    def with_mapping(self, mapping: PixelMapping) -> "WarpedPair":
+        """Return the pair with another mapping; the residual is that of the same windows.
+
+        It is converted if the mappings are nearly equal, else measured.
+        """
+        if mapping.field is self.mapping.field:
+            corners = geometry.corners(*self.pair.fixed.size_px)
+            difference_px = float(np.linalg.norm(mapping(corners) - self.mapping(corners), axis=1).max())
+            # The error of the conversion is then about 0.01 px, because interpolation changes shifts by 0.1 to 0.25 of
+            # their distance from whole pixels.
+            max_converted_px = 0.15
+            if difference_px <= max_converted_px:
+                return replace(self, mapping=mapping, residual=residual_under(self.residual, self.mapping, mapping))
+        return WarpedPair.of(self.pair, mapping, self.windows)
+
+    def is_better_than(self, other: "WarpedPair") -> bool:
+        """Return True if the median shift, divided by the coverage, is smaller in the same windows."""
+        compared = other if other.windows is self.windows else WarpedPair.of(other.pair, other.mapping, self.windows)
+        own, others = (r.median_px / max(r.coverage, 1e-6) for r in (self.residual, compared.residual))
+        return own < others
+
+    def cross_validated(self, by_halves: tuple[Matrix, Matrix]) -> "WarpedPair":
+        """Return the pair with the residual of each window under a mapping that was estimated without it.
+
+        `by_halves` are homographies estimated from the black and from the white windows of a chessboard.
+        """
+        by_black_px, by_white_px = (
+            residual_under(self.residual, self.mapping, replace(self.mapping, fixed_to_moving=matrix)).shifts_px
+            for matrix in by_halves
+        )
+        shifts_px = np.where(self.residual.is_black[:, None], by_white_px, by_black_px)
+        return replace(self, residual=self.residual.with_shifts(shifts_px))
+
+    @property
+    def reduced_scale(self) -> PixelScale:
+        """(x, y) of the reduced images relative to the fixed image."""
+        return self.pair.reference.seed_scale
+
+    def reduced_spectra(self) -> tuple[Field, Field]:
+        """Windowed spectra (height, width) of the structures of the reduced fixed and moving images."""
+        small = shrink(self.warped, self.pair.reference.seed_size_px)
+        return self.pair.reference.seed_spectrum, windowed_spectra(structure_field(small))
+
+    def is_expected(self, shift_px: tuple[float, float] = (0.0, 0.0)) -> bool:
+        """Return True if the mapping shifted by (x, y), px of the fixed image, agrees with a candidate of the pair."""
+        return self.pair.is_expected(self.mapping.fixed_to_moving, shift_px)
+
+    def issues(self, joint: JointResult[FixedImagePx]) -> tuple[Issue, ...]:
+        """Return the issues of the result with this mapping."""
+        pair = self.pair
+        size_px, pixel_px = pair.fixed.size_px, pair.file_pixel_size_px
+        return issues_of(Evidence(joint, self.residual, size_px, images=self, file_pixel_size_px=pixel_px))
+
+
+def with_metrics(
+    alignment: Alignment[FixedImagePx], pair: BandPair, *, with_ties: bool = False
+) -> Alignment[FixedImagePx]:
+    """Return the alignment with similarity metrics before (image borders overlaid) and after alignment.
+
+    `with_ties` also measures windows under the final mapping: small ones if parallax varies within large ones.
+    """
+    similarity = pair.reference.similarity
+    before = pair.warped_moving(PixelMapping(geometry.overlay(pair.fixed.size_px, pair.moving_image.size_px)))
+    after = pair.warped_moving(alignment.mapping)
+    windows = pair.windows if alignment.mapping.parallax is None else pair.reference.tie_windows
+    ties = windows.residuals(after) if with_ties else None
+    return replace(alignment, before=similarity.to(before), after=similarity.to(after), ties=ties)
