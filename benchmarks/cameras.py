@@ -5,12 +5,11 @@ python benchmarks/cameras.py [CAPTURES] [CAMERA ...]
 Cameras are rendered with half of their pixels along each side, but the Altum, with its small thermal band, with all.
 """
 
-import time
 from typing import Annotated
 
 import numpy as np
 import typer
-from common import Number, band_errors, flight_and_out, print_head, print_row, read_ties, run
+from common import Number, band_errors, flight_and_out, print_head, print_row, read_ties, run, timed
 from synthetic_flights.cameras import ALTUM, ALTUM_PT, MAVIC, MAVIC_3M, SENTERA_6X
 from synthetic_flights.troubles import make_two_headings
 
@@ -31,9 +30,8 @@ def main(captures: Number = 8, names: Annotated[list[str] | None, typer.Argument
         camera, size_px = CAMERAS[name]
         with flight_and_out() as (flight, out):
             truth = make_two_headings(flight, captures, size_px, camera=camera, line=captures // 2, lakes=False)
-            began = time.perf_counter()
-            agalign.align_folder(flight, out, options=agalign.DiscoverOptions(with_rgb=True))
-            seconds = time.perf_counter() - began
+            options = agalign.DiscoverOptions(with_rgb=True)
+            seconds, _ = timed(agalign.align_folder, flight, out, options=options)
             bands = band_errors(out, read_ties(truth))
         view = camera.bands[camera.reference].view
         for spec in camera.bands:

@@ -15,14 +15,13 @@ from typing import Annotated, Any
 
 import numpy as np
 import typer
+from bands.score import WRONG_PX, table
 from numpy.typing import NDArray
 from scipy.interpolate import CloughTocher2DInterpolator
 
 import agalign
 from agalign.products.sidecar_file import find_sidecars
 
-WRONG_PX = 1.0
-"""A band that is called aligned with a larger error is wrong."""
 Ties = dict[str, dict[str, Any]]
 """Entries of ties.json or truth.json by the name of the moving file, each with `ties` (n, 4), raw px."""
 Number = Annotated[int, typer.Argument()]
@@ -42,18 +41,24 @@ def run(main: Callable[..., None]) -> None:
     app()
 
 
+def timed(function: Callable[..., Any], *arguments: Any, **options: Any) -> tuple[float, Any]:
+    """Call a function; return (seconds, result)."""
+    began = time.perf_counter()
+    result = function(*arguments, **options)
+    return time.perf_counter() - began, result
+
+
 # ---- tables
 
 
 def print_row(*cells: object) -> None:
     """Print a row of a Markdown table."""
-    print("| " + " | ".join(map(str, cells)) + " |", flush=True)
+    print(table([cells]).partition("\n")[0], flush=True)
 
 
 def print_head(*cells: str) -> None:
     """Print the head of a Markdown table."""
-    print_row(*cells)
-    print("|---" * len(cells) + "|", flush=True)
+    print(table([cells]), flush=True)
 
 
 class Section:
@@ -63,10 +68,9 @@ class Section:
         self._marks = f"<!-- {name} -->", f"<!-- end of {name} -->"
         self._document, self._parts = document, list[str]()
 
-    def table(self, rows: Sequence[Sequence[str]]) -> None:
-        """Add rows of text, the first of them the head."""
-        head, *body = [[cell.replace("|", "\\|").replace("\n", " ") for cell in row] for row in rows]
-        self.say("\n".join("| " + " | ".join(line) + " |" for line in (head, ["---"] * len(head), *body)))
+    def table(self, rows: Sequence[Sequence[object]]) -> None:
+        """Add rows, the first of them the head."""
+        self.say(table(rows))
 
     def say(self, text: str) -> None:
         """Add a paragraph."""
@@ -116,9 +120,8 @@ def print_decisions(kinds: Sequence[str], pair_of: Callable[[str, np.random.Gene
     for number in numbers:
         kind = kinds[number % len(kinds)]
         fixed, moving, options, error_px = pair_of(kind, np.random.default_rng(number))
-        began = time.perf_counter()
-        result = agalign.align(fixed, moving, **options)
-        rows[kind].append((result.status, error_px(result.fixed_to_moving), time.perf_counter() - began))
+        seconds, result = timed(agalign.align, fixed, moving, **options)
+        rows[kind].append((result.status, error_px(result.fixed_to_moving), seconds))
         print("{:4d} {:28s} {:9s} {:7.2f} px {:5.1f} s".format(number, kind, *rows[kind][-1]), result.reason or "")
     statuses = "aligned", "seed_only", "failed"
     print_head("kind", "pairs", *statuses, "wrongly aligned", "worst error, px", "seconds")
@@ -126,8 +129,8 @@ def print_decisions(kinds: Sequence[str], pair_of: Callable[[str, np.random.Gene
         errors = [error for status, error, _ in some if status == "aligned"]
         wrong = sum(not error <= WRONG_PX for error in errors)
         counts = [sum(status == one for status, *_ in some) for one in statuses]
-        seconds = np.median([row[2] for row in some])
-        print_row(kind, len(some), *counts, wrong, f"{max(errors, default=np.nan):.2f}", f"{seconds:.1f}")
+        worst, median_s = max(errors, default=np.nan), np.median([row[2] for row in some])
+        print_row(kind, len(some), *counts, wrong, f"{worst:.2f}", f"{median_s:.1f}")
 
 
 # ---- runs of the command line
@@ -141,9 +144,7 @@ def command(flight: Path, out: Path, *options: str) -> list[str]:
 
 def align(flight: Path, out: Path, *options: str) -> float:
     """Align a folder, and return the seconds. Bands that are not aligned end the program with exit code 3."""
-    began = time.perf_counter()
-    subprocess.run(command(flight, out, *options), check=False)
-    return time.perf_counter() - began
+    return timed(subprocess.run, command(flight, out, *options), check=False)[0]
 
 
 @contextmanager

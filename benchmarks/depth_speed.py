@@ -18,7 +18,7 @@ import rasterio
 import typer
 from bands.images import in_other_light
 from common import command, flight_and_out, print_head, print_row, run
-from stages import events, read, runs, sift_seconds, timed
+from stages import events, read, run_alone, runs, sift_seconds
 
 from agalign.cameras.discover import discover
 from agalign.pixels.raster import without_warnings
@@ -55,7 +55,7 @@ def degraded_run(captures: list[Capture], name: str) -> tuple[float, str]:
             pixels = read(captures[1].moving[0]) if name == "stale" else in_other_light(read(band), name, rng)
             with without_warnings(), rasterio.open(flight / band.path.name, "r+") as dataset:
                 dataset.write(pixels, band.band_index)
-        _, log = timed(command(flight, out, "-j", "1", "--log-json"))
+        _, log = run_alone(command(flight, out, "-j", "1", "--log-json"))
     learning_s = sum(event["seconds"] for event in events(log, "learnt"))
     (capture,) = events(log, "capture")
     return learning_s + capture["seconds"], "{aligned} of {pairs}".format(**capture)

@@ -10,7 +10,6 @@ they show is more than 1 px off, or they show another scene.
 """
 
 import sys
-import time
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from itertools import product
@@ -20,7 +19,7 @@ from typing import Annotated
 import numpy as np
 import tifffile
 import typer
-from common import WRONG_PX, align, flight_and_out, print_head, print_row, run
+from common import WRONG_PX, align, flight_and_out, print_head, print_row, run, timed
 from peers import dis_flow
 from relief_score import Score, mapping_of, occlusion_scores, range_errors, read_sidecar, residuals
 from synthetic_flights.depth import Scene, Truth, write_capture
@@ -58,17 +57,15 @@ def program_scores(out: Path, truth: Truth, blank: Score) -> Iterator[Score]:
 def flow_scores(flight: Path, out: Path, truth: Truth, blank: Score) -> list[Score]:
     """Return the scores of the dense flow from the mappings of a run; a band without a mapping has none."""
     images = {p.name: tifffile.imread(p).astype(np.float32) for p in flight.rglob("*.tif")}
-    sidecar, scores = read_sidecar(out), []
+    sidecar, scores, total_s = read_sidecar(out), [], 0.0
     reference = images[sidecar.content["reference"]["file"]]
-    seconds = 0.0
     for band in sidecar.moving:
         start = mapping_of(sidecar, band)
-        began = time.perf_counter()
-        mapping = None if start is None else dis_flow(reference, images[band["file"]], start)
-        seconds += time.perf_counter() - began
+        seconds, mapping = (0.0, None) if start is None else timed(dis_flow, reference, images[band["file"]], start)
+        total_s += seconds
         values = residuals(mapping, truth.bands[band["band"]], sidecar.window)
         scores.append(replace(blank, band=band["band"], **values))
-    return [replace(score, seconds=seconds) for score in scores]
+    return [replace(score, seconds=total_s) for score in scores]
 
 
 def scores_of(scene: Scene, blank: Score, size_px: tuple[int, int], methods: Sequence[str]) -> Iterator[Score]:

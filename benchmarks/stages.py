@@ -12,7 +12,6 @@ import os
 import subprocess
 import sys
 import tempfile
-import time
 from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
@@ -21,7 +20,7 @@ from typing import Any
 
 import cv2
 import numpy as np
-from common import command, print_head, print_row, run
+from common import command, print_head, print_row, run, timed
 from peers import sift
 
 from agalign.cameras.discover import discover
@@ -39,19 +38,15 @@ def read(band: Band) -> np.ndarray:
 
 def sift_seconds(reference: Band, moving: Sequence[Band], features: int) -> float:
     """Return the seconds of SIFT + RANSAC on the reference with each other band at full size."""
-    fixed, images = read(reference), [read(band) for band in moving]
-    began = time.perf_counter()
-    for image in images:
-        sift(fixed, image, features)
-    return time.perf_counter() - began
+    fixed = read(reference)
+    return sum(timed(sift, fixed, read(band), features)[0] for band in moving)
 
 
-def timed(argv: list[str]) -> tuple[float, str]:
+def run_alone(argv: list[str]) -> tuple[float, str]:
     """Run a command on one core; return its time in seconds and its standard error."""
-    began = time.perf_counter()
-    environment = os.environ | {"OMP_NUM_THREADS": "1"}
-    done = subprocess.run(argv, check=False, env=environment, stderr=subprocess.PIPE, text=True)
-    return time.perf_counter() - began, done.stderr
+    options = {"env": os.environ | {"OMP_NUM_THREADS": "1"}, "stderr": subprocess.PIPE, "text": True}
+    seconds, done = timed(subprocess.run, argv, check=False, **options)
+    return seconds, done.stderr
 
 
 def events(log: str, name: str) -> list[dict[str, Any]]:
@@ -64,9 +59,9 @@ def runs(flight: Path) -> list[tuple[float, str]]:
     """Return (seconds, log) of a run on one core, and of one with the model that the first has learned, if any."""
     with tempfile.TemporaryDirectory() as folder:
         out, again = Path(folder) / "out", Path(folder) / "again"
-        first = timed(command(flight, out, "-j", "1", "--log-json"))
+        first = run_alone(command(flight, out, "-j", "1", "--log-json"))
         with_model = [option for path in (out / "models").glob("*") for option in ("--model", str(path))]
-        return [first, timed(command(flight, again, "-j", "1", "--log-json", *with_model[:2]))]
+        return [first, run_alone(command(flight, again, "-j", "1", "--log-json", *with_model[:2]))]
 
 
 def main(flight: Path) -> None:
@@ -76,7 +71,7 @@ def main(flight: Path) -> None:
     seconds: dict[str, list[float]] = {}
     for _ in range(ROUNDS):
         values = {"SIFT + RANSAC, a pair": sift_seconds(middle.reference, middle.moving[:1], 8000)}
-        values["imports of the libraries"] = timed([sys.executable, "-c", IMPORTS])[0]
+        values["imports of the libraries"] = run_alone([sys.executable, "-c", IMPORTS])[0]
         (whole_s, _), (again_s, log) = runs(flight)
         by_capture: dict[str, Counter[str]] = {}
         for event in events(log, "stage"):

@@ -9,15 +9,14 @@ the moving file. Prints a table, and draws a heat map.
 """
 
 import tempfile
-import time
 from collections.abc import Callable, Iterator
 from itertools import product
 from pathlib import Path
 
 import cv2
 import numpy as np
-from bands.images import straightened
-from common import WRONG_PX, heat_map, print_head, print_row, pyplot, read_ties, run
+from bands import images
+from common import WRONG_PX, heat_map, print_head, print_row, pyplot, read_ties, run, timed
 from numpy.typing import NDArray
 from peers import elastix, sift
 
@@ -48,18 +47,13 @@ def moved(raster: Raster, shift: float, degrees: float, scale: float) -> tuple[R
     about[:2, 2] = (np.array(size) - 1) / 2 - linear @ ((np.array([width, height]) - 1) / 2)
     frame = cv2.warpAffine(raster.valid.astype(np.uint8) * 255, within[:2], (width, height))
     whole = cv2.warpAffine(frame, about[:2], size) == 255
-    source = cv2.GaussianBlur(raster.pixels, (0, 0), 0.5 * np.sqrt(1 / scale**2 - 1)) if scale < 1 else raster.pixels
     matrix = about @ within
-    return Raster(cv2.warpAffine(source, matrix[:2], size, flags=cv2.INTER_CUBIC), whole), matrix
+    return Raster(images.moved(raster.pixels, matrix, size), whole), matrix
 
 
 def ours(fixed: Raster, moving: Raster) -> tuple[Matrix | None, bool]:
     result = agalign.align(fixed.pixels, moving.pixels, fixed_valid=fixed.valid, moving_valid=moving.valid)
     return result.fixed_to_moving, result.status == "aligned"
-
-
-def by_sift(fixed: Raster, moving: Raster) -> tuple[Matrix | None, bool]:
-    return sift(fixed.pixels, moving.pixels), True
 
 
 def by_elastix(fixed: Raster, moving: Raster) -> tuple[Matrix | None, bool]:
@@ -70,7 +64,11 @@ def by_elastix(fixed: Raster, moving: Raster) -> tuple[Matrix | None, bool]:
     return None if result is None else geometry.compose(overlay, result), True
 
 
-METHODS: dict[str, Aligner] = {"agalign": ours, "SIFT + RANSAC": by_sift, "elastix affine": by_elastix}
+METHODS: dict[str, Aligner] = {
+    "agalign": ours,
+    "SIFT + RANSAC": lambda fixed, moving: (sift(fixed.pixels, moving.pixels), True),
+    "elastix affine": by_elastix,
+}
 
 
 def error_px(ties: NDArray[np.float64], to_moved: Matrix, result: Matrix | None) -> float:
@@ -90,7 +88,7 @@ def chosen(folder: Path, count: int) -> Iterator[tuple[Raster, Raster, NDArray[n
     captures = discover(folder).captures
     pairs = [(c.reference, band) for c in captures for band in c.moving if band.path.name in truth]
     for index in np.unique(np.linspace(0, len(pairs) - 1, count).round().astype(int)):
-        fixed, moving = (straightened(read_for_alignment(band, 4096)) for band in pairs[index])
+        fixed, moving = (images.straightened(read_for_alignment(band, 4096)) for band in pairs[index])
         raw_px = np.hsplit(np.array(truth[pairs[index][1].path.name]["ties"]), 2)
         ties = [lens.undistort(band.lens, px) for band, px in zip(pairs[index], raw_px, strict=True)]
         yield fixed, moving, np.hstack(ties)
@@ -107,11 +105,9 @@ def main(data: list[Path], pairs: int = 3, methods: str = ";".join(METHODS), plo
         rows = []
         for fixed, moving, ties in tried:
             image, to_moved = moved(moving, *start)
-            began = time.perf_counter()
-            result, is_sure = METHODS[name](fixed, image)
-            rows.append((error_px(ties, to_moved, result), is_sure, time.perf_counter() - began))
-        off, seconds = (np.array([row[k] for row in rows]) for k in (0, 2))
-        sure = np.array([row[1] for row in rows])
+            seconds, (result, is_sure) = timed(METHODS[name], fixed, image)
+            rows.append((error_px(ties, to_moved, result), is_sure, seconds))
+        off, sure, seconds = map(np.array, zip(*rows, strict=True))
         hit = off <= FOUND_PX
         of_method[start] = float(hit.mean())
         worst = f"{off[sure].max():.2f}" if sure.any() else "-"

@@ -12,10 +12,14 @@ import json
 import re
 import sys
 import typing
-from collections.abc import Callable, Container, Iterable
+from collections.abc import Callable, Container
 from operator import attrgetter, not_
 from pathlib import Path
 from typing import Any
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "benchmarks"))
+
+from bands.score import table
 
 import agalign
 from agalign.cli.command import FieldOption, field_options
@@ -48,7 +52,7 @@ def options(owner: str) -> str:
             python = f"`{name}`{opposite}"
             value = with_default(value, option, parameter.default, attrgetter(name)(defaults))
         rows.append((f"`--{parameter.name.replace('_', '-')}`", python, value, effect(info.help)))
-    return table(rows)
+    return table(rows) + "\n"
 
 
 def with_default(values: str, option: FieldOption, given: Any, in_python: Any) -> str:
@@ -130,7 +134,7 @@ def reasons() -> str:
         grouped.setdefault(kind.remedy, []).append(f"`{text}`")
     rows = [("reason", "usual cause: remedy")]
     rows += [("; ".join(texts), f"{remedy.cause}: {remedy.advice}") for remedy, texts in grouped.items()]
-    return table(rows)
+    return table(rows) + "\n"
 
 
 def indices() -> str:
@@ -139,13 +143,7 @@ def indices() -> str:
     for index in INDICES.values():
         unit = "any unit" if index.any_unit else "reflectance"
         rows.append((index.name, f"`{index.formula}`", unit, index.source))
-    return table(rows)
-
-
-def table(rows: Iterable[tuple[str, ...]]) -> str:
-    """Return a Markdown table; the first row is the header."""
-    header, *body = ["| " + " | ".join(cell.replace("|", "\\|") for cell in row) + " |" for row in rows]
-    return "\n".join([header, "|---" * (header.count(" | ") + 1) + "|", *body]) + "\n"
+    return table(rows) + "\n"
 
 
 TABLES: dict[str, dict[str, Callable[[], str]]] = {

@@ -89,14 +89,14 @@ def in_other_light(plane: Image, variant: str, rng: np.random.Generator) -> Imag
     return _as(np.where(lit, LIGHT[variant](light, rng) * np.float32(full), np.float32(0)), plane)
 
 
-def moved(image: Image, matrix: NDArray[np.float64]) -> Image:
-    """Return the image transformed by an affine mapping in its frame, black outside."""
+def moved(image: Image, matrix: NDArray[np.float64], size_px: tuple[int, int] | None = None) -> Image:
+    """Return the image transformed by an affine mapping, black outside, in its frame or that of another size."""
     if np.array_equal(matrix, np.eye(3)):
         return image
     shrink = np.sqrt(abs(np.linalg.det(matrix[:2, :2])))
     # Blur against aliasing.
     source = cv2.GaussianBlur(image, (0, 0), 0.5 * np.sqrt(1 / shrink**2 - 1)) if shrink < 0.999 else image
-    return np.asarray(cv2.warpAffine(source, matrix[:2], image.shape[1::-1], flags=cv2.INTER_CUBIC))
+    return np.asarray(cv2.warpAffine(source, matrix[:2], size_px or image.shape[1::-1], flags=cv2.INTER_CUBIC))
 
 
 def _as(values: NDArray[Any], like: Image) -> Image:

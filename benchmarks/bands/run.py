@@ -13,7 +13,6 @@ import json
 import shutil
 import sys
 import tempfile
-import time
 from collections.abc import Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
@@ -27,7 +26,7 @@ import typer
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # run as a file, its package is not found
 
-from common import align, run, watched
+from common import align, run, timed, watched
 from peers import METHODS, Align, UnavailableError, grey_raster, method_named
 
 from agalign.cameras.discover import discover
@@ -104,9 +103,7 @@ def lens_corrected(method: Align, fixed: tuple[Image, Band], moving: tuple[Image
     The correction is not included in its seconds.
     """
     images = [straightened(replace(grey_raster(image), lens=band.lens)) for image, band in (fixed, moving)]
-    began = time.perf_counter()
-    matrix = method(images[0].pixels, images[1].pixels)
-    seconds = time.perf_counter() - began
+    seconds, matrix = timed(method, images[0].pixels, images[1].pixels)
     if matrix is None:
         return {"seconds": seconds}
     here = geometry.lattice(*images[0].size_px, 33, 25)
@@ -119,16 +116,14 @@ def asked(method: Align, pair: Pair, variant: str, paths: Paths, bands: Mapping[
     fixed, moving = read(paths[pair.reference]), read(paths[pair.file])
     if variant != LENS_CORRECTED:
         moving = degraded(moving, pair, variant)
-    began = time.perf_counter()
     try:
         if variant == LENS_CORRECTED:
             return lens_corrected(method, (fixed, bands[pair.reference]), (moving, bands[pair.file]))
-        matrix = method(fixed, moving)
+        seconds, matrix = timed(method, fixed, moving)
     except Exception as error:  # any exception of a method
         print(f"{pair.key}, {variant}: refused ({type(error).__name__}: {error})", file=sys.stderr)
-        matrix = None
-    result = {} if matrix is None else {"homography": np.asarray(matrix, float).tolist()}
-    return {**result, "seconds": time.perf_counter() - began}
+        return {}
+    return {"seconds": seconds} | ({} if matrix is None else {"homography": np.asarray(matrix, float).tolist()})
 
 
 # ---- methods on all sets

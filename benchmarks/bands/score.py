@@ -291,7 +291,8 @@ def write_csv(scores: Sequence[Score], path: Path) -> None:
 
 def table(rows: Sequence[Sequence[object]]) -> str:
     """Return a Markdown table; the first row is the head."""
-    head, *body = ["| " + " | ".join(map(str, row)) + " |" for row in rows]
+    cells = [[str(cell).replace("|", "\\|").replace("\n", " ") for cell in row] for row in rows]
+    head, *body = [f"| {' | '.join(row)} |" for row in cells]
     return "\n".join([head, "|---" * len(rows[0]) + "|", *body])
 
 

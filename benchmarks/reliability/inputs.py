@@ -36,7 +36,7 @@ from numpy.typing import NDArray
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from common import Section, command, ended, run
+from common import Section, command, ended, run, timed
 from kills import HUNG_S, contents
 from stages import read
 from synthetic_flights.aligned import make_aligned
@@ -218,6 +218,12 @@ def derived(capture: Capture, folder: Path, rng: np.random.Generator) -> Capture
     return replace(capture, folder=Path("Big Sky Farm"), bands=tuple(bands))
 
 
+def exclusion(capture: Capture) -> str:
+    sky, others = sky_captures([capture])
+    panels = any(c.is_of_a_panel for c in with_panels(others, without_code=True))
+    return "sky" if sky else "panel" if panels else ""
+
+
 def attack_exclusions(count: int, rng: np.random.Generator, folder: Path, data: Path) -> Iterator[Attack]:
     """Derive captures from those of the data that are neither of the sky nor of a panel."""
     result = Attack("ordinary captures", count)
@@ -225,12 +231,10 @@ def attack_exclusions(count: int, rng: np.random.Generator, folder: Path, data: 
     ordinary = [c for c in with_panels(sky_captures(found)[1]) if c.panel is None]
     for number in range(count):
         capture = derived(ordinary[number % len(ordinary)], folder, rng)
-        began = time.perf_counter()
-        sky, others = sky_captures([capture])
-        panels = [c for c in with_panels(others, without_code=True) if c.is_of_a_panel]
-        result.worst_s = max(result.worst_s, time.perf_counter() - began)
-        if sky or panels:
-            result.count("lost", f"{capture.name} as {'sky' if sky else 'panel'}")
+        seconds, excluded = timed(exclusion, capture)
+        result.worst_s = max(result.worst_s, seconds)
+        if excluded:
+            result.count("lost", f"{capture.name} as {excluded}")
     yield result
 
 
@@ -259,11 +263,8 @@ def relief(image: Raster) -> object:
 
 def attack_searches(rng: np.random.Generator) -> Iterator[Attack]:
     for name, function in (("search for a panel", lambda i: find_panel(i, without_code=True)), ("relief", relief)):
-        images, seconds = hostile((1600, 1200), rng), {}
-        for kind, pixels in images.items():
-            began = time.perf_counter()
-            function(Raster(np.asarray(pixels, np.float32), np.isfinite(pixels), None))
-            seconds[kind] = time.perf_counter() - began
+        images = {k: np.asarray(pixels, np.float32) for k, pixels in hostile((1600, 1200), rng).items()}
+        seconds = {k: timed(function, Raster(i, np.isfinite(i), None))[0] for k, i in images.items()}
         result, normal_s = Attack(name, len(images), worst_s=max(seconds.values())), seconds["texture 1"]
         for kind, s in seconds.items():
             if s > 3 * normal_s:
@@ -367,7 +368,7 @@ def main(
             attacks += [attack_exclusions(captures, rng, folder, data), attack_packets(packets, folder, data)]
         rows = [("attack", "tried", "tracebacks", "silent losses", "hangs", "worst, s")]
         for row in chain(*attacks):
-            rows.append((row.name, *map(str, (row.tried, row.tracebacks, row.lost, row.hangs)), f"{row.worst_s:.2f}"))
+            rows.append((row.name, row.tried, row.tracebacks, row.lost, row.hangs, f"{row.worst_s:.2f}"))
             print(rows[-1], flush=True)
     Section("inputs", markdown).table(rows)
 

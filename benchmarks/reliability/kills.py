@@ -30,7 +30,7 @@ import rasterio
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from common import Section, command, ended, run
+from common import Section, command, ended, run, timed
 from synthetic_flights.aligned import make_aligned
 
 from agalign.products.sidecar_file import find_sidecars
@@ -169,10 +169,10 @@ def main(
             start = partial(shutil.copytree, aligned, out) if of_indices else (lambda: None)
             shutil.rmtree(out, ignore_errors=True)
             start()
-            began = time.monotonic()
-            if subprocess.run(argv, check=False).returncode != 0:
+            seconds, done = timed(subprocess.run, argv, check=False)
+            if done.returncode != 0:
                 raise SystemExit(f"{mode}: the run without signals failed")
-            seconds, expected = time.monotonic() - began, snapshot(out)
+            expected = snapshot(out)
             targets = TARGETS if mode != "one job" else ("run",)
             counts: dict[str, Counter[str]] = defaultdict(Counter)
             for index in range(kills):
@@ -193,11 +193,11 @@ def main(
                     print(again.stderr, flush=True)
                 counts[target] += here + Counter(strikes=1)
             rows += [
-                (mode, target, str(n["strikes"]), str(n["hit"]), f"{seconds:.0f}", str(sum(n[k] for k in WRONG)))
+                (mode, target, n["strikes"], n["hit"], f"{seconds:.0f}", sum(n[k] for k in WRONG))
                 for target, n in counts.items()
             ]
     section.table(rows)
-    if any(int(faults) for *_, faults in rows[1:]):
+    if any(faults for *_, faults in rows[1:]):
         raise SystemExit("something is wrong")
 
 

@@ -72,7 +72,7 @@ def main(
     for (how, line), seen in rows.items():
         limits_gb, seconds_of = zip(*seen, strict=True)
         ends = dict.fromkeys(f"{gb:.2f}" for gb in (min(limits_gb), max(limits_gb)))
-        table.append((" to ".join(ends), str(len(seen)), f"{max(seconds_of):.0f}", how, line))
+        table.append((" to ".join(ends), len(seen), f"{max(seconds_of):.0f}", how, line))
     section.table(table)
 
 

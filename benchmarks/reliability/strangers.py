@@ -257,7 +257,7 @@ def main(folders: int = 5000, listed: int = 1_000_000, tagged: int = 1000, rng_s
             kind = KINDS[number % len(KINDS)]
             rows[f"output folder: {kind}"] += attack_folder(partial(change, kind, rng), whole)
         rows[f"{listed:,} captures listed"] = attack_folder(partial(list_many, listed), whole)
-    cells = [(kind, *(str(row[fault]) for fault in ("commands", *FAULTS))) for kind, row in rows.items()]
+    cells = [(kind, *(row[fault] for fault in ("commands", *FAULTS))) for kind, row in rows.items()]
     Section("strangers", None).table([("attack", "commands", *FAULTS), *cells])
 
 

@@ -177,7 +177,7 @@ def main(faults: int = 200, rng_seed: int = 0, markdown: Path | None = None) -> 
             "one failed call each, followed by the same command without a fault."
         )
         counts = {call: (*(row[k] for k in kinds), sum(row[k] for k in violations)) for call, row in rows.items()}
-        section.table([heads, *((call, *map(str, n)) for call, n in counts.items())])
+        section.table([heads, *((call, *n) for call, n in counts.items())])
 
 
 if __name__ == "__main__":

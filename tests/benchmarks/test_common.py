@@ -42,7 +42,7 @@ def test_a_section_replaces_what_is_between_its_marks(tmp_path: Path) -> None:
     section = Section("kills", page)
     section.say("New.")
     section.table([("a", "b"), ("1|2", "3")])
-    table = "| a | b |\n| --- | --- |\n| 1\\|2 | 3 |"
+    table = "| a | b |\n|---|---|\n| 1\\|2 | 3 |"
     assert page.read_text() == f"before\n<!-- kills -->\n\nNew.\n\n{table}\n\n<!-- end of kills -->\nafter\n"
     with pytest.raises(SystemExit, match="has no section"):
         Section("soak", page).say("text")
