@@ -57,6 +57,7 @@ main()
 """
 
 
+@pytest.mark.full
 @pytest.mark.slow
 def test_every_text_is_read_and_written_in_an_encoding_that_is_said(flight: Path, tmp_path: Path) -> None:
     """Where none is said it is the system's, which on Windows is not UTF-8."""

@@ -163,6 +163,7 @@ def test_a_flight_that_grows_needs_no_option(flight: Path, tmp_path: Path) -> No
     assert [r.state for r in agalign.align_folder(folder, out, settings=SEEDS)] == ["kept", "done"]
 
 
+@pytest.mark.full
 def test_all_captures_of_a_grown_flight_have_one_size(shared: Shared, tmp_path: Path) -> None:
     """Two captures are too few for a rig, with which the crop of all captures is known."""
     pytest.importorskip("xarray")

@@ -32,6 +32,7 @@ from agalign.products.sidecar_file import find_sidecars, read_result, read_sidec
 from agalign.synthetic.flight import make_flight
 from agalign.values.capture import Capture
 
+from ..builders import in_full_run
 from ..conftest import Shared, raising, save_known_model, seeded
 
 # The program itself reads files without a georeference quietly.
@@ -291,7 +292,7 @@ def test_a_fault_in_one_capture_costs_no_other(
     assert message in (lost.error or "")
 
 
-@pytest.mark.parametrize("fault", [cv2.error("of OpenCV"), agalign.GeometryError("no homography")])
+@pytest.mark.parametrize("fault", [cv2.error("of OpenCV"), in_full_run(agalign.GeometryError("no homography"))])
 def test_a_fault_while_learning_only_loses_the_network_of_the_flight(
     learned_flight: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, fault: Exception
 ) -> None:

@@ -36,6 +36,7 @@ pytestmark = pytest.mark.slow
 LOST = "its worker process was killed (signal 9; out of memory?); run again to process the remaining captures"
 
 
+@pytest.mark.full
 @pytest.mark.filterwarnings("ignore:Port .* is already in use", "ignore:unclosed:ResourceWarning")
 def test_a_dask_cluster_processes_captures(flight: Path, aligned_flight: Path, tmp_path: Path) -> None:
     """Two worker processes; one is killed while it processes a capture."""
@@ -141,6 +142,7 @@ def test_results_of_learning_tasks_come_in_order_and_a_lost_worker_ends_the_run(
         list(in_order(run, without_memory, [0]))
 
 
+@pytest.mark.full
 def test_an_executor_that_loses_its_processes_costs_the_captures(
     flight: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -40,8 +40,8 @@ RUN_BY = {"docker": "tools/container.sh", "dask": "tools/dask_cluster.sh", "pip"
 """What cannot be run inside a test, and the script that runs it and what stands with it in a block."""
 KINDS = {"sh", "python", "text", "{toctree}", "{include} ../CONTRIBUTING.md", "{include} ../CHANGELOG.md"}
 RUNNABLE = [page for page in PAGES if any(b.kind in ("sh", "python") for b in blocks_of(page))]
-LONG = {"benchmark-bands.md"}
-"""Pages with blocks that take more than ten seconds: they are in the full run."""
+LONG = {"benchmark-bands.md", "close-range.md", "paper.md", "photogrammetry.md", "qgis.md", "thermal.md"}
+"""Pages with blocks that take seconds, and of commands that other tests run: they are in the full run."""
 
 
 def write_orthophoto(folder: Path) -> None:
@@ -173,7 +173,11 @@ def test_every_example_is_run() -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    "name", [pytest.param(name, marks=[pytest.mark.full] if name == "on_dask.py" else []) for name in EXAMPLES]
+    "name",
+    [
+        pytest.param(name, marks=[pytest.mark.full] if name in ("next_flight.py", "on_dask.py") else [])
+        for name in EXAMPLES
+    ],
 )
 def test_an_example(name: str, desk: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     arguments, text, times = EXAMPLES[name]
@@ -316,6 +320,7 @@ def test_generated_tables_are_current(tool: str) -> None:
     python(ROOT / "tools" / tool, "--check")
 
 
+@pytest.mark.full
 @pytest.mark.slow
 def test_the_site_builds_without_warnings(tmp_path: Path) -> None:
     """Every page, and what the docstrings say, without a warning."""

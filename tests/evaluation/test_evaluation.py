@@ -141,6 +141,7 @@ def test_a_descriptor_learned_on_a_pair_beats_sift_with_reversed_contrast(tmp_pa
     assert float(rows[0]["error_px"]) == pytest.approx(ours.error_px, rel=1e-3)
 
 
+@pytest.mark.full
 def test_the_loss_is_least_at_the_truth(tmp_path: Path) -> None:
     fixed, moving = two_views(TRUTH)
     settings = JointSettings(recipe="paper", device="cpu")
@@ -179,6 +180,7 @@ def learnt(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
+@pytest.mark.full
 def test_a_learned_descriptor_works_on_an_unseen_pair(learnt: Path, tmp_path: Path) -> None:
     pair = write_pair(tmp_path, TRUTH, 9)
     methods = {name: method_named(name) for name in (str(learnt), "sift")}
@@ -205,15 +207,16 @@ def turned(angle_deg: float) -> np.ndarray:
     return about @ geometry.translation(-170, -130)
 
 
-def test_matching_finds_rotated_and_distant_images(learnt: Path) -> None:
-    truth = turned(25.0)
-    fixed, moving = two_views(truth, seed=4)
-    model = load_model(learnt, lambda: torch.device("cpu"))
-    for net in (starter_for_matching((1, 1)), matching_network(model.net, 1, (1, 1))):
-        result = match_seed(net, fixed, moving)
-        assert result is not None
-        points = geometry.lattice(400, 320, 8, 8)[20:44]
-        assert np.median(np.linalg.norm(geometry.apply(result, points) - geometry.apply(truth, points), axis=1)) < 2
+@pytest.mark.parametrize("network", ["starter", in_full_run("learnt")])
+def test_matching_finds_rotated_and_distant_images(network: str, request: pytest.FixtureRequest) -> None:
+    truth, net = turned(25.0), starter_for_matching((1, 1))
+    if network == "learnt":
+        model = load_model(request.getfixturevalue("learnt"), lambda: torch.device("cpu"))
+        net = matching_network(model.net, 1, (1, 1))
+    result = match_seed(net, *two_views(truth, seed=4))
+    assert result is not None
+    points = geometry.lattice(400, 320, 8, 8)[20:44]
+    assert np.median(np.linalg.norm(geometry.apply(result, points) - geometry.apply(truth, points), axis=1)) < 2
 
 
 def test_matching_finds_nothing_in_unrelated_images() -> None:

@@ -29,6 +29,7 @@ from agalign.products.sidecar_file import read_sidecar, write_sidecar
 from agalign.values import geometry, lens
 from agalign.values.output_folder import locked
 
+from ..builders import in_full_run
 from ..conftest import Shared
 from ..program import agalign_here
 
@@ -227,11 +228,11 @@ DAMAGED = "IMG_0009: left out: its entry in flight.geojson is damaged; run again
     ("change", "arguments", "code", "said"),
     [
         (with_changed_entry(height_m=[]), (), 3, DAMAGED),
-        (with_changed_entry(height_m=1e308), (), 3, DAMAGED),
-        (with_changed_entry(accuracy_m=-1), (), 3, DAMAGED),
-        (with_changed_entry(longitude=1e308), (), 3, "IMG_0009: left out: "),
+        in_full_run(with_changed_entry(height_m=1e308), (), 3, DAMAGED),
+        in_full_run(with_changed_entry(accuracy_m=-1), (), 3, DAMAGED),
+        in_full_run(with_changed_entry(longitude=1e308), (), 3, "IMG_0009: left out: "),
         (with_changed_entry(sidecar="../x.json"), (), 3, "IMG_0009: left out: it has no footprint in flight.geojson"),
-        (
+        in_full_run(
             with_changed_entry("geometry", coordinates=[[[1e308, 0]] * 5]),
             (),
             3,
@@ -298,6 +299,7 @@ def test_a_capture_without_tie_points_is_left_out_by_name(survey: Path, tmp_path
         assert np.isclose(field.read(1), 0.25, atol=1e-4).any()
 
 
+@pytest.mark.full
 def test_the_largest_group_is_written_with_its_own_misfit(survey: Path, tmp_path: Path) -> None:
     """The contrast of two captures is reversed, so that they match each other only."""
     out = without_texture(survey, tmp_path / "out", 9)
@@ -333,7 +335,7 @@ def test_threads_leave_the_filters_of_warnings_alone(survey: Path) -> None:
     assert warnings.filters == before
 
 
-@pytest.mark.parametrize("size", ["1600k", "3400k", "5000k"])
+@pytest.mark.parametrize("size", ["3400k", *map(in_full_run, ("1600k", "5000k"))])
 def test_a_full_disk_is_one_line(survey: Path, tmp_path: Path, size: str) -> None:
     """It is full while the mosaic is written, or its copy as a COG."""
     mount = ["mount", "-t", "tmpfs", "-o", f"size={size}", "tmpfs", str(tmp_path)]
@@ -349,6 +351,7 @@ def test_a_full_disk_is_one_line(survey: Path, tmp_path: Path, size: str) -> Non
     assert left == []
 
 
+@pytest.mark.full
 def test_the_next_mosaic_removes_what_a_killed_one_left(survey: Path, tmp_path: Path) -> None:
     command = [sys.executable, "-m", "agalign", "mosaic", survey, "-o", tmp_path / "field.tif"]
     with subprocess.Popen(command) as process:

@@ -20,6 +20,7 @@ from agalign.synthetic import flight as synthetic
 from agalign.values import geometry
 from agalign.values.capture import Band, Capture, Georeference
 
+from ..builders import in_full_run
 from ..conftest import Shared, read_json, seeded, textured_image, write_band, write_capture
 
 pytestmark = pytest.mark.slow
@@ -257,7 +258,7 @@ def test_the_file_of_a_photograph_does_not_take_the_name_of_the_stack() -> None:
         pytest.param(
             {"layout": "bands", "format": "cog", "crop": "none", "radiometry": "auto"}, marks=pytest.mark.full
         ),
-        {"layout": "both", "radiometry": "auto", "stac": True, "interpolation": "nearest"},
+        in_full_run({"layout": "both", "radiometry": "auto", "stac": True, "interpolation": "nearest"}),
         pytest.param(
             {"layout": "stack", "format": "cog", "undistort": True, "compression": "none"}, marks=pytest.mark.full
         ),

@@ -390,6 +390,7 @@ def test_an_alignment_warps_to_the_bytes_of_a_stack(aligned_flight: Path, flight
     assert sum(assert_same_as_stack(s, flight / s.parent.relative_to(aligned_flight)) for s in sidecars) == 8
 
 
+@pytest.mark.full
 @pytest.mark.real
 @pytest.mark.slow
 def test_an_alignment_warps_to_the_bytes_of_a_real_stack(real_data: Path, tmp_path: Path) -> None:

@@ -232,6 +232,7 @@ def test_files_and_working_folders_that_are_not_utf_8_are_named(
     assert not (tmp_path / f"{BAD}-aligned").exists()
 
 
+@pytest.mark.full
 @pytest.mark.slow
 @pytest.mark.skipif(sys.platform != "linux", reason="other systems decode names as UTF-8")
 def test_a_system_of_ascii_reports_names_outside_it(flight: Path, tmp_path: Path) -> None:

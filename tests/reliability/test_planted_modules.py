@@ -58,7 +58,7 @@ def names(shared: Shared, four_captures: Path) -> set[str]:
 
     def list_modules(folder: Path) -> None:
         (folder / "script.py").write_text(NAMES_OF_A_RUN)
-        command = folder / "script.py", four_captures, "-o", folder / "out", "-j", "2"
+        command = folder / "script.py", four_captures, "-o", folder / "out", "-j", "2", "--bands", "green,nir"
         (folder / "names").write_text(output(sys.executable, *command))
 
     return modules((shared("names_of_a_run", list_modules) / "names").read_text())
@@ -82,7 +82,8 @@ def test_no_module_is_imported_from_the_working_folder(
     assert {"rasterio", "click", "torch", "typing", "socket", "multiprocessing"} <= names
     folder = tmp_path / "working folder"
     log = plant(names, folder)
-    output(*command, four_captures, "-o", tmp_path / "out", "-j", "2", "--relief", "never", folder=folder)
+    options = "-j", "2", "--bands", "green,nir", "--relief", "never"
+    output(*command, four_captures, "-o", tmp_path / "out", *options, folder=folder)
     assert not log.exists(), log.read_text()
     for path, k in product(four_captures.rglob("*.tif"), range(_MIN_FILES_FOR_PROCESSES // 4)):
         os.link(path, folder / f"{k}{path.name}")
@@ -90,6 +91,7 @@ def test_no_module_is_imported_from_the_working_folder(
     assert not log.exists(), log.read_text()
 
 
+@pytest.mark.full
 def test_workers_of_a_script_import_what_the_script_imports(
     names: set[str], four_captures: Path, tmp_path: Path
 ) -> None:
