@@ -1,12 +1,12 @@
 """The real captures, where they are present: accuracy against reference ties."""
 
-import json
 from dataclasses import replace
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
+from common import band_errors, read_ties
 from scipy.interpolate import CloughTocher2DInterpolator
 
 import agalign
@@ -19,7 +19,6 @@ from agalign.config import FlightSettings, SeedSettings, Settings
 from agalign.flight.panel_readings import read_panel, with_panels
 from agalign.pixels.radiometry import calibrated
 from agalign.pixels.raster import open_raster, probe
-from agalign.products.sidecar_file import find_sidecars
 from agalign.values import geometry
 
 from .builders import in_full_run
@@ -29,16 +28,7 @@ pytestmark = [pytest.mark.real, pytest.mark.slow]
 
 def pair_medians(out: Path, ties_path: Path) -> dict[str, float]:
     """Median tie error of each pair that was delivered as aligned, by moving file."""
-    truth = {f: e for c in json.loads(ties_path.read_text()).values() for f, e in c["bands"].items()}
-    medians = {}
-    for path in find_sidecars(out):
-        for band in json.loads(path.read_text())["bands"]:
-            if band["status"] != "aligned" or band["file"] not in truth:
-                continue
-            ties = np.array(truth[band["file"]]["ties"])
-            mapping = CloughTocher2DInterpolator(band["grid"]["reference_px"], band["grid"]["moving_px"])
-            medians[band["file"]] = float(np.nanmedian(np.linalg.norm(mapping(ties[:, :2]) - ties[:, 2:], axis=1)))
-    return medians
+    return {b.file: b.median_px for b in band_errors(out, read_ties(ties_path)) if b.status == "aligned"}
 
 
 DOCUMENTED = {

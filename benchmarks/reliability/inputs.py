@@ -1,24 +1,18 @@
 """Attack what the program is given: strange images, rasters that change while they are read, ordinary captures that
-must not be left out, images that are hard to search for panels and relief, and damaged XMP packets.
+must not be left out, and images that are hard to search for panels and relief.
 
-    python benchmarks/reliability/inputs.py [--images 60] [--changes 40] [--captures 500] [--packets 10000]
-        [--data FOLDER] [--markdown FILE]
+    python benchmarks/reliability/inputs.py [--images 60] [--changes 40] [--captures 500] [--data FOLDER]
+        [--markdown FILE]
 
 Each file of a strange capture is in a sidecar or in a message. An index is that of an undisturbed run, or a message
 names its capture. The captures of `--data` are cropped,
 darkened and turned, in a folder named after the sky: none is one of the sky or of a panel. A search hangs that takes
 over three times as long as in a texture of the same size.
-The XMP packets of `--data` are damaged: a band's name that exiftool finds in a file is also found, or the file has a
-message. Reading a packet hangs that takes over a second.
 """
 
-import json
 import os
-import random
 import re
-import resource
 import shutil
-import subprocess
 import sys
 import tempfile
 import time
@@ -41,17 +35,10 @@ from kills import HUNG_S, contents
 from stages import read
 from synthetic_flights.aligned import make_aligned
 
-from agalign.cameras import known_cameras
-from agalign.cameras.discover import DiscoverOptions, discover
-from agalign.cameras.grouping import with_tags_of_flight
-from agalign.cameras.pix4d import NAMESPACE
-from agalign.cameras.read_files import read_file
-from agalign.cameras.tiff_directory import XMP, add_directories, byte_string, read_directories
-from agalign.cameras.xmp import Packet
+from agalign.cameras.discover import discover
 from agalign.flight.panel_readings import with_panels
 from agalign.flight.sky import sky_captures
 from agalign.pixels.panel_detection import find_panel
-from agalign.pixels.raster import suffix_format
 from agalign.products.sidecar_file import find_sidecars
 from agalign.relief.dense import DenseMatching, View
 from agalign.values.capture import Capture
@@ -272,92 +259,8 @@ def attack_searches(rng: np.random.Generator) -> Iterator[Attack]:
         yield result
 
 
-# ---- XMP packets
-
-
-FRAGMENTS = "<", ">", "&", "\0", '"', "/>", "<!--", "]]>", "<![CDATA[", "&#0;", "&x;", "\ufffe", "</rdf:Description>"
-FRAGMENTS += "</x:xmpmeta>", "<rdf:li>", "<Camera:BandName>", ' Camera:BandName="', "<!DOCTYPE l [", "<?xml?>", "\x02"
-
-
-def damaged(packet: bytes, rng: random.Random) -> bytes:
-    """Change up to four places of a packet: bytes, parts, tags, names, namespaces, its end."""
-    text = packet.decode("utf-8", "replace")
-    for _ in range(rng.randint(1, 4)):
-        at, length = rng.randrange(len(text) + 1), rng.choice((1, 1, 1, 5, 50, 500))
-        tags = [m.span() for m in re.finditer(r"<[^<>]*>|[\w-]+:[\w-]+(?==)|=\s*\"[^\"]*\"", text)] or [(at, at)]
-        start, end = rng.choice(tags)
-        text = rng.choice(
-            (
-                text[:at] + chr(rng.randrange(256)) + text[at + 1 :],
-                text[:at] + text[at + length :],
-                text[:at] + text[at : at + length] * 2 + text[at + length :],
-                text[:at] + rng.choice(FRAGMENTS) + text[at:],
-                text[:start] + text[end:],
-                text[:start] + text[start:end] * 2 + text[end:],
-                text[:start] + rng.choice(FRAGMENTS) + text[end:],
-                text[: rng.randrange(start, end + 1)] + text[end:],
-                text[:at] if rng.random() < 0.2 else text + text[at:],
-            )
-        )
-    return text.encode("utf-8", "replace")
-
-
-def attack_packets(count: int, folder: Path, data: Path) -> Iterator[Attack]:
-    """Read files with damaged packets of each model, and compare their band names with those that exiftool finds."""
-    rng, packets = random.Random(0), dict[str, list[tuple[Path, bytes]]]()
-    for path in sorted(p for p in (data / "captures").rglob("*") if suffix_format(p) in ("TIFF", "JPEG")):
-        directory = read_directories(path)[0]
-        if XMP in directory:
-            packets.setdefault(directory[272].data.decode(), []).append((path, directory[XMP].data))
-    intact = next(iter(packets.values()))[0][0]
-    pixel, cameras, options = np.zeros((32, 32), np.uint16), known_cameras(), DiscoverOptions(with_rgb=True)
-    attack, equal, found = Attack(f"damaged XMP packets of {len(packets)} cameras"), 0, 0
-    for batch in range(0, count, 2000):
-        images = folder / f"packets-{batch}"
-        images.mkdir()
-        for number in range(batch, min(batch + 2000, count)):
-            source, packet = rng.choice(packets[sorted(packets)[number % len(packets)]])
-            path, packet = images / f"{number}_{source.stem}.tif", damaged(packet, rng)
-            tifffile.imwrite(path, pixel, photometric="minisblack", metadata=None)
-            first = {tag: entry for tag, entry in read_directories(source)[0].items() if tag in (271, 272)}
-            add_directories(path, first | {XMP: byte_string(packet)}, {}, {})
-        tool = ["exiftool", "-q", "-q", "-fast", "-json", "-XMP-Camera:BandName", images]
-        theirs = json.loads(subprocess.run(tool, capture_output=True, check=False).stdout)
-        found_by_tool = {Path(row["SourceFile"]): row.get("BandName") for row in theirs}
-        names = {k: ",".join(v) if isinstance(v, list) else str(v) for k, v in found_by_tool.items() if v}
-        for path in sorted(images.iterdir()):
-            attack.tried += 1
-            began = time.monotonic()
-            try:
-                file = read_file(path, cameras, options)
-                _, problems = with_tags_of_flight([file])
-                own, other = (Packet.parse(read_directories(p)[0][XMP].data) for p in (path, intact))
-                own.take(other, file.camera.tag_transfer.geometry)
-                other.take(Packet.parse(own.serialised()), own.values().keys())
-                other.serialised()
-            except Exception as error:  # no damage of a packet may cause one
-                attack.count("tracebacks", f"{path}: {error!r}")
-                continue
-            seconds = time.monotonic() - began
-            attack.worst_s = max(attack.worst_s, seconds)
-            attack.hangs += seconds > 1
-            own = file.tags.text(NAMESPACE, "BandName")
-            found, equal = found + (path in names), equal + (path in names and own == names[path])
-            if path in names and not own and not problems:
-                attack.count("lost", f"{path}: {names[path]}")
-                shutil.copy(path, folder.parent)
-    peak_mb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss >> 10
-    print(f"exiftool finds {found} names of bands, {equal} of them equal; peak {peak_mb} MB", flush=True)
-    yield attack
-
-
 def main(
-    images: int = 60,
-    changes: int = 40,
-    captures: int = 500,
-    packets: int = 10_000,
-    data: Path | None = None,
-    markdown: Path | None = None,
+    images: int = 60, changes: int = 40, captures: int = 500, data: Path | None = None, markdown: Path | None = None
 ) -> None:
     rng = np.random.default_rng(0)
     warnings.simplefilter("ignore")
@@ -365,7 +268,7 @@ def main(
         folder = Path(name)
         attacks = [attack_searches(rng), attack_rasters(changes, rng, folder), attack_images(images, rng, folder)]
         if data:
-            attacks += [attack_exclusions(captures, rng, folder, data), attack_packets(packets, folder, data)]
+            attacks.append(attack_exclusions(captures, rng, folder, data))
         rows = [("attack", "tried", "tracebacks", "silent losses", "hangs", "worst, s")]
         for row in chain(*attacks):
             rows.append((row.name, row.tried, row.tracebacks, row.lost, row.hangs, f"{row.worst_s:.2f}"))

@@ -1,22 +1,18 @@
 """Scenes with depth are rendered where their truth has them, and are read as captures of a RedEdge."""
 
 from dataclasses import replace
-from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
-from synthetic_flights.depth import CLOSE_RANGE, Scene, Truth, truth_of, view, write_capture
+from synthetic_flights.depth import CLOSE_RANGE, Scene, Truth, truth_of, view
 from synthetic_flights.materials import make_textures
 from synthetic_flights.patches import Patch
 from synthetic_flights.relief import make_scene
 
-from agalign.cameras import rig_seed
-from agalign.cameras.discover import discover
 from agalign.pixels.structure import structure_field
-from agalign.synthetic.camera_model import CameraSpec, Pose, to_plane
+from agalign.synthetic.camera_model import CameraSpec, Pose
 from agalign.synthetic.flight import recorded
-from agalign.values import geometry
 from agalign.values.image import Raster
 from agalign.verify.residuals import FixedWindows
 
@@ -111,20 +107,6 @@ def test_pixels_behind_a_nearer_square_are_occluded() -> None:
             np.testing.assert_array_equal(hidden, shadow & ~in_square)
             assert hidden.sum() > 200
             assert not (truth.bands[band.name].visible & hidden).any()
-
-
-def test_files_are_a_capture_of_a_rededge(tmp_path: Path, plants: Scene) -> None:
-    size = 160, 120
-    truth = write_capture(tmp_path, plants, size_px=size)
-    (capture,) = discover(tmp_path).captures
-    assert (capture.camera.make, capture.camera.model) == ("MicaSense", "RedEdge-M")
-    assert capture.reference.name == "Green"
-    assert {b.name for b in capture.moving} == set(truth.bands) == {"Blue", "Red", "NIR", "Red edge"}
-    reference = CLOSE_RANGE.bands[CLOSE_RANGE.reference]
-    for band in capture.moving:
-        spec = next(b for b in CLOSE_RANGE.bands if b.name == band.name)
-        expected = geometry.invert(to_plane(reference, spec, size))
-        assert geometry.corner_error_px(rig_seed(capture.reference, band), expected, *size) < 0.01
 
 
 # ---- made to fool

@@ -113,7 +113,6 @@ def test_only_the_capture_that_is_looked_at_is_loaded(browser: Any, out: Path) -
     page.goto((out / "index.html").as_uri() + "#capture=0000SET%2F000%2FIMG_0001")
     page.wait_for_timeout(300)
     assert loaded == ["index.html", "IMG_0001.preview.jpg"]
-    page.close()
 
 
 def test_the_slider_moves_the_picture(page: Any) -> None:
@@ -314,7 +313,6 @@ def test_the_relief_over_the_picture(browser: Any, out: Path, tmp_path: Path) ->
         assert near == pytest.approx((0.75 * 45, 0.75 * 250, 0.75 * 205), abs=8)
         note = page.locator("#over-note").inner_text()
         assert all(text in note for text in ("-2.0 px", "2.0 px", "6.0 px", "1.00 to 2.00 m"))
-    page.close()
 
 
 def test_the_table_sorts_and_filters(page: Any) -> None:
@@ -422,7 +420,6 @@ def test_words_can_be_read_in_light_and_in_dark(browser: Any, out: Path, scheme:
             });
         }"""
     )
-    page.close()
     assert len(ratios) > 40
     assert [r for r in ratios if r[0] < 4.5] == []
 
@@ -450,7 +447,6 @@ def test_it_prints_and_fits_a_telephone(browser: Any, out: Path) -> None:
     page.emulate_media(media="screen")
     page.wait_for_timeout(200)
     assert page.locator("#table tbody th").count() == 3
-    page.close()
 
 
 def test_no_table_is_cut_on_a_screen(browser: Any, out: Path) -> None:
@@ -461,7 +457,6 @@ def test_no_table_is_cut_on_a_screen(browser: Any, out: Path) -> None:
     assert page.evaluate(cut) == 0
     before, after = page.locator("details.more tbody tr").first.locator("td").first.inner_text().split(" → ")
     assert float(after) > float(before) >= 0, "mutual information: higher is better"
-    page.close()
 
 
 def test_the_composite_returns_after_a_capture_without_its_bands(page: Any) -> None:
@@ -483,7 +478,6 @@ def test_a_clock_that_was_not_set(browser: Any, out: Path, tmp_path: Path) -> No
     text = page.locator("main").inner_text()
     assert "unknown time" in text
     assert "1970" not in text
-    page.close()
 
 
 def test_without_scripts_the_numbers_are_pointed_to(browser: Any, out: Path) -> None:
@@ -491,4 +485,3 @@ def test_without_scripts_the_numbers_are_pointed_to(browser: Any, out: Path) -> 
     page.goto((out / "index.html").as_uri())
     assert "holds the same numbers" in page.locator("noscript").inner_text()
     assert page.locator(".facts").is_visible()
-    page.close()

@@ -20,14 +20,15 @@ from agalign.flight.groups import camera_overviews
 from agalign.synthetic import flight as synthetic
 from agalign.values.capture import Band, CameraIdentity, Capture
 
+from ..conftest import write_band
+
+pytestmark = pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
+
 SMALL = np.arange(64, dtype=np.uint16).reshape(8, 8)
 
 
 def write(path: Path, bands: int = 1) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    planar = None if bands == 1 else "separate"
-    pixels = np.random.default_rng(0).integers(1, 4000, (bands, 64, 80), dtype=np.uint16).squeeze()
-    tifffile.imwrite(path, pixels, photometric="minisblack", planarconfig=planar)
+    write_band(path, np.random.default_rng(0).integers(1, 4000, (bands, 64, 80), dtype=np.uint16))
 
 
 def write_all(folder: Path, *names: str) -> Path:

@@ -213,7 +213,7 @@ def verified_together(candidates: Sequence[ReliefCandidate], settings: Settings)
 
 
 @pytest.mark.parametrize(("family", "is_allowed"), [("auto", True), ("translation", False), ("affine", False)])
-@pytest.mark.parametrize("use", ["auto", "always"])
+@pytest.mark.parametrize("use", ["auto", in_full_run("always")])
 def test_neither_relief_nor_field_replaces_another_model_family(
     candidates: Sequence[ReliefCandidate], family: FamilyChoice, use: ReliefUse, is_allowed: bool
 ) -> None:
@@ -244,8 +244,8 @@ def four_lenses() -> Rendered:
     return Rendered.of(make_scene("boxes", 8, width_px=size_px[0]), size_px, CLOSE_RANGE)
 
 
-@pytest.mark.parametrize("has_result", [True, False])
-@pytest.mark.parametrize(("noise", "status"), [(0.2, "aligned"), (0.31, "predicted")])
+@pytest.mark.parametrize("has_result", [True, in_full_run(False)])
+@pytest.mark.parametrize(("noise", "status"), [(0.2, "aligned"), in_full_run(0.31, "predicted")])
 def test_a_noisy_band_follows_the_relief_of_the_others(
     four_lenses: Rendered, noise: float, status: str, has_result: bool
 ) -> None:

@@ -19,7 +19,6 @@ import geopandas
 import numpy as np
 import pytest
 import rasterio
-import rioxarray
 from rasterio.enums import ColorInterp
 from rasterio.transform import Affine
 from shapely import Polygon
@@ -210,32 +209,6 @@ def test_the_recipe_for_plots_has_a_row_of_any_outline(plot_statistics: Callable
     assert [row["plot"] for row in rows] == ["A1", "", "edge", "bow tie"]
     assert [float(row["count"]) for row in rows] == pytest.approx([400, 400, 200, 150], abs=0.1)
     assert [float(row["mean"]) for row in rows] == pytest.approx([0.5, 0.8, 0.5, 0.8], abs=1e-6)
-
-
-@pytest.mark.real
-@pytest.mark.parametrize(
-    ("case", "raster", "outlines", "counts", "means"),
-    [
-        ("invalid-polygon", "ref.tif", "bow.gpkg", [450], {0.05}),
-        ("null-id", "ref.tif", "nullid.gpkg", [1600] * 16, {0.05}),
-        ("single-band", "therm.tif", "p.gpkg", [1600] * 16, {25.3}),
-    ],
-)
-def test_the_recipe_for_plots_on_real_files(
-    real_data: Path,
-    plot_statistics: Callable[..., Any],
-    case: str,
-    raster: str,
-    outlines: str,
-    counts: list[float],
-    means: set[float],
-) -> None:
-    folder = real_data / "cases" / f"plots-{case}"
-    with warnings.catch_warnings(action="ignore"):
-        values = rioxarray.open_rasterio(folder / raster, masked=True).sel(band=1)
-        table = plot_statistics(values, folder / outlines)
-    assert table["count"].tolist() == pytest.approx(counts)
-    assert set(table["mean"].round(4)) == means
 
 
 def test_the_python_of_the_readme_aligns_pixels() -> None:

@@ -4,13 +4,13 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-import rasterio
 import tifffile
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from agalign.pixels.band_resampling import resample_tile, warped
+from agalign.pixels.raster import probe
 from agalign.products.layout import _largest_rectangle, common_area
 from agalign.synthetic import cameras
 from agalign.values import geometry
@@ -21,17 +21,16 @@ from agalign.values.mapping import PixelMapping
 from agalign.values.pixel_units import PixelScale
 
 from ..builders import texture, two_views
-from ..conftest import textured_image
+from ..conftest import textured_image, write_band
 
+pytestmark = pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
 H = np.array([[1.002, 0.004, 6.3], [-0.003, 0.999, -4.7], [3e-6, -2e-6, 1.0]])
 
 
-def write_band(path: Path, pixels: np.ndarray, nodata: float | None = None) -> Band:
-    height, width = pixels.shape
-    profile = {"driver": "GTiff", "width": width, "height": height, "count": 1, "dtype": pixels.dtype, "nodata": nodata}
-    with pytest.warns(rasterio.errors.NotGeoreferencedWarning), rasterio.open(path, "w", **profile) as dataset:
-        dataset.write(pixels, 1)
-    return Band("b", path, 1, width, height, str(pixels.dtype), nodata=nodata)
+def band_of(path: Path, pixels: np.ndarray) -> Band:
+    write_band(path, pixels)
+    (band,) = probe(path)
+    return band
 
 
 def test_tiles_cover_the_area_once() -> None:
@@ -47,7 +46,7 @@ def test_tiles_cover_the_area_once() -> None:
 )
 def test_a_ramp_stays_a_ramp(tmp_path: Path, interpolation: str, tolerance: float) -> None:
     x, y = np.meshgrid(np.arange(300.0), np.arange(200.0))
-    band = write_band(tmp_path / "b.tif", (x + 1000 * y).astype(np.float64))
+    band = band_of(tmp_path / "b.tif", (x + 1000 * y).astype(np.float64))
     tile = Tile(30, 30, 200, 120)
     got, valid = resample_tile(band, PixelMapping(geometry.translation(6.3, -4.0)), tile, interpolation)
     expected = (x + 6.3 + 1000 * (y - 4.0))[30:150, 30:230]
@@ -59,7 +58,7 @@ def test_a_ramp_stays_a_ramp(tmp_path: Path, interpolation: str, tolerance: floa
 def test_the_type_is_kept_and_integers_are_rounded(tmp_path: Path, dtype: str) -> None:
     limits = (np.iinfo(dtype).min, np.iinfo(dtype).max) if dtype != "float32" else (-1e9, 1e9)
     pixels = np.clip(textured_image(120, 90) * 400, *limits).astype(dtype)
-    got, _ = resample_tile(write_band(tmp_path / "b.tif", pixels), PixelMapping(H), Tile(20, 20, 60, 50), "cubic")
+    got, _ = resample_tile(band_of(tmp_path / "b.tif", pixels), PixelMapping(H), Tile(20, 20, 60, 50), "cubic")
     assert got.dtype == dtype
     flags, border = cv2.INTER_CUBIC | cv2.WARP_INVERSE_MAP, cv2.BORDER_REPLICATE
     wide = pixels.astype(np.float64)
@@ -92,7 +91,7 @@ def test_kernels_do_not_ring_next_to_saturated_pixels(interpolation: str) -> Non
 
 
 def test_tiles_join_without_a_seam(tmp_path: Path) -> None:
-    band = write_band(tmp_path / "b.tif", (textured_image(300, 220) * 100).astype(np.float32))
+    band = band_of(tmp_path / "b.tif", (textured_image(300, 220) * 100).astype(np.float32))
     mapping = PixelMapping(H, cameras.BANDS[1].lens(300, 220), cameras.BANDS[3].lens(300, 220))
     # Not lanczos: OpenCV rounds its positions to 1/32 px, so tiny differences may change a result.
     whole, whole_valid = resample_tile(band, mapping, Tile(0, 0, 300, 220), "cubic")
@@ -141,7 +140,7 @@ def test_the_common_area_is_inside_every_band() -> None:
 
 def test_the_source_file_is_read_once_as_it_is(tmp_path: Path) -> None:
     pixels = (np.random.default_rng(0).random((60, 80)) * 60000).astype(np.uint16)
-    band = write_band(tmp_path / "b.tif", pixels)
+    band = band_of(tmp_path / "b.tif", pixels)
     got, valid = resample_tile(band, PixelMapping(np.eye(3)), Tile(0, 0, 80, 60), "lanczos")
     np.testing.assert_array_equal(got, tifffile.imread(tmp_path / "b.tif"))
     assert valid.all()
@@ -166,7 +165,7 @@ def test_an_identity_between_grids_of_different_scales_is_warped() -> None:
 
 @pytest.mark.parametrize("shift_px", [0.0, 500.0])
 def test_calibrated_pixels_are_float32_inside_and_outside_the_moving_image(tmp_path: Path, shift_px: float) -> None:
-    band = write_band(tmp_path / "b.tif", np.ones((100, 140), np.uint16))
+    band = band_of(tmp_path / "b.tif", np.ones((100, 140), np.uint16))
     mapping, tile = PixelMapping(geometry.translation(shift_px, 0)), Tile(0, 0, 30, 20)
     pixels, valid = resample_tile(band, mapping, tile, "cubic")
     assert pixels.dtype == np.uint16

@@ -20,6 +20,7 @@ from agalign.products.sidecar_file import find_sidecars, read_result
 from agalign.values.capture import Band, Capture
 from agalign.values.quality import Quality
 
+from ..cameras.test_vendors import packet, tagged
 from ..conftest import textured_image, write_band, write_capture
 
 pytestmark = pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
@@ -107,14 +108,6 @@ def test_colours_without_names_are_named_by_their_interpretation(tmp_path: Path)
     assert [b.name for b in generic_bands(tmp_path / "ortho.tif")] == ["a", "b", "c"]
 
 
-def packet_of(name: str, wavelength_nm: int) -> bytes:
-    values = f'Camera:BandName="{name}" Camera:CentralWavelength="{wavelength_nm}"'
-    return (
-        '<x:xmpmeta xmlns:x="adobe:ns:meta/"><rdf:RDF xmlns:rdf="http://www.w3.org/1999/02/22-rdf-syntax-ns#">'
-        f'<rdf:Description xmlns:Camera="http://pix4d.com/camera/1.0" {values}/></rdf:RDF></x:xmpmeta>'
-    ).encode()
-
-
 def write_pages(path: Path, bands: Sequence[tuple[str, int]], *, thumbnail: bool = False, mask: bool = False) -> None:
     """A page for each band, of one scene; a thumbnail is before them, a mask behind."""
     scene = texture_numbers()
@@ -122,8 +115,9 @@ def write_pages(path: Path, bands: Sequence[tuple[str, int]], *, thumbnail: bool
         if thumbnail:
             tiff.write(scene[::4, ::4], subfiletype=1, metadata=None)
         for number, (name, nm) in enumerate(bands):
-            xmp = [(700, 1, len(packet_of(name, nm)), packet_of(name, nm), True)] if name else []
-            tiff.write(np.roll(scene, number, axis=1) + number, metadata=None, extratags=xmp)
+            xmp = packet(tagged(NAMESPACE, BandName=name, CentralWavelength=str(nm)), "attributes")
+            tags = [(700, 1, len(xmp), xmp, True)] if name else []
+            tiff.write(np.roll(scene, number, axis=1) + number, metadata=None, extratags=tags)
         if mask:
             tiff.write(scene > 0, subfiletype=4, metadata=None)
 
@@ -167,22 +161,6 @@ def test_an_inverted_image_is_refused(tmp_path: Path) -> None:
     tifffile.imwrite(tmp_path / "a.tif", texture_numbers(), photometric="miniswhite")
     with pytest.raises(UnreadableFileError, match=r"a\.tif: is stored inverted .* export it with 0 as black"):
         probe(tmp_path / "a.tif")
-
-
-@pytest.mark.parametrize(
-    ("names", "wavelengths", "expected"),
-    [
-        (("Green", "Red", "NIR"), ("560", "668", "840"), [("Green", 560), ("Red", 668), ("NIR", 840)]),
-        (("Green",), ("560",), [("band_1", None), ("band_2", None), ("band_3", None)]),  # unknown channel
-        (("Green", "Red"), ("560", "668"), [("band_1", None), ("band_2", None), ("band_3", None)]),
-    ],
-)
-def test_lists_in_tags_have_an_item_for_each_channel(
-    names: tuple[str, ...], wavelengths: tuple[str, ...], expected: list[tuple[str, float | None]]
-) -> None:
-    stored = [Band("", Path("a.tif"), k, 64, 48, "uint16") for k in (1, 2, 3)]
-    tags = Tags(xmp={(NAMESPACE, "BandName"): names, (NAMESPACE, "CentralWavelength"): wavelengths})
-    assert [(b.name, b.wavelength_nm) for b in Generic().bands(Path("a.tif"), tags, stored)] == expected
 
 
 @pytest.mark.parametrize("name", ["f.tif", "f_RGB.tif"])

@@ -22,6 +22,7 @@ from agalign.values.choices import ExportProgram
 from agalign.values.image import OutputGrid
 from agalign.values.mapping import PixelMapping
 
+from ..builders import in_full_run
 from ..conftest import Shared, seeded
 from ..odm import OdmPhoto, pixels_in
 
@@ -49,7 +50,7 @@ def option(out: Path) -> str:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", list(CAMERAS))
+@pytest.mark.parametrize("name", ["RedEdge", "M3M", *map(in_full_run, ("M3M calibrated", "6X"))])
 def test_bands_are_one_camera_and_one_capture(name: str, shared: Shared, tmp_path: Path) -> None:
     photos = exported(CAMERAS[name], shared, tmp_path, "odm")
     assert len(photos) >= 4
@@ -62,7 +63,7 @@ def test_bands_are_one_camera_and_one_capture(name: str, shared: Shared, tmp_pat
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("program", ["odm", "metashape", "pix4d"])
+@pytest.mark.parametrize("program", ["odm", *map(in_full_run, ("metashape", "pix4d"))])
 def test_its_reflectance_is_that_of_this_program(program: ExportProgram, shared: Shared, tmp_path: Path) -> None:
     """Vignetting on the aligned grid, black level, exposure, gain, calibration and irradiance."""
     photos = exported(REDEDGE, shared, tmp_path, program)

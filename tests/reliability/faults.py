@@ -833,6 +833,14 @@ OTHERS = {
     "JSON lines that are not read": (both(unread_errors, asking("--log-json")), Ends(0, "", "abcde")),
 }
 FULL = {
+    "XML entities that multiply",
+    "an XML entity that names a file",
+    "XMP nested 1200 deep",
+    "XMP of five megabytes",
+    "a sidecar nested 200,000 deep",
+    "an infinite number in an earlier sidecar",
+    "a focal length of 1e308 mm in the tags",
+    "a formula for a name",
     "the system's folder on a card",
     "an input that may only be read",
     "an earlier run inside the input, killed",
