@@ -95,6 +95,7 @@ def test_aerial_rgb_nir_from_a_shifted_seed(real_data: Path, number: int) -> Non
     assert error < 0.3
 
 
+@pytest.mark.full
 def test_two_different_places_are_not_aligned(real_data: Path) -> None:
     folder = real_data / "pairs/aerial_rgb_nir"
     one = cv2.imread(str(folder / "VIS_5.png"), cv2.IMREAD_GRAYSCALE)

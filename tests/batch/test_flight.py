@@ -90,6 +90,7 @@ def forbid_starter(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(method_state, "start_from_starter", raising(AssertionError("the starter network is used")))
 
 
+@pytest.mark.full
 def test_captures_are_learned_from_random_weights(
     flight: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -377,6 +378,7 @@ def test_a_forced_seed_is_for_the_captures_that_the_flight_is_learned_from(
     assert {b.joint.recipe for b in bands if b.joint} == {"flight"}
 
 
+@pytest.mark.full
 def test_a_first_capture_that_lacks_a_band_belongs_to_its_flight(flight: Path, tmp_path: Path) -> None:
     folder = shutil.copytree(flight, tmp_path / "in")
     next(folder.rglob("IMG_0001_4.tif")).unlink()

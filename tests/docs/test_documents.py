@@ -39,7 +39,15 @@ RUN_BY = {"docker": "tools/container.sh", "dask": "tools/dask_cluster.sh", "pip"
 """What cannot be run inside a test, and the script that runs it and what stands with it in a block."""
 KINDS = {"sh", "python", "text", "{toctree}", "{include} ../CONTRIBUTING.md", "{include} ../CHANGELOG.md"}
 RUNNABLE = [page for page in PAGES if any(b.kind in ("sh", "python") for b in blocks_of(page))]
-LONG = {"benchmark-bands.md", "close-range.md", "paper.md", "photogrammetry.md", "qgis.md", "thermal.md"}
+LONG = {
+    "benchmark-bands.md",
+    "close-range.md",
+    "paper.md",
+    "photogrammetry.md",
+    "qgis.md",
+    "radiometry.md",
+    "thermal.md",
+}
 """Pages with blocks that take seconds, and of commands that other tests run: they are in the full run."""
 
 

@@ -80,6 +80,7 @@ def test_the_picture_shows_both_sides_of_what_changed_its_unit(by_panel: Path) -
     assert before.std() > 0.5 * after.std() > 10
 
 
+@pytest.mark.full
 @pytest.mark.slow
 def test_another_run_keeps_results_and_can_align_panels(between_panels: Path, tmp_path: Path) -> None:
     first, *_ = agalign.align_folder(between_panels, tmp_path, settings=seeded())

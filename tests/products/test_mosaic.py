@@ -327,6 +327,7 @@ def test_nothing_is_written_of_captures_that_do_not_match(survey: Path, tmp_path
     assert "Misfit" not in done.stdout
 
 
+@pytest.mark.full
 def test_threads_leave_the_filters_of_warnings_alone(survey: Path) -> None:
     before = list(warnings.filters)
     captures = place_captures(survey).captures

@@ -841,6 +841,7 @@ FULL = {
     "an infinite number in an earlier sidecar",
     "a focal length of 1e308 mm in the tags",
     "a formula for a name",
+    "a system without letters beyond ASCII",
     "the system's folder on a card",
     "an input that may only be read",
     "an earlier run inside the input, killed",
