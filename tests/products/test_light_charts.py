@@ -1,5 +1,7 @@
-from agalign.products.report.light import light_charts, light_of
-from agalign.products.report.rigs import CHART_HEIGHT
+from pathlib import Path
+
+from agalign.products.report.charts import CHART_HEIGHT
+from agalign.products.report.light import CaptureLight, light_charts
 from agalign.products.sidecar import Sidecar
 
 from .test_sidecar import example
@@ -20,7 +22,7 @@ def heights(points: tuple[str, ...]) -> list[float]:
 
 def test_irradiance_and_panel_factors_are_drawn_in_the_order_of_time() -> None:
     sidecars = [lit(20, 1.2, 2.5, 600.0), lit(0, 1.0, 4.0, 60.0), lit(10, 0.9, 4.0, 0.0)]
-    light = [light_of(f"{k}", s) for k, s in enumerate(sidecars)]
+    light = [CaptureLight.of(f"{k}", Path("a.json"), s) for k, s in enumerate(sidecars)]
     by_sensor, by_panel = light_charts(light)
     assert by_sensor.ends == ("1", "0")
     assert round(by_sensor.full, 3) == 0.2
@@ -28,7 +30,7 @@ def test_irradiance_and_panel_factors_are_drawn_in_the_order_of_time() -> None:
     assert by_panel.title.startswith("Light by panels")
     assert heights(by_panel.lines[0].points) == [0.0, 0.0, 1.0]
     # No chart without a panel, and no chart of only two captures.
-    alone = [light_of("a", lit(m, 1.0, 3.0, None)) for m in range(3)]
+    alone = [CaptureLight.of("a", Path("a.json"), lit(m, 1.0, 3.0, None)) for m in range(3)]
     assert len(light_charts(alone)) == 1
     assert light_charts(alone[:2]) == []
-    assert light_charts([light_of("a", example())] * 3) == []
+    assert light_charts([CaptureLight.of("a", Path("a.json"), example())] * 3) == []

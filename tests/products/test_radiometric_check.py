@@ -10,8 +10,7 @@ import pytest
 import rasterio
 
 from agalign.products.drawing import LEVEL_BLOCKS, block_means, read_reduced_bands
-from agalign.products.report.light import CaptureLight
-from agalign.products.report.radiometric_check import CaptureLevels, radiometric_check
+from agalign.products.report.light import CaptureLight, radiometric_check
 from agalign.products.sidecar_file import read_sidecar
 from agalign.values.capture import Band, Capture
 from agalign.values.image import OutputGrid
@@ -20,7 +19,7 @@ WIDTH, HEIGHT, STEP_PX = 320, 240, 100
 BANDS = "Green", "NIR"
 
 
-def flight(folder: Path, gains: list[float], nir: list[float] | None = None) -> list[CaptureLevels]:
+def flight(folder: Path, gains: list[float], nir: list[float] | None = None) -> list[CaptureLight]:
     """Captures along a strip over one texture that becomes brighter by half.
 
     `gains` multiply the levels of both bands, `nir` those of NIR.
@@ -35,8 +34,8 @@ def flight(folder: Path, gains: list[float], nir: list[float] | None = None) -> 
         cv2.imwrite(str(path), np.vstack([np.zeros_like(view), view * 100]).astype(np.uint8))
         levels = {"Green": block_means(gain * view), "NIR": block_means(gain * (nir or [1.0] * 9)[k] * view)}
         tile_px = (0, HEIGHT, WIDTH, HEIGHT)
-        light = CaptureLight("camera", f"{k}", f"{k}", {}, {})
-        captures.append(CaptureLevels(light, {"NIR": 0.01 * k}, levels, path, tile_px))
+        saturated = {"NIR": 0.01 * k}
+        captures.append(CaptureLight("camera", f"{k}", f"{k}", {}, {}, saturated, levels, path, tile_px))
     return captures
 
 
@@ -65,7 +64,7 @@ def test_the_cues_of_a_shadow_are_named(tmp_path: Path) -> None:
     assert list(jumps) == ["2"]
     assert "cloud shadow suspected (darker than the capture before)" in jumps["2"]
     light = [dict.fromkeys(BANDS, 0.7 if k == 2 else 1.0) for k in range(4)]
-    captures = [replace(c, light=replace(c.light, irradiance=one)) for c, one in zip(captures, light, strict=True)]
+    captures = [replace(c, irradiance=one) for c, one in zip(captures, light, strict=True)]
     check = radiometric_check(captures)
     assert "(darker than the capture before, light sensor)" in dict(check.jumps)["2"]
     assert check.chart.full == pytest.approx(-np.log(0.7), abs=0.02)
@@ -76,8 +75,8 @@ def test_captures_of_other_cameras_and_damaged_previews_are_not_compared(tmp_pat
     assert radiometric_check([]) is None
     # Less light in the flight of another camera indicates no shadow.
     bright, dark = (dict.fromkeys(BANDS, value) for value in (1.0, 0.3))
-    of_other = replace(second, light=CaptureLight("other", "1", "1", dark, {}))
-    check = radiometric_check([replace(first, light=replace(first.light, irradiance=bright)), of_other])
+    of_other = replace(second, camera="other", irradiance=dark)
+    check = radiometric_check([replace(first, irradiance=bright), of_other])
     assert (check.bands[0]["overlaps"], check.jumps) == (0, [])
     second.preview.write_bytes(b"no image")
     assert radiometric_check([first, second]).bands[0]["overlaps"] == 0

@@ -14,7 +14,6 @@ from pydantic import BaseModel
 
 from agalign.products.index_bands import RAW
 from agalign.products.index_rasters import IndexReport
-from agalign.products.report.light import CaptureLight, light_of
 from agalign.products.run_record import RefusalPart
 from agalign.products.sidecar import BandPart, BandResult, CaptureResult, GridPart, OutputPart, PreviewPart, Sidecar
 from agalign.values.issues import MISSING_BAND, MOSAICS, OTHER_REFERENCE, UNREADABLE, Remedy
@@ -157,8 +156,6 @@ class FlightFacts:
     pairs: PairTotals = field(default_factory=PairTotals)
     rows: list[dict[str, Any]] = field(default_factory=list)
     """The rows of the pairs in OUT/summary.csv."""
-    light: list[CaptureLight] = field(default_factory=list)
-    """The light of all captures."""
     _lattices: dict[tuple[float, ...], int] = field(default_factory=dict)
     """Centres of windows, which many pairs share, and their index in the data of the report."""
 
@@ -167,7 +164,6 @@ class FlightFacts:
         result = sidecar.result()
         label = Path(folder, sidecar.capture).as_posix()
         self.pairs.add(label, result)
-        self.light.append(light_of(label, sidecar))
         output, position, path = sidecar.output, sidecar.position, Path(folder)
         grid = output or OutputPart(file=None, bytes=None, crop=(0, 0, *sidecar.reference.size_px), nodata=None)
         files = {part.kind: part.file for part in sidecar.products}

@@ -20,10 +20,9 @@ from agalign.config import Settings
 from agalign.errors import SidecarError
 from agalign.products.excluded_captures import PANELS_FILE, SKY_FILE, PanelPart, SkyPart, read_panels, read_sky
 from agalign.products.index_rasters import IndexReport, reports_of_run, update_table
+from agalign.products.report.charts import drifts_of, rig_views
 from agalign.products.report.facts import BAND_COLUMNS, FailureGroup, FlightFacts, masked_shares
-from agalign.products.report.light import light_charts
-from agalign.products.report.radiometric_check import CaptureLevels, radiometric_check
-from agalign.products.report.rigs import drifts_of, rig_views
+from agalign.products.report.light import CaptureLight, light_charts, radiometric_check
 from agalign.products.run_record import RunPart, exclusion_lines, read_run_record
 from agalign.products.sidecar_file import find_sidecars, read_sidecar
 from agalign.products.text_files import write_csv
@@ -54,7 +53,7 @@ def write_pages(out: Path, on_problem: Callable[[str], None]) -> Pages:
     """
     indices: list[IndexReport] = []
     unreadable: list[str] = []
-    facts, levels = FlightFacts(), list[CaptureLevels | None]()
+    facts, light = FlightFacts(), list[CaptureLight]()
     for path in find_sidecars(out):
         folder = path.parent.relative_to(out).as_posix()
         try:
@@ -64,7 +63,7 @@ def write_pages(out: Path, on_problem: Callable[[str], None]) -> Pages:
             continue
         indices += reports_of_run(sidecar, folder, out)
         facts.add(folder, sidecar)
-        levels.append(CaptureLevels.of(path, facts.light[-1], sidecar))
+        light.append(CaptureLight.of(facts.captures[-1]["label"], path, sidecar))
     panels: list[PanelPart] = []
     sky: list[SkyPart] = []
     run: RunPart | None = None
@@ -76,7 +75,7 @@ def write_pages(out: Path, on_problem: Callable[[str], None]) -> Pages:
     facts.add_indices(update_table(out, indices), out)
     failures = facts.pairs.groups()
     slowest = sorted(((c["label"], c["seconds"]) for c in facts.captures), key=lambda c: -c[1])[:5]
-    write_text(out / REPORT_FILE, _page(out, facts, levels, panels, sky, run, unreadable.append))
+    write_text(out / REPORT_FILE, _page(out, facts, light, panels, sky, run, unreadable.append))
     if unreadable:
         with suppress(OSError):
             os.utime(out / REPORT_FILE, (0, 0))
@@ -115,7 +114,7 @@ def _rows_not_aligned(part: PanelPart | SkyPart, status: str) -> list[dict[str, 
 def _page(
     out: Path,
     facts: FlightFacts,
-    levels: Sequence[CaptureLevels | None],
+    light: Sequence[CaptureLight],
     panels: Sequence[PanelPart],
     sky: Sequence[SkyPart],
     run: RunPart | None,
@@ -155,8 +154,8 @@ def _page(
         median=median,
         rigs=rig_views(out, on_problem),
         drifts=drifts_of(facts.captures),
-        light=light_charts(facts.light),
-        check=radiometric_check([one for one in levels if one is not None and one.levels]),
+        light=light_charts(light),
+        check=radiometric_check(light),
         exclusions=[] if run is None else exclusion_lines(run.excluded),
         masked=masked_shares(facts.captures),
         panels=panels,

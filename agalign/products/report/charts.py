@@ -1,7 +1,7 @@
-"""Drawings of the rig of a flight and of its drift, in SVG units."""
+"""Drawings of the rig of a flight, and charts of values of its bands over the captures, in SVG units."""
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -44,14 +44,33 @@ class Line:
 
 @dataclass(frozen=True)
 class FlightChart:
-    """The differences of the bands of a camera over its captures, in the order of time."""
+    """Values of the bands of a camera over its captures, in the order of time."""
 
     title: str
     full: float
-    """Difference at the upper end of the axis."""
+    """Value at the upper end of the axis."""
     lines: tuple[Line, ...]
     ends: tuple[str, str]
     """Labels of the first and the last capture."""
+
+    @classmethod
+    def of(
+        cls, title: str, labels: Sequence[str], names: Sequence[str], values: NDArray[np.float64], min_full: float
+    ) -> "FlightChart":
+        """Return the chart of values (bands, captures); nan breaks a line. Values below `min_full` do not fill it."""
+        full = float(np.abs(values[np.isfinite(values)]).max(initial=min_full))
+        step = max(1, math.ceil(values.shape[1] / 400))  # more points than that are not distinguishable
+        lines = (
+            Line(name, _hue(number, len(names)), _polylines(of_band, full, step))
+            for number, (name, of_band) in enumerate(zip(names, values, strict=True))
+        )
+        return cls(title, full, tuple(lines), (labels[0], labels[-1]))
+
+
+def by_band(captures: Sequence[Mapping[str, Any]], missing: Any = np.nan) -> tuple[list[str], NDArray[np.float64]]:
+    """Return the names of the bands, and values (bands, captures, ...), given those of each capture by band."""
+    names = list(dict.fromkeys(name for of_capture in captures for name in of_capture))
+    return names, np.array([[of_capture.get(name, missing) for of_capture in captures] for name in names], np.float64)
 
 
 def rig_views(out: Path, on_problem: Callable[[str], None]) -> list[RigView]:
@@ -76,7 +95,7 @@ def _rig_view(camera: str, rig: Rig) -> RigView:
     bands = []
     for number, row in enumerate(rows):
         x, y = (PLAN_WIDTH / 2 + to_plan * v for v in row["baseline"])
-        drawn = {"hue": hue_of(number, len(rows)), "x": x, "y": y, "arrows": _arrows(rig, row["band"])}
+        drawn = {"hue": _hue(number, len(rows)), "x": x, "y": y, "arrows": _arrows(rig, row["band"])}
         bands.append(row | drawn)
     shared = ", ".join(rig.factors) or "nothing"
     return RigView(camera, len(rig.captures), shared, FIELD_WIDTH * height / width, tuple(bands))
@@ -93,8 +112,8 @@ def _arrows(rig: Rig, band: str) -> tuple[tuple[float, float, float, float], ...
     return tuple((x, y, x + dx, y + dy) for (x, y), (dx, dy) in zip(starts.tolist(), arrows.tolist(), strict=True))
 
 
-def hue_of(number: int, count: int) -> float:
-    """Return one of `count` equally spaced hues, degrees."""
+def _hue(number: int, count: int) -> float:
+    """One of `count` equally spaced hues, degrees."""
     return round(205 + 360 * number / max(count, 1)) % 360
 
 
@@ -103,37 +122,20 @@ def drifts_of(captures: Sequence[dict[str, Any]]) -> list[FlightChart]:
     result = []
     for camera in dict.fromkeys(c["camera"] for c in captures):
         in_order = sorted((c for c in captures if c["camera"] == camera), key=lambda c: (c["captured_at"], c["label"]))
-        offsets_px = [_offsets_px(c) for c in in_order]
-        names = list(dict.fromkeys(name for of_capture in offsets_px for name in of_capture))
-        if len(in_order) >= 3 and names:
-            lines, full_px = _lines(offsets_px, names)
-            ends = in_order[0]["label"], in_order[-1]["label"]
-            result.append(FlightChart(f"{camera} from capture to capture", full_px, lines, ends))
+        names, offsets_px = by_band([_offsets_px(c) for c in in_order], (np.nan, np.nan))
+        if len(in_order) < 3 or not names:
+            continue
+        differences = [_principal_component(of_band) for of_band in offsets_px]
+        # The sign of a principal component is arbitrary: choose that of the first band.
+        aligned = np.array([d if np.nansum(differences[0] * d) >= 0 else -d for d in differences])
+        labels, min_full_px = [c["label"] for c in in_order], 0.2  # smaller drifts are noise
+        result.append(FlightChart.of(f"{camera} from capture to capture", labels, names, aligned, min_full_px))
     return result
 
 
 def _offsets_px(capture: dict[str, Any]) -> dict[str, tuple[float, float]]:
     usable = [b for b in capture["bands"] if b["status"] in ("aligned", "predicted")]
     return {b["band"]: b["offset_px"] for b in usable if b["offset_px"]}
-
-
-def _lines(captures: Sequence[dict[str, Any]], names: Sequence[str]) -> tuple[tuple[Line, ...], float]:
-    """A line for each band, given offsets (x, y) by band of all captures, and the largest difference."""
-    offsets_px = np.array([[c.get(name, (np.nan, np.nan)) for c in captures] for name in names])
-    differences = [_principal_component(band_offsets_px) for band_offsets_px in offsets_px]
-    # The sign of a principal component is arbitrary: choose that of the first band.
-    differences = [d if np.nansum(differences[0] * d) >= 0 else -d for d in differences]
-    full = max(0.2, float(np.nanmax(np.abs(differences))))  # smaller drifts are noise
-    return lines_of(names, np.array(differences), full), full
-
-
-def lines_of(names: Sequence[str], values: NDArray[np.float64], full: float) -> tuple[Line, ...]:
-    """Return a line for each band, given values (bands, captures) from -full to full; nan breaks a line."""
-    step = max(1, math.ceil(values.shape[1] / 400))  # more points than that are not distinguishable
-    return tuple(
-        Line(name, hue_of(number, len(names)), _polylines(of_band, full, step))
-        for number, (name, of_band) in enumerate(zip(names, values, strict=True))
-    )
 
 
 def _principal_component(offsets_px: NDArray[np.float64]) -> NDArray[np.float64]:
