@@ -69,11 +69,6 @@ _Row = tuple[str, str, str, float]
 """Capture, band, status, largest distance of the matrix from the complete mapping, px."""
 
 
-def _numbered(capture: RunCapture) -> list[BandPart]:
-    """The bands in the order of their numbers in the file names."""
-    return sorted(read_sidecar(capture.path).bands, key=lambda b: (natural_order(b.file), b.band_index))
-
-
 @dataclass
 class ExportReport:
     """Result of an export."""
@@ -211,13 +206,10 @@ def write_opencv(captures: Sequence[RunCapture], target: Path) -> tuple[list[Pat
     """
     files: list[Path] = []
     rows: list[_Row] = []
-    taken: dict[str, str] = {}
-    for capture in captures:
-        name, bands = file_name(capture.label, taken), _numbered(capture)
+    for name, _, bands in _named(captures, {}):
         grids = [_grid(band) for band in bands]
-        matrices = [_fitted(*grid) for grid in grids]
-        errors_px = [_max_distance_px(matrix, *grid) for matrix, grid in zip(matrices, grids, strict=True)]
-        rows += [(name, b.band, b.status, e) for b, e in zip(bands, errors_px, strict=True)]
+        matrices, errors_px = zip(*(_fitted(*grid) for grid in grids), strict=True)
+        rows += _rows(name, bands, errors_px)
         arrays: dict[str, NDArray[np.generic]] = {"bands": np.array([b.band for b in bands])}
         for k, (points_px, mapped_px) in enumerate(grids):
             arrays |= {f"grid_reference_px_{k}": points_px, f"grid_moving_px_{k}": mapped_px}
@@ -241,21 +233,32 @@ def write_micasense(
     rows: list[_Row] = []
     by_camera: dict[str, list[NDArray[np.float64]]] = defaultdict(list)
     taken: dict[str, str] = {}
-    for capture in captures:
-        name, bands = file_name(capture.label, taken), _numbered(capture)
+    for name, capture, bands in _named(captures, taken):
         images = [_original(folder / Path(capture.label).parent / band.file) for band in bands]
         reference = next((i for i, b in zip(images, bands, strict=True) if b.status == "reference"), None)
         if reference is None:
             raise SidecarError(f"{capture.path}: has no reference band; run again with --overwrite")
-        results = [_in_notebook_px(band, reference, image) for band, image in zip(bands, images, strict=True)]
-        rows += [(name, b.band, b.status, e) for b, (_, e) in zip(bands, results, strict=True)]
-        stacked = np.stack([matrix for matrix, _ in results])
+        results = (_in_notebook_px(band, reference, image) for band, image in zip(bands, images, strict=True))
+        matrices, errors_px = zip(*results, strict=True)
+        rows += _rows(name, bands, errors_px)
+        stacked = np.stack(matrices)
         by_camera[images[0].tags.serial or "camera"].append(stacked)
         files.append(_write_npy(target / f"{name}_warp_matrices.npy", stacked))
     for serial, of_camera in by_camera.items():
         matrices_of_camera = _nearest_to_median(of_camera, captures[0].result.reference.size_px)
         files.append(_write_npy(target / f"{file_name(serial, taken)}_warp_matrices_opencv.npy", matrices_of_camera))
     return files, rows
+
+
+def _named(captures: Sequence[RunCapture], taken: dict[str, str]) -> Iterator[tuple[str, RunCapture, list[BandPart]]]:
+    """Yield (file name, capture, its bands in the order of their numbers in the file names)."""
+    for capture in captures:
+        bands = sorted(read_sidecar(capture.path).bands, key=lambda b: (natural_order(b.file), b.band_index))
+        yield file_name(capture.label, taken), capture, bands
+
+
+def _rows(name: str, bands: Sequence[BandPart], errors_px: Sequence[float]) -> list[_Row]:
+    return [(name, b.band, b.status, e) for b, e in zip(bands, errors_px, strict=True)]
 
 
 def _input_of(out: Path) -> Path:
@@ -272,9 +275,14 @@ def _grid(band: BandPart) -> tuple[Points, Points]:
     return np.array(band.grid.reference_px), np.array(band.grid.moving_px)
 
 
-def _fitted(points_px: Points, mapped_px: Points) -> Matrix:
-    """The homography between corresponding points (n, 2); the identity without any."""
-    return geometry.fit_homography(points_px, mapped_px) if len(points_px) else geometry.identity()
+def _fitted(points_px: Points, mapped_px: Points, matrix: Matrix | None = None) -> tuple[Matrix, float]:
+    """(`matrix` or the homography between corresponding points (n, 2), which is the identity without any; the largest
+    distance of the points that it maps from the corresponding ones, px).
+    """
+    if matrix is None:
+        matrix = geometry.fit_homography(points_px, mapped_px) if len(points_px) else geometry.identity()
+    distances_px = np.linalg.norm(geometry.apply(matrix, points_px) - mapped_px, axis=1)
+    return matrix, float(distances_px.max(initial=0.0))
 
 
 def _original(path: Path) -> ImageFile:
@@ -289,10 +297,9 @@ def _in_notebook_px(band: BandPart, reference: ImageFile, image: ImageFile) -> t
     new_reference, new_band = _new_camera_matrix(reference_lens, reference), _new_camera_matrix(band_lens, image)
     points_px, mapped_px = _grid(band)
     undistorted, mapped = lens.undistort(reference_lens, points_px), lens.undistort(band_lens, mapped_px)
-    matrix = _fitted(undistorted, mapped)
-    if band.homography is not None and band.homography.space == "undistorted":
-        matrix = np.array(band.homography.fixed_to_moving)
-    error_px = _max_distance_px(matrix, undistorted, mapped)
+    mapping = band.homography
+    known = None if mapping is None or mapping.space != "undistorted" else np.array(mapping.fixed_to_moving)
+    matrix, error_px = _fitted(undistorted, mapped, known)
     to_new, from_new = new_band @ np.linalg.inv(band_lens.matrix), reference_lens.matrix @ np.linalg.inv(new_reference)
     return geometry.compose(to_new, matrix, from_new), error_px
 
@@ -319,11 +326,6 @@ def _nearest_to_median(captures: Sequence[NDArray[np.float64]], size_px: tuple[i
     mapped = np.array([[geometry.apply(m, corners_px) for m in matrices] for matrices in complete])
     distances_px = np.linalg.norm(mapped - np.median(mapped, axis=0), axis=-1)
     return complete[int(distances_px.mean(axis=(1, 2)).argmin())]
-
-
-def _max_distance_px(matrix: Matrix, points_px: Points, mapped_px: Points) -> float:
-    distances_px = np.linalg.norm(geometry.apply(matrix, points_px) - mapped_px, axis=1)
-    return float(distances_px.max(initial=0.0))
 
 
 def _write_npy(path: Path, matrices: NDArray[np.float64]) -> Path:

@@ -55,13 +55,8 @@ def sidecar_of(context: ProductContext, not_written: Sequence[str] = (), seconds
     facts = {
         "agalign": __version__,
         "capture": capture.name,
-        "capture_id": capture.capture_id,
-        "flight_id": capture.flight_id,
-        "captured_at": capture.captured_at,
-        "position": capture.position,
-        "camera": capture.camera,
+        **_fields(capture, "capture_id", "flight_id", "captured_at", "position", "camera", "missing_bands"),
         "status": "degraded" if status == "ok" and capture.missing_bands else status,
-        "missing_bands": capture.missing_bands,
         "reference": _source(reference) | {"width": width, "height": height, "georeferenced": is_mosaic},
         "bands": bands,
         "output": _output(context) if context.layers else None,
@@ -110,6 +105,10 @@ def _file(file: WrittenFile, context: ProductContext) -> dict[str, Any]:
     return {"file": context.paths.relative(file.path), "bytes": file.path.stat().st_size}
 
 
+def _fields(record: object, *names: str) -> dict[str, Any]:
+    return {name: getattr(record, name) for name in names}
+
+
 def _nodata(value: float | None) -> float | str | None:
     """The value, with the text "nan" for nan, which JSON does not have."""
     return "nan" if value is not None and math.isnan(value) else value
@@ -137,21 +136,15 @@ def _band_part(context: ProductContext, band: Band) -> BandPart:
     mapping, size_px = alignment.mapping, context.capture.reference.size_px
     grid_px = _grid_px(mapping.of_the_plane, size_px)
     lenses = (mapping.fixed_lens, mapping.moving_lens)
+    facts |= _fields(alignment, "status", "reason", "issues", "seed", "joint", "prediction", "seconds")
     facts |= {
-        "status": alignment.status,
-        "reason": alignment.reason,
-        "issues": alignment.issues,
         "homography": alignment,
-        "seed": alignment.seed,
         "grid": {"reference_px": grid_px, "moving_px": mapping(grid_px)},
-        "joint": alignment.joint,
         "metrics": _metrics(alignment),
         "geometry": {"kind": alignment.geometry, "held_out_p95_px": alignment.candidates},
         "lenses": None if None in lenses else lenses,
         "field": mapping.field,
         "relief": _relief(context, mapping, grid_px),
-        "prediction": alignment.prediction,
-        "seconds": alignment.seconds,
     }
     part = BandPart.model_validate(facts)
     if part.joint is not None:

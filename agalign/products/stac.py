@@ -141,6 +141,8 @@ def _projection(capture: Capture, grid: OutputGrid) -> dict[str, Any]:
 def _add_assets(item: "pystac.Item", context: ProductContext) -> None:
     """Add the sidecar and every file with a STAC asset."""
     import pystac
+    from pystac.extensions.eo import EOExtension
+    from pystac.extensions.raster import RasterExtension
 
     folder, sidecar = context.paths.folder, context.paths.sidecar
     by_name = {b.name: b for b in context.capture.bands}
@@ -151,6 +153,8 @@ def _add_assets(item: "pystac.Item", context: ProductContext) -> None:
         asset = pystac.Asset(href, roles=roles, media_type=file.asset.media_type)
         item.add_asset(file.asset.key, asset)
         if file.bands:
+            EOExtension.add_to(item)
+            RasterExtension.add_to(item)
             _describe_bands(asset, [by_name[n] for n in file.bands], file.nodata, context)
     item.add_asset("sidecar", pystac.Asset(sidecar.name, media_type=pystac.MediaType.JSON, roles=["metadata"]))
 
@@ -159,28 +163,21 @@ def _describe_bands(
     asset: "pystac.Asset", bands: Sequence[Band], nodata: float | None, context: ProductContext
 ) -> None:
     """Describe the bands of an asset in the fields of the extensions, and in the common `bands` of STAC 1.1."""
-    from pystac.extensions.eo import Band as EoBand
-    from pystac.extensions.eo import EOExtension
-    from pystac.extensions.raster import DataType, NoDataStrings, RasterBand, RasterExtension
-
     raw = context.write_settings.radiometry == "off"
     dtype = np.result_type(*(b.dtype for b in bands)).name if raw else "float32"
-    missing = NoDataStrings.NAN if nodata is not None and math.isnan(nodata) else nodata
-    eo, raster, common = [], [], []
+    of_type = {"data_type": dtype, "nodata": "nan" if nodata is not None and math.isnan(nodata) else nodata}
+    described: list[tuple[dict[str, Any], ...]] = []
     for band in bands:
         scale, offset = band.scale_offset if raw else (1.0, 0.0)
         unit = UNITS[band.radiometry.quantity] if not raw and band.radiometry is not None else None
-        name, middle, width = _common_name(band, context.capture), _um(band.wavelength_nm), _um(band.bandwidth_nm)
-        eo.append(EoBand.create(band.name, name, None, middle, width))
-        raster.append(
-            RasterBand.create(data_type=DataType(dtype), nodata=missing, unit=unit, scale=scale, offset=offset)
+        eo = {"common_name": _common_name(band, context.capture), "center_wavelength": _um(band.wavelength_nm)}
+        eo |= {"full_width_half_max": _um(band.bandwidth_nm)}
+        common = {"name": band.name, **of_type, "unit": unit, **{f"eo:{k}": v for k, v in eo.items()}}
+        described.append(
+            ({"name": band.name, **eo}, of_type | {"unit": unit, "scale": scale, "offset": offset}, common)
         )
-        facts = {"name": band.name, "data_type": dtype, "nodata": missing, "unit": unit, "eo:common_name": name}
-        facts |= {"eo:center_wavelength": middle, "eo:full_width_half_max": width}
-        common.append({k: v for k, v in facts.items() if v is not None})
-    EOExtension.ext(asset, add_if_missing=True).bands = eo
-    RasterExtension.ext(asset, add_if_missing=True).bands = raster
-    asset.extra_fields["bands"] = common
+    for key, parts in zip(("eo:bands", "raster:bands", "bands"), zip(*described, strict=True), strict=True):
+        asset.extra_fields[key] = [{k: v for k, v in part.items() if v is not None} for part in parts]
 
 
 def _um(length_nm: float | None) -> float | None:
