@@ -32,7 +32,7 @@ def main(captures: Number = 3) -> None:
     infrared_and_red, reference = (bands["NIR"], bands["Red"]), cameras.BANDS[cameras.REFERENCE]
     with flight_and_out() as (flight, out):
         synthetic.make_flight(flight, captures, SIZE_PX)
-        poses, ground, _ = synthetic.plan_flight(captures, SIZE_PX)
+        poses, ground = synthetic.plan_flight(np.random.default_rng(0), captures, SIZE_PX)
         agalign.align_folder(flight, out, settings=Settings(write=WriteSettings(radiometry="auto")))
         reports = [r for done in run_indices(index_tasks(out, [NDVI], out)) for r in done]
         painted = [reflectance(ground, band) for band in infrared_and_red]

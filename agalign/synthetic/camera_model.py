@@ -158,22 +158,17 @@ def _pixel_to_ground(band: BandSpec, pose: Pose, size_px: tuple[int, int]) -> Ma
     return geometry.normalised(ray_to_ground @ rays)
 
 
-def to_plane(reference: BandSpec, band: BandSpec, size_px: tuple[int, int]) -> Matrix:
-    """Return the homography from undistorted pixels of a band to those of the reference, for lenses at one position."""
-    rays = _rotation(*band.rig_degrees) @ np.linalg.inv(band.lens(*size_px).matrix)
-    return np.asarray(reference.lens(*size_px).matrix @ _rotation(*reference.rig_degrees).T @ rays)
-
-
 def place_and_rays(band: BandSpec, pose: Pose, size_px: tuple[int, int]) -> tuple[NDArray[np.float64], Matrix]:
     """Return the position of the lens (metres east, south, down) and the 3x3 matrix from undistorted pixels to rays."""
-    attitude = _rotation(pose.roll_deg, pose.pitch_deg, pose.yaw_deg)
-    rays = attitude @ _rotation(*band.rig_degrees) @ np.linalg.inv(band.lens(*size_px).matrix)
+    attitude = rotation(pose.roll_deg, pose.pitch_deg, pose.yaw_deg)
+    rays = attitude @ rotation(*band.rig_degrees) @ np.linalg.inv(band.lens(*size_px).matrix)
     flown = band.delay_s * np.array([*pose.velocity_m_s, 0.0])
     place = attitude @ np.array([*band.baseline_m, 0.0]) + flown + (pose.east_m, pose.north_m, -pose.altitude_m)
     return place, rays
 
 
-def _rotation(a_deg: float, b_deg: float, c_deg: float) -> Matrix:
+def rotation(a_deg: float, b_deg: float, c_deg: float) -> Matrix:
+    """Return the product of the rotations about x, y and z by these angles."""
     rotations = [
         cv2.Rodrigues(np.radians(angle) * axis)[0] for angle, axis in zip((a_deg, b_deg, c_deg), np.eye(3), strict=True)
     ]

@@ -73,8 +73,8 @@ def make_flight(
     """
     rng, truth = np.random.default_rng(rng_seed), dict[str, Any]()
     for first in range(0, captures, _CAPTURES_PER_GROUND):
-        poses = [_pose(rng, number, altitude_m) for number in range(min(_CAPTURES_PER_GROUND, captures - first))]
-        ground = paint_ground(rng, poses, size_px, relief_m, camera)
+        count = min(_CAPTURES_PER_GROUND, captures - first)
+        poses, ground = plan_flight(rng, count, size_px, camera, relief_m, altitude_m)
         truth |= _write(folder, [Shot(pose, ground) for pose in poses], size_px, camera, rng, first)
     return _write_truth(folder, truth)
 
@@ -139,16 +139,26 @@ def _truth(shot: Shot, number: int, camera: CameraSpec, size_px: tuple[int, int]
 
 
 def plan_flight(
+    rng: np.random.Generator,
     captures: int,
     size_px: tuple[int, int],
-    rng_seed: int = 0,
+    camera: CameraSpec = REDEDGE,
     relief_m: float = 0.0,
     altitude_m: tuple[float, float] = ALTITUDE_M,
-) -> tuple[list[Pose], Ground, np.random.Generator]:
-    """Return (poses, ground, generator of the noise) of the flight that `make_flight` writes."""
-    rng = np.random.default_rng(rng_seed)
-    poses = [_pose(rng, number, altitude_m) for number in range(captures)]
-    return poses, paint_ground(rng, poses, size_px, relief_m), rng
+) -> tuple[list[Pose], Ground]:
+    """Return the poses of captures, as in `make_flight`, and their ground."""
+    poses = [
+        Pose(
+            altitude_m=float(rng.uniform(*altitude_m)),
+            yaw_deg=float(rng.uniform(-180, 180)),
+            roll_deg=float(rng.normal(0, 2)),
+            pitch_deg=float(rng.normal(0, 2)),
+            east_m=4.0 * (number % 10),
+            north_m=4.0 * (number // 10),
+        )
+        for number in range(captures)
+    ]
+    return poses, paint_ground(rng, poses, size_px, relief_m, camera)
 
 
 def true_ties(
@@ -212,17 +222,6 @@ def recorded(
     return np.asarray((np.clip(np.rint(levels / 16), 0, 4095) * 16).astype(np.uint16))
 
 
-def _pose(rng: np.random.Generator, number: int, altitude_m: tuple[float, float]) -> Pose:
-    return Pose(
-        altitude_m=float(rng.uniform(*altitude_m)),
-        yaw_deg=float(rng.uniform(-180, 180)),
-        roll_deg=float(rng.normal(0, 2)),
-        pitch_deg=float(rng.normal(0, 2)),
-        east_m=4.0 * (number % 10),
-        north_m=4.0 * (number // 10),
-    )
-
-
 @dataclass(frozen=True)
 class Score:
     """Error of a band pair at the tie points of the ground truth."""
@@ -246,12 +245,10 @@ def score_against_truth(reports: list[CaptureReport], truth_path: Path) -> list[
             known = truth[report.sidecar.capture]["bands"].get(band.file)
             if known is None or band.grid is None:
                 continue
-            ties = np.asarray(known["ties"], dtype=np.float64)
+            fixed_px, moving_px = np.hsplit(np.asarray(known["ties"], dtype=np.float64), 2)
             mapping = CloughTocher2DInterpolator(np.asarray(band.grid.reference_px), np.asarray(band.grid.moving_px))
-            error = np.linalg.norm(mapping(ties[:, :2]) - ties[:, 2:], axis=1)
-            before = np.linalg.norm(ties[:, :2] - ties[:, 2:], axis=1)
-            median, p95 = np.nanpercentile(error, (50, 95))
-            scores.append(
-                Score(report.label, band.band, band.status, float(np.median(before)), float(median), float(p95))
-            )
+            before_px = float(np.median(np.linalg.norm(fixed_px - moving_px, axis=1)))
+            errors_px = np.linalg.norm(mapping(fixed_px) - moving_px, axis=1)
+            numbers = np.nanpercentile(errors_px, (50, 95)).tolist()
+            scores.append(Score(report.label, band.band, band.status, before_px, *numbers))
     return scores

@@ -9,9 +9,10 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from agalign.cameras.tiff_directory import rational
-from agalign.synthetic.camera_model import BandSpec, CameraSpec, Exposure, to_plane
+from agalign.synthetic.camera_model import BandSpec, CameraSpec, Exposure, rotation
 from agalign.synthetic.cameras import BLACK_LEVEL, EXPOSURE_S, WHITE_LEVEL, MicaSenseCamera, write_tiff
 from agalign.values import geometry
+from agalign.values.geometry import Matrix
 
 _HERE = Path(__file__).parent
 _DJI, _SENTERA = ((_HERE / name).read_text(encoding="utf-8") for name in ("dji.xmp", "sentera.xmp"))
@@ -148,3 +149,9 @@ to each side; at 8 m/s and 28 m up near infra-red moves by 32 px against red bet
 ALTUM, ALTUM_PT = (_camera(name, MicaSenseCamera) for name in ("altum", "altum-pt"))
 SENTERA_6X = _camera("6x", SenteraCamera)
 """One folder per band; registered on board except for the parallax and small angles."""
+
+
+def to_plane(reference: BandSpec, band: BandSpec, size_px: tuple[int, int]) -> Matrix:
+    """Return the homography from undistorted pixels of a band to those of the reference, for lenses at one position."""
+    rays = rotation(*band.rig_degrees) @ np.linalg.inv(band.lens(*size_px).matrix)
+    return np.asarray(reference.lens(*size_px).matrix @ rotation(*reference.rig_degrees).T @ rays)

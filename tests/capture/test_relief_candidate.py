@@ -7,6 +7,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from synthetic_flights.cameras import to_plane
 from synthetic_flights.depth import CLOSE_RANGE, Scene, Truth, truth_of, view
 from synthetic_flights.relief import make_scene
 
@@ -30,7 +31,7 @@ from agalign.capture.warped_pair import WarpedPair
 from agalign.config import JointSettings, ReliefSettings, Settings
 from agalign.flight.rig import Rig
 from agalign.relief.range import inverse_range
-from agalign.synthetic.camera_model import BandSpec, CameraSpec, to_plane
+from agalign.synthetic.camera_model import BandSpec, CameraSpec
 from agalign.synthetic.flight import recorded
 from agalign.values import geometry, lens
 from agalign.values.alignment import Alignment, Seed

@@ -143,7 +143,8 @@ def stripes(light: Field, _rng: np.random.Generator) -> Field:
 
 @pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
 def test_a_capture_with_common_stripes_is_aligned(tmp_path: Path) -> None:
-    poses, ground, rng = plan_flight(1, SIZE_PX, rng_seed=3)
+    rng = np.random.default_rng(3)
+    poses, ground = plan_flight(rng, 1, SIZE_PX)
     truth = write_shots(tmp_path, [Shot(poses[0], ground, stripes)], SIZE_PX, REDEDGE, rng)
     reports = agalign.align_folder(tmp_path, tmp_path / "out")
     scores = score_against_truth(reports, truth)
