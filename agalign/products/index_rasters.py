@@ -9,18 +9,18 @@ import io
 import json
 import math
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path, PurePosixPath
 from typing import Any
 
 import cv2
 import numpy as np
-import tifffile
 from numpy.typing import NDArray
 
 from agalign._version import __version__
 from agalign.config import WriteSettings
-from agalign.errors import AgalignError, ConfigurationError, InputError
+from agalign.errors import ConfigurationError, InputError
 from agalign.pixels.raster import OpenRaster, open_raster
 from agalign.products.checked_raster import (
     FLOAT_OPTIONS,
@@ -34,7 +34,7 @@ from agalign.products.drawing import with_text, write_png
 from agalign.products.index_bands import RAW, BandReader, IndexBand
 from agalign.products.indices import Index, bands_for, compute, index_named
 from agalign.products.product import GEOTIFF, CapturePaths, Product, ProductContext, StacAsset, WrittenFile
-from agalign.products.raster_file import to_cog
+from agalign.products.raster_file import tags_of, to_cog
 from agalign.products.sidecar import CaptureResult
 from agalign.products.text_files import write_csv
 from agalign.values.capture import Band, Capture
@@ -120,15 +120,6 @@ def _statistics_in(tags: Mapping[str, str]) -> IndexStatistics | None:
         unit = str(fields.pop("unit"))
         return IndexStatistics(unit=unit, **{k: math.nan if v is None else float(v) for k, v in fields.items()})
     except (KeyError, ValueError, TypeError):
-        return None
-
-
-def _read_statistics(path: Path) -> IndexStatistics | None:
-    """Return the statistics of an index raster; None for another file, or one that cannot be read."""
-    try:
-        with open_raster(path) as source:
-            return _statistics_in(source.tags())
-    except AgalignError:
         return None
 
 
@@ -227,7 +218,7 @@ def outdated_rasters(base: Path) -> Iterator[Path]:
     """Yield the index rasters of a capture, `base`_<index>.tif, and their pictures."""
     for path in base.parent.glob(f"{glob.escape(base.name)}_*.tif"):
         # A file with a sidecar is the stack of another capture.
-        if not path.with_suffix(".json").exists() and _read_statistics(path) is not None:
+        if not path.with_suffix(".json").exists() and _statistics_in(tags_of(path)) is not None:
             yield from (path, path.with_suffix(".png"))
 
 
@@ -250,15 +241,12 @@ def _fingerprint(index: Index, bands: Sequence[IndexBand]) -> str:
 
 def _finished_before(target: Path, source: str) -> IndexStatistics | None:
     """The statistics of a complete raster with its picture and this fingerprint; None if there is none."""
-    if not target.is_file() or not target.with_suffix(".png").is_file():
-        return None
-    try:
+    with suppress(OSError):
         check_complete(target)
-        with open_raster(target) as dataset:
-            tags = dataset.tags()
-    except (AgalignError, OSError, tifffile.TiffFileError):
-        return None
-    return _statistics_in(tags) if tags.get("INDEX_MADE_FROM") == source else None
+        tags = tags_of(target)
+        if tags.get("INDEX_MADE_FROM") == source and target.with_suffix(".png").is_file():
+            return _statistics_in(tags)
+    return None
 
 
 def _common_unit(index: Index, bands: Sequence[IndexBand], reader: BandReader) -> str:
@@ -390,7 +378,7 @@ def reports_of_run(sidecar: CaptureResult, folder: str, out: Path) -> list[Index
         path = out / folder / part.file
         if part.kind == "index" and path.suffix == ".tif":
             name = path.stem.removeprefix(f"{Path(sidecar.capture).name}_")
-            statistics = _read_statistics(path)
+            statistics = _statistics_in(tags_of(path))
             if statistics is not None:
                 label = Path(folder, sidecar.capture).as_posix()
                 result.append(IndexReport(label, name, path, statistics).of(sidecar))

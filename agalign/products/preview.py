@@ -13,8 +13,8 @@ The JPEG has a column for each band of the sidecar, in its order, and these rows
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -45,26 +45,13 @@ def preview_bytes(captures: int) -> int:
     return min(600_000, 44_000_000 // max(captures, 1))
 
 
-@dataclass(frozen=True)
-class ReliefView:
+class ReliefView(NamedTuple):
     """The relief of a capture, reduced to the size of a tile."""
 
     parallax_px: NDArray[np.float32]
     """(height, width)"""
     range_m: tuple[float, float] | None
     """Smallest and largest range; None if it is unknown."""
-
-    @property
-    def limits_px(self) -> tuple[float, float]:
-        """Parallax shown as black and as white."""
-        low, high = np.percentile(self.parallax_px, _RELIEF_PERCENTILES)
-        return float(low), max(float(high), float(low) + 1e-3)
-
-    @property
-    def grey(self) -> Grey:
-        """The parallax as grey values (height, width)."""
-        low, high = self.limits_px
-        return np.asarray(np.rint(((self.parallax_px - low) / (high - low)).clip(0, 1) * 255), np.uint8)
 
 
 class Preview(Product):
@@ -96,10 +83,8 @@ def relief_view(context: ProductContext) -> ReliefView | None:
     size_px = reduced_size_px((context.grid.width, context.grid.height), reduction)
     layers = relief_layers(context.capture, context.with_pixels, relief, context.grid, size_px)
     range_m = layers["range"][np.isfinite(layers["range"])]
-    if range_m.size == 0:
-        return ReliefView(layers["parallax"], None)
-    near, far = np.percentile(range_m, _RELIEF_PERCENTILES).tolist()
-    return ReliefView(layers["parallax"], (near, far))
+    limits_m = tuple(np.percentile(range_m, _RELIEF_PERCENTILES).tolist()) if range_m.size else None
+    return ReliefView(layers["parallax"], limits_m)
 
 
 def write_preview(
@@ -150,8 +135,13 @@ def _sheet(
     if errors_px:
         errors = {name: np.nan_to_num(e / ERROR_FULL_PX, nan=1.0).clip(0, 1) * 255 for name, e in errors_px.items()}
         rows.append([_resized(np.asarray(errors.get(n, black), np.uint8), tile_px) for n in bands])
+    relief_part = None
     if relief is not None:
-        rows.append([_resized(relief.grey, tile_px)])
+        low, high = np.percentile(relief.parallax_px, _RELIEF_PERCENTILES).tolist()
+        high = max(high, low + 1e-3)
+        grey = np.rint(((relief.parallax_px - low) / (high - low)).clip(0, 1) * 255)
+        rows.append([_resized(np.asarray(grey, np.uint8), tile_px)])
+        relief_part = ReliefPreviewPart(parallax_px=(low, high), range_m=relief.range_m)
     strips = [np.hstack(row) for row in rows]
     sheet_width = max(s.shape[1] for s in strips)
     sheet = np.vstack([np.pad(s, ((0, 0), (0, sheet_width - s.shape[1]))) for s in strips])
@@ -161,7 +151,7 @@ def _sheet(
         detail_px=detail_px,
         detail=(x / width, y / height, detail_px[0] / width, detail_px[1] / height),
         error_full_px=ERROR_FULL_PX if errors_px else None,
-        relief=None if relief is None else _relief_part(relief),
+        relief=relief_part,
     )
     return part, np.asarray(sheet, np.uint8)
 
@@ -176,12 +166,6 @@ def _resized(image: Grey, size_px: tuple[int, int]) -> Grey:
     """The image at a size (width, height)."""
     larger = size_px[0] > image.shape[1]
     return np.asarray(cv2.resize(image, size_px, interpolation=cv2.INTER_LINEAR if larger else cv2.INTER_AREA))
-
-
-def _relief_part(relief: ReliefView) -> ReliefPreviewPart:
-    low, high = relief.limits_px
-    range_m = None if relief.range_m is None else (round(relief.range_m[0], 3), round(relief.range_m[1], 3))
-    return ReliefPreviewPart(parallax_px=(round(low, 2), round(high, 2)), range_m=range_m)
 
 
 class BeforeAfterPicture(Product):

@@ -3,6 +3,7 @@
 import itertools
 import math
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -102,11 +103,14 @@ def write_raster(
 
 def is_aligned_raster(path: Path) -> bool:
     """Return True for a file that `write_raster` has written."""
-    try:
-        with open_raster(path) as source:
-            return "REFERENCE_BAND" in source.tags()
-    except AgalignError:
-        return False
+    return "REFERENCE_BAND" in tags_of(path)
+
+
+def tags_of(path: Path) -> dict[str, str]:
+    """Return the tags of a raster; none for another file, or one that cannot be read."""
+    with suppress(AgalignError), open_raster(path) as source:
+        return dict(source.tags())
+    return {}
 
 
 def media_type(settings: WriteSettings) -> str:

@@ -65,6 +65,8 @@ PointsPx = Annotated[list[PointPx], _FromProgram(_from_array)]
 Coefficients = Annotated[list[PointPx], _FromProgram(partial(_from_array, decimals=9))]
 """Nine decimals: they are multiplied by the square of the parallax, up to hundreds of px."""
 Finite = Annotated[Number | None, _measured()]
+Number2 = Annotated[Number, _measured(2)]
+Number3 = Annotated[Number, _measured(3)]
 Fraction4 = Annotated[Number | None, _measured(4)]
 Fraction6 = Annotated[Number | None, _measured(6)]
 """Digits beyond the sixth depend on the order in which threads add up."""
@@ -306,7 +308,7 @@ class SimilarityPart(_Part):
 class ResidualTile(_Part):
     """Shift of a window after alignment."""
 
-    centre_px: tuple[Annotated[Number, _measured(2)], Annotated[Number, _measured(2)]]
+    centre_px: tuple[Number2, Number2]
     """Centre of the window, px of the reference."""
     shift_px: tuple[Fraction4, Fraction4]
     """Shift, px of the reference; null if none could be measured."""
@@ -429,7 +431,7 @@ class BandResult(_Result):
     """Prediction."""
     place: PlacePart | None = None
     """Where the aligned pixels of the band are."""
-    seconds: Annotated[Number, _measured(3)]
+    seconds: Number3
     """Processing time."""
     saturated: Fraction4 = None
     """Share of saturated pixels in the file."""
@@ -529,9 +531,9 @@ class ProductPart(_Part):
 class ReliefPreviewPart(_Part):
     """Picture of the parallax: first column, last row."""
 
-    parallax_px: tuple[Number, Number]
+    parallax_px: tuple[Number2, Number2]
     """Parallax shown as black and as white (nearest), px."""
-    range_m: tuple[Number, Number] | None
+    range_m: tuple[Number3, Number3] | None
     """1st and 99th percentile of the range, m; null if unknown."""
 
 
@@ -599,7 +601,7 @@ class CaptureResult(_Result):
     """Settings that differ from the defaults, by stage and name; null in older sidecars."""
     input_samples: dict[str, str] = {}
     """Hash of some bytes of the file of each band: it identifies captures without tags."""
-    seconds: Annotated[Number, _measured(3)] = 0.0
+    seconds: Number3 = 0.0
     """Processing time, with reading and writing."""
     checksum: str | None = None
     """SHA-256 of the content as JSON with sorted keys and no spaces, without `checksum` and `seconds`."""
