@@ -1,8 +1,8 @@
 """A synthetic flight over a farm, in the file format of a MicaSense-like camera, with ground truth.
 
-The scene is a plane of parcels with crop rows of different directions and spacings, bare soil, tracks and trees, or
-terraces with trees on them. Each band has its own lens (distortion, principal point), position and orientation in the
-rig, and spectrum: vegetation is darker than soil in the visible bands and much brighter in the near infrared.
+The scene is a plane of parcels with crop rows of different directions and spacings, bare soil, tracks and trees. Each
+band has its own lens (distortion, principal point), position and orientation in the rig, and spectrum: vegetation is
+darker than soil in the visible bands and much brighter in the near infrared.
 """
 
 import json
@@ -60,21 +60,19 @@ def make_flight(
     size_px: tuple[int, int] = (1280, 960),
     rng_seed: int = 0,
     camera: CameraSpec = REDEDGE,
-    relief_m: float = 0.0,
     altitude_m: tuple[float, float] = ALTITUDE_M,
 ) -> Path:
     """Write captures of all bands to folder/0000SET/000, and return the path of their ground truth.
 
     The ground truth, folder/truth.json, is {capture: {"reference": file, "bands": {file: {"fixed_to_moving": [[...]],
     "ties": [[x_ref, y_ref, x_mov, y_mov], ...]}}}}: the homography between undistorted pixels, and tie points in raw
-    pixels, exact to 0.001 px; the centre of the top-left pixel is (0, 0). With `relief_m` the ground has terraces of
-    that height and trees half as high; the homography is then that of the plane below them, and the tie points include
-    the relief. `altitude_m` is the lowest and the highest altitude above the plane.
+    pixels, exact to 0.001 px; the centre of the top-left pixel is (0, 0). `altitude_m` is the lowest and the highest
+    altitude above the plane.
     """
     rng, truth = np.random.default_rng(rng_seed), dict[str, Any]()
     for first in range(0, captures, _CAPTURES_PER_GROUND):
         count = min(_CAPTURES_PER_GROUND, captures - first)
-        poses, ground = plan_flight(rng, count, size_px, camera, relief_m, altitude_m)
+        poses, ground = plan_flight(rng, count, size_px, camera, altitude_m)
         truth |= _write(folder, [Shot(pose, ground) for pose in poses], size_px, camera, rng, first)
     return _write_truth(folder, truth)
 
@@ -143,7 +141,6 @@ def plan_flight(
     captures: int,
     size_px: tuple[int, int],
     camera: CameraSpec = REDEDGE,
-    relief_m: float = 0.0,
     altitude_m: tuple[float, float] = ALTITUDE_M,
 ) -> tuple[list[Pose], Ground]:
     """Return the poses of captures, as in `make_flight`, and their ground."""
@@ -158,7 +155,7 @@ def plan_flight(
         )
         for number in range(captures)
     ]
-    return poses, paint_ground(rng, poses, size_px, relief_m, camera)
+    return poses, paint_ground(rng, poses, size_px, camera)
 
 
 def true_ties(

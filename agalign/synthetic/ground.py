@@ -1,4 +1,4 @@
-"""The ground of a synthetic flight: parcels with crop rows, bare soil, tracks and trees, flat or in terraces."""
+"""The ground of a synthetic flight: parcels with crop rows, bare soil, tracks and trees."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -32,11 +32,7 @@ class Ground:
 
 
 def paint_ground(
-    rng: np.random.Generator,
-    poses: Sequence[Pose],
-    size_px: tuple[int, int],
-    relief_m: float = 0.0,
-    camera: CameraSpec = REDEDGE,
+    rng: np.random.Generator, poses: Sequence[Pose], size_px: tuple[int, int], camera: CameraSpec = REDEDGE
 ) -> Ground:
     """Return a ground with parcels, rows, tracks and trees, large and fine enough for all bands at all poses."""
     focal = FOCAL_LENGTH_MM * PIXELS_PER_MM * size_px[0] / 1280
@@ -80,7 +76,6 @@ def paint_ground(
         brightness.astype(np.float32),
         np.clip(vigour, -1.5, 1.5).astype(np.float32),
         metres_per_px,
-        _relief(rng, tree, metre, relief_m) if relief_m else None,
     )
 
 
@@ -118,20 +113,6 @@ def on_ground(ground: Ground, band: BandSpec, pose: Pose, size_px: tuple[int, in
 def map_px(ground: Ground, metres: Points) -> Points:
     """Return positions in metres east and south as pixels of the painted ground."""
     return metres / ground.metres_per_px + (len(ground.crop) - 1) / 2
-
-
-def _relief(rng: np.random.Generator, tree: Field, metre: float, relief_m: float) -> Field:
-    """Return heights above the plane, metres: three levels connected by slopes, with round trees.
-
-    Slopes are gentle enough to cause no occlusions, which cannot be aligned.
-    """
-    angle, terrace_m = rng.uniform(0, np.pi), 8.0
-    axis = np.arange(len(tree)) / (terrace_m * metre)
-    along = np.cos(angle) * axis[None, :] + np.sin(angle) * axis[:, None]
-    slope = np.clip((along % 1 - 0.4) / 0.6, 0, 1)
-    level = np.floor(along) + slope * slope * (3 - 2 * slope)
-    crowns = cv2.GaussianBlur(tree, (0, 0), 0.4 * metre)
-    return np.asarray(relief_m * (np.abs(level % 4 - 2) + 0.5 * crowns), np.float32)
 
 
 def _parcels(rng: np.random.Generator, side: int, count: int) -> tuple[NDArray[np.int64], Field]:

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +12,7 @@ from scipy.special import expit
 
 from agalign.synthetic.camera_model import CameraSpec, Pose
 from agalign.synthetic.cameras import REDEDGE
-from agalign.synthetic.flight import Shot, write_shots
+from agalign.synthetic.flight import Shot, plan_flight, write_shots
 from agalign.synthetic.ground import Field, Ground, paint_ground
 from synthetic_flights.cameras import MAVIC
 
@@ -59,6 +60,15 @@ def make_two_headings(
     return write_shots(folder, shots, size_px, camera, rng)
 
 
+def make_terraces(folder: Path, size_px: tuple[int, int], rng_seed: int, relief_m: float) -> Path:
+    """Write a capture of terraces. The homographies of its truth are those of the plane below them, and the tie points
+    include the relief. Returns the path of truth.json, as `make_flight` does.
+    """
+    rng = np.random.default_rng(rng_seed)
+    (pose,), ground = plan_flight(rng, 1, size_px)
+    return write_shots(folder, [Shot(pose, _terraces(rng, ground, relief_m))], size_px, REDEDGE, rng)
+
+
 def _plan(captures: int) -> list[Make]:
     """What to make of each capture: troubles first and last where they belong, the others spread over the flight."""
     panel = _capture("panel", 1.0, change=_with_panel)
@@ -67,7 +77,9 @@ def _plan(captures: int) -> list[Make]:
     twice = {"a lake": water, "fog": fog, "blur, 3 px": blur, "motion, 25 px": motion, "noise, 30 %": noise}
     between = [_capture(name, degrade=by) for name, by in twice.items() for _ in range(1 + (by is not motion))]
     between += [_capture("half saturated", degrade=half_saturated)]
-    between += [_capture("planted grid", change=_orchard)] * 3 + [_capture("terraces", relief_m=1.5)] * 2
+    between += [_capture("planted grid", change=_orchard)] * 3 + [
+        _capture("terraces", change=partial(_terraces, relief_m=1.5))
+    ] * 2
     between += [_capture("no NIR", without=("NIR",))]
     between += [_capture(f"{band} lost", degrade=nothing, degraded_bands=(band,)) for band in ("NIR", "Blue")]
     plain = [_capture()] * max(0, captures - len(start) - len(end) - len(between))
@@ -86,7 +98,6 @@ def _pose(rng: np.random.Generator, number: int) -> Pose:
 def _capture(
     trouble: str = "",
     altitude_m: float | None = None,
-    relief_m: float = 0.0,
     camera: CameraSpec = REDEDGE,
     change: Callable[[np.random.Generator, Ground], Ground] | None = None,
     **more: Any,
@@ -95,7 +106,7 @@ def _capture(
 
     def make(rng: np.random.Generator, pose: Pose, size_px: tuple[int, int]) -> Shot:
         pose = replace(pose, altitude_m=altitude_m or pose.altitude_m, east_m=0.0, north_m=0.0)
-        ground = paint_ground(rng, [pose], size_px, relief_m, camera)
+        ground = paint_ground(rng, [pose], size_px, camera)
         return Shot(pose, change(rng, ground) if change else ground, trouble=trouble, **more)
 
     return make
@@ -109,6 +120,20 @@ def _with_panel(_rng: np.random.Generator, ground: Ground) -> Ground:
     brightness = np.where(square, 2.0, np.where(bare, 0.3, ground.brightness)).astype(np.float32)
     crop, tree = (np.where(bare, np.float32(0), cover) for cover in (ground.crop, ground.tree))
     return replace(ground, brightness=brightness, crop=crop, tree=tree)
+
+
+def _terraces(rng: np.random.Generator, ground: Ground, relief_m: float) -> Ground:
+    """Three levels connected by slopes, `relief_m` apart, with round trees half as high.
+
+    Slopes are gentle enough to cause no occlusions, which cannot be aligned.
+    """
+    angle, terrace_m, metre = rng.uniform(0, np.pi), 8.0, 1 / ground.metres_per_px
+    axis = np.arange(len(ground.tree)) / (terrace_m * metre)
+    along = np.cos(angle) * axis[None, :] + np.sin(angle) * axis[:, None]
+    slope = np.clip((along % 1 - 0.4) / 0.6, 0, 1)
+    level = np.floor(along) + slope * slope * (3 - 2 * slope)
+    crowns = cv2.GaussianBlur(ground.tree, (0, 0), 0.4 * metre)
+    return replace(ground, height_m=np.asarray(relief_m * (np.abs(level % 4 - 2) + 0.5 * crowns), np.float32))
 
 
 def _orchard(rng: np.random.Generator, ground: Ground) -> Ground:

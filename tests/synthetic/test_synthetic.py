@@ -5,6 +5,7 @@ import cv2
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from synthetic_flights.troubles import make_terraces
 
 from agalign.cameras.discover import discover
 from agalign.pixels.raster import read_for_alignment
@@ -89,7 +90,7 @@ def test_bands_are_well_exposed(flight: Path, band: camera_model.BandSpec) -> No
 def test_relief_displaces_raised_objects(tmp_path: Path) -> None:
     truths = {}
     for relief_m in (0.0, 3.0):
-        path = synthetic.make_flight(tmp_path / str(relief_m), 1, (320, 240), rng_seed=2, relief_m=relief_m)
+        path = make_terraces(tmp_path / str(relief_m), (320, 240), rng_seed=2, relief_m=relief_m)
         bands = json.loads(path.read_text())["IMG_0001"]["bands"]
         truths[relief_m] = {(x, y): (u, v) for x, y, u, v in bands["IMG_0001_4.tif"]["ties"]}
     capture = discover(tmp_path / "3.0").captures[0]
