@@ -31,10 +31,10 @@ from agalign.products.checked_raster import (
     tiled_profile,
 )
 from agalign.products.drawing import with_text, write_png
-from agalign.products.index_bands import RAW, BandReader, IndexBand
 from agalign.products.indices import Index, bands_for, compute, index_named
 from agalign.products.product import GEOTIFF, CapturePaths, Product, ProductContext, StacAsset, WrittenFile
 from agalign.products.raster_file import tags_of, to_cog
+from agalign.products.run_captures import RAW, AlignedBand, BandReader
 from agalign.products.sidecar import CaptureResult
 from agalign.products.text_files import write_csv
 from agalign.values.capture import Band, Capture
@@ -176,19 +176,19 @@ def _has_bands(bands: Sequence[Band], name: str) -> bool:
         return False
 
 
-def _bands(context: ProductContext) -> list[IndexBand]:
+def _bands(context: ProductContext) -> list[AlignedBand]:
     places, usable, result = context.places, {context.capture.reference.name, *context.usable}, []
     for band in context.capture.bands:
         if band.name in usable and band.name in places:
             file, index = places[band.name]
-            result.append(IndexBand(band.name, band.wavelength_nm, file.path, index, file.sha256))
+            result.append(AlignedBand(band.name, band.wavelength_nm, file.path, index, file.sha256))
         else:
-            result.append(IndexBand(band.name, band.wavelength_nm, Path(), 1, problem="not usable"))
+            result.append(AlignedBand(band.name, band.wavelength_nm, Path(), 1, problem="not usable"))
     return result
 
 
 def write_rasters(
-    bands: Sequence[IndexBand], indices: Sequence[Index], base: Path, label: str, *, overwrite: bool = True
+    bands: Sequence[AlignedBand], indices: Sequence[Index], base: Path, label: str, *, overwrite: bool = True
 ) -> Iterator[IndexReport]:
     """Write `base`_<index>.tif and .png of a capture's bands, each atomically.
 
@@ -222,7 +222,7 @@ def outdated_rasters(base: Path) -> Iterator[Path]:
             yield from (path, path.with_suffix(".png"))
 
 
-def _bands_of_index(bands: Sequence[IndexBand], index: Index) -> list[IndexBand]:
+def _bands_of_index(bands: Sequence[AlignedBand], index: Index) -> list[AlignedBand]:
     """Return the bands of an index. Raises InputError if one is missing or not usable."""
     chosen = [bands[i] for i in bands_for(index, [b.name for b in bands], [b.wavelength_nm for b in bands])]
     for band in chosen:
@@ -231,7 +231,7 @@ def _bands_of_index(bands: Sequence[IndexBand], index: Index) -> list[IndexBand]
     return chosen
 
 
-def _fingerprint(index: Index, bands: Sequence[IndexBand]) -> str:
+def _fingerprint(index: Index, bands: Sequence[AlignedBand]) -> str:
     """Sixteen hexadecimal digits of everything that an index raster depends on."""
     sources = [(b.sha256, b.band_index) for b in bands]
     masks = [(b.quality[2], b.quality[1]) for b in bands if b.quality is not None]
@@ -249,7 +249,7 @@ def _finished_before(target: Path, source: str) -> IndexStatistics | None:
     return None
 
 
-def _common_unit(index: Index, bands: Sequence[IndexBand], reader: BandReader) -> str:
+def _common_unit(index: Index, bands: Sequence[AlignedBand], reader: BandReader) -> str:
     """Return the unit of the bands of an index.
 
     Raises InputError if units or sizes differ, also of quality flags, or if the index needs another unit.
@@ -270,7 +270,7 @@ def _common_unit(index: Index, bands: Sequence[IndexBand], reader: BandReader) -
 
 
 def _write(
-    index: Index, bands: Sequence[IndexBand], target: Path, unit: str, source: str, reader: BandReader
+    index: Index, bands: Sequence[AlignedBand], target: Path, unit: str, source: str, reader: BandReader
 ) -> IndexStatistics:
     """Write the raster tile by tile, and its picture. Raises OutputError, InputError for a band."""
     like = reader.file(bands[0].file, bands[0].band_index)

@@ -14,13 +14,12 @@ import numpy as np
 from agalign.errors import ConfigurationError, InputError
 from agalign.pixels.raster import open_raster
 from agalign.products.checked_raster import Block, LayerDescription, georeference_tags, grid_profile, write_layers
-from agalign.products.index_bands import BandReader, IndexBand
 from agalign.products.index_rasters import IndexReport, write_rasters
 from agalign.products.indices import Index, index_named
 from agalign.products.mosaic_adjustment import adjusted, misfit_m, tie_pairs, tied_groups
 from agalign.products.mosaic_placement import Placement, place_captures
 from agalign.products.raster_file import to_cog, with_nodata
-from agalign.products.run_captures import LeftOut
+from agalign.products.run_captures import AlignedBand, BandReader, LeftOut
 from agalign.values import geometry
 from agalign.values.capture import Georeference
 from agalign.values.choices import MAX_PIXELS
@@ -245,8 +244,8 @@ def _warped(capture: Placement, positions: FloatImage) -> tuple[FloatImage, Mask
     return result, valid
 
 
-def _write_indices(path: Path, bands: Sequence[IndexBand], indices: Sequence[Index]) -> Sequence[IndexReport]:
+def _write_indices(path: Path, bands: Sequence[AlignedBand], indices: Sequence[Index]) -> Sequence[IndexReport]:
     """Write indices of the mosaic, in its format."""
     checksum = file_checksum(path) if indices else ""
-    of_mosaic = [IndexBand(b.name, b.wavelength_nm, path, k, checksum) for k, b in enumerate(bands, start=1)]
+    of_mosaic = [AlignedBand(b.name, b.wavelength_nm, path, k, checksum) for k, b in enumerate(bands, start=1)]
     return [*write_rasters(of_mosaic, indices, path.with_suffix(""), path.stem)]

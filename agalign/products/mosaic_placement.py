@@ -12,8 +12,7 @@ from agalign.errors import AgalignError, InputError
 from agalign.pixels.raster import transformed
 from agalign.products.flight_map import FLIGHT_MAP_FILE, features_in
 from agalign.products.footprint import pose_errors, utm_wkt
-from agalign.products.index_bands import IndexBand
-from agalign.products.run_captures import LeftOut, RunCapture, captures_of_run, like_most
+from agalign.products.run_captures import AlignedBand, LeftOut, RunCapture, captures_of_run, like_most
 from agalign.products.sidecar import Sidecar
 from agalign.products.sidecar_file import read_sidecar
 from agalign.values import geometry, lens
@@ -30,8 +29,8 @@ class Placement:
     """A capture on a horizontal plane. Pixels are those of its aligned rasters; (0, 0) is the centre of a pixel."""
 
     label: str
-    bands: Sequence[IndexBand]
-    reference: IndexBand
+    bands: Sequence[AlignedBand]
+    reference: AlignedBand
     size_px: Size
     lens: Lens | None
     """Lens of the aligned rasters; None for rasters without lens distortion."""

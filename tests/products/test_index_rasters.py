@@ -14,7 +14,6 @@ from synthetic_flights.aligned import make_aligned
 
 from agalign.batch.index_run import index_tasks, run_indices
 from agalign.errors import ConfigurationError, InputError
-from agalign.products.index_bands import RAW, IndexBand
 from agalign.products.index_rasters import IndexReport, IndexStatistics, read_table, update_table, write_rasters
 from agalign.products.indices import (
     INDICES,
@@ -27,6 +26,7 @@ from agalign.products.indices import (
     symbols_of,
 )
 from agalign.products.report import write_pages
+from agalign.products.run_captures import RAW, AlignedBand
 from agalign.products.sidecar import ProductPart
 from agalign.products.sidecar_file import read_sidecar, verify_outputs, write_sidecar
 
@@ -223,7 +223,7 @@ def test_an_index_neither_replaces_a_band_nor_reads_one_of_another_size(
     for band, size_px in (("green", (160, 120)), ("red", (320, 240))):
         path = tmp_path / f"a_{band}.tif"
         write_band(path, np.full(size_px[::-1], 0.1, np.float32))
-        bands.append(IndexBand(band, None, path, 1))
+        bands.append(AlignedBand(band, None, path, 1))
     (report,) = write_rasters(bands, [index_of_formula(f"{name}=(G-R)/(G+R)")], tmp_path / "a", "a")
     assert report.path is None
     assert problem in report.problem
