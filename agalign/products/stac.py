@@ -165,17 +165,16 @@ def _describe_bands(
     """Describe the bands of an asset in the fields of the extensions, and in the common `bands` of STAC 1.1."""
     raw = context.write_settings.radiometry == "off"
     dtype = np.result_type(*(b.dtype for b in bands)).name if raw else "float32"
-    of_type = {"data_type": dtype, "nodata": "nan" if nodata is not None and math.isnan(nodata) else nodata}
+    missing = "nan" if nodata is not None and math.isnan(nodata) else nodata
     described: list[tuple[dict[str, Any], ...]] = []
     for band in bands:
         scale, offset = band.scale_offset if raw else (1.0, 0.0)
         unit = UNITS[band.radiometry.quantity] if not raw and band.radiometry is not None else None
         eo = {"common_name": _common_name(band, context.capture), "center_wavelength": _um(band.wavelength_nm)}
         eo |= {"full_width_half_max": _um(band.bandwidth_nm)}
-        common = {"name": band.name, **of_type, "unit": unit, **{f"eo:{k}": v for k, v in eo.items()}}
-        described.append(
-            ({"name": band.name, **eo}, of_type | {"unit": unit, "scale": scale, "offset": offset}, common)
-        )
+        raster = {"nodata": missing, "data_type": dtype, "unit": unit, "scale": scale, "offset": offset}
+        common = {"name": band.name, "data_type": dtype, "nodata": missing, "unit": unit}
+        described.append(({"name": band.name, **eo}, raster, common | {f"eo:{k}": v for k, v in eo.items()}))
     for key, parts in zip(("eo:bands", "raster:bands", "bands"), zip(*described, strict=True), strict=True):
         asset.extra_fields[key] = [{k: v for k, v in part.items() if v is not None} for part in parts]
 
