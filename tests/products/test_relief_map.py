@@ -79,12 +79,18 @@ class Run:
         parallax = self.alignments["NIR"].mapping.parallax
         return parallax.relief
 
-    def write(self, out: Path, **settings: object) -> tuple[Path, Sidecar]:
-        """Return the folder of the outputs and the sidecar."""
+    def write(
+        self,
+        out: Path,
+        alignments: dict[str, Alignment] | None = None,
+        capture: Capture | None = None,
+        **settings: object,
+    ) -> tuple[Path, Sidecar]:
+        """Return the folder of the outputs and the sidecar, by default of the true alignments of the capture."""
         chosen = agalign.Settings(write=agalign.WriteSettings.model_validate({"crop": "none", **settings}))
         with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(batch, "align_capture_bands", lambda *_: self.alignments)
-            outcome = batch.process_capture(self.capture, out, chosen)
+            patch.setattr(batch, "align_capture_bands", lambda *_: alignments or self.alignments)
+            outcome = batch.process_capture(capture or self.capture, out, chosen)
         assert outcome.failed_products == ()
         assert read_result(outcome.path) == outcome.result
         return out / self.capture.folder, outcome.sidecar
@@ -138,18 +144,16 @@ def test_without_a_request_it_has_the_parallax_alone(run: Run, written: tuple[Pa
     assert {"confidence", "range"}.isdisjoint(agalign.open_capture(folder / f"{sidecar.capture}.json").data_vars)
 
 
-def test_without_places_of_lenses_there_is_no_range(run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_places_of_lenses_there_is_no_range(run: Run, tmp_path: Path) -> None:
     unknown = replace(run.capture, bands=tuple(replace(b, lens_offset=None) for b in run.capture.bands))
-    monkeypatch.setattr(run, "capture", unknown)
-    layers = layers_of(*run.write(tmp_path, relief_map=True))
+    layers = layers_of(*run.write(tmp_path, capture=unknown, relief_map=True))
     assert np.isnan(layers["range"]).all()
     assert np.isfinite(layers["parallax"]).all()
 
 
-def test_without_a_relief_nothing_is_written(run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_a_relief_nothing_is_written(run: Run, tmp_path: Path) -> None:
     flat = {n: replace(a, mapping=a.mapping.of_the_plane) for n, a in run.alignments.items()}
-    monkeypatch.setattr(run, "alignments", flat)
-    folder, sidecar = run.write(tmp_path, relief_map=True)
+    folder, sidecar = run.write(tmp_path, flat, relief_map=True)
     assert not list(tmp_path.rglob("*.relief.tif"))
     assert all(b.relief is None for b in sidecar.bands)
     assert "parallax" not in agalign.open_capture(folder / f"{sidecar.capture}.json")
@@ -240,9 +244,6 @@ def test_occluded_pixels_are_filled_on_request(run: Run, written: tuple[Path, Si
             # Pixels beyond the band's image stay without a value.
             beyond = ~run.truth.bands[band].inside & ~run.truth.bands[band].hidden
             assert not filled.read_masks(index)[beyond].all()
-
-
-# ---- the dataset
 
 
 # ---- the places of lenses in tags
@@ -336,13 +337,10 @@ def on_hill(alignment: Alignment, decimals: int = 6) -> Alignment:
 
 
 @pytest.mark.parametrize("settings", [{}, {"crop": "common"}, {"crop": "common", "undistort": True}], ids=str)
-def test_a_relief_is_rebuilt_where_it_was_written(
-    run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, settings: dict[str, object]
-) -> None:
+def test_a_relief_is_rebuilt_where_it_was_written(run: Run, tmp_path: Path, settings: dict[str, object]) -> None:
     """A hill: steps of a relief are not reproduced on a grid with other pixels."""
     smooth = {name: on_hill(alignment) for name, alignment in run.alignments.items()}
-    monkeypatch.setattr(run, "alignments", smooth)
-    folder, sidecar = run.write(tmp_path, **settings)
+    folder, sidecar = run.write(tmp_path, smooth, **settings)
     lower, size_px = np.array(sidecar.output.crop[:2]), np.array(sidecar.output.crop[2:])
     at = lens.undistort(run.capture.reference.lens, PIXELS) if "undistort" in settings else PIXELS
     written = ((at >= lower) & (at <= lower + size_px - 1)).all(axis=-1)
@@ -403,33 +401,31 @@ def test_an_alignment_warps_to_the_bytes_of_a_real_stack(real_data: Path, tmp_pa
 
 
 @pytest.mark.parametrize("crop", ["common", "none"])
-def test_an_alignment_with_relief_warps_to_the_bytes_of_a_stack(
-    run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, crop: str
-) -> None:
+def test_an_alignment_with_relief_warps_to_the_bytes_of_a_stack(run: Run, tmp_path: Path, crop: str) -> None:
     """A hill without occlusions."""
-    monkeypatch.setattr(run, "alignments", {name: on_hill(a, decimals=2) for name, a in run.alignments.items()})
-    folder, sidecar = run.write(tmp_path, crop=crop)
+    hills = {name: on_hill(a, decimals=2) for name, a in run.alignments.items()}
+    folder, sidecar = run.write(tmp_path, hills, crop=crop)
     assert assert_same_as_stack(folder / f"{sidecar.capture}.json", run.capture.reference.path.parent) == 4
 
 
-def test_a_relief_on_a_finer_grid_is_rebuilt(run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_relief_on_a_finer_grid_is_rebuilt(run: Run, tmp_path: Path) -> None:
     """Its pixels 20 to 420 and 14 to 334, at twice the resolution, are those from 10 to 210 and 7 to 167."""
     folder, sidecar = run.write(tmp_path)
     path = folder / f"{sidecar.capture}.json"
     grid = OutputGrid(20, 14, 400, 320, PixelScale(2.0, 2.0))
     range_m = relief_layers(run.capture, run.alignments, run.relief, grid)["range"]
     assert np.median(range_m) == pytest.approx(np.median(run.truth.range_m[7:167, 10:210]), rel=0.005)
-    monkeypatch.setattr(run, "alignments", {n: on_hill(a) for n, a in run.alignments.items()})
-    layers = relief_layers(run.capture, run.alignments, run.relief, grid)
+    hills = {n: on_hill(a) for n, a in run.alignments.items()}
+    layers = relief_layers(run.capture, hills, hills["NIR"].mapping.parallax.relief, grid)
     tifffile.imwrite(path.with_name(f"{sidecar.capture}.relief.tif"), layers["parallax"].astype(np.float32))
     output = sidecar.output.model_copy(update={"crop": (20, 14, 400, 320), "scale": (2.0, 2.0)})
     write_sidecar(path, sidecar.model_copy(update={"output": output}))
     at = PIXELS[8:166, 11:209]
     result = agalign.read_alignment(path, "NIR")
-    assert np.abs(result.map(at) - run.alignments["NIR"].map(at)).max() < 0.02
+    assert np.abs(result.map(at) - hills["NIR"].map(at)).max() < 0.02
 
 
-def test_occlusions_are_those_of_the_run(run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_occlusions_are_those_of_the_run(run: Run, tmp_path: Path) -> None:
     """Behind a box of 12 px of parallax."""
     z = np.zeros(SIZE[::-1], np.float32)
     z[60:120, 80:160] = 12
@@ -439,8 +435,7 @@ def test_occlusions_are_those_of_the_run(run: Run, tmp_path: Path, monkeypatch: 
         baseline = alignment.mapping.parallax.baseline
         parallax = Parallax(box, baseline, occluded(box, baseline))
         boxes[name] = replace(alignment, mapping=alignment.mapping.with_parallax(parallax))
-    monkeypatch.setattr(run, "alignments", boxes)
-    folder, sidecar = run.write(tmp_path)
+    folder, sidecar = run.write(tmp_path, boxes)
     result = agalign.read_alignment(folder / f"{sidecar.capture}.json", "NIR")
     expected = boxes["NIR"].mapping.hidden(Tile(0, 0, *SIZE))
     assert expected.sum() > 500
