@@ -43,11 +43,11 @@ if TYPE_CHECKING:
     from agalign.errors import SidecarError as SidecarError
     from agalign.errors import UnreadableFileError as UnreadableFileError
     from agalign.errors import WorkerError as WorkerError
-    from agalign.products.dataset import open_capture as open_capture
-    from agalign.products.dataset import open_flight as open_flight
-    from agalign.products.mosaic import MosaicReport as MosaicReport
-    from agalign.products.mosaic import mosaic as mosaic
-    from agalign.products.read_alignment import read_alignment as read_alignment
+    from agalign.products.exports.dataset import open_capture as open_capture
+    from agalign.products.exports.dataset import open_flight as open_flight
+    from agalign.products.mosaic.compose import MosaicReport as MosaicReport
+    from agalign.products.mosaic.compose import mosaic as mosaic
+    from agalign.products.sidecar.alignment import read_alignment as read_alignment
     from agalign.values.alignment import Alignment as Alignment
     from agalign.values.alignment import Prediction as Prediction
     from agalign.values.alignment import Residual as Residual
@@ -65,9 +65,9 @@ _NAMES = {
     "Settings WriteSettings",
     "errors": "AgalignError ConfigurationError GeometryError InputError MemoryLimitError NoContrastError "
     "NoSuchBandError NotEnoughTextureError OutputError SidecarError UnreadableFileError WorkerError",
-    "products.dataset": "open_capture open_flight",
-    "products.mosaic": "MosaicReport mosaic",
-    "products.read_alignment": "read_alignment",
+    "products.exports.dataset": "open_capture open_flight",
+    "products.mosaic.compose": "MosaicReport mosaic",
+    "products.sidecar.alignment": "read_alignment",
     "values.alignment": "Alignment Prediction Residual Seed",
     "values.capture": "Capture",
     "values.pixel_units": "FixedFilePx FixedImagePx MovingFilePx",

@@ -141,7 +141,7 @@ def align_folder(
     Raises InputError if the folder does not exist, OutputError if `out` cannot be written, ConfigurationError
     for a model of another camera, and if `out` has results of other captures of the same name.
     """
-    from agalign.products.report import write_pages
+    from agalign.products.report.pages import write_pages
 
     end_if_reimported()
     source, target = Path(folder), Path(out)

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from scipy.interpolate import CloughTocher2DInterpolator
 
 import agalign
-from agalign.products.sidecar_file import find_sidecars
+from agalign.products.sidecar.file import find_sidecars
 
 Ties = dict[str, dict[str, Any]]
 """Entries of ties.json or truth.json by the name of the moving file, each with `ties` (n, 4), raw px."""

@@ -16,8 +16,8 @@ from agalign.cameras.micasense import MicaSense
 from agalign.config import Settings, WriteSettings
 from agalign.pixels.radiometry import calibrated
 from agalign.pixels.raster import probe
-from agalign.products.indices import INDICES, compute
-from agalign.products.sidecar_file import read_sidecar
+from agalign.products.indices.formulas import INDICES, compute
+from agalign.products.sidecar.file import read_sidecar
 from agalign.synthetic import camera_model, cameras
 from agalign.synthetic import flight as synthetic
 from agalign.synthetic.ground import reflectance

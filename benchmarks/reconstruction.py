@@ -23,7 +23,7 @@ from agalign.cameras.discover import discover
 from agalign.cameras.read_files import read_file
 from agalign.config import DiscoverOptions
 from agalign.pixels.raster import open_raster, without_warnings
-from agalign.products.sidecar_file import find_sidecars, read_sidecar
+from agalign.products.sidecar.file import find_sidecars, read_sidecar
 from agalign.values.capture import Band
 
 _SHOWN_PERCENTILES = 0.5, 99.5

@@ -14,7 +14,7 @@ from scipy.interpolate import RectBivariateSpline
 from synthetic_flights.depth import BandTruth, Truth
 
 from agalign.pixels.raster import without_warnings
-from agalign.products.sidecar_file import find_sidecars
+from agalign.products.sidecar.file import find_sidecars
 
 Map = NDArray[np.float64]
 """(height, width, 2): raw px of the moving image for each raw px of the reference."""

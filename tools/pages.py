@@ -3,9 +3,9 @@ reasons), or check that they are current.
 
     python tools/pages.py [--check]
 
-Options come from `agalign/config.py` and the command `align`, indices from `agalign/products/indices.py`, fields from
-`agalign/products/sidecar.py`, reasons from `agalign/values/issues.py` and the checks in `agalign/verify`. Each part is
-between two comments in its page.
+Options come from `agalign/config.py` and the command `align`, indices from `agalign/products/indices/formulas.py`,
+fields from `agalign/products/sidecar/schema.py`, reasons from `agalign/values/issues.py` and the checks in
+`agalign/verify`. Each part is between two comments in its page.
 """
 
 import json
@@ -25,8 +25,8 @@ import agalign
 from agalign.cli.command import FieldOption, field_options
 from agalign.cli.main import COMMANDS
 from agalign.config import DiscoverOptions, RunOptions, Settings
-from agalign.products.indices import INDICES
-from agalign.products.sidecar import Sidecar
+from agalign.products.indices.formulas import INDICES
+from agalign.products.sidecar.schema import Sidecar
 from agalign.values.issues import Issue, sentence
 from agalign.verify.checks import KINDS
 

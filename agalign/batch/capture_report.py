@@ -10,8 +10,8 @@ from pathlib import Path
 from typing import Literal
 
 from agalign.capture.align_bands import PairProgress
-from agalign.products.sidecar import BandResult, CaptureResult, Sidecar
-from agalign.products.sidecar_file import read_sidecar
+from agalign.products.sidecar.file import read_sidecar
+from agalign.products.sidecar.schema import BandResult, CaptureResult, Sidecar
 from agalign.values.text import counted
 
 

@@ -18,15 +18,15 @@ from agalign.flight.model import FlightModel, load_model
 from agalign.method.device import choose_device, keep_freed_memory, one_memory_error, one_thread
 from agalign.pixels.radiometry import check_pixels
 from agalign.pixels.raster import with_saturation_values
-from agalign.products.aligned_files import band_file_names
-from agalign.products.fill_sidecar import sidecar_of
-from agalign.products.index_rasters import outdated_rasters
-from agalign.products.layout import FlightLimits, output_layers
-from agalign.products.preview import preview_bytes
+from agalign.products.indices.rasters import outdated_rasters
 from agalign.products.product import CapturePaths, ProductContext
-from agalign.products.raster_file import is_aligned_raster
+from agalign.products.rasters.aligned_files import band_file_names
+from agalign.products.rasters.layout import FlightLimits, output_layers
+from agalign.products.rasters.raster_file import is_aligned_raster
 from agalign.products.registry import PRODUCTS
-from agalign.products.sidecar_file import read_result, write_sidecar
+from agalign.products.report.preview import preview_bytes
+from agalign.products.sidecar.file import read_result, write_sidecar
+from agalign.products.sidecar.fill import sidecar_of
 from agalign.values.capture import Capture
 from agalign.values.choices import RadiometryChoice
 from agalign.values.files import check_inside

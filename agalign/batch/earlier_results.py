@@ -12,8 +12,8 @@ from agalign.config import Settings
 from agalign.errors import ConfigurationError, SidecarError
 from agalign.flight.fingerprint import fingerprint, input_samples
 from agalign.products.product import CapturePaths
-from agalign.products.sidecar import CaptureResult
-from agalign.products.sidecar_file import read_result
+from agalign.products.sidecar.file import read_result
+from agalign.products.sidecar.schema import CaptureResult
 from agalign.values.capture import Capture, CaptureTime
 
 _MAX_APART = timedelta(seconds=1)

@@ -9,11 +9,11 @@ import cv2
 
 from agalign.batch.workers import chosen_run, failure_text, serially
 from agalign.errors import AgalignError
-from agalign.products.flight_map import link_indices
-from agalign.products.index_rasters import IndexReport, update_table, write_rasters
-from agalign.products.indices import Index
-from agalign.products.run_captures import bands_of
-from agalign.products.sidecar_file import read_result, run_sidecars, update_products
+from agalign.products.indices.formulas import Index
+from agalign.products.indices.rasters import IndexReport, update_table, write_rasters
+from agalign.products.run.captures import bands_of
+from agalign.products.run.flight_map import link_indices
+from agalign.products.sidecar.file import read_result, run_sidecars, update_products
 from agalign.values.cores import usable_cores
 from agalign.values.files import check_inside
 

@@ -35,22 +35,22 @@ from agalign.flight.rig_file import read_rig
 from agalign.flight.sky import SkyCapture, sky_captures
 from agalign.method.device import choose_device, limit_threads
 from agalign.pixels.radiometry import with_radiometry
-from agalign.products.excluded_captures import write_panels, write_sky
-from agalign.products.flight_map import FlightMap
-from agalign.products.footprint import (
+from agalign.products.exports.stac import write_collections
+from agalign.products.indices.rasters import check_indices
+from agalign.products.product import CapturePaths
+from agalign.products.rasters.layout import FlightLimits, common_grid, flight_limits
+from agalign.products.report.preview import preview_bytes
+from agalign.products.run.excluded import write_panels, write_sky
+from agalign.products.run.flight_map import FlightMap
+from agalign.products.run.footprint import (
     above_elevation,
     missing_for_footprint,
     utm_of_flights,
     with_approximate_georeference,
 )
-from agalign.products.index_rasters import check_indices
-from agalign.products.layout import FlightLimits, common_grid, flight_limits
-from agalign.products.preview import preview_bytes
-from agalign.products.product import CapturePaths
-from agalign.products.run_record import ExclusionPart, RunPart, RunState, begun
-from agalign.products.sidecar import CaptureResult
-from agalign.products.sidecar_file import read_result
-from agalign.products.stac import write_collections
+from agalign.products.run.record import ExclusionPart, RunPart, RunState, begun
+from agalign.products.sidecar.file import read_result
+from agalign.products.sidecar.schema import CaptureResult
 from agalign.values.capture import Capture
 from agalign.values.cores import usable_cores
 from agalign.values.files import check_inside

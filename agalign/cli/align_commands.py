@@ -41,8 +41,8 @@ def _align(
 ) -> int:
     """Align every capture below FOLDER."""
     from agalign.config import DiscoverOptions, RunOptions, Settings
-    from agalign.products.indices import index_named
-    from agalign.products.stac import need_stac
+    from agalign.products.exports.stac import need_stac
+    from agalign.products.indices.formulas import index_named
     from agalign.values.processes import start_server_ahead
 
     source = folder.resolve()

@@ -22,11 +22,11 @@ from agalign.config import DiscoverOptions, RunOptions, Settings
 from agalign.errors import InputError, OutputError, SidecarError, WorkerError
 from agalign.flight.groups import camera_overviews
 from agalign.products.product import CapturePaths
-from agalign.products.report import REPORT_FILE, pages_exist, write_pages
 from agalign.products.report.facts import FailureGroup, PairTotals
-from agalign.products.run_record import exclusion_lines, read_run_record
-from agalign.products.sidecar import BandResult, CaptureResult
-from agalign.products.sidecar_file import read_result
+from agalign.products.report.pages import REPORT_FILE, pages_exist, write_pages
+from agalign.products.run.record import exclusion_lines, read_run_record
+from agalign.products.sidecar.file import read_result
+from agalign.products.sidecar.schema import BandResult, CaptureResult
 from agalign.values.capture import Capture
 from agalign.values.text import counted
 

@@ -11,7 +11,7 @@ from agalign.cli.terminal import MAX_LISTED, RAW_NUMBERS, ExitCode, Terminal, ex
 from agalign.values.text import counted
 
 if TYPE_CHECKING:
-    from agalign.products.mosaic import MosaicReport
+    from agalign.products.mosaic.compose import MosaicReport
 
 IndexNames = Annotated[str | None, typer.Option("--index", "-i", help="Names of indices separated by commas.")]
 
@@ -30,7 +30,7 @@ def _mosaic(
     others are left out. The ground is assumed to be a horizontal plane: the mosaic shows a field and its zones, and
     replaces neither an orthomosaic (OpenDroneMap) nor ground control.
     """
-    from agalign.products.mosaic import mosaic as make_mosaic
+    from agalign.products.mosaic.compose import mosaic as make_mosaic
 
     chosen = [] if index is None else [one.name for one in chosen_indices(index, [])]
     path = target or out / "mosaic.tif"

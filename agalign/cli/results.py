@@ -12,8 +12,8 @@ from agalign.cli.terminal import MAX_LISTED, RAW_NUMBERS, ExitCode, Terminal, ex
 from agalign.values.choices import ExportProgram
 
 if TYPE_CHECKING:
-    from agalign.products.index_rasters import IndexReport
-    from agalign.products.indices import Index
+    from agalign.products.indices.formulas import Index
+    from agalign.products.indices.rasters import IndexReport
 
 Out = Annotated[Path, typer.Argument(help="Output folder of a run.", show_default=False)]
 _DEFAULT_INDEX = "ndvi"
@@ -26,8 +26,8 @@ def _report(
 ) -> int:
     """Rebuild the report and the summary from the sidecars."""
     from agalign.cli.align_run import explain
-    from agalign.products.report import write_pages
-    from agalign.products.sidecar_file import run_sidecars
+    from agalign.products.report.pages import write_pages
+    from agalign.products.sidecar.file import run_sidecars
     from agalign.values.output_folder import locked
 
     run_sidecars(out)
@@ -48,7 +48,7 @@ def _report(
 
 def _verify(terminal: Terminal, out: Out) -> int:
     """Compare the files of a run with their checksums."""
-    from agalign.products.sidecar_file import verify_outputs
+    from agalign.products.sidecar.file import verify_outputs
 
     captures = damaged = 0
     for _, problems in verify_outputs(out):
@@ -79,7 +79,7 @@ def _export(
     ] = None,
 ) -> int:
     """Export aligned captures for photogrammetry programs, MicaSense's notebooks or OpenCV."""
-    from agalign.products.export import export as run_export
+    from agalign.products.exports.programs import export as run_export
 
     run_folder = out.resolve()
     folder = target or run_folder.parent / f"{run_folder.name}-{program}"
@@ -171,7 +171,7 @@ def _conclude(
     names: Sequence[str], reports: "Sequence[IndexReport]", folder: Path, terminal: Terminal, *, as_json: bool
 ) -> int:
     """Print the statistics of all indices, and return the exit code."""
-    from agalign.products.index_rasters import INDICES_FILE
+    from agalign.products.indices.rasters import INDICES_FILE
 
     written = [r for r in reports if r.path is not None]
     if as_json:
@@ -199,7 +199,7 @@ indices = Command(
 def chosen_indices(names: str | None, formulas: Sequence[str]) -> "list[Index]":
     """Return the indices of names and formulas, or the default one. Raises ConfigurationError."""
     from agalign.errors import ConfigurationError
-    from agalign.products.indices import index_named, index_of_formula
+    from agalign.products.indices.formulas import index_named, index_of_formula
 
     requested = (names or ("" if formulas else _DEFAULT_INDEX)).split(",")
     chosen = [index_named(name) for name in requested if name.strip()] + [index_of_formula(f) for f in formulas]
@@ -234,7 +234,7 @@ def _facts(report: "IndexReport") -> dict[str, Any]:
 
 def _rebuild_report(out: Path, terminal: Terminal) -> None:
     """Rebuild the report of the run, which shows the indices, if there is one."""
-    from agalign.products.report import REPORT_FILE, write_pages
+    from agalign.products.report.pages import REPORT_FILE, write_pages
 
     if (out / REPORT_FILE).is_file():
         write_pages(out, terminal.problem)
@@ -252,7 +252,7 @@ def _print_table(names: Sequence[str], reports: "Sequence[IndexReport]", termina
     """Print a row per index: statistics of the medians of its captures."""
     from statistics import median
 
-    from agalign.products.run_captures import exceptions
+    from agalign.products.run.captures import exceptions
 
     written, rows = [r for r in reports if r.path is not None], []
     for name in names:

@@ -13,7 +13,7 @@ from agalign.errors import NoContrastError, NotEnoughTextureError
 from agalign.method.device import one_memory_error, one_thread
 from agalign.method.paper import DEFAULT_TRAINING, Training, descend
 from agalign.method.state import ImageGroup, JointState
-from agalign.products.drawing import with_text, write_png
+from agalign.products.report.drawing import with_text, write_png
 from agalign.values import geometry
 from agalign.values.geometry import Matrix
 from agalign.values.image import Raster

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 from agalign.config import Settings, WriteSettings
-from agalign.products.checked_raster import (
+from agalign.products.rasters.checked_raster import (
     FLOAT_OPTIONS,
     Block,
     LayerDescription,
@@ -16,9 +16,9 @@ from agalign.products.checked_raster import (
     grid_profile,
     write_layers,
 )
-from agalign.products.drawing import ReducedBands, read_reduced_bands
-from agalign.products.layout import FlightLimits, Layer
-from agalign.products.sidecar import PreviewPart, is_usable
+from agalign.products.rasters.layout import FlightLimits, Layer
+from agalign.products.report.drawing import ReducedBands, read_reduced_bands
+from agalign.products.sidecar.schema import PreviewPart, is_usable
 from agalign.values.alignment import Alignment
 from agalign.values.capture import Capture
 from agalign.values.files import file_checksum

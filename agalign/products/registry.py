@@ -1,14 +1,14 @@
 """Every product of a capture, in the order in which they are written."""
 
-from agalign.products.aligned_files import BandFiles, Stack
-from agalign.products.index_rasters import IndexRasters
-from agalign.products.pan_sharpen import PanSharpened
-from agalign.products.preview import BeforeAfterPicture, Preview
+from agalign.products.exports.stac import StacItem
+from agalign.products.exports.tie_points import TiePoints
+from agalign.products.indices.rasters import IndexRasters
 from agalign.products.product import Product
-from agalign.products.quality_raster import ErrorMap, QualityRaster
-from agalign.products.relief_map import ReliefMap
-from agalign.products.stac import StacItem
-from agalign.products.tie_points import TiePoints
+from agalign.products.rasters.aligned_files import BandFiles, Stack
+from agalign.products.rasters.pan_sharpen import PanSharpened
+from agalign.products.rasters.quality_raster import ErrorMap, QualityRaster
+from agalign.products.rasters.relief_map import ReliefMap
+from agalign.products.report.preview import BeforeAfterPicture, Preview
 
 PRODUCTS: tuple[Product, ...] = (
     BandFiles(),

@@ -31,7 +31,7 @@ from peers import METHODS, Align, UnavailableError, grey_raster, method_named
 
 from agalign.cameras.discover import discover
 from agalign.pixels.raster import suffix_format, without_warnings
-from agalign.products.sidecar_file import find_sidecars
+from agalign.products.sidecar.file import find_sidecars
 from agalign.values import geometry, lens
 from agalign.values.capture import Band
 from agalign.values.mapping import PixelMapping

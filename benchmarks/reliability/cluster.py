@@ -18,7 +18,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from common import Section, align, command, run
 from kills import differences, snapshot
 
-from agalign.products.sidecar_file import find_sidecars
+from agalign.products.sidecar.file import find_sidecars
 from agalign.synthetic import flight as synthetic
 
 SIZE_PX = 480, 360

@@ -39,7 +39,7 @@ from agalign.cameras.discover import discover
 from agalign.flight.panel_readings import with_panels
 from agalign.flight.sky import sky_captures
 from agalign.pixels.panel_detection import find_panel
-from agalign.products.sidecar_file import find_sidecars
+from agalign.products.sidecar.file import find_sidecars
 from agalign.relief.dense import DenseMatching, View
 from agalign.values.capture import Capture
 from agalign.values.image import Raster

@@ -33,7 +33,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from common import Section, command, ended, run, timed
 from synthetic_flights.aligned import make_aligned
 
-from agalign.products.sidecar_file import find_sidecars
+from agalign.products.sidecar.file import find_sidecars
 from agalign.synthetic import flight as synthetic
 from agalign.values.files import RUN_FILE
 

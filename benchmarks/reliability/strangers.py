@@ -36,14 +36,14 @@ from common import Ending, Section, align, run
 
 from agalign.cameras import tiff_directory as tiff
 from agalign.cli.main import main as agalign_main
-from agalign.products.sidecar_file import content_checksum, find_sidecars
+from agalign.products.sidecar.file import content_checksum, find_sidecars
 from agalign.synthetic import flight as synthetic
 
 CAPTURES, SIZE_PX, NAMES = 2, (240, 180), ("IMG_0001", "IMG_0002")
 PLACED = "--georeference", "--ground-elevation=0", "--stac", "--tie-points"
 OPTIONS = *PLACED, "--layout=both", "--error-map", "--qa", "--index=ndvi", "--relief=always", "--relief-map"
 TAG_OPTIONS = *PLACED, "--only-seed", "--bands=green,red", "--relief=never", "-j1", "-v"
-PRELOADED = "pystac", "agalign.cli.align_run", "agalign.products.mosaic"
+PRELOADED = "pystac", "agalign.cli.align_run", "agalign.products.mosaic.compose"
 MAX_S, MAX_BYTES = 60, 4 << 30
 """Limits of a command: time, and memory beyond that of this process."""
 SECRET = "the contents of a file of somebody else"

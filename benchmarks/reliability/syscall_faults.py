@@ -28,7 +28,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from common import Ending, Section, ended, run
 from kills import contents, differences, snapshot, whole_sidecars, without
 
-from agalign.products.report import SUMMARY_FILE
+from agalign.products.report.pages import SUMMARY_FILE
 from agalign.synthetic import flight as synthetic
 
 CAPTURES, SIZE_PX = 2, (240, 180)

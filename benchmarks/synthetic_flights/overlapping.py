@@ -6,10 +6,10 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from agalign.products.flight_map import FlightMap
-from agalign.products.footprint import ground_m
-from agalign.products.sidecar import LensPart, Sidecar
-from agalign.products.sidecar_file import read_result, write_sidecar
+from agalign.products.run.flight_map import FlightMap
+from agalign.products.run.footprint import ground_m
+from agalign.products.sidecar.file import read_result, write_sidecar
+from agalign.products.sidecar.schema import LensPart, Sidecar
 from agalign.values import geometry, lens
 from agalign.values.capture import Band, Capture, Pose, Position
 from agalign.values.lens import Lens

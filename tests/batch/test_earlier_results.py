@@ -16,7 +16,7 @@ from agalign.batch.run import _crops_of_cameras, plan_run, run_flight
 from agalign.cli.align_run import conclude
 from agalign.cli.align_run import run as run_command
 from agalign.cli.terminal import ExitCode, Terminal
-from agalign.products.sidecar_file import find_sidecars, read_result
+from agalign.products.sidecar.file import find_sidecars, read_result
 from agalign.synthetic.flight import make_flight
 from agalign.values.image import OutputGrid
 

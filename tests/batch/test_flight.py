@@ -26,9 +26,9 @@ from agalign.flight.rig_prediction import extreme_mappings
 from agalign.method import joint as method_joint
 from agalign.method import state as method_state
 from agalign.method.fast import Schedule, learn
-from agalign.products import preview
-from agalign.products.run_record import read_run_record
-from agalign.products.sidecar_file import find_sidecars, read_result, read_sidecar
+from agalign.products.report import preview
+from agalign.products.run.record import read_run_record
+from agalign.products.sidecar.file import find_sidecars, read_result, read_sidecar
 from agalign.synthetic.flight import make_flight
 from agalign.values.capture import Capture
 

@@ -25,8 +25,8 @@ from agalign.cameras.discover import discover
 from agalign.config import SeedSettings, Settings
 from agalign.errors import ConfigurationError, WorkerError
 from agalign.method.device import limit_threads
-from agalign.products.sidecar import CaptureResult
-from agalign.products.sidecar_file import find_sidecars, read_result
+from agalign.products.sidecar.file import find_sidecars, read_result
+from agalign.products.sidecar.schema import CaptureResult
 
 from ..conftest import raising, seeded
 from ..values.pool_tasks import signal_self, sleep, without_memory

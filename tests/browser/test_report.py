@@ -13,9 +13,9 @@ import tifffile
 
 import agalign
 from agalign.config import Settings, WriteSettings
-from agalign.products.drawing import ReducedBands
-from agalign.products.preview import ReliefView, preview_bytes, write_preview
-from agalign.products.report import write_pages
+from agalign.products.report.drawing import ReducedBands
+from agalign.products.report.pages import write_pages
+from agalign.products.report.preview import ReliefView, preview_bytes, write_preview
 from agalign.synthetic import flight as synthetic
 
 sync_api = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")

@@ -15,7 +15,7 @@ from agalign.cameras.metadata import Tags
 from agalign.cameras.tiff_directory import EXIF, GPS, add_directories, read_directories, short
 from agalign.pixels.radiometry import calibrated
 from agalign.pixels.raster import probe
-from agalign.products.sidecar_file import find_sidecars, read_result
+from agalign.products.sidecar.file import find_sidecars, read_result
 from agalign.values import geometry
 from agalign.values.capture import Capture
 from agalign.values.pixel_units import PixelScale

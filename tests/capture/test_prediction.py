@@ -22,7 +22,7 @@ from agalign.capture.prediction import with_predictions
 from agalign.config import CheckSettings, Settings
 from agalign.flight.model import FlightModel, load_model
 from agalign.method.joint import Results, refine_with
-from agalign.products.fill_sidecar import capture_status
+from agalign.products.sidecar.fill import capture_status
 from agalign.synthetic import make_flight
 from agalign.values import geometry
 from agalign.values.alignment import Alignment, Prediction

@@ -20,7 +20,7 @@ from agalign.flight import panel_readings
 from agalign.method import refine
 from agalign.pixels import raster
 from agalign.products.registry import PRODUCTS
-from agalign.products.sidecar import ProductPart
+from agalign.products.sidecar.schema import ProductPart
 from agalign.relief import dense
 from agalign.values.alignment import MIN_RETRIEVAL, MIN_TIMES_CHANCE
 from agalign.verify import checks, displacement_field, residuals

@@ -8,7 +8,7 @@ from agalign.flight.learn_rig import learn_rig
 from agalign.flight.rig import Observation, Rig, distance_px
 from agalign.flight.rig_file import rig_from_json, rig_to_json
 from agalign.flight.rig_prediction import extreme_mappings, predict_band, unobserved_error_px
-from agalign.products.sidecar import PredictionPart
+from agalign.products.sidecar.schema import PredictionPart
 from agalign.values import geometry
 from agalign.values.displacement import DisplacementField
 

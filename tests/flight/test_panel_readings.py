@@ -16,7 +16,7 @@ from agalign.flight.panel_readings import (
 )
 from agalign.pixels.panel_detection import DetectedPanel
 from agalign.pixels.radiometry import with_radiometry
-from agalign.products.excluded_captures import write_panels
+from agalign.products.run.excluded import write_panels
 from agalign.values.capture import Band, CameraIdentity, Capture, Panel, Pose, Position, Quantity, Radiometry
 
 AREA = ((20.0, 10.0), (39.0, 10.0), (39.0, 29.0), (20.0, 29.0))

@@ -11,7 +11,7 @@ from hypothesis.extra.numpy import arrays
 
 from agalign.pixels.band_resampling import resample_tile, warped
 from agalign.pixels.raster import probe
-from agalign.products.layout import _largest_rectangle, common_area
+from agalign.products.rasters.layout import _largest_rectangle, common_area
 from agalign.synthetic import cameras
 from agalign.values import geometry
 from agalign.values.capture import Band, Radiometry

@@ -16,7 +16,7 @@ from agalign.cameras.metadata import Tags
 from agalign.cameras.pix4d import NAMESPACE
 from agalign.errors import UnreadableFileError
 from agalign.pixels.raster import probe, with_saturation_values
-from agalign.products.sidecar_file import find_sidecars, read_result
+from agalign.products.sidecar.file import find_sidecars, read_result
 from agalign.values.capture import Band, Capture
 from agalign.values.quality import Quality
 

@@ -17,8 +17,8 @@ import agalign
 from agalign.batch import RunOptions
 from agalign.config import Settings, WriteSettings
 from agalign.errors import SidecarError
-from agalign.products.excluded_captures import PANELS_FILE, SKY_FILE, PanelPart, read_sky
-from agalign.products.report import write_pages
+from agalign.products.report.pages import write_pages
+from agalign.products.run.excluded import PANELS_FILE, SKY_FILE, PanelPart, read_sky
 
 from ..conftest import Shared, read_json, seeded
 from ..program import agalign_here

@@ -12,8 +12,8 @@ import pytest
 import agalign
 from agalign.cameras.metadata import read_tags
 from agalign.cameras.pix4d import perspective_lens
-from agalign.products.export import export
-from agalign.products.sidecar_file import find_sidecars, read_sidecar
+from agalign.products.exports.programs import export
+from agalign.products.sidecar.file import find_sidecars, read_sidecar
 from agalign.values.choices import ExportProgram
 
 from ..conftest import Shared, read_json, seeded

@@ -5,7 +5,7 @@ from typing import Any
 import pytest
 
 from agalign.products.report.facts import PairTotals
-from agalign.products.sidecar import CaptureResult
+from agalign.products.sidecar.schema import CaptureResult
 
 from .test_sidecar import NIR, example
 

@@ -13,8 +13,9 @@ from synthetic_flights.aligned import make_aligned
 
 import agalign
 from agalign.batch.index_run import index_tasks, run_indices
-from agalign.products.flight_map import FlightMap
-from agalign.products.footprint import (
+from agalign.products.indices.formulas import INDICES
+from agalign.products.run.flight_map import FlightMap
+from agalign.products.run.footprint import (
     above_elevation,
     accuracy_of_footprint_m,
     geojson_geometry,
@@ -26,9 +27,8 @@ from agalign.products.footprint import (
     with_approximate_georeference,
     with_assumed_height,
 )
-from agalign.products.indices import INDICES
-from agalign.products.sidecar import CaptureResult
-from agalign.products.sidecar_file import read_result
+from agalign.products.sidecar.file import read_result
+from agalign.products.sidecar.schema import CaptureResult
 from agalign.values import geometry
 from agalign.values.capture import Band, Capture, Pose, Position
 

@@ -11,7 +11,7 @@ from synthetic_flights.cameras import MAVIC, MAVIC_3M, SENTERA_6X
 from synthetic_flights.troubles import make_two_headings
 
 import agalign
-from agalign.products.sidecar_file import find_sidecars
+from agalign.products.sidecar.file import find_sidecars
 from agalign.synthetic.camera_model import CameraSpec
 from agalign.synthetic.cameras import REDEDGE
 

@@ -14,8 +14,7 @@ from synthetic_flights.aligned import make_aligned
 
 from agalign.batch.index_run import index_tasks, run_indices
 from agalign.errors import ConfigurationError, InputError
-from agalign.products.index_rasters import IndexReport, IndexStatistics, read_table, update_table, write_rasters
-from agalign.products.indices import (
+from agalign.products.indices.formulas import (
     INDICES,
     Index,
     bands_for,
@@ -25,10 +24,11 @@ from agalign.products.indices import (
     index_of_formula,
     symbols_of,
 )
-from agalign.products.report import write_pages
-from agalign.products.run_captures import RAW, AlignedBand
-from agalign.products.sidecar import ProductPart
-from agalign.products.sidecar_file import read_sidecar, verify_outputs, write_sidecar
+from agalign.products.indices.rasters import IndexReport, IndexStatistics, read_table, update_table, write_rasters
+from agalign.products.report.pages import write_pages
+from agalign.products.run.captures import RAW, AlignedBand
+from agalign.products.sidecar.file import read_sidecar, verify_outputs, write_sidecar
+from agalign.products.sidecar.schema import ProductPart
 
 from ..conftest import write_band
 

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 import rasterio
 
-from agalign.products.drawing import LEVEL_BLOCKS, block_means, read_reduced_bands
 from agalign.products.report.charts import CHART_HEIGHT
+from agalign.products.report.drawing import LEVEL_BLOCKS, block_means, read_reduced_bands
 from agalign.products.report.light import CaptureLight, light_charts, radiometric_check
-from agalign.products.sidecar import Sidecar
-from agalign.products.sidecar_file import read_sidecar
+from agalign.products.sidecar.file import read_sidecar
+from agalign.products.sidecar.schema import Sidecar
 from agalign.values.capture import Band, Capture
 from agalign.values.image import OutputGrid
 

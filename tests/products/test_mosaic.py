@@ -22,10 +22,10 @@ from synthetic_flights.overlapping import GPS_ERROR_M, GSD_M, LATITUDE, LENS, LO
 
 import agalign
 from agalign.pixels.raster import transformed
-from agalign.products.footprint import utm_wkt
-from agalign.products.mosaic_adjustment import adjusted, misfit_m, tie_pairs
-from agalign.products.mosaic_placement import PlacedFlight, Placement, place_captures
-from agalign.products.sidecar_file import read_sidecar, write_sidecar
+from agalign.products.mosaic.adjustment import adjusted, misfit_m, tie_pairs
+from agalign.products.mosaic.placement import PlacedFlight, Placement, place_captures
+from agalign.products.run.footprint import utm_wkt
+from agalign.products.sidecar.file import read_sidecar, write_sidecar
 from agalign.values import geometry, lens
 from agalign.values.output_folder import locked
 

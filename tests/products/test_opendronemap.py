@@ -10,10 +10,10 @@ from synthetic_flights.troubles import make_two_headings
 
 import agalign
 from agalign.cameras.pix4d import vignetting_on_grid
-from agalign.products import aligned_files
-from agalign.products.export import export
-from agalign.products.layout import Layer
-from agalign.products.sidecar_file import find_sidecars, read_sidecar
+from agalign.products.exports.programs import export
+from agalign.products.rasters import aligned_files
+from agalign.products.rasters.layout import Layer
+from agalign.products.sidecar.file import find_sidecars, read_sidecar
 from agalign.synthetic.camera_model import CameraSpec
 from agalign.synthetic.cameras import REDEDGE
 from agalign.values import geometry

@@ -13,10 +13,10 @@ from synthetic_flights.troubles import make_terraces
 import agalign
 from agalign.batch.index_run import do_indices, index_tasks, run_indices
 from agalign.capture.tag_seeds import geo_seed
-from agalign.products.aligned_files import band_file_names
-from agalign.products.index_rasters import IndexReport
-from agalign.products.indices import INDICES
-from agalign.products.sidecar_file import verify_outputs
+from agalign.products.indices.formulas import INDICES
+from agalign.products.indices.rasters import IndexReport
+from agalign.products.rasters.aligned_files import band_file_names
+from agalign.products.sidecar.file import verify_outputs
 from agalign.synthetic import flight as synthetic
 from agalign.values import geometry
 from agalign.values.capture import Band, Capture, Georeference

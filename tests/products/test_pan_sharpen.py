@@ -10,8 +10,9 @@ from synthetic_flights.troubles import make_two_headings
 
 import agalign
 from agalign.pixels.raster import open_raster
-from agalign.products.layout import Layer
-from agalign.products.pan_sharpen import (
+from agalign.products.product import CapturePaths, ProductContext
+from agalign.products.rasters.layout import Layer
+from agalign.products.rasters.pan_sharpen import (
     _is_in_range,
     _sharpen,
     _Sources,
@@ -20,7 +21,6 @@ from agalign.products.pan_sharpen import (
     panchromatic,
     weights_of,
 )
-from agalign.products.product import CapturePaths, ProductContext
 from agalign.values.capture import Band, Capture
 from agalign.values.image import OutputGrid
 from agalign.values.mapping import PixelMapping
@@ -146,7 +146,7 @@ def test_a_band_that_is_not_delivered_or_does_not_see_infra_red_sharpens_none(
         return [Layer(b, own) for b in bands if b is bands[0] or b.name in alignments], OutputGrid(0, 0, 64, 48)
 
     bands = [Band("NIR", Path("NIR"), 1, 64, 48, "uint16", wavelength_nm=840.0), pan]
-    monkeypatch.setattr("agalign.products.pan_sharpen.output_layers", placed)
+    monkeypatch.setattr("agalign.products.rasters.pan_sharpen.output_layers", placed)
     prediction = None if std_px is None else SimpleNamespace(std_px=std_px)
     alignments = {pan.name: SimpleNamespace(status=status, prediction=prediction)}
     capture, grid = Capture("a", Path("in"), tuple(bands), 0), OutputGrid(0, 0, 64, 48)

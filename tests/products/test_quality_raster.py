@@ -10,14 +10,14 @@ import rasterio
 
 import agalign
 from agalign.pixels.sun_glint import sun_glint
-from agalign.products import quality_raster
-from agalign.products.index_rasters import write_rasters
-from agalign.products.indices import index_named, index_of_formula
-from agalign.products.layout import Layer
+from agalign.products.indices.formulas import index_named, index_of_formula
+from agalign.products.indices.rasters import write_rasters
 from agalign.products.product import CapturePaths, ProductContext
-from agalign.products.quality_raster import _flags, error_lattice_px, error_on_tile
-from agalign.products.run_captures import bands_of
-from agalign.products.sidecar_file import read_result
+from agalign.products.rasters import quality_raster
+from agalign.products.rasters.layout import Layer
+from agalign.products.rasters.quality_raster import _flags, error_lattice_px, error_on_tile
+from agalign.products.run.captures import bands_of
+from agalign.products.sidecar.file import read_result
 from agalign.values import geometry, lens
 from agalign.values.capture import Band, Capture, Radiometry
 from agalign.values.image import OutputGrid

@@ -14,10 +14,11 @@ import pytest
 
 import agalign
 from agalign.flight.rig_file import read_rig
-from agalign.products.drawing import ReducedBands
-from agalign.products.preview import ReliefView, preview_bytes, write_preview
-from agalign.products.report import pages, pages_exist, write_pages
+from agalign.products.report import pages
 from agalign.products.report.charts import CHART_HEIGHT, drifts_of, rig_views
+from agalign.products.report.drawing import ReducedBands
+from agalign.products.report.pages import pages_exist, write_pages
+from agalign.products.report.preview import ReliefView, preview_bytes, write_preview
 
 from ..conftest import raising, read_json, save_known_model, textured_image
 

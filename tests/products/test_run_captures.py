@@ -15,10 +15,10 @@ import rasterio
 from synthetic_flights.aligned import make_aligned
 
 import agalign
-from agalign.products.export import export
-from agalign.products.raster_file import to_cog
-from agalign.products.run_captures import exceptions
-from agalign.products.sidecar_file import find_sidecars
+from agalign.products.exports.programs import export
+from agalign.products.rasters.raster_file import to_cog
+from agalign.products.run.captures import exceptions
+from agalign.products.sidecar.file import find_sidecars
 from agalign.synthetic import flight as synthetic
 
 from ..conftest import Shared, read_json, seeded
@@ -112,7 +112,7 @@ def test_a_mosaic_of_two_sources_names_both(tmp_path: Path) -> None:
 
 def test_a_killed_export_does_not_block_its_repeat(run: Path, tmp_path: Path) -> None:
     code = (
-        "import os, signal, sys; from pathlib import Path; from agalign.products.export import export\n"
+        "import os, signal, sys; from pathlib import Path; from agalign.products.exports.programs import export\n"
         "real, done = os.link, []\n"
         "def link(*names):\n"
         "    real(*names); done.append(1)\n"

@@ -15,10 +15,8 @@ from scipy.interpolate import CloughTocher2DInterpolator, RectBivariateSpline
 import agalign
 from agalign.config import Settings
 from agalign.errors import InputError, OutputError, SidecarError
-from agalign.products.fill_sidecar import sidecar_of
 from agalign.products.product import CapturePaths, ProductContext
-from agalign.products.sidecar import GridPart, ProductPart, Sidecar
-from agalign.products.sidecar_file import (
+from agalign.products.sidecar.file import (
     content_checksum,
     find_sidecars,
     read_result,
@@ -26,6 +24,8 @@ from agalign.products.sidecar_file import (
     verify_outputs,
     write_sidecar,
 )
+from agalign.products.sidecar.fill import sidecar_of
+from agalign.products.sidecar.schema import GridPart, ProductPart, Sidecar
 from agalign.values import geometry
 from agalign.values.alignment import Alignment, JointResult, Seed
 from agalign.values.capture import Band, Capture

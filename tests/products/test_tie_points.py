@@ -9,7 +9,7 @@ import pytest
 from scipy.interpolate import CloughTocher2DInterpolator
 
 import agalign
-from agalign.products.tie_points import TiePoint, _geojson
+from agalign.products.exports.tie_points import TiePoint, _geojson
 from agalign.synthetic.flight import make_flight
 from agalign.values.capture import Georeference
 

@@ -30,7 +30,7 @@ import tifffile
 
 from agalign.cli import align_run as cli_run
 from agalign.errors import SidecarError
-from agalign.products.sidecar_file import find_sidecars, read_sidecar
+from agalign.products.sidecar.file import find_sidecars, read_sidecar
 from agalign.values.files import RUN_FILE
 
 from ..conftest import textured_pair

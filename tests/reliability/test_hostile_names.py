@@ -17,9 +17,9 @@ from agalign.batch.capture_task import discard_outputs
 from agalign.batch.index_run import index_tasks, run_indices
 from agalign.cameras.tiff_directory import EXIF, GPS, XMP, add_directories, byte_string, read_directories, text
 from agalign.flight.groups import model_names
-from agalign.products.export import export
-from agalign.products.indices import index_named
-from agalign.products.sidecar_file import content_checksum, find_sidecars
+from agalign.products.exports.programs import export
+from agalign.products.indices.formulas import index_named
+from agalign.products.sidecar.file import content_checksum, find_sidecars
 from agalign.values.capture import Band, CameraIdentity, Capture
 from agalign.values.files import file_name
 from agalign.values.text import without_controls

@@ -25,9 +25,9 @@ from agalign.errors import AgalignError, InputError, SidecarError
 from agalign.flight.model import FlightModel, load_model, save_model
 from agalign.method.descriptor import Descriptor
 from agalign.pixels.raster import probe
-from agalign.products.excluded_captures import read_panels
-from agalign.products.run_record import read_run_record
-from agalign.products.sidecar_file import read_result, read_sidecar
+from agalign.products.run.excluded import read_panels
+from agalign.products.run.record import read_run_record
+from agalign.products.sidecar.file import read_result, read_sidecar
 from agalign.values.capture import Band
 from agalign.values.files import RUN_FILE
 from agalign.values.image import OutputGrid

@@ -23,11 +23,11 @@ from agalign.cameras.pix4d import NAMESPACE, focal_length_px
 from agalign.cameras.read_files import _with_lens_of_image
 from agalign.errors import SidecarError
 from agalign.flight.model import FlightModel, load_model, save_model
-from agalign.products.excluded_captures import PANELS_FILE, SKY_FILE, read_panels, read_sky
-from agalign.products.flight_map import FLIGHT_MAP_FILE, features_in
-from agalign.products.index_rasters import INDICES_FILE, read_table
-from agalign.products.run_record import read_run_record
-from agalign.products.sidecar_file import find_sidecars, read_sidecar
+from agalign.products.indices.rasters import INDICES_FILE, read_table
+from agalign.products.run.excluded import PANELS_FILE, SKY_FILE, read_panels, read_sky
+from agalign.products.run.flight_map import FLIGHT_MAP_FILE, features_in
+from agalign.products.run.record import read_run_record
+from agalign.products.sidecar.file import find_sidecars, read_sidecar
 from agalign.products.text_files import write_csv
 from agalign.synthetic import flight as synthetic
 from agalign.values import geometry

@@ -23,7 +23,7 @@ REJECTED = {
 ACCEPTED = "FixedImagePx(1.0) * 3.0 >= FixedImagePx(0.5)"
 PREAMBLE = """
 import numpy as np
-from agalign.products.tie_points import tie_points
+from agalign.products.exports.tie_points import tie_points
 from agalign.values.alignment import Alignment
 from agalign.values.capture import Band
 from agalign.values.pixel_units import FixedFilePx, FixedImagePx, FixedImagePoints, MovingFilePx, MovingImagePoints

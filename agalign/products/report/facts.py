@@ -12,10 +12,18 @@ from urllib.parse import quote
 import numpy as np
 from pydantic import BaseModel
 
-from agalign.products.index_rasters import IndexReport
-from agalign.products.run_captures import RAW
-from agalign.products.run_record import RefusalPart
-from agalign.products.sidecar import BandPart, BandResult, CaptureResult, GridPart, OutputPart, PreviewPart, Sidecar
+from agalign.products.indices.rasters import IndexReport
+from agalign.products.run.captures import RAW
+from agalign.products.run.record import RefusalPart
+from agalign.products.sidecar.schema import (
+    BandPart,
+    BandResult,
+    CaptureResult,
+    GridPart,
+    OutputPart,
+    PreviewPart,
+    Sidecar,
+)
 from agalign.values.issues import MISSING_BAND, MOSAICS, OTHER_REFERENCE, UNREADABLE, Remedy
 from agalign.verify.checks import KINDS
 

@@ -17,9 +17,9 @@ from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates
 
 from agalign.pixels.landmarks import Landmarks, landmarks, matched_homography
-from agalign.products.drawing import LEVEL_BLOCKS
 from agalign.products.report.charts import FlightChart, by_band
-from agalign.products.sidecar import Sidecar
+from agalign.products.report.drawing import LEVEL_BLOCKS
+from agalign.products.sidecar.schema import Sidecar
 from agalign.values import geometry
 from agalign.values.cores import usable_cores
 from agalign.values.files import read_regular

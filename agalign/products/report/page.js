@@ -307,7 +307,7 @@ function indexNames() {
 }
 
 /**
- * As agalign/products/index_rasters.py has them.
+ * As agalign/products/indices/rasters.py has them.
  * @param {number} share @param {boolean} raw
  */
 function indexColour(share, raw) {
@@ -614,7 +614,7 @@ function showDetail() {
 }
 
 /**
- * Place of a picture on the sheet: x, y, width, height. Rows are those of agalign/products/preview.py.
+ * Place of a picture on the sheet: x, y, width, height. Rows are those of agalign/products/report/preview.py.
  * @param {Preview} preview @param {number} column @param {number} line @returns {[number, number, number, number]}
  */
 function onSheet(preview, column, line) {

@@ -18,13 +18,13 @@ from jinja2 import Environment, PackageLoader, StrictUndefined, select_autoescap
 from agalign._version import __version__
 from agalign.config import Settings
 from agalign.errors import SidecarError
-from agalign.products.excluded_captures import PANELS_FILE, SKY_FILE, PanelPart, SkyPart, read_panels, read_sky
-from agalign.products.index_rasters import IndexReport, reports_of_run, update_table
+from agalign.products.indices.rasters import IndexReport, reports_of_run, update_table
 from agalign.products.report.charts import drifts_of, rig_views
 from agalign.products.report.facts import BAND_COLUMNS, FailureGroup, FlightFacts, masked_shares
 from agalign.products.report.light import CaptureLight, light_charts, radiometric_check
-from agalign.products.run_record import RunPart, exclusion_lines, read_run_record
-from agalign.products.sidecar_file import find_sidecars, read_sidecar
+from agalign.products.run.excluded import PANELS_FILE, SKY_FILE, PanelPart, SkyPart, read_panels, read_sky
+from agalign.products.run.record import RunPart, exclusion_lines, read_run_record
+from agalign.products.sidecar.file import find_sidecars, read_sidecar
 from agalign.products.text_files import write_csv
 from agalign.values.files import write_text
 

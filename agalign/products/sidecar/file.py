@@ -9,7 +9,7 @@ from typing import Any, TypeVar
 from pydantic import ValidationError
 
 from agalign.errors import InputError, SidecarError
-from agalign.products.sidecar import SCHEMA, CaptureResult, Sidecar
+from agalign.products.sidecar.schema import SCHEMA, CaptureResult, Sidecar
 from agalign.products.text_files import compact_lists
 from agalign.values.files import file_checksum, open_regular, read_regular, write_text
 

@@ -8,10 +8,10 @@ from typing import Any
 
 from pydantic_core import from_json
 
-from agalign.products.footprint import accuracy_of_footprint_m, footprint, geojson_geometry, with_assumed_height
-from agalign.products.index_rasters import IndexReport, read_table
+from agalign.products.indices.rasters import IndexReport, read_table
 from agalign.products.product import CapturePaths
-from agalign.products.sidecar import BandResult, CaptureResult
+from agalign.products.run.footprint import accuracy_of_footprint_m, footprint, geojson_geometry, with_assumed_height
+from agalign.products.sidecar.schema import BandResult, CaptureResult
 from agalign.values.capture import Capture, Pose
 from agalign.values.files import read_regular, write_text
 from agalign.values.image import OutputGrid

@@ -22,8 +22,8 @@ from scipy.sparse.linalg import spsolve
 
 from agalign.pixels.landmarks import Landmarks, landmarks, matches, robust_homography
 from agalign.pixels.raster import without_warnings
-from agalign.products.mosaic_placement import Placement
-from agalign.products.run_captures import BandReader
+from agalign.products.mosaic.placement import Placement
+from agalign.products.run.captures import BandReader
 from agalign.values import geometry
 from agalign.values.cores import usable_cores
 from agalign.values.geometry import Points

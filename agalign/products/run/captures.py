@@ -16,8 +16,8 @@ from rasterio.windows import Window
 
 from agalign.errors import InputError, SidecarError
 from agalign.pixels.raster import OpenRaster, innermost_cause, open_raster
-from agalign.products.sidecar import CaptureResult, is_usable
-from agalign.products.sidecar_file import read_result, run_sidecars
+from agalign.products.sidecar.file import read_result, run_sidecars
+from agalign.products.sidecar.schema import CaptureResult, is_usable
 from agalign.values.image import FloatImage, Tile, reduced_size_px
 from agalign.values.quality import UNUSABLE
 

@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 
 from agalign.errors import NoSuchBandError, SidecarError
 from agalign.pixels.raster import read_preview
-from agalign.products.sidecar import BandPart, ReliefPart, Sidecar
-from agalign.products.sidecar_file import read_sidecar
+from agalign.products.sidecar.file import read_sidecar
+from agalign.products.sidecar.schema import BandPart, ReliefPart, Sidecar
 from agalign.relief.occlusion import occluded
 from agalign.values import lens
 from agalign.values.alignment import Alignment, Residual, Seed

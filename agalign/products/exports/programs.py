@@ -23,10 +23,10 @@ from agalign.cameras.metadata import read_tags
 from agalign.cameras.read_files import ImageFile, natural_order, read_file
 from agalign.config import DiscoverOptions
 from agalign.errors import ConfigurationError, InputError, OutputError, SidecarError
-from agalign.products.run_captures import LeftOut, RunCapture, captures_of_run, like_most
-from agalign.products.run_record import read_run_record
-from agalign.products.sidecar import BandPart
-from agalign.products.sidecar_file import read_sidecar
+from agalign.products.run.captures import LeftOut, RunCapture, captures_of_run, like_most
+from agalign.products.run.record import read_run_record
+from agalign.products.sidecar.file import read_sidecar
+from agalign.products.sidecar.schema import BandPart
 from agalign.products.text_files import write_csv
 from agalign.values import geometry, lens
 from agalign.values.choices import ExportProgram

@@ -12,10 +12,10 @@ from agalign._version import __version__
 from agalign.cameras.base import is_thermal
 from agalign.errors import UnreadableFileError
 from agalign.flight.fingerprint import fingerprint, input_samples
-from agalign.products.aligned_files import BandFiles, Stack
 from agalign.products.product import ProductContext, WrittenFile
-from agalign.products.relief_map import ReliefMap
-from agalign.products.sidecar import BandPart, Sidecar, is_usable
+from agalign.products.rasters.aligned_files import BandFiles, Stack
+from agalign.products.rasters.relief_map import ReliefMap
+from agalign.products.sidecar.schema import BandPart, Sidecar, is_usable
 from agalign.values import geometry
 from agalign.values.alignment import Alignment
 from agalign.values.capture import Band

@@ -13,7 +13,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from agalign._version import __version__
 from agalign.config import Settings
 from agalign.flight.groups import CameraOverview, camera_overviews
-from agalign.products.sidecar import CaptureResult
+from agalign.products.sidecar.schema import CaptureResult
 from agalign.products.text_files import read_model, write_model
 from agalign.values.capture import Capture
 from agalign.values.cores import usable_cores

@@ -14,9 +14,9 @@ from agalign.cameras.tag_transfer import band_tags, capture_tags
 from agalign.config import WriteSettings
 from agalign.errors import UnreadableFileError
 from agalign.pixels.raster import suffix_format
-from agalign.products.layout import Layer, is_inside
 from agalign.products.product import CapturePaths, Product, ProductContext, StacAsset, WrittenFile
-from agalign.products.raster_file import media_type, write_raster
+from agalign.products.rasters.layout import Layer, is_inside
+from agalign.products.rasters.raster_file import media_type, write_raster
 from agalign.values import geometry
 from agalign.values.capture import Band, Capture, Radiometry
 from agalign.values.files import file_name

@@ -22,7 +22,9 @@ from agalign._version import __version__
 from agalign.config import WriteSettings
 from agalign.errors import ConfigurationError, InputError
 from agalign.pixels.raster import OpenRaster, open_raster
-from agalign.products.checked_raster import (
+from agalign.products.indices.formulas import Index, bands_for, compute, index_named
+from agalign.products.product import GEOTIFF, CapturePaths, Product, ProductContext, StacAsset, WrittenFile
+from agalign.products.rasters.checked_raster import (
     FLOAT_OPTIONS,
     WORK_TILE_PX,
     LayerDescription,
@@ -30,12 +32,10 @@ from agalign.products.checked_raster import (
     checked_raster,
     tiled_profile,
 )
-from agalign.products.drawing import with_text, write_png
-from agalign.products.indices import Index, bands_for, compute, index_named
-from agalign.products.product import GEOTIFF, CapturePaths, Product, ProductContext, StacAsset, WrittenFile
-from agalign.products.raster_file import tags_of, to_cog
-from agalign.products.run_captures import RAW, AlignedBand, BandReader
-from agalign.products.sidecar import CaptureResult
+from agalign.products.rasters.raster_file import tags_of, to_cog
+from agalign.products.report.drawing import with_text, write_png
+from agalign.products.run.captures import RAW, AlignedBand, BandReader
+from agalign.products.sidecar.schema import CaptureResult
 from agalign.products.text_files import write_csv
 from agalign.values.capture import Band, Capture
 from agalign.values.files import read_regular

@@ -11,10 +11,10 @@ import numpy as np
 
 from agalign.errors import ConfigurationError, InputError, UnreadableFileError
 from agalign.pixels.raster import without_warnings
-from agalign.products.relief_map import RELIEF_UNITS
-from agalign.products.run_captures import RunCapture, captures_of_run, exceptions, like_most
-from agalign.products.sidecar import BandPart, Sidecar
-from agalign.products.sidecar_file import read_sidecar
+from agalign.products.rasters.relief_map import RELIEF_UNITS
+from agalign.products.run.captures import RunCapture, captures_of_run, exceptions, like_most
+from agalign.products.sidecar.file import read_sidecar
+from agalign.products.sidecar.schema import BandPart, Sidecar
 from agalign.values.capture import CaptureTime
 
 if TYPE_CHECKING:

@@ -13,13 +13,19 @@ import numpy as np
 
 from agalign.errors import ConfigurationError, InputError
 from agalign.pixels.raster import open_raster
-from agalign.products.checked_raster import Block, LayerDescription, georeference_tags, grid_profile, write_layers
-from agalign.products.index_rasters import IndexReport, write_rasters
-from agalign.products.indices import Index, index_named
-from agalign.products.mosaic_adjustment import adjusted, misfit_m, tie_pairs, tied_groups
-from agalign.products.mosaic_placement import Placement, place_captures
-from agalign.products.raster_file import to_cog, with_nodata
-from agalign.products.run_captures import AlignedBand, BandReader, LeftOut
+from agalign.products.indices.formulas import Index, index_named
+from agalign.products.indices.rasters import IndexReport, write_rasters
+from agalign.products.mosaic.adjustment import adjusted, misfit_m, tie_pairs, tied_groups
+from agalign.products.mosaic.placement import Placement, place_captures
+from agalign.products.rasters.checked_raster import (
+    Block,
+    LayerDescription,
+    georeference_tags,
+    grid_profile,
+    write_layers,
+)
+from agalign.products.rasters.raster_file import to_cog, with_nodata
+from agalign.products.run.captures import AlignedBand, BandReader, LeftOut
 from agalign.values import geometry
 from agalign.values.capture import Georeference
 from agalign.values.choices import MAX_PIXELS

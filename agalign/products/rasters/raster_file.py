@@ -22,7 +22,9 @@ from agalign.errors import AgalignError
 from agalign.pixels.band_resampling import resample_tile
 from agalign.pixels.radiometry import calibrated
 from agalign.pixels.raster import GDAL_ENVIRONMENT, open_raster, read_tile, without_warnings
-from agalign.products.checked_raster import (
+from agalign.products.indices.formulas import Role, role_of_band
+from agalign.products.product import GEOTIFF
+from agalign.products.rasters.checked_raster import (
     WORK_TILE_PX,
     Block,
     LayerDescription,
@@ -31,9 +33,7 @@ from agalign.products.checked_raster import (
     predictor,
     write_layers,
 )
-from agalign.products.indices import Role, role_of_band
-from agalign.products.layout import Layer, is_inside
-from agalign.products.product import GEOTIFF
+from agalign.products.rasters.layout import Layer, is_inside
 from agalign.values.capture import Band, Capture, Quantity, Radiometry
 from agalign.values.choices import Interpolation
 from agalign.values.image import Mask, OutputGrid, Tile

@@ -1,0 +1,1 @@
+"""Spectral indices: formulas, rasters, statistics and table."""

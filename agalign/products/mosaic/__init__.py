@@ -1,0 +1,1 @@
+"""Quick mosaics of a flight."""

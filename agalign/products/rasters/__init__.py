@@ -1,0 +1,1 @@
+"""Rasters on the output grid of a capture."""

@@ -1,0 +1,1 @@
+"""The sidecar of a capture: its schema, values and file."""
