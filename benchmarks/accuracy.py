@@ -27,7 +27,7 @@ from agalign import Alignment, read_alignment
 from agalign.cameras.discover import discover
 from agalign.config import CheckSettings
 from agalign.pixels.raster import without_warnings
-from agalign.products.sidecar_file import find_sidecars
+from agalign.products.sidecar.file import find_sidecars
 from agalign.values import geometry
 
 Points = NDArray[np.float64]

@@ -5,7 +5,6 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
-from synthetic_flights.cameras import to_plane
 from synthetic_flights.depth import CLOSE_RANGE, Scene, Truth, truth_of, view
 from synthetic_flights.materials import make_textures
 from synthetic_flights.patches import Patch
