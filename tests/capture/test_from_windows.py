@@ -186,6 +186,15 @@ def test_a_rig_of_the_whole_image_prevents_extrapolation(
     assert extrapolated(replace(pair, candidate_std_px={"model": 1.0}), before, rig).status == status
 
 
+def test_a_homography_does_not_extrapolate_the_relief_of_a_flight(left: tuple[BandPair, Alignment]) -> None:
+    std_px, pair = {"moving": 0.1}, replace(left[0], candidate_std_px={"model": 1.0})
+    rig = Rig(SIZE, {"moving": MATRIX}, {"moving": (1.0, 0.0)}, {"moving": 0.0}, std_px, (), (), std_px)
+    after = extrapolated(pair, left[1], replace(rig, parallax_px={"moving": 4.0}))
+    assert after.status == "predicted"
+    assert after.prediction.std_px > 4.0
+    assert expected_error_px(after, SIZE, np.array([[320.0, 240.0]]))[0] > 3.5
+
+
 @pytest.mark.slow
 def test_half_masked_arrays_are_predicted() -> None:
     fixed, moving = distorted_images()

@@ -153,6 +153,12 @@ def test_a_failed_band_is_predicted_with_a_standard_error(five: Path, model: Fli
     assert result["Red"].prediction.off_px is not None
 
 
+def test_a_prediction_of_a_plane_contains_the_parallax_of_the_flight(five: Path, model: FlightModel) -> None:
+    with_relief = replace(model, rig=replace(model.rig, parallax_px=dict.fromkeys(model.rig.mean, 3.0)))
+    std_px = [bands_of(five, 2, m)["NIR"].prediction.std_px for m in (model, with_relief)]
+    assert std_px[1] == pytest.approx(np.hypot(std_px[0], 3.0))
+
+
 def test_a_capture_over_water_is_predicted_without_learning(run: Run) -> None:
     out, reports = run
     water = reports["IMG_0005"].sidecar

@@ -25,6 +25,7 @@ from agalign.capture.relief_candidate import (
     _common_parallax_px,
     _Estimate,
     _is_chosen,
+    _std_px,
     aligned_by_relief,
 )
 from agalign.capture.warped_pair import WarpedPair
@@ -41,7 +42,9 @@ from agalign.values.geometry import Matrix
 from agalign.values.image import Mask, Raster
 from agalign.values.issues import RETRIEVAL, Issue
 from agalign.values.mapping import PixelMapping
+from agalign.values.parallax import Relief
 from agalign.values.pixel_units import MovingFilePx
+from agalign.verify.extrapolation import expected_error_px
 
 from ..builders import in_full_run, joint_result, residual_of, whole
 from ..conftest import textured_image
@@ -154,6 +157,24 @@ def test_all_bands_are_aligned_by_one_relief(boxes: Rendered, aligned: Mapping[s
 def near(mask: Mask) -> Mask:
     """With a pixel around."""
     return np.asarray(cv2.dilate(mask.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0)
+
+
+def test_reliefs_from_different_bands_give_a_standard_error(boxes: Rendered, aligned: Mapping[str, Alignment]) -> None:
+    one, other = (Relief(np.full((40, 60), z, np.float32), np.ones((40, 60), np.float32)) for z in (1.0, 3.0))
+    np.testing.assert_allclose(_std_px([one, other]), 1.0)
+    np.testing.assert_allclose(_std_px([one, one, one, other]), np.sqrt(3 * 0.75))
+    parallax = next(iter(aligned.values())).mapping.parallax
+    assert parallax is not None
+    points = geometry.lattice(*next(iter(aligned.values())).size_px, 40, 30)
+    np.testing.assert_allclose(
+        parallax.variance_px2(points) / np.hypot(*parallax.baseline) ** 2,
+        replace(parallax.relief, parallax_px=parallax.relief.std_px)(points) ** 2,
+    )
+    known, certain = next(iter(aligned.values())), replace(parallax, relief=replace(parallax.relief, std_px=None))
+    flat = replace(known, mapping=known.mapping.with_parallax(certain))
+    squares = [expected_error_px(a, a.size_px, points) ** 2 for a in (known, flat)]
+    np.testing.assert_allclose(squares[0] - squares[1], parallax.variance_px2(points), atol=1e-9)
+    assert np.median(parallax.variance_px2(points)) < 0.3**2
 
 
 def test_occluded_pixels_are_detected(boxes: Rendered, aligned: Mapping[str, Alignment]) -> None:

@@ -103,6 +103,13 @@ def test_a_known_layout_predicts_captures_at_an_unseen_height() -> None:
     assert error < 2.5 * std
 
 
+def test_the_parallax_of_a_flight_is_the_rms_over_its_captures() -> None:
+    captures = flight(4)
+    with_relief = [replace(c, parallax_px={"Red": 6.0}) for c in captures[:1]] + captures[1:]
+    learned = learn_rig(with_relief, SIZE, {})
+    assert learned.parallax_px == pytest.approx({**dict.fromkeys(learned.mean, 0.0), "Red": 3.0})
+
+
 @pytest.mark.slow
 def test_an_aliased_band_does_not_bias_the_others(rig: Rig) -> None:
     known = observation(9.0, 1.0)

@@ -80,6 +80,23 @@ def test_windows_outside_a_moving_image_do_not_match() -> None:
     assert np.abs(relief.parallax_px).max() < 1.0
 
 
+def test_saturated_spots_of_a_band_take_no_part() -> None:
+    """The other bands determine the parallax there, with their confidence."""
+    seen = views(BOX, 12, BASELINES)
+    spot = slice(100, 140), slice(130, 190)
+    for k in (0, 1):
+        image = seen[k].image
+        valid = np.ones((HEIGHT, WIDTH), bool)
+        valid[spot] = False
+        seen[k] = View(Raster(np.where(valid, image.pixels, 0), valid), seen[k].plane, seen[k].baseline)
+    matching = of_views(seen, BOX, 12)
+    check(matching.matched(range(4)), BOX, 12)
+    (relief, by_spotted) = matching.refined(seen, [range(4), [0, 1]])
+    check(relief, BOX, 12)
+    assert relief.confidence[105:135, 140:180].mean() > 0.8
+    assert by_spotted.confidence[110:130, 150:170].max() == 0
+
+
 def test_thirty_bands_do_not_overflow() -> None:
     seen = views(BOX, 12, [BASELINES[k % 4] for k in range(30)])
     matching = of_views(seen, BOX, 12)
