@@ -105,8 +105,7 @@ def claims_px(path: Path, sidecar: Any, band: str, points_px: Points) -> Points:
 
 def rows_of(out: Path, folder: Path, clean: dict[tuple[str, str], Alignment[Any]] | None) -> list[Row]:
     """Return a row for each moving band of a run; `clean` are the mappings of the undamaged run."""
-    result = []
-    ties, truth = folder / "ties.json", {}
+    result, ties, truth = [], folder / "ties.json", {}
     for capture in json.loads(ties.read_text(encoding="utf-8")).values() if ties.exists() else ():
         truth |= {file: entry | {"reference": capture["reference"]} for file, entry in capture["bands"].items()}
     for path in find_sidecars(out):
@@ -163,9 +162,9 @@ def print_rows(name: str, rows: list[Row]) -> None:
         print_row(name, *what, *errors, beyond, claim, f"{row.seconds:.1f}")
 
 
-def summary(name: str, rows: list[Row], seconds: float) -> tuple[str, ...]:
+def summary(name: str, rows: list[Row]) -> tuple[str, ...]:
     aligned = [r for r in rows if r.status == "aligned"]
-    medians = np.array([np.median(r.error_px) for r in aligned if len(r.error_px)])
+    medians, p95s = (np.array([np.percentile(r.error_px, q) for r in aligned if len(r.error_px)]) for q in (50, 95))
     usable = [r for r in rows if r.is_usable and len(r.error_px) and np.isfinite(r.claim_px).any()]
     error = np.concatenate([r.error_px for r in usable]) if usable else np.empty(0)
     claim = np.concatenate([r.claim_px for r in usable]) if usable else np.empty(0)
@@ -180,9 +179,10 @@ def summary(name: str, rows: list[Row], seconds: float) -> tuple[str, ...]:
         str(sum(r.is_wrong for r in rows)),
         f"{np.median(medians):.3f}" if len(medians) else "",
         f"{medians.max():.3f}" if len(medians) else "",
+        f"{np.median(p95s):.2f}" if len(p95s) else "",
         within,
         false,
-        f"{seconds:.0f}",
+        f"{np.median([r.seconds for r in aligned]):.1f}" if aligned else "",
     )
 
 
@@ -205,15 +205,16 @@ def main(
             with flight_and_out() as (flight, out):
                 if name:
                     damaged_copy(folder, flight, name)
-                seconds = align(flight if name else folder, out, "--error-map")
+                align(flight if name else folder, out, "--error-map")
                 rows = rows_of(out, folder, clean if name else None)
                 if not name and damage:
                     clean = mappings(out)
             if bands:
                 print_rows(title, rows)
-            lines.append(summary(title, rows, seconds))
+            lines.append(summary(title, rows))
     print()
-    print_head("set", "aligned", "usable predictions", "wrong", "median, px", "worst", "<= 2 claims", "< 0.3, > 1", "s")
+    shares = "error <= 2 claims", "claim < 0.3, error > 1"
+    print_head("set", "aligned", "usable predictions", "wrong", "median, px", "worst", "95 %", *shares, "s per pair")
     for line in lines:
         print_row(*line)
 

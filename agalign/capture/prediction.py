@@ -14,7 +14,7 @@ from agalign.capture.warped_pair import WarpedPair
 from agalign.flight.rig import Observation, Rig, distance_px
 from agalign.flight.rig_prediction import predict_band
 from agalign.relief.occlusion import occluded
-from agalign.values.alignment import MIN_TIMES_CHANCE, Alignment
+from agalign.values.alignment import MIN_TIMES_CHANCE, Alignment, Prediction
 from agalign.values.capture import Capture
 from agalign.values.issues import Issue
 from agalign.values.parallax import Parallax
@@ -104,12 +104,9 @@ def _with_prediction(
     pair: BandPair, alignment: Alignment[FixedImagePx], rig: Rig, known: Observation, expected: _ExpectedParallax | None
 ) -> Alignment[FixedImagePx]:
     prediction = predict_band(rig, pair.name, known)
-    if expected is None:  # a homography does not follow the relief that captures of the flight have
-        of_parallax_px = rig.parallax_px.get(pair.name, MovingFilePx(0.0))
-    else:
+    if expected is not None:
         matrix = pair.scales.between_images(prediction.fixed_to_moving)
-        of_parallax_px = pair.in_moving_file_px(expected.std_px, matrix)
-    prediction = replace(prediction, std_px=MovingFilePx(np.hypot(prediction.std_px, of_parallax_px)))
+        prediction = _with_added_error(prediction, pair.in_moving_file_px(expected.std_px, matrix))
     if pair.name in known.mappings and alignment.joint is not None and alignment.residual is not None:
         off_px = distance_px(known.mappings[pair.name], prediction.fixed_to_moving, rig.size_px)
         prediction = replace(prediction, off_px=off_px)
@@ -124,6 +121,10 @@ def _with_prediction(
         if not issues:
             return replace(alignment, prediction=prediction)
         alignment = replace(alignment, issues=issues)
+    if expected is None:
+        # A homography does not follow the relief that captures of the flight have. The plane of a result, which the
+        # check above compares, is not displaced by it.
+        prediction = _with_added_error(prediction, rig.parallax_px.get(pair.name, MovingFilePx(0.0)))
     if alignment.prediction is not None and alignment.prediction.std_px <= prediction.std_px:
         by_windows = pair.scales.between_files(alignment.fixed_to_moving)
         if distance_px(by_windows, prediction.fixed_to_moving, rig.size_px) <= MAX_UNEXPECTED_PX:
@@ -136,7 +137,11 @@ def _with_prediction(
         return decided(replace(alignment, mapping=by_rig.mapping, residual=residual, prediction=prediction))
     off_px = distance_px(pair.scales.between_files(rotated), prediction.fixed_to_moving, rig.size_px)
     issues = Issue(UNEXPECTED_PX, off_px, MAX_UNEXPECTED_PX), *alignment.issues
-    return decided(replace(alignment, mapping=alignment.of_the_seed, issues=issues, prediction=None))
+    return decided(replace(alignment, mapping=alignment.of_the_seed, issues=issues, prediction=None, residual=None))
+
+
+def _with_added_error(prediction: Prediction, error_px: MovingFilePx) -> Prediction:
+    return replace(prediction, std_px=MovingFilePx(math.hypot(prediction.std_px, error_px)))
 
 
 def bands_to_learn(

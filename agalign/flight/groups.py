@@ -116,7 +116,7 @@ class CameraOverview:
     radiometry: tuple[RadiometryChoice, ...]
     """Values of `--radiometry` that the tags of all captures support; panels are not considered."""
     uncalibrated: str = ""
-    """Why there is no calibration: the missing or unused tags."""
+    """Missing or unused tags that prevent a calibration, in words."""
     gsd_per_height: float | None = None
     """Ground sample distance per metre of height, from the focal length of the reference."""
 

@@ -180,10 +180,10 @@ def test_a_capture_over_water_is_predicted_without_learning(run: Run) -> None:
 
 
 def test_an_alignment_that_contradicts_the_rig_is_rejected(five: Path, model: FlightModel) -> None:
-    """The images match with a shift of one period, which contradicts the other bands."""
+    """The images match with a shift of one period, which contradicts the other bands, in a flight with relief too."""
     mean = model.rig.mean
     moved = mean | {"NIR": geometry.compose(geometry.translation(25, 0), mean["NIR"])}
-    result = bands_of(five, 0, replace(model, rig=replace(model.rig, mean=moved)))
+    result = bands_of(five, 0, replace(model, rig=replace(model.rig, mean=moved, parallax_px={"NIR": 10.0})))
     assert result["NIR"].status == "predicted"
     assert result["NIR"].issues[0].code == "unexpected_px"
     assert result["NIR"].issues[0].value == pytest.approx(25, abs=3)
