@@ -69,6 +69,7 @@ def test_every_text_is_read_and_written_in_an_encoding_that_is_said(flight: Path
         assert done.returncode in (0, 3), done.stderr
 
 
+@pytest.mark.full
 @pytest.mark.slow
 def test_processes_that_start_from_nothing(flight: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """As on Windows and macOS: they do not share the memory of this process."""

@@ -252,6 +252,7 @@ def test_a_model_is_learned_again_if_its_input_changed(flight: Path) -> None:
     assert learning_fingerprint(captures, elsewhere) != before
 
 
+@pytest.mark.full
 def test_any_executor_will_do(flight: Path, out_with_model: Path) -> None:
     with ThreadPoolExecutor(1) as executor:
         reports = agalign.align_folder(flight, out_with_model, settings=SETTINGS, run=RunOptions(executor=executor))
@@ -354,6 +355,7 @@ def test_one_run_at_a_time(flight: Path, tmp_path: Path) -> None:
     assert not list(tmp_path.rglob(".agalign*"))
 
 
+@pytest.mark.full
 def test_a_failed_picture_is_only_reported(flight: Path, out_with_model: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(preview, "write_picture", raising(agalign.OutputError("a.png: cannot be written")))
     for report in run(flight, out_with_model):

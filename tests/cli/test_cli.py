@@ -109,6 +109,7 @@ def test_the_totals_name_captures_that_could_not_be_written(flight: Path, aligne
     assert "0 of 8 band pairs aligned; 1 capture not written" in done.stdout + done.stderr
 
 
+@pytest.mark.full
 def test_one_hopeless_band_does_not_stop_the_others(flight: Path, tmp_path: Path) -> None:
     shutil.copytree(flight / "0000SET", tmp_path / "in")
     images = tmp_path / "in" / "000"

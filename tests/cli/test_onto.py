@@ -128,6 +128,7 @@ def test_a_distant_mosaic_is_reported(mosaics: Path, tmp_path: Path) -> None:
     assert re.search(r"away\.tif: is 11[01]\.\d km away from the reference", done.stderr)
 
 
+@pytest.mark.full
 def test_the_limit_is_a_pixel_of_the_reference_and_the_advice_fits_mosaics(tmp_path: Path) -> None:
     """Leaves and branches that move: 3 px of the files, less than a pixel of mosaics with the size that is needed."""
     steps = np.random.default_rng(0).normal(size=(12, 16, 2)) * 2

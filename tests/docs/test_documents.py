@@ -40,10 +40,12 @@ RUN_BY = {"docker": "tools/container.sh", "dask": "tools/dask_cluster.sh", "pip"
 KINDS = {"sh", "python", "text", "{toctree}", "{include} ../CONTRIBUTING.md", "{include} ../CHANGELOG.md"}
 RUNNABLE = [page for page in PAGES if any(b.kind in ("sh", "python") for b in blocks_of(page))]
 LONG = {
+    "batch.md",
     "benchmark-bands.md",
     "close-range.md",
     "paper.md",
     "photogrammetry.md",
+    "python.md",
     "qgis.md",
     "radiometry.md",
     "thermal.md",

@@ -240,7 +240,7 @@ DAMAGED = "IMG_0009: left out: its entry in flight.geojson is damaged; run again
         ),
         (with_changed_entry(accuracy_m=math.nan), (), 1, "flight.geojson has no footprints"),
         (without_positions, (), 1, "no capture can be placed, because flight.geojson has no footprints"),
-        (with_another_band, (), 3, "IMG_0001: left out: it has bands Green (560 nm), Blue (668 nm), NIR"),
+        in_full_run(with_another_band, (), 3, "IMG_0001: left out: it has bands Green (560 nm), Blue (668 nm), NIR"),
         (None, ("--gsd", "0.0001"), 2, "pixels, which is too many; increase --gsd"),
         (None, ("-i", "nonsense"), 2, "unknown index 'nonsense'"),
         (None, ("-o", "0000SET/IMG_0001.tif"), 2, "give the mosaic a new file that ends in .tif"),
@@ -282,6 +282,7 @@ def labels(*numbers: int) -> list[str]:
     return [f"0000SET/IMG_{number:04d}" for number in numbers]
 
 
+@pytest.mark.full
 def test_a_capture_without_tie_points_is_left_out_by_name(survey: Path, tmp_path: Path) -> None:
     out = without_texture(survey, tmp_path / "out", 5)
     done = agalign_here("mosaic", out, "-o", tmp_path / "field.tif")

@@ -76,6 +76,7 @@ def test_its_reflectance_is_that_of_this_program(program: ExportProgram, shared:
     assert light == [pytest.approx((IRRADIANCE, math.pi / IRRADIANCE))] * len(photos)
 
 
+@pytest.mark.full
 @pytest.mark.slow
 def test_vignetting_follows_pixels_without_distortion(shared: Shared, tmp_path: Path) -> None:
     photos = exported(REDEDGE, shared, tmp_path, "odm", undistort=True)

@@ -68,6 +68,7 @@ def test_the_result_equals_that_of_gdal(tmp_path: Path) -> None:
     np.testing.assert_allclose(np.stack(bands) * ratio, expected, rtol=1e-4)
 
 
+@pytest.mark.full
 def test_sharpening_keeps_brightness_and_adds_detail(tmp_path: Path) -> None:
     make_two_headings(tmp_path / "in", 1, (640, 480), camera=ALTUM_PT, line=1, lakes=False)
     settings = agalign.Settings(write=agalign.WriteSettings(pan_sharpen=True, crop="none"))

@@ -17,6 +17,7 @@ pytestmark = pytest.mark.slow
 
 CONSOLE_SCRIPT = [str(Path(sys.executable).with_name("agalign"))]
 MODULE = [sys.executable, "-m", "agalign"]
+OPTIONS = "-j", "2", "--bands", "green,nir", "--relief", "never"
 NAMES_OF_A_RUN = """
 import atexit, sys
 atexit.register(lambda: print(*sys.modules))
@@ -58,7 +59,7 @@ def names(shared: Shared, four_captures: Path) -> set[str]:
 
     def list_modules(folder: Path) -> None:
         (folder / "script.py").write_text(NAMES_OF_A_RUN)
-        command = folder / "script.py", four_captures, "-o", folder / "out", "-j", "2", "--bands", "green,nir"
+        command = folder / "script.py", four_captures, "-o", folder / "out", *OPTIONS
         (folder / "names").write_text(output(sys.executable, *command))
 
     return modules((shared("names_of_a_run", list_modules) / "names").read_text())
@@ -82,8 +83,7 @@ def test_no_module_is_imported_from_the_working_folder(
     assert {"rasterio", "click", "torch", "typing", "socket", "multiprocessing"} <= names
     folder = tmp_path / "working folder"
     log = plant(names, folder)
-    options = "-j", "2", "--bands", "green,nir", "--relief", "never"
-    output(*command, four_captures, "-o", tmp_path / "out", *options, folder=folder)
+    output(*command, four_captures, "-o", tmp_path / "out", *OPTIONS, folder=folder)
     assert not log.exists(), log.read_text()
     for path, k in product(four_captures.rglob("*.tif"), range(_MIN_FILES_FOR_PROCESSES // 20)):
         os.link(path, folder / f"{k}{path.name}")
