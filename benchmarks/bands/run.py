@@ -87,8 +87,10 @@ def claim(band: Mapping[str, Any] | None) -> Row:
 
 def bands_of(paths: Paths) -> dict[str, Band]:
     """Return the bands with the lenses of a set's files by name; none for files without tags."""
+    if not has_tags(paths):
+        return {}
     with tempfile.TemporaryDirectory() as folder:
-        for name, path in paths.items() if has_tags(paths) else ():
+        for name, path in paths.items():
             Path(folder, name).symlink_to(path.resolve())
         return {band.path.name: band for capture in discover(Path(folder)).captures for band in capture.bands}
 
