@@ -39,17 +39,7 @@ RUN_BY = {"docker": "tools/container.sh", "dask": "tools/dask_cluster.sh", "pip"
 """What cannot be run inside a test, and the script that runs it and what stands with it in a block."""
 KINDS = {"sh", "python", "text", "{toctree}", "{include} ../CONTRIBUTING.md", "{include} ../CHANGELOG.md"}
 RUNNABLE = [page for page in PAGES if any(b.kind in ("sh", "python") for b in blocks_of(page))]
-LONG = {
-    "batch.md",
-    "benchmark-bands.md",
-    "close-range.md",
-    "paper.md",
-    "photogrammetry.md",
-    "python.md",
-    "qgis.md",
-    "radiometry.md",
-    "thermal.md",
-}
+LONG = re.compile("batch|benchmark-bands|close-range|paper|photogrammetry|python|qgis|radiometry|thermal")
 """Pages with blocks that take seconds, and of commands that other tests run: they are in the full run."""
 
 
@@ -147,7 +137,7 @@ def run_page(page: Path) -> None:
 @pytest.mark.parametrize(
     "page",
     [
-        pytest.param(p, id=p.relative_to(ROOT).as_posix(), marks=[pytest.mark.full] if p.name in LONG else [])
+        pytest.param(p, id=p.relative_to(ROOT).as_posix(), marks=[pytest.mark.full] if LONG.fullmatch(p.stem) else [])
         for p in RUNNABLE
     ],
 )
