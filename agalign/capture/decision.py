@@ -14,8 +14,6 @@ is confirmed at its own position, far from that of its band.
 from collections.abc import Sequence
 from dataclasses import replace
 
-import numpy as np
-
 from agalign.capture.band_pair import BandPair
 from agalign.capture.warped_pair import WarpedPair
 from agalign.pixels.band_resampling import channel_mean
@@ -74,10 +72,8 @@ def predicted_by_windows(
     The standard error is the RMS of the shifts of these windows.
     """
     assert alignment.residual is not None
-    lengths = np.linalg.norm(alignment.residual.shifts_px, axis=1)
-    std_px = FixedImagePx(np.sqrt(np.nanmean(lengths**2)))
     issues = alignment.issues if reason is None else (Issue(reason), *alignment.issues)
-    prediction = pair.prediction_by_windows(alignment.mapping, std_px)
+    prediction = pair.prediction_by_windows(alignment.mapping, alignment.residual.rms_px)
     return decided(replace(alignment, issues=issues, prediction=prediction))
 
 

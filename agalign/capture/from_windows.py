@@ -21,9 +21,9 @@ from agalign.values.alignment import Alignment, JointResult, Residual
 from agalign.values.issues import CORNERS_UNKNOWN, FEW_KEYPOINTS, NO_CONTRAST, RETRIEVAL
 from agalign.values.mapping import PixelMapping
 from agalign.values.pixel_units import FixedImagePx, MovingFilePx
+from agalign.verify.adjustment import WindowFit, fit_in_rounds, lens_std_px
 from agalign.verify.checks import BY_WINDOWS, MAX_ALIAS_PEAK, alias_peak, seed_fits
 from agalign.verify.extrapolation import issues_of_extrapolation, points_in_frame
-from agalign.verify.window_fit import WindowFit, fit_in_rounds, lens_std_px
 
 _MAX_STEP_PX = 16.0
 """Maximum displacement of a corner; larger ones contradict the seed."""

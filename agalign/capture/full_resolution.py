@@ -24,9 +24,9 @@ from agalign.values.image import Raster, Tile
 from agalign.values.issues import UNREADABLE, Issue
 from agalign.values.mapping import PixelMapping
 from agalign.values.pixel_units import FixedFilePx
+from agalign.verify.adjustment import fit_in_rounds
 from agalign.verify.checks import Evidence, issues_of
 from agalign.verify.residuals import FixedWindows
-from agalign.verify.window_fit import fit_in_rounds
 
 _TILE_PX = 640
 """Side of a tile with 36 windows; an error of a few pixels of the reduced images does not move their content out of

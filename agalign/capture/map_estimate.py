@@ -18,14 +18,16 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import block_diag
 
 from agalign.capture.band_pair import BandPair
-from agalign.flight.rig import FACTOR_STD_PX, MIN_STD_PX, Rig, lattice
+from agalign.flight.rig import FACTOR_STD_PX, FACTORS, MIN_STD_PX, Rig, lattice
 from agalign.values import geometry
 from agalign.values.alignment import JointResult, Residual
 from agalign.values.geometry import Matrix
+from agalign.values.least_squares import Robust, least_squares
 from agalign.values.pixel_units import FixedImagePx
-from agalign.verify.window_fit import REWEIGHTINGS, fit_windows
+from agalign.verify.adjustment import fit_windows
 
 Array = NDArray[np.float64]
 
@@ -71,39 +73,27 @@ def _solve(
     likelihoods: Sequence[tuple[Array, Array]], priors: Sequence[Expectation | None]
 ) -> list[tuple[Array, Array]]:
     """Return delta (8,) and its covariance (8, 8) of each band."""
-    factors = 8 * len(likelihoods) + np.arange(len(FACTOR_STD_PX))
-    weights = np.ones(len(likelihoods))
-    degrees_of_freedom = 4.0  # of the t distribution: heavy tails, as a lens may have moved
-    for _ in range(REWEIGHTINGS):
-        normal = np.zeros((factors[-1] + 1, factors[-1] + 1))
-        right_side = np.zeros(len(normal))
-        normal[factors, factors] = 1 / np.square(FACTOR_STD_PX)
-        for b, ((information, vector), prior) in enumerate(zip(likelihoods, priors, strict=True)):
-            band = 8 * b + np.arange(8)
-            normal[np.ix_(band, band)] += information
-            right_side[band] += vector
-            if prior is not None:
-                rows = np.concatenate([band, factors])
-                design = np.hstack([np.eye(8), -prior.by_factor])
-                weighted = weights[b] * design.T @ np.linalg.inv(prior.covariance)
-                normal[np.ix_(rows, rows)] += weighted @ design
-                right_side[rows] += weighted @ prior.corners
-        covariance = np.linalg.inv(normal)
-        solution = covariance @ right_side
-        for b, prior in enumerate(priors):
-            if prior is not None:
-                residual = solution[8 * b : 8 * b + 8] - prior.corners - prior.by_factor @ solution[factors]
-                mahalanobis2 = float(residual @ np.linalg.solve(prior.covariance, residual))
-                weights[b] = (degrees_of_freedom + 8) / (degrees_of_freedom + mahalanobis2)
     blocks = [slice(8 * b, 8 * b + 8) for b in range(len(likelihoods))]
+    information = block_diag(*(of_images for of_images, _ in likelihoods), np.diag(1 / np.square(FACTOR_STD_PX)))
+    mean = np.concatenate([*(of_images for _, of_images in likelihoods), np.zeros(FACTORS)])
+    # The residuals of the rig, in standard deviations.
+    design, values = np.zeros((len(blocks), 8, len(mean))), np.zeros((len(blocks), 8))
+    for band, (block, prior) in enumerate(zip(blocks, priors, strict=True)):
+        if prior is not None:
+            whitening = np.linalg.cholesky(np.linalg.inv(prior.covariance)).T
+            design[band, :, block], design[band, :, -FACTORS:] = whitening, -whitening @ prior.by_factor
+            values[band] = whitening @ prior.corners
+    degrees_of_freedom = 4.0  # of the t distribution: heavy tails, as a lens may have moved
+    weights = np.full(len(blocks), 1 + 8 / degrees_of_freedom)
+    solution = least_squares(design, values, weights, information, mean, robust=Robust(degrees_of_freedom**0.5))
     # Rounding removes the last bits, which depend on the machine's order of summation.
-    return [(np.round(solution[s], 6), np.round(covariance[s, s], 12)) for s in blocks]
+    return [(np.round(solution.mean[s], 6), np.round(solution.covariance[s, s], 12)) for s in blocks]
 
 
 def _likelihood(
     pair: BandPair, result: JointResult[FixedImagePx], residual: Residual[FixedImagePx]
 ) -> tuple[Array, Array]:
-    """Return the information (8, 8) on delta by descriptors and windows, and its product (8,) with their mean.
+    """Return the information (8, 8) on delta by descriptors and windows, and their mean (8,).
 
     The windows are ignored if they are too few or their correction is too large.
     """
@@ -114,7 +104,7 @@ def _likelihood(
     if fit is None or not fit.max_px <= max_correction_px:
         return information, np.zeros(8)
     of_windows = np.linalg.inv(fit.covariance_px2)
-    return information + of_windows, np.asarray(of_windows @ fit.mean_px)
+    return information + of_windows, np.linalg.solve(information + of_windows, of_windows @ fit.corners_px)
 
 
 def _prior(pair: BandPair, result: JointResult[FixedImagePx], rig: Rig | None) -> Expectation | None:

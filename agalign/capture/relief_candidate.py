@@ -17,36 +17,36 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agalign.capture.band_pair import BandPair
-from agalign.capture.decision import decided, without_result
+from agalign.capture.decision import decided, predicted_by_windows, without_result
 from agalign.capture.warped_pair import WarpedPair
 from agalign.errors import GeometryError
 from agalign.pixels.band_resampling import channel_mean
-from agalign.relief.adjustment import (
+from agalign.relief.dense import DenseMatching, View
+from agalign.relief.occlusion import nearer_sign, occluded
+from agalign.values.alignment import MIN_RETRIEVAL, Alignment, JointResult, Residual, Seed
+from agalign.values.choices import Geometry, ReliefUse
+from agalign.values.geometry import Matrix
+from agalign.values.image import FloatImage, Raster
+from agalign.values.issues import OTHER_GEOMETRY
+from agalign.values.mapping import PixelMapping
+from agalign.values.parallax import Parallax, Relief
+from agalign.values.pixel_units import FixedImagePx
+from agalign.verify.adjustment import (
     Adjustment,
+    WindowFit,
     WindowShifts,
     adjust,
     are_of_lenses,
     are_on_a_line,
+    fit_in_rounds,
+    fit_windows,
+    lens_std_px,
     parallax_of,
     shifts_by_corners,
 )
-from agalign.relief.dense import DenseMatching, View
-from agalign.relief.occlusion import nearer_sign, occluded
-from agalign.values import geometry
-from agalign.values.alignment import MIN_RETRIEVAL, Alignment, JointResult, Residual, Seed
-from agalign.values.choices import Geometry, ReliefUse
-from agalign.values.displacement import DisplacementField
-from agalign.values.geometry import Matrix
-from agalign.values.image import FloatImage, Raster
-from agalign.values.issues import OTHER_GEOMETRY, Issue
-from agalign.values.mapping import PixelMapping
-from agalign.values.parallax import Parallax, Relief
-from agalign.values.pixel_units import FixedImagePx
-from agalign.values.robust import shift_scale_px
 from agalign.verify.checks import BY_WINDOWS, MAX_ALIAS_PEAK, MAX_SHIFT_PX, alias_peak
-from agalign.verify.displacement_field import MIN_GAIN_SIGMA, MIN_WINDOWS, robust_loss
+from agalign.verify.displacement_field import MIN_GAIN_SIGMA, MIN_WINDOWS
 from agalign.verify.residuals import decrease_sigma
-from agalign.verify.window_fit import fit_windows
 
 _MIN_BANDS = 2
 """Minimum number of moving lenses: a relief is verified with the other lenses."""
@@ -127,7 +127,7 @@ def aligned_by_relief(
         if on_a_line and parallax_px > max_line_px:
             result.along_a_line |= {c.pair.name for c in group}
         elif use == "always" or parallax_px >= _MIN_PARALLAX_PX:
-            estimate, aligned = _aligned_group(group, is_requested=use == "always", is_observation=is_observation)
+            estimate, aligned = _aligned_group(group, is_observation=is_observation)
             result.alignments |= aligned
             if estimate is not None:
                 lost = () if is_observation else without_result
@@ -162,7 +162,7 @@ def _common_parallax_px(group: Sequence[ReliefCandidate]) -> tuple[float, bool]:
     if max(_p95_px(residual) for residual in residuals) < _MIN_PARALLAX_PX:
         return 0.0, False
     windows = WindowShifts.of(residuals, [c.warped.mapping for c in group])
-    consistent = _consistent(windows, group, with_fields=False)
+    consistent = _consistent(windows, group)
     if consistent is None:
         return 0.0, False
     bands, model = consistent
@@ -220,7 +220,7 @@ def _layout(group: Sequence[ReliefCandidate], bands: Sequence[int]) -> NDArray[n
 
 
 def _consistent(
-    windows: WindowShifts, group: Sequence[ReliefCandidate], *, with_fields: bool
+    windows: WindowShifts, group: Sequence[ReliefCandidate], lens_std: NDArray[np.float64] | None = None
 ) -> tuple[list[int], Adjustment] | None:
     """Adjust the model to the bands with common parallax; return their indices and the model, or None.
 
@@ -231,17 +231,17 @@ def _consistent(
     # another time. Residuals below the minimum are accepted anyway.
     max_scale_ratio, min_foreign_px = 2.0, 0.4
 
-    def adjusted(bands: Sequence[int], *, fields: bool) -> Adjustment | None:
+    def adjusted(bands: Sequence[int], lens_std: NDArray[np.float64] | None) -> Adjustment | None:
         layout, some = _layout(group, bands), windows.of_bands(bands)
-        model = adjust(some, size_px, layout, with_fields=fields) if some.are_enough(MIN_WINDOWS) else None
+        model = adjust(some, size_px, layout, lens_std) if some.are_enough(MIN_WINDOWS) else None
         return model if model is not None and are_of_lenses(model.baselines, layout) else None
 
     def median_scale_px(bands: Sequence[int]) -> float:
-        model = adjusted(bands, fields=False)
+        model = adjusted(bands, None)
         return math.inf if model is None else float(np.median(model.scales_px))
 
     kept = list(range(windows.shifts_px.shape[1]))
-    model = adjusted(kept, fields=with_fields)
+    model = adjusted(kept, lens_std)
     while len(kept) > _MIN_BANDS:
         if model is None:
             worst = int(np.argmin([median_scale_px([b for b in kept if b != foreign]) for foreign in kept]))
@@ -251,7 +251,7 @@ def _consistent(
             if model.scales_px[worst] <= max(min_foreign_px, max_scale_ratio * others_px):
                 break
         kept.pop(worst)
-        model = adjusted(kept, fields=with_fields)
+        model = adjusted(kept, lens_std)
     return None if model is None else (kept, model)
 
 
@@ -261,7 +261,7 @@ class _Band:
 
     candidate: ReliefCandidate
     plane: PixelMapping
-    baseline: tuple[float, float]
+    baseline: tuple[float, float] = (0.0, 0.0)
 
     @property
     def name(self) -> str:
@@ -273,35 +273,24 @@ class _Band:
         hidden = occluded(relief, self.baseline) if with_occlusions else None
         return self.plane.with_parallax(Parallax(relief, self.baseline, hidden))
 
-    def corrected(
-        self,
-        corners_px: NDArray[np.float64],
-        baseline: NDArray[np.float64],
-        lens_field: DisplacementField | None = None,
-    ) -> "_Band":
-        """Apply corrections of the corners (8,) and of the lens field; replace the baseline. Raises GeometryError."""
-        plane, size_px = self.plane, self.candidate.pair.fixed.size_px
-        matrix = geometry.compose(plane.fixed_to_moving, geometry.moving_corners(corners_px, *size_px))
-        field = plane.field
-        if lens_field is not None:
-            field = lens_field if field is None else lens_field.plus(field.on_lattice(lens_field.step_px, size_px))
-        x, y = baseline.tolist()
-        return replace(self, plane=replace(plane, fixed_to_moving=matrix, field=field), baseline=(x, y))
+    def fitted(self, fit: WindowFit) -> "_Band":
+        """Apply a fit to windows. Raises GeometryError."""
+        x, y = self.baseline if fit.baseline is None else fit.baseline.tolist()
+        return replace(self, plane=fit.applied_to(self.plane), baseline=(x, y))
 
 
 def _aligned_group(
-    group: Sequence[ReliefCandidate], *, is_requested: bool, is_observation: bool
+    group: Sequence[ReliefCandidate], *, is_observation: bool
 ) -> "tuple[_Estimate | None, dict[str, Alignment[FixedImagePx]]]":
     """Return the relief of a group and the bands that it aligns; (None, {}) if another geometry explains the capture
     better.
     """
-    with_fields = not is_observation and not group[0].pair.has_rig
     try:
-        estimate = _Estimate.of(group, with_fields=with_fields, is_refined=not is_observation)
+        estimate = _Estimate.of(group, is_refined=not is_observation)
         if estimate is None:
             return None, {}
         checked = [estimate.checked(band) for band in estimate.bands]
-        if not _is_chosen(checked) or (with_fields and not is_requested and not estimate.beats_fields(checked)):
+        if not _is_chosen(checked):
             return None, {}
     except GeometryError:
         return None, {}
@@ -316,26 +305,30 @@ class _Estimate:
     relief: Relief
     others: Sequence[Relief]
     """From the bands of `_verifying`, which do not contain the bands that they verify."""
-    with_fields: bool
-    """Displacement fields are fitted, as no rig contains the distortion of the lenses."""
 
     @classmethod
-    def of(cls, group: Sequence[ReliefCandidate], *, with_fields: bool, is_refined: bool) -> "_Estimate | None":
+    def of(cls, group: Sequence[ReliefCandidate], *, is_refined: bool) -> "_Estimate | None":
         """Estimate the relief from bands with common parallax; None if the windows do not determine the baselines.
 
         It has the full resolution if it `is_refined`, else half. Raises GeometryError.
         """
-        planes = [_Band(c, c.warped.mapping, (0.0, 0.0)) for c in group]
-        consistent = _consistent(_window_shifts(planes), group, with_fields=with_fields)
+        planes, size_px = [_Band(c, c.warped.mapping) for c in group], group[0].pair.fixed.size_px
+        lens_std = _lens_std_px(group[0].pair) if is_refined else None
+        consistent = _consistent(_window_shifts(planes), group, lens_std)
         if consistent is None:
             return None
         kept, model = consistent
         layout = _layout(group, kept)
-        bands = _applied([planes[k] for k in kept], model)
+        bands = [planes[k].fitted(fit) for k, fit in zip(kept, model.fits, strict=True)]
         low, high = np.percentile(model.parallax_px, (1.0, 99.0)).tolist()  # values beyond are wrong peaks
         matching = DenseMatching(group[0].pair.reference.grey, _views(bands), (low, high))
         matched = matching.matched(range(len(bands)))
-        bands = _refitted(bands, matched, with_fields=with_fields)
+        # The parallax of the windows is a free parameter: noise of the relief would otherwise shorten the baselines.
+        baselines = np.array([b.baseline for b in bands])
+        windows = _window_shifts(bands, matched, with_lens_shapes=lens_std is not None)
+        again = adjust(windows, size_px, baselines, lens_std)
+        if again is not None:
+            bands = [band.fitted(fit) for band, fit in zip(bands, again.fits, strict=True)]
         baselines = np.array([b.baseline for b in bands])
         if not are_of_lenses(baselines, layout) or (layout is None and are_on_a_line(baselines)):
             return None
@@ -344,7 +337,7 @@ class _Estimate:
             relief, *others = matching.refined(_views(bands), selections)
         else:
             relief, *others = (matching.matched(selection) for selection in selections)
-        result = cls(bands, replace(relief, std_px=_std_px(others)), others, with_fields)
+        result = cls(bands, replace(relief, std_px=_std_px(others)), others)
         return result.negated if layout is None and nearer_sign(matched, baselines) < 0 else result
 
     @property
@@ -362,17 +355,18 @@ class _Estimate:
 
         Raises GeometryError.
         """
-        band = _Band(candidate, candidate.warped.mapping, (0.0, 0.0))
-        rounds = 3  # large shifts are measured in steps
-        for _ in range(rounds):
-            mapping = band.mapping(self.relief)
-            residual = candidate.fit_residual(mapping)
-            if len(residual.measured_px) < MIN_WINDOWS:
-                return None
-            windows = WindowShifts.of([residual], [mapping])
-            corners_px, change = windows.fit_baseline(self.relief(windows.centres_px), candidate.pair.fixed.size_px)
-            band = band.corrected(corners_px, np.add(band.baseline, change))
-        return band
+        band = _Band(candidate, candidate.warped.mapping)
+
+        def measured(mapping: PixelMapping) -> Residual[FixedImagePx]:
+            return candidate.fit_residual(mapping)
+
+        start, size_px = band.mapping(self.relief), candidate.pair.fixed.size_px
+        if len(measured(start).measured_px) < MIN_WINDOWS:
+            return None
+        fitted = fit_in_rounds(start, measured, size_px, lens_std_px=_lens_std_px(candidate.pair), with_baseline=True)
+        if fitted is None or fitted[0].parallax is None:
+            return None
+        return _Band(candidate, fitted[0].of_the_plane, fitted[0].parallax.baseline)
 
     def for_others(self, candidates: Sequence[ReliefCandidate]) -> dict[str, Alignment[FixedImagePx]]:
         """Align or predict bands of the same reference where windows allow it, except those of the estimate: a relief
@@ -391,53 +385,25 @@ class _Estimate:
         return result
 
     def predicted(self, band: _Band) -> Alignment[FixedImagePx] | None:
-        """Predict a band that does not pass verification, with the robust standard deviation of the shifts of held-out
-        windows as standard error; None if that is above the limit for aligned windows, or the scene repeats.
+        """Predict a band that does not pass verification; None if half of the held-out windows are not aligned, or if
+        the scene repeats.
         """
         candidate, pair = band.candidate, band.candidate.pair
         mapping = band.mapping(self.relief, with_occlusions=True)
         windows = pair.reference.held_out_windows
         warped = WarpedPair(pair, mapping, pair.warped_moving(mapping), windows, candidate.held_out_residual(mapping))
-        shifts_px = warped.residual.shifts_px[np.isfinite(warped.residual.shifts_px[:, 0])]
-        std_px = FixedImagePx(shift_scale_px(np.linalg.norm(shifts_px, axis=1)))
-        is_known = len(shifts_px) >= MIN_WINDOWS and std_px <= MAX_SHIFT_PX * pair.file_pixel_size_px
+        residual = warped.residual
+        is_known = len(residual.measured_px) >= MIN_WINDOWS
+        is_known &= residual.median_px <= MAX_SHIFT_PX * pair.file_pixel_size_px
         if not is_known or alias_peak(*warped.reduced_spectra()).ratio > MAX_ALIAS_PEAK:
             return None
         joint = None if candidate.joint.recipe == BY_WINDOWS else candidate.joint
-        without = without_result(pair, candidate.seed, Issue(OTHER_GEOMETRY))
-        prediction, residual = pair.prediction_by_windows(mapping, std_px), warped.residual
-        return decided(replace(without, mapping=mapping, joint=joint, residual=residual, prediction=prediction))
-
-    def beats_fields(self, checked: Sequence["_Checked"]) -> bool:
-        """Return True if the relief explains windows better than displacement fields without it.
-
-        The bands with the longest baselines decide, which have the largest parallax.
-        """
-        gains: list[float] = []
-        confirmed = [(b, c) for b, c in zip(self.bands, checked, strict=True) if c.held_out and c.alignment]
-        confirmed.sort(key=lambda pair: -math.hypot(*pair[0].baseline))
-        max_bands = 2  # a field takes longer than the relief of a band
-        clear_gain = 2.0  # of the p95; a field cannot follow depth edges and needs no comparison above
-        for band, each in confirmed[:max_bands]:
-            assert each.held_out is not None
-            assert each.alignment is not None
-            if each.plane.p95_px >= clear_gain * each.held_out.p95_px:
-                gains.append(math.inf)
-                continue
-            pair, candidate = band.candidate.pair, band.candidate
-            estimator = pair.reference.displacement_field
-            field = estimator.refine(channel_mean(pair.moving_image), candidate.warped.mapping)
-            parallax = Parallax(self.verifying(band), band.baseline)
-            by_relief = pair.warped_moving(each.alignment.mapping.with_parallax(parallax))
-            by_field = field.held_out or estimator.verification.residuals(candidate.warped.warped)
-            gains.append(robust_loss(by_field) - robust_loss(estimator.verification.residuals(by_relief)))
-        return bool(gains) and float(np.mean(gains)) >= 0
+        without = without_result(pair, candidate.seed)
+        by_relief = replace(without, mapping=mapping, joint=joint, residual=residual)
+        return predicted_by_windows(by_relief, pair, OTHER_GEOMETRY)
 
     def checked(self, band: _Band) -> "_Checked":
-        """Verify a band with the relief from other bands, with a displacement field if that is more accurate.
-
-        Raises GeometryError.
-        """
+        """Verify a band with the relief from other bands. Raises GeometryError."""
         candidate, pair = band.candidate, band.candidate.pair
         plane = candidate.held_out_residual(candidate.warped.mapping)
         rejected = _Checked(pair.name, plane)
@@ -445,15 +411,11 @@ class _Estimate:
         fit = fit_windows(mapping, candidate.fit_residual(mapping), pair.fixed.size_px)
         if fit is None:
             return rejected
-        final = band.corrected(fit.mean_px, np.array(band.baseline))
+        final = band.fitted(fit)
         complete = final.mapping(self.relief, with_occlusions=True)
         verifying = final.mapping(self.verifying(band), with_occlusions=True)
         held_out = candidate.held_out_residual(verifying)
         joint = candidate.joint.with_homography(complete.fixed_to_moving, fit.covariance_px2)
-        if self.with_fields:
-            result = pair.reference.displacement_field.refine(channel_mean(pair.moving_image), complete, verifying)
-            if result.field is not None and result.held_out is not None:
-                complete, held_out = replace(complete, field=result.field), result.held_out
         warped, windows = pair.warped_moving(complete), pair.reference.held_out_windows
         issues = WarpedPair(pair, complete, warped, windows, held_out).issues(joint)
         if issues:
@@ -476,6 +438,11 @@ class _Checked:
     """The same with the relief; None if it was not measured."""
     alignment: Alignment[FixedImagePx] | None = None
     """None if it does not pass."""
+
+
+def _lens_std_px(pair: BandPair) -> NDArray[np.float64] | None:
+    """Return the standard deviations (4,) of the lens shapes of a pair; None if the rig contains its distortion."""
+    return None if pair.has_rig else lens_std_px(pair.fixed.size_px, calibrated=pair.space == "undistorted")
 
 
 def _verifying(bands: Sequence[int]) -> list[list[int]]:
@@ -517,25 +484,13 @@ def _is_chosen(checked: Sequence[_Checked]) -> bool:
     return median_high(gains_px) >= 0
 
 
-def _applied(bands: Sequence[_Band], model: Adjustment) -> list[_Band]:
-    """Return the bands with the corrections and baselines of a model. Raises GeometryError."""
-    by_band = zip(bands, model.corners_px, model.baselines, model.fields, strict=True)
-    return [band.corrected(corners_px, baseline, lens_field) for band, corners_px, baseline, lens_field in by_band]
-
-
-def _refitted(bands: Sequence[_Band], relief: Relief, *, with_fields: bool) -> list[_Band]:
-    """Fit planes and baselines again under a relief; the bands are unchanged if that fails. Raises GeometryError."""
-    windows, baselines = _window_shifts(bands, relief), np.array([b.baseline for b in bands])
-    # The parallax of the windows is a free parameter: noise of the relief would otherwise shorten the baselines.
-    total = windows.plus(relief(windows.centres_px), baselines)
-    model = adjust(total, bands[0].candidate.pair.fixed.size_px, baselines, with_fields=with_fields)
-    return list(bands) if model is None else _applied(bands, model)
-
-
-def _window_shifts(bands: Sequence[_Band], relief: Relief | None = None) -> WindowShifts:
+def _window_shifts(
+    bands: Sequence[_Band], relief: Relief | None = None, *, with_lens_shapes: bool = False
+) -> WindowShifts:
     """Measure the windows of the fit with the planes of the bands, or with a relief."""
     mappings = [b.plane if relief is None else b.mapping(relief) for b in bands]
-    return WindowShifts.of([b.candidate.fit_residual(m) for b, m in zip(bands, mappings, strict=True)], mappings)
+    residuals = [b.candidate.fit_residual(m) for b, m in zip(bands, mappings, strict=True)]
+    return WindowShifts.of(residuals, mappings, with_lens_shapes=with_lens_shapes)
 
 
 def _views(bands: Sequence[_Band]) -> list[View]:

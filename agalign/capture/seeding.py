@@ -20,8 +20,8 @@ from agalign.values.alignment import Seed
 from agalign.values.choices import SeedKind, Space
 from agalign.values.geometry import Matrix
 from agalign.values.issues import BLANK_MOVING, BLANK_REFERENCE, NO_SUCH_SEED, Issue
+from agalign.verify.adjustment import fit_in_rounds
 from agalign.verify.checks import seed_fits
-from agalign.verify.window_fit import fit_in_rounds
 
 _MIN_OVERLAP = 0.2
 """Minimum share of the reference that the moving image covers: the correlation is circular and meaningless for small

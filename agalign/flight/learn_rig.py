@@ -7,10 +7,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agalign.flight import rig
-from agalign.flight.rig import MIN_CAPTURES, CaptureFactors, Factor, Observation, Rig, design_tensor, least_squares
+from agalign.flight.rig import MIN_CAPTURES, CaptureFactors, Factor, Observation, Rig, capture_factors, design_tensor
+from agalign.values.least_squares import least_squares
 from agalign.values.pixel_units import MovingFilePx
 from agalign.values.process_pool import Apply
-from agalign.values.robust import cauchy_weights
 
 Array = NDArray[np.float64]
 Layout = Mapping[str, tuple[float, float]]
@@ -108,17 +108,18 @@ class _Table:
         max_iterations, max_change = 20, 1e-4  # change of the means, px, and of the baselines, of norm 1
         for _ in range(max_iterations):
             offset, lens = bands[:, :6].reshape(-1, 2, 3), bands[:, 6:]
-            result, _ = least_squares(np.tensordot(lens, tensor, 1), self.differences - offset, weights)
+            result = capture_factors(np.tensordot(lens, tensor, 1), self.differences - offset, weights).mean
             # The median is robust to a few captures at another height.
             result -= np.median(result[is_used > 0], axis=0)
-            # Errors of the baselines displace captures far from the median factors, which therefore have less weight.
-            robust = cauchy_weights(np.linalg.norm(result[:, :3], axis=1), rig.MIN_STD_PX / layout_std)
+            # Errors of the baselines displace captures far from the median factors.
+            displaced_px2 = layout_std**2 * (result[:, :3] ** 2).sum(axis=1, keepdims=True)
+            weights_of_bands = (weights / (1 + weights * displaced_px2)).T
             design = np.concatenate([of_offset, np.moveaxis(tensor @ result.T, (3, 0), (0, 3))], axis=3)
             # Parameters that neither the layout nor the factors determine keep their values.
             known = lens if self.layout is None else np.column_stack([self.layout, lens[:, 2]])
             prior = np.hstack([np.zeros((len(lens), 6)), _normalised(known, factors)])
-            by_band = self.differences.swapaxes(0, 1), (weights * robust[:, None]).T
-            estimate, _ = least_squares(design, *by_band, (prior, std), robust=False)
+            by_band = self.differences.swapaxes(0, 1).reshape(len(lens), -1, 6), weights_of_bands
+            estimate = least_squares(design.reshape(-1, 6, 9), *by_band, np.diag(std**-2), prior).mean
             previous, bands = bands, np.hstack([estimate[:, :6], _normalised(estimate[:, 6:], factors)])
             if np.abs(bands - previous).max() < max_change:
                 break
@@ -140,7 +141,7 @@ class _Table:
             differences = self.differences[is_left_out] - bands[:, :6].reshape(-1, 2, 3)
             for j in range(len(design)):
                 other_weights = self.weights[is_left_out] * (np.arange(len(design)) != j)
-                result, _ = least_squares(design, differences, other_weights)
+                result = capture_factors(design, differences, other_weights).mean
                 error_px = differences[:, j] - (design[j] @ result.T).transpose(2, 0, 1)
                 squares_px2[is_left_out, j] = (error_px**2).sum(axis=(1, 2))
         counts = (self.weights > 0).sum(axis=0)

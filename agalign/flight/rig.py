@@ -29,9 +29,8 @@ from numpy.typing import ArrayLike, NDArray
 from agalign.values import geometry
 from agalign.values.displacement import DisplacementField
 from agalign.values.geometry import Matrix, Points
+from agalign.values.least_squares import Estimate, Robust, least_squares
 from agalign.values.pixel_units import MovingFilePx
-from agalign.values.robust import cauchy_weights
-from agalign.verify.window_fit import REWEIGHTINGS
 
 Array = NDArray[np.float64]
 Factor = Literal["distance", "tilt", "motion", "reference"]
@@ -42,7 +41,6 @@ MIN_CAPTURES = 3
 """Fewer captures agree by chance too often."""
 FACTOR_STD_PX = (20.0, 3.0, 3.0, 20.0, 20.0)
 """Standard deviations of the prior of a capture's factors (5,); wide, to allow heights outside the learned range."""
-_FACTOR_PRIOR = np.zeros((1, FACTORS)), np.array(FACTOR_STD_PX)
 MIN_STD_PX = 0.05
 """Added in quadrature to the standard error of a mapping, which does not contain all errors."""
 
@@ -128,27 +126,17 @@ def design_tensor(factors: Sequence[Factor]) -> Array:
     return result * np.isin(range(FACTORS), [column for factor in factors for column in columns[factor]])
 
 
-def least_squares(
-    design: Array, target: Array, weights: Array, prior: tuple[Array, Array] = _FACTOR_PRIOR, *, robust: bool = True
-) -> tuple[Array, Array]:
-    """Solve n linear problems with Gaussian priors; return the parameters (n, p) and their covariances (n, p, p).
+def capture_factors(design: Array, differences: Array, weights: Array) -> Estimate:
+    """Estimate the factors (n, 5) of n captures and their covariances (n, 5, 5), with few outliers among the mappings.
 
-    The parameters are the factors of n captures, or the parameters of n bands. `target` (n, k, 2, 3) has the
-    coefficients of k mappings, px, and `design` (k, 2, 3, p) their derivative with respect to the parameters. `weights`
-    (n, k) are from `mapping_weight`, 0 without a mapping. `prior` is the mean (n or 1, p) and the standard deviation
-    (p,), by default of factors. `robust` reduces the weights of mappings with large residuals.
+    `differences` (n, k, 2, 3) are the coefficients of the mappings of k bands minus the mean, px, and `design`
+    (k, 2, 3, 5) their derivative with respect to the factors. `weights` (n, k) are from `mapping_weight`, 0 without a
+    mapping.
     """
-    x, y = design.reshape(len(design), 6, design.shape[-1]), target.reshape(*weights.shape, 6)
-    mean, information = prior[0], 1 / prior[1] ** 2
-    squares, products = x.swapaxes(1, 2) @ x, np.einsum("nkr,krp->nkp", y, x)
     half_weight_px = 0.3  # residual of a mapping at which its robust weight is one half
-    inlier = np.ones_like(weights)
-    for _ in range(REWEIGHTINGS if robust else 1):
-        covariance = np.linalg.inv(np.tensordot(weights * inlier, squares, 1) + np.diag(information))
-        right_side = ((weights * inlier)[:, None] @ products)[:, 0] + mean * information
-        result = (covariance @ right_side[..., None])[..., 0]
-        inlier = cauchy_weights(np.linalg.norm(y - np.moveaxis(x @ result.T, 2, 0), axis=2), half_weight_px)
-    return np.asarray(result), np.asarray(covariance)
+    by_mapping = design.reshape(len(design), 6, FACTORS), differences.reshape(*weights.shape, 6)
+    information = np.diag(1 / np.square(FACTOR_STD_PX))
+    return least_squares(*by_mapping, weights, information, robust=Robust(half_weight_px))
 
 
 def mapping_weight(std_px: ArrayLike, model_error_px: ArrayLike = 0.0) -> Array:

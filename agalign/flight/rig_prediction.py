@@ -17,7 +17,7 @@ from agalign.flight.rig import (
     Observation,
     Rig,
     affine_difference,
-    least_squares,
+    capture_factors,
     mapping_weight,
 )
 from agalign.values import geometry
@@ -96,7 +96,7 @@ def _from_bands(rig: Rig, band: str, known: Observation) -> Prediction:
     mappings = {**rig.mean, **known.mappings}
     differences = np.stack([affine_difference(rig.mean[b], mappings[b], rig.size_px) for b in others])
     weights = mapping_weight(np.stack([std_px, np.full(len(others), MIN_STD_PX)]), expected_px)
-    solutions, (covariance, complete) = least_squares(designs, np.stack([differences, 0 * differences]), weights)
+    solutions, (covariance, complete), _ = capture_factors(designs, np.stack([differences, 0 * differences]), weights)
     excess_px2 = ((differences - designs @ solutions[0]) ** 2).sum(axis=(1, 2)) - expected_px**2
     learned_px2 = [np.square(c.factors[:3]).sum() for c in rig.captures]
     outside_px2 = np.square(solutions[0, :3]).sum() - np.mean(learned_px2 or [0.0])

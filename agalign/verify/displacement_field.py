@@ -23,8 +23,8 @@ from agalign.values.geometry import Points
 from agalign.values.image import Mask, Raster
 from agalign.values.mapping import PixelMapping
 from agalign.values.pixel_units import FixedImagePx
+from agalign.verify.adjustment import NODE_STEP_PX
 from agalign.verify.residuals import FixedWindows, Shifts, in_standard_errors
-from agalign.verify.window_fit import NODE_STEP_PX
 
 _WINDOW_PX = 40
 """Side of the windows in which shifts are measured. On reference tie points of three cameras, smaller ones are as

@@ -10,8 +10,8 @@ from agalign.values.geometry import Points
 from agalign.values.issues import Issue, IssueKind, Remedy
 from agalign.values.mapping import PixelMapping
 from agalign.values.pixel_units import FixedFilePx, FixedPx
+from agalign.verify.adjustment import lens_shapes, lens_std_px, variance_px2
 from agalign.verify.residuals import window_spacing_px
-from agalign.verify.window_fit import lens_shapes, lens_std_px, variance_px2
 
 EXTRAPOLATED = IssueKind(
     "extrapolated",

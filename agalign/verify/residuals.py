@@ -20,9 +20,9 @@ from agalign.pixels.structure import (
 from agalign.values.alignment import Residual
 from agalign.values.geometry import Points
 from agalign.values.image import Mask, Raster
+from agalign.values.least_squares import cauchy_weights, shift_scale_px
 from agalign.values.mapping import PixelMapping
 from agalign.values.pixel_units import FixedImagePx, FixedPx
-from agalign.values.robust import cauchy_weights, shift_scale_px
 
 _Element = TypeVar("_Element", bound=np.generic)
 

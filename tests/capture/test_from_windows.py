@@ -18,9 +18,9 @@ from agalign.pixels.masks import raster_of
 from agalign.values import geometry
 from agalign.values.alignment import Alignment, Residual, Seed
 from agalign.values.issues import RETRIEVAL, UNREADABLE, Issue
+from agalign.verify.adjustment import lens_shapes
 from agalign.verify.checks import FOLDS, Evidence, issues_of
 from agalign.verify.extrapolation import expected_error_px
-from agalign.verify.window_fit import lens_shapes
 
 from ..builders import joint_result, pair_of, residual_of, rms, two_views, whole
 from ..conftest import textured_image

@@ -20,7 +20,7 @@ from agalign.values import geometry
 from agalign.values.alignment import Alignment, Prediction, Residual, Seed
 from agalign.values.capture import Capture
 from agalign.values.mapping import PixelMapping
-from agalign.verify import window_fit
+from agalign.verify import adjustment
 
 from ..builders import joint_result, residual_of, two_views
 
@@ -103,13 +103,13 @@ def test_the_windows_that_verify_share_no_pixel_with_those_of_the_fit(
     capture: Capture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     fitted: list[np.ndarray] = []
-    fit_windows = window_fit.fit_windows
+    fit_windows = adjustment.fit_windows
 
-    def recorded(mapping: PixelMapping, residual: Residual, *rest: Any) -> Any:
+    def recorded(mapping: PixelMapping, residual: Residual, *rest: Any, **named: Any) -> Any:
         fitted.append(residual.centres_px)
-        return fit_windows(mapping, residual, *rest)
+        return fit_windows(mapping, residual, *rest, **named)
 
-    monkeypatch.setattr(window_fit, "fit_windows", recorded)
+    monkeypatch.setattr(adjustment, "fit_windows", recorded)
     residual = refined(capture, aligned_on_reduced_images()).residual
     assert len(residual.centres_px) > 50
     apart = np.abs(residual.centres_px[:, None] - np.concatenate(fitted)[None]).max(axis=-1)

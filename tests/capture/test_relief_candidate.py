@@ -461,15 +461,16 @@ def test_the_others_are_aligned_without_a_foreign_band(
         assert np.percentile(errors, 90) < np.percentile(intact, 90) + 0.2
 
 
-def test_a_band_of_another_time_is_fitted_under_the_relief_of_the_others(boxes: Rendered) -> None:
-    """Its pixels moved smoothly by 2 px, which no common parallax and no lens field explains."""
+def test_a_band_of_another_time_is_predicted_under_the_relief_of_the_others(boxes: Rendered) -> None:
+    """Its pixels moved smoothly by 1 px, which no common parallax and no lens explains."""
     x, y = np.meshgrid(*(np.arange(n, dtype=np.float32) for n in boxes.size_px))
-    positions = x + 2 * np.sin(2 * np.pi * y / 600), y + 2 * np.cos(2 * np.pi * x / 600)
+    positions = x + np.sin(2 * np.pi * y / 300), y + np.cos(2 * np.pi * x / 300)
     nir = cv2.remap(boxes.images["NIR"], *positions, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT)
     result = aligned_by_relief(boxes.candidates({"NIR": nir}), "auto").alignments
-    assert set(result) == {b.name for b in MOVING}
-    assert result["NIR"].geometry == "relief and field"
-    assert result["NIR"].residual.median_px < 0.3
+    assert {name: a.status for name, a in result.items()} == {"Blue": "aligned", "Red": "aligned", "NIR": "predicted"}
+    assert result["NIR"].mapping.parallax is not None
+    # The RMS of the motion is 1 px, of which the plane of the band follows a part.
+    assert 0.5 < result["NIR"].prediction.std_px < 1.5
     # The relief is that of the other bands: its noise is not larger than without this band.
     assert all(np.median(boxes.error_px(name, result[name].mapping)) < 0.12 for name in ("Blue", "Red"))
 

@@ -10,10 +10,10 @@ from agalign.flight.rig import (
     CaptureFactors,
     Observation,
     Rig,
+    capture_factors,
     design_tensor,
     displaced,
     distance_px,
-    least_squares,
     mapping_weight,
     median_mapping,
 )
@@ -197,12 +197,10 @@ def test_the_median_mapping_ignores_an_outlier() -> None:
 
 def test_unused_factors_are_0_and_an_outlier_band_hardly_changes_the_others() -> None:
     differences = np.einsum("bakf,cf->cbak", DESIGNS, np.array([[3.0, 0, 0, 0, 0]]))
-    result, _ = least_squares(DISTANCE, differences, np.full((1, 3), 1e4))
+    result = capture_factors(DISTANCE, differences, np.full((1, 3), 1e4)).mean
     assert result[0, 0] == pytest.approx(3.0, abs=1e-3)
     assert not result[0, 1:].any()
     # One band is an outlier.
     differences[0, 2, :, 0] += 5.0
-    result, _ = least_squares(DISTANCE, differences, np.full((1, 3), 1e3))
+    result = capture_factors(DISTANCE, differences, np.full((1, 3), 1e3)).mean
     assert result[0, 0] == pytest.approx(3.0, abs=0.1)
-    result, _ = least_squares(DISTANCE, differences, np.full((1, 3), 1e3), robust=False)
-    assert abs(result[0, 0] - 3.0) > 0.5

@@ -7,9 +7,9 @@ from numpy.testing import assert_allclose
 
 from agalign.errors import GeometryError
 from agalign.values import geometry, lens
+from agalign.values.least_squares import MIN_SHIFT_SCALE_PX, cauchy_weights, shift_scale_px
 from agalign.values.lens import Lens
 from agalign.values.pixel_units import PixelScale
-from agalign.values.robust import MIN_SHIFT_SCALE_PX, cauchy_weights, shift_scale_px
 
 small = st.floats(-0.2, 0.2)
 matrices = st.builds(

@@ -11,6 +11,7 @@ from agalign.values.alignment import Alignment, Prediction, Residual, Seed
 from agalign.values.displacement import DisplacementField
 from agalign.values.issues import sentence
 from agalign.values.mapping import PixelMapping
+from agalign.verify.adjustment import CALIBRATED, LENS_STD, WindowFit, fit_windows, jacobian, lens_shapes, lens_std_px
 from agalign.verify.checks import KINDS
 from agalign.verify.extrapolation import (
     EXTRAPOLATED,
@@ -20,7 +21,6 @@ from agalign.verify.extrapolation import (
     unmodelled_std_px,
     unobserved_quarters,
 )
-from agalign.verify.window_fit import CALIBRATED, LENS_STD, WindowFit, fit_windows, jacobian, lens_shapes, lens_std_px
 
 from ..builders import joint_result, residual_of, rms
 
@@ -43,6 +43,11 @@ def fitted(residual: Residual, lens: bool = False, mapping: PixelMapping = IDENT
     return fit_windows(mapping, residual, SIZE, lens_std_px(SIZE, calibrated=False) if lens else None)
 
 
+def means_px(fit: WindowFit) -> np.ndarray:
+    """(8,) corners, (12,) with the lens shapes."""
+    return fit.corners_px if fit.lens_px is None else np.r_[fit.corners_px, fit.lens_px]
+
+
 def test_the_windows_correct_the_homography_through_the_displacement_field() -> None:
     """The field stretches the image by 1.2 along x: 1 px of the raw image is 1.2 px for the homography."""
     nodes = np.zeros((22, 28, 2))
@@ -51,7 +56,7 @@ def test_the_windows_correct_the_homography_through_the_displacement_field() -> 
     stretched = PixelMapping(geometry.translation(5.0, 3.0), field=DisplacementField(48.0, nodes))
     for mapping, expected_px in ((plain, 1.0), (stretched, 1.2)):
         fit = fitted(windows(np.tile([1.0, -0.5], 4), noise_px=0.0), mapping=mapping)
-        np.testing.assert_allclose(fit.mean_px, np.tile([expected_px, -0.5], 4), atol=0.01)
+        np.testing.assert_allclose(means_px(fit), np.tile([expected_px, -0.5], 4), atol=0.01)
         corrected = fit.applied_to(mapping)
         assert corrected.field is mapping.field
         moved = geometry.apply(corrected.fixed_to_moving, [300.0, 200.0])
@@ -60,7 +65,7 @@ def test_the_windows_correct_the_homography_through_the_displacement_field() -> 
 
 def test_exact_shifts_are_fitted_exactly_and_the_common_error_remains() -> None:
     fit = fitted(windows(CORNERS_PX, geometry.lattice(*SIZE, 60, 40), noise_px=0.0))
-    np.testing.assert_allclose(fit.mean_px, CORNERS_PX, atol=1e-6)
+    np.testing.assert_allclose(means_px(fit), CORNERS_PX, atol=1e-6)
     std_px = np.sqrt(np.diag(fit.covariance_px2))
     assert 0.01 <= std_px.min() <= std_px.max() < 0.015
 
@@ -78,8 +83,8 @@ def test_wrong_peaks_do_not_bias_the_fit(lens: bool) -> None:
     shifts = clean.shifts_px.copy()
     shifts[np.random.default_rng(1).permutation(len(shifts))[:20]] += (6.0, -3.0)
     fit = fitted(residual_of(CENTRES, shifts), lens)
-    design = jacobian(EVERYWHERE, SIZE, len(fit.mean_px))
-    assert rms(design @ (fit.mean_px - TRUTH_PX[: len(fit.mean_px)])) < 0.05
+    design = jacobian(EVERYWHERE, SIZE, len(means_px(fit)))
+    assert rms(design @ (means_px(fit) - TRUTH_PX[: len(means_px(fit))])) < 0.05
     # With a fifth fewer windows the standard errors are larger.
     assert np.trace(fit.covariance_px2) > np.trace(fitted(clean, lens).covariance_px2)
 
@@ -90,13 +95,13 @@ def test_windows_with_low_peaks_have_little_weight() -> None:
     shifts[::2], peaks[::2] = (0.1, 0.0), 10.0
     # Half the height, a sixteenth of the weight.
     np.testing.assert_allclose(
-        fitted(replace(residual_of(centres, shifts), peaks_sigma=peaks)).mean_px[0::2].mean(), 0.1 / 17, atol=0.002
+        fitted(replace(residual_of(centres, shifts), peaks_sigma=peaks)).corners_px[0::2].mean(), 0.1 / 17, atol=0.002
     )
 
 
 def test_the_covariance_equals_the_scatter_of_repeated_fits() -> None:
     fits = [fitted(windows(CORNERS_PX, noise_px=0.1, seed=seed)) for seed in range(200)]
-    scatter = np.cov(np.stack([f.mean_px for f in fits]).T)
+    scatter = np.cov(np.stack([means_px(f) for f in fits]).T)
     expected = np.mean([f.covariance_px2 for f in fits], axis=0) - 0.01**2 * np.eye(8)
     np.testing.assert_allclose(np.sqrt(np.diag(scatter)), np.sqrt(np.diag(expected)), rtol=0.25)
 
@@ -130,7 +135,7 @@ def test_windows_in_one_half_determine_the_lens_in_the_other_half_to_the_stated_
     ratios = []
     for seed in range(30):
         fit = fitted(windows(TRUTH_PX, LEFT, seed=seed), lens=True)
-        ratios.append(rms(jacobian(RIGHT, SIZE) @ (fit.mean_px - TRUTH_PX)) / fit.std_px(RIGHT))
+        ratios.append(rms(jacobian(RIGHT, SIZE) @ (means_px(fit) - TRUTH_PX)) / fit.std_px(RIGHT))
     # Errors of windows are assumed to be correlated; independent ones have smaller errors.
     assert 0.3 < np.sqrt(np.mean(np.square(ratios))) < 1.0
     assert fit.std_px(LEFT) < 0.15 < fit.std_px(RIGHT)
@@ -141,9 +146,9 @@ def test_more_windows_leave_less_error_and_none_leave_the_prior() -> None:
     assert many.std_px(EVERYWHERE) < 0.2 < few.std_px(EVERYWHERE) < 5
     unknown = fitted(residual_of(np.empty((0, 2)), (0, 0)), lens=True)
     assert unknown.std_px(EVERYWHERE) > 5
-    assert not unknown.mean_px.any()
+    assert not means_px(unknown).any()
     mapping, inside = many.applied_to(IDENTITY), EVERYWHERE[(EVERYWHERE > 50).all(axis=1)]
-    np.testing.assert_allclose(mapping.field(inside), lens_shapes(inside, SIZE) @ many.mean_px[8:], atol=0.02)
+    np.testing.assert_allclose(mapping.field(inside), lens_shapes(inside, SIZE) @ many.lens_px, atol=0.02)
 
 
 # ---- quarters of the image without a measured window

@@ -1,0 +1,99 @@
+"""Linear least squares with Gaussian priors and robust weights: the solver of every fit of the geometry.
+
+    min over m of  sum_i w_i rho(|y_i - X_i m|) + (m - m_0)^T P (m - m_0)
+
+y_i are observations of k components with weight w_i, such as the shift of a window (k = 2), and X_i their derivatives
+with respect to the parameters m. The prior of m has the mean m_0 and the information P. Robust estimates are computed
+by iteratively reweighted least squares with Cauchy weights (Holland & Welsch 1977).
+"""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+Array = NDArray[np.float64]
+
+MIN_SHIFT_SCALE_PX = 0.05
+"""Noise of the measured shift of a window: the minimum residual scale of a fit to shifts."""
+REWEIGHTINGS = 6
+"""Iterations after which robust weights have converged."""
+
+
+class Estimate(NamedTuple):
+    """The solution of n observations with p parameters, or of several such problems (…)."""
+
+    mean: Array
+    """(…, p)"""
+    covariance: Array
+    """(…, p, p) for weights that are inverse variances along each component."""
+    residuals: Array
+    """(…, n) lengths of the residuals."""
+
+
+class Robust(NamedTuple):
+    """The law of the robust weights."""
+
+    half_weight: float
+    """Residual at which the weight is one half, in scales of the residuals."""
+    scale: Callable[[Array], float] = lambda _: 1.0
+    """Returns the scale of lengths of residuals (n,)."""
+    variance: Callable[[float], float] = lambda _: 1.0
+    """Returns the variance along a component of an observation of weight 1 from that scale; 1 if the weights are
+    inverse variances, or relative to the prior."""
+
+
+def least_squares(
+    design: Array,
+    values: Array,
+    weights: Array,
+    information: Array,
+    mean: ArrayLike = 0.0,
+    *,
+    robust: Robust | None = None,
+    start: Array | None = None,
+) -> Estimate:
+    """Solve a problem, or several that have the leading dimensions (…).
+
+    `design` (…, n, k, p), `values` (…, n, k), `weights` (…, n), and `information` (p, p) and `mean` (p,) of the prior.
+    Without `robust` the weights are used as they are. The first robust weights are those of the residuals of the
+    parameters `start` (p,), by default 1. Directions that nothing determines have a large variance.
+    """
+    rows = design.reshape(*design.shape[:-3], -1, design.shape[-1])
+    flat = values.reshape(*values.shape[:-2], -1)
+    of_prior = (information @ np.broadcast_to(mean, (*values.shape[:-2], len(information)))[..., None])[..., 0]
+    weighted, scale, min_information_share = weights, MIN_SHIFT_SCALE_PX, 1e-12
+    if robust is not None and start is not None:
+        residuals = np.linalg.norm((flat - rows @ start).reshape(values.shape), axis=-1)
+        weighted = weights * cauchy_weights(residuals, robust.half_weight * robust.scale(residuals))
+    for _ in range(1 if robust is None else REWEIGHTINGS):
+        variance = 1.0 if robust is None else robust.variance(scale)
+        of_rows = np.repeat(weighted / variance, design.shape[-2], axis=-1)[..., None] * rows
+        normal = of_rows.swapaxes(-1, -2) @ rows + information
+        floor = min_information_share * np.trace(normal, axis1=-2, axis2=-1)
+        covariance = np.linalg.inv(normal + floor[..., None, None] * np.eye(normal.shape[-1]))
+        right_side = (of_rows.swapaxes(-1, -2) @ flat[..., None])[..., 0] + of_prior
+        solution = (covariance @ right_side[..., None])[..., 0]
+        residuals = np.linalg.norm((flat - (rows @ solution[..., None])[..., 0]).reshape(values.shape), axis=-1)
+        if robust is not None:
+            scale = robust.scale(residuals)
+            weighted = weights * cauchy_weights(residuals, robust.half_weight * scale)
+    return Estimate(solution, covariance, residuals)
+
+
+def shift_scale_px(lengths_px: Array) -> float:
+    """Return the robust standard deviation of residual shifts with these lengths (n,), at least MIN_SHIFT_SCALE_PX."""
+    median_px = float(np.median(lengths_px)) if len(lengths_px) else 0.0
+    mad_to_std = 1.4826  # standard deviation of a normal distribution over its median absolute deviation
+    return max(mad_to_std * median_px, MIN_SHIFT_SCALE_PX)
+
+
+def cauchy_weights(residuals: ArrayLike, scale: float | Array) -> Array:
+    """Return Cauchy weights 1 / (1 + (r / scale)^2) of residuals (...,), in their shape.
+
+    `residuals` are lengths in the unit of `scale`, which must be positive. A residual of 0 has weight 1, one of `scale`
+    has 0.5, an infinite one has 0. NaN stays NaN.
+    """
+    ratio = np.asarray(residuals, dtype=np.float64) / scale
+    return np.asarray(1 / (1 + ratio**2))

@@ -1,0 +1,428 @@
+"""The adjustment of a capture to the shifts of windows: the one linear model of its geometry.
+
+The shift of window i in band b, in undistorted px of the reference, is
+
+    s_ib = D(x_i) delta_b + N(x_i) f_b + t_b z_i + noise
+
+delta_b (8,) corrects the band's homography at the image corners and D is their Jacobian. f_b (4,) are the coefficients
+of the lens shapes N: the smooth displacement by which the distortions of two lenses differ, to first order of the
+Brown-Conrady model, which a homography only approximates where it is fitted. t_b (2,) is the band's baseline and z_i
+the parallax of the window, common to all bands: a rank-1 factorisation (Irani 2002).
+
+`fit_windows` fits a single band, without parallax or with a known one. `adjust` fits all bands of a capture by
+alternating least squares: z is determined before f, so that f only contains what no common parallax explains. Cauchy
+weights reduce the influence of wrong correlation peaks and of windows across depth edges.
+
+Two ambiguities are removed. A plane a + b x + c y added to z is equivalent to other homographies of all bands: z is 0
+on the plane that contains most windows. The scale of z is free: the longest baseline has length 1. If the lens layout
+is known, positive parallax is nearer to the camera.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from agalign.errors import GeometryError
+from agalign.values import geometry
+from agalign.values.alignment import Residual
+from agalign.values.displacement import DisplacementField
+from agalign.values.geometry import Points
+from agalign.values.least_squares import MIN_SHIFT_SCALE_PX, Robust, cauchy_weights, least_squares, shift_scale_px
+from agalign.values.mapping import PixelMapping
+from agalign.values.parallax import Parallax
+from agalign.values.pixel_units import FixedImagePx, FixedPx
+from agalign.verify.residuals import Shifts
+
+Array = NDArray[np.float64]
+
+LENS_STD = (1.3e-3, 0.7e-3, 1.2e-3, 1.2e-3)
+"""Standard deviation of each shape at the corners, as a share of half the diagonal. The lenses of 28 band pairs of six
+cameras (RedEdge-3, RedEdge-M, RedEdge-MX dual, Sequoia; calibrations in the tags) differ by 1.0, 0.6, 1.0 and 1.0 px
+at 800 px from the centre."""
+CALIBRATED = 0.4
+"""Factor on LENS_STD if both lenses are calibrated; measured on reference tie points of 45 RedEdge pairs."""
+NODE_STEP_PX = 48
+"""Spacing of the nodes of a displacement field of lenses, as their distortion varies over hundreds of pixels."""
+_CAUCHY_SCALES = 2.0
+"""Residual of a window at which its robust weight is one half, in residual scales."""
+_ALTERNATIONS = 12
+"""Enough for the baselines to converge to a relative change of 0.001."""
+_DAMPING = 1e-3
+"""Weight of zero correction and zero parallax, relative to one window; matters only where no window contributes."""
+
+
+@dataclass(frozen=True)
+class WindowFit:
+    """The geometry of one band that fits windows: a correction of its mapping, px of the reference."""
+
+    corners_px: Array
+    """(8,) displacements x and y of the corners in turn, clockwise from the top left."""
+    residuals_px: Array
+    """(n,) lengths of the residuals of the windows; NaN where not measured."""
+    size_px: tuple[int, int]
+    covariance_px2: Array
+    """(8, 8), or (12, 12) with the lens shapes."""
+    lens_px: Array | None = None
+    """(4,) coefficients of the lens shapes; None if they were not fitted."""
+    baseline: Array | None = None
+    """(2,) t_b; None without parallax."""
+
+    @property
+    def max_px(self) -> float:
+        """Maximum displacement of a corner along x or y."""
+        return float(np.abs(self.corners_px).max())
+
+    @property
+    def scale_px(self) -> float:
+        """Robust standard deviation of the residuals."""
+        return shift_scale_px(self.residuals_px[np.isfinite(self.residuals_px)])
+
+    def std_px(self, points_px: Points) -> float:
+        """Return the RMS error over points (n, 2), including the residual of single windows."""
+        of_mapping_px2 = variance_px2(points_px, self.covariance_px2, self.size_px).mean()
+        return float(np.sqrt(of_mapping_px2 + self.scale_px**2))
+
+    def applied_to(self, mapping: PixelMapping) -> PixelMapping:
+        """Correct a homography; lens shapes and baseline replace those of the mapping. Raises GeometryError."""
+        corners = geometry.moving_corners(self.corners_px, *self.size_px)
+        mapping = replace(mapping, fixed_to_moving=geometry.compose(mapping.fixed_to_moving, corners))
+        if self.lens_px is not None:
+            lens_px = self.lens_px
+
+            def displaced_px(points_px: Points) -> Points:
+                return np.asarray(lens_shapes(points_px, self.size_px) @ lens_px)
+
+            mapping = replace(mapping, field=DisplacementField.sampled(displaced_px, NODE_STEP_PX, self.size_px))
+        if self.baseline is not None and mapping.parallax is not None:
+            x, y = self.baseline.tolist()
+            mapping = mapping.with_parallax(Parallax(mapping.parallax.relief, (x, y)))
+        return mapping
+
+
+def lens_shapes(points_px: Points, size_px: tuple[int, int]) -> Array:
+    """Return (n, 2, 4) the displacements by each shape at points (n, 2) of an image (width, height).
+
+    The shapes are radial of third and fifth order, and the two of decentring. Their length is 1 at the corners.
+    """
+    centre = (np.array(size_px, dtype=np.float64) - 1) / 2
+    u, v = ((points_px - centre) / np.linalg.norm(centre)).T
+    square = u * u + v * v
+    dx = np.stack([u * square, u * square**2, square + 2 * u * u, 2 * u * v], axis=-1)
+    dy = np.stack([v * square, v * square**2, 2 * u * v, square + 2 * v * v], axis=-1)
+    # The length of the decentring shapes is up to 3 along their axis.
+    return np.asarray(np.stack([dx, dy], axis=1) * np.array([1.0, 1.0, 1 / 3, 1 / 3]))
+
+
+def lens_std_px(size_px: tuple[int, int], *, calibrated: bool) -> Array:
+    """Return (4,) the standard deviation of each shape on an image (width, height), px."""
+    return np.array(LENS_STD) * float(np.hypot(*size_px)) / 2 * (CALIBRATED if calibrated else 1.0)
+
+
+def jacobian(points_px: Points, size_px: tuple[int, int], parameters: int = 12) -> Array:
+    """Return (n, 2, 8 or 12) the derivative of displacements of points by those of the corners, and by lens shapes."""
+    of_corners = geometry.over_corners(points_px, *size_px)
+    return of_corners if parameters == 8 else np.concatenate([of_corners, lens_shapes(points_px, size_px)], axis=2)
+
+
+def variance_px2(points_px: Points, covariance_px2: Array, size_px: tuple[int, int]) -> Array:
+    """Return (n,) the variance at points (n, 2) by the covariance of the corners (8, 8), or with shapes (12, 12)."""
+    design = jacobian(points_px, size_px, len(covariance_px2))
+    return np.asarray(np.einsum("nki,ij,nkj->n", design, covariance_px2, design))
+
+
+def fit_windows(
+    mapping: PixelMapping,
+    residual: Residual[FixedPx],
+    size_px: tuple[int, int],
+    lens_std_px: Array | None = None,
+    *,
+    with_baseline: bool = False,
+) -> WindowFit | None:
+    """Fit the correction of a mapping of a reference (width, height) to the residual measured with this mapping.
+
+    With the standard deviations `lens_std_px` (4,) of the lens shapes, these are fitted too; `with_baseline`, the
+    baseline along which the band sees the relief of the mapping. Without lens shapes, the result is None if fewer than
+    12 windows are measured. A window's weight is that of its correlation peak times a Cauchy weight.
+    """
+    raw = Shifts.of(residual)
+    min_windows = 12  # without a prior: 1.5 times the eight parameters of a homography
+    if lens_std_px is None and len(raw.centres_px) < min_windows:
+        return None
+    points_px, shifted_px = (mapping.undistorted(p) for p in (raw.centres_px, raw.centres_px + raw.shifts_px))
+    shifts_px, std_px, factor = shifted_px - points_px, np.full(8, np.inf), 1.0
+    if lens_std_px is not None:
+        corner_std_px = 5.0  # error of an extrapolated affine mapping
+        std_px = np.r_[np.full(8, corner_std_px), lens_std_px]
+        # Lens shapes extrapolate errors by relief, which neighbouring windows have in common.
+        factor = 12.0
+    count = len(std_px)
+    design = jacobian(points_px, size_px, count)
+    if with_baseline and mapping.parallax is not None:
+        parallax_px = mapping.parallax.relief(raw.centres_px)
+        shifts_px = shifts_px + parallax_px[:, None] * np.array(mapping.parallax.baseline)
+        design, std_px = _with_parallax(design, parallax_px), np.r_[std_px, 1.0, 1.0]
+    axis_share = 1 / 3  # variance along one axis over the squared scale of lengths; normally distributed: 1 / 3.05
+    robust = Robust(
+        _CAUCHY_SCALES, shift_scale_px, lambda scale_px: factor * axis_share * scale_px**2 + MIN_SHIFT_SCALE_PX**2
+    )
+    estimate = least_squares(design, shifts_px, raw.weights, np.diag(std_px**-2.0), robust=robust)
+    common_std_px = 0.01  # common to all windows; their residuals do not contain it
+    covariance_px2 = estimate.covariance[:count, :count] + common_std_px**2 * np.eye(count)
+    return _window_fit(estimate.mean, estimate.residuals, size_px, covariance_px2)
+
+
+def _window_fit(mean: Array, residuals_px: Array, size_px: tuple[int, int], covariance_px2: Array) -> WindowFit:
+    """Split parameters into corners, lens shapes and baseline; the covariance contains no baseline."""
+    corners_px, lens_px, baseline = np.split(mean, [8, len(covariance_px2)])
+    lens, t = (None if not len(part) else part for part in (lens_px, baseline))
+    return WindowFit(corners_px, residuals_px, size_px, covariance_px2, lens, t)
+
+
+def _with_parallax(design: Array, parallax_px: Array) -> Array:
+    """Append the derivatives with respect to the baseline to a design (n, 2, p) for windows with a parallax (n,)."""
+    return np.concatenate([design, parallax_px[:, None, None] * np.eye(2)], axis=2)
+
+
+def fit_in_rounds(
+    mapping: PixelMapping,
+    measure: Callable[[PixelMapping], Residual[FixedPx]],
+    size_px: tuple[int, int],
+    is_accepted: Callable[[WindowFit], bool] = lambda _: True,
+    lens_std_px: Array | None = None,
+    rounds: int = 4,
+    *,
+    with_baseline: bool = False,
+) -> tuple[PixelMapping, WindowFit] | None:
+    """Correct a mapping repeatedly by the residual that `measure` returns for it; return it and the last correction.
+
+    Peaks are sharper when windows overlap better, and a correction is accurate to first order.
+    Other arguments are those of `fit_windows`. None if a correction does not exist or is not accepted. Lens shapes are
+    always fitted to a mapping with the given displacement field, and replace it in the result.
+    """
+    result: tuple[PixelMapping, WindowFit] | None = None
+    for _ in range(rounds):
+        fit = fit_windows(mapping, measure(mapping), size_px, lens_std_px, with_baseline=with_baseline)
+        if fit is None or not is_accepted(fit):
+            return None
+        try:
+            result = fit.applied_to(mapping), fit
+        except GeometryError:
+            return None
+        converged_px = 0.02  # noise of the windows
+        if fit.max_px <= converged_px:
+            break
+        mapping = replace(result[0], field=mapping.field)
+    return result
+
+
+# ---- all bands of a capture
+
+
+@dataclass(frozen=True)
+class WindowShifts:
+    """The shifts of the same windows in all bands, undistorted px of the reference."""
+
+    centres_px: Points
+    """(n, 2) of the windows, raw px."""
+    points_px: Points
+    """(n, 2) of the windows, undistorted px."""
+    shifts_px: Array
+    """(n, bands, 2) relative to the planes and the lenses of the tags or the rig, NaN where not measured."""
+    weights: Array
+    """(n, bands), median 1; 0 where not measured."""
+
+    @classmethod
+    def of(
+        cls,
+        residuals: Sequence[Residual[FixedImagePx]],
+        mappings: Sequence[PixelMapping],
+        *,
+        with_lens_shapes: bool = False,
+    ) -> "WindowShifts":
+        """Collect the windows of each band, measured with its mapping; all bands have the same grid of windows.
+
+        The displacements by the relief of the mappings are part of the shifts, and `with_lens_shapes` those by their
+        fields.
+        """
+        cells = np.concatenate([r.cells for r in residuals])
+        _, first, index = np.unique(cells, axis=0, return_index=True, return_inverse=True)
+        centres_px = np.concatenate([r.centres_px for r in residuals])[first]
+        index_of_band = np.split(index.reshape(-1), np.cumsum([len(r.cells) for r in residuals])[:-1])
+        shifts, peaks = np.full((len(first), len(residuals), 2), np.nan), np.zeros((len(first), len(residuals)))
+        for band, (residual, mapping) in enumerate(zip(residuals, mappings, strict=True)):
+            measured = np.isfinite(residual.shifts_px[:, 0])
+            if not measured.any():
+                continue
+            xy, rows = residual.centres_px[measured], index_of_band[band][measured]
+            shifts[rows, band] = mapping.undistorted(xy + residual.shifts_px[measured]) - mapping.undistorted(xy)
+            if mapping.parallax is not None:
+                shifts[rows, band] += mapping.parallax.relief(xy)[:, None] * np.array(mapping.parallax.baseline)
+            if with_lens_shapes and mapping.field is not None:
+                shifts[rows, band] += mapping.field(xy)
+            peaks[rows, band] = residual.peaks_sigma[measured]
+        positive = peaks[peaks > 0]
+        max_weight = 2.0  # so that well-textured parts do not dominate
+        weights = np.minimum((peaks / np.median(positive)) ** 2, max_weight) if positive.size else peaks
+        points = mappings[0].of_the_plane.undistorted(centres_px)
+        return cls(centres_px, points, shifts, np.where(np.isfinite(shifts[..., 0]), weights, 0.0))
+
+    def __len__(self) -> int:
+        return len(self.points_px)
+
+    def are_enough(self, minimum: int) -> bool:
+        """Return True if at least `minimum` windows are measured in each band."""
+        return len(self) > 0 and int((self.weights > 0).sum(axis=0).min()) >= minimum
+
+    def of_bands(self, bands: Sequence[int]) -> "WindowShifts":
+        """Select bands by index."""
+        return replace(self, shifts_px=self.shifts_px[:, bands], weights=self.weights[:, bands])
+
+
+@dataclass(frozen=True)
+class Adjustment:
+    """The adjusted model of a capture."""
+
+    fits: Sequence[WindowFit]
+    """Of each band; the longest baseline has length 1."""
+    parallax_px: Array
+    """(n,) parallax of the windows."""
+
+    @property
+    def baselines(self) -> Array:
+        """(bands, 2) t_b."""
+        return np.array([fit.baseline for fit in self.fits])
+
+    @property
+    def scales_px(self) -> Array:
+        """(bands,) robust standard deviation of the residuals."""
+        return np.array([fit.scale_px for fit in self.fits])
+
+
+def adjust(
+    windows: WindowShifts, size_px: tuple[int, int], layout: Array | None = None, lens_std_px: Array | None = None
+) -> Adjustment | None:
+    """Fit the model to the windows of a capture; None if too few windows are measured in all bands.
+
+    `size_px` is (width, height) of the reference. `layout` (bands, 2) are the known directions, in any unit, in which
+    points move in the bands when the scene comes nearer; they initialise the baselines and determine their sign.
+    Lens shapes are fitted with the standard deviations `lens_std_px` (4,).
+    """
+    initial = _initial_baselines(windows) if layout is None else layout
+    if initial is None or not np.linalg.norm(initial, axis=1).max() > 0:
+        return None
+    baselines = initial / np.linalg.norm(initial, axis=1).max()
+    information = np.full(8, _DAMPING)
+    if lens_std_px is not None:
+        noise_px = 0.1  # of a window of weight 1, to which the priors are relative
+        information = np.r_[information, (noise_px / lens_std_px) ** 2]
+    count = len(information)
+    design, prior = jacobian(windows.points_px, size_px, count), np.diag(np.r_[information, [1e-3 * _DAMPING] * 2])
+    plane = _plane_coordinates(windows.points_px, size_px)
+    shifts, weights = np.nan_to_num(windows.shifts_px), windows.weights
+    smooth, precisions = np.zeros((len(baselines), count)), np.ones(len(baselines))
+    for _ in range(_ALTERNATIONS):
+        relative = shifts - np.einsum("nki,bi->nbk", design, smooth)
+        parallax, of_windows = _parallax(relative, baselines, weights * precisions)
+        parallax = parallax - plane @ _reference_plane(parallax, plane, of_windows)
+        by_band = least_squares(_with_parallax(design, parallax), shifts.swapaxes(0, 1), weights.T, prior)
+        smooth, baselines = by_band.mean[:, :count], by_band.mean[:, count:]
+        longest = np.linalg.norm(baselines, axis=1).max()
+        if not longest > 0:
+            return None
+        baselines, parallax = baselines / longest, parallax * longest
+        residuals = np.where(windows.weights.T > 0, by_band.residuals, np.nan)
+        scales = np.array([shift_scale_px(r[np.isfinite(r)]) for r in residuals])
+        weights = windows.weights * np.nan_to_num(cauchy_weights(residuals.T, _CAUCHY_SCALES * scales))
+        # Inverse variance of bands worse than the median, so that an inconsistent band does not determine the parallax.
+        # The fit of a band does not use it: its priors are relative to windows of weight 1.
+        precisions = np.minimum(1, (np.median(scales) / scales) ** 2)
+    if layout is not None and np.sum(baselines * layout) < 0:
+        baselines, parallax = -baselines, -parallax
+    covariances = scales[:, None, None] ** 2 * by_band.covariance[:, :count, :count]
+    of_bands = zip(np.hstack([smooth, baselines]), residuals, covariances, strict=True)
+    return Adjustment([_window_fit(mean, r, size_px, covariance) for mean, r, covariance in of_bands], parallax)
+
+
+def are_of_lenses(baselines: Array, layout: Array | None) -> bool:
+    """Return True if baselines (bands, 2) are plausible for lenses with a layout (bands, 2), None if unknown.
+
+    Noise of the reference shifts the windows of all bands equally. It resembles parallax that is common to the bands,
+    but all baselines are nearly equal, which those of different lenses are not. Equal baselines resemble the layout of
+    lenses on one side of the reference, but it must be more similar to them than their mean is.
+    """
+    if layout is not None:
+        min_cosine = 0.8  # measured: 0.998 for scenes with depth, up to 0.55 for noise
+        of_mean = _cosine(baselines, np.broadcast_to(baselines.mean(axis=0), baselines.shape))
+        return _cosine(baselines, layout) >= max(min_cosine, of_mean)
+    lengths = np.linalg.norm(baselines, axis=1)
+    from_mean = np.linalg.norm(baselines - baselines.mean(axis=0), axis=1)
+    min_spread = 0.3  # at least 0.5 for real cameras, at most 0.2 for a blurred reference
+    return bool(from_mean.max() >= min_spread * lengths.max() > 0)
+
+
+def _cosine(baselines: Array, others: Array) -> float:
+    """Return the cosine similarity of baselines (bands, 2) and others; 0 if either are all zero."""
+    norms = np.linalg.norm(baselines) * np.linalg.norm(others)
+    return float(np.sum(baselines * others) / norms) if norms > 0 else 0.0
+
+
+def are_on_a_line(baselines: Array) -> bool:
+    """Return True if baselines (bands, 2) have one direction.
+
+    Those of lenses in a row do too, but edges of shadows and leaves in blurred bands, or rows in the wind, also move
+    along one direction, by a different length in each band.
+    """
+    longest, shortest = np.linalg.svd(baselines, compute_uv=False)[[0, -1]]
+    min_ratio = 0.15  # of baselines that are not on one line: 0.22 to 0.5 for cameras
+    return bool(shortest < min_ratio * longest)
+
+
+def shifts_by_corners(model: Adjustment, points_px: Points, size_px: tuple[int, int]) -> Array:
+    """Return (n, bands, 2) the shifts by the corrections of the homographies at points (n, 2), without parallax."""
+    corners_px = np.stack([fit.corners_px for fit in model.fits])
+    return np.asarray(np.einsum("nki,bi->nbk", geometry.over_corners(points_px, *size_px), corners_px))
+
+
+def parallax_of(residual_px: Array, baselines: Array, weights: Array) -> Array:
+    """Return the parallax (n,) of windows from their shifts (n, bands, 2) relative to the homographies.
+
+    `baselines` are (bands, 2), `weights` (n, bands). The parallax is 0 for windows without information.
+    """
+    return _parallax(np.nan_to_num(residual_px), baselines, weights)[0]
+
+
+def _initial_baselines(windows: WindowShifts) -> Array | None:
+    """Return (bands, 2) the first right singular vector of the shifts of windows that are measured in all bands."""
+    complete = (windows.weights > 0).all(axis=1)
+    if complete.sum() < 2 * windows.weights.shape[1]:
+        return None
+    shifts = windows.shifts_px[complete].reshape(int(complete.sum()), -1)
+    shifts = shifts - np.median(shifts, axis=0)
+    max_medians = 5.0  # larger shifts are clipped, so that outliers do not determine the initial estimate
+    limit = max_medians * np.median(np.abs(shifts)) + MIN_SHIFT_SCALE_PX
+    _, _, right = np.linalg.svd(np.clip(shifts, -limit, limit), full_matrices=False)
+    return np.asarray(right[0].reshape(-1, 2))
+
+
+def _plane_coordinates(points_px: Points, size_px: tuple[int, int]) -> Array:
+    """Return (n, 3) = (1, u, v) with u and v from -1 to 1 across the image."""
+    return np.column_stack([np.ones(len(points_px)), 2 * points_px / np.asarray(size_px) - 1])
+
+
+def _parallax(residual_px: Array, baselines: Array, weights: Array) -> tuple[Array, Array]:
+    """Return the parallax (n,) by weighted least squares along the baselines, and its information (n,)."""
+    projection = (weights * np.einsum("nbk,bk->nb", residual_px, baselines)).sum(axis=1)
+    information = (weights * (baselines**2).sum(axis=1)).sum(axis=1)
+    return projection / (information + 10 * _DAMPING), information
+
+
+def _reference_plane(parallax: Array, plane: Array, information: Array) -> Array:
+    """Return the coefficients (3,) in (1, u, v) of the plane of most windows: an M-estimate from their median."""
+    min_information = 0.2  # sum of weights times squared baselines for the parallax of a window to be known
+    half_weight_px = 0.5  # distance from the plane at which the robust weight of a window is one half
+    known = (information > min_information).astype(float)
+    median, damping = np.array([np.median(parallax), 0.0, 0.0]), 1e-6 * np.eye(3)
+    robust = Robust(half_weight_px)
+    return least_squares(plane[:, None], parallax[:, None], known, damping, median, robust=robust, start=median).mean
