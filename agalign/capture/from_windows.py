@@ -17,6 +17,7 @@ from agalign.capture.band_pair import BandPair
 from agalign.capture.decision import decided
 from agalign.capture.warped_pair import WarpedPair
 from agalign.flight.rig import Rig
+from agalign.values import geometry
 from agalign.values.alignment import Alignment, JointResult, Residual
 from agalign.values.issues import CORNERS_UNKNOWN, FEW_KEYPOINTS, NO_CONTRAST, RETRIEVAL
 from agalign.values.mapping import PixelMapping
@@ -25,6 +26,9 @@ from agalign.verify.adjustment import WindowFit, fit_in_rounds, lens_std_px
 from agalign.verify.checks import BY_WINDOWS, MAX_ALIAS_PEAK, alias_peak, seed_fits
 from agalign.verify.extrapolation import issues_of_extrapolation, points_in_frame
 
+_RELIEF_SHARE = 0.15
+"""Standard deviation of the relief of ground without common structure, as a share of its range: crops and trees at low
+altitude, plants and booms at a metre."""
 _MAX_STEP_PX = 16.0
 """Maximum displacement of a corner; larger ones contradict the seed."""
 
@@ -88,9 +92,10 @@ def without_extrapolated(
     """Return the alignments; those `aligned` but extrapolated over a quarter of the image become `predicted`.
 
     Bands that the rig covers and georeferenced files, which have no lens distortion, are not changed. A homography does
-    not extrapolate the relief of a flight: its spread is part of the standard error.
+    not extrapolate relief: the spread of that of the flight, or of unknown relief at the range of the capture, is part
+    of the standard error.
     """
-    checked = dict(result)
+    checked, of_range_px = dict(result), _shifts_by_range_px(pairs, result)
     for pair in pairs:
         alignment, size_px = result[pair.name], pair.fixed.size_px
         is_covered = rig is not None and pair.has_rig_pixels and pair.has_rig and rig.covers(pair.name)
@@ -106,11 +111,34 @@ def without_extrapolated(
         if issues:
             extrapolated = decided(replace(alignment, issues=issues, prediction=None))
             checked[pair.name] = predicted = _predicted(pair, extrapolated, plane) or extrapolated
+            of_relief_px = max(of_relief_px, MovingFilePx(_RELIEF_SHARE * of_range_px.get(pair.name, 0.0)))
             if predicted.prediction is not None and of_relief_px > MovingFilePx(0.0):
                 std_px = MovingFilePx(math.hypot(predicted.prediction.std_px, of_relief_px))
                 prediction = replace(predicted.prediction, std_px=std_px, covariance_px2=None)
                 checked[pair.name] = replace(predicted, prediction=prediction)
     return checked
+
+
+def _shifts_by_range_px(
+    pairs: Sequence[BandPair], result: Mapping[str, Alignment[FixedImagePx]]
+) -> dict[str, MovingFilePx]:
+    """Return by band the shift of the aligned scene, at its range, from one at an infinite distance.
+
+    The rig tags contain the mappings at infinity. Their errors have no common direction: the shift is the part of the
+    bands' differences from them that is proportional to the layout of the lenses.
+    """
+    layouts, offsets_px = {}, []
+    for pair in pairs:
+        if pair.layout is None or "rig" not in pair.candidates or result[pair.name].status != "aligned":
+            continue
+        centre = (np.array(pair.reference_file_px) - 1) / 2
+        found, at_infinity = result[pair.name].fixed_to_moving, pair.candidates["rig"]
+        at_centre = [geometry.apply(pair.scales.between_files(m), centre) for m in (found, at_infinity)]
+        layouts[pair.name] = np.array(pair.layout)
+        offsets_px.append(at_centre[0] - at_centre[1])
+    along, known = np.ravel(offsets_px), np.ravel(list(layouts.values()))
+    common_px = max(0.0, float(along @ known)) / max(float(known @ known), 1e-12)
+    return {name: MovingFilePx(common_px * float(np.linalg.norm(layout))) for name, layout in layouts.items()}
 
 
 def _predicted(

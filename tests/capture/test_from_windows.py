@@ -196,6 +196,23 @@ def test_a_homography_does_not_extrapolate_the_relief_of_a_flight(left: tuple[Ba
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize(
+    ("offset_px", "shift_px"),
+    [((-20.0, 0.0), 20.0), ((0.0, 20.0), 0.0), ((20.0, 0.0), 0.0)],
+    ids=["along the layout", "error of the tags", "beyond infinity"],
+)
+def test_unknown_relief_is_a_share_of_the_range(
+    left: tuple[BandPair, Alignment], offset_px: tuple[float, float], shift_px: float
+) -> None:
+    """The nearer the scene, the larger its shift from the mapping at infinity, along the layout of the lenses."""
+    pair, before = left
+    at_infinity = geometry.compose(geometry.translation(*np.negative(offset_px)), before.fixed_to_moving)
+    near = replace(pair, layout=(-1.0, 0.0), candidates={**pair.candidates, "rig": at_infinity})
+    relief_px = module._RELIEF_SHARE * shift_px
+    std_px = np.hypot(extrapolated(pair, before).prediction.std_px, relief_px)
+    assert extrapolated(near, before).prediction.std_px == pytest.approx(std_px, rel=0.01)
+
+
 def test_half_masked_arrays_are_predicted() -> None:
     fixed, moving = distorted_images()
     result = agalign.align(fixed, moving, fixed_valid=valid_in(RIGHT), moving_valid=valid_in(RIGHT))
