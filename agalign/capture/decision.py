@@ -22,11 +22,8 @@ from agalign.values.choices import Geometry, PairStatus, ReliefUse, SeedKind
 from agalign.values.geometry import Matrix
 from agalign.values.issues import SEED_DOES_NOT_FIT, Issue, IssueKind
 from agalign.values.pixel_units import FixedImagePx, FixedPx
-from agalign.verify.checks import CLOSE_WINDOWS, CLUSTER, RESIDUAL_PX, is_unchanged, seed_fits
+from agalign.verify.checks import BY_PARALLAX, is_unchanged, seed_fits
 from agalign.verify.displacement_field import DisplacementResult
-
-_PARALLAX_ISSUES = frozenset({CLOSE_WINDOWS, CLUSTER, RESIDUAL_PX})
-"""Issues caused by parallax, which a displacement field may remove."""
 
 
 def decided(alignment: Alignment[FixedPx], *, is_seed_usable: bool = False) -> Alignment[FixedPx]:
@@ -125,7 +122,7 @@ def _verified(
         held_out = displaced if displacement.held_out is None else replace(displaced, residual=displacement.held_out)
         # All checks run again, those of windows on all windows and on the held-out ones.
         remaining = held_out.issues(joint)
-        by_parallax = all(issue.kind in _PARALLAX_ISSUES for issue in remaining)
+        by_parallax = all(issue.kind in BY_PARALLAX for issue in remaining)
         if not displaced.issues(joint) and by_parallax and (issues or not remaining):
             return held_out, remaining, displacement
     return plane, issues, replace(displacement, field=None)
@@ -137,7 +134,7 @@ def _needs_field(use: ReliefUse, issues: tuple[Issue, ...], *, has_rig: bool) ->
     With `auto`, it is fitted if all issues may be caused by parallax, and without issues if no rig contains the
     residual lens distortion.
     """
-    only_parallax = all(issue.kind in _PARALLAX_ISSUES for issue in issues)
+    only_parallax = all(issue.kind in BY_PARALLAX for issue in issues)
     return only_parallax and (use == "always" or (use == "auto" and (bool(issues) or not has_rig)))
 
 

@@ -44,7 +44,7 @@ from agalign.verify.adjustment import (
     parallax_of,
     shifts_by_corners,
 )
-from agalign.verify.checks import BY_WINDOWS, MAX_ALIAS_PEAK, MAX_SHIFT_PX, alias_peak
+from agalign.verify.checks import BY_PARALLAX, BY_WINDOWS, MAX_ALIAS_PEAK, MAX_SHIFT_PX, alias_peak
 from agalign.verify.displacement_field import MIN_GAIN_SIGMA, MIN_WINDOWS
 from agalign.verify.residuals import decrease_sigma
 
@@ -52,6 +52,9 @@ _MIN_BANDS = 2
 """Minimum number of moving lenses: a relief is verified with the other lenses."""
 _MIN_PARALLAX_PX = 0.3
 """Minimum p95 of the parallax of windows for a relief; windows of flat fields have up to 0.2 px, mostly noise."""
+_MIN_OBSERVED_SHARE = 0.75
+"""Minimum share of aligned windows for an observation of a rig, which contains no depth edges: 0.79 or more in scenes
+with booms and plants at 1 m."""
 _MAX_FAR_SHARE = 0.05
 """A relief is also tried if more than this share of the windows has shifts above 1 px (`_far_share`): windows across
 depth edges may contain the parallax of neither side, so that the squared shifts do not decrease."""
@@ -112,7 +115,7 @@ def aligned_by_relief(
 
     Bands `without_result` of the joint optimisation, and those with another kind of lens model, follow the relief too.
     With `use` "auto" a relief is only estimated if the residuals of the homographies contain common parallax. For an
-    observation of the rig, only the homographies matter: there are no fields, and the relief has half the resolution.
+    observation of the rig, only the homographies matter, and the parallax of windows suffices.
     """
     result = ReliefResult()
     if use == "never":
@@ -127,11 +130,14 @@ def aligned_by_relief(
         if on_a_line and parallax_px > max_line_px:
             result.along_a_line |= {c.pair.name for c in group}
         elif use == "always" or parallax_px >= _MIN_PARALLAX_PX:
-            estimate, aligned = _aligned_group(group, is_observation=is_observation)
+            if is_observation:
+                with suppress(GeometryError):
+                    result.alignments |= _observed(group)
+                continue
+            estimate, aligned = _aligned_group(group)
             result.alignments |= aligned
             if estimate is not None:
-                lost = () if is_observation else without_result
-                others = [*(group if is_observation else candidates), *(ReliefCandidate.at_seed(*one) for one in lost)]
+                others = [*candidates, *(ReliefCandidate.at_seed(*one) for one in without_result)]
                 result.alignments |= estimate.for_others(others)
                 result.others |= {c.pair.name for c in group} - result.alignments.keys()
     return result
@@ -202,15 +208,12 @@ def _common_residuals(group: Sequence[ReliefCandidate]) -> list[Residual[FixedIm
 
 def _p95_px(residual: Residual[FixedImagePx]) -> float:
     """Return the p95 of the lengths of the measured shifts, 0 without any: robust, as a wrong peak is no parallax."""
-    measured_px = np.linalg.norm(residual.shifts_px[np.isfinite(residual.shifts_px[:, 0])], axis=1)
-    return float(np.percentile(measured_px, 95)) if measured_px.size else 0.0
+    return float(residual.p95_px) if len(residual.lengths_px) else 0.0
 
 
 def _far_share(residual: Residual[FixedImagePx]) -> float:
     """Return the share of the measured windows with a shift above 1 px."""
-    lengths = np.linalg.norm(residual.shifts_px, axis=1)
-    measured = np.isfinite(lengths)
-    return float((lengths[measured] > 1.0).mean()) if measured.any() else 0.0
+    return float((residual.lengths_px > MAX_SHIFT_PX).mean()) if len(residual.lengths_px) else 0.0
 
 
 def _layout(group: Sequence[ReliefCandidate], bands: Sequence[int]) -> NDArray[np.float64] | None:
@@ -279,14 +282,54 @@ class _Band:
         return replace(self, plane=fit.applied_to(self.plane), baseline=(x, y))
 
 
-def _aligned_group(
-    group: Sequence[ReliefCandidate], *, is_observation: bool
-) -> "tuple[_Estimate | None, dict[str, Alignment[FixedImagePx]]]":
+def _observed(group: Sequence[ReliefCandidate]) -> dict[str, Alignment[FixedImagePx]]:
+    """Align a group by the planes of its bands and the parallax of windows, without a relief of every pixel.
+
+    The parallax of a held-out window is that by the other bands. Empty if no parallax or the homographies alone explain
+    the windows better. Raises GeometryError.
+    """
+    bands, reference = [_Band(c, c.warped.mapping) for c in group], group[0].pair.reference
+    rounds, model = 2, None  # large shifts are measured in steps
+    for _ in range(rounds):
+        consistent = _consistent(_window_shifts(bands), [b.candidate for b in bands])
+        if consistent is None:
+            return {}
+        kept, model = consistent
+        bands = [bands[k].fitted(fit) for k, fit in zip(kept, model.fits, strict=True)]
+    assert model is not None
+    if _layout(group, range(len(group))) is None and are_on_a_line(model.baselines):
+        return {}
+    warped = [band.candidate.pair.warped_moving(band.plane) for band in bands]
+    residuals = [reference.held_out_windows.residuals(image) for image in warped]
+    windows, checked = WindowShifts.of(residuals, [band.plane for band in bands]), []
+    relief = windows.relief(parallax_of(windows.shifts_px, model.baselines, windows.weights), reference.grey.size_px)
+    for number, (band, fit) in enumerate(zip(bands, model.fits, strict=True)):
+        others = np.delete(np.arange(len(bands)), number)
+        by_others_px = parallax_of(windows.shifts_px[:, others], model.baselines[others], windows.weights[:, others])
+        shifts_px = windows.shifts_of(residuals[number], by_others_px[:, None] * model.baselines[number])
+        held_out = residuals[number].with_shifts(residuals[number].shifts_px - shifts_px)
+        candidate, plane = band.candidate, band.candidate.held_out_residual(band.candidate.warped.mapping)
+        joint = candidate.joint.with_homography(band.plane.fixed_to_moving, fit.covariance_px2)
+        # Planes of different depth resemble a repetition in images without relief.
+        mapping = band.mapping(relief)
+        image = candidate.pair.warped_moving(mapping)
+        verified = WarpedPair(candidate.pair, mapping, image, reference.held_out_windows, held_out)
+        # A window across a depth edge contains the parallax of neither side.
+        issues = [issue for issue in verified.issues(joint) if issue.kind not in BY_PARALLAX]
+        aligned_share = float((held_out.lengths_px <= MAX_SHIFT_PX * candidate.pair.file_pixel_size_px).mean())
+        without = without_result(candidate.pair, candidate.seed)
+        alignment = decided(replace(without, mapping=mapping, joint=joint, residual=held_out))
+        is_aligned = not issues and aligned_share >= _MIN_OBSERVED_SHARE
+        checked.append(_Checked(band.name, plane, held_out, alignment if is_aligned else None))
+    return {c.name: c.alignment for c in checked if c.alignment is not None} if _is_chosen(checked) else {}
+
+
+def _aligned_group(group: Sequence[ReliefCandidate]) -> "tuple[_Estimate | None, dict[str, Alignment[FixedImagePx]]]":
     """Return the relief of a group and the bands that it aligns; (None, {}) if another geometry explains the capture
     better.
     """
     try:
-        estimate = _Estimate.of(group, is_refined=not is_observation)
+        estimate = _Estimate.of(group)
         if estimate is None:
             return None, {}
         checked = [estimate.checked(band) for band in estimate.bands]
@@ -307,13 +350,13 @@ class _Estimate:
     """From the bands of `_verifying`, which do not contain the bands that they verify."""
 
     @classmethod
-    def of(cls, group: Sequence[ReliefCandidate], *, is_refined: bool) -> "_Estimate | None":
+    def of(cls, group: Sequence[ReliefCandidate]) -> "_Estimate | None":
         """Estimate the relief from bands with common parallax; None if the windows do not determine the baselines.
 
-        It has the full resolution if it `is_refined`, else half. Raises GeometryError.
+        Raises GeometryError.
         """
         planes, size_px = [_Band(c, c.warped.mapping) for c in group], group[0].pair.fixed.size_px
-        lens_std = _lens_std_px(group[0].pair) if is_refined else None
+        lens_std = _lens_std_px(group[0].pair)
         consistent = _consistent(_window_shifts(planes), group, lens_std)
         if consistent is None:
             return None
@@ -333,10 +376,7 @@ class _Estimate:
         if not are_of_lenses(baselines, layout) or (layout is None and are_on_a_line(baselines)):
             return None
         selections = [range(len(bands)), *_verifying(range(len(bands)))]
-        if is_refined:
-            relief, *others = matching.refined(_views(bands), selections)
-        else:
-            relief, *others = (matching.matched(selection) for selection in selections)
+        relief, *others = matching.refined(_views(bands), selections)
         result = cls(bands, replace(relief, std_px=_std_px(others)), others)
         return result.negated if layout is None and nearer_sign(matched, baselines) < 0 else result
 

@@ -142,16 +142,20 @@ class Residual(Generic[FixedPx]):
         return Residual[FixedPx].of(self.centres_px, shifts_px, self.peaks_sigma, self.cells)
 
     @property
+    def lengths_px(self) -> NDArray[np.float64]:
+        """(m,) lengths of the measured shifts."""
+        return np.asarray(np.linalg.norm(self.shifts_px[np.isfinite(self.shifts_px[:, 0])], axis=1))
+
+    @property
     def rms_px(self) -> FixedPx:
         """RMS shift of the windows, without a tenth of them, which may be wrong peaks; infinite without any.
 
         The larger of those of a normal distribution with the same median, and with the same 90th percentile.
         """
-        lengths_px = np.linalg.norm(self.shifts_px[np.isfinite(self.shifts_px[:, 0])], axis=1)
-        if not len(lengths_px):
+        if not len(self.lengths_px):
             return cast(FixedPx, math.inf)
         # Of a Rayleigh distribution: sqrt(-2 log(1 - p)) for the quantile p, and sqrt(2) for the RMS.
-        by_quantile = [np.quantile(lengths_px, p) / math.sqrt(-math.log(1 - p)) for p in (0.5, 0.9)]
+        by_quantile = [np.quantile(self.lengths_px, p) / math.sqrt(-math.log(1 - p)) for p in (0.5, 0.9)]
         return cast(FixedPx, float(max(by_quantile)))
 
     @property

@@ -23,6 +23,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from agalign.errors import GeometryError
 from agalign.values import geometry
@@ -31,8 +32,8 @@ from agalign.values.displacement import DisplacementField
 from agalign.values.geometry import Points
 from agalign.values.least_squares import MIN_SHIFT_SCALE_PX, Robust, cauchy_weights, least_squares, shift_scale_px
 from agalign.values.mapping import PixelMapping
-from agalign.values.parallax import Parallax
-from agalign.values.pixel_units import FixedImagePx, FixedPx
+from agalign.values.parallax import Parallax, Relief
+from agalign.values.pixel_units import FixedImagePx, FixedPx, PixelScale
 from agalign.verify.residuals import Shifts
 
 Array = NDArray[np.float64]
@@ -47,6 +48,10 @@ NODE_STEP_PX = 48
 """Spacing of the nodes of a displacement field of lenses, as their distortion varies over hundreds of pixels."""
 _CAUCHY_SCALES = 2.0
 """Residual of a window at which its robust weight is one half, in residual scales."""
+_RELIEF_STEP_PX = 32
+"""Spacing of a relief by windows."""
+_AXIS_SHARE = 1 / 3
+"""Variance along one axis over the squared scale of lengths; normally distributed: 1 / 3.05."""
 _ALTERNATIONS = 12
 """Enough for the baselines to converge to a relative change of 0.001."""
 _DAMPING = 1e-3
@@ -163,9 +168,8 @@ def fit_windows(
         parallax_px = mapping.parallax.relief(raw.centres_px)
         shifts_px = shifts_px + parallax_px[:, None] * np.array(mapping.parallax.baseline)
         design, std_px = _with_parallax(design, parallax_px), np.r_[std_px, 1.0, 1.0]
-    axis_share = 1 / 3  # variance along one axis over the squared scale of lengths; normally distributed: 1 / 3.05
     robust = Robust(
-        _CAUCHY_SCALES, shift_scale_px, lambda scale_px: factor * axis_share * scale_px**2 + MIN_SHIFT_SCALE_PX**2
+        _CAUCHY_SCALES, shift_scale_px, lambda scale_px: factor * _AXIS_SHARE * scale_px**2 + MIN_SHIFT_SCALE_PX**2
     )
     estimate = least_squares(design, shifts_px, raw.weights, np.diag(std_px**-2.0), robust=robust)
     common_std_px = 0.01  # common to all windows; their residuals do not contain it
@@ -275,6 +279,18 @@ class WindowShifts:
         """Return True if at least `minimum` windows are measured in each band."""
         return len(self) > 0 and int((self.weights > 0).sum(axis=0).min()) >= minimum
 
+    def relief(self, parallax_px: Array, size_px: tuple[int, int]) -> Relief:
+        """Return the parallax (n,) of the windows as a relief of a reference (width, height): that of the nearest."""
+        shape = size_px[1] // _RELIEF_STEP_PX, size_px[0] // _RELIEF_STEP_PX
+        scale = PixelScale.between(size_px, shape[::-1])
+        centres_px = scale.inverse.positions(np.indices(shape)[::-1].reshape(2, -1).T.astype(np.float64))
+        nearest = parallax_px[cKDTree(self.centres_px).query(centres_px)[1]].reshape(shape).astype(np.float32)
+        return Relief(nearest, np.ones_like(nearest), scale)
+
+    def shifts_of(self, residual: Residual[FixedImagePx], shifts_px: Array) -> Array:
+        """Select from the shifts (n, 2) of all windows those of the windows of a band."""
+        return np.asarray(shifts_px[cKDTree(self.centres_px).query(residual.centres_px)[1]])
+
     def of_bands(self, bands: Sequence[int]) -> "WindowShifts":
         """Select bands by index."""
         return replace(self, shifts_px=self.shifts_px[:, bands], weights=self.weights[:, bands])
@@ -340,7 +356,7 @@ def adjust(
         precisions = np.minimum(1, (np.median(scales) / scales) ** 2)
     if layout is not None and np.sum(baselines * layout) < 0:
         baselines, parallax = -baselines, -parallax
-    covariances = scales[:, None, None] ** 2 * by_band.covariance[:, :count, :count]
+    covariances = _AXIS_SHARE * scales[:, None, None] ** 2 * by_band.covariance[:, :count, :count]
     of_bands = zip(np.hstack([smooth, baselines]), residuals, covariances, strict=True)
     return Adjustment([_window_fit(mean, r, size_px, covariance) for mean, r, covariance in of_bands], parallax)
 

@@ -58,6 +58,8 @@ COVERAGE = IssueKind("coverage", "a shift can be measured in only {value:.1%} of
 CLOSE_WINDOWS = IssueKind("close_windows", "only {value:.1%} of the windows are aligned within {detail}", _PARALLAX)
 CLUSTER = IssueKind("cluster", "an area with {value:.0%} of the windows is misaligned", _PARALLAX)
 RESIDUAL_PX = IssueKind("residual_px", "the median residual shift is {value:.1f} px", UNLIKE)
+BY_PARALLAX = frozenset({CLOSE_WINDOWS, CLUSTER, RESIDUAL_PX})
+"""Issues that parallax may cause, which a relief or a displacement field removes."""
 UNEXPECTED_PX = IssueKind(
     "unexpected_px",
     "the result is {value:.1f} px from the position that the rig of the flight predicts",

@@ -352,6 +352,18 @@ def test_bands_measured_in_windows_of_different_sizes_have_common_residuals(
     assert shows_relief(without_layout(candidates))
 
 
+def test_an_observation_of_the_rig_needs_only_windows(four_lenses: Rendered) -> None:
+    """It has the planes and baselines of the lenses; a band with other content is not part of it."""
+    foreign_nir = {"NIR": foreign(four_lenses.images["NIR"], "unrelated", seed=3)}
+    for images, names in (({}, {"Blue", "Red", "NIR", "Red edge"}), (foreign_nir, {"Blue", "Red", "Red edge"})):
+        observed = aligned_by_relief(four_lenses.candidates(images), "auto", is_observation=True).alignments
+        assert {name for name, a in observed.items() if a.status == "aligned"} == names
+        for name, alignment in observed.items():
+            # The parallax of a pixel is that of the nearest window, on slopes too.
+            assert np.median(four_lenses.error_px(name, alignment.mapping)) < 0.6
+            assert alignment.joint.corner_std_px < 0.5
+
+
 def test_use(candidates: Sequence[ReliefCandidate]) -> None:
     assert aligned_by_relief(candidates, "never") == ReliefResult()
     # One moving band cannot be verified with others; a coarse one has another reference.
