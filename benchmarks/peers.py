@@ -25,6 +25,7 @@ from agalign.capture.band_pair import BandPair
 from agalign.capture.seeding import best_seed
 from agalign.errors import AgalignError
 from agalign.evaluation.methods import elastix_affinity
+from agalign.fit.windows import FixedWindows
 from agalign.method.match import to_8_bit
 from agalign.pixels.band_resampling import luma, warped
 from agalign.pixels.masks import raster_of
@@ -34,7 +35,6 @@ from agalign.values.geometry import Matrix
 from agalign.values.image import Raster
 from agalign.values.mapping import PixelMapping
 from agalign.values.pixel_units import PixelScale
-from agalign.verify.residuals import FixedWindows
 
 Image = NDArray[Any]
 Align = Callable[[Image, Image], Matrix | None]

@@ -21,6 +21,7 @@ from agalign.batch.learning_tasks import (
     try_model,
 )
 from agalign.config import Settings
+from agalign.fit.displacement_field import common_field
 from agalign.flight.fingerprint import hashed, refinement_key
 from agalign.flight.groups import flight_camera, flight_lenses
 from agalign.flight.learn_rig import learn_rig
@@ -37,7 +38,6 @@ from agalign.values.capture import Capture
 from agalign.values.geometry import Matrix
 from agalign.values.pixel_units import FixedFilePx, MovingFilePx
 from agalign.values.process_pool import A, Apply, R
-from agalign.verify.displacement_field import common_field
 from agalign.verify.extrapolation import unmodelled_std_px, unobserved_quarters
 
 _MIN_RIG_CAPTURES, _MAX_RIG_CAPTURES = 6, 48

@@ -15,13 +15,13 @@ from agalign.capture.relief_candidate import ReliefCandidate, aligned_by_relief
 from agalign.capture.seeding import find_seed, image_groups
 from agalign.capture.warped_pair import WarpedPair, with_metrics
 from agalign.config import Settings
+from agalign.fit.occlusion import occluded
 from agalign.flight.fingerprint import refinement_key
 from agalign.flight.model import FlightModel
 from agalign.method.device import one_thread
 from agalign.method.joint import Results, align_from_scratch, refine_with
 from agalign.method.refine import FLIGHT_PATCHES, PATCHES
 from agalign.method.state import ImageGroup
-from agalign.relief.occlusion import occluded
 from agalign.values import geometry
 from agalign.values.alignment import Alignment, JointResult, RefinedPair, Seed
 from agalign.values.capture import Band, Capture

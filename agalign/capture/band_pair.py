@@ -13,6 +13,7 @@ from agalign.capture.reference import Reference
 from agalign.capture.tag_seeds import seed_candidates
 from agalign.config import SeedSettings
 from agalign.errors import AgalignError
+from agalign.fit.windows import FixedWindows
 from agalign.flight.model import FlightModel
 from agalign.flight.rig_prediction import unobserved_error_px
 from agalign.pixels.band_resampling import channel_mean, warped
@@ -37,7 +38,6 @@ from agalign.values.pixel_units import (
     MovingImagePoints,
     PixelScale,
 )
-from agalign.verify.residuals import FixedWindows
 
 Candidates = Mapping[SeedKind, Matrix]
 """fixed_to_moving homographies between undistorted pixels, in order of preference."""

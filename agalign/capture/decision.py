@@ -16,6 +16,7 @@ from dataclasses import replace
 
 from agalign.capture.band_pair import BandPair
 from agalign.capture.warped_pair import WarpedPair
+from agalign.fit.displacement_field import DisplacementResult
 from agalign.pixels.band_resampling import channel_mean
 from agalign.values.alignment import Alignment, JointResult, Seed
 from agalign.values.choices import Geometry, PairStatus, ReliefUse, SeedKind
@@ -23,7 +24,6 @@ from agalign.values.geometry import Matrix
 from agalign.values.issues import SEED_DOES_NOT_FIT, Issue, IssueKind
 from agalign.values.pixel_units import FixedImagePx, FixedPx
 from agalign.verify.checks import BY_PARALLAX, is_unchanged, seed_fits
-from agalign.verify.displacement_field import DisplacementResult
 
 
 def decided(alignment: Alignment[FixedPx], *, is_seed_usable: bool = False) -> Alignment[FixedPx]:

@@ -16,13 +16,13 @@ import numpy as np
 from agalign.capture.band_pair import BandPair
 from agalign.capture.decision import decided
 from agalign.capture.warped_pair import WarpedPair
+from agalign.fit.adjustment import WindowFit, fit_in_rounds, lens_std_px
 from agalign.flight.rig import Rig
 from agalign.values import geometry
 from agalign.values.alignment import Alignment, JointResult, Residual
 from agalign.values.issues import CORNERS_UNKNOWN, FEW_KEYPOINTS, NO_CONTRAST, RETRIEVAL
 from agalign.values.mapping import PixelMapping
 from agalign.values.pixel_units import FixedImagePx, MovingFilePx
-from agalign.verify.adjustment import WindowFit, fit_in_rounds, lens_std_px
 from agalign.verify.checks import BY_WINDOWS, MAX_ALIAS_PEAK, alias_peak, seed_fits
 from agalign.verify.extrapolation import issues_of_extrapolation, points_in_frame
 

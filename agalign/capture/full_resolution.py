@@ -13,6 +13,8 @@ import numpy as np
 
 from agalign.capture.decision import decided
 from agalign.errors import UnreadableFileError
+from agalign.fit.adjustment import fit_in_rounds
+from agalign.fit.windows import FixedWindows
 from agalign.flight.rig import distance_px
 from agalign.pixels.band_resampling import resample_tile
 from agalign.pixels.masks import learnable
@@ -24,9 +26,7 @@ from agalign.values.image import Raster, Tile
 from agalign.values.issues import UNREADABLE, Issue
 from agalign.values.mapping import PixelMapping
 from agalign.values.pixel_units import FixedFilePx
-from agalign.verify.adjustment import fit_in_rounds
 from agalign.verify.checks import Evidence, issues_of
-from agalign.verify.residuals import FixedWindows
 
 _TILE_PX = 640
 """Side of a tile with 36 windows; an error of a few pixels of the reduced images does not move their content out of

@@ -21,13 +21,13 @@ from numpy.typing import NDArray
 from scipy.linalg import block_diag
 
 from agalign.capture.band_pair import BandPair
+from agalign.fit.adjustment import fit_windows
 from agalign.flight.rig import FACTOR_STD_PX, FACTORS, MIN_STD_PX, Rig, lattice
 from agalign.values import geometry
 from agalign.values.alignment import JointResult, Residual
 from agalign.values.geometry import Matrix
 from agalign.values.least_squares import Robust, least_squares
 from agalign.values.pixel_units import FixedImagePx
-from agalign.verify.adjustment import fit_windows
 
 Array = NDArray[np.float64]
 

@@ -11,9 +11,9 @@ from agalign.capture.band_pair import BandPair
 from agalign.capture.decision import decided
 from agalign.capture.seeding import find_rotated
 from agalign.capture.warped_pair import WarpedPair
+from agalign.fit.occlusion import occluded
 from agalign.flight.rig import Observation, Rig, distance_px
 from agalign.flight.rig_prediction import predict_band
-from agalign.relief.occlusion import occluded
 from agalign.values.alignment import MIN_TIMES_CHANCE, Alignment, Prediction
 from agalign.values.capture import Capture
 from agalign.values.issues import Issue

@@ -3,14 +3,14 @@
 from dataclasses import replace
 from functools import cached_property
 
+from agalign.fit.displacement_field import DisplacementEstimator
+from agalign.fit.windows import MIN_WINDOW_PX, FixedWindows
 from agalign.pixels.band_resampling import channel_mean, shrink, textured
 from agalign.pixels.landmarks import LandmarkInput, Landmarks, landmarks
 from agalign.pixels.structure import Field, blur_px, structure_field, windowed_spectra
 from agalign.values.image import Raster
 from agalign.values.pixel_units import PixelScale
-from agalign.verify.displacement_field import DisplacementEstimator
 from agalign.verify.metrics import FixedSimilarity
-from agalign.verify.residuals import MIN_WINDOW_PX, FixedWindows
 
 _HELD_OUT_PX = 64
 """Side of the windows that verify a relief; larger, because their shifts have less noise."""

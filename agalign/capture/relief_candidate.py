@@ -20,18 +20,7 @@ from agalign.capture.band_pair import BandPair
 from agalign.capture.decision import decided, predicted_by_windows, without_result
 from agalign.capture.warped_pair import WarpedPair
 from agalign.errors import GeometryError
-from agalign.pixels.band_resampling import channel_mean
-from agalign.relief.dense import DenseMatching, View
-from agalign.relief.occlusion import nearer_sign, occluded
-from agalign.values.alignment import MIN_RETRIEVAL, Alignment, JointResult, Residual, Seed
-from agalign.values.choices import Geometry, ReliefUse
-from agalign.values.geometry import Matrix
-from agalign.values.image import FloatImage, Raster
-from agalign.values.issues import OTHER_GEOMETRY
-from agalign.values.mapping import PixelMapping
-from agalign.values.parallax import Parallax, Relief
-from agalign.values.pixel_units import FixedImagePx
-from agalign.verify.adjustment import (
+from agalign.fit.adjustment import (
     Adjustment,
     WindowFit,
     WindowShifts,
@@ -44,9 +33,20 @@ from agalign.verify.adjustment import (
     parallax_of,
     shifts_by_corners,
 )
+from agalign.fit.dense import DenseMatching, View
+from agalign.fit.displacement_field import MIN_GAIN_SIGMA, MIN_WINDOWS
+from agalign.fit.occlusion import nearer_sign, occluded
+from agalign.fit.windows import decrease_sigma
+from agalign.pixels.band_resampling import channel_mean
+from agalign.values.alignment import MIN_RETRIEVAL, Alignment, JointResult, Residual, Seed
+from agalign.values.choices import Geometry, ReliefUse
+from agalign.values.geometry import Matrix
+from agalign.values.image import FloatImage, Raster
+from agalign.values.issues import OTHER_GEOMETRY
+from agalign.values.mapping import PixelMapping
+from agalign.values.parallax import Parallax, Relief
+from agalign.values.pixel_units import FixedImagePx
 from agalign.verify.checks import BY_PARALLAX, BY_WINDOWS, MAX_ALIAS_PEAK, MAX_SHIFT_PX, alias_peak
-from agalign.verify.displacement_field import MIN_GAIN_SIGMA, MIN_WINDOWS
-from agalign.verify.residuals import decrease_sigma
 
 _MIN_BANDS = 2
 """Minimum number of moving lenses: a relief is verified with the other lenses."""

@@ -8,6 +8,7 @@ import numpy as np
 from agalign.capture.band_pair import BandPair, Candidates
 from agalign.capture.warped_pair import WarpedPair
 from agalign.config import SeedSettings
+from agalign.fit.adjustment import fit_in_rounds
 from agalign.flight.model import FlightModel
 from agalign.method.descriptor import Descriptor
 from agalign.method.match import match_seed, starter_for_matching
@@ -20,7 +21,6 @@ from agalign.values.alignment import Seed
 from agalign.values.choices import SeedKind, Space
 from agalign.values.geometry import Matrix
 from agalign.values.issues import BLANK_MOVING, BLANK_REFERENCE, NO_SUCH_SEED, Issue
-from agalign.verify.adjustment import fit_in_rounds
 from agalign.verify.checks import seed_fits
 
 _MIN_OVERLAP = 0.2

@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from agalign.capture.band_pair import BandPair
+from agalign.fit.windows import FixedWindows, residual_under
 from agalign.pixels.band_resampling import shrink
 from agalign.pixels.structure import Field, structure_field, windowed_spectra
 from agalign.values import geometry
@@ -16,7 +17,6 @@ from agalign.values.mapping import PixelMapping
 from agalign.values.pixel_units import FixedImagePx, PixelScale
 from agalign.verify.checks import Evidence, issues_of
 from agalign.verify.extrapolation import points_in_frame, unobserved_quarters
-from agalign.verify.residuals import FixedWindows, residual_under
 
 
 @dataclass(frozen=True)

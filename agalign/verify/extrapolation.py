@@ -4,14 +4,14 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from agalign.fit.adjustment import lens_shapes, lens_std_px, variance_px2
+from agalign.fit.windows import window_spacing_px
 from agalign.values import geometry
 from agalign.values.alignment import Alignment, Residual
 from agalign.values.geometry import Points
 from agalign.values.issues import Issue, IssueKind, Remedy
 from agalign.values.mapping import PixelMapping
 from agalign.values.pixel_units import FixedFilePx, FixedPx
-from agalign.verify.adjustment import lens_shapes, lens_std_px, variance_px2
-from agalign.verify.residuals import window_spacing_px
 
 EXTRAPOLATED = IssueKind(
     "extrapolated",

@@ -36,11 +36,11 @@ from stages import read
 from synthetic_flights.aligned import make_aligned
 
 from agalign.cameras.discover import discover
+from agalign.fit.dense import DenseMatching, View
 from agalign.flight.panel_readings import with_panels
 from agalign.flight.sky import sky_captures
 from agalign.pixels.panel_detection import find_panel
 from agalign.products.sidecar.file import find_sidecars
-from agalign.relief.dense import DenseMatching, View
 from agalign.values.capture import Capture
 from agalign.values.image import Raster
 from agalign.values.mapping import PixelMapping

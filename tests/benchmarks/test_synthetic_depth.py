@@ -10,11 +10,11 @@ from synthetic_flights.materials import make_textures
 from synthetic_flights.patches import Patch
 from synthetic_flights.relief import make_scene
 
+from agalign.fit.windows import FixedWindows
 from agalign.pixels.structure import structure_field
 from agalign.synthetic.camera_model import CameraSpec, Pose
 from agalign.synthetic.flight import recorded
 from agalign.values.image import Raster
-from agalign.verify.residuals import FixedWindows
 
 pytestmark = pytest.mark.full
 

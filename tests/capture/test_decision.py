@@ -7,6 +7,7 @@ from agalign.capture import warped_pair
 from agalign.capture.band_pair import BandPair
 from agalign.capture.decision import at_seed, decided, verified, without_result
 from agalign.capture.warped_pair import WarpedPair, with_metrics
+from agalign.fit.displacement_field import DisplacementResult
 from agalign.values import geometry
 from agalign.values.alignment import PairScales, Prediction, Seed
 from agalign.values.choices import ReliefUse
@@ -14,7 +15,6 @@ from agalign.values.displacement import DisplacementField
 from agalign.values.image import Raster
 from agalign.values.issues import FEW_KEYPOINTS, RETRIEVAL, SEED_DOES_NOT_FIT, Issue
 from agalign.values.pixel_units import PixelScale
-from agalign.verify.displacement_field import DisplacementResult
 
 from ..builders import displaced_views, joint_result, pair_of, residual_of, texture, two_views, whole
 

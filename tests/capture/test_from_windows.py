@@ -13,12 +13,12 @@ from agalign.capture.decision import verified
 from agalign.capture.from_windows import from_windows, without_extrapolated
 from agalign.capture.seeding import find_seed
 from agalign.config import SeedSettings, Settings
+from agalign.fit.adjustment import lens_shapes
 from agalign.flight.rig import Rig
 from agalign.pixels.masks import raster_of
 from agalign.values import geometry
 from agalign.values.alignment import Alignment, Residual, Seed
 from agalign.values.issues import RETRIEVAL, UNREADABLE, Issue
-from agalign.verify.adjustment import lens_shapes
 from agalign.verify.checks import FOLDS, Evidence, issues_of
 from agalign.verify.extrapolation import expected_error_px
 

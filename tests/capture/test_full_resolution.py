@@ -15,12 +15,12 @@ from agalign.capture.align_bands import align_capture_bands
 from agalign.capture.full_resolution import at_full_resolution
 from agalign.config import JointSettings, Settings
 from agalign.errors import UnreadableFileError
+from agalign.fit import adjustment
 from agalign.flight.rig import distance_px
 from agalign.values import geometry
 from agalign.values.alignment import Alignment, Prediction, Residual, Seed
 from agalign.values.capture import Capture
 from agalign.values.mapping import PixelMapping
-from agalign.verify import adjustment
 
 from ..builders import joint_result, residual_of, two_views
 

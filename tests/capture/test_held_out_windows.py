@@ -13,13 +13,13 @@ from agalign.capture.decision import verified
 from agalign.capture.from_windows import from_windows
 from agalign.capture.reference import Reference
 from agalign.config import Settings
+from agalign.fit.windows import FixedWindows, Shifts
 from agalign.pixels.masks import raster_of
 from agalign.values import geometry
 from agalign.values.alignment import Alignment, Seed
 from agalign.values.geometry import Points
 from agalign.values.image import Raster
 from agalign.values.issues import RETRIEVAL, Issue
-from agalign.verify.residuals import FixedWindows, Shifts
 
 from ..builders import in_full_run, joint_result, pair_of, texture, two_views, whole
 from ..conftest import textured_image

@@ -30,8 +30,8 @@ from agalign.capture.relief_candidate import (
 )
 from agalign.capture.warped_pair import WarpedPair
 from agalign.config import JointSettings, ReliefSettings, Settings
+from agalign.fit.range import inverse_range
 from agalign.flight.rig import Rig
-from agalign.relief.range import inverse_range
 from agalign.synthetic.camera_model import BandSpec, CameraSpec
 from agalign.synthetic.flight import recorded
 from agalign.values import geometry, lens
@@ -481,7 +481,7 @@ def test_a_band_of_another_time_is_predicted_under_the_relief_of_the_others(boxe
     result = aligned_by_relief(boxes.candidates({"NIR": nir}), "auto").alignments
     assert {name: a.status for name, a in result.items()} == {"Blue": "aligned", "Red": "aligned", "NIR": "predicted"}
     assert result["NIR"].mapping.parallax is not None
-    # The RMS of the motion is 1 px, of which the plane of the band follows a part.
+    # The RMS of the motion is 1 px; the plane of the band follows a part of it.
     assert 0.5 < result["NIR"].prediction.std_px < 1.5
     # The relief is that of the other bands: its noise is not larger than without this band.
     assert all(np.median(boxes.error_px(name, result[name].mapping)) < 0.12 for name in ("Blue", "Red"))

@@ -12,6 +12,7 @@ from agalign.capture.tag_seeds import geo_seed
 from agalign.capture.warped_pair import WarpedPair
 from agalign.config import SeedSettings
 from agalign.errors import GeometryError
+from agalign.fit.windows import FixedWindows
 from agalign.pixels.landmarks import LANDMARK_INPUTS, landmarks, matched_homography
 from agalign.values import geometry
 from agalign.values.alignment import Seed
@@ -19,7 +20,6 @@ from agalign.values.capture import Band, Georeference
 from agalign.values.choices import SeedKind
 from agalign.values.image import Raster
 from agalign.values.mapping import PixelMapping
-from agalign.verify.residuals import FixedWindows
 
 from ..builders import pair_of, residual_of, texture, two_views
 from ..conftest import mean_error_px

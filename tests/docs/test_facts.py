@@ -16,14 +16,14 @@ import pytest
 from agalign.capture import band_pair, reference, relief_candidate
 from agalign.cli.main import COMMANDS
 from agalign.cli.terminal import ExitCode
+from agalign.fit import dense, displacement_field, windows
 from agalign.flight import panel_readings
 from agalign.method import refine
 from agalign.pixels import raster
 from agalign.products.registry import PRODUCTS
 from agalign.products.sidecar.schema import ProductPart
-from agalign.relief import dense
 from agalign.values.alignment import MIN_RETRIEVAL, MIN_TIMES_CHANCE
-from agalign.verify import checks, displacement_field, residuals
+from agalign.verify import checks
 
 from ..program import agalign_here
 from .blocks import PAGES, ROOT
@@ -145,7 +145,7 @@ LIMITS = {
     "method.md": (
         f"| at least {MIN_RETRIEVAL:g}, and {MIN_TIMES_CHANCE:g} times chance |",
         f"| {checks._MAX_CORNER_STD_PX:g} px |",
-        f"the textured windows ({residuals._WINDOW_PX} px)",
+        f"the textured windows ({windows._WINDOW_PX} px)",
         f"| {checks._MIN_COVERAGE:.0%} ({checks._MIN_HELD_OUT_COVERAGE:.0%} if".replace("%", " %"),
         f"| {checks._MIN_CLOSE_SHARE:.0%}; adjacent windows beyond {checks.MAX_SHIFT_PX:g} px: fewer than "
         f"{checks._MIN_CLUSTER}, or than {checks._MAX_CLUSTER_SHARE:.0%} of the windows |".replace("%", " %"),

@@ -17,11 +17,11 @@ import agalign
 from agalign.batch import capture_task as batch
 from agalign.cameras import pix4d, rig_seed
 from agalign.cameras.metadata import Tags
+from agalign.fit.occlusion import occluded
 from agalign.products.rasters.relief_map import relief_layers
 from agalign.products.sidecar.file import read_result, read_sidecar, write_sidecar
 from agalign.products.sidecar.fill import sidecar_of
 from agalign.products.sidecar.schema import Sidecar
-from agalign.relief.occlusion import occluded
 from agalign.synthetic import cameras
 from agalign.values import geometry, lens
 from agalign.values.alignment import Alignment, PairScales, Seed

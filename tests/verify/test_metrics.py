@@ -5,12 +5,12 @@ import SimpleITK as sitk
 from skimage.metrics import normalized_mutual_information, structural_similarity
 
 from agalign.capture.reference import Reference
+from agalign.fit.windows import FixedWindows
 from agalign.pixels.structure import structure_field
 from agalign.values import geometry
 from agalign.values.alignment import Residual
 from agalign.values.image import Raster
 from agalign.verify.metrics import FixedSimilarity, fixed_bins, joint_histogram, normalised_mutual_information
-from agalign.verify.residuals import FixedWindows
 
 from ..builders import texture, two_views
 from ..conftest import textured_image

@@ -8,9 +8,9 @@ from numpy.typing import NDArray
 from agalign.cameras import rig_seed
 from agalign.cameras.pix4d import rig_unit_m
 from agalign.errors import GeometryError
+from agalign.fit.range import inverse_range
 from agalign.products.product import GEOTIFF, Product, ProductContext, StacAsset, WrittenFile
 from agalign.products.rasters.checked_raster import LayerDescription
-from agalign.relief.range import inverse_range
 from agalign.values.alignment import Alignment
 from agalign.values.capture import Capture
 from agalign.values.image import OutputGrid

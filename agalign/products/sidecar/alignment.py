@@ -8,10 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agalign.errors import NoSuchBandError, SidecarError
+from agalign.fit.occlusion import occluded
 from agalign.pixels.raster import read_preview
 from agalign.products.sidecar.file import read_sidecar
 from agalign.products.sidecar.schema import BandPart, ReliefPart, Sidecar
-from agalign.relief.occlusion import occluded
 from agalign.values import lens
 from agalign.values.alignment import Alignment, Residual, Seed
 from agalign.values.choices import Geometry

@@ -18,9 +18,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from agalign.fit.semi_global import MAX_LARGE, aggregated, sub_label_minimum
 from agalign.pixels.band_resampling import shrink
 from agalign.pixels.structure import structure_field
-from agalign.relief.semi_global import MAX_LARGE, aggregated, sub_label_minimum
 from agalign.values import geometry, lens
 from agalign.values.image import FloatImage, Mask, Raster
 from agalign.values.mapping import PixelMapping

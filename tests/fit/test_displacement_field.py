@@ -2,13 +2,8 @@ import numpy as np
 import pytest
 
 from agalign.capture.reference import Reference
-from agalign.pixels.structure import structure_field
-from agalign.values import geometry
-from agalign.values.alignment import Residual
-from agalign.values.displacement import DisplacementField
-from agalign.values.mapping import PixelMapping
-from agalign.verify import displacement_field
-from agalign.verify.displacement_field import (
+from agalign.fit import displacement_field
+from agalign.fit.displacement_field import (
     DisplacementEstimator,
     DisplacementResult,
     _Gain,
@@ -16,7 +11,12 @@ from agalign.verify.displacement_field import (
     common_field,
     fitted_field,
 )
-from agalign.verify.residuals import Shifts
+from agalign.fit.windows import Shifts
+from agalign.pixels.structure import structure_field
+from agalign.values import geometry
+from agalign.values.alignment import Residual
+from agalign.values.displacement import DisplacementField
+from agalign.values.mapping import PixelMapping
 
 from ..builders import displaced_views, residual_of, texture
 

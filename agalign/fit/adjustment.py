@@ -26,6 +26,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from agalign.errors import GeometryError
+from agalign.fit.windows import Shifts
 from agalign.values import geometry
 from agalign.values.alignment import Residual
 from agalign.values.displacement import DisplacementField
@@ -34,7 +35,6 @@ from agalign.values.least_squares import MIN_SHIFT_SCALE_PX, Robust, cauchy_weig
 from agalign.values.mapping import PixelMapping
 from agalign.values.parallax import Parallax, Relief
 from agalign.values.pixel_units import FixedImagePx, FixedPx, PixelScale
-from agalign.verify.residuals import Shifts
 
 Array = NDArray[np.float64]
 

@@ -6,8 +6,8 @@ import cv2
 import numpy as np
 import pytest
 
-from agalign.relief import dense
-from agalign.relief.dense import DenseMatching, View
+from agalign.fit import dense
+from agalign.fit.dense import DenseMatching, View
 from agalign.values.image import Raster
 from agalign.values.mapping import PixelMapping
 from agalign.values.parallax import Relief

@@ -15,6 +15,8 @@ from scipy.linalg import solveh_banded
 from scipy.sparse import diags, identity, kron, vstack
 from scipy.spatial import cKDTree
 
+from agalign.fit.adjustment import NODE_STEP_PX
+from agalign.fit.windows import FixedWindows, Shifts, in_standard_errors
 from agalign.pixels.band_resampling import warped
 from agalign.pixels.structure import Field
 from agalign.values.alignment import Residual
@@ -23,8 +25,6 @@ from agalign.values.geometry import Points
 from agalign.values.image import Mask, Raster
 from agalign.values.mapping import PixelMapping
 from agalign.values.pixel_units import FixedImagePx
-from agalign.verify.adjustment import NODE_STEP_PX
-from agalign.verify.residuals import FixedWindows, Shifts, in_standard_errors
 
 _WINDOW_PX = 40
 """Side of the windows in which shifts are measured. On reference tie points of three cameras, smaller ones are as

@@ -5,11 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from agalign.synthetic import cameras
-from agalign.values import geometry
-from agalign.values.mapping import PixelMapping
-from agalign.values.parallax import Parallax, Relief
-from agalign.verify.adjustment import (
+from agalign.fit.adjustment import (
     Adjustment,
     WindowShifts,
     adjust,
@@ -19,6 +15,10 @@ from agalign.verify.adjustment import (
     parallax_of,
     shifts_by_corners,
 )
+from agalign.synthetic import cameras
+from agalign.values import geometry
+from agalign.values.mapping import PixelMapping
+from agalign.values.parallax import Parallax, Relief
 
 from ..builders import residual_of
 

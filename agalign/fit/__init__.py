@@ -1,0 +1,1 @@
+"""Fits to windows of a band pair and of a capture: shifts, the adjustment of all bands, fields, relief."""

@@ -1,1 +1,0 @@
-"""Relief of a capture: plane + parallax from windows, dense parallax by multi-baseline stereo, occlusions, range."""
