@@ -19,7 +19,6 @@ from contextlib import ExitStack, contextmanager
 from functools import partial
 from importlib import import_module
 from itertools import islice
-from operator import call
 from typing import Any, Protocol
 
 from agalign._version import __version__
@@ -27,17 +26,11 @@ from agalign.errors import AgalignError, ConfigurationError, WorkerError
 from agalign.pixels.raster import without_warnings
 from agalign.values.cores import usable_cores
 from agalign.values.process_pool import A, ProcessPool, R, WorkerDiedError
-from agalign.values.processes import (
-    WORKER_MODULE,
-    environment_of_children,
-    follow_parent,
-    without_interrupt_key,
-    worker_context,
-)
+from agalign.values.processes import WORKER_MODULE, environment_of_children, without_interrupt_key, worker_context
 
 _DASK_TIMEOUT_S = 10
-_POLL_INTERVAL_S = 5.0
-"""Interval at which the state of a cluster is checked while no task completes."""
+_POLL_INTERVAL_S = 1.0
+"""Interval at which the loss of workers is checked while no task completes. On Windows, SIGINT waits as long."""
 _MAX_WAITING_TASKS = 1000
 """Maximum number of tasks submitted to an executor at a time: enough for any cluster, and little memory."""
 
@@ -107,28 +100,18 @@ def own_processes(
     process of a task that exceeds the timeout is killed.
     """
     threads = max(1, usable_cores() // processes)
-    max_tasks = 500  # libraries leak some kilobytes per capture
     with (
         environment_of_children(threads),
-        ProcessPool[partial[Any], Any](
-            call, processes, worker_context(preload), _start, (initializer, threads), max_tasks_per_worker=max_tasks
-        ) as pool,
+        ProcessPool(processes, worker_context(preload), partial(initializer, threads)) as pool,
     ):
 
         def run(
             function: Callable[[A], R], tasks: Sequence[A], /, *, limited: bool = False
         ) -> Iterator[tuple[int, Callable[[], R]]]:
-            calls = [partial(function, task) for task in tasks]
-            for outcome in pool.run(calls, timeout_s if limited else None):
-                yield outcome.number, outcome.value
+            submit = partial(pool.submit, function, timeout_s=timeout_s if limited else None)
+            return _completed(submit, tasks, lambda: pool.loss)
 
         yield run
-
-
-def _start(initializer: Callable[[int], object], threads: int) -> None:
-    """Initialise a worker process."""
-    follow_parent()
-    initializer(threads)
 
 
 def on_executor(executor: Executor) -> Run:
@@ -137,31 +120,41 @@ def on_executor(executor: Executor) -> Run:
     def run(
         function: Callable[[A], R], tasks: Sequence[A], /, *, limited: bool = False
     ) -> Iterator[tuple[int, Callable[[], R]]]:
-        chosen = executor if limited or not isinstance(executor, DaskExecutor) else executor.without_timeout()
-        loss = chosen.loss if isinstance(chosen, DaskExecutor) else str
-        futures: dict[Future[R], int] = {}
-        remaining = iter(enumerate(tasks))
-
-        def submit(count: int) -> None:
-            for number, task in islice(remaining, count):
-                futures[_submitted(chosen, function, task)] = number
-
-        try:
-            submit(_MAX_WAITING_TASKS)
-            while futures:
-                done, _ = wait(futures, _POLL_INTERVAL_S, FIRST_COMPLETED)
-                if not done and (reason := loss()):  # futures of a lost cluster may never be done
-                    raise WorkerError(reason)
-                for future in done:
-                    if (future.cancelled() or future.exception() is not None) and (reason := loss()):
-                        raise WorkerError(reason)
-                    yield futures.pop(future), future.result
-                    submit(1)
-        finally:
-            for future in futures:
-                future.cancel()
+        if not isinstance(executor, DaskExecutor):
+            return _completed(partial(_submitted, executor, function), tasks, str)
+        chosen = executor if limited else executor.without_timeout()
+        return _completed(partial(chosen.submit, function), tasks, chosen.loss)
 
     return run
+
+
+def _completed(
+    submit: Callable[[A], "Future[R]"], tasks: Sequence[A], loss: Callable[[], str]
+) -> Iterator[tuple[int, Callable[[], R]]]:
+    """Submit the tasks; yield the number of each and how to get its result, as they complete.
+
+    Raises WorkerError if the executor gives a reason for its `loss`.
+    """
+    futures: dict[Future[R], int] = {}
+    remaining = iter(enumerate(tasks))
+
+    def submit_some(count: int) -> None:
+        futures.update((submit(task), number) for number, task in islice(remaining, count))
+
+    try:
+        submit_some(_MAX_WAITING_TASKS)
+        while futures:
+            done, _ = wait(futures, _POLL_INTERVAL_S, FIRST_COMPLETED)
+            if not done and (reason := loss()):  # futures of a lost cluster may never be done
+                raise WorkerError(reason)
+            for future in done:
+                if (future.cancelled() or future.exception() is not None) and (reason := loss()):
+                    raise WorkerError(reason)
+                yield futures.pop(future), future.result
+                submit_some(1)
+    finally:
+        for future in futures:
+            future.cancel()
 
 
 def _submitted(executor: Executor, function: Callable[[A], R], task: A) -> "Future[R]":

@@ -4,7 +4,6 @@ import re
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from functools import partial
 from multiprocessing import get_context
 from pathlib import Path
 
@@ -22,7 +21,7 @@ from agalign.values.capture import Band
 from agalign.values.lens import rescaled
 from agalign.values.pixel_units import SAME_PIXELS, PixelScale, Size
 from agalign.values.process_pool import ProcessPool, WorkerDiedError
-from agalign.values.processes import environment_of_children, follow_parent
+from agalign.values.processes import environment_of_children
 
 
 @dataclass(frozen=True)
@@ -151,19 +150,14 @@ def _read_in_processes(
     tasks: Sequence[Sequence[Path]], options: DiscoverOptions, processes: int
 ) -> Iterator[ImageFile | Problem]:
     # Not forked: a fork would copy locks that are held by threads of the calling program.
-    read = partial(_read_task, options=options)
-    finished: dict[int, list[ImageFile | Problem]] = {}
-    next_task = 0
-    with environment_of_children(threads=1), ProcessPool(read, processes, get_context("spawn"), follow_parent) as pool:
-        for outcome in pool.run(tasks):
+    with environment_of_children(threads=1), ProcessPool(processes, get_context("spawn")) as pool:
+        futures = [pool.submit(_read_task, task, options) for task in tasks]
+        for task, future in zip(tasks, futures, strict=True):
             try:
-                finished[outcome.number] = outcome.value()
+                yield from future.result()
             except WorkerDiedError:
                 what = "reading it, or a file read together with it, killed the process; take it out of the folder"
-                finished[outcome.number] = [Problem(p, UnreadableFileError(f"{p}: {what}")) for p in outcome.argument]
-            while next_task in finished:
-                yield from finished.pop(next_task)
-                next_task += 1
+                yield from (Problem(path, UnreadableFileError(f"{path}: {what}")) for path in task)
 
 
 def _read_task(paths: Sequence[Path], options: DiscoverOptions) -> list[ImageFile | Problem]:

@@ -13,7 +13,7 @@ import threading
 import time
 import zlib
 from collections import Counter
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor, as_completed
 from contextlib import suppress
 from multiprocessing import get_context
 from pathlib import Path
@@ -24,7 +24,6 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from agalign.errors import WorkerError
 from agalign.values.process_pool import ProcessPool, WorkerDiedError
-from agalign.values.processes import follow_parent
 
 WORKERS, TASKS = 8, 400
 MAX_BYTES = 400_000
@@ -71,18 +70,24 @@ def run_tiny(kills: int, rng: random.Random) -> Counter[str]:
     while result["kills"] < kills:
         given, began = make_tiny(rng), time.monotonic()
         seen, stopped = Counter[int](), threading.Event()
-        context = get_context("forkserver")
-        with ProcessPool(do_tiny, WORKERS, context, follow_parent) as pool, ThreadPoolExecutor(1) as threads:
+        with ProcessPool(WORKERS, get_context("forkserver")) as pool, ThreadPoolExecutor(1) as threads:
             killer = threads.submit(kill_workers, stopped, rng, kills - result["kills"])
+            futures = {pool.submit(do_tiny, task, timeout_s=20): task for task in given}
             try:
-                for outcome in pool.run(given, timeout_s=20):
-                    seen[outcome.number] += 1
-                    number, _, data, size = given[outcome.number]
-                    if isinstance(outcome.error, WorkerDiedError):
+                for future in as_completed(futures, HUNG_S):
+                    number, _, data, size = futures[future]
+                    seen[number] += 1
+                    error = future.exception()
+                    if isinstance(error, WorkerError):
+                        raise error
+                    if isinstance(error, WorkerDiedError):
                         result["reported as killed"] += 1
-                        result["wrong"] += str(outcome.error) != "signal 9"
+                        result["wrong"] += str(error) != "signal 9"
                     else:
-                        result["wrong"] += outcome.result != (number, zlib.crc32(data), bytes(size))
+                        expected = number, zlib.crc32(data), bytes(size)
+                        result["wrong"] += error is not None or future.result() != expected
+            except TimeoutError:
+                result["lost"] += TASKS - len(seen)
             except WorkerError:
                 result["runs ended with a reason"] += 1
             else:

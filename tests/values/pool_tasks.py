@@ -5,6 +5,7 @@ import os
 import pickle
 import signal
 import time
+from multiprocessing.connection import Connection
 from pathlib import Path
 
 
@@ -80,6 +81,19 @@ def signalled(task: tuple[Path, int, int] | int) -> str:
     """A task that sends itself a signal, or a plain one."""
     if not isinstance(task, int):
         signal_self(*task)
+    return "done"
+
+
+def sent_in_part(task: tuple[Path, int, int]) -> str:
+    """A task that sends its process a signal when part of the result is on its way."""
+    send = Connection._send
+
+    def send_in_part(pipe: Connection, data: bytes) -> None:
+        send(pipe, data[:5])
+        signal_self(*task)
+        send(pipe, data[5:])
+
+    Connection._send = send_in_part
     return "done"
 
 
