@@ -4,6 +4,7 @@ import math
 import os
 import sys
 import threading
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 from agalign.errors import ConfigurationError, MemoryLimitError
@@ -82,26 +83,25 @@ def _text(path: Path) -> str:
 def check_threads() -> None:
     """Raise ConfigurationError if the system allows too few processes (`ulimit -u`, or a container's limit).
 
-    Not checked with a limit of the address space: each thread reserves 64 MB of it for as long as the process runs.
+    It starts threads, because the limits do not show how many can be started: that of a user includes the processes of
+    other containers. Not checked with a limit of the address space: each thread reserves 64 MB of it for as long as the
+    process runs.
     """
     if _address_space_bytes() < math.inf:
         return
-    end, started = threading.Event(), list[threading.Thread]()
-    needed = _MIN_THREADS + _MIN_THREADS_PER_CORE * usable_cores()
-    try:
-        for _ in range(needed):
-            thread = threading.Thread(target=end.wait, daemon=True)
-            thread.start()
-            started.append(thread)
-    except RuntimeError:
-        raise ConfigurationError(
-            f"only {len(started)} more processes and threads can be started, and agalign needs {needed}; raise the "
-            "limit of processes (ulimit -u, or that of the container), or end other programs"
-        ) from None
-    finally:
-        end.set()
-        for thread in started:
-            thread.join()
+    end, started, needed = threading.Event(), 0, _MIN_THREADS + _MIN_THREADS_PER_CORE * usable_cores()
+    with ThreadPoolExecutor(needed) as threads:
+        try:
+            while started < needed:
+                threads.submit(end.wait)
+                started += 1
+        except RuntimeError:
+            raise ConfigurationError(
+                f"only {started} more processes and threads can be started, and agalign needs {needed}; raise the "
+                "limit of processes (ulimit -u, or that of the container), or end other programs"
+            ) from None
+        finally:
+            end.set()
 
 
 def _address_space_bytes() -> float:
