@@ -19,7 +19,7 @@ from contextlib import ExitStack, contextmanager
 from functools import partial
 from importlib import import_module
 from itertools import islice
-from typing import Any, Protocol
+from typing import Any, Protocol, TypeAlias
 
 from agalign._version import __version__
 from agalign.errors import AgalignError, ConfigurationError, WorkerError
@@ -35,26 +35,21 @@ _MAX_WAITING_TASKS = 1000
 """Maximum number of tasks submitted to an executor at a time: enough for any cluster, and little memory."""
 
 
+Completed: TypeAlias = Iterator[tuple[int, Callable[[], R]]]
+"""The tasks as they complete: the index of each, and a function that returns or raises its result."""
+
+
 class Run(Protocol):
-    """Calls a function with each task, and yields the tasks as they complete: the index of each, and a function that
-    returns or raises its result.
+    """Calls a function with each task, and yields the tasks as they complete.
 
     Function, tasks and results can be pickled, except in this process. Only calls that are `limited` end at the time
     limit. Raises WorkerError if no worker can be started, or if workers end one after another.
     """
 
-    def __call__(
-        self, function: Callable[[A], R], tasks: Sequence[A], /, *, limited: bool = False
-    ) -> Iterator[tuple[int, Callable[[], R]]]: ...
+    def __call__(self, function: Callable[[A], R], tasks: Sequence[A], /, *, limited: bool = False) -> Completed[R]: ...
 
 
-def serially(
-    function: Callable[[A], R],
-    tasks: Sequence[A],
-    /,
-    *,
-    limited: bool = False,  # noqa: ARG001 - of the protocol
-) -> Iterator[tuple[int, Callable[[], R]]]:
+def serially(function: Callable[[A], R], tasks: Sequence[A], /, **_: bool) -> Completed[R]:
     """Run the tasks in this process and thread: each when its result is requested."""
     for number, task in enumerate(tasks):
         yield number, partial(function, task)
@@ -105,9 +100,7 @@ def own_processes(
         ProcessPool(processes, worker_context(preload), partial(initializer, threads)) as pool,
     ):
 
-        def run(
-            function: Callable[[A], R], tasks: Sequence[A], /, *, limited: bool = False
-        ) -> Iterator[tuple[int, Callable[[], R]]]:
+        def run(function: Callable[[A], R], tasks: Sequence[A], /, *, limited: bool = False) -> Completed[R]:
             submit = partial(pool.submit, function, timeout_s=timeout_s if limited else None)
             return _completed(submit, tasks, lambda: pool.loss)
 
@@ -117,9 +110,7 @@ def own_processes(
 def on_executor(executor: Executor) -> Run:
     """Run tasks on an executor of the caller, which is not shut down."""
 
-    def run(
-        function: Callable[[A], R], tasks: Sequence[A], /, *, limited: bool = False
-    ) -> Iterator[tuple[int, Callable[[], R]]]:
+    def run(function: Callable[[A], R], tasks: Sequence[A], /, *, limited: bool = False) -> Completed[R]:
         if not isinstance(executor, DaskExecutor):
             return _completed(partial(_submitted, executor, function), tasks, str)
         chosen = executor if limited else executor.without_timeout()
@@ -128,13 +119,8 @@ def on_executor(executor: Executor) -> Run:
     return run
 
 
-def _completed(
-    submit: Callable[[A], "Future[R]"], tasks: Sequence[A], loss: Callable[[], str]
-) -> Iterator[tuple[int, Callable[[], R]]]:
-    """Submit the tasks; yield the number of each and how to get its result, as they complete.
-
-    Raises WorkerError if the executor gives a reason for its `loss`.
-    """
+def _completed(submit: Callable[[A], "Future[R]"], tasks: Sequence[A], loss: Callable[[], str]) -> Completed[R]:
+    """Submit the tasks, and yield them. Raises WorkerError if the executor gives a reason for its `loss`."""
     futures: dict[Future[R], int] = {}
     remaining = iter(enumerate(tasks))
 

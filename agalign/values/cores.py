@@ -43,23 +43,13 @@ def cgroup_quota(root: Path = Path("/sys/fs/cgroup"), own: Path = Path("/proc/se
 
     Version 2 has the file `cpu.max` ("200000 100000": quota and period in microseconds), version 1 one file for each.
     """
-    quotas = [q for folder in _folders(root, own) if (q := _quota_in(folder)) is not None]
-    return min(quotas, default=None)
-
-
-def _folders(root: Path, own: Path) -> list[Path]:
-    """Return the folders of this process's control groups and their parents; a container sees its own as the root."""
-    result = [root, root / "cpu"]
+    folders = [root, root / "cpu"]  # a container sees its own group as the root
     for line in _text(own).splitlines():
-        _, _, rest = line.partition(":")
-        controllers, _, path = rest.partition(":")
-        if controllers and "cpu" not in controllers.split(","):
-            continue
-        folder = root / "cpu" if controllers else root
-        for part in Path(path.lstrip("/")).parts:
-            folder = folder / part
-            result.append(folder)
-    return result
+        _, controllers, path = line.split(":", 2)
+        if not controllers or "cpu" in controllers.split(","):
+            group = (root / "cpu" if controllers else root) / path.lstrip("/")
+            folders += [group, *group.parents]
+    return min((q for folder in folders if (q := _quota_in(folder)) is not None), default=None)
 
 
 def _quota_in(folder: Path) -> float | None:

@@ -101,7 +101,12 @@ def worker_context(preload: str) -> BaseContext:
     Processes are spawned on macOS, where a fork of a process with Apple's libraries may crash or hang, and without a
     temporary folder, in which the fork server needs a socket.
     """
-    if sys.platform == "darwin" or "forkserver" not in get_all_start_methods() or not _has_temporary_folder():
+    try:
+        tempfile.gettempdir()
+        has_folder = True
+    except OSError:
+        has_folder = False
+    if sys.platform == "darwin" or "forkserver" not in get_all_start_methods() or not has_folder:
         return get_context("spawn")
     from multiprocessing import forkserver
 
@@ -127,14 +132,6 @@ def start_server_ahead(captures: int, cores: int) -> None:
     if processes > 1:
         with environment_of_children(cores // processes):
             worker_context(WORKER_MODULE)
-
-
-def _has_temporary_folder() -> bool:
-    try:
-        tempfile.gettempdir()
-    except OSError:
-        return False
-    return True
 
 
 def environment_of_children(threads: int) -> AbstractContextManager[None]:
