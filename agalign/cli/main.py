@@ -3,8 +3,7 @@
 import os
 import re
 import sys
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any
@@ -57,16 +56,6 @@ class RootGroup(TyperGroup):
         """Return a command; None if there is none of this name."""
         return COMMANDS[cmd_name].built(cmd_name) if cmd_name in COMMANDS else None
 
-    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        """Parse the options before the command."""
-        with _in_one_line(ctx):
-            return super().parse_args(ctx, args)
-
-    def invoke(self, ctx: Any) -> Any:
-        """Parse the arguments of the command, and run it."""
-        with _in_one_line(ctx):
-            return super().invoke(ctx)
-
     def format_help(self, ctx: Any, formatter: Any) -> None:
         """Write the usage, the options, a section of commands for each panel, and the examples."""
         self.format_usage(ctx, formatter)
@@ -86,21 +75,6 @@ class RootGroup(TyperGroup):
         for panel in dict.fromkeys(command.panel for command in COMMANDS.values()):
             with formatter.section(panel or "Commands"):
                 formatter.write_dl([(name, c.summary) for name, c in shown.items() if c.panel == panel])
-
-
-@contextmanager
-def _in_one_line(ctx: Any) -> Iterator[None]:
-    """Print usage errors in one line, and exit with code 2."""
-    try:
-        yield
-    except _UsageError as error:
-        where = error.ctx or ctx
-        if type(error).__name__ == "NoArgsIsHelpError":
-            typer.echo(error.message, err=True)
-        else:
-            text = f"{_reworded(error)}{options_from(where.params.get('config'))}"
-            _usage_problem(f"{text}; '{where.command_path} --help' lists the options")
-        raise typer.Exit(ExitCode.USAGE) from None
 
 
 def _usage_problem(text: str) -> None:
@@ -176,7 +150,16 @@ def main() -> None:
     limit_default_threads()
     silence_libraries()
     with printed():
-        app(args=arguments, prog_name="agalign")
+        try:
+            code = app(args=arguments, prog_name="agalign", standalone_mode=False)
+        except _UsageError as error:
+            if arguments:
+                text = f"{_reworded(error)}{options_from(error.ctx.params.get('config'))}"
+                _usage_problem(f"{text}; '{error.ctx.command_path} --help' lists the options")
+            else:
+                typer.echo(error.message, err=True)  # the help
+            code = ExitCode.USAGE
+        raise SystemExit(code)
 
 
 def _problem_of_folder(arguments: Sequence[str]) -> str:
