@@ -5,7 +5,7 @@ The commands import this module when they run, because the libraries that it nee
 
 import re
 import time
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Executor
 from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
@@ -110,10 +110,8 @@ class RunTotals:
     pairs: PairTotals = field(default_factory=PairTotals)
     saturated: dict[str, tuple[float, str]] = field(default_factory=dict)
     """Largest share of saturated pixels, and its capture, of each band."""
-    radiometry: Counter[str] = field(default_factory=Counter)
-    """Number of captures by the quantity that raw numbers were converted to."""
-    panel_age_s: dict[str, float] = field(default_factory=dict)
-    """Longest time between a capture and the nearest panel, by the same quantity."""
+    panel_ages_s: dict[str, list[float | None]] = field(default_factory=lambda: defaultdict(list))
+    """Times between captures and the nearest panel, by the quantity that raw numbers were converted to."""
 
     def add(self, report: "CaptureReport") -> None:
         """Add the report of a capture."""
@@ -126,10 +124,7 @@ class RunTotals:
         self.pairs.add(report.label, report.result)
         output = report.result.output
         if output is not None and output.radiometry is not None:
-            self.radiometry[output.radiometry] += 1
-            if output.panel_age_s is not None:
-                longest_s = self.panel_age_s.get(output.radiometry, 0.0)
-                self.panel_age_s[output.radiometry] = max(longest_s, output.panel_age_s)
+            self.panel_ages_s[output.radiometry].append(output.panel_age_s)
         for band in report.result.bands:
             share = band.saturated or 0.0
             self.saturated[band.band] = max(self.saturated.get(band.band, (0.0, "")), (share, report.label))
@@ -137,9 +132,7 @@ class RunTotals:
     def recount(self, captures: Sequence[Capture], out: Path) -> None:
         """Count the pairs of captures that have all their files: outputs may have been removed."""
         added, self.pairs = self.pairs.captures, PairTotals()
-        for capture in captures:
-            if capture.label not in added:
-                continue
+        for capture in (one for one in captures if one.label in added):
             path = CapturePaths.of(capture, out).sidecar
             with suppress(SidecarError):
                 result = read_result(path)
@@ -197,10 +190,9 @@ def run(
         def on_pair(band: str, stage: str, share: float) -> None:
             terminal.check()
             assert current is not None
-            names = [b.name for b in current.moving]
-            index = names.index(band) if band in names else len(names)
-            finished = index + (0.85 * share if stage in ("learning", "refining") else 0.0)
-            show(finished / max(len(names), 1), f"{current.label} {band}: {stage}")
+            names = [*(b.name for b in current.moving), band]
+            finished = names.index(band) + (0.85 * share if stage in ("learning", "refining") else 0.0)
+            show(finished / max(len(current.moving), 1), f"{current.label} {band}: {stage}")
 
         try:
             listener = Listener(on_start, on_pair, on_learning, on_learnt, on_again)
@@ -220,8 +212,8 @@ def run(
             # Also after an interruption.
             if totals.states:
                 totals.is_complete &= _write_pages(out, terminal, changed=set(totals.states) != {"kept"})
-    seconds = time.monotonic() - started
-    terminal.event("finished", seconds=round(seconds, 1), captures=totals.states.total(), **totals.states)
+    seconds = round(time.monotonic() - started, 1)
+    terminal.event("finished", seconds=seconds, captures=totals.states.total(), **totals.states)
     return totals
 
 
@@ -386,10 +378,10 @@ def _print_totals(totals: RunTotals, terminal: Terminal) -> None:
         terminal.problem(f"{of_all} could not be written, for the reasons above; the same command tries again")
     # Under a clear sky with the sun above 40 degrees, the irradiance changes by up to 10 % in half an hour.
     max_panel_age_s = 30 * 60.0
-    for quantity, count in totals.radiometry.items():
-        age_s = totals.panel_age_s.get(quantity)
+    for quantity, ages_s in totals.panel_ages_s.items():
+        age_s = max((one for one in ages_s if one is not None), default=None)
         age = "" if age_s is None else f", at most {age_s / 60:.0f} min from a panel"
-        terminal.result(f"Written as {quantity}: {counted(count, 'capture')}{age}")
+        terminal.result(f"Written as {quantity}: {counted(len(ages_s), 'capture')}{age}")
         if age_s is not None and age_s > max_panel_age_s and "light sensor" not in quantity:
             terminal.problem(
                 f"{quantity}: the light may have changed in {age_s / 60:.0f} min; record a panel before and after each "

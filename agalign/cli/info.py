@@ -60,8 +60,7 @@ def _show_folder(folder: Path, options: dict[str, Any], terminal: Terminal, *, a
         if not flight.captures:
             _show_unused(flight, terminal)
             return ExitCode.NOTHING
-    rows = _rows(flight)
-    cameras = camera_overviews(flight.captures)
+    rows, cameras = _rows(flight), camera_overviews(flight.captures)
     if as_json:
         problems = [{"file": str(p.path), "problem": p.text} for p in flight.problems]
         facts = {"folder": str(folder), "cameras": [vars(c) for c in cameras], "captures": rows, "problems": problems}
@@ -83,8 +82,7 @@ def _rows(flight: "FolderScan") -> list[dict[str, Any]]:
     by_label = {c.label: c for c in (*with_panels(others), *(s.capture for s in sky))}
     unreadable = _unreadable_files(flight)
     return [
-        _facts(by_label[c.label])
-        | {"sky": sky_cues.get(c.label, []), "unreadable_files": [p.name for p in unreadable.get(c.label, [])]}
+        _facts(by_label[c.label]) | {"sky": sky_cues.get(c.label, []), "unreadable_files": unreadable.get(c.label, [])}
         for c in flight.captures
     ]
 
@@ -110,17 +108,15 @@ def _show_captures(rows: Sequence[dict[str, Any]], problems: int, terminal: Term
     terminal.result(", ".join(parts))
 
 
-def _unreadable_files(flight: "FolderScan") -> dict[str, list[Path]]:
+def _unreadable_files(flight: "FolderScan") -> dict[str, list[str]]:
     """Return the unreadable files of each capture by label: those with names that begin with the capture's name."""
-    result: dict[str, list[Path]] = {}
-    for problem in flight.problems:
-        if not isinstance(problem.error, UnreadableFileError):
-            continue
-        in_folder = [c for c in flight.captures if c.reference.path.parent == problem.path.parent]
-        candidates = [c for c in in_folder if problem.path.name.startswith(c.name)]
+    result: dict[str, list[str]] = {}
+    for path in (p.path for p in flight.problems if isinstance(p.error, UnreadableFileError)):
+        in_folder = [c for c in flight.captures if c.reference.path.parent == path.parent]
+        candidates = [c for c in in_folder if path.name.startswith(c.name)]
         if candidates:
             label = max(candidates, key=lambda c: len(c.name)).label
-            result.setdefault(label, []).append(problem.path)
+            result.setdefault(label, []).append(path.name)
     return result
 
 
