@@ -150,17 +150,17 @@ def test_captures_with_other_options_are_done_again_and_this_is_printed_before(f
     assert "1 finished capture to be done again; changed since: version (agalign 0.0.9 before)" in done.stderr
 
 
+def aligned_in_part(flight: Path, out: Path, later: str, **options: Any) -> None:
+    """Align a flight before the captures with these numbers are added to it."""
+    ignore = shutil.ignore_patterns(f"IMG_000[{later}]_*.tif")
+    agalign.align_folder(shutil.copytree(flight, out.parent / "part", ignore=ignore), out, **options)
+
+
 def test_a_flight_that_grows_needs_no_option(flight: Path, tmp_path: Path) -> None:
-    folder, out = shutil.copytree(flight, tmp_path / "in"), tmp_path / "out"
-    later = [*folder.rglob("IMG_0002_*.tif")]
-    for path in later:
-        path.rename(tmp_path / path.name)
-    agalign.align_folder(folder, out, settings=SEEDS)
-    for path in later:
-        (tmp_path / path.name).rename(path)
-    scan = agalign.discover(folder)
-    assert [*plan_run(scan, out, SEEDS).values()] == ["kept from an earlier run", "to be aligned"]
-    assert [r.state for r in agalign.align_folder(folder, out, settings=SEEDS)] == ["kept", "done"]
+    aligned_in_part(flight, tmp_path / "out", "2", settings=SEEDS)
+    scan = agalign.discover(flight)
+    assert [*plan_run(scan, tmp_path / "out", SEEDS).values()] == ["kept from an earlier run", "to be aligned"]
+    assert [r.state for r in agalign.align_folder(flight, tmp_path / "out", settings=SEEDS)] == ["kept", "done"]
 
 
 @pytest.mark.full
@@ -168,16 +168,10 @@ def test_all_captures_of_a_grown_flight_have_one_size(shared: Shared, tmp_path: 
     """Two captures are too few for a rig, with which the crop of all captures is known."""
     pytest.importorskip("xarray")
     flight = shared("four_captures", lambda f: make_flight(f, captures=4, size_px=(480, 360), rng_seed=3))
-    folder, out = shutil.copytree(flight, tmp_path / "in"), tmp_path / "out"
-    later = [p for k in (3, 4) for p in folder.rglob(f"IMG_000{k}_*.tif")]
-    for path in later:
-        path.rename(tmp_path / path.name)
-    agalign.align_folder(folder, out, options=THREE)
-    for path in later:
-        (tmp_path / path.name).rename(path)
-    agalign.align_folder(folder, out, options=THREE)
-    assert agalign.open_flight(out).sizes["capture"] == 4
-    assert {r.state for r in agalign.align_folder(folder, out, options=THREE)} == {"kept"}
+    aligned_in_part(flight, tmp_path / "out", "34", options=THREE)
+    agalign.align_folder(flight, tmp_path / "out", options=THREE)
+    assert agalign.open_flight(tmp_path / "out").sizes["capture"] == 4
+    assert {r.state for r in agalign.align_folder(flight, tmp_path / "out", options=THREE)} == {"kept"}
 
 
 def test_most_finished_captures_decide_on_the_crop_of_a_camera(flight: Path, tmp_path: Path) -> None:
@@ -247,7 +241,7 @@ def removing(out: Path) -> Callable[[agalign.CaptureReport], object]:
 def test_outputs_removed_during_the_run_are_reported_and_not_counted(
     flight: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    terminal = Terminal(quiet=False, verbose=False, log_json=False)
+    terminal = Terminal()
     scan = agalign.discover(flight, THREE)
     settings, options = agalign.Settings(), agalign.RunOptions()
     totals = run_command(scan, tmp_path, settings, terminal, options, each=removing(tmp_path))
@@ -260,7 +254,7 @@ def test_outputs_removed_during_the_run_are_reported_and_not_counted(
 
 
 def test_a_run_fails_if_its_output_folder_is_removed(flight: Path, tmp_path: Path) -> None:
-    out, terminal = tmp_path / "out", Terminal(quiet=True, verbose=False, log_json=False)
+    out, terminal = tmp_path / "out", Terminal(quiet=True)
 
     def remove(report: agalign.CaptureReport) -> None:
         if report.label.endswith("2"):

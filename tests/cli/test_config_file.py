@@ -163,14 +163,6 @@ def test_a_dry_run_prints_its_plan_and_writes_nothing(tmp_path: Path) -> None:
     assert sorted(tmp_path.rglob("*")) == before
 
 
-def test_the_report_as_json(tmp_path: Path) -> None:
-    make_aligned(tmp_path, 2)
-    done = agalign_here("report", tmp_path, "--json")
-    assert done.returncode == 0
-    facts = json.loads(done.stdout)
-    assert [c["label"] for c in facts["captures"]] == ["0000SET/IMG_0001", "0000SET/IMG_0002"]
-
-
 @pytest.mark.parametrize("name", ["indices", "ndvi"])
 def test_indices_are_written_and_summed_up(tmp_path: Path, name: str) -> None:
     make_aligned(tmp_path, 2)

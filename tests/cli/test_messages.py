@@ -255,7 +255,7 @@ def test_the_list_of_commands_has_whole_sentences() -> None:
     ],
 )
 def test_each_end_has_a_code(error: BaseException, code: int, said: str, capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(typer.Exit) as ended, exits(Terminal(quiet=False, verbose=False, log_json=False)):
+    with pytest.raises(typer.Exit) as ended, exits(Terminal()):
         raise error
     assert ended.value.exit_code == code
     (line,) = capsys.readouterr().err.splitlines()
@@ -271,14 +271,14 @@ def test_many_files_with_one_problem_are_counted(capsys: pytest.CaptureFixture[s
     texts = {f"f{n:04d}.tif": f"is empty, {n} bytes" for n in range(4000)} | {"x.tif": "cannot be read"}
     problems = (Problem(Path(f"in/{n}"), UnreadableFileError(f"in/{n}: {text}")) for n, text in texts.items())
     scan = FolderScan(Path("in"), (), tuple(problems))
-    print_problems(scan, Terminal(quiet=False, verbose=False, log_json=False))
+    print_problems(scan, Terminal())
     lines = capsys.readouterr().err.splitlines()
     assert lines[0] == "agalign: in/f0000.tif: is empty, 0 bytes"
     assert lines[10:] == [
         "agalign: in/x.tif: cannot be read",
         "agalign: in: 3990 more files with the same problem as f0009.tif; 'agalign info --json' lists all",
     ]
-    print_problems(scan, Terminal(quiet=False, verbose=False, log_json=True))
+    print_problems(scan, Terminal(log_json=True))
     assert len(capsys.readouterr().err.splitlines()) == 4001
 
 
@@ -298,7 +298,7 @@ def test_the_age_of_a_panel_is_printed_and_warned_of(
     totals = RunTotals(True)
     sidecar = example(output=output | {"panel_age_s": age_s})
     totals.add(CaptureReport("IMG_1", "done", sidecar.result()))
-    conclude(totals, Path("out"), Terminal(quiet=False, verbose=False, log_json=False))
+    conclude(totals, Path("out"), Terminal())
     printed = capsys.readouterr()
     assert f"Written as {radiometry}: {text}" in printed.out.splitlines()
     is_warned = "the light may have changed in 53 min; record a panel before and after" in printed.err
@@ -315,7 +315,7 @@ def test_the_totals_count_missing_bands_and_captures_without_a_result(capsys: py
     totals.add(
         CaptureReport("IMG_1", "done", example(bands=[aligned], missing_bands=["Green"], reference=blue).result())
     )
-    assert conclude(totals, Path("out"), Terminal(quiet=False, verbose=False, log_json=False)) == 3
+    assert conclude(totals, Path("out"), Terminal()) == 3
     printed = capsys.readouterr()
     assert "3 of 8 band pairs aligned; 2 captures not written" in printed.out
     assert re.search(r"^│ Green +│ +0 │ +0 │ +0 │ +0 │ +1 │ +- │ +- │ +- │$", printed.out, re.MULTILINE)
@@ -330,7 +330,7 @@ def test_saturated_bands_are_named(share: float | None, is_printed: bool, capsys
     sidecar = example()
     sidecar.bands[0].saturated = share
     totals.add(CaptureReport("IMG_1", "done", sidecar.result()))
-    conclude(totals, Path("out"), Terminal(quiet=False, verbose=False, log_json=False))
+    conclude(totals, Path("out"), Terminal())
     line = f"Saturated pixels: {sidecar.bands[0].band} up to 3.1% (IMG_1)"
     assert (line in capsys.readouterr().out) is is_printed
 
@@ -343,7 +343,7 @@ def test_a_signal_during_an_import_ends_the_command_after_it() -> None:
     steps: list[str] = []
 
     def command() -> None:
-        with exits(Terminal(quiet=True, verbose=False, log_json=False)):
+        with exits(Terminal(quiet=True)):
             exec(interrupted, {"os": os, "signal": signal, "steps": steps})
             raise typer.Exit(0)
 

@@ -23,6 +23,7 @@ from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
 from typing import Any
+from unittest import mock
 
 import numpy as np
 import psutil
@@ -58,7 +59,7 @@ class Scene:
     arguments: list[str] = field(default_factory=list)
     command: list[str] | None = None
     """Instead of aligning the folder into `out`."""
-    during: Callable[[], None] | None = None
+    during: Callable[[], None] = lambda: None
     """Done when the captures are found."""
     watch: Callable[["subprocess.Popen[str]"], None] | None = None
     """Done while the program runs, in a process of its own."""
@@ -182,18 +183,11 @@ def run_inside(arguments: list[str], scene: Scene) -> tuple[int, str]:
 
     def result(*given: Any, **named: Any) -> Any:
         flight = real(*given, **named)
-        if scene.during is not None:
-            scene.during()
+        scene.during()
         return flight
 
-    homes = [module for module in list(sys.modules.values()) if getattr(module, "find_captures", None) is real]
-    for home in homes:
-        home.find_captures = result
-    try:
+    with mock.patch.object(cli_run, "find_captures", result):
         done = agalign_here(*arguments)
-    finally:
-        for home in homes:
-            home.find_captures = real
     return done.returncode, done.stderr
 
 
@@ -347,16 +341,15 @@ def read_only(scene: Scene) -> None:
 # ---- what is done to runs
 
 
-def first_run(scene: Scene) -> None:
-    code, output = run_inside(scene.run_of(scene.out), scene)
+def first_run(scene: Scene, out: Path | None = None) -> None:
+    code, output = run_inside(scene.run_of(out or scene.out), scene)
     assert code == 0, output
 
 
 def killed_inside_the_input(scene: Scene) -> None:
     """An earlier run wrote below its input, and was killed before its report."""
     earlier = scene.folder / "earlier"
-    code, _ = run_inside(scene.run_of(earlier), scene)
-    assert code == 0
+    first_run(scene, earlier)
     for name in ("summary.csv", "index.html"):
         (earlier / name).unlink()
     assert (earlier / RUN_FILE).is_file()
@@ -484,7 +477,7 @@ def kill_worker(process: "subprocess.Popen[str]", _scene: Scene) -> None:
 def kill_capture(process: "subprocess.Popen[str]", scene: Scene) -> None:
     """Kill the only worker, and again when it tries the same capture once more, which it does last."""
     for finished in (1, len(ALL) - 1):
-        wait_until(process, lambda finished=finished: len(list(scene.out.glob("?.json"))) >= finished)
+        wait_for_reports(process, scene, finished)
         (worker,) = workers(process)
         before_s = worker.cpu_times().user
         wait_until(process, lambda worker=worker, before_s=before_s: worker.cpu_times().user > before_s + 0.05)
@@ -492,7 +485,7 @@ def kill_capture(process: "subprocess.Popen[str]", scene: Scene) -> None:
 
 
 def kill_workers_as_they_appear(process: "subprocess.Popen[str]", scene: Scene) -> None:
-    wait_until(process, lambda: some_are_reported(scene))
+    wait_for_reports(process, scene)
     while process.poll() is None:
         kill_all_workers(process, scene)
         time.sleep(0.005)
@@ -506,9 +499,7 @@ def kill_all_workers(process: "subprocess.Popen[str]", _scene: Scene) -> None:
 
 def kill_server(process: "subprocess.Popen[str]", _scene: Scene) -> None:
     """The process that starts the workers."""
-    server = psutil.Process(workers(process)[0].ppid())
-    assert server.pid != process.pid
-    server.kill()
+    psutil.Process(workers(process)[0].ppid()).kill()
 
 
 def workers(process: "subprocess.Popen[str]") -> list[psutil.Process]:
@@ -529,14 +520,14 @@ def stop_worker(process: "subprocess.Popen[str]", _scene: Scene) -> None:
 
 
 def starve_workers(process: "subprocess.Popen[str]", scene: Scene) -> None:
-    wait_until(process, lambda: some_are_reported(scene))
+    wait_for_reports(process, scene)
     for worker in workers(process):
         worker.rlimit(psutil.RLIMIT_AS, (1 << 20, 1 << 20))
 
 
-def some_are_reported(scene: Scene) -> bool:
-    """Of three captures of two workers: a worker begins its second one when its first one is reported."""
-    return len(list(scene.out.glob("?.json"))) >= 3
+def wait_for_reports(process: "subprocess.Popen[str]", scene: Scene, captures: int = 3) -> None:
+    """Wait until captures are reported: of three by two workers, one has begun its second."""
+    wait_until(process, lambda: len(list(scene.out.glob("?.json"))) >= captures)
 
 
 def larger(scene: Scene) -> None:
@@ -622,16 +613,9 @@ def long_temporary_folder(scene: Scene) -> None:
 
 def no_locks(scene: Scene) -> None:
     """As on NFS without its lock daemon."""
-
-    def refuse(*_: object) -> None:
-        raise OSError(errno.ENOLCK, "No locks available")
-
-    real, fcntl.flock = fcntl.flock, refuse
-
-    def undo() -> None:
-        fcntl.flock = real
-
-    scene.undo = undo
+    patch = mock.patch.object(fcntl, "flock", side_effect=OSError(errno.ENOLCK, "No locks available"))
+    patch.start()
+    scene.undo = patch.stop
 
 
 def commanding(command: str) -> Inject:
@@ -932,9 +916,8 @@ def what_is_wrong(fault: Fault, seen: Seen) -> str:
         wrong.append(f"a traceback: {seen.output[-1500:]}")
     if "\x1b[31mred" in seen.output or "\a" in seen.output:
         wrong.append("an escape sequence reached the terminal")
-    if fault.ends.says and not any(re.search(fault.ends.says, line) for line in seen.complaints):
-        wrong.append(f"complaints {seen.complaints}")
-    if not fault.ends.says and seen.complaints:
+    is_said = any(re.search(fault.ends.says, line) for line in seen.complaints)
+    if is_said != bool(fault.ends.says):
         wrong.append(f"complaints {seen.complaints}")
     # What was stopped may have been written before.
     if fault.ends.all_but is not None and len(seen.finished) < len(ALL) - fault.ends.all_but:
