@@ -145,6 +145,7 @@ def _indices(
     """Compute spectral indices of aligned captures: rasters, pictures and a table of statistics."""
     from agalign.batch.index_run import index_tasks, run_indices
     from agalign.cli.align_run import cluster, progress
+    from agalign.products.report.pages import REPORT_FILE, write_pages
     from agalign.values.output_folder import locked
 
     chosen = chosen_indices(index, formula or [])
@@ -162,8 +163,8 @@ def _indices(
             for report in done:
                 _print(report, terminal)
             show(number, 0.0, done[0].capture, "")
-        if target is None:
-            _rebuild_report(out, terminal)
+        if target is None and (out / REPORT_FILE).is_file():
+            write_pages(out, terminal.problem)
     return _conclude([one.name for one in chosen], reports, folder, terminal, as_json=as_json)
 
 
@@ -230,14 +231,6 @@ def _facts(report: "IndexReport") -> dict[str, Any]:
         "kept": report.kept,
         "problem": report.problem or None,
     }
-
-
-def _rebuild_report(out: Path, terminal: Terminal) -> None:
-    """Rebuild the report of the run, which shows the indices, if there is one."""
-    from agalign.products.report.pages import REPORT_FILE, write_pages
-
-    if (out / REPORT_FILE).is_file():
-        write_pages(out, terminal.problem)
 
 
 def _warn_of_masks(written: "Sequence[IndexReport]", terminal: Terminal) -> None:

@@ -101,12 +101,10 @@ def worker_context(preload: str) -> BaseContext:
     Processes are spawned on macOS, where a fork of a process with Apple's libraries may crash or hang, and without a
     temporary folder, in which the fork server needs a socket.
     """
-    try:
-        tempfile.gettempdir()
-        has_folder = True
-    except OSError:
-        has_folder = False
-    if sys.platform == "darwin" or "forkserver" not in get_all_start_methods() or not has_folder:
+    temporary_folder = ""
+    with suppress(OSError):
+        temporary_folder = tempfile.gettempdir()
+    if sys.platform == "darwin" or "forkserver" not in get_all_start_methods() or not temporary_folder:
         return get_context("spawn")
     from multiprocessing import forkserver
 
@@ -146,12 +144,11 @@ def environment_of_children(threads: int) -> AbstractContextManager[None]:
 @contextmanager
 def _environment(values: Mapping[str, str]) -> Iterator[None]:
     """Set environment variables inside the block."""
-    before = {name: os.environ.get(name) for name in values}
+    before = {name: os.environ[name] for name in values if name in os.environ}
     os.environ.update(values)
     try:
         yield
     finally:
-        for name, value in before.items():
-            del os.environ[name]
-            if value is not None:
-                os.environ[name] = value
+        for name in values:
+            os.environ.pop(name, None)
+        os.environ.update(before)
