@@ -1,12 +1,10 @@
 """What is printed about arguments and files that cannot be used, and at the end: one line in plain words."""
 
+import io
 import json
 import os
 import re
 import signal
-import subprocess
-import sys
-from contextlib import suppress
 from pathlib import Path
 
 import cv2
@@ -120,22 +118,22 @@ def test_usage_errors_are_events_of_the_json_log(command: str) -> None:
     assert event == {"event": "problem", "message": event["message"]}
 
 
-@pytest.mark.skipif(os.name == "nt", reason="terminals of POSIX")
-def test_a_narrow_terminal_shows_every_date(flight: Path) -> None:
-    """A table is wrapped, not cut."""
-    import pty
+class TerminalText(io.StringIO):
+    """What is printed to a terminal."""
 
+    def isatty(self) -> bool:
+        return True
+
+
+def test_a_narrow_terminal_shows_every_date(flight: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A table is wrapped, not cut."""
     captures = json.loads(agalign_here("info", flight, "--json").stdout)["captures"]
-    parent, child = pty.openpty()
-    command = [sys.executable, "-m", "agalign", "info", flight]
-    with subprocess.Popen(command, stdout=child, stderr=child, env={**os.environ, "COLUMNS": "80"}):
-        os.close(child)
-        lines: list[str] = []
-        with suppress(OSError), os.fdopen(parent, encoding="utf-8") as terminal:  # Linux reports an error at the end
-            lines += iter(terminal.readline, "")
-    rows = [line for line in lines if line.startswith("│")]
-    assert all(len(row) == len("\n") + 80 for row in rows)
-    assert "…" not in "".join(lines)
+    monkeypatch.setenv("COLUMNS", "80")
+    monkeypatch.setattr(io, "StringIO", TerminalText)
+    printed = agalign_here("info", flight).stdout
+    rows = [line for line in printed.splitlines() if line.startswith("│")]
+    assert {len(row) for row in rows} == {80}
+    assert "…" not in printed
     for capture in captures:
         date, time = capture["captured_at"][:19].split("T")
         assert any(date in row for row in rows)
