@@ -54,8 +54,7 @@ def test_a_mosaic_is_aligned_to_the_grid_of_another(mosaics: Path, tmp_path: Pat
     assert (tmp_path / "index.html").is_file()
     with rasterio.open(mosaics / "summer.tif") as source:
         flipped = source.transform * Affine(1, 0, 0, 0, -1, source.height)
-        with rasterio.open(tmp_path / "south-up.tif", "w", **{**source.profile, "transform": flipped}) as target:
-            target.write(source.read()[:, ::-1])
+        write_band(tmp_path / "south-up.tif", source.read()[:, ::-1], **{**source.profile, "transform": flipped})
     assert onto(mosaics, tmp_path / "south-up.tif", tmp_path / "turned").returncode == 0
     with rasterio.open(tmp_path / "summer.tif") as out, rasterio.open(tmp_path / "turned" / "south-up.tif") as turned:
         np.testing.assert_array_equal(out.read(), turned.read())
@@ -122,8 +121,7 @@ def test_unusable_mosaics_are_one_line(mosaics: Path, tmp_path: Path) -> None:
 def test_a_distant_mosaic_is_reported(mosaics: Path, tmp_path: Path) -> None:
     with rasterio.open(mosaics / "summer.tif") as source:
         away = {**source.profile, "transform": Affine.translation(0, 111_000) * source.transform}
-        with rasterio.open(tmp_path / "away.tif", "w", **away) as target:
-            target.write(source.read())
+        write_band(tmp_path / "away.tif", source.read(), **away)
     done = onto(mosaics, tmp_path / "away.tif", tmp_path / "out")
     assert re.search(r"away\.tif: is 11[01]\.\d km away from the reference", done.stderr)
 

@@ -128,11 +128,8 @@ def ended_while(point: str, number: int, times: int, folder: Path) -> tuple[Call
     return {"computing": tasks.signalled, "sending": tasks.sent_in_part}[point], task
 
 
-POINTS = ("receiving", "computing", "sending")
-
-
 @pytest.mark.parametrize(("kills", "processes"), [(1, 1), (1, 2), (2, 1)])
-@pytest.mark.parametrize("point", POINTS)
+@pytest.mark.parametrize("point", ["receiving", "computing", "sending"])
 def test_a_task_is_tried_again_after_one_kill_and_fails_after_two(
     point: str, kills: int, processes: int, tmp_path: Path
 ) -> None:
@@ -172,22 +169,17 @@ def test_a_task_fails_at_once_if_its_worker_exits() -> None:
     assert outcomes == [0, "WorkerDiedError: exit code 3", 0]
 
 
-def test_a_worker_killed_while_idle_costs_no_try(tmp_path: Path) -> None:
+@pytest.mark.parametrize("by_time_limit", [False, True])
+def test_a_worker_killed_while_idle_costs_no_try(by_time_limit: bool, tmp_path: Path) -> None:
+    """A time limit may end at the moment of the result."""
     function, argument = ended_while("computing", signal.SIGKILL, 1, tmp_path)
     with pool() as workers:
-        (number,) = values(workers, tasks.process_id, [0])
-        process = psutil.Process(number)
-        process.kill()
-        process.wait(60)
-        assert values(workers, function, [argument]) == ["done"]
-
-
-def test_a_time_limit_at_the_moment_of_the_result_costs_the_next_task_nothing(tmp_path: Path) -> None:
-    function, argument = ended_while("computing", signal.SIGKILL, 1, tmp_path)
-    with pool() as workers:
-        first = values(workers, tasks.process_id, [0])
-        workers._workers[0]._kill_late()
-        assert values(workers, tasks.process_id, [0]) != first
+        process = psutil.Process(*values(workers, tasks.process_id, [0]))
+        if by_time_limit:
+            workers._workers[0]._kill_late()
+        else:
+            process.kill()
+            process.wait(60)
         assert values(workers, function, [argument]) == ["done"]
 
 
@@ -282,8 +274,7 @@ def test_tasks_are_done_if_the_fork_server_is_killed() -> None:
 def test_a_worker_is_killed_if_its_fork_server_was() -> None:
     """`multiprocessing` regards it as ended."""
     with pool() as workers:
-        (number,) = values(workers, tasks.process_id, [0])
-        process = psutil.Process(number)
+        process = psutil.Process(*values(workers, tasks.process_id, [0]))
         psutil.Process(process.ppid()).kill()
         (late,) = submitted(workers, tasks.sleep, [3600.0], timeout_s=0.5)
         assert value_or_error(late) == "TimeoutError: "
