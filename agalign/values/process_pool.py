@@ -76,7 +76,7 @@ class _Worker:
         """Start the process. Raises OSError, RuntimeError or MemoryError if the system lacks something for it."""
         self.created_s = time.monotonic()
         self._has_ended = self._is_late = False
-        self._pipe, worker_end = context.Pipe()
+        self.pipe, worker_end = context.Pipe()
         # BaseContext has no Process in typeshed.
         self._process = context.Process(  # type: ignore[attr-defined]
             target=_work, args=(worker_end, initializer), daemon=True
@@ -95,10 +95,11 @@ class _Worker:
             time.sleep(1)
             self._process.start()
 
-    def answer(self, message: bytes | None, timeout_s: float | None) -> bytes:
+    def answer(self, message: bytes | None, timeout_s: float | None = None) -> bytes:
         """Send a task, if any, and return the answer.
 
-        Raises WorkerDiedError if the process ends first, and TimeoutError if it is killed at the time limit.
+        Raises WorkerDiedError if the process ends first, and TimeoutError if it is killed at the time limit. The thread
+        of a time limit reserves 70 MB of address space.
         """
         limit = threading.Timer(timeout_s or 0.0, self._kill_late)
         limit.daemon = True
@@ -106,8 +107,8 @@ class _Worker:
             limit.start()
         try:
             if message is not None:
-                self._pipe.send_bytes(message)
-            return self._pipe.recv_bytes()
+                self.pipe.send_bytes(message)
+            return self.pipe.recv_bytes()
         except (EOFError, OSError):
             code = self._exit_code()
             raise TimeoutError if self._is_late else WorkerDiedError(code) from None
@@ -121,7 +122,7 @@ class _Worker:
 
     def ended_idle(self) -> bool:
         """True if the process has ended without a task (one that is idle sends nothing), or is about to."""
-        return self._is_late or self._pipe.poll()
+        return self._is_late or self.pipe.poll()
 
     def _kill_late(self) -> None:
         self._is_late = True
@@ -140,7 +141,7 @@ class _Worker:
         """Kill the process and wait for its end."""
         self.kill()
         self._exit_code()
-        self._pipe.close()
+        self.pipe.close()
 
     def _exit_code(self) -> int | None:
         """Wait for the end and return the exit code: -n for signal n, None if it is not known."""
@@ -278,10 +279,10 @@ class ProcessPool:
 
         Raises WorkerDiedError if a signal killed it, the exception of the initializer, or WorkerError.
         """
+        if not worker.pipe.poll(_START_TIMEOUT_S):
+            raise WorkerError(f"not ready after {_START_TIMEOUT_S:g} s")
         try:
-            is_ready, error = pickle.loads(worker.answer(None, _START_TIMEOUT_S))
-        except TimeoutError:
-            raise WorkerError(f"not ready after {_START_TIMEOUT_S:g} s") from None
+            is_ready, error = pickle.loads(worker.answer(None))
         except WorkerDiedError as death:
             if death.by_signal:
                 raise

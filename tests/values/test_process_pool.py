@@ -207,12 +207,12 @@ def test_a_worker_that_cannot_start_is_one_less(tmp_path: Path) -> None:
         assert len(set(values(workers, tasks.process_id, range(20)))) == 1
 
 
-@pytest.mark.parametrize("what", ["pipe", "thread", "timer", "process"])
+@pytest.mark.parametrize("what", ["pipe", "thread", "process"])
 def test_a_system_that_is_short_of_something(what: str, monkeypatch: pytest.MonkeyPatch) -> None:
     def short(*_: object, **__: object) -> None:
         raise OSError(11, "Resource unavailable") if what == "pipe" else RuntimeError("can't start new thread")
 
-    owners = {"pipe": type(CONTEXT), "thread": threading.Thread, "timer": threading.Timer, "process": CONTEXT.Process}
+    owners = {"pipe": type(CONTEXT), "thread": threading.Thread, "process": CONTEXT.Process}
     monkeypatch.setattr(owners[what], "Pipe" if what == "pipe" else "start", short)
     with pytest.raises(WorkerError, match=r"no worker process can be started \(\w+Error: "), pool(2) as workers:
         values(workers, tasks.received, [1])
