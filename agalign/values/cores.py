@@ -1,10 +1,12 @@
 """How many processor cores, and how much address space, this process may use."""
 
+import ctypes
 import math
 import os
 import sys
 import threading
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from pathlib import Path
 
 from agalign.errors import ConfigurationError, MemoryLimitError
@@ -13,8 +15,6 @@ THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"
 """Environment variables with the number of threads that libraries start; they read them once, at their import."""
 MIN_ADDRESS_SPACE_BYTES = 1_800_000_000
 """Below about 1.6 GB the libraries crash, abort or hang, which cannot be caught."""
-
-
 _MIN_THREADS, _MIN_THREADS_PER_CORE = 16, 4
 """With fewer, GDAL hangs and OpenMP ends the process. A run on two cores needs 24 processes and threads."""
 
@@ -74,8 +74,7 @@ def check_threads() -> None:
     """Raise ConfigurationError if the system allows too few processes (`ulimit -u`, or a container's limit).
 
     It starts threads, because the limits do not show how many can be started: that of a user includes the processes of
-    other containers. Not checked with a limit of the address space: each thread reserves 64 MB of it for as long as the
-    process runs.
+    other containers. Not checked with a limit of the address space: each thread reserves 8 MB of it for its stack.
     """
     if _address_space_bytes() < math.inf:
         return
@@ -105,10 +104,18 @@ def _address_space_bytes() -> float:
 
 
 def check_address_space() -> None:
-    """Raise MemoryLimitError if the address space (`ulimit -v`) is too small for the libraries."""
+    """Raise MemoryLimitError if the address space (`ulimit -v`) is too small for the libraries.
+
+    If it is limited, threads of this process and its children share one heap: glibc reserves 64 MB for each thread.
+    """
     limit_bytes = _address_space_bytes()
     if limit_bytes < MIN_ADDRESS_SPACE_BYTES:
         raise MemoryLimitError(
             f"the address space of this process is limited to {limit_bytes / 1e9:.2f} GB (ulimit -v); agalign needs "
             f"{MIN_ADDRESS_SPACE_BYTES / 1e9:g} GB or more; raise that limit"
         )
+    if limit_bytes < math.inf:
+        os.environ.setdefault("MALLOC_ARENA_MAX", "1")
+        m_arena_max = -8  # of mallopt(3)
+        with suppress(OSError, AttributeError):  # other allocators lack it
+            ctypes.CDLL(None).mallopt(m_arena_max, 1)

@@ -98,8 +98,7 @@ class _Worker:
     def answer(self, message: bytes | None, timeout_s: float | None = None) -> bytes:
         """Send a task, if any, and return the answer.
 
-        Raises WorkerDiedError if the process ends first, and TimeoutError if it is killed at the time limit. The thread
-        of a time limit reserves 70 MB of address space.
+        Raises WorkerDiedError if the process ends first, and TimeoutError if it is killed at the time limit.
         """
         limit = threading.Timer(timeout_s or 0.0, self._kill_late)
         limit.daemon = True

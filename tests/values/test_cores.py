@@ -1,6 +1,9 @@
 """Limits of the system and of containers: cores and address space."""
 
+import platform
 import re
+import subprocess
+import sys
 import threading
 from pathlib import Path
 
@@ -68,6 +71,27 @@ def test_too_little_address_space_is_refused_with_both_sizes(monkeypatch: pytest
     monkeypatch.setattr(resource, "getrlimit", lambda _: (1_200_000_000, resource.RLIM_INFINITY))
     with pytest.raises(MemoryLimitError, match=r"limited to 1\.20 GB \(ulimit -v\); agalign needs 1\.8 GB or more"):
         check_address_space()
+
+
+@pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="only glibc reserves a heap for each thread")
+def test_a_thread_reserves_no_heap_in_a_limited_address_space() -> None:
+    program = """if True:
+        import resource, threading
+        from pathlib import Path
+        from agalign.values.cores import check_address_space
+
+        def reserved_mb():
+            return int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize() / 1e6
+
+        resource.setrlimit(resource.RLIMIT_AS, (2_000_000_000, 2_000_000_000))
+        check_address_space()
+        before_mb = reserved_mb()
+        thread = threading.Thread(target=bytearray, args=(2000,))
+        thread.start()
+        thread.join()
+        print(reserved_mb() - before_mb)
+    """
+    assert float(subprocess.check_output([sys.executable, "-c", program])) < 60
 
 
 @pytest.mark.parametrize("text", ["can't start new thread", "could not create a primitive"])
