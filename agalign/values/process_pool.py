@@ -22,7 +22,7 @@ from multiprocessing.context import BaseContext
 from queue import SimpleQueue
 from typing import Any, Protocol, Self, TypeVar
 
-from agalign.errors import WorkerError
+from agalign.errors import WorkerError, is_out_of_memory
 from agalign.values.processes import ExitCode, follow_parent, silence_libraries, without_interrupt_key
 
 _MAX_DEATHS = 3
@@ -215,7 +215,7 @@ class ProcessPool:
             try:
                 thread.start()
             except RuntimeError as error:
-                self._one_less(f"{type(error).__name__}: {error}")
+                self._one_less(error)
             else:
                 self._threads.append(thread)
         if not self._threads:
@@ -249,10 +249,8 @@ class ProcessPool:
         try:
             while not self.loss:
                 self._use_one_worker()
-        except WorkerError as error:
-            self._one_less(str(error))
         except Exception as error:
-            self._one_less(f"{type(error).__name__}: {error}")
+            self._one_less(error)
         while self.loss and (task := self._next_task()) is not None:
             task.future.set_exception(WorkerError(self.loss))
 
@@ -312,8 +310,8 @@ class ProcessPool:
                 else:
                     task.future.set_exception(MemoryError() if out_of_memory else error)
                 raise
-            except Exception as error:  # what cannot be pickled
-                is_good, value = False, error
+            except Exception as error:  # what cannot be pickled, or no thread for the time limit
+                is_good, value = False, MemoryError() if is_out_of_memory(error) else error
             self._deaths = 0
             (task.future.set_result if is_good else task.future.set_exception)(value)
 
@@ -325,8 +323,9 @@ class ProcessPool:
         self._tasks.put(None)  # for the other threads
         return None
 
-    def _one_less(self, problem: str) -> None:
+    def _one_less(self, error: Exception) -> None:
         """Reduce the size of the pool by a worker that could not be started; at size 0 the pool is lost."""
+        problem = str(error) if isinstance(error, WorkerError) else f"{type(error).__name__}: {error}"
         with self._lock:
             self._size -= 1
             if self._size == 0 and not self.loss:

@@ -23,6 +23,7 @@ from agalign.values import process_pool
 from agalign.values.process_pool import ProcessPool
 
 from ..builders import in_full_run
+from ..conftest import raising
 from . import pool_tasks as tasks
 
 CONTEXT = get_context("forkserver" if sys.platform == "linux" else "spawn")
@@ -216,6 +217,14 @@ def test_a_system_that_is_short_of_something(what: str, monkeypatch: pytest.Monk
     monkeypatch.setattr(owners[what], "Pipe" if what == "pipe" else "start", short)
     with pytest.raises(WorkerError, match=r"no worker process can be started \(\w+Error: "), pool(2) as workers:
         values(workers, tasks.received, [1])
+
+
+def test_a_time_limit_without_a_thread_is_a_lack_of_memory(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(threading.Timer, "start", raising(RuntimeError("can't start new thread")))
+    with pool() as workers:
+        (future,) = submitted(workers, tasks.size, [b"abc"], timeout_s=60)
+        assert isinstance(future.exception(), MemoryError)
+        assert values(workers, tasks.size, [b"abc"]) == [3]
 
 
 def test_a_worker_that_is_stopped_while_it_starts(monkeypatch: pytest.MonkeyPatch) -> None:
