@@ -63,8 +63,8 @@ _MAX_THREADS = 4
 """Maximum number of threads that train a network or process captures; more wait for the interpreter's lock."""
 
 
-_Flight = tuple[Sequence[Capture], str, Sequence[Capture]]
-"""Captures of a flight, name of its model, and those captures that must be processed."""
+_Flight = tuple[list[Capture], Path | None]
+"""Captures of a flight, and the file of its model."""
 
 
 @dataclass(frozen=True)
@@ -281,26 +281,25 @@ class _FlightRun:
             if kept is not None:
                 grids[capture.label] = None if kept.output is None else kept.output.grid
         groups = flights_of(captures)
-        flights = [
-            (group, name, [c for c in group if c.label not in grids])
-            for group, name in zip(groups, model_names(groups), strict=True)
-        ]
         on_cpu = choose_device(self.settings.joint.device).type == "cpu"
         cores = self.options.jobs or (usable_cores() if on_cpu else 1)
-        number, timeout_s = sum(len(pending) for _, _, pending in flights), self.options.timeout_s
+        number, timeout_s = len(captures) - len(grids), self.options.timeout_s
         processes = min(cores, number // CAPTURES_WORTH_A_PROCESS if timeout_s is None else number)
         threads = min(cores, number, _MAX_THREADS)
         executor = self.options.executor
         with chosen_run(executor, processes, limit_threads, threads, timeout_s=timeout_s) as run:
-            models: list[Path | None] = []
+            flights: list[_Flight] = []
             learn = partial(learn_flight, apply=partial(in_order, run), threads=min(_MAX_THREADS, cores))
-            for group, name, pending in flights:
+            for group, name in zip(groups, model_names(groups), strict=True):
                 path = self.out / "models" / name
-                models.append(self._model(group, path, learn, record) if pending else path if path.is_file() else None)
-            crops = _crops_of_cameras(flights, models, grids, self.settings.write)
+                model = path if path.is_file() else None
+                if any(c.label not in grids for c in group):
+                    model = self._model(group, path, learn, record)
+                flights.append((group, model))
+            crops = _crops_of_cameras(flights, grids, self.settings.write)
             max_bytes = preview_bytes(len(self.flight.captures))
             tasks = []
-            for (group, _, _), model in zip(flights, models, strict=True):
+            for group, model in flights:
                 for capture in group:
                     limits, common = crops[_crop_key(capture)]
                     if common is not None and grids.get(capture.label) not in (None, common):
@@ -339,10 +338,10 @@ class _FlightRun:
         return path
 
 
-def _limits_of_cameras(flights: Sequence[_Flight], models: Sequence[Path | None]) -> dict[str, FlightLimits]:
-    """The limits of the flights of each camera, given the file of each flight's model."""
+def _limits_of_cameras(flights: Sequence[_Flight]) -> dict[str, FlightLimits]:
+    """The limits of the flights of each camera."""
     by_camera: dict[str, list[tuple[Sequence[Capture], Rig | None]]] = {}
-    for (captures, _, _), path in zip(flights, models, strict=True):
+    for captures, path in flights:
         rig = None
         with suppress(InputError):  # of an earlier run
             rig = None if path is None else read_rig(path)[1]
@@ -356,16 +355,13 @@ def _crop_key(capture: Capture) -> tuple[str, bool]:
 
 
 def _crops_of_cameras(
-    flights: Sequence[_Flight],
-    models: Sequence[Path | None],
-    kept: Mapping[str, OutputGrid | None],
-    settings: WriteSettings,
+    flights: Sequence[_Flight], kept: Mapping[str, OutputGrid | None], settings: WriteSettings
 ) -> dict[tuple[str, bool], tuple[FlightLimits, OutputGrid | None]]:
     """The limits and the common grid of each camera: that of most of its `kept` captures, given by label, if they are
     enough for a rig, else that of the rigs of its flights.
     """
-    limits, result = _limits_of_cameras(flights, models), {}
-    captures = [c for captures, _, _ in flights for c in captures]
+    limits, result = _limits_of_cameras(flights), {}
+    captures = [c for captures, _ in flights for c in captures]
     for key, capture in {_crop_key(c): c for c in captures}.items():
         grid = common_grid(capture.reference, settings, limits[key[0]])
         earlier = Counter(kept[c.label] for c in captures if _crop_key(c) == key and kept.get(c.label) is not None)

@@ -182,7 +182,7 @@ def test_most_finished_captures_decide_on_the_crop_of_a_camera(flight: Path, tmp
     def grid(model: Path | None, *kept: OutputGrid, crop: str = "flight") -> OutputGrid | None:
         grids = dict(zip((c.label for c in captures), kept, strict=False))
         settings = agalign.WriteSettings(crop=crop)
-        ((_, result),) = _crops_of_cameras([(captures, "", [])], [model], grids, settings).values()
+        ((_, result),) = _crops_of_cameras([(captures, model)], grids, settings).values()
         return result
 
     model, first, second = tmp_path / "m.safetensors", OutputGrid(4, 4, 400, 300), OutputGrid(5, 4, 400, 301)

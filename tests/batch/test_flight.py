@@ -192,13 +192,13 @@ def test_captures_of_one_camera_and_flight_are_a_group_with_a_model_name_of_its_
 def test_flights_of_one_camera_share_the_limits_of_their_crop(flight: Path, tmp_path: Path) -> None:
     """The rig of a finished flight takes part; a damaged model and a flight without a model do not."""
     one, other = agalign.discover(flight).captures
-    flights = [([replace(c, flight_id=str(k))], "", []) for k, c in enumerate((one, other, one, other))]
-    flights.append(([replace(one, camera=replace(one.camera, serial="X9"))], "", []))
     good, bad = tmp_path / "good.safetensors", tmp_path / "bad.safetensors"
     save_known_model(good)
     bad.write_text("damaged")
-    models = [good, None, bad, good, None]
-    limits = _limits_of_cameras(flights, models)
+    captures, models = (one, other, one, other), (good, None, bad, good)
+    flights = [([replace(c, flight_id=str(k))], m) for k, (c, m) in enumerate(zip(captures, models, strict=True))]
+    flights.append(([replace(one, camera=replace(one.camera, serial="X9"))], None))
+    limits = _limits_of_cameras(flights)
     assert list(limits) == [camera_key(one), camera_key(flights[-1][0][0])]
     of_first = limits[camera_key(one)]
     assert {band.name for _, band in of_first} == {"NIR"}
