@@ -7,19 +7,16 @@ import exifread
 import pytest
 import xmltodict
 from PIL import Image
-from synthetic_flights.cameras import MAVIC, MAVIC_3M, SENTERA_6X
-from synthetic_flights.troubles import make_two_headings
 
 import agalign
 from agalign.products.sidecar.file import find_sidecars
 from agalign.synthetic.camera_model import CameraSpec
-from agalign.synthetic.cameras import REDEDGE
 
 from ..conftest import Shared, read_json, seeded
+from .conftest import CAMERAS, capture_by
 
 pytestmark = pytest.mark.slow
 
-CAMERAS = {"RedEdge": REDEDGE, "M3M calibrated": MAVIC, "M3M": MAVIC_3M, "6X": SENTERA_6X}
 CAPTURE_TAGS = ("@drone-dji:CaptureUUID", "MicaSense:CaptureId", "@Camera:CaptureUUID", "Camera:CaptureUUID")
 TAGS = [
     *(f"Image {name}" for name in ("Make", "Model")),
@@ -29,25 +26,20 @@ TAGS = [
 DJI = "CalibratedHMatrix DewarpData RelativeOpticalCenterX RelativeOpticalCenterY CalibratedOpticalCenterX DewarpFlag"
 PIX4D = "PrincipalPoint", "PerspectiveDistortion", "PerspectiveFocalLength"
 SHARED_TAGS = [*(f"Camera:{name}" for name in PIX4D), *(f"@drone-dji:{name}" for name in DJI.split())]
-SIZE = 480, 360
-
-
 Aligned = tuple[CameraSpec, Path, Path]
 
 
-def make_aligned(folder: Path, camera: CameraSpec, **write: object) -> None:
-    make_two_headings(folder / "in", 1, SIZE, camera=camera, line=1, lakes=False)
+def align(images: Path, out: Path, **write: object) -> None:
     settings, options = seeded(layout="bands", **write), agalign.DiscoverOptions(with_rgb=True)
-    (report,) = agalign.align_folder(folder / "in", folder / "out", settings=settings, options=options)
+    (report,) = agalign.align_folder(images, out, settings=settings, options=options)
     assert report.error is None
 
 
 @pytest.fixture(params=list(CAMERAS))
 def aligned(request: pytest.FixtureRequest, shared: Shared) -> Aligned:
     """(camera, its files, the aligned ones)."""
-    camera = CAMERAS[request.param]
-    folder = shared(f"handoff {request.param}", lambda folder: make_aligned(folder, camera))
-    return camera, folder / "in", folder / "out"
+    images = capture_by(request.param, shared)
+    return CAMERAS[request.param], images, shared(f"handoff {request.param}", lambda out: align(images, out))
 
 
 def bands_of(folder: Path) -> list[Path]:
@@ -132,9 +124,9 @@ def test_the_principal_point_is_on_the_pixel_that_it_was_on(aligned: Aligned) ->
     assert moved == pytest.approx([x0, y0], abs=0.01)
 
 
-def test_undistorted_files_have_tags_without_distortion(tmp_path: Path) -> None:
-    make_aligned(tmp_path, MAVIC, undistort=True)
-    paths = bands_of(tmp_path / "out")
+def test_undistorted_files_have_tags_without_distortion(shared: Shared, tmp_path: Path) -> None:
+    align(capture_by("M3M calibrated", shared), tmp_path, undistort=True)
+    paths = bands_of(tmp_path)
     assert len(paths) == 4
     for path in paths:
         xmp = xmp_of(path)

@@ -10,7 +10,7 @@ import sys
 import time
 import warnings
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +22,7 @@ from synthetic_flights.overlapping import GPS_ERROR_M, GSD_M, LATITUDE, LENS, LO
 
 import agalign
 from agalign.pixels.raster import transformed
-from agalign.products.mosaic.adjustment import adjusted, misfit_m, tie_pairs
+from agalign.products.mosaic.adjustment import TiePair, adjusted, misfit_m, tie_pairs
 from agalign.products.mosaic.placement import PlacedFlight, Placement, place_captures
 from agalign.products.run.footprint import utm_wkt
 from agalign.products.sidecar.file import read_sidecar, write_sidecar
@@ -40,49 +40,54 @@ def survey(shared: Shared) -> Path:
     return shared("survey", lambda folder: np.savez(folder / "truth.npz", **make_overlapping(folder)))
 
 
-def truth_of(folder: Path) -> dict[str, np.ndarray]:
-    """{label: pixels to metres east and north of the survey's origin}."""
-    return dict(np.load(folder / "truth.npz"))
-
-
-def errors_m(flight: PlacedFlight, captures: list[Placement], truth: dict[str, np.ndarray]) -> np.ndarray:
-    """Distances of points of all captures from the truth, after the similarity of all captures that fits best."""
+def p95_m(captures: list[Placement], truth: dict[str, np.ndarray]) -> float:
+    """Of the distances of points of all captures from the truth, after the similarity that fits all of them best."""
     px = geometry.lattice(*SIZE_PX, 4, 4)
     placed = np.concatenate([c.on_ground(px) for c in captures]) @ (1, 1j)
     undistorted = lens.undistort(LENS, px)
     true = np.concatenate([geometry.apply(truth[c.label], undistorted) for c in captures]) @ (1, 1j)
     design = np.stack([placed, np.ones_like(placed)], axis=1)
-    return np.abs(design @ np.linalg.lstsq(design, true)[0] - true)
+    return float(np.percentile(np.abs(design @ np.linalg.lstsq(design, true)[0] - true), 95))
 
 
-def test_tie_points_place_captures_to_a_pixel(survey: Path) -> None:
-    flight, truth = place_captures(survey), truth_of(survey)
-    pairs = [pair.split() for pair in tie_pairs(flight.captures)]
-    placed = adjusted(flight.captures, [used for used, _ in pairs])
-    assert np.percentile(errors_m(flight, list(flight.captures), truth), 95) > 1.5
-    assert np.percentile(errors_m(flight, placed, truth), 95) < GSD_M
-    checks = [check for _, check in pairs]
-    assert misfit_m(checks, placed)[0] < 0.2 * GSD_M
-    assert misfit_m(checks, flight.captures)[0] > 1.0
+@dataclass(frozen=True)
+class Ties:
+    """The captures of the survey by their georeference and by tie points, and the truth."""
+
+    flight: PlacedFlight
+    used: list[TiePair]
+    checks: list[TiePair]
+    placed: list[Placement]
+    truth: dict[str, np.ndarray]
+    """{label: pixels to metres east and north of the survey's origin}."""
+
+
+@pytest.fixture(scope="module")
+def ties(survey: Path) -> Ties:
+    flight = place_captures(survey)
+    used, checks = map(list, zip(*(pair.split() for pair in tie_pairs(flight.captures)), strict=True))
+    return Ties(flight, used, checks, adjusted(flight.captures, used), dict(np.load(survey / "truth.npz")))
+
+
+def test_tie_points_place_captures_to_a_pixel(ties: Ties) -> None:
+    assert p95_m(ties.flight.captures, ties.truth) > 1.5
+    assert p95_m(ties.placed, ties.truth) < GSD_M
+    assert misfit_m(ties.checks, ties.placed)[0] < 0.2 * GSD_M
+    assert misfit_m(ties.checks, ties.flight.captures)[0] > 1.0
     # No tie point is both used and a check.
-    for used, check in pairs:
+    for used, check in zip(ties.used, ties.checks, strict=True):
         assert not set(map(tuple, used.first_px)) & set(map(tuple, check.first_px))
 
 
-def test_the_georeference_holds_the_position_of_the_whole(survey: Path) -> None:
+def test_the_georeference_holds_the_position_of_the_whole(ties: Ties) -> None:
     """Tie points are relative: the mean of the GPS positions stays."""
-    flight, truth = place_captures(survey), truth_of(survey)
-    placed = adjusted(flight.captures, [pair.split()[0] for pair in tie_pairs(flight.captures)])
     centre = (np.array([SIZE_PX], float) - 1) / 2
     origin_m = transformed(np.array([[LONGITUDE, LATITUDE]]), "EPSG:4326", utm_wkt(LONGITUDE, LATITUDE))[0]
-    off_m = [
-        c.on_ground(centre)[0] + flight.origin_m - origin_m - geometry.apply(truth[c.label], centre)[0] for c in placed
-    ]
-    assert np.linalg.norm(np.mean(off_m, axis=0)) < 2 * GPS_ERROR_M
+    off_m = [c.on_ground(centre)[0] - geometry.apply(ties.truth[c.label], centre)[0] for c in ties.placed]
+    assert np.linalg.norm(np.mean(off_m, axis=0) + ties.flight.origin_m - origin_m) < 2 * GPS_ERROR_M
 
 
-def test_the_positions_determine_the_scale_if_the_height_is_assumed(survey: Path) -> None:
-    flight = place_captures(survey)
+def test_the_positions_determine_the_scale_if_the_height_is_assumed(ties: Ties) -> None:
     double = [
         replace(
             c,
@@ -94,19 +99,17 @@ def test_the_positions_determine_the_scale_if_the_height_is_assumed(survey: Path
             accuracy_m=30.0,
             pose_std=(*c.pose_std[:2], 0.5, *c.pose_std[3:]),
         )
-        for c in flight.captures
+        for c in ties.flight.captures
     ]
     placed = adjusted(double, [pair.split()[0] for pair in tie_pairs(double)])
     assert np.median([c.gsd_m for c in placed]) == pytest.approx(GSD_M, rel=0.35)
-    assert np.percentile(errors_m(flight, placed, truth_of(survey)), 95) < GSD_M
+    assert p95_m(placed, ties.truth) < GSD_M
 
 
-def test_wrong_matches_of_a_pair_do_not_move_the_others(survey: Path) -> None:
-    flight = place_captures(survey)
-    pairs = [pair.split()[0] for pair in tie_pairs(flight.captures)]
-    wrong = replace(pairs[0], second_px=pairs[0].second_px + np.array([25.0, -15.0]))
-    placed = adjusted(flight.captures, [wrong, *pairs[1:]])
-    assert np.percentile(errors_m(flight, placed, truth_of(survey)), 95) < GSD_M
+def test_wrong_matches_of_a_pair_do_not_move_the_others(ties: Ties) -> None:
+    first, *others = ties.used
+    wrong = replace(first, second_px=first.second_px + np.array([25.0, -15.0]))
+    assert p95_m(adjusted(ties.flight.captures, [wrong, *others]), ties.truth) < GSD_M
 
 
 @pytest.fixture(scope="module")
@@ -135,17 +138,14 @@ def test_the_mosaic_is_a_cog_with_all_bands(written: tuple[Path, agalign.MosaicR
     np.testing.assert_allclose(ndvi, (bands[2] - bands[1]) / (bands[2] + bands[1]), rtol=1e-5)
 
 
-def test_the_mosaic_shows_the_ground(written: tuple[Path, agalign.MosaicReport], survey: Path) -> None:
+def test_the_mosaic_shows_the_ground(written: tuple[Path, agalign.MosaicReport], ties: Ties) -> None:
     """Each capture, resampled to the mosaic by its refined placement, has the values of the mosaic, seams included."""
-    path, _ = written
-    flight = place_captures(survey)
-    placed = adjusted(flight.captures, [pair.split()[0] for pair in tie_pairs(flight.captures)])
-    with rasterio.open(path) as field:
+    with rasterio.open(written[0]) as field:
         bands = field.read()
         to_px = np.array(~field.transform).reshape(3, 3)
-    for capture in placed:
+    for capture in ties.placed:
         px = geometry.lattice(*SIZE_PX, 30, 20).round()
-        x, y = np.floor(geometry.apply(to_px, capture.on_ground(px) + flight.origin_m)).astype(int).T
+        x, y = np.floor(geometry.apply(to_px, capture.on_ground(px) + ties.flight.origin_m)).astype(int).T
         with rasterio.open(capture.bands[0].file) as stack:
             own = stack.read()[:, *px.astype(int).T[::-1]]
         inside = (x >= 0) & (y >= 0) & (x < bands.shape[2]) & (y < bands.shape[1])

@@ -5,8 +5,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from synthetic_flights.cameras import MAVIC, MAVIC_3M, SENTERA_6X
-from synthetic_flights.troubles import make_two_headings
 
 import agalign
 from agalign.cameras.pix4d import vignetting_on_grid
@@ -14,8 +12,6 @@ from agalign.products.exports.programs import export
 from agalign.products.rasters import aligned_files
 from agalign.products.rasters.layout import Layer
 from agalign.products.sidecar.file import find_sidecars, read_sidecar
-from agalign.synthetic.camera_model import CameraSpec
-from agalign.synthetic.cameras import REDEDGE
 from agalign.values import geometry
 from agalign.values.capture import Band, Radiometry
 from agalign.values.choices import ExportProgram
@@ -25,19 +21,17 @@ from agalign.values.mapping import PixelMapping
 from ..builders import in_full_run
 from ..conftest import Shared, seeded
 from ..odm import OdmPhoto, pixels_in
+from .conftest import capture_by
 
-CAMERAS = {"RedEdge": REDEDGE, "M3M calibrated": MAVIC, "M3M": MAVIC_3M, "6X": SENTERA_6X}
 IRRADIANCE = 0.8
 """Of the synthetic flight, W / m^2 / nm."""
 
 
-def exported(camera: CameraSpec, shared: Shared, out: Path, program: ExportProgram, **write: object) -> list[OdmPhoto]:
+def exported(
+    shared: Shared, out: Path, program: ExportProgram = "odm", camera: str = "RedEdge", **write: object
+) -> list[OdmPhoto]:
     """The files of an export of one capture, the reference first."""
-    name = next(name for name, one in CAMERAS.items() if one is camera)
-    images = shared(
-        f"odm {name}", lambda folder: make_two_headings(folder, 1, (480, 360), camera=camera, line=1, lakes=False)
-    )
-    agalign.align_folder(images, out / "out", settings=seeded(layout="bands", **write))
+    agalign.align_folder(capture_by(camera, shared), out / "out", settings=seeded(layout="bands", **write))
     for path in find_sidecars(out / "out"):
         path.write_text(path.read_text().replace('"degraded"', '"ok"'))
     report = export(out / "out", out / "export", program)
@@ -52,7 +46,7 @@ def option(out: Path) -> str:
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["RedEdge", "M3M", *map(in_full_run, ("M3M calibrated", "6X"))])
 def test_bands_are_one_camera_and_one_capture(name: str, shared: Shared, tmp_path: Path) -> None:
-    photos = exported(CAMERAS[name], shared, tmp_path, "odm")
+    photos = exported(shared, tmp_path, camera=name)
     assert len(photos) >= 4
     assert len({p.camera_id for p in photos}) == 1
     assert len({p.capture_uuid for p in photos}) == 1
@@ -66,8 +60,8 @@ def test_bands_are_one_camera_and_one_capture(name: str, shared: Shared, tmp_pat
 @pytest.mark.parametrize("program", ["odm", *map(in_full_run, ("metashape", "pix4d"))])
 def test_its_reflectance_is_that_of_this_program(program: ExportProgram, shared: Shared, tmp_path: Path) -> None:
     """Vignetting on the aligned grid, black level, exposure, gain, calibration and irradiance."""
-    photos = exported(REDEDGE, shared, tmp_path, program)
-    expected = exported(REDEDGE, shared, tmp_path / "by agalign", program, radiometry="sun")
+    photos = exported(shared, tmp_path, program)
+    expected = exported(shared, tmp_path / "by agalign", program, radiometry="sun")
     check_reflectance(photos, expected)
     assert all(p.vignetting[1] for p in photos)
     assert not any(p.vignetting[1] or p.xmp("Camera:HorizontalIrradiance") for p in expected)
@@ -79,9 +73,9 @@ def test_its_reflectance_is_that_of_this_program(program: ExportProgram, shared:
 @pytest.mark.full
 @pytest.mark.slow
 def test_vignetting_follows_pixels_without_distortion(shared: Shared, tmp_path: Path) -> None:
-    photos = exported(REDEDGE, shared, tmp_path, "odm", undistort=True)
+    photos = exported(shared, tmp_path, undistort=True)
     assert all(p.vignetting[1] for p in photos)
-    check_reflectance(photos, exported(REDEDGE, shared, tmp_path / "r", "odm", undistort=True, radiometry="sun"))
+    check_reflectance(photos, exported(shared, tmp_path / "r", undistort=True, radiometry="sun"))
 
 
 @pytest.mark.slow
@@ -89,9 +83,9 @@ def test_vignetting_that_no_polynomial_follows_is_corrected_in_all_bands(
     shared: Shared, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(aligned_files, "_MAX_VIGNETTING_ERROR", 1e-7)  # of the reference, which is not moved: 1e-16
-    photos = exported(REDEDGE, shared, tmp_path, "odm")
+    photos = exported(shared, tmp_path)
     assert not any(p.vignetting[1] or b"Vignetting" in p.path.read_bytes() for p in photos)
-    check_reflectance(photos, exported(REDEDGE, shared, tmp_path / "r", "odm", radiometry="sun"))
+    check_reflectance(photos, exported(shared, tmp_path / "r", radiometry="sun"))
     notes = (tmp_path / "export" / "README.txt").read_text()
     assert "The vignetting of 1 capture is corrected in the pixels of all bands." in notes
     assert {pixels_in(p.path).dtype.name for p in photos} == {"uint16"}
