@@ -19,8 +19,8 @@ import numpy as np
 from common import print_head, print_row, run
 
 from agalign.cameras.discover import discover
-from agalign.cameras.light_sensor import horizontal_irradiance, sun_position
 from agalign.cameras.metadata import Tags, read_tags
+from agalign.cameras.micasense import horizontal_irradiance, sun_position
 from agalign.flight import panel_readings
 from agalign.flight.groups import camera_key
 from agalign.pixels.landmarks import landmarks, matched_homography, matches

@@ -71,7 +71,9 @@ class Camera(ABC):
     def elevation_deg(self, tags: Tags) -> float | None:
         """Return the angle of the optical axis above the horizon, -90 straight down; None if the tags lack it."""
         pose = self.pose(tags)
-        return None if pose is None else elevation_of(pose.pitch_deg, pose.roll_deg)
+        if pose is None:
+            return None
+        return -math.degrees(math.asin(math.cos(math.radians(pose.pitch_deg)) * math.cos(math.radians(pose.roll_deg))))
 
     def motion(self, tags: Tags) -> tuple[float, float] | None:
         """Return the velocity (right, down) of the ground in the image, focal lengths per second; None if unknown."""
@@ -80,12 +82,6 @@ class Camera(ABC):
     def capture_folder(self, path: Path) -> Path:
         """Return the folder of the capture that a file belongs to."""
         return path.parent
-
-
-def elevation_of(pitch_deg: float, roll_deg: float) -> float:
-    """Return the elevation of the optical axis, degrees, after these rotations of a camera that looks straight down."""
-    cos_nadir_angle = math.cos(math.radians(pitch_deg)) * math.cos(math.radians(roll_deg))
-    return -math.degrees(math.asin(cos_nadir_angle))
 
 
 def default_reference(bands: Sequence[Band]) -> int:

@@ -71,7 +71,9 @@ class Dji(Camera):
         return tags.make.upper() == "DJI" or (_DJI, "CaptureUUID") in tags.xmp
 
     def bands(self, path: Path, tags: Tags, stored: Sequence[Band]) -> tuple[Band, ...]:
-        is_mavic, by_centres = _is_mavic_3(tags) or bool(_MAVIC_3_NAME.match(path.stem)), _shift_to_rig(tags)
+        is_mavic = _is_mavic_3(tags) or bool(_MAVIC_3_NAME.match(path.stem))
+        centre = _pair(tags, "RelativeOpticalCenter")
+        by_centres = None if centre is None else geometry.translation(-centre[0], -centre[1])
         calibrated = _matrix(tags, "CalibratedHMatrix")
         lens = _lens(tags) if is_mavic or calibrated is not None else None
         if len(stored) > 1:
@@ -129,7 +131,9 @@ def _radiometry(tags: Tags) -> Radiometry | None:
     """The signal is (raw - black) / 65536 (1 + k1 r + ... + k6 r^6) / (gain exposure). By DJI's guide, signal *
     SensorGainAdjustment / Irradiance is proportional to reflectance, with the same factor for all bands.
     """
-    gain, exposure_us, black = tags.number(_DJI, "SensorGain"), tags.number(_DJI, "ExposureTime"), _black_level(tags)
+    gain, exposure_us = tags.number(_DJI, "SensorGain"), tags.number(_DJI, "ExposureTime")
+    levels = tags.number(_DJI, "BlackLevel"), tags.number(pix4d.NAMESPACE, "BlackCurrent"), tags.black_level
+    black = next((level for level in levels if level is not None), None)  # it may be 0
     if not gain or not exposure_us or black is None:
         return None
     irradiance = tags.number(_DJI, "Irradiance") or 0.0
@@ -148,12 +152,6 @@ def _radiometry(tags: Tags) -> Radiometry | None:
     )
 
 
-def _black_level(tags: Tags) -> float | None:
-    """The first black level in the tags, which may be 0."""
-    levels = tags.number(_DJI, "BlackLevel"), tags.number(pix4d.NAMESPACE, "BlackCurrent"), tags.black_level
-    return next((level for level in levels if level is not None), None)
-
-
 def _is_mavic_3(tags: Tags) -> bool:
     return tags.model.upper().startswith("M3M")
 
@@ -163,11 +161,6 @@ def _band_in_name(path: Path) -> str:
     if mavic and mavic["band"]:
         return {"G": "Green", "R": "Red", "RE": "RedEdge", "NIR": "NIR"}[mavic["band"].upper()]
     return {"1": "Blue", "2": "Green", "3": "Red", "4": "RedEdge", "5": "NIR"}.get(path.stem[-1], path.stem)
-
-
-def _shift_to_rig(tags: Tags) -> Matrix | None:
-    centre = _pair(tags, "RelativeOpticalCenter")
-    return None if centre is None else geometry.translation(-centre[0], -centre[1])
 
 
 def _pair(tags: Tags, name: str) -> tuple[float, float] | None:

@@ -21,7 +21,6 @@ from agalign.config import DiscoverOptions
 from agalign.errors import InputError
 from agalign.pixels.raster import suffix_format
 from agalign.values.capture import Band, CameraIdentity, Capture, CaptureTime, Pose
-from agalign.values.choices import BandOrder
 from agalign.values.files import RUN_FILE
 from agalign.values.pixel_units import SAME_PIXELS
 from agalign.values.text import counted
@@ -202,26 +201,14 @@ def _group_for(
     cameras: Iterable[Camera],
 ) -> _GroupKey | None:
     """The other group that a file without a capture id belongs to by its name, if there is one."""
-    if key[0] == Generic.name:
-        keys = [k for k in _keys_for(file, key[1], cameras, by_name) if k in groups]
-        return keys[0] if len(keys) == 1 else None
-    keys = [] if file.is_whole_capture else by_name.get(key, [])
-    return next((k for k in keys if k in groups and k != key), None)
-
-
-def _keys_for(
-    file: ImageFile, folder: str, cameras: Iterable[Camera], by_name: Mapping[_GroupKey, list[_GroupKey]]
-) -> list[_GroupKey]:
-    """The groups that a single band without tags may belong to by its name."""
+    if key[0] != Generic.name:
+        keys = [] if file.is_whole_capture else by_name.get(key, [])
+        return next((k for k in keys if k in groups and k != key), None)
     if file.tags.make or file.tags.xmp or len(file.bands) != 1 or not _is_tiff(file):
-        return []
-    names = {camera.name: camera.capture_name(file.path) for camera in cameras}
-    return [
-        key
-        for camera, name in names.items()
-        if name != file.path.stem
-        for key in by_name.get((camera, folder, name), ())
-    ]
+        return None
+    names = [(camera.name, key[1], camera.capture_name(file.path)) for camera in cameras]
+    keys = [k for name in names if name[2] != file.path.stem for k in by_name.get(name, ()) if k in groups]
+    return keys[0] if len(keys) == 1 else None
 
 
 def _with_camera(file: ImageFile, camera: Camera) -> ImageFile:
@@ -281,13 +268,17 @@ def capture_of(files: Sequence[ImageFile], folder: Path, options: DiscoverOption
     if options.ignore_metadata:
         bands = [replace(b, lens=None, to_rig=None, other_to_rig=None) for b in bands]
     reference = bands[reference_index(bands, options.reference, first.path)]
-    bands = _in_order(bands, options.order)
+    if options.order == "wavelength":
+        bands.sort(key=lambda b: math.inf if b.wavelength_nm is None else b.wavelength_nm)
+    elif options.order == "name":
+        bands.sort(key=lambda b: natural_order(b.name))
     tags = _tags_of(reference, files)
     camera = camera_of(tags)
     serials = sorted({f.tags.serial for f in files if f.tags.serial})
+    own_folder = first.camera.capture_folder(first.path)  # above the input if that is the folder of one band
     return Capture(
         name=(first.path.stem if len(files) == 1 else first.camera.capture_name(first.path)) or "capture",
-        folder=_relative_folder(first.camera.capture_folder(first.path), folder),
+        folder=own_folder.relative_to(folder) if own_folder.is_relative_to(folder) else Path(),
         bands=tuple(bands),
         reference_index=next(i for i, b in enumerate(bands) if b is reference),
         camera=CameraIdentity(tags.make, tags.model, _SERIAL_SEPARATOR.join(serials)),
@@ -331,17 +322,6 @@ def _bands_to_align(files: Sequence[ImageFile], names: Sequence[str]) -> list[Ba
     if len(files) == 1 and first.bands[0].one_lens:
         raise InputError(f"{first.path}: its bands come through one lens; there is nothing to align")
     return bands
-
-
-def _in_order(bands: Sequence[Band], order: BandOrder) -> list[Band]:
-    if order == "wavelength":
-        return sorted(bands, key=lambda b: math.inf if b.wavelength_nm is None else b.wavelength_nm)
-    return sorted(bands, key=lambda b: natural_order(b.name)) if order == "name" else list(bands)
-
-
-def _relative_folder(capture_folder: Path, folder: Path) -> Path:
-    """The folder relative to the input folder; "." if it is above, as the input may be the folder of one band."""
-    return capture_folder.relative_to(folder) if capture_folder.is_relative_to(folder) else Path()
 
 
 def with_missing_bands(captures: Sequence[Capture]) -> list[Capture]:

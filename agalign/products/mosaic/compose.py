@@ -91,7 +91,9 @@ def mosaic(
     """
     chosen_indices, path = [index_named(name) for name in indices], Path(target)
     flight = place_captures(Path(out))
-    _check_target(path, flight.captures)
+    stacks = {band.file.resolve() for capture in flight.captures for band in capture.bands}
+    if path.suffix.lower() not in (".tif", ".tiff") or path.resolve() in stacks:
+        raise ConfigurationError(f"{path}: give the mosaic a new file that ends in .tif")
     with locked(path.parent, below=False):
         pairs = [pair.split() for pair in tie_pairs(flight.captures)]
         largest, *others = tied_groups(len(flight.captures), [used for used, _ in pairs])
@@ -124,13 +126,6 @@ def mosaic(
             left_out=[*flight.left_out, *((label, _UNTIED) for label in labels if not untied)],
             indices=_write_indices(path, placed[0].bands, chosen_indices),
         )
-
-
-def _check_target(path: Path, captures: Sequence[Placement]) -> None:
-    """Raise ConfigurationError for a target that is an input or not a .tif."""
-    stacks = {band.file.resolve() for capture in captures for band in capture.bands}
-    if path.suffix.lower() not in (".tif", ".tiff") or path.resolve() in stacks:
-        raise ConfigurationError(f"{path}: give the mosaic a new file that ends in .tif")
 
 
 @dataclass(frozen=True)

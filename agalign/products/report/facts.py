@@ -15,15 +15,7 @@ from pydantic import BaseModel
 from agalign.products.indices.rasters import IndexReport
 from agalign.products.run.captures import RAW
 from agalign.products.run.record import RefusalPart
-from agalign.products.sidecar.schema import (
-    BandPart,
-    BandResult,
-    CaptureResult,
-    GridPart,
-    OutputPart,
-    PreviewPart,
-    Sidecar,
-)
+from agalign.products.sidecar.schema import BandPart, BandResult, CaptureResult, GridPart, OutputPart, Sidecar
 from agalign.values.issues import MISSING_BAND, MOSAICS, OTHER_REFERENCE, UNREADABLE, Remedy
 from agalign.verify.checks import KINDS
 
@@ -177,6 +169,10 @@ class FlightFacts:
         files = {part.kind: part.file for part in sidecar.products}
         relief = next((b.relief.file for b in sidecar.bands if b.relief is not None), None)
         keys = {"folder": folder, "capture": sidecar.capture, "reference": sidecar.reference.band}
+        preview: dict[str, Any] | None = None
+        if sidecar.preview is not None:
+            detail = [round(v, 5) for v in sidecar.preview.detail]
+            preview = sidecar.preview.model_dump() | {"file": _link(path, sidecar.preview.file), "detail": detail}
         facts = {
             "label": label,
             "captured_at": sidecar.captured_at,
@@ -195,7 +191,7 @@ class FlightFacts:
             "relief": _link(path, relief),
             "sidecar": _link(path, f"{sidecar.capture}.json"),
             "picture": _link(path, files.get("picture")),
-            "preview": _preview(path, sidecar.preview),
+            "preview": preview,
             "bands": [self._pair(b, sidecar, keys) for b in sidecar.bands],
             "indices": [],
         }
@@ -270,13 +266,6 @@ def rounded(value: Any) -> Any:
 
 def _link(folder: Path, name: str | None) -> str | None:
     return None if name is None else quote((folder / name).as_posix())
-
-
-def _preview(folder: Path, preview: PreviewPart | None) -> dict[str, Any] | None:
-    if preview is None:
-        return None
-    detail = [round(v, 5) for v in preview.detail]
-    return preview.model_dump() | {"file": _link(folder, preview.file), "detail": detail}
 
 
 def _fields_of(part: BaseModel | None) -> dict[str, Any] | None:

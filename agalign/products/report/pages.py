@@ -71,7 +71,9 @@ def write_pages(out: Path, on_problem: Callable[[str], None]) -> Pages:
         panels, sky, run = read_panels(out), read_sky(out), read_run_record(out)
     except SidecarError as error:
         unreadable.append(str(error))
-    _write_summary(out / SUMMARY_FILE, facts.rows, panels, sky)
+    not_aligned = [("panel", part) for part in panels if not part.in_scene] + [("sky", part) for part in sky]
+    rows = [*facts.rows, *(row for excluded in not_aligned for row in _rows_not_aligned(*excluded))]
+    write_csv(out / SUMMARY_FILE, SUMMARY_COLUMNS, ([row.get(name) for name in SUMMARY_COLUMNS] for row in rows))
     facts.add_indices(update_table(out, indices), out)
     failures = facts.pairs.groups()
     slowest = sorted(((c["label"], c["seconds"]) for c in facts.captures), key=lambda c: -c[1])[:5]
@@ -94,18 +96,7 @@ def pages_exist(out: Path) -> bool:
         return False
 
 
-def _write_summary(
-    path: Path, rows: Sequence[dict[str, Any]], panels: Sequence[PanelPart], sky: Sequence[SkyPart]
-) -> None:
-    """Write OUT/summary.csv, given the rows of the processed captures. Raises OutputError."""
-    all_rows = [*rows]
-    all_rows += [row for panel in panels if not panel.in_scene for row in _rows_not_aligned(panel, "panel")]
-    all_rows += [row for part in sky for row in _rows_not_aligned(part, "sky")]
-    cells = ([row.get(name) for name in SUMMARY_COLUMNS] for row in all_rows)
-    write_csv(path, SUMMARY_COLUMNS, cells)
-
-
-def _rows_not_aligned(part: PanelPart | SkyPart, status: str) -> list[dict[str, object]]:
+def _rows_not_aligned(status: str, part: PanelPart | SkyPart) -> list[dict[str, object]]:
     """A row for each band of a capture of a panel or of the sky; other columns are empty."""
     facts = {"folder": part.folder, "capture": part.capture, "status": status, "reason": part.sentence}
     return [{**facts, "band": band.band} for band in part.bands]

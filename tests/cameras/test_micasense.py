@@ -3,9 +3,8 @@ from pathlib import Path
 
 import pytest
 
-from agalign.cameras.light_sensor import horizontal_irradiance, sun_position, transmission
 from agalign.cameras.metadata import Tags, read_tags
-from agalign.cameras.micasense import MicaSense
+from agalign.cameras.micasense import MicaSense, horizontal_irradiance, sun_position, transmission
 from agalign.pixels.raster import probe
 from agalign.values.capture import CaptureTime, Position
 
