@@ -8,7 +8,6 @@ import shlex
 import shutil
 import subprocess
 import sys
-import tomllib
 import warnings
 from collections.abc import Callable
 from pathlib import Path
@@ -33,14 +32,14 @@ from ..cli.test_onto import TRUTH as MOVEMENT
 from ..cli.test_onto import write_mosaic
 from ..conftest import REAL_DATA, Shared, textured_pair, write_band
 from ..program import agalign_here
-from .blocks import PAGES, ROOT, blocks_of, commands_of, program
+from .blocks import PAGES, ROOT, blocks_of, commands_of, each_page, program, text_of
 
 RUN_BY = {"docker": "tools/container.sh", "dask": "tools/dask_cluster.sh", "pip": ".ci/run"}
 """What cannot be run inside a test, and the script that runs it and what stands with it in a block."""
 KINDS = {"sh", "python", "text", "{toctree}", "{include} ../CONTRIBUTING.md", "{include} ../CHANGELOG.md"}
 RUNNABLE = [page for page in PAGES if any(b.kind in ("sh", "python") for b in blocks_of(page))]
 LONG = re.compile("batch|benchmark-bands|close-range|paper|photogrammetry|python|qgis|radiometry|thermal")
-"""Pages with blocks that take seconds, and of commands that other tests run: they are in the full run."""
+"""Pages with blocks that take seconds, and of commands that other tests run: only the full run has them."""
 
 
 def write_orthophoto(folder: Path) -> None:
@@ -134,13 +133,7 @@ def run_page(page: Path) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "page",
-    [
-        pytest.param(p, id=p.relative_to(ROOT).as_posix(), marks=[pytest.mark.full] if LONG.fullmatch(p.stem) else [])
-        for p in RUNNABLE
-    ],
-)
+@each_page(page for page in RUNNABLE if not LONG.fullmatch(page.stem))
 def test_the_blocks_of_a_page_run(page: Path, desk: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(desk)
     run_page(page)
@@ -148,7 +141,7 @@ def test_the_blocks_of_a_page_run(page: Path, desk: Path, monkeypatch: pytest.Mo
 
 @pytest.mark.full
 @pytest.mark.slow
-@pytest.mark.parametrize("page", RUNNABLE, ids=[p.relative_to(ROOT).as_posix() for p in RUNNABLE])
+@each_page(RUNNABLE)
 def test_a_page_by_itself(page: Path, originals: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(shutil.copytree(originals, tmp_path / "desk", symlinks=True))
     run_page(page)
@@ -240,35 +233,18 @@ def test_the_python_of_the_readme_aligns_pixels() -> None:
 
 def test_every_block_has_a_kind() -> None:
     """One without a kind would not be run."""
-    blocks = [block for page in PAGES for block in blocks_of(page)]
-    assert blocks
-    for block in blocks:
-        assert block.kind in KINDS, block.where
+    assert [block.where for page in PAGES for block in blocks_of(page) if block.kind not in KINDS] == []
 
 
 def test_blocks_that_are_not_run_here_are_run_by_scripts() -> None:
-    seen = set()
-    for page in PAGES:
-        for block in blocks_of(page):
-            for command in commands_of(block) if block.kind == "sh" else ():
-                if program(command) in RUN_BY:
-                    seen.add(program(command))
-    assert seen == set(RUN_BY)
+    blocks = (block for page in PAGES for block in blocks_of(page) if block.kind == "sh")
+    assert set(RUN_BY) <= {program(command) for block in blocks for command in commands_of(block)}
     assert all((ROOT / script).is_file() for script in RUN_BY.values())
 
 
-def test_named_extras_exist() -> None:
-    extras = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]["optional-dependencies"]
-    text = "".join(page.read_text(encoding="utf-8") for page in PAGES)
-    named = {name for names in re.findall(r"pip install '?\.\[([\w,]+)\]", text) for name in names.split(",")}
-    assert named
-    assert named <= set(extras)
-
-
-@pytest.mark.parametrize("page", PAGES, ids=[p.relative_to(ROOT).as_posix() for p in PAGES])
+@each_page()
 def test_links_have_targets(page: Path) -> None:
-    text = re.sub(r"```.*?```", "", page.read_text(encoding="utf-8"), flags=re.DOTALL)
-    for target in re.findall(r"\]\(([^)\s]+)\)", text):
+    for target in re.findall(r"\]\(([^)\s]+)\)", text_of(page)):
         if re.match(r"[a-z]+:", target):
             continue
         path, _, anchor = target.partition("#")

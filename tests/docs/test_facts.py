@@ -26,9 +26,8 @@ from agalign.values.alignment import MIN_RETRIEVAL, MIN_TIMES_CHANCE
 from agalign.verify import checks
 
 from ..program import agalign_here
-from .blocks import PAGES, ROOT
+from .blocks import PAGES, ROOT, each_page, text_of
 
-EACH_PAGE = pytest.mark.parametrize("page", PAGES, ids=[p.relative_to(ROOT).as_posix() for p in PAGES])
 PACKAGE = ROOT / "agalign"
 OPTIONS_OF_OTHERS = {
     *("--cpus", "--gpus", "--read-only", "--tmpfs", "--user"),  # docker run
@@ -39,11 +38,6 @@ OPTIONS_OF_OTHERS = {
 WORDS_OF_A_MESSAGE = 4
 """Code of as many words is a quoted message, if it is none of these."""
 NOT_A_MESSAGE = re.compile(r"(agalign|python3?|pip|docker|sphinx-build|if __name__) |--|x ↦")
-
-
-def text_of(page: Path) -> str:
-    """The text of a page without blocks."""
-    return re.sub(r"```.*?```", "", page.read_text(encoding="utf-8"), flags=re.DOTALL)
 
 
 def code_in(page: Path) -> list[str]:
@@ -77,7 +71,7 @@ def strings_of_the_program() -> tuple[str, ...]:
     return tuple(map(template, parts))
 
 
-@EACH_PAGE
+@each_page()
 def test_quoted_messages_are_printed_by_the_program(page: Path) -> None:
     for code in code_in(page):
         if len(code.split()) >= WORDS_OF_A_MESSAGE and not NOT_A_MESSAGE.match(code):
@@ -92,7 +86,7 @@ def options_of_the_program() -> frozenset[str]:
     return frozenset(re.findall(r"--[a-z][\w-]+", "".join(helps)))
 
 
-@EACH_PAGE
+@each_page()
 def test_options_in_the_text_exist(page: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("COLUMNS", "300")
     named = set(re.findall(r"(?<![\w-])--[a-z][\w-]+", text_of(page)))
@@ -176,7 +170,7 @@ def test_limits(page: str) -> None:
     assert [limit for limit in LIMITS[page] if limit not in text] == []
 
 
-@EACH_PAGE
+@each_page()
 def test_files_in_the_text_exist(page: Path) -> None:
     for code in code_in(page):
         if re.fullmatch(r"[a-z_./]+/\w+\.(py|sh|j2|js)", code):
@@ -201,6 +195,9 @@ def test_equations_of_the_paper() -> None:
 def test_extras() -> None:
     extras = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]["optional-dependencies"]
     assert {name for row in table("install.md", "extra") for name in re.findall(r"`(\w+)`", row[0])} == set(extras)
+    commands = re.findall(r"pip install '?\.\[([\w,]+)\]", "".join(page.read_text(encoding="utf-8") for page in PAGES))
+    assert commands
+    assert {name for names in commands for name in names.split(",")} <= set(extras)
 
 
 def test_kinds_of_products() -> None:
