@@ -9,7 +9,6 @@ The claim at a point is the value of the error map (`--error-map`). A usable ban
 """
 
 import json
-import shutil
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
@@ -19,7 +18,7 @@ import numpy as np
 import rasterio
 import typer
 from bands.images import in_other_light
-from common import align, flight_and_out, print_head, print_row, run
+from common import align, flight_and_out, print_head, print_row, run, writable_copy
 from numpy.typing import NDArray
 from scipy.interpolate import RegularGridInterpolator
 
@@ -75,9 +74,7 @@ class Row:
 
 def damaged_copy(source: Path, copy: Path, name: str) -> None:
     """Copy a flight, with damage."""
-    shutil.copytree(source, copy, copy_function=shutil.copy)
-    for path in copy.rglob("*"):
-        path.chmod(0o755 if path.is_dir() else 0o644)
+    writable_copy(source, copy)
     change, which = DAMAGES[name]
     rng = np.random.default_rng(0)
     for capture in discover(copy).captures:

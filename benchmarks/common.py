@@ -2,6 +2,7 @@
 
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -145,6 +146,13 @@ def command(flight: Path, out: Path, *options: str) -> list[str]:
 def align(flight: Path, out: Path, *options: str) -> float:
     """Align a folder, and return the seconds. Bands that are not aligned end the program with exit code 3."""
     return timed(subprocess.run, command(flight, out, *options), check=False)[0]
+
+
+def writable_copy(folder: Path, copy: Path) -> None:
+    """Copy a folder whose files may be read-only."""
+    shutil.copytree(folder, copy, copy_function=shutil.copyfile)
+    for path in (copy, *copy.rglob("*/")):
+        path.chmod(0o755)
 
 
 @contextmanager

@@ -8,13 +8,12 @@ the standard error in the sidecar.
 """
 
 import json
-import shutil
 from pathlib import Path
 
 import cv2
 import numpy as np
 import rasterio
-from common import BandError, align, band_errors, flight_and_out, print_head, print_row, read_ties, run
+from common import BandError, align, band_errors, flight_and_out, print_head, print_row, read_ties, run, writable_copy
 
 
 def degrade(path: Path, how: str, rng: np.random.Generator) -> None:
@@ -32,9 +31,7 @@ def degrade(path: Path, how: str, rng: np.random.Generator) -> None:
 def run_without(flight: Path, lost: set[str], how: str, rng: np.random.Generator) -> list[BandError]:
     """Align a copy of a flight without these files, and return their errors."""
     with flight_and_out() as (copy, out):
-        shutil.copytree(flight, copy, copy_function=shutil.copy)
-        for path in copy.rglob("*"):
-            path.chmod(0o755 if path.is_dir() else 0o644)
+        writable_copy(flight, copy)
         for name in sorted(lost):
             degrade(next(copy.rglob(name)), how, rng)
         align(copy, out)

@@ -7,7 +7,6 @@ the files equal to those of a run without a cluster?
 import json
 import subprocess
 import sys
-import tempfile
 import time
 from pathlib import Path
 
@@ -15,7 +14,7 @@ import psutil
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from common import Section, align, command, run
+from common import Section, align, command, flight_and_out, run
 from kills import differences, snapshot
 
 from agalign.products.sidecar.file import find_sidecars
@@ -39,12 +38,11 @@ def kill_worker(nanny_pid: int) -> None:
 
 def main(captures: int = 40, markdown: Path | None = None) -> None:
     section = Section("cluster", markdown)
-    with tempfile.TemporaryDirectory() as folder:
-        flight, alone, out = Path(folder, "flight"), Path(folder, "alone"), Path(folder, "out")
-        address_file = Path(folder, "scheduler.json")
+    with flight_and_out() as (flight, out):
+        alone, address_file = (out.with_name(name) for name in ("alone", "scheduler.json"))
         synthetic.make_flight(flight, captures, SIZE_PX, rng_seed=5)
         alone_s = align(flight, alone, "-j", "2")
-        worker = "--nthreads", "1", "--local-directory", folder
+        worker = "--nthreads", "1", "--local-directory", str(out.parent)
         processes = [dask("dask_worker", address_file, *worker) for _ in range(2)]
         processes.append(dask("dask_scheduler", address_file, "--port", "0"))
         try:

@@ -9,7 +9,6 @@ import re
 import resource
 import signal
 import sys
-import tempfile
 from collections import defaultdict
 from pathlib import Path
 from typing import Annotated
@@ -18,7 +17,7 @@ import typer
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from common import Section, command, ended, run
+from common import Section, command, ended, flight_and_out, run
 
 from agalign.synthetic import flight as synthetic
 
@@ -55,15 +54,14 @@ def main(
 ) -> None:
     section = Section("memory limits", markdown)
     rows: dict[tuple[str, str], list[tuple[float, float]]] = defaultdict(list)
-    with tempfile.TemporaryDirectory() as name:
-        flight = Path(name, "flight")
+    with flight_and_out() as (flight, out):
         synthetic.make_flight(flight, CAPTURES, SIZE_PX, rng_seed=4)
         for jobs in (1, 2):
             for step in range(round((last_gb - first_gb) / step_gb) + 1):
                 limit_gb = first_gb + step * step_gb
                 # A time limit asks for worker processes; a flight of four captures is done in threads otherwise.
                 workers = ("-j", str(jobs)) if jobs == 1 else ("-j", str(jobs), "--timeout", "100")
-                how, line, seconds = run_within(limit_gb, flight, Path(name, f"out{jobs}-{step}"), *workers)
+                how, line, seconds = run_within(limit_gb, flight, out.with_name(f"out{jobs}-{step}"), *workers)
                 # The limit itself is in the line.
                 line = re.sub(r"limited to [0-9.]+ GB", "limited to … GB", line)
                 print(f"-j {jobs} {limit_gb:.2f} GB: {how}, {seconds:.1f} s: {line}", flush=True)
