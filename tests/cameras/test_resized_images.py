@@ -49,8 +49,6 @@ def test_tags_in_pixels_follow_the_size_that_exif_names(flight: Path, tmp_path: 
     assert not scan.problems
     scale = PixelScale.between(full.bands[0].size_px, small.bands[0].size_px)
     for before, after in zip(full.bands, small.bands, strict=True):
-        assert before.lens is not None
-        assert after.lens is not None
         assert after.lens.fx_px == pytest.approx(share * before.lens.fx_px)
         point = np.array([[100.0, 80.0]])
         np.testing.assert_allclose(
@@ -62,7 +60,6 @@ def test_tags_in_pixels_follow_the_size_that_exif_names(flight: Path, tmp_path: 
         reduced = calibrated(grey[: after.height_px, : after.width_px], after.radiometry, 0, 0)
         expected = cv2.resize(radiance, after.size_px, interpolation=cv2.INTER_AREA)
         np.testing.assert_allclose(reduced, expected, rtol=1e-3)
-    assert small.pose is not None
     assert small.pose.focal_length_px == pytest.approx(share * full.pose.focal_length_px)
 
 
@@ -83,9 +80,7 @@ def test_images_reduced_to_a_half_are_aligned_without_reflectance(flight: Path, 
     bands = read_result(sidecar).bands
     assert {b.status for b in bands} <= {"reference", "aligned", "predicted"}
     # Reflectance is float32.
-    assert {b.dtype for p in (tmp_path / "out").glob("IMG_*.tif") for b in probe(p)} == {
-        "uint16"
-    }  # reflectance is float32
+    assert {b.dtype for p in (tmp_path / "out").glob("IMG_*.tif") for b in probe(p)} == {"uint16"}
 
 
 @pytest.mark.parametrize(("size_px", "focal_px"), [((1280, 960), 1454.4), ((160, 120), 181.8), ((160, 80), None)])
