@@ -1,3 +1,4 @@
+import json
 from pathlib import Path
 
 import pytest
@@ -5,12 +6,29 @@ from synthetic_flights.cameras import MAVIC, MAVIC_3M, SENTERA_6X
 from synthetic_flights.panel import make_flight_between_panels
 from synthetic_flights.troubles import make_two_headings
 
+from agalign.batch.index_run import index_tasks, run_indices
+from agalign.products.indices.formulas import INDICES, Index
+from agalign.products.indices.rasters import IndexReport
 from agalign.synthetic.cameras import REDEDGE
 
-from ..conftest import Shared
+from ..conftest import Shared, read_json
 
 SUN = 1.0, 0.6
 CAMERAS = {"RedEdge": REDEDGE, "M3M calibrated": MAVIC, "M3M": MAVIC_3M, "6X": SENTERA_6X}
+
+
+def change(path: Path, **changes: object) -> None:
+    """Replace entries of the JSON object in a file."""
+    path.write_text(json.dumps(read_json(path) | changes))
+
+
+def indices_of(
+    out: Path, *indices: str | Index, target: Path | None = None, overwrite: bool = False
+) -> list[IndexReport]:
+    """Calculate indices of the captures of a run, by default NDVI."""
+    chosen = [INDICES[index] if isinstance(index, str) else index for index in indices or ("ndvi",)]
+    tasks = index_tasks(out, chosen, target or out, overwrite=overwrite)
+    return [report for done in run_indices(tasks, jobs=1) for report in done]
 
 
 def capture_by(camera: str, shared: Shared) -> Path:

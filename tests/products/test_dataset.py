@@ -1,4 +1,3 @@
-import json
 import shutil
 from pathlib import Path
 
@@ -10,6 +9,7 @@ import rioxarray  # noqa: F401
 import agalign
 
 from ..conftest import Shared, seeded, write_capture
+from .conftest import change
 
 pytestmark = pytest.mark.slow
 
@@ -56,10 +56,10 @@ def test_times_of_a_flight_are_in_utc_or_by_the_clock_of_the_camera(run: Path, t
     out = Path(shutil.copytree(run, tmp_path / "out"))
     moments = "2026-06-21T12:00:00+02:00", "2026-06-21T05:00:00-05:00"
     for path, moment in zip(sorted((out / "0000SET" / "000").glob("IMG_*.json")), moments, strict=False):
-        path.write_text(json.dumps(json.loads(path.read_text()) | {"captured_at": moment}))
+        change(path, captured_at=moment)
     flight = agalign.open_flight(out)
     assert [str(t)[:19] for t in flight.time.values] == ["2026-06-21T10:00:00"] * 2
-    path.write_text(json.dumps(json.loads(path.read_text()) | {"captured_at": "2026-06-21T10:00:00"}))
+    change(path, captured_at="2026-06-21T10:00:00")
     assert agalign.open_flight(out).time.attrs == {"source": "camera, clock of the camera (time zone unknown)"}
 
 

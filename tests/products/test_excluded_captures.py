@@ -167,14 +167,8 @@ def test_a_damaged_record_is_one_line(tmp_path: Path) -> None:
 
 
 def test_a_panel_in_other_light_than_the_sensor_is_described() -> None:
-    facts = {
-        "folder": ".",
-        "capture": "a",
-        "captured_at": "",
-        "seen_by": "tags",
-        "serial": "",
-        "picture": "a.panel.png",
-    }
+    facts = {"folder": ".", "capture": "a", "captured_at": "", "serial": ""}
+    facts |= {"seen_by": "tags", "picture": "a.panel.png"}
     texts = [PanelPart(**facts, bands=[], sensor_scale=1.45, fits_sensor=fits).sentence for fits in (True, False)]
     assert texts[0].endswith("irradiance 1.45 times that of the light sensor")
     values = {"file": "a", "area_px": [], "albedo": None, "radiance": None, "reflectance_per_radiance": None}

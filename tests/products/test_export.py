@@ -1,7 +1,6 @@
 """What other programs take: band files under names of their own, and matrices that do in OpenCV what the run did."""
 
 import csv
-import json
 import shutil
 from pathlib import Path
 
@@ -17,6 +16,7 @@ from agalign.products.sidecar.file import find_sidecars, read_sidecar
 from agalign.values.choices import ExportProgram
 
 from ..conftest import Shared, read_json, seeded
+from .conftest import change
 
 pytestmark = pytest.mark.slow
 
@@ -102,12 +102,11 @@ def test_captures_that_cannot_be_exported_are_one_line(run: Path, tmp_path: Path
     with pytest.raises(agalign.InputError, match=r"IMG_0001_1\.tif: the image is not there; .* --source"):
         export(run, tmp_path / "to", "micasense", source=tmp_path)
     path = find_sidecars(shutil.copytree(run, tmp_path / "changed"))[0]
-    content = read_json(path)
-    content["output"]["band_files"] = []
+    output = read_json(path)["output"] | {"band_files": []}
     for status, error, message in (
         ("ok", agalign.ConfigurationError, "--layout bands or both"),
         ("degraded", agalign.InputError, "no capture to export .*: its status is degraded"),
     ):
-        path.write_text(json.dumps(content | {"status": status}))
+        change(path, output=output, status=status)
         with pytest.raises(error, match=message):
             export(tmp_path / "changed", tmp_path / "to", "pix4d")

@@ -12,8 +12,6 @@ import rasterio
 from synthetic_flights.aligned import make_aligned
 
 import agalign
-from agalign.batch.index_run import index_tasks, run_indices
-from agalign.products.indices.formulas import INDICES
 from agalign.products.run.flight_map import FlightMap
 from agalign.products.run.footprint import (
     above_elevation,
@@ -33,6 +31,7 @@ from agalign.values import geometry
 from agalign.values.capture import Band, Capture, Pose, Position
 
 from ..conftest import read_json, seeded
+from .conftest import indices_of
 
 M_PER_DEGREE = 111_250.0  # of latitude, at 52 degrees
 
@@ -93,7 +92,7 @@ def test_index_rasters_of_a_later_command_are_linked_and_stay_linked(tmp_path: P
         return sorted(features[0]["properties"]["indices"])
 
     assert links(mapped(tmp_path, known)) == []
-    list(run_indices(index_tasks(tmp_path, [INDICES["ndvi"], INDICES["ndre"]], tmp_path)))
+    indices_of(tmp_path, "ndvi", "ndre")
     linked = ["0000SET/IMG_0001_ndre.tif", "0000SET/IMG_0001_ndvi.tif"]
     assert links(features_of(tmp_path)) == links(mapped(tmp_path, known)) == linked
     (tmp_path / linked[0]).unlink()
@@ -118,7 +117,7 @@ def test_a_map_of_another_program_is_not_changed(tmp_path: Path) -> None:
     make_aligned(tmp_path, 1)
     for text in ('{"features": [{"properties": {"name": "mine"}}]}', "[]", "not JSON"):
         (tmp_path / "flight.geojson").write_text(text)
-        list(run_indices(index_tasks(tmp_path, [INDICES["ndvi"]], tmp_path)))
+        indices_of(tmp_path)
         assert (tmp_path / "flight.geojson").read_text() == text
 
 

@@ -16,7 +16,6 @@ from agalign.batch.index_run import index_tasks, run_indices
 from agalign.errors import ConfigurationError, InputError
 from agalign.products.indices.formulas import (
     INDICES,
-    Index,
     bands_for,
     compute,
     evaluate,
@@ -31,14 +30,7 @@ from agalign.products.sidecar.file import read_sidecar, verify_outputs, write_si
 from agalign.products.sidecar.schema import ProductPart
 
 from ..conftest import write_band
-
-NDVI, NDRE = INDICES["ndvi"], INDICES["ndre"]
-
-
-def run(out: Path, *indices: Index, target: Path | None = None, overwrite: bool = False) -> list[IndexReport]:
-    tasks = index_tasks(out, indices or (NDVI,), target or out, overwrite=overwrite)
-    return [r for done in run_indices(tasks, jobs=1) for r in done]
-
+from .conftest import indices_of
 
 NO_FORMULAS = """__import__('os').system('true')\nN.real\n(lambda: N)()\nN if R else B\n[N][0]\nN; R\nN @ R\n'a'*N
 sqrt(N, R)\nopen(N)\nN < R\nf'{N}'\n1e40*N\nN and R"""
@@ -129,7 +121,7 @@ def test_a_built_in_index_has_the_value_of_the_catalogue(name: str) -> None:
 def test_values_statistics_and_tags_of_a_raster(tmp_path: Path) -> None:
     make_aligned(tmp_path, 1)
     mine = index_of_formula("mine = (N-RE)/(N+RE)")
-    ndvi, ndre, by_formula = run(tmp_path, NDVI, NDRE, mine)
+    ndvi, ndre, by_formula = indices_of(tmp_path, "ndvi", "ndre", mine)
     with rasterio.open(tmp_path / "0000SET" / "IMG_0001.tif") as stack:
         _, red, nir, _ = stack.read().astype(float)
     truth = (nir - red) / (nir + red)
@@ -151,7 +143,7 @@ def test_raw_numbers_are_named_and_drawn_in_neutral_greys(tmp_path: Path) -> Non
     folders = tmp_path / "raw", tmp_path / "reflectance"
     for folder in folders:
         make_aligned(folder, 1, raw=folder.name == "raw")
-    (of_raw,), (of_reflectance,) = map(run, folders)
+    (of_raw,), (of_reflectance,) = map(indices_of, folders)
     assert [report.statistics.unit for report in (of_raw, of_reflectance)] == [RAW, "reflectance"]
     with rasterio.open(of_raw.path) as dataset:
         assert dataset.tags()["INPUT"] == "raw numbers, not reflectance"
@@ -166,27 +158,27 @@ def test_raw_numbers_are_named_and_drawn_in_neutral_greys(tmp_path: Path) -> Non
 
 def test_only_new_indices_are_calculated(tmp_path: Path) -> None:
     make_aligned(tmp_path, 3)
-    assert [r.kept for r in run(tmp_path)] == [False] * 3
+    assert [r.kept for r in indices_of(tmp_path)] == [False] * 3
     rasters = sorted(tmp_path.rglob("*_ndvi.tif"))
     before = [p.stat().st_mtime_ns for p in rasters]
-    assert [r.kept for r in run(tmp_path, NDVI, NDRE)] == [True, False] * 3
+    assert [r.kept for r in indices_of(tmp_path, "ndvi", "ndre")] == [True, False] * 3
     assert [p.stat().st_mtime_ns for p in rasters] == before
     os.truncate(rasters[0], rasters[0].stat().st_size - 300)
     rasters[1].with_suffix(".png").unlink()
     sidecar = rasters[2].with_name("IMG_0003.json")
     sidecar.write_text(sidecar.read_text().replace(f"{3:064x}", f"{9:064x}"))  # another stack
-    assert [r.kept for r in run(tmp_path)] == [False] * 3
-    assert [r.kept for r in run(tmp_path)] == [True] * 3
+    assert [r.kept for r in indices_of(tmp_path)] == [False] * 3
+    assert [r.kept for r in indices_of(tmp_path)] == [True] * 3
     changed = index_of_formula("x=N/R"), index_of_formula("x=N/G")
-    assert [r.kept for index in changed for r in run(tmp_path, index)] == [False] * 6
-    assert [r.kept for r in run(tmp_path, changed[1], overwrite=True)] == [False] * 3
+    assert [r.kept for index in changed for r in indices_of(tmp_path, index)] == [False] * 6
+    assert [r.kept for r in indices_of(tmp_path, changed[1], overwrite=True)] == [False] * 3
 
 
 def test_the_table_has_a_row_per_capture_and_index(tmp_path: Path) -> None:
     make_aligned(tmp_path / "out", 2)
     target = tmp_path / "indices"
-    run(tmp_path / "out", NDVI, target=target)
-    run(tmp_path / "out", NDRE, target=target)
+    indices_of(tmp_path / "out", "ndvi", target=target)
+    indices_of(tmp_path / "out", "ndre", target=target)
     rows = list(csv.DictReader((target / "indices.csv").read_text().splitlines()))
     names = [(capture, index) for capture in ("IMG_0001", "IMG_0002") for index in ("ndre", "ndvi")]
     assert [(r["capture"], r["index"]) for r in rows] == names
@@ -210,7 +202,7 @@ def test_a_damaged_table_is_written_again(tmp_path: Path, line: str) -> None:
 def test_one_damaged_stack_costs_only_its_own_indices(tmp_path: Path) -> None:
     make_aligned(tmp_path, 2)
     os.truncate(tmp_path / "0000SET" / "IMG_0001.tif", 3000)
-    bad, good = run(tmp_path)
+    bad, good = indices_of(tmp_path)
     assert "IMG_0001.tif" in bad.problem
     assert good.path is not None
 
@@ -237,17 +229,17 @@ def test_the_sidecar_has_the_checksums_of_replaced_rasters(tmp_path: Path) -> No
     path = tmp_path / "0000SET" / "IMG_0001.json"
     old = [ProductPart(kind="index", file=f"IMG_0001_ndvi{end}", bytes=1, sha256="0" * 64) for end in (".tif", ".png")]
     write_sidecar(path, read_sidecar(path).model_copy(update={"products": old}))
-    run(tmp_path, NDVI, target=tmp_path / "elsewhere")
+    indices_of(tmp_path, "ndvi", target=tmp_path / "elsewhere")
     assert read_sidecar(path).products == old
-    run(tmp_path, NDVI, NDRE)
+    indices_of(tmp_path, "ndvi", "ndre")
     assert list(verify_outputs(tmp_path)) == [(path, [])]
     assert [part.file for part in read_sidecar(path).products] == ["IMG_0001_ndvi.tif", "IMG_0001_ndvi.png"]
 
 
 def test_processes_write_what_one_process_writes(tmp_path: Path) -> None:
     make_aligned(tmp_path, 20)
-    serial = {r.capture: r.statistics for r in run(tmp_path, target=tmp_path / "a")}
-    tasks = index_tasks(tmp_path, [NDVI], tmp_path / "b")
+    serial = {r.capture: r.statistics for r in indices_of(tmp_path, target=tmp_path / "a")}
+    tasks = index_tasks(tmp_path, [INDICES["ndvi"]], tmp_path / "b")
     parallel = {r.capture: r.statistics for d in run_indices(tasks, jobs=2) for r in d}
     assert parallel == serial
     one, other = (tmp_path / n / "0000SET" / "IMG_0007_ndvi.tif" for n in "ab")
@@ -256,7 +248,7 @@ def test_processes_write_what_one_process_writes(tmp_path: Path) -> None:
 
 def test_the_report_has_the_indices(tmp_path: Path) -> None:
     make_aligned(tmp_path, 2)
-    run(tmp_path, NDVI, NDRE)
+    indices_of(tmp_path, "ndvi", "ndre")
     write_pages(tmp_path, pytest.fail)
     page = (tmp_path / "index.html").read_text()
     facts = json.loads(page.split('id="facts">')[1].split("</script>")[0])

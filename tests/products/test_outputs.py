@@ -11,10 +11,7 @@ import tifffile
 from synthetic_flights.troubles import make_terraces
 
 import agalign
-from agalign.batch.index_run import do_indices, index_tasks, run_indices
 from agalign.capture.tag_seeds import geo_seed
-from agalign.products.indices.formulas import INDICES
-from agalign.products.indices.rasters import IndexReport
 from agalign.products.rasters.aligned_files import band_file_names
 from agalign.products.sidecar.file import verify_outputs
 from agalign.synthetic import flight as synthetic
@@ -23,6 +20,7 @@ from agalign.values.capture import Band, Capture, Georeference
 
 from ..builders import in_full_run
 from ..conftest import Shared, read_json, seeded, textured_image, write_band, write_capture
+from .conftest import indices_of
 
 pytestmark = pytest.mark.slow
 ONLY_SEED = seeded("identity")
@@ -34,11 +32,6 @@ def written(folder: Path, settings: agalign.Settings = ONLY_SEED, **options: Any
         folder / "in", folder / "out", settings=settings, run=agalign.RunOptions(**options)
     )
     return report
-
-
-def indices_of(out: Path, *names: str) -> list[IndexReport]:
-    tasks = index_tasks(out, [INDICES[name] for name in names], out, overwrite=True)
-    return [report for done in run_indices(tasks) for report in done]
 
 
 @pytest.fixture
@@ -118,7 +111,7 @@ def calibrated(shared: Shared, tmp_path: Path) -> Path:
 
 def test_ndvi_of_the_synthetic_flight_is_its_truth(calibrated: Path) -> None:
     out = calibrated / "out"
-    (result,) = indices_of(out, "ndvi")
+    (result,) = indices_of(out, overwrite=True)
     assert (result.problem, result.raw_numbers) == ("", False)
     with rasterio.open(result.path) as dataset:
         value = dataset.read(1)
@@ -139,8 +132,7 @@ def test_indices_and_error_map_are_removed_if_not_requested(calibrated: Path) ->
     assert files == ["IMG_0001_ndvi.tif", "IMG_0001_ndvi.png", "IMG_0001_savi.tif", "IMG_0001_savi.png"]
     table = (out / "indices.csv").read_text().splitlines()
     assert [line.split(",")[5] for line in table] == ["index", "ndvi", "savi"]
-    (task,) = index_tasks(out, [INDICES["ndvi"]], out)
-    (report,) = do_indices(task)
+    (report,) = indices_of(out)
     assert report.kept, "the command does not replace them: their checksums are in the sidecar"
     assert [problems for _, problems in verify_outputs(out)] == [[]]
     (path,) = out.rglob("*.error.tif")
@@ -161,7 +153,7 @@ def test_bands_in_different_units_make_no_index(calibrated: Path) -> None:
     ):
         with rasterio.open(stack, "r+") as dataset:
             dataset.update_tags(dataset.descriptions.index(band) + 1, QUANTITY="radiance")
-        assert problem in indices_of(calibrated / "out", index)[0].problem
+        assert problem in indices_of(calibrated / "out", index, overwrite=True)[0].problem
 
 
 @pytest.mark.parametrize(

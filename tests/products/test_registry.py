@@ -16,6 +16,7 @@ from agalign.products.registry import PRODUCTS
 from agalign.values.files import write_text
 
 from ..conftest import raising, read_json, seeded, write_capture
+from .conftest import change
 
 ALL, PLAIN = seeded("identity", layout="both", error_map=True, stac=True), seeded("identity")
 Align = Callable[..., agalign.CaptureReport]
@@ -109,9 +110,8 @@ def test_files_of_an_earlier_sidecar_are_removed(align: Align, tmp_path: Path) -
     align(PLAIN)
     sidecar, old = tmp_path / "out" / "f.json", tmp_path / "out" / "f.depth.tif"
     shutil.copy(tmp_path / "out" / "f.tif", old)
-    data = read_json(sidecar)
-    data["products"].append({"kind": "depth", "file": old.name, "bytes": 1, "sha256": ""})
-    sidecar.write_text(json.dumps(data))
+    of_old = {"kind": "depth", "file": old.name, "bytes": 1, "sha256": ""}
+    change(sidecar, products=[*read_json(sidecar)["products"], of_old])
     assert align(PLAIN, overwrite=True).state == "done"
     assert not old.exists()
 

@@ -21,6 +21,7 @@ from agalign.products.report.pages import pages_exist, write_pages
 from agalign.products.report.preview import ReliefView, preview_bytes, write_preview
 
 from ..conftest import raising, read_json, save_known_model, textured_image
+from .conftest import change
 
 PAGE = Path(agalign.__file__).parent / "products" / "report"
 
@@ -66,10 +67,6 @@ def headline(out: Path) -> str:
     write_pages(out, pytest.fail)
     page = (out / "index.html").read_text(encoding="utf-8")
     return " ".join(re.sub("<[^>]+>", "", page.partition('<p class="verdict">')[2].partition("</p>")[0]).split())
-
-
-def change(path: Path, **changes: Any) -> None:
-    path.write_text(json.dumps(read_json(path) | changes))
 
 
 @pytest.mark.slow

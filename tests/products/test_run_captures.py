@@ -1,6 +1,5 @@
 """Products of several captures when one of them differs: its light sensor failed, or it lacks a band."""
 
-import json
 import os
 import re
 import shutil
@@ -23,6 +22,7 @@ from agalign.synthetic import flight as synthetic
 
 from ..conftest import Shared, read_json, seeded
 from ..program import agalign_here
+from .conftest import change
 
 FIRST = "0000SET/000/IMG_0001"
 REASON = "it has radiance, and 5 of 6 captures have reflectance"
@@ -86,9 +86,8 @@ def test_the_exception_is_what_differs_from_most(run: Path, tmp_path: Path) -> N
     out = shutil.copytree(run, tmp_path / "out")
     (out / f"{FIRST}.tif").unlink()
     second = out / "0000SET" / "000" / "IMG_0002.json"
-    content = read_json(second)
-    content["bands"][3]["place"] = None
-    second.write_text(json.dumps(content))
+    bands = read_json(second)["bands"]
+    change(second, bands=[*bands[:3], bands[3] | {"place": None}, *bands[4:]])
     with pytest.warns(UserWarning, match="IMG_0002: left out: it has bands Blue") as warned:
         flight = agalign.open_flight(out)
     assert f"{FIRST}.tif: does not exist" in str(warned[0].message)
