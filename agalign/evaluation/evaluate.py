@@ -3,10 +3,10 @@
 import math
 import time
 import zlib
-from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import astuple, dataclass, fields
+from itertools import product
 from pathlib import Path
-from typing import TypeVar
 
 import numpy as np
 
@@ -19,8 +19,6 @@ from agalign.method.patches import Keypoints
 from agalign.products.text_files import write_csv
 from agalign.values import geometry
 from agalign.values.geometry import Matrix
-
-Key = TypeVar("Key", bound=Hashable)
 
 
 @dataclass(frozen=True)
@@ -111,9 +109,10 @@ def precision_table(results: Sequence[Result]) -> list[list[str]]:
     groups = list(dict.fromkeys(r.group for r in results))
     totals = ["all"] if len(groups) > 1 else []
     rows = [["method", *groups, *totals, "pairs"]]
-    for method, own in _grouped(described, lambda r: r.method).items():
-        by_group = _grouped(own, lambda r: r.group)
-        means = [_mean_precision(by_group.get(g, [])) for g in groups] + [_mean_precision(own) for _ in totals]
+    for method in dict.fromkeys(r.method for r in described):
+        own = [r for r in described if r.method == method]
+        means = [_mean_precision([r for r in own if r.group == group]) for group in groups]
+        means += [_mean_precision(own) for _ in totals]
         rows.append([method, *(f"{m:.3f}" for m in means), str(len({r.pair for r in own}))])
     return rows
 
@@ -123,11 +122,10 @@ def error_table(results: Sequence[Result]) -> list[list[str]]:
     rows = [
         ["method", "start off by", "median error, px", "worst, px", "mean, % of the side", "under 1 px", "mAP", "s"]
     ]
-    shifts = list(dict.fromkeys(r.shift for r in results))
     measured = [r for r in results if not math.isnan(r.error_px)]
-    for method, own in _grouped(measured, lambda r: r.method).items():
-        by_shift = _grouped(own, lambda r: r.shift)
-        rows += [_error_row(method, shift, by_shift[shift]) for shift in shifts if shift in by_shift]
+    for method, shift in product(*(dict.fromkeys(getattr(r, name) for r in results) for name in ("method", "shift"))):
+        own = [r for r in measured if (r.method, r.shift) == (method, shift)]
+        rows += [_error_row(method, shift, own)] if own else []
     return rows
 
 
@@ -144,14 +142,6 @@ def _error_row(method: str, shift: float, own: Sequence[Result]) -> list[str]:
         f"{_mean_precision(own):.3f}",
         f"{np.median([r.seconds for r in own]):.1f}",
     ]
-
-
-def _grouped(results: Sequence[Result], key: Callable[[Result], Key]) -> dict[Key, list[Result]]:
-    """Return the results grouped by a key, in the order of first occurrence."""
-    groups: dict[Key, list[Result]] = {}
-    for result in results:
-        groups.setdefault(key(result), []).append(result)
-    return groups
 
 
 def _mean_precision(results: Sequence[Result]) -> float:

@@ -1,3 +1,4 @@
+import csv
 import json
 from pathlib import Path
 
@@ -20,6 +21,12 @@ CAMERAS = {"RedEdge": REDEDGE, "M3M calibrated": MAVIC, "M3M": MAVIC_3M, "6X": S
 def change(path: Path, **changes: object) -> None:
     """Replace entries of the JSON object in a file."""
     path.write_text(json.dumps(read_json(path) | changes))
+
+
+def table_in(path: Path) -> list[dict[str, str]]:
+    """The rows of a CSV file."""
+    with path.open(newline="", encoding="utf-8") as file:
+        return list(csv.DictReader(file))
 
 
 def indices_of(

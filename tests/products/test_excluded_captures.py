@@ -1,6 +1,5 @@
 """Captures of a panel and of the sky in a flight, start to end."""
 
-import csv
 import json
 import shutil
 from html import unescape
@@ -22,7 +21,7 @@ from agalign.products.run.excluded import PANELS_FILE, SKY_FILE, PanelPart, read
 
 from ..conftest import Shared, read_json, seeded
 from ..program import agalign_here
-from .conftest import SUN
+from .conftest import SUN, table_in
 
 
 @pytest.fixture
@@ -60,8 +59,7 @@ def test_panels_are_named_and_drawn_and_kept_out(by_panel: Path) -> None:
     panels = read_json(by_panel / PANELS_FILE)["panels"]
     assert [p["capture"] for p in panels] == ["IMG_0001", "IMG_0004"]
     assert [b["albedo"] for p in panels for b in p["bands"]] == pytest.approx([0.51] * 10)
-    table = csv.DictReader((by_panel / "summary.csv").read_text().splitlines())
-    rows = [r for r in table if r["status"] == "panel"]
+    rows = [r for r in table_in(by_panel / "summary.csv") if r["status"] == "panel"]
     assert {(r["capture"], r["band"]) for r in rows} >= {("IMG_0001", "NIR"), ("IMG_0004", "Green")}
     page = (by_panel / "index.html").read_text()
     assert "Calibration panels" in page
@@ -133,8 +131,7 @@ def test_the_sky_is_left_out_and_named(with_sky: Path, tmp_path: Path) -> None:
     assert (part.folder, part.capture, [b.band for b in part.bands]) == ("sky", "S1", ["Blue", "Green", "NIR"])
     assert part.cues == ["its folder or name contains 'sky'", "no band has texture"]
     assert not list(out.rglob("S1*"))
-    table = csv.DictReader((out / "summary.csv").read_text().splitlines())
-    rows = [r for r in table if r["status"] == "sky"]
+    rows = [r for r in table_in(out / "summary.csv") if r["status"] == "sky"]
     assert [(r["folder"], r["capture"], r["band"]) for r in rows] == [("sky", "S1", b.band) for b in part.bands]
     assert "Sky captures" in (out / "index.html").read_text()
     assert read_json(out / "agalign-run.json")["captures"] == {"found": 2, "sky": 1, "done": 1}

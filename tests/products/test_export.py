@@ -1,6 +1,5 @@
 """What other programs take: band files under names of their own, and matrices that do in OpenCV what the run did."""
 
-import csv
 import shutil
 from pathlib import Path
 
@@ -16,7 +15,7 @@ from agalign.products.sidecar.file import find_sidecars, read_sidecar
 from agalign.values.choices import ExportProgram
 
 from ..conftest import Shared, read_json, seeded
-from .conftest import change
+from .conftest import change, table_in
 
 pytestmark = pytest.mark.slow
 
@@ -87,8 +86,7 @@ def test_matrices_for_opencv_are_between_raw_pixels(run: Path, tmp_path: Path) -
         assert error_px == pytest.approx(arrays["max_error_px"][k], abs=1e-6)
         assert 0 < error_px < 2.0
     np.testing.assert_array_equal(arrays["matrices"][1], np.eye(3))
-    rows = list(csv.DictReader((tmp_path / "matrices.csv").read_text().splitlines()))
-    assert [r["band"] for r in rows] == arrays["bands"].tolist()
+    assert [r["band"] for r in table_in(tmp_path / "matrices.csv")] == arrays["bands"].tolist()
     assert "Largest distance" in report.notes[-1]
 
 

@@ -1,4 +1,3 @@
-import csv
 import json
 import os
 import re
@@ -30,7 +29,7 @@ from agalign.products.sidecar.file import read_sidecar, verify_outputs, write_si
 from agalign.products.sidecar.schema import ProductPart
 
 from ..conftest import write_band
-from .conftest import indices_of
+from .conftest import indices_of, table_in
 
 NO_FORMULAS = """__import__('os').system('true')\nN.real\n(lambda: N)()\nN if R else B\n[N][0]\nN; R\nN @ R\n'a'*N
 sqrt(N, R)\nopen(N)\nN < R\nf'{N}'\n1e40*N\nN and R"""
@@ -179,7 +178,7 @@ def test_the_table_has_a_row_per_capture_and_index(tmp_path: Path) -> None:
     target = tmp_path / "indices"
     indices_of(tmp_path / "out", "ndvi", target=target)
     indices_of(tmp_path / "out", "ndre", target=target)
-    rows = list(csv.DictReader((target / "indices.csv").read_text().splitlines()))
+    rows = table_in(target / "indices.csv")
     names = [(capture, index) for capture in ("IMG_0001", "IMG_0002") for index in ("ndre", "ndvi")]
     assert [(r["capture"], r["index"]) for r in rows] == names
     assert [(r["latitude"], r["valid_share"], r["input"]) for r in rows] == [("52.0", "1.0", "reflectance")] * 4

@@ -200,10 +200,6 @@ def test_the_command_states_the_misfit(survey: Path, tmp_path: Path) -> None:
     assert [p.name for p in tmp_path.iterdir()] == ["field.tif"]
 
 
-def without_positions(out: Path) -> None:
-    (out / "flight.geojson").unlink()
-
-
 def with_another_band(out: Path) -> None:
     sidecar = read_sidecar(out / "0000SET" / "IMG_0001.json")
     bands = [b.model_copy(update={"band": "Blue"}) if b.band == "Red" else b for b in sidecar.bands]
@@ -222,6 +218,8 @@ def with_changed_entry(part: str = "properties", **changes: Any) -> Callable[[Pa
 
 
 DAMAGED = "IMG_0009: left out: its entry in flight.geojson is damaged; run again with --overwrite"
+NO_FOOTPRINT = "IMG_0009: left out: it has no footprint in flight.geojson"
+NONE_PLACED = "no capture can be placed, because flight.geojson has no footprints"
 
 
 @pytest.mark.parametrize(
@@ -231,15 +229,10 @@ DAMAGED = "IMG_0009: left out: its entry in flight.geojson is damaged; run again
         in_full_run(with_changed_entry(height_m=1e308), (), 3, DAMAGED),
         in_full_run(with_changed_entry(accuracy_m=-1), (), 3, DAMAGED),
         in_full_run(with_changed_entry(longitude=1e308), (), 3, "IMG_0009: left out: "),
-        (with_changed_entry(sidecar="../x.json"), (), 3, "IMG_0009: left out: it has no footprint in flight.geojson"),
-        in_full_run(
-            with_changed_entry("geometry", coordinates=[[[1e308, 0]] * 5]),
-            (),
-            3,
-            "IMG_0009: left out: it has no footprint in flight.geojson",
-        ),
-        (with_changed_entry(accuracy_m=math.nan), (), 1, "flight.geojson has no footprints"),
-        (without_positions, (), 1, "no capture can be placed, because flight.geojson has no footprints"),
+        (with_changed_entry(sidecar="../x.json"), (), 3, NO_FOOTPRINT),
+        in_full_run(with_changed_entry("geometry", coordinates=[[[1e308, 0]] * 5]), (), 3, NO_FOOTPRINT),
+        (with_changed_entry(accuracy_m=math.nan), (), 1, NONE_PLACED),
+        (lambda out: (out / "flight.geojson").unlink(), (), 1, NONE_PLACED),
         in_full_run(with_another_band, (), 3, "IMG_0001: left out: it has bands Green (560 nm), Blue (668 nm), NIR"),
         (None, ("--gsd", "0.0001"), 2, "pixels, which is too many; increase --gsd"),
         (None, ("-i", "nonsense"), 2, "unknown index 'nonsense'"),

@@ -248,13 +248,9 @@ def test_the_file_of_a_photograph_does_not_take_the_name_of_the_stack() -> None:
     "options",
     [
         {"layout": "both", "undistort": True, "resolution": "finest"},
-        pytest.param(
-            {"layout": "bands", "format": "cog", "crop": "none", "radiometry": "auto"}, marks=pytest.mark.full
-        ),
+        in_full_run({"layout": "bands", "format": "cog", "crop": "none", "radiometry": "auto"}),
         in_full_run({"layout": "both", "radiometry": "auto", "stac": True, "interpolation": "nearest"}),
-        pytest.param(
-            {"layout": "stack", "format": "cog", "undistort": True, "compression": "none"}, marks=pytest.mark.full
-        ),
+        in_full_run({"layout": "stack", "format": "cog", "undistort": True, "compression": "none"}),
     ],
     ids=str,
 )

@@ -1,6 +1,5 @@
 """What the report knows and draws, without a browser."""
 
-import csv
 import json
 import re
 import shutil
@@ -21,7 +20,7 @@ from agalign.products.report.pages import pages_exist, write_pages
 from agalign.products.report.preview import ReliefView, preview_bytes, write_preview
 
 from ..conftest import raising, read_json, save_known_model, textured_image
-from .conftest import change
+from .conftest import change, table_in
 
 PAGE = Path(agalign.__file__).parent / "products" / "report"
 
@@ -89,7 +88,7 @@ def test_the_headline_counts_what_was_to_be_aligned(out: Path) -> None:
 def test_missing_bands_and_references_are_in_the_summary(out: Path) -> None:
     change(out / "0000SET" / "000" / "IMG_0002.json", status="degraded", missing_bands=["Thermal"])
     write_pages(out, pytest.fail)
-    rows = list(csv.DictReader((out / "summary.csv").read_text().splitlines()))
+    rows = table_in(out / "summary.csv")
     assert [r["status"] for r in rows] == ["aligned"] * 8 + ["missing"]
     assert {r["reference"] for r in rows} == {"Green"}
     assert (rows[-1]["folder"], rows[-1]["capture"], rows[-1]["band"]) == ("0000SET/000", "IMG_0002", "Thermal")

@@ -161,19 +161,16 @@ def test_the_grid_is_fine_where_a_lens_bends_it() -> None:
 @pytest.mark.parametrize("name", ["../a.tif", "/vsicurl/http://example.org/a.tif", "C:/a.tif"])
 def test_a_sidecar_names_no_file_elsewhere(tmp_path: Path, name: str) -> None:
     path = tmp_path / "a.json"
-    data = json.loads(example(bands=[NIR | {"reason": None}]).model_dump_json(by_alias=True))
-    path.write_text(json.dumps(data))
-    read_sidecar(path)
-    for change in (
-        lambda d: d["output"].update(file=name),
-        lambda d: d.update(capture=name),
-        lambda d: d["output"]["band_files"].append({"file": name, "bytes": 1, "nodata": None}),
-        lambda d: d["bands"][0].update(place={"file": name, "band_index": 1}),
-        lambda d: d.update(products=[{"kind": "stack", "file": name, "bytes": 1, "sha256": ""}]),
+    write_sidecar(path, example())
+    data, file = read_json(path), {"file": name, "bytes": 1}
+    for changes in (
+        {"output": data["output"] | {"file": name}},
+        {"output": data["output"] | {"band_files": [file | {"nodata": None}]}},
+        {"capture": name},
+        {"bands": [data["bands"][0] | {"place": {"file": name, "band_index": 1}}]},
+        {"products": [file | {"kind": "stack", "sha256": ""}]},
     ):
-        changed = json.loads(json.dumps(data))
-        change(changed)
-        path.write_text(json.dumps(changed))
+        path.write_text(json.dumps(data | changes))
         with pytest.raises(SidecarError, match="names a file outside its folder"):
             read_sidecar(path)
 

@@ -1,6 +1,5 @@
 """Tie points are measured: they match the truth even where the alignment that they are measured under does not."""
 
-import csv
 import json
 from pathlib import Path
 
@@ -14,13 +13,13 @@ from agalign.synthetic.flight import make_flight
 from agalign.values.capture import Georeference
 
 from ..conftest import read_json, seeded
+from .conftest import table_in
 
 
 def tie_errors(report: agalign.CaptureReport, flight: Path) -> dict[str, np.ndarray]:
     """{band: distance (n,) of its tie points from the truth, px; nan outside of the known points}."""
     truth = read_json(flight / "truth.json")[report.path.stem]["bands"]
-    rows = list(csv.DictReader(report.path.with_suffix(".ties.csv").read_text().splitlines()))
-    result = {}
+    rows, result = table_in(report.path.with_suffix(".ties.csv")), {}
     for band in report.sidecar.bands:
         if band.status == "reference":
             continue
@@ -40,7 +39,7 @@ def test_tie_points_match_the_truth_where_the_alignment_is_off(flight: Path, tmp
     (report, *_) = agalign.align_folder(
         flight, tmp_path, settings=seeded("rig", tie_points=True), options=agalign.DiscoverOptions(bands=bands)
     )
-    rows = list(csv.DictReader(report.path.with_suffix(".ties.csv").read_text().splitlines()))
+    rows = table_in(report.path.with_suffix(".ties.csv"))
     errors_px = tie_errors(report, flight)
     for band in report.sidecar.bands:
         own = [r for r in rows if r["band"] == band.band]

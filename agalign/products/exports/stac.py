@@ -144,12 +144,12 @@ def _add_assets(item: "pystac.Item", context: ProductContext) -> None:
     from pystac.extensions.eo import EOExtension
     from pystac.extensions.raster import RasterExtension
 
-    folder, sidecar = context.paths.folder, context.paths.sidecar
+    sidecar = context.paths.sidecar
     by_name = {b.name: b for b in context.capture.bands}
     for file in context.written:
         if file.asset is None:
             continue
-        href, roles = file.path.relative_to(folder).as_posix(), list(file.asset.roles)
+        href, roles = context.paths.relative(file.path), list(file.asset.roles)
         asset = pystac.Asset(href, roles=roles, media_type=file.asset.media_type)
         item.add_asset(file.asset.key, asset)
         if file.bands:
