@@ -149,7 +149,7 @@ def align(flight: Path, out: Path, *options: str) -> float:
 
 
 def writable_copy(folder: Path, copy: Path) -> None:
-    """Copy a folder whose files may be read-only."""
+    """Copy a folder, in which files may be read-only, so that the copy can be changed."""
     shutil.copytree(folder, copy, copy_function=shutil.copyfile)
     for path in (copy, *copy.rglob("*/")):
         path.chmod(0o755)

@@ -1,21 +1,145 @@
-"""Aligned bands as the programs that come next read them, with the libraries that they read them with."""
+"""Aligned bands as the programs that come next read them: OpenDroneMap, by the rules in `tests/odm.py`, and others."""
 
+import math
 from pathlib import Path
 from typing import Any
 
 import exifread
+import numpy as np
 import pytest
 import xmltodict
 from PIL import Image
 
 import agalign
-from agalign.products.sidecar.file import find_sidecars
+from agalign.cameras.pix4d import vignetting_on_grid
+from agalign.products.exports.programs import export
+from agalign.products.rasters import aligned_files
+from agalign.products.rasters.layout import Layer
+from agalign.products.sidecar.file import find_sidecars, read_sidecar
 from agalign.synthetic.camera_model import CameraSpec
+from agalign.values import geometry
+from agalign.values.capture import Band, Radiometry
+from agalign.values.choices import ExportProgram
+from agalign.values.image import OutputGrid
+from agalign.values.mapping import PixelMapping
 
+from ..builders import in_full_run
 from ..conftest import Shared, read_json, seeded
+from ..odm import OdmPhoto, pixels_in
 from .conftest import CAMERAS, capture_by
 
-pytestmark = pytest.mark.slow
+IRRADIANCE = 0.8
+"""Of the synthetic flight, W / m^2 / nm."""
+
+
+def exported(
+    shared: Shared, out: Path, program: ExportProgram = "odm", camera: str = "RedEdge", **write: object
+) -> list[OdmPhoto]:
+    """The files of an export of one capture, the reference first."""
+    agalign.align_folder(capture_by(camera, shared), out / "out", settings=seeded(layout="bands", **write))
+    for path in find_sidecars(out / "out"):
+        path.write_text(path.read_text().replace('"degraded"', '"ok"'))
+    report = export(out / "out", out / "export", program)
+    return [OdmPhoto(path) for path in report.files]
+
+
+def option(out: Path) -> str:
+    """The value of --radiometric-calibration that the export recommends."""
+    return (out / "export" / "README.txt").read_text().partition("--radiometric-calibration ")[2].split()[0]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["RedEdge", "M3M", *map(in_full_run, ("M3M calibrated", "6X"))])
+def test_bands_are_one_camera_and_one_capture(name: str, shared: Shared, tmp_path: Path) -> None:
+    photos = exported(shared, tmp_path, camera=name)
+    assert len(photos) >= 4
+    assert len({p.camera_id for p in photos}) == 1
+    assert len({p.capture_uuid for p in photos}) == 1
+    assert len({p.band_name for p in photos}) == len(photos)
+    assert len({len(p.vignetting[1]) for p in photos}) == 1
+    with_sun = option(tmp_path) == "camera+sun"
+    assert with_sun == all(p.horizontal_irradiance is not None for p in photos) == (name == "RedEdge")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("program", ["odm", *map(in_full_run, ("metashape", "pix4d"))])
+def test_its_reflectance_is_that_of_this_program(program: ExportProgram, shared: Shared, tmp_path: Path) -> None:
+    """Vignetting on the aligned grid, black level, exposure, gain, calibration and irradiance."""
+    photos = exported(shared, tmp_path, program)
+    expected = exported(shared, tmp_path / "by agalign", program, radiometry="sun")
+    check_reflectance(photos, expected)
+    assert all(p.vignetting[1] for p in photos)
+    assert not any(p.vignetting[1] or p.xmp("Camera:HorizontalIrradiance") for p in expected)
+    (sidecar,) = map(read_sidecar, find_sidecars(tmp_path / "by agalign" / "out"))
+    light = [(band.irradiance, band.reflectance_per_radiance) for band in sidecar.output.illumination]
+    assert light == [pytest.approx((IRRADIANCE, math.pi / IRRADIANCE))] * len(photos)
+
+
+@pytest.mark.full
+@pytest.mark.slow
+def test_vignetting_follows_pixels_without_distortion(shared: Shared, tmp_path: Path) -> None:
+    photos = exported(shared, tmp_path, undistort=True)
+    assert all(p.vignetting[1] for p in photos)
+    check_reflectance(photos, exported(shared, tmp_path / "r", undistort=True, radiometry="sun"))
+
+
+@pytest.mark.slow
+def test_vignetting_that_no_polynomial_follows_is_corrected_in_all_bands(
+    shared: Shared, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(aligned_files, "_MAX_VIGNETTING_ERROR", 1e-7)  # of the reference, which is not moved: 1e-16
+    photos = exported(shared, tmp_path)
+    assert not any(p.vignetting[1] or b"Vignetting" in p.path.read_bytes() for p in photos)
+    check_reflectance(photos, exported(shared, tmp_path / "r", radiometry="sun"))
+    notes = (tmp_path / "export" / "README.txt").read_text()
+    assert "The vignetting of 1 capture is corrected in the pixels of all bands." in notes
+    assert {pixels_in(p.path).dtype.name for p in photos} == {"uint16"}
+
+
+def check_reflectance(photos: list[OdmPhoto], expected: list[OdmPhoto]) -> None:
+    assert [p.path.name for p in photos] == [p.path.name for p in expected]
+    for photo, other in zip(photos, expected, strict=True):
+        assert photo.horizontal_irradiance == pytest.approx(IRRADIANCE)
+        values = pixels_in(other.path)
+        valid = (values > 0.02) & (pixels_in(photo.path) > 0)
+        errors = np.abs(photo.reflectance()[valid] / values[valid] - 1)
+        assert np.median(errors) < 0.002, photo.band_name
+        assert np.percentile(errors, 99) < 0.01, photo.band_name
+
+
+OUTPUT_PX = geometry.lattice(480, 360, 25, 19)
+VIGNETTING = Radiometry("relative radiance", 0.0, 1.0, 1.0, (243.0, 176.0), (0.0, -4e-6, 0.0))
+
+
+@pytest.mark.parametrize("bump_px", [0.0, 8.0])
+def test_a_disturbed_centre_does_not_matter(bump_px: float) -> None:
+    """Relief or a field around the centre pixel: a scale there says nothing about the corners."""
+    distance_px = np.linalg.norm(OUTPUT_PX - (240, 180), axis=1, keepdims=True)
+    positions_px = 1.01 * OUTPUT_PX + (5.0, -3.0) + bump_px * np.exp(-((distance_px / 20) ** 2)) * (1.0, 0.3)
+    result = vignetting_on_grid(VIGNETTING, OUTPUT_PX, positions_px)
+    assert result.error < 0.002
+    assert result.centre_px == pytest.approx(((243 - 5) / 1.01, (176 + 3) / 1.01), abs=0.3)
+    at_px = 250.0
+    falloff = np.polynomial.polynomial.polyval(at_px, (1.0, *result.coefficients))
+    assert falloff == pytest.approx(1 - 4e-6 * (1.01 * at_px) ** 2, abs=0.002)
+
+
+def test_bands_of_one_file_have_each_their_own_vignetting(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(aligned_files, "_correction", lambda _: VIGNETTING)
+    bands = [Band(name, Path("one.tif"), 1, 480, 360, "uint16") for name in "ab"]
+    layers = [Layer(b, PixelMapping(geometry.translation(dx, 0))) for b, dx in zip(bands, (3.0, -5.0), strict=True)]
+    result = aligned_files._vignettings(layers, OutputGrid(0, 0, 480, 360))
+    assert [result[name].centre_px[0] for name in "ab"] == pytest.approx([243 - 3, 243 + 5])
+
+
+def test_large_relief_is_no_polynomial() -> None:
+    rng = np.random.default_rng(0)
+    positions_px = OUTPUT_PX + rng.normal(0, 15, OUTPUT_PX.shape)
+    assert vignetting_on_grid(VIGNETTING, OUTPUT_PX, positions_px).error > 0.01
+
+
+# ---- tags of aligned bands
+
 
 CAPTURE_TAGS = ("@drone-dji:CaptureUUID", "MicaSense:CaptureId", "@Camera:CaptureUUID", "Camera:CaptureUUID")
 TAGS = [
@@ -70,6 +194,7 @@ def numbers(value: Any) -> list[float]:
     return [float(v) for v in str(value).split(",")]
 
 
+@pytest.mark.slow
 def test_bands_place_time_and_camera_are_as_before(aligned: Aligned) -> None:
     camera, folder, out = aligned
     before, after = ({p.name: xmp_of(p) for p in bands_of(f)} for f in (folder, out))
@@ -91,6 +216,7 @@ def test_bands_place_time_and_camera_are_as_before(aligned: Aligned) -> None:
             assert image.getexif().get_ifd(0x8825)[1] == "N"
 
 
+@pytest.mark.slow
 def test_tags_of_aligned_bands_describe_one_camera(aligned: Aligned) -> None:
     """All bands are one camera's now: no angles between them, one principal point, one lens, one homography."""
     camera, _, out = aligned
@@ -104,6 +230,7 @@ def test_tags_of_aligned_bands_describe_one_camera(aligned: Aligned) -> None:
         assert len({str(xmp.get(tag)) for xmp in packets}) == 1, tag
 
 
+@pytest.mark.slow
 def test_the_principal_point_is_on_the_pixel_that_it_was_on(aligned: Aligned) -> None:
     camera, folder, out = aligned
     (sidecar,) = find_sidecars(out)
@@ -124,6 +251,7 @@ def test_the_principal_point_is_on_the_pixel_that_it_was_on(aligned: Aligned) ->
     assert moved == pytest.approx([x0, y0], abs=0.01)
 
 
+@pytest.mark.slow
 def test_undistorted_files_have_tags_without_distortion(shared: Shared, tmp_path: Path) -> None:
     align(capture_by("M3M calibrated", shared), tmp_path, undistort=True)
     paths = bands_of(tmp_path)
