@@ -58,14 +58,10 @@ def replaced(old: str, new: str) -> Callable[[str], str]:
     return change
 
 
-def without_wrapper(packet: str) -> str:
-    return re.sub(r"</?x:xmpmeta[^>]*>", "", packet)
-
-
 DAMAGES: dict[str, Callable[[str], str]] = {
     "two end tags": lambda p: p + "\n</x:xmpmeta>",
     "an end tag too many in the middle": replaced("</rdf:Description>", "</rdf:Description></rdf:Description>"),
-    "no wrapper": without_wrapper,
+    "no wrapper": lambda p: re.sub(r"</?x:xmpmeta[^>]*>", "", p),
     "xapmeta": lambda p: p.replace("x:xmpmeta", "x:xapmeta"),
     "undeclared prefix of the camera": replaced(' xmlns:Camera="http://pix4d.com/camera/1.0"', ""),
     "undeclared prefix of RDF": replaced(' xmlns:rdf="http://www.w3.org/1999/02/22-rdf-syntax-ns#"', ""),

@@ -71,17 +71,8 @@ def test_missing_bands_and_unreadable_files_are_reported(images: Path) -> None:
 
 
 COPIES = (
-    *(
-        "{} - Copy",
-        "{} - Copy (2)",
-        "{} - Kopie",
-        "{} \N{EN DASH} copie",
-        "{} - コピー",
-        "{} copy",
-        "{} copy 2",
-        "{} (1)",
-    ),
-    *("{}(1)", "{} (copy)", "Copy of {}", "Kopie von {}", "{} 2"),
+    *("{} - Copy", "{} - Copy (2)", "{} - Kopie", "{} \N{EN DASH} copie", "{} - コピー", "{} copy", "{} copy 2"),
+    *("{} (1)", "{}(1)", "{} (copy)", "Copy of {}", "Kopie von {}", "{} 2"),
 )
 """Names of copies by Windows, macOS, browsers and others."""
 

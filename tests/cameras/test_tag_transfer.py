@@ -1,6 +1,5 @@
 """Tags of aligned bands as other programs see them, and the directories of files."""
 
-import json
 import struct
 from dataclasses import replace
 from pathlib import Path
@@ -36,6 +35,7 @@ from agalign.values.capture import Band
 from agalign.values.image import OutputGrid
 from agalign.values.pixel_units import PixelScale
 
+from ..conftest import read_json
 from .test_vendors import DJI, MICASENSE, SIZE, VENDORS, packet, write_capture, write_file
 
 pytestmark = pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
@@ -55,20 +55,14 @@ def band_of(path: Path, camera: Camera | None = None) -> Band:
     return band
 
 
-def bands_in(folder: Path) -> dict[str, Band]:
-    return {band.name: band for band in map(band_of, sorted(folder.glob("IMG_0001_*.tif")))}
-
-
 @pytest.mark.slow
 def test_the_vignetting_centre_moves_with_the_band(flight: Path, both: Path) -> None:
-    data = json.loads((both / "IMG_0001.json").read_text())
-    truth = json.loads((flight / "truth.json").read_text())["IMG_0001"]["bands"]["IMG_0001_4.tif"]
-    centre = np.array(read_tags(flight / "0000SET" / "000" / "IMG_0001_4.tif").numbers(NAMESPACE, "VignettingCenter"))
-    bands = bands_in(flight / "0000SET" / "000")
-    back = geometry.apply(
-        geometry.invert(np.array(truth["fixed_to_moving"])), lens.undistort(bands["NIR"].lens, centre)
-    )
-    expected = lens.distort(bands["Green"].lens, back) - data["output"]["crop"][:2]
+    truth = read_json(flight / "truth.json")["IMG_0001"]["bands"]["IMG_0001_4.tif"]
+    green, nir = (flight / "0000SET" / "000" / f"IMG_0001_{number}.tif" for number in (2, 4))
+    centre = np.array(read_tags(nir).numbers(NAMESPACE, "VignettingCenter"))
+    to_green = geometry.invert(np.array(truth["fixed_to_moving"]))
+    back = geometry.apply(to_green, lens.undistort(band_of(nir).lens, centre))
+    expected = lens.distort(band_of(green).lens, back) - read_json(both / "IMG_0001.json")["output"]["crop"][:2]
     result = read_tags(both / "IMG_0001_4.tif").numbers(NAMESPACE, "VignettingCenter")
     np.testing.assert_allclose(result, expected, atol=0.2)
     assert np.linalg.norm(np.array(result) - centre) > 3
