@@ -3,7 +3,7 @@
 import os
 import re
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
 from pathlib import Path
@@ -31,9 +31,6 @@ from agalign.values.text import did_you_mean
 
 __all__ = ["DiscoverOptions", "FolderScan", "Problem", "discover"]
 
-Progress = Callable[[int, int], None]
-"""Called with (number of files read, number of files)."""
-
 
 @dataclass(frozen=True)
 class FolderScan:
@@ -58,9 +55,7 @@ class FolderScan:
         )
 
 
-def discover(
-    folder: str | Path, options: DiscoverOptions | None = None, progress: Progress | None = None
-) -> FolderScan:
+def discover(folder: str | Path, options: DiscoverOptions | None = None) -> FolderScan:
     """Return all captures below `folder`, sorted by folder and name, and the problems.
 
     Raises InputError if the folder does not exist or contains no image, ConfigurationError for a band that no capture
@@ -69,7 +64,7 @@ def discover(
     folder, options = Path(folder), options or DiscoverOptions()
     check_folder(folder)
     paths, problems = _chosen_images(folder, options)
-    files, copies = without_copies(_read(paths, options, progress, problems))
+    files, copies = without_copies(_read(paths, options, problems))
     files, damaged = with_tags_of_flight(files)
     problems += copies + damaged + list_problems(files) + lens_problems(files)
     captures: list[Capture] = []
@@ -109,13 +104,11 @@ def _chosen_images(folder: Path, options: DiscoverOptions) -> tuple[list[Path], 
     return paths, problems
 
 
-def _read(
-    paths: Sequence[Path], options: DiscoverOptions, progress: Progress | None, problems: list[Problem]
-) -> list[ImageFile]:
+def _read(paths: Sequence[Path], options: DiscoverOptions, problems: list[Problem]) -> list[ImageFile]:
     """The files that contain a band; files that cannot be read are added to `problems`."""
     files: list[ImageFile] = []
     generic = Generic(options.pattern)
-    for number, result in enumerate(read_files(paths, options), start=1):
+    for result in read_files(paths, options):
         if isinstance(result, ImageFile):
             files += [result] if result.bands else []
         # An unreadable colour photograph is a problem only if photographs take part.
@@ -125,8 +118,6 @@ def _read(
             or generic.is_named_as_band(result.path)
         ):
             problems.append(result)
-        if progress is not None:
-            progress(number, len(paths))
     return files
 
 

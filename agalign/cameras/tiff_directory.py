@@ -52,9 +52,9 @@ def text(value: str) -> Entry:
     return Entry(DATATYPE.ASCII, len(data), data)
 
 
-def byte_string(value: bytes, kind: int = DATATYPE.BYTE) -> Entry:
-    """Return an entry of bytes of the type BYTE or UNDEFINED."""
-    return Entry(kind, len(value), value)
+def byte_string(value: bytes) -> Entry:
+    """Return an entry of bytes."""
+    return Entry(DATATYPE.BYTE, len(value), value)
 
 
 def rational(*values: float) -> Entry:

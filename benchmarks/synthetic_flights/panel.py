@@ -22,16 +22,12 @@ _HEIGHT_M = 28.0
 
 
 def make_flight_between_panels(
-    folder: Path,
-    captures: int = 3,
-    size_px: tuple[int, int] = (1280, 960),
-    rng_seed: int = 0,
-    sun: tuple[float, float] = (1.0, 0.7),
+    folder: Path, captures: int = 3, size_px: tuple[int, int] = (1280, 960), sun: tuple[float, float] = (1.0, 0.7)
 ) -> Path:
     """Write the panel, a flight, and the panel again; the sun goes from the one brightness to the other, linearly, and
     the light sensor does not see it. Returns the path of truth.json, as `make_flight` does.
     """
-    rng = np.random.default_rng(rng_seed)
+    rng = np.random.default_rng(0)
     poses = [
         Pose(_HEIGHT_M + float(rng.normal(0, 0.7)), float(rng.normal(0, 3)), 0.0, 0.0, 4.0 * k, 0.0)
         for k in range(captures)

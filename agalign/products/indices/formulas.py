@@ -71,7 +71,7 @@ def symbols_of(formula: str) -> tuple[str, ...]:
     Allowed are names, numbers, + - * / ** (or ^), parentheses, and sqrt, log, exp and abs. Raises ConfigurationError
     for anything else.
     """
-    return tuple(dict.fromkeys(_names(_parsed(formula), formula)))
+    return tuple(dict.fromkeys(_names(_parsed(formula))))
 
 
 def evaluate(formula: str, values: Mapping[str, FloatImage]) -> FloatImage:
@@ -95,7 +95,7 @@ def _parsed(formula: str) -> ast.expr:
         raise ConfigurationError(f"'{formula}' is not a formula; write one like (N-R)/(N+R)") from None
 
 
-def _names(node: ast.expr, formula: str) -> Iterator[str]:
+def _names(node: ast.expr) -> Iterator[str]:
     max_number = 1e30  # numbers must fit into float32
     match node:
         case ast.Name(id=name):
@@ -103,12 +103,12 @@ def _names(node: ast.expr, formula: str) -> Iterator[str]:
         case ast.Constant(value=int() | float() as value) if abs(value) < max_number:
             pass
         case ast.BinOp(left=left, op=op, right=right) if type(op) in _OPERATORS:
-            yield from _names(left, formula)
-            yield from _names(right, formula)
+            yield from _names(left)
+            yield from _names(right)
         case ast.UnaryOp(op=op, operand=operand) if type(op) in _OPERATORS:
-            yield from _names(operand, formula)
+            yield from _names(operand)
         case ast.Call(func=ast.Name(id=name), args=[argument], keywords=[]) if name in _FUNCTIONS:
-            yield from _names(argument, formula)
+            yield from _names(argument)
         case _:
             part = ast.unparse(node)
             raise ConfigurationError(
