@@ -120,9 +120,9 @@ def test_glint_is_found_where_no_pixel_around_is_free_of_it() -> None:
     assert not sun_glint(green, nir).any()
 
 
-def scene_with_glint(height: int, width: int) -> tuple[np.ndarray, np.ndarray]:
+def scene_with_glint() -> tuple[np.ndarray, np.ndarray]:
     """Water that becomes darker to the left, with waves of glint, and a shore: green and near infrared."""
-    rng = np.random.default_rng(2)
+    rng, height, width = np.random.default_rng(2), 301, 411
     green, nir = (level + rng.normal(0, 0.002, (height, width)) for level in (0.08, 0.03))
     depth = np.linspace(0, 0.04, width)
     waves = (rng.random((height, width)) < 0.1) * rng.uniform(0.02, 0.2, (height, width))
@@ -134,7 +134,7 @@ def scene_with_glint(height: int, width: int) -> tuple[np.ndarray, np.ndarray]:
 
 def test_glint_does_not_depend_on_the_size_of_the_image() -> None:
     """Unknown pixels at the right and the bottom complete the blocks of 16 px, and change no other pixel."""
-    bands = scene_with_glint(301, 411)
+    bands = scene_with_glint()
     padded = (np.pad(band, ((0, 3), (0, 5)), constant_values=np.nan) for band in bands)
     result, expected = sun_glint(*bands), sun_glint(*padded)[:301, :411]
     assert 0.02 < result.mean() < 0.2
@@ -143,7 +143,7 @@ def test_glint_does_not_depend_on_the_size_of_the_image() -> None:
 
 def test_glint_does_not_depend_on_the_tile(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     reflectance = Radiometry("reflectance", 0.0, 65535.0, 1.0)
-    bands, values = [], scene_with_glint(301, 411)
+    bands, values = [], scene_with_glint()
     for name, pixels in zip(("Green", "NIR"), values, strict=True):
         write_band(tmp_path / f"{name}.tif", np.rint(pixels.clip(0, 1) * 65535).astype(np.uint16))
         bands.append(Band(name, tmp_path / f"{name}.tif", 1, 411, 301, "uint16", radiometry=reflectance))
