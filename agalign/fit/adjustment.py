@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from agalign.errors import GeometryError
-from agalign.fit.windows import Shifts
+from agalign.fit.windows import Shifts, peak_weights
 from agalign.values import geometry
 from agalign.values.alignment import Residual
 from agalign.values.displacement import DisplacementField
@@ -266,11 +266,8 @@ class WindowShifts:
             if with_lens_shapes and mapping.field is not None:
                 shifts[rows, band] += mapping.field(xy)
             peaks[rows, band] = residual.peaks_sigma[measured]
-        positive = peaks[peaks > 0]
-        max_weight = 2.0  # so that well-textured parts do not dominate
-        weights = np.minimum((peaks / np.median(positive)) ** 2, max_weight) if positive.size else peaks
         points = mappings[0].of_the_plane.undistorted(centres_px)
-        return cls(centres_px, points, shifts, np.where(np.isfinite(shifts[..., 0]), weights, 0.0))
+        return cls(centres_px, points, shifts, peak_weights(peaks))
 
     def __len__(self) -> int:
         return len(self.points_px)

@@ -67,13 +67,12 @@ class DisplacementEstimator:
         verification_px = 48  # side of windows without overlap; larger ones are farther from those of the fit
         self.verification = FixedWindows(valid, structure, verification_px)
 
-    def refine(self, moving: Raster, mapping: PixelMapping, verified: PixelMapping | None = None) -> DisplacementResult:
+    def refine(self, moving: Raster, mapping: PixelMapping) -> DisplacementResult:
         """Fit the displacement field of a mapping, including the field that the mapping already has.
 
         Returns no field if it does not reduce the residuals of held-out windows significantly. The shifts are measured
         again with the field of each round until their median is at most 0.2 px, as correlation is sharper and large
-        shifts are measured in steps. The residual of held-out windows is that of the mapping `verified`, by default
-        `mapping`, with the field.
+        shifts are measured in steps.
         """
         shifts = self._measure(moving, mapping)
         gain = self._best_gain(shifts)
@@ -93,7 +92,7 @@ class DisplacementEstimator:
             if number + 1 >= min_rounds and len(shifts.weights) and np.median(shifts.distances_px()) <= converged_px:
                 break
         assert field is not None
-        held_out = self._held_out(moving, replace(verified or mapping, field=field), total, gain.smoothness)
+        held_out = self._held_out(moving, replace(mapping, field=field), total, gain.smoothness)
         return replace(without, field=field, held_out=held_out)
 
     def _measure(self, moving: Raster, mapping: PixelMapping) -> Shifts:

@@ -128,10 +128,9 @@ class Shifts(NamedTuple):
 
     @classmethod
     def of(cls, residual: Residual[FixedPx]) -> "Shifts":
-        """Select the measured shifts of a residual. Their errors are inversely proportional to the squared peaks."""
+        """Select the measured shifts of a residual."""
         measured = np.isfinite(residual.shifts_px[:, 0])
-        peaks_sigma = residual.peaks_sigma[measured]
-        weights = (peaks_sigma / np.median(peaks_sigma)) ** 4 if len(peaks_sigma) else peaks_sigma
+        weights = peak_weights(residual.peaks_sigma[measured])
         return cls(residual.centres_px[measured], residual.shifts_px[measured], weights, residual.cells[measured])
 
     @classmethod
@@ -151,6 +150,16 @@ class Shifts(NamedTuple):
         residuals_px = self.distances_px(fitted_px)
         robust = cauchy_weights(residuals_px, scales * shift_scale_px(residuals_px))
         return self._replace(weights=self.weights * robust)
+
+
+def peak_weights(peaks_sigma: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the relative weights of shifts from the heights (n,) of their correlation peaks; 0 for a height of 0.
+
+    The errors of shifts are inversely proportional to the squared peaks. The weight of a median peak is 1; it is
+    limited, so that the parts with most texture do not determine the geometry of the others.
+    """
+    positive, max_weight = peaks_sigma[peaks_sigma > 0], 4.0
+    return np.minimum((peaks_sigma / np.median(positive)) ** 4, max_weight) if positive.size else peaks_sigma
 
 
 def in_standard_errors(decreases: NDArray[np.float64]) -> float:

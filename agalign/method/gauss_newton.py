@@ -144,7 +144,7 @@ def _solve_family(equations: PatchEquations, family: ModelFamily, max_step_px: f
         squared = (
             equations.energy - 2 * (shift * gradient).sum(dim=1) + torch.einsum("nk,nkl,nl->n", shift, hessian, shift)
         )
-        # Cauchy weights, as in `values.robust.cauchy_weights`, from squared residuals.
+        # Cauchy weights, as in `values.least_squares.cauchy_weights`, from squared residuals.
         weight = 1 / (1 + squared.clamp_min(0) / squared.median().clamp_min(1e-12))
         normal = torch.einsum("n,nij->ij", weight, patch_normals)
         normal = normal + torch.diag(_DAMPING * normal.diagonal() + 1e-12)

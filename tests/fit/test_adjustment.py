@@ -187,7 +187,7 @@ def test_windows_are_matched_by_their_cells() -> None:
     np.testing.assert_array_equal(windows.centres_px, at)
     np.testing.assert_array_equal(windows.shifts_px[..., 0], [[1, 4], [2, np.nan], [np.nan, 3]])
     # Weights grow with the peak height up to a limit; windows without a measurement have weight 0.
-    np.testing.assert_allclose(windows.weights, [[0.25, 2], [0.25, 0], [0, 2]])
+    np.testing.assert_allclose(windows.weights, [[0.0625, 4], [0.0625, 0], [0, 4]])
     assert WindowShifts.of([residual_of(at, (np.nan, np.nan))], [plain]).weights.tolist() == [[0.0]] * 3
     assert len(WindowShifts.of([residual_of(at[:0], at[:0])], [plain])) == 0
 
