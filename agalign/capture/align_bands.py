@@ -6,14 +6,15 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 
 from agalign.capture.band_pair import BandPair, read_pairs
+from agalign.capture.candidate import Candidate
 from agalign.capture.decision import at_seed, decided, predicted_by_windows, verified, without_result
 from agalign.capture.from_windows import from_windows, without_extrapolated
 from agalign.capture.full_resolution import at_full_resolution
 from agalign.capture.map_estimate import map_estimate
 from agalign.capture.prediction import bands_to_learn, with_predictions
-from agalign.capture.relief_candidate import ReliefCandidate, aligned_by_relief
+from agalign.capture.relief_candidate import aligned_by_relief
 from agalign.capture.seeding import find_seed, image_groups
-from agalign.capture.warped_pair import WarpedPair, with_metrics
+from agalign.capture.warped_pair import with_metrics
 from agalign.config import Settings
 from agalign.fit.occlusion import occluded
 from agalign.flight.fingerprint import refinement_key
@@ -310,8 +311,7 @@ def verify_together(
                 alignments[pair.name] = at_seed(pair, seed, (result,))
             else:
                 field_use = "never" if is_observation or pair.name in relief.along_a_line else use
-                each = candidates[pair.name]
-                alignment = verified(pair, seed, each.joint, field_use, each.warped, each.by_halves)
+                alignment = verified(candidates[pair.name], field_use)
                 is_mixed = pair.name in relief.others and alignment.status == "aligned"
                 alignments[pair.name] = predicted_by_windows(alignment, pair, OTHER_GEOMETRY) if is_mixed else alignment
     return alignments
@@ -319,10 +319,10 @@ def verify_together(
 
 def _candidates(
     starts: Sequence[Start], results: Results, model: FlightModel | None, settings: Settings
-) -> dict[str, ReliefCandidate]:
+) -> dict[str, Candidate]:
     """Return the pairs with a result, by name, after the MAP estimation of all bands of the capture."""
     measured = [
-        ReliefCandidate(pair, seed, result, WarpedPair.of(pair, pair.mapping(result.fixed_to_moving)))
+        Candidate.of(pair, seed, result)
         for (pair, seed), result in zip(starts, results, strict=True)
         if isinstance(result, JointResult)
     ]

@@ -15,12 +15,12 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 from agalign.capture.band_pair import BandPair
+from agalign.capture.candidate import Candidate
 from agalign.capture.warped_pair import WarpedPair
 from agalign.fit.displacement_field import DisplacementResult
 from agalign.pixels.band_resampling import channel_mean
 from agalign.values.alignment import Alignment, JointResult, Seed
 from agalign.values.choices import Geometry, PairStatus, ReliefUse, SeedKind
-from agalign.values.geometry import Matrix
 from agalign.values.issues import SEED_DOES_NOT_FIT, Issue, IssueKind
 from agalign.values.pixel_units import FixedImagePx, FixedPx
 from agalign.verify.checks import BY_PARALLAX, is_unchanged, seed_fits
@@ -74,27 +74,17 @@ def predicted_by_windows(
     return decided(replace(alignment, issues=issues, prediction=prediction))
 
 
-def verified(
-    pair: BandPair,
-    seed: Seed,
-    result: JointResult[FixedImagePx] | Issue,
-    use: ReliefUse,
-    warped_pair: WarpedPair | None = None,
-    by_halves: tuple[Matrix, Matrix] | None = None,
-) -> Alignment[FixedImagePx]:
-    """Verify a result; return its alignment with status, px of the images. With issues it has the mapping of the seed.
+def verified(candidate: Candidate, use: ReliefUse) -> Alignment[FixedImagePx]:
+    """Verify a candidate; return its alignment with status, px of the images.
 
-    `use` is "never" for no displacement field. `warped_pair` is the pair with a mapping close to the result's, if
-    available; it avoids measuring again. `by_halves` are homographies from half of the windows (`cross_validated`).
+    With issues it has the mapping of the seed. `use` is "never" for no displacement field.
     """
-    if isinstance(result, Issue):
-        return at_seed(pair, seed, (result,))
-    joint = _unchanged_if_aligned(result, pair)
-    mapping = pair.mapping(joint.fixed_to_moving)
-    warped_pair = WarpedPair.of(pair, mapping) if warped_pair is None else warped_pair.with_mapping(mapping)
-    if by_halves is not None and joint is result:
-        warped_pair = warped_pair.cross_validated(by_halves)
-    warped_pair, issues, displacement = _verified(warped_pair, joint, use)
+    pair, seed = candidate.pair, candidate.seed
+    joint = _unchanged_if_aligned(candidate.joint, pair)
+    plane = candidate.warped.with_mapping(pair.mapping(joint.fixed_to_moving))
+    if candidate.by_halves is not None and joint is candidate.joint:
+        plane = plane.cross_validated(candidate.by_halves)
+    warped_pair, issues, displacement = _verified(plane, joint, use)
     candidates: dict[Geometry, FixedImagePx] = {}
     if displacement is not None:
         candidates = {"homography": displacement.before_p95_px, "field": displacement.after_p95_px}

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agalign.capture.band_pair import BandPair
+from agalign.capture.candidate import Candidate
 from agalign.capture.decision import decided, predicted_by_windows, without_result
 from agalign.capture.warped_pair import WarpedPair
 from agalign.errors import GeometryError
@@ -38,10 +39,9 @@ from agalign.fit.displacement_field import MIN_GAIN_SIGMA, MIN_WINDOWS
 from agalign.fit.occlusion import nearer_sign, occluded
 from agalign.fit.windows import decrease_sigma
 from agalign.pixels.band_resampling import channel_mean
-from agalign.values.alignment import MIN_RETRIEVAL, Alignment, JointResult, Residual, Seed
+from agalign.values.alignment import MIN_RETRIEVAL, Alignment, Residual, Seed
 from agalign.values.choices import Geometry, ReliefUse
-from agalign.values.geometry import Matrix
-from agalign.values.image import FloatImage, Raster
+from agalign.values.image import FloatImage
 from agalign.values.issues import OTHER_GEOMETRY
 from agalign.values.mapping import PixelMapping
 from agalign.values.parallax import Parallax, Relief
@@ -60,38 +60,6 @@ _MAX_FAR_SHARE = 0.05
 depth edges may contain the parallax of neither side, so that the squared shifts do not decrease."""
 
 
-@dataclass(frozen=True)
-class ReliefCandidate:
-    """A band with a result of the joint optimisation and the residual of its windows."""
-
-    pair: BandPair
-    seed: Seed
-    joint: JointResult[FixedImagePx]
-    warped: WarpedPair
-    by_halves: tuple[Matrix, Matrix] | None = None
-    """Homographies from half of the windows (`WarpedPair.cross_validated`)."""
-
-    @classmethod
-    def at_seed(cls, pair: BandPair, seed: Seed) -> "ReliefCandidate":
-        """Return a band without a result: with the mapping of its seed, and without evidence of descriptors."""
-        matrix = seed.fixed_to_moving
-        joint = JointResult[FixedImagePx](
-            matrix, math.nan, 0.0, 0.0, 0, (1.0,), BY_WINDOWS, "homography", 0.0, ((math.inf, math.inf),) * 4
-        )
-        return cls(pair, seed, joint, WarpedPair.of(pair, pair.mapping(matrix)))
-
-    def fit_residual(self, mapping: PixelMapping) -> Residual[FixedImagePx]:
-        """Measure the windows of the fit with a mapping."""
-        return self.pair.reference.fit_windows.residuals(self._warped(mapping))
-
-    def held_out_residual(self, mapping: PixelMapping) -> Residual[FixedImagePx]:
-        """Measure the windows that take no part in the fit."""
-        return self.pair.reference.held_out_windows.residuals(self._warped(mapping))
-
-    def _warped(self, mapping: PixelMapping) -> Raster:
-        return self.warped.warped if mapping is self.warped.mapping else self.pair.warped_moving(mapping)
-
-
 @dataclass
 class ReliefResult:
     """The bands of a capture after the estimation of its relief."""
@@ -105,7 +73,7 @@ class ReliefResult:
 
 
 def aligned_by_relief(
-    candidates: Sequence[ReliefCandidate],
+    candidates: Sequence[Candidate],
     use: ReliefUse,
     *,
     without_result: Sequence[tuple[BandPair, Seed]] = (),
@@ -137,18 +105,18 @@ def aligned_by_relief(
             estimate, aligned = _aligned_group(group)
             result.alignments |= aligned
             if estimate is not None:
-                others = [*candidates, *(ReliefCandidate.at_seed(*one) for one in without_result)]
+                others = [*candidates, *(Candidate.at_seed(*one) for one in without_result)]
                 result.alignments |= estimate.for_others(others)
                 result.others |= {c.pair.name for c in group} - result.alignments.keys()
     return result
 
 
-def _comparable(candidates: Sequence[ReliefCandidate]) -> list[list[ReliefCandidate]]:
+def _comparable(candidates: Sequence[Candidate]) -> list[list[Candidate]]:
     """Group the bands by reference image and space of the homographies.
 
     Bands without retrieval of held-out patches, with few measured windows or low resolution are excluded.
     """
-    groups: dict[tuple[int, str], list[ReliefCandidate]] = {}
+    groups: dict[tuple[int, str], list[Candidate]] = {}
     for candidate in candidates:
         pair, residual = candidate.pair, candidate.warped.residual
         is_reliable = candidate.joint.retrieval >= MIN_RETRIEVAL and len(residual.measured_px) >= MIN_WINDOWS
@@ -157,7 +125,7 @@ def _comparable(candidates: Sequence[ReliefCandidate]) -> list[list[ReliefCandid
     return list(groups.values())
 
 
-def _common_parallax_px(group: Sequence[ReliefCandidate]) -> tuple[float, bool]:
+def _common_parallax_px(group: Sequence[Candidate]) -> tuple[float, bool]:
     """Return the p95 of the parallax that is common to the bands, 0 if it is not significant, and if the baselines are
     on one line without tags that confirm them.
 
@@ -194,7 +162,7 @@ def _gain_by_others_sigma(windows: WindowShifts, model: Adjustment, size_px: tup
     return float(np.median(gains))
 
 
-def _common_residuals(group: Sequence[ReliefCandidate]) -> list[Residual[FixedImagePx]]:
+def _common_residuals(group: Sequence[Candidate]) -> list[Residual[FixedImagePx]]:
     """Return the residuals of all bands in the same windows: large ones if any band is blurred, or small ones if the
     residual of any band uses these.
     """
@@ -216,14 +184,14 @@ def _far_share(residual: Residual[FixedImagePx]) -> float:
     return float((residual.lengths_px > MAX_SHIFT_PX).mean()) if len(residual.lengths_px) else 0.0
 
 
-def _layout(group: Sequence[ReliefCandidate], bands: Sequence[int]) -> NDArray[np.float64] | None:
+def _layout(group: Sequence[Candidate], bands: Sequence[int]) -> NDArray[np.float64] | None:
     """Return the layouts (bands, 2) of some bands; None if the tags lack one."""
     layouts = [group[band].pair.layout for band in bands]
     return None if any(layout is None for layout in layouts) else np.array(layouts, float)
 
 
 def _consistent(
-    windows: WindowShifts, group: Sequence[ReliefCandidate], lens_std: NDArray[np.float64] | None = None
+    windows: WindowShifts, group: Sequence[Candidate], lens_std: NDArray[np.float64] | None = None
 ) -> tuple[list[int], Adjustment] | None:
     """Adjust the model to the bands with common parallax; return their indices and the model, or None.
 
@@ -262,7 +230,7 @@ def _consistent(
 class _Band:
     """One band with the mapping of its reference plane and its baseline."""
 
-    candidate: ReliefCandidate
+    candidate: Candidate
     plane: PixelMapping
     baseline: tuple[float, float] = (0.0, 0.0)
 
@@ -282,7 +250,7 @@ class _Band:
         return replace(self, plane=fit.applied_to(self.plane), baseline=(x, y))
 
 
-def _observed(group: Sequence[ReliefCandidate]) -> dict[str, Alignment[FixedImagePx]]:
+def _observed(group: Sequence[Candidate]) -> dict[str, Alignment[FixedImagePx]]:
     """Align a group by the planes of its bands and the parallax of windows, without a relief of every pixel.
 
     The parallax of a held-out window is that by the other bands. Empty if no parallax or the homographies alone explain
@@ -324,7 +292,7 @@ def _observed(group: Sequence[ReliefCandidate]) -> dict[str, Alignment[FixedImag
     return {c.name: c.alignment for c in checked if c.alignment is not None} if _is_chosen(checked) else {}
 
 
-def _aligned_group(group: Sequence[ReliefCandidate]) -> "tuple[_Estimate | None, dict[str, Alignment[FixedImagePx]]]":
+def _aligned_group(group: Sequence[Candidate]) -> "tuple[_Estimate | None, dict[str, Alignment[FixedImagePx]]]":
     """Return the relief of a group and the bands that it aligns; (None, {}) if another geometry explains the capture
     better.
     """
@@ -350,7 +318,7 @@ class _Estimate:
     """From the bands of `_verifying`, which do not contain the bands that they verify."""
 
     @classmethod
-    def of(cls, group: Sequence[ReliefCandidate]) -> "_Estimate | None":
+    def of(cls, group: Sequence[Candidate]) -> "_Estimate | None":
         """Estimate the relief from bands with common parallax; None if the windows do not determine the baselines.
 
         Raises GeometryError.
@@ -390,7 +358,7 @@ class _Estimate:
         """Return the relief of other bands than this one."""
         return self.others[self.bands.index(band) % len(self.others)] if band in self.bands else self.relief
 
-    def fitted(self, candidate: ReliefCandidate) -> _Band | None:
+    def fitted(self, candidate: Candidate) -> _Band | None:
         """Fit homography and baseline of a band under the relief of the others; None if too few windows are measured.
 
         Raises GeometryError.
@@ -408,7 +376,7 @@ class _Estimate:
             return None
         return _Band(candidate, fitted[0].of_the_plane, fitted[0].parallax.baseline)
 
-    def for_others(self, candidates: Sequence[ReliefCandidate]) -> dict[str, Alignment[FixedImagePx]]:
+    def for_others(self, candidates: Sequence[Candidate]) -> dict[str, Alignment[FixedImagePx]]:
         """Align or predict bands of the same reference where windows allow it, except those of the estimate: a relief
         does not verify a band that it is estimated from.
         """

@@ -5,6 +5,7 @@ import pytest
 
 from agalign.capture import warped_pair
 from agalign.capture.band_pair import BandPair
+from agalign.capture.candidate import Candidate
 from agalign.capture.decision import at_seed, decided, verified, without_result
 from agalign.capture.warped_pair import WarpedPair, with_metrics
 from agalign.fit.displacement_field import DisplacementResult
@@ -65,7 +66,7 @@ def test_a_seed_that_contradicts_the_tags_is_replaced_by_their_mapping(pair: Ban
 
 
 def test_a_result_that_passes_is_aligned_and_measured(pair: BandPair) -> None:
-    results = verified(pair, SEED, GOOD, "always")
+    results = verified(Candidate.of(pair, SEED, GOOD), "always")
     assert (results.status, results.issues, results.reason) == ("aligned", (), None)
     assert results.residual.median_px < 0.1
     measured = with_metrics(results, pair)
@@ -90,7 +91,10 @@ def test_each_colour_is_verified_by_the_estimate_from_the_other(pair: BandPair) 
     crossed, before = warped_pair.cross_validated((by_black, by_white)).residual, warped_pair.residual
     expected_px = np.where(before.is_black[:, None], (0, 0.2), (-0.1, 0))
     np.testing.assert_allclose(crossed.shifts_px - before.shifts_px, expected_px, atol=1e-6)
-    assert verified(pair, SEED, GOOD, "never", None, (by_black, by_white)).residual.median_px > 0.08
+    assert (
+        verified(replace(Candidate.of(pair, SEED, GOOD), by_halves=(by_black, by_white)), "never").residual.median_px
+        > 0.08
+    )
 
 
 def test_of_two_mappings_the_better_has_smaller_shifts_in_more_of_the_same_windows(pair: BandPair) -> None:
@@ -109,11 +113,11 @@ def test_of_two_mappings_the_better_has_smaller_shifts_in_more_of_the_same_windo
 
 
 def test_a_result_with_issues_is_replaced_by_the_seed(pair: BandPair) -> None:
-    results = verified(pair, SEED, replace(GOOD, retrieval=0.01), "always")
+    results = verified(Candidate.of(pair, SEED, replace(GOOD, retrieval=0.01)), "always")
     assert (results.status, results.issues[0].code) == ("seed_only", "retrieval")
     np.testing.assert_array_equal(results.fixed_to_moving, SEED.fixed_to_moving)
     assert results.residual.median_px == pytest.approx(np.hypot(1, 1), abs=0.15)
-    missing = verified(pair, SEED, Issue(FEW_KEYPOINTS, 3, 16), "always")
+    missing = at_seed(pair, SEED, (Issue(FEW_KEYPOINTS, 3, 16),))
     assert missing.status == "seed_only"
     assert missing.reason == "only 3 keypoints are in the area that both bands show; the rig seed is used unchanged"
 
@@ -122,10 +126,10 @@ def test_a_result_with_issues_is_replaced_by_the_seed(pair: BandPair) -> None:
 def test_an_unrelated_image_is_not_aligned_by_a_seed_or_a_field(kind: str) -> None:
     noise = np.random.default_rng(3).normal(size=(320, 400)).astype(np.float32)
     pair = pair_of(texture(), whole(noise) if kind == "noise" else texture(seed=9), RIG)
-    failed = verified(pair, SEED, joint_result(retrieval=0.01), "always")
+    failed = verified(Candidate.of(pair, SEED, joint_result(retrieval=0.01)), "always")
     assert failed.status == "failed"
     assert failed.reason.endswith("but the seed does not fit either")
-    results = verified(pair, SEED, joint_result(SEED.fixed_to_moving), "always")
+    results = verified(Candidate.of(pair, SEED, joint_result(SEED.fixed_to_moving)), "always")
     assert results.status not in ("aligned", "predicted")
     assert results.geometry == "homography"
 
@@ -136,12 +140,12 @@ def test_verification_is_repeated_with_a_displacement_field(pair: BandPair, monk
     wild[..., 0] = 3.0
     result = DisplacementResult(DisplacementField(32.0, wild), 1.0, 0.5)
     monkeypatch.setattr(pair.reference.displacement_field, "refine", lambda *_, **__: result)
-    results = verified(pair, SEED, GOOD, "always")
+    results = verified(Candidate.of(pair, SEED, GOOD), "always")
     assert (results.status, results.geometry) == ("aligned", "homography")
     assert results.candidates == {"homography": 1.0, "field": 0.5}
     assert results.residual.median_px < 0.1
     monkeypatch.setattr(warped_pair, "issues_of", lambda *_: ())
-    assert verified(pair, SEED, GOOD, "always").geometry == "field"
+    assert verified(Candidate.of(pair, SEED, GOOD), "always").geometry == "field"
 
 
 def test_residuals_of_a_reduced_image_are_in_px_of_the_file() -> None:
@@ -166,14 +170,14 @@ def displaced_pair(height_px: float, wavelength_px: float | None = None) -> Band
 
 @pytest.mark.parametrize(("use", "status"), [("auto", "aligned"), ("always", "aligned"), ("never", "seed_only")])
 def test_a_field_is_fitted_where_a_part_of_the_image_is_misaligned(use: ReliefUse, status: str) -> None:
-    results = verified(displaced_pair(4.0), CENTRED, joint_result(), use)
+    results = verified(Candidate.of(displaced_pair(4.0), CENTRED, joint_result()), use)
     assert (results.status, results.geometry) == (status, "field" if status == "aligned" else "homography")
 
 
 @pytest.mark.slow
 def test_a_field_follows_quickly_varying_parallax() -> None:
     """Waves of 300 px. Shorter ones are not predicted without the windows that overlap one of verification."""
-    results = verified(displaced_pair(2.5, wavelength_px=300.0), CENTRED, joint_result(), "auto")
+    results = verified(Candidate.of(displaced_pair(2.5, wavelength_px=300.0), CENTRED, joint_result()), "auto")
     assert (results.status, results.geometry) == ("aligned", "field")
     # The residual is that of held-out windows.
     assert results.residual.median_px < 0.4
@@ -182,7 +186,7 @@ def test_a_field_follows_quickly_varying_parallax() -> None:
 @pytest.mark.parametrize(("rig_known", "tried"), [(True, False), (False, True)])
 def test_a_field_is_tried_without_a_rig_and_rejected_without_need(rig_known: bool, tried: bool) -> None:
     pair = replace(displaced_pair(0.0), candidate_std_px={"model": 1.0} if rig_known else {})
-    plain = verified(pair, CENTRED, joint_result(), "auto")
+    plain = verified(Candidate.of(pair, CENTRED, joint_result()), "auto")
     assert (plain.status, "field" in plain.candidates, plain.geometry) == ("aligned", tried, "homography")
 
 
@@ -190,7 +194,7 @@ def test_issues_that_a_field_cannot_remove_are_reported() -> None:
     """A third of the image 15 px off."""
     fixed, moving = two_views(TRUTH)
     moving.pixels[:, 270:] = np.roll(moving.pixels, 15, axis=0)[:, 270:]
-    results = verified(pair_of(fixed, moving, RIG), SEED, GOOD, "auto")
+    results = verified(Candidate.of(pair_of(fixed, moving, RIG), SEED, GOOD), "auto")
     assert results.status != "aligned"
     assert {"close_windows", "cluster"} & {d.code for d in results.issues}
     assert "of the windows" in results.reason
@@ -214,11 +218,11 @@ def test_a_field_is_verified_in_held_out_windows(monkeypatch: pytest.MonkeyPatch
     """A field may fit any shifts of its own windows."""
     pair = displaced_pair(2.5)
     good = pair.reference.displacement_field.refine(pair.moving_image, pair.mapping(np.eye(3)))
-    accepted = verified(pair, CENTRED, joint_result(), "always")
+    accepted = verified(Candidate.of(pair, CENTRED, joint_result()), "always")
     assert accepted.status == "aligned"
     np.testing.assert_array_equal(accepted.residual.shifts_px, good.held_out.shifts_px)
     misaligned = good.held_out.with_shifts(good.held_out.shifts_px + 1.5)
     monkeypatch.setattr(pair.reference.displacement_field, "refine", lambda *_: replace(good, held_out=misaligned))
-    refused = verified(pair, CENTRED, joint_result(), "always")
+    refused = verified(Candidate.of(pair, CENTRED, joint_result()), "always")
     assert refused.status == "predicted"
     assert refused.prediction.std_px > 1.5

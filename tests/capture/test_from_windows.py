@@ -9,10 +9,11 @@ import pytest
 import agalign
 from agalign.capture import from_windows as module
 from agalign.capture.band_pair import BandPair
-from agalign.capture.decision import verified
+from agalign.capture.candidate import Candidate
+from agalign.capture.decision import at_seed, verified
 from agalign.capture.from_windows import from_windows, without_extrapolated
 from agalign.capture.seeding import find_seed
-from agalign.config import SeedSettings, Settings
+from agalign.config import SeedSettings
 from agalign.fit.adjustment import lens_shapes
 from agalign.flight.rig import Rig
 from agalign.pixels.masks import raster_of
@@ -43,7 +44,7 @@ def pair() -> BandPair:
 
 def unaligned(pair: BandPair, issue: Issue = SILENT) -> Alignment:
     seed = Seed("structure", geometry.translation(5.0, -3.0), 20.0, trusted=True)
-    result = verified(pair, seed, issue, Settings())
+    result = at_seed(pair, seed, (issue,))
     assert result.status == "seed_only"
     return result
 
@@ -132,9 +133,8 @@ def aligned(pair: BandPair) -> Alignment:
     points = geometry.lattice(*SIZE, 40, 30)
     seen = points[pair.fixed.valid[points[:, 1].astype(int), points[:, 0].astype(int)]]
     matrix = geometry.fit_homography(seen, true_positions(seen))
-    result = verified(
-        pair, Seed("structure", matrix, 20.0), joint_result(matrix, covariance=0.0025 * np.eye(8)), Settings()
-    )
+    joint = joint_result(matrix, covariance=0.0025 * np.eye(8))
+    result = verified(Candidate.of(pair, Seed("structure", matrix, 20.0), joint), "auto")
     assert result.status == "aligned"
     return result
 

@@ -9,7 +9,7 @@ import pytest
 
 from agalign.capture.align_bands import _candidates
 from agalign.capture.band_pair import BandPair
-from agalign.capture.decision import verified
+from agalign.capture.decision import at_seed
 from agalign.capture.from_windows import from_windows
 from agalign.capture.reference import Reference
 from agalign.config import Settings
@@ -38,7 +38,7 @@ def with_border(image: np.ndarray, border_px: int) -> Raster:
 
 
 def by_windows(pair: BandPair) -> tuple[Alignment, Alignment]:
-    before = verified(pair, SEED, Issue(RETRIEVAL, 0.05, 0.2), "auto")
+    before = at_seed(pair, SEED, (Issue(RETRIEVAL, 0.05, 0.2),))
     return before, from_windows(pair, before)
 
 

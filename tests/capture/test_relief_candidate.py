@@ -14,12 +14,12 @@ from synthetic_flights.relief import make_scene
 from agalign.capture import align_bands
 from agalign.capture.align_bands import verify_together
 from agalign.capture.band_pair import BandPair
+from agalign.capture.candidate import Candidate
 from agalign.capture.decision import at_seed
 from agalign.capture.prediction import with_predictions
 from agalign.capture.reference import Reference
 from agalign.capture.relief_candidate import (
     _MIN_PARALLAX_PX,
-    ReliefCandidate,
     ReliefResult,
     _Checked,
     _common_parallax_px,
@@ -28,7 +28,6 @@ from agalign.capture.relief_candidate import (
     _std_px,
     aligned_by_relief,
 )
-from agalign.capture.warped_pair import WarpedPair
 from agalign.config import JointSettings, ReliefSettings, Settings
 from agalign.fit.range import inverse_range
 from agalign.flight.rig import Rig
@@ -89,7 +88,7 @@ class Rendered:
         matrix, _ = cv2.findHomography(*undistorted, cv2.RANSAC, 1.0)
         return np.asarray(matrix)
 
-    def candidates(self, instead: Mapping[str, np.ndarray] | None = None) -> list[ReliefCandidate]:
+    def candidates(self, instead: Mapping[str, np.ndarray] | None = None) -> list[Candidate]:
         """Candidates of all moving bands, some with other images `instead`."""
         images = {**self.images, **(instead or {})}
         reference = Reference(self.raster(REFERENCE, images))
@@ -99,8 +98,7 @@ class Rendered:
             matrix = self.plane(band)
             pair = BandPair(band.name, reference, self.raster(band, images), {"rig": matrix}, layout=layout)
             seed = Seed("rig", matrix, 30.0, 30.0, 5.0)
-            warped = WarpedPair.of(pair, pair.mapping(matrix))
-            result.append(ReliefCandidate(pair, seed, joint_result(matrix), warped))
+            result.append(Candidate.of(pair, seed, joint_result(matrix)))
         return result
 
     def error_px(self, band: str, mapping: PixelMapping) -> np.ndarray:
@@ -109,11 +107,11 @@ class Rendered:
         return np.asarray(np.linalg.norm(mapping(self.pixels) - known.moving_px, axis=-1)[known.visible])
 
 
-def without_layout(candidates: Sequence[ReliefCandidate]) -> list[ReliefCandidate]:
+def without_layout(candidates: Sequence[Candidate]) -> list[Candidate]:
     return [replace(c, pair=replace(c.pair, layout=None)) for c in candidates]
 
 
-def shows_relief(candidates: Sequence[ReliefCandidate]) -> bool:
+def shows_relief(candidates: Sequence[Candidate]) -> bool:
     parallax_px, on_a_line = _common_parallax_px(candidates)
     return parallax_px >= _MIN_PARALLAX_PX and not on_a_line
 
@@ -138,12 +136,12 @@ def flat() -> Rendered:
 
 
 @pytest.fixture(scope="module")
-def candidates(boxes: Rendered) -> list[ReliefCandidate]:
+def candidates(boxes: Rendered) -> list[Candidate]:
     return boxes.candidates()
 
 
 @pytest.fixture(scope="module")
-def aligned(candidates: Sequence[ReliefCandidate]) -> dict[str, Alignment]:
+def aligned(candidates: Sequence[Candidate]) -> dict[str, Alignment]:
     return aligned_by_relief(candidates, "auto").alignments
 
 
@@ -220,14 +218,14 @@ ON_A_LINE_M = {"Green": 0.0, "Blue": -0.03, "Red": 0.02, "NIR": -0.015}
 
 
 @pytest.fixture(scope="module")
-def on_a_line() -> list[ReliefCandidate]:
+def on_a_line() -> list[Candidate]:
     """The boxes as lenses in a row show them."""
     bands = tuple(replace(b, baseline_m=(ON_A_LINE_M[b.name], 0.0)) for b in CAMERA.bands)
     size_px = 640, 480
     return Rendered.of(make_scene("boxes", 8, width_px=size_px[0]), size_px, replace(CAMERA, bands=bands)).candidates()
 
 
-def test_parallax_along_a_line_needs_a_layout(on_a_line: Sequence[ReliefCandidate]) -> None:
+def test_parallax_along_a_line_needs_a_layout(on_a_line: Sequence[Candidate]) -> None:
     """Edges of shadows and leaves move along a line too; with a layout it is that of the lenses."""
     assert set(aligned_by_relief(on_a_line, "auto").alignments) == {b.name for b in MOVING}
     without = without_layout(on_a_line)
@@ -237,14 +235,14 @@ def test_parallax_along_a_line_needs_a_layout(on_a_line: Sequence[ReliefCandidat
         assert set(alignment.candidates) <= {"homography"}
 
 
-def verified_together(candidates: Sequence[ReliefCandidate], settings: Settings) -> dict[str, Alignment]:
+def verified_together(candidates: Sequence[Candidate], settings: Settings) -> dict[str, Alignment]:
     return verify_together([(c.pair, c.seed) for c in candidates], [c.joint for c in candidates], None, settings)
 
 
 @pytest.mark.parametrize(("family", "is_allowed"), [("auto", True), ("translation", False), ("affine", False)])
 @pytest.mark.parametrize("use", ["auto", in_full_run("always")])
 def test_neither_relief_nor_field_replaces_another_model_family(
-    candidates: Sequence[ReliefCandidate], family: FamilyChoice, use: ReliefUse, is_allowed: bool
+    candidates: Sequence[Candidate], family: FamilyChoice, use: ReliefUse, is_allowed: bool
 ) -> None:
     settings = Settings(joint=JointSettings(model_family=family), relief=ReliefSettings(use=use))
     for alignment in verified_together(candidates, settings).values():
@@ -292,7 +290,7 @@ def test_a_noisy_band_follows_the_relief_of_the_others(
 
 
 def test_a_relief_does_not_verify_a_band_that_it_is_estimated_from(
-    candidates: Sequence[ReliefCandidate], aligned: Mapping[str, Alignment], monkeypatch: pytest.MonkeyPatch
+    candidates: Sequence[Candidate], aligned: Mapping[str, Alignment], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Also if the band does not pass with the relief of the others."""
     checked = _Estimate.checked
@@ -310,7 +308,7 @@ def test_unrelated_images_do_not_follow_a_relief(four_lenses: Rendered) -> None:
 
 
 def test_a_lost_band_is_predicted_with_the_relief(
-    boxes: Rendered, candidates: Sequence[ReliefCandidate], aligned: Mapping[str, Alignment]
+    boxes: Rendered, candidates: Sequence[Candidate], aligned: Mapping[str, Alignment]
 ) -> None:
     """The rig knows planes and baselines, the relief is that of the other bands."""
     norm = np.linalg.norm([b.baseline_m for b in MOVING])
@@ -335,7 +333,7 @@ def test_a_lost_band_is_predicted_with_the_relief(
     assert {result[p.name].status for p in pairs[1:]} == {"aligned"}
 
 
-def test_the_sign_is_found_without_a_layout(boxes: Rendered, candidates: Sequence[ReliefCandidate]) -> None:
+def test_the_sign_is_found_without_a_layout(boxes: Rendered, candidates: Sequence[Candidate]) -> None:
     """The sign follows from occlusions. The reference plane may differ from the one with a layout."""
     result = aligned_by_relief(without_layout(candidates), "auto").alignments
     assert len(result) == len(MOVING)
@@ -343,9 +341,7 @@ def test_the_sign_is_found_without_a_layout(boxes: Rendered, candidates: Sequenc
     assert np.corrcoef(parallax.relief(boxes.pixels).ravel(), boxes.truth.range_m.ravel())[0, 1] < -0.5
 
 
-def test_bands_measured_in_windows_of_different_sizes_have_common_residuals(
-    candidates: Sequence[ReliefCandidate],
-) -> None:
+def test_bands_measured_in_windows_of_different_sizes_have_common_residuals(candidates: Sequence[Candidate]) -> None:
     """Their residuals are compared in the same windows."""
     assert len({len(c.warped.residual.centres_px) for c in candidates}) > 1
     assert shows_relief(candidates)
@@ -364,7 +360,7 @@ def test_an_observation_of_the_rig_needs_only_windows(four_lenses: Rendered) -> 
             assert alignment.joint.corner_std_px < 0.5
 
 
-def test_use(candidates: Sequence[ReliefCandidate]) -> None:
+def test_use(candidates: Sequence[Candidate]) -> None:
     assert aligned_by_relief(candidates, "never") == ReliefResult()
     # One moving band cannot be verified with others; a coarse one has another reference.
     assert aligned_by_relief(candidates[:1], "always") == ReliefResult()
