@@ -1,5 +1,6 @@
 import csv
 import json
+import pickle
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -29,14 +30,13 @@ from agalign.values.alignment import Alignment, Prediction
 from agalign.values.issues import Issue
 from agalign.verify.checks import CLOSE_WINDOWS
 
+from ..conftest import Shared
+
 pytestmark = [pytest.mark.slow, pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")]
 Run = tuple[Path, dict[str, CaptureReport]]
 
 
-@pytest.fixture(scope="module")
-def five(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Five captures: the NIR of the third is noise, the fifth is over water."""
-    folder = tmp_path_factory.mktemp("five")
+def make_five(folder: Path) -> None:
     make_flight(folder, captures=5, size_px=(400, 300), rng_seed=5, altitude_m=(12.0, 30.0))
     rng = np.random.default_rng(0)
     images = folder / "0000SET" / "000"
@@ -45,15 +45,25 @@ def five(tmp_path_factory: pytest.TempPathFactory) -> Path:
     for path in lost:
         with rasterio.open(path, "r+") as dataset:
             dataset.write((20_000 + 1500 * rng.normal(size=(1, 300, 400))).astype(np.uint16))
-    return folder
 
 
 @pytest.fixture(scope="module")
-def run(five: Path, tmp_path_factory: pytest.TempPathFactory) -> Run:
+def five(shared: Shared) -> Path:
+    """Five captures: the NIR of the third is noise, the fifth is over water."""
+    return shared("five", make_five)
+
+
+@pytest.fixture(scope="module")
+def run(five: Path, shared: Shared) -> Run:
     """The output folder and the reports of the five captures, without accepted predictions."""
-    out = tmp_path_factory.mktemp("run")
     settings = Settings(check=CheckSettings(accept_predicted_px=0.0))
-    return out, {r.label[-8:]: r for r in agalign.align_folder(five, out, settings=settings)}
+
+    def align(folder: Path) -> None:
+        reports = {r.label[-8:]: r for r in agalign.align_folder(five, folder / "out", settings=settings)}
+        (folder / "reports.pickle").write_bytes(pickle.dumps(reports))
+
+    folder = shared("aligned_five", align)
+    return folder / "out", pickle.loads((folder / "reports.pickle").read_bytes())
 
 
 @pytest.fixture(scope="module")

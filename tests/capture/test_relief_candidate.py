@@ -1,5 +1,6 @@
 """One relief for all bands of a capture, on rendered scenes with exact truth, without any learning."""
 
+import pickle
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -46,7 +47,7 @@ from agalign.values.pixel_units import MovingFilePx
 from agalign.verify.extrapolation import expected_error_px
 
 from ..builders import in_full_run, joint_result, residual_of, whole
-from ..conftest import textured_image
+from ..conftest import Shared, textured_image
 
 CAMERA = replace(
     CLOSE_RANGE, bands=tuple(b for b in CLOSE_RANGE.bands if b.name in ("Green", "Blue", "Red", "NIR")), reference=1
@@ -117,9 +118,15 @@ def shows_relief(candidates: Sequence[Candidate]) -> bool:
 
 
 @pytest.fixture(scope="module")
-def four_lenses() -> Rendered:
+def four_lenses(shared: Shared) -> Rendered:
     size_px = 640, 480
-    return Rendered.of(make_scene("boxes", 8, width_px=size_px[0]), size_px, CLOSE_RANGE)
+
+    def render(folder: Path) -> None:
+        rendered = Rendered.of(make_scene("boxes", 8, width_px=size_px[0]), size_px, CLOSE_RANGE)
+        (folder / "rendered.pickle").write_bytes(pickle.dumps(rendered))
+
+    rendered: Rendered = pickle.loads((shared("four_lenses", render) / "rendered.pickle").read_bytes())
+    return rendered
 
 
 @pytest.fixture(scope="module")
