@@ -150,17 +150,16 @@ def test_temperature_is_that_of_the_tags_of_the_altum(real_data: Path) -> None:
         assert result.min() - 1 < said < result.max() + 1
 
 
-@pytest.mark.parametrize("bands", [("Green", "NIR", "Red"), in_full_run(())])
-def test_bananas_from_close_by(real_data: Path, tmp_path: Path, bands: tuple[str, ...]) -> None:
-    """The full run takes all bands and the photograph."""
-    options = DiscoverOptions(bands=bands, with_rgb=not bands)
+@pytest.mark.full
+def test_bananas_from_close_by(real_data: Path, tmp_path: Path) -> None:
+    options = DiscoverOptions(with_rgb=True)
     (report,) = agalign.align_folder(real_data / "captures/p4m_bananas", tmp_path, options=options)
     moving = [b for b in report.sidecar.bands if b.metrics]
     photograph, multispectral = ([b for b in moving if b.band.startswith("RGB") == is_rgb] for is_rgb in (True, False))
-    assert (len(multispectral), len(photograph)) == ((2, 0) if bands else (4, 3))
+    assert (len(multispectral), len(photograph)) == (4, 3)
     assert all(b.status == "aligned" and b.metrics.after.residual_px < 0.5 for b in multispectral)
-    # Its lens is farther from the others than these from each other: a fifth of its windows are off by more than a px.
-    assert all(b.status != "aligned" for b in photograph)
+    # Leaves moved between the exposures: a third of its windows are off by more than a px, in all directions.
+    assert all(b.status == "predicted" and b.prediction.std_px > 1 for b in photograph)
 
 
 @pytest.mark.full
