@@ -29,7 +29,6 @@ from agalign.fit.adjustment import (
     are_of_lenses,
     are_on_a_line,
     fit_in_rounds,
-    fit_windows,
     lens_std_px,
     parallax_of,
     shifts_by_corners,
@@ -39,7 +38,7 @@ from agalign.fit.displacement_field import MIN_GAIN_SIGMA, MIN_WINDOWS
 from agalign.fit.occlusion import nearer_sign, occluded
 from agalign.fit.windows import decrease_sigma
 from agalign.pixels.band_resampling import channel_mean
-from agalign.values.alignment import MIN_RETRIEVAL, Alignment, Residual, Seed
+from agalign.values.alignment import MIN_RETRIEVAL, Alignment, JointResult, Residual, Seed
 from agalign.values.choices import Geometry, ReliefUse
 from agalign.values.image import FloatImage
 from agalign.values.issues import OTHER_GEOMETRY
@@ -233,6 +232,8 @@ class _Band:
     candidate: Candidate
     plane: PixelMapping
     baseline: tuple[float, float] = (0.0, 0.0)
+    covariance_px2: NDArray[np.float64] | None = None
+    """(8, 8) of the corners of the plane; None before it is fitted."""
 
     @property
     def name(self) -> str:
@@ -247,7 +248,14 @@ class _Band:
     def fitted(self, fit: WindowFit) -> "_Band":
         """Apply a fit to windows. Raises GeometryError."""
         x, y = self.baseline if fit.baseline is None else fit.baseline.tolist()
-        return replace(self, plane=fit.applied_to(self.plane), baseline=(x, y))
+        return replace(
+            self, plane=fit.applied_to(self.plane), baseline=(x, y), covariance_px2=fit.covariance_px2[:8, :8]
+        )
+
+    def joint(self) -> JointResult[FixedImagePx]:
+        """Return the result with the homography of the plane."""
+        assert self.covariance_px2 is not None
+        return self.candidate.joint.with_homography(self.plane.fixed_to_moving, self.covariance_px2)
 
 
 def _observed(group: Sequence[Candidate]) -> dict[str, Alignment[FixedImagePx]]:
@@ -271,13 +279,13 @@ def _observed(group: Sequence[Candidate]) -> dict[str, Alignment[FixedImagePx]]:
     residuals = [reference.held_out_windows.residuals(image) for image in warped]
     windows, checked = WindowShifts.of(residuals, [band.plane for band in bands]), []
     relief = windows.relief(parallax_of(windows.shifts_px, model.baselines, windows.weights), reference.grey.size_px)
-    for number, (band, fit) in enumerate(zip(bands, model.fits, strict=True)):
+    for number, band in enumerate(bands):
         others = np.delete(np.arange(len(bands)), number)
         by_others_px = parallax_of(windows.shifts_px[:, others], model.baselines[others], windows.weights[:, others])
         shifts_px = windows.shifts_of(residuals[number], by_others_px[:, None] * model.baselines[number])
         held_out = residuals[number].with_shifts(residuals[number].shifts_px - shifts_px)
         candidate, plane = band.candidate, band.candidate.held_out_residual(band.candidate.warped.mapping)
-        joint = candidate.joint.with_homography(band.plane.fixed_to_moving, fit.covariance_px2)
+        joint = band.joint()
         # Planes of different depth resemble a repetition in images without relief.
         mapping = band.mapping(relief)
         image = candidate.pair.warped_moving(mapping)
@@ -374,7 +382,8 @@ class _Estimate:
         fitted = fit_in_rounds(start, measured, size_px, lens_std_px=_lens_std_px(candidate.pair), with_baseline=True)
         if fitted is None or fitted[0].parallax is None:
             return None
-        return _Band(candidate, fitted[0].of_the_plane, fitted[0].parallax.baseline)
+        baseline, covariance_px2 = fitted[0].parallax.baseline, fitted[1].covariance_px2[:8, :8]
+        return _Band(candidate, fitted[0].of_the_plane, baseline, covariance_px2)
 
     def for_others(self, candidates: Sequence[Candidate]) -> dict[str, Alignment[FixedImagePx]]:
         """Align or predict bands of the same reference where windows allow it, except those of the estimate: a relief
@@ -398,8 +407,7 @@ class _Estimate:
         """
         candidate, pair = band.candidate, band.candidate.pair
         mapping = band.mapping(self.relief, with_occlusions=True)
-        windows = pair.reference.held_out_windows
-        warped = WarpedPair(pair, mapping, pair.warped_moving(mapping), windows, candidate.held_out_residual(mapping))
+        warped = WarpedPair.of(pair, mapping, pair.reference.held_out_windows)
         residual = warped.residual
         is_known = len(residual.measured_px) >= MIN_WINDOWS
         is_known &= residual.median_px <= MAX_SHIFT_PX * pair.file_pixel_size_px
@@ -414,20 +422,13 @@ class _Estimate:
         """Verify a band with the relief from other bands. Raises GeometryError."""
         candidate, pair = band.candidate, band.candidate.pair
         plane = candidate.held_out_residual(candidate.warped.mapping)
-        rejected = _Checked(pair.name, plane)
-        mapping = band.mapping(self.relief)
-        fit = fit_windows(mapping, candidate.fit_residual(mapping), pair.fixed.size_px)
-        if fit is None:
-            return rejected
-        final = band.fitted(fit)
-        complete = final.mapping(self.relief, with_occlusions=True)
-        verifying = final.mapping(self.verifying(band), with_occlusions=True)
+        complete = band.mapping(self.relief, with_occlusions=True)
+        verifying = band.mapping(self.verifying(band), with_occlusions=True)
         held_out = candidate.held_out_residual(verifying)
-        joint = candidate.joint.with_homography(complete.fixed_to_moving, fit.covariance_px2)
+        joint = band.joint()
         warped, windows = pair.warped_moving(complete), pair.reference.held_out_windows
-        issues = WarpedPair(pair, complete, warped, windows, held_out).issues(joint)
-        if issues:
-            return replace(rejected, held_out=held_out)
+        if WarpedPair(pair, complete, warped, windows, held_out).issues(joint):
+            return _Checked(pair.name, plane, held_out)
         kind: Geometry = "relief" if complete.field is None else "relief and field"
         candidates = {"homography": plane.p95_px, kind: held_out.p95_px}
         without = without_result(pair, candidate.seed)
@@ -442,8 +443,8 @@ class _Checked:
     name: str
     plane: Residual[FixedImagePx]
     """Residual of held-out windows by the homography alone."""
-    held_out: Residual[FixedImagePx] | None = None
-    """The same with the relief; None if it was not measured."""
+    held_out: Residual[FixedImagePx]
+    """The same with the relief."""
     alignment: Alignment[FixedImagePx] | None = None
     """None if it does not pass."""
 
@@ -484,7 +485,7 @@ def _is_chosen(checked: Sequence[_Checked]) -> bool:
     """
     gains_px = []
     for each in checked:
-        if each.held_out is None or each.alignment is None:
+        if each.alignment is None:
             gains_px.append(-math.inf)
             continue
         gain_px = float(each.plane.p95_px) - float(each.held_out.p95_px)

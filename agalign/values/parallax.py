@@ -129,7 +129,8 @@ def rounded(values: NDArray[np.floating]) -> FloatImage:
 
 
 _CELL_PX = 32.0
-"""Range of parallax over which a parabola replaces the mapping, to 0.001 px."""
+"""Range of parallax over which a parabola replaces the mapping, to 0.001 px; the first range is around 0, so that it
+contains most scenes."""
 
 
 def between_levels(at_level: Callable[[float], NDArray[np.floating]], parallax_px: FloatImage) -> NDArray[np.floating]:
@@ -138,11 +139,11 @@ def between_levels(at_level: Callable[[float], NDArray[np.floating]], parallax_p
     `at_level` evaluates the function for all pixels at one parallax. It is a homography after a shift, followed by a
     lens, and a parabola through three levels interpolates it. The levels do not depend on other pixels.
     """
-    cells = np.floor(parallax_px / np.float32(_CELL_PX))
+    cells = np.rint(parallax_px / np.float32(_CELL_PX))
     result = np.empty((*parallax_px.shape, 2), parallax_px.dtype)
     for cell in range(int(cells.min()), int(cells.max()) + 1):
-        before, at, after = (at_level(_CELL_PX * (cell + k / 2)) for k in range(3))
-        u = (parallax_px * np.float32(2 / _CELL_PX) - np.float32(2 * cell + 1))[..., None]
+        before, at, after = (at_level(_CELL_PX * (cell + k / 2)) for k in (-1, 0, 1))
+        u = (parallax_px * np.float32(2 / _CELL_PX) - np.float32(2 * cell))[..., None]
         values = at + u * ((after - before) / 2 + u * ((after + before) / 2 - at))
         np.copyto(result, values, where=(cells == cell)[..., None], casting="same_kind")
     return result
