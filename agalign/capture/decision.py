@@ -66,11 +66,11 @@ def predicted_by_windows(
 ) -> Alignment[FixedImagePx]:
     """Return as `predicted` an alignment that its windows do not confirm, or another geometry than that of its capture.
 
-    The standard error is the RMS of the shifts of these windows.
+    The standard error is that of these windows.
     """
     assert alignment.residual is not None
     issues = alignment.issues if reason is None else (Issue(reason), *alignment.issues)
-    prediction = pair.prediction_by_windows(alignment.mapping, alignment.residual.rms_px)
+    prediction = pair.prediction_by_windows(alignment.mapping, alignment.residual.std_px)
     return decided(replace(alignment, issues=issues, prediction=prediction))
 
 

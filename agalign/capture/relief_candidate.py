@@ -23,6 +23,7 @@ from agalign.capture.warped_pair import WarpedPair
 from agalign.errors import GeometryError
 from agalign.fit.adjustment import (
     Adjustment,
+    BaselinePrior,
     WindowFit,
     WindowShifts,
     adjust,
@@ -143,7 +144,7 @@ def _common_parallax_px(group: Sequence[Candidate]) -> tuple[float, bool]:
     if far_share <= _MAX_FAR_SHARE and _gain_by_others_sigma(windows.of_bands(bands), model, size_px) < MIN_GAIN_SIGMA:
         return 0.0, False
     parallax_px = float(np.percentile(np.abs(model.parallax_px), 95))
-    return parallax_px, _layout(group, bands) is None and are_on_a_line(model.baselines)
+    return parallax_px, _layout([group[band] for band in bands]) is None and are_on_a_line(model.baselines)
 
 
 def _gain_by_others_sigma(windows: WindowShifts, model: Adjustment, size_px: tuple[int, int]) -> float:
@@ -183,9 +184,9 @@ def _far_share(residual: Residual[FixedImagePx]) -> float:
     return float((residual.lengths_px > MAX_SHIFT_PX).mean()) if len(residual.lengths_px) else 0.0
 
 
-def _layout(group: Sequence[Candidate], bands: Sequence[int]) -> NDArray[np.float64] | None:
-    """Return the layouts (bands, 2) of some bands; None if the tags lack one."""
-    layouts = [group[band].pair.layout for band in bands]
+def _layout(group: Sequence[Candidate]) -> NDArray[np.float64] | None:
+    """Return the layouts (bands, 2) of bands; None if the tags lack one."""
+    layouts = [candidate.pair.layout for candidate in group]
     return None if any(layout is None for layout in layouts) else np.array(layouts, float)
 
 
@@ -202,7 +203,7 @@ def _consistent(
     max_scale_ratio, min_foreign_px = 2.0, 0.4
 
     def adjusted(bands: Sequence[int], lens_std: NDArray[np.float64] | None) -> Adjustment | None:
-        layout, some = _layout(group, bands), windows.of_bands(bands)
+        layout, some = _layout([group[band] for band in bands]), windows.of_bands(bands)
         model = adjust(some, size_px, layout, lens_std) if some.are_enough(MIN_WINDOWS) else None
         return model if model is not None and are_of_lenses(model.baselines, layout) else None
 
@@ -273,7 +274,7 @@ def _observed(group: Sequence[Candidate]) -> dict[str, Alignment[FixedImagePx]]:
         kept, model = consistent
         bands = [bands[k].fitted(fit) for k, fit in zip(kept, model.fits, strict=True)]
     assert model is not None
-    if _layout(group, range(len(group))) is None and are_on_a_line(model.baselines):
+    if _layout(group) is None and are_on_a_line(model.baselines):
         return {}
     warped = [band.candidate.pair.warped_moving(band.plane) for band in bands]
     residuals = [reference.held_out_windows.residuals(image) for image in warped]
@@ -337,7 +338,7 @@ class _Estimate:
         if consistent is None:
             return None
         kept, model = consistent
-        layout = _layout(group, kept)
+        layout = _layout([group[k] for k in kept])
         bands = [planes[k].fitted(fit) for k, fit in zip(kept, model.fits, strict=True)]
         low, high = np.percentile(model.parallax_px, (1.0, 99.0)).tolist()  # values beyond are wrong peaks
         matching = DenseMatching(group[0].pair.reference.grey, _views(bands), (low, high))
@@ -357,6 +358,11 @@ class _Estimate:
         return result.negated if layout is None and nearer_sign(matched, baselines) < 0 else result
 
     @property
+    def baselines(self) -> NDArray[np.float64]:
+        """(bands, 2) t_b."""
+        return np.array([band.baseline for band in self.bands])
+
+    @property
     def negated(self) -> "_Estimate":
         """The estimate with the opposite sign of reliefs and baselines, which has the same parallax."""
         bands = [replace(b, baseline=(-b.baseline[0], -b.baseline[1])) for b in self.bands]
@@ -369,9 +375,16 @@ class _Estimate:
     def fitted(self, candidate: Candidate) -> _Band | None:
         """Fit homography and baseline of a band under the relief of the others; None if too few windows are measured.
 
-        Raises GeometryError.
+        The layout of the lenses, scaled to the baselines of the others, is the prior of the baseline. Raises
+        GeometryError.
         """
-        band = _Band(candidate, candidate.warped.mapping)
+        prior, layout = BaselinePrior(), _layout([candidate, *(b.candidate for b in self.bands)])
+        if layout is not None:
+            own, others = layout[0], layout[1:]
+            layout_std = 0.3  # of lens positions without tags, which deviate by up to 0.1 of the longest baseline
+            x, y = own * float((others * self.baselines).sum() / max((others**2).sum(), 1e-12))
+            prior = BaselinePrior((x, y), layout_std)
+        band = _Band(candidate, candidate.warped.mapping, prior.mean)
 
         def measured(mapping: PixelMapping) -> Residual[FixedImagePx]:
             return candidate.fit_residual(mapping)
@@ -379,7 +392,7 @@ class _Estimate:
         start, size_px = band.mapping(self.relief), candidate.pair.fixed.size_px
         if len(measured(start).measured_px) < MIN_WINDOWS:
             return None
-        fitted = fit_in_rounds(start, measured, size_px, lens_std_px=_lens_std_px(candidate.pair), with_baseline=True)
+        fitted = fit_in_rounds(start, measured, size_px, lens_std_px=_lens_std_px(candidate.pair), baseline=prior)
         if fitted is None or fitted[0].parallax is None:
             return None
         baseline, covariance_px2 = fitted[0].parallax.baseline, fitted[1].covariance_px2[:8, :8]

@@ -20,6 +20,7 @@ is known, positive parallax is nearer to the camera.
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -56,6 +57,14 @@ _ALTERNATIONS = 12
 """Enough for the baselines to converge to a relative change of 0.001."""
 _DAMPING = 1e-3
 """Weight of zero correction and zero parallax, relative to one window; matters only where no window contributes."""
+
+
+class BaselinePrior(NamedTuple):
+    """What is known of the baseline of a band before it is fitted."""
+
+    mean: tuple[float, float] = (0.0, 0.0)
+    std: float = 1.0
+    """Standard deviation of each coordinate: by default that of the lenses themselves."""
 
 
 @dataclass(frozen=True)
@@ -143,13 +152,13 @@ def fit_windows(
     size_px: tuple[int, int],
     lens_std_px: Array | None = None,
     *,
-    with_baseline: bool = False,
+    baseline: BaselinePrior | None = None,
 ) -> WindowFit | None:
     """Fit the correction of a mapping of a reference (width, height) to the residual measured with this mapping.
 
-    With the standard deviations `lens_std_px` (4,) of the lens shapes, these are fitted too; `with_baseline`, the
-    baseline along which the band sees the relief of the mapping. Without lens shapes, the result is None if fewer than
-    12 windows are measured. A window's weight is that of its correlation peak times a Cauchy weight.
+    With the standard deviations `lens_std_px` (4,) of the lens shapes, these are fitted too; with the prior of its
+    `baseline`, also that along which the band sees the relief of the mapping. Without lens shapes, the result is None
+    if fewer than 12 windows are measured. A window's weight is that of its correlation peak times a Cauchy weight.
     """
     raw = Shifts.of(residual)
     min_windows = 12  # without a prior: 1.5 times the eight parameters of a homography
@@ -164,14 +173,16 @@ def fit_windows(
         factor = 12.0
     count = len(std_px)
     design = jacobian(points_px, size_px, count)
-    if with_baseline and mapping.parallax is not None:
+    mean = np.zeros(count)
+    if baseline is not None and mapping.parallax is not None:
         parallax_px = mapping.parallax.relief(raw.centres_px)
         shifts_px = shifts_px + parallax_px[:, None] * np.array(mapping.parallax.baseline)
-        design, std_px = _with_parallax(design, parallax_px), np.r_[std_px, 1.0, 1.0]
+        design, std_px = _with_parallax(design, parallax_px), np.r_[std_px, [baseline.std] * 2]
+        mean = np.r_[mean, baseline.mean]
     robust = Robust(
         _CAUCHY_SCALES, shift_scale_px, lambda scale_px: factor * _AXIS_SHARE * scale_px**2 + MIN_SHIFT_SCALE_PX**2
     )
-    estimate = least_squares(design, shifts_px, raw.weights, np.diag(std_px**-2.0), robust=robust)
+    estimate = least_squares(design, shifts_px, raw.weights, np.diag(std_px**-2.0), mean, robust=robust)
     common_std_px = 0.01  # common to all windows; their residuals do not contain it
     covariance_px2 = estimate.covariance[:count, :count] + common_std_px**2 * np.eye(count)
     return _window_fit(estimate.mean, estimate.residuals, size_px, covariance_px2)
@@ -197,7 +208,7 @@ def fit_in_rounds(
     lens_std_px: Array | None = None,
     rounds: int = 4,
     *,
-    with_baseline: bool = False,
+    baseline: BaselinePrior | None = None,
 ) -> tuple[PixelMapping, WindowFit] | None:
     """Correct a mapping repeatedly by the residual that `measure` returns for it; return it and the last correction.
 
@@ -207,7 +218,7 @@ def fit_in_rounds(
     """
     result: tuple[PixelMapping, WindowFit] | None = None
     for _ in range(rounds):
-        fit = fit_windows(mapping, measure(mapping), size_px, lens_std_px, with_baseline=with_baseline)
+        fit = fit_windows(mapping, measure(mapping), size_px, lens_std_px, baseline=baseline)
         if fit is None or not is_accepted(fit):
             return None
         try:

@@ -22,6 +22,9 @@ from agalign.values.pixel_units import SAME_PIXELS, FixedFilePx, FixedImagePx, F
 MIN_RETRIEVAL = 0.2
 """Minimum held-out retrieval: below it psi is not updated and no result is accepted. Chance is below 0.01; unrelated
 images reach 0.05."""
+_NOISE_PX_SIGMA2 = 48.0
+"""RMS shift of aligned windows of 48 to 64 px times the squared height of their peaks: 48 to 60 in close-range and flat
+scenes, with peaks of 8 sigma (noise of 60 %) to 30."""
 MIN_TIMES_CHANCE = 5.0
 """The same limit as a multiple of chance, which is high where few keypoints can be drawn."""
 
@@ -147,16 +150,20 @@ class Residual(Generic[FixedPx]):
         return np.asarray(np.linalg.norm(self.shifts_px[np.isfinite(self.shifts_px[:, 0])], axis=1))
 
     @property
-    def rms_px(self) -> FixedPx:
-        """RMS shift of the windows, without a tenth of them, which may be wrong peaks; infinite without any.
+    def std_px(self) -> FixedPx:
+        """Standard error that the windows show: their RMS shift beyond the noise of their peaks; infinite without any.
 
-        The larger of those of a normal distribution with the same median, and with the same 90th percentile.
+        A fifth of the windows may be wrong peaks or at depth edges: the RMS is the larger of those of a normal
+        distribution with the same median, and with the same 80th percentile. Half of it remains at least, as the noise
+        is known to a factor.
         """
         if not len(self.lengths_px):
             return cast(FixedPx, math.inf)
+        peaks_sigma = self.peaks_sigma[np.isfinite(self.shifts_px[:, 0])]
+        noise_px = _NOISE_PX_SIGMA2 / float(np.median(peaks_sigma)) ** 2
         # Of a Rayleigh distribution: sqrt(-2 log(1 - p)) for the quantile p, and sqrt(2) for the RMS.
-        by_quantile = [np.quantile(self.lengths_px, p) / math.sqrt(-math.log(1 - p)) for p in (0.5, 0.9)]
-        return cast(FixedPx, float(max(by_quantile)))
+        rms_px = max(float(np.quantile(self.lengths_px, p)) / math.sqrt(-math.log(1 - p)) for p in (0.5, 0.8))
+        return cast(FixedPx, math.sqrt(max(rms_px**2 - noise_px**2, (rms_px / 2) ** 2)))
 
     @property
     def is_black(self) -> NDArray[np.bool_]:
