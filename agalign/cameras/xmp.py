@@ -52,7 +52,7 @@ class Packet:
     def parse(cls, packet: Any) -> "Packet":
         """Parse bytes or text. Of a damaged packet, what can be read is read."""
         text = packet.decode("utf-8", "replace") if isinstance(packet, bytes) else str(packet)
-        max_length = 1 << 22  # cameras write a few thousand characters
+        max_length = 1 << 19  # cameras write a few thousand characters; the time of repairs is quadratic
         text = text[:max_length].strip("\0 \n")
         start = re.search(f"<({_ENVELOPE})", text)
         if start is None:
