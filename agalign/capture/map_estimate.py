@@ -84,8 +84,11 @@ def _solve(
             design[band, :, block], design[band, :, -FACTORS:] = whitening, -whitening @ prior.by_factor
             values[band] = whitening @ prior.corners
     degrees_of_freedom = 4.0  # of the t distribution: heavy tails, as a lens may have moved
-    weights = np.full(len(blocks), 1 + 8 / degrees_of_freedom)
-    solution = least_squares(design, values, weights, information, mean, robust=Robust(degrees_of_freedom**0.5))
+    robust = Robust(degrees_of_freedom**0.5, iterations=20)
+    first_weights = np.ones(len(blocks))  # those of a residual of 0 would start at the rig and may stay there
+    weights = (1 + 8 / degrees_of_freedom) * first_weights
+    system = design, values, weights, information, mean
+    solution = least_squares(*system, robust=robust, first_weights=first_weights)
     # Rounding removes the last bits, which depend on the machine's order of summation.
     return [(np.round(solution.mean[s], 6), np.round(solution.covariance[s, s], 12)) for s in blocks]
 

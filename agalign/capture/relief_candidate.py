@@ -101,6 +101,8 @@ def aligned_by_relief(
             if is_observation:
                 with suppress(GeometryError):
                     result.alignments |= _observed(group)
+                if result.alignments.keys() & {c.pair.name for c in group}:
+                    result.others |= {c.pair.name for c in group} - result.alignments.keys()
                 continue
             estimate, aligned = _aligned_group(group)
             result.alignments |= aligned
@@ -274,11 +276,13 @@ def _observed(group: Sequence[Candidate]) -> dict[str, Alignment[FixedImagePx]]:
         kept, model = consistent
         bands = [bands[k].fitted(fit) for k, fit in zip(kept, model.fits, strict=True)]
     assert model is not None
-    if _layout(group) is None and are_on_a_line(model.baselines):
+    if _layout([b.candidate for b in bands]) is None and are_on_a_line(model.baselines):
         return {}
     warped = [band.candidate.pair.warped_moving(band.plane) for band in bands]
     residuals = [reference.held_out_windows.residuals(image) for image in warped]
     windows, checked = WindowShifts.of(residuals, [band.plane for band in bands]), []
+    if not windows.are_enough(MIN_WINDOWS):
+        return {}
     relief = windows.relief(parallax_of(windows.shifts_px, model.baselines, windows.weights), reference.grey.size_px)
     for number, band in enumerate(bands):
         others = np.delete(np.arange(len(bands)), number)
@@ -333,7 +337,7 @@ class _Estimate:
         Raises GeometryError.
         """
         planes, size_px = [_Band(c, c.warped.mapping) for c in group], group[0].pair.fixed.size_px
-        lens_std = _lens_std_px(group[0].pair)
+        lens_std = None if any(c.pair.has_rig for c in group) else _lens_std_px(group[0].pair)
         consistent = _consistent(_window_shifts(planes), group, lens_std)
         if consistent is None:
             return None

@@ -20,7 +20,7 @@ is known, positive parallax is nearer to the camera.
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -51,8 +51,8 @@ _CAUCHY_SCALES = 2.0
 """Residual of a window at which its robust weight is one half, in residual scales."""
 _RELIEF_STEP_PX = 32
 """Spacing of a relief by windows."""
-_AXIS_SHARE = 1 / 3
-"""Variance along one axis over the squared scale of lengths; normally distributed: 1 / 3.05."""
+_COMMON_STD_PX = 0.01
+"""Error that is common to all windows; their residuals do not contain it."""
 _ALTERNATIONS = 12
 """Enough for the baselines to converge to a relative change of 0.001."""
 _DAMPING = 1e-3
@@ -179,13 +179,16 @@ def fit_windows(
         shifts_px = shifts_px + parallax_px[:, None] * np.array(mapping.parallax.baseline)
         design, std_px = _with_parallax(design, parallax_px), np.r_[std_px, [baseline.std] * 2]
         mean = np.r_[mean, baseline.mean]
-    robust = Robust(
-        _CAUCHY_SCALES, shift_scale_px, lambda scale_px: factor * _AXIS_SHARE * scale_px**2 + MIN_SHIFT_SCALE_PX**2
-    )
+    robust = Robust(_CAUCHY_SCALES, shift_scale_px, lambda scale_px: _shift_variance_px2(scale_px, factor))
     estimate = least_squares(design, shifts_px, raw.weights, np.diag(std_px**-2.0), mean, robust=robust)
-    common_std_px = 0.01  # common to all windows; their residuals do not contain it
-    covariance_px2 = estimate.covariance[:count, :count] + common_std_px**2 * np.eye(count)
+    covariance_px2 = estimate.covariance[:count, :count] + _COMMON_STD_PX**2 * np.eye(count)
     return _window_fit(estimate.mean, estimate.residuals, size_px, covariance_px2)
+
+
+def _shift_variance_px2(scale_px: float | Array, factor: float = 1.0) -> Any:
+    """Return the variance along an axis of shifts with residuals of this scale, multiplied by `factor`."""
+    axis_share = 1 / 3  # of the squared scale of lengths; normally distributed: 1 / 3.05
+    return factor * axis_share * scale_px**2 + MIN_SHIFT_SCALE_PX**2
 
 
 def _window_fit(mean: Array, residuals_px: Array, size_px: tuple[int, int], covariance_px2: Array) -> WindowFit:
@@ -225,8 +228,11 @@ def fit_in_rounds(
             result = fit.applied_to(mapping), fit
         except GeometryError:
             return None
-        converged_px = 0.02  # noise of the windows
-        if fit.max_px <= converged_px:
+        converged_px, change_px = 0.02, fit.max_px  # noise of the windows
+        if fit.baseline is not None and mapping.parallax is not None:
+            change = np.linalg.norm(fit.baseline - mapping.parallax.baseline)
+            change_px = max(change_px, float(change) * mapping.parallax.relief.rms_px)
+        if change_px <= converged_px:
             break
         mapping = replace(result[0], field=mapping.field)
     return result
@@ -364,7 +370,11 @@ def adjust(
         precisions = np.minimum(1, (np.median(scales) / scales) ** 2)
     if layout is not None and np.sum(baselines * layout) < 0:
         baselines, parallax = -baselines, -parallax
-    covariances = _AXIS_SHARE * scales[:, None, None] ** 2 * by_band.covariance[:, :count, :count]
+    # Without the damping, so that a corner is uncertain that no window determines.
+    information = np.zeros(count + 2) if lens_std_px is None else np.r_[np.zeros(8), lens_std_px**-2.0, [0.0] * 2]
+    absolute = weights.T / _shift_variance_px2(scales)[:, None]
+    by_band = least_squares(_with_parallax(design, parallax), shifts.swapaxes(0, 1), absolute, np.diag(information))
+    covariances = by_band.covariance[:, :count, :count] + _COMMON_STD_PX**2 * np.eye(count)
     of_bands = zip(np.hstack([smooth, baselines]), residuals, covariances, strict=True)
     return Adjustment([_window_fit(mean, r, size_px, covariance) for mean, r, covariance in of_bands], parallax)
 
@@ -448,5 +458,6 @@ def _reference_plane(parallax: Array, plane: Array, information: Array) -> Array
     half_weight_px = 0.5  # distance from the plane at which the robust weight of a window is one half
     known = (information > min_information).astype(float)
     median, damping = np.array([np.median(parallax), 0.0, 0.0]), 1e-6 * np.eye(3)
-    robust = Robust(half_weight_px)
-    return least_squares(plane[:, None], parallax[:, None], known, damping, median, robust=robust, start=median).mean
+    near_median = known * cauchy_weights(parallax - median[0], half_weight_px)
+    by_window = plane[:, None], parallax[:, None], known
+    return least_squares(*by_window, damping, median, robust=Robust(half_weight_px), first_weights=near_median).mean

@@ -17,8 +17,6 @@ Array = NDArray[np.float64]
 
 MIN_SHIFT_SCALE_PX = 0.05
 """Noise of the measured shift of a window: the minimum residual scale of a fit to shifts."""
-REWEIGHTINGS = 6
-"""Iterations after which robust weights have converged."""
 
 
 class Estimate(NamedTuple):
@@ -42,6 +40,8 @@ class Robust(NamedTuple):
     variance: Callable[[float], float] = lambda _: 1.0
     """Returns the variance along a component of an observation of weight 1 from that scale; 1 if the weights are
     inverse variances, or relative to the prior."""
+    iterations: int = 6
+    """Enough for the weights to converge where few observations are outliers."""
 
 
 def least_squares(
@@ -52,22 +52,20 @@ def least_squares(
     mean: ArrayLike = 0.0,
     *,
     robust: Robust | None = None,
-    start: Array | None = None,
+    first_weights: Array | None = None,
 ) -> Estimate:
     """Solve a problem, or several that have the leading dimensions (…).
 
     `design` (…, n, k, p), `values` (…, n, k), `weights` (…, n), and `information` (p, p) and `mean` (p,) of the prior.
-    Without `robust` the weights are used as they are. The first robust weights are those of the residuals of the
-    parameters `start` (p,), by default 1. Directions that nothing determines have a large variance.
+    Without `robust` the weights are used as they are. The first iteration has the weights `first_weights` (…, n), by
+    default `weights`. Directions that nothing determines have a large variance.
     """
     rows = design.reshape(*design.shape[:-3], -1, design.shape[-1])
     flat = values.reshape(*values.shape[:-2], -1)
     of_prior = (information @ np.broadcast_to(mean, (*values.shape[:-2], len(information)))[..., None])[..., 0]
-    weighted, scale, min_information_share = weights, MIN_SHIFT_SCALE_PX, 1e-12
-    if robust is not None and start is not None:
-        residuals = np.linalg.norm((flat - rows @ start).reshape(values.shape), axis=-1)
-        weighted = weights * cauchy_weights(residuals, robust.half_weight * robust.scale(residuals))
-    for _ in range(1 if robust is None else REWEIGHTINGS):
+    weighted = weights if first_weights is None else first_weights
+    scale, min_information_share = MIN_SHIFT_SCALE_PX, 1e-12
+    for _ in range(1 if robust is None else robust.iterations):
         variance = 1.0 if robust is None else robust.variance(scale)
         of_rows = np.repeat(weighted / variance, design.shape[-2], axis=-1)[..., None] * rows
         normal = of_rows.swapaxes(-1, -2) @ rows + information

@@ -74,6 +74,13 @@ def test_a_certain_band_is_not_biased_by_the_rig() -> None:
     np.testing.assert_allclose(corners_near_the_mean(both["nir"]), there, atol=0.05)
 
 
+def test_a_moved_lens_does_not_stay_at_the_rig() -> None:
+    """Of 5 px, by images with a standard error of 0.4 px."""
+    there = np.tile([3.0, 4.0], (4, 1))
+    both = found_together(result(0, 0.03), result(there, 0.4), rig(0.08))
+    np.testing.assert_allclose(corners_near_the_mean(both["nir"]), there, atol=0.3)
+
+
 def test_without_a_rig_the_results_are_unchanged() -> None:
     there = np.array([[0.2, 0.0], [0.0, 0.1], [-0.3, 0.0], [0.0, 0.0]])
     red = result(there, 0.05)

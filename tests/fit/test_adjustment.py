@@ -105,6 +105,18 @@ def test_priors_do_not_depend_on_the_noise_of_a_band() -> None:
     assert np.abs(error_px.mean(axis=0)).max() < 0.5
 
 
+def test_a_corner_without_windows_is_uncertain() -> None:
+    """The smaller the part of the image with windows, as in the fit of a single band."""
+    worst_px = []
+    for share in (1.0, 0.12):
+        some = np.array([320, 240]) + share * (POINTS - [320, 240])
+        shift = heights()[:, None, None] * BASELINES + np.random.default_rng(0).normal(0, 0.03, (len(some), 4, 2))
+        model = adjust(WindowShifts(some, some, shift, np.ones(shift.shape[:2])), SIZE, BASELINES)
+        worst_px.append(max(np.sqrt(np.diag(fit.covariance_px2)).max() for fit in model.fits))
+    assert worst_px[0] < 0.1
+    assert worst_px[1] > 0.5
+
+
 def test_the_layout_determines_only_the_sign() -> None:
     rough = BASELINES + np.random.default_rng(5).normal(0, 0.15, BASELINES.shape)
     assert_recovered(adjust(shifts(), SIZE, rough))

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from agalign.values.least_squares import Robust, least_squares, shift_scale_px
+from agalign.values.least_squares import Robust, cauchy_weights, least_squares, shift_scale_px
 
 X = np.random.default_rng(0).normal(size=(200, 2, 3))
 TRUTH = np.array([1.0, -2.0, 0.5])
@@ -34,13 +34,14 @@ def test_several_problems_are_solved_together() -> None:
         np.testing.assert_allclose(alone.mean, (number + 1) * TRUTH, atol=0.01)
 
 
-def test_the_start_decides_between_two_groups() -> None:
+def test_the_first_weights_decide_between_two_groups() -> None:
     """Most observations are of another solution."""
     values = X @ TRUTH
     values[:120] += X[:120] @ np.array([50.0, 0.0, 0.0])
     starts = TRUTH, (*TRUTH[:1] + 50.0, *TRUTH[1:])
     for start in starts:
-        estimate = least_squares(X, values, np.ones(200), NO_PRIOR, robust=Robust(0.3), start=start)
+        near = cauchy_weights(np.linalg.norm(values - X @ start, axis=1), 0.3)
+        estimate = least_squares(X, values, np.ones(200), NO_PRIOR, robust=Robust(0.3), first_weights=near)
         np.testing.assert_allclose(estimate.mean, start, atol=0.05)
 
 
