@@ -256,7 +256,7 @@ def test_the_file_of_a_photograph_does_not_take_the_name_of_the_stack() -> None:
 )
 def test_options_go_together(shared: Shared, tmp_path: Path, options: dict[str, object]) -> None:
     """Of one capture of terraces and trees."""
-    flight = shared("relief_flight", lambda f: make_terraces(f, (480, 360), rng_seed=5, relief_m=6.0))
+    flight = shared("relief_flight", lambda f: make_terraces(f, (640, 480), rng_seed=5, relief_m=6.0))
     settings = agalign.Settings(
         relief=agalign.ReliefSettings(use=True), write=agalign.WriteSettings.model_validate(options)
     )
