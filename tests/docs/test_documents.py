@@ -38,7 +38,7 @@ RUN_BY = {"docker": "tools/container.sh", "dask": "tools/dask_cluster.sh", "pip"
 """What cannot be run inside a test, and the script that runs it and what stands with it in a block."""
 KINDS = {"sh", "python", "text", "{toctree}", "{include} ../CONTRIBUTING.md", "{include} ../CHANGELOG.md"}
 RUNNABLE = [page for page in PAGES if any(b.kind in ("sh", "python") for b in blocks_of(page))]
-LONG = re.compile("batch|benchmark-bands|close-range|paper|photogrammetry|python|qgis|radiometry|thermal")
+LONG = re.compile("batch|benchmark-bands|close-range|paper|photogrammetry|python|qgis|quickstart|radiometry|thermal")
 """Pages with blocks that take seconds, and of commands that other tests run: only the full run has them."""
 
 
