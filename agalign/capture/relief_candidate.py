@@ -109,7 +109,8 @@ def aligned_by_relief(
             if estimate is not None:
                 others = [*candidates, *(Candidate.at_seed(*one) for one in without_result)]
                 result.alignments |= estimate.for_others(others)
-                result.others |= {c.pair.name for c in group} - result.alignments.keys()
+                same = [c.pair for c in candidates if c.pair.reference is group[0].pair.reference]
+                result.others |= {pair.name for pair in same if not pair.is_coarse} - result.alignments.keys()
     return result
 
 

@@ -224,7 +224,7 @@ class Prediction:
     off_px: MovingFilePx | None = None
     """Root mean square distance from the band's own alignment; None if there is none."""
     covariance_px2: NDArray[np.float64] | None = None
-    """(12, 12) of an extrapolated mapping, over the corners and the lens shapes (`verify.window_fit`), px of the
+    """(12, 12) of an extrapolated mapping, over the corners and the lens shapes (`fit.adjustment`), px of the
     reference's file; None for a rig's."""
 
 

@@ -1,4 +1,4 @@
-"""Linear least squares with Gaussian priors and robust weights: the solver of every fit of the geometry.
+"""Linear least squares with Gaussian priors and robust weights: the solver of the dense fits of the geometry.
 
     min over m of  sum_i w_i rho(|y_i - X_i m|) + (m - m_0)^T P (m - m_0)
 

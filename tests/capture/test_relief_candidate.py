@@ -367,6 +367,13 @@ def test_an_observation_of_the_rig_needs_only_windows(four_lenses: Rendered) -> 
             assert alignment.joint.corner_std_px < 0.5
 
 
+def test_a_band_without_retrieval_that_the_relief_does_not_align_has_another_geometry(boxes: Rendered) -> None:
+    """It is not part of the bands from which the relief is estimated."""
+    result = boxes.candidates({"NIR": foreign(boxes.images["NIR"], "unrelated", seed=3)})
+    lost = [replace(c, joint=replace(c.joint, retrieval=0.0)) if c.pair.name == "NIR" else c for c in result]
+    assert aligned_by_relief(lost, "auto").others == {"NIR"}
+
+
 def test_use(candidates: Sequence[Candidate]) -> None:
     assert aligned_by_relief(candidates, "never") == ReliefResult()
     # One moving band cannot be verified with others; a coarse one has another reference.
