@@ -79,7 +79,7 @@ def aligned_by_relief(
     without_result: Sequence[tuple[BandPair, Seed]] = (),
     is_observation: bool = False,
 ) -> ReliefResult:
-    """Align bands by one relief of the capture, with displacement fields where no rig contains them.
+    """Align bands by one relief of the capture, with lens shapes where no rig contains the distortion.
 
     Bands `without_result` of the joint optimisation, and those with another kind of lens model, follow the relief too.
     With `use` "auto" a relief is only estimated if the residuals of the homographies contain common parallax. For an
