@@ -3,7 +3,7 @@
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import lru_cache, partial
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
@@ -14,13 +14,16 @@ from agalign.values.displacement import DisplacementField
 from agalign.values.geometry import Matrix, Points
 from agalign.values.image import Mask, Tile
 from agalign.values.lens import Lens
-from agalign.values.parallax import Parallax, between_levels
+from agalign.values.parallax import Parallax
 from agalign.values.pixel_units import PixelScale, Size
 
 _BLOCK_PX = 256
 """Side of the blocks of the reference in which positions are interpolated."""
 _KNOT_STEP_PX = 32
 """Distance of the knots of interpolated curved mappings: the error with real lenses is below 0.0001 px."""
+_CELL_PX = 32.0
+"""Range of parallax over which a parabola replaces the mapping, to 0.001 px; the first range is around 0, so that it
+contains most scenes."""
 
 
 @dataclass(frozen=True)
@@ -122,8 +125,12 @@ class PixelMapping:
         """
         width, height = size_px or (tile.x0 + tile.width, tile.y0 + tile.height)
         (left, columns), (top, rows) = _blocks(tile.x0, tile.width, width), _blocks(tile.y0, tile.height, height)
-        blocks = [np.hstack([self.at_crossings(x_px, y_px, dtype) for x_px in columns]) for y_px in rows]
-        return np.vstack(blocks)[top : top + tile.height, left : left + tile.width]
+        result = np.empty((sum(map(len, rows)), sum(map(len, columns)), 2), dtype)
+        for y_px in rows:
+            of_row = result[int(y_px[0] - rows[0][0]) :][: len(y_px)]
+            for x_px in columns:
+                of_row[:, int(x_px[0] - columns[0][0]) :][:, : len(x_px)] = self.at_crossings(x_px, y_px, dtype)
+        return result[top : top + tile.height, left : left + tile.width]
 
     def at_crossings(self, x_px: Points, y_px: Points, dtype: DTypeLike = np.float64) -> Points:
         """Positions (m, n, 2) in the moving image, raw px, of columns x (n,) and rows y (m,), both ascending."""
@@ -140,22 +147,36 @@ class PixelMapping:
         return result
 
     def _with_parallax(self, parallax: Parallax, x_px: Points, y_px: Points, dtype: DTypeLike) -> Points:
-        """`at_crossings` with parallax, which is not smooth and cannot be interpolated between knots."""
+        """`at_crossings` with parallax, which is not smooth and cannot be interpolated between knots.
 
-        def at_level(parallax_px: float) -> Points:
-            moved = partial(self.at_parallax, baseline=parallax.baseline, parallax_px=parallax_px)
-            return splined(moved, x_px, y_px, self._knot_step_px, dtype)
-
+        In each cell of the parallax, the parabola through three levels replaces the mapping; its coefficients are
+        smooth. The cells do not depend on other pixels.
+        """
         relief = parallax.relief
         of_raw_pixels = self.pre_distortion is None
         levels_px = relief.at_crossings(x_px, y_px) if of_raw_pixels else relief(self._raw_crossings(x_px, y_px))
-        return np.asarray(between_levels(at_level, np.asarray(levels_px, np.float32)), dtype)
+        cells = np.rint(levels_px / _CELL_PX)
+        result = np.empty((*levels_px.shape, 2), dtype)
+        for cell in range(int(cells.min()), int(cells.max()) + 1):
+
+            def coefficients(points: Points, cell: int = cell) -> Points:
+                levels = (_CELL_PX * (cell + k / 2) for k in (-1, 0, 1))
+                before, at, after = (self.at_parallax(points, parallax.baseline, level_px) for level_px in levels)
+                return np.concatenate([at, (after - before) / 2, (after + before) / 2 - at], axis=-1)
+
+            constant, linear, square = np.split(splined(coefficients, x_px, y_px, self._knot_step_px, dtype), 3, axis=-1)
+            u = (levels_px * (2 / _CELL_PX) - 2 * cell).astype(dtype)[..., None]
+            np.copyto(result, constant + u * (linear + u * square), where=(cells == cell)[..., None])
+        return result
 
     def hidden(self, tile: Tile) -> Mask:
         """(height, width) True for pixels of a tile that nearer parts of the scene occlude in the moving image."""
         if self.parallax is None or self.parallax.hidden is None:
             return np.zeros((tile.height, tile.width), dtype=bool)
-        return self.parallax.hides(self._raw_crossings(_along(tile.x0, tile.width), _along(tile.y0, tile.height)))
+        x_px, y_px = _along(tile.x0, tile.width), _along(tile.y0, tile.height)
+        if self.pre_distortion is None:
+            return self.parallax.hides(x_px, y_px[:, None])
+        return self.parallax.hides(*np.moveaxis(self._raw_crossings(x_px, y_px), -1, 0))
 
     def _raw_crossings(self, x_px: Points, y_px: Points) -> Points:
         """(m, n, 2) raw reference px of the pixels of columns x (n,) and rows y (m,)."""
@@ -190,7 +211,7 @@ def splined(
     step_px: int = _KNOT_STEP_PX,
     dtype: DTypeLike = np.float64,
 ) -> Points:
-    """A smooth mapping of points (..., 2) at all crossings of columns x (n,) and rows y (m,): (m, n, 2).
+    """A smooth function (..., k) of points (..., 2) at all crossings of columns x (n,) and rows y (m,): (m, n, k).
 
     A bicubic spline through the mapping's values on a lattice is linear in those values: two matrix products. The
     second one, by far the larger, is in `dtype`.
@@ -200,10 +221,10 @@ def splined(
     )
     values = mapping(np.stack(np.meshgrid(x_px[0] + knots_x, y_px[0] + knots_y), axis=-1))
     across = np.ascontiguousarray(weights_x.T, dtype)
-    result = np.empty((len(y_px), len(x_px), 2), dtype)
-    for k in (0, 1):
-        result[..., k] = (weights_y @ values[..., k]).astype(dtype, copy=False) @ across
-    return result
+    planes = np.empty((values.shape[-1], len(y_px), len(x_px)), dtype)  # contiguous ones are faster
+    for k, plane in enumerate(planes):
+        np.matmul((weights_y @ values[..., k]).astype(dtype, copy=False), across, out=plane)
+    return np.moveaxis(planes, 0, -1)
 
 
 @lru_cache(maxsize=32)

@@ -9,7 +9,6 @@ in band b. H_b is the homography that the reference plane induces. The parallax 
 same in all bands: it is proportional to 1 / range minus that of the plane. t_b is the direction of the band's lens.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import cv2
@@ -96,13 +95,16 @@ class Parallax:
     hidden: Mask | None = None
     """On the raster of the relief: pixels that nearer parts of the scene occlude in this band. None hides nothing."""
 
-    def hides(self, points_px: NDArray[np.float64]) -> Mask:
-        """(...) True where a raw point (..., 2) of the reference is occluded in the band."""
+    def hides(self, x_px: NDArray[np.float64], y_px: NDArray[np.float64]) -> Mask:
+        """True where raw points of the reference are occluded in the band; x and y are broadcast to each other."""
         if self.hidden is None:
-            return np.zeros(points_px.shape[:-1], dtype=bool)
-        at = np.rint(self.relief.scale.positions(points_px)).astype(np.intp)
+            return np.zeros(np.broadcast_shapes(x_px.shape, y_px.shape), dtype=bool)
+        (x, _), (_, y) = (
+            np.moveaxis(np.rint(self.relief.scale.positions(np.stack([v, v], axis=-1))), -1, 0).astype(np.intp)
+            for v in (x_px, y_px)
+        )
         height, width = self.hidden.shape
-        return np.asarray(self.hidden[at[..., 1].clip(0, height - 1), at[..., 0].clip(0, width - 1)])
+        return np.asarray(self.hidden[y.clip(0, height - 1), x.clip(0, width - 1)])
 
     def rescaled(self, scale: PixelScale) -> "Parallax":
         """The same on a reference that is resized by `scale`."""
@@ -126,24 +128,3 @@ def rounded(values: NDArray[np.floating]) -> FloatImage:
     """Return values (height, width) of a relief as they are written: rounded below their errors, which compresses."""
     step = np.float64(0.01)
     return np.asarray(np.round(values / step) * step, np.float32)
-
-
-_CELL_PX = 32.0
-"""Range of parallax over which a parabola replaces the mapping, to 0.001 px; the first range is around 0, so that it
-contains most scenes."""
-
-
-def between_levels(at_level: Callable[[float], NDArray[np.floating]], parallax_px: FloatImage) -> NDArray[np.floating]:
-    """Return a smooth function of parallax and pixel, (height, width, 2), at the parallax of each pixel.
-
-    `at_level` evaluates the function for all pixels at one parallax. It is a homography after a shift, followed by a
-    lens, and a parabola through three levels interpolates it. The levels do not depend on other pixels.
-    """
-    cells = np.rint(parallax_px / np.float32(_CELL_PX))
-    result = np.empty((*parallax_px.shape, 2), parallax_px.dtype)
-    for cell in range(int(cells.min()), int(cells.max()) + 1):
-        before, at, after = (at_level(_CELL_PX * (cell + k / 2)) for k in (-1, 0, 1))
-        u = (parallax_px * np.float32(2 / _CELL_PX) - np.float32(2 * cell))[..., None]
-        values = at + u * ((after - before) / 2 + u * ((after + before) / 2 - at))
-        np.copyto(result, values, where=(cells == cell)[..., None], casting="same_kind")
-    return result
