@@ -55,8 +55,12 @@ _COMMON_STD_PX = 0.01
 """Error that is common to all windows; their residuals do not contain it."""
 _ALTERNATIONS = 12
 """Enough for the baselines to converge to a relative change of 0.001."""
-_DAMPING = 1e-3
-"""Weight of zero correction and zero parallax, relative to one window; matters only where no window contributes."""
+_CORNER_STD_PX = 5.0
+"""Prior of the displacement of a corner: the error of an extrapolated affine mapping."""
+_NOISE_PX = 0.1
+"""Scale of the residuals of windows before the first fit."""
+_MIN_INFORMATION = 0.01
+"""Weight of zero parallax, relative to one window of one band; matters only where no window contributes."""
 
 
 class BaselinePrior(NamedTuple):
@@ -167,8 +171,7 @@ def fit_windows(
     points_px, shifted_px = (mapping.undistorted(p) for p in (raw.centres_px, raw.centres_px + raw.shifts_px))
     shifts_px, std_px, factor = shifted_px - points_px, np.full(8, np.inf), 1.0
     if lens_std_px is not None:
-        corner_std_px = 5.0  # error of an extrapolated affine mapping
-        std_px = np.r_[np.full(8, corner_std_px), lens_std_px]
+        std_px = np.r_[np.full(8, _CORNER_STD_PX), lens_std_px]
         # Lens shapes extrapolate errors by relief, which neighbouring windows have in common.
         factor = 12.0
     count = len(std_px)
@@ -343,20 +346,23 @@ def adjust(
     if initial is None or not np.linalg.norm(initial, axis=1).max() > 0:
         return None
     baselines = initial / np.linalg.norm(initial, axis=1).max()
-    information = np.full(8, _DAMPING)
-    if lens_std_px is not None:
-        noise_px = 0.1  # of a window of weight 1, to which the priors are relative
-        information = np.r_[information, (noise_px / lens_std_px) ** 2]
-    count = len(information)
-    design, prior = jacobian(windows.points_px, size_px, count), np.diag(np.r_[information, [1e-3 * _DAMPING] * 2])
+    smooth_std_px = np.r_[np.full(8, _CORNER_STD_PX), [] if lens_std_px is None else lens_std_px]
+    count = len(smooth_std_px)
+    design, prior = (
+        jacobian(windows.points_px, size_px, count),
+        np.diag(np.r_[smooth_std_px, [BaselinePrior().std] * 2] ** -2),
+    )
     plane = _plane_coordinates(windows.points_px, size_px)
     shifts, weights = np.nan_to_num(windows.shifts_px), windows.weights
-    smooth, precisions = np.zeros((len(baselines), count)), np.ones(len(baselines))
+    smooth, scales = np.zeros((len(baselines), count)), np.full(len(baselines), _NOISE_PX)
     for _ in range(_ALTERNATIONS):
         relative = shifts - np.einsum("nki,bi->nbk", design, smooth)
+        # A band worse than the median has the weight of its variance, so that it does not determine the parallax.
+        precisions = np.minimum(1, (np.median(scales) / scales) ** 2)
         parallax, of_windows = _parallax(relative, baselines, weights * precisions)
         parallax = parallax - plane @ _reference_plane(parallax, plane, of_windows)
-        by_band = least_squares(_with_parallax(design, parallax), shifts.swapaxes(0, 1), weights.T, prior)
+        absolute = weights.T / _shift_variance_px2(scales)[:, None]
+        by_band = least_squares(_with_parallax(design, parallax), shifts.swapaxes(0, 1), absolute, prior)
         smooth, baselines = by_band.mean[:, :count], by_band.mean[:, count:]
         longest = np.linalg.norm(baselines, axis=1).max()
         if not longest > 0:
@@ -365,15 +371,8 @@ def adjust(
         residuals = np.where(windows.weights.T > 0, by_band.residuals, np.nan)
         scales = np.array([shift_scale_px(r[np.isfinite(r)]) for r in residuals])
         weights = windows.weights * np.nan_to_num(cauchy_weights(residuals.T, _CAUCHY_SCALES * scales))
-        # Inverse variance of bands worse than the median, so that an inconsistent band does not determine the parallax.
-        # The fit of a band does not use it: its priors are relative to windows of weight 1.
-        precisions = np.minimum(1, (np.median(scales) / scales) ** 2)
     if layout is not None and np.sum(baselines * layout) < 0:
         baselines, parallax = -baselines, -parallax
-    # Without the damping, so that a corner is uncertain that no window determines.
-    information = np.zeros(count + 2) if lens_std_px is None else np.r_[np.zeros(8), lens_std_px**-2.0, [0.0] * 2]
-    absolute = weights.T / _shift_variance_px2(scales)[:, None]
-    by_band = least_squares(_with_parallax(design, parallax), shifts.swapaxes(0, 1), absolute, np.diag(information))
     covariances = by_band.covariance[:, :count, :count] + _COMMON_STD_PX**2 * np.eye(count)
     of_bands = zip(np.hstack([smooth, baselines]), residuals, covariances, strict=True)
     return Adjustment([_window_fit(mean, r, size_px, covariance) for mean, r, covariance in of_bands], parallax)
@@ -449,7 +448,7 @@ def _parallax(residual_px: Array, baselines: Array, weights: Array) -> tuple[Arr
     """Return the parallax (n,) by weighted least squares along the baselines, and its information (n,)."""
     projection = (weights * np.einsum("nbk,bk->nb", residual_px, baselines)).sum(axis=1)
     information = (weights * (baselines**2).sum(axis=1)).sum(axis=1)
-    return projection / (information + 10 * _DAMPING), information
+    return projection / (information + _MIN_INFORMATION), information
 
 
 def _reference_plane(parallax: Array, plane: Array, information: Array) -> Array:
