@@ -14,8 +14,8 @@ from agalign.batch.earlier_results import refuse_other_captures
 from agalign.batch.run import Listener, run_flight
 from agalign.cameras.discover import discover
 from agalign.capture.align_bands import align_pairs
-from agalign.capture.band_pair import BandPair, Candidates
-from agalign.capture.from_windows import without_extrapolated
+from agalign.capture.band_pair import BandPair, SeedMatrices
+from agalign.capture.by_windows import without_extrapolated
 from agalign.capture.warped_pair import with_metrics
 from agalign.config import DiscoverOptions, RunOptions, Settings
 from agalign.errors import InputError
@@ -73,11 +73,11 @@ def align(
     settings = settings or Settings()
     fixed_raster = raster_of(fixed, fixed_valid, "fixed")
     moving_raster = raster_of(moving, moving_valid, "moving")
-    candidates: Candidates = {"identity": geometry.overlay(fixed_raster.size_px, moving_raster.size_px)}
+    matrices: SeedMatrices = {"identity": geometry.overlay(fixed_raster.size_px, moving_raster.size_px)}
     if seed is not None:
-        candidates = {"user": geometry.normalised(seed)}
+        matrices = {"user": geometry.normalised(seed)}
     seed_std: dict[SeedKind, FixedImagePx] = {} if seed_std_px is None else {"user": FixedImagePx(seed_std_px)}
-    pair = BandPair.of_images("moving", fixed_raster, moving_raster, candidates, seed_std)
+    pair = BandPair.of_images("moving", fixed_raster, moving_raster, matrices, seed_std)
     result = without_extrapolated([pair], align_pairs([pair], settings, quiet))
     return replace(with_metrics(result["moving"], pair), moving_size_px=moving_raster.size_px)
 

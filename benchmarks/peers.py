@@ -140,7 +140,7 @@ def elastix(fixed: Image, moving: Image) -> Matrix | None:
 def structure_seed(fixed: Raster, moving: Raster) -> Matrix:
     """Where the program starts on a pair without tags."""
     pair = BandPair.of_images("moving", fixed, moving, {"identity": np.eye(3)})
-    return best_seed(pair, pair.candidates).fixed_to_moving
+    return best_seed(pair, pair.seed_matrices).fixed_to_moving
 
 
 def structure_ties(fixed: Image, moving: Image) -> Matrix | None:

@@ -25,12 +25,12 @@ def seeds_of(pair: BandPair) -> dict[str, PixelMapping]:
     """Return the mappings between raw px of each kind of seed, and of the one that a run selects."""
     plain = geometry.overlay(pair.fixed.size_px, pair.moving.size_px)
     result = {"identity": PixelMapping(plain)}
-    if "rig" in pair.candidates:
-        result["rig"] = pair.mapping(pair.candidates["rig"])
+    if "rig" in pair.seed_matrices:
+        result["rig"] = pair.mapping(pair.seed_matrices["rig"])
     shifted = best_seed(pair, {"identity": plain})
     if shifted.kind == "structure":
         result["structure"] = pair.mapping(shifted.fixed_to_moving)
-    result["chosen"] = pair.mapping(best_seed(pair, pair.candidates).fixed_to_moving)
+    result["chosen"] = pair.mapping(best_seed(pair, pair.seed_matrices).fixed_to_moving)
     return result
 
 

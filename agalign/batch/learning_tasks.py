@@ -11,7 +11,7 @@ import numpy as np
 from agalign.batch.capture_task import quiet
 from agalign.capture.align_bands import PairAligner, refined_pairs, verify_together
 from agalign.capture.band_pair import BandPair, read_pairs
-from agalign.capture.prediction import observed, with_predictions
+from agalign.capture.by_rig import observed, with_predictions
 from agalign.capture.seeding import find_seed, image_groups
 from agalign.config import Settings
 from agalign.errors import AgalignError

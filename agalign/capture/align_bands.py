@@ -6,13 +6,13 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 
 from agalign.capture.band_pair import BandPair, read_pairs
+from agalign.capture.by_relief import aligned_by_relief
+from agalign.capture.by_rig import bands_to_learn, with_predictions
+from agalign.capture.by_windows import aligned_by_windows, without_extrapolated
 from agalign.capture.candidate import Candidate
 from agalign.capture.decision import at_seed, decided, predicted_by_windows, verified, without_result
-from agalign.capture.from_windows import from_windows, without_extrapolated
 from agalign.capture.full_resolution import at_full_resolution
 from agalign.capture.map_estimate import map_estimate
-from agalign.capture.prediction import bands_to_learn, with_predictions
-from agalign.capture.relief_candidate import aligned_by_relief
 from agalign.capture.seeding import find_seed, image_groups
 from agalign.capture.warped_pair import with_metrics
 from agalign.config import Settings
@@ -171,7 +171,7 @@ class PairAligner:
             names = self.bands_to_learn(pairs, capture)
             remaining = [s for s in remaining if s[0].name in names]
         self.learn(remaining)
-        self.fit_windows(starts)
+        self.align_by_windows(starts)
         return self.timed_result()
 
     def verify_refined(self, pairs: Sequence[BandPair], known: Mapping[str, RefinedPair]) -> bool:
@@ -203,7 +203,9 @@ class PairAligner:
                 self.progress(pair.name, "seeding", 0.0)
                 seed = find_seed(pair, self.settings.seed, self.model)
                 if isinstance(seed, Issue):
-                    self.result[pair.name] = without_result(pair, Seed(*next(iter(pair.candidates.items())), 0.0), seed)
+                    self.result[pair.name] = without_result(
+                        pair, Seed(*next(iter(pair.seed_matrices.items())), 0.0), seed
+                    )
                 else:
                     starts.append((pair, seed))
         return starts
@@ -236,7 +238,7 @@ class PairAligner:
         """Align pairs with networks that are learned from scratch."""
         self._align(starts, [], lambda group, report: align_from_scratch(group, self.settings.joint, report))
 
-    def fit_windows(self, starts: Sequence[Start]) -> None:
+    def align_by_windows(self, starts: Sequence[Start]) -> None:
         """Align by windows the pairs without retrieval of held-out patches."""
         if not _may_be_homography(self.settings):
             return
@@ -245,7 +247,7 @@ class PairAligner:
             if pair.name not in self.result:
                 continue
             with self.timer.measure([pair.name]):
-                before, after = self.result[pair.name], from_windows(pair, self.result[pair.name])
+                before, after = self.result[pair.name], aligned_by_windows(pair, self.result[pair.name])
                 is_mixed = has_relief and not pair.is_coarse and after is not before and after.status == "aligned"
                 self.result[pair.name] = predicted_by_windows(after, pair, OTHER_GEOMETRY) if is_mixed else after
 
@@ -300,7 +302,7 @@ def verify_together(
         candidates = _candidates(starts, results, model, settings)
         progress(starts[0][0].name if starts else "", "relief", 0.0)
         lost = [start for start, result in zip(starts, results, strict=True) if isinstance(result, Issue)]
-        relief = aligned_by_relief(list(candidates.values()), use, without_result=lost, is_observation=is_observation)
+        relief = aligned_by_relief(list(candidates.values()), use, lost=lost, is_observation=is_observation)
     alignments = relief.alignments
     for (pair, seed), result in zip(starts, results, strict=True):
         if pair.name in alignments:
@@ -312,7 +314,7 @@ def verify_together(
             else:
                 field_use = "never" if is_observation or pair.name in relief.along_a_line else use
                 alignment = verified(candidates[pair.name], field_use)
-                is_mixed = pair.name in relief.others and alignment.status == "aligned"
+                is_mixed = pair.name in relief.of_other_geometry and alignment.status == "aligned"
                 alignments[pair.name] = predicted_by_windows(alignment, pair, OTHER_GEOMETRY) if is_mixed else alignment
     return alignments
 

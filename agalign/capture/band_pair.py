@@ -1,4 +1,4 @@
-"""Band pairs: the reference and a moving image at the resolution of the estimation, with candidate mappings."""
+"""Band pairs: the reference and a moving image at the resolution of the estimation, with initial mappings."""
 
 import dataclasses
 import math
@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agalign.capture.reference import Reference
-from agalign.capture.tag_seeds import seed_candidates
+from agalign.capture.tag_seeds import tag_seeds
 from agalign.config import SeedSettings
 from agalign.errors import AgalignError
 from agalign.fit.windows import FixedWindows
@@ -39,10 +39,10 @@ from agalign.values.pixel_units import (
     PixelScale,
 )
 
-Candidates = Mapping[SeedKind, Matrix]
+SeedMatrices = Mapping[SeedKind, Matrix]
 """fixed_to_moving homographies between undistorted pixels, in order of preference."""
 _MAX_ERROR_STD = 3.0
-"""Maximum error of a candidate in standard errors."""
+"""Maximum error of an initial mapping in standard errors."""
 _LONGEST_SIDE_PX = 2700
 """Larger images are reduced to this for estimation, which limits memory and time; `full_resolution` refines the result.
 The bands of most cameras have fewer pixels (2592 on the Mavic 3M)."""
@@ -59,13 +59,13 @@ class BandPair:
     """Name of the moving band, or of the first of several bands of one lens."""
     reference: Reference
     moving_image: Raster
-    candidates: Candidates
+    seed_matrices: SeedMatrices
     bands: tuple[Band, ...] = ()
     """The moving bands: one, or three of an RGB image; empty for arrays."""
     scales: PairScales = SAME_SCALES
     """Scales of the two images relative to their files."""
-    candidate_std_px: Mapping[SeedKind, FixedImagePx] = dataclasses.field(default_factory=dict)
-    """Standard errors of candidates, where known."""
+    seed_std_px: Mapping[SeedKind, FixedImagePx] = dataclasses.field(default_factory=dict)
+    """Standard errors of these, where known."""
     is_coarse: bool = False
     """The moving image has so few pixels that the reference is reduced for it."""
     field: DisplacementField | None = None
@@ -80,11 +80,11 @@ class BandPair:
         name: str,
         fixed: Raster,
         moving: Raster,
-        candidates: Candidates,
-        candidate_std_px: Mapping[SeedKind, FixedImagePx] | None = None,
+        seed_matrices: SeedMatrices,
+        seed_std_px: Mapping[SeedKind, FixedImagePx] | None = None,
     ) -> "BandPair":
         """Create a pair of two images that are not reduced."""
-        return cls(name, Reference(fixed), moving, candidates, candidate_std_px=candidate_std_px or {})
+        return cls(name, Reference(fixed), moving, seed_matrices, seed_std_px=seed_std_px or {})
 
     @property
     def space(self) -> Space:
@@ -108,12 +108,12 @@ class BandPair:
     @property
     def max_shift_px(self) -> FixedImagePx:
         """Maximum distance of a result from its seed; infinite unless the user specified the seed."""
-        return self.candidate_std_px.get("user", FixedImagePx(math.inf)) * _MAX_ERROR_STD
+        return self.seed_std_px.get("user", FixedImagePx(math.inf)) * _MAX_ERROR_STD
 
     @property
     def has_rig(self) -> bool:
         """True if the flight's rig contains this band."""
-        return "model" in self.candidate_std_px
+        return "model" in self.seed_std_px
 
     @property
     def has_rig_pixels(self) -> bool:
@@ -161,19 +161,19 @@ class BandPair:
         return warped(channel_mean(self.moving_image), mapping, self.fixed.size_px)
 
     def is_expected(self, fixed_to_moving: Matrix, shift_px: tuple[float, float] = (0.0, 0.0)) -> bool:
-        """Return True if a mapping agrees with a candidate within _MAX_ERROR_STD standard errors.
+        """Return True if a mapping agrees with an initial one within _MAX_ERROR_STD standard errors.
 
         The mapping is shifted first by `shift_px` of the fixed image. The distance is measured in the fixed image, to
-        which the standard errors refer, between the image centre and the point that the candidate maps to the same
-        moving point.
+        which the standard errors refer, between the image centre and the point that the initial mapping maps to the
+        same moving point.
         """
         shifted = geometry.compose(fixed_to_moving, geometry.translation(*shift_px))
         centre = FixedImagePoints((np.array(self.fixed.size_px) - 1) / 2)
         mapped = MovingImagePoints(geometry.apply(shifted, centre))
         return any(
-            self._distance_px(centre, mapped, self.candidates[kind]) <= std_px * _MAX_ERROR_STD
-            for kind, std_px in self.candidate_std_px.items()
-            if kind in self.candidates
+            self._distance_px(centre, mapped, self.seed_matrices[kind]) <= std_px * _MAX_ERROR_STD
+            for kind, std_px in self.seed_std_px.items()
+            if kind in self.seed_matrices
         )
 
     @staticmethod
@@ -187,7 +187,7 @@ class BandPair:
         width, height = (round(n / s) for n, s in zip(self.fixed.size_px, self.scales.fixed, strict=True))
         return width, height
 
-    def prediction_by_windows(
+    def prediction_of(
         self, mapping: PixelMapping, std_px: FixedImagePx, covariance_px2: NDArray[np.float64] | None = None
     ) -> Prediction:
         """Return the prediction of a mapping between the images with this standard error.
@@ -217,8 +217,8 @@ def read_pairs(
     pairs: list[BandPair] = []
     unusable: dict[str, Issue] = {}
     for bands in capture.moving_lenses:
-        candidates = _candidates(capture.reference, bands[0], settings, model)
-        if not candidates:
+        matrices = _seed_matrices(capture.reference, bands[0], settings, model)
+        if not matrices:
             issue = Issue(NO_SUCH_SEED, detail=str(settings.force))
             unusable |= dict.fromkeys((b.name for b in bands), issue)
             continue
@@ -227,10 +227,10 @@ def read_pairs(
         except AgalignError as error:
             unusable |= dict.fromkeys((b.name for b in bands), Issue(UNREADABLE, detail=str(error)))
             continue
-        longest = longest_for(capture.reference, next(iter(candidates.values())))
+        longest = longest_for(capture.reference, next(iter(matrices.values())))
         if longest not in references:
             references[longest] = Reference(read_for_alignment(capture.reference, longest))
-        pairs.append(_pair(capture.reference, references[longest], longest, bands, moving, candidates, model))
+        pairs.append(_pair(capture.reference, references[longest], longest, bands, moving, matrices, model))
     return _without_stripes(pairs, references[_LONGEST_SIDE_PX]), unusable
 
 
@@ -246,12 +246,12 @@ def _without_stripes(pairs: Sequence[BandPair], reference: Reference) -> list[Ba
     ]
 
 
-def _candidates(reference: Band, moving: Band, settings: SeedSettings, model: FlightModel | None) -> Candidates:
+def _seed_matrices(reference: Band, moving: Band, settings: SeedSettings, model: FlightModel | None) -> SeedMatrices:
     """Return fixed_to_moving between undistorted px of the files by kind; empty if a forced kind is not available."""
-    candidates = seed_candidates(reference, moving, settings)
+    matrices = tag_seeds(reference, moving, settings)
     if model is not None and moving.name in model.mappings:
-        return {"model": model.mappings[moving.name], **candidates}
-    return candidates
+        return {"model": model.mappings[moving.name], **matrices}
+    return matrices
 
 
 def _pair(
@@ -260,7 +260,7 @@ def _pair(
     longest: int,
     bands: Sequence[Band],
     moving: Raster,
-    candidates: Candidates,
+    matrices: SeedMatrices,
     model: FlightModel | None,
 ) -> BandPair:
     """Create the pair of `reference`, the image of `band` reduced to `longest` px, and the image of `bands`."""
@@ -269,10 +269,10 @@ def _pair(
     scales = PairScales(
         PixelScale.between(band.size_px, reference.image.size_px), PixelScale.between(bands[0].size_px, moving.size_px)
     )
-    reduced: Candidates = {kind: scales.between_images(matrix) for kind, matrix in candidates.items()}
+    reduced: SeedMatrices = {kind: scales.between_images(matrix) for kind, matrix in matrices.items()}
     field = None if model is None or model.rig is None else model.rig.fields.get(name)
     field = None if field is None else field.rescaled(scales.fixed)
-    std_px = _candidate_std_px(name, model, scales.fixed)
+    std_px = _seed_std_px(name, model, scales.fixed)
     return BandPair(
         name, reference, moving, reduced, tuple(bands), scales, std_px, is_coarse, field, _layout(band, bands[0])
     )
@@ -300,8 +300,8 @@ def longest_for(reference: Band, fixed_to_moving: Matrix) -> int:
     return min(_LONGEST_SIDE_PX, max(side_px, min_side_px))
 
 
-def _candidate_std_px(band: str, model: FlightModel | None, scale: PixelScale) -> dict[SeedKind, FixedImagePx]:
-    """Return the standard errors of candidates from tags and of the flight's mean; `scale` is of the fixed image."""
+def _seed_std_px(band: str, model: FlightModel | None, scale: PixelScale) -> dict[SeedKind, FixedImagePx]:
+    """Return the standard errors of mappings by tags and of the flight's mean; `scale` is of the fixed image."""
     tags_std_px = 5.0  # errors on five cameras have a median of 2 px and a maximum of 12 px (docs/cameras.md)
     result: dict[SeedKind, FixedImagePx] = dict.fromkeys(("rig", "centre"), FixedImagePx(tags_std_px * scale.x))
     if model is not None and model.rig is not None and band in model.rig.mean:

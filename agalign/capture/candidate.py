@@ -40,11 +40,11 @@ class Candidate:
 
     def fit_residual(self, mapping: PixelMapping) -> Residual[FixedImagePx]:
         """Measure the windows of the fit with a mapping."""
-        return self.pair.reference.fit_windows.residuals(self._warped(mapping))
+        return self.pair.reference.black_windows.residuals(self._warped(mapping))
 
     def held_out_residual(self, mapping: PixelMapping) -> Residual[FixedImagePx]:
         """Measure the windows that take no part in the fit."""
-        return self.pair.reference.held_out_windows.residuals(self._warped(mapping))
+        return self.pair.reference.white_windows.residuals(self._warped(mapping))
 
     def _warped(self, mapping: PixelMapping) -> Raster:
         return self.warped.warped if mapping is self.warped.mapping else self.pair.warped_moving(mapping)

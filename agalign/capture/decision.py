@@ -52,10 +52,10 @@ def without_result(pair: BandPair, seed: Seed, *issues: Issue) -> Alignment[Fixe
 def at_seed(pair: BandPair, seed: Seed, issues: Sequence[Issue], *, seed_only: bool = False) -> Alignment[FixedImagePx]:
     """Return an alignment with the mapping of the seed, which is usable if it is trusted or with `seed_only`."""
     expected = min(
-        ((std_px, kind) for kind, std_px in pair.candidate_std_px.items() if kind in pair.candidates), default=None
+        ((std_px, kind) for kind, std_px in pair.seed_std_px.items() if kind in pair.seed_matrices), default=None
     )
     if expected is not None and not seed_only and not pair.is_expected(seed.fixed_to_moving):
-        seed = Seed(expected[1], pair.candidates[expected[1]], 0.0, trusted=True)
+        seed = Seed(expected[1], pair.seed_matrices[expected[1]], 0.0, trusted=True)
     result = without_result(pair, seed, *issues)
     result = replace(result, residual=WarpedPair.of(pair, result.mapping).residual)
     return decided(result, is_seed_usable=seed.trusted or seed_only)
@@ -70,7 +70,7 @@ def predicted_by_windows(
     """
     assert alignment.residual is not None
     issues = alignment.issues if reason is None else (Issue(reason), *alignment.issues)
-    prediction = pair.prediction_by_windows(alignment.mapping, alignment.residual.std_px)
+    prediction = pair.prediction_of(alignment.mapping, alignment.residual.std_px)
     return decided(replace(alignment, issues=issues, prediction=prediction))
 
 
@@ -134,7 +134,7 @@ def _unchanged_if_aligned(joint: JointResult[FixedImagePx], pair: BandPair) -> J
     Input that is aligned already is returned unchanged instead of resampled by a small shift.
     """
     kinds: tuple[SeedKind, ...] = ("geo", "identity")
-    for given in (pair.candidates[kind] for kind in kinds if kind in pair.candidates):
+    for given in (pair.seed_matrices[kind] for kind in kinds if kind in pair.seed_matrices):
         if pair.mapping(given).is_curved:
             continue  # with lens distortion the files are not aligned
         if is_unchanged(joint, given, pair.fixed.size_px, max(pair.scales.fixed)):

@@ -109,13 +109,13 @@ class Reference:
         return DisplacementEstimator(self.grey.valid, self.structure)
 
     @cached_property
-    def fit_windows(self) -> FixedWindows:
+    def black_windows(self) -> FixedWindows:
         """Windows in the black fields of a chessboard, for the fit of planes and baselines."""
         side_px = 48  # small, so that most windows contain a single surface
         return FixedWindows.on_chessboard(self.grey.valid, self.structure, side_px, white=False)
 
     @cached_property
-    def held_out_windows(self) -> FixedWindows:
+    def white_windows(self) -> FixedWindows:
         """Windows in the white fields, for the verification of a fit to the black ones."""
         return FixedWindows.on_chessboard(self.grey.valid, self.structure, _HELD_OUT_PX, white=True)
 

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from agalign.capture.band_pair import BandPair, Candidates
+from agalign.capture.band_pair import BandPair, SeedMatrices
 from agalign.capture.warped_pair import WarpedPair
 from agalign.config import SeedSettings
 from agalign.fit.adjustment import fit_in_rounds
@@ -39,23 +39,23 @@ def find_seed(pair: BandPair, settings: SeedSettings, model: FlightModel | None 
         return Issue(BLANK_REFERENCE)
     if not textured(pair.moving):
         return Issue(BLANK_MOVING)
-    candidates = pair.candidates
+    matrices = pair.seed_matrices
     # With a flight's mapping, the forced kind was already used in the captures from which the flight was learned.
-    force = None if "model" in candidates else settings.force
+    force = None if "model" in matrices else settings.force
     if force == "match":
         result = match_seed(_network(pair, model), pair.fixed, pair.moving)
         if result is None:
             return Issue(NO_SUCH_SEED, detail="match")
-        candidates = {"match": result}
-    best = best_seed(pair, candidates, force)
+        matrices = {"match": result}
+    best = best_seed(pair, matrices, force)
     # A mapping by the flight or the user or a forced seed excludes other positions.
-    is_given = force is not None or pair.has_rig or "user" in pair.candidates
+    is_given = force is not None or pair.has_rig or "user" in pair.seed_matrices
     # Correlation peak of images that are aligned everywhere. A rotation by 1 degree reduces it to 60 to 120, by 3
     # degrees to 17.
     certain_sigma = 120.0
     if best.score >= certain_sigma or is_given:
         return best
-    has_scale = bool(pair.candidates.keys() & {"rig", "centre", "geo", "model", "user"})
+    has_scale = bool(pair.seed_matrices.keys() & {"rig", "centre", "geo", "model", "user"})
     if not best.trusted and not has_scale:
         best = max((best, *_at_other_scales(pair)), key=lambda seed: seed.score)
     return _best_match(pair, model, best)
@@ -182,14 +182,14 @@ def _image_group(pairs: Sequence[BandPair], seeds: Sequence[Seed], sides: Sequen
     )
 
 
-def best_seed(pair: BandPair, candidates: Candidates, force: SeedKind | None = None) -> Seed:
+def best_seed(pair: BandPair, matrices: SeedMatrices, force: SeedKind | None = None) -> Seed:
     """Return the candidate with the highest score, or a candidate shifted to the correlation peak.
 
-    Candidates of the kind `force` are preferred to all others. If the flight's mapping is trusted, the others are not
+    Those of the kind `force` are preferred to all others. If the flight's mapping is trusted, the others are not
     scored.
     """
     scored: list[Seed] = []
-    for kind, matrix in candidates.items():
+    for kind, matrix in matrices.items():
         scored += _scored(pair, kind, matrix)
         best = max(scored, key=lambda seed: seed.score)
         if kind == "model" and best.trusted:
@@ -203,7 +203,7 @@ def _at_other_scales(pair: BandPair) -> Iterator[Seed]:
 
     Without tags the fields of view are unknown: that of a thermal camera may be a fifth wider than the others.
     """
-    overlay, centre = pair.candidates["identity"], (np.array(pair.fixed.size_px) - 1) / 2
+    overlay, centre = pair.seed_matrices["identity"], (np.array(pair.fixed.size_px) - 1) / 2
     for scale in _SCALES:
         about_centre = geometry.compose(
             geometry.translation(*centre), np.diag([scale, scale, 1.0]), geometry.translation(*-centre)

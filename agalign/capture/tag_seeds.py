@@ -13,7 +13,7 @@ from agalign.values.choices import SeedKind
 from agalign.values.geometry import Matrix
 
 
-def seed_candidates(reference: Band, moving: Band, settings: SeedSettings) -> dict[SeedKind, Matrix]:
+def tag_seeds(reference: Band, moving: Band, settings: SeedSettings) -> dict[SeedKind, Matrix]:
     """Return fixed_to_moving between undistorted px of the files by kind, in order of preference, identity last.
 
     If the settings force a kind that tags provide, only this kind is returned, or nothing if the tags lack it.
@@ -23,16 +23,16 @@ def seed_candidates(reference: Band, moving: Band, settings: SeedSettings) -> di
         ("centre", other_rig_seed),
         ("geo", geo_seed),
     )
-    candidates: dict[SeedKind, Matrix] = {}
+    matrices: dict[SeedKind, Matrix] = {}
     for kind, source in sources:
         with suppress(GeometryError):  # invalid values in the tags
             matrix = source(reference, moving)
             if matrix is not None:
-                candidates[kind] = matrix
-    candidates["identity"] = geometry.overlay(reference.size_px, moving.size_px)
+                matrices[kind] = matrix
+    matrices["identity"] = geometry.overlay(reference.size_px, moving.size_px)
     if settings.force in ("rig", "geo", "identity"):
-        return {kind: matrix for kind, matrix in candidates.items() if kind == settings.force}
-    return candidates
+        return {kind: matrix for kind, matrix in matrices.items() if kind == settings.force}
+    return matrices
 
 
 def geo_seed(reference: Band, moving: Band) -> Matrix | None:

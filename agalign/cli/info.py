@@ -173,10 +173,10 @@ def _show_model(path: Path, terminal: Terminal, *, as_json: bool) -> None:
 
 def _facts(capture: "Capture") -> dict[str, Any]:
     """Return what `info` prints about a capture, as a JSON object."""
-    from agalign.capture.tag_seeds import seed_candidates
+    from agalign.capture.tag_seeds import tag_seeds
     from agalign.config import SeedSettings
 
-    offered = {kind for b in capture.moving for kind in seed_candidates(capture.reference, b, SeedSettings())}
+    offered = {kind for b in capture.moving for kind in tag_seeds(capture.reference, b, SeedSettings())}
     bands = [
         {
             "name": b.name,

@@ -116,7 +116,7 @@ def _learned_on_pair(task: PairTask, settings: JointSettings, *, colour: bool) -
     seed = Seed("user", task.start, 0.0)
     pair = BandPair.of_images("moving", fixed, moving, {"user": task.start})
     if task.seeding:
-        seed = best_seed(pair, pair.candidates)
+        seed = best_seed(pair, pair.seed_matrices)
     state, [(_, group)] = JointState(settings, lambda *_: None), image_groups([pair], [seed])
     try:
         if settings.recipe == "paper":

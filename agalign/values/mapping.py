@@ -164,7 +164,9 @@ class PixelMapping:
                 before, at, after = (self.at_parallax(points, parallax.baseline, level_px) for level_px in levels)
                 return np.concatenate([at, (after - before) / 2, (after + before) / 2 - at], axis=-1)
 
-            constant, linear, square = np.split(splined(coefficients, x_px, y_px, self._knot_step_px, dtype), 3, axis=-1)
+            constant, linear, square = np.split(
+                splined(coefficients, x_px, y_px, self._knot_step_px, dtype), 3, axis=-1
+            )
             u = (levels_px * (2 / _CELL_PX) - 2 * cell).astype(dtype)[..., None]
             np.copyto(result, constant + u * (linear + u * square), where=(cells == cell)[..., None])
         return result

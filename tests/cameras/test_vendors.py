@@ -18,7 +18,7 @@ from agalign.cameras.parrot import Sequoia
 from agalign.cameras.pix4d import NAMESPACE
 from agalign.cameras.sentera import Sentera
 from agalign.cameras.tiff_directory import Entry, add_directories, byte_string, rational, short, text
-from agalign.capture.tag_seeds import seed_candidates
+from agalign.capture.tag_seeds import tag_seeds
 from agalign.config import SeedSettings
 from agalign.pixels.raster import probe
 from agalign.values import geometry, lens
@@ -371,7 +371,7 @@ def test_a_mavic_shifts_by_its_optical_centres_and_its_calibration(tmp_path: Pat
     red, nir = (mavic_band(tmp_path, mavic_tags(own, CalibratedHMatrix=matrix)) for own, matrix in calibrated)
     np.testing.assert_allclose(rig_seed(nir, red), geometry.translation(11, 3), atol=1e-9)
     np.testing.assert_allclose(other_rig_seed(nir, red), by_centres, atol=1e-9)
-    assert list(seed_candidates(nir, red, SeedSettings())) == ["rig", "centre", "identity"]
+    assert list(tag_seeds(nir, red, SeedSettings())) == ["rig", "centre", "identity"]
 
 
 def test_the_mavic_s_colour_photograph_goes_through_the_designed_frame(tmp_path: Path) -> None:

@@ -11,8 +11,8 @@ import agalign
 from agalign.cameras.discover import DiscoverOptions, discover
 from agalign.capture import band_pair
 from agalign.capture.align_bands import align_capture_bands
-from agalign.capture.band_pair import _candidate_std_px, longest_for, read_pairs
-from agalign.capture.prediction import observed
+from agalign.capture.band_pair import _seed_std_px, longest_for, read_pairs
+from agalign.capture.by_rig import observed
 from agalign.config import SeedSettings, Settings
 from agalign.flight.model import FlightModel
 from agalign.flight.rig import Rig
@@ -107,7 +107,7 @@ def test_the_error_of_a_rig_is_converted_to_px_of_the_reference(monkeypatch: pyt
     rig = Rig((800, 600), {"LWIR": np.diag([0.1, 0.1, 1.0])}, {"LWIR": (1.0, 0.0)}, {}, {}, (), (), {"LWIR": 0.5})
     monkeypatch.setattr(band_pair, "unobserved_error_px", lambda *_, **__: 0.5)
     model = FlightModel(None, "", ("LWIR",), {}, "", rig)
-    assert _candidate_std_px("LWIR", model, PixelScale(0.5, 0.5))["model"] == pytest.approx(0.5 / 0.1 * 0.5)
+    assert _seed_std_px("LWIR", model, PixelScale(0.5, 0.5))["model"] == pytest.approx(0.5 / 0.1 * 0.5)
 
 
 @pytest.mark.parametrize("scale", [0.5, 1.0, 3.0])

@@ -57,7 +57,7 @@ def test_the_status_is_that_of_the_first_row_that_applies(
 def test_a_seed_that_contradicts_the_tags_is_replaced_by_their_mapping(pair: BandPair) -> None:
     """An image of another capture fits at its own position, far from that of its band."""
     far = replace(SEED, kind="match", fixed_to_moving=geometry.translation(150, 0))
-    tagged = replace(pair, candidate_std_px={"rig": 5.0})
+    tagged = replace(pair, seed_std_px={"rig": 5.0})
     result = at_seed(tagged, far, (Issue(RETRIEVAL),))
     assert (result.status, result.seed.kind) == ("seed_only", "rig")
     np.testing.assert_array_equal(result.fixed_to_moving, RIG["rig"])
@@ -185,7 +185,7 @@ def test_a_field_follows_quickly_varying_parallax() -> None:
 
 @pytest.mark.parametrize(("rig_known", "tried"), [(True, False), (False, True)])
 def test_a_field_is_tried_without_a_rig_and_rejected_without_need(rig_known: bool, tried: bool) -> None:
-    pair = replace(displaced_pair(0.0), candidate_std_px={"model": 1.0} if rig_known else {})
+    pair = replace(displaced_pair(0.0), seed_std_px={"model": 1.0} if rig_known else {})
     plain = verified(Candidate.of(pair, CENTRED, joint_result()), "auto")
     assert (plain.status, "field" in plain.candidates, plain.geometry) == ("aligned", tried, "homography")
 

@@ -9,8 +9,8 @@ import pytest
 
 from agalign.capture.align_bands import _candidates
 from agalign.capture.band_pair import BandPair
+from agalign.capture.by_windows import aligned_by_windows
 from agalign.capture.decision import at_seed
-from agalign.capture.from_windows import from_windows
 from agalign.capture.reference import Reference
 from agalign.config import Settings
 from agalign.fit.windows import FixedWindows, Shifts
@@ -39,7 +39,7 @@ def with_border(image: np.ndarray, border_px: int) -> Raster:
 
 def by_windows(pair: BandPair) -> tuple[Alignment, Alignment]:
     before = at_seed(pair, SEED, (Issue(RETRIEVAL, 0.05, 0.2),))
-    return before, from_windows(pair, before)
+    return before, aligned_by_windows(pair, before)
 
 
 @pytest.mark.slow
@@ -152,7 +152,7 @@ def test_windows_of_a_relief_share_no_pixels_with_those_that_verify_it(border_px
             result[y : y + windows.side, x : x + windows.side] = True
         return result
 
-    fit, held_out = (covered(windows) for windows in (reference.fit_windows, reference.held_out_windows))
+    fit, held_out = (covered(windows) for windows in (reference.black_windows, reference.white_windows))
     assert fit.any()
     assert held_out.any()
     assert not (fit & held_out).any()

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from agalign.capture import seeding
-from agalign.capture.band_pair import BandPair, Candidates
+from agalign.capture.band_pair import BandPair, SeedMatrices
 from agalign.capture.seeding import best_seed, find_rotated, find_seed
 from agalign.capture.tag_seeds import geo_seed
 from agalign.capture.warped_pair import WarpedPair
@@ -27,7 +27,7 @@ from ..conftest import mean_error_px
 SHIFTED = np.array([[1.01, 0.01, 31.0], [-0.01, 1.0, -18.0], [0, 0, 1.0]])
 
 
-def best(images: Sequence[Raster], candidates: Candidates, force: SeedKind | None = None) -> Seed:
+def best(images: Sequence[Raster], candidates: SeedMatrices, force: SeedKind | None = None) -> Seed:
     return best_seed(pair_of(*images, candidates), candidates, force)
 
 
@@ -122,7 +122,7 @@ def test_a_wrong_rotation_in_the_tags_is_detected() -> None:
     image, truth = rotated(moving, 3.0)
     middle = np.array([(639 / 2, 479 / 2)])
     ((dx, dy),) = geometry.apply(truth, middle) - middle
-    tags: Candidates = {"rig": geometry.translation(dx, dy)}
+    tags: SeedMatrices = {"rig": geometry.translation(dx, dy)}
     pair = pair_of(fixed, image, tags, rig=8.0)
     first = best_seed(pair, tags)
     assert first.trusted, "by the peak alone it looks right"

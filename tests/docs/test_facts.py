@@ -16,7 +16,7 @@ from pathlib import Path
 
 import pytest
 
-from agalign.capture import band_pair, reference, relief_candidate
+from agalign.capture import band_pair, common_parallax, reference
 from agalign.cli.main import COMMANDS
 from agalign.cli.terminal import ExitCode
 from agalign.fit import dense, displacement_field, windows
@@ -150,8 +150,8 @@ LIMITS = {
         f"| the larger of {checks.MAX_UNEXPECTED_PX:g} px and {checks._MAX_UNEXPECTED_STD:g} standard errors |",
         f"in blurred images they have {reference._LARGE_WINDOW_PX} px",
         f"by more than {refine._FINAL_CONVERGED_PX:g} px",
-        f"the p95 of the parallax is at least {relief_candidate._MIN_PARALLAX_PX:g} px",
-        f"more than {relief_candidate._MAX_FAR_SHARE:.0%} of the windows".replace("%", " %"),
+        f"the p95 of the parallax is at least {common_parallax.MIN_PARALLAX_PX:g} px",
+        f"more than {common_parallax._MAX_FAR_SHARE:.0%} of the windows".replace("%", " %"),
         f"nodes every {displacement_field._LATTICE_PX} px",
         f"fitted to windows of {displacement_field._WINDOW_PX} px",
         f"Images above {band_pair._LONGEST_SIDE_PX} px",

@@ -144,5 +144,3 @@ def test_the_displacement_field_of_lenses_and_the_parallax_add_up() -> None:
     np.testing.assert_allclose(mapping(edge), lens.distort(MOVING, geometry.apply(H, expected)), atol=1e-6)
     tile = Tile(100, 100, 240, 170)
     assert np.abs(mapping.positions(tile) - mapping(pixels(tile))).max() < 0.002
-
-

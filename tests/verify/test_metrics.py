@@ -127,7 +127,7 @@ def covered(windows: FixedWindows, size_px: tuple[int, int]) -> np.ndarray:
 @pytest.mark.parametrize("size_px", [(640, 480), (701, 389), (512, 384)])
 def test_the_windows_of_a_fit_and_of_its_verification_share_no_pixel(size_px: tuple[int, int]) -> None:
     reference = Reference(texture(*size_px))
-    fit, held_out = (covered(w, size_px) for w in (reference.fit_windows, reference.held_out_windows))
+    fit, held_out = (covered(w, size_px) for w in (reference.black_windows, reference.white_windows))
     assert not (fit & held_out).any()
     # Both are all over the image.
     for mask in (fit, held_out):
@@ -135,7 +135,7 @@ def test_the_windows_of_a_fit_and_of_its_verification_share_no_pixel(size_px: tu
         height, width = mask.shape
         for rows in (mask[: height // 2], mask[height // 2 :]):
             assert all(half.mean() > 0.15 for half in (rows[:, : width // 2], rows[:, width // 2 :]))
-    assert reference.fit_windows.side != reference.held_out_windows.side
+    assert reference.black_windows.side != reference.white_windows.side
 
 
 def test_three_by_three_windows_in_each_field() -> None:

@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 
 import agalign
-from agalign.capture import from_windows as module
+from agalign.capture import by_windows as module
 from agalign.capture.band_pair import BandPair
+from agalign.capture.by_windows import aligned_by_windows, without_extrapolated
 from agalign.capture.candidate import Candidate
 from agalign.capture.decision import at_seed, verified
-from agalign.capture.from_windows import from_windows, without_extrapolated
 from agalign.capture.seeding import find_seed
 from agalign.config import SeedSettings
 from agalign.fit.adjustment import lens_shapes
@@ -51,7 +51,7 @@ def unaligned(pair: BandPair, issue: Issue = SILENT) -> Alignment:
 
 def test_windows_suffice_where_descriptors_fail(pair: BandPair) -> None:
     before = unaligned(pair)
-    after = from_windows(pair, before)
+    after = aligned_by_windows(pair, before)
     assert (after.status, after.issues, after.joint.recipe) == ("aligned", (), "windows")
     assert geometry.corner_error_px(before.fixed_to_moving, TRUTH, *LARGE) > 1
     assert geometry.corner_error_px(after.fixed_to_moving, TRUTH, *LARGE) < 0.3
@@ -62,10 +62,10 @@ def test_windows_suffice_where_descriptors_fail(pair: BandPair) -> None:
 def test_windows_do_not_override_descriptors_or_other_failures(pair: BandPair, monkeypatch: pytest.MonkeyPatch) -> None:
     others = [unaligned(pair, issue) for issue in (Issue(UNREADABLE, detail="x"), Issue(FOLDS, 9.0, 4.0))]
     for before in (*others, replace(unaligned(pair), status="aligned", issues=())):
-        assert from_windows(pair, before) is before
+        assert aligned_by_windows(pair, before) is before
     monkeypatch.setattr(module, "_MAX_STEP_PX", 0.5)  # less than the error of the seed
     before = unaligned(pair)
-    assert from_windows(pair, before) is before
+    assert aligned_by_windows(pair, before) is before
 
 
 def test_held_out_windows_must_confirm_the_fit() -> None:
@@ -73,7 +73,7 @@ def test_held_out_windows_must_confirm_the_fit() -> None:
     moving.pixels[:, 480:] = two_views(TRUTH, *LARGE, seed=5)[0].pixels[:, 480:]  # unrelated content
     pair = pair_of(fixed, moving)
     before = unaligned(pair)
-    assert from_windows(pair, before) is before
+    assert aligned_by_windows(pair, before) is before
 
 
 def windows(count: int, measured: float = 1.0) -> Residual:
@@ -170,7 +170,7 @@ def test_half_of_the_image_is_extrapolated_with_the_lens_and_its_error(left: tup
 def test_covered_images_georeferenced_files_and_failed_pairs_are_unchanged(left: tuple[BandPair, Alignment]) -> None:
     pair, before = left
     failed, everywhere = replace(before, status="failed"), pair_in(WHOLE)
-    mosaic = replace(pair, candidates={"geo": np.eye(3)})
+    mosaic = replace(pair, seed_matrices={"geo": np.eye(3)})
     for one, alignment in ((everywhere, aligned(everywhere)), (mosaic, before), (pair, failed)):
         assert extrapolated(one, alignment) is alignment
 
@@ -183,11 +183,11 @@ def test_a_rig_of_the_whole_image_prevents_extrapolation(
     mean, baselines, delays = {"moving": MATRIX}, {"moving": (1.0, 0.0)}, {"moving": 0.0}
     rig = Rig(SIZE, mean, baselines, delays, std_px, (), (), std_px, extrapolation_px=extrapolation_px)
     pair, before = left
-    assert extrapolated(replace(pair, candidate_std_px={"model": 1.0}), before, rig).status == status
+    assert extrapolated(replace(pair, seed_std_px={"model": 1.0}), before, rig).status == status
 
 
 def test_a_homography_does_not_extrapolate_the_relief_of_a_flight(left: tuple[BandPair, Alignment]) -> None:
-    std_px, pair = {"moving": 0.1}, replace(left[0], candidate_std_px={"model": 1.0})
+    std_px, pair = {"moving": 0.1}, replace(left[0], seed_std_px={"model": 1.0})
     rig = Rig(SIZE, {"moving": MATRIX}, {"moving": (1.0, 0.0)}, {"moving": 0.0}, std_px, (), (), std_px)
     after = extrapolated(pair, left[1], replace(rig, parallax_px={"moving": 4.0}))
     assert after.status == "predicted"
@@ -207,7 +207,7 @@ def test_unknown_relief_is_a_share_of_the_range(
     """The nearer the scene, the larger its shift from the mapping at infinity, along the layout of the lenses."""
     pair, before = left
     at_infinity = geometry.compose(geometry.translation(*np.negative(offset_px)), before.fixed_to_moving)
-    near = replace(pair, layout=(-1.0, 0.0), candidates={**pair.candidates, "rig": at_infinity})
+    near = replace(pair, layout=(-1.0, 0.0), seed_matrices={**pair.seed_matrices, "rig": at_infinity})
     relief_px = module._RELIEF_SHARE * shift_px
     std_px = np.hypot(extrapolated(pair, before).prediction.std_px, relief_px)
     assert extrapolated(near, before).prediction.std_px == pytest.approx(std_px, rel=0.01)
@@ -247,7 +247,7 @@ def tried(fixed: np.ndarray, moving: np.ndarray) -> tuple[BandPair, Alignment]:
     seed = find_seed(pair, SeedSettings())
     issue = Issue(RETRIEVAL, 0.0, 0.2)
     failed = Alignment(pair.mapping(seed.fixed_to_moving), pair.fixed.size_px, "failed", (issue,), seed)
-    return pair, from_windows(pair, failed)
+    return pair, aligned_by_windows(pair, failed)
 
 
 @pytest.fixture(scope="module")
@@ -267,8 +267,8 @@ def test_a_coarse_band_with_another_field_of_view_is_predicted_with_its_error(
     assert "predicted from windows in the image" in result.reason
     failed = replace(result, status="failed", prediction=None)
     untrusted = replace(failed, seed=replace(failed.seed, trusted=False))
-    assert from_windows(replace(pair, is_coarse=False), failed) is failed  # a band of full resolution
-    assert from_windows(pair, untrusted) is untrusted
+    assert aligned_by_windows(replace(pair, is_coarse=False), failed) is failed  # a band of full resolution
+    assert aligned_by_windows(pair, untrusted) is untrusted
 
 
 @pytest.mark.parametrize("kind", ["unrelated", "repetitive"])

@@ -33,7 +33,7 @@ _MAX_STEP_PX = 16.0
 """Maximum displacement of a corner; larger ones contradict the seed."""
 
 
-def from_windows(pair: BandPair, alignment: Alignment[FixedImagePx]) -> Alignment[FixedImagePx]:
+def aligned_by_windows(pair: BandPair, alignment: Alignment[FixedImagePx]) -> Alignment[FixedImagePx]:
     """Return an alignment by windows if the descriptors failed and held-out windows confirm it.
 
     Else return the prediction of a coarse band by windows that agree with its trusted seed, or else `alignment`.
@@ -103,7 +103,7 @@ def without_extrapolated(
         if rig is not None and alignment.mapping.parallax is None:
             of_relief_px = rig.parallax_px.get(pair.name, MovingFilePx(0.0))
             is_covered &= of_relief_px <= MovingFilePx(0.0)
-        if alignment.status != "aligned" or alignment.residual is None or "geo" in pair.candidates or is_covered:
+        if alignment.status != "aligned" or alignment.residual is None or "geo" in pair.seed_matrices or is_covered:
             continue
         plane = alignment.mapping.of_the_plane
         in_frame_px = points_in_frame(plane, size_px, pair.moving.size_px)
@@ -129,10 +129,10 @@ def _shifts_by_range_px(
     """
     layouts, offsets_px = {}, []
     for pair in pairs:
-        if pair.layout is None or "rig" not in pair.candidates or result[pair.name].status != "aligned":
+        if pair.layout is None or "rig" not in pair.seed_matrices or result[pair.name].status != "aligned":
             continue
         centre = (np.array(pair.reference_file_px) - 1) / 2
-        found, at_infinity = result[pair.name].fixed_to_moving, pair.candidates["rig"]
+        found, at_infinity = result[pair.name].fixed_to_moving, pair.seed_matrices["rig"]
         at_centre = [geometry.apply(pair.scales.between_files(m), centre) for m in (found, at_infinity)]
         layouts[pair.name] = np.array(pair.layout)
         offsets_px.append(at_centre[0] - at_centre[1])
@@ -161,7 +161,7 @@ def _predicted(
     mapping, fit = fitted
     to_file_px = np.r_[np.tile(to_file, 4), np.full(4, to_file.mean)]
     std_px = FixedImagePx(fit.std_px(points_in_frame(mapping, size_px, pair.moving.size_px)))
-    prediction = pair.prediction_by_windows(mapping, std_px, fit.covariance_px2 * np.outer(to_file_px, to_file_px))
+    prediction = pair.prediction_of(mapping, std_px, fit.covariance_px2 * np.outer(to_file_px, to_file_px))
     residual = WarpedPair.of(pair, mapping).residual
     return decided(replace(alignment, mapping=mapping, residual=residual, prediction=prediction))
 

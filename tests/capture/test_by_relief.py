@@ -4,6 +4,7 @@ import pickle
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -13,22 +14,15 @@ from synthetic_flights.depth import CLOSE_RANGE, Scene, Truth, truth_of, view
 from synthetic_flights.relief import make_scene
 
 from agalign.capture import align_bands
+from agalign.capture import by_relief as module
 from agalign.capture.align_bands import verify_together
 from agalign.capture.band_pair import BandPair
+from agalign.capture.by_relief import ReliefResult, _aligned, _Checked, _gain_px, _std_px, aligned_by_relief
+from agalign.capture.by_rig import with_predictions
 from agalign.capture.candidate import Candidate
+from agalign.capture.common_parallax import MIN_PARALLAX_PX, common_parallax_px
 from agalign.capture.decision import at_seed
-from agalign.capture.prediction import with_predictions
 from agalign.capture.reference import Reference
-from agalign.capture.relief_candidate import (
-    _MIN_PARALLAX_PX,
-    ReliefResult,
-    _Checked,
-    _common_parallax_px,
-    _Estimate,
-    _is_chosen,
-    _std_px,
-    aligned_by_relief,
-)
 from agalign.config import JointSettings, ReliefSettings, Settings
 from agalign.fit.range import inverse_range
 from agalign.flight.rig import Rig
@@ -113,8 +107,8 @@ def without_layout(candidates: Sequence[Candidate]) -> list[Candidate]:
 
 
 def shows_relief(candidates: Sequence[Candidate]) -> bool:
-    parallax_px, on_a_line = _common_parallax_px(candidates)
-    return parallax_px >= _MIN_PARALLAX_PX and not on_a_line
+    parallax_px, on_a_line = common_parallax_px(candidates)
+    return parallax_px >= MIN_PARALLAX_PX and not on_a_line
 
 
 @pytest.fixture(scope="module")
@@ -261,7 +255,7 @@ def test_a_band_that_the_relief_does_not_align_is_predicted(flat: Rendered, monk
     """Its homography passes all checks, but is another geometry than that of the other bands."""
     candidates = flat.candidates()
     assert {a.status for a in verified_together(candidates, Settings()).values()} == {"aligned"}
-    monkeypatch.setattr(align_bands, "aligned_by_relief", lambda *_, **__: ReliefResult(others={"NIR"}))
+    monkeypatch.setattr(align_bands, "aligned_by_relief", lambda *_, **__: ReliefResult(of_other_geometry={"NIR"}))
     result = verified_together(candidates, Settings())
     assert {name: a.status for name, a in result.items()} == {"Blue": "aligned", "Red": "aligned", "NIR": "predicted"}
     assert result["NIR"].prediction.source == "windows"
@@ -285,7 +279,7 @@ def test_a_noisy_band_follows_the_relief_of_the_others(
         result = aligned_by_relief(candidates, "auto")
     else:
         others = [c for c in candidates if c is not noisy]
-        result = aligned_by_relief(others, "auto", without_result=[(noisy.pair, noisy.seed)])
+        result = aligned_by_relief(others, "auto", lost=[(noisy.pair, noisy.seed)])
     alignment = result.alignments[name]
     assert alignment.status == status
     assert alignment.geometry.startswith("relief")
@@ -300,12 +294,11 @@ def test_a_relief_does_not_verify_a_band_that_it_is_estimated_from(
     candidates: Sequence[Candidate], aligned: Mapping[str, Alignment], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Also if the band does not pass with the relief of the others."""
-    checked = _Estimate.checked
-    fails = lambda estimate, band: replace(checked(estimate, band), alignment=None)  # noqa: E731
-    monkeypatch.setattr(_Estimate, "checked", lambda self, band: (fails if band.name == "NIR" else checked)(self, band))
+    checked = module._checked
+    monkeypatch.setattr(module, "_checked", lambda band, warped: None if band.name == "NIR" else checked(band, warped))
     result = aligned_by_relief(candidates, "auto")
     assert set(result.alignments) == set(aligned) - {"NIR"}
-    assert result.others == {"NIR"}
+    assert result.of_other_geometry == {"NIR"}
 
 
 def test_unrelated_images_do_not_follow_a_relief(four_lenses: Rendered) -> None:
@@ -371,7 +364,7 @@ def test_a_band_without_retrieval_that_the_relief_does_not_align_has_another_geo
     """It is not part of the bands from which the relief is estimated."""
     result = boxes.candidates({"NIR": foreign(boxes.images["NIR"], "unrelated", seed=3)})
     lost = [replace(c, joint=replace(c.joint, retrieval=0.0)) if c.pair.name == "NIR" else c for c in result]
-    assert aligned_by_relief(lost, "auto").others == {"NIR"}
+    assert aligned_by_relief(lost, "auto").of_other_geometry == {"NIR"}
 
 
 def test_use(candidates: Sequence[Candidate]) -> None:
@@ -419,11 +412,9 @@ def test_parallax_below_the_noise_is_not_relief(flat: Rendered, height_px: float
     assert shows_relief(result) == shown
 
 
-def checked(relief_px: tuple[float, float], plane_px: tuple[float, float], is_aligned: bool = True) -> _Checked:
-    """A band with a median and a p95 of its windows under the relief and under its homography."""
-    windows = residual_of(np.zeros((9, 2)), (0, 0))
-    residuals = (replace(windows, median_px=median, p95_px=p95) for median, p95 in (plane_px, relief_px))
-    return _Checked("NIR", *residuals, object() if is_aligned else None)
+def is_used(checked: Sequence[_Checked | None]) -> bool:
+    """Whether bands with these results are aligned by the relief."""
+    return bool(_aligned([SimpleNamespace(name=str(number)) for number in range(len(checked))], checked))
 
 
 @pytest.mark.parametrize(
@@ -440,9 +431,11 @@ def test_a_relief_may_not_be_worse_than_its_plane(
     relief_px: tuple[float, float], plane_px: tuple[float, float], is_chosen: bool
 ) -> None:
     """The median of the bands decides; a band that does not pass counts as one without a gain."""
-    band, failed = checked(relief_px, plane_px), checked(relief_px, plane_px, is_aligned=False)
-    assert _is_chosen([band]) == _is_chosen([band, band, failed]) == is_chosen
-    assert not _is_chosen([band, failed, failed])
+    windows = residual_of(np.zeros((9, 2)), (0, 0))
+    residuals = (replace(windows, median_px=median, p95_px=p95) for median, p95 in (plane_px, relief_px))
+    band = _Checked(object(), _gain_px(*residuals))
+    assert is_used([band]) == is_used([band, band, None]) == is_chosen
+    assert not is_used([band, None, None])
 
 
 # ---- what fits noise cannot pass

@@ -19,7 +19,7 @@ from agalign.cameras.discover import discover
 from agalign.capture import align_bands
 from agalign.capture.align_bands import align_capture_bands, align_pairs
 from agalign.capture.band_pair import read_pairs
-from agalign.capture.prediction import with_predictions
+from agalign.capture.by_rig import with_predictions
 from agalign.config import CheckSettings, Settings
 from agalign.flight.model import FlightModel, load_model
 from agalign.method.joint import Results, refine_with

@@ -10,7 +10,9 @@ import math
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
+from itertools import cycle
 from statistics import median_high
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -18,11 +20,18 @@ from numpy.typing import NDArray
 
 from agalign.capture.band_pair import BandPair
 from agalign.capture.candidate import Candidate
+from agalign.capture.common_parallax import (
+    MIN_BANDS,
+    MIN_PARALLAX_PX,
+    common_parallax_px,
+    comparable,
+    consistent_bands,
+    layout_of,
+)
 from agalign.capture.decision import decided, predicted_by_windows, without_result
 from agalign.capture.warped_pair import WarpedPair
 from agalign.errors import GeometryError
 from agalign.fit.adjustment import (
-    Adjustment,
     BaselinePrior,
     WindowFit,
     WindowShifts,
@@ -32,14 +41,12 @@ from agalign.fit.adjustment import (
     fit_in_rounds,
     lens_std_px,
     parallax_of,
-    shifts_by_corners,
 )
 from agalign.fit.dense import DenseMatching, View
-from agalign.fit.displacement_field import MIN_GAIN_SIGMA, MIN_WINDOWS
+from agalign.fit.displacement_field import MIN_WINDOWS
 from agalign.fit.occlusion import nearer_sign, occluded
-from agalign.fit.windows import decrease_sigma
 from agalign.pixels.band_resampling import channel_mean
-from agalign.values.alignment import MIN_RETRIEVAL, Alignment, JointResult, Residual, Seed
+from agalign.values.alignment import Alignment, JointResult, Residual, Seed
 from agalign.values.choices import Geometry, ReliefUse
 from agalign.values.image import FloatImage
 from agalign.values.issues import OTHER_GEOMETRY
@@ -48,16 +55,9 @@ from agalign.values.parallax import Parallax, Relief
 from agalign.values.pixel_units import FixedImagePx
 from agalign.verify.checks import BY_PARALLAX, BY_WINDOWS, MAX_ALIAS_PEAK, MAX_SHIFT_PX, alias_peak
 
-_MIN_BANDS = 2
-"""Minimum number of moving lenses: a relief is verified with the other lenses."""
-_MIN_PARALLAX_PX = 0.3
-"""Minimum p95 of the parallax of windows for a relief; windows of flat fields have up to 0.2 px, mostly noise."""
 _MIN_OBSERVED_SHARE = 0.75
 """Minimum share of aligned windows for an observation of a rig, which contains no depth edges: 0.79 or more in scenes
 with booms and plants at 1 m."""
-_MAX_FAR_SHARE = 0.05
-"""A relief is also tried if more than this share of the windows has shifts above 1 px (`_far_share`): windows across
-depth edges may contain the parallax of neither side, so that the squared shifts do not decrease."""
 
 
 @dataclass
@@ -66,7 +66,7 @@ class ReliefResult:
 
     alignments: dict[str, Alignment[FixedImagePx]] = field(default_factory=dict)
     """Bands aligned by the relief, by name."""
-    others: set[str] = field(default_factory=set)
+    of_other_geometry: set[str] = field(default_factory=set)
     """Bands of a capture with a relief that does not align them: their homographies are another geometry."""
     along_a_line: set[str] = field(default_factory=set)
     """Bands with common displacements that neither a relief nor displacement fields must follow."""
@@ -76,12 +76,12 @@ def aligned_by_relief(
     candidates: Sequence[Candidate],
     use: ReliefUse,
     *,
-    without_result: Sequence[tuple[BandPair, Seed]] = (),
+    lost: Sequence[tuple[BandPair, Seed]] = (),
     is_observation: bool = False,
 ) -> ReliefResult:
     """Align bands by one relief of the capture, with lens shapes where no rig contains the distortion.
 
-    Bands `without_result` of the joint optimisation, and those with another kind of lens model, follow the relief too.
+    Bands `lost` in the joint optimisation, and those with another kind of lens model, follow the relief too.
     With `use` "auto" a relief is only estimated if the residuals of the homographies contain common parallax. For an
     observation of the rig, only the homographies matter, and the parallax of windows suffices.
     """
@@ -91,142 +91,20 @@ def aligned_by_relief(
     # Along one line, larger common displacements are those of shadows or leaves, not of lenses; a displacement field
     # would follow them too.
     max_line_px = 1.0
-    for group in _comparable(candidates):
-        if len(group) < _MIN_BANDS:
+    for group in comparable(candidates):
+        if len(group) < MIN_BANDS:
             continue
-        parallax_px, on_a_line = _common_parallax_px(group)
+        parallax_px, on_a_line = common_parallax_px(group)
         if on_a_line and parallax_px > max_line_px:
             result.along_a_line |= {c.pair.name for c in group}
-        elif use == "always" or parallax_px >= _MIN_PARALLAX_PX:
-            if is_observation:
-                with suppress(GeometryError):
-                    result.alignments |= _observed(group)
-                if result.alignments.keys() & {c.pair.name for c in group}:
-                    result.others |= {c.pair.name for c in group} - result.alignments.keys()
-                continue
-            estimate, aligned = _aligned_group(group)
-            result.alignments |= aligned
-            if estimate is not None:
-                others = [*candidates, *(Candidate.at_seed(*one) for one in without_result)]
-                result.alignments |= estimate.for_others(others)
-                same = [c.pair for c in candidates if c.pair.reference is group[0].pair.reference]
-                result.others |= {pair.name for pair in same if not pair.is_coarse} - result.alignments.keys()
+        elif use == "always" or parallax_px >= MIN_PARALLAX_PX:
+            with suppress(GeometryError):
+                aligned = _observed(group) if is_observation else _aligned_group(group, candidates, lost)
+                if aligned:
+                    same = [c.pair for c in candidates if c.pair.reference is group[0].pair.reference]
+                    result.of_other_geometry |= {pair.name for pair in same if not pair.is_coarse} - aligned.keys()
+                result.alignments |= aligned
     return result
-
-
-def _comparable(candidates: Sequence[Candidate]) -> list[list[Candidate]]:
-    """Group the bands by reference image and space of the homographies.
-
-    Bands without retrieval of held-out patches, with few measured windows or low resolution are excluded.
-    """
-    groups: dict[tuple[int, str], list[Candidate]] = {}
-    for candidate in candidates:
-        pair, residual = candidate.pair, candidate.warped.residual
-        is_reliable = candidate.joint.retrieval >= MIN_RETRIEVAL and len(residual.measured_px) >= MIN_WINDOWS
-        if is_reliable and not pair.is_coarse:
-            groups.setdefault((id(pair.reference), pair.space), []).append(candidate)
-    return list(groups.values())
-
-
-def _common_parallax_px(group: Sequence[Candidate]) -> tuple[float, bool]:
-    """Return the p95 of the parallax that is common to the bands, 0 if it is not significant, and if the baselines are
-    on one line without tags that confirm them.
-
-    It is significant if either many shifts of a band are large, or the parallax from the other bands reduces the shifts
-    of the median band significantly.
-    """
-    residuals, size_px = _common_residuals(group), group[0].pair.fixed.size_px
-    if max(_p95_px(residual) for residual in residuals) < _MIN_PARALLAX_PX:
-        return 0.0, False
-    windows = WindowShifts.of(residuals, [c.warped.mapping for c in group])
-    consistent = _consistent(windows, group)
-    if consistent is None:
-        return 0.0, False
-    bands, model = consistent
-    far_share = max(_far_share(residuals[band]) for band in bands)
-    if far_share <= _MAX_FAR_SHARE and _gain_by_others_sigma(windows.of_bands(bands), model, size_px) < MIN_GAIN_SIGMA:
-        return 0.0, False
-    parallax_px = float(np.percentile(np.abs(model.parallax_px), 95))
-    return parallax_px, _layout([group[band] for band in bands]) is None and are_on_a_line(model.baselines)
-
-
-def _gain_by_others_sigma(windows: WindowShifts, model: Adjustment, size_px: tuple[int, int]) -> float:
-    """Return the decrease of the squared shifts of the median band by the parallax from the others, in sigma."""
-    shifts_px = windows.shifts_px - shifts_by_corners(model, windows.points_px, size_px)
-    bands, gains = np.arange(shifts_px.shape[1]), []
-    for band in bands:
-        others = np.delete(bands, band)
-        parallax = parallax_of(shifts_px[:, others], model.baselines[others], windows.weights[:, others])
-        after_px = shifts_px[:, band] - parallax[:, None] * model.baselines[band]
-        before, after = (np.linalg.norm(s, axis=1) for s in (shifts_px[:, band], after_px))
-        measured = np.isfinite(before) & np.isfinite(after)
-        enough = measured.sum() >= MIN_WINDOWS
-        gains.append(decrease_sigma(before[measured], after[measured]) if enough else 0.0)
-    return float(np.median(gains))
-
-
-def _common_residuals(group: Sequence[Candidate]) -> list[Residual[FixedImagePx]]:
-    """Return the residuals of all bands in the same windows: large ones if any band is blurred, or small ones if the
-    residual of any band uses these.
-    """
-    reference = group[0].pair.reference
-    if any(c.pair.is_blurred for c in group):
-        return [reference.large_windows.residuals(c.warped.warped) for c in group]
-    if all(c.warped.windows is reference.windows for c in group):
-        return [c.warped.residual for c in group]
-    return [reference.small_windows.residuals(c.warped.warped) for c in group]
-
-
-def _p95_px(residual: Residual[FixedImagePx]) -> float:
-    """Return the p95 of the lengths of the measured shifts, 0 without any: robust, as a wrong peak is no parallax."""
-    return float(residual.p95_px) if len(residual.lengths_px) else 0.0
-
-
-def _far_share(residual: Residual[FixedImagePx]) -> float:
-    """Return the share of the measured windows with a shift above 1 px."""
-    return float((residual.lengths_px > MAX_SHIFT_PX).mean()) if len(residual.lengths_px) else 0.0
-
-
-def _layout(group: Sequence[Candidate]) -> NDArray[np.float64] | None:
-    """Return the layouts (bands, 2) of bands; None if the tags lack one."""
-    layouts = [candidate.pair.layout for candidate in group]
-    return None if any(layout is None for layout in layouts) else np.array(layouts, float)
-
-
-def _consistent(
-    windows: WindowShifts, group: Sequence[Candidate], lens_std: NDArray[np.float64] | None = None
-) -> tuple[list[int], Adjustment] | None:
-    """Adjust the model to the bands with common parallax; return their indices and the model, or None.
-
-    A band that the parallax of the others does not explain is left out, one after another.
-    """
-    size_px = group[0].pair.fixed.size_px
-    # Residual of a band relative to that of the others: up to 1.4 for bands of the same time, 2.4 for a photograph of
-    # another time. Residuals below the minimum are accepted anyway.
-    max_scale_ratio, min_foreign_px = 2.0, 0.4
-
-    def adjusted(bands: Sequence[int], lens_std: NDArray[np.float64] | None) -> Adjustment | None:
-        layout, some = _layout([group[band] for band in bands]), windows.of_bands(bands)
-        model = adjust(some, size_px, layout, lens_std) if some.are_enough(MIN_WINDOWS) else None
-        return model if model is not None and are_of_lenses(model.baselines, layout) else None
-
-    def median_scale_px(bands: Sequence[int]) -> float:
-        model = adjusted(bands, None)
-        return math.inf if model is None else float(np.median(model.scales_px))
-
-    kept = list(range(windows.shifts_px.shape[1]))
-    model = adjusted(kept, lens_std)
-    while len(kept) > _MIN_BANDS:
-        if model is None:
-            worst = int(np.argmin([median_scale_px([b for b in kept if b != foreign]) for foreign in kept]))
-        else:
-            worst = int(model.scales_px.argmax())
-            others_px = float(np.median(np.delete(model.scales_px, worst)))
-            if model.scales_px[worst] <= max(min_foreign_px, max_scale_ratio * others_px):
-                break
-        kept.pop(worst)
-        model = adjusted(kept, lens_std)
-    return None if model is None else (kept, model)
 
 
 @dataclass(frozen=True)
@@ -271,16 +149,16 @@ def _observed(group: Sequence[Candidate]) -> dict[str, Alignment[FixedImagePx]]:
     bands, reference = [_Band(c, c.warped.mapping) for c in group], group[0].pair.reference
     rounds, model = 2, None  # large shifts are measured in steps
     for _ in range(rounds):
-        consistent = _consistent(_window_shifts(bands), [b.candidate for b in bands])
+        consistent = consistent_bands(_window_shifts(bands), [b.candidate for b in bands])
         if consistent is None:
             return {}
         kept, model = consistent
         bands = [bands[k].fitted(fit) for k, fit in zip(kept, model.fits, strict=True)]
     assert model is not None
-    if _layout([b.candidate for b in bands]) is None and are_on_a_line(model.baselines):
+    if layout_of([b.candidate for b in bands]) is None and are_on_a_line(model.baselines):
         return {}
     warped = [band.candidate.pair.warped_moving(band.plane) for band in bands]
-    residuals = [reference.held_out_windows.residuals(image) for image in warped]
+    residuals = [reference.white_windows.residuals(image) for image in warped]
     windows, checked = WindowShifts.of(residuals, [band.plane for band in bands]), []
     if not windows.are_enough(MIN_WINDOWS):
         return {}
@@ -290,36 +168,33 @@ def _observed(group: Sequence[Candidate]) -> dict[str, Alignment[FixedImagePx]]:
         by_others_px = parallax_of(windows.shifts_px[:, others], model.baselines[others], windows.weights[:, others])
         shifts_px = windows.shifts_of(residuals[number], by_others_px[:, None] * model.baselines[number])
         held_out = residuals[number].with_shifts(residuals[number].shifts_px - shifts_px)
-        candidate, plane = band.candidate, band.candidate.held_out_residual(band.candidate.warped.mapping)
-        joint = band.joint()
+        pair, mapping, joint = band.candidate.pair, band.mapping(relief), band.joint()
         # Planes of different depth resemble a repetition in images without relief.
-        mapping = band.mapping(relief)
-        image = candidate.pair.warped_moving(mapping)
-        verified = WarpedPair(candidate.pair, mapping, image, reference.held_out_windows, held_out)
+        verified = WarpedPair(pair, mapping, pair.warped_moving(mapping), reference.white_windows, held_out)
         # A window across a depth edge contains the parallax of neither side.
         issues = [issue for issue in verified.issues(joint) if issue.kind not in BY_PARALLAX]
-        aligned_share = float((held_out.lengths_px <= MAX_SHIFT_PX * candidate.pair.file_pixel_size_px).mean())
-        without = without_result(candidate.pair, candidate.seed)
-        alignment = decided(replace(without, mapping=mapping, joint=joint, residual=held_out))
+        aligned_share = float((held_out.lengths_px <= MAX_SHIFT_PX * pair.file_pixel_size_px).mean())
         is_aligned = not issues and aligned_share >= _MIN_OBSERVED_SHARE
-        checked.append(_Checked(band.name, plane, held_out, alignment if is_aligned else None))
-    return {c.name: c.alignment for c in checked if c.alignment is not None} if _is_chosen(checked) else {}
+        checked.append(_Checked.of(band, verified) if is_aligned else None)
+    return _aligned(bands, checked)
 
 
-def _aligned_group(group: Sequence[Candidate]) -> "tuple[_Estimate | None, dict[str, Alignment[FixedImagePx]]]":
-    """Return the relief of a group and the bands that it aligns; (None, {}) if another geometry explains the capture
-    better.
+def _aligned_group(
+    group: Sequence[Candidate], candidates: Sequence[Candidate], lost: Sequence[tuple[BandPair, Seed]]
+) -> dict[str, Alignment[FixedImagePx]]:
+    """Align a group by its relief, and the other bands by it too; empty if another geometry explains the group better.
+
+    Raises GeometryError.
     """
-    try:
-        estimate = _Estimate.of(group)
-        if estimate is None:
-            return None, {}
-        checked = [estimate.checked(band) for band in estimate.bands]
-        if not _is_chosen(checked):
-            return None, {}
-    except GeometryError:
-        return None, {}
-    return estimate, {c.name: c.alignment for c in checked if c.alignment is not None}
+    estimate = _Estimate.of(group)
+    if estimate is None:
+        return {}
+    verifying = cycle(estimate.from_others)
+    warped = [estimate.warped(band, relief) for band, relief in zip(estimate.bands, verifying, strict=False)]
+    aligned = _aligned(estimate.bands, [_checked(b, w) for b, w in zip(estimate.bands, warped, strict=True)])
+    if not aligned:
+        return {}
+    return aligned | estimate.for_others([*candidates, *(Candidate.at_seed(*one) for one in lost)])
 
 
 @dataclass(frozen=True)
@@ -328,8 +203,8 @@ class _Estimate:
 
     bands: Sequence[_Band]
     relief: Relief
-    others: Sequence[Relief]
-    """From the bands of `_verifying`, which do not contain the bands that they verify."""
+    from_others: Sequence[Relief]
+    """From the bands of `_verifying`: relief i of n verifies the bands i, i + n and so on."""
 
     @classmethod
     def of(cls, group: Sequence[Candidate]) -> "_Estimate | None":
@@ -339,11 +214,11 @@ class _Estimate:
         """
         planes, size_px = [_Band(c, c.warped.mapping) for c in group], group[0].pair.fixed.size_px
         lens_std = None if any(c.pair.has_rig for c in group) else _lens_std_px(group[0].pair)
-        consistent = _consistent(_window_shifts(planes), group, lens_std)
+        consistent = consistent_bands(_window_shifts(planes), group, lens_std)
         if consistent is None:
             return None
         kept, model = consistent
-        layout = _layout([group[k] for k in kept])
+        layout = layout_of([group[k] for k in kept])
         bands = [planes[k].fitted(fit) for k, fit in zip(kept, model.fits, strict=True)]
         low, high = np.percentile(model.parallax_px, (1.0, 99.0)).tolist()  # values beyond are wrong peaks
         matching = DenseMatching(group[0].pair.reference.grey, _views(bands), (low, high))
@@ -358,8 +233,8 @@ class _Estimate:
         if not are_of_lenses(baselines, layout) or (layout is None and are_on_a_line(baselines)):
             return None
         selections = [range(len(bands)), *_verifying(range(len(bands)))]
-        relief, *others = matching.refined(_views(bands), selections)
-        result = cls(bands, replace(relief, std_px=_std_px(others)), others)
+        relief, *from_others = matching.refined(_views(bands), selections)
+        result = cls(bands, replace(relief, std_px=_std_px(from_others)), from_others)
         return result.negated if layout is None and nearer_sign(matched, baselines) < 0 else result
 
     @property
@@ -371,11 +246,7 @@ class _Estimate:
     def negated(self) -> "_Estimate":
         """The estimate with the opposite sign of reliefs and baselines, which has the same parallax."""
         bands = [replace(b, baseline=(-b.baseline[0], -b.baseline[1])) for b in self.bands]
-        return replace(self, bands=bands, relief=self.relief.negated, others=[r.negated for r in self.others])
-
-    def verifying(self, band: _Band) -> Relief:
-        """Return the relief of other bands than this one."""
-        return self.others[self.bands.index(band) % len(self.others)] if band in self.bands else self.relief
+        return replace(self, bands=bands, relief=self.relief.negated, from_others=[r.negated for r in self.from_others])
 
     def fitted(self, candidate: Candidate) -> _Band | None:
         """Fit homography and baseline of a band under the relief of the others; None if too few windows are measured.
@@ -383,7 +254,7 @@ class _Estimate:
         The layout of the lenses, scaled to the baselines of the others, is the prior of the baseline. Raises
         GeometryError.
         """
-        prior, layout = BaselinePrior(), _layout([candidate, *(b.candidate for b in self.bands)])
+        prior, layout = BaselinePrior(), layout_of([candidate, *(b.candidate for b in self.bands)])
         if layout is not None:
             own, others = layout[0], layout[1:]
             layout_std = 0.3  # of lens positions without tags, which deviate by up to 0.1 of the longest baseline
@@ -415,56 +286,82 @@ class _Estimate:
                 continue
             with suppress(GeometryError):
                 band = self.fitted(candidate)
-                alignment = None if band is None else self.checked(band).alignment or self.predicted(band)
+                if band is None:
+                    continue
+                warped = self.warped(band)
+                checked = _checked(band, warped)
+                alignment = self.predicted(band, warped) if checked is None else checked.alignment
                 result |= {} if alignment is None else {pair.name: alignment}
         return result
 
-    def predicted(self, band: _Band) -> Alignment[FixedImagePx] | None:
+    def warped(self, band: _Band, verifying: Relief | None = None) -> WarpedPair:
+        """Warp a band by the relief of all bands; held-out windows are measured by the relief `verifying` of other
+        bands, if this band is one of those of the estimate.
+        """
+        pair, windows = band.candidate.pair, band.candidate.pair.reference.white_windows
+        mapping = band.mapping(self.relief, with_occlusions=True)
+        if verifying is None:
+            return WarpedPair.of(pair, mapping, windows)
+        by_others = band.candidate.held_out_residual(band.mapping(verifying, with_occlusions=True))
+        return WarpedPair(pair, mapping, pair.warped_moving(mapping), windows, by_others)
+
+    def predicted(self, band: _Band, warped: WarpedPair) -> Alignment[FixedImagePx] | None:
         """Predict a band that does not pass verification; None if half of the held-out windows are not aligned, or if
         the scene repeats.
         """
-        candidate, pair = band.candidate, band.candidate.pair
-        mapping = band.mapping(self.relief, with_occlusions=True)
-        warped = WarpedPair.of(pair, mapping, pair.reference.held_out_windows)
-        residual = warped.residual
+        candidate, pair, residual = band.candidate, warped.pair, warped.residual
         is_known = len(residual.measured_px) >= MIN_WINDOWS
         is_known &= residual.median_px <= MAX_SHIFT_PX * pair.file_pixel_size_px
         if not is_known or alias_peak(*warped.reduced_spectra()).ratio > MAX_ALIAS_PEAK:
             return None
         joint = None if candidate.joint.recipe == BY_WINDOWS else candidate.joint
         without = without_result(pair, candidate.seed)
-        by_relief = replace(without, mapping=mapping, joint=joint, residual=residual)
+        by_relief = replace(without, mapping=warped.mapping, joint=joint, residual=residual)
         return predicted_by_windows(by_relief, pair, OTHER_GEOMETRY)
 
-    def checked(self, band: _Band) -> "_Checked":
-        """Verify a band with the relief from other bands. Raises GeometryError."""
-        candidate, pair = band.candidate, band.candidate.pair
-        plane = candidate.held_out_residual(candidate.warped.mapping)
-        complete = band.mapping(self.relief, with_occlusions=True)
-        verifying = band.mapping(self.verifying(band), with_occlusions=True)
-        held_out = candidate.held_out_residual(verifying)
-        joint = band.joint()
-        warped, windows = pair.warped_moving(complete), pair.reference.held_out_windows
-        if WarpedPair(pair, complete, warped, windows, held_out).issues(joint):
-            return _Checked(pair.name, plane, held_out)
-        kind: Geometry = "relief" if complete.field is None else "relief and field"
-        candidates = {"homography": plane.p95_px, kind: held_out.p95_px}
-        without = without_result(pair, candidate.seed)
-        aligned = replace(without, mapping=complete, joint=joint, residual=held_out, candidates=candidates)
-        return _Checked(pair.name, plane, held_out, decided(aligned))
+
+class _Checked(NamedTuple):
+    """A band that passes verification with the relief from other bands."""
+
+    alignment: Alignment[FixedImagePx]
+    gain_px: float
+    """`_gain_px` by that relief."""
+
+    @classmethod
+    def of(cls, band: _Band, warped: WarpedPair) -> "_Checked":
+        """Compare a warped band with its homography."""
+        held_out, plane = warped.residual, band.candidate.held_out_residual(band.candidate.warped.mapping)
+        kind: Geometry = "relief" if warped.mapping.field is None else "relief and field"
+        aligned = replace(
+            without_result(warped.pair, band.candidate.seed),
+            mapping=warped.mapping,
+            joint=band.joint(),
+            residual=held_out,
+            candidates={"homography": plane.p95_px, kind: held_out.p95_px},
+        )
+        return cls(decided(aligned), _gain_px(plane, held_out))
 
 
-@dataclass(frozen=True)
-class _Checked:
-    """A band after its verification with the relief from other bands."""
+def _gain_px(plane: Residual[FixedImagePx], relief: Residual[FixedImagePx]) -> float:
+    """Return the decrease of the p95 of held-out windows by a relief, minus the increase of their median.
 
-    name: str
-    plane: Residual[FixedImagePx]
-    """Residual of held-out windows by the homography alone."""
-    held_out: Residual[FixedImagePx]
-    """The same with the relief."""
-    alignment: Alignment[FixedImagePx] | None = None
-    """None if it does not pass."""
+    If most windows are on the reference plane, the noise of the relief increases the median by some hundredths of a px.
+    """
+    return float(plane.p95_px - relief.p95_px) - max(0.0, float(relief.median_px - plane.median_px))
+
+
+def _checked(band: _Band, warped: WarpedPair) -> _Checked | None:
+    """Verify a band by its held-out windows; None if it does not pass."""
+    return None if warped.issues(band.joint()) else _Checked.of(band, warped)
+
+
+def _aligned(bands: Sequence[_Band], checked: Sequence[_Checked | None]) -> dict[str, Alignment[FixedImagePx]]:
+    """Return the bands that pass; none if the relief does not explain the held-out windows of half of the bands better
+    than the homographies.
+    """
+    if median_high([-math.inf if one is None else one.gain_px for one in checked]) < 0:
+        return {}
+    return {band.name: one.alignment for band, one in zip(bands, checked, strict=True) if one is not None}
 
 
 def _lens_std_px(pair: BandPair) -> NDArray[np.float64] | None:
@@ -494,21 +391,6 @@ def _std_px(reliefs: Sequence[Relief]) -> FloatImage:
     values = np.stack([relief.parallax_px for relief in reliefs])
     square = (len(values) - 1) * np.square(values - values.mean(axis=0)).mean(axis=0)
     return np.asarray(np.sqrt(cv2.blur(square, (surroundings_px, surroundings_px))))
-
-
-def _is_chosen(checked: Sequence[_Checked]) -> bool:
-    """Return True if the relief explains the held-out windows of half of the bands better than the homographies.
-
-    If most windows are on the reference plane, the noise of the relief increases the median by some hundredths of a px.
-    """
-    gains_px = []
-    for each in checked:
-        if each.alignment is None:
-            gains_px.append(-math.inf)
-            continue
-        gain_px = float(each.plane.p95_px) - float(each.held_out.p95_px)
-        gains_px.append(gain_px - max(0.0, float(each.held_out.median_px) - float(each.plane.median_px)))
-    return median_high(gains_px) >= 0
 
 
 def _window_shifts(

@@ -1,0 +1,146 @@
+"""Parallax that the bands of a capture have in common: whether windows show a relief, and which bands take part."""
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from agalign.capture.candidate import Candidate
+from agalign.fit.adjustment import (
+    Adjustment,
+    WindowShifts,
+    adjust,
+    are_of_lenses,
+    are_on_a_line,
+    parallax_of,
+    shifts_by_corners,
+)
+from agalign.fit.displacement_field import MIN_GAIN_SIGMA, MIN_WINDOWS
+from agalign.fit.windows import decrease_sigma
+from agalign.values.alignment import MIN_RETRIEVAL, Residual
+from agalign.values.pixel_units import FixedImagePx
+from agalign.verify.checks import MAX_SHIFT_PX
+
+MIN_BANDS = 2
+"""Minimum number of moving lenses: a relief is verified with the other lenses."""
+MIN_PARALLAX_PX = 0.3
+"""Minimum p95 of the parallax of windows for a relief; windows of flat fields have up to 0.2 px, mostly noise."""
+_MAX_FAR_SHARE = 0.05
+"""A relief is also tried if more than this share of the windows has shifts above 1 px (`_far_share`): windows across
+depth edges may contain the parallax of neither side, so that the squared shifts do not decrease."""
+
+
+def comparable(candidates: Sequence[Candidate]) -> list[list[Candidate]]:
+    """Group the bands by reference image and space of the homographies.
+
+    Bands without retrieval of held-out patches, with few measured windows or low resolution are excluded.
+    """
+    groups: dict[tuple[int, str], list[Candidate]] = {}
+    for candidate in candidates:
+        pair, residual = candidate.pair, candidate.warped.residual
+        is_reliable = candidate.joint.retrieval >= MIN_RETRIEVAL and len(residual.measured_px) >= MIN_WINDOWS
+        if is_reliable and not pair.is_coarse:
+            groups.setdefault((id(pair.reference), pair.space), []).append(candidate)
+    return list(groups.values())
+
+
+def common_parallax_px(group: Sequence[Candidate]) -> tuple[float, bool]:
+    """Return the p95 of the parallax that is common to the bands, 0 if it is not significant, and if the baselines are
+    on one line without tags that confirm them.
+
+    It is significant if either many shifts of a band are large, or the parallax from the other bands reduces the shifts
+    of the median band significantly.
+    """
+    residuals, size_px = _common_residuals(group), group[0].pair.fixed.size_px
+    if max(_p95_px(residual) for residual in residuals) < MIN_PARALLAX_PX:
+        return 0.0, False
+    windows = WindowShifts.of(residuals, [c.warped.mapping for c in group])
+    consistent = consistent_bands(windows, group)
+    if consistent is None:
+        return 0.0, False
+    bands, model = consistent
+    far_share = max(_far_share(residuals[band]) for band in bands)
+    if far_share <= _MAX_FAR_SHARE and _gain_by_others_sigma(windows.of_bands(bands), model, size_px) < MIN_GAIN_SIGMA:
+        return 0.0, False
+    parallax_px = float(np.percentile(np.abs(model.parallax_px), 95))
+    return parallax_px, layout_of([group[band] for band in bands]) is None and are_on_a_line(model.baselines)
+
+
+def _gain_by_others_sigma(windows: WindowShifts, model: Adjustment, size_px: tuple[int, int]) -> float:
+    """Return the decrease of the squared shifts of the median band by the parallax from the others, in sigma."""
+    shifts_px = windows.shifts_px - shifts_by_corners(model, windows.points_px, size_px)
+    bands, gains = np.arange(shifts_px.shape[1]), []
+    for band in bands:
+        others = np.delete(bands, band)
+        parallax = parallax_of(shifts_px[:, others], model.baselines[others], windows.weights[:, others])
+        after_px = shifts_px[:, band] - parallax[:, None] * model.baselines[band]
+        before, after = (np.linalg.norm(s, axis=1) for s in (shifts_px[:, band], after_px))
+        measured = np.isfinite(before) & np.isfinite(after)
+        enough = measured.sum() >= MIN_WINDOWS
+        gains.append(decrease_sigma(before[measured], after[measured]) if enough else 0.0)
+    return float(np.median(gains))
+
+
+def _common_residuals(group: Sequence[Candidate]) -> list[Residual[FixedImagePx]]:
+    """Return the residuals of all bands in the same windows: large ones if any band is blurred, or small ones if the
+    residual of any band uses these.
+    """
+    reference = group[0].pair.reference
+    if any(c.pair.is_blurred for c in group):
+        return [reference.large_windows.residuals(c.warped.warped) for c in group]
+    if all(c.warped.windows is reference.windows for c in group):
+        return [c.warped.residual for c in group]
+    return [reference.small_windows.residuals(c.warped.warped) for c in group]
+
+
+def _p95_px(residual: Residual[FixedImagePx]) -> float:
+    """Return the p95 of the lengths of the measured shifts, 0 without any: robust, as a wrong peak is no parallax."""
+    return float(residual.p95_px) if len(residual.lengths_px) else 0.0
+
+
+def _far_share(residual: Residual[FixedImagePx]) -> float:
+    """Return the share of the measured windows with a shift above 1 px."""
+    return float((residual.lengths_px > MAX_SHIFT_PX).mean()) if len(residual.lengths_px) else 0.0
+
+
+def layout_of(group: Sequence[Candidate]) -> NDArray[np.float64] | None:
+    """Return the layouts (bands, 2) of bands; None if the tags lack one."""
+    layouts = [candidate.pair.layout for candidate in group]
+    return None if any(layout is None for layout in layouts) else np.array(layouts, float)
+
+
+def consistent_bands(
+    windows: WindowShifts, group: Sequence[Candidate], lens_std: NDArray[np.float64] | None = None
+) -> tuple[list[int], Adjustment] | None:
+    """Adjust the model to the bands with common parallax; return their indices and the model, or None.
+
+    A band that the parallax of the others does not explain is left out, one after another.
+    """
+    size_px = group[0].pair.fixed.size_px
+    # Residual of a band relative to that of the others: up to 1.4 for bands of the same time, 2.4 for a photograph of
+    # another time. Residuals below the minimum are accepted anyway.
+    max_scale_ratio, min_foreign_px = 2.0, 0.4
+
+    def adjusted(bands: Sequence[int], lens_std: NDArray[np.float64] | None) -> Adjustment | None:
+        layout, some = layout_of([group[band] for band in bands]), windows.of_bands(bands)
+        model = adjust(some, size_px, layout, lens_std) if some.are_enough(MIN_WINDOWS) else None
+        return model if model is not None and are_of_lenses(model.baselines, layout) else None
+
+    def median_scale_px(bands: Sequence[int]) -> float:
+        model = adjusted(bands, None)
+        return math.inf if model is None else float(np.median(model.scales_px))
+
+    kept = list(range(windows.shifts_px.shape[1]))
+    model = adjusted(kept, lens_std)
+    while len(kept) > MIN_BANDS:
+        if model is None:
+            worst = int(np.argmin([median_scale_px([b for b in kept if b != foreign]) for foreign in kept]))
+        else:
+            worst = int(model.scales_px.argmax())
+            others_px = float(np.median(np.delete(model.scales_px, worst)))
+            if model.scales_px[worst] <= max(min_foreign_px, max_scale_ratio * others_px):
+                break
+        kept.pop(worst)
+        model = adjusted(kept, lens_std)
+    return None if model is None else (kept, model)
