@@ -81,12 +81,17 @@ class FixedWindows:
         Windows with a smaller share of valid pixels than `min_valid` are omitted: the outline of an invalid area biases
         the shift, by some tenths of a px in windows of 64 px with a twentieth of invalid pixels.
         """
-        valid = self._cut(self.valid & moving.valid, self.origins)
-        usable = np.flatnonzero(np.count_nonzero(valid, axis=(1, 2)) >= min_valid * self.side**2)
-        is_strong, windows = self._strong(structure_field(moving), self.origins[usable])
-        rows = usable[is_strong]
-        fixed = self.spectra if len(rows) == len(self.origins) else self.spectra[rows]
-        shifts_px, sigma = _peaks(whitened_cross_spectra(fixed, windowed_spectra(windows)))
+        both, structure = self.valid & moving.valid, structure_field(moving)
+        at_once = 64  # windows that fit into the CPU's cache: a quarter faster
+        parts = [(np.empty(0, np.int64), np.empty((0, 2)), np.empty(0))]
+        for first in range(0, len(self.origins), at_once):
+            rows = np.arange(first, min(first + at_once, len(self.origins)))
+            valid = self._cut(both, self.origins[rows])
+            rows = rows[np.count_nonzero(valid, axis=(1, 2)) >= min_valid * self.side**2]
+            is_strong, windows = self._strong(structure, self.origins[rows])
+            rows = rows[is_strong]
+            parts.append((rows, *_peaks(whitened_cross_spectra(self.spectra[rows], windowed_spectra(windows)))))
+        rows, shifts_px, sigma = map(np.concatenate, zip(*parts, strict=True))
         return Residual.of(self.centres_px[rows], shifts_px, sigma, self.cells[rows])
 
     def _cut(self, image: NDArray[_Element], origins: NDArray[np.int64]) -> NDArray[_Element]:
