@@ -19,7 +19,7 @@ from agalign.values.alignment import MIN_RETRIEVAL, MIN_TIMES_CHANCE, JointResul
 from agalign.values.geometry import Matrix
 from agalign.values.issues import RETRIEVAL, TEXTURELESS, UNLIKE, Issue, IssueKind, Remedy
 from agalign.values.pixel_units import FixedImagePx, FixedPx, PixelScale
-from agalign.verify.extrapolation import EXTRAPOLATED
+from agalign.verify.extrapolation import EXTRAPOLATED, MIN_COMMON_COVERAGE
 
 BY_WINDOWS = "windows"
 """Recipe of a result that is fitted to windows; its residual contains the windows that were left out of the fit."""
@@ -242,8 +242,8 @@ def issues_of(evidence: Evidence[FixedPx]) -> tuple[Issue, ...]:
 def seed_fits(residual: Residual[FixedPx]) -> bool:
     """Return True if the residual of a seed is small enough for the status `seed_only`."""
     # Rig tags have errors of a few px (docs/cameras.md).
-    min_coverage, max_median_px = 0.3, 8.0
-    return residual.coverage >= min_coverage and residual.median_px <= max_median_px
+    max_median_px = 8.0
+    return residual.coverage >= MIN_COMMON_COVERAGE and residual.median_px <= max_median_px
 
 
 def is_unchanged(joint: JointResult[FixedImagePx], given: Matrix, size_px: tuple[int, int], scale: float = 1.0) -> bool:

@@ -23,6 +23,8 @@ EXTRAPOLATED = IssueKind(
     ),
 )
 """Not in `checks.CHECKS`: the result is kept as a prediction with the error of the extrapolation."""
+MIN_COMMON_COVERAGE = 0.3
+"""Minimum share of the windows with a measured shift; in a band of noise, a tenth has one by chance."""
 _LATTICE = 24, 18
 """Columns and rows of the points of an image at which its coverage and the lens distortion are evaluated."""
 
@@ -94,11 +96,12 @@ def expected_error_px(
 
     C is the covariance of the corners and D the Jacobian `geometry.over_corners`, with lens shapes if the mapping is
     extrapolated. For a band that is predicted by a rig, the first term is the squared standard error. The local mean
-    square is that of the residual shifts of the nearest windows; `far` grows from 0 to 1 with the distance from them.
+    square is that of the residual shifts of the nearest windows, if the bands have common structure; `far` grows from 0
+    to 1 with the distance from them.
     Infinite where the error is unknown.
     """
     square, residual = _mapping_px2(alignment, size_px, points_px), alignment.residual
-    if residual is not None and len(residual.measured_px):
+    if residual is not None and residual.coverage >= MIN_COMMON_COVERAGE:
         square = square + _windows_px2(residual, points_px)
     if alignment.mapping.parallax is not None:
         square = square + alignment.mapping.parallax.variance_px2(points_px)
