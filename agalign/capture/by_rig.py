@@ -103,6 +103,9 @@ def _parallax_by_rig(
 def _with_prediction(
     pair: BandPair, alignment: Alignment[FixedImagePx], rig: Rig, known: Observation, expected: _ExpectedParallax | None
 ) -> Alignment[FixedImagePx]:
+    """Return the alignment with its distance from the rig's prediction, which replaces it if that contradicts it or is
+    more certain.
+    """
     prediction = predict_band(rig, pair.name, known)
     if expected is not None:
         matrix = pair.scales.between_images(prediction.fixed_to_moving)
@@ -129,13 +132,20 @@ def _with_prediction(
         by_windows = pair.scales.between_files(alignment.fixed_to_moving)
         if distance_px(by_windows, prediction.fixed_to_moving, rig.size_px) <= MAX_UNEXPECTED_PX:
             return alignment
+    return _predicted(pair, alignment, prediction, None if expected is None else expected.parallax)
+
+
+def _predicted(
+    pair: BandPair, alignment: Alignment[FixedImagePx], prediction: Prediction, parallax: Parallax | None
+) -> Alignment[FixedImagePx]:
+    """Return the alignment with the mapping of the prediction, unless the image is rotated or scaled relative to it."""
     mapping = pair.mapping(pair.scales.between_images(prediction.fixed_to_moving))
-    by_rig = WarpedPair.of(pair, mapping.with_parallax(None if expected is None else expected.parallax))
+    by_rig = WarpedPair.of(pair, mapping.with_parallax(parallax))
     rotated = find_rotated(by_rig)
     if rotated is None:
         residual = by_rig.residual
         return decided(replace(alignment, mapping=by_rig.mapping, residual=residual, prediction=prediction))
-    off_px = distance_px(pair.scales.between_files(rotated), prediction.fixed_to_moving, rig.size_px)
+    off_px = distance_px(pair.scales.between_files(rotated), prediction.fixed_to_moving, pair.reference_file_px)
     issues = Issue(UNEXPECTED_PX, off_px, MAX_UNEXPECTED_PX), *alignment.issues
     return decided(replace(alignment, mapping=alignment.of_the_seed, issues=issues, prediction=None, residual=None))
 

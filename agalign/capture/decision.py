@@ -17,7 +17,6 @@ from dataclasses import replace
 from agalign.capture.band_pair import BandPair
 from agalign.capture.candidate import Candidate
 from agalign.capture.warped_pair import WarpedPair
-from agalign.fit.displacement_field import DisplacementResult
 from agalign.pixels.band_resampling import channel_mean
 from agalign.values.alignment import Alignment, JointResult, Seed
 from agalign.values.choices import Geometry, PairStatus, ReliefUse, SeedKind
@@ -84,29 +83,30 @@ def verified(candidate: Candidate, use: ReliefUse) -> Alignment[FixedImagePx]:
     plane = candidate.warped.with_mapping(pair.mapping(joint.fixed_to_moving))
     if candidate.by_halves is not None and joint is candidate.joint:
         plane = plane.cross_validated(candidate.by_halves)
-    warped_pair, issues, displacement = _verified(plane, joint, use)
-    candidates: dict[Geometry, FixedImagePx] = {}
-    if displacement is not None:
-        candidates = {"homography": displacement.before_p95_px, "field": displacement.after_p95_px}
-    if issues and (displacement is None or displacement.field is None):
-        return replace(at_seed(pair, seed, issues), joint=joint, candidates=candidates)
-    size_px, residual = pair.fixed.size_px, warped_pair.residual
-    alignment = Alignment(warped_pair.mapping, size_px, "failed", issues, seed, joint, residual, candidates=candidates)
+    chosen, issues, p95_px = plane, plane.issues(joint), dict[Geometry, FixedImagePx]()
+    if _needs_field(use, issues, has_rig=pair.has_rig):
+        chosen, issues, p95_px = _with_field(plane, joint, issues)
+    if issues and chosen is plane:
+        return replace(at_seed(pair, seed, issues), joint=joint, candidates=p95_px)
+    size_px, residual = pair.fixed.size_px, chosen.residual
+    alignment = Alignment(chosen.mapping, size_px, "failed", issues, seed, joint, residual, candidates=p95_px)
     return predicted_by_windows(alignment, pair) if issues else decided(alignment)
 
 
-def _verified(
-    plane: WarpedPair, joint: JointResult[FixedImagePx], use: ReliefUse
-) -> tuple[WarpedPair, tuple[Issue, ...], DisplacementResult | None]:
-    """Return the pair, with a displacement field if one is accepted, its issues, and the result of the field fit.
+def _with_field(
+    plane: WarpedPair, joint: JointResult[FixedImagePx], issues: tuple[Issue, ...]
+) -> tuple[WarpedPair, tuple[Issue, ...], dict[Geometry, FixedImagePx]]:
+    """Return the pair with a displacement field, its issues, and the p95 of held-out windows by geometry.
 
-    With a field, the residual is that of held-out windows. The field is not accepted with issues that it cannot remove,
-    nor with any if the pair has none without it.
+    With a field, the residual is that of held-out windows. The pair and its issues are returned unchanged if it has no
+    significant field, one with issues that a field cannot remove, or one with issues where it has none without.
     """
-    pair, issues = plane.pair, plane.issues(joint)
-    if not _needs_field(use, issues, has_rig=pair.has_rig):
-        return plane, issues, None
+    pair = plane.pair
     displacement = pair.reference.displacement_field.refine(channel_mean(pair.moving_image), plane.mapping)
+    p95_px: dict[Geometry, FixedImagePx] = {
+        "homography": displacement.before_p95_px,
+        "field": displacement.after_p95_px,
+    }
     if displacement.field is not None:
         displaced = WarpedPair.of(pair, replace(plane.mapping, field=displacement.field), plane.windows)
         held_out = displaced if displacement.held_out is None else replace(displaced, residual=displacement.held_out)
@@ -114,8 +114,8 @@ def _verified(
         remaining = held_out.issues(joint)
         by_parallax = all(issue.kind in BY_PARALLAX for issue in remaining)
         if not displaced.issues(joint) and by_parallax and (issues or not remaining):
-            return held_out, remaining, displacement
-    return plane, issues, replace(displacement, field=None)
+            return held_out, remaining, p95_px
+    return plane, issues, p95_px
 
 
 def _needs_field(use: ReliefUse, issues: tuple[Issue, ...], *, has_rig: bool) -> bool:

@@ -86,7 +86,7 @@ def _solve(
     degrees_of_freedom = 4.0  # of the t distribution: heavy tails, as a lens may have moved
     robust = Robust(degrees_of_freedom**0.5, iterations=20)
     first_weights = np.ones(len(blocks))  # those of a residual of 0 would start at the rig and may stay there
-    weights = (1 + 8 / degrees_of_freedom) * first_weights
+    weights = (1 + 8 / degrees_of_freedom) * first_weights  # of a multivariate t distribution: (nu + 8) / (nu + r^2)
     system = design, values, weights, information, mean
     solution = least_squares(*system, robust=robust, first_weights=first_weights)
     # Rounding removes the last bits, which depend on the machine's order of summation.
