@@ -10,7 +10,7 @@ from agalign.capture.by_relief import aligned_by_relief
 from agalign.capture.by_rig import bands_to_learn, with_predictions
 from agalign.capture.by_windows import aligned_by_windows, without_extrapolated
 from agalign.capture.candidate import Candidate
-from agalign.capture.decision import at_seed, decided, predicted_by_windows, verified, without_result
+from agalign.capture.decision import at_seed, decided, of_one_geometry, verified, without_result
 from agalign.capture.full_resolution import at_full_resolution
 from agalign.capture.map_estimate import map_estimate
 from agalign.capture.seeding import find_seed, image_groups
@@ -26,7 +26,7 @@ from agalign.method.state import ImageGroup
 from agalign.values import geometry
 from agalign.values.alignment import Alignment, JointResult, RefinedPair, Seed
 from agalign.values.capture import Band, Capture
-from agalign.values.issues import OTHER_GEOMETRY, SEED_ASKED_FOR, Issue
+from agalign.values.issues import SEED_ASKED_FOR, Issue
 from agalign.values.mapping import PixelMapping
 from agalign.values.parallax import Parallax, Relief
 from agalign.values.pixel_units import FixedFilePx, FixedImagePx
@@ -172,6 +172,7 @@ class PairAligner:
             remaining = [s for s in remaining if s[0].name in names]
         self.learn(remaining)
         self.align_by_windows(starts)
+        self.result = of_one_geometry(pairs, self.result)
         return self.timed_result()
 
     def verify_refined(self, pairs: Sequence[BandPair], known: Mapping[str, RefinedPair]) -> bool:
@@ -242,14 +243,10 @@ class PairAligner:
         """Align by windows the pairs without retrieval of held-out patches."""
         if not _may_be_homography(self.settings):
             return
-        has_relief = any(a.mapping.parallax is not None for a in self.result.values())
         for pair, _ in starts:
-            if pair.name not in self.result:
-                continue
-            with self.timer.measure([pair.name]):
-                before, after = self.result[pair.name], aligned_by_windows(pair, self.result[pair.name])
-                is_mixed = has_relief and not pair.is_coarse and after is not before and after.status == "aligned"
-                self.result[pair.name] = predicted_by_windows(after, pair, OTHER_GEOMETRY) if is_mixed else after
+            if pair.name in self.result:
+                with self.timer.measure([pair.name]):
+                    self.result[pair.name] = aligned_by_windows(pair, self.result[pair.name])
 
     def _align(self, starts: Sequence[Start], sides: Sequence[int], align: _Align) -> None:
         with self.timer.measure([pair.name for pair, _ in starts]):
@@ -313,10 +310,8 @@ def verify_together(
                 alignments[pair.name] = at_seed(pair, seed, (result,))
             else:
                 field_use = "never" if is_observation or pair.name in relief.along_a_line else use
-                alignment = verified(candidates[pair.name], field_use)
-                is_mixed = pair.name in relief.of_other_geometry and alignment.status == "aligned"
-                alignments[pair.name] = predicted_by_windows(alignment, pair, OTHER_GEOMETRY) if is_mixed else alignment
-    return alignments
+                alignments[pair.name] = verified(candidates[pair.name], field_use)
+    return of_one_geometry([pair for pair, _ in starts], alignments)
 
 
 def _candidates(

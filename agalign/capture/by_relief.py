@@ -66,8 +66,6 @@ class ReliefResult:
 
     alignments: dict[str, Alignment[FixedImagePx]] = field(default_factory=dict)
     """Bands aligned by the relief, by name."""
-    of_other_geometry: set[str] = field(default_factory=set)
-    """Bands of a capture with a relief that does not align them: their homographies are another geometry."""
     along_a_line: set[str] = field(default_factory=set)
     """Bands with common displacements that neither a relief nor displacement fields must follow."""
 
@@ -99,11 +97,7 @@ def aligned_by_relief(
             result.along_a_line |= {c.pair.name for c in group}
         elif use == "always" or parallax_px >= MIN_PARALLAX_PX:
             with suppress(GeometryError):
-                aligned = _observed(group) if is_observation else _aligned_group(group, candidates, lost)
-                if aligned:
-                    same = [c.pair for c in candidates if c.pair.reference is group[0].pair.reference]
-                    result.of_other_geometry |= {pair.name for pair in same if not pair.is_coarse} - aligned.keys()
-                result.alignments |= aligned
+                result.alignments |= _observed(group) if is_observation else _aligned_group(group, candidates, lost)
     return result
 
 

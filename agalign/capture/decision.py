@@ -11,7 +11,7 @@ A seed that contradicts the tags or the flight is replaced by their mapping: an 
 is confirmed at its own position, far from that of its band.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 from agalign.capture.band_pair import BandPair
@@ -20,7 +20,7 @@ from agalign.capture.warped_pair import WarpedPair
 from agalign.pixels.band_resampling import channel_mean
 from agalign.values.alignment import Alignment, JointResult, Seed
 from agalign.values.choices import Geometry, PairStatus, ReliefUse, SeedKind
-from agalign.values.issues import SEED_DOES_NOT_FIT, Issue, IssueKind
+from agalign.values.issues import OTHER_GEOMETRY, SEED_DOES_NOT_FIT, Issue, IssueKind
 from agalign.values.pixel_units import FixedImagePx, FixedPx
 from agalign.verify.checks import BY_PARALLAX, is_unchanged, seed_fits
 
@@ -71,6 +71,23 @@ def predicted_by_windows(
     issues = alignment.issues if reason is None else (Issue(reason), *alignment.issues)
     prediction = pair.prediction_of(alignment.mapping, alignment.residual.std_px)
     return decided(replace(alignment, issues=issues, prediction=prediction))
+
+
+def of_one_geometry(
+    pairs: Sequence[BandPair], result: Mapping[str, Alignment[FixedImagePx]]
+) -> dict[str, Alignment[FixedImagePx]]:
+    """Return the alignments by name: if a capture has a relief, homographies that are `aligned` become `predicted`.
+
+    A spectral index would mix two geometries otherwise. Thermal bands, which have another reference image, keep theirs.
+    """
+    known = [(pair, result[pair.name]) for pair in pairs if pair.name in result]
+    with_relief = {id(pair.reference) for pair, alignment in known if alignment.mapping.parallax is not None}
+    mixed = {
+        pair.name: predicted_by_windows(alignment, pair, OTHER_GEOMETRY)
+        for pair, alignment in known
+        if alignment.status == "aligned" and alignment.mapping.parallax is None and id(pair.reference) in with_relief
+    }
+    return {**result, **mixed}
 
 
 def verified(candidate: Candidate, use: ReliefUse) -> Alignment[FixedImagePx]:

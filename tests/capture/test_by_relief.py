@@ -15,13 +15,13 @@ from synthetic_flights.relief import make_scene
 
 from agalign.capture import align_bands
 from agalign.capture import by_relief as module
-from agalign.capture.align_bands import verify_together
+from agalign.capture.align_bands import PairAligner, verify_together
 from agalign.capture.band_pair import BandPair
 from agalign.capture.by_relief import ReliefResult, _aligned, _Checked, _gain_px, _std_px, aligned_by_relief
 from agalign.capture.by_rig import with_predictions
 from agalign.capture.candidate import Candidate
 from agalign.capture.common_parallax import MIN_PARALLAX_PX, common_parallax_px
-from agalign.capture.decision import at_seed
+from agalign.capture.decision import at_seed, of_one_geometry
 from agalign.capture.reference import Reference
 from agalign.config import JointSettings, ReliefSettings, Settings
 from agalign.fit.range import inverse_range
@@ -36,7 +36,7 @@ from agalign.values.geometry import Matrix
 from agalign.values.image import Mask, Raster
 from agalign.values.issues import RETRIEVAL, Issue
 from agalign.values.mapping import PixelMapping
-from agalign.values.parallax import Relief
+from agalign.values.parallax import Parallax, Relief
 from agalign.values.pixel_units import MovingFilePx
 from agalign.verify.extrapolation import expected_error_px
 
@@ -251,14 +251,44 @@ def test_neither_relief_nor_field_replaces_another_model_family(
         assert (len(alignment.candidates) > 1) == is_allowed
 
 
-def test_a_band_that_the_relief_does_not_align_is_predicted(flat: Rendered, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Its homography passes all checks, but is another geometry than that of the other bands."""
-    candidates = flat.candidates()
-    assert {a.status for a in verified_together(candidates, Settings()).values()} == {"aligned"}
-    monkeypatch.setattr(align_bands, "aligned_by_relief", lambda *_, **__: ReliefResult(of_other_geometry={"NIR"}))
-    result = verified_together(candidates, Settings())
+@pytest.fixture(scope="module")
+def beside_relief(flat: Rendered) -> dict[str, Alignment]:
+    """All bands of a flat scene, of which Blue has a relief."""
+    result = verified_together(flat.candidates(), Settings())
+    relief = Relief(np.zeros((4, 4), np.float32), np.ones((4, 4), np.float32))
+    return {
+        **result,
+        "Blue": replace(result["Blue"], mapping=result["Blue"].mapping.with_parallax(Parallax(relief, (1, 0)))),
+    }
+
+
+def test_a_homography_next_to_a_relief_is_predicted(flat: Rendered, beside_relief: dict[str, Alignment]) -> None:
+    """It passes all checks, but is another geometry than that of the other bands; a thermal one has another grid."""
+    assert {a.status for a in beside_relief.values()} == {"aligned"}
+    pairs = {c.pair.name: c.pair for c in flat.candidates()}
+    pairs["Red"] = replace(pairs["Red"], reference=Reference(pairs["Red"].reference.image))
+    result = of_one_geometry(list(pairs.values()), beside_relief)
     assert {name: a.status for name, a in result.items()} == {"Blue": "aligned", "Red": "aligned", "NIR": "predicted"}
     assert result["NIR"].prediction.source == "windows"
+
+
+def test_the_bands_of_one_verification_have_one_geometry(
+    flat: Rendered, beside_relief: dict[str, Alignment], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    only_blue = ReliefResult({"Blue": beside_relief["Blue"]})
+    monkeypatch.setattr(align_bands, "aligned_by_relief", lambda *_, **__: only_blue)
+    result = verified_together(flat.candidates(), Settings())
+    assert {name: a.status for name, a in result.items()} == {"Blue": "aligned", "Red": "predicted", "NIR": "predicted"}
+
+
+def test_bands_that_are_aligned_one_after_another_have_one_geometry(
+    flat: Rendered, beside_relief: dict[str, Alignment], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A band that is learned from scratch after the relief of the others, for example."""
+    aligner = PairAligner(Settings(), None, lambda *_: None)
+    monkeypatch.setattr(PairAligner, "refine", lambda self, _: self.result.update(beside_relief))
+    result = aligner.align([c.pair for c in flat.candidates()], None)
+    assert {name: a.status for name, a in result.items()} == {"Blue": "aligned", "Red": "predicted", "NIR": "predicted"}
 
 
 def with_noise(image: np.ndarray, share: float) -> np.ndarray:
@@ -298,7 +328,6 @@ def test_a_relief_does_not_verify_a_band_that_it_is_estimated_from(
     monkeypatch.setattr(module, "_checked", lambda band, warped: None if band.name == "NIR" else checked(band, warped))
     result = aligned_by_relief(candidates, "auto")
     assert set(result.alignments) == set(aligned) - {"NIR"}
-    assert result.of_other_geometry == {"NIR"}
 
 
 def test_unrelated_images_do_not_follow_a_relief(four_lenses: Rendered) -> None:
@@ -358,13 +387,6 @@ def test_an_observation_of_the_rig_needs_only_windows(four_lenses: Rendered) -> 
             # The parallax of a pixel is that of the nearest window, on slopes too.
             assert np.median(four_lenses.error_px(name, alignment.mapping)) < 0.6
             assert alignment.joint.corner_std_px < 0.5
-
-
-def test_a_band_without_retrieval_that_the_relief_does_not_align_has_another_geometry(boxes: Rendered) -> None:
-    """It is not part of the bands from which the relief is estimated."""
-    result = boxes.candidates({"NIR": foreign(boxes.images["NIR"], "unrelated", seed=3)})
-    lost = [replace(c, joint=replace(c.joint, retrieval=0.0)) if c.pair.name == "NIR" else c for c in result]
-    assert aligned_by_relief(lost, "auto").of_other_geometry == {"NIR"}
 
 
 def test_use(candidates: Sequence[Candidate]) -> None:
