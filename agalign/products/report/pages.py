@@ -5,9 +5,8 @@ import hashlib
 import json
 import os
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path
 from statistics import median
@@ -20,7 +19,7 @@ from agalign.config import Settings
 from agalign.errors import SidecarError
 from agalign.products.indices.rasters import IndexReport, reports_of_run, update_table
 from agalign.products.report.charts import drifts_of, rig_views
-from agalign.products.report.facts import BAND_COLUMNS, FailureGroup, FlightFacts, masked_shares
+from agalign.products.report.facts import BAND_COLUMNS, FlightFacts
 from agalign.products.report.light import CaptureLight, light_charts, radiometric_check
 from agalign.products.run.excluded import PANELS_FILE, SKY_FILE, PanelPart, SkyPart, read_panels, read_sky
 from agalign.products.run.record import RunPart, exclusion_lines, read_run_record
@@ -32,21 +31,8 @@ SUMMARY_COLUMNS = ("folder", "capture", *BAND_COLUMNS, "reference")
 REPORT_FILE, SUMMARY_FILE = "index.html", "summary.csv"
 
 
-@dataclass(frozen=True)
-class Pages:
-    """The written documents, and their contents."""
-
-    report: Path
-    summary: Path
-    failures: Sequence[FailureGroup]
-    facts: Mapping[str, Any]
-    """Data of the report, schema `agalign-report/1`."""
-    slowest: tuple[tuple[str, float], ...]
-    """(label, seconds) of the captures with the longest processing time."""
-
-
-def write_pages(out: Path, on_problem: Callable[[str], None]) -> Pages:
-    """Write OUT/index.html, OUT/summary.csv and OUT/indices.csv from all sidecars below OUT.
+def write_pages(out: Path, on_problem: Callable[[str], None]) -> FlightFacts:
+    """Write OUT/index.html, OUT/summary.csv and OUT/indices.csv from all sidecars below OUT, and return their data.
 
     Unreadable files are reported to `on_problem` and left out; the pages then count as outdated in `pages_exist`.
     Raises OutputError.
@@ -75,15 +61,13 @@ def write_pages(out: Path, on_problem: Callable[[str], None]) -> Pages:
     rows = [*facts.rows, *(row for excluded in not_aligned for row in _rows_not_aligned(*excluded))]
     write_csv(out / SUMMARY_FILE, SUMMARY_COLUMNS, ([row.get(name) for name in SUMMARY_COLUMNS] for row in rows))
     facts.add_indices(update_table(out, indices), out)
-    failures = facts.pairs.groups()
-    slowest = sorted(((c["label"], c["seconds"]) for c in facts.captures), key=lambda c: -c[1])[:5]
     write_text(out / REPORT_FILE, _page(out, facts, light, panels, sky, run, unreadable.append))
     if unreadable:
         with suppress(OSError):
             os.utime(out / REPORT_FILE, (0, 0))
     for text in unreadable:
         on_problem(text)
-    return Pages(out / REPORT_FILE, out / SUMMARY_FILE, failures, facts.as_json(), tuple(slowest))
+    return facts
 
 
 def pages_exist(out: Path) -> bool:
@@ -148,7 +132,7 @@ def _page(
         light=light_charts(light),
         check=radiometric_check(light),
         exclusions=[] if run is None else exclusion_lines(run.excluded),
-        masked=masked_shares(facts.captures),
+        masked=facts.masked_shares(),
         panels=panels,
         sky=sky,
         mapped=sum(c["position"] is not None for c in facts.captures),
