@@ -74,6 +74,6 @@ def test_every_text_is_read_and_written_in_an_encoding_that_is_said(flight: Path
 def test_processes_that_start_from_nothing(flight: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """As on Windows and macOS: they do not share the memory of this process."""
     monkeypatch.setattr(processes, "get_all_start_methods", lambda: ["spawn"])
-    tasks = [Task(c, tmp_path, seeded(), None) for c in discover(flight).captures]
+    tasks = [Task(c, tmp_path, seeded()) for c in discover(flight).captures]
     with own_processes(2, limit_threads) as run:
         assert [r.state for r in capture_reports(run, tasks, Listener(), None)] == ["done"] * len(tasks)

@@ -37,26 +37,40 @@ def quiet(*_: object) -> None:
     """A progress callback that reports nothing."""
 
 
-def process_capture(
-    capture: Capture,
-    out: Path,
-    settings: Settings,
-    progress: PairProgress = quiet,
-    model: FlightModel | None = None,
-    max_preview_bytes: int = preview_bytes(1),
-    limits: FlightLimits = (),
-    common: OutputGrid | None = None,
-) -> CaptureReport:
+@dataclass(frozen=True)
+class Task:
+    """One capture to process, as sent to a worker."""
+
+    capture: Capture
+    """Its bands already have the chosen radiometry (`with_radiometry`)."""
+    out: Path
+    settings: Settings
+    model: Path | None = None
+    """File of the model of the flight."""
+    max_preview_bytes: int = preview_bytes(1)
+    """About the largest size of the preview."""
+    limits: FlightLimits = ()
+    """Limits of the flights of the camera."""
+    common: OutputGrid | None = None
+    """Grid of the captures of the camera, if they share one."""
+
+    def absolute(self) -> "Task":
+        """Return the task with absolute paths: workers may have another working folder."""
+        model = None if self.model is None else self.model.absolute()
+        return replace(self, capture=self.capture.with_absolute_paths(), out=self.out.absolute(), model=model)
+
+
+def process_capture(task: Task, progress: PairProgress = quiet, model: FlightModel | None = None) -> CaptureReport:
     """Align a capture, write its products and its sidecar, and return its report, without times of stages.
 
-    The other bands are aligned where one cannot be. The bands already have the chosen radiometry (`with_radiometry`).
-    With the `model` of the flight, a network is learned from scratch only for bands that the model cannot align. The
-    preview has at most about `max_preview_bytes`. The captures of the camera have the `limits` of its flights, and
-    their `common` grid, if any.
+    The other bands are aligned where one cannot be. With the `model` of the flight, which is read from the file of the
+    task, a network is learned from scratch only for bands that the model cannot align.
     Raises UnreadableFileError if the reference cannot be read, InputError or ConfigurationError if the capture or the
     installation lacks what a product needs, and OutputError.
     """
-    began_s, paths, capture = time.perf_counter(), CapturePaths.of(capture, out), with_saturation_values(capture)
+    began_s, settings, out = time.perf_counter(), task.settings, task.out
+    capture = with_saturation_values(task.capture)
+    paths = CapturePaths.of(capture, out)
     refuse_to_overwrite([capture], out, settings.write)
     if missing := missing_radiometry(capture, settings.write.radiometry):
         raise InputError(f"{capture.reference.path}: {missing}")
@@ -69,17 +83,17 @@ def process_capture(
     alignments = align_capture_bands(capture, settings, model, progress)
     progress(capture.reference.name, "writing", 0.0)
     whole = OutputGrid(0, 0, *capture.reference.size_px)
-    context = ProductContext(capture, paths, settings, alignments, (), whole, max_preview_bytes, limits)
+    context = ProductContext(capture, paths, settings, alignments, (), whole, task.max_preview_bytes, task.limits)
     if context.with_pixels:
-        layers, grid = output_layers(capture, context.with_pixels, settings.write, common)
+        layers, grid = output_layers(capture, context.with_pixels, settings.write, task.common)
         context = replace(context, layers=layers, grid=grid)
     discard_outputs(capture, out, settings.write)
     failures = _write_products(context)
     sidecar = write_sidecar(paths.sidecar, sidecar_of(context, list(failures), time.perf_counter() - began_s))
     # Products that need the same file fail with the same message.
     lost = (*dict.fromkeys(failures.values()), *lost_reflectance(capture, settings.write.radiometry))
-    result, path = sidecar.result(), paths.sidecar
-    return CaptureReport(capture.label, "done", result, path, failed_products=lost, seconds=sidecar.seconds)
+    result = sidecar.result()
+    return CaptureReport(capture.label, "done", result, paths.sidecar, failed_products=lost, seconds=sidecar.seconds)
 
 
 def _write_products(context: ProductContext) -> dict[str, str]:
@@ -169,24 +183,6 @@ def lost_reflectance(capture: Capture, choice: RadiometryChoice) -> tuple[str, .
     return tuple(f"not written as reflectance: {b.name}: {b.implausible}" for b in lost if choice == "auto")[:1]
 
 
-@dataclass(frozen=True)
-class Task:
-    """One capture to process, as sent to a worker."""
-
-    capture: Capture
-    out: Path
-    settings: Settings
-    model: Path | None
-    max_preview_bytes: int = preview_bytes(1)
-    limits: FlightLimits = ()
-    common: OutputGrid | None = None
-
-    def absolute(self) -> "Task":
-        """Return the task with absolute paths: workers may have another working folder."""
-        model = None if self.model is None else self.model.absolute()
-        return replace(self, capture=self.capture.with_absolute_paths(), out=self.out.absolute(), model=model)
-
-
 def do_capture(task: Task, on_pair: PairProgress = quiet) -> CaptureReport:
     """Process one capture and return its report, which includes errors."""
     label, clock = task.capture.label, StageClock(on_pair)
@@ -194,8 +190,7 @@ def do_capture(task: Task, on_pair: PairProgress = quiet) -> CaptureReport:
     try:
         model = None if task.model is None else loaded_model(task.model, task.settings.joint.device)
         with one_thread(), one_memory_error():
-            facts = task.max_preview_bytes, task.limits, task.common
-            report = process_capture(task.capture, task.out, task.settings, clock, model, *facts)
+            report = process_capture(task, clock, model)
     except Exception as error:
         # A defect of agalign in one capture must not stop the others.
         report = CaptureReport(label, "error", error=failure_text(error), seconds=clock.seconds)

@@ -31,7 +31,7 @@ from agalign.values.capture import Capture
 from agalign.values.text import counted
 
 if TYPE_CHECKING:
-    from agalign.batch import CaptureReport
+    from agalign.batch.capture_report import CaptureReport
 
 
 def find_captures(folder: Path, options: DiscoverOptions, terminal: Terminal) -> FolderScan:
@@ -157,7 +157,7 @@ def run(
 
     Raises OutputError or WorkerError if no capture could be processed.
     """
-    from agalign.batch import Listener, run_flight
+    from agalign.batch.run import Listener, run_flight
 
     asked = {c.label: len(c.moving) + len(c.missing_bands) for c in flight.captures}
     totals, pace = RunTotals(flight.is_complete, asked), _Pace()

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import CloughTocher2DInterpolator
 
-from agalign.batch import CaptureReport
+from agalign.batch.capture_report import CaptureReport
 from agalign.synthetic.camera_model import BandSpec, CameraSpec, Exposure, Pose, place_and_rays, true_homography
 from agalign.synthetic.cameras import BLACK_LEVEL, REDEDGE, WHITE_LEVEL
 from agalign.synthetic.ground import Field, Ground, map_px, on_ground, paint_ground, reflectance

@@ -15,13 +15,13 @@ import psutil
 import pytest
 
 import agalign
-from agalign.batch import RunOptions, dask_executor, run_flight, workers
+from agalign.batch import workers
 from agalign.batch.capture_report import CaptureReport
 from agalign.batch.capture_task import Task
-from agalign.batch.run import Listener, capture_reports
-from agalign.batch.workers import DaskExecutor, Run, in_order, on_executor, own_processes
+from agalign.batch.run import Listener, capture_reports, run_flight
+from agalign.batch.workers import DaskExecutor, Run, dask_executor, in_order, on_executor, own_processes
 from agalign.cameras.discover import discover
-from agalign.config import SeedSettings, Settings
+from agalign.config import RunOptions, SeedSettings, Settings
 from agalign.errors import ConfigurationError, WorkerError
 from agalign.method.device import limit_threads
 from agalign.products.sidecar.file import find_sidecars, read_result
@@ -70,7 +70,7 @@ def test_a_scheduler_that_does_not_answer(monkeypatch: pytest.MonkeyPatch) -> No
 
 
 def seeds_only(flight: Path, out: Path) -> list[Task]:
-    return [Task(c, out, seeded(), None) for c in discover(flight).captures]
+    return [Task(c, out, seeded()) for c in discover(flight).captures]
 
 
 def reports_of(run: Run, tasks: list[Task]) -> Iterator[CaptureReport]:

@@ -13,7 +13,8 @@ import rasterio
 import torch
 
 import agalign
-from agalign.batch import CaptureReport, learning_tasks
+from agalign.batch import learning_tasks
+from agalign.batch.capture_report import CaptureReport
 from agalign.batch.flight_learning import learn_flight
 from agalign.cameras.discover import discover
 from agalign.capture import align_bands

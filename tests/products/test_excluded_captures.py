@@ -13,8 +13,7 @@ from PIL import Image
 from pydantic import ValidationError
 
 import agalign
-from agalign.batch import RunOptions
-from agalign.config import Settings, WriteSettings
+from agalign.config import RunOptions, Settings, WriteSettings
 from agalign.errors import SidecarError
 from agalign.products.report.pages import write_pages
 from agalign.products.run.excluded import PANELS_FILE, SKY_FILE, PanelPart, read_sky

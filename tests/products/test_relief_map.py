@@ -87,7 +87,7 @@ class Run:
         chosen = agalign.Settings(write=agalign.WriteSettings.model_validate({"crop": "none", **settings}))
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr(batch, "align_capture_bands", lambda *_: alignments or self.alignments)
-            outcome = batch.process_capture(capture or self.capture, out, chosen)
+            outcome = batch.process_capture(batch.Task(capture or self.capture, out, chosen))
         assert outcome.failed_products == ()
         assert read_result(outcome.path) == outcome.result
         return outcome.path

@@ -151,7 +151,7 @@ def test_any_error_fails_one_capture_only(
     flight: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, error: Exception, said: str
 ) -> None:
     monkeypatch.setattr(batch, "process_capture", raising(error))
-    report = batch.do_capture(batch.Task(discover(flight).captures[0], tmp_path, seeded(), None))
+    report = batch.do_capture(batch.Task(discover(flight).captures[0], tmp_path, seeded()))
     assert report.state == "error"
     assert report.error.startswith(said)
 
