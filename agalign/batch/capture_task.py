@@ -100,7 +100,7 @@ def _write_products(context: ProductContext) -> dict[str, str]:
     """Write the enabled products; return {kind: message} of optional ones that failed. Raises like `Product.write`."""
     failures: dict[str, str] = {}
     for product in PRODUCTS:
-        if not product.is_enabled(context.write_settings) or (product.needs_layers and not context.layers):
+        if not product.is_enabled(context.settings.write) or (product.needs_layers and not context.layers):
             continue
         try:
             for file in product.write(context):

@@ -24,7 +24,7 @@ from agalign.flight.groups import camera_overviews
 from agalign.products.product import CapturePaths
 from agalign.products.report.facts import FailureGroup, PairTotals
 from agalign.products.report.pages import REPORT_FILE, pages_exist, write_pages
-from agalign.products.run.record import exclusion_lines, read_run_record
+from agalign.products.run.record import read_run_record
 from agalign.products.sidecar.file import read_result
 from agalign.products.sidecar.schema import BandResult, CaptureResult
 from agalign.values.capture import Capture
@@ -167,35 +167,27 @@ def run(
         progress(terminal, len(flight.captures)) as show_line,
     ):
         options = replace(options, executor=executor)
-        current: Capture | None = None
 
         def show(share: float, text: str) -> None:
             show_line(totals.states.total(), share, text, pace.of(totals.states))
-
-        def on_start(capture: Capture) -> None:
-            nonlocal current
-            terminal.check()
-            current = capture
 
         def on_learning(camera: str, share: float) -> None:
             terminal.check()
             show(0.0, f"learning from {camera}: {share:.0%} at most")
 
-        def on_learnt(camera: str, seconds: float) -> None:
-            terminal.event("learnt", camera=camera, seconds=round(seconds, 2))
-
-        def on_again(text: str) -> None:
-            terminal.event("again", text, message=text)
-
-        def on_pair(band: str, stage: str, share: float) -> None:
+        def on_pair(capture: Capture, band: str, stage: str, share: float) -> None:
             terminal.check()
-            assert current is not None
-            names = [*(b.name for b in current.moving), band]
+            names = [*(b.name for b in capture.moving), band]
             finished = names.index(band) + (0.85 * share if stage in ("learning", "refining") else 0.0)
-            show(finished / max(len(current.moving), 1), f"{current.label} {band}: {stage}")
+            show(finished / max(len(capture.moving), 1), f"{capture.label} {band}: {stage}")
 
+        listener = Listener(
+            on_pair,
+            on_learning,
+            on_learnt=lambda camera, seconds: terminal.event("learnt", camera=camera, seconds=round(seconds, 2)),
+            on_again=lambda text: terminal.event("again", text, message=text),
+        )
         try:
-            listener = Listener(on_start, on_pair, on_learning, on_learnt, on_again)
             for report in run_flight(flight, out, settings, options, listener, model):
                 terminal.check()
                 totals.add(report)
@@ -352,7 +344,7 @@ def conclude(totals: RunTotals, out: Path, terminal: Terminal) -> int:
         shares = ", ".join(f"{name} up to {share:.1%} ({label})" for name, share, label in high)
         terminal.result(f"Saturated pixels: {shares}")
     record = read_run_record(out)
-    for line in [] if record is None else exclusion_lines(record.excluded):
+    for line in [] if record is None else record.exclusions():
         terminal.result(line)
     terminal.result(f"Report: {out / REPORT_FILE}")
     if totals.states and set(totals.states) <= {"panel", "sky"}:

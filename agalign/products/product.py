@@ -8,14 +8,7 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 from agalign.config import Settings, WriteSettings
-from agalign.products.rasters.checked_raster import (
-    FLOAT_OPTIONS,
-    Block,
-    LayerDescription,
-    georeference_tags,
-    grid_profile,
-    write_layers,
-)
+from agalign.products.rasters.checked_raster import Block, LayerDescription, write_on_grid
 from agalign.products.rasters.layout import FlightLimits, Layer
 from agalign.products.report.drawing import ReducedBands, read_reduced_bands
 from agalign.products.sidecar.schema import PreviewPart, is_usable
@@ -107,11 +100,6 @@ class ProductContext:
     """Files of the products before this one in `PRODUCTS`."""
 
     @property
-    def write_settings(self) -> WriteSettings:
-        """The settings of the outputs."""
-        return self.settings.write
-
-    @property
     def with_pixels(self) -> dict[str, Alignment[FixedFilePx]]:
         """The alignments that did not fail, by band, in the order of the capture's bands."""
         return {b.name: a for b in self.capture.moving if (a := self.alignments[b.name]).status != "failed"}
@@ -186,13 +174,12 @@ class Product(ABC):
         layers: Sequence[LayerDescription],
         blocks: Iterable[Block],
         asset: StacAsset,
-        *,
-        tags: Mapping[str, str] | None = None,
-        dtype: str = "float32",
-        options: Mapping[str, Any] = FLOAT_OPTIONS,
+        **options: Any,
     ) -> list[WrittenFile]:
-        """Write one raster on the grid of the capture, with its georeference, and return it. Raises OutputError."""
+        """Write one raster on the grid of the capture, with these options of `write_on_grid`, and return it.
+
+        Raises OutputError.
+        """
         path, georeference = context.paths.file(self.suffix), context.capture.reference.georeference
-        profile = grid_profile(context.grid, georeference, len(layers), dtype, **options)
-        write_layers(path, profile, layers, {**(tags or {}), **georeference_tags(georeference)}, blocks)
+        write_on_grid(path, context.grid, georeference, layers, blocks, **options)
         return [WrittenFile(self.kind, path, asset)]

@@ -163,7 +163,7 @@ def _describe_bands(
     asset: "pystac.Asset", bands: Sequence[Band], nodata: float | None, context: ProductContext
 ) -> None:
     """Describe the bands of an asset in the fields of the extensions, and in the common `bands` of STAC 1.1."""
-    raw = context.write_settings.radiometry == "off"
+    raw = context.settings.write.radiometry == "off"
     dtype = np.result_type(*(b.dtype for b in bands)).name if raw else "float32"
     missing = "nan" if nodata is not None and math.isnan(nodata) else nodata
     described: list[tuple[dict[str, Any], ...]] = []

@@ -141,7 +141,7 @@ class IndexRasters(Product):
         Raises InputError if bands are in the wrong unit, OutputError.
         """
         bands = _bands(context)
-        indices = [index_named(name) for name in context.write_settings.indices]
+        indices = [index_named(name) for name in context.settings.write.indices]
         problems = []
         for report in write_rasters(bands, indices, context.paths.file(""), context.capture.label):
             if report.path is not None:

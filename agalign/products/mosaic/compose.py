@@ -6,6 +6,7 @@ It is for viewing: terrain is not corrected, which takes photogrammetry.
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -17,13 +18,7 @@ from agalign.products.indices.formulas import Index, index_named
 from agalign.products.indices.rasters import IndexReport, write_rasters
 from agalign.products.mosaic.adjustment import adjusted, misfit_m, tie_pairs, tied_groups
 from agalign.products.mosaic.placement import Placement, place_captures
-from agalign.products.rasters.checked_raster import (
-    Block,
-    LayerDescription,
-    georeference_tags,
-    grid_profile,
-    write_layers,
-)
+from agalign.products.rasters.checked_raster import Block, LayerDescription, write_on_grid
 from agalign.products.rasters.raster_file import to_cog, with_nodata
 from agalign.products.run.captures import AlignedBand, BandReader, LeftOut
 from agalign.values import geometry
@@ -165,8 +160,6 @@ def _write(
     """Write the mosaic of all bands."""
     dtype, layers, copied = _like(captures)
     nodata = math.nan if dtype.kind == "f" else 0.0
-    options = {"compress": _COMPRESSION, "nodata": nodata, "interleave": "band"}
-    profile = grid_profile(OutputGrid(0, 0, *grid.size_px), georeference, len(layers), dtype.name, **options)
 
     def blocks() -> Iterator[Block]:
         for tile in tiles(Tile(0, 0, *grid.size_px), _TILE_PX):
@@ -175,8 +168,12 @@ def _write(
                 values = band if dtype.kind == "f" else np.rint(band)
                 yield with_nodata(values.astype(dtype), valid, nodata), number, tile.x0, tile.y0
 
-    tags = copied | tags | georeference_tags(georeference)
-    write_layers(path, profile, layers, tags, blocks(), lambda partial: to_cog(partial, _COMPRESSION))
+    whole, finish = OutputGrid(0, 0, *grid.size_px), partial(to_cog, compression=_COMPRESSION)
+    options = {"compress": _COMPRESSION, "nodata": nodata, "interleave": "band"}
+    tags = copied | tags
+    write_on_grid(
+        path, whole, georeference, layers, blocks(), tags=tags, dtype=dtype.name, options=options, finish=finish
+    )
 
 
 def _like(captures: Sequence[Placement]) -> tuple[np.dtype[Any], list[LayerDescription], dict[str, str]]:

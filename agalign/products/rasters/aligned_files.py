@@ -10,13 +10,13 @@ import numpy as np
 
 from agalign.cameras.metadata import read_tags
 from agalign.cameras.pix4d import GridVignetting, vignetting_of, vignetting_on_grid
-from agalign.cameras.tag_transfer import band_tags, capture_tags
+from agalign.cameras.tag_transfer import TransferredTags, band_tags, capture_tags
 from agalign.config import WriteSettings
 from agalign.errors import UnreadableFileError
 from agalign.pixels.raster import suffix_format
-from agalign.products.product import CapturePaths, Product, ProductContext, StacAsset, WrittenFile
+from agalign.products.product import GEOTIFF, CapturePaths, Product, ProductContext, StacAsset, WrittenFile
 from agalign.products.rasters.layout import Layer, is_inside
-from agalign.products.rasters.raster_file import media_type, write_raster
+from agalign.products.rasters.raster_file import write_raster
 from agalign.values import geometry
 from agalign.values.capture import Band, Capture, Radiometry
 from agalign.values.files import file_name
@@ -44,7 +44,7 @@ class BandFiles(Product):
         """Write the files of all bands with pixels."""
         names = band_file_names(context.capture)
         layers = [layer for layer in context.layers if not layer.is_gap]
-        vignettings = {} if context.write_settings.radiometry != "off" else _vignettings(layers, context.grid)
+        vignettings = {} if context.settings.write.radiometry != "off" else _vignettings(layers, context.grid)
         if any(v.error > _MAX_VIGNETTING_ERROR for v in vignettings.values()):
             # A program that corrects some bands of a capture only would change its indices.
             layers = [replace(layer, vignetting=_correction(layer.band)) for layer in layers]
@@ -61,13 +61,9 @@ class BandFiles(Product):
     def _write_file(
         self, context: ProductContext, name: Path, layers: list[Layer], vignetting: GridVignetting | None
     ) -> WrittenFile:
-        settings, grid, path = context.write_settings, context.grid, context.paths.folder / name
-        reference, is_raw = context.capture.reference, settings.radiometry == "off"
-        tags = band_tags(layers[0].band, reference, grid, vignetting, radiometry=not is_raw)
-        nodata = write_raster(context.capture, layers, grid, path, settings, tags)
-        asset = StacAsset(name.as_posix(), media_type(settings), ("data",))
-        bands, is_flat = tuple(layer.band.name for layer in layers), any(layer.vignetting for layer in layers)
-        return WrittenFile(self.kind, path, asset, bands, nodata, is_flat=is_flat)
+        reference, is_raw = context.capture.reference, context.settings.write.radiometry == "off"
+        tags = band_tags(layers[0].band, reference, context.grid, vignetting, radiometry=not is_raw)
+        return _written(self.kind, context, layers, context.paths.folder / name, name.as_posix(), tags)
 
 
 def band_file_names(capture: Capture) -> dict[str, Path]:
@@ -131,8 +127,16 @@ class Stack(Product):
 
     def write(self, context: ProductContext) -> list[WrittenFile]:
         """Write <capture>.tif."""
-        settings, path = context.write_settings, context.paths.file(self.suffix)
         tags = capture_tags(context.capture.reference, context.grid)
-        nodata = write_raster(context.capture, context.layers, context.grid, path, settings, tags)
-        asset = StacAsset("stack", media_type(settings), ("data",))
-        return [WrittenFile(self.kind, path, asset, tuple(la.band.name for la in context.layers), nodata)]
+        return [_written(self.kind, context, context.layers, context.paths.file(self.suffix), "stack", tags)]
+
+
+def _written(
+    kind: str, context: ProductContext, layers: Sequence[Layer], path: Path, key: str, tags: TransferredTags
+) -> WrittenFile:
+    """Write layers as the bands of one file, and return it with its asset `key`."""
+    settings = context.settings.write
+    nodata = write_raster(context.capture, layers, context.grid, path, settings, tags)
+    media_type = f"{GEOTIFF}; profile=cloud-optimized" if settings.format == "cog" else GEOTIFF
+    bands, is_flat = tuple(layer.band.name for layer in layers), any(layer.vignetting for layer in layers)
+    return WrittenFile(kind, path, StacAsset(key, media_type, ("data",)), bands, nodata, is_flat=is_flat)

@@ -57,7 +57,7 @@ class PanSharpened(Product):
     def write(self, context: ProductContext) -> list[WrittenFile]:
         """Write <capture>.pan.tif; nothing if the panchromatic band is not usable."""
         fine = {"resolution": "finest", "format": "gtiff", "compression": "none"}
-        settings, path = context.write_settings.model_copy(update=fine), context.paths.file(self.suffix)
+        settings, path = context.settings.write.model_copy(update=fine), context.paths.file(self.suffix)
         sources = _sources(context, settings)
         if sources is None:
             return []

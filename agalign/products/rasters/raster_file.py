@@ -23,18 +23,9 @@ from agalign.pixels.band_resampling import resample_tile
 from agalign.pixels.radiometry import calibrated
 from agalign.pixels.raster import GDAL_ENVIRONMENT, open_raster, read_tile, without_warnings
 from agalign.products.indices.formulas import Role, role_of_band
-from agalign.products.product import GEOTIFF
-from agalign.products.rasters.checked_raster import (
-    WORK_TILE_PX,
-    Block,
-    LayerDescription,
-    georeference_tags,
-    grid_profile,
-    predictor,
-    write_layers,
-)
+from agalign.products.rasters.checked_raster import WORK_TILE_PX, Block, LayerDescription, predictor, write_on_grid
 from agalign.products.rasters.layout import Layer, is_inside
-from agalign.values.capture import Band, Capture, Quantity, Radiometry
+from agalign.values.capture import Capture, Quantity, Radiometry
 from agalign.values.choices import Interpolation
 from agalign.values.image import Mask, OutputGrid, Tile
 from agalign.values.interpolation import as_type, can_hold, tiles
@@ -95,9 +86,11 @@ def write_raster(
         if settings.format == "cog":
             to_cog(partial, compression)
 
-    profile = grid_profile(grid, capture.reference.georeference, len(layers), dtype.name, **options)
-    blocks = _blocks(layers, grid, dtype, nodata, settings)
-    write_layers(path, profile, _descriptions(layers, raw=raw), _tags(capture, layers, raw=raw), blocks, finish)
+    blocks, georeference = _blocks(layers, grid, dtype, nodata, settings), capture.reference.georeference
+    descriptions, own_tags = _descriptions(layers, raw=raw), _tags(capture, layers, raw=raw)
+    write_on_grid(
+        path, grid, georeference, descriptions, blocks, tags=own_tags, dtype=dtype.name, options=options, finish=finish
+    )
     return nodata
 
 
@@ -113,15 +106,10 @@ def tags_of(path: Path) -> dict[str, str]:
     return {}
 
 
-def media_type(settings: WriteSettings) -> str:
-    """Return the media type of the files that `write_raster` writes."""
-    return f"{GEOTIFF}; profile=cloud-optimized" if settings.format == "cog" else GEOTIFF
-
-
 def _tags(capture: Capture, layers: Sequence[Layer], *, raw: bool) -> dict[str, str]:
     """The tags of a file."""
     known = [] if raw else [layer.band.radiometry for layer in layers if layer.band.radiometry is not None]
-    tags = {
+    return {
         "TIFFTAG_SOFTWARE": "agalign",
         "TIFFTAG_DATETIME": capture.captured_at[:19].replace("-", ":").replace("T", " "),
         "CAPTURE_ID": capture.capture_id,
@@ -131,7 +119,6 @@ def _tags(capture: Capture, layers: Sequence[Layer], *, raw: bool) -> dict[str, 
         "RADIOMETRY_SOURCE": " and ".join(dict.fromkeys(r.source for r in known)),
         "VIGNETTING": "corrected" if any(layer.vignetting for layer in layers) else "",
     }
-    return tags | georeference_tags(capture.reference.georeference)
 
 
 def _descriptions(layers: Sequence[Layer], *, raw: bool) -> list[LayerDescription]:
@@ -256,15 +243,11 @@ def _unused_value(layers: Sequence[Layer], grid: OutputGrid, dtype: np.dtype[Any
 
     Copied pixels then keep their values.
     """
-    copied = [_values_in(layer.band, grid.tile) for layer in layers if layer.is_copied]
+    copied = []
+    for band in (layer.band for layer in layers if layer.is_copied):
+        with open_raster(band.path, band.page) as source:
+            copied += [np.unique(read_tile(band, tile, source)[0]) for tile in tiles(grid.tile, WORK_TILE_PX)]
     limits = np.iinfo(str(dtype))
     # All values of a 16-bit type; for larger types the first ones are sufficient.
     candidates = itertools.chain([0, limits.max], range(1, min(limits.max, 1 << 16)))
     return float(next((v for v in candidates if not any((values == v).any() for values in copied)), 0))
-
-
-def _values_in(band: Band, tile: Tile) -> Pixels:
-    """The different values of a band in a rectangle of its file."""
-    with open_raster(band.path, band.page) as source:
-        result = [np.unique(read_tile(band, t, source)[0]) for t in tiles(tile, WORK_TILE_PX)]
-    return np.unique(np.concatenate(result))

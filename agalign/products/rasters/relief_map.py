@@ -33,7 +33,7 @@ class ReliefMap(Product):
         if relief is None:
             return []
         layers = relief_layers(context.capture, context.with_pixels, relief, context.grid)
-        if not context.write_settings.relief_map:
+        if not context.settings.write.relief_map:
             layers = {"parallax": layers["parallax"]}
         descriptions = [LayerDescription(name, RELIEF_UNITS[name]) for name in layers]
         blocks = ((values, index, 0, 0) for index, values in enumerate(layers.values(), start=1))

@@ -120,6 +120,10 @@ class PairTotals:
         """Labels of the captures."""
         return {label for label, *_ in self._references}
 
+    def residuals_px(self) -> list[float]:
+        """Return the residuals of all aligned pairs, sorted."""
+        return sorted(px for band in self.bands.values() for px in band.residuals_px)
+
     def groups(self) -> list[FailureGroup]:
         """Return the failures by cause, and the captures with another reference than most of their flight; the most
         severe first, and the largest first of those.

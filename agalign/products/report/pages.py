@@ -4,8 +4,7 @@ import base64
 import hashlib
 import json
 import os
-from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from contextlib import suppress
 from importlib import resources
 from pathlib import Path
@@ -22,7 +21,7 @@ from agalign.products.report.charts import drifts_of, rig_views
 from agalign.products.report.facts import BAND_COLUMNS, FlightFacts
 from agalign.products.report.light import CaptureLight, light_charts, radiometric_check
 from agalign.products.run.excluded import PANELS_FILE, SKY_FILE, PanelPart, SkyPart, read_panels, read_sky
-from agalign.products.run.record import RunPart, exclusion_lines, read_run_record
+from agalign.products.run.record import RunPart, read_run_record
 from agalign.products.sidecar.file import find_sidecars, read_sidecar
 from agalign.products.text_files import write_csv
 from agalign.values.files import write_text
@@ -61,7 +60,21 @@ def write_pages(out: Path, on_problem: Callable[[str], None]) -> FlightFacts:
     rows = [*facts.rows, *(row for excluded in not_aligned for row in _rows_not_aligned(*excluded))]
     write_csv(out / SUMMARY_FILE, SUMMARY_COLUMNS, ([row.get(name) for name in SUMMARY_COLUMNS] for row in rows))
     facts.add_indices(update_table(out, indices), out)
-    write_text(out / REPORT_FILE, _page(out, facts, light, panels, sky, run, unreadable.append))
+    page = _page(
+        version=__version__,
+        median=median,
+        flight=facts,
+        facts=_script_json(facts.as_json()),
+        run=run,
+        settings=_changed_settings(run),
+        rigs=rig_views(out, unreadable.append),
+        drifts=drifts_of(facts.captures),
+        light=light_charts(light),
+        check=radiometric_check(light),
+        panels=panels,
+        sky=sky,
+    )
+    write_text(out / REPORT_FILE, page)
     if unreadable:
         with suppress(OSError):
             os.utime(out / REPORT_FILE, (0, 0))
@@ -86,15 +99,8 @@ def _rows_not_aligned(status: str, part: PanelPart | SkyPart) -> list[dict[str, 
     return [{**facts, "band": band.band} for band in part.bands]
 
 
-def _page(
-    out: Path,
-    facts: FlightFacts,
-    light: Sequence[CaptureLight],
-    panels: Sequence[PanelPart],
-    sky: Sequence[SkyPart],
-    run: RunPart | None,
-    on_problem: Callable[[str], None],
-) -> str:
+def _page(**values: Any) -> str:
+    """The page of the template, which gets these values."""
     environment = Environment(
         loader=PackageLoader("agalign.products.report", "."),
         autoescape=select_autoescape(["j2"]),
@@ -102,41 +108,10 @@ def _page(
         lstrip_blocks=True,
         undefined=StrictUndefined,
     )
-    script, states = _resource("page.js"), Counter({} if run is None else run.captures)
-    return environment.get_template("page.html.j2").render(
-        version=__version__,
-        style=_resource("page.css"),
-        script=script,
-        script_hash=base64.b64encode(hashlib.sha256(script.encode()).digest()).decode(),
-        facts=_script_json(facts.as_json()),
-        captures=facts.captures,
-        counts=Counter(c["status"] for c in facts.captures),
-        statuses=facts.pairs.statuses,
-        pairs=facts.pairs.statuses.total(),
-        found=states["found"],
-        errors=states["error"],
-        untried=2 * states["found"] - states.total(),  # the other states are of captures that were tried
-        cameras=Counter(c["camera"] for c in facts.captures),
-        residuals_px=sorted(px for band in facts.pairs.bands.values() for px in band.residuals_px),
-        capture_seconds=median(c["seconds"] for c in facts.captures) if facts.captures else None,
-        run_seconds=run.seconds if run is not None and states["done"] == len(facts.captures) else None,
-        failures=facts.pairs.groups(),
-        problems=[] if run is None else run.problems,
-        settings=_changed_settings(run),
-        run=run,
-        unfinished=run is not None and run.state == "interrupted",
-        bands=facts.pairs.bands,
-        median=median,
-        rigs=rig_views(out, on_problem),
-        drifts=drifts_of(facts.captures),
-        light=light_charts(light),
-        check=radiometric_check(light),
-        exclusions=[] if run is None else exclusion_lines(run.excluded),
-        masked=facts.masked_shares(),
-        panels=panels,
-        sky=sky,
-        mapped=sum(c["position"] is not None for c in facts.captures),
-    )
+    script = _resource("page.js")
+    digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
+    resources_of_page = {"style": _resource("page.css"), "script": script, "script_hash": digest}
+    return environment.get_template("page.html.j2").render(**resources_of_page, **values)
 
 
 def _changed_settings(run: RunPart | None) -> list[tuple[str, str]]:

@@ -66,7 +66,7 @@ class Preview(Product):
         """Write <capture>.preview.jpg."""
         path, reference = context.paths.file(self.suffix), context.capture.reference
         bands = [b.name for b in context.capture.bands]
-        mapped = context.with_pixels if context.write_settings.error_map else {}
+        mapped = context.with_pixels if context.settings.write.error_map else {}
         errors_px = {name: error_lattice_px(a, reference, context.grid) for name, a in mapped.items()}
         part = write_preview(
             context.reduced_bands, bands, errors_px, path, context.max_preview_bytes, relief_view(context)

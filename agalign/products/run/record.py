@@ -101,24 +101,23 @@ class RunPart(_Part):
         """Add processing time of a stage."""
         self.stage_seconds[stage] = self.stage_seconds.get(stage, 0.0) + seconds
 
+    def exclusions(self) -> list[str]:
+        """Return a line for each kind of exclusion: number of captures, and of those with each cue."""
+        lines = []
+        for kind, shows in (("panel", "a calibration panel"), ("sky", "the sky")):
+            of_kind = [part for part in self.excluded if part.kind == kind]
+            counts = Counter(cue for part in of_kind for cue in part.evidence)
+            if of_kind:
+                evidence = ", ".join(f"{cue} ({number})" for cue, number in counts.items())
+                lines.append(f"Left out: {counted(len(of_kind), 'capture')} of {shows}, by {evidence}")
+        return lines
+
     def write(self, out: Path, state: RunState, seconds: float) -> None:
         """Write OUT/agalign-run.json with the results so far. Raises OutputError."""
         facts: dict[str, Any] = {"state": state, "seconds": round(seconds, 2)}
         for name in ("stage_seconds", "capture_seconds"):
             facts[name] = {k: round(v, 3) for k, v in sorted(getattr(self, name).items())}
         write_model(out / RUN_FILE, self.model_copy(update=facts))
-
-
-def exclusion_lines(excluded: Sequence[ExclusionPart]) -> list[str]:
-    """Return a line for each kind of exclusion: number of captures, and of those with each cue."""
-    lines = []
-    for kind, shows in (("panel", "a calibration panel"), ("sky", "the sky")):
-        of_kind = [part for part in excluded if part.kind == kind]
-        counts = Counter(cue for part in of_kind for cue in part.evidence)
-        if of_kind:
-            evidence = ", ".join(f"{cue} ({number})" for cue, number in counts.items())
-            lines.append(f"Left out: {counted(len(of_kind), 'capture')} of {shows}, by {evidence}")
-    return lines
 
 
 def begun(folder: Path, settings: Settings, captures: Sequence[Capture] = (), command: str = "") -> RunPart:

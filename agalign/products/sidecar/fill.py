@@ -81,7 +81,7 @@ def _output(context: ProductContext) -> dict[str, Any]:
     stack: dict[str, Any] = stacks[0] if stacks else {"file": None, "bytes": None}
     values = {part["nodata"] for part in stacks or band_files}
     grid, capture = context.grid, context.capture
-    is_raw = context.write_settings.radiometry == "off"
+    is_raw = context.settings.write.radiometry == "off"
     radiometry = {b.name: b.radiometry for b in capture.bands if b.radiometry is not None and not is_raw}
     names = dict.fromkeys(f"{r.quantity} by {r.source}" for r in radiometry.values())
     return stack | {
