@@ -8,8 +8,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from agalign.batch.capture_report import CaptureReport, FlightReports
-from agalign.batch.capture_task import Task, process_capture, quiet
+from agalign.batch.capture_task import CaptureReport, FlightReports, Task, process_capture, quiet
 from agalign.batch.earlier_results import refuse_other_captures
 from agalign.batch.run import Listener, run_flight
 from agalign.cameras.discover import discover

@@ -10,8 +10,8 @@ from functools import partial
 from pathlib import Path
 from typing import Self
 
-from agalign.batch.capture_report import CaptureReport
 from agalign.batch.capture_task import (
+    CaptureReport,
     Task,
     discard_outputs,
     do_capture,

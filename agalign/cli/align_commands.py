@@ -108,7 +108,7 @@ def _demo(
     captures: Annotated[int, typer.Option(min=1, max=1000, help="Captures to make.")] = 3,
 ) -> int:
     """Make a synthetic flight, align it, and compare the result with the ground truth."""
-    from agalign.batch.capture_report import CaptureReport
+    from agalign.batch.capture_task import CaptureReport
     from agalign.cli.align_run import conclude, find_captures, run
     from agalign.config import DiscoverOptions, RunOptions, Settings
     from agalign.synthetic.flight import make_flight, score_against_truth

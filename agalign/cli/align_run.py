@@ -26,12 +26,12 @@ from agalign.products.report.facts import FailureGroup, PairTotals
 from agalign.products.report.pages import REPORT_FILE, pages_exist, write_pages
 from agalign.products.run.record import read_run_record
 from agalign.products.sidecar.file import read_result
-from agalign.products.sidecar.schema import BandResult, CaptureResult
+from agalign.products.sidecar.schema import BandResult
 from agalign.values.capture import Capture
 from agalign.values.text import counted
 
 if TYPE_CHECKING:
-    from agalign.batch.capture_report import CaptureReport
+    from agalign.batch.capture_task import CaptureReport
 
 
 def find_captures(folder: Path, options: DiscoverOptions, terminal: Terminal) -> FolderScan:
@@ -287,15 +287,12 @@ def _print_report(report: "CaptureReport", terminal: Terminal, number: int, coun
     for text in report.problems:
         terminal.problem(f"{report.label}: {text}", capture=report.label)
     if terminal.log_json:
-        for (name, stage), seconds in report.stages.items():
-            terminal.event("stage", capture=report.label, pair=name, stage=stage, seconds=round(seconds, 4))
-    if report.result is None:
-        terminal.event("capture", capture=report.label, state=report.state, seconds=round(report.seconds, 3))
+        for (name, stage), stage_s in report.stages.items():
+            terminal.event("stage", capture=report.label, pair=name, stage=stage, seconds=round(stage_s, 4))
+    result, seconds = report.result, round(report.seconds, 3)
+    if result is None:
+        terminal.event("capture", capture=report.label, state=report.state, seconds=seconds)
         return
-    _print_capture(report, report.result, heading, terminal)
-
-
-def _print_capture(report: "CaptureReport", result: CaptureResult, heading: str, terminal: Terminal) -> None:
     counts = Counter(status for _, status, _ in result.pairs)
     aligned, predicted = counts["aligned"], counts["predicted"]
     also = f", {predicted} predicted" if predicted else ""
@@ -311,7 +308,7 @@ def _print_capture(report: "CaptureReport", result: CaptureResult, heading: str,
         aligned=aligned,
         predicted=predicted,
         pairs=counts.total(),
-        seconds=round(report.seconds, 3),
+        seconds=seconds,
     )
     if terminal.verbose or terminal.log_json:
         for band in (b for b in result.bands if b.status != "reference"):

@@ -12,10 +12,9 @@ import numpy as np
 
 from agalign.errors import InputError
 from agalign.evaluation.image_pairs import PairFiles, read_image
-from agalign.evaluation.methods import Method, Outcome, PairTask, average_precision, homography_error_px
+from agalign.evaluation.methods import Method, PairTask, average_precision, homography_error_px
 from agalign.method.device import one_memory_error, one_thread
 from agalign.method.match import sift_keypoints, visible_in_both
-from agalign.method.patches import Keypoints
 from agalign.products.text_files import write_csv
 from agalign.values import geometry
 from agalign.values.geometry import Matrix
@@ -80,21 +79,16 @@ def evaluate(
                 with one_thread(), one_memory_error():
                     outcome = method(PairTask(fixed, moving, start, device, rng_seed, starts.seeding))
                 seconds = time.perf_counter() - began
-                precision, error_px = _scores(outcome, keypoints, truth)
+                precision = error_px = math.nan
+                if outcome.describe is not None and len(keypoints):
+                    precision = average_precision(*outcome.describe(keypoints, truth))
+                if outcome.fixed_to_moving is not None and len(keypoints):
+                    points_px = keypoints.xy.numpy().astype(np.float64)
+                    error_px = homography_error_px(outcome.fixed_to_moving, truth, points_px)
                 share = error_px / max(moving.size_px)
                 yield Result(pair.name, pair.group, name, shift, len(keypoints), precision, error_px, share, seconds)
                 if outcome.fixed_to_moving is None:
                     break
-
-
-def _scores(outcome: Outcome, keypoints: Keypoints, truth: Matrix) -> tuple[float, float]:
-    """Return (average precision, error in px of the second image); nan for what a method does not return."""
-    precision = error_px = math.nan
-    if outcome.describe is not None and len(keypoints):
-        precision = average_precision(*outcome.describe(keypoints, truth))
-    if outcome.fixed_to_moving is not None and len(keypoints):
-        error_px = homography_error_px(outcome.fixed_to_moving, truth, keypoints.xy.numpy().astype(np.float64))
-    return precision, error_px
 
 
 def write_results(path: Path, results: Sequence[Result]) -> None:
@@ -125,23 +119,11 @@ def error_table(results: Sequence[Result]) -> list[list[str]]:
     measured = [r for r in results if not math.isnan(r.error_px)]
     for method, shift in product(*(dict.fromkeys(getattr(r, name) for r in results) for name in ("method", "shift"))):
         own = [r for r in measured if (r.method, r.shift) == (method, shift)]
-        rows += [_error_row(method, shift, own)] if own else []
+        if own:
+            e, shares, seconds = np.array([(r.error_px, r.error_share, r.seconds) for r in own]).T
+            errors = f"{np.median(e):.3f}", f"{e.max():.2f}", f"{shares.mean():.3%}", f"{(e < 1).sum()} of {len(e)}"
+            rows.append([method, f"{shift:.1%}", *errors, f"{_mean_precision(own):.3f}", f"{np.median(seconds):.1f}"])
     return rows
-
-
-def _error_row(method: str, shift: float, own: Sequence[Result]) -> list[str]:
-    e = np.array([r.error_px for r in own])
-    share = float(np.mean([r.error_share for r in own]))
-    return [
-        method,
-        f"{shift:.1%}",
-        f"{np.median(e):.3f}",
-        f"{e.max():.2f}",
-        f"{share:.3%}",
-        f"{(e < 1).sum()} of {len(e)}",
-        f"{_mean_precision(own):.3f}",
-        f"{np.median([r.seconds for r in own]):.1f}",
-    ]
 
 
 def _mean_precision(results: Sequence[Result]) -> float:

@@ -1,5 +1,6 @@
 """The interface `Product` of each kind of output of a capture, and its arguments and results."""
 
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -73,6 +74,11 @@ class WrittenFile:
     """Layout of the preview; None for other files."""
     is_flat: bool = False
     """The vignetting of raw numbers is corrected in the pixels."""
+
+    @property
+    def nodata_in_json(self) -> float | str | None:
+        """The nodata value, with the text "nan" for nan, which JSON does not have."""
+        return "nan" if self.nodata is not None and math.isnan(self.nodata) else self.nodata
 
     @cached_property
     def sha256(self) -> str:

@@ -15,7 +15,7 @@ from agalign.batch import capture_task as batch_capture
 from agalign.batch import flight_learning as batch_learn
 from agalign.batch import learning_tasks
 from agalign.batch import run as batch_run
-from agalign.batch.capture_report import CaptureReport
+from agalign.batch.capture_task import CaptureReport
 from agalign.batch.flight_learning import learning_fingerprint
 from agalign.batch.run import _limits_of_cameras, run_flight
 from agalign.cameras.discover import FolderScan

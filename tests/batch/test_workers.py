@@ -16,8 +16,7 @@ import pytest
 
 import agalign
 from agalign.batch import workers
-from agalign.batch.capture_report import CaptureReport
-from agalign.batch.capture_task import Task
+from agalign.batch.capture_task import CaptureReport, Task
 from agalign.batch.run import Listener, capture_reports, run_flight
 from agalign.batch.workers import DaskExecutor, Run, dask_executor, in_order, on_executor, own_processes
 from agalign.cameras.discover import discover

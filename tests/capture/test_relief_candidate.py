@@ -32,7 +32,7 @@ from agalign.capture.relief_candidate import (
 from agalign.config import JointSettings, ReliefSettings, Settings
 from agalign.fit.range import inverse_range
 from agalign.flight.rig import Rig
-from agalign.synthetic.camera_model import BandSpec, CameraSpec
+from agalign.synthetic.cameras import BandSpec, CameraSpec
 from agalign.synthetic.flight import recorded
 from agalign.values import geometry, lens
 from agalign.values.alignment import Alignment, Seed

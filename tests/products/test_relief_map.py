@@ -19,8 +19,8 @@ from agalign.cameras import pix4d, rig_seed
 from agalign.cameras.metadata import Tags
 from agalign.fit.occlusion import occluded
 from agalign.products.rasters.relief_map import relief_layers
+from agalign.products.sidecar.convert import sidecar_of
 from agalign.products.sidecar.file import read_result, read_sidecar, write_sidecar
-from agalign.products.sidecar.fill import sidecar_of
 from agalign.synthetic import cameras
 from agalign.values import geometry, lens
 from agalign.values.alignment import Alignment, PairScales, Seed

@@ -11,8 +11,8 @@ from pydantic_core import from_json
 from agalign.products.indices.rasters import IndexReport, read_table
 from agalign.products.product import CapturePaths
 from agalign.products.run.footprint import accuracy_of_footprint_m, footprint, geojson_geometry, with_assumed_height
-from agalign.products.sidecar.schema import BandResult, CaptureResult
-from agalign.values.capture import Capture, Pose
+from agalign.products.sidecar.schema import CaptureResult
+from agalign.values.capture import Capture
 from agalign.values.files import read_regular, write_text
 from agalign.values.image import OutputGrid
 
@@ -36,7 +36,7 @@ class FlightMap:
         shown = capture if status in ("panel", "sky") else with_assumed_height(capture)
         output = None if result is None else result.output
         ring = footprint(shown, OutputGrid(0, 0, *capture.reference.size_px) if output is None else output.grid)
-        position = shown.position
+        position, pose = shown.position, shown.pose
         # RFC 7946: outer rings are counter-clockwise. 1e-7 degrees are a centimetre.
         geometry = geojson_geometry(None if ring is None else ring[::-1], position, decimals=7)
         georeference = capture.reference.georeference
@@ -44,16 +44,33 @@ class FlightMap:
             accuracy_m = None if ring is None else accuracy_of_footprint_m(shown)
         else:
             accuracy_m = georeference.accuracy_m
+        height_m = None if pose is None else pose.height_m
+        bands = [] if result is None else [b for b in result.bands if b.status != "reference"]
+        after = [b.metrics.after for b in bands if b.metrics is not None]
+        paths = CapturePaths.of(capture, Path())
+        products = [] if result is None else result.products
+        files = [(part.kind, (paths.folder / part.file).as_posix()) for part in products]
         properties = {
             "capture": capture.label,
             "status": status,
             "camera": f"{capture.camera.make} {capture.camera.model}".strip(),
             "captured_at": capture.captured_at,
             **{name: getattr(position, name, None) for name in ("longitude", "latitude", "altitude_m")},
-            **_of_pose(shown.pose),
+            "height_m": None if height_m is None else round(height_m, 1),
+            "height_from": None if pose is None or height_m is None else pose.height_from,
+            "heading_deg": None if pose is None else round(pose.heading_deg, 1) % 360,
             "accuracy_m": accuracy_m,
-            **_of_bands([] if result is None else result.bands),
-            **_files_of(capture, result),
+            "bands": len(bands),
+            "bands_aligned": sum(b.status == "aligned" for b in bands),
+            "bands_predicted": sum(b.status == "predicted" for b in bands),
+            # The largest of a band, px of the reference.
+            "residual_px": max((a.residual_px for a in after if a.residual_px is not None), default=None),
+            "residual_p95_px": max((a.residual_p95_px for a in after if a.residual_p95_px is not None), default=None),
+            # Files are relative to the output folder.
+            "sidecar": None if result is None else paths.sidecar.as_posix(),
+            "stack": dict(files).get("stack"),
+            "picture": dict(files).get("picture"),
+            "indices": [file for kind, file in files if kind == "index" and file.endswith(".tif")],
         }
         feature = {"type": "Feature", "id": capture.label, "geometry": geometry, "properties": properties}
         self._features[capture.label] = feature
@@ -111,39 +128,3 @@ def _write(out: Path, features: Sequence[dict[str, Any]], rows: Iterable[IndexRe
     lines = ",\n".join(json.dumps(f, ensure_ascii=False) for f in features)
     text = f'{{"type": "FeatureCollection", "name": "flight", "features": [\n{lines}\n]}}\n'
     write_text(out / FLIGHT_MAP_FILE, text)
-
-
-def _of_pose(pose: Pose | None) -> dict[str, Any]:
-    """The height above ground and the heading of a camera; None if unknown."""
-    height_m = None if pose is None else pose.height_m
-    return {
-        "height_m": None if height_m is None else round(height_m, 1),
-        "height_from": None if pose is None or height_m is None else pose.height_from,
-        "heading_deg": None if pose is None else round(pose.heading_deg, 1) % 360,
-    }
-
-
-def _of_bands(bands: Sequence[BandResult]) -> dict[str, Any]:
-    """The numbers of moving bands, and the largest residuals of a band, px of the reference."""
-    moving = [b for b in bands if b.status != "reference"]
-    after = [b.metrics.after for b in moving if b.metrics is not None]
-    return {
-        "bands": len(moving),
-        "bands_aligned": sum(b.status == "aligned" for b in moving),
-        "bands_predicted": sum(b.status == "predicted" for b in moving),
-        "residual_px": max((a.residual_px for a in after if a.residual_px is not None), default=None),
-        "residual_p95_px": max((a.residual_p95_px for a in after if a.residual_p95_px is not None), default=None),
-    }
-
-
-def _files_of(capture: Capture, result: CaptureResult | None) -> dict[str, Any]:
-    """The files of a capture, relative to the output folder."""
-    paths = CapturePaths.of(capture, Path())
-    products = [] if result is None else result.products
-    files = [(part.kind, (paths.folder / part.file).as_posix()) for part in products]
-    return {
-        "sidecar": None if result is None else paths.sidecar.as_posix(),
-        "stack": dict(files).get("stack"),
-        "picture": dict(files).get("picture"),
-        "indices": [file for kind, file in files if kind == "index" and file.endswith(".tif")],
-    }
