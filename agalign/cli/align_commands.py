@@ -22,7 +22,7 @@ _command = partial(
 def _align(
     terminal: Terminal,
     given: Given,
-    folder: Annotated[Path, typer.Argument(help="Folder with the images, sub-folders included.", show_default=False)],
+    folder: Annotated[Path, typer.Argument(help="Folder with the images, sub-folders included.")],
     model: Annotated[
         Path | None,
         typer.Option(help="Reuse the network and rig of an earlier flight of the same camera: OUT/models/…."),
@@ -34,7 +34,6 @@ def _align(
         typer.Option(
             is_eager=True,
             callback=load_config,
-            show_default=False,
             help="Read these options from a TOML file; 'agalign info --options' prints one.",
         ),
     ] = None,
@@ -141,20 +140,14 @@ demo = _command(
 def _onto(
     terminal: Terminal,
     given: Given,
-    reference: Annotated[Path, typer.Argument(help="The mosaic with the output grid.", show_default=False)],
-    moving: Annotated[list[Path], typer.Argument(help="Mosaics of other dates or sensors.", show_default=False)],
+    reference: Annotated[Path, typer.Argument(help="The mosaic with the output grid.")],
+    moving: Annotated[list[Path], typer.Argument(help="Mosaics of other dates or sensors.")],
     out: Annotated[
-        Path | None,
-        typer.Option("--out", "-o", help="Output folder; by default REFERENCE-aligned.", show_default=False),
+        Path | None, typer.Option("--out", "-o", help="Output folder; by default REFERENCE-aligned.")
     ] = None,
     band: Annotated[
         str | None,
-        typer.Option(
-            "--reference",
-            "--band",
-            show_default=False,
-            help="Band of the mosaic REFERENCE to compare with; by default green.",
-        ),
+        typer.Option("--reference", "--band", help="Band of the mosaic REFERENCE to compare with; by default green."),
     ] = None,
 ) -> int:
     """Align georeferenced mosaics of other dates or sensors to the grid of REFERENCE.

@@ -40,7 +40,7 @@ class FieldOption:
     option: "Option"
     kind: Any
     info: Mapping[str, Any]
-    """Default, its display, help text and range."""
+    """Default, help text and range."""
 
     @property
     def name(self) -> str:
@@ -89,7 +89,7 @@ def _options_of(owner: str, value: Any, path: tuple[str, ...]) -> Iterator[Field
         if option.type is not None or option.default is not None:
             default = option.default
         text = " ".join(of_field.description.split())
-        info = {"default": default, "show_default": option.show_default, "help": text}
+        info = {"default": default, "help": text}
         for limit in of_field.metadata:
             info |= {end: getattr(limit, of) for end, of in (("min", "ge"), ("max", "le")) if hasattr(limit, of)}
         yield FieldOption(owner, (*path, name), option, option.type or of_field.annotation, info)

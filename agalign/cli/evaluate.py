@@ -12,10 +12,7 @@ from agalign.errors import ConfigurationError
 from agalign.values.choices import Sharing
 
 Pairs = Annotated[
-    Path,
-    typer.Argument(
-        help="A CSV file (fixed, moving, homography), or a folder in the HPatches or Oxford layout.", show_default=False
-    ),
+    Path, typer.Argument(help="A CSV file (fixed, moving, homography), or a folder in the HPatches or Oxford layout.")
 ]
 
 
@@ -28,7 +25,6 @@ def _evaluate(
         typer.Option(
             "--method",
             "-m",
-            show_default=False,
             help="Recipe and sharing (fast:siamese; fast:siamese:grey for grey images), sift, daisy, elastix, or a "
             "network file; repeatable.",
         ),

@@ -16,13 +16,13 @@ if TYPE_CHECKING:
     from agalign.products.indices.formulas import Index
     from agalign.products.indices.rasters import IndexReport
 
-Out = Annotated[Path, typer.Argument(help="Output folder of a run.", show_default=False)]
+Out = Annotated[Path, typer.Argument(help="Output folder of a run.")]
 _DEFAULT_INDEX = "ndvi"
 
 
 def _report(
     terminal: Terminal,
-    out: Annotated[Path, typer.Argument(help="Output folder of an earlier run.", show_default=False)],
+    out: Annotated[Path, typer.Argument(help="Output folder of an earlier run.")],
     as_json: Annotated[bool, typer.Option("--json", help="Print the content of the report as JSON.")] = False,
 ) -> int:
     """Rebuild the report and the summary from the sidecars."""
@@ -67,9 +67,7 @@ def _export(
     program: Annotated[
         ExportProgram,
         typer.Option(
-            "--for",
-            show_default=False,
-            help="Band files with tags for odm, metashape or pix4d; warp matrices for micasense or opencv.",
+            "--for", help="Band files with tags for odm, metashape or pix4d; warp matrices for micasense or opencv."
         ),
     ],
     target: Annotated[
@@ -124,19 +122,15 @@ def _indices(
         typer.Option(
             "--index",
             "-i",
-            show_default=False,
             help=f"Names separated by commas: {_DEFAULT_INDEX} (the default), ndre, gndvi, ndwi, savi, evi …",
         ),
     ] = None,
     formula: Annotated[
         list[str] | None,
-        typer.Option(
-            show_default=False, help="A formula of the bands B, G, R, RE and N, as 'name=(N-R)/(N+R)'; repeatable."
-        ),
+        typer.Option(help="A formula of the bands B, G, R, RE and N, as 'name=(N-R)/(N+R)'; repeatable."),
     ] = None,
     target: Annotated[
-        Path | None,
-        typer.Option("-o", "--out", help="Folder for the rasters; by default next to the stacks.", show_default=False),
+        Path | None, typer.Option("-o", "--out", help="Folder for the rasters; by default next to the stacks.")
     ] = None,
     mask_qa: Annotated[
         bool, typer.Option("--mask-qa", help="Omit saturated, occluded and glint pixels; the run needs --qa.")

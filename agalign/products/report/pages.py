@@ -20,7 +20,7 @@ from agalign.products.indices.rasters import IndexReport, reports_of_run, update
 from agalign.products.report.charts import drifts_of, rig_views
 from agalign.products.report.facts import BAND_COLUMNS, FlightFacts
 from agalign.products.report.light import CaptureLight, light_charts, radiometric_check
-from agalign.products.run.excluded import PANELS_FILE, SKY_FILE, PanelPart, SkyPart, read_panels, read_sky
+from agalign.products.run.excluded import PANELS_FILE, SKY_FILE, PanelPart, SkyPart, read_excluded
 from agalign.products.run.record import RunPart, read_run_record
 from agalign.products.sidecar.file import find_sidecars, read_sidecar
 from agalign.products.text_files import write_csv
@@ -53,7 +53,7 @@ def write_pages(out: Path, on_problem: Callable[[str], None]) -> FlightFacts:
     sky: list[SkyPart] = []
     run: RunPart | None = None
     try:
-        panels, sky, run = read_panels(out), read_sky(out), read_run_record(out)
+        (panels, sky), run = read_excluded(out), read_run_record(out)
     except SidecarError as error:
         unreadable.append(str(error))
     not_aligned = [("panel", part) for part in panels if not part.in_scene] + [("sky", part) for part in sky]
