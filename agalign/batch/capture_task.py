@@ -176,11 +176,11 @@ class Task:
         return replace(self, capture=self.capture.with_absolute_paths(), out=self.out.absolute(), model=model)
 
 
-def process_capture(task: Task, progress: PairProgress = quiet, model: FlightModel | None = None) -> CaptureReport:
+def process_capture(task: Task, progress: PairProgress = quiet) -> CaptureReport:
     """Align a capture, write its products and its sidecar, and return its report, without times of stages.
 
-    The other bands are aligned where one cannot be. With the `model` of the flight, which is read from the file of the
-    task, a network is learned from scratch only for bands that the model cannot align.
+    The other bands are aligned where one cannot be. With the model of the flight, a network is learned from scratch
+    only for bands that the model cannot align.
     Raises UnreadableFileError if the reference cannot be read, InputError or ConfigurationError if the capture or the
     installation lacks what a product needs, and OutputError.
     """
@@ -196,6 +196,7 @@ def process_capture(task: Task, progress: PairProgress = quiet, model: FlightMod
     for product in PRODUCTS:
         if product.is_enabled(settings.write):
             product.check(capture)
+    model = None if task.model is None else loaded_model(task.model, settings.joint.device)
     alignments = align_capture_bands(capture, settings, model, progress)
     progress(capture.reference.name, "writing", 0.0)
     whole = OutputGrid(0, 0, *capture.reference.size_px)
@@ -304,9 +305,8 @@ def do_capture(task: Task, on_pair: PairProgress = quiet) -> CaptureReport:
     label, clock = task.capture.label, StageClock(on_pair)
     keep_freed_memory()
     try:
-        model = None if task.model is None else loaded_model(task.model, task.settings.joint.device)
         with one_thread(), one_memory_error():
-            report = process_capture(task, clock, model)
+            report = process_capture(task, clock)
     except Exception as error:
         # A defect of agalign in one capture must not stop the others.
         report = CaptureReport(label, "error", error=failure_text(error), seconds=clock.seconds)

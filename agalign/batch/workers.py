@@ -87,8 +87,8 @@ def chosen_run(
             yield run
     elif threads > 1:
         # Warning filters are global: threads that change and restore them would interfere.
-        with without_warnings(), ThreadPoolExecutor(threads) as pool:
-            yield on_executor(pool)
+        with without_warnings(), ThreadPoolExecutor(threads) as thread_pool:
+            yield on_executor(thread_pool)
     else:
         yield serially
 

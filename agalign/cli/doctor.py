@@ -29,7 +29,10 @@ def _doctor(
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON to standard output.")] = False,
 ) -> int:
     """Check this machine: versions, devices, threads, memory, disk and extras."""
-    facts = {"machine": _machine(), "disk": _disk(folder), "devices": _devices(), "extras": _extras()}
+    from agalign.method.device import devices
+
+    known = [{"device": d.name, "what": d.what, "threads": d.threads, "problem": d.problem} for d in devices()]
+    facts = {"machine": _machine(), "disk": _disk(folder), "devices": known, "extras": _extras()}
     problems = _problems(facts)
     if as_json:
         terminal.facts(facts | {"problems": problems})
@@ -79,12 +82,6 @@ def _disk(folder: Path) -> dict[str, Any]:
     existing = next((p for p in (folder.absolute(), *folder.absolute().parents) if p.is_dir()), Path.cwd())
     free_gb = round(shutil.disk_usage(existing).free / 1e9, 1)
     return {"folder": str(existing), "free_gb": free_gb, "writable": os.access(existing, os.W_OK)}
-
-
-def _devices() -> list[dict[str, Any]]:
-    from agalign.method.device import devices
-
-    return [{"device": d.name, "what": d.what, "threads": d.threads, "problem": d.problem} for d in devices()]
 
 
 def _extras() -> list[dict[str, Any]]:

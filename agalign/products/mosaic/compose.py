@@ -14,7 +14,7 @@ import numpy as np
 
 from agalign.errors import ConfigurationError, InputError
 from agalign.pixels.raster import open_raster
-from agalign.products.indices.formulas import Index, index_named
+from agalign.products.indices.formulas import index_named
 from agalign.products.indices.rasters import IndexReport, write_rasters
 from agalign.products.mosaic.adjustment import adjusted, misfit_m, tie_pairs, tied_groups
 from agalign.products.mosaic.placement import Placement, place_captures
@@ -107,7 +107,9 @@ def mosaic(
         # Geotransforms count from the corner of a pixel.
         on_map = geometry.translation(*flight.origin_m) @ grid.to_ground @ geometry.translation(-0.5, -0.5)
         _write(path, placed, grid, Georeference(on_map, flight.crs_wkt, accuracy_m), tags)
-        labels = [captures[k].label for k in apart]
+        labels, checksum = [captures[k].label for k in apart], file_checksum(path) if indices else ""
+        of_mosaic = enumerate(placed[0].bands, start=1)
+        bands = [AlignedBand(band.name, band.wavelength_nm, path, k, checksum) for k, band in of_mosaic]
         return MosaicReport(
             path,
             captures=len(placed),
@@ -119,7 +121,7 @@ def mosaic(
             accuracy_m=accuracy_m,
             height_is_assumed=any(c.height_is_assumed for c in placed),
             left_out=[*flight.left_out, *((label, _UNTIED) for label in labels if not untied)],
-            indices=_write_indices(path, placed[0].bands, chosen_indices),
+            indices=[*write_rasters(bands, chosen_indices, path.with_suffix(""), path.stem)],
         )
 
 
@@ -240,10 +242,3 @@ def _warped(capture: Placement, positions: FloatImage) -> tuple[FloatImage, Mask
             result[k] = one
             valid &= inside
     return result, valid
-
-
-def _write_indices(path: Path, bands: Sequence[AlignedBand], indices: Sequence[Index]) -> Sequence[IndexReport]:
-    """Write indices of the mosaic, in its format."""
-    checksum = file_checksum(path) if indices else ""
-    of_mosaic = [AlignedBand(b.name, b.wavelength_nm, path, k, checksum) for k, b in enumerate(bands, start=1)]
-    return [*write_rasters(of_mosaic, indices, path.with_suffix(""), path.stem)]

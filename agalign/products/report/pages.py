@@ -57,7 +57,10 @@ def write_pages(out: Path, on_problem: Callable[[str], None]) -> FlightFacts:
     except SidecarError as error:
         unreadable.append(str(error))
     not_aligned = [("panel", part) for part in panels if not part.in_scene] + [("sky", part) for part in sky]
-    rows = [*facts.rows, *(row for excluded in not_aligned for row in _rows_not_aligned(*excluded))]
+    rows = [*facts.rows]
+    for status, part in not_aligned:
+        of_capture = {"folder": part.folder, "capture": part.capture, "status": status, "reason": part.sentence}
+        rows += [of_capture | {"band": band.band} for band in part.bands]
     write_csv(out / SUMMARY_FILE, SUMMARY_COLUMNS, ([row.get(name) for name in SUMMARY_COLUMNS] for row in rows))
     facts.add_indices(update_table(out, indices), out)
     page = _page(
@@ -91,12 +94,6 @@ def pages_exist(out: Path) -> bool:
         return all(path.stat().st_mtime_ns < written for path in entries)
     except OSError:
         return False
-
-
-def _rows_not_aligned(status: str, part: PanelPart | SkyPart) -> list[dict[str, object]]:
-    """A row for each band of a capture of a panel or of the sky; other columns are empty."""
-    facts = {"folder": part.folder, "capture": part.capture, "status": status, "reason": part.sentence}
-    return [{**facts, "band": band.band} for band in part.bands]
 
 
 def _page(**values: Any) -> str:
