@@ -23,9 +23,8 @@ from agalign.pixels.radiometry import check_pixels
 from agalign.pixels.raster import with_saturation_values
 from agalign.products.indices.rasters import outdated_rasters
 from agalign.products.product import CapturePaths, ProductContext
-from agalign.products.rasters.aligned_files import band_file_names
+from agalign.products.rasters.aligned_files import band_file_names, is_aligned_raster
 from agalign.products.rasters.layout import FlightLimits, output_layers
-from agalign.products.rasters.raster_file import is_aligned_raster
 from agalign.products.registry import PRODUCTS
 from agalign.products.report.preview import preview_bytes
 from agalign.products.sidecar.convert import sidecar_of

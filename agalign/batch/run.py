@@ -40,8 +40,8 @@ from agalign.products.product import CapturePaths
 from agalign.products.rasters.layout import FlightLimits, common_grid, flight_limits
 from agalign.products.report.preview import preview_bytes
 from agalign.products.run.excluded import write_panels, write_sky
-from agalign.products.run.flight_map import FlightMap
-from agalign.products.run.footprint import (
+from agalign.products.run.flight_map import (
+    FlightMap,
     above_elevation,
     missing_for_footprint,
     utm_of_flights,

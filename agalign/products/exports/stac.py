@@ -18,10 +18,10 @@ from agalign.flight.groups import camera_key, flight_key, flights_of
 from agalign.pixels.raster import crs_code
 from agalign.products.indices.formulas import role_of_band
 from agalign.products.product import CapturePaths, Product, ProductContext, WrittenFile
+from agalign.products.rasters.aligned_files import UNITS
 from agalign.products.rasters.checked_raster import georeferenced
 from agalign.products.rasters.pan_sharpen import panchromatic
-from agalign.products.rasters.raster_file import UNITS
-from agalign.products.run.footprint import footprint, geojson_geometry
+from agalign.products.run.flight_map import footprint, geojson_geometry
 from agalign.values.capture import Band, Capture, CaptureTime
 from agalign.values.files import file_name, read_regular, write_text
 from agalign.values.image import OutputGrid

@@ -18,8 +18,8 @@ from agalign.products.indices.formulas import index_named
 from agalign.products.indices.rasters import IndexReport, write_rasters
 from agalign.products.mosaic.adjustment import adjusted, misfit_m, tie_pairs, tied_groups
 from agalign.products.mosaic.placement import Placement, place_captures
+from agalign.products.rasters.aligned_files import to_cog, with_nodata
 from agalign.products.rasters.checked_raster import Block, LayerDescription, write_on_grid
-from agalign.products.rasters.raster_file import to_cog, with_nodata
 from agalign.products.run.captures import AlignedBand, BandReader, LeftOut
 from agalign.values import geometry
 from agalign.values.capture import Georeference

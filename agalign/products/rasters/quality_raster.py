@@ -11,9 +11,9 @@ from agalign.pixels.raster import read_tile
 from agalign.pixels.sun_glint import sun_glint
 from agalign.products.indices.formulas import Role, role_of_band
 from agalign.products.product import GEOTIFF, Product, ProductContext, StacAsset, WrittenFile
+from agalign.products.rasters.aligned_files import layer_pixels
 from agalign.products.rasters.checked_raster import WORK_TILE_PX, LayerDescription
 from agalign.products.rasters.layout import Layer, is_inside
-from agalign.products.rasters.raster_file import layer_pixels
 from agalign.values import geometry
 from agalign.values.alignment import Alignment
 from agalign.values.capture import Band, Radiometry
