@@ -19,7 +19,7 @@ from agalign.flight.fingerprint import fingerprint, input_samples
 from agalign.pixels.raster import read_preview
 from agalign.products.product import ProductContext, WrittenFile
 from agalign.products.rasters.aligned_files import BandFiles, Stack
-from agalign.products.rasters.relief_map import ReliefMap
+from agalign.products.rasters.alignment_maps import ReliefMap
 from agalign.products.sidecar.file import read_sidecar
 from agalign.products.sidecar.schema import BandPart, ReliefPart, Sidecar, is_usable
 from agalign.values import geometry, lens
