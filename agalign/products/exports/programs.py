@@ -150,18 +150,14 @@ def _band_files(captures: Sequence[RunCapture], out: Path, images: Path, *, copy
         for part in output.band_files:
             source = check_inside(capture.path.parent / part.file, out)
             target = images / file_name((Path(capture.label).parent / part.file).as_posix(), taken)
-            written.append(_placed(source, target, copy=copy))
+            target.parent.mkdir(parents=True, exist_ok=True)
+            if not copy:
+                with suppress(OSError):  # another disk, or a file system without hard links
+                    os.link(source, target)
+            if not target.exists():
+                shutil.copyfile(source, target)
+            written.append(target)
     return written
-
-
-def _placed(source: Path, target: Path, *, copy: bool) -> Path:
-    target.parent.mkdir(parents=True, exist_ok=True)
-    if not copy:
-        with suppress(OSError):  # another disk, or a file system without hard links
-            os.link(source, target)
-            return target
-    shutil.copyfile(source, target)
-    return target
 
 
 def _notes(

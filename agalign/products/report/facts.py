@@ -165,9 +165,8 @@ class FlightFacts:
 
     def add(self, folder: str, sidecar: Sidecar) -> None:
         """Add a capture, given its folder relative to the output folder."""
-        result = sidecar.result()
         label = Path(folder, sidecar.capture).as_posix()
-        self.pairs.add(label, result)
+        self.pairs.add(label, sidecar)
         output, position, path = sidecar.output, sidecar.position, Path(folder)
         grid = output or OutputPart(file=None, bytes=None, crop=(0, 0, *sidecar.reference.size_px), nodata=None)
         files = {part.kind: part.file for part in sidecar.products}

@@ -122,6 +122,8 @@ class RunPart(_Part):
 
 def begun(folder: Path, settings: Settings, captures: Sequence[Capture] = (), command: str = "") -> RunPart:
     """Return the record of a run that starts now."""
+    versions = {"python": platform.python_version(), **{name: library_version(name) for name in _LIBRARIES}}
+    system = {"system": platform.system(), "release": platform.release(), "processor": platform.machine()}
     return RunPart(
         state="running",
         started_at=datetime.now(UTC).isoformat(timespec="seconds"),
@@ -129,8 +131,8 @@ def begun(folder: Path, settings: Settings, captures: Sequence[Capture] = (), co
         input=escape_controls(str(folder)),
         command=escape_controls(command),
         cameras=camera_overviews(captures),
-        versions=_versions(),
-        machine=_machine(settings),
+        versions={name: version or "unknown" for name, version in versions.items()},
+        machine={**system, "cores": usable_cores(), "device": settings.joint.device},
         settings=settings.model_dump(mode="json"),
         captures={"found": len(captures)},
     )
@@ -141,16 +143,9 @@ def read_run_record(out: Path) -> RunPart | None:
     return read_model(out / RUN_FILE, RunPart)
 
 
-def _versions() -> dict[str, str]:
-    result = {"python": platform.python_version()}
-    for name in _LIBRARIES:
-        try:
-            result[name] = metadata.version(name)
-        except metadata.PackageNotFoundError:
-            result[name] = "unknown"
-    return result
-
-
-def _machine(settings: Settings) -> dict[str, str | int]:
-    system = {"system": platform.system(), "release": platform.release(), "processor": platform.machine()}
-    return {**system, "cores": usable_cores(), "device": settings.joint.device}
+def library_version(distribution: str) -> str | None:
+    """Return the version of an installed distribution; None if there is none."""
+    try:
+        return metadata.version(distribution)
+    except metadata.PackageNotFoundError:
+        return None
