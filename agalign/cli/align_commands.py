@@ -107,7 +107,6 @@ def _demo(
     captures: Annotated[int, typer.Option(min=1, max=1000, help="Captures to make.")] = 3,
 ) -> int:
     """Make a synthetic flight, align it, and compare the result with the ground truth."""
-    from agalign.batch.capture_task import CaptureReport
     from agalign.cli.align_run import conclude, find_captures, run
     from agalign.config import DiscoverOptions, RunOptions, Settings
     from agalign.synthetic.flight import make_flight, score_against_truth
@@ -119,14 +118,11 @@ def _demo(
     settings = Settings.model_validate(given["settings"])
     truth = make_flight(source, captures, rng_seed=settings.joint.rng_seed)
     flight = find_captures(source, DiscoverOptions(), terminal)
-    reports: list[CaptureReport] = []
-    options = RunOptions(overwrite=True, **given["run"])
-    totals = run(flight, target, settings, terminal, options, each=reports.append)
-    reports.sort(key=lambda r: r.label)
+    totals = run(flight, target, settings, terminal, RunOptions(overwrite=True, **given["run"]))
     headers = ("Capture", "Band", "Status", "before", "median", "p95")
     rows = [
         (s.capture, s.band, s.status, f"{s.before_px:.1f}", f"{s.median_px:.3f}", f"{s.p95_px:.3f}")
-        for s in score_against_truth(reports, truth)
+        for s in score_against_truth(target, truth)
     ]
     terminal.table(headers, rows, "Error relative to the ground truth, px", texts=3)
     return conclude(totals, target, terminal)

@@ -151,7 +151,6 @@ def run(
     *,
     dask: str | None = None,
     model: Path | None = None,
-    each: Callable[["CaptureReport"], object] = lambda _: None,
 ) -> RunTotals:
     """Align the captures, print progress, and return the totals.
 
@@ -191,7 +190,6 @@ def run(
             for report in run_flight(flight, out, settings, options, listener, model):
                 terminal.check()
                 totals.add(report)
-                each(report)
                 show(0.0, report.label)
                 _print_report(report, terminal, totals.states.total(), len(flight.captures))
         except (OutputError, WorkerError) as error:

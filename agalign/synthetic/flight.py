@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import CloughTocher2DInterpolator
 
-from agalign.batch.capture_task import CaptureReport
+from agalign.products.sidecar.file import find_sidecars, read_sidecar
 from agalign.synthetic import cameras
 from agalign.synthetic.cameras import REDEDGE, BandSpec, CameraSpec, Exposure, Pose, place_and_rays, true_homography
 from agalign.synthetic.ground import Field, Ground, map_px, on_ground, paint_ground, reflectance
@@ -225,15 +225,14 @@ class Score:
     p95_px: float
 
 
-def score_against_truth(reports: list[CaptureReport], truth_path: Path) -> list[Score]:
-    """Return the errors of every pair, px, from the grids in the sidecars."""
+def score_against_truth(out: Path, truth_path: Path) -> list[Score]:
+    """Return the errors of every pair, px, from the grids in the sidecars below the output folder of a run."""
     truth = json.loads(truth_path.read_text(encoding="utf-8"))
     scores = []
-    for report in reports:
-        if report.sidecar is None:
-            continue
-        for band in report.sidecar.bands:
-            known = truth[report.sidecar.capture]["bands"].get(band.file)
+    for path in find_sidecars(out):
+        sidecar, label = read_sidecar(path), path.relative_to(out).with_suffix("").as_posix()
+        for band in sidecar.bands:
+            known = truth[sidecar.capture]["bands"].get(band.file)
             if known is None or band.grid is None:
                 continue
             fixed_px, moving_px = np.hsplit(np.asarray(known["ties"], dtype=np.float64), 2)
@@ -241,5 +240,5 @@ def score_against_truth(reports: list[CaptureReport], truth_path: Path) -> list[
             before_px = float(np.median(np.linalg.norm(fixed_px - moving_px, axis=1)))
             errors_px = np.linalg.norm(mapping(fixed_px) - moving_px, axis=1)
             numbers = np.nanpercentile(errors_px, (50, 95)).tolist()
-            scores.append(Score(report.label, band.band, band.status, before_px, *numbers))
+            scores.append(Score(label, band.band, band.status, before_px, *numbers))
     return scores

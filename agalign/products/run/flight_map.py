@@ -24,6 +24,7 @@ from agalign.products.sidecar.schema import CaptureResult
 from agalign.values import geometry
 from agalign.values.capture import Capture, Georeference, HeightSource, Position
 from agalign.values.files import read_regular, write_text
+from agalign.values.geometry import Points
 from agalign.values.image import OutputGrid
 
 FLIGHT_MAP_FILE = "flight.geojson"
@@ -154,8 +155,7 @@ def with_approximate_georeference(capture: Capture, crs: str) -> Capture:
     The ground is assumed to be a horizontal plane, lens distortion is neglected, and `accuracy_m` is set.
     """
     reference, position = capture.reference, capture.position
-    width, height = reference.size_px
-    corners = np.array([[0.0, 0.0], [width, 0.0], [width, height], [0.0, height]])
+    corners = _outline_px(capture)
     offsets_m = ground_m(capture, corners - 0.5)
     if reference.georeference is not None or offsets_m is None or position is None:
         return capture
@@ -186,8 +186,7 @@ def accuracy_of_footprint_m(capture: Capture) -> float | None:
     """Return the standard error, metres, of the farthest corner of a footprint by `ground_m`, from the errors of the
     camera's position, heading, tilt and height. None if `ground_m` returns None.
     """
-    width, height = capture.reference.size_px
-    offsets_m = ground_m(capture, np.array([[0, 0], [width, 0], [width, height], [0, height]]) - 0.5)
+    offsets_m = ground_m(capture, _outline_px(capture) - 0.5)
     pose = capture.pose
     if offsets_m is None or pose is None or pose.height_m is None:
         return None
@@ -213,6 +212,12 @@ def utm_of_flights(captures: Sequence[Capture]) -> dict[str, str]:
         if position is not None:
             result |= dict.fromkeys((c.label for c in flight), utm_wkt(position.longitude, position.latitude))
     return result
+
+
+def _outline_px(capture: Capture) -> Points:
+    """The outer corners (4, 2) of the corner pixels of the reference; (0, 0) is the first one."""
+    width, height = capture.reference.size_px
+    return geometry.corners(width + 1, height + 1)
 
 
 def _altitude_m(capture: Capture) -> float:
