@@ -137,16 +137,6 @@ class CameraSpec(ABC):
     def write_band(self, path: Path, pixels: NDArray[np.uint16], band: BandSpec, exposure: Exposure) -> None:
         """Write (height, width) pixels and their tags."""
 
-    @property
-    def sharpest(self) -> float:
-        """Highest angular resolution of a band, as a multiple of the RedEdge-M's."""
-        return max(b.size_ratio[0] / b.view for b in self.bands)
-
-    @property
-    def widest(self) -> float:
-        """Widest field of view of a band, as a multiple of the RedEdge-M's."""
-        return max(b.view for b in self.bands)
-
 
 def true_homography(reference: BandSpec, band: BandSpec, pose: Pose, size_px: tuple[int, int]) -> Matrix:
     """Return fixed_to_moving between undistorted pixels, from the homographies of both bands to the ground plane."""

@@ -37,10 +37,12 @@ def paint_ground(
     """Return a ground with parcels, rows, tracks and trees, large and fine enough for all bands at all poses."""
     focal = cameras.FOCAL_LENGTH_MM * cameras.PIXELS_PER_MM * size_px[0] / 1280
     lowest, highest = min(p.altitude_m for p in poses), max(p.altitude_m for p in poses)
+    # The highest angular resolution and the widest field of view of a band, as multiples of the RedEdge-M's.
+    sharpest, widest = max(b.size_ratio[0] / b.view for b in camera.bands), max(b.view for b in camera.bands)
     # The pixels of the ground must not be visible in the images.
     map_px_per_image_px = 1.25
-    metres_per_px = lowest / focal / camera.sharpest / map_px_per_image_px
-    seen_m = 0.62 * highest * np.hypot(*size_px) / focal * camera.widest
+    metres_per_px = lowest / focal / sharpest / map_px_per_image_px
+    seen_m = 0.62 * highest * np.hypot(*size_px) / focal * widest
     radius_m = max(np.hypot(p.east_m, p.north_m) for p in poses) + seen_m
     side = 2 * int(np.ceil(radius_m / metres_per_px))
     metre = 1 / metres_per_px

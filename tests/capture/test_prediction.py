@@ -25,7 +25,7 @@ from agalign.config import CheckSettings, Settings
 from agalign.flight.model import FlightModel, load_model
 from agalign.method.joint import Results, refine_with
 from agalign.products.sidecar.convert import capture_status
-from agalign.synthetic import make_flight
+from agalign.synthetic.flight import make_flight
 from agalign.values import geometry
 from agalign.values.alignment import Alignment, Prediction
 from agalign.values.issues import Issue

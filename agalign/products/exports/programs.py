@@ -218,11 +218,15 @@ def _write_micasense(
     Yields the file and the distances from the complete mappings. Raises InputError if the original images cannot be
     read, ConfigurationError for other cameras, OutputError.
     """
-    folder = source or _input_of(out)
+    if source is None:
+        run = read_run_record(out)
+        if run is None:
+            raise InputError(f"{out}: does not name the folder of the images; give it with --source")
+        source = Path(run.input)
     by_camera: dict[str, list[NDArray[np.float64]]] = defaultdict(list)
     taken: dict[str, str] = {}
     for name, capture, bands in _named(captures, taken):
-        images = [_original(folder / Path(capture.label).parent / band.file) for band in bands]
+        images = [_original(source / Path(capture.label).parent / band.file) for band in bands]
         reference = next((i for i, b in zip(images, bands, strict=True) if b.status == "reference"), None)
         if reference is None:
             raise SidecarError(f"{capture.path}: has no reference band; run again with --overwrite")
@@ -245,13 +249,6 @@ def _named(captures: Sequence[RunCapture], taken: dict[str, str]) -> Iterator[tu
 
 def _rows(name: str, bands: Sequence[BandPart], errors_px: Sequence[float]) -> list[_Row]:
     return [(name, b.band, b.status, e) for b, e in zip(bands, errors_px, strict=True)]
-
-
-def _input_of(out: Path) -> Path:
-    run = read_run_record(out)
-    if run is None:
-        raise InputError(f"{out}: does not name the folder of the images; give it with --source")
-    return Path(run.input)
 
 
 def _grid(band: BandPart) -> tuple[Points, Points]:
