@@ -4,12 +4,14 @@ the camera of `agalign demo` with MicaSense's file names and tags.
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import ClassVar, Literal
 
 import cv2
 import numpy as np
 import tifffile
+from jinja2 import Environment, PackageLoader, StrictUndefined, Template
 from numpy.typing import NDArray
 
 from agalign.cameras.tiff_directory import Directory, Entry, add_directories, byte_string, rational, short, text
@@ -191,71 +193,29 @@ class MicaSenseCamera(CameraSpec):
         write_tiff(path, pixels, self, band, exposure, xmp, "SY01-0000001-AG", first, exif)
 
     def _xmp(self, band: BandSpec, exposure: Exposure, density: float) -> str:
-        model, pose = band.lens(*exposure.size_px), exposure.pose
-        k1, k2, p1, p2, k3 = band.distortion
-        rig = ", ".join(f"{v + off:.6f}" for v, off in zip(band.rig_degrees, band.tags_off_deg, strict=True))
-        light = "" if band.sees == "heat" else _light_xmp(band, exposure)
-        return f"""<?xpacket begin="" id="W5M0MpCehiHzreSzNTczkc9d"?>
-<x:xmpmeta xmlns:x="adobe:ns:meta/">
- <rdf:RDF xmlns:rdf="http://www.w3.org/1999/02/22-rdf-syntax-ns#">
-  <rdf:Description rdf:about="Pix4D Camera Information" xmlns:Camera="http://pix4d.com/camera/1.0">
-   <Camera:RigName>{self.model}</Camera:RigName>
-   <Camera:BandName>{band.name}</Camera:BandName>
-   <Camera:CentralWavelength>{band.wavelength_nm:g}</Camera:CentralWavelength>
-   <Camera:WavelengthFWHM>{band.bandwidth_nm:g}</Camera:WavelengthFWHM>
-   <Camera:ModelType>perspective</Camera:ModelType>
-   <Camera:PrincipalPoint>{model.cx_px / density:.8f},{model.cy_px / density:.8f}</Camera:PrincipalPoint>
-   <Camera:PerspectiveFocalLength>{band.focal_length_mm}</Camera:PerspectiveFocalLength>
-   <Camera:PerspectiveFocalLengthUnits>mm</Camera:PerspectiveFocalLengthUnits>
-   <Camera:PerspectiveDistortion>
-    <rdf:Seq>
-     <rdf:li>{k1}</rdf:li><rdf:li>{k2}</rdf:li><rdf:li>{k3}</rdf:li><rdf:li>{p1}</rdf:li><rdf:li>{p2}</rdf:li>
-    </rdf:Seq>
-   </Camera:PerspectiveDistortion>
-   <Camera:RigRelatives>{rig}</Camera:RigRelatives>
-   <Camera:RigTranslations>{band.baseline_m[0]:.4f}, {band.baseline_m[1]:.4f}, 0</Camera:RigTranslations>
-   <Camera:Yaw>{pose.yaw_deg:.4f}</Camera:Yaw>
-   <Camera:Pitch>{pose.pitch_deg:.4f}</Camera:Pitch>
-   <Camera:Roll>{pose.roll_deg:.4f}</Camera:Roll>
-   <Camera:RigCameraIndex>{band.rig_index}</Camera:RigCameraIndex>
-   <Camera:RigRelativesReferenceRigCameraIndex>{self.bands[self.reference].rig_index}</Camera:RigRelativesReferenceRigCameraIndex>
-  </rdf:Description>
-  <rdf:Description rdf:about="Pix4D Camera Information" xmlns:MicaSense="http://micasense.com/MicaSense/1.0/">
-   <MicaSense:FlightId>syntheticflight00001</MicaSense:FlightId>
-   <MicaSense:CaptureId>synthetic{exposure.number:011d}</MicaSense:CaptureId>
-   <MicaSense:PressureAlt>{pose.altitude_m:.3f}</MicaSense:PressureAlt>
-  </rdf:Description>
-{light} </rdf:RDF>
-</x:xmpmeta>
-<?xpacket end="w"?>
-"""
+        """The tags in XMP, given the pixels per mm: with vignetting, calibration and light sensor except for heat."""
+        angles = (v + off for v, off in zip(band.rig_degrees, band.tags_off_deg, strict=True))
+        width, height = band.size_px(exposure.size_px)
+        return _xmp_template().render(
+            camera=self,
+            band=band,
+            exposure=exposure,
+            lens=band.lens(*exposure.size_px),
+            density=density,
+            rig=", ".join(f"{angle:.6f}" for angle in angles),
+            width=width,
+            height=height,
+            fall=-exposure.vignetting / ((width / 2) ** 2 + (height / 2) ** 2),
+            gain=_IRRADIANCE / np.pi * EXPOSURE_S * 65536 / (WHITE_LEVEL - BLACK_LEVEL) / band.exposure,
+            irradiance=_IRRADIANCE,
+        )
 
 
-def _light_xmp(band: BandSpec, exposure: Exposure) -> str:
-    """Vignetting, radiometric calibration and light sensor."""
-    width, height = band.size_px(exposure.size_px)
-    fall = -exposure.vignetting / ((width / 2) ** 2 + (height / 2) ** 2)
-    gain = _IRRADIANCE / np.pi * EXPOSURE_S * 65536 / (WHITE_LEVEL - BLACK_LEVEL) / band.exposure
-    return f"""  <rdf:Description rdf:about="Pix4D Camera Information" xmlns:Camera="http://pix4d.com/camera/1.0">
-   <Camera:VignettingCenter>
-    <rdf:Seq><rdf:li>{width / 2}</rdf:li><rdf:li>{height / 2}</rdf:li></rdf:Seq>
-   </Camera:VignettingCenter>
-   <Camera:VignettingPolynomial>
-    <rdf:Seq>
-     <rdf:li>0</rdf:li><rdf:li>{fall:.9e}</rdf:li><rdf:li>0</rdf:li>
-     <rdf:li>0</rdf:li><rdf:li>0</rdf:li><rdf:li>0</rdf:li>
-    </rdf:Seq>
-   </Camera:VignettingPolynomial>
-  </rdf:Description>
-  <rdf:Description rdf:about="Pix4D Camera Information" xmlns:MicaSense="http://micasense.com/MicaSense/1.0/">
-   <MicaSense:RadiometricCalibration>
-    <rdf:Seq><rdf:li>{gain:.9e}</rdf:li><rdf:li>0</rdf:li><rdf:li>0</rdf:li></rdf:Seq>
-   </MicaSense:RadiometricCalibration>
-  </rdf:Description>
-  <rdf:Description rdf:about="Pix4D Camera Information" xmlns:DLS="http://micasense.com/DLS/1.0/">
-   <DLS:HorizontalIrradiance>{_IRRADIANCE * 100:.6f}</DLS:HorizontalIrradiance>
-  </rdf:Description>
-"""
+@cache
+def _xmp_template() -> Template:
+    loader = PackageLoader("agalign.synthetic", ".")
+    environment = Environment(loader=loader, undefined=StrictUndefined, trim_blocks=True, keep_trailing_newline=True)
+    return environment.get_template("micasense.xmp.j2")
 
 
 def write_tiff(

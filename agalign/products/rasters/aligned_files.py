@@ -71,9 +71,9 @@ class BandFiles(Product):
 
     def write(self, context: ProductContext) -> list[WrittenFile]:
         """Write the files of all bands with pixels."""
-        names = band_file_names(context.capture)
+        names, is_raw = band_file_names(context.capture), context.settings.write.radiometry == "off"
         layers = [layer for layer in context.layers if not layer.is_gap]
-        vignettings = {} if context.settings.write.radiometry != "off" else _vignettings(layers, context.grid)
+        vignettings = _vignettings(layers, context.grid) if is_raw else {}
         if any(v.error > _MAX_VIGNETTING_ERROR for v in vignettings.values()):
             # A program that corrects some bands of a capture only would change its indices.
             layers = [replace(layer, vignetting=_correction(layer.band)) for layer in layers]
@@ -81,18 +81,13 @@ class BandFiles(Product):
         by_file: dict[Path, list[Layer]] = {}
         for layer in layers:
             by_file.setdefault(names[layer.band.name], []).append(layer)
-        return [
-            self._write_file(context, name, by_file[name], vignettings.get(by_file[name][0].band.name))
-            for name in dict.fromkeys(names.values())
-            if name in by_file
-        ]
-
-    def _write_file(
-        self, context: ProductContext, name: Path, layers: list[Layer], vignetting: GridVignetting | None
-    ) -> WrittenFile:
-        reference, is_raw = context.capture.reference, context.settings.write.radiometry == "off"
-        tags = band_tags(layers[0].band, reference, context.grid, vignetting, radiometry=not is_raw)
-        return _written(self.kind, context, layers, context.paths.folder / name, name.as_posix(), tags)
+        written = []
+        for name in dict.fromkeys(name for name in names.values() if name in by_file):
+            band, path = by_file[name][0].band, context.paths.folder / name
+            vignetting = vignettings.get(band.name)
+            tags = band_tags(band, context.capture.reference, context.grid, vignetting, radiometry=not is_raw)
+            written.append(_written(self.kind, context, by_file[name], path, name.as_posix(), tags))
+        return written
 
 
 def band_file_names(capture: Capture) -> dict[str, Path]:
