@@ -27,6 +27,8 @@ if TYPE_CHECKING:
 Given = dict[str, dict[str, Any]]
 """Values of the options of a command that belong to fields, by name of the field: `settings` by stage and field, for
 `Settings.model_validate`, `discover` of `DiscoverOptions`, `run` of `RunOptions`."""
+_TERMINAL = inspect.signature(Terminal).parameters
+"""Options of the terminal, by name."""
 
 
 @dataclass(frozen=True)
@@ -93,9 +95,6 @@ def _options_of(owner: str, value: Any, path: tuple[str, ...]) -> Iterator[Field
         for limit in of_field.metadata:
             info |= {end: getattr(limit, of) for end, of in (("min", "ge"), ("max", "le")) if hasattr(limit, of)}
         yield FieldOption(owner, (*path, name), option, option.type or of_field.annotation, info)
-
-
-_TERMINAL = inspect.signature(Terminal).parameters
 
 
 @dataclass(frozen=True)
