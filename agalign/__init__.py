@@ -18,8 +18,8 @@ if TYPE_CHECKING:
     from agalign.api import align_capture as align_capture
     from agalign.api import align_folder as align_folder
     from agalign.api import warp_onto as warp_onto
-    from agalign.batch.capture_report import CaptureReport as CaptureReport
-    from agalign.batch.capture_report import FlightReports as FlightReports
+    from agalign.batch.capture_task import CaptureReport as CaptureReport
+    from agalign.batch.capture_task import FlightReports as FlightReports
     from agalign.cameras.discover import FolderScan as FolderScan
     from agalign.cameras.discover import discover as discover
     from agalign.config import CheckSettings as CheckSettings
@@ -47,7 +47,7 @@ if TYPE_CHECKING:
     from agalign.products.exports.dataset import open_flight as open_flight
     from agalign.products.mosaic.compose import MosaicReport as MosaicReport
     from agalign.products.mosaic.compose import mosaic as mosaic
-    from agalign.products.sidecar.alignment import read_alignment as read_alignment
+    from agalign.products.sidecar.convert import read_alignment as read_alignment
     from agalign.values.alignment import Alignment as Alignment
     from agalign.values.alignment import Prediction as Prediction
     from agalign.values.alignment import Residual as Residual
@@ -59,7 +59,7 @@ if TYPE_CHECKING:
 
 _NAMES = {
     "api": "align align_capture align_folder warp_onto",
-    "batch.capture_report": "CaptureReport FlightReports",
+    "batch.capture_task": "CaptureReport FlightReports",
     "cameras.discover": "FolderScan discover",
     "config": "CheckSettings DiscoverOptions FlightSettings JointSettings ReliefSettings RunOptions SeedSettings "
     "Settings WriteSettings",
@@ -67,7 +67,7 @@ _NAMES = {
     "NoSuchBandError NotEnoughTextureError OutputError SidecarError UnreadableFileError WorkerError",
     "products.exports.dataset": "open_capture open_flight",
     "products.mosaic.compose": "MosaicReport mosaic",
-    "products.sidecar.alignment": "read_alignment",
+    "products.sidecar.convert": "read_alignment",
     "values.alignment": "Alignment Prediction Residual Seed",
     "values.capture": "Capture",
     "values.pixel_units": "FixedFilePx FixedImagePx MovingFilePx",

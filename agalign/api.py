@@ -8,8 +8,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from agalign.batch.capture_report import CaptureReport, FlightReports
-from agalign.batch.capture_task import process_capture, quiet
+from agalign.batch.capture_task import CaptureReport, FlightReports, Task, process_capture, quiet
 from agalign.batch.earlier_results import refuse_other_captures
 from agalign.batch.run import Listener, run_flight
 from agalign.cameras.discover import discover
@@ -118,7 +117,7 @@ def align_capture(capture: Capture, out: str | Path, *, settings: Settings | Non
     """
     settings = settings or Settings()
     refuse_other_captures([capture], Path(out))
-    return process_capture(with_radiometry(capture, settings.write.radiometry, {}), Path(out), settings)
+    return process_capture(Task(with_radiometry(capture, settings.write.radiometry, {}), Path(out), settings))
 
 
 def align_folder(

@@ -72,7 +72,6 @@ class Option:
     """Its default; by default that of the field, if `type` is that of the field."""
     parse: Callable[[Any], Any] = lambda value: value
     """Returns the value of the field for that of the option."""
-    show_default: bool = True
     alone: str = ""
     """Its value if it is given without one."""
     former: str = ""
@@ -84,7 +83,7 @@ def _yes_or_no(yes: str, no: str) -> BeforeValidator:
     return BeforeValidator(lambda value: {True: yes, False: no}[value] if isinstance(value, bool) else value)
 
 
-_GLOBS = Option(type=list[str] | None, parse=lambda globs: tuple(globs or ()), show_default=False)
+_GLOBS = Option(type=list[str] | None, parse=lambda globs: tuple(globs or ()))
 
 
 @validated.dataclass(frozen=True, config=ConfigDict(use_attribute_docstrings=True))
@@ -232,9 +231,7 @@ class WriteSettings(SettingsModel):
     """Pixel size: of the reference or of the finest band."""
     georeference: bool = False
     """Write an approximate georeference from GPS, altitude and yaw."""
-    ground_elevation_m: Annotated[
-        float | None, Field(ge=-1000, le=9000), Option("ground_elevation", show_default=False)
-    ] = None
+    ground_elevation_m: Annotated[float | None, Field(ge=-1000, le=9000), Option("ground_elevation")] = None
     """Elevation of the ground, m, in the height system of the GPS, if the tags lack the height above ground."""
     statistics: bool = False
     """Store minimum, maximum, mean and standard deviation of aligned bands."""
@@ -243,8 +240,7 @@ class WriteSettings(SettingsModel):
     stac: bool = False
     """Write a STAC item per capture and a collection per flight."""
     indices: Annotated[
-        tuple[str, ...],
-        Option("index", type=str | None, parse=lambda text: names_in((text or "").lower()), show_default=False),
+        tuple[str, ...], Option("index", type=str | None, parse=lambda text: names_in((text or "").lower()))
     ] = ()
     """Also write spectral indices, names separated by commas: ndvi, ndre …; 'agalign indices' adds others."""
     pan_sharpen: bool = False

@@ -13,8 +13,7 @@ import numpy as np
 from common import Number, Pair, print_decisions, run
 from lattices import pair as lattice
 
-from agalign.synthetic.camera_model import Pose, true_homography
-from agalign.synthetic.cameras import BANDS, REFERENCE
+from agalign.synthetic.cameras import BANDS, REFERENCE, Pose, true_homography
 from agalign.synthetic.flight import recorded
 from agalign.synthetic.flight import view as seen
 from agalign.synthetic.ground import Ground, paint_ground, reflectance

@@ -20,8 +20,8 @@ from synthetic_flights.depth import write_capture
 from synthetic_flights.relief import make_scene
 
 from agalign.config import JointSettings
+from agalign.evaluation.evaluate import PairTask, method_named
 from agalign.evaluation.image_pairs import read_image
-from agalign.evaluation.methods import PairTask, method_named
 from agalign.evaluation.surface import draw_surface, loss_surface
 from agalign.method.match import sift_keypoints, to_8_bit, visible_in_both
 from agalign.method.paper import Training

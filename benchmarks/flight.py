@@ -26,7 +26,7 @@ def main(of_captures: Numbers = "10,30,100", of_jobs: Numbers = "1,2") -> None:
     with tempfile.TemporaryDirectory() as folder:
         source = Path(folder) / "flight"
         # In a separate process, because the peak memory of a child starts at that of its parent.
-        make = f"from agalign.synthetic import make_flight; make_flight(Path({str(source)!r}), {max(lengths)})"
+        make = f"from agalign.synthetic.flight import make_flight; make_flight(Path({str(source)!r}), {max(lengths)})"
         subprocess.run([sys.executable, "-c", f"from pathlib import Path; {make}"], check=True)
         for length in lengths:
             part = Path(folder) / f"flight{length}"

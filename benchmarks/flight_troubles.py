@@ -25,7 +25,7 @@ from common import (
 )
 from synthetic_flights.troubles import make_troubled_flight, make_two_headings
 
-from agalign.synthetic import make_flight
+from agalign.synthetic.flight import make_flight
 
 
 def report(bands: list[BandError], truth: Ties) -> None:

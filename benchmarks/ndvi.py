@@ -18,7 +18,7 @@ from agalign.pixels.radiometry import calibrated
 from agalign.pixels.raster import probe
 from agalign.products.indices.formulas import INDICES, compute
 from agalign.products.sidecar.file import read_sidecar
-from agalign.synthetic import camera_model, cameras
+from agalign.synthetic import cameras
 from agalign.synthetic import flight as synthetic
 from agalign.synthetic.ground import reflectance
 
@@ -52,7 +52,7 @@ def main(captures: Number = 3) -> None:
         print_row(name, *figures, f"{(every > 0.1).mean():.1%}")
 
 
-def raw_reflectance(folder: Path, number: int, spec: camera_model.BandSpec) -> np.ndarray:
+def raw_reflectance(folder: Path, number: int, spec: cameras.BandSpec) -> np.ndarray:
     """Reflectance of a band in its own pixels."""
     path = folder / "0000SET" / "000" / f"IMG_{number:04d}_{spec.rig_index + 1}.tif"
     (band,) = MicaSense().bands(path, read_tags(path), probe(path))

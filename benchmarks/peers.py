@@ -24,7 +24,7 @@ import agalign
 from agalign.capture.band_pair import BandPair
 from agalign.capture.seeding import best_seed
 from agalign.errors import AgalignError
-from agalign.evaluation.methods import elastix_affinity
+from agalign.evaluation.evaluate import elastix_affinity
 from agalign.fit.windows import FixedWindows
 from agalign.method.match import to_8_bit
 from agalign.pixels.band_resampling import luma, warped

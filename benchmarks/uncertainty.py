@@ -10,7 +10,7 @@ import numpy as np
 from common import Number, flight_and_out, print_head, print_row, read_ties, run
 
 import agalign
-from agalign.synthetic import make_flight
+from agalign.synthetic.flight import make_flight
 from agalign.values import geometry
 
 

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import rasterio
 
-from agalign.batch import run_flight
+from agalign.batch.run import run_flight
 from agalign.cameras.discover import FolderScan
 from agalign.cameras.mosaics import captures_onto
 from agalign.config import FlightSettings, Settings, WriteSettings

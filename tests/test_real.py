@@ -10,7 +10,7 @@ from common import band_errors, read_ties
 from scipy.interpolate import CloughTocher2DInterpolator
 
 import agalign
-from agalign.batch.capture_task import process_capture
+from agalign.batch.capture_task import Task, process_capture
 from agalign.cameras import rig_seed
 from agalign.cameras.discover import DiscoverOptions, discover
 from agalign.cameras.metadata import read_tags
@@ -56,7 +56,7 @@ def assert_documented(medians: dict[str, float], folder: str, pairs: int) -> Non
 def test_a_capture_without_its_flight(real_data: Path, tmp_path: Path, folder: str) -> None:
     *_, number, bands = DOCUMENTED[folder]
     captures = discover(real_data / folder, DiscoverOptions(bands=bands)).captures
-    process_capture(captures[number], tmp_path, Settings())
+    process_capture(Task(captures[number], tmp_path, Settings()))
     assert_documented(pair_medians(tmp_path, real_data / folder / "ties.json"), folder, len(bands) - 1)
 
 
@@ -74,7 +74,7 @@ def test_errors_are_the_documented_ones(real_data: Path, tmp_path: Path, folder:
 @pytest.mark.full
 def test_without_metadata_and_from_identity_nothing_is_wrongly_aligned(real_data: Path, tmp_path: Path) -> None:
     flight = discover(real_data / "flights/rededge_m_rowcrop", DiscoverOptions(ignore_metadata=True))
-    process_capture(flight.captures[0], tmp_path, Settings(seed=SeedSettings(force="identity")))
+    process_capture(Task(flight.captures[0], tmp_path, Settings(seed=SeedSettings(force="identity"))))
     medians = pair_medians(tmp_path, real_data / "flights/rededge_m_rowcrop/ties.json")
     assert medians
     assert max(medians.values()) < 0.5
@@ -107,7 +107,7 @@ def test_two_different_places_are_not_aligned(real_data: Path) -> None:
 def test_the_phantoms_photograph_is_aligned_as_one(real_data: Path, tmp_path: Path) -> None:
     options = DiscoverOptions(with_rgb=True, bands=("Green", "NIR", "RGB Red", "RGB Green", "RGB Blue"))
     capture = discover(real_data / "captures/p4m_forest", options).captures[0]
-    sidecar = process_capture(capture, tmp_path, Settings()).sidecar
+    sidecar = process_capture(Task(capture, tmp_path, Settings())).sidecar
     colours = [b for b in sidecar.bands if b.band.startswith("RGB")]
     assert [b.status for b in colours] == ["aligned"] * 3
     assert len({str(b.homography) for b in colours}) == 1
@@ -168,7 +168,7 @@ def test_the_two_cameras_of_a_sentera_are_registered(real_data: Path, tmp_path: 
     assert [len(c.bands) for c in captures] == [5, 5]
     options = DiscoverOptions(bands=("Green", "Red edge", "NIR"))
     few = discover(real_data / "captures/sentera_d4k", options).captures[1]
-    sidecar = process_capture(few, tmp_path, Settings()).sidecar
+    sidecar = process_capture(Task(few, tmp_path, Settings())).sidecar
     second_camera = [b for b in sidecar.bands if b.band in ("Red edge", "NIR")]
     assert len(second_camera) == 2
     for band in second_camera:

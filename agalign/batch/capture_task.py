@@ -1,15 +1,18 @@
-"""Align one capture and write its products and its sidecar, also as the task of a worker."""
+"""Align one capture and write its products and its sidecar, also as the task of a worker; the report of it."""
 
 import logging
 import re
 import time
-from collections.abc import Sequence
+from collections import Counter, defaultdict
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
+from html import escape
+from itertools import pairwise
 from pathlib import Path
+from typing import Literal
 
-from agalign.batch.capture_report import CaptureReport, StageClock
 from agalign.batch.workers import failure_text
 from agalign.capture.align_bands import PairProgress, align_capture_bands
 from agalign.config import Settings, WriteSettings
@@ -20,43 +23,169 @@ from agalign.pixels.radiometry import check_pixels
 from agalign.pixels.raster import with_saturation_values
 from agalign.products.indices.rasters import outdated_rasters
 from agalign.products.product import CapturePaths, ProductContext
-from agalign.products.rasters.aligned_files import band_file_names
+from agalign.products.rasters.aligned_files import band_file_names, is_aligned_raster
 from agalign.products.rasters.layout import FlightLimits, output_layers
-from agalign.products.rasters.raster_file import is_aligned_raster
 from agalign.products.registry import PRODUCTS
 from agalign.products.report.preview import preview_bytes
-from agalign.products.sidecar.file import read_result, write_sidecar
-from agalign.products.sidecar.fill import sidecar_of
+from agalign.products.sidecar.convert import sidecar_of
+from agalign.products.sidecar.file import read_result, read_sidecar, write_sidecar
+from agalign.products.sidecar.schema import CaptureResult, Sidecar
 from agalign.values.capture import Capture
 from agalign.values.choices import RadiometryChoice
 from agalign.values.files import check_inside
 from agalign.values.image import OutputGrid
+from agalign.values.text import counted
 
 
 def quiet(*_: object) -> None:
     """A progress callback that reports nothing."""
 
 
-def process_capture(
-    capture: Capture,
-    out: Path,
-    settings: Settings,
-    progress: PairProgress = quiet,
-    model: FlightModel | None = None,
-    max_preview_bytes: int = preview_bytes(1),
-    limits: FlightLimits = (),
-    common: OutputGrid | None = None,
-) -> CaptureReport:
+@dataclass(frozen=True)
+class CaptureReport:
+    """State and result of one capture."""
+
+    label: str
+    """Folder and number of the capture, as 0000SET/000/IMG_0001."""
+    state: Literal["done", "kept", "error", "panel", "sky"]
+    """`kept`: an earlier run with the same settings has finished the capture. `panel` and `sky`: the capture shows a
+    calibration panel or the sky, and is not aligned.
+    """
+    result: CaptureResult | None = field(default=None, repr=False)
+    """Content of the sidecar, without the long tables."""
+    path: Path | None = None
+    """Path of the sidecar."""
+    error: str | None = None
+    """Why the capture has no result, one line."""
+    panel: str | None = None
+    """Description of the calibration panel."""
+    sky: str | None = None
+    """Why the capture counts as sky."""
+    failed_products: tuple[str, ...] = ()
+    """Products that could not be written, and why."""
+    seconds: float = 0.0
+    """Processing time in this run."""
+    stages: Mapping[tuple[str, str], float] = field(default_factory=dict, repr=False)
+    """Processing time by (band, stage), s."""
+
+    @property
+    def sidecar(self) -> Sidecar | None:
+        """The complete sidecar, read from its file; None if there is none. Raises SidecarError."""
+        return None if self.path is None else read_sidecar(self.path)
+
+    @property
+    def is_complete(self) -> bool:
+        """True if every band pair is aligned or predicted accurately enough, none is missing, and all products are
+        written; also for panels and the sky.
+        """
+        done = self.result is not None and self.result.status == "ok" and not self.failed_products
+        return self.state in ("panel", "sky") or done
+
+    @property
+    def problems(self) -> tuple[str, ...]:
+        """Errors, except bands that are not aligned; those are in the sidecar."""
+        return self.failed_products if self.error is None else (self.error, *self.failed_products)
+
+    @property
+    def summary(self) -> str:
+        """The state, with the number of bands by status, or the error."""
+        if self.result is None:
+            return f"{self.state}: {self.error or self.panel or self.sky}"
+        statuses = Counter(status for _, status, _ in self.result.pairs)
+        return f"{self.state}, " + ", ".join(f"{number} {status}" for status, number in statuses.items())
+
+    def _row(self) -> str:
+        return f"<tr><td>{escape(self.label)}</td><td>{self.state}</td><td>{escape(self.summary)}</td></tr>"
+
+    def _repr_html_(self) -> str:
+        """A short table for notebooks."""
+        if self.result is None:
+            return f"<p><b>{escape(self.label)}</b>: {escape(self.summary)}</p>"
+        residuals_px = [None if b.metrics is None else b.metrics.after.residual_px for b in self.result.bands]
+        rows = "".join(
+            f"<tr><td>{escape(b.band)}</td><td>{b.status}</td><td>{'' if px is None else f'{px:.3f}'}</td>"
+            f"<td>{escape(b.reason or '')}</td></tr>"
+            for b, px in zip(self.result.bands, residuals_px, strict=True)
+        )
+        head = "<tr><th>band</th><th>status</th><th>residual, px</th><th>reason</th></tr>"
+        return f"<p><b>{escape(self.label)}</b>: {self.result.status}</p><table>{head}{rows}</table>"
+
+
+class FlightReports(list[CaptureReport]):
+    """The reports of a run, which a notebook shows as a table."""
+
+    def _repr_html_(self) -> str:
+        max_rows = 20
+        counts = Counter(report.state for report in self)
+        total = ", ".join(f"{number} {state}" for state, number in counts.items())
+        head = "<tr><th>capture</th><th>state</th><th>bands</th></tr>"
+        rows = "".join(report._row() for report in self[:max_rows])
+        more = f"<p>and {len(self) - max_rows} more</p>" if len(self) > max_rows else ""
+        return f"<p>{counted(len(self), 'capture')}: {total}</p><table>{head}{rows}</table>{more}"
+
+
+class StageClock:
+    """Progress callback that forwards its calls and adds up the time of each stage."""
+
+    def __init__(self, progress: PairProgress) -> None:
+        self._progress = progress
+        self._starts: list[tuple[float, tuple[str, str] | None]] = [(time.perf_counter(), None)]
+        """Start time of each (band, stage); before the first, None."""
+
+    def __call__(self, band: str, stage: str, share: float) -> None:
+        """Report progress as `PairProgress`; a new band or stage ends the previous one."""
+        if (band, stage) != self._starts[-1][1]:
+            self._starts.append((time.perf_counter(), (band, stage)))
+        self._progress(band, stage, share)
+
+    @property
+    def seconds(self) -> float:
+        """Seconds since this timer was created."""
+        return time.perf_counter() - self._starts[0][0]
+
+    def stages(self) -> Mapping[tuple[str, str], float]:
+        """Seconds by (band, stage), including the current stage."""
+        seconds: defaultdict[tuple[str, str], float] = defaultdict(float)
+        for (since, stage), (until, _) in pairwise([*self._starts, (time.perf_counter(), None)]):
+            if stage is not None:
+                seconds[stage] += until - since
+        return dict(seconds)
+
+
+@dataclass(frozen=True)
+class Task:
+    """One capture to process, as sent to a worker."""
+
+    capture: Capture
+    """Its bands already have the chosen radiometry (`with_radiometry`)."""
+    out: Path
+    settings: Settings
+    model: Path | None = None
+    """File of the model of the flight."""
+    max_preview_bytes: int = preview_bytes(1)
+    """About the largest size of the preview."""
+    limits: FlightLimits = ()
+    """Limits of the flights of the camera."""
+    common: OutputGrid | None = None
+    """Grid of the captures of the camera, if they share one."""
+
+    def absolute(self) -> "Task":
+        """Return the task with absolute paths: workers may have another working folder."""
+        model = None if self.model is None else self.model.absolute()
+        return replace(self, capture=self.capture.with_absolute_paths(), out=self.out.absolute(), model=model)
+
+
+def process_capture(task: Task, progress: PairProgress = quiet) -> CaptureReport:
     """Align a capture, write its products and its sidecar, and return its report, without times of stages.
 
-    The other bands are aligned where one cannot be. The bands already have the chosen radiometry (`with_radiometry`).
-    With the `model` of the flight, a network is learned from scratch only for bands that the model cannot align. The
-    preview has at most about `max_preview_bytes`. The captures of the camera have the `limits` of its flights, and
-    their `common` grid, if any.
+    The other bands are aligned where one cannot be. With the model of the flight, a network is learned from scratch
+    only for bands that the model cannot align.
     Raises UnreadableFileError if the reference cannot be read, InputError or ConfigurationError if the capture or the
     installation lacks what a product needs, and OutputError.
     """
-    began_s, paths, capture = time.perf_counter(), CapturePaths.of(capture, out), with_saturation_values(capture)
+    began_s, settings, out = time.perf_counter(), task.settings, task.out
+    capture = with_saturation_values(task.capture)
+    paths = CapturePaths.of(capture, out)
     refuse_to_overwrite([capture], out, settings.write)
     if missing := missing_radiometry(capture, settings.write.radiometry):
         raise InputError(f"{capture.reference.path}: {missing}")
@@ -66,27 +195,28 @@ def process_capture(
     for product in PRODUCTS:
         if product.is_enabled(settings.write):
             product.check(capture)
+    model = None if task.model is None else loaded_model(task.model, settings.joint.device)
     alignments = align_capture_bands(capture, settings, model, progress)
     progress(capture.reference.name, "writing", 0.0)
     whole = OutputGrid(0, 0, *capture.reference.size_px)
-    context = ProductContext(capture, paths, settings, alignments, (), whole, max_preview_bytes, limits)
+    context = ProductContext(capture, paths, settings, alignments, (), whole, task.max_preview_bytes, task.limits)
     if context.with_pixels:
-        layers, grid = output_layers(capture, context.with_pixels, settings.write, common)
+        layers, grid = output_layers(capture, context.with_pixels, settings.write, task.common)
         context = replace(context, layers=layers, grid=grid)
     discard_outputs(capture, out, settings.write)
     failures = _write_products(context)
     sidecar = write_sidecar(paths.sidecar, sidecar_of(context, list(failures), time.perf_counter() - began_s))
     # Products that need the same file fail with the same message.
     lost = (*dict.fromkeys(failures.values()), *lost_reflectance(capture, settings.write.radiometry))
-    result, path = sidecar.result(), paths.sidecar
-    return CaptureReport(capture.label, "done", result, path, failed_products=lost, seconds=sidecar.seconds)
+    result = sidecar.result()
+    return CaptureReport(capture.label, "done", result, paths.sidecar, failed_products=lost, seconds=sidecar.seconds)
 
 
 def _write_products(context: ProductContext) -> dict[str, str]:
     """Write the enabled products; return {kind: message} of optional ones that failed. Raises like `Product.write`."""
     failures: dict[str, str] = {}
     for product in PRODUCTS:
-        if not product.is_enabled(context.write_settings) or (product.needs_layers and not context.layers):
+        if not product.is_enabled(context.settings.write) or (product.needs_layers and not context.layers):
             continue
         try:
             for file in product.write(context):
@@ -169,33 +299,13 @@ def lost_reflectance(capture: Capture, choice: RadiometryChoice) -> tuple[str, .
     return tuple(f"not written as reflectance: {b.name}: {b.implausible}" for b in lost if choice == "auto")[:1]
 
 
-@dataclass(frozen=True)
-class Task:
-    """One capture to process, as sent to a worker."""
-
-    capture: Capture
-    out: Path
-    settings: Settings
-    model: Path | None
-    max_preview_bytes: int = preview_bytes(1)
-    limits: FlightLimits = ()
-    common: OutputGrid | None = None
-
-    def absolute(self) -> "Task":
-        """Return the task with absolute paths: workers may have another working folder."""
-        model = None if self.model is None else self.model.absolute()
-        return replace(self, capture=self.capture.with_absolute_paths(), out=self.out.absolute(), model=model)
-
-
 def do_capture(task: Task, on_pair: PairProgress = quiet) -> CaptureReport:
     """Process one capture and return its report, which includes errors."""
     label, clock = task.capture.label, StageClock(on_pair)
     keep_freed_memory()
     try:
-        model = None if task.model is None else loaded_model(task.model, task.settings.joint.device)
         with one_thread(), one_memory_error():
-            facts = task.max_preview_bytes, task.limits, task.common
-            report = process_capture(task.capture, task.out, task.settings, clock, model, *facts)
+            report = process_capture(task, clock)
     except Exception as error:
         # A defect of agalign in one capture must not stop the others.
         report = CaptureReport(label, "error", error=failure_text(error), seconds=clock.seconds)

@@ -20,13 +20,12 @@ from agalign.flight.rig import Observation
 from agalign.method.descriptor import Descriptor, start_from
 from agalign.method.device import choose_device, keep_freed_memory, one_memory_error, one_thread
 from agalign.method.fast import SCHEDULES
-from agalign.method.joint import Results, refine_with
+from agalign.method.joint import refine_with
 from agalign.method.refine import FLIGHT_PATCHES
 from agalign.method.state import ImageGroup, JointState
 from agalign.pixels.raster import with_saturation_values
 from agalign.values.alignment import MIN_RETRIEVAL, Alignment, JointResult, RefinedPair, Residual, Seed
 from agalign.values.capture import Capture
-from agalign.values.choices import Recipe
 from agalign.values.geometry import Matrix
 from agalign.values.issues import Issue
 from agalign.values.pixel_units import FixedFilePx, FixedImagePx
@@ -146,7 +145,8 @@ class LoadedCapture:
         results = [of_pair[i] for i in range(len(self.pairs))]
         known = [(p, r) for p, r in zip(self.pairs, results, strict=True) if isinstance(r, JointResult)]
         starts = list(zip(self.pairs, self.seeds, strict=True))
-        is_good_enough, refined = _are_good_enough(results, settings.joint.recipe), refined_pairs(starts, results)
+        enough, refined = SCHEDULES[settings.joint.recipe].enough_retrieval, refined_pairs(starts, results)
+        is_good_enough = all(isinstance(r, JointResult) and r.retrieval > enough for r in results)
         observation = None
         if is_final or is_good_enough:
             aligned = verify_together(starts, results, None, settings, is_observation=True)
@@ -246,12 +246,6 @@ def try_model(model: FlightModel, settings: Settings, capture: Capture) -> tuple
             return None
         return len(predictions), aligner.refined
     return 0, {}
-
-
-def _are_good_enough(results: Results, recipe: Recipe) -> bool:
-    """True if a network needs no more learning for a capture with these results."""
-    enough = SCHEDULES[recipe].enough_retrieval
-    return all(isinstance(result, JointResult) and result.retrieval > enough for result in results)
 
 
 def _observation(

@@ -10,8 +10,8 @@ from functools import partial
 from pathlib import Path
 from typing import Self
 
-from agalign.batch.capture_report import CaptureReport
 from agalign.batch.capture_task import (
+    CaptureReport,
     Task,
     discard_outputs,
     do_capture,
@@ -24,7 +24,6 @@ from agalign.batch.earlier_results import changes, outputs_exist, refuse_other_c
 from agalign.batch.flight_learning import learn_flight, learning_fingerprint
 from agalign.batch.workers import Run, chosen_run, failure_text, in_order, serially
 from agalign.cameras.discover import FolderScan
-from agalign.capture.align_bands import PairProgress
 from agalign.config import RunOptions, Settings, WriteSettings
 from agalign.errors import AgalignError, ConfigurationError, InputError, OutputError, SidecarError
 from agalign.flight.groups import camera_key, difference, flight_camera, flights_of, is_flight_of, model_names
@@ -41,8 +40,8 @@ from agalign.products.product import CapturePaths
 from agalign.products.rasters.layout import FlightLimits, common_grid, flight_limits
 from agalign.products.report.preview import preview_bytes
 from agalign.products.run.excluded import write_panels, write_sky
-from agalign.products.run.flight_map import FlightMap
-from agalign.products.run.footprint import (
+from agalign.products.run.flight_map import (
+    FlightMap,
     above_elevation,
     missing_for_footprint,
     utm_of_flights,
@@ -71,9 +70,8 @@ _Flight = tuple[list[Capture], Path | None]
 class Listener:
     """Events of a run."""
 
-    on_start: Callable[[Capture], None] = quiet
-    on_pair: PairProgress = quiet
-    """Of captures in this process only."""
+    on_pair: Callable[[Capture, str, str, float], None] = quiet
+    """A capture that this process aligns, then as `PairProgress`."""
     on_learning: Callable[[str, float], None] = quiet
     """Camera of the network that is being learned, and the share that is done."""
     on_learnt: Callable[[str, float], None] = quiet
@@ -399,10 +397,9 @@ def capture_reports(
         return
     with ThreadPoolExecutor(1) as reader:
         for number, task in enumerate(tasks, start=1):
-            listener.on_start(task.capture)
             for following in tasks[number : number + 1]:
                 reader.submit(_read_ahead, following.capture)
-            yield do_capture(task, listener.on_pair)
+            yield do_capture(task, partial(listener.on_pair, task.capture))
 
 
 def _read_ahead(capture: Capture) -> None:

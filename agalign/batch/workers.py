@@ -65,46 +65,32 @@ def chosen_run(
     preload: str = WORKER_MODULE,
     timeout_s: float | None = None,
 ) -> Iterator[Run]:
-    """Run tasks on the executor if there is one; else in processes if there are several or there is a timeout (threads
-    cannot be killed); else in threads, or serially.
+    """Run tasks on the executor if there is one; else in processes of this machine if there are several or there is a
+    timeout (threads cannot be killed); else in threads, or serially.
+
+    `initializer` gets the number of threads of a process, and `preload` is a module that imports what it needs. The
+    processes start in the background, and that of a task that exceeds the timeout is killed.
     """
     if executor is not None:
         yield on_executor(executor)
     elif processes > 1 or (processes and timeout_s is not None):
-        with own_processes(processes, initializer, preload=preload, timeout_s=timeout_s) as run:
+        of_each = max(1, usable_cores() // processes)
+        with (
+            environment_of_children(of_each),
+            ProcessPool(processes, worker_context(preload), partial(initializer, of_each)) as pool,
+        ):
+
+            def run(function: Callable[[A], R], tasks: Sequence[A], /, *, limited: bool = False) -> Completed[R]:
+                submit = partial(pool.submit, function, timeout_s=timeout_s if limited else None)
+                return _completed(submit, tasks, lambda: pool.loss)
+
             yield run
     elif threads > 1:
         # Warning filters are global: threads that change and restore them would interfere.
-        with without_warnings(), ThreadPoolExecutor(threads) as pool:
-            yield on_executor(pool)
+        with without_warnings(), ThreadPoolExecutor(threads) as thread_pool:
+            yield on_executor(thread_pool)
     else:
         yield serially
-
-
-@contextmanager
-def own_processes(
-    processes: int,
-    initializer: Callable[[int], object],
-    *,
-    preload: str = WORKER_MODULE,
-    timeout_s: float | None = None,
-) -> Iterator[Run]:
-    """Run tasks in processes of this machine, which start in the background.
-
-    `initializer` gets the number of threads of a process, and `preload` is a module that imports what it needs. The
-    process of a task that exceeds the timeout is killed.
-    """
-    threads = max(1, usable_cores() // processes)
-    with (
-        environment_of_children(threads),
-        ProcessPool(processes, worker_context(preload), partial(initializer, threads)) as pool,
-    ):
-
-        def run(function: Callable[[A], R], tasks: Sequence[A], /, *, limited: bool = False) -> Completed[R]:
-            submit = partial(pool.submit, function, timeout_s=timeout_s if limited else None)
-            return _completed(submit, tasks, lambda: pool.loss)
-
-        yield run
 
 
 def on_executor(executor: Executor) -> Run:

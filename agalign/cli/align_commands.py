@@ -22,7 +22,7 @@ _command = partial(
 def _align(
     terminal: Terminal,
     given: Given,
-    folder: Annotated[Path, typer.Argument(help="Folder with the images, sub-folders included.", show_default=False)],
+    folder: Annotated[Path, typer.Argument(help="Folder with the images, sub-folders included.")],
     model: Annotated[
         Path | None,
         typer.Option(help="Reuse the network and rig of an earlier flight of the same camera: OUT/models/…."),
@@ -34,7 +34,6 @@ def _align(
         typer.Option(
             is_eager=True,
             callback=load_config,
-            show_default=False,
             help="Read these options from a TOML file; 'agalign info --options' prints one.",
         ),
     ] = None,
@@ -108,7 +107,6 @@ def _demo(
     captures: Annotated[int, typer.Option(min=1, max=1000, help="Captures to make.")] = 3,
 ) -> int:
     """Make a synthetic flight, align it, and compare the result with the ground truth."""
-    from agalign.batch import CaptureReport
     from agalign.cli.align_run import conclude, find_captures, run
     from agalign.config import DiscoverOptions, RunOptions, Settings
     from agalign.synthetic.flight import make_flight, score_against_truth
@@ -120,14 +118,11 @@ def _demo(
     settings = Settings.model_validate(given["settings"])
     truth = make_flight(source, captures, rng_seed=settings.joint.rng_seed)
     flight = find_captures(source, DiscoverOptions(), terminal)
-    reports: list[CaptureReport] = []
-    options = RunOptions(overwrite=True, **given["run"])
-    totals = run(flight, target, settings, terminal, options, each=reports.append)
-    reports.sort(key=lambda r: r.label)
+    totals = run(flight, target, settings, terminal, RunOptions(overwrite=True, **given["run"]))
     headers = ("Capture", "Band", "Status", "before", "median", "p95")
     rows = [
         (s.capture, s.band, s.status, f"{s.before_px:.1f}", f"{s.median_px:.3f}", f"{s.p95_px:.3f}")
-        for s in score_against_truth(reports, truth)
+        for s in score_against_truth(target, truth)
     ]
     terminal.table(headers, rows, "Error relative to the ground truth, px", texts=3)
     return conclude(totals, target, terminal)
@@ -141,20 +136,14 @@ demo = _command(
 def _onto(
     terminal: Terminal,
     given: Given,
-    reference: Annotated[Path, typer.Argument(help="The mosaic with the output grid.", show_default=False)],
-    moving: Annotated[list[Path], typer.Argument(help="Mosaics of other dates or sensors.", show_default=False)],
+    reference: Annotated[Path, typer.Argument(help="The mosaic with the output grid.")],
+    moving: Annotated[list[Path], typer.Argument(help="Mosaics of other dates or sensors.")],
     out: Annotated[
-        Path | None,
-        typer.Option("--out", "-o", help="Output folder; by default REFERENCE-aligned.", show_default=False),
+        Path | None, typer.Option("--out", "-o", help="Output folder; by default REFERENCE-aligned.")
     ] = None,
     band: Annotated[
         str | None,
-        typer.Option(
-            "--reference",
-            "--band",
-            show_default=False,
-            help="Band of the mosaic REFERENCE to compare with; by default green.",
-        ),
+        typer.Option("--reference", "--band", help="Band of the mosaic REFERENCE to compare with; by default green."),
     ] = None,
 ) -> int:
     """Align georeferenced mosaics of other dates or sensors to the grid of REFERENCE.

@@ -24,14 +24,14 @@ from agalign.flight.groups import camera_overviews
 from agalign.products.product import CapturePaths
 from agalign.products.report.facts import FailureGroup, PairTotals
 from agalign.products.report.pages import REPORT_FILE, pages_exist, write_pages
-from agalign.products.run.record import exclusion_lines, read_run_record
+from agalign.products.run.record import read_run_record
 from agalign.products.sidecar.file import read_result
-from agalign.products.sidecar.schema import BandResult, CaptureResult
+from agalign.products.sidecar.schema import BandResult
 from agalign.values.capture import Capture
 from agalign.values.text import counted
 
 if TYPE_CHECKING:
-    from agalign.batch import CaptureReport
+    from agalign.batch.capture_task import CaptureReport
 
 
 def find_captures(folder: Path, options: DiscoverOptions, terminal: Terminal) -> FolderScan:
@@ -151,13 +151,12 @@ def run(
     *,
     dask: str | None = None,
     model: Path | None = None,
-    each: Callable[["CaptureReport"], object] = lambda _: None,
 ) -> RunTotals:
     """Align the captures, print progress, and return the totals.
 
     Raises OutputError or WorkerError if no capture could be processed.
     """
-    from agalign.batch import Listener, run_flight
+    from agalign.batch.run import Listener, run_flight
 
     asked = {c.label: len(c.moving) + len(c.missing_bands) for c in flight.captures}
     totals, pace = RunTotals(flight.is_complete, asked), _Pace()
@@ -167,39 +166,30 @@ def run(
         progress(terminal, len(flight.captures)) as show_line,
     ):
         options = replace(options, executor=executor)
-        current: Capture | None = None
 
         def show(share: float, text: str) -> None:
             show_line(totals.states.total(), share, text, pace.of(totals.states))
-
-        def on_start(capture: Capture) -> None:
-            nonlocal current
-            terminal.check()
-            current = capture
 
         def on_learning(camera: str, share: float) -> None:
             terminal.check()
             show(0.0, f"learning from {camera}: {share:.0%} at most")
 
-        def on_learnt(camera: str, seconds: float) -> None:
-            terminal.event("learnt", camera=camera, seconds=round(seconds, 2))
-
-        def on_again(text: str) -> None:
-            terminal.event("again", text, message=text)
-
-        def on_pair(band: str, stage: str, share: float) -> None:
+        def on_pair(capture: Capture, band: str, stage: str, share: float) -> None:
             terminal.check()
-            assert current is not None
-            names = [*(b.name for b in current.moving), band]
+            names = [*(b.name for b in capture.moving), band]
             finished = names.index(band) + (0.85 * share if stage in ("learning", "refining") else 0.0)
-            show(finished / max(len(current.moving), 1), f"{current.label} {band}: {stage}")
+            show(finished / max(len(capture.moving), 1), f"{capture.label} {band}: {stage}")
 
+        listener = Listener(
+            on_pair,
+            on_learning,
+            on_learnt=lambda camera, seconds: terminal.event("learnt", camera=camera, seconds=round(seconds, 2)),
+            on_again=lambda text: terminal.event("again", text, message=text),
+        )
         try:
-            listener = Listener(on_start, on_pair, on_learning, on_learnt, on_again)
             for report in run_flight(flight, out, settings, options, listener, model):
                 terminal.check()
                 totals.add(report)
-                each(report)
                 show(0.0, report.label)
                 _print_report(report, terminal, totals.states.total(), len(flight.captures))
         except (OutputError, WorkerError) as error:
@@ -295,15 +285,12 @@ def _print_report(report: "CaptureReport", terminal: Terminal, number: int, coun
     for text in report.problems:
         terminal.problem(f"{report.label}: {text}", capture=report.label)
     if terminal.log_json:
-        for (name, stage), seconds in report.stages.items():
-            terminal.event("stage", capture=report.label, pair=name, stage=stage, seconds=round(seconds, 4))
-    if report.result is None:
-        terminal.event("capture", capture=report.label, state=report.state, seconds=round(report.seconds, 3))
+        for (name, stage), stage_s in report.stages.items():
+            terminal.event("stage", capture=report.label, pair=name, stage=stage, seconds=round(stage_s, 4))
+    result, seconds = report.result, round(report.seconds, 3)
+    if result is None:
+        terminal.event("capture", capture=report.label, state=report.state, seconds=seconds)
         return
-    _print_capture(report, report.result, heading, terminal)
-
-
-def _print_capture(report: "CaptureReport", result: CaptureResult, heading: str, terminal: Terminal) -> None:
     counts = Counter(status for _, status, _ in result.pairs)
     aligned, predicted = counts["aligned"], counts["predicted"]
     also = f", {predicted} predicted" if predicted else ""
@@ -319,7 +306,7 @@ def _print_capture(report: "CaptureReport", result: CaptureResult, heading: str,
         aligned=aligned,
         predicted=predicted,
         pairs=counts.total(),
-        seconds=round(report.seconds, 3),
+        seconds=seconds,
     )
     if terminal.verbose or terminal.log_json:
         for band in (b for b in result.bands if b.status != "reference"):
@@ -352,7 +339,7 @@ def conclude(totals: RunTotals, out: Path, terminal: Terminal) -> int:
         shares = ", ".join(f"{name} up to {share:.1%} ({label})" for name, share, label in high)
         terminal.result(f"Saturated pixels: {shares}")
     record = read_run_record(out)
-    for line in [] if record is None else exclusion_lines(record.excluded):
+    for line in [] if record is None else record.exclusions():
         terminal.result(line)
     terminal.result(f"Report: {out / REPORT_FILE}")
     if totals.states and set(totals.states) <= {"panel", "sky"}:

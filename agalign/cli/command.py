@@ -27,6 +27,8 @@ if TYPE_CHECKING:
 Given = dict[str, dict[str, Any]]
 """Values of the options of a command that belong to fields, by name of the field: `settings` by stage and field, for
 `Settings.model_validate`, `discover` of `DiscoverOptions`, `run` of `RunOptions`."""
+_TERMINAL = inspect.signature(Terminal).parameters
+"""Options of the terminal, by name."""
 
 
 @dataclass(frozen=True)
@@ -40,7 +42,7 @@ class FieldOption:
     option: "Option"
     kind: Any
     info: Mapping[str, Any]
-    """Default, its display, help text and range."""
+    """Default, help text and range."""
 
     @property
     def name(self) -> str:
@@ -89,14 +91,10 @@ def _options_of(owner: str, value: Any, path: tuple[str, ...]) -> Iterator[Field
         if option.type is not None or option.default is not None:
             default = option.default
         text = " ".join(of_field.description.split())
-        info = {"default": default, "show_default": option.show_default, "help": text}
+        info = {"default": default, "help": text}
         for limit in of_field.metadata:
             info |= {end: getattr(limit, of) for end, of in (("min", "ge"), ("max", "le")) if hasattr(limit, of)}
         yield FieldOption(owner, (*path, name), option, option.type or of_field.annotation, info)
-
-
-def _terminal_parameters() -> Mapping[str, inspect.Parameter]:
-    return inspect.signature(Terminal).parameters
 
 
 @dataclass(frozen=True)
@@ -127,7 +125,7 @@ class Command:
         result = []
         for panel, names in self.panels.items():
             for name in names.split():
-                shared = own.pop(name, None) or _terminal_parameters().get(name)
+                shared = own.pop(name, None) or _TERMINAL.get(name)
                 result.append(shared or field_options()[name].parameter(self.changes.get(name, {})))
                 get_args(result[-1].annotation)[1].rich_help_panel = panel
         result = [*(own[name] for name in own if name not in ("terminal", "given")), *result]
@@ -136,10 +134,10 @@ class Command:
     def built(self, name: str) -> Any:
         """Return the command of typer."""
         parameters, own = self.parameters(), inspect.signature(self.function).parameters
-        fields = [p.name for p in parameters if p.name not in {*own, *_terminal_parameters()}]
+        fields = [p.name for p in parameters if p.name not in {*own, *_TERMINAL}]
 
         def call(**values: Any) -> None:
-            terminal = Terminal(**{name: values.pop(name, False) for name in _terminal_parameters()})
+            terminal = Terminal(**{name: values.pop(name, False) for name in _TERMINAL})
             with exits(terminal, self.on_interrupt, values.get("config")):
                 check_address_space()
                 check_threads()
@@ -207,9 +205,8 @@ def load_config(ctx: typer.Context, path: Path | None) -> Path | None:
         if isinstance(value, (dict, list)) and values is not value:
             raise typer.BadParameter(f"{path}: '{key}' takes one value")
         if not all(type(one) in ((bool,) if option.is_flag else (str, int, float)) for one in values):
-            raise typer.BadParameter(
-                f"{path}: '{key}' takes {'true or false' if option.is_flag else 'a text or number'}"
-            )
+            kind = "true or false" if option.is_flag else "a text or number"
+            raise typer.BadParameter(f"{path}: '{key}' takes {kind}")
         defaults[option.name] = values if option.multiple else value
     ctx.default_map = {**(ctx.default_map or {}), **defaults}
     return path
@@ -223,9 +220,8 @@ def _read_toml(path: Path) -> dict[str, Any]:
     except FileNotFoundError:
         raise typer.BadParameter(f"{path} does not exist") from None
     except (OSError, ValueError, RecursionError) as error:
-        raise typer.BadParameter(
-            f"{path} cannot be read as TOML ({getattr(error, 'strerror', None) or error})"
-        ) from None
+        reason = getattr(error, "strerror", None) or error
+        raise typer.BadParameter(f"{path} cannot be read as TOML ({reason})") from None
 
 
 def config_text(command: Any) -> str:

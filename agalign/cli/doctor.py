@@ -29,7 +29,10 @@ def _doctor(
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON to standard output.")] = False,
 ) -> int:
     """Check this machine: versions, devices, threads, memory, disk and extras."""
-    facts = {"machine": _machine(), "disk": _disk(folder), "devices": _devices(), "extras": _extras()}
+    from agalign.method.device import devices
+
+    known = [{"device": d.name, "what": d.what, "threads": d.threads, "problem": d.problem} for d in devices()]
+    facts = {"machine": _machine(), "disk": _disk(folder), "devices": known, "extras": _extras()}
     problems = _problems(facts)
     if as_json:
         terminal.facts(facts | {"problems": problems})
@@ -47,25 +50,17 @@ doctor = Command(_doctor)
 
 def _machine() -> dict[str, Any]:
     from agalign.pixels.raster import gdal_version
+    from agalign.products.run.record import library_version
 
     return {
         "agalign": __version__,
         "python": platform.python_version(),
         "system": platform.platform(),
-        **{name: _version(name) for name in _LIBRARIES},
+        **{name: library_version(name) for name in _LIBRARIES},
         "gdal": gdal_version(),
         "cores": usable_cores(),
         "memory_gb": _memory_gb(),
     }
-
-
-def _version(distribution: str) -> str | None:
-    from importlib import metadata
-
-    try:
-        return metadata.version(distribution)
-    except metadata.PackageNotFoundError:
-        return None
 
 
 def _memory_gb() -> float | None:
@@ -81,17 +76,13 @@ def _disk(folder: Path) -> dict[str, Any]:
     return {"folder": str(existing), "free_gb": free_gb, "writable": os.access(existing, os.W_OK)}
 
 
-def _devices() -> list[dict[str, Any]]:
-    from agalign.method.device import devices
-
-    return [{"device": d.name, "what": d.what, "threads": d.threads, "problem": d.problem} for d in devices()]
-
-
 def _extras() -> list[dict[str, Any]]:
     """Return the purpose and the missing libraries of each extra."""
+    from agalign.products.run.record import library_version
+
     result = []
     for name, adds in EXTRAS.items():
-        missing = [d for d in _requirements(name) if _version(d) is None]
+        missing = [d for d in _requirements(name) if library_version(d) is None]
         result.append({"extra": name, "adds": adds, "missing": missing})
     return result
 

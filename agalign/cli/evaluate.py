@@ -12,10 +12,7 @@ from agalign.errors import ConfigurationError
 from agalign.values.choices import Sharing
 
 Pairs = Annotated[
-    Path,
-    typer.Argument(
-        help="A CSV file (fixed, moving, homography), or a folder in the HPatches or Oxford layout.", show_default=False
-    ),
+    Path, typer.Argument(help="A CSV file (fixed, moving, homography), or a folder in the HPatches or Oxford layout.")
 ]
 
 
@@ -28,7 +25,6 @@ def _evaluate(
         typer.Option(
             "--method",
             "-m",
-            show_default=False,
             help="Recipe and sharing (fast:siamese; fast:siamese:grey for grey images), sift, daisy, elastix, or a "
             "network file; repeatable.",
         ),
@@ -43,9 +39,8 @@ def _evaluate(
     out: Annotated[Path | None, typer.Option("--out", "-o", help="CSV file with a row per pair and method.")] = None,
 ) -> None:
     """Evaluate descriptors and homographies on pairs with ground truth (Dong et al., 2018)."""
-    from agalign.evaluation.evaluate import Starts, error_table, evaluate, precision_table, write_results
+    from agalign.evaluation.evaluate import Starts, error_table, evaluate, method_named, precision_table, write_results
     from agalign.evaluation.image_pairs import find_pairs
-    from agalign.evaluation.methods import method_named
 
     chosen = methods or [*(f"fast:{sharing}" for sharing in get_args(Sharing)), "sift"]
     named = {name: method_named(name) for name in chosen}

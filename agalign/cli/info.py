@@ -22,10 +22,7 @@ def _info(
     terminal: Terminal,
     given: Given,
     folder: Annotated[
-        Path | None,
-        typer.Argument(
-            help="Folder with images, or the model of a run (OUT/models/….safetensors).", show_default=False
-        ),
+        Path | None, typer.Argument(help="Folder with images, or the model of a run (OUT/models/….safetensors).")
     ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON to standard output.")] = False,
     options: Annotated[

@@ -15,9 +15,8 @@ from agalign._version import __version__
 from agalign.cli.align_commands import align, demo, onto
 from agalign.cli.doctor import doctor
 from agalign.cli.evaluate import evaluate, learn, surface
-from agalign.cli.field import mosaic
 from agalign.cli.info import info
-from agalign.cli.results import export, indices, report, verify
+from agalign.cli.results import export, indices, mosaic, report, verify
 from agalign.cli.terminal import ExitCode, Terminal, examples, options_from, printed
 from agalign.values.cores import limit_default_threads
 from agalign.values.processes import silence_libraries

@@ -1,4 +1,4 @@
-"""The commands that use the output folder of a run: `report`, `verify`, `export` and `indices`."""
+"""The commands that use the output folder of a run: `report`, `verify`, `export`, `indices` and `mosaic`."""
 
 import math
 from collections.abc import Sequence
@@ -10,39 +10,41 @@ import typer
 from agalign.cli.command import Command, Given
 from agalign.cli.terminal import MAX_LISTED, RAW_NUMBERS, ExitCode, Terminal, examples
 from agalign.values.choices import ExportProgram
+from agalign.values.text import counted
 
 if TYPE_CHECKING:
     from agalign.products.indices.formulas import Index
     from agalign.products.indices.rasters import IndexReport
 
-Out = Annotated[Path, typer.Argument(help="Output folder of a run.", show_default=False)]
+Out = Annotated[Path, typer.Argument(help="Output folder of a run.")]
 _DEFAULT_INDEX = "ndvi"
 
 
 def _report(
     terminal: Terminal,
-    out: Annotated[Path, typer.Argument(help="Output folder of an earlier run.", show_default=False)],
+    out: Annotated[Path, typer.Argument(help="Output folder of an earlier run.")],
     as_json: Annotated[bool, typer.Option("--json", help="Print the content of the report as JSON.")] = False,
 ) -> int:
     """Rebuild the report and the summary from the sidecars."""
     from agalign.cli.align_run import explain
-    from agalign.products.report.pages import write_pages
+    from agalign.products.report.pages import REPORT_FILE, SUMMARY_FILE, write_pages
     from agalign.products.sidecar.file import run_sidecars
     from agalign.values.output_folder import locked
 
     run_sidecars(out)
     unreadable: list[str] = []
     with locked(out):
-        pages = write_pages(out, unreadable.append)
+        facts = write_pages(out, unreadable.append)
     for text in unreadable:
         terminal.problem(text)
     if as_json:
-        terminal.facts(pages.facts)
-        return ExitCode.PARTIAL if unreadable else ExitCode.OK
-    explain(pages.failures, terminal)
-    terminal.table(("Slowest", "Seconds"), [(label, f"{seconds:.1f}") for label, seconds in pages.slowest])
-    for path in (pages.report, pages.summary):
-        terminal.result(str(path))
+        terminal.facts(facts.as_json())
+    else:
+        explain(facts.pairs.groups(), terminal)
+        slowest = sorted(facts.captures, key=lambda c: -c["seconds"])[:5]
+        terminal.table(("Slowest", "Seconds"), [(c["label"], f"{c['seconds']:.1f}") for c in slowest])
+        for name in (REPORT_FILE, SUMMARY_FILE):
+            terminal.result(str(out / name))
     return ExitCode.PARTIAL if unreadable else ExitCode.OK
 
 
@@ -65,9 +67,7 @@ def _export(
     program: Annotated[
         ExportProgram,
         typer.Option(
-            "--for",
-            show_default=False,
-            help="Band files with tags for odm, metashape or pix4d; warp matrices for micasense or opencv.",
+            "--for", help="Band files with tags for odm, metashape or pix4d; warp matrices for micasense or opencv."
         ),
     ],
     target: Annotated[
@@ -84,16 +84,15 @@ def _export(
     run_folder = out.resolve()
     folder = target or run_folder.parent / f"{run_folder.name}-{program}"
     report = run_export(out, folder, program, copy=copy, source=source)
-    print_left_out(report.left_out, terminal)
+    _print_left_out(report.left_out, terminal)
     for line in report.notes:
         terminal.result(line)
-    text = f"{report.captures} captures, {len(report.files)} files in {folder}"
     terminal.event("export", captures=report.captures, files=len(report.files), folder=str(folder))
-    terminal.result(text)
+    terminal.result(f"{report.captures} captures, {len(report.files)} files in {folder}")
     return ExitCode.PARTIAL if report.left_out else ExitCode.OK
 
 
-def print_left_out(left_out: Sequence[tuple[str, str]], terminal: Terminal) -> None:
+def _print_left_out(left_out: Sequence[tuple[str, str]], terminal: Terminal) -> None:
     """Print the captures that a result omits, from (capture, reason)."""
     for label, reason in left_out[:MAX_LISTED]:
         terminal.problem(f"{label}: left out: {reason}", capture=label)
@@ -123,19 +122,15 @@ def _indices(
         typer.Option(
             "--index",
             "-i",
-            show_default=False,
             help=f"Names separated by commas: {_DEFAULT_INDEX} (the default), ndre, gndvi, ndwi, savi, evi …",
         ),
     ] = None,
     formula: Annotated[
         list[str] | None,
-        typer.Option(
-            show_default=False, help="A formula of the bands B, G, R, RE and N, as 'name=(N-R)/(N+R)'; repeatable."
-        ),
+        typer.Option(help="A formula of the bands B, G, R, RE and N, as 'name=(N-R)/(N+R)'; repeatable."),
     ] = None,
     target: Annotated[
-        Path | None,
-        typer.Option("-o", "--out", help="Folder for the rasters; by default next to the stacks.", show_default=False),
+        Path | None, typer.Option("-o", "--out", help="Folder for the rasters; by default next to the stacks.")
     ] = None,
     mask_qa: Annotated[
         bool, typer.Option("--mask-qa", help="Omit saturated, occluded and glint pixels; the run needs --qa.")
@@ -148,7 +143,7 @@ def _indices(
     from agalign.products.report.pages import REPORT_FILE, write_pages
     from agalign.values.output_folder import locked
 
-    chosen = chosen_indices(index, formula or [])
+    chosen = _chosen_indices(index, formula or [])
     folder, jobs = target or out, given["run"]["jobs"]
     tasks = index_tasks(out, chosen, folder, overwrite=given["run"]["overwrite"], mask_qa=mask_qa)
     terminal.event("found", captures=len(tasks), indices=len(chosen))
@@ -179,7 +174,9 @@ def _conclude(
         terminal.facts({"folder": str(folder), "indices": [_facts(r) for r in reports]})
     elif written:
         _print_table(names, reports, terminal)
-        _warn_of_masks(written, terminal)
+        if masked := sorted({r.capture for r in written if r.statistics.masked_share > 1 / 3}):
+            more = f" and {len(masked) - 1} more captures" if masked[1:] else ""
+            terminal.problem(f"--mask-qa leaves out more than a third of {masked[0]}{more}: look at the .qa.tif")
         terminal.result(f"Statistics: {folder / INDICES_FILE}")
     return ExitCode.NOTHING if not written else ExitCode.OK if len(written) == len(reports) else ExitCode.PARTIAL
 
@@ -197,7 +194,7 @@ indices = Command(
 )
 
 
-def chosen_indices(names: str | None, formulas: Sequence[str]) -> "list[Index]":
+def _chosen_indices(names: str | None, formulas: Sequence[str]) -> "list[Index]":
     """Return the indices of names and formulas, or the default one. Raises ConfigurationError."""
     from agalign.errors import ConfigurationError
     from agalign.products.indices.formulas import index_named, index_of_formula
@@ -233,14 +230,6 @@ def _facts(report: "IndexReport") -> dict[str, Any]:
     }
 
 
-def _warn_of_masks(written: "Sequence[IndexReport]", terminal: Terminal) -> None:
-    """Name the captures with more than a third of the pixels masked by quality flags."""
-    captures = sorted({r.capture for r in written if r.statistics.masked_share > 1 / 3})
-    if captures:
-        more = f" and {len(captures) - 1} more captures" if captures[1:] else ""
-        terminal.problem(f"--mask-qa leaves out more than a third of {captures[0]}{more}: look at the .qa.tif")
-
-
 def _print_table(names: Sequence[str], reports: "Sequence[IndexReport]", terminal: Terminal) -> None:
     """Print a row per index: statistics of the medians of its captures."""
     from statistics import median
@@ -260,3 +249,52 @@ def _print_table(names: Sequence[str], reports: "Sequence[IndexReport]", termina
             rows.append((name, str(len(values)), *(f"{number:.3f}" for number in numbers), f"{masked:.1%}"))
     title = f"{len(written)} of {len(reports)} written; medians of captures"
     terminal.table(("Index", "Captures", "Median", "Lowest", "Highest", "Masked"), rows, title, texts=1)
+
+
+def _mosaic(
+    terminal: Terminal,
+    out: Out,
+    target: Annotated[Path | None, typer.Option("-o", "--out", help="By default OUT/mosaic.tif.")] = None,
+    index: Annotated[str | None, typer.Option("--index", "-i", help="Names of indices separated by commas.")] = None,
+    gsd: Annotated[float | None, typer.Option(min=1e-4, help="Pixel size, m; by default that of the captures.")] = None,
+    untied: Annotated[bool, typer.Option("--untied", help="Also place captures without tie points.")] = False,
+) -> int:
+    """Join the aligned captures of a flight into a quick mosaic for viewing.
+
+    Tie points between overlapping captures refine the georeference from GPS and attitude; captures without any to the
+    others are left out. The ground is assumed to be a horizontal plane: the mosaic shows a field and its zones, and
+    replaces neither an orthomosaic (OpenDroneMap) nor ground control.
+    """
+    from agalign.products.mosaic.compose import mosaic as make_mosaic
+
+    chosen = [] if index is None else [one.name for one in _chosen_indices(index, [])]
+    path = target or out / "mosaic.tif"
+    report = make_mosaic(out, path, indices=chosen, gsd_m=gsd, untied=untied)
+    left_out = [*report.left_out, *((path.name, r.problem) for r in report.indices if r.problem)]
+    _print_left_out(left_out, terminal)
+    if report.untied:
+        names = ", ".join(report.untied[:MAX_LISTED]) + (" …" if report.untied[MAX_LISTED:] else "")
+        place = f"placed by the georeference, accurate to {report.accuracy_m:.0f} m"
+        terminal.problem(f"{counted(len(report.untied), 'capture')} without tie points to the others: {place}: {names}")
+    if report.height_is_assumed:
+        terminal.problem("the height above ground is assumed, so the scale is uncertain; align with --ground-elevation")
+    if any(r.raw_numbers for r in report.indices):
+        terminal.problem(RAW_NUMBERS)
+    terminal.event("mosaic", **{k: v for k, v in vars(report).items() if k not in ("left_out", "indices")})
+    if report.pairs:
+        ties = f"{report.pairs} overlaps, {report.tie_points} tie points that were not used"
+        misfits = {ties: report.misfit_m, "by the georeference": report.georeference_misfit_m}
+        for source, (median_m, p95_m) in misfits.items():
+            terminal.result(f"Misfit between captures, {source}: median {median_m:.2f} m, p95 {p95_m:.2f} m")
+    place = f"{report.accuracy_m:.1f} m, as the georeference of a capture; no ground control"
+    terminal.result(f"Position on the map: accurate to {place}")
+    files = [path, *(r.path for r in report.indices if r.path is not None)]
+    terminal.result(f"Mosaic of {report.captures} captures: {', '.join(map(str, files))}")
+    return ExitCode.PARTIAL if left_out else ExitCode.OK
+
+
+mosaic = Command(
+    _mosaic,
+    {"Output": "target index gsd untied", "Running": "quiet log_json"},
+    epilog=examples(("agalign mosaic aligned/ -o field.tif --index ndvi", "field.tif, all bands, and field_ndvi.tif")),
+)

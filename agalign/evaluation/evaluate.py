@@ -1,24 +1,295 @@
-"""Evaluation of methods on pairs from several initial homographies, and tables of the results."""
+"""Evaluation of methods on pairs from several initial homographies, and tables of the results. The methods: descriptors
+learned on the pair, pretrained and hand-crafted descriptors, and elastix.
 
+A method returns descriptors of patches of both images, a homography, or both, from a pair and an initial homography.
+"""
+
+import importlib
+import importlib.util
 import math
+import re
 import time
 import zlib
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import astuple, dataclass, fields
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import astuple, dataclass, fields, replace
 from itertools import product
 from pathlib import Path
+from typing import get_args
 
+import cv2
 import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+from torch.nn import functional
 
-from agalign.errors import InputError
+from agalign.capture.band_pair import BandPair
+from agalign.capture.seeding import best_seed, image_groups
+from agalign.config import JointSettings
+from agalign.errors import ConfigurationError, GeometryError, InputError, NoContrastError, NotEnoughTextureError
 from agalign.evaluation.image_pairs import PairFiles, read_image
-from agalign.evaluation.methods import Method, Outcome, PairTask, average_precision, homography_error_px
+from agalign.flight.model import load_model
+from agalign.method.descriptor import Descriptor
 from agalign.method.device import one_memory_error, one_thread
-from agalign.method.match import sift_keypoints, visible_in_both
-from agalign.method.patches import Keypoints
+from agalign.method.fast import learn
+from agalign.method.match import matching_network, sift_keypoints, to_8_bit, visible_in_both
+from agalign.method.paper import align_by_paper, pyramid
+from agalign.method.patches import Keypoints, bilinear, patch_positions, transform
+from agalign.method.refine import MovingBand, describe_fixed, refine
+from agalign.method.state import ImageGroup, JointState
+from agalign.pixels.band_resampling import channel_mean, luma, warped
 from agalign.products.text_files import write_csv
 from agalign.values import geometry
+from agalign.values.alignment import JointResult, Seed
+from agalign.values.choices import Sharing
 from agalign.values.geometry import Matrix
+from agalign.values.image import Raster
+from agalign.values.mapping import PixelMapping
+
+
+@dataclass(frozen=True)
+class PairTask:
+    """Two images and the initial homography."""
+
+    fixed: Raster
+    moving: Raster
+    start: Matrix
+    """Initial fixed_to_moving, px."""
+    device: str = "auto"
+    rng_seed: int = 0
+    seeding: bool = True
+    """Correct `start` by the initial alignment first, as a run does."""
+
+
+Describe = Callable[[Keypoints, Matrix], tuple[Tensor, Tensor]]
+"""Return descriptors (f, f'), each (N, D), of the patches around keypoints of the first image, and of the patches of
+the second image that a homography maps them to."""
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """Result of a method for a pair."""
+
+    describe: Describe | None = None
+    fixed_to_moving: Matrix | None = None
+
+
+Method = Callable[[PairTask], Outcome]
+
+
+def method_named(name: str) -> Method:
+    """Return the method of a name on the command line.
+
+    * `fast`, `scratch` or `paper`, a colon and the sharing (`siamese`, `pseudo-siamese`, `unshared`): learned on the
+      pair by that recipe. `:grey` added: on grey images.
+    * `sift`, `daisy`, `elastix`.
+    * FILE.safetensors: a network of this program. FILE.pt: a TorchScript module that takes (N, 1, P, P) in [0, 1]; P is
+      32, or what follows an @, as in hardnet.pt@32.
+
+    Raises ConfigurationError for other names, InputError for a file that cannot be used.
+    """
+    fixed_names: dict[str, Method] = {
+        "sift": lambda task: _from_patches(task, 64, sift_of_patches),
+        "daisy": lambda task: _from_patches(task, 64, daisy_of_patches),
+        "elastix": _elastix,
+    }
+    if name == "elastix" and importlib.util.find_spec("itk") is None:
+        raise ConfigurationError(f"{name} needs more than is installed; in a checkout: pip install '.[evaluate]'")
+    if name in fixed_names:
+        return fixed_names[name]
+    learned = re.fullmatch(r"(fast|scratch|paper):([a-z-]+)(:grey)?", name)
+    if learned and learned[2] in get_args(Sharing):
+        settings = JointSettings.model_validate({"recipe": learned[1], "sharing": learned[2]})
+        return lambda task: _learned_on_pair(task, settings, colour=learned[3] is None)
+    if ".safetensors" in name:
+        return _saved_network(Path(name))
+    if ".pt" in name:
+        file, _, side = name.partition("@")
+        return _torchscript(Path(file), int(side) if side.isdigit() else 32)
+    raise ConfigurationError(
+        f"unknown method '{name}'; choose from sift, daisy, elastix, RECIPE:SHARING or a network file"
+    )
+
+
+# ---- descriptors of agalign
+
+
+def _learned_on_pair(task: PairTask, settings: JointSettings, *, colour: bool) -> Outcome:
+    """Learn a descriptor and a homography on the pair."""
+    fixed, moving = task.fixed, task.moving
+    if not colour or (settings.sharing == "siamese" and fixed.channels != moving.channels):
+        fixed, moving = (_without_colour(r) for r in (fixed, moving))
+    settings = settings.model_copy(update={"device": task.device, "rng_seed": task.rng_seed})
+    seed = Seed("user", task.start, 0.0)
+    pair = BandPair.of_images("moving", fixed, moving, {"user": task.start})
+    if task.seeding:
+        seed = best_seed(pair, pair.seed_matrices)
+    state, [(_, group)] = JointState(settings, lambda *_: None), image_groups([pair], [seed])
+    try:
+        if settings.recipe == "paper":
+            net, result = align_by_paper(state, group)
+        else:
+            net = state.fast_descriptor([fixed.channels, moving.channels])
+            learn(state, [group], net)
+            result = refine(state, net, group)[0]
+    except (NotEnoughTextureError, NoContrastError, GeometryError):
+        return Outcome(None, seed.fixed_to_moving)
+    mapping = result.fixed_to_moving if isinstance(result, JointResult) else group.mappings[0]
+    return Outcome(_by_network(net, state, fixed, moving), mapping)
+
+
+def _without_colour(raster: Raster) -> Raster:
+    return replace(raster, pixels=luma(raster.pixels))
+
+
+def _by_network(net: Descriptor, state: JointState, one: Raster, other: Raster) -> Describe:
+    @torch.no_grad()
+    def describe(keypoints: Keypoints, fixed_to_moving: Matrix) -> tuple[Tensor, Tensor]:
+        level = state.level(ImageGroup.of_one(one, other, fixed_to_moving), 1.0, [0])
+        h, keypoints = level.homography(fixed_to_moving, 0), keypoints.to(state.device)
+        return describe_fixed(net, level, keypoints), MovingBand(net, level, 0, 1).describe(keypoints, h)
+
+    return describe
+
+
+def _saved_network(path: Path) -> Method:
+    """Return a network of `agalign learn` or of an earlier run; images with another number of channels become grey."""
+    model = load_model(path, lambda: torch.device("cpu"))
+
+    def method(task: PairTask) -> Outcome:
+        fixed, moving = (
+            r if r.channels == channels else _without_colour(r)
+            for r, channels in zip((task.fixed, task.moving), model.net.channels, strict=False)
+        )
+        net = matching_network(model.net, 1, (fixed.channels, moving.channels))
+        state = JointState(JointSettings(device="cpu"), lambda *_: None)
+        return Outcome(_by_network(net, state, fixed, moving))
+
+    return method
+
+
+# ---- other methods
+
+
+def _from_patches(task: PairTask, side: int, describe_patches: Callable[[Tensor], Tensor]) -> Outcome:
+    """Return the outcome of a descriptor of patches (N, 1, side, side) in [0, 1]."""
+
+    def describe(keypoints: Keypoints, fixed_to_moving: Matrix) -> tuple[Tensor, Tensor]:
+        grid = patch_positions(keypoints, side)
+        mapped = transform(torch.tensor(fixed_to_moving, dtype=torch.float32), grid)
+        return describe_patches(grey_patches(task.fixed, grid)), describe_patches(grey_patches(task.moving, mapped))
+
+    return Outcome(describe)
+
+
+def _mosaic(patches: Tensor) -> tuple[NDArray[np.float32], int, int]:
+    """Return (image, its columns, side of a cell): patches (N, 1, P, P) row by row in one image for OpenCV and
+    scikit-image, each padded with its edge values.
+    """
+    margin = patches.shape[-1] // 8  # SIFT's outer cells extend beyond the edge of a patch by an eighth of its side
+    padded = functional.pad(patches, [margin] * 4, mode="replicate")
+    columns = max(1, math.ceil(math.sqrt(len(patches))))
+    rows = max(1, math.ceil(len(patches) / columns))
+    side = padded.shape[-1]
+    sheet = padded.new_zeros((rows * columns, side, side))
+    sheet[: len(patches)] = padded[:, 0]
+    image = sheet.reshape(rows, columns, side, side).swapaxes(1, 2).reshape(rows * side, -1)
+    return np.asarray(image.numpy()), columns, side
+
+
+def sift_of_patches(patches: Tensor) -> Tensor:
+    """(N, 1, P, P) -> (N, 128): SIFT at the centre, upright, its 4 x 4 cells over the whole patch."""
+    image, columns, side = _mosaic(patches)
+    rows_columns = (divmod(i, columns) for i in range(len(patches)))
+    centres = ((c * side + (side - 1) / 2, r * side + (side - 1) / 2) for r, c in rows_columns)
+    keypoints = [cv2.KeyPoint(x, y, patches.shape[-1] / 6, 0.0, 1.0, 0) for x, y in centres]
+    _, result = cv2.SIFT.create().compute(np.asarray((image * 255).round(), np.uint8), keypoints)
+    return torch.from_numpy(np.asarray(result, np.float32).reshape(len(patches), -1))
+
+
+def daisy_of_patches(patches: Tensor) -> Tensor:
+    """(N, 1, P, P) -> (N, 200): DAISY (Tola et al. 2010) at the centre, three rings of eight over the whole patch."""
+    from skimage.feature import daisy
+
+    image, columns, side = _mosaic(patches)
+    radius = patches.shape[-1] * 3 // 8  # plus the width of the outer ring: the edge of the patch
+    first = side // 2 - radius
+    result = daisy(image[first:, first:], step=side, radius=radius, rings=3, histograms=8, orientations=8)
+    return torch.from_numpy(result[:, :columns].reshape(-1, result.shape[-1])[: len(patches)].astype(np.float32))
+
+
+def _torchscript(path: Path, side: int) -> Method:
+    try:
+        module = torch.jit.load(str(path), map_location="cpu").eval()  # type: ignore[no-untyped-call]
+        with torch.no_grad():
+            module(torch.zeros(2, 1, side, side))
+    except (OSError, RuntimeError, ValueError) as error:
+        problem = str(error).strip().splitlines()[-1]
+        raise InputError(f"{path}: not a TorchScript module of {side} x {side} patches ({problem})") from None
+
+    @torch.no_grad()
+    def describe(patches: Tensor) -> Tensor:
+        return torch.cat([module(some).flatten(1) for some in torch.split(patches, 512)])
+
+    return lambda task: _from_patches(task, side, describe)
+
+
+def _elastix(task: PairTask) -> Outcome:
+    """Register the pair by elastix with the number of pyramid levels of recipe paper."""
+    moving = warped(channel_mean(task.moving), PixelMapping(task.start), task.fixed.size_px)
+    levels = len(pyramid(max(task.fixed.size_px)))
+    result = elastix_affinity(channel_mean(task.fixed), moving, levels)
+    return Outcome(None, task.start if result is None else geometry.compose(task.start, result))
+
+
+def elastix_affinity(fixed: Raster, moving: Raster, levels: int | None = None) -> Matrix | None:
+    """Return fixed_to_moving of two single-band images by elastix's affine registration with Mattes mutual information.
+
+    None if the registration fails, for example because too many samples are outside the moving image. `levels` of the
+    pyramid are elastix's default if None.
+    """
+    itk = importlib.import_module("itk")
+    parameters = itk.ParameterObject.New()
+    chosen = parameters.GetDefaultParameterMap("affine")
+    if levels is not None:
+        chosen["NumberOfResolutions"] = [str(levels)]
+    parameters.AddParameterMap(chosen)
+    images = [itk.GetImageFromArray(np.ascontiguousarray(r.pixels)) for r in (fixed, moving)]
+    try:
+        _, result = itk.elastix_registration_method(*images, parameter_object=parameters, log_to_console=False)
+    except RuntimeError:
+        return None
+    table = result.GetParameterMap(0)
+    a, b, c, d, tx, ty = (float(v) for v in table["TransformParameters"])
+    centre = np.array([float(v) for v in table["CenterOfRotationPoint"]])
+    linear = np.array([[a, b], [c, d]])
+    matrix = np.eye(3)
+    matrix[:2, :2], matrix[:2, 2] = linear, np.array([tx, ty]) + centre - linear @ centre
+    return matrix
+
+
+def grey_patches(raster: Raster, grid: Tensor) -> Tensor:
+    """Return grey patches (N, 1, side, side) in [0, 1] at positions (N, side, side, 2) px."""
+    plane = torch.from_numpy(to_8_bit(raster).astype(np.float32) / 255)
+    return bilinear(plane[None], grid)
+
+
+def average_precision(f: Tensor, f_prime: Tensor) -> float:
+    """Return the share of descriptors (N, D) of the first image with the corresponding descriptor as exact L2 nearest
+    neighbour among those of the second (N, D); nan for N = 0.
+    """
+    if len(f) == 0:
+        return math.nan
+    nearest = torch.cat([torch.cdist(some, f_prime).argmin(dim=1) for some in torch.split(f, 512)])
+    return float((nearest == torch.arange(len(f), device=f.device)).float().mean())
+
+
+def homography_error_px(result: Matrix, truth: Matrix, points: NDArray[np.float64]) -> float:
+    """Return the mean distance of points (N, 2) mapped by two homographies, px of the second image."""
+    return float(np.linalg.norm(geometry.apply(result, points) - geometry.apply(truth, points), axis=1).mean())
+
+
+# ---- evaluation
 
 
 @dataclass(frozen=True)
@@ -80,21 +351,16 @@ def evaluate(
                 with one_thread(), one_memory_error():
                     outcome = method(PairTask(fixed, moving, start, device, rng_seed, starts.seeding))
                 seconds = time.perf_counter() - began
-                precision, error_px = _scores(outcome, keypoints, truth)
+                precision = error_px = math.nan
+                if outcome.describe is not None and len(keypoints):
+                    precision = average_precision(*outcome.describe(keypoints, truth))
+                if outcome.fixed_to_moving is not None and len(keypoints):
+                    points_px = keypoints.xy.numpy().astype(np.float64)
+                    error_px = homography_error_px(outcome.fixed_to_moving, truth, points_px)
                 share = error_px / max(moving.size_px)
                 yield Result(pair.name, pair.group, name, shift, len(keypoints), precision, error_px, share, seconds)
                 if outcome.fixed_to_moving is None:
                     break
-
-
-def _scores(outcome: Outcome, keypoints: Keypoints, truth: Matrix) -> tuple[float, float]:
-    """Return (average precision, error in px of the second image); nan for what a method does not return."""
-    precision = error_px = math.nan
-    if outcome.describe is not None and len(keypoints):
-        precision = average_precision(*outcome.describe(keypoints, truth))
-    if outcome.fixed_to_moving is not None and len(keypoints):
-        error_px = homography_error_px(outcome.fixed_to_moving, truth, keypoints.xy.numpy().astype(np.float64))
-    return precision, error_px
 
 
 def write_results(path: Path, results: Sequence[Result]) -> None:
@@ -125,23 +391,11 @@ def error_table(results: Sequence[Result]) -> list[list[str]]:
     measured = [r for r in results if not math.isnan(r.error_px)]
     for method, shift in product(*(dict.fromkeys(getattr(r, name) for r in results) for name in ("method", "shift"))):
         own = [r for r in measured if (r.method, r.shift) == (method, shift)]
-        rows += [_error_row(method, shift, own)] if own else []
+        if own:
+            e, shares, seconds = np.array([(r.error_px, r.error_share, r.seconds) for r in own]).T
+            errors = f"{np.median(e):.3f}", f"{e.max():.2f}", f"{shares.mean():.3%}", f"{(e < 1).sum()} of {len(e)}"
+            rows.append([method, f"{shift:.1%}", *errors, f"{_mean_precision(own):.3f}", f"{np.median(seconds):.1f}"])
     return rows
-
-
-def _error_row(method: str, shift: float, own: Sequence[Result]) -> list[str]:
-    e = np.array([r.error_px for r in own])
-    share = float(np.mean([r.error_share for r in own]))
-    return [
-        method,
-        f"{shift:.1%}",
-        f"{np.median(e):.3f}",
-        f"{e.max():.2f}",
-        f"{share:.3%}",
-        f"{(e < 1).sum()} of {len(e)}",
-        f"{_mean_precision(own):.3f}",
-        f"{np.median([r.seconds for r in own]):.1f}",
-    ]
 
 
 def _mean_precision(results: Sequence[Result]) -> float:

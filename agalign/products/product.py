@@ -1,5 +1,6 @@
 """The interface `Product` of each kind of output of a capture, and its arguments and results."""
 
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -8,14 +9,7 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 from agalign.config import Settings, WriteSettings
-from agalign.products.rasters.checked_raster import (
-    FLOAT_OPTIONS,
-    Block,
-    LayerDescription,
-    georeference_tags,
-    grid_profile,
-    write_layers,
-)
+from agalign.products.rasters.checked_raster import Block, LayerDescription, write_on_grid
 from agalign.products.rasters.layout import FlightLimits, Layer
 from agalign.products.report.drawing import ReducedBands, read_reduced_bands
 from agalign.products.sidecar.schema import PreviewPart, is_usable
@@ -81,6 +75,11 @@ class WrittenFile:
     is_flat: bool = False
     """The vignetting of raw numbers is corrected in the pixels."""
 
+    @property
+    def nodata_in_json(self) -> float | str | None:
+        """The nodata value, with the text "nan" for nan, which JSON does not have."""
+        return "nan" if self.nodata is not None and math.isnan(self.nodata) else self.nodata
+
     @cached_property
     def sha256(self) -> str:
         """Checksum of the file. Raises OutputError."""
@@ -105,11 +104,6 @@ class ProductContext:
     """Limits of all flights of the camera, as far as their rigs are known."""
     written: list[WrittenFile] = field(default_factory=list)
     """Files of the products before this one in `PRODUCTS`."""
-
-    @property
-    def write_settings(self) -> WriteSettings:
-        """The settings of the outputs."""
-        return self.settings.write
 
     @property
     def with_pixels(self) -> dict[str, Alignment[FixedFilePx]]:
@@ -186,13 +180,12 @@ class Product(ABC):
         layers: Sequence[LayerDescription],
         blocks: Iterable[Block],
         asset: StacAsset,
-        *,
-        tags: Mapping[str, str] | None = None,
-        dtype: str = "float32",
-        options: Mapping[str, Any] = FLOAT_OPTIONS,
+        **options: Any,
     ) -> list[WrittenFile]:
-        """Write one raster on the grid of the capture, with its georeference, and return it. Raises OutputError."""
+        """Write one raster on the grid of the capture, with these options of `write_on_grid`, and return it.
+
+        Raises OutputError.
+        """
         path, georeference = context.paths.file(self.suffix), context.capture.reference.georeference
-        profile = grid_profile(context.grid, georeference, len(layers), dtype, **options)
-        write_layers(path, profile, layers, {**(tags or {}), **georeference_tags(georeference)}, blocks)
+        write_on_grid(path, context.grid, georeference, layers, blocks, **options)
         return [WrittenFile(self.kind, path, asset)]

@@ -5,9 +5,8 @@ from agalign.products.exports.tie_points import TiePoints
 from agalign.products.indices.rasters import IndexRasters
 from agalign.products.product import Product
 from agalign.products.rasters.aligned_files import BandFiles, Stack
+from agalign.products.rasters.alignment_maps import ErrorMap, QualityRaster, ReliefMap
 from agalign.products.rasters.pan_sharpen import PanSharpened
-from agalign.products.rasters.quality_raster import ErrorMap, QualityRaster
-from agalign.products.rasters.relief_map import ReliefMap
 from agalign.products.report.preview import BeforeAfterPicture, Preview
 
 PRODUCTS: tuple[Product, ...] = (

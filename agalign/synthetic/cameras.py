@@ -1,18 +1,175 @@
-"""The camera of the synthetic flight of `agalign demo`: its bands, and its files with MicaSense's names and tags."""
+"""Synthetic cameras: lenses, positions, orientations and spectra of their bands, their homographies to the ground, and
+the camera of `agalign demo` with MicaSense's file names and tags.
+"""
 
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
+from typing import ClassVar, Literal
 
+import cv2
 import numpy as np
 import tifffile
+from jinja2 import Environment, PackageLoader, StrictUndefined, Template
 from numpy.typing import NDArray
 
 from agalign.cameras.tiff_directory import Directory, Entry, add_directories, byte_string, rational, short, text
-from agalign.synthetic.camera_model import PIXELS_PER_MM, BandSpec, CameraSpec, Exposure, Pose
+from agalign.values import geometry
+from agalign.values.geometry import Matrix
+from agalign.values.lens import Lens
 
+PIXELS_PER_MM = 266.666667
+FOCAL_LENGTH_MM = 5.45
 BLACK_LEVEL, WHITE_LEVEL = 4800.0, 52000.0
 EXPOSURE_S = 1.3e-3
 _IRRADIANCE = 0.8
 """W/m^2/nm at every wavelength."""
+
+
+@dataclass(frozen=True)
+class BandSpec:
+    """One camera of the rig."""
+
+    name: str
+    wavelength_nm: float
+    bandwidth_nm: float
+    soil: float
+    crop: float
+    tree: float
+    """Reflectances, 0 to 1."""
+    rig_index: int
+    rig_degrees: tuple[float, float, float]
+    baseline_m: tuple[float, float]
+    """Position of the lens in the rig, metres right of and below the centre of the rig."""
+    distortion: tuple[float, float, float, float, float]
+    """k1, k2, p1, p2, k3."""
+    centre_offset_px: tuple[float, float]
+    """Offset of the principal point from the centre of a 1280 x 960 sensor."""
+    delay_s: float = 0.0
+    """Delay of its exposure after the first band's."""
+    sees: Literal["light", "colour", "heat"] = "light"
+    """colour: one of three bands in one file; heat: the reflectances are temperatures, as shares of 50 degrees C."""
+    size_ratio: tuple[float, float] = (1.0, 1.0)
+    """Width and height of its images relative to those of the reference."""
+    tags_off_deg: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """Error of the angles in its tags."""
+    view: float = 1.0
+    """Field of view as a multiple of the RedEdge-M's."""
+
+    @property
+    def exposure(self) -> float:
+        """Signal of a reflectance of 1, as a share of full scale."""
+        return 0.55 / max(self.soil, self.crop)
+
+    @property
+    def focal_length_mm(self) -> float:
+        """Focal length; all sensors are 4.8 mm wide."""
+        return FOCAL_LENGTH_MM / self.view
+
+    def size_px(self, camera_px: tuple[int, int]) -> tuple[int, int]:
+        """(width, height) of its images for a camera with this size of the reference's images."""
+        return round(camera_px[0] * self.size_ratio[0]), round(camera_px[1] * self.size_ratio[1])
+
+    def lens(self, width_px: int, height_px: int) -> Lens:
+        """The lens for a camera with this size of the reference's images; smaller images have larger pixels."""
+        width, height = self.size_px((width_px, height_px))
+        scale = width / 1280
+        focal = self.focal_length_mm * PIXELS_PER_MM * scale
+        cx = (width - 1) / 2 + self.centre_offset_px[0] * scale
+        cy = (height - 1) / 2 + self.centre_offset_px[1] * scale
+        return Lens(focal, focal, cx, cy, self.distortion)
+
+
+@dataclass(frozen=True)
+class Pose:
+    """Position and attitude of the rig at a capture."""
+
+    altitude_m: float
+    yaw_deg: float
+    roll_deg: float
+    pitch_deg: float
+    east_m: float
+    north_m: float
+    velocity_m_s: tuple[float, float] = (0.0, 0.0)
+    """East and south."""
+
+
+@dataclass(frozen=True)
+class Exposure:
+    """Conditions of one image of a band."""
+
+    pose: Pose
+    number: int
+    """Number of the capture, from 1."""
+    size_px: tuple[int, int]
+    """(width, height) of the reference's images."""
+    vignetting: float
+    """Relative decrease of the light from the centre to the corners."""
+    shutter: float = 1.0
+    """Exposure time as a multiple of the normal one."""
+
+    @property
+    def moment(self) -> str:
+        """Time in the format of Exif."""
+        return f"2026:06:21 10:{self.number // 60:02d}:{self.number % 60:02d}"
+
+
+@dataclass(frozen=True)
+class CameraSpec(ABC):
+    """A camera; its subclasses write the files of a maker."""
+
+    maker: ClassVar[str]
+    model: str
+    bands: tuple[BandSpec, ...]
+    reference: int
+    """Index of the band that the others are aligned to."""
+    size_px: tuple[int, int] = (1280, 960)
+    """(width, height) of the reference's images."""
+
+    @abstractmethod
+    def capture_name(self, number: int) -> str:
+        """Return the shared part of the file names of a capture; numbers start at 1."""
+
+    @abstractmethod
+    def file_name(self, band: BandSpec, number: int) -> str:
+        """Return the name of a band's file, with its folder if each band has a folder."""
+
+    @abstractmethod
+    def write_band(self, path: Path, pixels: NDArray[np.uint16], band: BandSpec, exposure: Exposure) -> None:
+        """Write (height, width) pixels and their tags."""
+
+
+def true_homography(reference: BandSpec, band: BandSpec, pose: Pose, size_px: tuple[int, int]) -> Matrix:
+    """Return fixed_to_moving between undistorted pixels, from the homographies of both bands to the ground plane."""
+    return geometry.compose(
+        geometry.invert(_pixel_to_ground(band, pose, size_px)), _pixel_to_ground(reference, pose, size_px)
+    )
+
+
+def _pixel_to_ground(band: BandSpec, pose: Pose, size_px: tuple[int, int]) -> Matrix:
+    """Return the homography from undistorted pixels to metres east and south on the ground plane."""
+    position, rays = place_and_rays(band, pose, size_px)
+    # ground = position + ray * (-position_z / ray_z); multiplied by ray_z, it is linear in the ray.
+    ray_to_ground = np.array([[-position[2], 0.0, position[0]], [0.0, -position[2], position[1]], [0.0, 0.0, 1.0]])
+    return geometry.normalised(ray_to_ground @ rays)
+
+
+def place_and_rays(band: BandSpec, pose: Pose, size_px: tuple[int, int]) -> tuple[NDArray[np.float64], Matrix]:
+    """Return the position of the lens (metres east, south, down) and the 3x3 matrix from undistorted pixels to rays."""
+    attitude = rotation(pose.roll_deg, pose.pitch_deg, pose.yaw_deg)
+    rays = attitude @ rotation(*band.rig_degrees) @ np.linalg.inv(band.lens(*size_px).matrix)
+    flown = band.delay_s * np.array([*pose.velocity_m_s, 0.0])
+    place = attitude @ np.array([*band.baseline_m, 0.0]) + flown + (pose.east_m, pose.north_m, -pose.altitude_m)
+    return place, rays
+
+
+def rotation(a_deg: float, b_deg: float, c_deg: float) -> Matrix:
+    """Return the product of the rotations about x, y and z by these angles."""
+    rotations = [
+        cv2.Rodrigues(np.radians(angle) * axis)[0] for angle, axis in zip((a_deg, b_deg, c_deg), np.eye(3), strict=True)
+    ]
+    return np.asarray(rotations[0] @ rotations[1] @ rotations[2], np.float64)
 
 
 class MicaSenseCamera(CameraSpec):
@@ -31,84 +188,34 @@ class MicaSenseCamera(CameraSpec):
     def write_band(self, path: Path, pixels: NDArray[np.uint16], band: BandSpec, exposure: Exposure) -> None:
         """Write (height, width) pixels and their tags."""
         black = {} if band.sees == "heat" else {50714: short(round(BLACK_LEVEL))}
-        write_tiff(
-            path,
-            pixels,
-            self,
-            band,
-            exposure,
-            self._xmp(band, exposure, _pixels_per_mm(pixels)),
-            "SY01-0000001-AG",
-            {305: text("agalign demo"), **black},
-            {0x829A: rational(EXPOSURE_S * exposure.shutter), 0x8827: short(100), 0x9290: text("000000")},
-        )
+        first, xmp = {305: text("agalign demo"), **black}, self._xmp(band, exposure, _pixels_per_mm(pixels))
+        exif = {0x829A: rational(EXPOSURE_S * exposure.shutter), 0x8827: short(100), 0x9290: text("000000")}
+        write_tiff(path, pixels, self, band, exposure, xmp, "SY01-0000001-AG", first, exif)
 
     def _xmp(self, band: BandSpec, exposure: Exposure, density: float) -> str:
-        model, pose = band.lens(*exposure.size_px), exposure.pose
-        k1, k2, p1, p2, k3 = band.distortion
-        rig = ", ".join(f"{v + off:.6f}" for v, off in zip(band.rig_degrees, band.tags_off_deg, strict=True))
-        light = "" if band.sees == "heat" else _light_xmp(band, exposure)
-        return f"""<?xpacket begin="" id="W5M0MpCehiHzreSzNTczkc9d"?>
-<x:xmpmeta xmlns:x="adobe:ns:meta/">
- <rdf:RDF xmlns:rdf="http://www.w3.org/1999/02/22-rdf-syntax-ns#">
-  <rdf:Description rdf:about="Pix4D Camera Information" xmlns:Camera="http://pix4d.com/camera/1.0">
-   <Camera:RigName>{self.model}</Camera:RigName>
-   <Camera:BandName>{band.name}</Camera:BandName>
-   <Camera:CentralWavelength>{band.wavelength_nm:g}</Camera:CentralWavelength>
-   <Camera:WavelengthFWHM>{band.bandwidth_nm:g}</Camera:WavelengthFWHM>
-   <Camera:ModelType>perspective</Camera:ModelType>
-   <Camera:PrincipalPoint>{model.cx_px / density:.8f},{model.cy_px / density:.8f}</Camera:PrincipalPoint>
-   <Camera:PerspectiveFocalLength>{band.focal_length_mm}</Camera:PerspectiveFocalLength>
-   <Camera:PerspectiveFocalLengthUnits>mm</Camera:PerspectiveFocalLengthUnits>
-   <Camera:PerspectiveDistortion>
-    <rdf:Seq>
-     <rdf:li>{k1}</rdf:li><rdf:li>{k2}</rdf:li><rdf:li>{k3}</rdf:li><rdf:li>{p1}</rdf:li><rdf:li>{p2}</rdf:li>
-    </rdf:Seq>
-   </Camera:PerspectiveDistortion>
-   <Camera:RigRelatives>{rig}</Camera:RigRelatives>
-   <Camera:RigTranslations>{band.baseline_m[0]:.4f}, {band.baseline_m[1]:.4f}, 0</Camera:RigTranslations>
-   <Camera:Yaw>{pose.yaw_deg:.4f}</Camera:Yaw>
-   <Camera:Pitch>{pose.pitch_deg:.4f}</Camera:Pitch>
-   <Camera:Roll>{pose.roll_deg:.4f}</Camera:Roll>
-   <Camera:RigCameraIndex>{band.rig_index}</Camera:RigCameraIndex>
-   <Camera:RigRelativesReferenceRigCameraIndex>{self.bands[self.reference].rig_index}</Camera:RigRelativesReferenceRigCameraIndex>
-  </rdf:Description>
-  <rdf:Description rdf:about="Pix4D Camera Information" xmlns:MicaSense="http://micasense.com/MicaSense/1.0/">
-   <MicaSense:FlightId>syntheticflight00001</MicaSense:FlightId>
-   <MicaSense:CaptureId>synthetic{exposure.number:011d}</MicaSense:CaptureId>
-   <MicaSense:PressureAlt>{pose.altitude_m:.3f}</MicaSense:PressureAlt>
-  </rdf:Description>
-{light} </rdf:RDF>
-</x:xmpmeta>
-<?xpacket end="w"?>
-"""
+        """The tags in XMP, given the pixels per mm: with vignetting, calibration and light sensor except for heat."""
+        angles = (v + off for v, off in zip(band.rig_degrees, band.tags_off_deg, strict=True))
+        width, height = band.size_px(exposure.size_px)
+        return _xmp_template().render(
+            camera=self,
+            band=band,
+            exposure=exposure,
+            lens=band.lens(*exposure.size_px),
+            density=density,
+            rig=", ".join(f"{angle:.6f}" for angle in angles),
+            width=width,
+            height=height,
+            fall=-exposure.vignetting / ((width / 2) ** 2 + (height / 2) ** 2),
+            gain=_IRRADIANCE / np.pi * EXPOSURE_S * 65536 / (WHITE_LEVEL - BLACK_LEVEL) / band.exposure,
+            irradiance=_IRRADIANCE,
+        )
 
 
-def _light_xmp(band: BandSpec, exposure: Exposure) -> str:
-    """Vignetting, radiometric calibration and light sensor."""
-    width, height = band.size_px(exposure.size_px)
-    fall = -exposure.vignetting / ((width / 2) ** 2 + (height / 2) ** 2)
-    gain = _IRRADIANCE / np.pi * EXPOSURE_S * 65536 / (WHITE_LEVEL - BLACK_LEVEL) / band.exposure
-    return f"""  <rdf:Description rdf:about="Pix4D Camera Information" xmlns:Camera="http://pix4d.com/camera/1.0">
-   <Camera:VignettingCenter>
-    <rdf:Seq><rdf:li>{width / 2}</rdf:li><rdf:li>{height / 2}</rdf:li></rdf:Seq>
-   </Camera:VignettingCenter>
-   <Camera:VignettingPolynomial>
-    <rdf:Seq>
-     <rdf:li>0</rdf:li><rdf:li>{fall:.9e}</rdf:li><rdf:li>0</rdf:li>
-     <rdf:li>0</rdf:li><rdf:li>0</rdf:li><rdf:li>0</rdf:li>
-    </rdf:Seq>
-   </Camera:VignettingPolynomial>
-  </rdf:Description>
-  <rdf:Description rdf:about="Pix4D Camera Information" xmlns:MicaSense="http://micasense.com/MicaSense/1.0/">
-   <MicaSense:RadiometricCalibration>
-    <rdf:Seq><rdf:li>{gain:.9e}</rdf:li><rdf:li>0</rdf:li><rdf:li>0</rdf:li></rdf:Seq>
-   </MicaSense:RadiometricCalibration>
-  </rdf:Description>
-  <rdf:Description rdf:about="Pix4D Camera Information" xmlns:DLS="http://micasense.com/DLS/1.0/">
-   <DLS:HorizontalIrradiance>{_IRRADIANCE * 100:.6f}</DLS:HorizontalIrradiance>
-  </rdf:Description>
-"""
+@cache
+def _xmp_template() -> Template:
+    loader = PackageLoader("agalign.synthetic", ".")
+    environment = Environment(loader=loader, undefined=StrictUndefined, trim_blocks=True, keep_trailing_newline=True)
+    return environment.get_template("micasense.xmp.j2")
 
 
 def write_tiff(
@@ -126,37 +233,17 @@ def write_tiff(
     the first directory and to the Exif directory.
     """
     tifffile.imwrite(path, pixels, photometric="minisblack", rowsperstrip=100, metadata=None)
-    moment, density = exposure.moment, rational(_pixels_per_mm(pixels))
-    add_directories(
-        path,
-        {271: text(camera.maker), 272: text(camera.model), 306: text(moment), 700: byte_string(xmp.encode()), **first},
-        {
-            0x9003: text(moment),
-            0x920A: rational(band.focal_length_mm),
-            0xA20E: density,
-            0xA20F: density,
-            0xA210: short(4),
-            0xA431: text(serial),
-            **exif,
-        },
-        _place(exposure.pose),
-    )
+    moment, density, pose = text(exposure.moment), rational(_pixels_per_mm(pixels)), exposure.pose
+    tags = {271: text(camera.maker), 272: text(camera.model), 306: moment, 700: byte_string(xmp.encode())}
+    of_exif = {0x9003: moment, 0x920A: rational(band.focal_length_mm), 0xA20E: density, 0xA20F: density}
+    of_exif |= {0xA210: short(4), 0xA431: text(serial)}
+    place = {1: text("N"), 2: _degrees(52.0 + pose.north_m / 111_320), 3: text("E")}
+    place |= {4: _degrees(5.0 + pose.east_m / 68_500), 5: byte_string(b"\0"), 6: rational(pose.altitude_m)}
+    add_directories(path, tags | first, of_exif | exif, place)
 
 
 def _pixels_per_mm(pixels: NDArray[np.uint16]) -> float:
     return PIXELS_PER_MM * float(pixels.shape[1]) / 1280
-
-
-def _place(pose: Pose) -> dict[int, Entry]:
-    """The GPS directory."""
-    return {
-        1: text("N"),
-        2: _degrees(52.0 + pose.north_m / 111_320),
-        3: text("E"),
-        4: _degrees(5.0 + pose.east_m / 68_500),
-        5: byte_string(b"\0"),
-        6: rational(pose.altitude_m),
-    }
 
 
 def _degrees(angle_deg: float) -> Entry:

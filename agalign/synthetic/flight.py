@@ -16,9 +16,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import CloughTocher2DInterpolator
 
-from agalign.batch import CaptureReport
-from agalign.synthetic.camera_model import BandSpec, CameraSpec, Exposure, Pose, place_and_rays, true_homography
-from agalign.synthetic.cameras import BLACK_LEVEL, REDEDGE, WHITE_LEVEL
+from agalign.products.sidecar.file import find_sidecars, read_sidecar
+from agalign.synthetic import cameras
+from agalign.synthetic.cameras import REDEDGE, BandSpec, CameraSpec, Exposure, Pose, place_and_rays, true_homography
 from agalign.synthetic.ground import Field, Ground, map_px, on_ground, paint_ground, reflectance
 from agalign.values import geometry, lens
 from agalign.values.geometry import Points
@@ -144,17 +144,11 @@ def plan_flight(
     altitude_m: tuple[float, float] = ALTITUDE_M,
 ) -> tuple[list[Pose], Ground]:
     """Return the poses of captures, as in `make_flight`, and their ground."""
-    poses = [
-        Pose(
-            altitude_m=float(rng.uniform(*altitude_m)),
-            yaw_deg=float(rng.uniform(-180, 180)),
-            roll_deg=float(rng.normal(0, 2)),
-            pitch_deg=float(rng.normal(0, 2)),
-            east_m=4.0 * (number % 10),
-            north_m=4.0 * (number // 10),
-        )
-        for number in range(captures)
-    ]
+    poses = []
+    for number in range(captures):
+        altitude, yaw_deg = float(rng.uniform(*altitude_m)), float(rng.uniform(-180, 180))
+        roll_deg, pitch_deg = rng.normal(0, 2, 2).tolist()
+        poses.append(Pose(altitude, yaw_deg, roll_deg, pitch_deg, 4.0 * (number % 10), 4.0 * (number // 10)))
     return poses, paint_ground(rng, poses, size_px, camera)
 
 
@@ -215,7 +209,7 @@ def recorded(
     signal = np.clip((light if degrade is None else degrade(light, rng)) * vignetting, 0, 1)
     electrons = signal * 4000
     noisy = electrons + rng.normal(size=signal.shape) * np.sqrt(electrons + 60)
-    levels = BLACK_LEVEL + noisy / 4000 * (WHITE_LEVEL - BLACK_LEVEL)
+    levels = cameras.BLACK_LEVEL + noisy / 4000 * (cameras.WHITE_LEVEL - cameras.BLACK_LEVEL)
     return np.asarray((np.clip(np.rint(levels / 16), 0, 4095) * 16).astype(np.uint16))
 
 
@@ -231,15 +225,14 @@ class Score:
     p95_px: float
 
 
-def score_against_truth(reports: list[CaptureReport], truth_path: Path) -> list[Score]:
-    """Return the errors of every pair, px, from the grids in the sidecars."""
+def score_against_truth(out: Path, truth_path: Path) -> list[Score]:
+    """Return the errors of every pair, px, from the grids in the sidecars below the output folder of a run."""
     truth = json.loads(truth_path.read_text(encoding="utf-8"))
     scores = []
-    for report in reports:
-        if report.sidecar is None:
-            continue
-        for band in report.sidecar.bands:
-            known = truth[report.sidecar.capture]["bands"].get(band.file)
+    for path in find_sidecars(out):
+        sidecar, label = read_sidecar(path), path.relative_to(out).with_suffix("").as_posix()
+        for band in sidecar.bands:
+            known = truth[sidecar.capture]["bands"].get(band.file)
             if known is None or band.grid is None:
                 continue
             fixed_px, moving_px = np.hsplit(np.asarray(known["ties"], dtype=np.float64), 2)
@@ -247,5 +240,5 @@ def score_against_truth(reports: list[CaptureReport], truth_path: Path) -> list[
             before_px = float(np.median(np.linalg.norm(fixed_px - moving_px, axis=1)))
             errors_px = np.linalg.norm(mapping(fixed_px) - moving_px, axis=1)
             numbers = np.nanpercentile(errors_px, (50, 95)).tolist()
-            scores.append(Score(report.label, band.band, band.status, before_px, *numbers))
+            scores.append(Score(label, band.band, band.status, before_px, *numbers))
     return scores

@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import expit
 
-from agalign.synthetic.camera_model import FOCAL_LENGTH_MM, PIXELS_PER_MM, BandSpec, CameraSpec, Pose, place_and_rays
-from agalign.synthetic.cameras import REDEDGE
+from agalign.synthetic import cameras
+from agalign.synthetic.cameras import REDEDGE, BandSpec, CameraSpec, Pose, place_and_rays
 from agalign.values import lens
 from agalign.values.geometry import Points
 
@@ -35,12 +35,14 @@ def paint_ground(
     rng: np.random.Generator, poses: Sequence[Pose], size_px: tuple[int, int], camera: CameraSpec = REDEDGE
 ) -> Ground:
     """Return a ground with parcels, rows, tracks and trees, large and fine enough for all bands at all poses."""
-    focal = FOCAL_LENGTH_MM * PIXELS_PER_MM * size_px[0] / 1280
+    focal = cameras.FOCAL_LENGTH_MM * cameras.PIXELS_PER_MM * size_px[0] / 1280
     lowest, highest = min(p.altitude_m for p in poses), max(p.altitude_m for p in poses)
+    # The highest angular resolution and the widest field of view of a band, as multiples of the RedEdge-M's.
+    sharpest, widest = max(b.size_ratio[0] / b.view for b in camera.bands), max(b.view for b in camera.bands)
     # The pixels of the ground must not be visible in the images.
     map_px_per_image_px = 1.25
-    metres_per_px = lowest / focal / camera.sharpest / map_px_per_image_px
-    seen_m = 0.62 * highest * np.hypot(*size_px) / focal * camera.widest
+    metres_per_px = lowest / focal / sharpest / map_px_per_image_px
+    seen_m = 0.62 * highest * np.hypot(*size_px) / focal * widest
     radius_m = max(np.hypot(p.east_m, p.north_m) for p in poses) + seen_m
     side = 2 * int(np.ceil(radius_m / metres_per_px))
     metre = 1 / metres_per_px
@@ -70,13 +72,8 @@ def paint_ground(
             brightness = brightness + 0.12 * _noise(rng, side, grain_m * metre)
             vigour = vigour + 0.3 * _noise(rng, side, grain_m * metre)
     brightness = np.clip(brightness + 0.25 * (edge < 0.35 * metre) - 0.3 * ruts, 0.3, 2.2)
-    return Ground(
-        crop.astype(np.float32),
-        tree,
-        brightness.astype(np.float32),
-        np.clip(vigour, -1.5, 1.5).astype(np.float32),
-        metres_per_px,
-    )
+    crop, brightness = crop.astype(np.float32), brightness.astype(np.float32)
+    return Ground(crop, tree, brightness, np.clip(vigour, -1.5, 1.5).astype(np.float32), metres_per_px)
 
 
 def reflectance(ground: Ground, band: BandSpec) -> Field:
@@ -156,8 +153,7 @@ def _noise(rng: np.random.Generator, side: int, grain_px: float) -> Field:
     """Return Gaussian noise (side, side) of mean 0 and standard deviation 1 with blobs `grain_px` wide."""
     reduction = max(1.0, grain_px / 2)
     small = max(8, int(np.ceil(side / reduction)))
-    coarse = cv2.GaussianBlur(
-        rng.normal(size=(small, small)).astype(np.float32), (0, 0), max(0.5, grain_px / reduction / 2)
-    )
+    white = rng.normal(size=(small, small)).astype(np.float32)
+    coarse = cv2.GaussianBlur(white, (0, 0), max(0.5, grain_px / reduction / 2))
     field = cv2.resize(coarse, (side, side), interpolation=cv2.INTER_CUBIC)
     return np.asarray((field - field.mean()) / field.std(), np.float32)

@@ -9,8 +9,17 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from agalign.cameras.tiff_directory import rational
-from agalign.synthetic.camera_model import BandSpec, CameraSpec, Exposure, rotation
-from agalign.synthetic.cameras import BLACK_LEVEL, EXPOSURE_S, WHITE_LEVEL, MicaSenseCamera, write_tiff
+from agalign.synthetic.cameras import (
+    BLACK_LEVEL,
+    EXPOSURE_S,
+    WHITE_LEVEL,
+    BandSpec,
+    CameraSpec,
+    Exposure,
+    MicaSenseCamera,
+    rotation,
+    write_tiff,
+)
 from agalign.values import geometry
 from agalign.values.geometry import Matrix
 

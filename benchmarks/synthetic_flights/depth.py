@@ -12,8 +12,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from agalign.synthetic.camera_model import BandSpec, CameraSpec, Exposure, Pose
-from agalign.synthetic.cameras import BANDS, REFERENCE, MicaSenseCamera
+from agalign.synthetic.cameras import BANDS, REFERENCE, BandSpec, CameraSpec, Exposure, MicaSenseCamera, Pose
 from agalign.synthetic.flight import VIGNETTING, recorded
 from agalign.synthetic.ground import Field
 from synthetic_flights.materials import Textures, reflectances, sample

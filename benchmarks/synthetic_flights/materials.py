@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 from scipy.special import expit
 
-from agalign.synthetic.camera_model import BandSpec
+from agalign.synthetic.cameras import BandSpec
 from agalign.synthetic.ground import Field
 
 _SIDE_IN_WIDTHS = 3.0

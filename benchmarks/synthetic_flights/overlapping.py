@@ -6,8 +6,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from agalign.products.run.flight_map import FlightMap
-from agalign.products.run.footprint import ground_m
+from agalign.products.run.flight_map import FlightMap, ground_m
 from agalign.products.sidecar.file import read_result, write_sidecar
 from agalign.products.sidecar.schema import LensPart, Sidecar
 from agalign.values import geometry, lens

@@ -6,8 +6,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from agalign.synthetic.camera_model import Pose
-from agalign.synthetic.cameras import REDEDGE
+from agalign.synthetic.cameras import REDEDGE, Pose
 from agalign.synthetic.flight import Shot, write_shots
 from agalign.synthetic.ground import Field, Ground, paint_ground
 

@@ -1,7 +1,7 @@
 """Flat patches in space, and exact ray casting onto them through the lenses of a synthetic camera.
 
 Every object of a scene with depth is made of patches: floors, faces of boxes, leaves. World coordinates are those of
-`agalign.synthetic.camera_model`: metres east, south and down.
+`agalign.synthetic.cameras`: metres east, south and down.
 """
 
 from collections.abc import Iterator, Sequence
@@ -12,7 +12,7 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from agalign.synthetic.camera_model import BandSpec, Pose, place_and_rays
+from agalign.synthetic.cameras import BandSpec, Pose, place_and_rays
 from agalign.values import lens
 from agalign.values.geometry import Matrix, Points
 from agalign.values.mapping import splined

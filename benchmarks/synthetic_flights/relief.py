@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from agalign.synthetic.camera_model import FOCAL_LENGTH_MM, PIXELS_PER_MM, Pose
+from agalign.synthetic.cameras import FOCAL_LENGTH_MM, PIXELS_PER_MM, Pose
 from synthetic_flights.depth import CLOSE_RANGE, Hand, Scene
 from synthetic_flights.materials import make_textures
 from synthetic_flights.patches import Patch

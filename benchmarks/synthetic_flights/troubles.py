@@ -10,8 +10,7 @@ import cv2
 import numpy as np
 from scipy.special import expit
 
-from agalign.synthetic.camera_model import CameraSpec, Pose
-from agalign.synthetic.cameras import REDEDGE
+from agalign.synthetic.cameras import REDEDGE, CameraSpec, Pose
 from agalign.synthetic.flight import Shot, plan_flight, write_shots
 from agalign.synthetic.ground import Field, Ground, paint_ground
 from synthetic_flights.cameras import MAVIC

@@ -9,7 +9,7 @@ from synthetic_flights.depth import write_capture
 from synthetic_flights.relief import make_scene
 
 import agalign
-from agalign.batch import run_flight
+from agalign.batch.run import run_flight
 from agalign.cameras.discover import discover
 from agalign.config import Settings, WriteSettings
 from agalign.flight.model import load_model

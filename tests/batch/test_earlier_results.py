@@ -13,7 +13,7 @@ import pytest
 import agalign
 from agalign.batch.earlier_results import is_same
 from agalign.batch.run import _crops_of_cameras, plan_run, run_flight
-from agalign.cli.align_run import conclude
+from agalign.cli.align_run import RunTotals, conclude
 from agalign.cli.align_run import run as run_command
 from agalign.cli.terminal import ExitCode, Terminal
 from agalign.products.sidecar.file import find_sidecars, read_result
@@ -227,24 +227,26 @@ def test_a_sidecar_removes_no_file_but_those_of_its_capture(flight: Path, tmp_pa
 # ---- outputs that are removed during the run
 
 
-def removing(out: Path) -> Callable[[agalign.CaptureReport], object]:
-    """Remove the files of the first capture when the second is reported."""
+def when_the_second_is_reported(monkeypatch: pytest.MonkeyPatch, remove: Callable[[], object]) -> None:
+    """Remove outputs when the command line has counted the second capture."""
+    add = RunTotals.add
 
-    def each(report: agalign.CaptureReport) -> None:
+    def added(totals: RunTotals, report: agalign.CaptureReport) -> None:
+        add(totals, report)
         if report.label.endswith("2"):
-            for path in out.rglob("IMG_0001*"):
-                path.unlink()
+            remove()
 
-    return each
+    monkeypatch.setattr(RunTotals, "add", added)
 
 
 def test_outputs_removed_during_the_run_are_reported_and_not_counted(
-    flight: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    flight: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     terminal = Terminal()
     scan = agalign.discover(flight, THREE)
     settings, options = agalign.Settings(), agalign.RunOptions()
-    totals = run_command(scan, tmp_path, settings, terminal, options, each=removing(tmp_path))
+    when_the_second_is_reported(monkeypatch, lambda: [path.unlink() for path in tmp_path.rglob("IMG_0001*")])
+    totals = run_command(scan, tmp_path, settings, terminal, options)
     assert conclude(totals, tmp_path, terminal) == ExitCode.PARTIAL
     printed = capsys.readouterr()
     removed = f"{tmp_path}: outputs of 1 capture were removed during the run, such as of 0000SET/000/IMG_0001"
@@ -253,14 +255,12 @@ def test_outputs_removed_during_the_run_are_reported_and_not_counted(
     assert [r.state for r in agalign.align_folder(flight, tmp_path, options=THREE)] == ["kept", "done"]
 
 
-def test_a_run_fails_if_its_output_folder_is_removed(flight: Path, tmp_path: Path) -> None:
+def test_a_run_fails_if_its_output_folder_is_removed(
+    flight: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     out, terminal = tmp_path / "out", Terminal(quiet=True)
-
-    def remove(report: agalign.CaptureReport) -> None:
-        if report.label.endswith("2"):
-            shutil.rmtree(out)
-
-    totals = run_command(agalign.discover(flight), out, SEEDS, terminal, agalign.RunOptions(), each=remove)
+    when_the_second_is_reported(monkeypatch, lambda: shutil.rmtree(out))
+    totals = run_command(agalign.discover(flight), out, SEEDS, terminal, agalign.RunOptions())
     assert conclude(totals, out, terminal) == ExitCode.NOTHING
     reports = run_flight(agalign.discover(flight), out, SEEDS)
     next(reports)

@@ -11,13 +11,15 @@ import pytest
 import torch
 
 import agalign
-from agalign.batch import CaptureReport, RunOptions, learning_tasks, run_flight
 from agalign.batch import capture_task as batch_capture
 from agalign.batch import flight_learning as batch_learn
+from agalign.batch import learning_tasks
 from agalign.batch import run as batch_run
+from agalign.batch.capture_task import CaptureReport
 from agalign.batch.flight_learning import learning_fingerprint
-from agalign.batch.run import _limits_of_cameras
+from agalign.batch.run import _limits_of_cameras, run_flight
 from agalign.cameras.discover import FolderScan
+from agalign.config import RunOptions
 from agalign.flight.groups import camera_key, flights_of, model_names
 from agalign.flight.model import FlightModel, load_model, save_model
 from agalign.flight.rig import MIN_CAPTURES
@@ -220,9 +222,9 @@ def test_the_crop_of_a_new_flight_depends_on_a_finished_one(
     monkeypatch.setattr(batch_run, "learn_flight", lambda *_, **__: None)
     limits: list[Any] = []
 
-    def process(*arguments: Any) -> CaptureReport:
-        limits.append(arguments[-2])
-        return CaptureReport(arguments[0].label, "done", earlier)
+    def process(task: batch_capture.Task, *_: Any) -> CaptureReport:
+        limits.append(task.limits)
+        return CaptureReport(task.capture.label, "done", earlier)
 
     monkeypatch.setattr(batch_capture, "process_capture", process)
     # The finished capture has a grid of its own, as without a rig: it gets that of the camera.

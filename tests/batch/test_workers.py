@@ -15,13 +15,12 @@ import psutil
 import pytest
 
 import agalign
-from agalign.batch import RunOptions, dask_executor, run_flight, workers
-from agalign.batch.capture_report import CaptureReport
-from agalign.batch.capture_task import Task
-from agalign.batch.run import Listener, capture_reports
-from agalign.batch.workers import DaskExecutor, Run, in_order, on_executor, own_processes
+from agalign.batch import workers
+from agalign.batch.capture_task import CaptureReport, Task
+from agalign.batch.run import Listener, capture_reports, run_flight
+from agalign.batch.workers import DaskExecutor, Run, chosen_run, dask_executor, in_order, on_executor
 from agalign.cameras.discover import discover
-from agalign.config import SeedSettings, Settings
+from agalign.config import RunOptions, SeedSettings, Settings
 from agalign.errors import ConfigurationError, WorkerError
 from agalign.method.device import limit_threads
 from agalign.products.sidecar.file import find_sidecars, read_result
@@ -70,7 +69,7 @@ def test_a_scheduler_that_does_not_answer(monkeypatch: pytest.MonkeyPatch) -> No
 
 
 def seeds_only(flight: Path, out: Path) -> list[Task]:
-    return [Task(c, out, seeded(), None) for c in discover(flight).captures]
+    return [Task(c, out, seeded()) for c in discover(flight).captures]
 
 
 def reports_of(run: Run, tasks: list[Task]) -> Iterator[CaptureReport]:
@@ -96,7 +95,7 @@ def kill_and_read(mark: Path, times: int) -> Settings:
 def test_a_process_that_is_killed_twice_costs_its_capture(flight: Path, tmp_path: Path) -> None:
     capture, *others = seeds_only(flight, tmp_path)
     deadly = replace(capture, settings=KillsWhenRead(tmp_path / "mark", 2))
-    with own_processes(1, limit_threads) as run:
+    with chosen_run(None, 1, limit_threads, timeout_s=600) as run:
         reports = {r.label: r for r in reports_of(run, [deadly, *others])}
     lost = reports.pop(capture.capture.label)
     killed = "its worker process was killed (signal 9; out of memory?); run again to process the remaining captures"
@@ -106,16 +105,16 @@ def test_a_process_that_is_killed_twice_costs_its_capture(flight: Path, tmp_path
 
 def test_results_of_learning_tasks_come_in_order_and_a_lost_worker_ends_the_run(tmp_path: Path) -> None:
     """The first argument takes longest; the loss of a worker twice, as by a lack of memory, is one line."""
-    with own_processes(2, limit_threads) as run:
+    with chosen_run(None, 2, limit_threads) as run:
         assert list(in_order(run, sleep, [0.6, 0.0, 0.1])) == [0.6, 0.0, 0.1]
     with ThreadPoolExecutor(2) as threads:
         assert list(in_order(on_executor(threads), sleep, [0.3, 0.0, 0.1])) == [0.3, 0.0, 0.1]
     with (
-        own_processes(1, limit_threads) as run,
+        chosen_run(None, 1, limit_threads, timeout_s=600) as run,
         pytest.raises(WorkerError, match="the flight cannot be learned: its worker process"),
     ):
         list(in_order(run, partial(signal_self, number=signal.SIGKILL, times=2), [tmp_path / "mark"]))
-    with own_processes(1, limit_threads) as run, pytest.raises(MemoryError):
+    with chosen_run(None, 1, limit_threads, timeout_s=600) as run, pytest.raises(MemoryError):
         list(in_order(run, without_memory, [0]))
 
 

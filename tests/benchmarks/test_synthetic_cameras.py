@@ -9,8 +9,7 @@ from synthetic_flights.cameras import ALTUM, ALTUM_PT, MAVIC, MAVIC_3M, SENTERA_
 
 from agalign.cameras import rig_seed
 from agalign.cameras.discover import DiscoverOptions, discover
-from agalign.synthetic.camera_model import CameraSpec, Pose, true_homography
-from agalign.synthetic.cameras import REDEDGE
+from agalign.synthetic.cameras import REDEDGE, CameraSpec, Pose, true_homography
 from agalign.synthetic.flight import Shot, write_shots
 from agalign.synthetic.ground import paint_ground
 from agalign.values import geometry

@@ -12,7 +12,7 @@ from synthetic_flights.relief import make_scene
 
 from agalign.fit.windows import FixedWindows
 from agalign.pixels.structure import structure_field
-from agalign.synthetic.camera_model import CameraSpec, Pose
+from agalign.synthetic.cameras import CameraSpec, Pose
 from agalign.synthetic.flight import recorded
 from agalign.values.image import Raster
 

@@ -17,7 +17,7 @@ from agalign.cameras.micasense import MicaSense, horizontal_irradiance, sun_posi
 from agalign.cameras.pix4d import NAMESPACE, panel_in
 from agalign.errors import ConfigurationError
 from agalign.pixels.raster import probe
-from agalign.synthetic import camera_model, cameras
+from agalign.synthetic import cameras
 from agalign.values import geometry
 from agalign.values.capture import Band, CaptureTime, Position
 
@@ -28,12 +28,12 @@ def test_lenses_and_rig_of_the_synthetic_camera_are_its_truth(flight: Path) -> N
     for path in sorted((flight / "0000SET" / "000").glob("IMG_0001_*.tif")):
         (band,) = MicaSense().bands(path, read_tags(path), probe(path))
         bands[band.name] = band
-    far = camera_model.Pose(1e4, 0.0, 0.0, 0.0, 0.0, 0.0)
+    far = cameras.Pose(1e4, 0.0, 0.0, 0.0, 0.0, 0.0)
     for spec in cameras.BANDS:
         expected, result = spec.lens(480, 360), bands[spec.name].lens
         np.testing.assert_allclose(result.matrix, expected.matrix, atol=1e-4)
         np.testing.assert_allclose(result.distortion, expected.distortion)
-        truth = camera_model.true_homography(cameras.BANDS[cameras.REFERENCE], spec, far, (480, 360))
+        truth = cameras.true_homography(cameras.BANDS[cameras.REFERENCE], spec, far, (480, 360))
         assert geometry.corner_error_px(rig_seed(bands["Green"], bands[spec.name]), truth, 480, 360) < 0.01
 
 

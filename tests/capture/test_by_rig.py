@@ -13,7 +13,8 @@ import rasterio
 import torch
 
 import agalign
-from agalign.batch import CaptureReport, learning_tasks
+from agalign.batch import learning_tasks
+from agalign.batch.capture_task import CaptureReport
 from agalign.batch.flight_learning import learn_flight
 from agalign.cameras.discover import discover
 from agalign.capture import align_bands
@@ -23,8 +24,8 @@ from agalign.capture.by_rig import with_predictions
 from agalign.config import CheckSettings, Settings
 from agalign.flight.model import FlightModel, load_model
 from agalign.method.joint import Results, refine_with
-from agalign.products.sidecar.fill import capture_status
-from agalign.synthetic import make_flight
+from agalign.products.sidecar.convert import capture_status
+from agalign.synthetic.flight import make_flight
 from agalign.values import geometry
 from agalign.values.alignment import Alignment, Prediction
 from agalign.values.issues import Issue

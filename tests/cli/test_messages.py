@@ -13,7 +13,7 @@ import pytest
 import typer
 
 import agalign
-from agalign.batch import CaptureReport
+from agalign.batch.capture_task import CaptureReport
 from agalign.cameras.discover import DiscoverOptions, FolderScan, Problem, discover
 from agalign.cli import main
 from agalign.cli.align_run import RunTotals, conclude, print_problems

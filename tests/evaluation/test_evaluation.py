@@ -14,17 +14,21 @@ from agalign.cli.main import app
 from agalign.config import JointSettings, SeedSettings, Settings
 from agalign.errors import ConfigurationError, InputError
 from agalign.evaluation.descriptor_learning import learn_descriptor
-from agalign.evaluation.evaluate import Starts, error_table, evaluate, precision_table, write_results
-from agalign.evaluation.image_pairs import PairFiles
-from agalign.evaluation.methods import (
+from agalign.evaluation.evaluate import (
     PairTask,
+    Starts,
     average_precision,
     daisy_of_patches,
+    error_table,
+    evaluate,
     grey_patches,
     homography_error_px,
     method_named,
+    precision_table,
     sift_of_patches,
+    write_results,
 )
+from agalign.evaluation.image_pairs import PairFiles
 from agalign.evaluation.surface import draw_surface, loss_surface
 from agalign.flight.model import load_model, save_model
 from agalign.method.descriptor import Descriptor

@@ -4,8 +4,7 @@ from synthetic_flights.panel import PANEL_CODE, with_panel
 
 from agalign.pixels import panel_detection as panels
 from agalign.pixels.panel_detection import albedo_of, find_panel, inside
-from agalign.synthetic.camera_model import Pose
-from agalign.synthetic.cameras import REDEDGE
+from agalign.synthetic.cameras import REDEDGE, Pose
 from agalign.synthetic.flight import view
 from agalign.synthetic.ground import paint_ground, reflectance
 from agalign.values.image import Raster

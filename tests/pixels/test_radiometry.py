@@ -17,7 +17,7 @@ from agalign.config import WriteSettings
 from agalign.errors import InputError
 from agalign.pixels.radiometry import calibrated, check_pixels, plausible, with_radiometry
 from agalign.pixels.raster import probe
-from agalign.synthetic import camera_model, cameras
+from agalign.synthetic import cameras
 from agalign.synthetic import flight as synthetic
 from agalign.synthetic.ground import paint_ground
 from agalign.values.capture import Band, Capture, PanelFactor, Quantity, Radiometry
@@ -61,7 +61,7 @@ def blue(images: Path) -> Path:
 
 def test_reflectance_of_the_synthetic_flight_is_the_truth(images: Path) -> None:
     rng = np.random.default_rng(1)
-    pose = camera_model.Pose(28.0, 20.0, 0.0, 0.0, 0.0, 0.0)
+    pose = cameras.Pose(28.0, 20.0, 0.0, 0.0, 0.0, 0.0)
     ground = paint_ground(rng, [pose], (320, 240))
     for spec in cameras.BANDS:
         band = by(images / f"IMG_0001_{spec.rig_index + 1}.tif", "sun")

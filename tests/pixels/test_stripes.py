@@ -147,7 +147,7 @@ def test_a_capture_with_common_stripes_is_aligned(tmp_path: Path) -> None:
     poses, ground = plan_flight(rng, 1, SIZE_PX)
     truth = write_shots(tmp_path, [Shot(poses[0], ground, stripes)], SIZE_PX, REDEDGE, rng)
     reports = agalign.align_folder(tmp_path, tmp_path / "out")
-    scores = score_against_truth(reports, truth)
+    scores = score_against_truth(tmp_path / "out", truth)
     assert [score.status for score in scores] == ["aligned"] * 4
     assert max(score.median_px for score in scores) < 0.3
     (sidecar,) = (report.sidecar for report in reports)

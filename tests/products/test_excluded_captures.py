@@ -13,11 +13,10 @@ from PIL import Image
 from pydantic import ValidationError
 
 import agalign
-from agalign.batch import RunOptions
-from agalign.config import Settings, WriteSettings
+from agalign.config import RunOptions, Settings, WriteSettings
 from agalign.errors import SidecarError
 from agalign.products.report.pages import write_pages
-from agalign.products.run.excluded import PANELS_FILE, SKY_FILE, PanelPart, read_sky
+from agalign.products.run.excluded import PANELS_FILE, SKY_FILE, PanelPart, read_excluded
 
 from ..conftest import Shared, read_json, seeded
 from ..program import agalign_here
@@ -127,7 +126,7 @@ def test_the_sky_is_left_out_and_named(with_sky: Path, tmp_path: Path) -> None:
     reports = agalign.align_folder(with_sky, out, settings=seeded())
     assert {r.label: r.state for r in reports} == {"sky/S1": "sky", "IMG_0001": "done"}
     assert next(r for r in reports if r.state == "sky").is_complete
-    (part,) = read_sky(out)
+    _, (part,) = read_excluded(out)
     assert (part.folder, part.capture, [b.band for b in part.bands]) == ("sky", "S1", ["Blue", "Green", "NIR"])
     assert part.cues == ["its folder or name contains 'sky'", "no band has texture"]
     assert not list(out.rglob("S1*"))
@@ -157,7 +156,7 @@ def test_info_names_the_sky(with_sky: Path) -> None:
 def test_a_damaged_record_is_one_line(tmp_path: Path) -> None:
     (tmp_path / SKY_FILE).write_text('{"schema": "agalign-sky/1"')
     with pytest.raises(SidecarError, match=r"sky\.json: cannot be read; delete it and run again"):
-        read_sky(tmp_path)
+        read_excluded(tmp_path)
     problems: list[str] = []
     write_pages(tmp_path, problems.append)
     assert len(problems) == 1

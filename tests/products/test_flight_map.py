@@ -12,8 +12,8 @@ import rasterio
 from synthetic_flights.aligned import make_aligned
 
 import agalign
-from agalign.products.run.flight_map import FlightMap
-from agalign.products.run.footprint import (
+from agalign.products.run.flight_map import (
+    FlightMap,
     above_elevation,
     accuracy_of_footprint_m,
     geojson_geometry,

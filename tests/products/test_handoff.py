@@ -16,7 +16,7 @@ from agalign.products.exports.programs import export
 from agalign.products.rasters import aligned_files
 from agalign.products.rasters.layout import Layer
 from agalign.products.sidecar.file import find_sidecars, read_sidecar
-from agalign.synthetic.camera_model import CameraSpec
+from agalign.synthetic.cameras import CameraSpec
 from agalign.values import geometry
 from agalign.values.capture import Band, Radiometry
 from agalign.values.choices import ExportProgram

@@ -24,7 +24,7 @@ import agalign
 from agalign.pixels.raster import transformed
 from agalign.products.mosaic.adjustment import TiePair, adjusted, misfit_m, tie_pairs
 from agalign.products.mosaic.placement import PlacedFlight, Placement, place_captures
-from agalign.products.run.footprint import utm_wkt
+from agalign.products.run.flight_map import utm_wkt
 from agalign.products.sidecar.file import read_sidecar, write_sidecar
 from agalign.values import geometry, lens
 from agalign.values.output_folder import locked

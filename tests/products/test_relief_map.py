@@ -18,9 +18,9 @@ from agalign.batch import capture_task as batch
 from agalign.cameras import pix4d, rig_seed
 from agalign.cameras.metadata import Tags
 from agalign.fit.occlusion import occluded
-from agalign.products.rasters.relief_map import relief_layers
+from agalign.products.rasters.alignment_maps import relief_layers
+from agalign.products.sidecar.convert import sidecar_of
 from agalign.products.sidecar.file import read_result, read_sidecar, write_sidecar
-from agalign.products.sidecar.fill import sidecar_of
 from agalign.synthetic import cameras
 from agalign.values import geometry, lens
 from agalign.values.alignment import Alignment, PairScales, Seed
@@ -87,7 +87,7 @@ class Run:
         chosen = agalign.Settings(write=agalign.WriteSettings.model_validate({"crop": "none", **settings}))
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr(batch, "align_capture_bands", lambda *_: alignments or self.alignments)
-            outcome = batch.process_capture(capture or self.capture, out, chosen)
+            outcome = batch.process_capture(batch.Task(capture or self.capture, out, chosen))
         assert outcome.failed_products == ()
         assert read_result(outcome.path) == outcome.result
         return outcome.path

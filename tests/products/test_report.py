@@ -156,7 +156,7 @@ def test_the_rig_is_read_without_its_network(tmp_path: Path) -> None:
     camera, rig = read_rig(path)
     assert camera == "Camera 7"
     (view,) = rig_views(tmp_path, pytest.fail)
-    assert [b["band"] for b in view.bands] == list(rig.mean) == ["NIR", "[Red]"]
+    assert [b["band"] for b in view["bands"]] == list(rig.mean) == ["NIR", "[Red]"]
     path.write_bytes(path.read_bytes()[:-500])
     with pytest.raises(agalign.InputError, match=r"a\.safetensors: its rig cannot be read"):
         read_rig(path)

@@ -16,6 +16,7 @@ import agalign
 from agalign.config import Settings
 from agalign.errors import InputError, OutputError, SidecarError
 from agalign.products.product import CapturePaths, ProductContext
+from agalign.products.sidecar.convert import sidecar_of
 from agalign.products.sidecar.file import (
     content_checksum,
     find_sidecars,
@@ -24,7 +25,6 @@ from agalign.products.sidecar.file import (
     verify_outputs,
     write_sidecar,
 )
-from agalign.products.sidecar.fill import sidecar_of
 from agalign.products.sidecar.schema import GridPart, ProductPart, Sidecar
 from agalign.values import geometry
 from agalign.values.alignment import Alignment, JointResult, Seed

@@ -18,7 +18,7 @@ from pystac.validation.stac_validator import JsonSchemaSTACValidator
 import agalign
 from agalign.flight.groups import flights_of
 from agalign.products.exports.stac import write_collections
-from agalign.products.run.footprint import ground_m
+from agalign.products.run.flight_map import ground_m
 from agalign.values.capture import Band, CameraIdentity, Capture, Pose
 from agalign.values.files import write_text
 

@@ -13,10 +13,9 @@ from agalign.config import Settings, WriteSettings
 from agalign.errors import OutputError
 from agalign.flight.rig import CaptureFactors, Rig
 from agalign.products.product import CapturePaths, ProductContext
-from agalign.products.rasters.aligned_files import BandFiles
+from agalign.products.rasters.aligned_files import BandFiles, write_raster
 from agalign.products.rasters.checked_raster import Block, LayerDescription, tiled_profile, write_layers
 from agalign.products.rasters.layout import Layer, common_grid, flight_limits, output_layers
-from agalign.products.rasters.raster_file import write_raster
 from agalign.values import geometry
 from agalign.values.alignment import Alignment, Seed
 from agalign.values.capture import Band, CameraIdentity, Capture, Georeference

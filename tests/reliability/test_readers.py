@@ -25,7 +25,7 @@ from agalign.errors import AgalignError, InputError, SidecarError
 from agalign.flight.model import FlightModel, load_model, save_model
 from agalign.method.descriptor import Descriptor
 from agalign.pixels.raster import probe
-from agalign.products.run.excluded import read_panels
+from agalign.products.run.excluded import read_excluded
 from agalign.products.run.record import read_run_record
 from agalign.products.sidecar.file import read_result, read_sidecar
 from agalign.values.capture import Band
@@ -148,7 +148,7 @@ def test_any_json(tmp_path: Path, data: object, raw: bytes | None) -> None:
         (tmp_path / name).write_bytes(contents)
         with pytest.raises(SidecarError, match=r"a\.json"):
             read(tmp_path / name)
-    for name, read_folder in (("panels.json", read_panels), (RUN_FILE, read_run_record)):
+    for name, read_folder in (("panels.json", read_excluded), (RUN_FILE, read_run_record)):
         (tmp_path / name).write_bytes(contents)
         with pytest.raises(SidecarError, match=re.escape(name)):
             read_folder(tmp_path)

@@ -24,7 +24,7 @@ from agalign.cameras.read_files import _with_lens_of_image
 from agalign.errors import SidecarError
 from agalign.flight.model import FlightModel, load_model, save_model
 from agalign.products.indices.rasters import INDICES_FILE, read_table
-from agalign.products.run.excluded import PANELS_FILE, SKY_FILE, read_panels, read_sky
+from agalign.products.run.excluded import PANELS_FILE, SKY_FILE, read_excluded
 from agalign.products.run.flight_map import FLIGHT_MAP_FILE, features_in
 from agalign.products.run.record import read_run_record
 from agalign.products.sidecar.file import find_sidecars, read_sidecar
@@ -47,7 +47,7 @@ def irregular(request: pytest.FixtureRequest) -> Callable[[Path], None]:
 
 
 @pytest.mark.parametrize(
-    ("name", "read"), [(RUN_FILE, read_run_record), (PANELS_FILE, read_panels), (SKY_FILE, read_sky)]
+    ("name", "read"), [(RUN_FILE, read_run_record), (PANELS_FILE, read_excluded), (SKY_FILE, read_excluded)]
 )
 def test_a_record_that_is_not_a_regular_file_is_an_error(
     tmp_path: Path, irregular: Callable[[Path], None], name: str, read: Callable[[Path], object]
@@ -151,7 +151,7 @@ def test_any_error_fails_one_capture_only(
     flight: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, error: Exception, said: str
 ) -> None:
     monkeypatch.setattr(batch, "process_capture", raising(error))
-    report = batch.do_capture(batch.Task(discover(flight).captures[0], tmp_path, seeded(), None))
+    report = batch.do_capture(batch.Task(discover(flight).captures[0], tmp_path, seeded()))
     assert report.state == "error"
     assert report.error.startswith(said)
 

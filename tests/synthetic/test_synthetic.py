@@ -9,7 +9,7 @@ from synthetic_flights.troubles import make_terraces
 
 from agalign.cameras.discover import discover
 from agalign.pixels.raster import read_for_alignment
-from agalign.synthetic import camera_model, cameras
+from agalign.synthetic import cameras
 from agalign.synthetic import flight as synthetic
 from agalign.synthetic.ground import paint_ground, reflectance
 from agalign.values import geometry, lens
@@ -21,7 +21,7 @@ def rotation(*degrees: float) -> np.ndarray:
 
 def test_the_truth_follows_from_rays_and_the_plane() -> None:
     # Independent of the generator's homographies: shoot a ray from the reference, hit the ground, look from the band.
-    pose = camera_model.Pose(30.0, 40.0, 1.5, -2.0, 3.0, -4.0)
+    pose = cameras.Pose(30.0, 40.0, 1.5, -2.0, 3.0, -4.0)
     size = (1280, 960)
     reference, band = cameras.BANDS[cameras.REFERENCE], cameras.BANDS[3]
     attitude = rotation(pose.roll_deg, pose.pitch_deg, pose.yaw_deg)
@@ -58,7 +58,7 @@ def test_the_images_show_the_truth(flight: Path) -> None:
 
 
 def test_contrast_reverses_between_green_and_near_infra_red(flight: Path) -> None:
-    ground = paint_ground(np.random.default_rng(0), [camera_model.Pose(30, 0, 0, 0, 0, 0)], (320, 240))
+    ground = paint_ground(np.random.default_rng(0), [cameras.Pose(30, 0, 0, 0, 0, 0)], (320, 240))
     by_name = {b.name: reflectance(ground, b).ravel() for b in cameras.BANDS}
     assert np.corrcoef(by_name["Red"], by_name["NIR"])[0, 1] < -0.25
     assert np.corrcoef(by_name["Green"], by_name["Red"])[0, 1] > 0.5
@@ -74,7 +74,7 @@ def test_the_same_seed_gives_the_same_flight(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("band", cameras.BANDS, ids=lambda b: b.name)
-def test_bands_are_well_exposed(flight: Path, band: camera_model.BandSpec) -> None:
+def test_bands_are_well_exposed(flight: Path, band: cameras.BandSpec) -> None:
     (result,) = [b for b in discover(flight).captures[0].bands if b.name == band.name]
     raster = read_for_alignment(result, 4096)
     assert raster.valid.mean() > 0.95

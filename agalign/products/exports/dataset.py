@@ -11,7 +11,7 @@ import numpy as np
 
 from agalign.errors import ConfigurationError, InputError, UnreadableFileError
 from agalign.pixels.raster import without_warnings
-from agalign.products.rasters.relief_map import RELIEF_UNITS
+from agalign.products.rasters.alignment_maps import RELIEF_UNITS
 from agalign.products.run.captures import RunCapture, captures_of_run, exceptions, like_most
 from agalign.products.sidecar.file import read_sidecar
 from agalign.products.sidecar.schema import BandPart, Sidecar

@@ -11,7 +11,7 @@ import shutil
 from collections import Counter, defaultdict
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
@@ -69,15 +69,14 @@ _Row = tuple[str, str, str, float]
 """Capture, band, status, largest distance of the matrix from the complete mapping, px."""
 
 
-@dataclass
+@dataclass(frozen=True)
 class ExportReport:
     """Result of an export."""
 
-    target: Path
-    captures: int = 0
-    files: list[Path] = field(default_factory=list)
-    left_out: LeftOut = field(default_factory=list)
-    notes: list[str] = field(default_factory=list)
+    captures: int
+    files: list[Path]
+    left_out: LeftOut
+    notes: list[str]
     """Instructions for the other program, one per line."""
 
 
@@ -102,23 +101,21 @@ def export(
     if not good:
         reason = ": ".join(left_out[0])
         raise InputError(f"{out}: no capture to export ({reason}); 'agalign report {out}' shows what failed")
-    report = ExportReport(target, len(good), left_out=left_out)
-    rows: list[_Row] = []
     with _complete_folder(target) as folder:
         if program == "micasense":
-            files, rows = write_micasense(good, out, folder, source)
+            written = list(_write_micasense(good, out, folder, source))
         elif program == "opencv":
-            files, rows = write_opencv(good, folder)
+            written = list(_write_opencv(good, folder))
         else:
-            files = _band_files(good, out, folder / "images", copy=copy)
+            written = [(path, []) for path in _band_files(good, out, folder / "images", copy=copy)]
+        files, rows = [path for path, _ in written], [row for _, rows in written for row in rows]
         if rows:
             files.append(folder / "matrices.csv")
             cells = ((*row[:3], f"{row[3]:.4f}") for row in rows)
             write_csv(files[-1], ("capture", "band", "status", "max_error_px"), cells)
-        report.files = [target / path.relative_to(folder) for path in files]
-        report.notes = _notes(program, good, files, rows)
-        write_text(folder / "README.txt", "\n".join(report.notes) + "\n")
-    return report
+        notes = _notes(program, good, files, rows)
+        write_text(folder / "README.txt", "\n".join(notes) + "\n")
+    return ExportReport(len(good), [target / path.relative_to(folder) for path in files], left_out, notes)
 
 
 @contextmanager
@@ -153,18 +150,14 @@ def _band_files(captures: Sequence[RunCapture], out: Path, images: Path, *, copy
         for part in output.band_files:
             source = check_inside(capture.path.parent / part.file, out)
             target = images / file_name((Path(capture.label).parent / part.file).as_posix(), taken)
-            written.append(_placed(source, target, copy=copy))
+            target.parent.mkdir(parents=True, exist_ok=True)
+            if not copy:
+                with suppress(OSError):  # another disk, or a file system without hard links
+                    os.link(source, target)
+            if not target.exists():
+                shutil.copyfile(source, target)
+            written.append(target)
     return written
-
-
-def _placed(source: Path, target: Path, *, copy: bool) -> Path:
-    target.parent.mkdir(parents=True, exist_ok=True)
-    if not copy:
-        with suppress(OSError):  # another disk, or a file system without hard links
-            os.link(source, target)
-            return target
-    shutil.copyfile(source, target)
-    return target
 
 
 def _notes(
@@ -199,55 +192,52 @@ def _of_raw_numbers(files: Sequence[Path]) -> dict[str, str]:
     return {"calibration": "camera", "contents": contents}
 
 
-def write_opencv(captures: Sequence[RunCapture], target: Path) -> tuple[list[Path], list[_Row]]:
-    """Write <capture>.npz for each capture. Returns the files and the distances from the complete mappings.
+def _write_opencv(captures: Sequence[RunCapture], target: Path) -> Iterator[tuple[Path, list[_Row]]]:
+    """Write <capture>.npz for each capture. Yields the file and the distances from the complete mappings.
 
     Raises OutputError.
     """
-    files: list[Path] = []
-    rows: list[_Row] = []
     for name, _, bands in _named(captures, {}):
         grids = [_grid(band) for band in bands]
         matrices, errors_px = zip(*(_fitted(*grid) for grid in grids), strict=True)
-        rows += _rows(name, bands, errors_px)
         arrays: dict[str, NDArray[np.generic]] = {"bands": np.array([b.band for b in bands])}
         for k, (points_px, mapped_px) in enumerate(grids):
             arrays |= {f"grid_reference_px_{k}": points_px, f"grid_moving_px_{k}": mapped_px}
         arrays |= {"matrices": np.stack(matrices), "max_error_px": np.array(errors_px)}
-        files.append(target / f"{name}.npz")
-        with complete_file(files[-1]) as partial:
+        path = target / f"{name}.npz"
+        with complete_file(path) as partial:
             np.savez(partial, allow_pickle=False, **arrays)
-    return files, rows
+        yield path, _rows(name, bands, errors_px)
 
 
-def write_micasense(
+def _write_micasense(
     captures: Sequence[RunCapture], out: Path, target: Path, source: Path | None
-) -> tuple[list[Path], list[_Row]]:
+) -> Iterator[tuple[Path, list[_Row]]]:
     """Write <capture>_warp_matrices.npy for each capture, and <serial>_warp_matrices_opencv.npy for each camera.
 
-    Returns the files and the distances from the complete mappings. Raises InputError if the original images cannot be
+    Yields the file and the distances from the complete mappings. Raises InputError if the original images cannot be
     read, ConfigurationError for other cameras, OutputError.
     """
-    folder = source or _input_of(out)
-    files: list[Path] = []
-    rows: list[_Row] = []
+    if source is None:
+        run = read_run_record(out)
+        if run is None:
+            raise InputError(f"{out}: does not name the folder of the images; give it with --source")
+        source = Path(run.input)
     by_camera: dict[str, list[NDArray[np.float64]]] = defaultdict(list)
     taken: dict[str, str] = {}
     for name, capture, bands in _named(captures, taken):
-        images = [_original(folder / Path(capture.label).parent / band.file) for band in bands]
+        images = [_original(source / Path(capture.label).parent / band.file) for band in bands]
         reference = next((i for i, b in zip(images, bands, strict=True) if b.status == "reference"), None)
         if reference is None:
             raise SidecarError(f"{capture.path}: has no reference band; run again with --overwrite")
         results = (_in_notebook_px(band, reference, image) for band, image in zip(bands, images, strict=True))
         matrices, errors_px = zip(*results, strict=True)
-        rows += _rows(name, bands, errors_px)
         stacked = np.stack(matrices)
         by_camera[images[0].tags.serial or "camera"].append(stacked)
-        files.append(_write_npy(target / f"{name}_warp_matrices.npy", stacked))
+        yield _write_npy(target / f"{name}_warp_matrices.npy", stacked), _rows(name, bands, errors_px)
     for serial, of_camera in by_camera.items():
         matrices_of_camera = _nearest_to_median(of_camera, captures[0].result.reference.size_px)
-        files.append(_write_npy(target / f"{file_name(serial, taken)}_warp_matrices_opencv.npy", matrices_of_camera))
-    return files, rows
+        yield _write_npy(target / f"{file_name(serial, taken)}_warp_matrices_opencv.npy", matrices_of_camera), []
 
 
 def _named(captures: Sequence[RunCapture], taken: dict[str, str]) -> Iterator[tuple[str, RunCapture, list[BandPart]]]:
@@ -259,13 +249,6 @@ def _named(captures: Sequence[RunCapture], taken: dict[str, str]) -> Iterator[tu
 
 def _rows(name: str, bands: Sequence[BandPart], errors_px: Sequence[float]) -> list[_Row]:
     return [(name, b.band, b.status, e) for b, e in zip(bands, errors_px, strict=True)]
-
-
-def _input_of(out: Path) -> Path:
-    run = read_run_record(out)
-    if run is None:
-        raise InputError(f"{out}: does not name the folder of the images; give it with --source")
-    return Path(run.input)
 
 
 def _grid(band: BandPart) -> tuple[Points, Points]:

@@ -3,7 +3,6 @@ electro-optical, raster and projection.
 """
 
 import json
-import math
 from collections.abc import Sequence
 from datetime import UTC, datetime
 from pathlib import Path
@@ -19,10 +18,10 @@ from agalign.flight.groups import camera_key, flight_key, flights_of
 from agalign.pixels.raster import crs_code
 from agalign.products.indices.formulas import role_of_band
 from agalign.products.product import CapturePaths, Product, ProductContext, WrittenFile
+from agalign.products.rasters.aligned_files import UNITS
 from agalign.products.rasters.checked_raster import georeferenced
 from agalign.products.rasters.pan_sharpen import panchromatic
-from agalign.products.rasters.raster_file import UNITS
-from agalign.products.run.footprint import footprint, geojson_geometry
+from agalign.products.run.flight_map import footprint, geojson_geometry
 from agalign.values.capture import Band, Capture, CaptureTime
 from agalign.values.files import file_name, read_regular, write_text
 from agalign.values.image import OutputGrid
@@ -155,25 +154,24 @@ def _add_assets(item: "pystac.Item", context: ProductContext) -> None:
         if file.bands:
             EOExtension.add_to(item)
             RasterExtension.add_to(item)
-            _describe_bands(asset, [by_name[n] for n in file.bands], file.nodata, context)
+            _describe_bands(asset, [by_name[n] for n in file.bands], file.nodata_in_json, context)
     item.add_asset("sidecar", pystac.Asset(sidecar.name, media_type=pystac.MediaType.JSON, roles=["metadata"]))
 
 
 def _describe_bands(
-    asset: "pystac.Asset", bands: Sequence[Band], nodata: float | None, context: ProductContext
+    asset: "pystac.Asset", bands: Sequence[Band], nodata: float | str | None, context: ProductContext
 ) -> None:
     """Describe the bands of an asset in the fields of the extensions, and in the common `bands` of STAC 1.1."""
-    raw = context.write_settings.radiometry == "off"
+    raw = context.settings.write.radiometry == "off"
     dtype = np.result_type(*(b.dtype for b in bands)).name if raw else "float32"
-    missing = "nan" if nodata is not None and math.isnan(nodata) else nodata
     described: list[tuple[dict[str, Any], ...]] = []
     for band in bands:
         scale, offset = band.scale_offset if raw else (1.0, 0.0)
         unit = UNITS[band.radiometry.quantity] if not raw and band.radiometry is not None else None
         eo = {"common_name": _common_name(band, context.capture), "center_wavelength": _um(band.wavelength_nm)}
         eo |= {"full_width_half_max": _um(band.bandwidth_nm)}
-        raster = {"nodata": missing, "data_type": dtype, "unit": unit, "scale": scale, "offset": offset}
-        common = {"name": band.name, "data_type": dtype, "nodata": missing, "unit": unit}
+        raster = {"nodata": nodata, "data_type": dtype, "unit": unit, "scale": scale, "offset": offset}
+        common = {"name": band.name, "data_type": dtype, "nodata": nodata, "unit": unit}
         described.append(({"name": band.name, **eo}, raster, common | {f"eo:{k}": v for k, v in eo.items()}))
     for key, parts in zip(("eo:bands", "raster:bands", "bands"), zip(*described, strict=True), strict=True):
         asset.extra_fields[key] = [{k: v for k, v in part.items() if v is not None} for part in parts]

@@ -53,7 +53,7 @@ class TiePoints(Product):
 
     def write(self, context: ProductContext) -> list[WrittenFile]:
         """Write <capture>.ties.csv and <capture>.ties.geojson."""
-        table, features = self.paths(context.capture, context.paths, context.write_settings)
+        table, features = self.paths(context.capture, context.paths, context.settings.write)
         ties = ((b, a) for b in context.capture.moving if (a := context.with_pixels.get(b.name)) is not None and a.ties)
         points = [point for band, alignment in ties for point in tie_points(band, alignment)]
         positions = [f"{side}_{axis}_px" for side in ("reference", "moving") for axis in "xy"]

@@ -24,6 +24,7 @@ from agalign.errors import ConfigurationError, InputError
 from agalign.pixels.raster import OpenRaster, open_raster
 from agalign.products.indices.formulas import Index, bands_for, compute, index_named
 from agalign.products.product import GEOTIFF, CapturePaths, Product, ProductContext, StacAsset, WrittenFile
+from agalign.products.rasters.aligned_files import tags_of, to_cog
 from agalign.products.rasters.checked_raster import (
     FLOAT_OPTIONS,
     WORK_TILE_PX,
@@ -32,7 +33,6 @@ from agalign.products.rasters.checked_raster import (
     checked_raster,
     tiled_profile,
 )
-from agalign.products.rasters.raster_file import tags_of, to_cog
 from agalign.products.report.drawing import with_text, write_png
 from agalign.products.run.captures import RAW, AlignedBand, BandReader
 from agalign.products.sidecar.schema import CaptureResult
@@ -141,7 +141,7 @@ class IndexRasters(Product):
         Raises InputError if bands are in the wrong unit, OutputError.
         """
         bands = _bands(context)
-        indices = [index_named(name) for name in context.write_settings.indices]
+        indices = [index_named(name) for name in context.settings.write.indices]
         problems = []
         for report in write_rasters(bands, indices, context.paths.file(""), context.capture.label):
             if report.path is not None:

@@ -6,6 +6,7 @@ It is for viewing: terrain is not corrected, which takes photogrammetry.
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -13,18 +14,12 @@ import numpy as np
 
 from agalign.errors import ConfigurationError, InputError
 from agalign.pixels.raster import open_raster
-from agalign.products.indices.formulas import Index, index_named
+from agalign.products.indices.formulas import index_named
 from agalign.products.indices.rasters import IndexReport, write_rasters
 from agalign.products.mosaic.adjustment import adjusted, misfit_m, tie_pairs, tied_groups
 from agalign.products.mosaic.placement import Placement, place_captures
-from agalign.products.rasters.checked_raster import (
-    Block,
-    LayerDescription,
-    georeference_tags,
-    grid_profile,
-    write_layers,
-)
-from agalign.products.rasters.raster_file import to_cog, with_nodata
+from agalign.products.rasters.aligned_files import to_cog, with_nodata
+from agalign.products.rasters.checked_raster import Block, LayerDescription, write_on_grid
 from agalign.products.run.captures import AlignedBand, BandReader, LeftOut
 from agalign.values import geometry
 from agalign.values.capture import Georeference
@@ -112,7 +107,9 @@ def mosaic(
         # Geotransforms count from the corner of a pixel.
         on_map = geometry.translation(*flight.origin_m) @ grid.to_ground @ geometry.translation(-0.5, -0.5)
         _write(path, placed, grid, Georeference(on_map, flight.crs_wkt, accuracy_m), tags)
-        labels = [captures[k].label for k in apart]
+        labels, checksum = [captures[k].label for k in apart], file_checksum(path) if indices else ""
+        of_mosaic = enumerate(placed[0].bands, start=1)
+        bands = [AlignedBand(band.name, band.wavelength_nm, path, k, checksum) for k, band in of_mosaic]
         return MosaicReport(
             path,
             captures=len(placed),
@@ -124,7 +121,7 @@ def mosaic(
             accuracy_m=accuracy_m,
             height_is_assumed=any(c.height_is_assumed for c in placed),
             left_out=[*flight.left_out, *((label, _UNTIED) for label in labels if not untied)],
-            indices=_write_indices(path, placed[0].bands, chosen_indices),
+            indices=[*write_rasters(bands, chosen_indices, path.with_suffix(""), path.stem)],
         )
 
 
@@ -165,8 +162,6 @@ def _write(
     """Write the mosaic of all bands."""
     dtype, layers, copied = _like(captures)
     nodata = math.nan if dtype.kind == "f" else 0.0
-    options = {"compress": _COMPRESSION, "nodata": nodata, "interleave": "band"}
-    profile = grid_profile(OutputGrid(0, 0, *grid.size_px), georeference, len(layers), dtype.name, **options)
 
     def blocks() -> Iterator[Block]:
         for tile in tiles(Tile(0, 0, *grid.size_px), _TILE_PX):
@@ -175,8 +170,12 @@ def _write(
                 values = band if dtype.kind == "f" else np.rint(band)
                 yield with_nodata(values.astype(dtype), valid, nodata), number, tile.x0, tile.y0
 
-    tags = copied | tags | georeference_tags(georeference)
-    write_layers(path, profile, layers, tags, blocks(), lambda partial: to_cog(partial, _COMPRESSION))
+    whole, finish = OutputGrid(0, 0, *grid.size_px), partial(to_cog, compression=_COMPRESSION)
+    options = {"compress": _COMPRESSION, "nodata": nodata, "interleave": "band"}
+    tags = copied | tags
+    write_on_grid(
+        path, whole, georeference, layers, blocks(), tags=tags, dtype=dtype.name, options=options, finish=finish
+    )
 
 
 def _like(captures: Sequence[Placement]) -> tuple[np.dtype[Any], list[LayerDescription], dict[str, str]]:
@@ -243,10 +242,3 @@ def _warped(capture: Placement, positions: FloatImage) -> tuple[FloatImage, Mask
             result[k] = one
             valid &= inside
     return result, valid
-
-
-def _write_indices(path: Path, bands: Sequence[AlignedBand], indices: Sequence[Index]) -> Sequence[IndexReport]:
-    """Write indices of the mosaic, in its format."""
-    checksum = file_checksum(path) if indices else ""
-    of_mosaic = [AlignedBand(b.name, b.wavelength_nm, path, k, checksum) for k, b in enumerate(bands, start=1)]
-    return [*write_rasters(of_mosaic, indices, path.with_suffix(""), path.stem)]

@@ -11,8 +11,7 @@ import numpy as np
 from agalign.errors import AgalignError, InputError
 from agalign.pixels.raster import transformed
 from agalign.products.run.captures import AlignedBand, LeftOut, RunCapture, captures_of_run, like_most
-from agalign.products.run.flight_map import FLIGHT_MAP_FILE, features_in
-from agalign.products.run.footprint import pose_errors, utm_wkt
+from agalign.products.run.flight_map import FLIGHT_MAP_FILE, features_in, pose_errors, utm_wkt
 from agalign.products.sidecar.file import read_sidecar
 from agalign.products.sidecar.schema import Sidecar
 from agalign.values import geometry, lens

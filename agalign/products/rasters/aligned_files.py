@@ -1,29 +1,58 @@
-"""The rasters of the aligned bands: a stack, or a file for each input file for photogrammetry programs."""
+"""The rasters of the aligned bands on the output grid, as GeoTIFF or COG: a stack, or a file for each input file for
+photogrammetry programs; their pixels, nodata value and tags.
+"""
 
+import itertools
+import math
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
+import cv2
 import numpy as np
+import rasterio
+from numpy.typing import NDArray
+from rasterio.enums import ColorInterp, Resampling
+from rasterio.fill import fillnodata
+from rasterio.shutil import copy as copy_dataset
 
 from agalign.cameras.metadata import read_tags
 from agalign.cameras.pix4d import GridVignetting, vignetting_of, vignetting_on_grid
-from agalign.cameras.tag_transfer import band_tags, capture_tags
+from agalign.cameras.tag_transfer import TransferredTags, band_tags, capture_tags
+from agalign.cameras.tiff_directory import add_directories
 from agalign.config import WriteSettings
-from agalign.errors import UnreadableFileError
-from agalign.pixels.raster import suffix_format
-from agalign.products.product import CapturePaths, Product, ProductContext, StacAsset, WrittenFile
+from agalign.errors import AgalignError, UnreadableFileError
+from agalign.pixels.band_resampling import resample_tile
+from agalign.pixels.radiometry import calibrated
+from agalign.pixels.raster import GDAL_ENVIRONMENT, open_raster, read_tile, suffix_format, without_warnings
+from agalign.products.indices.formulas import Role, role_of_band
+from agalign.products.product import GEOTIFF, CapturePaths, Product, ProductContext, StacAsset, WrittenFile
+from agalign.products.rasters.checked_raster import WORK_TILE_PX, Block, LayerDescription, predictor, write_on_grid
 from agalign.products.rasters.layout import Layer, is_inside
-from agalign.products.rasters.raster_file import media_type, write_raster
 from agalign.values import geometry
-from agalign.values.capture import Band, Capture, Radiometry
+from agalign.values.capture import Band, Capture, Quantity, Radiometry
+from agalign.values.choices import Interpolation
 from agalign.values.files import file_name
-from agalign.values.image import OutputGrid
+from agalign.values.image import Mask, OutputGrid, Tile
+from agalign.values.interpolation import as_type, can_hold, tiles
 
 _MAX_VIGNETTING_ERROR = 0.01
 """Limit for the tags of aligned files, p95 of corrected pixels: a fifth of the accuracy of the cameras' calibration."""
+_FILL_DISTANCE_PX = 100.0
+"""Search distance of the interpolation of occluded pixels: GDAL's default, wider than any occlusion."""
+UNITS: Mapping[Quantity, str] = {
+    "radiance": "W m-2 sr-1 nm-1",
+    "relative radiance": "",
+    "reflectance": "1",
+    "relative reflectance": "1",
+    "temperature": "degC",
+}
+"""Units in the notation of UDUNITS."""
+
+Pixels = NDArray[np.generic]
 
 
 class BandFiles(Product):
@@ -42,9 +71,9 @@ class BandFiles(Product):
 
     def write(self, context: ProductContext) -> list[WrittenFile]:
         """Write the files of all bands with pixels."""
-        names = band_file_names(context.capture)
+        names, is_raw = band_file_names(context.capture), context.settings.write.radiometry == "off"
         layers = [layer for layer in context.layers if not layer.is_gap]
-        vignettings = {} if context.write_settings.radiometry != "off" else _vignettings(layers, context.grid)
+        vignettings = _vignettings(layers, context.grid) if is_raw else {}
         if any(v.error > _MAX_VIGNETTING_ERROR for v in vignettings.values()):
             # A program that corrects some bands of a capture only would change its indices.
             layers = [replace(layer, vignetting=_correction(layer.band)) for layer in layers]
@@ -52,22 +81,13 @@ class BandFiles(Product):
         by_file: dict[Path, list[Layer]] = {}
         for layer in layers:
             by_file.setdefault(names[layer.band.name], []).append(layer)
-        return [
-            self._write_file(context, name, by_file[name], vignettings.get(by_file[name][0].band.name))
-            for name in dict.fromkeys(names.values())
-            if name in by_file
-        ]
-
-    def _write_file(
-        self, context: ProductContext, name: Path, layers: list[Layer], vignetting: GridVignetting | None
-    ) -> WrittenFile:
-        settings, grid, path = context.write_settings, context.grid, context.paths.folder / name
-        reference, is_raw = context.capture.reference, settings.radiometry == "off"
-        tags = band_tags(layers[0].band, reference, grid, vignetting, radiometry=not is_raw)
-        nodata = write_raster(context.capture, layers, grid, path, settings, tags)
-        asset = StacAsset(name.as_posix(), media_type(settings), ("data",))
-        bands, is_flat = tuple(layer.band.name for layer in layers), any(layer.vignetting for layer in layers)
-        return WrittenFile(self.kind, path, asset, bands, nodata, is_flat=is_flat)
+        written = []
+        for name in dict.fromkeys(name for name in names.values() if name in by_file):
+            band, path = by_file[name][0].band, context.paths.folder / name
+            vignetting = vignettings.get(band.name)
+            tags = band_tags(band, context.capture.reference, context.grid, vignetting, radiometry=not is_raw)
+            written.append(_written(self.kind, context, by_file[name], path, name.as_posix(), tags))
+        return written
 
 
 def band_file_names(capture: Capture) -> dict[str, Path]:
@@ -131,8 +151,225 @@ class Stack(Product):
 
     def write(self, context: ProductContext) -> list[WrittenFile]:
         """Write <capture>.tif."""
-        settings, path = context.write_settings, context.paths.file(self.suffix)
         tags = capture_tags(context.capture.reference, context.grid)
-        nodata = write_raster(context.capture, context.layers, context.grid, path, settings, tags)
-        asset = StacAsset("stack", media_type(settings), ("data",))
-        return [WrittenFile(self.kind, path, asset, tuple(la.band.name for la in context.layers), nodata)]
+        return [_written(self.kind, context, context.layers, context.paths.file(self.suffix), "stack", tags)]
+
+
+def _written(
+    kind: str, context: ProductContext, layers: Sequence[Layer], path: Path, key: str, tags: TransferredTags
+) -> WrittenFile:
+    """Write layers as the bands of one file, and return it with its asset `key`."""
+    settings = context.settings.write
+    nodata = write_raster(context.capture, layers, context.grid, path, settings, tags)
+    media_type = f"{GEOTIFF}; profile=cloud-optimized" if settings.format == "cog" else GEOTIFF
+    bands, is_flat = tuple(layer.band.name for layer in layers), any(layer.vignetting for layer in layers)
+    return WrittenFile(kind, path, StacAsset(key, media_type, ("data",)), bands, nodata, is_flat=is_flat)
+
+
+def write_raster(
+    capture: Capture,
+    layers: Sequence[Layer],
+    grid: OutputGrid,
+    path: Path,
+    settings: WriteSettings,
+    tags: TransferredTags | None = None,
+) -> float | None:
+    """Write layers as the bands of one file atomically; return its nodata value.
+
+    The type is that of the layers if all have the same, else the smallest type that represents them all; float32 after
+    radiometric calibration. A nodata value is declared only if some pixel needs it; valid moving pixels that equal it
+    change by the smallest step. A COG gets no `tags`: tags that GDAL does not write itself would break its layout.
+    Raises OutputError, or UnreadableFileError for an input.
+    """
+    raw = settings.radiometry == "off"
+    dtype = np.result_type(*(layer.band.dtype for layer in layers)) if raw else np.dtype(np.float32)
+    nodata = nodata_value(capture, layers, grid, dtype, settings)
+    # Many programs that read files of single bands do not support Zstandard.
+    fits_all = "deflate" if settings.layout == "bands" or len(layers) < len(capture.bands) else "zstd"
+    compression = fits_all if settings.compression == "auto" else settings.compression
+    options: dict[str, object] = {"interleave": "band", "photometric": "minisblack"}
+    if nodata is not None:
+        options["nodata"] = nodata
+    if compression != "none":
+        options |= {"compress": compression, "predictor": predictor(dtype.kind)}
+        options |= {"zstd_level": 1} if compression == "zstd" else {"zlevel": 6}
+
+    overviews = list(capture.reference.overviews) if settings.format == "gtiff" else []
+
+    def finish(partial: Path) -> None:
+        if overviews or settings.statistics:
+            with without_warnings(), rasterio.Env(**GDAL_ENVIRONMENT), rasterio.open(partial, "r+") as dataset:
+                if settings.statistics:
+                    dataset.stats(approx=False)  # GDAL stores in the file what it computes
+                if overviews:
+                    dataset.build_overviews(overviews, Resampling.average)
+        if tags is not None:
+            add_directories(partial, tags.first, tags.exif, tags.gps)
+        if settings.format == "cog":
+            to_cog(partial, compression)
+
+    blocks, georeference = _blocks(layers, grid, dtype, nodata, settings), capture.reference.georeference
+    descriptions, own_tags = _descriptions(layers, raw=raw), _tags(capture, layers, raw=raw)
+    write_on_grid(
+        path, grid, georeference, descriptions, blocks, tags=own_tags, dtype=dtype.name, options=options, finish=finish
+    )
+    return nodata
+
+
+def is_aligned_raster(path: Path) -> bool:
+    """Return True for a file that `write_raster` has written."""
+    return "REFERENCE_BAND" in tags_of(path)
+
+
+def tags_of(path: Path) -> dict[str, str]:
+    """Return the tags of a raster; none for another file, or one that cannot be read."""
+    with suppress(AgalignError), open_raster(path) as source:
+        return dict(source.tags())
+    return {}
+
+
+def _tags(capture: Capture, layers: Sequence[Layer], *, raw: bool) -> dict[str, str]:
+    """The tags of a file."""
+    known = [] if raw else [layer.band.radiometry for layer in layers if layer.band.radiometry is not None]
+    return {
+        "TIFFTAG_SOFTWARE": "agalign",
+        "TIFFTAG_DATETIME": capture.captured_at[:19].replace("-", ":").replace("T", " "),
+        "CAPTURE_ID": capture.capture_id,
+        "CAMERA": f"{capture.camera.make} {capture.camera.model}".strip(),
+        "REFERENCE_BAND": capture.reference.name,
+        "RADIOMETRY": " and ".join(dict.fromkeys(r.quantity for r in known)),
+        "RADIOMETRY_SOURCE": " and ".join(dict.fromkeys(r.source for r in known)),
+        "VIGNETTING": "corrected" if any(layer.vignetting for layer in layers) else "",
+    }
+
+
+def _descriptions(layers: Sequence[Layer], *, raw: bool) -> list[LayerDescription]:
+    result = []
+    for layer, colour in zip(layers, _colours(layers), strict=True):
+        band = layer.band
+        quantity = None if raw or band.radiometry is None else band.radiometry.quantity
+        tags, imagery = {} if quantity is None else {"QUANTITY": str(quantity)}, {}
+        if band.wavelength_nm is not None:
+            tags |= {"wavelength": f"{band.wavelength_nm:g}", "wavelength_units": "nm"}
+            imagery = {"CENTRAL_WAVELENGTH_UM": f"{band.wavelength_nm / 1000:g}"}
+            if band.bandwidth_nm is not None:
+                tags["fwhm"] = f"{band.bandwidth_nm:g}"
+                imagery["FWHM_UM"] = f"{band.bandwidth_nm / 1000:g}"
+        unit, scale_offset = "" if quantity is None else UNITS[quantity], band.scale_offset if raw else (1.0, 0.0)
+        result.append(LayerDescription(band.name, unit, tags, imagery, scale_offset, colour))
+    return result
+
+
+def _colours(layers: Sequence[Layer]) -> Sequence[ColorInterp | None]:
+    """The colour interpretation of each layer. If there are red, green and blue, the first band of each is displayed as
+    such by viewers; else the first layer is grey. None for a single layer.
+    """
+    if len(layers) == 1:
+        return [None]
+    roles, undefined = [role_of_band(layer.band) for layer in layers], ColorInterp.undefined
+    colours: tuple[Role, ...] = ("red", "green", "blue")
+    if not set(colours) <= set(roles):
+        return [ColorInterp.gray, *[undefined] * (len(layers) - 1)]
+    result = [undefined] * len(layers)
+    for role in colours:
+        result[roles.index(role)] = ColorInterp[role]
+    return result
+
+
+def _blocks(
+    layers: Sequence[Layer], grid: OutputGrid, dtype: np.dtype[Any], nodata: float | None, settings: WriteSettings
+) -> Iterator[Block]:
+    for index, layer in enumerate(layers, start=1):
+        for tile in tiles(grid.tile, WORK_TILE_PX):
+            if layer.is_gap:
+                pixels: Pixels = np.full((tile.height, tile.width), 0 if nodata is None else nodata, dtype=dtype)
+            else:
+                pixels, valid = _tile_of(layer, tile, settings)
+                pixels = pixels.astype(dtype, copy=False)
+                if nodata is not None and not (valid.all() and layer.is_copied):
+                    pixels = with_nodata(pixels, valid, nodata)
+            yield pixels, index, tile.x0 - grid.x0, tile.y0 - grid.y0
+
+
+def _tile_of(layer: Layer, tile: Tile, settings: WriteSettings) -> tuple[Pixels, Mask]:
+    """The pixels (height, width) of a layer that has any on a tile, and their mask."""
+    radiometry = layer.vignetting if settings.radiometry == "off" else layer.band.radiometry
+    pixels, valid = layer_pixels(layer, tile, settings.interpolation, radiometry)
+    if layer.vignetting is not None:
+        pixels = as_type(pixels.astype(np.float32) + layer.vignetting.black_level, np.dtype(layer.band.dtype))
+    if settings.fill_occluded and layer.mapping is not None:
+        occluded = layer.mapping.hidden(tile) & is_inside(layer.mapping.positions(tile), layer.band)
+        if occluded.any() and valid.any():  # GDAL's inverse distance weighting
+            distance_px = cv2.distanceTransform((~valid).astype(np.uint8), cv2.DIST_L2, 3)
+            occluded &= distance_px < _FILL_DISTANCE_PX
+            filled = fillnodata(np.where(valid, pixels, 0).astype(np.float32), valid, _FILL_DISTANCE_PX)
+            return np.where(occluded, as_type(filled, pixels.dtype), pixels), valid | occluded
+    return pixels, valid
+
+
+def layer_pixels(
+    layer: Layer, tile: Tile, interpolation: Interpolation, radiometry: Radiometry | None
+) -> tuple[Pixels, Mask]:
+    """Return the pixels of a layer (height, width) on a tile, calibrated if `radiometry` is given, and their mask."""
+    if layer.mapping is not None:
+        return resample_tile(layer.band, layer.mapping, tile, interpolation, radiometry, size_px=layer.size_px)
+    pixels, valid = read_tile(layer.band, tile)
+    return pixels if radiometry is None else calibrated(pixels, radiometry, tile.x0, tile.y0), valid
+
+
+def to_cog(path: Path, compression: str = "deflate") -> None:
+    """Replace a GeoTIFF by a cloud-optimised one with overviews. Errors are those of rasterio."""
+    cog = path.with_name(f"{path.name}.cog")
+    options = {"blocksize": 512, "bigtiff": "if_safer"}  # GDAL's default size of blocks
+    if compression != "none":
+        options |= {"compress": compression, "predictor": "yes"}
+    try:
+        copy_dataset(path, cog, driver="COG", **options)
+        cog.replace(path)
+    finally:
+        cog.unlink(missing_ok=True)
+
+
+def nodata_value(
+    capture: Capture, layers: Sequence[Layer], grid: OutputGrid, dtype: np.dtype[Any], settings: WriteSettings
+) -> float | None:
+    """Return the nodata value of a file with these layers; None if every pixel is valid. Raises UnreadableFileError."""
+    if settings.radiometry != "off":
+        return math.nan
+    declared = capture.reference.nodata
+    if declared is not None and can_hold(dtype, declared):
+        return declared
+    if dtype.kind == "f":
+        return math.nan  # input files may contain nan without declaring it
+    may_lack_pixels = any(la.is_gap or la.band.nodata is not None or la.band.has_mask for la in layers)
+    return _unused_value(layers, grid, dtype) if grid.has_gaps or may_lack_pixels else None
+
+
+def with_nodata(pixels: Pixels, valid: Mask, nodata: float) -> Pixels:
+    """Return pixels (height, width) with nodata where they are not valid.
+
+    Valid pixels that equal nodata change by the smallest step of their type.
+    """
+    dtype = pixels.dtype
+    if not math.isnan(nodata):
+        if dtype.kind == "f":
+            step = float(np.spacing(np.abs(dtype.type(nodata)) + 1))
+        else:
+            step = 1 if nodata < np.iinfo(str(dtype)).max else -1
+        pixels = np.where(valid & (pixels == nodata), dtype.type(nodata + step), pixels)
+    return np.where(valid, pixels, dtype.type(nodata))
+
+
+def _unused_value(layers: Sequence[Layer], grid: OutputGrid, dtype: np.dtype[Any]) -> float:
+    """The first of 0, the largest value of the type, 1, 2 … that no copied band contains; 0 if there is none.
+
+    Copied pixels then keep their values.
+    """
+    copied = []
+    for band in (layer.band for layer in layers if layer.is_copied):
+        with open_raster(band.path, band.page) as source:
+            copied += [np.unique(read_tile(band, tile, source)[0]) for tile in tiles(grid.tile, WORK_TILE_PX)]
+    limits = np.iinfo(str(dtype))
+    # All values of a 16-bit type; for larger types the first ones are sufficient.
+    candidates = itertools.chain([0, limits.max], range(1, min(limits.max, 1 << 16)))
+    return float(next((v for v in candidates if not any((values == v).any() for values in copied)), 0))

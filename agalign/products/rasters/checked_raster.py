@@ -68,8 +68,8 @@ def checked_raster(
     Raises OutputError.
     """
     written: list[tuple[int, Window, int]] = []
-    try:
-        with complete_file(path) as partial:
+    with complete_file(path) as partial:
+        try:
             with without_warnings(), rasterio.Env(**GDAL_ENVIRONMENT), rasterio.open(partial, "w", **profile) as file:
                 _describe(file, layers, tags)
 
@@ -86,11 +86,11 @@ def checked_raster(
             with without_warnings(), rasterio.Env(**GDAL_ENVIRONMENT), rasterio.open(partial) as file:
                 if any(_checksum(file.read(index, window=window)) != known for index, window, known in written):
                     raise OSError(errno.EIO, _INCOMPLETE)
-    except Exception as error:
-        if not is_gdal_error(error) and not isinstance(error, tifffile.TiffFileError):
-            raise
-        cause = innermost_cause(error).rstrip(".")
-        raise OutputError(f"{path}: cannot be written ({cause}; is the disk full?)") from None
+        except Exception as error:  # before `complete_file`: some errors of rasterio are OSErrors, without GDAL's cause
+            if not is_gdal_error(error) and not isinstance(error, tifffile.TiffFileError):
+                raise
+            cause = innermost_cause(error).rstrip(".")
+            raise OutputError(f"{path}: cannot be written ({cause}; is the disk full?)") from None
 
 
 def _describe(dataset: Any, layers: Sequence[LayerDescription], tags: Mapping[str, str]) -> None:
@@ -123,6 +123,33 @@ def write_layers(
             write(*block)
 
 
+def write_on_grid(
+    path: Path,
+    grid: OutputGrid,
+    georeference: Georeference | None,
+    layers: Sequence[LayerDescription],
+    blocks: Iterable[Block],
+    *,
+    tags: Mapping[str, str] | None = None,
+    dtype: str = "float32",
+    options: Mapping[str, Any] = FLOAT_OPTIONS,
+    finish: Callable[[Path], None] | None = None,
+) -> None:
+    """Write a tiled raster on an output grid, as `write_layers` does, with the georeference of the reference's file.
+
+    A file without a georeference gets no transform: an identity transform would be read as a georeference. Tags mark
+    one by the camera's pose as approximate. Raises OutputError.
+    """
+    profile, all_tags = tiled_profile(grid.width, grid.height, len(layers), dtype, **options), dict(tags or {})
+    if georeference is not None:
+        profile |= georeferenced(georeference, grid)
+        if georeference.accuracy_m is not None:
+            approximate = "approximate, from GPS position, altitude, yaw and focal length; no ground control"
+            all_tags["GEOREFERENCE"] = approximate
+            all_tags["GEOREFERENCE_ACCURACY_M"] = f"{georeference.accuracy_m:g}"
+    write_layers(path, profile, layers, all_tags, blocks, finish)
+
+
 def check_complete(path: Path) -> None:
     """Raise OSError for a TIFF in which a tile or strip is missing or truncated.
 
@@ -142,33 +169,12 @@ def tiled_profile(width: int, height: int, count: int, dtype: str, **options: An
     return {"driver": "GTiff"} | size | blocks | options
 
 
-def grid_profile(
-    grid: OutputGrid, georeference: Georeference | None, count: int, dtype: str, **options: Any
-) -> dict[str, Any]:
-    """Return the profile of a tiled GeoTIFF on an output grid, given the georeference of the reference's file.
-
-    A file without a georeference gets no transform: an identity transform would be read as a georeference.
-    """
-    profile = tiled_profile(grid.width, grid.height, count, dtype, **options)
-    return profile if georeference is None else profile | georeferenced(georeference, grid)
-
-
 def georeferenced(georeference: Georeference, grid: OutputGrid) -> dict[str, Any]:
     """Return rasterio's `transform` and `crs` of an output grid, given the georeference of the reference's file."""
     # Geotransforms start at the corner of a pixel, so a change of resolution only scales them.
     scale = np.diag([1 / grid.scale.x, 1 / grid.scale.y, 1.0])
     transform = georeference.transform @ scale @ geometry.translation(grid.x0, grid.y0)
     return {"transform": Affine(*transform[:2].ravel()), "crs": rasterio.CRS.from_wkt(georeference.crs_wkt)}
-
-
-def georeference_tags(georeference: Georeference | None) -> dict[str, str]:
-    """Return tags that mark a georeference by the camera's pose as approximate; empty for that of an input file."""
-    if georeference is None or georeference.accuracy_m is None:
-        return {}
-    return {
-        "GEOREFERENCE": "approximate, from GPS position, altitude, yaw and focal length; no ground control",
-        "GEOREFERENCE_ACCURACY_M": f"{georeference.accuracy_m:g}",
-    }
 
 
 def predictor(kind: str) -> int:

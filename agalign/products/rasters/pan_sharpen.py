@@ -25,9 +25,9 @@ from agalign.errors import InputError
 from agalign.pixels.masks import data_mask
 from agalign.pixels.raster import OpenRaster, open_raster
 from agalign.products.product import GEOTIFF, Product, ProductContext, StacAsset, WrittenFile
+from agalign.products.rasters.aligned_files import with_nodata, write_raster
 from agalign.products.rasters.checked_raster import Block, LayerDescription, predictor, write_layers
 from agalign.products.rasters.layout import Layer, common_grid, output_layers
-from agalign.products.rasters.raster_file import with_nodata, write_raster
 from agalign.values.capture import Band, Capture
 from agalign.values.files import scratch_file
 from agalign.values.image import FloatImage, Mask, OutputGrid, Tile
@@ -57,7 +57,7 @@ class PanSharpened(Product):
     def write(self, context: ProductContext) -> list[WrittenFile]:
         """Write <capture>.pan.tif; nothing if the panchromatic band is not usable."""
         fine = {"resolution": "finest", "format": "gtiff", "compression": "none"}
-        settings, path = context.write_settings.model_copy(update=fine), context.paths.file(self.suffix)
+        settings, path = context.settings.write.model_copy(update=fine), context.paths.file(self.suffix)
         sources = _sources(context, settings)
         if sources is None:
             return []

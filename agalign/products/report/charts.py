@@ -19,20 +19,6 @@ PLAN_WIDTH, FIELD_WIDTH, CHART_WIDTH, CHART_HEIGHT = 200.0, 160.0, 640.0, 130.0
 
 
 @dataclass(frozen=True)
-class RigView:
-    """The rig of a camera in a flight."""
-
-    camera: str
-    captures: int
-    shared: str
-    field_height: float
-    bands: tuple[dict[str, Any], ...]
-    """Rows of `band_summaries` with `hue`, the position `x`, `y` of the lens in the plan of the rig, and `arrows`
-    (x1, y1, x2, y2) of its displacement field.
-    """
-
-
-@dataclass(frozen=True)
 class Line:
     """One band over a flight, as drawn in a chart."""
 
@@ -73,8 +59,13 @@ def by_band(captures: Sequence[Mapping[str, Any]], missing: Any = np.nan) -> tup
     return names, np.array([[of_capture.get(name, missing) for of_capture in captures] for name in names], np.float64)
 
 
-def rig_views(out: Path, on_problem: Callable[[str], None]) -> list[RigView]:
-    """Return the rigs of the models below OUT/models; unreadable models are reported to `on_problem`."""
+def rig_views(out: Path, on_problem: Callable[[str], None]) -> list[dict[str, Any]]:
+    """Return the rigs of the models below OUT/models; unreadable models are reported to `on_problem`.
+
+    Each has `camera`, number of `captures`, `shared` factors in words, `field_height`, and `bands`: rows of
+    `band_summaries` with `hue`, the position `x`, `y` of the lens in the plan of the rig, and `arrows` (x1, y1, x2, y2)
+    of its displacement field.
+    """
     views = []
     for path in sorted((out / "models").glob("*.safetensors")):
         try:
@@ -83,22 +74,15 @@ def rig_views(out: Path, on_problem: Callable[[str], None]) -> list[RigView]:
             on_problem(str(error))
             continue
         if rig is not None:
-            views.append(_rig_view(path.stem, rig))
+            rows = band_summaries(rig)
+            longest = max((math.hypot(*r["baseline"]) for r in rows), default=0.0) or 1.0
+            to_plan = 0.36 * PLAN_WIDTH / longest  # leaves space for names
+            for number, row in enumerate(rows):
+                x, y = (PLAN_WIDTH / 2 + to_plan * v for v in row["baseline"])
+                row |= {"hue": _hue(number, len(rows)), "x": x, "y": y, "arrows": _arrows(rig, row["band"])}
+            size = {"field_height": FIELD_WIDTH * rig.size_px[1] / rig.size_px[0], "captures": len(rig.captures)}
+            views.append({"camera": path.stem, "shared": ", ".join(rig.factors) or "nothing", "bands": rows, **size})
     return views
-
-
-def _rig_view(camera: str, rig: Rig) -> RigView:
-    rows = band_summaries(rig)
-    longest = max((math.hypot(*r["baseline"]) for r in rows), default=0.0) or 1.0
-    to_plan = 0.36 * PLAN_WIDTH / longest  # leaves space for names
-    width, height = rig.size_px
-    bands = []
-    for number, row in enumerate(rows):
-        x, y = (PLAN_WIDTH / 2 + to_plan * v for v in row["baseline"])
-        drawn = {"hue": _hue(number, len(rows)), "x": x, "y": y, "arrows": _arrows(rig, row["band"])}
-        bands.append(row | drawn)
-    shared = ", ".join(rig.factors) or "nothing"
-    return RigView(camera, len(rig.captures), shared, FIELD_WIDTH * height / width, tuple(bands))
 
 
 def _arrows(rig: Rig, band: str) -> tuple[tuple[float, float, float, float], ...]:
@@ -122,7 +106,9 @@ def drifts_of(captures: Sequence[dict[str, Any]]) -> list[FlightChart]:
     result = []
     for camera in dict.fromkeys(c["camera"] for c in captures):
         in_order = sorted((c for c in captures if c["camera"] == camera), key=lambda c: (c["captured_at"], c["label"]))
-        names, offsets_px = by_band([_offsets_px(c) for c in in_order], (np.nan, np.nan))
+        usable = [[b for b in c["bands"] if b["status"] in ("aligned", "predicted")] for c in in_order]
+        offsets = [{b["band"]: b["offset_px"] for b in bands if b["offset_px"]} for bands in usable]
+        names, offsets_px = by_band(offsets, (np.nan, np.nan))
         if len(in_order) < 3 or not names:
             continue
         differences = [_principal_component(of_band) for of_band in offsets_px]
@@ -131,11 +117,6 @@ def drifts_of(captures: Sequence[dict[str, Any]]) -> list[FlightChart]:
         labels, min_full_px = [c["label"] for c in in_order], 0.2  # smaller drifts are noise
         result.append(FlightChart.of(f"{camera} from capture to capture", labels, names, aligned, min_full_px))
     return result
-
-
-def _offsets_px(capture: dict[str, Any]) -> dict[str, tuple[float, float]]:
-    usable = [b for b in capture["bands"] if b["status"] in ("aligned", "predicted")]
-    return {b["band"]: b["offset_px"] for b in usable if b["offset_px"]}
 
 
 def _principal_component(offsets_px: NDArray[np.float64]) -> NDArray[np.float64]:

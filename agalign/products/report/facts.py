@@ -120,6 +120,10 @@ class PairTotals:
         """Labels of the captures."""
         return {label for label, *_ in self._references}
 
+    def residuals_px(self) -> list[float]:
+        """Return the residuals of all aligned pairs, sorted."""
+        return sorted(px for band in self.bands.values() for px in band.residuals_px)
+
     def groups(self) -> list[FailureGroup]:
         """Return the failures by cause, and the captures with another reference than most of their flight; the most
         severe first, and the largest first of those.
@@ -161,9 +165,8 @@ class FlightFacts:
 
     def add(self, folder: str, sidecar: Sidecar) -> None:
         """Add a capture, given its folder relative to the output folder."""
-        result = sidecar.result()
         label = Path(folder, sidecar.capture).as_posix()
-        self.pairs.add(label, result)
+        self.pairs.add(label, sidecar)
         output, position, path = sidecar.output, sidecar.position, Path(folder)
         grid = output or OutputPart(file=None, bytes=None, crop=(0, 0, *sidecar.reference.size_px), nodata=None)
         files = {part.kind: part.file for part in sidecar.products}
@@ -213,6 +216,13 @@ class FlightFacts:
                 links = {"file": quote(file.as_posix()), "picture": quote(file.with_suffix(".png").as_posix())}
                 by_label[row.capture].append(facts | links)
 
+    def masked_shares(self) -> dict[str, list[float]]:
+        """Return the sorted shares of pixels that only the quality flags mask, by index."""
+        shares: dict[str, list[float]] = defaultdict(list)
+        for index in (index for capture in self.captures for index in capture["indices"] if index["masked"] > 0):
+            shares[index["name"]].append(index["masked"])
+        return {name: sorted(of_index) for name, of_index in shares.items()}
+
     def as_json(self) -> dict[str, Any]:
         """Return the data of the schema `agalign-report/1`. The script of the page declares their types."""
         facts = {"schema": "agalign-report/1", "captures": self.captures, "shift_step_px": _SHIFT_STEP_PX}
@@ -243,13 +253,6 @@ class FlightFacts:
             "lattice": self._lattices.setdefault(lattice, len(self._lattices)),
             "shifts": [None if v is None else round(v / _SHIFT_STEP_PX) for t in tiles for v in t.shift_px],
         }
-
-
-def masked_shares(captures: Sequence[dict[str, Any]]) -> list[tuple[str, list[float]]]:
-    """Return (index, sorted shares of pixels that only the quality flags mask), given the captures of the report."""
-    indices = [index for capture in captures for index in capture["indices"] if index["masked"] > 0]
-    names = dict.fromkeys(index["name"] for index in indices)
-    return [(name, sorted(index["masked"] for index in indices if index["name"] == name)) for name in names]
 
 
 def value_at(part: object, path: str) -> Any:

@@ -4,10 +4,8 @@ import base64
 import hashlib
 import json
 import os
-from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path
 from statistics import median
@@ -20,10 +18,10 @@ from agalign.config import Settings
 from agalign.errors import SidecarError
 from agalign.products.indices.rasters import IndexReport, reports_of_run, update_table
 from agalign.products.report.charts import drifts_of, rig_views
-from agalign.products.report.facts import BAND_COLUMNS, FailureGroup, FlightFacts, masked_shares
+from agalign.products.report.facts import BAND_COLUMNS, FlightFacts
 from agalign.products.report.light import CaptureLight, light_charts, radiometric_check
-from agalign.products.run.excluded import PANELS_FILE, SKY_FILE, PanelPart, SkyPart, read_panels, read_sky
-from agalign.products.run.record import RunPart, exclusion_lines, read_run_record
+from agalign.products.run.excluded import PANELS_FILE, SKY_FILE, PanelPart, SkyPart, read_excluded
+from agalign.products.run.record import RunPart, read_run_record
 from agalign.products.sidecar.file import find_sidecars, read_sidecar
 from agalign.products.text_files import write_csv
 from agalign.values.files import write_text
@@ -32,21 +30,8 @@ SUMMARY_COLUMNS = ("folder", "capture", *BAND_COLUMNS, "reference")
 REPORT_FILE, SUMMARY_FILE = "index.html", "summary.csv"
 
 
-@dataclass(frozen=True)
-class Pages:
-    """The written documents, and their contents."""
-
-    report: Path
-    summary: Path
-    failures: Sequence[FailureGroup]
-    facts: Mapping[str, Any]
-    """Data of the report, schema `agalign-report/1`."""
-    slowest: tuple[tuple[str, float], ...]
-    """(label, seconds) of the captures with the longest processing time."""
-
-
-def write_pages(out: Path, on_problem: Callable[[str], None]) -> Pages:
-    """Write OUT/index.html, OUT/summary.csv and OUT/indices.csv from all sidecars below OUT.
+def write_pages(out: Path, on_problem: Callable[[str], None]) -> FlightFacts:
+    """Write OUT/index.html, OUT/summary.csv and OUT/indices.csv from all sidecars below OUT, and return their data.
 
     Unreadable files are reported to `on_problem` and left out; the pages then count as outdated in `pages_exist`.
     Raises OutputError.
@@ -68,22 +53,37 @@ def write_pages(out: Path, on_problem: Callable[[str], None]) -> Pages:
     sky: list[SkyPart] = []
     run: RunPart | None = None
     try:
-        panels, sky, run = read_panels(out), read_sky(out), read_run_record(out)
+        (panels, sky), run = read_excluded(out), read_run_record(out)
     except SidecarError as error:
         unreadable.append(str(error))
     not_aligned = [("panel", part) for part in panels if not part.in_scene] + [("sky", part) for part in sky]
-    rows = [*facts.rows, *(row for excluded in not_aligned for row in _rows_not_aligned(*excluded))]
+    rows = [*facts.rows]
+    for status, part in not_aligned:
+        of_capture = {"folder": part.folder, "capture": part.capture, "status": status, "reason": part.sentence}
+        rows += [of_capture | {"band": band.band} for band in part.bands]
     write_csv(out / SUMMARY_FILE, SUMMARY_COLUMNS, ([row.get(name) for name in SUMMARY_COLUMNS] for row in rows))
     facts.add_indices(update_table(out, indices), out)
-    failures = facts.pairs.groups()
-    slowest = sorted(((c["label"], c["seconds"]) for c in facts.captures), key=lambda c: -c[1])[:5]
-    write_text(out / REPORT_FILE, _page(out, facts, light, panels, sky, run, unreadable.append))
+    page = _page(
+        version=__version__,
+        median=median,
+        flight=facts,
+        facts=_script_json(facts.as_json()),
+        run=run,
+        settings=_changed_settings(run),
+        rigs=rig_views(out, unreadable.append),
+        drifts=drifts_of(facts.captures),
+        light=light_charts(light),
+        check=radiometric_check(light),
+        panels=panels,
+        sky=sky,
+    )
+    write_text(out / REPORT_FILE, page)
     if unreadable:
         with suppress(OSError):
             os.utime(out / REPORT_FILE, (0, 0))
     for text in unreadable:
         on_problem(text)
-    return Pages(out / REPORT_FILE, out / SUMMARY_FILE, failures, facts.as_json(), tuple(slowest))
+    return facts
 
 
 def pages_exist(out: Path) -> bool:
@@ -96,21 +96,8 @@ def pages_exist(out: Path) -> bool:
         return False
 
 
-def _rows_not_aligned(status: str, part: PanelPart | SkyPart) -> list[dict[str, object]]:
-    """A row for each band of a capture of a panel or of the sky; other columns are empty."""
-    facts = {"folder": part.folder, "capture": part.capture, "status": status, "reason": part.sentence}
-    return [{**facts, "band": band.band} for band in part.bands]
-
-
-def _page(
-    out: Path,
-    facts: FlightFacts,
-    light: Sequence[CaptureLight],
-    panels: Sequence[PanelPart],
-    sky: Sequence[SkyPart],
-    run: RunPart | None,
-    on_problem: Callable[[str], None],
-) -> str:
+def _page(**values: Any) -> str:
+    """The page of the template, which gets these values."""
     environment = Environment(
         loader=PackageLoader("agalign.products.report", "."),
         autoescape=select_autoescape(["j2"]),
@@ -118,41 +105,10 @@ def _page(
         lstrip_blocks=True,
         undefined=StrictUndefined,
     )
-    script, states = _resource("page.js"), Counter({} if run is None else run.captures)
-    return environment.get_template("page.html.j2").render(
-        version=__version__,
-        style=_resource("page.css"),
-        script=script,
-        script_hash=base64.b64encode(hashlib.sha256(script.encode()).digest()).decode(),
-        facts=_script_json(facts.as_json()),
-        captures=facts.captures,
-        counts=Counter(c["status"] for c in facts.captures),
-        statuses=facts.pairs.statuses,
-        pairs=facts.pairs.statuses.total(),
-        found=states["found"],
-        errors=states["error"],
-        untried=2 * states["found"] - states.total(),  # the other states are of captures that were tried
-        cameras=Counter(c["camera"] for c in facts.captures),
-        residuals_px=sorted(px for band in facts.pairs.bands.values() for px in band.residuals_px),
-        capture_seconds=median(c["seconds"] for c in facts.captures) if facts.captures else None,
-        run_seconds=run.seconds if run is not None and states["done"] == len(facts.captures) else None,
-        failures=facts.pairs.groups(),
-        problems=[] if run is None else run.problems,
-        settings=_changed_settings(run),
-        run=run,
-        unfinished=run is not None and run.state == "interrupted",
-        bands=facts.pairs.bands,
-        median=median,
-        rigs=rig_views(out, on_problem),
-        drifts=drifts_of(facts.captures),
-        light=light_charts(light),
-        check=radiometric_check(light),
-        exclusions=[] if run is None else exclusion_lines(run.excluded),
-        masked=masked_shares(facts.captures),
-        panels=panels,
-        sky=sky,
-        mapped=sum(c["position"] is not None for c in facts.captures),
-    )
+    script = _resource("page.js")
+    digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
+    resources_of_page = {"style": _resource("page.css"), "script": script, "script_hash": digest}
+    return environment.get_template("page.html.j2").render(**resources_of_page, **values)
 
 
 def _changed_settings(run: RunPart | None) -> list[tuple[str, str]]:

@@ -23,8 +23,7 @@ from numpy.typing import NDArray
 from agalign.cameras.base import is_thermal
 from agalign.products.indices.formulas import ROLES
 from agalign.products.product import Product, ProductContext, StacAsset, WrittenFile
-from agalign.products.rasters.quality_raster import error_lattice_px
-from agalign.products.rasters.relief_map import relief_layers, relief_of
+from agalign.products.rasters.alignment_maps import error_lattice_px, relief_layers, relief_of
 from agalign.products.report.drawing import Grey, ReducedBands, encoded, side_by_side, titled, write_png
 from agalign.products.sidecar.schema import PreviewPart, ReliefPreviewPart
 from agalign.values.capture import Band
@@ -66,7 +65,7 @@ class Preview(Product):
         """Write <capture>.preview.jpg."""
         path, reference = context.paths.file(self.suffix), context.capture.reference
         bands = [b.name for b in context.capture.bands]
-        mapped = context.with_pixels if context.write_settings.error_map else {}
+        mapped = context.with_pixels if context.settings.write.error_map else {}
         errors_px = {name: error_lattice_px(a, reference, context.grid) for name, a in mapped.items()}
         part = write_preview(
             context.reduced_bands, bands, errors_px, path, context.max_preview_bytes, relief_view(context)

@@ -153,16 +153,13 @@ def write_sky(sky: Sequence[SkyCapture], out: Path) -> list[SkyPart]:
     return parts
 
 
-def read_panels(out: Path) -> list[PanelPart]:
-    """Return the captures of panels of an earlier run. Raises SidecarError for a file that agalign did not write."""
-    file = read_model(out / PANELS_FILE, PanelsFile)
-    return [] if file is None else file.panels
+def read_excluded(out: Path) -> tuple[list[PanelPart], list[SkyPart]]:
+    """Return the captures of panels and those of the sky of an earlier run.
 
-
-def read_sky(out: Path) -> list[SkyPart]:
-    """Return the captures of the sky of an earlier run. Raises SidecarError for a file that agalign did not write."""
-    file = read_model(out / SKY_FILE, SkyFile)
-    return [] if file is None else file.captures
+    Raises SidecarError for a file that agalign did not write.
+    """
+    panels, sky = read_model(out / PANELS_FILE, PanelsFile), read_model(out / SKY_FILE, SkyFile)
+    return ([] if panels is None else panels.panels), ([] if sky is None else sky.captures)
 
 
 def _identity(capture: Capture) -> dict[str, Any]:

@@ -1,22 +1,240 @@
-"""OUT/flight.geojson: footprints of the captures of a run, with their results and links to their files."""
+"""The footprint of a capture on the ground, by its georeference or the pose of the camera, and OUT/flight.geojson: the
+footprints of the captures of a run, with their results and links to their files.
+"""
 
 import json
+import math
 from collections import defaultdict
 from collections.abc import Iterable, Sequence
+from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
+import numpy as np
+from numpy.typing import NDArray
 from pydantic_core import from_json
 
+from agalign.errors import GeometryError
+from agalign.flight.groups import flights_of
+from agalign.pixels.raster import crs_wkt, transformed
 from agalign.products.indices.rasters import IndexReport, read_table
 from agalign.products.product import CapturePaths
-from agalign.products.run.footprint import accuracy_of_footprint_m, footprint, geojson_geometry, with_assumed_height
-from agalign.products.sidecar.schema import BandResult, CaptureResult
-from agalign.values.capture import Capture, Pose
+from agalign.products.sidecar.schema import CaptureResult
+from agalign.values import geometry
+from agalign.values.capture import Capture, Georeference, HeightSource, Position
 from agalign.values.files import read_regular, write_text
+from agalign.values.geometry import Points
 from agalign.values.image import OutputGrid
 
 FLIGHT_MAP_FILE = "flight.geojson"
+_MAX_TILT_DEG = 45.0
+"""The footprint of a camera with a larger tilt is not useful, and the tag is often wrong."""
+
+
+class PoseErrors(NamedTuple):
+    """Standard errors of the pose of a camera by its tags."""
+
+    position_m: float
+    """Of a GPS receiver without corrections."""
+    height: float
+    """Relative to the height above ground."""
+    heading: float
+    """Radians, of a magnetic heading."""
+    tilt: float
+    """Radians."""
+
+
+def footprint(capture: Capture, grid: OutputGrid) -> NDArray[np.float64] | None:
+    """Return a closed ring (5, 2) of (longitude, latitude) in degrees around the pixels of a grid.
+
+    None if neither a georeference nor the camera's pose is known.
+    """
+    x0, y0 = grid.x0, grid.y0
+    x1, y1 = x0 + grid.width, y0 + grid.height
+    corners = np.array([[x0, y0], [x1, y0], [x1, y1], [x0, y1], [x0, y0]], dtype=np.float64) / grid.scale
+    georeference = capture.reference.georeference
+    try:
+        if georeference is not None:
+            return transformed(geometry.apply(georeference.transform, corners), georeference.crs_wkt, "EPSG:4326")
+        offsets_m, position = ground_m(capture, corners - 0.5), capture.position
+        if offsets_m is None or position is None:
+            return None
+        return transformed(offsets_m, _local_crs(position), "EPSG:4326")
+    except GeometryError:
+        return None
+
+
+def geojson_geometry(
+    ring: NDArray[np.float64] | None, position: Position | None, decimals: int
+) -> dict[str, Any] | None:
+    """Return the GeoJSON geometry of a footprint (n, 2) with these decimals, else of the camera's position, or None.
+
+    A footprint across the 180th meridian is cut there (RFC 7946, 3.1.9).
+    """
+    if ring is not None and np.ptp(ring[:, 0]) > 180:
+        beyond = np.column_stack([ring[:, 0] % 360 - 180, ring[:, 1]])  # degrees east of the meridian
+        parts = [_clipped(beyond, side) - np.array([side * 180.0, 0.0]) for side in (-1, 1)]
+        return {"type": "MultiPolygon", "coordinates": [[part.round(decimals).tolist()] for part in parts]}
+    if ring is not None:
+        return {"type": "Polygon", "coordinates": [ring.round(decimals).tolist()]}
+    if position is not None:
+        return {"type": "Point", "coordinates": [position.longitude, position.latitude]}
+    return None
+
+
+def _clipped(ring: NDArray[np.float64], side: int) -> NDArray[np.float64]:
+    """Return the part of a closed ring (n, 2) with negative (`side` -1) or positive x."""
+    kept = []
+    for a, b in pairwise(ring):
+        if side * a[0] >= 0:
+            kept.append(a)
+        if a[0] * b[0] < 0:
+            kept.append(a + (b - a) * a[0] / (a[0] - b[0]))
+    return np.array([*kept, kept[0]])
+
+
+def ground_m(capture: Capture, points_px: NDArray[np.float64]) -> NDArray[np.float64] | None:
+    """Project pixels of the reference (n, 2) onto a horizontal plane: (n, 2) metres east and north of the camera.
+
+    None if height, heading or focal length is unknown, or the camera is tilted too much.
+    """
+    pose = capture.pose
+    if pose is None or pose.height_m is None or pose.focal_length_px is None:
+        return None
+    if math.hypot(pose.pitch_deg, pose.roll_deg) > _MAX_TILT_DEG:
+        return None
+    centre = (np.array(capture.reference.size_px) - 1) / 2
+    right, down = ((points_px - centre) / pose.focal_length_px).T
+    # Rays rotated by the pitch, then by the roll: components (forward, right, downward).
+    pitch, roll, heading = np.radians((pose.pitch_deg, pose.roll_deg, pose.heading_deg))
+    forward, downward = -down * np.cos(pitch) + np.sin(pitch), np.cos(pitch) + down * np.sin(pitch)
+    right, downward = (right * np.cos(roll) - downward * np.sin(roll), downward * np.cos(roll) + right * np.sin(roll))
+    if not (downward > 0).all():
+        return None
+    forward_m, right_m = pose.height_m * forward / downward, pose.height_m * right / downward
+    east_m = right_m * np.cos(heading) + forward_m * np.sin(heading)
+    return np.stack([east_m, forward_m * np.cos(heading) - right_m * np.sin(heading)], axis=-1)
+
+
+def missing_for_footprint(capture: Capture) -> str:
+    """Return what `ground_m` lacks of a capture, and the remedy: tags, the height, or a view that is steep enough."""
+    pose, position = capture.pose, capture.position
+    tags = {
+        "a position": position is not None,
+        "a heading": pose is not None,
+        "a focal length": pose is None or pose.focal_length_px is not None,
+    }
+    if lacking := [name for name, known in tags.items() if not known]:
+        return f"{' and '.join(lacking)} in its tags; leave --georeference out"
+    if pose is not None and pose.height_m is not None:
+        return f"a tilt below {_MAX_TILT_DEG:.0f} degrees; leave --georeference out"
+    if position is not None and position.altitude_m is not None:
+        return "a height above the ground; give --ground-elevation, in metres and below the altitude of the camera"
+    return "an altitude or a height above the ground in its tags; leave --georeference out"
+
+
+def above_elevation(capture: Capture, ground_elevation_m: float) -> Capture:
+    """Return the capture with the height above ground of this elevation, if neither tags nor a panel give a height."""
+    height_m = _altitude_m(capture) - ground_elevation_m
+    return _with_height(capture, height_m, "ground elevation")
+
+
+def with_assumed_height(capture: Capture) -> Capture:
+    """Return the capture with an upper limit of the height above ground, if no height is known: the altitude above sea
+    level, at most the legal limit.
+    """
+    max_assumed_height_m = 120.0  # legal limit of the height above ground of drones in most countries
+    return _with_height(capture, min(_altitude_m(capture), max_assumed_height_m), "assumed")
+
+
+def with_approximate_georeference(capture: Capture, crs: str) -> Capture:
+    """Return the capture with an affine georeference of its reference, if it has none and its height is known.
+
+    `crs` is the WKT of the flight's coordinate system: captures across the border of a UTM zone have one as well.
+    The ground is assumed to be a horizontal plane, lens distortion is neglected, and `accuracy_m` is set.
+    """
+    reference, position = capture.reference, capture.position
+    corners = _outline_px(capture)
+    offsets_m = ground_m(capture, corners - 0.5)
+    if reference.georeference is not None or offsets_m is None or position is None:
+        return capture
+    try:
+        on_map = transformed(offsets_m, _local_crs(position), crs)
+    except GeometryError:
+        return capture
+    design = np.column_stack([corners, np.ones(4)])
+    affine, *_ = np.linalg.lstsq(design, on_map - on_map[0], rcond=None)
+    fit_error_m = float(np.abs(design @ affine - (on_map - on_map[0])).max())
+    transform = np.vstack([affine.T, [0.0, 0.0, 1.0]])
+    transform[:2, 2] += on_map[0]
+    accuracy_m = accuracy_of_footprint_m(capture)
+    assert accuracy_m is not None
+    georeference = Georeference(transform, crs, round(math.hypot(accuracy_m, fit_error_m), 1))
+    bands = tuple(replace(b, georeference=georeference) if b is reference else b for b in capture.bands)
+    return replace(capture, bands=bands)
+
+
+def pose_errors(height_m: float | None, height_from: str | None, *, has_tilt: bool = False) -> PoseErrors:
+    """Return the standard errors of a camera's pose. Without a height, that of the height is zero."""
+    # Assumed height; barometric height over uneven ground. Gimbal or attitude sensor; camera fixed to an aircraft.
+    height = 0.5 if height_from == "assumed" else 5.0 / height_m if height_m else 0.0
+    return PoseErrors(3.0, height, math.radians(5.0), math.radians(2.0 if has_tilt else 7.0))
+
+
+def accuracy_of_footprint_m(capture: Capture) -> float | None:
+    """Return the standard error, metres, of the farthest corner of a footprint by `ground_m`, from the errors of the
+    camera's position, heading, tilt and height. None if `ground_m` returns None.
+    """
+    offsets_m = ground_m(capture, _outline_px(capture) - 0.5)
+    pose = capture.pose
+    if offsets_m is None or pose is None or pose.height_m is None:
+        return None
+    distance_m = float(np.linalg.norm(offsets_m, axis=1).max())
+    tangent = distance_m / pose.height_m  # of the corner's angle from the vertical
+    errors = pose_errors(pose.height_m, pose.height_from, has_tilt=bool(pose.pitch_deg or pose.roll_deg))
+    tilted_m = errors.tilt * pose.height_m * (1 + tangent**2)
+    errors_m = errors.position_m, errors.heading * distance_m, tilted_m, errors.height * pose.height_m * tangent
+    return round(math.hypot(*errors_m), 1)
+
+
+def utm_wkt(longitude: float, latitude: float) -> str:
+    """Return the WKT of the UTM zone of a position, degrees."""
+    zone = min(int((longitude + 180) // 6), 59) + 1
+    return crs_wkt(f"EPSG:{(32600 if latitude >= 0 else 32700) + zone}")
+
+
+def utm_of_flights(captures: Sequence[Capture]) -> dict[str, str]:
+    """Return the WKT of the UTM zone of each capture's flight, by label: that of the flight's first position."""
+    result: dict[str, str] = {}
+    for flight in flights_of(captures):
+        position = next((c.position for c in flight if c.position is not None), None)
+        if position is not None:
+            result |= dict.fromkeys((c.label for c in flight), utm_wkt(position.longitude, position.latitude))
+    return result
+
+
+def _outline_px(capture: Capture) -> Points:
+    """The outer corners (4, 2) of the corner pixels of the reference; (0, 0) is the first one."""
+    width, height = capture.reference.size_px
+    return geometry.corners(width + 1, height + 1)
+
+
+def _altitude_m(capture: Capture) -> float:
+    position = capture.position
+    return math.nan if position is None or position.altitude_m is None else position.altitude_m
+
+
+def _with_height(capture: Capture, height_m: float, source: HeightSource) -> Capture:
+    pose = capture.pose
+    if pose is None or pose.height_m is not None or not height_m > 1.0:  # nan too
+        return capture
+    return replace(capture, pose=replace(pose, height_m=height_m, height_from=source))
+
+
+def _local_crs(position: Position) -> str:
+    """Azimuthal equidistant projection around a position: metres east and north of it."""
+    return f"+proj=aeqd +lat_0={position.latitude:.9f} +lon_0={position.longitude:.9f} +datum=WGS84 +units=m"
 
 
 class FlightMap:
@@ -36,26 +254,43 @@ class FlightMap:
         shown = capture if status in ("panel", "sky") else with_assumed_height(capture)
         output = None if result is None else result.output
         ring = footprint(shown, OutputGrid(0, 0, *capture.reference.size_px) if output is None else output.grid)
-        position = shown.position
+        position, pose = shown.position, shown.pose
         # RFC 7946: outer rings are counter-clockwise. 1e-7 degrees are a centimetre.
-        geometry = geojson_geometry(None if ring is None else ring[::-1], position, decimals=7)
+        shape = geojson_geometry(None if ring is None else ring[::-1], position, decimals=7)
         georeference = capture.reference.georeference
         if georeference is None:
             accuracy_m = None if ring is None else accuracy_of_footprint_m(shown)
         else:
             accuracy_m = georeference.accuracy_m
+        height_m = None if pose is None else pose.height_m
+        bands = [] if result is None else [b for b in result.bands if b.status != "reference"]
+        after = [b.metrics.after for b in bands if b.metrics is not None]
+        paths = CapturePaths.of(capture, Path())
+        products = [] if result is None else result.products
+        files = [(part.kind, (paths.folder / part.file).as_posix()) for part in products]
         properties = {
             "capture": capture.label,
             "status": status,
             "camera": f"{capture.camera.make} {capture.camera.model}".strip(),
             "captured_at": capture.captured_at,
             **{name: getattr(position, name, None) for name in ("longitude", "latitude", "altitude_m")},
-            **_of_pose(shown.pose),
+            "height_m": None if height_m is None else round(height_m, 1),
+            "height_from": None if pose is None or height_m is None else pose.height_from,
+            "heading_deg": None if pose is None else round(pose.heading_deg, 1) % 360,
             "accuracy_m": accuracy_m,
-            **_of_bands([] if result is None else result.bands),
-            **_files_of(capture, result),
+            "bands": len(bands),
+            "bands_aligned": sum(b.status == "aligned" for b in bands),
+            "bands_predicted": sum(b.status == "predicted" for b in bands),
+            # The largest of a band, px of the reference.
+            "residual_px": max((a.residual_px for a in after if a.residual_px is not None), default=None),
+            "residual_p95_px": max((a.residual_p95_px for a in after if a.residual_p95_px is not None), default=None),
+            # Files are relative to the output folder.
+            "sidecar": None if result is None else paths.sidecar.as_posix(),
+            "stack": dict(files).get("stack"),
+            "picture": dict(files).get("picture"),
+            "indices": [file for kind, file in files if kind == "index" and file.endswith(".tif")],
         }
-        feature = {"type": "Feature", "id": capture.label, "geometry": geometry, "properties": properties}
+        feature = {"type": "Feature", "id": capture.label, "geometry": shape, "properties": properties}
         self._features[capture.label] = feature
 
     def write(self) -> Path | None:
@@ -111,39 +346,3 @@ def _write(out: Path, features: Sequence[dict[str, Any]], rows: Iterable[IndexRe
     lines = ",\n".join(json.dumps(f, ensure_ascii=False) for f in features)
     text = f'{{"type": "FeatureCollection", "name": "flight", "features": [\n{lines}\n]}}\n'
     write_text(out / FLIGHT_MAP_FILE, text)
-
-
-def _of_pose(pose: Pose | None) -> dict[str, Any]:
-    """The height above ground and the heading of a camera; None if unknown."""
-    height_m = None if pose is None else pose.height_m
-    return {
-        "height_m": None if height_m is None else round(height_m, 1),
-        "height_from": None if pose is None or height_m is None else pose.height_from,
-        "heading_deg": None if pose is None else round(pose.heading_deg, 1) % 360,
-    }
-
-
-def _of_bands(bands: Sequence[BandResult]) -> dict[str, Any]:
-    """The numbers of moving bands, and the largest residuals of a band, px of the reference."""
-    moving = [b for b in bands if b.status != "reference"]
-    after = [b.metrics.after for b in moving if b.metrics is not None]
-    return {
-        "bands": len(moving),
-        "bands_aligned": sum(b.status == "aligned" for b in moving),
-        "bands_predicted": sum(b.status == "predicted" for b in moving),
-        "residual_px": max((a.residual_px for a in after if a.residual_px is not None), default=None),
-        "residual_p95_px": max((a.residual_p95_px for a in after if a.residual_p95_px is not None), default=None),
-    }
-
-
-def _files_of(capture: Capture, result: CaptureResult | None) -> dict[str, Any]:
-    """The files of a capture, relative to the output folder."""
-    paths = CapturePaths.of(capture, Path())
-    products = [] if result is None else result.products
-    files = [(part.kind, (paths.folder / part.file).as_posix()) for part in products]
-    return {
-        "sidecar": None if result is None else paths.sidecar.as_posix(),
-        "stack": dict(files).get("stack"),
-        "picture": dict(files).get("picture"),
-        "indices": [file for kind, file in files if kind == "index" and file.endswith(".tif")],
-    }

@@ -101,6 +101,17 @@ class RunPart(_Part):
         """Add processing time of a stage."""
         self.stage_seconds[stage] = self.stage_seconds.get(stage, 0.0) + seconds
 
+    def exclusions(self) -> list[str]:
+        """Return a line for each kind of exclusion: number of captures, and of those with each cue."""
+        lines = []
+        for kind, shows in (("panel", "a calibration panel"), ("sky", "the sky")):
+            of_kind = [part for part in self.excluded if part.kind == kind]
+            counts = Counter(cue for part in of_kind for cue in part.evidence)
+            if of_kind:
+                evidence = ", ".join(f"{cue} ({number})" for cue, number in counts.items())
+                lines.append(f"Left out: {counted(len(of_kind), 'capture')} of {shows}, by {evidence}")
+        return lines
+
     def write(self, out: Path, state: RunState, seconds: float) -> None:
         """Write OUT/agalign-run.json with the results so far. Raises OutputError."""
         facts: dict[str, Any] = {"state": state, "seconds": round(seconds, 2)}
@@ -109,20 +120,10 @@ class RunPart(_Part):
         write_model(out / RUN_FILE, self.model_copy(update=facts))
 
 
-def exclusion_lines(excluded: Sequence[ExclusionPart]) -> list[str]:
-    """Return a line for each kind of exclusion: number of captures, and of those with each cue."""
-    lines = []
-    for kind, shows in (("panel", "a calibration panel"), ("sky", "the sky")):
-        of_kind = [part for part in excluded if part.kind == kind]
-        counts = Counter(cue for part in of_kind for cue in part.evidence)
-        if of_kind:
-            evidence = ", ".join(f"{cue} ({number})" for cue, number in counts.items())
-            lines.append(f"Left out: {counted(len(of_kind), 'capture')} of {shows}, by {evidence}")
-    return lines
-
-
 def begun(folder: Path, settings: Settings, captures: Sequence[Capture] = (), command: str = "") -> RunPart:
     """Return the record of a run that starts now."""
+    versions = {"python": platform.python_version(), **{name: library_version(name) for name in _LIBRARIES}}
+    system = {"system": platform.system(), "release": platform.release(), "processor": platform.machine()}
     return RunPart(
         state="running",
         started_at=datetime.now(UTC).isoformat(timespec="seconds"),
@@ -130,8 +131,8 @@ def begun(folder: Path, settings: Settings, captures: Sequence[Capture] = (), co
         input=escape_controls(str(folder)),
         command=escape_controls(command),
         cameras=camera_overviews(captures),
-        versions=_versions(),
-        machine=_machine(settings),
+        versions={name: version or "unknown" for name, version in versions.items()},
+        machine={**system, "cores": usable_cores(), "device": settings.joint.device},
         settings=settings.model_dump(mode="json"),
         captures={"found": len(captures)},
     )
@@ -142,16 +143,9 @@ def read_run_record(out: Path) -> RunPart | None:
     return read_model(out / RUN_FILE, RunPart)
 
 
-def _versions() -> dict[str, str]:
-    result = {"python": platform.python_version()}
-    for name in _LIBRARIES:
-        try:
-            result[name] = metadata.version(name)
-        except metadata.PackageNotFoundError:
-            result[name] = "unknown"
-    return result
-
-
-def _machine(settings: Settings) -> dict[str, str | int]:
-    system = {"system": platform.system(), "release": platform.release(), "processor": platform.machine()}
-    return {**system, "cores": usable_cores(), "device": settings.joint.device}
+def library_version(distribution: str) -> str | None:
+    """Return the version of an installed distribution; None if there is none."""
+    try:
+        return metadata.version(distribution)
+    except metadata.PackageNotFoundError:
+        return None
