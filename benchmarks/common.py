@@ -8,6 +8,7 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -15,13 +16,18 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
+import rasterio
 import typer
 from bands.score import WRONG_PX, table
 from numpy.typing import NDArray
-from scipy.interpolate import CloughTocher2DInterpolator
+from scipy.interpolate import RegularGridInterpolator
 
 import agalign
-from agalign.products.sidecar.file import find_sidecars
+from agalign.pixels.raster import without_warnings
+from agalign.products.sidecar.alignment import read_alignment
+from agalign.products.sidecar.file import find_sidecars, read_sidecar
+from agalign.products.sidecar.schema import Sidecar, is_usable
+from agalign.values.geometry import Points
 
 Ties = dict[str, dict[str, Any]]
 """Entries of ties.json or truth.json by the name of the moving file, each with `ties` (n, 4), raw px."""
@@ -248,46 +254,107 @@ class BandError:
     capture: str
     band: str
     file: str
+    reference: str
+    """File of the reference band of the run."""
     status: str
+    geometry: str
+    is_usable: bool
+    """Aligned, or predicted within --accept-predicted."""
     source: str
     """Origin of a prediction, or empty."""
-    median_px: float
-    p95_px: float
     std_px: float
     """Reported standard error; nan without one."""
+    error_px: Points
+    """(n,)"""
+    claim_px: Points
+    """(n,) values of the error map; nan outside, or without a map."""
     seconds: float
+
+    @property
+    def median_px(self) -> float:
+        return float(np.nanmedian(self.error_px))
+
+    @property
+    def p95_px(self) -> float:
+        return float(np.nanpercentile(self.error_px, 95))
 
 
 def read_ties(path: Path) -> Ties:
     """Return the truth of a ties.json or truth.json by file."""
-    captures = json.loads(path.read_text(encoding="utf-8")).values()
-    return {file: entry | {"trouble": c.get("trouble", "")} for c in captures for file, entry in c["bands"].items()}
+    result = {}
+    for capture in json.loads(path.read_text(encoding="utf-8")).values():
+        shared = {"reference": capture["reference"], "trouble": capture.get("trouble", "")}
+        result |= {file: entry | shared for file, entry in capture["bands"].items()}
+    return result
 
 
 def band_errors(out: Path, truth: Ties) -> list[BandError]:
-    """Return the error of each band with tie points, from the grids in the sidecars of a run."""
+    """Return the error of each band with tie points by the mappings in the sidecars of a run.
+
+    If the run has another reference than the truth, its points are mapped to that one first.
+    """
     result = []
     for path in find_sidecars(out):
-        sidecar = json.loads(path.read_text(encoding="utf-8"))
-        for band in sidecar["bands"]:
-            grid, prediction, joint = band["grid"], band["prediction"] or {}, band["joint"] or {}
-            if band["file"] not in truth or band["status"] == "reference" or grid is None:
+        sidecar = read_sidecar(path)
+        references = {b.file: b.band for b in sidecar.bands if b.status != "reference"}
+        for band in sidecar.bands:
+            if band.file not in truth or band.status == "reference" or band.homography is None:
                 continue
-            ties = np.array(truth[band["file"]]["ties"])
-            mapping = CloughTocher2DInterpolator(grid["reference_px"], grid["moving_px"])
-            error_px = np.linalg.norm(mapping(ties[:, :2]) - ties[:, 2:], axis=1)
-            std_px = prediction.get("std_px") if prediction else joint.get("corner_std_px")
-            aligned_or_predicted = band["status"] in ("aligned", "predicted") and std_px is not None
+            alignment, prediction = read_alignment(path, band.band), band.prediction
+            points, target = np.hsplit(np.array(truth[band.file]["ties"]), 2)
+            if truth[band.file]["reference"] in references:
+                points = read_alignment(path, references[truth[band.file]["reference"]]).inverse(points)
+            std_px = prediction.std_px if prediction else band.joint.corner_std_px if band.joint else None
+            aligned_or_predicted = band.status in ("aligned", "predicted") and std_px is not None
             result.append(
                 BandError(
-                    sidecar["capture"],
-                    band["band"],
-                    band["file"],
-                    band["status"],
-                    prediction.get("from", ""),
-                    *map(float, np.nanpercentile(error_px, (50, 95))),
+                    sidecar.capture,
+                    band.band,
+                    band.file,
+                    sidecar.reference.file,
+                    band.status,
+                    alignment.geometry,
+                    is_usable(band.status, prediction, sidecar.max_predicted_px),
+                    prediction.source if prediction else "",
                     std_px if aligned_or_predicted else np.nan,
-                    band["seconds"],
+                    np.linalg.norm(alignment.map(points) - target, axis=1),
+                    claims_px(path, sidecar, band.band, points),
+                    band.seconds,
                 )
             )
     return result
+
+
+def claims_px(path: Path, sidecar: Sidecar, band: str, points_px: Points) -> Points:
+    """Return the error map (n,) of a band at raw points (n, 2) of the reference; nan outside."""
+    error_map = path.with_suffix(".error.tif")
+    if not error_map.exists():
+        return np.full(len(points_px), np.nan)
+    with without_warnings(), rasterio.open(error_map) as dataset:
+        if band not in dataset.descriptions:
+            return np.full(len(points_px), np.nan)
+        values = dataset.read(dataset.descriptions.index(band) + 1)
+    x0, y0 = sidecar.output.crop[:2]
+    axes = (np.arange(n) + at for n, at in zip(values.shape, (y0, x0), strict=True))
+    return np.asarray(RegularGridInterpolator(tuple(axes), values, bounds_error=False)(points_px[:, ::-1]))
+
+
+def print_errors(groups: dict[str, list[BandError]]) -> None:
+    """Print a row for each group of bands, and a line for each band that is off or without result; errors are medians
+    over a band's tie points.
+    """
+    head = "captures", "bands", "median error, px", "worst", "worst error / std", "within 1 std", "within 2 std"
+    print_head("", *head)
+    for name, bands in groups.items():
+        errors, std = np.array([(b.median_px, b.std_px) for b in bands]).T
+        statuses = Counter(f"{b.status} ({b.source})" if b.source else b.status for b in bands)
+        counts = ", ".join(f"{n} {status}" for status, n in statuses.most_common())
+        shares = errors / std
+        within = [f"{np.mean(shares <= k):.0%}" for k in (1, 2)]
+        worst = f"{np.nanmax(shares):.1f}" if np.isfinite(shares).any() else "-"
+        captures = len({b.capture for b in bands})
+        print_row(name, captures, counts, f"{np.median(errors):.3f}", f"{errors.max():.3f}", worst, *within)
+    for name, bands in groups.items():
+        for b in bands:
+            if b.median_px > WRONG_PX or b.status not in ("aligned", "predicted"):
+                print(f"{name}: {b.capture} {b.band}: {b.status}, {b.median_px:.2f} px, standard error {b.std_px:.2f}")
