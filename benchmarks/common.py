@@ -325,15 +325,22 @@ def band_errors(out: Path, truth: Ties) -> list[BandError]:
     return result
 
 
+def layer(path: Path, name: str) -> NDArray[np.float64] | None:
+    """Return the band (height, width) of a raster with a name, nan where it has no data; None without file or band."""
+    if not path.exists():
+        return None
+    with without_warnings(), rasterio.open(path) as dataset:
+        if name not in dataset.descriptions:
+            return None
+        band = dataset.read(dataset.descriptions.index(name) + 1, masked=True)
+    return np.asarray(band.astype(np.float64).filled(np.nan))
+
+
 def claims_px(path: Path, sidecar: Sidecar, band: str, points_px: Points) -> Points:
-    """Return the error map (n,) of a band at raw points (n, 2) of the reference; nan outside."""
-    error_map = path.with_suffix(".error.tif")
-    if not error_map.exists():
+    """Return the error map (n,) of a band at raw points (n, 2) of the reference; nan outside, or without a map."""
+    values = layer(path.with_suffix(".error.tif"), band)
+    if values is None:
         return np.full(len(points_px), np.nan)
-    with without_warnings(), rasterio.open(error_map) as dataset:
-        if band not in dataset.descriptions:
-            return np.full(len(points_px), np.nan)
-        values = dataset.read(dataset.descriptions.index(band) + 1)
     x0, y0 = sidecar.output.crop[:2]
     axes = (np.arange(n) + at for n, at in zip(values.shape, (y0, x0), strict=True))
     return np.asarray(RegularGridInterpolator(tuple(axes), values, bounds_error=False)(points_px[:, ::-1]))
