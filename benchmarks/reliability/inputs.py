@@ -32,7 +32,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from common import Section, command, ended, run, timed
 from kills import HUNG_S, contents
-from stages import read
+from speed import read
 from synthetic_flights.aligned import make_aligned
 
 from agalign.cameras.discover import discover
