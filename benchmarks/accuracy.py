@@ -143,11 +143,7 @@ def summary(name: str, rows: list[BandError]) -> tuple[str, ...]:
 
 
 def main(
-    data: Path,
-    sets: Annotated[list[str] | None, typer.Argument()] = None,
-    *,
-    damage: Annotated[str, typer.Option()] = "",
-    bands: Annotated[bool, typer.Option()] = False,
+    data: Path, sets: Annotated[list[str] | None, typer.Argument()] = None, damage: str = "", *, bands: bool = False
 ) -> None:
     folders = sorted({p.parent for p in data.rglob("*") if p.suffix.lower() in (".tif", ".jpg", ".jpeg")})
     folders = [f for f in folders if (f.name in sets if sets else (f / "ties.json").exists())]

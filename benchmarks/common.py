@@ -22,7 +22,6 @@ from bands.score import WRONG_PX, table
 from numpy.typing import NDArray
 from scipy.interpolate import RegularGridInterpolator
 
-import agalign
 from agalign.pixels.raster import without_warnings
 from agalign.products.sidecar.alignment import read_alignment
 from agalign.products.sidecar.file import find_sidecars, read_sidecar
@@ -68,12 +67,20 @@ def print_head(*cells: str) -> None:
     print(table([cells]), flush=True)
 
 
+def with_section(document: Path, name: str, content: str) -> str:
+    """Return the text of a document with other content between the comments of a section."""
+    begin, end = f"<!-- {name} -->\n", f"<!-- end of {name} -->"
+    before, found, rest = document.read_text(encoding="utf-8").partition(begin)
+    if not found or end not in rest:
+        raise SystemExit(f"{document} has no section {begin.strip()}")
+    return before + begin + content + end + rest.partition(end)[2]
+
+
 class Section:
-    """A section of a document between two comments, printed at once; without a document it is only printed."""
+    """A section of a document, printed at once; without a document it is only printed."""
 
     def __init__(self, name: str, document: Path | None) -> None:
-        self._marks = f"<!-- {name} -->", f"<!-- end of {name} -->"
-        self._document, self._parts = document, list[str]()
+        self._name, self._document, self._parts = name, document, list[str]()
 
     def table(self, rows: Sequence[Sequence[object]]) -> None:
         """Add rows, the first of them the head."""
@@ -84,12 +91,8 @@ class Section:
         print(text, end="\n\n", flush=True)
         self._parts.append(text)
         if self._document is not None:
-            begin, end = self._marks
-            before, found, rest = self._document.read_text(encoding="utf-8").partition(begin)
-            if not found or end not in rest:
-                raise SystemExit(f"{self._document} has no section {begin}")
-            new = "\n\n".join([before + begin, *self._parts, end + rest.partition(end)[2]])
-            self._document.write_text(new, encoding="utf-8")
+            content = "\n" + "".join(f"{part}\n\n" for part in self._parts)
+            self._document.write_text(with_section(self._document, self._name, content), encoding="utf-8")
 
 
 def pyplot() -> Any:
@@ -112,32 +115,6 @@ def heat_map(axis: Any, values: NDArray[np.float64], rows: Sequence[str], column
     axis.set_xticks(range(len(columns)), columns, rotation=40, ha="right")
     axis.set_yticks(range(len(rows)), rows)
     return image
-
-
-# ---- decisions on pairs of images
-
-
-Pair = tuple[NDArray[Any], NDArray[Any], dict[str, Any], Callable[[NDArray[np.float64]], float]]
-"""Two images, options of `agalign.align`, and the error of a homography in px; nan if they show different scenes."""
-
-
-def print_decisions(kinds: Sequence[str], pair_of: Callable[[str, np.random.Generator], Pair], numbers: range) -> None:
-    """Align a pair for each number, of the kinds in turn, and print a table of the results."""
-    rows: dict[str, list[tuple[str, float, float]]] = {kind: [] for kind in kinds}
-    for number in numbers:
-        kind = kinds[number % len(kinds)]
-        fixed, moving, options, error_px = pair_of(kind, np.random.default_rng(number))
-        seconds, result = timed(agalign.align, fixed, moving, **options)
-        rows[kind].append((result.status, error_px(result.fixed_to_moving), seconds))
-        print("{:4d} {:28s} {:9s} {:7.2f} px {:5.1f} s".format(number, kind, *rows[kind][-1]), result.reason or "")
-    statuses = "aligned", "seed_only", "failed"
-    print_head("kind", "pairs", *statuses, "wrongly aligned", "worst error, px", "seconds")
-    for kind, some in ((kind, some) for kind, some in rows.items() if some):
-        errors = [error for status, error, _ in some if status == "aligned"]
-        wrong = sum(not error <= WRONG_PX for error in errors)
-        counts = [sum(status == one for status, *_ in some) for one in statuses]
-        worst, median_s = max(errors, default=np.nan), np.median([row[2] for row in some])
-        print_row(kind, len(some), *counts, wrong, f"{worst:.2f}", f"{median_s:.1f}")
 
 
 # ---- runs of the command line

@@ -13,13 +13,15 @@ images, each with noise of its own. Seeds: none; good, off by up to a quarter of
 off by one to three periods and not known to anything.
 """
 
-from typing import Annotated
+from collections.abc import Callable, Sequence
+from typing import Any
 
 import cv2
 import numpy as np
-import typer
-from common import Number, Pair, print_decisions, run
+from common import WRONG_PX, Number, print_head, print_row, run, timed
+from numpy.typing import NDArray
 
+import agalign
 from agalign.synthetic.camera_model import Pose, true_homography
 from agalign.synthetic.cameras import BANDS, REFERENCE
 from agalign.synthetic.flight import recorded
@@ -27,6 +29,8 @@ from agalign.synthetic.flight import view as seen
 from agalign.synthetic.ground import Ground, paint_ground, reflectance
 from agalign.values import geometry
 
+Pair = tuple[NDArray[Any], NDArray[Any], dict[str, Any], Callable[[NDArray[np.float64]], float]]
+"""Two images, options of `agalign.align`, and the error of a homography in px; nan if they show different scenes."""
 SIZE, GRID_SIZE = (640, 480), (480, 360)
 MARGIN = 120
 """Of a grid, which is cut off."""
@@ -157,7 +161,29 @@ def seeded_pair(kind: str, rng: np.random.Generator) -> Pair:
     return fixed, moving, options, lambda matrix: geometry.corner_error_px(matrix, truth, *GRID_SIZE)
 
 
-def main(count: Number = 200, first: Number = 0, *, grids: Annotated[bool, typer.Option()] = False) -> None:
+# ---- decisions
+
+
+def print_decisions(kinds: Sequence[str], pair_of: Callable[[str, np.random.Generator], Pair], numbers: range) -> None:
+    """Align a pair for each number, of the kinds in turn, and print a table of the results."""
+    rows: dict[str, list[tuple[str, float, float]]] = {kind: [] for kind in kinds}
+    for number in numbers:
+        kind = kinds[number % len(kinds)]
+        fixed, moving, options, error_px = pair_of(kind, np.random.default_rng(number))
+        seconds, result = timed(agalign.align, fixed, moving, **options)
+        rows[kind].append((result.status, error_px(result.fixed_to_moving), seconds))
+        print("{:4d} {:28s} {:9s} {:7.2f} px {:5.1f} s".format(number, kind, *rows[kind][-1]), result.reason or "")
+    statuses = "aligned", "seed_only", "failed"
+    print_head("kind", "pairs", *statuses, "wrongly aligned", "worst error, px", "seconds")
+    for kind, some in ((kind, some) for kind, some in rows.items() if some):
+        errors = [error for status, error, _ in some if status == "aligned"]
+        wrong = sum(not error <= WRONG_PX for error in errors)
+        counts = [sum(status == one for status, *_ in some) for one in statuses]
+        worst, median_s = max(errors, default=np.nan), np.median([row[2] for row in some])
+        print_row(kind, len(some), *counts, wrong, f"{worst:.2f}", f"{median_s:.1f}")
+
+
+def main(count: Number = 200, first: Number = 0, *, grids: bool = False) -> None:
     kinds, make = (("none", "good", "bad"), seeded_pair) if grids else ((*BAD, *GOOD, GRID), pair_with_error)
     print_decisions(kinds, make, range(first, first + count))
 

@@ -18,10 +18,8 @@ import sys
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import fields
 from pathlib import Path
-from typing import Annotated
 
 import numpy as np
-import typer
 from common import print_head, print_row, pyplot, run
 
 from agalign.evaluation.evaluate import Result, Starts, error_table
@@ -101,9 +99,7 @@ def draw(results: list[Path], path: Path) -> None:
     figure.savefig(path, dpi=110)
 
 
-def main(
-    paths: list[str], plot: Path | None = None, pieces: Path | None = None, jobs: Annotated[int, typer.Option()] = 1
-) -> None:
+def main(paths: list[str], plot: Path | None = None, pieces: Path | None = None, jobs: int = 1) -> None:
     if plot:
         draw([Path(path) for path in paths], plot)
     elif pieces:

@@ -21,12 +21,11 @@ from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 from statistics import mean, median
-from typing import Annotated, Any
+from typing import Any
 
 import cv2
 import numpy as np
 import rasterio
-import typer
 from bands.images import in_other_light
 from common import command, flight_and_out, print_head, print_row, run, timed
 from peers import sift
@@ -134,12 +133,7 @@ def print_stages(flight: Path, captures: list[Capture]) -> None:
         print_row(name, f"{median(some):.2f}")
 
 
-def main(
-    flights: list[Path],
-    *,
-    stages: Annotated[bool, typer.Option()] = False,
-    degraded: Annotated[bool, typer.Option()] = False,
-) -> None:
+def main(flights: list[Path], *, stages: bool = False, degraded: bool = False) -> None:
     cv2.setNumThreads(1)
     captures = {flight: discover(flight).captures for flight in flights}
     if stages:
