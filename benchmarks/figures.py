@@ -25,6 +25,7 @@ from agalign.evaluation.methods import PairTask, method_named
 from agalign.evaluation.surface import draw_surface, loss_surface
 from agalign.method.match import sift_keypoints, to_8_bit, visible_in_both
 from agalign.method.paper import Training
+from agalign.pixels.band_resampling import eight_bit
 from agalign.products.report.drawing import with_text
 from agalign.synthetic import cameras
 from agalign.synthetic import flight as synthetic
@@ -127,8 +128,7 @@ def detail(sidecar: Sidecar) -> NDArray[np.uint8]:
 
 
 def stretched(pixels: NDArray[np.float64]) -> NDArray[np.uint8]:
-    low, high = np.nanpercentile(pixels, (1, 99))
-    return np.asarray(np.nan_to_num((pixels - low) / (high - low)).clip(0, 1) * 255, np.uint8)
+    return eight_bit(np.nan_to_num(pixels), np.isfinite(pixels))
 
 
 def main(out: Annotated[Path, typer.Argument()] = Path("docs/figures")) -> None:

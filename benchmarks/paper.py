@@ -20,7 +20,8 @@ from dataclasses import fields
 from pathlib import Path
 
 import numpy as np
-from common import print_head, print_row, pyplot, run
+from bands.score import table
+from common import pyplot, run
 
 from agalign.evaluation.evaluate import Result, Starts, error_table
 from agalign.evaluation.image_pairs import read_image
@@ -64,14 +65,8 @@ def evaluate(pairs: Path, pieces: Path, jobs: int, options: list[str]) -> None:
 
     with ThreadPoolExecutor(jobs) as executor:
         list(executor.map(one, csv.DictReader(pairs.read_text(encoding="utf-8").splitlines())))
-    head, *body = error_table([_result(row) for row in rows_of(pieces)])
-    print_head(*head)
-    for cells in body:
-        print_row(*cells)
-
-
-def _result(row: dict[str, str]) -> Result:
-    return Result(**{f.name: f.type(row[f.name]) for f in fields(Result)})
+    results = [Result(**{f.name: f.type(row[f.name]) for f in fields(Result)}) for row in rows_of(pieces)]
+    print(table(error_table(results)))
 
 
 def rows_of(results: Path) -> list[dict[str, str]]:

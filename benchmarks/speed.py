@@ -15,7 +15,6 @@ most of a long flight; the fixed part is the time of the run minus that of as ma
 import json
 import os
 import shutil
-import subprocess
 import sys
 from collections import Counter
 from collections.abc import Sequence
@@ -27,14 +26,14 @@ import cv2
 import numpy as np
 import rasterio
 from bands.images import in_other_light
-from common import command, flight_and_out, print_head, print_row, run, timed
+from common import Ending, command, ended, flight_and_out, print_head, print_row, run, timed
 from peers import sift
 
 from agalign.cameras.discover import discover
 from agalign.pixels.raster import open_raster, without_warnings
 from agalign.values.capture import Band, Capture
 
-ROUNDS = 3
+ROUNDS, MAX_S = 3, 3600
 IMPORTS = "import torch, cv2, rasterio, scipy"
 DEGRADED = ("unchanged", "blur 3 px", "half saturated", "noise 30 %", "stale")
 """`stale` is one band with the image of the next capture."""
@@ -51,11 +50,9 @@ def sift_seconds(reference: Band, moving: Sequence[Band], features: int) -> floa
     return sum(timed(sift, fixed, read(band), features)[0] for band in moving)
 
 
-def run_alone(argv: list[str]) -> tuple[float, str]:
-    """Run a command on one core; return its time in seconds and its standard error."""
-    options = {"env": os.environ | {"OMP_NUM_THREADS": "1"}, "stderr": subprocess.PIPE, "text": True}
-    seconds, done = timed(subprocess.run, argv, check=False, **options)
-    return seconds, done.stderr
+def run_alone(argv: list[str]) -> Ending:
+    """Run a command with one thread."""
+    return ended(argv, MAX_S, env=os.environ | {"OMP_NUM_THREADS": "1"})
 
 
 def events(log: str, name: str) -> list[dict[str, Any]]:
@@ -68,8 +65,8 @@ def learning_seconds(log: str) -> float:
     return sum(event["seconds"] for event in events(log, "learnt"))
 
 
-def runs(flight: Path) -> list[tuple[float, str]]:
-    """Return (seconds, log) of a run on one core, and of one with the model that the first has learned, if any."""
+def runs(flight: Path) -> list[Ending]:
+    """Run with one thread, and again with the model that the first run has learned, if any."""
     with flight_and_out() as (again, out):
         first = run_alone(command(flight, out, "-j", "1", "--log-json"))
         with_model = [option for path in (out / "models").glob("*") for option in ("--model", str(path))]
@@ -78,7 +75,7 @@ def runs(flight: Path) -> list[tuple[float, str]]:
 
 def print_flight(folder: Path, captures: list[Capture]) -> None:
     """Print medians over the captures of a flight."""
-    without, with_model = (log for _, log in runs(folder))
+    without, with_model = (ending.errors for ending in runs(folder))
     first_s, again_s = (median(e["seconds"] for e in events(log, "capture")) for log in (without, with_model))
     sift_s = median(sift_seconds(c.reference, c.moving, 5000) for c in captures)
     times_s = learning_seconds(without) / len(captures) + first_s, again_s, sift_s
@@ -102,7 +99,7 @@ def print_degraded(captures: list[Capture]) -> None:
                 pixels = read(captures[1].moving[0]) if name == "stale" else in_other_light(read(band), name, rng)
                 with without_warnings(), rasterio.open(flight / band.path.name, "r+") as dataset:
                     dataset.write(pixels, band.band_index)
-            _, log = run_alone(command(flight, out, "-j", "1", "--log-json"))
+            log = run_alone(command(flight, out, "-j", "1", "--log-json")).errors
         (capture,) = events(log, "capture")
         seconds = learning_seconds(log) + capture["seconds"]
         unchanged_s = unchanged_s or seconds
@@ -114,16 +111,16 @@ def print_stages(flight: Path, captures: list[Capture]) -> None:
     seconds: dict[str, list[float]] = {}
     for _ in range(ROUNDS):
         values = {"SIFT + RANSAC, a pair": sift_seconds(middle.reference, middle.moving[:1], 8000)}
-        values["imports of the libraries"] = run_alone([sys.executable, "-c", IMPORTS])[0]
-        (whole_s, _), (again_s, log) = runs(flight)
+        values["imports of the libraries"] = run_alone([sys.executable, "-c", IMPORTS]).seconds
+        whole, again = runs(flight)
         by_capture: dict[str, Counter[str]] = {}
-        for event in events(log, "stage"):
+        for event in events(again.errors, "stage"):
             by_capture.setdefault(event["capture"], Counter())[event["stage"]] += event["seconds"]
         refined = [stages for stages in by_capture.values() if "refining" in stages] or list(by_capture.values())
         stages = {name: mean(one[name] for one in refined) for name in {n for one in refined for n in one}}
         capture_s = values["a capture"] = sum(stages.values())
         values |= {f"- {name}": stages[name] for name in sorted(stages, key=lambda name: -stages[name])}
-        for name, run_s in (("a run", whole_s), ("a run with the model of an earlier flight", again_s)):
+        for name, run_s in (("a run", whole.seconds), ("a run with the model of an earlier flight", again.seconds)):
             values |= {name: run_s, f"{name}: fixed part": run_s - capture_s * len(captures)}
         for name, value in values.items():
             seconds.setdefault(name, []).append(value)
