@@ -9,13 +9,12 @@ import pytest
 import rasterio
 
 import agalign
-from agalign.pixels.sun_glint import sun_glint
 from agalign.products.indices.formulas import index_named, index_of_formula
 from agalign.products.indices.rasters import write_rasters
 from agalign.products.product import CapturePaths, ProductContext
 from agalign.products.rasters import quality_raster
 from agalign.products.rasters.layout import Layer
-from agalign.products.rasters.quality_raster import _flags, error_lattice_px, error_on_tile
+from agalign.products.rasters.quality_raster import _flags, error_lattice_px, error_on_tile, sun_glint
 from agalign.products.run.captures import bands_of
 from agalign.products.sidecar.file import read_result
 from agalign.values import geometry, lens
