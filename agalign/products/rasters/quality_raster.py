@@ -226,7 +226,10 @@ def sun_glint(green: FloatImage, nir: FloatImage) -> Mask:
             return np.zeros(green.shape, dtype=bool)
         # Where all pixels nearby are glint, their minimum is above the value of water.
         nir_dark = np.fmin(nir_dark, np.median(nir_dark[is_water_block]))
-        blocks = _connected(ndwi > _MIN_PIXEL_NDWI, is_water_block)
+        # Blocks that are connected with water.
+        candidates = ndwi > _MIN_PIXEL_NDWI
+        _, labels = cv2.connectedComponents(candidates.astype(np.uint8))
+        blocks = candidates & np.isin(labels, np.unique(labels[is_water_block]))
         of_water = np.where(blocks, nir_dark, np.nan).repeat(_BLOCK_PX, axis=0).repeat(_BLOCK_PX, axis=1)
         glint = nir - of_water[:height, :width]
         is_flat = (green - nir) / (green + nir) > _MIN_PIXEL_NDWI
@@ -242,12 +245,6 @@ def _is_uniform(nir: FloatImage, area: Mask) -> Mask:
     )
     variance = square * share - mean * mean  # times the square of the share, as the square of the mean
     return np.asarray((share >= _MIN_AREA_SHARE) & (variance < (_MIN_VARIATION * mean) ** 2))
-
-
-def _connected(candidates: Mask, seeds: Mask) -> Mask:
-    """Return the candidates (rows, columns) that are connected with a seed; all seeds are candidates."""
-    _, labels = cv2.connectedComponents(candidates.astype(np.uint8))
-    return np.asarray(candidates & np.isin(labels, np.unique(labels[seeds])))
 
 
 def _darkest_nearby(band: FloatImage) -> NDArray[np.float32]:
