@@ -14,7 +14,6 @@ from typing import Annotated, Any
 
 import cv2
 import numpy as np
-import rasterio
 import typer
 from bands.images import in_other_light
 from common import (
@@ -25,15 +24,16 @@ from common import (
     flight_and_out,
     print_head,
     print_row,
+    read_band,
     read_ties,
     run,
     writable_copy,
+    write_band,
 )
 from numpy.typing import NDArray
 
 from agalign import read_alignment
 from agalign.cameras.discover import discover
-from agalign.pixels.raster import without_warnings
 from agalign.products.sidecar.file import find_sidecars, read_sidecar
 from agalign.values import geometry
 
@@ -69,9 +69,8 @@ def damaged_copy(source: Path, copy: Path, name: str) -> None:
         moving = [band for band in capture.moving if band.path.suffix.lower() in (".tif", ".tiff")]
         bands = {"one": moving[-1:], "moving": moving, "all": [capture.reference, *moving]}[which]
         for band in bands:
-            with without_warnings(), rasterio.open(band.path, "r+") as dataset:
-                pixels = dataset.read(1)
-                dataset.write(change(pixels, rng).clip(1, np.iinfo(pixels.dtype).max).astype(pixels.dtype), 1)
+            pixels = read_band(band.path)
+            write_band(band.path, change(pixels, rng).clip(1, np.iinfo(pixels.dtype).max).astype(pixels.dtype))
 
 
 def ties_of(out: Path) -> Ties:

@@ -117,6 +117,21 @@ def heat_map(axis: Any, values: NDArray[np.float64], rows: Sequence[str], column
     return image
 
 
+# ---- bands of files
+
+
+def read_band(path: Path, index: int = 1) -> NDArray[Any]:
+    """Return the pixels (height, width) of a band as they are stored."""
+    with without_warnings(), rasterio.open(path) as dataset:
+        return np.asarray(dataset.read(index))
+
+
+def write_band(path: Path, pixels: NDArray[Any], index: int = 1) -> None:
+    """Replace the pixels of a band, and leave the tags."""
+    with without_warnings(), rasterio.open(path, "r+") as dataset:
+        dataset.write(pixels, index)
+
+
 # ---- runs of the command line
 
 

@@ -11,20 +11,28 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-import rasterio
-from common import BandError, align, band_errors, flight_and_out, print_errors, read_ties, run, writable_copy
+from common import (
+    BandError,
+    align,
+    band_errors,
+    flight_and_out,
+    print_errors,
+    read_band,
+    read_ties,
+    run,
+    writable_copy,
+    write_band,
+)
 
 
 def degrade(path: Path, how: str, rng: np.random.Generator) -> None:
     """Replace a file's pixels, and leave its tags."""
-    with rasterio.open(path, "r+") as dataset:
-        pixels = dataset.read(1)
-        noise = rng.normal(size=pixels.shape)
-        if how == "water":
-            glitter = cv2.GaussianBlur(noise.astype(np.float32), (0, 0), 3.0)
-            noise = 0.3 * noise + glitter / glitter.std()
-        degraded = (np.median(pixels) + 0.5 * pixels.std() * noise).clip(1, 65000)
-        dataset.write(degraded.astype(pixels.dtype), 1)
+    pixels = read_band(path)
+    noise = rng.normal(size=pixels.shape)
+    if how == "water":
+        glitter = cv2.GaussianBlur(noise.astype(np.float32), (0, 0), 3.0)
+        noise = 0.3 * noise + glitter / glitter.std()
+    write_band(path, (np.median(pixels) + 0.5 * pixels.std() * noise).clip(1, 65000).astype(pixels.dtype))
 
 
 def run_without(flight: Path, lost: set[str], how: str, rng: np.random.Generator) -> list[BandError]:

@@ -16,7 +16,7 @@ from unittest.mock import patch
 
 import cv2
 import numpy as np
-from common import print_head, print_row, run
+from common import print_head, print_row, read_band, run
 
 from agalign.cameras.discover import discover
 from agalign.cameras.metadata import Tags, read_tags
@@ -25,10 +25,9 @@ from agalign.flight import panel_readings
 from agalign.flight.groups import camera_key
 from agalign.pixels.landmarks import landmarks, matched_homography, matches
 from agalign.pixels.radiometry import calibrated, with_radiometry
-from agalign.pixels.raster import read_for_alignment, read_tile
+from agalign.pixels.raster import read_for_alignment
 from agalign.values import geometry
 from agalign.values.capture import Band, Capture, CaptureTime
-from agalign.values.image import Tile
 
 CAMERA, DLS, PIX4D = "micasense.com/MicaSense", "micasense.com/DLS", "pix4d.com"
 MIN_TIES, MAX_ERROR_PX = 30, 4.0
@@ -179,7 +178,7 @@ def differences(a: Band, b: Band) -> Image:
 
 
 def pixels(band: Band) -> Image:
-    return read_tile(band, Tile(0, 0, *band.size_px))[0].astype(np.float64)
+    return read_band(band.path).astype(np.float64)
 
 
 if __name__ == "__main__":

@@ -14,14 +14,13 @@ from statistics import median
 import cv2
 import numpy as np
 import pycolmap
-from common import print_head, print_row, run
+from common import print_head, print_row, read_band, run
 from numpy.typing import NDArray
 
 from agalign.cameras import known_cameras
 from agalign.cameras.discover import discover
 from agalign.cameras.read_files import read_file
 from agalign.config import DiscoverOptions
-from agalign.pixels.raster import open_raster, without_warnings
 from agalign.products.sidecar.file import find_sidecars, read_sidecar
 from agalign.values.capture import Band
 
@@ -32,8 +31,7 @@ Photos = dict[tuple[str, str], NDArray[np.uint8]]
 
 def photo_of(band: Band, shared: Band) -> NDArray[np.uint8]:
     """A band of a file, undistorted by the lens in the file's tags to the pinhole camera of another band."""
-    with open_raster(band.path) as source:
-        raw = source.read(band.band_index).astype(np.float32)
+    raw = read_band(band.path, band.band_index).astype(np.float32)
     low, high = np.percentile(raw[raw > 0], _SHOWN_PERCENTILES)
     grey = (np.clip((raw - low) / (high - low), 0, 1) * 255).astype(np.uint8)
     distortion = np.array((*band.lens.distortion, *(0.0,) * 8)[:8])
@@ -119,9 +117,8 @@ def print_together(title: str, photos: Photos, shared: Band, reference: str) -> 
 def main(flight: Path, out: Path) -> None:
     """Print all tables."""
     pycolmap.logging.minloglevel = 2
-    with without_warnings():
-        photos, camera, reference = aligned_photos(out)
-        originals, their_camera = original_photos(flight, {capture for capture, _ in photos})
+    photos, camera, reference = aligned_photos(out)
+    originals, their_camera = original_photos(flight, {capture for capture, _ in photos})
     print_together("All aligned bands", photos, camera, reference)
     print_together("All original bands", originals, their_camera, reference)
 

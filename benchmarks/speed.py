@@ -24,13 +24,11 @@ from typing import Any
 
 import cv2
 import numpy as np
-import rasterio
 from bands.images import in_other_light
-from common import Ending, command, ended, flight_and_out, print_head, print_row, run, timed
+from common import Ending, command, ended, flight_and_out, print_head, print_row, read_band, run, timed, write_band
 from peers import sift
 
 from agalign.cameras.discover import discover
-from agalign.pixels.raster import open_raster, without_warnings
 from agalign.values.capture import Band, Capture
 
 ROUNDS, MAX_S = 3, 3600
@@ -39,15 +37,10 @@ DEGRADED = ("unchanged", "blur 3 px", "half saturated", "noise 30 %", "stale")
 """`stale` is one band with the image of the next capture."""
 
 
-def read(band: Band) -> np.ndarray:
-    with without_warnings(), open_raster(band.path) as source:
-        return np.asarray(source.read(band.band_index))
-
-
 def sift_seconds(reference: Band, moving: Sequence[Band], features: int) -> float:
     """Return the seconds of SIFT + RANSAC on the reference with each other band at full size."""
-    fixed = read(reference)
-    return sum(timed(sift, fixed, read(band), features)[0] for band in moving)
+    fixed, *others = (read_band(band.path, band.band_index) for band in (reference, *moving))
+    return sum(timed(sift, fixed, other, features)[0] for other in others)
 
 
 def run_alone(argv: list[str]) -> Ending:
@@ -96,9 +89,10 @@ def print_degraded(captures: list[Capture]) -> None:
                 shutil.copyfile(band.path, flight / band.path.name)
             changed = {"unchanged": (), "stale": captures[0].moving[:1]}.get(name, captures[0].moving)
             for band in changed:
-                pixels = read(captures[1].moving[0]) if name == "stale" else in_other_light(read(band), name, rng)
-                with without_warnings(), rasterio.open(flight / band.path.name, "r+") as dataset:
-                    dataset.write(pixels, band.band_index)
+                source = captures[1].moving[0] if name == "stale" else band
+                pixels = read_band(source.path, source.band_index)
+                pixels = pixels if name == "stale" else in_other_light(pixels, name, rng)
+                write_band(flight / band.path.name, pixels, band.band_index)
             log = run_alone(command(flight, out, "-j", "1", "--log-json")).errors
         (capture,) = events(log, "capture")
         seconds = learning_seconds(log) + capture["seconds"]
