@@ -147,11 +147,8 @@ def published_panel_light(band: Band) -> tuple[float, float]:
 
 def tilt_facts(tags: Tags) -> tuple[str, ...]:
     """Angles, and the measured and the corrected irradiance relative to HorizontalIrradiance."""
-    sun, horizontal = (
-        sun_position(tags.position, CaptureTime.of(tags.captured_at).utc.timestamp()),
-        tags.number(DLS, "HorizontalIrradiance"),
-    )
-    measured = tags.number(DLS, "SpectralIrradiance")
+    sun = sun_position(tags.position, CaptureTime.of(tags.captured_at).utc.timestamp())
+    horizontal, measured = (tags.number(DLS, f"{name}Irradiance") for name in ("Horizontal", "Spectral"))
     corrected = horizontal_irradiance(measured, tuple(np.degrees(attitude(tags))), sun)
     angles = math.degrees(sensor_to_sun(tags, *sun)), 90 - math.degrees(sun[0])
     return *(f"{v:.1f}" for v in angles), *(f"{v / horizontal:.2f}" for v in (measured, corrected))
