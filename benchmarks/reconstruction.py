@@ -41,7 +41,7 @@ def photo_of(band: Band, shared: Band) -> NDArray[np.uint8]:
 
 
 def aligned_photos(out: Path) -> tuple[Photos, Band, str]:
-    """(the band files of a run, the band whose camera they have, the name of the reference)."""
+    """(the band files of a run, a band with the camera of all, the name of the reference)."""
     bands: dict[tuple[str, str], Band] = {}
     for path in find_sidecars(out):
         sidecar = read_sidecar(path)
@@ -55,7 +55,7 @@ def aligned_photos(out: Path) -> tuple[Photos, Band, str]:
 
 
 def original_photos(flight: Path, names: set[str]) -> tuple[Photos, Band]:
-    """(the original bands of these captures, the first one's reference, with the camera of all)."""
+    """(the original bands of these captures, a band with the camera of all: the reference of the first one)."""
     captures = [c for c in discover(flight).captures if c.name in names]
     first = captures[0].reference
     return {(c.name, b.name): photo_of(b, first) for c in captures for b in c.bands}, first
