@@ -8,6 +8,7 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -15,13 +16,17 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
+import rasterio
 import typer
 from bands.score import WRONG_PX, table
 from numpy.typing import NDArray
-from scipy.interpolate import CloughTocher2DInterpolator
+from scipy.interpolate import RegularGridInterpolator
 
-import agalign
-from agalign.products.sidecar.file import find_sidecars
+from agalign.pixels.raster import without_warnings
+from agalign.products.sidecar.convert import read_alignment
+from agalign.products.sidecar.file import find_sidecars, read_sidecar
+from agalign.products.sidecar.schema import Sidecar, is_usable
+from agalign.values.geometry import Points
 
 Ties = dict[str, dict[str, Any]]
 """Entries of ties.json or truth.json by the name of the moving file, each with `ties` (n, 4), raw px."""
@@ -62,12 +67,20 @@ def print_head(*cells: str) -> None:
     print(table([cells]), flush=True)
 
 
+def with_section(document: Path, name: str, content: str) -> str:
+    """Return the text of a document with other content between the comments of a section."""
+    begin, end = f"<!-- {name} -->\n", f"<!-- end of {name} -->"
+    before, found, rest = document.read_text(encoding="utf-8").partition(begin)
+    if not found or end not in rest:
+        raise SystemExit(f"{document} has no section {begin.strip()}")
+    return before + begin + content + end + rest.partition(end)[2]
+
+
 class Section:
-    """A section of a document between two comments, printed at once; without a document it is only printed."""
+    """A section of a document, printed at once; without a document it is only printed."""
 
     def __init__(self, name: str, document: Path | None) -> None:
-        self._marks = f"<!-- {name} -->", f"<!-- end of {name} -->"
-        self._document, self._parts = document, list[str]()
+        self._name, self._document, self._parts = name, document, list[str]()
 
     def table(self, rows: Sequence[Sequence[object]]) -> None:
         """Add rows, the first of them the head."""
@@ -78,12 +91,8 @@ class Section:
         print(text, end="\n\n", flush=True)
         self._parts.append(text)
         if self._document is not None:
-            begin, end = self._marks
-            before, found, rest = self._document.read_text(encoding="utf-8").partition(begin)
-            if not found or end not in rest:
-                raise SystemExit(f"{self._document} has no section {begin}")
-            new = "\n\n".join([before + begin, *self._parts, end + rest.partition(end)[2]])
-            self._document.write_text(new, encoding="utf-8")
+            content = "\n" + "".join(f"{part}\n\n" for part in self._parts)
+            self._document.write_text(with_section(self._document, self._name, content), encoding="utf-8")
 
 
 def pyplot() -> Any:
@@ -108,30 +117,19 @@ def heat_map(axis: Any, values: NDArray[np.float64], rows: Sequence[str], column
     return image
 
 
-# ---- decisions on pairs of images
+# ---- bands of files
 
 
-Pair = tuple[NDArray[Any], NDArray[Any], dict[str, Any], Callable[[NDArray[np.float64]], float]]
-"""Two images, options of `agalign.align`, and the error of a homography in px; nan if they show different scenes."""
+def read_band(path: Path, index: int = 1) -> NDArray[Any]:
+    """Return the pixels (height, width) of a band as they are stored."""
+    with without_warnings(), rasterio.open(path) as dataset:
+        return np.asarray(dataset.read(index))
 
 
-def print_decisions(kinds: Sequence[str], pair_of: Callable[[str, np.random.Generator], Pair], numbers: range) -> None:
-    """Align a pair for each number, of the kinds in turn, and print a table of the results."""
-    rows: dict[str, list[tuple[str, float, float]]] = {kind: [] for kind in kinds}
-    for number in numbers:
-        kind = kinds[number % len(kinds)]
-        fixed, moving, options, error_px = pair_of(kind, np.random.default_rng(number))
-        seconds, result = timed(agalign.align, fixed, moving, **options)
-        rows[kind].append((result.status, error_px(result.fixed_to_moving), seconds))
-        print("{:4d} {:28s} {:9s} {:7.2f} px {:5.1f} s".format(number, kind, *rows[kind][-1]), result.reason or "")
-    statuses = "aligned", "seed_only", "failed"
-    print_head("kind", "pairs", *statuses, "wrongly aligned", "worst error, px", "seconds")
-    for kind, some in ((kind, some) for kind, some in rows.items() if some):
-        errors = [error for status, error, _ in some if status == "aligned"]
-        wrong = sum(not error <= WRONG_PX for error in errors)
-        counts = [sum(status == one for status, *_ in some) for one in statuses]
-        worst, median_s = max(errors, default=np.nan), np.median([row[2] for row in some])
-        print_row(kind, len(some), *counts, wrong, f"{worst:.2f}", f"{median_s:.1f}")
+def write_band(path: Path, pixels: NDArray[Any], index: int = 1) -> None:
+    """Replace the pixels of a band, and leave the tags."""
+    with without_warnings(), rasterio.open(path, "r+") as dataset:
+        dataset.write(pixels, index)
 
 
 # ---- runs of the command line
@@ -248,46 +246,114 @@ class BandError:
     capture: str
     band: str
     file: str
+    reference: str
+    """File of the reference band of the run."""
     status: str
+    geometry: str
+    is_usable: bool
+    """Aligned, or predicted within --accept-predicted."""
     source: str
     """Origin of a prediction, or empty."""
-    median_px: float
-    p95_px: float
     std_px: float
     """Reported standard error; nan without one."""
+    error_px: Points
+    """(n,)"""
+    claim_px: Points
+    """(n,) values of the error map; nan outside, or without a map."""
     seconds: float
+
+    @property
+    def median_px(self) -> float:
+        return float(np.nanmedian(self.error_px))
+
+    @property
+    def p95_px(self) -> float:
+        return float(np.nanpercentile(self.error_px, 95))
 
 
 def read_ties(path: Path) -> Ties:
     """Return the truth of a ties.json or truth.json by file."""
-    captures = json.loads(path.read_text(encoding="utf-8")).values()
-    return {file: entry | {"trouble": c.get("trouble", "")} for c in captures for file, entry in c["bands"].items()}
+    result = {}
+    for capture in json.loads(path.read_text(encoding="utf-8")).values():
+        shared = {"reference": capture["reference"], "trouble": capture.get("trouble", "")}
+        result |= {file: entry | shared for file, entry in capture["bands"].items()}
+    return result
 
 
 def band_errors(out: Path, truth: Ties) -> list[BandError]:
-    """Return the error of each band with tie points, from the grids in the sidecars of a run."""
+    """Return the error of each band with tie points by the mappings in the sidecars of a run.
+
+    If the run has another reference than the truth, its points are mapped to that one first.
+    """
     result = []
     for path in find_sidecars(out):
-        sidecar = json.loads(path.read_text(encoding="utf-8"))
-        for band in sidecar["bands"]:
-            grid, prediction, joint = band["grid"], band["prediction"] or {}, band["joint"] or {}
-            if band["file"] not in truth or band["status"] == "reference" or grid is None:
+        sidecar = read_sidecar(path)
+        references = {b.file: b.band for b in sidecar.bands if b.status != "reference"}
+        for band in sidecar.bands:
+            if band.file not in truth or band.status == "reference" or band.homography is None:
                 continue
-            ties = np.array(truth[band["file"]]["ties"])
-            mapping = CloughTocher2DInterpolator(grid["reference_px"], grid["moving_px"])
-            error_px = np.linalg.norm(mapping(ties[:, :2]) - ties[:, 2:], axis=1)
-            std_px = prediction.get("std_px") if prediction else joint.get("corner_std_px")
-            aligned_or_predicted = band["status"] in ("aligned", "predicted") and std_px is not None
+            alignment, prediction = read_alignment(path, band.band), band.prediction
+            points, target = np.hsplit(np.array(truth[band.file]["ties"]), 2)
+            if truth[band.file]["reference"] in references:
+                points = read_alignment(path, references[truth[band.file]["reference"]]).inverse(points)
+            std_px = prediction.std_px if prediction else band.joint.corner_std_px if band.joint else None
+            aligned_or_predicted = band.status in ("aligned", "predicted") and std_px is not None
             result.append(
                 BandError(
-                    sidecar["capture"],
-                    band["band"],
-                    band["file"],
-                    band["status"],
-                    prediction.get("from", ""),
-                    *map(float, np.nanpercentile(error_px, (50, 95))),
+                    sidecar.capture,
+                    band.band,
+                    band.file,
+                    sidecar.reference.file,
+                    band.status,
+                    alignment.geometry,
+                    is_usable(band.status, prediction, sidecar.max_predicted_px),
+                    prediction.source if prediction else "",
                     std_px if aligned_or_predicted else np.nan,
-                    band["seconds"],
+                    np.linalg.norm(alignment.map(points) - target, axis=1),
+                    claims_px(path, sidecar, band.band, points),
+                    band.seconds,
                 )
             )
     return result
+
+
+def layer(path: Path, name: str) -> NDArray[np.float64] | None:
+    """Return the band (height, width) of a raster with a name, nan where it has no data; None without file or band."""
+    if not path.exists():
+        return None
+    with without_warnings(), rasterio.open(path) as dataset:
+        if name not in dataset.descriptions:
+            return None
+        band = dataset.read(dataset.descriptions.index(name) + 1, masked=True)
+    return np.asarray(band.astype(np.float64).filled(np.nan))
+
+
+def claims_px(path: Path, sidecar: Sidecar, band: str, points_px: Points) -> Points:
+    """Return the error map (n,) of a band at raw points (n, 2) of the reference; nan outside, or without a map."""
+    values = layer(path.with_suffix(".error.tif"), band)
+    if values is None:
+        return np.full(len(points_px), np.nan)
+    x0, y0 = sidecar.output.crop[:2]
+    axes = (np.arange(n) + at for n, at in zip(values.shape, (y0, x0), strict=True))
+    return np.asarray(RegularGridInterpolator(tuple(axes), values, bounds_error=False)(points_px[:, ::-1]))
+
+
+def print_errors(groups: dict[str, list[BandError]]) -> None:
+    """Print a row for each group of bands, and a line for each band that is off or without result; errors are medians
+    over a band's tie points.
+    """
+    head = "captures", "bands", "median error, px", "worst", "worst error / std", "within 1 std", "within 2 std"
+    print_head("", *head)
+    for name, bands in groups.items():
+        errors, std = np.array([(b.median_px, b.std_px) for b in bands]).T
+        statuses = Counter(f"{b.status} ({b.source})" if b.source else b.status for b in bands)
+        counts = ", ".join(f"{n} {status}" for status, n in statuses.most_common())
+        shares = errors / std
+        within = [f"{np.mean(shares <= k):.0%}" for k in (1, 2)]
+        worst = f"{np.nanmax(shares):.1f}" if np.isfinite(shares).any() else "-"
+        captures = len({b.capture for b in bands})
+        print_row(name, captures, counts, f"{np.median(errors):.3f}", f"{errors.max():.3f}", worst, *within)
+    for name, bands in groups.items():
+        for b in bands:
+            if b.median_px > WRONG_PX or b.status not in ("aligned", "predicted"):
+                print(f"{name}: {b.capture} {b.band}: {b.status}, {b.median_px:.2f} px, standard error {b.std_px:.2f}")

@@ -13,9 +13,9 @@ from typing import Annotated
 import cv2
 import numpy as np
 import typer
-from common import align, flight_and_out, pyplot, read_ties, run
+from common import align, flight_and_out, layer, pyplot, read_ties, run
 from numpy.typing import NDArray
-from relief_score import Sidecar, layer, read_sidecar, written
+from relief import Sidecar, read_sidecar
 from synthetic_flights.depth import write_capture
 from synthetic_flights.relief import make_scene
 
@@ -25,6 +25,7 @@ from agalign.evaluation.image_pairs import read_image
 from agalign.evaluation.surface import draw_surface, loss_surface
 from agalign.method.match import sift_keypoints, to_8_bit, visible_in_both
 from agalign.method.paper import Training
+from agalign.pixels.band_resampling import eight_bit
 from agalign.products.report.drawing import with_text
 from agalign.synthetic import cameras
 from agalign.synthetic import flight as synthetic
@@ -98,7 +99,9 @@ def relief(path: Path) -> None:
         plt, panels = pyplot(), [["reference", "relief", "before"], ["reference", "relief", "after"]]
         style = {"figsize": (10.4, 3.0), "width_ratios": (3.6, 3.95, 1.95), "layout": "constrained"}
         figure, axes = plt.subplot_mosaic(panels, **style)
-        axes["reference"].imshow(stretched(written(aligned, "Green")), cmap="gray", extent=extent)
+        axes["reference"].imshow(
+            stretched(layer(aligned.path.with_suffix(".tif"), "Green")), cmap="gray", extent=extent
+        )
         parallax_px = layer(aligned.path.with_suffix(".relief.tif"), "parallax")
         shown = axes["relief"].imshow(parallax_px, cmap="viridis", extent=extent)
         axes["before"].imshow(detail(flat))
@@ -116,7 +119,7 @@ def relief(path: Path) -> None:
 
 def detail(sidecar: Sidecar) -> NDArray[np.uint8]:
     """Return (height, width, 3) of the enlarged part in false colours; grey where one of the bands has no data."""
-    bands = np.stack([written(sidecar, name) for name in ("NIR", "Red", "Green")], axis=-1)
+    bands = np.stack([layer(sidecar.path.with_suffix(".tif"), name) for name in ("NIR", "Red", "Green")], axis=-1)
     image = np.dstack([stretched(band) for band in np.moveaxis(bands, -1, 0)])
     image[np.isnan(bands).any(axis=-1)] = NO_DATA
     whole = np.zeros((*SCENE_SIZE_PX[::-1], 3), np.uint8)
@@ -125,8 +128,7 @@ def detail(sidecar: Sidecar) -> NDArray[np.uint8]:
 
 
 def stretched(pixels: NDArray[np.float64]) -> NDArray[np.uint8]:
-    low, high = np.nanpercentile(pixels, (1, 99))
-    return np.asarray(np.nan_to_num((pixels - low) / (high - low)).clip(0, 1) * 255, np.uint8)
+    return eight_bit(np.nan_to_num(pixels), np.isfinite(pixels))
 
 
 def main(out: Annotated[Path, typer.Argument()] = Path("docs/figures")) -> None:

@@ -3,8 +3,7 @@
     python benchmarks/lost_bands.py FLIGHT...
 
 FLIGHT holds a flight with reference tie points of its captures in ties.json. In one run each capture loses another
-band, to noise; in another one whole capture is water. Errors are medians over the ties of the written bands, next to
-the standard error in the sidecar.
+band, to noise; in another one whole capture is water. The rows are of the lost bands.
 """
 
 import json
@@ -12,20 +11,28 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-import rasterio
-from common import BandError, align, band_errors, flight_and_out, print_head, print_row, read_ties, run, writable_copy
+from common import (
+    BandError,
+    align,
+    band_errors,
+    flight_and_out,
+    print_errors,
+    read_band,
+    read_ties,
+    run,
+    writable_copy,
+    write_band,
+)
 
 
 def degrade(path: Path, how: str, rng: np.random.Generator) -> None:
     """Replace a file's pixels, and leave its tags."""
-    with rasterio.open(path, "r+") as dataset:
-        pixels = dataset.read(1)
-        noise = rng.normal(size=pixels.shape)
-        if how == "water":
-            glitter = cv2.GaussianBlur(noise.astype(np.float32), (0, 0), 3.0)
-            noise = 0.3 * noise + glitter / glitter.std()
-        degraded = (np.median(pixels) + 0.5 * pixels.std() * noise).clip(1, 65000)
-        dataset.write(degraded.astype(pixels.dtype), 1)
+    pixels = read_band(path)
+    noise = rng.normal(size=pixels.shape)
+    if how == "water":
+        glitter = cv2.GaussianBlur(noise.astype(np.float32), (0, 0), 3.0)
+        noise = 0.3 * noise + glitter / glitter.std()
+    write_band(path, (np.median(pixels) + 0.5 * pixels.std() * noise).clip(1, 65000).astype(pixels.dtype))
 
 
 def run_without(flight: Path, lost: set[str], how: str, rng: np.random.Generator) -> list[BandError]:
@@ -50,16 +57,7 @@ def main(flights: list[Path]) -> None:
         for capture in captures:
             lost = {capture["reference"], *capture["bands"]}
             result.setdefault(f"{flight.name}, a capture", []).extend(run_without(flight, lost, "water", rng))
-    print_head("lost", "band", "what it is called", "error at the ties, px", "standard error, px")
-    for kind, bands in result.items():
-        for b in bands:
-            status = b.status + (f" ({b.source})" if b.source else "")
-            print_row(kind, f"{b.capture} {b.band}", status, f"{b.median_px:.3f}", f"{b.std_px:.3f}")
-    for kind, bands in result.items():
-        errors, std = np.array([(b.median_px, b.std_px) for b in bands]).T
-        within = [f"{np.mean(errors <= times * std):.0%}" for times in (1, 2)]
-        print(f"{kind}: median {np.median(errors):.3f}, worst {errors.max():.3f} px;", end=" ")
-        print(f"within 1 standard error {within[0]}, within 2 {within[1]}")
+    print_errors(result)
 
 
 if __name__ == "__main__":

@@ -18,11 +18,10 @@ import sys
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import fields
 from pathlib import Path
-from typing import Annotated
 
 import numpy as np
-import typer
-from common import print_head, print_row, pyplot, run
+from bands.score import table
+from common import pyplot, run
 
 from agalign.evaluation.evaluate import Result, Starts, error_table
 from agalign.evaluation.image_pairs import read_image
@@ -66,14 +65,8 @@ def evaluate(pairs: Path, pieces: Path, jobs: int, options: list[str]) -> None:
 
     with ThreadPoolExecutor(jobs) as executor:
         list(executor.map(one, csv.DictReader(pairs.read_text(encoding="utf-8").splitlines())))
-    head, *body = error_table([_result(row) for row in rows_of(pieces)])
-    print_head(*head)
-    for cells in body:
-        print_row(*cells)
-
-
-def _result(row: dict[str, str]) -> Result:
-    return Result(**{f.name: f.type(row[f.name]) for f in fields(Result)})
+    results = [Result(**{f.name: f.type(row[f.name]) for f in fields(Result)}) for row in rows_of(pieces)]
+    print(table(error_table(results)))
 
 
 def rows_of(results: Path) -> list[dict[str, str]]:
@@ -101,9 +94,7 @@ def draw(results: list[Path], path: Path) -> None:
     figure.savefig(path, dpi=110)
 
 
-def main(
-    paths: list[str], plot: Path | None = None, pieces: Path | None = None, jobs: Annotated[int, typer.Option()] = 1
-) -> None:
+def main(paths: list[str], plot: Path | None = None, pieces: Path | None = None, jobs: int = 1) -> None:
     if plot:
         draw([Path(path) for path in paths], plot)
     elif pieces:

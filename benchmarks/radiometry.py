@@ -16,7 +16,7 @@ from unittest.mock import patch
 
 import cv2
 import numpy as np
-from common import print_head, print_row, run
+from common import print_head, print_row, read_band, run
 
 from agalign.cameras.discover import discover
 from agalign.cameras.metadata import Tags, read_tags
@@ -25,10 +25,9 @@ from agalign.flight import panel_readings
 from agalign.flight.groups import camera_key
 from agalign.pixels.landmarks import landmarks, matched_homography, matches
 from agalign.pixels.radiometry import calibrated, with_radiometry
-from agalign.pixels.raster import read_for_alignment, read_tile
+from agalign.pixels.raster import read_for_alignment
 from agalign.values import geometry
 from agalign.values.capture import Band, Capture, CaptureTime
-from agalign.values.image import Tile
 
 CAMERA, DLS, PIX4D = "micasense.com/MicaSense", "micasense.com/DLS", "pix4d.com"
 MIN_TIES, MAX_ERROR_PX = 30, 4.0
@@ -148,11 +147,8 @@ def published_panel_light(band: Band) -> tuple[float, float]:
 
 def tilt_facts(tags: Tags) -> tuple[str, ...]:
     """Angles, and the measured and the corrected irradiance relative to HorizontalIrradiance."""
-    sun, horizontal = (
-        sun_position(tags.position, CaptureTime.of(tags.captured_at).utc.timestamp()),
-        tags.number(DLS, "HorizontalIrradiance"),
-    )
-    measured = tags.number(DLS, "SpectralIrradiance")
+    sun = sun_position(tags.position, CaptureTime.of(tags.captured_at).utc.timestamp())
+    horizontal, measured = (tags.number(DLS, f"{name}Irradiance") for name in ("Horizontal", "Spectral"))
     corrected = horizontal_irradiance(measured, tuple(np.degrees(attitude(tags))), sun)
     angles = math.degrees(sensor_to_sun(tags, *sun)), 90 - math.degrees(sun[0])
     return *(f"{v:.1f}" for v in angles), *(f"{v / horizontal:.2f}" for v in (measured, corrected))
@@ -179,7 +175,7 @@ def differences(a: Band, b: Band) -> Image:
 
 
 def pixels(band: Band) -> Image:
-    return read_tile(band, Tile(0, 0, *band.size_px))[0].astype(np.float64)
+    return read_band(band.path).astype(np.float64)
 
 
 if __name__ == "__main__":

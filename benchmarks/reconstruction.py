@@ -8,21 +8,19 @@ capture have one pose where they are aligned. The original images, which a rig o
 """
 
 import tempfile
-from dataclasses import dataclass
 from pathlib import Path
 from statistics import median
 
 import cv2
 import numpy as np
 import pycolmap
-from common import print_head, print_row, run
+from common import print_head, print_row, read_band, run
 from numpy.typing import NDArray
 
 from agalign.cameras import known_cameras
 from agalign.cameras.discover import discover
 from agalign.cameras.read_files import read_file
 from agalign.config import DiscoverOptions
-from agalign.pixels.raster import open_raster, without_warnings
 from agalign.products.sidecar.file import find_sidecars, read_sidecar
 from agalign.values.capture import Band
 
@@ -31,34 +29,19 @@ Photos = dict[tuple[str, str], NDArray[np.uint8]]
 """By capture and band: 8 bits, undistorted to the pinhole camera that all photos share."""
 
 
-@dataclass(frozen=True)
-class Pinhole:
-    """The camera of all photos."""
-
-    matrix: NDArray[np.float64]
-    size_px: tuple[int, int]
-
-    @property
-    def params(self) -> str:
-        """fx, fy, cx, cy; COLMAP counts from the corner of the top-left pixel."""
-        k = self.matrix
-        return f"{k[0, 0]},{k[1, 1]},{k[0, 2] + 0.5},{k[1, 2] + 0.5}"
-
-
-def photo_of(band: Band, camera: Pinhole) -> NDArray[np.uint8]:
-    """A band of a file, undistorted by the lens in the file's tags."""
-    with open_raster(band.path) as source:
-        raw = source.read(band.band_index).astype(np.float32)
+def photo_of(band: Band, shared: Band) -> NDArray[np.uint8]:
+    """A band of a file, undistorted by the lens in the file's tags to the pinhole camera of another band."""
+    raw = read_band(band.path, band.band_index).astype(np.float32)
     low, high = np.percentile(raw[raw > 0], _SHOWN_PERCENTILES)
     grey = (np.clip((raw - low) / (high - low), 0, 1) * 255).astype(np.uint8)
     distortion = np.array((*band.lens.distortion, *(0.0,) * 8)[:8])
-    new = camera.matrix, camera.size_px, cv2.CV_32FC1
+    new = shared.lens.matrix, shared.size_px, cv2.CV_32FC1
     maps = cv2.initUndistortRectifyMap(band.lens.matrix, distortion, np.eye(3), *new)
     return np.asarray(cv2.remap(grey, *maps, cv2.INTER_CUBIC), np.uint8)
 
 
-def aligned_photos(out: Path) -> tuple[Photos, Pinhole, str]:
-    """(the band files of a run, their camera, the name of the reference)."""
+def aligned_photos(out: Path) -> tuple[Photos, Band, str]:
+    """(the band files of a run, a band with the camera of all, the name of the reference)."""
     bands: dict[tuple[str, str], Band] = {}
     for path in find_sidecars(out):
         sidecar = read_sidecar(path)
@@ -68,22 +51,23 @@ def aligned_photos(out: Path) -> tuple[Photos, Pinhole, str]:
     if not bands:
         raise SystemExit(f"{out}: no band files; run agalign with --layout bands")
     first = next(iter(bands.values()))
-    camera = Pinhole(first.lens.matrix, first.size_px)
-    return {key: photo_of(band, camera) for key, band in bands.items()}, camera, sidecar.reference.band
+    return {key: photo_of(band, first) for key, band in bands.items()}, first, sidecar.reference.band
 
 
-def original_photos(flight: Path, names: set[str]) -> tuple[Photos, Pinhole]:
-    """(the original bands of these captures, the camera of the first one's reference)."""
+def original_photos(flight: Path, names: set[str]) -> tuple[Photos, Band]:
+    """(the original bands of these captures, a band with the camera of all: the reference of the first one)."""
     captures = [c for c in discover(flight).captures if c.name in names]
-    camera = Pinhole(captures[0].reference.lens.matrix, captures[0].reference.size_px)
-    return {(c.name, b.name): photo_of(b, camera) for c in captures for b in c.bands}, camera
+    first = captures[0].reference
+    return {(c.name, b.name): photo_of(b, first) for c in captures for b in c.bands}, first
 
 
-def reconstruct(photos: Photos, camera: Pinhole) -> pycolmap.Reconstruction | None:
-    """The largest model of some photos with a known camera; None where there is none."""
+def reconstruct(photos: Photos, shared: Band) -> pycolmap.Reconstruction | None:
+    """The largest model of some photos with the known camera of a band; None where there is none."""
     fixed = dict.fromkeys(("ba_refine_focal_length", "ba_refine_principal_point", "ba_refine_extra_params"), False)
     options = pycolmap.IncrementalPipelineOptions(**fixed, min_model_size=2, random_seed=0)
-    reader = pycolmap.ImageReaderOptions(camera_model="PINHOLE", camera_params=camera.params)
+    k = shared.lens  # COLMAP counts from the corner of the top-left pixel
+    params = f"{k.fx_px},{k.fy_px},{k.cx_px + 0.5},{k.cy_px + 0.5}"
+    reader = pycolmap.ImageReaderOptions(camera_model="PINHOLE", camera_params=params)
     on_cpu = {"device": pycolmap.Device.cpu}
     with tempfile.TemporaryDirectory() as folder:
         root = Path(folder)
@@ -98,12 +82,12 @@ def reconstruct(photos: Photos, camera: Pinhole) -> pycolmap.Reconstruction | No
     return max(models.values(), key=lambda m: m.num_reg_images(), default=None)
 
 
-def shifts_px(model: pycolmap.Reconstruction, camera: Pinhole, reference: str) -> dict[str, list[float]]:
+def shifts_px(model: pycolmap.Reconstruction, shared: Band, reference: str) -> dict[str, list[float]]:
     """The poses of each band relative to the reference of its capture, where both are in the model: median distance of
     the scene's points in the two images.
     """
     images = {tuple(i.name.removesuffix(".png").split("--")): i for i in model.images.values() if i.has_pose}
-    focal_px = float(camera.matrix[0, 0])
+    focal_px = shared.lens.fx_px
     result: dict[str, list[float]] = {}
     for (capture, band), image in sorted(images.items()):
         other = images.get((capture, reference))
@@ -117,25 +101,24 @@ def shifts_px(model: pycolmap.Reconstruction, camera: Pinhole, reference: str) -
     return result
 
 
-def print_together(title: str, photos: Photos, camera: Pinhole, reference: str) -> None:
+def print_together(title: str, photos: Photos, shared: Band, reference: str) -> None:
     """One reconstruction of all bands; medians and maxima over the captures."""
-    model = reconstruct(photos, camera)
+    model = reconstruct(photos, shared)
     if model is None:
         print(f"\n{title}: no model; do at least three captures overlap?")
         return
     error_px = model.compute_mean_reprojection_error()
     print(f"\n{title}: {model.num_reg_images()} of {len(photos)} photos, reprojection error {error_px:.2f} px\n")
     print_head("band", "captures", f"shift of the scene against {reference}, px: median, maximum")
-    for band, own in sorted(shifts_px(model, camera, reference).items()):
+    for band, own in sorted(shifts_px(model, shared, reference).items()):
         print_row(band, len(own), f"{median(own):.2f}, {max(own):.2f}")
 
 
 def main(flight: Path, out: Path) -> None:
     """Print all tables."""
     pycolmap.logging.minloglevel = 2
-    with without_warnings():
-        photos, camera, reference = aligned_photos(out)
-        originals, their_camera = original_photos(flight, {capture for capture, _ in photos})
+    photos, camera, reference = aligned_photos(out)
+    originals, their_camera = original_photos(flight, {capture for capture, _ in photos})
     print_together("All aligned bands", photos, camera, reference)
     print_together("All original bands", originals, their_camera, reference)
 

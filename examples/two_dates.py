@@ -11,8 +11,7 @@ import numpy as np
 import rasterio
 
 from agalign.batch.run import run_flight
-from agalign.cameras.discover import FolderScan
-from agalign.cameras.mosaics import captures_onto
+from agalign.cameras.discover import FolderScan, captures_onto
 from agalign.config import FlightSettings, Settings, WriteSettings
 
 earlier, later, target = map(Path, sys.argv[1:4])

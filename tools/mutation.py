@@ -149,11 +149,8 @@ def is_detected(mutant: Mutant, copies: "Queue[Path]") -> bool:
 
 
 def main(count: int = 300, seed: int = 0, packages: str = "verify,capture,flight,values") -> None:
-    mutants, tried, detected = (
-        list(islice(mutants_of(packages.split(","), seed), count)),
-        Counter[str](),
-        Counter[str](),
-    )
+    mutants = list(islice(mutants_of(packages.split(","), seed), count))
+    tried, detected = Counter[str](), Counter[str]()
     copies: Queue[Path] = Queue()
     with tempfile.TemporaryDirectory(prefix="agalign-mutation-") as folder, ThreadPoolExecutor(2) as pool:
         for name in ("0", "1"):

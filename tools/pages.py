@@ -20,6 +20,7 @@ from typing import Any
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "benchmarks"))
 
 from bands.score import table
+from common import with_section
 
 import agalign
 from agalign.cli.command import FieldOption, field_options
@@ -163,14 +164,8 @@ def main() -> None:
     write_or_check(SCHEMA, json.dumps(sidecar_schema(), indent=1) + "\n")
     for name, tables in TABLES.items():
         page = DOCS / name
-        text = page.read_text(encoding="utf-8")
         for mark, content in tables.items():
-            begin, end = f"<!-- {mark} -->\n", f"<!-- end of {mark} -->"
-            head, found, rest = text.partition(begin)
-            if not found or end not in rest:
-                sys.exit(f"{page}: has no section {begin.strip()}")
-            text = head + begin + content() + end + rest.partition(end)[2]
-        write_or_check(page, text)
+            write_or_check(page, with_section(page, mark, content()))
 
 
 def write_or_check(path: Path, text: str) -> None:

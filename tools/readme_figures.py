@@ -46,9 +46,8 @@ def main() -> None:
             page.wait_for_timeout(1000)
             page.screenshot(path=Path(folder) / "report.png")
             browser.close()
-        smaller(Image.open(Path(folder) / "report.png").convert("RGB")).save(
-            FIGURES / "report.jpg", quality=72, optimize=True
-        )
+        screenshot = Image.open(Path(folder) / "report.png").convert("RGB")
+        smaller(screenshot).save(FIGURES / "report.jpg", quality=72, optimize=True)
 
 
 def false_colour(mosaic: Path) -> Image.Image:

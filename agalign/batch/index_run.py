@@ -14,8 +14,8 @@ from agalign.products.indices.rasters import IndexReport, update_table, write_ra
 from agalign.products.run.captures import bands_of
 from agalign.products.run.flight_map import link_indices
 from agalign.products.sidecar.file import read_result, run_sidecars, update_products
-from agalign.values.cores import usable_cores
 from agalign.values.files import check_inside
+from agalign.values.processes import usable_cores
 
 
 @dataclass(frozen=True)

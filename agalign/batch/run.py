@@ -51,11 +51,10 @@ from agalign.products.run.record import ExclusionPart, RunPart, RunState, begun
 from agalign.products.sidecar.file import read_result
 from agalign.products.sidecar.schema import CaptureResult
 from agalign.values.capture import Capture
-from agalign.values.cores import usable_cores
 from agalign.values.files import check_inside
 from agalign.values.image import OutputGrid
 from agalign.values.output_folder import is_full, locked
-from agalign.values.processes import CAPTURES_WORTH_A_PROCESS
+from agalign.values.processes import CAPTURES_WORTH_A_PROCESS, usable_cores
 from agalign.values.text import counted
 
 _MAX_THREADS = 4

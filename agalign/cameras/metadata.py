@@ -136,8 +136,11 @@ def _position(gps: Mapping[str, Any]) -> Position | None:
 
 def _signed_degrees(gps: Mapping[str, Any], axis: str, negative: str, max_deg: float) -> float | None:
     """A coordinate, negative if its reference (N, S, E, W) is `negative`; None if it is missing or beyond `max_deg`."""
-    degrees = _degrees(gps.get(f"GPS{axis}"))
-    if degrees is None or abs(degrees) > max_deg:
+    value = gps.get(f"GPS{axis}")  # degrees, minutes and seconds
+    if not isinstance(value, tuple) or len(value) != 3 or any(finite(part) is None for part in value):
+        return None
+    degrees = float(sum(part / 60**k for k, part in enumerate(value)))
+    if abs(degrees) > max_deg:
         return None
     return -degrees if _text(gps.get(f"GPS{axis}Ref")).upper() == negative else degrees
 
@@ -149,13 +152,6 @@ def _altitude_m(gps: Mapping[str, Any]) -> float | None:
     if altitude_m is None or abs(altitude_m) > max_altitude_m:
         return None
     return -altitude_m if gps.get("GPSAltitudeRef") == b"\x01" else altitude_m
-
-
-def _degrees(value: Any) -> float | None:
-    """Degrees from degrees, minutes and seconds."""
-    if not isinstance(value, tuple) or len(value) != 3 or any(finite(part) is None for part in value):
-        return None
-    return float(sum(part / 60**k for k, part in enumerate(value)))
 
 
 def _mean(value: Any) -> float | None:

@@ -96,13 +96,13 @@ def read_file(path: Path, cameras: Iterable[Camera], options: DiscoverOptions) -
     bands = [replace(b, panel=panel) for b in named if options.with_rgb or not b.companion]
     scale, other_lens = _scale(tags, stored[0].size_px), ""
     for i, band in enumerate(bands):
-        bands[i], why = _with_lens_of_image(band, scale)
+        rescaled_band, why = _with_lens_of_image(band, scale)
         other_lens = other_lens or why
-    for i, band in enumerate(bands):
-        if band.radiometry is not None:
-            radiometry, problem = plausible(band.radiometry, band.size_px)
+        if rescaled_band.radiometry is not None:
+            radiometry, problem = plausible(rescaled_band.radiometry, band.size_px)
             reason = f"no usable tags for radiance ({problem})" if radiometry is None else ""
-            bands[i] = replace(band, radiometry=radiometry, implausible=problem, uncalibrated=reason)
+            rescaled_band = replace(rescaled_band, radiometry=radiometry, implausible=problem, uncalibrated=reason)
+        bands[i] = rescaled_band
     return ImageFile(path, camera, tags, tuple(bands), scale, other_lens)
 
 

@@ -12,7 +12,7 @@ import typer
 from agalign.cli.command import Command, Given, load_config
 from agalign.cli.terminal import RAW_NUMBERS, Terminal, command_line, examples
 from agalign.values.choices import MAX_MOSAIC_PIXELS
-from agalign.values.cores import usable_cores
+from agalign.values.processes import usable_cores
 
 _command = partial(
     Command, on_interrupt="interrupted; finished captures are kept, and the same command resumes the run"
@@ -152,8 +152,7 @@ def _onto(
     pixel of REFERENCE: resample both to the pixel size that you need. For each MOVING, agalign writes a sidecar and a
     raster on the grid of REFERENCE, with one band of REFERENCE (--reference) and all bands of MOVING.
     """
-    from agalign.cameras.discover import FolderScan
-    from agalign.cameras.mosaics import captures_onto, distance_km
+    from agalign.cameras.discover import FolderScan, captures_onto, distance_km
     from agalign.cli.align_run import conclude, run
     from agalign.config import RunOptions, Settings
 

@@ -17,8 +17,8 @@ import typer
 from typer.core import TyperCommand
 
 from agalign.cli.terminal import Terminal, exits
-from agalign.values.cores import check_address_space, check_threads
 from agalign.values.files import read_regular
+from agalign.values.processes import check_address_space, check_threads
 from agalign.values.text import did_you_mean
 
 if TYPE_CHECKING:

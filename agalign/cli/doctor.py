@@ -11,7 +11,7 @@ import typer
 from agalign._version import __version__
 from agalign.cli.command import Command
 from agalign.cli.terminal import ExitCode, Terminal
-from agalign.values.cores import usable_cores
+from agalign.values.processes import usable_cores
 
 _LIBRARIES = ("torch", "numpy", "opencv-python-headless", "rasterio", "tifffile", "scikit-image", "pydantic")
 EXTRAS = {

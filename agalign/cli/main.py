@@ -18,8 +18,7 @@ from agalign.cli.evaluate import evaluate, learn, surface
 from agalign.cli.info import info
 from agalign.cli.results import export, indices, mosaic, report, verify
 from agalign.cli.terminal import ExitCode, Terminal, examples, options_from, printed
-from agalign.values.cores import limit_default_threads
-from agalign.values.processes import silence_libraries
+from agalign.values.processes import limit_default_threads, silence_libraries
 from agalign.values.text import did_you_mean, name_problem
 
 COMMANDS = {

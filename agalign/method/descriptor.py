@@ -47,10 +47,6 @@ class _FirstLayer(nn.Module):
         return nn.functional.max_pool2d(x, 2).tanh_()
 
 
-def _trunk() -> nn.Sequential:
-    return nn.Sequential(nn.Conv2d(32, 64, 3), nn.Tanh(), nn.Flatten(), nn.Linear(64 * 4 * 4, DIMENSION))
-
-
 def distance(f: Tensor, f_prime: Tensor) -> Tensor:
     """Return ||f(x) - f(x')||_2 row by row (paper, Eq. 3), (N, D) x (N, D) -> (N,). The gradient at 0 is 0."""
     return (f - f_prime).square().sum(dim=1).clamp_min(1e-12).sqrt()
@@ -96,7 +92,10 @@ class Descriptor(nn.Module):
         self.unit_length = unit_length
         first_channels = channels if sharing != "siamese" else channels[:1]
         self.first = nn.ModuleList(_FirstLayer(c, half_rectified) for c in first_channels)
-        self.trunk = nn.ModuleList(_trunk() for _ in (channels if sharing == "unshared" else channels[:1]))
+        self.trunk = nn.ModuleList(
+            nn.Sequential(nn.Conv2d(32, 64, 3), nn.Tanh(), nn.Flatten(), nn.Linear(64 * 4 * 4, DIMENSION))
+            for _ in (channels if sharing == "unshared" else channels[:1])
+        )
         # The NHWC layout makes the small convolutions nearly twice as fast on a CPU.
         self.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
 

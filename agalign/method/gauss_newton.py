@@ -25,7 +25,6 @@ _MAX_CORNER_STD_PX = 0.5
 """Above this standard error of the least certain corner, px of the level, a simpler family has a smaller error."""
 _MAX_STEP_PX = 4.0
 """Maximum step, px of the level: the descriptors are approximately linear in a shift of up to this length."""
-"""Model families, most parameters first."""
 
 
 @dataclass(frozen=True)

@@ -134,10 +134,9 @@ def make_level_image(raster: Raster, scale: float, device: torch.device) -> Leve
     """Reduce a raster by `scale` (1 is full resolution) and standardise each channel."""
     width, height = raster.size_px
     small = shrink(raster, (max(1, round(width * scale)), max(1, round(height * scale))))
-    planes = small.pixels if small.pixels.ndim == 3 else small.pixels[None]
     mask = small.valid.astype(np.uint8)
-    image = np.empty(planes.shape, np.float32)
-    for plane, standard in zip(planes, image, strict=True):
+    image = np.empty(small.planes.shape, np.float32)
+    for plane, standard in zip(small.planes, image, strict=True):
         mean, deviation = (float(v.item()) for v in cv2.meanStdDev(plane, mask=mask))
         np.multiply(plane - np.float32(mean), np.float32(1 / max(deviation, 1e-12)), out=standard)
         standard[~small.valid] = 0
@@ -244,23 +243,18 @@ def _gradient_magnitude(planes: FloatImage) -> FloatImage:
     return np.asarray(np.max(gradients, axis=0))
 
 
-def _held_out_cells(width_px: int, height_px: int) -> Mask:
-    """Return (height, width) True in the held-out cells: one cell in five of each row of cells, on diagonals."""
-    # Cells along the longer side; every fifth cell, in a diagonal pattern, is held out from training.
-    held_out_cells = 8
-    # Minimum width of a cell, so that it can contain the largest patches of recipe fast, 2 px between samples.
-    min_cell_px = 4 * FOOTPRINT_PX
-    cell_px = max(max(width_px, height_px) / held_out_cells, min_cell_px)
-    column, row = (np.arange(n) // cell_px % 5 for n in (width_px, height_px))
-    return np.asarray(column[None, :] == (-2 * row % 5)[:, None])
-
-
 @lru_cache(maxsize=2)
 def _max_radius_in_cells(width_px: int, height_px: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Return, for the training cells and for the held-out cells, (height, width) px distances to the cells of the
     other kind; 0 in the cells of the other kind.
     """
-    is_held_out = _held_out_cells(width_px, height_px)
+    # Cells along the longer side; every fifth cell of each row, on diagonals, is held out from training.
+    held_out_cells = 8
+    # Minimum width of a cell, so that it can contain the largest patches of recipe fast, 2 px between samples.
+    min_cell_px = 4 * FOOTPRINT_PX
+    cell_px = max(max(width_px, height_px) / held_out_cells, min_cell_px)
+    column, row = (np.arange(n) // cell_px % 5 for n in (width_px, height_px))
+    is_held_out = column[None, :] == (-2 * row % 5)[:, None]
     training, held_out = (
         np.asarray(cv2.distanceTransform(c.astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE))
         for c in (~is_held_out, is_held_out)

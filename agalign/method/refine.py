@@ -10,7 +10,6 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from agalign.errors import GeometryError, NotEnoughTextureError
@@ -259,7 +258,9 @@ def refine(
         if not all(math.isfinite(x) for x in (step.length_px, *itertools.chain(*std))):
             return Issue(CORNERS_UNKNOWN)
         held_out, chance = held_out_retrieval(band, homography, test, f_test)
-        of_step = step.family, step.length_px, std, _complete_covariance(step)
+        random = step.corner_covariance_px2.cpu().numpy()
+        covariance_px2 = random + s**2 * np.eye(8) if np.isfinite(random).all() else None
+        of_step = step.family, step.length_px, std, covariance_px2
         return JointResult(matrix, math.nan, held_out, chance, 0, (1.0,), "fast", *of_step)
 
     return [
@@ -268,9 +269,3 @@ def refine(
         else result(MovingBand(net, level, b, side), h[b])
         for b, side in enumerate(group.sides)
     ]
-
-
-def _complete_covariance(step: Step) -> NDArray[np.float64] | None:
-    """Return the covariance (8, 8) of the corners with the systematic part; None where it is not finite."""
-    random = step.corner_covariance_px2.cpu().numpy()
-    return random + _SYSTEMATIC_STD_PX**2 * np.eye(8) if np.isfinite(random).all() else None

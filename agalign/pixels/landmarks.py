@@ -16,6 +16,7 @@ from agalign.values import geometry, lens
 from agalign.values.geometry import Matrix, Points
 from agalign.values.image import Raster
 from agalign.values.lens import Lens
+from agalign.values.pixel_units import PixelScale
 
 LandmarkInput = Literal["edges", "image"]
 LANDMARK_INPUTS: tuple[LandmarkInput, ...] = ("edges", "image")
@@ -64,9 +65,9 @@ def landmarks(raster: Raster, view: LandmarkInput, max_keypoints: int = _MAX_KEY
     if descriptors is None:
         return Landmarks(np.empty((0, 2)), np.empty((0, 128), np.float32))
     xy = np.array([k.pt for k in keypoints], np.float64)
-    enlargement = width / small.size_px[0], height / small.size_px[1]
     root = np.sqrt(descriptors / np.maximum(descriptors.sum(axis=1, keepdims=True), 1e-12))
-    return Landmarks((xy + 0.5) * enlargement - 0.5, np.asarray(root, np.float32))
+    enlargement = PixelScale.between(small.size_px, raster.size_px)
+    return Landmarks(enlargement.positions(xy), np.asarray(root, np.float32))
 
 
 def matched_homography(fixed: Landmarks, moving: Landmarks, size_px: tuple[int, int]) -> Matrix | None:

@@ -51,21 +51,15 @@ _MAX_BANDS = 512
 """More than any imager has; a damaged file may declare 65,535."""
 
 
-def suffix_format(path: Path) -> Literal["TIFF", "JPEG", "PNG", "JPEG 2000"] | None:
-    """Return the format of a file by its suffix; None for other files.
+Format = Literal["TIFF", "JPEG", "PNG", "JPEG 2000"]
+_FORMATS: dict[str, Format] = {".tif": "TIFF", ".tiff": "TIFF", ".jpg": "JPEG", ".jpeg": "JPEG", ".png": "PNG"}
+_FORMATS |= {".jp2": "JPEG 2000", ".j2k": "JPEG 2000"}
+"""JPEG and PNG are photographs, or bands exported by other software, mostly in 8 bits. JPEG 2000 is refused."""
 
-    JPEG and PNG are photographs, or bands exported by other software, mostly in 8 bits. JPEG 2000 is refused.
-    """
-    match path.suffix.lower():
-        case ".tif" | ".tiff":
-            return "TIFF"
-        case ".jpg" | ".jpeg":
-            return "JPEG"
-        case ".png":
-            return "PNG"
-        case ".jp2" | ".j2k":
-            return "JPEG 2000"
-    return None
+
+def suffix_format(path: Path) -> Format | None:
+    """Return the format of a file by its suffix; None for other files."""
+    return _FORMATS.get(path.suffix.lower())
 
 
 @contextmanager

@@ -21,16 +21,15 @@ from typing import Annotated, Any
 
 import cv2
 import numpy as np
-import rasterio
 import typer
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # run as a file, its package is not found
 
-from common import align, run, timed, watched
+from common import align, run, timed, watched, write_band
 from peers import METHODS, Align, UnavailableError, grey_raster, method_named
 
 from agalign.cameras.discover import discover
-from agalign.pixels.raster import suffix_format, without_warnings
+from agalign.pixels.raster import suffix_format
 from agalign.products.sidecar.file import find_sidecars
 from agalign.values import geometry, lens
 from agalign.values.capture import Band
@@ -63,9 +62,7 @@ def by_command_line(method: str, paths: Paths, pairs: Sequence[Pair], variant: s
         for name, path in paths.items():
             shutil.copyfile(path, flight / name)
         for pair in pairs if variant != AS_IT_IS else ():
-            pixels = degraded(read(paths[pair.file]), pair, variant)
-            with without_warnings(), rasterio.open(flight / pair.file, "r+") as dataset:
-                dataset.write(pixels, 1)
+            write_band(flight / pair.file, degraded(read(paths[pair.file]), pair, variant))
         seconds = align(flight, out, *WHOLE[method]) / (len(paths) - len({p.reference for p in pairs}))
         sidecars = [json.loads(path.read_text(encoding="utf-8")) for path in find_sidecars(out)]
     bands = {band["file"]: band for sidecar in sidecars for band in sidecar["bands"]}

@@ -14,13 +14,13 @@ import psutil
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from common import Section, align, command, flight_and_out, run
+from common import Section, align, command, ended, flight_and_out, run
 from kills import differences, snapshot
 
 from agalign.products.sidecar.file import find_sidecars
 from agalign.synthetic import flight as synthetic
 
-SIZE_PX = 480, 360
+SIZE_PX, MAX_S = (480, 360), 1800
 
 
 def dask(program: str, address_file: Path, *arguments: str) -> "subprocess.Popen[bytes]":
@@ -49,24 +49,25 @@ def main(captures: int = 40, markdown: Path | None = None) -> None:
             while not address_file.is_file():
                 time.sleep(0.2)
             address = json.loads(address_file.read_text())["address"]
-            began, killed_at = time.monotonic(), 0
-            process = subprocess.Popen(command(flight, out, "--dask", address))
-            while process.poll() is None:
-                done = len(find_sidecars(out)) if out.is_dir() else 0
-                if not killed_at and done >= captures // 2:
-                    kill_worker(processes[0].pid)
-                    killed_at = done
-                time.sleep(0.1)
-            seconds = time.monotonic() - began
+            done = 0
+
+            def lose_a_worker(process: "subprocess.Popen[str]") -> None:
+                nonlocal done
+                while process.poll() is None and done < captures // 2:
+                    time.sleep(0.1)
+                    done = len(find_sidecars(out))
+                kill_worker(processes[0].pid)
+
+            ending = ended(command(flight, out, "--dask", address), MAX_S, lose_a_worker)
         finally:
             for one in processes:
                 one.terminate()
         result = differences(out, snapshot(alone))
         section.say(
             f"{captures} captures of {SIZE_PX[0]} x {SIZE_PX[1]} on a scheduler and two worker processes; one, "
-            f"with its nanny, killed by SIGKILL when {killed_at} captures were done: exit code {process.returncode}, "
-            f"{len(find_sidecars(out))} captures done in {seconds:.0f} s (a run on this machine's two cores without "
-            f"a cluster: {alone_s:.0f} s). Files compared with that run: {result['missing']} missing, "
+            f"with its nanny, killed by SIGKILL when {done} captures were done: exit code {ending.code}, "
+            f"{len(find_sidecars(out))} captures done in {ending.seconds:.0f} s (a run on this machine's two cores "
+            f"without a cluster: {alone_s:.0f} s). Files compared with that run: {result['missing']} missing, "
             f"{result['left over']} left over, {result['corrupt']} corrupt, {result['different']} different."
         )
 

@@ -30,9 +30,8 @@ from numpy.typing import NDArray
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from common import Section, command, ended, run, timed
+from common import Section, command, ended, read_band, run, timed
 from kills import HUNG_S, contents
-from stages import read
 from synthetic_flights.aligned import make_aligned
 
 from agalign.cameras.discover import discover
@@ -195,7 +194,7 @@ def derived(capture: Capture, folder: Path, rng: np.random.Generator) -> Capture
     side, gain, turns = rng.uniform(0.3, 1.0), rng.uniform(0.03, 1.0), int(rng.integers(4))
     at, bands = rng.uniform(0, 1 - side, 2), []
     for number, band in enumerate(capture.bands):
-        pixels = read(band)
+        pixels = read_band(band.path, band.band_index)
         (y, x), (height, width) = ((v * pixels.shape).astype(int) for v in (at, np.array((side, side))))
         black = 0.0 if band.radiometry is None else band.radiometry.black_level
         dark = np.rot90(black + (pixels[y : y + height, x : x + width].clip(black) - black) * gain, turns)

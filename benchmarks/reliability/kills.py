@@ -30,10 +30,10 @@ import rasterio
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from common import Section, command, ended, run, timed
+from common import Section, command, ended, run
 from synthetic_flights.aligned import make_aligned
 
-from agalign.products.sidecar.file import find_sidecars
+from agalign.products.sidecar.file import find_sidecars, verify_outputs
 from agalign.synthetic import flight as synthetic
 from agalign.values.files import RUN_FILE
 
@@ -43,7 +43,7 @@ INDICES = "indices"
 MODES = {"one job": ("-j", "1"), "two jobs": ("-j", "2"), "Dask": ("-j", "2", "--dask", "local"), INDICES: ("-j", "2")}
 TARGETS = "run", "fork server", "worker", "run and workers"
 WRONG = (
-    *("hung", "traceback", "bad exit", "outlived the run", "torn sidecars", "torn captures"),
+    *("hung", "traceback", "bad exit", "outlived the run", "torn"),
     *("missing", "left over", "corrupt", "different"),
 )
 STOPPED_S, HUNG_S = 5.0, 120.0
@@ -90,21 +90,12 @@ def differences(out: Path, expected: dict[str, object], content: Callable[[Path]
     return result
 
 
-def whole_sidecars(out: Path) -> Counter[str]:
-    """Right after a kill: a sidecar that is there must be readable, and its files must be as it says."""
-    result: Counter[str] = Counter()
-    for path in find_sidecars(out) if out.is_dir() else []:
-        try:
-            output = json.loads(path.read_text())["output"]
-        except ValueError:
-            result["torn sidecars"] += 1
-            continue
-        named = [*output["band_files"], {"file": output["file"], "bytes": output["bytes"]}]
-        result["torn captures"] += any(
-            not (path.parent / f["file"]).is_file() or (path.parent / f["file"]).stat().st_size != f["bytes"]
-            for f in named
-        )
-    return result
+def torn(out: Path) -> int:
+    """Return the number of captures with an unreadable sidecar, or with files that are not as it lists them. A file
+    that could not be written, which the run reports, is not in the list.
+    """
+    every = [problems for _, problems in verify_outputs(out)] if find_sidecars(out) else []
+    return sum(any("could not be written" not in problem for problem in problems) for problems in every)
 
 
 def processes_of(process: "subprocess.Popen[str]", target: str) -> list[psutil.Process]:
@@ -169,8 +160,8 @@ def main(
             start = partial(shutil.copytree, aligned, out) if of_indices else (lambda: None)
             shutil.rmtree(out, ignore_errors=True)
             start()
-            seconds, done = timed(subprocess.run, argv, check=False)
-            if done.returncode != 0:
+            whole = ended(argv, HUNG_S)
+            if whole.code != 0:
                 raise SystemExit(f"{mode}: the run without signals failed")
             expected = snapshot(out)
             targets = TARGETS if mode != "one job" else ("run",)
@@ -181,19 +172,19 @@ def main(
                 target = targets[index // len(signals.split(",")) % len(targets)]
                 shutil.rmtree(out, ignore_errors=True)
                 start()
-                at_s = rng.uniform(0.02, 1.0) * seconds
+                at_s = rng.uniform(0.02, 1.0) * whole.seconds
                 here = strike(argv, at_s, signal.Signals[name], target, rng)
-                here += Counter() if of_indices else whole_sidecars(out)
-                again = subprocess.run(argv, capture_output=True, text=True, check=False)
+                here["torn"] = 0 if of_indices else torn(out)
+                again = ended(argv, HUNG_S)
                 here += differences(out, expected)
-                here["bad exit"] += again.returncode != 0
+                here["bad exit"] += again.code != 0
                 wrong = {k: n for k, n in here.items() if n and k != "hit"}
                 print(f"{index + 1}: {mode}: {name} to {target} after {at_s:.1f} s: {wrong or 'equal'}", flush=True)
                 if wrong:
-                    print(again.stderr, flush=True)
+                    print(again.errors, flush=True)
                 counts[target] += here + Counter(strikes=1)
             rows += [
-                (mode, target, n["strikes"], n["hit"], f"{seconds:.0f}", sum(n[k] for k in WRONG))
+                (mode, target, n["strikes"], n["hit"], f"{whole.seconds:.0f}", sum(n[k] for k in WRONG))
                 for target, n in counts.items()
             ]
     section.table(rows)

@@ -26,7 +26,7 @@ import tifffile
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from common import Ending, Section, ended, run
-from kills import contents, differences, snapshot, whole_sidecars, without
+from kills import contents, differences, snapshot, torn, without
 
 from agalign.products.report.pages import SUMMARY_FILE
 from agalign.synthetic import flight as synthetic
@@ -112,7 +112,7 @@ def faults_of(ending: Ending, out: Path, expected: dict[str, object]) -> Counter
     if ending.code is None:
         result["hung"] += 1
         return result
-    result["torn"] = sum(whole_sidecars(out).values())
+    result["torn"] = torn(out)
     result["traceback"] = int(ending.has_traceback)
     if ending.code == 0 and not ending.complaints:
         result["unnoticed"] = sum(compared(out, expected).values())

@@ -7,31 +7,46 @@ from pathlib import Path
 import numpy as np
 import pytest
 from common import Section, band_errors, read_ties, watched
+from synthetic_flights.aligned import sidecar_of
 
 from agalign.values import geometry
 
 pytestmark = pytest.mark.full
 
 
-def test_the_error_is_that_of_the_grid_at_the_ties(tmp_path: Path) -> None:
-    here = geometry.lattice(100, 80, 17, 13)
-    grid = {"reference_px": here.tolist(), "moving_px": (here + np.array((3.3, 0.4))).tolist()}
-    band = {"band": "NIR", "status": "aligned", "grid": grid, "prediction": None, "seconds": 1.0}
+@pytest.mark.parametrize("reference", ["IMG_0001_1.tif", "IMG_0001_2.tif"])
+def test_the_error_is_that_of_the_mapping_at_the_ties(tmp_path: Path, reference: str) -> None:
+    """Also if the ties have the second band as their reference, from which the first one is shifted by (3.3, 0.4)."""
+    whole = sidecar_of("IMG_0001", 1, (160, 120), raw=False).model_dump(mode="json", by_alias=True)
+    shift = geometry.translation(3.3, 0.4).tolist()
+    seed = {"kind": "rig", "fixed_to_moving": shift, "peak_sigma": 9.0, "runner_up_sigma": 3.0}
+    homography = {"fixed_to_moving": shift, "space": "pixel"}
+    joint = dict.fromkeys(("loss", "retrieval", "chance", "last_step_px"), 0.1) | {"iterations": 1, "levels": [1.0]}
+    joint |= {
+        "recipe": "fast",
+        "model_family": "homography",
+        "corner_std_px": 0.2,
+        "corner_std_xy_px": [[0.1, 0.1]] * 4,
+    }
+    first, aligned, predicted, failed = whole["bands"]
+    mapped = {"homography": homography, "seed": seed}
+    prediction = {"from": "flight", "std_px": 0.7, "off_px": None}
     bands = [
-        band | {"file": "a_2.tif", "joint": {"corner_std_px": 0.2}},
-        band
-        | {"file": "a_3.tif", "joint": None, "status": "predicted", "prediction": {"from": "flight", "std_px": 0.7}},
-        band | {"file": "a_4.tif", "joint": None, "status": "failed", "grid": None},
-        band | {"file": "not in the truth.tif", "joint": None},
+        aligned | mapped | {"joint": joint},
+        predicted | mapped | {"status": "predicted", "prediction": prediction},
+        failed | {"status": "failed"},
+        aligned | mapped | {"file": "not in the truth.tif", "band": "x"},
     ]
-    (tmp_path / "a.json").write_text(json.dumps({"schema": "agalign/1", "capture": "a", "bands": bands}))
-    entry = {"ties": [[10, 10, 13, 10], [50, 40, 53, 40]]}
-    truth = {"a": {"reference": "a_1.tif", "bands": {f"a_{k}.tif": entry for k in (2, 3, 4)}}}
+    (tmp_path / "a.json").write_text(json.dumps(whole | {"bands": [first, *bands]}))
+    at = np.array([[10.0, 10], [50, 40]])
+    in_reference = at + np.array((0.0, 0.0) if reference == first["file"] else (3.3, 0.4))
+    entry = {"ties": np.hstack([in_reference, at + np.array((3.0, 0.0))]).tolist()}
+    truth = {"a": {"reference": reference, "bands": {f"IMG_0001_{k}.tif": entry for k in (2, 3, 4)}}}
     (tmp_path / "ties.json").write_text(json.dumps(truth))
     result = band_errors(tmp_path, read_ties(tmp_path / "ties.json"))
-    assert [(b.file, b.status, b.source, b.std_px) for b in result] == [
-        ("a_2.tif", "aligned", "", 0.2),
-        ("a_3.tif", "predicted", "flight", 0.7),
+    assert [(b.file, b.status, b.is_usable, b.source, b.std_px) for b in result] == [
+        ("IMG_0001_2.tif", "aligned", True, "", 0.2),
+        ("IMG_0001_3.tif", "predicted", True, "flight", 0.7),
     ]
     np.testing.assert_allclose([(b.median_px, b.p95_px) for b in result], 0.5, atol=1e-5)
 

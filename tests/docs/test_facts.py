@@ -34,7 +34,8 @@ from .blocks import PAGES, ROOT, each_page, text_of
 PACKAGE = ROOT / "agalign"
 OPTIONS_OF_OTHERS = {
     *("--cpus", "--gpus", "--read-only", "--tmpfs", "--user"),  # docker run
-    *("--kinds", "--markdown", "--pairs", "--plot", "--ranges", "--scenes"),  # benchmarks
+    *("--degraded", "--grids", "--kinds", "--markdown", "--pairs", "--plot", "--ranges", "--scenes"),  # benchmarks
+    *("--size", "--stages"),
     *("--extra-index-url", "--strict"),  # pip, mypy
 }
 """Options in the text of pages that are not those of agalign."""

@@ -18,7 +18,7 @@ from agalign.errors import UnreadableFileError
 from agalign.pixels.raster import probe, with_saturation_values
 from agalign.products.sidecar.file import find_sidecars, read_result
 from agalign.values.capture import Band, Capture
-from agalign.values.quality import Quality
+from agalign.values.choices import Quality
 
 from ..cameras.test_vendors import packet, tagged
 from ..conftest import textured_image, write_band, write_capture

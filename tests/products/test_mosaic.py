@@ -17,8 +17,16 @@ from typing import Any
 import numpy as np
 import pytest
 import rasterio
-from synthetic_flights.aligned import make_aligned
-from synthetic_flights.overlapping import GPS_ERROR_M, GSD_M, LATITUDE, LENS, LONGITUDE, SIZE_PX, make_overlapping
+from synthetic_flights.aligned import (
+    GPS_ERROR_M,
+    GSD_M,
+    LATITUDE,
+    LENS,
+    LONGITUDE,
+    SIZE_PX,
+    make_aligned,
+    make_overlapping,
+)
 
 import agalign
 from agalign.pixels.raster import transformed

@@ -20,10 +20,10 @@ from agalign.products.run.captures import bands_of
 from agalign.products.sidecar.file import read_result
 from agalign.values import geometry, lens
 from agalign.values.capture import Band, Capture, Radiometry
+from agalign.values.choices import QUALITY_MEANINGS, UNUSABLE_QUALITY, Quality
 from agalign.values.image import OutputGrid
 from agalign.values.lens import Lens
 from agalign.values.mapping import PixelMapping
-from agalign.values.quality import MEANINGS, UNUSABLE, Quality
 
 from ..builders import joint_result, residual_of
 from ..conftest import read_json, seeded, write_band
@@ -76,8 +76,8 @@ def test_expected_errors_and_predictions_are_flagged_and_an_unknown_error_is_a_l
     assert (unknown & Quality.ERROR_OVER_1_PX > 0).all()
     failed = flags_of(Layer(layer.band, None))
     assert (failed == Quality.MISSING).all()
-    assert not UNUSABLE & Quality.PREDICTED
-    assert UNUSABLE & Quality.MISSING
+    assert not UNUSABLE_QUALITY & Quality.PREDICTED
+    assert UNUSABLE_QUALITY & Quality.MISSING
 
 
 def water(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
@@ -199,7 +199,9 @@ def test_a_run_writes_flags_with_their_meaning_for_every_band_of_the_stack(fligh
         assert raster.shape == stack.shape
         tags = raster.tags()
         masks = [int(m) for m in tags["flag_masks"].split(", ")]
-        assert tags["flag_meanings"].split() == MEANINGS.split() == [str(Quality(m).name).lower() for m in masks]
+        assert (
+            tags["flag_meanings"].split() == QUALITY_MEANINGS.split() == [str(Quality(m).name).lower() for m in masks]
+        )
         assert tags["SUN_GLINT"]
         flags, pixels = raster.read(), stack.read()
     assert np.array_equal(flags[0], np.bitwise_or.reduce(flags[1:]))

@@ -96,7 +96,7 @@ def test_the_exception_is_what_differs_from_most(run: Path, tmp_path: Path) -> N
 
 
 def test_a_mosaic_of_two_sources_names_both(tmp_path: Path) -> None:
-    from synthetic_flights.overlapping import make_overlapping
+    from synthetic_flights.aligned import make_overlapping
 
     make_overlapping(tmp_path / "run")
     for number, source in ((1, "panel"), (2, "light sensor")):

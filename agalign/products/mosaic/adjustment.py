@@ -25,10 +25,10 @@ from agalign.pixels.raster import without_warnings
 from agalign.products.mosaic.placement import Placement
 from agalign.products.run.captures import BandReader
 from agalign.values import geometry
-from agalign.values.cores import usable_cores
 from agalign.values.geometry import Points
 from agalign.values.image import Raster, Tile
 from agalign.values.least_squares import cauchy_weights, shift_scale_px
+from agalign.values.processes import usable_cores
 
 _INLIER_PX = 5.0
 """Maximum residual, px, of a tie point from the homography of its pair: relief moves points by some pixels."""

@@ -21,11 +21,11 @@ from agalign.products.rasters.layout import Layer, is_inside
 from agalign.values import geometry
 from agalign.values.alignment import Alignment
 from agalign.values.capture import Band, Capture, Radiometry
+from agalign.values.choices import QUALITY_MEANINGS, Quality
 from agalign.values.image import FloatImage, Mask, OutputGrid, Tile
 from agalign.values.interpolation import source_positions, tiles
 from agalign.values.parallax import Relief, rounded
 from agalign.values.pixel_units import FixedFilePx
-from agalign.values.quality import MEANINGS, Quality
 from agalign.verify.extrapolation import expected_error_px
 
 _LATTICE_PX = 16
@@ -108,7 +108,7 @@ class QualityRaster(Product):
         unknown = "not assessed: the reflectance of green and near infrared is not known"
         tags = {
             "flag_masks": ", ".join(str(int(flag)) for flag in Quality),
-            "flag_meanings": MEANINGS,
+            "flag_meanings": QUALITY_MEANINGS,
             "SUN_GLINT": method if water else unknown,
         }
         # The first layer has the flags that are set in any band.

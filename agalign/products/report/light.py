@@ -21,10 +21,10 @@ from agalign.products.report.charts import FlightChart, by_band
 from agalign.products.report.drawing import LEVEL_BLOCKS
 from agalign.products.sidecar.schema import Sidecar
 from agalign.values import geometry
-from agalign.values.cores import usable_cores
 from agalign.values.files import read_regular
 from agalign.values.image import Raster
 from agalign.values.pixel_units import PixelScale
+from agalign.values.processes import usable_cores
 
 _JUMP = 0.15
 """Ground seen from opposite sides differs by 9 % in the same light; cloud shadows change all bands by more."""

@@ -18,8 +18,8 @@ from agalign.errors import InputError, SidecarError
 from agalign.pixels.raster import OpenRaster, innermost_cause, open_raster
 from agalign.products.sidecar.file import read_result, run_sidecars
 from agalign.products.sidecar.schema import CaptureResult, is_usable
+from agalign.values.choices import UNUSABLE_QUALITY
 from agalign.values.image import FloatImage, Tile, reduced_size_px
-from agalign.values.quality import UNUSABLE
 
 RAW = "raw numbers"
 """Unit of bands that are neither reflectance nor radiance."""
@@ -119,7 +119,7 @@ class BandReader(ExitStack):
         if band.quality is not None:
             path, layer, _ = band.quality
             flags = _read(self.file(path, layer), layer, window).data.astype(np.uint16)
-            result[flags & np.uint16(UNUSABLE.value) != 0] = np.nan
+            result[flags & np.uint16(UNUSABLE_QUALITY.value) != 0] = np.nan
         return result
 
 

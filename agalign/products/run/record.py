@@ -16,8 +16,8 @@ from agalign.flight.groups import CameraOverview, camera_overviews
 from agalign.products.sidecar.schema import CaptureResult
 from agalign.products.text_files import read_model, write_model
 from agalign.values.capture import Capture
-from agalign.values.cores import usable_cores
 from agalign.values.files import RUN_FILE
+from agalign.values.processes import usable_cores
 from agalign.values.text import counted, escape_controls
 
 _LIBRARIES = ("torch", "numpy", "rasterio", "opencv-python-headless", "tifffile", "pydantic")

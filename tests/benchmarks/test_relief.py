@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import rasterio
 from peers import dis_flow
-from relief_score import Score, Sidecar, mapping_of, occlusion_scores, range_errors, residuals
+from relief import Score, Sidecar, mapping_of, occlusion_scores, range_errors, residuals
 from synthetic_flights.depth import BandTruth, Truth
 
 from agalign.pixels.raster import without_warnings

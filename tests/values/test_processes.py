@@ -10,8 +10,14 @@ from pathlib import Path
 import pytest
 
 from agalign.errors import MemoryLimitError, is_out_of_memory
-from agalign.values import cores
-from agalign.values.cores import cgroup_quota, check_address_space, check_threads, limit_default_threads, usable_cores
+from agalign.values import processes
+from agalign.values.processes import (
+    cgroup_quota,
+    check_address_space,
+    check_threads,
+    limit_default_threads,
+    usable_cores,
+)
 
 from ..conftest import raising
 from ..program import agalign_here
@@ -40,17 +46,17 @@ def test_quota_of_a_container(tmp_path: Path, groups: str, files: dict[str, str]
 
 @pytest.mark.parametrize(("quota", "expected"), [(None, 8), (2.5, 3), (0.2, 1), (64.0, 8)])
 def test_a_part_of_a_core_counts_as_one(monkeypatch: pytest.MonkeyPatch, quota: float | None, expected: int) -> None:
-    monkeypatch.setattr(cores.sys, "platform", "linux")
-    monkeypatch.setattr(cores.os, "sched_getaffinity", lambda _: set(range(8)), raising=False)
-    monkeypatch.setattr(cores, "cgroup_quota", lambda: quota)
+    monkeypatch.setattr(processes.sys, "platform", "linux")
+    monkeypatch.setattr(processes.os, "sched_getaffinity", lambda _: set(range(8)), raising=False)
+    monkeypatch.setattr(processes, "cgroup_quota", lambda: quota)
     assert usable_cores() == expected
 
 
 def test_threads_follow_a_quota_and_what_the_user_has_set_stays(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(cores.sys, "platform", "linux")
-    monkeypatch.setattr(cores, "cgroup_quota", lambda: 1.0)
+    monkeypatch.setattr(processes.sys, "platform", "linux")
+    monkeypatch.setattr(processes, "cgroup_quota", lambda: 1.0)
     variables = {"OMP_NUM_THREADS": "7"}
-    monkeypatch.setattr(cores.os, "environ", variables)
+    monkeypatch.setattr(processes.os, "environ", variables)
     limit_default_threads()
     assert variables == {"OMP_NUM_THREADS": "7", "OPENBLAS_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
 
@@ -78,7 +84,7 @@ def test_a_thread_reserves_no_heap_in_a_limited_address_space() -> None:
     program = """if True:
         import resource, threading
         from pathlib import Path
-        from agalign.values.cores import check_address_space
+        from agalign.values.processes import check_address_space
 
         def reserved_mb():
             return int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize() / 1e6

@@ -1,0 +1,144 @@
+"""Time of a run on one core, and of SIFT + RANSAC on the same images.
+
+    python benchmarks/speed.py FLIGHT... [--degraded]
+    python benchmarks/speed.py FLIGHT... --stages
+
+FLIGHT is a folder with captures. It is aligned without a model, which includes learning one, and again with the learned
+model; SIFT gets all band pairs of each capture. --degraded adds a table of degraded versions of the first capture of
+the first flight, each aligned without a model.
+
+--stages has the stages in seconds. SIFT on a pair, the imports, a run, and the same with the model that it learned are
+timed in turn, three times; the table has medians. "A capture" is one that no model was learned from or tested with, as
+most of a long flight; the fixed part is the time of the run minus that of as many such captures.
+"""
+
+import json
+import os
+import shutil
+import sys
+from collections import Counter
+from collections.abc import Sequence
+from pathlib import Path
+from statistics import mean, median
+from typing import Any
+
+import cv2
+import numpy as np
+from bands.images import in_other_light
+from common import Ending, command, ended, flight_and_out, print_head, print_row, read_band, run, timed, write_band
+from peers import sift
+
+from agalign.cameras.discover import discover
+from agalign.values.capture import Band, Capture
+
+ROUNDS, MAX_S = 3, 3600
+IMPORTS = "import torch, cv2, rasterio, scipy"
+DEGRADED = ("unchanged", "blur 3 px", "half saturated", "noise 30 %", "stale")
+"""`stale` is one band with the image of the next capture."""
+
+
+def sift_seconds(reference: Band, moving: Sequence[Band], features: int) -> float:
+    """Return the seconds of SIFT + RANSAC on the reference with each other band at full size."""
+    fixed, *others = (read_band(band.path, band.band_index) for band in (reference, *moving))
+    return sum(timed(sift, fixed, other, features)[0] for other in others)
+
+
+def run_alone(argv: list[str]) -> Ending:
+    """Run a command with one thread."""
+    return ended(argv, MAX_S, env=os.environ | {"OMP_NUM_THREADS": "1"})
+
+
+def events(log: str, name: str) -> list[dict[str, Any]]:
+    """Return the events of a kind in a log in JSON."""
+    every = [json.loads(line) for line in log.splitlines() if line.startswith("{")]
+    return [event for event in every if event["event"] == name]
+
+
+def learning_seconds(log: str) -> float:
+    return sum(event["seconds"] for event in events(log, "learnt"))
+
+
+def runs(flight: Path) -> list[Ending]:
+    """Run with one thread, and again with the model that the first run has learned, if any."""
+    with flight_and_out() as (again, out):
+        first = run_alone(command(flight, out, "-j", "1", "--log-json"))
+        with_model = [option for path in (out / "models").glob("*") for option in ("--model", str(path))]
+        return [first, run_alone(command(flight, again, "-j", "1", "--log-json", *with_model[:2]))]
+
+
+def print_flight(folder: Path, captures: list[Capture]) -> None:
+    """Print medians over the captures of a flight."""
+    without, with_model = (ending.errors for ending in runs(folder))
+    first_s, again_s = (median(e["seconds"] for e in events(log, "capture")) for log in (without, with_model))
+    sift_s = median(sift_seconds(c.reference, c.moving, 5000) for c in captures)
+    times_s = learning_seconds(without) / len(captures) + first_s, again_s, sift_s
+    aligned = "{aligned} of {pairs}".format(**events(with_model, "capture")[0])
+    cells = [f"{s:.1f}" for s in times_s] + [f"{s / sift_s:.2f}" for s in times_s[:2]]
+    print_row(folder.name, len(captures), aligned, *cells)
+
+
+def print_degraded(captures: list[Capture]) -> None:
+    """Print times of the first capture with the moving bands in each variant."""
+    print_head("variant", "aligned", "s", "times the unchanged one")
+    unchanged_s = 0.0
+    for name in DEGRADED if len(captures) > 1 else DEGRADED[:-1]:
+        rng = np.random.default_rng(0)
+        with flight_and_out() as (flight, out):
+            flight.mkdir()
+            for band in captures[0].bands:
+                shutil.copyfile(band.path, flight / band.path.name)
+            changed = {"unchanged": (), "stale": captures[0].moving[:1]}.get(name, captures[0].moving)
+            for band in changed:
+                source = captures[1].moving[0] if name == "stale" else band
+                pixels = read_band(source.path, source.band_index)
+                pixels = pixels if name == "stale" else in_other_light(pixels, name, rng)
+                write_band(flight / band.path.name, pixels, band.band_index)
+            log = run_alone(command(flight, out, "-j", "1", "--log-json")).errors
+        (capture,) = events(log, "capture")
+        seconds = learning_seconds(log) + capture["seconds"]
+        unchanged_s = unchanged_s or seconds
+        print_row(name, "{aligned} of {pairs}".format(**capture), f"{seconds:.1f}", f"{seconds / unchanged_s:.2f}")
+
+
+def print_stages(flight: Path, captures: list[Capture]) -> None:
+    middle = captures[len(captures) // 2]  # the first may show the sky or a panel
+    seconds: dict[str, list[float]] = {}
+    for _ in range(ROUNDS):
+        values = {"SIFT + RANSAC, a pair": sift_seconds(middle.reference, middle.moving[:1], 8000)}
+        values["imports of the libraries"] = run_alone([sys.executable, "-c", IMPORTS]).seconds
+        whole, again = runs(flight)
+        by_capture: dict[str, Counter[str]] = {}
+        for event in events(again.errors, "stage"):
+            by_capture.setdefault(event["capture"], Counter())[event["stage"]] += event["seconds"]
+        refined = [stages for stages in by_capture.values() if "refining" in stages] or list(by_capture.values())
+        stages = {name: mean(one[name] for one in refined) for name in {n for one in refined for n in one}}
+        capture_s = values["a capture"] = sum(stages.values())
+        values |= {f"- {name}": stages[name] for name in sorted(stages, key=lambda name: -stages[name])}
+        for name, run_s in (("a run", whole.seconds), ("a run with the model of an earlier flight", again.seconds)):
+            values |= {name: run_s, f"{name}: fixed part": run_s - capture_s * len(captures)}
+        for name, value in values.items():
+            seconds.setdefault(name, []).append(value)
+    print(f"{flight.name}: {len(captures)} captures, {sum(len(c.moving) for c in captures)} pairs")
+    print_head("", "seconds")
+    for name, some in seconds.items():
+        print_row(name, f"{median(some):.2f}")
+
+
+def main(flights: list[Path], *, stages: bool = False, degraded: bool = False) -> None:
+    cv2.setNumThreads(1)
+    captures = {flight: discover(flight).captures for flight in flights}
+    if stages:
+        for flight in flights:
+            print_stages(flight, captures[flight])
+        return
+    times = "without a model, s a capture", "with a model", "SIFT + RANSAC", "without / SIFT", "with / SIFT"
+    print_head("flight", "captures", "aligned in the first", *times)
+    for flight in flights:
+        print_flight(flight, captures[flight])
+    if degraded:
+        print(f"\nThe first capture of {flights[0].name}:\n", flush=True)
+        print_degraded(captures[flights[0]])
+
+
+if __name__ == "__main__":
+    run(main)
