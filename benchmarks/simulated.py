@@ -32,8 +32,8 @@ from synthetic_flights.cameras import ALTUM, ALTUM_PT, MAVIC, MAVIC_3M, SENTERA_
 from synthetic_flights.troubles import make_troubled_flight, make_two_headings
 
 from agalign.products.sidecar.file import find_sidecars, read_sidecar
-from agalign.synthetic.flight import make_flight
 from agalign.synthetic.cameras import REDEDGE, CameraSpec
+from agalign.synthetic.flight import make_flight
 from agalign.values import geometry
 
 
