@@ -121,7 +121,7 @@ def _changed_settings(run: RunPart | None) -> list[tuple[str, str]]:
         for stage, values in run.settings.items()
         if isinstance(values, dict)
         for name, value in values.items()
-        if value != defaults.get(stage, {}).get(name) and (stage, name) != ("flight", "start")
+        if value != defaults.get(stage, {}).get(name) and (stage, name) != ("flight", "start_model")
     ]
 
 
