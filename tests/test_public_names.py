@@ -69,17 +69,6 @@ def test_settings_print_values_other_than_defaults() -> None:
     assert repr(changed) == "Settings(write=WriteSettings(layout='both', stac=True))"
 
 
-def test_an_alignment_prints_one_short_line() -> None:
-    seed = agalign.Seed("identity", np.eye(3), 0.0)
-    mapping = PixelMapping(np.eye(3))
-    residual = residual_of(np.zeros((44, 2)), np.array([0.0512, 0.0]))
-    result = agalign.Alignment(mapping, (640, 480), "aligned", (), seed, residual=residual)
-    assert repr(result) == "Alignment(status='aligned', residual.median_px=0.0512)"
-    failed = agalign.Alignment(mapping, (640, 480), "failed", (Issue(BLANK_MOVING),), seed)
-    assert repr(failed).startswith("Alignment(status='failed', reason='")
-    assert "array" not in repr(failed)
-
-
 def test_names_in_the_text_of_an_alignment_are_attributes() -> None:
     residual, joint = residual_of(np.zeros((4, 2)), (0.3, 0.4)), joint_result(std_px=0.25)
     prediction = agalign.Prediction(np.eye(3), "windows", 0.4)

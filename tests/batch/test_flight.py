@@ -1,6 +1,5 @@
 import os
 import shutil
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -250,14 +249,6 @@ def test_a_model_is_learned_again_if_its_input_changed(flight: Path) -> None:
     elsewhere = agalign.Settings(flight=agalign.FlightSettings(start_model="another network"))
     assert len({learning_fingerprint(c, SETTINGS) for c in (captures, no_lens, other_reference)}) == 3
     assert learning_fingerprint(captures, elsewhere) != before
-
-
-@pytest.mark.full
-def test_any_executor_will_do(flight: Path, out_with_model: Path) -> None:
-    with ThreadPoolExecutor(1) as executor:
-        reports = agalign.align_folder(flight, out_with_model, settings=SETTINGS, run=RunOptions(executor=executor))
-    assert sorted(r.label for r in reports) == ["0000SET/000/IMG_0001", "0000SET/000/IMG_0002"]
-    assert [r.is_complete for r in reports] == [True, True]
 
 
 def test_one_broken_reference_stops_neither_learning_nor_the_others(flight: Path, tmp_path: Path) -> None:

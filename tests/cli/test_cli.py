@@ -11,8 +11,6 @@ from pathlib import Path
 import jsonschema
 import numpy as np
 import pytest
-import rasterio
-import tifffile
 from scipy.interpolate import CloughTocher2DInterpolator
 
 import agalign as agalign_package
@@ -39,22 +37,6 @@ def test_a_flight_is_aligned(flight: Path, aligned_flight: Path, name: str) -> N
         assert np.nanmedian(error) < 0.1
         assert band["homography"]["space"] == "undistorted"
         assert band["metrics"]["after"]["residual_px"] < 0.3
-
-
-def test_the_stack_agrees_with_the_sidecar(flight: Path, aligned_flight: Path) -> None:
-    folder = aligned_flight / "0000SET" / "000"
-    data = read_json(folder / "IMG_0001.json")
-    x0, y0, width, height = data["output"]["crop"]
-    with rasterio.open(folder / data["output"]["file"]) as stack:
-        assert stack.shape == (height, width)
-        assert stack.descriptions == ("Blue", "Green", "Red", "NIR", "Red edge")
-        assert set(stack.dtypes) == {"uint16"}
-        assert stack.crs is None
-        source = tifffile.imread(flight / "0000SET" / "000" / data["reference"]["file"])
-        np.testing.assert_array_equal(stack.read(2), source[y0 : y0 + height, x0 : x0 + width])
-        green, red = stack.read(2).astype(float), stack.read(3).astype(float)
-    assert np.corrcoef(green.ravel(), red.ravel())[0, 1] > 0.75
-    assert (folder / "IMG_0001.png").read_bytes()[:4] == b"\x89PNG"
 
 
 @pytest.fixture
@@ -88,15 +70,6 @@ def test_log_and_report_have_the_same_time_of_a_capture(aligned_flight: Path, al
     assert all(c["seconds"] > sum(b["seconds"] for b in c["bands"]) for c in reported)
 
 
-def test_a_second_run_keeps_finished_captures(flight: Path, aligned_copy: Path) -> None:
-    stack = aligned_copy / "0000SET" / "000" / "IMG_0001.tif"
-    before = stack.stat().st_mtime_ns
-    done = agalign_here(flight, "-o", aligned_copy)
-    assert done.returncode == 0
-    assert "kept from an earlier run" in done.stderr
-    assert stack.stat().st_mtime_ns == before
-
-
 def test_the_totals_name_captures_that_could_not_be_written(flight: Path, aligned_copy: Path) -> None:
     stack = aligned_copy / "0000SET" / "000" / "IMG_0002.tif"
     stack.unlink()
@@ -105,35 +78,6 @@ def test_the_totals_name_captures_that_could_not_be_written(flight: Path, aligne
     assert done.returncode == 3
     assert "1 of 2 captures could not be written, for the reasons above" in done.stderr
     assert "0 of 8 band pairs aligned; 1 capture not written" in done.stdout + done.stderr
-
-
-@pytest.mark.full
-def test_one_hopeless_band_does_not_stop_the_others(flight: Path, tmp_path: Path) -> None:
-    shutil.copytree(flight / "0000SET", tmp_path / "in")
-    images = tmp_path / "in" / "000"
-    for path in images.glob("IMG_0002_*"):
-        path.unlink()
-    noise = np.random.default_rng(0).integers(5000, 50000, (360, 480))
-    for index, pixels in ((1, np.full((360, 480), 5000)), (3, noise)):
-        path = images / f"IMG_0001_{index}.tif"
-        with tifffile.TiffFile(path) as tiff:
-            offset = tiff.pages[0].dataoffsets[0]
-        with path.open("r+b") as file:
-            file.seek(offset)
-            file.write(pixels.astype("<u2").tobytes())
-    done = agalign_here(tmp_path / "in", "-o", tmp_path / "out", "--relief", "never")
-    assert done.returncode == 3
-    data = read_json(tmp_path / "out" / "000" / "IMG_0001.json")
-    status = {b["band"]: b["status"] for b in data["bands"]}
-    assert data["status"] == "degraded"
-    assert status["Blue"] in ("failed", "seed_only")
-    assert status["Red"] in ("failed", "seed_only")
-    assert status["NIR"] == status["Red edge"] == "aligned"
-    assert "IMG_0001 Blue" in done.stderr
-    with rasterio.open(tmp_path / "out" / "000" / "IMG_0001.tif") as stack:
-        assert stack.count == 5
-        for index, name in enumerate(stack.descriptions, start=1):
-            assert stack.read_masks(index).any() == (status[name] != "failed")
 
 
 def write_pair(folder: Path) -> None:
@@ -184,7 +128,8 @@ def test_too_little_address_space_is_refused_before_libraries_are_loaded(tmp_pat
     limit = functools.partial(resource.setrlimit, resource.RLIMIT_AS, (1_200_000_000, 1_200_000_000))
     done = agalign(tmp_path, "-o", tmp_path / "out", preexec_fn=limit)
     assert done.returncode == 1
-    assert done.stderr.startswith("agalign: the address space of this process is limited to 1.20 GB")
+    limits = "is limited to 1.20 GB (ulimit -v); agalign needs 1.8 GB or more"
+    assert done.stderr.startswith(f"agalign: the address space of this process {limits}")
 
 
 def test_info_shows_the_rig_of_a_model(tmp_path: Path) -> None:

@@ -188,7 +188,7 @@ def test_the_table_has_a_row_per_capture_and_index(tmp_path: Path) -> None:
     assert len(read_table(target)) == 3
 
 
-@pytest.mark.parametrize("line", [",,", "," * 40 + "x", "a\0b", "1,2,3"])
+@pytest.mark.parametrize("line", [",,", "," * 40 + "x", "a\0b", "1,2,3", f"{'x' * 200_000},y"])
 def test_a_damaged_table_is_written_again(tmp_path: Path, line: str) -> None:
     statistics = IndexStatistics(masked_share=0.25)
     update_table(tmp_path, [IndexReport("IMG_0001", "ndvi", None, statistics, "left out")])

@@ -484,24 +484,6 @@ def kill_capture(process: "subprocess.Popen[str]", scene: Scene) -> None:
         worker.kill()
 
 
-def kill_workers_as_they_appear(process: "subprocess.Popen[str]", scene: Scene) -> None:
-    wait_for_reports(process, scene)
-    while process.poll() is None:
-        kill_all_workers(process, scene)
-        time.sleep(0.005)
-
-
-def kill_all_workers(process: "subprocess.Popen[str]", _scene: Scene) -> None:
-    for worker in workers(process):
-        with contextlib.suppress(psutil.NoSuchProcess):
-            worker.kill()
-
-
-def kill_server(process: "subprocess.Popen[str]", _scene: Scene) -> None:
-    """The process that starts the workers."""
-    psutil.Process(workers(process)[0].ppid()).kill()
-
-
 def workers(process: "subprocess.Popen[str]") -> list[psutil.Process]:
     try:
         return [c for c in psutil.Process(process.pid).children(recursive=True) if c.ppid() != process.pid]
@@ -776,18 +758,10 @@ OTHERS = {
     "symlinks that lead in a circle": (loops, Ends(3, "b_nir2.tif: cannot be read", "a")),
     "the disk full": (full_disk, Ends(3, "the disk is full|cannot be written", "a")),
     "a worker killed by SIGKILL": (when_begun(kill_worker, "-j", "2", "--timeout", "100"), Ends(0, "", ALL)),
-    "both workers killed by SIGKILL": (when_begun(kill_all_workers, "-j", "2"), Ends(0, "", ALL)),
     "a worker killed twice at one capture": (
         both(when_begun(kill_capture, "-j", "1", "--timeout", "100"), larger),
         Ends(3, r"its worker process was killed \(signal 9; ", "", 1),
     ),
-    "each worker killed as it appears": (
-        when_begun(kill_workers_as_they_appear, "-j", "2"),
-        Ends(
-            3, r"^3 worker processes one after another ended before they finished anything \(the last by signal 9", ""
-        ),
-    ),
-    "the process that starts workers killed": (when_begun(kill_server, "-j", "2"), Ends(0, "", ALL)),
     "memory short in the workers": (
         both(when_begun(starve_workers, "-j", "2", "--timeout", "100"), larger),
         Ends(3, "out of memory|killed", ""),
@@ -836,13 +810,10 @@ FULL = {
     "a sidecar without permission, for the report",
     "a folder without permission",
     "an output that may not be written",
-    "each worker killed as it appears",
-    "the process that starts workers killed",
     "a capture that never ends",
     "SIGTERM",
     "names of every kind",
     "standard error that is not read",
-    "both workers killed by SIGKILL",
     "a worker killed twice at one capture",
     "memory short in the workers",
     "the interrupt key while workers start",
