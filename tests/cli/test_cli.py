@@ -70,16 +70,6 @@ def test_log_and_report_have_the_same_time_of_a_capture(aligned_flight: Path, al
     assert all(c["seconds"] > sum(b["seconds"] for b in c["bands"]) for c in reported)
 
 
-def test_the_totals_name_captures_that_could_not_be_written(flight: Path, aligned_copy: Path) -> None:
-    stack = aligned_copy / "0000SET" / "000" / "IMG_0002.tif"
-    stack.unlink()
-    stack.mkdir()
-    done = agalign_here(flight, "-o", aligned_copy, "--only-seed")
-    assert done.returncode == 3
-    assert "1 of 2 captures could not be written, for the reasons above" in done.stderr
-    assert "0 of 8 band pairs aligned; 1 capture not written" in done.stdout + done.stderr
-
-
 def write_pair(folder: Path) -> None:
     image = textured_image(300, 240, 1)
     for name, pixels in (("green", image), ("nir", -image)):

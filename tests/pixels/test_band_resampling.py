@@ -4,7 +4,6 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-import tifffile
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
@@ -136,14 +135,6 @@ def test_the_common_area_is_inside_every_band() -> None:
     assert area.y0 + area.height <= 143
     assert area.width * area.height > 0.9 * 183 * 143
     assert common_area(away, 200, 150) is None
-
-
-def test_the_source_file_is_read_once_as_it_is(tmp_path: Path) -> None:
-    pixels = (np.random.default_rng(0).random((60, 80)) * 60000).astype(np.uint16)
-    band = band_of(tmp_path / "b.tif", pixels)
-    got, valid = resample_tile(band, PixelMapping(np.eye(3)), Tile(0, 0, 80, 60), "lanczos")
-    np.testing.assert_array_equal(got, tifffile.imread(tmp_path / "b.tif"))
-    assert valid.all()
 
 
 def test_the_moving_image_is_warped_to_the_fixed_grid() -> None:

@@ -1,8 +1,8 @@
 """Faults of cards, disks, machines and files, and the results that the program must have.
 
 Each fault is done to a small flight of two good captures, `a` and `b`, and the program is run on it. `python -m
-tests.reliability.faults` prints the result of each fault, and with `--markdown docs/reliability.md` writes those of
-`IN_THE_DOCUMENT` to that page. test_faults.py compares the result of each fault with the expected one.
+tests.reliability.faults` prints the result of each fault, and with `--markdown docs/reliability.md` updates the table
+of that page. test_faults.py compares the result of each fault with the expected one.
 """
 
 import contextlib
@@ -37,6 +37,7 @@ from agalign.values.files import RUN_FILE
 from ..conftest import textured_pair
 from ..program import agalign_here
 
+DOCUMENT = Path(__file__).resolve().parents[2] / "docs" / "reliability.md"
 SHIFT = np.array([[1, 0, 6.0], [0, 1, -4.0], [0, 0, 1]])
 SIZE_PX = 320, 240
 ALL = "abcdefghijkl"
@@ -824,21 +825,6 @@ FULL = {
     "JSON lines that are not read",
 }
 """Only in the full tests: these take long, and others are like them."""
-IN_THE_DOCUMENT = {
-    "a TIFF cut short",
-    "no bytes at all",
-    "a file without permission",
-    "a text named .tif",
-    "a sparse image of 100,000 x 100,000",
-    "another run in the same output",
-    "the disk full",
-    "a worker killed twice at one capture",
-    "memory short in the workers",
-    "a capture that never ends",
-    "the interrupt key",
-    "SIGTERM",
-}
-"""The faults that users meet most."""
 FAULTS = (
     *(Fault(name, inject, Ends(0, "", "ab")) for name, inject in ALL_FINISHED.items()),
     *(Fault(name, inject, Ends(3, says)) for name, (inject, says) in B_IS_LOST.items()),
@@ -848,19 +834,28 @@ FAULTS = (
 )
 
 
+def documented() -> dict[str, str]:
+    """{fault: exit code} in the table of the most common faults."""
+    section = (
+        DOCUMENT.read_text(encoding="utf-8").partition("<!-- faults -->")[2].partition("<!-- end of faults -->")[0]
+    )
+    rows = [line.removeprefix("| ").split(" | ") for line in section.splitlines() if line.startswith("| ")][2:]
+    return {name: code for name, code, *_ in rows}
+
+
 def main() -> None:
     """Print the result of each fault, and write the table of docs/reliability.md."""
     sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "benchmarks"))
     from common import Section
 
     document = Path(sys.argv[2]) if sys.argv[1:2] == ["--markdown"] else None
-    rows = [("fault", "exit code", "first message, without the remedy")]
+    rows, reported = [("fault", "exit code", "first message, without the remedy")], documented()
     failed = []
     for fault in FAULTS:
         with tempfile.TemporaryDirectory() as folder:
             seen = run_fault(fault, Path(folder))
             row = (fault.name, str(seen.code), first_complaint(seen, Path(folder)))
-        if fault.name in IN_THE_DOCUMENT:
+        if fault.name in reported:
             rows.append(row)
         wrong = what_is_wrong(fault, seen)
         failed += [f"{fault.name}: {wrong}"] if wrong else []
