@@ -2,7 +2,6 @@
 
 import hashlib
 import shutil
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -40,16 +39,6 @@ def contents(folder: Path) -> dict[str, str]:
     return {str(p): hashlib.sha256(p.read_bytes()).hexdigest() for p in folder.rglob("*") if p.is_file()}
 
 
-def changed_copy(flight: Path, folder: Path, before: bytes, after: bytes) -> Path:
-    """A copy of a flight with other tags of the same length."""
-    shutil.copytree(flight, folder)
-    for path in folder.rglob("*.tif"):
-        data = path.read_bytes()
-        assert before in data
-        path.write_bytes(data.replace(before, after))
-    return folder
-
-
 @pytest.mark.parametrize(
     ("before", "after", "named"),
     [
@@ -62,12 +51,9 @@ def test_another_capture_of_the_same_name_is_refused_before_anything_is_written(
     flight: Path, out: Path, tmp_path: Path, before: bytes, after: bytes, named: str
 ) -> None:
     other = tmp_path / "other"
-    if b"synthetic" in before:
-        shutil.copytree(flight, other)
-        for path in other.rglob("IMG_0001_*.tif"):
-            path.write_bytes(path.read_bytes().replace(before, after))
-    else:
-        changed_copy(flight, other, before, after)
+    shutil.copytree(flight, other)
+    for path in other.rglob("*.tif"):
+        path.write_bytes(path.read_bytes().replace(before, after))
     unchanged = contents(out)
     for options in ((), ("--dry-run",), ("--overwrite",), ("--align-panels", "--crop", "none")):
         done = agalign_here(other, "-o", out, "--only-seed", *options)
@@ -227,24 +213,17 @@ def test_a_sidecar_removes_no_file_but_those_of_its_capture(flight: Path, tmp_pa
 # ---- outputs that are removed during the run
 
 
-def removing(out: Path) -> Callable[[agalign.CaptureReport], object]:
-    """Remove the files of the first capture when the second is reported."""
-
-    def each(report: agalign.CaptureReport) -> None:
-        if report.label.endswith("2"):
-            for path in out.rglob("IMG_0001*"):
-                path.unlink()
-
-    return each
-
-
 def test_outputs_removed_during_the_run_are_reported_and_not_counted(
     flight: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    terminal = Terminal()
-    scan = agalign.discover(flight, THREE)
-    settings, options = agalign.Settings(), agalign.RunOptions()
-    totals = run_command(scan, tmp_path, settings, terminal, options, each=removing(tmp_path))
+    def remove(report: agalign.CaptureReport) -> None:
+        """Remove the files of the first capture when the second is reported."""
+        if report.label.endswith("2"):
+            for path in tmp_path.rglob("IMG_0001*"):
+                path.unlink()
+
+    terminal, scan = Terminal(), agalign.discover(flight, THREE)
+    totals = run_command(scan, tmp_path, agalign.Settings(), terminal, agalign.RunOptions(), each=remove)
     assert conclude(totals, tmp_path, terminal) == ExitCode.PARTIAL
     printed = capsys.readouterr()
     removed = f"{tmp_path}: outputs of 1 capture were removed during the run, such as of 0000SET/000/IMG_0001"

@@ -19,12 +19,6 @@ matrices = st.builds(
 points = np.array([[0.0, 0.0], [100.0, 0.0], [37.5, 80.0], [120.0, 90.0]])
 
 
-@given(matrices, matrices)
-def test_compose_applies_the_last_first(one: np.ndarray, other: np.ndarray) -> None:
-    expected = geometry.apply(one, geometry.apply(other, points))
-    assert_allclose(geometry.apply(geometry.compose(one, other), points), expected, atol=1e-6)
-
-
 @pytest.mark.parametrize("bad", [np.zeros((3, 3)), np.eye(2), np.full((3, 3), np.nan), np.diag([1.0, 1.0, 0.0])])
 def test_other_matrices_than_homographies_are_refused(bad: np.ndarray) -> None:
     with pytest.raises(GeometryError):
