@@ -110,7 +110,6 @@ def test_a_gpu_gives_the_result_of_the_cpu(gpu: GPU, recipe: Recipe, has_float64
 
 
 @pytest.mark.full
-@pytest.mark.slow
 def test_a_flight_on_a_gpu_has_the_result_of_the_cpu(gpu: GPU, flight: Path, tmp_path: Path) -> None:
     """Learning, the model file, keypoint matching and refinement with the frozen network."""
     captures = discover(flight, DiscoverOptions(bands=("Green", "NIR"))).captures

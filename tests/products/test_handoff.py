@@ -74,7 +74,6 @@ def test_its_reflectance_is_that_of_this_program(program: ExportProgram, shared:
 
 
 @pytest.mark.full
-@pytest.mark.slow
 def test_vignetting_follows_pixels_without_distortion(shared: Shared, tmp_path: Path) -> None:
     photos = exported(shared, tmp_path, undistort=True)
     assert all(p.vignetting[1] for p in photos)

@@ -381,7 +381,6 @@ def test_a_run_without_a_map_names_what_is_missing(tmp_path: Path) -> None:
 
 
 @pytest.mark.real
-@pytest.mark.slow
 @pytest.mark.full
 def test_a_real_strip_has_a_fifth_of_the_misfit(real_data: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"

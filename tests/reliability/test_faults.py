@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from ..conftest import Shared
-from .faults import DOCUMENT, FAULTS, FULL, Fault, documented, make_model, run_fault, what_is_wrong
+from .faults import DOCUMENT, FAULTS, Fault, documented, make_model, run_fault, what_is_wrong
 
 pytestmark = pytest.mark.slow
 
@@ -17,7 +17,7 @@ def model(shared: Shared) -> Path:
 
 
 @pytest.mark.parametrize(
-    "fault", [pytest.param(f, id=f.name, marks=[pytest.mark.full] if f.name in FULL else []) for f in FAULTS]
+    "fault", [pytest.param(f, id=f.name, marks=[pytest.mark.full] if f.is_in_full_run else []) for f in FAULTS]
 )
 def test_fault(fault: Fault, model: Path, tmp_path: Path) -> None:
     seen = run_fault(fault, tmp_path, model)
