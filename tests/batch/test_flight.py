@@ -25,7 +25,6 @@ from agalign.flight.rig_prediction import extreme_mappings
 from agalign.method import joint as method_joint
 from agalign.method import state as method_state
 from agalign.method.fast import Schedule, learn
-from agalign.products.report import preview
 from agalign.products.run.record import read_run_record
 from agalign.products.sidecar.file import find_sidecars, read_result, read_sidecar
 from agalign.synthetic.flight import make_flight
@@ -205,16 +204,17 @@ def test_the_crop_of_a_new_flight_depends_on_a_finished_one(
     monkeypatch.setattr(batch_run._FlightRun, "earlier", read)
     monkeypatch.setattr(batch_run, "outputs_exist", lambda *_: True)
     monkeypatch.setattr(batch_run, "learn_flight", lambda *_, **__: None)
-    limits: list[Any] = []
+    crops: list[Any] = []
 
     def process(*arguments: Any) -> CaptureReport:
-        limits.append(arguments[-2])
+        crops.append(arguments[-2:])
         return CaptureReport(arguments[0].label, "done", earlier)
 
     monkeypatch.setattr(batch_capture, "process_capture", process)
     # The finished capture has a grid of its own, as without a rig: it gets that of the camera.
     assert states(list(run_flight(FolderScan(flight, captures, ()), tmp_path, SETTINGS))) == ["done", "done"]
-    assert [{band.name for _, band in of_capture} for of_capture in limits] == [{"NIR"}] * 2
+    assert [{band.name for _, band in limits} for limits, _ in crops] == [{"NIR"}] * 2
+    assert len({grid for _, grid in crops} - {None}) == 1
 
 
 def test_radiometry_that_no_capture_has_tags_for_is_refused(flight: Path, tmp_path: Path) -> None:
@@ -305,18 +305,6 @@ def test_one_run_at_a_time(flight: Path, tmp_path: Path) -> None:
     assert record.state == "interrupted"
     assert "kept" in states(run(flight, tmp_path, seeded()))
     assert not list(tmp_path.rglob(".agalign*"))
-
-
-@pytest.mark.full
-def test_a_failed_picture_is_only_reported(flight: Path, out_with_model: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(preview, "write_picture", raising(agalign.OutputError("a.png: cannot be written")))
-    for report in run(flight, out_with_model):
-        assert report.failed_products == ("a.png: cannot be written",)
-        assert not report.is_complete
-        assert (report.result.status, report.result.not_written) == ("ok", ["picture"])
-    monkeypatch.undo()
-    assert [(r.state, r.failed_products) for r in run(flight, out_with_model)] == [("done", ())] * 2
-    assert len(list(out_with_model.rglob("*.png"))) == 2
 
 
 @pytest.mark.full
