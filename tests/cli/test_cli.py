@@ -45,7 +45,8 @@ def aligned_copy(aligned_flight: Path, tmp_path: Path) -> Path:
     return shutil.copytree(aligned_flight, tmp_path / "out")
 
 
-def test_summary_and_report(aligned_copy: Path) -> None:
+def test_summary_report_and_log(aligned_flight: Path, aligned_copy: Path) -> None:
+    """The command `report` writes the page of the run again; all have the same time of a capture."""
     rows = list(csv.DictReader((aligned_copy / "summary.csv").read_text().splitlines()))
     assert [r["status"] for r in rows] == ["aligned"] * 8
     assert all(float(r["mattes_mi_after"]) < float(r["mattes_mi_before"]) for r in rows)
@@ -53,16 +54,12 @@ def test_summary_and_report(aligned_copy: Path) -> None:
     assert "8 of 8" in before
     assert '"picture":"0000SET/000/IMG_0001.png"' in before
     (aligned_copy / "index.html").unlink()
-    assert agalign_here("report", aligned_copy).returncode == 0
+    done = agalign_here("report", aligned_copy, "--json")
+    assert done.returncode == 0
     assert (aligned_copy / "index.html").read_text() == before
-
-
-def test_log_and_report_have_the_same_time_of_a_capture(aligned_flight: Path, aligned_copy: Path) -> None:
     events = [json.loads(line) for line in (aligned_flight.parent / "log.jsonl").read_text().splitlines()]
     assert [e["event"] for e in events].count("pair") == 8
     assert events[-1]["event"] == "finished"
-    done = agalign_here("report", aligned_copy, "--json")
-    assert done.returncode == 0
     reported = json.loads(done.stdout)["captures"]
     seconds = {e["capture"]: e["seconds"] for e in events if e["event"] == "capture"}
     assert {c["label"]: c["seconds"] for c in reported} == seconds

@@ -99,13 +99,6 @@ def test_undistort_inverts_distort() -> None:
     assert_allclose(lens.distort(MODEL, lens.undistort(MODEL, POINTS)), POINTS, atol=1e-5)
 
 
-def test_shapes_are_kept_and_no_lens_is_the_identity() -> None:
-    grid = POINTS.reshape(10, 20, 2)
-    assert lens.undistort(MODEL, grid).shape == grid.shape
-    assert_allclose(lens.undistort(None, grid), grid)
-    assert_allclose(lens.distort(Lens(1000, 1000, 5, 5), grid), grid)
-
-
 def test_a_resized_image_has_a_resized_lens() -> None:
     scale = PixelScale(0.5, 0.25)
     small = lens.rescaled(MODEL, scale)
