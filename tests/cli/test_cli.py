@@ -11,6 +11,8 @@ from pathlib import Path
 import jsonschema
 import numpy as np
 import pytest
+import rasterio
+import tifffile
 from scipy.interpolate import CloughTocher2DInterpolator
 
 import agalign as agalign_package
@@ -65,6 +67,35 @@ def test_summary_report_and_log(aligned_flight: Path, aligned_copy: Path) -> Non
     assert {c["label"]: c["seconds"] for c in reported} == seconds
     assert len(seconds) == 2
     assert all(c["seconds"] > sum(b["seconds"] for b in c["bands"]) for c in reported)
+
+
+@pytest.mark.full
+def test_one_hopeless_band_does_not_stop_the_others(flight: Path, tmp_path: Path) -> None:
+    shutil.copytree(flight / "0000SET", tmp_path / "in")
+    images = tmp_path / "in" / "000"
+    for path in images.glob("IMG_0002_*"):
+        path.unlink()
+    noise = np.random.default_rng(0).integers(5000, 50000, (360, 480))
+    for index, pixels in ((1, np.full((360, 480), 5000)), (3, noise)):
+        path = images / f"IMG_0001_{index}.tif"
+        with tifffile.TiffFile(path) as tiff:
+            offset = tiff.pages[0].dataoffsets[0]
+        with path.open("r+b") as file:
+            file.seek(offset)
+            file.write(pixels.astype("<u2").tobytes())
+    done = agalign_here(tmp_path / "in", "-o", tmp_path / "out", "--relief", "never")
+    assert done.returncode == 3
+    data = read_json(tmp_path / "out" / "000" / "IMG_0001.json")
+    status = {b["band"]: b["status"] for b in data["bands"]}
+    assert data["status"] == "degraded"
+    assert status["Blue"] in ("failed", "seed_only")
+    assert status["Red"] in ("failed", "seed_only")
+    assert status["NIR"] == status["Red edge"] == "aligned"
+    assert "IMG_0001 Blue" in done.stderr
+    with rasterio.open(tmp_path / "out" / "000" / "IMG_0001.tif") as stack:
+        assert stack.count == 5
+        for index, name in enumerate(stack.descriptions, start=1):
+            assert stack.read_masks(index).any() == (status[name] != "failed")
 
 
 def write_pair(folder: Path) -> None:
