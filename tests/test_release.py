@@ -58,7 +58,6 @@ main()
 
 
 @pytest.mark.full
-@pytest.mark.slow
 def test_every_text_is_read_and_written_in_an_encoding_that_is_said(flight: Path, tmp_path: Path) -> None:
     """Where none is said it is the system's, which on Windows is not UTF-8."""
     options = ["--only-seed", "--layout", "both", "--error-map", "--stac"]
@@ -70,7 +69,6 @@ def test_every_text_is_read_and_written_in_an_encoding_that_is_said(flight: Path
 
 
 @pytest.mark.full
-@pytest.mark.slow
 def test_processes_that_start_from_nothing(flight: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """As on Windows and macOS: they do not share the memory of this process."""
     monkeypatch.setattr(processes, "get_all_start_methods", lambda: ["spawn"])

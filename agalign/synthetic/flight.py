@@ -231,6 +231,8 @@ def score_against_truth(out: Path, truth_path: Path) -> list[Score]:
     scores = []
     for path in find_sidecars(out):
         sidecar, label = read_sidecar(path), path.relative_to(out).with_suffix("").as_posix()
+        if sidecar.capture not in truth:  # of an earlier demo with more captures in the same folder
+            continue
         for band in sidecar.bands:
             known = truth[sidecar.capture]["bands"].get(band.file)
             if known is None or band.grid is None:

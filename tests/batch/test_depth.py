@@ -16,7 +16,7 @@ from agalign.flight.model import load_model
 
 from ..products.test_relief_map import assert_same_as_stack
 
-pytestmark = [pytest.mark.slow, pytest.mark.full]
+pytestmark = pytest.mark.full
 
 SIZE = 480, 360
 CAPTURES = 4

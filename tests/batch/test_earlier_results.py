@@ -17,7 +17,6 @@ from agalign.cli.align_run import RunTotals, conclude
 from agalign.cli.align_run import run as run_command
 from agalign.cli.terminal import ExitCode, Terminal
 from agalign.products.sidecar.file import find_sidecars, read_result
-from agalign.synthetic.flight import make_flight
 from agalign.values.image import OutputGrid
 
 from ..conftest import Shared, save_known_model, seeded, textured_image, write_band, write_capture
@@ -40,16 +39,6 @@ def contents(folder: Path) -> dict[str, str]:
     return {str(p): hashlib.sha256(p.read_bytes()).hexdigest() for p in folder.rglob("*") if p.is_file()}
 
 
-def changed_copy(flight: Path, folder: Path, before: bytes, after: bytes) -> Path:
-    """A copy of a flight with other tags of the same length."""
-    shutil.copytree(flight, folder)
-    for path in folder.rglob("*.tif"):
-        data = path.read_bytes()
-        assert before in data
-        path.write_bytes(data.replace(before, after))
-    return folder
-
-
 @pytest.mark.parametrize(
     ("before", "after", "named"),
     [
@@ -62,12 +51,9 @@ def test_another_capture_of_the_same_name_is_refused_before_anything_is_written(
     flight: Path, out: Path, tmp_path: Path, before: bytes, after: bytes, named: str
 ) -> None:
     other = tmp_path / "other"
-    if b"synthetic" in before:
-        shutil.copytree(flight, other)
-        for path in other.rglob("IMG_0001_*.tif"):
-            path.write_bytes(path.read_bytes().replace(before, after))
-    else:
-        changed_copy(flight, other, before, after)
+    shutil.copytree(flight, other)
+    for path in other.rglob("*.tif"):
+        path.write_bytes(path.read_bytes().replace(before, after))
     unchanged = contents(out)
     for options in ((), ("--dry-run",), ("--overwrite",), ("--align-panels", "--crop", "none")):
         done = agalign_here(other, "-o", out, "--only-seed", *options)
@@ -150,28 +136,12 @@ def test_captures_with_other_options_are_done_again_and_this_is_printed_before(f
     assert "1 finished capture to be done again; changed since: version (agalign 0.0.9 before)" in done.stderr
 
 
-def aligned_in_part(flight: Path, out: Path, later: str, **options: Any) -> None:
-    """Align a flight before the captures with these numbers are added to it."""
-    ignore = shutil.ignore_patterns(f"IMG_000[{later}]_*.tif")
-    agalign.align_folder(shutil.copytree(flight, out.parent / "part", ignore=ignore), out, **options)
-
-
 def test_a_flight_that_grows_needs_no_option(flight: Path, tmp_path: Path) -> None:
-    aligned_in_part(flight, tmp_path / "out", "2", settings=SEEDS)
+    part = shutil.copytree(flight, tmp_path / "part", ignore=shutil.ignore_patterns("IMG_0002_*.tif"))
+    agalign.align_folder(part, tmp_path / "out", settings=SEEDS)
     scan = agalign.discover(flight)
     assert [*plan_run(scan, tmp_path / "out", SEEDS).values()] == ["kept from an earlier run", "to be aligned"]
     assert [r.state for r in agalign.align_folder(flight, tmp_path / "out", settings=SEEDS)] == ["kept", "done"]
-
-
-@pytest.mark.full
-def test_all_captures_of_a_grown_flight_have_one_size(shared: Shared, tmp_path: Path) -> None:
-    """Two captures are too few for a rig, with which the crop of all captures is known."""
-    pytest.importorskip("xarray")
-    flight = shared("four_captures", lambda f: make_flight(f, captures=4, size_px=(480, 360), rng_seed=3))
-    aligned_in_part(flight, tmp_path / "out", "34", options=THREE)
-    agalign.align_folder(flight, tmp_path / "out", options=THREE)
-    assert agalign.open_flight(tmp_path / "out").sizes["capture"] == 4
-    assert {r.state for r in agalign.align_folder(flight, tmp_path / "out", options=THREE)} == {"kept"}
 
 
 def test_most_finished_captures_decide_on_the_crop_of_a_camera(flight: Path, tmp_path: Path) -> None:

@@ -14,7 +14,7 @@ from agalign.synthetic.flight import Shot, write_shots
 from agalign.synthetic.ground import paint_ground
 from agalign.values import geometry
 
-pytestmark = [pytest.mark.slow, pytest.mark.full]
+pytestmark = pytest.mark.full
 
 CAMERAS = {
     "RedEdge": REDEDGE,

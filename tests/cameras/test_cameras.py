@@ -148,12 +148,7 @@ def test_an_alpha_band_that_is_not_the_last_shifts_no_index(tmp_path: Path) -> N
 def test_thermal_bands_count_in_hundredths_of_a_kelvin(tmp_path: Path) -> None:
     path = tmp_path / "IMG_0001_6.tif"
     tifffile.imwrite(path, np.zeros((48, 64), np.uint16), photometric="minisblack", metadata=None)
-    tags = Tags(
-        make="MicaSense",
-        model="Altum",
-        xmp={(NAMESPACE, "BandName"): ("LWIR",), (NAMESPACE, "CentralWavelength"): ("11000",)},
-    )
-    (band,) = MicaSense().bands(path, tags, probe(path))
+    (band,) = MicaSense().bands(path, tags(BandName="LWIR", CentralWavelength="11000"), probe(path))
     assert (band.radiometry.quantity, band.radiometry.gain) == ("temperature", 0.01)
 
 
@@ -175,7 +170,7 @@ def test_thermal_bands_count_in_hundredths_of_a_kelvin(tmp_path: Path) -> None:
 )
 def test_panels_as_firmware_writes_them(values: dict[str, str], expected: tuple[float | None, int] | None) -> None:
     """None: not a panel."""
-    result = panel_in(Tags(xmp={(NAMESPACE, k): (v,) for k, v in values.items()}), (64, 48))
+    result = panel_in(tags(**values), (64, 48))
     assert (result and (result.albedo, len(result.corners_px))) == expected
 
 

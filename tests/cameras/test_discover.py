@@ -60,16 +60,6 @@ def test_a_micasense_flight(flight: Path) -> None:
     assert all(b.lens is None and b.to_rig is None for c in without.captures for b in c.bands)
 
 
-def test_missing_bands_and_unreadable_files_are_reported(images: Path) -> None:
-    (images / "IMG_0002_3.tif").unlink()
-    (images / "IMG_0002_5.tif").write_bytes(b"II*\0 cut short")
-    result = discover(images)
-    assert [set(c.missing_bands) for c in result.captures] == [set(), {"Red", "Red edge"}]
-    (problem,) = result.problems
-    assert problem.text.startswith(f"{problem.path}: ")
-    assert problem.path.name == "IMG_0002_5.tif"
-
-
 COPIES = (
     *("{} - Copy", "{} - Copy (2)", "{} - Kopie", "{} \N{EN DASH} copie", "{} - コピー", "{} copy", "{} copy 2"),
     *("{} (1)", "{}(1)", "{} (copy)", "Copy of {}", "Kopie von {}", "{} 2"),
@@ -122,12 +112,6 @@ def test_a_copy_is_used_where_its_original_is_missing_or_unreadable(images: Path
     assert found(images) == before
 
 
-def test_files_of_other_names_and_equal_bytes_are_no_copies(tmp_path: Path) -> None:
-    """Two sensors that are covered record the same."""
-    write_all(tmp_path, "IMG_1_1", "IMG_1_10", "field_red", "field_red_edge")
-    assert found(tmp_path) == {"IMG_1": ["1", "10"], "field": ["red", "red_edge"]}
-
-
 def test_the_overview_of_a_camera_is_that_of_most_captures() -> None:
     """The first one lacks green, and has a band that the others lack."""
     first = replace(capture("first", "RM01", ("Blue", "Red", "Blue-2")), reference_index=0)
@@ -137,18 +121,29 @@ def test_the_overview_of_a_camera_is_that_of_most_captures() -> None:
     assert (set(overview.bands), overview.size_px) == (set(RED), (64, 48))
 
 
-def test_one_file_a_band(tmp_path: Path) -> None:
-    write_all(tmp_path, "north_red", "north_nir", "north_green", "south_red", "south_nir")
-    assert [c.reference.name for c in discover(tmp_path).captures] == ["green", "nir"]
-    assert found(tmp_path) == {"north": ["green", "nir", "red"], "south": ["nir", "red"]}
-    write_all(tmp_path / "numbers", "IMG_0001_10", "IMG_0001_1", "IMG_0001_2")
-    (capture,) = discover(tmp_path / "numbers").captures
-    assert [b.path.name for b in capture.bands] == ["IMG_0001_1.tif", "IMG_0001_2.tif", "IMG_0001_10.tif"]
+@pytest.mark.parametrize(
+    ("names", "pattern", "expected"),
+    [
+        ("north_red north_nir north_green", None, {"north": ["green", "nir", "red"]}),
+        ("north_red north_nir south_red south_nir", None, {"north": ["nir", "red"], "south": ["nir", "red"]}),
+        ("I_1_10 I_1_1 I_1_2", None, {"I_1": ["1", "2", "10"]}),
+        # Files of other names and equal bytes are no copies: two sensors that are covered record the same.
+        ("I_1_1 I_1_10 f_red f_red_edge", None, {"I_1": ["1", "10"], "f": ["red", "red_edge"]}),
+        ("plot_7/red plot_7/nir", None, {"plot_7/plot_7": ["nir", "red"]}),
+        ("I_7_1 I_7_2 f_red_edge f_red", "{capture}_{band}.tif", {"I_7": ["1", "2"], "f": ["red", "red_edge"]}),
+        ("A-of-7 B-of-7 A-of-8 B-of-8", "{band}-of-{capture}.tif", {"7": ["A", "B"], "8": ["A", "B"]}),
+    ],
+)
+def test_captures_by_the_names_of_files(
+    tmp_path: Path, names: str, pattern: str | None, expected: dict[str, list[str]]
+) -> None:
+    assert found(write_all(tmp_path, *names.split()), pattern=pattern) == expected
 
 
-def test_bands_alone_in_their_folder_are_named_by_it(tmp_path: Path) -> None:
-    write_all(tmp_path / "plot 7", "red", "nir")
-    assert found(tmp_path) == {"plot 7/plot 7": ["nir", "red"]}
+def test_a_pattern_of_pictures(tmp_path: Path) -> None:
+    for number in (1, 2):
+        write_picture(tmp_path / f"a_{number}.png")
+    assert found(tmp_path, pattern="{capture}_{band}.png") == {"a": ["1", "2"]}
 
 
 def test_a_band_without_tags_joins_the_capture_of_its_name(images: Path) -> None:
@@ -214,13 +209,6 @@ def test_images_that_cannot_be_read_are_problems_but_for_photographs(tmp_path: P
     assert "convert it to TIFF" in problems["d_red.jp2"]
 
 
-def test_a_multiband_file_is_a_capture(tmp_path: Path) -> None:
-    write(tmp_path / "stack.tif", bands=4)
-    (capture,) = discover(tmp_path).captures
-    assert capture.name == "stack"
-    assert [(b.name, b.band_index) for b in capture.bands] == [(f"band_{i}", i) for i in range(1, 5)]
-
-
 @pytest.mark.parametrize("name", ["lonely_red.tif", "lonely_red.png"])
 def test_a_band_without_companions_is_a_problem_not_a_capture(tmp_path: Path, name: str) -> None:
     (write if name.endswith("tif") else write_picture)(tmp_path / name)
@@ -277,16 +265,6 @@ def test_a_panel_of_another_flight_is_a_capture_of_its_own(images: Path, tmp_pat
         shutil.copy(path, images / path.name.replace("IMG_0001", "IMG_0000"))
     # Same CaptureId as IMG_0001 in this folder: real cameras never repeat one, so names distinguish the files.
     assert sum(map(len, found(images).values())) == 15
-
-
-def test_a_pattern_splits_names_where_the_band_begins(tmp_path: Path) -> None:
-    for number in (1, 2):
-        write_picture(tmp_path / "pictures" / f"a_{number}.png")
-    assert found(tmp_path / "pictures", pattern="{capture}_{band}.png") == {"a": ["1", "2"]}
-    write_all(tmp_path, "IMG_0007_1", "IMG_0007_2", "north_red_edge", "north_red")
-    assert found(tmp_path, pattern="{capture}_{band}.tif") == {"IMG_0007": ["1", "2"], "north": ["red", "red_edge"]}
-    write_all(tmp_path / "b", "A-of-7", "B-of-7", "A-of-8", "B-of-8")
-    assert found(tmp_path / "b", pattern="{band}-of-{capture}.tif") == {"7": ["A", "B"], "8": ["A", "B"]}
 
 
 def test_a_pattern_that_gives_two_files_for_a_band_is_reported(tmp_path: Path) -> None:

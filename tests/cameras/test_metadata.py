@@ -97,7 +97,7 @@ def test_reading_a_file(flight: Path, tmp_path: Path) -> None:
     assert tags.black_level == pytest.approx(4801)
 
 
-@pytest.mark.parametrize("content", [b"", b"II*\0", b"hello", b"II*\0\x08\0\0\0\xff\xff"])
+@pytest.mark.parametrize("content", [b"", b"II*\0", b"hello", b"II*\0\x08\0\0\0\xff\xff", b"II*\0@B\x0f\0"])
 def test_other_files_than_tiffs_are_named(tmp_path: Path, content: bytes) -> None:
     path = tmp_path / "broken.tif"
     path.write_bytes(content)

@@ -140,7 +140,6 @@ def test_the_blocks_of_a_page_run(page: Path, desk: Path, monkeypatch: pytest.Mo
 
 
 @pytest.mark.full
-@pytest.mark.slow
 @each_page(RUNNABLE)
 def test_a_page_by_itself(page: Path, originals: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(shutil.copytree(originals, tmp_path / "desk", symlinks=True))
@@ -270,7 +269,6 @@ def test_generated_tables_are_current(tool: str) -> None:
 
 
 @pytest.mark.full
-@pytest.mark.slow
 def test_the_site_builds_without_warnings(tmp_path: Path) -> None:
     """Every page, and what the docstrings say, without a warning."""
     pytest.importorskip("sphinx")

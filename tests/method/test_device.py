@@ -30,12 +30,16 @@ from ..builders import in_full_run, two_views, whole
 from .pretended_device import NAME, PretendedDevice
 
 
-def test_an_unavailable_device_is_a_configuration_error() -> None:
+def test_an_unavailable_device_is_a_configuration_error(monkeypatch: pytest.MonkeyPatch) -> None:
     assert choose_device("cpu").type == "cpu"
     assert choose_device("auto").type == ("cuda" if torch.cuda.is_available() else "cpu")
     for name in ("nonsense", "cuda:99", "hpu", "xpu:99"):
         with pytest.raises(ConfigurationError, match=name):
             choose_device(name)
+    monkeypatch.setattr("torch.cuda.is_available", lambda: False)
+    with pytest.raises(ConfigurationError, match="no CUDA device") as raised:
+        choose_device("cuda")
+    assert "Torch not compiled" not in str(raised.value)
 
 
 def test_overlapping_contexts_restore_the_threads_of_torch() -> None:
@@ -106,7 +110,6 @@ def test_a_gpu_gives_the_result_of_the_cpu(gpu: GPU, recipe: Recipe, has_float64
 
 
 @pytest.mark.full
-@pytest.mark.slow
 def test_a_flight_on_a_gpu_has_the_result_of_the_cpu(gpu: GPU, flight: Path, tmp_path: Path) -> None:
     """Learning, the model file, keypoint matching and refinement with the frozen network."""
     captures = discover(flight, DiscoverOptions(bands=("Green", "NIR"))).captures

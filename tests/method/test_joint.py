@@ -77,18 +77,6 @@ def test_images_without_contrast_or_overlap_have_an_issue() -> None:
     assert result.code == "few_keypoints"
 
 
-@pytest.mark.full
-def test_one_network_for_two_bands_and_an_unrelated_one() -> None:
-    fixed, moving = two_views(TRUTH)
-    images = [moving, texture(seed=9), whole(np.tanh(fixed.pixels))]
-    group = ImageGroup(fixed, images, [NEAR, NEAR, np.eye(3)], [1, 2, 3], [True] * 3)
-    result = align_from_scratch(group, JointSettings(), lambda *_: None)
-    assert [type(r) for r in result] == [JointResult, Issue, JointResult]
-    assert error_px(result[0]) < 0.1
-    assert result[1].code == "retrieval"
-    assert error_px(result[2], np.eye(3)) < 0.1
-
-
 @pytest.mark.parametrize(
     ("sharing", "training", "left"),
     [

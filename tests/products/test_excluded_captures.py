@@ -78,7 +78,6 @@ def test_the_picture_shows_both_sides_of_what_changed_its_unit(by_panel: Path) -
 
 
 @pytest.mark.full
-@pytest.mark.slow
 def test_another_run_keeps_results_and_can_align_panels(between_panels: Path, tmp_path: Path) -> None:
     first, *_ = agalign.align_folder(between_panels, tmp_path, settings=seeded())
     assert first.is_complete

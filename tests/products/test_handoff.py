@@ -4,10 +4,8 @@ import math
 from pathlib import Path
 from typing import Any
 
-import exifread
 import numpy as np
 import pytest
-import xmltodict
 from PIL import Image
 
 import agalign
@@ -76,7 +74,6 @@ def test_its_reflectance_is_that_of_this_program(program: ExportProgram, shared:
 
 
 @pytest.mark.full
-@pytest.mark.slow
 def test_vignetting_follows_pixels_without_distortion(shared: Shared, tmp_path: Path) -> None:
     photos = exported(shared, tmp_path, undistort=True)
     assert all(p.vignetting[1] for p in photos)
@@ -170,21 +167,9 @@ def bands_of(folder: Path) -> list[Path]:
     return sorted(p for p in folder.rglob("*") if p.suffix.lower() == ".tif" and not p.name.endswith("_D.tif"))
 
 
-def exif_of(path: Path) -> dict[str, Any]:
-    with path.open("rb") as file:
-        result: dict[str, Any] = exifread.process_file(file, details=True, extract_thumbnail=False)
-    return result
-
-
 def xmp_of(path: Path) -> dict[str, Any]:
-    """Keys with the prefixes that cameras write, attributes with an @, as OpenDroneMap looks them up."""
-    data = path.read_bytes()
-    packet = data[data.index(b"<x:xmpmeta") : data.index(b"</x:xmpmeta>") + len(b"</x:xmpmeta>")]
-    result = xmltodict.parse(packet)["x:xmpmeta"]["rdf:RDF"]["rdf:Description"]
-    merged: dict[str, Any] = {}
-    for description in result if isinstance(result, list) else [result]:
-        merged |= description
-    return merged
+    """Keys with the prefixes that cameras write, attributes with an @."""
+    return {name: value for part in OdmPhoto(path).descriptions for name, value in part.items()}
 
 
 def numbers(value: Any) -> list[float]:
@@ -208,7 +193,7 @@ def test_bands_place_time_and_camera_are_as_before(aligned: Aligned) -> None:
         assert xmp["Camera:BandName"]
     assert len({xmp["Camera:BandName"] for xmp in after.values()}) == len(after)
     for source, path in zip(bands_of(folder), bands_of(out), strict=True):
-        exif_before, exif_after = exif_of(source), exif_of(path)
+        exif_before, exif_after = OdmPhoto(source).exif, OdmPhoto(path).exif
         for tag in TAGS:
             assert str(exif_after.get(tag)) == str(exif_before.get(tag)), tag
         with Image.open(path) as image:
@@ -240,7 +225,7 @@ def test_the_principal_point_is_on_the_pixel_that_it_was_on(aligned: Aligned) ->
     before, after = (next(xmp_of(p) for p in bands_of(f) if p.name == reference) for f in (folder, out))
     if camera.maker == "MicaSense":
         (path,) = (p for p in bands_of(out) if p.name == reference)
-        density = float(exif_of(path)["EXIF FocalPlaneXResolution"].values[0])
+        density = OdmPhoto(path).exif_number("EXIF FocalPlaneXResolution")
         here, there = (numbers(x["Camera:PrincipalPoint"]) for x in (before, after))
         moved = [density * (a - b) for a, b in zip(here, there, strict=True)]
     elif camera.maker == "DJI":

@@ -38,7 +38,7 @@ from agalign.values import geometry, lens
 from agalign.values.output_folder import locked
 
 from ..builders import in_full_run
-from ..conftest import Shared
+from ..conftest import Shared, write_band
 from ..program import agalign_here
 
 
@@ -169,9 +169,8 @@ def test_whole_numbers_keep_their_type_and_unused_pixels_are_nodata(survey: Path
     for path in (tmp_path / "0000SET").glob("*.tif"):
         with rasterio.open(path) as stack:
             values, names = stack.read(), stack.descriptions
-        profile = {"driver": "GTiff", "width": values.shape[2], "height": values.shape[1], "count": 4, "nodata": 0}
-        with rasterio.open(path, "w", dtype="uint16", **profile) as stack:
-            stack.write((values * 40000).astype(np.uint16))
+        write_band(path, (values * 40000).astype(np.uint16), nodata=0)
+        with rasterio.open(path, "r+") as stack:
             stack.descriptions = names
     done = agalign_here("mosaic", tmp_path, "-o", tmp_path / "field.tif", "--gsd", "0.2", "-i", "ndvi")
     assert done.returncode == 0, done.stderr
@@ -390,7 +389,6 @@ def test_a_run_without_a_map_names_what_is_missing(tmp_path: Path) -> None:
 
 
 @pytest.mark.real
-@pytest.mark.slow
 @pytest.mark.full
 def test_a_real_strip_has_a_fifth_of_the_misfit(real_data: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"

@@ -58,7 +58,6 @@ def test_tie_points_match_the_truth_where_the_alignment_is_off(flight: Path, tmp
 
 
 @pytest.mark.full
-@pytest.mark.slow
 def test_tie_points_of_aligned_bands_are_accurate(tmp_path: Path) -> None:
     make_flight(tmp_path / "in", captures=2, size_px=(1280, 960), rng_seed=3)
     settings = agalign.Settings(write=agalign.WriteSettings(tie_points=True))

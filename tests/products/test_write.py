@@ -113,13 +113,6 @@ def test_georeference_and_statistics_in_either_format(tmp_path: Path, file_forma
         assert "STATISTICS_MEAN" not in dataset.tags(3)
 
 
-def test_moving_bands_are_resampled_where_the_mapping_says(tmp_path: Path) -> None:
-    capture, out = make_capture(tmp_path, "float32"), tmp_path / "out.tif"
-    write_raster(capture, layers_of(capture, PixelMapping(geometry.translation(3, -2))), CROP, out, WriteSettings())
-    with rasterio.open(out) as written, rasterio.open(capture.bands[0].path) as source:
-        np.testing.assert_allclose(written.read(1), source.read(1)[4:134, 7:187], rtol=1e-6)
-
-
 @pytest.mark.parametrize(
     ("dtype", "nodata", "expected"),
     [("uint16", None, 0), ("float32", None, np.nan), ("int16", -9999, -9999), ("uint8", 255, 255)],

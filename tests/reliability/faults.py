@@ -1,8 +1,8 @@
 """Faults of cards, disks, machines and files, and the results that the program must have.
 
 Each fault is done to a small flight of two good captures, `a` and `b`, and the program is run on it. `python -m
-tests.reliability.faults` prints the result of each fault, and with `--markdown docs/reliability.md` writes those of
-`IN_THE_DOCUMENT` to that page. test_faults.py compares the result of each fault with the expected one.
+tests.reliability.faults` prints the result of each fault, and with `--markdown docs/reliability.md` updates the table
+of that page. test_faults.py compares the result of each fault with the expected one.
 """
 
 import contextlib
@@ -37,6 +37,7 @@ from agalign.values.files import RUN_FILE
 from ..conftest import textured_pair
 from ..program import agalign_here
 
+DOCUMENT = Path(__file__).resolve().parents[2] / "docs" / "reliability.md"
 SHIFT = np.array([[1, 0, 6.0], [0, 1, -4.0], [0, 0, 1]])
 SIZE_PX = 320, 240
 ALL = "abcdefghijkl"
@@ -103,6 +104,10 @@ class Fault:
     name: str
     inject: Inject
     ends: Ends
+
+    @property
+    def is_in_full_run(self) -> bool:
+        return self.inject in _IN_FULL_RUN
 
 
 @dataclass(frozen=True)
@@ -484,24 +489,6 @@ def kill_capture(process: "subprocess.Popen[str]", scene: Scene) -> None:
         worker.kill()
 
 
-def kill_workers_as_they_appear(process: "subprocess.Popen[str]", scene: Scene) -> None:
-    wait_for_reports(process, scene)
-    while process.poll() is None:
-        kill_all_workers(process, scene)
-        time.sleep(0.005)
-
-
-def kill_all_workers(process: "subprocess.Popen[str]", _scene: Scene) -> None:
-    for worker in workers(process):
-        with contextlib.suppress(psutil.NoSuchProcess):
-            worker.kill()
-
-
-def kill_server(process: "subprocess.Popen[str]", _scene: Scene) -> None:
-    """The process that starts the workers."""
-    psutil.Process(workers(process)[0].ppid()).kill()
-
-
 def workers(process: "subprocess.Popen[str]") -> list[psutil.Process]:
     try:
         return [c for c in psutil.Process(process.pid).children(recursive=True) if c.ppid() != process.pid]
@@ -640,6 +627,15 @@ def counting_beyond(scene: Scene) -> None:
     path.write_bytes(path.read_bytes().replace(one, many, 1))
 
 
+_IN_FULL_RUN: list[Inject] = []
+
+
+def in_full_run(inject: Inject) -> Inject:
+    """A fault of the full tests alone, because it takes long and others are like it."""
+    _IN_FULL_RUN.append(inject)
+    return inject
+
+
 _SECOND = '"file": "b.tif",\n    "band_index": 2'
 _NESTED = "<a>" * 1200 + "</a>" * 1200
 _BOMB = (
@@ -654,9 +650,9 @@ _OUTSIDE = '<!DOCTYPE l [<!ENTITY a SYSTEM "file:///etc/passwd">]>' + _PACKET.fo
 
 ALL_FINISHED: dict[str, Inject] = {
     "a folder named .tif": lambda s: (s.folder / "c_nir.tif").mkdir(),
-    "the system's folder on a card": forbidden(lambda s: s.folder / "lost+found", "new"),
-    "an input that may only be read": read_only,
-    "XMP nested 1200 deep": tagged(_PACKET.format(_NESTED)),
+    "the system's folder on a card": in_full_run(forbidden(lambda s: s.folder / "lost+found", "new")),
+    "an input that may only be read": in_full_run(read_only),
+    "XMP nested 1200 deep": in_full_run(tagged(_PACKET.format(_NESTED))),
     "numbers in the tags that cannot be": both(
         xmp(
             "<Camera:PerspectiveFocalLength>nan</Camera:PerspectiveFocalLength><Camera:PrincipalPoint>1e300,inf"
@@ -666,30 +662,34 @@ ALL_FINISHED: dict[str, Inject] = {
         asking("--radiometry", "off"),
     ),
     "a band of another size": of_other_size,
-    "a formula for a name": lambda s: write_capture(s.folder, '=HYPERLINK("a")', 3),
+    "a formula for a name": in_full_run(lambda s: write_capture(s.folder, '=HYPERLINK("a")', 3)),
     "a camera model of 300 characters": both(
         learning, tagged(None, (271, 2, 0, "Maker", True), (272, 2, 0, "M" * 300, True))
     ),
     "an output inside the input": lambda s: setattr(s, "out", s.folder / "out"),
-    "an earlier run inside the input, killed": killed_inside_the_input,
-    "two captures that would write one file": colliding,
+    "an earlier run inside the input, killed": in_full_run(killed_inside_the_input),
+    "two captures that would write one file": in_full_run(colliding),
     "overviews that describe other files": overviews_elsewhere,
     "a sidecar that names files elsewhere": with_sidecar(
         lambda s, t: t.replace('"band_files": []', '"band_files": [{"file": "../a", "bytes": 1}]')
     ),
-    "a sidecar nested 200,000 deep": with_sidecar(lambda *_: '{"schema": "agalign/1", "bands": ' + "[" * 200_000),
+    "a sidecar nested 200,000 deep": in_full_run(
+        with_sidecar(lambda *_: '{"schema": "agalign/1", "bands": ' + "[" * 200_000)
+    ),
     "a model of an earlier run, damaged": damaged_model,
     "the lock of a killed run": held_by_a_killed_one,
-    "a terminal of ASCII": both(strange_names, with_environment(PYTHONIOENCODING="ascii")),
+    "a terminal of ASCII": in_full_run(both(strange_names, with_environment(PYTHONIOENCODING="ascii"))),
     "a pipe where a sidecar belongs": sidecar_is_a_pipe,
-    "an infinite number in an earlier sidecar": both(endless_number, commanding("{folder} -o {out} -j 1")),
-    "standard output closed": without_streams(1),
-    "all standard streams closed": without_streams(0, 1, 2),
-    "a temporary folder with a name of 150 letters": long_temporary_folder,
+    "an infinite number in an earlier sidecar": in_full_run(both(endless_number, commanding("{folder} -o {out} -j 1"))),
+    "standard output closed": in_full_run(without_streams(1)),
+    "all standard streams closed": in_full_run(without_streams(0, 1, 2)),
+    "a temporary folder with a name of 150 letters": in_full_run(long_temporary_folder),
     "a file system without locks": no_locks,
-    "a focal length of 1e308 mm in the tags": xmp(
-        "<Camera:PerspectiveFocalLength>1e308</Camera:PerspectiveFocalLength>"
-        "<Camera:PerspectiveFocalLengthUnits>mm</Camera:PerspectiveFocalLengthUnits>"
+    "a focal length of 1e308 mm in the tags": in_full_run(
+        xmp(
+            "<Camera:PerspectiveFocalLength>1e308</Camera:PerspectiveFocalLength>"
+            "<Camera:PerspectiveFocalLengthUnits>mm</Camera:PerspectiveFocalLengthUnits>"
+        )
     ),
 }
 """After these, both captures are aligned, without a complaint."""
@@ -703,7 +703,7 @@ B_IS_LOST: dict[str, tuple[Inject, str]] = {
         lambda s: setattr(s, "during", s.file().unlink),
         r"b_nir\.tif: does not exist",
     ),
-    "a thousand tags of one value of 2 MB": (long_tags, "b_nir.tif: .*declare more than 32 MB"),
+    "a thousand tags of one value of 2 MB": (in_full_run(long_tags), "b_nir.tif: .*declare more than 32 MB"),
     "a tag that counts beyond the file": (counting_beyond, "b_nir.tif: not a readable TIFF"),
     "images of one pixel": (of_one_pixel, "^b nir: "),
     "a band that is all nodata": (all_nodata, "^b nir: "),
@@ -713,7 +713,7 @@ B_IS_LOST: dict[str, tuple[Inject, str]] = {
         "b.json: reference.width",
     ),
     "a sidecar without permission, for the report": (
-        both(first_run, forbidden(lambda s: s.out / "b.json"), commanding("report {out}")),
+        in_full_run(both(first_run, forbidden(lambda s: s.out / "b.json"), commanding("report {out}"))),
         r"b.json: cannot be read \(Permission",
     ),
     "a folder where a stack belongs": (output_is_a_folder("b.tif"), "b.tif: cannot be written"),
@@ -728,7 +728,7 @@ FILE_IS_NAMED: dict[str, tuple[Inject, str]] = {
     "a text named .tif": (extra("c_nir.tif", b"hello"), "c_nir.tif: is not a TIFF"),
     "a pipe named .tif": (lambda s: os.mkfifo(s.folder / "c_nir.tif"), "c_nir.tif: is not a regular file"),
     "a folder without permission": (
-        forbidden(lambda s: s.folder / "sub", "new"),
+        in_full_run(forbidden(lambda s: s.folder / "sub", "new")),
         r"sub: cannot be looked into \(Permission denied\)",
     ),
     "a sparse image of 100,000 x 100,000": (enormous, r"declares 100000 x 100000 pixels.*--max-pixels"),
@@ -741,14 +741,14 @@ FILE_IS_NAMED: dict[str, tuple[Inject, str]] = {
         "b.tif: has no band 99",
     ),
     "a system without letters beyond ASCII": (
-        both(strange_names, with_environment(LC_ALL="C", PYTHONUTF8="0", PYTHONCOERCECLOCALE="0")),
+        in_full_run(both(strange_names, with_environment(LC_ALL="C", PYTHONUTF8="0", PYTHONCOERCECLOCALE="0"))),
         "its name is not valid ASCII; rename it, or set LC_ALL=C.UTF-8",
     ),
 }
 """After these, both captures are aligned, and another file is complained of."""
 REFUSED: dict[str, tuple[Inject, int, str]] = {
     "an output that may not be written": (
-        forbidden(lambda s: s.out, "new", 0o555),
+        in_full_run(forbidden(lambda s: s.out, "new", 0o555)),
         1,
         "out: no permission to write there",
     ),
@@ -767,107 +767,56 @@ REFUSED: dict[str, tuple[Inject, int, str]] = {
 }
 """These end the run: with the exit code and a pattern of the complaint."""
 OTHERS = {
-    "XML entities that multiply": (tagged(_BOMB), Ends(0, "b_nir.tif: its XMP packet .* lacks BandName", "ab")),
-    "an XML entity that names a file": (tagged(_OUTSIDE), Ends(0, "b_nir.tif: its XMP packet .* lacks BandName", "ab")),
+    "XML entities that multiply": (
+        in_full_run(tagged(_BOMB)),
+        Ends(0, "b_nir.tif: its XMP packet .* lacks BandName", "ab"),
+    ),
+    "an XML entity that names a file": (
+        in_full_run(tagged(_OUTSIDE)),
+        Ends(0, "b_nir.tif: its XMP packet .* lacks BandName", "ab"),
+    ),
     "XMP of five megabytes": (
-        xmp(f"<Camera:BandName>{'x' * 5_000_000}</Camera:BandName>"),
+        in_full_run(xmp(f"<Camera:BandName>{'x' * 5_000_000}</Camera:BandName>")),
         Ends(0, "b_nir.tif: its XMP packet is damaged and lacks its end, BandName", "ab"),
     ),
     "symlinks that lead in a circle": (loops, Ends(3, "b_nir2.tif: cannot be read", "a")),
     "the disk full": (full_disk, Ends(3, "the disk is full|cannot be written", "a")),
     "a worker killed by SIGKILL": (when_begun(kill_worker, "-j", "2", "--timeout", "100"), Ends(0, "", ALL)),
-    "both workers killed by SIGKILL": (when_begun(kill_all_workers, "-j", "2"), Ends(0, "", ALL)),
     "a worker killed twice at one capture": (
-        both(when_begun(kill_capture, "-j", "1", "--timeout", "100"), larger),
+        in_full_run(both(when_begun(kill_capture, "-j", "1", "--timeout", "100"), larger)),
         Ends(3, r"its worker process was killed \(signal 9; ", "", 1),
     ),
-    "each worker killed as it appears": (
-        when_begun(kill_workers_as_they_appear, "-j", "2"),
-        Ends(
-            3, r"^3 worker processes one after another ended before they finished anything \(the last by signal 9", ""
-        ),
-    ),
-    "the process that starts workers killed": (when_begun(kill_server, "-j", "2"), Ends(0, "", ALL)),
     "memory short in the workers": (
-        both(when_begun(starve_workers, "-j", "2", "--timeout", "100"), larger),
+        in_full_run(both(when_begun(starve_workers, "-j", "2", "--timeout", "100"), larger)),
         Ends(3, "out of memory|killed", ""),
     ),
     "a capture that never ends": (
-        when_begun(stop_worker, "-j", "2", "--timeout", "4"),
+        in_full_run(when_begun(stop_worker, "-j", "2", "--timeout", "4")),
         Ends(3, "stopped after 4 s", "", 1),
     ),
     "the interrupt key": (when_begun(signalled(signal.SIGINT), "-j", "2"), Ends(130, "interrupted; finished", "")),
     "the interrupt key, workers of Dask": (
-        when_begun(signalled(signal.SIGINT), "--dask", "local"),
+        in_full_run(when_begun(signalled(signal.SIGINT), "--dask", "local")),
         Ends(130, "interrupted; finished", ""),
     ),
     "the interrupt key while workers start": (
-        both(with_captures(ALL[2:]), when(has_children(1), signalled(signal.SIGINT), "-j", "2")),
+        in_full_run(both(with_captures(ALL[2:]), when(has_children(1), signalled(signal.SIGINT), "-j", "2"))),
         Ends(130, "interrupted; finished", ""),
     ),
-    "SIGTERM": (when_begun(signalled(signal.SIGTERM), "-j", "2"), Ends(143, "interrupted; finished", "")),
+    "SIGTERM": (in_full_run(when_begun(signalled(signal.SIGTERM), "-j", "2")), Ends(143, "interrupted; finished", "")),
     "SIGTERM while files are read": (
-        both(many_files, when(has_children(2), signalled(signal.SIGTERM, 0.3), "-j", "2")),
+        in_full_run(both(many_files, when(has_children(2), signalled(signal.SIGTERM, 0.3), "-j", "2"))),
         Ends(143, "interrupted; finished", ""),
     ),
-    "names of every kind": (strange_names, Ends(0, "", ("a", "b", "-rf", "new\nline", "\x1b[31mred\a", "x" * 200))),
+    "names of every kind": (
+        in_full_run(strange_names),
+        Ends(0, "", ("a", "b", "-rf", "new\nline", "\x1b[31mred\a", "x" * 200)),
+    ),
     "standard output full": (standard_output_full, Ends(1, "standard output|output: No space left", "ab")),
     "an infinite number in a sidecar, for the report": (endless_number, Ends(3, r"b\.json: .*finite", "a")),
-    "standard error that is not read": (unread_errors, Ends(0, "", "abcde")),
-    "JSON lines that are not read": (both(unread_errors, asking("--log-json")), Ends(0, "", "abcde")),
+    "standard error that is not read": (in_full_run(unread_errors), Ends(0, "", "abcde")),
+    "JSON lines that are not read": (in_full_run(both(unread_errors, asking("--log-json"))), Ends(0, "", "abcde")),
 }
-FULL = {
-    "XML entities that multiply",
-    "an XML entity that names a file",
-    "XMP nested 1200 deep",
-    "XMP of five megabytes",
-    "a sidecar nested 200,000 deep",
-    "an infinite number in an earlier sidecar",
-    "a focal length of 1e308 mm in the tags",
-    "a formula for a name",
-    "a system without letters beyond ASCII",
-    "the system's folder on a card",
-    "an input that may only be read",
-    "an earlier run inside the input, killed",
-    "two captures that would write one file",
-    "all standard streams closed",
-    "standard output closed",
-    "a temporary folder with a name of 150 letters",
-    "a sidecar without permission, for the report",
-    "a folder without permission",
-    "an output that may not be written",
-    "each worker killed as it appears",
-    "the process that starts workers killed",
-    "a capture that never ends",
-    "SIGTERM",
-    "names of every kind",
-    "standard error that is not read",
-    "both workers killed by SIGKILL",
-    "a worker killed twice at one capture",
-    "memory short in the workers",
-    "the interrupt key while workers start",
-    "the interrupt key, workers of Dask",
-    "SIGTERM while files are read",
-    "a thousand tags of one value of 2 MB",
-    "a terminal of ASCII",
-    "JSON lines that are not read",
-}
-"""Only in the full tests: these take long, and others are like them."""
-IN_THE_DOCUMENT = {
-    "a TIFF cut short",
-    "no bytes at all",
-    "a file without permission",
-    "a text named .tif",
-    "a sparse image of 100,000 x 100,000",
-    "another run in the same output",
-    "the disk full",
-    "a worker killed twice at one capture",
-    "memory short in the workers",
-    "a capture that never ends",
-    "the interrupt key",
-    "SIGTERM",
-}
-"""The faults that users meet most."""
 FAULTS = (
     *(Fault(name, inject, Ends(0, "", "ab")) for name, inject in ALL_FINISHED.items()),
     *(Fault(name, inject, Ends(3, says)) for name, (inject, says) in B_IS_LOST.items()),
@@ -877,19 +826,28 @@ FAULTS = (
 )
 
 
+def documented() -> dict[str, str]:
+    """{fault: exit code} in the table of the most common faults."""
+    section = (
+        DOCUMENT.read_text(encoding="utf-8").partition("<!-- faults -->")[2].partition("<!-- end of faults -->")[0]
+    )
+    rows = [line.removeprefix("| ").split(" | ") for line in section.splitlines() if line.startswith("| ")][2:]
+    return {name: code for name, code, *_ in rows}
+
+
 def main() -> None:
     """Print the result of each fault, and write the table of docs/reliability.md."""
     sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "benchmarks"))
     from common import Section
 
     document = Path(sys.argv[2]) if sys.argv[1:2] == ["--markdown"] else None
-    rows = [("fault", "exit code", "first message, without the remedy")]
+    rows, reported = [("fault", "exit code", "first message, without the remedy")], documented()
     failed = []
     for fault in FAULTS:
         with tempfile.TemporaryDirectory() as folder:
             seen = run_fault(fault, Path(folder))
             row = (fault.name, str(seen.code), first_complaint(seen, Path(folder)))
-        if fault.name in IN_THE_DOCUMENT:
+        if fault.name in reported:
             rows.append(row)
         wrong = what_is_wrong(fault, seen)
         failed += [f"{fault.name}: {wrong}"] if wrong else []

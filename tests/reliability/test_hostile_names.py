@@ -25,7 +25,6 @@ from agalign.values.files import file_name
 from agalign.values.text import without_controls
 
 from ..conftest import Shared, read_json, seeded
-from ..program import agalign as run_agalign
 from ..program import agalign_here
 
 HOSTILE = ("../../pwn", "/tmp/p", "..", "a\r\n\x1b[31mb", "x" * 300, "CON", "", ".hidden", "a/b", "a:b", "C:\\b", "é‮/")
@@ -230,13 +229,3 @@ def test_files_and_working_folders_that_are_not_utf_8_are_named(
     assert (done.returncode, done.stderr.count("\n")) == (1, 2), done.stderr
     assert done.stderr.endswith("f\\udcf6lder-aligned: its name is not valid UTF-8; rename it\n")
     assert not (tmp_path / f"{BAD}-aligned").exists()
-
-
-@pytest.mark.full
-@pytest.mark.slow
-@pytest.mark.skipif(sys.platform != "linux", reason="other systems decode names as UTF-8")
-def test_a_system_of_ascii_reports_names_outside_it(flight: Path, tmp_path: Path) -> None:
-    environment = {**os.environ, "LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"}
-    done = run_agalign(flight, "-o", tmp_path / "öut", env=environment)
-    assert done.returncode == 2
-    assert done.stderr.endswith("ut: its name is not valid ASCII; rename it, or set LC_ALL=C.UTF-8\n")

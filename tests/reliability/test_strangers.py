@@ -79,11 +79,6 @@ def test_no_table_has_a_formula(tmp_path: Path) -> None:
     assert (tmp_path / "a.csv").read_text().splitlines() == expected
 
 
-def test_a_table_with_a_huge_cell_is_empty(tmp_path: Path) -> None:
-    (tmp_path / INDICES_FILE).write_text(f"folder,capture\n{'x' * 200_000},y\n")
-    assert read_table(tmp_path) == []
-
-
 def test_tags_have_no_character_that_changes_other_text() -> None:
     assert without_controls("Ca\x1b[2Jm\u202e\u2066e\u2028ra\x00 é\u3000") == "Ca[2Jmera é\u3000"
 
@@ -141,9 +136,7 @@ def test_values_of_a_sidecar_that_no_run_writes_are_an_error(
     ("error", "said"),
     [
         (ImportError("libx.so"), "agalign failed on it (ImportError: libx.so); please report this"),
-        (AssertionError("x"), "agalign failed on it (AssertionError: x); please report this"),
         (StopIteration(), "agalign failed on it (StopIteration: StopIteration); please report this"),
-        (EOFError("x"), "agalign failed on it (EOFError: x); please report this"),
         (RuntimeError("[enforce fail at alloc_cpu.cpp] DefaultCPUAllocator: not enough memory"), "out of memory; "),
     ],
 )

@@ -29,14 +29,6 @@ def stop_forever() -> None:
     os.kill(os.getpid(), signal.SIGSTOP)
 
 
-def size(data: bytes) -> int:
-    return len(data)
-
-
-def zeros(count: int) -> bytes:
-    return bytes(count)
-
-
 def log_level(logger: str) -> str:
     return logging.getLevelName(logging.getLogger(logger).level)
 

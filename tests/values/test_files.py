@@ -14,7 +14,6 @@ from agalign.values.files import (
     RUN_FILE,
     complete_file,
     is_inside,
-    open_regular,
     read_regular,
     remove_partial_files,
     scratch_file,
@@ -147,13 +146,3 @@ def test_partial_files_of_a_running_process_are_kept(tmp_path: Path) -> None:
     assert (run / partial.name).exists()
     remove_partial_files(run)
     assert not (run / partial.name).exists()
-
-
-def test_only_regular_files_are_opened(tmp_path: Path) -> None:
-    os.mkfifo(tmp_path / "pipe")
-    for path in (tmp_path / "pipe", tmp_path, Path("/dev/null")):
-        with pytest.raises(OSError, match="not a regular file"):
-            open_regular(path)
-    (tmp_path / "file").write_bytes(b"x")
-    with open_regular(tmp_path / "file") as file:
-        assert file.read() == b"x"

@@ -19,12 +19,6 @@ matrices = st.builds(
 points = np.array([[0.0, 0.0], [100.0, 0.0], [37.5, 80.0], [120.0, 90.0]])
 
 
-@given(matrices, matrices)
-def test_compose_applies_the_last_first(one: np.ndarray, other: np.ndarray) -> None:
-    expected = geometry.apply(one, geometry.apply(other, points))
-    assert_allclose(geometry.apply(geometry.compose(one, other), points), expected, atol=1e-6)
-
-
 @pytest.mark.parametrize("bad", [np.zeros((3, 3)), np.eye(2), np.full((3, 3), np.nan), np.diag([1.0, 1.0, 0.0])])
 def test_other_matrices_than_homographies_are_refused(bad: np.ndarray) -> None:
     with pytest.raises(GeometryError):
@@ -103,13 +97,6 @@ def test_distort_is_opencvs_projection() -> None:
 
 def test_undistort_inverts_distort() -> None:
     assert_allclose(lens.distort(MODEL, lens.undistort(MODEL, POINTS)), POINTS, atol=1e-5)
-
-
-def test_shapes_are_kept_and_no_lens_is_the_identity() -> None:
-    grid = POINTS.reshape(10, 20, 2)
-    assert lens.undistort(MODEL, grid).shape == grid.shape
-    assert_allclose(lens.undistort(None, grid), grid)
-    assert_allclose(lens.distort(Lens(1000, 1000, 5, 5), grid), grid)
 
 
 def test_a_resized_image_has_a_resized_lens() -> None:

@@ -9,15 +9,9 @@ from pathlib import Path
 
 import pytest
 
-from agalign.errors import MemoryLimitError, is_out_of_memory
+from agalign.errors import is_out_of_memory
 from agalign.values import processes
-from agalign.values.processes import (
-    cgroup_quota,
-    check_address_space,
-    check_threads,
-    limit_default_threads,
-    usable_cores,
-)
+from agalign.values.processes import cgroup_quota, check_threads, limit_default_threads, usable_cores
 
 from ..conftest import raising
 from ..program import agalign_here
@@ -71,12 +65,6 @@ def test_no_threads_are_started_to_check_their_number_in_a_small_address_space(m
     monkeypatch.setattr(resource, "getrlimit", lambda _: (2_000_000_000, 2_000_000_000))
     monkeypatch.setattr(threading.Thread, "start", raising(RuntimeError()))
     check_threads()
-
-
-def test_too_little_address_space_is_refused_with_both_sizes(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(resource, "getrlimit", lambda _: (1_200_000_000, resource.RLIM_INFINITY))
-    with pytest.raises(MemoryLimitError, match=r"limited to 1\.20 GB \(ulimit -v\); agalign needs 1\.8 GB or more"):
-        check_address_space()
 
 
 @pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="only glibc reserves a heap for each thread")
