@@ -2,17 +2,21 @@
 
     python benchmarks/lost_bands.py FLIGHT...
 
-FLIGHT holds a flight with reference tie points of its captures in ties.json. In one run each capture loses another
-band, to noise; in another one whole capture is water. The rows are of the lost bands.
+In one run each capture of the flight loses another band, to noise; in another one whole capture is water. The rows are
+of the lost bands. Errors are those at the reference tie points in ties.json. Without that file, they are the distances
+from the mappings of the undamaged run, and the damaged runs use its model.
 """
 
-import json
+from collections import defaultdict
+from collections.abc import Sequence
 from pathlib import Path
 
 import cv2
 import numpy as np
+from accuracy import ties_of
 from common import (
     BandError,
+    Ties,
     align,
     band_errors,
     flight_and_out,
@@ -35,28 +39,41 @@ def degrade(path: Path, how: str, rng: np.random.Generator) -> None:
     write_band(path, (np.median(pixels) + 0.5 * pixels.std() * noise).clip(1, 65000).astype(pixels.dtype))
 
 
-def run_without(flight: Path, lost: set[str], how: str, rng: np.random.Generator) -> list[BandError]:
+def run_without(
+    flight: Path, truth: Ties, lost: Sequence[str], how: str, rng: np.random.Generator, *options: str
+) -> list[BandError]:
     """Align a copy of a flight without these files, and return their errors."""
     with flight_and_out() as (copy, out):
         writable_copy(flight, copy)
         for name in sorted(lost):
             degrade(next(copy.rglob(name)), how, rng)
-        align(copy, out)
-        truth = read_ties(flight / "ties.json")
+        align(copy, out, *options)
         return band_errors(out, {name: entry for name, entry in truth.items() if name in lost})
 
 
 def main(flights: list[Path]) -> None:
     rng, result = np.random.default_rng(0), dict[str, list[BandError]]()
     for flight in flights:
-        captures = list(json.loads((flight / "ties.json").read_text()).values())
-        count = len(captures[0]["bands"])
-        for turn in range(count):
-            lost = {list(c["bands"])[(turn + i) % count] for i, c in enumerate(captures)}
-            result.setdefault(f"{flight.name}, a band", []).extend(run_without(flight, lost, "noise", rng))
-        for capture in captures:
-            lost = {capture["reference"], *capture["bands"]}
-            result.setdefault(f"{flight.name}, a capture", []).extend(run_without(flight, lost, "water", rng))
+        with flight_and_out() as (_, out):
+            if (flight / "ties.json").exists():
+                truth, options = read_ties(flight / "ties.json"), []
+            else:
+                align(flight, out)
+                truth, options = ties_of(out), ["--model", *map(str, out.glob("models/*.safetensors"))]
+            captures = defaultdict[str, list[str]](list)
+            for file, entry in truth.items():
+                captures[entry["reference"]].append(file)
+            count = max(map(len, captures.values()))
+            for turn in range(count):
+                lost = [files[(turn + k) % len(files)] for k, files in enumerate(captures.values())]
+                result.setdefault(f"{flight.name}, a band", []).extend(
+                    run_without(flight, truth, lost, "noise", rng, *options)
+                )
+            for reference, files in captures.items():
+                lost = [reference, *files]
+                result.setdefault(f"{flight.name}, a capture", []).extend(
+                    run_without(flight, truth, lost, "water", rng, *options)
+                )
     print_errors(result)
 
 
