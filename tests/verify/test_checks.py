@@ -8,9 +8,8 @@ import pytest
 from agalign.pixels.structure import Field
 from agalign.values import geometry
 from agalign.values.alignment import Prediction, Residual
-from agalign.values.issues import Issue, IssueKind, Remedy, sentence
-from agalign.verify import checks
-from agalign.verify.checks import CHECKS, KINDS, Check, Evidence, is_unchanged, issues_of, seed_fits
+from agalign.values.issues import sentence
+from agalign.verify.checks import CHECKS, KINDS, Evidence, is_unchanged, issues_of, seed_fits
 
 from ..builders import joint_result, residual_of
 
@@ -19,7 +18,6 @@ JOINT = joint_result(std_px=0.07)
 RESIDUAL = replace(residual_of(np.zeros((50, 2)), np.zeros((50, 2))), median_px=0.05, p95_px=0.2)
 GOOD = Evidence(JOINT, RESIDUAL, SIZE)
 PREDICTION = Prediction(np.eye(3), "bands", std_px=0.2)
-HALF_WRONG = np.vstack([np.zeros((20, 2)), np.full((30, 2), 5.0)])
 NAN = float("nan")
 
 
@@ -41,22 +39,14 @@ def test_a_good_result_has_no_issues_and_every_check_lists_its_kinds() -> None:
 @pytest.mark.parametrize(
     ("joint", "residual", "expected"),
     [
-        ({"retrieval": 0.1}, {}, "retrieval"),
         ({"retrieval": NAN}, {}, "retrieval"),
-        ({"retrieval": 0.3, "chance": 1 / 16}, {}, "retrieval"),
-        ({"corner_std_xy_px": ((0.1, 0.1), (3.0, 4.0))}, {}, "corner_std_px"),
         ({"corner_std_xy_px": ((NAN, 0.1),) * 4}, {}, "corner_std_px"),
         ({"fixed_to_moving": np.diag([-1.0, 1, 1])}, {}, "folds"),
-        ({"fixed_to_moving": stretched_by(-7e-4)}, {}, "folds"),
-        ({}, {"centres_px": np.zeros((2, 2))}, "few_windows"),
-        ({}, {"coverage": 0.4}, "coverage"),
-        ({}, {"median_px": 2.5}, "residual_px"),
         ({}, {"median_px": float("inf")}, "residual_px"),
-        ({}, {"shifts_px": HALF_WRONG}, "close_windows"),
         ({"retrieval": 0.1}, {"median_px": 2.5}, "retrieval residual_px"),
     ],
 )
-def test_every_issue_is_sufficient_and_listed(
+def test_values_that_are_not_finite_and_mirrored_mappings_are_issues(
     joint: dict[str, object], residual: dict[str, object], expected: str
 ) -> None:
     issues = issues_of(Evidence(replace(JOINT, **joint), replace(RESIDUAL, **residual), SIZE))
@@ -178,12 +168,6 @@ def test_a_repetitive_scene_is_an_issue_unless_aliases_are_excluded() -> None:
     assert codes(replace(GOOD, images=RepetitiveImages(expected_within_px=-1.0))) == ["repeats"]
     # A costly check runs only where the others pass.
     assert codes(replace(GOOD, joint=replace(JOINT, retrieval=0.0), images=RepetitiveImages())) == ["retrieval"]
-
-
-def test_a_new_check_is_one_entry(monkeypatch: pytest.MonkeyPatch) -> None:
-    kind = IssueKind("too_late", "taken at night", Remedy("the sun is down", "fly at noon"))
-    monkeypatch.setattr(checks, "CHECKS", (*CHECKS, Check(lambda _: [Issue(kind)], (kind,))))
-    assert codes() == ["too_late"]
 
 
 # ---- seeds and unchanged inputs
