@@ -26,10 +26,10 @@ HELD = replace(GREEN, panel=Panel("look"))
 GROUND, HIGH = Position(52.0, 5.0, 93.0), Position(52.0, 5.0, 112.0)
 
 
-def panel_file(path: Path, level: int = 33768) -> Band:
-    """A square of one level, (33768 - 1000) / 65536 = 0.5 by default, in the dark."""
+def panel_file(path: Path, levels: int | np.ndarray = 33768) -> Band:
+    """A square of one level or of (30, 30), by default (33768 - 1000) / 65536 = 0.5, in the dark."""
     pixels = np.full((48, 64), 2000, np.uint16)
-    pixels[5:35, 15:45] = level
+    pixels[5:35, 15:45] = levels
     tifffile.imwrite(path, pixels)
     panel = Panel("tags", "RP04", 0.4, AREA)
     return Band("Green", path, 1, 64, 48, "uint16", saturation_value=65520.0, radiometry=PLAIN, panel=panel)
@@ -53,61 +53,45 @@ def test_the_factor_is_reflectance_by_the_tags_or_the_user_over_radiance(tmp_pat
     assert read_panel(shown, {"red": 0.6}).bands[0].factor == pytest.approx(0.4)
 
 
-@pytest.mark.parametrize(("level", "problem"), [(65535, "saturated"), (900, "black")])
-def test_a_panel_that_cannot_be_measured_has_no_factor(tmp_path: Path, level: int, problem: str) -> None:
-    (result,) = read_panel(capture(panel_file(tmp_path / "a.tif", level)), {}).bands
-    assert problem in result.problem
-    assert result.factor is None
-
-
-def panel_in_light(path: Path, light: str) -> Band:
-    """A panel of 80 x 80 px with the noise of a camera, in this light."""
+def in_light(light: str) -> np.ndarray:
+    """Levels (30, 30) of a panel with the noise of a camera, in this light."""
     rng = np.random.default_rng(1)
-    square = rng.normal(1.0, 0.03, (80, 80))
+    panel = rng.normal(1.0, 0.03, (30, 30))
     if light.startswith("shadow"):
-        square[:, : int(light.split()[2]) * 80 // 100] *= 0.5
+        panel[:, : 5 + int(light.split()[2]) * 20 // 100] *= 0.5
     elif light == "noise":
-        square = rng.uniform(0.0, 2.0, (80, 80))
+        panel = rng.uniform(0.0, 2.0, (30, 30))
     elif light == "half black":
-        square[:40] = 0.0
-    pixels = np.full((120, 160), 2000, np.uint16)
-    pixels[20:100, 40:120] = np.clip(1000 + 20000 * square, 0, 65000)
-    tifffile.imwrite(path, pixels)
-    area = ((40.0, 20.0), (119.0, 20.0), (119.0, 99.0), (40.0, 99.0))
-    return replace(
-        panel_file(path.with_name("b.tif")),
-        path=path,
-        panel=Panel("tags", "RP04", 0.4, area),
-        width_px=160,
-        height_px=120,
-    )
+        panel[:15] = 0.0
+    return np.clip(1000 + 20000 * panel, 0, 65000)
 
 
 @pytest.mark.parametrize(
-    ("light", "is_measured"),
+    ("levels", "problem"),
     [
-        ("even", True),
-        ("shadow of 30 %", True),
-        ("shadow of 50 %", False),
-        ("shadow of 70 %", False),
-        ("noise", False),
-        ("half black", False),
+        (in_light("even"), ""),
+        (in_light("shadow of 30 %"), ""),
+        (in_light("shadow of 50 %"), "its pixels vary by "),
+        (in_light("shadow of 70 %"), "its pixels vary by "),
+        (in_light("noise"), "its pixels vary by "),
+        (in_light("half black"), "its pixels vary by "),
+        (900, "it is black"),
+        (65535, "saturated"),
     ],
 )
-def test_a_panel_is_measured_where_it_is_evenly_lit(tmp_path: Path, light: str, is_measured: bool) -> None:
+def test_a_panel_is_measured_where_it_is_evenly_lit_and_exposed(
+    tmp_path: Path, levels: int | np.ndarray, problem: str
+) -> None:
     """A shadow over 30 % of the panel, by half, would make every band 16 % too bright."""
-    (result,) = read_panel(capture(panel_in_light(tmp_path / "a.tif", light)), {}).bands
-    if is_measured:
-        assert (result.problem, result.radiance) == ("", pytest.approx(2.0 * 20000 / 65536, rel=0.03))
-    else:
-        assert "its pixels vary by" in result.problem or result.problem == "it is black"
+    reading = read_panel(capture(panel_file(tmp_path / "a.tif", levels)), {})
+    (result,) = reading.bands
+    if problem:
+        assert problem in result.problem
         assert result.factor is None
-
-
-def test_a_refused_panel_is_named_with_the_reason(tmp_path: Path) -> None:
-    reading = read_panel(capture(panel_in_light(tmp_path / "a.tif", "noise")), {})
-    (part,) = write_panels([reading], tmp_path)
-    assert "not used in Green: its pixels vary by " in part.sentence
+        (part,) = write_panels([reading], tmp_path)
+        assert f"not used in Green: {result.problem}" in part.sentence
+    else:
+        assert (result.problem, result.radiance) == ("", pytest.approx(2.0 * 20000 / 65536, rel=0.03))
 
 
 def test_illumination_is_interpolated_in_time_and_constant_outside() -> None:

@@ -159,6 +159,10 @@ def test_the_extremes_exclude_outliers() -> None:
     # Unused factors are equal in all captures: their extremes are the first capture.
     assert offsets == [pytest.approx(30 - 0.6 * 2), pytest.approx(30 + 0.6 * 3)]
     assert len(extreme_mappings(replace(rig(*captures), factors=()), "Red")) == 1
+    # If all captures are outliers, each in another factor, the least outlying one is kept.
+    steps = [capture(0.0, steps_px=steps_px) for steps_px in ((90.0, 0.0), (0.0, 70.0))]
+    (end,) = extreme_mappings(rig(capture(50.0), *steps), "Red")
+    assert end[0, 2] == pytest.approx(30 + 0.6 * 50)
 
 
 def test_the_summary_has_the_offset_of_the_centre_and_the_errors() -> None:
