@@ -6,9 +6,7 @@ import pytest
 
 from agalign.flight.learn_rig import learn_rig
 from agalign.flight.rig import Observation, Rig, distance_px
-from agalign.flight.rig_file import rig_from_json, rig_to_json
 from agalign.flight.rig_prediction import predict_band, unobserved_error_px
-from agalign.products.sidecar.schema import PredictionPart
 from agalign.values import geometry
 
 SIZE = 1280, 960
@@ -186,8 +184,7 @@ def test_interpolation_between_different_captures_has_an_error() -> None:
 def test_too_few_known_times_have_the_typical_error(known_times: int) -> None:
     sinking = [observation(10.0 * k if k < known_times else None, 0.5 * k, altitude_m=90.0 - k) for k in range(9)]
     rig = learn_rig(sinking, SIZE, {})
-    again = rig_from_json(rig_to_json(rig), {})
-    assert [s.seconds for s in again.captures] == [s.seconds for s in rig.captures] == [c.seconds for c in sinking]
+    assert [c.seconds for c in rig.captures] == [c.seconds for c in sinking]
     for band in BASELINES:
         unseen = predict_band(rig, band, Observation(35.0, {}, {}))
         # Without the times the error is that of the flight, not that of few captures.
@@ -212,8 +209,3 @@ def test_a_band_in_few_captures_has_a_finite_error() -> None:
     error, std = error_px(rig, "NIR", unobserved, mappings(0.5)["NIR"])
     assert error < 0.3
     assert error < 3 * std < 1.0
-    # Model files and sidecars contain only finite numbers.
-    assert "Infinity" not in rig_to_json(rig)
-    prediction = predict_band(rig, "NIR", unobserved)
-    part = PredictionPart(source=prediction.source, std_px=prediction.std_px, off_px=prediction.off_px)
-    assert PredictionPart.model_validate_json(part.model_dump_json()) == part
