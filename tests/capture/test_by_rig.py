@@ -81,11 +81,6 @@ def bands_of(five: Path, number: int, model: FlightModel) -> dict[str, Alignment
     return align_capture_bands(discover(five).captures[number], Settings(), model, lambda *_: None)
 
 
-def test_the_rig_of_the_flight_is_learned(model: FlightModel) -> None:
-    assert "distance" in model.rig.factors
-    assert set(model.rig.mean) == {"Blue", "Red", "NIR", "Red edge"}
-
-
 def test_a_valid_model_is_kept(five: Path, model: FlightModel) -> None:
     again = learned(five, model)
     assert again.net is model.net

@@ -78,25 +78,24 @@ def test_the_z_buffer_of_a_rough_relief(baseline: tuple[float, float]) -> None:
     np.testing.assert_array_equal(occluded(relief, baseline), expected)
 
 
-def matched(sign: int, baselines: np.ndarray, shown: float = 0.9, behind: float = 0.2) -> Relief:
+BASELINES = np.array([[1.0, 0.0], [0.0, 0.6]])
+
+
+def matched(sign: int, behind: float = 0.2) -> Relief:
     """A relief with low correlation of occluded pixels; with sign -1 all parallax is reversed."""
     z = layers().parallax_px
-    hidden = np.logical_or.reduce([occluded(layers(), (x, y)) for x, y in (sign * baselines).tolist()])
-    rng = np.random.default_rng(0)
-    confidence = np.where(hidden, behind, shown) + rng.normal(0, 0.05, z.shape)
+    hidden = np.logical_or.reduce([occluded(layers(), (x, y)) for x, y in (sign * BASELINES).tolist()])
+    confidence = np.where(hidden, behind, 0.9) + np.random.default_rng(0).normal(0, 0.05, z.shape)
     return Relief(z * np.float32(sign), confidence.astype(np.float32))
-
-
-BASELINES = np.array([[1.0, 0.0], [0.0, 0.6]])
 
 
 @pytest.mark.parametrize("sign", [1, -1])
 def test_pixels_that_match_are_nearer(sign: int) -> None:
-    assert nearer_sign(matched(sign, BASELINES), BASELINES) == sign
+    assert nearer_sign(matched(sign), BASELINES) == sign
 
 
 def test_the_sign_is_unknown_without_occlusions_or_if_occluded_pixels_match_too() -> None:
-    assert nearer_sign(matched(1, BASELINES, behind=0.9), BASELINES) == 0
+    assert nearer_sign(matched(1, behind=0.9), BASELINES) == 0
     assert nearer_sign(layers(near_px=0.0), BASELINES) == 0
-    small = Relief(layers((slice(20, 22), slice(30, 32))).parallax_px, matched(1, BASELINES).confidence)
+    small = Relief(layers((slice(20, 22), slice(30, 32))).parallax_px, matched(1).confidence)
     assert nearer_sign(small, BASELINES / 6) == 0

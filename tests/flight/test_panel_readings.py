@@ -108,29 +108,29 @@ def lit(irradiance: float, quantity: Quantity = "reflectance") -> Band:
     return replace(GREEN, radiometry=replace(PLAIN, by_sun=(np.pi / irradiance, quantity)))
 
 
-def lit_panel(moment: str, irradiance: float, measured: float, quantity: Quantity = "reflectance") -> PanelReading:
-    """A panel of reflectance 0.5 under an irradiance that the light sensor measures as `measured`."""
+def lit_panel(moment: str, measured: float, quantity: Quantity = "reflectance") -> PanelReading:
+    """A panel of reflectance 0.5 under an irradiance of 1 that the light sensor measures as `measured`."""
     band = lit(measured, quantity)
-    return PanelReading(capture(band, moment), (BandReading(band, 0.5, 0.5 * irradiance / np.pi),))
+    return PanelReading(capture(band, moment), (BandReading(band, 0.5, 0.5 / np.pi),))
 
 
 def test_the_panel_scales_the_light_sensor_which_follows_the_light() -> None:
     """53 minutes after the panel, the sensor measures 15 % more light; it shows 0.9 of the light on the panel."""
-    panel, later = lit_panel("2026-06-21T15:04:00", 1.0, 0.9), capture(lit(0.9 * 1.15), "2026-06-21T15:57:00")
+    panel, later = lit_panel("2026-06-21T15:04:00", 0.9), capture(lit(0.9 * 1.15), "2026-06-21T15:57:00")
     result = reflectance_factors(later, [panel])
     assert result == {"Green": (pytest.approx(np.pi / 1.15), "panel and light sensor", 53 * 60)}
     (band,) = with_radiometry(later, "auto", result).bands
     assert (band.radiometry.source, band.radiometry.panel_age_s) == ("panel and light sensor", 53 * 60)
     assert band.radiometry.gain == pytest.approx(PLAIN.gain * np.pi / 1.15)
     # Between two panels, the scale of the sensor is interpolated.
-    two = [panel, lit_panel("2026-06-21T16:50:00", 1.0, 1.0)]
+    two = [panel, lit_panel("2026-06-21T16:50:00", 1.0)]
     scale = (1 / 0.9 + 1.0) / 2
     assert reflectance_factors(later, two)["Green"].value == pytest.approx(np.pi / (0.9 * 1.15) / scale)
 
 
 def test_a_light_sensor_that_was_shaded_at_the_panel_is_not_combined_with_it() -> None:
     later = capture(lit(1.2), "2026-06-21T10:30:00")
-    shaded, good = lit_panel("2026-06-21T10:00:00", 1.0, 0.6), lit_panel("2026-06-21T11:00:00", 1.0, 1.0)
+    shaded, good = lit_panel("2026-06-21T10:00:00", 0.6), lit_panel("2026-06-21T11:00:00", 1.0)
     assert shaded.sensor_scales == {"Green": pytest.approx(1 / 0.6)}
     assert [r.fits_sensor for r in (shaded, good)] == [False, True]
     for panels in ([shaded], [shaded, good]):
@@ -139,7 +139,7 @@ def test_a_light_sensor_that_was_shaded_at_the_panel_is_not_combined_with_it() -
         sources = [with_radiometry(later, c, factors).bands[0].radiometry.source for c in ("auto", "panel", "sun")]
         assert sources == ["light sensor", "panel", "light sensor"]
     # A sensor with an unknown unit has any scale.
-    relative = lit_panel("2026-06-21T10:00:00", 1.0, 3000.0, "relative reflectance")
+    relative = lit_panel("2026-06-21T10:00:00", 3000.0, "relative reflectance")
     assert (relative.sensor_scales, relative.fits_sensor) == ({}, True)
     in_same_unit = capture(lit(3300.0, "relative reflectance"), "2026-06-21T10:30:00")
     assert reflectance_factors(in_same_unit, [relative])["Green"].value == pytest.approx(np.pi / 1.1)
