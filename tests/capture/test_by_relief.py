@@ -97,7 +97,6 @@ class Rendered:
 
     def correlation(self, mapping: PixelMapping) -> float:
         """Return the correlation of range and parallax, which is negative: positive parallax is nearer."""
-        assert mapping.parallax is not None
         parallax_px = mapping.parallax.relief(self.pixels)
         return float(np.corrcoef(parallax_px.ravel(), self.truth.range_m.ravel())[0, 1])
 

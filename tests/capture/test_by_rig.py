@@ -202,7 +202,6 @@ def test_a_more_accurate_prediction_by_windows_is_kept(five: Path, model: Flight
     pairs, _ = read_pairs(capture, settings.seed, model)
     result = align_pairs(pairs, settings, lambda *_: None, model)
     nir = result["NIR"]
-    assert model.rig is not None
     for std_px, away_px, source in ((0.001, 0.0, "windows"), (50.0, 0.0, "bands"), (0.001, 40.0, "bands")):
         matrix = geometry.compose(geometry.translation(away_px, 0), nir.fixed_to_moving)
         mapping = replace(nir.mapping, fixed_to_moving=matrix)

@@ -102,9 +102,7 @@ def test_the_map_estimate_without_a_colour_ignores_its_windows(border_px: int) -
 
     def halves(image: np.ndarray) -> tuple[np.ndarray, ...]:
         pair = pair_of(whole(fixed), with_border(image, border_px))
-        by_halves = _candidates([(pair, SEED)], [result], None, Settings())["moving"].by_halves
-        assert by_halves is not None
-        return by_halves
+        return _candidates([(pair, SEED)], [result], None, Settings())["moving"].by_halves
 
     def change_px(one: np.ndarray, other: np.ndarray) -> float:
         return geometry.corner_error_px(one, other, *fixed.shape[::-1])

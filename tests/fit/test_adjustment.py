@@ -90,7 +90,6 @@ def test_priors_do_not_depend_on_the_noise_of_a_band() -> None:
     shift = heights()[::6, None, None] * BASELINES + rng.normal(0, 0.02, (len(few), 4, 2))
     shift[:, 1] += rng.normal((20, -20), 1.5, (len(few), 2))
     model = adjust(WindowShifts(few, few, shift, np.ones((len(few), 4))), SIZE, BASELINES)
-    assert model is not None
     error_px = shifts_by_corners(model, few, SIZE)[:, 1] - [20, -20]
     assert np.abs(error_px.mean(axis=0)).max() < 0.5
 
@@ -133,7 +132,6 @@ def test_lens_fields_are_recovered_next_to_parallax() -> None:
     left = shifts_by_corners(model, POINTS, SIZE) - planes() - lens_fields()
     for band, fit in enumerate(model.fits):
         field = fit.applied_to(PixelMapping(np.eye(3))).field
-        assert field is not None
         error_px = np.linalg.norm(left[:, band] + field(POINTS), axis=1)
         assert np.percentile(error_px, 95) < 0.25
         assert np.median(error_px) < 0.08

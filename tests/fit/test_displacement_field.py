@@ -72,7 +72,6 @@ def of_captures(count: int, height: float, seed: int) -> list[Residual]:
 
 def test_the_common_field_of_captures_is_that_of_the_lenses() -> None:
     field = common_field(of_captures(6, 0.4, 1), SIZE)
-    assert field is not None
     at = geometry.lattice(*SIZE, 17, 13)
     left = np.linalg.norm(field(at) - bump(at, 0.4), axis=1)
     assert np.sqrt((left**2).mean()) < 0.5 * np.sqrt((bump(at, 0.4) ** 2).sum(-1).mean())

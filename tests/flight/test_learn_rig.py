@@ -114,7 +114,6 @@ def test_an_unseen_altitude_increases_the_standard_error() -> None:
         for k in range(5)
     ]
     rig = learn_rig(level, SIZE, BASELINES)
-    assert rig is not None
     bars = [predict_band(rig, "NIR", Observation(2.5, {}, {}, altitude_m)).std_px for altitude_m in (101.0, 90.0, None)]
     assert bars[0] < 0.6
     assert bars[1] > 2.0
@@ -170,7 +169,6 @@ def test_interpolation_between_different_captures_has_an_error() -> None:
     panel = replace(observation(0.0, 100.0), altitude_m=1.0)
     others = [replace(observation(10.0 * k, 0.1 * (k % 3)), altitude_m=28.0 + 0.1 * (k % 3)) for k in range(1, 9)]
     rig = learn_rig([panel, *others], SIZE, BASELINES)
-    assert rig is not None
     unobserved = Observation(6.0, {}, {}, 28.1)
     error, std = error_px(rig, "NIR", unobserved, mappings(0.1)["NIR"])
     assert error < min(1.0, 3 * std)
