@@ -179,7 +179,6 @@ def test_the_summary_has_the_offset_of_the_centre_and_the_errors() -> None:
 
 
 LENSES = np.array([[0.6, 0.0, 0.2], [0.0, 0.7, -0.5], [-0.3, 0.2, 0.8]])
-DESIGNS = np.tensordot(LENSES, design_tensor(("distance", "tilt", "motion")), 1)
 DISTANCE = np.tensordot(LENSES, design_tensor(("distance",)), 1)
 
 
@@ -200,7 +199,7 @@ def test_the_median_mapping_ignores_an_outlier() -> None:
 
 
 def test_unused_factors_are_0_and_an_outlier_band_hardly_changes_the_others() -> None:
-    differences = np.einsum("bakf,cf->cbak", DESIGNS, np.array([[3.0, 0, 0, 0, 0]]))
+    differences = np.einsum("bakf,cf->cbak", DISTANCE, np.array([[3.0, 0, 0, 0, 0]]))
     result = capture_factors(DISTANCE, differences, np.full((1, 3), 1e4)).mean
     assert result[0, 0] == pytest.approx(3.0, abs=1e-3)
     assert not result[0, 1:].any()

@@ -17,7 +17,6 @@ SIZE = (1280, 960)
 JOINT = joint_result(std_px=0.07)
 RESIDUAL = replace(residual_of(np.zeros((50, 2)), np.zeros((50, 2))), median_px=0.05, p95_px=0.2)
 GOOD = Evidence(JOINT, RESIDUAL, SIZE)
-PREDICTION = Prediction(np.eye(3), "bands", std_px=0.2)
 STRETCHED = np.array([[1.0, 0, 0], [0, 1, 0], [-5e-4, 0, 1]])
 NAN = float("nan")
 
@@ -90,7 +89,7 @@ def test_results_and_windows_pass_at_their_limits(
     [(None, 0.2, False), (2.9, 0.2, False), (3.1, 0.2, True), (4.9, 1.0, False), (5.1, 1.0, True), (NAN, 0.2, True)],
 )
 def test_a_result_far_from_the_rig_is_an_issue(off_px: float | None, std_px: float, is_issue: bool) -> None:
-    prediction = replace(PREDICTION, off_px=off_px, std_px=std_px)
+    prediction = Prediction(np.eye(3), "bands", std_px, off_px=off_px)
     assert codes(replace(GOOD, prediction=prediction)) == ["unexpected_px"] * is_issue
 
 
