@@ -62,9 +62,9 @@ def rms(vectors: np.ndarray) -> float:
     return float(np.sqrt((vectors**2).sum(axis=1).mean()))
 
 
-def displaced_views(displacement: Callable[[np.ndarray], np.ndarray], seed: int = 4) -> list[Raster]:
+def displaced_views(displacement: Callable[[np.ndarray], np.ndarray]) -> list[Raster]:
     """Views of 640 x 480 px in which the moving image shows at x + d(x) what the fixed one shows at x."""
-    fixed, moving = two_views(np.eye(3), 640, 480, seed)
+    fixed, moving = two_views(np.eye(3), 640, 480, seed=4)
     grid = np.stack(np.meshgrid(np.arange(640.0), np.arange(480.0)), -1)
     # Two iterations invert x + d(x).
     back = (grid - displacement(grid - displacement(grid))).astype(np.float32)

@@ -8,12 +8,11 @@ from synthetic_flights.cameras import ALTUM
 from synthetic_flights.troubles import make_two_headings
 
 import agalign
-from agalign.cameras.discover import DiscoverOptions, discover
+from agalign.cameras.discover import discover
 from agalign.capture import band_pair
-from agalign.capture.align_bands import align_capture_bands
 from agalign.capture.band_pair import _seed_std_px, longest_for, read_pairs
 from agalign.capture.by_rig import observed
-from agalign.config import SeedSettings, Settings
+from agalign.config import SeedSettings
 from agalign.flight.model import FlightModel
 from agalign.flight.rig import Rig
 from agalign.synthetic.flight import score_against_truth
@@ -27,23 +26,11 @@ from ..builders import joint_result, pair_of, whole
 pytestmark = pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
 
 
-@pytest.mark.parametrize("kind", ["rig", "geo"])
-def test_a_seed_that_tags_do_not_give_is_not_replaced_by_another(flight: Path, kind: str) -> None:
-    capture = discover(flight, DiscoverOptions(ignore_metadata=True)).captures[0]
-    settings = Settings(seed=SeedSettings(force=kind))
-    result = align_capture_bands(capture, settings, None, lambda *_: None)
-    assert {a.status for a in result.values()} == {"failed"}
-    assert {a.reason for a in result.values()} == {f"this band has no {kind} seed; omit --seed"}
-
-
 def test_the_reference_is_computed_once_for_all_bands(flight: Path) -> None:
     pairs, left_out = read_pairs(discover(flight).captures[0], SeedSettings())
     assert not left_out
     assert len(pairs) == 4
     assert len({id(p.reference) for p in pairs}) == 1
-    reference = pairs[0].reference
-    assert reference.seed_spectrum is reference.seed_spectrum
-    assert reference.windows is pairs[3].reference.windows
     assert all(p.space == "undistorted" for p in pairs)
 
 

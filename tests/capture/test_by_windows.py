@@ -175,24 +175,24 @@ def test_covered_images_georeferenced_files_and_failed_pairs_are_unchanged(left:
         assert extrapolated(one, alignment) is alignment
 
 
-@pytest.mark.parametrize(("extrapolation_px", "status"), [({}, "aligned"), ({"moving": 0.7}, "predicted")])
-def test_a_rig_of_the_whole_image_prevents_extrapolation(
-    left: tuple[BandPair, Alignment], extrapolation_px: dict[str, float], status: str
+@pytest.mark.parametrize(
+    ("facts", "status"),
+    [
+        ({}, "aligned"),
+        ({"extrapolation_px": {"moving": 0.7}}, "predicted"),
+        ({"parallax_px": {"moving": 4.0}}, "predicted"),
+    ],
+)
+def test_a_rig_of_the_whole_image_without_relief_prevents_extrapolation(
+    left: tuple[BandPair, Alignment], facts: dict[str, dict[str, float]], status: str
 ) -> None:
-    std_px = {"moving": 0.1}
-    mean, baselines, delays = {"moving": MATRIX}, {"moving": (1.0, 0.0)}, {"moving": 0.0}
-    rig = Rig(SIZE, mean, baselines, delays, std_px, (), (), std_px, extrapolation_px=extrapolation_px)
-    pair, before = left
-    assert extrapolated(replace(pair, seed_std_px={"model": 1.0}), before, rig).status == status
-
-
-def test_a_homography_does_not_extrapolate_the_relief_of_a_flight(left: tuple[BandPair, Alignment]) -> None:
     std_px, pair = {"moving": 0.1}, replace(left[0], seed_std_px={"model": 1.0})
-    rig = Rig(SIZE, {"moving": MATRIX}, {"moving": (1.0, 0.0)}, {"moving": 0.0}, std_px, (), (), std_px)
-    after = extrapolated(pair, left[1], replace(rig, parallax_px={"moving": 4.0}))
-    assert after.status == "predicted"
-    assert after.prediction.std_px > 4.0
-    assert expected_error_px(after, SIZE, np.array([[320.0, 240.0]]))[0] > 3.5
+    rig = Rig(SIZE, {"moving": MATRIX}, {"moving": (1.0, 0.0)}, {"moving": 0.0}, std_px, (), (), std_px, **facts)
+    after = extrapolated(pair, left[1], rig)
+    assert after.status == status
+    if "parallax_px" in facts:
+        assert after.prediction.std_px > 4.0
+        assert expected_error_px(after, SIZE, np.array([[320.0, 240.0]]))[0] > 3.5
 
 
 @pytest.mark.slow

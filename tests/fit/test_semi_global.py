@@ -23,38 +23,16 @@ def by_definition(costs: np.ndarray, small: int, large: int) -> np.ndarray:
     return total
 
 
-@pytest.mark.parametrize(("labels", "small", "large"), [(5, 6, 40), (7, 3, 15), (3, 10, 10), (1, 2, 5), (2, 2, 5)])
+@pytest.mark.parametrize(
+    ("labels", "small", "large"), [(5, 6, 40), (7, 3, 15), (3, 10, 10), (1, 2, 5), (6, 9, MAX_LARGE)]
+)
 def test_four_paths(labels: int, small: int, large: int) -> None:
-    costs = np.random.default_rng(labels).integers(0, 100, (labels, 6, 8)).astype(np.uint8)
+    """With the highest costs that do not overflow."""
+    some = np.array([0, 13, 60, 61, 255 - small - large], np.uint8)
+    costs = np.random.default_rng(labels).choice(some, (labels, 6, 8))
     given = costs.copy()
     np.testing.assert_array_equal(aggregated(costs, small, large), by_definition(costs, small, large))
     np.testing.assert_array_equal(costs, given)
-
-
-def test_the_highest_costs_and_penalties_do_not_overflow() -> None:
-    small, highest = 9, 255 - 9 - MAX_LARGE
-    costs = np.random.default_rng(0).choice(np.array([0, highest], np.uint8), (6, 9, 7))
-    np.testing.assert_array_equal(aggregated(costs, small, MAX_LARGE), by_definition(costs, small, MAX_LARGE))
-
-
-def test_edges_are_preserved_and_noise_is_removed() -> None:
-    rng = np.random.default_rng(0)
-    truth = np.where(np.arange(30)[None, :] < 13, 2, 6).repeat(20, axis=0).reshape(20, 30)
-    costs = rng.integers(60, 100, (9, 20, 30)).astype(np.uint8)
-    np.put_along_axis(costs, truth[None], 40, axis=0)
-    wrong = rng.random(truth.shape) < 0.15
-    costs[0][wrong] = 10
-    raw, smooth = costs.argmin(axis=0), aggregated(costs, 15, 60).argmin(axis=0)
-    assert (raw != truth).mean() > 0.1
-    assert (smooth != truth).mean() < 0.02
-
-
-@pytest.mark.parametrize("dtype", [np.uint16, np.float32])
-@pytest.mark.parametrize("at", [1.0, 1.4, 3.0, 3.45, 4.62, 5.0])
-def test_the_minimum_of_a_parabola(at: float, dtype: type) -> None:
-    labels = np.arange(7)
-    costs = np.round(1000 * (labels - at) ** 2 + 50).astype(dtype)[:, None, None]
-    assert sub_label_minimum(costs)[0, 0] == pytest.approx(at, abs=1e-3)
 
 
 @pytest.mark.parametrize(
@@ -72,7 +50,8 @@ def test_at_the_borders_there_is_no_parabola(costs: list[float], label: float) -
     assert sub_label_minimum(volume)[0, 0] == pytest.approx(label, abs=1e-6)
 
 
-def test_every_pixel_has_its_own_minimum() -> None:
+@pytest.mark.parametrize("dtype", [np.uint16, np.float32])
+def test_every_pixel_has_its_own_minimum(dtype: type) -> None:
     at = np.random.default_rng(0).uniform(0.6, 4.4, (5, 6))
-    costs = ((np.arange(6)[:, None, None] - at) ** 2).astype(np.float32)
-    np.testing.assert_allclose(sub_label_minimum(costs), at, atol=1e-4)
+    costs = np.round(1000 * (np.arange(6)[:, None, None] - at) ** 2 + 50).astype(dtype)
+    np.testing.assert_allclose(sub_label_minimum(costs), at, atol=1e-3)

@@ -6,11 +6,8 @@ import pytest
 
 from agalign.flight.learn_rig import learn_rig
 from agalign.flight.rig import Observation, Rig, distance_px
-from agalign.flight.rig_file import rig_from_json, rig_to_json
-from agalign.flight.rig_prediction import extreme_mappings, predict_band, unobserved_error_px
-from agalign.products.sidecar.schema import PredictionPart
+from agalign.flight.rig_prediction import predict_band, unobserved_error_px
 from agalign.values import geometry
-from agalign.values.displacement import DisplacementField
 
 SIZE = 1280, 960
 BASELINES = {"Blue": (0.9, 0.0), "Red": (0.0, 0.65), "NIR": (0.9, 0.7), "Red edge": (0.4, 0.35)}
@@ -42,36 +39,18 @@ def flight(count: int = 8) -> list[Observation]:
     return [observation(float(k), rng.normal(), noise=0.03, seed=k) for k in range(count)]
 
 
-@pytest.fixture(scope="module")
-def rig() -> Rig:
-    return learn_rig(flight(), SIZE, {})
-
-
-@pytest.fixture(scope="module")
-def sinking_rig() -> Rig:
-    """The rig of a drone that descends steadily."""
-    return learn_rig([observation(10.0 * k, 0.5 * k) for k in range(9)], SIZE, {})
-
-
 def error_px(rig: Rig, band: str, known: Observation, truth: np.ndarray) -> tuple[float, float]:
     prediction = predict_band(rig, band, known)
     return distance_px(prediction.fixed_to_moving, truth, SIZE), prediction.std_px
 
 
-def test_the_baselines_are_estimated_up_to_a_factor(rig: Rig) -> None:
+def test_the_baselines_are_estimated_up_to_a_factor() -> None:
+    rig = learn_rig(flight(), SIZE, {})
     assert rig.factors == ("distance",)
     result, wanted = (np.array([b[name] for name in BASELINES]) for b in (rig.baselines, BASELINES))
     wanted = wanted / np.linalg.norm(wanted)
     assert abs((result * wanted).sum()) > 0.995
     assert np.linalg.norm(result) == pytest.approx(1)
-
-
-def test_a_band_is_predicted_from_the_others(rig: Rig) -> None:
-    low = observation(9.0, 4.0, without="NIR")
-    error, std = error_px(rig, "NIR", low, mappings(4.0)["NIR"])
-    assert error < min(0.3, 2 * std)
-    assert predict_band(rig, "NIR", low).source == "bands"
-    assert distance_px(rig.mean["NIR"], mappings(4.0)["NIR"], SIZE) > 3
 
 
 @pytest.mark.slow
@@ -111,42 +90,22 @@ def test_the_parallax_of_a_flight_is_the_rms_over_its_captures() -> None:
 
 
 @pytest.mark.slow
-def test_an_aliased_band_does_not_bias_the_others(rig: Rig) -> None:
-    known = observation(9.0, 1.0)
-    wrong = geometry.compose(geometry.translation(40.0, 0.0), known.mappings["Blue"])
-    outlier = Observation(9.0, {**known.mappings, "Blue": wrong}, known.std_px)
-    for band in ("Red", "NIR", "Red edge"):
-        assert error_px(rig, band, outlier, mappings(1.0)[band])[0] < 1.0
-    assert error_px(rig, "Blue", outlier, wrong)[0] > 35
-
-
-@pytest.mark.slow
-def test_a_capture_without_bands_is_interpolated_between_its_neighbours(sinking_rig: Rig) -> None:
+def test_a_capture_without_bands_is_interpolated_between_its_neighbours() -> None:
     """The drone descends steadily: interpolation is more accurate than the flight's mean."""
-    prediction = predict_band(sinking_rig, "NIR", Observation(35.0, {}, {}))
+    rig = learn_rig([observation(10.0 * k, 0.5 * k) for k in range(9)], SIZE, {})
+    prediction = predict_band(rig, "NIR", Observation(35.0, {}, {}))
     assert prediction.source == "neighbours"
     assert distance_px(prediction.fixed_to_moving, mappings(1.75)["NIR"], SIZE) < 0.3
     # A capture of unknown time is not one at time 0.
     for altitude_m in (None, 100.0):
-        prediction = predict_band(sinking_rig, "NIR", Observation(None, {}, {}, altitude_m))
+        prediction = predict_band(rig, "NIR", Observation(None, {}, {}, altitude_m))
         assert prediction.source == "flight"
-        np.testing.assert_allclose(prediction.fixed_to_moving, sinking_rig.mean["NIR"], atol=1e-4)
+        np.testing.assert_allclose(prediction.fixed_to_moving, rig.mean["NIR"], atol=1e-4)
 
 
 def test_too_few_captures_give_no_rig() -> None:
     assert learn_rig(flight(2), SIZE, {}) is None
     assert learn_rig([], SIZE, BASELINES) is None
-
-
-def test_a_rig_is_read_back_as_it_was_written(rig: Rig) -> None:
-    field = DisplacementField(32.0, np.random.default_rng(0).normal(size=(31, 41, 2)))
-    rig = replace(rig, fields={"Red": field}, extrapolation_px={"Red": 0.7})
-    again = rig_from_json(rig_to_json(rig), {"Red": field.displacements_px})
-    np.testing.assert_array_equal(again.mean["NIR"], rig.mean["NIR"])
-    np.testing.assert_array_equal(again.fields["Red"].displacements_px, field.displacements_px)
-    names = "baselines", "baseline_std", "delays", "factors", "captures", "from_bands_px", "size_px"
-    for name in (*names, "extrapolation_px"):
-        assert getattr(again, name) == getattr(rig, name)
 
 
 def test_an_unseen_altitude_increases_the_standard_error() -> None:
@@ -155,19 +114,10 @@ def test_an_unseen_altitude_increases_the_standard_error() -> None:
         for k in range(5)
     ]
     rig = learn_rig(level, SIZE, BASELINES)
-    assert rig is not None
     bars = [predict_band(rig, "NIR", Observation(2.5, {}, {}, altitude_m)).std_px for altitude_m in (101.0, 90.0, None)]
     assert bars[0] < 0.6
     assert bars[1] > 2.0
     assert bars[2] < 0.6
-
-
-def test_errors_of_captures_left_out_and_inconsistent_bands_increase_the_standard_error(rig: Rig) -> None:
-    alike, unlike = (observation(9.0, 0.5, without="NIR", noise=noise, seed=3) for noise in (0.0, 3.0))
-    worse = replace(rig, from_bands_px={**rig.from_bands_px, "NIR": 2.0})
-    assert predict_band(rig, "NIR", alike).std_px < 0.2
-    assert predict_band(worse, "NIR", alike).std_px >= 2.0
-    assert predict_band(rig, "NIR", unlike).std_px > 1
 
 
 DELAYS = {"Blue": 0.0, "Red": 0.4, "NIR": 1.0, "Red edge": 0.7}
@@ -219,7 +169,6 @@ def test_interpolation_between_different_captures_has_an_error() -> None:
     panel = replace(observation(0.0, 100.0), altitude_m=1.0)
     others = [replace(observation(10.0 * k, 0.1 * (k % 3)), altitude_m=28.0 + 0.1 * (k % 3)) for k in range(1, 9)]
     rig = learn_rig([panel, *others], SIZE, BASELINES)
-    assert rig is not None
     unobserved = Observation(6.0, {}, {}, 28.1)
     error, std = error_px(rig, "NIR", unobserved, mappings(0.1)["NIR"])
     assert error < min(1.0, 3 * std)
@@ -233,8 +182,7 @@ def test_interpolation_between_different_captures_has_an_error() -> None:
 def test_too_few_known_times_have_the_typical_error(known_times: int) -> None:
     sinking = [observation(10.0 * k if k < known_times else None, 0.5 * k, altitude_m=90.0 - k) for k in range(9)]
     rig = learn_rig(sinking, SIZE, {})
-    again = rig_from_json(rig_to_json(rig), {})
-    assert [s.seconds for s in again.captures] == [s.seconds for s in rig.captures] == [c.seconds for c in sinking]
+    assert [c.seconds for c in rig.captures] == [c.seconds for c in sinking]
     for band in BASELINES:
         unseen = predict_band(rig, band, Observation(35.0, {}, {}))
         # Without the times the error is that of the flight, not that of few captures.
@@ -259,19 +207,3 @@ def test_a_band_in_few_captures_has_a_finite_error() -> None:
     error, std = error_px(rig, "NIR", unobserved, mappings(0.5)["NIR"])
     assert error < 0.3
     assert error < 3 * std < 1.0
-    # Model files and sidecars contain only finite numbers.
-    assert "Infinity" not in rig_to_json(rig)
-    prediction = predict_band(rig, "NIR", unobserved)
-    part = PredictionPart(source=prediction.source, std_px=prediction.std_px, off_px=prediction.off_px)
-    assert PredictionPart.model_validate_json(part.model_dump_json()) == part
-
-
-def test_extremes_of_outliers_are_the_least_outlying_capture() -> None:
-    rig = learn_rig(flight(3), SIZE, {})
-    outliers = [(90.0, 0.0, 0.0, 0.0, 0.0), (0.0, 50.0, 0.0, 0.0, 0.0), (0.0, 0.0, 70.0, 0.0, 0.0)]
-    captures = tuple(replace(c, factors=f) for c, f in zip(rig.captures, outliers, strict=True))
-    rig = replace(rig, factors=("distance", "tilt"), captures=captures)
-    (extreme,) = extreme_mappings(rig, "NIR")
-    tilted = np.array(rig.baselines["NIR"]) * 50.0
-    moved_px = geometry.apply(extreme, [1279.0, 479.5]) - geometry.apply(rig.mean["NIR"], [1279.0, 479.5])
-    np.testing.assert_allclose(moved_px, tilted * 1.5, rtol=0.02)

@@ -4,7 +4,7 @@ import json
 import math
 import os
 import struct
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import numpy as np
@@ -22,7 +22,7 @@ from agalign.values.alignment import JointResult, RefinedPair, Seed
 from agalign.values.displacement import DisplacementField
 from agalign.values.pixel_units import FixedImagePx, MovingFilePx
 
-FIELD = DisplacementField(48.0, np.arange(24.0).reshape(3, 4, 2) / 100)
+FIELD = DisplacementField(40.0, np.arange(24.0).reshape(3, 4, 2) / 100)
 
 SEED = Seed("structure", geometry.translation(1 / 3, 0.1), 20.0, 18.0, 2.5, trusted=True)
 RESULT = JointResult[FixedImagePx](
@@ -38,11 +38,8 @@ RESULT = JointResult[FixedImagePx](
     ((0.1, 0.2), (0.1, 0.2), (0.3, 0.2), (0.1, 1 / 3)),
     np.eye(8) / 3,
 )
-SIZES_PX = ((640, 480), (320, 240))
-REFINED = {
-    "key": {"Red": RefinedPair(SEED, RESULT, SIZES_PX)},
-    "other": {"NIR": RefinedPair(SEED, replace(RESULT, corner_covariance_px2=None), SIZES_PX)},
-}
+PAIR = RefinedPair(SEED, RESULT, ((640, 480), (320, 240)))
+REFINED = {"key": {"Red": PAIR}, "other": {"NIR": replace(PAIR, result=replace(RESULT, corner_covariance_px2=None))}}
 
 
 def load(path: Path) -> FlightModel:
@@ -57,6 +54,7 @@ def model() -> FlightModel:
     mappings = {"Red": geometry.translation(3, 4), "NIR": geometry.translation(-1, 2)}
     by_band = {"Red": mappings["Red"]}, {"Red": (1.0, 0.0)}, {"Red": 0.5}, {"Red": 0.01}
     rig = Rig((640, 480), *by_band, ("distance",), captures, {"Red": MovingFilePx(0.1)}, fields={"Red": FIELD})
+    rig = replace(rig, extrapolation_px={"Red": MovingFilePx(0.7)}, parallax_px={"Red": MovingFilePx(3.0)})
     return FlightModel(net, "Maker Model 1 [Green 640x480]", ("Red", "NIR"), mappings, "abc", rig, REFINED)
 
 
@@ -69,36 +67,20 @@ def path(model: FlightModel, tmp_path: Path) -> Path:
 
 def test_a_model_is_read_back_as_it_was_written(model: FlightModel, path: Path) -> None:
     again = load(path)
-    assert (again.camera, again.bands, again.fingerprint) == (model.camera, model.bands, model.fingerprint)
     assert again.net.channels == (1, 1, 1)
     for name, value in model.net.state_dict().items():
         assert torch.equal(again.net.state_dict()[name], value)
-    assert set(again.mappings) == {"Red", "NIR"}
-    for band, mapping in model.mappings.items():
-        np.testing.assert_array_equal(again.mappings[band], mapping)
-    same = ("size_px", "baselines", "delays", "baseline_std", "factors", "captures", "from_bands_px")
-    assert [getattr(again.rig, n) for n in same] == [getattr(model.rig, n) for n in same]
-    np.testing.assert_array_equal(again.rig.fields["Red"].displacements_px, FIELD.displacements_px)
-    assert again.rig.fields["Red"].step_px == 48.0
+    np.testing.assert_equal(asdict(replace(again, net=None)), asdict(replace(model, net=None)))
     camera, rig = read_rig(path)
     assert camera == model.camera
-    assert rig.captures == model.rig.captures
-
-
-def test_refined_mappings_are_read_back_exactly(path: Path) -> None:
-    again = load(path).refined
-    assert {key: list(pairs) for key, pairs in again.items()} == {"key": ["Red"], "other": ["NIR"]}
-    pair = again["key"]["Red"]
-    assert pair.sizes_px == SIZES_PX
-    np.testing.assert_equal(vars(pair.seed), vars(SEED))
-    np.testing.assert_equal(vars(pair.result), vars(RESULT))
-    assert again["other"]["NIR"].result.corner_covariance_px2 is None
+    np.testing.assert_equal(asdict(rig), asdict(model.rig))
 
 
 def test_equal_models_have_equal_bytes_with_and_without_a_rig(model: FlightModel, path: Path, tmp_path: Path) -> None:
     other, plain = (tmp_path / f"{n}.safetensors" for n in ("other", "plain"))
     save_model(model, other)
     assert path.read_bytes() == other.read_bytes()
+    assert struct.unpack_from("<Q", path.read_bytes())[0] % 8 == 0, "the tensors after the header are aligned"
     (tmp_path / "any").touch()
     assert path.stat().st_mode == (tmp_path / "any").stat().st_mode, "everybody who reads other files reads models"
     save_model(replace(model, rig=None), plain)
@@ -165,12 +147,3 @@ def test_values_that_are_not_finite_or_too_large_are_an_error(model: FlightModel
             load(unreadable)
     with pytest.raises(InputError, match=r"m\.safetensors: its rig cannot be read"):
         read_rig(path)
-
-
-def test_metadata_is_sorted_in_the_file(path: Path) -> None:
-    (length,) = struct.unpack_from("<Q", path.read_bytes())
-    header = json.loads(path.read_bytes()[8 : 8 + length])
-    names = {"format", "agalign", "camera", "bands", "sharing", "channels", "fingerprint", "rig", "refined", "digest"}
-    assert set(header["__metadata__"]) == names
-    assert list(header) == sorted(header)
-    assert length % 8 == 0

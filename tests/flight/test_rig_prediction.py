@@ -159,6 +159,10 @@ def test_the_extremes_exclude_outliers() -> None:
     # Unused factors are equal in all captures: their extremes are the first capture.
     assert offsets == [pytest.approx(30 - 0.6 * 2), pytest.approx(30 + 0.6 * 3)]
     assert len(extreme_mappings(replace(rig(*captures), factors=()), "Red")) == 1
+    # If all captures are outliers, each in another factor, the least outlying one is kept.
+    steps = [capture(0.0, steps_px=steps_px) for steps_px in ((90.0, 0.0), (0.0, 70.0))]
+    (end,) = extreme_mappings(rig(capture(50.0), *steps), "Red")
+    assert end[0, 2] == pytest.approx(30 + 0.6 * 50)
 
 
 def test_the_summary_has_the_offset_of_the_centre_and_the_errors() -> None:
@@ -175,7 +179,6 @@ def test_the_summary_has_the_offset_of_the_centre_and_the_errors() -> None:
 
 
 LENSES = np.array([[0.6, 0.0, 0.2], [0.0, 0.7, -0.5], [-0.3, 0.2, 0.8]])
-DESIGNS = np.tensordot(LENSES, design_tensor(("distance", "tilt", "motion")), 1)
 DISTANCE = np.tensordot(LENSES, design_tensor(("distance",)), 1)
 
 
@@ -196,7 +199,7 @@ def test_the_median_mapping_ignores_an_outlier() -> None:
 
 
 def test_unused_factors_are_0_and_an_outlier_band_hardly_changes_the_others() -> None:
-    differences = np.einsum("bakf,cf->cbak", DESIGNS, np.array([[3.0, 0, 0, 0, 0]]))
+    differences = np.einsum("bakf,cf->cbak", DISTANCE, np.array([[3.0, 0, 0, 0, 0]]))
     result = capture_factors(DISTANCE, differences, np.full((1, 3), 1e4)).mean
     assert result[0, 0] == pytest.approx(3.0, abs=1e-3)
     assert not result[0, 1:].any()

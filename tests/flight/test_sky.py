@@ -65,7 +65,6 @@ def test_the_light_sensor_gives_the_direction_of_the_camera(pitch: float, roll: 
     angles = {"Yaw": 1.0, "Pitch": pitch, "Roll": roll}
     tags = Tags(make="MicaSense", xmp={(DLS, name): (str(angle),) for name, angle in angles.items()})
     pose = MicaSense().pose(tags)
-    assert pose is not None
     assert (pose.heading_deg, pose.pitch_deg, pose.roll_deg) == pytest.approx(np.degrees([1.0, pitch, roll]))
     assert MicaSense().elevation_deg(tags) == pytest.approx(elevation_deg, abs=0.1)
     assert MicaSense().elevation_deg(Tags(make="MicaSense")) is None

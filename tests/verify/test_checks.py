@@ -8,9 +8,8 @@ import pytest
 from agalign.pixels.structure import Field
 from agalign.values import geometry
 from agalign.values.alignment import Prediction, Residual
-from agalign.values.issues import Issue, IssueKind, Remedy, sentence
-from agalign.verify import checks
-from agalign.verify.checks import CHECKS, KINDS, Check, Evidence, is_unchanged, issues_of, seed_fits
+from agalign.values.issues import sentence
+from agalign.verify.checks import CHECKS, KINDS, Evidence, is_unchanged, issues_of, seed_fits
 
 from ..builders import joint_result, residual_of
 
@@ -18,17 +17,12 @@ SIZE = (1280, 960)
 JOINT = joint_result(std_px=0.07)
 RESIDUAL = replace(residual_of(np.zeros((50, 2)), np.zeros((50, 2))), median_px=0.05, p95_px=0.2)
 GOOD = Evidence(JOINT, RESIDUAL, SIZE)
-PREDICTION = Prediction(np.eye(3), "bands", std_px=0.2)
-HALF_WRONG = np.vstack([np.zeros((20, 2)), np.full((30, 2), 5.0)])
+STRETCHED = np.array([[1.0, 0, 0], [0, 1, 0], [-5e-4, 0, 1]])
 NAN = float("nan")
 
 
 def codes(evidence: Evidence = GOOD, residual: Residual | None = None) -> list[str]:
     return [issue.code for issue in issues_of(replace(evidence, residual=residual or evidence.residual))]
-
-
-def stretched_by(p: float) -> np.ndarray:
-    return np.array([[1, 0, 0], [0, 1, 0], [p, 0, 1.0]])
 
 
 def test_a_good_result_has_no_issues_and_every_check_lists_its_kinds() -> None:
@@ -41,22 +35,14 @@ def test_a_good_result_has_no_issues_and_every_check_lists_its_kinds() -> None:
 @pytest.mark.parametrize(
     ("joint", "residual", "expected"),
     [
-        ({"retrieval": 0.1}, {}, "retrieval"),
         ({"retrieval": NAN}, {}, "retrieval"),
-        ({"retrieval": 0.3, "chance": 1 / 16}, {}, "retrieval"),
-        ({"corner_std_xy_px": ((0.1, 0.1), (3.0, 4.0))}, {}, "corner_std_px"),
         ({"corner_std_xy_px": ((NAN, 0.1),) * 4}, {}, "corner_std_px"),
         ({"fixed_to_moving": np.diag([-1.0, 1, 1])}, {}, "folds"),
-        ({"fixed_to_moving": stretched_by(-7e-4)}, {}, "folds"),
-        ({}, {"centres_px": np.zeros((2, 2))}, "few_windows"),
-        ({}, {"coverage": 0.4}, "coverage"),
-        ({}, {"median_px": 2.5}, "residual_px"),
         ({}, {"median_px": float("inf")}, "residual_px"),
-        ({}, {"shifts_px": HALF_WRONG}, "close_windows"),
         ({"retrieval": 0.1}, {"median_px": 2.5}, "retrieval residual_px"),
     ],
 )
-def test_every_issue_is_sufficient_and_listed(
+def test_values_that_are_not_finite_and_mirrored_mappings_are_issues(
     joint: dict[str, object], residual: dict[str, object], expected: str
 ) -> None:
     issues = issues_of(Evidence(replace(JOINT, **joint), replace(RESIDUAL, **residual), SIZE))
@@ -83,7 +69,7 @@ def shifted(count_off: int, off_px: float, total: int = 100) -> Residual:
         (joint_result(retrieval=0.2), joint_result(retrieval=0.19), "retrieval", 0.19, 0.2),
         (joint_result(retrieval=0.5, chance=0.1), joint_result(retrieval=0.49, chance=0.1), "retrieval", 0.49, 0.5),
         (joint_result(std_px=2**0.5), joint_result(std_px=2.01 / 2**0.5), "corner_std_px", 2.01, 2.0),
-        (joint_result(np.diag([2.0, 0.5, 1])), joint_result(stretched_by(-5e-4)), "folds", 4.62, 4.0),
+        (joint_result(np.diag([2.0, 0.5, 1])), joint_result(STRETCHED), "folds", 4.62, 4.0),
     ],
 )
 def test_results_and_windows_pass_at_their_limits(
@@ -103,7 +89,7 @@ def test_results_and_windows_pass_at_their_limits(
     [(None, 0.2, False), (2.9, 0.2, False), (3.1, 0.2, True), (4.9, 1.0, False), (5.1, 1.0, True), (NAN, 0.2, True)],
 )
 def test_a_result_far_from_the_rig_is_an_issue(off_px: float | None, std_px: float, is_issue: bool) -> None:
-    prediction = replace(PREDICTION, off_px=off_px, std_px=std_px)
+    prediction = Prediction(np.eye(3), "bands", std_px, off_px=off_px)
     assert codes(replace(GOOD, prediction=prediction)) == ["unexpected_px"] * is_issue
 
 
@@ -178,12 +164,6 @@ def test_a_repetitive_scene_is_an_issue_unless_aliases_are_excluded() -> None:
     assert codes(replace(GOOD, images=RepetitiveImages(expected_within_px=-1.0))) == ["repeats"]
     # A costly check runs only where the others pass.
     assert codes(replace(GOOD, joint=replace(JOINT, retrieval=0.0), images=RepetitiveImages())) == ["retrieval"]
-
-
-def test_a_new_check_is_one_entry(monkeypatch: pytest.MonkeyPatch) -> None:
-    kind = IssueKind("too_late", "taken at night", Remedy("the sun is down", "fly at noon"))
-    monkeypatch.setattr(checks, "CHECKS", (*CHECKS, Check(lambda _: [Issue(kind)], (kind,))))
-    assert codes() == ["too_late"]
 
 
 # ---- seeds and unchanged inputs
