@@ -191,12 +191,6 @@ class _Gain(NamedTuple):
         return self.sigma >= min_sigma and self.after_p95_px <= max_p95_growth * self.before_p95_px
 
 
-def robust_loss(residual: Residual[FixedImagePx]) -> float:
-    """Return the mean of log(1 + (shift / 0.1 px)^2) of the measured windows, infinite without any."""
-    shifts = Shifts.of(residual)
-    return float(_losses(shifts.distances_px()).mean()) if len(shifts.weights) else math.inf
-
-
 def _losses(lengths_px: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return log(1 + (length / 0.1 px)^2), which is robust to wrong peaks and depth edges."""
     scale_px = 0.1  # several times the noise of a shift
