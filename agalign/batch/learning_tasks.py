@@ -9,7 +9,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from agalign.batch.capture_task import quiet
-from agalign.capture.align_bands import PairAligner, refined_pairs, verify_together
+from agalign.capture.align_bands import PairAligner, refined_pairs
 from agalign.capture.band_pair import BandPair, read_pairs
 from agalign.capture.by_rig import observed, with_predictions
 from agalign.capture.seeding import find_seed, image_groups
@@ -149,8 +149,9 @@ class LoadedCapture:
         is_good_enough, refined = _are_good_enough(results, settings.joint.recipe), refined_pairs(starts, results)
         observation = None
         if is_final or is_good_enough:
-            aligned = verify_together(starts, results, None, settings, is_observation=True)
-            observation = _observation(self.pairs, aligned, refined, self.capture)
+            aligner = PairAligner(settings, None, quiet, is_observation=True)
+            aligner.verify(starts, results)
+            observation = _observation(self.pairs, aligner.result, refined, self.capture)
         mappings = {p.name: p.scales.between_files(r.fixed_to_moving) for p, r in known if r.retrieval >= MIN_RETRIEVAL}
         return LearningCapture(self.capture, is_good_enough, mappings, refined, observation)
 

@@ -155,31 +155,20 @@ def image_groups(
     groups: dict[tuple[int, Space], list[int]] = {}
     for index, pair in enumerate(pairs):
         groups.setdefault((id(pair.reference), pair.space), []).append(index)
-    return [
-        (
-            indices,
-            _image_group(
-                [pairs[i] for i in indices],
-                [seeds[i] for i in indices],
-                [sides[i] for i in indices] if sides else range(1, len(indices) + 1),
-            ),
+    result = []
+    for indices in groups.values():
+        of_group = [(pairs[i], seeds[i]) for i in indices]
+        images = ImageGroup(
+            of_group[0][0].fixed,
+            [pair.moving for pair, _ in of_group],
+            [seed.fixed_to_moving for _, seed in of_group],
+            [sides[i] for i in indices] if sides else range(1, len(indices) + 1),
+            [seed.trusted for _, seed in of_group],
+            [pair.max_shift_px for pair, _ in of_group],
+            fields=[pair.field for pair, _ in of_group],
         )
-        for indices in groups.values()
-    ]
-
-
-def _image_group(pairs: Sequence[BandPair], seeds: Sequence[Seed], sides: Sequence[int]) -> ImageGroup:
-    mappings = [s.fixed_to_moving for s in seeds]
-    fields = [p.field for p in pairs]
-    return ImageGroup(
-        pairs[0].fixed,
-        [p.moving for p in pairs],
-        mappings,
-        sides,
-        [s.trusted for s in seeds],
-        [p.max_shift_px for p in pairs],
-        fields=fields if any(f is not None for f in fields) else (),
-    )
+        result.append((indices, images))
+    return result
 
 
 def best_seed(pair: BandPair, matrices: SeedMatrices, force: SeedKind | None = None) -> Seed:

@@ -13,9 +13,10 @@ from synthetic_flights.cameras import to_plane
 from synthetic_flights.depth import CLOSE_RANGE, Scene, Truth, truth_of, view
 from synthetic_flights.relief import make_scene
 
+from agalign.batch.capture_task import quiet
 from agalign.capture import align_bands
 from agalign.capture import by_relief as module
-from agalign.capture.align_bands import PairAligner, verify_together
+from agalign.capture.align_bands import PairAligner
 from agalign.capture.band_pair import BandPair
 from agalign.capture.by_relief import ReliefResult, _aligned, _Checked, _gain_px, _std_px, aligned_by_relief
 from agalign.capture.by_rig import with_predictions
@@ -237,7 +238,9 @@ def test_parallax_along_a_line_needs_a_layout(on_a_line: Sequence[Candidate]) ->
 
 
 def verified_together(candidates: Sequence[Candidate], settings: Settings) -> dict[str, Alignment]:
-    return verify_together([(c.pair, c.seed) for c in candidates], [c.joint for c in candidates], None, settings)
+    aligner = PairAligner(settings, None, quiet)
+    aligner.verify([(c.pair, c.seed) for c in candidates], [c.joint for c in candidates])
+    return aligner.result
 
 
 @pytest.mark.parametrize(("family", "is_allowed"), [("auto", True), ("translation", False), ("affine", False)])
@@ -285,7 +288,7 @@ def test_bands_that_are_aligned_one_after_another_have_one_geometry(
     flat: Rendered, beside_relief: dict[str, Alignment], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A band that is learned from scratch after the relief of the others, for example."""
-    aligner = PairAligner(Settings(), None, lambda *_: None)
+    aligner = PairAligner(Settings(), None, quiet)
     monkeypatch.setattr(PairAligner, "refine", lambda self, _: self.result.update(beside_relief))
     result = aligner.align([c.pair for c in flat.candidates()], None)
     assert {name: a.status for name, a in result.items()} == {"Blue": "aligned", "Red": "predicted", "NIR": "predicted"}
