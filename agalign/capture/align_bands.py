@@ -10,12 +10,11 @@ from agalign.capture.band_pair import BandPair, read_pairs
 from agalign.capture.by_relief import aligned_by_relief
 from agalign.capture.by_rig import bands_to_learn, with_predictions
 from agalign.capture.by_windows import aligned_by_windows, without_extrapolated
-from agalign.capture.candidate import Candidate
 from agalign.capture.decision import at_seed, decided, of_one_geometry, verified, without_result
 from agalign.capture.full_resolution import at_full_resolution
 from agalign.capture.map_estimate import map_estimate
 from agalign.capture.seeding import find_seed, image_groups
-from agalign.capture.warped_pair import with_metrics
+from agalign.capture.warped_pair import Candidate, with_metrics
 from agalign.config import Settings
 from agalign.fit.occlusion import occluded
 from agalign.flight.fingerprint import refinement_key
@@ -246,8 +245,9 @@ class PairAligner:
             candidates = self._candidates(starts, results)
             self.progress(starts[0][0].name if starts else "", "relief", 0.0)
             lost = [start for start, result in zip(starts, results, strict=True) if isinstance(result, Issue)]
-            relief = aligned_by_relief(list(candidates.values()), use, lost=lost, is_observation=self.is_observation)
-        alignments = relief.alignments
+            alignments, along_a_line = aligned_by_relief(
+                list(candidates.values()), use, lost=lost, is_observation=self.is_observation
+            )
         for (pair, seed), result in zip(starts, results, strict=True):
             if pair.name in alignments:
                 continue
@@ -256,7 +256,7 @@ class PairAligner:
                 if isinstance(result, Issue):
                     alignments[pair.name] = at_seed(pair, seed, (result,))
                 else:
-                    field_use = "never" if self.is_observation or pair.name in relief.along_a_line else use
+                    field_use = "never" if self.is_observation or pair.name in along_a_line else use
                     alignments[pair.name] = verified(candidates[pair.name], field_use)
         self.result |= of_one_geometry([pair for pair, _ in starts], alignments)
 

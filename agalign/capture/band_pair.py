@@ -13,6 +13,7 @@ from agalign.capture.reference import Reference
 from agalign.capture.tag_seeds import tag_seeds
 from agalign.config import SeedSettings
 from agalign.errors import AgalignError
+from agalign.fit.adjustment import lens_std_px
 from agalign.fit.windows import FixedWindows
 from agalign.flight.model import FlightModel
 from agalign.flight.rig_prediction import unobserved_error_px
@@ -128,6 +129,11 @@ class BandPair:
         """True if one of the images is blurred: shifts of small windows are then noisy."""
         max_sharp_px = 2.5  # length at which a sharp image varies
         return max(self.reference.blur_px, blur_px(channel_mean(self.moving_image))) > max_sharp_px
+
+    @property
+    def lens_std_px(self) -> NDArray[np.float64]:
+        """(4,) standard deviations of the lens shapes that the lenses of the two images do not contain."""
+        return lens_std_px(self.fixed.size_px, calibrated=self.space == "undistorted")
 
     @property
     def windows(self) -> FixedWindows:

@@ -15,15 +15,15 @@ import numpy as np
 
 from agalign.capture.band_pair import BandPair
 from agalign.capture.decision import decided
-from agalign.capture.warped_pair import WarpedPair
-from agalign.fit.adjustment import WindowFit, fit_in_rounds, lens_std_px
+from agalign.capture.warped_pair import WarpedPair, result_of_windows
+from agalign.fit.adjustment import WindowFit, fit_in_rounds
 from agalign.flight.rig import Rig
 from agalign.values import geometry
-from agalign.values.alignment import Alignment, JointResult, Residual
+from agalign.values.alignment import Alignment, Residual
 from agalign.values.issues import CORNERS_UNKNOWN, FEW_KEYPOINTS, NO_CONTRAST, RETRIEVAL
 from agalign.values.mapping import PixelMapping
 from agalign.values.pixel_units import FixedImagePx, MovingFilePx
-from agalign.verify.checks import BY_WINDOWS, MAX_ALIAS_PEAK, alias_peak, seed_fits
+from agalign.verify.checks import MAX_ALIAS_PEAK, alias_peak, seed_fits
 from agalign.verify.extrapolation import issues_of_extrapolation, points_in_frame
 
 _RELIEF_SHARE = 0.15
@@ -69,9 +69,8 @@ def _aligned(pair: BandPair, alignment: Alignment[FixedImagePx]) -> Alignment[Fi
     warped_pair = WarpedPair.of(pair, mapping, start.windows)
     held_out = warped_pair.residual.half(black=False)
     retrieval, chance = (0.0, 0.0) if alignment.joint is None else (alignment.joint.retrieval, alignment.joint.chance)
-    joint = JointResult[FixedImagePx](
-        mapping.fixed_to_moving, math.nan, retrieval, chance, 0, (1.0,), BY_WINDOWS, "homography", fit.max_px, ()
-    ).with_homography(mapping.fixed_to_moving, fit.covariance_px2)
+    joint = result_of_windows(mapping.fixed_to_moving).with_homography(mapping.fixed_to_moving, fit.covariance_px2)
+    joint = replace(joint, retrieval=retrieval, chance=chance, last_step_px=fit.max_px)
     if replace(warped_pair, residual=held_out).issues(joint):
         return None
     return decided(replace(alignment, mapping=mapping, issues=(), joint=joint, residual=held_out))
@@ -150,11 +149,7 @@ def _predicted(
     """Return the alignment as `predicted` by a homography and lens shapes, which replace the field of `start`."""
     size_px, to_file = pair.fixed.size_px, pair.scales.fixed.inverse
     fitted = fit_in_rounds(
-        replace(start, field=None),
-        lambda mapping: _measured(pair, mapping),
-        size_px,
-        is_accepted,
-        lens_std_px(size_px, calibrated=pair.space == "undistorted"),
+        replace(start, field=None), lambda mapping: _measured(pair, mapping), size_px, is_accepted, pair.lens_std_px
     )
     if fitted is None:
         return None

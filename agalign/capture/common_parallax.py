@@ -6,7 +6,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from agalign.capture.candidate import Candidate
+from agalign.capture.warped_pair import Candidate
 from agalign.fit.adjustment import (
     Adjustment,
     WindowShifts,

@@ -15,8 +15,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 from agalign.capture.band_pair import BandPair
-from agalign.capture.candidate import Candidate
-from agalign.capture.warped_pair import WarpedPair
+from agalign.capture.warped_pair import Candidate, WarpedPair
 from agalign.pixels.band_resampling import channel_mean
 from agalign.values.alignment import Alignment, JointResult, Seed
 from agalign.values.choices import Geometry, PairStatus, ReliefUse, SeedKind

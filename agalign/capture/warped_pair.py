@@ -1,5 +1,6 @@
-"""A band pair on one grid: the residual of its windows and the issues of an alignment."""
+"""A band pair on one grid: the residual of its windows, the issues of an alignment, and results to be compared."""
 
+import math
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -9,13 +10,13 @@ from agalign.fit.windows import FixedWindows, residual_under
 from agalign.pixels.band_resampling import shrink
 from agalign.pixels.structure import Field, structure_field, windowed_spectra
 from agalign.values import geometry
-from agalign.values.alignment import Alignment, JointResult, Residual
+from agalign.values.alignment import Alignment, JointResult, Residual, Seed
 from agalign.values.geometry import Matrix
 from agalign.values.image import Raster
 from agalign.values.issues import Issue
 from agalign.values.mapping import PixelMapping
 from agalign.values.pixel_units import FixedImagePx, PixelScale
-from agalign.verify.checks import Evidence, issues_of
+from agalign.verify.checks import BY_WINDOWS, Evidence, issues_of
 from agalign.verify.extrapolation import points_in_frame, unobserved_quarters
 
 
@@ -102,6 +103,45 @@ class WarpedPair:
         pair = self.pair
         size_px, pixel_px = pair.fixed.size_px, pair.file_pixel_size_px
         return issues_of(Evidence(joint, self.residual, size_px, images=self, file_pixel_size_px=pixel_px))
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """A band with a result of the joint optimisation and the residual of its windows."""
+
+    pair: BandPair
+    seed: Seed
+    joint: JointResult[FixedImagePx]
+    warped: WarpedPair
+    by_halves: tuple[Matrix, Matrix] | None = None
+    """Homographies from half of the windows (`WarpedPair.cross_validated`)."""
+
+    @classmethod
+    def of(cls, pair: BandPair, seed: Seed, joint: JointResult[FixedImagePx]) -> "Candidate":
+        """Measure the windows with the homography of a result."""
+        return cls(pair, seed, joint, WarpedPair.of(pair, pair.mapping(joint.fixed_to_moving)))
+
+    @classmethod
+    def at_seed(cls, pair: BandPair, seed: Seed) -> "Candidate":
+        """Return a band without a result: with the mapping of its seed, and without evidence of descriptors."""
+        return cls.of(pair, seed, result_of_windows(seed.fixed_to_moving))
+
+    def fit_residual(self, mapping: PixelMapping) -> Residual[FixedImagePx]:
+        """Measure the windows of the fit with a mapping."""
+        return self.pair.reference.black_windows.residuals(self._warped(mapping))
+
+    def held_out_residual(self, mapping: PixelMapping) -> Residual[FixedImagePx]:
+        """Measure the windows that take no part in the fit."""
+        return self.pair.reference.white_windows.residuals(self._warped(mapping))
+
+    def _warped(self, mapping: PixelMapping) -> Raster:
+        return self.warped.warped if mapping is self.warped.mapping else self.pair.warped_moving(mapping)
+
+
+def result_of_windows(fixed_to_moving: Matrix) -> JointResult[FixedImagePx]:
+    """Return a result without evidence of descriptors, with an infinite standard error."""
+    std = ((math.inf, math.inf),) * 4
+    return JointResult(fixed_to_moving, math.nan, 0.0, 0.0, 0, (1.0,), BY_WINDOWS, "homography", 0.0, std)
 
 
 def with_metrics(

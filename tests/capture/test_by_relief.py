@@ -18,12 +18,12 @@ from agalign.capture import align_bands
 from agalign.capture import by_relief as module
 from agalign.capture.align_bands import PairAligner
 from agalign.capture.band_pair import BandPair
-from agalign.capture.by_relief import ReliefResult, _aligned, _Checked, _gain_px, _std_px, aligned_by_relief
+from agalign.capture.by_relief import _aligned, _Checked, _gain_px, _std_px, aligned_by_relief
 from agalign.capture.by_rig import with_predictions
-from agalign.capture.candidate import Candidate
 from agalign.capture.common_parallax import MIN_PARALLAX_PX, common_parallax_px
 from agalign.capture.decision import at_seed, of_one_geometry
 from agalign.capture.reference import Reference
+from agalign.capture.warped_pair import Candidate
 from agalign.config import JointSettings, ReliefSettings, Settings
 from agalign.fit.range import inverse_range
 from agalign.flight.rig import Rig
@@ -144,7 +144,7 @@ def candidates(boxes: Rendered) -> list[Candidate]:
 
 @pytest.fixture(scope="module")
 def aligned(candidates: Sequence[Candidate]) -> dict[str, Alignment]:
-    return aligned_by_relief(candidates, "auto").alignments
+    return aligned_by_relief(candidates, "auto")[0]
 
 
 def test_all_bands_are_aligned_by_one_relief(boxes: Rendered, aligned: Mapping[str, Alignment]) -> None:
@@ -229,9 +229,9 @@ def on_a_line() -> list[Candidate]:
 
 def test_parallax_along_a_line_needs_a_layout(on_a_line: Sequence[Candidate]) -> None:
     """Edges of shadows and leaves move along a line too; with a layout it is that of the lenses."""
-    assert set(aligned_by_relief(on_a_line, "auto").alignments) == {b.name for b in MOVING}
+    assert set(aligned_by_relief(on_a_line, "auto")[0]) == {b.name for b in MOVING}
     without = without_layout(on_a_line)
-    assert aligned_by_relief(without, "auto") == ReliefResult(along_a_line={b.name for b in MOVING})
+    assert aligned_by_relief(without, "auto") == ({}, {b.name for b in MOVING})
     # No displacement field follows them either.
     for alignment in verified_together(without, Settings()).values():
         assert set(alignment.candidates) <= {"homography"}
@@ -278,7 +278,7 @@ def test_a_homography_next_to_a_relief_is_predicted(flat: Rendered, beside_relie
 def test_the_bands_of_one_verification_have_one_geometry(
     flat: Rendered, beside_relief: dict[str, Alignment], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    only_blue = ReliefResult({"Blue": beside_relief["Blue"]})
+    only_blue = {"Blue": beside_relief["Blue"]}, set()
     monkeypatch.setattr(align_bands, "aligned_by_relief", lambda *_, **__: only_blue)
     result = verified_together(flat.candidates(), Settings())
     assert {name: a.status for name, a in result.items()} == {"Blue": "aligned", "Red": "predicted", "NIR": "predicted"}
@@ -313,7 +313,7 @@ def test_a_noisy_band_follows_the_relief_of_the_others(
     else:
         others = [c for c in candidates if c is not noisy]
         result = aligned_by_relief(others, "auto", lost=[(noisy.pair, noisy.seed)])
-    alignment = result.alignments[name]
+    alignment = result[0][name]
     assert alignment.status == status
     assert alignment.geometry.startswith("relief")
     errors, plane = (scene.error_px(name, m) for m in (alignment.mapping, alignment.mapping.of_the_plane))
@@ -330,13 +330,13 @@ def test_a_relief_does_not_verify_a_band_that_it_is_estimated_from(
     checked = module._checked
     monkeypatch.setattr(module, "_checked", lambda band, warped: None if band.name == "NIR" else checked(band, warped))
     result = aligned_by_relief(candidates, "auto")
-    assert set(result.alignments) == set(aligned) - {"NIR"}
+    assert set(result[0]) == set(aligned) - {"NIR"}
 
 
 def test_unrelated_images_do_not_follow_a_relief(four_lenses: Rendered) -> None:
     other = textured_image(*four_lenses.size_px, seed=5)
     candidates = four_lenses.candidates(instead={"Red edge": (1000 + 100 * other).astype(np.float32)})
-    assert set(aligned_by_relief(candidates, "auto").alignments) == {"Blue", "Red", "NIR"}
+    assert set(aligned_by_relief(candidates, "auto")[0]) == {"Blue", "Red", "NIR"}
 
 
 def test_a_lost_band_is_predicted_with_the_relief(
@@ -367,7 +367,7 @@ def test_a_lost_band_is_predicted_with_the_relief(
 
 def test_the_sign_is_found_without_a_layout(boxes: Rendered, candidates: Sequence[Candidate]) -> None:
     """The sign follows from occlusions. The reference plane may differ from the one with a layout."""
-    result = aligned_by_relief(without_layout(candidates), "auto").alignments
+    result = aligned_by_relief(without_layout(candidates), "auto")[0]
     assert len(result) == len(MOVING)
     parallax = result["NIR"].mapping.parallax
     assert np.corrcoef(parallax.relief(boxes.pixels).ravel(), boxes.truth.range_m.ravel())[0, 1] < -0.5
@@ -384,7 +384,7 @@ def test_an_observation_of_the_rig_needs_only_windows(four_lenses: Rendered) -> 
     """It has the planes and baselines of the lenses; a band with other content is not part of it."""
     foreign_nir = {"NIR": foreign(four_lenses.images["NIR"], "unrelated", seed=3)}
     for images, names in (({}, {"Blue", "Red", "NIR", "Red edge"}), (foreign_nir, {"Blue", "Red", "Red edge"})):
-        observed = aligned_by_relief(four_lenses.candidates(images), "auto", is_observation=True).alignments
+        observed = aligned_by_relief(four_lenses.candidates(images), "auto", is_observation=True)[0]
         assert {name for name, a in observed.items() if a.status == "aligned"} == names
         for name, alignment in observed.items():
             # The parallax of a pixel is that of the nearest window, on slopes too.
@@ -393,19 +393,19 @@ def test_an_observation_of_the_rig_needs_only_windows(four_lenses: Rendered) -> 
 
 
 def test_use(candidates: Sequence[Candidate]) -> None:
-    assert aligned_by_relief(candidates, "never") == ReliefResult()
+    assert aligned_by_relief(candidates, "never") == ({}, set())
     # One moving band cannot be verified with others; a coarse one has another reference.
-    assert aligned_by_relief(candidates[:1], "always") == ReliefResult()
+    assert aligned_by_relief(candidates[:1], "always") == ({}, set())
     coarse = [replace(c, pair=replace(c.pair, is_coarse=True)) for c in candidates[1:]]
-    assert aligned_by_relief([candidates[0], *coarse], "always") == ReliefResult()
+    assert aligned_by_relief([candidates[0], *coarse], "always") == ({}, set())
 
 
 def test_a_flat_scene_gets_no_relief(flat: Rendered) -> None:
     candidates = flat.candidates()
     assert not shows_relief(candidates)
-    assert aligned_by_relief(candidates, "auto") == ReliefResult()
+    assert aligned_by_relief(candidates, "auto") == ({}, set())
     # A forced relief is not better than the homographies and therefore rejected.
-    assert aligned_by_relief(candidates, "always") == ReliefResult()
+    assert aligned_by_relief(candidates, "always") == ({}, set())
 
 
 @pytest.mark.parametrize("has_layout", [True, False])
@@ -421,7 +421,7 @@ def test_noise_of_the_reference_is_not_relief(flat: Rendered, has_layout: bool) 
     candidates = flat.candidates({REFERENCE.name: image})
     candidates = candidates if has_layout else without_layout(candidates)
     assert not shows_relief(candidates)
-    assert aligned_by_relief(candidates, "always") == ReliefResult()
+    assert aligned_by_relief(candidates, "always") == ({}, set())
 
 
 @pytest.mark.parametrize(("height_px", "shown"), [(0.25, False), (1.0, True)])
@@ -492,7 +492,7 @@ def test_the_others_are_aligned_without_a_foreign_band(
     boxes: Rendered, aligned: Mapping[str, Alignment], kind: str
 ) -> None:
     nir = foreign(boxes.images["NIR"], kind, 3)
-    result = aligned_by_relief(boxes.candidates({"NIR": nir}), "auto").alignments
+    result = aligned_by_relief(boxes.candidates({"NIR": nir}), "auto")[0]
     assert set(result) == {"Blue", "Red"}
     for name in result:
         errors, intact = (boxes.error_px(name, a[name].mapping) for a in (result, aligned))
@@ -506,7 +506,7 @@ def test_a_band_of_another_time_is_predicted_under_the_relief_of_the_others(boxe
     x, y = np.meshgrid(*(np.arange(n, dtype=np.float32) for n in boxes.size_px))
     positions = x + np.sin(2 * np.pi * y / 300), y + np.cos(2 * np.pi * x / 300)
     nir = cv2.remap(boxes.images["NIR"], *positions, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT)
-    result = aligned_by_relief(boxes.candidates({"NIR": nir}), "auto").alignments
+    result = aligned_by_relief(boxes.candidates({"NIR": nir}), "auto")[0]
     assert {name: a.status for name, a in result.items()} == {"Blue": "aligned", "Red": "aligned", "NIR": "predicted"}
     assert result["NIR"].mapping.parallax is not None
     # The RMS of the motion is 1 px; the plane of the band follows a part of it.
@@ -518,4 +518,4 @@ def test_a_band_of_another_time_is_predicted_under_the_relief_of_the_others(boxe
 @pytest.mark.parametrize("kind", ["unrelated", "scrambled", in_full_run("noise")])
 def test_unrelated_bands_are_not_aligned(boxes: Rendered, kind: str) -> None:
     images = {b.name: foreign(boxes.images[b.name], kind, n) for n, b in enumerate(MOVING)}
-    assert aligned_by_relief(boxes.candidates(images), "always").alignments == {}
+    assert aligned_by_relief(boxes.candidates(images), "always")[0] == {}
