@@ -16,7 +16,7 @@ from agalign.capture.map_estimate import map_estimate
 from agalign.capture.seeding import find_seed, image_groups
 from agalign.capture.warped_pair import Candidate, with_metrics
 from agalign.config import Settings
-from agalign.fit.occlusion import occluded
+from agalign.fit.relief import occluded
 from agalign.flight.fingerprint import refinement_key
 from agalign.flight.model import FlightModel
 from agalign.method.device import one_thread

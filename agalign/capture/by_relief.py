@@ -42,7 +42,7 @@ from agalign.fit.adjustment import (
 )
 from agalign.fit.dense import DenseMatching, View
 from agalign.fit.displacement_field import MIN_WINDOWS
-from agalign.fit.occlusion import nearer_sign, occluded
+from agalign.fit.relief import nearer_sign, occluded
 from agalign.pixels.band_resampling import channel_mean
 from agalign.values.alignment import Alignment, Alignments, JointResult, Residual, Seed
 from agalign.values.choices import Geometry, ReliefUse

@@ -25,7 +25,7 @@ from agalign.capture.decision import at_seed, of_one_geometry
 from agalign.capture.reference import Reference
 from agalign.capture.warped_pair import Candidate
 from agalign.config import JointSettings, ReliefSettings, Settings
-from agalign.fit.range import inverse_range
+from agalign.fit.relief import inverse_range
 from agalign.flight.rig import Rig
 from agalign.synthetic.camera_model import BandSpec, CameraSpec
 from agalign.synthetic.flight import recorded

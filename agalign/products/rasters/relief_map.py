@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from agalign.cameras import rig_seed
 from agalign.cameras.pix4d import rig_unit_m
 from agalign.errors import GeometryError
-from agalign.fit.range import inverse_range
+from agalign.fit.relief import inverse_range
 from agalign.products.product import GEOTIFF, Product, ProductContext, StacAsset, WrittenFile
 from agalign.products.rasters.checked_raster import LayerDescription
 from agalign.values.alignment import Alignment

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agalign.errors import NoSuchBandError, SidecarError
-from agalign.fit.occlusion import occluded
+from agalign.fit.relief import occluded
 from agalign.pixels.raster import read_preview
 from agalign.products.sidecar.file import read_sidecar
 from agalign.products.sidecar.schema import BandPart, ReliefPart, Sidecar
