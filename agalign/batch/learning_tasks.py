@@ -24,7 +24,7 @@ from agalign.method.joint import Results, refine_with
 from agalign.method.refine import FLIGHT_PATCHES
 from agalign.method.state import ImageGroup, JointState
 from agalign.pixels.raster import with_saturation_values
-from agalign.values.alignment import MIN_RETRIEVAL, Alignment, JointResult, RefinedPair, Residual, Seed
+from agalign.values.alignment import MIN_RETRIEVAL, Alignments, JointResult, RefinedPair, Residual, Seed
 from agalign.values.capture import Capture
 from agalign.values.choices import Recipe
 from agalign.values.geometry import Matrix
@@ -256,10 +256,7 @@ def _are_good_enough(results: Results, recipe: Recipe) -> bool:
 
 
 def _observation(
-    pairs: Sequence[BandPair],
-    result: Mapping[str, Alignment[FixedImagePx]],
-    refined: Mapping[str, RefinedPair],
-    capture: Capture,
+    pairs: Sequence[BandPair], result: Alignments, refined: Mapping[str, RefinedPair], capture: Capture
 ) -> RigObservation:
     in_file_px = {p.name: result[p.name].in_file_px(p.scales, p.reference_file_px) for p in pairs}
     residuals = {b: a.residual for b, a in in_file_px.items() if a.status == "aligned" and a.residual is not None}

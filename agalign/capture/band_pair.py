@@ -207,8 +207,8 @@ class BandPair:
     def in_moving_file_px(self, distance_px: FixedImagePx, fixed_to_moving: Matrix) -> MovingFilePx:
         """Convert a distance in the fixed image to the moving file, for a homography between the images."""
         between_files = self.scales.between_files(fixed_to_moving)
-        magnification = float(geometry.local_scale(between_files, *self.reference_file_px)[-1])
-        return MovingFilePx(distance_px / min(self.scales.fixed) * abs(magnification))
+        magnification = geometry.magnification(between_files, *self.reference_file_px)
+        return MovingFilePx(distance_px / min(self.scales.fixed) * magnification)
 
 
 def read_pairs(
@@ -297,7 +297,7 @@ def longest_for(reference: Band, fixed_to_moving: Matrix) -> int:
 
     It is less than _LONGEST_SIDE_PX for a band with much larger pixels, as of a thermal camera.
     """
-    ratio = abs(float(geometry.local_scale(fixed_to_moving, *reference.size_px)[-1]))
+    ratio = geometry.magnification(fixed_to_moving, *reference.size_px)
     if not 0 < ratio < _COARSE_RATIO:
         return _LONGEST_SIDE_PX
     oversampling = 2.0  # along a line; more pixels of the reference add no common detail
@@ -313,7 +313,7 @@ def _seed_std_px(band: str, model: FlightModel | None, scale: PixelScale) -> dic
     if model is not None and model.rig is not None and band in model.rig.mean:
         mean, rig = model.rig.mean[band], model.rig
         # The errors of a rig are in px of the band's own file.
-        ratio = abs(float(geometry.local_scale(mean, *rig.size_px)[-1]))
+        ratio = geometry.magnification(mean, *rig.size_px)
         error_px = FixedFilePx(unobserved_error_px(rig, band, by_neighbours=False) / ratio)
         min_std_px = 1.0  # of the mean: captures differ by this in height and tilt
         result["model"] = FixedImagePx(max(error_px, min_std_px) * scale.x)

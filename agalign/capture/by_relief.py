@@ -51,7 +51,7 @@ from agalign.values.issues import OTHER_GEOMETRY
 from agalign.values.mapping import PixelMapping
 from agalign.values.parallax import Parallax, Relief
 from agalign.values.pixel_units import FixedImagePx
-from agalign.verify.checks import BY_PARALLAX, BY_WINDOWS, MAX_ALIAS_PEAK, MAX_SHIFT_PX, alias_peak
+from agalign.verify.checks import BY_PARALLAX, BY_WINDOWS, MAX_ALIAS_PEAK, MAX_SHIFT_PX
 
 _MIN_OBSERVED_SHARE = 0.75
 """Minimum share of aligned windows for an observation of a rig, which contains no depth edges: 0.79 or more in scenes
@@ -289,7 +289,7 @@ class _Estimate:
         candidate, pair, residual = band.candidate, warped.pair, warped.residual
         is_known = len(residual.measured_px) >= MIN_WINDOWS
         is_known &= residual.median_px <= MAX_SHIFT_PX * pair.file_pixel_size_px
-        if not is_known or alias_peak(*warped.reduced_spectra()).ratio > MAX_ALIAS_PEAK:
+        if not is_known or warped.alias_peak().ratio > MAX_ALIAS_PEAK:
             return None
         joint = None if candidate.joint.recipe == BY_WINDOWS else candidate.joint
         without = without_result(pair, candidate.seed)

@@ -13,7 +13,7 @@ from agalign.capture.warped_pair import WarpedPair
 from agalign.fit.relief import occluded
 from agalign.flight.rig import Observation, Rig, distance_px
 from agalign.flight.rig_prediction import predict_band
-from agalign.values.alignment import MIN_TIMES_CHANCE, Alignment, Prediction
+from agalign.values.alignment import MIN_TIMES_CHANCE, Alignment, Alignments, Prediction
 from agalign.values.capture import Capture
 from agalign.values.geometry import Matrix
 from agalign.values.issues import Issue
@@ -22,7 +22,7 @@ from agalign.values.pixel_units import FixedImagePx, MovingFilePx
 from agalign.verify.checks import MAX_UNEXPECTED_PX, UNEXPECTED_PX, Evidence, issues_of
 
 
-def observed(pairs: Sequence[BandPair], result: Mapping[str, Alignment[FixedImagePx]], capture: Capture) -> Observation:
+def observed(pairs: Sequence[BandPair], result: Alignments, capture: Capture) -> Observation:
     """Return the aligned mappings of a capture as an observation of the rig."""
     mappings, std_px, parallax_px = dict[str, Matrix](), dict[str, MovingFilePx](), dict[str, MovingFilePx]()
     for pair in pairs:
@@ -39,9 +39,7 @@ def observed(pairs: Sequence[BandPair], result: Mapping[str, Alignment[FixedImag
     return Observation(capture.time_s, mappings, std_px, altitude_m, capture.motion, parallax_px)
 
 
-def with_predictions(
-    pairs: Sequence[BandPair], result: Mapping[str, Alignment[FixedImagePx]], rig: Rig, capture: Capture
-) -> dict[str, Alignment[FixedImagePx]]:
+def with_predictions(pairs: Sequence[BandPair], result: Alignments, rig: Rig, capture: Capture) -> Alignments:
     """Return the alignments with the rig's predictions, px of the files; the prediction replaces failed alignments.
 
     It also replaces results that contradict the rig, because of aliasing in repetitive scenes. A rotated or scaled
@@ -59,7 +57,7 @@ def with_predictions(
 
 
 def _parallax_by_rig(
-    pair: BandPair, by_relief: Mapping[str, BandPair], result: Mapping[str, Alignment[FixedImagePx]], rig: Rig
+    pair: BandPair, by_relief: Mapping[str, BandPair], result: Alignments, rig: Rig
 ) -> tuple[Parallax | None, FixedImagePx]:
     """Return the relief of the other bands with the baseline of the rig, scaled to theirs, and its standard error.
 
@@ -140,11 +138,7 @@ def _with_added_error(prediction: Prediction, error_px: MovingFilePx) -> Predict
 
 
 def bands_to_learn(
-    pairs: Sequence[BandPair],
-    result: Mapping[str, Alignment[FixedImagePx]],
-    rig: Rig,
-    capture: Capture,
-    accept_predicted_px: float,
+    pairs: Sequence[BandPair], result: Alignments, rig: Rig, capture: Capture, accept_predicted_px: float
 ) -> set[str]:
     """Return the bands to learn from scratch if the flight's network did not align them.
 

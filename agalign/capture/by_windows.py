@@ -8,7 +8,7 @@
 """
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -19,11 +19,11 @@ from agalign.capture.warped_pair import WarpedPair, result_of_windows
 from agalign.fit.adjustment import WindowFit, fit_in_rounds
 from agalign.flight.rig import Rig
 from agalign.values import geometry
-from agalign.values.alignment import Alignment, Residual
+from agalign.values.alignment import Alignment, Alignments, Residual
 from agalign.values.issues import CORNERS_UNKNOWN, FEW_KEYPOINTS, NO_CONTRAST, RETRIEVAL
 from agalign.values.mapping import PixelMapping
 from agalign.values.pixel_units import FixedImagePx, MovingFilePx
-from agalign.verify.checks import MAX_ALIAS_PEAK, alias_peak, seed_fits
+from agalign.verify.checks import MAX_ALIAS_PEAK, seed_fits
 from agalign.verify.extrapolation import issues_of_extrapolation, points_in_frame
 
 _RELIEF_SHARE = 0.15
@@ -43,9 +43,8 @@ def aligned_by_windows(pair: BandPair, alignment: Alignment[FixedImagePx]) -> Al
     result = _aligned(pair, alignment)
     if result is None and pair.is_coarse and alignment.seed.trusted:
         result = _predicted(pair, alignment, pair.mapping(alignment.seed.fixed_to_moving), _is_consistent)
-        if result is not None:
-            alias = alias_peak(*WarpedPair.of(pair, result.mapping).reduced_spectra())
-            result = None if alias.ratio > MAX_ALIAS_PEAK else result
+        if result is not None and WarpedPair.of(pair, result.mapping).alias_peak().ratio > MAX_ALIAS_PEAK:
+            result = None
     return result or alignment
 
 
@@ -85,9 +84,7 @@ def _is_consistent(fit: WindowFit) -> bool:
     return count >= min_windows and bool((fit.residuals_px <= max_close_px).sum() >= min_close_share * count)
 
 
-def without_extrapolated(
-    pairs: Sequence[BandPair], result: Mapping[str, Alignment[FixedImagePx]], rig: Rig | None = None
-) -> dict[str, Alignment[FixedImagePx]]:
+def without_extrapolated(pairs: Sequence[BandPair], result: Alignments, rig: Rig | None = None) -> Alignments:
     """Return the alignments; those `aligned` but extrapolated over a quarter of the image become `predicted`.
 
     Bands that the rig covers and georeferenced files, which have no lens distortion, are not changed. A homography does
@@ -118,9 +115,7 @@ def without_extrapolated(
     return checked
 
 
-def _shifts_by_range_px(
-    pairs: Sequence[BandPair], result: Mapping[str, Alignment[FixedImagePx]]
-) -> dict[str, MovingFilePx]:
+def _shifts_by_range_px(pairs: Sequence[BandPair], result: Alignments) -> dict[str, MovingFilePx]:
     """Return by band the shift of the aligned scene, at its range, from one at an infinite distance.
 
     The rig tags contain the mappings at infinity. Their errors have no common direction: the shift is the part of the

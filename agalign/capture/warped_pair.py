@@ -8,15 +8,15 @@ import numpy as np
 from agalign.capture.band_pair import BandPair
 from agalign.fit.windows import FixedWindows, residual_under
 from agalign.pixels.band_resampling import shrink
-from agalign.pixels.structure import Field, structure_field, windowed_spectra
+from agalign.pixels.structure import structure_field, windowed_spectra
 from agalign.values import geometry
 from agalign.values.alignment import Alignment, JointResult, Residual, Seed
 from agalign.values.geometry import Matrix
 from agalign.values.image import Raster
 from agalign.values.issues import Issue
 from agalign.values.mapping import PixelMapping
-from agalign.values.pixel_units import FixedImagePx, PixelScale
-from agalign.verify.checks import BY_WINDOWS, Evidence, issues_of
+from agalign.values.pixel_units import FixedImagePx
+from agalign.verify.checks import BY_WINDOWS, AliasPeak, Evidence, alias_peak, issues_of
 from agalign.verify.extrapolation import points_in_frame, unobserved_quarters
 
 
@@ -84,15 +84,11 @@ class WarpedPair:
         shifts_px = np.where(self.residual.is_black[:, None], by_white_px, by_black_px)
         return replace(self, residual=self.residual.with_shifts(shifts_px))
 
-    @property
-    def reduced_scale(self) -> PixelScale:
-        """(x, y) of the reduced images relative to the fixed image."""
-        return self.pair.reference.seed_scale
-
-    def reduced_spectra(self) -> tuple[Field, Field]:
-        """Windowed spectra (height, width) of the structures of the reduced fixed and moving images."""
-        small = shrink(self.warped, self.pair.reference.seed_size_px)
-        return self.pair.reference.seed_spectrum, windowed_spectra(structure_field(small))
+    def alias_peak(self) -> AliasPeak:
+        """Return the highest correlation peak of the reduced images after that of the mapping."""
+        reference = self.pair.reference
+        moving = windowed_spectra(structure_field(shrink(self.warped, reference.seed_size_px)))
+        return alias_peak(reference.seed_spectrum, moving, reference.seed_scale)
 
     def is_expected(self, shift_px: tuple[float, float] = (0.0, 0.0)) -> bool:
         """Return True if the mapping shifted by (x, y), px of the fixed image, agrees with a candidate of the pair."""

@@ -263,7 +263,7 @@ class _MovingBand:
 
     def _size_px(self, view: View) -> tuple[int, int]:
         """Return the size at which the pixels of the moving image are as large as those of the reduced reference."""
-        magnification = abs(float(geometry.local_scale(view.plane.fixed_to_moving, *self.fixed.full_px)[-1]))
+        magnification = geometry.magnification(view.plane.fixed_to_moving, *self.fixed.full_px)
         ratio = min(1.0, self.fixed.scale.mean / magnification)
         width, height = view.image.size_px
         return max(1, round(width * ratio)), max(1, round(height * ratio))
