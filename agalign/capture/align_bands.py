@@ -13,7 +13,7 @@ from agalign.capture.by_windows import aligned_by_windows, without_extrapolated
 from agalign.capture.decision import at_seed, decided, of_one_geometry, verified, without_result
 from agalign.capture.full_resolution import at_full_resolution
 from agalign.capture.map_estimate import map_estimate
-from agalign.capture.seeding import find_seed, image_groups
+from agalign.capture.seeding import Start, find_seed, image_groups
 from agalign.capture.warped_pair import Candidate, with_metrics
 from agalign.config import Settings
 from agalign.fit.relief import occluded
@@ -33,7 +33,6 @@ from agalign.values.pixel_units import FixedFilePx, FixedImagePx
 
 PairProgress = Callable[[str, str, float], None]
 """Called with the name of the band, the stage and its completed share, 0 to 1."""
-Start = tuple[BandPair, Seed]
 
 
 class _Timer:
@@ -227,7 +226,7 @@ class PairAligner:
         """Align the pairs by image group, with the network's `sides`, and verify them."""
         results: dict[int, JointResult[FixedImagePx] | Issue] = {}
         with self.timer.measure([pair.name for pair, _ in starts]):
-            for indices, group in image_groups([p for p, _ in starts], [s for _, s in starts], sides):
+            for indices, group in image_groups(starts, sides):
                 report = partial(self.progress, starts[indices[0]][0].name)  # with the name of the group's first pair
                 report("refining", 0.0)
                 results |= zip(indices, align(group, report), strict=True)

@@ -18,7 +18,6 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from agalign.capture.band_pair import BandPair
 from agalign.capture.common_parallax import (
     MIN_BANDS,
     MIN_PARALLAX_PX,
@@ -28,6 +27,7 @@ from agalign.capture.common_parallax import (
     layout_of,
 )
 from agalign.capture.decision import decided, predicted_by_windows, without_result
+from agalign.capture.seeding import Start
 from agalign.capture.warped_pair import Candidate, WarpedPair
 from agalign.errors import GeometryError
 from agalign.fit.adjustment import (
@@ -44,7 +44,7 @@ from agalign.fit.dense import DenseMatching, View
 from agalign.fit.displacement_field import MIN_WINDOWS
 from agalign.fit.relief import nearer_sign, occluded
 from agalign.pixels.band_resampling import channel_mean
-from agalign.values.alignment import Alignment, Alignments, JointResult, Residual, Seed
+from agalign.values.alignment import Alignment, Alignments, JointResult, Residual
 from agalign.values.choices import Geometry, ReliefUse
 from agalign.values.image import FloatImage
 from agalign.values.issues import OTHER_GEOMETRY
@@ -59,11 +59,7 @@ with booms and plants at 1 m."""
 
 
 def aligned_by_relief(
-    candidates: Sequence[Candidate],
-    use: ReliefUse,
-    *,
-    lost: Sequence[tuple[BandPair, Seed]] = (),
-    is_observation: bool = False,
+    candidates: Sequence[Candidate], use: ReliefUse, *, lost: Sequence[Start] = (), is_observation: bool = False
 ) -> tuple[Alignments, set[str]]:
     """Align bands by one relief of the capture, with lens shapes where no rig contains the distortion.
 
@@ -164,9 +160,7 @@ def _observed(group: Sequence[Candidate]) -> Alignments:
     return _aligned(bands, checked)
 
 
-def _aligned_group(
-    group: Sequence[Candidate], candidates: Sequence[Candidate], lost: Sequence[tuple[BandPair, Seed]]
-) -> Alignments:
+def _aligned_group(group: Sequence[Candidate], candidates: Sequence[Candidate], lost: Sequence[Start]) -> Alignments:
     """Align a group by its relief, and the other bands by it too; empty if another geometry explains the group better.
 
     Raises GeometryError.

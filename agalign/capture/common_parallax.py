@@ -53,7 +53,8 @@ def common_parallax_px(group: Sequence[Candidate]) -> tuple[float, bool]:
     of the median band significantly.
     """
     residuals, size_px = _common_residuals(group), group[0].pair.fixed.size_px
-    if max(_p95_px(residual) for residual in residuals) < MIN_PARALLAX_PX:
+    # The p95 is robust, as a wrong peak is no parallax.
+    if max((r.p95_px for r in residuals if len(r.lengths_px)), default=0.0) < MIN_PARALLAX_PX:
         return 0.0, False
     windows = WindowShifts.of(residuals, [c.warped.mapping for c in group])
     consistent = consistent_bands(windows, group)
@@ -92,11 +93,6 @@ def _common_residuals(group: Sequence[Candidate]) -> list[Residual[FixedImagePx]
     if all(c.warped.windows is reference.windows for c in group):
         return [c.warped.residual for c in group]
     return [reference.small_windows.residuals(c.warped.warped) for c in group]
-
-
-def _p95_px(residual: Residual[FixedImagePx]) -> float:
-    """Return the p95 of the lengths of the measured shifts, 0 without any: robust, as a wrong peak is no parallax."""
-    return float(residual.p95_px) if len(residual.lengths_px) else 0.0
 
 
 def _far_share(residual: Residual[FixedImagePx]) -> float:

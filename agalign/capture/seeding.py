@@ -23,6 +23,8 @@ from agalign.values.geometry import Matrix
 from agalign.values.issues import BLANK_MOVING, BLANK_REFERENCE, NO_SUCH_SEED, Issue
 from agalign.verify.checks import seed_fits
 
+Start = tuple[BandPair, Seed]
+"""A pair with its initial alignment."""
 _MIN_OVERLAP = 0.2
 """Minimum share of the reference that the moving image covers: the correlation is circular and meaningless for small
 overlaps."""
@@ -144,20 +146,18 @@ def _network(pair: BandPair, model: FlightModel | None) -> Descriptor:
     return starter_for_matching(channels) if model is None else model.matching_network(pair.name, channels)
 
 
-def image_groups(
-    pairs: Sequence[BandPair], seeds: Sequence[Seed], sides: Sequence[int] = ()
-) -> list[tuple[list[int], ImageGroup]]:
+def image_groups(starts: Sequence[Start], sides: Sequence[int] = ()) -> list[tuple[list[int], ImageGroup]]:
     """Group the pairs with the same reference image and space for the joint method.
 
     Returns the indices of the pairs and the images of each group. `sides` are the network's sides of the pairs, by
     default 1, 2, … in each group.
     """
     groups: dict[tuple[int, Space], list[int]] = {}
-    for index, pair in enumerate(pairs):
+    for index, (pair, _) in enumerate(starts):
         groups.setdefault((id(pair.reference), pair.space), []).append(index)
     result = []
     for indices in groups.values():
-        of_group = [(pairs[i], seeds[i]) for i in indices]
+        of_group = [starts[i] for i in indices]
         images = ImageGroup(
             of_group[0][0].fixed,
             [pair.moving for pair, _ in of_group],

@@ -117,7 +117,7 @@ def _learned_on_pair(task: PairTask, settings: JointSettings, *, colour: bool) -
     pair = BandPair.of_images("moving", fixed, moving, {"user": task.start})
     if task.seeding:
         seed = best_seed(pair, pair.seed_matrices)
-    state, [(_, group)] = JointState(settings, lambda *_: None), image_groups([pair], [seed])
+    state, [(_, group)] = JointState(settings, lambda *_: None), image_groups([(pair, seed)])
     try:
         if settings.recipe == "paper":
             net, result = align_by_paper(state, group)

@@ -36,11 +36,8 @@ def is_flight_of(captures: Sequence[Capture], camera: str) -> bool:
 
     An empty `camera` fits every flight.
     """
-    if camera in ("", flight_camera(captures)):
-        return True
-    reference = camera_key(captures[0]).removesuffix("]")
-    model_bands = camera.removeprefix(reference).removesuffix("]").split(", ")
-    return camera.startswith(reference) and {_with_size(b) for b in _bands_of(captures)[1:]} <= set(model_bands)
+    (learned, bands), (own, own_bands) = map(_camera_and_bands, (camera, flight_camera(captures)))
+    return not camera or ((learned, bands[0]) == (own, own_bands[0]) and set(own_bands) <= set(bands))
 
 
 def difference(learned: str, here: str) -> str:
