@@ -241,7 +241,7 @@ class PairAligner:
         self.refined |= refined_pairs(starts, results)
         use = self.settings.relief.use if self._may_be_homography else "never"
         with self.timer.measure([pair.name for pair, _ in starts]):
-            candidates = self._candidates(starts, results)
+            candidates = self.candidates(starts, results)
             self.progress(starts[0][0].name if starts else "", "relief", 0.0)
             lost = [start for start, result in zip(starts, results, strict=True) if isinstance(result, Issue)]
             alignments, along_a_line = aligned_by_relief(
@@ -259,7 +259,7 @@ class PairAligner:
                     alignments[pair.name] = verified(candidates[pair.name], field_use)
         self.result |= of_one_geometry([pair for pair, _ in starts], alignments)
 
-    def _candidates(self, starts: Sequence[Start], results: Results) -> dict[str, Candidate]:
+    def candidates(self, starts: Sequence[Start], results: Results) -> dict[str, Candidate]:
         """Return the pairs with a result, by name, after the MAP estimation of all bands of the capture."""
         measured = [
             Candidate.of(pair, seed, result)

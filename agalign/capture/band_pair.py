@@ -30,7 +30,6 @@ from agalign.values.geometry import Matrix
 from agalign.values.image import Raster
 from agalign.values.issues import NO_SUCH_SEED, UNREADABLE, Issue
 from agalign.values.mapping import PixelMapping
-from agalign.values.parallax import Parallax
 from agalign.values.pixel_units import (
     FixedFilePx,
     FixedImagePoints,
@@ -74,18 +73,6 @@ class BandPair:
     layout: tuple[float, float] | None = None
     """Direction (x, y) in which points move in the moving image, relative to the reference, when the scene comes
     nearer, in a unit common to the camera's bands; None if the tags do not contain it."""
-
-    @classmethod
-    def of_images(
-        cls,
-        name: str,
-        fixed: Raster,
-        moving: Raster,
-        seed_matrices: SeedMatrices,
-        seed_std_px: Mapping[SeedKind, FixedImagePx] | None = None,
-    ) -> "BandPair":
-        """Create a pair of two images that are not reduced."""
-        return cls(name, Reference(fixed), moving, seed_matrices, seed_std_px=seed_std_px or {})
 
     @property
     def space(self) -> Space:
@@ -155,12 +142,9 @@ class BandPair:
         """The moving image, with its lens if the homographies are between undistorted pixels."""
         return self.moving_image if self.space == "undistorted" else replace(self.moving_image, lens=None)
 
-    def mapping(
-        self, fixed_to_moving: Matrix, field: DisplacementField | None = None, parallax: Parallax | None = None
-    ) -> PixelMapping:
-        """Return the complete mapping between raw pixels of the images; `field` replaces the rig's field."""
-        lenses = self.fixed.lens, self.moving.lens
-        return PixelMapping(fixed_to_moving, *lenses, field=field or self.field, parallax=parallax)
+    def mapping(self, fixed_to_moving: Matrix) -> PixelMapping:
+        """Return the complete mapping between raw pixels of the images."""
+        return PixelMapping(fixed_to_moving, self.fixed.lens, self.moving.lens, field=self.field)
 
     def warped_moving(self, mapping: PixelMapping) -> Raster:
         """Warp the channel mean of the moving image to the grid of the reference."""
@@ -223,7 +207,9 @@ def read_pairs(
     pairs: list[BandPair] = []
     unusable: dict[str, Issue] = {}
     for bands in capture.moving_lenses:
-        matrices = _seed_matrices(capture.reference, bands[0], settings, model)
+        matrices = tag_seeds(capture.reference, bands[0], settings)
+        if model is not None and bands[0].name in model.mappings:
+            matrices = {"model": model.mappings[bands[0].name], **matrices}
         if not matrices:
             issue = Issue(NO_SUCH_SEED, detail=str(settings.force))
             unusable |= dict.fromkeys((b.name for b in bands), issue)
@@ -250,14 +236,6 @@ def _without_stripes(pairs: Sequence[BandPair], reference: Reference) -> list[Ba
         replace(pair, reference=cleaned_reference, moving_image=next(images)) if pair.reference is reference else pair
         for pair in pairs
     ]
-
-
-def _seed_matrices(reference: Band, moving: Band, settings: SeedSettings, model: FlightModel | None) -> SeedMatrices:
-    """Return fixed_to_moving between undistorted px of the files by kind; empty if a forced kind is not available."""
-    matrices = tag_seeds(reference, moving, settings)
-    if model is not None and moving.name in model.mappings:
-        return {"model": model.mappings[moving.name], **matrices}
-    return matrices
 
 
 def _pair(

@@ -233,12 +233,10 @@ class _Estimate:
             layout_std = 0.3  # of lens positions without tags, which deviate by up to 0.1 of the longest baseline
             x, y = own * float((others * baselines).sum() / max((others**2).sum(), 1e-12))
             prior = BaselinePrior((x, y), layout_std)
-        band = _Band(candidate, candidate.warped.mapping, prior.mean)
-
-        start, lens_std = band.mapping(self.relief), None if candidate.pair.has_rig else candidate.pair.lens_std_px
+        start = _Band(candidate, candidate.warped.mapping, prior.mean).mapping(self.relief)
         if len(candidate.fit_residual(start).measured_px) < MIN_WINDOWS:
             return None
-        size_px = candidate.pair.fixed.size_px
+        size_px, lens_std = candidate.pair.fixed.size_px, None if candidate.pair.has_rig else candidate.pair.lens_std_px
         fitted = fit_in_rounds(start, candidate.fit_residual, size_px, lens_std_px=lens_std, baseline=prior)
         if fitted is None or fitted[0].parallax is None:
             return None

@@ -102,7 +102,7 @@ def without_extrapolated(pairs: Sequence[BandPair], result: Alignments, rig: Rig
         if alignment.status != "aligned" or alignment.residual is None or "geo" in pair.seed_matrices or is_covered:
             continue
         plane = alignment.mapping.of_the_plane
-        in_frame_px = points_in_frame(plane, size_px, pair.moving.size_px)
+        in_frame_px = points_in_frame(plane, *pair.sizes_px)
         issues = issues_of_extrapolation(alignment.residual, size_px, in_frame_px)
         if issues:
             extrapolated = decided(replace(alignment, issues=issues, prediction=None))
@@ -150,7 +150,7 @@ def _predicted(
         return None
     mapping, fit = fitted
     to_file_px = np.r_[np.tile(to_file, 4), np.full(4, to_file.mean)]
-    std_px = FixedImagePx(fit.std_px(points_in_frame(mapping, size_px, pair.moving.size_px)))
+    std_px = FixedImagePx(fit.std_px(points_in_frame(mapping, *pair.sizes_px)))
     prediction = pair.prediction_of(mapping, std_px, fit.covariance_px2 * np.outer(to_file_px, to_file_px))
     residual = WarpedPair.of(pair, mapping).residual
     return decided(replace(alignment, mapping=mapping, residual=residual, prediction=prediction))

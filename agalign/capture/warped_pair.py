@@ -43,7 +43,7 @@ class WarpedPair:
         if windows is not None:
             return cls(pair, mapping, warped, windows, windows.residuals(warped))
         usual, size_px = cls(pair, mapping, warped, pair.windows, pair.windows.residuals(warped)), pair.fixed.size_px
-        in_frame_px = points_in_frame(mapping, size_px, pair.moving_image.size_px)
+        in_frame_px = points_in_frame(mapping, *pair.sizes_px)
         if not unobserved_quarters(usual.residual.centres_px, size_px, in_frame_px):
             return usual
         small = pair.reference.small_windows
