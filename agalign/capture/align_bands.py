@@ -145,7 +145,7 @@ class PairAligner:
         cannot align are learned from scratch, with a rig only those without an accurate prediction; without `scratch`,
         only pairs that the network does not contain.
         """
-        if not self._are_verified(pairs, capture):
+        if not self._verify_refined(pairs, capture):
             starts = self._seeded(pairs)
             if self.settings.seed.only:
                 self._keep_seeds(starts)
@@ -156,7 +156,7 @@ class PairAligner:
                 self.result = of_one_geometry(pairs, self.result)
         return self.timer.added_to(self.result)
 
-    def _are_verified(self, pairs: Sequence[BandPair], capture: Capture | None) -> bool:
+    def _verify_refined(self, pairs: Sequence[BandPair], capture: Capture | None) -> bool:
         """Verify mappings that were refined when the flight was learned; False unless all pairs are aligned by them."""
         if capture is None or self.model is None:
             return False

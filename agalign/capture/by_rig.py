@@ -35,8 +35,7 @@ def observed(pairs: Sequence[BandPair], result: Alignments, capture: Capture) ->
         if parallax is not None:
             rms_px = FixedImagePx(parallax.relief.rms_px * math.hypot(*parallax.baseline))
             parallax_px[pair.name] = pair.in_moving_file_px(rms_px, matrix)
-    altitude_m = None if capture.position is None else capture.position.altitude_m
-    return Observation(capture.time_s, mappings, std_px, altitude_m, capture.motion, parallax_px)
+    return Observation(capture.time_s, mappings, std_px, capture.altitude_m, capture.motion, parallax_px)
 
 
 def with_predictions(pairs: Sequence[BandPair], result: Alignments, rig: Rig, capture: Capture) -> Alignments:
