@@ -1,7 +1,7 @@
 """Predictions of the flight's rig for the bands of a capture: checks, replacements, and selection of bands to learn."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -47,31 +47,30 @@ def with_predictions(pairs: Sequence[BandPair], result: Alignments, rig: Rig, ca
     """
     known = observed([p for p in pairs if p.has_rig_pixels], result, capture)
     covered = [p for p in pairs if p.name in rig.mean and p.has_rig_pixels]
-    by_relief = {p.name: p for p in covered if p.name in known.mappings and result[p.name].mapping.parallax is not None}
+    parallaxes = [(p, result[p.name].mapping.parallax) for p in covered if p.name in known.mappings]
     predicted = {
-        p.name: _with_prediction(p, result[p.name], rig, known, *_parallax_by_rig(p, by_relief, result, rig))
-        for p in covered
+        p.name: _with_prediction(p, result[p.name], rig, known, *_parallax_by_rig(p, parallaxes, rig)) for p in covered
     }
     return {**result, **predicted}
 
 
 def _parallax_by_rig(
-    pair: BandPair, by_relief: Mapping[str, BandPair], result: Alignments, rig: Rig
+    pair: BandPair, parallaxes: Sequence[tuple[BandPair, Parallax | None]], rig: Rig
 ) -> tuple[Parallax | None, FixedImagePx]:
     """Return the relief of the other bands with the baseline of the rig, scaled to theirs, and its standard error.
 
     The error is that of the baseline, and of pixels for which the relief has no value. None and 0 without a relief.
     """
-    parallaxes = {
-        name: parallax
-        for name, other in by_relief.items()
-        if name != pair.name and other.reference is pair.reference and (parallax := result[name].mapping.parallax)
+    others = {
+        other.name: parallax
+        for other, parallax in parallaxes
+        if parallax is not None and other is not pair and other.reference is pair.reference
     }
-    if not parallaxes:
+    if not others:
         return None, FixedImagePx(0.0)
-    relief = next(iter(parallaxes.values())).relief
-    seen = np.array([parallax.baseline for parallax in parallaxes.values()])
-    of_rig = np.array([rig.baselines[name] for name in parallaxes])
+    relief = next(iter(others.values())).relief
+    seen = np.array([parallax.baseline for parallax in others.values()])
+    of_rig = np.array([rig.baselines[name] for name in others])
     scale = float((seen * of_rig).sum() / max((of_rig**2).sum(), 1e-12))
     error = float(np.sqrt(((seen - scale * of_rig) ** 2).sum(axis=1).mean()))
     x, y = (scale * np.array(rig.baselines[pair.name])).tolist()

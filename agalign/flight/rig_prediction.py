@@ -96,9 +96,8 @@ def _from_bands(rig: Rig, band: str, known: Observation) -> Prediction:
     mappings = {**rig.mean, **known.mappings}
     differences = np.stack([affine_difference(rig.mean[b], mappings[b], rig.size_px) for b in others])
     weights = mapping_weight(np.stack([std_px, np.full(len(others), MIN_STD_PX)]), expected_px)
-    solutions, (covariance, if_all_known), _ = capture_factors(
-        designs, np.stack([differences, 0 * differences]), weights
-    )
+    both = np.stack([differences, 0 * differences])  # of this capture, and of one with accurate mappings of all others
+    solutions, (covariance, if_all_known), _ = capture_factors(designs, both, weights)
     excess_px2 = ((differences - designs @ solutions[0]) ** 2).sum(axis=(1, 2)) - expected_px**2
     learned_px2 = [np.square(c.factors[:3]).sum() for c in rig.captures]
     outside_px2 = np.square(solutions[0, :3]).sum() - np.mean(learned_px2 or [0.0])
