@@ -111,7 +111,8 @@ def consistent_bands(
 ) -> tuple[list[int], Adjustment] | None:
     """Adjust the model to the bands with common parallax; return their indices and the model, or None.
 
-    A band that the parallax of the others does not explain is left out, one after another.
+    A band that the parallax of the others does not explain is left out, one after another. Lens shapes are fitted with
+    the standard deviations `lens_std` (4,), not without.
     """
     size_px = group[0].pair.fixed.size_px
     # Residual of a band relative to that of the others: up to 1.4 for bands of the same time, 2.4 for a photograph of

@@ -255,8 +255,8 @@ def test_neither_relief_nor_field_replaces_another_model_family(
 
 
 @pytest.fixture(scope="module")
-def beside_relief(flat: Rendered) -> dict[str, Alignment]:
-    """All bands of a flat scene, of which Blue has a relief."""
+def one_relief(flat: Rendered) -> dict[str, Alignment]:
+    """All bands of a flat scene; only Blue has a relief."""
     result = verified_together(flat.candidates(), Settings())
     relief = Relief(np.zeros((4, 4), np.float32), np.ones((4, 4), np.float32))
     return {
@@ -265,31 +265,31 @@ def beside_relief(flat: Rendered) -> dict[str, Alignment]:
     }
 
 
-def test_a_homography_next_to_a_relief_is_predicted(flat: Rendered, beside_relief: dict[str, Alignment]) -> None:
+def test_a_homography_next_to_a_relief_is_predicted(flat: Rendered, one_relief: dict[str, Alignment]) -> None:
     """It passes all checks, but is another geometry than that of the other bands; a thermal one has another grid."""
-    assert {a.status for a in beside_relief.values()} == {"aligned"}
+    assert {a.status for a in one_relief.values()} == {"aligned"}
     pairs = {c.pair.name: c.pair for c in flat.candidates()}
     pairs["Red"] = replace(pairs["Red"], reference=Reference(pairs["Red"].reference.image))
-    result = of_one_geometry(list(pairs.values()), beside_relief)
+    result = of_one_geometry(list(pairs.values()), one_relief)
     assert {name: a.status for name, a in result.items()} == {"Blue": "aligned", "Red": "aligned", "NIR": "predicted"}
     assert result["NIR"].prediction.source == "windows"
 
 
 def test_the_bands_of_one_verification_have_one_geometry(
-    flat: Rendered, beside_relief: dict[str, Alignment], monkeypatch: pytest.MonkeyPatch
+    flat: Rendered, one_relief: dict[str, Alignment], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    only_blue = {"Blue": beside_relief["Blue"]}, set()
+    only_blue = {"Blue": one_relief["Blue"]}, set()
     monkeypatch.setattr(align_bands, "aligned_by_relief", lambda *_, **__: only_blue)
     result = verified_together(flat.candidates(), Settings())
     assert {name: a.status for name, a in result.items()} == {"Blue": "aligned", "Red": "predicted", "NIR": "predicted"}
 
 
 def test_bands_that_are_aligned_one_after_another_have_one_geometry(
-    flat: Rendered, beside_relief: dict[str, Alignment], monkeypatch: pytest.MonkeyPatch
+    flat: Rendered, one_relief: dict[str, Alignment], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A band that is learned from scratch after the relief of the others, for example."""
     aligner = PairAligner(Settings(), None, quiet)
-    monkeypatch.setattr(PairAligner, "refine", lambda self, _: self.result.update(beside_relief))
+    monkeypatch.setattr(PairAligner, "refine", lambda self, _: self.result.update(one_relief))
     result = aligner.align([c.pair for c in flat.candidates()], None)
     assert {name: a.status for name, a in result.items()} == {"Blue": "aligned", "Red": "predicted", "NIR": "predicted"}
 

@@ -142,7 +142,7 @@ LIMITS = {
     "method.md": (
         f"| at least {MIN_RETRIEVAL:g}, and {MIN_TIMES_CHANCE:g} times chance |",
         f"| {checks._MAX_CORNER_STD_PX:g} px |",
-        f"the textured windows ({windows._WINDOW_PX} px)",
+        f"| textured windows ({windows._WINDOW_PX} px) |",
         f"| {checks._MIN_COVERAGE:.0%} ({checks._MIN_HELD_OUT_COVERAGE:.0%} if".replace("%", " %"),
         f"| {checks._MIN_CLOSE_SHARE:.0%}; adjacent windows beyond {checks.MAX_SHIFT_PX:g} px: fewer than "
         f"{checks._MIN_CLUSTER}, or than {checks._MAX_CLUSTER_SHARE:.0%} of the windows |".replace("%", " %"),
