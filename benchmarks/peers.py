@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 
 import agalign
 from agalign.capture.band_pair import BandPair
+from agalign.capture.reference import Reference
 from agalign.capture.seeding import best_seed
 from agalign.errors import AgalignError
 from agalign.evaluation.evaluate import elastix_affinity
@@ -139,7 +140,7 @@ def elastix(fixed: Image, moving: Image) -> Matrix | None:
 
 def structure_seed(fixed: Raster, moving: Raster) -> Matrix:
     """Where the program starts on a pair without tags."""
-    pair = BandPair.of_images("moving", fixed, moving, {"identity": np.eye(3)})
+    pair = BandPair("moving", Reference(fixed), moving, {"identity": np.eye(3)})
     return best_seed(pair, pair.seed_matrices).fixed_to_moving
 
 

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from agalign.capture.band_pair import BandPair
+from agalign.capture.reference import Reference
 from agalign.values.alignment import JointResult, Residual
 from agalign.values.image import Raster
 from agalign.values.lens import Lens
@@ -38,7 +39,7 @@ def pair_of(
     fixed: Raster, moving: Raster, candidates: Mapping[str, np.ndarray] | None = None, **std_px: float
 ) -> BandPair:
     """A pair with candidates for its mapping, by default the identity, and their standard errors."""
-    return BandPair.of_images("moving", fixed, moving, candidates or {"identity": np.eye(3)}, std_px)
+    return BandPair("moving", Reference(fixed), moving, candidates or {"identity": np.eye(3)}, seed_std_px=std_px)
 
 
 def joint_result(

@@ -254,7 +254,7 @@ def _extrapolation_px(
     for band, of_band in residuals.items():
         centres_px = np.concatenate([r.measured_px for r in of_band])
         if unobserved_quarters(centres_px, rig.size_px):
-            ratio = abs(float(geometry.local_scale(rig.mean[band], *rig.size_px)[-1]))
+            ratio = geometry.magnification(rig.mean[band], *rig.size_px)
             std_px = unmodelled_std_px(centres_px, rig.size_px, calibrated=calibrated)
             result[band] = MovingFilePx(std_px * ratio)
     return result

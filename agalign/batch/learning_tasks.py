@@ -9,10 +9,10 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from agalign.batch.capture_task import quiet
-from agalign.capture.align_bands import PairAligner, refined_pairs, verify_together
+from agalign.capture.align_bands import PairAligner, refined_pairs
 from agalign.capture.band_pair import BandPair, read_pairs
 from agalign.capture.by_rig import observed, with_predictions
-from agalign.capture.seeding import find_seed, image_groups
+from agalign.capture.seeding import Start, find_seed, image_groups
 from agalign.config import Settings
 from agalign.errors import AgalignError
 from agalign.flight.model import FlightModel
@@ -24,7 +24,7 @@ from agalign.method.joint import refine_with
 from agalign.method.refine import FLIGHT_PATCHES
 from agalign.method.state import ImageGroup, JointState
 from agalign.pixels.raster import with_saturation_values
-from agalign.values.alignment import MIN_RETRIEVAL, Alignment, JointResult, RefinedPair, Residual, Seed
+from agalign.values.alignment import MIN_RETRIEVAL, Alignments, JointResult, RefinedPair, Residual, Seed
 from agalign.values.capture import Capture
 from agalign.values.geometry import Matrix
 from agalign.values.issues import Issue
@@ -111,25 +111,24 @@ class LoadedCapture:
 
     capture: Capture
     groups: list[tuple[list[int], ImageGroup]]
-    """Groups of images, each with the indices of its pairs in `pairs`."""
-    pairs: list[BandPair]
-    seeds: list[Seed]
+    """Groups of images, each with the indices of its pairs in `starts`."""
+    starts: list[Start]
 
     @property
     def similarity_sigma(self) -> float:
         """Median height of the correlation peaks of the seeds, in standard deviations."""
-        return float(np.median([s.peak_sigma for s in self.seeds]))
+        return float(np.median([seed.peak_sigma for _, seed in self.starts]))
 
     @property
     def is_trusted(self) -> bool:
         """True if all seeds are confirmed by the images."""
-        return all(s.trusted for s in self.seeds)
+        return all(seed.trusted for _, seed in self.starts)
 
     def groups_from(self, refined: Mapping[str, RefinedPair]) -> list[ImageGroup]:
         """Return the groups with the refined mappings of pairs with distinguishable patches as initial mappings."""
         for places, group in self.groups:
             for k, place in enumerate(places):
-                pair = refined.get(self.pairs[place].name)
+                pair = refined.get(self.starts[place][0].name)
                 if pair is not None and pair.result.retrieval >= MIN_RETRIEVAL:
                     group.mappings[k] = pair.result.fixed_to_moving
         return [group for _, group in self.groups]
@@ -142,15 +141,16 @@ class LoadedCapture:
         of_pair: dict[int, JointResult[FixedImagePx] | Issue] = {}
         for places, group in self.groups:
             of_pair |= zip(places, refine_with(net, group, settings.joint, quiet, FLIGHT_PATCHES), strict=True)
-        results = [of_pair[i] for i in range(len(self.pairs))]
-        known = [(p, r) for p, r in zip(self.pairs, results, strict=True) if isinstance(r, JointResult)]
-        starts = list(zip(self.pairs, self.seeds, strict=True))
-        enough, refined = SCHEDULES[settings.joint.recipe].enough_retrieval, refined_pairs(starts, results)
+        results = [of_pair[i] for i in range(len(self.starts))]
+        pairs = [pair for pair, _ in self.starts]
+        known = [(p, r) for p, r in zip(pairs, results, strict=True) if isinstance(r, JointResult)]
+        enough, refined = SCHEDULES[settings.joint.recipe].enough_retrieval, refined_pairs(self.starts, results)
         is_good_enough = all(isinstance(r, JointResult) and r.retrieval > enough for r in results)
         observation = None
         if is_final or is_good_enough:
-            aligned = verify_together(starts, results, None, settings, is_observation=True)
-            observation = _observation(self.pairs, aligned, refined, self.capture)
+            aligner = PairAligner(settings, None, quiet, is_observation=True)
+            aligner.verify(self.starts, results)
+            observation = _observation(pairs, aligner.result, refined, self.capture)
         mappings = {p.name: p.scales.between_files(r.fixed_to_moving) for p, r in known if r.retrieval >= MIN_RETRIEVAL}
         return LearningCapture(self.capture, is_good_enough, mappings, refined, observation)
 
@@ -171,9 +171,8 @@ def load_capture(
         seeds_of = [(p, known[p.name].seed if p.name in known else find_seed(p, settings.seed, start)) for p in pairs]
         result = [(p, seed) for p, seed in seeds_of if isinstance(seed, Seed)]
         if result:
-            usable, seeds = [p for p, _ in result], [seed for _, seed in result]
-            groups = image_groups(usable, seeds, [bands.index(p.name) + 1 for p in usable])
-            return LoadedCapture(capture, groups, usable, seeds)
+            groups = image_groups(result, [bands.index(p.name) + 1 for p, _ in result])
+            return LoadedCapture(capture, groups, result)
     return None
 
 
@@ -249,10 +248,7 @@ def try_model(model: FlightModel, settings: Settings, capture: Capture) -> tuple
 
 
 def _observation(
-    pairs: Sequence[BandPair],
-    result: Mapping[str, Alignment[FixedImagePx]],
-    refined: Mapping[str, RefinedPair],
-    capture: Capture,
+    pairs: Sequence[BandPair], result: Alignments, refined: Mapping[str, RefinedPair], capture: Capture
 ) -> RigObservation:
     in_file_px = {p.name: result[p.name].in_file_px(p.scales, p.reference_file_px) for p in pairs}
     residuals = {b: a.residual for b, a in in_file_px.items() if a.status == "aligned" and a.residual is not None}

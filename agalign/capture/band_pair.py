@@ -13,6 +13,7 @@ from agalign.capture.reference import Reference
 from agalign.capture.tag_seeds import tag_seeds
 from agalign.config import SeedSettings
 from agalign.errors import AgalignError
+from agalign.fit.adjustment import lens_std_px
 from agalign.fit.windows import FixedWindows
 from agalign.flight.model import FlightModel
 from agalign.flight.rig_prediction import unobserved_error_px
@@ -29,7 +30,6 @@ from agalign.values.geometry import Matrix
 from agalign.values.image import Raster
 from agalign.values.issues import NO_SUCH_SEED, UNREADABLE, Issue
 from agalign.values.mapping import PixelMapping
-from agalign.values.parallax import Parallax
 from agalign.values.pixel_units import (
     FixedFilePx,
     FixedImagePoints,
@@ -73,18 +73,6 @@ class BandPair:
     layout: tuple[float, float] | None = None
     """Direction (x, y) in which points move in the moving image, relative to the reference, when the scene comes
     nearer, in a unit common to the camera's bands; None if the tags do not contain it."""
-
-    @classmethod
-    def of_images(
-        cls,
-        name: str,
-        fixed: Raster,
-        moving: Raster,
-        seed_matrices: SeedMatrices,
-        seed_std_px: Mapping[SeedKind, FixedImagePx] | None = None,
-    ) -> "BandPair":
-        """Create a pair of two images that are not reduced."""
-        return cls(name, Reference(fixed), moving, seed_matrices, seed_std_px=seed_std_px or {})
 
     @property
     def space(self) -> Space:
@@ -130,6 +118,11 @@ class BandPair:
         return max(self.reference.blur_px, blur_px(channel_mean(self.moving_image))) > max_sharp_px
 
     @property
+    def lens_std_px(self) -> NDArray[np.float64]:
+        """(4,) standard deviations of the lens shapes that the lenses of the two images do not contain."""
+        return lens_std_px(self.fixed.size_px, calibrated=self.space == "undistorted")
+
+    @property
     def windows(self) -> FixedWindows:
         """The windows that verify an alignment."""
         return self.reference.large_windows if self.is_blurred else self.reference.windows
@@ -149,12 +142,9 @@ class BandPair:
         """The moving image, with its lens if the homographies are between undistorted pixels."""
         return self.moving_image if self.space == "undistorted" else replace(self.moving_image, lens=None)
 
-    def mapping(
-        self, fixed_to_moving: Matrix, field: DisplacementField | None = None, parallax: Parallax | None = None
-    ) -> PixelMapping:
-        """Return the complete mapping between raw pixels of the images; `field` replaces the rig's field."""
-        lenses = self.fixed.lens, self.moving.lens
-        return PixelMapping(fixed_to_moving, *lenses, field=field or self.field, parallax=parallax)
+    def mapping(self, fixed_to_moving: Matrix) -> PixelMapping:
+        """Return the complete mapping between raw pixels of the images."""
+        return PixelMapping(fixed_to_moving, self.fixed.lens, self.moving.lens, field=self.field)
 
     def warped_moving(self, mapping: PixelMapping) -> Raster:
         """Warp the channel mean of the moving image to the grid of the reference."""
@@ -201,8 +191,8 @@ class BandPair:
     def in_moving_file_px(self, distance_px: FixedImagePx, fixed_to_moving: Matrix) -> MovingFilePx:
         """Convert a distance in the fixed image to the moving file, for a homography between the images."""
         between_files = self.scales.between_files(fixed_to_moving)
-        magnification = float(geometry.local_scale(between_files, *self.reference_file_px)[-1])
-        return MovingFilePx(distance_px / min(self.scales.fixed) * abs(magnification))
+        magnification = geometry.magnification(between_files, *self.reference_file_px)
+        return MovingFilePx(distance_px / min(self.scales.fixed) * magnification)
 
 
 def read_pairs(
@@ -217,7 +207,9 @@ def read_pairs(
     pairs: list[BandPair] = []
     unusable: dict[str, Issue] = {}
     for bands in capture.moving_lenses:
-        matrices = _seed_matrices(capture.reference, bands[0], settings, model)
+        matrices = tag_seeds(capture.reference, bands[0], settings)
+        if model is not None and bands[0].name in model.mappings:
+            matrices = {"model": model.mappings[bands[0].name], **matrices}
         if not matrices:
             issue = Issue(NO_SUCH_SEED, detail=str(settings.force))
             unusable |= dict.fromkeys((b.name for b in bands), issue)
@@ -244,14 +236,6 @@ def _without_stripes(pairs: Sequence[BandPair], reference: Reference) -> list[Ba
         replace(pair, reference=cleaned_reference, moving_image=next(images)) if pair.reference is reference else pair
         for pair in pairs
     ]
-
-
-def _seed_matrices(reference: Band, moving: Band, settings: SeedSettings, model: FlightModel | None) -> SeedMatrices:
-    """Return fixed_to_moving between undistorted px of the files by kind; empty if a forced kind is not available."""
-    matrices = tag_seeds(reference, moving, settings)
-    if model is not None and moving.name in model.mappings:
-        return {"model": model.mappings[moving.name], **matrices}
-    return matrices
 
 
 def _pair(
@@ -291,7 +275,7 @@ def longest_for(reference: Band, fixed_to_moving: Matrix) -> int:
 
     It is less than _LONGEST_SIDE_PX for a band with much larger pixels, as of a thermal camera.
     """
-    ratio = abs(float(geometry.local_scale(fixed_to_moving, *reference.size_px)[-1]))
+    ratio = geometry.magnification(fixed_to_moving, *reference.size_px)
     if not 0 < ratio < _COARSE_RATIO:
         return _LONGEST_SIDE_PX
     oversampling = 2.0  # along a line; more pixels of the reference add no common detail
@@ -307,7 +291,7 @@ def _seed_std_px(band: str, model: FlightModel | None, scale: PixelScale) -> dic
     if model is not None and model.rig is not None and band in model.rig.mean:
         mean, rig = model.rig.mean[band], model.rig
         # The errors of a rig are in px of the band's own file.
-        ratio = abs(float(geometry.local_scale(mean, *rig.size_px)[-1]))
+        ratio = geometry.magnification(mean, *rig.size_px)
         error_px = FixedFilePx(unobserved_error_px(rig, band, by_neighbours=False) / ratio)
         min_std_px = 1.0  # of the mean: captures differ by this in height and tilt
         result["model"] = FixedImagePx(max(error_px, min_std_px) * scale.x)

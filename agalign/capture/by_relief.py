@@ -9,7 +9,7 @@ Either all bands of the capture use the relief, or none.
 import math
 from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from itertools import cycle
 from statistics import median_high
 from typing import NamedTuple
@@ -18,8 +18,6 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from agalign.capture.band_pair import BandPair
-from agalign.capture.candidate import Candidate
 from agalign.capture.common_parallax import (
     MIN_BANDS,
     MIN_PARALLAX_PX,
@@ -29,7 +27,8 @@ from agalign.capture.common_parallax import (
     layout_of,
 )
 from agalign.capture.decision import decided, predicted_by_windows, without_result
-from agalign.capture.warped_pair import WarpedPair
+from agalign.capture.seeding import Start
+from agalign.capture.warped_pair import Candidate, WarpedPair
 from agalign.errors import GeometryError
 from agalign.fit.adjustment import (
     BaselinePrior,
@@ -39,53 +38,41 @@ from agalign.fit.adjustment import (
     are_of_lenses,
     are_on_a_line,
     fit_in_rounds,
-    lens_std_px,
     parallax_of,
 )
 from agalign.fit.dense import DenseMatching, View
 from agalign.fit.displacement_field import MIN_WINDOWS
-from agalign.fit.occlusion import nearer_sign, occluded
+from agalign.fit.relief import nearer_sign, occluded
 from agalign.pixels.band_resampling import channel_mean
-from agalign.values.alignment import Alignment, JointResult, Residual, Seed
+from agalign.values.alignment import Alignment, Alignments, JointResult, Residual
 from agalign.values.choices import Geometry, ReliefUse
 from agalign.values.image import FloatImage
 from agalign.values.issues import OTHER_GEOMETRY
 from agalign.values.mapping import PixelMapping
 from agalign.values.parallax import Parallax, Relief
 from agalign.values.pixel_units import FixedImagePx
-from agalign.verify.checks import BY_PARALLAX, BY_WINDOWS, MAX_ALIAS_PEAK, MAX_SHIFT_PX, alias_peak
+from agalign.verify.checks import BY_PARALLAX, BY_WINDOWS, MAX_ALIAS_PEAK, MAX_SHIFT_PX
 
 _MIN_OBSERVED_SHARE = 0.75
 """Minimum share of aligned windows for an observation of a rig, which contains no depth edges: 0.79 or more in scenes
 with booms and plants at 1 m."""
 
 
-@dataclass
-class ReliefResult:
-    """The bands of a capture after the estimation of its relief."""
-
-    alignments: dict[str, Alignment[FixedImagePx]] = field(default_factory=dict)
-    """Bands aligned by the relief, by name."""
-    along_a_line: set[str] = field(default_factory=set)
-    """Bands with common displacements that neither a relief nor displacement fields must follow."""
-
-
 def aligned_by_relief(
-    candidates: Sequence[Candidate],
-    use: ReliefUse,
-    *,
-    lost: Sequence[tuple[BandPair, Seed]] = (),
-    is_observation: bool = False,
-) -> ReliefResult:
+    candidates: Sequence[Candidate], use: ReliefUse, *, lost: Sequence[Start] = (), is_observation: bool = False
+) -> tuple[Alignments, set[str]]:
     """Align bands by one relief of the capture, with lens shapes where no rig contains the distortion.
 
+    Return the bands that are aligned, and the names of those with common displacements along a line that neither a
+    relief nor displacement fields must follow.
     Bands `lost` in the joint optimisation, and those with another kind of lens model, follow the relief too.
     With `use` "auto" a relief is only estimated if the residuals of the homographies contain common parallax. For an
     observation of the rig, only the homographies matter, and the parallax of windows suffices.
     """
-    result = ReliefResult()
+    alignments: Alignments = {}
+    along_a_line: set[str] = set()
     if use == "never":
-        return result
+        return alignments, along_a_line
     # Along one line, larger common displacements are those of shadows or leaves, not of lenses; a displacement field
     # would follow them too.
     max_line_px = 1.0
@@ -94,11 +81,11 @@ def aligned_by_relief(
             continue
         parallax_px, on_a_line = common_parallax_px(group)
         if on_a_line and parallax_px > max_line_px:
-            result.along_a_line |= {c.pair.name for c in group}
+            along_a_line |= {c.pair.name for c in group}
         elif use == "always" or parallax_px >= MIN_PARALLAX_PX:
             with suppress(GeometryError):
-                result.alignments |= _observed(group) if is_observation else _aligned_group(group, candidates, lost)
-    return result
+                alignments |= _observed(group) if is_observation else _aligned_group(group, candidates, lost)
+    return alignments, along_a_line
 
 
 @dataclass(frozen=True)
@@ -134,7 +121,7 @@ class _Band:
         return self.candidate.joint.with_homography(self.plane.fixed_to_moving, self.covariance_px2)
 
 
-def _observed(group: Sequence[Candidate]) -> dict[str, Alignment[FixedImagePx]]:
+def _observed(group: Sequence[Candidate]) -> Alignments:
     """Align a group by the planes of its bands and the parallax of windows, without a relief of every pixel.
 
     The parallax of a held-out window is that by the other bands. Empty if no parallax or the homographies alone explain
@@ -173,9 +160,7 @@ def _observed(group: Sequence[Candidate]) -> dict[str, Alignment[FixedImagePx]]:
     return _aligned(bands, checked)
 
 
-def _aligned_group(
-    group: Sequence[Candidate], candidates: Sequence[Candidate], lost: Sequence[tuple[BandPair, Seed]]
-) -> dict[str, Alignment[FixedImagePx]]:
+def _aligned_group(group: Sequence[Candidate], candidates: Sequence[Candidate], lost: Sequence[Start]) -> Alignments:
     """Align a group by its relief, and the other bands by it too; empty if another geometry explains the group better.
 
     Raises GeometryError.
@@ -207,7 +192,7 @@ class _Estimate:
         Raises GeometryError.
         """
         planes, size_px = [_Band(c, c.warped.mapping) for c in group], group[0].pair.fixed.size_px
-        lens_std = None if any(c.pair.has_rig for c in group) else _lens_std_px(group[0].pair)
+        lens_std = None if any(c.pair.has_rig for c in group) else group[0].pair.lens_std_px
         consistent = consistent_bands(_window_shifts(planes), group, lens_std)
         if consistent is None:
             return None
@@ -218,23 +203,17 @@ class _Estimate:
         matching = DenseMatching(group[0].pair.reference.grey, _views(bands), (low, high))
         matched = matching.matched(range(len(bands)))
         # The parallax of the windows is a free parameter: noise of the relief would otherwise shorten the baselines.
-        baselines = np.array([b.baseline for b in bands])
         windows = _window_shifts(bands, matched, with_lens_shapes=lens_std is not None)
-        again = adjust(windows, size_px, baselines, lens_std)
+        again = adjust(windows, size_px, _baselines(bands), lens_std)
         if again is not None:
             bands = [band.fitted(fit) for band, fit in zip(bands, again.fits, strict=True)]
-        baselines = np.array([b.baseline for b in bands])
+        baselines = _baselines(bands)
         if not are_of_lenses(baselines, layout) or (layout is None and are_on_a_line(baselines)):
             return None
         selections = [range(len(bands)), *_verifying(range(len(bands)))]
         relief, *from_others = matching.refined(_views(bands), selections)
         result = cls(bands, replace(relief, std_px=_std_px(from_others)), from_others)
         return result.negated if layout is None and nearer_sign(matched, baselines) < 0 else result
-
-    @property
-    def baselines(self) -> NDArray[np.float64]:
-        """(bands, 2) t_b."""
-        return np.array([band.baseline for band in self.bands])
 
     @property
     def negated(self) -> "_Estimate":
@@ -250,30 +229,26 @@ class _Estimate:
         """
         prior, layout = BaselinePrior(), layout_of([candidate, *(b.candidate for b in self.bands)])
         if layout is not None:
-            own, others = layout[0], layout[1:]
+            own, others, baselines = layout[0], layout[1:], _baselines(self.bands)
             layout_std = 0.3  # of lens positions without tags, which deviate by up to 0.1 of the longest baseline
-            x, y = own * float((others * self.baselines).sum() / max((others**2).sum(), 1e-12))
+            x, y = own * float((others * baselines).sum() / max((others**2).sum(), 1e-12))
             prior = BaselinePrior((x, y), layout_std)
-        band = _Band(candidate, candidate.warped.mapping, prior.mean)
-
-        def measured(mapping: PixelMapping) -> Residual[FixedImagePx]:
-            return candidate.fit_residual(mapping)
-
-        start, size_px = band.mapping(self.relief), candidate.pair.fixed.size_px
-        if len(measured(start).measured_px) < MIN_WINDOWS:
+        start = _Band(candidate, candidate.warped.mapping, prior.mean).mapping(self.relief)
+        if len(candidate.fit_residual(start).measured_px) < MIN_WINDOWS:
             return None
-        fitted = fit_in_rounds(start, measured, size_px, lens_std_px=_lens_std_px(candidate.pair), baseline=prior)
+        size_px, lens_std = candidate.pair.fixed.size_px, None if candidate.pair.has_rig else candidate.pair.lens_std_px
+        fitted = fit_in_rounds(start, candidate.fit_residual, size_px, lens_std_px=lens_std, baseline=prior)
         if fitted is None or fitted[0].parallax is None:
             return None
         baseline, covariance_px2 = fitted[0].parallax.baseline, fitted[1].covariance_px2[:8, :8]
         return _Band(candidate, fitted[0].of_the_plane, baseline, covariance_px2)
 
-    def for_others(self, candidates: Sequence[Candidate]) -> dict[str, Alignment[FixedImagePx]]:
+    def for_others(self, candidates: Sequence[Candidate]) -> Alignments:
         """Align or predict bands of the same reference where windows allow it, except those of the estimate: a relief
         does not verify a band that it is estimated from.
         """
         names, reference = {band.name for band in self.bands}, self.bands[0].candidate.pair.reference
-        result: dict[str, Alignment[FixedImagePx]] = {}
+        result: Alignments = {}
         for candidate in candidates:
             pair = candidate.pair
             if pair.name in names or pair.is_coarse or pair.reference is not reference:
@@ -306,7 +281,7 @@ class _Estimate:
         candidate, pair, residual = band.candidate, warped.pair, warped.residual
         is_known = len(residual.measured_px) >= MIN_WINDOWS
         is_known &= residual.median_px <= MAX_SHIFT_PX * pair.file_pixel_size_px
-        if not is_known or alias_peak(*warped.reduced_spectra()).ratio > MAX_ALIAS_PEAK:
+        if not is_known or warped.alias_peak().ratio > MAX_ALIAS_PEAK:
             return None
         joint = None if candidate.joint.recipe == BY_WINDOWS else candidate.joint
         without = without_result(pair, candidate.seed)
@@ -349,18 +324,13 @@ def _checked(band: _Band, warped: WarpedPair) -> _Checked | None:
     return None if warped.issues(band.joint()) else _Checked.of(band, warped)
 
 
-def _aligned(bands: Sequence[_Band], checked: Sequence[_Checked | None]) -> dict[str, Alignment[FixedImagePx]]:
+def _aligned(bands: Sequence[_Band], checked: Sequence[_Checked | None]) -> Alignments:
     """Return the bands that pass; none if the relief does not explain the held-out windows of half of the bands better
     than the homographies.
     """
     if median_high([-math.inf if one is None else one.gain_px for one in checked]) < 0:
         return {}
     return {band.name: one.alignment for band, one in zip(bands, checked, strict=True) if one is not None}
-
-
-def _lens_std_px(pair: BandPair) -> NDArray[np.float64] | None:
-    """Return the standard deviations (4,) of the lens shapes of a pair; None if the rig contains its distortion."""
-    return None if pair.has_rig else lens_std_px(pair.fixed.size_px, calibrated=pair.space == "undistorted")
 
 
 def _verifying(bands: Sequence[int]) -> list[list[int]]:
@@ -394,6 +364,11 @@ def _window_shifts(
     mappings = [b.plane if relief is None else b.mapping(relief) for b in bands]
     residuals = [b.candidate.fit_residual(m) for b, m in zip(bands, mappings, strict=True)]
     return WindowShifts.of(residuals, mappings, with_lens_shapes=with_lens_shapes)
+
+
+def _baselines(bands: Sequence[_Band]) -> NDArray[np.float64]:
+    """Return (bands, 2) t_b."""
+    return np.array([band.baseline for band in bands])
 
 
 def _views(bands: Sequence[_Band]) -> list[View]:

@@ -1,9 +1,8 @@
 """Predictions of the flight's rig for the bands of a capture: checks, replacements, and selection of bands to learn."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
-from typing import NamedTuple
 
 import numpy as np
 
@@ -11,48 +10,35 @@ from agalign.capture.band_pair import BandPair
 from agalign.capture.decision import decided
 from agalign.capture.seeding import find_rotated
 from agalign.capture.warped_pair import WarpedPair
-from agalign.fit.occlusion import occluded
+from agalign.fit.relief import occluded
 from agalign.flight.rig import Observation, Rig, distance_px
 from agalign.flight.rig_prediction import predict_band
-from agalign.values.alignment import MIN_TIMES_CHANCE, Alignment, Prediction
+from agalign.values.alignment import MIN_TIMES_CHANCE, Alignment, Alignments, Prediction
 from agalign.values.capture import Capture
+from agalign.values.geometry import Matrix
 from agalign.values.issues import Issue
 from agalign.values.parallax import Parallax
 from agalign.values.pixel_units import FixedImagePx, MovingFilePx
 from agalign.verify.checks import MAX_UNEXPECTED_PX, UNEXPECTED_PX, Evidence, issues_of
 
 
-def observed(pairs: Sequence[BandPair], result: Mapping[str, Alignment[FixedImagePx]], capture: Capture) -> Observation:
+def observed(pairs: Sequence[BandPair], result: Alignments, capture: Capture) -> Observation:
     """Return the aligned mappings of a capture as an observation of the rig."""
-    aligned = {p.name: (p, a) for p in pairs if (a := result[p.name]).status == "aligned" and a.joint is not None}
-    return Observation(
-        capture.time_s,
-        {name: pair.scales.between_files(a.fixed_to_moving) for name, (pair, a) in aligned.items()},
-        {name: _std_moving_px(pair, a) for name, (pair, a) in aligned.items()},
-        None if capture.position is None else capture.position.altitude_m,
-        capture.motion,
-        {
-            name: pair.in_moving_file_px(_rms_px(parallax), a.fixed_to_moving)
-            for name, (pair, a) in aligned.items()
-            if (parallax := a.mapping.parallax) is not None
-        },
-    )
+    mappings, std_px, parallax_px = dict[str, Matrix](), dict[str, MovingFilePx](), dict[str, MovingFilePx]()
+    for pair in pairs:
+        alignment = result[pair.name]
+        if alignment.status != "aligned" or alignment.joint is None:
+            continue
+        matrix, parallax = alignment.fixed_to_moving, alignment.mapping.parallax
+        mappings[pair.name] = pair.scales.between_files(matrix)
+        std_px[pair.name] = pair.in_moving_file_px(alignment.joint.corner_std_px, matrix)
+        if parallax is not None:
+            rms_px = FixedImagePx(parallax.relief.rms_px * math.hypot(*parallax.baseline))
+            parallax_px[pair.name] = pair.in_moving_file_px(rms_px, matrix)
+    return Observation(capture.time_s, mappings, std_px, capture.altitude_m, capture.motion, parallax_px)
 
 
-def _rms_px(parallax: Parallax) -> FixedImagePx:
-    """Return the RMS displacement of a band by a relief."""
-    return FixedImagePx(parallax.relief.rms_px * math.hypot(*parallax.baseline))
-
-
-def _std_moving_px(pair: BandPair, alignment: Alignment[FixedImagePx]) -> MovingFilePx:
-    """Return the standard error of a mapping, px of the moving file."""
-    assert alignment.joint is not None
-    return pair.in_moving_file_px(alignment.joint.corner_std_px, alignment.fixed_to_moving)
-
-
-def with_predictions(
-    pairs: Sequence[BandPair], result: Mapping[str, Alignment[FixedImagePx]], rig: Rig, capture: Capture
-) -> dict[str, Alignment[FixedImagePx]]:
+def with_predictions(pairs: Sequence[BandPair], result: Alignments, rig: Rig, capture: Capture) -> Alignments:
     """Return the alignments with the rig's predictions, px of the files; the prediction replaces failed alignments.
 
     It also replaces results that contradict the rig, because of aliasing in repetitive scenes. A rotated or scaled
@@ -61,55 +47,50 @@ def with_predictions(
     """
     known = observed([p for p in pairs if p.has_rig_pixels], result, capture)
     covered = [p for p in pairs if p.name in rig.mean and p.has_rig_pixels]
-    by_relief = {p.name: p for p in covered if p.name in known.mappings and result[p.name].mapping.parallax is not None}
-    return {
-        **result,
-        **{
-            p.name: _with_prediction(p, result[p.name], rig, known, _parallax_by_rig(p, by_relief, result, rig))
-            for p in covered
-        },
+    parallaxes = [(p, result[p.name].mapping.parallax) for p in covered if p.name in known.mappings]
+    predicted = {
+        p.name: _with_prediction(p, result[p.name], rig, known, *_parallax_by_rig(p, parallaxes, rig)) for p in covered
     }
-
-
-class _ExpectedParallax(NamedTuple):
-    """The relief of a capture as a band should see it."""
-
-    parallax: Parallax
-    std_px: FixedImagePx
-    """Standard error by that of the baseline, and of pixels for which the relief has no value."""
+    return {**result, **predicted}
 
 
 def _parallax_by_rig(
-    pair: BandPair, by_relief: Mapping[str, BandPair], result: Mapping[str, Alignment[FixedImagePx]], rig: Rig
-) -> _ExpectedParallax | None:
-    """Return the relief of the other bands with the baseline of the rig, scaled to theirs; None without a relief."""
-    parallaxes = {
-        name: parallax
-        for name, other in by_relief.items()
-        if name != pair.name and other.reference is pair.reference and (parallax := result[name].mapping.parallax)
+    pair: BandPair, parallaxes: Sequence[tuple[BandPair, Parallax | None]], rig: Rig
+) -> tuple[Parallax | None, FixedImagePx]:
+    """Return the relief of the other bands with the baseline of the rig, scaled to theirs, and its standard error.
+
+    The error is that of the baseline, and of pixels for which the relief has no value. None and 0 without a relief.
+    """
+    others = {
+        other.name: parallax
+        for other, parallax in parallaxes
+        if parallax is not None and other is not pair and other.reference is pair.reference
     }
-    if not parallaxes:
-        return None
-    relief = next(iter(parallaxes.values())).relief
-    seen = np.array([parallax.baseline for parallax in parallaxes.values()])
-    of_rig = np.array([rig.baselines[name] for name in parallaxes])
+    if not others:
+        return None, FixedImagePx(0.0)
+    relief = next(iter(others.values())).relief
+    seen = np.array([parallax.baseline for parallax in others.values()])
+    of_rig = np.array([rig.baselines[name] for name in others])
     scale = float((seen * of_rig).sum() / max((of_rig**2).sum(), 1e-12))
     error = float(np.sqrt(((seen - scale * of_rig) ** 2).sum(axis=1).mean()))
     x, y = (scale * np.array(rig.baselines[pair.name])).tolist()
-    std_px = FixedImagePx(error * relief.rms_px)
-    return _ExpectedParallax(Parallax(relief, (x, y), occluded(relief, (x, y))), std_px)
+    return Parallax(relief, (x, y), occluded(relief, (x, y))), FixedImagePx(error * relief.rms_px)
 
 
 def _with_prediction(
-    pair: BandPair, alignment: Alignment[FixedImagePx], rig: Rig, known: Observation, expected: _ExpectedParallax | None
+    pair: BandPair,
+    alignment: Alignment[FixedImagePx],
+    rig: Rig,
+    known: Observation,
+    parallax: Parallax | None,
+    parallax_std_px: FixedImagePx,
 ) -> Alignment[FixedImagePx]:
     """Return the alignment with its distance from the rig's prediction, which replaces it if that contradicts it or is
     more certain.
     """
     prediction = predict_band(rig, pair.name, known)
-    if expected is not None:
-        matrix = pair.scales.between_images(prediction.fixed_to_moving)
-        prediction = _with_added_error(prediction, pair.in_moving_file_px(expected.std_px, matrix))
+    matrix = pair.scales.between_images(prediction.fixed_to_moving)
+    prediction = _with_added_error(prediction, pair.in_moving_file_px(parallax_std_px, matrix))
     if pair.name in known.mappings and alignment.joint is not None and alignment.residual is not None:
         off_px = distance_px(known.mappings[pair.name], prediction.fixed_to_moving, rig.size_px)
         prediction = replace(prediction, off_px=off_px)
@@ -124,7 +105,7 @@ def _with_prediction(
         if not issues:
             return replace(alignment, prediction=prediction)
         alignment = replace(alignment, issues=issues)
-    if expected is None:
+    if parallax is None:
         # A homography does not follow the relief that captures of the flight have. The plane of a result, which the
         # check above compares, is not displaced by it.
         prediction = _with_added_error(prediction, rig.parallax_px.get(pair.name, MovingFilePx(0.0)))
@@ -132,7 +113,7 @@ def _with_prediction(
         by_windows = pair.scales.between_files(alignment.fixed_to_moving)
         if distance_px(by_windows, prediction.fixed_to_moving, rig.size_px) <= MAX_UNEXPECTED_PX:
             return alignment
-    return _predicted(pair, alignment, prediction, None if expected is None else expected.parallax)
+    return _predicted(pair, alignment, prediction, parallax)
 
 
 def _predicted(
@@ -155,11 +136,7 @@ def _with_added_error(prediction: Prediction, error_px: MovingFilePx) -> Predict
 
 
 def bands_to_learn(
-    pairs: Sequence[BandPair],
-    result: Mapping[str, Alignment[FixedImagePx]],
-    rig: Rig,
-    capture: Capture,
-    accept_predicted_px: float,
+    pairs: Sequence[BandPair], result: Alignments, rig: Rig, capture: Capture, accept_predicted_px: float
 ) -> set[str]:
     """Return the bands to learn from scratch if the flight's network did not align them.
 

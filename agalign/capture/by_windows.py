@@ -8,22 +8,22 @@
 """
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
 
 from agalign.capture.band_pair import BandPair
 from agalign.capture.decision import decided
-from agalign.capture.warped_pair import WarpedPair
-from agalign.fit.adjustment import WindowFit, fit_in_rounds, lens_std_px
+from agalign.capture.warped_pair import WarpedPair, result_of_windows
+from agalign.fit.adjustment import WindowFit, fit_in_rounds
 from agalign.flight.rig import Rig
 from agalign.values import geometry
-from agalign.values.alignment import Alignment, JointResult, Residual
+from agalign.values.alignment import Alignment, Alignments, Residual
 from agalign.values.issues import CORNERS_UNKNOWN, FEW_KEYPOINTS, NO_CONTRAST, RETRIEVAL
 from agalign.values.mapping import PixelMapping
 from agalign.values.pixel_units import FixedImagePx, MovingFilePx
-from agalign.verify.checks import BY_WINDOWS, MAX_ALIAS_PEAK, alias_peak, seed_fits
+from agalign.verify.checks import MAX_ALIAS_PEAK, seed_fits
 from agalign.verify.extrapolation import issues_of_extrapolation, points_in_frame
 
 _RELIEF_SHARE = 0.15
@@ -43,9 +43,8 @@ def aligned_by_windows(pair: BandPair, alignment: Alignment[FixedImagePx]) -> Al
     result = _aligned(pair, alignment)
     if result is None and pair.is_coarse and alignment.seed.trusted:
         result = _predicted(pair, alignment, pair.mapping(alignment.seed.fixed_to_moving), _is_consistent)
-        if result is not None:
-            alias = alias_peak(*WarpedPair.of(pair, result.mapping).reduced_spectra())
-            result = None if alias.ratio > MAX_ALIAS_PEAK else result
+        if result is not None and WarpedPair.of(pair, result.mapping).alias_peak().ratio > MAX_ALIAS_PEAK:
+            result = None
     return result or alignment
 
 
@@ -69,9 +68,8 @@ def _aligned(pair: BandPair, alignment: Alignment[FixedImagePx]) -> Alignment[Fi
     warped_pair = WarpedPair.of(pair, mapping, start.windows)
     held_out = warped_pair.residual.half(black=False)
     retrieval, chance = (0.0, 0.0) if alignment.joint is None else (alignment.joint.retrieval, alignment.joint.chance)
-    joint = JointResult[FixedImagePx](
-        mapping.fixed_to_moving, math.nan, retrieval, chance, 0, (1.0,), BY_WINDOWS, "homography", fit.max_px, ()
-    ).with_homography(mapping.fixed_to_moving, fit.covariance_px2)
+    joint = result_of_windows(mapping.fixed_to_moving).with_homography(mapping.fixed_to_moving, fit.covariance_px2)
+    joint = replace(joint, retrieval=retrieval, chance=chance, last_step_px=fit.max_px)
     if replace(warped_pair, residual=held_out).issues(joint):
         return None
     return decided(replace(alignment, mapping=mapping, issues=(), joint=joint, residual=held_out))
@@ -86,9 +84,7 @@ def _is_consistent(fit: WindowFit) -> bool:
     return count >= min_windows and bool((fit.residuals_px <= max_close_px).sum() >= min_close_share * count)
 
 
-def without_extrapolated(
-    pairs: Sequence[BandPair], result: Mapping[str, Alignment[FixedImagePx]], rig: Rig | None = None
-) -> dict[str, Alignment[FixedImagePx]]:
+def without_extrapolated(pairs: Sequence[BandPair], result: Alignments, rig: Rig | None = None) -> Alignments:
     """Return the alignments; those `aligned` but extrapolated over a quarter of the image become `predicted`.
 
     Bands that the rig covers and georeferenced files, which have no lens distortion, are not changed. A homography does
@@ -106,7 +102,7 @@ def without_extrapolated(
         if alignment.status != "aligned" or alignment.residual is None or "geo" in pair.seed_matrices or is_covered:
             continue
         plane = alignment.mapping.of_the_plane
-        in_frame_px = points_in_frame(plane, size_px, pair.moving.size_px)
+        in_frame_px = points_in_frame(plane, *pair.sizes_px)
         issues = issues_of_extrapolation(alignment.residual, size_px, in_frame_px)
         if issues:
             extrapolated = decided(replace(alignment, issues=issues, prediction=None))
@@ -119,9 +115,7 @@ def without_extrapolated(
     return checked
 
 
-def _shifts_by_range_px(
-    pairs: Sequence[BandPair], result: Mapping[str, Alignment[FixedImagePx]]
-) -> dict[str, MovingFilePx]:
+def _shifts_by_range_px(pairs: Sequence[BandPair], result: Alignments) -> dict[str, MovingFilePx]:
     """Return by band the shift of the aligned scene, at its range, from one at an infinite distance.
 
     The rig tags contain the mappings at infinity. Their errors have no common direction: the shift is the part of the
@@ -150,17 +144,13 @@ def _predicted(
     """Return the alignment as `predicted` by a homography and lens shapes, which replace the field of `start`."""
     size_px, to_file = pair.fixed.size_px, pair.scales.fixed.inverse
     fitted = fit_in_rounds(
-        replace(start, field=None),
-        lambda mapping: _measured(pair, mapping),
-        size_px,
-        is_accepted,
-        lens_std_px(size_px, calibrated=pair.space == "undistorted"),
+        replace(start, field=None), lambda mapping: _measured(pair, mapping), size_px, is_accepted, pair.lens_std_px
     )
     if fitted is None:
         return None
     mapping, fit = fitted
     to_file_px = np.r_[np.tile(to_file, 4), np.full(4, to_file.mean)]
-    std_px = FixedImagePx(fit.std_px(points_in_frame(mapping, size_px, pair.moving.size_px)))
+    std_px = FixedImagePx(fit.std_px(points_in_frame(mapping, *pair.sizes_px)))
     prediction = pair.prediction_of(mapping, std_px, fit.covariance_px2 * np.outer(to_file_px, to_file_px))
     residual = WarpedPair.of(pair, mapping).residual
     return decided(replace(alignment, mapping=mapping, residual=residual, prediction=prediction))

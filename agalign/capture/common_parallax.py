@@ -6,7 +6,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from agalign.capture.candidate import Candidate
+from agalign.capture.warped_pair import Candidate
 from agalign.fit.adjustment import (
     Adjustment,
     WindowShifts,
@@ -53,7 +53,8 @@ def common_parallax_px(group: Sequence[Candidate]) -> tuple[float, bool]:
     of the median band significantly.
     """
     residuals, size_px = _common_residuals(group), group[0].pair.fixed.size_px
-    if max(_p95_px(residual) for residual in residuals) < MIN_PARALLAX_PX:
+    # The p95 is robust, as a wrong peak is no parallax.
+    if max((r.p95_px for r in residuals if len(r.lengths_px)), default=0.0) < MIN_PARALLAX_PX:
         return 0.0, False
     windows = WindowShifts.of(residuals, [c.warped.mapping for c in group])
     consistent = consistent_bands(windows, group)
@@ -94,11 +95,6 @@ def _common_residuals(group: Sequence[Candidate]) -> list[Residual[FixedImagePx]
     return [reference.small_windows.residuals(c.warped.warped) for c in group]
 
 
-def _p95_px(residual: Residual[FixedImagePx]) -> float:
-    """Return the p95 of the lengths of the measured shifts, 0 without any: robust, as a wrong peak is no parallax."""
-    return float(residual.p95_px) if len(residual.lengths_px) else 0.0
-
-
 def _far_share(residual: Residual[FixedImagePx]) -> float:
     """Return the share of the measured windows with a shift above 1 px."""
     return float((residual.lengths_px > MAX_SHIFT_PX).mean()) if len(residual.lengths_px) else 0.0
@@ -116,7 +112,7 @@ def consistent_bands(
     """Adjust the model to the bands with common parallax; return their indices and the model, or None.
 
     A band that the parallax of the others does not explain is left out, one after another. Lens shapes are fitted with
-    the standard deviations `lens_std` (4,).
+    the standard deviations `lens_std` (4,), not without.
     """
     size_px = group[0].pair.fixed.size_px
     # Residual of a band relative to that of the others: up to 1.4 for bands of the same time, 2.4 for a photograph of

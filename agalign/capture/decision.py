@@ -11,14 +11,13 @@ A seed that contradicts the tags or the flight is replaced by their mapping: an 
 is confirmed at its own position, far from that of its band.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 
 from agalign.capture.band_pair import BandPair
-from agalign.capture.candidate import Candidate
-from agalign.capture.warped_pair import WarpedPair
+from agalign.capture.warped_pair import Candidate, WarpedPair
 from agalign.pixels.band_resampling import channel_mean
-from agalign.values.alignment import Alignment, JointResult, Seed
+from agalign.values.alignment import Alignment, Alignments, JointResult, Seed
 from agalign.values.choices import Geometry, PairStatus, ReliefUse, SeedKind
 from agalign.values.issues import OTHER_GEOMETRY, SEED_DOES_NOT_FIT, Issue, IssueKind
 from agalign.values.pixel_units import FixedImagePx, FixedPx
@@ -73,9 +72,7 @@ def predicted_by_windows(
     return decided(replace(alignment, issues=issues, prediction=prediction))
 
 
-def of_one_geometry(
-    pairs: Sequence[BandPair], result: Mapping[str, Alignment[FixedImagePx]]
-) -> dict[str, Alignment[FixedImagePx]]:
+def of_one_geometry(pairs: Sequence[BandPair], result: Alignments) -> Alignments:
     """Return the alignments by name: if a capture has a relief, homographies that are `aligned` become `predicted`.
 
     A spectral index would mix two geometries otherwise. Thermal bands, which have another reference image, keep theirs.

@@ -23,6 +23,8 @@ from agalign.values.geometry import Matrix
 from agalign.values.issues import BLANK_MOVING, BLANK_REFERENCE, NO_SUCH_SEED, Issue
 from agalign.verify.checks import seed_fits
 
+Start = tuple[BandPair, Seed]
+"""A pair with its initial alignment."""
 _MIN_OVERLAP = 0.2
 """Minimum share of the reference that the moving image covers: the correlation is circular and meaningless for small
 overlaps."""
@@ -144,42 +146,29 @@ def _network(pair: BandPair, model: FlightModel | None) -> Descriptor:
     return starter_for_matching(channels) if model is None else model.matching_network(pair.name, channels)
 
 
-def image_groups(
-    pairs: Sequence[BandPair], seeds: Sequence[Seed], sides: Sequence[int] = ()
-) -> list[tuple[list[int], ImageGroup]]:
+def image_groups(starts: Sequence[Start], sides: Sequence[int] = ()) -> list[tuple[list[int], ImageGroup]]:
     """Group the pairs with the same reference image and space for the joint method.
 
     Returns the indices of the pairs and the images of each group. `sides` are the network's sides of the pairs, by
     default 1, 2, … in each group.
     """
     groups: dict[tuple[int, Space], list[int]] = {}
-    for index, pair in enumerate(pairs):
+    for index, (pair, _) in enumerate(starts):
         groups.setdefault((id(pair.reference), pair.space), []).append(index)
-    return [
-        (
-            indices,
-            _image_group(
-                [pairs[i] for i in indices],
-                [seeds[i] for i in indices],
-                [sides[i] for i in indices] if sides else range(1, len(indices) + 1),
-            ),
+    result = []
+    for indices in groups.values():
+        of_group = [starts[i] for i in indices]
+        images = ImageGroup(
+            of_group[0][0].fixed,
+            [pair.moving for pair, _ in of_group],
+            [seed.fixed_to_moving for _, seed in of_group],
+            [sides[i] for i in indices] if sides else range(1, len(indices) + 1),
+            [seed.trusted for _, seed in of_group],
+            [pair.max_shift_px for pair, _ in of_group],
+            fields=[pair.field for pair, _ in of_group],
         )
-        for indices in groups.values()
-    ]
-
-
-def _image_group(pairs: Sequence[BandPair], seeds: Sequence[Seed], sides: Sequence[int]) -> ImageGroup:
-    mappings = [s.fixed_to_moving for s in seeds]
-    fields = [p.field for p in pairs]
-    return ImageGroup(
-        pairs[0].fixed,
-        [p.moving for p in pairs],
-        mappings,
-        sides,
-        [s.trusted for s in seeds],
-        [p.max_shift_px for p in pairs],
-        fields=fields if any(f is not None for f in fields) else (),
-    )
+        result.append((indices, images))
+    return result
 
 
 def best_seed(pair: BandPair, matrices: SeedMatrices, force: SeedKind | None = None) -> Seed:

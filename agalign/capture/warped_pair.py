@@ -1,5 +1,6 @@
-"""A band pair on one grid: the residual of its windows and the issues of an alignment."""
+"""A band pair on one grid: the residual of its windows, the issues of an alignment, and results to be compared."""
 
+import math
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -7,15 +8,15 @@ import numpy as np
 from agalign.capture.band_pair import BandPair
 from agalign.fit.windows import FixedWindows, residual_under
 from agalign.pixels.band_resampling import shrink
-from agalign.pixels.structure import Field, structure_field, windowed_spectra
+from agalign.pixels.structure import structure_field, windowed_spectra
 from agalign.values import geometry
-from agalign.values.alignment import Alignment, JointResult, Residual
+from agalign.values.alignment import Alignment, JointResult, Residual, Seed
 from agalign.values.geometry import Matrix
 from agalign.values.image import Raster
 from agalign.values.issues import Issue
 from agalign.values.mapping import PixelMapping
-from agalign.values.pixel_units import FixedImagePx, PixelScale
-from agalign.verify.checks import Evidence, issues_of
+from agalign.values.pixel_units import FixedImagePx
+from agalign.verify.checks import BY_WINDOWS, AliasPeak, Evidence, alias_peak, issues_of
 from agalign.verify.extrapolation import points_in_frame, unobserved_quarters
 
 
@@ -42,7 +43,7 @@ class WarpedPair:
         if windows is not None:
             return cls(pair, mapping, warped, windows, windows.residuals(warped))
         usual, size_px = cls(pair, mapping, warped, pair.windows, pair.windows.residuals(warped)), pair.fixed.size_px
-        in_frame_px = points_in_frame(mapping, size_px, pair.moving_image.size_px)
+        in_frame_px = points_in_frame(mapping, *pair.sizes_px)
         if not unobserved_quarters(usual.residual.centres_px, size_px, in_frame_px):
             return usual
         small = pair.reference.small_windows
@@ -83,15 +84,11 @@ class WarpedPair:
         shifts_px = np.where(self.residual.is_black[:, None], by_white_px, by_black_px)
         return replace(self, residual=self.residual.with_shifts(shifts_px))
 
-    @property
-    def reduced_scale(self) -> PixelScale:
-        """(x, y) of the reduced images relative to the fixed image."""
-        return self.pair.reference.seed_scale
-
-    def reduced_spectra(self) -> tuple[Field, Field]:
-        """Windowed spectra (height, width) of the structures of the reduced fixed and moving images."""
-        small = shrink(self.warped, self.pair.reference.seed_size_px)
-        return self.pair.reference.seed_spectrum, windowed_spectra(structure_field(small))
+    def alias_peak(self) -> AliasPeak:
+        """Return the highest correlation peak of the reduced images after that of the mapping."""
+        reference = self.pair.reference
+        moving = windowed_spectra(structure_field(shrink(self.warped, reference.seed_size_px)))
+        return alias_peak(reference.seed_spectrum, moving, reference.seed_scale)
 
     def is_expected(self, shift_px: tuple[float, float] = (0.0, 0.0)) -> bool:
         """Return True if the mapping shifted by (x, y), px of the fixed image, agrees with a candidate of the pair."""
@@ -102,6 +99,45 @@ class WarpedPair:
         pair = self.pair
         size_px, pixel_px = pair.fixed.size_px, pair.file_pixel_size_px
         return issues_of(Evidence(joint, self.residual, size_px, images=self, file_pixel_size_px=pixel_px))
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """A band with a result of the joint optimisation and the residual of its windows."""
+
+    pair: BandPair
+    seed: Seed
+    joint: JointResult[FixedImagePx]
+    warped: WarpedPair
+    by_halves: tuple[Matrix, Matrix] | None = None
+    """Homographies from half of the windows (`WarpedPair.cross_validated`)."""
+
+    @classmethod
+    def of(cls, pair: BandPair, seed: Seed, joint: JointResult[FixedImagePx]) -> "Candidate":
+        """Measure the windows with the homography of a result."""
+        return cls(pair, seed, joint, WarpedPair.of(pair, pair.mapping(joint.fixed_to_moving)))
+
+    @classmethod
+    def at_seed(cls, pair: BandPair, seed: Seed) -> "Candidate":
+        """Return a band without a result: with the mapping of its seed, and without evidence of descriptors."""
+        return cls.of(pair, seed, result_of_windows(seed.fixed_to_moving))
+
+    def fit_residual(self, mapping: PixelMapping) -> Residual[FixedImagePx]:
+        """Measure the windows of the fit with a mapping."""
+        return self.pair.reference.black_windows.residuals(self._warped(mapping))
+
+    def held_out_residual(self, mapping: PixelMapping) -> Residual[FixedImagePx]:
+        """Measure the windows that take no part in the fit."""
+        return self.pair.reference.white_windows.residuals(self._warped(mapping))
+
+    def _warped(self, mapping: PixelMapping) -> Raster:
+        return self.warped.warped if mapping is self.warped.mapping else self.pair.warped_moving(mapping)
+
+
+def result_of_windows(fixed_to_moving: Matrix) -> JointResult[FixedImagePx]:
+    """Return a result without evidence of descriptors, with an infinite standard error."""
+    std = ((math.inf, math.inf),) * 4
+    return JointResult(fixed_to_moving, math.nan, 0.0, 0.0, 0, (1.0,), BY_WINDOWS, "homography", 0.0, std)
 
 
 def with_metrics(

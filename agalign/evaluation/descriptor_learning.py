@@ -13,6 +13,7 @@ import torch
 
 from agalign.capture.align_bands import align_pairs
 from agalign.capture.band_pair import BandPair
+from agalign.capture.reference import Reference
 from agalign.config import Settings
 from agalign.errors import InputError, NoContrastError, NotEnoughTextureError
 from agalign.evaluation.image_pairs import find_pairs, read_image
@@ -115,5 +116,5 @@ def read_rough_pairs(source: Path) -> list[BandPair]:
         fixed, moving = read_image(files.fixed), read_image(files.moving)
         known = files.fixed_to_moving
         start = geometry.overlay(fixed.size_px, moving.size_px) if known is None else known
-        result.append(BandPair.of_images(files.name, fixed, moving, {"user": start}))
+        result.append(BandPair(files.name, Reference(fixed), moving, {"user": start}))
     return result

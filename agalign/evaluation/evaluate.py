@@ -24,6 +24,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from agalign.capture.band_pair import BandPair
+from agalign.capture.reference import Reference
 from agalign.capture.seeding import best_seed, image_groups
 from agalign.config import JointSettings
 from agalign.errors import ConfigurationError, GeometryError, InputError, NoContrastError, NotEnoughTextureError
@@ -121,10 +122,10 @@ def _learned_on_pair(task: PairTask, settings: JointSettings, *, colour: bool) -
         fixed, moving = (_without_colour(r) for r in (fixed, moving))
     settings = settings.model_copy(update={"device": task.device, "rng_seed": task.rng_seed})
     seed = Seed("user", task.start, 0.0)
-    pair = BandPair.of_images("moving", fixed, moving, {"user": task.start})
+    pair = BandPair("moving", Reference(fixed), moving, {"user": task.start})
     if task.seeding:
         seed = best_seed(pair, pair.seed_matrices)
-    state, [(_, group)] = JointState(settings, lambda *_: None), image_groups([pair], [seed])
+    state, [(_, group)] = JointState(settings, lambda *_: None), image_groups([(pair, seed)])
     try:
         if settings.recipe == "paper":
             net, result = align_by_paper(state, group)

@@ -348,11 +348,10 @@ def adjust(
     baselines = initial / np.linalg.norm(initial, axis=1).max()
     smooth_std_px = np.r_[np.full(8, _CORNER_STD_PX), [] if lens_std_px is None else lens_std_px]
     count = len(smooth_std_px)
-    design, prior = (
-        jacobian(windows.points_px, size_px, count),
-        np.diag(np.r_[smooth_std_px, [BaselinePrior().std] * 2] ** -2),
-    )
-    plane = _plane_coordinates(windows.points_px, size_px)
+    design = jacobian(windows.points_px, size_px, count)
+    prior = np.diag(np.r_[smooth_std_px, [BaselinePrior().std] * 2] ** -2)
+    # (n, 3) = (1, u, v) with u and v from -1 to 1 across the image.
+    plane = np.column_stack([np.ones(len(windows)), 2 * windows.points_px / np.asarray(size_px) - 1])
     shifts, weights = np.nan_to_num(windows.shifts_px), windows.weights
     smooth, scales = np.zeros((len(baselines), count)), np.full(len(baselines), _NOISE_PX)
     for _ in range(_ALTERNATIONS):
@@ -437,11 +436,6 @@ def _initial_baselines(windows: WindowShifts) -> Array | None:
     limit = max_medians * np.median(np.abs(shifts)) + MIN_SHIFT_SCALE_PX
     _, _, right = np.linalg.svd(np.clip(shifts, -limit, limit), full_matrices=False)
     return np.asarray(right[0].reshape(-1, 2))
-
-
-def _plane_coordinates(points_px: Points, size_px: tuple[int, int]) -> Array:
-    """Return (n, 3) = (1, u, v) with u and v from -1 to 1 across the image."""
-    return np.column_stack([np.ones(len(points_px)), 2 * points_px / np.asarray(size_px) - 1])
 
 
 def _parallax(residual_px: Array, baselines: Array, weights: Array) -> tuple[Array, Array]:

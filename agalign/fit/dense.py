@@ -9,6 +9,9 @@ Three levels: a wide search at a quarter of the resolution determines the range 
 resolution preserves edges, and a local search at full resolution refines z per pixel. The wide search determines only
 the range and no start for each pixel, because it smooths thin objects away: with real plants, one pixel in twenty is
 more than 6 px from its result.
+
+Semi-global matching (Hirschmuller 2008) gives each pixel the label with the minimum sum of costs over four paths.
+OpenCV's StereoSGBM cannot be used: it computes the costs from two rectified images and accepts no cost volume.
 """
 
 from collections.abc import Iterator, Sequence
@@ -18,7 +21,6 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from agalign.fit.semi_global import MAX_LARGE, aggregated, sub_label_minimum
 from agalign.pixels.band_resampling import shrink
 from agalign.pixels.structure import structure_field
 from agalign.values import geometry, lens
@@ -29,6 +31,9 @@ from agalign.values.pixel_units import PixelScale
 
 Costs = NDArray[np.uint8]
 """(levels, height, width): truncated 1 - correlation of one band, in units of 1 / _UNIT_COST, or _UNKNOWN."""
+MAX_LARGE = 63
+"""Maximum large penalty of semi-global matching. A path adds at most this much to the cost, so the sum over four paths
+is at most 252; a cost plus both penalties is at most 255."""
 
 _SEARCH_NEARER, _SEARCH_FARTHER = 0.06, 0.03
 """Searched parallax as a share of the longer side: for lenses 3 cm apart and a reference plane 1 m away, an object at
@@ -156,6 +161,61 @@ def _semi_global_match(
     return np.asarray(parallax_px), confidence
 
 
+def aggregated(costs: Costs, small: int, large: int) -> NDArray[np.uint16]:
+    """Return the sum of the path costs from the left, right, top and bottom, (labels, height, width).
+
+    Along each path, with cost C(d) at label d and q the previous pixel,
+
+        L(p, d) = C(p, d) + min(L(q, d), L(q, d +- 1) + small, min_k L(q, k) + large) - min_k L(q, k)
+
+    `small` is the penalty of a step by one label, `large` that of a longer step.
+    """
+    vertical = _path_penalties(costs, np.uint8(small), np.uint8(large))
+    horizontal = _path_penalties(np.stack([cv2.transpose(plane) for plane in costs]), np.uint8(small), np.uint8(large))
+    result = np.multiply(costs, 4, dtype=np.uint16)
+    for plane, down, across in zip(result, vertical, horizontal, strict=True):
+        plane += cv2.add(down, cv2.transpose(across))
+    return result
+
+
+def _path_penalties(costs: Costs, small: np.uint8, large: np.uint8) -> Costs:
+    """Return L - C (labels, length, lines) of the two paths along the second axis of the costs, added."""
+    result = np.zeros_like(costs)
+    length = costs.shape[1]
+    for path in (range(length), range(length - 1, -1, -1)):
+        previous = costs[:, path[0]].copy()
+        current = np.empty_like(previous)
+        for i in path[1:]:
+            minimum = previous.min(axis=0)
+            np.minimum(previous, minimum + large, out=current)
+            previous += small
+            np.minimum(current[1:], previous[:-1], out=current[1:])
+            np.minimum(current[:-1], previous[1:], out=current[:-1])
+            current -= minimum
+            result[:, i] += current
+            current += costs[:, i]
+            previous, current = current, previous
+    return result
+
+
+def sub_label_minimum(costs: NDArray[np.uint16] | NDArray[np.float32]) -> FloatImage:
+    """Return the label of minimum cost, (height, width), refined by the parabola through its neighbours.
+
+    There are at least three labels.
+    """
+    last = len(costs) - 1
+    minimum = costs.min(axis=0)
+    label = np.zeros(minimum.shape, np.uint16)
+    for k in range(last, -1, -1):  # `argmin` along the first axis is several times slower.
+        np.copyto(label, k, where=costs[k] == minimum)
+    inner = np.clip(label, 1, last - 1)
+    at = inner * np.intp(minimum.size) + np.arange(minimum.size).reshape(minimum.shape)
+    lower, centre, upper = (costs.reshape(-1).take(at + k * minimum.size).astype(np.float32) for k in (-1, 0, 1))
+    curvature = lower - 2 * centre + upper
+    offset = np.where(curvature > 0, (lower - upper) / (2 * np.maximum(curvature, 1e-9)), 0.0)
+    return np.asarray(np.where(inner == label, inner + np.clip(offset, -0.5, 0.5), label), np.float32)
+
+
 def _mean_costs(costs: Sequence[Costs]) -> Costs:
     """Return the mean over the bands. It has the range of one band, so that no number of bands overflows."""
     result = np.empty_like(costs[0])
@@ -263,7 +323,7 @@ class _MovingBand:
 
     def _size_px(self, view: View) -> tuple[int, int]:
         """Return the size at which the pixels of the moving image are as large as those of the reduced reference."""
-        magnification = abs(float(geometry.local_scale(view.plane.fixed_to_moving, *self.fixed.full_px)[-1]))
+        magnification = geometry.magnification(view.plane.fixed_to_moving, *self.fixed.full_px)
         ratio = min(1.0, self.fixed.scale.mean / magnification)
         width, height = view.image.size_px
         return max(1, round(width * ratio)), max(1, round(height * ratio))

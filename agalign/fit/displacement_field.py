@@ -23,6 +23,7 @@ from agalign.values.alignment import Residual
 from agalign.values.displacement import DisplacementField
 from agalign.values.geometry import Points
 from agalign.values.image import Mask, Raster
+from agalign.values.least_squares import cauchy_weights, shift_scale_px
 from agalign.values.mapping import PixelMapping
 from agalign.values.pixel_units import FixedImagePx
 
@@ -191,12 +192,6 @@ class _Gain(NamedTuple):
         return self.sigma >= min_sigma and self.after_p95_px <= max_p95_growth * self.before_p95_px
 
 
-def robust_loss(residual: Residual[FixedImagePx]) -> float:
-    """Return the mean of log(1 + (shift / 0.1 px)^2) of the measured windows, infinite without any."""
-    shifts = Shifts.of(residual)
-    return float(_losses(shifts.distances_px()).mean()) if len(shifts.weights) else math.inf
-
-
 def _losses(lengths_px: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return log(1 + (length / 0.1 px)^2), which is robust to wrong peaks and depth edges."""
     scale_px = 0.1  # several times the noise of a shift
@@ -277,7 +272,8 @@ def fitted_field(
         field = solveh_banded(normal, np.stack(right_side, axis=-1), overwrite_ab=True, lower=True, check_finite=False)
         if number + 1 < reweightings:
             fitted_px = (bilinear[..., None] * field[nodes]).sum(axis=0)
-            weights = shifts.reweighted(fitted_px, _CAUCHY_SCALES).weights
+            residuals_px = shifts.distances_px(fitted_px)
+            weights = shifts.weights * cauchy_weights(residuals_px, _CAUCHY_SCALES * shift_scale_px(residuals_px))
     lattice = field.reshape(rows, columns, 2)
     return DisplacementField(float(lattice_px), lattice if order[0] == 0 else lattice.transpose(1, 0, 2).copy())
 

@@ -20,7 +20,6 @@ from agalign.pixels.structure import (
 from agalign.values.alignment import Residual
 from agalign.values.geometry import Points
 from agalign.values.image import Mask, Raster
-from agalign.values.least_squares import cauchy_weights, shift_scale_px
 from agalign.values.mapping import PixelMapping
 from agalign.values.pixel_units import FixedImagePx, FixedPx
 
@@ -149,12 +148,6 @@ class Shifts(NamedTuple):
     def distances_px(self, predicted_px: Points | float = 0.0) -> NDArray[np.float64]:
         """Return (n,) the lengths of the shifts, minus predicted ones (n, 2)."""
         return np.asarray(np.linalg.norm(self.shifts_px - predicted_px, axis=1))
-
-    def reweighted(self, fitted_px: Points, scales: float) -> "Shifts":
-        """Return the windows with half the weight at `scales` standard deviations from the fitted shifts (n, 2)."""
-        residuals_px = self.distances_px(fitted_px)
-        robust = cauchy_weights(residuals_px, scales * shift_scale_px(residuals_px))
-        return self._replace(weights=self.weights * robust)
 
 
 def peak_weights(peaks_sigma: NDArray[np.float64]) -> NDArray[np.float64]:

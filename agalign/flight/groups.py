@@ -36,11 +36,8 @@ def is_flight_of(captures: Sequence[Capture], camera: str) -> bool:
 
     An empty `camera` fits every flight.
     """
-    if camera in ("", flight_camera(captures)):
-        return True
-    reference = camera_key(captures[0]).removesuffix("]")
-    model_bands = camera.removeprefix(reference).removesuffix("]").split(", ")
-    return camera.startswith(reference) and {_with_size(b) for b in _bands_of(captures)[1:]} <= set(model_bands)
+    (learned, bands), (own, own_bands) = map(_camera_and_bands, (camera, flight_camera(captures)))
+    return not camera or ((learned, bands[0]) == (own, own_bands[0]) and set(own_bands) <= set(bands))
 
 
 def difference(learned: str, here: str) -> str:
@@ -150,7 +147,7 @@ def camera_overviews(captures: Sequence[Capture]) -> list[CameraOverview]:
 
 def _overview(name: str, serial: str, captures: Sequence[Capture]) -> CameraOverview:
     height_m, gsd_m = _median_height_and_gsd_m(captures)
-    altitudes_m = [a for c in captures if c.position is not None and (a := c.position.altitude_m) is not None]
+    altitudes_m = [c.altitude_m for c in captures if c.altitude_m is not None]
     times = sorted({c.captured_at for c in captures} - {""}) or [""]
     choices: tuple[RadiometryChoice, ...] = ("camera", "sun")
     reference = mode(c.reference.name for c in captures)

@@ -120,8 +120,7 @@ def _panel_cues(capture: Capture, flight_altitude_m: float) -> tuple[str, ...]:
     cues += ["a QR code"] if "QR code" in seen_by else []
     if sum(map(_shows_square, capture.bands)) > len(capture.bands) / 2:
         cues.append("a homogeneous square in most bands")
-    altitude_m = None if capture.position is None else capture.position.altitude_m
-    if altitude_m is not None and altitude_m < flight_altitude_m - _MIN_HEIGHT_M:
+    if capture.altitude_m is not None and capture.altitude_m < flight_altitude_m - _MIN_HEIGHT_M:
         cues.append(f"an altitude more than {_MIN_HEIGHT_M:.0f} m below the median of the flight")
     if any(re.search("panel|calib", name, re.IGNORECASE) for name in (*capture.folder.parts, capture.name)):
         cues.append("'panel' or 'calib' in its folder or name")
@@ -145,7 +144,7 @@ def _shows_square(band: Band) -> bool:
 
 def _median_altitude_m(flight: Sequence[Capture]) -> float:
     """Return the median altitude of the captures; nan if none is known."""
-    altitudes_m = [a for c in flight if c.position is not None and (a := c.position.altitude_m) is not None]
+    altitudes_m = [c.altitude_m for c in flight if c.altitude_m is not None]
     return float(np.median(altitudes_m)) if altitudes_m else math.nan
 
 
@@ -185,13 +184,13 @@ def with_height(capture: Capture, readings: Iterable[PanelReading]) -> Capture:
 
     Captures with a height in the tags, without an altitude or without a panel within hours are not changed.
     """
-    pose, position = capture.pose, capture.position
-    if pose is None or pose.height_m is not None or position is None or position.altitude_m is None:
+    pose = capture.pose
+    if pose is None or pose.height_m is not None or capture.altitude_m is None:
         return capture
     on_ground = [r.capture for _, r in _within_hours(readings, capture) if r.capture.is_of_a_panel]
-    altitudes_m = [a for c in on_ground if c.position is not None and (a := c.position.altitude_m) is not None]
+    altitudes_m = [c.altitude_m for c in on_ground if c.altitude_m is not None]
     above_panel_m = 1.0  # of the camera when a panel is recorded
-    height_m = position.altitude_m - min(altitudes_m) + above_panel_m if altitudes_m else 0.0
+    height_m = capture.altitude_m - min(altitudes_m) + above_panel_m if altitudes_m else 0.0
     if height_m <= _MIN_HEIGHT_M:
         return capture
     return replace(capture, pose=replace(pose, height_m=height_m, height_from="panel"))

@@ -376,3 +376,7 @@ class Alignment(Generic[FixedPx]):
         std = "" if self.joint is None else f", joint.corner_std_px={self.joint.corner_std_px:.3g}"
         reason = "" if self.reason is None else f", reason={self.reason!r}"
         return f"Alignment(status={self.status!r}{residual}{std}{reason})"
+
+
+Alignments = dict[str, Alignment[FixedImagePx]]
+"""Alignments between images by band."""

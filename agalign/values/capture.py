@@ -293,6 +293,11 @@ class Capture:
         return self.panel is not None and not self.panel.in_scene
 
     @property
+    def altitude_m(self) -> float | None:
+        """Altitude in the tags, above sea level or an ellipsoid; None if it is unknown."""
+        return None if self.position is None else self.position.altitude_m
+
+    @property
     def time_s(self) -> float | None:
         """Unix time of the capture, s, as `CaptureTime`; None if it is unknown."""
         moment = CaptureTime.of(self.captured_at)

@@ -128,6 +128,11 @@ def local_scale(matrix: Matrix, width_px: int, height_px: int) -> Points:
     return np.asarray(np.sign(area) * np.sqrt(np.abs(area)))
 
 
+def magnification(matrix: Matrix, width_px: int, height_px: int) -> float:
+    """Pixels of the moving image per pixel of the reference (width, height) at its centre."""
+    return abs(float(local_scale(matrix, width_px, height_px)[-1]))
+
+
 def over_corners(points_px: ArrayLike, width_px: int, height_px: int) -> NDArray[np.float64]:
     """Return the Jacobian (n, 2, 8) of points (n, 2) over the displacements of the image's corners, for a homography
     close to the identity: (dx, dy) of each corner, clockwise from the top left (DeTone et al. 2016, Sec. 3).

@@ -96,7 +96,10 @@ class Parallax:
     """On the raster of the relief: pixels that nearer parts of the scene occlude in this band. None hides nothing."""
 
     def hides(self, x_px: NDArray[np.float64], y_px: NDArray[np.float64]) -> Mask:
-        """(height, width) True where raw points of the reference, x (..., width) and y (height, ...), are occluded."""
+        """True where raw points of the reference are occluded in the band.
+
+        x and y are broadcast to one shape, such as (height, width).
+        """
         if self.hidden is None:
             return np.zeros(np.broadcast_shapes(x_px.shape, y_px.shape), dtype=bool)
         (x, _), (_, y) = (

@@ -18,7 +18,7 @@ from agalign.values import geometry, issues
 from agalign.values.alignment import MIN_RETRIEVAL, MIN_TIMES_CHANCE, JointResult, Prediction, Residual
 from agalign.values.geometry import Matrix
 from agalign.values.issues import RETRIEVAL, TEXTURELESS, UNLIKE, Issue, IssueKind, Remedy
-from agalign.values.pixel_units import FixedImagePx, FixedPx, PixelScale
+from agalign.values.pixel_units import SAME_PIXELS, FixedImagePx, FixedPx, PixelScale
 from agalign.verify.extrapolation import EXTRAPOLATED, MIN_COMMON_COVERAGE
 
 BY_WINDOWS = "windows"
@@ -81,12 +81,8 @@ REPEATS = IssueKind(
 class AlignedImages(Protocol):
     """The two images of a result on one grid, for checks that use pixels."""
 
-    @property
-    def reduced_scale(self) -> PixelScale:
-        """Scale of the reduced images relative to the fixed image."""
-
-    def reduced_spectra(self) -> tuple[Field, Field]:
-        """Windowed spectra (height, width) of the structures of the reduced fixed and moving images."""
+    def alias_peak(self) -> "AliasPeak":
+        """Return the highest correlation peak after that of the result."""
 
     def is_expected(self, shift_px: tuple[float, float] = (0.0, 0.0)) -> bool:
         """Return True if the mapping shifted by (x, y), px of the fixed image, agrees with tags, flight or user."""
@@ -180,21 +176,23 @@ def _repetition_issues(evidence: Evidence[FixedPx]) -> Iterator[Issue]:
     images = evidence.images
     if images is None:
         return
-    alias = alias_peak(*images.reduced_spectra())
-    x_px, y_px = (shift / scale for shift, scale in zip(alias.shift_px, images.reduced_scale, strict=True))
-    if alias.ratio > MAX_ALIAS_PEAK and (not images.is_expected() or images.is_expected((x_px, y_px))):
-        yield Issue(REPEATS, math.hypot(x_px, y_px))
+    alias = images.alias_peak()
+    if alias.ratio > MAX_ALIAS_PEAK and (not images.is_expected() or images.is_expected(alias.shift_px)):
+        yield Issue(REPEATS, math.hypot(*alias.shift_px))
 
 
 class AliasPeak(NamedTuple):
-    """The highest correlation peak after that of the result: (x, y), px of the reduced images, and relative height."""
+    """The highest correlation peak after that of the result: (x, y), px of the fixed image, and relative height."""
 
     shift_px: tuple[float, float]
     ratio: float
 
 
-def alias_peak(fixed: Field, moving: Field) -> AliasPeak:
-    """Return the highest peak except that at zero shift; `fixed` and `moving` are windowed spectra (height, width)."""
+def alias_peak(fixed: Field, moving: Field, scale: PixelScale = SAME_PIXELS) -> AliasPeak:
+    """Return the highest peak except that at zero shift; `fixed` and `moving` are windowed spectra (height, width).
+
+    They are of images that are reduced by `scale`.
+    """
     surface = np.fft.fftshift(correlation_surfaces(fixed, moving))
     height, width = surface.shape
     row, column = height // 2, width // 2
@@ -204,7 +202,7 @@ def alias_peak(fixed: Field, moving: Field) -> AliasPeak:
     surface[centre] = -np.inf
     index = int(surface.argmax())
     ratio = float(surface.flat[index]) / centre_peak if centre_peak > 0 else math.inf
-    return AliasPeak((float(index % width - column), float(index // width - row)), ratio)
+    return AliasPeak(((index % width - column) / scale.x, (index // width - row) / scale.y), ratio)
 
 
 class Check(NamedTuple):

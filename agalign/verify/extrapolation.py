@@ -115,7 +115,7 @@ def _mapping_px2(alignment: Alignment[FixedFilePx], size_px: tuple[int, int], po
         if prediction.covariance_px2 is not None:
             return variance_px2(points_px, prediction.covariance_px2, size_px)
         # The standard error is in px of the moving file.
-        ratio = abs(float(geometry.local_scale(alignment.fixed_to_moving, *size_px)[-1]))
+        ratio = geometry.magnification(alignment.fixed_to_moving, *size_px)
         return np.full(len(points_px), (prediction.std_px / ratio) ** 2)
     if alignment.status != "aligned" or joint is None or joint.corner_covariance_px2 is None:
         return np.full(len(points_px), 0.0 if joint is None and alignment.status == "aligned" else np.inf)
@@ -124,10 +124,8 @@ def _mapping_px2(alignment: Alignment[FixedFilePx], size_px: tuple[int, int], po
 
 def _windows_px2(residual: Residual[FixedFilePx], points_px: Points) -> NDArray[np.float64]:
     """Return the expected squared residual shift at points, (n,)."""
-    centres, squares = (
-        residual.measured_px,
-        (residual.shifts_px[np.isfinite(residual.shifts_px[:, 0])] ** 2).sum(axis=1),
-    )
+    centres = residual.measured_px
+    squares = (residual.shifts_px[np.isfinite(residual.shifts_px[:, 0])] ** 2).sum(axis=1)
     count = min(8, len(centres))  # nearest windows, weighted by their distance
     distance, index = (values.reshape(-1, count) for values in cKDTree(centres).query(points_px, k=count))
     spacing_px = max(window_spacing_px(residual.centres_px), 1.0)

@@ -13,16 +13,17 @@ from scipy.ndimage import maximum_filter
 from synthetic_flights.depth import CLOSE_RANGE, Scene, Truth, truth_of, view
 from synthetic_flights.relief import make_scene
 
+from agalign.batch.capture_task import quiet
 from agalign.capture import align_bands
 from agalign.capture import by_relief as module
-from agalign.capture.align_bands import PairAligner, verify_together
+from agalign.capture.align_bands import PairAligner
 from agalign.capture.band_pair import BandPair
-from agalign.capture.by_relief import ReliefResult, _aligned, _Checked, _gain_px, _std_px, aligned_by_relief
+from agalign.capture.by_relief import _aligned, _Checked, _gain_px, _std_px, aligned_by_relief
 from agalign.capture.by_rig import with_predictions
-from agalign.capture.candidate import Candidate
 from agalign.capture.common_parallax import MIN_PARALLAX_PX, common_parallax_px
 from agalign.capture.decision import at_seed, of_one_geometry
 from agalign.capture.reference import Reference
+from agalign.capture.warped_pair import Candidate
 from agalign.config import JointSettings, ReliefSettings, Settings
 from agalign.flight.rig import Rig
 from agalign.synthetic.cameras import BandSpec, CameraSpec
@@ -147,7 +148,7 @@ def candidates(boxes: Rendered) -> list[Candidate]:
 
 @pytest.fixture(scope="module")
 def aligned(candidates: Sequence[Candidate]) -> dict[str, Alignment]:
-    return aligned_by_relief(candidates, "auto").alignments
+    return aligned_by_relief(candidates, "auto")[0]
 
 
 def test_all_bands_are_aligned_by_one_relief(boxes: Rendered, aligned: Mapping[str, Alignment]) -> None:
@@ -204,16 +205,18 @@ def on_a_line() -> list[Candidate]:
 
 def test_parallax_along_a_line_needs_a_layout(on_a_line: Sequence[Candidate]) -> None:
     """Edges of shadows and leaves move along a line too; with a layout it is that of the lenses."""
-    assert set(aligned_by_relief(on_a_line, "auto").alignments) == {b.name for b in MOVING}
+    assert set(aligned_by_relief(on_a_line, "auto")[0]) == {b.name for b in MOVING}
     without = without_layout(on_a_line)
-    assert aligned_by_relief(without, "auto") == ReliefResult(along_a_line={b.name for b in MOVING})
+    assert aligned_by_relief(without, "auto") == ({}, {b.name for b in MOVING})
     # No displacement field follows them either.
     for alignment in verified_together(without, Settings()).values():
         assert set(alignment.candidates) <= {"homography"}
 
 
 def verified_together(candidates: Sequence[Candidate], settings: Settings) -> dict[str, Alignment]:
-    return verify_together([(c.pair, c.seed) for c in candidates], [c.joint for c in candidates], None, settings)
+    aligner = PairAligner(settings, None, quiet)
+    aligner.verify([(c.pair, c.seed) for c in candidates], [c.joint for c in candidates])
+    return aligner.result
 
 
 @pytest.mark.parametrize(("family", "is_allowed"), [("auto", True), ("translation", False), ("affine", False)])
@@ -228,8 +231,8 @@ def test_neither_relief_nor_field_replaces_another_model_family(
 
 
 @pytest.fixture(scope="module")
-def one_with_relief(flat: Rendered) -> dict[str, Alignment]:
-    """All bands of a flat scene; Blue has a relief."""
+def one_relief(flat: Rendered) -> dict[str, Alignment]:
+    """All bands of a flat scene; only Blue has a relief."""
     result = verified_together(flat.candidates(), Settings())
     relief = Relief(np.zeros((4, 4), np.float32), np.ones((4, 4), np.float32))
     return {
@@ -238,24 +241,24 @@ def one_with_relief(flat: Rendered) -> dict[str, Alignment]:
     }
 
 
-def test_a_homography_next_to_a_relief_is_predicted(flat: Rendered, one_with_relief: dict[str, Alignment]) -> None:
+def test_a_homography_next_to_a_relief_is_predicted(flat: Rendered, one_relief: dict[str, Alignment]) -> None:
     """It passes all checks, but is another geometry than that of the other bands; a thermal one has another grid."""
-    assert {a.status for a in one_with_relief.values()} == {"aligned"}
+    assert {a.status for a in one_relief.values()} == {"aligned"}
     pairs = {c.pair.name: c.pair for c in flat.candidates()}
     pairs["Red"] = replace(pairs["Red"], reference=Reference(pairs["Red"].reference.image))
-    result = of_one_geometry(list(pairs.values()), one_with_relief)
+    result = of_one_geometry(list(pairs.values()), one_relief)
     assert {name: a.status for name, a in result.items()} == {"Blue": "aligned", "Red": "aligned", "NIR": "predicted"}
     assert result["NIR"].prediction.source == "windows"
 
 
 def test_bands_that_are_aligned_together_or_one_after_another_have_one_geometry(
-    flat: Rendered, one_with_relief: dict[str, Alignment], monkeypatch: pytest.MonkeyPatch
+    flat: Rendered, one_relief: dict[str, Alignment], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A band that is learned from scratch after the relief of the others, for example."""
-    blue = one_with_relief["Blue"]
-    monkeypatch.setattr(align_bands, "aligned_by_relief", lambda *_, **__: ReliefResult({"Blue": blue}))
+    blue = one_relief["Blue"]
+    monkeypatch.setattr(align_bands, "aligned_by_relief", lambda *_, **__: ({"Blue": blue}, set()))
     together = verified_together(flat.candidates(), Settings())
-    monkeypatch.setattr(PairAligner, "refine", lambda self, _: self.result.update(one_with_relief))
+    monkeypatch.setattr(PairAligner, "refine", lambda self, _: self.result.update(one_relief))
     one_by_one = PairAligner(Settings(), None, lambda *_: None).align([c.pair for c in flat.candidates()], None)
     expected = {"Blue": "aligned", "Red": "predicted", "NIR": "predicted"}
     for result in (together, one_by_one):
@@ -278,7 +281,7 @@ def test_a_noisy_band_follows_the_relief_of_the_others(
     else:
         others = [c for c in candidates if c is not lost]
         result = aligned_by_relief(others, "auto", lost=[(lost.pair, lost.seed)])
-    alignment = result.alignments[name]
+    alignment = result[0][name]
     assert alignment.status == status
     assert alignment.geometry.startswith("relief")
     errors, plane = (scene.error_px(name, m) for m in (alignment.mapping, alignment.mapping.of_the_plane))
@@ -295,13 +298,13 @@ def test_a_relief_does_not_verify_a_band_that_it_is_estimated_from(
     checked = module._checked
     monkeypatch.setattr(module, "_checked", lambda band, warped: None if band.name == "NIR" else checked(band, warped))
     result = aligned_by_relief(candidates, "auto")
-    assert set(result.alignments) == set(aligned) - {"NIR"}
+    assert set(result[0]) == set(aligned) - {"NIR"}
 
 
 def test_unrelated_images_do_not_follow_a_relief(four_lenses: Rendered) -> None:
     other = textured_image(*four_lenses.size_px, seed=5)
     candidates = four_lenses.candidates(instead={"Red edge": (1000 + 100 * other).astype(np.float32)})
-    assert set(aligned_by_relief(candidates, "auto").alignments) == {"Blue", "Red", "NIR"}
+    assert set(aligned_by_relief(candidates, "auto")[0]) == {"Blue", "Red", "NIR"}
 
 
 def test_a_lost_band_is_predicted_with_the_relief(
@@ -332,7 +335,7 @@ def test_a_lost_band_is_predicted_with_the_relief(
 
 def test_the_sign_is_found_without_a_layout(boxes: Rendered, candidates: Sequence[Candidate]) -> None:
     """The sign follows from occlusions. The reference plane may differ from the one with a layout."""
-    result = aligned_by_relief(without_layout(candidates), "auto").alignments
+    result = aligned_by_relief(without_layout(candidates), "auto")[0]
     assert len(result) == len(MOVING)
     assert boxes.correlation(result["NIR"].mapping) < -0.5
 
@@ -341,7 +344,7 @@ def test_an_observation_of_the_rig_needs_only_windows(four_lenses: Rendered) -> 
     """It has the planes and baselines of the lenses; a band with other content is not part of it."""
     foreign_nir = {"NIR": foreign(four_lenses.images["NIR"], "unrelated", seed=3)}
     for images, names in (({}, {"Blue", "Red", "NIR", "Red edge"}), (foreign_nir, {"Blue", "Red", "Red edge"})):
-        observed = aligned_by_relief(four_lenses.candidates(images), "auto", is_observation=True).alignments
+        observed = aligned_by_relief(four_lenses.candidates(images), "auto", is_observation=True)[0]
         assert {name for name, a in observed.items() if a.status == "aligned"} == names
         for name, alignment in observed.items():
             # The parallax of a pixel is that of the nearest window, on slopes too.
@@ -350,19 +353,19 @@ def test_an_observation_of_the_rig_needs_only_windows(four_lenses: Rendered) -> 
 
 
 def test_use(candidates: Sequence[Candidate]) -> None:
-    assert aligned_by_relief(candidates, "never") == ReliefResult()
+    assert aligned_by_relief(candidates, "never") == ({}, set())
     # One moving band cannot be verified with others; a coarse one has another reference.
-    assert aligned_by_relief(candidates[:1], "always") == ReliefResult()
+    assert aligned_by_relief(candidates[:1], "always") == ({}, set())
     coarse = [replace(c, pair=replace(c.pair, is_coarse=True)) for c in candidates[1:]]
-    assert aligned_by_relief([candidates[0], *coarse], "always") == ReliefResult()
+    assert aligned_by_relief([candidates[0], *coarse], "always") == ({}, set())
 
 
 def test_a_flat_scene_gets_no_relief(flat: Rendered) -> None:
     candidates = flat.candidates()
     assert not shows_relief(candidates)
-    assert aligned_by_relief(candidates, "auto") == ReliefResult()
+    assert aligned_by_relief(candidates, "auto") == ({}, set())
     # A forced relief is not better than the homographies and therefore rejected.
-    assert aligned_by_relief(candidates, "always") == ReliefResult()
+    assert aligned_by_relief(candidates, "always") == ({}, set())
 
 
 @pytest.mark.parametrize("has_layout", [True, False])
@@ -378,7 +381,7 @@ def test_noise_of_the_reference_is_not_relief(flat: Rendered, has_layout: bool) 
     candidates = flat.candidates({REFERENCE.name: image})
     candidates = candidates if has_layout else without_layout(candidates)
     assert not shows_relief(candidates)
-    assert aligned_by_relief(candidates, "always") == ReliefResult()
+    assert aligned_by_relief(candidates, "always") == ({}, set())
 
 
 @pytest.mark.parametrize(("height_px", "shown"), [(0.25, False), (1.0, True)])
@@ -449,7 +452,7 @@ def test_the_others_are_aligned_without_a_foreign_band(
     boxes: Rendered, aligned: Mapping[str, Alignment], kind: str
 ) -> None:
     nir = foreign(boxes.images["NIR"], kind, 3)
-    result = aligned_by_relief(boxes.candidates({"NIR": nir}), "auto").alignments
+    result = aligned_by_relief(boxes.candidates({"NIR": nir}), "auto")[0]
     assert set(result) == {"Blue", "Red"}
     for name in result:
         errors, intact = (boxes.error_px(name, a[name].mapping) for a in (result, aligned))
@@ -463,7 +466,7 @@ def test_a_band_of_another_time_is_predicted_under_the_relief_of_the_others(boxe
     x, y = np.meshgrid(*(np.arange(n, dtype=np.float32) for n in boxes.size_px))
     positions = x + np.sin(2 * np.pi * y / 300), y + np.cos(2 * np.pi * x / 300)
     nir = cv2.remap(boxes.images["NIR"], *positions, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT)
-    result = aligned_by_relief(boxes.candidates({"NIR": nir}), "auto").alignments
+    result = aligned_by_relief(boxes.candidates({"NIR": nir}), "auto")[0]
     assert {name: a.status for name, a in result.items()} == {"Blue": "aligned", "Red": "aligned", "NIR": "predicted"}
     assert result["NIR"].mapping.parallax is not None
     # The RMS of the motion is 1 px; the plane of the band follows a part of it.
@@ -475,4 +478,4 @@ def test_a_band_of_another_time_is_predicted_under_the_relief_of_the_others(boxe
 @pytest.mark.parametrize("kind", ["unrelated", "scrambled", in_full_run("noise")])
 def test_unrelated_bands_are_not_aligned(boxes: Rendered, kind: str) -> None:
     images = {b.name: foreign(boxes.images[b.name], kind, n) for n, b in enumerate(MOVING)}
-    assert aligned_by_relief(boxes.candidates(images), "always").alignments == {}
+    assert aligned_by_relief(boxes.candidates(images), "always")[0] == {}

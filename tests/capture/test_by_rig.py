@@ -13,12 +13,11 @@ import rasterio
 import torch
 
 import agalign
-from agalign.batch import learning_tasks
 from agalign.batch.capture_task import CaptureReport
 from agalign.batch.flight_learning import learn_flight
 from agalign.cameras.discover import discover
 from agalign.capture import align_bands
-from agalign.capture.align_bands import align_capture_bands, align_pairs
+from agalign.capture.align_bands import PairAligner, align_capture_bands, align_pairs
 from agalign.capture.band_pair import read_pairs
 from agalign.capture.by_rig import with_predictions
 from agalign.config import CheckSettings, Settings
@@ -101,15 +100,14 @@ def test_a_band_that_its_first_seed_does_not_align_is_part_of_the_rig(
     five: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Where a capture is lower than the others, its bands start too far off; the model's mappings are nearer."""
-    verify_together = learning_tasks.verify_together
+    verify = PairAligner.verify
 
-    def not_nir(*arguments: Any, **options: Any) -> dict[str, Alignment]:
-        return {
-            name: replace(a, status="seed_only") if name == "NIR" else a
-            for name, a in verify_together(*arguments, **options).items()
-        }
+    def without_nir(self: PairAligner, *arguments: Any) -> None:
+        verify(self, *arguments)
+        if self.model is None:
+            self.result["NIR"] = replace(self.result["NIR"], status="seed_only")
 
-    monkeypatch.setattr(learning_tasks, "verify_together", not_nir)
+    monkeypatch.setattr(PairAligner, "verify", without_nir)
     assert "NIR" in learned(five).rig.mean
 
 

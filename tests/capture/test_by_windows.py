@@ -10,9 +10,9 @@ import agalign
 from agalign.capture import by_windows as module
 from agalign.capture.band_pair import BandPair
 from agalign.capture.by_windows import aligned_by_windows, without_extrapolated
-from agalign.capture.candidate import Candidate
 from agalign.capture.decision import at_seed, verified
 from agalign.capture.seeding import find_seed
+from agalign.capture.warped_pair import Candidate
 from agalign.config import SeedSettings
 from agalign.fit.adjustment import lens_shapes
 from agalign.flight.rig import Rig

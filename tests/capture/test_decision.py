@@ -5,9 +5,8 @@ import pytest
 
 from agalign.capture import warped_pair
 from agalign.capture.band_pair import BandPair
-from agalign.capture.candidate import Candidate
 from agalign.capture.decision import at_seed, decided, verified, without_result
-from agalign.capture.warped_pair import WarpedPair, with_metrics
+from agalign.capture.warped_pair import Candidate, WarpedPair, with_metrics
 from agalign.fit.displacement_field import DisplacementResult
 from agalign.values import geometry
 from agalign.values.alignment import PairScales, Prediction, Seed

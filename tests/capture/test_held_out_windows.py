@@ -7,7 +7,8 @@ import cv2
 import numpy as np
 import pytest
 
-from agalign.capture.align_bands import _candidates
+from agalign.batch.capture_task import quiet
+from agalign.capture.align_bands import PairAligner
 from agalign.capture.band_pair import BandPair
 from agalign.capture.by_windows import aligned_by_windows
 from agalign.capture.decision import at_seed
@@ -102,7 +103,9 @@ def test_the_map_estimate_without_a_colour_ignores_its_windows(border_px: int) -
 
     def halves(image: np.ndarray) -> tuple[np.ndarray, ...]:
         pair = pair_of(whole(fixed), with_border(image, border_px))
-        return _candidates([(pair, SEED)], [result], None, Settings())["moving"].by_halves
+        by_halves = PairAligner(Settings(), None, quiet).candidates([(pair, SEED)], [result])["moving"].by_halves
+        assert by_halves is not None
+        return by_halves
 
     def change_px(one: np.ndarray, other: np.ndarray) -> float:
         return geometry.corner_error_px(one, other, *fixed.shape[::-1])

@@ -9,6 +9,7 @@ import torch
 from typer.testing import CliRunner
 
 from agalign.capture.band_pair import BandPair
+from agalign.capture.reference import Reference
 from agalign.capture.seeding import find_seed
 from agalign.cli.main import app
 from agalign.config import JointSettings, SeedSettings, Settings
@@ -164,7 +165,7 @@ ON_CPU = Settings(joint=JointSettings(device="cpu"))
 
 
 def rough_pair(name: str, fixed: Raster, moving: Raster) -> BandPair:
-    return BandPair.of_images(name, fixed, moving, {"user": np.eye(3)})
+    return BandPair(name, Reference(fixed), moving, {"user": np.eye(3)})
 
 
 @pytest.fixture(scope="module")

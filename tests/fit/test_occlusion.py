@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from agalign.fit.occlusion import nearer_sign, occluded
+from agalign.fit.relief import nearer_sign, occluded
 from agalign.values.image import Mask
 from agalign.values.parallax import Relief
 from agalign.values.pixel_units import PixelScale

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from agalign.fit.range import inverse_range
+from agalign.fit.relief import inverse_range
 from agalign.values import lens
 from agalign.values.lens import Lens
 from agalign.values.mapping import PixelMapping

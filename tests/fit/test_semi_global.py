@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from agalign.fit.semi_global import MAX_LARGE, aggregated, sub_label_minimum
+from agalign.fit.dense import MAX_LARGE, aggregated, sub_label_minimum
 
 
 def by_definition(costs: np.ndarray, small: int, large: int) -> np.ndarray:

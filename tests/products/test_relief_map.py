@@ -17,7 +17,7 @@ import agalign
 from agalign.batch import capture_task as batch
 from agalign.cameras import pix4d, rig_seed
 from agalign.cameras.metadata import Tags
-from agalign.fit.occlusion import occluded
+from agalign.fit.relief import occluded
 from agalign.products.rasters.alignment_maps import relief_layers
 from agalign.products.sidecar.convert import sidecar_of
 from agalign.products.sidecar.file import read_result, read_sidecar, write_sidecar

@@ -5,11 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from agalign.pixels.structure import Field
 from agalign.values import geometry
 from agalign.values.alignment import Prediction, Residual
 from agalign.values.issues import sentence
-from agalign.verify.checks import CHECKS, KINDS, Evidence, is_unchanged, issues_of, seed_fits
+from agalign.values.pixel_units import PixelScale
+from agalign.verify.checks import CHECKS, KINDS, AliasPeak, Evidence, alias_peak, is_unchanged, issues_of, seed_fits
 
 from ..builders import joint_result, residual_of
 
@@ -140,16 +140,14 @@ def test_the_windows_of_a_cluster_are_counted(total: int, allowed: int) -> None:
 class RepetitiveImages:
     """Images that also match with a shift of 16 px to the right."""
 
-    reduced_scale = (0.5, 0.5)
-
     def __init__(self, expected_within_px: float = np.inf) -> None:
         self.expected_within_px = expected_within_px
 
-    def reduced_spectra(self) -> tuple[Field, Field]:
+    def alias_peak(self) -> AliasPeak:
         rng = np.random.default_rng(0)
         tile = rng.normal(size=(64, 8)) + 1j * rng.normal(size=(64, 8))
         spectrum = np.fft.fft2(np.tile(tile, (1, 8))).astype(np.complex64)
-        return spectrum, spectrum
+        return alias_peak(spectrum, spectrum, PixelScale(0.5, 0.5))
 
     def is_expected(self, shift_px: tuple[float, float] = (0.0, 0.0)) -> bool:
         return float(np.hypot(*shift_px)) <= self.expected_within_px

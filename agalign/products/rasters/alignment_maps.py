@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from agalign.cameras import rig_seed
 from agalign.cameras.pix4d import rig_unit_m
 from agalign.errors import GeometryError
-from agalign.fit.range import inverse_range
+from agalign.fit.relief import inverse_range
 from agalign.pixels.radiometry import to_reflectance
 from agalign.pixels.raster import read_tile
 from agalign.pixels.sun_glint import sun_glint

@@ -14,7 +14,7 @@ from scipy.interpolate import CloughTocher2DInterpolator
 from agalign._version import __version__
 from agalign.cameras.base import is_thermal
 from agalign.errors import NoSuchBandError, SidecarError, UnreadableFileError
-from agalign.fit.occlusion import occluded
+from agalign.fit.relief import occluded
 from agalign.flight.fingerprint import fingerprint, input_samples
 from agalign.pixels.raster import read_preview
 from agalign.products.product import ProductContext, WrittenFile
