@@ -95,6 +95,10 @@ def test_tile_residuals_measure_a_known_shift(shift: tuple[float, float]) -> Non
     assert residual.median_px == pytest.approx(np.hypot(*shift), abs=0.1)
 
 
+def test_few_windows_of_unrelated_images_have_a_clear_peak() -> None:
+    assert residuals(texture(seed=1), texture(seed=2)).coverage < 0.2
+
+
 def test_windows_without_valid_pixels_are_skipped() -> None:
     fixed, moving = two_views(np.eye(3))
     valid = np.ones(fixed.valid.shape, bool)
