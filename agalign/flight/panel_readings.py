@@ -260,8 +260,7 @@ def _detect(band: Band, *, without_code: bool) -> DetectedPanel | None:
     result = find_panel(replace(image, lens=None), without_code=without_code)
     if result is None:
         return None
-    scale = image.size_px[0] / band.width_px
-    in_file_px = PixelScale(scale, scale).inverse.positions(result.area_px)
+    in_file_px = PixelScale.between(band.size_px, image.size_px).inverse.positions(result.area_px)
     return replace(result, area_px=tuple((x, y) for x, y in in_file_px.tolist()))
 
 
