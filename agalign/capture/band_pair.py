@@ -25,11 +25,10 @@ from agalign.values import geometry
 from agalign.values.alignment import SAME_SCALES, PairScales, Prediction
 from agalign.values.capture import Band, Capture
 from agalign.values.choices import SeedKind, Space
-from agalign.values.displacement import DisplacementField
 from agalign.values.geometry import Matrix
 from agalign.values.image import Raster
 from agalign.values.issues import NO_SUCH_SEED, UNREADABLE, Issue
-from agalign.values.mapping import PixelMapping
+from agalign.values.mapping import DisplacementField, PixelMapping
 from agalign.values.pixel_units import (
     FixedFilePx,
     FixedImagePoints,

@@ -39,10 +39,10 @@ from agalign.method.patches import Keypoints, bilinear, patch_positions, transfo
 from agalign.method.refine import MovingBand, describe_fixed, refine
 from agalign.method.state import ImageGroup, JointState
 from agalign.pixels.band_resampling import channel_mean, luma, warped
-from agalign.products.text_files import write_csv
 from agalign.values import geometry
 from agalign.values.alignment import JointResult, Seed
 from agalign.values.choices import Sharing
+from agalign.values.files import write_csv
 from agalign.values.geometry import Matrix
 from agalign.values.image import Raster
 from agalign.values.mapping import PixelMapping

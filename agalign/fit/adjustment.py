@@ -30,10 +30,9 @@ from agalign.errors import GeometryError
 from agalign.fit.windows import Shifts, peak_weights
 from agalign.values import geometry
 from agalign.values.alignment import Residual
-from agalign.values.displacement import DisplacementField
 from agalign.values.geometry import Points
 from agalign.values.least_squares import MIN_SHIFT_SCALE_PX, Robust, cauchy_weights, least_squares, shift_scale_px
-from agalign.values.mapping import PixelMapping
+from agalign.values.mapping import DisplacementField, PixelMapping
 from agalign.values.parallax import Parallax, Relief
 from agalign.values.pixel_units import FixedImagePx, FixedPx, PixelScale
 

@@ -20,11 +20,10 @@ from agalign.fit.windows import FixedWindows, Shifts, in_standard_errors
 from agalign.pixels.band_resampling import warped
 from agalign.pixels.structure import Field
 from agalign.values.alignment import Residual
-from agalign.values.displacement import DisplacementField
 from agalign.values.geometry import Points
 from agalign.values.image import Mask, Raster
 from agalign.values.least_squares import cauchy_weights, shift_scale_px
-from agalign.values.mapping import PixelMapping
+from agalign.values.mapping import DisplacementField, PixelMapping
 from agalign.values.pixel_units import FixedImagePx
 
 _WINDOW_PX = 40

@@ -27,9 +27,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from agalign.values import geometry
-from agalign.values.displacement import DisplacementField
 from agalign.values.geometry import Matrix, Points
 from agalign.values.least_squares import Estimate, Robust, least_squares
+from agalign.values.mapping import DisplacementField
 from agalign.values.pixel_units import MovingFilePx
 
 Array = NDArray[np.float64]

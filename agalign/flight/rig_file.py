@@ -13,9 +13,9 @@ from safetensors import safe_open
 from agalign.errors import InputError
 from agalign.flight.rig import CaptureFactors, Rig
 from agalign.values.alignment import JointResult, RefinedPair, Seed
-from agalign.values.displacement import DisplacementField
 from agalign.values.files import open_regular
 from agalign.values.geometry import normalised
+from agalign.values.mapping import DisplacementField
 from agalign.values.pixel_units import FixedImagePx
 
 

@@ -16,10 +16,10 @@ from agalign.method.patches import FOOTPRINT_PX, Keypoints, bilinear, footprint_
 from agalign.pixels.band_resampling import shrink
 from agalign.pixels.structure import gradient_magnitude
 from agalign.values import geometry, lens
-from agalign.values.displacement import DisplacementField
 from agalign.values.geometry import Matrix
 from agalign.values.image import FloatImage, Mask, Raster
 from agalign.values.lens import Lens
+from agalign.values.mapping import DisplacementField
 from agalign.values.pixel_units import SAME_PIXELS, PixelScale
 
 _FIELD_COLUMNS = 65

@@ -10,9 +10,9 @@ from agalign.errors import NoContrastError
 from agalign.method.descriptor import Descriptor, start_from, start_from_starter
 from agalign.method.device import choose_device
 from agalign.method.levels import Level, Sampler, make_level
-from agalign.values.displacement import DisplacementField
 from agalign.values.geometry import Matrix
 from agalign.values.image import Raster
+from agalign.values.mapping import DisplacementField
 
 Progress = Callable[[str, float], None]
 """Called with the name of a stage and its completed share, 0 to 1."""

@@ -11,9 +11,9 @@ from agalign.fit.displacement_field import DisplacementResult
 from agalign.values import geometry
 from agalign.values.alignment import PairScales, Prediction, Seed
 from agalign.values.choices import ReliefUse
-from agalign.values.displacement import DisplacementField
 from agalign.values.image import Raster
 from agalign.values.issues import FEW_KEYPOINTS, RETRIEVAL, SEED_DOES_NOT_FIT, Issue
+from agalign.values.mapping import DisplacementField
 from agalign.values.pixel_units import PixelScale
 
 from ..builders import displaced_views, joint_result, pair_of, residual_of, texture, two_views, whole

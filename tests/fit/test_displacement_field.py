@@ -7,7 +7,7 @@ from agalign.fit.windows import Shifts
 from agalign.pixels.structure import structure_field
 from agalign.values import geometry
 from agalign.values.alignment import Residual
-from agalign.values.displacement import DisplacementField
+from agalign.values.mapping import DisplacementField
 
 from ..builders import residual_of, texture
 

@@ -9,9 +9,8 @@ import pytest
 from agalign.fit.adjustment import CALIBRATED, LENS_STD, WindowFit, fit_windows, jacobian, lens_shapes, lens_std_px
 from agalign.values import geometry
 from agalign.values.alignment import Alignment, Prediction, Residual, Seed
-from agalign.values.displacement import DisplacementField
 from agalign.values.issues import sentence
-from agalign.values.mapping import PixelMapping
+from agalign.values.mapping import DisplacementField, PixelMapping
 from agalign.verify.checks import KINDS
 from agalign.verify.extrapolation import (
     EXTRAPOLATED,

@@ -19,7 +19,7 @@ from agalign.flight.rig_file import read_rig
 from agalign.method.descriptor import Descriptor
 from agalign.values import geometry
 from agalign.values.alignment import JointResult, RefinedPair, Seed
-from agalign.values.displacement import DisplacementField
+from agalign.values.mapping import DisplacementField
 from agalign.values.pixel_units import FixedImagePx, MovingFilePx
 
 FIELD = DisplacementField(40.0, np.arange(24.0).reshape(3, 4, 2) / 100)

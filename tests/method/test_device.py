@@ -23,8 +23,8 @@ from agalign.method.state import ImageGroup
 from agalign.values import geometry
 from agalign.values.alignment import JointResult
 from agalign.values.choices import Recipe
-from agalign.values.displacement import DisplacementField
 from agalign.values.lens import Lens
+from agalign.values.mapping import DisplacementField
 
 from ..builders import in_full_run, two_views, whole
 from .pretended_device import NAME, PretendedDevice

@@ -22,9 +22,9 @@ from agalign.method.patches import (
     warp_keypoints,
 )
 from agalign.values import lens
-from agalign.values.displacement import DisplacementField
 from agalign.values.image import Raster
 from agalign.values.lens import Lens
+from agalign.values.mapping import DisplacementField
 
 from ..builders import texture, whole
 

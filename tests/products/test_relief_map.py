@@ -25,11 +25,10 @@ from agalign.synthetic import cameras
 from agalign.values import geometry, lens
 from agalign.values.alignment import Alignment, PairScales, Seed
 from agalign.values.capture import Band, Capture
-from agalign.values.displacement import DisplacementField
 from agalign.values.image import OutputGrid, Tile
 from agalign.values.issues import RETRIEVAL, Issue
 from agalign.values.lens import Lens
-from agalign.values.mapping import PixelMapping
+from agalign.values.mapping import DisplacementField, PixelMapping
 from agalign.values.parallax import Parallax, Relief
 from agalign.values.pixel_units import PixelScale
 

@@ -28,11 +28,10 @@ from agalign.products.run.excluded import PANELS_FILE, SKY_FILE, read_excluded
 from agalign.products.run.flight_map import FLIGHT_MAP_FILE, features_in
 from agalign.products.run.record import read_run_record
 from agalign.products.sidecar.file import find_sidecars, read_sidecar
-from agalign.products.text_files import write_csv
 from agalign.synthetic import flight as synthetic
 from agalign.values import geometry
 from agalign.values.alignment import RefinedPair
-from agalign.values.files import RUN_FILE
+from agalign.values.files import RUN_FILE, write_csv
 from agalign.values.pixel_units import SAME_PIXELS
 from agalign.values.text import without_controls
 

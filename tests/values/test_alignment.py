@@ -8,8 +8,7 @@ from numpy.testing import assert_allclose
 
 from agalign.values import geometry
 from agalign.values.alignment import Alignment, PairScales, Seed
-from agalign.values.displacement import DisplacementField
-from agalign.values.mapping import PixelMapping
+from agalign.values.mapping import DisplacementField, PixelMapping
 from agalign.values.pixel_units import FixedImagePx, PixelScale
 
 from ..builders import joint_result, residual_of

@@ -7,9 +7,8 @@ import pytest
 
 from agalign.synthetic import cameras
 from agalign.values import geometry, lens
-from agalign.values.displacement import DisplacementField
 from agalign.values.image import Tile
-from agalign.values.mapping import PixelMapping
+from agalign.values.mapping import DisplacementField, PixelMapping
 from agalign.values.parallax import Parallax, Relief
 from agalign.values.pixel_units import SAME_PIXELS, PixelScale
 

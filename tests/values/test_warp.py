@@ -11,9 +11,8 @@ from agalign.synthetic import cameras
 from agalign.values import geometry
 from agalign.values.alignment import Alignment, Seed
 from agalign.values.choices import Interpolation
-from agalign.values.displacement import DisplacementField
 from agalign.values.image import Tile
-from agalign.values.mapping import PixelMapping
+from agalign.values.mapping import DisplacementField, PixelMapping
 from agalign.values.parallax import Parallax, Relief
 
 SIZE = 320, 240

@@ -27,10 +27,17 @@ from agalign.products.run.captures import LeftOut, RunCapture, captures_of_run, 
 from agalign.products.run.record import read_run_record
 from agalign.products.sidecar.file import read_sidecar
 from agalign.products.sidecar.schema import BandPart
-from agalign.products.text_files import write_csv
 from agalign.values import geometry, lens
 from agalign.values.choices import ExportProgram
-from agalign.values.files import check_inside, complete_file, file_name, remove_partial_files, scratch_file, write_text
+from agalign.values.files import (
+    check_inside,
+    complete_file,
+    file_name,
+    remove_partial_files,
+    scratch_file,
+    write_csv,
+    write_text,
+)
 from agalign.values.geometry import Matrix, Points
 from agalign.values.lens import Lens
 from agalign.values.text import counted

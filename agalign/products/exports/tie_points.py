@@ -16,12 +16,11 @@ from agalign.config import WriteSettings
 from agalign.errors import GeometryError
 from agalign.pixels.raster import transformed
 from agalign.products.product import CapturePaths, Product, ProductContext, StacAsset, WrittenFile
-from agalign.products.text_files import write_csv
 from agalign.values import geometry
 from agalign.values.alignment import Alignment
 from agalign.values.capture import Band, Capture, Georeference
 from agalign.values.choices import PairStatus
-from agalign.values.files import write_text
+from agalign.values.files import write_csv, write_text
 from agalign.values.pixel_units import FixedFilePx
 from agalign.values.text import escape_controls
 

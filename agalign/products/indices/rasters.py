@@ -36,9 +36,8 @@ from agalign.products.rasters.checked_raster import (
 from agalign.products.report.drawing import with_text, write_png
 from agalign.products.run.captures import RAW, AlignedBand, BandReader
 from agalign.products.sidecar.schema import CaptureResult
-from agalign.products.text_files import write_csv
 from agalign.values.capture import Band, Capture
-from agalign.values.files import read_regular
+from agalign.values.files import read_regular, write_csv
 from agalign.values.image import Tile, reduced_size_px
 from agalign.values.interpolation import tiles
 from agalign.values.text import without_formula

@@ -23,8 +23,7 @@ from agalign.products.report.light import CaptureLight, light_charts, radiometri
 from agalign.products.run.excluded import PANELS_FILE, SKY_FILE, PanelPart, SkyPart, read_excluded
 from agalign.products.run.record import RunPart, read_run_record
 from agalign.products.sidecar.file import find_sidecars, read_sidecar
-from agalign.products.text_files import write_csv
-from agalign.values.files import write_text
+from agalign.values.files import write_csv, write_text
 
 SUMMARY_COLUMNS = ("folder", "capture", *BAND_COLUMNS, "reference")
 REPORT_FILE, SUMMARY_FILE = "index.html", "summary.csv"

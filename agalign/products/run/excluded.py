@@ -14,9 +14,8 @@ from agalign.flight.panel_readings import BandReading, PanelReading
 from agalign.flight.sky import SkyCapture, sky_radiance
 from agalign.pixels.raster import read_preview
 from agalign.products.report.drawing import Picture, side_by_side, titled, write_png
-from agalign.products.text_files import read_model, write_model
 from agalign.values.capture import Band, Capture, PanelSource
-from agalign.values.files import check_inside
+from agalign.values.files import check_inside, read_model, write_model
 from agalign.values.pixel_units import PixelScale
 
 PANELS_FILE, SKY_FILE = "panels.json", "sky.json"

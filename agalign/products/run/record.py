@@ -14,9 +14,8 @@ from agalign._version import __version__
 from agalign.config import Settings
 from agalign.flight.groups import CameraOverview, camera_overviews
 from agalign.products.sidecar.schema import CaptureResult
-from agalign.products.text_files import read_model, write_model
 from agalign.values.capture import Capture
-from agalign.values.files import RUN_FILE
+from agalign.values.files import RUN_FILE, read_model, write_model
 from agalign.values.processes import usable_cores
 from agalign.values.text import counted, escape_controls
 

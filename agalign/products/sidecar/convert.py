@@ -26,12 +26,11 @@ from agalign.values import geometry, lens
 from agalign.values.alignment import Alignment, Residual, Seed
 from agalign.values.capture import Band
 from agalign.values.choices import CaptureStatus
-from agalign.values.displacement import DisplacementField
 from agalign.values.geometry import Points
 from agalign.values.image import OutputGrid
 from agalign.values.issues import Issue
 from agalign.values.lens import Lens
-from agalign.values.mapping import PixelMapping
+from agalign.values.mapping import DisplacementField, PixelMapping
 from agalign.values.parallax import Parallax, Relief
 from agalign.values.pixel_units import FixedFilePx
 from agalign.verify.checks import KINDS

@@ -10,8 +10,7 @@ from pydantic import ValidationError
 
 from agalign.errors import InputError, SidecarError
 from agalign.products.sidecar.schema import SCHEMA, CaptureResult, Sidecar
-from agalign.products.text_files import compact_lists
-from agalign.values.files import file_checksum, open_regular, read_regular, write_text
+from agalign.values.files import compact_lists, file_checksum, open_regular, read_regular, write_text
 
 _MAX_BYTES = 1 << 26
 """Limit of a file that is read: ten times the sidecar of many bands."""

@@ -17,10 +17,10 @@ from pydantic_core import CoreSchema, core_schema
 from agalign.config import CheckSettings
 from agalign.values.alignment import Prediction
 from agalign.values.choices import CaptureStatus, Geometry, ModelFamily, PairStatus, PredictionSource, SeedKind, Space
-from agalign.values.displacement import POSITION_DECIMALS
 from agalign.values.files import is_inside
 from agalign.values.image import OutputGrid
 from agalign.values.issues import MISSING_BAND, IssueKind
+from agalign.values.mapping import POSITION_DECIMALS
 from agalign.values.pixel_units import PixelScale
 from agalign.verify.checks import KINDS
 
