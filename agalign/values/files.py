@@ -15,15 +15,16 @@ from collections.abc import Iterable, Iterator, MutableMapping, Sequence
 from contextlib import contextmanager, suppress
 from io import BufferedReader
 from pathlib import Path, PurePosixPath, PureWindowsPath
-from typing import TypeVar
-
-from pydantic import BaseModel, ValidationError
+from typing import TYPE_CHECKING, TypeVar
 
 from agalign.errors import OutputError, SidecarError
 from agalign.values.processes import is_running
 from agalign.values.text import without_formula
 
-_Model = TypeVar("_Model", bound=BaseModel)
+if TYPE_CHECKING:  # `agalign --help` does without pydantic
+    from pydantic import BaseModel
+
+_Model = TypeVar("_Model", bound="BaseModel")
 
 RUN_FILE = "agalign-run.json"
 """Name of the run record. It is written first, and identifies an output folder."""
@@ -196,7 +197,7 @@ def compact_lists(text: str) -> str:
     return re.sub(r"(?<=[0-9le])\n *\]", "]", text)
 
 
-def write_model(path: Path, model: BaseModel | None) -> None:
+def write_model(path: Path, model: "BaseModel | None") -> None:
     """Write a model atomically as indented JSON; None removes the file of an earlier run. Raises OutputError."""
     if model is None:
         with suppress(OSError):
@@ -211,7 +212,7 @@ def read_model(path: Path, model: type[_Model]) -> _Model | None:
         return model.model_validate_json(read_regular(path))
     except FileNotFoundError:
         return None
-    except (OSError, ValidationError) as error:
+    except (OSError, ValueError) as error:  # pydantic's ValidationError is a ValueError
         reason = f" ({error.strerror})" if isinstance(error, OSError) else ""
         raise SidecarError(f"{path}: cannot be read{reason}; delete it and run again") from None
 
