@@ -153,6 +153,15 @@ class RepetitiveImages:
         return float(np.hypot(*shift_px)) <= self.expected_within_px
 
 
+def test_an_alias_is_along_the_repetition_in_px_of_the_full_image() -> None:
+    """The scene repeats along x, every 8 px of images with half the width."""
+    rng = np.random.default_rng(0)
+    spectrum = np.fft.fft2(np.tile(rng.normal(size=(64, 8)), (1, 8))).astype(np.complex64)
+    x_px, y_px = alias_peak(spectrum, spectrum, PixelScale(0.5, 0.25)).shift_px
+    assert (abs(x_px) % 16, y_px) == (0, 0)
+    assert x_px != 0
+
+
 def test_a_repetitive_scene_is_an_issue_unless_aliases_are_excluded() -> None:
     (issue,) = issues_of(replace(GOOD, images=RepetitiveImages()))
     assert issue.code == "repeats"
