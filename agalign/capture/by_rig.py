@@ -145,6 +145,7 @@ def bands_to_learn(
     height than those of the flight's network.
     """
     known = observed([p for p in pairs if p.has_rig_pixels and p.name in result], result, capture)
+    has_relief = any(alignment.mapping.parallax is not None for alignment in result.values())
 
     def is_skipped(pair: BandPair) -> bool:
         alignment = result.get(pair.name)
@@ -153,6 +154,9 @@ def bands_to_learn(
         joint = alignment.joint
         is_retrieved = joint is not None and joint.retrieval >= MIN_TIMES_CHANCE * joint.chance
         has_common_structure = alignment.seed.trusted or is_retrieved
-        return not has_common_structure or predict_band(rig, pair.name, known).std_px <= accept_predicted_px
+        prediction = predict_band(rig, pair.name, known)
+        if not has_relief:
+            prediction = _with_added_error(prediction, rig.parallax_px.get(pair.name, MovingFilePx(0.0)))
+        return not has_common_structure or prediction.std_px <= accept_predicted_px
 
     return {pair.name for pair in pairs if not is_skipped(pair)}

@@ -19,7 +19,7 @@ from agalign.cameras.discover import discover
 from agalign.capture import align_bands
 from agalign.capture.align_bands import PairAligner, align_capture_bands, align_pairs
 from agalign.capture.band_pair import read_pairs
-from agalign.capture.by_rig import with_predictions
+from agalign.capture.by_rig import bands_to_learn, with_predictions
 from agalign.config import CheckSettings, Settings
 from agalign.flight.model import FlightModel, load_model
 from agalign.method.joint import Results, refine_with
@@ -208,6 +208,19 @@ def test_a_more_accurate_prediction_by_windows_is_kept(five: Path, model: Flight
         of_windows = replace(nir, status="predicted", mapping=mapping, issues=issues, prediction=prediction)
         checked = with_predictions(pairs, {**result, "NIR": of_windows}, model.rig, capture)["NIR"]
         assert (checked.status, checked.prediction.source) == ("predicted", source)
+
+
+@pytest.mark.parametrize(("parallax_px", "is_learned"), [(0.0, False), (10.0, True)])
+def test_a_band_is_learned_from_scratch_if_its_prediction_is_not_usable(
+    five: Path, model: FlightModel, parallax_px: float, is_learned: bool
+) -> None:
+    """A plane does not contain the parallax of the flight."""
+    capture = discover(five).captures[0]
+    pairs, _ = read_pairs(capture, Settings().seed, model)
+    result = align_pairs(pairs, Settings(), lambda *_: None, model)
+    result["NIR"] = replace(result["NIR"], status="seed_only", seed=replace(result["NIR"].seed, trusted=True))
+    rig = replace(model.rig, parallax_px={"NIR": parallax_px})
+    assert bands_to_learn(pairs, result, rig, capture, 1.0) == ({"NIR"} if is_learned else set())
 
 
 def test_a_rotated_band_is_not_predicted_by_the_rig(five: Path, model: FlightModel, tmp_path: Path) -> None:
