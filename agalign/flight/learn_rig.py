@@ -13,7 +13,7 @@ from agalign.values.pixel_units import MovingFilePx
 from agalign.values.process_pool import Apply
 
 Array = NDArray[np.float64]
-Layout = Mapping[str, tuple[float, float]]
+LensLayout = Mapping[str, tuple[float, float]]
 """Positions of the lenses by band, in any unit."""
 
 _FACTOR_SETS: tuple[tuple[Factor, ...], ...] = (
@@ -30,7 +30,7 @@ _FACTOR_SETS: tuple[tuple[Factor, ...], ...] = (
 
 
 def learn_rig(
-    captures: Sequence[Observation], size_px: tuple[int, int], layout: Layout, apply: Apply = map
+    captures: Sequence[Observation], size_px: tuple[int, int], layout: LensLayout, apply: Apply = map
 ) -> Rig | None:
     """Estimate the rig from captures; None if no band has a mapping in at least MIN_CAPTURES of them.
 
@@ -64,7 +64,7 @@ class _Table:
     """The mappings of all captures as coefficients."""
 
     def __init__(
-        self, captures: Sequence[Observation], bands: Sequence[str], size_px: tuple[int, int], layout: Layout
+        self, captures: Sequence[Observation], bands: Sequence[str], size_px: tuple[int, int], layout: LensLayout
     ) -> None:
         self.median = [rig.median_mapping([c.mappings[b] for c in captures if b in c.mappings], size_px) for b in bands]
         self.differences = np.zeros((len(captures), len(bands), 2, 3))
