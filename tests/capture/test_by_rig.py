@@ -210,17 +210,15 @@ def test_a_more_accurate_prediction_by_windows_is_kept(five: Path, model: Flight
         assert (checked.status, checked.prediction.source) == ("predicted", source)
 
 
-@pytest.mark.parametrize(("parallax_px", "is_learned"), [(0.0, False), (10.0, True)])
-def test_a_band_is_learned_from_scratch_if_its_prediction_is_not_usable(
-    five: Path, model: FlightModel, parallax_px: float, is_learned: bool
-) -> None:
+def test_a_band_is_learned_from_scratch_if_its_prediction_is_not_usable(five: Path, model: FlightModel) -> None:
     """A plane does not contain the parallax of the flight."""
     capture = discover(five).captures[0]
     pairs, _ = read_pairs(capture, Settings().seed, model)
     result = align_pairs(pairs, Settings(), lambda *_: None, model)
     result["NIR"] = replace(result["NIR"], status="seed_only", seed=replace(result["NIR"].seed, trusted=True))
-    rig = replace(model.rig, parallax_px={"NIR": parallax_px})
-    assert bands_to_learn(pairs, result, rig, capture, 1.0) == ({"NIR"} if is_learned else set())
+    with_relief = replace(model.rig, parallax_px={"NIR": 10.0})
+    assert bands_to_learn(pairs, result, model.rig, capture, 1.0) == set()
+    assert bands_to_learn(pairs, result, with_relief, capture, 1.0) == {"NIR"}
 
 
 def test_a_rotated_band_is_not_predicted_by_the_rig(five: Path, model: FlightModel, tmp_path: Path) -> None:
