@@ -28,7 +28,7 @@ def test_the_notebook(tmp_path: Path) -> None:
     outputs = [output for cell in notebook.cells for output in cell.get("outputs", [])]
     text = "".join(o.get("text", "") + o.get("data", {}).get("text/plain", "") for o in outputs)
     assert "2 of 2: 0000SET/000/IMG_000" in text
-    assert sum("image/png" in o.get("data", {}) for o in outputs) == 3
+    assert sum("image/png" in o.get("data", {}) for o in outputs) == 2
     tables = [o["data"]["text/html"] for o in outputs if "text/html" in o.get("data", {})]
     assert "2 captures: 2 done" in tables[0]
     medians = [float(v) for v in re.findall(r"IMG_000\d +(-?[\d.]+)", text)]
