@@ -96,12 +96,14 @@ def expected_error_px(
 
     C is the covariance of the corners and D the Jacobian `geometry.over_corners`, with lens shapes if the mapping is
     extrapolated. For a band that is predicted by a rig, the first term is the squared standard error. The local mean
-    square is that of the residual shifts of the nearest windows, if the bands have common structure; `far` grows from 0
-    to 1 with the distance from them.
+    square is that of the residual shifts of the nearest windows, but not for a band without common structure that a rig
+    predicts; `far` grows from 0 to 1 with the distance from them.
     Infinite where the error is unknown.
     """
     square, residual = _mapping_px2(alignment, size_px, points_px), alignment.residual
-    if residual is not None and residual.coverage >= MIN_COMMON_COVERAGE:
+    is_by_rig = alignment.prediction is not None and alignment.prediction.source != "windows"
+    is_lost = is_by_rig and residual is not None and residual.coverage < MIN_COMMON_COVERAGE
+    if residual is not None and len(residual.measured_px) and not is_lost:
         square = square + _windows_px2(residual, points_px)
     if alignment.mapping.parallax is not None:
         square = square + alignment.mapping.parallax.variance_px2(points_px)

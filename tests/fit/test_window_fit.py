@@ -217,10 +217,15 @@ def test_predictions_have_their_standard_error_and_seeds_none() -> None:
     assert np.isinf(expected_px(replace(known, status="seed_only"), 60.0, 240.0))
 
 
-@pytest.mark.parametrize(("measured", "error_px"), [(0.1, 0.4), (0.9, 15.0)])
-def test_chance_peaks_of_a_lost_band_are_no_error(measured: float, error_px: float) -> None:
-    """The rig predicts a band that shows nothing; with common structure, its windows contradict the prediction."""
+@pytest.mark.parametrize(
+    ("source", "measured", "error_px"), [("bands", 0.1, 0.4), ("bands", 0.9, 15.0), ("windows", 0.1, 15.0)]
+)
+def test_chance_peaks_of_a_lost_band_are_no_error(source: str, measured: float, error_px: float) -> None:
+    """The rig predicts a band that shows nothing; with common structure, its windows contradict the prediction.
+
+    A thermal band that few windows predict has their error.
+    """
     shifts_px = np.where(np.arange(len(CENTRES))[:, None] < measured * len(CENTRES), (15.0, 0.0), (np.nan, np.nan))
     known = alignment([0.01] * 4, residual_of(CENTRES, shifts_px))
-    lost = replace(known, status="predicted", prediction=Prediction(np.eye(3), "bands", 0.4))
+    lost = replace(known, status="predicted", prediction=Prediction(np.eye(3), source, 0.4))
     assert expected_px(lost, *CENTRES[0]) == pytest.approx(error_px, rel=0.02)
