@@ -7,7 +7,7 @@ import pytest
 from numpy.typing import ArrayLike
 
 from agalign.capture.band_pair import BandPair
-from agalign.capture.map_estimate import expected_corners, map_estimate
+from agalign.capture.map_estimate import map_estimate
 from agalign.capture.warped_pair import WarpedPair
 from agalign.flight.rig import Rig
 from agalign.values import geometry
@@ -111,24 +111,11 @@ def test_collinear_windows_do_not_determine_corners_away_from_the_line() -> None
     assert results.corner_std_px > 0.5
 
 
-def test_expected_corners_equal_those_of_the_rig_for_any_mapping() -> None:
-    near = geometry.translation(28.0, -12.0)
-    expectation = expected_corners(rig(), "red", near)
-    np.testing.assert_allclose(expectation.corners, [2.0, 0.0] * 4, atol=1e-9)
-    np.testing.assert_allclose(expectation.by_factor[:, 0], [0.6, 0.0] * 4, atol=1e-9)
-    assert not expectation.by_factor[:, 3:].any()
+@pytest.mark.parametrize("magnification", [1.0, 0.1])
+def test_a_band_without_texture_has_the_error_of_its_prediction_in_px_of_the_reference(magnification: float) -> None:
+    to_nir = geometry.compose(np.diag([magnification, magnification, 1.0]), MEAN)
+    nir = replace(result(0, 50.0), fixed_to_moving=to_nir)
+    both = found_together(result(0, 0.03), nir, replace(rig(), mean={"red": MEAN, "nir": to_nir}))
     over = geometry.over_corners(geometry.lattice(*SIZE, 7, 5), *SIZE)
-    squares = np.einsum("nki,ij,nkj->n", over, expectation.covariance, over)
-    assert squares.mean() == pytest.approx(0.1**2)
-    double = expected_corners(rig(), "red", near, (2.0, 3.0))
-    np.testing.assert_allclose(double.corners, [4.0, 0.0] * 4, atol=1e-9)
-    np.testing.assert_allclose(double.by_factor[0::2, 0], 1.2)
-    up = np.diag([2.0, 3.0] * 4)
-    np.testing.assert_allclose(double.covariance, up @ expectation.covariance @ up)
-
-
-def test_expectations_of_a_coarse_band_are_in_px_of_the_reference() -> None:
-    coarse = replace(rig(), mean={"nir": geometry.compose(np.diag([0.1, 0.1, 1.0]), MEAN)})
-    one, other = (expected_corners(r, "nir", r.mean["nir"]) for r in (rig(), coarse))
-    np.testing.assert_allclose(other.covariance, 100 * one.covariance, rtol=1e-6)
-    np.testing.assert_allclose(other.by_factor, 10 * one.by_factor, rtol=1e-3, atol=1e-9)
+    squares = np.einsum("nki,ij,nkj->n", over, both["nir"].corner_covariance_px2, over)
+    assert squares.mean() == pytest.approx((0.1 / magnification) ** 2, rel=0.01)
