@@ -29,14 +29,7 @@ from agalign.values.geometry import Matrix
 from agalign.values.image import Raster
 from agalign.values.issues import NO_SUCH_SEED, UNREADABLE, Issue
 from agalign.values.mapping import DisplacementField, PixelMapping
-from agalign.values.pixel_units import (
-    FixedFilePx,
-    FixedImagePoints,
-    FixedImagePx,
-    MovingFilePx,
-    MovingImagePoints,
-    PixelScale,
-)
+from agalign.values.pixel_units import FixedFilePx, FixedImagePx, MovingFilePx, PixelScale
 
 SeedMatrices = Mapping[SeedKind, Matrix]
 """fixed_to_moving homographies between undistorted pixels, in order of preference."""
@@ -157,18 +150,13 @@ class BandPair:
         same moving point.
         """
         shifted = geometry.compose(fixed_to_moving, geometry.translation(*shift_px))
-        centre = FixedImagePoints((np.array(self.fixed.size_px) - 1) / 2)
-        mapped = MovingImagePoints(geometry.apply(shifted, centre))
-        return any(
-            self._distance_px(centre, mapped, self.seed_matrices[kind]) <= std_px * _MAX_ERROR_STD
-            for kind, std_px in self.seed_std_px.items()
-            if kind in self.seed_matrices
-        )
-
-    @staticmethod
-    def _distance_px(fixed: FixedImagePoints, moving: MovingImagePoints, fixed_to_moving: Matrix) -> FixedImagePx:
-        """Return the distance of a fixed point (2,) from the one that a homography maps to a moving point (2,)."""
-        return FixedImagePx(np.linalg.norm(geometry.apply(geometry.invert(fixed_to_moving), moving) - fixed))
+        centre_px = (np.array(self.fixed.size_px) - 1) / 2
+        mapped_px = geometry.apply(shifted, centre_px)
+        for kind in self.seed_std_px.keys() & self.seed_matrices.keys():
+            expected_px = geometry.apply(geometry.invert(self.seed_matrices[kind]), mapped_px)
+            if FixedImagePx(np.linalg.norm(expected_px - centre_px)) <= self.seed_std_px[kind] * _MAX_ERROR_STD:
+                return True
+        return False
 
     @property
     def reference_file_px(self) -> tuple[int, int]:

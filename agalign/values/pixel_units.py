@@ -10,7 +10,7 @@ a position x of one is (x + 0.5) * scale - 0.5 in the other. Only `PixelScale` i
 """
 
 import math
-from typing import TYPE_CHECKING, NamedTuple, NewType, Self, TypeVar
+from typing import TYPE_CHECKING, NamedTuple, Self, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -59,11 +59,6 @@ class MovingFilePx(Px):
 
 FixedPx = TypeVar("FixedPx", FixedImagePx, FixedFilePx)
 """Grid of a result: of the images, or of the files."""
-
-FixedImagePoints = NewType("FixedImagePoints", NDArray[np.float64])
-"""(..., 2) positions in the reference image."""
-MovingImagePoints = NewType("MovingImagePoints", NDArray[np.float64])
-"""(..., 2) positions in the moving image."""
 
 
 class PixelScale(NamedTuple):
