@@ -10,7 +10,7 @@ import json
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path, PurePosixPath
 from typing import Any
 
@@ -67,6 +67,18 @@ class IndexStatistics:
     masked_share: float = 0.0
     """Share of the pixels that only the quality flags mask."""
 
+    @classmethod
+    def of(cls, facts: dict[str, Any]) -> "IndexStatistics":
+        """Return the statistics in the tag of a raster or in a row of the table; nan for null and for empty cells.
+
+        Raises KeyError, TypeError, ValueError.
+        """
+        known = {"masked_share": 0.0} | facts  # older tables do not have it
+        numbers = {f.name: known[f.name] for f in fields(cls) if f.name != "unit"}
+        return cls(
+            unit=str(facts["unit"]), **{k: math.nan if v in (None, "") else float(v) for k, v in numbers.items()}
+        )
+
     def as_json(self) -> dict[str, float | str | None]:
         """Return the fields by name, with null for nan, which JSON does not have."""
         return {k: v if isinstance(v, str) or math.isfinite(v) else None for k, v in vars(self).items()}
@@ -115,9 +127,7 @@ class IndexReport:
 def _statistics_in(tags: Mapping[str, str]) -> IndexStatistics | None:
     """Return the statistics in the tags of a raster; None if there are none."""
     try:
-        fields: dict[str, Any] = json.loads(tags[_STATISTICS_TAG])
-        unit = str(fields.pop("unit"))
-        return IndexStatistics(unit=unit, **{k: math.nan if v is None else float(v) for k, v in fields.items()})
+        return IndexStatistics.of(json.loads(tags[_STATISTICS_TAG]))
     except (KeyError, ValueError, TypeError):
         return None
 
@@ -139,7 +149,7 @@ class IndexRasters(Product):
 
         Raises InputError if bands are in the wrong unit, OutputError.
         """
-        bands = _bands(context)
+        bands = list(_bands(context))
         indices = [index_named(name) for name in context.settings.write.indices]
         problems = []
         for report in write_rasters(bands, indices, context.paths.file(""), context.capture.label):
@@ -175,15 +185,14 @@ def _has_bands(bands: Sequence[Band], name: str) -> bool:
         return False
 
 
-def _bands(context: ProductContext) -> list[AlignedBand]:
-    places, usable, result = context.places, {context.capture.reference.name, *context.usable}, []
+def _bands(context: ProductContext) -> Iterator[AlignedBand]:
+    places, usable = context.places, {context.capture.reference.name, *context.usable}
     for band in context.capture.bands:
         if band.name in usable and band.name in places:
             file, index = places[band.name]
-            result.append(AlignedBand(band.name, band.wavelength_nm, file.path, index, file.sha256))
+            yield AlignedBand(band.name, band.wavelength_nm, file.path, index, file.sha256)
         else:
-            result.append(AlignedBand(band.name, band.wavelength_nm, Path(), 1, problem="not usable"))
-    return result
+            yield AlignedBand(band.name, band.wavelength_nm, Path(), 1, problem="not usable")
 
 
 def write_rasters(
@@ -192,25 +201,35 @@ def write_rasters(
     """Write `base`_<index>.tif and .png of a capture's bands, each atomically.
 
     Without `overwrite`, rasters that an earlier command wrote from the same bands with the same formula are kept. If a
-    band of an index is missing, not usable or not in the unit that the index needs, the report has the problem.
-    Raises OutputError, or InputError for a file that cannot be read.
+    band of an index is missing, not usable, unreadable or not in the unit that the index needs, the report has the
+    problem. Raises OutputError.
     """
     with BandReader() as reader:
         for index in indices:
             target = base.with_name(f"{base.name}_{index.name}.tif")
             try:
-                chosen = _bands_of_index(bands, index)
-                source = _fingerprint(index, chosen)
-                may_be_kept = not overwrite and all(band.sha256 for band in chosen)
-                earlier = _finished_before(target, source) if may_be_kept else None
-                if earlier is None and target.resolve() in {band.file.resolve() for band in bands}:
-                    raise InputError(f"{target}: is the file of a band; give the formula '{index.name}' another name")
-                unit = earlier.unit if earlier is not None else _common_unit(index, chosen, reader)
+                statistics, kept = _raster(index, bands, target, reader, overwrite=overwrite)
+                report = IndexReport(label, index.name, target, statistics, kept=kept)
             except InputError as error:
-                yield IndexReport(label, index.name, problem=str(error))
-                continue
-            statistics = earlier or _write(index, chosen, target, unit, source, reader)
-            yield IndexReport(label, index.name, target, statistics, kept=earlier is not None)
+                report = IndexReport(label, index.name, problem=str(error))
+            yield report
+
+
+def _raster(
+    index: Index, bands: Sequence[AlignedBand], target: Path, reader: BandReader, *, overwrite: bool
+) -> tuple[IndexStatistics, bool]:
+    """(statistics of the raster of an index, which is written if it must be; whether it is kept). Raises InputError."""
+    chosen = [bands[i] for i in bands_for(index, [b.name for b in bands], [b.wavelength_nm for b in bands])]
+    if problems := [band.problem for band in chosen if band.problem]:
+        raise InputError(f"{index.name} is left out: {problems[0]}")
+    source = _fingerprint(index, chosen)
+    if not overwrite and all(band.sha256 for band in chosen):
+        earlier = _finished_before(target, source)
+        if earlier is not None:
+            return earlier, True
+    if target.resolve() in {band.file.resolve() for band in bands}:
+        raise InputError(f"{target}: is the file of a band; give the formula '{index.name}' another name")
+    return _write(index, chosen, target, _common_unit(index, chosen, reader), source, reader), False
 
 
 def outdated_rasters(base: Path) -> Iterator[Path]:
@@ -219,15 +238,6 @@ def outdated_rasters(base: Path) -> Iterator[Path]:
         # A file with a sidecar is the stack of another capture.
         if not path.with_suffix(".json").exists() and _statistics_in(tags_of(path)) is not None:
             yield from (path, path.with_suffix(".png"))
-
-
-def _bands_of_index(bands: Sequence[AlignedBand], index: Index) -> list[AlignedBand]:
-    """Return the bands of an index. Raises InputError if one is missing or not usable."""
-    chosen = [bands[i] for i in bands_for(index, [b.name for b in bands], [b.wavelength_nm for b in bands])]
-    for band in chosen:
-        if band.problem:
-            raise InputError(f"{index.name} is left out: {band.problem}")
-    return chosen
 
 
 def _fingerprint(index: Index, bands: Sequence[AlignedBand]) -> str:
@@ -420,15 +430,13 @@ def _cells(row: IndexReport, out: Path) -> dict[str, Any]:
 
 def _row(cells: Mapping[str, str], out: Path) -> IndexReport:
     cells = {k: _unquoted(v) for k, v in cells.items()}
-    numbers = {k: float(cells[k] or "nan") for k in ("median", "p5", "p95", "valid_share", "low", "high")}
-    numbers["masked_share"] = float(cells.get("masked_share") or 0)  # older tables do not have it
     path = out / cells["file"]
     path.relative_to(out)  # raises ValueError for an absolute path, which no table has
     latitude, longitude = (float(cells[k]) if cells[k] else None for k in ("latitude", "longitude"))
     return IndexReport(
         Path(cells["folder"], cells["capture"]).as_posix(),
         path=path if cells["file"] else None,
-        statistics=IndexStatistics(unit=cells["input"], **numbers),
+        statistics=IndexStatistics.of(cells | {"unit": cells["input"]}),
         index=cells["index"],
         problem=cells["problem"],
         captured_at=cells["captured_at"],
