@@ -17,9 +17,8 @@ from agalign._version import __version__
 from agalign.config import Settings
 from agalign.errors import SidecarError
 from agalign.products.indices.rasters import IndexReport, reports_of_run, update_table
-from agalign.products.report.charts import drifts_of, rig_views
+from agalign.products.report.charts import CaptureLight, drifts_of, light_charts, radiometric_check, rig_views
 from agalign.products.report.facts import BAND_COLUMNS, FlightFacts
-from agalign.products.report.light import CaptureLight, light_charts, radiometric_check
 from agalign.products.run.excluded import PANELS_FILE, SKY_FILE, PanelPart, SkyPart, read_excluded
 from agalign.products.run.record import RunPart, read_run_record
 from agalign.products.sidecar.file import find_sidecars, read_sidecar
