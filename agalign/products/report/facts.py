@@ -13,7 +13,6 @@ import numpy as np
 from pydantic import BaseModel
 
 from agalign.products.indices.rasters import IndexReport
-from agalign.products.run.captures import RAW
 from agalign.products.run.record import RefusalPart
 from agalign.products.sidecar.schema import BandPart, BandResult, CaptureResult, GridPart, OutputPart, Sidecar
 from agalign.values.issues import MISSING_BAND, MOSAICS, OTHER_REFERENCE, UNREADABLE, Remedy
@@ -207,11 +206,10 @@ class FlightFacts:
         by_label = {c["label"]: c["indices"] for c in self.captures}
         for row in rows:
             if row.path is not None and row.capture in by_label:
-                statistics = row.statistics.as_json()
-                facts = {name: rounded(statistics[name]) for name in ("median", "p5", "p95")}
-                facts |= {"name": row.index, "valid": row.statistics.valid_share, "unit": row.statistics.unit}
-                facts |= {"masked": row.statistics.masked_share}
-                facts |= {"span": (statistics["low"], statistics["high"]), "raw": row.statistics.unit == RAW}
+                known = row.statistics.as_json()
+                facts = {name: rounded(known[name]) for name in ("median", "p5", "p95")} | {"name": row.index}
+                facts |= {"valid": known["valid_share"], "unit": known["unit"], "masked": known["masked_share"]}
+                facts |= {"span": (known["low"], known["high"]), "raw": row.raw_numbers}
                 file = row.path.relative_to(out)
                 links = {"file": quote(file.as_posix()), "picture": quote(file.with_suffix(".png").as_posix())}
                 by_label[row.capture].append(facts | links)
@@ -283,10 +281,9 @@ def _band_offset(grid: GridPart | None, sidecar: Sidecar) -> tuple[tuple[float, 
     if grid is None:
         return None, None
     reference_px, moving_px = np.array(grid.reference_px), np.array(grid.moving_px)
-    reference_span, moving_span = np.ptp(reference_px, axis=0), np.ptp(moving_px, axis=0)
-    if not (np.abs(moving_span - reference_span) < 0.1 * reference_span).all():
+    offsets, span_px = moving_px - reference_px, np.ptp(reference_px, axis=0)
+    if not (np.abs(np.ptp(moving_px, axis=0) - span_px) < 0.1 * span_px).all():
         return None, None
-    offsets = moving_px - reference_px
     centre = (np.array(sidecar.reference.size_px) - 1) / 2
     dx, dy = offsets[np.linalg.norm(reference_px - centre, axis=1).argmin()].tolist()
     return (round(dx, 3), round(dy, 3)), round(float(np.median(np.linalg.norm(offsets, axis=1))), 3)

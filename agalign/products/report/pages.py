@@ -65,7 +65,7 @@ def write_pages(out: Path, on_problem: Callable[[str], None]) -> FlightFacts:
         version=__version__,
         median=median,
         flight=facts,
-        facts=_script_json(facts.as_json()),
+        facts=facts.as_json(),
         run=run,
         settings=_changed_settings(run),
         rigs=rig_views(out, unreadable.append),
@@ -97,16 +97,17 @@ def pages_exist(out: Path) -> bool:
 def _page(**values: Any) -> str:
     """The page of the template, which gets these values."""
     environment = Environment(
-        loader=PackageLoader("agalign.products.report", "."),
+        loader=PackageLoader(__package__, "."),
         autoescape=select_autoescape(["j2"]),
         trim_blocks=True,
         lstrip_blocks=True,
         undefined=StrictUndefined,
     )
-    script = _resource("page.js")
+    environment.policies["json.dumps_kwargs"] = {"separators": (",", ":"), "ensure_ascii": False, "allow_nan": False}
+    style, script = (resources.files(__package__).joinpath(f"page.{kind}").read_text("utf-8") for kind in ("css", "js"))
     digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
-    resources_of_page = {"style": _resource("page.css"), "script": script, "script_hash": digest}
-    return environment.get_template("page.html.j2").render(**resources_of_page, **values)
+    template = environment.get_template("page.html.j2")
+    return template.render(style=style, script=script, script_hash=digest, **values)
 
 
 def _changed_settings(run: RunPart | None) -> list[tuple[str, str]]:
@@ -121,13 +122,3 @@ def _changed_settings(run: RunPart | None) -> list[tuple[str, str]]:
         for name, value in values.items()
         if value != defaults.get(stage, {}).get(name) and (stage, name) != ("flight", "start_model")
     ]
-
-
-def _resource(name: str) -> str:
-    return resources.files("agalign.products.report").joinpath(name).read_text(encoding="utf-8")
-
-
-def _script_json(facts: dict[str, Any]) -> str:
-    """JSON for an HTML script element, escaped so that no text in it ends the element."""
-    text = json.dumps(facts, separators=(",", ":"), ensure_ascii=False, allow_nan=False)
-    return text.replace("&", "\\u0026").replace("<", "\\u003c").replace(">", "\\u003e")
