@@ -72,6 +72,7 @@ def symbols_of(formula: str) -> tuple[str, ...]:
     Allowed are names, numbers, + - * / ** (or ^), parentheses, and sqrt, log, exp and abs. Raises ConfigurationError
     for anything else.
     """
+    # The evaluation adds an entry for each name that it reads.
     used: dict[str, FloatImage] = defaultdict(lambda: np.ones((1, 1), np.float32))
     evaluate(formula, used)
     return tuple(used)
