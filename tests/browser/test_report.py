@@ -409,8 +409,7 @@ def test_it_prints_and_fits_a_telephone(browser: Any, out: Path) -> None:
     assert page.locator("details.short:not([open])").count() == 0
     assert not any("IMG_0001" in label for label in page.locator("#table tbody th").all_inner_texts())
     page.emulate_media(media="screen")
-    page.wait_for_timeout(200)
-    assert page.locator("#table tbody th").count() == 3
+    page.wait_for_function("() => document.querySelectorAll('#table tbody th').length === 3")
 
 
 def test_no_table_is_cut_on_a_screen(browser: Any, out: Path) -> None:

@@ -65,7 +65,7 @@ def ties(survey: Path) -> Ties:
     return Ties(flight, used, checks, adjusted(flight.captures, used), dict(np.load(survey / "truth.npz")))
 
 
-def test_tie_points_place_captures_to_a_pixel(ties: Ties) -> None:
+def test_tie_points_place_captures_to_a_pixel_and_do_not_move_the_whole(ties: Ties) -> None:
     assert p95_m(ties.flight.captures, ties.truth) > 1.5
     assert p95_m(ties.placed, ties.truth) < GSD_M
     assert misfit_m(ties.checks, ties.placed)[0] < 0.2 * GSD_M
@@ -73,10 +73,7 @@ def test_tie_points_place_captures_to_a_pixel(ties: Ties) -> None:
     # No tie point is both used and a check.
     for used, check in zip(ties.used, ties.checks, strict=True):
         assert not set(map(tuple, used.first_px)) & set(map(tuple, check.first_px))
-
-
-def test_the_georeference_holds_the_position_of_the_whole(ties: Ties) -> None:
-    """Tie points are relative: the mean of the GPS positions stays."""
+    # Tie points are relative: the mean of the GPS positions stays.
     centre = (np.array([SIZE_PX], float) - 1) / 2
     origin_m = transformed(np.array([[LONGITUDE, LATITUDE]]), "EPSG:4326", utm_wkt(LONGITUDE, LATITUDE))[0]
     off_m = [c.on_ground(centre)[0] - geometry.apply(ties.truth[c.label], centre)[0] for c in ties.placed]
@@ -102,15 +99,13 @@ def test_wrong_matches_of_a_pair_do_not_move_the_others(ties: Ties) -> None:
 
 
 @pytest.fixture(scope="module")
-def written(survey: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, agalign.MosaicReport]:
-    path = tmp_path_factory.mktemp("mosaic") / "field.tif"
-    return path, agalign.mosaic(survey, path, indices=["ndvi"])
+def written(survey: Path, tmp_path_factory: pytest.TempPathFactory) -> agalign.MosaicReport:
+    return agalign.mosaic(survey, tmp_path_factory.mktemp("mosaic") / "field.tif", indices=["ndvi"])
 
 
-def test_the_mosaic_is_a_cog_with_all_bands(written: tuple[Path, agalign.MosaicReport]) -> None:
-    path, report = written
-    assert (report.captures, report.untied, report.left_out) == (9, [], [])
-    with rasterio.open(path) as field:
+def test_the_mosaic_is_a_cog_with_all_bands(written: agalign.MosaicReport) -> None:
+    assert (written.captures, written.untied, written.left_out) == (9, [], [])
+    with rasterio.open(written.path) as field:
         assert field.tags(ns="IMAGE_STRUCTURE")["LAYOUT"] == "COG"
         assert field.overviews(1)
         assert field.descriptions == ("Green", "Red", "NIR", "Red edge")
@@ -118,18 +113,18 @@ def test_the_mosaic_is_a_cog_with_all_bands(written: tuple[Path, agalign.MosaicR
         assert field.crs.to_epsg() == 32631
         assert field.transform.a == -field.transform.e == pytest.approx(GSD_M, rel=0.03)
         assert np.isnan(field.nodata)
-        assert float(field.tags()["MISFIT_BETWEEN_CAPTURES_M"]) == pytest.approx(report.misfit_m[0], abs=1e-3)
+        assert float(field.tags()["MISFIT_BETWEEN_CAPTURES_M"]) == pytest.approx(written.misfit_m[0], abs=1e-3)
         bands = field.read()
     assert np.isfinite(bands).all(axis=0).mean() > 0.8
-    with rasterio.open(path.with_name("field_ndvi.tif")) as index:
+    with rasterio.open(written.path.with_name("field_ndvi.tif")) as index:
         assert index.tags(ns="IMAGE_STRUCTURE")["LAYOUT"] == "COG"
         ndvi = index.read(1)
     np.testing.assert_allclose(ndvi, (bands[2] - bands[1]) / (bands[2] + bands[1]), rtol=1e-5)
 
 
-def test_the_mosaic_shows_the_ground(written: tuple[Path, agalign.MosaicReport], ties: Ties) -> None:
+def test_the_mosaic_shows_the_ground(written: agalign.MosaicReport, ties: Ties) -> None:
     """Each capture, resampled to the mosaic by its refined placement, has the values of the mosaic, seams included."""
-    with rasterio.open(written[0]) as field:
+    with rasterio.open(written.path) as field:
         bands = field.read()
         to_px = np.array(~field.transform).reshape(3, 3)
     for capture in ties.placed:
@@ -169,7 +164,7 @@ def test_whole_numbers_keep_their_type_and_holes_are_filled(survey: Path, tmp_pa
 
 
 def test_the_command_writes_the_same_and_states_the_misfit(
-    written: tuple[Path, agalign.MosaicReport], survey: Path, tmp_path: Path
+    written: agalign.MosaicReport, survey: Path, tmp_path: Path
 ) -> None:
     with scratch_file(tmp_path / "field.tif") as left:
         pass
@@ -181,10 +176,9 @@ def test_the_command_writes_the_same_and_states_the_misfit(
     assert "tie points that were not used: median 0.0" in text
     assert "Misfit between captures, by the georeference: median" in text
     assert "Mosaic of 9 captures" in text
-    path, _ = written
     assert sorted(os.listdir(tmp_path)) == ["field.tif", "field_ndvi.png", "field_ndvi.tif"]
     for name in os.listdir(tmp_path):
-        assert (tmp_path / name).read_bytes() == path.with_name(name).read_bytes(), name
+        assert (tmp_path / name).read_bytes() == written.path.with_name(name).read_bytes(), name
 
 
 def with_another_band(out: Path) -> None:
