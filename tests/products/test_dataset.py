@@ -54,6 +54,7 @@ def test_a_flight_is_read_when_it_is_asked_for(run: Path) -> None:
     assert (float(one.x[0]), float(flight.x[0])) == (0.0, 0.0)
 
 
+@pytest.mark.parametrize("run", ["stack"], indirect=True)
 def test_times_of_a_flight_are_in_utc_or_by_the_clock_of_the_camera(run: Path, tmp_path: Path) -> None:
     out = Path(shutil.copytree(run, tmp_path / "out"))
     moments = "2026-06-21T12:00:00+02:00", "2026-06-21T05:00:00-05:00"

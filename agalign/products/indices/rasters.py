@@ -10,7 +10,7 @@ import json
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path, PurePosixPath
 from typing import Any
 
@@ -22,7 +22,7 @@ from agalign._version import __version__
 from agalign.config import WriteSettings
 from agalign.errors import ConfigurationError, InputError
 from agalign.pixels.raster import OpenRaster, open_raster
-from agalign.products.indices.formulas import Index, bands_for, compute, index_named
+from agalign.products.indices.formulas import Index, bands_for, compute, index_named, role_of_band
 from agalign.products.product import GEOTIFF, CapturePaths, Product, ProductContext, StacAsset, WrittenFile
 from agalign.products.rasters.aligned_files import tags_of, to_cog
 from agalign.products.rasters.checked_raster import (
@@ -66,18 +66,6 @@ class IndexStatistics:
     """Value at the upper end of the colour scale."""
     masked_share: float = 0.0
     """Share of the pixels that only the quality flags mask."""
-
-    @classmethod
-    def of(cls, facts: dict[str, Any]) -> "IndexStatistics":
-        """Return the statistics in the tag of a raster or in a row of the table; nan for null and for empty cells.
-
-        Raises KeyError, TypeError, ValueError.
-        """
-        known = {"masked_share": 0.0} | facts  # older tables do not have it
-        numbers = {f.name: known[f.name] for f in fields(cls) if f.name != "unit"}
-        return cls(
-            unit=str(facts["unit"]), **{k: math.nan if v in (None, "") else float(v) for k, v in numbers.items()}
-        )
 
     def as_json(self) -> dict[str, float | str | None]:
         """Return the fields by name, with null for nan, which JSON does not have."""
@@ -127,7 +115,9 @@ class IndexReport:
 def _statistics_in(tags: Mapping[str, str]) -> IndexStatistics | None:
     """Return the statistics in the tags of a raster; None if there are none."""
     try:
-        return IndexStatistics.of(json.loads(tags[_STATISTICS_TAG]))
+        fields: dict[str, Any] = json.loads(tags[_STATISTICS_TAG])
+        unit = str(fields.pop("unit"))
+        return IndexStatistics(unit=unit, **{k: math.nan if v is None else float(v) for k, v in fields.items()})
     except (KeyError, ValueError, TypeError):
         return None
 
@@ -152,11 +142,12 @@ class IndexRasters(Product):
         bands = list(_bands(context))
         indices = [index_named(name) for name in context.settings.write.indices]
         problems = []
-        for report in write_rasters(bands, indices, context.paths.file(""), context.capture.label):
+        reports = write_rasters(bands, indices, context.paths.file(""), context.capture.label)
+        for index, report in zip(indices, reports, strict=True):
             if report.path is not None:
                 yield WrittenFile(self.kind, report.path, StacAsset(report.index, GEOTIFF, ("data",)))
                 yield WrittenFile(self.kind, report.path.with_suffix(".png"))
-            elif all(not b.problem for b in bands) and _has_bands(context.capture.bands, report.index):
+            elif all(not b.problem for b in bands) and _has_bands(context.capture.bands, index):
                 problems.append(report.problem)
         if problems:
             raise InputError("; ".join(problems))
@@ -166,7 +157,7 @@ def check_indices(captures: Sequence[Capture], settings: WriteSettings) -> None:
     """Raise ConfigurationError for an unknown index, and for an index that no capture has the bands or unit for."""
     for name in settings.indices:
         index = index_named(name)
-        suitable = [c for c in captures if _has_bands(c.bands, name)]
+        suitable = [c for c in captures if _has_bands(c.bands, index)]
         if captures and not suitable:
             names = ", ".join(dict.fromkeys(b.name for c in captures for b in c.bands))
             raise ConfigurationError(
@@ -177,12 +168,8 @@ def check_indices(captures: Sequence[Capture], settings: WriteSettings) -> None:
             raise ConfigurationError(f"--index {name}: needs reflectance; add --radiometry")
 
 
-def _has_bands(bands: Sequence[Band], name: str) -> bool:
-    narrow = [b for b in bands if not b.companion]
-    try:
-        return bool(bands_for(index_named(name), [b.name for b in narrow], [b.wavelength_nm for b in narrow]))
-    except InputError:
-        return False
+def _has_bands(bands: Sequence[Band], index: Index) -> bool:
+    return {role_of_band(band) for band in bands} >= set(index.roles)
 
 
 def _bands(context: ProductContext) -> Iterator[AlignedBand]:
@@ -201,35 +188,25 @@ def write_rasters(
     """Write `base`_<index>.tif and .png of a capture's bands, each atomically.
 
     Without `overwrite`, rasters that an earlier command wrote from the same bands with the same formula are kept. If a
-    band of an index is missing, not usable, unreadable or not in the unit that the index needs, the report has the
-    problem. Raises OutputError.
+    band of an index is missing, not usable or not in the unit that the index needs, the report has the problem.
+    Raises OutputError, or InputError for a file that cannot be read.
     """
     with BandReader() as reader:
         for index in indices:
             target = base.with_name(f"{base.name}_{index.name}.tif")
             try:
-                statistics, kept = _raster(index, bands, target, reader, overwrite=overwrite)
-                report = IndexReport(label, index.name, target, statistics, kept=kept)
+                chosen = _bands_of_index(bands, index)
+                source = _fingerprint(index, chosen)
+                may_be_kept = not overwrite and all(band.sha256 for band in chosen)
+                earlier = _finished_before(target, source) if may_be_kept else None
+                if earlier is None and target.resolve() in {band.file.resolve() for band in bands}:
+                    raise InputError(f"{target}: is the file of a band; give the formula '{index.name}' another name")
+                unit = earlier.unit if earlier is not None else _common_unit(index, chosen, reader)
             except InputError as error:
-                report = IndexReport(label, index.name, problem=str(error))
-            yield report
-
-
-def _raster(
-    index: Index, bands: Sequence[AlignedBand], target: Path, reader: BandReader, *, overwrite: bool
-) -> tuple[IndexStatistics, bool]:
-    """(statistics of the raster of an index, which is written if it must be; whether it is kept). Raises InputError."""
-    chosen = [bands[i] for i in bands_for(index, [b.name for b in bands], [b.wavelength_nm for b in bands])]
-    if problems := [band.problem for band in chosen if band.problem]:
-        raise InputError(f"{index.name} is left out: {problems[0]}")
-    source = _fingerprint(index, chosen)
-    if not overwrite and all(band.sha256 for band in chosen):
-        earlier = _finished_before(target, source)
-        if earlier is not None:
-            return earlier, True
-    if target.resolve() in {band.file.resolve() for band in bands}:
-        raise InputError(f"{target}: is the file of a band; give the formula '{index.name}' another name")
-    return _write(index, chosen, target, _common_unit(index, chosen, reader), source, reader), False
+                yield IndexReport(label, index.name, problem=str(error))
+                continue
+            statistics = earlier or _write(index, chosen, target, unit, source, reader)
+            yield IndexReport(label, index.name, target, statistics, kept=earlier is not None)
 
 
 def outdated_rasters(base: Path) -> Iterator[Path]:
@@ -238,6 +215,15 @@ def outdated_rasters(base: Path) -> Iterator[Path]:
         # A file with a sidecar is the stack of another capture.
         if not path.with_suffix(".json").exists() and _statistics_in(tags_of(path)) is not None:
             yield from (path, path.with_suffix(".png"))
+
+
+def _bands_of_index(bands: Sequence[AlignedBand], index: Index) -> list[AlignedBand]:
+    """Return the bands of an index. Raises InputError if one is missing or not usable."""
+    chosen = [bands[i] for i in bands_for(index, [b.name for b in bands], [b.wavelength_nm for b in bands])]
+    for band in chosen:
+        if band.problem:
+            raise InputError(f"{index.name} is left out: {band.problem}")
+    return chosen
 
 
 def _fingerprint(index: Index, bands: Sequence[AlignedBand]) -> str:
@@ -430,13 +416,15 @@ def _cells(row: IndexReport, out: Path) -> dict[str, Any]:
 
 def _row(cells: Mapping[str, str], out: Path) -> IndexReport:
     cells = {k: _unquoted(v) for k, v in cells.items()}
+    numbers = {k: float(cells[k] or "nan") for k in ("median", "p5", "p95", "valid_share", "low", "high")}
+    numbers["masked_share"] = float(cells.get("masked_share") or 0)  # older tables do not have it
     path = out / cells["file"]
     path.relative_to(out)  # raises ValueError for an absolute path, which no table has
     latitude, longitude = (float(cells[k]) if cells[k] else None for k in ("latitude", "longitude"))
     return IndexReport(
         Path(cells["folder"], cells["capture"]).as_posix(),
         path=path if cells["file"] else None,
-        statistics=IndexStatistics.of(cells | {"unit": cells["input"]}),
+        statistics=IndexStatistics(unit=cells["input"], **numbers),
         index=cells["index"],
         problem=cells["problem"],
         captured_at=cells["captured_at"],

@@ -55,11 +55,10 @@ def write_pages(out: Path, on_problem: Callable[[str], None]) -> FlightFacts:
     except SidecarError as error:
         unreadable.append(str(error))
     not_aligned = [("panel", part) for part in panels if not part.in_scene] + [("sky", part) for part in sky]
-    rows = [*facts.rows]
     for status, part in not_aligned:
         of_capture = {"folder": part.folder, "capture": part.capture, "status": status, "reason": part.sentence}
-        rows += [of_capture | {"band": band.band} for band in part.bands]
-    write_csv(out / SUMMARY_FILE, SUMMARY_COLUMNS, ([row.get(name) for name in SUMMARY_COLUMNS] for row in rows))
+        facts.rows += [of_capture | {"band": band.band} for band in part.bands]
+    write_csv(out / SUMMARY_FILE, SUMMARY_COLUMNS, ([row.get(name) for name in SUMMARY_COLUMNS] for row in facts.rows))
     facts.add_indices(update_table(out, indices), out)
     page = _page(
         version=__version__,
