@@ -44,13 +44,13 @@ BAND_COLUMNS = {
 """Field of a band in the sidecar by column of OUT/summary.csv."""
 
 
-@dataclass
+@dataclass(frozen=True)
 class FailureGroup:
     """The bands of a run with the same status and the same cause."""
 
     status: str
     remedy: Remedy
-    bands: list[RefusalPart] = field(default_factory=list)
+    bands: list[RefusalPart]
 
     @property
     def advice(self) -> str:
@@ -85,7 +85,7 @@ class PairTotals:
     """The band pairs of a run. Captures are added one by one, and not kept, which limits memory."""
 
     bands: dict[str, BandTotals] = field(default_factory=lambda: defaultdict(BandTotals))
-    _by_cause: dict[tuple[str, Remedy], FailureGroup] = field(default_factory=dict)
+    _by_cause: dict[tuple[str, Remedy], list[RefusalPart]] = field(default_factory=lambda: defaultdict(list))
     _references: list[tuple[str, tuple[str, ...], str, set[str]]] = field(default_factory=list)
     """(capture, flight, reference band, its other bands with the missing ones)."""
     _votes: dict[tuple[str, ...], Counter[str]] = field(default_factory=lambda: defaultdict(Counter))
@@ -101,7 +101,7 @@ class PairTotals:
             if status != "aligned":
                 refusal = RefusalPart(capture=label, band=name, status=status, reason=reason or "")
                 remedy = MISSING_BAND if part is None else _remedy_of(part, is_mosaic=is_mosaic)
-                _add_to(self._by_cause, refusal, remedy)
+                self._by_cause[status, remedy].append(refusal)
             elif part and part.metrics and (residual_px := part.metrics.after.residual_px) is not None:
                 band.residuals_px.append(residual_px)
         camera, reference = result.camera, result.reference.band
@@ -127,19 +127,17 @@ class PairTotals:
         """Return the failures by cause, and the captures with another reference than most of their flight; the most
         severe first, and the largest first of those.
         """
-        groups = dict(self._by_cause)
+        groups = [FailureGroup(*cause, bands) for cause, bands in self._by_cause.items()]
+        exceptions = []
         for label, flight, band, others in self._references:
             usual = self._votes[flight].most_common(1)[0][0]
             if usual in others:
                 reason = f"on the grid of {band}; most captures of the flight are on that of {usual}"
-                refusal = RefusalPart(capture=label, band=band, status="other_reference", reason=reason)
-                _add_to(groups, refusal, OTHER_REFERENCE)
+                exceptions.append(RefusalPart(capture=label, band=band, status="other_reference", reason=reason))
+        if exceptions:
+            groups.append(FailureGroup("other_reference", OTHER_REFERENCE, exceptions))
         severity = "failed", "seed_only", "missing", "other_reference", "predicted"
-        return sorted(groups.values(), key=lambda g: (severity.index(g.status), -len(g.bands), g.remedy.cause))
-
-
-def _add_to(groups: dict[tuple[str, Remedy], FailureGroup], band: RefusalPart, remedy: Remedy) -> None:
-    groups.setdefault((band.status, remedy), FailureGroup(band.status, remedy)).bands.append(band)
+        return sorted(groups, key=lambda g: (severity.index(g.status), -len(g.bands), g.remedy.cause))
 
 
 def _remedy_of(band: BandResult, *, is_mosaic: bool) -> Remedy:
