@@ -20,7 +20,6 @@ from agalign.pixels.raster import transformed
 from agalign.products.mosaic.adjustment import TiePair, adjusted, misfit_m, tie_pairs
 from agalign.products.mosaic.placement import PlacedFlight, Placement, place_captures
 from agalign.products.run.flight_map import utm_wkt
-from agalign.products.sidecar.file import read_sidecar, write_sidecar
 from agalign.values import geometry, lens
 from agalign.values.files import scratch_file
 from agalign.values.output_folder import locked
@@ -181,12 +180,6 @@ def test_the_command_writes_the_same_and_states_the_misfit(
         assert (tmp_path / name).read_bytes() == written.path.with_name(name).read_bytes(), name
 
 
-def with_another_band(out: Path) -> None:
-    sidecar = read_sidecar(out / "0000SET" / "IMG_0001.json")
-    bands = [b.model_copy(update={"band": "Blue"}) if b.band == "Red" else b for b in sidecar.bands]
-    write_sidecar(out / "0000SET" / "IMG_0001.json", sidecar.model_copy(update={"bands": bands}))
-
-
 def with_changed_entry(part: str = "properties", **changes: Any) -> Callable[[Path], None]:
     """A change of the last capture in the flight map."""
 
@@ -214,7 +207,6 @@ NONE_PLACED = "because flight.geojson has no footprints; they need position, alt
         in_full_run(with_changed_entry("geometry", coordinates=[[[1e308, 0]] * 5]), (), 3, NO_FOOTPRINT),
         (with_changed_entry(accuracy_m=math.nan), (), 1, NONE_PLACED),
         (lambda out: (out / "flight.geojson").unlink(), (), 1, NONE_PLACED),
-        in_full_run(with_another_band, (), 3, "IMG_0001: left out: it has bands Green (560 nm), Blue (668 nm), NIR"),
         (None, ("--gsd", "0.0001"), 2, "pixels, which is too many; increase --gsd"),
         (None, ("-i", "nonsense"), 2, "unknown index 'nonsense'"),
         (None, ("-o", "0000SET/IMG_0001.tif"), 2, "give the mosaic a new file that ends in .tif"),
