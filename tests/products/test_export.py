@@ -91,20 +91,18 @@ def test_matrices_for_opencv_are_between_raw_pixels(run: Path, tmp_path: Path) -
 
 
 def test_captures_that_cannot_be_exported_are_one_line(run: Path, tmp_path: Path) -> None:
-    with pytest.raises(agalign.InputError, match="give the output folder of a run"):
-        export(tmp_path, tmp_path / "to", "odm")
     (tmp_path / "full").mkdir()
     (tmp_path / "full" / "x").touch()
-    with pytest.raises(agalign.OutputError, match="is not empty"):
-        export(run, tmp_path / "full", "odm")
-    with pytest.raises(agalign.InputError, match=r"IMG_0001_1\.tif: the image is not there; .* --source"):
-        export(run, tmp_path / "to", "micasense", source=tmp_path)
-    path = find_sidecars(shutil.copytree(run, tmp_path / "changed"))[0]
-    output = read_json(path)["output"] | {"band_files": []}
-    for status, error, message in (
-        ("ok", agalign.ConfigurationError, "--layout bands or both"),
-        ("degraded", agalign.InputError, "no capture to export .*: its status is degraded"),
+    degraded, without_files = (Path(shutil.copytree(run, tmp_path / name)) for name in ("degraded", "without files"))
+    for out, status in ((degraded, "degraded"), (without_files, "ok")):
+        path = find_sidecars(out)[0]
+        change(path, output=read_json(path)["output"] | {"band_files": []}, status=status)
+    for out, target, program, error, message in (
+        (tmp_path / "full", "to", "odm", agalign.InputError, "give the output folder of a run"),
+        (run, "full", "odm", agalign.OutputError, "is not empty"),
+        (run, "to", "micasense", agalign.InputError, r"IMG_0001_1\.tif: the image is not there; .* --source"),
+        (without_files, "to", "pix4d", agalign.ConfigurationError, "--layout bands or both"),
+        (degraded, "to", "pix4d", agalign.InputError, "no capture to export .*: its status is degraded"),
     ):
-        change(path, output=output, status=status)
         with pytest.raises(error, match=message):
-            export(tmp_path / "changed", tmp_path / "to", "pix4d")
+            export(out, tmp_path / target, program, source=tmp_path)

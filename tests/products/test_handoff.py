@@ -17,7 +17,6 @@ from agalign.products.sidecar.file import find_sidecars, read_sidecar
 from agalign.synthetic.cameras import CameraSpec
 from agalign.values import geometry
 from agalign.values.capture import Band, Radiometry
-from agalign.values.choices import ExportProgram
 from agalign.values.image import OutputGrid
 from agalign.values.mapping import PixelMapping
 
@@ -30,54 +29,26 @@ IRRADIANCE = 0.8
 """Of the synthetic flight, W / m^2 / nm."""
 
 
-def exported(
-    shared: Shared, out: Path, program: ExportProgram = "odm", camera: str = "RedEdge", **write: object
-) -> list[OdmPhoto]:
-    """The files of an export of one capture, the reference first."""
+def exported(shared: Shared, out: Path, camera: str = "RedEdge", **write: object) -> list[OdmPhoto]:
+    """The files of an export of one capture."""
     agalign.align_folder(capture_by(camera, shared), out / "out", settings=seeded(layout="bands", **write))
     for path in find_sidecars(out / "out"):
         path.write_text(path.read_text().replace('"degraded"', '"ok"'))
-    report = export(out / "out", out / "export", program)
-    return [OdmPhoto(path) for path in report.files]
-
-
-def option(out: Path) -> str:
-    """The value of --radiometric-calibration that the export recommends."""
-    return (out / "export" / "README.txt").read_text().partition("--radiometric-calibration ")[2].split()[0]
+    return [OdmPhoto(path) for path in export(out / "out", out / "export", "odm").files]
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["RedEdge", "M3M", *map(in_full_run, ("M3M calibrated", "6X"))])
-def test_bands_are_one_camera_and_one_capture(name: str, shared: Shared, tmp_path: Path) -> None:
-    photos = exported(shared, tmp_path, camera=name)
-    assert len(photos) >= 4
-    assert len({p.camera_id for p in photos}) == 1
-    assert len({p.capture_uuid for p in photos}) == 1
-    assert len({p.band_name for p in photos}) == len(photos)
-    assert len({len(p.vignetting[1]) for p in photos}) == 1
-    with_sun = option(tmp_path) == "camera+sun"
-    assert with_sun == all(p.horizontal_irradiance is not None for p in photos) == (name == "RedEdge")
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("program", ["odm", *map(in_full_run, ("metashape", "pix4d"))])
-def test_its_reflectance_is_that_of_this_program(program: ExportProgram, shared: Shared, tmp_path: Path) -> None:
+@pytest.mark.parametrize("undistort", [False, in_full_run(True)])
+def test_its_reflectance_is_that_of_this_program(undistort: bool, shared: Shared, tmp_path: Path) -> None:
     """Vignetting on the aligned grid, black level, exposure, gain, calibration and irradiance."""
-    photos = exported(shared, tmp_path, program)
-    expected = exported(shared, tmp_path / "by agalign", program, radiometry="sun")
+    photos = exported(shared, tmp_path, undistort=undistort)
+    expected = exported(shared, tmp_path / "by agalign", undistort=undistort, radiometry="sun")
     check_reflectance(photos, expected)
     assert all(p.vignetting[1] for p in photos)
     assert not any(p.vignetting[1] or p.xmp("Camera:HorizontalIrradiance") for p in expected)
     (sidecar,) = map(read_sidecar, find_sidecars(tmp_path / "by agalign" / "out"))
     light = [(band.irradiance, band.reflectance_per_radiance) for band in sidecar.output.illumination]
     assert light == [pytest.approx((IRRADIANCE, math.pi / IRRADIANCE))] * len(photos)
-
-
-@pytest.mark.full
-def test_vignetting_follows_pixels_without_distortion(shared: Shared, tmp_path: Path) -> None:
-    photos = exported(shared, tmp_path, undistort=True)
-    assert all(p.vignetting[1] for p in photos)
-    check_reflectance(photos, exported(shared, tmp_path / "r", undistort=True, radiometry="sun"))
 
 
 @pytest.mark.slow
@@ -119,6 +90,9 @@ def test_a_disturbed_centre_does_not_matter(bump_px: float) -> None:
     at_px = 250.0
     falloff = np.polynomial.polynomial.polyval(at_px, (1.0, *result.coefficients))
     assert falloff == pytest.approx(1 - 4e-6 * (1.01 * at_px) ** 2, abs=0.002)
+    # Large relief is no polynomial.
+    noise_px = np.random.default_rng(0).normal(0, 15, OUTPUT_PX.shape)
+    assert vignetting_on_grid(VIGNETTING, OUTPUT_PX, OUTPUT_PX + noise_px).error > 0.01
 
 
 def test_bands_of_one_file_have_each_their_own_vignetting(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -127,12 +101,6 @@ def test_bands_of_one_file_have_each_their_own_vignetting(monkeypatch: pytest.Mo
     layers = [Layer(b, PixelMapping(geometry.translation(dx, 0))) for b, dx in zip(bands, (3.0, -5.0), strict=True)]
     result = aligned_files._vignettings(layers, OutputGrid(0, 0, 480, 360))
     assert [result[name].centre_px[0] for name in "ab"] == pytest.approx([243 - 3, 243 + 5])
-
-
-def test_large_relief_is_no_polynomial() -> None:
-    rng = np.random.default_rng(0)
-    positions_px = OUTPUT_PX + rng.normal(0, 15, OUTPUT_PX.shape)
-    assert vignetting_on_grid(VIGNETTING, OUTPUT_PX, positions_px).error > 0.01
 
 
 # ---- tags of aligned bands
@@ -147,29 +115,24 @@ TAGS = [
 DJI = "CalibratedHMatrix DewarpData RelativeOpticalCenterX RelativeOpticalCenterY CalibratedOpticalCenterX DewarpFlag"
 PIX4D = "PrincipalPoint", "PerspectiveDistortion", "PerspectiveFocalLength"
 SHARED_TAGS = [*(f"Camera:{name}" for name in PIX4D), *(f"@drone-dji:{name}" for name in DJI.split())]
-Aligned = tuple[CameraSpec, Path, Path]
-
-
-def align(images: Path, out: Path, **write: object) -> None:
-    settings, options = seeded(layout="bands", **write), agalign.DiscoverOptions(with_rgb=True)
-    (report,) = agalign.align_folder(images, out, settings=settings, options=options)
-    assert report.error is None
+Aligned = tuple[CameraSpec, list[OdmPhoto], list[OdmPhoto], Path]
 
 
 @pytest.fixture(params=list(CAMERAS))
 def aligned(request: pytest.FixtureRequest, shared: Shared) -> Aligned:
-    """(camera, its files, the aligned ones)."""
-    images = capture_by(request.param, shared)
-    return CAMERAS[request.param], images, shared(f"handoff {request.param}", lambda out: align(images, out))
+    """(camera, its files, the aligned ones, the folder of their export)."""
+    name = request.param
+    out = shared(f"handoff {name}", lambda folder: exported(shared, folder, camera=name))
+    before, after = (
+        [OdmPhoto(path) for path in sorted(folder.rglob("*")) if path.suffix.lower() == ".tif"]
+        for folder in (capture_by(name, shared), out / "out")
+    )
+    return CAMERAS[name], before, after, out / "export"
 
 
-def bands_of(folder: Path) -> list[Path]:
-    return sorted(p for p in folder.rglob("*") if p.suffix.lower() == ".tif" and not p.name.endswith("_D.tif"))
-
-
-def xmp_of(path: Path) -> dict[str, Any]:
+def xmp_of(photo: OdmPhoto) -> dict[str, Any]:
     """Keys with the prefixes that cameras write, attributes with an @."""
-    return {name: value for part in OdmPhoto(path).descriptions for name, value in part.items()}
+    return {name: value for part in photo.descriptions for name, value in part.items()}
 
 
 def numbers(value: Any) -> list[float]:
@@ -180,68 +143,62 @@ def numbers(value: Any) -> list[float]:
 
 
 @pytest.mark.slow
+def test_bands_are_one_camera_and_one_capture(aligned: Aligned) -> None:
+    """No angles between bands, one principal point, one lens, one homography."""
+    camera, _, photos, export_folder = aligned
+    assert len(photos) == sum(b.sees == "light" for b in camera.bands) > 1
+    assert len({p.camera_id for p in photos}) == len({p.capture_uuid for p in photos}) == 1
+    assert len({p.band_name for p in photos}) == len(photos)
+    assert len({len(p.vignetting[1]) for p in photos}) == 1
+    packets = [xmp_of(p) for p in photos]
+    for tag in SHARED_TAGS:
+        assert len({str(xmp.get(tag)) for xmp in packets}) == 1, tag
+    is_micasense = camera.maker == "MicaSense"
+    for xmp in packets if is_micasense else []:
+        assert numbers(xmp["Camera:RigRelatives"]) == numbers(xmp["Camera:RigTranslations"]) == [0, 0, 0]
+    text = (export_folder / "README.txt").read_text()
+    assert ("--radiometric-calibration camera+sun" in text) == is_micasense
+    assert all((p.horizontal_irradiance is not None) == is_micasense for p in photos)
+
+
+@pytest.mark.slow
 def test_bands_place_time_and_camera_are_as_before(aligned: Aligned) -> None:
-    camera, folder, out = aligned
-    before, after = ({p.name: xmp_of(p) for p in bands_of(f)} for f in (folder, out))
-    assert set(before) == set(after)
-    assert len(after) == sum(b.sees == "light" for b in camera.bands)
-    captures = {xmp.get(tag) for xmp in after.values() for tag in CAPTURE_TAGS} - {None}
-    assert len(captures) == 1
-    for name, xmp in after.items():
+    _, before, after, _ = aligned
+    for source, photo in zip(before, after, strict=True):
+        assert photo.path.name == source.path.name
+        old, new = xmp_of(source), xmp_of(photo)
         for tag in ("Camera:BandName", "Camera:CentralWavelength", *CAPTURE_TAGS):
-            assert xmp.get(tag) == before[name].get(tag)
-        assert xmp["Camera:BandName"]
-    assert len({xmp["Camera:BandName"] for xmp in after.values()}) == len(after)
-    for source, path in zip(bands_of(folder), bands_of(out), strict=True):
-        exif_before, exif_after = OdmPhoto(source).exif, OdmPhoto(path).exif
+            assert new.get(tag) == old.get(tag)
+        assert new["Camera:BandName"]
         for tag in TAGS:
-            assert str(exif_after.get(tag)) == str(exif_before.get(tag)), tag
-        with Image.open(path) as image:
-            assert image.getexif()[271] == str(exif_before["Image Make"])
+            assert str(photo.exif.get(tag)) == str(source.exif.get(tag)), tag
+        with Image.open(photo.path) as image:
+            assert image.getexif()[271] == str(source.exif["Image Make"])
             assert image.getexif().get_ifd(0x8825)[1] == "N"
 
 
 @pytest.mark.slow
-def test_tags_of_aligned_bands_describe_one_camera(aligned: Aligned) -> None:
-    """All bands are one camera's now: no angles between them, one principal point, one lens, one homography."""
-    camera, _, out = aligned
-    packets = [xmp_of(p) for p in bands_of(out)]
-    assert len(packets) > 1
-    if camera.maker == "MicaSense":
-        for xmp in packets:
-            assert numbers(xmp["Camera:RigRelatives"]) == [0, 0, 0]
-            assert numbers(xmp["Camera:RigTranslations"]) == [0, 0, 0]
-    for tag in SHARED_TAGS:
-        assert len({str(xmp.get(tag)) for xmp in packets}) == 1, tag
-
-
-@pytest.mark.slow
 def test_the_principal_point_is_on_the_pixel_that_it_was_on(aligned: Aligned) -> None:
-    camera, folder, out = aligned
-    (sidecar,) = find_sidecars(out)
-    data = read_json(sidecar)
-    x0, y0, *_ = data["output"]["crop"]
-    reference = data["reference"]["file"]
-    before, after = (next(xmp_of(p) for p in bands_of(f) if p.name == reference) for f in (folder, out))
+    camera, before, after, export_folder = aligned
+    data = read_json(find_sidecars(export_folder.parent / "out")[0])
+    here, there = (next(p for p in ps if p.path.name == data["reference"]["file"]) for ps in (before, after))
+    old, new = xmp_of(here), xmp_of(there)
     if camera.maker == "MicaSense":
-        (path,) = (p for p in bands_of(out) if p.name == reference)
-        density = OdmPhoto(path).exif_number("EXIF FocalPlaneXResolution")
-        here, there = (numbers(x["Camera:PrincipalPoint"]) for x in (before, after))
-        moved = [density * (a - b) for a, b in zip(here, there, strict=True)]
+        density = there.exif_number("EXIF FocalPlaneXResolution")
+        points = zip(numbers(old["Camera:PrincipalPoint"]), numbers(new["Camera:PrincipalPoint"]), strict=True)
+        moved = [density * (a - b) for a, b in points]
     elif camera.maker == "DJI":
-        names = "@drone-dji:CalibratedOpticalCenterX", "@drone-dji:CalibratedOpticalCenterY"
-        moved = [float(before[n]) - float(after[n]) for n in names]
+        names = (f"@drone-dji:CalibratedOpticalCenter{axis}" for axis in "XY")
+        moved = [float(old[n]) - float(new[n]) for n in names]
     else:
         pytest.skip("its tags have no principal point")
-    assert moved == pytest.approx([x0, y0], abs=0.01)
+    assert moved == pytest.approx(data["output"]["crop"][:2], abs=0.01)
 
 
 @pytest.mark.slow
 def test_undistorted_files_have_tags_without_distortion(shared: Shared, tmp_path: Path) -> None:
-    align(capture_by("M3M calibrated", shared), tmp_path, undistort=True)
-    paths = bands_of(tmp_path)
-    assert len(paths) == 4
-    for path in paths:
-        xmp = xmp_of(path)
+    photos = exported(shared, tmp_path, camera="M3M calibrated", undistort=True)
+    assert len(photos) == 4
+    for xmp in map(xmp_of, photos):
         assert xmp["@drone-dji:DewarpFlag"] == "1"
         assert numbers(xmp["@drone-dji:DewarpData"].partition(";")[2])[4:] == [0] * 5

@@ -13,15 +13,7 @@ from synthetic_flights.aligned import make_aligned
 
 from agalign.batch.index_run import index_tasks, run_indices
 from agalign.errors import ConfigurationError, InputError
-from agalign.products.indices.formulas import (
-    INDICES,
-    bands_for,
-    compute,
-    evaluate,
-    index_named,
-    index_of_formula,
-    symbols_of,
-)
+from agalign.products.indices.formulas import INDICES, bands_for, compute, evaluate, index_named, index_of_formula
 from agalign.products.indices.rasters import IndexReport, IndexStatistics, read_table, update_table, write_rasters
 from agalign.products.report.pages import write_pages
 from agalign.products.run.captures import RAW, AlignedBand
@@ -36,11 +28,20 @@ sqrt(N, R)\nopen(N)\nN < R\nf'{N}'\n1e40*N\nN and R"""
 
 
 @pytest.mark.parametrize(
-    "text", [*NO_FORMULAS.splitlines(), "", "N\0", "\ud800", "(" * 200, "N" * 400, "-" * 290 + "("]
+    ("text", "problem"),
+    [
+        *((text, "formula") for text in NO_FORMULAS.splitlines()),
+        *((text, "formula") for text in ("", "N\0", "\ud800", "(" * 200, "N" * 400, "-" * 290 + "(")),
+        ("Q+N", "uses Q; the bands are B, G, R, RE and N"),
+        ("1+1", "uses no band"),
+        ("ndvi=N/R", "'ndvi' cannot name"),
+        ("../x=N/R", "'../x' cannot name"),
+        ("N+", "is not a formula"),
+    ],
 )
-def test_a_formula_is_arithmetic_and_nothing_else(text: str) -> None:
-    with pytest.raises(ConfigurationError):
-        symbols_of(text)
+def test_a_formula_is_arithmetic_of_bands_and_nothing_else(text: str, problem: str) -> None:
+    with pytest.raises(ConfigurationError, match=problem):
+        index_of_formula(text)
 
 
 ARITHMETIC = st.recursive(
@@ -75,21 +76,6 @@ def test_a_formula_has_the_value_of_its_arithmetic() -> None:
     assert np.isinf(evaluate("9**9**9 + 0*N", {"N": n})).all(), "and takes no time"
     golden_ratio = evaluate("1/(1+" * 40 + "N" + ")" * 40, {"N": n})
     np.testing.assert_allclose(golden_ratio[0, ::2], (5**0.5 - 1) / 2, rtol=1e-6)
-
-
-@pytest.mark.parametrize(
-    ("text", "problem"),
-    [
-        ("Q+N", "uses Q; the bands are B, G, R, RE and N"),
-        ("1+1", "uses no band"),
-        ("ndvi=N/R", "'ndvi' cannot name"),
-        ("../x=N/R", "'../x' cannot name"),
-        ("N+", "is not a formula"),
-    ],
-)
-def test_a_formula_that_is_none_is_a_usage_error(text: str, problem: str) -> None:
-    with pytest.raises(ConfigurationError, match=problem):
-        index_of_formula(text)
 
 
 def test_the_catalogue_gives_names_and_constants() -> None:
@@ -263,14 +249,18 @@ NM = (444.0, 475.0, 560.0, 650.0, 668.0, 705.0, 717.0, 842.0)
 
 
 @pytest.mark.parametrize(
-    ("index", "expected"), [("ndvi", "NIR, Red"), ("ndre", "NIR, Red edge"), ("evi", "NIR, Red, Blue")]
+    ("index", "names", "wavelengths_nm", "expected"),
+    [
+        ("ndvi", NAMES, NM, "NIR, Red"),
+        ("ndre", NAMES, NM, "NIR, Red edge"),
+        ("evi", NAMES, NM, "NIR, Red, Blue"),
+        ("ndre", ("red", "NIR", "RedEdge"), (None,) * 3, "NIR, RedEdge"),
+    ],
 )
-def test_bands_are_those_nearest_to_the_nominal_wavelength(index: str, expected: str) -> None:
-    assert ", ".join(NAMES[i] for i in bands_for(INDICES[index], NAMES, NM)) == expected
-
-
-def test_without_wavelengths_the_names_count() -> None:
-    assert bands_for(INDICES["ndre"], ("red", "NIR", "RedEdge"), (None,) * 3) == [1, 2]
+def test_bands_are_those_nearest_to_the_nominal_wavelength_or_with_the_name(
+    index: str, names: tuple[str, ...], wavelengths_nm: tuple[float | None, ...], expected: str
+) -> None:
+    assert ", ".join(names[i] for i in bands_for(INDICES[index], names, wavelengths_nm)) == expected
 
 
 def test_a_missing_band_is_named() -> None:

@@ -9,9 +9,8 @@ import numpy as np
 import pytest
 import rasterio
 
-from agalign.products.report.charts import CHART_HEIGHT
+from agalign.products.report.charts import CHART_HEIGHT, CaptureLight, light_charts, radiometric_check
 from agalign.products.report.drawing import LEVEL_BLOCKS, block_means, read_reduced_bands
-from agalign.products.report.light import CaptureLight, light_charts, radiometric_check
 from agalign.products.sidecar.file import read_sidecar
 from agalign.products.sidecar.schema import Sidecar
 from agalign.values.capture import Band, Capture
@@ -46,7 +45,7 @@ def test_irradiance_and_panel_factors_are_drawn_in_the_order_of_time() -> None:
     assert by_panel.title.startswith("Light by panels")
     assert heights(by_panel.lines[0].points) == [0.0, 0.0, 1.0]
     # No chart without a panel, and no chart of only two captures.
-    alone = [CaptureLight.of("a", Path("a.json"), lit(m, 1.0, 3.0, None)) for m in range(3)]
+    alone = [CaptureLight.of(f"{m}", Path("a.json"), lit(m, 1.0, 3.0, None)) for m in range(3)]
     assert len(light_charts(alone)) == 1
     assert light_charts(alone[:2]) == []
     assert light_charts([CaptureLight.of("a", Path("a.json"), example())] * 3) == []

@@ -12,8 +12,6 @@ import numpy as np
 import pytest
 
 import agalign
-from agalign.flight.rig_file import read_rig
-from agalign.products.report import pages
 from agalign.products.report.charts import CHART_HEIGHT, drifts_of, rig_views
 from agalign.products.report.drawing import ReducedBands
 from agalign.products.report.facts import PairTotals
@@ -21,7 +19,7 @@ from agalign.products.report.pages import pages_exist, write_pages
 from agalign.products.report.preview import ReliefView, preview_bytes, write_preview
 from agalign.products.sidecar.schema import CaptureResult
 
-from ..conftest import raising, read_json, save_known_model, textured_image
+from ..conftest import read_json, save_known_model, textured_image
 from .conftest import change, table_in
 from .test_sidecar import NIR, example
 
@@ -72,7 +70,7 @@ def headline(out: Path) -> str:
 
 
 @pytest.mark.slow
-def test_the_headline_counts_what_was_to_be_aligned(out: Path) -> None:
+def test_headline_and_summary_count_what_was_to_be_aligned(out: Path) -> None:
     assert headline(out).startswith("Every band of every capture is aligned. The median residual is")
     record, sidecar = out / "agalign-run.json", out / "0000SET" / "000" / "IMG_0002.json"
     change(record, problems=[{"of": "IMG_0003_1.tif", "problem": "cannot be read"}])
@@ -85,16 +83,12 @@ def test_the_headline_counts_what_was_to_be_aligned(out: Path) -> None:
     change(record, state="finished", captures={"found": 2, "done": 2})
     change(sidecar, status="degraded", missing_bands=["Thermal", "Pan"])
     assert headline(out).startswith("8 of 10 band pairs are aligned, 2 are missing. The median")
-
-
-@pytest.mark.slow
-def test_missing_bands_and_references_are_in_the_summary(out: Path) -> None:
-    change(out / "0000SET" / "000" / "IMG_0002.json", status="degraded", missing_bands=["Thermal"])
-    write_pages(out, pytest.fail)
     rows = table_in(out / "summary.csv")
-    assert [r["status"] for r in rows] == ["aligned"] * 8 + ["missing"]
+    assert [r["status"] for r in rows] == ["aligned"] * 8 + ["missing"] * 2
     assert {r["reference"] for r in rows} == {"Green"}
-    assert (rows[-1]["folder"], rows[-1]["capture"], rows[-1]["band"]) == ("0000SET/000", "IMG_0002", "Thermal")
+    assert [(r["folder"], r["capture"], r["band"]) for r in rows[8:]] == [
+        ("0000SET/000", "IMG_0002", name) for name in ("Thermal", "Pan")
+    ]
     assert "other captures of this camera have" in rows[-1]["reason"]
 
 
@@ -133,36 +127,28 @@ def test_a_page_is_small_and_loads_nothing(aligned_flight: Path, tmp_path: Path)
 
 
 @pytest.mark.slow
-def test_pages_stand_until_a_sidecar_is_newer_or_was_unreadable(out: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_pages_stand_until_a_sidecar_is_newer_or_was_unreadable(out: Path) -> None:
     assert pages_exist(out)
     path = out / "0000SET" / "000" / "IMG_0001.json"
-    path.write_bytes(path.read_bytes())
-    assert not pages_exist(out)
-    write_pages(out, pytest.fail)
-    assert pages_exist(out)
+    contents = path.read_bytes()
     problems: list[str] = []
-    with monkeypatch.context() as patched:
-        patched.setattr(pages, "read_sidecar", raising(agalign.SidecarError("IMG_0001.json: cannot be read")))
+    for written, is_readable in ((contents, True), (b'{"schema": "agalign/', False), (contents, True)):
+        path.write_bytes(written)
+        assert not pages_exist(out)
         write_pages(out, problems.append)
-    assert "IMG_0001.json: cannot be read" in problems
-    assert not pages_exist(out)
-    write_pages(out, pytest.fail)
-    assert pages_exist(out)
+        assert pages_exist(out) == is_readable
+    (problem,) = problems
+    assert "IMG_0001.json: not valid JSON" in problem
 
 
-def test_the_rig_is_read_without_its_network(tmp_path: Path) -> None:
-    path = tmp_path / "models" / "a.safetensors"
-    save_known_model(path)
-    camera, rig = read_rig(path)
-    assert camera == "Camera 7"
-    (view,) = rig_views(tmp_path, pytest.fail)
-    assert [b["band"] for b in view["bands"]] == list(rig.mean) == ["NIR", "[Red]"]
-    path.write_bytes(path.read_bytes()[:-500])
-    with pytest.raises(agalign.InputError, match=r"a\.safetensors: its rig cannot be read"):
-        read_rig(path)
-    said: list[str] = []
-    assert rig_views(tmp_path, said.append) == []
-    assert len(said) == 1
+def test_rigs_are_drawn_of_models_that_can_be_read(tmp_path: Path) -> None:
+    save_known_model(tmp_path / "models" / "a.safetensors")
+    (tmp_path / "models" / "b.safetensors").write_bytes(b"")
+    problems: list[str] = []
+    (view,) = rig_views(tmp_path, problems.append)
+    assert [b["band"] for b in view["bands"]] == ["NIR", "[Red]"]
+    (problem,) = problems
+    assert "b.safetensors" in problem
 
 
 def capture_data(label: str, offsets: dict[str, tuple[float, float]]) -> dict[str, object]:
@@ -207,12 +193,16 @@ def views() -> ReducedBands:
     return ReducedBands({"Green": grey(1), "NIR": grey(2)}, {"Green": grey(3)}, (640, 480))
 
 
-def test_every_picture_is_at_the_place_in_the_sidecar(views: ReducedBands, tmp_path: Path) -> None:
-    errors = {"NIR": np.full((4, 5), 0.25, np.float32)}
-    part = write_preview(views, ["Green", "NIR"], errors, tmp_path / "a.preview.jpg", preview_bytes(1))
+@pytest.mark.parametrize("has_errors", [False, True])
+def test_every_picture_is_at_the_place_in_the_sidecar(views: ReducedBands, tmp_path: Path, has_errors: bool) -> None:
+    parallax_px = np.linspace(-3, 7, 320, dtype=np.float32)[None].repeat(240, axis=0)
+    parallax_px[:2, :2] = 1000.0  # wrong pixels take no contrast
+    errors = {"NIR": np.full((4, 5), 0.25, np.float32)} if has_errors else {}
+    relief = ReliefView(parallax_px, (1.23456, 2.5))
+    part = write_preview(views, ["Green", "NIR"], errors, tmp_path / "a.preview.jpg", preview_bytes(1), relief)
     sheet = cv2.imread(str(tmp_path / part.file), cv2.IMREAD_GRAYSCALE)
     (w, h), (dw, dh) = part.tile_px, part.detail_px
-    assert sheet.shape == (3 * h + 2 * dh, 2 * w)
+    assert sheet.shape == ((3 + has_errors) * h + 2 * dh, 2 * w)
 
     def like(result: np.ndarray, image: np.ndarray) -> float:
         there = cv2.resize(image, result.shape[::-1], interpolation=cv2.INTER_AREA)
@@ -223,27 +213,16 @@ def test_every_picture_is_at_the_place_in_the_sidecar(views: ReducedBands, tmp_p
     assert like(sheet[h : 2 * h, :w], views.after["Green"]) > 0.98
     assert sheet[h : 2 * h, w:].max() < 4, "what was not written is black"
     x, y = round(part.detail[0] * 640), round(part.detail[1] * 480)
-    assert like(sheet[2 * h : 2 * h + dh, dw : 2 * dw], views.before["NIR"][y : y + dh, x : x + dw]) > 0.98
-    assert like(sheet[2 * h + dh : 2 * h + 2 * dh, :dw], views.after["Green"][y : y + dh, x : x + dw]) > 0.98
-    assert np.median(sheet[2 * h + 2 * dh :, w:]) == pytest.approx(255 * 0.25 / part.error_full_px, abs=3)
-
-
-@pytest.mark.parametrize("has_errors", [False, True])
-def test_the_relief_is_the_last_row(views: ReducedBands, tmp_path: Path, has_errors: bool) -> None:
-    parallax_px = np.linspace(-3, 7, 320, dtype=np.float32)[None].repeat(240, axis=0)
-    parallax_px[:2, :2] = 1000.0  # wrong pixels take no contrast
-    errors = {"NIR": np.full((4, 5), 0.25, np.float32)} if has_errors else {}
-    relief = ReliefView(parallax_px, (1.23456, 2.5))
-    part = write_preview(views, ["Green", "NIR"], errors, tmp_path / "a.preview.jpg", preview_bytes(1), relief)
+    detail, below = sheet[2 * h : 2 * h + 2 * dh], sheet[2 * h + 2 * dh :]
+    assert like(detail[:dh, dw : 2 * dw], views.before["NIR"][y : y + dh, x : x + dw]) > 0.98
+    assert like(detail[dh:, :dw], views.after["Green"][y : y + dh, x : x + dw]) > 0.98
+    if has_errors:
+        assert np.median(below[:h, w:]) == pytest.approx(255 * 0.25 / part.error_full_px, abs=3)
     low, high = part.relief.parallax_px
     assert (low, high) == pytest.approx((-2.9, 6.9), abs=0.1)
     assert part.relief.range_m == (1.235, 2.5)
-    sheet = cv2.imread(str(tmp_path / part.file), cv2.IMREAD_GRAYSCALE)
-    (w, h), (_, dh) = part.tile_px, part.detail_px
-    row = sheet[(3 if has_errors else 2) * h + 2 * dh :]
-    assert row.shape == (h, 2 * w)
-    assert row[:, w:].max() < 4
-    shown = low + row[h // 2, :w].astype(float) / 255 * (high - low)
+    assert below[-h:, w:].max() < 4
+    shown = low + below[-h // 2, :w].astype(float) / 255 * (high - low)
     np.testing.assert_allclose(shown, np.linspace(-3, 7, w).clip(low, high), atol=0.25)
 
 
@@ -251,16 +230,14 @@ def test_the_relief_is_the_last_row(views: ReducedBands, tmp_path: Path, has_err
 def test_all_previews_of_a_flight_have_a_limit(views: ReducedBands, tmp_path: Path, captures: int) -> None:
     path = tmp_path / "a.preview.jpg"
     write_preview(views, ["Green", "NIR"], {}, path, preview_bytes(captures))
-    assert path.stat().st_size <= preview_bytes(captures)
-    assert captures * preview_bytes(captures) <= 44_000_000
+    assert path.stat().st_size <= preview_bytes(captures) <= 44_000_000 / captures
 
 
 def test_images_smaller_than_a_tile_are_shown_as_they_are(tmp_path: Path) -> None:
     tiny = {"Green": grey(1, 60, 41), "NIR": grey(2, 60, 41)}
     part = write_preview(ReducedBands(tiny, tiny, (60, 41)), ["Green", "NIR"], {}, tmp_path / "a.preview.jpg", 10_000)
     assert part.tile_px == (56, 40)
-    assert part.detail[2] <= 1
-    assert part.detail[3] <= 1
+    assert max(part.detail[2:]) <= 1
 
 
 # ---- failed bands, grouped by their cause
@@ -277,9 +254,8 @@ def capture(*bands: tuple[str, str, str | None], missing: tuple[str, ...] = (), 
 
 def test_bands_are_grouped_by_cause_and_status_most_severe_first() -> None:
     result = PairTotals()
-    result.add(
-        "one", capture(("Green", "reference", None), ("Blue", "aligned", None), ("NIR", "predicted", "retrieval"))
-    )
+    bands = ("Green", "reference", None), ("Blue", "aligned", None), ("NIR", "predicted", "retrieval")
+    result.add("one", capture(*bands))
     result.add("two", capture(("NIR", "predicted", "few_windows"), ("Red", "failed", "unreadable"), missing=("X",)))
     result.add("three", capture(("NIR", "seed_only", "repeats")))
     result.add("four", capture(("NIR", "seed_only", None)))
@@ -292,6 +268,13 @@ def test_bands_are_grouped_by_cause_and_status_most_severe_first() -> None:
         "indices use those with a standard error (prediction.std_px) within --accept-predicted"
     )
     assert "card" in groups[0].advice
+    assert result.statuses == {"aligned": 1, "predicted": 2, "failed": 1, "missing": 1, "seed_only": 2}
+    assert {name: dict(band.statuses) for name, band in result.bands.items()} == {
+        "Blue": {"aligned": 1},
+        "NIR": {"predicted": 2, "seed_only": 2},
+        "Red": {"failed": 1},
+        "X": {"missing": 1},
+    }
 
 
 def with_reference(name: str, missing: tuple[str, ...] = (), flight_id: str = "") -> CaptureResult:
@@ -325,14 +308,3 @@ def test_captures_with_another_reference_than_most_of_their_flight_are_named(ref
             groups[0].bands[0].reason
             == f"on the grid of {names[odd[0]]}; most captures of the flight are on that of {usual}"
         )
-
-
-def test_missing_bands_count_among_those_to_align() -> None:
-    result = PairTotals()
-    result.add("one", capture(("Green", "reference", None), ("NIR", "aligned", None), missing=("Red",)))
-    result.add("two", capture(("Green", "reference", None), ("NIR", "failed", "unreadable"), ("Red", "aligned", None)))
-    assert result.statuses == {"aligned": 2, "missing": 1, "failed": 1}
-    assert {name: dict(band.statuses) for name, band in result.bands.items()} == {
-        "NIR": {"aligned": 1, "failed": 1},
-        "Red": {"missing": 1, "aligned": 1},
-    }

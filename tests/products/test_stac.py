@@ -143,12 +143,6 @@ def test_odc_stac_opens_a_capture_by_its_common_names(tmp_path: Path) -> None:
             np.testing.assert_array_equal(loaded[name].values[0], dataset.read(index))
 
 
-def test_an_item_of_a_capture_without_a_known_height_is_a_point(flight: Path, tmp_path: Path) -> None:
-    agalign.align_folder(flight, tmp_path, settings=seeded(stac=True))
-    item = pystac.Item.from_file(str(tmp_path / "0000SET" / "000" / "IMG_0001.stac.json"))
-    assert item.geometry == {"type": "Point", "coordinates": pytest.approx([5.0, 52.0])}
-
-
 def test_collections_are_the_flights_that_share_a_network(tmp_path: Path) -> None:
     """Two units of one model on one day are two flights, with or without a flight id."""
 

@@ -8,7 +8,7 @@ import pytest
 from scipy.interpolate import CloughTocher2DInterpolator
 
 import agalign
-from agalign.products.exports.tie_points import TiePoint, _geojson
+from agalign.products.exports.tie_points import _geojson
 from agalign.synthetic.flight import make_flight
 from agalign.values.capture import Georeference
 
@@ -72,7 +72,7 @@ def test_tie_points_of_aligned_bands_are_accurate(tmp_path: Path) -> None:
 
 def test_points_of_a_georeferenced_image_are_in_degrees() -> None:
     transform = np.array([[10.0, 0.0, 500_000.0], [0.0, -10.0, 5_000_000.0], [0.0, 0.0, 1.0]])
-    point = TiePoint("NIR", "aligned", (9.5, 19.5), (9.6, 19.4), 0.14, 1.0)
+    point = ("NIR", "aligned", [9.5, 19.5, 9.6, 19.4, 0.14, 1.0])
     result = json.loads(_geojson([point], Georeference(transform, "EPSG:32633")))
     assert result["coordinates_in"] == "EPSG:4326"
     # 100 m east of the central meridian, 15 degrees east, and 200 m south of 5,000 km north.

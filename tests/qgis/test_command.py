@@ -7,7 +7,6 @@ import subprocess
 import sys
 import time
 from pathlib import Path
-from types import ModuleType
 
 import pytest
 
@@ -19,14 +18,9 @@ PLUGIN = ROOT / "qgis" / "agalign_provider"
 HAS_QGIS = shutil.which("qgis_process.bin") or shutil.which("qgis_process")
 
 
-def _load() -> ModuleType:
-    spec = importlib.util.spec_from_file_location("agalign_provider_command", PLUGIN / "command.py")
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
-
-
-command = _load()
+spec = importlib.util.spec_from_file_location("agalign_provider_command", PLUGIN / "command.py")
+command = importlib.util.module_from_spec(spec)
+spec.loader.exec_module(command)
 
 
 def script(path: Path, text: str) -> Path:

@@ -1,6 +1,5 @@
 """Aligned captures as lazily read xarray datasets, with a variable for each band."""
 
-import math
 import re
 import warnings
 from collections.abc import Sequence
@@ -14,7 +13,7 @@ from agalign.pixels.raster import without_warnings
 from agalign.products.rasters.alignment_maps import RELIEF_UNITS
 from agalign.products.run.captures import RunCapture, captures_of_run, exceptions, like_most
 from agalign.products.sidecar.file import read_sidecar
-from agalign.products.sidecar.schema import BandPart, Sidecar
+from agalign.products.sidecar.schema import BandPart
 from agalign.values.capture import CaptureTime
 
 if TYPE_CHECKING:
@@ -33,13 +32,11 @@ def open_capture(path: str | Path, *, masked: bool = True) -> "xarray.Dataset":
     length 1, larger for nearer objects) and, if the run wrote them, `confidence` and `range` (m).
     Raises SidecarError, UnreadableFileError, InputError for a folder, and ConfigurationError without xarray.
     """
-    import_xarray()
     given = Path(path)
     if given.is_dir():
         raise InputError(f"{given}: is a folder; give the sidecar of a capture, or use open_flight")
     name = re.sub(r"(?:\.stac)?\.json$|\.tiff?$", "", given.name, flags=re.IGNORECASE)
-    sidecar_path = given.with_name(f"{name}.json")
-    return _dataset(read_sidecar(sidecar_path), sidecar_path.parent, masked=masked)
+    return _dataset(given.with_name(f"{name}.json"), masked=masked)
 
 
 def open_flight(out: str | Path, *, masked: bool = True) -> "xarray.Dataset":
@@ -54,7 +51,7 @@ def open_flight(out: str | Path, *, masked: bool = True) -> "xarray.Dataset":
     """
     xr = import_xarray()
     captures = _captures_with_output(Path(out))
-    opened = [_dataset(read_sidecar(c.path), c.path.parent, masked=masked) for c in captures]
+    opened = [_dataset(c.path, masked=masked) for c in captures]
     common = [name for name in opened[0].data_vars if all(name in one for one in opened)]
     # In pixels: the map coordinates of the captures differ.
     in_pixels = [_in_pixels(one[common]) for one in opened]
@@ -64,12 +61,17 @@ def open_flight(out: str | Path, *, masked: bool = True) -> "xarray.Dataset":
     stacked.attrs = {k: opened[0].attrs[k] for k in ("camera", "reference_band")}
     for name in bands:
         del stacked[name].attrs["status"]
+    # nan for an unknown position
+    places = {
+        name: ("capture", np.array([getattr(c.result.position, name, None) for c in captures], np.float64))
+        for name in ("latitude", "longitude", "altitude_m")
+    }
     flight: xarray.Dataset = stacked.assign_coords(
         capture=[c.label for c in captures],
         time=_times(captures),
         band=bands,
         status=(("capture", "band"), status),
-        **{name: ("capture", _coordinates(captures, name)) for name in ("latitude", "longitude", "altitude_m")},
+        **places,
     )
     return flight
 
@@ -89,12 +91,6 @@ def _captures_with_output(folder: Path) -> list[RunCapture]:
     return alike
 
 
-def _coordinates(captures: Sequence[RunCapture], name: str) -> list[float]:
-    """A coordinate of the position of each capture; nan if it is unknown."""
-    values = [getattr(c.result.position, name, None) for c in captures]
-    return [math.nan if value is None else float(value) for value in values]
-
-
 def import_xarray() -> Any:
     """Import and return xarray. Raises ConfigurationError if it or a library that it needs here is not installed."""
     try:
@@ -108,8 +104,9 @@ def import_xarray() -> Any:
     return xr
 
 
-def _dataset(sidecar: Sidecar, folder: Path, *, masked: bool) -> "xarray.Dataset":
-    xr = import_xarray()
+def _dataset(path: Path, *, masked: bool) -> "xarray.Dataset":
+    """The dataset of the capture with the sidecar at `path`."""
+    xr, sidecar, folder = import_xarray(), read_sidecar(path), path.parent
     files: dict[str, xarray.DataArray] = {}
     result = {}
     for band in sidecar.bands:
@@ -117,34 +114,32 @@ def _dataset(sidecar: Sidecar, folder: Path, *, masked: bool) -> "xarray.Dataset
             continue
         name = band.place.file
         if name not in files:
-            files[name] = _opened(folder, name, masked=masked)
+            files[name] = _opened(folder / name, masked=masked)
         result[band.band] = _variable(files[name], band, band.place.band_index, name, masked=masked)
     relief = next((b.relief.file for b in sidecar.bands if b.relief is not None and b.relief.file), None)
     if relief is not None:
-        layers = _opened(folder, relief, masked=True)
+        layers = _opened(folder / relief, masked=True)
         for index, name in enumerate(np.atleast_1d(layers.attrs.get("long_name", "parallax"))):
-            result[str(name)] = layers.isel(band=index, drop=True).assign_attrs(
-                long_name=str(name), units=RELIEF_UNITS[name]
-            )
+            one = layers.isel(band=index, drop=True)
+            result[str(name)] = one.assign_attrs(long_name=str(name), units=RELIEF_UNITS[name])
     dataset: xarray.Dataset = xr.Dataset(result)
     dataset.attrs = {k: getattr(sidecar, k) for k in ("capture", "capture_id", "flight_id", "captured_at")}
     dataset.attrs |= {"camera": sidecar.camera.name, "reference_band": sidecar.reference.band}
     return dataset if dataset.rio.crs is not None else _in_pixels(dataset)
 
 
-def _opened(folder: Path, name: str, *, masked: bool) -> "xarray.DataArray":
+def _opened(path: Path, *, masked: bool) -> Any:
+    """The array of a file."""
     import rioxarray
 
-    path = folder / name
     try:
         with without_warnings():
             # Some of GDAL's other drivers open files or addresses that the contents of a file name.
             # Chunks of four blocks of the stacks along each axis: dask reads 2 MB of 16 bits at a time.
             chunks = {"x": 1024, "y": 1024}
-            opened: xarray.DataArray = rioxarray.open_rasterio(path, chunks=chunks, masked=masked, driver="GTiff")
+            return rioxarray.open_rasterio(path, chunks=chunks, masked=masked, driver="GTiff")
     except OSError as error:
         raise UnreadableFileError(f"{path}: cannot be read ({error}); run again") from None
-    return opened
 
 
 def _variable(file: "xarray.DataArray", band: BandPart, index: int, name: str, *, masked: bool) -> "xarray.DataArray":

@@ -13,6 +13,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -20,9 +21,9 @@ from numpy.typing import NDArray
 
 from agalign.cameras import known_cameras, pix4d
 from agalign.cameras.metadata import read_tags
-from agalign.cameras.read_files import ImageFile, natural_order, read_file
+from agalign.cameras.read_files import natural_order, read_file
 from agalign.config import DiscoverOptions
-from agalign.errors import ConfigurationError, InputError, OutputError, SidecarError
+from agalign.errors import ConfigurationError, InputError, OutputError
 from agalign.products.run.captures import LeftOut, RunCapture, captures_of_run, like_most
 from agalign.products.run.record import read_run_record
 from agalign.products.sidecar.file import read_sidecar
@@ -108,18 +109,18 @@ def export(
     if not good:
         reason = ": ".join(left_out[0])
         raise InputError(f"{out}: no capture to export ({reason}); 'agalign report {out}' shows what failed")
+    rows: list[_Row] = []
     with _complete_folder(target) as folder:
         if program == "micasense":
-            written = list(_write_micasense(good, out, folder, source))
+            rows = _write_micasense(good, folder, source or _input_of(out))
         elif program == "opencv":
-            written = list(_write_opencv(good, folder))
+            rows = _write_opencv(good, folder)
         else:
-            written = [(path, []) for path in _band_files(good, out, folder / "images", copy=copy)]
-        files, rows = [path for path, _ in written], [row for _, rows in written for row in rows]
+            _write_band_files(good, out, folder / "images", copy=copy)
         if rows:
-            files.append(folder / "matrices.csv")
             cells = ((*row[:3], f"{row[3]:.4f}") for row in rows)
-            write_csv(files[-1], ("capture", "band", "status", "max_error_px"), cells)
+            write_csv(folder / "matrices.csv", ("capture", "band", "status", "max_error_px"), cells)
+        files = sorted((p for p in folder.rglob("*") if p.is_file()), key=lambda p: natural_order(p.name))
         notes = _notes(program, good, files, rows)
         write_text(folder / "README.txt", "\n".join(notes) + "\n")
     return ExportReport(len(good), [target / path.relative_to(folder) for path in files], left_out, notes)
@@ -144,9 +145,8 @@ def _complete_folder(target: Path) -> Iterator[Path]:
             path.rename(target / path.name)
 
 
-def _band_files(captures: Sequence[RunCapture], out: Path, images: Path, *, copy: bool) -> list[Path]:
+def _write_band_files(captures: Sequence[RunCapture], out: Path, images: Path, *, copy: bool) -> None:
     """Link or copy the band files. Raises ConfigurationError and OutputError."""
-    written = []
     taken: dict[str, str] = {}
     for capture in captures:
         output = capture.result.output
@@ -163,8 +163,6 @@ def _band_files(captures: Sequence[RunCapture], out: Path, images: Path, *, copy
                     os.link(source, target)
             if not target.exists():
                 shutil.copyfile(source, target)
-            written.append(target)
-    return written
 
 
 def _notes(
@@ -199,11 +197,9 @@ def _of_raw_numbers(files: Sequence[Path]) -> dict[str, str]:
     return {"calibration": "camera", "contents": contents}
 
 
-def _write_opencv(captures: Sequence[RunCapture], target: Path) -> Iterator[tuple[Path, list[_Row]]]:
-    """Write <capture>.npz for each capture. Yields the file and the distances from the complete mappings.
-
-    Raises OutputError.
-    """
+def _write_opencv(captures: Sequence[RunCapture], target: Path) -> list[_Row]:
+    """Write <capture>.npz for each capture, and return the distances from the complete mappings. Raises OutputError."""
+    rows: list[_Row] = []
     for name, _, bands in _named(captures, {}):
         grids = [_grid(band) for band in bands]
         matrices, errors_px = zip(*(_fitted(*grid) for grid in grids), strict=True)
@@ -211,40 +207,46 @@ def _write_opencv(captures: Sequence[RunCapture], target: Path) -> Iterator[tupl
         for k, (points_px, mapped_px) in enumerate(grids):
             arrays |= {f"grid_reference_px_{k}": points_px, f"grid_moving_px_{k}": mapped_px}
         arrays |= {"matrices": np.stack(matrices), "max_error_px": np.array(errors_px)}
-        path = target / f"{name}.npz"
-        with complete_file(path) as partial:
+        with complete_file(target / f"{name}.npz") as partial:
             np.savez(partial, allow_pickle=False, **arrays)
-        yield path, _rows(name, bands, errors_px)
+        rows += _rows(name, bands, errors_px)
+    return rows
 
 
-def _write_micasense(
-    captures: Sequence[RunCapture], out: Path, target: Path, source: Path | None
-) -> Iterator[tuple[Path, list[_Row]]]:
-    """Write <capture>_warp_matrices.npy for each capture, and <serial>_warp_matrices_opencv.npy for each camera.
+def _write_micasense(captures: Sequence[RunCapture], target: Path, source: Path) -> list[_Row]:
+    """Write <capture>_warp_matrices.npy for each capture, and <serial>_warp_matrices_opencv.npy for each camera, and
+    return the distances from the complete mappings.
 
-    Yields the file and the distances from the complete mappings. Raises InputError if the original images cannot be
-    read, ConfigurationError for other cameras, OutputError.
+    `source` is the folder of the images. Raises InputError if an image cannot be read, ConfigurationError for other
+    cameras, OutputError.
     """
-    if source is None:
-        run = read_run_record(out)
-        if run is None:
-            raise InputError(f"{out}: does not name the folder of the images; give it with --source")
-        source = Path(run.input)
+    rows: list[_Row] = []
+    files: dict[str, NDArray[np.float64]] = {}
     by_camera: dict[str, list[NDArray[np.float64]]] = defaultdict(list)
     taken: dict[str, str] = {}
     for name, capture, bands in _named(captures, taken):
-        images = [_original(source / Path(capture.label).parent / band.file) for band in bands]
-        reference = next((i for i, b in zip(images, bands, strict=True) if b.status == "reference"), None)
-        if reference is None:
-            raise SidecarError(f"{capture.path}: has no reference band; run again with --overwrite")
-        results = (_in_notebook_px(band, reference, image) for band, image in zip(bands, images, strict=True))
-        matrices, errors_px = zip(*results, strict=True)
-        stacked = np.stack(matrices)
-        by_camera[images[0].tags.serial or "camera"].append(stacked)
-        yield _write_npy(target / f"{name}_warp_matrices.npy", stacked), _rows(name, bands, errors_px)
+        folder = source / Path(capture.label).parent
+        cameras = {band.file: _camera_of(folder / band.file) for band in bands}
+        reference = cameras[capture.result.reference.file]
+        matrices, errors_px = zip(*(_in_notebook_px(b, reference, cameras[b.file]) for b in bands), strict=True)
+        files[f"{name}_warp_matrices"] = stacked = np.stack(matrices)
+        by_camera[cameras[bands[0].file].serial].append(stacked)
+        rows += _rows(name, bands, errors_px)
     for serial, of_camera in by_camera.items():
-        matrices_of_camera = _nearest_to_median(of_camera, captures[0].result.reference.size_px)
-        yield _write_npy(target / f"{file_name(serial, taken)}_warp_matrices_opencv.npy", matrices_of_camera), []
+        typical = _nearest_to_median(of_camera, captures[0].result.reference.size_px)
+        files[f"{file_name(serial, taken)}_warp_matrices_opencv"] = typical
+    for name, stacked in files.items():
+        with complete_file(target / f"{name}.npy") as partial:
+            np.save(partial, stacked)
+    return rows
+
+
+def _input_of(out: Path) -> Path:
+    """The folder of the images of a run. Raises InputError."""
+    run = read_run_record(out)
+    if run is None:
+        raise InputError(f"{out}: does not name the folder of the images; give it with --source")
+    return Path(run.input)
 
 
 def _named(captures: Sequence[RunCapture], taken: dict[str, str]) -> Iterator[tuple[str, RunCapture, list[BandPart]]]:
@@ -275,36 +277,38 @@ def _fitted(points_px: Points, mapped_px: Points, matrix: Matrix | None = None) 
     return matrix, float(distances_px.max(initial=0.0))
 
 
-def _original(path: Path) -> ImageFile:
+class _Camera(NamedTuple):
+    """The camera of a band of MicaSense."""
+
+    lens: Lens
+    new_matrix: Matrix
+    """Of the undistorted image in the notebooks."""
+    serial: str
+
+
+def _camera_of(path: Path) -> _Camera:
+    """The camera of an original image. Raises InputError, ConfigurationError."""
     if not path.is_file():
         raise InputError(f"{path}: the image is not there; give the folder of the flight's images with --source")
-    return read_file(path, known_cameras(), DiscoverOptions())
+    image = read_file(path, known_cameras(), DiscoverOptions())
+    of_image = image.bands[0].lens if image.bands else None
+    if image.camera.name != "MicaSense" or of_image is None:
+        raise ConfigurationError(f"{path}: no lens tags of a MicaSense camera; use --for opencv")
+    distortion = np.array((*of_image.distortion, 0.0, 0.0, 0.0, 0.0, 0.0)[:5])  # k1, k2, p1, p2, k3
+    new_matrix, _ = cv2.getOptimalNewCameraMatrix(of_image.matrix, distortion, image.bands[0].size_px, 1)
+    return _Camera(of_image, np.asarray(new_matrix, np.float64), image.tags.serial or "camera")
 
 
-def _in_notebook_px(band: BandPart, reference: ImageFile, image: ImageFile) -> tuple[Matrix, float]:
+def _in_notebook_px(band: BandPart, reference: _Camera, camera: _Camera) -> tuple[Matrix, float]:
     """(the matrix between the pixels that the notebooks warp, its largest distance from the complete mapping, px)."""
-    reference_lens, band_lens = _lens(reference), _lens(image)
-    new_reference, new_band = _new_camera_matrix(reference_lens, reference), _new_camera_matrix(band_lens, image)
     points_px, mapped_px = _grid(band)
-    undistorted, mapped = lens.undistort(reference_lens, points_px), lens.undistort(band_lens, mapped_px)
+    undistorted, mapped = lens.undistort(reference.lens, points_px), lens.undistort(camera.lens, mapped_px)
     mapping = band.homography
     known = None if mapping is None or mapping.space != "undistorted" else np.array(mapping.fixed_to_moving)
     matrix, error_px = _fitted(undistorted, mapped, known)
-    to_new, from_new = new_band @ np.linalg.inv(band_lens.matrix), reference_lens.matrix @ np.linalg.inv(new_reference)
+    to_new = camera.new_matrix @ np.linalg.inv(camera.lens.matrix)
+    from_new = reference.lens.matrix @ np.linalg.inv(reference.new_matrix)
     return geometry.compose(to_new, matrix, from_new), error_px
-
-
-def _lens(image: ImageFile) -> Lens:
-    result = image.bands[0].lens if image.bands else None
-    if image.camera.name != "MicaSense" or result is None:
-        raise ConfigurationError(f"{image.path}: no lens tags of a MicaSense camera; use --for opencv")
-    return result
-
-
-def _new_camera_matrix(band_lens: Lens, image: ImageFile) -> Matrix:
-    distortion = np.array((*band_lens.distortion, 0.0, 0.0, 0.0, 0.0, 0.0)[:5])  # k1, k2, p1, p2, k3
-    matrix, _ = cv2.getOptimalNewCameraMatrix(band_lens.matrix, distortion, image.bands[0].size_px, 1)
-    return np.asarray(matrix, np.float64)
 
 
 def _nearest_to_median(captures: Sequence[NDArray[np.float64]], size_px: tuple[int, int]) -> NDArray[np.float64]:
@@ -316,9 +320,3 @@ def _nearest_to_median(captures: Sequence[NDArray[np.float64]], size_px: tuple[i
     mapped = np.array([[geometry.apply(m, corners_px) for m in matrices] for matrices in complete])
     distances_px = np.linalg.norm(mapped - np.median(mapped, axis=0), axis=-1)
     return complete[int(distances_px.mean(axis=(1, 2)).argmin())]
-
-
-def _write_npy(path: Path, matrices: NDArray[np.float64]) -> Path:
-    with complete_file(path) as partial:
-        np.save(partial, matrices)
-    return path

@@ -8,7 +8,8 @@ import json
 import math
 import re
 import warnings
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections import defaultdict
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache, cached_property, lru_cache
 from importlib import metadata
@@ -71,13 +72,16 @@ def symbols_of(formula: str) -> tuple[str, ...]:
     Allowed are names, numbers, + - * / ** (or ^), parentheses, and sqrt, log, exp and abs. Raises ConfigurationError
     for anything else.
     """
-    return tuple(dict.fromkeys(_names(_parsed(formula))))
+    # The evaluation adds an entry for each name that it reads.
+    used: dict[str, FloatImage] = defaultdict(lambda: np.ones((1, 1), np.float32))
+    evaluate(formula, used)
+    return tuple(used)
 
 
 def evaluate(formula: str, values: Mapping[str, FloatImage]) -> FloatImage:
     """Return the value (height, width) of a formula, given an array of that shape for each name.
 
-    Not finite where it is undefined.
+    Not finite where it is undefined. Raises ConfigurationError for anything but arithmetic.
     """
     with np.errstate(all="ignore"):
         return np.asarray(_value(_parsed(formula), values), np.float32)
@@ -95,48 +99,31 @@ def _parsed(formula: str) -> ast.expr:
         raise ConfigurationError(f"'{formula}' is not a formula; write one like (N-R)/(N+R)") from None
 
 
-def _names(node: ast.expr) -> Iterator[str]:
+def _value(node: ast.expr, values: Mapping[str, FloatImage]) -> Any:
     max_number = 1e30  # numbers must fit into float32
     match node:
         case ast.Name(id=name):
-            yield name
-        case ast.Constant(value=int() | float() as value) if abs(value) < max_number:
-            pass
-        case ast.BinOp(left=left, op=op, right=right) if type(op) in _OPERATORS:
-            yield from _names(left)
-            yield from _names(right)
-        case ast.UnaryOp(op=op, operand=operand) if type(op) in _OPERATORS:
-            yield from _names(operand)
-        case ast.Call(func=ast.Name(id=name), args=[argument], keywords=[]) if name in _FUNCTIONS:
-            yield from _names(argument)
-        case _:
-            part = ast.unparse(node)
-            raise ConfigurationError(
-                f"'{part}' is not allowed in a formula; use band letters, numbers, + - * / **, parentheses, "
-                f"{', '.join(_FUNCTIONS)}"
-            )
-
-
-def _value(node: ast.expr, values: Mapping[str, FloatImage]) -> Any:
-    match node:
-        case ast.Name(id=name):
             return values[name]
-        case ast.Constant(value=value):
+        case ast.Constant(value=int() | float() as value) if abs(value) < max_number:
             # float32 overflows to infinity; Python's integers would grow without limit, as in 9**9**9.
-            return np.float32(value)  # type: ignore[arg-type]
+            return np.float32(value)
         case ast.BinOp(left=left, op=ast.Div(), right=right):
+            dividend = _value(left, values)
             # nan where a denominator of bands is not positive beyond the noise of its terms.
             divisor, magnitude = _sum(right, values)
             if any(isinstance(part, ast.Name) for part in ast.walk(right)):
                 divisor = np.where(divisor > _NOISE * magnitude, divisor, np.float32(np.nan))
-            return _value(left, values) / divisor
-        case ast.BinOp(left=left, op=op, right=right):
+            return dividend / divisor
+        case ast.BinOp(left=left, op=op, right=right) if type(op) in _OPERATORS:
             return _OPERATORS[type(op)](_value(left, values), _value(right, values))
-        case ast.UnaryOp(op=op, operand=operand):
+        case ast.UnaryOp(op=op, operand=operand) if type(op) in _OPERATORS:
             return _OPERATORS[type(op)](_value(operand, values))
-        case ast.Call(func=ast.Name(id=name), args=[argument]):
+        case ast.Call(func=ast.Name(id=name), args=[argument], keywords=[]) if name in _FUNCTIONS:
             return _FUNCTIONS[name](_value(argument, values))
-    raise AssertionError(ast.dump(node))  # `_names` has refused it
+    raise ConfigurationError(
+        f"'{ast.unparse(node)}' is not allowed in a formula; use band letters, numbers, + - * / **, parentheses, "
+        f"{', '.join(_FUNCTIONS)}"
+    )
 
 
 def _sum(node: ast.expr, values: Mapping[str, FloatImage]) -> tuple[Any, Any]:
@@ -209,7 +196,7 @@ def index_named(name: str) -> Index:
     wanted = name.strip().lower()
     if wanted in INDICES:
         return INDICES[wanted]
-    entries = _data_of_spyndex("spectral-indices-dict.json", "SpectralIndices")
+    entries = _data_of_spyndex("spectral-indices-dict.json").get("SpectralIndices", {})
     catalogue = {key.lower(): entry for key, entry in entries.items()}
     if wanted in catalogue:
         return _of_catalogue(wanted, catalogue[wanted])
@@ -230,20 +217,18 @@ def index_of_formula(text: str) -> Index:
 
 
 @cache
-def _data_of_spyndex(file: str, key: str) -> Mapping[str, Any]:
+def _data_of_spyndex(file: str) -> dict[str, Any]:
     """The data of spyndex, read without executing its code; empty if it is not installed."""
     try:
         path = Path(str(metadata.distribution("spyndex").locate_file(f"spyndex/data/{file}")))
-        data = json.loads(path.read_text(encoding="utf-8"))
+        return dict(json.loads(path.read_text(encoding="utf-8")))
     except (metadata.PackageNotFoundError, OSError, ValueError):
         return {}
-    entries: Mapping[str, Any] = data.get(key, data)
-    return entries
 
 
 def _of_catalogue(name: str, entry: Mapping[str, Any]) -> Index:
     formula = str(entry["formula"])
-    defaults = {k: v.get("default") for k, v in _data_of_spyndex("constants.json", "").items()}
+    defaults = {k: v.get("default") for k, v in _data_of_spyndex("constants.json").items()}
     constants = tuple((s, float(defaults[s])) for s in symbols_of(formula) if defaults.get(s) is not None)
     index = Index(name, formula, source=str(entry.get("reference", "")), constants=constants)
     _check_bands(index)

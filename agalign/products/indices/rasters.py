@@ -22,7 +22,7 @@ from agalign._version import __version__
 from agalign.config import WriteSettings
 from agalign.errors import ConfigurationError, InputError
 from agalign.pixels.raster import OpenRaster, open_raster
-from agalign.products.indices.formulas import Index, bands_for, compute, index_named
+from agalign.products.indices.formulas import Index, bands_for, compute, index_named, role_of_band
 from agalign.products.product import GEOTIFF, CapturePaths, Product, ProductContext, StacAsset, WrittenFile
 from agalign.products.rasters.aligned_files import tags_of, to_cog
 from agalign.products.rasters.checked_raster import (
@@ -139,14 +139,15 @@ class IndexRasters(Product):
 
         Raises InputError if bands are in the wrong unit, OutputError.
         """
-        bands = _bands(context)
+        bands = list(_bands(context))
         indices = [index_named(name) for name in context.settings.write.indices]
         problems = []
-        for report in write_rasters(bands, indices, context.paths.file(""), context.capture.label):
+        reports = write_rasters(bands, indices, context.paths.file(""), context.capture.label)
+        for index, report in zip(indices, reports, strict=True):
             if report.path is not None:
                 yield WrittenFile(self.kind, report.path, StacAsset(report.index, GEOTIFF, ("data",)))
                 yield WrittenFile(self.kind, report.path.with_suffix(".png"))
-            elif all(not b.problem for b in bands) and _has_bands(context.capture.bands, report.index):
+            elif all(not b.problem for b in bands) and _has_bands(context.capture.bands, index):
                 problems.append(report.problem)
         if problems:
             raise InputError("; ".join(problems))
@@ -156,7 +157,7 @@ def check_indices(captures: Sequence[Capture], settings: WriteSettings) -> None:
     """Raise ConfigurationError for an unknown index, and for an index that no capture has the bands or unit for."""
     for name in settings.indices:
         index = index_named(name)
-        suitable = [c for c in captures if _has_bands(c.bands, name)]
+        suitable = [c for c in captures if _has_bands(c.bands, index)]
         if captures and not suitable:
             names = ", ".join(dict.fromkeys(b.name for c in captures for b in c.bands))
             raise ConfigurationError(
@@ -167,23 +168,18 @@ def check_indices(captures: Sequence[Capture], settings: WriteSettings) -> None:
             raise ConfigurationError(f"--index {name}: needs reflectance; add --radiometry")
 
 
-def _has_bands(bands: Sequence[Band], name: str) -> bool:
-    narrow = [b for b in bands if not b.companion]
-    try:
-        return bool(bands_for(index_named(name), [b.name for b in narrow], [b.wavelength_nm for b in narrow]))
-    except InputError:
-        return False
+def _has_bands(bands: Sequence[Band], index: Index) -> bool:
+    return {role_of_band(band) for band in bands} >= set(index.roles)
 
 
-def _bands(context: ProductContext) -> list[AlignedBand]:
-    places, usable, result = context.places, {context.capture.reference.name, *context.usable}, []
+def _bands(context: ProductContext) -> Iterator[AlignedBand]:
+    places, usable = context.places, {context.capture.reference.name, *context.usable}
     for band in context.capture.bands:
         if band.name in usable and band.name in places:
             file, index = places[band.name]
-            result.append(AlignedBand(band.name, band.wavelength_nm, file.path, index, file.sha256))
+            yield AlignedBand(band.name, band.wavelength_nm, file.path, index, file.sha256)
         else:
-            result.append(AlignedBand(band.name, band.wavelength_nm, Path(), 1, problem="not usable"))
-    return result
+            yield AlignedBand(band.name, band.wavelength_nm, Path(), 1, problem="not usable")
 
 
 def write_rasters(

@@ -145,9 +145,9 @@ def adjusted(captures: Sequence[Placement], pairs: Sequence[TiePair]) -> list[Pl
 
     One without tie points is not changed.
     """
-    parameters = np.zeros((len(captures), _PARAMETERS))
     if not pairs:
         return list(captures)
+    parameters = np.zeros((len(captures), _PARAMETERS))
     tied = np.concatenate([np.tile((p.first, p.second), (len(p), 1)) for p in pairs])
     ties = tied, np.concatenate([np.stack([p.first_px, p.second_px], axis=1) for p in pairs])
     scale = np.inf

@@ -89,9 +89,9 @@ def place_captures(out: Path) -> PlacedFlight:
     corner = next(iter(rings.values()))[:1]
     crs = utm_wkt(*corner[0].tolist())
     origin_m = transformed(corner, _WGS84, crs)[0]
-    left_out += [(c.label, problem) for c in captures if (problem := _problem(c, rings))]
-    alike, differing = like_most([c for c in captures if not _problem(c, rings)])
-    left_out += differing
+    problems = {c.label: problem for c in captures if (problem := _problem(c, rings))}
+    alike, differing = like_most([c for c in captures if c.label not in problems])
+    left_out += [*problems.items(), *differing]
     placed = []
     for capture in alike:
         properties = features[f"{capture.label}.json"]["properties"] | {"ring": rings[capture.label]}
@@ -127,8 +127,7 @@ def _ring(feature: dict[str, Any]) -> Points | None:
 def _placed(capture: RunCapture, feature: dict[str, Any], origin_m: Points, crs: str) -> Placement:
     """The placement by a feature's properties. Raises AgalignError, and KeyError or others for a damaged map."""
     sidecar, bands = read_sidecar(capture.path), capture.bands
-    if sidecar.output is None:
-        raise InputError("it has no aligned bands")
+    assert sidecar.output is not None  # see `_problem`
     grid = sidecar.output.grid
     # From counter-clockwise to the order of `geometry.corners`.
     corners_m = transformed(feature["ring"][[0, 3, 2, 1]], _WGS84, crs) - origin_m

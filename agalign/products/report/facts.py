@@ -13,7 +13,6 @@ import numpy as np
 from pydantic import BaseModel
 
 from agalign.products.indices.rasters import IndexReport
-from agalign.products.run.captures import RAW
 from agalign.products.run.record import RefusalPart
 from agalign.products.sidecar.schema import BandPart, BandResult, CaptureResult, GridPart, OutputPart, Sidecar
 from agalign.values.issues import MISSING_BAND, MOSAICS, OTHER_REFERENCE, UNREADABLE, Remedy
@@ -45,13 +44,13 @@ BAND_COLUMNS = {
 """Field of a band in the sidecar by column of OUT/summary.csv."""
 
 
-@dataclass
+@dataclass(frozen=True)
 class FailureGroup:
     """The bands of a run with the same status and the same cause."""
 
     status: str
     remedy: Remedy
-    bands: list[RefusalPart] = field(default_factory=list)
+    bands: list[RefusalPart]
 
     @property
     def advice(self) -> str:
@@ -86,7 +85,7 @@ class PairTotals:
     """The band pairs of a run. Captures are added one by one, and not kept, which limits memory."""
 
     bands: dict[str, BandTotals] = field(default_factory=lambda: defaultdict(BandTotals))
-    _by_cause: dict[tuple[str, Remedy], FailureGroup] = field(default_factory=dict)
+    _by_cause: dict[tuple[str, Remedy], list[RefusalPart]] = field(default_factory=lambda: defaultdict(list))
     _references: list[tuple[str, tuple[str, ...], str, set[str]]] = field(default_factory=list)
     """(capture, flight, reference band, its other bands with the missing ones)."""
     _votes: dict[tuple[str, ...], Counter[str]] = field(default_factory=lambda: defaultdict(Counter))
@@ -102,7 +101,7 @@ class PairTotals:
             if status != "aligned":
                 refusal = RefusalPart(capture=label, band=name, status=status, reason=reason or "")
                 remedy = MISSING_BAND if part is None else _remedy_of(part, is_mosaic=is_mosaic)
-                _add_to(self._by_cause, refusal, remedy)
+                self._by_cause[status, remedy].append(refusal)
             elif part and part.metrics and (residual_px := part.metrics.after.residual_px) is not None:
                 band.residuals_px.append(residual_px)
         camera, reference = result.camera, result.reference.band
@@ -128,19 +127,17 @@ class PairTotals:
         """Return the failures by cause, and the captures with another reference than most of their flight; the most
         severe first, and the largest first of those.
         """
-        groups = dict(self._by_cause)
+        groups = [FailureGroup(*cause, bands) for cause, bands in self._by_cause.items()]
+        exceptions = []
         for label, flight, band, others in self._references:
             usual = self._votes[flight].most_common(1)[0][0]
             if usual in others:
                 reason = f"on the grid of {band}; most captures of the flight are on that of {usual}"
-                refusal = RefusalPart(capture=label, band=band, status="other_reference", reason=reason)
-                _add_to(groups, refusal, OTHER_REFERENCE)
+                exceptions.append(RefusalPart(capture=label, band=band, status="other_reference", reason=reason))
+        if exceptions:
+            groups.append(FailureGroup("other_reference", OTHER_REFERENCE, exceptions))
         severity = "failed", "seed_only", "missing", "other_reference", "predicted"
-        return sorted(groups.values(), key=lambda g: (severity.index(g.status), -len(g.bands), g.remedy.cause))
-
-
-def _add_to(groups: dict[tuple[str, Remedy], FailureGroup], band: RefusalPart, remedy: Remedy) -> None:
-    groups.setdefault((band.status, remedy), FailureGroup(band.status, remedy)).bands.append(band)
+        return sorted(groups, key=lambda g: (severity.index(g.status), -len(g.bands), g.remedy.cause))
 
 
 def _remedy_of(band: BandResult, *, is_mosaic: bool) -> Remedy:
@@ -207,11 +204,10 @@ class FlightFacts:
         by_label = {c["label"]: c["indices"] for c in self.captures}
         for row in rows:
             if row.path is not None and row.capture in by_label:
-                statistics = row.statistics.as_json()
-                facts = {name: rounded(statistics[name]) for name in ("median", "p5", "p95")}
-                facts |= {"name": row.index, "valid": row.statistics.valid_share, "unit": row.statistics.unit}
-                facts |= {"masked": row.statistics.masked_share}
-                facts |= {"span": (statistics["low"], statistics["high"]), "raw": row.statistics.unit == RAW}
+                known = row.statistics.as_json()
+                facts = {name: rounded(known[name]) for name in ("median", "p5", "p95")} | {"name": row.index}
+                facts |= {"valid": known["valid_share"], "unit": known["unit"], "masked": known["masked_share"]}
+                facts |= {"span": (known["low"], known["high"]), "raw": row.raw_numbers}
                 file = row.path.relative_to(out)
                 links = {"file": quote(file.as_posix()), "picture": quote(file.with_suffix(".png").as_posix())}
                 by_label[row.capture].append(facts | links)
@@ -283,10 +279,9 @@ def _band_offset(grid: GridPart | None, sidecar: Sidecar) -> tuple[tuple[float, 
     if grid is None:
         return None, None
     reference_px, moving_px = np.array(grid.reference_px), np.array(grid.moving_px)
-    reference_span, moving_span = np.ptp(reference_px, axis=0), np.ptp(moving_px, axis=0)
-    if not (np.abs(moving_span - reference_span) < 0.1 * reference_span).all():
+    offsets, span_px = moving_px - reference_px, np.ptp(reference_px, axis=0)
+    if not (np.abs(np.ptp(moving_px, axis=0) - span_px) < 0.1 * span_px).all():
         return None, None
-    offsets = moving_px - reference_px
     centre = (np.array(sidecar.reference.size_px) - 1) / 2
     dx, dy = offsets[np.linalg.norm(reference_px - centre, axis=1).argmin()].tolist()
     return (round(dx, 3), round(dy, 3)), round(float(np.median(np.linalg.norm(offsets, axis=1))), 3)

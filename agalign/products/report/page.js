@@ -73,6 +73,32 @@ function set(element, attributes) {
   }
 }
 
+/** @param {string} text @param {() => void} then @param {Record<string, string | number | boolean>} [attributes] */
+function button(text, then, attributes = {}) {
+  const made = el("button", { type: "button", ...attributes }, text);
+  made.addEventListener("click", then);
+  return made;
+}
+
+/** An entry of a legend. @param {string} colour @param {string} text */
+function key(colour, text) {
+  return el("span", { class: "key", style: `--key:${colour}` }, text);
+}
+
+/**
+ * A row of a table; the first cell is its head.
+ * @param {(Node | string)[]} cells @param {(column: number) => boolean} isNumber
+ */
+function tableRow(cells, isNumber) {
+  return el("tr", {}, ...cells.map((cell, i) => (i === 0 ? el("th", { scope: "row" }, cell) : el("td", { class: isNumber(i) ? "n" : "" }, cell))));
+}
+
+/** @param {string[]} heads @param {(Node | string)[][]} rows @param {(column: number) => boolean} isNumber */
+function tableOf(heads, rows, isNumber) {
+  const head = el("tr", {}, ...heads.map((text, i) => el("th", { scope: "col", class: isNumber(i) ? "n" : "" }, text)));
+  return el("div", { class: "scroll" }, el("table", {}, el("thead", {}, head), el("tbody", {}, ...rows.map((cells) => tableRow(cells, isNumber)))));
+}
+
 /** @param {number | null | undefined} value @param {number} [digits] */
 function fixed(value, digits = 2) {
   return value === null || value === undefined ? "–" : value.toFixed(digits);
@@ -119,7 +145,7 @@ function address(capture) {
 const columns = [
   { title: "Capture", numeric: false, value: (c) => c.label, cell: (c) => el("a", { href: address(c) }, c.label) },
   { title: "Status", numeric: false, value: (c) => ["failed", "degraded", "ok"].indexOf(c.status), cell: (c) => badge(c.status) },
-  { title: "Bands", numeric: true, value: (c) => moving(c).filter((b) => b.status === "aligned").length / Math.max(1, moving(c).length + c.missing.length), cell: chips },
+  { title: "Bands", numeric: false, value: (c) => moving(c).filter((b) => b.status === "aligned").length / Math.max(1, moving(c).length + c.missing.length), cell: chips },
   { title: "Largest residual, px", numeric: true, value: (c) => worst(c, "residual_px"), cell: (c) => fixed(worst(c, "residual_px"), 3) },
   { title: "Corner error, px", numeric: true, value: (c) => worst(c, "corner_std_px"), cell: (c) => fixed(worst(c, "corner_std_px"), 3) },
   { title: "Taken", numeric: false, value: (c) => c.captured_at, cell: (c) => taken(c.captured_at) },
@@ -143,27 +169,20 @@ function chips(capture) {
 function tableHead() {
   const line = el("tr");
   columns.forEach((column, i) => {
-    const button = el("button", { type: "button" }, column.title);
-    button.addEventListener("click", () => {
+    const sort = () => {
       table.up = table.sorted === i ? !table.up : true;
       table.sorted = i;
       tableBody();
-    });
-    line.append(el("th", { scope: "col", class: column.numeric && column.title !== "Bands" ? "n" : "" }, button));
+    };
+    line.append(el("th", { scope: "col", class: column.numeric ? "n" : "" }, button(column.title, sort)));
   });
   byId("table").querySelector("thead")?.replaceChildren(line);
 }
 
 /** @param {Capture} capture */
 function row(capture) {
-  const made = table.rows.get(capture) ?? el("tr");
-  if (!table.rows.has(capture)) {
-    columns.forEach((column, i) => {
-      const attributes = { class: column.numeric && column.title !== "Bands" ? "n" : "" };
-      made.append(i === 0 ? el("th", { scope: "row", ...attributes }, column.cell(capture)) : el("td", attributes, column.cell(capture)));
-    });
-    table.rows.set(capture, made);
-  }
+  const made = table.rows.get(capture) ?? tableRow(columns.map((c) => c.cell(capture)), (i) => columns[i].numeric);
+  table.rows.set(capture, made);
   return made;
 }
 
@@ -268,7 +287,7 @@ function colourMap() {
   if (what === "status") {
     for (const [c, dot] of dots) set(dot, { fill: colourOf(c.status) });
     const present = Object.keys(STATUS_COLOURS).filter((s) => captures.some((c) => c.status === s));
-    legend.replaceChildren(...present.map((s) => el("span", { class: "key", style: `--key:${colourOf(s)}` }, s)));
+    legend.replaceChildren(...present.map((s) => key(colourOf(s), s)));
     return;
   }
   if (what.startsWith("index:")) {
@@ -279,8 +298,8 @@ function colourMap() {
     const value = worst(c, /** @type {"residual_px"} */ (what));
     set(dot, { fill: value === null ? MISSING_COLOUR : ramp(value / MAP_FULL_PX) });
   }
-  const steps = [0, 0.5, 1].map((s) => el("span", { class: "key", style: `--key:${ramp(s)}` }, `${(s * MAP_FULL_PX).toFixed(2)} px${s === 1 ? " and more" : ""}`));
-  legend.replaceChildren(...steps, el("span", { class: "key", style: `--key:${MISSING_COLOUR}` }, "no value"));
+  const steps = [0, 0.5, 1].map((s) => key(ramp(s), `${(s * MAP_FULL_PX).toFixed(2)} px${s === 1 ? " and more" : ""}`));
+  legend.replaceChildren(...steps, key(MISSING_COLOUR, "no value"));
 }
 
 /**
@@ -297,8 +316,8 @@ function colourByIndex(name, legend) {
     const value = of(c)?.median ?? null;
     set(dot, { fill: value === null ? MISSING_COLOUR : medianColour((value - low) / (high - low || 1), raw) });
   }
-  const steps = known.length ? [0, 0.5, 1].map((s) => el("span", { class: "key", style: `--key:${medianColour(s, raw)}` }, (low + s * (high - low)).toFixed(3))) : [];
-  legend.replaceChildren(...steps, el("span", { class: "key", style: `--key:${MISSING_COLOUR}` }, "no value"), raw ? RAW_NOTE : "");
+  const steps = known.length ? [0, 0.5, 1].map((s) => key(medianColour(s, raw), (low + s * (high - low)).toFixed(3))) : [];
+  legend.replaceChildren(...steps, key(MISSING_COLOUR, "no value"), raw ? RAW_NOTE : "");
 }
 
 /** The names of all indices, of whichever captures have them. */
@@ -426,11 +445,7 @@ function heading(capture) {
   const order = chosen();
   const at = order.indexOf(capture);
   /** @param {string} text @param {Capture | undefined} to */
-  const step = (text, to) => {
-    const button = el("button", { type: "button", class: "button", disabled: to === undefined }, text);
-    button.addEventListener("click", () => { if (to !== undefined) location.hash = address(to); });
-    return button;
-  };
+  const step = (text, to) => button(text, () => { if (to !== undefined) location.hash = address(to); }, { class: "button", disabled: to === undefined });
   const where = capture.position === null ? "" : ` · ${capture.position.map((v) => v.toFixed(6)).join(", ")}${capture.altitude_m === null ? "" : `, ${capture.altitude_m.toFixed(0)} m`}`;
   const files = el("span", {}, capture.radiometry === null ? "" : ` · ${capture.radiometry}`);
   for (const [file, name] of [[capture.stack, "aligned stack"], [capture.sidecar, "sidecar"], [capture.relief, "relief"], [capture.picture, "picture"]]) {
@@ -519,27 +534,15 @@ function compositeTools(capture) {
 }
 
 function viewTools() {
-  const line = el("div", { class: "tools", id: "view-tools" });
-  /** @param {string} text @param {() => void} then @param {string} [mode] */
-  const button = (text, then, mode) => {
-    const made = el("button", { type: "button", class: "button", ...(mode === undefined ? {} : { "data-mode": mode, "aria-pressed": String(look.mode === mode) }) }, text);
-    made.addEventListener("click", then);
-    return made;
-  };
-  line.append(
-    button("Swipe", () => setMode("swipe"), "swipe"),
-    button("Blink", () => setMode("blink"), "blink"),
-    button("Side by side", () => setMode("side"), "side"),
-    button("−", () => zoomBy(1 / 1.6), undefined),
-    button("+", () => zoomBy(1.6), undefined),
-    button("All", () => showAll(), undefined),
-    button("Detail", () => showDetail(), undefined),
+  /** @type {["swipe" | "blink" | "side", string][]} */
+  const modes = [["swipe", "Swipe"], ["blink", "Blink"], ["side", "Side by side"]];
+  return el("div", { class: "tools", id: "view-tools" },
+    ...modes.map(([mode, text]) => button(text, () => setMode(mode), { class: "button", "data-mode": mode, "aria-pressed": String(look.mode === mode) })),
+    button("−", () => zoomBy(1 / 1.6), { class: "button", "aria-label": "Zoom out" }),
+    button("+", () => zoomBy(1.6), { class: "button", "aria-label": "Zoom in" }),
+    button("All", showAll, { class: "button" }),
+    button("Detail", showDetail, { class: "button" }),
   );
-  line.querySelectorAll("button").forEach((b) => {
-    if (b.textContent === "−") set(b, { "aria-label": "Zoom out" });
-    if (b.textContent === "+") set(b, { "aria-label": "Zoom in" });
-  });
-  return line;
 }
 
 /** @param {Capture} capture */
@@ -718,8 +721,6 @@ function channelNote(capture) {
  * @param {Preview} preview
  */
 function legend(preview) {
-  /** @param {string} colour @param {string} text */
-  const key = (colour, text) => el("span", { class: "key", style: `--key:${colour}` }, text);
   if (["vectors", "heat"].includes(look.overlay)) return [0, 0.5, 1].map((share) => key(ramp(share), `${(share * FULL_PX).toFixed(2)} px`));
   const index = look.capture ? indexOf(look.capture) : undefined;
   if (index) {
@@ -773,25 +774,27 @@ function picture(pen, capture, when, origin, from, width) {
 function over(pen, capture, at) {
   const column = capture.bands.findIndex((b) => b.band === look.overlayBand);
   const pair = capture.bands[column];
-  if (look.overlay.startsWith("index:")) {
-    overIndex(pen, capture, at);
-    return;
-  }
-  if (!pair || look.overlay === "none") return;
-  if (look.overlay === "error" || look.overlay === "relief") {
+  if (look.overlay.startsWith("index:")) overIndex(pen, capture, at);
+  else if (!pair || look.overlay === "none") return;
+  else if (look.overlay === "heat") overHeat(pen, capture, pair, at);
+  else if (look.overlay === "vectors") overVectors(pen, capture, pair, at);
+  else {
     const made = look.overlay === "relief" ? relief(capture) : capture.preview?.error_full_px ? composed(4, [{ column, colour: "#ff5a1f" }]) : null;
     if (look.overlay === "error") pen.globalCompositeOperation = "screen";
     else pen.globalAlpha = RELIEF_OPACITY;
     const [x, y] = at(0, 0);
     const [right, bottom] = at(1, 1);
     if (made) pen.drawImage(made, x, y, right - x, bottom - y);
-    return;
   }
+}
+
+/**
+ * An arrow for each window along its shift.
+ * @param {CanvasRenderingContext2D} pen @param {Capture} capture @param {Pair} pair
+ * @param {(u: number, v: number) => [number, number]} at
+ */
+function overVectors(pen, capture, pair, at) {
   const lattice = facts.lattices[pair.lattice];
-  if (look.overlay === "heat") {
-    overHeat(pen, capture, pair, at);
-    return;
-  }
   const [x0, y0, width, height] = capture.crop;
   const [sx, sy] = capture.scale;
   const apart = 0.5 * nearest(lattice);
@@ -978,12 +981,12 @@ function listenToStage() {
 /** @param {Capture} capture */
 function indexTable(capture) {
   if (!capture.indices.length) return [];
-  const head = el("tr", {}, ...["Index", "Median", "5th percentile", "95th percentile", "Valid pixels", "Masked by flags", "Of"].map((text, i) => el("th", { scope: "col", class: i > 0 && i < 6 ? "n" : "" }, text)));
-  const body = capture.indices.map((index) => {
-    const cells = [fixed(index.median, 3), fixed(index.p5, 3), fixed(index.p95, 3), percent(index.valid), percent(index.masked)];
-    return el("tr", {}, el("th", { scope: "row" }, el("a", { href: index.file }, index.name.toUpperCase())), ...cells.map((text) => el("td", { class: "n" }, text)), el("td", {}, index.unit));
-  });
-  return [el("div", { class: "scroll", id: "indices" }, el("table", {}, el("thead", {}, head), el("tbody", {}, ...body)))];
+  const heads = ["Index", "Median", "5th percentile", "95th percentile", "Valid pixels", "Masked by flags", "Of"];
+  const rows = capture.indices.map((index) => [
+    el("a", { href: index.file }, index.name.toUpperCase()), fixed(index.median, 3), fixed(index.p5, 3), fixed(index.p95, 3),
+    percent(index.valid), percent(index.masked), index.unit,
+  ]);
+  return [el("div", { id: "indices" }, tableOf(heads, rows, (i) => i > 0 && i < 6))];
 }
 
 /** @param {Capture} capture */
@@ -1021,17 +1024,16 @@ function sentence(pair, capture) {
 /** @param {Capture} capture */
 function numbers(capture) {
   const heads = ["Band", "Status", "Seed", "Residual, px", "95 %, px", "Coverage", "Corner error, px", "Retrieval", "Geometry, 95 %", "Relief, occluded", "Seconds"];
-  const body = moving(capture).map((pair) => {
+  const rows = moving(capture).map((pair) => {
     const heldOut = pair.geometry === null ? {} : pair.geometry.held_out_p95_px;
     const geometry = pair.geometry === null ? "–" : `${pair.geometry.kind}${Object.keys(heldOut).length > 1 ? ` (${Object.entries(heldOut).map(([kind, px]) => `${kind} ${fixed(px)}`).join(", ")})` : ""}`;
-    const cells = [
-      pair.seed ?? "–", fixed(pair.residual_px, 3), fixed(pair.residual_p95_px, 3), pair.coverage === null ? "–" : `${Math.round(pair.coverage * 100)} %`,
-      fixed(pair.corner_std_px, 3), fixed(pair.retrieval), geometry, pair.occluded === null ? "–" : percent(pair.occluded), pair.seconds.toFixed(1),
+    return [
+      pair.band, badge(pair.status), pair.seed ?? "–", fixed(pair.residual_px, 3), fixed(pair.residual_p95_px, 3),
+      pair.coverage === null ? "–" : `${Math.round(pair.coverage * 100)} %`, fixed(pair.corner_std_px, 3), fixed(pair.retrieval), geometry,
+      pair.occluded === null ? "–" : percent(pair.occluded), pair.seconds.toFixed(1),
     ];
-    return el("tr", {}, el("th", { scope: "row" }, pair.band), el("td", {}, badge(pair.status)), ...cells.map((text, i) => el("td", { class: i === 0 ? "" : "n" }, text)));
   });
-  const head = el("tr", {}, ...heads.map((text, i) => el("th", { scope: "col", class: i < 3 ? "" : "n" }, text)));
-  return el("div", { class: "scroll" }, el("table", {}, el("thead", {}, head), el("tbody", {}, ...body)));
+  return tableOf(heads, rows, (i) => i > 2);
 }
 
 /** @type {[string, string, number][]} Name, column, and the sign that makes higher better. */
@@ -1041,12 +1043,12 @@ const SIMILARITIES = [["mattes_mi", "Mutual information", -1], ["nmi", "NMI", 1]
 function similarities(capture) {
   /** @param {number | null | undefined} value @param {number} sign */
   const signed = (value, sign) => (value === null || value === undefined ? "–" : fixed(sign * value || 0, 3));
-  const body = moving(capture).map((pair) => el("tr", {}, el("th", { scope: "row" }, pair.band), ...SIMILARITIES.map(([name, , sign]) => {
+  const rows = moving(capture).map((pair) => [pair.band, ...SIMILARITIES.map(([name, , sign]) => {
     const [before, after] = pair.similarity?.[name] ?? [null, null];
-    return el("td", { class: "n" }, `${signed(before, sign)} → ${signed(after, sign)}`);
-  })));
-  const head = el("tr", {}, el("th", { scope: "col" }, "Band"), ...SIMILARITIES.map(([, title]) => el("th", { scope: "col", class: "n" }, title)));
-  return el("details", { class: "more" }, el("summary", {}, "Similarity of the images before → after alignment"), el("div", { class: "scroll" }, el("table", {}, el("thead", {}, head), el("tbody", {}, ...body))));
+    return `${signed(before, sign)} → ${signed(after, sign)}`;
+  })]);
+  const heads = ["Band", ...SIMILARITIES.map(([, title]) => title)];
+  return el("details", { class: "more" }, el("summary", {}, "Similarity of the images before → after alignment"), tableOf(heads, rows, (i) => i > 0));
 }
 
 // ---- what happens

@@ -17,9 +17,8 @@ from agalign._version import __version__
 from agalign.config import Settings
 from agalign.errors import SidecarError
 from agalign.products.indices.rasters import IndexReport, reports_of_run, update_table
-from agalign.products.report.charts import drifts_of, rig_views
+from agalign.products.report.charts import CaptureLight, drifts_of, light_charts, radiometric_check, rig_views
 from agalign.products.report.facts import BAND_COLUMNS, FlightFacts
-from agalign.products.report.light import CaptureLight, light_charts, radiometric_check
 from agalign.products.run.excluded import PANELS_FILE, SKY_FILE, PanelPart, SkyPart, read_excluded
 from agalign.products.run.record import RunPart, read_run_record
 from agalign.products.sidecar.file import find_sidecars, read_sidecar
@@ -56,17 +55,16 @@ def write_pages(out: Path, on_problem: Callable[[str], None]) -> FlightFacts:
     except SidecarError as error:
         unreadable.append(str(error))
     not_aligned = [("panel", part) for part in panels if not part.in_scene] + [("sky", part) for part in sky]
-    rows = [*facts.rows]
     for status, part in not_aligned:
         of_capture = {"folder": part.folder, "capture": part.capture, "status": status, "reason": part.sentence}
-        rows += [of_capture | {"band": band.band} for band in part.bands]
-    write_csv(out / SUMMARY_FILE, SUMMARY_COLUMNS, ([row.get(name) for name in SUMMARY_COLUMNS] for row in rows))
+        facts.rows += [of_capture | {"band": band.band} for band in part.bands]
+    write_csv(out / SUMMARY_FILE, SUMMARY_COLUMNS, ([row.get(name) for name in SUMMARY_COLUMNS] for row in facts.rows))
     facts.add_indices(update_table(out, indices), out)
     page = _page(
         version=__version__,
         median=median,
         flight=facts,
-        facts=_script_json(facts.as_json()),
+        facts=facts.as_json(),
         run=run,
         settings=_changed_settings(run),
         rigs=rig_views(out, unreadable.append),
@@ -98,16 +96,17 @@ def pages_exist(out: Path) -> bool:
 def _page(**values: Any) -> str:
     """The page of the template, which gets these values."""
     environment = Environment(
-        loader=PackageLoader("agalign.products.report", "."),
+        loader=PackageLoader(__package__, "."),
         autoescape=select_autoescape(["j2"]),
         trim_blocks=True,
         lstrip_blocks=True,
         undefined=StrictUndefined,
     )
-    script = _resource("page.js")
+    environment.policies["json.dumps_kwargs"] = {"separators": (",", ":"), "ensure_ascii": False, "allow_nan": False}
+    style, script = (resources.files(__package__).joinpath(f"page.{kind}").read_text("utf-8") for kind in ("css", "js"))
     digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
-    resources_of_page = {"style": _resource("page.css"), "script": script, "script_hash": digest}
-    return environment.get_template("page.html.j2").render(**resources_of_page, **values)
+    template = environment.get_template("page.html.j2")
+    return template.render(style=style, script=script, script_hash=digest, **values)
 
 
 def _changed_settings(run: RunPart | None) -> list[tuple[str, str]]:
@@ -122,13 +121,3 @@ def _changed_settings(run: RunPart | None) -> list[tuple[str, str]]:
         for name, value in values.items()
         if value != defaults.get(stage, {}).get(name) and (stage, name) != ("flight", "start_model")
     ]
-
-
-def _resource(name: str) -> str:
-    return resources.files("agalign.products.report").joinpath(name).read_text(encoding="utf-8")
-
-
-def _script_json(facts: dict[str, Any]) -> str:
-    """JSON for an HTML script element, escaped so that no text in it ends the element."""
-    text = json.dumps(facts, separators=(",", ":"), ensure_ascii=False, allow_nan=False)
-    return text.replace("&", "\\u0026").replace("<", "\\u003c").replace(">", "\\u003e")
