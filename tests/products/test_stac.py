@@ -17,7 +17,7 @@ from pystac.validation.stac_validator import JsonSchemaSTACValidator
 
 import agalign
 from agalign.flight.groups import flights_of
-from agalign.products.exports.stac import write_collections
+from agalign.products.exports.stac import bounding_box, write_collections
 from agalign.products.run.flight_map import ground_m
 from agalign.values.capture import Band, CameraIdentity, Capture, Pose
 from agalign.values.files import write_text
@@ -165,3 +165,12 @@ def test_a_damaged_item_is_named(tmp_path: Path) -> None:
     (tmp_path / "a.stac.json").write_bytes(b"\0\0")
     with pytest.raises(agalign.OutputError, match=r"a\.stac\.json: cannot be read as a STAC item .* --overwrite"):
         write_collections([Capture("a", Path(), (GREEN,), 0)], tmp_path)
+
+
+def test_the_box_of_a_footprint_across_the_180th_meridian_crosses_it() -> None:
+    west = [[[179.9, -17.0], [180.0, -17.0], [180.0, -16.9], [179.9, -17.0]]]
+    east = [[[-180.0, -17.1], [-179.8, -17.1], [-180.0, -16.9], [-180.0, -17.0], [-180.0, -17.1]]]
+    across = {"type": "MultiPolygon", "coordinates": [west, east]}
+    assert bounding_box(across) == [179.9, -17.1, -179.8, -16.9]
+    assert bounding_box({"type": "Polygon", "coordinates": west}) == [179.9, -17.0, 180.0, -16.9]
+    assert bounding_box({"type": "Point", "coordinates": [8.0, 50.0]}) == [8.0, 50.0, 8.0, 50.0]

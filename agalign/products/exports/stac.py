@@ -3,7 +3,7 @@ electro-optical, raster and projection.
 """
 
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -112,8 +112,7 @@ def _item(context: ProductContext) -> "pystac.Item":
 
     capture, grid = context.capture, context.grid
     shape = geojson_geometry(footprint(capture, grid), capture.position, decimals=8)
-    corners = None if shape is None else np.atleast_2d(np.array(shape["coordinates"]).squeeze())
-    box = None if corners is None else [*corners.min(axis=0).tolist(), *corners.max(axis=0).tolist()]
+    box = None if shape is None else bounding_box(shape)
     moment, source = _moment(capture)
     properties = {"agalign:datetime_source": source, "agalign:reference_band": capture.reference.name}
     item = pystac.Item(capture.label, geometry=shape, bbox=box, datetime=moment, properties=properties)
@@ -125,6 +124,16 @@ def _item(context: ProductContext) -> "pystac.Item":
     for relation in ("collection", "parent", "root"):
         item.add_link(pystac.Link(relation, f"{to_out}/{item.collection_id}.collection.json", pystac.MediaType.JSON))
     return item
+
+
+def bounding_box(shape: Mapping[str, Any]) -> list[float]:
+    """Return [west, south, east, north] of a GeoJSON point, polygon, or multipolygon with a part on each side of the
+    180th meridian: then west is larger than east (RFC 7946, 5.2).
+    """
+    parts = shape["coordinates"] if shape["type"] == "MultiPolygon" else [shape["coordinates"]]
+    first, last = (np.reshape(part, (-1, 2)) for part in (parts[0], parts[-1]))
+    latitudes = np.concatenate([first, last])[:, 1]
+    return [float(first[:, 0].min()), float(latitudes.min()), float(last[:, 0].max()), float(latitudes.max())]
 
 
 def _projection(capture: Capture, grid: OutputGrid) -> dict[str, Any]:
