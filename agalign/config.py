@@ -5,15 +5,16 @@ help text of its command-line option, and its row in docs/options.md. Other para
 use them, with their reasons.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import Executor
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from operator import not_
 from pathlib import Path
 from typing import Annotated, Any
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
 from pydantic import dataclasses as validated
+from pydantic.fields import FieldInfo
 
 from agalign.errors import ConfigurationError
 from agalign.values.choices import (
@@ -61,7 +62,9 @@ def albedos(text: str | None) -> tuple[tuple[str, float], ...]:
 
 @dataclass(frozen=True)
 class Option:
-    """The command-line option of a field, where it differs from the field."""
+    """The command-line option of a field. The annotation of the field states what differs from it;
+    `cli.command.field_options` adds the rest.
+    """
 
     name: str = ""
     """Its name as an identifier; by default that of the field."""
@@ -76,6 +79,21 @@ class Option:
     """Its value if it is given without one."""
     former: str = ""
     """A deprecated name, with its dashes."""
+    path: tuple[str, ...] = ()
+    """Names of the model (settings, discover or run), of the stage, if any, and of the field."""
+    info: Mapping[str, Any] = field(default_factory=dict)
+    """Help text and range."""
+
+    @property
+    def flag(self) -> str:
+        """Its long name, with its dashes."""
+        return f"--{self.name.replace('_', '-')}"
+
+
+def option_of(name: str, of_field: FieldInfo) -> Option:
+    """Return the option that the annotation of a field describes."""
+    option = next((m for m in of_field.metadata if isinstance(m, Option)), Option())
+    return replace(option, name=option.name or name)
 
 
 def _yes_or_no(yes: str, no: str) -> BeforeValidator:
@@ -144,13 +162,12 @@ class SettingsModel(BaseModel):
     @classmethod
     def flag(cls, field: str) -> str:
         """Return the long name of the command-line option of a field, with its dashes."""
-        names = (m.name for m in cls.model_fields[field].metadata if isinstance(m, Option) and m.name)
-        return "--" + next(names, field).replace("_", "-").removeprefix("start-")  # --model sets `start_model`
+        return option_of(field, cls.model_fields[field]).flag.replace("--start-", "--")  # --model sets `start_model`
 
     def __repr_args__(self) -> Iterator[tuple[str | None, Any]]:
         """Return the fields that differ from their defaults."""
-        for name, field in type(self).model_fields.items():
-            if (value := getattr(self, name)) != field.get_default():
+        for name, of_field in type(self).model_fields.items():
+            if (value := getattr(self, name)) != of_field.get_default():
                 yield name, value
 
 

@@ -25,10 +25,15 @@ EXTRAS = {
 
 def _doctor(
     terminal: Terminal,
-    folder: Annotated[Path, typer.Argument(help="Folder for aligned files.")] = Path(),
-    as_json: Annotated[bool, typer.Option("--json", help="Print JSON to standard output.")] = False,
+    folder: Annotated[Path, typer.Argument()] = Path(),
+    as_json: Annotated[bool, typer.Option("--json")] = False,
 ) -> int:
-    """Check this machine: versions, devices, threads, memory, disk and extras."""
+    """Check this machine: versions, devices, threads, memory, disk and extras.
+
+    Options:
+        folder: Folder for aligned files.
+        as_json: Print JSON to standard output.
+    """
     from agalign.method.device import devices
 
     known = [{"device": d.name, "what": d.what, "threads": d.threads, "problem": d.problem} for d in devices()]

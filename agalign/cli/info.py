@@ -21,15 +21,17 @@ if TYPE_CHECKING:
 def _info(
     terminal: Terminal,
     given: Given,
-    folder: Annotated[
-        Path | None, typer.Argument(help="Folder with images, or the model of a run (OUT/models/….safetensors).")
-    ] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="Print JSON to standard output.")] = False,
-    options: Annotated[
-        bool, typer.Option("--options", help="Print a --config file with all options of 'agalign align'.")
-    ] = False,
+    folder: Annotated[Path | None, typer.Argument()] = None,
+    as_json: Annotated[bool, typer.Option("--json")] = False,
+    options: bool = False,
 ) -> int:
-    """List cameras, captures, bands and missing files of a folder, or show the rig of a model."""
+    """List cameras, captures, bands and missing files of a folder, or show the rig of a model.
+
+    Options:
+        folder: Folder with images, or the model of a run (OUT/models/….safetensors).
+        as_json: Print JSON to standard output.
+        options: Print a --config file with all options of 'agalign align'.
+    """
     if options:
         typer.echo(config_text(align.built("align")))
         return ExitCode.OK

@@ -83,16 +83,19 @@ def _console(**options: Any) -> "Console":
 class Terminal:
     """Prints results to standard output, progress and problems to standard error; its parameters are options of all
     commands that list them.
+
+    Options:
+        quiet: Print problems only.
+        verbose: Print a line per band pair.
+        log_json: Print one JSON object per line to standard error.
     """
 
     def __init__(
         self,
         *,
-        quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Print problems only.")] = False,
-        verbose: Annotated[bool, typer.Option("--verbose", "-v", help="Print a line per band pair.")] = False,
-        log_json: Annotated[
-            bool, typer.Option("--log-json", help="Print one JSON object per line to standard error.")
-        ] = False,
+        quiet: Annotated[bool, typer.Option("--quiet", "-q")] = False,
+        verbose: Annotated[bool, typer.Option("--verbose", "-v")] = False,
+        log_json: bool = False,
     ) -> None:
         self.quiet, self.verbose, self.log_json = quiet, verbose, log_json
         self._stopped_by: int | None = None
@@ -178,12 +181,6 @@ class Terminal:
             for number, handler in before.items():
                 signal.signal(number, handler)
             self.check()
-
-
-def examples(*lines: tuple[str, str]) -> str:
-    """Return the epilog of a help text from (command, description)."""
-    quoted = [(command.replace("[", r"\["), what.replace("[", r"\[")) for command, what in lines]
-    return "\n\n".join(["Examples:", *(f"[bold]{command}[/]  {what}" for command, what in quoted)])
 
 
 @contextmanager
