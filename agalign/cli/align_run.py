@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING
 from agalign.batch.earlier_results import outputs_exist
 from agalign.batch.workers import dask_executor
 from agalign.cameras.discover import FolderScan, discover
-from agalign.cli.terminal import MAX_LISTED, ExitCode, Terminal, shown
+from agalign.cli.terminal import MAX_LISTED, ExitCode, Terminal
 from agalign.config import DiscoverOptions, RunOptions, Settings
 from agalign.errors import InputError, OutputError, SidecarError, WorkerError
 from agalign.flight.groups import camera_overviews
@@ -28,7 +28,7 @@ from agalign.products.run.record import read_run_record
 from agalign.products.sidecar.file import read_result
 from agalign.products.sidecar.schema import BandResult
 from agalign.values.capture import Capture
-from agalign.values.text import counted
+from agalign.values.text import counted, escape_controls
 
 if TYPE_CHECKING:
     from agalign.batch.capture_task import CaptureReport
@@ -159,8 +159,7 @@ def run(
     from agalign.batch.run import Listener, run_flight
 
     asked = {c.label: len(c.moving) + len(c.missing_bands) for c in flight.captures}
-    totals, pace = RunTotals(flight.is_complete, asked), _Pace()
-    started = time.monotonic()
+    totals, started = RunTotals(flight.is_complete, asked), time.monotonic()
     with (
         cluster(dask, options.jobs, options.timeout_s) as executor,
         progress(terminal, len(flight.captures)) as show_line,
@@ -168,7 +167,8 @@ def run(
         options = replace(options, executor=executor)
 
         def show(share: float, text: str) -> None:
-            show_line(totals.states.total(), share, text, pace.of(totals.states))
+            skipped = totals.states["kept"] + totals.states["panel"] + totals.states["sky"]
+            show_line(totals.states.total() + share, text, skipped)
 
         def on_learning(camera: str, share: float) -> None:
             terminal.check()
@@ -226,10 +226,11 @@ def cluster(dask: str | None, jobs: int, timeout_s: float | None = None) -> Abst
 
 
 @contextmanager
-def progress(terminal: Terminal, captures: int) -> Iterator[Callable[[int, float, str, str], None]]:
+def progress(terminal: Terminal, captures: int) -> Iterator[Callable[[float, str, int], None]]:
     """Show a progress line on a terminal; yield the function that updates it.
 
-    Its arguments are the number of finished captures, the finished share of the current one, a description, and a rate.
+    Its arguments are the number of finished captures, with the finished share of the current one, a description, and
+    the number of captures that needed no time, which count neither for the rate nor for the time that is left.
     """
     if terminal.quiet or terminal.log_json or not terminal.err.is_terminal:
         yield lambda *_: None
@@ -239,40 +240,23 @@ def progress(terminal: Terminal, captures: int) -> Iterator[Callable[[int, float
 
     columns = (
         BarColumn(bar_width=20),
-        TextColumn("{task.fields[done]} of {task.total} captures"),
+        TextColumn("{task.fields[done]} of {task.fields[captures]} captures"),
         TextColumn("{task.fields[rate]}"),
         TimeElapsedColumn(),
         TextColumn("left"),
         TimeRemainingColumn(),
-        TextColumn("{task.description}", table_column=Column(no_wrap=True, overflow="ellipsis")),
+        TextColumn("{task.description}", markup=False, table_column=Column(no_wrap=True, overflow="ellipsis")),
     )
-    with Progress(*columns, console=terminal.err, transient=True) as line:
-        task = line.add_task("starting", total=captures, done=0, rate="")
+    with Progress(*columns, console=terminal.err, transient=True, speed_estimate_period=600) as line:
+        task = line.add_task("starting", total=captures, done=0, captures=captures, rate="")
 
-        def show(done: int, share: float, text: str, rate: str) -> None:
-            line.update(task, completed=done + share, done=done, rate=rate, description=shown(text))
+        def show(done: float, text: str, skipped: int) -> None:
+            speed = line.tasks[0].speed
+            rate = "" if speed is None else f"{60 * speed:.0f} a minute"
+            description, total = escape_controls(text), captures - skipped
+            line.update(task, description=description, total=total, completed=done - skipped, done=int(done), rate=rate)
 
         yield show
-
-
-@dataclass
-class _Pace:
-    """Captures per minute, without kept captures and the time for learning."""
-
-    since: float = field(default_factory=time.monotonic)
-    before: int = 0
-
-    def of(self, states: Counter[str]) -> str:
-        """Return the rate as text; empty until it is known."""
-        done = states.total() - states["kept"] - states["panel"] - states["sky"]
-        if done == 0:
-            self.since = time.monotonic()
-            return ""
-        # Captures that finish first were started before the clock.
-        if self.before == 0:
-            self.before, self.since = done, time.monotonic()
-        seconds = time.monotonic() - self.since
-        return f"{60 * (done - self.before) / seconds:.0f} a minute" if done > self.before else ""
 
 
 def _print_report(report: "CaptureReport", terminal: Terminal, number: int, count: int) -> None:

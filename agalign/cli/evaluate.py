@@ -41,11 +41,11 @@ def _evaluate(
     from agalign.evaluation.image_pairs import find_pairs
 
     chosen = methods or [*(f"fast:{sharing}" for sharing in get_args(Sharing)), "sift"]
-    named = {name: method_named(name) for name in chosen}
-    starts = Starts(_shares(shift), directions, seeding)
+    joint = given["settings"]["joint"]
+    named = {name: method_named(name, **joint, seeding=seeding) for name in chosen}
     results = []
     try:
-        for result in evaluate(find_pairs(pairs), named, starts, **given["settings"]["joint"]):
+        for result in evaluate(find_pairs(pairs), named, Starts(_shares(shift), directions), joint["rng_seed"]):
             results.append(result)
             line = f"{result.pair}, {result.method}: mAP {result.average_precision:.3f}, {result.error_px:.3f} px"
             terminal.event("result", line if terminal.verbose else "", **vars(result))

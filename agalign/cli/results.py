@@ -153,7 +153,7 @@ def _indices(
             reports += done
             for report in done:
                 _print(report, terminal)
-            show(number, 0.0, done[0].capture, "")
+            show(number, done[0].capture, 0)
         if target is None and (out / REPORT_FILE).is_file():
             write_pages(out, terminal.problem)
     return _conclude([one.name for one in chosen], reports, folder, terminal, as_json=as_json)

@@ -55,13 +55,6 @@ def command_line() -> str:
     return shlex.join(["agalign", *sys.argv[1:]])
 
 
-def shown(text: str) -> str:
-    """Return an external text for rich, with markup and control characters escaped."""
-    from rich.markup import escape
-
-    return escape(escape_controls(text))
-
-
 def in_json(value: Any) -> Any:
     """Return a value for JSON; nan and infinity, which JSON lacks, become strings."""
     return str(value) if isinstance(value, float) and not math.isfinite(value) else value
@@ -77,7 +70,7 @@ def _console(**options: Any) -> "Console":
             os.dup2(null_device, self.file.fileno())
             os.close(null_device)
 
-    return PipeConsole(highlight=False, emoji=False, **options)
+    return PipeConsole(markup=False, highlight=False, emoji=False, **options)
 
 
 class Terminal:
@@ -112,21 +105,21 @@ class Terminal:
             except BrokenPipeError:
                 self.err.on_broken_pipe()
         elif text and not self.quiet:
-            self.err.print(shown(text))
+            self.err.print(escape_controls(text))
 
     def problem(self, text: str, more: Sequence[str] = (), /, **fields: Any) -> None:
         """Print a problem, also with --quiet, followed by indented lines of details."""
         if self.log_json:
             self.event("problem", message=text, **fields)
             return
-        self.err.print(f"[yellow]agalign: {shown(text)}[/]")
+        self.err.print(f"agalign: {escape_controls(text)}", style="yellow")
         for line in more:
-            self.err.print(f"    {shown(line)}")
+            self.err.print(f"    {escape_controls(line)}")
 
     def result(self, text: str) -> None:
         """Print a result to standard output, unless --quiet or --log-json."""
         if not self.quiet and not self.log_json:
-            self.out.print(shown(text))
+            self.out.print(escape_controls(text))
 
     def facts(self, facts: Mapping[str, Any]) -> None:
         """Print the result of a command with --json to standard output."""
@@ -142,7 +135,7 @@ class Terminal:
         for place, name in enumerate(headers):
             table.add_column(name, justify="left" if place < texts else "right", overflow="fold")  # nothing is cut
         for row in rows:
-            table.add_row(*map(shown, row))
+            table.add_row(*map(escape_controls, row))
         if not self.quiet and not self.log_json:
             self.out.print(table)
 
@@ -186,23 +179,27 @@ class Terminal:
 @contextmanager
 def exits(terminal: Terminal, on_interrupt: str = "interrupted", config: Any = None) -> Iterator[None]:
     """Convert exceptions in the block to one line and an exit code; usage errors name the file of options."""
+    code, details = ExitCode.NOTHING + 0, ""
     try:
         with terminal.stoppable():
             yield
+        return
     except typer.Exit:
         raise
-    except BaseException as error:
-        code, text = _exit_code(error, on_interrupt)
-        if code is None:
-            raise
-        text += options_from(config) if code == ExitCode.USAGE else ""
-        with suppress(OSError):  # standard error may be a file on a full disk
-            if terminal.verbose and code == ExitCode.NOTHING and not isinstance(error, AgalignError):
-                from rich.markup import escape
-
-                terminal.err.print(escape(traceback.format_exc()))
-            terminal.problem(text)
-        raise typer.Exit(code) from None
+    except KeyboardInterrupt as error:
+        code = ExitCode.SIGNAL + (error.number if isinstance(error, Stopped) else signal.SIGINT)
+        text = on_interrupt
+    except ConfigurationError as error:
+        code, text = ExitCode.USAGE, f"{error}{options_from(config)}"
+    except AgalignError as error:
+        text = str(error)
+    except Exception as error:
+        text, details = _unexpected(error), traceback.format_exc()
+    with suppress(OSError):  # standard error may be a file on a full disk
+        if terminal.verbose and details:
+            terminal.err.print(details)
+        terminal.problem(text)
+    raise typer.Exit(code)
 
 
 def options_from(config: Any) -> str:
@@ -210,27 +207,15 @@ def options_from(config: Any) -> str:
     return f" (options also from {config})" if config else ""
 
 
-def _exit_code(error: BaseException, on_interrupt: str) -> tuple[int | None, str]:
-    """Return (exit code, message) for an exception; no code for exceptions that are not caught."""
-    match error:
-        case KeyboardInterrupt():
-            number = error.number if isinstance(error, Stopped) else signal.SIGINT
-            return ExitCode.SIGNAL + number, on_interrupt
-        case ConfigurationError():
-            return ExitCode.USAGE, str(error)
-        case AgalignError():
-            text = str(error)
-        case _ if is_out_of_memory(error):
-            text = "out of memory; close other programs or try a smaller image"
-        case ImportError():
-            text = f"a library cannot be loaded ({error}); is memory short, or the installation damaged?"
-        case OSError():
-            text = f"{error.filename or 'output'}: {error.strerror or error}"
-        case Exception():
-            text = f"agalign failed ({type(error).__name__}: {error}); please report this"
-        case _:
-            return None, ""
-    return ExitCode.NOTHING, text
+def _unexpected(error: Exception) -> str:
+    """Return the message for an exception of a library or of the system."""
+    if is_out_of_memory(error):
+        return "out of memory; close other programs or try a smaller image"
+    if isinstance(error, ImportError):
+        return f"a library cannot be loaded ({error}); is memory short, or the installation damaged?"
+    if isinstance(error, OSError):
+        return f"{error.filename or 'output'}: {error.strerror or error}"
+    return f"agalign failed ({type(error).__name__}: {error}); please report this"
 
 
 @contextmanager

@@ -17,7 +17,7 @@ from agalign.batch.capture_task import CaptureReport
 from agalign.cameras.discover import DiscoverOptions, FolderScan, Problem, discover
 from agalign.cli import main
 from agalign.cli.align_run import RunTotals, conclude, print_problems
-from agalign.cli.terminal import Terminal, exits, shown
+from agalign.cli.terminal import Terminal, exits
 from agalign.errors import ConfigurationError, InputError, UnreadableFileError
 from agalign.flight.groups import camera_overviews
 from agalign.synthetic import flight as synthetic
@@ -249,9 +249,13 @@ def test_each_end_has_a_code(error: BaseException, code: int, said: str, capsys:
     assert said in line
 
 
-def test_text_from_files_is_escaped_in_the_terminal() -> None:
-    assert shown("\x1b[31mred\a\n[b]") == "\\x1b[31mred\\x07\\n\\[b]"
-    assert shown("Köln, 雨 [1]") == "Köln, 雨 [1]"
+def test_text_from_files_is_escaped_in_the_terminal(capsys: pytest.CaptureFixture[str]) -> None:
+    terminal = Terminal()
+    terminal.problem("\x1b[31mred\a\n[b]")
+    terminal.table(["Capture"], [["Köln, 雨 [1]"]])
+    printed = capsys.readouterr()
+    assert printed.err == "agalign: \\x1b[31mred\\x07\\n[b]\n"
+    assert "│ Köln, 雨 [1] │" in printed.out
 
 
 def test_many_files_with_one_problem_are_counted(capsys: pytest.CaptureFixture[str]) -> None:

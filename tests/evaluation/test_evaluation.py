@@ -16,7 +16,6 @@ from agalign.config import JointSettings, SeedSettings, Settings
 from agalign.errors import ConfigurationError, InputError
 from agalign.evaluation.descriptor_learning import learn_descriptor
 from agalign.evaluation.evaluate import (
-    PairTask,
     Starts,
     average_precision,
     daisy_of_patches,
@@ -94,7 +93,7 @@ def test_hand_made_descriptors_find_copies_and_nothing_in_unrelated_images(name:
     fixed, other = texture(), texture(seed=5)
     keypoints = visible_in_both(sift_keypoints(fixed, maximum=200), np.eye(3), fixed, fixed)
     for moving, low, high in ((fixed, 0.99, 1.0), (other, 0.0, 0.05)):
-        describe = method_named(name)(PairTask(fixed, moving, np.eye(3))).describe
+        describe, _ = method_named(name)(fixed, moving, np.eye(3))
         assert describe is not None
         assert low <= average_precision(*describe(keypoints, np.eye(3))) <= high
 
@@ -123,7 +122,7 @@ def test_a_torchscript_descriptor_is_evaluated(tmp_path: Path) -> None:
         torch.jit.trace(flat, torch.zeros(2, 1, 32, 32)).save(str(path))
     fixed = texture()
     keypoints = visible_in_both(sift_keypoints(fixed, maximum=200), np.eye(3), fixed, fixed)
-    describe = method_named(f"{path}@32")(PairTask(fixed, fixed, np.eye(3))).describe
+    describe, _ = method_named(f"{path}@32")(fixed, fixed, np.eye(3))
     assert describe is not None
     assert average_precision(*describe(keypoints, np.eye(3))) > 0.95
     with pytest.raises(InputError, match="64 x 64"):
@@ -132,8 +131,8 @@ def test_a_torchscript_descriptor_is_evaluated(tmp_path: Path) -> None:
 
 def test_a_descriptor_learned_on_a_pair_beats_sift_with_reversed_contrast(tmp_path: Path) -> None:
     pair = write_pair(tmp_path, TRUTH, 3)
-    methods = {name: method_named(name) for name in ("fast:pseudo-siamese", "sift")}
-    results = list(evaluate([pair], methods, Starts((0.05,)), device="cpu"))
+    methods = {name: method_named(name, device="cpu") for name in ("fast:pseudo-siamese", "sift")}
+    results = list(evaluate([pair], methods, Starts((0.05,))))
     ours, sift = results
     assert ours.average_precision > 0.8
     assert ours.average_precision > sift.average_precision
@@ -189,7 +188,7 @@ def learnt(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_a_learned_descriptor_works_on_an_unseen_pair(learnt: Path, tmp_path: Path) -> None:
     pair = write_pair(tmp_path, TRUTH, 9)
     methods = {name: method_named(name) for name in (str(learnt), "sift")}
-    ours, sift = evaluate([pair], methods, Starts(), device="cpu")
+    ours, sift = evaluate([pair], methods, Starts())
     assert ours.average_precision > 0.7
     assert ours.average_precision > sift.average_precision
 
