@@ -66,21 +66,17 @@ def print_problems(flight: FolderScan, terminal: Terminal) -> None:
 
     With --log-json, print a line for each file.
     """
-    counts: Counter[str] = Counter()
-    listed: dict[str, str] = {}
+    by_cause: dict[str, list[str]] = defaultdict(list)
     for problem in flight.problems:
         # Group by message without numbers, because sizes differ between files with the same cause.
         cause = re.sub(r"\d+", "0", problem.text.replace(str(problem.path), "").replace(problem.path.name, ""))
-        counts[cause] += 1
-        if terminal.log_json or counts[cause] <= MAX_LISTED:
+        by_cause[cause].append(problem.path.name)
+        if terminal.log_json or len(by_cause[cause]) <= MAX_LISTED:
             terminal.problem(problem.text, file=problem.path)
-            listed[cause] = problem.path.name
-    for cause, count in counts.items():
-        if count > MAX_LISTED and not terminal.log_json:
-            terminal.problem(
-                f"{flight.folder}: {count - MAX_LISTED} more files with the same problem as {listed[cause]}; "
-                "'agalign info --json' lists all"
-            )
+    for names in by_cause.values():
+        if len(names) > MAX_LISTED and not terminal.log_json:
+            same = f"{len(names) - MAX_LISTED} more files with the same problem as {names[MAX_LISTED - 1]}"
+            terminal.problem(f"{flight.folder}: {same}; 'agalign info --json' lists all")
 
 
 def print_plan(flight: FolderScan, out: Path, settings: Settings, options: RunOptions, terminal: Terminal) -> int:
@@ -104,8 +100,8 @@ class RunTotals:
 
     is_complete: bool
     """All captures are good, no file has a problem, and the report is written."""
-    unfinished: dict[str, int] = field(default_factory=dict)
-    """Number of band pairs of each capture that has no result yet."""
+    asked: dict[str, int] = field(default_factory=dict)
+    """Number of band pairs of each capture that is to be aligned."""
     states: Counter[str] = field(default_factory=Counter)
     pairs: PairTotals = field(default_factory=PairTotals)
     saturated: dict[str, tuple[float, str]] = field(default_factory=dict)
@@ -117,8 +113,8 @@ class RunTotals:
         """Add the report of a capture."""
         self.states[report.state] += 1
         self.is_complete &= report.is_complete
-        if report.state != "error":
-            self.unfinished.pop(report.label, None)
+        if report.state in ("panel", "sky"):
+            self.asked.pop(report.label, None)
         if report.result is None:
             return
         self.pairs.add(report.label, report.result)
@@ -138,8 +134,6 @@ class RunTotals:
                 result = read_result(path)
                 if outputs_exist(path, result.files):
                     self.pairs.add(capture.label, result)
-                    continue
-            self.unfinished[capture.label] = len(capture.moving) + len(capture.missing_bands)
 
 
 def run(
@@ -338,14 +332,15 @@ def conclude(totals: RunTotals, out: Path, terminal: Terminal) -> int:
 
 
 def _print_totals(totals: RunTotals, terminal: Terminal) -> None:
-    lost, statuses = len(totals.unfinished), totals.pairs.statuses
-    asked = statuses.total() + sum(totals.unfinished.values())
+    statuses, written = totals.pairs.statuses, totals.pairs.captures
+    unfinished = [pairs for label, pairs in totals.asked.items() if label not in written]
+    asked, lost = statuses.total() + sum(unfinished), len(unfinished)
     if statuses:
         missing = f"; {counted(lost, 'capture')} not written" if lost else ""
         _print_table(totals.pairs, f"{statuses['aligned']} of {asked} band pairs aligned{missing}", terminal)
     explain(totals.pairs.groups(), terminal)
     if lost:
-        of_all = f"{lost} of {counted(lost + len(totals.pairs.captures), 'capture')}"
+        of_all = f"{lost} of {counted(lost + len(written), 'capture')}"
         terminal.problem(f"{of_all} could not be written, for the reasons above; the same command tries again")
     # Under a clear sky with the sun above 40 degrees, the irradiance changes by up to 10 % in half an hour.
     max_panel_age_s = 30 * 60.0

@@ -100,10 +100,7 @@ class Terminal:
         """Print a line of progress: JSON with --log-json, else the text unless --quiet."""
         if self.log_json:
             line = json.dumps({"event": kind, **{k: in_json(v) for k, v in fields.items()}}, default=str)
-            try:
-                print(line, file=sys.stderr, flush=True)
-            except BrokenPipeError:
-                self.err.on_broken_pipe()
+            self.err.out(line, highlight=False)
         elif text and not self.quiet:
             self.err.print(escape_controls(text))
 
