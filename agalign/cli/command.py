@@ -105,7 +105,13 @@ class Command:
     on_interrupt: str = "interrupted"
     panel: str | None = None
     """Panel in the list of commands."""
-    hidden: bool = False
+    alias: str = ""
+    """Second name of a command, which the list of commands leaves out."""
+
+    @property
+    def name(self) -> str:
+        """Its name on the command line."""
+        return self.alias or self.function.__name__.removeprefix("_")
 
     @property
     def summary(self) -> str:
@@ -135,7 +141,7 @@ class Command:
         default = self.defaults.get(option.name, option.default)
         return inspect.Parameter(option.name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=annotation)
 
-    def built(self, name: str) -> Any:
+    def built(self) -> Any:
         """Return the command of typer."""
         parameters, own = self.parameters(), inspect.signature(self.function).parameters
         fields = [p.name for p in parameters if p.name not in {*own, *_TERMINAL}]
@@ -157,7 +163,7 @@ class Command:
         app = typer.Typer(add_completion=False, rich_markup_mode="rich", pretty_exceptions_enable=False)
         cls = _LenientCommand if fields else TyperCommand
         epilog = "\n\n".join(["Examples:", *map(_highlighted, examples)]) if examples else None
-        app.command(name, cls=cls, epilog=epilog, hidden=self.hidden, rich_help_panel=self.panel)(call)
+        app.command(self.name, cls=cls, epilog=epilog, hidden=bool(self.alias))(call)
         return typer.main.get_command(app)
 
 

@@ -33,7 +33,7 @@ def _info(
         options: Print a --config file with all options of 'agalign align'.
     """
     if options:
-        typer.echo(config_text(align.built("align")))
+        typer.echo(config_text(align.built()))
         return ExitCode.OK
     if folder is None:
         raise ConfigurationError("give a folder with images, a model, or --options")

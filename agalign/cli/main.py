@@ -22,22 +22,9 @@ from agalign.cli.terminal import ExitCode, Terminal, options_from, printed
 from agalign.values.processes import limit_default_threads, silence_libraries
 from agalign.values.text import did_you_mean, name_problem
 
-COMMANDS = {
-    "align": align,
-    "demo": demo,
-    "info": info,
-    "report": report,
-    "verify": verify,
-    "indices": indices,
-    "ndvi": replace(indices, hidden=True),
-    "export": export,
-    "mosaic": mosaic,
-    "onto": onto,
-    "doctor": doctor,
-    "evaluate": evaluate,
-    "surface": surface,
-    "learn": learn,
-}
+ndvi = replace(indices, alias="ndvi")
+_ALL = align, demo, info, report, verify, indices, ndvi, export, mosaic, onto, doctor, evaluate, surface, learn
+COMMANDS = {command.name: command for command in _ALL}
 _UsageError: Any = typer.BadParameter.__mro__[1]
 """The class of click, or of the copy of click in typer."""
 
@@ -53,14 +40,13 @@ class RootGroup(TyperGroup):
 
     def get_command(self, ctx: Any, cmd_name: str) -> Any:  # noqa: ARG002
         """Return a command; None if there is none of this name."""
-        return COMMANDS[cmd_name].built(cmd_name) if cmd_name in COMMANDS else None
+        return COMMANDS[cmd_name].built() if cmd_name in COMMANDS else None
 
     def format_commands(self, ctx: Any, formatter: Any) -> None:  # noqa: ARG002
         """Write a section of commands for each panel."""
-        shown = {name: command for name, command in COMMANDS.items() if not command.hidden}
-        for panel in dict.fromkeys(command.panel for command in COMMANDS.values()):
+        for panel in dict.fromkeys(command.panel for command in _ALL):
             with formatter.section(panel or "Commands"):
-                formatter.write_dl([(name, c.summary) for name, c in shown.items() if c.panel == panel])
+                formatter.write_dl([(c.name, c.summary) for c in _ALL if c.panel == panel and not c.alias])
 
     def format_epilog(self, ctx: Any, formatter: Any) -> None:  # noqa: ARG002
         """Write the examples."""

@@ -42,14 +42,6 @@ class ExitCode(IntEnum):
     """Added to the number of the signal that ended the program, as shells do: 130 for SIGINT, 143 for SIGTERM."""
 
 
-class Stopped(KeyboardInterrupt):
-    """A signal requests the end of the program."""
-
-    def __init__(self, number: int) -> None:
-        super().__init__(number)
-        self.number = number
-
-
 def command_line() -> str:
     """Return the command line, quoted for a shell."""
     return shlex.join(["agalign", *sys.argv[1:]])
@@ -137,15 +129,15 @@ class Terminal:
             self.out.print(table)
 
     def check(self) -> None:
-        """Raise Stopped if a signal has requested the end: an exception from a signal handler is lost in callbacks of C
-        libraries.
+        """Raise KeyboardInterrupt, with the number of the signal, if one has requested the end: an exception from a
+        signal handler is lost in callbacks of C libraries.
         """
         if self._stopped_by is not None:
-            raise Stopped(self._stopped_by)
+            raise KeyboardInterrupt(self._stopped_by)
 
     @contextmanager
     def stoppable(self) -> Iterator[None]:
-        """Raise Stopped in the block at the first signal; the second one ends the process at once.
+        """Raise KeyboardInterrupt in the block at the first signal; the second one ends the process at once.
 
         While a module is imported, `check` or the end of the block raises it: Python ignores exceptions in callbacks of
         its import locks, and one of these locks may then be held for ever.
@@ -156,7 +148,7 @@ class Terminal:
                 os._exit(ExitCode.SIGNAL + number)
             self._stopped_by = number
             if frame is None or "<frozen importlib" not in frame.f_code.co_filename:
-                raise Stopped(number)
+                self.check()
 
         before = {}
         if threading.current_thread() is threading.main_thread():
@@ -184,8 +176,8 @@ def exits(terminal: Terminal, on_interrupt: str = "interrupted", config: Any = N
     except typer.Exit:
         raise
     except KeyboardInterrupt as error:
-        code = ExitCode.SIGNAL + (error.number if isinstance(error, Stopped) else signal.SIGINT)
-        text = on_interrupt
+        number = error.args[0] if error.args else signal.SIGINT
+        code, text = ExitCode.SIGNAL + number, on_interrupt
     except ConfigurationError as error:
         code, text = ExitCode.USAGE, f"{error}{options_from(config)}"
     except AgalignError as error:
