@@ -116,10 +116,12 @@ def test_info_shows_the_rig_of_a_model(tmp_path: Path) -> None:
     assert "no rig" in agalign_here("info", path).stdout
 
 
-def test_help_imports_nothing_that_is_slow_to_load() -> None:
+def test_the_names_of_the_package_and_the_help_import_nothing_that_is_slow_to_load() -> None:
     code = """
-import sys
-slow = {"torch", "rasterio", "numpy", "pydantic", "rich.console", "typer.rich_utils", "importlib.metadata"}
+import agalign, sys
+slow = {"cv2", "numpy", "pydantic", "rasterio", "scipy", "torch", "rich.console", "typer.rich_utils"}
+slow |= {"importlib.metadata"}
+dir(agalign)
 sys.argv = ["agalign", "--help"]
 from agalign.cli.main import main
 try:

@@ -8,22 +8,11 @@ import numpy as np
 import pytest
 import torch
 
-from agalign.capture.band_pair import BandPair
-from agalign.capture.reference import Reference
 from agalign.capture.seeding import find_seed
 from agalign.config import JointSettings, SeedSettings, Settings
 from agalign.errors import ConfigurationError, InputError
+from agalign.evaluation import evaluate as evaluation
 from agalign.evaluation.descriptor_learning import learn_descriptor
-from agalign.evaluation.evaluate import (
-    Starts,
-    average_precision,
-    daisy_of_patches,
-    evaluate,
-    grey_patches,
-    homography_error_px,
-    method_named,
-    sift_of_patches,
-)
 from agalign.evaluation.image_pairs import PairFiles
 from agalign.evaluation.surface import draw_surface, loss_surface
 from agalign.flight.model import load_model, save_model
@@ -32,7 +21,6 @@ from agalign.method.match import match_seed, matching_network, sift_keypoints, s
 from agalign.method.paper import Training
 from agalign.method.patches import patch_positions
 from agalign.values import geometry
-from agalign.values.image import Raster
 from agalign.values.issues import NO_SUCH_SEED, Issue
 
 from ..builders import in_full_run, pair_of, texture, two_views, whole
@@ -55,15 +43,15 @@ def write_pair(folder: Path, matrix: np.ndarray, seed: int, *size_px: int) -> Pa
 
 def test_average_precision_counts_nearest_neighbours() -> None:
     f = torch.eye(4)
-    assert average_precision(f, f) == 1.0
-    assert average_precision(f, f[[1, 0, 2, 3]]) == 0.5
-    assert math.isnan(average_precision(f[:0], f[:0]))
+    assert evaluation.average_precision(f, f) == 1.0
+    assert evaluation.average_precision(f, f[[1, 0, 2, 3]]) == 0.5
+    assert math.isnan(evaluation.average_precision(f[:0], f[:0]))
 
 
 def test_homography_error_is_the_mean_over_the_matches() -> None:
     points = geometry.lattice(100, 80, 5, 4)
-    assert homography_error_px(TRUTH @ geometry.translation(0, 0), TRUTH, points) == 0
-    assert homography_error_px(geometry.translation(3, 4), np.eye(3), points) == pytest.approx(5)
+    assert evaluation.homography_error_px(TRUTH @ geometry.translation(0, 0), TRUTH, points) == 0
+    assert evaluation.homography_error_px(geometry.translation(3, 4), np.eye(3), points) == pytest.approx(5)
 
 
 def test_keypoints_with_a_patch_outside_an_image_do_not_count() -> None:
@@ -77,12 +65,12 @@ def test_keypoints_with_a_patch_outside_an_image_do_not_count() -> None:
 def test_sift_and_daisy_of_a_mosaic_are_those_of_single_patches() -> None:
     fixed = texture()
     keypoints = sift_keypoints(fixed, maximum=30)
-    patches = grey_patches(fixed, patch_positions(keypoints, 64))
-    alone = torch.cat([sift_of_patches(p[None]) for p in patches])
-    together = sift_of_patches(patches)
+    patches = evaluation.grey_patches(fixed, patch_positions(keypoints, 64))
+    alone = torch.cat([evaluation.sift_of_patches(p[None]) for p in patches])
+    together = evaluation.sift_of_patches(patches)
     assert torch.cosine_similarity(alone, together).min() > 0.98
-    result = daisy_of_patches(patches)
-    assert torch.cosine_similarity(result[7], daisy_of_patches(patches[7:8])[0], dim=0) > 0.99
+    result = evaluation.daisy_of_patches(patches)
+    assert torch.cosine_similarity(result[7], evaluation.daisy_of_patches(patches[7:8])[0], dim=0) > 0.99
 
 
 @pytest.mark.parametrize("name", ["sift", in_full_run("daisy"), "mean.pt@32"])
@@ -97,15 +85,15 @@ def test_hand_made_descriptors_find_copies_and_nothing_in_unrelated_images(
     fixed, other = texture(), texture(seed=5)
     keypoints = visible_in_both(sift_keypoints(fixed, maximum=200), np.eye(3), fixed, fixed)
     for moving, low, high in ((fixed, 0.95, 1.0), (other, 0.0, 0.05)):
-        describe, _ = method_named(name)(fixed, moving, np.eye(3))
+        describe, _ = evaluation.method_named(name)(fixed, moving, np.eye(3))
         assert describe is not None
-        assert low <= average_precision(*describe(keypoints, np.eye(3))) <= high
+        assert low <= evaluation.average_precision(*describe(keypoints, np.eye(3))) <= high
     with pytest.raises(InputError, match=r"mean\.pt: not a TorchScript module of 64 x 64 patches"):
-        method_named("mean.pt@64")
+        evaluation.method_named("mean.pt@64")
 
 
 def test_starts_have_the_requested_error() -> None:
-    starts = list(Starts((0.0, 0.1), directions=4).of(TRUTH, 400, np.random.default_rng(0)))
+    starts = list(evaluation.Starts((0.0, 0.1), directions=4).of(TRUTH, 400, np.random.default_rng(0)))
     assert [share for share, _ in starts] == [0.0, 0.1, 0.1, 0.1, 0.1]
     shifts = [geometry.apply(geometry.compose(geometry.invert(TRUTH), m), [[0.0, 0.0]])[0] for _, m in starts]
     np.testing.assert_allclose([np.hypot(*s) for s in shifts], [0, 40, 40, 40, 40], atol=1e-9)
@@ -115,10 +103,10 @@ def test_starts_have_the_requested_error() -> None:
 def test_names_of_methods(tmp_path: Path) -> None:
     for name in ("surf", "fast:twins"):
         with pytest.raises(ConfigurationError, match=f"unknown method '{name}'"):
-            method_named(name)
+            evaluation.method_named(name)
     for name, message in (("none.pt", r"none\.pt: not a TorchScript module"), ("none.safetensors", r"none\.safe")):
         with pytest.raises(InputError, match=message):
-            method_named(str(tmp_path / name))
+            evaluation.method_named(str(tmp_path / name))
 
 
 @pytest.mark.full
@@ -139,32 +127,28 @@ UNRELATED = texture(seed=70), texture(seed=71)
 ON_CPU = Settings(joint=JointSettings(device="cpu"))
 
 
-def rough_pair(name: str, fixed: Raster, moving: Raster) -> BandPair:
-    return BandPair(name, Reference(fixed), moving, {"user": np.eye(3)})
-
-
 @pytest.fixture(scope="module")
 def learnt(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    pairs = [rough_pair(str(k), *two_views(TRUTH, seed=k)) for k in (1, 2)]
+    pairs = [pair_of(*two_views(TRUTH, seed=k)) for k in (1, 2)]
     path = tmp_path_factory.mktemp("learnt") / "learnt.safetensors"
-    save_model(learn_descriptor([*pairs, rough_pair("unrelated", *UNRELATED)], ON_CPU, steps_a_pair=30), path)
+    save_model(learn_descriptor([*pairs, pair_of(*UNRELATED)], ON_CPU, steps_a_pair=30), path)
     return path
 
 
 @pytest.mark.full
 def test_a_learned_descriptor_works_on_an_unseen_pair(learnt: Path, tmp_path: Path) -> None:
     pair = write_pair(tmp_path, TRUTH, 9)
-    methods = {name: method_named(name) for name in (str(learnt), "sift")}
-    ours, sift = evaluate([pair], methods, Starts())
+    methods = {name: evaluation.method_named(name) for name in (str(learnt), "sift")}
+    ours, sift = evaluation.evaluate([pair], methods, evaluation.Starts())
     assert ours.average_precision > 0.7
     assert ours.average_precision > sift.average_precision
 
 
 def test_nothing_aligned_is_nothing_to_learn_from() -> None:
-    blank = rough_pair("blank", texture(), whole(np.zeros((320, 400), np.float32)))
+    blank = pair_of(texture(), whole(np.zeros((320, 400), np.float32)))
     with pytest.raises(InputError, match="no pair could be aligned"):
         learn_descriptor([blank], ON_CPU)
-    colour = rough_pair("colour", whole(np.stack([texture().pixels] * 3)), texture())
+    colour = pair_of(whole(np.stack([texture().pixels] * 3)), texture())
     with pytest.raises(InputError, match="different channels"):
         learn_descriptor([blank, colour], ON_CPU)
 
