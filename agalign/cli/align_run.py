@@ -368,25 +368,19 @@ def explain(failures: Sequence[FailureGroup], terminal: Terminal) -> None:
             names = [f"{b.capture} {b.band}" for b in group.bands]
             more = f" and {len(names) - max_named} more" if len(names) > max_named else ""
             named = [f"{', '.join(names[:max_named])}{more}: {first.reason}"]
-        terminal.problem(
-            text,
-            (*named, f"try: {group.advice}"),
-            status=group.status,
-            bands=len(group.bands),
-            captures=group.captures,
-            advice=group.advice,
-        )
+        counts = {"bands": len(group.bands), "captures": group.captures}
+        terminal.problem(text, (*named, f"try: {group.advice}"), status=group.status, **counts, advice=group.advice)
 
 
 def _print_table(pairs: PairTotals, title: str, terminal: Terminal) -> None:
     """Print a row per band: number of pairs by status, residuals, time."""
-    columns = {"aligned": "Aligned", "predicted": "Predicted", "seed_only": "Seed only", "failed": "Failed"}
+    columns, rows = ["aligned", "predicted", "seed_only", "failed"], []
     if pairs.statuses["missing"]:
-        columns["missing"] = "Missing"
-    rows = []
+        columns.append("missing")
     for name, band in pairs.bands.items():
         px, seconds = band.residuals_px, f"{median(band.seconds):.1f}" if band.seconds else "-"
         residuals = (f"{median(px):.3f}", f"{max(px):.3f}") if px else ("-", "-")
         rows.append((name, *(str(band.statuses[status]) for status in columns), *residuals, seconds))
-    headers = ("Band", *columns.values(), "Residual px, median", "Worst", "Seconds a pair")
+    titles = (status.replace("_", " ").capitalize() for status in columns)
+    headers = ("Band", *titles, "Residual px, median", "Worst", "Seconds a pair")
     terminal.table(headers, rows, title, texts=1)

@@ -77,9 +77,9 @@ def help_of(function: Any) -> tuple[str, dict[str, str], list[str]]:
     return text, {name: " ".join(words.split()) for name, words in options}, [line.strip() for line in examples]
 
 
-def _own_option(parameter: inspect.Parameter, text: str | None) -> inspect.Parameter:
-    """Return a parameter of a function, which may have an option of typer as annotation, as a parameter of the command
-    line, with this help text unless the annotation has one.
+def _on_command_line(parameter: inspect.Parameter, text: str | None, panel: str | None) -> inspect.Parameter:
+    """Return a parameter, which may have an option of typer as annotation, as one of the command line in a panel of
+    its help. The help text replaces that of the annotation.
     """
     kind, info = parameter.annotation, typer.Option()
     if kind is bool:
@@ -87,8 +87,8 @@ def _own_option(parameter: inspect.Parameter, text: str | None) -> inspect.Param
     elif get_origin(kind) is Annotated:
         kind, info = get_args(kind)
     info = copy.copy(info)
-    info.help = info.help or text
-    return parameter.replace(annotation=Annotated[kind, info])
+    info.help, info.rich_help_panel = text or info.help, panel
+    return parameter.replace(kind=inspect.Parameter.KEYWORD_ONLY, annotation=Annotated[kind, info])
 
 
 @dataclass(frozen=True)
@@ -124,20 +124,12 @@ class Command:
         panels = {name: panel for panel, names in self.panels.items() for name in names.split()}
         names = [*(name for name in own if name not in ("terminal", "given", *panels)), *panels]
         helps = help_of(Terminal)[1] | help_of(self.function)[1]
-        result = []
-        for name in names:
-            if name in own or name in _TERMINAL:
-                parameter = _own_option(own.get(name) or _TERMINAL[name], helps.get(name))
-            else:
-                parameter = self._field_option(field_options()[name], helps.get(name))
-            get_args(parameter.annotation)[1].rich_help_panel = panels.get(name)
-            result.append(parameter.replace(kind=inspect.Parameter.KEYWORD_ONLY))
-        return result
+        parameters = (own.get(name) or _TERMINAL.get(name) or self._of_field(field_options()[name]) for name in names)
+        return [_on_command_line(p, helps.get(p.name), panels.get(p.name)) for p in parameters]
 
-    def _field_option(self, option: "Option", text: str | None) -> inspect.Parameter:
-        info = {**option.info, "help": text or option.info["help"]}
+    def _of_field(self, option: "Option") -> inspect.Parameter:
         kind: Any = option.type
-        annotation = Annotated[kind, typer.Option(*filter(None, (option.flag, option.short)), **info)]
+        annotation = Annotated[kind, typer.Option(*filter(None, (option.flag, option.short)), **option.info)]
         default = self.defaults.get(option.name, option.default)
         return inspect.Parameter(option.name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=annotation)
 
