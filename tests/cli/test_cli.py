@@ -11,6 +11,7 @@ from pathlib import Path
 import jsonschema
 import numpy as np
 import pytest
+import rasterio
 from scipy.interpolate import CloughTocher2DInterpolator
 
 import agalign as agalign_package
@@ -67,19 +68,20 @@ def test_summary_report_and_log(aligned_flight: Path, aligned_copy: Path) -> Non
     assert all(c["seconds"] > sum(b["seconds"] for b in c["bands"]) for c in reported)
 
 
-def test_a_repaired_input_and_a_damaged_output_are_done_again(tmp_path: Path) -> None:
-    write_capture(tmp_path / "in", "green", "nir", name="a")
-    nir, stack, command = (
-        tmp_path / "in" / "a_nir.tif",
-        tmp_path / "out" / "a.tif",
-        (tmp_path / "in", "-o", tmp_path / "out"),
-    )
-    good = nir.read_bytes()
-    nir.write_bytes(good[: len(good) // 2])
-    first = agalign_here(*command, "--log-json")
+def test_a_blank_input_and_a_damaged_output_are_done_again_when_they_are_repaired(tmp_path: Path) -> None:
+    """The blank band does not stop the other one."""
+    write_capture(tmp_path / "in", "green", "red", "nir", name="a")
+    nir, stack = tmp_path / "in" / "a_nir.tif", tmp_path / "out" / "a.tif"
+    command, good = (nir.parent, "-o", stack.parent, "--relief", "never"), nir.read_bytes()
+    write_band(nir, np.full((240, 300), 5000, np.uint16))
+    first = agalign_here(*command)
     assert first.returncode == 3
-    assert any("a_nir.tif" in json.loads(line).get("message", "") for line in first.stderr.splitlines())
-    assert not stack.exists()
+    assert "a nir: failed: the moving band is constant or all invalid" in first.stderr
+    bands = read_json(stack.with_suffix(".json"))["bands"]
+    assert {b["band"]: b["status"] for b in bands} == {"green": "reference", "red": "aligned", "nir": "failed"}
+    with rasterio.open(stack) as written:
+        has_pixels = {n: written.read_masks(i).any() for i, n in enumerate(written.descriptions, start=1)}
+    assert has_pixels == {"green": True, "red": True, "nir": False}
     nir.write_bytes(good)
     assert agalign_here(*command).returncode == 0
     size = stack.stat().st_size

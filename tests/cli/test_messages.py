@@ -57,22 +57,10 @@ GREEN = "(did you mean 'Green'?); choose from Blue, Green, Red, NIR, Red edge"
         ("align {flight} -o {tmp}/o --bands Green", 2, "--bands Green: leaves less than the two bands"),
         ("align {flight} -o {tmp}/o --bands Green,NIR --reference red", 2, "asks; choose from Green, NIR"),
         ("align {flight} -o {tmp}/o --pattern {{capture}}_{{band}}.png", 2, "matches none of 10 images, such as IMG_"),
-        (
-            "align {flight} -o {tmp}/o --include *.xyz",
-            1,
-            "none of 10 images, such as 0000SET/000/IMG_0001_1.tif, passes",
-        ),
+        ("align {flight} -o {tmp}/o --include *.xyz", 1, "none of 10 images, such as 0000SET/000/IMG_0001_1.tif"),
         ("align {flight} --dry-run --georeference", 2, "no capture has a height above the ground; give --ground-elev"),
-        (
-            "align {flight} --dry-run --radiometry panel",
-            2,
-            "--radiometry panel: no usable calibration panel of known reflectance",
-        ),
-        (
-            "align {flight} -o {tmp}/o --model nosuch",
-            1,
-            "nosuch: cannot be read as a model (No such file or directory);",
-        ),
+        ("align {flight} --dry-run --radiometry panel", 2, "--radiometry panel: no usable calibration panel of known"),
+        ("align {flight} -o {tmp}/o --model nosuch", 1, "nosuch: cannot be read as a model (No such file or directory"),
         ("align {flight} -o {tmp}/o --model {tmp}", 1, "cannot be read as a model (it is not a regular file); give"),
         ("align {flight} -o {tmp}/o --device gpu", 2, "unknown device 'gpu'; use auto, cpu, cuda"),
         ("align {flight} -o {tmp}/o --device cuda:99", 2, "device 'cuda:99' cannot be used"),
@@ -134,10 +122,8 @@ def test_a_narrow_terminal_shows_every_date(flight: Path, monkeypatch: pytest.Mo
     rows = [line for line in printed.splitlines() if line.startswith("│")]
     assert {len(row) for row in rows} == {80}
     assert "…" not in printed
-    for capture in captures:
-        date, time = capture["captured_at"][:19].split("T")
-        assert any(date in row for row in rows)
-        assert any(time in row for row in rows)
+    for part in (part for capture in captures for part in capture["captured_at"][:19].split("T")):
+        assert any(part in row for row in rows)
 
 
 def test_a_folder_without_captures_is_described(tmp_path: Path) -> None:
@@ -271,7 +257,7 @@ def test_the_age_of_a_panel_is_printed_and_warned_of(
 
 
 def test_the_totals_count_missing_bands_and_captures_without_a_result(capsys: pytest.CaptureFixture[str]) -> None:
-    """Of a disk that is full after the second of four captures."""
+    """Of a disk that is full after the third of four captures, which shows a panel."""
     totals = RunTotals(False, {f"IMG_{number}": 2 for number in range(4)})
     blue = {"band": "Blue", "file": "b.tif", "band_index": 1, "width": 10, "height": 8}
     aligned = NIR | {"status": "aligned", "reason": None}
@@ -280,13 +266,14 @@ def test_the_totals_count_missing_bands_and_captures_without_a_result(capsys: py
     totals.add(
         CaptureReport("IMG_1", "done", example(bands=[aligned], missing_bands=["Green"], reference=blue).result())
     )
+    totals.add(CaptureReport("IMG_2", "panel", panel="a calibration panel"))
     assert conclude(totals, Path("out"), Terminal()) == 3
     printed = capsys.readouterr()
-    assert "3 of 8 band pairs aligned; 2 captures not written" in printed.out
+    assert "3 of 6 band pairs aligned; 1 capture not written" in printed.out
     assert re.search(r"^│ Green +│ +0 │ +0 │ +0 │ +0 │ +1 │ +- │ +- │ +- │$", printed.out, re.MULTILINE)
     reference = "IMG_1 Blue: other reference: on the grid of Blue; most captures of the flight are on that of Green"
     assert reference in printed.err
-    assert "2 of 4 captures could not be written" in printed.err
+    assert "1 of 3 captures could not be written" in printed.err
     assert "Saturated pixels: NIR up to 3.1% (IMG_0)" in printed.out
 
 
