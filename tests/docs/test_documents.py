@@ -26,7 +26,7 @@ import agalign
 from agalign.synthetic import flight as synthetic
 from agalign.values import geometry
 
-from ..builders import displaced_views
+from ..builders import displaced_views, in_full_run
 from ..cli.test_onto import TRUTH as MOVEMENT
 from ..cli.test_onto import write_mosaic
 from ..conftest import REAL_DATA, Shared, textured_pair, write_band
@@ -162,13 +162,7 @@ def test_every_example_is_run() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "name",
-    [
-        pytest.param(name, marks=[pytest.mark.full] if name in ("next_flight.py", "on_dask.py") else [])
-        for name in EXAMPLES
-    ],
-)
+@pytest.mark.parametrize("name", [in_full_run(n) if n in ("next_flight.py", "on_dask.py") else n for n in EXAMPLES])
 def test_an_example(name: str, desk: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     arguments, text, times = EXAMPLES[name]
     monkeypatch.chdir(desk)
