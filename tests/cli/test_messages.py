@@ -6,6 +6,7 @@ import os
 import re
 import signal
 from pathlib import Path
+from typing import get_args
 
 import cv2
 import numpy as np
@@ -17,6 +18,7 @@ from agalign.batch.capture_task import CaptureReport
 from agalign.cameras.discover import FolderScan, Problem, discover
 from agalign.cli import main
 from agalign.cli.align_run import RunTotals, conclude, print_problems
+from agalign.cli.command import Command, help_of
 from agalign.cli.terminal import Terminal, exits
 from agalign.errors import ConfigurationError, InputError, UnreadableFileError
 
@@ -174,6 +176,14 @@ def test_expert_options_are_a_panel_at_the_end(monkeypatch: pytest.MonkeyPatch) 
     assert last.startswith("Expert")
     expert = ["--recipe", "--sharing", "--model-family", "--each-alone", "--rng-seed"]
     assert re.findall(r"^│ (--[a-z-]+)", last, re.MULTILINE) == expert
+
+
+@pytest.mark.parametrize("command", main.COMMANDS.values(), ids=main.COMMANDS)
+def test_every_option_of_a_command_has_a_help_text(command: Command) -> None:
+    """And its docstring describes no other option."""
+    helps = {p.name: get_args(p.annotation)[1].help for p in command.parameters()}
+    assert all(helps.values())
+    assert set(help_of(command.function)[1]) <= set(helps)
 
 
 def test_the_list_of_commands_has_whole_sentences() -> None:
