@@ -5,35 +5,19 @@ help text of its command-line option, and its row in docs/options.md. Other para
 use them, with their reasons.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import Executor
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from operator import not_
 from pathlib import Path
 from typing import Annotated, Any
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
 from pydantic import dataclasses as validated
+from pydantic.fields import FieldInfo
 
 from agalign.errors import ConfigurationError
-from agalign.values.choices import (
-    MAX_PIXELS,
-    MAX_RNG_SEED,
-    BandOrder,
-    Compression,
-    Crop,
-    FamilyChoice,
-    Interpolation,
-    Layout,
-    RadiometryChoice,
-    RasterFormat,
-    Recipe,
-    ReliefUse,
-    Resolution,
-    SeedChoice,
-    SeedKind,
-    Sharing,
-)
+from agalign.values import choices
 
 
 def names_in(text: str | None) -> tuple[str, ...]:
@@ -61,7 +45,9 @@ def albedos(text: str | None) -> tuple[tuple[str, float], ...]:
 
 @dataclass(frozen=True)
 class Option:
-    """The command-line option of a field, where it differs from the field."""
+    """The command-line option of a field. The annotation of the field states what differs from it;
+    `cli.command.field_options` adds the rest.
+    """
 
     name: str = ""
     """Its name as an identifier; by default that of the field."""
@@ -76,6 +62,21 @@ class Option:
     """Its value if it is given without one."""
     former: str = ""
     """A deprecated name, with its dashes."""
+    path: tuple[str, ...] = ()
+    """Names of the model (settings, discover or run), of the stage, if any, and of the field."""
+    info: Mapping[str, Any] = field(default_factory=dict)
+    """Help text and range."""
+
+    @property
+    def flag(self) -> str:
+        """Its long name, with its dashes."""
+        return f"--{self.name.replace('_', '-')}"
+
+
+def option_of(name: str, of_field: FieldInfo) -> Option:
+    """Return the option that the annotation of a field describes."""
+    option = next((m for m in of_field.metadata if isinstance(m, Option)), Option())
+    return replace(option, name=option.name or name)
 
 
 def _yes_or_no(yes: str, no: str) -> BeforeValidator:
@@ -83,6 +84,7 @@ def _yes_or_no(yes: str, no: str) -> BeforeValidator:
     return BeforeValidator(lambda value: {True: yes, False: no}[value] if isinstance(value, bool) else value)
 
 
+_RELIEF = Option("relief", alone="always", former="--local")
 _GLOBS = Option(type=list[str] | None, parse=lambda globs: tuple(globs or ()))
 
 
@@ -100,11 +102,11 @@ class DiscoverOptions:
     """Also align the camera's colour photograph (JPEG), as three bands."""
     bands: Annotated[tuple[str, ...], Option(type=str | None, parse=names_in)] = ()
     """Names of the bands to align, separated by commas; by default all."""
-    order: BandOrder = "index"
+    order: choices.BandOrder = "index"
     """Order of the bands: as numbered by the camera, by wavelength, or by name."""
     skip: tuple[Path, ...] = ()
     """Folders to leave out, such as the output folder."""
-    max_pixels: Annotated[int, Field(ge=1)] = MAX_PIXELS
+    max_pixels: Annotated[int, Field(ge=1)] = choices.MAX_PIXELS
     """Refuse images with more pixels than this, without reading them."""
     jobs: int = 1
     """Processes that read the tags of many files; with more than one the calling script must be importable."""
@@ -144,28 +146,27 @@ class SettingsModel(BaseModel):
     @classmethod
     def flag(cls, field: str) -> str:
         """Return the long name of the command-line option of a field, with its dashes."""
-        names = (m.name for m in cls.model_fields[field].metadata if isinstance(m, Option) and m.name)
-        return "--" + next(names, field).replace("_", "-").removeprefix("start-")  # --model sets `start_model`
+        return option_of(field, cls.model_fields[field]).flag.replace("--start-", "--")  # --model sets `start_model`
 
     def __repr_args__(self) -> Iterator[tuple[str | None, Any]]:
         """Return the fields that differ from their defaults."""
-        for name, field in type(self).model_fields.items():
-            if (value := getattr(self, name)) != field.get_default():
+        for name, of_field in type(self).model_fields.items():
+            if (value := getattr(self, name)) != of_field.get_default():
                 yield name, value
 
 
 class JointSettings(SettingsModel):
     """Joint optimisation of the descriptor and the homographies."""
 
-    recipe: Recipe = "fast"
+    recipe: choices.Recipe = "fast"
     """Algorithm: fast, the same from random weights (scratch), or the published one (paper)."""
-    sharing: Sharing = "pseudo-siamese"
+    sharing: choices.Sharing = "pseudo-siamese"
     """Layers that the networks of both bands share: all, all but the first, or none."""
-    model_family: FamilyChoice = "auto"
+    model_family: choices.FamilyChoice = "auto"
     """Mapping to fit; auto is the most general one that the images determine."""
     device: str = "auto"
     """Torch device: auto, cpu, cuda, cuda:1 …"""
-    rng_seed: Annotated[int, Field(ge=0, le=MAX_RNG_SEED)] = 0
+    rng_seed: Annotated[int, Field(ge=0, le=choices.MAX_RNG_SEED)] = 0
     """Seed of all random numbers."""
 
 
@@ -182,8 +183,8 @@ class SeedSettings(SettingsModel):
     """Initial alignment."""
 
     force: Annotated[
-        SeedKind | None,
-        Option("seed", type=SeedChoice, default="auto", parse=lambda kind: None if kind == "auto" else kind),
+        choices.SeedKind | None,
+        Option("seed", type=choices.SeedChoice, default="auto", parse=lambda kind: None if kind == "auto" else kind),
     ] = None
     """Use only this kind of initial alignment; auto is the best of all."""
     only: Annotated[bool, Option("only_seed")] = False
@@ -202,9 +203,9 @@ class ReliefSettings(SettingsModel):
 
     # A single moving lens gets a smooth displacement field instead, if left-out windows confirm it: no other band can
     # verify its relief.
-    use: Annotated[ReliefUse, _yes_or_no("always", "never"), Option("relief", alone="always", former="--local")] = (
-        "auto"
-    )
+    use: Annotated[
+        choices.ReliefUse, _yes_or_no("always", "never"), Option("relief", alone="always", former="--local")
+    ] = "auto"
     """Correct parallax (trees, terraces, close range) by one relief for all bands of a capture. auto: if windows show
     parallax. --relief alone means always."""
 
@@ -214,20 +215,20 @@ class WriteSettings(SettingsModel):
 
     # RMS error on a random image of waves of up to 0.25 cycles/px, relative to its standard deviation: Lanczos 1.4 %,
     # OpenCV's cubic kernel 3.0 %, bilinear 16 %.
-    interpolation: Interpolation = "lanczos"
+    interpolation: choices.Interpolation = "lanczos"
     """Resampling of the moving bands."""
-    crop: Crop = "flight"
+    crop: choices.Crop = "flight"
     """Area to write: shared by all bands of all captures of a camera (flight) or of the capture (common), or the whole
     reference (none)."""
-    format: RasterFormat = "gtiff"
+    format: choices.RasterFormat = "gtiff"
     """Write tiled GeoTIFF or cloud-optimised GeoTIFF."""
-    compression: Compression = "auto"
+    compression: choices.Compression = "auto"
     """Lossless compression; auto is zstd for stacks and deflate for single bands."""
     undistort: bool = False
     """Remove the lens distortion of the reference from the output."""
-    layout: Layout = "stack"
+    layout: choices.Layout = "stack"
     """Write one stack per capture, one file with tags per input file, or both."""
-    resolution: Resolution = "reference"
+    resolution: choices.Resolution = "reference"
     """Pixel size: of the reference or of the finest band."""
     georeference: bool = False
     """Write an approximate georeference from GPS, altitude and yaw."""
@@ -254,7 +255,7 @@ class WriteSettings(SettingsModel):
     """Add confidence and range (m) to the raster of a capture's relief."""
     fill_occluded: bool = False
     """Interpolate pixels that are occluded in a band; by default they are nodata."""
-    radiometry: Annotated[RadiometryChoice, _yes_or_no("auto", "off"), Option(alone="auto")] = "off"
+    radiometry: Annotated[choices.RadiometryChoice, _yes_or_no("auto", "off"), Option(alone="auto")] = "off"
     """Write float32: radiance by the camera's calibration (camera), reflectance by light sensor (sun) or by calibration
     panel and light sensor if any (panel), or panel, sun, camera, the first that is available (auto; --radiometry
     alone). Thermal bands: degrees C."""

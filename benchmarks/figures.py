@@ -20,7 +20,7 @@ from synthetic_flights.depth import write_capture
 from synthetic_flights.relief import make_scene
 
 from agalign.config import JointSettings
-from agalign.evaluation.evaluate import PairTask, method_named
+from agalign.evaluation.evaluate import method_named
 from agalign.evaluation.image_pairs import read_image
 from agalign.evaluation.surface import draw_surface, loss_surface
 from agalign.method.match import sift_keypoints, to_8_bit, visible_in_both
@@ -60,7 +60,7 @@ def matches(fixed: Raster, moving: Raster, truth: Matrix) -> NDArray[np.uint8]:
     drawn = rng.choice(len(keypoints), DRAWN, replace=False)
     rows = []
     for name, title in (("fast:pseudo-siamese", "learned on this pair"), ("sift", "SIFT")):
-        describe = method_named(name)(PairTask(fixed, moving, start, seeding=False)).describe
+        describe, _ = method_named(name)(fixed, moving, start)
         assert describe is not None
         f, f_prime = describe(keypoints, truth)
         nearest = ((f[:, None] - f_prime[None]) ** 2).sum(-1).argmin(1).numpy()

@@ -2,8 +2,6 @@
 
 import operator
 import re
-import subprocess
-import sys
 import typing
 from pathlib import Path
 
@@ -51,14 +49,6 @@ def test_types_in_the_signatures_are_public(name: str) -> None:
     ours = {t.__name__ for t in own if t.__module__.startswith("agalign") and hasattr(t, "__name__")}
     assert ours
     assert ours <= set(agalign.__all__)
-
-
-def test_importing_loads_no_heavy_library(tmp_path: Path) -> None:
-    heavy = {"cv2", "numpy", "pydantic", "rasterio", "scipy", "torch"}
-    code = f"import agalign, sys; dir(agalign); print({heavy!r} & set(sys.modules))"
-    root = Path(agalign.__file__).parents[1]
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=root)
-    assert done.stdout.strip() == "set()"
 
 
 def test_settings_print_values_other_than_defaults() -> None:

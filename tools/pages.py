@@ -23,9 +23,9 @@ from bands.score import table
 from common import with_section
 
 import agalign
-from agalign.cli.command import FieldOption, field_options
+from agalign.cli.command import field_options
 from agalign.cli.main import COMMANDS
-from agalign.config import DiscoverOptions, RunOptions, Settings
+from agalign.config import DiscoverOptions, Option, RunOptions, Settings
 from agalign.products.indices.formulas import INDICES
 from agalign.products.sidecar.schema import Sidecar
 from agalign.values.issues import Issue, sentence
@@ -36,7 +36,7 @@ SCHEMA = Path(agalign.__file__).parent / "sidecar.schema.json"
 
 
 def options(owner: str) -> str:
-    """One row per option of an owner in `Given`: its name, the Python name, type and default, and help text.
+    """One row per option of a model in `Given`: its name, the Python name, type and default, and help text.
 
     Options of the command line only are in the table of `run`.
     """
@@ -44,25 +44,25 @@ def options(owner: str) -> str:
     defaults = {"settings": Settings(), "discover": DiscoverOptions(), "run": RunOptions()}[owner]
     for parameter in COMMANDS["align"].parameters():
         option = field_options().get(parameter.name)
-        if owner != (option.owner if option else "run") or parameter.name == "folder":
+        if owner != (option.path[0] if option else "run") or parameter.name == "folder":
             continue
         kind, info = typing.get_args(parameter.annotation)
         python, value = f"argument `{parameter.name}`" if parameter.name in ("model", "out") else "", type_name(kind)
         if option is not None:
-            name, opposite = ".".join(option.path), " (opposite)" if option.option.parse is not_ else ""
+            name, opposite = ".".join(option.path[1:]), " (opposite)" if option.parse is not_ else ""
             python = f"`{name}`{opposite}"
             value = with_default(value, option, parameter.default, attrgetter(name)(defaults))
         rows.append((f"`--{parameter.name.replace('_', '-')}`", python, value, effect(info.help)))
     return table(rows) + "\n"
 
 
-def with_default(values: str, option: FieldOption, given: Any, in_python: Any) -> str:
+def with_default(values: str, option: Option, given: Any, in_python: Any) -> str:
     """Return the values of an option with its default in bold, and that of its field if it gives another result."""
     if given is None or given is False:
         return values
     if f"`{given}`" in values:
         return values.replace(f"`{given}`", f"**`{given}`**")
-    differs = option.option.parse(given) != in_python
+    differs = option.parse(given) != in_python
     return f"{values}, **`{given}`**" + (f" (in Python **`{in_python}`**)" if differs else "")
 
 

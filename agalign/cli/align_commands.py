@@ -10,7 +10,7 @@ from typing import Annotated
 import typer
 
 from agalign.cli.command import Command, Given, load_config
-from agalign.cli.terminal import RAW_NUMBERS, Terminal, command_line, examples
+from agalign.cli.terminal import RAW_NUMBERS, Terminal, command_line
 from agalign.values.choices import MAX_MOSAIC_PIXELS
 from agalign.values.processes import usable_cores
 
@@ -22,23 +22,29 @@ _command = partial(
 def _align(
     terminal: Terminal,
     given: Given,
-    folder: Annotated[Path, typer.Argument(help="Folder with the images, sub-folders included.")],
-    model: Annotated[
-        Path | None,
-        typer.Option(help="Reuse the network and rig of an earlier flight of the same camera: OUT/models/…."),
-    ] = None,
-    out: Annotated[Path | None, typer.Option("-o", "--out", help="Output folder; by default FOLDER-aligned.")] = None,
-    dry_run: Annotated[bool, typer.Option("--dry-run", help="Print what would be done, and write nothing.")] = False,
-    config: Annotated[  # noqa: ARG001 - its callback applies the file
-        Path | None,
-        typer.Option(
-            is_eager=True,
-            callback=load_config,
-            help="Read these options from a TOML file; 'agalign info --options' prints one.",
-        ),
-    ] = None,
+    folder: Annotated[Path, typer.Argument()],
+    model: Path | None = None,
+    out: Annotated[Path | None, typer.Option("-o", "--out")] = None,
+    dry_run: bool = False,
+    config: Annotated[Path | None, typer.Option(is_eager=True, callback=load_config)] = None,  # noqa: ARG001 - applied
 ) -> int:
-    """Align every capture below FOLDER."""
+    """Align every capture below FOLDER.
+
+    Options:
+        folder: Folder with the images, sub-folders included.
+        model: Reuse the network and rig of an earlier flight of the same camera: OUT/models/….
+        out: Output folder; by default FOLDER-aligned.
+        dry_run: Print what would be done, and write nothing.
+        config: Read these options from a TOML file; 'agalign info --options' prints one.
+
+    Examples:
+        agalign flight/  align the bands of all captures, into flight-aligned/
+        agalign flight/ -o aligned/ --radiometry  write reflectance, if the camera's tags are sufficient
+        agalign flight/ -o aligned/ --layout bands  write a file per band with its tags, for photogrammetry
+        agalign orchard/ --relief --error-map  correct parallax of trees; map the expected error
+        agalign flight/ --model earlier/models/CAMERA.safetensors  reuse the network and rig of an earlier flight
+        agalign flight/ --retry-failed  process failed captures again
+    """
     from agalign.config import DiscoverOptions, RunOptions, Settings
     from agalign.products.exports.stac import need_stac
     from agalign.products.indices.formulas import index_named
@@ -89,24 +95,22 @@ align = _command(
         "Running": "device jobs dask overwrite retry_failed timeout dry_run config quiet verbose log_json",
         "Expert": "recipe sharing model_family each_alone rng_seed",
     },
-    epilog=examples(
-        ("agalign flight/", "align the bands of all captures, into flight-aligned/"),
-        ("agalign flight/ -o aligned/ --radiometry", "write reflectance, if the camera's tags are sufficient"),
-        ("agalign flight/ -o aligned/ --layout bands", "write a file per band with its tags, for photogrammetry"),
-        ("agalign orchard/ --relief --error-map", "correct parallax of trees; map the expected error"),
-        ("agalign flight/ --model earlier/models/CAMERA.safetensors", "reuse the network and rig of an earlier flight"),
-        ("agalign flight/ --retry-failed", "process failed captures again"),
-    ),
 )
 
 
 def _demo(
     terminal: Terminal,
     given: Given,
-    out: Annotated[Path, typer.Argument(help="Folder to make.")] = Path("agalign-demo"),
-    captures: Annotated[int, typer.Option(min=1, max=1000, help="Captures to make.")] = 3,
+    out: Annotated[Path, typer.Argument()] = Path("agalign-demo"),
+    captures: Annotated[int, typer.Option(min=1, max=1000)] = 3,
 ) -> int:
-    """Make a synthetic flight, align it, and compare the result with the ground truth."""
+    """Make a synthetic flight, align it, and compare the result with the ground truth.
+
+    Options:
+        out: Folder to make.
+        captures: Captures to make.
+        device: auto, cpu, cuda, cuda:1 …
+    """
     from agalign.cli.align_run import conclude, find_captures, run
     from agalign.config import DiscoverOptions, RunOptions, Settings
     from agalign.synthetic.flight import make_flight, score_against_truth
@@ -128,29 +132,36 @@ def _demo(
     return conclude(totals, target, terminal)
 
 
-demo = _command(
-    _demo, {"Running": "jobs device rng_seed quiet verbose log_json"}, {"device": {"help": "auto, cpu, cuda, cuda:1 …"}}
-)
+demo = _command(_demo, {"Running": "jobs device rng_seed quiet verbose log_json"})
 
 
 def _onto(
     terminal: Terminal,
     given: Given,
-    reference: Annotated[Path, typer.Argument(help="The mosaic with the output grid.")],
-    moving: Annotated[list[Path], typer.Argument(help="Mosaics of other dates or sensors.")],
-    out: Annotated[
-        Path | None, typer.Option("--out", "-o", help="Output folder; by default REFERENCE-aligned.")
-    ] = None,
-    band: Annotated[
-        str | None,
-        typer.Option("--reference", "--band", help="Band of the mosaic REFERENCE to compare with; by default green."),
-    ] = None,
+    reference: Annotated[Path, typer.Argument()],
+    moving: Annotated[list[Path], typer.Argument()],
+    out: Annotated[Path | None, typer.Option("--out", "-o")] = None,
+    band: Annotated[str | None, typer.Option("--reference", "--band")] = None,
 ) -> int:
     """Align georeferenced mosaics of other dates or sensors to the grid of REFERENCE.
 
     Grids, resolutions and coordinate reference systems may differ. A mosaic is aligned if its windows are within a
     pixel of REFERENCE: resample both to the pixel size that you need. For each MOVING, agalign writes a sidecar and a
     raster on the grid of REFERENCE, with one band of REFERENCE (--reference) and all bands of MOVING.
+
+    Options:
+        reference: The mosaic with the output grid.
+        moving: Mosaics of other dates or sensors.
+        out: Output folder; by default REFERENCE-aligned.
+        band: Band of the mosaic REFERENCE to compare with; by default green.
+        relief: Add a smooth displacement field to the homography. auto: if windows not used in its fit confirm it.
+        interpolation: Resampling of the moving mosaics.
+        format: Tiled GeoTIFF or cloud-optimised GeoTIFF.
+        compression: Lossless compression.
+        device: auto, cpu, cuda, cuda:1 …
+        jobs: Mosaics processed at the same time; 0 is one per core.
+        overwrite: Process finished mosaics again.
+        max_pixels: Refuse mosaics with more pixels than this, without reading them.
     """
     from agalign.cameras.discover import FolderScan, captures_onto, distance_km
     from agalign.cli.align_run import conclude, run
@@ -178,20 +189,5 @@ onto = Command(
         "Alignment": "relief",
         "Running": "device rng_seed jobs overwrite quiet verbose log_json",
     },
-    {
-        "relief": {
-            "help": "Add a smooth displacement field to the homography. auto: if windows not used in its fit confirm "
-            "it."
-        },
-        "interpolation": {"help": "Resampling of the moving mosaics."},
-        "format": {"help": "Tiled GeoTIFF or cloud-optimised GeoTIFF."},
-        "compression": {"help": "Lossless compression."},
-        "device": {"help": "auto, cpu, cuda, cuda:1 …"},
-        "jobs": {"default": 1, "help": "Mosaics processed at the same time; 0 is one per core."},
-        "overwrite": {"help": "Process finished mosaics again."},
-        "max_pixels": {
-            "default": MAX_MOSAIC_PIXELS,
-            "help": "Refuse mosaics with more pixels than this, without reading them.",
-        },
-    },
+    defaults={"jobs": 1, "max_pixels": MAX_MOSAIC_PIXELS},
 )

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING
 from agalign.batch.earlier_results import outputs_exist
 from agalign.batch.workers import dask_executor
 from agalign.cameras.discover import FolderScan, discover
-from agalign.cli.terminal import MAX_LISTED, ExitCode, Terminal, shown
+from agalign.cli.terminal import MAX_LISTED, ExitCode, Terminal
 from agalign.config import DiscoverOptions, RunOptions, Settings
 from agalign.errors import InputError, OutputError, SidecarError, WorkerError
 from agalign.flight.groups import camera_overviews
@@ -28,7 +28,7 @@ from agalign.products.run.record import read_run_record
 from agalign.products.sidecar.file import read_result
 from agalign.products.sidecar.schema import BandResult
 from agalign.values.capture import Capture
-from agalign.values.text import counted
+from agalign.values.text import counted, escape_controls
 
 if TYPE_CHECKING:
     from agalign.batch.capture_task import CaptureReport
@@ -66,21 +66,17 @@ def print_problems(flight: FolderScan, terminal: Terminal) -> None:
 
     With --log-json, print a line for each file.
     """
-    counts: Counter[str] = Counter()
-    listed: dict[str, str] = {}
+    by_cause: dict[str, list[str]] = defaultdict(list)
     for problem in flight.problems:
         # Group by message without numbers, because sizes differ between files with the same cause.
         cause = re.sub(r"\d+", "0", problem.text.replace(str(problem.path), "").replace(problem.path.name, ""))
-        counts[cause] += 1
-        if terminal.log_json or counts[cause] <= MAX_LISTED:
+        by_cause[cause].append(problem.path.name)
+        if terminal.log_json or len(by_cause[cause]) <= MAX_LISTED:
             terminal.problem(problem.text, file=problem.path)
-            listed[cause] = problem.path.name
-    for cause, count in counts.items():
-        if count > MAX_LISTED and not terminal.log_json:
-            terminal.problem(
-                f"{flight.folder}: {count - MAX_LISTED} more files with the same problem as {listed[cause]}; "
-                "'agalign info --json' lists all"
-            )
+    for names in by_cause.values():
+        if len(names) > MAX_LISTED and not terminal.log_json:
+            same = f"{len(names) - MAX_LISTED} more files with the same problem as {names[MAX_LISTED - 1]}"
+            terminal.problem(f"{flight.folder}: {same}; 'agalign info --json' lists all")
 
 
 def print_plan(flight: FolderScan, out: Path, settings: Settings, options: RunOptions, terminal: Terminal) -> int:
@@ -104,8 +100,8 @@ class RunTotals:
 
     is_complete: bool
     """All captures are good, no file has a problem, and the report is written."""
-    unfinished: dict[str, int] = field(default_factory=dict)
-    """Number of band pairs of each capture that has no result yet."""
+    asked: dict[str, int] = field(default_factory=dict)
+    """Number of band pairs of each capture that is to be aligned."""
     states: Counter[str] = field(default_factory=Counter)
     pairs: PairTotals = field(default_factory=PairTotals)
     saturated: dict[str, tuple[float, str]] = field(default_factory=dict)
@@ -117,8 +113,8 @@ class RunTotals:
         """Add the report of a capture."""
         self.states[report.state] += 1
         self.is_complete &= report.is_complete
-        if report.state != "error":
-            self.unfinished.pop(report.label, None)
+        if report.state in ("panel", "sky"):
+            self.asked.pop(report.label, None)
         if report.result is None:
             return
         self.pairs.add(report.label, report.result)
@@ -138,8 +134,6 @@ class RunTotals:
                 result = read_result(path)
                 if outputs_exist(path, result.files):
                     self.pairs.add(capture.label, result)
-                    continue
-            self.unfinished[capture.label] = len(capture.moving) + len(capture.missing_bands)
 
 
 def run(
@@ -159,8 +153,7 @@ def run(
     from agalign.batch.run import Listener, run_flight
 
     asked = {c.label: len(c.moving) + len(c.missing_bands) for c in flight.captures}
-    totals, pace = RunTotals(flight.is_complete, asked), _Pace()
-    started = time.monotonic()
+    totals, started = RunTotals(flight.is_complete, asked), time.monotonic()
     with (
         cluster(dask, options.jobs, options.timeout_s) as executor,
         progress(terminal, len(flight.captures)) as show_line,
@@ -168,7 +161,8 @@ def run(
         options = replace(options, executor=executor)
 
         def show(share: float, text: str) -> None:
-            show_line(totals.states.total(), share, text, pace.of(totals.states))
+            skipped = totals.states["kept"] + totals.states["panel"] + totals.states["sky"]
+            show_line(totals.states.total() + share, text, skipped)
 
         def on_learning(camera: str, share: float) -> None:
             terminal.check()
@@ -226,10 +220,11 @@ def cluster(dask: str | None, jobs: int, timeout_s: float | None = None) -> Abst
 
 
 @contextmanager
-def progress(terminal: Terminal, captures: int) -> Iterator[Callable[[int, float, str, str], None]]:
+def progress(terminal: Terminal, captures: int) -> Iterator[Callable[[float, str, int], None]]:
     """Show a progress line on a terminal; yield the function that updates it.
 
-    Its arguments are the number of finished captures, the finished share of the current one, a description, and a rate.
+    Its arguments are the number of finished captures, with the finished share of the current one, a description, and
+    the number of captures that needed no time, which count neither for the rate nor for the time that is left.
     """
     if terminal.quiet or terminal.log_json or not terminal.err.is_terminal:
         yield lambda *_: None
@@ -239,40 +234,23 @@ def progress(terminal: Terminal, captures: int) -> Iterator[Callable[[int, float
 
     columns = (
         BarColumn(bar_width=20),
-        TextColumn("{task.fields[done]} of {task.total} captures"),
+        TextColumn("{task.fields[done]} of {task.fields[captures]} captures"),
         TextColumn("{task.fields[rate]}"),
         TimeElapsedColumn(),
         TextColumn("left"),
         TimeRemainingColumn(),
-        TextColumn("{task.description}", table_column=Column(no_wrap=True, overflow="ellipsis")),
+        TextColumn("{task.description}", markup=False, table_column=Column(no_wrap=True, overflow="ellipsis")),
     )
-    with Progress(*columns, console=terminal.err, transient=True) as line:
-        task = line.add_task("starting", total=captures, done=0, rate="")
+    with Progress(*columns, console=terminal.err, transient=True, speed_estimate_period=600) as line:
+        task = line.add_task("starting", total=captures, done=0, captures=captures, rate="")
 
-        def show(done: int, share: float, text: str, rate: str) -> None:
-            line.update(task, completed=done + share, done=done, rate=rate, description=shown(text))
+        def show(done: float, text: str, skipped: int) -> None:
+            speed = line.tasks[0].speed
+            rate = "" if speed is None else f"{60 * speed:.0f} a minute"
+            description, total = escape_controls(text), captures - skipped
+            line.update(task, description=description, total=total, completed=done - skipped, done=int(done), rate=rate)
 
         yield show
-
-
-@dataclass
-class _Pace:
-    """Captures per minute, without kept captures and the time for learning."""
-
-    since: float = field(default_factory=time.monotonic)
-    before: int = 0
-
-    def of(self, states: Counter[str]) -> str:
-        """Return the rate as text; empty until it is known."""
-        done = states.total() - states["kept"] - states["panel"] - states["sky"]
-        if done == 0:
-            self.since = time.monotonic()
-            return ""
-        # Captures that finish first were started before the clock.
-        if self.before == 0:
-            self.before, self.since = done, time.monotonic()
-        seconds = time.monotonic() - self.since
-        return f"{60 * (done - self.before) / seconds:.0f} a minute" if done > self.before else ""
 
 
 def _print_report(report: "CaptureReport", terminal: Terminal, number: int, count: int) -> None:
@@ -354,14 +332,15 @@ def conclude(totals: RunTotals, out: Path, terminal: Terminal) -> int:
 
 
 def _print_totals(totals: RunTotals, terminal: Terminal) -> None:
-    lost, statuses = len(totals.unfinished), totals.pairs.statuses
-    asked = statuses.total() + sum(totals.unfinished.values())
+    statuses, written = totals.pairs.statuses, totals.pairs.captures
+    unfinished = [pairs for label, pairs in totals.asked.items() if label not in written]
+    asked, lost = statuses.total() + sum(unfinished), len(unfinished)
     if statuses:
         missing = f"; {counted(lost, 'capture')} not written" if lost else ""
         _print_table(totals.pairs, f"{statuses['aligned']} of {asked} band pairs aligned{missing}", terminal)
     explain(totals.pairs.groups(), terminal)
     if lost:
-        of_all = f"{lost} of {counted(lost + len(totals.pairs.captures), 'capture')}"
+        of_all = f"{lost} of {counted(lost + len(written), 'capture')}"
         terminal.problem(f"{of_all} could not be written, for the reasons above; the same command tries again")
     # Under a clear sky with the sun above 40 degrees, the irradiance changes by up to 10 % in half an hour.
     max_panel_age_s = 30 * 60.0
@@ -389,25 +368,19 @@ def explain(failures: Sequence[FailureGroup], terminal: Terminal) -> None:
             names = [f"{b.capture} {b.band}" for b in group.bands]
             more = f" and {len(names) - max_named} more" if len(names) > max_named else ""
             named = [f"{', '.join(names[:max_named])}{more}: {first.reason}"]
-        terminal.problem(
-            text,
-            (*named, f"try: {group.advice}"),
-            status=group.status,
-            bands=len(group.bands),
-            captures=group.captures,
-            advice=group.advice,
-        )
+        counts = {"bands": len(group.bands), "captures": group.captures}
+        terminal.problem(text, (*named, f"try: {group.advice}"), status=group.status, **counts, advice=group.advice)
 
 
 def _print_table(pairs: PairTotals, title: str, terminal: Terminal) -> None:
     """Print a row per band: number of pairs by status, residuals, time."""
-    columns = {"aligned": "Aligned", "predicted": "Predicted", "seed_only": "Seed only", "failed": "Failed"}
+    columns, rows = ["aligned", "predicted", "seed_only", "failed"], []
     if pairs.statuses["missing"]:
-        columns["missing"] = "Missing"
-    rows = []
+        columns.append("missing")
     for name, band in pairs.bands.items():
         px, seconds = band.residuals_px, f"{median(band.seconds):.1f}" if band.seconds else "-"
         residuals = (f"{median(px):.3f}", f"{max(px):.3f}") if px else ("-", "-")
         rows.append((name, *(str(band.statuses[status]) for status in columns), *residuals, seconds))
-    headers = ("Band", *columns.values(), "Residual px, median", "Worst", "Seconds a pair")
+    titles = (status.replace("_", " ").capitalize() for status in columns)
+    headers = ("Band", *titles, "Residual px, median", "Worst", "Seconds a pair")
     terminal.table(headers, rows, title, texts=1)

@@ -1,17 +1,20 @@
 """Commands: their options are parameters of their functions, and fields of the settings (`agalign.config`).
 
-An option of a field has its type, default, range and docstring (the help text).
+The docstrings of functions and fields are the help texts. That of a function may end with the sections `Options`, with
+`name: help text` of its parameters and of fields whose help text differs for this command, and `Examples`, with
+command lines, two spaces, and what they do.
 """
 
+import copy
 import inspect
 import json
-from collections import defaultdict
+import re
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cache
 from itertools import pairwise
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, get_args
+from typing import TYPE_CHECKING, Annotated, Any, get_args, get_origin
 
 import typer
 from typer.core import TyperCommand
@@ -31,70 +34,61 @@ _TERMINAL = inspect.signature(Terminal).parameters
 """Options of the terminal, by name."""
 
 
-@dataclass(frozen=True)
-class FieldOption:
-    """The command-line option of a field."""
-
-    owner: str
-    """Key in `Given`."""
-    path: tuple[str, ...]
-    """Names of the stage, if any, and of the field."""
-    option: "Option"
-    kind: Any
-    info: Mapping[str, Any]
-    """Default, help text and range."""
-
-    @property
-    def name(self) -> str:
-        """Return the name of the option as an identifier."""
-        return self.option.name or self.path[-1]
-
-    @property
-    def flag(self) -> str:
-        """Return the long name of the option, with its dashes."""
-        return f"--{self.name.replace('_', '-')}"
-
-    def parameter(self, changes: Mapping[str, Any]) -> inspect.Parameter:
-        """Return it as a parameter of a function; `changes` replace its default or help text."""
-        info = {**self.info, **changes}
-        default, names = info.pop("default"), filter(None, (self.flag, self.option.short))
-        kind: Any = self.kind
-        annotation = Annotated[kind, typer.Option(*names, **info)]
-        return inspect.Parameter(self.name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=annotation)
-
-    def store(self, value: Any, given: Given) -> None:
-        """Add the value of the option to the values of its owner."""
-        values = given[self.owner]
-        for stage in self.path[:-1]:
-            values = values.setdefault(stage, {})
-        values[self.path[-1]] = self.option.parse(value)
-
-
 @cache
-def field_options() -> dict[str, FieldOption]:
+def field_options() -> dict[str, "Option"]:
     """Return the options of all fields by name, in the order of the fields."""
     from agalign.config import DiscoverOptions, RunOptions, Settings
 
-    owners = {"settings": Settings(), "discover": DiscoverOptions(), "run": RunOptions()}
-    return {option.name: option for owner, value in owners.items() for option in _options_of(owner, value, ())}
+    models = {"settings": Settings(), "discover": DiscoverOptions(), "run": RunOptions()}
+    return {option.name: option for name, model in models.items() for option in _options_of(model, (name,))}
 
 
-def _options_of(owner: str, value: Any, path: tuple[str, ...]) -> Iterator[FieldOption]:
-    from agalign.config import Option, SettingsModel
+def _options_of(model: Any, path: tuple[str, ...]) -> Iterator["Option"]:
+    from agalign.config import SettingsModel, option_of
 
-    for name, of_field in type(value).__pydantic_fields__.items():
-        default = getattr(value, name)
+    for name, of_field in type(model).__pydantic_fields__.items():
+        default, option = getattr(model, name), option_of(name, of_field)
         if isinstance(default, SettingsModel):
-            yield from _options_of(owner, default, (*path, name))
+            yield from _options_of(default, (*path, name))
             continue
-        option = next((m for m in of_field.metadata if isinstance(m, Option)), Option())
         if option.type is not None or option.default is not None:
             default = option.default
-        text = " ".join(of_field.description.split())
-        info = {"default": default, "help": text}
+        info = {"help": " ".join(of_field.description.split())}
         for limit in of_field.metadata:
             info |= {end: getattr(limit, of) for end, of in (("min", "ge"), ("max", "le")) if hasattr(limit, of)}
-        yield FieldOption(owner, (*path, name), option, option.type or of_field.annotation, info)
+        kind = option.type or of_field.annotation
+        yield replace(option, path=(*path, name), type=kind, default=default, info=info)
+
+
+def _store(option: "Option", value: Any, given: dict[str, Any]) -> None:
+    """Add the value of an option to the values of its model."""
+    *folders, name = option.path
+    for folder in folders:
+        given = given.setdefault(folder, {})
+    given[name] = option.parse(value)
+
+
+def help_of(function: Any) -> tuple[str, dict[str, str], list[str]]:
+    """Return the help text in the docstring of a function, the help texts of its options by name, and the examples."""
+    text, *parts = re.split(r"\n\n(Options|Examples):\n", inspect.getdoc(function) or "")
+    sections = dict(zip(parts[::2], parts[1::2], strict=True))
+    options = re.findall(r"^ {4}(\w+): (.+(?:\n {8}.+)*)", sections.get("Options", ""), re.MULTILINE)
+    examples = sections.get("Examples", "").splitlines()
+    return text, {name: " ".join(words.split()) for name, words in options}, [line.strip() for line in examples]
+
+
+def _on_command_line(parameter: inspect.Parameter, text: str | None, panel: str | None) -> inspect.Parameter:
+    """Return a parameter, which may have an option of typer as annotation, as one of the command line in a panel of
+    its help. The help text replaces that of the annotation.
+    """
+    kind, info = parameter.annotation, typer.Option()
+    if kind is bool:
+        info = typer.Option(f"--{parameter.name.replace('_', '-')}")  # without --no-…
+    elif get_origin(kind) is Annotated:
+        kind, info = get_args(kind)
+    info = copy.copy(info)
+    info.help, info.rich_help_panel = text or info.help, panel
+    return parameter.replace(kind=inspect.Parameter.KEYWORD_ONLY, annotation=Annotated[kind, info])
 
 
 @dataclass(frozen=True)
@@ -106,32 +100,40 @@ class Command:
     code. Its docstring is the help text."""
     panels: Mapping[str, str] = field(default_factory=dict)
     """Names of options by panel of the help: own parameters, fields, and options of the terminal."""
-    changes: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
-    """Help texts and defaults of fields that differ for this command."""
+    defaults: Mapping[str, Any] = field(default_factory=dict)
+    """Defaults of fields that differ for this command."""
     on_interrupt: str = "interrupted"
-    epilog: str | None = None
     panel: str | None = None
     """Panel in the list of commands."""
-    hidden: bool = False
+    alias: str = ""
+    """Second name of a command, which the list of commands leaves out."""
+
+    @property
+    def name(self) -> str:
+        """Its name on the command line."""
+        return self.alias or self.function.__name__.removeprefix("_")
 
     @property
     def summary(self) -> str:
         """The first paragraph of the help text, a sentence."""
-        return " ".join((inspect.getdoc(self.function) or "").split("\n\n")[0].split())
+        return " ".join(help_of(self.function)[0].split("\n\n")[0].split())
 
     def parameters(self) -> list[inspect.Parameter]:
         """Return the parameters of the command line: own ones outside of panels, then those of each panel."""
         own = dict(inspect.signature(self.function).parameters)
-        result = []
-        for panel, names in self.panels.items():
-            for name in names.split():
-                shared = own.pop(name, None) or _TERMINAL.get(name)
-                result.append(shared or field_options()[name].parameter(self.changes.get(name, {})))
-                get_args(result[-1].annotation)[1].rich_help_panel = panel
-        result = [*(own[name] for name in own if name not in ("terminal", "given")), *result]
-        return [parameter.replace(kind=inspect.Parameter.KEYWORD_ONLY) for parameter in result]
+        panels = {name: panel for panel, names in self.panels.items() for name in names.split()}
+        names = [*(name for name in own if name not in ("terminal", "given", *panels)), *panels]
+        helps = help_of(Terminal)[1] | help_of(self.function)[1]
+        parameters = (own.get(name) or _TERMINAL.get(name) or self._of_field(field_options()[name]) for name in names)
+        return [_on_command_line(p, helps.get(p.name), panels.get(p.name)) for p in parameters]
 
-    def built(self, name: str) -> Any:
+    def _of_field(self, option: "Option") -> inspect.Parameter:
+        kind: Any = option.type
+        annotation = Annotated[kind, typer.Option(*filter(None, (option.flag, option.short)), **option.info)]
+        default = self.defaults.get(option.name, option.default)
+        return inspect.Parameter(option.name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=annotation)
+
+    def built(self) -> Any:
         """Return the command of typer."""
         parameters, own = self.parameters(), inspect.signature(self.function).parameters
         fields = [p.name for p in parameters if p.name not in {*own, *_TERMINAL}]
@@ -141,19 +143,26 @@ class Command:
             with exits(terminal, self.on_interrupt, values.get("config")):
                 check_address_space()
                 check_threads()
-                given: Given = defaultdict(dict)
+                given: Given = {}
                 for name in fields:
-                    field_options()[name].store(values.pop(name), given)
+                    _store(field_options()[name], values.pop(name), given)
                 if fields:
                     values["given"] = given
                 raise typer.Exit(self.function(terminal, **values) or 0)
 
-        call.__doc__ = self.function.__doc__
+        call.__doc__, _, examples = help_of(self.function)
         call.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
         app = typer.Typer(add_completion=False, rich_markup_mode="rich", pretty_exceptions_enable=False)
         cls = _LenientCommand if fields else TyperCommand
-        app.command(name, cls=cls, epilog=self.epilog, hidden=self.hidden, rich_help_panel=self.panel)(call)
+        epilog = "\n\n".join(["Examples:", *map(_highlighted, examples)]) if examples else None
+        app.command(self.name, cls=cls, epilog=epilog, hidden=bool(self.alias))(call)
         return typer.main.get_command(app)
+
+
+def _highlighted(example: str) -> str:
+    """Return an example in the markup of rich, with its command line in bold."""
+    command, what = example.replace("[", r"\[").split("  ")
+    return f"[bold]{command}[/]  {what}"
 
 
 class _LenientCommand(TyperCommand):
@@ -162,28 +171,25 @@ class _LenientCommand(TyperCommand):
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         """Parse the arguments, after options are renamed and get their missing values."""
         own = {param.name for param in self.params}
-        for one in field_options().values():
-            if one.option.alone and one.name in own:
-                args = _completed(args, one)
+        for option in field_options().values():
+            if option.alone and option.name in own:
+                args = _completed(args, option)
         return super().parse_args(ctx, args)
 
 
-def _completed(args: list[str], one: FieldOption) -> list[str]:
+def _completed(args: list[str], option: "Option") -> list[str]:
     result = []
     for argument, following in pairwise([*args, ""]):
         name, equals, value = argument.partition("=")
-        if name and name == one.option.former:
-            Terminal(log_json="--log-json" in args).problem(f"{name} is deprecated; use {one.flag}")
-            name = one.flag
+        if name and name == option.former:
+            Terminal(log_json="--log-json" in args).problem(f"{name} is deprecated; use {option.flag}")
+            name = option.flag
         result.append(f"{name}{equals}{value}")
-        if name == one.flag and not equals and not _is_value(following, one):
-            result.append(one.option.alone)
+        # A word that is neither an option nor a path is a misspelt choice.
+        is_value = following in get_args(option.type) or (following.isalnum() and not Path(following).exists())
+        if name == option.flag and not equals and not is_value:
+            result.append(option.alone)
     return result
-
-
-def _is_value(text: str, one: FieldOption) -> bool:
-    """Return True for a choice of an option, and for a word that is neither an option nor a path: a misspelt choice."""
-    return text in get_args(one.kind) or (text.isalnum() and not Path(text).exists())
 
 
 def load_config(ctx: typer.Context, path: Path | None) -> Path | None:

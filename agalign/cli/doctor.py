@@ -2,7 +2,9 @@
 
 import os
 import platform
+import re
 import shutil
+from contextlib import suppress
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -25,10 +27,15 @@ EXTRAS = {
 
 def _doctor(
     terminal: Terminal,
-    folder: Annotated[Path, typer.Argument(help="Folder for aligned files.")] = Path(),
-    as_json: Annotated[bool, typer.Option("--json", help="Print JSON to standard output.")] = False,
+    folder: Annotated[Path, typer.Argument()] = Path(),
+    as_json: Annotated[bool, typer.Option("--json")] = False,
 ) -> int:
-    """Check this machine: versions, devices, threads, memory, disk and extras."""
+    """Check this machine: versions, devices, threads, memory, disk and extras.
+
+    Options:
+        folder: Folder for aligned files.
+        as_json: Print JSON to standard output.
+    """
     from agalign.method.device import devices
 
     known = [{"device": d.name, "what": d.what, "threads": d.threads, "problem": d.problem} for d in devices()]
@@ -52,6 +59,9 @@ def _machine() -> dict[str, Any]:
     from agalign.pixels.raster import gdal_version
     from agalign.products.run.record import library_version
 
+    memory_gb = None
+    with suppress(AttributeError, ValueError, OSError):  # not on Windows
+        memory_gb = round(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 1e9, 1)
     return {
         "agalign": __version__,
         "python": platform.python_version(),
@@ -59,15 +69,8 @@ def _machine() -> dict[str, Any]:
         **{name: library_version(name) for name in _LIBRARIES},
         "gdal": gdal_version(),
         "cores": usable_cores(),
-        "memory_gb": _memory_gb(),
+        "memory_gb": memory_gb,
     }
-
-
-def _memory_gb() -> float | None:
-    try:
-        return round(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 1e9, 1)
-    except (AttributeError, ValueError, OSError):  # not on Windows
-        return None
 
 
 def _disk(folder: Path) -> dict[str, Any]:
@@ -80,19 +83,16 @@ def _extras() -> list[dict[str, Any]]:
     """Return the purpose and the missing libraries of each extra."""
     from agalign.products.run.record import library_version
 
-    result = []
-    for name, adds in EXTRAS.items():
-        missing = [d for d in _requirements(name) if library_version(d) is None]
-        result.append({"extra": name, "adds": adds, "missing": missing})
-    return result
+    missing = {name: [d for d in _requirements(name) if library_version(d) is None] for name in EXTRAS}
+    return [{"extra": name, "adds": adds, "missing": missing[name]} for name, adds in EXTRAS.items()]
 
 
 def _requirements(extra: str) -> list[str]:
     """Return the distributions that an extra requires, from the metadata of the package."""
     from importlib import metadata
 
-    requirements = [r for r in metadata.requires("agalign") or [] if f"extra == '{extra}'" in r.replace('"', "'")]
-    return ["".join(c if c.isalnum() or c in "-_." else " " for c in r).split()[0] for r in requirements]
+    requirements = metadata.requires("agalign") or []
+    return [found[1] for r in requirements if (found := re.match(rf"([\w.-]+).*extra == .{extra}\b", r))]
 
 
 def _problems(facts: dict[str, Any]) -> list[str]:

@@ -20,34 +20,32 @@ def _evaluate(
     terminal: Terminal,
     given: Given,
     pairs: Pairs,
-    methods: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--method",
-            "-m",
-            help="Recipe and sharing (fast:siamese; fast:siamese:grey for grey images), sift, daisy, elastix, or a "
-            "network file; repeatable.",
-        ),
-    ] = None,
-    shift: Annotated[
-        str, typer.Option(help="Distances of the start from the truth, % of the longer side, separated by commas.")
-    ] = "5",
-    directions: Annotated[int, typer.Option(min=1, help="Directions of the start for each distance.")] = 1,
-    seeding: Annotated[
-        bool, typer.Option("--seeding", help="Correct the start by the initial alignment first, as a run does.")
-    ] = False,
-    out: Annotated[Path | None, typer.Option("--out", "-o", help="CSV file with a row per pair and method.")] = None,
+    methods: Annotated[list[str] | None, typer.Option("--method", "-m")] = None,
+    shift: str = "5",
+    directions: Annotated[int, typer.Option(min=1)] = 1,
+    seeding: bool = False,
+    out: Annotated[Path | None, typer.Option("--out", "-o")] = None,
 ) -> None:
-    """Evaluate descriptors and homographies on pairs with ground truth (Dong et al., 2018)."""
+    """Evaluate descriptors and homographies on pairs with ground truth (Dong et al., 2018).
+
+    Options:
+        methods: Recipe and sharing (fast:siamese; fast:siamese:grey for grey images), sift, daisy, elastix, or a
+            network file; repeatable.
+        shift: Distances of the start from the truth, % of the longer side, separated by commas.
+        directions: Directions of the start for each distance.
+        seeding: Correct the start by the initial alignment first, as a run does.
+        out: CSV file with a row per pair and method.
+        device: auto, cpu, cuda, cuda:1 …
+    """
     from agalign.evaluation.evaluate import Starts, error_table, evaluate, method_named, precision_table, write_results
     from agalign.evaluation.image_pairs import find_pairs
 
     chosen = methods or [*(f"fast:{sharing}" for sharing in get_args(Sharing)), "sift"]
-    named = {name: method_named(name) for name in chosen}
-    starts = Starts(_shares(shift), directions, seeding)
+    joint = given["settings"]["joint"]
+    named = {name: method_named(name, **joint, seeding=seeding) for name in chosen}
     results = []
     try:
-        for result in evaluate(find_pairs(pairs), named, starts, **given["settings"]["joint"]):
+        for result in evaluate(find_pairs(pairs), named, Starts(_shares(shift), directions), joint["rng_seed"]):
             results.append(result)
             line = f"{result.pair}, {result.method}: mAP {result.average_precision:.3f}, {result.error_px:.3f} px"
             terminal.event("result", line if terminal.verbose else "", **vars(result))
@@ -63,13 +61,22 @@ def _surface(
     terminal: Terminal,
     given: Given,
     pairs: Pairs,
-    out: Annotated[Path, typer.Option("--out", "-o", help="Picture to write.")] = Path("loss-surface.png"),
-    number: Annotated[int, typer.Option(min=1, help="Number of the pair, from 1.")] = 1,
-    reach: Annotated[float, typer.Option(min=1, help="Largest offset, px.")] = 100.0,
-    points: Annotated[int, typer.Option(min=3, help="Offsets along each axis.")] = 17,
-    epochs: Annotated[int, typer.Option(min=1, help="Training epochs for each offset.")] = 2,
+    out: Annotated[Path, typer.Option("--out", "-o")] = Path("loss-surface.png"),
+    number: Annotated[int, typer.Option(min=1)] = 1,
+    reach: Annotated[float, typer.Option(min=1)] = 100.0,
+    points: Annotated[int, typer.Option(min=3)] = 17,
+    epochs: Annotated[int, typer.Option(min=1)] = 2,
 ) -> None:
-    """Plot the training loss over misalignments of a pair (figure 2 of Dong et al., 2018)."""
+    """Plot the training loss over misalignments of a pair (figure 2 of Dong et al., 2018).
+
+    Options:
+        out: Picture to write.
+        number: Number of the pair, from 1.
+        reach: Largest offset, px.
+        points: Offsets along each axis.
+        epochs: Training epochs for each offset.
+        device: auto, cpu, cuda, cuda:1 …
+    """
     import numpy as np
 
     from agalign.config import JointSettings
@@ -101,10 +108,16 @@ def _learn(
     terminal: Terminal,
     given: Given,
     pairs: Pairs,
-    out: Annotated[Path, typer.Option("--out", "-o", help="Network to write.")] = Path("learnt.safetensors"),
-    steps: Annotated[int, typer.Option(min=1, help="Training steps per aligned pair.")] = 200,
+    out: Annotated[Path, typer.Option("--out", "-o")] = Path("learnt.safetensors"),
+    steps: Annotated[int, typer.Option(min=1)] = 200,
 ) -> None:
-    """Learn one descriptor from pairs without labels, using those that can be aligned."""
+    """Learn one descriptor from pairs without labels, using those that can be aligned.
+
+    Options:
+        out: Network to write.
+        steps: Training steps per aligned pair.
+        device: auto, cpu, cuda, cuda:1 …
+    """
     from agalign.config import Settings
     from agalign.evaluation.descriptor_learning import learn_descriptor, read_rough_pairs
     from agalign.flight.model import save_model
@@ -127,10 +140,7 @@ def _learn(
 
 
 _command = partial(
-    Command,
-    panels={"Options": "device", "Running": "rng_seed quiet verbose log_json"},
-    changes={"device": {"help": "auto, cpu, cuda, cuda:1 …"}},
-    panel="Descriptors",
+    Command, panels={"Options": "device", "Running": "rng_seed quiet verbose log_json"}, panel="Descriptors"
 )
 evaluate, surface = _command(_evaluate), _command(_surface)
 learn = _command(_learn, panels={"Options": "sharing device", "Running": "rng_seed quiet verbose log_json"})

@@ -1,6 +1,6 @@
 """The command `agalign info`: the captures of a folder, or the contents of a model."""
 
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -21,17 +21,19 @@ if TYPE_CHECKING:
 def _info(
     terminal: Terminal,
     given: Given,
-    folder: Annotated[
-        Path | None, typer.Argument(help="Folder with images, or the model of a run (OUT/models/….safetensors).")
-    ] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="Print JSON to standard output.")] = False,
-    options: Annotated[
-        bool, typer.Option("--options", help="Print a --config file with all options of 'agalign align'.")
-    ] = False,
+    folder: Annotated[Path | None, typer.Argument()] = None,
+    as_json: Annotated[bool, typer.Option("--json")] = False,
+    options: bool = False,
 ) -> int:
-    """List cameras, captures, bands and missing files of a folder, or show the rig of a model."""
+    """List cameras, captures, bands and missing files of a folder, or show the rig of a model.
+
+    Options:
+        folder: Folder with images, or the model of a run (OUT/models/….safetensors).
+        as_json: Print JSON to standard output.
+        options: Print a --config file with all options of 'agalign align'.
+    """
     if options:
-        typer.echo(config_text(align.built("align")))
+        typer.echo(config_text(align.built()))
         return ExitCode.OK
     if folder is None:
         raise ConfigurationError("give a folder with images, a model, or --options")
@@ -52,20 +54,19 @@ def _show_folder(folder: Path, options: dict[str, Any], terminal: Terminal, *, a
     from agalign.flight.groups import camera_overviews
 
     flight = discover(folder, DiscoverOptions(**options))
-    if not as_json:
-        print_found(flight, terminal)
-        if not flight.captures:
-            _show_unused(flight, terminal)
-            return ExitCode.NOTHING
     rows, cameras = _rows(flight), camera_overviews(flight.captures)
     if as_json:
         problems = [{"file": str(p.path), "problem": p.text} for p in flight.problems]
         facts = {"folder": str(folder), "cameras": [vars(c) for c in cameras], "captures": rows, "problems": problems}
         terminal.facts(facts)
     else:
+        print_found(flight, terminal)
         for camera in cameras:
             terminal.result(camera.text)
-        _show_captures(rows, len(flight.problems), terminal)
+        if rows:
+            _show_captures(rows, len(flight.problems), terminal)
+        else:
+            _show_unused(flight, terminal)
     return ExitCode.NOTHING if not rows else ExitCode.OK if flight.is_complete else ExitCode.PARTIAL
 
 
@@ -79,7 +80,7 @@ def _rows(flight: "FolderScan") -> list[dict[str, Any]]:
     by_label = {c.label: c for c in (*with_panels(others), *(s.capture for s in sky))}
     unreadable = _unreadable_files(flight)
     return [
-        _facts(by_label[c.label]) | {"sky": sky_cues.get(c.label, []), "unreadable_files": unreadable.get(c.label, [])}
+        _facts(by_label[c.label]) | {"sky": sky_cues.get(c.label, []), "unreadable_files": unreadable[c.label]}
         for c in flight.captures
     ]
 
@@ -107,13 +108,12 @@ def _show_captures(rows: Sequence[dict[str, Any]], problems: int, terminal: Term
 
 def _unreadable_files(flight: "FolderScan") -> dict[str, list[str]]:
     """Return the unreadable files of each capture by label: those with names that begin with the capture's name."""
-    result: dict[str, list[str]] = {}
+    result: dict[str, list[str]] = defaultdict(list)
     for path in (p.path for p in flight.problems if isinstance(p.error, UnreadableFileError)):
         in_folder = [c for c in flight.captures if c.reference.path.parent == path.parent]
         candidates = [c for c in in_folder if path.name.startswith(c.name)]
         if candidates:
-            label = max(candidates, key=lambda c: len(c.name)).label
-            result.setdefault(label, []).append(path.name)
+            result[max(candidates, key=lambda c: len(c.name)).label].append(path.name)
     return result
 
 

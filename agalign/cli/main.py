@@ -13,36 +13,24 @@ from typer.core import TyperGroup
 
 from agalign._version import __version__
 from agalign.cli.align_commands import align, demo, onto
+from agalign.cli.command import help_of
 from agalign.cli.doctor import doctor
 from agalign.cli.evaluate import evaluate, learn, surface
 from agalign.cli.info import info
 from agalign.cli.results import export, indices, mosaic, report, verify
-from agalign.cli.terminal import ExitCode, Terminal, examples, options_from, printed
+from agalign.cli.terminal import ExitCode, Terminal, options_from, printed
 from agalign.values.processes import limit_default_threads, silence_libraries
 from agalign.values.text import did_you_mean, name_problem
 
-COMMANDS = {
-    "align": align,
-    "demo": demo,
-    "info": info,
-    "report": report,
-    "verify": verify,
-    "indices": indices,
-    "ndvi": replace(indices, hidden=True),
-    "export": export,
-    "mosaic": mosaic,
-    "onto": onto,
-    "doctor": doctor,
-    "evaluate": evaluate,
-    "surface": surface,
-    "learn": learn,
-}
+ndvi = replace(indices, alias="ndvi")
+_ALL = align, demo, info, report, verify, indices, ndvi, export, mosaic, onto, doctor, evaluate, surface, learn
+COMMANDS = {command.name: command for command in _ALL}
 _UsageError: Any = typer.BadParameter.__mro__[1]
 """The class of click, or of the copy of click in typer."""
 
 
 class RootGroup(TyperGroup):
-    """Root group: its help is plain text, because typer's panels double the start-up time. A command is built when it
+    """Root group. Its help is plain text, because typer's panels double the start-up time. A command is built when it
     is used, because the settings with its options take as long again to load.
     """
 
@@ -52,27 +40,19 @@ class RootGroup(TyperGroup):
 
     def get_command(self, ctx: Any, cmd_name: str) -> Any:  # noqa: ARG002
         """Return a command; None if there is none of this name."""
-        return COMMANDS[cmd_name].built(cmd_name) if cmd_name in COMMANDS else None
+        return COMMANDS[cmd_name].built() if cmd_name in COMMANDS else None
 
-    def format_help(self, ctx: Any, formatter: Any) -> None:
-        """Write the usage, the options, a section of commands for each panel, and the examples."""
-        self.format_usage(ctx, formatter)
-        formatter.write_paragraph()
-        formatter.write_text(self.help or "")
-        options = [param.get_help_record(ctx) for param in self.get_params(ctx)]
-        with formatter.section("Options"):
-            formatter.write_dl([record for record in options if record is not None])
-        self._write_commands(formatter)
-        formatter.write_paragraph()
-        for line in (self.epilog or "").split("\n\n"):
-            formatter.write(f"{line.replace('[bold]', '  ').replace('[/]', '')}\n")
-
-    def _write_commands(self, formatter: Any) -> None:
+    def format_commands(self, ctx: Any, formatter: Any) -> None:  # noqa: ARG002
         """Write a section of commands for each panel."""
-        shown = {name: command for name, command in COMMANDS.items() if not command.hidden}
-        for panel in dict.fromkeys(command.panel for command in COMMANDS.values()):
+        for panel in dict.fromkeys(command.panel for command in _ALL):
             with formatter.section(panel or "Commands"):
-                formatter.write_dl([(name, c.summary) for name, c in shown.items() if c.panel == panel])
+                formatter.write_dl([(c.name, c.summary) for c in _ALL if c.panel == panel and not c.alias])
+
+    def format_epilog(self, ctx: Any, formatter: Any) -> None:  # noqa: ARG002
+        """Write the examples."""
+        formatter.write("\nExamples:\n")
+        for example in help_of(_root)[2]:
+            formatter.write(f"  {example}\n")
 
 
 def _usage_problem(text: str) -> None:
@@ -104,30 +84,27 @@ def _reworded(error: Any) -> str:
     return f"{name}{text[:1].lower()}{text[1:]}"
 
 
-app = typer.Typer(
-    cls=RootGroup,
-    name="agalign",
-    help="Co-register the bands of multispectral drone cameras. 'agalign FOLDER' aligns everything below FOLDER.",
-    epilog=examples(
-        ("agalign demo", "align a synthetic flight and compare it with its ground truth"),
-        ("agalign info flight/", "list captures, bands and missing files"),
-        ("agalign flight/ -o aligned/", "align a flight; 'agalign align --help' lists the options"),
-        ("agalign indices aligned/", "compute spectral indices of the aligned captures"),
-        ("agalign doctor", "check this machine"),
-    ),
-    no_args_is_help=True,
-    rich_markup_mode="rich",
-    pretty_exceptions_enable=False,
-)
-
-
-@app.callback(invoke_without_command=True)
 def _root(
     version: Annotated[bool, typer.Option("--version", help="Print the version and exit.", is_eager=True)] = False,
 ) -> None:
+    """Co-register the bands of multispectral drone cameras. 'agalign FOLDER' aligns everything below FOLDER.
+
+    Examples:
+        agalign demo  align a synthetic flight and compare it with its ground truth
+        agalign info flight/  list captures, bands and missing files
+        agalign flight/ -o aligned/  align a flight; 'agalign align --help' lists the options
+        agalign indices aligned/  compute spectral indices of the aligned captures
+        agalign doctor  check this machine
+    """
     if version:
         typer.echo(f"agalign {__version__}")
         raise typer.Exit
+
+
+app = typer.Typer(
+    cls=RootGroup, name="agalign", no_args_is_help=True, rich_markup_mode=None, pretty_exceptions_enable=False
+)
+app.callback(invoke_without_command=True, help=help_of(_root)[0])(_root)
 
 
 def main() -> None:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from agalign.cli.command import Command, Given
-from agalign.cli.terminal import MAX_LISTED, RAW_NUMBERS, ExitCode, Terminal, examples
+from agalign.cli.terminal import MAX_LISTED, RAW_NUMBERS, ExitCode, Terminal
 from agalign.values.choices import ExportProgram
 from agalign.values.text import counted
 
@@ -17,15 +17,16 @@ if TYPE_CHECKING:
     from agalign.products.indices.rasters import IndexReport
 
 Out = Annotated[Path, typer.Argument(help="Output folder of a run.")]
-_DEFAULT_INDEX = "ndvi"
+Json = Annotated[bool, typer.Option("--json")]
 
 
-def _report(
-    terminal: Terminal,
-    out: Annotated[Path, typer.Argument(help="Output folder of an earlier run.")],
-    as_json: Annotated[bool, typer.Option("--json", help="Print the content of the report as JSON.")] = False,
-) -> int:
-    """Rebuild the report and the summary from the sidecars."""
+def _report(terminal: Terminal, out: Annotated[Path, typer.Argument()], as_json: Json = False) -> int:
+    """Rebuild the report and the summary from the sidecars.
+
+    Options:
+        out: Output folder of an earlier run.
+        as_json: Print the content of the report as JSON.
+    """
     from agalign.cli.align_run import explain
     from agalign.products.report.pages import REPORT_FILE, SUMMARY_FILE, write_pages
     from agalign.products.sidecar.file import run_sidecars
@@ -64,21 +65,24 @@ def _verify(terminal: Terminal, out: Out) -> int:
 def _export(
     terminal: Terminal,
     out: Out,
-    program: Annotated[
-        ExportProgram,
-        typer.Option(
-            "--for", help="Band files with tags for odm, metashape or pix4d; warp matrices for micasense or opencv."
-        ),
-    ],
-    target: Annotated[
-        Path | None, typer.Option("-o", "--out", help="Output folder; by default OUT with the program's name added.")
-    ] = None,
-    copy: Annotated[bool, typer.Option("--copy", help="Copy the band files instead of creating hard links.")] = False,
-    source: Annotated[
-        Path | None, typer.Option(help="Folder with the original images, if they were moved; for micasense only.")
-    ] = None,
+    program: Annotated[ExportProgram, typer.Option("--for")],
+    target: Annotated[Path | None, typer.Option("-o", "--out")] = None,
+    copy: bool = False,
+    source: Path | None = None,
 ) -> int:
-    """Export aligned captures for photogrammetry programs, MicaSense's notebooks or OpenCV."""
+    """Export aligned captures for photogrammetry programs, MicaSense's notebooks or OpenCV.
+
+    Options:
+        program: Band files with tags for odm, metashape or pix4d; warp matrices for micasense or opencv.
+        target: Output folder; by default OUT with the program's name added.
+        copy: Copy the band files instead of creating hard links.
+        source: Folder with the original images, if they were moved; for micasense only.
+
+    Examples:
+        agalign export aligned/ --for odm  band files in one folder, and the options for OpenDroneMap
+        agalign export aligned/ --for micasense  warp matrices for MicaSense's notebooks
+        agalign export aligned/ --for opencv -o matrices/  homographies and sampled mappings for scripts
+    """
     from agalign.products.exports.programs import export as run_export
 
     run_folder = out.resolve()
@@ -102,42 +106,34 @@ def _print_left_out(left_out: Sequence[tuple[str, str]], terminal: Terminal) -> 
 
 report = Command(_report)
 verify = Command(_verify)
-export = Command(
-    _export,
-    {"Output": "program target copy source", "Running": "quiet log_json"},
-    epilog=examples(
-        ("agalign export aligned/ --for odm", "band files in one folder, and the options for OpenDroneMap"),
-        ("agalign export aligned/ --for micasense", "warp matrices for MicaSense's notebooks"),
-        ("agalign export aligned/ --for opencv -o matrices/", "homographies and sampled mappings for scripts"),
-    ),
-)
+export = Command(_export, {"Output": "program target copy source", "Running": "quiet log_json"})
 
 
 def _indices(
     terminal: Terminal,
     given: Given,
     out: Out,
-    index: Annotated[
-        str | None,
-        typer.Option(
-            "--index",
-            "-i",
-            help=f"Names separated by commas: {_DEFAULT_INDEX} (the default), ndre, gndvi, ndwi, savi, evi …",
-        ),
-    ] = None,
-    formula: Annotated[
-        list[str] | None,
-        typer.Option(help="A formula of the bands B, G, R, RE and N, as 'name=(N-R)/(N+R)'; repeatable."),
-    ] = None,
-    target: Annotated[
-        Path | None, typer.Option("-o", "--out", help="Folder for the rasters; by default next to the stacks.")
-    ] = None,
-    mask_qa: Annotated[
-        bool, typer.Option("--mask-qa", help="Omit saturated, occluded and glint pixels; the run needs --qa.")
-    ] = False,
-    as_json: Annotated[bool, typer.Option("--json", help="Print JSON to standard output.")] = False,
+    index: Annotated[str | None, typer.Option("--index", "-i")] = None,
+    formula: list[str] | None = None,
+    target: Annotated[Path | None, typer.Option("-o", "--out")] = None,
+    mask_qa: bool = False,
+    as_json: Json = False,
 ) -> int:
-    """Compute spectral indices of aligned captures: rasters, pictures and a table of statistics."""
+    """Compute spectral indices of aligned captures: rasters, pictures and a table of statistics.
+
+    Options:
+        index: Names separated by commas: ndvi (the default), ndre, gndvi, ndwi, savi, evi …
+        formula: A formula of the bands B, G, R, RE and N, as 'name=(N-R)/(N+R)'; repeatable.
+        target: Folder for the rasters; by default next to the stacks.
+        mask_qa: Omit saturated, occluded and glint pixels; the run needs --qa.
+        as_json: Print JSON to standard output.
+        overwrite: Compute again what an earlier command wrote.
+
+    Examples:
+        agalign indices aligned/  NDVI of every capture, next to its stack
+        agalign indices aligned/ --index ndvi,ndre,savi -o indices/  three indices, into another folder
+        agalign indices aligned/ --formula 'mine=(N-RE)/(N+RE)'  a formula of the bands B, G, R, RE and N
+    """
     from agalign.batch.index_run import index_tasks, run_indices
     from agalign.cli.align_run import cluster, progress
     from agalign.products.report.pages import REPORT_FILE, write_pages
@@ -157,7 +153,7 @@ def _indices(
             reports += done
             for report in done:
                 _print(report, terminal)
-            show(number, 0.0, done[0].capture, "")
+            show(number, done[0].capture, 0)
         if target is None and (out / REPORT_FILE).is_file():
             write_pages(out, terminal.problem)
     return _conclude([one.name for one in chosen], reports, folder, terminal, as_json=as_json)
@@ -184,13 +180,7 @@ def _conclude(
 indices = Command(
     _indices,
     {"Output": "index formula target mask_qa", "Running": "jobs dask overwrite as_json quiet verbose log_json"},
-    {"overwrite": {"help": "Compute again what an earlier command wrote."}},
     on_interrupt="interrupted; written indices are kept, and the same command resumes the run",
-    epilog=examples(
-        ("agalign indices aligned/", "NDVI of every capture, next to its stack"),
-        ("agalign indices aligned/ --index ndvi,ndre,savi -o indices/", "three indices, into another folder"),
-        ("agalign indices aligned/ --formula 'mine=(N-RE)/(N+RE)'", "a formula of the bands B, G, R, RE and N"),
-    ),
 )
 
 
@@ -199,7 +189,7 @@ def _chosen_indices(names: str | None, formulas: Sequence[str]) -> "list[Index]"
     from agalign.errors import ConfigurationError
     from agalign.products.indices.formulas import index_named, index_of_formula
 
-    requested = (names or ("" if formulas else _DEFAULT_INDEX)).split(",")
+    requested = (names or ("" if formulas else "ndvi")).split(",")
     chosen = [index_named(name) for name in requested if name.strip()] + [index_of_formula(f) for f in formulas]
     repeated = [one.name for i, one in enumerate(chosen) if one.name in [c.name for c in chosen[:i]]]
     if repeated or not chosen:
@@ -254,16 +244,25 @@ def _print_table(names: Sequence[str], reports: "Sequence[IndexReport]", termina
 def _mosaic(
     terminal: Terminal,
     out: Out,
-    target: Annotated[Path | None, typer.Option("-o", "--out", help="By default OUT/mosaic.tif.")] = None,
-    index: Annotated[str | None, typer.Option("--index", "-i", help="Names of indices separated by commas.")] = None,
-    gsd: Annotated[float | None, typer.Option(min=1e-4, help="Pixel size, m; by default that of the captures.")] = None,
-    untied: Annotated[bool, typer.Option("--untied", help="Also place captures without tie points.")] = False,
+    target: Annotated[Path | None, typer.Option("-o", "--out")] = None,
+    index: Annotated[str | None, typer.Option("--index", "-i")] = None,
+    gsd: Annotated[float | None, typer.Option(min=1e-4)] = None,
+    untied: bool = False,
 ) -> int:
     """Join the aligned captures of a flight into a quick mosaic for viewing.
 
     Tie points between overlapping captures refine the georeference from GPS and attitude; captures without any to the
     others are left out. The ground is assumed to be a horizontal plane: the mosaic shows a field and its zones, and
     replaces neither an orthomosaic (OpenDroneMap) nor ground control.
+
+    Options:
+        target: By default OUT/mosaic.tif.
+        index: Names of indices separated by commas.
+        gsd: Pixel size, m; by default that of the captures.
+        untied: Also place captures without tie points.
+
+    Examples:
+        agalign mosaic aligned/ -o field.tif --index ndvi  field.tif, all bands, and field_ndvi.tif
     """
     from agalign.products.mosaic.compose import mosaic as make_mosaic
 
@@ -293,8 +292,4 @@ def _mosaic(
     return ExitCode.PARTIAL if left_out else ExitCode.OK
 
 
-mosaic = Command(
-    _mosaic,
-    {"Output": "target index gsd untied", "Running": "quiet log_json"},
-    epilog=examples(("agalign mosaic aligned/ -o field.tif --index ndvi", "field.tif, all bands, and field_ndvi.tif")),
-)
+mosaic = Command(_mosaic, {"Output": "target index gsd untied", "Running": "quiet log_json"})

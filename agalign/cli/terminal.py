@@ -42,24 +42,9 @@ class ExitCode(IntEnum):
     """Added to the number of the signal that ended the program, as shells do: 130 for SIGINT, 143 for SIGTERM."""
 
 
-class Stopped(KeyboardInterrupt):
-    """A signal requests the end of the program."""
-
-    def __init__(self, number: int) -> None:
-        super().__init__(number)
-        self.number = number
-
-
 def command_line() -> str:
     """Return the command line, quoted for a shell."""
     return shlex.join(["agalign", *sys.argv[1:]])
-
-
-def shown(text: str) -> str:
-    """Return an external text for rich, with markup and control characters escaped."""
-    from rich.markup import escape
-
-    return escape(escape_controls(text))
 
 
 def in_json(value: Any) -> Any:
@@ -77,22 +62,25 @@ def _console(**options: Any) -> "Console":
             os.dup2(null_device, self.file.fileno())
             os.close(null_device)
 
-    return PipeConsole(highlight=False, emoji=False, **options)
+    return PipeConsole(markup=False, highlight=False, emoji=False, **options)
 
 
 class Terminal:
     """Prints results to standard output, progress and problems to standard error; its parameters are options of all
     commands that list them.
+
+    Options:
+        quiet: Print problems only.
+        verbose: Print a line per band pair.
+        log_json: Print one JSON object per line to standard error.
     """
 
     def __init__(
         self,
         *,
-        quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Print problems only.")] = False,
-        verbose: Annotated[bool, typer.Option("--verbose", "-v", help="Print a line per band pair.")] = False,
-        log_json: Annotated[
-            bool, typer.Option("--log-json", help="Print one JSON object per line to standard error.")
-        ] = False,
+        quiet: Annotated[bool, typer.Option("--quiet", "-q")] = False,
+        verbose: Annotated[bool, typer.Option("--verbose", "-v")] = False,
+        log_json: bool = False,
     ) -> None:
         self.quiet, self.verbose, self.log_json = quiet, verbose, log_json
         self._stopped_by: int | None = None
@@ -104,26 +92,23 @@ class Terminal:
         """Print a line of progress: JSON with --log-json, else the text unless --quiet."""
         if self.log_json:
             line = json.dumps({"event": kind, **{k: in_json(v) for k, v in fields.items()}}, default=str)
-            try:
-                print(line, file=sys.stderr, flush=True)
-            except BrokenPipeError:
-                self.err.on_broken_pipe()
+            self.err.out(line, highlight=False)
         elif text and not self.quiet:
-            self.err.print(shown(text))
+            self.err.print(escape_controls(text))
 
     def problem(self, text: str, more: Sequence[str] = (), /, **fields: Any) -> None:
         """Print a problem, also with --quiet, followed by indented lines of details."""
         if self.log_json:
             self.event("problem", message=text, **fields)
             return
-        self.err.print(f"[yellow]agalign: {shown(text)}[/]")
+        self.err.print(f"agalign: {escape_controls(text)}", style="yellow")
         for line in more:
-            self.err.print(f"    {shown(line)}")
+            self.err.print(f"    {escape_controls(line)}")
 
     def result(self, text: str) -> None:
         """Print a result to standard output, unless --quiet or --log-json."""
         if not self.quiet and not self.log_json:
-            self.out.print(shown(text))
+            self.out.print(escape_controls(text))
 
     def facts(self, facts: Mapping[str, Any]) -> None:
         """Print the result of a command with --json to standard output."""
@@ -139,20 +124,20 @@ class Terminal:
         for place, name in enumerate(headers):
             table.add_column(name, justify="left" if place < texts else "right", overflow="fold")  # nothing is cut
         for row in rows:
-            table.add_row(*map(shown, row))
+            table.add_row(*map(escape_controls, row))
         if not self.quiet and not self.log_json:
             self.out.print(table)
 
     def check(self) -> None:
-        """Raise Stopped if a signal has requested the end: an exception from a signal handler is lost in callbacks of C
-        libraries.
+        """Raise KeyboardInterrupt, with the number of the signal, if one has requested the end: an exception from a
+        signal handler is lost in callbacks of C libraries.
         """
         if self._stopped_by is not None:
-            raise Stopped(self._stopped_by)
+            raise KeyboardInterrupt(self._stopped_by)
 
     @contextmanager
     def stoppable(self) -> Iterator[None]:
-        """Raise Stopped in the block at the first signal; the second one ends the process at once.
+        """Raise KeyboardInterrupt in the block at the first signal; the second one ends the process at once.
 
         While a module is imported, `check` or the end of the block raises it: Python ignores exceptions in callbacks of
         its import locks, and one of these locks may then be held for ever.
@@ -163,7 +148,7 @@ class Terminal:
                 os._exit(ExitCode.SIGNAL + number)
             self._stopped_by = number
             if frame is None or "<frozen importlib" not in frame.f_code.co_filename:
-                raise Stopped(number)
+                self.check()
 
         before = {}
         if threading.current_thread() is threading.main_thread():
@@ -180,32 +165,30 @@ class Terminal:
             self.check()
 
 
-def examples(*lines: tuple[str, str]) -> str:
-    """Return the epilog of a help text from (command, description)."""
-    quoted = [(command.replace("[", r"\["), what.replace("[", r"\[")) for command, what in lines]
-    return "\n\n".join(["Examples:", *(f"[bold]{command}[/]  {what}" for command, what in quoted)])
-
-
 @contextmanager
 def exits(terminal: Terminal, on_interrupt: str = "interrupted", config: Any = None) -> Iterator[None]:
     """Convert exceptions in the block to one line and an exit code; usage errors name the file of options."""
+    code, details = ExitCode.NOTHING + 0, ""
     try:
         with terminal.stoppable():
             yield
+        return
     except typer.Exit:
         raise
-    except BaseException as error:
-        code, text = _exit_code(error, on_interrupt)
-        if code is None:
-            raise
-        text += options_from(config) if code == ExitCode.USAGE else ""
-        with suppress(OSError):  # standard error may be a file on a full disk
-            if terminal.verbose and code == ExitCode.NOTHING and not isinstance(error, AgalignError):
-                from rich.markup import escape
-
-                terminal.err.print(escape(traceback.format_exc()))
-            terminal.problem(text)
-        raise typer.Exit(code) from None
+    except KeyboardInterrupt as error:
+        number = error.args[0] if error.args else signal.SIGINT
+        code, text = ExitCode.SIGNAL + number, on_interrupt
+    except ConfigurationError as error:
+        code, text = ExitCode.USAGE, f"{error}{options_from(config)}"
+    except AgalignError as error:
+        text = str(error)
+    except Exception as error:
+        text, details = _unexpected(error), traceback.format_exc()
+    with suppress(OSError):  # standard error may be a file on a full disk
+        if terminal.verbose and details:
+            terminal.err.print(details)
+        terminal.problem(text)
+    raise typer.Exit(code)
 
 
 def options_from(config: Any) -> str:
@@ -213,27 +196,15 @@ def options_from(config: Any) -> str:
     return f" (options also from {config})" if config else ""
 
 
-def _exit_code(error: BaseException, on_interrupt: str) -> tuple[int | None, str]:
-    """Return (exit code, message) for an exception; no code for exceptions that are not caught."""
-    match error:
-        case KeyboardInterrupt():
-            number = error.number if isinstance(error, Stopped) else signal.SIGINT
-            return ExitCode.SIGNAL + number, on_interrupt
-        case ConfigurationError():
-            return ExitCode.USAGE, str(error)
-        case AgalignError():
-            text = str(error)
-        case _ if is_out_of_memory(error):
-            text = "out of memory; close other programs or try a smaller image"
-        case ImportError():
-            text = f"a library cannot be loaded ({error}); is memory short, or the installation damaged?"
-        case OSError():
-            text = f"{error.filename or 'output'}: {error.strerror or error}"
-        case Exception():
-            text = f"agalign failed ({type(error).__name__}: {error}); please report this"
-        case _:
-            return None, ""
-    return ExitCode.NOTHING, text
+def _unexpected(error: Exception) -> str:
+    """Return the message for an exception of a library or of the system."""
+    if is_out_of_memory(error):
+        return "out of memory; close other programs or try a smaller image"
+    if isinstance(error, ImportError):
+        return f"a library cannot be loaded ({error}); is memory short, or the installation damaged?"
+    if isinstance(error, OSError):
+        return f"{error.filename or 'output'}: {error.strerror or error}"
+    return f"agalign failed ({type(error).__name__}: {error}); please report this"
 
 
 @contextmanager

@@ -6,7 +6,6 @@ The keypoints are SIFT's, the positives their patches warped by the estimated ho
 import math
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
 from pathlib import Path
 
 import torch
@@ -32,12 +31,8 @@ from agalign.values.alignment import Alignment
 from agalign.values.geometry import Matrix
 from agalign.values.pixel_units import FixedImagePx
 
-
-@dataclass(frozen=True)
-class _Example:
-    level: Level
-    homography: torch.Tensor
-    keypoints: Keypoints
+_Example = tuple[Level, torch.Tensor, Keypoints]
+"""A pair at full resolution, its homography, and the keypoints of the first image that both show."""
 
 
 def learn_descriptor(
@@ -75,12 +70,11 @@ def learn_descriptor(
 
 def _example(state: JointState, pair: BandPair, fixed_to_moving: Matrix) -> _Example:
     level = state.level(ImageGroup.of_one(pair.fixed, pair.moving, fixed_to_moving), 1.0, [0])
-    keypoints = sift_keypoints(pair.fixed)
-    keypoints = visible_in_both(keypoints, fixed_to_moving, pair.fixed, pair.moving)
+    keypoints = visible_in_both(sift_keypoints(pair.fixed), fixed_to_moving, pair.fixed, pair.moving)
     minimum = 2
     if len(keypoints) < minimum:
         raise NotEnoughTextureError(len(keypoints), minimum)
-    return _Example(level, level.homography(fixed_to_moving, 0), keypoints.to(state.device))
+    return level, level.homography(fixed_to_moving, 0), keypoints.to(state.device)
 
 
 def _learn(net: Descriptor, examples: Sequence[_Example], state: JointState, steps: int) -> None:
@@ -89,15 +83,15 @@ def _learn(net: Descriptor, examples: Sequence[_Example], state: JointState, ste
     optimiser = torch.optim.Adam(net.parameters(), LEARNING_RATE)
     annealing = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, steps)
     for step in range(steps):
-        example = examples[step % len(examples)]
-        rows = torch.randint(len(example.keypoints), (BATCH,), generator=generator)
-        k = example.keypoints[rows.to(state.device)]
+        level, homography, keypoints = examples[step % len(examples)]
+        rows = torch.randint(len(keypoints), (BATCH,), generator=generator)
+        k = keypoints[rows.to(state.device)]
         # Data augmentation: random orientations and scales in addition to those of SIFT.
         rotation = 2 * math.pi * torch.rand(len(k), generator=generator)
         zoom = 2 ** (torch.rand(len(k), generator=generator) - 0.5)
         k = Keypoints(k.xy, k.angle + rotation.to(k.angle), k.scale * zoom.to(k.scale))
-        moving = MovingBand(net, example.level, 0, 1)
-        patches = [example.level.fixed.patches(patch_positions(k)), moving.patches(k, example.homography)]
+        moving = MovingBand(net, level, 0, 1)
+        patches = [level.fixed.patches(patch_positions(k)), moving.patches(k, homography)]
         f, f_prime = net.describe(patches, [REFERENCE, moving.side])
         loss = in_batch_loss(f, f_prime, far_apart(k))
         optimiser.zero_grad()

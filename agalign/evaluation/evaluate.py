@@ -1,7 +1,5 @@
 """Evaluation of methods on pairs from several initial homographies, and tables of the results. The methods: descriptors
 learned on the pair, pretrained and hand-crafted descriptors, and elastix.
-
-A method returns descriptors of patches of both images, a homography, or both, from a pair and an initial homography.
 """
 
 import importlib
@@ -12,8 +10,10 @@ import time
 import zlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import astuple, dataclass, fields, replace
+from functools import partial
 from itertools import product
 from pathlib import Path
+from statistics import fmean
 from typing import get_args
 
 import cv2
@@ -47,39 +47,19 @@ from agalign.values.geometry import Matrix
 from agalign.values.image import Raster
 from agalign.values.mapping import PixelMapping
 
-
-@dataclass(frozen=True)
-class PairTask:
-    """Two images and the initial homography."""
-
-    fixed: Raster
-    moving: Raster
-    start: Matrix
-    """Initial fixed_to_moving, px."""
-    device: str = "auto"
-    rng_seed: int = 0
-    seeding: bool = True
-    """Correct `start` by the initial alignment first, as a run does."""
-
-
 Describe = Callable[[Keypoints, Matrix], tuple[Tensor, Tensor]]
 """Return descriptors (f, f'), each (N, D), of the patches around keypoints of the first image, and of the patches of
 the second image that a homography maps them to."""
+Outcome = tuple[Describe | None, Matrix | None]
+"""Descriptors and homography (fixed_to_moving) of a pair, as far as a method has them."""
+Method = Callable[[Raster, Raster, Matrix], Outcome]
+"""Return the outcome for two images and the initial homography, px."""
 
 
-@dataclass(frozen=True)
-class Outcome:
-    """Result of a method for a pair."""
-
-    describe: Describe | None = None
-    fixed_to_moving: Matrix | None = None
-
-
-Method = Callable[[PairTask], Outcome]
-
-
-def method_named(name: str) -> Method:
+def method_named(name: str, device: str = "auto", rng_seed: int = 0, *, seeding: bool = False) -> Method:
     """Return the method of a name on the command line.
+
+    With `seeding`, descriptors that are learned on the pair start from the initial alignment, as in a run.
 
     * `fast`, `scratch` or `paper`, a colon and the sharing (`siamese`, `pseudo-siamese`, `unshared`): learned on the
       pair by that recipe. `:grey` added: on grey images.
@@ -90,8 +70,8 @@ def method_named(name: str) -> Method:
     Raises ConfigurationError for other names, InputError for a file that cannot be used.
     """
     fixed_names: dict[str, Method] = {
-        "sift": lambda task: _from_patches(task, 64, sift_of_patches),
-        "daisy": lambda task: _from_patches(task, 64, daisy_of_patches),
+        "sift": _from_patches(64, sift_of_patches),
+        "daisy": _from_patches(64, daisy_of_patches),
         "elastix": _elastix,
     }
     if name == "elastix" and importlib.util.find_spec("itk") is None:
@@ -100,8 +80,9 @@ def method_named(name: str) -> Method:
         return fixed_names[name]
     learned = re.fullmatch(r"(fast|scratch|paper):([a-z-]+)(:grey)?", name)
     if learned and learned[2] in get_args(Sharing):
-        settings = JointSettings.model_validate({"recipe": learned[1], "sharing": learned[2]})
-        return lambda task: _learned_on_pair(task, settings, colour=learned[3] is None)
+        facts = {"recipe": learned[1], "sharing": learned[2], "device": device, "rng_seed": rng_seed}
+        settings = JointSettings.model_validate(facts)
+        return partial(_learned_on_pair, settings=settings, colour=learned[3] is None, seeding=seeding)
     if ".safetensors" in name:
         return _saved_network(Path(name))
     if ".pt" in name:
@@ -115,16 +96,14 @@ def method_named(name: str) -> Method:
 # ---- descriptors of agalign
 
 
-def _learned_on_pair(task: PairTask, settings: JointSettings, *, colour: bool) -> Outcome:
+def _learned_on_pair(
+    fixed: Raster, moving: Raster, start: Matrix, *, settings: JointSettings, colour: bool, seeding: bool
+) -> Outcome:
     """Learn a descriptor and a homography on the pair."""
-    fixed, moving = task.fixed, task.moving
     if not colour or (settings.sharing == "siamese" and fixed.channels != moving.channels):
         fixed, moving = (_without_colour(r) for r in (fixed, moving))
-    settings = settings.model_copy(update={"device": task.device, "rng_seed": task.rng_seed})
-    seed = Seed("user", task.start, 0.0)
-    pair = BandPair("moving", Reference(fixed), moving, {"user": task.start})
-    if task.seeding:
-        seed = best_seed(pair, pair.seed_matrices)
+    pair = BandPair("moving", Reference(fixed), moving, {"user": start})
+    seed = best_seed(pair, pair.seed_matrices) if seeding else Seed("user", start, 0.0)
     state, [(_, group)] = JointState(settings, lambda *_: None), image_groups([(pair, seed)])
     try:
         if settings.recipe == "paper":
@@ -134,9 +113,9 @@ def _learned_on_pair(task: PairTask, settings: JointSettings, *, colour: bool) -
             learn(state, [group], net)
             result = refine(state, net, group)[0]
     except (NotEnoughTextureError, NoContrastError, GeometryError):
-        return Outcome(None, seed.fixed_to_moving)
+        return None, seed.fixed_to_moving
     mapping = result.fixed_to_moving if isinstance(result, JointResult) else group.mappings[0]
-    return Outcome(_by_network(net, state, fixed, moving), mapping)
+    return _by_network(net, state, fixed, moving), mapping
 
 
 def _without_colour(raster: Raster) -> Raster:
@@ -157,14 +136,14 @@ def _saved_network(path: Path) -> Method:
     """Return a network of `agalign learn` or of an earlier run; images with another number of channels become grey."""
     model = load_model(path, lambda: torch.device("cpu"))
 
-    def method(task: PairTask) -> Outcome:
+    def method(one: Raster, other: Raster, _: Matrix) -> Outcome:
         fixed, moving = (
             r if r.channels == channels else _without_colour(r)
-            for r, channels in zip((task.fixed, task.moving), model.net.channels, strict=False)
+            for r, channels in zip((one, other), model.net.channels, strict=False)
         )
         net = matching_network(model.net, 1, (fixed.channels, moving.channels))
         state = JointState(JointSettings(device="cpu"), lambda *_: None)
-        return Outcome(_by_network(net, state, fixed, moving))
+        return _by_network(net, state, fixed, moving), None
 
     return method
 
@@ -172,15 +151,18 @@ def _saved_network(path: Path) -> Method:
 # ---- other methods
 
 
-def _from_patches(task: PairTask, side: int, describe_patches: Callable[[Tensor], Tensor]) -> Outcome:
-    """Return the outcome of a descriptor of patches (N, 1, side, side) in [0, 1]."""
+def _from_patches(side: int, describe_patches: Callable[[Tensor], Tensor]) -> Method:
+    """Return the method of a descriptor of patches (N, 1, side, side) in [0, 1]."""
 
-    def describe(keypoints: Keypoints, fixed_to_moving: Matrix) -> tuple[Tensor, Tensor]:
-        grid = patch_positions(keypoints, side)
-        mapped = transform(torch.tensor(fixed_to_moving, dtype=torch.float32), grid)
-        return describe_patches(grey_patches(task.fixed, grid)), describe_patches(grey_patches(task.moving, mapped))
+    def method(fixed: Raster, moving: Raster, _: Matrix) -> Outcome:
+        def describe(keypoints: Keypoints, fixed_to_moving: Matrix) -> tuple[Tensor, Tensor]:
+            grid = patch_positions(keypoints, side)
+            mapped = transform(torch.tensor(fixed_to_moving, dtype=torch.float32), grid)
+            return describe_patches(grey_patches(fixed, grid)), describe_patches(grey_patches(moving, mapped))
 
-    return Outcome(describe)
+        return describe, None
+
+    return method
 
 
 def _mosaic(patches: Tensor) -> tuple[NDArray[np.float32], int, int]:
@@ -232,15 +214,14 @@ def _torchscript(path: Path, side: int) -> Method:
     def describe(patches: Tensor) -> Tensor:
         return torch.cat([module(some).flatten(1) for some in torch.split(patches, 512)])
 
-    return lambda task: _from_patches(task, side, describe)
+    return _from_patches(side, describe)
 
 
-def _elastix(task: PairTask) -> Outcome:
+def _elastix(fixed: Raster, moving: Raster, start: Matrix) -> Outcome:
     """Register the pair by elastix with the number of pyramid levels of recipe paper."""
-    moving = warped(channel_mean(task.moving), PixelMapping(task.start), task.fixed.size_px)
-    levels = len(pyramid(max(task.fixed.size_px)))
-    result = elastix_affinity(channel_mean(task.fixed), moving, levels)
-    return Outcome(None, task.start if result is None else geometry.compose(task.start, result))
+    warped_moving = warped(channel_mean(moving), PixelMapping(start), fixed.size_px)
+    result = elastix_affinity(channel_mean(fixed), warped_moving, len(pyramid(max(fixed.size_px))))
+    return None, start if result is None else geometry.compose(start, result)
 
 
 def elastix_affinity(fixed: Raster, moving: Raster, levels: int | None = None) -> Matrix | None:
@@ -300,8 +281,6 @@ class Starts:
     shifts: tuple[float, ...] = (0.05,)
     directions: int = 1
     """Number of directions for each shift, evenly spaced from a random one for each pair."""
-    seeding: bool = False
-    """Correct the initial homography by the initial alignment first, as a run does."""
 
     def of(self, truth: Matrix, longer_side_px: int, rng: np.random.Generator) -> Iterator[tuple[float, Matrix]]:
         """Yield (shift, fixed_to_moving) of every initial homography."""
@@ -333,7 +312,7 @@ class Result:
 
 
 def evaluate(
-    pairs: Sequence[PairFiles], methods: Mapping[str, Method], starts: Starts, device: str = "auto", rng_seed: int = 0
+    pairs: Sequence[PairFiles], methods: Mapping[str, Method], starts: Starts, rng_seed: int = 0
 ) -> Iterator[Result]:
     """Yield the results pair by pair; methods without a homography do not depend on the start and are run once.
 
@@ -345,22 +324,22 @@ def evaluate(
             raise InputError(f"{pair.fixed}: has no homography to compare with")
         fixed, moving = read_image(pair.fixed), read_image(pair.moving)
         keypoints = visible_in_both(sift_keypoints(fixed), truth, fixed, moving)
+        points_px = keypoints.xy.numpy().astype(np.float64)
         for name, method in methods.items():
             rng = np.random.default_rng((rng_seed, zlib.crc32(pair.name.encode())))
             for shift, start in starts.of(truth, max(fixed.size_px), rng):
                 began = time.perf_counter()
                 with one_thread(), one_memory_error():
-                    outcome = method(PairTask(fixed, moving, start, device, rng_seed, starts.seeding))
+                    describe, result = method(fixed, moving, start)
                 seconds = time.perf_counter() - began
                 precision = error_px = math.nan
-                if outcome.describe is not None and len(keypoints):
-                    precision = average_precision(*outcome.describe(keypoints, truth))
-                if outcome.fixed_to_moving is not None and len(keypoints):
-                    points_px = keypoints.xy.numpy().astype(np.float64)
-                    error_px = homography_error_px(outcome.fixed_to_moving, truth, points_px)
+                if describe is not None and len(keypoints):
+                    precision = average_precision(*describe(keypoints, truth))
+                if result is not None and len(keypoints):
+                    error_px = homography_error_px(result, truth, points_px)
                 share = error_px / max(moving.size_px)
                 yield Result(pair.name, pair.group, name, shift, len(keypoints), precision, error_px, share, seconds)
-                if outcome.fixed_to_moving is None:
+                if result is None:
                     break
 
 
@@ -401,4 +380,4 @@ def error_table(results: Sequence[Result]) -> list[list[str]]:
 
 def _mean_precision(results: Sequence[Result]) -> float:
     """Return the mean of the average precisions; nan without results."""
-    return float(np.mean([r.average_precision for r in results])) if results else math.nan
+    return fmean(r.average_precision for r in results) if results else math.nan

@@ -80,28 +80,24 @@ def _from_csv(path: Path) -> Iterator[PairFiles]:
         except KeyError as missing:
             raise InputError(f"{path}: has no column {missing}; it needs fixed and moving") from None
         name = row.get("name") or f"{Path(fixed).stem} {Path(moving).stem}"
-        matrix = _homography_in(row.get("homography") or "", path, number)
+        matrix, cell = None, row.get("homography") or ""
+        if len(cell.replace(",", " ").split()) > 1:
+            matrix = _homography_of(cell, f"{path}, line {number}")
+        elif cell:
+            matrix = _read_homography(path.parent / cell)
         yield PairFiles(name, row.get("group") or path.stem, path.parent / fixed, path.parent / moving, matrix)
-
-
-def _homography_in(cell: str, path: Path, line: int) -> Matrix | None:
-    """Of a cell of a CSV file: nine numbers, the name of a file of them, or empty."""
-    numbers = cell.replace(",", " ").split()
-    if len(numbers) > 1:
-        return _as_homography(numbers, f"{path}, line {line}")
-    return _read_homography(path.parent / cell) if cell else None
 
 
 def _read_homography(path: Path) -> Matrix:
     try:
-        return _as_homography(path.read_text(encoding="utf-8").replace(",", " ").split(), str(path))
+        return _homography_of(path.read_text(encoding="utf-8"), str(path))
     except (OSError, UnicodeDecodeError) as error:
         raise InputError(f"{path}: cannot be read ({error})") from None
 
 
-def _as_homography(numbers: list[str], where: str) -> Matrix:
+def _homography_of(text: str, where: str) -> Matrix:
     try:
-        return geometry.normalised(np.array([float(n) for n in numbers]).reshape(3, 3))
+        return geometry.normalised(np.array(text.replace(",", " ").split(), float).reshape(3, 3))
     except (ValueError, GeometryError):
         raise InputError(f"{where}: a homography is nine numbers, row by row") from None
 

@@ -32,15 +32,11 @@ def test_it_names_every_extra_that_a_user_may_want() -> None:
         assert all(re.fullmatch(r"[\w.-]+", name) for name in doctor._requirements(extra))
 
 
-def test_problems_of_the_machine_are_listed(monkeypatch: pytest.MonkeyPatch) -> None:
-    machine = dict.fromkeys(doctor._LIBRARIES, "1")
-    well = {"machine": machine, "devices": [], "disk": {"folder": "/data", "writable": True, "free_gb": 100.0}}
-    assert doctor._problems(well) == []
-    broken = {
-        "machine": machine | {"torch": None},
-        "devices": [{"device": "cuda:0", "problem": "no kernel image"}],
-        "disk": {"folder": "/data", "writable": False, "free_gb": 0.2},
-    }
-    text = "\n".join(doctor._problems(broken))
-    for word in ("torch", "--device", "-o", "0.2 GB"):
-        assert word in text
+def test_problems_of_the_machine_are_listed() -> None:
+    disk = {"folder": "/data", "writable": True, "free_gb": 100.0}
+    good = {"machine": dict.fromkeys(doctor._LIBRARIES, "1"), "devices": [], "disk": disk}
+    assert doctor._problems(good) == []
+    devices = [{"device": "cuda:0", "problem": "no kernel image"}]
+    bad = {"machine": good["machine"] | {"torch": None}, "devices": devices}
+    text = "\n".join(doctor._problems(bad | {"disk": disk | {"writable": False, "free_gb": 0.2}}))
+    assert all(word in text for word in ("torch", "--device", "-o", "0.2 GB"))

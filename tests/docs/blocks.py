@@ -41,16 +41,9 @@ class Block:
 
 def blocks_of(page: Path) -> Iterator[Block]:
     """All fenced blocks of a page."""
-    lines = page.read_text(encoding="utf-8").splitlines()
-    begin: int | None = None
-    for number, line in enumerate(lines):
-        if not line.startswith("```"):
-            continue
-        if begin is None:
-            begin = number
-            continue
-        yield Block(page, begin + 1, lines[begin][3:].strip(), "\n".join(lines[begin + 1 : number]))
-        begin = None
+    text = page.read_text(encoding="utf-8")
+    for found in re.finditer(r"^```(.*?)\n(.*?)\n?^```", text, re.MULTILINE | re.DOTALL):
+        yield Block(page, text.count("\n", 0, found.start()) + 1, found[1].strip(), found[2])
 
 
 def commands_of(block: Block) -> list[str]:
