@@ -8,11 +8,11 @@ from functools import partial
 
 import numpy as np
 
+from agalign.batch.capture_task import in_one_thread
 from agalign.batch.learning_tasks import (
     LearningCapture,
     RigObservation,
     choose_and_refine,
-    in_one_thread,
     initial_network,
     load_capture,
     logged_failure,
@@ -189,7 +189,7 @@ class _FlightLearner:
     def _observations(self, model: FlightModel, known: Sequence[LearningCapture]) -> dict[str, RigObservation]:
         """Return observations of the rig by capture, until every observed band is in enough of them.
 
-        `known` are the captures that the network has refined.
+        `known` are the captures that the network has refined. Of these, only the misaligned bands are observed again.
         """
         # Neighbours have about the same height and speed.
         captures_per_rig_capture = 8
@@ -200,24 +200,15 @@ class _FlightLearner:
         model = portable(model)
         while waiting and (missing := count - _min_observations(result.values())) > 0:
             some, waiting = waiting[:missing], waiting[missing:]
-            self._observe(some, model, result, count)
+            # The model's mappings are better initial alignments than the seeds of the misaligned bands.
+            arguments = [(c, result[c.label].misaligned if c.label in result else None) for c in some]
+            observations = self.apply(partial(observe_rig, model, self.settings), arguments)
+            for capture, observation in zip(some, observations, strict=True):
+                if observation is not None:
+                    earlier = result.get(capture.label)
+                    result[capture.label] = observation if earlier is None else earlier.updated(observation)
+                self.progress("the rig", min(1.0, len(result) / count))
         return {c.label: result[c.label] for c in self.captures if c.label in result}
-
-    def _observe(
-        self, captures: Sequence[Capture], model: FlightModel, result: dict[str, RigObservation], count: int
-    ) -> None:
-        """Add observations of captures to `result`, which `count` of them complete.
-
-        Of captures that it contains, only the misaligned bands are observed again.
-        """
-        # The model's mappings are better initial alignments than the seeds of the misaligned bands.
-        arguments = [(c, result[c.label].misaligned if c.label in result else None) for c in captures]
-        observations = self.apply(partial(observe_rig, model, self.settings), arguments)
-        for capture, observation in zip(captures, observations, strict=True):
-            if observation is not None:
-                earlier = result.get(capture.label)
-                result[capture.label] = observation if earlier is None else earlier.updated(observation)
-            self.progress("the rig", min(1.0, len(result) / count))
 
     def _rig(self, observations: Sequence[RigObservation]) -> Rig | None:
         """Return the rig, with the displacement fields of the lenses; None if the captures do not determine it."""

@@ -2,7 +2,7 @@
 
 import copy
 import logging
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 
@@ -18,7 +18,7 @@ from agalign.errors import AgalignError
 from agalign.flight.model import FlightModel
 from agalign.flight.rig import Observation
 from agalign.method.descriptor import Descriptor, start_from
-from agalign.method.device import choose_device, keep_freed_memory, one_memory_error, one_thread
+from agalign.method.device import choose_device
 from agalign.method.fast import SCHEDULES
 from agalign.method.joint import refine_with
 from agalign.method.refine import FLIGHT_PATCHES
@@ -29,7 +29,6 @@ from agalign.values.capture import Capture
 from agalign.values.geometry import Matrix
 from agalign.values.issues import Issue
 from agalign.values.pixel_units import FixedFilePx, FixedImagePx
-from agalign.values.process_pool import A, R
 
 
 @contextmanager
@@ -45,14 +44,6 @@ def logged_failure(message: str) -> Iterator[None]:
     except Exception as error:
         is_defect = not isinstance(error, AgalignError)
         logging.getLogger(__name__).debug("%s: %s", message, error, exc_info=is_defect)
-
-
-@one_thread()
-@one_memory_error()
-def in_one_thread(function: Callable[[A], R], argument: A) -> R:
-    """Call a function that uses one thread; memory errors of libraries are MemoryError."""
-    keep_freed_memory()
-    return function(argument)
 
 
 def portable(model: FlightModel) -> FlightModel:
