@@ -30,7 +30,7 @@ from agalign.flight.rig import MIN_CAPTURES, Rig, median_mapping
 from agalign.method.descriptor import Descriptor
 from agalign.method.device import keep_freed_memory, one_memory_error, one_thread
 from agalign.method.fast import learn
-from agalign.method.state import ImageGroup, JointState, Progress
+from agalign.method.state import JointState, Progress
 from agalign.pixels.raster import without_warnings
 from agalign.values import geometry
 from agalign.values.alignment import RefinedPair, Residual
@@ -165,7 +165,7 @@ class _FlightLearner:
         if not chosen:
             return None
         net = initial_network(self._bands, self.settings, self.start)
-        if all(one.is_good_enough for one in chosen):
+        if all(one.observation is not None for one in chosen):
             return net, list({one.capture.label: one for one in refined if one is not None}.values())
         return self._trained(net, chosen)
 
@@ -174,16 +174,14 @@ class _FlightLearner:
     ) -> tuple[Descriptor, list[LearningCapture]] | None:
         """Train a network on captures, from the mappings that are already refined; None if that fails."""
         settings = self.settings
-        loaded = [load_capture(one.capture, self._bands, settings, self.start, one.refined) for one in chosen]
-        pairs = [(one, images) for one, images in zip(chosen, loaded, strict=True) if images is not None]
-        groups: list[ImageGroup] = []
-        for one, images in pairs:
-            groups += images.groups_from(one.refined)
+        read = [load_capture(one.capture, self._bands, settings, self.start, one.refined) for one in chosen]
+        loaded = [capture for capture in read if capture is not None]
+        groups = [group for capture in loaded for _, group in capture.groups]
         # One capture may make learning from all of them fail; a network is then learned for each capture alone.
         with logged_failure("the flight cannot be learned from"):
             learn(JointState(settings.joint, self.progress), groups, net, self.threads)
             with ThreadPoolExecutor(self.threads) as pool:
-                return net, list(pool.map(lambda p: p[1].refined_by(net, settings), pairs))
+                return net, list(pool.map(lambda capture: capture.refined_by(net, settings), loaded))
         return None
 
     def _observations(self, model: FlightModel, known: Sequence[LearningCapture]) -> dict[str, RigObservation]:

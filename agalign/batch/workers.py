@@ -86,13 +86,7 @@ def chosen_run(
             environment_of_children(of_each),
             ProcessPool(processes, worker_context(preload), partial(initializer, of_each)) as pool,
         ):
-
-            def run(
-                function: Callable[[A], R], tasks: Sequence[A], /, *, timeout_s: float | None = None
-            ) -> Completed[R]:
-                return _completed(partial(pool.submit, function, timeout_s=timeout_s), tasks, lambda: pool.loss)
-
-            yield run
+            yield on_executor(pool)
     elif threads > 1:
         # Warning filters are global: threads that change and restore them would interfere.
         with without_warnings(), ThreadPoolExecutor(threads) as thread_pool:
@@ -101,19 +95,19 @@ def chosen_run(
         yield serially
 
 
-def on_executor(executor: Executor) -> Run:
-    """Run tasks on an executor of the caller, which is not shut down."""
+def on_executor(executor: "Executor | ProcessPool") -> Run:
+    """Run tasks on an executor, which is not shut down. A time limit and a loss of all workers need one of agalign."""
 
     def run(function: Callable[[A], R], tasks: Sequence[A], /, *, timeout_s: float | None = None) -> Completed[R]:
-        if not isinstance(executor, DaskExecutor):
-            return _completed(partial(_submitted, executor, function), tasks, str)
-        return _completed(partial(executor.submit, _on_worker, __version__, timeout_s, function), tasks, executor.loss)
+        if isinstance(executor, (ProcessPool, DaskExecutor)):
+            return _completed(partial(executor.submit, function, timeout_s=timeout_s), tasks, lambda: executor.loss)
+        return _completed(partial(_submitted, executor, function), tasks, str)
 
     return run
 
 
 def _completed(submit: Callable[[A], "Future[R]"], tasks: Sequence[A], loss: Callable[[], str]) -> Completed[R]:
-    """Submit the tasks, and yield them. Raises WorkerError if the executor gives a reason for its `loss`."""
+    """Submit the tasks, and yield them. Raises WorkerError if there is a reason for the `loss` of all workers."""
     futures: dict[Future[R], int] = {}
     remaining = iter(enumerate(tasks))
 
@@ -250,11 +244,12 @@ class DaskExecutor(Executor):
     def __init__(self, client: Any) -> None:
         self._client, self._executor = client, client.get_executor(pure=False)
 
-    def submit(self, function: Any, /, *arguments: Any, **named: Any) -> Any:
-        return self._executor.submit(function, *arguments, **named)
+    def submit(self, function: Any, /, *arguments: Any, **timeout_s: Any) -> Any:
+        return self._executor.submit(_on_worker, __version__, function, *arguments, **timeout_s)
 
+    @property
     def loss(self) -> str:
-        """Return why no task can complete any more; empty while the scheduler answers."""
+        """Why no task can complete any more; empty while the scheduler answers."""
         if self._client.status == "running":
             return ""
         return (
@@ -263,7 +258,7 @@ class DaskExecutor(Executor):
         )
 
 
-def _on_worker(version: str, timeout_s: float | None, function: Callable[[A], R], task: A) -> R:
+def _on_worker(version: str, function: Callable[..., R], *arguments: Any, timeout_s: float | None = None) -> R:
     """Call a function in one thread; OMP_NUM_THREADS, which Dask sets, does not limit all libraries.
 
     Ends this process if it takes longer than the timeout: code that hangs in a library cannot be interrupted.
@@ -278,6 +273,6 @@ def _on_worker(version: str, timeout_s: float | None, function: Callable[[A], R]
         from agalign.method.device import limit_threads
 
         limit_threads(1)
-        return function(task)
+        return function(*arguments)
     finally:
         alarm.cancel()
