@@ -291,16 +291,14 @@ import sys
 from multiprocessing import get_context
 from agalign.values.process_pool import ProcessPool
 from tests.values.pool_tasks import sleep
-if __name__ == "__main__":
-    # A shell starts jobs in the background with this signal ignored.
-    signal.signal(signal.SIGINT, signal.default_int_handler)
-    with ProcessPool(4, get_context(sys.argv[1])) as workers:
-        futures = [workers.submit(sleep, seconds) for seconds in [0.1] * 4 + [3600.0] * 8]
-        for future in futures[:4]:
-            future.result()
-        print("begun", flush=True)
-        for future in futures[4:]:
-            future.result()
+# A shell starts jobs in the background with this signal ignored.
+signal.signal(signal.SIGINT, signal.default_int_handler)
+with ProcessPool(4, get_context(sys.argv[1])) as workers:
+    futures = [workers.submit(sleep, seconds) for seconds in [0.1] * 4 + [3600.0] * 8]
+    for number, future in enumerate(futures):
+        future.result()
+        if number == 3:
+            print("begun", flush=True)
 """
 
 
@@ -308,14 +306,10 @@ if __name__ == "__main__":
 @pytest.mark.parametrize("target", ["parent", in_full_run("group")])
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGKILL, in_full_run(signal.SIGINT)])
 @pytest.mark.parametrize("method", ["forkserver", in_full_run("spawn")])
-def test_no_process_outlives_its_parent(method: str, number: int, target: str, tmp_path: Path) -> None:
-    script = tmp_path / "script.py"
-    script.write_text(SCRIPT)
-    command = [sys.executable, str(script), method]
+def test_no_process_outlives_its_parent(method: str, number: int, target: str) -> None:
     root = Path(__file__).resolve().parents[2]
-    environment = {**os.environ, "PYTHONPATH": str(root)}
-    given = {"stdout": subprocess.PIPE, "stderr": subprocess.DEVNULL, "start_new_session": True, "env": environment}
-    with subprocess.Popen(command, **given) as process:
+    given = {"stdout": subprocess.PIPE, "stderr": subprocess.DEVNULL, "start_new_session": True, "cwd": root}
+    with subprocess.Popen([sys.executable, "-c", SCRIPT, method], **given) as process:
         try:
             assert process.stdout.readline() == b"begun\n"
             children = psutil.Process(process.pid).children(recursive=True)
