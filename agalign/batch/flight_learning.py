@@ -35,7 +35,6 @@ from agalign.pixels.raster import without_warnings
 from agalign.values import geometry
 from agalign.values.alignment import RefinedPair, Residual
 from agalign.values.capture import Capture
-from agalign.values.geometry import Matrix
 from agalign.values.pixel_units import FixedFilePx, MovingFilePx
 from agalign.values.process_pool import A, Apply, R
 from agalign.verify.extrapolation import unmodelled_std_px, unobserved_quarters
@@ -105,13 +104,11 @@ class _FlightLearner:
         if network is None:
             return None
         net, known = network
-        mappings: dict[str, list[Matrix]] = {}
-        for one in known:
-            for name, matrix in one.mappings.items():
-                mappings.setdefault(name, []).append(matrix)
-        if not mappings:
+        names = dict.fromkeys(name for one in known for name in one.mappings)
+        if not names:
             return None
-        medians = {name: median_mapping(of, self._size_px) for name, of in mappings.items()}
+        mappings = {name: [one.mappings[name] for one in known if name in one.mappings] for name in names}
+        medians = {name: median_mapping(of_band, self._size_px) for name, of_band in mappings.items()}
         model = FlightModel(net, flight_camera(self.captures), self._bands, medians, "")
         observations = self._observations(model, known)
         rig = self._rig(list(observations.values())) or self._start_rig
