@@ -61,18 +61,27 @@ class Scene:
     arguments: list[str] = field(default_factory=list)
     command: list[str] | None = None
     """Instead of aligning the folder into `out`."""
-    watch: Callable[["subprocess.Popen[str]"], None] | None = None
-    """Done while the program runs, in a process of its own."""
+    watch: "Inject | None" = None
+    """Done while the program runs, in a process of its own: `run`."""
+    run: "subprocess.Popen[str] | None" = None
     process: dict[str, Any] = field(default_factory=dict)
     """How that process is started, where it must have one."""
     options: tuple[str, ...] = ()
     """Options that save time in what the fault does not concern."""
     undo: Callable[[], None] = lambda: None
-    children: list[psutil.Process] = field(default_factory=list)
+    stopped: list[psutil.Process] = field(default_factory=list)
     """Processes that must not outlive the program."""
 
     def file(self, name: str = "b_nir.tif") -> Path:
         return self.folder / name
+
+    def children(self) -> list[psutil.Process]:
+        """All processes that the program has started."""
+        return psutil.Process(self.run.pid).children(recursive=True)
+
+    def workers(self) -> list[psutil.Process]:
+        """The processes that do captures: the fork server starts them."""
+        return [c for c in self.children() if c.ppid() != self.run.pid]
 
     def run_of(self, out: Path) -> list[str]:
         """Arguments of a usual run into this folder."""
@@ -180,12 +189,12 @@ def run_outside(arguments: list[str], scene: Scene) -> tuple[int, str]:
     """In a process of its own: (exit code, standard error)."""
     given = {"stdout": subprocess.DEVNULL, "stderr": subprocess.PIPE, "text": True, "start_new_session": True}
     given |= scene.process
-    with subprocess.Popen([sys.executable, "-m", "agalign", *arguments], **given) as process:
+    with subprocess.Popen([sys.executable, "-m", "agalign", *arguments], **given) as scene.run:
         if scene.watch is not None:
-            scene.watch(process)
-        _, errors = process.communicate()
-    psutil.wait_procs(scene.children)
-    return process.returncode, errors or ""
+            scene.watch(scene)
+        _, errors = scene.run.communicate()
+    psutil.wait_procs(scene.stopped)
+    return scene.run.returncode, errors or ""
 
 
 # ---- what is done to files
@@ -424,23 +433,14 @@ def full_disk(scene: Scene) -> None:
     scene.process = {"preexec_fn": limit}
 
 
-Act = Callable[["subprocess.Popen[str]", Scene], object]
-"""Is done to a run."""
-
-
-def when(ready: Act, act: Act, *arguments: str) -> Inject:
+def when(ready: Inject, act: Inject, *arguments: str) -> Inject:
     """Something happens to a run once `ready` returns something true."""
 
-    def inject(scene: Scene) -> None:
-        scene.arguments = list(arguments)
+    def watch(scene: Scene) -> None:
+        wait_until(scene, lambda: bool(ready(scene)))
+        act(scene)
 
-        def watch(process: "subprocess.Popen[str]") -> None:
-            wait_until(process, lambda: bool(ready(process, scene)))
-            act(process, scene)
-
-        scene.watch = watch
-
-    return inject
+    return lambda scene: vars(scene).update(arguments=[*arguments], watch=watch)
 
 
 def with_captures(names: str) -> Inject:
@@ -448,50 +448,41 @@ def with_captures(names: str) -> Inject:
     return lambda scene: [write_capture(scene.folder, name, place % 3) for place, name in enumerate(names)]
 
 
-def when_begun(act: Act, *arguments: str) -> Inject:
+def when_begun(act: Inject, *arguments: str) -> Inject:
     """Something happens to a run of twelve captures once the first of them is done."""
-    return both(with_captures(ALL[2:]), when(lambda _, scene: any(scene.out.glob("?.json")), act, *arguments))
+    return both(with_captures(ALL[2:]), when(lambda scene: any(scene.out.glob("?.json")), act, *arguments))
 
 
-def has_children(count: int) -> Act:
-    return lambda process, _: len(psutil.Process(process.pid).children()) >= count
-
-
-def workers(process: "subprocess.Popen[str]") -> list[psutil.Process]:
-    """The processes that do captures: the fork server starts them."""
-    return [c for c in psutil.Process(process.pid).children(recursive=True) if c.ppid() != process.pid]
-
-
-def to_busiest(act: Callable[[psutil.Process], object]) -> Act:
+def to_busiest(act: Callable[[psutil.Process], object]) -> Inject:
     """Is done to the worker that has computed most."""
-    return lambda process, _: act(max(workers(process), key=lambda worker: worker.cpu_times().user))
+    return lambda scene: act(max(scene.workers(), key=lambda worker: worker.cpu_times().user))
 
 
-def kill_capture(process: "subprocess.Popen[str]", scene: Scene) -> None:
+def kill_capture(scene: Scene) -> None:
     """Kill the only worker, and again when it tries the same capture once more, which it does last."""
     for finished in (1, len(ALL) - 1):
-        wait_for_reports(process, scene, finished)
-        (worker,) = workers(process)
+        wait_for_reports(scene, finished)
+        (worker,) = scene.workers()
         before_s = worker.cpu_times().user
-        wait_until(process, lambda worker=worker, before_s=before_s: worker.cpu_times().user > before_s + 0.05)
+        wait_until(scene, lambda worker=worker, before_s=before_s: worker.cpu_times().user > before_s + 0.05)
         worker.kill()
 
 
-def wait_until(process: "subprocess.Popen[str]", true: Callable[[], bool]) -> None:
+def wait_until(scene: Scene, true: Callable[[], bool]) -> None:
     while not true():
-        assert process.poll() is None or true(), "the run ended before the fault"
+        assert scene.run.poll() is None or true(), "the run ended before the fault"
         time.sleep(0.01)
 
 
-def starve_workers(process: "subprocess.Popen[str]", scene: Scene) -> None:
-    wait_for_reports(process, scene)
-    for worker in workers(process):
+def starve_workers(scene: Scene) -> None:
+    wait_for_reports(scene)
+    for worker in scene.workers():
         worker.rlimit(psutil.RLIMIT_AS, (1 << 20, 1 << 20))
 
 
-def wait_for_reports(process: "subprocess.Popen[str]", scene: Scene, captures: int = 3) -> None:
+def wait_for_reports(scene: Scene, captures: int = 3) -> None:
     """Wait until captures are reported: of three by two workers, one has begun its second."""
-    wait_until(process, lambda: len(list(scene.out.glob("?.json"))) >= captures)
+    wait_until(scene, lambda: len(list(scene.out.glob("?.json"))) >= captures)
 
 
 def larger(scene: Scene) -> None:
@@ -505,13 +496,13 @@ def larger(scene: Scene) -> None:
         tifffile.imwrite(path, np.kron(tifffile.imread(path), np.ones((times, times), np.uint16)))
 
 
-def signalled(number_: int, after_s: float = 0.0) -> Act:
+def signalled(number_: int, after_s: float = 0.0) -> Inject:
     """Sent to all processes of the run, as a terminal does; none of them may be left."""
 
-    def act(process: "subprocess.Popen[str]", scene: Scene) -> None:
+    def act(scene: Scene) -> None:
         time.sleep(after_s)
-        scene.children = psutil.Process(process.pid).children(recursive=True)
-        os.killpg(process.pid, number_)
+        scene.stopped = scene.children()
+        os.killpg(scene.run.pid, number_)
 
     return act
 
@@ -605,6 +596,7 @@ _LINE = np.random.default_rng(0).integers(0, 60000, (1, 100000), np.uint16)
 _MAKER, _NODATA = (271, 2, 0, "Maker", True), [(42113, 2, 2, "0", True)]
 _DEEP = '{"schema": "agalign/1", "bands": ' + "[" * 200_000
 _POSSIBLE_NAMES = "a", "b", "-rf", "new\nline", "\x1b[31mred\a", "x" * 200
+_IN_TIME = "-j", "2", "--timeout", "100"
 _FILES_ELSEWHERE = '"band_files": [{"file": "../a", "bytes": 1}]'
 _BOMB = (
     '<!DOCTYPE l [<!ENTITY a "aaaaaaaaaa">'
@@ -620,8 +612,10 @@ names_another = partial(Fault, code=3)
 """Both captures are aligned, and another file is complained of."""
 loses_b = partial(Fault, code=3, finished="a")
 refused = partial(Fault, code=1, finished="")
+"""The run cannot begin."""
 wrong_use = partial(Fault, code=2, finished="")
 of_long_run = partial(Fault, code=3, finished="")
+"""Captures of a run of twelve are lost."""
 interrupted = partial(Fault, says="interrupted; finished", code=130, finished="")
 
 USUAL = (
@@ -681,11 +675,7 @@ USUAL = (
     wrong_use("a random seed beyond 64 bits", asking("--rng-seed", "9" * 30), "--rng-seed: give"),
     wrong_use("a torch device without data", asking("--device", "meta"), "device 'meta' cannot be used"),
     wrong_use("an empty name for the folder", commanding(" -o {out}"), "the name of the folder is empty"),
-    Fault(
-        "a worker killed by SIGKILL",
-        when_begun(to_busiest(psutil.Process.kill), "-j", "2", "--timeout", "100"),
-        finished=ALL,
-    ),
+    Fault("a worker killed by SIGKILL", when_begun(to_busiest(psutil.Process.kill), *_IN_TIME), finished=ALL),
     interrupted("the interrupt key", when_begun(signalled(signal.SIGINT), "-j", "2")),
 )
 LONG = (
@@ -695,9 +685,7 @@ LONG = (
     Fault("a formula for a name", lambda s: write_capture(s.folder, '=HYPERLINK("a")', 3)),
     Fault("an earlier run inside the input, killed", killed_inside_the_input),
     Fault("two captures that would write one file", colliding),
-    Fault(
-        "a sidecar nested 200,000 deep", with_sidecar(r"(?s).+", '{"schema": "agalign/1", "bands": ' + "[" * 200_000)
-    ),
+    Fault("a sidecar nested 200,000 deep", with_sidecar("(?s).+", _DEEP)),
     Fault("a terminal of ASCII", both(strange_names, with_environment(PYTHONIOENCODING="ascii"))),
     Fault("an infinite number in an earlier sidecar", both(endless_number, commanding("{folder} -o {out} -j 1"))),
     Fault("standard output closed", without_streams(1)),
@@ -734,9 +722,7 @@ LONG = (
         at_least=len(ALL) - 1,
     ),
     of_long_run(
-        "memory short in the workers",
-        both(when_begun(starve_workers, "-j", "2", "--timeout", "100"), larger),
-        "out of memory|killed",
+        "memory short in the workers", both(when_begun(starve_workers, *_IN_TIME), larger), "out of memory|killed"
     ),
     of_long_run(
         "a capture that never ends",
@@ -747,12 +733,12 @@ LONG = (
     interrupted("the interrupt key, workers of Dask", when_begun(signalled(signal.SIGINT), "--dask", "local")),
     interrupted(
         "the interrupt key while workers start",
-        both(with_captures(ALL[2:]), when(has_children(1), signalled(signal.SIGINT), "-j", "2")),
+        both(with_captures(ALL[2:]), when(Scene.children, signalled(signal.SIGINT), "-j", "2")),
     ),
     interrupted("SIGTERM", when_begun(signalled(signal.SIGTERM), "-j", "2"), code=143),
     interrupted(
         "SIGTERM while files are read",
-        both(many_files, when(has_children(2), signalled(signal.SIGTERM, 0.3), "-j", "2")),
+        both(many_files, when(lambda s: s.children()[1:], signalled(signal.SIGTERM, 0.3), "-j", "2")),
         code=143,
     ),
 )
