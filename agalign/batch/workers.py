@@ -96,7 +96,7 @@ def chosen_run(
 
 
 def on_executor(executor: "Executor | ProcessPool") -> Run:
-    """Run tasks on an executor, which is not shut down. A time limit and a loss of all workers need one of agalign."""
+    """Run tasks on an executor, which is not shut down; only those of this package have a time limit."""
 
     def run(function: Callable[[A], R], tasks: Sequence[A], /, *, timeout_s: float | None = None) -> Completed[R]:
         if isinstance(executor, (ProcessPool, DaskExecutor)):
@@ -244,8 +244,8 @@ class DaskExecutor(Executor):
     def __init__(self, client: Any) -> None:
         self._client, self._executor = client, client.get_executor(pure=False)
 
-    def submit(self, function: Any, /, *arguments: Any, **timeout_s: Any) -> Any:
-        return self._executor.submit(_on_worker, __version__, function, *arguments, **timeout_s)
+    def submit(self, function: Any, /, *arguments: Any, **named: Any) -> Any:
+        return self._executor.submit(_on_worker, __version__, function, *arguments, **named)
 
     @property
     def loss(self) -> str:
