@@ -69,7 +69,7 @@ def seeds_only(flight: Path, out: Path) -> list[Task]:
 
 
 def reports_of(run: Run, tasks: list[Task]) -> Iterator[CaptureReport]:
-    return capture_reports(run, tasks, Listener(), timeout_s=10)
+    return capture_reports(run, tasks, Listener(), timeout_s=600)
 
 
 def deadly(task: Task, folder: Path, times: int) -> Task:
