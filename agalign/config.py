@@ -131,7 +131,7 @@ class RunOptions:
     """Address of a Dask scheduler, as tcp://host:8786; 'local' starts workers on this machine."""
     retry_failed: bool = False
     """Process captures with bands that are missing or not aligned again."""
-    # An `executor` of the caller ignores it; `dask_executor` has its own.
+    # An `executor` of the caller ignores it, except `dask_executor`.
     timeout_s: Annotated[float | None, Field(ge=1, le=1e6), Option("timeout")] = None
     """Seconds after which a capture is abandoned; by default unlimited."""
     command: str = ""

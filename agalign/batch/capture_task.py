@@ -4,10 +4,10 @@ import logging
 import re
 import time
 from collections import Counter, defaultdict
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
-from functools import lru_cache
+from functools import lru_cache, partial
 from html import escape
 from itertools import pairwise
 from pathlib import Path
@@ -34,6 +34,7 @@ from agalign.values.capture import Capture
 from agalign.values.choices import RadiometryChoice
 from agalign.values.files import check_inside
 from agalign.values.image import OutputGrid
+from agalign.values.process_pool import A, R
 from agalign.values.text import counted
 
 
@@ -94,9 +95,6 @@ class CaptureReport:
         statuses = Counter(status for _, status, _ in self.result.pairs)
         return f"{self.state}, " + ", ".join(f"{number} {status}" for status, number in statuses.items())
 
-    def _row(self) -> str:
-        return f"<tr><td>{escape(self.label)}</td><td>{self.state}</td><td>{escape(self.summary)}</td></tr>"
-
     def _repr_html_(self) -> str:
         """A short table for notebooks."""
         if self.result is None:
@@ -119,7 +117,10 @@ class FlightReports(list[CaptureReport]):
         counts = Counter(report.state for report in self)
         total = ", ".join(f"{number} {state}" for state, number in counts.items())
         head = "<tr><th>capture</th><th>state</th><th>bands</th></tr>"
-        rows = "".join(report._row() for report in self[:max_rows])
+        rows = "".join(
+            f"<tr><td>{escape(report.label)}</td><td>{report.state}</td><td>{escape(report.summary)}</td></tr>"
+            for report in self[:max_rows]
+        )
         more = f"<p>and {len(self) - max_rows} more</p>" if len(self) > max_rows else ""
         return f"<p>{counted(len(self), 'capture')}: {total}</p><table>{head}{rows}</table>{more}"
 
@@ -299,13 +300,19 @@ def lost_reflectance(capture: Capture, choice: RadiometryChoice) -> tuple[str, .
     return tuple(f"not written as reflectance: {b.name}: {b.implausible}" for b in lost if choice == "auto")[:1]
 
 
+@one_thread()
+@one_memory_error()
+def in_one_thread(function: Callable[[A], R], argument: A) -> R:
+    """Call a function that uses one thread; memory errors of libraries are MemoryError."""
+    keep_freed_memory()
+    return function(argument)
+
+
 def do_capture(task: Task, on_pair: PairProgress = quiet) -> CaptureReport:
     """Process one capture and return its report, which includes errors."""
     label, clock = task.capture.label, StageClock(on_pair)
-    keep_freed_memory()
     try:
-        with one_thread(), one_memory_error():
-            report = process_capture(task, clock)
+        report = in_one_thread(partial(process_capture, progress=clock), task)
     except Exception as error:
         # A defect of agalign in one capture must not stop the others.
         report = CaptureReport(label, "error", error=failure_text(error), seconds=clock.seconds)

@@ -8,11 +8,11 @@ from functools import partial
 
 import numpy as np
 
+from agalign.batch.capture_task import in_one_thread
 from agalign.batch.learning_tasks import (
     LearningCapture,
     RigObservation,
     choose_and_refine,
-    in_one_thread,
     initial_network,
     load_capture,
     logged_failure,
@@ -30,12 +30,11 @@ from agalign.flight.rig import MIN_CAPTURES, Rig, median_mapping
 from agalign.method.descriptor import Descriptor
 from agalign.method.device import keep_freed_memory, one_memory_error, one_thread
 from agalign.method.fast import learn
-from agalign.method.state import ImageGroup, JointState, Progress
+from agalign.method.state import JointState, Progress
 from agalign.pixels.raster import without_warnings
 from agalign.values import geometry
 from agalign.values.alignment import RefinedPair, Residual
 from agalign.values.capture import Capture
-from agalign.values.geometry import Matrix
 from agalign.values.pixel_units import FixedFilePx, MovingFilePx
 from agalign.values.process_pool import A, Apply, R
 from agalign.verify.extrapolation import unmodelled_std_px, unobserved_quarters
@@ -105,13 +104,11 @@ class _FlightLearner:
         if network is None:
             return None
         net, known = network
-        mappings: dict[str, list[Matrix]] = {}
-        for one in known:
-            for name, matrix in one.mappings.items():
-                mappings.setdefault(name, []).append(matrix)
-        if not mappings:
+        names = dict.fromkeys(name for one in known for name in one.mappings)
+        if not names:
             return None
-        medians = {name: median_mapping(of, self._size_px) for name, of in mappings.items()}
+        mappings = {name: [one.mappings[name] for one in known if name in one.mappings] for name in names}
+        medians = {name: median_mapping(of_band, self._size_px) for name, of_band in mappings.items()}
         model = FlightModel(net, flight_camera(self.captures), self._bands, medians, "")
         observations = self._observations(model, known)
         rig = self._rig(list(observations.values())) or self._start_rig
@@ -165,7 +162,7 @@ class _FlightLearner:
         if not chosen:
             return None
         net = initial_network(self._bands, self.settings, self.start)
-        if all(one.is_good_enough for one in chosen):
+        if all(one.observation is not None for one in chosen):
             return net, list({one.capture.label: one for one in refined if one is not None}.values())
         return self._trained(net, chosen)
 
@@ -174,22 +171,20 @@ class _FlightLearner:
     ) -> tuple[Descriptor, list[LearningCapture]] | None:
         """Train a network on captures, from the mappings that are already refined; None if that fails."""
         settings = self.settings
-        loaded = [load_capture(one.capture, self._bands, settings, self.start, one.refined) for one in chosen]
-        pairs = [(one, images) for one, images in zip(chosen, loaded, strict=True) if images is not None]
-        groups: list[ImageGroup] = []
-        for one, images in pairs:
-            groups += images.groups_from(one.refined)
+        read = [load_capture(one.capture, self._bands, settings, self.start, one.refined) for one in chosen]
+        loaded = [capture for capture in read if capture is not None]
+        groups = [group for capture in loaded for _, group in capture.groups]
         # One capture may make learning from all of them fail; a network is then learned for each capture alone.
         with logged_failure("the flight cannot be learned from"):
             learn(JointState(settings.joint, self.progress), groups, net, self.threads)
             with ThreadPoolExecutor(self.threads) as pool:
-                return net, list(pool.map(lambda p: p[1].refined_by(net, settings), pairs))
+                return net, list(pool.map(lambda capture: capture.refined_by(net, settings), loaded))
         return None
 
     def _observations(self, model: FlightModel, known: Sequence[LearningCapture]) -> dict[str, RigObservation]:
         """Return observations of the rig by capture, until every observed band is in enough of them.
 
-        `known` are the captures that the network has refined.
+        `known` are the captures that the network has refined. Of these, only the misaligned bands are observed again.
         """
         # Neighbours have about the same height and speed.
         captures_per_rig_capture = 8
@@ -200,24 +195,15 @@ class _FlightLearner:
         model = portable(model)
         while waiting and (missing := count - _min_observations(result.values())) > 0:
             some, waiting = waiting[:missing], waiting[missing:]
-            self._observe(some, model, result, count)
+            # The model's mappings are better initial alignments than the seeds of the misaligned bands.
+            arguments = [(c, result[c.label].misaligned if c.label in result else None) for c in some]
+            observations = self.apply(partial(observe_rig, model, self.settings), arguments)
+            for capture, observation in zip(some, observations, strict=True):
+                if observation is not None:
+                    earlier = result.get(capture.label)
+                    result[capture.label] = observation if earlier is None else earlier.updated(observation)
+                self.progress("the rig", min(1.0, len(result) / count))
         return {c.label: result[c.label] for c in self.captures if c.label in result}
-
-    def _observe(
-        self, captures: Sequence[Capture], model: FlightModel, result: dict[str, RigObservation], count: int
-    ) -> None:
-        """Add observations of captures to `result`, which `count` of them complete.
-
-        Of captures that it contains, only the misaligned bands are observed again.
-        """
-        # The model's mappings are better initial alignments than the seeds of the misaligned bands.
-        arguments = [(c, result[c.label].misaligned if c.label in result else None) for c in captures]
-        observations = self.apply(partial(observe_rig, model, self.settings), arguments)
-        for capture, observation in zip(captures, observations, strict=True):
-            if observation is not None:
-                earlier = result.get(capture.label)
-                result[capture.label] = observation if earlier is None else earlier.updated(observation)
-            self.progress("the rig", min(1.0, len(result) / count))
 
     def _rig(self, observations: Sequence[RigObservation]) -> Rig | None:
         """Return the rig, with the displacement fields of the lenses; None if the captures do not determine it."""

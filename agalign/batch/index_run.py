@@ -66,7 +66,7 @@ def run_indices(
         with chosen_run(executor, processes, cv2.setNumThreads, preload=__name__) as run:
             if run is not serially:
                 tasks = [task.absolute() for task in tasks]
-            for number, result in run(do_indices, tasks, limited=True):
+            for number, result in run(do_indices, tasks):
                 try:
                     reports = result()
                     rows += reports

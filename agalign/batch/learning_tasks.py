@@ -2,7 +2,7 @@
 
 import copy
 import logging
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 
@@ -18,7 +18,7 @@ from agalign.errors import AgalignError
 from agalign.flight.model import FlightModel
 from agalign.flight.rig import Observation
 from agalign.method.descriptor import Descriptor, start_from
-from agalign.method.device import choose_device, keep_freed_memory, one_memory_error, one_thread
+from agalign.method.device import choose_device
 from agalign.method.fast import SCHEDULES
 from agalign.method.joint import refine_with
 from agalign.method.refine import FLIGHT_PATCHES
@@ -29,7 +29,6 @@ from agalign.values.capture import Capture
 from agalign.values.geometry import Matrix
 from agalign.values.issues import Issue
 from agalign.values.pixel_units import FixedFilePx, FixedImagePx
-from agalign.values.process_pool import A, R
 
 
 @contextmanager
@@ -45,14 +44,6 @@ def logged_failure(message: str) -> Iterator[None]:
     except Exception as error:
         is_defect = not isinstance(error, AgalignError)
         logging.getLogger(__name__).debug("%s: %s", message, error, exc_info=is_defect)
-
-
-@one_thread()
-@one_memory_error()
-def in_one_thread(function: Callable[[A], R], argument: A) -> R:
-    """Call a function that uses one thread; memory errors of libraries are MemoryError."""
-    keep_freed_memory()
-    return function(argument)
 
 
 def portable(model: FlightModel) -> FlightModel:
@@ -95,8 +86,6 @@ class LearningCapture:
     """A capture to learn the network from, with the results of the initial network or of the learned one."""
 
     capture: Capture
-    is_good_enough: bool
-    """The network needs no more learning for it."""
     mappings: Mapping[str, Matrix] = field(default_factory=dict)
     """Refined mappings of bands with distinguishable held-out patches, px of the files."""
     refined: Mapping[str, RefinedPair] = field(default_factory=dict)
@@ -124,15 +113,6 @@ class LoadedCapture:
         """True if all seeds are confirmed by the images."""
         return all(seed.trusted for _, seed in self.starts)
 
-    def groups_from(self, refined: Mapping[str, RefinedPair]) -> list[ImageGroup]:
-        """Return the groups with the refined mappings of pairs with distinguishable patches as initial mappings."""
-        for places, group in self.groups:
-            for k, place in enumerate(places):
-                pair = refined.get(self.starts[place][0].name)
-                if pair is not None and pair.result.retrieval >= MIN_RETRIEVAL:
-                    group.mappings[k] = pair.result.fixed_to_moving
-        return [group for _, group in self.groups]
-
     def refined_by(self, net: Descriptor, settings: Settings, *, is_final: bool = True) -> LearningCapture:
         """Refine the pairs by a network; return the capture without its images.
 
@@ -152,7 +132,7 @@ class LoadedCapture:
             aligner.verify(self.starts, results)
             observation = _observation(pairs, aligner.result, refined, self.capture)
         mappings = {p.name: p.scales.between_files(r.fixed_to_moving) for p, r in known if r.retrieval >= MIN_RETRIEVAL}
-        return LearningCapture(self.capture, is_good_enough, mappings, refined, observation)
+        return LearningCapture(self.capture, mappings, refined, observation)
 
 
 def load_capture(
@@ -164,7 +144,8 @@ def load_capture(
 ) -> LoadedCapture | None:
     """Read a capture and find its seeds, or use those of the `known` pairs by band; None if no band can be used.
 
-    Bands have their index in `bands` as index in the network. Seeds of kind `match` use the network of `start`.
+    Initial mappings are those of known pairs with distinguishable patches, else the seeds. Bands have their index in
+    `bands` as index in the network. Seeds of kind `match` use the network of `start`.
     """
     with logged_failure(f"{capture.label} cannot be learned from"):
         pairs = [p for p in read_pairs(with_saturation_values(capture), settings.seed)[0] if p.has_rig_pixels]
@@ -172,6 +153,11 @@ def load_capture(
         result = [(p, seed) for p, seed in seeds_of if isinstance(seed, Seed)]
         if result:
             groups = image_groups(result, [bands.index(p.name) + 1 for p, _ in result])
+            for places, group in groups:
+                for k, place in enumerate(places):
+                    pair = known.get(result[place][0].name)
+                    if pair is not None and pair.result.retrieval >= MIN_RETRIEVAL:
+                        group.mappings[k] = pair.result.fixed_to_moving
             return LoadedCapture(capture, groups, result)
     return None
 
@@ -205,7 +191,7 @@ def choose_and_refine(
     if best is None:
         return None
     if not best.is_trusted:
-        return LearningCapture(best.capture, is_good_enough=False)
+        return LearningCapture(best.capture)
     with logged_failure(f"{best.capture.label} cannot be learned from"):
         return best.refined_by(initial_network(bands, settings, start), settings, is_final=False)
     return None

@@ -47,7 +47,7 @@ from agalign.products.run.flight_map import (
     utm_of_flights,
     with_approximate_georeference,
 )
-from agalign.products.run.record import ExclusionPart, RunPart, RunState, begun
+from agalign.products.run.record import ExclusionPart, RunPart, begun
 from agalign.products.sidecar.file import read_result
 from agalign.products.sidecar.schema import CaptureResult
 from agalign.values.capture import Capture
@@ -144,18 +144,14 @@ def _recorded(run: "_FlightRun") -> Iterator[RunPart]:
     record = begun(run.flight.folder, run.settings, run.flight.captures, run.options.command)
     for problem in run.flight.problems:
         record.add_problem(str(problem.path), problem.text)
-
-    def write(state: RunState) -> None:
-        record.write(run.out, state, time.monotonic() - began)
-
-    write("running")
+    record.write(run.out, "running", 0.0)
     try:
         yield record
     except BaseException:
         with suppress(OutputError):
-            write("interrupted")
+            record.write(run.out, "interrupted", time.monotonic() - began)
         raise
-    write("finished")
+    record.write(run.out, "finished", time.monotonic() - began)
 
 
 @dataclass(frozen=True)
@@ -284,7 +280,7 @@ class _FlightRun:
         processes = min(cores, number // CAPTURES_WORTH_A_PROCESS if timeout_s is None else number)
         threads = min(cores, number, _MAX_THREADS)
         executor = self.options.executor
-        with chosen_run(executor, processes, limit_threads, threads, timeout_s=timeout_s) as run:
+        with chosen_run(executor, processes, limit_threads, threads, has_timeout=timeout_s is not None) as run:
             flights: list[_Flight] = []
             learn = partial(learn_flight, apply=partial(in_order, run), threads=min(_MAX_THREADS, cores))
             for group, name in zip(groups, model_names(groups), strict=True):
@@ -335,17 +331,6 @@ class _FlightRun:
         return path
 
 
-def _limits_of_cameras(flights: Sequence[_Flight]) -> dict[str, FlightLimits]:
-    """The limits of the flights of each camera."""
-    by_camera: dict[str, list[tuple[Sequence[Capture], Rig | None]]] = {}
-    for captures, path in flights:
-        rig = None
-        with suppress(InputError):  # of an earlier run
-            rig = None if path is None else read_rig(path)[1]
-        by_camera.setdefault(camera_key(captures[0]), []).append((captures, rig))
-    return {camera: flight_limits(of_camera) for camera, of_camera in by_camera.items()}
-
-
 def _crop_key(capture: Capture) -> tuple[str, bool]:
     """The camera, and whether its reference can be undistorted."""
     return camera_key(capture), capture.reference.lens is None
@@ -354,19 +339,26 @@ def _crop_key(capture: Capture) -> tuple[str, bool]:
 def _crops_of_cameras(
     flights: Sequence[_Flight], kept: Mapping[str, OutputGrid | None], settings: WriteSettings
 ) -> dict[tuple[str, bool], tuple[FlightLimits, OutputGrid | None]]:
-    """The limits and the common grid of each camera: that of most of its `kept` captures, given by label, if they are
-    enough for a rig, else that of the rigs of its flights.
+    """The limits of the flights and the common grid of each camera: that of most of its `kept` captures, given by
+    label, if they are enough for a rig, else that of the rigs of its flights.
     """
-    limits, result = _limits_of_cameras(flights), {}
-    captures = [c for captures, _ in flights for c in captures]
-    for key, capture in {_crop_key(c): c for c in captures}.items():
-        grid = common_grid(capture.reference, settings, limits[key[0]])
-        earlier = Counter(kept[c.label] for c in captures if _crop_key(c) == key and kept.get(c.label) is not None)
+    by_camera: dict[str, list[tuple[Sequence[Capture], Rig | None]]] = {}
+    for captures, path in flights:
+        rig = None
+        with suppress(InputError):  # of an earlier run
+            rig = None if path is None else read_rig(path)[1]
+        by_camera.setdefault(camera_key(captures[0]), []).append((captures, rig))
+    result = {}
+    every = [c for captures, _ in flights for c in captures]
+    for key, capture in {_crop_key(c): c for c in every}.items():
+        limits = flight_limits(by_camera[key[0]])
+        grid = common_grid(capture.reference, settings, limits)
+        earlier = Counter(kept[c.label] for c in every if _crop_key(c) == key and kept.get(c.label) is not None)
         most, count = next(iter(earlier.most_common(1)), (None, 0))
         # Without rigs, each capture has its own grid.
         if settings.crop == "flight" and count >= MIN_CAPTURES and (grid is not None or len(earlier) == 1):
             grid = most
-        result[key] = limits[key[0]], grid
+        result[key] = limits, grid
     return result
 
 
@@ -387,7 +379,7 @@ def capture_reports(
     capture are read into the page cache meanwhile.
     """
     if run is not serially:
-        for number, result in run(do_capture, [task.absolute() for task in tasks], limited=True):
+        for number, result in run(do_capture, [task.absolute() for task in tasks], timeout_s=timeout_s):
             try:
                 report = result()
             except Exception as error:

@@ -47,14 +47,16 @@ Completed: TypeAlias = Iterator[tuple[int, Callable[[], R]]]
 class Run(Protocol):
     """Calls a function with each task, and yields the tasks as they complete.
 
-    Function, tasks and results can be pickled, except in this process. Only calls that are `limited` end at the time
-    limit. Raises WorkerError if no worker can be started, or if workers end one after another.
+    Function, tasks and results can be pickled, except in this process. The time limit applies to each call in worker
+    processes and on a Dask cluster. Raises WorkerError if no worker can be started or workers end one after another.
     """
 
-    def __call__(self, function: Callable[[A], R], tasks: Sequence[A], /, *, limited: bool = False) -> Completed[R]: ...
+    def __call__(
+        self, function: Callable[[A], R], tasks: Sequence[A], /, *, timeout_s: float | None = None
+    ) -> Completed[R]: ...
 
 
-def serially(function: Callable[[A], R], tasks: Sequence[A], /, **_: bool) -> Completed[R]:
+def serially(function: Callable[[A], R], tasks: Sequence[A], /, **_: object) -> Completed[R]:
     """Run the tasks in this process and thread: each when its result is requested."""
     for number, task in enumerate(tasks):
         yield number, partial(function, task)
@@ -68,28 +70,23 @@ def chosen_run(
     threads: int = 1,
     *,
     preload: str = WORKER_MODULE,
-    timeout_s: float | None = None,
+    has_timeout: bool = False,
 ) -> Iterator[Run]:
     """Run tasks on the executor if there is one; else in processes of this machine if there are several or there is a
     timeout (threads cannot be killed); else in threads, or serially.
 
     `initializer` gets the number of threads of a process, and `preload` is a module that imports what it needs. The
-    processes start in the background, and that of a task that exceeds the timeout is killed.
+    processes start in the background.
     """
     if executor is not None:
         yield on_executor(executor)
-    elif processes > 1 or (processes and timeout_s is not None):
+    elif processes > 1 or (processes and has_timeout):
         of_each = max(1, usable_cores() // processes)
         with (
             environment_of_children(of_each),
             ProcessPool(processes, worker_context(preload), partial(initializer, of_each)) as pool,
         ):
-
-            def run(function: Callable[[A], R], tasks: Sequence[A], /, *, limited: bool = False) -> Completed[R]:
-                submit = partial(pool.submit, function, timeout_s=timeout_s if limited else None)
-                return _completed(submit, tasks, lambda: pool.loss)
-
-            yield run
+            yield on_executor(pool)
     elif threads > 1:
         # Warning filters are global: threads that change and restore them would interfere.
         with without_warnings(), ThreadPoolExecutor(threads) as thread_pool:
@@ -98,20 +95,19 @@ def chosen_run(
         yield serially
 
 
-def on_executor(executor: Executor) -> Run:
-    """Run tasks on an executor of the caller, which is not shut down."""
+def on_executor(executor: "Executor | ProcessPool") -> Run:
+    """Run tasks on an executor, which is not shut down; only those of this package have a time limit."""
 
-    def run(function: Callable[[A], R], tasks: Sequence[A], /, *, limited: bool = False) -> Completed[R]:
-        if not isinstance(executor, DaskExecutor):
-            return _completed(partial(_submitted, executor, function), tasks, str)
-        chosen = executor if limited else executor.without_timeout()
-        return _completed(partial(chosen.submit, function), tasks, chosen.loss)
+    def run(function: Callable[[A], R], tasks: Sequence[A], /, *, timeout_s: float | None = None) -> Completed[R]:
+        if isinstance(executor, (ProcessPool, DaskExecutor)):
+            return _completed(partial(executor.submit, function, timeout_s=timeout_s), tasks, lambda: executor.loss)
+        return _completed(partial(_submitted, executor, function), tasks, str)
 
     return run
 
 
 def _completed(submit: Callable[[A], "Future[R]"], tasks: Sequence[A], loss: Callable[[], str]) -> Completed[R]:
-    """Submit the tasks, and yield them. Raises WorkerError if the executor gives a reason for its `loss`."""
+    """Submit the tasks, and yield them. Raises WorkerError if there is a reason for the `loss` of all workers."""
     futures: dict[Future[R], int] = {}
     remaining = iter(enumerate(tasks))
 
@@ -182,7 +178,7 @@ def failure_text(error: Exception, timeout_s: float | None = None) -> str:
 
 
 @contextmanager
-def dask_executor(address: str, jobs: int = 0, timeout_s: float | None = None) -> Iterator[Executor]:
+def dask_executor(address: str, jobs: int = 0) -> Iterator[Executor]:
     """Connect to a Dask cluster as an executor. Its workers need this version of agalign and the same folders.
 
     `address` is that of a scheduler, such as tcp://host:8786, or `local` for `jobs` worker processes on this machine; 0
@@ -223,7 +219,7 @@ def dask_executor(address: str, jobs: int = 0, timeout_s: float | None = None) -
         # Workers import their libraries while this process learns the flight.
         for worker in client.ncores():
             fire_and_forget(client.submit(import_module, WORKER_MODULE, workers=[worker], pure=False))
-        yield DaskExecutor(client, timeout_s)
+        yield DaskExecutor(client)
 
 
 def _check_versions(client: Any) -> None:
@@ -243,20 +239,17 @@ def _check_versions(client: Any) -> None:
 
 
 class DaskExecutor(Executor):
-    """The workers of a Dask cluster. A task that exceeds the timeout ends its worker."""
+    """The workers of a Dask cluster."""
 
-    def __init__(self, client: Any, timeout_s: float | None) -> None:
-        self._client, self._executor, self._timeout_s = client, client.get_executor(pure=False), timeout_s
+    def __init__(self, client: Any) -> None:
+        self._client, self._executor = client, client.get_executor(pure=False)
 
     def submit(self, function: Any, /, *arguments: Any, **named: Any) -> Any:
-        return self._executor.submit(_on_worker, __version__, self._timeout_s, function, *arguments, **named)
+        return self._executor.submit(_on_worker, __version__, function, *arguments, **named)
 
-    def without_timeout(self) -> "DaskExecutor":
-        """Return the same executor without a time limit."""
-        return DaskExecutor(self._client, None)
-
+    @property
     def loss(self) -> str:
-        """Return why no task can complete any more; empty while the scheduler answers."""
+        """Why no task can complete any more; empty while the scheduler answers."""
         if self._client.status == "running":
             return ""
         return (
@@ -265,9 +258,7 @@ class DaskExecutor(Executor):
         )
 
 
-def _on_worker(
-    version: str, timeout_s: float | None, function: Callable[..., Any], *arguments: Any, **named: Any
-) -> Any:
+def _on_worker(version: str, function: Callable[..., R], *arguments: Any, timeout_s: float | None = None) -> R:
     """Call a function in one thread; OMP_NUM_THREADS, which Dask sets, does not limit all libraries.
 
     Ends this process if it takes longer than the timeout: code that hangs in a library cannot be interrupted.
@@ -282,6 +273,6 @@ def _on_worker(
         from agalign.method.device import limit_threads
 
         limit_threads(1)
-        return function(*arguments, **named)
+        return function(*arguments)
     finally:
         alarm.cancel()

@@ -154,10 +154,7 @@ def run(
 
     asked = {c.label: len(c.moving) + len(c.missing_bands) for c in flight.captures}
     totals, started = RunTotals(flight.is_complete, asked), time.monotonic()
-    with (
-        cluster(dask, options.jobs, options.timeout_s) as executor,
-        progress(terminal, len(flight.captures)) as show_line,
-    ):
+    with cluster(dask, options.jobs) as executor, progress(terminal, len(flight.captures)) as show_line:
         options = replace(options, executor=executor)
 
         def show(share: float, text: str) -> None:
@@ -214,9 +211,9 @@ def _write_pages(out: Path, terminal: Terminal, *, changed: bool) -> bool:
     return not problems
 
 
-def cluster(dask: str | None, jobs: int, timeout_s: float | None = None) -> AbstractContextManager[Executor | None]:
+def cluster(dask: str | None, jobs: int) -> AbstractContextManager[Executor | None]:
     """Connect to a Dask cluster if its address is given."""
-    return nullcontext() if dask is None else dask_executor(dask, jobs, timeout_s)
+    return nullcontext() if dask is None else dask_executor(dask, jobs)
 
 
 @contextmanager

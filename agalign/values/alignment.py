@@ -15,7 +15,7 @@ from agalign.values.choices import Geometry, Interpolation, ModelFamily, PairSta
 from agalign.values.geometry import Matrix, Points
 from agalign.values.image import Mask
 from agalign.values.interpolation import can_hold, planes_of, resample_planes
-from agalign.values.issues import SEED_DOES_NOT_FIT, Issue, explanation, sentence
+from agalign.values.issues import SEED_DOES_NOT_FIT, Issue, sentence
 from agalign.values.mapping import PixelMapping
 from agalign.values.pixel_units import SAME_PIXELS, FixedFilePx, FixedImagePx, FixedPx, MovingFilePx, PixelScale, Size
 
@@ -352,7 +352,7 @@ class Alignment(Generic[FixedPx]):
     @property
     def reason(self) -> str | None:
         """Why the band is not aligned; None if it is."""
-        text = explanation(self.issues)
+        text = sentence(self.issues[0]) if self.issues else None
         if text is None or self.status == "aligned":
             return None
         if self.status == "predicted" and self.prediction is not None:

@@ -57,13 +57,9 @@ class Tile:
 
 
 @dataclass(frozen=True)
-class OutputGrid:
+class OutputGrid(Tile):
     """Grid of the output: a rectangle, from (x0, y0) on, of the reference's grid at a scale."""
 
-    x0: int
-    y0: int
-    width: int
-    height: int
     scale: PixelScale = SAME_PIXELS
     """Output pixels per pixel of the reference; each side has a whole number of pixels."""
     undistorted: bool = False

@@ -1,6 +1,5 @@
 """Reasons for not accepting an alignment: what was measured, the limit, in words, and a suggestion for the user."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 
@@ -44,11 +43,6 @@ class Issue:
 def sentence(issue: Issue) -> str:
     """Return the reason in words, without a full stop."""
     return issue.kind.sentence.format(value=issue.value, limit=issue.limit, detail=issue.detail)
-
-
-def explanation(issues: Sequence[Issue]) -> str | None:
-    """Return the reason of the first, most important issue in words; None without issues."""
-    return sentence(issues[0]) if issues else None
 
 
 # ---- remedies that kinds in several modules share

@@ -214,10 +214,9 @@ class ProcessPool:
             thread = threading.Thread(target=self._serve, daemon=True)
             try:
                 thread.start()
+                self._threads.append(thread)
             except RuntimeError as error:
                 self._one_less(error)
-            else:
-                self._threads.append(thread)
         if not self._threads:
             raise WorkerError(self.loss)
 

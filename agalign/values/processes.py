@@ -10,9 +10,9 @@ import signal
 import sys
 import tempfile
 import threading
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import AbstractContextManager, contextmanager, suppress
+from contextlib import contextmanager, suppress
 from enum import IntEnum
 from multiprocessing import current_process, get_all_start_methods, get_context, parent_process, resource_tracker
 from multiprocessing.context import BaseContext
@@ -144,8 +144,7 @@ def follow_parent() -> None:
     silence_libraries()
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     parent = parent_process()
-    if parent is None:
-        return
+    assert parent is not None
 
     def end_with_parent() -> None:
         parent.join()
@@ -161,16 +160,13 @@ def is_running(process: int) -> bool:
     """
     if os.name == "nt":
         return False
-    try:
-        os.kill(process, 0)
-        state = Path(f"/proc/{process}/stat").read_text(encoding="utf-8", errors="replace")
-    except ProcessLookupError:
-        return False
-    except FileNotFoundError:
-        return not Path("/proc/self").exists()
-    except OSError:  # another user's process
-        return True
-    return state.rpartition(")")[2].split()[0] not in "ZX"
+    with suppress(PermissionError):  # another user's process
+        try:
+            os.kill(process, 0)
+        except ProcessLookupError:
+            return False
+    state = _text(Path(f"/proc/{process}/stat")).rpartition(")")[2].split()
+    return not state or state[0] not in "ZX"
 
 
 class ExitCode(IntEnum):
@@ -227,10 +223,7 @@ def worker_context(preload: str) -> BaseContext:
 
     context = get_context("forkserver")
     context.set_forkserver_preload([preload])
-    # The server imports from where this process does: until Python 3.12.9, `multiprocessing` sends the path to workers
-    # only. If the server cannot be started, the workers report the reason.
-    search_path = {"PYTHONPATH": os.pathsep.join(map(str, sys.path))}
-    with suppress(OSError, RuntimeError), _environment(search_path), without_interrupt_key():
+    with suppress(OSError, RuntimeError), without_interrupt_key():  # the workers report why it cannot be started
         forkserver.ensure_running()
     return context
 
@@ -249,18 +242,16 @@ def start_server_ahead(captures: int, cores: int) -> None:
             worker_context(WORKER_MODULE)
 
 
-def environment_of_children(threads: int) -> AbstractContextManager[None]:
+@contextmanager
+def environment_of_children(threads: int) -> Iterator[None]:
     """Set the number of threads that libraries in child processes start, and where these search for modules.
 
-    More threads than cores, over all processes, double the time. Without PYTHONSAFEPATH, child processes of
-    `multiprocessing` search the working folder first, and run a `rasterio.py` that is there.
+    More threads than cores, over all processes, double the time. Child processes search where this process does: until
+    Python 3.12.9, `multiprocessing` sends the path to workers, but not to the fork server. Without PYTHONSAFEPATH, they
+    search the working folder first, and run a `rasterio.py` that is there.
     """
-    return _environment({**dict.fromkeys(THREAD_VARIABLES, str(threads)), "PYTHONSAFEPATH": "1"})
-
-
-@contextmanager
-def _environment(values: Mapping[str, str]) -> Iterator[None]:
-    """Set environment variables inside the block."""
+    values = dict.fromkeys(THREAD_VARIABLES, str(threads))
+    values |= {"PYTHONSAFEPATH": "1", "PYTHONPATH": os.pathsep.join(map(str, sys.path))}
     before = {name: os.environ[name] for name in values if name in os.environ}
     os.environ.update(values)
     try:

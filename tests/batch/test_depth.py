@@ -11,7 +11,7 @@ from synthetic_flights.relief import make_scene
 import agalign
 from agalign.batch.run import run_flight
 from agalign.cameras.discover import discover
-from agalign.config import Settings, WriteSettings
+from agalign.config import Settings
 from agalign.flight.model import load_model
 
 from ..products.test_relief_map import assert_same_as_stack
@@ -22,34 +22,24 @@ SIZE = 480, 360
 CAPTURES = 4
 
 
-@pytest.fixture(scope="module")
-def close_range(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("close_range")
-    scene = make_scene("boxes", 8, width_px=SIZE[0])
+def test_captures_with_relief_determine_the_rig_and_have_one_size(tmp_path: Path) -> None:
+    scene, folder, out = make_scene("boxes", 8, width_px=SIZE[0]), tmp_path / "in", tmp_path / "out"
     for number in range(1, CAPTURES + 1):
-        pose = replace(
-            scene.pose,
-            east_m=0.05 * number,
-            yaw_deg=scene.pose.yaw_deg + 3 * number,
-            altitude_m=scene.pose.altitude_m * (1 + 0.04 * number),
-        )
+        yaw_deg, altitude_m = scene.pose.yaw_deg + 3 * number, scene.pose.altitude_m * (1 + 0.04 * number)
+        pose = replace(scene.pose, east_m=0.05 * number, yaw_deg=yaw_deg, altitude_m=altitude_m)
         write_capture(folder, replace(scene, pose=pose), number, SIZE, number)
-    return folder
-
-
-def test_captures_with_relief_determine_the_rig_and_have_one_size(close_range: Path, tmp_path: Path) -> None:
-    reports = list(run_flight(discover(close_range), tmp_path, Settings(write=WriteSettings(crop="flight"))))
+    reports = list(run_flight(discover(folder), out, Settings()))
     bands = [b for r in reports for b in r.sidecar.bands if b.status != "reference"]
     assert {b.status for b in bands} == {"aligned"}
     assert all(b.relief is not None for b in bands)
-    (path,) = (tmp_path / "models").iterdir()
+    (path,) = (out / "models").iterdir()
     model = load_model(path, lambda: torch.device("cpu"))
     assert set(model.rig.mean) == {"Blue", "Red", "NIR", "Red edge"}
     assert all(b.prediction is not None and b.prediction.std_px < 0.3 for b in bands)
     assert len({r.sidecar.output.crop for r in reports if r.sidecar.output is not None}) == 1
     for report in reports:
-        inputs = close_range / report.path.parent.relative_to(tmp_path)
+        inputs = folder / report.path.parent.relative_to(out)
         assert assert_same_as_stack(report.path, inputs, occluded_from_outside=True) == 4
-    flight = agalign.open_flight(tmp_path)
+    flight = agalign.open_flight(out)
     assert flight.sizes["capture"] == CAPTURES
     assert (flight.sizes["x"], flight.sizes["y"]) != SIZE

@@ -10,6 +10,7 @@ from dataclasses import replace
 from functools import partial
 from multiprocessing import get_context
 from pathlib import Path
+from unittest import mock
 
 import psutil
 import pytest
@@ -20,14 +21,13 @@ from agalign.batch.capture_task import CaptureReport, Task
 from agalign.batch.run import Listener, capture_reports, run_flight
 from agalign.batch.workers import DaskExecutor, Run, chosen_run, dask_executor, in_order, on_executor
 from agalign.cameras.discover import discover
-from agalign.config import RunOptions, SeedSettings, Settings
+from agalign.config import RunOptions, Settings
 from agalign.errors import ConfigurationError, WorkerError
 from agalign.method.device import limit_threads
 from agalign.products.sidecar.file import find_sidecars, read_result
-from agalign.products.sidecar.schema import CaptureResult
 
 from ..conftest import raising, seeded
-from ..values.pool_tasks import signal_self, sleep, without_memory
+from ..values.pool_tasks import WhenUnpickled, signal_self, sleep, without_memory
 
 pytestmark = pytest.mark.slow
 
@@ -44,19 +44,15 @@ def test_a_dask_cluster_processes_captures(flight: Path, aligned_flight: Path, t
         processes[0].kill()
         result += reports
     assert [r.is_complete for r in result] == [True, True]
-    alone = [read_result(path) for path in find_sidecars(aligned_flight)]
-    by_name = sorted((r.result for r in result if r.result is not None), key=lambda r: r.capture)
-    assert [without_seconds(r) for r in by_name] == [without_seconds(r) for r in alone]
+    here, alone = ([read_result(p) for p in find_sidecars(out)] for out in (tmp_path, aligned_flight))
+    assert [[(b.homography, b.metrics) for b in r.bands] for r in here] == [
+        [(b.homography, b.metrics) for b in r.bands] for r in alone
+    ]
 
 
 def is_worker(process: psutil.Process) -> bool:
     """Dask names its workers where setproctitle is installed."""
     return any(text in " ".join(process.cmdline()) for text in ("spawn_main", "dask worker"))
-
-
-def without_seconds(result: CaptureResult) -> CaptureResult:
-    bands = [b.model_copy(update={"seconds": 0.0}) for b in result.bands]
-    return result.model_copy(update={"bands": bands, "seconds": 0.0, "checksum": None, "settings": ""})
 
 
 def test_a_scheduler_that_does_not_answer(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -73,34 +69,20 @@ def seeds_only(flight: Path, out: Path) -> list[Task]:
 
 
 def reports_of(run: Run, tasks: list[Task]) -> Iterator[CaptureReport]:
-    return capture_reports(run, tasks, Listener(), timeout_s=10)
+    return capture_reports(run, tasks, Listener(), timeout_s=600)
 
 
-class KillsWhenRead(Settings):
-    """Settings that kill the process that unpickles them, this many times in all."""
-
-    def __init__(self, mark: Path, times: int) -> None:
-        super().__init__(seed=SeedSettings(only=True))
-        self._given = mark, times
-
-    def __reduce__(self) -> tuple[object, ...]:
-        return kill_and_read, self._given
-
-
-def kill_and_read(mark: Path, times: int) -> Settings:
-    signal_self(mark, signal.SIGKILL, times)
-    return seeded()
+def deadly(task: Task, folder: Path, times: int) -> Task:
+    """A task that kills the processes that receive it, up to a number of times."""
+    return replace(task, settings=WhenUnpickled(folder / "mark", signal.SIGKILL, times))
 
 
 def test_a_process_that_is_killed_twice_costs_its_capture(flight: Path, tmp_path: Path) -> None:
-    capture, *others = seeds_only(flight, tmp_path)
-    deadly = replace(capture, settings=KillsWhenRead(tmp_path / "mark", 2))
-    with chosen_run(None, 1, limit_threads, timeout_s=600) as run:
-        reports = {r.label: r for r in reports_of(run, [deadly, *others])}
-    lost = reports.pop(capture.capture.label)
+    one, other = seeds_only(flight, tmp_path)
+    with chosen_run(None, 1, limit_threads, has_timeout=True) as run:
+        reports = {r.label: (r.state, r.error) for r in reports_of(run, [deadly(one, tmp_path, 2), other])}
     killed = "its worker process was killed (signal 9; out of memory?); run again to process the remaining captures"
-    assert (lost.state, lost.error) == ("error", killed)
-    assert [r.state for r in reports.values()] == ["done"] * len(others)
+    assert reports == {one.capture.label: ("error", killed), other.capture.label: ("done", None)}
 
 
 def test_results_of_learning_tasks_come_in_order_and_a_lost_worker_ends_the_run(tmp_path: Path) -> None:
@@ -109,13 +91,11 @@ def test_results_of_learning_tasks_come_in_order_and_a_lost_worker_ends_the_run(
         assert list(in_order(run, sleep, [0.6, 0.0, 0.1])) == [0.6, 0.0, 0.1]
     with ThreadPoolExecutor(2) as threads:
         assert list(in_order(on_executor(threads), sleep, [0.3, 0.0, 0.1])) == [0.3, 0.0, 0.1]
-    with (
-        chosen_run(None, 1, limit_threads, timeout_s=600) as run,
-        pytest.raises(WorkerError, match="the flight cannot be learned: its worker process"),
-    ):
-        list(in_order(run, partial(signal_self, number=signal.SIGKILL, times=2), [tmp_path / "mark"]))
-    with chosen_run(None, 1, limit_threads, timeout_s=600) as run, pytest.raises(MemoryError):
-        list(in_order(run, without_memory, [0]))
+    with chosen_run(None, 1, limit_threads, has_timeout=True) as run:
+        with pytest.raises(WorkerError, match="the flight cannot be learned: its worker process"):
+            list(in_order(run, partial(signal_self, number=signal.SIGKILL, times=2), [tmp_path / "mark"]))
+        with pytest.raises(MemoryError):
+            list(in_order(run, without_memory, [0]))
 
 
 @pytest.mark.full
@@ -124,33 +104,24 @@ def test_an_executor_that_loses_its_processes_costs_the_captures(
 ) -> None:
     """Also those that it refuses to take afterwards."""
     monkeypatch.setattr(workers, "_MAX_WAITING_TASKS", 1)
-    capture, *_ = seeds_only(flight, tmp_path)
-    deadly = replace(capture, settings=KillsWhenRead(tmp_path / "mark", 1))
+    task, *_ = seeds_only(flight, tmp_path)
     with ProcessPoolExecutor(1, get_context("spawn")) as executor:
-        reports = list(reports_of(on_executor(executor), [deadly, capture, capture]))
+        reports = list(reports_of(on_executor(executor), [deadly(task, tmp_path, 1), task, task]))
     assert {r.error for r in reports} == {
         "the executor lost its processes (out of memory?); run again to process the remaining captures"
     }
 
 
 def test_a_capture_that_takes_too_long_ends_its_process_on_a_cluster() -> None:
-    call = f"_on_worker({agalign.__version__!r}, 0.3, time.sleep, 60)"
+    call = f"_on_worker({agalign.__version__!r}, time.sleep, 60, timeout_s=0.3)"
     code = f"import time; from agalign.batch.workers import _on_worker; {call}"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 75
-    assert workers._on_worker(agalign.__version__, 30, max, 1, 2) == 2
 
 
-class Client:
+def client(versions: dict[str, object], status: str = "running", executor: object = None) -> mock.Mock:
     """A Dask client with the answers of its workers."""
-
-    def __init__(self, versions: dict[str, object], status: str = "running") -> None:
-        self.versions, self.status = versions, status
-
-    def run(self, *_: object, **__: object) -> dict[str, object]:
-        return self.versions
-
-    def get_executor(self, **_: object) -> ThreadPoolExecutor:
-        return ThreadPoolExecutor(1)
+    methods = {"run.return_value": versions, "get_executor.return_value": executor}
+    return mock.Mock(status=status, **methods)
 
 
 @pytest.mark.parametrize(
@@ -162,15 +133,15 @@ class Client:
 )
 def test_a_dask_worker_without_this_version_is_refused(answer: object, problem: str) -> None:
     with pytest.raises(ConfigurationError, match=f"the Dask worker at tcp://b:1 {problem}"):
-        workers._check_versions(Client({"tcp://a:1": agalign.__version__, "tcp://b:1": answer}))
-    workers._check_versions(Client({"tcp://a:1": agalign.__version__}))
-    assert workers._on_worker(agalign.__version__, None, max, 1, 2) == 2
+        workers._check_versions(client({"tcp://a:1": agalign.__version__, "tcp://b:1": answer}))
+    workers._check_versions(client({"tcp://a:1": agalign.__version__}))
+    assert workers._on_worker(agalign.__version__, abs, -2, timeout_s=30) == 2
     with pytest.raises(ConfigurationError, match=r"^a Dask worker has agalign .*; install agalign 0\.0\.9 there$"):
-        workers._on_worker("0.0.9", None, max, 1, 2)
+        workers._on_worker("0.0.9", abs, -2)
 
 
 def test_a_dask_scheduler_without_workers_is_reported(caplog: pytest.LogCaptureFixture) -> None:
-    workers._check_versions(Client({}))
+    workers._check_versions(client({}))
     assert caplog.messages == ["agalign: no worker is connected to the Dask scheduler; the run waits for one"]
 
 
@@ -180,16 +151,11 @@ def test_a_lost_dask_scheduler_ends_the_run_in_one_line(
 ) -> None:
     """Futures of a lost scheduler are cancelled, or never end."""
     monkeypatch.setattr(workers, "_POLL_INTERVAL_S", 0.01)
-    executor = DaskExecutor(Client({}, "connecting"), None)
-
-    def submit(*_: object) -> "Future[CaptureReport]":
-        future: Future[CaptureReport] = Future()
-        if ends:
-            future.cancel()
-            future.set_running_or_notify_cancel()
-        return future
-
-    monkeypatch.setattr(executor, "submit", submit)
+    future: Future[CaptureReport] = Future()
+    if ends:
+        future.cancel()
+        future.set_running_or_notify_cancel()
+    executor = DaskExecutor(client({}, "connecting", mock.Mock(**{"submit.return_value": future})))
     with pytest.raises(WorkerError, match=r"^the Dask scheduler does not answer any more; finished captures are kept"):
         list(reports_of(on_executor(executor), seeds_only(flight, tmp_path)))
 

@@ -20,8 +20,9 @@ import tempfile
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 from unittest import mock
 
@@ -34,7 +35,7 @@ from agalign.errors import SidecarError
 from agalign.products.sidecar.file import find_sidecars, read_sidecar
 from agalign.values.files import RUN_FILE
 
-from ..conftest import textured_pair
+from ..conftest import raising, textured_pair
 from ..program import agalign_here
 
 DOCUMENT = Path(__file__).resolve().parents[2] / "docs" / "reliability.md"
@@ -60,20 +61,27 @@ class Scene:
     arguments: list[str] = field(default_factory=list)
     command: list[str] | None = None
     """Instead of aligning the folder into `out`."""
-    during: Callable[[], None] = lambda: None
-    """Done when the captures are found."""
-    watch: Callable[["subprocess.Popen[str]"], None] | None = None
-    """Done while the program runs, in a process of its own."""
+    watch: "Inject | None" = None
+    """Done while the program runs, in a process of its own: `run`."""
+    run: "subprocess.Popen[str] | None" = None
     process: dict[str, Any] = field(default_factory=dict)
     """How that process is started, where it must have one."""
     options: tuple[str, ...] = ()
     """Options that save time in what the fault does not concern."""
     undo: Callable[[], None] = lambda: None
-    children: list[psutil.Process] = field(default_factory=list)
+    stopped: list[psutil.Process] = field(default_factory=list)
     """Processes that must not outlive the program."""
 
     def file(self, name: str = "b_nir.tif") -> Path:
         return self.folder / name
+
+    def children(self) -> list[psutil.Process]:
+        """All processes that the program has started."""
+        return psutil.Process(self.run.pid).children(recursive=True)
+
+    def workers(self) -> list[psutil.Process]:
+        """The processes that do captures: the fork server starts them."""
+        return [c for c in self.children() if c.ppid() != self.run.pid]
 
     def run_of(self, out: Path) -> list[str]:
         """Arguments of a usual run into this folder."""
@@ -85,29 +93,18 @@ Inject = Callable[[Scene], object]
 
 
 @dataclass(frozen=True)
-class Ends:
-    """How a run must end."""
-
-    code: int
-    says: str = ""
-    """A pattern of one of the complaints; nothing is to be complained of where it is empty."""
-    finished: Sequence[str] = "a"
-    """Captures that must be aligned all the same."""
-    all_but: int | None = None
-    """This many of the twelve captures of a longer run are lost, whichever."""
-
-
-@dataclass(frozen=True)
 class Fault:
-    """Something that is wrong."""
+    """Something that is wrong, and how a run must end."""
 
     name: str
     inject: Inject
-    ends: Ends
-
-    @property
-    def is_in_full_run(self) -> bool:
-        return self.inject in _IN_FULL_RUN
+    says: str = ""
+    """A pattern of one of the complaints; nothing is to be complained of where it is empty."""
+    code: int = 0
+    finished: Sequence[str] = "ab"
+    """Captures that must be aligned all the same."""
+    at_least: int = 0
+    """Number of captures that must be aligned, whichever: what was stopped may have been written before."""
 
 
 @dataclass(frozen=True)
@@ -182,17 +179,9 @@ def aligned(out: Path) -> list[str]:
     return result
 
 
-def run_inside(arguments: list[str], scene: Scene) -> tuple[int, str]:
+def run_inside(arguments: list[str], _scene: Scene) -> tuple[int, str]:
     """In this process, which has loaded everything: (exit code, standard error)."""
-    real = cli_run.find_captures
-
-    def result(*given: Any, **named: Any) -> Any:
-        flight = real(*given, **named)
-        scene.during()
-        return flight
-
-    with mock.patch.object(cli_run, "find_captures", result):
-        done = agalign_here(*arguments)
+    done = agalign_here(*arguments)
     return done.returncode, done.stderr
 
 
@@ -200,12 +189,12 @@ def run_outside(arguments: list[str], scene: Scene) -> tuple[int, str]:
     """In a process of its own: (exit code, standard error)."""
     given = {"stdout": subprocess.DEVNULL, "stderr": subprocess.PIPE, "text": True, "start_new_session": True}
     given |= scene.process
-    with subprocess.Popen([sys.executable, "-m", "agalign", *arguments], **given) as process:
+    with subprocess.Popen([sys.executable, "-m", "agalign", *arguments], **given) as scene.run:
         if scene.watch is not None:
-            scene.watch(process)
-        _, errors = process.communicate()
-    psutil.wait_procs(scene.children)
-    return process.returncode, errors or ""
+            scene.watch(scene)
+        _, errors = scene.run.communicate()
+    psutil.wait_procs(scene.stopped)
+    return scene.run.returncode, errors or ""
 
 
 # ---- what is done to files
@@ -223,26 +212,37 @@ def extra(name: str, data: bytes) -> Inject:
     return lambda scene: (scene.folder / name).write_bytes(data)
 
 
-def tagged(packet: str | None = None, *tags: tuple[int, int, int, str, bool]) -> Inject:
-    """Both files of b with an XMP packet and other tags."""
+def repainted(change: Callable[[np.ndarray], np.ndarray], *names: str, **tags: object) -> Inject:
+    """Files of other images or tags; both files of b where none is named."""
 
     def inject(scene: Scene) -> None:
-        data = (packet or "").encode()
-        extratags = [(XMP, 1, len(data), data, True), *tags] if data else tags
-        for path in (scene.file("b_green.tif"), scene.file()):
-            tifffile.imwrite(path, tifffile.imread(path), extratags=extratags)
+        for name in names or ("b_green.tif", "b_nir.tif"):
+            tifffile.imwrite(scene.file(name), change(tifffile.imread(scene.file(name))), **tags)
 
     return inject
 
 
+def tagged(*tags: tuple[int, int, int, str | bytes, bool]) -> Inject:
+    return repainted(np.copy, extratags=tags)
+
+
+def packet(text: str) -> Inject:
+    return tagged((XMP, 1, len(text), text.encode(), True))
+
+
 def xmp(values: str) -> Inject:
-    return tagged(_PACKET.format(values))
+    return packet(_PACKET.format(values))
 
 
 def directory_of(entries: list[tuple[int, int, int, bytes]], more: bytes = b"") -> bytes:
     """A little-endian TIFF of (tag, type, count, value or place), and what follows."""
     body = b"".join(struct.pack("<HHI", *head) + value.ljust(4, b"\0") for *head, value in entries)
     return b"II*\0" + struct.pack("<IH", 8, len(entries)) + body + struct.pack("<I", 0) + more
+
+
+def many_strips(data: bytes) -> bytes:
+    one, many = (struct.pack("<HHI", 273, 4, count) for count in (1, 1 << 30))
+    return data.replace(one, many, 1)
 
 
 def number(value: int) -> bytes:
@@ -287,22 +287,6 @@ def overviews_elsewhere(scene: Scene) -> None:
         (scene.folder / name).write_text(vrt(scene))
 
 
-def of_other_size(scene: Scene) -> None:
-    path = scene.file()
-    tifffile.imwrite(path, tifffile.imread(path)[::2, ::2])
-
-
-def of_one_pixel(scene: Scene) -> None:
-    for band in ("green", "nir"):
-        tifffile.imwrite(scene.file(f"b_{band}.tif"), np.ones((1, 1), np.uint16))
-
-
-def all_nodata(scene: Scene) -> None:
-    path = scene.file()
-    blank = np.zeros_like(tifffile.imread(path))
-    tifffile.imwrite(path, blank, extratags=[(42113, 2, 2, "0", True)])
-
-
 def strange_names(scene: Scene) -> None:
     for place, name in enumerate(STRANGE_NAMES):
         write_capture(scene.folder, name, place)
@@ -313,26 +297,24 @@ def loops(scene: Scene) -> None:
     (scene.folder / "b_nir2.tif").symlink_to(scene.folder / "b_nir2.tif")
 
 
-def without_permission(scene: Scene, target: Path, mode: int) -> None:
-    """Root passes over permissions by two capabilities, which the program is started without."""
+def forbidden(path: str, mode: int = 0) -> Inject:
+    """A file or folder, by default a new one, that whoever runs the program may not use.
+
+    Root passes over permissions by two capabilities, which the program is started without.
+    """
 
     def drop_capabilities() -> None:
         libc = ctypes.CDLL(None)
         for capability in (1, 2):  # CAP_DAC_OVERRIDE, CAP_DAC_READ_SEARCH
             libc.prctl(24, capability, 0, 0, 0)  # PR_CAPBSET_DROP
 
-    target.chmod(mode)
-    scene.process = {"preexec_fn": drop_capabilities}
-    scene.undo = lambda: target.chmod(0o755)
-
-
-def forbidden(path: Callable[[Scene], Path], name: str = "", mode: int = 0) -> Inject:
-    """A file or folder that whoever runs the program may not read."""
-
     def inject(scene: Scene) -> None:
-        if name:
-            path(scene).mkdir()
-        without_permission(scene, path(scene), mode)
+        target = scene.folder.parent / path
+        if not target.exists():
+            target.mkdir()
+        target.chmod(mode)
+        scene.process = {"preexec_fn": drop_capabilities}
+        scene.undo = lambda: target.chmod(0o755)
 
     return inject
 
@@ -340,15 +322,27 @@ def forbidden(path: Callable[[Scene], Path], name: str = "", mode: int = 0) -> I
 def read_only(scene: Scene) -> None:
     for path in scene.folder.iterdir():
         path.chmod(0o444)
-    without_permission(scene, scene.folder, 0o555)
+    forbidden("flight", 0o555)(scene)
 
 
 # ---- what is done to runs
 
 
 def first_run(scene: Scene, out: Path | None = None) -> None:
-    code, output = run_inside(scene.run_of(out or scene.out), scene)
-    assert code == 0, output
+    done = agalign_here(*scene.run_of(out or scene.out))
+    assert done.returncode == 0, done.stderr
+
+
+def patched(scene: Scene, module: ModuleType, name: str, replacement: Callable[..., object]) -> None:
+    patch = mock.patch.object(module, name, replacement)
+    patch.start()
+    scene.undo = patch.stop
+
+
+def vanishing(scene: Scene) -> None:
+    """A file that vanishes when the captures are found."""
+    find_captures = cli_run.find_captures
+    patched(scene, cli_run, "find_captures", lambda *given: (find_captures(*given), scene.file().unlink())[0])
 
 
 def killed_inside_the_input(scene: Scene) -> None:
@@ -360,11 +354,11 @@ def killed_inside_the_input(scene: Scene) -> None:
     assert (earlier / RUN_FILE).is_file()
 
 
-def with_sidecar(change: Callable[[Scene, str], str]) -> Inject:
+def with_sidecar(pattern: str, new: str) -> Inject:
     def inject(scene: Scene) -> None:
         first_run(scene)
         path = scene.out / "b.json"
-        path.write_text(change(scene, path.read_text()))
+        path.write_text(re.sub(pattern, new, path.read_text()))
 
     return inject
 
@@ -391,6 +385,10 @@ def given_model(make: Callable[[Path], object]) -> Inject:
         scene.arguments = ["--model", str(path)]
 
     return inject
+
+
+def malformed(path: Path) -> None:
+    path.write_bytes(b"\x40" + bytes(7) + b"{" + b"[" * 63)
 
 
 def output_is_a_folder(name: str) -> Inject:
@@ -435,23 +433,14 @@ def full_disk(scene: Scene) -> None:
     scene.process = {"preexec_fn": limit}
 
 
-Act = Callable[["subprocess.Popen[str]", Scene], object]
-"""Is done to a run."""
-
-
-def when(ready: Act, act: Act, *arguments: str) -> Inject:
+def when(ready: Inject, act: Inject, *arguments: str) -> Inject:
     """Something happens to a run once `ready` returns something true."""
 
-    def inject(scene: Scene) -> None:
-        scene.arguments = list(arguments)
+    def watch(scene: Scene) -> None:
+        wait_until(scene, lambda: bool(ready(scene)))
+        act(scene)
 
-        def watch(process: "subprocess.Popen[str]") -> None:
-            wait_until(process, lambda: bool(ready(process, scene)))
-            act(process, scene)
-
-        scene.watch = watch
-
-    return inject
+    return lambda scene: vars(scene).update(arguments=[*arguments], watch=watch)
 
 
 def with_captures(names: str) -> Inject:
@@ -459,62 +448,41 @@ def with_captures(names: str) -> Inject:
     return lambda scene: [write_capture(scene.folder, name, place % 3) for place, name in enumerate(names)]
 
 
-def when_begun(act: Act, *arguments: str) -> Inject:
+def when_begun(act: Inject, *arguments: str) -> Inject:
     """Something happens to a run of twelve captures once the first of them is done."""
-    return both(with_captures(ALL[2:]), when(lambda _, scene: any(scene.out.glob("?.json")), act, *arguments))
+    return both(with_captures(ALL[2:]), when(lambda scene: any(scene.out.glob("?.json")), act, *arguments))
 
 
-def has_children(count: int) -> Act:
-    return lambda process, _: len(psutil.Process(process.pid).children()) >= count
+def to_busiest(act: Callable[[psutil.Process], object]) -> Inject:
+    """Is done to the worker that has computed most."""
+    return lambda scene: act(max(scene.workers(), key=lambda worker: worker.cpu_times().user))
 
 
-def a_worker(process: "subprocess.Popen[str]") -> psutil.Process:
-    """A process that is doing a capture."""
-    children = psutil.Process(process.pid).children(recursive=True)
-    busy = {child: child.cpu_times() for child in children}
-    return max(children, key=lambda child: (child.ppid() != process.pid, busy[child].user))
-
-
-def kill_worker(process: "subprocess.Popen[str]", _scene: Scene) -> None:
-    a_worker(process).kill()
-
-
-def kill_capture(process: "subprocess.Popen[str]", scene: Scene) -> None:
+def kill_capture(scene: Scene) -> None:
     """Kill the only worker, and again when it tries the same capture once more, which it does last."""
     for finished in (1, len(ALL) - 1):
-        wait_for_reports(process, scene, finished)
-        (worker,) = workers(process)
+        wait_for_reports(scene, finished)
+        (worker,) = scene.workers()
         before_s = worker.cpu_times().user
-        wait_until(process, lambda worker=worker, before_s=before_s: worker.cpu_times().user > before_s + 0.05)
+        wait_until(scene, lambda worker=worker, before_s=before_s: worker.cpu_times().user > before_s + 0.05)
         worker.kill()
 
 
-def workers(process: "subprocess.Popen[str]") -> list[psutil.Process]:
-    try:
-        return [c for c in psutil.Process(process.pid).children(recursive=True) if c.ppid() != process.pid]
-    except psutil.NoSuchProcess:
-        return []
-
-
-def wait_until(process: "subprocess.Popen[str]", true: Callable[[], bool]) -> None:
+def wait_until(scene: Scene, true: Callable[[], bool]) -> None:
     while not true():
-        assert process.poll() is None or true(), "the run ended before the fault"
+        assert scene.run.poll() is None or true(), "the run ended before the fault"
         time.sleep(0.01)
 
 
-def stop_worker(process: "subprocess.Popen[str]", _scene: Scene) -> None:
-    a_worker(process).suspend()
-
-
-def starve_workers(process: "subprocess.Popen[str]", scene: Scene) -> None:
-    wait_for_reports(process, scene)
-    for worker in workers(process):
+def starve_workers(scene: Scene) -> None:
+    wait_for_reports(scene)
+    for worker in scene.workers():
         worker.rlimit(psutil.RLIMIT_AS, (1 << 20, 1 << 20))
 
 
-def wait_for_reports(process: "subprocess.Popen[str]", scene: Scene, captures: int = 3) -> None:
+def wait_for_reports(scene: Scene, captures: int = 3) -> None:
     """Wait until captures are reported: of three by two workers, one has begun its second."""
-    wait_until(process, lambda: len(list(scene.out.glob("?.json"))) >= captures)
+    wait_until(scene, lambda: len(list(scene.out.glob("?.json"))) >= captures)
 
 
 def larger(scene: Scene) -> None:
@@ -528,13 +496,13 @@ def larger(scene: Scene) -> None:
         tifffile.imwrite(path, np.kron(tifffile.imread(path), np.ones((times, times), np.uint16)))
 
 
-def signalled(number_: int, after_s: float = 0.0) -> Act:
+def signalled(number_: int, after_s: float = 0.0) -> Inject:
     """Sent to all processes of the run, as a terminal does; none of them may be left."""
 
-    def act(process: "subprocess.Popen[str]", scene: Scene) -> None:
+    def act(scene: Scene) -> None:
         time.sleep(after_s)
-        scene.children = psutil.Process(process.pid).children(recursive=True)
-        os.killpg(process.pid, number_)
+        scene.stopped = scene.children()
+        os.killpg(scene.run.pid, number_)
 
     return act
 
@@ -559,18 +527,13 @@ def asking(*options: str) -> Inject:
     return lambda scene: scene.arguments.extend(options)
 
 
-def lines(scene: Scene) -> None:
-    for name in ("b_green.tif", "b_nir.tif"):
-        tifffile.imwrite(scene.file(name), np.random.default_rng(0).integers(0, 60000, (1, 100000), np.uint16))
-
-
 def sidecar_is_a_pipe(scene: Scene) -> None:
     scene.out.mkdir()
     os.mkfifo(scene.out / "b.json")
 
 
 def endless_number(scene: Scene) -> None:
-    with_sidecar(lambda _, text: re.sub(r'"seconds": [0-9.]+', '"seconds": 1e309', text))(scene)
+    with_sidecar(r'"seconds": [0-9.]+', '"seconds": 1e309')(scene)
     commanding("report {out}")(scene)
 
 
@@ -600,9 +563,7 @@ def long_temporary_folder(scene: Scene) -> None:
 
 def no_locks(scene: Scene) -> None:
     """As on NFS without its lock daemon."""
-    patch = mock.patch.object(fcntl, "flock", side_effect=OSError(errno.ENOLCK, "No locks available"))
-    patch.start()
-    scene.undo = patch.stop
+    patched(scene, fcntl, "flock", raising(OSError(errno.ENOLCK, "No locks available")))
 
 
 def commanding(command: str) -> Inject:
@@ -621,23 +582,22 @@ def colliding(scene: Scene) -> None:
     tifffile.imwrite(scene.file("a_nir.tiff"), bands, photometric="minisblack", planarconfig="separate")
 
 
-def counting_beyond(scene: Scene) -> None:
-    path = scene.file()
-    one, many = (struct.pack("<HHI", 273, 4, count) for count in (1, 1 << 30))
-    path.write_bytes(path.read_bytes().replace(one, many, 1))
-
-
-_IN_FULL_RUN: list[Inject] = []
-
-
-def in_full_run(inject: Inject) -> Inject:
-    """A fault of the full tests alone, because it takes long and others are like it."""
-    _IN_FULL_RUN.append(inject)
-    return inject
-
-
 _SECOND = '"file": "b.tif",\n    "band_index": 2'
-_NESTED = "<a>" * 1200 + "</a>" * 1200
+_NO_NUMBERS = (
+    "<Camera:PerspectiveFocalLength>nan</Camera:PerspectiveFocalLength><Camera:PrincipalPoint>1e300,inf"
+    "</Camera:PrincipalPoint><DLS:HorizontalIrradiance>-5</DLS:HorizontalIrradiance>"
+    "<MicaSense:RadiometricCalibration>1e300,0,0</MicaSense:RadiometricCalibration>"
+)
+_ENDLESS_LENS = (
+    "<Camera:PerspectiveFocalLength>1e308</Camera:PerspectiveFocalLength>"
+    "<Camera:PerspectiveFocalLengthUnits>mm</Camera:PerspectiveFocalLengthUnits>"
+)
+_LINE = np.random.default_rng(0).integers(0, 60000, (1, 100000), np.uint16)
+_MAKER, _NODATA = (271, 2, 0, "Maker", True), [(42113, 2, 2, "0", True)]
+_DEEP = '{"schema": "agalign/1", "bands": ' + "[" * 200_000
+_POSSIBLE_NAMES = "a", "b", "-rf", "new\nline", "\x1b[31mred\a", "x" * 200
+_IN_TIME = "-j", "2", "--timeout", "100"
+_FILES_ELSEWHERE = '"band_files": [{"file": "../a", "bytes": 1}]'
 _BOMB = (
     '<!DOCTYPE l [<!ENTITY a "aaaaaaaaaa">'
     + "".join(f'<!ENTITY {chr(98 + k)} "{("&" + chr(97 + k) + ";") * 10}">' for k in range(8))
@@ -648,182 +608,142 @@ _OUTSIDE = '<!DOCTYPE l [<!ENTITY a SYSTEM "file:///etc/passwd">]>' + _PACKET.fo
     "<Camera:BandName>&a;</Camera:BandName>"
 )
 
-ALL_FINISHED: dict[str, Inject] = {
-    "a folder named .tif": lambda s: (s.folder / "c_nir.tif").mkdir(),
-    "the system's folder on a card": in_full_run(forbidden(lambda s: s.folder / "lost+found", "new")),
-    "an input that may only be read": in_full_run(read_only),
-    "XMP nested 1200 deep": in_full_run(tagged(_PACKET.format(_NESTED))),
-    "numbers in the tags that cannot be": both(
-        xmp(
-            "<Camera:PerspectiveFocalLength>nan</Camera:PerspectiveFocalLength><Camera:PrincipalPoint>1e300,inf"
-            "</Camera:PrincipalPoint><DLS:HorizontalIrradiance>-5</DLS:HorizontalIrradiance>"
-            "<MicaSense:RadiometricCalibration>1e300,0,0</MicaSense:RadiometricCalibration>"
-        ),
-        asking("--radiometry", "off"),
+names_another = partial(Fault, code=3)
+"""Both captures are aligned, and another file is complained of."""
+loses_b = partial(Fault, code=3, finished="a")
+refused = partial(Fault, code=1, finished="")
+"""The run cannot begin."""
+wrong_use = partial(Fault, code=2, finished="")
+of_long_run = partial(Fault, code=3, finished="")
+"""Captures of a run of twelve are lost."""
+interrupted = partial(Fault, says="interrupted; finished", code=130, finished="")
+
+USUAL = (
+    Fault("a folder named .tif", lambda s: s.file("c_nir.tif").mkdir()),
+    Fault("numbers in the tags that cannot be", both(xmp(_NO_NUMBERS), asking("--radiometry", "off"))),
+    Fault("a band of another size", repainted(lambda image: image[::2, ::2], "b_nir.tif")),
+    Fault("a camera model of 300 characters", both(learning, tagged(_MAKER, (272, 2, 0, "M" * 300, True)))),
+    Fault("an output inside the input", lambda s: setattr(s, "out", s.folder / "out")),
+    Fault("overviews that describe other files", overviews_elsewhere),
+    Fault("a sidecar that names files elsewhere", with_sidecar('"band_files": \\[\\]', _FILES_ELSEWHERE)),
+    Fault("a model of an earlier run, damaged", damaged_model),
+    Fault("the lock of a killed run", held_by_a_killed_one),
+    Fault("a pipe where a sidecar belongs", sidecar_is_a_pipe),
+    Fault("a file system without locks", no_locks),
+    names_another("a text named .tif", extra("c_nir.tif", b"hello"), "c_nir.tif: is not a TIFF"),
+    names_another("a pipe named .tif", lambda s: os.mkfifo(s.file("c_nir.tif")), "c_nir.tif: is not a regular file"),
+    names_another("a sparse image of 100,000 x 100,000", enormous, r"declares 100000 x 100000 pixels.*--max-pixels"),
+    names_another("an image of 65,535 bands", extra("c.tif", declared(64, 64, 65535)), "c.tif: "),
+    names_another(
+        "a band index of 99 in a sidecar, for indices",
+        both(with_sidecar(_SECOND, _SECOND.replace("2", "99")), commanding("ndvi {out} --index gndvi")),
+        "b.tif: has no band 99",
     ),
-    "a band of another size": of_other_size,
-    "a formula for a name": in_full_run(lambda s: write_capture(s.folder, '=HYPERLINK("a")', 3)),
-    "a camera model of 300 characters": both(
-        learning, tagged(None, (271, 2, 0, "Maker", True), (272, 2, 0, "M" * 300, True))
+    names_another("standard output full", standard_output_full, "standard output|output: No space left", code=1),
+    loses_b("a TIFF cut short", edited(lambda data: data[: len(data) // 2]), r"b_nir\.tif: .*copy it from the card"),
+    loses_b("half of a TIFF zeros", edited(lambda data: data[:2000] + bytes(len(data) - 2000)), "^b nir: "),
+    loses_b("wrong magic", edited(lambda data: b"XX" + data[2:]), "b_nir.tif: is not a TIFF, JPEG or PNG"),
+    loses_b("no bytes at all", edited(lambda _: b""), "b_nir.tif: is empty"),
+    loses_b("a file without permission", forbidden("flight/b_nir.tif"), r"b_nir.tif: cannot be read \(Permission"),
+    loses_b("a file that vanishes during the run", vanishing, r"b_nir\.tif: does not exist"),
+    loses_b("a tag that counts beyond the file", edited(many_strips), "b_nir.tif: not a readable TIFF"),
+    loses_b("images of one pixel", repainted(lambda _: np.ones((1, 1), np.uint16)), "^b nir: "),
+    loses_b("a band that is all nodata", repainted(np.zeros_like, "b_nir.tif", extratags=_NODATA), "^b nir: "),
+    loses_b(
+        "a TIFF that describes other files (VRT)", lambda s: s.file().write_text(vrt(s)), "b_nir.tif: is not a TIFF"
     ),
-    "an output inside the input": lambda s: setattr(s, "out", s.folder / "out"),
-    "an earlier run inside the input, killed": in_full_run(killed_inside_the_input),
-    "two captures that would write one file": in_full_run(colliding),
-    "overviews that describe other files": overviews_elsewhere,
-    "a sidecar that names files elsewhere": with_sidecar(
-        lambda s, t: t.replace('"band_files": []', '"band_files": [{"file": "../a", "bytes": 1}]')
-    ),
-    "a sidecar nested 200,000 deep": in_full_run(
-        with_sidecar(lambda *_: '{"schema": "agalign/1", "bands": ' + "[" * 200_000)
-    ),
-    "a model of an earlier run, damaged": damaged_model,
-    "the lock of a killed run": held_by_a_killed_one,
-    "a terminal of ASCII": in_full_run(both(strange_names, with_environment(PYTHONIOENCODING="ascii"))),
-    "a pipe where a sidecar belongs": sidecar_is_a_pipe,
-    "an infinite number in an earlier sidecar": in_full_run(both(endless_number, commanding("{folder} -o {out} -j 1"))),
-    "standard output closed": in_full_run(without_streams(1)),
-    "all standard streams closed": in_full_run(without_streams(0, 1, 2)),
-    "a temporary folder with a name of 150 letters": in_full_run(long_temporary_folder),
-    "a file system without locks": no_locks,
-    "a focal length of 1e308 mm in the tags": in_full_run(
-        xmp(
-            "<Camera:PerspectiveFocalLength>1e308</Camera:PerspectiveFocalLength>"
-            "<Camera:PerspectiveFocalLengthUnits>mm</Camera:PerspectiveFocalLengthUnits>"
-        )
-    ),
-}
-"""After these, both captures are aligned, without a complaint."""
-B_IS_LOST: dict[str, tuple[Inject, str]] = {
-    "a TIFF cut short": (edited(lambda data: data[: len(data) // 2]), r"b_nir\.tif: .*copy it from the card"),
-    "half of a TIFF zeros": (edited(lambda data: data[:2000] + bytes(len(data) - 2000)), r"^b nir: "),
-    "wrong magic": (edited(lambda data: b"XX" + data[2:]), "b_nir.tif: is not a TIFF, JPEG or PNG"),
-    "no bytes at all": (edited(lambda _: b""), "b_nir.tif: is empty"),
-    "a file without permission": (forbidden(lambda s: s.file()), r"b_nir.tif: cannot be read \(Permission"),
-    "a file that vanishes during the run": (
-        lambda s: setattr(s, "during", s.file().unlink),
-        r"b_nir\.tif: does not exist",
-    ),
-    "a thousand tags of one value of 2 MB": (in_full_run(long_tags), "b_nir.tif: .*declare more than 32 MB"),
-    "a tag that counts beyond the file": (counting_beyond, "b_nir.tif: not a readable TIFF"),
-    "images of one pixel": (of_one_pixel, "^b nir: "),
-    "a band that is all nodata": (all_nodata, "^b nir: "),
-    "a TIFF that describes other files (VRT)": (lambda s: s.file().write_text(vrt(s)), "b_nir.tif: is not a TIFF"),
-    "a sidecar of width 0, for the report": (
-        both(with_sidecar(lambda _, t: re.sub(r'"width": \d+', '"width": 0', t)), commanding("report {out}")),
+    loses_b(
+        "a sidecar of width 0, for the report",
+        both(with_sidecar(r'"width": \d+', '"width": 0'), commanding("report {out}")),
         "b.json: reference.width",
     ),
-    "a sidecar without permission, for the report": (
-        in_full_run(both(first_run, forbidden(lambda s: s.out / "b.json"), commanding("report {out}"))),
-        r"b.json: cannot be read \(Permission",
-    ),
-    "a folder where a stack belongs": (output_is_a_folder("b.tif"), "b.tif: cannot be written"),
-    "a folder where a band's file belongs": (
+    loses_b("an infinite number in a sidecar, for the report", endless_number, r"b\.json: .*finite"),
+    loses_b("a folder where a stack belongs", output_is_a_folder("b.tif"), "b.tif: cannot be written"),
+    loses_b(
+        "a folder where a band's file belongs",
         both(output_is_a_folder("b_nir.tif"), asking("--layout", "bands")),
         "b_nir.tif: cannot be written",
     ),
-    "images of a line of 100,000 pixels": (lines, "^b nir: "),
-}
-"""After these, the other capture is aligned; with a pattern of the complaint."""
-FILE_IS_NAMED: dict[str, tuple[Inject, str]] = {
-    "a text named .tif": (extra("c_nir.tif", b"hello"), "c_nir.tif: is not a TIFF"),
-    "a pipe named .tif": (lambda s: os.mkfifo(s.folder / "c_nir.tif"), "c_nir.tif: is not a regular file"),
-    "a folder without permission": (
-        in_full_run(forbidden(lambda s: s.folder / "sub", "new")),
-        r"sub: cannot be looked into \(Permission denied\)",
+    loses_b("images of a line of 100,000 pixels", repainted(lambda _: _LINE), "^b nir: "),
+    loses_b("symlinks that lead in a circle", loops, "b_nir2.tif: cannot be read"),
+    loses_b("the disk full", full_disk, "the disk is full|cannot be written"),
+    refused("an output that is a file", lambda s: s.out.write_text("x"), "out: is a file"),
+    refused("a malformed model file", given_model(malformed), "m.safetensors: cannot be read"),
+    refused("another run in the same output", held_by_another, r"out: another run writes there \(process \d+ on "),
+    refused("a pipe for a model", given_model(os.mkfifo), r"m\.safetensors: .*not a regular file"),
+    refused("one of GDAL's virtual paths", commanding("/vsizip/flight.zip -o {out}"), "virtual paths"),
+    wrong_use("a random seed beyond 64 bits", asking("--rng-seed", "9" * 30), "--rng-seed: give"),
+    wrong_use("a torch device without data", asking("--device", "meta"), "device 'meta' cannot be used"),
+    wrong_use("an empty name for the folder", commanding(" -o {out}"), "the name of the folder is empty"),
+    Fault("a worker killed by SIGKILL", when_begun(to_busiest(psutil.Process.kill), *_IN_TIME), finished=ALL),
+    interrupted("the interrupt key", when_begun(signalled(signal.SIGINT), "-j", "2")),
+)
+LONG = (
+    Fault("the system's folder on a card", forbidden("flight/lost+found")),
+    Fault("an input that may only be read", read_only),
+    Fault("XMP nested 1200 deep", xmp("<a>" * 1200 + "</a>" * 1200)),
+    Fault("a formula for a name", lambda s: write_capture(s.folder, '=HYPERLINK("a")', 3)),
+    Fault("an earlier run inside the input, killed", killed_inside_the_input),
+    Fault("two captures that would write one file", colliding),
+    Fault("a sidecar nested 200,000 deep", with_sidecar("(?s).+", _DEEP)),
+    Fault("a terminal of ASCII", both(strange_names, with_environment(PYTHONIOENCODING="ascii"))),
+    Fault("an infinite number in an earlier sidecar", both(endless_number, commanding("{folder} -o {out} -j 1"))),
+    Fault("standard output closed", without_streams(1)),
+    Fault("all standard streams closed", without_streams(0, 1, 2)),
+    Fault("a temporary folder with a name of 150 letters", long_temporary_folder),
+    Fault("a focal length of 1e308 mm in the tags", xmp(_ENDLESS_LENS)),
+    Fault("names of every kind", strange_names, finished=_POSSIBLE_NAMES),
+    Fault("standard error that is not read", unread_errors, finished="abcde"),
+    Fault("JSON lines that are not read", both(unread_errors, asking("--log-json")), finished="abcde"),
+    Fault("XML entities that multiply", packet(_BOMB), "b_nir.tif: its XMP packet .* lacks BandName"),
+    Fault("an XML entity that names a file", packet(_OUTSIDE), "b_nir.tif: its XMP packet .* lacks BandName"),
+    Fault(
+        "XMP of five megabytes",
+        xmp(f"<Camera:BandName>{'x' * 5_000_000}</Camera:BandName>"),
+        "b_nir.tif: its XMP packet is damaged and lacks its end, BandName",
     ),
-    "a sparse image of 100,000 x 100,000": (enormous, r"declares 100000 x 100000 pixels.*--max-pixels"),
-    "an image of 65,535 bands": (extra("c.tif", declared(64, 64, 65535)), "c.tif: "),
-    "a band index of 99 in a sidecar, for indices": (
-        both(
-            with_sidecar(lambda _, t: t.replace(_SECOND, _SECOND.replace("2", "99"))),
-            commanding("ndvi {out} --index gndvi"),
-        ),
-        "b.tif: has no band 99",
-    ),
-    "a system without letters beyond ASCII": (
-        in_full_run(both(strange_names, with_environment(LC_ALL="C", PYTHONUTF8="0", PYTHONCOERCECLOCALE="0"))),
+    names_another("a folder without permission", forbidden("flight/sub"), r"sub: cannot be looked into \(Permission"),
+    names_another(
+        "a system without letters beyond ASCII",
+        both(strange_names, with_environment(LC_ALL="C", PYTHONUTF8="0", PYTHONCOERCECLOCALE="0")),
         "its name is not valid ASCII; rename it, or set LC_ALL=C.UTF-8",
     ),
-}
-"""After these, both captures are aligned, and another file is complained of."""
-REFUSED: dict[str, tuple[Inject, int, str]] = {
-    "an output that may not be written": (
-        in_full_run(forbidden(lambda s: s.out, "new", 0o555)),
-        1,
-        "out: no permission to write there",
+    loses_b("a thousand tags of one value of 2 MB", long_tags, "b_nir.tif: .*declare more than 32 MB"),
+    loses_b(
+        "a sidecar without permission, for the report",
+        both(first_run, forbidden("out/b.json"), commanding("report {out}")),
+        r"b.json: cannot be read \(Permission",
     ),
-    "an output that is a file": (lambda s: s.out.write_text("x"), 1, "out: is a file"),
-    "a malformed model file": (
-        given_model(lambda path: path.write_bytes(b"\x40" + bytes(7) + b"{" + b"[" * 63)),
-        1,
-        "m.safetensors: cannot be read",
+    refused("an output that may not be written", forbidden("out", 0o555), "out: no permission to write there"),
+    of_long_run(
+        "a worker killed twice at one capture",
+        both(when_begun(kill_capture, "-j", "1", "--timeout", "100"), larger),
+        r"its worker process was killed \(signal 9; ",
+        at_least=len(ALL) - 1,
     ),
-    "another run in the same output": (held_by_another, 1, r"out: another run writes there \(process \d+ on "),
-    "a random seed beyond 64 bits": (asking("--rng-seed", "9" * 30), 2, "--rng-seed: give"),
-    "a torch device without data": (asking("--device", "meta"), 2, "device 'meta' cannot be used"),
-    "a pipe for a model": (given_model(os.mkfifo), 1, r"m\.safetensors: .*not a regular file"),
-    "an empty name for the folder": (commanding(" -o {out}"), 2, "the name of the folder is empty"),
-    "one of GDAL's virtual paths": (commanding("/vsizip/flight.zip -o {out}"), 1, "virtual paths"),
-}
-"""These end the run: with the exit code and a pattern of the complaint."""
-OTHERS = {
-    "XML entities that multiply": (
-        in_full_run(tagged(_BOMB)),
-        Ends(0, "b_nir.tif: its XMP packet .* lacks BandName", "ab"),
+    of_long_run(
+        "memory short in the workers", both(when_begun(starve_workers, *_IN_TIME), larger), "out of memory|killed"
     ),
-    "an XML entity that names a file": (
-        in_full_run(tagged(_OUTSIDE)),
-        Ends(0, "b_nir.tif: its XMP packet .* lacks BandName", "ab"),
+    of_long_run(
+        "a capture that never ends",
+        when_begun(to_busiest(psutil.Process.suspend), "-j", "2", "--timeout", "4"),
+        "stopped after 4 s",
+        at_least=len(ALL) - 1,
     ),
-    "XMP of five megabytes": (
-        in_full_run(xmp(f"<Camera:BandName>{'x' * 5_000_000}</Camera:BandName>")),
-        Ends(0, "b_nir.tif: its XMP packet is damaged and lacks its end, BandName", "ab"),
+    interrupted("the interrupt key, workers of Dask", when_begun(signalled(signal.SIGINT), "--dask", "local")),
+    interrupted(
+        "the interrupt key while workers start",
+        both(with_captures(ALL[2:]), when(Scene.children, signalled(signal.SIGINT), "-j", "2")),
     ),
-    "symlinks that lead in a circle": (loops, Ends(3, "b_nir2.tif: cannot be read", "a")),
-    "the disk full": (full_disk, Ends(3, "the disk is full|cannot be written", "a")),
-    "a worker killed by SIGKILL": (when_begun(kill_worker, "-j", "2", "--timeout", "100"), Ends(0, "", ALL)),
-    "a worker killed twice at one capture": (
-        in_full_run(both(when_begun(kill_capture, "-j", "1", "--timeout", "100"), larger)),
-        Ends(3, r"its worker process was killed \(signal 9; ", "", 1),
+    interrupted("SIGTERM", when_begun(signalled(signal.SIGTERM), "-j", "2"), code=143),
+    interrupted(
+        "SIGTERM while files are read",
+        both(many_files, when(lambda s: s.children()[1:], signalled(signal.SIGTERM, 0.3), "-j", "2")),
+        code=143,
     ),
-    "memory short in the workers": (
-        in_full_run(both(when_begun(starve_workers, "-j", "2", "--timeout", "100"), larger)),
-        Ends(3, "out of memory|killed", ""),
-    ),
-    "a capture that never ends": (
-        in_full_run(when_begun(stop_worker, "-j", "2", "--timeout", "4")),
-        Ends(3, "stopped after 4 s", "", 1),
-    ),
-    "the interrupt key": (when_begun(signalled(signal.SIGINT), "-j", "2"), Ends(130, "interrupted; finished", "")),
-    "the interrupt key, workers of Dask": (
-        in_full_run(when_begun(signalled(signal.SIGINT), "--dask", "local")),
-        Ends(130, "interrupted; finished", ""),
-    ),
-    "the interrupt key while workers start": (
-        in_full_run(both(with_captures(ALL[2:]), when(has_children(1), signalled(signal.SIGINT), "-j", "2"))),
-        Ends(130, "interrupted; finished", ""),
-    ),
-    "SIGTERM": (in_full_run(when_begun(signalled(signal.SIGTERM), "-j", "2")), Ends(143, "interrupted; finished", "")),
-    "SIGTERM while files are read": (
-        in_full_run(both(many_files, when(has_children(2), signalled(signal.SIGTERM, 0.3), "-j", "2"))),
-        Ends(143, "interrupted; finished", ""),
-    ),
-    "names of every kind": (
-        in_full_run(strange_names),
-        Ends(0, "", ("a", "b", "-rf", "new\nline", "\x1b[31mred\a", "x" * 200)),
-    ),
-    "standard output full": (standard_output_full, Ends(1, "standard output|output: No space left", "ab")),
-    "an infinite number in a sidecar, for the report": (endless_number, Ends(3, r"b\.json: .*finite", "a")),
-    "standard error that is not read": (in_full_run(unread_errors), Ends(0, "", "abcde")),
-    "JSON lines that are not read": (in_full_run(both(unread_errors, asking("--log-json"))), Ends(0, "", "abcde")),
-}
-FAULTS = (
-    *(Fault(name, inject, Ends(0, "", "ab")) for name, inject in ALL_FINISHED.items()),
-    *(Fault(name, inject, Ends(3, says)) for name, (inject, says) in B_IS_LOST.items()),
-    *(Fault(name, inject, Ends(3, says, "ab")) for name, (inject, says) in FILE_IS_NAMED.items()),
-    *(Fault(name, inject, Ends(code, says, "")) for name, (inject, code, says) in REFUSED.items()),
-    *(Fault(name, inject, ends) for name, (inject, ends) in OTHERS.items()),
 )
+"""Only in the full tests, because they take long and others are like them."""
+FAULTS = USUAL + LONG
 
 
 def documented() -> dict[str, str]:
@@ -867,24 +787,18 @@ def first_complaint(seen: Seen, folder: Path) -> str:
 
 def what_is_wrong(fault: Fault, seen: Seen) -> str:
     """Nothing where a fault came to what it must come to."""
-    wrong = []
-    if seen.code != fault.ends.code:
-        wrong.append(f"exit code {seen.code}, not {fault.ends.code}")
-    if "Traceback" in seen.output or "please report" in seen.output:
-        wrong.append(f"a traceback: {seen.output[-1500:]}")
-    if "\x1b[31mred" in seen.output or "\a" in seen.output:
-        wrong.append("an escape sequence reached the terminal")
-    is_said = any(re.search(fault.ends.says, line) for line in seen.complaints)
-    if is_said != bool(fault.ends.says):
-        wrong.append(f"complaints {seen.complaints}")
-    # What was stopped may have been written before.
-    if fault.ends.all_but is not None and len(seen.finished) < len(ALL) - fault.ends.all_but:
-        wrong.append(f"{len(seen.finished)} captures finished")
-    if "left behind" in seen.output:
-        wrong.append("processes are left")
-    if missing := set(fault.ends.finished) - set(seen.finished):
-        wrong.append(f"not finished: {sorted(missing)}")
-    return "; ".join(wrong)
+    is_said = any(re.search(fault.says, line) for line in seen.complaints)
+    missing = sorted(set(fault.finished) - set(seen.finished))
+    wrong = {
+        f"exit code {seen.code}, not {fault.code}": seen.code != fault.code,
+        f"a traceback: {seen.output[-1500:]}": "Traceback" in seen.output or "please report" in seen.output,
+        "an escape sequence reached the terminal": "\x1b[31mred" in seen.output or "\a" in seen.output,
+        f"complaints {seen.complaints}": is_said != bool(fault.says),
+        "processes are left": "left behind" in seen.output,
+        f"not finished: {missing}": missing,
+        f"{len(seen.finished)} captures finished": len(seen.finished) < fault.at_least,
+    }
+    return "; ".join(what for what, is_so in wrong.items() if is_so)
 
 
 if __name__ == "__main__":

@@ -3,21 +3,12 @@
 import logging
 import os
 import pickle
-import signal
 import time
 from multiprocessing.connection import Connection
 from pathlib import Path
 
 
-def nothing() -> None:
-    pass
-
-
-def refuse() -> None:
-    raise ValueError("no room")
-
-
-def refuse_after_first(folder: Path) -> None:
+def start_first_only(folder: Path) -> None:
     """The first worker starts, the others do not."""
     try:
         (folder / "first").mkdir()
@@ -25,39 +16,13 @@ def refuse_after_first(folder: Path) -> None:
         raise ValueError("no room") from None
 
 
-def stop_forever() -> None:
-    os.kill(os.getpid(), signal.SIGSTOP)
-
-
 def log_level(logger: str) -> str:
     return logging.getLevelName(logging.getLogger(logger).level)
-
-
-def process_id(_: int) -> int:
-    return os.getpid()
 
 
 def sleep(seconds: float) -> float:
     time.sleep(seconds)
     return seconds
-
-
-def unpicklable(_: int) -> object:
-    return lambda: None
-
-
-def raise_unpicklable(_: int) -> None:
-    raise TwoArgumentsError("a", "b")
-
-
-def raise_key_error(_: int) -> None:
-    raise KeyError("what")
-
-
-def leave(code: int) -> int:
-    if code:
-        os._exit(code)
-    return code
 
 
 def signal_self(mark: Path, number: int, times: int) -> None:
@@ -69,14 +34,12 @@ def signal_self(mark: Path, number: int, times: int) -> None:
         os.kill(os.getpid(), number)
 
 
-def signalled(task: tuple[Path, int, int] | int) -> str:
-    """A task that sends itself a signal, or a plain one."""
-    if not isinstance(task, int):
-        signal_self(*task)
-    return "done"
+def signalled(task: tuple[Path, int, int]) -> None:
+    """A task that sends itself a signal."""
+    signal_self(*task)
 
 
-def sent_in_part(task: tuple[Path, int, int]) -> str:
+def sent_in_part(task: tuple[Path, int, int]) -> None:
     """A task that sends its process a signal when part of the result is on its way."""
     send = Connection._send
 
@@ -86,12 +49,6 @@ def sent_in_part(task: tuple[Path, int, int]) -> str:
         send(pipe, data[5:])
 
     Connection._send = send_in_part
-    return "done"
-
-
-class TwoArgumentsError(Exception):
-    def __init__(self, one: str, _two: str) -> None:
-        super().__init__(one)
 
 
 class WhenUnpickled:
@@ -105,8 +62,13 @@ class WhenUnpickled:
         signal_self(*self.what)
 
 
-def received(_: object) -> str:
-    return "done"
+def received(_: object) -> None:
+    pass
+
+
+class TwoArgumentsError(Exception):
+    def __init__(self, one: str, _two: str) -> None:
+        super().__init__(one)
 
 
 class NotUnpicklable:
@@ -114,8 +76,16 @@ class NotUnpicklable:
         return pickle.loads, (b"nonsense",)
 
 
-def result_that_cannot_be_read(_: int) -> NotUnpicklable:
-    return NotUnpicklable()
+def unusual_outcome(kind: str) -> object:
+    """An error, or a result that cannot be sent."""
+    match kind:
+        case "error that cannot be unpickled":
+            raise TwoArgumentsError("a", "b")
+        case "result that cannot be unpickled":
+            return NotUnpicklable()
+        case "result that cannot be pickled":
+            return lambda: None
+    raise KeyError(kind)
 
 
 def without_memory(_: int) -> None:

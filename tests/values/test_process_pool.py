@@ -50,7 +50,7 @@ def worker_processes() -> list[psutil.Process]:
     return result
 
 
-def pool(processes: int = 1, initializer: Callable[[], object] = tasks.nothing) -> ProcessPool:
+def pool(processes: int = 1, initializer: Callable[[], object] = int) -> ProcessPool:
     return ProcessPool(processes, CONTEXT, initializer)
 
 
@@ -60,30 +60,28 @@ def submitted(
     return [workers.submit(function, argument, timeout_s=timeout_s) for argument in arguments]
 
 
-def values(workers: ProcessPool, function: Callable[[Any], Any], arguments: Iterable[Any]) -> list[Any]:
-    return [future.result() for future in submitted(workers, function, arguments)]
+def outcomes(*call: Any, timeout_s: float | None = None) -> list[Any]:
+    """The result or the error of each argument: `outcomes(workers, function, arguments)`."""
+    futures = submitted(*call, timeout_s=timeout_s)
+    errors = [f.exception() for f in futures]
+    return [f.result() if e is None else f"{type(e).__name__}: {e}" for f, e in zip(futures, errors, strict=True)]
 
 
-def value_or_error(future: Future[Any]) -> object:
-    error = future.exception()
-    return future.result() if error is None else f"{type(error).__name__}: {error}"
+def process_id(workers: ProcessPool) -> int:
+    """Id of the only process; raises the error of one that cannot start."""
+    return workers.submit(os.getpid).result()
 
 
-def test_each_argument_has_its_result() -> None:
+def test_large_arguments_and_results_pass_whole_and_in_order() -> None:
     with pool(2) as workers:
-        assert values(workers, len, [bytes(n) for n in range(100)]) == list(range(100))
-
-
-def test_large_arguments_and_results_pass_whole() -> None:
-    with pool() as workers:
-        assert values(workers, len, [bytes(LARGE)]) == [LARGE]
-        assert [len(value) for value in values(workers, bytes, [0, 1, LARGE])] == [0, 1, LARGE]
+        assert outcomes(workers, bytes, [0, 1, LARGE, 2]) == [b"", bytes(1), bytes(LARGE), bytes(2)]
+        assert outcomes(workers, len, [bytes(LARGE), b"a"]) == [LARGE, 1]
 
 
 def test_workers_are_replaced_after_their_tasks(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(process_pool, "_MAX_TASKS_PER_WORKER", 2)
     with pool() as workers:
-        seen = values(workers, tasks.process_id, range(6))
+        seen = [process_id(workers) for _ in range(6)]
     assert [seen.count(p) for p in dict.fromkeys(seen)] == [2, 2, 2]
 
 
@@ -94,28 +92,19 @@ def test_what_is_cancelled_is_not_called() -> None:
         assert [first.result(), third.result()] == [0.3, 0.0]
 
 
-@pytest.mark.parametrize(
-    ("function", "said"),
-    [
-        (tasks.raise_key_error, "KeyError: 'what'"),
-        (tasks.raise_unpicklable, "RuntimeError: TwoArgumentsError: a"),
-        (tasks.unpicklable, "lambda"),
-        (tasks.result_that_cannot_be_read, "UnpicklingError"),
-    ],
-)
-def test_a_failed_task_ends_no_worker(function: Callable[[int], object], said: str) -> None:
+def test_a_failed_task_ends_no_worker() -> None:
+    """Nor does an argument, a result or an error that cannot be pickled or unpickled."""
+    expected = {
+        "any": "KeyError: 'any'",
+        "error that cannot be unpickled": "RuntimeError: TwoArgumentsError: a",
+        "result that cannot be pickled": "lambda",
+        "result that cannot be unpickled": "UnpicklingError",
+    }
     with pool() as workers:
-        before = values(workers, tasks.process_id, [0])
-        outcomes = [value_or_error(f) for f in submitted(workers, function, [1, 2])]
-        assert values(workers, tasks.process_id, [0]) == before
-    assert all(said in str(o) for o in outcomes)
-
-
-def test_an_argument_that_cannot_be_pickled_costs_itself() -> None:
-    with pool() as workers:
-        outcomes = [value_or_error(f) for f in submitted(workers, tasks.received, [1, lambda: None, 2])]
-    assert outcomes[0] == outcomes[2] == "done"
-    assert "lambda" in str(outcomes[1])
+        before = process_id(workers)
+        errors = outcomes(workers, tasks.unusual_outcome, [*expected, lambda: None])
+        assert process_id(workers) == before
+    assert all(said in error for said, error in zip([*expected.values(), "lambda"], errors, strict=True))
 
 
 # ---- killed and stopped at each point of a task
@@ -136,21 +125,20 @@ def test_a_task_is_tried_again_after_one_kill_and_fails_after_two(
 ) -> None:
     function, argument = ended_while(point, signal.SIGKILL, kills, tmp_path)
     with pool(processes) as workers:
-        outcomes = [value_or_error(f) for f in submitted(workers, function, [argument])]
-        assert outcomes == ["WorkerDiedError: signal 9" if kills == 2 else "done"]
-        assert values(workers, function, [argument]) == ["done"]
+        assert outcomes(workers, function, [argument]) == ["WorkerDiedError: signal 9" if kills == 2 else None]
+        assert outcomes(workers, function, [argument]) == [None]
 
 
 @pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGSTOP])
 def test_a_worker_that_takes_no_more_of_an_argument(number: int) -> None:
     """The thread waits within `send_bytes`, as the buffer of the pipe is full."""
     with pool() as workers:
-        (process,) = values(workers, tasks.process_id, [0])
+        process = process_id(workers)
         os.kill(process, signal.SIGSTOP)
-        (future,) = submitted(workers, len, [bytes(LARGE)], timeout_s=60 if number == signal.SIGKILL else 1)
-        time.sleep(0.3)
-        os.kill(process, number)
-        assert value_or_error(future) == (LARGE if number == signal.SIGKILL else "TimeoutError: ")
+        threading.Timer(0.3, os.kill, (process, number)).start()
+        is_killed = number == signal.SIGKILL
+        outcome = outcomes(workers, len, [bytes(LARGE)], timeout_s=60 if is_killed else 1)
+        assert outcome == [LARGE if is_killed else "TimeoutError: "]
 
 
 @pytest.mark.slow
@@ -160,14 +148,13 @@ def test_a_stopped_worker_is_late(point: str, tmp_path: Path) -> None:
     function, argument = ended_while(point, signal.SIGSTOP, 1, tmp_path)
     with pool(2) as workers:
         (late,) = submitted(workers, function, [argument], timeout_s=5)
-        assert values(workers, tasks.sleep, [0.0] * 5) == [0.0] * 5
-        assert value_or_error(late) == "TimeoutError: "
+        assert outcomes(workers, tasks.sleep, [0.0] * 5) == [0.0] * 5
+        assert isinstance(late.exception(), TimeoutError)
 
 
 def test_a_task_fails_at_once_if_its_worker_exits() -> None:
     with pool() as workers:
-        outcomes = [value_or_error(f) for f in submitted(workers, tasks.leave, [0, 3, 0])]
-    assert outcomes == [0, "WorkerDiedError: exit code 3", 0]
+        assert outcomes(workers, os._exit, [3]) == ["WorkerDiedError: exit code 3"]
 
 
 @pytest.mark.parametrize("by_time_limit", [False, True])
@@ -175,13 +162,13 @@ def test_a_worker_killed_while_idle_costs_no_try(by_time_limit: bool, tmp_path: 
     """A time limit may end at the moment of the result."""
     function, argument = ended_while("computing", signal.SIGKILL, 1, tmp_path)
     with pool() as workers:
-        process = psutil.Process(*values(workers, tasks.process_id, [0]))
+        process = psutil.Process(process_id(workers))
         if by_time_limit:
             workers._workers[0]._kill_late()
         else:
             process.kill()
             process.wait(60)
-        assert values(workers, function, [argument]) == ["done"]
+        assert outcomes(workers, function, [argument]) == [None]
 
 
 @pytest.mark.parametrize("step_s", [86_400, -86_400])
@@ -190,22 +177,22 @@ def test_time_limits_do_not_run_on_the_clock_of_the_day(step_s: int, monkeypatch
     clock_s = count(2 * 10**9, step_s)
     monkeypatch.setattr(time, "time", lambda: next(clock_s))
     with pool() as workers:
-        assert [f.result() for f in submitted(workers, tasks.sleep, [0.3, 0.3], timeout_s=30)] == [0.3, 0.3]
+        assert outcomes(workers, tasks.sleep, [0.3, 0.3], timeout_s=30) == [0.3, 0.3]
 
 
 # ---- workers that cannot start
 
 
 def test_workers_that_cannot_start_fail_all_tasks_in_one_line() -> None:
-    with pool(3, tasks.refuse) as workers:
-        futures = submitted(workers, tasks.received, [1, 2])
-        assert all("no worker process can be started (ValueError: no room); " in str(f.exception()) for f in futures)
-        assert workers.loss == str(futures[0].exception())
+    with pool(3, partial(int, "x")) as workers:
+        errors = outcomes(workers, tasks.received, [1, 2])
+        assert errors == [f"WorkerError: {workers.loss}"] * 2
+        assert workers.loss.startswith("no worker process can be started (ValueError: invalid literal")
 
 
 def test_a_worker_that_cannot_start_is_one_less(tmp_path: Path) -> None:
-    with pool(3, partial(tasks.refuse_after_first, tmp_path)) as workers:
-        assert len(set(values(workers, tasks.process_id, range(20)))) == 1
+    with pool(3, partial(tasks.start_first_only, tmp_path)) as workers:
+        assert len({process_id(workers) for _ in range(20)}) == 1
 
 
 @pytest.mark.parametrize("what", ["pipe", "thread", "process"])
@@ -216,21 +203,21 @@ def test_a_system_that_is_short_of_something(what: str, monkeypatch: pytest.Monk
     owners = {"pipe": type(CONTEXT), "thread": threading.Thread, "process": CONTEXT.Process}
     monkeypatch.setattr(owners[what], "Pipe" if what == "pipe" else "start", short)
     with pytest.raises(WorkerError, match=r"no worker process can be started \(\w+Error: "), pool(2) as workers:
-        values(workers, tasks.received, [1])
+        process_id(workers)
 
 
 def test_a_time_limit_without_a_thread_is_a_lack_of_memory(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(threading.Timer, "start", raising(RuntimeError("can't start new thread")))
     with pool() as workers:
-        (future,) = submitted(workers, len, [b"abc"], timeout_s=60)
-        assert isinstance(future.exception(), MemoryError)
-        assert values(workers, len, [b"abc"]) == [3]
+        assert outcomes(workers, len, [b"abc"], timeout_s=60) == ["MemoryError: "]
+        assert outcomes(workers, len, [b"abc"]) == [3]
 
 
 def test_a_worker_that_is_stopped_while_it_starts(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(process_pool, "_START_TIMEOUT_S", 1.0)
-    with pytest.raises(WorkerError, match="not ready after 1 s"), pool(1, tasks.stop_forever) as workers:
-        values(workers, tasks.received, [1])
+    stop = partial(signal.raise_signal, signal.SIGSTOP)
+    with pytest.raises(WorkerError, match="not ready after 1 s"), pool(1, stop) as workers:
+        process_id(workers)
 
 
 # ---- storms
@@ -251,13 +238,13 @@ def test_a_start_is_tried_again_if_the_fork_server_fails(
 
     monkeypatch.setattr(CONTEXT.Process, "start", refused_first)
     with pool() as workers:
-        assert values(workers, len, [b"abc"]) == [3]
+        assert outcomes(workers, len, [b"abc"]) == [3]
     assert len(starts) == 2
 
 
 def test_workers_killed_together_do_not_end_the_run() -> None:
     with pool(6) as workers:
-        values(workers, tasks.sleep, [0.1] * 6)
+        outcomes(workers, tasks.sleep, [0.1] * 6)
         futures = submitted(workers, tasks.sleep, [0.3] * 12)
         for worker in worker_processes():
             worker.kill()
@@ -267,33 +254,32 @@ def test_workers_killed_together_do_not_end_the_run() -> None:
 def test_workers_that_end_one_after_another_fail_all_tasks(tmp_path: Path) -> None:
     function, argument = ended_while("computing", signal.SIGKILL, 99, tmp_path)
     with pool() as workers:
-        outcomes = [value_or_error(f) for f in submitted(workers, function, [argument] * 4)]
+        errors = outcomes(workers, function, [argument] * 4)
     said = "3 worker processes one after another ended before they finished anything (the last by signal 9"
-    assert all(said in str(o) for o in outcomes)
+    assert all(said in error for error in errors)
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="other systems have no fork server here")
 def test_tasks_are_done_if_the_fork_server_is_killed() -> None:
     with pool(2) as workers:
-        values(workers, tasks.process_id, [0])
+        server = psutil.Process(process_id(workers)).parent()
         futures = submitted(workers, tasks.sleep, [0.3] * 6)
-        psutil.Process(worker_processes()[0].ppid()).kill()
+        server.kill()
         assert [f.result() for f in futures] == [0.3] * 6
 
 
 def test_a_worker_is_killed_if_its_fork_server_was() -> None:
     """`multiprocessing` regards it as ended."""
     with pool() as workers:
-        process = psutil.Process(*values(workers, tasks.process_id, [0]))
-        psutil.Process(process.ppid()).kill()
-        (late,) = submitted(workers, tasks.sleep, [3600.0], timeout_s=0.5)
-        assert value_or_error(late) == "TimeoutError: "
+        process = psutil.Process(process_id(workers))
+        process.parent().kill()
+        assert outcomes(workers, tasks.sleep, [3600.0], timeout_s=0.5) == ["TimeoutError: "]
         process.wait(60)
 
 
 def test_libraries_log_nothing_in_workers() -> None:
     with pool() as workers:
-        assert values(workers, tasks.log_level, ["rasterio", "tifffile"]) == ["CRITICAL", "CRITICAL"]
+        assert outcomes(workers, tasks.log_level, ["rasterio", "tifffile"]) == ["CRITICAL", "CRITICAL"]
 
 
 # ---- ends
@@ -305,16 +291,14 @@ import sys
 from multiprocessing import get_context
 from agalign.values.process_pool import ProcessPool
 from tests.values.pool_tasks import sleep
-if __name__ == "__main__":
-    # A shell starts jobs in the background with this signal ignored.
-    signal.signal(signal.SIGINT, signal.default_int_handler)
-    with ProcessPool(4, get_context(sys.argv[1])) as workers:
-        futures = [workers.submit(sleep, seconds) for seconds in [0.1] * 4 + [3600.0] * 8]
-        for future in futures[:4]:
-            future.result()
-        print("begun", flush=True)
-        for future in futures[4:]:
-            future.result()
+# A shell starts jobs in the background with this signal ignored.
+signal.signal(signal.SIGINT, signal.default_int_handler)
+with ProcessPool(4, get_context(sys.argv[1])) as workers:
+    futures = [workers.submit(sleep, seconds) for seconds in [0.1] * 4 + [3600.0] * 8]
+    for number, future in enumerate(futures):
+        future.result()
+        if number == 3:
+            print("begun", flush=True)
 """
 
 
@@ -322,14 +306,10 @@ if __name__ == "__main__":
 @pytest.mark.parametrize("target", ["parent", in_full_run("group")])
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGKILL, in_full_run(signal.SIGINT)])
 @pytest.mark.parametrize("method", ["forkserver", in_full_run("spawn")])
-def test_no_process_outlives_its_parent(method: str, number: int, target: str, tmp_path: Path) -> None:
-    script = tmp_path / "script.py"
-    script.write_text(SCRIPT)
-    command = [sys.executable, str(script), method]
+def test_no_process_outlives_its_parent(method: str, number: int, target: str) -> None:
     root = Path(__file__).resolve().parents[2]
-    environment = {**os.environ, "PYTHONPATH": str(root)}
-    given = {"stdout": subprocess.PIPE, "stderr": subprocess.DEVNULL, "start_new_session": True, "env": environment}
-    with subprocess.Popen(command, **given) as process:
+    given = {"stdout": subprocess.PIPE, "stderr": subprocess.DEVNULL, "start_new_session": True, "cwd": root}
+    with subprocess.Popen([sys.executable, "-c", SCRIPT, method], **given) as process:
         try:
             assert process.stdout.readline() == b"begun\n"
             children = psutil.Process(process.pid).children(recursive=True)

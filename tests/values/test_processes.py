@@ -40,19 +40,16 @@ def test_quota_of_a_container(tmp_path: Path, groups: str, files: dict[str, str]
 
 @pytest.mark.parametrize(("quota", "expected"), [(None, 8), (2.5, 3), (0.2, 1), (64.0, 8)])
 def test_a_part_of_a_core_counts_as_one(monkeypatch: pytest.MonkeyPatch, quota: float | None, expected: int) -> None:
+    """It is also the number of threads of libraries where there is a quota; what the user has set stays."""
     monkeypatch.setattr(processes.sys, "platform", "linux")
     monkeypatch.setattr(processes.os, "sched_getaffinity", lambda _: set(range(8)), raising=False)
     monkeypatch.setattr(processes, "cgroup_quota", lambda: quota)
     assert usable_cores() == expected
-
-
-def test_threads_follow_a_quota_and_what_the_user_has_set_stays(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(processes.sys, "platform", "linux")
-    monkeypatch.setattr(processes, "cgroup_quota", lambda: 1.0)
     variables = {"OMP_NUM_THREADS": "7"}
     monkeypatch.setattr(processes.os, "environ", variables)
     limit_default_threads()
-    assert variables == {"OMP_NUM_THREADS": "7", "OPENBLAS_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
+    others = {} if quota is None else dict.fromkeys(("OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), str(expected))
+    assert variables == {"OMP_NUM_THREADS": "7", **others}
 
 
 # ---- address space
