@@ -14,7 +14,6 @@ from pathlib import Path
 import numpy as np
 
 from agalign.cameras.metadata import Tags
-from agalign.cameras.pix4d import TagTransfer
 from agalign.cameras.xmp import Name
 from agalign.errors import GeometryError, NoSuchBandError
 from agalign.values import geometry
@@ -36,8 +35,6 @@ class Camera(ABC):
     """True if its Exif times are in UTC."""
     utc_times: tuple[Name, ...] = ()
     """The XMP values of the time in UTC, tried in turn."""
-    tag_transfer: TagTransfer = TagTransfer()
-    """Conversion of its tags for a band that is written on the reference's grid."""
 
     @abstractmethod
     def recognises(self, tags: Tags) -> bool:
