@@ -31,6 +31,8 @@ class Camera(ABC):
     """The XMP values that identify a capture, tried in turn."""
     flight_ids: tuple[Name, ...] = ()
     """The XMP values that identify a flight, tried in turn."""
+    band_in_name: re.Pattern[str]
+    """The end of a file's name, without suffix, that differs between the bands of a capture."""
     clock_is_utc = False
     """True if its Exif times are in UTC."""
     utc_times: tuple[Name, ...] = ()
@@ -44,9 +46,9 @@ class Camera(ABC):
     def bands(self, path: Path, tags: Tags, stored: Sequence[Band]) -> tuple[Band, ...]:
         """Return the bands in one of its files, with lens and `to_rig`; `stored` is from `pixels.raster.probe`."""
 
-    @abstractmethod
     def capture_name(self, path: Path) -> str:
         """Return the part of a file name that all bands of a capture share."""
+        return self.band_in_name.sub("", path.stem)
 
     def capture_key(self, path: Path, tags: Tags) -> str:
         """Return a text that is the same for all files of a capture, and unique for a camera and folder."""
@@ -67,8 +69,7 @@ class Camera(ABC):
 
     def elevation_deg(self, tags: Tags) -> float | None:
         """Return the angle of the optical axis above the horizon, -90 straight down; None if the tags lack it."""
-        pose = self.pose(tags)
-        if pose is None:
+        if (pose := self.pose(tags)) is None:
             return None
         return -math.degrees(math.asin(math.cos(math.radians(pose.pitch_deg)) * math.cos(math.radians(pose.roll_deg))))
 

@@ -13,6 +13,7 @@ colour photograph. The bands are exposed one after another, so in motion a seed 
 import math
 import re
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
@@ -27,7 +28,7 @@ from agalign.values.capture import Band, Pose, Radiometry
 from agalign.values.geometry import Matrix
 from agalign.values.lens import Lens
 
-_MAVIC_3_NAME = re.compile(r"^(?P<capture>.*?)_(?:MS_(?P<band>G|RE?|NIR)|D)$", re.IGNORECASE)
+_MAVIC_3_BAND = r"_(?:MS_(?P<band>G|RE?|NIR)|D)$"
 NAMESPACE = "dji.com/drone-dji"
 
 
@@ -36,13 +37,14 @@ class Dji(Camera):
 
     name = "DJI"
     capture_ids = ((NAMESPACE, "CaptureUUID"),)
+    band_in_name = re.compile(rf"{_MAVIC_3_BAND}|(?<=\d)\d$", re.IGNORECASE)
     utc_times = ((NAMESPACE, "UTCAtExposure"),)
 
     def recognises(self, tags: Tags) -> bool:
         return tags.make.upper() == "DJI" or (NAMESPACE, "CaptureUUID") in tags.xmp
 
     def bands(self, path: Path, tags: Tags, stored: Sequence[Band]) -> tuple[Band, ...]:
-        is_mavic = _is_mavic_3(tags) or bool(_MAVIC_3_NAME.match(path.stem))
+        is_mavic = _is_mavic_3(tags) or bool(re.search(_MAVIC_3_BAND, path.stem, re.IGNORECASE))
         centre = pair(tags, "RelativeOpticalCenter")
         by_centres = None if centre is None else geometry.translation(-centre[0], -centre[1])
         calibrated = _matrix(tags, "CalibratedHMatrix")
@@ -64,38 +66,40 @@ class Dji(Camera):
         return [replace(b, to_rig=to_rig) if b.companion and b.to_rig is None else b for b in bands]
 
     def pose(self, tags: Tags) -> Pose | None:
-        yaw_deg, pitch_deg = tags.number(NAMESPACE, "GimbalYawDegree"), tags.number(NAMESPACE, "GimbalPitchDegree")
-        if yaw_deg is None or pitch_deg is None:
+        heading_deg, pitch_deg = _heading_deg(tags), tags.number(NAMESPACE, "GimbalPitchDegree")
+        if heading_deg is None or pitch_deg is None:
             return None
-        height_m = tags.number(NAMESPACE, "RelativeAltitude")
-        height_m = height_m if height_m and height_m > 0 else None
         focal_length_px = tags.number(NAMESPACE, "CalibratedFocalLength")
-        return Pose(_heading_deg(tags, yaw_deg), pitch_deg + 90, 0.0, height_m, focal_length_px)
+        return Pose(heading_deg, pitch_deg + 90, 0.0, _height_m(tags), focal_length_px)
 
     def motion(self, tags: Tags) -> tuple[float, float] | None:
         """Calculate the motion from the speed over ground (north, east, m/s), the heading of the image's upper edge and
         the height above the take-off point.
         """
-        names = "FlightXSpeed", "FlightYSpeed", "GimbalYawDegree", "RelativeAltitude"
-        north, east, yaw_deg, height_m = (tags.number(NAMESPACE, name) for name in names)
-        if north is None or east is None or yaw_deg is None or height_m is None or height_m <= 0:
+        north, east = (tags.number(NAMESPACE, f"Flight{axis}Speed") for axis in "XY")
+        heading_deg, height_m = _heading_deg(tags), _height_m(tags)
+        if north is None or east is None or heading_deg is None or height_m is None:
             return None
-        yaw = math.radians(_heading_deg(tags, yaw_deg))
+        yaw = math.radians(heading_deg)
         forward = north * math.cos(yaw) + east * math.sin(yaw)
         right = east * math.cos(yaw) - north * math.sin(yaw)
         return -right / height_m, forward / height_m
 
-    def capture_name(self, path: Path) -> str:
-        mavic = _MAVIC_3_NAME.match(path.stem)
-        return mavic["capture"] if mavic else re.sub(r"(?<=\d)\d$", "", path.stem)
 
-
-def _heading_deg(tags: Tags, yaw_deg: float) -> float:
+def _heading_deg(tags: Tags) -> float | None:
     """The heading of the image's upper edge. Some gimbals that look down report a roll of 180 degrees and the opposite
     yaw.
     """
+    yaw_deg, roll_deg = tags.number(NAMESPACE, "GimbalYawDegree"), tags.number(NAMESPACE, "GimbalRollDegree")
     max_upright_roll_deg = 90.0  # larger gimbal rolls mean upside down: gimbals write a roll near 0 or near 180 degrees
-    return yaw_deg + (180 if abs(tags.number(NAMESPACE, "GimbalRollDegree") or 0.0) > max_upright_roll_deg else 0)
+    is_upside_down = abs(roll_deg or 0.0) > max_upright_roll_deg
+    return None if yaw_deg is None else yaw_deg + (180 if is_upside_down else 0)
+
+
+def _height_m(tags: Tags) -> float | None:
+    """The height above the take-off point; None if it is not positive."""
+    height_m = tags.number(NAMESPACE, "RelativeAltitude")
+    return height_m if height_m and height_m > 0 else None
 
 
 def _radiometry(tags: Tags) -> Radiometry | None:
@@ -128,10 +132,11 @@ def _is_mavic_3(tags: Tags) -> bool:
 
 
 def _band_in_name(path: Path) -> str:
-    mavic = _MAVIC_3_NAME.match(path.stem)
-    if mavic and mavic["band"]:
-        return {"G": "Green", "R": "Red", "RE": "RedEdge", "NIR": "NIR"}[mavic["band"].upper()]
-    return {"1": "Blue", "2": "Green", "3": "Red", "4": "RedEdge", "5": "NIR"}.get(path.stem[-1], path.stem)
+    mavic = re.search(_MAVIC_3_BAND, path.stem, re.IGNORECASE)
+    part = mavic["band"] or "" if mavic else path.stem[-1]
+    names = {"1": "Blue", "2": "Green", "3": "Red", "4": "RedEdge", "5": "NIR"}
+    names |= {"G": "Green", "R": "Red", "RE": "RedEdge", "NIR": "NIR"}
+    return names.get(part.upper(), path.stem)
 
 
 def pair(tags: Tags, name: str) -> tuple[float, float] | None:
@@ -142,15 +147,11 @@ def pair(tags: Tags, name: str) -> tuple[float, float] | None:
 
 def _matrix(tags: Tags, name: str) -> Matrix | None:
     """A tag as a matrix (3, 3); None if it is missing or singular."""
-    values = tags.numbers(NAMESPACE, name)
-    if len(values) != 9:
-        return None
-    matrix = np.array(values).reshape(3, 3)
-    try:
+    with suppress(GeometryError, ValueError):
+        matrix = np.reshape(tags.numbers(NAMESPACE, name), (3, 3))
         geometry.invert(matrix)
-    except GeometryError:
-        return None
-    return matrix
+        return matrix
+    return None
 
 
 def _lens(tags: Tags) -> Lens | None:
@@ -170,8 +171,7 @@ def dewarp_data(tags: Tags) -> tuple[str, list[float]]:
     if the tag has another form.
     """
     date, _, text = tags.text(NAMESPACE, "DewarpData").rpartition(";")
-    try:
+    with suppress(ValueError):
         terms = [float(part) for part in text.split(",")]
-    except ValueError:
-        terms = []
-    return date, terms if len(terms) == 9 else []
+        return date, terms if len(terms) == 9 else []
+    return date, []

@@ -48,6 +48,7 @@ class MicaSense(Camera):
     name = "MicaSense"
     capture_ids = ((NAMESPACE, "CaptureId"),)
     flight_ids = ((NAMESPACE, "FlightId"),)
+    band_in_name = re.compile(r"_\d+$")
     clock_is_utc = True
 
     def recognises(self, tags: Tags) -> bool:
@@ -77,9 +78,6 @@ class MicaSense(Camera):
         """Return the pose in the camera's tags, else the attitude of the light sensor on the same aircraft."""
         by_sensor = Pose(*_sensor_attitude_deg(tags), focal_length_px=pix4d.focal_length_px(tags))
         return pix4d.pose_of(tags) or (None if tags.number(_DLS, "Yaw") is None else by_sensor)
-
-    def capture_name(self, path: Path) -> str:
-        return re.sub(r"_\d+$", "", path.stem)
 
 
 def _radiometry(tags: Tags) -> Radiometry | None:

@@ -23,8 +23,6 @@ from agalign.values.geometry import Matrix
 from agalign.values.lens import Lens, radial_coefficients
 from agalign.values.pixel_units import Size
 
-_SUFFIX = re.compile(r"_(GRE|RED|REG|NIR|RGB)$", re.IGNORECASE)
-
 
 class Sequoia(Camera):
     """Parrot Sequoia and Sequoia+."""
@@ -32,6 +30,7 @@ class Sequoia(Camera):
     name = "Parrot Sequoia"
     capture_ids = ((pix4d.NAMESPACE, "CaptureUUID"),)
     flight_ids = ((pix4d.NAMESPACE, "FlightUUID"),)
+    band_in_name = re.compile(r"_(GRE|RED|REG|NIR|RGB)$", re.IGNORECASE)
 
     def recognises(self, tags: Tags) -> bool:
         return tags.make.lower() == "parrot" or tags.text(pix4d.NAMESPACE, "RigName").lower().startswith("sequoia")
@@ -45,7 +44,7 @@ class Sequoia(Camera):
         to_rig = rays_to_rig(lens, rotation(*pix4d.rig_degrees(tags)) @ to_camera)
         if len(stored) > 1:
             return colour_bands(stored, lens, to_rig)
-        suffix = _SUFFIX.search(path.stem)
+        suffix = self.band_in_name.search(path.stem)
         names = {"GRE": "Green", "RED": "Red", "REG": "Red edge", "NIR": "NIR"}
         named_by_tag = tags.text(pix4d.NAMESPACE, "BandName") or path.stem
         name = names.get(suffix[1].upper(), suffix[1]) if suffix else named_by_tag
@@ -53,9 +52,6 @@ class Sequoia(Camera):
         # Parrot's formula for them has not been compared with a reference.
         why = "no tags for radiance (SensorModel and IrradianceList are not used)"
         return (replace(band, uncalibrated=why if tags.text(pix4d.NAMESPACE, "SensorModel") else ""),)
-
-    def capture_name(self, path: Path) -> str:
-        return _SUFFIX.sub("", path.stem)
 
 
 def _fisheye_lens(tags: Tags, size_px: Size) -> Lens | None:

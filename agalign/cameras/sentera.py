@@ -29,6 +29,7 @@ class Sentera(Camera):
     name = "Sentera"
     capture_ids = ((pix4d.NAMESPACE, "CaptureUUID"), (_SENTERA, "CaptureUUID"), (_SENTERA, "ImageUniqueID"))
     flight_ids = ((pix4d.NAMESPACE, "FlightUUID"), (_SENTERA, "FlightUUID"), (_SENTERA, "FlightUniqueID"))
+    band_in_name = re.compile(r"_\d{3}_\d{2,3}$")
 
     def recognises(self, tags: Tags) -> bool:
         return "sentera" in tags.make.lower() or any(namespace == _SENTERA for namespace, _ in tags.xmp)
@@ -56,9 +57,6 @@ class Sentera(Camera):
             r"^(?:\d+-)?(?:n?RGB|NDRE|NDVI|NIR|RE|LWIR)$", folder.name, re.IGNORECASE
         )
         return folder.parent if named else folder
-
-    def capture_name(self, path: Path) -> str:
-        return re.sub(r"_\d{3}_\d{2,3}$", "", path.stem)
 
 
 def _channel_bands(path: Path, tags: Tags, stored: Sequence[Band]) -> tuple[Band, ...]:

@@ -1,9 +1,6 @@
 """Damaged XMP packets, lists of bands in tags, and missing tags of the radiance."""
 
-import json
 import re
-import shutil
-import subprocess
 from collections.abc import Callable
 from pathlib import Path
 
@@ -11,7 +8,6 @@ import pytest
 
 from agalign.batch.capture_task import missing_radiometry
 from agalign.cameras.discover import FolderScan, discover
-from agalign.cameras.metadata import read_tags
 from agalign.cameras.pix4d import NAMESPACE
 from agalign.cameras.tiff_directory import byte_string, rational, short, text
 from agalign.cameras.xmp import Packet
@@ -123,16 +119,6 @@ def test_damaged_packets_give_the_tags_of_intact_ones(tmp_path: Path, name: str)
     (capture,) = scan.captures
     assert offers(capture) == offers(intact(tmp_path / "b"))
     assert not [p.text for p in scan.problems if "foo" not in p.text]
-
-
-@pytest.mark.skipif(shutil.which("exiftool") is None, reason="exiftool is not installed")
-@pytest.mark.parametrize("name", DAMAGES)
-def test_exiftool_finds_the_same_band(tmp_path: Path, name: str) -> None:
-    write_capture(tmp_path, change=DAMAGES[name])
-    path = tmp_path / "IMG_0001_2.tif"
-    done = subprocess.run(["exiftool", "-json", "-XMP:BandName", path], capture_output=True, text=True, check=False)
-    theirs = json.loads(done.stdout)[0].get("BandName", "Green")
-    assert read_tags(path).text(NAMESPACE, "BandName") == theirs == "Green"
 
 
 @pytest.mark.parametrize("at", ["<Camera:BandName>Gr", "<Camera:Wave", "<Camera:Pers", "<MicaSense:Fl", "</x:xmpmeta"])

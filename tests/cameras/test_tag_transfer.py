@@ -9,7 +9,6 @@ import rasterio
 import tifffile
 from PIL import Image
 
-import agalign
 from agalign.cameras.base import Camera
 from agalign.cameras.metadata import Tags, read_tags
 from agalign.cameras.micasense import MicaSense
@@ -27,25 +26,14 @@ from agalign.cameras.tiff_directory import (
     short,
     text,
 )
-from agalign.config import Settings, WriteSettings
 from agalign.pixels.raster import probe
-from agalign.values import geometry, lens
 from agalign.values.capture import Band
 from agalign.values.image import OutputGrid
 from agalign.values.pixel_units import PixelScale
 
-from ..conftest import read_json
 from .test_vendors import DJI, MICASENSE, SIZE, VENDORS, packet, write_capture, write_file
 
 pytestmark = pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
-
-
-@pytest.fixture(scope="module")
-def both(flight: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Stacks and single bands of the synthetic flight's first capture."""
-    out = tmp_path_factory.mktemp("both")
-    agalign.align_folder(flight, out, settings=Settings(write=WriteSettings(layout="both")))
-    return out / "0000SET" / "000"
 
 
 def band_of(path: Path, camera: Camera | None = None) -> Band:
@@ -54,22 +42,8 @@ def band_of(path: Path, camera: Camera | None = None) -> Band:
     return band
 
 
-@pytest.mark.slow
-def test_the_vignetting_centre_moves_with_the_band(flight: Path, both: Path) -> None:
-    truth = read_json(flight / "truth.json")["IMG_0001"]["bands"]["IMG_0001_4.tif"]
-    green, nir = (flight / "0000SET" / "000" / f"IMG_0001_{number}.tif" for number in (2, 4))
-    centre = np.array(read_tags(nir).numbers(NAMESPACE, "VignettingCenter"))
-    to_green = geometry.invert(np.array(truth["fixed_to_moving"]))
-    back = geometry.apply(to_green, lens.undistort(band_of(nir).lens, centre))
-    expected = lens.distort(band_of(green).lens, back) - read_json(both / "IMG_0001.json")["output"]["crop"][:2]
-    result = read_tags(both / "IMG_0001_4.tif").numbers(NAMESPACE, "VignettingCenter")
-    np.testing.assert_allclose(result, expected, atol=0.2)
-    assert np.linalg.norm(np.array(result) - centre) > 3
-
-
-@pytest.mark.slow
-def test_the_stack_has_the_tags_that_all_bands_share(both: Path) -> None:
-    result = read_directories(both / "IMG_0001.tif")
+def test_the_stack_has_the_tags_that_all_bands_share(aligned_flight: Path) -> None:
+    result = read_directories(aligned_flight / "0000SET" / "000" / "IMG_0001.tif")
     assert result[GPS][1].data == b"N\0"
     assert 36867 in result[EXIF]
     assert 33434 not in result[EXIF]  # each band was exposed for a time of its own

@@ -311,14 +311,6 @@ def test_dji_radiometry_is_the_guides_formula(tmp_path: Path) -> None:
     assert not band.radiometry.vignetting_divides
 
 
-def test_one_damaged_file_makes_no_band_that_others_lack(tmp_path: Path) -> None:
-    for number in range(3):
-        write_capture(tmp_path / f"{number:03d}", VENDORS["RedEdge"])
-    write_file(tmp_path / "001" / "IMG_0007_3.tif", {271: text("MicaSense"), 272: text("RedEdge-M")})
-    missing = {c.folder.name: c.missing_bands for c in discover(tmp_path).captures}
-    assert missing == {"000": (), "001": ("Red",), "002": ()}
-
-
 def test_a_stack_with_a_vendors_make_is_a_stack(tmp_path: Path) -> None:
     for make in ("MicaSense", "DJI", "Parrot", "Sentera", "MAPIR"):
         write_file(tmp_path / f"{make}.tif", {271: text(make)}, shape=(5, 120, 160))
