@@ -8,14 +8,11 @@ import numpy as np
 import pytest
 import tifffile
 
-import agalign
 from agalign.cameras import pix4d
 from agalign.cameras.discover import FolderScan, discover
 from agalign.cameras.metadata import Tags
 from agalign.cameras.tiff_directory import EXIF, GPS, add_directories, read_directories, short
 from agalign.pixels.radiometry import calibrated
-from agalign.pixels.raster import probe
-from agalign.products.sidecar.file import find_sidecars, read_result
 from agalign.values import geometry
 from agalign.values.capture import Capture
 from agalign.values.pixel_units import PixelScale
@@ -71,16 +68,6 @@ def test_the_lens_of_another_image_size_is_left_out_with_a_line(flight: Path, tm
     assert f"is not that of an image of {size} px, and so in 4 other files; lens, rig and radiometry" in problem.text
     assert all(b.lens is None and b.to_rig is None and b.radiometry is None for b in only(scan).bands)
     assert only(scan).pose == replace(discover(flight).captures[0].pose, focal_length_px=None)
-
-
-def test_images_reduced_to_a_half_are_aligned_without_reflectance(flight: Path, tmp_path: Path) -> None:
-    folder = resized(flight, tmp_path / "small", 0.5, with_size=False)
-    list(agalign.align_folder(folder, tmp_path / "out"))
-    (sidecar,) = find_sidecars(tmp_path / "out")
-    bands = read_result(sidecar).bands
-    assert {b.status for b in bands} <= {"reference", "aligned", "predicted"}
-    # Reflectance is float32.
-    assert {b.dtype for p in (tmp_path / "out").glob("IMG_*.tif") for b in probe(p)} == {"uint16"}
 
 
 @pytest.mark.parametrize(("size_px", "focal_px"), [((1280, 960), 1454.4), ((160, 120), 181.8), ((160, 80), None)])

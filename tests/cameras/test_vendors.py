@@ -385,15 +385,8 @@ def test_the_mavic_s_colour_photograph_goes_through_the_designed_frame(tmp_path:
 
 @pytest.mark.parametrize(("roll", "yaw"), [("0.00", "30"), ("+180.00", "-150")])
 def test_a_mavic_s_gimbal_is_turned_either_way(roll: str, yaw: str) -> None:
-    tags = mavic_tags(
-        GimbalRollDegree=roll,
-        GimbalYawDegree=yaw,
-        GimbalPitchDegree="-90",
-        FlightXSpeed="8.66",
-        FlightYSpeed="5",
-        RelativeAltitude="20",
-        CalibratedFocalLength="2170",
-    )
+    moving = {"FlightXSpeed": "8.66", "FlightYSpeed": "5", "RelativeAltitude": "20"}
+    tags = mavic_tags(GimbalRollDegree=roll, GimbalYawDegree=yaw, GimbalPitchDegree="-90", **moving)
     assert Dji().motion(tags) == pytest.approx((0.0, 0.5), abs=1e-3)
     pose = Dji().pose(tags)
     assert (pose.heading_deg % 360, pose.pitch_deg, pose.height_m) == (pytest.approx(30), 0, 20)

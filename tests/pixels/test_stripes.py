@@ -4,10 +4,8 @@ import logging
 from collections.abc import Sequence
 from pathlib import Path
 
-import cv2
 import numpy as np
 import pytest
-import rasterio
 
 import agalign
 from agalign.pixels.stripes import without_common_stripes
@@ -72,17 +70,6 @@ def test_bands_peak_at_their_offset_once_the_common_pattern_is_removed(
     assert all((word in caplog.text) == (axis in axes) for axis, word in enumerate(("columns", "rows")))
 
 
-@pytest.mark.parametrize("axis", [0, 1])
-def test_most_of_a_pattern_is_removed(axis: int) -> None:
-    clean = bands()
-    result = without_common_stripes(striped(clean, pattern(axis)))
-    for k, (before, after) in enumerate(zip(clean, result, strict=True)):
-        scale = 100 * (k + 1)
-        left = np.diff(cv2.GaussianBlur((after.pixels - before.pixels) / scale, (0, 0), 1.0), axis=1 - axis)
-        there = np.diff(cv2.GaussianBlur(np.ascontiguousarray(pattern(axis)), (0, 0), 1.0), axis=1 - axis)
-        assert left.std() < 0.2 * there.std()
-
-
 def test_without_a_common_pattern_the_images_are_the_same_objects() -> None:
     images = bands()
     assert is_same(without_common_stripes(images), images)
@@ -128,31 +115,18 @@ def test_images_of_another_size_or_of_several_channels_are_not_compared() -> Non
         np.testing.assert_array_equal(one.pixels, other.pixels)
 
 
-# ---- a capture with stripes
-
-
-SIZE_PX = (480, 360)
-
-
-def stripes(light: Field, _rng: np.random.Generator) -> Field:
-    """White column stripes, equal in all bands, of +-20 % of the range."""
-    low, high = np.percentile(light, (1, 99))
-    pattern = np.random.default_rng(5).uniform(-0.2, 0.2, light.shape[1]).astype(np.float32)
-    return np.asarray(light + (high - low) * pattern, np.float32)
-
-
 @pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
 def test_a_capture_with_common_stripes_is_aligned(tmp_path: Path) -> None:
-    rng = np.random.default_rng(3)
-    poses, ground = plan_flight(rng, 1, SIZE_PX)
-    truth = write_shots(tmp_path, [Shot(poses[0], ground, stripes)], SIZE_PX, REDEDGE, rng)
-    reports = agalign.align_folder(tmp_path, tmp_path / "out")
+    """White column stripes, equal in all bands, of +-20 % of the range."""
+
+    def stripes(light: Field, _rng: np.random.Generator) -> Field:
+        low, high = np.percentile(light, (1, 99))
+        return np.asarray(light + (high - low) * np.random.default_rng(5).uniform(-0.2, 0.2, light.shape[1]), "f4")
+
+    size_px, rng = (480, 360), np.random.default_rng(3)
+    poses, ground = plan_flight(rng, 1, size_px)
+    truth = write_shots(tmp_path, [Shot(poses[0], ground, stripes)], size_px, REDEDGE, rng)
+    list(agalign.align_folder(tmp_path, tmp_path / "out"))
     scores = score_against_truth(tmp_path / "out", truth)
     assert [score.status for score in scores] == ["aligned"] * 4
     assert max(score.median_px for score in scores) < 0.3
-    (sidecar,) = (report.sidecar for report in reports)
-    x0, y0, width, height = sidecar.output.crop
-    (source,), (stack,) = tmp_path.rglob(sidecar.reference.file), (tmp_path / "out").rglob(sidecar.output.file)
-    with rasterio.open(source) as read, rasterio.open(stack) as written:
-        pixels = written.read(1 + written.descriptions.index(sidecar.reference.band))
-        np.testing.assert_array_equal(pixels, read.read(1)[y0 : y0 + height, x0 : x0 + width])
