@@ -179,36 +179,22 @@ def _add_files_without_id(groups: dict[_GroupKey, list[ImageFile]]) -> None:
             by_name[key[0], key[1], name].append(key)
     cameras = {key[0]: group[0].camera for key, group in groups.items() if key[0] != Generic.name}
     for key in sorted(groups, key=lambda key: key[0] == Generic.name):
-        remaining = []
-        for file in groups[key]:
-            target = _group_for(file, key, groups, by_name, cameras.values())
-            if target is None:
-                remaining.append(file)
+        for file in list(groups[key]):
+            if key[0] != Generic.name:
+                names = [] if file.is_whole_capture else [key]
+            elif file.tags.make or file.tags.xmp or len(file.bands) != 1 or not _is_tiff(file):
+                names = []
             else:
-                groups[target].append(_with_camera(file, groups[target][0].camera))
-                groups[target].sort(key=lambda f: natural_order(f.path.name))
-        if remaining:
-            groups[key] = remaining
-        else:
+                of_cameras = [(name, key[1], camera.capture_name(file.path)) for name, camera in cameras.items()]
+                names = [name for name in of_cameras if name[2] != file.path.stem]
+            targets = [k for name in names for k in by_name.get(name, ()) if k in groups and k != key]
+            if len(targets) == 1 or (targets and key[0] != Generic.name):
+                groups[key].remove(file)
+                joined = groups[targets[0]]
+                joined.append(_with_camera(file, joined[0].camera))
+                joined.sort(key=lambda f: natural_order(f.path.name))
+        if not groups[key]:
             del groups[key]
-
-
-def _group_for(
-    file: ImageFile,
-    key: _GroupKey,
-    groups: Mapping[_GroupKey, list[ImageFile]],
-    by_name: Mapping[_GroupKey, list[_GroupKey]],
-    cameras: Iterable[Camera],
-) -> _GroupKey | None:
-    """The other group that a file without a capture id belongs to by its name, if there is one."""
-    if key[0] != Generic.name:
-        keys = [] if file.is_whole_capture else by_name.get(key, [])
-        return next((k for k in keys if k in groups and k != key), None)
-    if file.tags.make or file.tags.xmp or len(file.bands) != 1 or not _is_tiff(file):
-        return None
-    names = [(camera.name, key[1], camera.capture_name(file.path)) for camera in cameras]
-    keys = [k for name in names if name[2] != file.path.stem for k in by_name.get(name, ()) if k in groups]
-    return keys[0] if len(keys) == 1 else None
 
 
 def _with_camera(file: ImageFile, camera: Camera) -> ImageFile:
@@ -366,16 +352,13 @@ def _cameras(captures: Sequence[Capture]) -> list[_CameraKey]:
         sharing = [known for known in same_model if known & own]
         if own:
             same_model[:] = [known for known in same_model if not known & own] + [own.union(*sharing)]
-    return [_camera_of(c, cameras[c.camera.make, c.camera.model]) for c in captures]
-
-
-def _camera_of(capture: Capture, same_model: Sequence[set[str]]) -> _CameraKey:
-    camera = capture.camera
-    if not camera.model:
-        return (capture.folder.as_posix(),)
-    own = _serials(camera)
-    known = [serials for serials in same_model if serials & own or (not own and len(same_model) == 1)]
-    return (camera.make, camera.model, *sorted(known[0] if known else own))
+    keys: list[_CameraKey] = []
+    for capture in captures:
+        make, model, own = capture.camera.make, capture.camera.model, _serials(capture.camera)
+        same_model = cameras[make, model]
+        known = [serials for serials in same_model if serials & own or (not own and len(same_model) == 1)]
+        keys.append((make, model, *sorted(known[0] if known else own)) if model else (capture.folder.as_posix(),))
+    return keys
 
 
 def _serials(camera: CameraIdentity) -> set[str]:

@@ -61,15 +61,6 @@ class Tags:
         return next(iter(self.numbers(namespace, name)), None)
 
     @property
-    def pixels_per_mm(self) -> float | None:
-        """Pixels per mm of the focal plane, from EXIF FocalPlaneXResolution and its unit."""
-        resolution = finite(self.exif.get("FocalPlaneXResolution"))
-        unit = self.exif.get("FocalPlaneResolutionUnit", 2)
-        mm_per_unit = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}  # inch, cm, mm, micrometre
-        mm = mm_per_unit.get(int(unit)) if isinstance(unit, int) else None
-        return resolution / mm if resolution and mm else None
-
-    @property
     def camera_size_px(self) -> tuple[int, int] | None:
         """(width, height) of the image that the camera wrote, by EXIF; programs that resize images keep these tags."""
         return _size(self.exif, "ExifImageWidth", "ExifImageHeight")

@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from agalign.cameras.metadata import Tags
+from agalign.cameras.metadata import Tags, finite
 from agalign.pixels.radiometry import plausible
 from agalign.values.capture import Band, Panel, Pose, Radiometry
 from agalign.values.geometry import Points
@@ -38,8 +38,10 @@ def pixels_per_mm(tags: Tags) -> float | None:
     """Return EXIF's resolution of the focal plane, else the ratio of the focal length in px to EXIF's in mm, else, as
     in files without EXIF, that with the principal point in the middle of the image.
     """
-    if tags.pixels_per_mm:
-        return tags.pixels_per_mm
+    resolution, unit = finite(tags.exif.get("FocalPlaneXResolution")), tags.exif.get("FocalPlaneResolutionUnit", 2)
+    mm_per_unit = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}.get(unit)  # inch, cm, mm, micrometre
+    if resolution and mm_per_unit:
+        return resolution / mm_per_unit
     focal_px = tags.number(NAMESPACE, "PerspectiveFocalLength") if focal_length_is_in_px(tags) else None
     if focal_px and tags.focal_length_mm:
         return focal_px / tags.focal_length_mm

@@ -11,7 +11,7 @@ from PIL.ExifTags import Base
 from agalign.cameras.dji import Dji
 from agalign.cameras.metadata import Tags, finite, read_tags
 from agalign.cameras.micasense import MicaSense
-from agalign.cameras.pix4d import NAMESPACE
+from agalign.cameras.pix4d import NAMESPACE, pixels_per_mm
 from agalign.cameras.tiff_directory import EXIF, GPS, add_directories, rational, read_directories, text
 from agalign.cameras.xmp import Packet
 from agalign.values.capture import CaptureTime
@@ -83,7 +83,7 @@ def test_a_finite_number(value: object, expected: float | None) -> None:
 @pytest.mark.parametrize(("unit", "density"), [(4, 266.0), (3, 26.6), (2, 266 / 25.4), (5, 266_000.0), (9, None)])
 def test_pixel_density_by_unit(unit: int, density: float | None) -> None:
     tags = Tags(exif={"FocalPlaneXResolution": 266.0, "FocalPlaneResolutionUnit": unit})
-    assert tags.pixels_per_mm == (None if density is None else pytest.approx(density))
+    assert pixels_per_mm(tags) == (None if density is None else pytest.approx(density))
 
 
 def test_reading_a_file(flight: Path, tmp_path: Path) -> None:

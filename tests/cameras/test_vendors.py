@@ -199,6 +199,7 @@ def test_damaged_tags_leave_the_names_of_the_files(tmp_path: Path, name: str, da
     named = {f"band_{part}" if numbered else band for part, (band, _) in vendor.bands.items()}
     assert {b.name for b in capture.bands} == named
     assert all(b.lens is None or np.isfinite(b.lens.matrix).all() for b in capture.bands)
+    assert damage != "missing" or rig_seed(*capture.bands[:2]) is None
 
 
 @pytest.mark.parametrize(("name", "shift_px"), [("Phantom 4", (3, -3)), ("Mavic 3", (-3, 0))])
