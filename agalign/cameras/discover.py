@@ -89,9 +89,8 @@ def discover(folder: str | Path, options: DiscoverOptions | None = None) -> Fold
             problems.append(Problem(group[0].path, error))
     if not captures:
         _check_pattern(options.pattern, paths, folder)
-        for problem in problems:
-            if isinstance(problem.error, NoSuchBandError):
-                raise problem.error
+        for unknown_band in (p.error for p in problems if isinstance(p.error, NoSuchBandError)):
+            raise unknown_band
     captures.sort(key=lambda c: (c.folder.as_posix(), c.name))
     captures = with_missing_bands(with_unique_capture_names(captures, band_file_owners(captures)))
     return FolderScan(folder, tuple(captures), tuple(problems))
@@ -119,14 +118,11 @@ def _read(paths: Sequence[Path], options: DiscoverOptions, problems: list[Proble
     files: list[ImageFile] = []
     generic = Generic(options.pattern)
     for result in read_files(paths, options):
+        is_photograph = suffix_format(result.path) in ("JPEG", "PNG") and not generic.is_named_as_band(result.path)
         if isinstance(result, ImageFile):
             files += [result] if result.bands else []
         # An unreadable colour photograph is a problem only if photographs take part.
-        elif (
-            options.with_rgb
-            or suffix_format(result.path) not in ("JPEG", "PNG")
-            or generic.is_named_as_band(result.path)
-        ):
+        elif options.with_rgb or not is_photograph:
             problems.append(result)
     return files
 

@@ -4,7 +4,6 @@ input file, with the lens and rig of the reference instead of the band's own.
 
 from collections.abc import Iterable
 from contextlib import suppress
-from dataclasses import dataclass
 
 from PIL.ExifTags import Base
 
@@ -65,15 +64,8 @@ _RADIOMETRY = {
     *_VIGNETTING,
 }
 """Values of corrections that have been applied to the pixels if radiance or reflectance is written."""
-
-
-@dataclass(frozen=True)
-class TransferredTags:
-    """Entries for the first, the Exif and the GPS directory of an aligned file."""
-
-    first: Directory
-    exif: Directory
-    gps: Directory
+TransferredTags = tuple[Directory, Directory, Directory]
+"""Entries for the first, the Exif and the GPS directory of an aligned file."""
 
 
 def capture_tags(reference: Band, grid: OutputGrid) -> TransferredTags:
@@ -82,7 +74,7 @@ def capture_tags(reference: Band, grid: OutputGrid) -> TransferredTags:
     first = _some(source[0], _CAPTURE_TAGS | {Base.Orientation})
     times = {tag for tag in Base if tag.name.startswith(("DateTime", "OffsetTime", "SubsecTime"))}
     exif = _some(source[EXIF], times | {Base.ExifVersion, Base.BodySerialNumber, Base.LensModel})
-    return TransferredTags(first, _on_grid(exif, source[EXIF], grid), source[GPS])
+    return first, _on_grid(exif, source[EXIF], grid), source[GPS]
 
 
 def band_tags(
@@ -107,7 +99,7 @@ def band_tags(
         _put_radiometry(packet, own_tags, vignetting, radiometry=radiometry)
         if serialised := packet.serialised():
             first[XMP] = byte_string(serialised)
-    return TransferredTags(first, _on_grid(exif, of_reference[EXIF], grid), own[GPS])
+    return first, _on_grid(exif, of_reference[EXIF], grid), own[GPS]
 
 
 def _put_geometry(packet: Packet, reference: Band, tags: Tags, grid: OutputGrid) -> None:

@@ -198,7 +198,9 @@ def test_irradiance_in_the_plane_of_the_sensor_is_corrected_for_its_tilt(flight:
     for damaged in (away, leaning, {"HorizontalIrradiance": "1e-300", SCALE: "1e-300"}):
         assert irradiance(path, {"Yaw": azimuth} | damaged) is None
     assert math.isnan(horizontal_irradiance(0.2, (180, -5, 0), (math.radians(-3), math.pi)))  # the sun has set
-    assert irradiance(path, {"HorizontalIrradiance": 120.0, SCALE: -0.01}) is None
+    for value, scale in ((120.0, -0.01), (-5, 0.01), (0, 0.01), ("nan", 0.01)):
+        assert irradiance(path, {"HorizontalIrradiance": value, SCALE: scale}) is None
+    assert irradiance(path, {}) is None
 
 
 @pytest.mark.parametrize(("error", "expected"), [(1.0, 1.0), (1.004, 1.004), (1.2, 1.0)])

@@ -59,7 +59,7 @@ def transferred(source: Path, reference: Band | Path, grid: OutputGrid, out: str
     band = Band("reference", reference, 1, *SIZE, "uint16") if isinstance(reference, Path) else reference
     tags = band_tags(replace(band, path=source), band, grid, GridVignetting((80, 60), (1e-4,), 0), **options)
     path = write_file(source.parent / out, shape=(grid.height, grid.width))
-    add_directories(path, tags.first, tags.exif, tags.gps)
+    add_directories(path, *tags)
     return path
 
 
@@ -97,12 +97,6 @@ def test_upside_down_principal_points(tmp_path: Path, grid: OutputGrid, expected
     assert result.orientation == 3
 
 
-def test_undistorted_pixels_have_no_distortion(tmp_path: Path) -> None:
-    undistorted = replace(UNCHANGED, undistorted=True)
-    result = carried(tmp_path, "RedEdge", "IMG_0007_4.tif", "IMG_0007_2.tif", undistorted)
-    assert result.numbers(NAMESPACE, "PerspectiveDistortion") == (0.0,) * 5
-
-
 def test_tags_of_applied_radiometry_are_removed(tmp_path: Path) -> None:
     write_capture(tmp_path, VENDORS["RedEdge"])
     values = {(NAMESPACE, "VignettingCenter"): ("80", "60"), (NAMESPACE, "BandName"): ("NIR",)}
@@ -114,14 +108,6 @@ def test_tags_of_applied_radiometry_are_removed(tmp_path: Path) -> None:
         assert ((NAMESPACE, "VignettingCenter") in result.xmp) != radiometry
         assert ((MICASENSE, "RadiometricCalibration") in result.xmp) != radiometry
         assert (result.black_level is None) == radiometry
-
-
-def test_a_source_that_cannot_be_followed_gives_nothing(tmp_path: Path) -> None:
-    (tmp_path / "broken.tif").write_bytes(b"II*\0\xff\xff\xff\xff")
-    band = Band("broken", tmp_path / "broken.tif", 1, 9, 9, "uint16")
-    tags = band_tags(replace(band, path=tmp_path / "broken.tif"), band, OutputGrid(0, 0, 9, 9), None)
-    assert (tags.first, tags.exif, tags.gps) == ({}, {}, {})
-    assert text("x").count == 2
 
 
 def test_an_undistorted_fisheye_is_a_pinhole(tmp_path: Path) -> None:
@@ -153,8 +139,8 @@ def test_a_centre_of_vignetting_without_position_is_omitted(tmp_path: Path, cent
     path = write_file(tmp_path / "IMG_0001_2.tif", first)
     assert vignetting_of(read_tags(path), SIZE) is None
     band = Band("Green", path, 1, *SIZE, "uint16")
-    tags = band_tags(band, band, OutputGrid(0, 0, *SIZE), None)
-    assert b"Vignetting" not in tags.first[XMP].data
+    first, _, _ = band_tags(band, band, OutputGrid(0, 0, *SIZE), None)
+    assert b"Vignetting" not in first[XMP].data
 
 
 # ---- directories of TIFF files

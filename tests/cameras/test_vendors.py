@@ -3,6 +3,7 @@
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from types import MappingProxyType
 
 import cv2
 import numpy as np
@@ -35,6 +36,8 @@ PREFIXES = {NAMESPACE: "Camera", MICASENSE: "MicaSense", DJI: "drone-dji", SENTE
 SIZE = 160, 120
 
 Values = Mapping[tuple[str, str], Sequence[str]]
+Tagged = Mapping[int, Entry]
+NONE: Tagged = MappingProxyType({})
 
 
 @dataclass(frozen=True)
@@ -120,7 +123,7 @@ def packet(values: Values, dialect: str) -> bytes:
             elements += f"<{namespace}:{name}>{', '.join(items)}</{namespace}:{name}>\n"
         else:
             listed = "".join(f"<rdf:li>{item}</rdf:li>" for item in items)
-            elements += f"<{namespace}:{name}><rdf:Seq>{listed}</rdf:Seq></{namespace}:{name}>\n"
+            elements += f"<{namespace}:{name}><rdf:Bag>{listed}</rdf:Bag></{namespace}:{name}>\n"
     declared = " ".join(f'xmlns:{k}="{v}"' for k, v in URIS.items())
     return (
         '<?xpacket begin="" id="W5M0MpCehiHzreSzNTczkc9d"?><x:xmpmeta xmlns:x="adobe:ns:meta/">'
@@ -130,32 +133,26 @@ def packet(values: Values, dialect: str) -> bytes:
     ).encode()
 
 
-def write_file(
-    path: Path,
-    first: Mapping[int, Entry] | None = None,
-    exif: Mapping[int, Entry] | None = None,
-    shape: tuple[int, ...] = SIZE[::-1],
-) -> Path:
+def write_file(path: Path, first: Tagged = NONE, exif: Tagged = NONE, shape: tuple[int, ...] = SIZE[::-1]) -> Path:
     """A TIFF file of zeros with tags; of several bands where the shape has three numbers."""
     path.parent.mkdir(parents=True, exist_ok=True)
     planar = "separate" if len(shape) == 3 else None
     pixels = np.zeros(shape, np.uint16)
     tifffile.imwrite(path, pixels, photometric="minisblack", planarconfig=planar, metadata=None)
-    add_directories(path, dict(first or {}), dict(exif or {}), {})
+    add_directories(path, first, dict(exif), {})
     return path
 
 
 def write_capture(folder: Path, vendor: Vendor, dialect: str = "attributes", damage: str = "") -> None:
     for name, (band, nm, values) in vendor.files.items():
-        spectral = {(NAMESPACE, "BandName"): (band,), (NAMESPACE, "CentralWavelength"): (f"{nm}",)}
-        xmp = packet({**spectral, **values}, dialect)
+        values = {(NAMESPACE, "BandName"): (band,), (NAMESPACE, "CentralWavelength"): (f"{nm}",), **values}
         if damage == "empty":
-            xmp = packet(dict.fromkeys({**spectral, **values}, ("",)), dialect)
-        elif damage == "malformed":
-            xmp = xmp[: len(xmp) // 2]
+            values = dict.fromkeys(values, ("",))
         elif damage == "no numbers":
             keep = "BandName", "CaptureId", "CaptureUUID"
-            xmp = packet({k: v if k[1] in keep else ("-inf;nan",) for k, v in {**spectral, **values}.items()}, dialect)
+            values = {k: v if k[1] in keep else ("-inf;nan",) for k, v in values.items()}
+        xmp = packet(values, dialect)
+        xmp = xmp[: len(xmp) // 2] if damage == "malformed" else xmp
         first = {271: text(vendor.make), 272: text(vendor.model), 274: short(vendor.orientation)}
         if damage != "missing":
             first[700] = byte_string(xmp)
