@@ -51,8 +51,8 @@ class Dji(Camera):
         lens = _lens(tags) if is_mavic or calibrated is not None else None
         if len(stored) > 1:
             return colour_bands(stored, lens, None if is_mavic else by_centres)
-        name = tags.text(pix4d.NAMESPACE, "BandName") or tags.text(NAMESPACE, "BandName") or _band_in_name(path)
-        band = replace(pix4d.with_wavelength(stored[0], tags), name=name, lens=lens, radiometry=_radiometry(tags))
+        band = pix4d.described(stored[0], tags, tags.text(NAMESPACE, "BandName") or _band_in_name(path))
+        band = replace(band, lens=lens, radiometry=_radiometry(tags))
         if calibrated is None or lens is None:
             return (replace(band, to_rig=by_centres),)
         return (replace(band, to_rig=calibrated, other_to_rig=by_centres),)

@@ -55,11 +55,10 @@ class MicaSense(Camera):
         return tags.make.lower() == "micasense" or (NAMESPACE, "CaptureId") in tags.xmp
 
     def bands(self, path: Path, tags: Tags, stored: Sequence[Band]) -> tuple[Band, ...]:
-        name = tags.text(pix4d.NAMESPACE, "BandName") or _index_in_name(path) or path.stem
-        band = replace(pix4d.with_wavelength(stored[0], tags), name=name)
+        band = pix4d.described(stored[0], tags, _index_in_name(path) or path.stem)
         lens = pix4d.perspective_lens(tags)
         offset = pix4d.lens_offset(tags)
-        known_parallax = _REDEDGE_M_PARALLAX.get(name) if tags.model == "RedEdge-M" else None
+        known_parallax = _REDEDGE_M_PARALLAX.get(band.name) if tags.model == "RedEdge-M" else None
         centikelvin = Radiometry("temperature", 27315.0, 1.0, 0.01)  # in agreement with the Altum's SceneTemperature
         max_twelve_bit_value = 65520.0  # stored in the upper bits of uint16
         band = replace(

@@ -46,9 +46,9 @@ class Sequoia(Camera):
             return colour_bands(stored, lens, to_rig)
         suffix = self.band_in_name.search(path.stem)
         names = {"GRE": "Green", "RED": "Red", "REG": "Red edge", "NIR": "NIR"}
-        named_by_tag = tags.text(pix4d.NAMESPACE, "BandName") or path.stem
-        name = names.get(suffix[1].upper(), suffix[1]) if suffix else named_by_tag
-        band = replace(pix4d.with_wavelength(stored[0], tags), name=name, lens=lens, to_rig=to_rig)
+        described = pix4d.described(stored[0], tags, path.stem)
+        name = names.get(suffix[1].upper(), suffix[1]) if suffix else described.name
+        band = replace(described, name=name, lens=lens, to_rig=to_rig)
         # Parrot's formula for them has not been compared with a reference.
         why = "no tags for radiance (SensorModel and IrradianceList are not used)"
         return (replace(band, uncalibrated=why if tags.text(pix4d.NAMESPACE, "SensorModel") else ""),)

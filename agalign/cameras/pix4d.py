@@ -92,10 +92,11 @@ def rig_unit_m(bands: Iterable[Band]) -> float:
     return 1.0 if max(offsets, default=0.0) < max_offset_m else 1e-3
 
 
-def with_wavelength(band: Band, tags: Tags) -> Band:
-    """Return the band with the centre wavelength and bandwidth in its tags, nm."""
+def described(band: Band, tags: Tags, name: str) -> Band:
+    """Return the band with the name in its tags, else `name`, and the centre wavelength and bandwidth in them, nm."""
     return replace(
         band,
+        name=tags.text(NAMESPACE, "BandName") or name,
         wavelength_nm=tags.number(NAMESPACE, "CentralWavelength"),
         bandwidth_nm=tags.number(NAMESPACE, "WavelengthFWHM"),
     )

@@ -40,8 +40,7 @@ class Sentera(Camera):
         matrix = tags.numbers(_SENTERA, "AlignMatrix")
         to_rig = np.array(matrix).reshape(3, 3) if len(matrix) == 9 else None
         folder = _BAND_FOLDER.match(path.parent.name)
-        name = tags.text(pix4d.NAMESPACE, "BandName") or (folder["name"] if folder else path.stem)
-        band = replace(pix4d.with_wavelength(stored[0], tags), name=name)
+        band = pix4d.described(stored[0], tags, folder["name"] if folder else path.stem)
         if folder and band.wavelength_nm is None:
             width = float(folder["width"]) if folder["width"] else None
             band = replace(band, wavelength_nm=float(folder["wavelength"]), bandwidth_nm=width)

@@ -22,7 +22,7 @@ from agalign.cameras.tiff_directory import (
     read_directories,
     values,
 )
-from agalign.cameras.xmp import Packet, names_in
+from agalign.cameras.xmp import Name, Packet
 from agalign.errors import UnreadableFileError
 from agalign.values.capture import Band
 from agalign.values.image import OutputGrid
@@ -36,33 +36,29 @@ _GEOMETRIC_EXIF: set[int] = {
     Base.FocalLength,
     Base.FocalLengthIn35mmFilm,
 }
-_IN_PX = {
-    *names_in(pix4d.NAMESPACE, "FisheyeAffineMatrix"),
-    *names_in(dji.NAMESPACE, "CalibratedFocalLength RelativeOpticalCenterX RelativeOpticalCenterY"),
-}
+
+
+def _names(of_pix4d: str, of_dji: str = "", of_micasense: str = "") -> frozenset[Name]:
+    """Return the names, separated by spaces, in the namespaces of Pix4D, DJI and MicaSense."""
+    texts = {pix4d.NAMESPACE: of_pix4d, dji.NAMESPACE: of_dji, micasense.NAMESPACE: of_micasense}
+    return frozenset((namespace, name) for namespace, text in texts.items() for name in text.split())
+
+
+_IN_PX = _names("FisheyeAffineMatrix", "CalibratedFocalLength RelativeOpticalCenterX RelativeOpticalCenterY")
 """Lengths in px, which are multiplied by the scale of the output."""
-_FISHEYE = names_in(pix4d.NAMESPACE, "FisheyePolynomial FisheyeAffineMatrix FisheyeAffineSymmetric")
-_GEOMETRY = {
-    *names_in(pix4d.NAMESPACE, "PerspectiveFocalLength PerspectiveFocalLengthUnits PerspectiveDistortion ModelType"),
-    *names_in(pix4d.NAMESPACE, "PrincipalPoint RigRelatives RigRelativesReferenceRigCameraIndex RigTranslations"),
-    *names_in(dji.NAMESPACE, "CalibratedOpticalCenterX CalibratedOpticalCenterY CalibratedHMatrix"),
-    *names_in(dji.NAMESPACE, "DewarpData DewarpFlag DewarpHMatrix"),
-    *_IN_PX,
-    *_FISHEYE,
-}
+_FISHEYE = _names("FisheyePolynomial FisheyeAffineMatrix FisheyeAffineSymmetric")
+_GEOMETRY = (
+    _IN_PX
+    | _FISHEYE
+    | _names("PrincipalPoint PerspectiveFocalLength PerspectiveFocalLengthUnits PerspectiveDistortion ModelType")
+    | _names("RigRelatives RigRelativesReferenceRigCameraIndex RigTranslations", "DewarpData DewarpFlag DewarpHMatrix")
+    | _names("", "CalibratedOpticalCenterX CalibratedOpticalCenterY CalibratedHMatrix")
+)
 """Values of lens and rig, which are replaced by those of the reference."""
-_SENSOR_ONLY = {
-    *names_in(pix4d.NAMESPACE, "InvalidPixel VignettingPolynomial2D VignettingPolynomial2DName"),
-    *names_in(dji.NAMESPACE, "VignettingData"),
-}
+_SENSOR_ONLY = _names("InvalidPixel VignettingPolynomial2D VignettingPolynomial2DName", "VignettingData")
 """Values that refer to the sensor's own pixels and are removed."""
-_VIGNETTING = names_in(pix4d.NAMESPACE, "VignettingCenter VignettingPolynomial")
-_RADIOMETRY = {
-    *names_in(pix4d.NAMESPACE, "BlackCurrent"),
-    *names_in(micasense.NAMESPACE, "RadiometricCalibration DarkRowValue"),
-    *names_in(dji.NAMESPACE, "BlackLevel"),
-    *_VIGNETTING,
-}
+_VIGNETTING = _names("VignettingCenter VignettingPolynomial")
+_RADIOMETRY = _VIGNETTING | _names("BlackCurrent", "BlackLevel", "RadiometricCalibration DarkRowValue")
 """Values of corrections that have been applied to the pixels if radiance or reflectance is written."""
 TransferredTags = tuple[Directory, Directory, Directory]
 """Entries for the first, the Exif and the GPS directory of an aligned file."""
@@ -111,7 +107,7 @@ def _put_geometry(packet: Packet, reference: Band, tags: Tags, grid: OutputGrid)
     for name in ("RigRelatives", "RigTranslations"):
         packet.put((pix4d.NAMESPACE, name), ["0", "0", "0"])
     _put_principal_point(packet, reference, tags, grid)
-    focal_length = names_in(pix4d.NAMESPACE, "PerspectiveFocalLength" if pix4d.focal_length_is_in_px(tags) else "")
+    focal_length = _names("PerspectiveFocalLength" if pix4d.focal_length_is_in_px(tags) else "")
     for length in _IN_PX | focal_length if grid.scale.mean != 1 else ():
         if numbers := tags.numbers(*length):
             packet.put(length, _texts(v * grid.scale.mean for v in numbers))

@@ -1,9 +1,10 @@
 """Every vendor's naming and tags, in every dialect of XMP, whole and damaged."""
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from types import MappingProxyType
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -40,8 +41,7 @@ Tagged = Mapping[int, Entry]
 NONE: Tagged = MappingProxyType({})
 
 
-@dataclass(frozen=True)
-class Vendor:
+class Vendor(NamedTuple):
     """A camera, and the names and XMP values of the files of one capture."""
 
     make: str
@@ -55,14 +55,6 @@ class Vendor:
     bands: Mapping[str, tuple[str, float]]
     """{part of the file's name: (band, wavelength in nm)}."""
     orientation: int = 1
-
-    @property
-    def files(self) -> dict[str, tuple[str, float, Values]]:
-        """{file: (band, wavelength in nm, XMP values)}."""
-        return {
-            self.file.format(part=part, band=band, nm=nm): (band, nm, self.tags(k))
-            for k, (part, (band, nm)) in enumerate(self.bands.items(), start=1)
-        }
 
 
 def tagged(namespace: str, **values: str) -> Values:
@@ -144,8 +136,10 @@ def write_file(path: Path, first: Tagged = NONE, exif: Tagged = NONE, shape: tup
 
 
 def write_capture(folder: Path, vendor: Vendor, dialect: str = "attributes", damage: str = "") -> None:
-    for name, (band, nm, values) in vendor.files.items():
-        values = {(NAMESPACE, "BandName"): (band,), (NAMESPACE, "CentralWavelength"): (f"{nm}",), **values}
+    for k, (part, (band, nm)) in enumerate(vendor.bands.items(), start=1):
+        name = vendor.file.format(part=part, band=band, nm=nm)
+        spectral = {(NAMESPACE, "BandName"): (band,), (NAMESPACE, "CentralWavelength"): (f"{nm}",)}
+        values = {**spectral, **vendor.tags(k)}
         if damage == "empty":
             values = dict.fromkeys(values, ("",))
         elif damage == "no numbers":
@@ -174,7 +168,7 @@ def test_a_capture_is_grouped_named_and_seeded(tmp_path: Path, name: str, dialec
     write_capture(tmp_path, vendor, dialect)
     capture = only_capture(tmp_path)
     assert capture.label == vendor.capture
-    assert {b.name: b.wavelength_nm for b in capture.bands} == {band: nm for band, nm, _ in vendor.files.values()}
+    assert {b.name: b.wavelength_nm for b in capture.bands} == dict(vendor.bands.values())
     assert capture.reference.name == "Green"
     assert capture.capture_id == "abc"
     for band in capture.moving:
@@ -191,7 +185,7 @@ def test_damaged_tags_leave_the_names_of_the_files(tmp_path: Path, name: str, da
     write_capture(tmp_path, vendor, damage=damage)
     scan = discover(tmp_path)
     (capture,) = scan.captures
-    assert len(scan.problems) == (len(vendor.files) if damage == "malformed" else 0)
+    assert len(scan.problems) == (len(vendor.bands) if damage == "malformed" else 0)
     numbered = name == "RedEdge" and damage != "no numbers"  # its files have no names of bands
     named = {f"band_{part}" if numbered else band for part, (band, _) in vendor.bands.items()}
     assert {b.name for b in capture.bands} == named
