@@ -97,6 +97,12 @@ def test_upside_down_principal_points(tmp_path: Path, grid: OutputGrid, expected
     assert result.orientation == 3
 
 
+def test_undistorted_pixels_have_no_distortion(tmp_path: Path) -> None:
+    undistorted = replace(UNCHANGED, undistorted=True)
+    result = carried(tmp_path, "RedEdge", "IMG_0007_4.tif", "IMG_0007_2.tif", undistorted)
+    assert result.numbers(NAMESPACE, "PerspectiveDistortion") == (0.0,) * 5
+
+
 def test_tags_of_applied_radiometry_are_removed(tmp_path: Path) -> None:
     write_capture(tmp_path, VENDORS["RedEdge"])
     values = {(NAMESPACE, "VignettingCenter"): ("80", "60"), (NAMESPACE, "BandName"): ("NIR",)}
