@@ -52,6 +52,13 @@ def with_tags(path: Path, **changes: object) -> Radiometry | None:
     return band.radiometry
 
 
+def test_gain_and_row_gradient_are_those_of_the_tags(blue: Path) -> None:
+    tags = read_tags(blue)
+    xmp = {**tags.xmp, ("micasense.com/MicaSense", "RadiometricCalibration"): ("2e-4", "1e-7", "3e-5")}
+    radiometry = with_tags(blue, xmp=xmp, exif={**tags.exif, "ExposureTime": 1e-3, "ISOSpeed": 400})
+    assert (radiometry.gain, radiometry.row_gradient) == pytest.approx((2e-4 / 4 / 1e-3, 1e-7 / 1e-3 - 3e-5))
+
+
 @pytest.mark.parametrize("missing", ["RadiometricCalibration", "ExposureTime", "ISOSpeed", "black"])
 def test_without_its_tags_there_is_no_radiometry(blue: Path, missing: str) -> None:
     tags = read_tags(blue)
