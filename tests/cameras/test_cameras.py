@@ -70,24 +70,6 @@ def test_a_pattern_is_above_all_cameras() -> None:
     assert [c.name for c in known_cameras("{capture}_{band}.tif")] == ["generic"]
 
 
-@pytest.mark.parametrize(
-    ("name", "expected"),
-    [
-        ("field-3_RedEdge.tif", ("field-3", "RedEdge")),
-        ("IMG_0007_4.tif", ("IMG_0007", "4")),
-        ("plot 12 NIR.tif", ("plot 12", "NIR")),
-        ("north_840nm.tif", ("north", "840nm")),
-        ("north_b3.tif", ("north", "b3")),
-        ("fieldGreen.tif", ("field", "Green")),
-        ("ortho_red_edge.tif", ("ortho", "red_edge")),
-        ("été_nir.tif", ("été", "nir")),
-        ("nir.tif", ("", "nir")),
-    ],
-)
-def test_names_of_files(name: str, expected: tuple[str, str]) -> None:
-    assert Generic().split(Path(name)) == expected
-
-
 def test_pattern() -> None:
     generic = Generic("cap{capture}-of-{band}.tif")
     assert generic.split(Path("cap12-of-X.tif")) == ("12", "X")
