@@ -22,7 +22,6 @@ from agalign.errors import InputError
 from agalign.pixels.raster import suffix_format
 from agalign.values.capture import Band, CameraIdentity, Capture, CaptureTime, Pose
 from agalign.values.files import RUN_FILE
-from agalign.values.pixel_units import SAME_PIXELS
 from agalign.values.text import counted
 
 _GroupKey = tuple[str, str, str]
@@ -281,7 +280,7 @@ def capture_of(files: Sequence[ImageFile], folder: Path, options: DiscoverOption
 def _pose(camera: Camera, tags: Tags, file: ImageFile) -> Pose | None:
     """The pose by the tags of a file, with the focal length in pixels of its image."""
     pose = camera.pose(tags)
-    if pose is None or pose.focal_length_px is None or not (file.other_lens or file.scale != SAME_PIXELS):
+    if pose is None or pose.focal_length_px is None:
         return pose
     return replace(pose, focal_length_px=None if file.other_lens else pose.focal_length_px * file.scale.mean)
 

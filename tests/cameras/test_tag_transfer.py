@@ -191,14 +191,3 @@ def test_directories_that_follow_are_kept(tmp_path: Path) -> None:
     with tifffile.TiffFile(path) as tiff:
         assert len(tiff.pages) == 2
         np.testing.assert_array_equal(tiff.pages[1].asarray(), PIXELS + 1)
-
-
-def test_a_jpegs_exif_is_read(tmp_path: Path) -> None:
-    exif = Image.Exif()
-    exif[271] = "Maker"
-    exif.get_ifd(GPS)[1] = "S"
-    Image.fromarray(np.zeros((20, 20, 3), np.uint8)).save(tmp_path / "x.jpg", exif=exif, xmp=b"packet")
-    result = read_directories(tmp_path / "x.jpg")
-    assert result[0][271].data == b"Maker\0"
-    assert result[GPS][1].data == b"S\0"
-    assert result[0][700].data == b"packet"
