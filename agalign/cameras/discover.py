@@ -19,9 +19,8 @@ from agalign.cameras.grouping import (
     band_file_owners,
     capture_of,
     group_files,
-    lens_problems,
-    list_problems,
     pattern_clashes,
+    tag_problems,
     with_missing_bands,
     with_tags_of_flight,
     with_unique_band_names,
@@ -76,7 +75,7 @@ def discover(folder: str | Path, options: DiscoverOptions | None = None) -> Fold
     paths, problems = _chosen_images(folder, options)
     files, copies = without_copies(_read(paths, options, problems))
     files, damaged = with_tags_of_flight(files)
-    problems += copies + damaged + list_problems(files) + lens_problems(files)
+    problems += copies + damaged + tag_problems(files)
     captures: list[Capture] = []
     groups = group_files(files, with_rgb=options.with_rgb)
     _check_bands(groups, options.bands, folder)

@@ -96,28 +96,22 @@ def with_tags_of_flight(files: Sequence[ImageFile]) -> tuple[list[ImageFile], li
     return result, problems
 
 
-def lens_problems(files: Sequence[ImageFile]) -> list[Problem]:
-    """Return a problem for all files with tags of another lens or image size; it names the first of them."""
-    wrong = [file for file in files if file.other_lens]
-    if not wrong:
-        return []
-    others = f", and so in {counted(len(wrong) - 1, 'other file')}" if len(wrong) > 1 else ""
-    advice = "lens, rig and radiometry are not used: give the original images"
-    text = f"{wrong[0].path}: {wrong[0].other_lens}{others}; {advice}"
-    return [Problem(wrong[0].path, InputError(text), loses_nothing=True)]
-
-
-def list_problems(files: Iterable[ImageFile]) -> list[Problem]:
-    """Return a problem for each multiband file with tags that list another number of names or wavelengths."""
-    result = []
+def tag_problems(files: Sequence[ImageFile]) -> list[Problem]:
+    """Return a problem for each multiband file with tags that list another number of names or wavelengths, and one for
+    all files with tags of another lens or image size, which names the first of them.
+    """
+    texts: dict[Path, str] = {}
     for file in files:
         names, wavelengths = len(listed_names(file.tags)), len(file.tags.numbers(NAMESPACE, "CentralWavelength"))
         bands = len(file.bands)
         if file.is_whole_capture and isinstance(file.camera, Generic) and not {names, wavelengths} <= {0, bands}:
             counts = f"{counted(names, 'name')} and {counted(wavelengths, 'wavelength')} of bands"
-            text = f"{file.path}: has {bands} bands, and its tags list {counts}; lists of other lengths are not used"
-            result.append(Problem(file.path, InputError(text), loses_nothing=True))
-    return result
+            texts[file.path] = f"has {bands} bands, and its tags list {counts}; lists of other lengths are not used"
+    if wrong := [file for file in files if file.other_lens]:
+        others = f", and so in {counted(len(wrong) - 1, 'other file')}" if len(wrong) > 1 else ""
+        advice = "lens, rig and radiometry are not used: give the original images"
+        texts[wrong[0].path] = f"{wrong[0].other_lens}{others}; {advice}"
+    return [Problem(path, InputError(f"{path}: {text}"), loses_nothing=True) for path, text in texts.items()]
 
 
 def _similar(file: ImageFile) -> tuple[object, object]:

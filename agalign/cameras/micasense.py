@@ -55,7 +55,8 @@ class MicaSense(Camera):
         return tags.make.lower() == "micasense" or (NAMESPACE, "CaptureId") in tags.xmp
 
     def bands(self, path: Path, tags: Tags, stored: Sequence[Band]) -> tuple[Band, ...]:
-        band = pix4d.described(stored[0], tags, _index_in_name(path) or path.stem)
+        numbered = self.band_in_name.search(path.stem)
+        band = pix4d.described(stored[0], tags, f"band{numbered[0]}" if numbered else path.stem)
         lens = pix4d.perspective_lens(tags)
         offset = pix4d.lens_offset(tags)
         known_parallax = _REDEDGE_M_PARALLAX.get(band.name) if tags.model == "RedEdge-M" else None
@@ -155,11 +156,6 @@ def _sensor_attitude_deg(tags: Tags) -> tuple[float, float, float]:
     """(yaw, pitch, roll) of the light sensor; zeros if they are missing, as in MicaSense's library."""
     yaw, pitch, roll = (math.degrees(tags.number(_DLS, name) or 0.0) for name in ("Yaw", "Pitch", "Roll"))
     return yaw, pitch, roll
-
-
-def _index_in_name(path: Path) -> str:
-    match = re.search(r"_(\d+)$", path.stem)
-    return f"band_{match.group(1)}" if match else ""
 
 
 # ---- the light sensor

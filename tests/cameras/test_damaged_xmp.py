@@ -41,10 +41,15 @@ PACKET = """<?xpacket begin="" id="W5M0MpCehiHzreSzNTczkc9d"?>
  </rdf:RDF>
 </x:xmpmeta>
 <?xpacket end="w"?>"""
+Change = Callable[[str], str]
+"""A change of a packet."""
+Bands = dict[int, tuple[str, int]]
+"""{number of the file: (band, wavelength in nm)}."""
+NOON = "2026:06:21 12:00:00"
 BANDS = {2: ("Green", 560), 3: ("Red", 668), 4: ("NIR", 840)}
 
 
-def replaced(old: str, new: str) -> Callable[[str], str]:
+def replaced(old: str, new: str) -> Change:
     def change(packet: str) -> str:
         assert old in packet
         return packet.replace(old, new, 1)
@@ -52,7 +57,7 @@ def replaced(old: str, new: str) -> Callable[[str], str]:
     return change
 
 
-DAMAGES: dict[str, Callable[[str], str]] = {
+DAMAGES: dict[str, Change] = {
     "two end tags": lambda p: p + "\n</x:xmpmeta>",
     "an end tag too many in the middle": replaced("</rdf:Description>", "</rdf:Description></rdf:Description>"),
     "no wrapper": lambda p: re.sub(r"</?x:xmpmeta[^>]*>", "", p),
@@ -72,17 +77,12 @@ DAMAGES: dict[str, Callable[[str], str]] = {
 
 
 def write_capture(
-    folder: Path,
-    number: int = 1,
-    change: Callable[[str], str] = lambda p: p,
-    only: int | None = None,
-    bands: dict[int, tuple[str, int]] | None = None,
-    at: str = "2026:06:21 10:00:00",
+    folder: Path, number: int = 1, change: Change = str, only: int = 0, bands: Bands = BANDS, at: str = NOON
 ) -> None:
     """Three bands of a RedEdge-M; `change` is that of the packets of all bands, or of that of one."""
-    for k, (band, nm) in (BANDS if bands is None else bands).items():
+    for k, (band, nm) in bands.items():
         xmp = PACKET.format(band=band, nm=nm, x=0.29 + k / 100, capture=f"capture{number}")
-        xmp = change(xmp) if only in (None, k) else xmp
+        xmp = change(xmp) if only in (0, k) else xmp
         first = {271: text("MicaSense"), 272: text("RedEdge-M"), 700: byte_string(xmp.encode()), 50714: short(4800)}
         exif = {0xA20E: rational(266.67), 0xA20F: rational(266.67), 0xA210: short(4), 0x829A: rational(0.001)}
         exif |= {0x8827: short(100), 0x9003: text(at)}
@@ -265,11 +265,9 @@ def test_the_halves_of_a_dual_camera_are_joined(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("bands", "at"), [(BANDS, "2026:06:21 10:00:00"), (OTHER_HALF, "2026:06:22 10:00:00")], ids=["copy", "another day"]
+    ("bands", "at"), [(BANDS, NOON), (OTHER_HALF, "2026:06:22 12:00:00")], ids=["copy", "next day"]
 )
-def test_other_folders_with_an_id_are_captures_of_their_own(
-    tmp_path: Path, bands: dict[int, tuple[str, int]], at: str
-) -> None:
+def test_other_folders_with_an_id_are_captures_of_their_own(tmp_path: Path, bands: Bands, at: str) -> None:
     write_capture(tmp_path / "a")
     write_capture(tmp_path / "b", bands=bands, at=at)
     assert sorted(len(c.bands) for c in discover(tmp_path).captures) == sorted([3, len(bands)])
