@@ -228,11 +228,8 @@ def pattern_clashes(files: Sequence[ImageFile], pattern: str) -> list[Problem]:
     for file in files:
         for name in {b.name for b in file.bands}:
             if first.setdefault(name, file.path) != file.path:
-                text = (
-                    f"{file.path}: is band '{name}' of one capture with {first[name].name} by the pattern "
-                    f"'{pattern}'; give one that distinguishes them"
-                )
-                result.append(Problem(file.path, InputError(text)))
+                what = f"is band '{name}' of one capture with {first[name].name} by the pattern '{pattern}'"
+                result.append(Problem(file.path, InputError(f"{file.path}: {what}; give one that distinguishes them")))
     return result
 
 

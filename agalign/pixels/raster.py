@@ -159,17 +159,15 @@ def probe(path: Path, max_pixels: int = MAX_PIXELS, page: int = 0) -> tuple[Band
     except UnreadableFileError:
         raise
     except Exception as error:  # damaged files raise errors of many classes
-        raise UnreadableFileError(
-            f"{path}: cannot be read ({innermost_cause(error)}); copy it from the card again"
-        ) from None
+        what = f"cannot be read ({innermost_cause(error)})"
+        raise UnreadableFileError(f"{path}: {what}; copy it from the card again") from None
 
 
 def _bands(path: Path, dataset: rasterio.DatasetReader, max_pixels: int) -> tuple[Band, ...]:
     width, height, count = dataset.width, dataset.height, dataset.count
     if width * height > max_pixels:
-        raise UnreadableFileError(
-            f"{path}: declares {width} x {height} pixels, more than the {max_pixels:,} that --max-pixels allows"
-        )
+        what = f"declares {width} x {height} pixels, more than the {max_pixels:,} that --max-pixels allows"
+        raise UnreadableFileError(f"{path}: {what}")
     if count > _MAX_BANDS:
         raise UnreadableFileError(f"{path}: declares {count} bands; at most {_MAX_BANDS} can take part")
     if not all(np.dtype(t).kind in "uif" for t in dataset.dtypes):
