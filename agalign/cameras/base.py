@@ -14,7 +14,6 @@ from pathlib import Path
 import numpy as np
 
 from agalign.cameras.metadata import Tags
-from agalign.cameras.pix4d import TagTransfer
 from agalign.cameras.xmp import Name
 from agalign.errors import GeometryError, NoSuchBandError
 from agalign.values import geometry
@@ -32,12 +31,12 @@ class Camera(ABC):
     """The XMP values that identify a capture, tried in turn."""
     flight_ids: tuple[Name, ...] = ()
     """The XMP values that identify a flight, tried in turn."""
+    band_in_name: re.Pattern[str]
+    """The end of a file's name, without suffix, that differs between the bands of a capture."""
     clock_is_utc = False
     """True if its Exif times are in UTC."""
     utc_times: tuple[Name, ...] = ()
     """The XMP values of the time in UTC, tried in turn."""
-    tag_transfer: TagTransfer = TagTransfer()
-    """Conversion of its tags for a band that is written on the reference's grid."""
 
     @abstractmethod
     def recognises(self, tags: Tags) -> bool:
@@ -47,9 +46,9 @@ class Camera(ABC):
     def bands(self, path: Path, tags: Tags, stored: Sequence[Band]) -> tuple[Band, ...]:
         """Return the bands in one of its files, with lens and `to_rig`; `stored` is from `pixels.raster.probe`."""
 
-    @abstractmethod
     def capture_name(self, path: Path) -> str:
         """Return the part of a file name that all bands of a capture share."""
+        return self.band_in_name.sub("", path.stem)
 
     def capture_key(self, path: Path, tags: Tags) -> str:
         """Return a text that is the same for all files of a capture, and unique for a camera and folder."""
@@ -70,8 +69,7 @@ class Camera(ABC):
 
     def elevation_deg(self, tags: Tags) -> float | None:
         """Return the angle of the optical axis above the horizon, -90 straight down; None if the tags lack it."""
-        pose = self.pose(tags)
-        if pose is None:
+        if (pose := self.pose(tags)) is None:
             return None
         return -math.degrees(math.asin(math.cos(math.radians(pose.pitch_deg)) * math.cos(math.radians(pose.roll_deg))))
 
@@ -125,20 +123,17 @@ def is_thermal(band: Band) -> bool:
 
 def rig_seed(reference: Band, moving: Band) -> Matrix | None:
     """Return `fixed_to_moving` (3, 3) between undistorted pixels from tags alone; None if the tags lack it."""
-    return _through_rig(reference.to_rig, moving.to_rig)
+    if reference.to_rig is None or moving.to_rig is None:
+        return None
+    return geometry.compose(geometry.invert(moving.to_rig), reference.to_rig)
 
 
 def other_rig_seed(reference: Band, moving: Band) -> Matrix | None:
     """Return `rig_seed` by the second set of tags that some makers write; None if both bands lack it."""
     if reference.other_to_rig is None and moving.other_to_rig is None:
         return None
-    return _through_rig(*(b.to_rig if b.other_to_rig is None else b.other_to_rig for b in (reference, moving)))
-
-
-def _through_rig(reference: Matrix | None, moving: Matrix | None) -> Matrix | None:
-    if reference is None or moving is None:
-        return None
-    return geometry.normalised(geometry.compose(geometry.invert(moving), reference))
+    others = (b if b.other_to_rig is None else replace(b, to_rig=b.other_to_rig) for b in (reference, moving))
+    return rig_seed(*others)
 
 
 # ---- for the modules of the cameras

@@ -19,9 +19,8 @@ from agalign.cameras.grouping import (
     band_file_owners,
     capture_of,
     group_files,
-    lens_problems,
-    list_problems,
     pattern_clashes,
+    tag_problems,
     with_missing_bands,
     with_tags_of_flight,
     with_unique_band_names,
@@ -76,7 +75,7 @@ def discover(folder: str | Path, options: DiscoverOptions | None = None) -> Fold
     paths, problems = _chosen_images(folder, options)
     files, copies = without_copies(_read(paths, options, problems))
     files, damaged = with_tags_of_flight(files)
-    problems += copies + damaged + list_problems(files) + lens_problems(files)
+    problems += copies + damaged + tag_problems(files)
     captures: list[Capture] = []
     groups = group_files(files, with_rgb=options.with_rgb)
     _check_bands(groups, options.bands, folder)
@@ -89,9 +88,8 @@ def discover(folder: str | Path, options: DiscoverOptions | None = None) -> Fold
             problems.append(Problem(group[0].path, error))
     if not captures:
         _check_pattern(options.pattern, paths, folder)
-        for problem in problems:
-            if isinstance(problem.error, NoSuchBandError):
-                raise problem.error
+        for unknown_band in (p.error for p in problems if isinstance(p.error, NoSuchBandError)):
+            raise unknown_band
     captures.sort(key=lambda c: (c.folder.as_posix(), c.name))
     captures = with_missing_bands(with_unique_capture_names(captures, band_file_owners(captures)))
     return FolderScan(folder, tuple(captures), tuple(problems))
@@ -119,14 +117,11 @@ def _read(paths: Sequence[Path], options: DiscoverOptions, problems: list[Proble
     files: list[ImageFile] = []
     generic = Generic(options.pattern)
     for result in read_files(paths, options):
+        is_photograph = suffix_format(result.path) in ("JPEG", "PNG") and not generic.is_named_as_band(result.path)
         if isinstance(result, ImageFile):
             files += [result] if result.bands else []
         # An unreadable colour photograph is a problem only if photographs take part.
-        elif (
-            options.with_rgb
-            or suffix_format(result.path) not in ("JPEG", "PNG")
-            or generic.is_named_as_band(result.path)
-        ):
+        elif options.with_rgb or not is_photograph:
             problems.append(result)
     return files
 

@@ -13,6 +13,7 @@ colour photograph. The bands are exposed one after another, so in motion a seed 
 import math
 import re
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
@@ -21,65 +22,37 @@ import numpy as np
 from agalign.cameras import pix4d
 from agalign.cameras.base import FULL_SCALE, Camera, colour_bands
 from agalign.cameras.metadata import Tags
-from agalign.cameras.xmp import Packet, names_in
 from agalign.errors import GeometryError
 from agalign.values import geometry
 from agalign.values.capture import Band, Pose, Radiometry
 from agalign.values.geometry import Matrix
-from agalign.values.image import OutputGrid
 from agalign.values.lens import Lens
 
-_MAVIC_3_NAME = re.compile(r"^(?P<capture>.*?)_(?:MS_(?P<band>G|RE?|NIR)|D)$", re.IGNORECASE)
-_DJI = "dji.com/drone-dji"
-
-
-class _TagTransfer(pix4d.TagTransfer):
-    in_px = names_in(_DJI, "CalibratedFocalLength RelativeOpticalCenterX RelativeOpticalCenterY")
-    geometry = pix4d.TagTransfer.geometry.union(
-        in_px,
-        names_in(_DJI, "CalibratedOpticalCenterX CalibratedOpticalCenterY CalibratedHMatrix"),
-        names_in(_DJI, "DewarpData DewarpFlag DewarpHMatrix"),
-    )
-    sensor_only = pix4d.TagTransfer.sensor_only | {(_DJI, "VignettingData")}
-    radiometry = pix4d.TagTransfer.radiometry | {(_DJI, "BlackLevel")}
-
-    def put_geometry(
-        self, packet: Packet, reference_packet: Packet, reference: Band, tags: Tags, grid: OutputGrid
-    ) -> None:
-        super().put_geometry(packet, reference_packet, reference, tags, grid)
-        centre = _pair(tags, "CalibratedOpticalCenter")
-        if centre is not None:
-            for axis, value in zip("XY", grid.px(*centre), strict=True):
-                packet.put((_DJI, f"CalibratedOpticalCenter{axis}"), [pix4d.number_text(value)])
-        date, terms = _dewarp_data(tags)
-        if terms:
-            scaled = [v * grid.scale.mean for v in terms[:4]] + [0.0 if grid.undistorted else v for v in terms[4:]]
-            packet.put((_DJI, "DewarpData"), [f"{date};" + ",".join(map(pix4d.number_text, scaled))])
-        if grid.undistorted:
-            packet.put((_DJI, "DewarpFlag"), ["1"])
+_MAVIC_3_BAND = r"_(?:MS_(?P<band>G|RE?|NIR)|D)$"
+NAMESPACE = "dji.com/drone-dji"
 
 
 class Dji(Camera):
     """The multispectral cameras of DJI."""
 
     name = "DJI"
-    capture_ids = ((_DJI, "CaptureUUID"),)
-    utc_times = ((_DJI, "UTCAtExposure"),)
-    tag_transfer = _TagTransfer()
+    capture_ids = ((NAMESPACE, "CaptureUUID"),)
+    band_in_name = re.compile(rf"{_MAVIC_3_BAND}|(?<=\d)\d$", re.IGNORECASE)
+    utc_times = ((NAMESPACE, "UTCAtExposure"),)
 
     def recognises(self, tags: Tags) -> bool:
-        return tags.make.upper() == "DJI" or (_DJI, "CaptureUUID") in tags.xmp
+        return tags.make.upper() == "DJI" or (NAMESPACE, "CaptureUUID") in tags.xmp
 
     def bands(self, path: Path, tags: Tags, stored: Sequence[Band]) -> tuple[Band, ...]:
-        is_mavic = _is_mavic_3(tags) or bool(_MAVIC_3_NAME.match(path.stem))
-        centre = _pair(tags, "RelativeOpticalCenter")
+        is_mavic = _is_mavic_3(tags) or bool(re.search(_MAVIC_3_BAND, path.stem, re.IGNORECASE))
+        centre = pair(tags, "RelativeOpticalCenter")
         by_centres = None if centre is None else geometry.translation(-centre[0], -centre[1])
         calibrated = _matrix(tags, "CalibratedHMatrix")
         lens = _lens(tags) if is_mavic or calibrated is not None else None
         if len(stored) > 1:
             return colour_bands(stored, lens, None if is_mavic else by_centres)
-        name = tags.text(pix4d.NAMESPACE, "BandName") or tags.text(_DJI, "BandName") or _band_in_name(path)
-        band = replace(pix4d.with_wavelength(stored[0], tags), name=name, lens=lens, radiometry=_radiometry(tags))
+        band = pix4d.described(stored[0], tags, tags.text(NAMESPACE, "BandName") or _band_in_name(path))
+        band = replace(band, lens=lens, radiometry=_radiometry(tags))
         if calibrated is None or lens is None:
             return (replace(band, to_rig=by_centres),)
         return (replace(band, to_rig=calibrated, other_to_rig=by_centres),)
@@ -93,52 +66,54 @@ class Dji(Camera):
         return [replace(b, to_rig=to_rig) if b.companion and b.to_rig is None else b for b in bands]
 
     def pose(self, tags: Tags) -> Pose | None:
-        yaw_deg, pitch_deg = tags.number(_DJI, "GimbalYawDegree"), tags.number(_DJI, "GimbalPitchDegree")
-        if yaw_deg is None or pitch_deg is None:
+        heading_deg, pitch_deg = _heading_deg(tags), tags.number(NAMESPACE, "GimbalPitchDegree")
+        if heading_deg is None or pitch_deg is None:
             return None
-        height_m = tags.number(_DJI, "RelativeAltitude")
-        height_m = height_m if height_m and height_m > 0 else None
-        focal_length_px = tags.number(_DJI, "CalibratedFocalLength")
-        return Pose(_heading_deg(tags, yaw_deg), pitch_deg + 90, 0.0, height_m, focal_length_px)
+        focal_length_px = tags.number(NAMESPACE, "CalibratedFocalLength")
+        return Pose(heading_deg, pitch_deg + 90, 0.0, _height_m(tags), focal_length_px)
 
     def motion(self, tags: Tags) -> tuple[float, float] | None:
         """Calculate the motion from the speed over ground (north, east, m/s), the heading of the image's upper edge and
         the height above the take-off point.
         """
-        names = "FlightXSpeed", "FlightYSpeed", "GimbalYawDegree", "RelativeAltitude"
-        north, east, yaw_deg, height_m = (tags.number(_DJI, name) for name in names)
-        if north is None or east is None or yaw_deg is None or height_m is None or height_m <= 0:
+        north, east = (tags.number(NAMESPACE, f"Flight{axis}Speed") for axis in "XY")
+        heading_deg, height_m = _heading_deg(tags), _height_m(tags)
+        if north is None or east is None or heading_deg is None or height_m is None:
             return None
-        yaw = math.radians(_heading_deg(tags, yaw_deg))
+        yaw = math.radians(heading_deg)
         forward = north * math.cos(yaw) + east * math.sin(yaw)
         right = east * math.cos(yaw) - north * math.sin(yaw)
         return -right / height_m, forward / height_m
 
-    def capture_name(self, path: Path) -> str:
-        mavic = _MAVIC_3_NAME.match(path.stem)
-        return mavic["capture"] if mavic else re.sub(r"(?<=\d)\d$", "", path.stem)
 
-
-def _heading_deg(tags: Tags, yaw_deg: float) -> float:
+def _heading_deg(tags: Tags) -> float | None:
     """The heading of the image's upper edge. Some gimbals that look down report a roll of 180 degrees and the opposite
     yaw.
     """
+    yaw_deg, roll_deg = tags.number(NAMESPACE, "GimbalYawDegree"), tags.number(NAMESPACE, "GimbalRollDegree")
     max_upright_roll_deg = 90.0  # larger gimbal rolls mean upside down: gimbals write a roll near 0 or near 180 degrees
-    return yaw_deg + (180 if abs(tags.number(_DJI, "GimbalRollDegree") or 0.0) > max_upright_roll_deg else 0)
+    is_upside_down = abs(roll_deg or 0.0) > max_upright_roll_deg
+    return None if yaw_deg is None else yaw_deg + (180 if is_upside_down else 0)
+
+
+def _height_m(tags: Tags) -> float | None:
+    """The height above the take-off point; None if it is not positive."""
+    height_m = tags.number(NAMESPACE, "RelativeAltitude")
+    return height_m if height_m and height_m > 0 else None
 
 
 def _radiometry(tags: Tags) -> Radiometry | None:
     """The signal is (raw - black) / 65536 (1 + k1 r + ... + k6 r^6) / (gain exposure). By DJI's guide, signal *
     SensorGainAdjustment / Irradiance is proportional to reflectance, with the same factor for all bands.
     """
-    gain, exposure_us = tags.number(_DJI, "SensorGain"), tags.number(_DJI, "ExposureTime")
-    levels = tags.number(_DJI, "BlackLevel"), tags.number(pix4d.NAMESPACE, "BlackCurrent"), tags.black_level
+    gain, exposure_us = tags.number(NAMESPACE, "SensorGain"), tags.number(NAMESPACE, "ExposureTime")
+    levels = tags.number(NAMESPACE, "BlackLevel"), tags.number(pix4d.NAMESPACE, "BlackCurrent"), tags.black_level
     black = next((level for level in levels if level is not None), None)  # it may be 0
     if not gain or not exposure_us or black is None:
         return None
-    irradiance = tags.number(_DJI, "Irradiance") or 0.0
-    adjusted = tags.number(_DJI, "SensorGainAdjustment") or 1.0
-    centre, k = _pair(tags, "CalibratedOpticalCenter"), tags.numbers(_DJI, "VignettingData")
+    irradiance = tags.number(NAMESPACE, "Irradiance") or 0.0
+    adjusted = tags.number(NAMESPACE, "SensorGainAdjustment") or 1.0
+    centre, k = pair(tags, "CalibratedOpticalCenter"), tags.numbers(NAMESPACE, "VignettingData")
     return Radiometry(
         "relative radiance",
         black,
@@ -157,49 +132,46 @@ def _is_mavic_3(tags: Tags) -> bool:
 
 
 def _band_in_name(path: Path) -> str:
-    mavic = _MAVIC_3_NAME.match(path.stem)
-    if mavic and mavic["band"]:
-        return {"G": "Green", "R": "Red", "RE": "RedEdge", "NIR": "NIR"}[mavic["band"].upper()]
-    return {"1": "Blue", "2": "Green", "3": "Red", "4": "RedEdge", "5": "NIR"}.get(path.stem[-1], path.stem)
+    mavic = re.search(_MAVIC_3_BAND, path.stem, re.IGNORECASE)
+    part = mavic["band"] or "" if mavic else path.stem[-1]
+    names = {"1": "Blue", "2": "Green", "3": "Red", "4": "RedEdge", "5": "NIR"}
+    names |= {"G": "Green", "R": "Red", "RE": "RedEdge", "NIR": "NIR"}
+    return names.get(part.upper(), path.stem)
 
 
-def _pair(tags: Tags, name: str) -> tuple[float, float] | None:
-    x, y = (tags.number(_DJI, f"{name}{axis}") for axis in "XY")
+def pair(tags: Tags, name: str) -> tuple[float, float] | None:
+    """Return the numbers of the two values whose names end in X and Y; None if one is missing."""
+    x, y = (tags.number(NAMESPACE, f"{name}{axis}") for axis in "XY")
     return None if x is None or y is None else (x, y)
 
 
 def _matrix(tags: Tags, name: str) -> Matrix | None:
     """A tag as a matrix (3, 3); None if it is missing or singular."""
-    values = tags.numbers(_DJI, name)
-    if len(values) != 9:
-        return None
-    matrix = np.array(values).reshape(3, 3)
-    try:
+    with suppress(GeometryError, ValueError):
+        matrix = np.reshape(tags.numbers(NAMESPACE, name), (3, 3))
         geometry.invert(matrix)
-    except GeometryError:
-        return None
-    return matrix
+        return matrix
+    return None
 
 
 def _lens(tags: Tags) -> Lens | None:
     """The lens by DewarpData (fx, fy, cx, cy, k …), with the principal point CalibratedOpticalCenter + (cx, cy). If
     DewarpFlag is 1, the image is already undistorted.
     """
-    (_, terms), centre = _dewarp_data(tags), _pair(tags, "CalibratedOpticalCenter")
+    (_, terms), centre = dewarp_data(tags), pair(tags, "CalibratedOpticalCenter")
     if centre is None or not terms or not (terms[0] > 0 and terms[1] > 0):
         return None
     fx, fy, cx, cy, *k = terms
-    dewarped = tags.number(_DJI, "DewarpFlag") == 1
+    dewarped = tags.number(NAMESPACE, "DewarpFlag") == 1
     return Lens(fx, fy, centre[0] + cx, centre[1] + cy, () if dewarped else tuple(k))
 
 
-def _dewarp_data(tags: Tags) -> tuple[str, list[float]]:
-    """(date, [fx, fy, cx, cy, k1, k2, p1, p2, k3]) of DewarpData 'date;fx,fy,…', px, in OpenCV's order; no terms if the
-    tag has another form.
+def dewarp_data(tags: Tags) -> tuple[str, list[float]]:
+    """Return (date, [fx, fy, cx, cy, k1, k2, p1, p2, k3]) of DewarpData 'date;fx,fy,…', px, in OpenCV's order; no terms
+    if the tag has another form.
     """
-    date, _, text = tags.text(_DJI, "DewarpData").rpartition(";")
-    try:
+    date, _, text = tags.text(NAMESPACE, "DewarpData").rpartition(";")
+    with suppress(ValueError):
         terms = [float(part) for part in text.split(",")]
-    except ValueError:
-        terms = []
-    return date, terms if len(terms) == 9 else []
+        return date, terms if len(terms) == 9 else []
+    return date, []

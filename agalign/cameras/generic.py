@@ -37,7 +37,11 @@ class Generic(Camera):
 
     def bands(self, path: Path, tags: Tags, stored: Sequence[Band]) -> tuple[Band, ...]:
         if suffix_format(path) in ("JPEG", "PNG"):
-            return self._picture_bands(path, stored)
+            if not self.is_named_as_band(path):  # a photograph; another PNG has no band
+                return colour_bands(stored) if suffix_format(path) == "JPEG" else ()
+            # A number in the name of a picture is not a band. Of three equal channels, the first is read.
+            name = self.split(path)[1]
+            return (replace(stored[0], name=name, wavelength_nm=_wavelength_in(name)),)
         if len(stored) > 1:
             listed = listed_bands(tags, stored)
             return tuple(replace(b, name=b.name or b.colour or f"band_{b.band_index}") for b in listed)
@@ -46,16 +50,6 @@ class Generic(Camera):
         (band,) = stored
         name = band.name or own_name or f"band_{band.band_index}"
         return (replace(band, name=name, wavelength_nm=band.wavelength_nm or file_wavelength_nm),)
-
-    def _picture_bands(self, path: Path, stored: Sequence[Band]) -> tuple[Band, ...]:
-        """One band if the file name is that of a band, else the colours of a JPEG; none of another PNG.
-
-        A number in the name of a picture is not a band. If a band is stored as three equal channels, the first is read.
-        """
-        if self.is_named_as_band(path):
-            name = self.split(path)[1]
-            return (replace(stored[0], name=name, wavelength_nm=_wavelength_in(name)),)
-        return colour_bands(stored) if suffix_format(path) == "JPEG" else ()
 
     def is_named_as_band(self, path: Path) -> bool:
         """Return True for a picture with the name of a band, and not of a photograph."""

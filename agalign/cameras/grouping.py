@@ -22,7 +22,6 @@ from agalign.errors import InputError
 from agalign.pixels.raster import suffix_format
 from agalign.values.capture import Band, CameraIdentity, Capture, CaptureTime, Pose
 from agalign.values.files import RUN_FILE
-from agalign.values.pixel_units import SAME_PIXELS
 from agalign.values.text import counted
 
 _GroupKey = tuple[str, str, str]
@@ -97,28 +96,22 @@ def with_tags_of_flight(files: Sequence[ImageFile]) -> tuple[list[ImageFile], li
     return result, problems
 
 
-def lens_problems(files: Sequence[ImageFile]) -> list[Problem]:
-    """Return a problem for all files with tags of another lens or image size; it names the first of them."""
-    wrong = [file for file in files if file.other_lens]
-    if not wrong:
-        return []
-    others = f", and so in {counted(len(wrong) - 1, 'other file')}" if len(wrong) > 1 else ""
-    advice = "lens, rig and radiometry are not used: give the original images"
-    text = f"{wrong[0].path}: {wrong[0].other_lens}{others}; {advice}"
-    return [Problem(wrong[0].path, InputError(text), loses_nothing=True)]
-
-
-def list_problems(files: Iterable[ImageFile]) -> list[Problem]:
-    """Return a problem for each multiband file with tags that list another number of names or wavelengths."""
-    result = []
+def tag_problems(files: Sequence[ImageFile]) -> list[Problem]:
+    """Return a problem for each multiband file with tags that list another number of names or wavelengths, and one for
+    all files with tags of another lens or image size, which names the first of them.
+    """
+    texts: dict[Path, str] = {}
     for file in files:
         names, wavelengths = len(listed_names(file.tags)), len(file.tags.numbers(NAMESPACE, "CentralWavelength"))
         bands = len(file.bands)
         if file.is_whole_capture and isinstance(file.camera, Generic) and not {names, wavelengths} <= {0, bands}:
             counts = f"{counted(names, 'name')} and {counted(wavelengths, 'wavelength')} of bands"
-            text = f"{file.path}: has {bands} bands, and its tags list {counts}; lists of other lengths are not used"
-            result.append(Problem(file.path, InputError(text), loses_nothing=True))
-    return result
+            texts[file.path] = f"has {bands} bands, and its tags list {counts}; lists of other lengths are not used"
+    if wrong := [file for file in files if file.other_lens]:
+        others = f", and so in {counted(len(wrong) - 1, 'other file')}" if len(wrong) > 1 else ""
+        advice = "lens, rig and radiometry are not used: give the original images"
+        texts[wrong[0].path] = f"{wrong[0].other_lens}{others}; {advice}"
+    return [Problem(path, InputError(f"{path}: {text}"), loses_nothing=True) for path, text in texts.items()]
 
 
 def _similar(file: ImageFile) -> tuple[object, object]:
@@ -179,36 +172,22 @@ def _add_files_without_id(groups: dict[_GroupKey, list[ImageFile]]) -> None:
             by_name[key[0], key[1], name].append(key)
     cameras = {key[0]: group[0].camera for key, group in groups.items() if key[0] != Generic.name}
     for key in sorted(groups, key=lambda key: key[0] == Generic.name):
-        remaining = []
-        for file in groups[key]:
-            target = _group_for(file, key, groups, by_name, cameras.values())
-            if target is None:
-                remaining.append(file)
+        for file in list(groups[key]):
+            if key[0] != Generic.name:
+                names = [] if file.is_whole_capture else [key]
+            elif file.tags.make or file.tags.xmp or len(file.bands) != 1 or not _is_tiff(file):
+                names = []
             else:
-                groups[target].append(_with_camera(file, groups[target][0].camera))
-                groups[target].sort(key=lambda f: natural_order(f.path.name))
-        if remaining:
-            groups[key] = remaining
-        else:
+                of_cameras = [(name, key[1], camera.capture_name(file.path)) for name, camera in cameras.items()]
+                names = [name for name in of_cameras if name[2] != file.path.stem]
+            targets = [k for name in names for k in by_name.get(name, ()) if k in groups and k != key]
+            if len(targets) == 1 or (targets and key[0] != Generic.name):
+                groups[key].remove(file)
+                joined = groups[targets[0]]
+                joined.append(_with_camera(file, joined[0].camera))
+                joined.sort(key=lambda f: natural_order(f.path.name))
+        if not groups[key]:
             del groups[key]
-
-
-def _group_for(
-    file: ImageFile,
-    key: _GroupKey,
-    groups: Mapping[_GroupKey, list[ImageFile]],
-    by_name: Mapping[_GroupKey, list[_GroupKey]],
-    cameras: Iterable[Camera],
-) -> _GroupKey | None:
-    """The other group that a file without a capture id belongs to by its name, if there is one."""
-    if key[0] != Generic.name:
-        keys = [] if file.is_whole_capture else by_name.get(key, [])
-        return next((k for k in keys if k in groups and k != key), None)
-    if file.tags.make or file.tags.xmp or len(file.bands) != 1 or not _is_tiff(file):
-        return None
-    names = [(camera.name, key[1], camera.capture_name(file.path)) for camera in cameras]
-    keys = [k for name in names if name[2] != file.path.stem for k in by_name.get(name, ()) if k in groups]
-    return keys[0] if len(keys) == 1 else None
 
 
 def _with_camera(file: ImageFile, camera: Camera) -> ImageFile:
@@ -249,11 +228,8 @@ def pattern_clashes(files: Sequence[ImageFile], pattern: str) -> list[Problem]:
     for file in files:
         for name in {b.name for b in file.bands}:
             if first.setdefault(name, file.path) != file.path:
-                text = (
-                    f"{file.path}: is band '{name}' of one capture with {first[name].name} by the pattern "
-                    f"'{pattern}'; give one that distinguishes them"
-                )
-                result.append(Problem(file.path, InputError(text)))
+                what = f"is band '{name}' of one capture with {first[name].name} by the pattern '{pattern}'"
+                result.append(Problem(file.path, InputError(f"{file.path}: {what}; give one that distinguishes them")))
     return result
 
 
@@ -295,7 +271,7 @@ def capture_of(files: Sequence[ImageFile], folder: Path, options: DiscoverOption
 def _pose(camera: Camera, tags: Tags, file: ImageFile) -> Pose | None:
     """The pose by the tags of a file, with the focal length in pixels of its image."""
     pose = camera.pose(tags)
-    if pose is None or pose.focal_length_px is None or not (file.other_lens or file.scale != SAME_PIXELS):
+    if pose is None or pose.focal_length_px is None:
         return pose
     return replace(pose, focal_length_px=None if file.other_lens else pose.focal_length_px * file.scale.mean)
 
@@ -366,16 +342,13 @@ def _cameras(captures: Sequence[Capture]) -> list[_CameraKey]:
         sharing = [known for known in same_model if known & own]
         if own:
             same_model[:] = [known for known in same_model if not known & own] + [own.union(*sharing)]
-    return [_camera_of(c, cameras[c.camera.make, c.camera.model]) for c in captures]
-
-
-def _camera_of(capture: Capture, same_model: Sequence[set[str]]) -> _CameraKey:
-    camera = capture.camera
-    if not camera.model:
-        return (capture.folder.as_posix(),)
-    own = _serials(camera)
-    known = [serials for serials in same_model if serials & own or (not own and len(same_model) == 1)]
-    return (camera.make, camera.model, *sorted(known[0] if known else own))
+    keys: list[_CameraKey] = []
+    for capture in captures:
+        make, model, own = capture.camera.make, capture.camera.model, _serials(capture.camera)
+        same_model = cameras[make, model]
+        known = [serials for serials in same_model if serials & own or (not own and len(same_model) == 1)]
+        keys.append((make, model, *sorted(known[0] if known else own)) if model else (capture.folder.as_posix(),))
+    return keys
 
 
 def _serials(camera: CameraIdentity) -> set[str]:

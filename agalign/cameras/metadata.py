@@ -61,15 +61,6 @@ class Tags:
         return next(iter(self.numbers(namespace, name)), None)
 
     @property
-    def pixels_per_mm(self) -> float | None:
-        """Pixels per mm of the focal plane, from EXIF FocalPlaneXResolution and its unit."""
-        resolution = finite(self.exif.get("FocalPlaneXResolution"))
-        unit = self.exif.get("FocalPlaneResolutionUnit", 2)
-        mm_per_unit = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}  # inch, cm, mm, micrometre
-        mm = mm_per_unit.get(int(unit)) if isinstance(unit, int) else None
-        return resolution / mm if resolution and mm else None
-
-    @property
     def camera_size_px(self) -> tuple[int, int] | None:
         """(width, height) of the image that the camera wrote, by EXIF; programs that resize images keep these tags."""
         return _size(self.exif, "ExifImageWidth", "ExifImageHeight")
@@ -96,9 +87,8 @@ def read_tags(path: Path, page: int = 0) -> Tags:
         directories = read_directories(path, page)
     except Exception as error:  # damaged files cause struct.error, KeyError, MemoryError … in the libraries
         kind = suffix_format(path) or "TIFF"
-        raise UnreadableFileError(
-            f"{path}: not a readable {kind} ({error or 'empty'}); copy it from the card again"
-        ) from None
+        what = f"not a readable {kind} ({error or 'empty'})"
+        raise UnreadableFileError(f"{path}: {what}; copy it from the card again") from None
     first, exif, gps = (
         {names.get(tag, str(tag)): values(entry) for tag, entry in directories[key].items()}
         for key, names in ((0, ExifTags.TAGS), (EXIF, ExifTags.TAGS), (GPS, ExifTags.GPSTAGS))

@@ -27,10 +27,9 @@ from numpy.typing import NDArray
 from agalign.cameras import pix4d
 from agalign.cameras.base import FULL_SCALE, Camera, is_thermal, rays_to_rig, rotation
 from agalign.cameras.metadata import Tags, finite
-from agalign.cameras.xmp import Packet, names_in
 from agalign.values.capture import Band, CaptureTime, Pose, Position, Radiometry
 
-_MICASENSE, _DLS = "micasense.com/MicaSense", "micasense.com/DLS"
+NAMESPACE, _DLS = "micasense.com/MicaSense", "micasense.com/DLS"
 _REDEDGE_M_PARALLAX = {
     "Blue": (-0.9, 0.0),
     "Green": (0.0, 0.0),
@@ -43,38 +42,24 @@ ground decreases. Two flights with two cameras agree within 5 %.
 """
 
 
-class _TagTransfer(pix4d.TagTransfer):
-    radiometry = pix4d.TagTransfer.radiometry | names_in(_MICASENSE, "RadiometricCalibration DarkRowValue")
-
-    def put_radiometry(
-        self, packet: Packet, tags: Tags, vignetting: pix4d.GridVignetting | None, *, radiometry: bool
-    ) -> None:
-        """Also add the horizontal irradiance under the names that OpenDroneMap reads, with its unit."""
-        super().put_radiometry(packet, tags, vignetting, radiometry=radiometry)
-        irradiance = None if radiometry else _irradiance(tags)
-        if irradiance is not None:
-            packet.add((pix4d.NAMESPACE, "HorizontalIrradiance"), pix4d.number_text(irradiance[0]))
-            packet.add((pix4d.NAMESPACE, "IrradianceScaleToSIUnits"), pix4d.number_text(irradiance[1]))
-
-
 class MicaSense(Camera):
     """The MicaSense family."""
 
     name = "MicaSense"
-    capture_ids = ((_MICASENSE, "CaptureId"),)
-    flight_ids = ((_MICASENSE, "FlightId"),)
+    capture_ids = ((NAMESPACE, "CaptureId"),)
+    flight_ids = ((NAMESPACE, "FlightId"),)
+    band_in_name = re.compile(r"_\d+$")
     clock_is_utc = True
-    tag_transfer = _TagTransfer()
 
     def recognises(self, tags: Tags) -> bool:
-        return tags.make.lower() == "micasense" or (_MICASENSE, "CaptureId") in tags.xmp
+        return tags.make.lower() == "micasense" or (NAMESPACE, "CaptureId") in tags.xmp
 
     def bands(self, path: Path, tags: Tags, stored: Sequence[Band]) -> tuple[Band, ...]:
-        name = tags.text(pix4d.NAMESPACE, "BandName") or _index_in_name(path) or path.stem
-        band = replace(pix4d.with_wavelength(stored[0], tags), name=name)
+        numbered = self.band_in_name.search(path.stem)
+        band = pix4d.described(stored[0], tags, f"band{numbered[0]}" if numbered else path.stem)
         lens = pix4d.perspective_lens(tags)
         offset = pix4d.lens_offset(tags)
-        known_parallax = _REDEDGE_M_PARALLAX.get(name) if tags.model == "RedEdge-M" else None
+        known_parallax = _REDEDGE_M_PARALLAX.get(band.name) if tags.model == "RedEdge-M" else None
         centikelvin = Radiometry("temperature", 27315.0, 1.0, 0.01)  # in agreement with the Altum's SceneTemperature
         max_twelve_bit_value = 65520.0  # stored in the upper bits of uint16
         band = replace(
@@ -94,20 +79,17 @@ class MicaSense(Camera):
         by_sensor = Pose(*_sensor_attitude_deg(tags), focal_length_px=pix4d.focal_length_px(tags))
         return pix4d.pose_of(tags) or (None if tags.number(_DLS, "Yaw") is None else by_sensor)
 
-    def capture_name(self, path: Path) -> str:
-        return re.sub(r"_\d+$", "", path.stem)
-
 
 def _radiometry(tags: Tags) -> Radiometry | None:
     """L = V a1 / g (p - p_black) / (t + a2 y - a3 t y) with p = raw / 65536, vignetting V, gain g = ISO / 100, exposure
     time t and row y; reflectance = pi L / E with the irradiance E of the light sensor on a horizontal plane.
     """
-    a = tags.numbers(_MICASENSE, "RadiometricCalibration")
+    a = tags.numbers(NAMESPACE, "RadiometricCalibration")
     exposure_s = finite(tags.exif.get("ExposureTime"))
     iso = finite(tags.exif.get("ISOSpeed", tags.exif.get("ISOSpeedRatings")))
     if len(a) != 3 or not exposure_s or tags.black_level is None or not iso:
         return None
-    irradiance = _irradiance(tags)
+    by_sensor = irradiance(tags)
     centre, k = tags.numbers(pix4d.NAMESPACE, "VignettingCenter"), tags.numbers(pix4d.NAMESPACE, "VignettingPolynomial")
     has_vignetting = len(centre) == 2
     return Radiometry(
@@ -119,7 +101,7 @@ def _radiometry(tags: Tags) -> Radiometry | None:
         k if has_vignetting else (),
         True,
         a[1] / exposure_s - a[2],
-        (math.pi / math.prod(irradiance), "reflectance") if irradiance else None,
+        (math.pi / math.prod(by_sensor), "reflectance") if by_sensor else None,
         tags={"calibration coefficient": a[0], "sensor gain": iso / 100, "exposure time (s)": exposure_s},
     )
 
@@ -127,7 +109,7 @@ def _radiometry(tags: Tags) -> Radiometry | None:
 def _without_calibration(tags: Tags) -> str:
     """The tags that radiance needs and the file lacks, in words; empty if it lacks none."""
     has = {
-        "RadiometricCalibration": tags.text(_MICASENSE, "RadiometricCalibration"),
+        "RadiometricCalibration": tags.text(NAMESPACE, "RadiometricCalibration"),
         "ExposureTime": tags.exif.get("ExposureTime"),
         "ISOSpeed": tags.exif.get("ISOSpeed", tags.exif.get("ISOSpeedRatings")),
         "BlackLevel": tags.black_level is not None,
@@ -136,8 +118,8 @@ def _without_calibration(tags: Tags) -> str:
     return f"no tag {', '.join(missing)} for radiance" if missing else ""
 
 
-def _irradiance(tags: Tags) -> tuple[float, float] | None:
-    """(irradiance on a horizontal plane in the unit of the tags, this unit in W / m^2 / nm); None if there is no
+def irradiance(tags: Tags) -> tuple[float, float] | None:
+    """Return (irradiance on a horizontal plane in the unit of the tags, this unit in W / m^2 / nm); None if there is no
     plausible one.
 
     Older sensors measure only in their own plane: the time, the place and the attitude then give the horizontal one.
@@ -174,11 +156,6 @@ def _sensor_attitude_deg(tags: Tags) -> tuple[float, float, float]:
     """(yaw, pitch, roll) of the light sensor; zeros if they are missing, as in MicaSense's library."""
     yaw, pitch, roll = (math.degrees(tags.number(_DLS, name) or 0.0) for name in ("Yaw", "Pitch", "Roll"))
     return yaw, pitch, roll
-
-
-def _index_in_name(path: Path) -> str:
-    match = re.search(r"_(\d+)$", path.stem)
-    return f"band_{match.group(1)}" if match else ""
 
 
 # ---- the light sensor

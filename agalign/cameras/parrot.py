@@ -18,34 +18,10 @@ import numpy as np
 from agalign.cameras import pix4d
 from agalign.cameras.base import Camera, colour_bands, rays_to_rig, rotation
 from agalign.cameras.metadata import Tags
-from agalign.cameras.xmp import Packet, names_in
 from agalign.values.capture import Band
 from agalign.values.geometry import Matrix
-from agalign.values.image import OutputGrid
 from agalign.values.lens import Lens, radial_coefficients
 from agalign.values.pixel_units import Size
-
-_SUFFIX = re.compile(r"_(GRE|RED|REG|NIR|RGB)$", re.IGNORECASE)
-
-
-class _TagTransfer(pix4d.TagTransfer):
-    fisheye = names_in(pix4d.NAMESPACE, "FisheyePolynomial FisheyeAffineMatrix FisheyeAffineSymmetric")
-    geometry = pix4d.TagTransfer.geometry | fisheye
-    in_px = names_in(pix4d.NAMESPACE, "FisheyeAffineMatrix")
-    principal_point_follows_orientation = True
-
-    def put_geometry(
-        self, packet: Packet, reference_packet: Packet, reference: Band, tags: Tags, grid: OutputGrid
-    ) -> None:
-        super().put_geometry(packet, reference_packet, reference, tags, grid)
-        density = pix4d.pixels_per_mm(tags)
-        is_fisheye = bool(tags.numbers(pix4d.NAMESPACE, "FisheyeAffineMatrix"))
-        if grid.undistorted and is_fisheye and density and reference.lens is not None:
-            # The undistorted image is that of a pinhole camera.
-            packet.remove(self.fisheye)
-            packet.put((pix4d.NAMESPACE, "ModelType"), ["perspective"])
-            packet.add((pix4d.NAMESPACE, "PerspectiveFocalLength"), pix4d.number_text(reference.lens.fx_px / density))
-            packet.add((pix4d.NAMESPACE, "PerspectiveFocalLengthUnits"), "mm")
 
 
 class Sequoia(Camera):
@@ -54,7 +30,7 @@ class Sequoia(Camera):
     name = "Parrot Sequoia"
     capture_ids = ((pix4d.NAMESPACE, "CaptureUUID"),)
     flight_ids = ((pix4d.NAMESPACE, "FlightUUID"),)
-    tag_transfer = _TagTransfer()
+    band_in_name = re.compile(r"_(GRE|RED|REG|NIR|RGB)$", re.IGNORECASE)
 
     def recognises(self, tags: Tags) -> bool:
         return tags.make.lower() == "parrot" or tags.text(pix4d.NAMESPACE, "RigName").lower().startswith("sequoia")
@@ -63,22 +39,19 @@ class Sequoia(Camera):
         fisheye = "fisheye" in tags.text(pix4d.NAMESPACE, "ModelType").lower()
         lens = _fisheye_lens(tags, stored[0].size_px) if fisheye else pix4d.perspective_lens(tags)
         to_camera = np.eye(3)
-        if self.tag_transfer.is_rotated(tags):
+        if tags.orientation == 3:
             lens, to_camera = lens and _upside_down(lens, stored[0].size_px), np.diag([-1.0, -1.0, 1.0])
         to_rig = rays_to_rig(lens, rotation(*pix4d.rig_degrees(tags)) @ to_camera)
         if len(stored) > 1:
             return colour_bands(stored, lens, to_rig)
-        suffix = _SUFFIX.search(path.stem)
+        suffix = self.band_in_name.search(path.stem)
         names = {"GRE": "Green", "RED": "Red", "REG": "Red edge", "NIR": "NIR"}
-        named_by_tag = tags.text(pix4d.NAMESPACE, "BandName") or path.stem
-        name = names.get(suffix[1].upper(), suffix[1]) if suffix else named_by_tag
-        band = replace(pix4d.with_wavelength(stored[0], tags), name=name, lens=lens, to_rig=to_rig)
+        described = pix4d.described(stored[0], tags, path.stem)
+        name = names.get(suffix[1].upper(), suffix[1]) if suffix else described.name
+        band = replace(described, name=name, lens=lens, to_rig=to_rig)
         # Parrot's formula for them has not been compared with a reference.
         why = "no tags for radiance (SensorModel and IrradianceList are not used)"
         return (replace(band, uncalibrated=why if tags.text(pix4d.NAMESPACE, "SensorModel") else ""),)
-
-    def capture_name(self, path: Path) -> str:
-        return _SUFFIX.sub("", path.stem)
 
 
 def _fisheye_lens(tags: Tags, size_px: Size) -> Lens | None:

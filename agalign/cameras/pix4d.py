@@ -1,26 +1,18 @@
-"""The XMP tags that most makers share, defined by Pix4D: lens, rig, band, vignetting and panel.
-
-`TagTransfer` converts them for a band that is written on the reference's grid; vendors with other tags subclass it.
-"""
+"""The XMP tags that most makers share, defined by Pix4D: lens, rig, band, vignetting and panel."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from agalign.cameras.metadata import Tags
-from agalign.cameras.xmp import Name, Packet, names_in
+from agalign.cameras.metadata import Tags, finite
 from agalign.pixels.radiometry import plausible
 from agalign.values.capture import Band, Panel, Pose, Radiometry
 from agalign.values.geometry import Points
-from agalign.values.image import OutputGrid
 from agalign.values.lens import Lens
 
 NAMESPACE = "pix4d.com"
 """Contains `pix4d.com/camera/1.0`, and `pix4d.com/1.0` of older firmware."""
-
-
-# ---- reading
 
 
 def perspective_lens(tags: Tags) -> Lens | None:
@@ -46,8 +38,10 @@ def pixels_per_mm(tags: Tags) -> float | None:
     """Return EXIF's resolution of the focal plane, else the ratio of the focal length in px to EXIF's in mm, else, as
     in files without EXIF, that with the principal point in the middle of the image.
     """
-    if tags.pixels_per_mm:
-        return tags.pixels_per_mm
+    resolution, unit = finite(tags.exif.get("FocalPlaneXResolution")), tags.exif.get("FocalPlaneResolutionUnit", 2)
+    mm_per_unit = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}.get(unit)  # inch, cm, mm, micrometre
+    if resolution and mm_per_unit:
+        return resolution / mm_per_unit
     focal_px = tags.number(NAMESPACE, "PerspectiveFocalLength") if focal_length_is_in_px(tags) else None
     if focal_px and tags.focal_length_mm:
         return focal_px / tags.focal_length_mm
@@ -98,10 +92,11 @@ def rig_unit_m(bands: Iterable[Band]) -> float:
     return 1.0 if max(offsets, default=0.0) < max_offset_m else 1e-3
 
 
-def with_wavelength(band: Band, tags: Tags) -> Band:
-    """Return the band with the centre wavelength and bandwidth in its tags, nm."""
+def described(band: Band, tags: Tags, name: str) -> Band:
+    """Return the band with the name in its tags, else `name`, and the centre wavelength and bandwidth in them, nm."""
     return replace(
         band,
+        name=tags.text(NAMESPACE, "BandName") or name,
         wavelength_nm=tags.number(NAMESPACE, "CentralWavelength"),
         bandwidth_nm=tags.number(NAMESPACE, "WavelengthFWHM"),
     )
@@ -163,7 +158,7 @@ def _panel_corners(tags: Tags, size_px: tuple[int, int]) -> tuple[tuple[float, f
     return corners if inside and len(set(corners)) == len(corners) else ()
 
 
-# ---- writing on the reference's grid
+# ---- vignetting
 
 
 @dataclass(frozen=True)
@@ -207,83 +202,8 @@ def vignetting_on_grid(vignetting: Radiometry, output_px: Points, positions_px: 
     return GridVignetting((centre_px[0], centre_px[1]), tuple((k / r.max() ** exponents).tolist()), error)
 
 
-class TagTransfer:
-    """Conversion of XMP values for a band that is written on the reference's grid."""
-
-    geometry: frozenset[Name] = names_in(
-        NAMESPACE,
-        "PrincipalPoint PerspectiveFocalLength PerspectiveFocalLengthUnits PerspectiveDistortion ModelType "
-        "RigRelatives RigRelativesReferenceRigCameraIndex RigTranslations",
-    )
-    """Values of lens and rig, which are replaced by those of the reference."""
-    sensor_only: frozenset[Name] = names_in(NAMESPACE, "InvalidPixel VignettingPolynomial2D VignettingPolynomial2DName")
-    """Values that refer to the sensor's own pixels and are removed."""
-    radiometry: frozenset[Name] = names_in(NAMESPACE, "VignettingCenter VignettingPolynomial BlackCurrent")
-    """Values of corrections that have been applied to the pixels if radiance or reflectance is written."""
-    in_px: frozenset[Name] = frozenset()
-    """Lengths in px, which are multiplied by the scale of the output."""
-    principal_point_follows_orientation = False
-    """True if the principal point refers to the image after EXIF's Orientation is applied."""
-
-    def put_geometry(
-        self, packet: Packet, reference_packet: Packet, reference: Band, tags: Tags, grid: OutputGrid
-    ) -> None:
-        """Replace a band's geometry in `packet` by that of the reference on a grid. `reference_packet` and `tags` are
-        those of the reference's file.
-
-        The rig becomes zero: software that reads it would otherwise align the bands a second time.
-        """
-        packet.take(reference_packet, self.geometry)
-        packet.remove(self.sensor_only)
-        for name in ("RigRelatives", "RigTranslations"):
-            packet.put((NAMESPACE, name), ["0", "0", "0"])
-        self._put_principal_point(packet, reference, tags, grid)
-        focal_length = names_in(NAMESPACE, "PerspectiveFocalLength" if focal_length_is_in_px(tags) else "")
-        for length in self.in_px | focal_length:
-            values = tags.numbers(*length)
-            if values and grid.scale.mean != 1:
-                packet.put(length, [number_text(v * grid.scale.mean) for v in values])
-        if grid.undistorted:
-            distortion = NAMESPACE, "PerspectiveDistortion"
-            packet.put(distortion, ["0"] * len(tags.numbers(*distortion)))
-
-    def _put_principal_point(self, packet: Packet, reference: Band, tags: Tags, grid: OutputGrid) -> None:
-        point_px, density = principal_point_px(tags), pixels_per_mm(tags)
-        if point_px is None or density is None:
-            return
-        if self.is_rotated(tags):
-            stored = rotated_180(point_px, reference.size_px)
-            point_px = rotated_180(grid.px(*stored), (grid.width, grid.height))
-        else:
-            point_px = grid.px(*point_px)
-        packet.put((NAMESPACE, "PrincipalPoint"), [number_text(v / (density * grid.scale.mean)) for v in point_px])
-
-    def put_radiometry(
-        self, packet: Packet, tags: Tags, vignetting: GridVignetting | None, *, radiometry: bool
-    ) -> None:
-        """Replace the vignetting; `tags` are the band's own. None removes it, and `radiometry` also the other values
-        that have been applied to the pixels.
-        """
-        if radiometry:
-            packet.remove(self.radiometry)
-        elif vignetting is None:
-            packet.remove(names_in(NAMESPACE, "VignettingCenter VignettingPolynomial"))
-        else:
-            packet.put((NAMESPACE, "VignettingCenter"), [number_text(v) for v in vignetting.centre_px])
-            packet.put((NAMESPACE, "VignettingPolynomial"), [f"{v:.9e}" for v in vignetting.coefficients])
-
-    def is_rotated(self, tags: Tags) -> bool:
-        """Return True if the principal point refers to the image rotated by 180 degrees: Orientation 3 of Exif."""
-        return self.principal_point_follows_orientation and tags.orientation == 3
-
-
 def rotated_180(point_px: Sequence[float], size_px: tuple[int, int]) -> tuple[float, float]:
     """Return a pixel (x, y) of an image (width, height) in the image rotated by 180 degrees; (0, 0) is the centre of
     the top-left pixel.
     """
     return size_px[0] - 1 - point_px[0], size_px[1] - 1 - point_px[1]
-
-
-def number_text(value: float) -> str:
-    """Return a number as text for a tag."""
-    return f"{value:.10g}"

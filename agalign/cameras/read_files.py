@@ -67,24 +67,22 @@ class ImageFile:
 
 def read_files(paths: Sequence[Path], options: DiscoverOptions) -> Iterator[ImageFile | Problem]:
     """Yield each file with its bands, or the reason why it cannot be used, in the order of `paths`."""
-    tasks = [paths[i : i + _FILES_PER_TASK] for i in range(0, len(paths), _FILES_PER_TASK)]
-    processes = min(options.jobs, len(tasks))
-    if processes > 1 and len(paths) >= _MIN_FILES_FOR_PROCESSES:
-        yield from _read_in_processes(tasks, options, processes)
-        return
-    for task in tasks:
-        yield from _read_task(task, options)
+    if options.jobs > 1 and len(paths) >= _MIN_FILES_FOR_PROCESSES:
+        yield from _read_in_processes(paths, options)
+    else:
+        yield from _read_task(paths, options)
 
 
 def read_file(path: Path, cameras: Iterable[Camera], options: DiscoverOptions) -> ImageFile:
     """Return a file with its bands. Raises UnreadableFileError."""
     pages = _stored_pages(path, options.max_pixels)
-    stored = pages[0]
+    stored, size_px = pages[0], pages[0][0].size_px
     tags = read_tags(path, stored[0].page)
     # A stack was made by software, even if its tags name a camera: cameras write single bands and photographs.
+    is_photograph = stored[0].dtype == "uint8" and len(stored) in (3, 4)
+    is_stack = suffix_format(path) == "TIFF" and len(stored) > 1 and not is_photograph
     *_, generic = cameras
-    camera = generic if _is_stack(stored) else next(c for c in cameras if c.recognises(tags))
-    panel = panel_in(tags, stored[0].size_px)
+    camera = generic if is_stack else next(c for c in cameras if c.recognises(tags))
     named = list(camera.bands(path, tags, stored))
     for page in pages[1:]:
         named += camera.bands(path, read_tags(path, page[0].page), page)
@@ -93,17 +91,11 @@ def read_file(path: Path, cameras: Iterable[Camera], options: DiscoverOptions) -
         raise UnreadableFileError(f"{path}: {what}; write each page to a file of its own (tiffsplit)")
     if len(pages) > 1:
         named = [replace(band, band_index=band.page) for band in named]
-    bands = [replace(b, panel=panel) for b in named if options.with_rgb or not b.companion]
-    scale, other_lens = _scale(tags, stored[0].size_px), ""
-    for i, band in enumerate(bands):
-        rescaled_band, why = _with_lens_of_image(band, scale)
-        other_lens = other_lens or why
-        if rescaled_band.radiometry is not None:
-            radiometry, problem = plausible(rescaled_band.radiometry, band.size_px)
-            reason = f"no usable tags for radiance ({problem})" if radiometry is None else ""
-            rescaled_band = replace(rescaled_band, radiometry=radiometry, implausible=problem, uncalibrated=reason)
-        bands[i] = rescaled_band
-    return ImageFile(path, camera, tags, tuple(bands), scale, other_lens)
+    panel, scale = panel_in(tags, size_px), _scale(tags, size_px)
+    used = (replace(b, panel=panel) for b in named if options.with_rgb or not b.companion)
+    checked = [_with_lens_of_image(band, scale) for band in used]
+    other_lens = next((why for _, why in checked if why), "")
+    return ImageFile(path, camera, tags, tuple(_with_plausible_tags(band) for band, _ in checked), scale, other_lens)
 
 
 def _scale(tags: Tags, size_px: Size) -> PixelScale:
@@ -133,6 +125,15 @@ def _with_lens_of_image(band: Band, scale: PixelScale) -> tuple[Band, str]:
     return band, why
 
 
+def _with_plausible_tags(band: Band) -> Band:
+    """The band without a calibration, or its factor to reflectance, by implausible tags."""
+    if band.radiometry is None:
+        return band
+    radiometry, problem = plausible(band.radiometry, band.size_px)
+    reason = f"no usable tags for radiance ({problem})" if radiometry is None else ""
+    return replace(band, radiometry=radiometry, implausible=problem, uncalibrated=reason)
+
+
 def _stored_pages(path: Path, max_pixels: int) -> list[tuple[Band, ...]]:
     """Return the bands of each page with an image of full size; most files have one. Raises UnreadableFileError."""
     first, numbers = probe(path, max_pixels), [1]
@@ -146,9 +147,9 @@ def _stored_pages(path: Path, max_pixels: int) -> list[tuple[Band, ...]]:
     return [page for page in pages if page[0].size_px == largest_px]
 
 
-def _read_in_processes(
-    tasks: Sequence[Sequence[Path]], options: DiscoverOptions, processes: int
-) -> Iterator[ImageFile | Problem]:
+def _read_in_processes(paths: Sequence[Path], options: DiscoverOptions) -> Iterator[ImageFile | Problem]:
+    tasks = [paths[i : i + _FILES_PER_TASK] for i in range(0, len(paths), _FILES_PER_TASK)]
+    processes = min(options.jobs, len(tasks))
     # Not forked: a fork would copy locks that are held by threads of the calling program.
     with environment_of_children(threads=1), ProcessPool(processes, get_context("spawn")) as pool:
         futures = [pool.submit(_read_task, task, options) for task in tasks]
@@ -160,7 +161,7 @@ def _read_in_processes(
                 yield from (Problem(path, UnreadableFileError(f"{path}: {what}")) for path in task)
 
 
-def _read_task(paths: Sequence[Path], options: DiscoverOptions) -> list[ImageFile | Problem]:
+def _read_task(paths: Iterable[Path], options: DiscoverOptions) -> list[ImageFile | Problem]:
     cameras = known_cameras(options.pattern)
     result: list[ImageFile | Problem] = []
     for path in paths:
@@ -169,11 +170,6 @@ def _read_task(paths: Sequence[Path], options: DiscoverOptions) -> list[ImageFil
         except UnreadableFileError as error:
             result.append(Problem(path, error))
     return result
-
-
-def _is_stack(stored: Sequence[Band]) -> bool:
-    photograph = stored[0].dtype == "uint8" and len(stored) in (3, 4)
-    return suffix_format(stored[0].path) == "TIFF" and len(stored) > 1 and not photograph
 
 
 def natural_order(name: str) -> list[tuple[bool, int, str]]:

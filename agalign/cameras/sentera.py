@@ -29,6 +29,7 @@ class Sentera(Camera):
     name = "Sentera"
     capture_ids = ((pix4d.NAMESPACE, "CaptureUUID"), (_SENTERA, "CaptureUUID"), (_SENTERA, "ImageUniqueID"))
     flight_ids = ((pix4d.NAMESPACE, "FlightUUID"), (_SENTERA, "FlightUUID"), (_SENTERA, "FlightUniqueID"))
+    band_in_name = re.compile(r"_\d{3}_\d{2,3}$")
 
     def recognises(self, tags: Tags) -> bool:
         return "sentera" in tags.make.lower() or any(namespace == _SENTERA for namespace, _ in tags.xmp)
@@ -39,8 +40,7 @@ class Sentera(Camera):
         matrix = tags.numbers(_SENTERA, "AlignMatrix")
         to_rig = np.array(matrix).reshape(3, 3) if len(matrix) == 9 else None
         folder = _BAND_FOLDER.match(path.parent.name)
-        name = tags.text(pix4d.NAMESPACE, "BandName") or (folder["name"] if folder else path.stem)
-        band = replace(pix4d.with_wavelength(stored[0], tags), name=name)
+        band = pix4d.described(stored[0], tags, folder["name"] if folder else path.stem)
         if folder and band.wavelength_nm is None:
             width = float(folder["width"]) if folder["width"] else None
             band = replace(band, wavelength_nm=float(folder["wavelength"]), bandwidth_nm=width)
@@ -56,9 +56,6 @@ class Sentera(Camera):
             r"^(?:\d+-)?(?:n?RGB|NDRE|NDVI|NIR|RE|LWIR)$", folder.name, re.IGNORECASE
         )
         return folder.parent if named else folder
-
-    def capture_name(self, path: Path) -> str:
-        return re.sub(r"_\d{3}_\d{2,3}$", "", path.stem)
 
 
 def _channel_bands(path: Path, tags: Tags, stored: Sequence[Band]) -> tuple[Band, ...]:

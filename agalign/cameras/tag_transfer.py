@@ -4,12 +4,12 @@ input file, with the lens and rig of the reference instead of the band's own.
 
 from collections.abc import Iterable
 from contextlib import suppress
-from dataclasses import dataclass
 
 from PIL.ExifTags import Base
 
-from agalign.cameras import camera_of
-from agalign.cameras.metadata import finite, read_tags
+from agalign.cameras import camera_of, dji, micasense, pix4d
+from agalign.cameras.metadata import Tags, finite, read_tags
+from agalign.cameras.parrot import Sequoia
 from agalign.cameras.pix4d import GridVignetting
 from agalign.cameras.tiff_directory import (
     EXIF,
@@ -22,7 +22,7 @@ from agalign.cameras.tiff_directory import (
     read_directories,
     values,
 )
-from agalign.cameras.xmp import Packet
+from agalign.cameras.xmp import Name, Packet
 from agalign.errors import UnreadableFileError
 from agalign.values.capture import Band
 from agalign.values.image import OutputGrid
@@ -38,13 +38,30 @@ _GEOMETRIC_EXIF: set[int] = {
 }
 
 
-@dataclass(frozen=True)
-class TransferredTags:
-    """Entries for the first, the Exif and the GPS directory of an aligned file."""
+def _names(of_pix4d: str, of_dji: str = "", of_micasense: str = "") -> frozenset[Name]:
+    """Return the names, separated by spaces, in the namespaces of Pix4D, DJI and MicaSense."""
+    texts = {pix4d.NAMESPACE: of_pix4d, dji.NAMESPACE: of_dji, micasense.NAMESPACE: of_micasense}
+    return frozenset((namespace, name) for namespace, text in texts.items() for name in text.split())
 
-    first: Directory
-    exif: Directory
-    gps: Directory
+
+_IN_PX = _names("FisheyeAffineMatrix", "CalibratedFocalLength RelativeOpticalCenterX RelativeOpticalCenterY")
+"""Lengths in px, which are multiplied by the scale of the output."""
+_FISHEYE = _names("FisheyePolynomial FisheyeAffineMatrix FisheyeAffineSymmetric")
+_GEOMETRY = (
+    _IN_PX
+    | _FISHEYE
+    | _names("PrincipalPoint PerspectiveFocalLength PerspectiveFocalLengthUnits PerspectiveDistortion ModelType")
+    | _names("RigRelatives RigRelativesReferenceRigCameraIndex RigTranslations", "DewarpData DewarpFlag DewarpHMatrix")
+    | _names("", "CalibratedOpticalCenterX CalibratedOpticalCenterY CalibratedHMatrix")
+)
+"""Values of lens and rig, which are replaced by those of the reference."""
+_SENSOR_ONLY = _names("InvalidPixel VignettingPolynomial2D VignettingPolynomial2DName", "VignettingData")
+"""Values that refer to the sensor's own pixels and are removed."""
+_VIGNETTING = _names("VignettingCenter VignettingPolynomial")
+_RADIOMETRY = _VIGNETTING | _names("BlackCurrent", "BlackLevel", "RadiometricCalibration DarkRowValue")
+"""Values of corrections that have been applied to the pixels if radiance or reflectance is written."""
+TransferredTags = tuple[Directory, Directory, Directory]
+"""Entries for the first, the Exif and the GPS directory of an aligned file."""
 
 
 def capture_tags(reference: Band, grid: OutputGrid) -> TransferredTags:
@@ -53,7 +70,7 @@ def capture_tags(reference: Band, grid: OutputGrid) -> TransferredTags:
     first = _some(source[0], _CAPTURE_TAGS | {Base.Orientation})
     times = {tag for tag in Base if tag.name.startswith(("DateTime", "OffsetTime", "SubsecTime"))}
     exif = _some(source[EXIF], times | {Base.ExifVersion, Base.BodySerialNumber, Base.LensModel})
-    return TransferredTags(first, _on_grid(exif, source[EXIF], grid), source[GPS])
+    return first, _on_grid(exif, source[EXIF], grid), source[GPS]
 
 
 def band_tags(
@@ -73,13 +90,85 @@ def band_tags(
     packet, reference_packet = (Packet.parse(d[0][XMP].data if XMP in d[0] else b"") for d in (own, of_reference))
     with suppress(UnreadableFileError):
         reference_tags, own_tags = (read_tags(band.path, band.page) for band in (reference, source))
-        transfer = camera_of(reference_tags).tag_transfer
-        transfer.put_geometry(packet, reference_packet, reference, reference_tags, grid)
-        transfer = camera_of(own_tags).tag_transfer
-        transfer.put_radiometry(packet, own_tags, vignetting, radiometry=radiometry)
+        packet.take(reference_packet, _GEOMETRY)
+        _put_geometry(packet, reference, reference_tags, grid)
+        _put_radiometry(packet, own_tags, vignetting, radiometry=radiometry)
         if serialised := packet.serialised():
             first[XMP] = byte_string(serialised)
-    return TransferredTags(first, _on_grid(exif, of_reference[EXIF], grid), own[GPS])
+    return first, _on_grid(exif, of_reference[EXIF], grid), own[GPS]
+
+
+def _put_geometry(packet: Packet, reference: Band, tags: Tags, grid: OutputGrid) -> None:
+    """Change the values of the reference, whose file has these `tags`, to those on a grid.
+
+    The rig becomes zero: software that reads it would otherwise align the bands a second time.
+    """
+    packet.remove(_SENSOR_ONLY)
+    for name in ("RigRelatives", "RigTranslations"):
+        packet.put((pix4d.NAMESPACE, name), ["0", "0", "0"])
+    _put_principal_point(packet, reference, tags, grid)
+    focal_length = _names("PerspectiveFocalLength" if pix4d.focal_length_is_in_px(tags) else "")
+    for length in _IN_PX | focal_length if grid.scale.mean != 1 else ():
+        if numbers := tags.numbers(*length):
+            packet.put(length, _texts(v * grid.scale.mean for v in numbers))
+    centre = dji.pair(tags, "CalibratedOpticalCenter")
+    for axis, value in zip("XY", () if centre is None else grid.px(*centre), strict=False):
+        packet.put((dji.NAMESPACE, f"CalibratedOpticalCenter{axis}"), _texts([value]))
+    date, terms = dji.dewarp_data(tags)
+    if terms:
+        scaled = [v * grid.scale.mean for v in terms[:4]] + [0.0 if grid.undistorted else v for v in terms[4:]]
+        packet.put((dji.NAMESPACE, "DewarpData"), [f"{date};" + ",".join(_texts(scaled))])
+    if grid.undistorted:
+        _put_pinhole(packet, reference, tags)
+
+
+def _put_pinhole(packet: Packet, reference: Band, tags: Tags) -> None:
+    """Change the lens to that of undistorted images: a pinhole camera, also for a fisheye."""
+    distortion = pix4d.NAMESPACE, "PerspectiveDistortion"
+    packet.put(distortion, ["0"] * len(tags.numbers(*distortion)))
+    packet.put((dji.NAMESPACE, "DewarpFlag"), ["1"])
+    density = pix4d.pixels_per_mm(tags)
+    if tags.numbers(pix4d.NAMESPACE, "FisheyeAffineMatrix") and density and reference.lens is not None:
+        packet.remove(_FISHEYE)
+        packet.put((pix4d.NAMESPACE, "ModelType"), ["perspective"])
+        packet.add((pix4d.NAMESPACE, "PerspectiveFocalLength"), *_texts([reference.lens.fx_px / density]))
+        packet.add((pix4d.NAMESPACE, "PerspectiveFocalLengthUnits"), "mm")
+
+
+def _put_principal_point(packet: Packet, reference: Band, tags: Tags, grid: OutputGrid) -> None:
+    point_px, density = pix4d.principal_point_px(tags), pix4d.pixels_per_mm(tags)
+    if point_px is None or density is None:
+        return
+    if isinstance(camera_of(tags), Sequoia) and tags.orientation == 3:
+        stored = pix4d.rotated_180(point_px, reference.size_px)
+        point_px = pix4d.rotated_180(grid.px(*stored), (grid.width, grid.height))
+    else:
+        point_px = grid.px(*point_px)
+    packet.put((pix4d.NAMESPACE, "PrincipalPoint"), _texts(v / (density * grid.scale.mean) for v in point_px))
+
+
+def _put_radiometry(packet: Packet, tags: Tags, vignetting: GridVignetting | None, *, radiometry: bool) -> None:
+    """Replace the vignetting; `tags` are the band's own. None removes it, and `radiometry` also the other values that
+    have been applied to the pixels.
+
+    The horizontal irradiance is added under the names that OpenDroneMap reads, with its unit.
+    """
+    if radiometry:
+        packet.remove(_RADIOMETRY)
+        return
+    if vignetting is None:
+        packet.remove(_VIGNETTING)
+    else:
+        packet.put((pix4d.NAMESPACE, "VignettingCenter"), _texts(vignetting.centre_px))
+        packet.put((pix4d.NAMESPACE, "VignettingPolynomial"), [f"{v:.9e}" for v in vignetting.coefficients])
+    irradiance = micasense.irradiance(tags) if isinstance(camera_of(tags), micasense.MicaSense) else None
+    names = "HorizontalIrradiance", "IrradianceScaleToSIUnits"
+    for name, text in zip(names, _texts(irradiance or ()), strict=False):
+        packet.add((pix4d.NAMESPACE, name), text)
+
+
+def _texts(numbers: Iterable[float]) -> list[str]:
+    return [f"{number:.10g}" for number in numbers]
 
 
 def _directories(band: Band) -> dict[int, Directory]:

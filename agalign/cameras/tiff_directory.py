@@ -11,8 +11,9 @@ from itertools import islice
 from pathlib import Path
 from typing import Any, BinaryIO
 
+import numpy as np
 from PIL import Image
-from tifffile import DATATYPE, TIFF
+from tifffile import DATATYPE, TIFF, TiffFormat
 
 from agalign.pixels.raster import suffix_format
 
@@ -21,6 +22,10 @@ EXIF, GPS = 34665, 34853
 XMP = 700
 _SIZE = {kind: struct.calcsize(f"<{numbers}") for kind, numbers in TIFF.DATA_FORMATS.items()}
 """Bytes of a value of each type."""
+_LAYOUTS = {b"II*\0": TIFF.CLASSIC_LE, b"MM\0*": TIFF.CLASSIC_BE, b"II+\0": TIFF.BIG_LE, b"MM\0+": TIFF.BIG_BE}
+"""The formats of the numbers of a file by its first bytes. The offset of its first directory follows at the position
+that is the size of an offset.
+"""
 
 
 @dataclass(frozen=True)
@@ -105,36 +110,18 @@ def add_directories(path: Path, first: Mapping[int, Entry], exif: Directory, gps
     The first directory is written again at the end of the file; the pixels are not moved.
     """
     with path.open("r+b") as file:
-        layout, at, pointer_at = _header(file)
-        entries, following = _read_directory(file, layout, at)
-        entries |= first
+        layout, at = _header(file)
+        page, following = _directory_at(file, layout, at)
+        entries = {**_entries(file, layout, page), **first}
+        offset_format = layout.offsetformat[-1]
+        kind = DATATYPE.LONG8 if offset_format == "Q" else DATATYPE.LONG
         for tag, directory in ((EXIF, exif), (GPS, gps)):
             if directory:
-                entries[tag] = layout.pointer(_write_directory(file, layout, directory, 0))
+                start = _write_directory(file, layout, directory, 0)
+                entries[tag] = Entry(kind, 1, struct.pack(f"<{offset_format}", start))
         start = _write_directory(file, layout, entries, following)
-        file.seek(pointer_at)
-        file.write(struct.pack(layout.order + layout.offset, start))
-
-
-@dataclass(frozen=True)
-class _Layout:
-    """Number formats of a file, as in the module `struct`: classic TIFF or BigTIFF, in either byte order."""
-
-    order: str
-    offset: str
-    """Format of an offset, and of the number of values of an entry."""
-    entries: str
-    """Format of the number of entries of a directory."""
-
-    @property
-    def inline_bytes(self) -> int:
-        """Length up to which values are stored in the entry itself."""
-        return struct.calcsize(self.offset)
-
-    def pointer(self, offset: int) -> Entry:
-        """Return the offset of a directory as a tag's value: LONG, or LONG8 in a BigTIFF."""
-        kind = DATATYPE.LONG8 if self.offset == "Q" else DATATYPE.LONG
-        return Entry(kind, 1, struct.pack("<" + self.offset, offset))
+        file.seek(layout.offsetsize)
+        file.write(struct.pack(layout.offsetformat, start))
 
 
 def image_pages(path: Path) -> list[int]:
@@ -143,103 +130,94 @@ def image_pages(path: Path) -> list[int]:
     Raises ValueError or OSError like `read_directories`.
     """
     with path.open("rb") as file:
-        layout, at, _ = _header(file)
-        if _raw_entries(file, layout, at)[1] == 0:  # most files: their tags are read only once, by `read_directories`
+        layout, at = _header(file)
+        pages = list(_pages(file, layout, at))
+        if len(pages) == 1:  # most files: their tags are read only once, by `read_directories`
             return [1]
-        kinds = [values(page[254]) if 254 in page else 0 for page in _pages(file)]
+        kinds = [_entries(file, layout, page).get(254, long(0)) for page in pages]
     reduced_or_mask = 1 | 4  # of the tag NewSubfileType
-    return [number for number, kind in enumerate(kinds, 1) if not int(kind) & reduced_or_mask]
-
-
-def _pages(file: BinaryIO) -> Iterator[Directory]:
-    layout, at, _ = _header(file)
-    first, following = _read_directory(file, layout, at)
-    yield first
-    max_pages = 512  # offsets of a damaged file may form a circle
-    for _ in range(max_pages):
-        if following == 0:
-            return
-        try:
-            page, following = _read_directory(file, layout, following)
-        except (ValueError, OverflowError, OSError):
-            return  # some cameras write no valid offset after the only page
-        yield page
+    return [number for number, kind in enumerate(kinds, 1) if not int(values(kind)) & reduced_or_mask]
 
 
 def _read_all(file: BinaryIO, page: int = 0) -> dict[int, Directory]:
-    layout, at, _ = _header(file)
-    first, _ = _read_directory(file, layout, at)
+    layout, at = _header(file)
+    pages = _pages(file, layout, at)
+    first = _entries(file, layout, next(pages))
     if page > 1:
-        first |= next(islice(_pages(file), page - 1, None))
+        first |= _entries(file, layout, next(islice(pages, page - 2, None)))
     result = {0: first, EXIF: Directory(), GPS: Directory()}
     for tag in (EXIF, GPS):
         if tag in first:
             place = int.from_bytes(first[tag].data[: _SIZE[first[tag].type]], "little")
-            result[tag] = _read_directory(file, layout, place)[0]
+            result[tag] = _entries(file, layout, _directory_at(file, layout, place)[0])
     return result
 
 
-def _header(file: BinaryIO) -> tuple[_Layout, int, int]:
-    """(layout, offset of the first directory, position of that offset in the file)."""
+def _header(file: BinaryIO) -> tuple[TiffFormat, int]:
+    """(layout, offset of the first directory)."""
     file.seek(0)
-    head = file.read(16)
-    order = {b"II": "<", b"MM": ">"}.get(head[:2])
-    version = struct.unpack_from(order + "H", head, 2)[0] if order is not None and len(head) >= 8 else 0
-    if order is not None and version == 43 and len(head) == 16:
-        return _Layout(order, "Q", "Q"), struct.unpack_from(order + "Q", head, 8)[0], 8
-    if order is None or version != 42:
+    layout = _LAYOUTS.get(file.read(4))
+    if layout is None:
         raise ValueError("no TIFF header")
-    return _Layout(order, "I", "H"), struct.unpack_from(order + "I", head, 4)[0], 4
+    file.seek(layout.offsetsize)
+    return layout, _number(file, layout.offsetformat)
 
 
-def _read_directory(file: BinaryIO, layout: _Layout, at: int) -> tuple[Directory, int]:
-    """(entries, offset of the next directory), without entries of unknown types and those beyond the end of the file.
+def _pages(file: BinaryIO, layout: TiffFormat, at: int) -> Iterator[bytes]:
+    """Yield the entries of each page as in the file. Raises ValueError or OSError if the first page is malformed."""
+    max_pages = 512  # offsets of a damaged file may form a circle
+    for number in range(max_pages):
+        try:
+            page, at = _directory_at(file, layout, at)
+        except (ValueError, OverflowError, OSError):
+            if number == 0:
+                raise
+            return  # some cameras write no valid offset after the only page
+        yield page
+        if at == 0:
+            return
 
-    Raises ValueError if there are more entries, or they declare more bytes, than any camera writes.
+
+def _directory_at(file: BinaryIO, layout: TiffFormat, at: int) -> tuple[bytes, int]:
+    """(entries as in the file, offset of the next directory). Raises ValueError for more entries than cameras write."""
+    max_entries = 4096  # cameras write fewer than 100
+    file.seek(at)
+    count = _number(file, layout.tagnoformat)
+    if count > max_entries:
+        raise ValueError(f"a directory of {count} tags")
+    return _exactly(file, count * layout.tagsize), _number(file, layout.offsetformat)
+
+
+def _entries(file: BinaryIO, layout: TiffFormat, directory: bytes) -> Directory:
+    """The entries with their values, without those of unknown types and those beyond the end of the file.
+
+    Raises ValueError if they declare more bytes than any camera writes.
     """
     max_bytes = 1 << 25  # cameras write a few thousand
-    head = struct.Struct(f"{layout.order}HH{layout.offset}")
-    size = head.size + layout.inline_bytes
-    raw, following = _raw_entries(file, layout, at)
     result: Directory = {}
     declared = 0
-    for start in range(0, len(raw), size):
-        tag, kind, number = head.unpack_from(raw, start)
-        length, value = _SIZE.get(kind, 0) * number, raw[start + head.size : start + size]
+    for tag, kind, number, value in struct.iter_unpack(layout.tagformat1 + layout.tagformat2[1:], directory):
+        length = _SIZE.get(kind, 0) * number
         declared += length
         if declared > max_bytes:
             raise ValueError(f"its tags declare more than {max_bytes >> 20} MB")
-        if length > layout.inline_bytes:
-            file.seek(struct.unpack(layout.order + layout.offset, value)[0])
+        if length > layout.offsetsize:
+            file.seek(struct.unpack(layout.offsetformat, value)[0])
             value = file.read(length)
         if 0 < length <= len(value):
-            result[tag] = Entry(kind, number, _swapped(value[:length], kind, layout.order))
-    return result, following
+            result[tag] = Entry(kind, number, _swapped(value[:length], kind, layout))
+    return result
 
 
-def _raw_entries(file: BinaryIO, layout: _Layout, at: int) -> tuple[bytes, int]:
-    """(entries as in the file, offset of the next directory)."""
-    max_entries = 4096  # cameras write fewer than 100
-    file.seek(at)
-    (count,) = struct.unpack(layout.order + layout.entries, _exactly(file, struct.calcsize(layout.entries)))
-    if count > max_entries:
-        raise ValueError(f"a directory of {count} tags")
-    raw = _exactly(file, count * (struct.calcsize(f"{layout.order}HH{layout.offset}") + layout.inline_bytes))
-    (following,) = struct.unpack(layout.order + layout.offset, _exactly(file, layout.inline_bytes))
-    return raw, following
-
-
-def _write_directory(file: BinaryIO, layout: _Layout, entries: Directory, following: int) -> int:
+def _write_directory(file: BinaryIO, layout: TiffFormat, entries: Directory, following: int) -> int:
     """Append a directory, values first, and return its offset."""
-    packed = []
+    packed = struct.pack(layout.tagnoformat, len(entries))
     for tag, entry in sorted(entries.items()):
-        value = _swapped(entry.data, entry.type, layout.order)
-        if len(value) > layout.inline_bytes:
-            value = struct.pack(layout.order + layout.offset, _append(file, value))
-        head = struct.pack(f"{layout.order}HH{layout.offset}", tag, entry.type, entry.count)
-        packed.append(head + value.ljust(layout.inline_bytes, b"\0"))
-    count = struct.pack(layout.order + layout.entries, len(packed))
-    return _append(file, count + b"".join(packed) + struct.pack(layout.order + layout.offset, following))
+        value = _swapped(entry.data, entry.type, layout)
+        if len(value) > layout.offsetsize:
+            value = struct.pack(layout.offsetformat, _append(file, value))
+        packed += struct.pack(layout.tagformat1 + layout.tagformat2[1:], tag, entry.type, entry.count, value)
+    return _append(file, packed + struct.pack(layout.offsetformat, following))
 
 
 def _append(file: BinaryIO, data: bytes) -> int:
@@ -250,12 +228,16 @@ def _append(file: BinaryIO, data: bytes) -> int:
     return offset
 
 
-def _swapped(value: bytes, kind: int, order: str) -> bytes:
+def _swapped(value: bytes, kind: int, layout: TiffFormat) -> bytes:
     """A value converted between little-endian and a file's byte order."""
-    size = struct.calcsize(f"<{TIFF.DATA_FORMATS[kind][-1]}")
-    if order == "<" or size == 1:
+    if layout.byteorder == "<":
         return value
-    return b"".join(value[i : i + size][::-1] for i in range(0, len(value), size))
+    size = struct.calcsize(f"<{TIFF.DATA_FORMATS[kind][-1]}")
+    return np.frombuffer(value, f"u{size}").byteswap().tobytes()
+
+
+def _number(file: BinaryIO, number_format: str) -> int:
+    return int(struct.unpack(number_format, _exactly(file, struct.calcsize(number_format)))[0])
 
 
 def _exactly(file: BinaryIO, length: int) -> bytes:

@@ -2,7 +2,7 @@
 
 import re
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any
 
 import cv2
 import numpy as np
@@ -17,40 +17,35 @@ Corners = NDArray[np.float64]
 """(4, 2) px, in order around the quadrilateral."""
 
 
-class _Limits(NamedTuple):
-    """What distinguishes a panel from other bright squares."""
-
-    corner_tolerance: float = 0.04
-    """Maximum distance of a contour from a quadrilateral, relative to the length of the contour."""
-    side_ratio: float = 1.4
-    """Maximum ratio of the longest and the shortest side."""
-    taper: float = 1.15
-    """Maximum ratio of opposite sides."""
-    relative_std: float = 0.06
-    """Maximum standard deviation within the measured area, relative to its mean."""
-    lit_tolerance: float = 0.2
-    """Maximum difference of an evenly lit pixel from the median of the panel, relative. If one is brighter, the median
-    may be in the shadow.
-    """
-    lit_share: float = 0.6
-    """Minimum share of evenly lit pixels: of two halves, it is not known which one is in the light."""
-    contrast: float = 1.5
-    """Minimum ratio of the brightness of a panel and its surroundings."""
-    ring_ratios: tuple[float, float] = (1.15, 1.4)
-    """Inner and outer side of the surrounding ring used for comparison, relative to that of the panel."""
-    code_area_ratios: tuple[float, float] = (0.3, 6.0)
-    """Minimum and maximum area of the panel, relative to that of its code."""
-    code_distance: float = 3.0
-    """Maximum distance between the centres of panel and code, in sides of the code."""
-    image_shares: tuple[float, float] = (0.004, 0.3)
-    """Minimum and maximum area of a panel without a code, relative to the image."""
-    aimed_share: float = 0.02
-    """Minimum share of the image that a panel covers from 1 m above; 0.03 on a RedEdge-M."""
-    off_centre: float = 1 / 6
-    """A camera that is aimed at a panel has its centre in the middle third of the image."""
-
-
-_LIMITS = _Limits()
+# What distinguishes a panel from other bright squares.
+_CORNER_TOLERANCE = 0.04
+"""Maximum distance of a contour from a quadrilateral, relative to the length of the contour."""
+_SIDE_RATIO = 1.4
+"""Maximum ratio of the longest and the shortest side."""
+_TAPER = 1.15
+"""Maximum ratio of opposite sides."""
+_RELATIVE_STD = 0.06
+"""Maximum standard deviation within the measured area, relative to its mean."""
+_LIT_TOLERANCE = 0.2
+"""Maximum difference of an evenly lit pixel from the median of the panel, relative. If one is brighter, the median
+may be in the shadow.
+"""
+_LIT_SHARE = 0.6
+"""Minimum share of evenly lit pixels: of two halves, it is not known which one is in the light."""
+_CONTRAST = 1.5
+"""Minimum ratio of the brightness of a panel and its surroundings."""
+_RING_RATIOS = (1.15, 1.4)
+"""Inner and outer side of the surrounding ring used for comparison, relative to that of the panel."""
+_CODE_AREA_RATIOS = (0.3, 6.0)
+"""Minimum and maximum area of the panel, relative to that of its code."""
+_CODE_DISTANCE = 3.0
+"""Maximum distance between the centres of panel and code, in sides of the code."""
+_IMAGE_SHARES = (0.004, 0.3)
+"""Minimum and maximum area of a panel without a code, relative to the image."""
+_AIMED_SHARE = 0.02
+"""Minimum share of the image that a panel covers from 1 m above; 0.03 on a RedEdge-M."""
+_OFF_CENTRE = 1 / 6
+"""A camera that is aimed at a panel has its centre in the middle third of the image."""
 
 
 @dataclass(frozen=True)
@@ -86,16 +81,12 @@ def _is_in_scene(square: Corners, image: NDArray[np.uint8]) -> bool:
     """Return True if a panel or its code is small and outside the middle third of the image."""
     size = np.array(image.shape[::-1], np.float64)
     off_centre = np.abs((square.mean(axis=0) - (size - 1) / 2) / size).max()
-    return bool(off_centre > _LIMITS.off_centre and _area(square) < _LIMITS.aimed_share * image.size)
+    return bool(off_centre > _OFF_CENTRE and _area(square) < _AIMED_SHARE * image.size)
 
 
 def _largest_panel(image: NDArray[np.uint8], code: Corners | None) -> Corners | None:
     """Return the largest square that may be a panel, next to the code if there is one; None without any."""
-    limits = (
-        _LIMITS.image_shares
-        if code is None
-        else tuple(share * _area(code) / image.size for share in _LIMITS.code_area_ratios)
-    )
+    limits = _IMAGE_SHARES if code is None else tuple(share * _area(code) / image.size for share in _CODE_AREA_RATIOS)
     squares = _quadrilaterals(image, limits[0] * image.size, limits[1] * image.size)
     squares = [s for s in squares if code is None or _is_next_to(s, code)]
     return next((s for s in sorted(squares, key=_area, reverse=True) if _is_panel(image, s)), None)
@@ -162,19 +153,19 @@ def _quadrilaterals(image: NDArray[np.uint8], min_area: float, max_area: float) 
     for level in np.unique(np.linspace(low, high, 14)[1:-1].astype(int)):
         contours, _ = cv2.findContours((image > level).astype(np.uint8), cv2.RETR_LIST, cv2.CHAIN_APPROX_SIMPLE)
         for contour in (c for c in contours if min_area <= cv2.contourArea(c) <= max_area):
-            tolerance_px = _LIMITS.corner_tolerance * cv2.arcLength(contour, closed=True)
+            tolerance_px = _CORNER_TOLERANCE * cv2.arcLength(contour, closed=True)
             polygon = cv2.approxPolyDP(contour, tolerance_px, closed=True).reshape(-1, 2)
             if len(polygon) == 4 and cv2.isContourConvex(polygon):
                 sides = np.linalg.norm(polygon - np.roll(polygon, 1, axis=0), axis=1)
                 longer, shorter = np.maximum(sides[:2], sides[2:]), np.minimum(sides[:2], sides[2:])
-                if sides.max() <= _LIMITS.side_ratio * sides.min() and (longer <= _LIMITS.taper * shorter).all():
+                if sides.max() <= _SIDE_RATIO * sides.min() and (longer <= _TAPER * shorter).all():
                     result.append(polygon.astype(np.float64))
     return result
 
 
 def _is_panel(image: NDArray[np.uint8], square: Corners) -> bool:
     """Return True if a square is homogeneous and brighter than the ring around it."""
-    ratios = _AREA_RATIO, *_LIMITS.ring_ratios
+    ratios = _AREA_RATIO, *_RING_RATIOS
     around = _scaled(square, ratios[-1])
     # Even, so that halves of pixels are rounded as in the whole image.
     first = 2 * np.floor(around.min(axis=0).clip(0) / 2).astype(int)
@@ -184,12 +175,12 @@ def _is_panel(image: NDArray[np.uint8], square: Corners) -> bool:
     area, ring = image[inner].astype(np.float64), image[outer & ~edge]
     if not len(area) or not len(ring):
         return False
-    return bool(area.mean() >= _LIMITS.contrast * np.median(ring)) and is_homogeneous(area)
+    return bool(area.mean() >= _CONTRAST * np.median(ring)) and is_homogeneous(area)
 
 
 def is_homogeneous(values: NDArray[np.floating[Any]]) -> bool:
     """Return True if pixels (n,) vary as little as those of a panel."""
-    return len(values) > 0 and bool(values.std() <= _LIMITS.relative_std * values.mean())
+    return len(values) > 0 and bool(values.std() <= _RELATIVE_STD * values.mean())
 
 
 def evenly_lit(image: FloatImage, within: Mask) -> Mask:
@@ -199,15 +190,15 @@ def evenly_lit(image: FloatImage, within: Mask) -> Mask:
     """
     smooth = cv2.blur(image, (5, 5)).astype(np.float64)
     ratios = smooth / np.median(smooth[within])
-    lit = within & (np.abs(ratios - 1) <= _LIMITS.lit_tolerance)
-    is_bright = ratios[within].max(initial=0) > 1 + _LIMITS.lit_tolerance
-    is_most = np.count_nonzero(lit) >= _LIMITS.lit_share * np.count_nonzero(within)
+    lit = within & (np.abs(ratios - 1) <= _LIT_TOLERANCE)
+    is_bright = ratios[within].max(initial=0) > 1 + _LIT_TOLERANCE
+    is_most = np.count_nonzero(lit) >= _LIT_SHARE * np.count_nonzero(within)
     return lit if is_most and not is_bright and is_homogeneous(smooth[lit]) else np.zeros_like(within)
 
 
 def _is_next_to(square: Corners, code: Corners) -> bool:
     side, distance = _area(code) ** 0.5, float(np.linalg.norm(square.mean(axis=0) - code.mean(axis=0)))
-    return bool(side <= distance <= _LIMITS.code_distance * side)
+    return bool(side <= distance <= _CODE_DISTANCE * side)
 
 
 def _area(corners: Corners) -> float:

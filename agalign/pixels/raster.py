@@ -90,13 +90,8 @@ def open_raster(path: Path, page: int = 0) -> Iterator[rasterio.DatasetReader]:
             if not _is_south_up(dataset):
                 yield dataset
                 return
-            with WarpedVRT(
-                dataset,
-                transform=dataset.transform * Affine(1, 0, 0, 0, -1, dataset.height),
-                width=dataset.width,
-                height=dataset.height,
-                resampling=Resampling.nearest,
-            ) as north_up:
+            flipped = dataset.transform * Affine(1, 0, 0, 0, -1, dataset.height)
+            with WarpedVRT(dataset, transform=flipped, width=dataset.width, height=dataset.height) as north_up:
                 yield north_up
     except UnicodeEncodeError:
         raise UnreadableFileError(name_problem(path)) from None
@@ -142,12 +137,10 @@ def _driver_of(path: Path) -> str:
         text = getattr(error, "strerror", None) or error
         raise UnreadableFileError(f"{path}: cannot be read ({text}); copy it from the card again") from None
     # Some of GDAL's other drivers execute code or contact servers.
-    if magic in (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+"):
-        return "GTiff"
-    if magic.startswith(b"\xff\xd8\xff"):
-        return "JPEG"
-    if magic == b"\x89PNG":
-        return "PNG"
+    drivers = {"GTiff": (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+"), "JPEG": (b"\xff\xd8\xff",), "PNG": (b"\x89PNG",)}
+    for driver, starts in drivers.items():
+        if magic.startswith(starts):
+            return driver
     if suffix_format(path) == "JPEG 2000":
         raise UnreadableFileError(f"{path}: JPEG 2000 is not supported; convert it to TIFF (gdal_translate)")
     problem = "is empty" if not magic else "is not a TIFF, JPEG or PNG"
@@ -166,17 +159,15 @@ def probe(path: Path, max_pixels: int = MAX_PIXELS, page: int = 0) -> tuple[Band
     except UnreadableFileError:
         raise
     except Exception as error:  # damaged files raise errors of many classes
-        raise UnreadableFileError(
-            f"{path}: cannot be read ({innermost_cause(error)}); copy it from the card again"
-        ) from None
+        what = f"cannot be read ({innermost_cause(error)})"
+        raise UnreadableFileError(f"{path}: {what}; copy it from the card again") from None
 
 
 def _bands(path: Path, dataset: rasterio.DatasetReader, max_pixels: int) -> tuple[Band, ...]:
     width, height, count = dataset.width, dataset.height, dataset.count
     if width * height > max_pixels:
-        raise UnreadableFileError(
-            f"{path}: declares {width} x {height} pixels, more than the {max_pixels:,} that --max-pixels allows"
-        )
+        what = f"declares {width} x {height} pixels, more than the {max_pixels:,} that --max-pixels allows"
+        raise UnreadableFileError(f"{path}: {what}")
     if count > _MAX_BANDS:
         raise UnreadableFileError(f"{path}: declares {count} bands; at most {_MAX_BANDS} can take part")
     if not all(np.dtype(t).kind in "uif" for t in dataset.dtypes):
@@ -343,9 +334,8 @@ def transformed(points: NDArray[np.float64], from_crs: str, to_crs: str) -> NDAr
     Raises GeometryError if GDAL cannot transform them.
     """
     try:
-        x, y = warp.transform(
-            rasterio.CRS.from_user_input(from_crs), rasterio.CRS.from_user_input(to_crs), points[:, 0], points[:, 1]
-        )
+        source, target = (rasterio.CRS.from_user_input(system) for system in (from_crs, to_crs))
+        x, y = warp.transform(source, target, points[:, 0], points[:, 1])
     except Exception as error:  # GDAL's errors have no public class
         raise GeometryError(f"coordinates cannot be transformed ({error})") from None
     return np.stack([x, y], axis=-1)

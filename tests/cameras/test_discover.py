@@ -9,7 +9,6 @@ import pytest
 import tifffile
 from PIL import Image
 
-from agalign.cameras import metadata
 from agalign.cameras.discover import DiscoverOptions, discover
 from agalign.cameras.generic import Generic
 from agalign.cameras.grouping import with_missing_bands, with_unique_band_names
@@ -17,8 +16,7 @@ from agalign.cameras.metadata import read_tags
 from agalign.cameras.tiff_directory import EXIF, add_directories, rational, read_directories, text
 from agalign.errors import InputError, NoSuchBandError
 from agalign.flight.groups import camera_overviews
-from agalign.synthetic import flight as synthetic
-from agalign.values.capture import Band, CameraIdentity, Capture
+from agalign.values.capture import Band, CameraIdentity, Capture, Position
 
 from ..conftest import write_band
 
@@ -29,10 +27,19 @@ def write(path: Path, bands: int = 1) -> None:
     write_band(path, np.random.default_rng(0).integers(1, 4000, (bands, 64, 80), dtype=np.uint16))
 
 
+def write_picture(path: Path, channels: int = 1) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    grey = np.random.default_rng(0).integers(1, 255, (64, 80), dtype=np.uint8)
+    Image.fromarray(grey if channels == 1 else np.stack([grey] * channels, axis=-1)).save(path)
+
+
 def write_all(folder: Path, *names: str) -> Path:
-    """Write a TIFF file of one band for each name."""
+    """Write a picture for each name with a suffix, and a TIFF file of one band for each other name."""
     for name in names:
-        write(folder / f"{name}.tif")
+        if "." in name:
+            write_picture(folder / name, 3 if "photo" in name else 1)
+        else:
+            write(folder / f"{name}.tif")
     return folder
 
 
@@ -50,7 +57,7 @@ def images(flight: Path, tmp_path: Path) -> Path:
 def test_a_micasense_flight(flight: Path) -> None:
     result, names = discover(flight), ["Blue", "Green", "Red", "NIR", "Red edge"]
     assert found(flight) == {"0000SET/000/IMG_0001": names, "0000SET/000/IMG_0002": names}
-    assert result.problems == ()
+    assert (result.problems, result.eight_bit) == ((), ())
     first = result.captures[0]
     assert first.reference.name == "Green"
     assert first.capture_id == "synthetic00000000001"
@@ -67,31 +74,23 @@ COPIES = (
 """Names of copies by Windows, macOS, browsers and others."""
 
 
-@pytest.mark.parametrize("name", COPIES)
-def test_copies_of_files_are_left_out_with_a_line(images: Path, name: str) -> None:
-    """Of files with a capture id, of those without tags, and of multiband files."""
+def test_copies_of_files_are_left_out_with_a_line(images: Path) -> None:
+    """Of files with a capture id, of those without tags, of multiband files, of all files of a capture, and one with a
+    name that does not show it.
+    """
     write_all(images, "plot_red", "plot_nir")
     write(images / "field.tif", bands=3)
     before, originals = found(images), ("IMG_0001_2", "plot_red", "field")
-    for original in originals:
-        shutil.copy(images / f"{original}.tif", images / f"{name.format(original)}.tif")
+    copies = {f"{name.format(original)}.tif": f"{original}.tif" for original in originals for name in COPIES}
+    copies |= {f"{path.stem} - Copy.tif": path.name for path in images.glob("IMG_0001_*")}
+    copies["backup_of_nir_19.tif"] = "IMG_0002_4.tif"
+    for copy, original in copies.items():
+        shutil.copy(images / original, images / copy)
     result = discover(images)
     assert found(images) == before
-    assert {p.path.name: p.text.rpartition(" ")[2] for p in result.problems} == {
-        f"{name.format(original)}.tif": f"{original}.tif" for original in originals
-    }
+    assert {p.path.name: p.text.rpartition(" ")[2] for p in result.problems} == copies
     assert all("left out, because it is a copy of" in p.text for p in result.problems)
     assert result.is_complete
-
-
-def test_all_files_of_a_capture_copied_and_a_copy_under_any_name(images: Path) -> None:
-    """The capture id and the bytes show what the name does not."""
-    before = found(images)
-    for path in list(images.glob("IMG_0001_*")):
-        shutil.copy(path, path.with_stem(f"{path.stem} - Copy"))
-    shutil.copy(images / "IMG_0002_4.tif", images / "backup_of_nir_19.tif")
-    assert found(images) == before
-    assert len(discover(images).problems) == 6
 
 
 def test_a_changed_copy_is_left_out_with_another_line(images: Path) -> None:
@@ -102,6 +101,9 @@ def test_a_changed_copy_is_left_out_with_another_line(images: Path) -> None:
     (problem,) = result.problems
     assert problem.text.startswith(f"{copy}: is left out as a changed copy of IMG_0001_2.tif: same band and capture")
     assert not result.is_complete
+    # Under another name it is an image of another flight: real cameras never repeat a capture id.
+    copy.rename(images / "IMG_0009_2.tif")
+    assert sum(map(len, found(images).values())) == sum(map(len, before.values())) + 1
 
 
 def test_a_copy_is_used_where_its_original_is_missing_or_unreadable(images: Path) -> None:
@@ -127,23 +129,25 @@ def test_the_overview_of_a_camera_is_that_of_most_captures() -> None:
         ("north_red north_nir north_green", None, {"north": ["green", "nir", "red"]}),
         ("north_red north_nir south_red south_nir", None, {"north": ["nir", "red"], "south": ["nir", "red"]}),
         ("I_1_10 I_1_1 I_1_2", None, {"I_1": ["1", "2", "10"]}),
+        ("f-3_RE f-3_840nm f-3_b3 f-3Green f-3_red_edge", None, {"f-3": ["840nm", "b3", "RE", "red_edge", "Green"]}),
+        ("été_nir été_red", None, {"été": ["nir", "red"]}),
         # Files of other names and equal bytes are no copies: two sensors that are covered record the same.
         ("I_1_1 I_1_10 f_red f_red_edge", None, {"I_1": ["1", "10"], "f": ["red", "red_edge"]}),
         ("plot_7/red plot_7/nir", None, {"plot_7/plot_7": ["nir", "red"]}),
         ("I_7_1 I_7_2 f_red_edge f_red", "{capture}_{band}.tif", {"I_7": ["1", "2"], "f": ["red", "red_edge"]}),
         ("A-of-7 B-of-7 A-of-8 B-of-8", "{band}-of-{capture}.tif", {"7": ["A", "B"], "8": ["A", "B"]}),
+        ("a_1.png a_2.png", "{capture}_{band}.png", {"a": ["1", "2"]}),
+        # Previews are ignored, but for a picture of a band without a TIFF.
+        ("a_red a_nir a_red.jpg a_nir.jpg m_red.png x.png photo_1.jpg photo_2.jpg", None, {"a": ["nir", "red"]}),
+        ("a_red a_green a_red.jpg a_nir.png", None, {"a": ["green", "nir", "red"]}),
+        ("a_red a_nir b_red.png b_nir.jpg", None, {"a": ["nir", "red"], "b": ["nir", "red"]}),
     ],
 )
 def test_captures_by_the_names_of_files(
     tmp_path: Path, names: str, pattern: str | None, expected: dict[str, list[str]]
 ) -> None:
     assert found(write_all(tmp_path, *names.split()), pattern=pattern) == expected
-
-
-def test_a_pattern_of_pictures(tmp_path: Path) -> None:
-    for number in (1, 2):
-        write_picture(tmp_path / f"a_{number}.png")
-    assert found(tmp_path, pattern="{capture}_{band}.png") == {"a": ["1", "2"]}
+    assert discover(tmp_path, DiscoverOptions(pattern=pattern)).problems == ()
 
 
 def test_a_band_without_tags_joins_the_capture_of_its_name(images: Path) -> None:
@@ -165,39 +169,17 @@ def test_the_capture_has_the_tags_of_the_only_file_that_has_some(flight: Path, t
     assert (result.camera.make, result.capture_id) == ("MicaSense", "synthetic00000000001")
 
 
-def write_picture(path: Path, channels: int = 1) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    grey = np.random.default_rng(0).integers(1, 255, (64, 80), dtype=np.uint8)
-    Image.fromarray(grey if channels == 1 else np.stack([grey] * channels, axis=-1)).save(path)
-
-
 @pytest.mark.parametrize(("suffix", "channels"), [("jpg", 1), ("JPEG", 3), ("png", 1), ("png", 3)])
 def test_pictures_one_a_band_by_name_are_a_capture(tmp_path: Path, suffix: str, channels: int) -> None:
     for plot in (1, 2):
         for band in ("red", "nir", "550nm"):
-            write_picture(tmp_path / f"plot_{plot}_{band}.{suffix}", channels)
-        write_picture(tmp_path / f"plot_{plot}_rgb.{suffix}", 3)
+            write_picture(tmp_path / f"plot {plot} {band}.{suffix}", channels)
+        write_picture(tmp_path / f"plot {plot} rgb.{suffix}", 3)
     result = discover(tmp_path)
-    assert found(tmp_path) == {"plot_1": ["550nm", "nir", "red"], "plot_2": ["550nm", "nir", "red"]}
+    assert found(tmp_path) == {"plot 1": ["550nm", "nir", "red"], "plot 2": ["550nm", "nir", "red"]}
     assert result.captures[0].reference.wavelength_nm == 550
     assert result.eight_bit == result.captures
     assert result.problems == ()
-
-
-def test_previews_next_to_tiffs_are_ignored(tmp_path: Path) -> None:
-    write_all(tmp_path, "a_red", "a_nir")
-    for name in ("a_red.jpg", "a_nir.jpg", "map_red.png", "chart.png", "photo_1.jpg", "photo_2.jpg"):
-        write_picture(tmp_path / name, 3 if "photo" in name else 1)
-    result = discover(tmp_path)
-    assert found(tmp_path) == {"a": ["nir", "red"]}
-    assert (result.problems, result.eight_bit) == ((), ())
-
-
-def test_a_picture_of_a_band_without_a_tiff_is_used(tmp_path: Path) -> None:
-    write_all(tmp_path, "a_red", "a_green")
-    for name in ("a_red.jpg", "a_nir.png", "b_red.png", "b_nir.jpg"):
-        write_picture(tmp_path / name)
-    assert found(tmp_path) == {"a": ["green", "nir", "red"], "b": ["nir", "red"]}
 
 
 def test_images_that_cannot_be_read_are_problems_but_for_photographs(tmp_path: Path) -> None:
@@ -230,12 +212,6 @@ def test_reference_by_name(flight: Path) -> None:
         discover(flight, DiscoverOptions(reference="swir"))
 
 
-def test_a_reference_by_the_number_of_a_repeated_name(tmp_path: Path) -> None:
-    write_all(tmp_path, "a_1_red", "a_2_red", "a_1_nir")
-    options = DiscoverOptions(pattern="{capture}_*_{band}.tif", reference="RED-2")
-    assert discover(tmp_path, options).captures[0].reference.path.name == "a_2_red.tif"
-
-
 def test_chosen_bands_of_unreadable_files_are_not_called_missing(tmp_path: Path) -> None:
     for name in ("a_red.tif", "a_nir.tif"):
         (tmp_path / name).write_bytes(b"damaged")
@@ -259,19 +235,12 @@ def test_where_there_is_nothing(tmp_path: Path) -> None:
             discover(tmp_path / name)
 
 
-def test_a_panel_of_another_flight_is_a_capture_of_its_own(images: Path, tmp_path: Path) -> None:
-    synthetic.make_flight(tmp_path / "other", captures=1, size_px=(480, 360), rng_seed=9)
-    for path in (tmp_path / "other" / "0000SET" / "000").iterdir():
-        shutil.copy(path, images / path.name.replace("IMG_0001", "IMG_0000"))
-    # Same CaptureId as IMG_0001 in this folder: real cameras never repeat one, so names distinguish the files.
-    assert sum(map(len, found(images).values())) == 15
-
-
 def test_a_pattern_that_gives_two_files_for_a_band_is_reported(tmp_path: Path) -> None:
     write_all(tmp_path, "a_1_red", "a_2_red", "a_1_nir")
-    result = discover(tmp_path, DiscoverOptions(pattern="{capture}_*_{band}.tif"))
+    result = discover(tmp_path, DiscoverOptions(pattern="{capture}_*_{band}.tif", reference="RED-2"))
     (problem,) = result.problems
     assert "a_2_red.tif: is band 'red' of one capture with a_1_red.tif" in problem.text
+    assert result.captures[0].reference.path.name == "a_2_red.tif"
 
 
 def test_the_day_of_a_date_is_no_band(tmp_path: Path) -> None:
@@ -291,21 +260,16 @@ def test_digits_that_are_not_numbers_and_a_number_alone_are_names(tmp_path: Path
 
 
 def test_a_capture_has_the_position_of_its_reference(images: Path) -> None:
-    path = images / "IMG_0001_1.tif"  # blue, the first file
-    elsewhere = {1: text("S"), 2: rational(10, 0, 0), 3: text("W"), 4: rational(20, 0, 0)}
-    add_directories(path, {}, read_directories(path)[EXIF], elsewhere)
-    assert read_tags(path).position.latitude == -10
+    path, exif = images / "IMG_0001_1.tif", read_directories(images / "IMG_0001_1.tif")[EXIF]  # blue, the first file
+    for place, expected in (((91, 20), None), ((10, 181), None), ((10, 20), Position(-10, -20))):
+        latitude, longitude = (rational(degrees, 0, 0) for degrees in place)
+        impossible_m = rational(4e9)
+        elsewhere = {1: text("S"), 2: latitude, 3: text("W"), 4: longitude, 6: impossible_m}
+        add_directories(path, {}, exif, elsewhere)
+        assert read_tags(path).position == expected
     capture = discover(images).captures[0]
     assert capture.reference.name == "Green"
     assert capture.position.latitude == pytest.approx(52, abs=0.01)
-
-
-def test_positions_that_cannot_be_are_none(tmp_path: Path) -> None:
-    def gps(latitude: float, longitude: float) -> dict[str, object]:
-        return {"GPSLatitude": (latitude, 0.0, 0.0), "GPSLongitude": (longitude, 0.0, 0.0), "GPSAltitude": 1e9}
-
-    assert metadata._position(gps(47.0, 9.0)).altitude_m is None
-    assert [metadata._position(gps(*degrees)) for degrees in ((4e9, 9.0), (47.0, 181.0))] == [None, None]
 
 
 def write_fields(folder: Path, count: int) -> None:

@@ -9,7 +9,6 @@ import rasterio
 import tifffile
 from PIL import Image
 
-import agalign
 from agalign.cameras.base import Camera
 from agalign.cameras.metadata import Tags, read_tags
 from agalign.cameras.micasense import MicaSense
@@ -27,25 +26,14 @@ from agalign.cameras.tiff_directory import (
     short,
     text,
 )
-from agalign.config import Settings, WriteSettings
 from agalign.pixels.raster import probe
-from agalign.values import geometry, lens
 from agalign.values.capture import Band
 from agalign.values.image import OutputGrid
 from agalign.values.pixel_units import PixelScale
 
-from ..conftest import read_json
 from .test_vendors import DJI, MICASENSE, SIZE, VENDORS, packet, write_capture, write_file
 
 pytestmark = pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
-
-
-@pytest.fixture(scope="module")
-def both(flight: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Stacks and single bands of the synthetic flight's first capture."""
-    out = tmp_path_factory.mktemp("both")
-    agalign.align_folder(flight, out, settings=Settings(write=WriteSettings(layout="both")))
-    return out / "0000SET" / "000"
 
 
 def band_of(path: Path, camera: Camera | None = None) -> Band:
@@ -54,22 +42,8 @@ def band_of(path: Path, camera: Camera | None = None) -> Band:
     return band
 
 
-@pytest.mark.slow
-def test_the_vignetting_centre_moves_with_the_band(flight: Path, both: Path) -> None:
-    truth = read_json(flight / "truth.json")["IMG_0001"]["bands"]["IMG_0001_4.tif"]
-    green, nir = (flight / "0000SET" / "000" / f"IMG_0001_{number}.tif" for number in (2, 4))
-    centre = np.array(read_tags(nir).numbers(NAMESPACE, "VignettingCenter"))
-    to_green = geometry.invert(np.array(truth["fixed_to_moving"]))
-    back = geometry.apply(to_green, lens.undistort(band_of(nir).lens, centre))
-    expected = lens.distort(band_of(green).lens, back) - read_json(both / "IMG_0001.json")["output"]["crop"][:2]
-    result = read_tags(both / "IMG_0001_4.tif").numbers(NAMESPACE, "VignettingCenter")
-    np.testing.assert_allclose(result, expected, atol=0.2)
-    assert np.linalg.norm(np.array(result) - centre) > 3
-
-
-@pytest.mark.slow
-def test_the_stack_has_the_tags_that_all_bands_share(both: Path) -> None:
-    result = read_directories(both / "IMG_0001.tif")
+def test_the_stack_has_the_tags_that_all_bands_share(aligned_flight: Path) -> None:
+    result = read_directories(aligned_flight / "0000SET" / "000" / "IMG_0001.tif")
     assert result[GPS][1].data == b"N\0"
     assert 36867 in result[EXIF]
     assert 33434 not in result[EXIF]  # each band was exposed for a time of its own
@@ -85,7 +59,7 @@ def transferred(source: Path, reference: Band | Path, grid: OutputGrid, out: str
     band = Band("reference", reference, 1, *SIZE, "uint16") if isinstance(reference, Path) else reference
     tags = band_tags(replace(band, path=source), band, grid, GridVignetting((80, 60), (1e-4,), 0), **options)
     path = write_file(source.parent / out, shape=(grid.height, grid.width))
-    add_directories(path, tags.first, tags.exif, tags.gps)
+    add_directories(path, *tags)
     return path
 
 
@@ -142,14 +116,6 @@ def test_tags_of_applied_radiometry_are_removed(tmp_path: Path) -> None:
         assert (result.black_level is None) == radiometry
 
 
-def test_a_source_that_cannot_be_followed_gives_nothing(tmp_path: Path) -> None:
-    (tmp_path / "broken.tif").write_bytes(b"II*\0\xff\xff\xff\xff")
-    band = Band("broken", tmp_path / "broken.tif", 1, 9, 9, "uint16")
-    tags = band_tags(replace(band, path=tmp_path / "broken.tif"), band, OutputGrid(0, 0, 9, 9), None)
-    assert (tags.first, tags.exif, tags.gps) == ({}, {}, {})
-    assert text("x").count == 2
-
-
 def test_an_undistorted_fisheye_is_a_pinhole(tmp_path: Path) -> None:
     write_capture(tmp_path, VENDORS["Sequoia"])
     path = tmp_path / "IMG_180413_080658_0000_GRE.TIF"
@@ -179,8 +145,8 @@ def test_a_centre_of_vignetting_without_position_is_omitted(tmp_path: Path, cent
     path = write_file(tmp_path / "IMG_0001_2.tif", first)
     assert vignetting_of(read_tags(path), SIZE) is None
     band = Band("Green", path, 1, *SIZE, "uint16")
-    tags = band_tags(band, band, OutputGrid(0, 0, *SIZE), None)
-    assert b"Vignetting" not in tags.first[XMP].data
+    first, _, _ = band_tags(band, band, OutputGrid(0, 0, *SIZE), None)
+    assert b"Vignetting" not in first[XMP].data
 
 
 # ---- directories of TIFF files
@@ -225,14 +191,3 @@ def test_directories_that_follow_are_kept(tmp_path: Path) -> None:
     with tifffile.TiffFile(path) as tiff:
         assert len(tiff.pages) == 2
         np.testing.assert_array_equal(tiff.pages[1].asarray(), PIXELS + 1)
-
-
-def test_a_jpegs_exif_is_read(tmp_path: Path) -> None:
-    exif = Image.Exif()
-    exif[271] = "Maker"
-    exif.get_ifd(GPS)[1] = "S"
-    Image.fromarray(np.zeros((20, 20, 3), np.uint8)).save(tmp_path / "x.jpg", exif=exif, xmp=b"packet")
-    result = read_directories(tmp_path / "x.jpg")
-    assert result[0][271].data == b"Maker\0"
-    assert result[GPS][1].data == b"S\0"
-    assert result[0][700].data == b"packet"

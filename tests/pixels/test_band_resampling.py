@@ -13,7 +13,7 @@ from agalign.products.rasters.layout import _largest_rectangle, common_area
 from agalign.values import geometry
 from agalign.values.capture import Band, Radiometry
 from agalign.values.image import Tile
-from agalign.values.interpolation import resample, tiles
+from agalign.values.interpolation import resample
 from agalign.values.mapping import PixelMapping
 from agalign.values.pixel_units import PixelScale
 
@@ -28,14 +28,6 @@ def band_of(path: Path, pixels: np.ndarray) -> Band:
     write_band(path, pixels)
     (band,) = probe(path)
     return band
-
-
-def test_tiles_cover_the_area_once() -> None:
-    covered = np.zeros((90, 70), int)
-    for t in tiles(Tile(10, 20, 55, 61), 16):
-        covered[t.y0 : t.y0 + t.height, t.x0 : t.x0 + t.width] += 1
-    assert covered.sum() == 55 * 61
-    assert (covered[20:81, 10:65] == 1).all()
 
 
 @pytest.mark.parametrize(

@@ -122,8 +122,7 @@ def write_pages(path: Path, bands: Sequence[tuple[str, int]], *, thumbnail: bool
             tiff.write(scene > 0, subfiletype=4, metadata=None)
 
 
-@pytest.mark.parametrize("thumbnail", [False, True])
-@pytest.mark.parametrize("mask", [False, True])
+@pytest.mark.parametrize(("thumbnail", "mask"), [(False, False), (True, True)])
 def test_pages_with_tags_of_their_own_are_bands(tmp_path: Path, thumbnail: bool, mask: bool) -> None:
     bands = {"Green": 560, "Red": 668, "NIR": 840}
     (tmp_path / "in").mkdir()

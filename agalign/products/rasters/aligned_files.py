@@ -204,7 +204,7 @@ def write_raster(
                 if overviews:
                     dataset.build_overviews(overviews, Resampling.average)
         if tags is not None:
-            add_directories(partial, tags.first, tags.exif, tags.gps)
+            add_directories(partial, *tags)
         if settings.format == "cog":
             to_cog(partial, compression)
 
