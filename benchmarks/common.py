@@ -76,23 +76,19 @@ def with_section(document: Path, name: str, content: str) -> str:
     return before + begin + content + end + rest.partition(end)[2]
 
 
-class Section:
-    """A section of a document, printed at once; without a document it is only printed."""
+def report(name: str, document: Path | None, *parts: str | Sequence[Sequence[object]]) -> None:
+    """Print paragraphs and tables, which are rows with the head first, and put them into the section of a document."""
+    texts = [part if isinstance(part, str) else table(part) for part in parts]
+    content = "\n" + "".join(f"{text}\n\n" for text in texts)
+    print(content, flush=True)
+    if document is not None:
+        document.write_text(with_section(document, name, content), encoding="utf-8")
 
-    def __init__(self, name: str, document: Path | None) -> None:
-        self._name, self._document, self._parts = name, document, list[str]()
 
-    def table(self, rows: Sequence[Sequence[object]]) -> None:
-        """Add rows, the first of them the head."""
-        self.say(table(rows))
-
-    def say(self, text: str) -> None:
-        """Add a paragraph."""
-        print(text, end="\n\n", flush=True)
-        self._parts.append(text)
-        if self._document is not None:
-            content = "\n" + "".join(f"{part}\n\n" for part in self._parts)
-            self._document.write_text(with_section(self._document, self._name, content), encoding="utf-8")
+def cell(values: Sequence[float] | NDArray[Any], style: str, statistic: Callable[..., Any] = np.median) -> str:
+    """Return a statistic of the values that are not nan, "-" without any."""
+    known = np.asarray(values)[~np.isnan(values)]
+    return format(statistic(known), style) if len(known) else "-"
 
 
 def pyplot() -> Any:
@@ -130,6 +126,12 @@ def write_band(path: Path, pixels: NDArray[Any], index: int = 1) -> None:
     """Replace the pixels of a band, and leave the tags."""
     with without_warnings(), rasterio.open(path, "r+") as dataset:
         dataset.write(pixels, index)
+
+
+def change_band(path: Path, change: Callable[[NDArray[Any]], NDArray[Any]], index: int = 1) -> None:
+    """Replace the pixels of a band by a function of them, within the range of their type but for 0, for no data."""
+    pixels = read_band(path, index)
+    write_band(path, change(pixels).clip(1, np.iinfo(pixels.dtype).max).astype(pixels.dtype), index)
 
 
 # ---- runs of the command line
@@ -272,8 +274,10 @@ class BandError:
 
 
 def read_ties(path: Path) -> Ties:
-    """Return the truth of a ties.json or truth.json by file."""
-    result = {}
+    """Return the truth of a ties.json or truth.json by file; nothing if there is no such file."""
+    result: Ties = {}
+    if not path.is_file():
+        return result
     for capture in json.loads(path.read_text(encoding="utf-8")).values():
         shared = {"reference": capture["reference"], "trouble": capture.get("trouble", "")}
         result |= {file: entry | shared for file, entry in capture["bands"].items()}
@@ -317,6 +321,18 @@ def band_errors(out: Path, truth: Ties) -> list[BandError]:
     return result
 
 
+def only_sidecar(out: Path) -> tuple[Path, Sidecar]:
+    """Return the one sidecar below the output of a run, with its path."""
+    (path,) = find_sidecars(out)
+    return path, read_sidecar(path)
+
+
+def window_of(sidecar: Sidecar) -> tuple[slice, slice]:
+    """Return the rows and columns of the reference in the output."""
+    x0, y0, width, height = sidecar.output.crop
+    return np.s_[y0 : y0 + height, x0 : x0 + width]
+
+
 def layer(path: Path, name: str) -> NDArray[np.float64] | None:
     """Return the band (height, width) of a raster with a name, nan where it has no data; None without file or band."""
     if not path.exists():
@@ -349,10 +365,9 @@ def print_errors(groups: dict[str, list[BandError]]) -> None:
         statuses = Counter(f"{b.status} ({b.source})" if b.source else b.status for b in bands)
         counts = ", ".join(f"{n} {status}" for status, n in statuses.most_common())
         shares = errors / std
+        cells = f"{np.median(errors):.3f}", f"{errors.max():.3f}", cell(shares, ".1f", np.max)
         within = [f"{np.mean(shares <= k):.0%}" for k in (1, 2)]
-        worst = f"{np.nanmax(shares):.1f}" if np.isfinite(shares).any() else "-"
-        captures = len({b.capture for b in bands})
-        print_row(name, captures, counts, f"{np.median(errors):.3f}", f"{errors.max():.3f}", worst, *within)
+        print_row(name, len({b.capture for b in bands}), counts, *cells, *within)
     for name, bands in groups.items():
         for b in bands:
             if b.median_px > WRONG_PX or b.status not in ("aligned", "predicted"):

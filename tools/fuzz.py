@@ -145,7 +145,7 @@ def main(
     markdown: Path | None = None,
     libfuzzer: Annotated[list[str] | None, typer.Argument(help="options and files for libFuzzer")] = None,
 ) -> None:
-    from common import Section
+    from common import report
 
     if target and corpus:
         fuzz(target, corpus, [f"-runs={inputs}", *(libfuzzer or ())])
@@ -161,7 +161,7 @@ def main(
             parts.append(
                 f"{one} {count} in {seconds} s ({int(bool(error))} failures, slowest {slowest} s, {memory} MB)"
             )
-        Section("fuzz", markdown).say(f"Inputs: {', '.join(parts)}.")
+        report("fuzz", markdown, f"Inputs: {', '.join(parts)}.")
         if errors:
             raise SystemExit("\n".join(errors))
 

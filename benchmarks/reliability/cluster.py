@@ -14,7 +14,7 @@ import psutil
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from common import Section, align, command, ended, flight_and_out, run
+from common import align, command, ended, flight_and_out, report, run
 from kills import differences, snapshot
 
 from agalign.products.sidecar.file import find_sidecars
@@ -37,7 +37,6 @@ def kill_worker(nanny_pid: int) -> None:
 
 
 def main(captures: int = 40, markdown: Path | None = None) -> None:
-    section = Section("cluster", markdown)
     with flight_and_out() as (flight, out):
         alone, address_file = (out.with_name(name) for name in ("alone", "scheduler.json"))
         synthetic.make_flight(flight, captures, SIZE_PX, rng_seed=5)
@@ -63,12 +62,14 @@ def main(captures: int = 40, markdown: Path | None = None) -> None:
             for one in processes:
                 one.terminate()
         result = differences(out, snapshot(alone))
-        section.say(
+        report(
+            "cluster",
+            markdown,
             f"{captures} captures of {SIZE_PX[0]} x {SIZE_PX[1]} on a scheduler and two worker processes; one, "
             f"with its nanny, killed by SIGKILL when {done} captures were done: exit code {ending.code}, "
             f"{len(find_sidecars(out))} captures done in {ending.seconds:.0f} s (a run on this machine's two cores "
             f"without a cluster: {alone_s:.0f} s). Files compared with that run: {result['missing']} missing, "
-            f"{result['left over']} left over, {result['corrupt']} corrupt, {result['different']} different."
+            f"{result['left over']} left over, {result['corrupt']} corrupt, {result['different']} different.",
         )
 
 

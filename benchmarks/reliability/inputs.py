@@ -30,7 +30,7 @@ from numpy.typing import NDArray
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from common import Section, command, ended, read_band, run, timed
+from common import command, ended, read_band, report, run, timed
 from kills import HUNG_S, contents
 from synthetic_flights.aligned import make_aligned
 
@@ -272,7 +272,7 @@ def main(
         for row in chain(*attacks):
             rows.append((row.name, row.tried, row.tracebacks, row.lost, row.hangs, f"{row.worst_s:.2f}"))
             print(rows[-1], flush=True)
-    Section("inputs", markdown).table(rows)
+    report("inputs", markdown, rows)
 
 
 if __name__ == "__main__":

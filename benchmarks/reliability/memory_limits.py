@@ -17,7 +17,7 @@ import typer
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from common import Section, command, ended, flight_and_out, run
+from common import command, ended, flight_and_out, report, run
 
 from agalign.synthetic import flight as synthetic
 
@@ -52,7 +52,6 @@ def main(
     step_gb: Annotated[float, typer.Option("--step")] = 0.05,
     markdown: Path | None = None,
 ) -> None:
-    section = Section("memory limits", markdown)
     rows: dict[tuple[str, str], list[tuple[float, float]]] = defaultdict(list)
     with flight_and_out() as (flight, out):
         synthetic.make_flight(flight, CAPTURES, SIZE_PX, rng_seed=4)
@@ -71,7 +70,7 @@ def main(
         limits_gb, seconds_of = zip(*seen, strict=True)
         ends = dict.fromkeys(f"{gb:.2f}" for gb in (min(limits_gb), max(limits_gb)))
         table.append((" to ".join(ends), len(seen), f"{max(seconds_of):.0f}", how, line))
-    section.table(table)
+    report("memory limits", markdown, table)
 
 
 if __name__ == "__main__":

@@ -102,19 +102,17 @@ def run_tiny(kills: int, rng: random.Random) -> Counter[str]:
 
 
 def main(kills: int = 1000, rng_seed: int = 0, markdown: Path | None = None) -> None:
-    # Each worker imports this module: what loads slowly is imported here.
-    from common import Section
-
     os.environ.setdefault("OMP_NUM_THREADS", "1")
     result = run_tiny(kills, random.Random(rng_seed))
     counted = ("runs", "tasks", "kills", "reported as killed", "runs ended with a reason", *KINDS)
     heads = (name.replace("runs ended", "ended") for name in counted)
-    Section("worker kills", markdown).table([(*heads,), [result[name] for name in counted]])
+    report("worker kills", markdown, [[*heads], [result[name] for name in counted]])
     if any(result[kind] for kind in KINDS):
         raise SystemExit("something was lost, hung, wrong or left over")
 
 
 if __name__ == "__main__":
-    from common import run
+    # Each worker imports this module: what loads slowly is imported here.
+    from common import report, run
 
     run(main)

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from common import Section, band_errors, read_ties, watched
+from common import band_errors, read_ties, report, watched
 from synthetic_flights.aligned import sidecar_of
 
 from agalign.values import geometry
@@ -54,13 +54,11 @@ def test_the_error_is_that_of_the_mapping_at_the_ties(tmp_path: Path, reference:
 def test_a_section_replaces_what_is_between_its_marks(tmp_path: Path) -> None:
     page = tmp_path / "page.md"
     page.write_text("before\n<!-- kills -->\nold\n<!-- end of kills -->\nafter\n")
-    section = Section("kills", page)
-    section.say("New.")
-    section.table([("a", "b"), ("1|2", "3")])
+    report("kills", page, "New.", [("a", "b"), ("1|2", "3")])
     table = "| a | b |\n|---|---|\n| 1\\|2 | 3 |"
     assert page.read_text() == f"before\n<!-- kills -->\n\nNew.\n\n{table}\n\n<!-- end of kills -->\nafter\n"
     with pytest.raises(SystemExit, match="has no section"):
-        Section("soak", page).say("text")
+        report("soak", page, "text")
 
 
 def test_a_watched_process_has_its_children() -> None:
