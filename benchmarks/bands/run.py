@@ -10,12 +10,15 @@ written to -o, and as tables next to it (.md); the mapping of each pair to --map
 
 import csv
 import json
+import resource
 import shutil
 import sys
 import tempfile
 from collections.abc import Iterable, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
 from dataclasses import replace
+from functools import partial
+from multiprocessing import get_context
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -25,12 +28,13 @@ import typer
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # run as a file, its package is not found
 
-from common import align, run, timed, watched, write_band
-from peers import METHODS, Align, UnavailableError, grey_raster, method_named
+from common import align, flight_and_out, run, timed, write_band
+from peers import METHODS, Align, grey_raster, method_named
 
 from agalign.cameras.discover import discover
 from agalign.pixels.raster import suffix_format
-from agalign.products.sidecar.file import find_sidecars
+from agalign.products.sidecar.file import find_sidecars, read_sidecar
+from agalign.products.sidecar.schema import BandPart
 from agalign.values import geometry, lens
 from agalign.values.capture import Band
 from agalign.values.mapping import PixelMapping
@@ -56,27 +60,23 @@ def by_command_line(method: str, paths: Paths, pairs: Sequence[Pair], variant: s
     """`agalign FOLDER` on the files of a set, with degraded moving bands of the pairs; the rest of the flight is
     unchanged. A band is claimed if it is aligned; a predicted one is given and not claimed.
     """
-    with tempfile.TemporaryDirectory() as folder:
-        flight, out = Path(folder, "flight"), Path(folder, "out")
+    with flight_and_out() as (flight, out):
         flight.mkdir()
         for name, path in paths.items():
             shutil.copyfile(path, flight / name)
         for pair in pairs if variant != AS_IT_IS else ():
             write_band(flight / pair.file, degraded(read(paths[pair.file]), pair, variant))
         seconds = align(flight, out, *WHOLE[method]) / (len(paths) - len({p.reference for p in pairs}))
-        sidecars = [json.loads(path.read_text(encoding="utf-8")) for path in find_sidecars(out)]
-    bands = {band["file"]: band for sidecar in sidecars for band in sidecar["bands"]}
+        bands = {band.file: band for path in find_sidecars(out) for band in read_sidecar(path).bands}
     return [{**claim(bands.get(pair.file)), "seconds": seconds} for pair in pairs]
 
 
-def claim(band: Mapping[str, Any] | None) -> Row:
+def claim(band: BandPart | None) -> Row:
     """Return the mapping of a band in a sidecar, if it has one, and whether it is claimed."""
-    if band is None or band["status"] not in ("aligned", "predicted") or not band["grid"]:
+    if band is None or band.status not in ("aligned", "predicted") or band.grid is None:
         return {}
-    return {
-        "grid": _grid(band["grid"]["reference_px"], band["grid"]["moving_px"]),
-        "claimed": "yes" if band["status"] == "aligned" else "no",
-    }
+    claimed = "yes" if band.status == "aligned" else "no"
+    return {"grid": _grid(band.grid.reference_px, band.grid.moving_px), "claimed": claimed}
 
 
 # ---- pair methods
@@ -136,8 +136,11 @@ def applies(name: str, variant: str, pairs: Sequence[Pair], bands: Mapping[str, 
     return name not in WHOLE or has_tags(paths)
 
 
-def run_method(name: str, located: Mapping[str, Paths], sets: dict[str, Any], variants: Sequence[str]) -> list[Row]:
-    """Return the rows of one method for all pairs. Raises UnavailableError."""
+def run_method(
+    located: Mapping[str, Paths], sets: dict[str, Any], variants: Sequence[str], name: str
+) -> tuple[list[Row], float]:
+    """Return (rows of one method for all pairs, memory of the largest process in GB). Raises UnavailableError."""
+    cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_ERROR)  # it warns of every unknown tag
     method = None if name in WHOLE else method_named(name)
     rows: list[Row] = []
     for set_name, paths in located.items():
@@ -153,19 +156,18 @@ def run_method(name: str, located: Mapping[str, Paths], sets: dict[str, Any], va
             for pair, row in zip(pairs, mapped, strict=True):
                 key = dict(zip(("set", "capture", "file"), pair.key, strict=True))
                 rows.append({"method": name, "variant": variant, **key, **row})
-    return rows
+    processes = resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN
+    return rows, max(resource.getrusage(one).ru_maxrss for one in processes) / 1e6
 
 
-def child(name: str, arguments: Sequence[str]) -> tuple[list[Row], float]:
-    """Return (rows, largest memory in GB) of this script running one method in a process of its own, which may crash;
-    no rows without a result.
-    """
-    with tempfile.NamedTemporaryFile("r", suffix=".json") as file:
-        process = watched([sys.executable, __file__, *arguments, "--only", name, "-o", file.name])
-        if process.code:
-            print(f"{name}: left out", file=sys.stderr)
-            return [], 0.0
-        return json.load(file), process.largest_gb
+def in_its_process(function: Any, name: str) -> tuple[list[Row], float]:
+    """Return the result of a method in a process of its own, which may crash; no rows without a result."""
+    try:
+        with ProcessPoolExecutor(1, get_context("spawn")) as pool:
+            return pool.submit(function, name).result()
+    except Exception as error:  # any exception of a method
+        print(f"{name}: left out ({error})", file=sys.stderr)
+        return [], 0.0
 
 
 def print_missing(missing: Mapping[str, Sequence[str]], sets: dict[str, Any]) -> None:
@@ -194,7 +196,6 @@ def main(
     jobs: Annotated[int, typer.Option(help="methods at a time; above one, seconds mean little")] = 1,
     mappings: Path | None = None,
     plot: Path | None = None,
-    only: Annotated[str, typer.Option(hidden=True)] = "",
 ) -> None:
     known = read_sets()
     if sets:
@@ -202,20 +203,13 @@ def main(
     if unknown := set(variants.split(",")) - set(VARIANTS):
         sys.exit(f"unknown variant '{unknown.pop()}'; choose from {', '.join(VARIANTS)}")
     located, missing = locate(data, known)
-    if only:
-        cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_ERROR)  # it warns of every unknown tag
-        try:
-            output.write_text(json.dumps(run_method(only, located, known, variants.split(","))))
-        except UnavailableError as error:
-            sys.exit(f"{only}: {error}")
-        return
     print_missing(missing, known)
     if not located:
         sys.exit(f"{data}: contains no complete set")
     names = methods.split(";")
-    arguments = [str(data), "--sets", ",".join(located), "--variants", variants]
+    one = partial(in_its_process, partial(run_method, located, known, variants.split(",")))
     with ThreadPoolExecutor(jobs) as pool:
-        result = dict(zip(names, pool.map(lambda name: child(name, arguments), names), strict=True))
+        result = dict(zip(names, pool.map(one, names), strict=True))
     rows = [row for some, _ in result.values() for row in some]
     if mappings:
         write_mappings(rows, mappings)

@@ -14,8 +14,10 @@ from bands import score
 from bands.images import VARIANTS, degraded, locate, read
 from bands.run import asked, claim, lens_corrected, write_mappings
 from peers import UnavailableError, identity, method_named
+from synthetic_flights.aligned import sidecar_of
 
 from agalign.cameras.discover import discover
+from agalign.products.sidecar.schema import GridPart
 from agalign.values import geometry
 
 pytestmark = pytest.mark.full
@@ -195,8 +197,10 @@ def test_a_method_is_loaded_from_a_file(tmp_path: Path) -> None:
 
 
 def test_only_what_is_called_aligned_is_claimed() -> None:
-    grid = {"reference_px": [[0, 0], [1, 0], [0, 1]], "moving_px": [[0, 0], [1, 0], [0, 1]]}
-    claims = {s: claim({"status": s, "grid": grid}) for s in ("aligned", "predicted", "seed_only", "failed")}
+    corners = [[0, 0], [1, 0], [0, 1]]
+    grid = GridPart(reference_px=corners, moving_px=corners)
+    band = sidecar_of("IMG_0001", 1, (160, 120), raw=False).bands[1].model_copy(update={"grid": grid})
+    claims = {s: claim(band.model_copy(update={"status": s})) for s in ("aligned", "predicted", "seed_only", "failed")}
     assert (claims["aligned"]["claimed"], claims["predicted"]["claimed"]) == ("yes", "no")
     assert claims["seed_only"] == claims["failed"] == claim(None) == {}
 
