@@ -10,6 +10,7 @@ import contextlib
 import importlib
 import importlib.util
 import io
+import runpy
 from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
@@ -49,12 +50,9 @@ def method_named(name: str) -> Align:
     """Return a method of this module by its name, or FILE.py:FUNCTION. Raises UnavailableError."""
     if ".py:" in name:
         path, _, function = name.rpartition(":")
-        spec = importlib.util.spec_from_file_location(Path(path).stem, path)
-        if spec is None or spec.loader is None or not Path(path).is_file():
+        if not Path(path).is_file():
             raise UnavailableError(f"{path}: not a Python file")
-        module = importlib.util.module_from_spec(spec)
-        spec.loader.exec_module(module)
-        align: Align = getattr(module, function)
+        align: Align = runpy.run_path(path)[function]
         return align
     if name not in METHODS:
         raise UnavailableError(f"unknown method; choose from {', '.join(METHODS)}")
@@ -123,7 +121,7 @@ def ecc(fixed: Image, moving: Image) -> Matrix | None:
         small = [cv2.resize(e, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA) for e in edges]
         start = geometry.rescale(matrix, PixelScale(scale, scale), PixelScale(scale, scale)).astype(np.float32)
         try:
-            _, result = cv2.findTransformECC(small[0], small[1], start, cv2.MOTION_HOMOGRAPHY, criteria, None, 1)
+            _, result = cv2.findTransformECC(*small, start, cv2.MOTION_HOMOGRAPHY, criteria, None, 1)
         except cv2.error:
             return None
         matrix = geometry.rescale(result.astype(float), *(PixelScale(scale, scale).inverse,) * 2)

@@ -14,8 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from agalign.synthetic.cameras import FOCAL_LENGTH_MM, PIXELS_PER_MM, Pose
 from synthetic_flights.depth import CLOSE_RANGE, Hand, Scene
-from synthetic_flights.materials import make_textures
-from synthetic_flights.patches import Patch
+from synthetic_flights.patches import Patch, make_textures
 
 CLOSE_M, FAR_M = (1.2, 2.0), (18.0, 22.0)
 """Range to the lowest surface."""

@@ -19,17 +19,14 @@ def test_the_error_is_that_of_the_mapping_at_the_ties(tmp_path: Path, reference:
     """Also if the ties have the second band as their reference, from which the first one is shifted by (3.3, 0.4)."""
     whole = sidecar_of("IMG_0001", 1, (160, 120), raw=False).model_dump(mode="json", by_alias=True)
     shift = geometry.translation(3.3, 0.4).tolist()
-    seed = {"kind": "rig", "fixed_to_moving": shift, "peak_sigma": 9.0, "runner_up_sigma": 3.0}
-    homography = {"fixed_to_moving": shift, "space": "pixel"}
     joint = dict.fromkeys(("loss", "retrieval", "chance", "last_step_px"), 0.1) | {"iterations": 1, "levels": [1.0]}
-    joint |= {
-        "recipe": "fast",
-        "model_family": "homography",
-        "corner_std_px": 0.2,
-        "corner_std_xy_px": [[0.1, 0.1]] * 4,
-    }
+    joint |= {"recipe": "fast", "model_family": "homography"}
+    joint |= {"corner_std_px": 0.2, "corner_std_xy_px": [[0.1, 0.1]] * 4}
     first, aligned, predicted, failed = whole["bands"]
-    mapped = {"homography": homography, "seed": seed}
+    mapped = {
+        "homography": {"fixed_to_moving": shift, "space": "pixel"},
+        "seed": {"kind": "rig", "fixed_to_moving": shift, "peak_sigma": 9.0, "runner_up_sigma": 3.0},
+    }
     prediction = {"from": "flight", "std_px": 0.7, "off_px": None}
     bands = [
         aligned | mapped | {"joint": joint},
