@@ -79,9 +79,10 @@ def known_errors(out: Path, ties: Ties, of_a_run: Ties) -> list[BandError]:
     """
     result = []
     for band in common.band_errors(out, of_a_run | ties):
-        noise_px = TIE_NOISE_PX * (1 if (of_a_run | ties)[band.file]["reference"] == band.reference else 2)
-        claim_px = np.hypot(band.claim_px, noise_px)
-        known = np.isfinite(band.error_px) & (band.file in ties or np.isfinite(claim_px))
+        file = band.part.file
+        is_reference = (of_a_run | ties)[file]["reference"] == band.sidecar.reference.file
+        claim_px = np.hypot(band.claim_px, TIE_NOISE_PX * (1 if is_reference else 2))
+        known = np.isfinite(band.error_px) & (file in ties or np.isfinite(claim_px))
         result.append(replace(band, error_px=band.error_px[known], claim_px=claim_px[known]))
     return result
 
@@ -96,12 +97,12 @@ def print_bands(name: str, bands: list[BandError]) -> None:
         wrong = "WRONG" if is_wrong(row) else "usable" if row.is_usable else ""
         errors = [cell(row.error_px, ".3f", partial(np.percentile, q=q)) for q in (50, 68, 90)]
         beyond, claim = cell(row.error_px > 1, ".0%", np.mean), cell(row.claim_px, ".3f")
-        what = (f"{row.capture} {row.band}", row.status, row.geometry, wrong)
-        print_row(name, *what, *errors, beyond, claim, f"{row.seconds:.1f}")
+        what = row.name, row.part.status, row.part.geometry.kind, wrong
+        print_row(name, *what, *errors, beyond, claim, f"{row.part.seconds:.1f}")
 
 
 def summary(name: str, rows: list[BandError]) -> tuple[object, ...]:
-    aligned, usable = [r for r in rows if r.status == "aligned"], [r for r in rows if r.is_usable]
+    aligned, usable = [r for r in rows if r.part.status == "aligned"], [r for r in rows if r.is_usable]
     medians, p95s = ([np.percentile(r.error_px, q) for r in aligned if len(r.error_px)] for q in (50, 95))
     pairs = [np.stack([r.error_px, r.claim_px]) for r in usable]
     error, claim = np.concatenate([np.empty((2, 0)), *pairs], axis=1)
@@ -116,7 +117,7 @@ def summary(name: str, rows: list[BandError]) -> tuple[object, ...]:
         cell(p95s, ".2f"),
         cell(error <= 2 * claim, ".0%", np.mean),
         cell((claim < 0.3) & (error > 1), ".1%", np.mean),
-        cell([r.seconds for r in aligned], ".1f"),
+        cell([r.part.seconds for r in aligned], ".1f"),
     )
 
 

@@ -10,7 +10,7 @@ import tempfile
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
@@ -25,7 +25,7 @@ from scipy.interpolate import RegularGridInterpolator
 from agalign.pixels.raster import without_warnings
 from agalign.products.sidecar.convert import read_alignment
 from agalign.products.sidecar.file import find_sidecars, read_sidecar
-from agalign.products.sidecar.schema import Sidecar, is_usable
+from agalign.products.sidecar.schema import BandPart, Sidecar, is_usable
 from agalign.values.geometry import Points
 
 Ties = dict[str, dict[str, Any]]
@@ -211,30 +211,27 @@ class Watched:
     """Processes that outlived it."""
 
 
-def watched(argv: Sequence[str], **options: Any) -> Watched:
-    """Run a command and sample its resources. `options` are those of subprocess.Popen."""
+def watched(argv: Sequence[str]) -> Watched:
+    """Run a command and sample its resources."""
     import psutil
 
     began, samples, seen = time.monotonic(), [], set[psutil.Process]()
-    process = subprocess.Popen(argv, **options)
-    while True:
-        pid, status, usage = os.wait4(process.pid, os.WNOHANG)
-        if pid:
-            process.returncode = os.waitstatus_to_exitcode(status)
-            break
-        values = []
-        with_children = [psutil.Process(process.pid), *psutil.Process(process.pid).children(recursive=True)]
-        for one in with_children:
-            try:
+    process = subprocess.Popen(argv)
+    here = psutil.Process(process.pid)
+    while not (ended := os.wait4(process.pid, os.WNOHANG))[0]:
+        children = here.children(recursive=True)
+        values = np.zeros(4)
+        for one in (here, *children):
+            with suppress(psutil.Error, OSError):
                 memory = one.memory_full_info()
-                values.append((memory.rss / 1e6, memory.uss / 1e6, one.num_fds(), 1))
-            except (psutil.Error, OSError):
-                continue
-        seen.update(with_children[1:])
-        samples.append((time.monotonic() - began, *np.sum(values or [(0, 0, 0, 0)], axis=0)))
+                values += memory.rss / 1e6, memory.uss / 1e6, one.num_fds(), 1
+        seen.update(children)
+        samples.append((time.monotonic() - began, *values))
         time.sleep(0.5)
     seconds = time.monotonic() - began
     _, left = psutil.wait_procs(seen, timeout=10)
+    _, status, usage = ended
+    process.returncode = os.waitstatus_to_exitcode(status)
     return Watched(process.returncode, seconds, usage.ru_maxrss / 1e6, np.array(samples), left)
 
 
@@ -245,24 +242,24 @@ def watched(argv: Sequence[str], **options: Any) -> Watched:
 class BandError:
     """Error of a moving band at its tie points."""
 
-    capture: str
-    band: str
-    file: str
-    reference: str
-    """File of the reference band of the run."""
-    status: str
-    geometry: str
-    is_usable: bool
-    """Aligned, or predicted within --accept-predicted."""
-    source: str
-    """Origin of a prediction, or empty."""
+    sidecar: Sidecar
+    part: BandPart
+    """The band in it."""
     std_px: float
     """Reported standard error; nan without one."""
     error_px: Points
     """(n,)"""
     claim_px: Points
     """(n,) values of the error map; nan outside, or without a map."""
-    seconds: float
+
+    @property
+    def name(self) -> str:
+        return f"{self.sidecar.capture} {self.part.band}"
+
+    @property
+    def is_usable(self) -> bool:
+        """Aligned, or predicted within --accept-predicted."""
+        return is_usable(self.part.status, self.part.prediction, self.sidecar.max_predicted_px)
 
     @property
     def median_px(self) -> float:
@@ -301,23 +298,9 @@ def band_errors(out: Path, truth: Ties) -> list[BandError]:
             if truth[band.file]["reference"] in references:
                 points = read_alignment(path, references[truth[band.file]["reference"]]).inverse(points)
             std_px = prediction.std_px if prediction else band.joint.corner_std_px if band.joint else None
-            aligned_or_predicted = band.status in ("aligned", "predicted") and std_px is not None
-            result.append(
-                BandError(
-                    sidecar.capture,
-                    band.band,
-                    band.file,
-                    sidecar.reference.file,
-                    band.status,
-                    alignment.geometry,
-                    is_usable(band.status, prediction, sidecar.max_predicted_px),
-                    prediction.source if prediction else "",
-                    std_px if aligned_or_predicted else np.nan,
-                    np.linalg.norm(alignment.map(points) - target, axis=1),
-                    claims_px(path, sidecar, band.band, points),
-                    band.seconds,
-                )
-            )
+            known_std_px = std_px if band.status in ("aligned", "predicted") and std_px is not None else np.nan
+            error_px = np.linalg.norm(alignment.map(points) - target, axis=1)
+            result.append(BandError(sidecar, band, known_std_px, error_px, claims_px(path, sidecar, band.band, points)))
     return result
 
 
@@ -362,13 +345,14 @@ def print_errors(groups: dict[str, list[BandError]]) -> None:
     print_head("", *head)
     for name, bands in groups.items():
         errors, std = np.array([(b.median_px, b.std_px) for b in bands]).T
-        statuses = Counter(f"{b.status} ({b.source})" if b.source else b.status for b in bands)
+        parts = [b.part for b in bands]
+        statuses = Counter(f"{p.status} ({p.prediction.source})" if p.prediction else p.status for p in parts)
         counts = ", ".join(f"{n} {status}" for status, n in statuses.most_common())
         shares = errors / std
         cells = f"{np.median(errors):.3f}", f"{errors.max():.3f}", cell(shares, ".1f", np.max)
         within = [f"{np.mean(shares <= k):.0%}" for k in (1, 2)]
-        print_row(name, len({b.capture for b in bands}), counts, *cells, *within)
+        print_row(name, len({b.sidecar.capture for b in bands}), counts, *cells, *within)
     for name, bands in groups.items():
         for b in bands:
-            if b.median_px > WRONG_PX or b.status not in ("aligned", "predicted"):
-                print(f"{name}: {b.capture} {b.band}: {b.status}, {b.median_px:.2f} px, standard error {b.std_px:.2f}")
+            if b.median_px > WRONG_PX or b.part.status not in ("aligned", "predicted"):
+                print(f"{name}: {b.name}: {b.part.status}, {b.median_px:.2f} px, standard error {b.std_px:.2f}")

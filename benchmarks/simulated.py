@@ -54,7 +54,7 @@ FLIGHTS: dict[str, Flight] = {
 def by_fault(bands: list[BandError], truth: Ties) -> dict[str, list[BandError]]:
     groups = defaultdict[str, list[BandError]](list)
     for band in bands:
-        groups[truth[band.file]["trouble"] or "none"].append(band)
+        groups[truth[band.part.file]["trouble"] or "none"].append(band)
     return groups
 
 
@@ -62,7 +62,7 @@ def by_band(bands: list[BandError], camera: CameraSpec) -> dict[str, list[BandEr
     """Group bands by name, with errors in px of the reference, and again in their own px if these differ."""
     groups: dict[str, list[BandError]] = {}
     for spec in camera.bands:
-        own = [b for b in bands if b.band == spec.name]
+        own = [b for b in bands if b.part.band == spec.name]
         scale = spec.size_ratio[0] / spec.view * camera.bands[camera.reference].view
         if own:
             groups[spec.name] = [replace(b, error_px=b.error_px / scale, std_px=b.std_px / scale) for b in own]

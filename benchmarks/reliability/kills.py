@@ -88,11 +88,10 @@ def torn(out: Path) -> int:
 def processes_of(process: "subprocess.Popen[str]", target: str) -> list[psutil.Process]:
     """Return the running processes that a signal is sent to; the run itself where it has no workers."""
     here = psutil.Process(process.pid)
-    below = [c for c in here.children(recursive=True) if c.ppid() != here.pid]
-    chosen = {c.parent() for c in below} if target == "fork server" else set(below) if target == "worker" else {here}
-    if target == "run and workers":
-        chosen |= set(here.children(recursive=True))
-    return [c for c in chosen if c is not None] or [here]
+    children = here.children(recursive=True)
+    below = [c for c in children if c.ppid() != here.pid]
+    servers = [c for c in {c.parent() for c in below} if c is not None]
+    return {"run": [], "fork server": servers, "worker": below, "run and workers": [here, *children]}[target] or [here]
 
 
 def strike(argv: list[str], after_s: float, number: signal.Signals, target: str, rng: random.Random) -> Counter[str]:

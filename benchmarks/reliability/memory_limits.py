@@ -35,13 +35,14 @@ def run_within(limit_gb: float, flight: Path, out: Path, *options: str) -> tuple
     )
     if ending.code is None:
         return f"not ended after {MAX_S} s", "", ending.seconds
-    lines = ending.errors.replace(f"{out}/", "").replace(f"{flight}/", "").splitlines()
-    line = next((line for line in lines if line.startswith("agalign: ")), lines[-1] if lines else "")
+    # The limit itself is in the line.
+    line = next(iter([*ending.complaints, *ending.errors.splitlines()[-1:]]), "")
+    line = re.sub(r"limited to [0-9.]+ GB", "limited to … GB", line.replace(f"{out}/", "").replace(f"{flight}/", ""))
     code = ending.code
     how = f"exit code {code}" if code >= 0 else f"ended by {signal.Signals(-code).name}"
     if ending.has_traceback:
         how += ", with a traceback or a request for a report"
-    elif code and not line.startswith("agalign: "):
+    elif code and not ending.complaints:
         how += ", without a reason"
     return how, line.removeprefix("agalign: "), ending.seconds
 
@@ -61,8 +62,6 @@ def main(
                 # A time limit asks for worker processes; a flight of four captures is done in threads otherwise.
                 workers = ("-j", str(jobs)) if jobs == 1 else ("-j", str(jobs), "--timeout", "100")
                 how, line, seconds = run_within(limit_gb, flight, out.with_name(f"out{jobs}-{step}"), *workers)
-                # The limit itself is in the line.
-                line = re.sub(r"limited to [0-9.]+ GB", "limited to … GB", line)
                 print(f"-j {jobs} {limit_gb:.2f} GB: {how}, {seconds:.1f} s: {line}", flush=True)
                 rows[how, line].append((limit_gb, seconds))
     table = [("limit, GB", "runs", "slowest, s", "how it ended", "first line")]

@@ -41,9 +41,9 @@ def test_the_error_is_that_of_the_mapping_at_the_ties(tmp_path: Path, reference:
     truth = {"a": {"reference": reference, "bands": {f"IMG_0001_{k}.tif": entry for k in (2, 3, 4)}}}
     (tmp_path / "ties.json").write_text(json.dumps(truth))
     result = band_errors(tmp_path, read_ties(tmp_path / "ties.json"))
-    assert [(b.file, b.status, b.is_usable, b.source, b.std_px) for b in result] == [
-        ("IMG_0001_2.tif", "aligned", True, "", 0.2),
-        ("IMG_0001_3.tif", "predicted", True, "flight", 0.7),
+    assert [(b.part.file, b.part.status, b.is_usable, b.std_px) for b in result] == [
+        ("IMG_0001_2.tif", "aligned", True, 0.2),
+        ("IMG_0001_3.tif", "predicted", True, 0.7),
     ]
     np.testing.assert_allclose([(b.median_px, b.p95_px) for b in result], 0.5, atol=1e-5)
 

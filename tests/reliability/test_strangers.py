@@ -214,4 +214,4 @@ def test_a_model_changed_by_hand_makes_no_wrong_alignment(
     assert changed.read_bytes() == contents, "the model was used"
     errors = band_errors(tmp_path, read_ties(learned / "in" / "truth.json"))
     assert len(errors) == 16
-    assert [e for e in errors if e.status == "aligned" and not e.p95_px <= WRONG_PX] == []
+    assert [e for e in errors if e.part.status == "aligned" and not e.p95_px <= WRONG_PX] == []
