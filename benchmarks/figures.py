@@ -64,8 +64,8 @@ def matches(fixed: Raster, moving: Raster, truth: Matrix) -> NDArray[np.uint8]:
         f, f_prime = describe(keypoints, truth)
         nearest = ((f[:, None] - f_prime[None]) ** 2).sum(-1).argmin(1).numpy()
         right = nearest == np.arange(len(keypoints))
-        here = keypoints.xy.numpy().astype(np.float64)[drawn]
-        there = geometry.apply(truth, keypoints.xy.numpy().astype(np.float64)[nearest[drawn]])
+        xy = keypoints.xy.numpy().astype(np.float64)
+        here, there = xy[drawn], geometry.apply(truth, xy[nearest[drawn]])
         text = f"{title}: {right.mean():.0%} of {len(right)} keypoints find their own patch"
         strip = with_text(np.full((34, 2 * SIZE_PX[0], 3), 255, np.uint8), text, (6, 24), 20)
         rows += [strip, draw_matches(fixed, moving, here, there, right[drawn])]
@@ -75,12 +75,10 @@ def matches(fixed: Raster, moving: Raster, truth: Matrix) -> NDArray[np.uint8]:
 def draw_matches(fixed: Raster, moving: Raster, here: Points, there: Points, right: NDArray) -> NDArray[np.uint8]:
     """Return both images next to each other, with lines between corresponding rows of `here` and `there`, (N, 2)."""
     sheet = np.hstack([cv2.cvtColor(to_8_bit(r), cv2.COLOR_GRAY2BGR) for r in (fixed, moving)])
-    right_of = np.array([fixed.size_px[0], 0.0])
-    for one, other, is_right in zip(here, there + right_of, right, strict=True):
-        colour = GREEN if is_right else RED
-        ends = [(round(float(x)), round(float(y))) for x, y in (one, other)]
-        cv2.line(sheet, *ends, colour, 1, cv2.LINE_AA)
-        for end in ends:
+    ends = np.stack([here, np.add(there, (fixed.size_px[0], 0.0))], axis=1).round().astype(int)
+    for line, colour in zip(ends.tolist(), np.where(right[:, None], GREEN, RED).tolist(), strict=True):
+        cv2.line(sheet, *line, colour, 1, cv2.LINE_AA)
+        for end in line:
             cv2.circle(sheet, end, 4, colour, 1, cv2.LINE_AA)
     return sheet
 

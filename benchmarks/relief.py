@@ -141,16 +141,10 @@ def occlusion_scores(
         return {}
     inside = truth.inside[window]
     masked, hidden = np.isnan(pixels) & inside, truth.hidden[window] & inside
-    return {"precision": _share(masked, _grown(hidden)), "recall": _share(hidden, _grown(masked))}
-
-
-def _grown(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    side = 2 * _TOLERANCE_PX + 1
-    return np.asarray(cv2.dilate(mask.astype(np.uint8), np.ones((side, side), np.uint8)) > 0)
-
-
-def _share(some: NDArray[np.bool_], of: NDArray[np.bool_]) -> float:
-    return float(of[some].mean()) if some.any() else np.nan
+    near = np.ones((2 * _TOLERANCE_PX + 1,) * 2, np.uint8)
+    near_masked, near_hidden = (cv2.dilate(mask.astype(np.uint8), near) for mask in (masked, hidden))
+    precision, recall = (of.mean() if len(of) else np.nan for of in (near_hidden[masked], near_masked[hidden]))
+    return {"precision": float(precision), "recall": float(recall)}
 
 
 # ---- runs

@@ -41,15 +41,10 @@ def locate(folder: Path, sets: Mapping[str, Mapping[str, Any]]) -> tuple[dict[st
     sizes = {entry["bytes"] for s in sets.values() for entry in s["files"].values()}
     files = [p for p in sorted(folder.rglob("*")) if p.is_file() and p.stat().st_size in sizes]
     by_sum = {file_checksum(path): path for path in files}
-    located: dict[str, Paths] = {}
-    missing: dict[str, list[str]] = {}
-    for name, description in sets.items():
-        paths = {f: by_sum[entry["sha256"]] for f, entry in description["files"].items() if entry["sha256"] in by_sum}
-        if absent := [f for f in description["files"] if f not in paths]:
-            missing[name] = absent
-        else:
-            located[name] = paths
-    return located, missing
+    paths = {name: {f: by_sum.get(e["sha256"]) for f, e in s["files"].items()} for name, s in sets.items()}
+    missing = {name: [f for f, path in of_set.items() if path is None] for name, of_set in paths.items()}
+    located = {name: of_set for name, of_set in paths.items() if not missing[name]}
+    return located, {name: absent for name, absent in missing.items() if absent}
 
 
 def read(path: Path) -> Image:

@@ -14,7 +14,7 @@ import resource
 import shutil
 import sys
 import tempfile
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
 from dataclasses import replace
 from functools import partial
@@ -28,7 +28,7 @@ import typer
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # run as a file, its package is not found
 
-from common import align, flight_and_out, run, timed, write_band
+from common import align, flight_and_out, heat_map, pyplot, run, timed, write_band
 from peers import METHODS, Align, grey_raster, method_named
 
 from agalign.cameras.discover import discover
@@ -39,8 +39,19 @@ from agalign.values import geometry, lens
 from agalign.values.capture import Band
 from agalign.values.mapping import PixelMapping
 from bands.images import LENS_CORRECTED, VARIANTS, Image, Paths, degraded, locate, read, straightened
-from bands.report import draw, tables
-from bands.score import AS_IT_IS, Pair, pairs_of, read_sets, score_pairs, summary, write_csv
+from bands.score import (
+    AS_IT_IS,
+    Pair,
+    Score,
+    Scored,
+    markdown,
+    pairs_of,
+    read_sets,
+    score_pairs,
+    summary,
+    table,
+    write_csv,
+)
 
 WHOLE = {"agalign, capture": (), "agalign, capture, no tags": ("--ignore-metadata",)}
 """Runs of the command line on a whole flight, with its files and tags: options by name."""
@@ -123,6 +134,67 @@ def asked(method: Align, pair: Pair, variant: str, paths: Paths, bands: Mapping[
         print(f"{pair.key}, {variant}: refused ({type(error).__name__}: {error})", file=sys.stderr)
         return {}
     return {"seconds": seconds} | ({} if matrix is None else {"homography": np.asarray(matrix, float).tolist()})
+
+
+# ---- tables and a figure
+
+
+def tables(scored: Sequence[Scored], gigabytes: Mapping[str, float]) -> str:
+    """An overview; unmodified images by set; each variant with the sets pooled; and the memory of each method."""
+    degraded = summary([s for s in scored if s.variant != AS_IT_IS], "all sets")
+    by_variant = {variant: [s for s in degraded if s.variant == variant] for variant in VARIANTS}
+    parts = [f"### {variant}\n\n{markdown(scores)}\n" for variant, scores in by_variant.items() if scores]
+    memory = "; ".join(f"{name} {value:.1f}" for name, value in gigabytes.items())
+    return "\n".join([overview(scored), by_set(scored), *parts, f"Largest process, GB: {memory}.\n"])
+
+
+def overview(scored: Sequence[Scored]) -> str:
+    """Methods by variants, all sets together: pairs claimed within 0.5 px, and wrong claims."""
+
+    def cell(score: Score, pairs: int) -> str:
+        # The number of pairs, if the method was not run on all.
+        of = "" if score.pairs == pairs else f" of {score.pairs}"
+        return f"{round(score.under_half_px * score.pairs)}{of}/**{score.wrong_claims}**"
+
+    return _by_method("", {(s.method, s.variant): s for s in summary(scored, "all sets")}, cell)
+
+
+def by_set(scored: Sequence[Scored]) -> str:
+    """Methods by sets, unmodified images: median error of the claims in px, and wrong claims."""
+
+    def cell(score: Score, _pairs: int) -> str:
+        median = "-" if np.isnan(score.median_px) else f"{score.median_px:.3f}"
+        return f"{median}/**{score.wrong_claims}**"
+
+    scores = summary([s for s in scored if s.variant == AS_IT_IS])
+    return _by_method("method", {(s.method, s.set): s for s in scores}, cell)
+
+
+def _by_method(corner: str, scores: Mapping[tuple[str, str], Score], cell: Callable[[Score, int], str]) -> str:
+    """A row for each method, a column for each variant or set, with its number of pairs in the head."""
+    methods, columns = (dict.fromkeys(key[k] for key in scores) for k in (0, 1))
+    pairs = {c: max(s.pairs for (_, column), s in scores.items() if column == c) for c in columns}
+    rows = [
+        [method, *(cell(scores[method, c], pairs[c]) if (method, c) in scores else "-" for c in columns)]
+        for method in methods
+    ]
+    return table([[corner, *(f"{c} ({n})" for c, n in pairs.items())], *rows]) + "\n"
+
+
+def draw(scored: Sequence[Scored], path: Path) -> None:
+    """Two heat maps, methods by variants: the share of pairs claimed to half a px, and of wrong claims."""
+    scores = summary(scored, "all sets")
+    methods, variants = (list(dict.fromkeys(getattr(s, name) for s in scores)) for name in ("method", "variant"))
+    grids = np.full((2, len(methods), len(variants)), np.nan)
+    for s in scores:
+        grids[:, methods.index(s.method), variants.index(s.variant)] = s.under_half_px, s.wrong_claims / s.pairs
+    size = 13, 1.7 + 0.42 * len(methods)
+    figure, axes = pyplot().subplots(1, 2, figsize=size, sharey=True, layout="constrained")
+    titles = "claimed, and within 0.5 px: % of pairs", "wrong claims, more than 1 px off: % of pairs"
+    for axis, grid, title, colours in zip(axes, grids, titles, ("Greens", "Reds"), strict=True):
+        heat_map(axis, grid, methods, variants, cmap=colours)
+        axis.set_title(title, fontsize=11)
+    figure.savefig(path, dpi=85)
 
 
 # ---- methods on all sets

@@ -23,17 +23,10 @@ from agalign.synthetic import flight as synthetic
 SIZE_PX, MAX_S = (480, 360), 1800
 
 
-def dask(program: str, address_file: Path, *arguments: str) -> "subprocess.Popen[bytes]":
+def dask(program: str, address_file: Path, *arguments: str) -> psutil.Popen:
     module = [sys.executable, "-m", f"distributed.cli.{program}", "--scheduler-file", str(address_file)]
     quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
-    return subprocess.Popen([*module, "--no-dashboard", *arguments], **quiet)
-
-
-def kill_worker(nanny_pid: int) -> None:
-    """Kill a nanny and its worker, which is the largest of its children."""
-    nanny = psutil.Process(nanny_pid)
-    max(nanny.children(recursive=True), key=lambda p: p.memory_info().rss).kill()
-    nanny.kill()
+    return psutil.Popen([*module, "--no-dashboard", *arguments], **quiet)
 
 
 def main(captures: int = 40, markdown: Path | None = None) -> None:
@@ -51,11 +44,14 @@ def main(captures: int = 40, markdown: Path | None = None) -> None:
             done = 0
 
             def lose_a_worker(process: "subprocess.Popen[str]") -> None:
+                """Kill a nanny and its worker, which is the largest of its children, half-way."""
                 nonlocal done
                 while process.poll() is None and done < captures // 2:
                     time.sleep(0.1)
                     done = len(find_sidecars(out))
-                kill_worker(processes[0].pid)
+                nanny = processes[0]
+                max(nanny.children(recursive=True), key=lambda p: p.memory_info().rss).kill()
+                nanny.kill()
 
             ending = ended(command(flight, out, "--dask", address), MAX_S, lose_a_worker)
         finally:

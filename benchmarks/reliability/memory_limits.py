@@ -10,6 +10,7 @@ import resource
 import signal
 import sys
 from collections import defaultdict
+from functools import partial
 from pathlib import Path
 from typing import Annotated
 
@@ -27,12 +28,8 @@ MAX_S = 60
 
 def run_within(limit_gb: float, flight: Path, out: Path, *options: str) -> tuple[str, str, float]:
     """(how it ended, its first line, seconds) of a run with so much address space."""
-    limit = int(limit_gb * 1e9)
-    ending = ended(
-        command(flight, out, "--bands", "green,red", *options),
-        MAX_S,
-        preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_AS, (limit, limit)),
-    )
+    limit = partial(resource.setrlimit, resource.RLIMIT_AS, (int(limit_gb * 1e9),) * 2)
+    ending = ended(command(flight, out, "--bands", "green,red", *options), MAX_S, preexec_fn=limit)
     if ending.code is None:
         return f"not ended after {MAX_S} s", "", ending.seconds
     # The limit itself is in the line.
@@ -60,8 +57,9 @@ def main(
             for step in range(round((last_gb - first_gb) / step_gb) + 1):
                 limit_gb = first_gb + step * step_gb
                 # A time limit asks for worker processes; a flight of four captures is done in threads otherwise.
-                workers = ("-j", str(jobs)) if jobs == 1 else ("-j", str(jobs), "--timeout", "100")
-                how, line, seconds = run_within(limit_gb, flight, out.with_name(f"out{jobs}-{step}"), *workers)
+                workers = () if jobs == 1 else ("--timeout", "100")
+                new = out.with_name(f"out{jobs}-{step}")
+                how, line, seconds = run_within(limit_gb, flight, new, "-j", str(jobs), *workers)
                 print(f"-j {jobs} {limit_gb:.2f} GB: {how}, {seconds:.1f} s: {line}", flush=True)
                 rows[how, line].append((limit_gb, seconds))
     table = [("limit, GB", "runs", "slowest, s", "how it ended", "first line")]

@@ -25,11 +25,10 @@ def growth(samples: np.ndarray) -> str:
     """Return mean, growth and scatter of each quantity in the second half of a run."""
     count = samples[:, 4]
     working = samples[count == np.median(count)]  # neither while processes start nor while they end
-    half = working[working[:, 0] > working[-1, 0] / 2]
-    parts = []
+    half = working[working[:, 0] > working[-1, 0] / 2].T
+    parts, t_s = [], half[0]
     for name, column in QUANTITIES.items():
-        t_s, y = half[:, 0], half[:, column]
-        line = np.polyfit(t_s, y, 1)
+        y, line = half[column], np.polyfit(t_s, half[column], 1)
         growth, scatter = line[0] * (t_s[-1] - t_s[0]), (y - np.polyval(line, t_s)).std()
         parts.append(f"{name} {y.mean():.0f} (growth {growth:+.1f}, scatter {scatter:.1f})")
     return ", ".join(parts)

@@ -103,11 +103,6 @@ def test_every_writer_stays_in_its_folder(hostile_run: Path, tmp_path: Path, com
     written = files_in(tmp_path) - before
     assert all(p.is_relative_to(out) or p.is_relative_to(new) or p.parent == new.parent for p in written), written
     assert all(is_plain(p.name) for p in written)
-    if "export" in command:
-        images = 3 if needs_equal_bands else len(HOSTILE)
-        of_cameras = len(HOSTILE) if "micasense" in command else 0
-        extra = {"README.txt", "matrices.csv"} & {p.name for p in written}
-        assert len(written) == images + of_cameras + len(extra)
 
 
 @pytest.mark.slow
