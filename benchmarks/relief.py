@@ -16,23 +16,12 @@ from itertools import product
 from pathlib import Path
 from typing import Annotated
 
+import common
 import cv2
 import numpy as np
 import tifffile
 import typer
-from common import (
-    WRONG_PX,
-    align,
-    cell,
-    flight_and_out,
-    layer,
-    only_sidecar,
-    print_head,
-    print_row,
-    run,
-    timed,
-    window_of,
-)
+from common import WRONG_PX, cell, layer, print_head, print_row
 from numpy.typing import NDArray
 from peers import dis_flow
 from synthetic_flights.depth import BandTruth, Scene, Truth, write_capture
@@ -152,8 +141,8 @@ def occlusion_scores(
 
 def program_scores(out: Path, truth: Truth, blank: Score) -> Iterator[Score]:
     """Yield the scores of a run on one capture."""
-    path, sidecar = only_sidecar(out)
-    window = window_of(sidecar)
+    path, sidecar = common.only_sidecar(out)
+    window = common.window_of(sidecar)
     # With --relief-map the raster contains the range.
     of_range = range_errors(layer(path.with_suffix(".relief.tif"), "range"), truth.range_m[window])
     for name, known in truth.bands.items():
@@ -166,27 +155,27 @@ def program_scores(out: Path, truth: Truth, blank: Score) -> Iterator[Score]:
 def flow_scores(flight: Path, out: Path, truth: Truth, blank: Score) -> list[Score]:
     """Return the scores of the dense flow from the mappings of a run; a band without a mapping has none."""
     images = {p.name: tifffile.imread(p).astype(np.float32) for p in flight.rglob("*.tif")}
-    (path, sidecar), scores, total_s = only_sidecar(out), [], 0.0
+    (path, sidecar), scores, total_s = common.only_sidecar(out), [], 0.0
     reference = images[sidecar.reference.file]
     for band in (b for b in sidecar.bands if b.status != "reference"):
         start = mapping_of(path, band.band, sidecar.reference.size_px)
-        seconds, mapping = (0.0, None) if start is None else timed(dis_flow, reference, images[band.file], start)
+        seconds, mapping = (0.0, None) if start is None else common.timed(dis_flow, reference, images[band.file], start)
         total_s += seconds
-        values = residuals(mapping, truth.bands[band.band], window_of(sidecar))
+        values = residuals(mapping, truth.bands[band.band], common.window_of(sidecar))
         scores.append(replace(blank, band=band.band, **values))
     return [replace(score, seconds=total_s) for score in scores]
 
 
 def scores_of(scene: Scene, blank: Score, size_px: tuple[int, int], methods: Sequence[str]) -> Iterator[Score]:
     """Yield the scores of methods on one scene."""
-    with flight_and_out() as (flight, out):
+    with common.flight_and_out() as (flight, out):
         truth = write_capture(flight, scene, size_px=size_px, rng_seed=blank.scene)
         for method in methods:
             blank = replace(blank, method=method)
             if method == FLOW:
                 yield from flow_scores(flight, out / START, truth, blank)
             else:
-                seconds = align(flight, out / method, *_OPTIONS[method])
+                seconds = common.align(flight, out / method, *_OPTIONS[method])
                 yield from program_scores(out / method, truth, replace(blank, seconds=seconds))
 
 
@@ -237,4 +226,4 @@ def main(
 
 
 if __name__ == "__main__":
-    run(main)
+    common.run(main)

@@ -38,20 +38,9 @@ from agalign.products.sidecar.schema import BandPart
 from agalign.values import geometry, lens
 from agalign.values.capture import Band
 from agalign.values.mapping import PixelMapping
+from bands import score
 from bands.images import LENS_CORRECTED, VARIANTS, Image, Paths, degraded, locate, read, straightened
-from bands.score import (
-    AS_IT_IS,
-    Pair,
-    Score,
-    Scored,
-    markdown,
-    pairs_of,
-    read_sets,
-    score_pairs,
-    summary,
-    table,
-    write_csv,
-)
+from bands.score import AS_IT_IS, Pair, Score, Scored, summary, table
 
 WHOLE = {"agalign, capture": (), "agalign, capture, no tags": ("--ignore-metadata",)}
 """Runs of the command line on a whole flight, with its files and tags: options by name."""
@@ -143,7 +132,7 @@ def tables(scored: Sequence[Scored], gigabytes: Mapping[str, float]) -> str:
     """An overview; unmodified images by set; each variant with the sets pooled; and the memory of each method."""
     degraded = summary([s for s in scored if s.variant != AS_IT_IS], "all sets")
     by_variant = {variant: [s for s in degraded if s.variant == variant] for variant in VARIANTS}
-    parts = [f"### {variant}\n\n{markdown(scores)}\n" for variant, scores in by_variant.items() if scores]
+    parts = [f"### {variant}\n\n{score.markdown(scores)}\n" for variant, scores in by_variant.items() if scores]
     memory = "; ".join(f"{name} {value:.1f}" for name, value in gigabytes.items())
     return "\n".join([overview(scored), by_set(scored), *parts, f"Largest process, GB: {memory}.\n"])
 
@@ -151,10 +140,10 @@ def tables(scored: Sequence[Scored], gigabytes: Mapping[str, float]) -> str:
 def overview(scored: Sequence[Scored]) -> str:
     """Methods by variants, all sets together: pairs claimed within 0.5 px, and wrong claims."""
 
-    def cell(score: Score, pairs: int) -> str:
+    def cell(s: Score, pairs: int) -> str:
         # The number of pairs, if the method was not run on all.
-        of = "" if score.pairs == pairs else f" of {score.pairs}"
-        return f"{round(score.under_half_px * score.pairs)}{of}/**{score.wrong_claims}**"
+        of = "" if s.pairs == pairs else f" of {s.pairs}"
+        return f"{round(s.under_half_px * s.pairs)}{of}/**{s.wrong_claims}**"
 
     return _by_method("", {(s.method, s.variant): s for s in summary(scored, "all sets")}, cell)
 
@@ -162,9 +151,9 @@ def overview(scored: Sequence[Scored]) -> str:
 def by_set(scored: Sequence[Scored]) -> str:
     """Methods by sets, unmodified images: median error of the claims in px, and wrong claims."""
 
-    def cell(score: Score, _pairs: int) -> str:
-        median = "-" if np.isnan(score.median_px) else f"{score.median_px:.3f}"
-        return f"{median}/**{score.wrong_claims}**"
+    def cell(s: Score, _pairs: int) -> str:
+        median = "-" if np.isnan(s.median_px) else f"{s.median_px:.3f}"
+        return f"{median}/**{s.wrong_claims}**"
 
     scores = summary([s for s in scored if s.variant == AS_IT_IS])
     return _by_method("method", {(s.method, s.set): s for s in scores}, cell)
@@ -218,7 +207,7 @@ def run_method(
     for set_name, paths in located.items():
         bands = bands_of(paths)
         for variant in variants:
-            pairs = pairs_of(sets[set_name], variant)
+            pairs = score.pairs_of(sets[set_name], variant)
             if not applies(name, variant, pairs, bands, paths):
                 continue
             if method is None:
@@ -269,7 +258,7 @@ def main(
     mappings: Path | None = None,
     plot: Path | None = None,
 ) -> None:
-    known = read_sets()
+    known = score.read_sets()
     if sets:
         known = {name: known[name] for name in sets.split(",")}
     if unknown := set(variants.split(",")) - set(VARIANTS):
@@ -285,8 +274,8 @@ def main(
     rows = [row for some, _ in result.values() for row in some]
     if mappings:
         write_mappings(rows, mappings)
-    scored = score_pairs(rows, known)
-    write_csv(summary(scored), output)
+    scored = score.score_pairs(rows, known)
+    score.write_csv(summary(scored), output)
     text = tables(scored, {name: gigabytes for name, (some, gigabytes) in result.items() if some})
     output.with_suffix(".md").write_text(text, encoding="utf-8")
     print(text)

@@ -9,17 +9,8 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from agalign.cameras.tiff_directory import rational
-from agalign.synthetic.cameras import (
-    BLACK_LEVEL,
-    EXPOSURE_S,
-    WHITE_LEVEL,
-    BandSpec,
-    CameraSpec,
-    Exposure,
-    MicaSenseCamera,
-    rotation,
-    write_tiff,
-)
+from agalign.synthetic import cameras
+from agalign.synthetic.cameras import BandSpec, CameraSpec, Exposure, MicaSenseCamera, rotation, write_tiff
 from agalign.values import geometry
 from agalign.values.geometry import Matrix
 
@@ -80,7 +71,9 @@ class DjiCamera(CameraSpec):
         planes = [b.name for b in self.bands if b.sees == "colour"]
         kept = path.with_suffix(".npy")
         before = np.load(kept) if kept.is_file() else np.zeros((*pixels.shape, len(planes)), np.uint8)
-        share = np.clip((pixels.astype(np.float32) - BLACK_LEVEL) / (WHITE_LEVEL - BLACK_LEVEL), 0, 1)
+        share = np.clip(
+            (pixels.astype(np.float32) - cameras.BLACK_LEVEL) / (cameras.WHITE_LEVEL - cameras.BLACK_LEVEL), 0, 1
+        )
         before[..., planes.index(band.name)] = np.rint(255 * share ** (1 / 2.2))
         if planes.index(band.name) < len(planes) - 1:
             np.save(kept, before)
@@ -134,7 +127,7 @@ class SenteraCamera(CameraSpec):
         plane = geometry.normalised(to_plane(self.bands[self.reference], band, exposure.size_px))
         matrix = "".join(f"<rdf:li>{v:.9g}</rdf:li>" for v in plane.ravel())
         xmp = _SENTERA.format(band=band, capture=f"synthetic{exposure.number:011d}", matrix=matrix)
-        write_tiff(path, pixels, self, band, exposure, xmp, "SY6X0001", {}, {0x829A: rational(EXPOSURE_S)})
+        write_tiff(path, pixels, self, band, exposure, xmp, "SY6X0001", {}, {0x829A: rational(cameras.EXPOSURE_S)})
 
 
 def _camera(name: str, kind: type[CameraSpec]) -> CameraSpec:

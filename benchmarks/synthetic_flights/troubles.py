@@ -27,8 +27,6 @@ _SPEED_M_S = 8.0
 _LINE = 8
 """Captures of a line, before the drone turns."""
 
-Make = Callable[[np.random.Generator, Pose, tuple[int, int]], Shot]
-
 
 def make_troubled_flight(
     folder: Path, captures: int = 60, size_px: tuple[int, int] = (1280, 960), rng_seed: int = 0
@@ -37,7 +35,7 @@ def make_troubled_flight(
     Returns the path of truth.json, as `make_flight` does.
     """
     rng = np.random.default_rng(rng_seed)
-    shots = [make(rng, _pose(rng, number), size_px) for number, make in enumerate(_plan(captures))]
+    shots = [_shot(rng, _pose(rng, number), size_px, **what) for number, what in enumerate(_plan(captures))]
     return write_shots(folder, shots, size_px, REDEDGE, rng)
 
 
@@ -55,13 +53,12 @@ def make_two_headings(
     after another; with `lakes` the captures before and after each turn are over water.
     """
     rng = np.random.default_rng(rng_seed)
-    plain, lake = _capture(camera=camera), _capture("a lake", camera=camera, degrade=water)
-    shots = []
+    lake, shots = {"trouble": "a lake", "degrade": water}, []
     for number in range(captures):
         speed, drift = rng.normal(_SPEED_M_S, 0.5) * (-1) ** (number // line), rng.normal(0.0, 0.3)
         pose = replace(_pose(rng, number), yaw_deg=rng.normal(12.0, 1.5), velocity_m_s=(drift, -speed))
         turns = lakes and number % line in (0, line - 1) and 0 < number < captures - 1
-        shots.append((lake if turns else plain)(rng, pose, size_px))
+        shots.append(_shot(rng, pose, size_px, camera, **(lake if turns else {})))
     return write_shots(folder, shots, size_px, camera, rng)
 
 
@@ -91,22 +88,27 @@ def make_flight_between_panels(folder: Path, captures: int, size_px: tuple[int, 
     return write_shots(folder, lit, size_px, REDEDGE, rng)
 
 
-def _plan(captures: int) -> list[Make]:
-    """What to make of each capture: troubles first and last where they belong, the others spread over the flight."""
-    panel = _capture("panel", 1.0, change=_with_plain_panel)
-    start = [panel, panel, *(_capture("take-off", height_m) for height_m in (4.0, 8.0, 13.0, 19.0))]
-    end = [*(_capture("landing", height_m) for height_m in (15.0, 6.0)), panel]
-    twice = {"a lake": water, "fog": fog, "blur, 3 px": blur, "motion, 25 px": motion, "noise, 30 %": noise}
-    between = [_capture(name, degrade=by) for name, by in twice.items() for _ in range(1 + (by is not motion))]
-    between += [_capture("half saturated", degrade=half_saturated)]
-    between += [_capture("planted grid", change=_orchard)] * 3
-    between += [_capture("terraces", change=partial(_terraces, relief_m=1.5))] * 2
-    between += [_capture("no NIR", without=("NIR",))]
-    between += [_capture(f"{band} lost", degrade=nothing, degraded_bands=(band,)) for band in ("NIR", "Blue")]
-    plain = [_capture()] * max(0, captures - len(start) - len(end) - len(between))
+def _plan(captures: int) -> list[dict[str, Any]]:
+    """What is special in each capture, as options of `_shot`: troubles first and last where they belong, the others
+    spread over the flight.
+    """
+    panel = {"trouble": "panel", "altitude_m": 1.0, "change": _with_plain_panel}
+    start = [panel, panel, *({"trouble": "take-off", "altitude_m": height_m} for height_m in (4.0, 8.0, 13.0, 19.0))]
+    end = [*({"trouble": "landing", "altitude_m": height_m} for height_m in (15.0, 6.0)), panel]
+    degraded = {"a lake": water, "fog": fog, "blur, 3 px": blur, "motion, 25 px": motion, "noise, 30 %": noise}
+    degraded |= {"half saturated": half_saturated}
+    between: list[dict[str, Any]] = []
+    for name, by in degraded.items():
+        between += [{"trouble": name, "degrade": by}] * (1 if by in (motion, half_saturated) else 2)
+    between += [{"trouble": "planted grid", "change": _orchard}] * 3
+    between += [{"trouble": "terraces", "change": partial(_terraces, relief_m=1.5)}] * 2
+    between += [{"trouble": "no NIR", "without": ("NIR",)}]
+    for band in ("NIR", "Blue"):
+        between += [{"trouble": f"{band} lost", "degrade": nothing, "degraded_bands": (band,)}]
+    plain = max(0, captures - len(start) - len(end) - len(between))
     # One of every few captures is degraded, the first few being good.
-    until = np.linspace(0, len(between), len(plain) + 1).astype(int).tolist()
-    mixed = [make for k, one in enumerate(plain) for make in (one, *between[until[k] : until[k + 1]])]
+    until = np.linspace(0, len(between), plain + 1).astype(int).tolist()
+    mixed = [what for k in range(plain) for what in ({}, *between[until[k] : until[k + 1]])]
     return [*start, *mixed, *between[until[-1] :], *end][:captures]
 
 
@@ -115,21 +117,19 @@ def _pose(rng: np.random.Generator, number: int) -> Pose:
     return Pose(altitude_m, *angles_deg, 4.0 * (number % 10), 4.0 * (number // 10))
 
 
-def _capture(
-    trouble: str = "",
-    altitude_m: float | None = None,
+def _shot(
+    rng: np.random.Generator,
+    pose: Pose,
+    size_px: tuple[int, int],
     camera: CameraSpec = REDEDGE,
+    altitude_m: float | None = None,
     change: Callable[[np.random.Generator, Ground], Ground] | None = None,
     **more: Any,
-) -> Make:
-    """Return a function that makes a capture over its own ground, which is centred on it. `more` are fields of Shot."""
-
-    def make(rng: np.random.Generator, pose: Pose, size_px: tuple[int, int]) -> Shot:
-        pose = replace(pose, altitude_m=altitude_m or pose.altitude_m, east_m=0.0, north_m=0.0)
-        ground = paint_ground(rng, [pose], size_px, camera)
-        return Shot(pose, change(rng, ground) if change else ground, trouble=trouble, **more)
-
-    return make
+) -> Shot:
+    """A capture over its own ground, which is centred on it. `more` are fields of Shot."""
+    pose = replace(pose, altitude_m=altitude_m or pose.altitude_m, east_m=0.0, north_m=0.0)
+    ground = paint_ground(rng, [pose], size_px, camera)
+    return Shot(pose, change(rng, ground) if change else ground, **more)
 
 
 def _with_plain_panel(_rng: np.random.Generator, ground: Ground) -> Ground:
