@@ -90,8 +90,7 @@ def files_in(folder: Path) -> set[Path]:
 )
 def test_every_writer_stays_in_its_folder(hostile_run: Path, tmp_path: Path, command: str) -> None:
     """The files of the run, those of the command, and no others."""
-    root = tmp_path / "a" / "b"
-    shutil.copytree(hostile_run, root)
+    root = shutil.copytree(hostile_run, tmp_path / "a" / "b")
     images = ",".join(str(root / "in" / f"IMG_0000_{band}.tif") for band in (2, 3))
     (root / "pairs.csv").write_text(f"fixed,moving,name,homography\n{images},../../pwn,1 0 0 0 1 0 0 0 1\n")
     out, new, before = root / "deep" / "er" / "out", root / "some" / "where" / "new", files_in(tmp_path)
@@ -107,10 +106,9 @@ def test_every_writer_stays_in_its_folder(hostile_run: Path, tmp_path: Path, com
 
 @pytest.mark.slow
 def test_a_run_writes_plain_names_inside(hostile_run: Path) -> None:
-    assert {p.name for p in hostile_run.iterdir()} == {"in", "deep"}
-    written = files_in(hostile_run / "deep")
+    written = files_in(hostile_run) - files_in(hostile_run / "in")
     assert all(p.is_relative_to(hostile_run / "deep" / "er" / "out") and is_plain(p.name) for p in written)
-    assert len([p for p in written if p.name.endswith(".collection.json")]) >= len(HOSTILE) - 2
+    assert sum(p.name.endswith(".collection.json") for p in written) >= len(HOSTILE) - 2
 
 
 def test_names_of_files_are_plain_and_different() -> None:
@@ -129,10 +127,11 @@ def test_equal_names_do_not_overwrite_each_other(tmp_path: Path) -> None:
     """Labels of captures that are equal as one name, and a name that is the checksummed one of another text."""
     out = tmp_path / "out"
     make_aligned(out, 1)
+    content = read_json(out / "0000SET" / "IMG_0001.json") | {"status": "ok"}
+    for band in content["bands"]:
+        band["place"] = None
     for folder, name in (("0000SET/x", "y"), ("0000SET", "x_y"), ("0000SET_x", "y")):
-        content = read_json(out / "0000SET" / "IMG_0001.json") | {"capture": name, "status": "ok"}
-        for band in content["bands"]:
-            band["place"] = None
+        content["capture"] = name
         content["output"]["band_files"] = [{"file": f"{name}.tif", "bytes": 1}]
         (out / folder).mkdir(exist_ok=True)
         (out / folder / f"{name}.tif").write_text(folder)

@@ -106,8 +106,12 @@ def test_a_focal_length_of_damaged_tags_is_not_used() -> None:
 @pytest.mark.parametrize(
     ("field", "value", "said"),
     [
-        ("bands.0.grid.reference_px", [], "bands.0.grid: its lists of points are empty or of different lengths"),
         ("bands.0.grid.moving_px", [[0, 0]], "bands.0.grid: its lists of points are empty or of different lengths"),
+        (
+            "bands.0.grid",
+            {"reference_px": [], "moving_px": []},
+            "its lists of points are empty or of different lengths",
+        ),
         ("bands.0.seconds", 1e308, "bands.0.seconds: Input should be less than or equal to 1"),
         ("bands.0.metrics.tiles.0.shift_px.0", -1e200, "shift_px.0: Input should be greater than or equal to -1"),
         ("bands", [], "bands: List should have at least 1 item"),
