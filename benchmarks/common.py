@@ -93,12 +93,10 @@ def cell(values: Sequence[float] | NDArray[Any], style: str, statistic: Callable
 
 def pyplot() -> Any:
     """Return matplotlib.pyplot for figures in files."""
-    import matplotlib as mpl
+    from matplotlib import pyplot
 
-    mpl.use("Agg")
-    from matplotlib import pyplot as plt
-
-    return plt
+    pyplot.switch_backend("Agg")
+    return pyplot
 
 
 def heat_map(axis: Any, values: NDArray[np.float64], rows: Sequence[str], columns: Sequence[str], **style: Any) -> Any:
