@@ -13,7 +13,7 @@ images, each with noise of its own. Seeds: none; good, off by up to a quarter of
 off by one to three periods and not known to anything.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from functools import partial
 from itertools import product
 from typing import Any
@@ -159,10 +159,10 @@ def seeded_pair(kind: str, rng: np.random.Generator) -> Pair:
 # ---- decisions
 
 
-def print_decisions(kinds: Sequence[str], pair_of: Callable[[str, np.random.Generator], Pair], numbers: range) -> None:
-    """Align a pair for each number, of the kinds in turn, and print a table of the results."""
+def main(count: Number = 200, first: Number = 0, *, grids: bool = False) -> None:
+    kinds, pair_of = (("none", "good", "bad"), seeded_pair) if grids else ((*BAD, *GOOD, GRID), pair_with_error)
     rows: dict[str, list[tuple[str, float, float]]] = {kind: [] for kind in kinds}
-    for number in numbers:
+    for number in range(first, first + count):
         kind = kinds[number % len(kinds)]
         fixed, moving, options, error_px = pair_of(kind, np.random.default_rng(number))
         seconds, result = timed(agalign.align, fixed, moving, **options)
@@ -175,11 +175,6 @@ def print_decisions(kinds: Sequence[str], pair_of: Callable[[str, np.random.Gene
         counts = [sum(status == one for status, *_ in some) for one in statuses]
         wrong, worst_px = sum(not error <= WRONG_PX for error in errors), max(errors, default=np.nan)
         print_row(kind, len(some), *counts, wrong, f"{worst_px:.2f}", cell([s for *_, s in some], ".1f"))
-
-
-def main(count: Number = 200, first: Number = 0, *, grids: bool = False) -> None:
-    kinds, make = (("none", "good", "bad"), seeded_pair) if grids else ((*BAD, *GOOD, GRID), pair_with_error)
-    print_decisions(kinds, make, range(first, first + count))
 
 
 if __name__ == "__main__":

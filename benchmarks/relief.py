@@ -11,7 +11,7 @@ they show is more than 1 px off, or they show another scene.
 
 import sys
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, fields, replace
 from itertools import product
 from pathlib import Path
 from typing import Annotated
@@ -35,22 +35,16 @@ _OPTIONS = {DEFAULT: ("--relief-map",), START: ("--relief", "never")}
 """The relief's map changes no alignment; it contains the range, which is scored."""
 _FIRST_SEED = 1000
 """Apart from those of the fooling scenes."""
-_COLUMNS = {
-    "median_px": ("median, px", ".3f"),
-    "p90_px": ("p90, px", ".2f"),
-    "beyond_1_px": ("beyond 1 px", ".1%"),
-    "range_error": ("range error", ".2%"),
-    "density": ("density", ".0%"),
-    "precision": ("occlusion precision", ".0%"),
-    "recall": ("recall", ".0%"),
-    "seconds": ("s a capture", ".1f"),
-}
-"""Medians over bands in the table: field of a score, title, format."""
 Map = NDArray[np.float64]
 """(height, width, 2): raw px of the moving image for each raw px of the reference."""
 _TOLERANCE_PX = 1
 """An occluded pixel counts as found, and a masked one as right, where the other is this near: truth is decided at
 pixel centres."""
+
+
+def _column(title: str, style: str) -> float:
+    """A field of a score, nan by default, whose median over bands has this title and format in the table."""
+    return field(default=np.nan, metadata={"title": title, "style": style})
 
 
 @dataclass(frozen=True)
@@ -64,18 +58,18 @@ class Score:
     band: str = ""
     status: str = "-"
     """`-` for a method that does not verify."""
-    median_px: float = np.nan
-    p90_px: float = np.nan
-    beyond_1_px: float = np.nan
+    median_px: float = _column("median, px", ".3f")
+    p90_px: float = _column("p90, px", ".2f")
+    beyond_1_px: float = _column("beyond 1 px", ".1%")
     """Share of the pixels."""
-    range_error: float = np.nan
+    range_error: float = _column("range error", ".2%")
     """Median relative error of the relief's range."""
-    density: float = np.nan
+    density: float = _column("density", ".0%")
     """Share of the written pixels that have a range."""
-    precision: float = np.nan
-    recall: float = np.nan
+    precision: float = _column("occlusion precision", ".0%")
+    recall: float = _column("recall", ".0%")
     """Of the pixels without data in the stack, against the occluded ones."""
-    seconds: float = np.nan
+    seconds: float = _column("s a capture", ".1f")
     """Processing time of the whole capture."""
 
     @property
@@ -181,7 +175,9 @@ def scores_of(scene: Scene, blank: Score, size_px: tuple[int, int], methods: Seq
 
 def print_table(scores: Sequence[Score]) -> None:
     """Print a row for each kind, range and method, and one for all scenes of a method; then the wrong bands."""
-    print_head("kind", "range", "method", "bands", "aligned", "wrongly", *(title for title, _ in _COLUMNS.values()))
+    columns = [f for f in fields(Score) if f.metadata]
+    titles = (column.metadata["title"] for column in columns)
+    print_head("kind", "range", "method", "bands", "aligned", "wrongly", *titles)
     groups: dict[tuple[str, ...], list[Score]] = {}
     for s in sorted(scores, key=lambda s: (GEOMETRIES + FOOLING).index(s.kind)):
         groups.setdefault((s.kind, "1-2 m" if s.close else "20 m", s.method), []).append(s)
@@ -190,7 +186,7 @@ def print_table(scores: Sequence[Score]) -> None:
     for title, some in groups.items():
         is_verified = some[0].status != "-"
         counts = (sum(s.status == "aligned" for s in some), sum(s.wrong for s in some)) if is_verified else ("-", "-")
-        cells = [cell([getattr(s, name) for s in some], style) for name, (_, style) in _COLUMNS.items()]
+        cells = [cell([getattr(s, column.name) for s in some], column.metadata["style"]) for column in columns]
         print_row(*title, len(some), *counts, *cells)
     wrong, aligned = [s for s in scores if s.wrong], sum(s.status == "aligned" for s in scores)
     print(f"\n{len(wrong)} of {aligned} bands called aligned are more than {WRONG_PX:g} px off at p90,", end=" ")

@@ -4,7 +4,7 @@ Lengths are shares of the range to the lowest surface, so that a scene close by 
 far away is lower.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import product
 from typing import Any
@@ -192,13 +192,7 @@ def _pots(site: Site) -> list[Patch]:
     return result
 
 
-_KINDS: dict[str, Callable[[Site], list[Patch]]] = {
-    "flat": _flat,
-    "terraces": _terraces,
-    "plants": _plants,
-    "boxes": _boxes,
-    "pots": _pots,
-}
+_KINDS = {"flat": _flat, "terraces": _terraces, "plants": _plants, "boxes": _boxes, "pots": _pots}
 
 
 def make_scene(kind: str, rng_seed: int, *, close: bool = True, width_px: int = 640) -> Scene:
