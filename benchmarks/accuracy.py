@@ -107,18 +107,10 @@ def summary(name: str, rows: list[BandError]) -> tuple[object, ...]:
     pairs = [np.stack([r.error_px, r.claim_px]) for r in usable]
     error, claim = np.concatenate([np.empty((2, 0)), *pairs], axis=1)
     error, claim = error[np.isfinite(claim)], claim[np.isfinite(claim)]
-    return (
-        name,
-        f"{len(aligned)} of {len(rows)}",
-        len(usable) - len(aligned),
-        sum(map(is_wrong, rows)),
-        cell(medians, ".3f"),
-        cell(medians, ".3f", np.max),
-        cell(p95s, ".2f"),
-        cell(error <= 2 * claim, ".0%", np.mean),
-        cell((claim < 0.3) & (error > 1), ".1%", np.mean),
-        cell([r.part.seconds for r in aligned], ".1f"),
-    )
+    counts = f"{len(aligned)} of {len(rows)}", len(usable) - len(aligned), sum(map(is_wrong, rows))
+    errors = cell(medians, ".3f"), cell(medians, ".3f", np.max), cell(p95s, ".2f")
+    shares = cell(error <= 2 * claim, ".0%", np.mean), cell((claim < 0.3) & (error > 1), ".1%", np.mean)
+    return name, *counts, *errors, *shares, cell([r.part.seconds for r in aligned], ".1f")
 
 
 def main(

@@ -117,11 +117,8 @@ def fuzz_in_process(target: str, inputs: int, corpus: Path) -> tuple[str, str]:
     stats = Counter({name: int(value) for name, value in re.findall(r"stat::(\w+):\s+(\d+)", done.stdout)})
     _, found, uncaught = done.stdout.partition("=== Uncaught")
     error = (found + uncaught if found else done.stdout)[-3000:] if done.returncode else ""
-    limits = f"slowest {stats['slowest_unit_time_sec']} s, {stats['peak_rss_mb']} MB"
-    return (
-        f"{target} {stats['number_of_executed_units']} in {{seconds}} s ({int(bool(error))} failures, {limits})",
-        error,
-    )
+    limits = f"{int(bool(error))} failures, slowest {stats['slowest_unit_time_sec']} s, {stats['peak_rss_mb']} MB"
+    return f"{target} {stats['number_of_executed_units']} in {{seconds}} s ({limits})", error
 
 
 def main(

@@ -114,13 +114,10 @@ def pairs_of(description: Mapping[str, Any], variant: str = AS_IT_IS) -> list[Pa
     """The pairs of a set that a variant is made of, with their truth there: all of a set as it is, at most three
     otherwise, which are of one capture where that has several; where bands are lost, another one of each capture.
     """
-    by_capture = [
-        [
-            _pair(description, capture, truth["reference"], file, entry, variant)
-            for file, entry in truth["pairs"].items()
-        ]
-        for capture, truth in description["captures"].items()
-    ]
+    by_capture = []
+    for capture, truth in description["captures"].items():
+        of_all = description, capture, truth["reference"]
+        by_capture.append([_pair(*of_all, file, entry, variant) for file, entry in truth["pairs"].items()])
     pairs = [pair for group in by_capture for pair in group]
     if variant in (AS_IT_IS, "lens-corrected"):
         return pairs

@@ -132,10 +132,8 @@ def main(
     rng_seed: int = 0,
     markdown: Path | None = None,
 ) -> None:
-    rng, rows = (
-        random.Random(rng_seed),
-        [("run", "signals to", "signals", "while it ran", "seconds of a run", "faults")],
-    )
+    rng = random.Random(rng_seed)
+    rows = [("run", "signals to", "signals", "while it ran", "seconds of a run", "faults")]
     with tempfile.TemporaryDirectory() as folder:
         flight, aligned, out = Path(folder, "flight"), Path(folder, "aligned"), Path(folder, "out")
         synthetic.make_flight(flight, captures, SIZE_PX, rng_seed=4)
@@ -169,10 +167,8 @@ def main(
                 if wrong:
                     print(again.errors, flush=True)
                 counts[target] += here + Counter(strikes=1, faults=sum(wrong.values()))
-            rows += [
-                (mode, target, n["strikes"], n["hit"], f"{whole.seconds:.0f}", n["faults"])
-                for target, n in counts.items()
-            ]
+            for target, n in counts.items():
+                rows.append((mode, target, n["strikes"], n["hit"], f"{whole.seconds:.0f}", n["faults"]))
     report("kills", markdown, rows)
     if any(faults for *_, faults in rows[1:]):
         raise SystemExit("something is wrong")
