@@ -89,7 +89,7 @@ def known_errors(out: Path, ties: Ties, of_a_run: Ties) -> list[BandError]:
 
 def is_wrong(band: BandError) -> bool:
     off = (band.error_px > 1) & ~(band.error_px <= 2 * band.claim_px)
-    return band.is_usable and float(off.mean()) > 0.1
+    return band.is_usable and bool(off.sum() > 0.1 * len(off))
 
 
 def print_bands(name: str, bands: list[BandError]) -> None:

@@ -204,7 +204,7 @@ class Watched:
     largest_gb: float
     """Peak memory of the largest process."""
     samples: NDArray[np.float64]
-    """(n, 5) every half second: seconds, resident and own memory in MB, open files, processes."""
+    """(n, 4) every half second: seconds, own memory in MB, open files, processes."""
     left: list[Any]
     """Processes that outlived it."""
 
@@ -218,11 +218,10 @@ def watched(argv: Sequence[str]) -> Watched:
     here = psutil.Process(process.pid)
     while not (ended := os.wait4(process.pid, os.WNOHANG))[0]:
         children = here.children(recursive=True)
-        values = np.zeros(4)
+        values = np.zeros(3)
         for one in (here, *children):
             with suppress(psutil.Error, OSError):
-                memory = one.memory_full_info()
-                values += memory.rss / 1e6, memory.uss / 1e6, one.num_fds(), 1
+                values += one.memory_full_info().uss / 1e6, one.num_fds(), 1
         seen.update(children)
         samples.append((time.monotonic() - began, *values))
         time.sleep(0.5)

@@ -17,18 +17,18 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from common import command, flight_and_out, report, run, watched
 
-QUANTITIES = {"memory of all processes, MB": 2, "open files of all processes": 3, "processes": 4}
-"""Columns of the samples."""
+QUANTITIES = "memory of all processes, MB", "open files of all processes", "processes"
+"""Columns of the samples, after the seconds."""
 
 
 def growth(samples: np.ndarray) -> str:
     """Return mean, growth and scatter of each quantity in the second half of a run."""
-    count = samples[:, 4]
+    count = samples[:, 3]
     working = samples[count == np.median(count)]  # neither while processes start nor while they end
-    half = working[working[:, 0] > working[-1, 0] / 2].T
-    parts, t_s = [], half[0]
-    for name, column in QUANTITIES.items():
-        y, line = half[column], np.polyfit(t_s, half[column], 1)
+    t_s, *values = working[working[:, 0] > working[-1, 0] / 2].T
+    parts = []
+    for name, y in zip(QUANTITIES, values, strict=True):
+        line = np.polyfit(t_s, y, 1)
         growth, scatter = line[0] * (t_s[-1] - t_s[0]), (y - np.polyval(line, t_s)).std()
         parts.append(f"{name} {y.mean():.0f} (growth {growth:+.1f}, scatter {scatter:.1f})")
     return ", ".join(parts)
@@ -50,7 +50,7 @@ def main(captures: int = 1000, jobs: str = "2", size: str = "240x180", markdown:
                 f"{len(first.left)} processes left behind.",
                 f"Second half of the run, while all processes work: {growth(first.samples)}.",
                 f"The same command again, all kept: exit code {again.code}, {again.seconds:.1f} s, "
-                f"{again.samples[:, 2].max():.0f} MB.",
+                f"{again.samples[:, 1].max():.0f} MB.",
             ]
     report("soak", markdown, *parts)
 

@@ -62,7 +62,6 @@ class Hand:
 class Scene:
     """What a rig sees at one capture. Band names are the keys of the exceptions."""
 
-    kind: str
     patches: tuple[Patch, ...]
     textures: Textures
     pose: Pose
@@ -112,7 +111,6 @@ class BandTruth:
 class Truth:
     """The geometry of a capture on the reference's raw pixels."""
 
-    kind: str
     range_m: Field
     """(height, width): depth along the reference's optical axis."""
     bands: Mapping[str, BandTruth]
@@ -162,7 +160,7 @@ def truth_of(scene: Scene, size_px: tuple[int, int], camera: CameraSpec = CLOSE_
     patches, eye = scene.at_exposure_of(reference), scene.eye(reference, size_px)
     seen = nearest(patches, eye, *eye.rays(), boxes_of(patches, eye))
     bands = {b.name: _band_truth(scene, b, eye, *seen) for b in camera.bands if b is not reference}
-    return Truth(scene.kind, np.asarray(seen[0], np.float32), bands)
+    return Truth(np.asarray(seen[0], np.float32), bands)
 
 
 def _band_truth(scene: Scene, band: BandSpec, reference: Eye, depth: Field, index: NDArray[np.int32]) -> BandTruth:

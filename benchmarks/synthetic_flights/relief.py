@@ -207,9 +207,9 @@ def make_scene(kind: str, rng_seed: int, *, close: bool = True, width_px: int = 
     pose = Pose(site.range_m, rng.uniform(-180, 180), roll, pitch, 0.0, 0.0)
     if kind == "glossy":
         make = _plants if rng.random() < 0.5 else _boxes
-        return Scene(kind, tuple(make(site, rng.uniform(1.0, 3.0))), textures, pose)
+        return Scene(tuple(make(site, rng.uniform(1.0, 3.0))), textures, pose)
     geometry = kind if kind in _KINDS else "plants" if kind == "wind" else rng.choice(["plants", "boxes", "terraces"])
-    scene = Scene(kind, tuple(_KINDS[geometry](site)), textures, pose)
+    scene = Scene(tuple(_KINDS[geometry](site)), textures, pose)
     if kind in _KINDS:
         return scene
     if kind == "wind":

@@ -68,7 +68,7 @@ def test_parallax_and_occlusion_of_a_square_above_a_floor() -> None:
     floor = Patch((0, 0, 0), (5, 0, 0), (0, 5, 0), "soil")
     square = Patch((0, 0, near_m - far_m), (half_m, 0, 0), (0, half_m, 0), "leaf")
     textures = make_textures(np.random.default_rng(0), 0.002, SIZE[0])
-    truth = truth_of(Scene("two layers", (floor, square), textures, Pose(far_m, 0, 0, 0, 0, 0)), SIZE, STRAIGHT)
+    truth = truth_of(Scene((floor, square), textures, Pose(far_m, 0, 0, 0, 0, 0)), SIZE, STRAIGHT)
     focal_px = STRAIGHT.bands[0].lens(*SIZE).fx_px
     half_px = focal_px * half_m / near_m
     x, y = np.meshgrid(*(np.arange(n) - (n - 1) / 2 for n in SIZE))
