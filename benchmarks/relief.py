@@ -43,7 +43,7 @@ pixel centres."""
 
 
 def _column(title: str, style: str) -> float:
-    """A field of a score, nan by default, whose median over bands has this title and format in the table."""
+    """A field of a score, nan by default; its median over bands is in the table with this title and format."""
     return field(default=np.nan, metadata={"title": title, "style": style})
 
 
