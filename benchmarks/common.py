@@ -216,7 +216,7 @@ def watched(argv: Sequence[str]) -> Watched:
     began, samples, seen = time.monotonic(), [], set[psutil.Process]()
     process = subprocess.Popen(argv)
     here = psutil.Process(process.pid)
-    while not (ended := os.wait4(process.pid, os.WNOHANG))[0]:
+    while not (result := os.wait4(process.pid, os.WNOHANG))[0]:
         children = here.children(recursive=True)
         values = np.zeros(3)
         for one in (here, *children):
@@ -227,7 +227,7 @@ def watched(argv: Sequence[str]) -> Watched:
         time.sleep(0.5)
     seconds = time.monotonic() - began
     _, left = psutil.wait_procs(seen, timeout=10)
-    _, status, usage = ended
+    _, status, usage = result
     process.returncode = os.waitstatus_to_exitcode(status)
     return Watched(process.returncode, seconds, usage.ru_maxrss / 1e6, np.array(samples), left)
 

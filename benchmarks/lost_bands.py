@@ -17,13 +17,9 @@ import common
 import cv2
 import numpy as np
 from accuracy import ties_of
+from bands.images import without_scene
 from common import BandError, Ties
 from numpy.typing import NDArray
-
-
-def noise(pixels: NDArray[Any], rng: np.random.Generator) -> NDArray[Any]:
-    """Return noise with the brightness of an image."""
-    return np.median(pixels) + 0.5 * pixels.std() * rng.normal(size=pixels.shape)
 
 
 def water(pixels: NDArray[Any], rng: np.random.Generator) -> NDArray[Any]:
@@ -39,7 +35,7 @@ def losses(truth: Ties) -> Iterator[tuple[str, list[str], Any]]:
     for file, entry in truth.items():
         captures[entry["reference"]].append(file)
     for turn in range(max(map(len, captures.values()))):
-        yield "a band", [files[(turn + k) % len(files)] for k, files in enumerate(captures.values())], noise
+        yield "a band", [files[(turn + k) % len(files)] for k, files in enumerate(captures.values())], without_scene
     for reference, files in captures.items():
         yield "a capture", [reference, *files], water
 

@@ -31,6 +31,9 @@ from agalign.cameras.discover import discover
 from agalign.values.capture import Capture
 
 ROUNDS, MAX_S = 3, 3600
+LOGGED = "-j", "1", "--log-json"
+Events = dict[str, list[dict[str, Any]]]
+"""Events of a log in JSON by kind."""
 IMPORTS = "import torch, cv2, rasterio, scipy"
 DEGRADED = ("unchanged", "blur 3 px", "half saturated", "noise 30 %", "stale")
 """`stale` is one band with the image of the next capture."""
@@ -43,8 +46,8 @@ def sift_seconds(capture: Capture, pairs: int, features: int) -> float:
     return sum(timed(sift, fixed, other, features)[0] for other in others)
 
 
-def run_alone(argv: list[str]) -> tuple[float, dict[str, list[dict[str, Any]]]]:
-    """Run a command with one thread; return (seconds, the events of its log in JSON by kind)."""
+def run_alone(*argv: str) -> tuple[float, Events]:
+    """Run a command with one thread; return (seconds, the events of its log)."""
     ending = ended(argv, MAX_S, env=os.environ | {"OMP_NUM_THREADS": "1"})
     events = defaultdict[str, list[dict[str, Any]]](list)
     for event in (json.loads(line) for line in ending.errors.splitlines() if line.startswith("{")):
@@ -56,12 +59,12 @@ def total_s(events: list[dict[str, Any]]) -> float:
     return sum(event["seconds"] for event in events)
 
 
-def runs(flight: Path) -> list[tuple[float, dict[str, list[dict[str, Any]]]]]:
+def runs(flight: Path) -> list[tuple[float, Events]]:
     """Run with one thread, and again with the model that the first run has learned, if any."""
     with flight_and_out() as (again, out):
-        first = run_alone(command(flight, out, "-j", "1", "--log-json"))
+        first = run_alone(*command(flight, out, *LOGGED))
         with_model = [option for path in (out / "models").glob("*") for option in ("--model", str(path))]
-        return [first, run_alone(command(flight, again, "-j", "1", "--log-json", *with_model[:2]))]
+        return [first, run_alone(*command(flight, again, *LOGGED, *with_model[:2]))]
 
 
 def print_flight(folder: Path, captures: list[Capture]) -> None:
@@ -91,7 +94,7 @@ def print_degraded(captures: list[Capture]) -> None:
                 pixels = read_band(source.path, source.band_index)
                 pixels = pixels if name == "stale" else in_other_light(pixels, name, rng)
                 write_band(flight / band.path.name, pixels, band.band_index)
-            _, events = run_alone(command(flight, out, "-j", "1", "--log-json"))
+            _, events = run_alone(*command(flight, out, *LOGGED))
         (capture,) = events["capture"]
         seconds = total_s(events["learnt"]) + capture["seconds"]
         unchanged_s = unchanged_s or seconds
@@ -103,7 +106,7 @@ def print_stages(flight: Path, captures: list[Capture]) -> None:
     seconds = defaultdict[str, list[float]](list)
     for _ in range(ROUNDS):
         seconds["SIFT + RANSAC, a pair"].append(sift_seconds(middle, 1, 8000))
-        seconds["imports of the libraries"].append(run_alone([sys.executable, "-c", IMPORTS])[0])
+        seconds["imports of the libraries"].append(run_alone(sys.executable, "-c", IMPORTS)[0])
         (whole_s, _), (again_s, events) = runs(flight)
         by_capture = defaultdict[str, Counter[str]](Counter)
         for event in events["stage"]:

@@ -70,10 +70,13 @@ def degraded(image: Image, pair: Pair, variant: str) -> Image:
         made = [in_other_light(plane, variant, np.random.default_rng(seed)) for plane in planes]
         return np.dstack(made).reshape(image.shape)
     if variant == LOST:
-        # Noise about its own brightness, as of a frame that a camera wrote without an exposure.
-        noise = np.random.default_rng(seed).normal(size=image.shape)
-        return _as(np.median(image) + 0.5 * image.std() * noise, image)
+        return _as(without_scene(image, np.random.default_rng(seed)), image)
     return moved(image, movement(variant, pair.size_px))
+
+
+def without_scene(image: Image, rng: np.random.Generator) -> NDArray[np.float64]:
+    """Noise about the brightness of an image, as of a frame that a camera wrote without an exposure."""
+    return np.median(image) + 0.5 * image.std() * rng.normal(size=image.shape)
 
 
 def in_other_light(plane: Image, variant: str, rng: np.random.Generator) -> Image:

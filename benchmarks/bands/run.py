@@ -112,9 +112,7 @@ def lens_corrected(method: Align, fixed: tuple[Image, Band], moving: tuple[Image
 
 def asked(method: Align, pair: Pair, variant: str, paths: Paths, bands: Mapping[str, Band]) -> Row:
     """Return the mapping of a pair by a pair method; an exception is a refusal."""
-    fixed, moving = read(paths[pair.reference]), read(paths[pair.file])
-    if variant != LENS_CORRECTED:
-        moving = degraded(moving, pair, variant)
+    fixed, moving = read(paths[pair.reference]), degraded(read(paths[pair.file]), pair, variant)
     try:
         if variant == LENS_CORRECTED:
             return lens_corrected(method, (fixed, bands[pair.reference]), (moving, bands[pair.file]))
@@ -130,8 +128,8 @@ def asked(method: Align, pair: Pair, variant: str, paths: Paths, bands: Mapping[
 
 def tables(scored: Sequence[Scored], gigabytes: Mapping[str, float]) -> str:
     """An overview; unmodified images by set; each variant with the sets pooled; and the memory of each method."""
-    degraded = summary([s for s in scored if s.variant != AS_IT_IS], "all sets")
-    by_variant = {variant: [s for s in degraded if s.variant == variant] for variant in VARIANTS}
+    pooled = summary([s for s in scored if s.variant != AS_IT_IS], "all sets")
+    by_variant = {variant: [s for s in pooled if s.variant == variant] for variant in VARIANTS}
     parts = [f"### {variant}\n\n{score.markdown(scores)}\n" for variant, scores in by_variant.items() if scores]
     memory = "; ".join(f"{name} {value:.1f}" for name, value in gigabytes.items())
     return "\n".join([overview(scored), by_set(scored), *parts, f"Largest process, GB: {memory}.\n"])
