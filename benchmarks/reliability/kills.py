@@ -22,7 +22,6 @@ from collections import Counter, defaultdict
 from contextlib import suppress
 from itertools import cycle, islice, product
 from pathlib import Path
-from typing import Any
 
 import psutil
 
@@ -49,15 +48,11 @@ CHANGING = {RUN_FILE, "summary.csv", "index.html"}
 def contents(path: Path) -> object:
     """Return what must be equal: JSON without seconds, else the bytes; the error of an unreadable file."""
     try:
-        return (
-            json.loads(path.read_text(), object_hook=without_seconds) if path.suffix == ".json" else path.read_bytes()
-        )
+        if path.suffix != ".json":
+            return path.read_bytes()
+        return json.loads(path.read_text(), object_hook=lambda part: {k: v for k, v in part.items() if k != "seconds"})
     except (OSError, ValueError) as error:
         return error
-
-
-def without_seconds(part: dict[str, Any]) -> dict[str, Any]:
-    return {name: value for name, value in part.items() if name != "seconds"}
 
 
 def snapshot(out: Path) -> dict[str, object]:
