@@ -118,7 +118,7 @@ def occlusion_scores(
     pixels: NDArray[np.float64] | None, truth: BandTruth, window: tuple[slice, slice]
 ) -> dict[str, float]:
     """Return precision and recall, as fields of a score, of the nan pixels of a band of the stack, where the truth is
-    inside the moving image.
+    inside the moving image; nothing for a band without pixels.
     """
     if pixels is None:
         return {}
@@ -139,11 +139,12 @@ def program_scores(out: Path, truth: Truth, blank: Score) -> Iterator[Score]:
     window = common.window_of(sidecar)
     # With --relief-map the raster contains the range.
     of_range = range_errors(layer(path.with_suffix(".relief.tif"), "range"), truth.range_m[window])
-    for name, known in truth.bands.items():
-        (status,) = (band.status for band in sidecar.bands if band.band == name)
-        values = residuals(mapping_of(path, name, sidecar.reference.size_px), known, window)
-        values |= occlusion_scores(layer(path.with_suffix(".tif"), name), known, window)
-        yield replace(blank, band=name, status=status, **values, **of_range)
+    for band in (b for b in sidecar.bands if b.status != "reference"):
+        known = truth.bands[band.band]
+        values = residuals(mapping_of(path, band.band, sidecar.reference.size_px), known, window)
+        written = None if band.place is None else layer(path.with_suffix(".tif"), band.band)
+        values |= occlusion_scores(written, known, window)
+        yield replace(blank, band=band.band, status=band.status, **values, **of_range)
 
 
 def flow_scores(flight: Path, out: Path, truth: Truth, blank: Score) -> list[Score]:
