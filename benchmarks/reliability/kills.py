@@ -85,8 +85,9 @@ def processes_of(process: "subprocess.Popen[str]", target: str) -> list[psutil.P
     here = psutil.Process(process.pid)
     children = here.children(recursive=True)
     below = [c for c in children if c.ppid() != here.pid]
-    servers = [c for c in {c.parent() for c in below} if c is not None]
-    return {"run": [], "fork server": servers, "worker": below, "run and workers": [here, *children]}[target] or [here]
+    if target == "fork server":
+        below = list({c.parent() for c in below} - {None})
+    return {"run": [here], "run and workers": [here, *children]}.get(target, below) or [here]
 
 
 def strike(argv: list[str], after_s: float, number: signal.Signals, target: str, rng: random.Random) -> Counter[str]:
