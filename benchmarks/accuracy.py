@@ -9,27 +9,16 @@ The claim at a point is the value of the error map (`--error-map`). A usable ban
 """
 
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
+import common
 import cv2
 import numpy as np
 import typer
 from bands.images import in_other_light
-from common import (
-    BandError,
-    Ties,
-    align,
-    band_errors,
-    flight_and_out,
-    print_head,
-    print_row,
-    read_band,
-    read_ties,
-    run,
-    writable_copy,
-    write_band,
-)
+from common import BandError, Ties, cell, print_head, print_row
 from numpy.typing import NDArray
 
 from agalign import read_alignment
@@ -41,8 +30,9 @@ TIE_NOISE_PX = 0.05
 """Noise of reference tie points, added to the claims."""
 
 
-def with_noise(share: float) -> Any:
-    return lambda pixels, rng: pixels + share * pixels.mean() * rng.normal(size=pixels.shape)
+def with_noise(pixels: NDArray[Any], rng: np.random.Generator) -> NDArray[Any]:
+    """Add noise with a standard deviation of 60 % of the mean."""
+    return pixels + 0.6 * pixels.mean() * rng.normal(size=pixels.shape)
 
 
 def with_gloss(pixels: NDArray[Any], rng: np.random.Generator) -> NDArray[Any]:
@@ -52,25 +42,23 @@ def with_gloss(pixels: NDArray[Any], rng: np.random.Generator) -> NDArray[Any]:
 
 
 DAMAGES: dict[str, tuple[Any, str]] = {
-    "noise 60 % in one": (with_noise(0.6), "one"),
-    "noise 30 %": (lambda pixels, rng: in_other_light(pixels, "noise 30 %", rng), "moving"),
-    "half saturated": (lambda pixels, rng: in_other_light(pixels, "half saturated", rng), "moving"),
+    "noise 60 % in one": (with_noise, "one"),
+    "noise 30 %": (partial(in_other_light, variant="noise 30 %"), "moving"),
+    "half saturated": (partial(in_other_light, variant="half saturated"), "moving"),
     "gloss": (with_gloss, "all"),
 }
-"""Function of (pixels, generator), and the bands of each capture that it changes: one, the moving ones, or all."""
+"""Function of pixels and `rng`, and the bands of each capture that it changes: one, the moving ones, or all."""
 
 
 def damaged_copy(source: Path, copy: Path, name: str) -> None:
     """Copy a flight, with damage."""
-    writable_copy(source, copy)
-    change, which = DAMAGES[name]
-    rng = np.random.default_rng(0)
+    common.writable_copy(source, copy)
+    damage, which = DAMAGES[name]
+    change = partial(damage, rng=np.random.default_rng(0))
     for capture in discover(copy).captures:
         moving = [band for band in capture.moving if band.path.suffix.lower() in (".tif", ".tiff")]
-        bands = {"one": moving[-1:], "moving": moving, "all": [capture.reference, *moving]}[which]
-        for band in bands:
-            pixels = read_band(band.path)
-            write_band(band.path, change(pixels, rng).clip(1, np.iinfo(pixels.dtype).max).astype(pixels.dtype))
+        for band in {"one": moving[-1:], "moving": moving, "all": [capture.reference, *moving]}[which]:
+            common.change_band(band.path, change)
 
 
 def ties_of(out: Path) -> Ties:
@@ -90,55 +78,39 @@ def known_errors(out: Path, ties: Ties, of_a_run: Ties) -> list[BandError]:
     there with the noise of the ties. A file without any has no errors.
     """
     result = []
-    for band in band_errors(out, of_a_run | ties):
-        noise_px = TIE_NOISE_PX * (1 if (of_a_run | ties)[band.file]["reference"] == band.reference else 2)
-        claim_px = np.hypot(band.claim_px, noise_px)
-        known = np.isfinite(band.error_px) & (band.file in ties or np.isfinite(claim_px))
+    for band in common.band_errors(out, of_a_run | ties):
+        file = band.part.file
+        is_reference = (of_a_run | ties)[file]["reference"] == band.sidecar.reference.file
+        claim_px = np.hypot(band.claim_px, TIE_NOISE_PX * (1 if is_reference else 2))
+        known = np.isfinite(band.error_px) & (file in ties or np.isfinite(claim_px))
         result.append(replace(band, error_px=band.error_px[known], claim_px=claim_px[known]))
     return result
 
 
 def is_wrong(band: BandError) -> bool:
     off = (band.error_px > 1) & ~(band.error_px <= 2 * band.claim_px)
-    return band.is_usable and float(off.mean()) > 0.1
-
-
-def percentile(values: NDArray[np.float64], share: float) -> str:
-    return f"{np.nanpercentile(values, share):.3f}" if np.isfinite(values).any() else ""
+    return band.is_usable and bool(off.sum() > 0.1 * len(off))
 
 
 def print_bands(name: str, bands: list[BandError]) -> None:
     for row in bands:
         wrong = "WRONG" if is_wrong(row) else "usable" if row.is_usable else ""
-        errors = [percentile(row.error_px, q) for q in (50, 68, 90)]
-        beyond = f"{(row.error_px > 1).mean():.0%}" if len(row.error_px) else ""
-        claim = percentile(row.claim_px, 50)
-        what = (f"{row.capture} {row.band}", row.status, row.geometry, wrong)
-        print_row(name, *what, *errors, beyond, claim, f"{row.seconds:.1f}")
+        errors = [cell(row.error_px, ".3f", partial(np.percentile, q=q)) for q in (50, 68, 90)]
+        beyond, claim = cell(row.error_px > 1, ".0%", np.mean), cell(row.claim_px, ".3f")
+        what = row.name, row.part.status, row.part.geometry.kind, wrong
+        print_row(name, *what, *errors, beyond, claim, f"{row.part.seconds:.1f}")
 
 
-def summary(name: str, rows: list[BandError]) -> tuple[str, ...]:
-    aligned = [r for r in rows if r.status == "aligned"]
-    medians, p95s = (np.array([np.percentile(r.error_px, q) for r in aligned if len(r.error_px)]) for q in (50, 95))
-    usable = [r for r in rows if r.is_usable and len(r.error_px) and np.isfinite(r.claim_px).any()]
-    error = np.concatenate([r.error_px for r in usable]) if usable else np.empty(0)
-    claim = np.concatenate([r.claim_px for r in usable]) if usable else np.empty(0)
-    known = np.isfinite(claim)
-    error, claim = error[known], claim[known]
-    within = f"{(error <= 2 * claim).mean():.0%}" if len(error) else ""
-    false = f"{((claim < 0.3) & (error > 1)).mean():.1%}" if len(error) else ""
-    return (
-        name,
-        f"{len(aligned)} of {len(rows)}",
-        str(sum(r.is_usable for r in rows) - len(aligned)),
-        str(sum(map(is_wrong, rows))),
-        f"{np.median(medians):.3f}" if len(medians) else "",
-        f"{medians.max():.3f}" if len(medians) else "",
-        f"{np.median(p95s):.2f}" if len(p95s) else "",
-        within,
-        false,
-        f"{np.median([r.seconds for r in aligned]):.1f}" if aligned else "",
-    )
+def summary(name: str, rows: list[BandError]) -> tuple[object, ...]:
+    aligned, usable = [r for r in rows if r.part.status == "aligned"], [r for r in rows if r.is_usable]
+    medians, p95s = ([np.percentile(r.error_px, q) for r in aligned if len(r.error_px)] for q in (50, 95))
+    pairs = [np.stack([r.error_px, r.claim_px]) for r in usable]
+    error, claim = np.concatenate([np.empty((2, 0)), *pairs], axis=1)
+    error, claim = error[np.isfinite(claim)], claim[np.isfinite(claim)]
+    counts = f"{len(aligned)} of {len(rows)}", len(usable) - len(aligned), sum(map(is_wrong, rows))
+    errors = cell(medians, ".3f"), cell(medians, ".3f", np.max), cell(p95s, ".2f")
+    shares = cell(error <= 2 * claim, ".0%", np.mean), cell((claim < 0.3) & (error > 1), ".1%", np.mean)
+    return name, *counts, *errors, *shares, cell([r.part.seconds for r in aligned], ".1f")
 
 
 def main(
@@ -150,15 +122,15 @@ def main(
     if bands:
         print_head("set", "band", "status", "geometry", "", "p50, px", "p68", "p90", "> 1 px", "claim", "seconds")
     for folder in folders:
-        ties = read_ties(folder / "ties.json") if (folder / "ties.json").exists() else {}
+        ties = common.read_ties(folder / "ties.json")
         nothing = {"ties": np.empty((0, 4)), "reference": ""}
         of_a_run = {band.path.name: nothing for capture in discover(folder).captures for band in capture.bands}
         for name in ("", *(d for d in damage.split(",") if d)):
             title = f"{folder.name}, {name}" if name else folder.name
-            with flight_and_out() as (flight, out):
+            with common.flight_and_out() as (flight, out):
                 if name:
                     damaged_copy(folder, flight, name)
-                align(flight if name else folder, out, "--error-map")
+                common.align(flight if name else folder, out, "--error-map")
                 rows = known_errors(out, ties, of_a_run)
                 if not name and damage:
                     of_a_run |= ties_of(out)
@@ -173,4 +145,4 @@ def main(
 
 
 if __name__ == "__main__":
-    run(main)
+    common.run(main)

@@ -10,7 +10,7 @@ import tempfile
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
@@ -25,7 +25,7 @@ from scipy.interpolate import RegularGridInterpolator
 from agalign.pixels.raster import without_warnings
 from agalign.products.sidecar.convert import read_alignment
 from agalign.products.sidecar.file import find_sidecars, read_sidecar
-from agalign.products.sidecar.schema import Sidecar, is_usable
+from agalign.products.sidecar.schema import BandPart, Sidecar, is_usable
 from agalign.values.geometry import Points
 
 Ties = dict[str, dict[str, Any]]
@@ -76,33 +76,27 @@ def with_section(document: Path, name: str, content: str) -> str:
     return before + begin + content + end + rest.partition(end)[2]
 
 
-class Section:
-    """A section of a document, printed at once; without a document it is only printed."""
+def report(name: str, document: Path | None, *parts: str | Sequence[Sequence[object]]) -> None:
+    """Print paragraphs and tables, which are rows with the head first, and put them into the section of a document."""
+    texts = [part if isinstance(part, str) else table(part) for part in parts]
+    content = "\n" + "".join(f"{text}\n\n" for text in texts)
+    print(content, flush=True)
+    if document is not None:
+        document.write_text(with_section(document, name, content), encoding="utf-8")
 
-    def __init__(self, name: str, document: Path | None) -> None:
-        self._name, self._document, self._parts = name, document, list[str]()
 
-    def table(self, rows: Sequence[Sequence[object]]) -> None:
-        """Add rows, the first of them the head."""
-        self.say(table(rows))
-
-    def say(self, text: str) -> None:
-        """Add a paragraph."""
-        print(text, end="\n\n", flush=True)
-        self._parts.append(text)
-        if self._document is not None:
-            content = "\n" + "".join(f"{part}\n\n" for part in self._parts)
-            self._document.write_text(with_section(self._document, self._name, content), encoding="utf-8")
+def cell(values: Sequence[float] | NDArray[Any], style: str, statistic: Callable[..., Any] = np.median) -> str:
+    """Return a statistic of the values that are not nan, "-" without any."""
+    known = np.asarray(values)[~np.isnan(values)]
+    return format(statistic(known), style) if len(known) else "-"
 
 
 def pyplot() -> Any:
     """Return matplotlib.pyplot for figures in files."""
-    import matplotlib as mpl
+    from matplotlib import pyplot
 
-    mpl.use("Agg")
-    from matplotlib import pyplot as plt
-
-    return plt
+    pyplot.switch_backend("Agg")
+    return pyplot
 
 
 def heat_map(axis: Any, values: NDArray[np.float64], rows: Sequence[str], columns: Sequence[str], **style: Any) -> Any:
@@ -130,6 +124,12 @@ def write_band(path: Path, pixels: NDArray[Any], index: int = 1) -> None:
     """Replace the pixels of a band, and leave the tags."""
     with without_warnings(), rasterio.open(path, "r+") as dataset:
         dataset.write(pixels, index)
+
+
+def change_band(path: Path, change: Callable[[NDArray[Any]], NDArray[Any]], index: int = 1) -> None:
+    """Replace the pixels of a band by a function of them, within the range of their type but for 0, for no data."""
+    pixels = read_band(path, index)
+    write_band(path, change(pixels).clip(1, np.iinfo(pixels.dtype).max).astype(pixels.dtype), index)
 
 
 # ---- runs of the command line
@@ -204,35 +204,31 @@ class Watched:
     largest_gb: float
     """Peak memory of the largest process."""
     samples: NDArray[np.float64]
-    """(n, 5) every half second: seconds, resident and own memory in MB, open files, processes."""
+    """(n, 4) every half second: seconds, own memory in MB, open files, processes."""
     left: list[Any]
     """Processes that outlived it."""
 
 
-def watched(argv: Sequence[str], **options: Any) -> Watched:
-    """Run a command and sample its resources. `options` are those of subprocess.Popen."""
+def watched(argv: Sequence[str]) -> Watched:
+    """Run a command and sample its resources."""
     import psutil
 
     began, samples, seen = time.monotonic(), [], set[psutil.Process]()
-    process = subprocess.Popen(argv, **options)
-    while True:
-        pid, status, usage = os.wait4(process.pid, os.WNOHANG)
-        if pid:
-            process.returncode = os.waitstatus_to_exitcode(status)
-            break
-        values = []
-        with_children = [psutil.Process(process.pid), *psutil.Process(process.pid).children(recursive=True)]
-        for one in with_children:
-            try:
-                memory = one.memory_full_info()
-                values.append((memory.rss / 1e6, memory.uss / 1e6, one.num_fds(), 1))
-            except (psutil.Error, OSError):
-                continue
-        seen.update(with_children[1:])
-        samples.append((time.monotonic() - began, *np.sum(values or [(0, 0, 0, 0)], axis=0)))
+    process = subprocess.Popen(argv)
+    here = psutil.Process(process.pid)
+    while not (result := os.wait4(process.pid, os.WNOHANG))[0]:
+        children = here.children(recursive=True)
+        values = np.zeros(3)
+        for one in (here, *children):
+            with suppress(psutil.Error, OSError):
+                values += one.memory_full_info().uss / 1e6, one.num_fds(), 1
+        seen.update(children)
+        samples.append((time.monotonic() - began, *values))
         time.sleep(0.5)
     seconds = time.monotonic() - began
     _, left = psutil.wait_procs(seen, timeout=10)
+    _, status, usage = result
+    process.returncode = os.waitstatus_to_exitcode(status)
     return Watched(process.returncode, seconds, usage.ru_maxrss / 1e6, np.array(samples), left)
 
 
@@ -243,24 +239,24 @@ def watched(argv: Sequence[str], **options: Any) -> Watched:
 class BandError:
     """Error of a moving band at its tie points."""
 
-    capture: str
-    band: str
-    file: str
-    reference: str
-    """File of the reference band of the run."""
-    status: str
-    geometry: str
-    is_usable: bool
-    """Aligned, or predicted within --accept-predicted."""
-    source: str
-    """Origin of a prediction, or empty."""
+    sidecar: Sidecar
+    part: BandPart
+    """The band in it."""
     std_px: float
     """Reported standard error; nan without one."""
     error_px: Points
     """(n,)"""
     claim_px: Points
     """(n,) values of the error map; nan outside, or without a map."""
-    seconds: float
+
+    @property
+    def name(self) -> str:
+        return f"{self.sidecar.capture} {self.part.band}"
+
+    @property
+    def is_usable(self) -> bool:
+        """Aligned, or predicted within --accept-predicted."""
+        return is_usable(self.part.status, self.part.prediction, self.sidecar.max_predicted_px)
 
     @property
     def median_px(self) -> float:
@@ -272,8 +268,10 @@ class BandError:
 
 
 def read_ties(path: Path) -> Ties:
-    """Return the truth of a ties.json or truth.json by file."""
-    result = {}
+    """Return the truth of a ties.json or truth.json by file; nothing if there is no such file."""
+    result: Ties = {}
+    if not path.is_file():
+        return result
     for capture in json.loads(path.read_text(encoding="utf-8")).values():
         shared = {"reference": capture["reference"], "trouble": capture.get("trouble", "")}
         result |= {file: entry | shared for file, entry in capture["bands"].items()}
@@ -297,24 +295,22 @@ def band_errors(out: Path, truth: Ties) -> list[BandError]:
             if truth[band.file]["reference"] in references:
                 points = read_alignment(path, references[truth[band.file]["reference"]]).inverse(points)
             std_px = prediction.std_px if prediction else band.joint.corner_std_px if band.joint else None
-            aligned_or_predicted = band.status in ("aligned", "predicted") and std_px is not None
-            result.append(
-                BandError(
-                    sidecar.capture,
-                    band.band,
-                    band.file,
-                    sidecar.reference.file,
-                    band.status,
-                    alignment.geometry,
-                    is_usable(band.status, prediction, sidecar.max_predicted_px),
-                    prediction.source if prediction else "",
-                    std_px if aligned_or_predicted else np.nan,
-                    np.linalg.norm(alignment.map(points) - target, axis=1),
-                    claims_px(path, sidecar, band.band, points),
-                    band.seconds,
-                )
-            )
+            known_std_px = std_px if band.status in ("aligned", "predicted") and std_px is not None else np.nan
+            error_px = np.linalg.norm(alignment.map(points) - target, axis=1)
+            result.append(BandError(sidecar, band, known_std_px, error_px, claims_px(path, sidecar, band.band, points)))
     return result
+
+
+def only_sidecar(out: Path) -> tuple[Path, Sidecar]:
+    """Return the one sidecar below the output of a run, with its path."""
+    (path,) = find_sidecars(out)
+    return path, read_sidecar(path)
+
+
+def window_of(sidecar: Sidecar) -> tuple[slice, slice]:
+    """Return the rows and columns of the reference in the output."""
+    x0, y0, width, height = sidecar.output.crop
+    return np.s_[y0 : y0 + height, x0 : x0 + width]
 
 
 def layer(path: Path, name: str) -> NDArray[np.float64] | None:
@@ -346,14 +342,14 @@ def print_errors(groups: dict[str, list[BandError]]) -> None:
     print_head("", *head)
     for name, bands in groups.items():
         errors, std = np.array([(b.median_px, b.std_px) for b in bands]).T
-        statuses = Counter(f"{b.status} ({b.source})" if b.source else b.status for b in bands)
+        parts = [b.part for b in bands]
+        statuses = Counter(f"{p.status} ({p.prediction.source})" if p.prediction else p.status for p in parts)
         counts = ", ".join(f"{n} {status}" for status, n in statuses.most_common())
         shares = errors / std
+        cells = f"{np.median(errors):.3f}", f"{errors.max():.3f}", cell(shares, ".1f", np.max)
         within = [f"{np.mean(shares <= k):.0%}" for k in (1, 2)]
-        worst = f"{np.nanmax(shares):.1f}" if np.isfinite(shares).any() else "-"
-        captures = len({b.capture for b in bands})
-        print_row(name, captures, counts, f"{np.median(errors):.3f}", f"{errors.max():.3f}", worst, *within)
+        print_row(name, len({b.sidecar.capture for b in bands}), counts, *cells, *within)
     for name, bands in groups.items():
         for b in bands:
-            if b.median_px > WRONG_PX or b.status not in ("aligned", "predicted"):
-                print(f"{name}: {b.capture} {b.band}: {b.status}, {b.median_px:.2f} px, standard error {b.std_px:.2f}")
+            if b.median_px > WRONG_PX or b.part.status not in ("aligned", "predicted"):
+                print(f"{name}: {b.name}: {b.part.status}, {b.median_px:.2f} px, standard error {b.std_px:.2f}")

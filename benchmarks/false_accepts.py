@@ -13,12 +13,14 @@ images, each with noise of its own. Seeds: none; good, off by up to a quarter of
 off by one to three periods and not known to anything.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
+from functools import partial
+from itertools import product
 from typing import Any
 
 import cv2
 import numpy as np
-from common import WRONG_PX, Number, print_head, print_row, run, timed
+from common import WRONG_PX, Number, cell, print_head, print_row, run, timed
 from numpy.typing import NDArray
 
 import agalign
@@ -59,50 +61,47 @@ def pair(kind: str, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, n
     if kind == GRID:
         fixed, moving, truth, _ = lattice(rng)
         return fixed, moving, None, truth
-    band = int(rng.choice([0, 2, 3, 4]))
-    reference, moving = BANDS[REFERENCE], BANDS[band]
-    away = {"another place of the field": 60.0, "8 % overlap": 0.92 * SIZE[0] / 640 * 26.0 * 1280 / 1453.33}
-    ground, here, there = scene(rng, away.get(kind, 0.0))
+    band, seed, truth = int(rng.choice([0, 2, 3, 4])), None, None
+    ground, here, there = scene(rng, AWAY_M.get(kind, 0.0))
     fixed = view(ground, REFERENCE, here, rng)
     if kind == "water":
         return water(rng), water(rng), None, None
     if kind == "another field":
-        other, pose, _ = scene(rng)
-        return fixed, view(other, band, pose, rng), None, None
-    other_view = view(ground, band, there, rng)
-    if kind in away:
-        return fixed, other_view, None, None
-    truth = true_homography(reference, moving, here, SIZE)
-    seed = None
-    if kind == "all but saturated":
-        return fixed, saturated(other_view, 0.01), None, None
-    if kind == "a third displaced":
-        third = SIZE[0] // 3
-        other_view = other_view.copy()
-        other_view[:, -third:] = np.roll(other_view, 15, axis=0)[:, -third:]
-        return fixed, other_view, None, None
-    if kind == "blurred":
-        other_view = cv2.GaussianBlur(other_view, (0, 0), 1.5)
-    elif kind == "noisy":
-        noisy = other_view + rng.normal(0, 1500, other_view.shape)
-        other_view = np.clip(noisy, 0, 65535).astype(np.uint16)
-    elif kind == "partly saturated":
-        other_view = saturated(other_view, 0.7)
-    elif kind == "5 % off":
+        ground, there, _ = scene(rng)
+    moving = view(ground, band, there, rng)
+    if kind in CHANGES:
+        moving = CHANGES[kind](moving, rng).clip(0, 65535).astype(np.uint16)
+    if kind in GOOD:
+        truth = true_homography(BANDS[REFERENCE], BANDS[band], here, SIZE)
+    if kind == "5 % off":
         angle = rng.uniform(0, 2 * np.pi)
-        shift = 0.05 * SIZE[0] * np.array([np.cos(angle), np.sin(angle)])
-        seed = truth @ geometry.translation(*shift)
-    return fixed, other_view, seed, truth
+        seed = truth @ geometry.translation(0.05 * SIZE[0] * np.cos(angle), 0.05 * SIZE[0] * np.sin(angle))
+    return fixed, moving, seed, truth
 
 
-def saturated(image: np.ndarray, share: float) -> np.ndarray:
+def saturated(image: np.ndarray, _rng: np.random.Generator, share: float) -> np.ndarray:
     """Return an image with saturated pixels above a quantile."""
-    return np.where(image > np.quantile(image, share), 65535, image).astype(np.uint16)
+    return np.where(image > np.quantile(image, share), 65535, image)
+
+
+def displaced(image: np.ndarray, _rng: np.random.Generator) -> np.ndarray:
+    """Return an image with a third of it 15 px lower."""
+    is_left = np.arange(SIZE[0]) < SIZE[0] - SIZE[0] // 3
+    return np.where(is_left, image, np.roll(image, 15, axis=0))
 
 
 BAD = ("another field", "another place of the field", "water", "8 % overlap", "all but saturated", "a third displaced")
 GRID = "planted grid"
 GOOD = ("as it comes", "blurred", "noisy", "partly saturated", "5 % off")
+AWAY_M = {"another place of the field": 60.0, "8 % overlap": 0.92 * SIZE[0] / 640 * 26.0 * 1280 / 1453.33}
+CHANGES: dict[str, Callable[[np.ndarray, np.random.Generator], np.ndarray]] = {
+    "all but saturated": partial(saturated, share=0.01),
+    "a third displaced": displaced,
+    "blurred": lambda image, _: cv2.GaussianBlur(image, (0, 0), 1.5),
+    "noisy": lambda image, rng: image + rng.normal(0, 1500, image.shape),
+    "partly saturated": partial(saturated, share=0.7),
+}
+"""Functions of the moving image and a generator."""
 
 
 def pair_with_error(kind: str, rng: np.random.Generator) -> Pair:
@@ -113,9 +112,8 @@ def pair_with_error(kind: str, rng: np.random.Generator) -> Pair:
     middle = points[(np.abs(points - np.divide(size, 2)) < np.multiply(size, 0.3)).all(axis=1)]
 
     def error_px(matrix: np.ndarray) -> float:
-        if truth is None:
-            return np.nan
-        return float(np.linalg.norm(geometry.apply(matrix, middle) - geometry.apply(truth, middle), axis=1).mean())
+        there = np.full_like(middle, np.nan) if truth is None else geometry.apply(truth, middle)
+        return float(np.linalg.norm(geometry.apply(matrix, middle) - there, axis=1).mean())
 
     return fixed, moving, {"seed": seed}, error_px
 
@@ -128,23 +126,21 @@ def lattice(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.ndarra
     period = float(np.exp(rng.uniform(np.log(8), np.log(80))))
     jitter = float(rng.choice([0.0, rng.uniform(0, 0.1)]))
     angle = rng.uniform(0, np.pi)
-    size = GRID_SIZE[0] + 2 * MARGIN, GRID_SIZE[1] + 2 * MARGIN
+    size = np.array(GRID_SIZE) + 2 * MARGIN
     reach = int(np.hypot(*size) / period) + 2
     grid = np.stack(np.meshgrid(np.arange(-reach, reach), np.arange(-reach, reach)), -1).reshape(-1, 2) * period
     turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
-    places = grid @ turn.T + np.array(size) / 2 + jitter * period * rng.normal(size=grid.shape)
+    places = grid @ turn.T + size / 2 + jitter * period * rng.normal(size=grid.shape)
     shift = rng.uniform(-40, 40, 2)
     images = []
     for offset, sign in (((0.0, 0.0), 1.0), (shift, -0.7)):
         at = places + offset
-        canvas = np.zeros((size[1], size[0]), np.float32)
-        inside = ((at > 1) & (at < np.array(size) - 2)).all(axis=1)
-        whole = np.floor(at[inside]).astype(int)
-        part = at[inside] - whole
-        for dx in (0, 1):
-            for dy in (0, 1):
-                weight = np.abs(1 - dx - part[:, 0]) * np.abs(1 - dy - part[:, 1])
-                np.add.at(canvas, (whole[:, 1] + dy, whole[:, 0] + dx), weight)
+        canvas = np.zeros(size[::-1], np.float32)
+        at = at[((at > 1) & (at < size - 2)).all(axis=1)]
+        whole = np.floor(at).astype(int)
+        for corner in product((0, 1), repeat=2):
+            x, y = (whole + corner).T
+            np.add.at(canvas, (y, x), np.abs(1 - np.array(corner) - (at - whole)).prod(axis=1))
         canvas = cv2.GaussianBlur(canvas, (0, 0), max(1.2, 0.18 * period))
         canvas = sign * canvas / canvas.std() + 0.1 * rng.normal(size=canvas.shape)
         images.append(canvas[MARGIN:-MARGIN, MARGIN:-MARGIN].astype(np.float32))
@@ -163,10 +159,10 @@ def seeded_pair(kind: str, rng: np.random.Generator) -> Pair:
 # ---- decisions
 
 
-def print_decisions(kinds: Sequence[str], pair_of: Callable[[str, np.random.Generator], Pair], numbers: range) -> None:
-    """Align a pair for each number, of the kinds in turn, and print a table of the results."""
+def main(count: Number = 200, first: Number = 0, *, grids: bool = False) -> None:
+    kinds, pair_of = (("none", "good", "bad"), seeded_pair) if grids else ((*BAD, *GOOD, GRID), pair_with_error)
     rows: dict[str, list[tuple[str, float, float]]] = {kind: [] for kind in kinds}
-    for number in numbers:
+    for number in range(first, first + count):
         kind = kinds[number % len(kinds)]
         fixed, moving, options, error_px = pair_of(kind, np.random.default_rng(number))
         seconds, result = timed(agalign.align, fixed, moving, **options)
@@ -176,15 +172,9 @@ def print_decisions(kinds: Sequence[str], pair_of: Callable[[str, np.random.Gene
     print_head("kind", "pairs", *statuses, "wrongly aligned", "worst error, px", "seconds")
     for kind, some in ((kind, some) for kind, some in rows.items() if some):
         errors = [error for status, error, _ in some if status == "aligned"]
-        wrong = sum(not error <= WRONG_PX for error in errors)
         counts = [sum(status == one for status, *_ in some) for one in statuses]
-        worst, median_s = max(errors, default=np.nan), np.median([row[2] for row in some])
-        print_row(kind, len(some), *counts, wrong, f"{worst:.2f}", f"{median_s:.1f}")
-
-
-def main(count: Number = 200, first: Number = 0, *, grids: bool = False) -> None:
-    kinds, make = (("none", "good", "bad"), seeded_pair) if grids else ((*BAD, *GOOD, GRID), pair_with_error)
-    print_decisions(kinds, make, range(first, first + count))
+        wrong, worst_px = sum(not error <= WRONG_PX for error in errors), max(errors, default=np.nan)
+        print_row(kind, len(some), *counts, wrong, f"{worst_px:.2f}", cell([s for *_, s in some], ".1f"))
 
 
 if __name__ == "__main__":

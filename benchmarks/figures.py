@@ -13,9 +13,8 @@ from typing import Annotated
 import cv2
 import numpy as np
 import typer
-from common import align, flight_and_out, layer, pyplot, read_ties, run
+from common import align, flight_and_out, layer, only_sidecar, pyplot, read_ties, run, window_of
 from numpy.typing import NDArray
-from relief import Sidecar, read_sidecar
 from synthetic_flights.depth import write_capture
 from synthetic_flights.relief import make_scene
 
@@ -65,8 +64,8 @@ def matches(fixed: Raster, moving: Raster, truth: Matrix) -> NDArray[np.uint8]:
         f, f_prime = describe(keypoints, truth)
         nearest = ((f[:, None] - f_prime[None]) ** 2).sum(-1).argmin(1).numpy()
         right = nearest == np.arange(len(keypoints))
-        here = keypoints.xy.numpy().astype(np.float64)[drawn]
-        there = geometry.apply(truth, keypoints.xy.numpy().astype(np.float64)[nearest[drawn]])
+        xy = keypoints.xy.numpy().astype(np.float64)
+        here, there = xy[drawn], geometry.apply(truth, xy[nearest[drawn]])
         text = f"{title}: {right.mean():.0%} of {len(right)} keypoints find their own patch"
         strip = with_text(np.full((34, 2 * SIZE_PX[0], 3), 255, np.uint8), text, (6, 24), 20)
         rows += [strip, draw_matches(fixed, moving, here, there, right[drawn])]
@@ -76,12 +75,10 @@ def matches(fixed: Raster, moving: Raster, truth: Matrix) -> NDArray[np.uint8]:
 def draw_matches(fixed: Raster, moving: Raster, here: Points, there: Points, right: NDArray) -> NDArray[np.uint8]:
     """Return both images next to each other, with lines between corresponding rows of `here` and `there`, (N, 2)."""
     sheet = np.hstack([cv2.cvtColor(to_8_bit(r), cv2.COLOR_GRAY2BGR) for r in (fixed, moving)])
-    right_of = np.array([fixed.size_px[0], 0.0])
-    for one, other, is_right in zip(here, there + right_of, right, strict=True):
-        colour = GREEN if is_right else RED
-        ends = [(round(float(x)), round(float(y))) for x, y in (one, other)]
-        cv2.line(sheet, *ends, colour, 1, cv2.LINE_AA)
-        for end in ends:
+    ends = np.stack([here, np.add(there, (fixed.size_px[0], 0.0))], axis=1).round().astype(int)
+    for line, colour in zip(ends.tolist(), np.where(right[:, None], GREEN, RED).tolist(), strict=True):
+        cv2.line(sheet, *line, colour, 1, cv2.LINE_AA)
+        for end in line:
             cv2.circle(sheet, end, 4, colour, 1, cv2.LINE_AA)
     return sheet
 
@@ -93,19 +90,17 @@ def relief(path: Path) -> None:
         write_capture(flight, scene, size_px=SCENE_SIZE_PX, rng_seed=SCENE)
         for use in ("auto", "never"):
             align(flight, out / use, "--relief", use)
-        aligned, flat = (read_sidecar(out / use) for use in ("auto", "never"))
-        x0, y0, width, height = aligned.content["output"]["crop"]
+        path, sidecar = only_sidecar(out / "auto")
+        x0, y0, width, height = sidecar.output.crop
         extent = (x0, x0 + width, y0 + height, y0)
         plt, panels = pyplot(), [["reference", "relief", "before"], ["reference", "relief", "after"]]
         style = {"figsize": (10.4, 3.0), "width_ratios": (3.6, 3.95, 1.95), "layout": "constrained"}
         figure, axes = plt.subplot_mosaic(panels, **style)
-        axes["reference"].imshow(
-            stretched(layer(aligned.path.with_suffix(".tif"), "Green")), cmap="gray", extent=extent
-        )
-        parallax_px = layer(aligned.path.with_suffix(".relief.tif"), "parallax")
+        axes["reference"].imshow(stretched(layer(path.with_suffix(".tif"), "Green")), cmap="gray", extent=extent)
+        parallax_px = layer(path.with_suffix(".relief.tif"), "parallax")
         shown = axes["relief"].imshow(parallax_px, cmap="viridis", extent=extent)
-        axes["before"].imshow(detail(flat))
-        axes["after"].imshow(detail(aligned))
+        axes["before"].imshow(detail(out / "never"))
+        axes["after"].imshow(detail(out / "auto"))
     figure.colorbar(shown, ax=axes["relief"], fraction=0.05, pad=0.02, label="far → near")
     titles = "reference band", "relief: parallax, px", "homographies", "with the relief"
     for axis, title in zip(axes.values(), titles, strict=True):
@@ -117,13 +112,14 @@ def relief(path: Path) -> None:
     figure.savefig(path, dpi=100)
 
 
-def detail(sidecar: Sidecar) -> NDArray[np.uint8]:
+def detail(out: Path) -> NDArray[np.uint8]:
     """Return (height, width, 3) of the enlarged part in false colours; grey where one of the bands has no data."""
-    bands = np.stack([layer(sidecar.path.with_suffix(".tif"), name) for name in ("NIR", "Red", "Green")], axis=-1)
+    path, sidecar = only_sidecar(out)
+    bands = np.stack([layer(path.with_suffix(".tif"), name) for name in ("NIR", "Red", "Green")], axis=-1)
     image = np.dstack([stretched(band) for band in np.moveaxis(bands, -1, 0)])
     image[np.isnan(bands).any(axis=-1)] = NO_DATA
     whole = np.zeros((*SCENE_SIZE_PX[::-1], 3), np.uint8)
-    whole[sidecar.window] = image
+    whole[window_of(sidecar)] = image
     return np.asarray(cv2.resize(whole[DETAIL], None, fx=3, fy=3, interpolation=cv2.INTER_NEAREST))
 
 

@@ -4,7 +4,7 @@ python benchmarks/ndvi.py [CAPTURES]
 """
 
 import numpy as np
-from common import Number, flight_and_out, print_head, print_row, read_band, run
+from common import Number, flight_and_out, print_head, print_row, read_band, run, window_of
 
 import agalign
 from agalign.batch.index_run import index_tasks, run_indices
@@ -34,8 +34,7 @@ def main(captures: Number = 3) -> None:
             truth = compute(NDVI, [synthetic.view(p, ground, reference, pose, SIZE_PX) for p in painted])
             own = {b.name: calibrated(read_band(b.path), b.radiometry, 0, 0) for b in capture.bands}
             before, after = compute(NDVI, [own[name] for name in BANDS]), read_band(report.path)
-            x0, y0, width, height = read_sidecar(report.path.with_name(f"{capture.name}.json")).output.crop
-            window = np.s_[y0 : y0 + height, x0 : x0 + width]
+            window = window_of(read_sidecar(report.path.with_name(f"{capture.name}.json")))
             errors["before"].append(np.abs(before[window] - truth[window]))
             errors["after"].append(np.abs(after - truth[window]))
     print_head("NDVI", "median error", "mean", "95 %", "pixels off by more than 0.1")

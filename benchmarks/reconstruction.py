@@ -8,6 +8,7 @@ capture have one pose where they are aligned. The original images, which a rig o
 """
 
 import tempfile
+from collections import defaultdict
 from pathlib import Path
 from statistics import median
 
@@ -75,8 +76,8 @@ def reconstruct(photos: Photos, shared: Band) -> pycolmap.Reconstruction | None:
         images.mkdir()
         for key, pixels in photos.items():
             cv2.imwrite(str(images / f"{'--'.join(key)}.png"), pixels)
-        mode = pycolmap.CameraMode.SINGLE
-        pycolmap.extract_features(database, images, camera_mode=mode, reader_options=reader, **on_cpu)
+        camera = {"camera_mode": pycolmap.CameraMode.SINGLE, "reader_options": reader}
+        pycolmap.extract_features(database, images, **camera, **on_cpu)
         pycolmap.match_exhaustive(database, **on_cpu)
         models = pycolmap.incremental_mapping(database, images, root / "models", options)
     return max(models.values(), key=lambda m: m.num_reg_images(), default=None)
@@ -87,17 +88,17 @@ def shifts_px(model: pycolmap.Reconstruction, shared: Band, reference: str) -> d
     the scene's points in the two images.
     """
     images = {tuple(i.name.removesuffix(".png").split("--")): i for i in model.images.values() if i.has_pose}
-    focal_px = shared.lens.fx_px
-    result: dict[str, list[float]] = {}
+    result = defaultdict[str, list[float]](list)
     for (capture, band), image in sorted(images.items()):
         other = images.get((capture, reference))
         if band == reference or other is None:
             continue
-        poses = image.cam_from_world(), other.cam_from_world()
         points = np.array([model.points3D[p.point3D_id].xyz for p in other.points2D if p.has_point3D()])
-        seen, seen_by_other = (points @ m.rotation.matrix().T + m.translation for m in poses)
-        shifts = (seen[:, :2] / seen[:, 2:] - seen_by_other[:, :2] / seen_by_other[:, 2:]) * focal_px
-        result.setdefault(band, []).append(float(np.median(np.linalg.norm(shifts, axis=1))))
+        seen = [
+            points @ m.rotation.matrix().T + m.translation for m in (image.cam_from_world(), other.cam_from_world())
+        ]
+        here, there = (shared.lens.fx_px * m[:, :2] / m[:, 2:] for m in seen)
+        result[band].append(float(np.median(np.linalg.norm(here - there, axis=1))))
     return result
 
 

@@ -9,54 +9,42 @@ each written pixel that a band shows. `--fooled` counts bands that are called `a
 they show is more than 1 px off, or they show another scene.
 """
 
-import json
 import sys
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, fields, replace
 from itertools import product
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
+import common
 import cv2
 import numpy as np
-import rasterio
 import tifffile
 import typer
-from common import WRONG_PX, align, flight_and_out, layer, print_head, print_row, run, timed
+from common import WRONG_PX, cell, layer, print_head, print_row
 from numpy.typing import NDArray
 from peers import dis_flow
-from scipy.interpolate import RectBivariateSpline
 from synthetic_flights.depth import BandTruth, Scene, Truth, write_capture
 from synthetic_flights.relief import FOOLING, GEOMETRIES, fooling, make_scene
 
-from agalign.pixels.raster import without_warnings
-from agalign.products.sidecar.file import find_sidecars
+from agalign import SidecarError, read_alignment
+from agalign.values.image import Tile
 
 DEFAULT, START, FLOW = "agalign", "agalign, homography alone", "DIS flow on structure"
 _OPTIONS = {DEFAULT: ("--relief-map",), START: ("--relief", "never")}
 """The relief's map changes no alignment; it contains the range, which is scored."""
 _FIRST_SEED = 1000
 """Apart from those of the fooling scenes."""
-_COLUMNS = {
-    "median_px": ("median, px", ".3f"),
-    "p90_px": ("p90, px", ".2f"),
-    "beyond_1_px": ("beyond 1 px", ".1%"),
-    "range_error": ("range error", ".2%"),
-    "density": ("density", ".0%"),
-    "precision": ("occlusion precision", ".0%"),
-    "recall": ("recall", ".0%"),
-    "seconds": ("s a capture", ".1f"),
-}
-"""Medians over bands in the table: field of a score, title, format."""
 Map = NDArray[np.float64]
 """(height, width, 2): raw px of the moving image for each raw px of the reference."""
-Window = tuple[slice, slice]
-"""Rows and columns of the reference."""
-WHOLE: Window = (slice(None), slice(None))
-
 _TOLERANCE_PX = 1
 """An occluded pixel counts as found, and a masked one as right, where the other is this near: truth is decided at
 pixel centres."""
+
+
+def _column(title: str, style: str) -> float:
+    """A field of a score, nan by default; its median over bands is in the table with this title and format."""
+    return field(default=np.nan, metadata={"title": title, "style": style})
 
 
 @dataclass(frozen=True)
@@ -70,18 +58,18 @@ class Score:
     band: str = ""
     status: str = "-"
     """`-` for a method that does not verify."""
-    median_px: float = np.nan
-    p90_px: float = np.nan
-    beyond_1_px: float = np.nan
+    median_px: float = _column("median, px", ".3f")
+    p90_px: float = _column("p90, px", ".2f")
+    beyond_1_px: float = _column("beyond 1 px", ".1%")
     """Share of the pixels."""
-    range_error: float = np.nan
+    range_error: float = _column("range error", ".2%")
     """Median relative error of the relief's range."""
-    density: float = np.nan
+    density: float = _column("density", ".0%")
     """Share of the written pixels that have a range."""
-    precision: float = np.nan
-    recall: float = np.nan
+    precision: float = _column("occlusion precision", ".0%")
+    recall: float = _column("recall", ".0%")
     """Of the pixels without data in the stack, against the occluded ones."""
-    seconds: float = np.nan
+    seconds: float = _column("s a capture", ".1f")
     """Processing time of the whole capture."""
 
     @property
@@ -95,100 +83,51 @@ class Score:
         return f"{self.kind}, {'close' if self.close else 'far'}, scene {self.scene}"
 
 
-@dataclass(frozen=True)
-class Sidecar:
-    """Outputs of a run for a capture."""
-
-    path: Path
-    content: dict[str, Any]
-
-    @property
-    def moving(self) -> list[dict[str, Any]]:
-        """The bands but for the reference."""
-        return [band for band in self.content["bands"] if band["status"] != "reference"]
-
-    @property
-    def window(self) -> Window:
-        """Rows and columns of the reference in the output."""
-        x0, y0, width, height = self.content["output"]["crop"]
-        return slice(y0, y0 + height), slice(x0, x0 + width)
+def mapping_of(sidecar: Path, band: str, size_px: tuple[int, int]) -> Map | None:
+    """Return the mapping of a band at every pixel of the reference; None where its sidecar has none."""
+    try:
+        return read_alignment(sidecar, band).mapping.positions(Tile(0, 0, *size_px))
+    except SidecarError:
+        return None
 
 
-def read_sidecar(out: Path) -> Sidecar:
-    """Return the one sidecar below the output of a run."""
-    (path,) = find_sidecars(out)
-    return Sidecar(path, json.loads(path.read_text(encoding="utf-8")))
-
-
-def mapping_of(sidecar: Sidecar, band: dict[str, Any]) -> Map | None:
-    """The mapping of a band at every pixel of the reference, as its sidecar has it: from `relief` and the raster that
-    it names, nan outside the written area, else from `grid`. None where it has neither.
-    """
-    relief, grid = band.get("relief"), band.get("grid")
-    if relief and relief["file"]:
-        plane_px, slope = (_interpolated(sidecar, relief["reference_px"], relief[k]) for k in ("plane_px", "slope"))
-        parallax_px = np.full(plane_px.shape[:2], np.nan)
-        parallax_px[sidecar.window] = layer(sidecar.path.parent / relief["file"], "parallax")
-        return np.asarray(plane_px + parallax_px[..., None] * slope)
-    return _interpolated(sidecar, grid["reference_px"], grid["moving_px"]) if grid else None
-
-
-def _interpolated(sidecar: Sidecar, nodes_px: list[list[float]], values: list[list[float]]) -> Map:
-    """A cubic spline at every pixel of the reference, through values on a lattice of nodes, row by row."""
-    here, there = np.array(nodes_px, np.float64), np.array(values, np.float64)
-    x, y = np.unique(here[:, 0]), np.unique(here[:, 1])
-    columns, rows = (np.arange(sidecar.content["reference"][name]) for name in ("width", "height"))
-    lattice = there.reshape(len(y), len(x), 2)
-    return np.stack([RectBivariateSpline(y, x, lattice[..., k])(rows, columns) for k in (0, 1)], axis=-1)
-
-
-def residuals(mapping: Map | None, truth: BandTruth, window: Window = WHOLE) -> dict[str, float]:
+def residuals(mapping: Map | None, truth: BandTruth, window: tuple[slice, slice]) -> dict[str, float]:
     """Return median, 90th percentile and share beyond 1 px of the distance to the truth, as fields of a score, over
-    pixels of a window that the band shows and that did not move.
+    pixels of a window of the reference that the band shows and that did not move.
     """
     some = truth.scored[window]
     if mapping is None or not some.any():
         return {}
     error_px = np.linalg.norm(mapping[window][some] - truth.moving_px[window][some], axis=-1)
     # A pixel without a mapping is infinitely far off, which no interpolating quantile can express.
-    error_px = np.sort(np.where(np.isfinite(error_px), error_px, np.inf))
-    median, p90 = (float(error_px[int(share * (len(error_px) - 1))]) for share in (0.5, 0.9))
+    error_px = np.where(np.isfinite(error_px), error_px, np.inf)
+    median, p90 = np.percentile(error_px, (50, 90), method="lower").tolist()
     return {"median_px": median, "p90_px": p90, "beyond_1_px": float((error_px > 1).mean())}
 
 
-def range_errors(sidecar: Sidecar, truth: Truth) -> tuple[float, float]:
-    """(median relative error, density) of the range in <capture>.relief.tif, which has it with --relief-map."""
-    range_m = layer(sidecar.path.with_suffix(".relief.tif"), "range")
+def range_errors(range_m: NDArray[np.float64] | None, expected_m: NDArray[np.floating]) -> dict[str, float]:
+    """Return median relative error and density of a range (height, width), as fields of a score; none without it."""
     if range_m is None:
-        return np.nan, np.nan
-    expected = truth.range_m[sidecar.window]
-    some = np.isfinite(range_m) & (range_m > 0)
-    if not some.any():
-        return np.nan, 0.0
-    return float(np.median(np.abs(range_m[some] / expected[some] - 1))), float(some.mean())
-
-
-def occlusion_scores(sidecar: Sidecar, band: dict[str, Any], truth: BandTruth) -> dict[str, float]:
-    """Return precision and recall, as fields of a score, of the pixels without data in the stack, where the truth is
-    inside the moving image.
-    """
-    place = band.get("place")
-    if place is None:
         return {}
-    with without_warnings(), rasterio.open(sidecar.path.parent / place["file"]) as dataset:
-        masked = dataset.read_masks(place["band_index"]) == 0
-    inside = truth.inside[sidecar.window]
-    masked, hidden = masked & inside, truth.hidden[sidecar.window] & inside
-    return {"precision": _share(masked, _grown(hidden)), "recall": _share(hidden, _grown(masked))}
+    some = np.isfinite(range_m) & (range_m > 0)
+    error = float(np.median(np.abs(range_m[some] / expected_m[some] - 1))) if some.any() else np.nan
+    return {"range_error": error, "density": float(some.mean())}
 
 
-def _grown(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    side = 2 * _TOLERANCE_PX + 1
-    return np.asarray(cv2.dilate(mask.astype(np.uint8), np.ones((side, side), np.uint8)) > 0)
-
-
-def _share(some: NDArray[np.bool_], of: NDArray[np.bool_]) -> float:
-    return float(of[some].mean()) if some.any() else np.nan
+def occlusion_scores(
+    pixels: NDArray[np.float64] | None, truth: BandTruth, window: tuple[slice, slice]
+) -> dict[str, float]:
+    """Return precision and recall, as fields of a score, of the nan pixels of a band of the stack, where the truth is
+    inside the moving image; nothing for a band without pixels.
+    """
+    if pixels is None:
+        return {}
+    inside = truth.inside[window]
+    masked, hidden = np.isnan(pixels) & inside, truth.hidden[window] & inside
+    near = np.ones((2 * _TOLERANCE_PX + 1,) * 2, np.uint8)
+    near_masked, near_hidden = (cv2.dilate(mask.astype(np.uint8), near) for mask in (masked, hidden))
+    precision, recall = (of.mean() if len(of) else np.nan for of in (near_hidden[masked], near_masked[hidden]))
+    return {"precision": float(precision), "recall": float(recall)}
 
 
 # ---- runs
@@ -196,63 +135,60 @@ def _share(some: NDArray[np.bool_], of: NDArray[np.bool_]) -> float:
 
 def program_scores(out: Path, truth: Truth, blank: Score) -> Iterator[Score]:
     """Yield the scores of a run on one capture."""
-    sidecar = read_sidecar(out)
-    range_error, density = range_errors(sidecar, truth)
-    for band in sidecar.moving:
-        known = truth.bands[band["band"]]
-        values = residuals(mapping_of(sidecar, band), known, sidecar.window) | occlusion_scores(sidecar, band, known)
-        values |= {"range_error": range_error, "density": density}
-        yield replace(blank, band=band["band"], status=band["status"], **values)
+    path, sidecar = common.only_sidecar(out)
+    window = common.window_of(sidecar)
+    # With --relief-map the raster contains the range.
+    of_range = range_errors(layer(path.with_suffix(".relief.tif"), "range"), truth.range_m[window])
+    for band in (b for b in sidecar.bands if b.status != "reference"):
+        known = truth.bands[band.band]
+        values = residuals(mapping_of(path, band.band, sidecar.reference.size_px), known, window)
+        written = None if band.place is None else layer(path.with_suffix(".tif"), band.band)
+        values |= occlusion_scores(written, known, window)
+        yield replace(blank, band=band.band, status=band.status, **values, **of_range)
 
 
 def flow_scores(flight: Path, out: Path, truth: Truth, blank: Score) -> list[Score]:
     """Return the scores of the dense flow from the mappings of a run; a band without a mapping has none."""
     images = {p.name: tifffile.imread(p).astype(np.float32) for p in flight.rglob("*.tif")}
-    sidecar, scores, total_s = read_sidecar(out), [], 0.0
-    reference = images[sidecar.content["reference"]["file"]]
-    for band in sidecar.moving:
-        start = mapping_of(sidecar, band)
-        seconds, mapping = (0.0, None) if start is None else timed(dis_flow, reference, images[band["file"]], start)
+    (path, sidecar), scores, total_s = common.only_sidecar(out), [], 0.0
+    reference = images[sidecar.reference.file]
+    for band in (b for b in sidecar.bands if b.status != "reference"):
+        start = mapping_of(path, band.band, sidecar.reference.size_px)
+        seconds, mapping = (0.0, None) if start is None else common.timed(dis_flow, reference, images[band.file], start)
         total_s += seconds
-        values = residuals(mapping, truth.bands[band["band"]], sidecar.window)
-        scores.append(replace(blank, band=band["band"], **values))
+        values = residuals(mapping, truth.bands[band.band], common.window_of(sidecar))
+        scores.append(replace(blank, band=band.band, **values))
     return [replace(score, seconds=total_s) for score in scores]
 
 
 def scores_of(scene: Scene, blank: Score, size_px: tuple[int, int], methods: Sequence[str]) -> Iterator[Score]:
     """Yield the scores of methods on one scene."""
-    with flight_and_out() as (flight, out):
+    with common.flight_and_out() as (flight, out):
         truth = write_capture(flight, scene, size_px=size_px, rng_seed=blank.scene)
         for method in methods:
             blank = replace(blank, method=method)
             if method == FLOW:
                 yield from flow_scores(flight, out / START, truth, blank)
             else:
-                seconds = align(flight, out / method, *_OPTIONS[method])
+                seconds = common.align(flight, out / method, *_OPTIONS[method])
                 yield from program_scores(out / method, truth, replace(blank, seconds=seconds))
-
-
-def print_scores(title: Sequence[str], scores: Sequence[Score]) -> None:
-    """Print a line of the table."""
-    verified = scores[0].status != "-"
-    counts = (sum(s.status == "aligned" for s in scores), sum(s.wrong for s in scores)) if verified else ("-", "-")
-    cells = []
-    for name, (_, style) in _COLUMNS.items():
-        values = np.array([getattr(s, name) for s in scores])
-        cells.append("-" if np.isnan(values).all() else format(np.nanmedian(values), style))
-    print_row(*title, len(scores), *counts, *cells)
 
 
 def print_table(scores: Sequence[Score]) -> None:
     """Print a row for each kind, range and method, and one for all scenes of a method; then the wrong bands."""
-    print_head("kind", "range", "method", "bands", "aligned", "wrongly", *(title for title, _ in _COLUMNS.values()))
+    columns = [f for f in fields(Score) if f.metadata]
+    titles = (column.metadata["title"] for column in columns)
+    print_head("kind", "range", "method", "bands", "aligned", "wrongly", *titles)
     groups: dict[tuple[str, ...], list[Score]] = {}
     for s in sorted(scores, key=lambda s: (GEOMETRIES + FOOLING).index(s.kind)):
         groups.setdefault((s.kind, "1-2 m" if s.close else "20 m", s.method), []).append(s)
     for s in scores:
         groups.setdefault(("all", "", s.method), []).append(s)
     for title, some in groups.items():
-        print_scores(title, some)
+        is_verified = some[0].status != "-"
+        counts = (sum(s.status == "aligned" for s in some), sum(s.wrong for s in some)) if is_verified else ("-", "-")
+        cells = [cell([getattr(s, column.name) for s in some], column.metadata["style"]) for column in columns]
+        print_row(*title, len(some), *counts, *cells)
     wrong, aligned = [s for s in scores if s.wrong], sum(s.status == "aligned" for s in scores)
     print(f"\n{len(wrong)} of {aligned} bands called aligned are more than {WRONG_PX:g} px off at p90,", end=" ")
     print("or show another scene")
@@ -287,4 +223,4 @@ def main(
 
 
 if __name__ == "__main__":
-    run(main)
+    common.run(main)

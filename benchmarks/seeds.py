@@ -34,9 +34,9 @@ def seeds_of(pair: BandPair) -> dict[str, PixelMapping]:
     return result
 
 
-def error_px(pair: BandPair, mapping: PixelMapping, truth: Ties | None) -> float:
+def error_px(pair: BandPair, mapping: PixelMapping, truth: Ties) -> float:
     """Return the median error of a pair at its ties, or without truth in windows."""
-    if truth is None:
+    if not truth:
         return pair.reference.windows.residuals(pair.warped_moving(mapping)).median_px
     ties = np.array(truth[pair.bands[0].path.name]["ties"])
     return float(np.median(np.linalg.norm(mapping(ties[:, :2]) - ties[:, 2:], axis=1)))
@@ -44,14 +44,12 @@ def error_px(pair: BandPair, mapping: PixelMapping, truth: Ties | None) -> float
 
 def main(data: Path) -> None:
     print_head("camera, set", "pairs", *KINDS)
-    for folder in sorted(p for p in [*(data / "flights").iterdir(), *(data / "captures").iterdir()] if p.is_dir()):
-        truth = read_ties(folder / "ties.json") if (folder / "ties.json").is_file() else None
-        errors: dict[str, list[float]] = {kind: [] for kind in KINDS}
-        for capture in discover(folder).captures:
-            for pair in read_pairs(capture, SeedSettings())[0]:
-                if truth is None or pair.bands[0].path.name in truth:
-                    for kind, mapping in seeds_of(pair).items():
-                        errors[kind].append(error_px(pair, mapping, truth))
+    for folder in sorted(p for part in ("flights", "captures") for p in (data / part).iterdir() if p.is_dir()):
+        truth, errors = read_ties(folder / "ties.json"), {kind: list[float]() for kind in KINDS}
+        for pair in (p for capture in discover(folder).captures for p in read_pairs(capture, SeedSettings())[0]):
+            if not truth or pair.bands[0].path.name in truth:
+                for kind, mapping in seeds_of(pair).items():
+                    errors[kind].append(error_px(pair, mapping, truth))
         cells = [f"{np.median(v):.1f} / {max(v):.1f}" if v else "-" for v in errors.values()]
         print_row(f"{folder.name}{'' if truth else ', by windows'}", len(errors["identity"]), *cells)
 

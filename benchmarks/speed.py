@@ -16,63 +16,64 @@ import json
 import os
 import shutil
 import sys
-from collections import Counter
-from collections.abc import Sequence
+from collections import Counter, defaultdict
 from pathlib import Path
-from statistics import mean, median
+from statistics import median
 from typing import Any
 
 import cv2
 import numpy as np
 from bands.images import in_other_light
-from common import Ending, command, ended, flight_and_out, print_head, print_row, read_band, run, timed, write_band
+from common import command, ended, flight_and_out, print_head, print_row, read_band, run, timed, write_band
 from peers import sift
 
 from agalign.cameras.discover import discover
-from agalign.values.capture import Band, Capture
+from agalign.values.capture import Capture
 
 ROUNDS, MAX_S = 3, 3600
+LOGGED = "-j", "1", "--log-json"
+Events = dict[str, list[dict[str, Any]]]
+"""Events of a log in JSON by kind."""
 IMPORTS = "import torch, cv2, rasterio, scipy"
 DEGRADED = ("unchanged", "blur 3 px", "half saturated", "noise 30 %", "stale")
 """`stale` is one band with the image of the next capture."""
 
 
-def sift_seconds(reference: Band, moving: Sequence[Band], features: int) -> float:
-    """Return the seconds of SIFT + RANSAC on the reference with each other band at full size."""
-    fixed, *others = (read_band(band.path, band.band_index) for band in (reference, *moving))
+def sift_seconds(capture: Capture, pairs: int, features: int) -> float:
+    """Return the seconds of SIFT + RANSAC on the reference of a capture with some of its other bands at full size."""
+    bands = capture.reference, *capture.moving[:pairs]
+    fixed, *others = (read_band(band.path, band.band_index) for band in bands)
     return sum(timed(sift, fixed, other, features)[0] for other in others)
 
 
-def run_alone(argv: list[str]) -> Ending:
-    """Run a command with one thread."""
-    return ended(argv, MAX_S, env=os.environ | {"OMP_NUM_THREADS": "1"})
+def run_alone(*argv: str) -> tuple[float, Events]:
+    """Run a command with one thread; return (seconds, the events of its log)."""
+    ending = ended(argv, MAX_S, env=os.environ | {"OMP_NUM_THREADS": "1"})
+    events = defaultdict[str, list[dict[str, Any]]](list)
+    for event in (json.loads(line) for line in ending.errors.splitlines() if line.startswith("{")):
+        events[event["event"]].append(event)
+    return ending.seconds, events
 
 
-def events(log: str, name: str) -> list[dict[str, Any]]:
-    """Return the events of a kind in a log in JSON."""
-    every = [json.loads(line) for line in log.splitlines() if line.startswith("{")]
-    return [event for event in every if event["event"] == name]
+def total_s(events: list[dict[str, Any]]) -> float:
+    return sum(event["seconds"] for event in events)
 
 
-def learning_seconds(log: str) -> float:
-    return sum(event["seconds"] for event in events(log, "learnt"))
-
-
-def runs(flight: Path) -> list[Ending]:
+def runs(flight: Path) -> list[tuple[float, Events]]:
     """Run with one thread, and again with the model that the first run has learned, if any."""
     with flight_and_out() as (again, out):
-        first = run_alone(command(flight, out, "-j", "1", "--log-json"))
+        first = run_alone(*command(flight, out, *LOGGED))
         with_model = [option for path in (out / "models").glob("*") for option in ("--model", str(path))]
-        return [first, run_alone(command(flight, again, "-j", "1", "--log-json", *with_model[:2]))]
+        return [first, run_alone(*command(flight, again, *LOGGED, *with_model[:2]))]
 
 
 def print_flight(folder: Path, captures: list[Capture]) -> None:
     """Print medians over the captures of a flight."""
-    without, with_model = (ending.errors for ending in runs(folder))
-    first_s, again_s = (median(e["seconds"] for e in events(log, "capture")) for log in (without, with_model))
-    sift_s = median(sift_seconds(c.reference, c.moving, 5000) for c in captures)
-    times_s = learning_seconds(without) / len(captures) + first_s, again_s, sift_s
-    aligned = "{aligned} of {pairs}".format(**events(with_model, "capture")[0])
+    (_, without), (_, with_model) = runs(folder)
+    first_s, again_s = (median(e["seconds"] for e in events["capture"]) for events in (without, with_model))
+    sift_s = median(sift_seconds(c, len(c.moving), 5000) for c in captures)
+    times_s = total_s(without["learnt"]) / len(captures) + first_s, again_s, sift_s
+    aligned = "{aligned} of {pairs}".format(**with_model["capture"][0])
     cells = [f"{s:.1f}" for s in times_s] + [f"{s / sift_s:.2f}" for s in times_s[:2]]
     print_row(folder.name, len(captures), aligned, *cells)
 
@@ -93,31 +94,32 @@ def print_degraded(captures: list[Capture]) -> None:
                 pixels = read_band(source.path, source.band_index)
                 pixels = pixels if name == "stale" else in_other_light(pixels, name, rng)
                 write_band(flight / band.path.name, pixels, band.band_index)
-            log = run_alone(command(flight, out, "-j", "1", "--log-json")).errors
-        (capture,) = events(log, "capture")
-        seconds = learning_seconds(log) + capture["seconds"]
+            _, events = run_alone(*command(flight, out, *LOGGED))
+        (capture,) = events["capture"]
+        seconds = total_s(events["learnt"]) + capture["seconds"]
         unchanged_s = unchanged_s or seconds
         print_row(name, "{aligned} of {pairs}".format(**capture), f"{seconds:.1f}", f"{seconds / unchanged_s:.2f}")
 
 
 def print_stages(flight: Path, captures: list[Capture]) -> None:
     middle = captures[len(captures) // 2]  # the first may show the sky or a panel
-    seconds: dict[str, list[float]] = {}
+    seconds = defaultdict[str, list[float]](list)
     for _ in range(ROUNDS):
-        values = {"SIFT + RANSAC, a pair": sift_seconds(middle.reference, middle.moving[:1], 8000)}
-        values["imports of the libraries"] = run_alone([sys.executable, "-c", IMPORTS]).seconds
-        whole, again = runs(flight)
-        by_capture: dict[str, Counter[str]] = {}
-        for event in events(again.errors, "stage"):
-            by_capture.setdefault(event["capture"], Counter())[event["stage"]] += event["seconds"]
+        seconds["SIFT + RANSAC, a pair"].append(sift_seconds(middle, 1, 8000))
+        seconds["imports of the libraries"].append(run_alone(sys.executable, "-c", IMPORTS)[0])
+        (whole_s, _), (again_s, events) = runs(flight)
+        by_capture = defaultdict[str, Counter[str]](Counter)
+        for event in events["stage"]:
+            by_capture[event["capture"]][event["stage"]] += event["seconds"]
         refined = [stages for stages in by_capture.values() if "refining" in stages] or list(by_capture.values())
-        stages = {name: mean(one[name] for one in refined) for name in {n for one in refined for n in one}}
-        capture_s = values["a capture"] = sum(stages.values())
-        values |= {f"- {name}": stages[name] for name in sorted(stages, key=lambda name: -stages[name])}
-        for name, run_s in (("a run", whole.seconds), ("a run with the model of an earlier flight", again.seconds)):
-            values |= {name: run_s, f"{name}: fixed part": run_s - capture_s * len(captures)}
-        for name, value in values.items():
-            seconds.setdefault(name, []).append(value)
+        total = sum(refined, Counter[str]())
+        capture_s = total.total() / len(refined)
+        seconds["a capture"].append(capture_s)
+        for name, stage_s in total.most_common():
+            seconds[f"- {name}"].append(stage_s / len(refined))
+        for name, run_s in (("a run", whole_s), ("a run with the model of an earlier flight", again_s)):
+            seconds[name].append(run_s)
+            seconds[f"{name}: fixed part"].append(run_s - capture_s * len(captures))
     print(f"{flight.name}: {len(captures)} captures, {sum(len(c.moving) for c in captures)} pairs")
     print_head("", "seconds")
     for name, some in seconds.items():

@@ -16,7 +16,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 from bands import images
-from common import WRONG_PX, heat_map, print_head, print_row, pyplot, read_ties, run, timed
+from common import WRONG_PX, cell, heat_map, print_head, print_row, pyplot, read_ties, run, timed
 from numpy.typing import NDArray
 from peers import elastix, sift
 
@@ -24,6 +24,7 @@ import agalign
 from agalign.cameras.discover import discover
 from agalign.pixels.raster import read_for_alignment
 from agalign.synthetic import flight as synthetic
+from agalign.synthetic.cameras import rotation
 from agalign.values import geometry, lens
 from agalign.values.geometry import Matrix
 from agalign.values.image import Raster
@@ -31,6 +32,8 @@ from agalign.values.image import Raster
 FOUND_PX = 0.3
 SHIFTS, TURNS, SCALES = (0.0, 0.1, 0.2, 0.25), (0.0, 3.0, 10.0, 45.0, 90.0, 180.0), (0.5, 0.8, 1.25, 2.0)
 STARTS = [(shift, turn, 1.0) for turn in TURNS for shift in SHIFTS] + [(0.0, turn, s) for s in SCALES for turn in TURNS]
+Shares = dict[str, dict[tuple[float, float, float], float]]
+"""Share of successes by method and start."""
 Aligner = Callable[[Raster, Raster], tuple[Matrix | None, bool]]
 """Maps a pair to (fixed_to_moving, whether the method accepts its result)."""
 
@@ -39,12 +42,9 @@ def moved(raster: Raster, shift: float, degrees: float, scale: float) -> tuple[R
     """Return (the image shifted, rotated and scaled in its frame, the homography from old to new pixels)."""
     width, height = raster.size_px
     within = geometry.translation(shift * width, -shift * height / 2)
-    turn = np.radians(degrees)
-    linear = scale * np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
-    size = tuple(np.ceil(np.abs(linear) @ (width, height)).astype(int).tolist())
-    about = np.eye(3)
-    about[:2, :2] = linear
-    about[:2, 2] = (np.array(size) - 1) / 2 - linear @ ((np.array([width, height]) - 1) / 2)
+    about = rotation(0, 0, degrees) @ np.diag([scale, scale, 1.0])
+    size = tuple(np.ceil(np.abs(about[:2, :2]) @ (width, height)).astype(int).tolist())
+    about[:2, 2] = (np.array(size) - 1) / 2 - about[:2, :2] @ ((np.array([width, height]) - 1) / 2)
     frame = cv2.warpAffine(raster.valid.astype(np.uint8) * 255, within[:2], (width, height))
     whole = cv2.warpAffine(frame, about[:2], size) == 255
     matrix = about @ within
@@ -84,7 +84,7 @@ def chosen(folder: Path, count: int) -> Iterator[tuple[Raster, Raster, NDArray[n
     """Yield this number of pairs of a flight, evenly spread: two images without lens distortion, and (n, 4) tie points
     in their pixels.
     """
-    truth = read_ties(next(path for name in ("ties.json", "truth.json") if (path := folder / name).is_file()))
+    truth = read_ties(folder / "ties.json") or read_ties(folder / "truth.json")
     captures = discover(folder).captures
     pairs = [(c.reference, band) for c in captures for band in c.moving if band.path.name in truth]
     for index in np.unique(np.linspace(0, len(pairs) - 1, count).round().astype(int)):
@@ -95,9 +95,9 @@ def chosen(folder: Path, count: int) -> Iterator[tuple[Raster, Raster, NDArray[n
 
 
 def main(data: list[Path], pairs: int = 3, methods: str = ";".join(METHODS), plot: Path | None = None) -> None:
-    shares: dict[str, dict[tuple[float, float, float], float]] = {name: {} for name in methods.split(";")}
-    head = "method", "shift", "turn", "scale", "found", "median, px", "worst sure, px", "wrong though sure", "s"
-    print_head(*head)
+    shares: Shares = {name: {} for name in methods.split(";")}
+    kind = "method", "shift", "turn", "scale"
+    print_head(*kind, "found", "median, px", "worst sure, px", "wrong though sure", "s")
     with tempfile.TemporaryDirectory() as folder:
         synthetic.make_flight(Path(folder), captures=2, rng_seed=11)
         tried = [pair for flight in (*data, Path(folder)) for pair in chosen(flight, pairs)]
@@ -110,15 +110,14 @@ def main(data: list[Path], pairs: int = 3, methods: str = ";".join(METHODS), plo
         off, sure, seconds = map(np.array, zip(*rows, strict=True))
         hit = off <= FOUND_PX
         of_method[start] = float(hit.mean())
-        worst = f"{off[sure].max():.2f}" if sure.any() else "-"
-        errors = f"{np.median(off):.3f}", worst, (sure & (off > WRONG_PX)).sum(), f"{np.median(seconds):.1f}"
+        errors = cell(off, ".3f"), cell(off[sure], ".2f", np.max), (sure & (off > WRONG_PX)).sum(), cell(seconds, ".1f")
         moved_by = f"{start[0]:.0%}", f"{start[1]:g}°", f"{start[2]:g}"
         print_row(name, *moved_by, f"{hit.sum()} of {len(hit)}", *errors)
     if plot is not None:
         draw(shares, plot)
 
 
-def draw(shares: dict[str, dict[tuple[float, float, float], float]], path: Path) -> None:
+def draw(shares: Shares, path: Path) -> None:
     """Draw a heat map per method: share of successes by rotation, shift and scale."""
     across = [(s, 1.0) for s in SHIFTS] + [(0.0, s) for s in SCALES]
     labels = [f"{shift:.0%}" for shift in SHIFTS] + [f"x{scale:g}" for scale in SCALES]
@@ -128,8 +127,7 @@ def draw(shares: dict[str, dict[tuple[float, float, float], float]], path: Path)
         table = np.array([[result[shift, turn, scale] for shift, scale in across] for turn in TURNS])
         image = heat_map(axis, table, [f"{turn:g}°" for turn in TURNS], labels, cmap="RdYlGn")
         axis.axvline(len(SHIFTS) - 0.5, color="white", linewidth=3)
-        axis.set_title(name)
-        axis.set_xlabel("shift of the width        scale")
+        axis.set(title=name, xlabel="shift of the width        scale")
     axes[0, 0].set_ylabel("turn")
     figure.colorbar(image, ax=axes[0].tolist(), label="found within 0.3 px")
     figure.savefig(path, dpi=110, bbox_inches="tight")

@@ -16,7 +16,7 @@ import re
 import subprocess
 import sys
 import tempfile
-import time
+from collections import Counter
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -29,7 +29,6 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "benchmarks"))
 SHARES = {"xmp": 0.5, "tags": 0.35, "names": 0.15}
 MAX_SECONDS, MAX_MEGABYTES = 1, 500
 LONGEST_BYTES = {"xmp": 20_000, "tags": 30_000, "names": 300}
-SIZE_PX = 32, 24
 
 
 def seeds(folder: Path) -> None:
@@ -44,16 +43,14 @@ def seeds(folder: Path) -> None:
         (folder / target).mkdir(parents=True)
     for camera in (REDEDGE, MAVIC, MAVIC_3M, ALTUM, SENTERA_6X):
         made = folder / "made" / camera.model.replace(" ", "_")
-        make_flight(made, 1, SIZE_PX, camera=camera)
-        names = []
-        for path in sorted(p for p in made.rglob("*") if p.suffix.lower() in (".tif", ".jpg")):
-            names.append(path.name)
-            packet = read_directories(path)[0].get(XMP)
-            if packet is not None:
+        make_flight(made, 1, (32, 24), camera=camera)
+        images = sorted(p for p in made.rglob("*") if p.suffix.lower() in (".tif", ".jpg"))
+        for path in images:
+            if packet := read_directories(path)[0].get(XMP):
                 (folder / "xmp" / path.name).write_bytes(packet.data)
             if path.stat().st_size < LONGEST_BYTES["tags"]:
                 (folder / "tags" / path.name).write_bytes(path.read_bytes())
-        (folder / "names" / made.name).write_text("\n".join(names))
+        (folder / "names" / made.name).write_text("\n".join(path.name for path in images))
     (folder / "names" / "generic").write_text("a_red.tif\na_nir.tif\nb-840nm.tiff\nDJI_0011.TIF\n.hidden.tif\n_1.tif")
 
 
@@ -62,16 +59,8 @@ def fuzz(target: str, corpus: Path, arguments: list[str]) -> None:
     import atheris
 
     with atheris.instrument_imports(include=["agalign.cameras", "agalign.values", "tifffile"]):
-        from agalign.cameras import (
-            discover,
-            known_cameras,
-            metadata,
-            pix4d,
-            read_files,
-            tag_transfer,
-            tiff_directory,
-            xmp,
-        )
+        from agalign.cameras import discover, known_cameras, metadata, pix4d, read_files, tag_transfer, xmp
+        from agalign.cameras.tiff_directory import read_directories
     from agalign.errors import AgalignError
     from agalign.values.capture import Band
 
@@ -105,20 +94,14 @@ def fuzz(target: str, corpus: Path, arguments: list[str]) -> None:
             metadata.read_tags(file)
         tag_transfer._directories(file)
         with contextlib.suppress(ValueError):
-            tiff_directory.read_directories(file)
+            read_directories(file)
 
     def on_names(data: bytes) -> None:
-        folder = Path(tempfile.mkdtemp(dir=scratch))
-        made = []
-        for name in data.decode("utf-8", "surrogateescape").split("\n")[:8]:
-            with contextlib.suppress(OSError, ValueError):
-                os.link(plain, folder / name)
-                made.append(folder / name)
-        with contextlib.suppress(AgalignError):
-            discover.discover(folder)
-        for path in made:
-            path.unlink()
-        folder.rmdir()
+        with tempfile.TemporaryDirectory(dir=scratch) as folder, contextlib.suppress(AgalignError):
+            for name in data.decode("utf-8", "surrogateescape").split("\n")[:8]:
+                with contextlib.suppress(OSError, ValueError):
+                    os.link(plain, Path(folder, name))
+            discover.discover(Path(folder))
 
     limits = f"-timeout={MAX_SECONDS} -rss_limit_mb={MAX_MEGABYTES} -max_len={LONGEST_BYTES[target]}"
     options = [*limits.split(), "-print_final_stats=1", "-verbosity=1"]
@@ -127,15 +110,15 @@ def fuzz(target: str, corpus: Path, arguments: list[str]) -> None:
     atheris.Fuzz()
 
 
-def fuzz_in_process(target: str, inputs: int, corpus: Path) -> tuple[list[int], str]:
-    """([inputs, slowest in seconds, peak MB], error, if any) of a target in a process of its own."""
+def fuzz_in_process(target: str, inputs: int, corpus: Path) -> tuple[str, str]:
+    """(numbers of a target in a process of its own, without its `{seconds}`; error, if any)."""
     command = [sys.executable, __file__, "--target", target, "--inputs", str(inputs), "--corpus", str(corpus)]
     done = subprocess.run(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, check=False)
-    stats = {name: int(value) for name, value in re.findall(r"stat::(\w+):\s+(\d+)", done.stdout)}
-    names = "number_of_executed_units", "slowest_unit_time_sec", "peak_rss_mb"
+    stats = Counter({name: int(value) for name, value in re.findall(r"stat::(\w+):\s+(\d+)", done.stdout)})
     _, found, uncaught = done.stdout.partition("=== Uncaught")
     error = (found + uncaught if found else done.stdout)[-3000:] if done.returncode else ""
-    return [stats.get(name, 0) for name in names], error
+    limits = f"{int(bool(error))} failures, slowest {stats['slowest_unit_time_sec']} s, {stats['peak_rss_mb']} MB"
+    return f"{target} {stats['number_of_executed_units']} in {{seconds}} s ({limits})", error
 
 
 def main(
@@ -145,23 +128,18 @@ def main(
     markdown: Path | None = None,
     libfuzzer: Annotated[list[str] | None, typer.Argument(help="options and files for libFuzzer")] = None,
 ) -> None:
-    from common import Section
+    from common import report, timed
 
     if target and corpus:
         fuzz(target, corpus, [f"-runs={inputs}", *(libfuzzer or ())])
     with tempfile.TemporaryDirectory() as folder:
         seeds(Path(folder))
-        parts = []
-        errors = []
+        parts, errors = [], []
         for one, share in SHARES.items() if target is None else {target: 1.0}.items():
-            began = time.monotonic()
-            (count, slowest, memory), error = fuzz_in_process(one, round(inputs * share), Path(folder, one))
+            seconds, (part, error) = timed(fuzz_in_process, one, round(inputs * share), Path(folder, one))
+            parts.append(part.format(seconds=round(seconds)))
             errors += [error] if error else []
-            seconds = round(time.monotonic() - began)
-            parts.append(
-                f"{one} {count} in {seconds} s ({int(bool(error))} failures, slowest {slowest} s, {memory} MB)"
-            )
-        Section("fuzz", markdown).say(f"Inputs: {', '.join(parts)}.")
+        report("fuzz", markdown, f"Inputs: {', '.join(parts)}.")
         if errors:
             raise SystemExit("\n".join(errors))
 

@@ -9,14 +9,19 @@ The check allows libraries that are not installed, and other spellings of a lice
 import re
 import sys
 import tomllib
+from contextlib import suppress
 from importlib.metadata import PackageNotFoundError, distribution, distributions
 from pathlib import Path
 
 from packaging.requirements import Requirement
 
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "benchmarks"))
+
+from bands.score import table
+from common import with_section
+
 ROOT = Path(__file__).resolve().parents[1]
 PAGE = ROOT / "docs" / "licences.md"
-BEGIN, END = "<!-- licences -->\n", "<!-- end of licences -->\n"
 READ = {"atheris": "Apache-2.0", "exifread": "BSD-3-Clause", "odc-stac": "Apache-2.0"}
 """Licences, from the licence file, of packages with missing or inexact metadata."""
 SPELT = {
@@ -27,36 +32,30 @@ SPELT = {
 }
 """Names of licences in classifiers, in short."""
 NOT_PERMISSIVE = re.compile(r"GPL|General Public|MPL|Mozilla|EUPL|Proprietary|Commercial")
-HEAD = "| licence | every run | extras |\n| --- | --- | --- |\n"
 
 
 def main() -> None:
     """Write the table, or check it."""
-    needed = requirements()
-    before, rest = PAGE.read_text(encoding="utf-8").split(BEGIN)
-    table, after = rest.split(END)
+    every_run, extras = requirements()
     if "--check" in sys.argv[1:]:
-        problems = check(needed, table)
-        print("\n".join(problems) or f"licences: {len(needed)} libraries, as in docs/licences.md")
+        problems = check(every_run, extras)
+        print("\n".join(problems) or f"licences: {len(every_run | extras)} libraries, as in docs/licences.md")
         sys.exit(1 if problems else 0)
-    columns: dict[str, tuple[list[str], list[str]]] = {}
-    for name, is_extra in needed.items():
-        columns.setdefault(licence(name), ([], []))[is_extra].append(name)
-    rows = [
-        f"| {text} | {', '.join(every_run)} | {', '.join(extras)} |\n"
-        for text, (every_run, extras) in sorted(columns.items())
-    ]
-    PAGE.write_text(f"{before}{BEGIN}{HEAD}{''.join(rows)}{END}{after}", encoding="utf-8", newline="\n")
+    columns = {text: ([], []) for text in sorted(set(map(licence, every_run | extras)))}
+    for column, names in enumerate((every_run, extras)):
+        for name in sorted(names):
+            columns[licence(name)][column].append(name)
+    rows = [(text, *(", ".join(names) for names in both)) for text, both in columns.items()]
+    content = table([("licence", "every run", "extras"), *rows]) + "\n"
+    PAGE.write_text(with_section(PAGE, "licences", content), encoding="utf-8", newline="\n")
 
 
-def requirements() -> dict[str, bool]:
-    """Return the libraries in pyproject.toml, and whether only extras need them."""
+def requirements() -> tuple[set[str], set[str]]:
+    """Return the libraries in pyproject.toml that every run needs, and those that only extras need."""
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
-    extras = [text for texts in project["optional-dependencies"].values() for text in texts]
-    every_run, of_extras = (
-        {Requirement(text).name.lower() for text in texts} for texts in (project["dependencies"], extras)
-    )
-    return {name: name not in every_run for name in sorted(every_run | of_extras)}
+    of_extras = [text for texts in project["optional-dependencies"].values() for text in texts]
+    every_run, extras = ({Requirement(text).name.lower() for text in t} for t in (project["dependencies"], of_extras))
+    return every_run, extras - every_run
 
 
 def licence(name: str) -> str:
@@ -69,24 +68,17 @@ def licence(name: str) -> str:
     return facts.get("License-Expression") or short or (facts.get("License") or "unknown").strip().splitlines()[0]
 
 
-def check(needed: dict[str, bool], table: str) -> list[str]:
+def check(every_run: set[str], extras: set[str]) -> list[str]:
     """Return the libraries that the table lacks or has in a wrong column, and those with other licences."""
-    listed: dict[str, bool] = {}
-    for row in table.splitlines()[2:]:
-        _, every_run, extras = row.strip("|").split("|")
-        listed |= {
-            name: is_extra for is_extra, cell in enumerate((every_run, extras)) for name in re.findall(r"[\w.-]+", cell)
-        }
-    wrong = sorted({name for name, _ in needed.items() ^ listed.items()})
-    problems = [f"docs/licences.md: {name}: run python tools/licences.py" for name in wrong]
     page = PAGE.read_text(encoding="utf-8").lower()
-    for result in sorted({d.name.lower() for d in distributions()}):
-        try:
-            text = licence(result)
-        except PackageNotFoundError:
-            continue
-        if NOT_PERMISSIVE.search(text) and result not in page:
-            problems.append(f"{result} is under {text}: add it to docs/licences.md")
+    rows = re.findall(r"^\| (?!licence|---).* \| (.*) \| (.*) \|$", page.partition("<!-- end of")[0], re.MULTILINE)
+    listed = (set(re.findall(r"[\w.-]+", " ".join(column))) for column in zip(*rows, strict=True))
+    wrong = sorted(set().union(*(one ^ other for one, other in zip((every_run, extras), listed, strict=True))))
+    problems = [f"docs/licences.md: {name}: run python tools/licences.py" for name in wrong]
+    for name in sorted({d.name.lower() for d in distributions()}):
+        with suppress(PackageNotFoundError):
+            if NOT_PERMISSIVE.search(licence(name)) and name not in page:
+                problems.append(f"{name} is under {licence(name)}: add it to docs/licences.md")
     return problems
 
 

@@ -13,6 +13,7 @@ zip, which only asserts.
 import difflib
 import os
 import random
+import re
 import shutil
 import subprocess
 import sys
@@ -29,7 +30,6 @@ import typer
 
 try:
     import libcst as cst
-    from libcst.metadata import MetadataWrapper, PositionProvider
     from mutmut.mutation.mutators import mutation_operators
 except ImportError:
     sys.exit('mutmut is not installed: pip install "mutmut>=3.8,<4"')
@@ -40,6 +40,7 @@ CALLERS = "batch", "cameras", "capture", "flight", "pixels", "test_api.py", "pro
 NOT_COPIED = (".git", ".*_cache", "__pycache__", ".hypothesis", ".venv", "build", "dist", "site", "*.egg-info")
 TIMEOUT_S = 600.0
 """A mutant is detected if its tests take longer than this."""
+STRICT = re.compile(r",\s*strict=\w+")
 TESTS = ["-x", "-q", "-n0", "-p", "no:cacheprovider", "--hypothesis-seed=0", "-m", "not real and not full"]
 
 
@@ -57,31 +58,16 @@ class Mutant:
 # ---- mutants
 
 
-class _Collector(cst.CSTVisitor):
-    """Collects (line, name of the operator, node, changed node) in `found`."""
-
-    METADATA_DEPENDENCIES = (PositionProvider,)
-
-    def __init__(self) -> None:
-        self.found: list[tuple[int, str, cst.CSTNode, cst.CSTNode]] = []
-
-    def on_visit(self, node: cst.CSTNode) -> bool:
-        if _is_skipped(node):
-            return False
-        position = self.get_metadata(PositionProvider, node, None)
-        for kind, operator in mutation_operators:
-            if position is not None and isinstance(node, kind):
-                changes = [changed for changed in operator(node) if not _only_strict_differs(node, changed)]
-                name = operator.__name__.removeprefix("operator_")
-                self.found += [(position.start.line, name, node, changed) for changed in changes]
-        return True
-
-
-def _only_strict_differs(node: cst.CSTNode, changed: cst.CSTNode) -> bool:
-    if not (isinstance(node, cst.Call) and isinstance(changed, cst.Call)):
-        return False
-    before, after = ([a for a in call.args if not _is_skipped(a)] for call in (node, changed))
-    return changed.func is node.func and before == after
+def changes_in(node: cst.CSTNode) -> Iterator[tuple[cst.CSTNode, cst.CSTNode, str]]:
+    """Yield (node, changed node, name of the operator) of a node and those below it."""
+    if _is_skipped(node):
+        return
+    for kind, operator in mutation_operators:
+        if isinstance(node, kind):
+            for changed in operator(node):
+                yield node, changed, operator.__name__.removeprefix("operator_")
+    for child in node.children:
+        yield from changes_in(child)
 
 
 def _is_skipped(node: cst.CSTNode) -> bool:
@@ -92,7 +78,7 @@ def _is_skipped(node: cst.CSTNode) -> bool:
             return " " in node.value or node.value.startswith(('"""', "'''"))
         case cst.Call(func=cst.Attribute(value=cst.Name(value="_LOG"))):
             return True
-        case cst.Call(func=cst.Name(value="NewType" | "TypeVar" | "cast")) | cst.Arg(keyword=cst.Name(value="strict")):
+        case cst.Call(func=cst.Name(value="NewType" | "TypeVar" | "cast")):
             return True
         case cst.Assign(targets=[cst.AssignTarget(target=cst.Name(value=name))]):
             bare = name.strip("_")  # CamelCase is a type alias
@@ -104,20 +90,20 @@ def mutants_of(packages: list[str], seed: int) -> Iterator[Mutant]:
     """Yield the mutants of all modules that compile, in random order."""
     candidates = []
     for path in sorted(p for name in packages for p in (ROOT / "agalign" / name).rglob("*.py")):
-        wrapper, collector = MetadataWrapper(cst.parse_module(path.read_text(encoding="utf-8"))), _Collector()
-        wrapper.visit(collector)
-        candidates += [(path, wrapper.module, *found) for found in collector.found]
+        module = cst.parse_module(path.read_text(encoding="utf-8"))
+        candidates += [(path, module, *change) for change in changes_in(module)]
     random.Random(seed).shuffle(candidates)
-    for path, module, line, operator, old, new in candidates:
+    for path, module, old, new, operator in candidates:
         try:
             source = cst.ensure_type(module.deep_replace(old, new), cst.Module).code
             compile(source, path.name, "exec", dont_inherit=True)
         except (SyntaxError, cst.CSTValidationError, TypeError):
             continue  # for example a positional argument that now follows a keyword
-        rows = difflib.unified_diff(module.code.splitlines(), source.splitlines(), n=0, lineterm="")
-        changed = [row for row in rows if not row.startswith(("---", "+++", "@@"))]
-        if changed:
-            yield Mutant(path.relative_to(ROOT).as_posix(), line, operator, "\n".join(changed), source)
+        if STRICT.sub("", source) == STRICT.sub("", module.code):
+            continue
+        _, _, place, *changed = difflib.unified_diff(module.code.splitlines(), source.splitlines(), n=0, lineterm="")
+        line = int(re.findall(r"\d+", place)[0])
+        yield Mutant(path.relative_to(ROOT).as_posix(), line, operator, "\n".join(changed), source)
 
 
 # ---- tests

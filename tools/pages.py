@@ -13,6 +13,7 @@ import re
 import sys
 import typing
 from collections.abc import Callable, Container
+from functools import partial
 from operator import attrgetter, not_
 from pathlib import Path
 from typing import Any
@@ -147,25 +148,22 @@ def indices() -> str:
     return table(rows) + "\n"
 
 
-TABLES: dict[str, dict[str, Callable[[], str]]] = {
-    "options.md": {
-        "Settings": lambda: options("settings"),
-        "DiscoverOptions": lambda: options("discover"),
-        "RunOptions": lambda: options("run"),
-    },
-    "radiometry.md": {"indices": indices},
-    "sidecar.md": {"fields": fields},
-    "troubleshooting.md": {"reasons": reasons},
-}
+PARTS: tuple[tuple[str, str, Callable[[], str]], ...] = (
+    ("options.md", "Settings", partial(options, "settings")),
+    ("options.md", "DiscoverOptions", partial(options, "discover")),
+    ("options.md", "RunOptions", partial(options, "run")),
+    ("radiometry.md", "indices", indices),
+    ("sidecar.md", "fields", fields),
+    ("troubleshooting.md", "reasons", reasons),
+)
+"""Page, mark of the part in it, and the function that makes its content."""
 
 
 def main() -> None:
     """Write the schema and the pages, or check them with --check."""
     write_or_check(SCHEMA, json.dumps(sidecar_schema(), indent=1) + "\n")
-    for name, tables in TABLES.items():
-        page = DOCS / name
-        for mark, content in tables.items():
-            write_or_check(page, with_section(page, mark, content()))
+    for name, mark, content in PARTS:
+        write_or_check(DOCS / name, with_section(DOCS / name, mark, content()))
 
 
 def write_or_check(path: Path, text: str) -> None:

@@ -31,13 +31,11 @@ def main() -> None:
         if len(sys.argv) == 1:
             subprocess.run([sys.executable, "-m", "agalign", "demo", str(demo), "--captures", "12"], check=True)
         aligned = demo / "aligned"
-        picture = Image.open(aligned / "0000SET" / "000" / "IMG_0001.png").convert("RGB")
-        smaller(picture).save(FIGURES / "demo.jpg", quality=78, optimize=True)
+        save(Image.open(aligned / "0000SET" / "000" / "IMG_0001.png"), "demo.jpg", 78)
         if len(sys.argv) > 2:
-            real = Image.open(Path(sys.argv[2]) / "IMG_0009.png").convert("RGB")
-            smaller(real).save(FIGURES / "row-crop.jpg", quality=78, optimize=True)
+            save(Image.open(Path(sys.argv[2]) / "IMG_0009.png"), "row-crop.jpg", 78)
             report = agalign.mosaic(sys.argv[2], Path(folder) / "field.tif")
-            smaller(false_colour(report.path)).save(FIGURES / "mosaic.jpg", quality=72, optimize=True)
+            save(false_colour(report.path), "mosaic.jpg", 72)
         with sync_playwright() as playwright:
             path = shutil.which("chromium") or shutil.which("google-chrome")
             browser = playwright.chromium.launch(executable_path=path, args=["--no-sandbox"])
@@ -46,8 +44,7 @@ def main() -> None:
             page.wait_for_timeout(1000)
             page.screenshot(path=Path(folder) / "report.png")
             browser.close()
-        screenshot = Image.open(Path(folder) / "report.png").convert("RGB")
-        smaller(screenshot).save(FIGURES / "report.jpg", quality=72, optimize=True)
+        save(Image.open(Path(folder) / "report.png"), "report.jpg", 72)
 
 
 def false_colour(mosaic: Path) -> Image.Image:
@@ -60,8 +57,11 @@ def false_colour(mosaic: Path) -> Image.Image:
     return Image.fromarray((255 * np.moveaxis(shown, 0, -1)).astype(np.uint8))
 
 
-def smaller(picture: Image.Image) -> Image.Image:
-    return picture.resize((WIDTH_PX, round(picture.height * WIDTH_PX / picture.width)), Image.Resampling.LANCZOS)
+def save(picture: Image.Image, name: str, quality: int) -> None:
+    """Write a picture in the width of the figures."""
+    size = WIDTH_PX, round(picture.height * WIDTH_PX / picture.width)
+    smaller = picture.convert("RGB").resize(size, Image.Resampling.LANCZOS)
+    smaller.save(FIGURES / name, quality=quality, optimize=True)
 
 
 if __name__ == "__main__":

@@ -41,15 +41,10 @@ def locate(folder: Path, sets: Mapping[str, Mapping[str, Any]]) -> tuple[dict[st
     sizes = {entry["bytes"] for s in sets.values() for entry in s["files"].values()}
     files = [p for p in sorted(folder.rglob("*")) if p.is_file() and p.stat().st_size in sizes]
     by_sum = {file_checksum(path): path for path in files}
-    located: dict[str, Paths] = {}
-    missing: dict[str, list[str]] = {}
-    for name, description in sets.items():
-        paths = {f: by_sum[entry["sha256"]] for f, entry in description["files"].items() if entry["sha256"] in by_sum}
-        if absent := [f for f in description["files"] if f not in paths]:
-            missing[name] = absent
-        else:
-            located[name] = paths
-    return located, missing
+    paths = {name: {f: by_sum.get(e["sha256"]) for f, e in s["files"].items()} for name, s in sets.items()}
+    missing = {name: [f for f, path in of_set.items() if path is None] for name, of_set in paths.items()}
+    located = {name: of_set for name, of_set in paths.items() if not missing[name]}
+    return located, {name: absent for name, absent in missing.items() if absent}
 
 
 def read(path: Path) -> Image:
@@ -75,10 +70,13 @@ def degraded(image: Image, pair: Pair, variant: str) -> Image:
         made = [in_other_light(plane, variant, np.random.default_rng(seed)) for plane in planes]
         return np.dstack(made).reshape(image.shape)
     if variant == LOST:
-        # Noise about its own brightness, as of a frame that a camera wrote without an exposure.
-        noise = np.random.default_rng(seed).normal(size=image.shape)
-        return _as(np.median(image) + 0.5 * image.std() * noise, image)
+        return _as(without_scene(image, np.random.default_rng(seed)), image)
     return moved(image, movement(variant, pair.size_px))
+
+
+def without_scene(image: Image, rng: np.random.Generator) -> NDArray[np.float64]:
+    """Noise about the brightness of an image, as of a frame that a camera wrote without an exposure."""
+    return np.median(image) + 0.5 * image.std() * rng.normal(size=image.shape)
 
 
 def in_other_light(plane: Image, variant: str, rng: np.random.Generator) -> Image:

@@ -10,12 +10,15 @@ written to -o, and as tables next to it (.md); the mapping of each pair to --map
 
 import csv
 import json
+import resource
 import shutil
 import sys
 import tempfile
-from collections.abc import Iterable, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
 from dataclasses import replace
+from functools import partial
+from multiprocessing import get_context
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -25,18 +28,19 @@ import typer
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # run as a file, its package is not found
 
-from common import align, run, timed, watched, write_band
-from peers import METHODS, Align, UnavailableError, grey_raster, method_named
+from common import align, flight_and_out, heat_map, pyplot, run, timed, write_band
+from peers import METHODS, Align, grey_raster, method_named
 
 from agalign.cameras.discover import discover
 from agalign.pixels.raster import suffix_format
-from agalign.products.sidecar.file import find_sidecars
+from agalign.products.sidecar.file import find_sidecars, read_sidecar
+from agalign.products.sidecar.schema import BandPart
 from agalign.values import geometry, lens
 from agalign.values.capture import Band
 from agalign.values.mapping import PixelMapping
+from bands import score
 from bands.images import LENS_CORRECTED, VARIANTS, Image, Paths, degraded, locate, read, straightened
-from bands.report import draw, tables
-from bands.score import AS_IT_IS, Pair, pairs_of, read_sets, score_pairs, summary, write_csv
+from bands.score import AS_IT_IS, Pair, Score, Scored, summary, table
 
 WHOLE = {"agalign, capture": (), "agalign, capture, no tags": ("--ignore-metadata",)}
 """Runs of the command line on a whole flight, with its files and tags: options by name."""
@@ -56,27 +60,23 @@ def by_command_line(method: str, paths: Paths, pairs: Sequence[Pair], variant: s
     """`agalign FOLDER` on the files of a set, with degraded moving bands of the pairs; the rest of the flight is
     unchanged. A band is claimed if it is aligned; a predicted one is given and not claimed.
     """
-    with tempfile.TemporaryDirectory() as folder:
-        flight, out = Path(folder, "flight"), Path(folder, "out")
+    with flight_and_out() as (flight, out):
         flight.mkdir()
         for name, path in paths.items():
             shutil.copyfile(path, flight / name)
         for pair in pairs if variant != AS_IT_IS else ():
             write_band(flight / pair.file, degraded(read(paths[pair.file]), pair, variant))
         seconds = align(flight, out, *WHOLE[method]) / (len(paths) - len({p.reference for p in pairs}))
-        sidecars = [json.loads(path.read_text(encoding="utf-8")) for path in find_sidecars(out)]
-    bands = {band["file"]: band for sidecar in sidecars for band in sidecar["bands"]}
+        bands = {band.file: band for path in find_sidecars(out) for band in read_sidecar(path).bands}
     return [{**claim(bands.get(pair.file)), "seconds": seconds} for pair in pairs]
 
 
-def claim(band: Mapping[str, Any] | None) -> Row:
+def claim(band: BandPart | None) -> Row:
     """Return the mapping of a band in a sidecar, if it has one, and whether it is claimed."""
-    if band is None or band["status"] not in ("aligned", "predicted") or not band["grid"]:
+    if band is None or band.status not in ("aligned", "predicted") or band.grid is None:
         return {}
-    return {
-        "grid": _grid(band["grid"]["reference_px"], band["grid"]["moving_px"]),
-        "claimed": "yes" if band["status"] == "aligned" else "no",
-    }
+    claimed = "yes" if band.status == "aligned" else "no"
+    return {"grid": _grid(band.grid.reference_px, band.grid.moving_px), "claimed": claimed}
 
 
 # ---- pair methods
@@ -112,9 +112,7 @@ def lens_corrected(method: Align, fixed: tuple[Image, Band], moving: tuple[Image
 
 def asked(method: Align, pair: Pair, variant: str, paths: Paths, bands: Mapping[str, Band]) -> Row:
     """Return the mapping of a pair by a pair method; an exception is a refusal."""
-    fixed, moving = read(paths[pair.reference]), read(paths[pair.file])
-    if variant != LENS_CORRECTED:
-        moving = degraded(moving, pair, variant)
+    fixed, moving = read(paths[pair.reference]), degraded(read(paths[pair.file]), pair, variant)
     try:
         if variant == LENS_CORRECTED:
             return lens_corrected(method, (fixed, bands[pair.reference]), (moving, bands[pair.file]))
@@ -123,6 +121,67 @@ def asked(method: Align, pair: Pair, variant: str, paths: Paths, bands: Mapping[
         print(f"{pair.key}, {variant}: refused ({type(error).__name__}: {error})", file=sys.stderr)
         return {}
     return {"seconds": seconds} | ({} if matrix is None else {"homography": np.asarray(matrix, float).tolist()})
+
+
+# ---- tables and a figure
+
+
+def tables(scored: Sequence[Scored], gigabytes: Mapping[str, float]) -> str:
+    """An overview; unmodified images by set; each variant with the sets pooled; and the memory of each method."""
+    pooled = summary([s for s in scored if s.variant != AS_IT_IS], "all sets")
+    by_variant = {variant: [s for s in pooled if s.variant == variant] for variant in VARIANTS}
+    parts = [f"### {variant}\n\n{score.markdown(scores)}\n" for variant, scores in by_variant.items() if scores]
+    memory = "; ".join(f"{name} {value:.1f}" for name, value in gigabytes.items())
+    return "\n".join([overview(scored), by_set(scored), *parts, f"Largest process, GB: {memory}.\n"])
+
+
+def overview(scored: Sequence[Scored]) -> str:
+    """Methods by variants, all sets together: pairs claimed within 0.5 px, and wrong claims."""
+
+    def cell(s: Score, pairs: int) -> str:
+        # The number of pairs, if the method was not run on all.
+        of = "" if s.pairs == pairs else f" of {s.pairs}"
+        return f"{round(s.under_half_px * s.pairs)}{of}/**{s.wrong_claims}**"
+
+    return _by_method("", {(s.method, s.variant): s for s in summary(scored, "all sets")}, cell)
+
+
+def by_set(scored: Sequence[Scored]) -> str:
+    """Methods by sets, unmodified images: median error of the claims in px, and wrong claims."""
+
+    def cell(s: Score, _pairs: int) -> str:
+        median = "-" if np.isnan(s.median_px) else f"{s.median_px:.3f}"
+        return f"{median}/**{s.wrong_claims}**"
+
+    scores = summary([s for s in scored if s.variant == AS_IT_IS])
+    return _by_method("method", {(s.method, s.set): s for s in scores}, cell)
+
+
+def _by_method(corner: str, scores: Mapping[tuple[str, str], Score], cell: Callable[[Score, int], str]) -> str:
+    """A row for each method, a column for each variant or set, with its number of pairs in the head."""
+    methods, columns = (dict.fromkeys(key[k] for key in scores) for k in (0, 1))
+    pairs = {c: max(s.pairs for (_, column), s in scores.items() if column == c) for c in columns}
+    rows = [
+        [method, *(cell(scores[method, c], pairs[c]) if (method, c) in scores else "-" for c in columns)]
+        for method in methods
+    ]
+    return table([[corner, *(f"{c} ({n})" for c, n in pairs.items())], *rows]) + "\n"
+
+
+def draw(scored: Sequence[Scored], path: Path) -> None:
+    """Two heat maps, methods by variants: the share of pairs claimed to half a px, and of wrong claims."""
+    scores = summary(scored, "all sets")
+    methods, variants = (list(dict.fromkeys(getattr(s, name) for s in scores)) for name in ("method", "variant"))
+    grids = np.full((2, len(methods), len(variants)), np.nan)
+    for s in scores:
+        grids[:, methods.index(s.method), variants.index(s.variant)] = s.under_half_px, s.wrong_claims / s.pairs
+    size = 13, 1.7 + 0.42 * len(methods)
+    figure, axes = pyplot().subplots(1, 2, figsize=size, sharey=True, layout="constrained")
+    titles = "claimed, and within 0.5 px: % of pairs", "wrong claims, more than 1 px off: % of pairs"
+    for axis, grid, title, colours in zip(axes, grids, titles, ("Greens", "Reds"), strict=True):
+        heat_map(axis, grid, methods, variants, cmap=colours)
+        axis.set_title(title, fontsize=11)
+    figure.savefig(path, dpi=85)
 
 
 # ---- methods on all sets
@@ -136,14 +195,17 @@ def applies(name: str, variant: str, pairs: Sequence[Pair], bands: Mapping[str, 
     return name not in WHOLE or has_tags(paths)
 
 
-def run_method(name: str, located: Mapping[str, Paths], sets: dict[str, Any], variants: Sequence[str]) -> list[Row]:
-    """Return the rows of one method for all pairs. Raises UnavailableError."""
+def run_method(
+    located: Mapping[str, Paths], sets: dict[str, Any], variants: Sequence[str], name: str
+) -> tuple[list[Row], float]:
+    """Return (rows of one method for all pairs, memory of the largest process in GB). Raises UnavailableError."""
+    cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_ERROR)  # it warns of every unknown tag
     method = None if name in WHOLE else method_named(name)
     rows: list[Row] = []
     for set_name, paths in located.items():
         bands = bands_of(paths)
         for variant in variants:
-            pairs = pairs_of(sets[set_name], variant)
+            pairs = score.pairs_of(sets[set_name], variant)
             if not applies(name, variant, pairs, bands, paths):
                 continue
             if method is None:
@@ -153,19 +215,18 @@ def run_method(name: str, located: Mapping[str, Paths], sets: dict[str, Any], va
             for pair, row in zip(pairs, mapped, strict=True):
                 key = dict(zip(("set", "capture", "file"), pair.key, strict=True))
                 rows.append({"method": name, "variant": variant, **key, **row})
-    return rows
+    processes = resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN
+    return rows, max(resource.getrusage(one).ru_maxrss for one in processes) / 1e6
 
 
-def child(name: str, arguments: Sequence[str]) -> tuple[list[Row], float]:
-    """Return (rows, largest memory in GB) of this script running one method in a process of its own, which may crash;
-    no rows without a result.
-    """
-    with tempfile.NamedTemporaryFile("r", suffix=".json") as file:
-        process = watched([sys.executable, __file__, *arguments, "--only", name, "-o", file.name])
-        if process.code:
-            print(f"{name}: left out", file=sys.stderr)
-            return [], 0.0
-        return json.load(file), process.largest_gb
+def in_its_process(function: Any, name: str) -> tuple[list[Row], float]:
+    """Return the result of a method in a process of its own, which may crash; no rows without a result."""
+    try:
+        with ProcessPoolExecutor(1, get_context("spawn")) as pool:
+            return pool.submit(function, name).result()
+    except Exception as error:  # any exception of a method
+        print(f"{name}: left out ({error})", file=sys.stderr)
+        return [], 0.0
 
 
 def print_missing(missing: Mapping[str, Sequence[str]], sets: dict[str, Any]) -> None:
@@ -194,33 +255,25 @@ def main(
     jobs: Annotated[int, typer.Option(help="methods at a time; above one, seconds mean little")] = 1,
     mappings: Path | None = None,
     plot: Path | None = None,
-    only: Annotated[str, typer.Option(hidden=True)] = "",
 ) -> None:
-    known = read_sets()
+    known = score.read_sets()
     if sets:
         known = {name: known[name] for name in sets.split(",")}
     if unknown := set(variants.split(",")) - set(VARIANTS):
         sys.exit(f"unknown variant '{unknown.pop()}'; choose from {', '.join(VARIANTS)}")
     located, missing = locate(data, known)
-    if only:
-        cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_ERROR)  # it warns of every unknown tag
-        try:
-            output.write_text(json.dumps(run_method(only, located, known, variants.split(","))))
-        except UnavailableError as error:
-            sys.exit(f"{only}: {error}")
-        return
     print_missing(missing, known)
     if not located:
         sys.exit(f"{data}: contains no complete set")
     names = methods.split(";")
-    arguments = [str(data), "--sets", ",".join(located), "--variants", variants]
+    one = partial(in_its_process, partial(run_method, located, known, variants.split(",")))
     with ThreadPoolExecutor(jobs) as pool:
-        result = dict(zip(names, pool.map(lambda name: child(name, arguments), names), strict=True))
+        result = dict(zip(names, pool.map(one, names), strict=True))
     rows = [row for some, _ in result.values() for row in some]
     if mappings:
         write_mappings(rows, mappings)
-    scored = score_pairs(rows, known)
-    write_csv(summary(scored), output)
+    scored = score.score_pairs(rows, known)
+    score.write_csv(summary(scored), output)
     text = tables(scored, {name: gigabytes for name, (some, gigabytes) in result.items() if some})
     output.with_suffix(".md").write_text(text, encoding="utf-8")
     print(text)

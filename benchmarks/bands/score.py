@@ -14,8 +14,9 @@ import csv
 import json
 import re
 import sys
+from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import astuple, dataclass, fields, replace
+from dataclasses import astuple, dataclass, fields
 from pathlib import Path
 from typing import Any
 
@@ -113,33 +114,13 @@ def pairs_of(description: Mapping[str, Any], variant: str = AS_IT_IS) -> list[Pa
     """The pairs of a set that a variant is made of, with their truth there: all of a set as it is, at most three
     otherwise, which are of one capture where that has several; where bands are lost, another one of each capture.
     """
-    pairs = [
-        _pair(description, capture, truth["reference"], file, entry)
-        for capture, truth in description["captures"].items()
-        for file, entry in truth["pairs"].items()
-    ]
-    return [_moved(pair, variant) for pair in _chosen(pairs, variant)]
-
-
-def _pair(description: Mapping[str, Any], capture: str, reference: str, file: str, entry: Mapping[str, Any]) -> Pair:
-    width, height = description["files"][file]["size_px"]
-    if "ties" in entry:
-        here, there = np.hsplit(np.array(entry["ties"], float), 2)
-    else:
-        w, h = description["files"][reference]["size_px"]
-        x, y = np.meshgrid(np.linspace(0, w - 1, _LATTICE), np.linspace(0, h - 1, _LATTICE))
-        here = np.stack([x.ravel(), y.ravel()], axis=1)
-        there = apply(np.array(entry["homography"], float), here)
-        inside = _inside(there, (width, height))
-        here, there = here[inside], there[inside]
-    return Pair(description["set"], capture, reference, file, here, there, (width, height))
-
-
-def _chosen(pairs: list[Pair], variant: str) -> list[Pair]:
+    by_capture = []
+    for capture, truth in description["captures"].items():
+        of_all = description, capture, truth["reference"]
+        by_capture.append([_pair(*of_all, file, entry, variant) for file, entry in truth["pairs"].items()])
+    pairs = [pair for group in by_capture for pair in group]
     if variant in (AS_IT_IS, "lens-corrected"):
         return pairs
-    captures = list(dict.fromkeys(p.capture for p in pairs))
-    by_capture = [[p for p in pairs if p.capture == c] for c in captures]
     if len(by_capture[0]) == 1:
         some = pairs
     elif variant == LOST:
@@ -150,18 +131,27 @@ def _chosen(pairs: list[Pair], variant: str) -> list[Pair]:
     return [some[i] for i in spread]
 
 
-def _moved(pair: Pair, variant: str) -> Pair:
-    there = apply(movement(variant, pair.size_px), pair.moving_px)
-    inside = _inside(there, pair.size_px)
-    return replace(pair, reference_px=pair.reference_px[inside], moving_px=there[inside])
+def _pair(
+    description: Mapping[str, Any], capture: str, reference: str, file: str, entry: Mapping[str, Any], variant: str
+) -> Pair:
+    width, height = description["files"][file]["size_px"]
+    if "ties" in entry:
+        here, there = np.hsplit(np.array(entry["ties"], float), 2)
+    else:
+        w, h = description["files"][reference]["size_px"]
+        x, y = np.meshgrid(np.linspace(0, w - 1, _LATTICE), np.linspace(0, h - 1, _LATTICE))
+        here = np.stack([x.ravel(), y.ravel()], axis=1)
+        there = apply(np.array(entry["homography"], float), here)
+    moved = apply(movement(variant, (width, height)), there)
+    inside = np.logical_and(*(((at >= 0) & (at <= (width - 1, height - 1))).all(axis=1) for at in (there, moved)))
+    return Pair(description["set"], capture, reference, file, here[inside], moved[inside], (width, height))
 
 
 def movement(variant: str, size_px: tuple[int, int]) -> Matrix:
     """Where a variant puts the pixels of a moving file (width, height): `turn DEGREES` (clockwise as seen) and `scale
     FACTOR` about its centre and within its frame; all others leave them in their places.
     """
-    result = re.fullmatch(r"(turn|scale) ([\d.]+)", variant)
-    matrix = np.eye(3)
+    result, matrix = re.fullmatch(r"(turn|scale) ([\d.]+)", variant), np.eye(3)
     if result:
         angle, scale = (np.radians(float(result[2])), 1.0) if result[1] == "turn" else (0.0, float(result[2]))
         cos, sin = scale * np.cos(angle), scale * np.sin(angle)
@@ -176,10 +166,6 @@ def apply(matrix: Matrix, points_px: Points) -> Points:
     mapped = points_px @ matrix[:, :2].T + matrix[:, 2]
     with np.errstate(divide="ignore", invalid="ignore"):
         return np.asarray(mapped[:, :2] / mapped[:, 2:])
-
-
-def _inside(points_px: Points, size_px: tuple[int, int]) -> NDArray[np.bool_]:
-    return np.asarray(((points_px >= 0) & (points_px <= np.subtract(size_px, 1))).all(axis=1))
 
 
 # ---- results of a method
@@ -220,9 +206,9 @@ def score_pairs(rows: Iterable[Mapping[str, Any]], sets: Mapping[str, Mapping[st
 
     Raises ValueError for rows of unknown pairs, for two rows of one pair, and for mappings that are none.
     """
-    groups: dict[tuple[str, str, str], dict[tuple[str, str, str], Mapping[str, Any]]] = {}
+    groups = defaultdict[tuple[str, str, str], dict[tuple[str, str, str], Mapping[str, Any]]](dict)
     for row in rows:
-        group = groups.setdefault((row["set"], row.get("variant", AS_IT_IS), row["method"]), {})
+        group = groups[row["set"], row.get("variant", AS_IT_IS), row["method"]]
         key = row["set"], str(row["capture"]), row["file"]
         if key in group:
             raise ValueError(f"{row['method']}: two rows for {key}")
@@ -232,8 +218,7 @@ def score_pairs(rows: Iterable[Mapping[str, Any]], sets: Mapping[str, Mapping[st
         if name not in sets:
             raise ValueError(f"{method}: there is no set {name}")
         pairs = pairs_of(sets[name], variant)
-        unknown = set(group) - {p.key for p in pairs}
-        if unknown:
+        if unknown := set(group) - {p.key for p in pairs}:
             raise ValueError(f"{method}, {variant}: no such pair: {sorted(unknown)[0]}")
         scored += [_scored(group.get(p.key, {}), p, variant, method) for p in pairs]
     return scored
@@ -244,38 +229,35 @@ def _scored(row: Mapping[str, Any], pair: Pair, variant: str, method: str) -> Sc
         error = errors_px(row, pair)
     except (ValueError, KeyError, TypeError) as problem:
         raise ValueError(f"{method}: {pair.key}: no mapping ({problem})") from None
-    given = error is not None
+    given, seconds = error is not None, float(row.get("seconds", "nan"))
     # Of the order statistics the upper one, for between a number and inf nothing can be interpolated.
-    median, p95 = (np.nan, np.nan) if error is None else np.percentile(error, (50, 95), method="higher")
+    quantiles_px = np.percentile(error, (50, 95), method="higher").tolist() if given else (np.nan, np.nan)
     claimed = given and str(row.get("claimed", "yes")).lower() not in ("no", "false", "0")
-    return Scored(
-        pair.set, variant, method, claimed, given, float(median), float(p95), float(row.get("seconds", "nan"))
-    )
+    return Scored(pair.set, variant, method, claimed, given, *quantiles_px, seconds)
 
 
 def summary(scored: Sequence[Scored], name: str | None = None) -> list[Score]:
     """A score for each set, variant and method, in the order in which they come; `name` pools the sets under it."""
-    groups: dict[tuple[str, str, str], list[Scored]] = {}
+    groups = defaultdict[tuple[str, str, str], list[Scored]](list)
     for s in scored:
-        groups.setdefault((name or s.set, s.variant, s.method), []).append(s)
+        groups[name or s.set, s.variant, s.method].append(s)
     return [_score(*key, group) for key, group in groups.items()]
 
 
 def _score(set_name: str, variant: str, method: str, group: Sequence[Scored]) -> Score:
-    claims = [s for s in group if s.claimed]
-    medians, p95 = np.array([s.median_px for s in claims]), np.array([s.p95_px for s in claims])
-    unclaimed = np.array([s.median_px for s in group if s.given and not s.claimed])
-    seconds = np.array([s.seconds for s in group])
+    medians, p95 = (np.array([getattr(s, name) for s in group if s.claimed]) for name in ("median_px", "p95_px"))
+    unclaimed = [s.median_px for s in group if s.given and not s.claimed]
+    refused = sum(not s.given for s in group)
+    counts = len(group), len(medians), int((medians > WRONG_PX).sum()), refused, len(unclaimed)
     under = [float((medians <= limit_px).sum() / len(group)) for limit_px in (GOOD_PX, WRONG_PX)]
-    worst = float(medians.max()) if claims else np.nan
-    wrong, refused = int((medians > WRONG_PX).sum()), sum(not s.given for s in group)
-    counts = len(group), len(claims), wrong, refused, len(unclaimed)
-    errors = _median(medians), _median(p95), worst, _median(unclaimed), _median(seconds[np.isfinite(seconds)])
-    return Score(set_name, variant, method, *counts, *under, *errors)
+    errors = _median(medians), _median(p95), max(medians.tolist(), default=np.nan), _median(unclaimed)
+    return Score(set_name, variant, method, *counts, *under, *errors, _median([s.seconds for s in group]))
 
 
-def _median(values: NDArray[np.float64]) -> float:
-    return float(np.median(values)) if len(values) else float("nan")
+def _median(values: Iterable[float]) -> float:
+    """Return the median of the values that are not nan, nan without any."""
+    known = [value for value in values if not np.isnan(value)]
+    return float(np.median(known)) if known else np.nan
 
 
 # ---- tables

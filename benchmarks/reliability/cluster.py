@@ -14,7 +14,7 @@ import psutil
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from common import Section, align, command, ended, flight_and_out, run
+from common import align, command, ended, flight_and_out, report, run
 from kills import differences, snapshot
 
 from agalign.products.sidecar.file import find_sidecars
@@ -23,21 +23,13 @@ from agalign.synthetic import flight as synthetic
 SIZE_PX, MAX_S = (480, 360), 1800
 
 
-def dask(program: str, address_file: Path, *arguments: str) -> "subprocess.Popen[bytes]":
+def dask(program: str, address_file: Path, *arguments: str) -> psutil.Popen:
     module = [sys.executable, "-m", f"distributed.cli.{program}", "--scheduler-file", str(address_file)]
     quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
-    return subprocess.Popen([*module, "--no-dashboard", *arguments], **quiet)
-
-
-def kill_worker(nanny_pid: int) -> None:
-    """Kill a nanny and its worker, which is the largest of its children."""
-    nanny = psutil.Process(nanny_pid)
-    max(nanny.children(recursive=True), key=lambda p: p.memory_info().rss).kill()
-    nanny.kill()
+    return psutil.Popen([*module, "--no-dashboard", *arguments], **quiet)
 
 
 def main(captures: int = 40, markdown: Path | None = None) -> None:
-    section = Section("cluster", markdown)
     with flight_and_out() as (flight, out):
         alone, address_file = (out.with_name(name) for name in ("alone", "scheduler.json"))
         synthetic.make_flight(flight, captures, SIZE_PX, rng_seed=5)
@@ -52,23 +44,28 @@ def main(captures: int = 40, markdown: Path | None = None) -> None:
             done = 0
 
             def lose_a_worker(process: "subprocess.Popen[str]") -> None:
+                """Kill a nanny and its worker, which is the largest of its children, half-way."""
                 nonlocal done
                 while process.poll() is None and done < captures // 2:
                     time.sleep(0.1)
                     done = len(find_sidecars(out))
-                kill_worker(processes[0].pid)
+                nanny = processes[0]
+                max(nanny.children(recursive=True), key=lambda p: p.memory_info().rss).kill()
+                nanny.kill()
 
             ending = ended(command(flight, out, "--dask", address), MAX_S, lose_a_worker)
         finally:
             for one in processes:
                 one.terminate()
         result = differences(out, snapshot(alone))
-        section.say(
+        report(
+            "cluster",
+            markdown,
             f"{captures} captures of {SIZE_PX[0]} x {SIZE_PX[1]} on a scheduler and two worker processes; one, "
             f"with its nanny, killed by SIGKILL when {done} captures were done: exit code {ending.code}, "
             f"{len(find_sidecars(out))} captures done in {ending.seconds:.0f} s (a run on this machine's two cores "
             f"without a cluster: {alone_s:.0f} s). Files compared with that run: {result['missing']} missing, "
-            f"{result['left over']} left over, {result['corrupt']} corrupt, {result['different']} different."
+            f"{result['left over']} left over, {result['corrupt']} corrupt, {result['different']} different.",
         )
 
 

@@ -17,8 +17,9 @@ import sys
 import tempfile
 import time
 import warnings
+from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from itertools import chain
 from pathlib import Path
 
@@ -30,7 +31,7 @@ from numpy.typing import NDArray
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from common import Section, command, ended, read_band, run, timed
+from common import command, ended, read_band, report, run, timed
 from kills import HUNG_S, contents
 from synthetic_flights.aligned import make_aligned
 
@@ -48,19 +49,20 @@ Image = NDArray[np.generic]
 Writer = Callable[[Path, Image], object]
 
 
+FAULTS = "tracebacks", "silent losses", "hangs"
+
+
 @dataclass
 class Attack:
     """A row of the table."""
 
     name: str
     tried: int = 0
-    tracebacks: int = 0
-    lost: int = 0
-    hangs: int = 0
     worst_s: float = 0.0
+    faults: Counter[str] = field(default_factory=Counter)
 
     def count(self, kind: str, what: object) -> None:
-        setattr(self, kind, getattr(self, kind) + 1)
+        self.faults[kind] += 1
         print(f"{self.name}: {kind}: {what}", flush=True)
 
     def program(self, argv: list[str], disturb: Callable[[object], object] = lambda _: None) -> str:
@@ -149,7 +151,8 @@ def attack_images(count: int, rng: np.random.Generator, folder: Path) -> Iterato
         failed = re.findall(r'"capture": "(\w+)", "state": "error"', errors)
         for path in flight.iterdir():
             if path.name not in known and path.name.split("_")[0] not in failed:
-                result.count("lost", f"{path.name}: {list(WRITERS)[int(path.name[1:].split('_')[0]) % len(WRITERS)]}")
+                kind = list(WRITERS)[int(re.findall(r"\d+", path.name)[0]) % len(WRITERS)]
+                result.count("silent losses", f"{path.name}: {kind}")
     yield result
 
 
@@ -182,7 +185,7 @@ def attack_rasters(count: int, rng: np.random.Generator, folder: Path) -> Iterat
         for name in expected:
             is_reported = name not in written and name.removesuffix("_ndvi.tif") in errors
             if not is_reported and written.get(name) != expected[name]:
-                result.count("lost", name)
+                result.count("silent losses", name)
     yield result
 
 
@@ -220,7 +223,7 @@ def attack_exclusions(count: int, rng: np.random.Generator, folder: Path, data: 
         seconds, excluded = timed(exclusion, capture)
         result.worst_s = max(result.worst_s, seconds)
         if excluded:
-            result.count("lost", f"{capture.name} as {excluded}")
+            result.count("silent losses", f"{capture.name} as {excluded}")
     yield result
 
 
@@ -263,16 +266,16 @@ def main(
 ) -> None:
     rng = np.random.default_rng(0)
     warnings.simplefilter("ignore")
+    rows = [("attack", "tried", *FAULTS, "worst, s")]
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         attacks = [attack_searches(rng), attack_rasters(changes, rng, folder), attack_images(images, rng, folder)]
         if data:
             attacks.append(attack_exclusions(captures, rng, folder, data))
-        rows = [("attack", "tried", "tracebacks", "silent losses", "hangs", "worst, s")]
         for row in chain(*attacks):
-            rows.append((row.name, row.tried, row.tracebacks, row.lost, row.hangs, f"{row.worst_s:.2f}"))
+            rows.append((row.name, row.tried, *(row.faults[kind] for kind in FAULTS), f"{row.worst_s:.2f}"))
             print(rows[-1], flush=True)
-    Section("inputs", markdown).table(rows)
+    report("inputs", markdown, rows)
 
 
 if __name__ == "__main__":

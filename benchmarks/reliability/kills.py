@@ -6,7 +6,7 @@
 The synthetic flight, `--layout both` with an error map and STAC items, so that every kind of file is at stake; and
 `agalign indices` on five times as many aligned captures. `--kills` is the number for each mode. Moments are drawn
 evenly over the time that an undisturbed run takes. Signals go to the run, its fork server, a worker, or all of them.
-SIGSTOP is followed by SIGCONT. Compared are all files that a run writes, rasters pixel by pixel, sidecars without the
+SIGSTOP is followed by SIGCONT. Compared are all files that a run writes, byte by byte, but JSON without the
 seconds.
 """
 
@@ -18,19 +18,16 @@ import subprocess
 import sys
 import tempfile
 import time
-import warnings
 from collections import Counter, defaultdict
-from collections.abc import Callable, Collection
 from contextlib import suppress
-from functools import partial
+from itertools import cycle, islice, product
 from pathlib import Path
 
 import psutil
-import rasterio
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from common import Section, command, ended, run
+from common import command, ended, report, run
 from synthetic_flights.aligned import make_aligned
 
 from agalign.products.sidecar.file import find_sidecars, verify_outputs
@@ -42,51 +39,36 @@ OPTIONS = "--layout", "both", "--error-map", "--stac"
 INDICES = "indices"
 MODES = {"one job": ("-j", "1"), "two jobs": ("-j", "2"), "Dask": ("-j", "2", "--dask", "local"), INDICES: ("-j", "2")}
 TARGETS = "run", "fork server", "worker", "run and workers"
-WRONG = (
-    *("hung", "traceback", "bad exit", "outlived the run", "torn"),
-    *("missing", "left over", "corrupt", "different"),
-)
 STOPPED_S, HUNG_S = 5.0, 120.0
 """Seconds for which SIGSTOP stops a process, and after which a run hangs."""
 CHANGING = {RUN_FILE, "summary.csv", "index.html"}
 """These hold seconds."""
 
 
-def without(value: object, names: Collection[str]) -> object:
-    """Return a JSON value without the entries of these names."""
-    if isinstance(value, dict):
-        return {k: without(v, names) for k, v in value.items() if k not in names}
-    return [without(v, names) for v in value] if isinstance(value, list) else value
-
-
 def contents(path: Path) -> object:
-    """Return what must be equal: pixels and names of bands, JSON without times, else the bytes."""
-    if path.suffix == ".tif":
-        with rasterio.open(path) as source:
-            return source.profile["dtype"], source.descriptions, source.read().tobytes()
-    return without(json.loads(path.read_text()), {"seconds"}) if path.suffix == ".json" else path.read_bytes()
+    """Return what must be equal: JSON without seconds, else the bytes; the error of an unreadable file."""
+    try:
+        if path.suffix != ".json":
+            return path.read_bytes()
+        return json.loads(path.read_text(), object_hook=lambda part: {k: v for k, v in part.items() if k != "seconds"})
+    except (OSError, ValueError) as error:
+        return error
 
 
-def snapshot(out: Path, content: Callable[[Path], object] = contents) -> dict[str, object]:
-    """Return the contents of the files of a run by name; the error of an unreadable one."""
-    result: dict[str, object] = {}
-    for path in (p for p in out.rglob("*") if p.is_file() and p.name not in CHANGING):
-        try:
-            result[path.relative_to(out).as_posix()] = content(path)
-        except Exception as error:
-            result[path.relative_to(out).as_posix()] = error
-    return result
+def snapshot(out: Path) -> dict[str, object]:
+    """Return the contents of the files of a run by name."""
+    files = (p for p in out.rglob("*") if p.is_file() and p.name not in CHANGING)
+    return {path.relative_to(out).as_posix(): contents(path) for path in files}
 
 
-def differences(out: Path, expected: dict[str, object], content: Callable[[Path], object] = contents) -> Counter[str]:
+def differences(out: Path, expected: dict[str, object]) -> Counter[str]:
     """Return the numbers of missing, left-over, unreadable and different files."""
-    here = snapshot(out, content)
+    here = snapshot(out)
     result = Counter({"missing": len(expected.keys() - here), "left over": len(here.keys() - expected)})
-    for name in expected.keys() & here:
-        corrupt = isinstance(here[name], Exception)
-        if corrupt or here[name] != expected[name]:
-            print("corrupt:" if corrupt else "different:", name)
-            result["corrupt" if corrupt else "different"] += 1
+    for name in (n for n in expected.keys() & here if here[n] != expected[n]):
+        kind = "corrupt" if isinstance(here[name], Exception) else "different"
+        print(f"{kind}: {name}")
+        result[kind] += 1
     return result
 
 
@@ -101,11 +83,11 @@ def torn(out: Path) -> int:
 def processes_of(process: "subprocess.Popen[str]", target: str) -> list[psutil.Process]:
     """Return the running processes that a signal is sent to; the run itself where it has no workers."""
     here = psutil.Process(process.pid)
-    below = [c for c in here.children(recursive=True) if c.ppid() != here.pid]
-    chosen = {c.parent() for c in below} if target == "fork server" else set(below) if target == "worker" else {here}
-    if target == "run and workers":
-        chosen |= set(here.children(recursive=True))
-    return [c for c in chosen if c is not None] or [here]
+    children = here.children(recursive=True)
+    below = [c for c in children if c.ppid() != here.pid]
+    if target == "fork server":
+        below = list({c.parent() for c in below} - {None})
+    return {"run": [here], "run and workers": [here, *children]}.get(target, below) or [here]
 
 
 def strike(argv: list[str], after_s: float, number: signal.Signals, target: str, rng: random.Random) -> Counter[str]:
@@ -127,13 +109,13 @@ def strike(argv: list[str], after_s: float, number: signal.Signals, target: str,
                     one.send_signal(signal.SIGCONT)
 
     ending = ended(argv, HUNG_S, send)
-    result["hung"] = int(ending.code is None)
     _, left = psutil.wait_procs(children, timeout=10)
+    result["hung"] = ending.code is None
     result["outlived the run"] = sum(c.is_running() and c.status() != psutil.STATUS_ZOMBIE for c in left)
-    result["traceback"] = int(ending.has_traceback)
+    result["traceback"] = ending.has_traceback
     # A second signal, or one before the program catches it, ends the process at once.
-    result["bad exit"] = int(ending.code not in (None, 0, 1, 3, 128 + number, -number))
-    if +result - Counter({"hit": 1}):
+    result["bad exit"] = ending.code not in (None, 0, 1, 3, 128 + number, -number)
+    if result.total() > result["hit"]:
         print(ending.code, ending.errors, [c.pid for c in left], flush=True)
     return result
 
@@ -146,8 +128,7 @@ def main(
     rng_seed: int = 0,
     markdown: Path | None = None,
 ) -> None:
-    section, rng = Section("kills", markdown), random.Random(rng_seed)
-    warnings.simplefilter("ignore")  # of rasters without georeference
+    rng = random.Random(rng_seed)
     rows = [("run", "signals to", "signals", "while it ran", "seconds of a run", "faults")]
     with tempfile.TemporaryDirectory() as folder:
         flight, aligned, out = Path(folder, "flight"), Path(folder, "aligned"), Path(folder, "out")
@@ -157,20 +138,19 @@ def main(
             of_indices = mode == INDICES
             make = [sys.executable, "-m", "agalign", "indices", str(out), "-q", "--index", "ndvi,ndre,savi"]
             argv = [*(make if of_indices else command(flight, out, *OPTIONS)), *MODES[mode]]
-            start = partial(shutil.copytree, aligned, out) if of_indices else (lambda: None)
-            shutil.rmtree(out, ignore_errors=True)
+
+            def start(of_indices: bool = of_indices) -> None:
+                shutil.rmtree(out, ignore_errors=True)
+                if of_indices:
+                    shutil.copytree(aligned, out)
+
             start()
             whole = ended(argv, HUNG_S)
             if whole.code != 0:
                 raise SystemExit(f"{mode}: the run without signals failed")
-            expected = snapshot(out)
-            targets = TARGETS if mode != "one job" else ("run",)
-            counts: dict[str, Counter[str]] = defaultdict(Counter)
-            for index in range(kills):
-                # Each pair of signal and target in turn.
-                name = signals.split(",")[index % len(signals.split(","))]
-                target = targets[index // len(signals.split(",")) % len(targets)]
-                shutil.rmtree(out, ignore_errors=True)
+            expected, counts = snapshot(out), defaultdict[str, Counter[str]](Counter)
+            turns = product(TARGETS if mode != "one job" else ("run",), signals.split(","))
+            for index, (target, name) in enumerate(islice(cycle(turns), kills), start=1):
                 start()
                 at_s = rng.uniform(0.02, 1.0) * whole.seconds
                 here = strike(argv, at_s, signal.Signals[name], target, rng)
@@ -179,15 +159,13 @@ def main(
                 here += differences(out, expected)
                 here["bad exit"] += again.code != 0
                 wrong = {k: n for k, n in here.items() if n and k != "hit"}
-                print(f"{index + 1}: {mode}: {name} to {target} after {at_s:.1f} s: {wrong or 'equal'}", flush=True)
+                print(f"{index}: {mode}: {name} to {target} after {at_s:.1f} s: {wrong or 'equal'}", flush=True)
                 if wrong:
                     print(again.errors, flush=True)
-                counts[target] += here + Counter(strikes=1)
-            rows += [
-                (mode, target, n["strikes"], n["hit"], f"{whole.seconds:.0f}", sum(n[k] for k in WRONG))
-                for target, n in counts.items()
-            ]
-    section.table(rows)
+                counts[target] += here + Counter(strikes=1, faults=sum(wrong.values()))
+            for target, n in counts.items():
+                rows.append((mode, target, n["strikes"], n["hit"], f"{whole.seconds:.0f}", n["faults"]))
+    report("kills", markdown, rows)
     if any(faults for *_, faults in rows[1:]):
         raise SystemExit("something is wrong")
 

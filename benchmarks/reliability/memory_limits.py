@@ -10,6 +10,7 @@ import resource
 import signal
 import sys
 from collections import defaultdict
+from functools import partial
 from pathlib import Path
 from typing import Annotated
 
@@ -17,7 +18,7 @@ import typer
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from common import Section, command, ended, flight_and_out, run
+from common import command, ended, flight_and_out, report, run
 
 from agalign.synthetic import flight as synthetic
 
@@ -27,21 +28,18 @@ MAX_S = 60
 
 def run_within(limit_gb: float, flight: Path, out: Path, *options: str) -> tuple[str, str, float]:
     """(how it ended, its first line, seconds) of a run with so much address space."""
-    limit = int(limit_gb * 1e9)
-    ending = ended(
-        command(flight, out, "--bands", "green,red", *options),
-        MAX_S,
-        preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_AS, (limit, limit)),
-    )
+    limit = partial(resource.setrlimit, resource.RLIMIT_AS, (int(limit_gb * 1e9),) * 2)
+    ending = ended(command(flight, out, "--bands", "green,red", *options), MAX_S, preexec_fn=limit)
     if ending.code is None:
         return f"not ended after {MAX_S} s", "", ending.seconds
-    lines = ending.errors.replace(f"{out}/", "").replace(f"{flight}/", "").splitlines()
-    line = next((line for line in lines if line.startswith("agalign: ")), lines[-1] if lines else "")
+    # The limit itself is in the line.
+    line = next(iter([*ending.complaints, *ending.errors.splitlines()[-1:]]), "")
+    line = re.sub(r"limited to [0-9.]+ GB", "limited to … GB", line.replace(f"{out}/", "").replace(f"{flight}/", ""))
     code = ending.code
     how = f"exit code {code}" if code >= 0 else f"ended by {signal.Signals(-code).name}"
     if ending.has_traceback:
         how += ", with a traceback or a request for a report"
-    elif code and not line.startswith("agalign: "):
+    elif code and not ending.complaints:
         how += ", without a reason"
     return how, line.removeprefix("agalign: "), ending.seconds
 
@@ -52,7 +50,6 @@ def main(
     step_gb: Annotated[float, typer.Option("--step")] = 0.05,
     markdown: Path | None = None,
 ) -> None:
-    section = Section("memory limits", markdown)
     rows: dict[tuple[str, str], list[tuple[float, float]]] = defaultdict(list)
     with flight_and_out() as (flight, out):
         synthetic.make_flight(flight, CAPTURES, SIZE_PX, rng_seed=4)
@@ -60,10 +57,9 @@ def main(
             for step in range(round((last_gb - first_gb) / step_gb) + 1):
                 limit_gb = first_gb + step * step_gb
                 # A time limit asks for worker processes; a flight of four captures is done in threads otherwise.
-                workers = ("-j", str(jobs)) if jobs == 1 else ("-j", str(jobs), "--timeout", "100")
-                how, line, seconds = run_within(limit_gb, flight, out.with_name(f"out{jobs}-{step}"), *workers)
-                # The limit itself is in the line.
-                line = re.sub(r"limited to [0-9.]+ GB", "limited to … GB", line)
+                workers = () if jobs == 1 else ("--timeout", "100")
+                new = out.with_name(f"out{jobs}-{step}")
+                how, line, seconds = run_within(limit_gb, flight, new, "-j", str(jobs), *workers)
                 print(f"-j {jobs} {limit_gb:.2f} GB: {how}, {seconds:.1f} s: {line}", flush=True)
                 rows[how, line].append((limit_gb, seconds))
     table = [("limit, GB", "runs", "slowest, s", "how it ended", "first line")]
@@ -71,7 +67,7 @@ def main(
         limits_gb, seconds_of = zip(*seen, strict=True)
         ends = dict.fromkeys(f"{gb:.2f}" for gb in (min(limits_gb), max(limits_gb)))
         table.append((" to ".join(ends), len(seen), f"{max(seconds_of):.0f}", how, line))
-    section.table(table)
+    report("memory limits", markdown, table)
 
 
 if __name__ == "__main__":

@@ -15,20 +15,19 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from common import Section, command, flight_and_out, run, watched
+from common import command, flight_and_out, report, run, watched
 
-QUANTITIES = {"memory of all processes, MB": 2, "open files of all processes": 3, "processes": 4}
-"""Columns of the samples."""
+QUANTITIES = "memory of all processes, MB", "open files of all processes", "processes"
+"""Columns of the samples, after the seconds."""
 
 
 def growth(samples: np.ndarray) -> str:
     """Return mean, growth and scatter of each quantity in the second half of a run."""
-    count = samples[:, 4]
+    count = samples[:, 3]
     working = samples[count == np.median(count)]  # neither while processes start nor while they end
-    half = working[working[:, 0] > working[-1, 0] / 2]
+    t_s, *values = working[working[:, 0] > working[-1, 0] / 2].T
     parts = []
-    for name, column in QUANTITIES.items():
-        t_s, y = half[:, 0], half[:, column]
+    for name, y in zip(QUANTITIES, values, strict=True):
         line = np.polyfit(t_s, y, 1)
         growth, scatter = line[0] * (t_s[-1] - t_s[0]), (y - np.polyval(line, t_s)).std()
         parts.append(f"{name} {y.mean():.0f} (growth {growth:+.1f}, scatter {scatter:.1f})")
@@ -36,7 +35,7 @@ def growth(samples: np.ndarray) -> str:
 
 
 def main(captures: int = 1000, jobs: str = "2", size: str = "240x180", markdown: Path | None = None) -> None:
-    section = Section("soak", markdown)
+    parts = []
     with flight_and_out() as (flight, out):
         # In a separate process, because the peak memory of a child starts at that of its parent.
         make = f"make_flight(Path({str(flight)!r}), {captures}, ({size.replace('x', ', ')}), rng_seed=1)"
@@ -44,18 +43,16 @@ def main(captures: int = 1000, jobs: str = "2", size: str = "240x180", markdown:
         subprocess.run([sys.executable, "-c", code], check=True)
         for count in jobs.split(","):
             argv = command(flight, out.with_name(f"out{count}"), "-j", count)
-            process = watched(argv)
-            section.say(
+            first, again = watched(argv), watched(argv)
+            parts += [
                 f"{captures} captures of {size.replace('x', ' x ')} and five bands, {count} worker processes: exit "
-                f"code {process.code}, {process.seconds:.0f} s, largest process {process.largest_gb:.2f} GB, "
-                f"{len(process.left)} processes left behind."
-            )
-            section.say(f"Second half of the run, while all processes work: {growth(process.samples)}.")
-            process = watched(argv)
-            mb = process.samples[:, 2].max()
-            section.say(
-                f"The same command again, all kept: exit code {process.code}, {process.seconds:.1f} s, {mb:.0f} MB."
-            )
+                f"code {first.code}, {first.seconds:.0f} s, largest process {first.largest_gb:.2f} GB, "
+                f"{len(first.left)} processes left behind.",
+                f"Second half of the run, while all processes work: {growth(first.samples)}.",
+                f"The same command again, all kept: exit code {again.code}, {again.seconds:.1f} s, "
+                f"{again.samples[:, 1].max():.0f} MB.",
+            ]
+    report("soak", markdown, *parts)
 
 
 if __name__ == "__main__":

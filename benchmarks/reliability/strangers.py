@@ -32,7 +32,8 @@ import tifffile
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from common import Ending, Section, align, run
+from bands.score import table
+from common import Ending, align, run
 
 from agalign.cameras import tiff_directory as tiff
 from agalign.cli.main import main as agalign_main
@@ -258,7 +259,7 @@ def main(folders: int = 5000, listed: int = 1_000_000, tagged: int = 1000, rng_s
             rows[f"output folder: {kind}"] += attack_folder(partial(change, kind, rng), whole)
         rows[f"{listed:,} captures listed"] = attack_folder(partial(list_many, listed), whole)
     cells = [(kind, *(row[fault] for fault in ("commands", *FAULTS))) for kind, row in rows.items()]
-    Section("strangers", None).table([("attack", "commands", *FAULTS), *cells])
+    print(table([("attack", "commands", *FAULTS), *cells]))
 
 
 if __name__ == "__main__":

@@ -14,19 +14,15 @@ import re
 import shutil
 import sys
 import tempfile
-import time
-import warnings
 from collections import Counter, defaultdict
 from collections.abc import Iterator
 from itertools import cycle, islice
 from pathlib import Path
 
-import tifffile
-
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from common import Ending, Section, ended, run
-from kills import contents, differences, snapshot, torn, without
+from common import Ending, ended, report, run
+from kills import differences, snapshot, torn
 
 from agalign.products.report.pages import SUMMARY_FILE
 from agalign.synthetic import flight as synthetic
@@ -48,9 +44,6 @@ secrets.token_hex = lambda _bytes=None: f"{next(numbers):016x}"
 files.os = types.SimpleNamespace(**(vars(os) | {"getpid": lambda: 1}))
 main()
 """
-_PLACES = {273, 279, 324, 325}
-"""TIFF tags that may differ between equal images."""
-_SIZES = {"seconds", "bytes", "sha256", "file:size", "file:checksum"}
 _CALL = re.compile(r'^\d+\s+(\w+)\((?:\d+<([^>]*)>|(?:AT_FDCWD[^,]*, )?"([^"]*)")')
 
 
@@ -84,50 +77,32 @@ def plan(calls: dict[str, Counter[str]], faults: int, rng: random.Random) -> lis
     return list(result)[:faults]
 
 
-def strict_contents(path: Path) -> object:
-    """Return contents with all tags of a TIFF file, but without the positions and sizes of tiles, strips and files: a
-    repeated write may leave a gap.
-    """
-    if path.suffix == ".json":
-        return without(contents(path), _SIZES)
-    if path.suffix != ".tif":
-        return contents(path)
-    with tifffile.TiffFile(path) as tiff:
-        tags = [(t.code, t.value) for page in tiff.pages for t in page.tags if t.code not in _PLACES]
-    return contents(path), tags
-
-
 def compared(out: Path, expected: dict[str, object]) -> Counter[str]:
     """Return the numbers of missing, left-over, unreadable and different files; the summary, which holds seconds, is
     different if it lacks a line.
     """
-    result, summary = differences(out, expected, strict_contents), out / SUMMARY_FILE
+    result, summary = differences(out, expected), out / SUMMARY_FILE
     result["different"] += not summary.exists() or len(summary.read_text().splitlines()) != 1 + CAPTURES
     return result
 
 
 def faults_of(ending: Ending, out: Path, expected: dict[str, object]) -> Counter[str]:
     """What is wrong right after a run with a fault."""
-    result: Counter[str] = Counter()
     if ending.code is None:
-        result["hung"] += 1
-        return result
-    result["torn"] = torn(out)
-    result["traceback"] = int(ending.has_traceback)
+        return Counter(hung=1)
+    result = Counter(torn=torn(out), traceback=int(ending.has_traceback))
     if ending.code == 0 and not ending.complaints:
         result["unnoticed"] = sum(compared(out, expected).values())
     elif ending.code not in (1, 3) or not ending.complaints:
         result["bad exit"] = 1
-    if any(p.name.startswith(".agalign") for p in out.rglob("*")):
-        result["left over"] += 1
+    result["left over"] = any(p.name.startswith(".agalign") for p in out.rglob("*"))
     return result
 
 
 def main(faults: int = 200, rng_seed: int = 0, markdown: Path | None = None) -> None:
     if shutil.which("strace") is None or sys.platform != "linux":
         raise SystemExit("strace is not installed (apt-get install strace)")
-    section, rng = Section("syscall faults", markdown), random.Random(rng_seed)
-    warnings.simplefilter("ignore")
+    rng, rows = random.Random(rng_seed), defaultdict[str, Counter[str]](Counter)
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name).resolve()
         flight, out = folder / "flight", folder / "out"
@@ -136,15 +111,13 @@ def main(faults: int = 200, rng_seed: int = 0, markdown: Path | None = None) -> 
         whole, trace = run_traced(argv, folder, "-e", "trace=" + ",".join(ERRORS))
         if whole.code != 0 or whole.complaints:
             raise SystemExit(f"the run without faults ended with {whole.code}: {whole.errors}")
-        expected = snapshot(out, strict_contents)
+        expected = snapshot(out)
         calls: dict[str, Counter[str]] = defaultdict(Counter)
         for call, path, _ in calls_in(out, trace):
             calls[call][path] += 1
         print({name: paths.total() for name, paths in calls.items()}, f"{len(expected)} files", flush=True)
-        rows: dict[str, Counter[str]] = defaultdict(Counter)
         for number, (call, error, path, at) in enumerate(plan(calls, faults, rng), start=1):
             shutil.rmtree(out, ignore_errors=True)
-            began = time.monotonic()
             inject = f"inject={call}:error={error}:when={at}"
             ending, trace = run_traced(argv, folder, "-P", path, "-e", f"trace={call}", "-e", inject)
             here = faults_of(ending, out, expected)
@@ -153,31 +126,29 @@ def main(faults: int = 200, rng_seed: int = 0, markdown: Path | None = None) -> 
             after["bad exit"] = int(again.code != 0 or bool(again.complaints))
             failed = (os.path.relpath(p, out) for _, p, injected in calls_in(out, trace) if injected)
             hit = re.sub(r"part-[\w-]+", "part-*", next(failed, ""))
-            row = rows[call]
-            row["runs"] += bool(hit)
-            row["refused"] += ending.code in (1, 3) and bool(ending.complaints)
-            row["as if nothing happened"] += ending.code == 0
-            row["lost"] += after["missing"] + after["bad exit"]
-            row["different"] += after["different"] + after["corrupt"]
-            row["left over"] += after["left over"]
-            row.update(here)
             wrong = +(here + Counter({f"{k} afterwards": v for k, v in after.items()}))
+            rows[call]["runs"] += bool(hit)
+            rows[call]["refused"] += ending.code in (1, 3) and bool(ending.complaints)
+            rows[call]["as if nothing happened"] += ending.code == 0
+            rows[call]["violations"] += wrong.total()
             print(
                 f"{number}: {call} {error} {at} ({hit or 'not reached'}): {ending.code} {ending.complaints[:1]} "
-                f"{time.monotonic() - began:.1f} s {dict(wrong) or ''}",
+                f"{ending.seconds + again.seconds:.1f} s {dict(wrong) or ''}",
                 flush=True,
             )
             if wrong:
                 print(ending.errors, "\nafterwards:", again.code, again.errors, flush=True)
-        kinds = ("runs", "refused", "as if nothing happened")
-        violations = ("traceback", "bad exit", "unnoticed", "torn", "lost", "different", "left over", "hung")
-        heads = ("call", "runs", "error reported", "finished", "violations")
-        section.say(
-            f"{sum(r['runs'] for r in rows.values())} runs over {CAPTURES} captures of {SIZE_PX[0]} x {SIZE_PX[1]}, "
-            "one failed call each, followed by the same command without a fault."
-        )
-        counts = {call: (*(row[k] for k in kinds), sum(row[k] for k in violations)) for call, row in rows.items()}
-        section.table([heads, *((call, *n) for call, n in counts.items())])
+    kinds = "runs", "refused", "as if nothing happened", "violations"
+    report(
+        "syscall faults",
+        markdown,
+        f"{sum(r['runs'] for r in rows.values())} runs over {CAPTURES} captures of {SIZE_PX[0]} x {SIZE_PX[1]}, "
+        "one failed call each, followed by the same command without a fault.",
+        [
+            ("call", "runs", "error reported", "finished", "violations"),
+            *((call, *(row[kind] for kind in kinds)) for call, row in rows.items()),
+        ],
+    )
 
 
 if __name__ == "__main__":

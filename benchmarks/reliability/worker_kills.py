@@ -69,14 +69,14 @@ def run_tiny(kills: int, rng: random.Random) -> Counter[str]:
     result: Counter[str] = Counter()
     while result["kills"] < kills:
         given, began = make_tiny(rng), time.monotonic()
-        seen, stopped = Counter[int](), threading.Event()
+        done, stopped = 0, threading.Event()
         with ProcessPool(WORKERS, get_context("forkserver")) as pool, ThreadPoolExecutor(1) as threads:
             killer = threads.submit(kill_workers, stopped, rng, kills - result["kills"])
             futures = {pool.submit(do_tiny, task, timeout_s=20): task for task in given}
             try:
                 for future in as_completed(futures, HUNG_S):
+                    done += 1
                     number, _, data, size = futures[future]
-                    seen[number] += 1
                     error = future.exception()
                     if isinstance(error, WorkerError):
                         raise error
@@ -87,34 +87,30 @@ def run_tiny(kills: int, rng: random.Random) -> Counter[str]:
                         expected = number, zlib.crc32(data), bytes(size)
                         result["wrong"] += error is not None or future.result() != expected
             except TimeoutError:
-                result["lost"] += TASKS - len(seen)
+                result["lost"] += TASKS - done
             except WorkerError:
                 result["runs ended with a reason"] += 1
-            else:
-                result["lost"] += sum(seen[n] != 1 for n in range(TASKS))
             stopped.set()
             result["kills"] += killer.result()
         result["runs"] += 1
-        result["tasks"] += seen.total()
+        result["tasks"] += done
         result["hung"] += time.monotonic() - began > HUNG_S
         result["left over"] += len(workers())
     return result
 
 
 def main(kills: int = 1000, rng_seed: int = 0, markdown: Path | None = None) -> None:
-    # Each worker imports this module: what loads slowly is imported here.
-    from common import Section
-
     os.environ.setdefault("OMP_NUM_THREADS", "1")
     result = run_tiny(kills, random.Random(rng_seed))
     counted = ("runs", "tasks", "kills", "reported as killed", "runs ended with a reason", *KINDS)
     heads = (name.replace("runs ended", "ended") for name in counted)
-    Section("worker kills", markdown).table([(*heads,), [result[name] for name in counted]])
+    report("worker kills", markdown, [[*heads], [result[name] for name in counted]])
     if any(result[kind] for kind in KINDS):
         raise SystemExit("something was lost, hung, wrong or left over")
 
 
 if __name__ == "__main__":
-    from common import run
+    # Each worker imports this module: what loads slowly is imported here.
+    from common import report, run
 
     run(main)

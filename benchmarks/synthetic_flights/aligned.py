@@ -47,20 +47,19 @@ def write_stack(path: Path, planes: np.ndarray, *, raw: bool = False) -> None:
     count, height, width = planes.shape
     profile = {"driver": "GTiff", "width": width, "height": height, "count": count, "compress": "zstd"}
     profile |= {"dtype": "uint16"} if raw else {"dtype": "float32", "nodata": np.nan}
+    of_stack, of_band = ({}, {}) if raw else ({"RADIOMETRY": "reflectance"}, {"QUANTITY": "reflectance"})
     with without_warnings(), rasterio.open(path, "w", **profile) as dataset:
         dataset.write((planes * _FULL if raw else planes).astype(profile["dtype"]))
         dataset.descriptions = tuple(BANDS)
-        dataset.update_tags(TIFFTAG_DATETIME="2026:06:21 10:00:00", **({} if raw else {"RADIOMETRY": "reflectance"}))
+        dataset.update_tags(TIFFTAG_DATETIME="2026:06:21 10:00:00", **of_stack)
         for index, (wavelength_nm, *_) in enumerate(BANDS.values(), start=1):
-            quantity = {} if raw else {"QUANTITY": "reflectance"}
-            dataset.update_tags(index, wavelength=wavelength_nm, wavelength_units="nm", **quantity)
+            dataset.update_tags(index, wavelength=wavelength_nm, wavelength_units="nm", **of_band)
 
 
 def sidecar_of(name: str, number: int, size_px: tuple[int, int], *, raw: bool) -> Sidecar:
     """The sidecar of aligned.json with another name, time, place and size."""
     width, height = size_px
-    text = (Path(__file__).parent / "aligned.json").read_text(encoding="utf-8").replace("IMG_0001", name)
-    content = json.loads(text)
+    content = json.loads(Path(__file__).with_name("aligned.json").read_text(encoding="utf-8").replace("IMG_0001", name))
     content["captured_at"] = f"2026-06-21T10:{number // 60 % 60:02d}:{number % 60:02d}"
     content["position"]["longitude"] += 1e-4 * number
     content["reference"] |= {"width": width, "height": height}
@@ -114,8 +113,8 @@ def make_overlapping(folder: Path) -> dict[str, np.ndarray]:
         to_ground = geometry.fit_homography(points, ground_m(capture, points) + camera_m)
         write_stack(folder / "0000SET" / f"{name}.tif", _seen(ground, from_metres @ to_ground))
         write_sidecar(folder / "0000SET" / f"{name}.json", _sidecar(name, number))
-        noise = rng.normal(0, ANGLE_ERROR_DEG, 3)
-        noisy = replace(pose, heading_deg=heading + noise[0], pitch_deg=pitch + noise[1], roll_deg=roll + noise[2])
+        angles_deg = np.array((heading, pitch, roll)) + rng.normal(0, ANGLE_ERROR_DEG, 3)
+        noisy = Pose(*angles_deg, height_m=pose.height_m, focal_length_px=FOCAL_PX)
         known = _capture(name, camera_m + rng.normal(0, GPS_ERROR_M, 2), noisy, whole_px)
         flight_map.add(known, "ok", read_result(folder / "0000SET" / f"{name}.json"))
         truth[capture.label] = to_ground
@@ -124,9 +123,9 @@ def make_overlapping(folder: Path) -> dict[str, np.ndarray]:
 
 
 def _capture(name: str, camera_m: np.ndarray, pose: Pose, size_px: tuple[int, int]) -> Capture:
-    longitude, latitude = np.array([LONGITUDE, LATITUDE]) + camera_m / _M_PER_DEGREE
+    longitude, latitude = ((LONGITUDE, LATITUDE) + camera_m / _M_PER_DEGREE).tolist()
     band = Band("Green", Path(f"{name}_2.tif"), 1, *size_px, "uint16")
-    position = Position(float(latitude), float(longitude), 100.0)
+    position = Position(latitude, longitude, 100.0)
     return Capture(name, Path("0000SET"), (band,), 0, position=position, pose=pose)
 
 
@@ -144,7 +143,7 @@ def _ground(width: int, height: int, rng: np.random.Generator) -> np.ndarray:
     """(4, height, width) reflectance of the bands, from soil to vegetation."""
     cover = np.zeros((height, width), np.float32)
     for grain_px in (1.0, 3.0, 9.0, 40.0):
-        shape = max(2, round(height / grain_px)), max(2, round(width / grain_px))
+        shape = [max(2, round(n / grain_px)) for n in (height, width)]
         cover += cv2.resize(rng.random(shape, np.float32), (width, height), interpolation=cv2.INTER_CUBIC) / 4
     return reflectances(cover)
 

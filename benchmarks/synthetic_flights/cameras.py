@@ -9,17 +9,8 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from agalign.cameras.tiff_directory import rational
-from agalign.synthetic.cameras import (
-    BLACK_LEVEL,
-    EXPOSURE_S,
-    WHITE_LEVEL,
-    BandSpec,
-    CameraSpec,
-    Exposure,
-    MicaSenseCamera,
-    rotation,
-    write_tiff,
-)
+from agalign.synthetic import cameras
+from agalign.synthetic.cameras import BandSpec, CameraSpec, Exposure, MicaSenseCamera, rotation, write_tiff
 from agalign.values import geometry
 from agalign.values.geometry import Matrix
 
@@ -27,8 +18,8 @@ _HERE = Path(__file__).parent
 _DJI, _SENTERA = ((_HERE / name).read_text(encoding="utf-8") for name in ("dji.xmp", "sentera.xmp"))
 _BAND_NAMES = {"Green": "G", "Red": "R", "RedEdge": "RE", "NIR": "NIR"}
 _SERIAL = "SYNTHETIC0000001"
-_TO_COLOUR = 1.7162, (1296.0, 972.0), (2639.9, 1978.0), (2592, 5280)
-"""Of one real Mavic 3M, band frame to colour photograph: scale, a point in each, and their widths in px."""
+_TO_COLOUR = 1.7162, (1296.0, 972.0), (2639.9, 1978.0), 2592
+"""Of one real Mavic 3M, band frame to colour photograph: scale, a point in each, and the width of the frame in px."""
 
 
 @dataclass(frozen=True)
@@ -64,15 +55,15 @@ class DjiCamera(CameraSpec):
         if self.calibrated:
             return f'drone-dji:CalibratedHMatrix="{_numbers(to_plane(self.bands[self.reference], band, size_px))}"'
         x, y = (v * size_px[0] / 1280 for v in band.centre_offset_px)
-        scale, here, there, (own_px, colour_px) = _TO_COLOUR
-        reduced = size_px[0] / own_px
-        own, colour = (np.diag([s, s, 1.0]) for s in (reduced, size_px[0] * colour_px / own_px / colour_px))
+        scale, here, there, own_px = _TO_COLOUR
         designed = (
-            geometry.translation(*there) @ np.diag([scale, scale, 1.0]) @ geometry.translation(-here[0], -here[1])
+            geometry.translation(*there) @ np.diag([scale, scale, 1.0]) @ geometry.translation(*np.negative(here))
         )
+        # Both images are reduced alike.
+        reduced = np.diag([size_px[0] / own_px, size_px[0] / own_px, 1.0])
         return (
             f'drone-dji:RelativeOpticalCenterX="{x:.5f}" drone-dji:RelativeOpticalCenterY="{y:.5f}" '
-            f'drone-dji:DewarpHMatrix="{_numbers(colour @ designed @ np.linalg.inv(own))}"'
+            f'drone-dji:DewarpHMatrix="{_numbers(reduced @ designed @ np.linalg.inv(reduced))}"'
         )
 
     def _write_colour(self, path: Path, pixels: NDArray[np.uint16], band: BandSpec, exposure: Exposure) -> None:
@@ -80,7 +71,9 @@ class DjiCamera(CameraSpec):
         planes = [b.name for b in self.bands if b.sees == "colour"]
         kept = path.with_suffix(".npy")
         before = np.load(kept) if kept.is_file() else np.zeros((*pixels.shape, len(planes)), np.uint8)
-        share = np.clip((pixels.astype(np.float32) - BLACK_LEVEL) / (WHITE_LEVEL - BLACK_LEVEL), 0, 1)
+        share = np.clip(
+            (pixels.astype(np.float32) - cameras.BLACK_LEVEL) / (cameras.WHITE_LEVEL - cameras.BLACK_LEVEL), 0, 1
+        )
         before[..., planes.index(band.name)] = np.rint(255 * share ** (1 / 2.2))
         if planes.index(band.name) < len(planes) - 1:
             np.save(kept, before)
@@ -134,7 +127,7 @@ class SenteraCamera(CameraSpec):
         plane = geometry.normalised(to_plane(self.bands[self.reference], band, exposure.size_px))
         matrix = "".join(f"<rdf:li>{v:.9g}</rdf:li>" for v in plane.ravel())
         xmp = _SENTERA.format(band=band, capture=f"synthetic{exposure.number:011d}", matrix=matrix)
-        write_tiff(path, pixels, self, band, exposure, xmp, "SY6X0001", {}, {0x829A: rational(EXPOSURE_S)})
+        write_tiff(path, pixels, self, band, exposure, xmp, "SY6X0001", {}, {0x829A: rational(cameras.EXPOSURE_S)})
 
 
 def _camera(name: str, kind: type[CameraSpec]) -> CameraSpec:

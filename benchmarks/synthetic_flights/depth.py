@@ -15,8 +15,7 @@ from numpy.typing import NDArray
 from agalign.synthetic.cameras import BANDS, REFERENCE, BandSpec, CameraSpec, Exposure, MicaSenseCamera, Pose
 from agalign.synthetic.flight import VIGNETTING, recorded
 from agalign.synthetic.ground import Field
-from synthetic_flights.materials import Textures, reflectances, sample
-from synthetic_flights.patches import Eye, Hits, Patch, boxes_of, nearer, nearest
+from synthetic_flights.patches import Eye, Hits, Patch, Textures, boxes_of, nearer, nearest, reflectances, sample
 
 Mask = NDArray[np.bool_]
 
@@ -52,19 +51,17 @@ class Hand:
     def cover(self, size_px: tuple[int, int]) -> Field:
         """Share (height, width) of the light that it takes from each pixel."""
         width, height = size_px
-        x, y = np.arange(width) / width - self.centre[0], (np.arange(height) / height - self.centre[1]) * height / width
-        distance = np.hypot(x[None, :], y[:, None])
+        x = np.arange(width) / width - self.centre[0]
+        y = ((np.arange(height) / height - self.centre[1]) * height / width)[:, None]
         # Fingers: the outline is not a circle.
-        angle = np.arctan2(y[:, None], x[None, :])
-        outline = self.radius * (1 + 0.25 * np.sin(5 * angle))
-        return np.asarray(np.clip((outline - distance) / (0.4 * self.radius) + 0.5, 0, 1), np.float32)
+        outline = self.radius * (1 + 0.25 * np.sin(5 * np.arctan2(y, x)))
+        return np.clip((outline - np.hypot(x, y)) / (0.4 * self.radius) + 0.5, 0, 1).astype(np.float32)
 
 
 @dataclass(frozen=True)
 class Scene:
     """What a rig sees at one capture. Band names are the keys of the exceptions."""
 
-    kind: str
     patches: tuple[Patch, ...]
     textures: Textures
     pose: Pose
@@ -114,7 +111,6 @@ class BandTruth:
 class Truth:
     """The geometry of a capture on the reference's raw pixels."""
 
-    kind: str
     range_m: Field
     """(height, width): depth along the reference's optical axis."""
     bands: Mapping[str, BandTruth]
@@ -131,8 +127,7 @@ def view(scene: Scene, band: BandSpec, size_px: tuple[int, int]) -> Field:
         tile, rays = tiles[patches[index].material], (x[window], y[window])
         light[window][closer] = _shaded(patches[index], hits, seen.textures, tile, eye, rays)[closer]
     mean = cv2.resize(cv2.GaussianBlur(light, (0, 0), _BLUR_PX * _SAMPLES), size_px, interpolation=cv2.INTER_AREA)
-    hand = scene.hands.get(band.name)
-    if hand is not None:
+    if hand := scene.hands.get(band.name):
         cover = hand.cover(size_px)
         mean = mean * (1 - cover) + hand.reflectance * max(band.soil, band.crop) * cover
     return np.asarray(mean, np.float32)
@@ -143,14 +138,12 @@ def _shaded(patch: Patch, hits: Hits, textures: Textures, tile: Field, eye: Eye,
     length_u, length_v = (float(np.linalg.norm(axis)) for axis in (patch.u_m, patch.v_m))
     # Rays that miss a small patch would sample far away, or at infinity.
     u, v = (np.clip(np.nan_to_num(at), -1, 1) for at in (hits.u, hits.v))
-    mean = tile.mean()
     offset_u, offset_v = (t % (len(tile) * textures.texel_m) for t in patch.texture_m)
-    u_m, v_m = u * length_u + offset_u, v * length_v + offset_v
-    result = mean + (sample(tile, u_m, v_m, textures.texel_m) - mean) * np.float32(patch.contrast)
-    result *= np.float32(patch.shade)
+    at_m, mean = (u * length_u + offset_u, v * length_v + offset_v, textures.texel_m), tile.mean()
+    result = (mean + (sample(tile, *at_m) - mean) * np.float32(patch.contrast)) * np.float32(patch.shade)
     if not patch.gloss:
         return result
-    slopes = [sample(w, u_m, v_m, textures.texel_m) * np.float32(_GLINT_SLOPE) for w in textures.waves]
+    slopes = [sample(w, *at_m) * np.float32(_GLINT_SLOPE) for w in textures.waves]
     along, across = np.array(patch.u_m) / length_u, np.array(patch.v_m) / length_v
     up = np.cross(along, across) * -np.sign(np.cross(along, across)[2])
     normal = up - slopes[0][..., None] * along - slopes[1][..., None] * across
@@ -167,7 +160,7 @@ def truth_of(scene: Scene, size_px: tuple[int, int], camera: CameraSpec = CLOSE_
     patches, eye = scene.at_exposure_of(reference), scene.eye(reference, size_px)
     seen = nearest(patches, eye, *eye.rays(), boxes_of(patches, eye))
     bands = {b.name: _band_truth(scene, b, eye, *seen) for b in camera.bands if b is not reference}
-    return Truth(scene.kind, np.asarray(seen[0], np.float32), bands)
+    return Truth(np.asarray(seen[0], np.float32), bands)
 
 
 def _band_truth(scene: Scene, band: BandSpec, reference: Eye, depth: Field, index: NDArray[np.int32]) -> BandTruth:
@@ -178,32 +171,29 @@ def _band_truth(scene: Scene, band: BandSpec, reference: Eye, depth: Field, inde
     x, y = reference.rays()
     points = reference.to_world(np.stack([x, y, np.ones_like(x)], axis=-1) * depth[..., None])
     before, after = (np.array([p.centre_m for p in scene.at_exposure_of(b)]) for b in (reference.band, band))
-    by = after - before
-    points, moved = points + by[index], np.abs(by).max(axis=1)[index] > 0
+    by = (after - before)[index]
     eye = scene.eye(band, reference.size_px)
-    there = eye.to_camera(points)
+    there = eye.to_camera(points + by)
     there_px = eye.project(there)
     inside = ((there_px >= 0) & (there_px <= np.subtract(eye.size_px, 1))).all(axis=-1)
     # The ray from the band's lens to a point meets something nearer.
     patches, z = scene.at_exposure_of(band), there[..., 2]
     boxes = boxes_of(patches, reference, farther_px=_reach_px(scene, reference, eye, depth))
     hidden = nearest(patches, eye, there[..., 0] / z, there[..., 1] / z, boxes)[0] < z * (1 - _SAME_SURFACE)
-    hand = scene.hands.get(band.name)
-    if hand is not None:
+    if hand := scene.hands.get(band.name):
         cover = cv2.remap(hand.cover(eye.size_px), there_px.astype(np.float32), None, cv2.INTER_LINEAR)
         hidden |= cover > _SEEN_THROUGH
-    return BandTruth(there_px.astype(np.float32), hidden, inside, moved)
+    return BandTruth(there_px.astype(np.float32), hidden, inside, (by != 0).any(axis=-1))
 
 
 def _reach_px(scene: Scene, reference: Eye, eye: Eye, depth: Field) -> float:
     """Largest distance in the reference's image between a point and what hides it from another lens: the difference of
     their disparities, and what moved between the exposures.
     """
-    focal_px = eye.band.lens(*eye.size_px).fx_px
     moved = [np.linalg.norm(by) for groups in scene.moved_m.values() for by in groups.values()]
-    baseline_m = float(np.linalg.norm(eye.place_m - reference.place_m)) + 2 * float(max(moved, default=0.0))
+    baseline_m = np.linalg.norm(eye.place_m - reference.place_m) + 2 * max(moved, default=0.0)
     # A hiding patch may be nearer than anything that the reference sees.
-    return float(focal_px * baseline_m * (1 / (0.7 * depth.min()) - 1 / depth.max()))
+    return float(eye.model.fx_px * baseline_m * (1 / (0.7 * depth.min()) - 1 / depth.max()))
 
 
 def write_capture(

@@ -4,16 +4,17 @@ Lengths are shares of the range to the lowest surface, so that a scene close by 
 far away is lower.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import product
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from agalign.synthetic.cameras import FOCAL_LENGTH_MM, PIXELS_PER_MM, Pose
 from synthetic_flights.depth import CLOSE_RANGE, Hand, Scene
-from synthetic_flights.materials import make_textures
-from synthetic_flights.patches import Patch
+from synthetic_flights.patches import Patch, make_textures
 
 CLOSE_M, FAR_M = (1.2, 2.0), (18.0, 22.0)
 """Range to the lowest surface."""
@@ -49,94 +50,74 @@ class Site:
     def relief(self) -> float:
         """A height of the highest surface that carries others, in ranges."""
         # Trees of 3-5 m are a quarter of 20 m.
-        return float(self.rng.uniform(0.22, 0.38) if self.close else self.rng.uniform(0.12, 0.26))
+        return self.rng.uniform(0.22, 0.38) if self.close else self.rng.uniform(0.12, 0.26)
 
-    def uniform(self, low: float, high: float) -> float:
-        return float(self.rng.uniform(low, high))
-
-    def patch(
-        self, centre: Sequence[float], u: Sequence[float], v: Sequence[float], material: str, **more: object
-    ) -> Patch:
+    def patch(self, centre: ArrayLike, u: ArrayLike, v: ArrayLike, material: str, **more: Any) -> Patch:
         """A patch from lengths in ranges, with x east, y south and z up; textures differ from patch to patch."""
-        length = self.range_m
-        c, a, b = (_down(axis, length) for axis in (centre, u, v))
-        texture = tuple(float(t) for t in self.rng.uniform(0, 10 * length, 2))
-        contrast = self.uniform(*_CONTRAST)
-        return Patch(c, a, b, material, **{"texture_m": texture, "contrast": contrast, **more})  # type: ignore[arg-type]
+        axes_m = (tuple((np.array(axis) * (1, 1, -1) * self.range_m).tolist()) for axis in (centre, u, v))
+        random = {"texture_m": tuple(self.rng.uniform(0, 10 * self.range_m, 2).tolist())}
+        random["contrast"] = self.rng.uniform(*_CONTRAST)
+        return Patch(*axes_m, material, **(random | more))
 
-    def floor(self, height: float, material: str) -> Patch:
+    def floor(self, height: float, material: str, **more: Any) -> Patch:
         """A horizontal surface that fills the image, at any angle to it."""
-        angle = self.uniform(0, np.pi)
-        u, v = _VIEW * _turned((1, 0), angle), _VIEW * _turned((0, 1), angle)
-        return self.patch((0, 0, height), (*u, 0), (*v, 0), material)
+        u, v = (_VIEW * axis for axis in axes(self.rng.uniform(0, np.pi)))
+        return self.patch((0, 0, height), (*u, 0), (*v, 0), material, **more)
+
+    def places(self, count: int, apart: float, half_x: float = 0.55, half_y: float = 0.45) -> list[Vector]:
+        """Up to `count` places, no two closer than `apart`."""
+        result: list[Vector] = []
+        for _ in range(20 * count):
+            place = self.rng.uniform((-half_x, -half_y), (half_x, half_y))
+            if len(result) < count and all(np.hypot(*(place - other)) > apart for other in result):
+                result.append(place)
+        return result
 
 
-def _down(up: Sequence[float], length_m: float) -> tuple[float, float, float]:
-    x, y, z = (float(v) * length_m for v in up)
-    return x, y, -z
-
-
-def _turned(xy: Sequence[float], angle: float) -> Vector:
+def axes(angle: float) -> tuple[Vector, Vector]:
+    """Unit vectors along an angle, and perpendicular to it."""
     c, s = np.cos(angle), np.sin(angle)
-    return np.array([c * xy[0] - s * xy[1], s * xy[0] + c * xy[1]])
+    return np.array([c, s]), np.array([-s, c])
 
 
 # ---- what scenes consist of
 
 
 def box(
-    site: Site, centre: Sequence[float], half: Sequence[float], angle: float, material: str, **more: object
+    site: Site, centre: Sequence[float], half: Sequence[float], angle: float, material: str, **more: Any
 ) -> list[Patch]:
     """The top and the four walls of a box with its base at `centre`; `half` is half its length, half its width, and its
     height.
     """
     x, y, base = centre
-    a, b = half[0] * _turned((1, 0), angle), half[1] * _turned((0, 1), angle)
-    up = (0.0, 0.0, half[2] / 2)
+    a, b = (length * axis for length, axis in zip(half, axes(angle), strict=False))
     patches = [site.patch((x, y, base + half[2]), (*a, 0), (*b, 0), material, **more)]
     for out, along in ((a, b), (b, a), (-a, b), (-b, a)):
         shade = 0.62 + 0.2 * float(out @ (0.8, -0.6)) / float(np.hypot(*out))
         middle = (x + out[0], y + out[1], base + half[2] / 2)
-        patches.append(site.patch(middle, (*along, 0), up, material, **{"shade": shade, **more}))
+        patches.append(site.patch(middle, (*along, 0), (0, 0, half[2] / 2), material, **{"shade": shade, **more}))
     return patches
 
 
 def plant(
-    site: Site,
-    centre: Sequence[float],
-    size: float,
-    height: float,
-    group: int,
-    gloss: float = 0.0,
-    leaves_between: tuple[int, int] = (9, 16),
+    site: Site, centre: Sequence[float], size: float, height: float, leaves: tuple[int, int] = (9, 16), **more: Any
 ) -> list[Patch]:
-    """Leaves around a stem, at several heights and tilts, the higher ones shorter."""
-    leaves = []
-    count = int(site.rng.integers(*leaves_between))
-    turn = site.uniform(0, 2 * np.pi)
+    """Leaves around a stem, at several heights and tilts, the higher ones shorter; their number is in a range."""
+    result, uniform = [], site.rng.uniform
+    count = site.rng.integers(*leaves)
+    turn = uniform(0, 2 * np.pi)
     for number in range(count):
         at = (number + 0.5) / count
-        angle = turn + 2.4 * number  # the golden angle: leaves do not cover each other
-        length = size * (1 - 0.5 * at) * site.uniform(0.8, 1.2) / 2
-        tilt = site.uniform(-0.5, 0.3)
-        out, side = _turned((1, 0), angle), _turned((0, 1), angle)
+        out, side = axes(turn + 2.4 * number)  # the golden angle: leaves do not cover each other
+        length = size * (1 - 0.5 * at) * uniform(0.8, 1.2) / 2
+        tilt = uniform(-0.5, 0.3)
         u = length * np.array([*(np.cos(tilt) * out), np.sin(tilt)])
-        roll = site.uniform(-0.4, 0.4)
+        roll = uniform(-0.4, 0.4)
         lift = np.array([*(-np.sin(tilt) * out), np.cos(tilt)])
         v = 0.38 * length * (np.cos(roll) * np.array([*side, 0.0]) + np.sin(roll) * lift)
         middle = np.array(centre) + (0, 0, height * at) + u * 0.95
-        shade = 0.7 + 0.3 * at + site.uniform(-0.1, 0.1)
-        leaves.append(site.patch(middle, u, v, "leaf", shape="leaf", group=group, gloss=gloss, shade=shade))
-    return leaves
-
-
-def _places(site: Site, count: int, apart: float, half_x: float = 0.55, half_y: float = 0.45) -> list[Vector]:
-    """Up to `count` places, no two closer than `apart`."""
-    result: list[Vector] = []
-    for _ in range(20 * count):
-        place = site.rng.uniform((-half_x, -half_y), (half_x, half_y))
-        if len(result) < count and all(np.hypot(*(place - other)) > apart for other in result):
-            result.append(place)
+        shade = 0.7 + 0.3 * at + uniform(-0.1, 0.1)
+        result.append(site.patch(middle, u, v, "leaf", shape="leaf", shade=shade, **more))
     return result
 
 
@@ -149,71 +130,69 @@ def _flat(site: Site) -> list[Patch]:
 
 def _terraces(site: Site) -> list[Patch]:
     """Long level steps up and down again, with banks of any slope between them."""
-    angle, width = site.uniform(0, np.pi), site.uniform(0.16, 0.24)
-    step, bank = site.relief() / 3, site.uniform(0.0, 0.06)
+    (down, along), width = axes(site.rng.uniform(0, np.pi)), site.rng.uniform(0.16, 0.24)
+    step, bank = site.relief() / 3, site.rng.uniform(0.0, 0.06)
     levels = [0, 1, 2, 3, 2, 1] if site.rng.random() < 0.5 else [0, 1, 2, 3]
-    offset = int(site.rng.integers(len(levels)))
-    half = np.append(_VIEW * _turned((0, 1), angle), 0.0)
+    offset = site.rng.integers(len(levels))
+    half = (*(_VIEW * along), 0)
     result = []
     for number in range(-6, 7):
         here, there = (step * levels[(number + k + offset) % len(levels)] for k in (0, 1))
-        middle = _turned((number * width, 0), angle)
-        tread = (width - bank) / 2 * _turned((1, 0), angle)
-        result.append(site.patch((*middle, here), (*tread, 0), half, str(site.rng.choice(["field", "soil"]))))
-        across = _turned(((number + 0.5) * width, 0), angle)
-        slope = np.append(bank / 2 * _turned((1, 0), angle), (there - here) / 2)
-        result.append(site.patch((*across, (here + there) / 2), slope, half, "soil", shade=0.8))
+        tread = (width - bank) / 2 * down
+        material = str(site.rng.choice(["field", "soil"]))
+        result.append(site.patch((*(number * width * down), here), (*tread, 0), half, material))
+        middle = (*((number + 0.5) * width * down), (here + there) / 2)
+        slope = (*(bank / 2 * down), (there - here) / 2)
+        result.append(site.patch(middle, slope, half, "soil", shade=0.8))
     return result
 
 
 def _plants(site: Site, gloss: float = 0.0) -> list[Patch]:
     """Tall plants of different heights over soil."""
     result = [site.floor(0, "soil")]
-    height, size = site.relief(), site.uniform(0.14, 0.2)
-    for group, place in enumerate(_places(site, int(site.rng.integers(14, 30)), 0.55 * size), start=1):
-        result += plant(site, (*place, 0), size, height * site.uniform(0.5, 1.1), group, gloss)
+    height, size = site.relief(), site.rng.uniform(0.14, 0.2)
+    for group, place in enumerate(site.places(site.rng.integers(14, 30), 0.55 * size), start=1):
+        result += plant(site, (*place, 0), size, height * site.rng.uniform(0.5, 1.1), group=group, gloss=gloss)
     return result
 
 
 def _boxes(site: Site, gloss: float = 0.0) -> list[Patch]:
     """Boxes on a bench above a floor, and on the floor."""
-    bench, angle = site.relief(), site.uniform(0, np.pi)
-    end = _turned((site.uniform(-0.15, 0.15), site.uniform(0.1, 0.3)), angle)
+    uniform = site.rng.uniform
+    bench, angle = site.relief(), uniform(0, np.pi)
+    along, across = axes(angle)
+    end = uniform(-0.15, 0.15) * along + uniform(0.1, 0.3) * across
     result = [site.floor(0, "concrete")]
-    half_width = site.uniform(0.2, 0.28)
+    half_width = uniform(0.2, 0.28)
     result += box(site, (*end, 0.9 * bench), (1.2, half_width, 0.1 * bench), angle, "bench")
-    across = _turned((0, 1), angle)
-    tall = bench * 0.5
-    for place in _places(site, 16, 0.13, 0.5, 0.4):
-        away = float((place - end) @ across)
-        size = site.uniform(0.03, 0.07), site.uniform(0.03, 0.07), tall * site.uniform(0.3, 1.0)
-        if abs(abs(away) - half_width) > 0.1:
-            base = bench if abs(away) < half_width else 0.0
+    for place in site.places(16, 0.13, 0.5, 0.4):
+        away = abs((place - end) @ across)
+        size = uniform(0.03, 0.07), uniform(0.03, 0.07), bench * 0.5 * uniform(0.3, 1.0)
+        if abs(away - half_width) > 0.1:
+            base = bench if away < half_width else 0.0
             material = str(site.rng.choice(["box", "plastic", "concrete"], p=[0.6, 0.2, 0.2]))
-            result += box(site, (*place, base), size, site.uniform(0, np.pi), material, gloss=gloss)
+            result += box(site, (*place, base), size, uniform(0, np.pi), material, gloss=gloss)
     return result
 
 
 def _pots(site: Site) -> list[Patch]:
     """A bench with a regular grid of identical pots and seedlings."""
-    pitch, angle = site.uniform(0.06, 0.1), site.uniform(0, np.pi)
-    same_seed = int(site.rng.integers(2**31))
-    result = [replace(site.floor(0, "plastic"), shade=0.6)]
+    pitch, angle = site.rng.uniform(0.06, 0.1), site.rng.uniform(0, np.pi)
+    same_seed = site.rng.integers(2**31)
+    result = [site.floor(0, "plastic", shade=0.6)]
+    along, across = axes(angle)
     many = int(0.6 / pitch)
-    for row in range(-many, many + 1):
-        for column in range(-many, many + 1):
-            same = replace(site, rng=np.random.default_rng(same_seed))
-            x, y = _turned((column * pitch, row * pitch), angle)
-            if abs(x) < 0.58 and abs(y) < 0.48:
-                height = 0.6 * pitch
-                result += box(same, (x, y, 0), (0.36 * pitch, 0.36 * pitch, height), angle, "box")
-                result += plant(same, (x, y, height), 0.7 * pitch, 0.7 * pitch, 0, leaves_between=(5, 7))
+    for row, column in product(range(-many, many + 1), repeat=2):
+        same = replace(site, rng=np.random.default_rng(same_seed))
+        x, y = column * pitch * along + row * pitch * across
+        if abs(x) < 0.58 and abs(y) < 0.48:
+            height = 0.6 * pitch
+            result += box(same, (x, y, 0), (0.36 * pitch, 0.36 * pitch, height), angle, "box")
+            result += plant(same, (x, y, height), 0.7 * pitch, 0.7 * pitch, leaves=(5, 7))
     return result
 
 
-_KINDS: dict[str, Callable[[Site], list[Patch]]] = dict(
-    zip((*GEOMETRIES, "pots"), (_flat, _terraces, _plants, _boxes, _pots), strict=True)
-)
+_KINDS = {"flat": _flat, "terraces": _terraces, "plants": _plants, "boxes": _boxes, "pots": _pots}
 
 
 def make_scene(kind: str, rng_seed: int, *, close: bool = True, width_px: int = 640) -> Scene:
@@ -221,45 +200,42 @@ def make_scene(kind: str, rng_seed: int, *, close: bool = True, width_px: int = 
     if kind not in (*GEOMETRIES, *FOOLING):
         raise ValueError(f"unknown kind '{kind}'; choose from {', '.join((*GEOMETRIES, *FOOLING))}")
     rng = np.random.default_rng(rng_seed)
-    range_m = float(rng.uniform(*(CLOSE_M if close else FAR_M)))
-    site = Site(rng, range_m, close)
+    site = Site(rng, rng.uniform(*(CLOSE_M if close else FAR_M)), close)
     focal_px = FOCAL_LENGTH_MM * PIXELS_PER_MM * width_px / 1280
-    textures = make_textures(rng, range_m * _NEAREST_SHARE / focal_px / 2, width_px)
-    roll, pitch = (float(v) for v in rng.normal(0, _TILT_DEG, 2))
-    pose = Pose(range_m, float(rng.uniform(-180, 180)), roll, pitch, 0.0, 0.0)
-    if kind in _KINDS:
-        return Scene(kind, tuple(_KINDS[kind](site)), textures, pose)
-    if kind == "wind":
-        return _in_wind(Scene(kind, tuple(_plants(site)), textures, pose), site)
+    textures = make_textures(rng, site.range_m * _NEAREST_SHARE / focal_px / 2, width_px)
+    roll, pitch = rng.normal(0, _TILT_DEG, 2).tolist()
+    pose = Pose(site.range_m, rng.uniform(-180, 180), roll, pitch, 0.0, 0.0)
     if kind == "glossy":
         make = _plants if rng.random() < 0.5 else _boxes
-        return Scene(kind, tuple(make(site, site.uniform(1.0, 3.0))), textures, pose)
-    base = Scene(kind, tuple(_KINDS[str(rng.choice(["plants", "boxes", "terraces"]))](site)), textures, pose)
+        return Scene(tuple(make(site, rng.uniform(1.0, 3.0))), textures, pose)
+    geometry = kind if kind in _KINDS else "plants" if kind == "wind" else rng.choice(["plants", "boxes", "terraces"])
+    scene = Scene(tuple(_KINDS[geometry](site)), textures, pose)
+    if kind in _KINDS:
+        return scene
+    if kind == "wind":
+        return _in_wind(scene, site)
     band = str(rng.choice(_MOVING))
     if kind == "hand":
-        centre = site.uniform(0.1, 0.9), site.uniform(0.1, 0.9)
-        return replace(base, hands={band: Hand(centre, site.uniform(0.2, 0.4), site.uniform(0.3, 1.2))})
+        centre = rng.uniform(0.1, 0.9), rng.uniform(0.1, 0.9)
+        return replace(scene, hands={band: Hand(centre, rng.uniform(0.2, 0.4), rng.uniform(0.3, 1.2))})
     if kind == "other scene":
-        other = make_scene(str(rng.choice(GEOMETRIES)), int(rng.integers(2**31)), close=close, width_px=width_px)
-        return replace(base, others={band: other})
-    east, north = (site.uniform(*_OTHER_TIME_SHARE) * range_m * rng.choice([-1, 1]) for _ in range(2))
-    later = replace(pose, east_m=float(east), north_m=float(north), yaw_deg=pose.yaw_deg + site.uniform(-3, 3))
-    return replace(base, poses={band: later})
+        other = make_scene(rng.choice(GEOMETRIES), rng.integers(2**31), close=close, width_px=width_px)
+        return replace(scene, others={band: other})
+    east, north = (float(rng.uniform(*_OTHER_TIME_SHARE) * site.range_m * rng.choice([-1, 1])) for _ in range(2))
+    later = replace(pose, east_m=east, north_m=north, yaw_deg=pose.yaw_deg + rng.uniform(-3, 3))
+    return replace(scene, poses={band: later})
 
 
 def _in_wind(scene: Scene, site: Site) -> Scene:
     """A share of the plants has another place at each band's exposure."""
     groups = sorted({p.group for p in scene.patches} - {0})
-    share = site.uniform(*_WIND_SHARE)
+    share = site.rng.uniform(*_WIND_SHARE)
     moving = [g for g in groups if site.rng.random() < share]
     pixel_m = site.range_m / (FOCAL_LENGTH_MM * PIXELS_PER_MM / 2)
-    moved = {}
-    for band in _MOVING:
-        by = {}
-        for group in moving:
-            length, angle = site.uniform(*_WIND_PX) * pixel_m, site.uniform(0, 2 * np.pi)
-            by[group] = (length * float(np.cos(angle)), length * float(np.sin(angle)), 0.0)
-        moved[band] = by
+    moved: dict[str, dict[int, tuple[float, float, float]]] = {band: {} for band in _MOVING}
+    for by, group in product(moved.values(), moving):
+        length, (direction, _) = site.rng.uniform(*_WIND_PX) * pixel_m, axes(site.rng.uniform(0, 2 * np.pi))
+        by[group] = (*(length * direction).tolist(), 0.0)
     return replace(scene, moved_m=moved)
 
 

@@ -1,4 +1,4 @@
-"""A flight with the faults of a whole season, with its ground truth."""
+"""Flights with the faults of a season, on two headings, and between calibration panels, with their ground truth."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -15,12 +15,17 @@ from agalign.synthetic.flight import Shot, plan_flight, write_shots
 from agalign.synthetic.ground import Field, Ground, paint_ground
 from synthetic_flights.cameras import MAVIC
 
+PANEL_CODE, PANEL_ALBEDO = "RP04-0000001-SY_04005101000510", 0.51
+"""51.0 % at 400 nm and at 1000 nm."""
+_CASE, _LABEL, _INK = 0.03, 0.85, 0.04
+_SQUARE_M, _CODE_M, _APART_M = 0.15, 0.135, 0.21
+_HELD_M = 1.0
+_SHUTTER = 0.12
+"""A panel is brighter than crops."""
 _HEIGHT_M = 28.0
 _SPEED_M_S = 8.0
 _LINE = 8
 """Captures of a line, before the drone turns."""
-
-Make = Callable[[np.random.Generator, Pose, tuple[int, int]], Shot]
 
 
 def make_troubled_flight(
@@ -30,7 +35,7 @@ def make_troubled_flight(
     Returns the path of truth.json, as `make_flight` does.
     """
     rng = np.random.default_rng(rng_seed)
-    shots = [make(rng, _pose(rng, number), size_px) for number, make in enumerate(_plan(captures))]
+    shots = [_shot(rng, _pose(rng, number), size_px, **what) for number, what in enumerate(_plan(captures))]
     return write_shots(folder, shots, size_px, REDEDGE, rng)
 
 
@@ -48,14 +53,12 @@ def make_two_headings(
     after another; with `lakes` the captures before and after each turn are over water.
     """
     rng = np.random.default_rng(rng_seed)
-    plain, lake = _capture(camera=camera), _capture("a lake", camera=camera, degrade=water)
-    shots = []
+    lake, shots = {"trouble": "a lake", "degrade": water}, []
     for number in range(captures):
-        speed = float(rng.normal(_SPEED_M_S, 0.5)) * (-1) ** (number // line)
-        drift = float(rng.normal(0.0, 0.3))
-        pose = replace(_pose(rng, number), yaw_deg=float(rng.normal(12.0, 1.5)), velocity_m_s=(drift, -speed))
+        speed, drift = rng.normal(_SPEED_M_S, 0.5) * (-1) ** (number // line), rng.normal(0.0, 0.3)
+        pose = replace(_pose(rng, number), yaw_deg=rng.normal(12.0, 1.5), velocity_m_s=(drift, -speed))
         turns = lakes and number % line in (0, line - 1) and 0 < number < captures - 1
-        shots.append((lake if turns else plain)(rng, pose, size_px))
+        shots.append(_shot(rng, pose, size_px, camera, **(lake if turns else {})))
     return write_shots(folder, shots, size_px, camera, rng)
 
 
@@ -68,51 +71,69 @@ def make_terraces(folder: Path, size_px: tuple[int, int], rng_seed: int, relief_
     return write_shots(folder, [Shot(pose, _terraces(rng, ground, relief_m))], size_px, REDEDGE, rng)
 
 
-def _plan(captures: int) -> list[Make]:
-    """What to make of each capture: troubles first and last where they belong, the others spread over the flight."""
-    panel = _capture("panel", 1.0, change=_with_panel)
-    start = [panel, panel, *(_capture("take-off", height_m) for height_m in (4.0, 8.0, 13.0, 19.0))]
-    end = [*(_capture("landing", height_m) for height_m in (15.0, 6.0)), panel]
-    twice = {"a lake": water, "fog": fog, "blur, 3 px": blur, "motion, 25 px": motion, "noise, 30 %": noise}
-    between = [_capture(name, degrade=by) for name, by in twice.items() for _ in range(1 + (by is not motion))]
-    between += [_capture("half saturated", degrade=half_saturated)]
-    between += [_capture("planted grid", change=_orchard)] * 3 + [
-        _capture("terraces", change=partial(_terraces, relief_m=1.5))
-    ] * 2
-    between += [_capture("no NIR", without=("NIR",))]
-    between += [_capture(f"{band} lost", degrade=nothing, degraded_bands=(band,)) for band in ("NIR", "Blue")]
-    plain = [_capture()] * max(0, captures - len(start) - len(end) - len(between))
+def make_flight_between_panels(folder: Path, captures: int, size_px: tuple[int, int], sun: tuple[float, float]) -> Path:
+    """Write the panel, a flight, and the panel again; the sun goes from the one brightness to the other, linearly, and
+    the light sensor does not see it. Returns the path of truth.json, as `make_flight` does.
+    """
+    rng = np.random.default_rng(0)
+    heights_and_yaws = [(_HEIGHT_M + rng.normal(0, 0.7), rng.normal(0, 3)) for _ in range(captures)]
+    poses = [Pose(height_m, yaw_deg, 0.0, 0.0, 4.0 * k, 0.0) for k, (height_m, yaw_deg) in enumerate(heights_and_yaws)]
+    field = paint_ground(rng, poses, size_px, camera=REDEDGE)
+    held = Pose(_HELD_M, 0.0, 0.0, 0.0, 0.0, 0.0)
+    panel = Shot(
+        held, with_panel(paint_ground(rng, [held], size_px, camera=REDEDGE)), trouble="panel", shutter=_SHUTTER
+    )
+    shots = [panel, *(Shot(pose, field) for pose in poses), panel]
+    lit = [replace(s, sun=b) for s, b in zip(shots, np.linspace(*sun, len(shots)).tolist(), strict=True)]
+    return write_shots(folder, lit, size_px, REDEDGE, rng)
+
+
+def _plan(captures: int) -> list[dict[str, Any]]:
+    """What is special in each capture, as options of `_shot`: troubles first and last where they belong, the others
+    spread over the flight.
+    """
+    panel = {"trouble": "panel", "altitude_m": 1.0, "change": _with_plain_panel}
+    start = [panel, panel, *({"trouble": "take-off", "altitude_m": height_m} for height_m in (4.0, 8.0, 13.0, 19.0))]
+    end = [*({"trouble": "landing", "altitude_m": height_m} for height_m in (15.0, 6.0)), panel]
+    degraded = {"a lake": water, "fog": fog, "blur, 3 px": blur, "motion, 25 px": motion, "noise, 30 %": noise}
+    degraded |= {"half saturated": half_saturated}
+    between: list[dict[str, Any]] = []
+    for name, by in degraded.items():
+        between += [{"trouble": name, "degrade": by}] * (1 if by in (motion, half_saturated) else 2)
+    between += [{"trouble": "planted grid", "change": _orchard}] * 3
+    between += [{"trouble": "terraces", "change": partial(_terraces, relief_m=1.5)}] * 2
+    between += [{"trouble": "no NIR", "without": ("NIR",)}]
+    for band in ("NIR", "Blue"):
+        between += [{"trouble": f"{band} lost", "degrade": nothing, "degraded_bands": (band,)}]
+    plain = max(0, captures - len(start) - len(end) - len(between))
     # One of every few captures is degraded, the first few being good.
-    until = np.linspace(0, len(between), len(plain) + 1).astype(int).tolist()
-    mixed = [make for k, one in enumerate(plain) for make in (one, *between[until[k] : until[k + 1]])]
+    until = np.linspace(0, len(between), plain + 1).astype(int).tolist()
+    mixed = [what for k in range(plain) for what in ({}, *between[until[k] : until[k + 1]])]
     return [*start, *mixed, *between[until[-1] :], *end][:captures]
 
 
 def _pose(rng: np.random.Generator, number: int) -> Pose:
-    altitude_m = float(rng.normal(_HEIGHT_M, 0.7))
-    yaw_deg, roll_deg, pitch_deg = (float(rng.normal(0, std_deg)) for std_deg in (3, 2, 2))
-    return Pose(altitude_m, yaw_deg, roll_deg, pitch_deg, 4.0 * (number % 10), 4.0 * (number // 10))
+    altitude_m, *angles_deg = rng.normal((_HEIGHT_M, 0, 0, 0), (0.7, 3, 2, 2)).tolist()
+    return Pose(altitude_m, *angles_deg, 4.0 * (number % 10), 4.0 * (number // 10))
 
 
-def _capture(
-    trouble: str = "",
-    altitude_m: float | None = None,
+def _shot(
+    rng: np.random.Generator,
+    pose: Pose,
+    size_px: tuple[int, int],
     camera: CameraSpec = REDEDGE,
+    altitude_m: float | None = None,
     change: Callable[[np.random.Generator, Ground], Ground] | None = None,
     **more: Any,
-) -> Make:
-    """Return a function that makes a capture over its own ground, which is centred on it. `more` are fields of Shot."""
-
-    def make(rng: np.random.Generator, pose: Pose, size_px: tuple[int, int]) -> Shot:
-        pose = replace(pose, altitude_m=altitude_m or pose.altitude_m, east_m=0.0, north_m=0.0)
-        ground = paint_ground(rng, [pose], size_px, camera)
-        return Shot(pose, change(rng, ground) if change else ground, trouble=trouble, **more)
-
-    return make
+) -> Shot:
+    """A capture over its own ground, which is centred on it. `more` are fields of Shot."""
+    pose = replace(pose, altitude_m=altitude_m or pose.altitude_m, east_m=0.0, north_m=0.0)
+    ground = paint_ground(rng, [pose], size_px, camera)
+    return Shot(pose, change(rng, ground) if change else ground, **more)
 
 
-def _with_panel(_rng: np.random.Generator, ground: Ground) -> Ground:
-    """The calibration panel on the ground."""
+def _with_plain_panel(_rng: np.random.Generator, ground: Ground) -> Ground:
+    """A calibration panel without a code on the ground."""
     axis = (np.arange(len(ground.crop)) - len(ground.crop) / 2) * ground.metres_per_px
     distance = np.maximum(*np.abs(np.meshgrid(axis, axis)))
     bare, square = distance < 0.1, distance < 0.075
@@ -126,9 +147,8 @@ def _terraces(rng: np.random.Generator, ground: Ground, relief_m: float) -> Grou
 
     Slopes are gentle enough to cause no occlusions, which cannot be aligned.
     """
-    angle, terrace_m, metre = rng.uniform(0, np.pi), 8.0, 1 / ground.metres_per_px
-    axis = np.arange(len(ground.tree)) / (terrace_m * metre)
-    along = np.cos(angle) * axis[None, :] + np.sin(angle) * axis[:, None]
+    terrace_m, metre = 8.0, 1 / ground.metres_per_px
+    along, _ = _turned_grid(len(ground.tree), rng.uniform(0, np.pi), terrace_m * metre)
     slope = np.clip((along % 1 - 0.4) / 0.6, 0, 1)
     level = np.floor(along) + slope * slope * (3 - 2 * slope)
     crowns = cv2.GaussianBlur(ground.tree, (0, 0), 0.4 * metre)
@@ -137,11 +157,7 @@ def _terraces(rng: np.random.Generator, ground: Ground, relief_m: float) -> Grou
 
 def _orchard(rng: np.random.Generator, ground: Ground) -> Ground:
     """Round trees on a lattice, 2.2 m apart, on mown grass."""
-    side, metre = len(ground.crop), 1 / ground.metres_per_px
-    period, angle = 2.2 * metre, float(rng.uniform(0, np.pi))
-    axis = np.arange(side, dtype=np.float32)
-    along = (np.cos(angle) * axis[None, :] + np.sin(angle) * axis[:, None]) / period
-    across = (np.cos(angle) * axis[:, None] - np.sin(angle) * axis[None, :]) / period
+    along, across = _turned_grid(len(ground.crop), rng.uniform(0, np.pi), 2.2 / ground.metres_per_px)
     row, column = np.floor(along).astype(int), np.floor(across).astype(int)
     # Each tree is a little off the lattice.
     jitter = 0.03 * rng.normal(size=(2, 512, 512)).astype(np.float32)[:, row % 512, column % 512]
@@ -149,6 +165,36 @@ def _orchard(rng: np.random.Generator, ground: Ground) -> Ground:
     tree = expit(30 * (0.32 - off)).astype(np.float32)
     covers = {"tree": tree, "crop": np.asarray(0.15 * (1 - tree), np.float32)}
     return replace(ground, **covers, brightness=0.9 + 0.1 * ground.brightness, vigour=0.2 * ground.vigour)
+
+
+def _turned_grid(side: int, angle: float, period_px: float) -> tuple[Field, Field]:
+    """Coordinates (side, side) of the pixels of a ground along an angle and across, in periods."""
+    x, y = np.arange(side) / period_px, np.arange(side)[:, None] / period_px
+    return np.cos(angle) * x + np.sin(angle) * y, np.cos(angle) * y - np.sin(angle) * x
+
+
+# ---- the panel
+
+
+def with_panel(ground: Ground) -> Ground:
+    """The ground with an opened panel on it: a grey square and, right of it, its code on a label, in a black case."""
+    overlay = np.full(ground.crop.shape, np.nan, np.float32)
+    axis_m = (np.arange(len(overlay)) - (len(overlay) - 1) / 2) * ground.metres_per_px
+
+    def rectangle(x_m: float, width_m: float, height_m: float) -> tuple[slice, slice]:
+        """Rows and columns of a rectangle with its centre so far to the right of the middle."""
+        rows, columns = (
+            np.flatnonzero(np.abs(axis_m - at_m) < length_m / 2) for at_m, length_m in ((0, height_m), (x_m, width_m))
+        )
+        return slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1)
+
+    overlay[rectangle(0, 0.48, 0.3)] = _CASE
+    overlay[rectangle(-_APART_M / 2, _SQUARE_M, _SQUARE_M)] = PANEL_ALBEDO
+    overlay[rectangle(_APART_M / 2, 1.3 * _CODE_M, 1.3 * _CODE_M)] = _LABEL
+    code = overlay[rectangle(_APART_M / 2, _CODE_M, _CODE_M)]
+    drawn = cv2.resize(cv2.QRCodeEncoder.create().encode(PANEL_CODE), code.shape[::-1], interpolation=cv2.INTER_NEAREST)
+    code[:] = np.where(drawn > 127, _LABEL, _INK)
+    return replace(ground, overlay=overlay)
 
 
 # ---- changes of the light

@@ -13,10 +13,15 @@ import pytest
 from bands import score
 from bands.images import VARIANTS, degraded, locate, read
 from bands.run import asked, claim, lens_corrected, write_mappings
+from common import read_ties
 from peers import UnavailableError, identity, method_named
+from synthetic_flights.aligned import sidecar_of
 
 from agalign.cameras.discover import discover
+from agalign.products.sidecar.schema import GridPart
 from agalign.values import geometry
+
+from ..conftest import raising
 
 pytestmark = pytest.mark.full
 
@@ -33,31 +38,35 @@ def sets() -> dict[str, Any]:
     """One set of two captures with two bands each and exact truth."""
     there = score.apply(TRUE, TIES_PX)
     inside = ((there >= 0) & (there <= (639, 479))).all(axis=1)
-    ties = np.hstack([TIES_PX, there])[inside].tolist()
-    captures = {
-        c: {"reference": f"{c}_g.png", "pairs": {f"{c}_{b}.png": {"ties": ties} for b in "rn"}} for c in ("1", "2")
-    }
-    files = {f"{c}_{b}.png": {"size_px": [640, 480], "bytes": 1, "sha256": ""} for c in "12" for b in "grn"}
+    ties = {"ties": np.hstack([TIES_PX, there])[inside].tolist()}
+    captures = {c: {"reference": f"{c}_g.png", "pairs": {f"{c}_{b}.png": ties for b in "rn"}} for c in "12"}
+    files = {f"{c}_{b}.png": {"size_px": [640, 480]} for c in "12" for b in "grn"}
     return {"field": {"set": "field", "files": files, "captures": captures}}
+
+
+@pytest.fixture
+def pair(sets: dict[str, Any]) -> score.Pair:
+    return score.pairs_of(sets["field"])[0]
+
+
+def grid_of(matrix: np.ndarray, here: np.ndarray) -> dict[str, Any]:
+    return {"reference_px": here.tolist(), "moving_px": score.apply(matrix, here).tolist()}
 
 
 def row(file: str, **values: Any) -> dict[str, Any]:
     return {"method": "m", "set": "field", "capture": file[0], "file": file, **values}
 
 
-def test_the_error_of_a_known_homography_and_of_its_grid_is_exact(sets: dict[str, Any]) -> None:
-    here = geometry.lattice(640, 480, 33, 25)
-    grid = {"reference_px": here.tolist(), "moving_px": score.apply(shifted(0.6, 0.8), here).tolist()}
-    rows = [row("1_r.png", homography=shifted(0.3, 0.4).tolist()), row("1_n.png", grid=grid)]
-    by_homography, by_grid, *_ = score.score_pairs(rows, sets)
-    assert (by_homography.median_px, by_homography.p95_px) == pytest.approx((0.5, 0.5), abs=1e-9)
-    assert by_grid.median_px == pytest.approx(1.0, abs=1e-3)
+def test_the_error_of_a_known_homography_and_of_its_grid_is_exact(pair: score.Pair) -> None:
+    by_homography = score.errors_px({"homography": shifted(0.3, 0.4).tolist()}, pair)
+    assert by_homography == pytest.approx(0.5, abs=1e-9)
+    by_grid = score.errors_px({"grid": grid_of(shifted(0.6, 0.8), geometry.lattice(640, 480, 33, 25))}, pair)
+    assert np.median(by_grid) == pytest.approx(1.0, abs=1e-3)
 
 
 def test_the_area_outside_a_grid_counts_as_wrong(sets: dict[str, Any]) -> None:
     here = np.array([[0, 0], [200, 0], [200, 200], [0, 200], [100, 100.0]])
-    grid = {"reference_px": here.tolist(), "moving_px": score.apply(TRUE, here).tolist()}
-    (first, *_) = score.score_pairs([row("1_r.png", grid=grid)], sets)
+    (first, *_) = score.score_pairs([row("1_r.png", grid=grid_of(TRUE, here))], sets)
     assert first.median_px == np.inf
     assert score.summary([first])[0].wrong_claims == 1
 
@@ -110,8 +119,7 @@ def test_the_scorer_does_not_import_agalign() -> None:
 
 
 @pytest.mark.parametrize("variant", ["turn 3", "turn 20", "scale 0.8"])
-def test_an_image_moves_as_its_truth_does(sets: dict[str, Any], variant: str) -> None:
-    pair = score.pairs_of(sets["field"])[0]
+def test_an_image_moves_as_its_truth_does(pair: score.Pair, variant: str) -> None:
     y, x = np.mgrid[:480, :640]
     image = (60000 * np.exp(-((x - 400.0) ** 2 + (y - 150.0) ** 2) / 50)).astype(np.uint16)
     result = degraded(image, pair, variant).astype(float)
@@ -121,8 +129,7 @@ def test_an_image_moves_as_its_truth_does(sets: dict[str, Any], variant: str) ->
 
 
 @pytest.mark.parametrize("variant", VARIANTS)
-def test_variants_are_the_same_in_every_run_and_keep_size_and_type(sets: dict[str, Any], variant: str) -> None:
-    pair = score.pairs_of(sets["field"])[0]
+def test_variants_are_the_same_in_every_run_and_keep_size_and_type(pair: score.Pair, variant: str) -> None:
     image = np.random.default_rng(1).integers(1, 60000, (480, 640)).astype(np.uint16)
     image[:50] = 0
     one, other = (degraded(image, pair, variant) for _ in range(2))
@@ -133,19 +140,14 @@ def test_variants_are_the_same_in_every_run_and_keep_size_and_type(sets: dict[st
 
 @pytest.mark.parametrize("name", sorted(score.read_sets()))
 def test_a_set_is_sound(name: str) -> None:
-    path = score.SETS / f"{name}.json"
-    assert path.stat().st_size < 200_000
+    assert (score.SETS / f"{name}.json").stat().st_size < 200_000
     description = score.read_sets()[name]
     assert description["set"] == name
     assert {"camera", "difficulty", "published", "convention", "truth", "truth_std_px"} <= set(description)
-    assert description["files"]
     for entry in description["files"].values():
         assert re.fullmatch("[0-9a-f]{64}", entry["sha256"])
         assert entry["bytes"] > 0
-    pairs = score.pairs_of(description)
-    assert pairs
-    for pair in pairs:
-        assert pair.reference in description["files"]
+    for pair in score.pairs_of(description):
         assert 30 < len(pair.reference_px) <= 400
         w, h = description["files"][pair.reference]["size_px"]
         assert ((pair.reference_px >= 0) & (pair.reference_px <= (w - 1, h - 1))).all()
@@ -169,18 +171,11 @@ def test_images_that_are_not_there_are_named(tmp_path: Path) -> None:
     assert len(missing["p4m_forest"]) == 5
 
 
-def test_a_method_that_raises_has_refused(
-    sets: dict[str, Any], tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    pair = score.pairs_of(sets["field"])[0]
+def test_a_method_that_raises_has_refused(pair: score.Pair, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     paths = {name: tmp_path / name for name in (pair.reference, pair.file)}
     for path in paths.values():
         cv2.imwrite(str(path), np.full((480, 640), 9, np.uint8))
-
-    def dies(_fixed: np.ndarray, _moving: np.ndarray) -> None:
-        raise RuntimeError("out of luck")
-
-    assert asked(dies, pair, score.AS_IT_IS, paths, {}) == {}
+    assert asked(raising(RuntimeError("out of luck")), pair, score.AS_IT_IS, paths, {}) == {}
     assert "refused (RuntimeError: out of luck)" in capsys.readouterr().err
     assert asked(identity, pair, score.AS_IT_IS, paths, {})["homography"] == np.eye(3).tolist()
 
@@ -195,19 +190,19 @@ def test_a_method_is_loaded_from_a_file(tmp_path: Path) -> None:
 
 
 def test_only_what_is_called_aligned_is_claimed() -> None:
-    grid = {"reference_px": [[0, 0], [1, 0], [0, 1]], "moving_px": [[0, 0], [1, 0], [0, 1]]}
-    claims = {s: claim({"status": s, "grid": grid}) for s in ("aligned", "predicted", "seed_only", "failed")}
+    corners = [[0, 0], [1, 0], [0, 1]]
+    grid = GridPart(reference_px=corners, moving_px=corners)
+    band = sidecar_of("IMG_0001", 1, (160, 120), raw=False).bands[1].model_copy(update={"grid": grid})
+    claims = {s: claim(band.model_copy(update={"status": s})) for s in ("aligned", "predicted", "seed_only", "failed")}
     assert (claims["aligned"]["claimed"], claims["predicted"]["claimed"]) == ("yes", "no")
     assert claims["seed_only"] == claims["failed"] == claim(None) == {}
 
 
 def test_lens_corrected_images_are_scored_between_raw_pixels(flight: Path) -> None:
-    truth = json.loads((flight / "truth.json").read_text())["IMG_0001"]
+    truth = read_ties(flight / "truth.json")["IMG_0001_4.tif"]
     bands = {b.path.name: b for c in discover(flight).captures for b in c.bands}
-    file = "IMG_0001_4.tif"
-    both = [(read(bands[name].path), bands[name]) for name in (truth["reference"], file)]
-    known = truth["bands"][file]
-    result = lens_corrected(lambda _f, _m: np.array(known["fixed_to_moving"]), *both)
-    here, there = np.hsplit(np.array(known["ties"]), 2)
-    pair = score.Pair("synthetic", "1", truth["reference"], file, here, there, bands[file].size_px)
+    both = [(read(bands[name].path), bands[name]) for name in (truth["reference"], "IMG_0001_4.tif")]
+    result = lens_corrected(lambda _f, _m: np.array(truth["fixed_to_moving"]), *both)
+    here, there = np.hsplit(np.array(truth["ties"]), 2)
+    pair = score.Pair("synthetic", "1", truth["reference"], "IMG_0001_4.tif", here, there, both[1][1].size_px)
     assert np.median(score.errors_px(result, pair)) < 0.02

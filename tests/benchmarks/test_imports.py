@@ -1,8 +1,6 @@
 """Scripts in benchmarks/ and tools/ import only names of agalign that exist; mypy does not check them."""
 
 import ast
-import importlib
-import importlib.util
 from pathlib import Path
 
 import pytest
@@ -14,10 +12,5 @@ SCRIPTS = sorted(p for folder in ("benchmarks", "tools") for p in (ROOT / folder
 @pytest.mark.parametrize("path", SCRIPTS, ids=lambda p: str(p.relative_to(ROOT)))
 def test_imported_names_exist(path: Path) -> None:
     for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
-        if isinstance(node, ast.ImportFrom) and not node.level and (node.module or "").split(".")[0] == "agalign":
-            module = importlib.import_module(str(node.module))
-            for name in (alias.name for alias in node.names):
-                is_module = (
-                    hasattr(module, "__path__") and importlib.util.find_spec(f"{node.module}.{name}") is not None
-                )
-                assert hasattr(module, name) or is_module, f"{node.module} has no {name}"
+        if isinstance(node, ast.ImportFrom) and (node.module or "").split(".")[0] == "agalign":
+            exec(ast.unparse(node))

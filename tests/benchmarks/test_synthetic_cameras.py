@@ -16,31 +16,21 @@ from agalign.values import geometry
 
 pytestmark = pytest.mark.full
 
-CAMERAS = {
-    "RedEdge": REDEDGE,
-    "M3M calibrated": MAVIC,
-    "M3M": MAVIC_3M,
-    "Altum": ALTUM,
-    "Altum-PT": ALTUM_PT,
-    "6X": SENTERA_6X,
-}
+CAMERAS = REDEDGE, MAVIC, MAVIC_3M, ALTUM, ALTUM_PT, SENTERA_6X
 SIZE = 324, 243
 
 
-@pytest.mark.parametrize("name", list(CAMERAS))
-def test_rig_tags_are_the_truth_from_far_above(tmp_path: Path, name: str) -> None:
-    camera: CameraSpec = CAMERAS[name]
+@pytest.mark.parametrize("camera", CAMERAS, ids=["RedEdge", "M3M calibrated", "M3M", "Altum", "Altum-PT", "6X"])
+def test_rig_tags_are_the_truth_from_far_above(tmp_path: Path, camera: CameraSpec) -> None:
     ground = paint_ground(np.random.default_rng(0), [Pose(28.0, 20.0, 0, 0, 0, 0)], SIZE, camera=camera)
     pose = Pose(40_000.0, 20.0, 0, 0, 0, 0)  # so high that the lenses stand in one place
     path = write_shots(tmp_path, [Shot(pose, ground)], SIZE, camera, np.random.default_rng(0))
     (capture,) = discover(tmp_path, DiscoverOptions(with_rgb=True)).captures
-    assert {b.name for b in capture.bands} == {b.name for b in camera.bands}
+    specs = {b.name: b for b in camera.bands}
+    assert {b.name: b.size_px for b in capture.bands} == {name: spec.size_px(SIZE) for name, spec in specs.items()}
     assert capture.reference.name == camera.bands[camera.reference].name
-    for band in capture.bands:
-        spec = next(b for b in camera.bands if b.name == band.name)
-        assert band.size_px == spec.size_px(SIZE)
     for band in capture.moving:
-        spec = next(b for b in camera.bands if b.name == band.name)
+        spec = specs[band.name]
         truth = true_homography(camera.bands[camera.reference], spec, pose, SIZE)
         seed = rig_seed(capture.reference, band)
         assert seed is not None

@@ -1,6 +1,6 @@
 import numpy as np
 import pytest
-from synthetic_flights.panel import PANEL_CODE, with_panel
+from synthetic_flights.troubles import PANEL_CODE, with_panel
 
 from agalign.pixels import panel_detection as panels
 from agalign.pixels.panel_detection import albedo_of, find_panel, inside

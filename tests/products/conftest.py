@@ -4,8 +4,7 @@ from pathlib import Path
 
 import pytest
 from synthetic_flights.cameras import MAVIC, MAVIC_3M, SENTERA_6X
-from synthetic_flights.panel import make_flight_between_panels
-from synthetic_flights.troubles import make_two_headings
+from synthetic_flights.troubles import make_flight_between_panels, make_two_headings
 
 from agalign.batch.index_run import index_tasks, run_indices
 from agalign.products.indices.formulas import INDICES, Index

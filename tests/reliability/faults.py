@@ -758,7 +758,7 @@ def documented() -> dict[str, str]:
 def main() -> None:
     """Print the result of each fault, and write the table of docs/reliability.md."""
     sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "benchmarks"))
-    from common import Section
+    from common import report
 
     document = Path(sys.argv[2]) if sys.argv[1:2] == ["--markdown"] else None
     rows, reported = [("fault", "exit code", "first message, without the remedy")], documented()
@@ -772,8 +772,7 @@ def main() -> None:
         wrong = what_is_wrong(fault, seen)
         failed += [f"{fault.name}: {wrong}"] if wrong else []
         print(f"{seen.seconds:5.1f} s  {' | '.join(row)}  {wrong}", flush=True)
-    section = Section("faults", document)
-    section.table(rows)
+    report("faults", document, rows)
     if failed:
         raise SystemExit("\n".join(failed))
 

@@ -38,9 +38,7 @@ if __name__ == "__main__":
 
 def output(*command: object, folder: Path | None = None) -> str:
     """Run a command in a folder; return its standard output."""
-    done = subprocess.run([*map(str, command)], cwd=folder, capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr
-    return done.stdout
+    return subprocess.run([*map(str, command)], cwd=folder, stdout=subprocess.PIPE, text=True, check=True).stdout
 
 
 def modules(printed: str) -> set[str]:
