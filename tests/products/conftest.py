@@ -1,6 +1,8 @@
 import csv
 import json
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import pytest
 from synthetic_flights.cameras import MAVIC, MAVIC_3M, SENTERA_6X
@@ -8,9 +10,17 @@ from synthetic_flights.panel import make_flight_between_panels
 from synthetic_flights.troubles import make_two_headings
 
 from agalign.batch.index_run import index_tasks, run_indices
+from agalign.config import Settings, WriteSettings
 from agalign.products.indices.formulas import INDICES, Index
 from agalign.products.indices.rasters import IndexReport
+from agalign.products.product import CapturePaths, ProductContext
+from agalign.products.rasters.layout import Layer
 from agalign.synthetic.cameras import REDEDGE
+from agalign.values.alignment import Alignment, Seed
+from agalign.values.capture import Capture
+from agalign.values.choices import PairStatus
+from agalign.values.image import OutputGrid
+from agalign.values.mapping import PixelMapping
 
 from ..conftest import Shared, read_json
 
@@ -21,6 +31,26 @@ CAMERAS = {"RedEdge": REDEDGE, "M3M calibrated": MAVIC, "M3M": MAVIC_3M, "6X": S
 def change(path: Path, **changes: object) -> None:
     """Replace entries of the JSON object in a file."""
     path.write_text(json.dumps(read_json(path) | changes))
+
+
+def aligned(mapping: PixelMapping, size_px: tuple[int, int], status: PairStatus = "aligned", **facts: Any) -> Alignment:
+    """The alignment of a band to a reference of `size_px` (width, height), equal to its seed."""
+    facts = {"issues": (), "seed": Seed("rig", mapping.fixed_to_moving, 30.0, 30.0, 5.0)} | facts
+    return Alignment(mapping, size_px, status, **facts)
+
+
+def context_of(
+    capture: Capture,
+    alignments: Mapping[str, Alignment],
+    folder: Path = Path(),
+    layers: Sequence[Layer] = (),
+    grid: OutputGrid | None = None,
+    **write: Any,
+) -> ProductContext:
+    """Of a capture for which nothing was written; its grid is by default that of the reference."""
+    paths, settings = CapturePaths(folder, capture.name), Settings(write=WriteSettings(**write))
+    grid = grid or OutputGrid(0, 0, *capture.reference.size_px)
+    return ProductContext(capture, paths, settings, alignments, layers, grid, 0)
 
 
 def table_in(path: Path) -> list[dict[str, str]]:
