@@ -14,7 +14,7 @@ from agalign.errors import OutputError
 from agalign.flight.rig import CaptureFactors, Rig
 from agalign.products.product import CapturePaths, ProductContext
 from agalign.products.rasters.aligned_files import BandFiles, write_raster
-from agalign.products.rasters.checked_raster import Block, LayerDescription, tiled_profile, write_layers
+from agalign.products.rasters.checked_raster import Block, LayerDescription, write_on_grid
 from agalign.products.rasters.layout import Layer, common_grid, flight_limits, output_layers
 from agalign.values import geometry
 from agalign.values.alignment import Alignment, Seed
@@ -201,10 +201,10 @@ def test_a_tile_that_gdal_lost_is_noticed(tmp_path: Path) -> None:
         with rasterio.open(path, "r+") as dataset:
             dataset.write(np.zeros_like(pixels), 1)
 
-    to_write = tiled_profile(64, 48, 1, "uint16"), [LayerDescription("a")], {}, [(pixels, 1, 0, 0)]
-    write_layers(tmp_path / "a.tif", *to_write)
+    to_write = OutputGrid(0, 0, 64, 48), None, [LayerDescription("a")], [(pixels, 1, 0, 0)]
+    write_on_grid(tmp_path / "a.tif", *to_write, dtype="uint16", options={})
     with pytest.raises(OutputError, match="the file came out incomplete"):
-        write_layers(tmp_path / "b.tif", *to_write, lose)
+        write_on_grid(tmp_path / "b.tif", *to_write, dtype="uint16", options={}, finish=lose)
     assert [p.name for p in tmp_path.iterdir()] == ["a.tif"]
 
 
@@ -312,9 +312,9 @@ def test_standard_error_belongs_to_the_caller(tmp_path: Path, capfd: pytest.Capt
         thread.start()
         thread.join()
         assert capfd.readouterr().err == lines.decode()
-        yield np.ones((90, 120), np.uint16), 1, 0, 0
+        yield np.ones((90, 120), np.float32), 1, 0, 0
 
-    write_layers(tmp_path / "a.tif", tiled_profile(120, 90, 1, "uint16"), [LayerDescription("a")], {}, blocks())
+    write_on_grid(tmp_path / "a.tif", OutputGrid(0, 0, 120, 90), None, [LayerDescription("a")], blocks())
 
 
 @pytest.mark.skipif(os.name == "nt", reason="limits of POSIX")

@@ -10,7 +10,6 @@ which is 1 only on average. Bands outside the range of P are resampled and not s
 
 import math
 from collections.abc import Iterator, Sequence
-from pathlib import Path
 
 import cv2
 import numpy as np
@@ -24,7 +23,7 @@ from agalign.pixels.masks import data_mask
 from agalign.pixels.raster import OpenRaster, open_raster
 from agalign.products.product import GEOTIFF, Product, ProductContext, StacAsset, WrittenFile
 from agalign.products.rasters.aligned_files import with_nodata, write_raster
-from agalign.products.rasters.checked_raster import Block, LayerDescription, predictor, write_layers
+from agalign.products.rasters.checked_raster import Block, LayerDescription, predictor, write_on_grid
 from agalign.products.rasters.layout import common_grid, output_layers
 from agalign.values.capture import Band, Capture
 from agalign.values.files import scratch_file
@@ -71,8 +70,14 @@ class PanSharpened(Product):
         with scratch_file(path) as unsharpened:
             write_raster(capture, [*others, *pan], grid, unsharpened, settings)
             with open_raster(unsharpened) as file:
-                is_raw = settings.radiometry == "off"
-                sharpen(file, path, [la.band for la in others], broad, max(grid.scale), is_raw=is_raw)
+                bands, is_raw = [la.band for la in others], settings.radiometry == "off"
+                descriptions, blocks = sharpened(file, bands, broad, max(grid.scale), is_raw=is_raw)
+                dtype, georeference = file.dtypes[0], capture.reference.georeference
+                options = {"compress": "deflate", "predictor": predictor(np.dtype(dtype).kind), "interleave": "band"}
+                if file.nodata is not None:
+                    options["nodata"] = file.nodata
+                tags = {k: v for k, v in file.tags().items() if k != "AREA_OR_POINT"}
+                write_on_grid(path, grid, georeference, descriptions, blocks, tags=tags, dtype=dtype, options=options)
         return [WrittenFile(self.kind, path, StacAsset("pan", GEOTIFF, ("data",)))]
 
 
@@ -122,13 +127,11 @@ def brovey_ratio(bands: Sequence[FloatImage], pan: FloatImage, weights: NDArray[
     return np.asarray(np.clip(np.nan_to_num(ratio, nan=1.0), 1 / max_ratio, max_ratio), np.float32)
 
 
-def sharpen(
-    file: OpenRaster, target: Path, bands: Sequence[Band], pan: Sequence[Band], scale: float, *, is_raw: bool
-) -> None:
-    """Write the sharpened bands, given a file of the resampled `bands` followed by the panchromatic ones, which have
+def sharpened(
+    file: OpenRaster, bands: Sequence[Band], pan: Sequence[Band], scale: float, *, is_raw: bool
+) -> tuple[list[LayerDescription], Iterator[Block]]:
+    """Return the sharpened bands, given a file of the resampled `bands` followed by the panchromatic ones, which have
     pixels `scale` times smaller. Raw numbers include the black level, and Brovey ratios are ratios of light.
-
-    Raises OutputError.
     """
     count, dtype, nodata = len(bands), np.dtype(file.dtypes[0]), file.nodata
     radiometry = [b.radiometry if is_raw else None for b in (*bands, *pan)]
@@ -158,10 +161,7 @@ def sharpen(
     source, texts = "the colour photograph" if pan[0].companion else pan[0].name, ["no"] * count
     for k, weight in zip(in_range, weights.tolist(), strict=True):
         texts[k] = f"weighted Brovey by {source}, weight {weight:.4g}"
-    layers = [
+    return [
         LayerDescription(band.name, unit or "", file.tags(k) | {"PANSHARPENED": text}, file.tags(k, ns="IMAGERY"))
         for k, (band, unit, text) in enumerate(zip(bands, file.units, texts, strict=False), start=1)
-    ]
-    tags = {k: v for k, v in file.tags().items() if k != "AREA_OR_POINT"}
-    profile = file.profile | {"count": count, "compress": "deflate", "predictor": predictor(dtype.kind)}
-    write_layers(target, profile, layers, tags, blocks())
+    ], blocks()
