@@ -82,11 +82,11 @@ class BandFiles(Product):
         for layer in layers:
             by_file.setdefault(names[layer.band.name], []).append(layer)
         written = []
-        for name in dict.fromkeys(name for name in names.values() if name in by_file):
-            band, path = by_file[name][0].band, context.paths.folder / name
+        for name, of_file in by_file.items():
+            band, path = of_file[0].band, context.paths.folder / name
             vignetting = vignettings.get(band.name)
             tags = band_tags(band, context.capture.reference, context.grid, vignetting, radiometry=not is_raw)
-            written.append(_written(self.kind, context, by_file[name], path, name.as_posix(), tags))
+            written.append(_written(self.kind, context, of_file, path, name.as_posix(), tags))
         return written
 
 
@@ -187,12 +187,9 @@ def write_raster(
     # Many programs that read files of single bands do not support Zstandard.
     fits_all = "deflate" if settings.layout == "bands" or len(layers) < len(capture.bands) else "zstd"
     compression = fits_all if settings.compression == "auto" else settings.compression
-    options: dict[str, object] = {"interleave": "band", "photometric": "minisblack"}
-    if nodata is not None:
-        options["nodata"] = nodata
+    options: dict[str, object] = {"interleave": "band", "photometric": "minisblack", "nodata": nodata}
     if compression != "none":
-        options |= {"compress": compression, "predictor": predictor(dtype.kind)}
-        options |= {"zstd_level": 1} if compression == "zstd" else {"zlevel": 6}
+        options |= {"compress": compression, "predictor": predictor(dtype.kind), "zstd_level": 1}
 
     overviews = list(capture.reference.overviews) if settings.format == "gtiff" else []
 

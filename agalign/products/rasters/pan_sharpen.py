@@ -10,6 +10,7 @@ which is 1 only on average. Bands outside the range of P are resampled and not s
 
 import math
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -23,7 +24,7 @@ from agalign.pixels.masks import data_mask
 from agalign.pixels.raster import OpenRaster, open_raster
 from agalign.products.product import GEOTIFF, Product, ProductContext, StacAsset, WrittenFile
 from agalign.products.rasters.aligned_files import with_nodata, write_raster
-from agalign.products.rasters.checked_raster import Block, LayerDescription, predictor, write_on_grid
+from agalign.products.rasters.checked_raster import Block, LayerDescription, predictor
 from agalign.products.rasters.layout import common_grid, output_layers
 from agalign.values.capture import Band, Capture
 from agalign.values.files import scratch_file
@@ -72,13 +73,11 @@ class PanSharpened(Product):
             with open_raster(unsharpened) as file:
                 bands, is_raw = [la.band for la in others], settings.radiometry == "off"
                 descriptions, blocks = sharpened(file, bands, broad, max(grid.scale), is_raw=is_raw)
-                dtype, georeference = file.dtypes[0], capture.reference.georeference
-                options = {"compress": "deflate", "predictor": predictor(np.dtype(dtype).kind), "interleave": "band"}
-                if file.nodata is not None:
-                    options["nodata"] = file.nodata
-                tags = {k: v for k, v in file.tags().items() if k != "AREA_OR_POINT"}
-                write_on_grid(path, grid, georeference, descriptions, blocks, tags=tags, dtype=dtype, options=options)
-        return [WrittenFile(self.kind, path, StacAsset("pan", GEOTIFF, ("data",)))]
+                options = {"compress": "deflate", "predictor": predictor(np.dtype(file.dtypes[0]).kind)}
+                options |= {"interleave": "band", "nodata": file.nodata}
+                more = {"tags": file.tags(), "dtype": file.dtypes[0], "options": options}
+                asset = StacAsset("pan", GEOTIFF, ("data",))
+                return self.write_layers(replace(context, grid=grid), descriptions, blocks, asset, **more)
 
 
 def panchromatic(capture: Capture) -> list[Band]:
