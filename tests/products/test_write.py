@@ -9,26 +9,26 @@ import numpy as np
 import pytest
 import rasterio
 
-from agalign.config import Settings, WriteSettings
+from agalign.config import WriteSettings
 from agalign.errors import OutputError
 from agalign.flight.rig import CaptureFactors, Rig
-from agalign.products.product import CapturePaths, ProductContext
-from agalign.products.rasters.aligned_files import BandFiles, write_raster
+from agalign.products.rasters.aligned_files import write_raster
 from agalign.products.rasters.checked_raster import Block, LayerDescription, write_on_grid
 from agalign.products.rasters.layout import Layer, common_grid, flight_limits, output_layers
 from agalign.values import geometry
-from agalign.values.alignment import Alignment, Seed
 from agalign.values.capture import Band, CameraIdentity, Capture, Georeference
 from agalign.values.image import OutputGrid
 from agalign.values.lens import Lens
 from agalign.values.mapping import PixelMapping
 
 from ..conftest import textured_image, write_band
+from .conftest import aligned
 
 TRANSFORM = np.array([[0.1, 0, 500000], [0, -0.1, 5800000], [0, 0, 1.0]])
 SHIFT = PixelMapping(geometry.translation(3.25, -2.5))
 FRAME = OutputGrid(0, 0, 200, 150)
 CROP = OutputGrid(4, 6, 180, 130, has_gaps=False)
+Output = tuple[list[Layer], OutputGrid]
 
 
 def make_capture(folder: Path, dtype: str = "uint16", nodata: float | None = None, is_on_map: bool = False) -> Capture:
@@ -183,16 +183,6 @@ def test_nodata_is_a_value_that_copied_pixels_do_not_have(tmp_path: Path) -> Non
         assert written.read_masks(3)[10:, :190].all()
 
 
-def test_files_of_bands_have_each_their_own_nodata(tmp_path: Path) -> None:
-    capture, floats = make_capture(tmp_path), make_capture(tmp_path / "floats", "float32").bands[2]
-    capture = replace(capture, bands=(*capture.bands[:2], floats))
-    paths, settings = CapturePaths(tmp_path / "out", "c"), Settings(write=WriteSettings(layout="bands"))
-    context = ProductContext(capture, paths, settings, {}, layers_of(capture), FRAME, 0)
-    by_name = {file.path.name: file.nodata for file in BandFiles().write(context)}
-    assert by_name["f_0.tif"] == 0
-    assert np.isnan(by_name["f_2.tif"])
-
-
 def test_a_tile_that_gdal_lost_is_noticed(tmp_path: Path) -> None:
     """A write that fails once while GDAL closes a file leaves a tile of zeros and no error."""
     pixels = np.arange(64 * 48, dtype=np.uint16).reshape(48, 64)
@@ -211,38 +201,36 @@ def test_a_tile_that_gdal_lost_is_noticed(tmp_path: Path) -> None:
 LENS = Lens(150.0, 150.0, 59.5, 44.5, (-0.1, 0.05))
 
 
-def capture_of(folder: Path) -> Capture:
-    bands = [Band(name, folder / f"{name}.tif", 1, 120, 90, "uint16", lens=LENS) for name in ("green", "nir")]
+@pytest.fixture
+def capture(tmp_path: Path) -> Capture:
+    """Two equal bands, `green` the reference."""
+    bands = [Band(name, tmp_path / f"{name}.tif", 1, 120, 90, "uint16", lens=LENS) for name in ("green", "nir")]
     for band in bands:
         write_band(band.path, np.full((90, 120), 500, np.uint16))
     return Capture("c", Path(), tuple(bands), 0)
 
 
-def aligned_by(shift_px: float) -> Alignment:
-    seed = Seed("identity", geometry.translation(shift_px, 0), 0.0)
-    return Alignment(PixelMapping(seed.fixed_to_moving, LENS, LENS), (120, 90), "aligned", (), seed)
+def output_of(capture: Capture, shift_px: float, common: OutputGrid | None = None, **write: Any) -> Output:
+    """Layers and grid of the capture, with the moving band, if it has one, shifted to the right."""
+    moving = aligned(PixelMapping(geometry.translation(shift_px, 0), LENS, LENS), (120, 90))
+    return output_layers(capture, {b.name: moving for b in capture.moving}, WriteSettings(**write), common)
 
 
 @pytest.mark.parametrize("undistort", [False, True])
-def test_without_a_common_area_what_no_band_shows_is_nodata(tmp_path: Path, undistort: bool) -> None:
-    capture, settings = capture_of(tmp_path), WriteSettings(undistort=undistort)
-    layers, grid = output_layers(capture, {"nir": aligned_by(200.0)}, settings)
+def test_without_a_common_area_what_no_band_shows_is_nodata(capture: Capture, tmp_path: Path, undistort: bool) -> None:
+    layers, grid = output_of(capture, 200.0, undistort=undistort)
     assert (grid.width, grid.height, grid.has_gaps) == (120, 90, True)
-    write_raster(capture, layers, grid, tmp_path / "out.tif", settings)
+    write_raster(capture, layers, grid, tmp_path / "out.tif", WriteSettings(undistort=undistort))
     with rasterio.open(tmp_path / "out.tif") as written:
         assert not written.read_masks(2).any()
 
 
-def test_where_all_bands_show_everything_no_nodata_is_declared(tmp_path: Path) -> None:
-    capture = capture_of(tmp_path)
-    for crop in ("common", "none"):
-        _, grid = output_layers(capture, {"nir": aligned_by(0.0)}, WriteSettings(crop=crop))
-        assert not grid.has_gaps
-    moved, cut = output_layers(capture, {"nir": aligned_by(9.0)}, WriteSettings())
+def test_where_all_bands_show_everything_no_nodata_is_declared(capture: Capture, tmp_path: Path) -> None:
+    for shift_px, crop, has_gaps in ((0.0, "common", False), (0.0, "none", False), (9.0, "none", True)):
+        assert output_of(capture, shift_px, crop=crop)[1].has_gaps == has_gaps
+    moved, cut = output_of(capture, 9.0)
     assert not cut.has_gaps
     assert cut.width < 120
-    _, whole = output_layers(capture, {"nir": aligned_by(9.0)}, WriteSettings(crop="none"))
-    assert whole.has_gaps
     assert write_raster(capture, moved, cut, tmp_path / "out.tif", WriteSettings()) is None
 
 
@@ -255,14 +243,12 @@ def rig_between(low_px: float, high_px: float) -> Rig:
     return Rig((120, 90), mean, baselines, {"nir": 0.0}, std_px, ("distance",), captures, std_px)
 
 
-def test_all_captures_of_a_flight_have_one_geometry(tmp_path: Path) -> None:
-    capture = capture_of(tmp_path)
+def test_all_captures_of_a_flight_have_one_geometry(capture: Capture) -> None:
     limits = flight_limits([([capture], rig_between(2.0, 12.0))])
 
     def grids_of(*shifts_px: float, crop: str = "flight") -> list[OutputGrid]:
-        settings = WriteSettings(crop=crop)
-        common = common_grid(capture.reference, settings, limits)
-        return [output_layers(capture, {"nir": aligned_by(s)}, settings, common)[1] for s in shifts_px]
+        common = common_grid(capture.reference, WriteSettings(crop=crop), limits)
+        return [output_of(capture, shift_px, common, crop=crop)[1] for shift_px in shifts_px]
 
     grids = grids_of(2.0, 7.0, 12.0)
     assert len(set(grids)) == 1
@@ -276,26 +262,20 @@ def test_all_captures_of_a_flight_have_one_geometry(tmp_path: Path) -> None:
     assert beyond == replace(grids[0], has_gaps=True)
 
 
-def test_flights_and_captures_without_a_band_have_the_size_of_their_camera(tmp_path: Path) -> None:
+def test_flights_and_captures_without_a_band_have_the_size_of_their_camera(capture: Capture) -> None:
     """Two flights at other heights, one without a rig, captures without a band, and pixels of a finer band."""
-    capture = capture_of(tmp_path)
     without = replace(capture, bands=(capture.reference,), missing_bands=("nir",))
-    flights = [
-        ([capture, without], rig_between(2.0, 12.0)),
-        ([without, capture], rig_between(6.0, 20.0)),
-        ([capture], None),
-    ]
-    for settings in (WriteSettings(), WriteSettings(resolution="finest")):
-        common = common_grid(capture.reference, settings, flight_limits(flights))
-        grids = [output_layers(capture, {"nir": aligned_by(s)}, settings, common)[1] for s in (3.0, 19.0)]
-        grids.append(output_layers(without, {}, settings, common)[1])
+    rigs = rig_between(2.0, 12.0), rig_between(6.0, 20.0)
+    flights = [([capture, without], rigs[0]), ([without, capture], rigs[1]), ([capture], None)]
+    for write in ({}, {"resolution": "finest"}):
+        common = common_grid(capture.reference, WriteSettings(**write), flight_limits(flights))
+        grids = [output_of(c, s, common, **write)[1] for c, s in ((capture, 3.0), (capture, 19.0), (without, 0.0))]
         assert len({(g.x0, g.y0, g.width, g.height, g.scale) for g in grids}) == 1
         assert 120 - (grids[0].x0 + grids[0].width) in range(21, 25)
     green, nir = (replace(band, lens=None) for band in capture.bands)
     finer = replace(capture, bands=(green, replace(nir, width_px=240, height_px=180)))
-    limits = flight_limits([([finer], replace(rig_between(2.0, 12.0), mean={"nir": np.diag([2.0, 2.0, 1.0])}))])
-    common = common_grid(green, settings, limits)
-    layers, grid = output_layers(finer, {"nir": aligned_by(3.0)}, settings, common)
+    limits = flight_limits([([finer], replace(rigs[0], mean={"nir": np.diag([2.0, 2.0, 1.0])}))])
+    layers, grid = output_of(finer, 3.0, common_grid(green, WriteSettings(**write), limits), **write)
     assert grid.scale == (2.0, 2.0)
     assert {layer.size_px for layer in layers} == {(240, 180)}, "the output before the crop"
 
@@ -331,7 +311,7 @@ def test_a_full_disk_is_one_error_at_any_size(
     size = (out / "a.tif").stat().st_size
     (out / "a.tif").unlink()
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
-    for limit in (0, 1, 7, 8, 100, *range(1000, size, size // 30)):
+    for limit in (0, 1, 7, 8, 100, *range(1000, size, size // 12)):
         resource.setrlimit(resource.RLIMIT_FSIZE, (limit, before[1]))
         try:
             with pytest.raises(OutputError, match=r"a\.tif: cannot be written \(.*; is the disk full\?\)|too large"):
