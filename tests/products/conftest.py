@@ -9,6 +9,7 @@ from synthetic_flights.cameras import MAVIC, MAVIC_3M, SENTERA_6X
 from synthetic_flights.panel import make_flight_between_panels
 from synthetic_flights.troubles import make_two_headings
 
+from agalign import align_folder
 from agalign.batch.index_run import index_tasks, run_indices
 from agalign.config import Settings, WriteSettings
 from agalign.products.indices.formulas import INDICES, Index
@@ -22,7 +23,7 @@ from agalign.values.choices import PairStatus
 from agalign.values.image import OutputGrid
 from agalign.values.mapping import PixelMapping
 
-from ..conftest import Shared, read_json
+from ..conftest import Shared, read_json, seeded
 
 SUN = 1.0, 0.6
 CAMERAS = {"RedEdge": REDEDGE, "M3M calibrated": MAVIC, "M3M": MAVIC_3M, "6X": SENTERA_6X}
@@ -81,3 +82,10 @@ def capture_by(camera: str, shared: Shared) -> Path:
 def between_panels(shared: Shared) -> Path:
     """The panel, two captures, and the panel again, while the sun goes down."""
     return shared("between_panels", lambda folder: make_flight_between_panels(folder, 2, (640, 480), sun=SUN))
+
+
+@pytest.fixture(scope="session")
+def by_sun(between_panels: Path, shared: Shared) -> Path:
+    """The two captures as georeferenced reflectance by the light sensor, mapped by their tags."""
+    settings = seeded(radiometry="sun", georeference=True)
+    return shared("by_sun", lambda out: align_folder(between_panels, out, settings=settings))

@@ -8,11 +8,13 @@ import numpy as np
 import pytest
 import rasterio
 import tifffile
+from synthetic_flights.aligned import make_aligned
 from synthetic_flights.troubles import make_terraces
 
 import agalign
 from agalign.capture.tag_seeds import geo_seed
 from agalign.products.rasters.aligned_files import band_file_names
+from agalign.products.run.captures import RAW, AlignedBand, BandReader
 from agalign.products.sidecar.file import verify_outputs
 from agalign.synthetic import flight as synthetic
 from agalign.values import geometry
@@ -20,7 +22,7 @@ from agalign.values.capture import Band, Capture, Georeference
 
 from ..builders import in_full_run
 from ..conftest import Shared, read_json, seeded, textured_image, write_band, write_capture
-from .conftest import indices_of
+from .conftest import change, indices_of
 
 pytestmark = pytest.mark.slow
 ONLY_SEED = seeded("identity")
@@ -134,15 +136,15 @@ def test_indices_and_error_map_are_removed_if_not_requested(calibrated: Path) ->
     assert not [*out.rglob("*_ndvi.*"), *out.rglob("*.error.tif")]
 
 
-def test_bands_in_different_units_make_no_index(calibrated: Path) -> None:
-    (stack,) = calibrated.rglob("out/**/IMG_0001.tif")
+def test_bands_in_different_units_make_no_index(tmp_path: Path) -> None:
+    make_aligned(tmp_path, 1)
     for band, index, problem in (
         ("NIR", "ndvi", "different units"),
         ("Red", "savi", "needs reflectance, and the bands are radiance"),
     ):
-        with rasterio.open(stack, "r+") as dataset:
+        with rasterio.open(tmp_path / "0000SET" / "IMG_0001.tif", "r+") as dataset:
             dataset.update_tags(dataset.descriptions.index(band) + 1, QUANTITY="radiance")
-        assert problem in indices_of(calibrated / "out", index, overwrite=True)[0].problem
+        assert problem in indices_of(tmp_path, index)[0].problem
 
 
 @pytest.mark.parametrize(
@@ -155,20 +157,20 @@ def test_an_index_that_no_capture_can_have_is_refused_first(tmp_path: Path, inde
         written(tmp_path, agalign.Settings(write=agalign.WriteSettings(indices=(index,))))
 
 
-@pytest.mark.usefixtures("pan_capture")
 def test_indices_go_with_the_stack_that_they_were_made_of(tmp_path: Path) -> None:
     """An index of raw numbers must not stand next to reflectance."""
+    write_capture(tmp_path / "in", "green", "red")
     out = tmp_path / "out"
     written(tmp_path)
-    write_band(out / "field_mine.tif", np.zeros((8, 8), np.float32))
-    with rasterio.open(out / "field_mine.tif", "r+") as dataset:
+    write_band(out / "f_mine.tif", np.zeros((8, 8), np.float32))
+    with rasterio.open(out / "f_mine.tif", "r+") as dataset:
         dataset.update_tags(INDEX_STATISTICS='{"unit": "reflectance"}')
-    for name in ("field_mine.png", "field_notes.tif"):
+    for name in ("f_mine.png", "f_notes.tif"):
         (out / name).write_bytes(b"x")
     written(tmp_path)
-    assert (out / "field_mine.tif").exists(), "nothing was written again"
+    assert (out / "f_mine.tif").exists(), "nothing was written again"
     written(tmp_path, overwrite=True)
-    assert {p.name for p in out.glob("field_*")} == {"field_notes.tif"}
+    assert {p.name for p in out.glob("f_*")} == {"f_notes.tif"}
 
 
 def test_geo_seed_between_coordinate_systems() -> None:
@@ -261,33 +263,32 @@ def test_options_go_together(shared: Shared, tmp_path: Path, options: dict[str, 
     assert np.corrcoef(planes["Green"][both], planes["Red"][both])[0, 1] > 0.6
 
 
-@pytest.mark.parametrize(("factor", "is_written"), [(1.0, True), (60_000.0, False)])
-def test_floats_without_a_unit_may_be_reflectance(tmp_path: Path, factor: float, is_written: bool) -> None:
+@pytest.mark.parametrize(("factor", "unit"), [(1.0, "reflectance"), (60_000.0, RAW)])
+def test_floats_without_a_unit_may_be_reflectance(tmp_path: Path, factor: float, unit: str) -> None:
     scene = (textured_image(320, 240, 5) * 0.05 + 0.4).clip(0, 1) * factor
-    for name in ("red", "nir"):
-        write_band(tmp_path / "in" / f"field_{name}.tif", scene.astype(np.float32))
-    written(tmp_path, agalign.Settings())
-    by_name = {r.index: r for r in indices_of(tmp_path / "out", "savi", "ndvi")}
-    assert (by_name["savi"].path is not None) == is_written
-    assert is_written or "needs reflectance, and the bands are raw numbers" in by_name["savi"].problem
-    assert by_name["ndvi"].path is not None
-    assert by_name["ndvi"].raw_numbers != is_written
+    write_band(tmp_path / "a.tif", scene.astype(np.float32))
+    with BandReader() as reader:
+        assert reader.units(AlignedBand("red", None, tmp_path / "a.tif", 1)) == [unit]
 
 
 @pytest.mark.parametrize(
-    ("accepted_px", "std_px", "problem"), [(2.0, 1.5, ""), (0.5, 0.8, "predicted to 0.8 px, not 0.5"), (0.5, 0.4, "")]
+    ("status", "accepted_px", "std_px", "problem"),
+    [
+        ("predicted", 2.0, 1.5, ""),
+        ("predicted", 0.5, 0.8, "NIR is predicted to 0.8 px, not 0.5"),
+        ("predicted", 0.5, 0.4, ""),
+        ("seed_only", 0.5, 0.4, "NIR is seed_only"),
+    ],
 )
-def test_indices_of_delivered_bands(tmp_path: Path, accepted_px: float, std_px: float, problem: str) -> None:
+def test_indices_of_delivered_bands(
+    tmp_path: Path, status: str, accepted_px: float, std_px: float, problem: str
+) -> None:
     """A band that `--accept-predicted` counts as delivered is good enough for indices, and no other."""
-    write_capture(tmp_path / "in", "green", "red", "nir")
-    written(tmp_path, ONLY_SEED.model_copy(update={"check": agalign.CheckSettings(accept_predicted_px=accepted_px)}))
-    (result,) = indices_of(tmp_path / "out", "ndvi")
-    assert "nir is seed_only" in result.problem
-    path = tmp_path / "out" / "f.json"
-    prediction = f'"prediction": {{"from": "flight", "std_px": {std_px}, "off_px": null}}'
-    text = path.read_text().replace('"status": "seed_only"', '"status": "predicted"')
-    assert text.count('"prediction": null') == 3
-    path.write_text(text.replace('"prediction": null', prediction))
-    (result,) = indices_of(tmp_path / "out", "ndvi")
+    make_aligned(tmp_path, 1)
+    path = tmp_path / "0000SET" / "IMG_0001.json"
+    of_nir = {"status": status, "prediction": {"from": "flight", "std_px": std_px, "off_px": None}}
+    bands = [part | (of_nir if part["band"] == "NIR" else {}) for part in read_json(path)["bands"]]
+    change(path, bands=bands, accept_predicted_px=accepted_px)
+    (result,) = indices_of(tmp_path)
     assert (result.path is None) == bool(problem)
     assert problem in result.problem
