@@ -4,6 +4,7 @@ import hashlib
 import json
 import math
 import os
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,7 @@ import pytest
 from scipy.interpolate import CloughTocher2DInterpolator, RectBivariateSpline
 
 import agalign
+from agalign.config import CheckSettings, Settings
 from agalign.errors import InputError, OutputError, SidecarError
 from agalign.products.sidecar.convert import sidecar_of
 from agalign.products.sidecar.file import content_checksum, find_sidecars, read_sidecar, verify_outputs, write_sidecar
@@ -92,9 +94,12 @@ def test_a_rejected_result_is_not_accepted_in_the_sidecar() -> None:
     bands = tuple(Band(name, Path(f"{name}.tif"), 1, 64, 48, "uint16") for name in ("green", "nir"))
     capture, mapping = Capture("c", Path(), bands, 0), PixelMapping(geometry.translation(3, 4))
     issues = (Issue(RETRIEVAL, 0.1, 0.2), Issue(COVERAGE, math.nan, 0.6))
+    settings = Settings(check=CheckSettings(accept_predicted_px=0.25))
     for status, of_status in (("seed_only", issues), ("aligned", ())):
         alignment = aligned(mapping, (64, 48), status, issues=of_status, joint=joint_result())
-        part = sidecar_of(context_of(capture, {"nir": alignment})).bands[1]
+        sidecar = sidecar_of(replace(context_of(capture, {"nir": alignment}), settings=settings))
+        assert sidecar.max_predicted_px == 0.25
+        part = sidecar.bands[1]
         assert part.joint.accepted == (status == "aligned")
         assert [d.kind for d in part.issues] == [d.code for d in of_status]
         assert [json.loads(d.model_dump_json())["value"] for d in part.issues] == [0.1, None][: len(of_status)]
