@@ -22,7 +22,7 @@ from agalign.values.lens import Lens
 from agalign.values.mapping import PixelMapping
 
 from ..conftest import textured_image, write_band
-from .conftest import aligned
+from .conftest import aligned, context_of
 
 TRANSFORM = np.array([[0.1, 0, 500000], [0, -0.1, 5800000], [0, 0, 1.0]])
 SHIFT = PixelMapping(geometry.translation(3.25, -2.5))
@@ -50,7 +50,7 @@ def layers_of(capture: Capture) -> list[Layer]:
 def write(capture: Capture, grid: OutputGrid, layers: list[Layer] | None = None, **settings: Any) -> Path:
     """Write these layers, or those of `layers_of`, next to the files of the capture."""
     path = capture.reference.path.with_name("out.tif")
-    write_raster(capture, layers or layers_of(capture), grid, path, WriteSettings(**settings))
+    write_raster(context_of(capture, {}, grid=grid, **settings), layers or layers_of(capture), path)
     return path
 
 
@@ -207,21 +207,21 @@ def output_of(capture: Capture, shift_px: float, common: OutputGrid | None = Non
 
 
 @pytest.mark.parametrize("undistort", [False, True])
-def test_without_a_common_area_what_no_band_shows_is_nodata(capture: Capture, tmp_path: Path, undistort: bool) -> None:
+def test_without_a_common_area_what_no_band_shows_is_nodata(capture: Capture, undistort: bool) -> None:
     layers, grid = output_of(capture, 200.0, undistort=undistort)
     assert (grid.width, grid.height, grid.has_gaps) == (120, 90, True)
-    write_raster(capture, layers, grid, tmp_path / "out.tif", WriteSettings(undistort=undistort))
-    with rasterio.open(tmp_path / "out.tif") as written:
+    with rasterio.open(write(capture, grid, layers, undistort=undistort)) as written:
         assert not written.read_masks(2).any()
 
 
-def test_where_all_bands_show_everything_no_nodata_is_declared(capture: Capture, tmp_path: Path) -> None:
+def test_where_all_bands_show_everything_no_nodata_is_declared(capture: Capture) -> None:
     for shift_px, crop, has_gaps in ((0.0, "common", False), (0.0, "none", False), (9.0, "none", True)):
         assert output_of(capture, shift_px, crop=crop)[1].has_gaps == has_gaps
     moved, cut = output_of(capture, 9.0)
     assert not cut.has_gaps
     assert cut.width < 120
-    assert write_raster(capture, moved, cut, tmp_path / "out.tif", WriteSettings()) is None
+    with rasterio.open(write(capture, cut, moved)) as written:
+        assert written.nodata is None
 
 
 def rig_between(low_px: float, high_px: float) -> Rig:
@@ -296,8 +296,8 @@ def test_a_full_disk_is_one_error_at_any_size(
     import resource
 
     capture, out = make_capture(tmp_path), tmp_path / "out"
-    settings = WriteSettings(statistics=True, format=file_format)
-    write_raster(capture, layers_of(capture), CROP, out / "a.tif", settings)
+    context = context_of(capture, {}, grid=CROP, statistics=True, format=file_format)
+    write_raster(context, layers_of(capture), out / "a.tif")
     size = (out / "a.tif").stat().st_size
     (out / "a.tif").unlink()
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
@@ -305,7 +305,7 @@ def test_a_full_disk_is_one_error_at_any_size(
         resource.setrlimit(resource.RLIMIT_FSIZE, (limit, before[1]))
         try:
             with pytest.raises(OutputError, match=r"a\.tif: cannot be written \(.*; is the disk full\?\)|too large"):
-                write_raster(capture, layers_of(capture), CROP, out / "a.tif", settings)
+                write_raster(context, layers_of(capture), out / "a.tif")
         finally:
             resource.setrlimit(resource.RLIMIT_FSIZE, before)
     assert not list(out.iterdir())

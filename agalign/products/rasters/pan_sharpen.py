@@ -62,6 +62,7 @@ class PanSharpened(Product):
         settings = context.settings.write.model_copy(update=fine)
         common = common_grid(capture.reference, settings, context.limits)
         layers, grid = output_layers(capture, usable, settings, common)
+        context = replace(context, settings=context.settings.model_copy(update={"write": settings}), grid=grid)
         pan = [la for la in layers if la.band in broad]
         others = [
             la for la in layers if not (la.is_gap or la.band in broad or la.band.companion or is_thermal(la.band))
@@ -69,15 +70,14 @@ class PanSharpened(Product):
         if not any(is_in_range(la.band, broad) for la in others):
             return []
         with scratch_file(path) as unsharpened:
-            write_raster(capture, [*others, *pan], grid, unsharpened, settings)
+            write_raster(context, [*others, *pan], unsharpened)
             with open_raster(unsharpened) as file:
-                bands, is_raw = [la.band for la in others], settings.radiometry == "off"
-                descriptions, blocks = sharpened(file, bands, broad, max(grid.scale), is_raw=is_raw)
+                bands, scale = [la.band for la in others], max(grid.scale)
+                descriptions, blocks = sharpened(file, bands, broad, scale, is_raw=context.is_raw)
                 options = {"compress": "deflate", "predictor": predictor(np.dtype(file.dtypes[0]).kind)}
                 options |= {"interleave": "band", "nodata": file.nodata}
                 more = {"tags": file.tags(), "dtype": file.dtypes[0], "options": options}
-                asset = StacAsset("pan", GEOTIFF, ("data",))
-                return self.write_layers(replace(context, grid=grid), descriptions, blocks, asset, **more)
+                return self.write_layers(context, descriptions, blocks, StacAsset("pan", GEOTIFF, ("data",)), **more)
 
 
 def panchromatic(capture: Capture) -> list[Band]:
