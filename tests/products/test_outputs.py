@@ -1,6 +1,5 @@
 """Sizes, orders, resolutions and indices: what options make of one capture."""
 
-import shutil
 from pathlib import Path
 from typing import Any
 
@@ -87,52 +86,31 @@ def test_layout_bands_of_a_multiband_file(tmp_path: Path) -> None:
         assert stack.offsets == (0.0, -0.1)
 
 
-@pytest.fixture
-def calibrated(shared: Shared, tmp_path: Path) -> Path:
-    """A synthetic capture in `in`, and aligned in `out`, as reflectance with an error map; a test may change it."""
-
-    def fill(folder: Path) -> None:
-        synthetic.make_flight(folder / "in", 1, (480, 360), rng_seed=3)
-        write = agalign.WriteSettings(radiometry="auto", error_map=True, indices=("ndvi", "savi"))
-        assert written(folder, agalign.Settings(write=write)).is_complete
-
-    return shutil.copytree(shared("calibrated", fill), tmp_path / "calibrated")
-
-
-def test_ndvi_of_the_synthetic_flight_is_its_truth(calibrated: Path) -> None:
-    out = calibrated / "out"
-    (result,) = indices_of(out, overwrite=True)
-    assert (result.problem, result.raw_numbers) == ("", False)
-    with rasterio.open(result.path) as dataset:
+def test_indices_of_the_synthetic_flight_are_its_truth(tmp_path: Path) -> None:
+    synthetic.make_flight(tmp_path / "in", 1, (480, 360), rng_seed=3)
+    write = agalign.WriteSettings(radiometry="auto", error_map=True, indices=("ndvi", "savi"))
+    report, out = written(tmp_path, agalign.Settings(write=write)), tmp_path / "out"
+    assert report.result.output.radiometry == "reflectance by light sensor"
+    files = [p.file for p in report.result.products if p.kind == "index"]
+    assert files == ["IMG_0001_ndvi.tif", "IMG_0001_ndvi.png", "IMG_0001_savi.tif", "IMG_0001_savi.png"]
+    table = (out / "indices.csv").read_text().splitlines()
+    assert [line.split(",")[5] for line in table] == ["index", "ndvi", "savi"]
+    (ndvi,) = indices_of(out)
+    assert ndvi.kept, "the command does not replace them: their checksums are in the sidecar"
+    assert [problems for _, problems in verify_outputs(out)] == [[]]
+    with rasterio.open(ndvi.path) as dataset:
         value = dataset.read(1)
         assert dataset.dtypes == ("float32",)
         assert np.isnan(dataset.nodata)
         assert dataset.tags()["RADIOMETRY"] == "reflectance"
-    assert read_json(next(out.rglob("IMG_0001.json")))["output"]["radiometry"] == "reflectance by light sensor"
     # Bare soil and full crop of the generator, by their reflectances.
     bare, crop = (0.265 - 0.185) / (0.265 + 0.185), (0.52 - 0.055) / (0.52 + 0.055)
     assert np.nanpercentile(value, (5, 95)) == pytest.approx([bare, crop], abs=0.11)
-    assert result.path.with_suffix(".png").read_bytes()[:4] == b"\x89PNG"
-
-
-def test_indices_and_error_map_are_removed_if_not_requested(calibrated: Path) -> None:
-    out = calibrated / "out"
-    sidecar = read_json(next(out.rglob("IMG_0001.json")))
-    files = [p["file"] for p in sidecar["products"] if p["kind"] == "index"]
-    assert files == ["IMG_0001_ndvi.tif", "IMG_0001_ndvi.png", "IMG_0001_savi.tif", "IMG_0001_savi.png"]
-    table = (out / "indices.csv").read_text().splitlines()
-    assert [line.split(",")[5] for line in table] == ["index", "ndvi", "savi"]
-    (report,) = indices_of(out)
-    assert report.kept, "the command does not replace them: their checksums are in the sidecar"
-    assert [problems for _, problems in verify_outputs(out)] == [[]]
-    (path,) = out.rglob("*.error.tif")
-    with rasterio.open(path) as errors, rasterio.open(path.with_name("IMG_0001.tif")) as aligned:
-        assert errors.shape == aligned.shape
-        assert list(errors.descriptions) == [b["band"] for b in sidecar["bands"] if b["status"] == "aligned"]
-        values = errors.read()
-    assert ((values > 0) & (values < 1)).all()
-    written(calibrated)
-    assert not [*out.rglob("*_ndvi.*"), *out.rglob("*.error.tif")]
+    assert ndvi.path.with_suffix(".png").read_bytes()[:4] == b"\x89PNG"
+    with rasterio.open(report.path.with_suffix(".error.tif")) as errors:
+        assert errors.shape == value.shape
+        assert list(errors.descriptions) == [b.band for b in report.result.bands if b.status == "aligned"]
+        assert ((errors.read() > 0) & (errors.read() < 1)).all()
 
 
 def test_bands_in_different_units_make_no_index(tmp_path: Path) -> None:
