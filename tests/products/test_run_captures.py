@@ -28,7 +28,7 @@ REASON = "it has radiance, and 8 of 9 captures have reflectance"
 
 @pytest.fixture(scope="module")
 def run(shared: Shared) -> Path:
-    """Nine overlapping captures, of which the first is radiance and two have other sources and times; their stacks
+    """Nine overlapping captures: the first is radiance, and two have other sources and times. Their stacks
     count as files of bands.
     """
 
