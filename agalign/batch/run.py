@@ -108,7 +108,7 @@ def run_flight(
             if report.state == "done":
                 record.capture_seconds[report.label] = report.seconds
             for (_, stage), seconds in report.stages.items():
-                record.add_seconds(stage, seconds)
+                record.stage_seconds[stage] += seconds
             yield report
             if report.problems and is_full(out):
                 raise OutputError(f"{out}: the disk is full; free space, then the same command resumes the run")
@@ -323,7 +323,7 @@ class _FlightRun:
         start = given if given is not None and is_flight_of(captures, given.camera) else None
         model = learn(captures, settings, lambda _stage, share: self.listener.on_learning(path.stem, share), start)
         seconds = time.monotonic() - began
-        record.add_seconds("learning a flight", seconds)
+        record.stage_seconds["learning a flight"] += seconds
         self.listener.on_learnt(path.stem, seconds)
         if model is None:
             return None

@@ -106,6 +106,11 @@ class ProductContext:
     """Files of the products before this one in `PRODUCTS`."""
 
     @property
+    def is_raw(self) -> bool:
+        """True if raw numbers are written, without radiometric calibration."""
+        return self.settings.write.radiometry == "off"
+
+    @property
     def with_pixels(self) -> dict[str, Alignment[FixedFilePx]]:
         """The alignments that did not fail, by band, in the order of the capture's bands."""
         return {b.name: a for b in self.capture.moving if (a := self.alignments[b.name]).status != "failed"}

@@ -1,17 +1,28 @@
 import csv
 import json
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import pytest
 from synthetic_flights.cameras import MAVIC, MAVIC_3M, SENTERA_6X
 from synthetic_flights.troubles import make_flight_between_panels, make_two_headings
 
+from agalign import align_folder
 from agalign.batch.index_run import index_tasks, run_indices
+from agalign.config import Settings, WriteSettings
 from agalign.products.indices.formulas import INDICES, Index
 from agalign.products.indices.rasters import IndexReport
+from agalign.products.product import CapturePaths, ProductContext
+from agalign.products.rasters.layout import Layer
 from agalign.synthetic.cameras import REDEDGE
+from agalign.values.alignment import Alignment, Seed
+from agalign.values.capture import Capture
+from agalign.values.choices import PairStatus
+from agalign.values.image import OutputGrid
+from agalign.values.mapping import PixelMapping
 
-from ..conftest import Shared, read_json
+from ..conftest import Shared, read_json, seeded
 
 SUN = 1.0, 0.6
 CAMERAS = {"RedEdge": REDEDGE, "M3M calibrated": MAVIC, "M3M": MAVIC_3M, "6X": SENTERA_6X}
@@ -20,6 +31,26 @@ CAMERAS = {"RedEdge": REDEDGE, "M3M calibrated": MAVIC, "M3M": MAVIC_3M, "6X": S
 def change(path: Path, **changes: object) -> None:
     """Replace entries of the JSON object in a file."""
     path.write_text(json.dumps(read_json(path) | changes))
+
+
+def aligned(mapping: PixelMapping, size_px: tuple[int, int], status: PairStatus = "aligned", **facts: Any) -> Alignment:
+    """The alignment of a band to a reference of `size_px` (width, height), equal to its seed."""
+    facts = {"issues": (), "seed": Seed("rig", mapping.fixed_to_moving, 30.0, 30.0, 5.0)} | facts
+    return Alignment(mapping, size_px, status, **facts)
+
+
+def context_of(
+    capture: Capture,
+    alignments: Mapping[str, Alignment],
+    folder: Path = Path(),
+    layers: Sequence[Layer] = (),
+    grid: OutputGrid | None = None,
+    **write: Any,
+) -> ProductContext:
+    """Of a capture for which nothing was written; its grid is by default that of the reference."""
+    paths, settings = CapturePaths(folder, capture.name), Settings(write=WriteSettings(**write))
+    grid = grid or OutputGrid(0, 0, *capture.reference.size_px)
+    return ProductContext(capture, paths, settings, alignments, layers, grid, 0)
 
 
 def table_in(path: Path) -> list[dict[str, str]]:
@@ -50,3 +81,10 @@ def capture_by(camera: str, shared: Shared) -> Path:
 def between_panels(shared: Shared) -> Path:
     """The panel, two captures, and the panel again, while the sun goes down."""
     return shared("between_panels", lambda folder: make_flight_between_panels(folder, 2, (640, 480), sun=SUN))
+
+
+@pytest.fixture(scope="session")
+def by_sun(between_panels: Path, shared: Shared) -> Path:
+    """The two captures as georeferenced reflectance by the light sensor, mapped by their tags."""
+    settings = seeded(radiometry="sun", georeference=True)
+    return shared("by_sun", lambda out: align_folder(between_panels, out, settings=settings))

@@ -1,6 +1,5 @@
 """Sizes, orders, resolutions and indices: what options make of one capture."""
 
-import shutil
 from pathlib import Path
 from typing import Any
 
@@ -8,19 +7,20 @@ import numpy as np
 import pytest
 import rasterio
 import tifffile
+from synthetic_flights.aligned import make_aligned
 from synthetic_flights.troubles import make_terraces
 
 import agalign
 from agalign.capture.tag_seeds import geo_seed
 from agalign.products.rasters.aligned_files import band_file_names
+from agalign.products.run.captures import RAW, AlignedBand, BandReader
 from agalign.products.sidecar.file import verify_outputs
 from agalign.synthetic import flight as synthetic
 from agalign.values import geometry
 from agalign.values.capture import Band, Capture, Georeference
 
-from ..builders import in_full_run
 from ..conftest import Shared, read_json, seeded, textured_image, write_band, write_capture
-from .conftest import indices_of
+from .conftest import change, indices_of
 
 pytestmark = pytest.mark.slow
 ONLY_SEED = seeded("identity")
@@ -86,63 +86,42 @@ def test_layout_bands_of_a_multiband_file(tmp_path: Path) -> None:
         assert stack.offsets == (0.0, -0.1)
 
 
-@pytest.fixture
-def calibrated(shared: Shared, tmp_path: Path) -> Path:
-    """A synthetic capture in `in`, and aligned in `out`, as reflectance with an error map; a test may change it."""
-
-    def fill(folder: Path) -> None:
-        synthetic.make_flight(folder / "in", 1, (480, 360), rng_seed=3)
-        write = agalign.WriteSettings(radiometry="auto", error_map=True, indices=("ndvi", "savi"))
-        assert written(folder, agalign.Settings(write=write)).is_complete
-
-    return shutil.copytree(shared("calibrated", fill), tmp_path / "calibrated")
-
-
-def test_ndvi_of_the_synthetic_flight_is_its_truth(calibrated: Path) -> None:
-    out = calibrated / "out"
-    (result,) = indices_of(out, overwrite=True)
-    assert (result.problem, result.raw_numbers) == ("", False)
-    with rasterio.open(result.path) as dataset:
+def test_indices_of_the_synthetic_flight_are_its_truth(tmp_path: Path) -> None:
+    synthetic.make_flight(tmp_path / "in", 1, (480, 360), rng_seed=3)
+    write = agalign.WriteSettings(radiometry="auto", error_map=True, indices=("ndvi", "savi"))
+    report, out = written(tmp_path, agalign.Settings(write=write)), tmp_path / "out"
+    assert report.result.output.radiometry == "reflectance by light sensor"
+    files = [p.file for p in report.result.products if p.kind == "index"]
+    assert files == ["IMG_0001_ndvi.tif", "IMG_0001_ndvi.png", "IMG_0001_savi.tif", "IMG_0001_savi.png"]
+    table = (out / "indices.csv").read_text().splitlines()
+    assert [line.split(",")[5] for line in table] == ["index", "ndvi", "savi"]
+    (ndvi,) = indices_of(out)
+    assert ndvi.kept, "the command does not replace them: their checksums are in the sidecar"
+    assert [problems for _, problems in verify_outputs(out)] == [[]]
+    with rasterio.open(ndvi.path) as dataset:
         value = dataset.read(1)
         assert dataset.dtypes == ("float32",)
         assert np.isnan(dataset.nodata)
         assert dataset.tags()["RADIOMETRY"] == "reflectance"
-    assert read_json(next(out.rglob("IMG_0001.json")))["output"]["radiometry"] == "reflectance by light sensor"
     # Bare soil and full crop of the generator, by their reflectances.
     bare, crop = (0.265 - 0.185) / (0.265 + 0.185), (0.52 - 0.055) / (0.52 + 0.055)
     assert np.nanpercentile(value, (5, 95)) == pytest.approx([bare, crop], abs=0.11)
-    assert result.path.with_suffix(".png").read_bytes()[:4] == b"\x89PNG"
+    assert ndvi.path.with_suffix(".png").read_bytes()[:4] == b"\x89PNG"
+    with rasterio.open(report.path.with_suffix(".error.tif")) as errors:
+        assert errors.shape == value.shape
+        assert list(errors.descriptions) == [b.band for b in report.result.bands if b.status == "aligned"]
+        assert ((errors.read() > 0) & (errors.read() < 1)).all()
 
 
-def test_indices_and_error_map_are_removed_if_not_requested(calibrated: Path) -> None:
-    out = calibrated / "out"
-    sidecar = read_json(next(out.rglob("IMG_0001.json")))
-    files = [p["file"] for p in sidecar["products"] if p["kind"] == "index"]
-    assert files == ["IMG_0001_ndvi.tif", "IMG_0001_ndvi.png", "IMG_0001_savi.tif", "IMG_0001_savi.png"]
-    table = (out / "indices.csv").read_text().splitlines()
-    assert [line.split(",")[5] for line in table] == ["index", "ndvi", "savi"]
-    (report,) = indices_of(out)
-    assert report.kept, "the command does not replace them: their checksums are in the sidecar"
-    assert [problems for _, problems in verify_outputs(out)] == [[]]
-    (path,) = out.rglob("*.error.tif")
-    with rasterio.open(path) as errors, rasterio.open(path.with_name("IMG_0001.tif")) as aligned:
-        assert errors.shape == aligned.shape
-        assert list(errors.descriptions) == [b["band"] for b in sidecar["bands"] if b["status"] == "aligned"]
-        values = errors.read()
-    assert ((values > 0) & (values < 1)).all()
-    written(calibrated)
-    assert not [*out.rglob("*_ndvi.*"), *out.rglob("*.error.tif")]
-
-
-def test_bands_in_different_units_make_no_index(calibrated: Path) -> None:
-    (stack,) = calibrated.rglob("out/**/IMG_0001.tif")
+def test_bands_in_different_units_make_no_index(tmp_path: Path) -> None:
+    make_aligned(tmp_path, 1)
     for band, index, problem in (
         ("NIR", "ndvi", "different units"),
         ("Red", "savi", "needs reflectance, and the bands are radiance"),
     ):
-        with rasterio.open(stack, "r+") as dataset:
+        with rasterio.open(tmp_path / "0000SET" / "IMG_0001.tif", "r+") as dataset:
             dataset.update_tags(dataset.descriptions.index(band) + 1, QUANTITY="radiance")
-        assert problem in indices_of(calibrated / "out", index, overwrite=True)[0].problem
+        assert problem in indices_of(tmp_path, index)[0].problem
 
 
 @pytest.mark.parametrize(
@@ -155,20 +134,20 @@ def test_an_index_that_no_capture_can_have_is_refused_first(tmp_path: Path, inde
         written(tmp_path, agalign.Settings(write=agalign.WriteSettings(indices=(index,))))
 
 
-@pytest.mark.usefixtures("pan_capture")
 def test_indices_go_with_the_stack_that_they_were_made_of(tmp_path: Path) -> None:
     """An index of raw numbers must not stand next to reflectance."""
+    write_capture(tmp_path / "in", "green", "red")
     out = tmp_path / "out"
     written(tmp_path)
-    write_band(out / "field_mine.tif", np.zeros((8, 8), np.float32))
-    with rasterio.open(out / "field_mine.tif", "r+") as dataset:
+    write_band(out / "f_mine.tif", np.zeros((8, 8), np.float32))
+    with rasterio.open(out / "f_mine.tif", "r+") as dataset:
         dataset.update_tags(INDEX_STATISTICS='{"unit": "reflectance"}')
-    for name in ("field_mine.png", "field_notes.tif"):
+    for name in ("f_mine.png", "f_notes.tif"):
         (out / name).write_bytes(b"x")
     written(tmp_path)
-    assert (out / "field_mine.tif").exists(), "nothing was written again"
+    assert (out / "f_mine.tif").exists(), "nothing was written again"
     written(tmp_path, overwrite=True)
-    assert {p.name for p in out.glob("field_*")} == {"field_notes.tif"}
+    assert {p.name for p in out.glob("f_*")} == {"f_notes.tif"}
 
 
 def test_geo_seed_between_coordinate_systems() -> None:
@@ -176,15 +155,14 @@ def test_geo_seed_between_coordinate_systems() -> None:
     one = Georeference(np.array([[0.5, 0, 500000], [0, -0.5, 5800000], [0, 0, 1.0]]), utm.to_wkt())
     # The same corner and about the same scale in Web Mercator, from its own transformation.
     x, y = rasterio.warp.transform(utm, web, [500000, 500400], [5800000, 5799700])
-    other = Georeference(
-        np.array([[(x[1] - x[0]) / 800, 0, x[0]], [0, (y[1] - y[0]) / 600, y[0]], [0, 0, 1.0]]), web.to_wkt()
-    )
-    seed = geo_seed(*(Band("b", Path("b"), 1, 800, 600, "uint8", georeference=g) for g in (one, other)))
-    # Meridians converge: the third corner is where the projection says, not on a rectangle.
-    x2, y2 = rasterio.warp.transform(utm, web, [500400], [5800000])
-    third = (np.linalg.inv(other.transform) @ [x2[0], y2[0], 1])[:2] - 0.5
-    corners = geometry.apply(seed, np.array([[-0.5, -0.5], [799.5, 599.5], [799.5, -0.5]]))
-    np.testing.assert_allclose(corners, [[-0.5, -0.5], [799.5, 599.5], third], atol=0.1)
+    transform = np.array([[(x[1] - x[0]) / 800, 0, x[0]], [0, (y[1] - y[0]) / 600, y[0]], [0, 0, 1.0]])
+    pair = one, Georeference(transform, web.to_wkt())
+    seed = geo_seed(*(Band("b", Path("b"), 1, 800, 600, "uint8", georeference=g) for g in pair))
+    # Meridians converge: the corners are where the projection says, not on a rectangle.
+    corners = geometry.corners(801, 601)
+    on_web = np.transpose(rasterio.warp.transform(utm, web, *geometry.apply(one.transform, corners).T))
+    expected = geometry.apply(np.linalg.inv(transform), on_web) - 0.5
+    np.testing.assert_allclose(geometry.apply(seed, corners - 0.5), expected, atol=0.1)
 
 
 def test_the_references_own_mask_is_kept(tmp_path: Path) -> None:
@@ -216,10 +194,8 @@ def test_files_of_another_layout_or_of_a_lost_band_are_removed(tmp_path: Path) -
     written(tmp_path, seeded("identity", layout="both"))
     assert files() == ["f.tif", "f_green.tif", "f_nir.tif", "f_red.tif"]
     write_band(tmp_path / "in" / "f_nir.tif", np.full((240, 300), 7, np.uint16))  # without any texture
-    written(tmp_path, seeded("identity", layout="both"))
-    assert files() == ["f.tif", "f_green.tif", "f_red.tif"]
-    written(tmp_path)
-    assert files() == ["f.tif"]
+    written(tmp_path, seeded("identity", layout="bands"))
+    assert files() == ["f_green.tif", "f_red.tif"]
 
 
 def test_the_file_of_a_photograph_does_not_take_the_name_of_the_stack() -> None:
@@ -229,13 +205,14 @@ def test_the_file_of_a_photograph_does_not_take_the_name_of_the_stack() -> None:
     assert names == {"green": Path("field_green.tif"), "RGB Red": Path("field_jpg.tif")}
 
 
+@pytest.mark.full
 @pytest.mark.parametrize(
     "options",
     [
         {"layout": "both", "undistort": True, "resolution": "finest"},
-        in_full_run({"layout": "bands", "format": "cog", "crop": "none", "radiometry": "auto"}),
-        in_full_run({"layout": "both", "radiometry": "auto", "stac": True, "interpolation": "nearest"}),
-        in_full_run({"layout": "stack", "format": "cog", "undistort": True, "compression": "none"}),
+        {"layout": "bands", "format": "cog", "crop": "none", "radiometry": "auto"},
+        {"layout": "both", "radiometry": "auto", "stac": True, "interpolation": "nearest"},
+        {"layout": "stack", "format": "cog", "undistort": True, "compression": "none"},
     ],
     ids=str,
 )
@@ -261,33 +238,32 @@ def test_options_go_together(shared: Shared, tmp_path: Path, options: dict[str, 
     assert np.corrcoef(planes["Green"][both], planes["Red"][both])[0, 1] > 0.6
 
 
-@pytest.mark.parametrize(("factor", "is_written"), [(1.0, True), (60_000.0, False)])
-def test_floats_without_a_unit_may_be_reflectance(tmp_path: Path, factor: float, is_written: bool) -> None:
+@pytest.mark.parametrize(("factor", "unit"), [(1.0, "reflectance"), (60_000.0, RAW)])
+def test_floats_without_a_unit_may_be_reflectance(tmp_path: Path, factor: float, unit: str) -> None:
     scene = (textured_image(320, 240, 5) * 0.05 + 0.4).clip(0, 1) * factor
-    for name in ("red", "nir"):
-        write_band(tmp_path / "in" / f"field_{name}.tif", scene.astype(np.float32))
-    written(tmp_path, agalign.Settings())
-    by_name = {r.index: r for r in indices_of(tmp_path / "out", "savi", "ndvi")}
-    assert (by_name["savi"].path is not None) == is_written
-    assert is_written or "needs reflectance, and the bands are raw numbers" in by_name["savi"].problem
-    assert by_name["ndvi"].path is not None
-    assert by_name["ndvi"].raw_numbers != is_written
+    write_band(tmp_path / "a.tif", scene.astype(np.float32))
+    with BandReader() as reader:
+        assert reader.units(AlignedBand("red", None, tmp_path / "a.tif", 1)) == [unit]
 
 
 @pytest.mark.parametrize(
-    ("accepted_px", "std_px", "problem"), [(2.0, 1.5, ""), (0.5, 0.8, "predicted to 0.8 px, not 0.5"), (0.5, 0.4, "")]
+    ("status", "accepted_px", "std_px", "problem"),
+    [
+        ("predicted", 2.0, 1.5, ""),
+        ("predicted", 0.5, 0.8, "NIR is predicted to 0.8 px, not 0.5"),
+        ("predicted", 0.5, 0.4, ""),
+        ("seed_only", 0.5, 0.4, "NIR is seed_only"),
+    ],
 )
-def test_indices_of_delivered_bands(tmp_path: Path, accepted_px: float, std_px: float, problem: str) -> None:
+def test_indices_of_delivered_bands(
+    tmp_path: Path, status: str, accepted_px: float, std_px: float, problem: str
+) -> None:
     """A band that `--accept-predicted` counts as delivered is good enough for indices, and no other."""
-    write_capture(tmp_path / "in", "green", "red", "nir")
-    written(tmp_path, ONLY_SEED.model_copy(update={"check": agalign.CheckSettings(accept_predicted_px=accepted_px)}))
-    (result,) = indices_of(tmp_path / "out", "ndvi")
-    assert "nir is seed_only" in result.problem
-    path = tmp_path / "out" / "f.json"
-    prediction = f'"prediction": {{"from": "flight", "std_px": {std_px}, "off_px": null}}'
-    text = path.read_text().replace('"status": "seed_only"', '"status": "predicted"')
-    assert text.count('"prediction": null') == 3
-    path.write_text(text.replace('"prediction": null', prediction))
-    (result,) = indices_of(tmp_path / "out", "ndvi")
+    make_aligned(tmp_path, 1)
+    path = tmp_path / "0000SET" / "IMG_0001.json"
+    of_nir = {"status": status, "prediction": {"from": "flight", "std_px": std_px, "off_px": None}}
+    bands = [part | (of_nir if part["band"] == "NIR" else {}) for part in read_json(path)["bands"]]
+    change(path, bands=bands, accept_predicted_px=accepted_px)
+    (result,) = indices_of(tmp_path)
     assert (result.path is None) == bool(problem)
     assert problem in result.problem

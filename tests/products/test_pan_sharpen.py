@@ -1,36 +1,24 @@
 from pathlib import Path
-from types import SimpleNamespace
 
 import cv2
 import numpy as np
 import pytest
 import rasterio
+import tifffile
 from synthetic_flights.cameras import ALTUM_PT
 from synthetic_flights.troubles import make_two_headings
 
 import agalign
 from agalign.pixels.raster import open_raster
-from agalign.products.product import CapturePaths, ProductContext
-from agalign.products.rasters.layout import Layer
-from agalign.products.rasters.pan_sharpen import (
-    _is_in_range,
-    _sharpen,
-    _Sources,
-    _sources,
-    brovey_ratio,
-    panchromatic,
-    weights_of,
-)
+from agalign.products.rasters.pan_sharpen import PanSharpened, brovey_ratio, panchromatic, sharpened, weights_of
+from agalign.values.alignment import Prediction
 from agalign.values.capture import Band, Capture
-from agalign.values.image import OutputGrid
 from agalign.values.mapping import PixelMapping
-from agalign.values.pixel_units import PixelScale
 
-from ..conftest import seeded, textured_image, write_band
+from ..conftest import textured_image, write_band
+from .conftest import aligned, context_of
 
 pytestmark = pytest.mark.slow
-PANCHRO = Band("Panchro", Path("pan"), 1, 64, 48, "uint16")
-COLOUR = Band("RGB Red", Path("rgb"), 1, 64, 48, "uint8", companion=True)
 
 
 def scene() -> tuple[list[np.ndarray], np.ndarray]:
@@ -89,9 +77,8 @@ def test_sharpening_keeps_brightness_and_adds_detail(tmp_path: Path) -> None:
     assert np.std(cv2.Laplacian(after, -1)) > 1.3 * np.std(cv2.Laplacian(plain, -1))
 
 
-def test_without_a_panchromatic_band_it_is_refused(flight: Path, tmp_path: Path) -> None:
-    reports = agalign.align_folder(flight, tmp_path, settings=seeded(pan_sharpen=True))
-    assert ["--with-rgb" in (r.error or "") for r in reports] == [True, True]
+def capture_of(*bands: Band) -> Capture:
+    return Capture("a", Path(), bands, 0)
 
 
 def test_what_sees_the_others_light_together() -> None:
@@ -99,13 +86,16 @@ def test_what_sees_the_others_light_together() -> None:
         return Band(name, Path("x.tif"), 1, 64, 48, "uint16", bandwidth_nm=width_nm, **more)
 
     def pan(*bands: Band) -> list[str]:
-        return [b.name for b in panchromatic(Capture("a", Path(), bands, 0))]
+        return [b.name for b in panchromatic(capture_of(*bands))]
 
     colours = [band(f"RGB {c}", companion=True) for c in ("Red", "Green", "Blue")]
     assert pan(band("Green", 20), band("Panchro", 463)) == ["Panchro"]
-    assert pan(band("Green", 20), band("LWIR", 6000, wavelength_nm=11000.0)) == []
+    thermal = band("Green", 20), band("LWIR", 6000, wavelength_nm=11000.0)
+    assert pan(*thermal) == []
     assert pan(band("Green", 20), *colours) == ["RGB Red", "RGB Green", "RGB Blue"]
     assert pan(band("Green", 20), band("pan"), *colours) == ["pan"]
+    with pytest.raises(agalign.InputError, match="--with-rgb"):
+        PanSharpened().check(capture_of(*thermal))
 
 
 @pytest.mark.parametrize(("nodata", "dtype"), [(0, np.uint16), (-9999.0, np.float32)])
@@ -118,44 +108,39 @@ def test_gaps_keep_nodata_and_unseen_bands_are_not_sharpened(tmp_path: Path, nod
         Band(name, tmp_path, 1, 320, 240, "uint16", wavelength_nm=nm, bandwidth_nm=width_nm)
         for name, nm, width_nm in (("Green", 560.0, 20.0), ("NIR", 900.0, 40.0), ("Panchro", 634.5, 463.0))
     ]
-    layers = [Layer(band, None) for band in bands]
-    grid = OutputGrid(0, 0, 320, 240, PixelScale(2.0, 2.0))
     with open_raster(tmp_path / "layers.tif") as file:
-        _sharpen(file, tmp_path / "out.tif", _Sources(layers[:2], layers[2:], grid))
-    with rasterio.open(tmp_path / "out.tif") as file:
-        result = file.read()
+        _, blocks = sharpened(file, bands[:2], bands[2:], 2.0, is_raw=False)
+        result = np.stack([pixels for pixels, *_ in blocks])
     assert (result[:, :20] == nodata).all()
     assert result[0, 30:].std() > 100
     assert (result[1, 20:] == 2000).all()
 
 
 @pytest.mark.parametrize(
-    ("pan", "status", "std_px", "sharpens"),
+    ("pan", "wavelength_nm", "status", "std_px", "sharpens"),
     [
-        (PANCHRO, "aligned", None, True),
-        (PANCHRO, "predicted", 0.9, True),
-        (PANCHRO, "predicted", 1.9, False),
-        (PANCHRO, "seed_only", None, False),
-        (COLOUR, "aligned", None, False),
+        ("Panchro", 840.0, "aligned", 0.0, True),
+        ("Panchro", 840.0, "predicted", 0.9, True),
+        ("Panchro", 840.0, "predicted", 1.9, False),
+        ("Panchro", 840.0, "seed_only", 0.0, False),
+        ("RGB Red", 650.0, "aligned", 0.0, True),
+        ("RGB Red", 730.0, "aligned", 0.0, False),
     ],
 )
 def test_a_band_that_is_not_delivered_or_does_not_see_infra_red_sharpens_none(
-    monkeypatch: pytest.MonkeyPatch, pan: Band, status: str, std_px: float | None, sharpens: bool
+    tmp_path: Path, pan: str, wavelength_nm: float, status: str, std_px: float, sharpens: bool
 ) -> None:
-    def placed(_: Capture, alignments: dict[str, object], *__: object) -> tuple[list[Layer], OutputGrid]:
-        own = PixelMapping(np.eye(3))
-        return [Layer(b, own) for b in bands if b is bands[0] or b.name in alignments], OutputGrid(0, 0, 64, 48)
-
-    bands = [Band("NIR", Path("NIR"), 1, 64, 48, "uint16", wavelength_nm=840.0), pan]
-    monkeypatch.setattr("agalign.products.rasters.pan_sharpen.output_layers", placed)
-    prediction = None if std_px is None else SimpleNamespace(std_px=std_px)
-    alignments = {pan.name: SimpleNamespace(status=status, prediction=prediction)}
-    capture, grid = Capture("a", Path("in"), tuple(bands), 0), OutputGrid(0, 0, 64, 48)
-    paths = CapturePaths.of(capture, Path("out"))
-    context = ProductContext(capture, paths, agalign.Settings(), alignments, (), grid, 0)
-    assert (_sources(context, agalign.WriteSettings()) is not None) == sharpens
-
-
-def test_a_photograph_sees_red_and_no_red_edge(tmp_path: Path) -> None:
-    red, red_edge = (Band("b", tmp_path, 1, 64, 48, "uint16", wavelength_nm=nm) for nm in (650.0, 730.0))
-    assert (_is_in_range(red, [COLOUR]), _is_in_range(red_edge, [COLOUR])) == (True, False)
+    size_px, identity = (64, 48), PixelMapping(np.eye(3))
+    one = Band("b", tmp_path / "b.tif", 1, *size_px, "uint16", wavelength_nm=wavelength_nm)
+    other = Band(pan, tmp_path / "pan.tif", 1, *size_px, "uint16", companion=pan == "RGB Red")
+    for path in (one.path, other.path):
+        write_band(path, np.full((48, 64), 500, np.uint16))
+    prediction = Prediction(np.eye(3), "flight", std_px)
+    context = context_of(
+        capture_of(one, other), {pan: aligned(identity, size_px, status, prediction=prediction)}, tmp_path
+    )
+    files = PanSharpened().write(context)
+    assert bool(files) == sharpens
+    for file in files:
+        with tifffile.TiffFile(file.path) as image:
+            assert "ModelTransformationTag" not in image.pages[0].tags, "no georeference is invented"

@@ -1,5 +1,6 @@
 """Quality flags, each where the pixels are known to have it."""
 
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,7 +13,6 @@ import agalign
 from agalign.pixels.sun_glint import sun_glint
 from agalign.products.indices.formulas import index_named, index_of_formula
 from agalign.products.indices.rasters import write_rasters
-from agalign.products.product import CapturePaths, ProductContext
 from agalign.products.rasters import alignment_maps as quality_raster
 from agalign.products.rasters.alignment_maps import _flags, error_lattice_px, error_on_tile
 from agalign.products.rasters.layout import Layer
@@ -20,13 +20,14 @@ from agalign.products.run.captures import bands_of
 from agalign.products.sidecar.file import read_result
 from agalign.values import geometry, lens
 from agalign.values.capture import Band, Capture, Radiometry
-from agalign.values.choices import QUALITY_MEANINGS, UNUSABLE_QUALITY, Quality
+from agalign.values.choices import UNUSABLE_QUALITY, Quality
 from agalign.values.image import OutputGrid
 from agalign.values.lens import Lens
 from agalign.values.mapping import PixelMapping
 
 from ..builders import joint_result, residual_of
-from ..conftest import read_json, seeded, write_band
+from ..conftest import Shared, seeded, write_band
+from .conftest import aligned, context_of
 
 GRID = OutputGrid(4, 2, 60, 40)
 
@@ -147,13 +148,10 @@ def test_glint_does_not_depend_on_the_tile(tmp_path: Path, monkeypatch: pytest.M
     for name, pixels in zip(("Green", "NIR"), values, strict=True):
         write_band(tmp_path / f"{name}.tif", np.rint(pixels.clip(0, 1) * 65535).astype(np.uint16))
         bands.append(Band(name, tmp_path / f"{name}.tif", 1, 411, 301, "uint16", radiometry=reflectance))
-    capture, grid = Capture("c", Path(), tuple(bands), 0), OutputGrid(3, 5, 400, 290)
-    seed = agalign.Seed("identity", geometry.identity(), 0.0)
-    mapping = PixelMapping(geometry.identity())
-    alignment = agalign.Alignment(mapping, (411, 301), "aligned", (), seed)
+    mapping, capture = PixelMapping(geometry.identity()), Capture("c", Path(), tuple(bands), 0)
     layers = Layer(bands[0], None, is_reference=True), Layer(bands[1], mapping)
-    paths = CapturePaths(tmp_path, "c")
-    context = ProductContext(capture, paths, agalign.Settings(), {"NIR": alignment}, layers, grid, 0)
+    alignments, grid = {"NIR": aligned(mapping, (411, 301))}, OutputGrid(3, 5, 400, 290)
+    context = context_of(capture, alignments, tmp_path, layers, grid)
     flags = []
     for tile_px in (1000, 64):
         monkeypatch.setattr(quality_raster, "WORK_TILE_PX", tile_px)
@@ -171,9 +169,8 @@ def test_the_error_of_an_undistorted_pixel_is_that_of_its_raw_one() -> None:
     reference = Band("Green", Path(), 1, *size_px, "uint16", lens=lens_of_reference)
     joint = joint_result(covariance=np.diag(np.arange(1.0, 9.0)))
     residual = residual_of(np.array([[100.0, 100.0], [300.0, 200.0], [200.0, 400.0], [500.0, 300.0]]), (0.1, 0.1))
-    seed = agalign.Seed("identity", geometry.identity(), 0.0)
     mapping = PixelMapping(geometry.identity(), lens_of_reference, lens_of_reference)
-    alignment = agalign.Alignment(mapping, size_px, "aligned", (), seed, joint, residual)
+    alignment = aligned(mapping, size_px, joint=joint, residual=residual)
     raw, undistorted = OutputGrid(0, 0, *size_px), OutputGrid(0, 0, *size_px, undistorted=True)
     on_raw, on_undistorted = (
         error_on_tile(error_lattice_px(alignment, reference, g), g, g.tile) for g in (raw, undistorted)
@@ -187,59 +184,57 @@ def test_the_error_of_an_undistorted_pixel_is_that_of_its_raw_one() -> None:
     np.testing.assert_allclose(on_undistorted[inside], expected[inside], atol=0.01)
 
 
+@pytest.fixture
+def sidecar(flight: Path, shared: Shared, tmp_path: Path) -> Path:
+    """That of a capture with a quality raster, in a run that a test may change."""
+    settings = seeded(qa=True, crop="none")
+    done = shared("quality", lambda out: agalign.align_folder(flight, out, settings=settings))
+    return shutil.copytree(done, tmp_path / "out") / "0000SET" / "000" / "IMG_0001.json"
+
+
 @pytest.mark.slow
-def test_a_run_writes_flags_with_their_meaning_for_every_band_of_the_stack(flight: Path, tmp_path: Path) -> None:
-    (report, *_) = agalign.align_folder(flight, tmp_path, settings=seeded(qa=True, crop="none"))
-    assert [p.file for p in report.sidecar.products if p.kind == "qa"] == [f"{report.path.stem}.qa.tif"]
-    with (
-        rasterio.open(report.path.with_suffix(".qa.tif")) as raster,
-        rasterio.open(report.path.with_suffix(".tif")) as stack,
-    ):
+def test_a_run_writes_flags_with_their_meaning_for_every_band_of_the_stack(sidecar: Path) -> None:
+    path = sidecar.with_suffix(".qa.tif")
+    assert [p.file for p in read_result(sidecar).products if p.kind == "qa"] == [path.name]
+    with rasterio.open(path) as raster, rasterio.open(sidecar.with_suffix(".tif")) as stack:
         assert raster.descriptions == ("all bands", *stack.descriptions)
         assert raster.shape == stack.shape
-        tags = raster.tags()
-        masks = [int(m) for m in tags["flag_masks"].split(", ")]
-        assert (
-            tags["flag_meanings"].split() == QUALITY_MEANINGS.split() == [str(Quality(m).name).lower() for m in masks]
-        )
-        assert tags["SUN_GLINT"]
-        flags, pixels = raster.read(), stack.read()
+        tags, flags, pixels = raster.tags(), raster.read(), stack.read()
+    masks = [int(m) for m in tags["flag_masks"].split(", ")]
+    assert masks == [1 << i for i in range(len(Quality))]
+    assert tags["flag_meanings"].split() == [str(Quality(m).name).lower() for m in masks]
+    assert tags["SUN_GLINT"]
     assert np.array_equal(flags[0], np.bitwise_or.reduce(flags[1:]))
     # Whatever is outside is nodata in the stack, and the reverse.
     no_value = flags[1:] & np.uint16(Quality.OUTSIDE | Quality.NODATA | Quality.OCCLUDED | Quality.MISSING) > 0
     assert no_value.any()
     assert np.array_equal(pixels == stack.nodata, no_value)
-    assert read_json(report.path)["schema"] == "agalign/1"
-    assert masks == [1 << i for i in range(len(Quality))]
 
 
 @pytest.mark.slow
-def test_indices_omit_pixels_flagged_in_their_own_bands(flight: Path, tmp_path: Path) -> None:
-    (report, *_) = agalign.align_folder(flight, tmp_path, settings=seeded(qa=True))
-    sidecar = read_result(report.path)
-    plain = [replace(b, problem="") for b in bands_of(sidecar, report.path.parent)]
-    masked = [replace(b, problem="") for b in bands_of(sidecar, report.path.parent, mask_qa=True)]
-    path = report.path.with_suffix(".qa.tif")
+def test_indices_omit_pixels_flagged_in_their_own_bands(sidecar: Path, tmp_path: Path) -> None:
+    result, path = read_result(sidecar), sidecar.with_suffix(".qa.tif")
+    plain, masked = (
+        [replace(b, problem="") for b in bands_of(result, sidecar.parent, mask_qa=mask_qa)] for mask_qa in (False, True)
+    )
+    saturated, predicted = np.s_[110:120, 130:150], np.s_[140:150, 130:150]
     with rasterio.open(path, "r+") as raster:
         flags = np.zeros(raster.shape, np.uint16)
-        flags[10:20, 30:50] = Quality.SATURATED
-        flags[40:50, 30:50] = Quality.PREDICTED
+        flags[saturated], flags[predicted] = Quality.SATURATED, Quality.PREDICTED
         for index, name in enumerate(raster.descriptions, start=1):
             raster.write(flags if name == "NIR" else np.zeros_like(flags), index)
     (ndvi,) = write_rasters(plain, [index_named("ndvi")], tmp_path / "plain", "a")
     (left,) = write_rasters(masked, [index_named("ndvi")], tmp_path / "masked", "a", overwrite=False)
     (green,) = write_rasters(masked, [index_of_formula("green=(G-R)/(G+R)")], tmp_path / "masked", "a")
     values, kept, without_nir = (rasterio.open(r.path).read(1) for r in (ndvi, left, green))
-    expected = values.copy()
-    expected[10:20, 30:50] = np.nan
-    assert np.array_equal(kept, expected, equal_nan=True)
-    masked_px = np.isfinite(values[10:20, 30:50]).sum()
-    assert left.statistics.masked_share == pytest.approx(masked_px / values.size, abs=1e-6)
+    assert np.isfinite(values[saturated]).all()
+    values[saturated] = np.nan
+    assert np.array_equal(kept, values, equal_nan=True)
+    assert left.statistics.masked_share == pytest.approx(200 / values.size, abs=1e-6)
     assert ndvi.statistics.masked_share == 0
-    assert np.isfinite(without_nir[10:20, 30:50]).all()
+    assert np.isfinite(without_nir[saturated]).all()
     # The same bands without the mask are another raster, which is not taken for this one.
     (again,) = write_rasters(plain, [index_named("ndvi")], tmp_path / "masked", "a", overwrite=False)
     assert not again.kept
-    path.unlink()
     with pytest.raises(agalign.InputError, match="--qa"):
-        bands_of(sidecar.model_copy(update={"products": []}), report.path.parent, mask_qa=True)
+        bands_of(result.model_copy(update={"products": []}), sidecar.parent, mask_qa=True)

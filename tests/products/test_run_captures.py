@@ -1,7 +1,6 @@
 """Products of several captures when one of them differs: its light sensor failed, or it lacks a band."""
 
 import os
-import re
 import shutil
 import signal
 import subprocess
@@ -11,66 +10,67 @@ from pathlib import Path
 import numpy as np
 import pytest
 import rasterio
-from synthetic_flights.aligned import make_aligned
+from synthetic_flights.aligned import make_aligned, make_overlapping
 
 import agalign
 from agalign.products.exports.programs import export
 from agalign.products.rasters.aligned_files import to_cog
 from agalign.products.run.captures import exceptions
 from agalign.products.sidecar.file import find_sidecars
-from agalign.synthetic import flight as synthetic
 
-from ..conftest import Shared, read_json, seeded
+from ..conftest import Shared, read_json
 from ..program import agalign_here
 from .conftest import change
 
-FIRST = "0000SET/000/IMG_0001"
-REASON = "it has radiance, and 5 of 6 captures have reflectance"
+FIRST = "0000SET/IMG_0001"
+REASON = "it has radiance, and 8 of 9 captures have reflectance"
 
 
 @pytest.fixture(scope="module")
 def run(shared: Shared) -> Path:
-    """Six captures, aligned by the tags alone and then called aligned; the light sensor of the first measured 0."""
+    """Nine overlapping captures: the first is radiance, and two have other sources and times. Their stacks
+    count as files of bands.
+    """
 
     def fill(folder: Path) -> None:
-        synthetic.make_flight(folder / "in", captures=6, size_px=(240, 180), rng_seed=3)
-        for path in (folder / "in").rglob("IMG_0001_*.tif"):
-            content = path.read_bytes()
-            (irradiance,) = re.findall(rb"HorizontalIrradiance>([0-9.]+)<", content)
-            path.write_bytes(content.replace(irradiance, b"0" * len(irradiance)))
-        agalign.align_folder(
-            folder / "in", folder / "out", settings=seeded("rig", layout="both", radiometry="auto", crop="none")
-        )
-        for path in find_sidecars(folder / "out"):
-            text = path.read_text().replace('"status": "degraded"', '"status": "ok"')
-            path.write_text(text.replace('"status": "seed_only"', '"status": "aligned"'))
+        make_overlapping(folder)
+        tags = {"RADIOMETRY_SOURCE": "panel", "TIFFTAG_DATETIME": "2026:06:21 01:00:00"}
+        for number, changes in ((1, {"RADIOMETRY": "radiance"}), (2, tags), (3, {"RADIOMETRY_SOURCE": "light sensor"})):
+            with rasterio.open(folder / "0000SET" / f"IMG_000{number}.tif", "r+") as stack:
+                stack.update_tags(**changes)
+                for index in stack.indexes if number == 1 else ():
+                    stack.update_tags(index, QUANTITY="radiance")
+        for path in find_sidecars(folder):
+            output = read_json(path)["output"]
+            change(path, output=output | {"band_files": [{"file": path.with_suffix(".tif").name, "bytes": 1}]})
 
-    return shared("failed_sensor", fill) / "out"
+    return shared("mixed", fill)
 
 
-def test_the_mosaic_is_of_one_quantity(run: Path, tmp_path: Path) -> None:
-    report = agalign.mosaic(run, tmp_path / "field.tif", indices=["savi"], untied=True)
-    assert report.left_out == [(FIRST, REASON)]
-    assert report.captures == 5
+def test_the_mosaic_is_of_one_quantity_and_names_both_sources(run: Path, tmp_path: Path) -> None:
+    report = agalign.mosaic(run, tmp_path / "field.tif", indices=["savi"], untied=True, gsd_m=0.4)
+    assert (report.left_out, report.captures) == ([(FIRST, REASON)], 8)
     assert [index.statistics.unit for index in report.indices] == ["reflectance"]
     with rasterio.open(report.path) as field:
-        assert field.tags()["RADIOMETRY"] == "reflectance"
+        tags = field.tags()
+    assert tags["RADIOMETRY"] == "reflectance"
+    assert tags["RADIOMETRY_SOURCE"] == "light sensor and panel"
+    assert tags["TIFFTAG_DATETIME"] == "2026:06:21 01:00:00"
 
 
 def test_an_export_is_of_one_quantity(run: Path, tmp_path: Path) -> None:
     report = export(run, tmp_path / "odm", "odm")
-    assert report.left_out == [(FIRST, REASON)]
-    assert len(report.files) == 25
+    assert (report.left_out, len(report.files)) == ([(FIRST, REASON)], 8)
     assert "The files contain reflectance by light sensor: OpenDroneMap must not" in report.notes[-1]
     # Matrices are of the original images.
-    assert export(run, tmp_path / "opencv", "opencv").captures == 6
+    assert export(run, tmp_path / "opencv", "opencv").captures == 9
 
 
 def test_a_flight_has_one_unit(run: Path) -> None:
     with pytest.warns(UserWarning, match=f"{FIRST}: left out: {REASON}"):
         flight = agalign.open_flight(run)
     assert FIRST not in flight.capture
-    assert (flight.sizes["capture"], flight.NIR.attrs["units"]) == (5, "1")
+    assert flight.sizes["capture"] == 8
     assert float(flight.NIR.max()) < 2
 
 
@@ -78,35 +78,22 @@ def test_medians_of_an_index_are_of_one_unit(run: Path, tmp_path: Path) -> None:
     done = agalign_here("indices", run, "-o", tmp_path)
     assert f"{FIRST} ndvi: not in the medians of captures: {REASON}" in " ".join(done.stderr.split())
     (row,) = [line for line in done.stdout.splitlines() if " ndvi " in line]
-    assert row.split("│")[2].strip() == "5"
+    assert row.split("│")[2].strip() == "8"
 
 
 def test_the_exception_is_what_differs_from_most(run: Path, tmp_path: Path) -> None:
     """A band that the first capture lacks is not taken from the others; a file that cannot be read is named."""
     out = shutil.copytree(run, tmp_path / "out")
     (out / f"{FIRST}.tif").unlink()
-    second = out / "0000SET" / "000" / "IMG_0002.json"
-    bands = read_json(second)["bands"]
-    change(second, bands=[*bands[:3], bands[3] | {"place": None}, *bands[4:]])
-    with pytest.warns(UserWarning, match="IMG_0002: left out: it has bands Blue") as warned:
+    second = out / "0000SET" / "IMG_0002.json"
+    change(
+        second, bands=[part | ({"place": None} if part["band"] == "NIR" else {}) for part in read_json(second)["bands"]]
+    )
+    with pytest.warns(UserWarning, match="IMG_0002: left out: it has bands Green") as warned:
         flight = agalign.open_flight(out)
     assert f"{FIRST}.tif: does not exist" in str(warned[0].message)
-    assert (flight.sizes["capture"], "NIR" in flight) == (4, True)
+    assert (flight.sizes["capture"], "NIR" in flight) == (7, True)
     assert exceptions({}) == []
-
-
-def test_a_mosaic_of_two_sources_names_both(tmp_path: Path) -> None:
-    from synthetic_flights.aligned import make_overlapping
-
-    make_overlapping(tmp_path / "run")
-    for number, source in ((1, "panel"), (2, "light sensor")):
-        with rasterio.open(tmp_path / "run" / "0000SET" / f"IMG_000{number}.tif", "r+") as stack:
-            stack.update_tags(RADIOMETRY_SOURCE=source, TIFFTAG_DATETIME=f"2026:06:21 0{3 - number}:00:00")
-    agalign.mosaic(tmp_path / "run", tmp_path / "field.tif", gsd_m=0.4)
-    with rasterio.open(tmp_path / "field.tif") as field:
-        tags = field.tags()
-    assert tags["RADIOMETRY_SOURCE"] == "light sensor and panel"
-    assert tags["TIFFTAG_DATETIME"] == "2026:06:21 01:00:00"
 
 
 def test_a_killed_export_does_not_block_its_repeat(run: Path, tmp_path: Path) -> None:

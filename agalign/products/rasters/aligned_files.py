@@ -71,9 +71,9 @@ class BandFiles(Product):
 
     def write(self, context: ProductContext) -> list[WrittenFile]:
         """Write the files of all bands with pixels."""
-        names, is_raw = band_file_names(context.capture), context.settings.write.radiometry == "off"
+        names = band_file_names(context.capture)
         layers = [layer for layer in context.layers if not layer.is_gap]
-        vignettings = _vignettings(layers, context.grid) if is_raw else {}
+        vignettings = _vignettings(layers, context.grid) if context.is_raw else {}
         if any(v.error > _MAX_VIGNETTING_ERROR for v in vignettings.values()):
             # A program that corrects some bands of a capture only would change its indices.
             layers = [replace(layer, vignetting=_correction(layer.band)) for layer in layers]
@@ -82,11 +82,11 @@ class BandFiles(Product):
         for layer in layers:
             by_file.setdefault(names[layer.band.name], []).append(layer)
         written = []
-        for name in dict.fromkeys(name for name in names.values() if name in by_file):
-            band, path = by_file[name][0].band, context.paths.folder / name
+        for name, of_file in by_file.items():
+            band, path = of_file[0].band, context.paths.folder / name
             vignetting = vignettings.get(band.name)
-            tags = band_tags(band, context.capture.reference, context.grid, vignetting, radiometry=not is_raw)
-            written.append(_written(self.kind, context, by_file[name], path, name.as_posix(), tags))
+            tags = band_tags(band, context.capture.reference, context.grid, vignetting, radiometry=not context.is_raw)
+            written.append(_written(self.kind, context, of_file, path, name.as_posix(), tags))
         return written
 
 
@@ -159,40 +159,31 @@ def _written(
     kind: str, context: ProductContext, layers: Sequence[Layer], path: Path, key: str, tags: TransferredTags
 ) -> WrittenFile:
     """Write layers as the bands of one file, and return it with its asset `key`."""
-    settings = context.settings.write
-    nodata = write_raster(context.capture, layers, context.grid, path, settings, tags)
-    media_type = f"{GEOTIFF}; profile=cloud-optimized" if settings.format == "cog" else GEOTIFF
+    nodata = write_raster(context, layers, path, tags)
+    media_type = f"{GEOTIFF}; profile=cloud-optimized" if context.settings.write.format == "cog" else GEOTIFF
     bands, is_flat = tuple(layer.band.name for layer in layers), any(layer.vignetting for layer in layers)
     return WrittenFile(kind, path, StacAsset(key, media_type, ("data",)), bands, nodata, is_flat=is_flat)
 
 
 def write_raster(
-    capture: Capture,
-    layers: Sequence[Layer],
-    grid: OutputGrid,
-    path: Path,
-    settings: WriteSettings,
-    tags: TransferredTags | None = None,
+    context: ProductContext, layers: Sequence[Layer], path: Path, tags: TransferredTags | None = None
 ) -> float | None:
-    """Write layers as the bands of one file atomically; return its nodata value.
+    """Write layers of a capture as the bands of one file atomically; return its nodata value.
 
     The type is that of the layers if all have the same, else the smallest type that represents them all; float32 after
     radiometric calibration. A nodata value is declared only if some pixel needs it; valid moving pixels that equal it
     change by the smallest step. A COG gets no `tags`: tags that GDAL does not write itself would break its layout.
     Raises OutputError, or UnreadableFileError for an input.
     """
-    raw = settings.radiometry == "off"
+    capture, settings, raw = context.capture, context.settings.write, context.is_raw
     dtype = np.result_type(*(layer.band.dtype for layer in layers)) if raw else np.dtype(np.float32)
-    nodata = nodata_value(capture, layers, grid, dtype, settings)
+    nodata = nodata_value(context, layers, dtype)
     # Many programs that read files of single bands do not support Zstandard.
     fits_all = "deflate" if settings.layout == "bands" or len(layers) < len(capture.bands) else "zstd"
     compression = fits_all if settings.compression == "auto" else settings.compression
-    options: dict[str, object] = {"interleave": "band", "photometric": "minisblack"}
-    if nodata is not None:
-        options["nodata"] = nodata
+    options: dict[str, object] = {"interleave": "band", "photometric": "minisblack", "nodata": nodata}
     if compression != "none":
-        options |= {"compress": compression, "predictor": predictor(dtype.kind)}
-        options |= {"zstd_level": 1} if compression == "zstd" else {"zlevel": 6}
+        options |= {"compress": compression, "predictor": predictor(dtype.kind), "zstd_level": 1}
 
     overviews = list(capture.reference.overviews) if settings.format == "gtiff" else []
 
@@ -208,8 +199,8 @@ def write_raster(
         if settings.format == "cog":
             to_cog(partial, compression)
 
-    blocks, georeference = _blocks(layers, grid, dtype, nodata, settings), capture.reference.georeference
-    descriptions, own_tags = _descriptions(layers, raw=raw), _tags(capture, layers, raw=raw)
+    blocks, georeference = _blocks(context, layers, dtype, nodata), capture.reference.georeference
+    descriptions, own_tags, grid = _descriptions(layers, raw=raw), _tags(capture, layers, raw=raw), context.grid
     write_on_grid(
         path, grid, georeference, descriptions, blocks, tags=own_tags, dtype=dtype.name, options=options, finish=finish
     )
@@ -277,14 +268,15 @@ def _colours(layers: Sequence[Layer]) -> Sequence[ColorInterp | None]:
 
 
 def _blocks(
-    layers: Sequence[Layer], grid: OutputGrid, dtype: np.dtype[Any], nodata: float | None, settings: WriteSettings
+    context: ProductContext, layers: Sequence[Layer], dtype: np.dtype[Any], nodata: float | None
 ) -> Iterator[Block]:
+    grid = context.grid
     for index, layer in enumerate(layers, start=1):
         for tile in tiles(grid.tile, WORK_TILE_PX):
             if layer.is_gap:
                 pixels: Pixels = np.full((tile.height, tile.width), 0 if nodata is None else nodata, dtype=dtype)
             else:
-                pixels, valid = _tile_of(layer, tile, settings)
+                pixels, valid = _tile_of(layer, tile, context.settings.write)
                 pixels = pixels.astype(dtype, copy=False)
                 if nodata is not None and not (valid.all() and layer.is_copied):
                     pixels = with_nodata(pixels, valid, nodata)
@@ -330,13 +322,11 @@ def to_cog(path: Path, compression: str = "deflate") -> None:
         cog.unlink(missing_ok=True)
 
 
-def nodata_value(
-    capture: Capture, layers: Sequence[Layer], grid: OutputGrid, dtype: np.dtype[Any], settings: WriteSettings
-) -> float | None:
+def nodata_value(context: ProductContext, layers: Sequence[Layer], dtype: np.dtype[Any]) -> float | None:
     """Return the nodata value of a file with these layers; None if every pixel is valid. Raises UnreadableFileError."""
-    if settings.radiometry != "off":
+    declared, grid = context.capture.reference.nodata, context.grid
+    if not context.is_raw:
         return math.nan
-    declared = capture.reference.nodata
     if declared is not None and can_hold(dtype, declared):
         return declared
     if dtype.kind == "f":

@@ -1,6 +1,7 @@
 """Rasters of the expected alignment error, of quality flags and of the relief, on the grid of the aligned files."""
 
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 
 import cv2
 import numpy as np
@@ -101,7 +102,7 @@ class QualityRaster(Product):
             if glint is not None:
                 in_tile = glint[tile.y0 - grid.y0 :, tile.x0 - grid.x0 :][: tile.height, : tile.width]
                 for flags in bands:
-                    flags[in_tile & (flags & _bit(Quality.MISSING) == 0)] |= _bit(Quality.SUN_GLINT)
+                    flags[in_tile & (flags & Quality.MISSING.value == 0)] |= Quality.SUN_GLINT.value
             return [np.bitwise_or.reduce(bands), *bands]
 
         method = "water by NDWI > 0 (McFeeters 1996), glint by the excess of near infrared (Hedley et al. 2005)"
@@ -123,24 +124,20 @@ class QualityRaster(Product):
         return self.write_layers(context, layers, blocks, asset, tags=tags, dtype="uint16", options=options)
 
 
-def _bit(flag: Quality) -> np.uint16:
-    return np.uint16(flag.value)
-
-
 def _flags(
     layer: Layer, tile: Tile, grid: OutputGrid, nodes: Mapping[str, NDArray[np.float32]], *, is_predicted: bool
 ) -> Flags:
     """Flags (height, width) of a band on a tile, except sun glint; `nodes` has the expected error by band."""
     if layer.is_gap:
-        return np.full((tile.height, tile.width), _bit(Quality.MISSING), np.uint16)
-    result = np.full((tile.height, tile.width), _bit(Quality.PREDICTED) if is_predicted else 0, np.uint16)
+        return np.full((tile.height, tile.width), Quality.MISSING.value, np.uint16)
+    result = np.full((tile.height, tile.width), Quality.PREDICTED.value if is_predicted else 0, np.uint16)
     masks = _of_source(layer, tile)
     if layer.band.name in nodes:
         error_px = error_on_tile(nodes[layer.band.name], grid, tile)
         masks[Quality.ERROR_OVER_HALF_PX] = np.isnan(error_px) | (error_px > 0.5)
         masks[Quality.ERROR_OVER_1_PX] = np.isnan(error_px) | (error_px > 1.0)
     for flag, mask in masks.items():
-        result[mask] |= _bit(flag)
+        result[mask] |= flag.value
     return result
 
 
@@ -251,24 +248,20 @@ def _range_m(
     parallax_px: NDArray[np.float64],
 ) -> NDArray[np.float32]:
     """Range (height, width), nan if baselines, focal length or the orientation of the lenses are unknown."""
-    reference, at_infinity, baselines_m, mappings = capture.reference, [], [], []
-    unit_m = rig_unit_m(capture.bands)
+    reference, unit_m, known = capture.reference, rig_unit_m(capture.bands), []
     for band in capture.moving:
         alignment = alignments.get(band.name)
         if alignment is None or alignment.mapping.parallax is None or alignment.space != "undistorted":
             continue
-        try:
-            homography_at_infinity = rig_seed(reference, band)
-        except GeometryError:
-            continue
-        if homography_at_infinity is None or band.lens_offset is None or reference.lens_offset is None:
-            continue
-        at_infinity.append(homography_at_infinity)
-        baselines_m.append(np.subtract(reference.lens_offset, band.lens_offset) * unit_m)
-        mappings.append(alignment.mapping)
-    if not mappings or reference.lens is None:
+        with suppress(GeometryError):
+            at_infinity = rig_seed(reference, band)
+            if at_infinity is not None and band.lens_offset is not None and reference.lens_offset is not None:
+                baseline_m = np.subtract(reference.lens_offset, band.lens_offset) * unit_m
+                known.append((alignment.mapping, at_infinity, baseline_m))
+    if not known or reference.lens is None:
         return np.full(parallax_px.shape, np.nan, np.float32)
-    inverse_m = inverse_range(mappings, at_infinity, np.array(baselines_m), reference.lens, points, parallax_px)
+    mappings, at_infinity_of, baselines_m = zip(*known, strict=True)
+    inverse_m = inverse_range(mappings, at_infinity_of, np.array(baselines_m), reference.lens, points, parallax_px)
     max_range_m = 1e5  # the parallax of a larger range cannot be distinguished from that of an infinite one
     with np.errstate(divide="ignore"):
         range_m = np.where(inverse_m > 1 / max_range_m, 1 / inverse_m, np.nan)

@@ -109,20 +109,6 @@ def _describe(dataset: Any, layers: Sequence[LayerDescription], tags: Mapping[st
         dataset.update_tags(index, ns="IMAGERY", **layer.imagery)
 
 
-def write_layers(
-    path: Path,
-    profile: dict[str, Any],
-    layers: Sequence[LayerDescription],
-    tags: Mapping[str, str],
-    blocks: Iterable[Block],
-    finish: Callable[[Path], None] | None = None,
-) -> None:
-    """Write a raster with these layers and tags block by block, as `checked_raster` does. Raises OutputError."""
-    with checked_raster(path, profile, layers, tags, finish) as (_, write):
-        for block in blocks:
-            write(*block)
-
-
 def write_on_grid(
     path: Path,
     grid: OutputGrid,
@@ -135,7 +121,8 @@ def write_on_grid(
     options: Mapping[str, Any] = FLOAT_OPTIONS,
     finish: Callable[[Path], None] | None = None,
 ) -> None:
-    """Write a tiled raster on an output grid, as `write_layers` does, with the georeference of the reference's file.
+    """Write a tiled raster on an output grid block by block, with the georeference of the reference's file, as
+    `checked_raster` does.
 
     A file without a georeference gets no transform: an identity transform would be read as a georeference. Tags mark
     one by the camera's pose as approximate. Raises OutputError.
@@ -147,7 +134,9 @@ def write_on_grid(
             approximate = "approximate, from GPS position, altitude, yaw and focal length; no ground control"
             all_tags["GEOREFERENCE"] = approximate
             all_tags["GEOREFERENCE_ACCURACY_M"] = f"{georeference.accuracy_m:g}"
-    write_layers(path, profile, layers, all_tags, blocks, finish)
+    with checked_raster(path, profile, layers, all_tags, finish) as (_, write):
+        for block in blocks:
+            write(*block)
 
 
 def check_complete(path: Path) -> None:

@@ -10,8 +10,7 @@ which is 1 only on average. Bands outside the range of P are resampled and not s
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
-from pathlib import Path
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -20,17 +19,16 @@ from rasterio.windows import Window
 from scipy.optimize import nnls
 
 from agalign.cameras.base import is_thermal
-from agalign.config import WriteSettings
 from agalign.errors import InputError
 from agalign.pixels.masks import data_mask
 from agalign.pixels.raster import OpenRaster, open_raster
 from agalign.products.product import GEOTIFF, Product, ProductContext, StacAsset, WrittenFile
 from agalign.products.rasters.aligned_files import with_nodata, write_raster
-from agalign.products.rasters.checked_raster import Block, LayerDescription, predictor, write_layers
-from agalign.products.rasters.layout import Layer, common_grid, output_layers
+from agalign.products.rasters.checked_raster import Block, LayerDescription, predictor
+from agalign.products.rasters.layout import common_grid, output_layers
 from agalign.values.capture import Band, Capture
 from agalign.values.files import scratch_file
-from agalign.values.image import FloatImage, Mask, OutputGrid, Tile
+from agalign.values.image import FloatImage, Mask, Tile
 from agalign.values.interpolation import as_type, tiles
 
 _TILE_PX = 1024
@@ -55,17 +53,31 @@ class PanSharpened(Product):
             )
 
     def write(self, context: ProductContext) -> list[WrittenFile]:
-        """Write <capture>.pan.tif; nothing if the panchromatic band is not usable."""
+        """Write <capture>.pan.tif; nothing if the panchromatic band is not usable, or no band is within its range."""
+        capture, usable, path = context.capture, context.usable, context.paths.file(self.suffix)
+        broad = panchromatic(capture)
+        if not broad or not {b.name for b in broad} <= {capture.reference.name, *usable}:
+            return []
         fine = {"resolution": "finest", "format": "gtiff", "compression": "none"}
-        settings, path = context.settings.write.model_copy(update=fine), context.paths.file(self.suffix)
-        sources = _sources(context, settings)
-        if sources is None:
+        settings = context.settings.write.model_copy(update=fine)
+        common = common_grid(capture.reference, settings, context.limits)
+        layers, grid = output_layers(capture, usable, settings, common)
+        context = replace(context, settings=context.settings.model_copy(update={"write": settings}), grid=grid)
+        pan = [la for la in layers if la.band in broad]
+        others = [
+            la for la in layers if not (la.is_gap or la.band in broad or la.band.companion or is_thermal(la.band))
+        ]
+        if not any(is_in_range(la.band, broad) for la in others):
             return []
         with scratch_file(path) as unsharpened:
-            write_raster(context.capture, sources.layers, sources.grid, unsharpened, settings)
+            write_raster(context, [*others, *pan], unsharpened)
             with open_raster(unsharpened) as file:
-                _sharpen(file, path, sources)
-        return [WrittenFile(self.kind, path, StacAsset("pan", GEOTIFF, ("data",)))]
+                bands, scale = [la.band for la in others], max(grid.scale)
+                descriptions, blocks = sharpened(file, bands, broad, scale, is_raw=context.is_raw)
+                options = {"compress": "deflate", "predictor": predictor(np.dtype(file.dtypes[0]).kind)}
+                options |= {"interleave": "band", "nodata": file.nodata}
+                more = {"tags": file.tags(), "dtype": file.dtypes[0], "options": options}
+                return self.write_layers(context, descriptions, blocks, StacAsset("pan", GEOTIFF, ("data",)), **more)
 
 
 def panchromatic(capture: Capture) -> list[Band]:
@@ -77,46 +89,7 @@ def panchromatic(capture: Capture) -> list[Band]:
     return [b for b in broad if not is_thermal(b)][:1] or [b for b in capture.bands if b.companion]
 
 
-@dataclass(frozen=True)
-class _Sources:
-    """The layers that a sharpened file is calculated from, all on one grid."""
-
-    bands: list[Layer]
-    pan: list[Layer]
-    grid: OutputGrid
-    is_raw: bool = False
-    """The numbers have the sensor's black level."""
-
-    @property
-    def layers(self) -> list[Layer]:
-        """All layers, those of the panchromatic band last."""
-        return [*self.bands, *self.pan]
-
-    @property
-    def is_sharpened(self) -> list[bool]:
-        """For each of `bands`: True if it is within the spectral range of the panchromatic band."""
-        return [_is_in_range(layer.band, [pan.band for pan in self.pan]) for layer in self.bands]
-
-    @property
-    def black_levels(self) -> NDArray[np.float32]:
-        """(n,) of `layers`: Brovey ratios are ratios of light, which is without them."""
-        calibrations = [layer.band.radiometry if self.is_raw else None for layer in self.layers]
-        return np.array([0.0 if c is None else c.black_level for c in calibrations], np.float32)
-
-
-def _sources(context: ProductContext, settings: WriteSettings) -> _Sources | None:
-    """None if the panchromatic band is not usable, or no band is within its spectral range."""
-    pan, usable = panchromatic(context.capture), context.usable
-    if not pan or not {b.name for b in pan} <= {context.capture.reference.name, *usable}:
-        return None
-    common = common_grid(context.capture.reference, settings, context.limits)
-    layers, grid = output_layers(context.capture, usable, settings, common)
-    others = [la for la in layers if not (la.is_gap or la.band in pan or la.band.companion or is_thermal(la.band))]
-    sources = _Sources(others, [la for la in layers if la.band in pan], grid, settings.radiometry == "off")
-    return sources if any(sources.is_sharpened) else None
-
-
-def _is_in_range(band: Band, pan: Sequence[Band]) -> bool:
+def is_in_range(band: Band, pan: Sequence[Band]) -> bool:
     """True for a band within the spectral range of the panchromatic band, or if either is unknown."""
     if band.wavelength_nm is None:
         return True
@@ -153,10 +126,16 @@ def brovey_ratio(bands: Sequence[FloatImage], pan: FloatImage, weights: NDArray[
     return np.asarray(np.clip(np.nan_to_num(ratio, nan=1.0), 1 / max_ratio, max_ratio), np.float32)
 
 
-def _sharpen(file: OpenRaster, target: Path, sources: _Sources) -> None:
-    """Write the sharpened bands, given a file of the resampled bands followed by the panchromatic ones."""
-    count, dtype, nodata = len(sources.bands), np.dtype(file.dtypes[0]), file.nodata
-    black_levels, is_sharpened = sources.black_levels, sources.is_sharpened
+def sharpened(
+    file: OpenRaster, bands: Sequence[Band], pan: Sequence[Band], scale: float, *, is_raw: bool
+) -> tuple[list[LayerDescription], Iterator[Block]]:
+    """Return the sharpened bands, given a file of the resampled `bands` followed by the panchromatic ones, which have
+    pixels `scale` times smaller. Raw numbers include the black level, and Brovey ratios are ratios of light.
+    """
+    count, dtype, nodata = len(bands), np.dtype(file.dtypes[0]), file.nodata
+    radiometry = [b.radiometry if is_raw else None for b in (*bands, *pan)]
+    black_levels = np.array([0.0 if r is None else r.black_level for r in radiometry], np.float32)
+    is_sharpened = [is_in_range(band, pan) for band in bands]
     in_range = np.flatnonzero(is_sharpened)
 
     def read(tile: Tile) -> tuple[FloatImage, Mask]:
@@ -167,7 +146,7 @@ def _sharpen(file: OpenRaster, target: Path, sources: _Sources) -> None:
 
     width, height = min(file.width, _TILE_PX), min(file.height, _TILE_PX)
     light, _ = read(Tile((file.width - width) // 2, (file.height - height) // 2, width, height))
-    weights = weights_of([*light[in_range]], light[count:].mean(axis=0), max(sources.grid.scale))
+    weights = weights_of([*light[in_range]], light[count:].mean(axis=0), scale)
 
     def blocks() -> Iterator[Block]:
         for tile in tiles(Tile(0, 0, file.width, file.height), _TILE_PX):
@@ -178,13 +157,10 @@ def _sharpen(file: OpenRaster, target: Path, sources: _Sources) -> None:
                 pixels = as_type(values if dtype.kind == "f" else np.nan_to_num(values), dtype)
                 yield pixels if nodata is None else with_nodata(pixels, valid[k], nodata), k + 1, tile.x0, tile.y0
 
-    pan, texts = sources.pan[0].band, ["no"] * count
+    source, texts = "the colour photograph" if pan[0].companion else pan[0].name, ["no"] * count
     for k, weight in zip(in_range, weights.tolist(), strict=True):
-        texts[k] = f"weighted Brovey by {'the colour photograph' if pan.companion else pan.name}, weight {weight:.4g}"
-    layers = [
-        LayerDescription(la.band.name, unit or "", file.tags(k) | {"PANSHARPENED": text}, file.tags(k, ns="IMAGERY"))
-        for k, (la, unit, text) in enumerate(zip(sources.bands, file.units, texts, strict=False), start=1)
-    ]
-    tags = {k: v for k, v in file.tags().items() if k != "AREA_OR_POINT"}
-    profile = file.profile | {"count": count, "compress": "deflate", "predictor": predictor(dtype.kind)}
-    write_layers(target, profile, layers, tags, blocks())
+        texts[k] = f"weighted Brovey by {source}, weight {weight:.4g}"
+    return [
+        LayerDescription(band.name, unit or "", file.tags(k) | {"PANSHARPENED": text}, file.tags(k, ns="IMAGERY"))
+        for k, (band, unit, text) in enumerate(zip(bands, file.units, texts, strict=False), start=1)
+    ], blocks()

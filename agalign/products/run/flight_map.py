@@ -50,9 +50,8 @@ def footprint(capture: Capture, grid: OutputGrid) -> NDArray[np.float64] | None:
 
     None if neither a georeference nor the camera's pose is known.
     """
-    x0, y0 = grid.x0, grid.y0
-    x1, y1 = x0 + grid.width, y0 + grid.height
-    corners = np.array([[x0, y0], [x1, y0], [x1, y1], [x0, y1], [x0, y0]], dtype=np.float64) / grid.scale
+    outline = geometry.corners(grid.width + 1, grid.height + 1)[[0, 1, 2, 3, 0]]
+    corners = np.add(outline, (grid.x0, grid.y0)) / grid.scale
     georeference = capture.reference.georeference
     try:
         if georeference is not None:
@@ -136,8 +135,7 @@ def missing_for_footprint(capture: Capture) -> str:
 
 def above_elevation(capture: Capture, ground_elevation_m: float) -> Capture:
     """Return the capture with the height above ground of this elevation, if neither tags nor a panel give a height."""
-    height_m = _altitude_m(capture) - ground_elevation_m
-    return _with_height(capture, height_m, "ground elevation")
+    return _with_height(capture, ground_elevation_m, math.inf, "ground elevation")
 
 
 def with_assumed_height(capture: Capture) -> Capture:
@@ -145,7 +143,7 @@ def with_assumed_height(capture: Capture) -> Capture:
     level, at most the legal limit.
     """
     max_assumed_height_m = 120.0  # legal limit of the height above ground of drones in most countries
-    return _with_height(capture, min(_altitude_m(capture), max_assumed_height_m), "assumed")
+    return _with_height(capture, 0.0, max_assumed_height_m, "assumed")
 
 
 def with_approximate_georeference(capture: Capture, crs: str) -> Capture:
@@ -220,15 +218,12 @@ def _outline_px(capture: Capture) -> Points:
     return geometry.corners(width + 1, height + 1)
 
 
-def _altitude_m(capture: Capture) -> float:
-    position = capture.position
-    return math.nan if position is None or position.altitude_m is None else position.altitude_m
-
-
-def _with_height(capture: Capture, height_m: float, source: HeightSource) -> Capture:
-    pose = capture.pose
-    if pose is None or pose.height_m is not None or not height_m > 1.0:  # nan too
+def _with_height(capture: Capture, elevation_m: float, max_height_m: float, source: HeightSource) -> Capture:
+    """The capture with the height of its altitude above an elevation, if none is known and that is above the ground."""
+    pose, altitude_m = capture.pose, capture.altitude_m
+    if pose is None or pose.height_m is not None or altitude_m is None or altitude_m - elevation_m <= 1.0:
         return capture
+    height_m = min(altitude_m - elevation_m, max_height_m)
     return replace(capture, pose=replace(pose, height_m=height_m, height_from=source))
 
 

@@ -1,7 +1,7 @@
 """OUT/agalign-run.json: command, settings, versions, machine and results of a run; the first file that a run writes."""
 
 import platform
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Iterable, Sequence
 from datetime import UTC, datetime
 from importlib import metadata
@@ -70,11 +70,11 @@ class RunPart(_Part):
     versions: dict[str, str]
     machine: dict[str, str | int]
     settings: dict[str, Any]
-    captures: dict[str, int] = {}
+    captures: Counter[str] = Counter()
     """Number of captures found, done, kept, panel, sky, and error."""
-    pairs: dict[str, int] = {}
+    pairs: Counter[str] = Counter()
     """Number of band pairs by status."""
-    stage_seconds: dict[str, float] = {}
+    stage_seconds: defaultdict[str, float] = defaultdict(float)
     """Processing time by stage, summed over workers; includes learning the flight."""
     capture_seconds: dict[str, float] = {}
     """Processing time by capture."""
@@ -84,21 +84,17 @@ class RunPart(_Part):
 
     def add(self, label: str, state: str, result: CaptureResult | None, problems: Iterable[str]) -> None:
         """Add the result of a capture."""
-        self.captures[state] = self.captures.get(state, 0) + 1
+        self.captures[state] += 1
         for text in problems:
             self.add_problem(label, text)
         for band, status, reason in [] if result is None else result.pairs:
-            self.pairs[status] = self.pairs.get(status, 0) + 1
+            self.pairs[status] += 1
             if status != "aligned":
                 self.refused.append(RefusalPart(capture=label, band=band, status=status, reason=reason))
 
     def add_problem(self, what: str, text: str) -> None:
         """Add a problem of a file or capture; characters that are not printable are escaped."""
         self.problems.append(ProblemPart(of=escape_controls(what), problem=escape_controls(text)))
-
-    def add_seconds(self, stage: str, seconds: float) -> None:
-        """Add processing time of a stage."""
-        self.stage_seconds[stage] = self.stage_seconds.get(stage, 0.0) + seconds
 
     def exclusions(self) -> list[str]:
         """Return a line for each kind of exclusion: number of captures, and of those with each cue."""
@@ -133,7 +129,7 @@ def begun(folder: Path, settings: Settings, captures: Sequence[Capture] = (), co
         versions={name: version or "unknown" for name, version in versions.items()},
         machine={**system, "cores": usable_cores(), "device": settings.joint.device},
         settings=settings.model_dump(mode="json"),
-        captures={"found": len(captures)},
+        captures=Counter(found=len(captures)),
     )
 
 

@@ -92,8 +92,7 @@ def _output(context: ProductContext) -> dict[str, Any]:
     stack: dict[str, Any] = stacks[0] if stacks else {"file": None, "bytes": None}
     values = {part["nodata"] for part in stacks or band_files}
     grid, capture = context.grid, context.capture
-    is_raw = context.settings.write.radiometry == "off"
-    radiometry = {b.name: b.radiometry for b in capture.bands if b.radiometry is not None and not is_raw}
+    radiometry = {b.name: b.radiometry for b in capture.bands if b.radiometry is not None and not context.is_raw}
     names = dict.fromkeys(f"{r.quantity} by {r.source}" for r in radiometry.values())
     return stack | {
         "band_files": band_files,
