@@ -17,7 +17,14 @@ import agalign
 from agalign.config import CheckSettings, Settings
 from agalign.errors import InputError, OutputError, SidecarError
 from agalign.products.sidecar.convert import sidecar_of
-from agalign.products.sidecar.file import content_checksum, find_sidecars, read_sidecar, verify_outputs, write_sidecar
+from agalign.products.sidecar.file import (
+    content_checksum,
+    find_sidecars,
+    read_result,
+    read_sidecar,
+    verify_outputs,
+    write_sidecar,
+)
 from agalign.products.sidecar.schema import ProductPart, Sidecar
 from agalign.values import geometry
 from agalign.values.capture import Band, Capture
@@ -130,6 +137,16 @@ def test_the_grid_is_fine_where_a_lens_bends_it() -> None:
             np.stack([s.ev(at_px[:, 1], at_px[:, 0]) for s in splines], axis=-1),
         ):
             assert np.abs(there - mappings[part.band](at_px)).max() < 0.02
+
+
+def test_the_reference_is_one_of_the_bands(tmp_path: Path) -> None:
+    path = tmp_path / "a.json"
+    write_sidecar(path, example())
+    data = read_json(path)
+    path.write_text(json.dumps(data | {"reference": data["reference"] | {"band": "Ghost"}}))
+    for read in (read_sidecar, read_result):
+        with pytest.raises(SidecarError, match=r"a\.json: bands: none of them is the reference band 'Ghost'"):
+            read(path)
 
 
 @pytest.mark.parametrize("name", ["../a.tif", "/vsicurl/http://example.org/a.tif", "C:/a.tif"])

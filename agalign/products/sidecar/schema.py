@@ -11,7 +11,16 @@ from functools import partial
 from typing import Annotated, Any, Literal, Self
 
 import numpy as np
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, GetCoreSchemaHandler, model_validator
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    ConfigDict,
+    Field,
+    GetCoreSchemaHandler,
+    ValidationInfo,
+    field_validator,
+    model_validator,
+)
 from pydantic_core import CoreSchema, core_schema
 
 from agalign.config import CheckSettings
@@ -605,6 +614,14 @@ class CaptureResult(_Result):
     """Processing time, with reading and writing."""
     checksum: str | None = None
     """SHA-256 of the content as JSON with sorted keys and no spaces, without `checksum` and `seconds`."""
+
+    @field_validator("bands")
+    @classmethod
+    def _has_reference(cls, bands: Sequence[BandResult], given: ValidationInfo) -> Sequence[BandResult]:
+        reference = given.data.get("reference")
+        if reference is not None and reference.band not in [b.band for b in bands]:
+            raise ValueError(f"none of them is the reference band {reference.band!r}")
+        return bands
 
     @property
     def max_predicted_px(self) -> float:
