@@ -130,7 +130,7 @@ class LoadedCapture:
             for k, place in enumerate(places):
                 pair = refined.get(self.starts[place][0].name)
                 if pair is not None and pair.result.retrieval >= MIN_RETRIEVAL:
-                    group.mappings[k] = pair.result.fixed_to_moving
+                    group.moving[k].fixed_to_moving = pair.result.fixed_to_moving
         return [group for _, group in self.groups]
 
     def refined_by(self, net: Descriptor, settings: Settings, *, is_final: bool = True) -> LearningCapture:

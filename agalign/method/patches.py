@@ -66,13 +66,6 @@ def transform(homography: Tensor, points: Tensor) -> Tensor:
     return mapped[..., :2] / mapped[..., 2:]
 
 
-def translation(shift: Tensor) -> Tensor:
-    """Return the homography (3, 3) of a shift (2,) px."""
-    h = torch.eye(3, dtype=shift.dtype, device=shift.device)
-    h[:2, 2] = shift
-    return h
-
-
 @dataclass(frozen=True)
 class Keypoints:
     """Oriented, scaled positions in one image."""

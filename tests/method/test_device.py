@@ -19,7 +19,7 @@ from agalign.method.device import choose_device, one_memory_error, one_thread
 from agalign.method.fast import Schedule
 from agalign.method.joint import align_from_scratch
 from agalign.method.paper import Training
-from agalign.method.state import ImageGroup
+from agalign.method.state import ImageGroup, MovingImage
 from agalign.values import geometry
 from agalign.values.alignment import JointResult
 from agalign.values.choices import Recipe
@@ -89,13 +89,13 @@ def gpu(monkeypatch: pytest.MonkeyPatch) -> GPU:
 )
 def test_a_gpu_gives_the_result_of_the_cpu(gpu: GPU, recipe: Recipe, has_float64: bool) -> None:
     fixed, moving = (view.pixels for view in two_views(geometry.translation(6.0, -4.0), 260, 200))
-    lens, fields = Lens(260.0, 260.0, 130.0, 100.0, (0.01,)), [DisplacementField(60.0, np.full((5, 6, 2), 0.1))]
+    lens, field = Lens(260.0, 260.0, 130.0, 100.0, (0.01,)), DisplacementField(60.0, np.full((5, 6, 2), 0.1))
     short = {"schedule": Schedule(max_steps=10, enough_retrieval=2.0), "training": Training(200, 1)}
 
     def align(name: str) -> JointResult:
         rgb, band = whole(np.stack([fixed, 0.5 * fixed, -fixed]), lens), whole(moving, lens)
         seed, settings = geometry.translation(7.0, -5.0), JointSettings(recipe=recipe, device=name)
-        group = ImageGroup(rgb, [band], [seed], [1], [False], max_shift_px=[9.0], fields=fields)
+        group = ImageGroup(rgb, [MovingImage(band, seed, max_shift_px=9.0, field=field)])
         (result,) = align_from_scratch(group, settings, lambda *_: None, **short)
         assert isinstance(result, JointResult)
         return result

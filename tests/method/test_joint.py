@@ -9,7 +9,7 @@ from agalign.method.fast import learn, learn_scales
 from agalign.method.joint import align_from_scratch
 from agalign.method.paper import Training
 from agalign.method.refine import refine
-from agalign.method.state import ImageGroup, JointState
+from agalign.method.state import ImageGroup, JointState, MovingImage
 from agalign.values import geometry
 from agalign.values.alignment import JointResult
 from agalign.values.choices import Recipe
@@ -28,7 +28,7 @@ NEAR = geometry.translation(7.5, -5.5)
 def scratch(
     fixed: Raster, moving: Raster, seed: np.ndarray, settings: JointSettings | None = None, **how: Any
 ) -> JointResult | Issue:
-    group = ImageGroup.of_one(fixed, moving, seed, trusted=True)
+    group = ImageGroup(fixed, [MovingImage(moving, seed, trusted=True)])
     return align_from_scratch(group, settings or JointSettings(), lambda *_: None, **how)[0]
 
 
@@ -108,7 +108,7 @@ def test_a_distant_start_is_found_by_searching_the_loss() -> None:
     fixed, moving = two_views(truth)
     state = JointState(JointSettings(device="cpu"), lambda *_: None)
     net = state.fast_descriptor([1, 1])
-    group = ImageGroup.of_one(fixed, moving, geometry.translation(46.0, 26.0))
+    group = ImageGroup(fixed, [MovingImage(moving, geometry.translation(46.0, 26.0))])
     learn(state, [group], net)
     result = refine(state, net, group)[0]
     assert np.abs(geometry.apply(result.fixed_to_moving, [[200.0, 160.0]]) - [206.0, 156.0]).max() < 0.2
