@@ -1,3 +1,4 @@
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -53,43 +54,35 @@ def test_the_factor_is_reflectance_by_the_tags_or_the_user_over_radiance(tmp_pat
     assert read_panel(shown, {"red": 0.6}).bands[0].factor == pytest.approx(0.4)
 
 
-def in_light(light: str) -> np.ndarray:
-    """Levels (30, 30) of a panel with the noise of a camera, in this light."""
-    rng = np.random.default_rng(1)
-    panel = rng.normal(1.0, 0.03, (30, 30))
-    if light.startswith("shadow"):
-        panel[:, : 5 + int(light.split()[2]) * 20 // 100] *= 0.5
-    elif light == "noise":
-        panel = rng.uniform(0.0, 2.0, (30, 30))
-    elif light == "half black":
-        panel[:15] = 0.0
+def levels(shaded_columns: int = 0, light: float = 0.5, noise: float = 0.03) -> np.ndarray:
+    """Levels (30, 30) of a panel with the noise of a camera and less light in some columns."""
+    panel = np.random.default_rng(1).normal(1.0, noise, (30, 30))
+    panel[:, :shaded_columns] *= light
     return np.clip(1000 + 20000 * panel, 0, 65000)
 
 
 @pytest.mark.parametrize(
-    ("levels", "problem"),
+    ("values", "problem"),
     [
-        (in_light("even"), ""),
-        (in_light("shadow of 30 %"), ""),
-        (in_light("shadow of 50 %"), "its pixels vary by "),
-        (in_light("shadow of 70 %"), "its pixels vary by "),
-        (in_light("noise"), "its pixels vary by "),
-        (in_light("half black"), "its pixels vary by "),
+        (levels(), ""),
+        (levels(11), ""),
+        (levels(15), "its pixels vary by "),
+        (levels(noise=0.6), "its pixels vary by "),
+        (levels(15, light=0.0), "its pixels vary by "),
         (900, "it is black"),
         (65535, "saturated"),
     ],
 )
 def test_a_panel_is_measured_where_it_is_evenly_lit_and_exposed(
-    tmp_path: Path, levels: int | np.ndarray, problem: str
+    tmp_path: Path, values: int | np.ndarray, problem: str
 ) -> None:
     """A shadow over 30 % of the panel, by half, would make every band 16 % too bright."""
-    reading = read_panel(capture(panel_file(tmp_path / "a.tif", levels)), {})
+    reading = read_panel(capture(panel_file(tmp_path / "a.tif", values)), {})
     (result,) = reading.bands
     if problem:
         assert problem in result.problem
         assert result.factor is None
-        (part,) = write_panels([reading], tmp_path)
-        assert f"not used in Green: {result.problem}" in part.sentence
+        assert f"not used in Green: {result.problem}" in write_panels([reading], tmp_path)[0].sentence
     else:
         assert (result.problem, result.radiance) == ("", pytest.approx(2.0 * 20000 / 65536, rel=0.03))
 
@@ -170,32 +163,24 @@ def test_a_panel_on_the_ground_gives_the_height_of_other_captures() -> None:
     assert with_height(replace(high, position=Position(52.0, 5.0, 93.5)), [ground]).pose == high.pose
 
 
-def captures_in_seconds(undated: int | None = None) -> list[Capture]:
-    """Twenty captures, named by the second in which they were taken."""
-    moments = ["" if k == undated else f"2026-06-21T10:00:{k:02d}" for k in range(20)]
-    return [replace(capture(GREEN, moment), name=f"{k}") for k, moment in enumerate(moments)]
+def found(folder: Path, seconds: Iterable[int], shown: Sequence[int], undated: int | None = None) -> list[int]:
+    """The captures with a panel, by the second in which they were taken, of a flight with panels in some of them."""
+    flight = []
+    for k in seconds:
+        band = replace(panel_file(folder / f"{k}.tif", 33768 if k in shown else 2000), panel=None)
+        moment = "" if k == undated else f"2026-06-21T10:00:{k:02d}"
+        flight.append(replace(capture(band, moment), name=f"{k}"))
+    return [int(c.name) for c in with_panels(flight, without_code=True) if c.panel]
 
 
-def test_the_search_for_panels_ends_after_three_captures_without_one(monkeypatch: pytest.MonkeyPatch) -> None:
-    flight, looked, shown = captures_in_seconds(), [], (0, 1, 2, 3, 5, 18)
-
-    def detected(one: Capture, _without_code: bool) -> Capture:
-        looked.append(int(one.name))
-        return replace(one, bands=(HELD if int(one.name) in shown else GREEN,))
-
-    monkeypatch.setattr("agalign.flight.panel_readings._with_detected_panel", detected)
-    assert [int(c.name) for c in with_panels(flight) if c.panel] == list(shown)
-    assert sorted(looked) == [0, 1, 2, 3, 4, 5, 6, 7, 8, 15, 16, 17, 18, 19]
-    for few in (flight[7:8], flight[7:9], []):
-        looked.clear()
-        assert len(with_panels(few)) == len(few)
-        assert sorted(looked) == [int(c.name) for c in few]
+def test_the_search_for_panels_ends_after_three_captures_without_one(tmp_path: Path) -> None:
+    assert found(tmp_path, range(20), [0, 1, 2, 3, 6, 10, 14, 18]) == [0, 1, 2, 3, 6, 18]
+    for few in ([7], [7, 8], []):
+        assert found(tmp_path, few, few) == few
     # One unknown time leaves the captures in their order.
-    looked.clear()
-    detect = "agalign.flight.panel_readings._with_detected_panel"
-    monkeypatch.setattr(detect, lambda one, _without_code: looked.append(int(one.name)) or one)
-    with_panels(captures_in_seconds(undated=10))
-    assert sorted(looked) == [0, 1, 2, 17, 18, 19]
+    turned = [*range(10, 20), *range(10)]
+    assert found(tmp_path, turned, [0, 19]) == [19, 0]
+    assert found(tmp_path, turned, [0, 19], undated=5) == []
 
 
 def test_without_a_time_no_panel_is_of_the_same_hours() -> None:
@@ -210,8 +195,6 @@ def test_without_a_time_no_panel_is_of_the_same_hours() -> None:
     ground = PanelReading(capture(HELD, "1970-01-01T01:00:00", position=GROUND), ())
     high = capture(GREEN, "", position=HIGH, pose=Pose(30.0))
     assert with_height(high, [ground]) == high
-    undated = replace(ground, capture=replace(ground.capture, captured_at=""))
-    assert with_height(replace(high, captured_at="1970-01-01T01:00:00"), [undated]).pose == high.pose
 
 
 @pytest.mark.parametrize("code", ["RP04", ""])
