@@ -55,12 +55,10 @@ def distance(f: Tensor, f_prime: Tensor) -> Tensor:
 def retrieval(f: Tensor, f_prime: Tensor, allowed: Tensor) -> float:
     """Return the share of rows i of `f` (N, D) with row i of `f_prime` (N, D) as nearest neighbour.
 
-    It is averaged over both directions. Pairs that are False in `allowed` (N, N) are ignored, except on the diagonal.
+    It is averaged over both directions. Pairs that are False in `allowed` (N, N) are ignored; its diagonal is True.
     Chance is about 1 / N.
     """
-    d = torch.cdist(f, f_prime)
-    keep = allowed | torch.eye(len(f), dtype=torch.bool, device=f.device)
-    d = d.masked_fill(~keep, float("inf"))
+    d = torch.cdist(f, f_prime).masked_fill(~allowed, float("inf"))
     target = torch.arange(len(f), device=f.device)
     hits = (d.argmin(dim=1) == target).float().mean() + (d.argmin(dim=0) == target).float().mean()
     return float(0.5 * hits)

@@ -263,11 +263,9 @@ def in_batch_loss(f: Tensor, f_prime: Tensor, allowed: Tensor) -> Tensor:
     """Return the symmetric InfoNCE loss with the other rows of the batch as negatives, a scalar.
 
     `f` and `f_prime` are (N, D) descriptors of unit length; row i of one matches row i of the other. `allowed` (N, N)
-    is False where two keypoints are too close to be negatives of each other; its diagonal is ignored.
+    is False where two keypoints are too close to be negatives of each other; its diagonal is True.
     Source: van den Oord et al. 2018, Eq. 4.
     """
-    logits = f @ f_prime.T / _TEMPERATURE
-    keep = allowed | torch.eye(len(f), dtype=torch.bool, device=f.device)
-    logits = logits.masked_fill(~keep, float("-inf"))
+    logits = (f @ f_prime.T / _TEMPERATURE).masked_fill(~allowed, float("-inf"))
     target = torch.arange(len(f), device=f.device)
     return 0.5 * (functional.cross_entropy(logits, target) + functional.cross_entropy(logits.T, target))

@@ -133,5 +133,6 @@ def footprint_radius(scale: Tensor) -> Tensor:
 
 
 def far_apart(keypoints: Keypoints) -> Tensor:
-    """Return (N, N) True where two keypoints are far enough apart to be negatives of each other."""
-    return torch.cdist(keypoints.xy, keypoints.xy) >= _MIN_NEGATIVE_PX
+    """Return (N, N) True where two keypoints are far apart, so that they may be negatives, and on the diagonal."""
+    is_far = torch.cdist(keypoints.xy, keypoints.xy) >= _MIN_NEGATIVE_PX
+    return is_far.fill_diagonal_(True)
