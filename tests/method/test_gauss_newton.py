@@ -1,6 +1,7 @@
 import math
 from collections.abc import Callable
 
+import cv2
 import numpy as np
 import pytest
 import torch
@@ -15,7 +16,8 @@ from agalign.method.state import ImageGroup, JointState, MovingImage
 from agalign.values import geometry
 from agalign.values.issues import CORNERS_UNKNOWN, Issue
 
-from ..builders import two_views
+from ..builders import whole
+from ..conftest import textured_image
 
 SIZE = WIDTH, HEIGHT = 300, 200
 CORNERS = torch.from_numpy(geometry.corners(WIDTH, HEIGHT))
@@ -79,13 +81,29 @@ def test_the_standard_error_equals_the_scatter_of_repeated_trials() -> None:
 # ---- steps on images
 
 
-@pytest.fixture(scope="module")
-def level() -> Level:
-    """Two equal views."""
-    fixed, moving = two_views(np.eye(3))
-    return make_level(
-        JointState(JointSettings(device="cpu"), lambda *_: None), fixed, [MovingImage(moving, np.eye(3))], 1.0
-    )
+STATE = JointState(JointSettings(device="cpu"), lambda *_: None)
+
+
+@pytest.fixture
+def group() -> ImageGroup:
+    """Two equal smooth images."""
+    smooth = whole(cv2.GaussianBlur(textured_image(400, 320), (0, 0), 3.0))
+    return ImageGroup(smooth, [MovingImage(smooth, np.eye(3))])
+
+
+@pytest.fixture
+def level(group: ImageGroup) -> Level:
+    return make_level(STATE, group.fixed, group.moving, 1.0)
+
+
+@torch.no_grad()
+def test_the_gradient_predicts_the_descriptors_of_shifted_patches(level: Level) -> None:
+    net, (p, _) = STATE.fast_descriptor([1, 1]), level.draw(level.anywhere, 200, 0.3)
+    patches = ReferencePatches.of(net, level, p)
+    for shift in ((0.7, 0.0), (0.0, 0.7)):
+        change = level.describe(net, p.moved(*shift)) - patches.f
+        predicted = patches.gradient @ torch.tensor(shift)
+        assert float((predicted * change).sum() / change.square().sum()) == pytest.approx(0.9, abs=0.1)
 
 
 def step_of(x: float, length_px: float) -> Step:
@@ -112,15 +130,11 @@ def test_steps_with_a_constant_ratio_are_extrapolated_and_infinite_ones_left_out
 ) -> None:
     monkeypatch.setattr("agalign.method.refine.step_from", lambda _net, band, *_: step_at(float(band.h[0, 2])))
     (band,) = level.bands
-    band.h = torch.eye(3)
     patches = ReferencePatches(*(torch.zeros(4, 2),) * 3)
     assert converge(None, band, patches, "homography").length_px == pytest.approx(last_px, abs=0.03)
     assert float(band.h[0, 2]) == pytest.approx(end, abs=1e-3)
 
 
-def test_an_infinite_last_step_means_unknown_corners(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_infinite_last_step_means_unknown_corners(group: ImageGroup, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("agalign.method.gauss_newton.transform", lambda _h, points: points * math.nan)
-    state = JointState(JointSettings(device="cpu"), lambda *_: None)
-    fixed, moving = two_views(np.eye(3))
-    group = ImageGroup(fixed, [MovingImage(moving, np.eye(3))])
-    assert refine(state, state.fast_descriptor([1, 1]), group) == [Issue(CORNERS_UNKNOWN)]
+    assert refine(STATE, STATE.fast_descriptor([1, 1]), group) == [Issue(CORNERS_UNKNOWN)]
