@@ -11,7 +11,7 @@ from agalign.config import SeedSettings
 from agalign.fit.adjustment import fit_in_rounds
 from agalign.flight.model import FlightModel
 from agalign.method.descriptor import Descriptor
-from agalign.method.match import match_seed, starter_for_matching
+from agalign.method.match import match_seed, matching_network, starter_for_matching
 from agalign.method.state import ImageGroup, MovingImage
 from agalign.pixels.band_resampling import channel_mean, textured, warped
 from agalign.pixels.landmarks import LANDMARK_INPUTS, landmarks, matched_homography
@@ -143,7 +143,9 @@ def _matches(pair: BandPair, model: FlightModel | None, *, by_learned_descriptor
 
 def _network(pair: BandPair, model: FlightModel | None) -> Descriptor:
     channels = pair.fixed.channels, pair.moving.channels
-    return starter_for_matching(channels) if model is None else model.matching_network(pair.name, channels)
+    if model is None:
+        return starter_for_matching(channels)
+    return matching_network(model.net, model.side(pair.name) or 1, channels)
 
 
 def image_groups(starts: Sequence[Start], sides: Sequence[int] = ()) -> list[tuple[list[int], ImageGroup]]:

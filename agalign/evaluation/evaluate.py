@@ -149,7 +149,7 @@ def _by_network(net: Descriptor, state: JointState, one: Raster, other: Raster) 
     def describe(keypoints: Keypoints, fixed_to_moving: Matrix) -> tuple[Tensor, Tensor]:
         level = make_level(state, one, [MovingImage(other, fixed_to_moving)], 1.0)
         keypoints = keypoints.to(state.device)
-        return level.describe(net, keypoints), level.bands[0].describe(net, keypoints)
+        return level.fixed.describe(net, keypoints), level.bands[0].describe(net, keypoints)
 
     return describe
 

@@ -227,7 +227,7 @@ class _Learner:
         p, _ = level.draw(level.anywhere, _PATCHES, _OCTAVES)
         if len(p) < MIN_KEYPOINTS:
             return True
-        f_test = level.describe(self.net, test)
+        f_test = level.fixed.describe(self.net, test)
         patches = ReferencePatches.of(self.net, level, p)
         for band in level.bands:
             band.retrieval, _ = held_out_retrieval(self.net, band, test, f_test)

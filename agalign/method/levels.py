@@ -60,6 +60,11 @@ class LevelImage:
         """Sample patches at undistorted positions, (N, 16, 16, 2) -> (N, C, 16, 16)."""
         return bilinear(self.image, self.raw(positions))
 
+    def describe(self, net: Descriptor, keypoints: Keypoints, side: int = REFERENCE) -> Tensor:
+        """Return the descriptors (N, 256) of keypoints of this image by a side of the network."""
+        f: Tensor = net(self.patches(patch_positions(keypoints)), side)
+        return f
+
     def clearance_at(self, points: Tensor) -> Tensor:
         """Return the distance (N,) px from undistorted positions (N, 2) to the nearest invalid pixel; 0 outside."""
         width, height = self.size_px
@@ -154,11 +159,6 @@ class Level:
     anywhere: Pool
     """Both, without a limit on the radius of a patch."""
     generator: torch.Generator
-
-    def describe(self, net: Descriptor, keypoints: Keypoints) -> Tensor:
-        """Return f(x) for keypoints x of I, (N, 256)."""
-        f: Tensor = net(self.fixed.patches(patch_positions(keypoints)), REFERENCE)
-        return f
 
     def draw(self, pool: Pool, count: int, octaves: float, spacing_px: float = 1.0) -> tuple[Keypoints, Tensor]:
         """Draw up to `count` keypoints with patches in the valid area of I and of at least one I'.

@@ -89,10 +89,10 @@ def match_seed(net: Descriptor, fixed: Raster, moving: Raster, maximum: int = MA
     (image, keypoints), (image_prime, keypoints_prime) = (_keypoints(r, device, maximum) for r in (fixed, moving))
     if min(len(keypoints), len(keypoints_prime)) < _MIN_MATCHES:
         return None
-    f = net(image.patches(patch_positions(keypoints)), REFERENCE)
+    f = image.describe(net, keypoints)
     # Reversed contrast turns the gradient, and with it the orientation of a keypoint, by 180 degrees.
     orientations = [replace(keypoints_prime, angle=keypoints_prime.angle + turn) for turn in (0.0, torch.pi)]
-    f_prime = torch.cat([net(image_prime.patches(patch_positions(k)), 1) for k in orientations])
+    f_prime = torch.cat([image_prime.describe(net, k, side=1) for k in orientations])
     rows, columns = _mutual_nearest(f, f_prime, len(keypoints_prime))
     if len(rows) < _MIN_MATCHES:
         return None

@@ -54,10 +54,6 @@ class Training:
     """Passes over the keypoints at the coarsest level, half as many at each next one: psi has farthest to go at the
     coarsest. Not given in the paper; its 90 s a pair on a GTX 1080 Ti are about 100 at each level."""
 
-    def at(self, level: int) -> "Training":
-        """Return the training of a level, 0 for the coarsest."""
-        return replace(self, epochs=max(1, self.epochs >> level))
-
 
 DEFAULT_TRAINING = Training()
 
@@ -89,7 +85,8 @@ def align_by_paper(
         def report(share: float, number: int = number) -> None:
             state.progress("learning", (number + share) / len(scales))
 
-        level_steps, loss, last_step_px = descend(state, net, level, pool, training.at(number), report=report)
+        at_level = replace(training, epochs=max(1, training.epochs >> number))
+        level_steps, loss, last_step_px = descend(state, net, level, pool, at_level, report=report)
         moving.fixed_to_moving = level.bands[0].fixed_to_moving
         steps += level_steps
     result = refine(state, net, group, update_psi=False)[0]
@@ -175,7 +172,7 @@ def _draw(level: Level, pool: Pool, count: int) -> tuple[Keypoints, Keypoints, T
 
 def _loss(net: Descriptor, level: Level, h: Tensor, x: Keypoints, x_false: Keypoints, is_negative: Tensor) -> Tensor:
     """Return the sum of L0(x, w_k(x; psi)) and of L1(x, x') (paper, Eq. 3)."""
-    f = level.describe(net, x)
+    f = level.fixed.describe(net, x)
     band = level.bands[0]
     positions = torch.cat([patch_positions(warp_keypoints(x, h)), patch_positions(x_false)])
     f_true, f_false = net(band.view.patches(positions), band.moving.side).chunk(2)

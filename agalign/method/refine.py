@@ -69,10 +69,10 @@ class ReferencePatches:
 
         def difference(dx_px: float, dy_px: float) -> Tensor:
             ahead, behind = keypoints.moved(dx_px, dy_px), keypoints.moved(-dx_px, -dy_px)
-            return level.describe(net, ahead) - level.describe(net, behind)
+            return level.fixed.describe(net, ahead) - level.fixed.describe(net, behind)
 
         gradient = torch.stack([difference(e, 0), difference(0, e)], dim=2) / (2 * e)
-        return cls(keypoints, level.describe(net, keypoints), gradient)
+        return cls(keypoints, level.fixed.describe(net, keypoints), gradient)
 
     def head(self, count: int) -> "ReferencePatches":
         """Return the first `count` patches."""
@@ -140,26 +140,16 @@ def best_shift(net: Descriptor, level: Level, band: LevelBand, keypoints: Keypoi
     nowhere = band.h.new_zeros(2)
     if len(keypoints) < MIN_KEYPOINTS:
         return nowhere
-    f = level.describe(net, keypoints)
+    f = level.fixed.describe(net, keypoints)
     count = int(radius_px / _SEARCH_STEP_PX)
     offsets = torch.arange(-count, count + 1) * _SEARCH_STEP_PX
     shifts = torch.cartesian_prod(offsets, offsets).to(band.h)
     shifts = shifts[shifts.norm(dim=1) <= radius_px]
-
-    def losses_of(some: Tensor, count: int) -> tuple[Tensor, Tensor]:
-        """Return the losses (S, count) of shifts (S, 2) with the first keypoints, and their means (S,), inf where too
-        few patches are visible.
-        """
-        p = keypoints[torch.arange(min(count, len(keypoints)), device=band.h.device)]
-        shifts_per_batch = 16  # limits the memory of a search
-        batches = torch.split(some, shifts_per_batch)
-        losses = torch.cat([_shifted_losses(net, band, p, f[: len(p)], batch) for batch in batches])
-        enough = losses.isfinite().sum(dim=1) >= MIN_KEYPOINTS
-        return losses, losses.nanmean(dim=1).masked_fill(~enough, float("inf"))
-
-    _, means = losses_of(shifts, _PRESELECTION_PATCHES)
+    few = torch.arange(min(_PRESELECTION_PATCHES, len(keypoints)), device=band.h.device)
+    means = _means(_shifted_losses(net, band, keypoints[few], f[few], shifts))
     candidates = torch.cat([nowhere[None], shifts[means.argsort()[:_CANDIDATE_SHIFTS]]])
-    losses, means = losses_of(candidates, len(keypoints))
+    losses = _shifted_losses(net, band, keypoints, f, candidates)
+    means = _means(losses)
     best = int(means.argmin())
     gain = losses[0] - losses[best]
     gain = gain[gain.isfinite()]
@@ -171,11 +161,20 @@ def best_shift(net: Descriptor, level: Level, band: LevelBand, keypoints: Keypoi
 
 def _shifted_losses(net: Descriptor, band: LevelBand, keypoints: Keypoints, f: Tensor, shifts: Tensor) -> Tensor:
     """Return L0 (S, N) of each keypoint with each shift (S, 2) of the fixed side, NaN where its patch leaves I'."""
-    count = len(shifts)
-    xy = (keypoints.xy + shifts[:, None]).reshape(-1, 2)
-    shifted = Keypoints(xy, keypoints.angle.repeat(count), keypoints.scale.repeat(count))
-    losses = distance(f.repeat(count, 1), band.describe(net, shifted))
-    return losses.masked_fill(~band.shows(shifted), float("nan")).reshape(count, -1)
+    shifts_per_batch = 16  # limits the memory of a search
+    losses = []
+    for batch in torch.split(shifts, shifts_per_batch):
+        xy, count = (keypoints.xy + batch[:, None]).reshape(-1, 2), len(batch)
+        shifted = Keypoints(xy, keypoints.angle.repeat(count), keypoints.scale.repeat(count))
+        loss = distance(f.repeat(count, 1), band.describe(net, shifted))
+        losses.append(loss.masked_fill(~band.shows(shifted), float("nan")).reshape(count, -1))
+    return torch.cat(losses)
+
+
+def _means(losses: Tensor) -> Tensor:
+    """Return the means (S,) of losses (S, N) that are not NaN, infinite where these are too few."""
+    enough = losses.isfinite().sum(dim=1) >= MIN_KEYPOINTS
+    return losses.nanmean(dim=1).masked_fill(~enough, float("inf"))
 
 
 @torch.no_grad()
@@ -193,7 +192,7 @@ def refine(
     if len(p) < MIN_KEYPOINTS:
         return [Issue(FEW_KEYPOINTS, len(p), MIN_KEYPOINTS)] * len(group.moving)
     reference_patches = ReferencePatches.of(net, level, p)
-    f_test = level.describe(net, test)
+    f_test = level.fixed.describe(net, test)
 
     def result(band: LevelBand) -> JointResult[FixedImagePx] | Issue:
         if band.moving.dropped_at is not None:
