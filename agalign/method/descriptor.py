@@ -7,10 +7,9 @@ Conv(C, 32, 5) - Tanh - MaxPool(2) - Conv(32, 64, 3) - Tanh - FC(256) on 16 x 16
 from collections.abc import Mapping, Sequence
 from functools import cache
 from importlib import resources
-from pathlib import Path
 
 import torch
-from safetensors.torch import load, save_file
+from safetensors.torch import load
 from torch import Tensor, nn
 
 from agalign.errors import ConfigurationError
@@ -136,11 +135,6 @@ def start_from_starter(net: Descriptor) -> None:
     same method on synthetic flights (tools/learn_starter.py).
     """
     start_from(net, _weights())
-
-
-def save_starter(net: Descriptor, path: Path) -> None:
-    """Write a siamese network in half precision."""
-    save_file({name: value.detach().cpu().half().contiguous() for name, value in net.state_dict().items()}, path)
 
 
 @cache

@@ -5,7 +5,6 @@ the parameters of a homography, L0 and L1 the losses. The constants are those of
 """
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -81,12 +80,9 @@ def align_by_paper(
         # The last theta measures the held-out retrieval, so it must not be trained on the held-out cells.
         pool = level.trainable if scale == 1.0 else level.anywhere
         net = state.random_descriptor(channels)
-
-        def report(share: float, number: int = number) -> None:
-            state.progress("learning", (number + share) / len(scales))
-
         at_level = replace(training, epochs=max(1, training.epochs >> number))
-        level_steps, loss, last_step_px = descend(state, net, level, pool, at_level, report=report)
+        shares = number / len(scales), (number + 1) / len(scales)
+        level_steps, loss, last_step_px = descend(state, net, level, pool, at_level, shares=shares)
         moving.fixed_to_moving = level.bands[0].fixed_to_moving
         steps += level_steps
     result = refine(state, net, group, update_psi=False)[0]
@@ -110,14 +106,15 @@ def descend(
     pool: Pool,
     training: Training = DEFAULT_TRAINING,
     *,
-    report: Callable[[float], None] = lambda _: None,
+    shares: tuple[float, float] = (0.0, 1.0),
     update_psi: bool = True,
 ) -> tuple[int, float, float]:
     """Minimise sum L0(x; psi, theta) + sum L1(x, x'; theta) over theta and psi (paper, Eq. 5).
 
     Keypoints x are drawn from `pool`. Without `update_psi`, only theta is learned (paper, Eq. 4). The homography of the
-    moving image is updated. Returns (number of steps, mean loss per keypoint over the last epoch, largest displacement
-    of a corner in the last step, px of the level). Raises NotEnoughTextureError.
+    moving image is updated. `shares` are the completed shares of the whole work before and after. Returns (number of
+    steps, mean loss per keypoint over the last epoch, largest displacement of a corner in the last step, px of the
+    level). Raises NotEnoughTextureError.
     """
     size_px, band = level.fixed.size_px, level.bands[0]
     psi = psi_from_homography(to_float64(band.h), *size_px).to(level.fixed.image).requires_grad_()
@@ -148,7 +145,7 @@ def descend(
         annealing.step()
         steps += len(batches)
         loss_value = pass_loss / (len(batches) * _BATCH)
-        report((epoch + 1) / training.epochs)
+        state.progress("learning", float(np.interp(epoch + 1, (0, training.epochs), shares)))
     band.h, h_before = (homography_from_psi(q, *size_px).detach() for q in (psi, before))
     corners = torch.tensor(geometry.corners(*size_px)).to(band.h)
     last_step = (transform(band.h, corners) - transform(h_before, corners)).norm(dim=1).max()
