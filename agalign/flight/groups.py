@@ -24,7 +24,10 @@ def flight_key(capture: Capture) -> tuple[str, str]:
 
 def flight_camera(captures: Sequence[Capture]) -> str:
     """Return the camera of a flight and all bands in its captures, the reference first."""
-    return _key(captures[0], _bands_of(captures))
+    bands = {captures[0].reference.name: captures[0].reference}
+    for band in (b for c in _by_completeness(captures) for b in c.moving):
+        bands.setdefault(band.name, band)
+    return _key(captures[0], bands.values())
 
 
 def flight_lenses(captures: Sequence[Capture]) -> tuple[str, ...]:
@@ -189,18 +192,9 @@ def _supports(capture: Capture, choice: RadiometryChoice) -> bool:
     return all(b.radiometry is not None for b in bands if not b.companion)
 
 
-def _key(capture: Capture, bands: Sequence[Band]) -> str:
+def _key(capture: Capture, bands: Iterable[Band]) -> str:
     camera, with_sizes = capture.camera, (f"{b.name} {b.width_px}x{b.height_px}" for b in bands)
     return f"{camera.make} {camera.model} {camera.serial}".strip() + f" [{', '.join(with_sizes)}]"
-
-
-def _bands_of(captures: Sequence[Capture]) -> list[Band]:
-    """Return one band of each name, the reference first."""
-    result = {captures[0].reference.name: captures[0].reference}
-    for capture in _by_completeness(captures):
-        for band in capture.moving:
-            result.setdefault(band.name, band)
-    return list(result.values())
 
 
 def _by_completeness(captures: Sequence[Capture]) -> list[Capture]:

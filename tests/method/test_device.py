@@ -1,9 +1,9 @@
-import re
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 import torch
@@ -59,13 +59,12 @@ def test_overlapping_contexts_restore_the_threads_of_torch() -> None:
 
 
 def test_out_of_memory_is_always_a_memory_error() -> None:
-    for text, error in (
-        ("[enforce fail at alloc_cpu.cpp] DefaultCPUAllocator: not enough memory", MemoryError),
-        ("MPS backend out of memory (MPS allocated: 8.00 GB)", MemoryError),
-        ("something else, of memory", RuntimeError),
-    ):
-        with pytest.raises(error, match=re.escape(text)), one_memory_error():
-            raise RuntimeError(text)
+    with pytest.raises(MemoryError, match="Failed to allocate"), one_memory_error():
+        cv2.resize(np.zeros((9, 9)), (1 << 30, 1 << 20))
+    with pytest.raises(MemoryError, match="can't allocate memory"), one_memory_error():
+        torch.empty(1 << 60)
+    with pytest.raises(RuntimeError, match="something else"), one_memory_error():
+        raise RuntimeError("something else, of memory")
 
 
 AssertEqualOnGpu = Callable[[Callable[[str], JointResult], bool], None]
