@@ -37,11 +37,9 @@ def sift_keypoints(raster: Raster, maximum: int = MAX_KEYPOINTS) -> Keypoints:
     strongest = sorted(detected, key=lambda k: -k.response)[:maximum]
     # Patches are as wide as the area that SIFT describes, 6 times the size of the keypoint.
     spacing_per_size = 6 / PATCH_PX
-    return Keypoints(
-        torch.tensor([k.pt for k in strongest], dtype=torch.float32).reshape(-1, 2),
-        torch.tensor([math.radians(k.angle) for k in strongest], dtype=torch.float32),
-        torch.tensor([k.size * spacing_per_size for k in strongest], dtype=torch.float32),
-    )
+    rows = [(*k.pt, math.radians(k.angle), k.size * spacing_per_size) for k in strongest]
+    x, y, angle, scale = torch.tensor(rows, dtype=torch.float32).reshape(-1, 4).unbind(dim=1)
+    return Keypoints(torch.stack([x, y], dim=1), angle, scale)
 
 
 def visible_in_both(keypoints: Keypoints, fixed_to_moving: Matrix, fixed: Raster, moving: Raster) -> Keypoints:
