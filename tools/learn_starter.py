@@ -12,13 +12,13 @@ import tempfile
 from pathlib import Path
 
 import torch
+from safetensors.torch import save_file
 
 import agalign
 from agalign.cameras.discover import discover
 from agalign.capture.band_pair import read_pairs
 from agalign.capture.seeding import find_seed, image_groups
 from agalign.config import JointSettings, SeedSettings
-from agalign.method.descriptor import save_starter
 from agalign.method.fast import Schedule, learn
 from agalign.method.state import ImageGroup, JointState
 from agalign.synthetic.flight import make_flight
@@ -56,7 +56,8 @@ def main() -> None:
         if net is None:
             net = state.fast_descriptor([1] * (1 + len(groups[0].moving)))
         learn(state, groups, net, schedule=schedule)
-    save_starter(net, Path(agalign.__file__).parent / "method" / "starter.safetensors")
+    weights = {name: value.detach().half().contiguous() for name, value in net.cpu().state_dict().items()}
+    save_file(weights, Path(agalign.__file__).parent / "method" / "starter.safetensors")
 
 
 if __name__ == "__main__":

@@ -157,7 +157,7 @@ def load_capture(
                 for k, place in enumerate(places):
                     pair = known.get(result[place][0].name)
                     if pair is not None and pair.result.retrieval >= MIN_RETRIEVAL:
-                        group.mappings[k] = pair.result.fixed_to_moving
+                        group.moving[k].fixed_to_moving = pair.result.fixed_to_moving
             return LoadedCapture(capture, groups, result)
     return None
 

@@ -11,8 +11,8 @@ from agalign.config import SeedSettings
 from agalign.fit.adjustment import fit_in_rounds
 from agalign.flight.model import FlightModel
 from agalign.method.descriptor import Descriptor
-from agalign.method.match import match_seed, starter_for_matching
-from agalign.method.state import ImageGroup
+from agalign.method.match import match_seed, matching_network, starter_for_matching
+from agalign.method.state import ImageGroup, MovingImage
 from agalign.pixels.band_resampling import channel_mean, textured, warped
 from agalign.pixels.landmarks import LANDMARK_INPUTS, landmarks, matched_homography
 from agalign.pixels.structure import Peak, correlation_surfaces, find_peak, structure_field, windowed_spectra
@@ -143,7 +143,9 @@ def _matches(pair: BandPair, model: FlightModel | None, *, by_learned_descriptor
 
 def _network(pair: BandPair, model: FlightModel | None) -> Descriptor:
     channels = pair.fixed.channels, pair.moving.channels
-    return starter_for_matching(channels) if model is None else model.matching_network(pair.name, channels)
+    if model is None:
+        return starter_for_matching(channels)
+    return matching_network(model.net, model.side(pair.name) or 1, channels)
 
 
 def image_groups(starts: Sequence[Start], sides: Sequence[int] = ()) -> list[tuple[list[int], ImageGroup]]:
@@ -158,16 +160,12 @@ def image_groups(starts: Sequence[Start], sides: Sequence[int] = ()) -> list[tup
     result = []
     for indices in groups.values():
         of_group = [starts[i] for i in indices]
-        images = ImageGroup(
-            of_group[0][0].fixed,
-            [pair.moving for pair, _ in of_group],
-            [seed.fixed_to_moving for _, seed in of_group],
-            [sides[i] for i in indices] if sides else range(1, len(indices) + 1),
-            [seed.trusted for _, seed in of_group],
-            [pair.max_shift_px for pair, _ in of_group],
-            fields=[pair.field for pair, _ in of_group],
-        )
-        result.append((indices, images))
+        of_sides = [sides[i] for i in indices] if sides else range(1, len(indices) + 1)
+        moving = [
+            MovingImage(pair.moving, seed.fixed_to_moving, side, seed.trusted, pair.max_shift_px, pair.field)
+            for (pair, seed), side in zip(of_group, of_sides, strict=True)
+        ]
+        result.append((indices, ImageGroup(of_group[0][0].fixed, moving)))
     return result
 
 

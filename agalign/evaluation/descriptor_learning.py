@@ -21,18 +21,17 @@ from agalign.flight.model import FlightModel
 from agalign.method.descriptor import REFERENCE, Descriptor
 from agalign.method.device import one_memory_error, one_thread
 from agalign.method.fast import BATCH, LEARNING_RATE, in_batch_loss
-from agalign.method.levels import Level
+from agalign.method.levels import Level, make_level
 from agalign.method.match import sift_keypoints, visible_in_both
 from agalign.method.patches import Keypoints, far_apart, patch_positions
-from agalign.method.refine import MovingBand
-from agalign.method.state import ImageGroup, JointState
+from agalign.method.state import JointState, MovingImage
 from agalign.values import geometry
 from agalign.values.alignment import Alignment
 from agalign.values.geometry import Matrix
 from agalign.values.pixel_units import FixedImagePx
 
-_Example = tuple[Level, torch.Tensor, Keypoints]
-"""A pair at full resolution, its homography, and the keypoints of the first image that both show."""
+_Example = tuple[Level, Keypoints]
+"""A pair at full resolution, and the keypoints of the first image that both show."""
 
 
 def learn_descriptor(
@@ -69,30 +68,30 @@ def learn_descriptor(
 
 
 def _example(state: JointState, pair: BandPair, fixed_to_moving: Matrix) -> _Example:
-    level = state.level(ImageGroup.of_one(pair.fixed, pair.moving, fixed_to_moving), 1.0, [0])
+    level = make_level(state, pair.fixed, [MovingImage(pair.moving, fixed_to_moving)], 1.0)
     keypoints = visible_in_both(sift_keypoints(pair.fixed), fixed_to_moving, pair.fixed, pair.moving)
     minimum = 2
     if len(keypoints) < minimum:
         raise NotEnoughTextureError(len(keypoints), minimum)
-    return level, level.homography(fixed_to_moving, 0), keypoints.to(state.device)
+    return level, keypoints.to(state.device)
 
 
 def _learn(net: Descriptor, examples: Sequence[_Example], state: JointState, steps: int) -> None:
     """Optimise theta with Adam and fixed psi, one pair per step; the learning rate decreases to 0 along a cosine."""
-    generator = state.sampler.generator
+    generator = state.generator
     optimiser = torch.optim.Adam(net.parameters(), LEARNING_RATE)
     annealing = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, steps)
     for step in range(steps):
-        level, homography, keypoints = examples[step % len(examples)]
+        level, keypoints = examples[step % len(examples)]
         rows = torch.randint(len(keypoints), (BATCH,), generator=generator)
         k = keypoints[rows.to(state.device)]
         # Data augmentation: random orientations and scales in addition to those of SIFT.
         rotation = 2 * math.pi * torch.rand(len(k), generator=generator)
         zoom = 2 ** (torch.rand(len(k), generator=generator) - 0.5)
         k = Keypoints(k.xy, k.angle + rotation.to(k.angle), k.scale * zoom.to(k.scale))
-        moving = MovingBand(net, level, 0, 1)
-        patches = [level.fixed.patches(patch_positions(k)), moving.patches(k, homography)]
-        f, f_prime = net.describe(patches, [REFERENCE, moving.side])
+        (moving,) = level.bands
+        patches = [level.fixed.patches(patch_positions(k)), moving.patches(k)]
+        f, f_prime = net.describe(patches, [REFERENCE, moving.moving.side])
         loss = in_batch_loss(f, f_prime, far_apart(k))
         optimiser.zero_grad()
         torch.autograd.backward(loss)

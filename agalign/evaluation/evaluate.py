@@ -33,11 +33,12 @@ from agalign.flight.model import load_model
 from agalign.method.descriptor import Descriptor
 from agalign.method.device import one_memory_error, one_thread
 from agalign.method.fast import learn
+from agalign.method.levels import make_level
 from agalign.method.match import matching_network, sift_keypoints, to_8_bit, visible_in_both
 from agalign.method.paper import align_by_paper, pyramid
 from agalign.method.patches import Keypoints, bilinear, patch_positions, transform
-from agalign.method.refine import MovingBand, describe_fixed, refine
-from agalign.method.state import ImageGroup, JointState
+from agalign.method.refine import refine
+from agalign.method.state import JointState, MovingImage
 from agalign.pixels.band_resampling import channel_mean, luma, warped
 from agalign.values import geometry
 from agalign.values.alignment import JointResult, Seed
@@ -114,7 +115,7 @@ def _learned_on_pair(
             result = refine(state, net, group)[0]
     except (NotEnoughTextureError, NoContrastError, GeometryError):
         return None, seed.fixed_to_moving
-    mapping = result.fixed_to_moving if isinstance(result, JointResult) else group.mappings[0]
+    mapping = (result if isinstance(result, JointResult) else group.moving[0]).fixed_to_moving
     return _by_network(net, state, fixed, moving), mapping
 
 
@@ -125,9 +126,9 @@ def _without_colour(raster: Raster) -> Raster:
 def _by_network(net: Descriptor, state: JointState, one: Raster, other: Raster) -> Describe:
     @torch.no_grad()
     def describe(keypoints: Keypoints, fixed_to_moving: Matrix) -> tuple[Tensor, Tensor]:
-        level = state.level(ImageGroup.of_one(one, other, fixed_to_moving), 1.0, [0])
-        h, keypoints = level.homography(fixed_to_moving, 0), keypoints.to(state.device)
-        return describe_fixed(net, level, keypoints), MovingBand(net, level, 0, 1).describe(keypoints, h)
+        level = make_level(state, one, [MovingImage(other, fixed_to_moving)], 1.0)
+        keypoints = keypoints.to(state.device)
+        return level.fixed.describe(net, keypoints), level.bands[0].describe(net, keypoints)
 
     return describe
 

@@ -11,8 +11,9 @@ from numpy.typing import NDArray
 from agalign.config import JointSettings
 from agalign.errors import NoContrastError, NotEnoughTextureError
 from agalign.method.device import one_memory_error, one_thread
+from agalign.method.levels import make_level
 from agalign.method.paper import DEFAULT_TRAINING, Training, descend
-from agalign.method.state import ImageGroup, JointState
+from agalign.method.state import JointState, MovingImage
 from agalign.products.report.drawing import with_text, write_png
 from agalign.values import geometry
 from agalign.values.geometry import Matrix
@@ -41,10 +42,10 @@ def loss_surface(
             start = geometry.compose(truth, geometry.translation(float(dx), float(dy)))
             state = JointState(settings, lambda *_: None)
             with suppress(NotEnoughTextureError, NoContrastError), one_thread(), one_memory_error():
-                level = state.level(ImageGroup.of_one(fixed, moving, start), scale, [0])
-                net = state.paper_descriptor([fixed.channels, moving.channels])
-                pool = level.trainable
-                result[row, column] = descend(state, net, level, pool, start, training, update_psi=False).loss
+                level = make_level(state, fixed, [MovingImage(moving, start)], scale)
+                net = state.random_descriptor([fixed.channels, moving.channels])
+                _, loss, _ = descend(state, net, level, level.trainable, training, update_psi=False)
+                result[row, column] = loss
         progress((row + 1) / len(offsets_px))
     return result
 

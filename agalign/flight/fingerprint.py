@@ -1,9 +1,9 @@
 """Fingerprints: hashes of everything that a result depends on."""
 
 import hashlib
+import json
 import os
-import struct
-from collections.abc import Iterable
+from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
 
@@ -15,7 +15,7 @@ from agalign.values.capture import Capture
 from agalign.values.files import open_regular
 from agalign.values.lens import Lens
 
-Fact = str | int | float | bool | None | np.ndarray | Lens | Iterable["Fact"]
+Fact = str | int | float | bool | None | np.ndarray | Lens | Sequence["Fact"]
 
 
 def fingerprint(capture: Capture, *stages: SettingsModel) -> str:
@@ -40,7 +40,7 @@ def refinement_key(capture: Capture, settings: Settings) -> str:
 
 def hashed(*facts: Fact) -> str:
     """Return the first 16 hexadecimal digits of the SHA-256 of the facts."""
-    return hashlib.sha256(b"".join(map(_canonical, facts))).hexdigest()[:16]
+    return hashlib.sha256(json.dumps(facts, default=_plain).encode()).hexdigest()[:16]
 
 
 def input_samples(capture: Capture) -> dict[str, str]:
@@ -58,19 +58,9 @@ def input_samples(capture: Capture) -> dict[str, str]:
     return {b.name: samples[b.path] for b in capture.bands if b.path in samples}
 
 
-def _canonical(fact: Fact) -> bytes:
-    """Encode a fact unambiguously: type, length and contents."""
-    if isinstance(fact, Lens):
-        return _canonical((fact.fx_px, fact.fy_px, fact.cx_px, fact.cy_px, fact.distortion))
-    if isinstance(fact, np.ndarray):
-        contents, kind = np.ascontiguousarray(fact, np.float64).tobytes(), b"a"
-    elif isinstance(fact, float):
-        contents, kind = struct.pack("<d", fact), b"f"
-    elif fact is None or isinstance(fact, (str, int)):
-        contents, kind = repr(fact).encode(), b"s"
-    else:
-        contents, kind = b"".join(map(_canonical, fact)), b"l"
-    return kind + struct.pack("<Q", len(contents)) + contents
+def _plain(fact: np.ndarray | Lens) -> object:
+    """Return an array as a list and a lens as its fields, for `json.dumps`."""
+    return fact.tolist() if isinstance(fact, np.ndarray) else vars(fact)
 
 
 def _state(path: Path) -> tuple[int, int]:

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from itertools import count
 from statistics import median, mode
 
 from agalign.cameras.grouping import usual_bands
@@ -23,7 +24,10 @@ def flight_key(capture: Capture) -> tuple[str, str]:
 
 def flight_camera(captures: Sequence[Capture]) -> str:
     """Return the camera of a flight and all bands in its captures, the reference first."""
-    return _key(captures[0], _bands_of(captures))
+    bands = {captures[0].reference.name: captures[0].reference}
+    for band in (b for c in _by_completeness(captures) for b in c.moving):
+        bands.setdefault(band.name, band)
+    return _key(captures[0], bands.values())
 
 
 def flight_lenses(captures: Sequence[Capture]) -> tuple[str, ...]:
@@ -36,18 +40,20 @@ def is_flight_of(captures: Sequence[Capture], camera: str) -> bool:
 
     An empty `camera` fits every flight.
     """
-    (learned, bands), (own, own_bands) = map(_camera_and_bands, (camera, flight_camera(captures)))
-    return not camera or ((learned, bands[0]) == (own, own_bands[0]) and set(own_bands) <= set(bands))
+    return not camera or not difference(camera, flight_camera(captures))
 
 
 def difference(learned: str, here: str) -> str:
-    """Return in words what distinguishes two values of `flight_camera`: that of a model, and that of the images."""
+    """Return in words why a model, learned for a `flight_camera`, does not contain all bands of another; empty if it
+    does.
+    """
     (camera, bands), (own_camera, own_bands) = map(_camera_and_bands, (learned, here))
     if camera != own_camera:
         return f"was learned for {camera}; the images here are of {own_camera}"
     if bands[0] != own_bands[0]:
         return f"was learned with the reference {bands[0]}; the reference here is {own_bands[0]}"
-    return f"was learned without {', '.join(b for b in own_bands if b not in bands)}"
+    missing = [b for b in own_bands if b not in bands]
+    return f"was learned without {', '.join(missing)}" if missing else ""
 
 
 def _camera_and_bands(text: str) -> tuple[str, list[str]]:
@@ -83,10 +89,8 @@ def model_names(groups: Sequence[Sequence[Capture]]) -> list[str]:
     for group in groups:
         camera = group[0].camera
         stem = file_name(f"{camera.model} {camera.serial}".strip() or "camera")
-        name, count = stem, 1
-        while name.lower() in used:
-            count += 1
-            name = f"{stem}-{count}"
+        numbered = (stem if k == 1 else f"{stem}-{k}" for k in count(1))
+        name = next(n for n in numbered if n.lower() not in used)
         used.add(name.lower())
         names.append(f"{name}.safetensors")
     return names
@@ -188,22 +192,9 @@ def _supports(capture: Capture, choice: RadiometryChoice) -> bool:
     return all(b.radiometry is not None for b in bands if not b.companion)
 
 
-def _key(capture: Capture, bands: Sequence[Band]) -> str:
-    camera = capture.camera
-    return f"{camera.make} {camera.model} {camera.serial}".strip() + f" [{', '.join(map(_with_size, bands))}]"
-
-
-def _with_size(band: Band) -> str:
-    return f"{band.name} {band.width_px}x{band.height_px}"
-
-
-def _bands_of(captures: Sequence[Capture]) -> list[Band]:
-    """Return one band of each name, the reference first."""
-    result = {captures[0].reference.name: captures[0].reference}
-    for capture in _by_completeness(captures):
-        for band in capture.moving:
-            result.setdefault(band.name, band)
-    return list(result.values())
+def _key(capture: Capture, bands: Iterable[Band]) -> str:
+    camera, with_sizes = capture.camera, (f"{b.name} {b.width_px}x{b.height_px}" for b in bands)
+    return f"{camera.make} {camera.model} {camera.serial}".strip() + f" [{', '.join(with_sizes)}]"
 
 
 def _by_completeness(captures: Sequence[Capture]) -> list[Capture]:

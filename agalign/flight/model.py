@@ -22,7 +22,6 @@ from agalign.errors import InputError, is_out_of_memory
 from agalign.flight.rig import Rig
 from agalign.flight.rig_file import refined_from_json, refined_to_json, rig_from_json, rig_to_json
 from agalign.method.descriptor import Descriptor
-from agalign.method.match import matching_network
 from agalign.values.alignment import RefinedPair
 from agalign.values.files import complete_file, open_regular
 from agalign.values.geometry import Matrix, normalised
@@ -51,10 +50,6 @@ class FlightModel:
     def side(self, band: str) -> int | None:
         """Return the network's side of a moving band; None for an unknown band."""
         return self.bands.index(band) + 1 if band in self.bands else None
-
-    def matching_network(self, band: str, channels: tuple[int, int]) -> Descriptor:
-        """Return a network that matches the reference with a moving band, for images of these channels."""
-        return matching_network(self.net, self.side(band) or 1, channels)
 
 
 def save_model(model: FlightModel, path: Path) -> None:

@@ -7,10 +7,9 @@ Conv(C, 32, 5) - Tanh - MaxPool(2) - Conv(32, 64, 3) - Tanh - FC(256) on 16 x 16
 from collections.abc import Mapping, Sequence
 from functools import cache
 from importlib import resources
-from pathlib import Path
 
 import torch
-from safetensors.torch import load, save_file
+from safetensors.torch import load
 from torch import Tensor, nn
 
 from agalign.errors import ConfigurationError
@@ -55,12 +54,10 @@ def distance(f: Tensor, f_prime: Tensor) -> Tensor:
 def retrieval(f: Tensor, f_prime: Tensor, allowed: Tensor) -> float:
     """Return the share of rows i of `f` (N, D) with row i of `f_prime` (N, D) as nearest neighbour.
 
-    It is averaged over both directions. Pairs that are False in `allowed` (N, N) are ignored, except on the diagonal.
+    It is averaged over both directions. Pairs that are False in `allowed` (N, N) are ignored; its diagonal is True.
     Chance is about 1 / N.
     """
-    d = torch.cdist(f, f_prime)
-    keep = allowed | torch.eye(len(f), dtype=torch.bool, device=f.device)
-    d = d.masked_fill(~keep, float("inf"))
+    d = torch.cdist(f, f_prime).masked_fill(~allowed, float("inf"))
     target = torch.arange(len(f), device=f.device)
     hits = (d.argmin(dim=1) == target).float().mean() + (d.argmin(dim=0) == target).float().mean()
     return float(0.5 * hits)
@@ -138,11 +135,6 @@ def start_from_starter(net: Descriptor) -> None:
     same method on synthetic flights (tools/learn_starter.py).
     """
     start_from(net, _weights())
-
-
-def save_starter(net: Descriptor, path: Path) -> None:
-    """Write a siamese network in half precision."""
-    save_file({name: value.detach().cpu().half().contiguous() for name, value in net.state_dict().items()}, path)
 
 
 @cache

@@ -4,7 +4,7 @@ import ctypes
 import platform
 import threading
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from functools import cache
 
@@ -32,12 +32,19 @@ def choose_device(name: str) -> torch.device:
         if device.type == kind and not is_available():
             reason = f"no {kind.upper()} device, or PyTorch without {kind.upper()}"
             raise ConfigurationError(f"device '{name}' cannot be used: {reason}; 'agalign doctor' lists devices")
-    try:
-        if device.type != "cpu":
-            _test(device)
-    except (RuntimeError, AssertionError, ImportError) as error:
-        raise ConfigurationError(f"device '{name}' cannot be used here: {str(error).splitlines()[0]}") from None
+    problem = _problem(device)
+    if problem:
+        raise ConfigurationError(f"device '{name}' cannot be used here: {problem}")
     return device
+
+
+def _problem(device: torch.device) -> str:
+    """Return why a device cannot be used; empty if it can."""
+    try:
+        _test(device)
+    except (RuntimeError, AssertionError, ImportError) as error:
+        return str(error).splitlines()[0]
+    return ""
 
 
 @cache
@@ -67,22 +74,13 @@ class Device:
 
 def devices() -> list[Device]:
     """List the CPU and every GPU, each tested."""
-    result = [Device("cpu", platform.machine(), torch.get_num_threads(), _problem("cpu"))]
+    known = [("cpu", platform.machine(), torch.get_num_threads())]
     for i in range(torch.cuda.device_count()):
         properties = torch.cuda.get_device_properties(i)
-        what = f"{properties.name}, {properties.total_memory / 1e9:.0f} GB"
-        result.append(Device(f"cuda:{i}", what, 0, _problem(f"cuda:{i}")))
+        known.append((f"cuda:{i}", f"{properties.name}, {properties.total_memory / 1e9:.0f} GB", 0))
     if torch.backends.mps.is_available():
-        result.append(Device("mps", "Apple GPU", 0, _problem("mps")))
-    return result
-
-
-def _problem(name: str) -> str:
-    try:
-        _test(torch.device(name))
-    except RuntimeError as error:
-        return str(error).splitlines()[0]
-    return ""
+        known.append(("mps", "Apple GPU", 0))
+    return [Device(name, what, threads, _problem(torch.device(name))) for name, what, threads in known]
 
 
 def to_float64(tensor: Tensor) -> Tensor:
@@ -118,10 +116,8 @@ def keep_freed_memory() -> None:
 _lock = threading.Lock()
 _active = 0
 """Number of `one_thread` contexts that are open in all threads."""
-_torch_threads_outside = 1
-"""Threads of torch when the first of these contexts was opened."""
-_blas_limit: threadpool_limits | None = None
-"""The limit on BLAS while a context is open."""
+_outside = ExitStack()
+"""Restores the settings that were in force when the first of these contexts was opened."""
 
 
 @contextmanager
@@ -132,10 +128,11 @@ def one_thread() -> Iterator[None]:
     limit applies to the whole process; when contexts are open in several threads, the last one to close restores the
     original settings.
     """
-    global _active, _torch_threads_outside, _blas_limit
+    global _active
     with _lock:
         if _active == 0:
-            _torch_threads_outside, _blas_limit = torch.get_num_threads(), threadpool_limits(1, user_api="blas")
+            _outside.callback(torch.set_num_threads, torch.get_num_threads())
+            _outside.enter_context(threadpool_limits(1, user_api="blas"))
             torch.set_num_threads(1)
         _active += 1
     try:
@@ -144,9 +141,7 @@ def one_thread() -> Iterator[None]:
         with _lock:
             _active -= 1
             if _active == 0:
-                torch.set_num_threads(_torch_threads_outside)
-                if _blas_limit is not None:
-                    _blas_limit.restore_original_limits()
+                _outside.close()
 
 
 @contextmanager
@@ -155,13 +150,6 @@ def one_memory_error() -> Iterator[None]:
     try:
         yield
     except (cv2.error, RuntimeError) as error:
-        if not _is_out_of_memory(error):
+        if not is_out_of_memory(error):
             raise
         raise MemoryError(str(error)) from None
-
-
-def _is_out_of_memory(error: cv2.error | RuntimeError) -> bool:
-    if isinstance(error, cv2.error):
-        return error.code == cv2.Error.STS_NO_MEM
-    # On the CPU torch raises a plain RuntimeError.
-    return isinstance(error, torch.cuda.OutOfMemoryError) or is_out_of_memory(error)

@@ -4,10 +4,10 @@ All given captures share one theta; each image pair has its own psi (the paper p
 """
 
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor, nn
@@ -15,21 +15,19 @@ from torch.nn import functional
 
 from agalign.errors import GeometryError, NotEnoughTextureError
 from agalign.method.descriptor import REFERENCE, Descriptor
-from agalign.method.levels import Level
-from agalign.method.patches import far_apart, patch_positions, translation
+from agalign.method.levels import Level, make_level
+from agalign.method.patches import far_apart, patch_positions
 from agalign.method.refine import (
     CONVERGED_PX,
     MIN_KEYPOINTS,
     TEST_KEYPOINTS,
-    MovingBand,
-    Solver,
+    ReferencePatches,
     best_shift,
-    describe_fixed,
-    describe_reference,
     held_out_retrieval,
-    updated,
+    step_from,
 )
 from agalign.method.state import ImageGroup, JointState
+from agalign.values import geometry
 from agalign.values.alignment import MIN_RETRIEVAL
 from agalign.values.choices import Recipe
 
@@ -71,8 +69,6 @@ _TEMPERATURE = 0.07
 """Temperature of the in-batch loss (He et al. 2020, Sec. 3.3)."""
 _COARSEST_PX = 200
 """The longer side of the coarsest level, where an untrusted seed starts, is between this and twice this."""
-_SEARCH_STEP_PX = 3.0
-"""Spacing of the translations that are searched, px of that level: a Gauss-Newton step can bridge it."""
 _OCTAVES = 1.0
 """Patch scales are drawn from [1, 2**_OCTAVES] px between samples."""
 _FIRST_UPDATES = 5
@@ -111,35 +107,36 @@ def learn(
     loss, NaN without a step. Raises NoContrastError.
     """
     scales = learn_scales(max(max(g.fixed.size_px) for g in groups))
-    steps, loss, schedule = 0, math.nan, schedule or SCHEDULES[state.settings.recipe]
+    steps, loss = 0, math.nan
     # Each group has its own random generator, so its samples do not depend on the other groups.
     states = [JointState(state.settings, state.progress) for _ in groups]
     with ThreadPoolExecutor(threads) as pool:
-
-        def update_psi(some: Sequence[_GroupAtLevel]) -> list[bool]:
-            return list(pool.map(_update_psi, some))
-
+        learner = _Learner(state, net, schedule or SCHEDULES[state.settings.recipe], pool)
         for scale in scales:
-            at_level = [
-                _GroupAtLevel(own_state, net, group, bands, own_state.level(group, scale, bands), schedule)
+            is_finest = scale == scales[-1]
+            levels = [
+                make_level(own_state, group.fixed, moving, scale)
                 for own_state, group in zip(states, groups, strict=True)
-                if (bands := _learned_bands(group, is_finest=scale == scales[-1]))
+                if (moving := [m for m in group.moving if m.dropped_at is None and (is_finest or not m.trusted)])
             ]
-            if not at_level:
+            if not levels:
                 continue
             if scale == scales[0]:
-                list(pool.map(_search, at_level))
-            if not _converges(at_level, update_psi):
-                level_steps, loss = _train(state, net, at_level, schedule, update_psi)
+                list(pool.map(learner.search, levels))
+            if not learner.converges(levels):
+                level_steps, loss = learner.train(levels)
                 steps += level_steps
-            for group in at_level:
-                group.store()
+            for level in levels:
+                _store(level)
     return steps, loss
 
 
-def _learned_bands(group: ImageGroup, *, is_finest: bool) -> list[int]:
-    """Return the moving images that take part at a level; those with a trusted seed do so at the finest level only."""
-    return [b for b in group.active if is_finest or not group.trusted[b]]
+def _store(level: Level) -> None:
+    """Write the homographies that can be inverted into the moving images, and the retrieval of those to be dropped."""
+    for band in level.bands:
+        band.moving.dropped_at = None if band.distinguished else band.retrieval
+        with suppress(GeometryError):
+            band.moving.fixed_to_moving = band.fixed_to_moving
 
 
 def learn_scales(longer_side_px: int) -> list[float]:
@@ -153,129 +150,112 @@ def learn_scales(longer_side_px: int) -> list[float]:
     return scales
 
 
-@dataclass
-class _GroupAtLevel:
-    """Some moving images of a group at one level, and their homographies."""
+@dataclass(frozen=True)
+class _Learner:
+    """The steps of `learn` at a level of all captures."""
 
     state: JointState
-    """With the random generator of this group."""
     net: Descriptor
-    group: ImageGroup
-    indices: Sequence[int]
-    """Of the moving images in the group."""
-    level: Level
     schedule: Schedule
-    h: list[Tensor] = field(init=False)
-    """(3, 3) fixed_to_moving of each moving image, px of the level."""
-    converged: list[bool] = field(init=False)
-    """True after the first step on psi shorter than CONVERGED_PX; updates continue until all psi have converged."""
-    distinguished: list[bool] = field(init=False)
-    """True once held-out retrieval has reached MIN_RETRIEVAL, which steps on psi require."""
-    retrieved: list[float] = field(init=False)
-    """Held-out retrieval at the last test."""
+    pool: ThreadPoolExecutor
 
-    def __post_init__(self) -> None:
-        self.converged, self.distinguished = ([False] * len(self.indices) for _ in range(2))
-        self.retrieved = [0.0] * len(self.indices)
-        self.h = [self.level.homography(self.group.mappings[b], i) for i, b in enumerate(self.indices)]
+    @torch.no_grad()
+    def search(self, level: Level) -> None:
+        """Shift each untrusted mapping by the translation with the smallest loss of the patches.
 
-    @property
-    def bands(self) -> list[MovingBand]:
-        """The moving images with their sides of the network."""
-        return [MovingBand(self.net, self.level, i, self.group.sides[b]) for i, b in enumerate(self.indices)]
+        The loss decreases towards the true position (paper, Fig. 2) over a larger distance than a Gauss-Newton step
+        covers.
+        """
+        search_patches = 64  # patches with which the translations are compared
+        p, _ = level.draw(level.anywhere, search_patches, _OCTAVES)
+        # Radius of the search around an untrusted seed at the coarsest level, as a share of the longer side.
+        search_radius_share = 0.22
+        for band in (b for b in level.bands if not b.moving.trusted):
+            max_shift_px = band.moving.max_shift_px * level.fixed.scale[0]
+            radius_px = min(search_radius_share * max(level.fixed.size_px), max_shift_px)
+            shift = best_shift(self.net, level, band, p, radius_px)
+            band.h = band.h @ torch.from_numpy(geometry.translation(*map(float, shift))).to(band.h)
 
-    @property
-    def needs_no_training(self) -> bool:
-        """True where retrieval is high enough for every psi that has not converged: steps on psi suffice."""
-        enough = self.schedule.enough_retrieval
-        return all(r > enough for r, converged in zip(self.retrieved, self.converged, strict=True) if not converged)
+    def converges(self, levels: Sequence[Level]) -> bool:
+        """Update every psi without training the network; return True if all converge."""
+        remaining = levels
+        for update in range(1, 2 * _FIRST_UPDATES + 1):
+            converged = self._update_psi(remaining)
+            remaining = [level for level, is_done in zip(remaining, converged, strict=True) if not is_done]
+            if not remaining:
+                return True
+            bands = [band for level in remaining for band in level.bands]
+            is_blocked = update > 1 and not all(b.distinguished for b in bands)
+            # Steps on psi suffice where retrieval is high enough.
+            needs_no_training = all(b.converged or b.retrieval > self.schedule.enough_retrieval for b in bands)
+            if is_blocked or (update >= _FIRST_UPDATES and not needs_no_training):
+                return False
+        return False
 
-    def store(self) -> None:
-        """Write the homographies that can be inverted into the group, and the moving images that are dropped."""
-        self.group.dropped |= {b: self.retrieved[i] for i, b in enumerate(self.indices) if not self.distinguished[i]}
-        for i, b in enumerate(self.indices):
-            with suppress(GeometryError):
-                self.group.mappings[b] = self.level.full_matrix(self.h[i], i)
+    def train(self, levels: Sequence[Level]) -> tuple[int, float]:
+        """Learn theta with Adam, one capture per step; every few steps update each psi by Gauss-Newton.
 
+        Returns the number of steps and the last loss.
+        """
+        loss_value, count = math.nan, len(levels)
+        max_steps = self.schedule.max_steps * count
+        optimiser = Adam(self.net.parameters(), self.schedule.learning_rate)
+        steps_between_updates = 10  # steps on theta per capture between two steps on psi
+        for step in range(1, max_steps + 1):
+            loss = _loss(self.net, levels[step % count])
+            if loss is not None:
+                optimiser.step(loss)
+                loss_value = float(loss.detach())
+            if step % (steps_between_updates * count):
+                continue
+            self.state.progress("learning", step / max_steps)
+            if all(self._update_psi(levels)):
+                break
+            is_hopeless = not any(band.distinguished for level in levels for band in level.bands)
+            if is_hopeless and step >= self.schedule.max_steps_without_retrieval * count:
+                break
+        return step, loss_value
 
-_UpdatePsi = Callable[[Sequence[_GroupAtLevel]], list[bool]]
-"""Take one step on each psi of some groups; return True for each group in which all psi have converged."""
+    def _update_psi(self, levels: Sequence[Level]) -> list[bool]:
+        """Take one step on each psi; return True for each capture in which all have converged."""
+        return list(self.pool.map(self._update_psi_of, levels))
 
-
-@torch.no_grad()
-def _search(g: _GroupAtLevel) -> None:
-    """Shift each untrusted mapping by the translation with the smallest loss of the patches.
-
-    The loss decreases towards the true position (paper, Fig. 2) over a larger distance than a Gauss-Newton step covers.
-    """
-    search_patches = 64  # patches with which the translations are compared
-    p, _ = g.state.sampler.draw(g.level, g.level.anywhere, g.h, search_patches, _OCTAVES)
-    # Radius of the search around an untrusted seed at the coarsest level, as a share of the longer side.
-    search_radius_share = 0.22
-    for i, band in enumerate(g.bands):
-        if g.group.trusted[g.indices[i]]:
-            continue
-        radius_px = search_radius_share * max(g.level.fixed.size_px)
-        if g.group.max_shift_px:
-            radius_px = min(radius_px, g.group.max_shift_px[g.indices[i]] * g.level.fixed.scale[0])
-        shift = best_shift(band, g.h[i], p, radius_px, _SEARCH_STEP_PX)
-        g.h[i] = g.h[i] @ translation(shift).to(g.h[i])
-
-
-def _converges(at_level: Sequence[_GroupAtLevel], update_psi: _UpdatePsi) -> bool:
-    """Update every psi without training the network; return True if all converge."""
-    remaining = at_level
-    for update in range(1, 2 * _FIRST_UPDATES + 1):
-        remaining = [g for g, converged in zip(remaining, update_psi(remaining), strict=True) if not converged]
-        if not remaining:
+    @torch.no_grad()
+    def _update_psi_of(self, level: Level) -> bool:
+        """Take one step on each psi of a capture that passes held-out retrieval; return True if all have converged."""
+        test, _ = level.draw(level.held_out, TEST_KEYPOINTS, _OCTAVES)
+        p, _ = level.draw(level.anywhere, _PATCHES, _OCTAVES)
+        if len(p) < MIN_KEYPOINTS:
             return True
-        is_blocked = update > 1 and not all(all(g.distinguished) for g in remaining)
-        if is_blocked or (update >= _FIRST_UPDATES and not all(g.needs_no_training for g in remaining)):
-            return False
-    return False
+        f_test = level.fixed.describe(self.net, test)
+        patches = ReferencePatches.of(self.net, level, p)
+        for band in level.bands:
+            band.retrieval, _ = held_out_retrieval(self.net, band, test, f_test)
+            if band.retrieval < MIN_RETRIEVAL:
+                continue
+            band.distinguished = True
+            with suppress(NotEnoughTextureError):
+                step = step_from(self.net, band, patches, self.state.family)
+                band.update(step)
+                is_enough = band.retrieval > self.schedule.enough_retrieval
+                band.converged |= is_enough and step.length_px < CONVERGED_PX
+        return all(band.converged for band in level.bands)
 
 
-def _train(
-    state: JointState, net: Descriptor, at_level: Sequence[_GroupAtLevel], schedule: Schedule, update_psi: _UpdatePsi
-) -> tuple[int, float]:
-    """Learn theta with Adam, one group per step; every few steps update each psi by Gauss-Newton.
-
-    Returns the number of steps and the last loss.
-    """
-    loss_value, count = math.nan, len(at_level)
-    max_steps = schedule.max_steps * count
-    optimiser = Adam(net.parameters(), schedule.learning_rate)
-    steps_between_updates = 10  # steps on theta per capture between two steps on psi
-    for step in range(1, max_steps + 1):
-        loss = _loss(at_level[step % count])
-        if loss is not None:
-            optimiser.step(loss)
-            loss_value = float(loss.detach())
-        if step % (steps_between_updates * count):
-            continue
-        state.progress("learning", step / max_steps)
-        if all(update_psi(at_level)):
-            break
-        if step >= schedule.max_steps_without_retrieval * count and not any(any(g.distinguished) for g in at_level):
-            break
-    return step, loss_value
-
-
-def _loss(g: _GroupAtLevel) -> Tensor | None:
+def _loss(net: Descriptor, level: Level) -> Tensor | None:
     """Return the mean in-batch loss of the pairs of a capture on new keypoints; None if too few can be drawn."""
-    p, inside = g.state.sampler.draw(g.level, g.level.trainable, g.h, BATCH, _OCTAVES)
-    visible = [inside[:, i].nonzero()[:, 0] for i in range(len(g.h))]
-    bands = [band for band in g.bands if len(visible[band.index]) >= MIN_KEYPOINTS]
-    if not bands:
+    p, inside = level.draw(level.trainable, BATCH, _OCTAVES)
+    visible = [of_band.nonzero()[:, 0] for of_band in inside.unbind(dim=1)]
+    used = [(band, rows) for band, rows in zip(level.bands, visible, strict=True) if len(rows) >= MIN_KEYPOINTS]
+    if not used:
         return None
-    patches = [g.level.fixed.patches(patch_positions(p))]
-    patches += [band.patches(p[visible[band.index]], g.h[band.index]) for band in bands]
-    f, *f_primes = g.net.describe(patches, [REFERENCE, *(band.side for band in bands)])
+    patches = [level.fixed.patches(patch_positions(p)), *(band.patches(p[rows]) for band, rows in used)]
+    f, *f_primes = net.describe(patches, [REFERENCE, *(band.moving.side for band, _ in used)])
     allowed = far_apart(p)
-    losses = []
-    for band, f_prime in zip(bands, f_primes, strict=True):
-        rows = visible[band.index]
-        losses.append(in_batch_loss(f[rows], f_prime, allowed[rows][:, rows]))
+    losses = [
+        in_batch_loss(f[rows], f_prime, allowed[rows][:, rows])
+        for (_, rows), f_prime in zip(used, f_primes, strict=True)
+    ]
     return torch.stack(losses).mean()
 
 
@@ -283,33 +263,9 @@ def in_batch_loss(f: Tensor, f_prime: Tensor, allowed: Tensor) -> Tensor:
     """Return the symmetric InfoNCE loss with the other rows of the batch as negatives, a scalar.
 
     `f` and `f_prime` are (N, D) descriptors of unit length; row i of one matches row i of the other. `allowed` (N, N)
-    is False where two keypoints are too close to be negatives of each other; its diagonal is ignored.
+    is False where two keypoints are too close to be negatives of each other; its diagonal is True.
     Source: van den Oord et al. 2018, Eq. 4.
     """
-    logits = f @ f_prime.T / _TEMPERATURE
-    keep = allowed | torch.eye(len(f), dtype=torch.bool, device=f.device)
-    logits = logits.masked_fill(~keep, float("-inf"))
+    logits = (f @ f_prime.T / _TEMPERATURE).masked_fill(~allowed, float("-inf"))
     target = torch.arange(len(f), device=f.device)
     return 0.5 * (functional.cross_entropy(logits, target) + functional.cross_entropy(logits.T, target))
-
-
-@torch.no_grad()
-def _update_psi(g: _GroupAtLevel) -> bool:
-    """Take one step on each psi of a capture that passes held-out retrieval; return True if all have converged."""
-    test, _ = g.state.sampler.draw(g.level, g.level.held_out, g.h, TEST_KEYPOINTS, _OCTAVES)
-    p, _ = g.state.sampler.draw(g.level, g.level.anywhere, g.h, _PATCHES, _OCTAVES)
-    if len(p) < MIN_KEYPOINTS:
-        return True
-    f_test = describe_fixed(g.net, g.level, test)
-    reference_patches = describe_reference(g.net, g.level, p)
-    solver = Solver(g.state.family)
-    for i, band in enumerate(g.bands):
-        g.retrieved[i], _ = held_out_retrieval(band, g.h[i], test, f_test)
-        if g.retrieved[i] < MIN_RETRIEVAL:
-            continue
-        g.distinguished[i] = True
-        with suppress(NotEnoughTextureError):
-            step = solver.step(band, g.h[i], reference_patches)
-            g.h[i] = updated(g.h[i], step)
-            g.converged[i] |= g.retrieved[i] > g.schedule.enough_retrieval and step.length_px < CONVERGED_PX
-    return all(g.converged)

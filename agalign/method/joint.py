@@ -22,7 +22,7 @@ from agalign.method.descriptor import Descriptor
 from agalign.method.fast import Schedule, learn
 from agalign.method.paper import DEFAULT_TRAINING, Training, align_by_paper
 from agalign.method.refine import PATCHES, refine
-from agalign.method.state import ImageGroup, JointState, Progress
+from agalign.method.state import ImageGroup, JointState, MovingImage, Progress
 from agalign.values.alignment import JointResult
 from agalign.values.issues import FEW_KEYPOINTS, NO_CONTRAST, NOT_INVERTIBLE, Issue
 from agalign.values.pixel_units import FixedImagePx
@@ -46,8 +46,9 @@ def align_from_scratch(
     """
     state = JointState(settings, progress)
     if settings.recipe == "paper":
-        return [_by_paper(state, group, b, training) for b in range(len(group.moving))]
-    net = state.fast_descriptor([r.channels for r in (group.fixed, *group.moving)])
+        pairs = (ImageGroup(group.fixed, [MovingImage(m.raster, m.fixed_to_moving)]) for m in group.moving)
+        return [_by_paper(state, pair, training) for pair in pairs]
+    net = state.fast_descriptor([group.fixed.channels, *(moving.raster.channels for moving in group.moving)])
     try:
         steps, loss = learn(state, [group], net, schedule=schedule)
         results = refine(state, net, group)
@@ -69,8 +70,7 @@ def refine_with(
     return [r if isinstance(r, Issue) else replace(r, recipe="flight") for r in results]
 
 
-def _by_paper(state: JointState, group: ImageGroup, band: int, training: Training) -> JointResult[FixedImagePx] | Issue:
-    pair = ImageGroup.of_one(group.fixed, group.moving[band], group.mappings[band])
+def _by_paper(state: JointState, pair: ImageGroup, training: Training) -> JointResult[FixedImagePx] | Issue:
     try:
         return align_by_paper(state, pair, training)[1]
     except NotEnoughTextureError as error:

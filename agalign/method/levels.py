@@ -1,8 +1,8 @@
-"""The images of one capture at one resolution, and random sampling of keypoints."""
+"""The images of one capture at one resolution, their homographies, and random sampling of keypoints."""
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import lru_cache
 
 import cv2
@@ -12,7 +12,12 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn import functional
 
-from agalign.method.patches import FOOTPRINT_PX, Keypoints, bilinear, footprint_radius, transform
+from agalign.errors import NoContrastError
+from agalign.method.descriptor import REFERENCE, Descriptor
+from agalign.method.device import to_float64
+from agalign.method.gauss_newton import Step
+from agalign.method.patches import FOOTPRINT_PX, Keypoints, bilinear, footprint_radius, patch_positions, transform
+from agalign.method.state import JointState, MovingImage
 from agalign.pixels.band_resampling import shrink
 from agalign.pixels.structure import gradient_magnitude
 from agalign.values import geometry, lens
@@ -20,7 +25,7 @@ from agalign.values.geometry import Matrix
 from agalign.values.image import FloatImage, Mask, Raster
 from agalign.values.lens import Lens
 from agalign.values.mapping import DisplacementField
-from agalign.values.pixel_units import SAME_PIXELS, PixelScale
+from agalign.values.pixel_units import SAME_PIXELS, PixelScale, Size
 
 _FIELD_COLUMNS = 65
 """Columns of the grid on which displacement fields are sampled."""
@@ -55,6 +60,11 @@ class LevelImage:
         """Sample patches at undistorted positions, (N, 16, 16, 2) -> (N, C, 16, 16)."""
         return bilinear(self.image, self.raw(positions))
 
+    def describe(self, net: Descriptor, keypoints: Keypoints, side: int = REFERENCE) -> Tensor:
+        """Return the descriptors (N, 256) of keypoints of this image by a side of the network."""
+        f: Tensor = net(self.patches(patch_positions(keypoints)), side)
+        return f
+
     def clearance_at(self, points: Tensor) -> Tensor:
         """Return the distance (N,) px from undistorted positions (N, 2) to the nearest invalid pixel; 0 outside."""
         width, height = self.size_px
@@ -77,57 +87,98 @@ class Pool:
         return len(self.xy)
 
 
+@dataclass
+class LevelBand:
+    """A moving image I' at one resolution, and its alignment with the image I of the reference."""
+
+    moving: MovingImage
+    fixed_view: LevelImage
+    """I."""
+    view: LevelImage
+    """I'."""
+    h: Tensor
+    """(3, 3) float32, fixed_to_moving in px of the level; the optimisation updates it."""
+    field: Tensor | None
+    """Displacement field (1, 2, rows, columns): px of the level at the nodes of a grid over I, added to positions of I
+    before the homography."""
+    retrieval: float = 0.0
+    """Held-out retrieval at the last test."""
+    distinguished: bool = False
+    """True once held-out retrieval has reached MIN_RETRIEVAL, which steps on psi require."""
+    converged: bool = False
+    """True after the first short step on psi; updates continue until those of all images are short."""
+
+    def shows(self, keypoints: Keypoints) -> Tensor:
+        """Return (N,) True for each keypoint of I with a patch of only valid pixels in I'."""
+        magnification = self.h[:2, :2].det().abs().sqrt()
+        clearance = self.view.clearance_at(transform(self.h, keypoints.xy))
+        return clearance > (footprint_radius(keypoints.scale) + 1) * magnification
+
+    def overlaps(self, keypoints: Keypoints) -> Tensor:
+        """Return (N,) True for each keypoint of I with a patch of only valid pixels in both images."""
+        inside_fixed = self.fixed_view.clearance_at(keypoints.xy) > footprint_radius(keypoints.scale) + 1
+        return inside_fixed & self.shows(keypoints)
+
+    def patches(self, keypoints: Keypoints) -> Tensor:
+        """Return B(w(x; psi); I'), (N, C, 16, 16); the homography maps each sample position, not only the keypoint."""
+        positions = patch_positions(keypoints)
+        if self.field is not None:
+            size = keypoints.xy.new_tensor(self.fixed_view.size_px) - 1
+            at = (2 * self.fixed_view.raw(keypoints.xy) / size - 1)[None, :, None]
+            displacement = functional.grid_sample(self.field, at, padding_mode="border", align_corners=True)
+            positions = positions + displacement[0, :, :, 0].T[:, None, None]
+        return self.view.patches(transform(self.h, positions))
+
+    def describe(self, net: Descriptor, keypoints: Keypoints) -> Tensor:
+        """Return f(w(x; psi)) for keypoints x of I, (N, 256)."""
+        f_prime: Tensor = net(self.patches(keypoints), self.moving.side)
+        return f_prime
+
+    def update(self, step: Step, factor: float = 1.0) -> None:
+        """Replace H by H @ change, with the change of psi, which is linear in it, scaled by a factor."""
+        identity = torch.eye(3, dtype=step.change.dtype, device=step.change.device)
+        self.h = (to_float64(self.h) @ (identity + factor * (step.change - identity))).to(self.h)
+
+    @property
+    def fixed_to_moving(self) -> Matrix:
+        """The homography in px of the full resolution. Raises GeometryError if it cannot be inverted."""
+        up, moving_up = self.fixed_view.scale.inverse, self.view.scale.inverse
+        return geometry.rescale(self.h.cpu().double().numpy(), up, moving_up)
+
+
 @dataclass(frozen=True)
 class Level:
     """I and one or more I' at one resolution, and the candidate positions of keypoints in I."""
 
     fixed: LevelImage
-    moving: tuple[LevelImage, ...]
+    bands: tuple[LevelBand, ...]
     trainable: Pool
     """Positions with texture in the cells on which theta is trained."""
     held_out: Pool
     """Positions with texture in the held-out cells. Their patches share no pixels with those of `trainable`."""
     anywhere: Pool
     """Both, without a limit on the radius of a patch."""
-    fields: tuple[Tensor | None, ...] = ()
-    """Displacement field (1, 2, rows, columns) of each moving image: px of the level at the nodes of a grid over I,
-    added to positions of I before the homography. Empty if no image has one."""
+    generator: torch.Generator
 
-    def with_fields(self, fields: Sequence[DisplacementField | None]) -> "Level":
-        """Return the level with displacement fields of the moving images, which are in px at full resolution."""
-        width, height = self.fixed.size_px
-        nodes = geometry.lattice(width, height, _FIELD_COLUMNS, round(_FIELD_COLUMNS * height / width) + 1)
-        shape = (-1, _FIELD_COLUMNS, 2)
+    def draw(self, pool: Pool, count: int, octaves: float, spacing_px: float = 1.0) -> tuple[Keypoints, Tensor]:
+        """Draw up to `count` keypoints with patches in the valid area of I and of at least one I'.
 
-        def on_lattice(field: DisplacementField) -> Tensor:
-            shift = field.rescaled(self.fixed.scale)(nodes)
-            values = np.moveaxis(shift.reshape(shape), -1, 0)[None].astype(np.float32)
-            return torch.from_numpy(np.ascontiguousarray(values)).to(self.fixed.image.device)
-
-        return replace(self, fields=tuple(None if f is None else on_lattice(f) for f in fields))
-
-    def displacement(self, band: int, xy: Tensor) -> Tensor | None:
-        """Return the displacement, (N, 2) px, of positions (N, 2) of I before the homography; None without a field."""
-        field = self.fields[band] if self.fields else None
-        if field is None:
-            return None
-        size = xy.new_tensor(self.fixed.size_px) - 1
-        at = (2 * self.fixed.raw(xy) / size - 1)[None, :, None]
-        result = functional.grid_sample(field, at, padding_mode="border", align_corners=True)
-        return result[0, :, :, 0].T
-
-    def homography(self, matrix: Matrix, band: int) -> Tensor:
-        """Convert fixed_to_moving of a moving image from full resolution to px of the level, (3, 3) float32."""
-        scaled = geometry.rescale(matrix, self.fixed.scale, self.moving[band].scale)
-        return torch.tensor(scaled, dtype=torch.float32, device=self.fixed.image.device)
-
-    def full_matrix(self, homography: Tensor, band: int) -> Matrix:
-        """Convert fixed_to_moving (3, 3) of a moving image from px of the level to full resolution.
-
-        Raises GeometryError for a matrix that cannot be inverted.
+        Returns the keypoints and (N, bands) True for each I' that contains the patch; keypoints in most bands come
+        first. The orientation is uniform in [0, 2 pi], log2(scale / spacing_px) is uniform in [0, octaves] (paper,
+        Sec. 5.3).
         """
-        up, moving_up = self.fixed.scale.inverse, self.moving[band].scale.inverse
-        return geometry.rescale(homography.cpu().double().numpy(), up, moving_up)
+        tries_per_keypoint = 4  # keypoints are drawn in excess, because patches that leave the valid area are rejected
+        tries, device = tries_per_keypoint * count if len(pool) else 0, pool.xy.device
+        rows = torch.randint(max(1, len(pool)), (tries,), generator=self.generator).to(device)
+        angle = torch.rand(tries, generator=self.generator) * (2 * math.pi)
+        scale = spacing_px * 2 ** (torch.rand(tries, generator=self.generator) * octaves)
+        keypoints = Keypoints(pool.xy[rows], angle.to(device), scale.to(device))
+        inside = torch.stack([band.overlaps(keypoints) for band in self.bands], dim=1)
+        inside &= (footprint_radius(keypoints.scale) + 1 < pool.max_radius_px[rows])[:, None]
+        bands = inside.sum(dim=1)
+        order = torch.argsort(bands, descending=True, stable=True)[:count]
+        order = order[bands[order] > 0]
+        return keypoints[order], inside[order]
 
 
 def make_level_image(raster: Raster, scale: float, device: torch.device) -> LevelImage:
@@ -145,84 +196,43 @@ def make_level_image(raster: Raster, scale: float, device: torch.device) -> Leve
     return LevelImage(torch.from_numpy(image).to(device), clearance_px, relative, small.lens)
 
 
-def make_level(
-    fixed: Raster,
-    moving: Sequence[Raster],
-    mappings: Sequence[Matrix],
-    scale: float,
-    generator: torch.Generator,
-    device: torch.device,
-) -> Level:
-    """Reduce the images by `scale`.
-
-    The moving images are reduced so that the magnification of their mapping is 1, but never enlarged. `mappings` are
-    fixed_to_moving at full resolution.
-    """
-    fixed_view = make_level_image(fixed, scale, device)
-    views = []
-    for raster, matrix in zip(moving, mappings, strict=True):
-        magnification = float(np.median(np.abs(geometry.local_scale(matrix, *fixed.size_px))))
-        usable = np.isfinite(magnification) and magnification > 0
-        views.append(make_level_image(raster, min(1.0, scale / magnification) if usable else scale, device))
+def make_level(state: JointState, fixed: Raster, moving: Sequence[MovingImage], scale: float) -> Level:
+    """Reduce the images of a capture by `scale`. Raises NoContrastError."""
+    fixed_view = make_level_image(fixed, scale, state.device)
+    bands = tuple(_level_band(m, fixed.size_px, fixed_view, scale, state.device) for m in moving)
     gradient = _gradient_magnitude(fixed_view.image.cpu().numpy())
     # Keypoints are drawn where the gradient of the standardised image is larger than this (paper, Sec. 5.3).
     min_gradient_per_px = 0.05
     has_texture = (gradient > min_gradient_per_px) & (fixed_view.clearance_px.cpu().numpy() > FOOTPRINT_PX)
     trainable, held_out = (
-        _pool(has_texture, max_radius_px, fixed_view.lens, generator, device)
+        _pool(has_texture, max_radius_px, fixed_view.lens, state)
         for max_radius_px in _max_radius_in_cells(*fixed_view.size_px)
     )
+    if len(trainable) == 0:
+        raise NoContrastError
     xy = torch.cat([trainable.xy, held_out.xy])
     anywhere = Pool(xy, torch.full_like(xy[:, 0], math.inf))
-    return Level(fixed_view, tuple(views), trainable, held_out, anywhere)
+    return Level(fixed_view, bands, trainable, held_out, anywhere, state.generator)
 
 
-@dataclass
-class Sampler:
-    """Random sampling of keypoints, the only source of randomness apart from the initial weights."""
-
-    generator: torch.Generator
-
-    def draw(
-        self,
-        level: Level,
-        pool: Pool,
-        homographies: Sequence[Tensor],
-        count: int,
-        octaves: float,
-        spacing_px: float = 1.0,
-    ) -> tuple[Keypoints, Tensor]:
-        """Draw up to `count` keypoints with patches in the valid area of I and of at least one I'.
-
-        Returns the keypoints and (N, bands) True for each I' that contains the patch; keypoints in most bands come
-        first. The orientation is uniform in [0, 2 pi], log2(scale / spacing_px) is uniform in [0, octaves] (paper,
-        Sec. 5.3). `homographies` are fixed_to_moving in px of the level.
-        """
-        tries_per_keypoint = 4  # keypoints are drawn in excess, because patches that leave the valid area are rejected
-        tries, device = tries_per_keypoint * count if len(pool) else 0, pool.xy.device
-        rows = torch.randint(max(1, len(pool)), (tries,), generator=self.generator).to(device)
-        angle = torch.rand(tries, generator=self.generator) * (2 * math.pi)
-        scale = spacing_px * 2 ** (torch.rand(tries, generator=self.generator) * octaves)
-        keypoints = Keypoints(pool.xy[rows], angle.to(device), scale.to(device))
-        inside = torch.stack([footprints_inside(level, b, keypoints, h) for b, h in enumerate(homographies)], dim=1)
-        inside &= (footprint_radius(keypoints.scale) + 1 < pool.max_radius_px[rows])[:, None]
-        bands = inside.sum(dim=1)
-        order = torch.argsort(bands, descending=True, stable=True)[:count]
-        order = order[bands[order] > 0]
-        return keypoints[order], inside[order]
+def _level_band(
+    moving: MovingImage, fixed_size_px: Size, fixed_view: LevelImage, scale: float, device: torch.device
+) -> LevelBand:
+    """Reduce a moving image so that the magnification of its mapping is 1, but never enlarge it."""
+    magnification = float(np.median(np.abs(geometry.local_scale(moving.fixed_to_moving, *fixed_size_px))))
+    usable = np.isfinite(magnification) and magnification > 0
+    view = make_level_image(moving.raster, min(1.0, scale / magnification) if usable else scale, device)
+    h = torch.tensor(geometry.rescale(moving.fixed_to_moving, fixed_view.scale, view.scale), dtype=torch.float32)
+    field = None if moving.field is None else _on_grid(moving.field, fixed_view).to(device)
+    return LevelBand(moving, fixed_view, view, h.to(device), field)
 
 
-def footprints_inside(level: Level, band: int, keypoints: Keypoints, homography: Tensor) -> Tensor:
-    """Return (N,) True for each keypoint with a patch of only valid pixels in both images."""
-    inside_fixed = level.fixed.clearance_at(keypoints.xy) > footprint_radius(keypoints.scale) + 1
-    return inside_fixed & footprints_inside_moving(level, band, keypoints, homography)
-
-
-def footprints_inside_moving(level: Level, band: int, keypoints: Keypoints, homography: Tensor) -> Tensor:
-    """Return (N,) True for each keypoint of I with a patch of only valid pixels in the moving image."""
-    warped_xy = transform(homography, keypoints.xy)
-    magnification = homography[:2, :2].det().abs().sqrt()
-    return level.moving[band].clearance_at(warped_xy) > (footprint_radius(keypoints.scale) + 1) * magnification
+def _on_grid(field: DisplacementField, fixed_view: LevelImage) -> Tensor:
+    """Return `LevelBand.field` of a displacement field, which is in px at full resolution."""
+    width, height = fixed_view.size_px
+    nodes = geometry.lattice(width, height, _FIELD_COLUMNS, round(_FIELD_COLUMNS * height / width) + 1)
+    shift = field.rescaled(fixed_view.scale)(nodes).reshape(-1, _FIELD_COLUMNS, 2)
+    return torch.from_numpy(np.ascontiguousarray(np.moveaxis(shift, -1, 0)[None].astype(np.float32)))
 
 
 def _clearance_px(valid: Mask) -> NDArray[np.float32]:
@@ -262,18 +272,12 @@ def _max_radius_in_cells(width_px: int, height_px: int) -> tuple[NDArray[np.floa
     return training, held_out
 
 
-def _pool(
-    has_texture: Mask,
-    max_radius_px: NDArray[np.float32],
-    model: Lens | None,
-    generator: torch.Generator,
-    device: torch.device,
-) -> Pool:
+def _pool(has_texture: Mask, max_radius_px: NDArray[np.float32], model: Lens | None, state: JointState) -> Pool:
     """Select at random up to _MAX_POSITIONS pixels with texture around which the smallest patch fits."""
     flat = np.flatnonzero(has_texture & (max_radius_px > FOOTPRINT_PX + 1))
     if len(flat) > _MAX_POSITIONS:
-        flat = flat[torch.randint(len(flat), (_MAX_POSITIONS,), generator=generator).numpy()]
+        flat = flat[torch.randint(len(flat), (_MAX_POSITIONS,), generator=state.generator).numpy()]
     row, column = np.divmod(flat, has_texture.shape[1])
     xy = lens.undistort(model, np.stack([column, row], axis=1)).astype(np.float32)
     radius_px = max_radius_px[row, column].astype(np.float32)
-    return Pool(torch.from_numpy(xy).to(device), torch.from_numpy(radius_px).to(device))
+    return Pool(torch.from_numpy(xy).to(state.device), torch.from_numpy(radius_px).to(state.device))

@@ -37,11 +37,9 @@ def sift_keypoints(raster: Raster, maximum: int = MAX_KEYPOINTS) -> Keypoints:
     strongest = sorted(detected, key=lambda k: -k.response)[:maximum]
     # Patches are as wide as the area that SIFT describes, 6 times the size of the keypoint.
     spacing_per_size = 6 / PATCH_PX
-    return Keypoints(
-        torch.tensor([k.pt for k in strongest], dtype=torch.float32).reshape(-1, 2),
-        torch.tensor([math.radians(k.angle) for k in strongest], dtype=torch.float32),
-        torch.tensor([k.size * spacing_per_size for k in strongest], dtype=torch.float32),
-    )
+    rows = [(*k.pt, math.radians(k.angle), k.size * spacing_per_size) for k in strongest]
+    x, y, angle, scale = torch.tensor(rows, dtype=torch.float32).reshape(-1, 4).unbind(dim=1)
+    return Keypoints(torch.stack([x, y], dim=1), angle, scale)
 
 
 def visible_in_both(keypoints: Keypoints, fixed_to_moving: Matrix, fixed: Raster, moving: Raster) -> Keypoints:
@@ -89,10 +87,10 @@ def match_seed(net: Descriptor, fixed: Raster, moving: Raster, maximum: int = MA
     (image, keypoints), (image_prime, keypoints_prime) = (_keypoints(r, device, maximum) for r in (fixed, moving))
     if min(len(keypoints), len(keypoints_prime)) < _MIN_MATCHES:
         return None
-    f = net(image.patches(patch_positions(keypoints)), REFERENCE)
+    f = image.describe(net, keypoints)
     # Reversed contrast turns the gradient, and with it the orientation of a keypoint, by 180 degrees.
     orientations = [replace(keypoints_prime, angle=keypoints_prime.angle + turn) for turn in (0.0, torch.pi)]
-    f_prime = torch.cat([net(image_prime.patches(patch_positions(k)), 1) for k in orientations])
+    f_prime = torch.cat([image_prime.describe(net, k, side=1) for k in orientations])
     rows, columns = _mutual_nearest(f, f_prime, len(keypoints_prime))
     if len(rows) < _MIN_MATCHES:
         return None

@@ -5,7 +5,6 @@ the parameters of a homography, L0 and L1 the losses. The constants are those of
 """
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -14,9 +13,9 @@ from torch import Tensor
 from torch.nn import functional
 
 from agalign.errors import NotEnoughTextureError
-from agalign.method.descriptor import REFERENCE, Descriptor, distance
+from agalign.method.descriptor import Descriptor, distance
 from agalign.method.device import to_float64
-from agalign.method.levels import Level, Pool
+from agalign.method.levels import Level, Pool, make_level
 from agalign.method.patches import (
     FAMILY_PARAMETERS,
     Keypoints,
@@ -30,12 +29,9 @@ from agalign.method.refine import refine
 from agalign.method.state import ImageGroup, JointState
 from agalign.values import geometry
 from agalign.values.alignment import JointResult
-from agalign.values.geometry import Matrix
 from agalign.values.issues import Issue
 from agalign.values.pixel_units import FixedImagePx
 
-_MOVING = 1
-"""Side of the network that describes the moving image."""
 _COARSEST_PX = 80
 """Longer side of the coarsest level. With 64, where few patches fit, psi moves half as far (docs/paper.md)."""
 _OCTAVES = 4.0
@@ -57,10 +53,6 @@ class Training:
     """Passes over the keypoints at the coarsest level, half as many at each next one: psi has farthest to go at the
     coarsest. Not given in the paper; its 90 s a pair on a GTX 1080 Ti are about 100 at each level."""
 
-    def at(self, level: int) -> "Training":
-        """Return the training of a level, 0 for the coarsest."""
-        return replace(self, epochs=max(1, self.epochs >> level))
-
 
 DEFAULT_TRAINING = Training()
 
@@ -79,45 +71,32 @@ def align_by_paper(
     Coarse to fine: theta is reinitialised at each level, psi is kept. Raises NotEnoughTextureError, NoContrastError,
     and GeometryError if the final matrix is not invertible.
     """
-    channels = group.fixed.channels, group.moving[0].channels
+    moving = group.moving[0]
+    channels = group.fixed.channels, moving.raster.channels
     scales = pyramid(max(group.fixed.size_px))
     steps = 0
     for number, scale in enumerate(scales):
-        level = state.level(group, scale, [0])
+        level = make_level(state, group.fixed, group.moving, scale)
         # The last theta measures the held-out retrieval, so it must not be trained on the held-out cells.
         pool = level.trainable if scale == 1.0 else level.anywhere
-        net = state.paper_descriptor(channels)
-
-        def report(share: float, number: int = number) -> None:
-            state.progress("learning", (number + share) / len(scales))
-
-        descent = descend(state, net, level, pool, group.mappings[0], training.at(number), report=report)
-        group.mappings[0] = descent.fixed_to_moving
-        steps += descent.steps
+        net = state.random_descriptor(channels)
+        at_level = replace(training, epochs=max(1, training.epochs >> number))
+        shares = number / len(scales), (number + 1) / len(scales)
+        level_steps, loss, last_step_px = descend(state, net, level, pool, at_level, shares=shares)
+        moving.fixed_to_moving = level.bands[0].fixed_to_moving
+        steps += level_steps
     result = refine(state, net, group, update_psi=False)[0]
     if isinstance(result, Issue):
         return net, result
     return net, replace(
         result,
-        fixed_to_moving=descent.fixed_to_moving,
-        loss=descent.loss,
+        fixed_to_moving=moving.fixed_to_moving,
+        loss=loss,
         iterations=steps,
         levels=scales,
         recipe="paper",
-        last_step_px=descent.last_step_px,
+        last_step_px=last_step_px,
     )
-
-
-@dataclass(frozen=True)
-class Descent:
-    """Result of SGD at one level."""
-
-    fixed_to_moving: Matrix
-    steps: int
-    loss: float
-    """Mean per keypoint over the last epoch."""
-    last_step_px: float
-    """Largest displacement of a corner in the last step, px of the level."""
 
 
 def descend(
@@ -125,19 +104,20 @@ def descend(
     net: Descriptor,
     level: Level,
     pool: Pool,
-    start: Matrix,
     training: Training = DEFAULT_TRAINING,
     *,
-    report: Callable[[float], None] = lambda _: None,
+    shares: tuple[float, float] = (0.0, 1.0),
     update_psi: bool = True,
-) -> Descent:
+) -> tuple[int, float, float]:
     """Minimise sum L0(x; psi, theta) + sum L1(x, x'; theta) over theta and psi (paper, Eq. 5).
 
-    Keypoints x are drawn from `pool`. Without `update_psi`, only theta is learned (paper, Eq. 4). Raises
-    NotEnoughTextureError.
+    Keypoints x are drawn from `pool`. Without `update_psi`, only theta is learned (paper, Eq. 4). The homography of the
+    moving image is updated. `shares` are the completed shares of the whole work before and after. Returns (number of
+    steps, mean loss per keypoint over the last epoch, largest displacement of a corner in the last step, px of the
+    level). Raises NotEnoughTextureError.
     """
-    size_px = level.fixed.size_px
-    psi = psi_from_homography(to_float64(level.homography(start, 0)), *size_px).to(level.fixed.image).requires_grad_()
+    size_px, band = level.fixed.size_px, level.bands[0]
+    psi = psi_from_homography(to_float64(band.h), *size_px).to(level.fixed.image).requires_grad_()
     is_free = torch.zeros_like(psi)
     if update_psi:
         is_free[list(FAMILY_PARAMETERS[state.family or "homography"])] = 1.0
@@ -148,11 +128,13 @@ def descend(
     annealing = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, training.epochs)
     loss_value, before = float("nan"), psi.detach().clone()
     for epoch in range(training.epochs):
-        keypoints = _draw(state, level, pool, homography_from_psi(psi.detach(), *size_px), training.keypoints)
-        batches = torch.split(torch.arange(len(keypoints.x) // _BATCH * _BATCH), _BATCH)
+        band.h = homography_from_psi(psi.detach(), *size_px)
+        x, x_false, is_negative = _draw(level, pool, training.keypoints)
+        batches = torch.split(torch.arange(len(x) // _BATCH * _BATCH), _BATCH)
         pass_loss = 0.0
         for rows in batches:
-            loss = _loss(net, level, keypoints.of(rows), homography_from_psi(psi, *size_px))
+            h = homography_from_psi(psi, *size_px)
+            loss = _loss(net, level, h, x[rows], x_false[rows], is_negative[rows])
             optimiser.zero_grad()
             torch.autograd.backward(loss)
             assert psi.grad is not None
@@ -163,47 +145,35 @@ def descend(
         annealing.step()
         steps += len(batches)
         loss_value = pass_loss / (len(batches) * _BATCH)
-        report((epoch + 1) / training.epochs)
-    h, h_before = (homography_from_psi(q, *size_px).detach() for q in (psi, before))
-    corners = torch.tensor(geometry.corners(*size_px)).to(h)
-    last_step = (transform(h, corners) - transform(h_before, corners)).norm(dim=1).max()
-    return Descent(level.full_matrix(h, 0), steps, loss_value, float(last_step))
+        state.progress("learning", float(np.interp(epoch + 1, (0, training.epochs), shares)))
+    band.h, h_before = (homography_from_psi(q, *size_px).detach() for q in (psi, before))
+    corners = torch.tensor(geometry.corners(*size_px)).to(band.h)
+    last_step = (transform(band.h, corners) - transform(h_before, corners)).norm(dim=1).max()
+    return steps, loss_value, float(last_step)
 
 
-@dataclass(frozen=True)
-class _Samples:
-    """Keypoints of I, each with a non-matching keypoint of I'."""
-
-    x: Keypoints
-    x_false: Keypoints
-    is_negative: Tensor
-    """(N,) False where `x_false` is too close to the true position to serve as a negative."""
-
-    def of(self, rows: Tensor) -> "_Samples":
-        """Select a batch."""
-        return _Samples(self.x[rows], self.x_false[rows], self.is_negative[rows])
-
-
-def _draw(state: JointState, level: Level, pool: Pool, h: Tensor, count: int) -> _Samples:
-    """Draw the keypoints of a pass; a negative is the warped position of another random keypoint."""
+def _draw(level: Level, pool: Pool, count: int) -> tuple[Keypoints, Keypoints, Tensor]:
+    """Draw the keypoints x of a pass, N non-matching keypoints x' of I', and (N,) False where x' is too close to the
+    true position to serve as a negative. A negative is the warped position of another random keypoint.
+    """
     # Distance between a patch's samples at s = 1: patches are 4 to 64 px wide. Not given in the paper.
     spacing_px = 0.25
-    x, _ = state.sampler.draw(level, pool, [h], count, _OCTAVES, spacing_px)
+    x, _ = level.draw(pool, count, _OCTAVES, spacing_px)
     if len(x) < _BATCH:
         raise NotEnoughTextureError(len(x), _BATCH)
-    order = torch.randperm(len(x), generator=state.sampler.generator).to(state.device)
+    h = level.bands[0].h
+    order = torch.randperm(len(x), generator=level.generator).to(h.device)
     x_false = warp_keypoints(x[order], h)
-    is_negative = (x_false.xy - transform(h, x.xy)).norm(dim=1) >= _MIN_NEGATIVE_PX
-    return _Samples(x, x_false, is_negative)
+    return x, x_false, (x_false.xy - transform(h, x.xy)).norm(dim=1) >= _MIN_NEGATIVE_PX
 
 
-def _loss(net: Descriptor, level: Level, batch: _Samples, h: Tensor) -> Tensor:
+def _loss(net: Descriptor, level: Level, h: Tensor, x: Keypoints, x_false: Keypoints, is_negative: Tensor) -> Tensor:
     """Return the sum of L0(x, w_k(x; psi)) and of L1(x, x') (paper, Eq. 3)."""
-    fixed, moving = level.fixed, level.moving[0]
-    f = net(fixed.patches(patch_positions(batch.x)), REFERENCE)
-    positions = torch.cat([patch_positions(warp_keypoints(batch.x, h)), patch_positions(batch.x_false)])
-    f_true, f_false = net(moving.patches(positions), _MOVING).chunk(2)
-    return contrastive_loss(distance(f, f_true), distance(f, f_false)[batch.is_negative])
+    f = level.fixed.describe(net, x)
+    band = level.bands[0]
+    positions = torch.cat([patch_positions(warp_keypoints(x, h)), patch_positions(x_false)])
+    f_true, f_false = net(band.view.patches(positions), band.moving.side).chunk(2)
+    return contrastive_loss(distance(f, f_true), distance(f, f_false)[is_negative])
 
 
 def contrastive_loss(positive: Tensor, negative: Tensor) -> Tensor:

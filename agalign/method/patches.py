@@ -30,47 +30,34 @@ FAMILY_PARAMETERS: dict[ModelFamily, tuple[int, ...]] = {
 """Indices of the elements of psi that are free parameters of a model family, in the order of preference."""
 
 
+_ROWS, _COLUMNS = [0, 0, 1, 1, 0, 1, 2, 2], [0, 1, 0, 1, 2, 2, 0, 1]
+"""Places of the elements of psi in H - 1."""
+
+
 def homography_from_psi(psi: Tensor, width_px: int, height_px: int) -> Tensor:
     """Return H (3, 3) of psi (8,) = alpha [h11-1, h12, h21, h22-1, h13/w, h23/h, h31 w, h32 h] (paper, Sec. 5.1)."""
-    p = psi / ALPHA
-    one = torch.ones_like(p[0])
-    return torch.stack(
-        [
-            torch.stack([1 + p[0], p[1], p[4] * width_px]),
-            torch.stack([p[2], 1 + p[3], p[5] * height_px]),
-            torch.stack([p[6] / width_px, p[7] / height_px, one]),
-        ]
-    )
+    factor, divisor = _size_factors(psi, width_px, height_px)
+    result = torch.eye(3, dtype=psi.dtype, device=psi.device)
+    result[_ROWS, _COLUMNS] += psi / ALPHA * factor / divisor
+    return result
 
 
 def psi_from_homography(homography: Tensor, width_px: int, height_px: int) -> Tensor:
     """Return psi (8,) of H (3, 3); the inverse of `homography_from_psi`."""
-    h = homography / homography[2, 2]
-    return ALPHA * torch.stack(
-        [
-            h[0, 0] - 1,
-            h[0, 1],
-            h[1, 0],
-            h[1, 1] - 1,
-            h[0, 2] / width_px,
-            h[1, 2] / height_px,
-            h[2, 0] * width_px,
-            h[2, 1] * height_px,
-        ]
-    )
+    factor, divisor = _size_factors(homography, width_px, height_px)
+    identity = torch.eye(3, dtype=homography.dtype, device=homography.device)
+    return ALPHA * ((homography / homography[2, 2] - identity)[_ROWS, _COLUMNS] / factor * divisor)
+
+
+def _size_factors(like: Tensor, width_px: int, height_px: int) -> tuple[Tensor, Tensor]:
+    """Return the factors and divisors (8,) of psi in px, of the type and on the device of another tensor."""
+    return like.new_tensor([1, 1, 1, 1, width_px, height_px, 1, 1]), like.new_tensor([1] * 6 + [width_px, height_px])
 
 
 def transform(homography: Tensor, points: Tensor) -> Tensor:
     """Map points (..., 2) by H (3, 3)."""
     mapped = points @ homography[:, :2].T + homography[:, 2]
     return mapped[..., :2] / mapped[..., 2:]
-
-
-def translation(shift: Tensor) -> Tensor:
-    """Return the homography (3, 3) of a shift (2,) px."""
-    h = torch.eye(3, dtype=shift.dtype, device=shift.device)
-    h[:2, 2] = shift
-    return h
 
 
 @dataclass(frozen=True)
@@ -146,5 +133,6 @@ def footprint_radius(scale: Tensor) -> Tensor:
 
 
 def far_apart(keypoints: Keypoints) -> Tensor:
-    """Return (N, N) True where two keypoints are far enough apart to be negatives of each other."""
-    return torch.cdist(keypoints.xy, keypoints.xy) >= _MIN_NEGATIVE_PX
+    """Return (N, N) True where two keypoints are far apart, so that they may be negatives, and on the diagonal."""
+    is_far = torch.cdist(keypoints.xy, keypoints.xy) >= _MIN_NEGATIVE_PX
+    return is_far.fill_diagonal_(True)

@@ -23,6 +23,8 @@ PIXELS_PER_MM = 266.666667
 FOCAL_LENGTH_MM = 5.45
 BLACK_LEVEL, WHITE_LEVEL = 4800.0, 52000.0
 EXPOSURE_S = 1.3e-3
+VIGNETTING = 0.35
+"""Relative decrease of the light from the centre to the corners."""
 _IRRADIANCE = 0.8
 """W/m^2/nm at every wavelength."""
 
@@ -104,8 +106,6 @@ class Exposure:
     """Number of the capture, from 1."""
     size_px: tuple[int, int]
     """(width, height) of the reference's images."""
-    vignetting: float
-    """Relative decrease of the light from the centre to the corners."""
     shutter: float = 1.0
     """Exposure time as a multiple of the normal one."""
 
@@ -205,7 +205,7 @@ class MicaSenseCamera(CameraSpec):
             rig=", ".join(f"{angle:.6f}" for angle in angles),
             width=width,
             height=height,
-            fall=-exposure.vignetting / ((width / 2) ** 2 + (height / 2) ** 2),
+            fall=-VIGNETTING / ((width / 2) ** 2 + (height / 2) ** 2),
             gain=_IRRADIANCE / np.pi * EXPOSURE_S * 65536 / (WHITE_LEVEL - BLACK_LEVEL) / band.exposure,
             irradiance=_IRRADIANCE,
         )

@@ -27,8 +27,6 @@ from agalign.values.mapping import splined
 ALTITUDE_M = 22.0, 34.0
 _CAPTURES_PER_GROUND = 4
 """Captures over one painted ground; longer flights have several grounds, one in memory at a time."""
-VIGNETTING = 0.35
-"""Relative decrease of the light from the centre to the corners."""
 
 
 Degrade = Callable[[Field, np.random.Generator], Field]
@@ -107,7 +105,7 @@ def _write(
                 path = images / camera.file_name(band, number)
                 path.parent.mkdir(parents=True, exist_ok=True)
                 pose = replace(shot.pose, north_m=shot.pose.north_m + before)
-                camera.write_band(path, pixels, band, Exposure(pose, number, size_px, VIGNETTING, shot.shutter))
+                camera.write_band(path, pixels, band, Exposure(pose, number, size_px, shot.shutter))
     return {
         camera.capture_name(number): _truth(shot, number, camera, size_px)
         for number, shot in enumerate(shots, start=before + 1)
@@ -204,7 +202,7 @@ def recorded(
     height, width = scene.shape
     y, x = np.arange(height), np.arange(width)
     radius2 = ((x - width / 2) ** 2)[None, :] + ((y - height / 2) ** 2)[:, None]
-    vignetting = 1 - VIGNETTING * radius2 / ((width / 2) ** 2 + (height / 2) ** 2)
+    vignetting = 1 - cameras.VIGNETTING * radius2 / ((width / 2) ** 2 + (height / 2) ** 2)
     light = np.asarray(scene * band.exposure, np.float32)
     signal = np.clip((light if degrade is None else degrade(light, rng)) * vignetting, 0, 1)
     electrons = signal * 4000

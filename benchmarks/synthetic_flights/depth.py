@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agalign.synthetic.cameras import BANDS, REFERENCE, BandSpec, CameraSpec, Exposure, MicaSenseCamera, Pose
-from agalign.synthetic.flight import VIGNETTING, recorded
+from agalign.synthetic.flight import recorded
 from agalign.synthetic.ground import Field
 from synthetic_flights.patches import Eye, Hits, Patch, Textures, boxes_of, nearer, nearest, reflectances, sample
 
@@ -208,7 +208,7 @@ def write_capture(
     rng = np.random.default_rng(rng_seed)
     images = folder / "0000SET" / "000"
     images.mkdir(parents=True, exist_ok=True)
-    exposure = Exposure(scene.pose, number, size_px, VIGNETTING)
+    exposure = Exposure(scene.pose, number, size_px)
     for band in camera.bands:
         pixels = recorded(view(scene, band, size_px), band, rng)
         camera.write_band(images / camera.file_name(band, number), pixels, band, exposure)

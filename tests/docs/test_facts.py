@@ -193,7 +193,7 @@ def test_equations_of_the_paper() -> None:
             value = operator.attrgetter(code.partition("(")[0])(module)
             assert not equations or equations[0] in (inspect.getdoc(value) or ""), code
             names.append(code)
-    assert {"contrastive_loss", "descend", "bilinear", "match_seed", "Sampler.draw"} <= set(names)
+    assert {"contrastive_loss", "descend", "bilinear", "match_seed", "Level.draw"} <= set(names)
 
 
 def test_extras() -> None:

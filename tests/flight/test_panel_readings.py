@@ -1,3 +1,4 @@
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -53,43 +54,35 @@ def test_the_factor_is_reflectance_by_the_tags_or_the_user_over_radiance(tmp_pat
     assert read_panel(shown, {"red": 0.6}).bands[0].factor == pytest.approx(0.4)
 
 
-def in_light(light: str) -> np.ndarray:
-    """Levels (30, 30) of a panel with the noise of a camera, in this light."""
-    rng = np.random.default_rng(1)
-    panel = rng.normal(1.0, 0.03, (30, 30))
-    if light.startswith("shadow"):
-        panel[:, : 5 + int(light.split()[2]) * 20 // 100] *= 0.5
-    elif light == "noise":
-        panel = rng.uniform(0.0, 2.0, (30, 30))
-    elif light == "half black":
-        panel[:15] = 0.0
+def levels(shaded_columns: int = 0, light: float = 0.5, noise: float = 0.03) -> np.ndarray:
+    """Levels (30, 30) of a panel with the noise of a camera and less light in some columns."""
+    panel = np.random.default_rng(1).normal(1.0, noise, (30, 30))
+    panel[:, :shaded_columns] *= light
     return np.clip(1000 + 20000 * panel, 0, 65000)
 
 
 @pytest.mark.parametrize(
-    ("levels", "problem"),
+    ("values", "problem"),
     [
-        (in_light("even"), ""),
-        (in_light("shadow of 30 %"), ""),
-        (in_light("shadow of 50 %"), "its pixels vary by "),
-        (in_light("shadow of 70 %"), "its pixels vary by "),
-        (in_light("noise"), "its pixels vary by "),
-        (in_light("half black"), "its pixels vary by "),
+        (levels(), ""),
+        (levels(11), ""),
+        (levels(15), "its pixels vary by "),
+        (levels(noise=0.6), "its pixels vary by "),
+        (levels(15, light=0.0), "its pixels vary by "),
         (900, "it is black"),
         (65535, "saturated"),
     ],
 )
 def test_a_panel_is_measured_where_it_is_evenly_lit_and_exposed(
-    tmp_path: Path, levels: int | np.ndarray, problem: str
+    tmp_path: Path, values: int | np.ndarray, problem: str
 ) -> None:
     """A shadow over 30 % of the panel, by half, would make every band 16 % too bright."""
-    reading = read_panel(capture(panel_file(tmp_path / "a.tif", levels)), {})
+    reading = read_panel(capture(panel_file(tmp_path / "a.tif", values)), {})
     (result,) = reading.bands
     if problem:
         assert problem in result.problem
         assert result.factor is None
-        (part,) = write_panels([reading], tmp_path)
-        assert f"not used in Green: {result.problem}" in part.sentence
+        assert f"not used in Green: {result.problem}" in write_panels([reading], tmp_path)[0].sentence
     else:
         assert (result.problem, result.radiance) == ("", pytest.approx(2.0 * 20000 / 65536, rel=0.03))
 
@@ -103,15 +96,16 @@ def test_illumination_is_interpolated_in_time_and_constant_outside() -> None:
     assert reflectance_factors(replace(capture(GREEN), camera=CameraIdentity("a", "b", "2")), panels) == {}
 
 
-def lit(irradiance: float, quantity: Quantity = "reflectance") -> Band:
+def lit(irradiance: float, quantity: Quantity = "reflectance", name: str = "Green") -> Band:
     """A band with a light sensor that measures an irradiance."""
-    return replace(GREEN, radiometry=replace(PLAIN, by_sun=(np.pi / irradiance, quantity)))
+    return replace(GREEN, name=name, radiometry=replace(PLAIN, by_sun=(np.pi / irradiance, quantity)))
 
 
-def lit_panel(moment: str, measured: float, quantity: Quantity = "reflectance") -> PanelReading:
-    """A panel of reflectance 0.5 under an irradiance of 1 that the light sensor measures as `measured`."""
-    band = lit(measured, quantity)
-    return PanelReading(capture(band, moment), (BandReading(band, 0.5, 0.5 / np.pi),))
+def lit_panel(moment: str, *measured: float, quantity: Quantity = "reflectance") -> PanelReading:
+    """A panel of reflectance 0.5 under an irradiance of 1 that the light sensor of each band measures as `measured`."""
+    bands = tuple(lit(*facts) for facts in zip(measured, [quantity] * 3, ("Green", "Red", "NIR"), strict=False))
+    seen = replace(capture(GREEN, moment), bands=bands)
+    return PanelReading(seen, tuple(BandReading(band, 0.5, 0.5 / np.pi) for band in bands))
 
 
 def test_the_panel_scales_the_light_sensor_which_follows_the_light() -> None:
@@ -119,9 +113,6 @@ def test_the_panel_scales_the_light_sensor_which_follows_the_light() -> None:
     panel, later = lit_panel("2026-06-21T15:04:00", 0.9), capture(lit(0.9 * 1.15), "2026-06-21T15:57:00")
     result = reflectance_factors(later, [panel])
     assert result == {"Green": (pytest.approx(np.pi / 1.15), "panel and light sensor", 53 * 60)}
-    (band,) = with_radiometry(later, "auto", result).bands
-    assert (band.radiometry.source, band.radiometry.panel_age_s) == ("panel and light sensor", 53 * 60)
-    assert band.radiometry.gain == pytest.approx(PLAIN.gain * np.pi / 1.15)
     # Between two panels, the scale of the sensor is interpolated.
     two = [panel, lit_panel("2026-06-21T16:50:00", 1.0)]
     scale = (1 / 0.9 + 1.0) / 2
@@ -139,23 +130,19 @@ def test_a_light_sensor_that_was_shaded_at_the_panel_is_not_combined_with_it() -
         sources = [with_radiometry(later, c, factors).bands[0].radiometry.source for c in ("auto", "panel", "sun")]
         assert sources == ["light sensor", "panel", "light sensor"]
     # A sensor with an unknown unit has any scale.
-    relative = lit_panel("2026-06-21T10:00:00", 3000.0, "relative reflectance")
+    relative = lit_panel("2026-06-21T10:00:00", 3000.0, quantity="relative reflectance")
     assert (relative.sensor_scales, relative.fits_sensor) == ({}, True)
     in_same_unit = capture(lit(3300.0, "relative reflectance"), "2026-06-21T10:30:00")
     assert reflectance_factors(in_same_unit, [relative])["Green"].value == pytest.approx(np.pi / 1.1)
 
 
-def test_a_panel_that_differs_from_the_light_sensor_in_one_band_is_not_combined_with_it(tmp_path: Path) -> None:
+@pytest.mark.parametrize(("scale", "source"), [(1.18, "panel and light sensor"), (1.4, "panel")])
+def test_a_panel_that_differs_from_the_light_sensor_in_one_band_is_not_combined_with_it(
+    scale: float, source: str
+) -> None:
     """On a RedEdge-M with a DLS 1, the largest scale of a band is 1.18 times the smallest."""
-    later = capture(lit(1.2), "2026-06-21T10:30:00")
-    for nir, fits in ((1.18, True), (1.4, False)):
-        bands = [replace(lit(1.0), name=name) for name in ("Green", "Red", "NIR")]
-        scales = zip(bands, (1.0, 1.0, nir), strict=True)
-        readings = tuple(BandReading(band, 0.5, 0.5 * scale / np.pi) for band, scale in scales)
-        reading = PanelReading(replace(later, bands=tuple(bands)), readings)
-        assert reading.fits_sensor == fits
-        (factor,) = reflectance_factors(later, [reading]).values()
-        assert factor.source == ("panel and light sensor" if fits else "panel")
+    panel = lit_panel("2026-06-21T10:30:00", 1.0, 1.0, 1 / scale)
+    assert reflectance_factors(capture(lit(1.2), "2026-06-21T10:30:00"), [panel])["Green"].source == source
 
 
 def test_a_panel_on_the_ground_gives_the_height_of_other_captures() -> None:
@@ -170,32 +157,24 @@ def test_a_panel_on_the_ground_gives_the_height_of_other_captures() -> None:
     assert with_height(replace(high, position=Position(52.0, 5.0, 93.5)), [ground]).pose == high.pose
 
 
-def captures_in_seconds(undated: int | None = None) -> list[Capture]:
-    """Twenty captures, named by the second in which they were taken."""
-    moments = ["" if k == undated else f"2026-06-21T10:00:{k:02d}" for k in range(20)]
-    return [replace(capture(GREEN, moment), name=f"{k}") for k, moment in enumerate(moments)]
+def found(folder: Path, seconds: Iterable[int], shown: Sequence[int], undated: int | None = None) -> list[int]:
+    """The captures with a panel, by the second in which they were taken, of a flight with panels in some of them."""
+    flight = []
+    for k in seconds:
+        band = replace(panel_file(folder / f"{k}.tif", 33768 if k in shown else 2000), panel=None)
+        moment = "" if k == undated else f"2026-06-21T10:00:{k:02d}"
+        flight.append(replace(capture(band, moment), name=f"{k}"))
+    return [int(c.name) for c in with_panels(flight, without_code=True) if c.panel]
 
 
-def test_the_search_for_panels_ends_after_three_captures_without_one(monkeypatch: pytest.MonkeyPatch) -> None:
-    flight, looked, shown = captures_in_seconds(), [], (0, 1, 2, 3, 5, 18)
-
-    def detected(one: Capture, _without_code: bool) -> Capture:
-        looked.append(int(one.name))
-        return replace(one, bands=(HELD if int(one.name) in shown else GREEN,))
-
-    monkeypatch.setattr("agalign.flight.panel_readings._with_detected_panel", detected)
-    assert [int(c.name) for c in with_panels(flight) if c.panel] == list(shown)
-    assert sorted(looked) == [0, 1, 2, 3, 4, 5, 6, 7, 8, 15, 16, 17, 18, 19]
-    for few in (flight[7:8], flight[7:9], []):
-        looked.clear()
-        assert len(with_panels(few)) == len(few)
-        assert sorted(looked) == [int(c.name) for c in few]
+def test_the_search_for_panels_ends_after_three_captures_without_one(tmp_path: Path) -> None:
+    assert found(tmp_path, range(20), [0, 1, 2, 3, 6, 10, 14, 18]) == [0, 1, 2, 3, 6, 18]
+    for few in ([7], [7, 8], []):
+        assert found(tmp_path, few, few) == few
     # One unknown time leaves the captures in their order.
-    looked.clear()
-    detect = "agalign.flight.panel_readings._with_detected_panel"
-    monkeypatch.setattr(detect, lambda one, _without_code: looked.append(int(one.name)) or one)
-    with_panels(captures_in_seconds(undated=10))
-    assert sorted(looked) == [0, 1, 2, 17, 18, 19]
+    turned = [*range(10, 20), *range(10)]
+    assert found(tmp_path, turned, [0, 19]) == [19, 0]
+    assert found(tmp_path, turned, [0, 19], undated=5) == []
 
 
 def test_without_a_time_no_panel_is_of_the_same_hours() -> None:
@@ -210,8 +189,6 @@ def test_without_a_time_no_panel_is_of_the_same_hours() -> None:
     ground = PanelReading(capture(HELD, "1970-01-01T01:00:00", position=GROUND), ())
     high = capture(GREEN, "", position=HIGH, pose=Pose(30.0))
     assert with_height(high, [ground]) == high
-    undated = replace(ground, capture=replace(ground.capture, captured_at=""))
-    assert with_height(replace(high, captured_at="1970-01-01T01:00:00"), [undated]).pose == high.pose
 
 
 @pytest.mark.parametrize("code", ["RP04", ""])

@@ -4,12 +4,12 @@ It refuses what a GPU refuses: tensors of CPU and GPU in one operation, NumPy ar
 a generator of the CPU, and float64 where the GPU is Apple's.
 """
 
-from collections.abc import Callable, Iterator
 from typing import Any
 
 import torch
 from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
+from torch.utils._pytree import tree_leaves, tree_map_only
 
 NAME = "lazy"
 """Autograd runs backward passes of this device type in the calling thread, and those of GPUs in a GPU's thread."""
@@ -57,7 +57,7 @@ class PretendedDevice(TorchDispatchMode):
 
     def __torch_dispatch__(self, operation: Any, _types: Any, args: Any = (), kwargs: Any = None) -> Any:
         kwargs = dict(kwargs or {})
-        tensors = list(_tensors((args, kwargs)))
+        tensors = _tensors((args, kwargs))
         is_used = any(isinstance(t, OnDevice) for t in tensors)
         is_target = is_used if kwargs.get("device") is None else torch.device(kwargs["device"]).type == NAME
         if not is_used and not is_target:
@@ -70,38 +70,22 @@ class PretendedDevice(TorchDispatchMode):
         if operation not in _BETWEEN_DEVICES:
             # A GPU takes indices, and single values in arithmetic, from the CPU.
             if operation in _INDEXING:
-                tensors = list(_tensors((args[0], args[2:])))
+                tensors = _tensors((args[0], args[2:]))
             elif torch.Tag.pointwise in operation.tags:
                 tensors = [t for t in tensors if t.ndim > 0]
             if not all(isinstance(t, OnDevice) for t in tensors):
                 raise RuntimeError(f"{operation}: expected all tensors on one device, but found {NAME} and cpu")
-        result = operation(*_mapped(_values, args), **{name: _mapped(_values, v) for name, v in kwargs.items()})
+        values, options = tree_map_only(OnDevice, lambda t: t.values_on_cpu, (args, kwargs))
+        result = operation(*values, **options)
         if operation._schema.is_mutable:
             return args[0]
-        return _mapped(self._on_device, result) if is_target else result
+        return tree_map_only(Tensor, self._on_device, result) if is_target else result
 
-    def _on_device(self, value: Any) -> Any:
-        if not isinstance(value, Tensor):
-            return value
-        if value.dtype == torch.float64 and not self.has_float64:
+    def _on_device(self, values: Tensor) -> OnDevice:
+        if values.dtype == torch.float64 and not self.has_float64:
             raise TypeError("the device has no float64")
-        return OnDevice(value)
+        return OnDevice(values)
 
 
-def _values(value: Any) -> Any:
-    return value.values_on_cpu if isinstance(value, OnDevice) else value
-
-
-def _tensors(nested: Any) -> Iterator[Tensor]:
-    if isinstance(nested, Tensor):
-        yield nested
-    elif isinstance(nested, list | tuple | dict):
-        for item in nested.values() if isinstance(nested, dict) else nested:
-            yield from _tensors(item)
-
-
-def _mapped(function: Callable[[Any], Any], nested: Any) -> Any:
-    """Apply a function to each item of nested lists and tuples."""
-    if isinstance(nested, list | tuple):
-        return type(nested)(_mapped(function, item) for item in nested)
-    return function(nested)
+def _tensors(nested: Any) -> list[Tensor]:
+    return [leaf for leaf in tree_leaves(nested) if isinstance(leaf, Tensor)]

@@ -1,9 +1,9 @@
-import re
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 import torch
@@ -19,7 +19,7 @@ from agalign.method.device import choose_device, one_memory_error, one_thread
 from agalign.method.fast import Schedule
 from agalign.method.joint import align_from_scratch
 from agalign.method.paper import Training
-from agalign.method.state import ImageGroup
+from agalign.method.state import ImageGroup, MovingImage
 from agalign.values import geometry
 from agalign.values.alignment import JointResult
 from agalign.values.choices import Recipe
@@ -59,58 +59,62 @@ def test_overlapping_contexts_restore_the_threads_of_torch() -> None:
 
 
 def test_out_of_memory_is_always_a_memory_error() -> None:
-    for text, error in (
-        ("[enforce fail at alloc_cpu.cpp] DefaultCPUAllocator: not enough memory", MemoryError),
-        ("MPS backend out of memory (MPS allocated: 8.00 GB)", MemoryError),
-        ("something else, of memory", RuntimeError),
-    ):
-        with pytest.raises(error, match=re.escape(text)), one_memory_error():
-            raise RuntimeError(text)
+    with pytest.raises(MemoryError, match="Failed to allocate"), one_memory_error():
+        cv2.resize(np.zeros((9, 9)), (1 << 30, 1 << 20))
+    with pytest.raises(MemoryError, match="can't allocate memory"), one_memory_error():
+        torch.empty(1 << 60)
+    with pytest.raises(RuntimeError, match="something else"), one_memory_error():
+        raise RuntimeError("something else, of memory")
 
 
-GPU = Callable[[bool], PretendedDevice]
+AssertEqualOnGpu = Callable[[Callable[[str], JointResult], bool], None]
+"""Call with a function that aligns on the device of a name, and whether the GPU has float64, which Apple's lack."""
 
 
 @pytest.fixture
-def gpu(monkeypatch: pytest.MonkeyPatch) -> GPU:
-    """Pretend a device with or without float64, as Apple's, with all work in one thread."""
+def assert_equal_on_gpu(monkeypatch: pytest.MonkeyPatch) -> AssertEqualOnGpu:
+    """The results of the CPU and of a pretended GPU are equal; all work is in one thread."""
     monkeypatch.setattr(ThreadPoolExecutor, "map", lambda _self, function, *items: map(function, *items))
 
-    def of_kind(has_float64: bool) -> PretendedDevice:
+    def check(align: Callable[[str], JointResult], has_float64: bool) -> None:
         monkeypatch.setattr(device, "_has_float64", lambda d: has_float64 or d.type != NAME)
-        return PretendedDevice(has_float64=has_float64)
+        on_cpu = align("cpu")
+        with PretendedDevice(has_float64=has_float64) as used:
+            on_gpu = align(NAME)
+        assert used.operations > 1000
+        np.testing.assert_allclose(on_gpu.fixed_to_moving, on_cpu.fixed_to_moving, rtol=1e-9)
+        np.testing.assert_allclose((on_gpu.loss, on_gpu.retrieval), (on_cpu.loss, on_cpu.retrieval), rtol=1e-6)
+        assert on_gpu.iterations == on_cpu.iterations
 
-    return of_kind
+    return check
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("recipe", "has_float64"), [("fast", False), in_full_run("fast", True), in_full_run("paper", False)]
 )
-def test_a_gpu_gives_the_result_of_the_cpu(gpu: GPU, recipe: Recipe, has_float64: bool) -> None:
+def test_a_gpu_gives_the_result_of_the_cpu(
+    assert_equal_on_gpu: AssertEqualOnGpu, recipe: Recipe, has_float64: bool
+) -> None:
     fixed, moving = (view.pixels for view in two_views(geometry.translation(6.0, -4.0), 260, 200))
-    lens, fields = Lens(260.0, 260.0, 130.0, 100.0, (0.01,)), [DisplacementField(60.0, np.full((5, 6, 2), 0.1))]
+    lens, field = Lens(260.0, 260.0, 130.0, 100.0, (0.01,)), DisplacementField(60.0, np.full((5, 6, 2), 0.1))
     short = {"schedule": Schedule(max_steps=10, enough_retrieval=2.0), "training": Training(200, 1)}
 
     def align(name: str) -> JointResult:
         rgb, band = whole(np.stack([fixed, 0.5 * fixed, -fixed]), lens), whole(moving, lens)
         seed, settings = geometry.translation(7.0, -5.0), JointSettings(recipe=recipe, device=name)
-        group = ImageGroup(rgb, [band], [seed], [1], [False], max_shift_px=[9.0], fields=fields)
+        group = ImageGroup(rgb, [MovingImage(band, seed, max_shift_px=9.0, field=field)])
         (result,) = align_from_scratch(group, settings, lambda *_: None, **short)
-        assert isinstance(result, JointResult)
+        assert result.iterations > 0
         return result
 
-    on_cpu = align("cpu")
-    with gpu(has_float64) as used:
-        on_gpu = align(NAME)
-    assert used.operations > 1000
-    np.testing.assert_allclose(on_gpu.fixed_to_moving, on_cpu.fixed_to_moving, rtol=1e-9)
-    np.testing.assert_allclose((on_gpu.loss, on_gpu.retrieval), (on_cpu.loss, on_cpu.retrieval), rtol=1e-6)
-    assert on_gpu.iterations == on_cpu.iterations > 0
+    assert_equal_on_gpu(align, has_float64)
 
 
 @pytest.mark.full
-def test_a_flight_on_a_gpu_has_the_result_of_the_cpu(gpu: GPU, flight: Path, tmp_path: Path) -> None:
+def test_a_flight_on_a_gpu_has_the_result_of_the_cpu(
+    assert_equal_on_gpu: AssertEqualOnGpu, flight: Path, tmp_path: Path
+) -> None:
     """Learning, the model file, keypoint matching and refinement with the frozen network."""
     captures = discover(flight, DiscoverOptions(bands=("Green", "NIR"))).captures
 
@@ -120,13 +124,6 @@ def test_a_flight_on_a_gpu_has_the_result_of_the_cpu(gpu: GPU, flight: Path, tmp
         save_model(model, path)
         loaded = load_model(path, lambda: choose_device(name))
         assert {w.device.type for w in (*model.net.parameters(), *loaded.net.parameters())} == {name}
-        joint = align_capture_bands(captures[0], settings, loaded, lambda *_: None)["NIR"].joint
-        assert joint is not None
-        return joint
+        return align_capture_bands(captures[0], settings, loaded, lambda *_: None)["NIR"].joint
 
-    on_cpu = align("cpu")
-    with gpu(True) as used:
-        on_gpu = align(NAME)
-    assert used.operations > 1000
-    np.testing.assert_allclose(on_gpu.fixed_to_moving, on_cpu.fixed_to_moving, rtol=1e-9)
-    assert on_gpu.retrieval == on_cpu.retrieval
+    assert_equal_on_gpu(align, True)

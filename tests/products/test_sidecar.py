@@ -49,7 +49,8 @@ def example(**changes: Any) -> Sidecar:
     output = {"file": "IMG_1.tif", "bytes": 1, "crop": (0, 0, 10, 8), "nodata": None}
     names = {"agalign": "0", "capture": "IMG_1", "capture_id": "x", "flight_id": "", "captured_at": "", "settings": "0"}
     bands = {"camera": camera, "status": "ok", "missing_bands": [], "reference": reference}
-    bands["bands"] = [NIR | {"reason": None}]
+    nir = NIR | {"reason": None}
+    bands["bands"] = [nir, nir | {"band": "Green", "file": "g.tif", "status": "reference"}]
     return Sidecar.model_validate(names | bands | {"output": output} | changes)
 
 
