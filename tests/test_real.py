@@ -28,7 +28,7 @@ pytestmark = [pytest.mark.real, pytest.mark.slow]
 
 def pair_medians(out: Path, ties_path: Path) -> dict[str, float]:
     """Median tie error of each pair that was delivered as aligned, by moving file."""
-    return {b.file: b.median_px for b in band_errors(out, read_ties(ties_path)) if b.part.status == "aligned"}
+    return {b.part.file: b.median_px for b in band_errors(out, read_ties(ties_path)) if b.part.status == "aligned"}
 
 
 DOCUMENTED = {
