@@ -10,7 +10,6 @@ from agalign.fit.adjustment import (
     WindowShifts,
     adjust,
     are_of_lenses,
-    are_on_a_line,
     lens_std_px,
     parallax_of,
     shifts_by_corners,
@@ -138,13 +137,6 @@ def test_lens_fields_are_recovered_next_to_parallax() -> None:
     without = adjust(windows, SIZE, BASELINES)
     assert all(fit.lens_px is None for fit in without.fits)
     assert np.all(without.scales_px > 1.05 * model.scales_px)
-
-
-def test_baselines_on_a_line() -> None:
-    assert are_on_a_line(np.array([[-1.0, 0.5], [0.4, -0.2], [-0.2, 0.1]]))
-    assert are_on_a_line(np.array([[-1.0, 0.5], [0.4, -0.15]]))
-    assert not are_on_a_line(BASELINES)
-    assert not are_on_a_line(BASELINES[[0, 1]])
 
 
 def test_too_few_windows_give_no_model() -> None:

@@ -2,14 +2,14 @@ import numpy as np
 import pytest
 
 from agalign.fit import displacement_field
-from agalign.fit.displacement_field import DisplacementEstimator, _Gain, _is_one_to_one, common_field, fitted_field
+from agalign.fit.displacement_field import DisplacementEstimator, _Gain, common_field, fitted_field
 from agalign.fit.windows import Shifts
 from agalign.pixels.structure import structure_field
 from agalign.values import geometry
 from agalign.values.alignment import Residual
-from agalign.values.mapping import DisplacementField
+from agalign.values.mapping import DisplacementField, PixelMapping
 
-from ..builders import residual_of, texture
+from ..builders import displaced_views, residual_of, texture
 
 SIZE = 640, 480
 
@@ -24,23 +24,13 @@ def centres() -> np.ndarray:
     return np.stack(np.meshgrid(np.arange(32, 640, 32.0), np.arange(32, 480, 32.0)), -1).reshape(-1, 2)
 
 
-def shifts_at(at: np.ndarray, shifts_px: np.ndarray) -> Shifts:
-    """Shifts with equal weights."""
-    return Shifts.of(residual_of(at, shifts_px))
-
-
-def estimator() -> DisplacementEstimator:
-    image = texture(*SIZE)
-    return DisplacementEstimator(image.valid, structure_field(image))
-
-
 def test_a_smooth_field_is_fitted_despite_noise_and_wrong_peaks() -> None:
     rng = np.random.default_rng(0)
     at = centres()
     shifts = bump(at) + 0.08 * rng.normal(size=at.shape)
     wrong = rng.random(len(at)) < 0.05
     shifts[wrong] += rng.uniform(-20, 20, (wrong.sum(), 2))
-    field = fitted_field(shifts_at(at, shifts), 1.0, 48, SIZE)
+    field = fitted_field(Shifts.of(residual_of(at, shifts)), 1.0, 48, SIZE)
     error = np.linalg.norm(field(at) - bump(at), axis=1)
     assert np.sqrt((error**2).mean()) < 0.09
     assert np.linalg.norm(bump(at), axis=1).max() > 1.2
@@ -49,17 +39,19 @@ def test_a_smooth_field_is_fitted_despite_noise_and_wrong_peaks() -> None:
 def test_the_field_vanishes_far_from_all_measurements() -> None:
     at = centres()
     near = at[at[:, 0] < 200]
-    field = fitted_field(shifts_at(near, np.tile([2.0, 0.0], (len(near), 1))), 1.0, 48, (6400, 480))
+    field = fitted_field(Shifts.of(residual_of(near, (2.0, 0.0))), 1.0, 48, (6400, 480))
     assert field(np.array([[100.0, 240.0]]))[0, 0] == pytest.approx(2.0, abs=0.05)
     assert abs(field(np.array([[6000.0, 240.0]]))[0]).max() < 0.2
 
 
-def test_folding_is_detected() -> None:
-    flat = np.zeros((16, 21, 2))
-    assert _is_one_to_one(DisplacementField(32.0, flat), SIZE)
-    steep = flat.copy()
+def test_a_field_that_folds_the_image_is_rejected(monkeypatch: pytest.MonkeyPatch) -> None:
+    fixed, moving = displaced_views(bump)
+    estimator, mapping = DisplacementEstimator(fixed.valid, structure_field(fixed)), PixelMapping(np.eye(3))
+    assert estimator.refine(moving, mapping).field is not None
+    steep = np.zeros((21, 28, 2))
     steep[:, 10, 0] = -60
-    assert not _is_one_to_one(DisplacementField(32.0, steep), SIZE)
+    monkeypatch.setattr(estimator, "_field", lambda *_: DisplacementField(24.0, steep))
+    assert estimator.refine(moving, mapping).field is None
 
 
 def of_captures(count: int, height: float, seed: int) -> list[Residual]:
@@ -78,7 +70,7 @@ def test_the_common_field_of_captures_is_that_of_the_lenses() -> None:
     assert common_field(of_captures(6, 0.0, 1), SIZE) is None
     assert common_field(of_captures(2, 0.4, 1), SIZE) is None
     # Displacements that differ between captures are not caused by the lenses.
-    own = [of_captures(1, h, k)[0] for k, h in enumerate((0.4, -0.4, 0.4, -0.4))]
+    own = [of_captures(1, height, seed)[0] for seed, height in enumerate((0.4, -0.4, 0.4, -0.4))]
     assert common_field(own, SIZE) is None
 
 
@@ -110,8 +102,9 @@ def test_a_field_fitted_to_noise_does_not_predict_held_out_windows(chance: int) 
     """Random shifts: a fine field fits them, but does not predict others."""
     rng, at = np.random.default_rng(chance), centres()
     shifts = rng.uniform(-4, 4, at.shape)
-    measured = Shifts.of(residual_of(at, shifts))
-    assert not estimator()._best_gain(measured).is_significant(4.0)
-    field = estimator()._field(measured, 0.001)
+    measured, image = Shifts.of(residual_of(at, shifts)), texture(*SIZE)
+    estimator = DisplacementEstimator(image.valid, structure_field(image))
+    assert not estimator._best_gain(measured).is_significant(4.0)
+    field = estimator._field(measured, 0.001)
     explained = np.linalg.norm(shifts - field(at), axis=1)
     assert np.median(explained) < 0.8 * np.median(np.linalg.norm(shifts, axis=1))
