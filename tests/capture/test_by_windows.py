@@ -55,31 +55,28 @@ def test_windows_suffice_where_descriptors_fail(pair: BandPair) -> None:
     assert (after.status, after.issues, after.joint.recipe) == ("aligned", (), "windows")
     assert geometry.corner_error_px(before.fixed_to_moving, TRUTH, *LARGE) > 1
     assert geometry.corner_error_px(after.fixed_to_moving, TRUTH, *LARGE) < 0.3
-    # Only held-out windows verify the fit.
-    assert 0.4 < len(after.residual.centres_px) / len(before.residual.centres_px) < 0.6
 
 
 def test_windows_do_not_override_descriptors_or_other_failures(pair: BandPair, monkeypatch: pytest.MonkeyPatch) -> None:
-    others = [unaligned(pair, issue) for issue in (Issue(UNREADABLE, detail="x"), Issue(FOLDS, 9.0, 4.0))]
-    for before in (*others, replace(unaligned(pair), status="aligned", issues=())):
-        assert aligned_by_windows(pair, before) is before
-    monkeypatch.setattr(module, "_MAX_STEP_PX", 0.5)  # less than the error of the seed
     before = unaligned(pair)
+    others = [unaligned(pair, issue) for issue in (Issue(UNREADABLE, detail="x"), Issue(FOLDS, 9.0, 4.0))]
+    for other in (*others, replace(before, status="aligned", issues=())):
+        assert aligned_by_windows(pair, other) is other
+    monkeypatch.setattr(module, "_MAX_STEP_PX", 0.5)  # less than the error of the seed
     assert aligned_by_windows(pair, before) is before
 
 
 def test_held_out_windows_must_confirm_the_fit() -> None:
     fixed, moving = two_views(TRUTH, *LARGE)
-    moving.pixels[:, 480:] = two_views(TRUTH, *LARGE, seed=5)[0].pixels[:, 480:]  # unrelated content
+    moving.pixels[:, 480:] = textured_image(320, 640, seed=5)  # unrelated content
     pair = pair_of(fixed, moving)
     before = unaligned(pair)
     assert aligned_by_windows(pair, before) is before
 
 
 def windows(count: int, measured: float = 1.0) -> Residual:
-    shifts = np.full((count, 2), 0.1)
-    shifts[round(measured * count) :] = np.nan
-    return residual_of(np.stack([100.0 * np.arange(count), np.zeros(count)], axis=1), shifts)
+    number = np.arange(count)[:, None]
+    return residual_of(number * [100.0, 0.0], np.where(number < round(measured * count), (0.1, 0.1), np.nan))
 
 
 @pytest.mark.parametrize(
@@ -109,7 +106,7 @@ WHOLE, LEFT, RIGHT = slice(None), slice(None, 320), slice(320, None)
 def distorted_images() -> tuple[np.ndarray, np.ndarray]:
     """A pair of lenses with a difference of up to 1.2 px."""
     fixed, moving = two_views(MATRIX, *SIZE)
-    pixels = np.stack(np.meshgrid(np.arange(SIZE[0]), np.arange(SIZE[1])), -1).reshape(-1, 2).astype(np.float64)
+    pixels = geometry.lattice(*SIZE, *SIZE)
     away = (pixels + lens_shapes(pixels, SIZE) @ LENS_PX).reshape(SIZE[1], SIZE[0], 2).astype(np.float32)
     return cv2.remap(fixed.pixels, away, None, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT), moving.pixels
 

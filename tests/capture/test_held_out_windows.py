@@ -159,13 +159,3 @@ def test_windows_of_a_relief_share_no_pixels_with_those_that_verify_it(
     for mask in (fit, held_out):
         quarters = (half for rows in np.array_split(mask, 2) for half in np.array_split(rows, 2, axis=1))
         assert all(quarter.mean() > 0.15 for quarter in quarters)
-
-
-def test_a_window_keeps_its_column_and_row() -> None:
-    image = texture(6 * SHARP_PX, 5 * SHARP_PX)
-    windows = Reference(image).windows
-    every, cut = (windows.residuals(with_border(image.pixels, border_px)) for border_px in (0, 40))
-    assert (len(every.centres_px), len(cut.centres_px)) == (30, 25)
-    for residual in (every, cut, cut.where(np.arange(25) % 3 == 0), cut.half(black=False)):
-        np.testing.assert_array_equal(residual.cells, residual.centres_px // SHARP_PX)
-    assert (cut.half(black=True).cells.sum(axis=1) % 2 == 0).all()

@@ -47,6 +47,8 @@ def test_an_alignment_between_images_is_the_same_between_files() -> None:
     assert between_files.mapping.field is not None
     assert between_files.mapping.field.scale == (1, 1)
     assert_allclose(SCALES.moving.positions(between_files.map(POINTS)), mapped, atol=0.01)
+    assert_allclose(between_files.residual.centres_px, SCALES.fixed.inverse.positions(POINTS))
+    assert_allclose(between_files.residual.shifts_px, [[0.2, 0.4]] * 3)
     assert_allclose(between_files.fixed_to_moving, SCALES.between_files(H))
     assert_allclose(between_files.seed.fixed_to_moving, SCALES.between_files(seed.fixed_to_moving))
     assert between_files.candidates == pytest.approx({"homography": 0.5 * np.sqrt(8), "field": 0.25 * np.sqrt(8)})

@@ -31,7 +31,7 @@ def test_a_unique_scene_has_no_alias_peak() -> None:
 IMAGES = planted((0, 0), 1), planted((9.0, -6.0), 2, -0.7)
 
 
-@pytest.mark.parametrize("off", [(0.0, 0.0), (2.0, 1.0), (PERIOD, 0.0)])
+@pytest.mark.parametrize("off", [(2.0, 1.0), (PERIOD, 0.0)])
 def test_a_repetitive_scene_without_prior_information_is_not_aligned(off: tuple[float, float]) -> None:
     result = agalign.align(*IMAGES, seed=geometry.compose(TRUTH, geometry.translation(*off)))
     assert result.status != "aligned"
