@@ -370,7 +370,6 @@ def test_parallax_below_the_noise_is_not_relief(flat: Rendered, height_px: float
 @pytest.mark.parametrize(
     ("relief_px", "plane_px", "is_chosen"),
     [
-        ((0.10, 0.30), (0.20, 0.50), True),
         ((0.13, 0.33), (0.08, 6.30), True),  # Most windows are on the plane and some far from it.
         ((0.08, 0.25), (0.04, 0.12), False),  # a flat scene
         ((0.30, 0.40), (0.10, 0.50), False),
@@ -399,20 +398,14 @@ def foreign(image: np.ndarray, kind: str, seed: int) -> np.ndarray:
         return rng.uniform(500, 4000, image.shape).astype(np.float32)
     if kind == "unrelated":
         return np.asarray(2000 + 500 * textured_image(width, height, seed), np.float32)
-    if kind == "mirrored":
-        return np.ascontiguousarray(image[:, ::-1])
-    if kind == "another scene":
-        band = next(b for b in MOVING if b.name == "NIR")
-        seen = view(make_scene("plants", 5, width_px=width), band, (width, height))
-        return recorded(seen, band, rng).astype(np.float32)
-    for y in range(0, image.shape[0], 64):
-        for x in range(0, image.shape[1], 64):
+    for y in range(0, height, 64):
+        for x in range(0, width, 64):
             piece = slice(y, y + 64), slice(x, x + 64)
             result[piece] = np.roll(image, tuple(rng.integers(-6, 7, 2)), (0, 1))[piece]
     return result
 
 
-@pytest.mark.parametrize("kind", ["unrelated", *map(in_full_run, ("scrambled", "noise", "mirrored", "another scene"))])
+@pytest.mark.parametrize("kind", ["unrelated", in_full_run("scrambled"), in_full_run("noise")])
 def test_the_others_are_aligned_without_a_foreign_band(
     boxes: Rendered, aligned: Mapping[str, Alignment], kind: str
 ) -> None:

@@ -216,7 +216,6 @@ def test_half_masked_arrays_are_predicted() -> None:
     assert result.status == "predicted"
     points = geometry.lattice(*SIZE, 17, 13)
     assert rms(result.map(points) - true_positions(points)) < 2 * result.prediction.std_px
-    assert agalign.align(fixed, moving).status == "aligned"
 
 
 # ---- bands with few pixels and little common structure: predicted with a correct standard error, or failed

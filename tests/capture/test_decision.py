@@ -6,7 +6,7 @@ import pytest
 from agalign.capture import warped_pair
 from agalign.capture.band_pair import BandPair
 from agalign.capture.decision import at_seed, decided, verified, without_result
-from agalign.capture.warped_pair import Candidate, WarpedPair, with_metrics
+from agalign.capture.warped_pair import Candidate, WarpedPair
 from agalign.fit.displacement_field import DisplacementResult
 from agalign.values import geometry
 from agalign.values.alignment import Prediction, Seed
@@ -63,15 +63,6 @@ def test_a_seed_that_contradicts_the_tags_is_replaced_by_their_mapping(pair: Ban
     assert at_seed(tagged, far, (Issue(RETRIEVAL),), seed_only=True).seed == far
 
 
-def test_a_result_that_passes_is_aligned_and_measured(pair: BandPair) -> None:
-    results = verified(Candidate.of(pair, SEED, GOOD), "always")
-    assert (results.status, results.issues, results.reason) == ("aligned", (), None)
-    assert results.residual.median_px < 0.1
-    measured = with_metrics(results, pair)
-    assert measured.after["overlap"] > 0.9
-    assert measured.after["mattes_mi"] < measured.before["mattes_mi"]
-
-
 def test_a_converted_residual_equals_a_new_measurement(pair: BandPair) -> None:
     warped_pair = WarpedPair.of(pair, pair.mapping(geometry.translation(5.95, -3.95)))
     mapping = pair.mapping(np.array([[1.0001, 0, 6.0], [0, 0.9999, -4.0], [0, 0, 1.0]]))
@@ -112,7 +103,7 @@ def test_a_result_with_issues_is_replaced_by_the_seed(pair: BandPair) -> None:
     results = verified(Candidate.of(pair, SEED, replace(GOOD, retrieval=0.01)), "always")
     assert (results.status, results.issues[0].code) == ("seed_only", "retrieval")
     np.testing.assert_array_equal(results.fixed_to_moving, SEED.fixed_to_moving)
-    assert results.residual.median_px == pytest.approx(np.hypot(1, 1), abs=0.15)
+    assert results.residual.median_px == pytest.approx(np.hypot(1, 1), abs=0.05)
     missing = at_seed(pair, SEED, (Issue(FEW_KEYPOINTS, 3, 16),))
     assert missing.status == "seed_only"
     assert missing.reason == "only 3 keypoints are in the area that both bands show; the rig seed is used unchanged"

@@ -9,7 +9,6 @@ import pytest
 
 from agalign.batch.capture_task import quiet
 from agalign.capture.align_bands import PairAligner
-from agalign.capture.band_pair import BandPair
 from agalign.capture.by_windows import aligned_by_windows
 from agalign.capture.decision import at_seed
 from agalign.capture.reference import Reference
@@ -39,29 +38,6 @@ def with_border(image: np.ndarray, border_px: int) -> Raster:
     return raster_of(image, valid, "moving")
 
 
-def by_windows(pair: BandPair) -> Alignment:
-    return aligned_by_windows(pair, at_seed(pair, SEED, (Issue(RETRIEVAL, 0.05, 0.2),)))
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("border_px", [in_full_run(0), in_full_run(10), 14, in_full_run(17), in_full_run(40)])
-@pytest.mark.parametrize("depth_px", [6.0, -6.0])
-def test_two_depths_as_a_chessboard_of_windows_are_not_aligned(depth_px: float, border_px: int) -> None:
-    """Each colour fits a homography that is 12 px off in the other: they must not be exchanged between rounds."""
-    width, height = 8 * BLURRED_PX, 5 * BLURRED_PX
-    scene = textured_image(width + 80, height + 80, 3)
-    y, x = np.mgrid[0:height, 0:width].astype(np.float32) + 40
-    is_black = (x - 40) // BLURRED_PX % 2 == (y - 40) // BLURRED_PX % 2
-    off_px = np.where(is_black, depth_px, -depth_px).astype(np.float32)
-    views = cv2.remap(scene, x, y, cv2.INTER_CUBIC), -cv2.remap(scene, x - off_px, y, cv2.INTER_CUBIC)
-    fixed, moving = (cv2.GaussianBlur(view, (0, 0), 4) for view in views)
-    # Tags that exclude aliases, so that only held-out windows can prevent the alignment.
-    for prior_px in (depth_px, -depth_px):
-        prior = {"rig": geometry.translation(prior_px, 0.0)}
-        result = by_windows(pair_of(whole(fixed), with_border(moving, border_px), prior, rig=1.0))
-        assert result.status != "aligned", f"residual {result.residual.median_px} px"
-
-
 def moved_inside(image: np.ndarray, centres_px: Points, side_px: int, off_px: float) -> np.ndarray:
     """The image with its content moved inside the windows with these centres (n, 2).
 
@@ -82,7 +58,8 @@ def test_the_fit_of_an_alignment_by_windows_ignores_those_that_verify_it(border_
     moving = -np.roll(fixed, (-3, 5), axis=(0, 1))
 
     def aligned(image: np.ndarray) -> Alignment:
-        result = by_windows(pair_of(whole(fixed), with_border(image, border_px)))
+        pair = pair_of(whole(fixed), with_border(image, border_px))
+        result = aligned_by_windows(pair, at_seed(pair, SEED, (Issue(RETRIEVAL, 0.05, 0.2),)))
         assert (result.status, result.joint.recipe) == ("aligned", "windows")
         return result
 

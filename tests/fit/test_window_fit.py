@@ -10,7 +10,13 @@ from agalign.fit.adjustment import CALIBRATED, LENS_STD, WindowFit, fit_windows,
 from agalign.values import geometry
 from agalign.values.alignment import Alignment, Prediction, Residual, Seed
 from agalign.values.mapping import DisplacementField, PixelMapping
-from agalign.verify.extrapolation import expected_error_px, points_in_frame, unmodelled_std_px, unobserved_quarters
+from agalign.verify.extrapolation import (
+    expected_error_px,
+    issues_of_extrapolation,
+    points_in_frame,
+    unmodelled_std_px,
+    unobserved_quarters,
+)
 
 from ..builders import joint_result, residual_of, rms
 
@@ -157,6 +163,12 @@ def test_areas_outside_the_moving_image_need_no_window() -> None:
     assert frame[:, 0].max() < 640
     assert unobserved_quarters(LEFT, SIZE, frame) == []
     assert len(points_in_frame(IDENTITY, SIZE, SIZE)) == 24 * 18
+
+
+def test_only_measured_windows_count() -> None:
+    residual = residual_of(CENTRES, np.where(CENTRES[:, :1] < 600, (0.1, 0.0), np.nan))
+    (issue,) = issues_of_extrapolation(residual, SIZE, points_in_frame(IDENTITY, SIZE, SIZE))
+    assert issue.value == 2
 
 
 # ---- expected errors near windows and far from them, of predictions and of seeds

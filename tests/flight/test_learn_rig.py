@@ -160,21 +160,6 @@ def test_a_capture_on_another_heading_is_predicted_from_its_motion() -> None:
         assert error < min(1.0, 2.5 * std)
 
 
-@pytest.mark.slow
-def test_interpolation_between_different_captures_has_an_error() -> None:
-    """A capture of a panel from one metre precedes the flight: its time is similar, its height is not."""
-    panel = observation(0.0, 100.0, altitude_m=1.0)
-    others = [observation(10.0 * k, 0.1 * (k % 3), altitude_m=28.0 + 0.1 * (k % 3)) for k in range(1, 9)]
-    rig = learn_rig([panel, *others], SIZE, BASELINES)
-    unobserved = Observation(6.0, {}, {}, 28.1)
-    error, std = error_px(rig, "NIR", unobserved, mappings(0.1)["NIR"])
-    assert error < min(1.0, 3 * std)
-    # Without the height, the standard error contains the difference of the two captures.
-    error, std = error_px(rig, "NIR", replace(unobserved, altitude_m=None), mappings(0.1)["NIR"])
-    assert std > 10
-    assert error < 3 * std
-
-
 @pytest.mark.parametrize("known_times", [0, 1, 2])
 def test_too_few_known_times_have_the_typical_error(known_times: int) -> None:
     sinking = [observation(10.0 * k if k < known_times else None, 0.5 * k, altitude_m=90.0 - k) for k in range(9)]

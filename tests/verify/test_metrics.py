@@ -5,7 +5,6 @@ import SimpleITK as sitk
 from skimage.metrics import normalized_mutual_information, structural_similarity
 
 from agalign.capture.reference import Reference
-from agalign.values import geometry
 from agalign.values.image import Raster
 from agalign.verify.metrics import FixedSimilarity, fixed_bins, joint_histogram, normalised_mutual_information
 
@@ -80,15 +79,6 @@ def test_large_values_that_hardly_vary_are_binned() -> None:
     bins = fixed_bins(constant, (1e30, 1e30))
     assert set(bins) == {0}
     assert joint_histogram(bins, constant, (1e30, 1e30)).sum() == pytest.approx(1.0)
-
-
-@pytest.mark.parametrize("shift", [(0.0, 0.0), (0.4, -0.25), (3.0, 2.0)])
-def test_tile_residuals_measure_a_known_shift(shift: tuple[float, float]) -> None:
-    fixed, moving = two_views(geometry.translation(*shift))
-    residual = Reference(fixed).windows.residuals(moving)
-    assert residual.coverage == 1.0
-    np.testing.assert_allclose(np.median(residual.shifts_px, axis=0), shift, atol=0.08)
-    assert residual.median_px == pytest.approx(np.hypot(*shift), abs=0.1)
 
 
 def test_windows_without_valid_pixels_are_skipped() -> None:
