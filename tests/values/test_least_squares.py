@@ -23,6 +23,17 @@ def test_observations_and_prior_have_the_weight_of_their_information() -> None:
     np.testing.assert_allclose(estimate.residuals, np.linalg.norm(values - X @ expected, axis=1), rtol=1e-6)
 
 
+def test_several_problems_are_solved_together() -> None:
+    values = np.stack([X @ TRUTH, X @ (2 * TRUTH)])
+    values[1, :50] += 30.0
+    weights = np.stack([np.ones(200), np.linspace(1, 2, 200)])
+    together = least_squares(X, values, weights, NO_PRIOR, robust=Robust(0.5))
+    for number in (0, 1):
+        alone = least_squares(X, values[number], weights[number], NO_PRIOR, robust=Robust(0.5))
+        np.testing.assert_allclose(together.mean[number], alone.mean, atol=1e-9)
+        np.testing.assert_allclose(alone.mean, (number + 1) * TRUTH, atol=0.01)
+
+
 def test_the_first_weights_decide_between_two_groups() -> None:
     """Most observations are of another solution."""
     values = X @ TRUTH

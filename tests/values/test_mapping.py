@@ -28,18 +28,7 @@ def pixels(tile: Tile = WHOLE) -> np.ndarray:
     return np.stack(np.meshgrid(x, y), axis=-1).astype(float)
 
 
-def stepped() -> Relief:
-    """A sloping ground with two boxes, one of them near the border."""
-    x, y = np.moveaxis(pixels(), -1, 0)
-    z = 0.01 * x - 0.004 * y
-    z[80:120, 80:160] = 12
-    z[-40:, -60:] = -7
-    return Relief(z.astype(np.float32), np.ones_like(z, np.float32))
-
-
-def hill(height_px: float) -> Relief:
-    x, y = np.moveaxis(pixels(), -1, 0)
-    z = height_px * np.exp(-((x - 160) ** 2 + (y - 120) ** 2) / 2 / 50**2)
+def relief(z: np.ndarray) -> Relief:
     return Relief(z.astype(np.float32), np.ones_like(z, np.float32))
 
 
@@ -50,11 +39,17 @@ def waves(amplitude_px: float, period_px: float, step_px: float = 48.0) -> Displ
     return DisplacementField(step_px, amplitude_px * np.stack([np.sin(at * y), np.cos(at * x)], axis=-1))
 
 
+X, Y = np.moveaxis(pixels(), -1, 0)
+STEPPED = 0.01 * X - 0.004 * Y
+"""A sloping ground with two boxes, one of them near the border."""
+STEPPED[80:120, 80:160] = 12
+STEPPED[-40:, -60:] = -7
 HIDDEN = np.zeros(SIZE[::-1], bool)
 HIDDEN[50:80, 160:173] = True
 HIDDEN[20:40, 30:60] = True
-MAPPING = PixelMapping(H, FIXED, MOVING, parallax=Parallax(stepped(), BASELINE, HIDDEN))
-FIELD, HILL = waves(1.5, 160.0), Parallax(hill(8.0), BASELINE)
+MAPPING = PixelMapping(H, FIXED, MOVING, parallax=Parallax(relief(STEPPED), BASELINE, HIDDEN))
+FIELD = waves(1.5, 160.0)
+HILL = Parallax(relief(8.0 * np.exp(-((X - 160) ** 2 + (Y - 120) ** 2) / 2 / 50**2)), BASELINE)
 MAPPINGS = {
     "homography": PixelMapping(H),
     "lenses": PixelMapping(H, FIXED, MOVING),
@@ -128,16 +123,15 @@ def test_hidden_is_that_of_the_nearest_pixel() -> None:
 
 
 def test_beyond_the_image_the_parallax_and_the_mask_are_those_of_the_edge() -> None:
-    relief = stepped()
-    np.testing.assert_allclose(relief(np.array([[340.0, 235.0], [-9.0, 0.0]])), [-7, 0], atol=1e-5)
+    stepped = relief(STEPPED)
+    np.testing.assert_allclose(stepped(np.array([[340.0, 235.0], [-9.0, 0.0]])), [-7, 0], atol=1e-5)
     x, y = np.arange(310.0, 340), np.arange(220.0, 250)
-    expected = relief(np.stack(np.meshgrid(x, y), axis=-1))
-    np.testing.assert_allclose(relief.at_crossings(x, y), expected, atol=2e-3)
+    expected = stepped(np.stack(np.meshgrid(x, y), axis=-1))
+    np.testing.assert_allclose(stepped.at_crossings(x, y), expected, atol=2e-3)
     hidden = np.zeros((4, 5), bool)
     hidden[-1, -1] = True
     at = np.array([[9.0, 9.0], [-3.0, 2.0]])
-    parallax = Parallax(Relief(hidden.astype(np.float32), hidden.astype(np.float32)), BASELINE, hidden)
-    assert parallax.hides(*at.T).tolist() == [True, False]
+    assert Parallax(relief(hidden), BASELINE, hidden).hides(*at.T).tolist() == [True, False]
 
 
 def test_a_relief_of_fewer_pixels_is_one_of_the_whole_image() -> None:
