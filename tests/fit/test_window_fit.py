@@ -18,10 +18,10 @@ from agalign.verify.extrapolation import (
     unobserved_quarters,
 )
 
-from ..builders import joint_result, residual_of, rms
+from ..builders import grid_px, joint_result, residual_of, rms
 
 SIZE = 1280, 960
-CENTRES = np.stack(np.meshgrid(np.arange(56.0, 1280, 112), np.arange(56.0, 960, 112)), -1).reshape(-1, 2)
+CENTRES = grid_px(np.arange(56, 1280, 112), np.arange(56, 960, 112))
 LEFT = CENTRES[CENTRES[:, 0] < 600]
 EVERYWHERE = geometry.lattice(*SIZE, 17, 13)
 RIGHT = EVERYWHERE[EVERYWHERE[:, 0] > 640]
@@ -185,8 +185,8 @@ def expected_px(known: Alignment, *point: float) -> float:
 
 def columns(count: int) -> Residual:
     """Columns of windows with a shift of 0.3 px, and 2 px as 95th percentile."""
-    centres = np.stack(np.meshgrid(50.0 + 100 * np.arange(count), 50.0 + 100 * np.arange(4)), -1).reshape(-1, 2)
-    return replace(residual_of(centres, (0.3, 0.0)), p95_px=2.0)
+    centres_px = grid_px(50 + 100 * np.arange(count), 50 + 100 * np.arange(4))
+    return replace(residual_of(centres_px, (0.3, 0.0)), p95_px=2.0)
 
 
 def test_the_expected_error_is_the_covariance_at_corners_and_the_residual_near_windows() -> None:

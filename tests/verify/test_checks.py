@@ -14,7 +14,7 @@ from agalign.values.issues import sentence
 from agalign.values.pixel_units import PixelScale
 from agalign.verify.checks import CHECKS, KINDS, AliasPeak, Evidence, alias_peak, is_unchanged, issues_of, seed_fits
 
-from ..builders import joint_result, residual_of, texture, whole
+from ..builders import grid_px, joint_result, residual_of, texture, whole
 
 SIZE = (1280, 960)
 JOINT = joint_result(std_px=0.07)
@@ -107,7 +107,7 @@ def test_the_limit_is_a_pixel_of_the_file_where_the_images_are_reduced() -> None
 
 def windows(off: np.ndarray) -> Residual:
     """12 x 9 windows with a spacing of 112 px, some with a shift of 3 px."""
-    centres = np.stack(np.meshgrid(np.arange(12), np.arange(9)), axis=-1).reshape(-1, 2) * 112.0 + 56
+    centres = 112 * grid_px(np.arange(12), np.arange(9)) + 56
     shifts = np.where(off.reshape(-1, 1), [3.0, 0.0], [0.05, 0.0])
     return replace(residual_of(centres, shifts), median_px=0.05)
 
