@@ -88,6 +88,22 @@ def test_results_and_windows_pass_at_their_limits(
 
 
 @pytest.mark.parametrize(
+    ("recipe", "residual", "is_accepted"),
+    [
+        ("windows", shifted(0, 0.0, 20), True),
+        ("fast", shifted(0, 0.0, 20), False),
+        ("windows", shifted(0, 0.0, 11), False),
+        ("windows", shifted(0, 0.0, 12), True),
+        ("windows", shifted(9, NAN, 30), False),
+        ("windows", shifted(6, NAN, 30), True),
+    ],
+)
+def test_without_descriptors_more_windows_are_required(recipe: str, residual: Residual, is_accepted: bool) -> None:
+    joint = joint_result(retrieval=0.05, recipe=recipe, std_px=0.1)
+    assert codes(replace(GOOD, joint=joint, residual=residual)) == ([] if is_accepted else ["retrieval"])
+
+
+@pytest.mark.parametrize(
     ("off_px", "std_px", "is_issue"),
     [(None, 0.2, False), (2.9, 0.2, False), (3.1, 0.2, True), (4.9, 1.0, False), (5.1, 1.0, True), (NAN, 0.2, True)],
 )
