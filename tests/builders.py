@@ -58,6 +58,11 @@ def residual_of(centres_px: np.ndarray, shifts_px: np.ndarray, sigma: float = 20
     return Residual.of(centres_px, shifts_px, np.full(len(centres_px), sigma), np.stack(columns_and_rows, axis=1))
 
 
+def grid_px(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """(n, 2) all positions (x, y), row by row."""
+    return np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2).astype(float)
+
+
 def rms(vectors: np.ndarray) -> float:
     """Root mean square length of vectors (n, 2)."""
     return float(np.sqrt((vectors**2).sum(axis=1).mean()))

@@ -9,7 +9,6 @@ from synthetic_flights.troubles import make_two_headings
 
 import agalign
 from agalign.cameras.discover import discover
-from agalign.capture import band_pair
 from agalign.capture.band_pair import _seed_std_px, longest_for, read_pairs
 from agalign.capture.by_rig import observed
 from agalign.config import SeedSettings
@@ -90,9 +89,10 @@ def test_errors_of_a_rig_are_in_px_of_each_band_s_file(flight: Path) -> None:
         assert known.std_px[pair.name] == pytest.approx(std_px)
 
 
-def test_the_error_of_a_rig_is_converted_to_px_of_the_reference(monkeypatch: pytest.MonkeyPatch) -> None:
-    rig = Rig((800, 600), {"LWIR": np.diag([0.1, 0.1, 1.0])}, {"LWIR": (1.0, 0.0)}, {}, {}, (), (), {"LWIR": 0.5})
-    monkeypatch.setattr(band_pair, "unobserved_error_px", lambda *_, **__: 0.5)
+def test_the_error_of_a_rig_is_converted_to_px_of_the_reference() -> None:
+    rig = Rig(
+        (800, 600), {"LWIR": np.diag([0.1, 0.1, 1.0])}, {"LWIR": (1.0, 0.0)}, {"LWIR": 0.0}, {}, (), (), {"LWIR": 0.5}
+    )
     model = FlightModel(None, "", ("LWIR",), {}, "", rig)
     assert _seed_std_px("LWIR", model, PixelScale(0.5, 0.5))["model"] == pytest.approx(0.5 / 0.1 * 0.5)
 

@@ -18,12 +18,12 @@ from agalign.fit.adjustment import lens_shapes
 from agalign.flight.rig import Rig
 from agalign.pixels.masks import raster_of
 from agalign.values import geometry
-from agalign.values.alignment import Alignment, Residual, Seed
+from agalign.values.alignment import Alignment, Seed
 from agalign.values.issues import RETRIEVAL, UNREADABLE, Issue
-from agalign.verify.checks import FOLDS, Evidence, issues_of
+from agalign.verify.checks import FOLDS
 from agalign.verify.extrapolation import expected_error_px
 
-from ..builders import joint_result, pair_of, residual_of, rms, two_views, whole
+from ..builders import joint_result, pair_of, rms, two_views, whole
 from ..conftest import textured_image
 
 SIZE = 640, 480
@@ -55,48 +55,23 @@ def test_windows_suffice_where_descriptors_fail(pair: BandPair) -> None:
     assert (after.status, after.issues, after.joint.recipe) == ("aligned", (), "windows")
     assert geometry.corner_error_px(before.fixed_to_moving, TRUTH, *LARGE) > 1
     assert geometry.corner_error_px(after.fixed_to_moving, TRUTH, *LARGE) < 0.3
-    # Only held-out windows verify the fit.
-    assert 0.4 < len(after.residual.centres_px) / len(before.residual.centres_px) < 0.6
 
 
 def test_windows_do_not_override_descriptors_or_other_failures(pair: BandPair, monkeypatch: pytest.MonkeyPatch) -> None:
-    others = [unaligned(pair, issue) for issue in (Issue(UNREADABLE, detail="x"), Issue(FOLDS, 9.0, 4.0))]
-    for before in (*others, replace(unaligned(pair), status="aligned", issues=())):
-        assert aligned_by_windows(pair, before) is before
-    monkeypatch.setattr(module, "_MAX_STEP_PX", 0.5)  # less than the error of the seed
     before = unaligned(pair)
+    others = [unaligned(pair, issue) for issue in (Issue(UNREADABLE, detail="x"), Issue(FOLDS, 9.0, 4.0))]
+    for other in (*others, replace(before, status="aligned", issues=())):
+        assert aligned_by_windows(pair, other) is other
+    monkeypatch.setattr(module, "_MAX_STEP_PX", 0.5)  # less than the error of the seed
     assert aligned_by_windows(pair, before) is before
 
 
 def test_held_out_windows_must_confirm_the_fit() -> None:
     fixed, moving = two_views(TRUTH, *LARGE)
-    moving.pixels[:, 480:] = two_views(TRUTH, *LARGE, seed=5)[0].pixels[:, 480:]  # unrelated content
+    moving.pixels[:, 480:] = textured_image(320, 640, seed=5)  # unrelated content
     pair = pair_of(fixed, moving)
     before = unaligned(pair)
     assert aligned_by_windows(pair, before) is before
-
-
-def windows(count: int, measured: float = 1.0) -> Residual:
-    shifts = np.full((count, 2), 0.1)
-    shifts[round(measured * count) :] = np.nan
-    return residual_of(np.stack([100.0 * np.arange(count), np.zeros(count)], axis=1), shifts)
-
-
-@pytest.mark.parametrize(
-    ("recipe", "residual", "is_accepted"),
-    [
-        ("windows", windows(20), True),
-        ("fast", windows(20), False),
-        ("windows", windows(11), False),
-        ("windows", windows(12), True),
-        ("windows", windows(30, 0.7), False),
-        ("windows", windows(30, 0.8), True),
-    ],
-)
-def test_without_descriptors_more_windows_are_required(recipe: str, residual: Residual, is_accepted: bool) -> None:
-    joint = joint_result(retrieval=0.05, recipe=recipe, std_px=0.1)
-    codes = [issue.code for issue in issues_of(Evidence(joint, residual, (3000, 100)))]
-    assert codes == ([] if is_accepted else ["retrieval"])
 
 
 # ---- no structure in one half: a prediction with the error of that half
@@ -109,7 +84,7 @@ WHOLE, LEFT, RIGHT = slice(None), slice(None, 320), slice(320, None)
 def distorted_images() -> tuple[np.ndarray, np.ndarray]:
     """A pair of lenses with a difference of up to 1.2 px."""
     fixed, moving = two_views(MATRIX, *SIZE)
-    pixels = np.stack(np.meshgrid(np.arange(SIZE[0]), np.arange(SIZE[1])), -1).reshape(-1, 2).astype(np.float64)
+    pixels = geometry.lattice(*SIZE, *SIZE)
     away = (pixels + lens_shapes(pixels, SIZE) @ LENS_PX).reshape(SIZE[1], SIZE[0], 2).astype(np.float32)
     return cv2.remap(fixed.pixels, away, None, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT), moving.pixels
 
@@ -219,7 +194,6 @@ def test_half_masked_arrays_are_predicted() -> None:
     assert result.status == "predicted"
     points = geometry.lattice(*SIZE, 17, 13)
     assert rms(result.map(points) - true_positions(points)) < 2 * result.prediction.std_px
-    assert agalign.align(fixed, moving).status == "aligned"
 
 
 # ---- bands with few pixels and little common structure: predicted with a correct standard error, or failed

@@ -6,15 +6,14 @@ import pytest
 from agalign.capture import warped_pair
 from agalign.capture.band_pair import BandPair
 from agalign.capture.decision import at_seed, decided, verified, without_result
-from agalign.capture.warped_pair import Candidate, WarpedPair, with_metrics
+from agalign.capture.warped_pair import Candidate, WarpedPair
 from agalign.fit.displacement_field import DisplacementResult
 from agalign.values import geometry
-from agalign.values.alignment import PairScales, Prediction, Seed
+from agalign.values.alignment import Prediction, Seed
 from agalign.values.choices import ReliefUse
 from agalign.values.image import Raster
 from agalign.values.issues import FEW_KEYPOINTS, RETRIEVAL, SEED_DOES_NOT_FIT, Issue
 from agalign.values.mapping import DisplacementField
-from agalign.values.pixel_units import PixelScale
 
 from ..builders import displaced_views, joint_result, pair_of, residual_of, texture, two_views, whole
 
@@ -64,15 +63,6 @@ def test_a_seed_that_contradicts_the_tags_is_replaced_by_their_mapping(pair: Ban
     assert at_seed(tagged, far, (Issue(RETRIEVAL),), seed_only=True).seed == far
 
 
-def test_a_result_that_passes_is_aligned_and_measured(pair: BandPair) -> None:
-    results = verified(Candidate.of(pair, SEED, GOOD), "always")
-    assert (results.status, results.issues, results.reason) == ("aligned", (), None)
-    assert results.residual.median_px < 0.1
-    measured = with_metrics(results, pair)
-    assert measured.after["overlap"] > 0.9
-    assert measured.after["mattes_mi"] < measured.before["mattes_mi"]
-
-
 def test_a_converted_residual_equals_a_new_measurement(pair: BandPair) -> None:
     warped_pair = WarpedPair.of(pair, pair.mapping(geometry.translation(5.95, -3.95)))
     mapping = pair.mapping(np.array([[1.0001, 0, 6.0], [0, 0.9999, -4.0], [0, 0, 1.0]]))
@@ -90,10 +80,8 @@ def test_each_colour_is_verified_by_the_estimate_from_the_other(pair: BandPair) 
     crossed, before = warped_pair.cross_validated((by_black, by_white)).residual, warped_pair.residual
     expected_px = np.where(before.is_black[:, None], (0, 0.2), (-0.1, 0))
     np.testing.assert_allclose(crossed.shifts_px - before.shifts_px, expected_px, atol=1e-6)
-    assert (
-        verified(replace(Candidate.of(pair, SEED, GOOD), by_halves=(by_black, by_white)), "never").residual.median_px
-        > 0.08
-    )
+    candidate = replace(Candidate.of(pair, SEED, GOOD), by_halves=(by_black, by_white))
+    assert verified(candidate, "never").residual.median_px > 0.08
 
 
 def test_of_two_mappings_the_better_has_smaller_shifts_in_more_of_the_same_windows(pair: BandPair) -> None:
@@ -115,7 +103,7 @@ def test_a_result_with_issues_is_replaced_by_the_seed(pair: BandPair) -> None:
     results = verified(Candidate.of(pair, SEED, replace(GOOD, retrieval=0.01)), "always")
     assert (results.status, results.issues[0].code) == ("seed_only", "retrieval")
     np.testing.assert_array_equal(results.fixed_to_moving, SEED.fixed_to_moving)
-    assert results.residual.median_px == pytest.approx(np.hypot(1, 1), abs=0.15)
+    assert results.residual.median_px == pytest.approx(np.hypot(1, 1), abs=0.05)
     missing = at_seed(pair, SEED, (Issue(FEW_KEYPOINTS, 3, 16),))
     assert missing.status == "seed_only"
     assert missing.reason == "only 3 keypoints are in the area that both bands show; the rig seed is used unchanged"
@@ -147,39 +135,34 @@ def test_verification_is_repeated_with_a_displacement_field(pair: BandPair, monk
     assert verified(Candidate.of(pair, SEED, GOOD), "always").geometry == "field"
 
 
-def test_residuals_of_a_reduced_image_are_in_px_of_the_file() -> None:
-    at_quarter = PairScales(PixelScale(0.25, 0.25), PixelScale(0.25, 0.25))
-    residual = residual_of(np.array([[10.0, 20.0]]), np.array([[0.5, 0.0]])).in_file_px(at_quarter)
-    np.testing.assert_allclose(residual.centres_px, [[41.5, 81.5]])
-    assert (residual.median_px, residual.shifts_px[0, 0]) == (2.0, 2.0)
-
-
 def displaced_pair(height_px: float, wavelength_px: float | None = None) -> BandPair:
     """A pair with a smooth bump in the centre or waves everywhere, which no homography represents."""
 
     def displacement(points: np.ndarray) -> np.ndarray:
-        if wavelength_px is None:
-            fall = np.exp(-(((points - (320, 240)) / 110) ** 2).sum(-1))
-        else:
-            fall = np.prod(np.sin(2 * np.pi * points / wavelength_px), axis=-1)
-        return height_px * fall[..., None] * np.array([1.0, -0.6])
+        bump = np.exp(-(((points - (320, 240)) / 110) ** 2).sum(-1))
+        form = bump if wavelength_px is None else np.prod(np.sin(2 * np.pi * points / wavelength_px), axis=-1)
+        return height_px * form[..., None] * np.array([1.0, -0.6])
 
     return pair_of(*displaced_views(displacement), {"rig": np.eye(3)})
 
 
-@pytest.mark.parametrize(("use", "status"), [("auto", "aligned"), ("always", "aligned"), ("never", "seed_only")])
-def test_a_field_is_fitted_where_a_part_of_the_image_is_misaligned(use: ReliefUse, status: str) -> None:
-    results = verified(Candidate.of(displaced_pair(4.0), CENTRED, joint_result()), use)
-    assert (results.status, results.geometry) == (status, "field" if status == "aligned" else "homography")
-
-
-@pytest.mark.slow
-def test_a_field_follows_quickly_varying_parallax() -> None:
-    """Waves of 300 px. Shorter ones are not predicted without the windows that overlap one of verification."""
-    results = verified(Candidate.of(displaced_pair(2.5, wavelength_px=300.0), CENTRED, joint_result()), "auto")
-    assert (results.status, results.geometry) == ("aligned", "field")
+@pytest.mark.parametrize(
+    ("displaced", "use", "status", "geometry"),
+    [
+        ((4.0,), "auto", "aligned", "field"),
+        ((4.0,), "always", "aligned", "field"),
+        ((4.0,), "never", "seed_only", "homography"),
+        # Shorter waves are not predicted without the windows that overlap one of verification.
+        ((2.5, 300.0), "auto", "aligned", "field"),
+    ],
+)
+def test_a_field_is_fitted_where_a_part_of_the_image_is_misaligned(
+    displaced: tuple[float, ...], use: ReliefUse, status: str, geometry: str
+) -> None:
+    results = verified(Candidate.of(displaced_pair(*displaced), CENTRED, joint_result()), use)
+    assert (results.status, results.geometry) == (status, geometry)
     # The residual is that of held-out windows.
-    assert results.residual.median_px < 0.4
+    assert status != "aligned" or results.residual.median_px < 0.4
 
 
 @pytest.mark.parametrize(("rig_known", "tried"), [(True, False), (False, True)])

@@ -52,27 +52,7 @@ def refined(capture: Capture, alignment: Alignment) -> Alignment:
     return at_full_resolution(capture.reference, capture.moving[0], alignment)
 
 
-def align_reduced(capture: Capture, monkeypatch: pytest.MonkeyPatch) -> dict[str, Alignment]:
-    monkeypatch.setattr("agalign.capture.band_pair._LONGEST_SIDE_PX", 400)
-    return align_capture_bands(capture, Settings(joint=JointSettings(device="cpu")), None, lambda *_: None)
-
-
-def error_px(capture: Capture, monkeypatch: pytest.MonkeyPatch) -> float:
-    nir = align_reduced(capture, monkeypatch)["nir"]
-    assert nir.status == "aligned"
-    assert nir.residual.centres_px.max() > 700  # px of the file
-    return geometry.corner_error_px(nir.fixed_to_moving, TRUTH, *SIZE)
-
-
-def test_a_result_of_reduced_images_is_refined_on_the_files(capture: Capture, monkeypatch: pytest.MonkeyPatch) -> None:
-    at_full = error_px(capture, monkeypatch)
-    monkeypatch.setattr("agalign.capture.align_bands.at_full_resolution", lambda _r, _m, alignment: alignment)
-    reduced = error_px(capture, monkeypatch)
-    assert at_full < 0.05
-    assert at_full < 0.5 * reduced
-
-
-def test_a_band_with_an_unreadable_tile_fails_and_stops_no_other(
+def test_bands_are_refined_on_the_files_and_one_with_an_unreadable_tile_fails(
     capture: Capture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     resample_tile = full_resolution.resample_tile
@@ -83,10 +63,12 @@ def test_a_band_with_an_unreadable_tile_fails_and_stops_no_other(
         return resample_tile(band, *rest, **options)
 
     monkeypatch.setattr(full_resolution, "resample_tile", unreadable)
-    result = align_reduced(capture, monkeypatch)
+    monkeypatch.setattr("agalign.capture.band_pair._LONGEST_SIDE_PX", 400)
+    result = align_capture_bands(capture, Settings(joint=JointSettings(device="cpu")), None, lambda *_: None)
     assert {name: a.status for name, a in result.items()} == {"nir": "failed", "red": "aligned"}
     assert "field_nir.tif: cannot be read (tile 7)" in (result["nir"].reason or "")
     assert geometry.corner_error_px(result["red"].fixed_to_moving, TRUTH, *SIZE) < 0.05
+    assert result["red"].residual.centres_px.max() > 700  # px of the file
 
 
 def test_a_refinement_that_fails_verification_leaves_the_earlier_result(capture: Capture) -> None:

@@ -36,9 +36,7 @@ def result(corners_px: ArrayLike, std_px: ArrayLike) -> JointResult:
     """A result with given distances of the corners from the rig's mean and standard errors, px, up to (4, 2)."""
     corners_px, std_px = (np.broadcast_to(np.asarray(values, float), (4, 2)) for values in (corners_px, std_px))
     moved = geometry.compose(MEAN, geometry.moving_corners(corners_px.ravel(), *SIZE))
-    covariance = np.diag(std_px.ravel() ** 2)
-    std = tuple((float(x), float(y)) for x, y in std_px)
-    return joint_result(moved, corner_std_xy_px=std, covariance=covariance)
+    return joint_result().with_homography(moved, np.diag(std_px.ravel() ** 2))
 
 
 def corners_near_the_mean(result: JointResult) -> np.ndarray:

@@ -106,7 +106,7 @@ def rotated(image: Raster, degrees: float, scale: float = 1.0) -> tuple[Raster, 
     return Raster(cv2.warpAffine(image.pixels, matrix[:2], size, flags=cv2.INTER_CUBIC), valid), matrix
 
 
-@pytest.mark.parametrize(("degrees", "scale"), [(3, 1.0), (45, 1.0), (180, 1.0), (10, 0.6), (-90, 1.5)])
+@pytest.mark.parametrize(("degrees", "scale"), [(45, 1.0), (10, 0.6), (-90, 1.5)])
 def test_landmarks_align_rotated_and_scaled_images(degrees: float, scale: float) -> None:
     fixed, moving = two_views(SHIFTED)
     image, to_rotated = rotated(moving, degrees, scale)

@@ -10,7 +10,6 @@ from agalign.fit.adjustment import (
     WindowShifts,
     adjust,
     are_of_lenses,
-    are_on_a_line,
     lens_std_px,
     parallax_of,
     shifts_by_corners,
@@ -20,33 +19,26 @@ from agalign.values import geometry
 from agalign.values.mapping import PixelMapping
 from agalign.values.parallax import Parallax, Relief
 
-from ..builders import residual_of
+from ..builders import grid_px, residual_of
 
 SIZE = 640, 480
 BASELINES = np.array([[-0.8, 0.0], [0.0, -0.6], [-0.8, -0.6], [-0.4, -0.3]])
 """The longest has length 1; points move opposite to the positions of the lenses."""
-POINTS = np.stack(np.meshgrid(np.arange(24, 640, 24.0), np.arange(24, 480, 24.0)), axis=-1).reshape(-1, 2)
-
-
-def heights() -> np.ndarray:
-    """Parallax (n,) of the windows: most on the ground, some on a bench, on boxes and below the ground."""
-    z = np.zeros(len(POINTS))
-    z[(POINTS[:, 0] > 250) & (POINTS[:, 0] < 400)] = 4
-    z[(POINTS[:, 0] > 300) & (POINTS[:, 0] < 370) & (POINTS[:, 1] > 200) & (POINTS[:, 1] < 330)] = 11
-    z[POINTS[:, 1] > 430] = -3
-    return z
-
-
-def planes() -> np.ndarray:
-    """Shifts (n, bands, 2) of the windows by errors of the homographies."""
-    corners_px = np.random.default_rng(1).normal(0, 1.5, (len(BASELINES), 8))
-    return np.einsum("nki,bi->nbk", geometry.over_corners(POINTS, *SIZE), corners_px)
+POINTS = grid_px(np.arange(24, 640, 24), np.arange(24, 480, 24))
+HEIGHTS = np.zeros(len(POINTS))
+"""Parallax (n,) of the windows: most on the ground, some on a bench, on boxes and below the ground."""
+HEIGHTS[(POINTS[:, 0] > 250) & (POINTS[:, 0] < 400)] = 4
+HEIGHTS[(POINTS[:, 0] > 300) & (POINTS[:, 0] < 370) & (POINTS[:, 1] > 200) & (POINTS[:, 1] < 330)] = 11
+HEIGHTS[POINTS[:, 1] > 430] = -3
+CORNERS_PX = np.random.default_rng(1).normal(0, 1.5, (len(BASELINES), 8))
+PLANES = np.einsum("nki,bi->nbk", geometry.over_corners(POINTS, *SIZE), CORNERS_PX)
+"""Shifts (n, bands, 2) of the windows by errors of the homographies."""
 
 
 def shifts(wrong: float = 0.2, missing: float = 0.0) -> WindowShifts:
     """Shifts of all windows in all bands, with wrong peaks of up to 20 px."""
     rng = np.random.default_rng(0)
-    result = planes() + heights()[:, None, None] * BASELINES
+    result = PLANES + HEIGHTS[:, None, None] * BASELINES
     result += rng.normal(0, 0.06, result.shape)
     off = rng.random(result.shape[:2]) < wrong
     result[off] = rng.uniform(-20, 20, (off.sum(), 2))
@@ -57,8 +49,8 @@ def shifts(wrong: float = 0.2, missing: float = 0.0) -> WindowShifts:
 
 def assert_recovered(model: Adjustment | None, sign: int = 1) -> None:
     np.testing.assert_allclose(model.baselines, sign * BASELINES, atol=0.02)
-    assert np.percentile(np.abs(model.parallax_px - sign * heights()), 75) < 0.15
-    assert np.abs(shifts_by_corners(model, POINTS, SIZE) - planes()).max() < 0.15
+    assert np.percentile(np.abs(model.parallax_px - sign * HEIGHTS), 75) < 0.15
+    assert np.abs(shifts_by_corners(model, POINTS, SIZE) - PLANES).max() < 0.15
 
 
 @pytest.mark.parametrize(("unit", "missing"), [(0.001, 0.0), (40.0, 0.0), (1.0, 0.3)])
@@ -87,7 +79,7 @@ def test_priors_do_not_depend_on_the_noise_of_a_band() -> None:
     """A noisy band has little influence on the parallax, but its own homography must not be damped."""
     few = POINTS[::6]
     rng = np.random.default_rng(0)
-    shift = heights()[::6, None, None] * BASELINES + rng.normal(0, 0.02, (len(few), 4, 2))
+    shift = HEIGHTS[::6, None, None] * BASELINES + rng.normal(0, 0.02, (len(few), 4, 2))
     shift[:, 1] += rng.normal((20, -20), 1.5, (len(few), 2))
     model = adjust(WindowShifts(few, few, shift, np.ones((len(few), 4))), SIZE, BASELINES)
     error_px = shifts_by_corners(model, few, SIZE)[:, 1] - [20, -20]
@@ -99,7 +91,7 @@ def test_a_corner_without_windows_is_uncertain() -> None:
     worst_px = []
     for share in (1.0, 0.12):
         some = np.array([320, 240]) + share * (POINTS - [320, 240])
-        shift = heights()[:, None, None] * BASELINES + np.random.default_rng(0).normal(0, 0.03, (len(some), 4, 2))
+        shift = HEIGHTS[:, None, None] * BASELINES + np.random.default_rng(0).normal(0, 0.03, (len(some), 4, 2))
         model = adjust(WindowShifts(some, some, shift, np.ones(shift.shape[:2])), SIZE, BASELINES)
         worst_px.append(max(np.sqrt(np.diag(fit.covariance_px2)).max() for fit in model.fits))
     assert worst_px[0] < 0.1
@@ -128,8 +120,8 @@ def test_lens_fields_are_recovered_next_to_parallax() -> None:
     windows = replace(windows, shifts_px=windows.shifts_px + lens_fields())
     model = adjust(windows, SIZE, BASELINES, 3 * lens_std_px(SIZE, calibrated=False))
     np.testing.assert_allclose(model.baselines, BASELINES, atol=0.02)
-    assert np.percentile(np.abs(model.parallax_px - heights()), 90) < 0.15
-    left = shifts_by_corners(model, POINTS, SIZE) - planes() - lens_fields()
+    assert np.percentile(np.abs(model.parallax_px - HEIGHTS), 90) < 0.15
+    left = shifts_by_corners(model, POINTS, SIZE) - PLANES - lens_fields()
     for band, fit in enumerate(model.fits):
         field = fit.applied_to(PixelMapping(np.eye(3))).field
         error_px = np.linalg.norm(left[:, band] + field(POINTS), axis=1)
@@ -138,13 +130,6 @@ def test_lens_fields_are_recovered_next_to_parallax() -> None:
     without = adjust(windows, SIZE, BASELINES)
     assert all(fit.lens_px is None for fit in without.fits)
     assert np.all(without.scales_px > 1.05 * model.scales_px)
-
-
-def test_baselines_on_a_line() -> None:
-    assert are_on_a_line(np.array([[-1.0, 0.5], [0.4, -0.2], [-0.2, 0.1]]))
-    assert are_on_a_line(np.array([[-1.0, 0.5], [0.4, -0.15]]))
-    assert not are_on_a_line(BASELINES)
-    assert not are_on_a_line(BASELINES[[0, 1]])
 
 
 def test_too_few_windows_give_no_model() -> None:

@@ -55,13 +55,6 @@ def showing(rig: Rig, band: str, distance_px: float, std_px: float = 0.01) -> Ob
     return Observation(None, {band: mapping}, {band: MovingFilePx(std_px)})
 
 
-def test_a_band_is_predicted_along_its_baseline(some: Rig) -> None:
-    predicted = predict_band(some, "NIR", showing(some, "Red", 2.0))
-    assert predicted.source == "bands"
-    # The wide prior biases the factor by one thousandth.
-    assert distance_px(predicted.fixed_to_moving, geometry.translation(-12, 8 + 0.8 * 2.0), SIZE) < 0.01
-
-
 def test_an_unobserved_quarter_adds_the_error_of_the_lenses(some: Rig) -> None:
     half = replace(some, extrapolation_px={"NIR": MovingFilePx(0.7)})
     assert (some.covers("NIR"), half.covers("NIR"), some.covers("Green")) == (True, False, False)
@@ -87,8 +80,7 @@ def test_factors_outside_the_learned_range_add_the_error_of_the_baseline() -> No
 
 
 def test_an_uncertain_mapping_makes_the_prediction_uncertain(some: Rig) -> None:
-    sure = predict_band(some, "NIR", showing(some, "Red", 1.0, std_px=0.05)).std_px
-    unsure = predict_band(some, "NIR", showing(some, "Red", 1.0, std_px=1.0)).std_px
+    sure, unsure = (predict_band(some, "NIR", showing(some, "Red", 1.0, std_px)).std_px for std_px in (0.05, 1.0))
     # The baselines are 0.6 and 0.8: 1 px in Red corresponds to 0.8 / 0.6 px in NIR.
     assert sure < 0.2
     assert unsure == pytest.approx(0.8 / 0.6 / np.sqrt(2), rel=0.5)
@@ -102,15 +94,6 @@ def test_excess_residuals_of_bands_make_the_prediction_uncertain(some: Rig) -> N
     assert usual < 0.2
     # The excess, and the larger variance of the factor because the weight of the band is smaller.
     assert np.sqrt(3.0**2 - FROM_BANDS_PX**2) < unusual < 3.6
-
-
-def test_without_factors_every_capture_is_the_mean(some: Rig) -> None:
-    still = replace(some, factors=())
-    known = showing(rig(), "Red", 0.0)
-    predicted = predict_band(still, "NIR", known)
-    assert predicted.source == "flight"
-    np.testing.assert_allclose(predicted.fixed_to_moving, still.mean["NIR"], atol=1e-9)
-    assert predicted.std_px == pytest.approx(FROM_BANDS_PX, rel=0.05)
 
 
 def test_errors_of_unobserved_captures() -> None:
@@ -180,12 +163,6 @@ def test_the_summary_has_the_offset_of_the_centre_and_the_errors() -> None:
 
 LENSES = np.array([[0.6, 0.0, 0.2], [0.0, 0.7, -0.5], [-0.3, 0.2, 0.8]])
 DISTANCE = np.tensordot(LENSES, design_tensor(("distance",)), 1)
-
-
-def test_the_model_shifts_a_band_along_its_baseline_and_by_its_delay() -> None:
-    tensor = design_tensor(("distance", "tilt", "motion"))
-    change = np.tensordot([0.6, -0.8, 0.5], tensor, 1) @ np.array([1.0, 2.0, 3.0, 4.0, 5.0])
-    np.testing.assert_allclose(change, [[0.6 + 0.5 * 4, 1.2, 1.8], [-0.8 + 0.5 * 5, -1.6, -2.4]])
 
 
 def test_a_weight_is_the_inverse_of_all_variances() -> None:

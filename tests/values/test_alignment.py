@@ -18,14 +18,7 @@ POINTS = np.array([[3.0, 4.0], [100.0, 7.0], [41.5, 60.25]])
 
 
 H = np.array([[1.02, 0.03, 5.0], [-0.02, 0.97, -3.0], [1e-5, -2e-5, 1.0]])
-FIELD = DisplacementField(20.0, np.random.default_rng(0).normal(0, 1, (6, 8, 2)))
 JOINT = joint_result(H, last_step_px=0.02, corner_std_xy_px=((0.3, 0.4), (0.1, 0.1), (0.2, 0.1), (0.1, 0.2)))
-
-
-def test_a_field_taken_over_to_another_lattice_keeps_its_values_at_the_nodes() -> None:
-    finer = FIELD.rescaled(PixelScale(2.0, 2.0)).on_lattice(10.0, (300, 200))
-    nodes = np.array([[0.0, 0.0], [120.0, 40.0], [200.0, 100.0]])
-    assert_allclose(finer(nodes), 2 * FIELD((nodes + 0.5) / 2 - 0.5), atol=6e-5)
 
 
 def test_the_standard_errors_of_corners_are_scaled_axis_by_axis() -> None:
@@ -54,6 +47,8 @@ def test_an_alignment_between_images_is_the_same_between_files() -> None:
     assert between_files.mapping.field is not None
     assert between_files.mapping.field.scale == (1, 1)
     assert_allclose(SCALES.moving.positions(between_files.map(POINTS)), mapped, atol=0.01)
+    assert_allclose(between_files.residual.centres_px, SCALES.fixed.inverse.positions(POINTS))
+    assert_allclose(between_files.residual.shifts_px, [[0.2, 0.4]] * 3)
     assert_allclose(between_files.fixed_to_moving, SCALES.between_files(H))
     assert_allclose(between_files.seed.fixed_to_moving, SCALES.between_files(seed.fixed_to_moving))
     assert between_files.candidates == pytest.approx({"homography": 0.5 * np.sqrt(8), "field": 0.25 * np.sqrt(8)})

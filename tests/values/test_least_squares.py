@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from agalign.values.least_squares import Robust, cauchy_weights, least_squares, shift_scale_px
+from agalign.values.least_squares import MIN_SHIFT_SCALE_PX, Robust, cauchy_weights, least_squares, shift_scale_px
 
 X = np.random.default_rng(0).normal(size=(200, 2, 3))
 TRUTH = np.array([1.0, -2.0, 0.5])
@@ -63,3 +63,14 @@ def test_the_variance_of_the_weights_grows_with_the_residuals() -> None:
     np.testing.assert_allclose(large, 100 * small, rtol=1e-3)
     exact = np.linalg.inv(np.einsum("nki,nkj->ij", X, X)) * 0.2**2
     assert np.sqrt(np.diag(small)) == pytest.approx(np.sqrt(np.diag(exact)), rel=0.2)
+
+
+def test_cauchy_weights_at_known_residuals() -> None:
+    weights = cauchy_weights([0.0, 2.0, -2.0, 6.0, np.inf], 2.0)
+    np.testing.assert_allclose(weights, [1.0, 0.5, 0.5, 0.1, 0.0])
+
+
+def test_the_scale_of_shifts_is_at_least_their_noise() -> None:
+    assert shift_scale_px(np.array([0.1, 0.2, 9.0])) == 0.2 * 1.4826
+    assert shift_scale_px(np.array([0.001, 0.002, 0.003])) == MIN_SHIFT_SCALE_PX
+    assert shift_scale_px(np.array([])) == MIN_SHIFT_SCALE_PX

@@ -50,7 +50,7 @@ def test_a_scale_maps_outer_edges_onto_outer_edges() -> None:
     edges = np.array([[-0.5, -0.5], [199.5, 99.5]])
     assert_allclose(scale.positions(edges), [[-0.5, -0.5], [49.5, 19.5]])
     assert_allclose(scale.inverse.positions(scale.positions(edges)), edges)
-    assert_allclose(geometry.apply(scale.matrix, edges), scale.positions(edges))
+    assert_allclose(geometry.apply(geometry.overlay((200, 100), (50, 20)), edges), scale.positions(edges))
     assert_allclose(scale.displacements([4.0, 5.0]), [1.0, 1.0])
     assert scale.mean == pytest.approx(np.sqrt(0.25 * 0.2))
 
