@@ -44,14 +44,17 @@ NIR = {"band": "NIR", "file": "n.tif", "band_index": 1, "status": "failed", "sec
 
 
 def example(**changes: Any) -> Sidecar:
+    """A sidecar with the reference band, unless it is one of the `bands` in the changes."""
     reference = {"band": "Green", "file": "g.tif", "band_index": 1, "width": 10, "height": 8}
     camera = {"make": "", "model": "", "serial": ""}
     output = {"file": "IMG_1.tif", "bytes": 1, "crop": (0, 0, 10, 8), "nodata": None}
     names = {"agalign": "0", "capture": "IMG_1", "capture_id": "x", "flight_id": "", "captured_at": "", "settings": "0"}
     bands = {"camera": camera, "status": "ok", "missing_bands": [], "reference": reference}
-    nir = NIR | {"reason": None}
-    bands["bands"] = [nir, nir | {"band": "Green", "file": "g.tif", "status": "reference"}]
-    return Sidecar.model_validate(names | bands | {"output": output} | changes)
+    facts = names | bands | {"output": output, "bands": [NIR | {"reason": None}]} | changes
+    name = facts["reference"]["band"]
+    if name not in [band["band"] for band in facts["bands"]]:
+        facts["bands"] = [*facts["bands"], NIR | {"reason": None, "band": name, "status": "reference"}]
+    return Sidecar.model_validate(facts)
 
 
 def test_round_trip(tmp_path: Path) -> None:
