@@ -44,18 +44,18 @@ def main(flights: list[Path]) -> None:
     rng, result = np.random.default_rng(0), defaultdict[str, list[BandError]](list)
     for flight in flights:
         truth, options = common.read_ties(flight / "ties.json"), list[str]()
-        if not truth:
-            with common.flight_and_out() as (_, out):
-                common.align(flight, out)
-                truth, options = ties_of(out), ["--model", *map(str, out.glob("models/*.safetensors"))]
-        for name, lost, change in losses(truth):
-            with common.flight_and_out() as (copy, out):
-                common.writable_copy(flight, copy)
-                for file in sorted(lost):
-                    common.change_band(next(copy.rglob(file)), partial(change, rng=rng))
-                common.align(copy, out, *options)
-                known = {file: truth[file] for file in lost if file in truth}
-                result[f"{flight.name}, {name}"] += common.band_errors(out, known)
+        with common.flight_and_out() as (_, undamaged):
+            if not truth:
+                common.align(flight, undamaged)
+                truth, options = ties_of(undamaged), ["--model", *map(str, undamaged.glob("models/*.safetensors"))]
+            for name, lost, change in losses(truth):
+                with common.flight_and_out() as (copy, out):
+                    common.writable_copy(flight, copy)
+                    for file in sorted(lost):
+                        common.change_band(next(copy.rglob(file)), partial(change, rng=rng))
+                    common.align(copy, out, *options)
+                    known = {file: truth[file] for file in lost if file in truth}
+                    result[f"{flight.name}, {name}"] += common.band_errors(out, known)
     common.print_errors(result)
 
 

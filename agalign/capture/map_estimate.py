@@ -22,7 +22,7 @@ from agalign.flight.rig import Observation, Rig, lattice
 from agalign.flight.rig_prediction import predict_band
 from agalign.values import geometry
 from agalign.values.alignment import JointResult, Prediction, Residual
-from agalign.values.least_squares import Robust, cauchy_weights, least_squares
+from agalign.values.least_squares import Robust, least_squares
 from agalign.values.pixel_units import FixedImagePx
 
 
@@ -86,11 +86,8 @@ def _with_prior(pair: BandPair, result: JointResult[FixedImagePx], prior: Predic
     of_images = np.asarray(np.linalg.inv(result.corner_covariance_px2), np.float64)
     of_rig = whitening[None], (whitening @ delta_px)[None], weight
     estimate = least_squares(*of_rig, of_images, robust=robust, first_weights=first_weight)
-    # The curvature of the t distribution at its maximum claims a third of the variance of the prediction.
-    at_solution = np.minimum(1.0, weight * cauchy_weights(estimate.residuals, degrees_of_freedom**0.5))
-    covariance = np.asarray(np.linalg.inv(of_images + at_solution * information), np.float64)
     # Rounding removes the last bits, which depend on the machine's order of summation.
-    return _displaced(pair, result, np.round(estimate.mean, 6), np.round(covariance, 12))
+    return _displaced(pair, result, np.round(estimate.mean, 6), np.round(estimate.covariance, 12))
 
 
 def _displaced(
