@@ -354,7 +354,8 @@ def _std_px(reliefs: Sequence[Relief]) -> FloatImage:
     surroundings_px = 17  # the distance of the nodes of an error map
     values = np.stack([relief.parallax_px for relief in reliefs])
     square = (len(values) - 1) * np.square(values - values.mean(axis=0)).mean(axis=0)
-    return np.asarray(np.sqrt(cv2.blur(square, (surroundings_px, surroundings_px))))
+    # The running sums of the filter may be just below 0.
+    return np.asarray(np.sqrt(np.maximum(cv2.blur(square, (surroundings_px, surroundings_px)), 0)))
 
 
 def _window_shifts(

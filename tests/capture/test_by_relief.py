@@ -170,6 +170,10 @@ def test_reliefs_from_different_bands_give_a_standard_error(boxes: Rendered, ali
     one, other = (Relief(np.full((40, 60), z, np.float32), np.ones((40, 60), np.float32)) for z in (1.0, 3.0))
     np.testing.assert_allclose(_std_px([one, other]), 1.0)
     np.testing.assert_allclose(_std_px([one, one, one, other]), np.sqrt(3 * 0.75))
+    for seed in range(20):  # the running sums of a few are below 0 where the reliefs are equal
+        edge = np.pad(np.random.default_rng(seed).normal(size=(20, 30)) * 100, ((20, 80), (30, 100)))
+        several = [Relief(z.astype(np.float32), np.ones_like(z, np.float32)) for z in (0 * edge, edge)]
+        assert np.isfinite(_std_px(several)).all()
     known = aligned["NIR"]
     parallax, points = known.mapping.parallax, geometry.lattice(*known.size_px, 40, 30)
     of_relief_px = replace(parallax.relief, parallax_px=parallax.relief.std_px)(points)
