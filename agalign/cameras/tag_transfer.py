@@ -99,7 +99,7 @@ def band_tags(
 
 
 def _put_geometry(packet: Packet, reference: Band, tags: Tags, grid: OutputGrid) -> None:
-    """Change the values of the reference, whose file has these `tags`, to those on a grid.
+    """Change the values of the reference, which are in the `tags` of its file, to those on a grid.
 
     The rig becomes zero: software that reads it would otherwise align the bands a second time.
     """

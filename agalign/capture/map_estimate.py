@@ -67,8 +67,8 @@ def _by_images(
 
 
 def _with_prior(pair: BandPair, result: JointResult[FixedImagePx], prior: Prediction) -> JointResult[FixedImagePx]:
-    """Combine a result with the rig's prediction, whose error is distributed over all homographies: those with equal
-    mean square are equally likely.
+    """Combine a result with the rig's prediction. Errors of the prediction with equal mean square over the image are
+    equally likely.
     """
     assert result.corner_covariance_px2 is not None
     size_px, to_fixed = pair.fixed.size_px, geometry.invert(result.fixed_to_moving)

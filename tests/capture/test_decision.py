@@ -161,8 +161,8 @@ def test_a_field_is_fitted_where_a_part_of_the_image_is_misaligned(
 ) -> None:
     results = verified(Candidate.of(displaced_pair(*displaced), CENTRED, joint_result()), use)
     assert (results.status, results.geometry) == (status, geometry)
-    # The residual is that of held-out windows.
-    assert status != "aligned" or results.residual.median_px < 0.4
+    if status == "aligned":  # the residual is that of held-out windows
+        assert results.residual.median_px < (0.1 if displaced == (4.0,) else 0.4)
 
 
 @pytest.mark.parametrize(("rig_known", "tried"), [(True, False), (False, True)])

@@ -120,7 +120,7 @@ def test_relief_is_always_and_local_its_old_name(
     arguments: str, relief: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    (tmp_path / "flight").mkdir()  # a folder after --relief is no choice of it
+    (tmp_path / "flight").mkdir()  # a folder after --relief is not its value
     values = parameters(*arguments.split())
     assert values["relief"] == relief
     assert values.get("folder", Path("flight")) == Path("flight")

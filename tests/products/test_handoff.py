@@ -90,7 +90,7 @@ def test_a_disturbed_centre_does_not_matter(bump_px: float) -> None:
     at_px = 250.0
     falloff = np.polynomial.polynomial.polyval(at_px, (1.0, *result.coefficients))
     assert falloff == pytest.approx(1 - 4e-6 * (1.01 * at_px) ** 2, abs=0.002)
-    # Large relief is no polynomial.
+    # A polynomial cannot represent a large relief.
     noise_px = np.random.default_rng(0).normal(0, 15, OUTPUT_PX.shape)
     assert vignetting_on_grid(VIGNETTING, OUTPUT_PX, OUTPUT_PX + noise_px).error > 0.01
 
