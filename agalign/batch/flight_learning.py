@@ -150,7 +150,11 @@ class _FlightLearner:
         return {key: refined for key, aligned, refined in known if len(refined) == aligned}
 
     def _network(self) -> tuple[Descriptor, list[LearningCapture]] | None:
-        """Return (the network, captures with mappings refined by it); None if learning fails."""
+        """Return (the network, captures with mappings refined by it); None if no capture can be used.
+
+        The initial network is trained on the captures in which it does not align all bands. Training on a band that
+        shows nothing would impair it, so the result is used only if it aligns more bands of these captures.
+        """
         stretches, others = _stretches_and_others(self.captures)
         start = None if self.start is None else portable(self.start)
         task = partial(choose_and_refine, self._bands, self.settings, start)
@@ -161,25 +165,29 @@ class _FlightLearner:
         chosen = [one for one in refined[: len(stretches)] if one is not None]
         if not chosen:
             return None
-        net = initial_network(self._bands, self.settings, self.start)
-        if all(one.observation is not None for one in chosen):
-            return net, list({one.capture.label: one for one in refined if one is not None}.values())
-        return self._trained(net, chosen)
+        usable = {one.capture.label: one for one in refined if one is not None}
+        unaligned = [one for one in chosen if not one.is_aligned]
+        if unaligned:
+            net = initial_network(self._bands, self.settings, self.start)
+            trained = self._trained(net, unaligned)
+            if sum(one.aligned_bands for one in trained) > sum(one.aligned_bands for one in unaligned):
+                return net, [*(one for one in usable.values() if one.is_aligned), *trained]
+        return initial_network(self._bands, self.settings, self.start), list(usable.values())
 
-    def _trained(
-        self, net: Descriptor, chosen: Sequence[LearningCapture]
-    ) -> tuple[Descriptor, list[LearningCapture]] | None:
-        """Train a network on captures, from the mappings that are already refined; None if that fails."""
+    def _trained(self, net: Descriptor, chosen: Sequence[LearningCapture]) -> list[LearningCapture]:
+        """Train a network on captures, from the mappings that are already refined; return them refined by it.
+
+        Empty if learning fails; a network is then learned for each capture that needs it.
+        """
         settings = self.settings
         read = [load_capture(one.capture, self._bands, settings, self.start, one.refined) for one in chosen]
         loaded = [capture for capture in read if capture is not None]
         groups = [group for capture in loaded for _, group in capture.groups]
-        # One capture may make learning from all of them fail; a network is then learned for each capture alone.
         with logged_failure("the flight cannot be learned from"):
             learn(JointState(settings.joint, self.progress), groups, net, self.threads)
             with ThreadPoolExecutor(self.threads) as pool:
-                return net, list(pool.map(lambda capture: capture.refined_by(net, settings), loaded))
-        return None
+                return list(pool.map(lambda capture: capture.refined_by(net, settings), loaded))
+        return []
 
     def _observations(self, model: FlightModel, known: Sequence[LearningCapture]) -> dict[str, RigObservation]:
         """Return observations of the rig by capture, until every observed band is in enough of them.

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from agalign.batch.capture_task import quiet
-from agalign.capture.align_bands import PairAligner, refined_pairs
+from agalign.capture.align_bands import PairAligner
 from agalign.capture.band_pair import BandPair, read_pairs
 from agalign.capture.by_rig import observed, with_predictions
 from agalign.capture.seeding import Start, find_seed, image_groups
@@ -19,7 +19,6 @@ from agalign.flight.model import FlightModel
 from agalign.flight.rig import Observation
 from agalign.method.descriptor import Descriptor, start_from
 from agalign.method.device import choose_device
-from agalign.method.fast import SCHEDULES
 from agalign.method.joint import refine_with
 from agalign.method.refine import FLIGHT_PATCHES
 from agalign.method.state import ImageGroup, JointState
@@ -91,7 +90,17 @@ class LearningCapture:
     refined: Mapping[str, RefinedPair] = field(default_factory=dict)
     """Refined mappings of all bands; empty if the initial network was not applied, because a seed is not trusted."""
     observation: RigObservation | None = None
-    """None if the mappings were not verified, because the network needs more learning."""
+    """None if the initial network was not applied."""
+
+    @property
+    def aligned_bands(self) -> int:
+        """Number of the bands that pass verification."""
+        return 0 if self.observation is None else len(self.observation.residuals)
+
+    @property
+    def is_aligned(self) -> bool:
+        """True if all bands pass verification."""
+        return self.observation is not None and self.observation.is_aligned
 
 
 @dataclass(frozen=True)
@@ -113,26 +122,19 @@ class LoadedCapture:
         """True if all seeds are confirmed by the images."""
         return all(seed.trusted for _, seed in self.starts)
 
-    def refined_by(self, net: Descriptor, settings: Settings, *, is_final: bool = True) -> LearningCapture:
-        """Refine the pairs by a network; return the capture without its images.
-
-        They are also verified, as observations of the rig, if the network is final or good enough.
-        """
+    def refined_by(self, net: Descriptor, settings: Settings) -> LearningCapture:
+        """Refine the pairs by a network and verify them, as observations of the rig; return them without images."""
         of_pair: dict[int, JointResult[FixedImagePx] | Issue] = {}
         for places, group in self.groups:
             of_pair |= zip(places, refine_with(net, group, settings.joint, quiet, FLIGHT_PATCHES), strict=True)
         results = [of_pair[i] for i in range(len(self.starts))]
         pairs = [pair for pair, _ in self.starts]
         known = [(p, r) for p, r in zip(pairs, results, strict=True) if isinstance(r, JointResult)]
-        enough, refined = SCHEDULES[settings.joint.recipe].enough_retrieval, refined_pairs(self.starts, results)
-        is_good_enough = all(isinstance(r, JointResult) and r.retrieval > enough for r in results)
-        observation = None
-        if is_final or is_good_enough:
-            aligner = PairAligner(settings, None, quiet, is_observation=True)
-            aligner.verify(self.starts, results)
-            observation = _observation(pairs, aligner.result, refined, self.capture)
+        aligner = PairAligner(settings, None, quiet, is_observation=True)
+        aligner.verify(self.starts, results)
+        observation = _observation(pairs, aligner.result, aligner.refined, self.capture)
         mappings = {p.name: p.scales.between_files(r.fixed_to_moving) for p, r in known if r.retrieval >= MIN_RETRIEVAL}
-        return LearningCapture(self.capture, mappings, refined, observation)
+        return LearningCapture(self.capture, mappings, aligner.refined, observation)
 
 
 def load_capture(
@@ -193,7 +195,7 @@ def choose_and_refine(
     if not best.is_trusted:
         return LearningCapture(best.capture)
     with logged_failure(f"{best.capture.label} cannot be learned from"):
-        return best.refined_by(initial_network(bands, settings, start), settings, is_final=False)
+        return best.refined_by(initial_network(bands, settings, start), settings)
     return None
 
 
