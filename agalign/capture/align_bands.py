@@ -1,8 +1,7 @@
 """Alignment of the band pairs of one capture: seeds, joint estimation, verification of each pair."""
 
 import time
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 
@@ -35,25 +34,6 @@ PairProgress = Callable[[str, str, float], None]
 """Called with the name of the band, the stage and its completed share, 0 to 1."""
 
 
-class _Timer:
-    """Processing time by band; time for several bands is divided equally among them."""
-
-    def __init__(self) -> None:
-        self._seconds: dict[str, float] = {}
-
-    @contextmanager
-    def measure(self, names: Sequence[str]) -> Iterator[None]:
-        """Measure the time of a block for these bands."""
-        start = time.perf_counter()
-        yield
-        for name in names:
-            self._seconds[name] = self._seconds.get(name, 0.0) + (time.perf_counter() - start) / len(names)
-
-    def added_to(self, result: Alignments) -> Alignments:
-        """Return the alignments with the measured times added."""
-        return {name: replace(a, seconds=a.seconds + self._seconds.get(name, 0.0)) for name, a in result.items()}
-
-
 def align_capture_bands(
     capture: Capture, settings: Settings, model: FlightModel | None, progress: PairProgress
 ) -> dict[str, Alignment[FixedFilePx]]:
@@ -62,6 +42,7 @@ def align_capture_bands(
     A band that cannot be read is `failed`; the others are aligned. Raises UnreadableFileError if the reference cannot
     be read.
     """
+    start_s = time.perf_counter()
     progress(capture.reference.name, "reading", 0.0)
     pairs, unusable = read_pairs(capture, settings.seed, model)
     aligned = align_pairs(pairs, settings, progress, model, capture)
@@ -70,15 +51,11 @@ def align_capture_bands(
         aligned = with_predictions(pairs, aligned, rig, capture)
     if not settings.seed.only:
         aligned = without_extrapolated(pairs, aligned, rig)
-    timer = _Timer()
-    for pair in pairs:
-        progress(pair.name, "measuring", 0.0)
-        with timer.measure([pair.name]):
-            aligned[pair.name] = with_metrics(aligned[pair.name], pair, with_ties=settings.write.tie_points)
-    aligned = timer.added_to(aligned)
     result: dict[str, Alignment[FixedFilePx]] = {}
     for pair in pairs:
-        result |= _between_files(capture, pair, aligned[pair.name])
+        progress(pair.name, "measuring", 0.0)
+        measured = with_metrics(aligned[pair.name], pair, with_ties=settings.write.tie_points)
+        result |= dict.fromkeys((b.name for b in pair.bands), _between_files(capture, pair, measured))
     size_px = capture.reference.size_px
     for band in capture.moving:
         if band.name not in result:
@@ -88,7 +65,8 @@ def align_capture_bands(
             result[band.name] = decided(Alignment(mapping, size_px, "failed", issues, overlay))
     reliefs = (a.mapping.parallax.relief for a in result.values() if a.mapping.parallax is not None)
     relief = next((relief.on_pixels(size_px) for relief in reliefs), None)  # the same in all bands
-    return {band.name: _as_written(result[band.name], band, relief) for band in capture.moving}
+    seconds = (time.perf_counter() - start_s) / len(capture.moving)  # most steps are for all bands together
+    return {b.name: replace(_as_written(result[b.name], b, relief), seconds=seconds) for b in capture.moving}
 
 
 def _as_written(alignment: Alignment[FixedFilePx], band: Band, relief: Relief | None) -> Alignment[FixedFilePx]:
@@ -100,15 +78,12 @@ def _as_written(alignment: Alignment[FixedFilePx], band: Band, relief: Relief | 
     return replace(alignment, mapping=mapping, moving_size_px=band.size_px)
 
 
-def _between_files(
-    capture: Capture, pair: BandPair, aligned: Alignment[FixedImagePx]
-) -> dict[str, Alignment[FixedFilePx]]:
+def _between_files(capture: Capture, pair: BandPair, aligned: Alignment[FixedImagePx]) -> Alignment[FixedFilePx]:
     """Convert the alignment of a pair to px of the files of its bands; refine it if the files have more pixels."""
     alignment = aligned.in_file_px(pair.scales, capture.reference.size_px)
     if pair.is_reduced and alignment.status == "aligned":
-        alignment = at_full_resolution(capture.reference, pair.bands[0], alignment)
-    shared = replace(alignment, seconds=alignment.seconds / len(pair.bands))
-    return dict.fromkeys((b.name for b in pair.bands), shared)
+        return at_full_resolution(capture.reference, pair.bands[0], alignment)
+    return alignment
 
 
 @one_thread()
@@ -136,10 +111,9 @@ class PairAligner:
     """Results by band of the last optimisation, before they are combined with those of other bands and the rig."""
     result: Alignments = field(default_factory=dict)
     """Alignments by band."""
-    timer: _Timer = field(default_factory=_Timer)
 
     def align(self, pairs: Sequence[BandPair], capture: Capture | None, *, scratch: bool = True) -> Alignments:
-        """Take all steps; return the alignments with their processing times.
+        """Take all steps; return the alignments.
 
         A capture that the model was learned from has refined mappings in the model. Pairs that the flight's network
         cannot align are learned from scratch, with a rig only those without an accurate prediction; without `scratch`,
@@ -154,7 +128,7 @@ class PairAligner:
                 self._learn(starts, capture, scratch=scratch)
                 self._align_by_windows(starts)
                 self.result = of_one_geometry(pairs, self.result)
-        return self.timer.added_to(self.result)
+        return self.result
 
     def _verify_refined(self, pairs: Sequence[BandPair], capture: Capture | None) -> bool:
         """Verify mappings that were refined when the flight was learned; False unless all pairs are aligned by them."""
@@ -173,22 +147,20 @@ class PairAligner:
     def _seeded(self, pairs: Sequence[BandPair]) -> list[Start]:
         """Return the pairs with a seed; the other pairs are failed."""
         starts: list[Start] = []
-        with self.timer.measure([p.name for p in pairs]):
-            for pair in pairs:
-                self.progress(pair.name, "seeding", 0.0)
-                seed = find_seed(pair, self.settings.seed, self.model)
-                if isinstance(seed, Issue):
-                    kind, matrix = next(iter(pair.seed_matrices.items()))
-                    self.result[pair.name] = without_result(pair, Seed(kind, matrix, 0.0), seed)
-                else:
-                    starts.append((pair, seed))
+        for pair in pairs:
+            self.progress(pair.name, "seeding", 0.0)
+            seed = find_seed(pair, self.settings.seed, self.model)
+            if isinstance(seed, Issue):
+                kind, matrix = next(iter(pair.seed_matrices.items()))
+                self.result[pair.name] = without_result(pair, Seed(kind, matrix, 0.0), seed)
+            else:
+                starts.append((pair, seed))
         return starts
 
     def _keep_seeds(self, starts: Sequence[Start]) -> None:
         """Use the seeds as results, as the user requested."""
         for pair, seed in starts:
-            with self.timer.measure([pair.name]):
-                self.result[pair.name] = at_seed(pair, seed, (Issue(SEED_ASKED_FOR),), seed_only=True)
+            self.result[pair.name] = at_seed(pair, seed, (Issue(SEED_ASKED_FOR),), seed_only=True)
 
     def refine(self, starts: Sequence[Start]) -> None:
         """Align the pairs of the bands that the flight's network contains with this network."""
@@ -217,19 +189,17 @@ class PairAligner:
         """Align by windows the pairs without retrieval of held-out patches."""
         if self._may_be_homography:
             for pair, _ in starts:
-                with self.timer.measure([pair.name]):
-                    self.result[pair.name] = aligned_by_windows(pair, self.result[pair.name])
+                self.result[pair.name] = aligned_by_windows(pair, self.result[pair.name])
 
     def _optimise(
         self, starts: Sequence[Start], sides: Sequence[int], align: Callable[[ImageGroup, Progress], Results]
     ) -> None:
         """Align the pairs by image group, with the network's `sides`, and verify them."""
         results: dict[int, JointResult[FixedImagePx] | Issue] = {}
-        with self.timer.measure([pair.name for pair, _ in starts]):
-            for indices, group in image_groups(starts, sides):
-                report = partial(self.progress, starts[indices[0]][0].name)  # with the name of the group's first pair
-                report("refining", 0.0)
-                results |= zip(indices, align(group, report), strict=True)
+        for indices, group in image_groups(starts, sides):
+            report = partial(self.progress, starts[indices[0]][0].name)  # with the name of the group's first pair
+            report("refining", 0.0)
+            results |= zip(indices, align(group, report), strict=True)
         self.verify(starts, [results[i] for i in range(len(starts))])
 
     def verify(self, starts: Sequence[Start], results: Results) -> None:
@@ -240,23 +210,21 @@ class PairAligner:
         """
         self.refined |= refined_pairs(starts, results)
         use = self.settings.relief.use if self._may_be_homography else "never"
-        with self.timer.measure([pair.name for pair, _ in starts]):
-            candidates = self.candidates(starts, results)
-            self.progress(starts[0][0].name if starts else "", "relief", 0.0)
-            lost = [start for start, result in zip(starts, results, strict=True) if isinstance(result, Issue)]
-            alignments, along_a_line = aligned_by_relief(
-                list(candidates.values()), use, lost=lost, is_observation=self.is_observation
-            )
+        candidates = self.candidates(starts, results)
+        self.progress(starts[0][0].name if starts else "", "relief", 0.0)
+        lost = [start for start, result in zip(starts, results, strict=True) if isinstance(result, Issue)]
+        alignments, along_a_line = aligned_by_relief(
+            list(candidates.values()), use, lost=lost, is_observation=self.is_observation
+        )
         for (pair, seed), result in zip(starts, results, strict=True):
             if pair.name in alignments:
                 continue
             self.progress(pair.name, "checking", 0.0)
-            with self.timer.measure([pair.name]):
-                if isinstance(result, Issue):
-                    alignments[pair.name] = at_seed(pair, seed, (result,))
-                else:
-                    field_use = "never" if self.is_observation or pair.name in along_a_line else use
-                    alignments[pair.name] = verified(candidates[pair.name], field_use)
+            if isinstance(result, Issue):
+                alignments[pair.name] = at_seed(pair, seed, (result,))
+            else:
+                field_use = "never" if self.is_observation or pair.name in along_a_line else use
+                alignments[pair.name] = verified(candidates[pair.name], field_use)
         self.result |= of_one_geometry([pair for pair, _ in starts], alignments)
 
     def candidates(self, starts: Sequence[Start], results: Results) -> dict[str, Candidate]:
