@@ -7,28 +7,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agalign.capture.warped_pair import Candidate
-from agalign.fit.adjustment import (
-    Adjustment,
-    WindowShifts,
-    adjust,
-    are_of_lenses,
-    are_on_a_line,
-    parallax_of,
-    shifts_by_corners,
-)
-from agalign.fit.displacement_field import MIN_GAIN_SIGMA, MIN_WINDOWS
-from agalign.fit.windows import decrease_sigma
+from agalign.fit.adjustment import Adjustment, WindowShifts, adjust, are_of_lenses, are_on_a_line
+from agalign.fit.displacement_field import MIN_WINDOWS
 from agalign.values.alignment import MIN_RETRIEVAL, Residual
 from agalign.values.pixel_units import FixedImagePx
-from agalign.verify.checks import MAX_SHIFT_PX
 
 MIN_BANDS = 2
 """Minimum number of moving lenses: a relief is verified with the other lenses."""
 MIN_PARALLAX_PX = 0.3
 """Minimum p95 of the parallax of windows for a relief; windows of flat fields have up to 0.2 px, mostly noise."""
-_MAX_FAR_SHARE = 0.05
-"""A relief is also tried if more than this share of the windows has shifts above 1 px (`_far_share`): windows across
-depth edges may contain the parallax of neither side, so that the squared shifts do not decrease."""
 
 
 def comparable(candidates: Sequence[Candidate]) -> list[list[Candidate]]:
@@ -46,13 +33,10 @@ def comparable(candidates: Sequence[Candidate]) -> list[list[Candidate]]:
 
 
 def common_parallax_px(group: Sequence[Candidate]) -> tuple[float, bool]:
-    """Return the p95 of the parallax that is common to the bands, 0 if it is not significant, and if the baselines are
-    on one line without tags that confirm them.
-
-    It is significant if either many shifts of a band are large, or the parallax from the other bands reduces the shifts
-    of the median band significantly.
+    """Return the p95 of the parallax that is common to the bands, 0 if there is none, and if the baselines are on one
+    line without tags that confirm them.
     """
-    residuals, size_px = _common_residuals(group), group[0].pair.fixed.size_px
+    residuals = _common_residuals(group)
     # The p95 is robust, as a wrong peak is no parallax.
     if max((r.p95_px for r in residuals if len(r.lengths_px)), default=0.0) < MIN_PARALLAX_PX:
         return 0.0, False
@@ -61,43 +45,18 @@ def common_parallax_px(group: Sequence[Candidate]) -> tuple[float, bool]:
     if consistent is None:
         return 0.0, False
     bands, model = consistent
-    far_share = max(_far_share(residuals[band]) for band in bands)
-    if far_share <= _MAX_FAR_SHARE and _gain_by_others_sigma(windows.of_bands(bands), model, size_px) < MIN_GAIN_SIGMA:
-        return 0.0, False
     parallax_px = float(np.percentile(np.abs(model.parallax_px), 95))
     return parallax_px, layout_of([group[band] for band in bands]) is None and are_on_a_line(model.baselines)
-
-
-def _gain_by_others_sigma(windows: WindowShifts, model: Adjustment, size_px: tuple[int, int]) -> float:
-    """Return the decrease of the squared shifts of the median band by the parallax from the others, in sigma."""
-    shifts_px = windows.shifts_px - shifts_by_corners(model, windows.points_px, size_px)
-    bands, gains = np.arange(shifts_px.shape[1]), []
-    for band in bands:
-        others = np.delete(bands, band)
-        parallax = parallax_of(shifts_px[:, others], model.baselines[others], windows.weights[:, others])
-        after_px = shifts_px[:, band] - parallax[:, None] * model.baselines[band]
-        before, after = (np.linalg.norm(s, axis=1) for s in (shifts_px[:, band], after_px))
-        measured = np.isfinite(before) & np.isfinite(after)
-        enough = measured.sum() >= MIN_WINDOWS
-        gains.append(decrease_sigma(before[measured], after[measured]) if enough else 0.0)
-    return float(np.median(gains))
 
 
 def _common_residuals(group: Sequence[Candidate]) -> list[Residual[FixedImagePx]]:
     """Return the residuals of all bands in the same windows: large ones if any band is blurred, or small ones if the
     residual of any band uses these.
     """
-    reference = group[0].pair.reference
-    if any(c.pair.is_blurred for c in group):
-        return [reference.large_windows.residuals(c.warped.warped) for c in group]
-    if all(c.warped.windows is reference.windows for c in group):
-        return [c.warped.residual for c in group]
-    return [reference.small_windows.residuals(c.warped.warped) for c in group]
-
-
-def _far_share(residual: Residual[FixedImagePx]) -> float:
-    """Return the share of the measured windows with a shift above 1 px."""
-    return float((residual.lengths_px > MAX_SHIFT_PX).mean()) if len(residual.lengths_px) else 0.0
+    is_blurred = any(c.pair.is_blurred for c in group)
+    smallest = min((c.warped.windows for c in group), key=lambda windows: windows.side)
+    common = group[0].pair.reference.large_windows if is_blurred else smallest
+    return [c.warped.residual if c.warped.windows is common else common.residuals(c.warped.warped) for c in group]
 
 
 def layout_of(group: Sequence[Candidate]) -> NDArray[np.float64] | None:

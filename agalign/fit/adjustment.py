@@ -410,12 +410,6 @@ def are_on_a_line(baselines: Array) -> bool:
     return bool(shortest < min_ratio * longest)
 
 
-def shifts_by_corners(model: Adjustment, points_px: Points, size_px: tuple[int, int]) -> Array:
-    """Return (n, bands, 2) the shifts by the corrections of the homographies at points (n, 2), without parallax."""
-    corners_px = np.stack([fit.corners_px for fit in model.fits])
-    return np.asarray(np.einsum("nki,bi->nbk", geometry.over_corners(points_px, *size_px), corners_px))
-
-
 def parallax_of(residual_px: Array, baselines: Array, weights: Array) -> Array:
     """Return the parallax (n,) of windows from their shifts (n, bands, 2) relative to the homographies.
 

@@ -36,8 +36,8 @@ _CAUCHY_SCALES = 4.0
 MIN_WINDOWS = 24
 """Minimum number of windows with a shift for a field or a relief; a fit without one fold may have half as many."""
 MIN_GAIN_SIGMA = 4.0
-"""Minimum decrease of the loss of held-out windows by a field, or of the shifts of a band by the parallax from others,
-in standard errors: 4 to 8 for lenses and canopies, up to 3 by chance and for edges of shadows in blurred bands."""
+"""Minimum decrease of the loss of held-out windows by a field in standard errors: 4 to 8 for lenses and canopies, up to
+3 by chance and for edges of shadows in blurred bands."""
 _FOLDS = 4
 """Every fourth window along both axes is a fold. Without the windows that overlap it, most windows remain."""
 

@@ -178,15 +178,6 @@ def residual_under(residual: Residual[FixedPx], before: PixelMapping, after: Pix
     return residual.with_shifts(shifts - difference)
 
 
-def decrease_sigma(before_px: NDArray[np.float64], after_px: NDArray[np.float64]) -> float:
-    """Return the mean decrease of squared shifts with lengths (n,), in standard errors.
-
-    Lengths are clipped at twice the p95 of `before_px`, which limits the influence of wrong peaks.
-    """
-    limit_px = 2 * np.percentile(before_px, 95)
-    return in_standard_errors(np.minimum(before_px, limit_px) ** 2 - np.minimum(after_px, limit_px) ** 2)
-
-
 def _grid(x: Sequence[int], y: Sequence[int]) -> NDArray[np.int64]:
     """Return (n, 2) all (x, y), row by row."""
     return np.stack(np.meshgrid(np.array(x, np.int64), np.array(y, np.int64)), axis=-1).reshape(-1, 2)

@@ -5,15 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from agalign.fit.adjustment import (
-    Adjustment,
-    WindowShifts,
-    adjust,
-    are_of_lenses,
-    lens_std_px,
-    parallax_of,
-    shifts_by_corners,
-)
+from agalign.fit.adjustment import Adjustment, WindowShifts, adjust, are_of_lenses, lens_std_px, parallax_of
 from agalign.synthetic import cameras
 from agalign.values import geometry
 from agalign.values.mapping import PixelMapping
@@ -47,10 +39,15 @@ def shifts(wrong: float = 0.2, missing: float = 0.0) -> WindowShifts:
     return WindowShifts(POINTS, POINTS, result, np.where(gone, 0.0, 1.0))
 
 
+def by_corners(model: Adjustment, points_px: np.ndarray) -> np.ndarray:
+    """Return (n, bands, 2) the shifts by the corrections of the homographies."""
+    return np.stack([geometry.over_corners(points_px, *SIZE) @ fit.corners_px for fit in model.fits], axis=1)
+
+
 def assert_recovered(model: Adjustment | None, sign: int = 1) -> None:
     np.testing.assert_allclose(model.baselines, sign * BASELINES, atol=0.02)
     assert np.percentile(np.abs(model.parallax_px - sign * HEIGHTS), 75) < 0.15
-    assert np.abs(shifts_by_corners(model, POINTS, SIZE) - PLANES).max() < 0.15
+    assert np.abs(by_corners(model, POINTS) - PLANES).max() < 0.15
 
 
 @pytest.mark.parametrize(("unit", "missing"), [(0.001, 0.0), (40.0, 0.0), (1.0, 0.3)])
@@ -82,7 +79,7 @@ def test_priors_do_not_depend_on_the_noise_of_a_band() -> None:
     shift = HEIGHTS[::6, None, None] * BASELINES + rng.normal(0, 0.02, (len(few), 4, 2))
     shift[:, 1] += rng.normal((20, -20), 1.5, (len(few), 2))
     model = adjust(WindowShifts(few, few, shift, np.ones((len(few), 4))), SIZE, BASELINES)
-    error_px = shifts_by_corners(model, few, SIZE)[:, 1] - [20, -20]
+    error_px = by_corners(model, few)[:, 1] - [20, -20]
     assert np.abs(error_px.mean(axis=0)).max() < 0.5
 
 
@@ -121,7 +118,7 @@ def test_lens_fields_are_recovered_next_to_parallax() -> None:
     model = adjust(windows, SIZE, BASELINES, 3 * lens_std_px(SIZE, calibrated=False))
     np.testing.assert_allclose(model.baselines, BASELINES, atol=0.02)
     assert np.percentile(np.abs(model.parallax_px - HEIGHTS), 90) < 0.15
-    left = shifts_by_corners(model, POINTS, SIZE) - PLANES - lens_fields()
+    left = by_corners(model, POINTS) - PLANES - lens_fields()
     for band, fit in enumerate(model.fits):
         field = fit.applied_to(PixelMapping(np.eye(3))).field
         error_px = np.linalg.norm(left[:, band] + field(POINTS), axis=1)
