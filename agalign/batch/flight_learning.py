@@ -1,6 +1,6 @@
 """Learn the model of a flight: one network for all its captures, from a few of them, and its rig."""
 
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
@@ -11,14 +11,12 @@ import numpy as np
 from agalign.batch.capture_task import in_one_thread
 from agalign.batch.learning_tasks import (
     LearningCapture,
-    RigObservation,
     choose_and_refine,
     initial_network,
     load_capture,
     logged_failure,
     observe_rig,
     portable,
-    try_model,
 )
 from agalign.config import Settings
 from agalign.fit.displacement_field import common_field
@@ -27,6 +25,7 @@ from agalign.flight.groups import flight_camera, flight_lenses
 from agalign.flight.learn_rig import learn_rig
 from agalign.flight.model import FlightModel
 from agalign.flight.rig import MIN_CAPTURES, Rig, median_mapping
+from agalign.flight.rig_prediction import predict_band
 from agalign.method.descriptor import Descriptor
 from agalign.method.device import keep_freed_memory, one_memory_error, one_thread
 from agalign.method.fast import learn
@@ -35,6 +34,7 @@ from agalign.pixels.raster import without_warnings
 from agalign.values import geometry
 from agalign.values.alignment import RefinedPair, Residual
 from agalign.values.capture import Capture
+from agalign.values.geometry import Matrix
 from agalign.values.pixel_units import FixedFilePx, MovingFilePx
 from agalign.values.process_pool import A, Apply, R
 from agalign.verify.extrapolation import unmodelled_std_px, unobserved_quarters
@@ -104,19 +104,19 @@ class _FlightLearner:
         if network is None:
             return None
         net, known = network
-        names = dict.fromkeys(name for one in known for name in one.mappings)
-        if not names:
+        mappings = defaultdict[str, list[Matrix]](list)
+        for name, matrix in (pair for one in known for pair in one.mappings.items()):
+            mappings[name].append(matrix)
+        if not mappings:
             return None
-        mappings = {name: [one.mappings[name] for one in known if name in one.mappings] for name in names}
         medians = {name: median_mapping(of_band, self._size_px) for name, of_band in mappings.items()}
         model = FlightModel(net, flight_camera(self.captures), self._bands, medians, "")
         observations = self._observations(model, known)
-        rig = self._rig(list(observations.values())) or self._start_rig
+        rig = self._rig(observations) or self._start_rig
         if rig is None:
             # A second refinement from the medians reduces the errors.
             return model
-        aligned = {label: o.refined for label, o in observations.items() if o.is_aligned}
-        refined = {refinement_key(c, self.settings): aligned[c.label] for c in self.captures if c.label in aligned}
+        refined = {refinement_key(one.capture, self.settings): one.refined for one in observations if one.is_aligned}
         return replace(model, rig=rig, mappings={**medians, **rig.mean}, refined=refined)
 
     @property
@@ -141,13 +141,13 @@ class _FlightLearner:
         if model.rig is None or not set(self._bands) <= set(model.bands):
             return None
         some = [self.captures[len(self.captures) * k // 3] for k in (1, 2)]
-        tests = list(self.apply(partial(try_model, portable(model), self.settings), some))
-        known = [
-            (refinement_key(c, self.settings), *test) for c, test in zip(some, tests, strict=True) if test is not None
-        ]
-        if len(known) < len(some) or sum(aligned for _, aligned, _ in known) < len(self._bands):
+        tests = list(filter(None, self.apply(partial(observe_rig, portable(model), self.settings), some)))
+        known = [(band, one.observation) for one in tests for band in one.residuals]
+        limit_px = self.settings.check.accept_predicted_px
+        is_accurate = all(predict_band(model.rig, band, o).std_px <= limit_px for band, o in known)
+        if len(tests) < len(some) or len(known) < len(self._bands) or not is_accurate:
             return None
-        return {key: refined for key, aligned, refined in known if len(refined) == aligned}
+        return {refinement_key(one.capture, self.settings): one.refined for one in tests if one.is_aligned}
 
     def _network(self) -> tuple[Descriptor, list[LearningCapture]] | None:
         """Return (the network, captures with mappings refined by it); None if no capture can be used.
@@ -170,7 +170,7 @@ class _FlightLearner:
         if unaligned:
             net = initial_network(self._bands, self.settings, self.start)
             trained = self._trained(net, unaligned)
-            if sum(one.aligned_bands for one in trained) > sum(one.aligned_bands for one in unaligned):
+            if sum(len(one.residuals) for one in trained) > sum(len(one.residuals) for one in unaligned):
                 return net, [*(one for one in usable.values() if one.is_aligned), *trained]
         return initial_network(self._bands, self.settings, self.start), list(usable.values())
 
@@ -189,31 +189,29 @@ class _FlightLearner:
                 return list(pool.map(lambda capture: capture.refined_by(net, settings), loaded))
         return []
 
-    def _observations(self, model: FlightModel, known: Sequence[LearningCapture]) -> dict[str, RigObservation]:
-        """Return observations of the rig by capture, until every observed band is in enough of them.
+    def _observations(self, model: FlightModel, known: Sequence[LearningCapture]) -> list[LearningCapture]:
+        """Return observations of the rig, in the order of the captures, until each aligned band is in enough of them.
 
-        `known` are the captures that the network has refined. Of these, only the misaligned bands are observed again.
+        `known` are the captures that the network has refined. Those with bands that are not aligned come first, because
+        the model's mappings are better initial alignments than seeds.
         """
         # Neighbours have about the same height and speed.
         captures_per_rig_capture = 8
         count = min(_MAX_RIG_CAPTURES, max(_MIN_RIG_CAPTURES, len(self.captures) // captures_per_rig_capture))
-        result = {one.capture.label: one.observation for one in known if one.observation is not None}
-        again = [c for c in self.captures if c.label in result and result[c.label].misaligned]
-        waiting = [*again, *(c for c in _spread(self.captures, count) if c.label not in result)]
-        model = portable(model)
+        result = {one.capture.label: one for one in known}
+        unaligned = [one.capture for one in known if not one.is_aligned]
+        waiting = [*unaligned, *(c for c in _spread(self.captures, count) if c.label not in result)]
+        task = partial(observe_rig, portable(model), self.settings)
         while waiting and (missing := count - _min_observations(result.values())) > 0:
             some, waiting = waiting[:missing], waiting[missing:]
-            # The model's mappings are better initial alignments than the seeds of the misaligned bands.
-            arguments = [(c, result[c.label].misaligned if c.label in result else None) for c in some]
-            observations = self.apply(partial(observe_rig, model, self.settings), arguments)
-            for capture, observation in zip(some, observations, strict=True):
-                if observation is not None:
-                    earlier = result.get(capture.label)
-                    result[capture.label] = observation if earlier is None else earlier.updated(observation)
+            for one in self.apply(task, some):
+                if one is not None:
+                    earlier = result.get(one.capture.label, one)
+                    result[one.capture.label] = max(earlier, one, key=lambda o: len(o.residuals))
                 self.progress("the rig", min(1.0, len(result) / count))
-        return {c.label: result[c.label] for c in self.captures if c.label in result}
+        return [result[c.label] for c in self.captures if c.label in result]
 
-    def _rig(self, observations: Sequence[RigObservation]) -> Rig | None:
+    def _rig(self, observations: Sequence[LearningCapture]) -> Rig | None:
         """Return the rig, with the displacement fields of the lenses; None if the captures do not determine it."""
         rig = learn_rig([o.observation for o in observations], self._size_px, _layout(self.captures), self.apply)
         if rig is None:
@@ -231,7 +229,7 @@ class _FlightLearner:
         return replace(rig, extrapolation_px=extrapolation_px, fields=known)
 
 
-def _min_observations(observations: Iterable[RigObservation]) -> int:
+def _min_observations(observations: Iterable[LearningCapture]) -> int:
     """Return the number of observations of the aligned band with the fewest."""
     counts = Counter(band for o in observations for band in o.residuals)
     return min(counts.values(), default=0)

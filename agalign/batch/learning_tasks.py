@@ -9,9 +9,9 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from agalign.batch.capture_task import quiet
-from agalign.capture.align_bands import PairAligner
+from agalign.capture.align_bands import PairAligner, aligned_groups
 from agalign.capture.band_pair import BandPair, read_pairs
-from agalign.capture.by_rig import observed, with_predictions
+from agalign.capture.by_rig import observed
 from agalign.capture.seeding import Start, find_seed, image_groups
 from agalign.config import Settings
 from agalign.errors import AgalignError
@@ -23,11 +23,10 @@ from agalign.method.joint import refine_with
 from agalign.method.refine import FLIGHT_PATCHES
 from agalign.method.state import ImageGroup, JointState
 from agalign.pixels.raster import with_saturation_values
-from agalign.values.alignment import MIN_RETRIEVAL, Alignments, JointResult, RefinedPair, Residual, Seed
+from agalign.values.alignment import MIN_RETRIEVAL, PairScales, RefinedPair, Residual, Seed
 from agalign.values.capture import Capture
 from agalign.values.geometry import Matrix
-from agalign.values.issues import Issue
-from agalign.values.pixel_units import FixedFilePx, FixedImagePx
+from agalign.values.pixel_units import FixedFilePx
 
 
 @contextmanager
@@ -55,52 +54,38 @@ def _on_device(model: FlightModel, settings: Settings) -> FlightModel:
 
 
 @dataclass(frozen=True)
-class RigObservation:
-    """Observation of the rig by one capture: its mappings, and the residual shifts of its windows."""
+class LearningCapture:
+    """A capture from which the network or the rig is learned, aligned by a network without a rig."""
 
-    observation: Observation
-    residuals: Mapping[str, Residual[FixedFilePx]]
+    capture: Capture
+    refined: Mapping[str, RefinedPair] = field(default_factory=dict)
+    """Mappings of all bands before they were combined; empty if no network was applied, as a seed is not trusted."""
+    residuals: Mapping[str, Residual[FixedFilePx]] = field(default_factory=dict)
     """Of the aligned bands."""
-    refined: Mapping[str, RefinedPair]
-    """Mappings of all bands before they were combined."""
-    misaligned: frozenset[str] = frozenset()
-    """Bands with distinguishable patches that are not aligned."""
+    observation: Observation = field(default_factory=lambda: Observation(None, {}, {}))
+    """The mappings of the aligned bands, for the rig."""
+
+    @classmethod
+    def of(cls, capture: Capture, pairs: Sequence[BandPair], aligner: PairAligner) -> "LearningCapture":
+        """Collect the results for the pairs of a capture."""
+        in_file_px = {p.name: aligner.result[p.name].in_file_px(p.scales, p.reference_file_px) for p in pairs}
+        residuals = {b: a.residual for b, a in in_file_px.items() if a.status == "aligned" and a.residual is not None}
+        return cls(capture, aligner.refined, residuals, observed(pairs, aligner.result, capture))
 
     @property
     def is_aligned(self) -> bool:
         """True if all bands are aligned."""
-        return self.residuals.keys() == self.refined.keys()
-
-    def updated(self, other: "RigObservation") -> "RigObservation":
-        """Return the observation with the bands of another one of the same capture."""
-        mine, others = self.observation, other.observation
-        mappings, std_px = {**mine.mappings, **others.mappings}, {**mine.std_px, **others.std_px}
-        residuals, refined = {**self.residuals, **other.residuals}, {**self.refined, **other.refined}
-        observation = replace(mine, mappings=mappings, std_px=std_px)
-        return RigObservation(observation, residuals, refined, other.misaligned)
-
-
-@dataclass(frozen=True)
-class LearningCapture:
-    """A capture to learn the network from, with the results of the initial network or of the learned one."""
-
-    capture: Capture
-    mappings: Mapping[str, Matrix] = field(default_factory=dict)
-    """Refined mappings of bands with distinguishable held-out patches, px of the files."""
-    refined: Mapping[str, RefinedPair] = field(default_factory=dict)
-    """Refined mappings of all bands; empty if the initial network was not applied, because a seed is not trusted."""
-    observation: RigObservation | None = None
-    """None if the initial network was not applied."""
+        return bool(self.refined) and self.residuals.keys() == self.refined.keys()
 
     @property
-    def aligned_bands(self) -> int:
-        """Number of the bands that pass verification."""
-        return 0 if self.observation is None else len(self.observation.residuals)
-
-    @property
-    def is_aligned(self) -> bool:
-        """True if all bands pass verification."""
-        return self.observation is not None and self.observation.is_aligned
+    def mappings(self) -> dict[str, Matrix]:
+        """Refined mappings of the bands with distinguishable held-out patches, px of the files."""
+        result, files_px = {}, {band.name: band.size_px for band in self.capture.bands}
+        for band, pair in self.refined.items():
+            if pair.result.retrieval >= MIN_RETRIEVAL:
+                scales = PairScales.of((self.capture.reference.size_px, files_px[band]), pair.sizes_px)
+                result[band] = scales.between_files(pair.result.fixed_to_moving)
+        return result
 
 
 @dataclass(frozen=True)
@@ -124,17 +109,10 @@ class LoadedCapture:
 
     def refined_by(self, net: Descriptor, settings: Settings) -> LearningCapture:
         """Refine the pairs by a network and verify them, as observations of the rig; return them without images."""
-        of_pair: dict[int, JointResult[FixedImagePx] | Issue] = {}
-        for places, group in self.groups:
-            of_pair |= zip(places, refine_with(net, group, settings.joint, quiet, FLIGHT_PATCHES), strict=True)
-        results = [of_pair[i] for i in range(len(self.starts))]
-        pairs = [pair for pair, _ in self.starts]
-        known = [(p, r) for p, r in zip(pairs, results, strict=True) if isinstance(r, JointResult)]
         aligner = PairAligner(settings, None, quiet, is_observation=True)
+        results = aligned_groups(self.groups, lambda g: refine_with(net, g, settings.joint, quiet, FLIGHT_PATCHES))
         aligner.verify(self.starts, results)
-        observation = _observation(pairs, aligner.result, aligner.refined, self.capture)
-        mappings = {p.name: p.scales.between_files(r.fixed_to_moving) for p, r in known if r.retrieval >= MIN_RETRIEVAL}
-        return LearningCapture(self.capture, mappings, aligner.refined, observation)
+        return LearningCapture.of(self.capture, [pair for pair, _ in self.starts], aligner)
 
 
 def load_capture(
@@ -199,50 +177,12 @@ def choose_and_refine(
     return None
 
 
-def observe_rig(
-    model: FlightModel, settings: Settings, argument: tuple[Capture, frozenset[str] | None]
-) -> RigObservation | None:
-    """Align a capture, or the given bands of it, by the network and the mappings of a model without a rig.
-
-    None if that fails.
-    """
-    capture, bands = argument
+def observe_rig(model: FlightModel, settings: Settings, capture: Capture) -> LearningCapture | None:
+    """Align a capture by a model, without its rig's predictions; None if that fails."""
     with logged_failure(f"{capture.label} does not determine the rig"):
-        model = _on_device(model, settings)
         pairs, _ = read_pairs(with_saturation_values(capture), settings.seed, model)
-        pairs = [p for p in pairs if p.has_rig_pixels and (bands is None or p.name in bands)]
-        aligner = PairAligner(settings, model, quiet, is_observation=True)
-        return _observation(pairs, aligner.align(pairs, None, scratch=False), aligner.refined, capture)
+        pairs = [p for p in pairs if p.has_rig_pixels]
+        aligner = PairAligner(settings, _on_device(model, settings), quiet, is_observation=True)
+        aligner.align(pairs, None, scratch=False)
+        return LearningCapture.of(capture, pairs, aligner)
     return None
-
-
-def try_model(model: FlightModel, settings: Settings, capture: Capture) -> tuple[int, Mapping[str, RefinedPair]] | None:
-    """Align a capture by an earlier model; return (number of aligned bands, refined mappings of all bands).
-
-    None if its rig does not predict each aligned band from the others accurately enough.
-    """
-    model = _on_device(model, settings)
-    assert model.rig is not None
-    with logged_failure(f"{capture.label} is not aligned by the model"):
-        pairs, _ = read_pairs(with_saturation_values(capture), settings.seed, model)
-        aligner = PairAligner(settings, model, quiet, is_observation=True)
-        result = aligner.align(pairs, None, scratch=False)
-        checked = with_predictions(pairs, result, model.rig, capture)
-        predictions = [checked[name].prediction for name, a in result.items() if a.status == "aligned"]
-        if any(p is None or p.std_px > settings.check.accept_predicted_px for p in predictions):
-            return None
-        return len(predictions), aligner.refined
-    return 0, {}
-
-
-def _observation(
-    pairs: Sequence[BandPair], result: Alignments, refined: Mapping[str, RefinedPair], capture: Capture
-) -> RigObservation:
-    in_file_px = {p.name: result[p.name].in_file_px(p.scales, p.reference_file_px) for p in pairs}
-    residuals = {b: a.residual for b, a in in_file_px.items() if a.status == "aligned" and a.residual is not None}
-    misaligned = frozenset(
-        name
-        for name, a in in_file_px.items()
-        if a.status != "aligned" and a.joint is not None and a.joint.retrieval >= MIN_RETRIEVAL
-    )
-    return RigObservation(observed(pairs, result, capture), residuals, refined, misaligned)

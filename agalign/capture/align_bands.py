@@ -195,12 +195,12 @@ class PairAligner:
         self, starts: Sequence[Start], sides: Sequence[int], align: Callable[[ImageGroup, Progress], Results]
     ) -> None:
         """Align the pairs by image group, with the network's `sides`, and verify them."""
-        results: dict[int, JointResult[FixedImagePx] | Issue] = {}
-        for indices, group in image_groups(starts, sides):
-            report = partial(self.progress, starts[indices[0]][0].name)  # with the name of the group's first pair
+        results: Results = []
+        if starts:
+            report = partial(self.progress, starts[0][0].name)  # with the name of the first pair
             report("refining", 0.0)
-            results |= zip(indices, align(group, report), strict=True)
-        self.verify(starts, [results[i] for i in range(len(starts))])
+            results = aligned_groups(image_groups(starts, sides), lambda group: align(group, report))
+        self.verify(starts, results)
 
     def verify(self, starts: Sequence[Start], results: Results) -> None:
         """Combine the results of a capture by MAP estimation and verify each one.
@@ -208,7 +208,11 @@ class PairAligner:
         For an observation of the rig, no displacement fields are fitted. A model family that the user chose is not
         replaced by a relief or a displacement field.
         """
-        self.refined |= refined_pairs(starts, results)
+        self.refined |= {
+            pair.name: RefinedPair(seed, result, pair.sizes_px)
+            for (pair, seed), result in zip(starts, results, strict=True)
+            if isinstance(result, JointResult)
+        }
         use = self.settings.relief.use if self._may_be_homography else "never"
         candidates = self.candidates(starts, results)
         self.progress(starts[0][0].name if starts else "", "relief", 0.0)
@@ -255,10 +259,9 @@ class PairAligner:
         return self.settings.joint.model_family in ("auto", "homography")
 
 
-def refined_pairs(starts: Sequence[Start], results: Results) -> dict[str, RefinedPair]:
-    """Return the refined mappings of the pairs that have one, by name."""
-    return {
-        pair.name: RefinedPair(seed, result, pair.sizes_px)
-        for (pair, seed), result in zip(starts, results, strict=True)
-        if isinstance(result, JointResult)
-    }
+def aligned_groups(groups: Sequence[tuple[list[int], ImageGroup]], align: Callable[[ImageGroup], Results]) -> Results:
+    """Align groups of images, each with the indices of its pairs; return the results in the order of the pairs."""
+    results: dict[int, JointResult[FixedImagePx] | Issue] = {}
+    for indices, group in groups:
+        results |= zip(indices, align(group), strict=True)
+    return [results[i] for i in sorted(results)]

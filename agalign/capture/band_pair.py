@@ -237,9 +237,7 @@ def _pair(
     """Create the pair of `reference`, the image of `band` reduced to `longest` px, and the image of `bands`."""
     name = bands[0].name
     is_coarse = longest < min(_LONGEST_SIDE_PX, max(band.size_px))
-    scales = PairScales(
-        PixelScale.between(band.size_px, reference.image.size_px), PixelScale.between(bands[0].size_px, moving.size_px)
-    )
+    scales = PairScales.of((band.size_px, bands[0].size_px), (reference.image.size_px, moving.size_px))
     reduced: SeedMatrices = {kind: scales.between_images(matrix) for kind, matrix in matrices.items()}
     field = None if model is None or model.rig is None else model.rig.fields.get(name)
     field = None if field is None else field.rescaled(scales.fixed)

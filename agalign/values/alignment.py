@@ -198,6 +198,11 @@ class PairScales:
     fixed: PixelScale = SAME_PIXELS
     moving: PixelScale = SAME_PIXELS
 
+    @classmethod
+    def of(cls, files_px: tuple[Size, Size], images_px: tuple[Size, Size]) -> "PairScales":
+        """The scales for the sizes (width, height) of the two files and of their images."""
+        return cls(*map(PixelScale.between, files_px, images_px))
+
     def between_files(self, fixed_to_moving: Matrix) -> Matrix:
         """A homography between the images as one between their files."""
         return geometry.rescale(fixed_to_moving, self.fixed.inverse, self.moving.inverse)
