@@ -214,44 +214,27 @@ class PairAligner:
             if isinstance(result, JointResult)
         }
         use = self.settings.relief.use if self._may_be_homography else "never"
-        candidates = self.candidates(starts, results)
+        candidates = self.candidates([Candidate.of(*start, r) for start, r in zip(starts, results, strict=True)])
         self.progress(starts[0][0].name if starts else "", "relief", 0.0)
-        lost = [start for start, result in zip(starts, results, strict=True) if isinstance(result, Issue)]
-        alignments, along_a_line = aligned_by_relief(
-            list(candidates.values()), use, lost=lost, is_observation=self.is_observation
-        )
-        for (pair, seed), result in zip(starts, results, strict=True):
-            if pair.name in alignments:
-                continue
-            self.progress(pair.name, "checking", 0.0)
-            if isinstance(result, Issue):
-                alignments[pair.name] = at_seed(pair, seed, (result,))
-            else:
-                field_use = "never" if self.is_observation or pair.name in along_a_line else use
-                alignments[pair.name] = verified(candidates[pair.name], field_use)
+        alignments, along_a_line = aligned_by_relief(candidates, use, is_observation=self.is_observation)
+        for name, candidate in ((c.pair.name, c) for c in candidates if c.pair.name not in alignments):
+            self.progress(name, "checking", 0.0)
+            alignments[name] = verified(candidate, "never" if self.is_observation or name in along_a_line else use)
         self.result |= of_one_geometry([pair for pair, _ in starts], alignments)
 
-    def candidates(self, starts: Sequence[Start], results: Results) -> dict[str, Candidate]:
-        """Return the pairs with a result, by name, after the MAP estimation of all bands of the capture."""
-        measured = [
-            Candidate.of(pair, seed, result)
-            for (pair, seed), result in zip(starts, results, strict=True)
-            if isinstance(result, JointResult)
-        ]
+    def candidates(self, measured: Sequence[Candidate]) -> list[Candidate]:
+        """Return candidates after the MAP estimation of all bands of the capture."""
+        if not self._may_be_homography:  # but of the family that the user chose
+            return list(measured)
         pairs, joint = [c.pair for c in measured], {c.pair.name: c.joint for c in measured}
         residuals = {c.pair.name: c.warped.residual for c in measured}
         halves = ({name: r.half(black=is_black) for name, r in residuals.items()} for is_black in (True, False))
-        # The MAP estimate is a homography, which may not be of the family that the user chose.
         rig = None if self.model is None else self.model.rig
-        estimates, black, white = (
-            map_estimate(pairs, joint, some, rig) if self._may_be_homography else joint for some in (residuals, *halves)
-        )
-        return {
-            name: replace(
-                c, joint=estimates[name], by_halves=(black[name].fixed_to_moving, white[name].fixed_to_moving)
-            )
-            for name, c in zip(joint, measured, strict=True)
-        }
+        estimates, black, white = (map_estimate(pairs, joint, some, rig) for some in (residuals, *halves))
+        return [
+            replace(c, joint=estimates[n], by_halves=(black[n].fixed_to_moving, white[n].fixed_to_moving))
+            for n, c in zip(joint, measured, strict=True)
+        ]
 
     @property
     def _may_be_homography(self) -> bool:

@@ -27,7 +27,6 @@ from agalign.capture.common_parallax import (
     layout_of,
 )
 from agalign.capture.decision import decided, predicted_by_windows, without_result
-from agalign.capture.seeding import Start
 from agalign.capture.warped_pair import Candidate, WarpedPair
 from agalign.errors import GeometryError
 from agalign.fit.adjustment import (
@@ -51,7 +50,7 @@ from agalign.values.issues import OTHER_GEOMETRY
 from agalign.values.mapping import PixelMapping
 from agalign.values.parallax import Parallax, Relief
 from agalign.values.pixel_units import FixedImagePx
-from agalign.verify.checks import BY_PARALLAX, BY_WINDOWS, MAX_ALIAS_PEAK, MAX_SHIFT_PX
+from agalign.verify.checks import BY_PARALLAX, MAX_ALIAS_PEAK, MAX_SHIFT_PX
 
 _MIN_OBSERVED_SHARE = 0.75
 """Minimum share of aligned windows for an observation of a rig, which contains no depth edges: 0.79 or more in scenes
@@ -59,13 +58,13 @@ with booms and plants at 1 m."""
 
 
 def aligned_by_relief(
-    candidates: Sequence[Candidate], use: ReliefUse, *, lost: Sequence[Start] = (), is_observation: bool = False
+    candidates: Sequence[Candidate], use: ReliefUse, *, is_observation: bool = False
 ) -> tuple[Alignments, set[str]]:
     """Align bands by one relief of the capture, with lens shapes where no rig contains the distortion.
 
     Return the bands that are aligned, and the names of those with common displacements along a line that neither a
     relief nor displacement fields must follow.
-    Bands `lost` in the joint optimisation, and those with another kind of lens model, follow the relief too.
+    Bands without a result, and those with another kind of lens model, follow the relief too.
     With `use` "auto" a relief is only estimated if the residuals of the homographies contain common parallax. For an
     observation of the rig, only the homographies matter, and the parallax of windows suffices.
     """
@@ -84,7 +83,7 @@ def aligned_by_relief(
             along_a_line |= {c.pair.name for c in group}
         elif use == "always" or parallax_px >= MIN_PARALLAX_PX:
             with suppress(GeometryError):
-                alignments |= _observed(group) if is_observation else _aligned_group(group, candidates, lost)
+                alignments |= _observed(group) if is_observation else _aligned_group(group, candidates)
     return alignments, along_a_line
 
 
@@ -160,7 +159,7 @@ def _observed(group: Sequence[Candidate]) -> Alignments:
     return _aligned(bands, checked)
 
 
-def _aligned_group(group: Sequence[Candidate], candidates: Sequence[Candidate], lost: Sequence[Start]) -> Alignments:
+def _aligned_group(group: Sequence[Candidate], candidates: Sequence[Candidate]) -> Alignments:
     """Align a group by its relief, and the other bands by it too; empty if another geometry explains the group better.
 
     Raises GeometryError.
@@ -173,7 +172,7 @@ def _aligned_group(group: Sequence[Candidate], candidates: Sequence[Candidate], 
     aligned = _aligned(estimate.bands, [_checked(b, w) for b, w in zip(estimate.bands, warped, strict=True)])
     if not aligned:
         return {}
-    return aligned | estimate.for_others([*candidates, *(Candidate.at_seed(*one) for one in lost)])
+    return aligned | estimate.for_others(candidates)
 
 
 @dataclass(frozen=True)
@@ -283,7 +282,7 @@ class _Estimate:
         is_known &= residual.median_px <= MAX_SHIFT_PX * pair.file_pixel_size_px
         if not is_known or warped.alias_peak().ratio > MAX_ALIAS_PEAK:
             return None
-        joint = None if candidate.joint.recipe == BY_WINDOWS else candidate.joint
+        joint = None if candidate.issue is not None else candidate.joint
         without = without_result(pair, candidate.seed)
         by_relief = replace(without, mapping=warped.mapping, joint=joint, residual=residual)
         return predicted_by_windows(by_relief, pair, OTHER_GEOMETRY)

@@ -93,6 +93,8 @@ def verified(candidate: Candidate, use: ReliefUse) -> Alignment[FixedImagePx]:
     With issues it has the mapping of the seed. `use` is "never" for no displacement field.
     """
     pair, seed = candidate.pair, candidate.seed
+    if candidate.issue is not None:
+        return at_seed(pair, seed, [candidate.issue])
     joint = _unchanged_if_aligned(candidate.joint, pair)
     plane = candidate.warped.with_mapping(pair.mapping(joint.fixed_to_moving))
     if candidate.by_halves is not None and joint is candidate.joint:

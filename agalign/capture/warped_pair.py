@@ -103,24 +103,24 @@ class WarpedPair:
 
 @dataclass(frozen=True)
 class Candidate:
-    """A band with a result of the joint optimisation and the residual of its windows."""
+    """A band with the residual of its windows under the result of the joint optimisation, or under its seed."""
 
     pair: BandPair
     seed: Seed
     joint: JointResult[FixedImagePx]
+    """Without evidence of descriptors, at the seed, if the optimisation has no result."""
     warped: WarpedPair
+    issue: Issue | None = None
+    """Why the optimisation has no result."""
     by_halves: tuple[Matrix, Matrix] | None = None
     """Homographies from half of the windows (`WarpedPair.cross_validated`)."""
 
     @classmethod
-    def of(cls, pair: BandPair, seed: Seed, joint: JointResult[FixedImagePx]) -> "Candidate":
+    def of(cls, pair: BandPair, seed: Seed, result: JointResult[FixedImagePx] | Issue) -> "Candidate":
         """Measure the windows with the homography of a result."""
-        return cls(pair, seed, joint, WarpedPair.of(pair, pair.mapping(joint.fixed_to_moving)))
-
-    @classmethod
-    def at_seed(cls, pair: BandPair, seed: Seed) -> "Candidate":
-        """Return a band without a result: with the mapping of its seed, and without evidence of descriptors."""
-        return cls.of(pair, seed, result_of_windows(seed.fixed_to_moving))
+        issue = result if isinstance(result, Issue) else None
+        joint = result_of_windows(seed.fixed_to_moving) if isinstance(result, Issue) else result
+        return cls(pair, seed, joint, WarpedPair.of(pair, pair.mapping(joint.fixed_to_moving)), issue)
 
     def fit_residual(self, mapping: PixelMapping) -> Residual[FixedImagePx]:
         """Measure the windows of the fit with a mapping."""

@@ -34,7 +34,7 @@ from agalign.values.capture import Capture
 from agalign.values.choices import FamilyChoice, ReliefUse
 from agalign.values.geometry import Matrix
 from agalign.values.image import Raster
-from agalign.values.issues import RETRIEVAL, Issue
+from agalign.values.issues import NO_CONTRAST, RETRIEVAL, Issue
 from agalign.values.mapping import PixelMapping
 from agalign.values.parallax import Parallax, Relief
 from agalign.values.pixel_units import MovingFilePx
@@ -270,13 +270,10 @@ def test_a_noisy_band_follows_the_relief_of_the_others(
     image = scene.images[name]
     noisy = image + np.random.default_rng(3).normal(0, noise * float(image.mean()), image.shape)
     candidates = scene.candidates(instead={name: noisy.clip(1, 65000).astype(np.float32)})
-    lost = next(c for c in candidates if c.pair.name == name)
-    if has_result:
-        result = aligned_by_relief(candidates, "auto")
-    else:
-        others = [c for c in candidates if c is not lost]
-        result = aligned_by_relief(others, "auto", lost=[(lost.pair, lost.seed)])
-    alignment = result[0][name]
+    if not has_result:
+        lost = Issue(NO_CONTRAST)
+        candidates = [c if c.pair.name != name else Candidate.of(c.pair, c.seed, lost) for c in candidates]
+    alignment = aligned_by_relief(candidates, "auto")[0][name]
     assert (alignment.status, alignment.mapping.parallax is None) == (status, False)
     errors, plane = (scene.error_px(name, m) for m in (alignment.mapping, alignment.mapping.of_the_plane))
     assert np.percentile(errors, 90) < 1.2

@@ -12,6 +12,7 @@ from agalign.capture.align_bands import PairAligner
 from agalign.capture.by_windows import aligned_by_windows
 from agalign.capture.decision import at_seed
 from agalign.capture.reference import Reference
+from agalign.capture.warped_pair import Candidate
 from agalign.config import Settings
 from agalign.fit.windows import FixedWindows, Shifts
 from agalign.pixels.masks import raster_of
@@ -79,8 +80,8 @@ def test_the_map_estimate_without_a_colour_ignores_its_windows(border_px: int) -
 
     def halves(image: np.ndarray) -> tuple[np.ndarray, ...]:
         pair = pair_of(whole(fixed), with_border(image, border_px))
-        by_halves = PairAligner(Settings(), None, quiet).candidates([(pair, SEED)], [result])["moving"].by_halves
-        return by_halves or ()
+        (candidate,) = PairAligner(Settings(), None, quiet).candidates([Candidate.of(pair, SEED, result)])
+        return candidate.by_halves or ()
 
     def change_px(one: np.ndarray, other: np.ndarray) -> float:
         return geometry.corner_error_px(one, other, *fixed.shape[::-1])
