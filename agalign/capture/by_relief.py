@@ -10,9 +10,9 @@ import math
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from functools import cached_property
 from itertools import cycle
 from statistics import median_high
-from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -114,10 +114,23 @@ class _Band:
             self, plane=fit.applied_to(self.plane), baseline=(x, y), covariance_px2=fit.covariance_px2[:8, :8]
         )
 
+    @property
     def joint(self) -> JointResult[FixedImagePx]:
-        """Return the result with the homography of the plane."""
+        """The result with the homography of the plane."""
         assert self.covariance_px2 is not None
         return self.candidate.joint.with_homography(self.plane.fixed_to_moving, self.covariance_px2)
+
+    @cached_property
+    def by_homography(self) -> Residual[FixedImagePx]:
+        """Of the held-out windows with the homography of the candidate."""
+        return self.candidate.held_out_residual(self.candidate.warped.mapping)
+
+    def aligned(self, mapping: PixelMapping, held_out: Residual[FixedImagePx]) -> Alignment[FixedImagePx]:
+        """Return the alignment by a mapping with a relief that passes verification in held-out windows."""
+        kind: Geometry = "relief" if mapping.field is None else "relief and field"
+        p95_px: dict[Geometry, FixedImagePx] = {"homography": self.by_homography.p95_px, kind: held_out.p95_px}
+        without = without_result(self.candidate.pair, self.candidate.seed)
+        return decided(replace(without, mapping=mapping, joint=self.joint, residual=held_out, candidates=p95_px))
 
 
 def _observed(group: Sequence[Candidate]) -> Alignments:
@@ -139,7 +152,7 @@ def _observed(group: Sequence[Candidate]) -> Alignments:
         return {}
     warped = [band.candidate.pair.warped_moving(band.plane) for band in bands]
     residuals = [reference.white_windows.residuals(image) for image in warped]
-    windows, checked = WindowShifts.of(residuals, [band.plane for band in bands]), []
+    windows, result = WindowShifts.of(residuals, [band.plane for band in bands]), dict[str, Alignment[FixedImagePx]]()
     if not windows.are_enough(MIN_WINDOWS):
         return {}
     relief = windows.relief(parallax_of(windows.shifts_px, model.baselines, windows.weights), reference.grey.size_px)
@@ -148,15 +161,15 @@ def _observed(group: Sequence[Candidate]) -> Alignments:
         by_others_px = parallax_of(windows.shifts_px[:, others], model.baselines[others], windows.weights[:, others])
         shifts_px = windows.shifts_of(residuals[number], by_others_px[:, None] * model.baselines[number])
         held_out = residuals[number].with_shifts(residuals[number].shifts_px - shifts_px)
-        pair, mapping, joint = band.candidate.pair, band.mapping(relief), band.joint()
+        pair, mapping = band.candidate.pair, band.mapping(relief)
         # Planes of different depth resemble a repetition in images without relief.
         verified = WarpedPair(pair, mapping, pair.warped_moving(mapping), reference.white_windows, held_out)
         # A window across a depth edge contains the parallax of neither side.
-        issues = [issue for issue in verified.issues(joint) if issue.kind not in BY_PARALLAX]
+        issues = [issue for issue in verified.issues(band.joint) if issue.kind not in BY_PARALLAX]
         aligned_share = float((held_out.lengths_px <= MAX_SHIFT_PX * pair.file_pixel_size_px).mean())
-        is_aligned = not issues and aligned_share >= _MIN_OBSERVED_SHARE
-        checked.append(_Checked.of(band, verified) if is_aligned else None)
-    return _aligned(bands, checked)
+        if not issues and aligned_share >= _MIN_OBSERVED_SHARE:
+            result[band.name] = band.aligned(mapping, held_out)
+    return result if _is_better(bands, result) else {}
 
 
 def _aligned_group(group: Sequence[Candidate], candidates: Sequence[Candidate]) -> Alignments:
@@ -167,12 +180,10 @@ def _aligned_group(group: Sequence[Candidate], candidates: Sequence[Candidate]) 
     estimate = _Estimate.of(group)
     if estimate is None:
         return {}
-    verifying = cycle(estimate.from_others)
-    warped = [estimate.warped(band, relief) for band, relief in zip(estimate.bands, verifying, strict=False)]
-    aligned = _aligned(estimate.bands, [_checked(b, w) for b, w in zip(estimate.bands, warped, strict=True)])
-    if not aligned:
-        return {}
-    return aligned | estimate.for_others(candidates)
+    result: Alignments = {}
+    for band, verifying in zip(estimate.bands, cycle(estimate.from_others), strict=False):
+        result |= estimate.alignment(band, verifying)
+    return result | estimate.for_others(candidates) if _is_better(estimate.bands, result) else {}
 
 
 @dataclass(frozen=True)
@@ -254,60 +265,37 @@ class _Estimate:
                 continue
             with suppress(GeometryError):
                 band = self.fitted(candidate)
-                if band is None:
-                    continue
-                warped = self.warped(band)
-                checked = _checked(band, warped)
-                alignment = self.predicted(band, warped) if checked is None else checked.alignment
-                result |= {} if alignment is None else {pair.name: alignment}
+                result |= {} if band is None else self.alignment(band)
         return result
 
-    def warped(self, band: _Band, verifying: Relief | None = None) -> WarpedPair:
-        """Warp a band by the relief of all bands; held-out windows are measured by the relief `verifying` of other
-        bands, if this band is one of those of the estimate.
-        """
-        pair, windows = band.candidate.pair, band.candidate.pair.reference.white_windows
-        mapping = band.mapping(self.relief, with_occlusions=True)
-        if verifying is None:
-            return WarpedPair.of(pair, mapping, windows)
-        by_others = band.candidate.held_out_residual(band.mapping(verifying, with_occlusions=True))
-        return WarpedPair(pair, mapping, pair.warped_moving(mapping), windows, by_others)
+    def alignment(self, band: _Band, verifying: Relief | None = None) -> Alignments:
+        """Align a band by the relief of all bands, or predict it.
 
-    def predicted(self, band: _Band, warped: WarpedPair) -> Alignment[FixedImagePx] | None:
-        """Predict a band that does not pass verification; None if half of the held-out windows are not aligned, or if
-        the scene repeats.
+        The held-out windows of a band of the estimate are measured by the relief `verifying` of other bands. Empty if
+        half of them are not aligned, or if the scene repeats.
         """
-        candidate, pair, residual = band.candidate, warped.pair, warped.residual
+        candidate, pair, windows = band.candidate, band.candidate.pair, band.candidate.pair.reference.white_windows
+        mapping = band.mapping(self.relief, with_occlusions=True)
+        image = pair.warped_moving(mapping)
+        by_others = None if verifying is None else band.mapping(verifying, with_occlusions=True)
+        residual = windows.residuals(image) if by_others is None else candidate.held_out_residual(by_others)
+        warped = WarpedPair(pair, mapping, image, windows, residual)
+        if not warped.issues(band.joint):
+            return {band.name: band.aligned(mapping, residual)}
         is_known = len(residual.measured_px) >= MIN_WINDOWS
         is_known &= residual.median_px <= MAX_SHIFT_PX * pair.file_pixel_size_px
         if not is_known or warped.alias_peak().ratio > MAX_ALIAS_PEAK:
-            return None
+            return {}
         joint = None if candidate.issue is not None else candidate.joint
-        without = without_result(pair, candidate.seed)
-        by_relief = replace(without, mapping=warped.mapping, joint=joint, residual=residual)
-        return predicted_by_windows(by_relief, pair, OTHER_GEOMETRY)
+        by_relief = replace(without_result(pair, candidate.seed), mapping=mapping, joint=joint, residual=residual)
+        return {band.name: predicted_by_windows(by_relief, pair, OTHER_GEOMETRY)}
 
 
-class _Checked(NamedTuple):
-    """A band that passes verification with the relief from other bands."""
-
-    alignment: Alignment[FixedImagePx]
-    gain_px: float
-    """`_gain_px` by that relief."""
-
-    @classmethod
-    def of(cls, band: _Band, warped: WarpedPair) -> "_Checked":
-        """Compare a warped band with its homography."""
-        held_out, plane = warped.residual, band.candidate.held_out_residual(band.candidate.warped.mapping)
-        kind: Geometry = "relief" if warped.mapping.field is None else "relief and field"
-        aligned = replace(
-            without_result(warped.pair, band.candidate.seed),
-            mapping=warped.mapping,
-            joint=band.joint(),
-            residual=held_out,
-            candidates={"homography": plane.p95_px, kind: held_out.p95_px},
-        )
-        return cls(decided(aligned), _gain_px(plane, held_out))
+def _is_better(bands: Sequence[_Band], result: Alignments) -> bool:
+    """Return True if a relief aligns half of the bands better than their homographies."""
+    aligned = {name: a.residual for name, a in result.items() if a.status == "aligned" and a.residual is not None}
+    gains = [_gain_px(b.by_homography, aligned[b.name]) if b.name in aligned else -math.inf for b in bands]
+    return median_high(gains) >= 0
 
 
 def _gain_px(plane: Residual[FixedImagePx], relief: Residual[FixedImagePx]) -> float:
@@ -316,20 +304,6 @@ def _gain_px(plane: Residual[FixedImagePx], relief: Residual[FixedImagePx]) -> f
     If most windows are on the reference plane, the noise of the relief increases the median by some hundredths of a px.
     """
     return float(plane.p95_px - relief.p95_px) - max(0.0, float(relief.median_px - plane.median_px))
-
-
-def _checked(band: _Band, warped: WarpedPair) -> _Checked | None:
-    """Verify a band by its held-out windows; None if it does not pass."""
-    return None if warped.issues(band.joint()) else _Checked.of(band, warped)
-
-
-def _aligned(bands: Sequence[_Band], checked: Sequence[_Checked | None]) -> Alignments:
-    """Return the bands that pass; none if the relief does not explain the held-out windows of half of the bands better
-    than the homographies.
-    """
-    if median_high([-math.inf if one is None else one.gain_px for one in checked]) < 0:
-        return {}
-    return {band.name: one.alignment for band, one in zip(bands, checked, strict=True) if one is not None}
 
 
 def _verifying(bands: Sequence[int]) -> list[list[int]]:

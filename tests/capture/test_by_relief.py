@@ -15,21 +15,20 @@ from synthetic_flights.relief import make_scene
 
 from agalign.batch.capture_task import quiet
 from agalign.capture import align_bands
-from agalign.capture import by_relief as module
 from agalign.capture.align_bands import PairAligner
 from agalign.capture.band_pair import BandPair
-from agalign.capture.by_relief import _aligned, _Checked, _gain_px, _std_px, aligned_by_relief
+from agalign.capture.by_relief import _is_better, _std_px, aligned_by_relief
 from agalign.capture.by_rig import with_predictions
 from agalign.capture.common_parallax import MIN_PARALLAX_PX, common_parallax_px
 from agalign.capture.decision import at_seed, of_one_geometry
 from agalign.capture.reference import Reference
-from agalign.capture.warped_pair import Candidate
+from agalign.capture.warped_pair import Candidate, WarpedPair
 from agalign.config import JointSettings, ReliefSettings, Settings
 from agalign.flight.rig import Rig
 from agalign.synthetic.cameras import BandSpec, CameraSpec
 from agalign.synthetic.flight import recorded
 from agalign.values import geometry, lens
-from agalign.values.alignment import Alignment, Seed
+from agalign.values.alignment import Alignment, JointResult, Seed
 from agalign.values.capture import Capture
 from agalign.values.choices import FamilyChoice, ReliefUse
 from agalign.values.geometry import Matrix
@@ -285,11 +284,16 @@ def test_a_noisy_band_follows_the_relief_of_the_others(
 def test_a_relief_does_not_verify_a_band_that_it_is_estimated_from(
     candidates: Sequence[Candidate], aligned: Mapping[str, Alignment], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Also if the band does not pass with the relief of the others."""
-    checked = module._checked
-    monkeypatch.setattr(module, "_checked", lambda band, warped: None if band.name == "NIR" else checked(band, warped))
-    result = aligned_by_relief(candidates, "auto")
-    assert set(result[0]) == set(aligned) - {"NIR"}
+    """A band that does not pass with the relief of the others is predicted by it, with the error of those windows."""
+    issues = WarpedPair.issues
+
+    def with_nir_failed(warped: WarpedPair, joint: JointResult) -> tuple[Issue, ...]:
+        return (Issue(RETRIEVAL),) if warped.pair.name == "NIR" else issues(warped, joint)
+
+    monkeypatch.setattr(WarpedPair, "issues", with_nir_failed)
+    result = aligned_by_relief(candidates, "auto")[0]
+    assert {name: a.status for name, a in result.items()} == dict.fromkeys(aligned, "aligned") | {"NIR": "predicted"}
+    np.testing.assert_array_equal(result["NIR"].residual.shifts_px, aligned["NIR"].residual.shifts_px)
 
 
 def test_a_lost_band_is_predicted_with_the_relief(
@@ -382,10 +386,12 @@ def test_a_relief_may_not_be_worse_than_its_plane(
 ) -> None:
     """The median of the bands decides; a band that does not pass counts as one without a gain."""
     windows = residual_of(np.zeros((9, 2)), (0, 0))
-    residuals = (replace(windows, median_px=median, p95_px=p95) for median, p95 in (plane_px, relief_px))
-    band = _Checked(object(), _gain_px(*residuals))
-    for checked, is_used in (([band], is_chosen), ([band, band, None], is_chosen), ([band, None, None], False)):
-        assert bool(_aligned([SimpleNamespace(name=id(one)) for one in checked], checked)) == is_used
+    plane, relief = (replace(windows, median_px=median, p95_px=p95) for median, p95 in (plane_px, relief_px))
+    bands = [SimpleNamespace(name=name, by_homography=plane) for name in ("Blue", "Red", "NIR")]
+    aligned, not_aligned = (SimpleNamespace(status=status, residual=relief) for status in ("aligned", "predicted"))
+    assert _is_better(bands[:1], {"Blue": aligned}) == is_chosen
+    assert _is_better(bands, {"Blue": aligned, "Red": aligned}) == is_chosen
+    assert not _is_better(bands, {"Blue": aligned, "Red": not_aligned})
 
 
 # ---- what fits noise cannot pass
