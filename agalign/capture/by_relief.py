@@ -274,12 +274,11 @@ class _Estimate:
         The held-out windows of a band of the estimate are measured by the relief `verifying` of other bands. Empty if
         half of them are not aligned, or if the scene repeats.
         """
-        candidate, pair, windows = band.candidate, band.candidate.pair, band.candidate.pair.reference.white_windows
+        candidate, pair = band.candidate, band.candidate.pair
         mapping = band.mapping(self.relief, with_occlusions=True)
-        image = pair.warped_moving(mapping)
-        by_others = None if verifying is None else band.mapping(verifying, with_occlusions=True)
-        residual = windows.residuals(image) if by_others is None else candidate.held_out_residual(by_others)
-        warped = WarpedPair(pair, mapping, image, windows, residual)
+        by_others = mapping if verifying is None else band.mapping(verifying, with_occlusions=True)
+        warped = WarpedPair.of(pair, by_others, pair.reference.white_windows)
+        residual = warped.residual
         if not warped.issues(band.joint):
             return {band.name: band.aligned(mapping, residual)}
         is_known = len(residual.measured_px) >= MIN_WINDOWS

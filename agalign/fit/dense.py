@@ -304,7 +304,8 @@ class _MovingBand:
             known = ~np.logical_or.reduce([unknown for _, unknown in at_steps])
             count[rows] += known
             for plane, (correlation, _) in zip(total[:, rows], at_steps, strict=True):
-                plane -= correlation * known
+                correlation *= known
+                plane -= correlation
 
     def _positions(self, parallax_px: FloatImage | np.float32, rows: slice) -> FloatImage:
         """Return the positions (2, rows, width) in the moving image, x and y, at a parallax."""
