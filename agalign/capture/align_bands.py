@@ -15,7 +15,6 @@ from agalign.capture.map_estimate import map_estimate
 from agalign.capture.seeding import Start, find_seed, image_groups
 from agalign.capture.warped_pair import Candidate, with_metrics
 from agalign.config import Settings
-from agalign.fit.relief import occluded
 from agalign.flight.fingerprint import refinement_key
 from agalign.flight.model import FlightModel
 from agalign.method.device import one_thread
@@ -73,8 +72,7 @@ def _as_written(alignment: Alignment[FixedFilePx], band: Band, relief: Relief | 
     """Return the alignment of a band with the relief that is written: a reader of the sidecar has the same mapping."""
     mapping = alignment.mapping
     if relief is not None and mapping.parallax is not None:
-        baseline = mapping.parallax.baseline
-        mapping = mapping.with_parallax(Parallax(relief, baseline, occluded(relief, baseline)))
+        mapping = mapping.with_parallax(Parallax(relief, mapping.parallax.baseline).with_occlusions())
     return replace(alignment, mapping=mapping, moving_size_px=band.size_px)
 
 

@@ -39,9 +39,8 @@ from agalign.fit.adjustment import (
     fit_in_rounds,
     parallax_of,
 )
-from agalign.fit.dense import DenseMatching, View
+from agalign.fit.dense import DenseMatching, View, nearer_sign
 from agalign.fit.displacement_field import MIN_WINDOWS
-from agalign.fit.relief import nearer_sign, occluded
 from agalign.pixels.band_resampling import channel_mean
 from agalign.values.alignment import Alignment, Alignments, JointResult, Residual
 from agalign.values.choices import Geometry, ReliefUse
@@ -104,8 +103,8 @@ class _Band:
 
     def mapping(self, relief: Relief, *, with_occlusions: bool = False) -> PixelMapping:
         """Return the mapping with a relief; verification excludes occluded pixels, robust fits do not need to."""
-        hidden = occluded(relief, self.baseline) if with_occlusions else None
-        return self.plane.with_parallax(Parallax(relief, self.baseline, hidden))
+        parallax = Parallax(relief, self.baseline)
+        return self.plane.with_parallax(parallax.with_occlusions() if with_occlusions else parallax)
 
     def fitted(self, fit: WindowFit) -> "_Band":
         """Apply a fit to windows. Raises GeometryError."""

@@ -10,7 +10,6 @@ from agalign.capture.band_pair import BandPair
 from agalign.capture.decision import decided
 from agalign.capture.seeding import find_rotated
 from agalign.capture.warped_pair import WarpedPair
-from agalign.fit.relief import occluded
 from agalign.flight.rig import Observation, Rig, distance_px
 from agalign.flight.rig_prediction import predict_band
 from agalign.values.alignment import MIN_TIMES_CHANCE, Alignment, Alignments, Prediction
@@ -74,7 +73,7 @@ def _parallax_by_rig(
     scale = float((seen * of_rig).sum() / max((of_rig**2).sum(), 1e-12))
     error = float(np.sqrt(((seen - scale * of_rig) ** 2).sum(axis=1).mean()))
     x, y = (scale * np.array(rig.baselines[pair.name])).tolist()
-    return Parallax(relief, (x, y), occluded(relief, (x, y))), FixedImagePx(error * relief.rms_px)
+    return Parallax(relief, (x, y)).with_occlusions(), FixedImagePx(error * relief.rms_px)
 
 
 def _with_prediction(

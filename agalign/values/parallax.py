@@ -9,6 +9,7 @@ in band b. H_b is the homography that the reference plane induces. The parallax 
 same in all bands: it is proportional to 1 / range minus that of the plane. t_b is the direction of the band's lens.
 """
 
+import math
 from dataclasses import dataclass, replace
 
 import cv2
@@ -94,6 +95,30 @@ class Parallax:
     """t_b (x, y): displacement in undistorted px of the reference for a parallax of 1 px."""
     hidden: Mask | None = None
     """On the raster of the relief: pixels that nearer parts of the scene occlude in this band. None hides nothing."""
+
+    def with_occlusions(self) -> "Parallax":
+        """The same with the pixels hidden where a nearer one, of larger parallax, is displaced to the same position."""
+        min_width_px = 1.5  # smaller differences of parallax are slopes of one surface, or noise
+        min_area_px = 16  # smaller areas are single pixels with wrong parallax
+        z_px, (t_x, t_y) = self.relief.parallax_px, np.multiply(self.baseline, self.relief.scale)
+        min_step_px = min_width_px / max(math.hypot(t_x, t_y), 1e-9)
+        parallax_px = z_px - z_px.min()
+        height, width = parallax_px.shape
+        x, y = np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32)[:, None]
+        moved_x, moved_y = (np.rint(at + np.float32(t) * z_px).astype(np.int32) for at, t in ((x, t_x), (y, t_y)))
+        inside = (moved_x >= 0) & (moved_x < width) & (moved_y >= 0) & (moved_y < height)
+        cell = np.where(inside, moved_y * np.int32(width) + moved_x, np.int32(height * width))
+        nearest = np.zeros(height * width + 1, np.float32)
+        # The bits of floats that are not negative have their order, and `maximum.at` is much faster for integers.
+        np.maximum.at(nearest.view(np.int32), cell.ravel(), parallax_px.ravel().view(np.int32))
+        nearest[-1] = 0  # Pixels outside share the last cell, which is ignored.
+        hidden = nearest.take(cell) > parallax_px + np.float32(min_step_px)
+        # Closing fills the gaps between the pixels of a magnified nearer surface.
+        closed = cv2.morphologyEx(hidden.astype(np.uint8), cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8))
+        _, labels, statistics, _ = cv2.connectedComponentsWithStats(closed, connectivity=8)
+        is_large = statistics[:, cv2.CC_STAT_AREA] >= min_area_px
+        is_large[0] = False  # the background
+        return replace(self, hidden=np.asarray(is_large[labels]))
 
     def hides(self, x_px: NDArray[np.float64], y_px: NDArray[np.float64]) -> Mask:
         """True where raw points of the reference are occluded in the band.

@@ -5,7 +5,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from agalign.fit.relief import inverse_range, nearer_sign, occluded
+from agalign.fit.dense import nearer_sign
+from agalign.products.rasters.alignment_maps import inverse_range
 from agalign.values import lens
 from agalign.values.image import Mask
 from agalign.values.lens import Lens
@@ -20,6 +21,10 @@ def layers(rows: slice = slice(20, 40), columns: slice = slice(30, 55), near_px:
     z = np.zeros((HEIGHT, WIDTH), np.float32)
     z[rows, columns] = near_px
     return Relief(z, np.ones_like(z))
+
+
+def occluded(relief: Relief, baseline: tuple[float, float]) -> Mask:
+    return np.asarray(Parallax(relief, baseline).with_occlusions().hidden)
 
 
 def test_low_relief_and_a_band_without_a_baseline_have_no_occlusions() -> None:

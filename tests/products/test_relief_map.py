@@ -17,7 +17,6 @@ import agalign
 from agalign.batch import capture_task as batch
 from agalign.cameras import pix4d, rig_seed
 from agalign.cameras.metadata import Tags
-from agalign.fit.relief import occluded
 from agalign.products.rasters.alignment_maps import relief_layers
 from agalign.products.sidecar.convert import sidecar_of
 from agalign.products.sidecar.file import read_result, read_sidecar, write_sidecar
@@ -88,7 +87,7 @@ class Run:
         relief, result = Relief(parallax_px.astype(np.float32), np.ones(SIZE[::-1], np.float32)), {}
         for name, alignment in self.alignments.items():
             baseline = alignment.mapping.parallax.baseline
-            parallax = Parallax(relief, baseline, occluded(relief, baseline))
+            parallax = Parallax(relief, baseline).with_occlusions()
             result[name] = replace(alignment, mapping=alignment.mapping.with_parallax(parallax))
         return result
 

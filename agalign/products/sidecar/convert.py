@@ -14,7 +14,6 @@ from scipy.interpolate import CloughTocher2DInterpolator
 from agalign._version import __version__
 from agalign.cameras.base import is_thermal
 from agalign.errors import NoSuchBandError, SidecarError, UnreadableFileError
-from agalign.fit.relief import occluded
 from agalign.flight.fingerprint import fingerprint, input_samples
 from agalign.pixels.raster import read_preview
 from agalign.products.product import ProductContext, WrittenFile
@@ -261,7 +260,7 @@ def _parallax_of(path: Path, content: Sidecar, part: ReliefPart, fixed: Lens | N
     values = read_preview(path.parent / part.file, 1, (0, 0, grid.width, grid.height), (grid.width, grid.height))
     parallax_px = _on_reference(values, grid, content.reference.size_px, fixed)
     relief = Relief(parallax_px, np.ones_like(parallax_px))
-    return Parallax(relief, part.baseline, occluded(relief, part.baseline))
+    return Parallax(relief, part.baseline).with_occlusions()
 
 
 def _on_reference(
