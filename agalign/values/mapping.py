@@ -71,10 +71,6 @@ class DisplacementField:
         """
         return DisplacementField.sampled(lambda points: self(points).round(POSITION_DECIMALS), step_px, size_px)
 
-    def plus(self, other: "DisplacementField") -> "DisplacementField":
-        """The sum of two fields on one lattice: x -> d(x) + other(x)."""
-        return DisplacementField(self.step_px, self.displacements_px + other.displacements_px)
-
 
 @dataclass(frozen=True)
 class PixelMapping:
