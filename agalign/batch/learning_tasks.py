@@ -4,7 +4,7 @@ import copy
 import logging
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -58,24 +58,22 @@ class LearningCapture:
     """A capture from which the network or the rig is learned, aligned by a network without a rig."""
 
     capture: Capture
-    refined: Mapping[str, RefinedPair] = field(default_factory=dict)
-    """Mappings of all bands before they were combined; empty if no network was applied, as a seed is not trusted."""
-    residuals: Mapping[str, Residual[FixedFilePx]] = field(default_factory=dict)
+    refined: Mapping[str, RefinedPair]
+    """Mappings of all bands before they were combined."""
+    residuals: Mapping[str, Residual[FixedFilePx]]
     """Of the aligned bands."""
-    observation: Observation = field(default_factory=lambda: Observation(None, {}, {}))
+    observation: Observation
     """The mappings of the aligned bands, for the rig."""
+    is_aligned: bool
+    """True if all bands that could be read are aligned."""
 
     @classmethod
     def of(cls, capture: Capture, pairs: Sequence[BandPair], aligner: PairAligner) -> "LearningCapture":
         """Collect the results for the pairs of a capture."""
         in_file_px = {p.name: aligner.result[p.name].in_file_px(p.scales, p.reference_file_px) for p in pairs}
         residuals = {b: a.residual for b, a in in_file_px.items() if a.status == "aligned" and a.residual is not None}
-        return cls(capture, aligner.refined, residuals, observed(pairs, aligner.result, capture))
-
-    @property
-    def is_aligned(self) -> bool:
-        """True if all bands are aligned."""
-        return bool(self.refined) and self.residuals.keys() == self.refined.keys()
+        observation = observed(pairs, aligner.result, capture)
+        return cls(capture, aligner.refined, residuals, observation, is_aligned=len(residuals) == len(pairs))
 
     @property
     def mappings(self) -> dict[str, Matrix]:
@@ -170,8 +168,6 @@ def choose_and_refine(
             break
     if best is None:
         return None
-    if not best.is_trusted:
-        return LearningCapture(best.capture)
     with logged_failure(f"{best.capture.label} cannot be learned from"):
         return best.refined_by(initial_network(bands, settings, start), settings)
     return None

@@ -5,8 +5,11 @@ from pathlib import Path
 from typing import Any
 
 import cv2
+import numpy as np
 import pytest
+import rasterio
 import torch
+from rasterio.errors import NotGeoreferencedWarning
 
 import agalign
 from agalign.batch import flight_learning as batch_learn
@@ -203,6 +206,19 @@ def test_a_fault_while_learning_only_loses_the_network_of_the_flight(
     reports = list(run_flight(agalign.discover(learned_flight, TWO_PAIRS), tmp_path, SETTINGS))
     assert [r.is_complete for r in reports] == [True] * MIN_CAPTURES
     assert {b.joint.recipe for r in reports for b in r.sidecar.bands if b.joint} == {"fast"}
+
+
+def test_a_band_of_noise_in_one_capture_does_not_change_the_network(learned_flight: Path, tmp_path: Path) -> None:
+    """It is trained on the capture, but aligns no more bands of it then."""
+    folder = shutil.copytree(learned_flight, tmp_path / "in")
+    (path,) = folder.rglob("IMG_0001_4.tif")
+    with pytest.warns(NotGeoreferencedWarning), rasterio.open(path, "r+") as file:
+        file.write(np.random.default_rng(0).integers(1000, 40000, file.shape, np.uint16), 1)
+    captures = agalign.discover(folder, TWO_PAIRS).captures
+    learned = batch_learn.learn_flight(captures, SETTINGS, lambda *_: None)
+    expected = learning_tasks.initial_network(learned.bands, SETTINGS, None).state_dict()
+    assert all(torch.equal(value, expected[name]) for name, value in learned.net.state_dict().items())
+    assert [len(known) for known in learned.refined.values()] == [2] * (MIN_CAPTURES - 1)
 
 
 def test_an_output_that_cannot_be_made_is_named(flight: Path, tmp_path: Path) -> None:
