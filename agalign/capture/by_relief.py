@@ -208,14 +208,20 @@ class _Estimate:
         kept, model = consistent
         layout = layout_of([group[k] for k in kept])
         bands = [planes[k].fitted(fit) for k, fit in zip(kept, model.fits, strict=True)]
-        low, high = np.percentile(model.parallax_px, (1.0, 99.0)).tolist()  # values beyond are wrong peaks
-        matching = DenseMatching(group[0].pair.reference.grey, _views(bands), (low, high))
-        matched = matching.matched(range(len(bands)))
-        # The parallax of the windows is a free parameter: noise of the relief would otherwise shorten the baselines.
-        windows = _window_shifts(bands, matched, with_lens_shapes=lens_std is not None)
-        again = adjust(windows, size_px, _baselines(bands), lens_std)
-        if again is not None:
-            bands = [band.fitted(fit) for band, fit in zip(bands, again.fits, strict=True)]
+        max_rounds = 3
+        for _ in range(max_rounds):
+            low, high = np.percentile(model.parallax_px, (1.0, 99.0)).tolist()  # values beyond are wrong peaks
+            matching = DenseMatching(group[0].pair.reference.grey, _views(bands), (low, high))
+            matched = matching.matched(range(len(bands)))
+            # The parallax of the windows is free: noise of the relief would otherwise shorten the baselines.
+            windows = _window_shifts(bands, matched, with_lens_shapes=lens_std is not None)
+            again = adjust(windows, size_px, _baselines(bands), lens_std)
+            if again is None:
+                break
+            model, bands = again, [band.fitted(fit) for band, fit in zip(bands, again.fits, strict=True)]
+            # A relief is relative to the planes: the refinement does not follow them farther.
+            if max(fit.max_px for fit in model.fits) <= matching.refined_px:
+                break
         baselines = _baselines(bands)
         if not are_of_lenses(baselines, layout) or (layout is None and are_on_a_line(baselines)):
             return None
