@@ -315,6 +315,15 @@ def test_a_lost_band_is_predicted_with_the_relief(
     assert result["Blue"].prediction.std_px > 0.05
 
 
+def test_the_relief_follows_planes_that_its_windows_move() -> None:
+    """The first planes of this scene are several steps of the refinement off: large shifts are measured in steps."""
+    size_px = 448, 336
+    scene = Rendered.of(make_scene("boxes", 9, width_px=size_px[0]), size_px, CLOSE_RANGE)
+    result = aligned_by_relief(scene.candidates(), "auto")[0]
+    assert {name: a.status for name, a in result.items()} == dict.fromkeys((b.name for b in scene.moving), "aligned")
+    assert max(np.percentile(scene.error_px(name, a.mapping), 90) for name, a in result.items()) < 0.8
+
+
 def test_the_sign_is_found_without_a_layout(boxes: Rendered, candidates: Sequence[Candidate]) -> None:
     """The sign follows from occlusions. The reference plane may differ from the one with a layout."""
     result = aligned_by_relief(without_layout(candidates), "auto")[0]
