@@ -58,7 +58,8 @@ def _parallax_by_rig(
 ) -> tuple[Parallax | None, FixedImagePx]:
     """Return the relief of the other bands with the baseline of the rig, scaled to theirs, and its standard error.
 
-    The error is that of the baseline, and of pixels for which the relief has no value. None and 0 without a relief.
+    The error is that of the baseline and of the relief in half of the pixels; the error map has those at depth edges.
+    None and 0 without a relief.
     """
     others = {
         other.name: parallax
@@ -73,7 +74,8 @@ def _parallax_by_rig(
     scale = float((seen * of_rig).sum() / max((of_rig**2).sum(), 1e-12))
     error = float(np.sqrt(((seen - scale * of_rig) ** 2).sum(axis=1).mean()))
     x, y = (scale * np.array(rig.baselines[pair.name])).tolist()
-    return Parallax(relief, (x, y)).with_occlusions(), FixedImagePx(error * relief.rms_px)
+    of_relief = 0.0 if relief.std_px is None else float(np.median(relief.std_px)) * relief.unit * math.hypot(x, y)
+    return Parallax(relief, (x, y)).with_occlusions(), FixedImagePx(math.hypot(error * relief.rms_px, of_relief))
 
 
 def _with_prediction(

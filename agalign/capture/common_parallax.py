@@ -19,17 +19,17 @@ MIN_PARALLAX_PX = 0.3
 
 
 def comparable(candidates: Sequence[Candidate]) -> list[list[Candidate]]:
-    """Group the bands by reference image and space of the homographies.
+    """Group the bands by reference image, space of the homographies and sharpness, sharp ones first.
 
     Bands without retrieval of held-out patches, with few measured windows or low resolution are excluded.
     """
-    groups: dict[tuple[int, str], list[Candidate]] = {}
+    groups: dict[tuple[bool, int, str], list[Candidate]] = {}
     for candidate in candidates:
         pair, residual = candidate.pair, candidate.warped.residual
         is_reliable = candidate.joint.retrieval >= MIN_RETRIEVAL and len(residual.measured_px) >= MIN_WINDOWS
         if is_reliable and not pair.is_coarse:
-            groups.setdefault((id(pair.reference), pair.space), []).append(candidate)
-    return list(groups.values())
+            groups.setdefault((pair.is_blurred, id(pair.reference), pair.space), []).append(candidate)
+    return [groups[key] for key in sorted(groups)]
 
 
 def common_parallax_px(group: Sequence[Candidate]) -> tuple[float, bool]:
@@ -50,12 +50,8 @@ def common_parallax_px(group: Sequence[Candidate]) -> tuple[float, bool]:
 
 
 def _common_residuals(group: Sequence[Candidate]) -> list[Residual[FixedImagePx]]:
-    """Return the residuals of all bands in the same windows: large ones if any band is blurred, or small ones if the
-    residual of any band uses these.
-    """
-    is_blurred = any(c.pair.is_blurred for c in group)
-    smallest = min((c.warped.windows for c in group), key=lambda windows: windows.side)
-    common = group[0].pair.reference.large_windows if is_blurred else smallest
+    """Return the residuals of all bands in the same windows: the smallest that the residual of any band uses."""
+    common = min((c.warped.windows for c in group), key=lambda windows: windows.side)
     return [c.warped.residual if c.warped.windows is common else common.residuals(c.warped.warped) for c in group]
 
 
