@@ -282,14 +282,14 @@ def test_a_noisy_band_follows_the_relief_of_the_others(
 
 
 def test_a_blurred_band_leaves_the_relief_to_the_sharp_ones_and_follows_it(four_lenses: Rendered) -> None:
-    blurred = cv2.GaussianBlur(four_lenses.images["Red edge"], (0, 0), 3)
-    candidates = four_lenses.candidates({"Red edge": blurred})
-    assert [c.pair.name for c in candidates if c.pair.is_blurred] == ["Red edge"]
+    blurred = cv2.GaussianBlur(four_lenses.images["Blue"], (0, 0), 3)
+    candidates = four_lenses.candidates({"Blue": blurred})
+    assert [c.pair.name for c in candidates if c.pair.is_blurred] == ["Blue"]
     result = aligned_by_relief(candidates, "auto")[0]
-    assert {name for name, a in result.items() if a.status == "aligned"} >= {"Blue", "Red", "NIR"}
+    assert {name for name, a in result.items() if a.status == "aligned"} >= {"Red", "NIR", "Red edge"}
     for name, alignment in result.items():
         assert np.percentile(four_lenses.error_px(name, alignment.mapping), 90) < 1
-    assert result["Red edge"].mapping.parallax is not None
+    assert result["Blue"].mapping.parallax is not None
 
 
 def test_a_relief_does_not_verify_a_band_that_it_is_estimated_from(
@@ -324,7 +324,7 @@ def test_a_lost_band_is_predicted_with_the_relief(
     assert result["Blue"].geometry == "relief"
     errors_px = boxes.error_px("Blue", result["Blue"].mapping)
     assert np.percentile(errors_px, 90) < 0.8
-    assert 0.5 * np.percentile(errors_px, 68) < result["Blue"].prediction.std_px < 0.8
+    assert np.percentile(errors_px, 68) < result["Blue"].prediction.std_px < 0.8
 
 
 def test_the_relief_follows_planes_that_its_windows_move() -> None:
