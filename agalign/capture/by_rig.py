@@ -19,6 +19,7 @@ from agalign.values.issues import Issue
 from agalign.values.parallax import Parallax
 from agalign.values.pixel_units import FixedImagePx, MovingFilePx
 from agalign.verify.checks import MAX_UNEXPECTED_PX, UNEXPECTED_PX, Evidence, issues_of
+from agalign.verify.extrapolation import issues_of_extrapolation, points_in_frame
 
 
 def observed(pairs: Sequence[BandPair], result: Alignments, capture: Capture) -> Observation:
@@ -40,9 +41,9 @@ def observed(pairs: Sequence[BandPair], result: Alignments, capture: Capture) ->
 def with_predictions(pairs: Sequence[BandPair], result: Alignments, rig: Rig, capture: Capture) -> Alignments:
     """Return the alignments with the rig's predictions, px of the files; the prediction replaces failed alignments.
 
-    It also replaces results that contradict the rig, because of aliasing in repetitive scenes. A rotated or scaled
-    image does not fit the rig; its alignment gets an issue and is not replaced. Predictions follow the relief of the
-    capture, if it has one.
+    It also replaces results that contradict the rig, because of aliasing in repetitive scenes, and those under a relief
+    that are extrapolated over a quarter of the image. A rotated or scaled image does not fit the rig; its alignment
+    gets an issue and is not replaced. Predictions follow the relief of the capture, if it has one.
     """
     known = observed([p for p in pairs if p.has_rig_pixels], result, capture)
     covered = [p for p in pairs if p.name in rig.mean and p.has_rig_pixels]
@@ -103,6 +104,9 @@ def _with_prediction(
             file_pixel_size_px=pair.file_pixel_size_px,
         )
         issues = issues_of(evidence)
+        if parallax is not None:  # a homography under a relief is not combined with the rig
+            in_frame_px = points_in_frame(alignment.mapping, *pair.sizes_px)
+            issues += issues_of_extrapolation(alignment.residual, pair.fixed.size_px, in_frame_px)
         if not issues:
             return replace(alignment, prediction=prediction)
         alignment = replace(alignment, issues=issues)

@@ -37,7 +37,7 @@ from agalign.values.issues import NO_CONTRAST, RETRIEVAL, Issue
 from agalign.values.mapping import PixelMapping
 from agalign.values.parallax import Parallax, Relief
 from agalign.values.pixel_units import MovingFilePx
-from agalign.verify.extrapolation import expected_error_px
+from agalign.verify.extrapolation import EXTRAPOLATED, expected_error_px
 
 from ..builders import in_full_run, joint_result, residual_of, whole
 from ..conftest import Shared, textured_image
@@ -322,6 +322,13 @@ def test_a_lost_band_is_predicted_with_the_relief(
     # The other bands are verified by the rig as before.
     assert {name: a.status for name, a in result.items()} == {"Blue": "predicted", "Red": "aligned", "NIR": "aligned"}
     assert result["Blue"].geometry == "relief"
+    # A band of which half shows nothing is predicted too: its homography is extrapolated over the rest.
+    half = aligned["Blue"].residual.where(aligned["Blue"].residual.centres_px[:, 0] < boxes.size_px[0] / 2)
+    known = {**aligned, "Blue": replace(aligned["Blue"], residual=half)}
+    assert with_predictions(pairs, aligned, rig, Capture("a", Path(), (), 0))["Blue"].status == "aligned"
+    extrapolated = with_predictions(pairs, known, rig, Capture("a", Path(), (), 0))["Blue"]
+    assert (extrapolated.status, [i.kind for i in extrapolated.issues]) == ("predicted", [EXTRAPOLATED])
+    assert extrapolated.geometry == "relief"
     errors_px = boxes.error_px("Blue", result["Blue"].mapping)
     assert np.percentile(errors_px, 90) < 0.8
     assert np.percentile(errors_px, 68) < result["Blue"].prediction.std_px < 0.8
