@@ -38,6 +38,7 @@ from agalign.fit.adjustment import (
     are_on_a_line,
     fit_in_rounds,
     parallax_of,
+    variance_px2,
 )
 from agalign.fit.dense import DenseMatching, View, nearer_sign
 from agalign.fit.displacement_field import MIN_WINDOWS
@@ -50,6 +51,7 @@ from agalign.values.mapping import PixelMapping
 from agalign.values.parallax import Parallax, Relief
 from agalign.values.pixel_units import FixedImagePx
 from agalign.verify.checks import BY_PARALLAX, MAX_ALIAS_PEAK, MAX_SHIFT_PX
+from agalign.verify.extrapolation import points_in_frame
 
 _MIN_OBSERVED_SHARE = 0.75
 """Minimum share of aligned windows for an observation of a rig, which contains no depth edges: 0.79 or more in scenes
@@ -118,6 +120,14 @@ class _Band:
         """The result with the homography of the plane."""
         assert self.covariance_px2 is not None
         return self.candidate.joint.with_homography(self.plane.fixed_to_moving, self.covariance_px2)
+
+    @property
+    def std_px(self) -> float:
+        """RMS standard error of the plane over the image, with the parts in which the band shows nothing."""
+        assert self.covariance_px2 is not None
+        pair = self.candidate.pair
+        points_px = points_in_frame(self.plane, *pair.sizes_px)
+        return float(np.sqrt(variance_px2(points_px, self.covariance_px2, pair.fixed.size_px).mean()))
 
     @cached_property
     def by_homography(self) -> Residual[FixedImagePx]:
@@ -292,7 +302,7 @@ class _Estimate:
             return {}
         joint = None if candidate.issue is not None else candidate.joint
         by_relief = replace(without_result(pair, candidate.seed), mapping=mapping, joint=joint, residual=residual)
-        return {band.name: predicted_by_windows(by_relief, pair, OTHER_GEOMETRY)}
+        return {band.name: predicted_by_windows(by_relief, pair, OTHER_GEOMETRY, band.std_px)}
 
 
 def _is_better(bands: Sequence[_Band], result: Alignments) -> bool:

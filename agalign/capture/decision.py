@@ -60,15 +60,16 @@ def at_seed(pair: BandPair, seed: Seed, issues: Sequence[Issue], *, seed_only: b
 
 
 def predicted_by_windows(
-    alignment: Alignment[FixedImagePx], pair: BandPair, reason: IssueKind | None = None
+    alignment: Alignment[FixedImagePx], pair: BandPair, reason: IssueKind | None = None, min_std_px: float = 0.0
 ) -> Alignment[FixedImagePx]:
     """Return as `predicted` an alignment that its windows do not confirm, or another geometry than that of its capture.
 
-    The standard error is that of these windows.
+    The standard error is that of these windows, or `min_std_px` if that is larger.
     """
     assert alignment.residual is not None
     issues = alignment.issues if reason is None else (Issue(reason), *alignment.issues)
-    prediction = pair.prediction_of(alignment.mapping, alignment.residual.std_px)
+    std_px = max(alignment.residual.std_px, FixedImagePx(min_std_px))
+    prediction = pair.prediction_of(alignment.mapping, std_px)
     return decided(replace(alignment, issues=issues, prediction=prediction))
 
 

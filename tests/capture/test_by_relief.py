@@ -281,6 +281,17 @@ def test_a_noisy_band_follows_the_relief_of_the_others(
         assert 0.5 * np.percentile(errors, 68) < alignment.prediction.std_px <= 1
 
 
+@pytest.mark.parametrize("name", ["Blue", "NIR"])
+def test_a_band_that_shows_nothing_in_a_part_claims_the_error_there(four_lenses: Rendered, name: str) -> None:
+    image = four_lenses.images[name].copy()
+    image[:, int(0.4 * image.shape[1]) :] = 60_000
+    candidates = four_lenses.candidates({name: image})
+    lost = [Candidate.of(c.pair, c.seed, Issue(NO_CONTRAST)) if c.pair.name == name else c for c in candidates]
+    prediction, mapping = (getattr(aligned_by_relief(lost, "auto")[0][name], of) for of in ("prediction", "mapping"))
+    p68_px = np.percentile(four_lenses.error_px(name, mapping), 68)
+    assert 0.5 * p68_px < prediction.std_px < 4 * p68_px
+
+
 def test_a_blurred_band_leaves_the_relief_to_the_sharp_ones_and_follows_it(four_lenses: Rendered) -> None:
     blurred = cv2.GaussianBlur(four_lenses.images["Blue"], (0, 0), 3)
     candidates = four_lenses.candidates({"Blue": blurred})
