@@ -333,7 +333,7 @@ def test_a_lost_band_is_predicted_with_the_relief(
     # The other bands are verified by the rig as before.
     assert {name: a.status for name, a in result.items()} == {"Blue": "predicted", "Red": "aligned", "NIR": "aligned"}
     assert result["Blue"].geometry == "relief"
-    # A band of which half shows nothing is predicted too: its homography is extrapolated over the rest.
+    # A band with windows in one half only is predicted too: its homography is extrapolated over the other.
     half = aligned["Blue"].residual.where(aligned["Blue"].residual.centres_px[:, 0] < boxes.size_px[0] / 2)
     known = {**aligned, "Blue": replace(aligned["Blue"], residual=half)}
     assert with_predictions(pairs, aligned, rig, Capture("a", Path(), (), 0))["Blue"].status == "aligned"
