@@ -251,7 +251,7 @@ class Alignment(Generic[FixedPx]):
     residual: Residual[FixedPx] | None = None
     """Of windows that took no part in the estimation."""
     seconds: float = 0.0
-    """Processing time of the pair."""
+    """Share of the capture's processing time, equal for all its bands."""
     before: Mapping[str, float] = dataclasses.field(default_factory=dict)
     """Comparison metrics by name under the seed, such as mutual information."""
     after: Mapping[str, float] = dataclasses.field(default_factory=dict)

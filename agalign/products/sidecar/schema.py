@@ -441,7 +441,7 @@ class BandResult(_Result):
     place: PlacePart | None = None
     """Where the aligned pixels of the band are."""
     seconds: Number3
-    """Processing time."""
+    """Share of the capture's processing time, equal for all its bands."""
     saturated: Fraction4 = None
     """Share of saturated pixels in the file."""
 
