@@ -64,7 +64,7 @@ def align_capture_bands(
             result[band.name] = decided(Alignment(mapping, size_px, "failed", issues, overlay))
     reliefs = (a.mapping.parallax.relief for a in result.values() if a.mapping.parallax is not None)
     relief = next((relief.on_pixels(size_px) for relief in reliefs), None)  # the same in all bands
-    seconds = (time.perf_counter() - start_s) / len(capture.moving)  # most steps are for all bands together
+    seconds = (time.perf_counter() - start_s) / max(1, len(capture.moving))  # most steps are for all bands together
     return {b.name: replace(_as_written(result[b.name], b, relief), seconds=seconds) for b in capture.moving}
 
 
@@ -222,7 +222,7 @@ class PairAligner:
 
     def candidates(self, measured: Sequence[Candidate]) -> list[Candidate]:
         """Return candidates after the MAP estimation of all bands of the capture."""
-        if not self._may_be_homography:  # but of the family that the user chose
+        if not self._may_be_homography:  # as the MAP estimate is
             return list(measured)
         pairs, joint = [c.pair for c in measured], {c.pair.name: c.joint for c in measured}
         residuals = {c.pair.name: c.warped.residual for c in measured}
