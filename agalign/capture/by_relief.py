@@ -77,7 +77,7 @@ def aligned_by_relief(
     # would follow them too.
     max_line_px = 1.0
     for group in comparable(candidates):
-        if len(group) < MIN_BANDS or any(c.pair.name in alignments for c in group):
+        if len(group) < MIN_BANDS:
             continue
         parallax_px, on_a_line = common_parallax_px(group)
         if on_a_line and parallax_px > max_line_px:

@@ -19,17 +19,18 @@ MIN_PARALLAX_PX = 0.3
 
 
 def comparable(candidates: Sequence[Candidate]) -> list[list[Candidate]]:
-    """Group the bands by reference image, space of the homographies and sharpness, sharp ones first.
+    """Group the bands by reference image and space of the homographies; sharp ones only, if these are enough.
 
     Bands without retrieval of held-out patches, with few measured windows or low resolution are excluded.
     """
-    groups: dict[tuple[bool, int, str], list[Candidate]] = {}
+    groups: dict[tuple[int, str], list[Candidate]] = {}
     for candidate in candidates:
         pair, residual = candidate.pair, candidate.warped.residual
         is_reliable = candidate.joint.retrieval >= MIN_RETRIEVAL and len(residual.measured_px) >= MIN_WINDOWS
         if is_reliable and not pair.is_coarse:
-            groups.setdefault((pair.is_blurred, id(pair.reference), pair.space), []).append(candidate)
-    return [groups[key] for key in sorted(groups)]
+            groups.setdefault((id(pair.reference), pair.space), []).append(candidate)
+    sharp = [[c for c in group if not c.pair.is_blurred] for group in groups.values()]
+    return [some if len(some) >= MIN_BANDS else group for some, group in zip(sharp, groups.values(), strict=True)]
 
 
 def common_parallax_px(group: Sequence[Candidate]) -> tuple[float, bool]:
@@ -50,8 +51,11 @@ def common_parallax_px(group: Sequence[Candidate]) -> tuple[float, bool]:
 
 
 def _common_residuals(group: Sequence[Candidate]) -> list[Residual[FixedImagePx]]:
-    """Return the residuals of all bands in the same windows: the smallest that the residual of any band uses."""
-    common = min((c.warped.windows for c in group), key=lambda windows: windows.side)
+    """Return the residuals of all bands in the same windows: large ones if any band is blurred, else the smallest that
+    the residual of any band uses.
+    """
+    smallest = min((c.warped.windows for c in group), key=lambda windows: windows.side)
+    common = group[0].pair.reference.large_windows if any(c.pair.is_blurred for c in group) else smallest
     return [c.warped.residual if c.warped.windows is common else common.residuals(c.warped.warped) for c in group]
 
 
