@@ -48,6 +48,9 @@ NODE_STEP_PX = 48
 """Spacing of the nodes of a displacement field of lenses, as their distortion varies over hundreds of pixels."""
 _CAUCHY_SCALES = 2.0
 """Residual of a window at which its robust weight is one half, in residual scales."""
+_LENS_VARIANCE_FACTOR = 12.0
+"""Factor on the variance of shifts for lens shapes: these extrapolate errors by relief, which neighbouring windows have
+in common."""
 _RELIEF_STEP_PX = 32
 """Spacing of a relief by windows."""
 _COMMON_STD_PX = 0.01
@@ -170,9 +173,7 @@ def fit_windows(
     points_px, shifted_px = (mapping.undistorted(p) for p in (raw.centres_px, raw.centres_px + raw.shifts_px))
     shifts_px, std_px, factor = shifted_px - points_px, np.full(8, np.inf), 1.0
     if lens_std_px is not None:
-        std_px = np.r_[np.full(8, _CORNER_STD_PX), lens_std_px]
-        # Lens shapes extrapolate errors by relief, which neighbouring windows have in common.
-        factor = 12.0
+        std_px, factor = np.r_[np.full(8, _CORNER_STD_PX), lens_std_px], _LENS_VARIANCE_FACTOR
     count = len(std_px)
     design = jacobian(points_px, size_px, count)
     mean = np.zeros(count)
@@ -185,6 +186,11 @@ def fit_windows(
     estimate = least_squares(design, shifts_px, raw.weights, np.diag(std_px**-2.0), mean, robust=robust)
     covariance_px2 = estimate.covariance[:count, :count] + _COMMON_STD_PX**2 * np.eye(count)
     return _window_fit(estimate.mean, estimate.residuals, size_px, covariance_px2)
+
+
+def lens_shift_variance_px2(scale_px: float) -> float:
+    """Return the variance along an axis of shifts with residuals of this scale that lens shapes are fitted to."""
+    return float(_shift_variance_px2(scale_px, _LENS_VARIANCE_FACTOR))
 
 
 def _shift_variance_px2(scale_px: float | Array, factor: float = 1.0) -> Any:

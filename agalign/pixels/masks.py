@@ -10,7 +10,7 @@ from agalign.values.interpolation import planes_of
 
 _MIN_SIDE_PX = 48
 """Smaller images contain too few patches for learning."""
-_MIN_SATURATED_PX = 3
+_MIN_SATURATED_PX = 7
 """Minimum width of a masked saturated area: patches around smaller ones contain enough of their surroundings."""
 
 

@@ -72,12 +72,17 @@ class Peak:
 def windowed_spectra(fields: Field) -> Field:
     """Return the Fourier transform of fields (..., height, width) under a Hann window."""
     height, width = fields.shape[-2:]
-    return _each_plane(cv2.dft, fields * _hann_window(height, width))
+    return forward_transform(fields * _hann_window(height, width))
 
 
 @cache
 def _hann_window(height: int, width: int) -> FloatImage:
     return np.outer(np.hanning(height + 2)[1:-1], np.hanning(width + 2)[1:-1]).astype(np.float32)
+
+
+def forward_transform(planes: Field) -> Field:
+    """Return the Fourier transform of planes (..., height, width)."""
+    return _each_plane(cv2.dft, planes)
 
 
 def inverse_transform(spectra: Field) -> Field:
@@ -157,7 +162,8 @@ def paraboloid_peaks(patches: NDArray[np.float64]) -> NDArray[np.float64]:
 def find_peak(surface: NDArray[np.float32], exclusion_px: int, max_shift_px: float = np.inf) -> Peak:
     """Return the subpixel peak of a correlation surface (height, width) with a shift of at most `max_shift_px`.
 
-    `exclusion_px` is half the side of the square around the peak that is excluded from the search for the runner-up.
+    The runner-up is the highest other position with such a shift, outside a square around the peak; `exclusion_px` is
+    half its side. Shifts are circular.
     """
     height, width = surface.shape
     std = float(surface.std())
@@ -165,16 +171,19 @@ def find_peak(surface: NDArray[np.float32], exclusion_px: int, max_shift_px: flo
         return Peak((0.0, 0.0), 0.0, 0.0, 0.0)
     z = np.fft.fftshift((surface - surface.mean()) / std)
     zero_row, zero_column = height // 2, width // 2
-    shift_px = np.hypot(*np.ogrid[-zero_row : height - zero_row, -zero_column : width - zero_column])
-    row, column = np.unravel_index(int(np.where(shift_px > max_shift_px, -np.inf, z).argmax()), z.shape)
+    rows, columns = np.ogrid[-zero_row : height - zero_row, -zero_column : width - zero_column]
+    allowed = np.where(np.hypot(rows, columns) > max_shift_px, np.float32(-np.inf), z)
+    row, column = np.unravel_index(int(allowed.argmax()), z.shape)
     dx = column - zero_column + _vertex(z[row, (column - 1) % width], z[row, column], z[row, (column + 1) % width])
     dy = row - zero_row + _vertex(z[(row - 1) % height, column], z[row, column], z[(row + 1) % height, column])
-    sigma = float(z[row, column])
-    at_zero = float(z[zero_row, zero_column])
-    rows, columns = (slice(max(0, i - exclusion_px), i + exclusion_px + 1) for i in (int(row), int(column)))
-    z[rows, columns] = -np.inf
-    runner_up = float(z.max())
-    return Peak((float(dx), float(dy)), sigma, runner_up if np.isfinite(runner_up) else 0.0, at_zero)
+    near = [
+        np.arange(at - exclusion_px, at + exclusion_px + 1) % length
+        for at, length in ((int(row), height), (int(column), width))
+    ]
+    allowed[np.ix_(*near)] = -np.inf
+    runner_up = float(allowed.max())
+    peak_sigma, zero_sigma = float(z[row, column]), float(z[zero_row, zero_column])
+    return Peak((float(dx), float(dy)), peak_sigma, runner_up if np.isfinite(runner_up) else 0.0, zero_sigma)
 
 
 def _vertex(left: float, centre: float, right: float) -> float:

@@ -2,7 +2,7 @@
 
 import dataclasses
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Generic, cast
 
@@ -23,10 +23,15 @@ MIN_RETRIEVAL = 0.2
 """Minimum held-out retrieval: below it psi is not updated and no result is accepted. Chance is below 0.01; unrelated
 images reach 0.05."""
 _NOISE_PX_SIGMA2 = 48.0
-"""RMS shift of aligned windows of 48 to 64 px times the squared height of their peaks: 48 to 60 in close-range and flat
-scenes, with peaks of 8 sigma (noise of 60 %) to 30."""
+"""RMS noise of the shift of a window times the squared height of its peak, in windows of 40 to 64 px: the median shift
+of aligned windows is 0.7 to 1.35 of that noise in sharp, noisy and blurred scenes, with peaks of 8 sigma to 30."""
 MIN_TIMES_CHANCE = 5.0
 """The same limit as a multiple of chance, which is high where few keypoints can be drawn."""
+
+
+def noise_px(peaks_sigma: ArrayLike) -> NDArray[np.float64]:
+    """Return the RMS noise (n,) of the length of measured shifts from the heights (n,) of their correlation peaks."""
+    return np.asarray(_NOISE_PX_SIGMA2 / np.square(peaks_sigma))
 
 
 @dataclass(frozen=True)
@@ -140,6 +145,12 @@ class Residual(Generic[FixedPx]):
         of_shifts = cast(FixedPx, float(median)), cast(FixedPx, float(p95)), coverage
         return cls(centres_px, shifts_px, *of_shifts, peaks_sigma, cells)
 
+    @classmethod
+    def joined(cls, several: Sequence["Residual[FixedPx]"]) -> "Residual[FixedPx]":
+        """Return the windows of several residuals as one."""
+        parts = zip(*((r.centres_px, r.shifts_px, r.peaks_sigma, r.cells) for r in several), strict=True)
+        return cls.of(*map(np.concatenate, parts))
+
     def with_shifts(self, shifts_px: NDArray[np.float64]) -> "Residual[FixedPx]":
         """The same windows with other shifts (n, 2)."""
         return Residual[FixedPx].of(self.centres_px, shifts_px, self.peaks_sigma, self.cells)
@@ -159,11 +170,10 @@ class Residual(Generic[FixedPx]):
         """
         if not len(self.lengths_px):
             return cast(FixedPx, math.inf)
-        peaks_sigma = self.peaks_sigma[np.isfinite(self.shifts_px[:, 0])]
-        noise_px = _NOISE_PX_SIGMA2 / float(np.median(peaks_sigma)) ** 2
+        noise = float(np.median(noise_px(self.peaks_sigma[np.isfinite(self.shifts_px[:, 0])])))
         # Of a Rayleigh distribution: sqrt(-2 log(1 - p)) for the quantile p, and sqrt(2) for the RMS.
         rms_px = max(float(np.quantile(self.lengths_px, p)) / math.sqrt(-math.log(1 - p)) for p in (0.5, 0.8))
-        return cast(FixedPx, math.sqrt(max(rms_px**2 - noise_px**2, (rms_px / 2) ** 2)))
+        return cast(FixedPx, math.sqrt(max(rms_px**2 - noise**2, (rms_px / 2) ** 2)))
 
     @property
     def is_black(self) -> NDArray[np.bool_]:
@@ -260,6 +270,12 @@ class Alignment(Generic[FixedPx]):
     """p95 of the shifts of held-out windows by each geometry that was fitted; empty if only a homography was."""
     prediction: Prediction | None = None
     """Prediction by the rig of the flight; None without a rig."""
+    lens_std_px: NDArray[np.float64] | None = None
+    """(4,) standard deviations of the lens shapes (`fit.adjustment`) that neither tags nor a rig determine, px of the
+    reference; None if they are known, or contained in a prediction."""
+    relief_std_px: float = 0.0
+    """Spread of the relief of the flight, px of the reference, which a mapping without relief lacks where no window is
+    near."""
     ties: Residual[FixedPx] | None = None
     """Of all windows under this mapping, including those that it was fitted to; None unless they were requested."""
     moving_size_px: Size | None = None
@@ -350,6 +366,8 @@ class Alignment(Generic[FixedPx]):
             seed=replace(self.seed, fixed_to_moving=scales.between_files(self.seed.fixed_to_moving)),
             joint=None if self.joint is None else self.joint.in_file_px(scales),
             residual=None if self.residual is None else self.residual.in_file_px(scales),
+            lens_std_px=None if self.lens_std_px is None else self.lens_std_px * up.mean,
+            relief_std_px=self.relief_std_px * up.mean,
             ties=None if self.ties is None else self.ties.in_file_px(scales),
             candidates={kind: FixedFilePx(p95_px * up.mean) for kind, p95_px in self.candidates.items()},
         )

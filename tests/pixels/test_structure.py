@@ -50,6 +50,18 @@ def test_the_peak_is_at_the_shift(shift: tuple[float, float]) -> None:
     assert result.sigma > 3 * result.runner_up_sigma
 
 
+def test_a_runner_up_is_within_the_limit_and_apart_from_the_peak_across_the_border() -> None:
+    """Shifts are circular: a peak at the border of the surface continues at the opposite one."""
+    surface = np.random.default_rng(0).normal(0, 0.1, (64, 64)).astype(np.float32)
+    surface[0, 0], surface[0, 20], surface[0, 32], surface[0, 31] = 10.0, 12.0, 30.0, 29.0
+    near = find_peak(surface, 4, max_shift_px=10.0)
+    assert np.hypot(*near.shift_px) < 1
+    assert near.runner_up_sigma < 0.1 * near.sigma
+    at_the_border = find_peak(surface, 4)
+    assert abs(abs(at_the_border.shift_px[0]) - 32) < 1
+    assert at_the_border.runner_up_sigma < 0.5 * at_the_border.sigma
+
+
 def test_invalid_pixels_leave_no_edge() -> None:
     valid = np.ones((240, 320), bool)
     valid[100:140, 100:180] = False
