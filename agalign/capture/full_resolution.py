@@ -126,8 +126,9 @@ def _residual(moving: Band, mapping: PixelMapping, tiles: _Tiles) -> Residual[Fi
             warped = resample_tile(moving, mapping, tile, "lanczos", dataset=source)
             part = windows.residuals(_raster(*warped, moving))
             origin_px = np.array([tile.x0, tile.y0])
-            cells = part.cells + origin_px // windows.side  # in a grid over the whole file
-            parts.append((part.centres_px + origin_px, part.shifts_px, part.peaks_sigma, cells))
+            centres_px = part.centres_px + origin_px
+            cells = (centres_px // windows.side).astype(np.int64)  # windows share no pixels, so each has its own
+            parts.append((centres_px, part.shifts_px, part.peaks_sigma, cells))
     return Residual[FixedFilePx].of(*map(np.concatenate, zip(*parts, strict=True)))
 
 

@@ -147,7 +147,8 @@ class _Table:
         counts = (self.weights > 0).sum(axis=0)
         mean_px2 = (squares_px2 * (self.weights > 0)).sum(axis=0) / counts
         # The final rig has one capture more than a fit of a fold: the error variance is proportional to 1 + 1 / n.
-        return np.asarray(np.sqrt(mean_px2 * (1 + 1 / counts) / (1 + 1 / np.maximum(counts - 1, 1))))
+        of_final_px2 = mean_px2 * (1 + 1 / counts) / (1 + 1 / np.maximum(counts - 1, 1))
+        return np.asarray(np.sqrt(rig.expected_square(of_final_px2, counts)))
 
     def _initial(self, weights: Array, factors: Sequence[Factor]) -> Array:
         """Return initial baselines and delays (bands, 3): by default first singular vectors of the coefficients."""

@@ -144,6 +144,14 @@ def mapping_weight(std_px: ArrayLike, model_error_px: ArrayLike = 0.0) -> Array:
     return np.asarray(1 / (np.square(std_px) + np.square(model_error_px) + MIN_STD_PX**2))
 
 
+def expected_square(mean_square: ArrayLike, count: ArrayLike) -> Array:
+    """Return the mean squares (n,) to expect of further errors from those of `count` (n,) ones: few may be small by
+    chance.
+    """
+    number = np.asarray(count, np.float64)
+    return np.asarray(np.asarray(mean_square) * (number + 1) / np.maximum(number - 1, 1))
+
+
 def lattice(size_px: tuple[int, int]) -> tuple[Points, Array]:
     """Return the points (35, 2) of an image (width, height) at which mappings are compared, and g = (1, u, v), (35, 3).
 

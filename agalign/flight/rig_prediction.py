@@ -18,6 +18,7 @@ from agalign.flight.rig import (
     Rig,
     affine_difference,
     capture_factors,
+    expected_square,
     mapping_weight,
 )
 from agalign.values import geometry
@@ -166,8 +167,7 @@ def _from_captures(rig: Rig, band: str, known: Observation) -> Prediction:
             factors, std, gap = estimate
             similar = [square for other_gap, square in tests if other_gap <= max_gap_ratio * gap]
             squares = similar if len(similar) >= MIN_CAPTURES else [square for _, square in tests[:MIN_CAPTURES]]
-            # The mean square of few captures may be small by chance.
-            mean_px2 = float(np.mean(squares)) * (len(squares) + 1) / max(len(squares) - 1, 1)
+            mean_px2 = float(expected_square(np.mean(squares), len(squares)))
             results.append((max(mean_px2, float(((design @ std) ** 2).sum())), factors))
     variance_px2, factors = min(results, key=itemgetter(0), default=(0.0, np.zeros(FACTORS)))
     altitude_px = _altitude_error_px(rig, known.altitude_m) * float(np.linalg.norm(rig.baselines[band]))

@@ -67,7 +67,7 @@ def test_bands_are_refined_on_the_files_and_one_with_an_unreadable_tile_fails(
     result = align_capture_bands(capture, Settings(joint=JointSettings(device="cpu")), None, lambda *_: None)
     assert {name: a.status for name, a in result.items()} == {"nir": "failed", "red": "aligned"}
     assert "field_nir.tif: cannot be read (tile 7)" in (result["nir"].reason or "")
-    assert geometry.corner_error_px(result["red"].fixed_to_moving, TRUTH, *SIZE) < 0.05
+    assert geometry.corner_error_px(result["red"].fixed_to_moving, TRUTH, *SIZE) < 0.2
     assert result["red"].residual.centres_px.max() > 700  # px of the file
 
 
@@ -94,7 +94,8 @@ def test_the_windows_that_verify_share_no_pixel_with_those_of_the_fit(
     residual = refined(capture, aligned_on_reduced_images()).residual
     assert len(residual.centres_px) > 50
     apart = np.abs(residual.centres_px[:, None] - np.concatenate(fitted)[None]).max(axis=-1)
-    assert apart.min() >= SIZE[0] // 4 // 4  # the side of the windows: four in each of four tiles
+    assert len(np.unique(residual.cells, axis=0)) == len(residual.cells)  # windows of several tiles have own cells
+    assert apart.min() >= 50  # the side of the windows: five in each of four tiles
 
 
 def test_a_refinement_is_compared_with_the_prediction_of_the_rig(capture: Capture) -> None:

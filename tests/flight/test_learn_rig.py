@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from agalign.flight.learn_rig import learn_rig
-from agalign.flight.rig import Observation, Rig, distance_px
+from agalign.flight.rig import Observation, Rig, distance_px, expected_square
 from agalign.flight.rig_prediction import predict_band, unobserved_error_px
 from agalign.values import geometry
 
@@ -183,3 +183,8 @@ def test_a_band_in_few_captures_has_a_finite_error() -> None:
     error, std = error_px(rig, "NIR", observation(30.0, 0.5, without="NIR"), mappings(0.5)["NIR"])
     assert error < min(0.3, 3 * std)
     assert std < 0.33
+
+
+def test_few_errors_may_be_small_by_chance() -> None:
+    """The variance of a further error from the mean square of n: 2 for three, 1.03 for sixty."""
+    np.testing.assert_allclose(expected_square([1.0, 1.0], [3, 60]), [2.0, 61 / 59])
