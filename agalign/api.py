@@ -14,7 +14,7 @@ from agalign.batch.run import Listener, run_flight
 from agalign.cameras.discover import discover
 from agalign.capture.align_bands import align_pairs
 from agalign.capture.band_pair import BandPair, SeedMatrices
-from agalign.capture.by_windows import without_extrapolated
+from agalign.capture.by_windows import with_lens_shapes
 from agalign.capture.reference import Reference
 from agalign.capture.warped_pair import with_metrics
 from agalign.config import DiscoverOptions, RunOptions, Settings
@@ -78,7 +78,7 @@ def align(
         matrices = {"user": geometry.normalised(seed)}
     seed_std: dict[SeedKind, FixedImagePx] = {} if seed_std_px is None else {"user": FixedImagePx(seed_std_px)}
     pair = BandPair("moving", Reference(fixed_raster), moving_raster, matrices, seed_std_px=seed_std)
-    result = without_extrapolated([pair], align_pairs([pair], settings, quiet))
+    result = with_lens_shapes([pair], align_pairs([pair], settings, quiet))
     return replace(with_metrics(result["moving"], pair), moving_size_px=moving_raster.size_px)
 
 

@@ -19,6 +19,7 @@ from agalign.batch.learning_tasks import (
     portable,
 )
 from agalign.config import Settings
+from agalign.fit.adjustment import lens_std_px
 from agalign.fit.displacement_field import common_field
 from agalign.flight.fingerprint import hashed, refinement_key
 from agalign.flight.groups import flight_camera, flight_lenses
@@ -37,7 +38,7 @@ from agalign.values.capture import Capture
 from agalign.values.geometry import Matrix
 from agalign.values.pixel_units import FixedFilePx, MovingFilePx
 from agalign.values.process_pool import A, Apply, R
-from agalign.verify.extrapolation import unmodelled_std_px, unobserved_quarters
+from agalign.verify.expected_error import unmodelled_std_px
 
 _MIN_RIG_CAPTURES, _MAX_RIG_CAPTURES = 6, 48
 """The factors of the rig need the minimum; more than the maximum do not improve it."""
@@ -238,17 +239,18 @@ def _min_observations(observations: Iterable[LearningCapture]) -> int:
 def _extrapolation_px(
     rig: Rig, residuals: Mapping[str, Sequence[Residual[FixedFilePx]]], *, calibrated: bool
 ) -> dict[str, MovingFilePx]:
-    """Return the standard error (px of the band's file) from the lens in a quarter of the image without measurements.
+    """Return the standard error (px of the band's file) from the lens in parts of the image without measurements.
 
-    Only bands with such a quarter are in the result.
+    Only bands with such parts are in the result.
     """
+    max_covered_px = 0.15  # windows in all parts leave less unknown
     result: dict[str, MovingFilePx] = {}
     for band, of_band in residuals.items():
-        centres_px = np.concatenate([r.measured_px for r in of_band])
-        if unobserved_quarters(centres_px, rig.size_px):
-            ratio = geometry.magnification(rig.mean[band], *rig.size_px)
-            std_px = unmodelled_std_px(centres_px, rig.size_px, calibrated=calibrated)
-            result[band] = MovingFilePx(std_px * ratio)
+        std_px = unmodelled_std_px(
+            Residual.joined(of_band), rig.size_px, lens_std_px(rig.size_px, calibrated=calibrated)
+        )
+        if std_px > max_covered_px:
+            result[band] = MovingFilePx(std_px * geometry.magnification(rig.mean[band], *rig.size_px))
     return result
 
 

@@ -8,11 +8,11 @@ from functools import partial
 from agalign.capture.band_pair import BandPair, read_pairs
 from agalign.capture.by_relief import aligned_by_relief
 from agalign.capture.by_rig import bands_to_learn, with_predictions
-from agalign.capture.by_windows import aligned_by_windows, without_extrapolated
+from agalign.capture.by_windows import aligned_by_windows, with_lens_shapes
 from agalign.capture.decision import at_seed, decided, of_one_geometry, verified, without_result
 from agalign.capture.full_resolution import at_full_resolution
 from agalign.capture.map_estimate import map_estimate
-from agalign.capture.seeding import Start, find_seed, image_groups
+from agalign.capture.seeding import Start, corrected, find_seed, image_groups
 from agalign.capture.warped_pair import Candidate, with_metrics
 from agalign.config import Settings
 from agalign.flight.fingerprint import refinement_key
@@ -22,7 +22,15 @@ from agalign.method.joint import Results, align_from_scratch, refine_with
 from agalign.method.refine import FLIGHT_PATCHES, PATCHES
 from agalign.method.state import ImageGroup, Progress
 from agalign.values import geometry
-from agalign.values.alignment import Alignment, Alignments, JointResult, RefinedPair, Seed
+from agalign.values.alignment import (
+    MIN_RETRIEVAL,
+    MIN_TIMES_CHANCE,
+    Alignment,
+    Alignments,
+    JointResult,
+    RefinedPair,
+    Seed,
+)
 from agalign.values.capture import Band, Capture
 from agalign.values.issues import SEED_ASKED_FOR, Issue
 from agalign.values.mapping import PixelMapping
@@ -49,7 +57,7 @@ def align_capture_bands(
     if rig is not None and not settings.seed.only:
         aligned = with_predictions(pairs, aligned, rig, capture)
     if not settings.seed.only:
-        aligned = without_extrapolated(pairs, aligned, rig)
+        aligned = with_lens_shapes(pairs, aligned, rig)
     result: dict[str, Alignment[FixedFilePx]] = {}
     for pair in pairs:
         progress(pair.name, "measuring", 0.0)
@@ -168,20 +176,45 @@ class PairAligner:
         known = [s for s in starts if model.side(s[0].name) is not None]
         sides = [model.side(pair.name) or 0 for pair, _ in known]
         patches = PATCHES if model.rig is None else FLIGHT_PATCHES
-        self._optimise(
-            known, sides, lambda group, report: refine_with(model.net, group, self.settings.joint, report, patches)
-        )
+
+        def optimised(some: Sequence[Start], of_sides: Sequence[int]) -> Results:
+            return self._optimised(
+                some,
+                of_sides,
+                lambda group, report: refine_with(model.net, group, self.settings.joint, report, patches),
+            )
+
+        results = optimised(known, sides)
+        # Tags may have the wrong scale: descriptors that do not align a seed may align it once windows correct it.
+        again = {k: start for k, r in enumerate(results) if not is_retrieved(r) and (start := corrected(known[k]))}
+        for k, result in zip(again, optimised(list(again.values()), [sides[k] for k in again]), strict=True):
+            results[k] = result if is_retrieved(result) else results[k]
+        self.verify(known, results)
 
     def _learn(self, starts: Sequence[Start], capture: Capture | None, *, scratch: bool) -> None:
         """Align pairs with networks that are learned from scratch."""
-        done = {name for name, a in self.result.items() if not scratch or a.status in ("aligned", "predicted")}
+        limit_px = self.settings.check.accept_predicted_px
+        done = {name for name, a in self.result.items() if not scratch or is_delivered(a, limit_px)}
         remaining = [s for s in starts if s[0].name not in done]
         rig = None if self.model is None else self.model.rig
         if remaining and capture is not None and rig is not None:
-            pairs, limit_px = [pair for pair, _ in starts], self.settings.check.accept_predicted_px
+            pairs = [pair for pair, _ in starts]
             names = bands_to_learn(pairs, self.result, rig, capture, limit_px)
             remaining = [s for s in remaining if s[0].name in names]
-        self._optimise(remaining, [], lambda group, report: align_from_scratch(group, self.settings.joint, report))
+        results = self._optimised(
+            remaining, [], lambda group, report: align_from_scratch(group, self.settings.joint, report)
+        )
+        if all(alignment.mapping.parallax is None for alignment in self.result.values()):
+            self.verify(remaining, results)
+            return
+        # All bands have one relief: it is estimated again, and used if it delivers more of them.
+        before, learned = dict(self.result), {pair.name: r for (pair, _), r in zip(remaining, results, strict=True)}
+        known = [s for s in starts if s[0].name in learned or s[0].name in self.refined]
+        self.verify(known, [learned.get(pair.name) or self.refined[pair.name].result for pair, _ in known])
+        if sum(is_delivered(a, limit_px) for a in self.result.values()) <= sum(
+            is_delivered(a, limit_px) for a in before.values()
+        ):
+            self.result = before
 
     def _align_by_windows(self, starts: Sequence[Start]) -> None:
         """Align by windows the pairs without retrieval of held-out patches."""
@@ -189,16 +222,15 @@ class PairAligner:
             for pair, _ in starts:
                 self.result[pair.name] = aligned_by_windows(pair, self.result[pair.name])
 
-    def _optimise(
+    def _optimised(
         self, starts: Sequence[Start], sides: Sequence[int], align: Callable[[ImageGroup, Progress], Results]
-    ) -> None:
-        """Align the pairs by image group, with the network's `sides`, and verify them."""
-        results: Results = []
-        if starts:
-            report = partial(self.progress, starts[0][0].name)  # with the name of the first pair
-            report("refining", 0.0)
-            results = aligned_groups(image_groups(starts, sides), lambda group: align(group, report))
-        self.verify(starts, results)
+    ) -> Results:
+        """Return the results of the pairs, by image group, with the network's `sides`."""
+        if not starts:
+            return []
+        report = partial(self.progress, starts[0][0].name)  # with the name of the first pair
+        report("refining", 0.0)
+        return aligned_groups(image_groups(starts, sides), lambda group: align(group, report))
 
     def verify(self, starts: Sequence[Start], results: Results) -> None:
         """Combine the results of a capture by MAP estimation and verify each one.
@@ -238,6 +270,18 @@ class PairAligner:
     def _may_be_homography(self) -> bool:
         """False if the user chose a model family with fewer parameters."""
         return self.settings.joint.model_family in ("auto", "homography")
+
+
+def is_delivered(alignment: Alignment[FixedImagePx], limit_px: float) -> bool:
+    """Return True if a band is aligned, or predicted with a standard error of at most the limit."""
+    if alignment.status == "predicted" and alignment.prediction is not None:
+        return alignment.prediction.std_px <= limit_px
+    return alignment.status == "aligned"
+
+
+def is_retrieved(result: JointResult[FixedImagePx] | Issue) -> bool:
+    """Return True if the descriptors distinguish held-out patches."""
+    return isinstance(result, JointResult) and result.retrieval >= max(MIN_RETRIEVAL, MIN_TIMES_CHANCE * result.chance)
 
 
 def aligned_groups(groups: Sequence[tuple[list[int], ImageGroup]], align: Callable[[ImageGroup], Results]) -> Results:

@@ -62,6 +62,10 @@ class BandPair:
     """The moving image has so few pixels that the reference is reduced for it."""
     field: DisplacementField | None = None
     """Displacement field of the lenses by the flight's rig, px of the fixed image; applied before a homography."""
+    is_lens_known: bool = False
+    """The flight's rig contains the mapping of the band in all parts of the image."""
+    relief_std_px: float = 0.0
+    """RMS displacement by the reliefs of the flight, which a homography does not contain, px of the fixed image."""
     layout: tuple[float, float] | None = None
     """Direction (x, y) in which points move in the moving image, relative to the reference, when the scene comes
     nearer, in a unit common to the camera's bands; None if the tags do not contain it."""
@@ -113,6 +117,11 @@ class BandPair:
     def lens_std_px(self) -> NDArray[np.float64]:
         """(4,) standard deviations of the lens shapes that the lenses of the two images do not contain."""
         return lens_std_px(self.fixed.size_px, calibrated=self.space == "undistorted")
+
+    @property
+    def unknown_lens_std_px(self) -> NDArray[np.float64] | None:
+        """(4,) standard deviations of lens shapes that nothing determines; None if a rig does, or without lenses."""
+        return None if self.is_lens_known or "geo" in self.seed_matrices else self.lens_std_px
 
     @property
     def windows(self) -> FixedWindows:
@@ -242,9 +251,12 @@ def _pair(
     field = None if model is None or model.rig is None else model.rig.fields.get(name)
     field = None if field is None else field.rescaled(scales.fixed)
     std_px = _seed_std_px(name, model, scales.fixed)
-    return BandPair(
-        name, reference, moving, reduced, tuple(bands), scales, std_px, is_coarse, field, _layout(band, bands[0])
-    )
+    pair = BandPair(name, reference, moving, reduced, tuple(bands), scales, std_px, is_coarse, field)
+    rig = None if model is None else model.rig
+    if rig is not None and name in rig.mean:
+        relief_px = rig.parallax_px.get(name, MovingFilePx(0.0)) / geometry.magnification(rig.mean[name], *rig.size_px)
+        pair = replace(pair, is_lens_known=rig.covers(name), relief_std_px=relief_px * scales.fixed.mean)
+    return replace(pair, layout=_layout(band, bands[0]))
 
 
 def _layout(reference: Band, moving: Band) -> tuple[float, float] | None:

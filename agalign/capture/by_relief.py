@@ -18,6 +18,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from agalign.capture.band_pair import BandPair
 from agalign.capture.common_parallax import (
     MIN_BANDS,
     MIN_PARALLAX_PX,
@@ -26,7 +27,7 @@ from agalign.capture.common_parallax import (
     consistent_bands,
     layout_of,
 )
-from agalign.capture.decision import decided, predicted_by_windows, without_result
+from agalign.capture.decision import decided, predicted, without_result
 from agalign.capture.warped_pair import Candidate, WarpedPair
 from agalign.errors import GeometryError
 from agalign.fit.adjustment import (
@@ -38,7 +39,6 @@ from agalign.fit.adjustment import (
     are_on_a_line,
     fit_in_rounds,
     parallax_of,
-    variance_px2,
 )
 from agalign.fit.dense import DenseMatching, View, nearer_sign
 from agalign.fit.displacement_field import MIN_WINDOWS
@@ -46,12 +46,11 @@ from agalign.pixels.band_resampling import channel_mean
 from agalign.values.alignment import Alignment, Alignments, JointResult, Residual
 from agalign.values.choices import Geometry, ReliefUse
 from agalign.values.image import FloatImage
-from agalign.values.issues import OTHER_GEOMETRY
+from agalign.values.issues import OTHER_GEOMETRY, Issue
 from agalign.values.mapping import PixelMapping
 from agalign.values.parallax import Parallax, Relief
 from agalign.values.pixel_units import FixedImagePx
-from agalign.verify.checks import BY_PARALLAX, MAX_ALIAS_PEAK, MAX_SHIFT_PX
-from agalign.verify.extrapolation import points_in_frame
+from agalign.verify.checks import BY_PARALLAX, BY_WINDOWS, MAX_ALIAS_PEAK, MAX_SHIFT_PX
 
 _MIN_OBSERVED_SHARE = 0.75
 """Minimum share of aligned windows for an observation of a rig, which contains no depth edges: 0.79 or more in scenes
@@ -117,17 +116,10 @@ class _Band:
 
     @property
     def joint(self) -> JointResult[FixedImagePx]:
-        """The result with the homography of the plane."""
+        """The result with the homography of the plane, which is fitted to windows and verified with others."""
         assert self.covariance_px2 is not None
-        return self.candidate.joint.with_homography(self.plane.fixed_to_moving, self.covariance_px2)
-
-    @property
-    def std_px(self) -> float:
-        """RMS standard error of the plane over the image, with the parts in which the band shows nothing."""
-        assert self.covariance_px2 is not None
-        pair = self.candidate.pair
-        points_px = points_in_frame(self.plane, *pair.sizes_px)
-        return float(np.sqrt(variance_px2(points_px, self.covariance_px2, pair.fixed.size_px).mean()))
+        joint = replace(self.candidate.joint, recipe=BY_WINDOWS)
+        return joint.with_homography(self.plane.fixed_to_moving, self.covariance_px2)
 
     @cached_property
     def by_homography(self) -> Residual[FixedImagePx]:
@@ -139,7 +131,9 @@ class _Band:
         kind: Geometry = "relief" if mapping.field is None else "relief and field"
         p95_px: dict[Geometry, FixedImagePx] = {"homography": self.by_homography.p95_px, kind: held_out.p95_px}
         without = without_result(self.candidate.pair, self.candidate.seed)
-        return decided(replace(without, mapping=mapping, joint=self.joint, residual=held_out, candidates=p95_px))
+        lens_std_px = self.candidate.pair.unknown_lens_std_px
+        measured = replace(without, mapping=mapping, joint=self.joint, residual=held_out, lens_std_px=lens_std_px)
+        return decided(replace(measured, candidates=p95_px))
 
 
 def _observed(group: Sequence[Candidate]) -> Alignments:
@@ -192,7 +186,16 @@ def _aligned_group(group: Sequence[Candidate], candidates: Sequence[Candidate]) 
     result: Alignments = {}
     for band, verifying in zip(estimate.bands, cycle(estimate.from_others), strict=False):
         result |= estimate.alignment(band, verifying)
-    return result | estimate.for_others(candidates) if _is_better(estimate.bands, result) else {}
+    if not _is_better(estimate.bands, result):
+        return {}
+    result |= estimate.for_others(candidates)
+    if not any(c.pair.has_rig for c in group):
+        result |= {
+            name: _with_field(candidate.pair, result[name])
+            for candidate in candidates
+            if (name := candidate.pair.name) in result
+        }
+    return result
 
 
 @dataclass(frozen=True)
@@ -294,7 +297,8 @@ class _Estimate:
         by_others = mapping if verifying is None else band.mapping(verifying, with_occlusions=True)
         warped = WarpedPair.of(pair, by_others, pair.reference.white_windows)
         residual = warped.residual
-        if not warped.issues(band.joint):
+        issues = warped.issues(band.joint)
+        if not issues:
             return {band.name: band.aligned(mapping, residual)}
         is_known = len(residual.measured_px) >= MIN_WINDOWS
         is_known &= residual.median_px <= MAX_SHIFT_PX * pair.file_pixel_size_px
@@ -302,13 +306,27 @@ class _Estimate:
             return {}
         joint = None if candidate.issue is not None else candidate.joint
         by_relief = replace(without_result(pair, candidate.seed), mapping=mapping, joint=joint, residual=residual)
-        return {band.name: predicted_by_windows(by_relief, pair, OTHER_GEOMETRY, band.std_px)}
+        return {band.name: predicted(by_relief, pair, warped.std_px(band.joint), Issue(OTHER_GEOMETRY), *issues)}
+
+
+def _with_field(pair: BandPair, alignment: Alignment[FixedImagePx]) -> Alignment[FixedImagePx]:
+    """Add the displacement field that its relief and lens shapes leave, if held-out windows confirm it."""
+    mapping = alignment.mapping
+    displacement = pair.reference.displacement_field.refine(channel_mean(pair.moving_image), mapping)
+    return replace(alignment, mapping=replace(mapping, field=displacement.field)) if displacement.field else alignment
 
 
 def _is_better(bands: Sequence[_Band], result: Alignments) -> bool:
-    """Return True if a relief aligns half of the bands better than their homographies."""
-    aligned = {name: a.residual for name, a in result.items() if a.status == "aligned" and a.residual is not None}
-    gains = [_gain_px(b.by_homography, aligned[b.name]) if b.name in aligned else -math.inf for b in bands]
+    """Return True if a relief fits half of the bands better than their homographies.
+
+    A band that it predicts counts only if a homography cannot align it: fields follow small parallax better.
+    """
+    gains = []
+    for band in bands:
+        alignment, plane = result.get(band.name), band.by_homography
+        is_fitted = alignment is not None and (alignment.status == "aligned" or plane.p95_px > MAX_SHIFT_PX)
+        known = alignment.residual if alignment is not None and is_fitted else None
+        gains.append(-math.inf if known is None else _gain_px(plane, known))
     return median_high(gains) >= 0
 
 

@@ -18,8 +18,7 @@ from agalign.values.geometry import Matrix
 from agalign.values.issues import Issue
 from agalign.values.parallax import Parallax
 from agalign.values.pixel_units import FixedImagePx, MovingFilePx
-from agalign.verify.checks import MAX_UNEXPECTED_PX, UNEXPECTED_PX, Evidence, issues_of
-from agalign.verify.extrapolation import issues_of_extrapolation, points_in_frame
+from agalign.verify.checks import MAX_UNEXPECTED_PX, OTHER_CONTENT, UNEXPECTED_PX, rig_issues
 
 
 def observed(pairs: Sequence[BandPair], result: Alignments, capture: Capture) -> Observation:
@@ -96,17 +95,8 @@ def _with_prediction(
     if pair.name in known.mappings and alignment.joint is not None and alignment.residual is not None:
         off_px = distance_px(known.mappings[pair.name], prediction.fixed_to_moving, rig.size_px)
         prediction = replace(prediction, off_px=off_px)
-        evidence = Evidence(
-            alignment.joint,
-            alignment.residual,
-            pair.fixed.size_px,
-            prediction=prediction,
-            file_pixel_size_px=pair.file_pixel_size_px,
-        )
-        issues = issues_of(evidence)
-        if parallax is not None:  # a homography under a relief is not combined with the rig
-            in_frame_px = points_in_frame(alignment.mapping, *pair.sizes_px)
-            issues += issues_of_extrapolation(alignment.residual, pair.fixed.size_px, in_frame_px)
+        # The other checks have passed.
+        issues = tuple(rig_issues(prediction))
         if not issues:
             return replace(alignment, prediction=prediction)
         alignment = replace(alignment, issues=issues)
@@ -114,7 +104,10 @@ def _with_prediction(
         # A homography does not follow the relief that captures of the flight have. The plane of a result, which the
         # check above compares, is not displaced by it.
         prediction = _with_added_error(prediction, rig.parallax_px.get(pair.name, MovingFilePx(0.0)))
-    if alignment.prediction is not None and alignment.prediction.std_px <= prediction.std_px:
+    # Windows of another scene contribute to the mapping of the band, but not to the rig's.
+    is_mixed = any(issue.kind == OTHER_CONTENT for issue in alignment.issues)
+    own = None if is_mixed else alignment.prediction
+    if own is not None and own.std_px <= prediction.std_px:
         by_windows = pair.scales.between_files(alignment.fixed_to_moving)
         if distance_px(by_windows, prediction.fixed_to_moving, rig.size_px) <= MAX_UNEXPECTED_PX:
             return alignment

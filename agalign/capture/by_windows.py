@@ -14,7 +14,7 @@ from dataclasses import replace
 import numpy as np
 
 from agalign.capture.band_pair import BandPair
-from agalign.capture.decision import decided
+from agalign.capture.decision import decided, predicted
 from agalign.capture.warped_pair import WarpedPair, result_of_windows
 from agalign.fit.adjustment import WindowFit, fit_in_rounds
 from agalign.flight.rig import Rig
@@ -23,8 +23,8 @@ from agalign.values.alignment import Alignment, Alignments, Residual
 from agalign.values.issues import CORNERS_UNKNOWN, FEW_KEYPOINTS, NO_CONTRAST, RETRIEVAL
 from agalign.values.mapping import PixelMapping
 from agalign.values.pixel_units import FixedImagePx, MovingFilePx
-from agalign.verify.checks import MAX_ALIAS_PEAK, seed_fits
-from agalign.verify.extrapolation import issues_of_extrapolation, points_in_frame
+from agalign.verify.checks import INACCURATE, MAX_ALIAS_PEAK, PREDICTED_WITH, seed_fits
+from agalign.verify.expected_error import points_in_frame, unobserved_quarters
 
 _RELIEF_SHARE = 0.15
 """Standard deviation of the relief of ground without common structure, as a share of its range: crops and trees at low
@@ -70,9 +70,13 @@ def _aligned(pair: BandPair, alignment: Alignment[FixedImagePx]) -> Alignment[Fi
     retrieval, chance = (0.0, 0.0) if alignment.joint is None else (alignment.joint.retrieval, alignment.joint.chance)
     joint = result_of_windows(mapping.fixed_to_moving).with_homography(mapping.fixed_to_moving, fit.covariance_px2)
     joint = replace(joint, retrieval=retrieval, chance=chance, last_step_px=fit.max_px)
-    if replace(warped_pair, residual=held_out).issues(joint):
+    verified = replace(warped_pair, residual=held_out)
+    issues = verified.issues(joint)
+    if not all(issue.kind in PREDICTED_WITH for issue in issues):
         return None
-    return decided(replace(alignment, mapping=mapping, issues=(), joint=joint, residual=held_out))
+    lens_std_px = pair.unknown_lens_std_px
+    result = replace(alignment, mapping=mapping, issues=issues, joint=joint, residual=held_out, lens_std_px=lens_std_px)
+    return predicted(result, pair, verified.std_px(joint)) if issues else decided(result)
 
 
 def _is_consistent(fit: WindowFit) -> bool:
@@ -84,35 +88,35 @@ def _is_consistent(fit: WindowFit) -> bool:
     return count >= min_windows and bool((fit.residuals_px <= max_close_px).sum() >= min_close_share * count)
 
 
-def without_extrapolated(pairs: Sequence[BandPair], result: Alignments, rig: Rig | None = None) -> Alignments:
-    """Return the alignments; those `aligned` but extrapolated over a quarter of the image become `predicted`.
+def with_lens_shapes(pairs: Sequence[BandPair], result: Alignments, rig: Rig | None = None) -> Alignments:
+    """Return the alignments; those that are predicted with a quarter of the image without windows get lens shapes.
 
-    Bands that the rig covers and georeferenced files, which have no lens distortion, are not changed. A homography does
-    not extrapolate relief: the spread of that of the flight, or of unknown relief at the range of the capture, is part
-    of the standard error.
+    A homography does not extrapolate relief: the spread of that of the flight, or of unknown relief at the range of the
+    capture, is part of the standard error.
     """
-    checked, of_range_px = dict(result), _shifts_by_range_px(pairs, result)
+    fitted, of_range_px = dict(result), _shifts_by_range_px(pairs, result)
     for pair in pairs:
-        alignment, size_px = result[pair.name], pair.fixed.size_px
-        is_covered = rig is not None and pair.has_rig_pixels and pair.has_rig and rig.covers(pair.name)
-        of_relief_px = MovingFilePx(0.0)
-        if rig is not None and alignment.mapping.parallax is None:
-            of_relief_px = rig.parallax_px.get(pair.name, MovingFilePx(0.0))
-            is_covered &= of_relief_px <= MovingFilePx(0.0)
-        if alignment.status != "aligned" or alignment.residual is None or "geo" in pair.seed_matrices or is_covered:
+        alignment = result[pair.name]
+        own, residual = alignment.prediction, alignment.residual
+        is_inaccurate = own is not None and [i.kind for i in alignment.issues] == [INACCURATE]
+        if not is_inaccurate or own is None or residual is None or alignment.mapping.parallax is not None:
             continue
-        plane = alignment.mapping.of_the_plane
-        in_frame_px = points_in_frame(plane, *pair.sizes_px)
-        issues = issues_of_extrapolation(alignment.residual, size_px, in_frame_px)
-        if issues:
-            extrapolated = decided(replace(alignment, issues=issues, prediction=None))
-            checked[pair.name] = predicted = _predicted(pair, extrapolated, plane) or extrapolated
-            of_relief_px = max(of_relief_px, MovingFilePx(_RELIEF_SHARE * of_range_px.get(pair.name, 0.0)))
-            if predicted.prediction is not None and of_relief_px > MovingFilePx(0.0):
-                std_px = MovingFilePx(math.hypot(predicted.prediction.std_px, of_relief_px))
-                prediction = replace(predicted.prediction, std_px=std_px, covariance_px2=None)
-                checked[pair.name] = replace(predicted, prediction=prediction)
-    return checked
+        plane, size_px = alignment.mapping.of_the_plane, pair.fixed.size_px
+        if "geo" in pair.seed_matrices or not unobserved_quarters(
+            residual.measured_px, size_px, points_in_frame(plane, *pair.sizes_px)
+        ):
+            continue
+        again = _predicted(pair, alignment, plane)
+        better = (
+            alignment if again is None or again.prediction is None or own.std_px < again.prediction.std_px else again
+        )
+        of_flight_px = MovingFilePx(0.0) if rig is None else rig.parallax_px.get(pair.name, MovingFilePx(0.0))
+        of_relief_px = max(of_flight_px, MovingFilePx(_RELIEF_SHARE * of_range_px.get(pair.name, 0.0)))
+        if better.prediction is not None and of_relief_px > MovingFilePx(0.0):
+            std_px = MovingFilePx(math.hypot(better.prediction.std_px, of_relief_px))
+            better = replace(better, prediction=replace(better.prediction, std_px=std_px, covariance_px2=None))
+        fitted[pair.name] = better
+    return fitted
 
 
 def _shifts_by_range_px(pairs: Sequence[BandPair], result: Alignments) -> dict[str, MovingFilePx]:
@@ -123,7 +127,7 @@ def _shifts_by_range_px(pairs: Sequence[BandPair], result: Alignments) -> dict[s
     """
     layouts, offsets_px = {}, []
     for pair in pairs:
-        if pair.layout is None or "rig" not in pair.seed_matrices or result[pair.name].status != "aligned":
+        if pair.layout is None or "rig" not in pair.seed_matrices or result[pair.name].joint is None:
             continue
         centre = (np.array(pair.reference_file_px) - 1) / 2
         found, at_infinity = result[pair.name].fixed_to_moving, pair.seed_matrices["rig"]

@@ -19,9 +19,9 @@ from agalign.capture.warped_pair import Candidate, WarpedPair
 from agalign.pixels.band_resampling import channel_mean
 from agalign.values.alignment import Alignment, Alignments, JointResult, Seed
 from agalign.values.choices import Geometry, PairStatus, ReliefUse, SeedKind
-from agalign.values.issues import OTHER_GEOMETRY, SEED_DOES_NOT_FIT, Issue, IssueKind
+from agalign.values.issues import OTHER_GEOMETRY, SEED_DOES_NOT_FIT, Issue
 from agalign.values.pixel_units import FixedImagePx, FixedPx
-from agalign.verify.checks import BY_PARALLAX, is_unchanged, seed_fits
+from agalign.verify.checks import BY_PARALLAX, PREDICTED_WITH, is_unchanged, seed_fits
 
 
 def decided(alignment: Alignment[FixedPx], *, is_seed_usable: bool = False) -> Alignment[FixedPx]:
@@ -59,18 +59,15 @@ def at_seed(pair: BandPair, seed: Seed, issues: Sequence[Issue], *, seed_only: b
     return decided(result, is_seed_usable=seed.trusted or seed_only)
 
 
-def predicted_by_windows(
-    alignment: Alignment[FixedImagePx], pair: BandPair, reason: IssueKind | None = None, min_std_px: float = 0.0
+def predicted(
+    alignment: Alignment[FixedImagePx], pair: BandPair, std_px: FixedImagePx, *issues: Issue
 ) -> Alignment[FixedImagePx]:
-    """Return as `predicted` an alignment that its windows do not confirm, or another geometry than that of its capture.
+    """Return as `predicted`, with this standard error, an alignment that its windows do not confirm everywhere.
 
-    The standard error is that of these windows, or `min_std_px` if that is larger.
+    `issues` precede its own.
     """
-    assert alignment.residual is not None
-    issues = alignment.issues if reason is None else (Issue(reason), *alignment.issues)
-    std_px = max(alignment.residual.std_px, FixedImagePx(min_std_px))
     prediction = pair.prediction_of(alignment.mapping, std_px)
-    return decided(replace(alignment, issues=issues, prediction=prediction))
+    return decided(replace(alignment, issues=(*issues, *alignment.issues), prediction=prediction))
 
 
 def of_one_geometry(pairs: Sequence[BandPair], result: Alignments) -> Alignments:
@@ -80,11 +77,12 @@ def of_one_geometry(pairs: Sequence[BandPair], result: Alignments) -> Alignments
     """
     known = [(pair, result[pair.name]) for pair in pairs if pair.name in result]
     with_relief = {id(pair.reference) for pair, alignment in known if alignment.mapping.parallax is not None}
-    mixed = {
-        pair.name: predicted_by_windows(alignment, pair, OTHER_GEOMETRY)
-        for pair, alignment in known
-        if alignment.status == "aligned" and alignment.mapping.parallax is None and id(pair.reference) in with_relief
-    }
+    mixed: Alignments = {}
+    for pair, alignment in known:
+        is_homography = alignment.status == "aligned" and alignment.mapping.parallax is None
+        if is_homography and alignment.joint is not None and id(pair.reference) in with_relief:
+            std_px = WarpedPair.of(pair, alignment.mapping).std_px(alignment.joint)
+            mixed[pair.name] = predicted(alignment, pair, std_px, Issue(OTHER_GEOMETRY))
     return {**result, **mixed}
 
 
@@ -103,11 +101,19 @@ def verified(candidate: Candidate, use: ReliefUse) -> Alignment[FixedImagePx]:
     chosen, issues, p95_px = plane, plane.issues(joint), dict[Geometry, FixedImagePx]()
     if _needs_field(use, issues, has_rig=pair.has_rig):
         chosen, issues, p95_px = _with_field(plane, joint, issues)
-    if issues and chosen is plane:
+    if not all(issue.kind in PREDICTED_WITH for issue in issues):
         return replace(at_seed(pair, seed, issues), joint=joint, candidates=p95_px)
-    size_px, residual = pair.fixed.size_px, chosen.residual
-    alignment = Alignment(chosen.mapping, size_px, "failed", issues, seed, joint, residual, candidates=p95_px)
-    return predicted_by_windows(alignment, pair) if issues else decided(alignment)
+    alignment = replace(
+        without_result(pair, seed),
+        mapping=chosen.mapping,
+        issues=issues,
+        joint=joint,
+        residual=chosen.residual,
+        lens_std_px=pair.unknown_lens_std_px,
+        relief_std_px=pair.relief_std_px,
+        candidates=p95_px,
+    )
+    return predicted(alignment, pair, chosen.std_px(joint)) if issues else decided(alignment)
 
 
 def _with_field(
@@ -115,8 +121,9 @@ def _with_field(
 ) -> tuple[WarpedPair, tuple[Issue, ...], dict[Geometry, FixedImagePx]]:
     """Return the pair with a displacement field, its issues, and the p95 of held-out windows by geometry.
 
-    With a field, the residual is that of held-out windows. The pair and its issues are returned unchanged if it has no
-    significant field, one with issues that a field cannot remove, or one with issues where it has none without.
+    With a field, the residual is that of held-out windows, or of the homography if these, which are smaller, do not
+    pass. The pair and its issues are returned unchanged if it has no field, or one with issues and no smaller standard
+    error.
     """
     pair = plane.pair
     displacement = pair.reference.displacement_field.refine(channel_mean(pair.moving_image), plane.mapping)
@@ -127,11 +134,17 @@ def _with_field(
     if displacement.field is not None:
         displaced = WarpedPair.of(pair, replace(plane.mapping, field=displacement.field), plane.windows)
         held_out = displaced if displacement.held_out is None else replace(displaced, residual=displacement.held_out)
-        # All checks run again, those of windows on all windows and on the held-out ones.
-        remaining = held_out.issues(joint)
-        by_parallax = all(issue.kind in BY_PARALLAX for issue in remaining)
-        if not displaced.issues(joint) and by_parallax and (issues or not remaining):
+        # All checks run again, those of windows on the held-out ones and on all windows.
+        remaining = held_out.issues(joint) or displaced.issues(joint)
+        if not remaining or (
+            issues
+            and all(issue.kind in PREDICTED_WITH for issue in remaining)
+            and held_out.std_px(joint) < plane.std_px(joint)
+        ):
             return held_out, remaining, p95_px
+        if not issues and not displaced.issues(joint):
+            # The homography is verified, and the field reduces the shifts of held-out windows.
+            return replace(displaced, residual=plane.residual), issues, p95_px
     return plane, issues, p95_px
 
 

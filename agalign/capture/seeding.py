@@ -89,6 +89,19 @@ def _best_match(pair: BandPair, model: FlightModel | None, best: Seed) -> Seed:
     return best
 
 
+def corrected(start: Start) -> Start | None:
+    """Return a pair with its seed corrected by windows: the scale of tags may be wrong by several px at the corners.
+
+    None if the windows do not determine a correction, or if it does not fit them better.
+    """
+    pair, seed = start
+    given, *others = _with_corrected(pair, seed.fixed_to_moving)
+    for other in others:
+        if seed_fits(other.residual) and other.is_better_than(given):
+            return pair, replace(seed, fixed_to_moving=other.mapping.fixed_to_moving)
+    return None
+
+
 def _with_corrected(pair: BandPair, fixed_to_moving: Matrix) -> Iterator[WarpedPair]:
     """Yield the pair with a mapping, then with its correction by its windows if these are enough."""
     warped_pair = WarpedPair.of(pair, pair.mapping(fixed_to_moving))

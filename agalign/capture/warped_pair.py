@@ -11,13 +11,13 @@ from agalign.pixels.band_resampling import shrink
 from agalign.pixels.structure import structure_field, windowed_spectra
 from agalign.values import geometry
 from agalign.values.alignment import Alignment, JointResult, Residual, Seed
-from agalign.values.geometry import Matrix
+from agalign.values.geometry import Matrix, Points
 from agalign.values.image import Raster
 from agalign.values.issues import Issue
 from agalign.values.mapping import PixelMapping
 from agalign.values.pixel_units import FixedImagePx
 from agalign.verify.checks import BY_WINDOWS, AliasPeak, Evidence, alias_peak, issues_of
-from agalign.verify.extrapolation import points_in_frame, unobserved_quarters
+from agalign.verify.expected_error import points_in_frame, unobserved_quarters
 
 
 @dataclass(frozen=True)
@@ -94,11 +94,45 @@ class WarpedPair:
         """Return True if the mapping shifted by (x, y), px of the fixed image, agrees with a candidate of the pair."""
         return self.pair.is_expected(self.mapping.fixed_to_moving, shift_px)
 
+    def separate_windows(self) -> Residual[FixedImagePx]:
+        """Return the residual of windows that cover the image once."""
+        usual, is_black = self.pair.windows, self.residual.is_black
+        is_complete = self.windows is usual and is_black.any() and not is_black.all()  # not one half of them
+        return self.residual if is_complete else usual.residuals(self.warped)
+
+    def common_px(self) -> Points:
+        """Return the points (n, 2) of a grid over the reference that the moving image covers.
+
+        Georeferenced rasters have areas without data, which do not count; the image of a camera is complete.
+        """
+        if "geo" in self.pair.seed_matrices:
+            return self.windows.visible_px(self.warped)
+        return points_in_frame(self.mapping, *self.pair.sizes_px)
+
+    def evidence(self, joint: JointResult[FixedImagePx]) -> Evidence[FixedImagePx]:
+        """Return the evidence for a result with this mapping."""
+        pair = self.pair
+        return Evidence(
+            joint,
+            self.residual,
+            pair.fixed.size_px,
+            images=self,
+            field=self.mapping.field,
+            parallax=self.mapping.parallax,
+            lens_std_px=pair.unknown_lens_std_px,
+            relief_std_px=pair.relief_std_px,
+            file_pixel_size_px=pair.file_pixel_size_px,
+        )
+
     def issues(self, joint: JointResult[FixedImagePx]) -> tuple[Issue, ...]:
         """Return the issues of the result with this mapping."""
-        pair = self.pair
-        size_px, pixel_px = pair.fixed.size_px, pair.file_pixel_size_px
-        return issues_of(Evidence(joint, self.residual, size_px, images=self, file_pixel_size_px=pixel_px))
+        return issues_of(self.evidence(joint))
+
+    def std_px(self, joint: JointResult[FixedImagePx]) -> FixedImagePx:
+        """Return the standard error of the mapping: the RMS of the expected error over the visible windows."""
+        points_px = self.common_px()
+        points_px = points_px if len(points_px) else self.residual.centres_px
+        return FixedImagePx(np.sqrt(np.square(self.evidence(joint).error_px(points_px)).mean()))
 
 
 @dataclass(frozen=True)

@@ -15,11 +15,13 @@ from numpy.typing import NDArray
 
 from agalign.pixels.structure import Field, correlation_surfaces
 from agalign.values import geometry, issues
-from agalign.values.alignment import MIN_RETRIEVAL, MIN_TIMES_CHANCE, JointResult, Prediction, Residual
-from agalign.values.geometry import Matrix
+from agalign.values.alignment import MIN_RETRIEVAL, MIN_TIMES_CHANCE, JointResult, Prediction, Residual, noise_px
+from agalign.values.geometry import Matrix, Points
 from agalign.values.issues import RETRIEVAL, TEXTURELESS, UNLIKE, Issue, IssueKind, Remedy
+from agalign.values.mapping import DisplacementField
+from agalign.values.parallax import Parallax
 from agalign.values.pixel_units import SAME_PIXELS, FixedImagePx, FixedPx, PixelScale
-from agalign.verify.extrapolation import EXTRAPOLATED, MIN_COMMON_COVERAGE
+from agalign.verify.expected_error import MIN_COMMON_COVERAGE, error_px
 
 BY_WINDOWS = "windows"
 """Recipe of a result that is fitted to windows; its residual contains the windows that were left out of the fit."""
@@ -28,15 +30,14 @@ MAX_UNEXPECTED_PX = 3.0
 MAX_ALIAS_PEAK = 0.75
 """Ratio of the heights of the next correlation peak and that of the result, above which the scene is repetitive."""
 
-_MAX_CORNER_STD_PX = 2.0
-"""Maximum standard error of the least certain mapped corner: windows near the centre do not verify the corners."""
-_MIN_HELD_OUT_COVERAGE = 0.8
-"""Minimum share of held-out windows with a measured shift, if they are the only evidence. In unrelated images one in a
-thousand is within 1 px."""
-_MIN_COVERAGE = 0.6
-"""Minimum share of the windows with structure that have a measured shift; it is small for unrelated images."""
+_MAX_ERROR_PX, _MIN_ACCURATE_SHARE = 0.5, 0.9
+"""`aligned` means an expected error of at most this in this share of the pixels with texture. Errors of 0.5 px RMS are
+beyond 1 px in 2 % of the pixels."""
 MAX_SHIFT_PX = 1.0
-"""Maximum residual shift of an aligned window, and of the median: beyond it, a spectral index mixes neighbours."""
+"""Maximum residual shift of an aligned window: beyond it, a spectral index mixes neighbours."""
+_MAX_NOISE_STD = 2.0
+"""A window is misaligned if its shift is beyond MAX_SHIFT_PX and this multiple of its noise, added in quadrature; by
+noise alone, 2 % are beyond the multiple."""
 _MIN_CLOSE_SHARE = 0.9
 """Minimum share of aligned windows among the measured ones: a few wrong peaks are normal."""
 _MIN_CLUSTER, _MAX_CLUSTER_SHARE = 5, 0.04
@@ -50,16 +51,30 @@ _PARALLAX = Remedy(
     "fly higher or slower, do not use --relief never; --bands omits a band",
 )
 FOLDS = IssueKind("folds", "the mapping folds or stretches the image", UNLIKE)
-CORNER_STD_PX = IssueKind(
-    "corner_std_px", "the standard error at the corners of the image is {value:.1f} px", TEXTURELESS
+INACCURATE = IssueKind(
+    "inaccurate",
+    "the expected error is above {detail} in {value:.0%} of the image",
+    Remedy(
+        "blur, noise, parallax, or a part of the image without common structure",
+        "look at --error-map; give --model OUT/models/… of a flight that shows the whole image",
+    ),
+)
+OTHER_CONTENT = IssueKind(
+    "other_content",
+    "an area with {value:.0%} of the windows shows something else in this band",
+    Remedy(
+        "a part of the image shows another scene (a file written in part, an object near the camera, waves)",
+        "look at the picture; copy the file from the card again; --bands omits a band",
+    ),
 )
 FEW_WINDOWS = IssueKind("few_windows", "too little common structure to verify the result", TEXTURELESS)
 COVERAGE = IssueKind("coverage", "a shift can be measured in only {value:.1%} of the windows", UNLIKE)
 CLOSE_WINDOWS = IssueKind("close_windows", "only {value:.1%} of the windows are aligned within {detail}", _PARALLAX)
 CLUSTER = IssueKind("cluster", "an area with {value:.0%} of the windows is misaligned", _PARALLAX)
-RESIDUAL_PX = IssueKind("residual_px", "the median residual shift is {value:.1f} px", UNLIKE)
-BY_PARALLAX = frozenset({CLOSE_WINDOWS, CLUSTER, RESIDUAL_PX})
+BY_PARALLAX = frozenset({CLOSE_WINDOWS, CLUSTER, INACCURATE})
 """Issues that parallax may cause, which a relief or a displacement field removes."""
+PREDICTED_WITH = frozenset({*BY_PARALLAX, OTHER_CONTENT})
+"""Issues of a mapping that the images confirm, but not everywhere: it is a prediction with its standard error."""
 UNEXPECTED_PX = IssueKind(
     "unexpected_px",
     "the result is {value:.1f} px from the position that the rig of the flight predicts",
@@ -87,6 +102,12 @@ class AlignedImages(Protocol):
     def is_expected(self, shift_px: tuple[float, float] = (0.0, 0.0)) -> bool:
         """Return True if the mapping shifted by (x, y), px of the fixed image, agrees with tags, flight or user."""
 
+    def separate_windows(self) -> Residual[FixedImagePx]:
+        """Return the residual of windows that cover the image once."""
+
+    def common_px(self) -> Points:
+        """Return the points (n, 2) of a grid over the reference that the moving image covers."""
+
 
 @dataclass(frozen=True)
 class Evidence(Generic[FixedPx]):
@@ -101,8 +122,29 @@ class Evidence(Generic[FixedPx]):
     """None omits the checks that use pixels."""
     prediction: Prediction | None = None
     """Prediction by the rig, with the distance `off_px` of the result; None without a rig."""
+    field: DisplacementField | None = None
+    """Displacement field of the mapping."""
+    parallax: Parallax | None = None
+    """Relief of the mapping."""
+    lens_std_px: NDArray[np.float64] | None = None
+    """(4,) standard deviations of unknown lens shapes; None if the lenses are known."""
+    relief_std_px: float = 0.0
+    """Spread of the relief that a mapping without one lacks."""
     file_pixel_size_px: float = 1.0
     """Size of a pixel of the reference's file on this grid; the limits of residual shifts are in px of the file."""
+
+    def error_px(self, points_px: Points) -> NDArray[np.float64]:
+        """Return the expected error (n,) at points (n, 2)."""
+        return error_px(
+            self.joint.corner_covariance_px2,
+            self.residual,
+            self.size_px,
+            points_px,
+            lens_std_px=self.lens_std_px,
+            field=self.field,
+            parallax=self.parallax,
+            relief_std_px=self.relief_std_px,
+        )
 
 
 def _mapping_issues(evidence: Evidence[FixedPx]) -> Iterator[Issue]:
@@ -113,19 +155,14 @@ def _mapping_issues(evidence: Evidence[FixedPx]) -> Iterator[Issue]:
 
 
 def _descriptor_issues(evidence: Evidence[FixedPx]) -> Iterator[Issue]:
-    """Retrieval of held-out patches, or held-out windows of a result that is fitted to windows; corner errors."""
+    """Retrieval of held-out patches, or held-out windows of a result that is fitted to windows."""
     joint, residual = evidence.joint, evidence.residual
-    min_held_out_windows = 12  # with a measured shift, if they are the only evidence
-    is_confirmed = (
-        joint.recipe == BY_WINDOWS
-        and len(residual.measured_px) >= min_held_out_windows
-        and residual.coverage >= _MIN_HELD_OUT_COVERAGE
-    )
+    # With a measured shift, if they are the only evidence: in unrelated images one in a thousand is aligned.
+    min_held_out_windows = 12
+    is_confirmed = joint.recipe == BY_WINDOWS and len(residual.measured_px) >= min_held_out_windows
     minimum = max(MIN_RETRIEVAL, MIN_TIMES_CHANCE * joint.chance)
     if not (joint.retrieval >= minimum or is_confirmed):
         yield Issue(RETRIEVAL, joint.retrieval, minimum)
-    if not joint.corner_std_px <= _MAX_CORNER_STD_PX:
-        yield Issue(CORNER_STD_PX, joint.corner_std_px, _MAX_CORNER_STD_PX)
 
 
 def _window_issues(evidence: Evidence[FixedPx]) -> Iterator[Issue]:
@@ -135,11 +172,11 @@ def _window_issues(evidence: Evidence[FixedPx]) -> Iterator[Issue]:
     if len(residual.centres_px) < min_windows:
         yield Issue(FEW_WINDOWS, len(residual.centres_px), min_windows)
         return
-    if not residual.coverage >= _MIN_COVERAGE:
-        yield Issue(COVERAGE, residual.coverage, _MIN_COVERAGE)
+    if not residual.coverage >= MIN_COMMON_COVERAGE:
+        yield Issue(COVERAGE, residual.coverage, MIN_COMMON_COVERAGE)
     measured = len(residual.measured_px)
     count = max(measured, 1)
-    is_far = np.linalg.norm(np.nan_to_num(residual.shifts_px), axis=1) > MAX_SHIFT_PX * evidence.file_pixel_size_px
+    is_far = is_misaligned(residual, evidence.file_pixel_size_px)
     close = 1 - float(is_far.sum()) / count
     if not close >= _MIN_CLOSE_SHARE:
         yield Issue(CLOSE_WINDOWS, close, _MIN_CLOSE_SHARE, f"{MAX_SHIFT_PX:g} px")
@@ -147,9 +184,54 @@ def _window_issues(evidence: Evidence[FixedPx]) -> Iterator[Issue]:
     limit = max(_MIN_CLUSTER, round(_MAX_CLUSTER_SHARE * measured))
     if not cluster < limit:
         yield Issue(CLUSTER, cluster / count, limit / count)
-    median_px = residual.median_px / evidence.file_pixel_size_px
-    if not median_px <= MAX_SHIFT_PX:
-        yield Issue(RESIDUAL_PX, median_px, MAX_SHIFT_PX)
+
+
+def is_misaligned(residual: Residual[FixedPx], pixel_px: float = 1.0) -> NDArray[np.bool_]:
+    """Return True (n,) for windows with a shift that neither the limit nor its noise explain.
+
+    `pixel_px` is the size of a pixel of the reference's file on this grid.
+    """
+    lengths_px = np.linalg.norm(np.nan_to_num(residual.shifts_px), axis=1)
+    noise = noise_px(np.maximum(residual.peaks_sigma, 1e-6))
+    return np.asarray(lengths_px > np.hypot(MAX_SHIFT_PX * pixel_px, _MAX_NOISE_STD * noise))
+
+
+def _error_issues(evidence: Evidence[FixedPx]) -> Iterator[Issue]:
+    """The expected error where the reference has texture and both images are valid."""
+    points_px = evidence.residual.centres_px if evidence.images is None else evidence.images.common_px()
+    if len(points_px):
+        max_px = _MAX_ERROR_PX * evidence.file_pixel_size_px
+        share = float((evidence.error_px(points_px) <= max_px).mean())
+        if not share >= _MIN_ACCURATE_SHARE:
+            yield Issue(INACCURATE, 1 - share, 1 - _MIN_ACCURATE_SHARE, f"{_MAX_ERROR_PX:g} px")
+
+
+def _content_issues(evidence: Evidence[FixedPx]) -> Iterator[Issue]:
+    """An area with texture in both bands and no common peak shows something else. Single windows are normal."""
+    if evidence.images is None:
+        return
+    residual = evidence.images.separate_windows()
+    is_lost = ~np.isfinite(residual.shifts_px[:, 0]) | is_misaligned(residual, evidence.file_pixel_size_px)
+    area = _solid_area(residual.cells, is_lost)
+    if area:
+        yield Issue(OTHER_CONTENT, area / len(is_lost), 0.0)
+
+
+def _solid_area(cells: NDArray[np.int64], is_lost: NDArray[np.bool_]) -> int:
+    """Return the number of lost windows in squares of only lost ones, of a side that scattered ones do not fill.
+
+    `cells` are the columns and rows (n, 2) of the windows.
+    """
+    max_chance = 0.01  # that scattered windows fill a square somewhere
+    share = float(is_lost.mean()) if len(is_lost) else 0.0
+    sides = (3, 4, 5)
+    side = next((k for k in sides if len(cells) * share ** (k * k) <= max_chance), None)
+    if share == 0 or side is None:
+        return 0
+    occupied = np.zeros(cells.max(axis=0) + 1, np.uint8)
+    occupied[tuple(cells[is_lost].T)] = 1
+    squares = cv2.morphologyEx(occupied, cv2.MORPH_OPEN, np.ones((side, side), np.uint8), borderValue=0)
+    return int(squares.sum())
 
 
 def _largest_cluster(cells: NDArray[np.int64]) -> int:
@@ -162,10 +244,9 @@ def _largest_cluster(cells: NDArray[np.int64]) -> int:
     return int(statistics[1:, cv2.CC_STAT_AREA].max())
 
 
-def _rig_issues(evidence: Evidence[FixedPx]) -> Iterator[Issue]:
-    """Distance from the prediction by the rig, which detects aliasing in repetitive scenes."""
-    prediction = evidence.prediction
-    if prediction is not None and prediction.off_px is not None:
+def rig_issues(prediction: Prediction) -> Iterator[Issue]:
+    """Distance of a result from the prediction by the rig, which detects aliasing in repetitive scenes."""
+    if prediction.off_px is not None:
         limit_px = max(MAX_UNEXPECTED_PX, _MAX_UNEXPECTED_STD * prediction.std_px)
         if not prediction.off_px <= limit_px:
             yield Issue(UNEXPECTED_PX, prediction.off_px, limit_px)
@@ -216,16 +297,18 @@ class Check(NamedTuple):
 
 CHECKS = (
     Check(_mapping_issues, (FOLDS,)),
-    Check(_descriptor_issues, (CORNER_STD_PX,)),
-    Check(_window_issues, (FEW_WINDOWS, COVERAGE, CLOSE_WINDOWS, CLUSTER, RESIDUAL_PX)),
-    Check(_rig_issues, (UNEXPECTED_PX,)),
+    Check(_descriptor_issues, ()),
+    Check(_window_issues, (FEW_WINDOWS, COVERAGE, CLOSE_WINDOWS, CLUSTER)),
+    Check(_error_issues, (INACCURATE,)),
+    Check(lambda evidence: () if evidence.prediction is None else rig_issues(evidence.prediction), (UNEXPECTED_PX,)),
+    Check(_content_issues, (OTHER_CONTENT,), is_costly=True),
     Check(_repetition_issues, (REPEATS,), is_costly=True),
 )
 """In the order in which their issues are listed; the first issue is the reason in the sidecar."""
 
 KINDS: Mapping[str, IssueKind] = {
     kind.code: kind
-    for kinds in (issues.KINDS, *(check.kinds for check in CHECKS), (EXTRAPOLATED, issues.SEED_DOES_NOT_FIT))
+    for kinds in (issues.KINDS, *(check.kinds for check in CHECKS), (issues.SEED_DOES_NOT_FIT,))
     for kind in kinds
 }
 """Every kind of issue that a sidecar may contain, by code."""

@@ -9,7 +9,7 @@ import pytest
 import agalign
 from agalign.capture import by_windows as module
 from agalign.capture.band_pair import BandPair
-from agalign.capture.by_windows import aligned_by_windows, without_extrapolated
+from agalign.capture.by_windows import aligned_by_windows, with_lens_shapes
 from agalign.capture.decision import at_seed, verified
 from agalign.capture.seeding import find_seed
 from agalign.capture.warped_pair import Candidate
@@ -21,7 +21,7 @@ from agalign.values import geometry
 from agalign.values.alignment import Alignment, Seed
 from agalign.values.issues import RETRIEVAL, UNREADABLE, Issue
 from agalign.verify.checks import FOLDS
-from agalign.verify.extrapolation import expected_error_px
+from agalign.verify.expected_error import expected_error_px
 
 from ..builders import joint_result, pair_of, rms, two_views, whole
 from ..conftest import textured_image
@@ -70,8 +70,11 @@ def test_held_out_windows_must_confirm_the_fit() -> None:
     fixed, moving = two_views(TRUTH, *LARGE)
     moving.pixels[:, 480:] = textured_image(320, 640, seed=5)  # unrelated content
     pair = pair_of(fixed, moving)
-    before = unaligned(pair)
-    assert aligned_by_windows(pair, before) is before
+    after = aligned_by_windows(pair, unaligned(pair))
+    assert (after.status, [issue.code for issue in after.issues]) == ("predicted", ["other_content"])
+    moving.pixels[:] = textured_image(*LARGE, seed=5)
+    before = unaligned(pair_of(fixed, two_views(TRUTH, *LARGE)[1]))
+    assert aligned_by_windows(pair_of(fixed, moving), before) is before
 
 
 # ---- no structure in one half: a prediction with the error of that half
@@ -109,9 +112,7 @@ def aligned(pair: BandPair) -> Alignment:
     seen = points[pair.fixed.valid[points[:, 1].astype(int), points[:, 0].astype(int)]]
     matrix = geometry.fit_homography(seen, true_positions(seen))
     joint = joint_result(matrix, covariance=0.0025 * np.eye(8))
-    result = verified(Candidate.of(pair, Seed("structure", matrix, 20.0), joint), "auto")
-    assert result.status == "aligned"
-    return result
+    return verified(Candidate.of(pair, Seed("structure", matrix, 20.0), joint), "never")
 
 
 @pytest.fixture(scope="module")
@@ -122,15 +123,15 @@ def left() -> tuple[BandPair, Alignment]:
 
 
 def extrapolated(pair: BandPair, before: Alignment, rig: Rig | None = None) -> Alignment:
-    return without_extrapolated([pair], {"moving": before}, rig)["moving"]
+    return with_lens_shapes([pair], {"moving": before}, rig)["moving"]
 
 
 def test_half_of_the_image_is_extrapolated_with_the_lens_and_its_error(left: tuple[BandPair, Alignment]) -> None:
     pair, before = left
     after = extrapolated(pair, before)
     assert (after.status, after.prediction.source) == ("predicted", "windows")
-    assert [issue.code for issue in after.issues] == ["extrapolated"]
-    assert "top right and bottom right" in after.reason
+    assert [issue.code for issue in after.issues] == ["inaccurate"]
+    assert "the expected error is above 0.5 px in" in after.reason
     assert "windows in the image" in after.reason
     points = geometry.lattice(*SIZE, 17, 13)
     errors, homography_errors = (a.map(points) - true_positions(points) for a in (after, before))
@@ -144,8 +145,9 @@ def test_half_of_the_image_is_extrapolated_with_the_lens_and_its_error(left: tup
 
 def test_covered_images_georeferenced_files_and_failed_pairs_are_unchanged(left: tuple[BandPair, Alignment]) -> None:
     pair, before = left
-    failed, everywhere = replace(before, status="failed"), pair_in(WHOLE)
+    failed, everywhere = replace(before, status="failed", prediction=None), pair_in(WHOLE)
     mosaic = replace(pair, seed_matrices={"geo": np.eye(3)})
+    assert aligned(everywhere).status == "aligned"
     for one, alignment in ((everywhere, aligned(everywhere)), (mosaic, before), (pair, failed)):
         assert extrapolated(one, alignment) is alignment
 
@@ -153,21 +155,19 @@ def test_covered_images_georeferenced_files_and_failed_pairs_are_unchanged(left:
 @pytest.mark.parametrize(
     ("facts", "status"),
     [
-        ({}, "aligned"),
-        ({"extrapolation_px": {"moving": 0.7}}, "predicted"),
-        ({"parallax_px": {"moving": 4.0}}, "predicted"),
+        ({"is_lens_known": True}, "aligned"),
+        ({}, "predicted"),
+        ({"is_lens_known": True, "relief_std_px": 4.0}, "predicted"),
     ],
 )
 def test_a_rig_of_the_whole_image_without_relief_prevents_extrapolation(
-    left: tuple[BandPair, Alignment], facts: dict[str, dict[str, float]], status: str
+    left: tuple[BandPair, Alignment], facts: dict[str, object], status: str
 ) -> None:
-    std_px, pair = {"moving": 0.1}, replace(left[0], seed_std_px={"model": 1.0})
-    rig = Rig(SIZE, {"moving": MATRIX}, {"moving": (1.0, 0.0)}, {"moving": 0.0}, std_px, (), (), std_px, **facts)
-    after = extrapolated(pair, left[1], rig)
+    after = aligned(replace(left[0], seed_std_px={"model": 1.0}, **facts))
     assert after.status == status
-    if "parallax_px" in facts:
-        assert after.prediction.std_px > 4.0
-        assert expected_error_px(after, SIZE, np.array([[320.0, 240.0]]))[0] > 3.5
+    if "relief_std_px" in facts:
+        assert after.prediction.std_px > 1.5
+        assert expected_error_px(after, SIZE, np.array([[620.0, 240.0]]))[0] > 3.5
 
 
 @pytest.mark.slow

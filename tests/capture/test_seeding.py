@@ -7,7 +7,7 @@ import pytest
 
 from agalign.capture import seeding
 from agalign.capture.band_pair import BandPair, SeedMatrices
-from agalign.capture.seeding import best_seed, find_rotated, find_seed
+from agalign.capture.seeding import best_seed, corrected, find_rotated, find_seed
 from agalign.capture.tag_seeds import geo_seed
 from agalign.capture.warped_pair import WarpedPair
 from agalign.config import SeedSettings
@@ -53,6 +53,20 @@ def test_a_forced_seed_is_used_whatever_its_score(kind: SeedKind) -> None:
     seed = best(two_views(SHIFTED), candidates, kind)
     assert seed.kind == kind
     np.testing.assert_array_equal(seed.fixed_to_moving, candidates[kind])
+
+
+def test_windows_correct_the_scale_of_a_seed() -> None:
+    """A seed by tags without the scale of the band is wrong by several px at the corners."""
+    truth = geometry.compose(geometry.translation(6.0, -4.0), np.diag([1.012, 1.012, 1.0]))
+    pair = pair_of(*two_views(truth, 800, 640))
+    seed = Seed("rig", geometry.translation(6.0, -4.0), 50.0, trusted=True)
+    again = corrected((pair, seed))
+    assert again is not None
+    assert again[1].kind == "rig"
+    assert geometry.corner_error_px(seed.fixed_to_moving, truth, 800, 640) > 5
+    assert geometry.corner_error_px(again[1].fixed_to_moving, truth, 800, 640) < 0.5
+    unrelated = pair_of(texture(seed=5), texture(seed=6))
+    assert corrected((unrelated, seed)) is None
 
 
 def test_unrelated_images_have_no_trusted_seed_and_no_common_landmarks() -> None:

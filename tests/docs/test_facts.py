@@ -22,11 +22,11 @@ from agalign.cli.terminal import ExitCode
 from agalign.fit import dense, displacement_field, windows
 from agalign.flight import panel_readings
 from agalign.method import refine
-from agalign.pixels import raster
+from agalign.pixels import masks, raster
 from agalign.products.registry import PRODUCTS
 from agalign.products.sidecar.schema import ProductPart
 from agalign.values.alignment import MIN_RETRIEVAL, MIN_TIMES_CHANCE
-from agalign.verify import checks
+from agalign.verify import checks, expected_error
 
 from ..program import agalign_here
 from .blocks import PAGES, ROOT, each_page, text_of
@@ -142,11 +142,13 @@ def test_stages_of_a_capture() -> None:
 LIMITS = {
     "method.md": (
         f"| at least {MIN_RETRIEVAL:g}, and {MIN_TIMES_CHANCE:g} times chance |",
-        f"| {checks._MAX_CORNER_STD_PX:g} px |",
-        f"the textured windows ({windows._WINDOW_PX} px)",
-        f"| {checks._MIN_COVERAGE:.0%} ({checks._MIN_HELD_OUT_COVERAGE:.0%} if".replace("%", " %"),
-        f"| {checks._MIN_CLOSE_SHARE:.0%}; adjacent windows beyond {checks.MAX_SHIFT_PX:g} px: fewer than "
-        f"{checks._MIN_CLUSTER}, or than {checks._MAX_CLUSTER_SHARE:.0%} of the windows |".replace("%", " %"),
+        f"at most {checks._MAX_ERROR_PX:g} px in {checks._MIN_ACCURATE_SHARE:.0%} of the image".replace("%", " %"),
+        f"windows with structure ({windows._WINDOW_PX} px at most)",
+        f"| {expected_error.MIN_COMMON_COVERAGE:.0%} |".replace("%", " %"),
+        f"| {checks._MIN_CLOSE_SHARE:.0%}; adjacent windows beyond: fewer than {checks._MIN_CLUSTER}, or than "
+        f"{checks._MAX_CLUSTER_SHARE:.0%} of the windows |".replace("%", " %"),
+        f"narrower than {masks._MIN_SATURATED_PX} px are not masked",
+        f"standard deviation of {displacement_field._NOISE_PX / displacement_field._SMOOTHNESS**0.5:.2f} px",
         f"| {checks.MAX_ALIAS_PEAK:.0%} of the first".replace("%", " %"),
         f"| the larger of {checks.MAX_UNEXPECTED_PX:g} px and {checks._MAX_UNEXPECTED_STD:g} standard errors |",
         f"in blurred images they have {reference._LARGE_WINDOW_PX} px",

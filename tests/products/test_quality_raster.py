@@ -168,7 +168,7 @@ def test_the_error_of_an_undistorted_pixel_is_that_of_its_raw_one() -> None:
     lens_of_reference = Lens(600, 600, 320, 240, (-0.1, 0.0, 0.0, 0.0, 0.0))
     reference = Band("Green", Path(), 1, *size_px, "uint16", lens=lens_of_reference)
     joint = joint_result(covariance=np.diag(np.arange(1.0, 9.0)))
-    residual = residual_of(np.array([[100.0, 100.0], [300.0, 200.0], [200.0, 400.0], [500.0, 300.0]]), (0.1, 0.1))
+    residual = residual_of(geometry.lattice(*size_px, 8, 6), (0.1, 0.1))
     mapping = PixelMapping(geometry.identity(), lens_of_reference, lens_of_reference)
     alignment = aligned(mapping, size_px, joint=joint, residual=residual)
     raw, undistorted = OutputGrid(0, 0, *size_px), OutputGrid(0, 0, *size_px, undistorted=True)

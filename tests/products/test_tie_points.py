@@ -50,7 +50,7 @@ def test_tie_points_match_the_truth_where_the_alignment_is_off(flight: Path, tmp
         assert np.nanmedian(errors_px[band.band]) < 0.3
         # By its tags alone the band is off by more than that.
         assert np.median([float(r["residual_px"]) for r in own]) > 0.6
-        assert np.median([float(r["weight"]) for r in own]) == pytest.approx(1.0, abs=1e-3)
+        assert np.median([float(r["weight"]) for r in own]) == pytest.approx(1.0, abs=1e-2)
     features = read_json(report.path.with_suffix(".ties.geojson"))["features"]
     assert [f["properties"]["band"] for f in features] == [r["band"] for r in rows]
     x, y = features[0]["geometry"]["coordinates"]

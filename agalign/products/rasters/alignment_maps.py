@@ -30,7 +30,7 @@ from agalign.values.lens import Lens
 from agalign.values.mapping import PixelMapping
 from agalign.values.parallax import Relief, rounded
 from agalign.values.pixel_units import FixedFilePx
-from agalign.verify.extrapolation import expected_error_px
+from agalign.verify.expected_error import expected_error_px
 
 _LATTICE_PX = 16
 """Distance of the nodes at which the error, which is smooth, is calculated."""

