@@ -129,7 +129,7 @@ class WarpedPair:
         return issues_of(self.evidence(joint))
 
     def std_px(self, joint: JointResult[FixedImagePx]) -> FixedImagePx:
-        """Return the standard error of the mapping: the RMS of the expected error over the visible windows."""
+        """Return the standard error of the mapping: the RMS of the expected error over the common area."""
         points_px = self.common_px()
         points_px = points_px if len(points_px) else self.residual.centres_px
         return FixedImagePx(np.sqrt(np.square(self.evidence(joint).error_px(points_px)).mean()))

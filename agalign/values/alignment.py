@@ -78,6 +78,13 @@ class JointResult(Generic[FixedPx]):
         """Standard error of the mapping at the least certain corner: root mean square over both axes together."""
         return cast(FixedPx, max(math.hypot(*std) for std in self.corner_std_xy_px))
 
+    @property
+    def covariance_px2(self) -> NDArray[np.float64]:
+        """The covariance (8, 8) of the corners, or their variances alone where only these are known."""
+        if self.corner_covariance_px2 is not None:
+            return self.corner_covariance_px2
+        return np.diag(np.square(np.ravel(self.corner_std_xy_px)))
+
     def with_homography(self, fixed_to_moving: Matrix, covariance_px2: NDArray[np.float64]) -> "JointResult[FixedPx]":
         """Return the result with another homography and covariance (8, 8) of the corners."""
         std = tuple((float(x), float(y)) for x, y in np.sqrt(np.diag(covariance_px2)).reshape(4, 2))

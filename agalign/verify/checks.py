@@ -136,7 +136,7 @@ class Evidence(Generic[FixedPx]):
     def error_px(self, points_px: Points) -> NDArray[np.float64]:
         """Return the expected error (n,) at points (n, 2)."""
         return error_px(
-            self.joint.corner_covariance_px2,
+            self.joint.covariance_px2,
             self.residual,
             self.size_px,
             points_px,

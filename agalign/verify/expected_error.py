@@ -29,11 +29,7 @@ def points_in_frame(mapping: PixelMapping, size_px: tuple[int, int], moving_size
 
     Sizes are (width, height).
     """
-    return in_frame(geometry.lattice(*size_px, *_LATTICE), mapping, moving_size_px)
-
-
-def in_frame(points_px: Points, mapping: PixelMapping, moving_size_px: tuple[int, int]) -> Points:
-    """Return those of the points (n, 2) of the reference that are mapped into the moving image (width, height)."""
+    points_px = geometry.lattice(*size_px, *_LATTICE)
     mapped = mapping(points_px)
     return points_px[((mapped >= -0.5) & (mapped <= np.subtract(moving_size_px, 0.5))).all(axis=1)]
 
@@ -88,7 +84,7 @@ def expected_error_px(
     if alignment.status == "predicted" and prediction is not None:
         if prediction.covariance_px2 is not None:
             return error_px(prediction.covariance_px2, residual, size_px, points_px, parallax=parallax)
-        if prediction.source != "windows" or joint is None or joint.corner_covariance_px2 is None:
+        if prediction.source != "windows" or joint is None:
             # The standard error is in px of the moving file.
             std_px = prediction.std_px / geometry.magnification(alignment.fixed_to_moving, *size_px)
             is_lost = residual is None or residual.coverage < MIN_COMMON_COVERAGE
@@ -97,7 +93,7 @@ def expected_error_px(
     elif alignment.status != "aligned":
         return np.full(len(points_px), np.inf)
     return error_px(
-        None if joint is None else joint.corner_covariance_px2,
+        None if joint is None else joint.covariance_px2,
         residual,
         size_px,
         points_px,
@@ -168,9 +164,8 @@ def _with_lenses(
     A homography fitted to the windows follows the lens shapes where the windows are, so that their errors cancel there
     and not elsewhere. The windows also limit the shapes that are possible.
     """
-    centres_px = residual.measured_px
-    corners, lenses = (m(centres_px, size_px) for m in (_over_corners, lens_shapes))
-    flat_corners, flat_lenses = corners.reshape(-1, 8), lenses.reshape(-1, 4)
+    flat_corners = geometry.over_corners(residual.measured_px, *size_px).reshape(-1, 8)
+    flat_lenses = lens_shapes(residual.measured_px, size_px).reshape(-1, 4)
     damping = 1e-9 * np.trace(flat_corners.T @ flat_corners) * np.eye(8)
     followed = np.linalg.solve(flat_corners.T @ flat_corners + damping, flat_corners.T @ flat_lenses)
     remaining = flat_lenses - flat_corners @ followed
@@ -183,15 +178,11 @@ def _with_lenses(
     return result
 
 
-def _over_corners(points_px: Points, size_px: tuple[int, int]) -> NDArray[np.float64]:
-    return geometry.over_corners(points_px, *size_px)
-
-
 def _unmodelled_px2(residual: Residual[FixedPx], points_px: Points, far: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the expected squared shift (n,) at points that the mapping does not contain.
 
-    It is that of the nearest windows beyond their noise, by the median, because a single wrong peak is no displacement,
-    and shrunk to that of all windows, which is used alone far from them.
+    It is the median of the nearest windows, so that a single wrong peak does not count, minus their noise. It is shrunk
+    towards the value of all windows, which is used alone far from them.
     """
     is_measured = np.isfinite(residual.shifts_px[:, 0])
     centres, noise_px2 = residual.centres_px[is_measured], np.square(noise_px(residual.peaks_sigma[is_measured]))

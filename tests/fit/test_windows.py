@@ -21,7 +21,7 @@ def spots(share: float, seed: int = 0) -> Mask:
 
 
 def measured(fixed_valid: Mask, moving_valid: Mask) -> np.ndarray:
-    """Errors (n, 2) of the shifts of windows; NaN where there is no peak."""
+    """Return the errors (n, 2) of the measured shifts; NaN for windows without a clear peak."""
     image = textured_image(*SIZE, seed=2)
     matrix = np.array([[1.0, 0, SHIFT_PX[0]], [0, 1, SHIFT_PX[1]]])
     moved = -cv2.warpAffine(image, matrix, SIZE, flags=cv2.INTER_LANCZOS4, borderMode=cv2.BORDER_REFLECT)

@@ -40,6 +40,7 @@ def test_a_good_result_has_no_issues_and_every_check_lists_its_kinds() -> None:
     [
         ({"retrieval": NAN}, {}, "retrieval"),
         ({"corner_covariance_px2": np.full((8, 8), NAN)}, {}, "inaccurate"),
+        ({"corner_std_xy_px": ((float("inf"), 0.1),) * 4}, {}, "inaccurate"),
         ({"fixed_to_moving": np.diag([-1.0, 1, 1])}, {}, "folds"),
         ({}, {"coverage": NAN}, "coverage"),
         ({"retrieval": 0.1}, {"coverage": 0.1}, "retrieval coverage"),
@@ -55,7 +56,7 @@ def test_values_that_are_not_finite_and_mirrored_mappings_are_issues(
 
 def shifted(count_off: int, off_px: float, total: int = 100) -> Residual:
     """A row of windows, some of them misaligned at scattered positions."""
-    centres = np.stack([np.arange(total) * 100.0, np.zeros(total)], axis=1)
+    centres = np.stack([np.linspace(0, SIZE[0] - 1, total), np.zeros(total)], axis=1)
     shifts = np.zeros((total, 2))
     shifts[: 3 * count_off : 3, 0] = off_px
     return replace(residual_of(centres, shifts), median_px=0.0)
