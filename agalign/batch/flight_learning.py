@@ -33,7 +33,7 @@ from agalign.method.fast import learn
 from agalign.method.state import JointState, Progress
 from agalign.pixels.raster import without_warnings
 from agalign.values import geometry
-from agalign.values.alignment import RefinedPair, Residual
+from agalign.values.alignment import Residual
 from agalign.values.capture import Capture
 from agalign.values.geometry import Matrix
 from agalign.values.pixel_units import FixedFilePx, MovingFilePx
@@ -85,10 +85,8 @@ class _FlightLearner:
 
     def learned(self) -> FlightModel | None:
         """Return the model, without a fingerprint."""
-        if self.start is not None:
-            refined = self._refined_by(self.start)
-            if refined is not None:
-                return replace(self.start, refined=refined)
+        if self.start is not None and self._holds(self.start):
+            return self.start
         if len(self.captures) >= MIN_CAPTURES:
             return self._from_captures()
         if self.start is None and self.settings.joint.recipe == "scratch":
@@ -117,8 +115,7 @@ class _FlightLearner:
         if rig is None:
             # A second refinement from the medians reduces the errors.
             return model
-        refined = {refinement_key(one.capture, self.settings): one.refined for one in observations if one.is_aligned}
-        return replace(model, rig=rig, mappings={**medians, **rig.mean}, refined=refined)
+        return replace(model, rig=rig, mappings={**medians, **rig.mean})
 
     @property
     def _bands(self) -> tuple[str, ...]:
@@ -132,23 +129,20 @@ class _FlightLearner:
     def _size_px(self) -> tuple[int, int]:
         return self.captures[0].reference.size_px
 
-    def _refined_by(self, model: FlightModel) -> dict[str, Mapping[str, RefinedPair]] | None:
-        """Return the refined mappings of two captures of the flight by an earlier model; None if it must be learned
-        again.
+    def _holds(self, model: FlightModel) -> bool:
+        """Return True if an earlier model fits this flight, so that none must be learned.
 
-        The model holds if the two captures can be aligned, and its rig predicts each aligned band from the others with
-        a standard error of at most `accept_predicted_px`.
+        It does if two captures can be aligned, and its rig predicts each aligned band from the others with a standard
+        error of at most `accept_predicted_px`.
         """
         if model.rig is None or not set(self._bands) <= set(model.bands):
-            return None
+            return False
         some = [self.captures[len(self.captures) * k // 3] for k in (1, 2)]
         tests = list(filter(None, self.apply(partial(observe_rig, portable(model), self.settings), some)))
         known = [(band, one.observation) for one in tests for band in one.residuals]
         limit_px = self.settings.check.accept_predicted_px
         is_accurate = all(predict_band(model.rig, band, o).std_px <= limit_px for band, o in known)
-        if len(tests) < len(some) or len(known) < len(self._bands) or not is_accurate:
-            return None
-        return {refinement_key(one.capture, self.settings): one.refined for one in tests if one.is_aligned}
+        return len(tests) == len(some) and len(known) >= len(self._bands) and is_accurate
 
     def _network(self) -> tuple[Descriptor, list[LearningCapture]] | None:
         """Return (the network, captures with mappings refined by it); None if no capture can be used.

@@ -15,7 +15,6 @@ from agalign.capture.map_estimate import map_estimate
 from agalign.capture.seeding import Start, corrected, find_seed, image_groups
 from agalign.capture.warped_pair import Candidate, with_metrics
 from agalign.config import Settings
-from agalign.flight.fingerprint import refinement_key
 from agalign.flight.model import FlightModel
 from agalign.method.device import one_thread
 from agalign.method.joint import Results, align_from_scratch, refine_with
@@ -121,34 +120,18 @@ class PairAligner:
     def align(self, pairs: Sequence[BandPair], capture: Capture | None, *, scratch: bool = True) -> Alignments:
         """Take all steps; return the alignments.
 
-        A capture that the model was learned from has refined mappings in the model. Pairs that the flight's network
-        cannot align are learned from scratch, with a rig only those without an accurate prediction; without `scratch`,
-        only pairs that the network does not contain.
+        Pairs that the flight's network cannot align are learned from scratch, with a rig only those without an accurate
+        prediction; without `scratch`, only pairs that the network does not contain.
         """
-        if not self._verify_refined(pairs, capture):
-            starts = self._seeded(pairs)
-            if self.settings.seed.only:
-                self._keep_seeds(starts)
-            else:
-                self.refine(starts)
-                self._learn(starts, capture, scratch=scratch)
-                self._align_by_windows(starts)
-                self.result = of_one_geometry(pairs, self.result)
+        starts = self._seeded(pairs)
+        if self.settings.seed.only:
+            self._keep_seeds(starts)
+        else:
+            self.refine(starts)
+            self._learn(starts, capture, scratch=scratch)
+            self._align_by_windows(starts)
+            self.result = of_one_geometry(pairs, self.result)
         return self.result
-
-    def _verify_refined(self, pairs: Sequence[BandPair], capture: Capture | None) -> bool:
-        """Verify mappings that were refined when the flight was learned; False unless all pairs are aligned by them."""
-        if capture is None or self.model is None:
-            return False
-        known = self.model.refined.get(refinement_key(capture, self.settings), {})
-        if not all(p.name in known and known[p.name].sizes_px == p.sizes_px for p in pairs):
-            return False
-        self.progress(pairs[0].name if pairs else "", "checking", 0.0)
-        self.verify([(pair, known[pair.name].seed) for pair in pairs], [known[pair.name].result for pair in pairs])
-        if all(a.status == "aligned" for a in self.result.values()):
-            return True
-        self.result = {}
-        return False
 
     def _seeded(self, pairs: Sequence[BandPair]) -> list[Start]:
         """Return the pairs with a seed; the other pairs are failed."""

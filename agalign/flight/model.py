@@ -9,7 +9,7 @@ import json
 import os
 import struct
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -20,9 +20,8 @@ from safetensors.torch import save
 from agalign._version import __version__
 from agalign.errors import InputError, is_out_of_memory
 from agalign.flight.rig import Rig
-from agalign.flight.rig_file import refined_from_json, refined_to_json, rig_from_json, rig_to_json
+from agalign.flight.rig_file import rig_from_json, rig_to_json
 from agalign.method.descriptor import Descriptor
-from agalign.values.alignment import RefinedPair
 from agalign.values.files import complete_file, open_regular
 from agalign.values.geometry import Matrix, normalised
 
@@ -44,8 +43,6 @@ class FlightModel:
     """Hash of the captures and settings from which it was learned."""
     rig: Rig | None = None
     """Geometry of the camera; None if too few captures determine it."""
-    refined: Mapping[str, Mapping[str, RefinedPair]] = field(default_factory=dict)
-    """Mappings by band of captures with which it was learned or tested, by `fingerprint.refinement_key`."""
 
     def side(self, band: str) -> int | None:
         """Return the network's side of a moving band; None for an unknown band."""
@@ -67,7 +64,6 @@ def save_model(model: FlightModel, path: Path) -> None:
         "channels": json.dumps(model.net.channels),
         "fingerprint": model.fingerprint,
         "rig": "" if model.rig is None else rig_to_json(model.rig),
-        "refined": refined_to_json(model.refined),
     }
     contents = _with_sorted_header(save(tensors, facts | {"digest": _digest(tensors, facts)}))
     with complete_file(path) as partial:
@@ -107,7 +103,6 @@ def _read_model(path: Path) -> FlightModel:
         mappings={band: normalised(matrix.numpy()) for band, matrix in _with_prefix("mapping.", tensors).items()},
         fingerprint=facts["fingerprint"],
         rig=rig_from_json(facts["rig"], fields) if facts.get("rig") else None,
-        refined=refined_from_json(facts.get("refined", "{}")),
     )
 
 

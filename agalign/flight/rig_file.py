@@ -1,7 +1,6 @@
-"""The rig and the refined mappings of a model file as JSON. The rig can be read without torch, as reports require."""
+"""The rig of a model file as JSON, which can be read without torch, as reports require."""
 
 import json
-import math
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -12,11 +11,8 @@ from safetensors import safe_open
 
 from agalign.errors import InputError
 from agalign.flight.rig import CaptureFactors, Rig
-from agalign.values.alignment import JointResult, RefinedPair, Seed
 from agalign.values.files import open_regular
-from agalign.values.geometry import normalised
 from agalign.values.mapping import DisplacementField
-from agalign.values.pixel_units import FixedImagePx
 
 
 def rig_to_json(rig: Rig) -> str:
@@ -58,37 +54,6 @@ def read_rig(path: Path) -> tuple[str, Rig | None]:
     except Exception as error:  # damaged files raise errors of many classes
         reason = next(iter(str(error).splitlines()), type(error).__name__)
         raise InputError(f"{path}: its rig cannot be read ({reason})") from None
-
-
-def refined_to_json(refined: Mapping[str, Mapping[str, RefinedPair]]) -> str:
-    """Serialise refined mappings by capture and band; numbers are read again exactly."""
-    facts = {
-        key: {
-            # The loss is NaN with a frozen network.
-            band: vars(pair) | {"result": {k: v for k, v in vars(pair.result).items() if k != "loss"}}
-            for band, pair in pairs.items()
-        }
-        for key, pairs in refined.items()
-    }
-    return json.dumps(facts, sort_keys=True, default=_plain)
-
-
-def refined_from_json(text: str) -> dict[str, dict[str, RefinedPair]]:
-    """Deserialise refined mappings. Raises AttributeError, KeyError, TypeError or ValueError for damaged text."""
-    return {key: {band: _pair(facts) for band, facts in of.items()} for key, of in json.loads(text).items()}
-
-
-def _pair(facts: Mapping[str, Any]) -> RefinedPair:
-    seed, result = (
-        {**part, "fixed_to_moving": normalised(part["fixed_to_moving"])} for part in (facts["seed"], facts["result"])
-    )
-    if result["corner_covariance_px2"] is not None:
-        result["corner_covariance_px2"] = np.array(result["corner_covariance_px2"])
-    result["corner_std_xy_px"] = tuple((x, y) for x, y in result["corner_std_xy_px"])
-    result["levels"] = tuple(result["levels"])
-    (fixed_width, fixed_height), (moving_width, moving_height) = facts["sizes_px"]
-    sizes_px = (fixed_width, fixed_height), (moving_width, moving_height)
-    return RefinedPair(Seed(**seed), JointResult[FixedImagePx](loss=math.nan, **result), sizes_px)
 
 
 def _plain(value: Any) -> Any:

@@ -15,7 +15,6 @@ import agalign
 from agalign.batch.capture_task import CaptureReport
 from agalign.batch.flight_learning import learn_flight
 from agalign.cameras.discover import discover
-from agalign.capture import align_bands
 from agalign.capture.align_bands import PairAligner, align_capture_bands, align_pairs
 from agalign.capture.band_pair import BandPair, read_pairs
 from agalign.capture.by_rig import bands_to_learn, with_predictions
@@ -25,12 +24,12 @@ from agalign.products.sidecar.convert import capture_status
 from agalign.synthetic.cameras import BANDS, REDEDGE
 from agalign.synthetic.flight import make_flight
 from agalign.values import geometry
-from agalign.values.alignment import Alignment, Alignments, Prediction, RefinedPair
+from agalign.values.alignment import Alignment, Alignments, Prediction
 from agalign.values.capture import Capture
 from agalign.values.issues import Issue
 from agalign.verify.checks import CLOSE_WINDOWS
 
-from ..conftest import Shared, raising, read_json
+from ..conftest import Shared, read_json
 
 pytestmark = [pytest.mark.slow, pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")]
 SIZE = 400, 300
@@ -134,24 +133,6 @@ def test_a_band_that_its_first_seed_does_not_align_is_part_of_the_rig(
 
     monkeypatch.setattr(PairAligner, "verify", without_nir)
     assert "NIR" in learned(captures).rig.mean
-
-
-def test_mappings_that_learning_refined_are_verified_and_not_refined_again(
-    captures: Captures, model: FlightModel, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Their NIR is noise in the third capture, so learning could not align it."""
-    monkeypatch.setattr(align_bands, "refine_with", raising(AssertionError("refined again")))
-    assert {a.status for a in bands_of(captures[0], model).values()} == {"aligned"}
-
-    def shifted(pair: RefinedPair) -> RefinedPair:
-        matrix = geometry.compose(pair.result.fixed_to_moving, geometry.translation(30.0, 0.0))
-        return replace(pair, result=replace(pair.result, fixed_to_moving=matrix))
-
-    # Mappings of other images do not pass verification.
-    refined = {key: {band: shifted(one) for band, one in pairs.items()} for key, pairs in model.refined.items()}
-    for number, other in ((2, model), (0, replace(model, refined=refined))):
-        with pytest.raises(AssertionError, match="refined again"):
-            bands_of(captures[number], other)
 
 
 def test_a_failed_band_is_predicted_with_a_standard_error(five: Path, captures: Captures, model: FlightModel) -> None:

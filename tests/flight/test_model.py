@@ -1,6 +1,5 @@
 """Model files are read back as written; damaged ones are errors with the name of the file."""
 
-import math
 import os
 import struct
 from dataclasses import asdict, replace
@@ -16,19 +15,12 @@ from agalign.errors import InputError
 from agalign.flight.model import FlightModel, _digest, load_model, save_model
 from agalign.flight.rig_file import read_rig
 from agalign.values import geometry
-from agalign.values.alignment import RefinedPair, Seed
 from agalign.values.mapping import DisplacementField
 from agalign.values.pixel_units import MovingFilePx
 
-from ..builders import joint_result
 from ..conftest import save_known_model
 
 FIELD = DisplacementField(40.0, np.arange(24.0).reshape(3, 4, 2) / 100)
-SEED = Seed("structure", geometry.translation(1 / 3, 0.1), 20.0, 18.0, 2.5, trusted=True)
-RESULTS = [
-    joint_result(geometry.translation(1 / 7, -0.3), std_px=1 / 3, covariance=covariance, loss=math.nan)
-    for covariance in (np.eye(8) / 3, None)
-]
 
 
 def load(path: Path) -> FlightModel:
@@ -37,13 +29,12 @@ def load(path: Path) -> FlightModel:
 
 @pytest.fixture
 def model(tmp_path: Path) -> FlightModel:
-    """A model with a rig, a displacement field and refined mappings."""
+    """A model with a rig and a displacement field."""
     save_known_model(tmp_path / "known.safetensors")
     known = load(tmp_path / "known.safetensors")
     one_band = {"extrapolation_px": MovingFilePx(0.7), "parallax_px": MovingFilePx(3.0), "fields": FIELD}
     rig = replace(known.rig, **{name: {"NIR": value} for name, value in one_band.items()})
-    refined = {f"capture {k}": {"NIR": RefinedPair(SEED, r, ((640, 480), (320, 240)))} for k, r in enumerate(RESULTS)}
-    return replace(known, rig=rig, mappings={"NIR": geometry.translation(3, 4)}, fingerprint="0f", refined=refined)
+    return replace(known, rig=rig, mappings={"NIR": geometry.translation(3, 4)}, fingerprint="0f")
 
 
 @pytest.fixture
