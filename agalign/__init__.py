@@ -53,9 +53,6 @@ if TYPE_CHECKING:
     from agalign.values.alignment import Residual as Residual
     from agalign.values.alignment import Seed as Seed
     from agalign.values.capture import Capture as Capture
-    from agalign.values.pixel_units import FixedFilePx as FixedFilePx
-    from agalign.values.pixel_units import FixedImagePx as FixedImagePx
-    from agalign.values.pixel_units import MovingFilePx as MovingFilePx
 
 _NAMES = {
     "api": "align align_capture align_folder warp_onto",
@@ -70,7 +67,6 @@ _NAMES = {
     "products.sidecar.convert": "read_alignment",
     "values.alignment": "Alignment Prediction Residual Seed",
     "values.capture": "Capture",
-    "values.pixel_units": "FixedFilePx FixedImagePx MovingFilePx",
 }
 """Public names by module. A module is imported at the first use of one of its names (PEP 562): torch takes seconds."""
 _MODULES = {name: module for module, names in _NAMES.items() for name in names.split()}

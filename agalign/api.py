@@ -27,7 +27,6 @@ from agalign.values.capture import Capture
 from agalign.values.choices import Interpolation, SeedKind
 from agalign.values.image import Mask
 from agalign.values.mapping import PixelMapping
-from agalign.values.pixel_units import FixedImagePx
 from agalign.values.processes import end_if_reimported
 
 Progress = Callable[[CaptureReport, int, int], object]
@@ -44,7 +43,7 @@ def align(
     fixed_valid: ArrayLike | None = None,
     moving_valid: ArrayLike | None = None,
     settings: Settings | None = None,
-) -> Alignment[FixedImagePx]:
+) -> Alignment:
     """Estimate the homography between two images of the same scene, which may be of different modalities.
 
     fixed, moving
@@ -76,7 +75,7 @@ def align(
     matrices: SeedMatrices = {"identity": geometry.overlay(fixed_raster.size_px, moving_raster.size_px)}
     if seed is not None:
         matrices = {"user": geometry.normalised(seed)}
-    seed_std: dict[SeedKind, FixedImagePx] = {} if seed_std_px is None else {"user": FixedImagePx(seed_std_px)}
+    seed_std: dict[SeedKind, float] = {} if seed_std_px is None else {"user": float(seed_std_px)}
     pair = BandPair("moving", Reference(fixed_raster), moving_raster, matrices, seed_std_px=seed_std)
     result = with_lens_shapes([pair], align_pairs([pair], settings, quiet))
     return replace(with_metrics(result["moving"], pair), moving_size_px=moving_raster.size_px)
@@ -102,9 +101,7 @@ def warp_onto(
     if isinstance(fixed_to_moving, Alignment):
         raise InputError("an alignment is more than a homography; use its method warp(moving)")
     mapping = PixelMapping(geometry.normalised(fixed_to_moving))
-    by_homography = Alignment[FixedImagePx](
-        mapping, fixed_size_px, "aligned", (), Seed("user", mapping.fixed_to_moving, 0.0)
-    )
+    by_homography = Alignment(mapping, fixed_size_px, "aligned", (), Seed("user", mapping.fixed_to_moving, 0.0))
     return by_homography.warp(moving, valid=valid, interpolation=interpolation)
 
 

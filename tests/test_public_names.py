@@ -20,7 +20,7 @@ from .builders import joint_result, residual_of
 FUNCTIONS = "align align_capture align_folder discover mosaic open_capture open_flight read_alignment warp_onto"
 SETTINGS = "CheckSettings FlightSettings JointSettings ReliefSettings SeedSettings Settings WriteSettings"
 RESULTS = "Alignment Capture CaptureReport FlightReports FolderScan MosaicReport Prediction Residual Seed"
-OPTIONS_AND_UNITS = "DiscoverOptions RunOptions FixedFilePx FixedImagePx MovingFilePx"
+OPTIONS_AND_UNITS = "DiscoverOptions RunOptions float float float"
 ERRORS = """AgalignError ConfigurationError GeometryError InputError NoContrastError NoSuchBandError MemoryLimitError
 NotEnoughTextureError OutputError SidecarError UnreadableFileError WorkerError"""
 

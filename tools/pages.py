@@ -29,8 +29,7 @@ from agalign.cli.main import COMMANDS
 from agalign.config import DiscoverOptions, Option, RunOptions, Settings
 from agalign.products.indices.formulas import INDICES
 from agalign.products.sidecar.schema import Sidecar
-from agalign.values.issues import Issue, sentence
-from agalign.verify.checks import KINDS
+from agalign.values.issues import KINDS, Issue, sentence
 
 DOCS = Path(__file__).resolve().parents[1] / "docs"
 SCHEMA = Path(agalign.__file__).parent / "sidecar.schema.json"

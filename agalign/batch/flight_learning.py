@@ -21,7 +21,7 @@ from agalign.batch.learning_tasks import (
 from agalign.config import Settings
 from agalign.fit.adjustment import lens_std_px
 from agalign.fit.displacement_field import common_field
-from agalign.flight.fingerprint import hashed, refinement_key
+from agalign.flight.fingerprint import learning_fingerprint
 from agalign.flight.groups import flight_camera, flight_lenses
 from agalign.flight.learn_rig import learn_rig
 from agalign.flight.model import FlightModel
@@ -36,7 +36,6 @@ from agalign.values import geometry
 from agalign.values.alignment import Residual
 from agalign.values.capture import Capture
 from agalign.values.geometry import Matrix
-from agalign.values.pixel_units import FixedFilePx, MovingFilePx
 from agalign.values.process_pool import A, Apply, R
 from agalign.verify.expected_error import unmodelled_std_px
 
@@ -69,7 +68,9 @@ def learn_flight(
         return apply(task, arguments)
 
     learned = _FlightLearner(captures, settings, progress, start, apply_in_one_thread, threads).learned()
-    return None if learned is None else replace(learned, fingerprint=learning_fingerprint(captures, settings))
+    return None if learned is None else replace(
+        learned, fingerprint=learning_fingerprint(flight_camera(captures), captures, settings)
+    )
 
 
 @dataclass(frozen=True)
@@ -230,21 +231,19 @@ def _min_observations(observations: Iterable[LearningCapture]) -> int:
     return min(counts.values(), default=0)
 
 
-def _extrapolation_px(
-    rig: Rig, residuals: Mapping[str, Sequence[Residual[FixedFilePx]]], *, calibrated: bool
-) -> dict[str, MovingFilePx]:
+def _extrapolation_px(rig: Rig, residuals: Mapping[str, Sequence[Residual]], *, calibrated: bool) -> dict[str, float]:
     """Return the standard error (px of the band's file) from the lens in parts of the image without measurements.
 
     Only bands with such parts are in the result.
     """
     max_covered_px = 0.15  # windows in all parts leave less unknown
-    result: dict[str, MovingFilePx] = {}
+    result: dict[str, float] = {}
     for band, of_band in residuals.items():
         std_px = unmodelled_std_px(
             Residual.joined(of_band), rig.size_px, lens_std_px(rig.size_px, calibrated=calibrated)
         )
         if std_px > max_covered_px:
-            result[band] = MovingFilePx(std_px * geometry.magnification(rig.mean[band], *rig.size_px))
+            result[band] = float(std_px * geometry.magnification(rig.mean[band], *rig.size_px))
     return result
 
 
@@ -281,6 +280,3 @@ def _layout(captures: Iterable[Capture]) -> dict[str, tuple[float, float]]:
     return result
 
 
-def learning_fingerprint(captures: Sequence[Capture], settings: Settings) -> str:
-    """Return a hash of everything that a learned model depends on: the captures and the settings."""
-    return hashed(flight_camera(captures), *(refinement_key(c, settings) for c in captures))

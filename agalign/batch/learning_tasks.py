@@ -26,7 +26,6 @@ from agalign.pixels.raster import with_saturation_values
 from agalign.values.alignment import MIN_RETRIEVAL, PairScales, RefinedPair, Residual, Seed
 from agalign.values.capture import Capture
 from agalign.values.geometry import Matrix
-from agalign.values.pixel_units import FixedFilePx
 
 
 @contextmanager
@@ -60,7 +59,7 @@ class LearningCapture:
     capture: Capture
     refined: Mapping[str, RefinedPair]
     """Mappings of all bands before they were combined."""
-    residuals: Mapping[str, Residual[FixedFilePx]]
+    residuals: Mapping[str, Residual]
     """Of the aligned bands."""
     observation: Observation
     """The mappings of the aligned bands, for the rig."""

@@ -34,7 +34,6 @@ from agalign.values.capture import Band, Capture
 from agalign.values.issues import SEED_ASKED_FOR, Issue
 from agalign.values.mapping import PixelMapping
 from agalign.values.parallax import Parallax, Relief
-from agalign.values.pixel_units import FixedFilePx, FixedImagePx
 
 PairProgress = Callable[[str, str, float], None]
 """Called with the name of the band, the stage and its completed share, 0 to 1."""
@@ -42,7 +41,7 @@ PairProgress = Callable[[str, str, float], None]
 
 def align_capture_bands(
     capture: Capture, settings: Settings, model: FlightModel | None, progress: PairProgress
-) -> dict[str, Alignment[FixedFilePx]]:
+) -> dict[str, Alignment]:
     """Align every moving band of a capture; return the alignments by band, px of the files.
 
     A band that cannot be read is `failed`; the others are aligned. Raises UnreadableFileError if the reference cannot
@@ -57,7 +56,7 @@ def align_capture_bands(
         aligned = with_predictions(pairs, aligned, rig, capture)
     if not settings.seed.only:
         aligned = with_lens_shapes(pairs, aligned, rig)
-    result: dict[str, Alignment[FixedFilePx]] = {}
+    result: dict[str, Alignment] = {}
     for pair in pairs:
         progress(pair.name, "measuring", 0.0)
         measured = with_metrics(aligned[pair.name], pair, with_ties=settings.write.tie_points)
@@ -75,7 +74,7 @@ def align_capture_bands(
     return {b.name: replace(_as_written(result[b.name], b, relief), seconds=seconds) for b in capture.moving}
 
 
-def _as_written(alignment: Alignment[FixedFilePx], band: Band, relief: Relief | None) -> Alignment[FixedFilePx]:
+def _as_written(alignment: Alignment, band: Band, relief: Relief | None) -> Alignment:
     """Return the alignment of a band with the relief that is written: a reader of the sidecar has the same mapping."""
     mapping = alignment.mapping
     if relief is not None and mapping.parallax is not None:
@@ -83,7 +82,7 @@ def _as_written(alignment: Alignment[FixedFilePx], band: Band, relief: Relief | 
     return replace(alignment, mapping=mapping, moving_size_px=band.size_px)
 
 
-def _between_files(capture: Capture, pair: BandPair, aligned: Alignment[FixedImagePx]) -> Alignment[FixedFilePx]:
+def _between_files(capture: Capture, pair: BandPair, aligned: Alignment) -> Alignment:
     """Convert the alignment of a pair to px of the files of its bands; refine it if the files have more pixels."""
     alignment = aligned.in_file_px(pair.scales, capture.reference.size_px)
     if pair.is_reduced and alignment.status == "aligned":
@@ -255,21 +254,21 @@ class PairAligner:
         return self.settings.joint.model_family in ("auto", "homography")
 
 
-def is_delivered(alignment: Alignment[FixedImagePx], limit_px: float) -> bool:
+def is_delivered(alignment: Alignment, limit_px: float) -> bool:
     """Return True if a band is aligned, or predicted with a standard error of at most the limit."""
     if alignment.status == "predicted" and alignment.prediction is not None:
         return alignment.prediction.std_px <= limit_px
     return alignment.status == "aligned"
 
 
-def is_retrieved(result: JointResult[FixedImagePx] | Issue) -> bool:
+def is_retrieved(result: JointResult | Issue) -> bool:
     """Return True if the descriptors distinguish held-out patches."""
     return isinstance(result, JointResult) and result.retrieval >= max(MIN_RETRIEVAL, MIN_TIMES_CHANCE * result.chance)
 
 
 def aligned_groups(groups: Sequence[tuple[list[int], ImageGroup]], align: Callable[[ImageGroup], Results]) -> Results:
     """Align groups of images, each with the indices of its pairs; return the results in the order of the pairs."""
-    results: dict[int, JointResult[FixedImagePx] | Issue] = {}
+    results: dict[int, JointResult | Issue] = {}
     for indices, group in groups:
         results |= zip(indices, align(group), strict=True)
     return [results[i] for i in sorted(results)]

@@ -29,7 +29,7 @@ from agalign.values.geometry import Matrix
 from agalign.values.image import Raster
 from agalign.values.issues import NO_SUCH_SEED, UNREADABLE, Issue
 from agalign.values.mapping import DisplacementField, PixelMapping
-from agalign.values.pixel_units import FixedFilePx, FixedImagePx, MovingFilePx, PixelScale
+from agalign.values.pixel_units import PixelScale
 
 SeedMatrices = Mapping[SeedKind, Matrix]
 """fixed_to_moving homographies between undistorted pixels, in order of preference."""
@@ -56,7 +56,7 @@ class BandPair:
     """The moving bands: one, or three of an RGB image; empty for arrays."""
     scales: PairScales = SAME_SCALES
     """Scales of the two images relative to their files."""
-    seed_std_px: Mapping[SeedKind, FixedImagePx] = dataclasses.field(default_factory=dict)
+    seed_std_px: Mapping[SeedKind, float] = dataclasses.field(default_factory=dict)
     """Standard errors of these, where known."""
     is_coarse: bool = False
     """The moving image has so few pixels that the reference is reduced for it."""
@@ -90,9 +90,9 @@ class BandPair:
         return 1.0 if self.is_coarse else min(self.scales.fixed)
 
     @property
-    def max_shift_px(self) -> FixedImagePx:
+    def max_shift_px(self) -> float:
         """Maximum distance of a result from its seed; infinite unless the user specified the seed."""
-        return self.seed_std_px.get("user", FixedImagePx(math.inf)) * _MAX_ERROR_STD
+        return self.seed_std_px.get("user", float(math.inf)) * _MAX_ERROR_STD
 
     @property
     def has_rig(self) -> bool:
@@ -163,7 +163,7 @@ class BandPair:
         mapped_px = geometry.apply(shifted, centre_px)
         for kind in self.seed_std_px.keys() & self.seed_matrices.keys():
             expected_px = geometry.apply(geometry.invert(self.seed_matrices[kind]), mapped_px)
-            if FixedImagePx(np.linalg.norm(expected_px - centre_px)) <= self.seed_std_px[kind] * _MAX_ERROR_STD:
+            if float(np.linalg.norm(expected_px - centre_px)) <= self.seed_std_px[kind] * _MAX_ERROR_STD:
                 return True
         return False
 
@@ -174,7 +174,7 @@ class BandPair:
         return width, height
 
     def prediction_of(
-        self, mapping: PixelMapping, std_px: FixedImagePx, covariance_px2: NDArray[np.float64] | None = None
+        self, mapping: PixelMapping, std_px: float, covariance_px2: NDArray[np.float64] | None = None
     ) -> Prediction:
         """Return the prediction of a mapping between the images with this standard error.
 
@@ -184,11 +184,11 @@ class BandPair:
         error_px = self.in_moving_file_px(std_px, matrix)
         return Prediction(self.scales.between_files(matrix), "windows", error_px, covariance_px2=covariance_px2)
 
-    def in_moving_file_px(self, distance_px: FixedImagePx, fixed_to_moving: Matrix) -> MovingFilePx:
+    def in_moving_file_px(self, distance_px: float, fixed_to_moving: Matrix) -> float:
         """Convert a distance in the fixed image to the moving file, for a homography between the images."""
         between_files = self.scales.between_files(fixed_to_moving)
         magnification = geometry.magnification(between_files, *self.reference_file_px)
-        return MovingFilePx(distance_px / min(self.scales.fixed) * magnification)
+        return float(distance_px / min(self.scales.fixed) * magnification)
 
 
 def read_pairs(
@@ -254,7 +254,7 @@ def _pair(
     pair = BandPair(name, reference, moving, reduced, tuple(bands), scales, std_px, is_coarse, field)
     rig = None if model is None else model.rig
     if rig is not None and name in rig.mean:
-        relief_px = rig.parallax_px.get(name, MovingFilePx(0.0)) / geometry.magnification(rig.mean[name], *rig.size_px)
+        relief_px = rig.parallax_px.get(name, 0.0) / geometry.magnification(rig.mean[name], *rig.size_px)
         pair = replace(pair, is_lens_known=rig.covers(name), relief_std_px=relief_px * scales.fixed.mean)
     return replace(pair, layout=_layout(band, bands[0]))
 
@@ -281,17 +281,17 @@ def longest_for(reference: Band, fixed_to_moving: Matrix) -> int:
     return min(_LONGEST_SIDE_PX, max(side_px, min_side_px))
 
 
-def _seed_std_px(band: str, model: FlightModel | None, scale: PixelScale) -> dict[SeedKind, FixedImagePx]:
+def _seed_std_px(band: str, model: FlightModel | None, scale: PixelScale) -> dict[SeedKind, float]:
     """Return the standard errors of mappings by tags and of the flight's mean; `scale` is of the fixed image."""
     tags_std_px = 5.0  # errors on five cameras have a median of 2 px and a maximum of 12 px (docs/cameras.md)
-    result: dict[SeedKind, FixedImagePx] = dict.fromkeys(("rig", "centre"), FixedImagePx(tags_std_px * scale.x))
+    result: dict[SeedKind, float] = dict.fromkeys(("rig", "centre"), float(tags_std_px * scale.x))
     if model is not None and model.rig is not None and band in model.rig.mean:
         mean, rig = model.rig.mean[band], model.rig
         # The errors of a rig are in px of the band's own file.
         ratio = geometry.magnification(mean, *rig.size_px)
-        error_px = FixedFilePx(unobserved_error_px(rig, band, by_neighbours=False) / ratio)
+        error_px = float(unobserved_error_px(rig, band, by_neighbours=False) / ratio)
         min_std_px = 1.0  # of the mean: captures differ by this in height and tilt
-        result["model"] = FixedImagePx(max(error_px, min_std_px) * scale.x)
+        result["model"] = float(max(error_px, min_std_px) * scale.x)
     return result
 
 

@@ -49,7 +49,6 @@ from agalign.values.image import FloatImage
 from agalign.values.issues import OTHER_GEOMETRY, Issue
 from agalign.values.mapping import PixelMapping
 from agalign.values.parallax import Parallax, Relief
-from agalign.values.pixel_units import FixedImagePx
 from agalign.verify.checks import BY_PARALLAX, BY_WINDOWS, MAX_ALIAS_PEAK, MAX_SHIFT_PX
 
 _MIN_OBSERVED_SHARE = 0.75
@@ -115,21 +114,21 @@ class _Band:
         )
 
     @property
-    def joint(self) -> JointResult[FixedImagePx]:
+    def joint(self) -> JointResult:
         """The result with the homography of the plane, which is fitted to windows and verified with others."""
         assert self.covariance_px2 is not None
         joint = replace(self.candidate.joint, recipe=BY_WINDOWS)
         return joint.with_homography(self.plane.fixed_to_moving, self.covariance_px2)
 
     @cached_property
-    def by_homography(self) -> Residual[FixedImagePx]:
+    def by_homography(self) -> Residual:
         """Of the held-out windows with the homography of the candidate."""
         return self.candidate.held_out_residual(self.candidate.warped.mapping)
 
-    def aligned(self, mapping: PixelMapping, held_out: Residual[FixedImagePx]) -> Alignment[FixedImagePx]:
+    def aligned(self, mapping: PixelMapping, held_out: Residual) -> Alignment:
         """Return the alignment by a mapping with a relief that passes verification in held-out windows."""
         kind: Geometry = "relief" if mapping.field is None else "relief and field"
-        p95_px: dict[Geometry, FixedImagePx] = {"homography": self.by_homography.p95_px, kind: held_out.p95_px}
+        p95_px: dict[Geometry, float] = {"homography": self.by_homography.p95_px, kind: held_out.p95_px}
         without = without_result(self.candidate.pair, self.candidate.seed)
         lens_std_px = self.candidate.pair.unknown_lens_std_px
         measured = replace(without, mapping=mapping, joint=self.joint, residual=held_out, lens_std_px=lens_std_px)
@@ -155,7 +154,7 @@ def _observed(group: Sequence[Candidate]) -> Alignments:
         return {}
     warped = [band.candidate.pair.warped_moving(band.plane) for band in bands]
     residuals = [reference.white_windows.residuals(image) for image in warped]
-    windows, result = WindowShifts.of(residuals, [band.plane for band in bands]), dict[str, Alignment[FixedImagePx]]()
+    windows, result = WindowShifts.of(residuals, [band.plane for band in bands]), dict[str, Alignment]()
     if not windows.are_enough(MIN_WINDOWS):
         return {}
     relief = windows.relief(parallax_of(windows.shifts_px, model.baselines, windows.weights), reference.grey.size_px)
@@ -309,7 +308,7 @@ class _Estimate:
         return {band.name: predicted(by_relief, pair, warped.std_px(band.joint), Issue(OTHER_GEOMETRY), *issues)}
 
 
-def _with_field(pair: BandPair, alignment: Alignment[FixedImagePx]) -> Alignment[FixedImagePx]:
+def _with_field(pair: BandPair, alignment: Alignment) -> Alignment:
     """Add the displacement field that its relief and lens shapes leave, if held-out windows confirm it."""
     mapping = alignment.mapping
     displacement = pair.reference.displacement_field.refine(channel_mean(pair.moving_image), mapping)
@@ -330,7 +329,7 @@ def _is_better(bands: Sequence[_Band], result: Alignments) -> bool:
     return median_high(gains) >= 0
 
 
-def _gain_px(plane: Residual[FixedImagePx], relief: Residual[FixedImagePx]) -> float:
+def _gain_px(plane: Residual, relief: Residual) -> float:
     """Return the decrease of the p95 of held-out windows by a relief, minus the increase of their median.
 
     If most windows are on the reference plane, the noise of the relief increases the median by some hundredths of a px.

@@ -15,15 +15,14 @@ from agalign.flight.rig_prediction import predict_band
 from agalign.values.alignment import MIN_TIMES_CHANCE, Alignment, Alignments, Prediction
 from agalign.values.capture import Capture
 from agalign.values.geometry import Matrix
-from agalign.values.issues import Issue
+from agalign.values.issues import OTHER_CONTENT, UNEXPECTED_PX, Issue
 from agalign.values.parallax import Parallax
-from agalign.values.pixel_units import FixedImagePx, MovingFilePx
-from agalign.verify.checks import MAX_UNEXPECTED_PX, OTHER_CONTENT, UNEXPECTED_PX, rig_issues
+from agalign.verify.checks import MAX_UNEXPECTED_PX, rig_issues
 
 
 def observed(pairs: Sequence[BandPair], result: Alignments, capture: Capture) -> Observation:
     """Return the aligned mappings of a capture as an observation of the rig."""
-    mappings, std_px, parallax_px = dict[str, Matrix](), dict[str, MovingFilePx](), dict[str, MovingFilePx]()
+    mappings, std_px, parallax_px = dict[str, Matrix](), dict[str, float](), dict[str, float]()
     for pair in pairs:
         alignment = result[pair.name]
         if alignment.status != "aligned" or alignment.joint is None:
@@ -32,7 +31,7 @@ def observed(pairs: Sequence[BandPair], result: Alignments, capture: Capture) ->
         mappings[pair.name] = pair.scales.between_files(matrix)
         std_px[pair.name] = pair.in_moving_file_px(alignment.joint.corner_std_px, matrix)
         if parallax is not None:
-            rms_px = FixedImagePx(parallax.relief.rms_px * math.hypot(*parallax.baseline))
+            rms_px = float(parallax.relief.rms_px * math.hypot(*parallax.baseline))
             parallax_px[pair.name] = pair.in_moving_file_px(rms_px, matrix)
     return Observation(capture.time_s, mappings, std_px, capture.altitude_m, capture.motion, parallax_px)
 
@@ -55,7 +54,7 @@ def with_predictions(pairs: Sequence[BandPair], result: Alignments, rig: Rig, ca
 
 def _parallax_by_rig(
     pair: BandPair, parallaxes: Sequence[tuple[BandPair, Parallax | None]], rig: Rig
-) -> tuple[Parallax | None, FixedImagePx]:
+) -> tuple[Parallax | None, float]:
     """Return the relief of the other bands with the baseline of the rig, scaled to theirs, and its standard error.
 
     The error is that of the baseline and of the relief in half of the pixels; the error map has those at depth edges.
@@ -67,7 +66,7 @@ def _parallax_by_rig(
         if parallax is not None and other is not pair and other.reference is pair.reference
     }
     if not others:
-        return None, FixedImagePx(0.0)
+        return None, 0.0
     relief = next(iter(others.values())).relief
     seen = np.array([parallax.baseline for parallax in others.values()])
     of_rig = np.array([rig.baselines[name] for name in others])
@@ -75,17 +74,17 @@ def _parallax_by_rig(
     error = float(np.sqrt(((seen - scale * of_rig) ** 2).sum(axis=1).mean()))
     x, y = (scale * np.array(rig.baselines[pair.name])).tolist()
     of_relief = 0.0 if relief.std_px is None else float(np.median(relief.std_px)) * relief.unit * math.hypot(x, y)
-    return Parallax(relief, (x, y)).with_occlusions(), FixedImagePx(math.hypot(error * relief.rms_px, of_relief))
+    return Parallax(relief, (x, y)).with_occlusions(), float(math.hypot(error * relief.rms_px, of_relief))
 
 
 def _with_prediction(
     pair: BandPair,
-    alignment: Alignment[FixedImagePx],
+    alignment: Alignment,
     rig: Rig,
     known: Observation,
     parallax: Parallax | None,
-    parallax_std_px: FixedImagePx,
-) -> Alignment[FixedImagePx]:
+    parallax_std_px: float,
+) -> Alignment:
     """Return the alignment with its distance from the rig's prediction, which replaces it if that contradicts it or is
     more certain.
     """
@@ -103,7 +102,7 @@ def _with_prediction(
     if parallax is None:
         # A homography does not follow the relief that captures of the flight have. The plane of a result, which the
         # check above compares, is not displaced by it.
-        prediction = _with_added_error(prediction, rig.parallax_px.get(pair.name, MovingFilePx(0.0)))
+        prediction = _with_added_error(prediction, rig.parallax_px.get(pair.name, 0.0))
     # Windows of another scene contribute to the mapping of the band, but not to the rig's.
     is_mixed = any(issue.kind == OTHER_CONTENT for issue in alignment.issues)
     own = None if is_mixed else alignment.prediction
@@ -114,9 +113,7 @@ def _with_prediction(
     return _predicted(pair, alignment, prediction, parallax)
 
 
-def _predicted(
-    pair: BandPair, alignment: Alignment[FixedImagePx], prediction: Prediction, parallax: Parallax | None
-) -> Alignment[FixedImagePx]:
+def _predicted(pair: BandPair, alignment: Alignment, prediction: Prediction, parallax: Parallax | None) -> Alignment:
     """Return the alignment with the mapping of the prediction, unless the image is rotated or scaled relative to it."""
     mapping = pair.mapping(pair.scales.between_images(prediction.fixed_to_moving))
     by_rig = WarpedPair.of(pair, mapping.with_parallax(parallax))
@@ -129,8 +126,8 @@ def _predicted(
     return decided(replace(alignment, mapping=alignment.of_the_seed, issues=issues, prediction=None, residual=None))
 
 
-def _with_added_error(prediction: Prediction, error_px: MovingFilePx) -> Prediction:
-    return replace(prediction, std_px=MovingFilePx(math.hypot(prediction.std_px, error_px)))
+def _with_added_error(prediction: Prediction, error_px: float) -> Prediction:
+    return replace(prediction, std_px=float(math.hypot(prediction.std_px, error_px)))
 
 
 def bands_to_learn(
@@ -154,7 +151,7 @@ def bands_to_learn(
         has_common_structure = alignment.seed.trusted or is_retrieved
         prediction = predict_band(rig, pair.name, known)
         if not has_relief:
-            prediction = _with_added_error(prediction, rig.parallax_px.get(pair.name, MovingFilePx(0.0)))
+            prediction = _with_added_error(prediction, rig.parallax_px.get(pair.name, 0.0))
         return not has_common_structure or prediction.std_px <= accept_predicted_px
 
     return {pair.name for pair in pairs if not is_skipped(pair)}

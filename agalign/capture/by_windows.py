@@ -20,10 +20,9 @@ from agalign.fit.adjustment import WindowFit, fit_in_rounds
 from agalign.flight.rig import Rig
 from agalign.values import geometry
 from agalign.values.alignment import Alignment, Alignments, Residual
-from agalign.values.issues import CORNERS_UNKNOWN, FEW_KEYPOINTS, NO_CONTRAST, RETRIEVAL
+from agalign.values.issues import CORNERS_UNKNOWN, FEW_KEYPOINTS, INACCURATE, NO_CONTRAST, RETRIEVAL
 from agalign.values.mapping import PixelMapping
-from agalign.values.pixel_units import FixedImagePx, MovingFilePx
-from agalign.verify.checks import INACCURATE, MAX_ALIAS_PEAK, PREDICTED_WITH, seed_fits
+from agalign.verify.checks import MAX_ALIAS_PEAK, PREDICTED_WITH, seed_fits
 from agalign.verify.expected_error import points_in_frame, unobserved_quarters
 
 _RELIEF_SHARE = 0.15
@@ -33,7 +32,7 @@ _MAX_STEP_PX = 16.0
 """Maximum displacement of a corner; larger ones contradict the seed."""
 
 
-def aligned_by_windows(pair: BandPair, alignment: Alignment[FixedImagePx]) -> Alignment[FixedImagePx]:
+def aligned_by_windows(pair: BandPair, alignment: Alignment) -> Alignment:
     """Return an alignment by windows if the descriptors failed and held-out windows confirm it.
 
     Else return the prediction of a coarse band by windows that agree with its trusted seed, or else `alignment`.
@@ -48,7 +47,7 @@ def aligned_by_windows(pair: BandPair, alignment: Alignment[FixedImagePx]) -> Al
     return result or alignment
 
 
-def _aligned(pair: BandPair, alignment: Alignment[FixedImagePx]) -> Alignment[FixedImagePx] | None:
+def _aligned(pair: BandPair, alignment: Alignment) -> Alignment | None:
     # With other issues, the descriptors of sharp images have a result that may contradict the windows.
     of_descriptors = {RETRIEVAL, FEW_KEYPOINTS, NO_CONTRAST, CORNERS_UNKNOWN}
     descriptors_failed = pair.is_blurred or any(issue.kind in of_descriptors for issue in alignment.issues)
@@ -110,16 +109,16 @@ def with_lens_shapes(pairs: Sequence[BandPair], result: Alignments, rig: Rig | N
         better = (
             alignment if again is None or again.prediction is None or own.std_px < again.prediction.std_px else again
         )
-        of_flight_px = MovingFilePx(0.0) if rig is None else rig.parallax_px.get(pair.name, MovingFilePx(0.0))
-        of_relief_px = max(of_flight_px, MovingFilePx(_RELIEF_SHARE * of_range_px.get(pair.name, 0.0)))
-        if better.prediction is not None and of_relief_px > MovingFilePx(0.0):
-            std_px = MovingFilePx(math.hypot(better.prediction.std_px, of_relief_px))
+        of_flight_px = 0.0 if rig is None else rig.parallax_px.get(pair.name, 0.0)
+        of_relief_px = max(of_flight_px, float(_RELIEF_SHARE * of_range_px.get(pair.name, 0.0)))
+        if better.prediction is not None and of_relief_px > 0.0:
+            std_px = float(math.hypot(better.prediction.std_px, of_relief_px))
             better = replace(better, prediction=replace(better.prediction, std_px=std_px, covariance_px2=None))
         fitted[pair.name] = better
     return fitted
 
 
-def _shifts_by_range_px(pairs: Sequence[BandPair], result: Alignments) -> dict[str, MovingFilePx]:
+def _shifts_by_range_px(pairs: Sequence[BandPair], result: Alignments) -> dict[str, float]:
     """Return by band the shift of the aligned scene, at its range, from one at an infinite distance.
 
     The rig tags contain the mappings at infinity. Their errors have no common direction: the shift is the part of the
@@ -136,15 +135,12 @@ def _shifts_by_range_px(pairs: Sequence[BandPair], result: Alignments) -> dict[s
         offsets_px.append(at_centre[0] - at_centre[1])
     along, known = np.ravel(offsets_px), np.ravel(list(layouts.values()))
     common_px = max(0.0, float(along @ known)) / max(float(known @ known), 1e-12)
-    return {name: MovingFilePx(common_px * float(np.linalg.norm(layout))) for name, layout in layouts.items()}
+    return {name: float(common_px * float(np.linalg.norm(layout))) for name, layout in layouts.items()}
 
 
 def _predicted(
-    pair: BandPair,
-    alignment: Alignment[FixedImagePx],
-    start: PixelMapping,
-    is_accepted: Callable[[WindowFit], bool] = lambda _: True,
-) -> Alignment[FixedImagePx] | None:
+    pair: BandPair, alignment: Alignment, start: PixelMapping, is_accepted: Callable[[WindowFit], bool] = lambda _: True
+) -> Alignment | None:
     """Return the alignment as `predicted` by a homography and lens shapes, which replace the field of `start`."""
     size_px, to_file = pair.fixed.size_px, pair.scales.fixed.inverse
     fitted = fit_in_rounds(
@@ -154,13 +150,13 @@ def _predicted(
         return None
     mapping, fit = fitted
     to_file_px = np.r_[np.tile(to_file, 4), np.full(4, to_file.mean)]
-    std_px = FixedImagePx(fit.std_px(points_in_frame(mapping, *pair.sizes_px)))
+    std_px = float(fit.std_px(points_in_frame(mapping, *pair.sizes_px)))
     prediction = pair.prediction_of(mapping, std_px, fit.covariance_px2 * np.outer(to_file_px, to_file_px))
     residual = WarpedPair.of(pair, mapping).residual
     return decided(replace(alignment, mapping=mapping, residual=residual, prediction=prediction))
 
 
-def _measured(pair: BandPair, mapping: PixelMapping) -> Residual[FixedImagePx]:
+def _measured(pair: BandPair, mapping: PixelMapping) -> Residual:
     if pair.is_coarse:
         return pair.reference.overlapping_windows.residuals(pair.warped_moving(mapping))
     return WarpedPair.of(pair, mapping).residual

@@ -10,7 +10,6 @@ from agalign.capture.warped_pair import Candidate
 from agalign.fit.adjustment import Adjustment, WindowShifts, adjust, are_of_lenses, are_on_a_line
 from agalign.fit.displacement_field import MIN_WINDOWS
 from agalign.values.alignment import MIN_RETRIEVAL, Residual
-from agalign.values.pixel_units import FixedImagePx
 
 MIN_BANDS = 2
 """Minimum number of moving lenses: a relief is verified with the other lenses."""
@@ -50,7 +49,7 @@ def common_parallax_px(group: Sequence[Candidate]) -> tuple[float, bool]:
     return parallax_px, layout_of([group[band] for band in bands]) is None and are_on_a_line(model.baselines)
 
 
-def _common_residuals(group: Sequence[Candidate]) -> list[Residual[FixedImagePx]]:
+def _common_residuals(group: Sequence[Candidate]) -> list[Residual]:
     """Return the residuals of all bands in the same windows: large ones if any band is blurred, else the smallest that
     the residual of any band uses.
     """

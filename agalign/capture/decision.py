@@ -20,11 +20,10 @@ from agalign.pixels.band_resampling import channel_mean
 from agalign.values.alignment import Alignment, Alignments, JointResult, Seed
 from agalign.values.choices import Geometry, PairStatus, ReliefUse, SeedKind
 from agalign.values.issues import OTHER_GEOMETRY, SEED_DOES_NOT_FIT, Issue
-from agalign.values.pixel_units import FixedImagePx, FixedPx
 from agalign.verify.checks import BY_PARALLAX, PREDICTED_WITH, is_unchanged, seed_fits
 
 
-def decided(alignment: Alignment[FixedPx], *, is_seed_usable: bool = False) -> Alignment[FixedPx]:
+def decided(alignment: Alignment, *, is_seed_usable: bool = False) -> Alignment:
     """Return the alignment with its status.
 
     A `prediction` together with issues is one of the mapping. `is_seed_usable` is for the mapping of a seed.
@@ -42,12 +41,12 @@ def decided(alignment: Alignment[FixedPx], *, is_seed_usable: bool = False) -> A
     return replace(alignment, status=status, issues=issues)
 
 
-def without_result(pair: BandPair, seed: Seed, *issues: Issue) -> Alignment[FixedImagePx]:
+def without_result(pair: BandPair, seed: Seed, *issues: Issue) -> Alignment:
     """Return a failed alignment with the mapping of a seed."""
     return decided(Alignment(pair.mapping(seed.fixed_to_moving), pair.fixed.size_px, "failed", issues, seed))
 
 
-def at_seed(pair: BandPair, seed: Seed, issues: Sequence[Issue], *, seed_only: bool = False) -> Alignment[FixedImagePx]:
+def at_seed(pair: BandPair, seed: Seed, issues: Sequence[Issue], *, seed_only: bool = False) -> Alignment:
     """Return an alignment with the mapping of the seed, which is usable if it is trusted or with `seed_only`."""
     expected = min(
         ((std_px, kind) for kind, std_px in pair.seed_std_px.items() if kind in pair.seed_matrices), default=None
@@ -59,9 +58,7 @@ def at_seed(pair: BandPair, seed: Seed, issues: Sequence[Issue], *, seed_only: b
     return decided(result, is_seed_usable=seed.trusted or seed_only)
 
 
-def predicted(
-    alignment: Alignment[FixedImagePx], pair: BandPair, std_px: FixedImagePx, *issues: Issue
-) -> Alignment[FixedImagePx]:
+def predicted(alignment: Alignment, pair: BandPair, std_px: float, *issues: Issue) -> Alignment:
     """Return as `predicted`, with this standard error, an alignment that its windows do not confirm everywhere.
 
     `issues` precede its own.
@@ -86,7 +83,7 @@ def of_one_geometry(pairs: Sequence[BandPair], result: Alignments) -> Alignments
     return {**result, **mixed}
 
 
-def verified(candidate: Candidate, use: ReliefUse) -> Alignment[FixedImagePx]:
+def verified(candidate: Candidate, use: ReliefUse) -> Alignment:
     """Verify a candidate; return its alignment with status, px of the images.
 
     With issues it has the mapping of the seed. `use` is "never" for no displacement field.
@@ -98,7 +95,7 @@ def verified(candidate: Candidate, use: ReliefUse) -> Alignment[FixedImagePx]:
     plane = candidate.warped.with_mapping(pair.mapping(joint.fixed_to_moving))
     if candidate.by_halves is not None and joint is candidate.joint:
         plane = plane.cross_validated(candidate.by_halves)
-    chosen, issues, p95_px = plane, plane.issues(joint), dict[Geometry, FixedImagePx]()
+    chosen, issues, p95_px = plane, plane.issues(joint), dict[Geometry, float]()
     if _needs_field(use, issues, has_rig=pair.has_rig):
         chosen, issues, p95_px = _with_field(plane, joint, issues)
     if not all(issue.kind in PREDICTED_WITH for issue in issues):
@@ -117,8 +114,8 @@ def verified(candidate: Candidate, use: ReliefUse) -> Alignment[FixedImagePx]:
 
 
 def _with_field(
-    plane: WarpedPair, joint: JointResult[FixedImagePx], issues: tuple[Issue, ...]
-) -> tuple[WarpedPair, tuple[Issue, ...], dict[Geometry, FixedImagePx]]:
+    plane: WarpedPair, joint: JointResult, issues: tuple[Issue, ...]
+) -> tuple[WarpedPair, tuple[Issue, ...], dict[Geometry, float]]:
     """Return the pair with a displacement field, its issues, and the p95 of held-out windows by geometry.
 
     With a field, the residual is that of held-out windows, or of the homography if these, which are smaller, do not
@@ -127,10 +124,7 @@ def _with_field(
     """
     pair = plane.pair
     displacement = pair.reference.displacement_field.refine(channel_mean(pair.moving_image), plane.mapping)
-    p95_px: dict[Geometry, FixedImagePx] = {
-        "homography": displacement.before_p95_px,
-        "field": displacement.after_p95_px,
-    }
+    p95_px: dict[Geometry, float] = {"homography": displacement.before_p95_px, "field": displacement.after_p95_px}
     if displacement.field is not None:
         displaced = WarpedPair.of(pair, replace(plane.mapping, field=displacement.field), plane.windows)
         held_out = displaced if displacement.held_out is None else replace(displaced, residual=displacement.held_out)
@@ -158,7 +152,7 @@ def _needs_field(use: ReliefUse, issues: tuple[Issue, ...], *, has_rig: bool) ->
     return only_parallax and (use == "always" or (use == "auto" and (bool(issues) or not has_rig)))
 
 
-def _unchanged_if_aligned(joint: JointResult[FixedImagePx], pair: BandPair) -> JointResult[FixedImagePx]:
+def _unchanged_if_aligned(joint: JointResult, pair: BandPair) -> JointResult:
     """Replace the mapping by the one given by the files if it does not differ significantly.
 
     Input that is aligned already is returned unchanged instead of resampled by a small shift.

@@ -25,7 +25,6 @@ from agalign.values.capture import Band
 from agalign.values.image import Raster, Tile
 from agalign.values.issues import UNREADABLE, Issue
 from agalign.values.mapping import PixelMapping
-from agalign.values.pixel_units import FixedFilePx
 from agalign.verify.checks import Evidence, issues_of
 
 _TILE_PX = 640
@@ -36,7 +35,7 @@ _Tiles = Sequence[tuple[Tile, FixedWindows]]
 """Tiles with the windows of the reference."""
 
 
-def at_full_resolution(reference: Band, moving: Band, alignment: Alignment[FixedFilePx]) -> Alignment[FixedFilePx]:
+def at_full_resolution(reference: Band, moving: Band, alignment: Alignment) -> Alignment:
     """Refine an alignment between the files of two bands that was estimated on reduced images.
 
     It is returned unchanged if the tiles have too little structure or the refined one does not pass verification. It is
@@ -63,8 +62,8 @@ def _windows(source: OpenRaster, reference: Band, tile: Tile) -> FixedWindows:
 
 
 def _refined(
-    alignment: Alignment[FixedFilePx], moving: Band, for_fit: _Tiles, held_out: _Tiles, size_px: tuple[int, int]
-) -> Alignment[FixedFilePx] | None:
+    alignment: Alignment, moving: Band, for_fit: _Tiles, held_out: _Tiles, size_px: tuple[int, int]
+) -> Alignment | None:
     """Return the alignment fitted to half of the tiles, with its covariance and the residual of the other half.
 
     None if the median shift of that half does not decrease or a check finds an issue. Raises UnreadableFileError.
@@ -93,7 +92,7 @@ def _refined(
     return replace(alignment, mapping=mapping, joint=joint, residual=after, ties=ties, prediction=prediction)
 
 
-def _tiles(reference: Band, alignment: Alignment[FixedFilePx]) -> tuple[list[Tile], list[Tile]]:
+def _tiles(reference: Band, alignment: Alignment) -> tuple[list[Tile], list[Tile]]:
     """Return, for each cell, a tile around the window with the highest peak in the reduced images, by colour."""
     residual, size_px = alignment.residual, reference.size_px
     if residual is None:
@@ -118,9 +117,9 @@ def _side(centre_px: float, length_px: int, cells: int) -> tuple[int, int, int]:
     return cell, int(np.clip(centre_px - side / 2, first, end - side)), side
 
 
-def _residual(moving: Band, mapping: PixelMapping, tiles: _Tiles) -> Residual[FixedFilePx]:
+def _residual(moving: Band, mapping: PixelMapping, tiles: _Tiles) -> Residual:
     """Measure the residual of the windows of all tiles, px of the reference's file. Raises UnreadableFileError."""
-    parts = [(np.empty((0, 2)), np.empty((0, 2)), np.empty(0), np.empty((0, 2), np.int64))]
+    parts = [Residual(np.empty((0, 2)), np.empty((0, 2)), np.empty(0), np.empty((0, 2), np.int64))]
     with open_raster(moving.path, moving.page) as source:
         for tile, windows in tiles:
             warped = resample_tile(moving, mapping, tile, "lanczos", dataset=source)
@@ -128,8 +127,8 @@ def _residual(moving: Band, mapping: PixelMapping, tiles: _Tiles) -> Residual[Fi
             origin_px = np.array([tile.x0, tile.y0])
             centres_px = part.centres_px + origin_px
             cells = (centres_px // windows.side).astype(np.int64)  # windows share no pixels, so each has its own
-            parts.append((centres_px, part.shifts_px, part.peaks_sigma, cells))
-    return Residual[FixedFilePx].of(*map(np.concatenate, zip(*parts, strict=True)))
+            parts.append(replace(part, centres_px=centres_px, cells=cells))
+    return Residual.joined(parts)
 
 
 def _raster(pixels: np.ndarray, valid: np.ndarray, band: Band) -> Raster:

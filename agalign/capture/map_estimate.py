@@ -23,15 +23,11 @@ from agalign.flight.rig_prediction import predict_band
 from agalign.values import geometry
 from agalign.values.alignment import JointResult, Prediction, Residual
 from agalign.values.least_squares import Robust, least_squares
-from agalign.values.pixel_units import FixedImagePx
 
 
 def map_estimate(
-    pairs: Sequence[BandPair],
-    results: Mapping[str, JointResult[FixedImagePx]],
-    residuals: Mapping[str, Residual[FixedImagePx]],
-    rig: Rig | None,
-) -> dict[str, JointResult[FixedImagePx]]:
+    pairs: Sequence[BandPair], results: Mapping[str, JointResult], residuals: Mapping[str, Residual], rig: Rig | None
+) -> dict[str, JointResult]:
     """Return the results by band with the MAP estimates of the homographies and their covariances.
 
     `residuals` are those of the results. Results without a covariance are returned unchanged.
@@ -52,9 +48,7 @@ def map_estimate(
     return estimates
 
 
-def _by_images(
-    pair: BandPair, result: JointResult[FixedImagePx], residual: Residual[FixedImagePx]
-) -> JointResult[FixedImagePx]:
+def _by_images(pair: BandPair, result: JointResult, residual: Residual) -> JointResult:
     """Combine descriptors and windows. The windows are ignored if they are too few or their correction is too large."""
     assert result.corner_covariance_px2 is not None
     fit = fit_windows(pair.mapping(result.fixed_to_moving), residual, pair.fixed.size_px)
@@ -66,7 +60,7 @@ def _by_images(
     return _displaced(pair, result, covariance @ of_windows @ fit.corners_px, covariance)
 
 
-def _with_prior(pair: BandPair, result: JointResult[FixedImagePx], prior: Prediction) -> JointResult[FixedImagePx]:
+def _with_prior(pair: BandPair, result: JointResult, prior: Prediction) -> JointResult:
     """Combine a result with the rig's prediction. Errors of the prediction with equal mean square over the image are
     equally likely.
     """
@@ -75,7 +69,7 @@ def _with_prior(pair: BandPair, result: JointResult[FixedImagePx], prior: Predic
     corners = geometry.corners(*size_px)
     expected = geometry.apply(pair.scales.between_images(prior.fixed_to_moving), corners)
     delta_px = (geometry.apply(to_fixed, expected) - corners).ravel()
-    std_px = prior.std_px / pair.in_moving_file_px(FixedImagePx(1.0), result.fixed_to_moving)
+    std_px = prior.std_px / pair.in_moving_file_px(1.0, result.fixed_to_moving)
     over = geometry.over_corners(lattice(size_px)[0], *size_px)
     information = 8 / std_px**2 * np.einsum("nki,nkj->ij", over, over) / len(over)
     whitening = np.linalg.cholesky(information).T
@@ -91,7 +85,7 @@ def _with_prior(pair: BandPair, result: JointResult[FixedImagePx], prior: Predic
 
 
 def _displaced(
-    pair: BandPair, result: JointResult[FixedImagePx], delta_px: NDArray[np.float64], covariance: NDArray[np.float64]
-) -> JointResult[FixedImagePx]:
+    pair: BandPair, result: JointResult, delta_px: NDArray[np.float64], covariance: NDArray[np.float64]
+) -> JointResult:
     moved = geometry.moving_corners(delta_px, *pair.fixed.size_px)
     return result.with_homography(geometry.compose(result.fixed_to_moving, moved), covariance)

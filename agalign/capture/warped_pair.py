@@ -15,7 +15,6 @@ from agalign.values.geometry import Matrix, Points
 from agalign.values.image import Raster
 from agalign.values.issues import Issue
 from agalign.values.mapping import PixelMapping
-from agalign.values.pixel_units import FixedImagePx
 from agalign.verify.checks import BY_WINDOWS, AliasPeak, Evidence, alias_peak, issues_of
 from agalign.verify.expected_error import points_in_frame, unobserved_quarters
 
@@ -29,7 +28,7 @@ class WarpedPair:
     warped: Raster
     """The moving image, one channel, on the grid of the reference."""
     windows: FixedWindows
-    residual: Residual[FixedImagePx]
+    residual: Residual
     """Of these windows."""
 
     @classmethod
@@ -94,7 +93,7 @@ class WarpedPair:
         """Return True if the mapping shifted by (x, y), px of the fixed image, agrees with a candidate of the pair."""
         return self.pair.is_expected(self.mapping.fixed_to_moving, shift_px)
 
-    def separate_windows(self) -> Residual[FixedImagePx]:
+    def separate_windows(self) -> Residual:
         """Return the residual of windows that cover the image once."""
         usual, is_black = self.pair.windows, self.residual.is_black
         is_complete = self.windows is usual and is_black.any() and not is_black.all()  # not one half of them
@@ -109,7 +108,7 @@ class WarpedPair:
             return self.windows.visible_px(self.warped)
         return points_in_frame(self.mapping, *self.pair.sizes_px)
 
-    def evidence(self, joint: JointResult[FixedImagePx]) -> Evidence[FixedImagePx]:
+    def evidence(self, joint: JointResult) -> Evidence:
         """Return the evidence for a result with this mapping."""
         pair = self.pair
         return Evidence(
@@ -124,15 +123,15 @@ class WarpedPair:
             file_pixel_size_px=pair.file_pixel_size_px,
         )
 
-    def issues(self, joint: JointResult[FixedImagePx]) -> tuple[Issue, ...]:
+    def issues(self, joint: JointResult) -> tuple[Issue, ...]:
         """Return the issues of the result with this mapping."""
         return issues_of(self.evidence(joint))
 
-    def std_px(self, joint: JointResult[FixedImagePx]) -> FixedImagePx:
+    def std_px(self, joint: JointResult) -> float:
         """Return the standard error of the mapping: the RMS of the expected error over the common area."""
         points_px = self.common_px()
         points_px = points_px if len(points_px) else self.residual.centres_px
-        return FixedImagePx(np.sqrt(np.square(self.evidence(joint).error_px(points_px)).mean()))
+        return float(np.sqrt(np.square(self.evidence(joint).error_px(points_px)).mean()))
 
 
 @dataclass(frozen=True)
@@ -141,7 +140,7 @@ class Candidate:
 
     pair: BandPair
     seed: Seed
-    joint: JointResult[FixedImagePx]
+    joint: JointResult
     """Without evidence of descriptors, at the seed, if the optimisation has no result."""
     warped: WarpedPair
     issue: Issue | None = None
@@ -150,17 +149,17 @@ class Candidate:
     """Homographies from half of the windows (`WarpedPair.cross_validated`)."""
 
     @classmethod
-    def of(cls, pair: BandPair, seed: Seed, result: JointResult[FixedImagePx] | Issue) -> "Candidate":
+    def of(cls, pair: BandPair, seed: Seed, result: JointResult | Issue) -> "Candidate":
         """Measure the windows with the homography of a result."""
         issue = result if isinstance(result, Issue) else None
         joint = result_of_windows(seed.fixed_to_moving) if isinstance(result, Issue) else result
         return cls(pair, seed, joint, WarpedPair.of(pair, pair.mapping(joint.fixed_to_moving)), issue)
 
-    def fit_residual(self, mapping: PixelMapping) -> Residual[FixedImagePx]:
+    def fit_residual(self, mapping: PixelMapping) -> Residual:
         """Measure the windows of the fit with a mapping."""
         return self.pair.reference.black_windows.residuals(self._warped(mapping))
 
-    def held_out_residual(self, mapping: PixelMapping) -> Residual[FixedImagePx]:
+    def held_out_residual(self, mapping: PixelMapping) -> Residual:
         """Measure the windows that take no part in the fit."""
         return self.pair.reference.white_windows.residuals(self._warped(mapping))
 
@@ -168,15 +167,13 @@ class Candidate:
         return self.warped.warped if mapping is self.warped.mapping else self.pair.warped_moving(mapping)
 
 
-def result_of_windows(fixed_to_moving: Matrix) -> JointResult[FixedImagePx]:
+def result_of_windows(fixed_to_moving: Matrix) -> JointResult:
     """Return a result without evidence of descriptors, with an infinite standard error."""
     std = ((math.inf, math.inf),) * 4
     return JointResult(fixed_to_moving, math.nan, 0.0, 0.0, 0, (1.0,), BY_WINDOWS, "homography", 0.0, std)
 
 
-def with_metrics(
-    alignment: Alignment[FixedImagePx], pair: BandPair, *, with_ties: bool = False
-) -> Alignment[FixedImagePx]:
+def with_metrics(alignment: Alignment, pair: BandPair, *, with_ties: bool = False) -> Alignment:
     """Return the alignment with similarity metrics before (image borders overlaid) and after alignment.
 
     `with_ties` also measures windows under the final mapping: small ones if parallax varies within large ones.

@@ -122,11 +122,10 @@ def _learn(
     from agalign.evaluation.descriptor_learning import learn_descriptor, read_rough_pairs
     from agalign.flight.model import save_model
     from agalign.values.alignment import Alignment
-    from agalign.values.pixel_units import FixedImagePx
 
     aligned = 0
 
-    def on_pair(name: str, result: Alignment[FixedImagePx]) -> None:
+    def on_pair(name: str, result: Alignment) -> None:
         nonlocal aligned
         aligned += result.status == "aligned"
         text = f"{name}: {result.status}" + (f" ({result.reason})" if result.reason else "")

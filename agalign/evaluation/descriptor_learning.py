@@ -28,7 +28,6 @@ from agalign.method.state import JointState, MovingImage
 from agalign.values import geometry
 from agalign.values.alignment import Alignment
 from agalign.values.geometry import Matrix
-from agalign.values.pixel_units import FixedImagePx
 
 _Example = tuple[Level, Keypoints]
 """A pair at full resolution, and the keypoints of the first image that both show."""
@@ -39,7 +38,7 @@ def learn_descriptor(
     settings: Settings,
     *,
     steps_a_pair: int = 200,
-    on_pair: Callable[[str, Alignment[FixedImagePx]], None] = lambda *_: None,
+    on_pair: Callable[[str, Alignment], None] = lambda *_: None,
 ) -> FlightModel:
     """Return a model with one network for all pairs, which must have the same numbers of channels.
 

@@ -34,7 +34,7 @@ from agalign.values.geometry import Points
 from agalign.values.least_squares import MIN_SHIFT_SCALE_PX, Robust, cauchy_weights, least_squares, shift_scale_px
 from agalign.values.mapping import DisplacementField, PixelMapping
 from agalign.values.parallax import Parallax, Relief
-from agalign.values.pixel_units import FixedImagePx, FixedPx, PixelScale
+from agalign.values.pixel_units import PixelScale
 
 Array = NDArray[np.float64]
 
@@ -154,7 +154,7 @@ def variance_px2(points_px: Points, covariance_px2: Array, size_px: tuple[int, i
 
 def fit_windows(
     mapping: PixelMapping,
-    residual: Residual[FixedPx],
+    residual: Residual,
     size_px: tuple[int, int],
     lens_std_px: Array | None = None,
     *,
@@ -213,7 +213,7 @@ def _with_parallax(design: Array, parallax_px: Array) -> Array:
 
 def fit_in_rounds(
     mapping: PixelMapping,
-    measure: Callable[[PixelMapping], Residual[FixedPx]],
+    measure: Callable[[PixelMapping], Residual],
     size_px: tuple[int, int],
     is_accepted: Callable[[WindowFit], bool] = lambda _: True,
     lens_std_px: Array | None = None,
@@ -264,11 +264,7 @@ class WindowShifts:
 
     @classmethod
     def of(
-        cls,
-        residuals: Sequence[Residual[FixedImagePx]],
-        mappings: Sequence[PixelMapping],
-        *,
-        with_lens_shapes: bool = False,
+        cls, residuals: Sequence[Residual], mappings: Sequence[PixelMapping], *, with_lens_shapes: bool = False
     ) -> "WindowShifts":
         """Collect the windows of each band, measured with its mapping; all bands have the same grid of windows.
 
@@ -309,7 +305,7 @@ class WindowShifts:
         nearest = parallax_px[cKDTree(self.centres_px).query(centres_px)[1]].reshape(shape).astype(np.float32)
         return Relief(nearest, np.ones_like(nearest), scale)
 
-    def shifts_of(self, residual: Residual[FixedImagePx], shifts_px: Array) -> Array:
+    def shifts_of(self, residual: Residual, shifts_px: Array) -> Array:
         """Select from the shifts (n, 2) of all windows those of the windows of a band."""
         return np.asarray(shifts_px[cKDTree(self.centres_px).query(residual.centres_px)[1]])
 

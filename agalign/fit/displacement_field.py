@@ -24,7 +24,6 @@ from agalign.values.geometry import Points
 from agalign.values.image import Mask, Raster
 from agalign.values.least_squares import cauchy_weights, shift_scale_px
 from agalign.values.mapping import DisplacementField, PixelMapping
-from agalign.values.pixel_units import FixedImagePx
 
 _WINDOW_PX = 40
 """Side of the windows in which shifts are measured. On reference tie points of three cameras, smaller ones are as
@@ -51,9 +50,9 @@ class DisplacementResult:
     """A displacement field, and its effect on the residual of held-out windows; no field if it does not reduce it."""
 
     field: DisplacementField | None
-    before_p95_px: FixedImagePx
-    after_p95_px: FixedImagePx
-    held_out: Residual[FixedImagePx] | None = None
+    before_p95_px: float
+    after_p95_px: float
+    held_out: Residual | None = None
     """Residual of held-out windows: each field is fitted without the window and those that overlap it."""
 
 
@@ -85,7 +84,7 @@ class DisplacementEstimator:
             before_px = 0.0 if field is None else field(shifts.centres_px)
             total = shifts._replace(shifts_px=shifts.shifts_px + before_px)
             if len(total.weights) < MIN_WINDOWS:
-                return DisplacementResult(None, FixedImagePx(math.nan), FixedImagePx(math.nan))
+                return DisplacementResult(None, float(math.nan), float(math.nan))
             field = fitted_field(total, _SMOOTHNESS, self.lattice_px, self.size_px)
             if np.median(shifts.distances_px()) <= converged_px:
                 break
@@ -103,7 +102,7 @@ class DisplacementEstimator:
 
     def _held_out(
         self, moving: Raster, mapping: PixelMapping, field: DisplacementField, total: Shifts
-    ) -> tuple[Residual[FixedImagePx], FixedImagePx]:
+    ) -> tuple[Residual, float]:
         """Return the cross-validated residual of the verification windows, and their p95 without the field.
 
         The shifts are measured with the complete mapping, for which correlation is sharp. The total shift of each
@@ -116,7 +115,7 @@ class DisplacementEstimator:
         given_px = 0.0 if mapping.field is None else mapping.field(residual.centres_px)
         return residual.with_shifts(shifts_px - predicted_px), residual.with_shifts(shifts_px - given_px).p95_px
 
-    def _cross_predicted(self, shifts: Shifts, windows: Residual[FixedImagePx], min_distance_px: float) -> Points:
+    def _cross_predicted(self, shifts: Shifts, windows: Residual, min_distance_px: float) -> Points:
         """Predict the shifts (n, 2) of windows by fields fitted to the shifts of others at a minimum distance.
 
         The distance is the maximum norm. NaN in other folds and where too few windows are left.
@@ -137,8 +136,8 @@ class _Gain(NamedTuple):
     """Decrease of the residuals of held-out windows by a field."""
 
     smoothness: float
-    before_p95_px: FixedImagePx = FixedImagePx(math.nan)
-    after_p95_px: FixedImagePx = FixedImagePx(math.nan)
+    before_p95_px: float = float(math.nan)
+    after_p95_px: float = float(math.nan)
     loss: float = math.inf
     """Mean of `_losses` of the remaining shifts, weighted."""
     sigma: float = 0.0
@@ -154,7 +153,7 @@ class _Gain(NamedTuple):
             return cls(smoothness)
         shifts = shifts.subset(compared)
         before_px, after_px = shifts.distances_px(), shifts.distances_px(predicted_px[compared])
-        before_p95_px, after_p95_px = (FixedImagePx(np.percentile(v, 95)) for v in (before_px, after_px))
+        before_p95_px, after_p95_px = (float(np.percentile(v, 95)) for v in (before_px, after_px))
         losses = _losses(after_px)
         loss = float(np.average(losses, weights=shifts.weights))
         return cls(smoothness, before_p95_px, after_p95_px, loss, in_standard_errors(_losses(before_px) - losses))
@@ -182,7 +181,7 @@ def _near(centres_px: Points, others_px: Points, distance_px: float) -> NDArray[
     return np.asarray(nearest < distance_px)
 
 
-def common_field(residuals: Sequence[Residual[FixedImagePx]], size_px: tuple[int, int]) -> DisplacementField | None:
+def common_field(residuals: Sequence[Residual], size_px: tuple[int, int]) -> DisplacementField | None:
     """Fit the displacement field that several captures have in common, on an image (width, height).
 
     None if it does not reduce the residuals of captures that are left out of the fit.

@@ -23,7 +23,6 @@ from agalign.values.alignment import Residual
 from agalign.values.geometry import Points
 from agalign.values.image import Mask, Raster
 from agalign.values.mapping import PixelMapping
-from agalign.values.pixel_units import FixedImagePx, FixedPx
 
 _Element = TypeVar("_Element", bound=np.generic)
 
@@ -86,7 +85,7 @@ class FixedWindows:
         origins = (corners[:, None] + _grid(starts, starts)).reshape(-1, 2)
         return cls(valid, structure, side_px, origins=origins)
 
-    def residuals(self, moving: Raster) -> Residual[FixedImagePx]:
+    def residuals(self, moving: Raster) -> Residual:
         """Measure the shift of each window in a moving band on the reference grid, px; NaN without a clear peak.
 
         A window is measured by the pixels that are valid in both images; the fewer these are, the lower is the peak,
@@ -109,7 +108,7 @@ class FixedWindows:
                 cross[masked] = _relative_to_overlap(cross[masked], fixed, other)
             parts.append((rows, *_peaks(cross)))
         rows, shifts_px, sigma = map(np.concatenate, zip(*parts, strict=True))
-        return Residual.of(self.centres_px[rows], shifts_px, sigma, self.cells[rows])
+        return Residual(self.centres_px[rows], shifts_px, sigma, self.cells[rows])
 
     def visible_px(self, moving: Raster) -> Points:
         """Return the centres (n, 2) of the windows with enough pixels that are valid in both images."""
@@ -186,7 +185,7 @@ class Shifts(NamedTuple):
     cells: NDArray[np.int64]
 
     @classmethod
-    def of(cls, residual: Residual[FixedPx]) -> "Shifts":
+    def of(cls, residual: Residual) -> "Shifts":
         """Select the measured shifts of a residual."""
         measured = np.isfinite(residual.shifts_px[:, 0])
         weights = peak_weights(residual.peaks_sigma[measured])
@@ -220,7 +219,7 @@ def in_standard_errors(decreases: NDArray[np.float64]) -> float:
     return float(decreases.mean() / max(decreases.std() / math.sqrt(len(decreases)), 1e-12))
 
 
-def residual_under(residual: Residual[FixedPx], before: PixelMapping, after: PixelMapping) -> Residual[FixedPx]:
+def residual_under(residual: Residual, before: PixelMapping, after: PixelMapping) -> Residual:
     """Convert the residual of windows measured with the mapping `before` to a mapping `after` that is nearly equal.
 
     A point p + s of the fixed image, mapped by `before`, corresponds to p + s - d, mapped by `after`, with

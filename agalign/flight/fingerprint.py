@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from agalign._version import __version__
-from agalign.config import Settings, SettingsModel
+from agalign.config import Settings, SettingsModel, WriteSettings
 from agalign.values.capture import Capture
 from agalign.values.files import open_regular
 from agalign.values.lens import Lens
@@ -18,24 +18,43 @@ from agalign.values.lens import Lens
 Fact = str | int | float | bool | None | np.ndarray | Lens | Sequence["Fact"]
 
 
-def fingerprint(capture: Capture, *stages: SettingsModel) -> str:
-    """Return the hash of the files of a capture, the metadata of its bands, settings and the version of agalign.
+def estimation_fingerprint(capture: Capture, settings: Settings) -> str:
+    """Return the hash of everything that the estimation of a capture depends on.
 
-    It does not depend on the other captures of the flight, so results remain valid when captures are added.
+    That is not the other captures of the flight, so results remain valid when captures are added.
     """
-    bands: list[Fact] = []
+    return _fingerprint(capture, *(stage for key, stage in settings if key != "write"))
+
+
+def learning_fingerprint(camera: str, captures: Sequence[Capture], settings: Settings) -> str:
+    """Return the hash of everything that the model of a flight depends on.
+
+    It contains the labels: files of two folders may have equal names, sizes and times.
+    """
+    stages = settings.joint, settings.seed, settings.flight
+    return hashed(camera, *((c.label, _fingerprint(c, *stages)) for c in captures))
+
+
+def render_fingerprint(capture: Capture, settings: WriteSettings) -> str:
+    """Return the hash of everything that the products of an estimated capture depend on, apart from the list of
+    indices, which are independent of each other.
+    """
+    facts: list[Fact] = []
     for b in capture.bands:
         calibration = None if b.radiometry is None else (b.radiometry.quantity, b.radiometry.gain)
-        bands.append((b.name, b.address, b.lens, b.to_rig, b.georeference is not None, _state(b.path), calibration))
+        georeference = None if b.georeference is None else b.georeference.transform
+        facts.append((b.name, calibration, georeference))
+    return hashed(__version__, settings.model_dump_json(exclude={"indices"}), facts)
+
+
+def _fingerprint(capture: Capture, *stages: SettingsModel) -> str:
+    """Return the hash of the files of a capture, the tags that the estimation uses, settings and the version."""
+    bands: list[Fact] = []
+    for b in capture.bands:
+        # A georeference by the pose of the camera is for the output alone.
+        is_georeferenced = b.georeference is not None and b.georeference.accuracy_m is None
+        bands.append((b.name, b.address, b.lens, b.to_rig, is_georeferenced, _state(b.path)))
     return hashed(__version__, *(s.model_dump_json() for s in stages), capture.reference_index, bands)
-
-
-def refinement_key(capture: Capture, settings: Settings) -> str:
-    """Return the hash of everything that the refined mappings of a capture depend on, apart from the network.
-
-    It contains the label: files of two folders may have equal names, sizes and times.
-    """
-    return hashed(capture.label, fingerprint(capture, settings.joint, settings.seed, settings.flight))
 
 
 def hashed(*facts: Fact) -> str:

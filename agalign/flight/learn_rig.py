@@ -9,7 +9,6 @@ from numpy.typing import NDArray
 from agalign.flight import rig
 from agalign.flight.rig import MIN_CAPTURES, CaptureFactors, Factor, Observation, Rig, capture_factors, design_tensor
 from agalign.values.least_squares import least_squares
-from agalign.values.pixel_units import MovingFilePx
 from agalign.values.process_pool import Apply
 
 Array = NDArray[np.float64]
@@ -56,7 +55,7 @@ def learn_rig(
         factors=factors,
         captures=tuple(CaptureFactors(c.seconds, c.altitude_m, c.motion, tuple(f)) for c, f in by_capture),
         from_bands_px=dict(zip(bands, errors_px.tolist(), strict=True)),
-        parallax_px={b: MovingFilePx(np.sqrt(np.mean(squares))) for b, squares in squares_px2.items()},
+        parallax_px={b: float(np.sqrt(np.mean(squares))) for b, squares in squares_px2.items()},
     )
 
 

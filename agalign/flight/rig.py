@@ -30,7 +30,6 @@ from agalign.values import geometry
 from agalign.values.geometry import Matrix, Points
 from agalign.values.least_squares import Estimate, Robust, least_squares
 from agalign.values.mapping import DisplacementField
-from agalign.values.pixel_units import MovingFilePx
 
 Array = NDArray[np.float64]
 Factor = Literal["distance", "tilt", "motion", "reference"]
@@ -53,13 +52,13 @@ class Observation:
     """Capture time, from any origin; None if unknown."""
     mappings: Mapping[str, Matrix]
     """fixed_to_moving by band, undistorted px of the files."""
-    std_px: Mapping[str, MovingFilePx]
+    std_px: Mapping[str, float]
     """Standard error of each mapping."""
     altitude_m: float | None = None
     """Altitude in the tags, above any datum; None if unknown."""
     motion: tuple[float, float] | None = None
     """Velocity of the ground in the image (right, down), in any unit; None if unknown."""
-    parallax_px: Mapping[str, MovingFilePx] = field(default_factory=dict)
+    parallax_px: Mapping[str, float] = field(default_factory=dict)
     """RMS displacement by the relief of the capture, for bands that have one."""
 
 
@@ -92,12 +91,12 @@ class Rig:
     """The factors that cross-validation selected."""
     captures: tuple[CaptureFactors, ...]
     """The captures from which the rig was learned, in their order."""
-    from_bands_px: Mapping[str, MovingFilePx]
+    from_bands_px: Mapping[str, float]
     """RMS error by band of predictions from the other bands, in captures that were left out."""
-    extrapolation_px: Mapping[str, MovingFilePx] = field(default_factory=dict)
+    extrapolation_px: Mapping[str, float] = field(default_factory=dict)
     """RMS error by band of the mean mapping, for bands without an observed quarter of the image, into which the
     homography extrapolates differences of lens distortion."""
-    parallax_px: Mapping[str, MovingFilePx] = field(default_factory=dict)
+    parallax_px: Mapping[str, float] = field(default_factory=dict)
     """RMS displacement by band by the reliefs of the captures, which a homography does not contain."""
     fields: Mapping[str, DisplacementField] = field(default_factory=dict)
     """Displacement field by band that all captures have in common and no homography represents, raw px of the
@@ -174,11 +173,11 @@ def displaced(mean: Matrix, coefficients: Array, size_px: tuple[int, int]) -> Ma
     return geometry.fit_homography(points, geometry.apply(mean, points) + g @ coefficients.T)
 
 
-def distance_px(one: Matrix, other: Matrix, size_px: tuple[int, int]) -> MovingFilePx:
+def distance_px(one: Matrix, other: Matrix, size_px: tuple[int, int]) -> float:
     """Return the RMS distance between two homographies over an image (width, height), px of the moving file."""
     points, _ = lattice(size_px)
     difference_px = geometry.apply(one, points) - geometry.apply(other, points)
-    return MovingFilePx(np.sqrt((difference_px**2).sum(axis=1).mean()))
+    return float(np.sqrt((difference_px**2).sum(axis=1).mean()))
 
 
 def median_mapping(matrices: Sequence[Matrix], size_px: tuple[int, int]) -> Matrix:

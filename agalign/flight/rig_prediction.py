@@ -24,7 +24,6 @@ from agalign.flight.rig import (
 from agalign.values import geometry
 from agalign.values.alignment import Prediction
 from agalign.values.geometry import Matrix
-from agalign.values.pixel_units import MovingFilePx
 
 Array = NDArray[np.float64]
 Captures = Sequence[CaptureFactors]
@@ -35,16 +34,16 @@ def predict_band(rig: Rig, band: str, known: Observation) -> Prediction:
     """Predict the mapping of a band of the rig from the other bands of the capture, or if none is known from others."""
     has_others = any(b != band and b in rig.mean for b in known.mappings)
     prediction = (_from_bands if has_others else _from_captures)(rig, band, known)
-    return replace(prediction, std_px=MovingFilePx(np.hypot(prediction.std_px, rig.extrapolation_px.get(band, 0.0))))
+    return replace(prediction, std_px=float(np.hypot(prediction.std_px, rig.extrapolation_px.get(band, 0.0))))
 
 
-def unobserved_error_px(rig: Rig, band: str, *, by_neighbours: bool) -> MovingFilePx:
+def unobserved_error_px(rig: Rig, band: str, *, by_neighbours: bool) -> float:
     """Return the RMS error of a band in captures without any known band.
 
     They are predicted from the captures before and after (`by_neighbours`) or from the flight's mean.
     """
     squares = [square for _, square in _leave_one_out(rig, band, "seconds" if by_neighbours else "flight")]
-    return MovingFilePx(np.sqrt(np.mean(squares or [0.0]) + rig.from_bands_px[band] ** 2))
+    return float(np.sqrt(np.mean(squares or [0.0]) + rig.from_bands_px[band] ** 2))
 
 
 def extreme_mappings(rig: Rig, band: str) -> list[Matrix]:
@@ -107,7 +106,7 @@ def _from_bands(rig: Rig, band: str, known: Observation) -> Prediction:
     variances_px2 = (np.median(excess_px2[weights[0] > 0]), of_factors_px2, baseline_px2)
     error_px = np.sqrt(rig.from_bands_px[band] ** 2 + sum(max(0.0, v) for v in variances_px2))
     mapping = rig.mapping(band, solutions[0])
-    return Prediction(mapping, "bands" if rig.factors else "flight", MovingFilePx(error_px))
+    return Prediction(mapping, "bands" if rig.factors else "flight", float(error_px))
 
 
 def estimated_factors(
@@ -171,7 +170,7 @@ def _from_captures(rig: Rig, band: str, known: Observation) -> Prediction:
             results.append((max(mean_px2, float(((design @ std) ** 2).sum())), factors))
     variance_px2, factors = min(results, key=itemgetter(0), default=(0.0, np.zeros(FACTORS)))
     altitude_px = _altitude_error_px(rig, known.altitude_m) * float(np.linalg.norm(rig.baselines[band]))
-    error_px = MovingFilePx(np.sqrt(variance_px2 + rig.from_bands_px[band] ** 2 + altitude_px**2))
+    error_px = float(np.sqrt(variance_px2 + rig.from_bands_px[band] ** 2 + altitude_px**2))
     return Prediction(rig.mapping(band, factors), "neighbours" if (design @ factors).any() else "flight", error_px)
 
 

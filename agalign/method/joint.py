@@ -25,9 +25,8 @@ from agalign.method.refine import PATCHES, refine
 from agalign.method.state import ImageGroup, JointState, MovingImage, Progress
 from agalign.values.alignment import JointResult
 from agalign.values.issues import FEW_KEYPOINTS, NO_CONTRAST, NOT_INVERTIBLE, Issue
-from agalign.values.pixel_units import FixedImagePx
 
-Results = list[JointResult[FixedImagePx] | Issue]
+Results = list[JointResult | Issue]
 """The result for each moving image of a group, or the reason why there is none."""
 
 
@@ -70,7 +69,7 @@ def refine_with(
     return [r if isinstance(r, Issue) else replace(r, recipe="flight") for r in results]
 
 
-def _by_paper(state: JointState, pair: ImageGroup, training: Training) -> JointResult[FixedImagePx] | Issue:
+def _by_paper(state: JointState, pair: ImageGroup, training: Training) -> JointResult | Issue:
     try:
         return align_by_paper(state, pair, training)[1]
     except NotEnoughTextureError as error:

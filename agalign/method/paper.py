@@ -30,7 +30,6 @@ from agalign.method.state import ImageGroup, JointState
 from agalign.values import geometry
 from agalign.values.alignment import JointResult
 from agalign.values.issues import Issue
-from agalign.values.pixel_units import FixedImagePx
 
 _COARSEST_PX = 80
 """Longer side of the coarsest level. With 64, where few patches fit, psi moves half as far (docs/paper.md)."""
@@ -65,7 +64,7 @@ def pyramid(longer_side_px: int) -> tuple[float, ...]:
 
 def align_by_paper(
     state: JointState, group: ImageGroup, training: Training = DEFAULT_TRAINING
-) -> tuple[Descriptor, JointResult[FixedImagePx] | Issue]:
+) -> tuple[Descriptor, JointResult | Issue]:
     """Align a group of one moving image; return the network and the result.
 
     Coarse to fine: theta is reinitialised at each level, psi is kept. Raises NotEnoughTextureError, NoContrastError,

@@ -21,7 +21,6 @@ from agalign.method.state import ImageGroup, JointState
 from agalign.values.alignment import MIN_RETRIEVAL, JointResult
 from agalign.values.choices import ModelFamily
 from agalign.values.issues import CORNERS_UNKNOWN, FEW_KEYPOINTS, NOT_INVERTIBLE, RETRIEVAL, Issue
-from agalign.values.pixel_units import FixedImagePx
 
 MIN_KEYPOINTS = 16
 """Minimum number of patches in both images for a step on psi or a test of retrieval."""
@@ -180,7 +179,7 @@ def _means(losses: Tensor) -> Tensor:
 @torch.no_grad()
 def refine(
     state: JointState, net: Descriptor, group: ImageGroup, *, update_psi: bool = True, patches: int = PATCHES
-) -> list[JointResult[FixedImagePx] | Issue]:
+) -> list[JointResult | Issue]:
     """Refine every psi of a capture at full resolution with theta frozen.
 
     Returns a result per moving image, or the issue that prevents one. A step uses up to `patches` patches. Without
@@ -194,7 +193,7 @@ def refine(
     reference_patches = ReferencePatches.of(net, level, p)
     f_test = level.fixed.describe(net, test)
 
-    def result(band: LevelBand) -> JointResult[FixedImagePx] | Issue:
+    def result(band: LevelBand) -> JointResult | Issue:
         if band.moving.dropped_at is not None:
             return Issue(RETRIEVAL, band.moving.dropped_at, MIN_RETRIEVAL)
         try:

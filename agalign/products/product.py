@@ -17,7 +17,6 @@ from agalign.values.alignment import Alignment
 from agalign.values.capture import Capture
 from agalign.values.files import file_checksum
 from agalign.values.image import OutputGrid
-from agalign.values.pixel_units import FixedFilePx
 
 GEOTIFF = "image/tiff; application=geotiff"
 
@@ -93,7 +92,7 @@ class ProductContext:
     capture: Capture
     paths: CapturePaths
     settings: Settings
-    alignments: Mapping[str, Alignment[FixedFilePx]]
+    alignments: Mapping[str, Alignment]
     """By moving band, including failed ones."""
     layers: Sequence[Layer]
     """One for each band, in their order; empty if no moving band can be written."""
@@ -111,12 +110,12 @@ class ProductContext:
         return self.settings.write.radiometry == "off"
 
     @property
-    def with_pixels(self) -> dict[str, Alignment[FixedFilePx]]:
+    def with_pixels(self) -> dict[str, Alignment]:
         """The alignments that did not fail, by band, in the order of the capture's bands."""
         return {b.name: a for b in self.capture.moving if (a := self.alignments[b.name]).status != "failed"}
 
     @property
-    def usable(self) -> dict[str, Alignment[FixedFilePx]]:
+    def usable(self) -> dict[str, Alignment]:
         """The alignments of the aligned bands, and of predicted bands with an accepted standard error."""
         limit_px = self.settings.check.accept_predicted_px
         return {name: a for name, a in self.with_pixels.items() if is_usable(a.status, a.prediction, limit_px)}

@@ -1,24 +1,39 @@
 """Results of aligning a band pair, and their uncertainty."""
 
-import dataclasses
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
-from typing import Generic, cast
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import Annotated, TypedDict
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from pydantic import Field
+from pydantic import dataclasses as validated
 
 from agalign.errors import InputError
 from agalign.values import geometry
 from agalign.values.choices import Geometry, Interpolation, ModelFamily, PairStatus, PredictionSource, SeedKind, Space
+from agalign.values.fields import (
+    POSITION_DECIMALS,
+    RECORD,
+    Array,
+    Matrix3x3,
+    Measured,
+    Number,
+    Number4,
+    Number6,
+    UpToInfinity,
+)
 from agalign.values.geometry import Matrix, Points
 from agalign.values.image import Mask
 from agalign.values.interpolation import can_hold, planes_of, resample_planes
 from agalign.values.issues import SEED_DOES_NOT_FIT, Issue, sentence
 from agalign.values.mapping import PixelMapping
-from agalign.values.pixel_units import SAME_PIXELS, FixedFilePx, FixedImagePx, FixedPx, MovingFilePx, PixelScale, Size
+from agalign.values.pixel_units import SAME_PIXELS, PixelScale, Size
 
+COVARIANCE_DECIMALS = 9
+"""Of covariances in a sidecar, px squared: a millionth of those of accurate mappings."""
 MIN_RETRIEVAL = 0.2
 """Minimum held-out retrieval: below it psi is not updated and no result is accepted. Chance is below 0.01; unrelated
 images reach 0.05."""
@@ -34,49 +49,58 @@ def noise_px(peaks_sigma: ArrayLike) -> NDArray[np.float64]:
     return np.asarray(_NOISE_PX_SIGMA2 / np.square(peaks_sigma))
 
 
-@dataclass(frozen=True)
+@validated.dataclass(frozen=True, config=RECORD)
 class Seed:
     """Initial alignment, with the correlation of the images under it."""
 
     kind: SeedKind
-    fixed_to_moving: Matrix
+    """`user`; `match` (learned descriptors matched); `model` (median mapping of the flight); `rig` (camera tags);
+    `centre` (optical centres of DJI); `geo` (geotransforms); `structure` (phase correlation); `identity`."""
+    fixed_to_moving: Matrix3x3
     """Between undistorted px if both lenses are known, else between raw px."""
-    score: float
+    score: Number
     """Height of the correlation at this mapping, in standard deviations; candidates are compared by it."""
-    peak_sigma: float = 0.0
+    peak_sigma: Number = 0.0
     """Height of the correlation peak above its surroundings, in standard deviations."""
-    runner_up_sigma: float = 0.0
+    runner_up_sigma: Number = 0.0
     """The same for the second highest separate peak."""
     trusted: bool = False
     """The images confirm that it is accurate to a few pixels."""
 
 
-@dataclass(frozen=True)
-class JointResult(Generic[FixedPx]):
-    """The result of the joint optimisation, on the grid of the images or of the files (`FixedPx`)."""
+@validated.dataclass(frozen=True, config=RECORD)
+class JointResult:
+    """The result of the joint optimisation of descriptor and mapping."""
 
-    fixed_to_moving: Matrix
-    loss: float
-    retrieval: float
+    fixed_to_moving: Matrix3x3
+    """Homography before it was combined with a prediction, between the same px as the seed."""
+    loss: Annotated[float, Measured()]
+    """Final loss; null if nothing was learned."""
+    retrieval: Number
     """Share of held-out patches with the corresponding patch as nearest descriptor in the other image."""
-    chance: float
+    chance: Number
     """The retrieval that guessing would give."""
     iterations: int
-    levels: tuple[float, ...]
+    """Steps; 0 if nothing was learned."""
+    levels: tuple[Number, ...]
     """Resolutions of the image pyramid, coarse to fine; 1 is full."""
     recipe: str
+    """`flight` (frozen network of the flight), `fast` (learned on this capture), `paper`, or `windows` (windows
+    alone)."""
     model_family: ModelFamily
-    last_step_px: float
-    corner_std_xy_px: tuple[tuple[float, float], ...]
-    """Standard deviations along x and y of the mapping at the corners of the reference, clockwise from the top left,
-    px of the reference: from the curvature at the solution and the scatter of the patches."""
-    corner_covariance_px2: NDArray[np.float64] | None = None
-    """(8, 8) of (x, y) of those corners, for a homography whatever the family; None where it is not known."""
+    """Mapping that was fitted."""
+    last_step_px: Number
+    """Movement of a corner in the last step, px of the reference."""
+    corner_std_xy_px: Annotated[tuple[tuple[UpToInfinity, UpToInfinity], ...], Field(min_length=4, max_length=4)]
+    """Standard errors (x, y) of the mapping at the corners of the reference, clockwise from the top left, px of the
+    reference: from the curvature at the solution and the scatter of the patches."""
+    corner_covariance_px2: Annotated[NDArray[np.float64], Array((8, 8), COVARIANCE_DECIMALS)] | None = None
+    """(8, 8) of (x, y) of those corners, for a homography whatever the family; null if it is not known."""
 
     @property
-    def corner_std_px(self) -> FixedPx:
+    def corner_std_px(self) -> float:
         """Standard error of the mapping at the least certain corner: root mean square over both axes together."""
-        return cast(FixedPx, max(math.hypot(*std) for std in self.corner_std_xy_px))
+        return max(math.hypot(*std) for std in self.corner_std_xy_px)
 
     @property
     def covariance_px2(self) -> NDArray[np.float64]:
@@ -85,26 +109,24 @@ class JointResult(Generic[FixedPx]):
             return self.corner_covariance_px2
         return np.diag(np.square(np.ravel(self.corner_std_xy_px)))
 
-    def with_homography(self, fixed_to_moving: Matrix, covariance_px2: NDArray[np.float64]) -> "JointResult[FixedPx]":
+    def with_homography(self, fixed_to_moving: Matrix, covariance_px2: NDArray[np.float64]) -> "JointResult":
         """Return the result with another homography and covariance (8, 8) of the corners."""
         std = tuple((float(x), float(y)) for x, y in np.sqrt(np.diag(covariance_px2)).reshape(4, 2))
         return replace(
             self, fixed_to_moving=fixed_to_moving, corner_covariance_px2=covariance_px2, corner_std_xy_px=std
         )
 
-    def in_file_px(self: "JointResult[FixedImagePx]", scales: "PairScales") -> "JointResult[FixedFilePx]":
-        """The same between the files."""
+    def in_file_px(self, scales: "PairScales") -> "JointResult":
+        """Convert the result between the images to one between the files."""
         up = scales.fixed.inverse
         per_axis = np.outer(np.tile(up, 4), np.tile(up, 4))
-        covariance = None if self.corner_covariance_px2 is None else self.corner_covariance_px2 * per_axis
-        result = replace(
+        return replace(
             self,
             fixed_to_moving=scales.between_files(self.fixed_to_moving),
             last_step_px=self.last_step_px * up.mean,
             corner_std_xy_px=tuple((x * up.x, y * up.y) for x, y in self.corner_std_xy_px),
-            corner_covariance_px2=covariance,
+            corner_covariance_px2=None if self.corner_covariance_px2 is None else self.corner_covariance_px2 * per_axis,
         )
-        return cast("JointResult[FixedFilePx]", result)
 
 
 @dataclass(frozen=True)
@@ -112,63 +134,77 @@ class RefinedPair:
     """The seed of a pair and its mapping refined by a flight's network, from the images of this pair alone."""
 
     seed: Seed
-    result: JointResult[FixedImagePx]
+    result: JointResult
     sizes_px: tuple[tuple[int, int], tuple[int, int]]
     """(width, height) of the fixed and the moving image."""
 
 
-@dataclass(frozen=True)
-class Residual(Generic[FixedPx]):
-    """Shifts of windows that remain after alignment, measured independently of the estimation, on the fixed grid."""
+@validated.dataclass(frozen=True, config=RECORD)
+class Residual:
+    """Shifts of windows that remain after alignment, measured independently of the estimation."""
 
-    centres_px: NDArray[np.float64]
-    """(n, 2) centres of the windows."""
-    shifts_px: NDArray[np.float64]
-    """(n, 2) position of the moving band's structure minus that of the reference's; nan where not measured."""
-    median_px: FixedPx
-    """Of the lengths of the shifts; infinite if none was measured."""
-    p95_px: FixedPx
-    coverage: float
-    """Share of the textured windows in which a shift could be measured."""
-    peaks_sigma: NDArray[np.float64]
-    """(n,) height of the correlation peak of each window, in standard deviations; the error of a shift is inversely
+    centres_px: Annotated[NDArray[np.float64], Array((None, 2), 2)]
+    """Centres of the n windows, px of the reference."""
+    shifts_px: Annotated[NDArray[np.float64], Array((None, 2), POSITION_DECIMALS, nullable=True)]
+    """Position of the moving band's structure minus that of the reference's, px of the reference; null where it could
+    not be measured."""
+    peaks_sigma: Annotated[NDArray[np.float64], Array((None,), 4, nullable=True)]
+    """Height of the correlation peak of each window, in standard deviations; the error of a shift is inversely
     proportional to its square."""
-    cells: NDArray[np.int64]
-    """(n, 2) column and row of each window in the complete grid, whichever windows of it are measured."""
+    cells: Annotated[NDArray[np.int64], Array((None, 2), integers=True)]
+    """Column and row of each window in the complete grid, whichever windows of it are measured."""
+
+    def __post_init__(self) -> None:
+        """Raise ValueError for arrays of different lengths."""
+        if len({len(column) for column in (self.centres_px, self.shifts_px, self.peaks_sigma, self.cells)}) > 1:
+            raise ValueError("its lists have different lengths")
 
     @classmethod
-    def of(
-        cls,
-        centres_px: NDArray[np.float64],
-        shifts_px: NDArray[np.float64],
-        peaks_sigma: NDArray[np.float64],
-        cells: NDArray[np.int64],
-    ) -> "Residual[FixedPx]":
-        """Return the statistics of shifts (n, 2) with correlation peaks (n,) in standard deviations."""
-        measured = np.isfinite(shifts_px[:, 0])
-        length = np.linalg.norm(shifts_px[measured], axis=1)
-        median, p95 = np.percentile(length, (50, 95)) if len(length) else (np.inf, np.inf)
-        coverage = float(measured.mean()) if len(measured) else 0.0
-        of_shifts = cast(FixedPx, float(median)), cast(FixedPx, float(p95)), coverage
-        return cls(centres_px, shifts_px, *of_shifts, peaks_sigma, cells)
-
-    @classmethod
-    def joined(cls, several: Sequence["Residual[FixedPx]"]) -> "Residual[FixedPx]":
+    def joined(cls, several: Sequence["Residual"]) -> "Residual":
         """Return the windows of several residuals as one."""
-        parts = zip(*((r.centres_px, r.shifts_px, r.peaks_sigma, r.cells) for r in several), strict=True)
-        return cls.of(*map(np.concatenate, parts))
+        return cls(
+            np.concatenate([one.centres_px for one in several]),
+            np.concatenate([one.shifts_px for one in several]),
+            np.concatenate([one.peaks_sigma for one in several]),
+            np.concatenate([one.cells for one in several]),
+        )
 
-    def with_shifts(self, shifts_px: NDArray[np.float64]) -> "Residual[FixedPx]":
-        """The same windows with other shifts (n, 2)."""
-        return Residual[FixedPx].of(self.centres_px, shifts_px, self.peaks_sigma, self.cells)
+    def with_shifts(self, shifts_px: NDArray[np.float64]) -> "Residual":
+        """Return the same windows with other shifts (n, 2)."""
+        return replace(self, shifts_px=shifts_px)
 
     @property
+    def is_measured(self) -> NDArray[np.bool_]:
+        """(n,) True for windows in which a shift was measured."""
+        return np.isfinite(self.shifts_px[:, 0])
+
+    @cached_property
     def lengths_px(self) -> NDArray[np.float64]:
         """(m,) lengths of the measured shifts."""
-        return np.asarray(np.linalg.norm(self.shifts_px[np.isfinite(self.shifts_px[:, 0])], axis=1))
+        return np.asarray(np.linalg.norm(self.shifts_px[self.is_measured], axis=1))
 
     @property
-    def std_px(self) -> FixedPx:
+    def median_px(self) -> float:
+        """Median length of the measured shifts; infinite without any."""
+        return self._percentiles_px[0]
+
+    @property
+    def p95_px(self) -> float:
+        """95th percentile of the lengths of the measured shifts; infinite without any."""
+        return self._percentiles_px[1]
+
+    @cached_property
+    def _percentiles_px(self) -> tuple[float, float]:
+        median, p95 = np.percentile(self.lengths_px, (50, 95)).tolist() if len(self.lengths_px) else (np.inf, np.inf)
+        return median, p95
+
+    @property
+    def coverage(self) -> float:
+        """Share of the textured windows in which a shift could be measured."""
+        return float(self.is_measured.mean()) if len(self.shifts_px) else 0.0
+
+    @property
+    def std_px(self) -> float:
         """Standard error that the windows show: their RMS shift beyond the noise of their peaks; infinite without any.
 
         A fifth of the windows may be wrong peaks or at depth edges: the RMS is the larger of those of a normal
@@ -176,36 +212,36 @@ class Residual(Generic[FixedPx]):
         is known to a factor.
         """
         if not len(self.lengths_px):
-            return cast(FixedPx, math.inf)
-        noise = float(np.median(noise_px(self.peaks_sigma[np.isfinite(self.shifts_px[:, 0])])))
+            return math.inf
+        noise = float(np.median(noise_px(self.peaks_sigma[self.is_measured])))
         # Of a Rayleigh distribution: sqrt(-2 log(1 - p)) for the quantile p, and sqrt(2) for the RMS.
         rms_px = max(float(np.quantile(self.lengths_px, p)) / math.sqrt(-math.log(1 - p)) for p in (0.5, 0.8))
-        return cast(FixedPx, math.sqrt(max(rms_px**2 - noise**2, (rms_px / 2) ** 2)))
+        return math.sqrt(max(rms_px**2 - noise**2, (rms_px / 2) ** 2))
 
     @property
     def is_black(self) -> NDArray[np.bool_]:
         """(n,) True for alternate windows along both axes of their grid, as on a chessboard."""
         return np.asarray(self.cells.sum(axis=1) % 2 == 0)
 
-    def half(self, *, black: bool) -> "Residual[FixedPx]":
-        """The black or the white windows: one half for a fit, the other for its verification."""
+    def half(self, *, black: bool) -> "Residual":
+        """Return the black or the white windows: one half for a fit, the other for its verification."""
         return self.where(self.is_black == black)
 
-    def where(self, selected: NDArray[np.bool_]) -> "Residual[FixedPx]":
-        """The windows where a mask (n,) is True."""
+    def where(self, selected: NDArray[np.bool_]) -> "Residual":
+        """Return the windows where a mask (n,) is True."""
         shifts_px, peaks_sigma, cells = self.shifts_px[selected], self.peaks_sigma[selected], self.cells[selected]
-        return Residual[FixedPx].of(self.centres_px[selected], shifts_px, peaks_sigma, cells)
+        return Residual(self.centres_px[selected], shifts_px, peaks_sigma, cells)
 
     @property
     def measured_px(self) -> NDArray[np.float64]:
         """(m, 2) centres of the windows in which a shift was measured."""
-        return self.centres_px[np.isfinite(self.shifts_px[:, 0])]
+        return self.centres_px[self.is_measured]
 
-    def in_file_px(self: "Residual[FixedImagePx]", scales: "PairScales") -> "Residual[FixedFilePx]":
-        """The same on the grid of the reference band's file."""
+    def in_file_px(self, scales: "PairScales") -> "Residual":
+        """Convert the residual to px of the reference band's file."""
         up = scales.fixed.inverse
         centres_px, shifts_px = up.positions(self.centres_px), up.displacements(self.shifts_px)
-        return Residual[FixedFilePx].of(centres_px, shifts_px, self.peaks_sigma, self.cells)
+        return replace(self, centres_px=centres_px, shifts_px=shifts_px)
 
 
 @dataclass(frozen=True)
@@ -233,25 +269,49 @@ SAME_SCALES = PairScales()
 """Both images have the pixels of their files."""
 
 
-@dataclass(frozen=True)
+@validated.dataclass(frozen=True, config=RECORD)
 class Prediction:
     """Mapping of a band by the rig of the flight, or by extrapolation."""
 
-    fixed_to_moving: Matrix
+    fixed_to_moving: Matrix3x3
     """Between the files; between undistorted pixels if the mappings of the rig are."""
-    source: PredictionSource
-    """Other bands of the capture, neighbouring captures, mean of the flight, or windows in the rest of the image."""
-    std_px: MovingFilePx
-    """Standard error: root mean square over the image."""
-    off_px: MovingFilePx | None = None
-    """Root mean square distance from the band's own alignment; None if there is none."""
-    covariance_px2: NDArray[np.float64] | None = None
+    source: Annotated[PredictionSource, Field(alias="from")]
+    """`bands` (other bands of the capture), `neighbours` (other captures), `flight` (mean), or `windows` (a part of the
+    image)."""
+    std_px: Number4
+    """Standard error over the image (root mean square), px of the band's own file."""
+    off_px: Number4 | None = None
+    """Root mean square distance from the band's own alignment, px of the band's own file; null if there is none."""
+    covariance_px2: Annotated[NDArray[np.float64], Array((12, 12), COVARIANCE_DECIMALS)] | None = None
     """(12, 12) of an extrapolated mapping, over the corners and the lens shapes (`fit.adjustment`), px of the
-    reference's file; None for a rig's."""
+    reference's file; null for a rig's."""
+
+
+class Similarity(TypedDict, total=False):
+    """Similarity of the pixels that are valid in both bands; in large images of a sample of at least 250,000."""
+
+    mattes_mi: Number6
+    """Negative Mattes mutual information, nats, 32 bins: lower is better."""
+    nmi: Number6
+    """Normalised mutual information, 1 to 2: higher is better."""
+    ncc: Number6
+    """Normalised cross-correlation; negative if contrast is reversed."""
+    gradient_correlation: Number6
+    """Correlation of gradient magnitudes: higher is better."""
+    structure_ssim: Number6
+    """SSIM of the structure images: higher is better."""
+    overlap: Number6
+    """Share of the image in which both bands are valid."""
+    residual_px: Number6
+    """Median length of the shifts of the windows, px of the reference."""
+    residual_p95_px: Number6
+    """Their 95th percentile, px of the reference."""
+    residual_coverage: Number6
+    """Share of the textured windows with a measured shift."""
 
 
 @dataclass(frozen=True)
-class Alignment(Generic[FixedPx]):
+class Alignment:
     """Mapping of one band pair, between the images or between the files, and how it was estimated and verified."""
 
     mapping: PixelMapping
@@ -263,17 +323,17 @@ class Alignment(Generic[FixedPx]):
     issues: tuple[Issue, ...]
     """Reasons against accepting the alignment, the most important first; empty if it is `aligned`."""
     seed: Seed
-    joint: JointResult[FixedPx] | None = None
+    joint: JointResult | None = None
     """Result of the optimisation with its standard error; None if it was not run or failed."""
-    residual: Residual[FixedPx] | None = None
+    residual: Residual | None = None
     """Of windows that took no part in the estimation."""
     seconds: float = 0.0
     """Share of the capture's processing time, equal for all its bands."""
-    before: Mapping[str, float] = dataclasses.field(default_factory=dict)
+    before: Similarity = field(default_factory=lambda: Similarity())
     """Comparison metrics by name under the seed, such as mutual information."""
-    after: Mapping[str, float] = dataclasses.field(default_factory=dict)
+    after: Similarity = field(default_factory=lambda: Similarity())
     """The same under the mapping."""
-    candidates: Mapping[Geometry, FixedPx] = dataclasses.field(default_factory=dict)
+    candidates: Mapping[Geometry, float] = field(default_factory=dict)
     """p95 of the shifts of held-out windows by each geometry that was fitted; empty if only a homography was."""
     prediction: Prediction | None = None
     """Prediction by the rig of the flight; None without a rig."""
@@ -283,7 +343,7 @@ class Alignment(Generic[FixedPx]):
     relief_std_px: float = 0.0
     """Spread of the relief of the flight, px of the reference, which a mapping without relief lacks where no window is
     near."""
-    ties: Residual[FixedPx] | None = None
+    ties: Residual | None = None
     """Of all windows under this mapping, including those that it was fitted to; None unless they were requested."""
     moving_size_px: Size | None = None
     """(width, height) of the moving image; None if it is not known, as in sidecars of earlier versions."""
@@ -356,7 +416,7 @@ class Alignment(Generic[FixedPx]):
         """The pixels between which the homography is."""
         return "pixel" if self.mapping.fixed_lens is None else "undistorted"
 
-    def in_file_px(self: "Alignment[FixedImagePx]", scales: "PairScales", size_px: Size) -> "Alignment[FixedFilePx]":
+    def in_file_px(self: "Alignment", scales: "PairScales", size_px: Size) -> "Alignment":
         """The same between the files of the two bands; `size_px` is (width, height) of the reference's file.
 
         A displacement field gets a lattice on the file, as a sidecar has it.
@@ -367,7 +427,7 @@ class Alignment(Generic[FixedPx]):
             field = mapping.field.on_lattice(mapping.field.step_px / mapping.field.scale.mean, size_px)
             mapping = replace(mapping, field=field)
         return replace(
-            cast("Alignment[FixedFilePx]", self),
+            self,
             mapping=mapping,
             size_px=size_px,
             seed=replace(self.seed, fixed_to_moving=scales.between_files(self.seed.fixed_to_moving)),
@@ -376,7 +436,7 @@ class Alignment(Generic[FixedPx]):
             lens_std_px=None if self.lens_std_px is None else self.lens_std_px * up.mean,
             relief_std_px=self.relief_std_px * up.mean,
             ties=None if self.ties is None else self.ties.in_file_px(scales),
-            candidates={kind: FixedFilePx(p95_px * up.mean) for kind, p95_px in self.candidates.items()},
+            candidates={kind: float(p95_px * up.mean) for kind, p95_px in self.candidates.items()},
         )
 
     @property
@@ -408,5 +468,5 @@ class Alignment(Generic[FixedPx]):
         return f"Alignment(status={self.status!r}{residual}{std}{reason})"
 
 
-Alignments = dict[str, Alignment[FixedImagePx]]
+Alignments = dict[str, Alignment]
 """Alignments between images by band."""

@@ -8,6 +8,9 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Literal, NamedTuple
 
+from pydantic import dataclasses as validated
+
+from agalign.values.fields import RECORD, Number
 from agalign.values.geometry import Matrix
 from agalign.values.lens import Lens
 from agalign.values.pixel_units import PixelScale
@@ -193,43 +196,54 @@ class Band:
         return self.path.name if self.band_index == 1 else f"{self.path.name}[{self.band_index}]"
 
 
-@dataclass(frozen=True)
+@validated.dataclass(frozen=True, config=RECORD)
 class Position:
-    """Position of the camera: WGS 84 in degrees, altitude in metres above the datum of the camera."""
+    """GPS position of the camera."""
 
-    latitude: float
-    longitude: float
-    altitude_m: float | None = None
+    latitude: Number
+    """Degrees, WGS 84."""
+    longitude: Number
+    """Degrees, WGS 84."""
+    altitude_m: Number | None = None
+    """Altitude in the tags, m above the datum of the camera."""
 
 
 HeightSource = Literal["tags", "panel", "ground elevation", "assumed"]
 
 
-@dataclass(frozen=True)
+@validated.dataclass(frozen=True, config=RECORD)
 class Pose:
     """Orientation of the camera, and its height."""
 
-    heading_deg: float
-    """Direction of the image's top, clockwise from north."""
-    pitch_deg: float = 0.0
-    """Angle of the optical axis ahead of nadir."""
-    roll_deg: float = 0.0
-    """Angle of the optical axis to the left of nadir: positive if the right side of the aircraft is down."""
-    height_m: float | None = None
-    """Height above the ground."""
-    focal_length_px: float | None = None
+    heading_deg: Number
+    """Direction of the image's top, degrees clockwise from north."""
+    pitch_deg: Number = 0.0
+    """Angle of the optical axis ahead of nadir, degrees."""
+    roll_deg: Number = 0.0
+    """Angle of the optical axis to the left of nadir, degrees: positive if the right side of the aircraft is down."""
+    height_m: Number | None = None
+    """Height above the ground, m."""
+    focal_length_px: Number | None = None
     """Focal length of the reference, px."""
     height_from: HeightSource = "tags"
     """Source of `height_m`."""
 
 
-@dataclass(frozen=True)
+@validated.dataclass(frozen=True, config=RECORD)
 class CameraIdentity:
     """The camera, from the tags of the images."""
 
     make: str = ""
+    """Manufacturer."""
     model: str = ""
+    """Model."""
     serial: str = ""
+    """Serial numbers, joined by `+`."""
+
+    @property
+    def name(self) -> str:
+        """Manufacturer and model; empty if both are unknown."""
+        return f"{self.make} {self.model}".strip()
 
 
 @dataclass(frozen=True)

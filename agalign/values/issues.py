@@ -1,6 +1,14 @@
 """Reasons for not accepting an alignment: what was measured, the limit, in words, and a suggestion for the user."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Annotated, Any
+
+from pydantic import GetCoreSchemaHandler
+from pydantic import dataclasses as validated
+from pydantic_core import CoreSchema, core_schema
+
+from agalign.values.fields import RECORD, Measured
 
 
 @dataclass(frozen=True)
@@ -13,36 +21,13 @@ class Remedy:
 
 @dataclass(frozen=True)
 class IssueKind:
-    """A kind of issue. `verify.checks.KINDS` has all of them by code."""
+    """A kind of issue. `KINDS` has all of them by code."""
 
     code: str
     """Identifies the kind in sidecars; it must not change."""
     sentence: str
     """Template of the reason, without a full stop: `value`, `limit` and `detail` are filled in."""
     remedy: Remedy
-
-
-@dataclass(frozen=True)
-class Issue:
-    """One reason for not accepting an alignment."""
-
-    kind: IssueKind
-    value: float | None = None
-    """Measured value, in the unit of the kind: px, a share, a count."""
-    limit: float | None = None
-    """Minimum or maximum accepted value."""
-    detail: str = ""
-    """A file's error, the seed that was requested, or the distance that a share refers to."""
-
-    @property
-    def code(self) -> str:
-        """Code of the kind."""
-        return self.kind.code
-
-
-def sentence(issue: Issue) -> str:
-    """Return the reason in words, without a full stop."""
-    return issue.kind.sentence.format(value=issue.value, limit=issue.limit, detail=issue.detail)
 
 
 # ---- remedies that kinds in several modules share
@@ -69,7 +54,7 @@ OTHER_REFERENCE = Remedy(
     "copy missing files from the card again, or give --reference with a band that all captures have",
 )
 
-# ---- kinds of issues that reading, seeding and estimation report; a check defines its own
+# ---- kinds of issues that reading, seeding and estimation report
 
 _BLANK = Remedy(
     "a blank band", "look at the file (covered lens, defective sensor, wrong exposure); --bands omits a band"
@@ -110,16 +95,119 @@ OTHER_GEOMETRY = IssueKind(
 )
 """Reported for a band that only a homography or displacement field aligns, in a capture with a relief."""
 
-KINDS = (
-    UNREADABLE,
-    BLANK_REFERENCE,
-    BLANK_MOVING,
-    NO_SUCH_SEED,
-    SEED_ASKED_FOR,
-    NO_CONTRAST,
-    FEW_KEYPOINTS,
-    NOT_INVERTIBLE,
-    CORNERS_UNKNOWN,
-    RETRIEVAL,
-    OTHER_GEOMETRY,
+# ---- kinds of issues that checks report
+
+_PARALLAX = Remedy(
+    "parallax (trees, buildings, terraces), or motion between the exposures",
+    "fly higher or slower, do not use --relief never; --bands omits a band",
 )
+FOLDS = IssueKind("folds", "the mapping folds or stretches the image", UNLIKE)
+INACCURATE = IssueKind(
+    "inaccurate",
+    "the expected error is above {detail} in {value:.0%} of the image",
+    Remedy(
+        "blur, noise, parallax, or a part of the image without common structure",
+        "look at --error-map; give --model OUT/models/… of a flight that shows the whole image",
+    ),
+)
+OTHER_CONTENT = IssueKind(
+    "other_content",
+    "an area with {value:.0%} of the windows shows something else in this band",
+    Remedy(
+        "a part of the image shows another scene (a file written in part, an object near the camera, waves)",
+        "look at the picture; copy the file from the card again; --bands omits a band",
+    ),
+)
+FEW_WINDOWS = IssueKind("few_windows", "too little common structure to verify the result", TEXTURELESS)
+COVERAGE = IssueKind("coverage", "a shift can be measured in only {value:.1%} of the windows", UNLIKE)
+CLOSE_WINDOWS = IssueKind("close_windows", "only {value:.1%} of the windows are aligned within {detail}", _PARALLAX)
+CLUSTER = IssueKind("cluster", "an area with {value:.0%} of the windows is misaligned", _PARALLAX)
+UNEXPECTED_PX = IssueKind(
+    "unexpected_px",
+    "the result is {value:.1f} px from the position that the rig of the flight predicts",
+    Remedy(
+        "the result contradicts the rig of the flight",
+        "if a lens was replaced or moved, align without --model; otherwise look at the picture",
+    ),
+)
+REPEATS = IssueKind(
+    "repeats",
+    "the scene repeats: a shift of {value:.0f} px fits nearly as well, and no prior information decides",
+    Remedy(
+        "a repetitive scene (plant rows, solar panels)",
+        "keep the metadata of the camera, without --ignore-metadata, or give --model OUT/models/… of an earlier flight",
+    ),
+)
+
+
+KINDS: Mapping[str, IssueKind] = {
+    kind.code: kind
+    for kind in (
+        UNREADABLE,
+        BLANK_REFERENCE,
+        BLANK_MOVING,
+        NO_SUCH_SEED,
+        SEED_ASKED_FOR,
+        NO_CONTRAST,
+        FEW_KEYPOINTS,
+        NOT_INVERTIBLE,
+        CORNERS_UNKNOWN,
+        RETRIEVAL,
+        OTHER_GEOMETRY,
+        FOLDS,
+        FEW_WINDOWS,
+        COVERAGE,
+        CLOSE_WINDOWS,
+        CLUSTER,
+        INACCURATE,
+        UNEXPECTED_PX,
+        OTHER_CONTENT,
+        REPEATS,
+        SEED_DOES_NOT_FIT,
+    )
+}
+"""Every kind of issue that a sidecar may contain, by code."""
+
+
+def _kind_of(code: str) -> IssueKind:
+    if code not in KINDS:
+        raise ValueError(f"unknown kind of issue {code!r}")
+    return KINDS[code]
+
+
+class _ByCode:
+    """A kind of issue, which JSON holds as its code."""
+
+    def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
+        code = core_schema.literal_schema(list(KINDS))
+        return core_schema.json_or_python_schema(
+            core_schema.no_info_after_validator_function(_kind_of, code),
+            core_schema.is_instance_schema(IssueKind),
+            serialization=core_schema.plain_serializer_function_ser_schema(
+                lambda kind: kind.code, return_schema=code, when_used="json"
+            ),
+        )
+
+
+@validated.dataclass(frozen=True, config=RECORD)
+class Issue:
+    """One reason for not accepting an alignment."""
+
+    kind: Annotated[IssueKind, _ByCode()]
+    """Code of the reason."""
+    value: Annotated[float, Measured()] | None = None
+    """Measured value, in the unit of the kind: px, a share, a count."""
+    limit: Annotated[float, Measured()] | None = None
+    """Minimum or maximum accepted value."""
+    detail: str = ""
+    """A file's error, the seed that was requested, or the distance that a share refers to."""
+
+    @property
+    def code(self) -> str:
+        """Code of the kind."""
+        return self.kind.code
+
+
+def sentence(issue: Issue) -> str:
+    """Return the reason in words, without a full stop."""
+    return issue.kind.sentence.format(value=issue.value, limit=issue.limit, detail=issue.detail)

@@ -11,30 +11,33 @@ field of view of drone cameras the error is below 0.01 px (`radial_coefficients`
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import ArrayLike
+from pydantic import dataclasses as validated
 
+from agalign.values.fields import RECORD, Number
 from agalign.values.geometry import Matrix, Points
 from agalign.values.pixel_units import SAME_PIXELS, PixelScale, Size
 
 
-@dataclass(frozen=True)
+@validated.dataclass(frozen=True, config=RECORD)
 class Lens:
-    """A camera's intrinsics in raw pixels: x_px = fx * x / z + cx, after Brown-Conrady distortion.
+    """Lens model of a camera, raw pixels of the file: x_px = fx * x / z + cx, after Brown-Conrady distortion."""
 
-    `distortion` is k1, k2, p1, p2, k3, k4, k5, k6 in OpenCV's order and for normalised coordinates; coefficients
-    omitted at the end are 0, and empty means no distortion.
-    """
-
-    fx_px: float
-    fy_px: float
-    cx_px: float
-    cy_px: float
-    distortion: tuple[float, ...] = ()
+    fx_px: Number
+    """Focal length along x."""
+    fy_px: Number
+    """Focal length along y."""
+    cx_px: Number
+    """Optical centre, x."""
+    cy_px: Number
+    """Optical centre, y."""
+    distortion: tuple[Number, ...] = ()
+    """k1, k2, p1, p2, k3, k4, k5, k6 in OpenCV's order and for normalised coordinates; omitted ones are 0."""
 
     @property
     def matrix(self) -> Matrix:

@@ -4,13 +4,17 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import lru_cache
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
+from pydantic import Field
+from pydantic import dataclasses as validated
 from scipy.interpolate import CubicSpline
 from scipy.ndimage import map_coordinates
 
 from agalign.values import geometry, lens
+from agalign.values.fields import POSITION_DECIMALS, RECORD, Array, Positive
 from agalign.values.geometry import Matrix, Points
 from agalign.values.image import Mask, Tile
 from agalign.values.lens import Lens
@@ -24,19 +28,18 @@ _KNOT_STEP_PX = 32
 _CELL_PX = 32.0
 """Range of parallax over which a parabola replaces the mapping, to 0.001 px; the first range is around 0, so that it
 contains most scenes."""
-POSITION_DECIMALS = 4
-"""Of positions and displacements in a sidecar, px: a hundredth of the error of an alignment."""
 
 
-@dataclass(frozen=True)
+@validated.dataclass(frozen=True, config=RECORD)
 class DisplacementField:
-    """A smooth field of displacements on an image, px, by its values on a lattice."""
+    """A smooth field of displacements of the raw pixels of an image, px, by its values on a lattice."""
 
-    step_px: float
+    step_px: Positive
     """Distance of the lattice's nodes, px of the image that it was made for."""
-    displacements_px: NDArray[np.float64]
-    """(rows, columns, 2), px of that image; the first node is the centre of its top-left pixel."""
-    scale: PixelScale = SAME_PIXELS
+    displacements_px: Annotated[NDArray[np.float64], Array((None, None, 2), POSITION_DECIMALS)]
+    """(x, y) by row and column, px of that image; the first node is the centre of its top-left pixel, with cubic
+    splines between the nodes."""
+    scale: Annotated[PixelScale, Field(exclude=True)] = SAME_PIXELS
     """Size of that image relative to the one on which the field is evaluated."""
 
     @classmethod

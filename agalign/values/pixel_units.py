@@ -1,64 +1,22 @@
-"""Lengths in pixels, one type for each pixel grid of a band pair, and the scale between two grids.
+"""The scale between two pixel grids.
 
 A band pair has four pixel grids: those of the *files* of the fixed (reference) and of the moving band, and those of the
-*images* that the estimation uses, which are reductions of large files. A moving pixel may cover
-several times the ground of a fixed one, so a limit in fixed px must never be compared with a distance in moving px.
-With the types below mypy rejects that. At run time a length is a plain float.
+*images* that the estimation uses, which are reductions of large files. Inside the package `capture`, lengths are in px
+of the images, by default of the fixed one; outside of it, in px of the files. Names and docstrings state exceptions: a
+moving pixel may cover several times the ground of a fixed one.
 
 Positions count from the CENTRE of the top-left pixel, (0, 0). Two images of the same area share their outer EDGES, so
 a position x of one is (x + 0.5) * scale - 0.5 in the other. Only `PixelScale` implements this formula.
 """
 
 import math
-from typing import TYPE_CHECKING, NamedTuple, Self, TypeVar
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 Size = tuple[int, int]
 """(width, height) of an image in pixels."""
-
-
-class Px(float):
-    """A length in pixels of some grid. Subclasses name the grid; mypy lets only equal types be compared or added."""
-
-    __slots__ = ()
-
-    if TYPE_CHECKING:
-
-        def __lt__(self, other: Self) -> bool: ...  # type: ignore[override]
-        def __le__(self, other: Self) -> bool: ...  # type: ignore[override]
-        def __gt__(self, other: Self) -> bool: ...  # type: ignore[override]
-        def __ge__(self, other: Self) -> bool: ...  # type: ignore[override]
-        def __add__(self, other: Self) -> Self: ...  # type: ignore[override]
-        def __radd__(self, other: Self) -> Self: ...  # type: ignore[override]
-        def __sub__(self, other: Self) -> Self: ...  # type: ignore[override]
-        def __rsub__(self, other: Self) -> Self: ...  # type: ignore[override]
-        def __mul__(self, factor: float) -> Self: ...
-        def __rmul__(self, factor: float) -> Self: ...
-        def __truediv__(self, divisor: float) -> Self: ...
-
-
-class FixedImagePx(Px):
-    """Pixels of the reference image that the estimation uses."""
-
-    __slots__ = ()
-
-
-class FixedFilePx(Px):
-    """Pixels of the reference band's file."""
-
-    __slots__ = ()
-
-
-class MovingFilePx(Px):
-    """Pixels of the moving band's file."""
-
-    __slots__ = ()
-
-
-FixedPx = TypeVar("FixedPx", FixedImagePx, FixedFilePx)
-"""Grid of a result: of the images, or of the files."""
 
 
 class PixelScale(NamedTuple):

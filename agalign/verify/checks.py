@@ -1,26 +1,38 @@
-"""Checks of an alignment, which find its issues, and all kinds of issues by code.
+"""Checks of an alignment, which find its issues (`values.issues` has the kinds of issues).
 
 A new check is one function, which yields issues, and one line in `CHECKS`. The worst error is a wrong alignment called
 `aligned`. Negated comparisons also reject NaN.
 """
 
 import math
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
-from typing import Any, Generic, NamedTuple, Protocol
+from typing import NamedTuple, Protocol
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from agalign.pixels.structure import Field, correlation_surfaces
-from agalign.values import geometry, issues
+from agalign.values import geometry
 from agalign.values.alignment import MIN_RETRIEVAL, MIN_TIMES_CHANCE, JointResult, Prediction, Residual, noise_px
 from agalign.values.geometry import Matrix, Points
-from agalign.values.issues import RETRIEVAL, TEXTURELESS, UNLIKE, Issue, IssueKind, Remedy
+from agalign.values.issues import (
+    CLOSE_WINDOWS,
+    CLUSTER,
+    COVERAGE,
+    FEW_WINDOWS,
+    FOLDS,
+    INACCURATE,
+    OTHER_CONTENT,
+    REPEATS,
+    RETRIEVAL,
+    UNEXPECTED_PX,
+    Issue,
+)
 from agalign.values.mapping import DisplacementField
 from agalign.values.parallax import Parallax
-from agalign.values.pixel_units import SAME_PIXELS, FixedImagePx, FixedPx, PixelScale
+from agalign.values.pixel_units import SAME_PIXELS, PixelScale
 from agalign.verify.expected_error import MIN_COMMON_COVERAGE, error_px
 
 BY_WINDOWS = "windows"
@@ -46,51 +58,10 @@ an issue; both must be reached. Wrong peaks are scattered, windows with parallax
 _MAX_UNEXPECTED_STD = 5.0
 """Distances from the prediction above MAX_UNEXPECTED_PX are accepted up to this multiple of its standard error."""
 
-_PARALLAX = Remedy(
-    "parallax (trees, buildings, terraces), or motion between the exposures",
-    "fly higher or slower, do not use --relief never; --bands omits a band",
-)
-FOLDS = IssueKind("folds", "the mapping folds or stretches the image", UNLIKE)
-INACCURATE = IssueKind(
-    "inaccurate",
-    "the expected error is above {detail} in {value:.0%} of the image",
-    Remedy(
-        "blur, noise, parallax, or a part of the image without common structure",
-        "look at --error-map; give --model OUT/models/… of a flight that shows the whole image",
-    ),
-)
-OTHER_CONTENT = IssueKind(
-    "other_content",
-    "an area with {value:.0%} of the windows shows something else in this band",
-    Remedy(
-        "a part of the image shows another scene (a file written in part, an object near the camera, waves)",
-        "look at the picture; copy the file from the card again; --bands omits a band",
-    ),
-)
-FEW_WINDOWS = IssueKind("few_windows", "too little common structure to verify the result", TEXTURELESS)
-COVERAGE = IssueKind("coverage", "a shift can be measured in only {value:.1%} of the windows", UNLIKE)
-CLOSE_WINDOWS = IssueKind("close_windows", "only {value:.1%} of the windows are aligned within {detail}", _PARALLAX)
-CLUSTER = IssueKind("cluster", "an area with {value:.0%} of the windows is misaligned", _PARALLAX)
 BY_PARALLAX = frozenset({CLOSE_WINDOWS, CLUSTER, INACCURATE})
 """Issues that parallax may cause, which a relief or a displacement field removes."""
 PREDICTED_WITH = frozenset({*BY_PARALLAX, OTHER_CONTENT})
 """Issues of a mapping that the images confirm, but not everywhere: it is a prediction with its standard error."""
-UNEXPECTED_PX = IssueKind(
-    "unexpected_px",
-    "the result is {value:.1f} px from the position that the rig of the flight predicts",
-    Remedy(
-        "the result contradicts the rig of the flight",
-        "if a lens was replaced or moved, align without --model; otherwise look at the picture",
-    ),
-)
-REPEATS = IssueKind(
-    "repeats",
-    "the scene repeats: a shift of {value:.0f} px fits nearly as well, and no prior information decides",
-    Remedy(
-        "a repetitive scene (plant rows, solar panels)",
-        "keep the metadata of the camera, without --ignore-metadata, or give --model OUT/models/… of an earlier flight",
-    ),
-)
 
 
 class AlignedImages(Protocol):
@@ -102,7 +73,7 @@ class AlignedImages(Protocol):
     def is_expected(self, shift_px: tuple[float, float] = (0.0, 0.0)) -> bool:
         """Return True if the mapping shifted by (x, y), px of the fixed image, agrees with tags, flight or user."""
 
-    def separate_windows(self) -> Residual[FixedImagePx]:
+    def separate_windows(self) -> Residual:
         """Return the residual of windows that cover the image once."""
 
     def common_px(self) -> Points:
@@ -110,11 +81,11 @@ class AlignedImages(Protocol):
 
 
 @dataclass(frozen=True)
-class Evidence(Generic[FixedPx]):
-    """The input of the checks, on the grid of the images or of the files (`FixedPx`)."""
+class Evidence:
+    """The input of the checks, on the grid of the images or of the files (`float`)."""
 
-    joint: JointResult[FixedPx]
-    residual: Residual[FixedPx]
+    joint: JointResult
+    residual: Residual
     """Residual shifts of windows after alignment."""
     size_px: tuple[int, int]
     """(width, height) of the fixed image."""
@@ -147,14 +118,14 @@ class Evidence(Generic[FixedPx]):
         )
 
 
-def _mapping_issues(evidence: Evidence[FixedPx]) -> Iterator[Issue]:
+def _mapping_issues(evidence: Evidence) -> Iterator[Issue]:
     max_stretch = 4.0  # of the largest magnification relative to the smallest; beyond it, a homography is degenerate
     scale = geometry.local_scale(evidence.joint.fixed_to_moving, *evidence.size_px)
     if not (scale.min() > 0 and scale.max() <= max_stretch * scale.min()):
         yield Issue(FOLDS, float(scale.max() / scale.min()), max_stretch)
 
 
-def _descriptor_issues(evidence: Evidence[FixedPx]) -> Iterator[Issue]:
+def _descriptor_issues(evidence: Evidence) -> Iterator[Issue]:
     """Retrieval of held-out patches, or held-out windows of a result that is fitted to windows."""
     joint, residual = evidence.joint, evidence.residual
     # With a measured shift, if they are the only evidence: in unrelated images one in a thousand is aligned.
@@ -165,7 +136,7 @@ def _descriptor_issues(evidence: Evidence[FixedPx]) -> Iterator[Issue]:
         yield Issue(RETRIEVAL, joint.retrieval, minimum)
 
 
-def _window_issues(evidence: Evidence[FixedPx]) -> Iterator[Issue]:
+def _window_issues(evidence: Evidence) -> Iterator[Issue]:
     """Residual shifts of windows, which are independent of the estimation."""
     residual = evidence.residual
     min_windows = 4  # with structure; fewer cannot cover all corners of the image
@@ -186,7 +157,7 @@ def _window_issues(evidence: Evidence[FixedPx]) -> Iterator[Issue]:
         yield Issue(CLUSTER, cluster / count, limit / count)
 
 
-def is_misaligned(residual: Residual[FixedPx], pixel_px: float = 1.0) -> NDArray[np.bool_]:
+def is_misaligned(residual: Residual, pixel_px: float = 1.0) -> NDArray[np.bool_]:
     """Return True (n,) for windows with a shift that neither the limit nor its noise explain.
 
     `pixel_px` is the size of a pixel of the reference's file on this grid.
@@ -196,7 +167,7 @@ def is_misaligned(residual: Residual[FixedPx], pixel_px: float = 1.0) -> NDArray
     return np.asarray(lengths_px > np.hypot(MAX_SHIFT_PX * pixel_px, _MAX_NOISE_STD * noise))
 
 
-def _error_issues(evidence: Evidence[FixedPx]) -> Iterator[Issue]:
+def _error_issues(evidence: Evidence) -> Iterator[Issue]:
     """The expected error where the reference has texture and both images are valid."""
     points_px = evidence.residual.centres_px if evidence.images is None else evidence.images.common_px()
     if len(points_px):
@@ -206,7 +177,7 @@ def _error_issues(evidence: Evidence[FixedPx]) -> Iterator[Issue]:
             yield Issue(INACCURATE, 1 - share, 1 - _MIN_ACCURATE_SHARE, f"{_MAX_ERROR_PX:g} px")
 
 
-def _content_issues(evidence: Evidence[FixedPx]) -> Iterator[Issue]:
+def _content_issues(evidence: Evidence) -> Iterator[Issue]:
     """An area with texture in both bands and no common peak shows something else. Single windows are normal."""
     if evidence.images is None:
         return
@@ -252,7 +223,7 @@ def rig_issues(prediction: Prediction) -> Iterator[Issue]:
             yield Issue(UNEXPECTED_PX, prediction.off_px, limit_px)
 
 
-def _repetition_issues(evidence: Evidence[FixedPx]) -> Iterator[Issue]:
+def _repetition_issues(evidence: Evidence) -> Iterator[Issue]:
     """Another shift fits nearly as well in an orchard or on solar panels, and no prior information excludes it."""
     images = evidence.images
     if images is None:
@@ -287,54 +258,46 @@ def alias_peak(fixed: Field, moving: Field, scale: PixelScale = SAME_PIXELS) -> 
 
 
 class Check(NamedTuple):
-    """One check: the function that returns its issues, and the kinds of issues that it defines."""
+    """One check: the function that returns its issues."""
 
-    issues: Callable[[Evidence[Any]], Iterable[Issue]]
-    kinds: tuple[IssueKind, ...]
+    issues: Callable[[Evidence], Iterable[Issue]]
     is_costly: bool = False
     """Run only if no other check returns an issue."""
 
 
 CHECKS = (
-    Check(_mapping_issues, (FOLDS,)),
-    Check(_descriptor_issues, ()),
-    Check(_window_issues, (FEW_WINDOWS, COVERAGE, CLOSE_WINDOWS, CLUSTER)),
-    Check(_error_issues, (INACCURATE,)),
-    Check(lambda evidence: () if evidence.prediction is None else rig_issues(evidence.prediction), (UNEXPECTED_PX,)),
-    Check(_content_issues, (OTHER_CONTENT,), is_costly=True),
-    Check(_repetition_issues, (REPEATS,), is_costly=True),
+    Check(_mapping_issues),
+    Check(_descriptor_issues),
+    Check(_window_issues),
+    Check(_error_issues),
+    Check(lambda evidence: () if evidence.prediction is None else rig_issues(evidence.prediction)),
+    Check(_content_issues, is_costly=True),
+    Check(_repetition_issues, is_costly=True),
 )
 """In the order in which their issues are listed; the first issue is the reason in the sidecar."""
 
-KINDS: Mapping[str, IssueKind] = {
-    kind.code: kind
-    for kinds in (issues.KINDS, *(check.kinds for check in CHECKS), (issues.SEED_DOES_NOT_FIT,))
-    for kind in kinds
-}
-"""Every kind of issue that a sidecar may contain, by code."""
 
-
-def issues_of(evidence: Evidence[FixedPx]) -> tuple[Issue, ...]:
+def issues_of(evidence: Evidence) -> tuple[Issue, ...]:
     """Return every reason for not accepting a result; empty if it passes verification."""
     result = tuple(i for check in CHECKS if not check.is_costly for i in check.issues(evidence))
     return result or tuple(i for check in CHECKS if check.is_costly for i in check.issues(evidence))
 
 
-def seed_fits(residual: Residual[FixedPx]) -> bool:
+def seed_fits(residual: Residual) -> bool:
     """Return True if the residual of a seed is small enough for the status `seed_only`."""
     # Rig tags have errors of a few px (docs/cameras.md).
     max_median_px = 8.0
     return residual.coverage >= MIN_COMMON_COVERAGE and residual.median_px <= max_median_px
 
 
-def is_unchanged(joint: JointResult[FixedImagePx], given: Matrix, size_px: tuple[int, int], scale: float = 1.0) -> bool:
+def is_unchanged(joint: JointResult, given: Matrix, size_px: tuple[int, int], scale: float = 1.0) -> bool:
     """Return True if a result on an image (width, height) does not differ from the mapping `given` by the files.
 
     `scale` is the size of the image relative to its file.
     """
     change = geometry.compose(geometry.invert(given), joint.fixed_to_moving)
-    change_px = FixedImagePx(geometry.corner_error_px(change, geometry.identity(), *size_px))
+    change_px = float(geometry.corner_error_px(change, geometry.identity(), *size_px))
     # Px of the file, and standard errors of the least certain corner. Resampling would cost more sharpness than such a
     # small correction gains.
     max_unchanged_px, max_unchanged_std = 0.25, 3.0
-    return change_px <= min(FixedImagePx(max_unchanged_px * scale), joint.corner_std_px * max_unchanged_std)
+    return change_px <= min(float(max_unchanged_px * scale), joint.corner_std_px * max_unchanged_std)

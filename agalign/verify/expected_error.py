@@ -13,7 +13,6 @@ from agalign.values.alignment import Alignment, Residual, noise_px
 from agalign.values.geometry import Points
 from agalign.values.mapping import DisplacementField, PixelMapping
 from agalign.values.parallax import Parallax
-from agalign.values.pixel_units import FixedFilePx, FixedPx
 
 MIN_COMMON_COVERAGE = 0.3
 """Minimum share of the windows with a measured shift; in a band of noise, a tenth has one by chance."""
@@ -61,7 +60,7 @@ def unobserved_quarters(centres_px: Points, size_px: tuple[int, int], in_frame_p
     ]
 
 
-def unmodelled_std_px(residual: Residual[FixedPx], size_px: tuple[int, int], lens_std_px: NDArray[np.float64]) -> float:
+def unmodelled_std_px(residual: Residual, size_px: tuple[int, int], lens_std_px: NDArray[np.float64]) -> float:
     """Return the RMS lens distortion, px, that a homography fitted to the windows of a residual does not model.
 
     It is averaged over the whole image (width, height). `lens_std_px` (4,) are the standard deviations of the lens
@@ -71,9 +70,7 @@ def unmodelled_std_px(residual: Residual[FixedPx], size_px: tuple[int, int], len
     return float(np.sqrt(variance_px2(geometry.lattice(*size_px, *_LATTICE), covariance_px2, size_px).mean()))
 
 
-def expected_error_px(
-    alignment: Alignment[FixedFilePx], size_px: tuple[int, int], points_px: Points
-) -> NDArray[np.float64]:
+def expected_error_px(alignment: Alignment, size_px: tuple[int, int], points_px: Points) -> NDArray[np.float64]:
     """Return the expected RMS error, px, at points (n, 2) of the reference (width, height), raw px.
 
     By `error_px` for a band that is aligned or predicted by windows. The mapping by a rig has the standard error of the
@@ -106,7 +103,7 @@ def expected_error_px(
 
 def error_px(
     covariance_px2: NDArray[np.float64] | None,
-    residual: Residual[FixedPx] | None,
+    residual: Residual | None,
     size_px: tuple[int, int],
     points_px: Points,
     *,
@@ -146,7 +143,7 @@ def error_px(
     return np.asarray(np.sqrt(square + unmodelled_px2))
 
 
-def _far(residual: Residual[FixedPx], points_px: Points) -> NDArray[np.float64]:
+def _far(residual: Residual, points_px: Points) -> NDArray[np.float64]:
     """Return (n,) from 0 to 1 how far points (n, 2) are from the measured windows: 0 within one spacing of these."""
     spacing_px, transition_spacings = max(window_spacing_px(residual.centres_px), 1.0), 3.0
     distance_px, _ = cKDTree(residual.measured_px).query(points_px)
@@ -154,10 +151,7 @@ def _far(residual: Residual[FixedPx], points_px: Points) -> NDArray[np.float64]:
 
 
 def _with_lenses(
-    covariance_px2: NDArray[np.float64],
-    residual: Residual[FixedPx],
-    size_px: tuple[int, int],
-    lens_std_px: NDArray[np.float64],
+    covariance_px2: NDArray[np.float64], residual: Residual, size_px: tuple[int, int], lens_std_px: NDArray[np.float64]
 ) -> NDArray[np.float64]:
     """Return the covariance (12, 12) of the corners and of unknown lens shapes, given the windows of a residual.
 
@@ -178,7 +172,7 @@ def _with_lenses(
     return result
 
 
-def _unmodelled_px2(residual: Residual[FixedPx], points_px: Points, far: NDArray[np.float64]) -> NDArray[np.float64]:
+def _unmodelled_px2(residual: Residual, points_px: Points, far: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the expected squared shift (n,) at points that the mapping does not contain.
 
     It is the median of the nearest windows, so that a single wrong peak does not count, minus their noise. It is shrunk

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from scipy.special import entr
 
 from agalign.pixels.structure import gradient_magnitude
+from agalign.values.alignment import Similarity
 from agalign.values.image import FloatImage, Mask, Raster
 
 _BINS = 32
@@ -35,7 +36,7 @@ class FixedSimilarity:
         self.sampled = fixed.pixels[self.grid].ravel()
         self.bins = fixed_bins(self.sampled, _range(fixed))
 
-    def to(self, moving: Raster) -> dict[str, float]:
+    def to(self, moving: Raster) -> Similarity:
         """Compute all metrics over the pixels that are valid in both rasters.
 
         Keys: mattes_mi (elastix's sign: lower is better), nmi, ncc, gradient_correlation, structure_ssim (higher is

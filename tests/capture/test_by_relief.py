@@ -36,7 +36,6 @@ from agalign.values.image import Raster
 from agalign.values.issues import NO_CONTRAST, RETRIEVAL, Issue
 from agalign.values.mapping import PixelMapping
 from agalign.values.parallax import Parallax, Relief
-from agalign.values.pixel_units import MovingFilePx
 from agalign.verify.expected_error import expected_error_px
 
 from ..builders import in_full_run, joint_result, residual_of, whole
@@ -327,7 +326,7 @@ def test_a_lost_band_is_predicted_with_the_relief(
     norm = np.linalg.norm([b.baseline_m for b in MOVING])
     mean = {name: a.fixed_to_moving for name, a in aligned.items()}
     baselines = {b.name: (-b.baseline_m[0] / norm, -b.baseline_m[1] / norm) for b in MOVING}
-    none, from_bands_px = (dict.fromkeys(mean, MovingFilePx(value)) for value in (0.0, 0.05))
+    none, from_bands_px = (dict.fromkeys(mean, float(value)) for value in (0.0, 0.05))
     rig = Rig(boxes.size_px, mean, baselines, none, none, ("distance",), (), from_bands_px)
     pairs = [c.pair for c in candidates]
     lost = at_seed(pairs[0], candidates[0].seed, (Issue(RETRIEVAL, 0.0, 0.2),))

@@ -19,8 +19,7 @@ from agalign.flight.rig import Rig
 from agalign.pixels.masks import raster_of
 from agalign.values import geometry
 from agalign.values.alignment import Alignment, Seed
-from agalign.values.issues import RETRIEVAL, UNREADABLE, Issue
-from agalign.verify.checks import FOLDS
+from agalign.values.issues import FOLDS, RETRIEVAL, UNREADABLE, Issue
 from agalign.verify.expected_error import expected_error_px
 
 from ..builders import joint_result, pair_of, rms, two_views, whole

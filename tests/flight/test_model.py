@@ -16,7 +16,6 @@ from agalign.flight.model import FlightModel, _digest, load_model, save_model
 from agalign.flight.rig_file import read_rig
 from agalign.values import geometry
 from agalign.values.mapping import DisplacementField
-from agalign.values.pixel_units import MovingFilePx
 
 from ..conftest import save_known_model
 
@@ -32,7 +31,7 @@ def model(tmp_path: Path) -> FlightModel:
     """A model with a rig and a displacement field."""
     save_known_model(tmp_path / "known.safetensors")
     known = load(tmp_path / "known.safetensors")
-    one_band = {"extrapolation_px": MovingFilePx(0.7), "parallax_px": MovingFilePx(3.0), "fields": FIELD}
+    one_band = {"extrapolation_px": 0.7, "parallax_px": 3.0, "fields": FIELD}
     rig = replace(known.rig, **{name: {"NIR": value} for name, value in one_band.items()})
     return replace(known, rig=rig, mappings={"NIR": geometry.translation(3, 4)}, fingerprint="0f")
 

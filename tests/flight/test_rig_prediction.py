@@ -25,10 +25,9 @@ from agalign.flight.rig_prediction import (
     unobserved_error_px,
 )
 from agalign.values import geometry
-from agalign.values.pixel_units import MovingFilePx
 
 SIZE = 640, 480
-FROM_BANDS_PX = MovingFilePx(0.1)
+FROM_BANDS_PX = 0.1
 
 
 def capture(distance_px: float, seconds: float | None = None, **more: Any) -> CaptureFactors:
@@ -52,11 +51,11 @@ def some() -> Rig:
 def showing(rig: Rig, band: str, distance_px: float, std_px: float = 0.01) -> Observation:
     factors = np.array([distance_px, 0, 0, 0, 0])
     mapping = displaced(rig.mean[band], rig.design(band) @ factors, SIZE)
-    return Observation(None, {band: mapping}, {band: MovingFilePx(std_px)})
+    return Observation(None, {band: mapping}, {band: float(std_px)})
 
 
 def test_an_unobserved_quarter_adds_the_error_of_the_lenses(some: Rig) -> None:
-    half = replace(some, extrapolation_px={"NIR": MovingFilePx(0.7)})
+    half = replace(some, extrapolation_px={"NIR": 0.7})
     assert (some.covers("NIR"), half.covers("NIR"), some.covers("Green")) == (True, False, False)
     for band, other, extra_px in (("NIR", "Red", 0.7), ("Red", "NIR", 0.0)):
         std_px, half_px = (predict_band(r, band, showing(some, other, 2.0)).std_px for r in (some, half))

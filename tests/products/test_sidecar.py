@@ -28,10 +28,9 @@ from agalign.products.sidecar.file import (
 from agalign.products.sidecar.schema import ProductPart, Sidecar
 from agalign.values import geometry
 from agalign.values.capture import Band, Capture
-from agalign.values.issues import RETRIEVAL, Issue
+from agalign.values.issues import COVERAGE, RETRIEVAL, Issue
 from agalign.values.lens import Lens
 from agalign.values.mapping import PixelMapping
-from agalign.verify.checks import COVERAGE
 
 from ..builders import joint_result
 from ..conftest import read_json

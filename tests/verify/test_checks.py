@@ -10,9 +10,9 @@ import agalign
 from agalign.pixels.structure import structure_field, windowed_spectra
 from agalign.values import geometry
 from agalign.values.alignment import Prediction, Residual
-from agalign.values.issues import sentence
+from agalign.values.issues import KINDS, sentence
 from agalign.values.pixel_units import PixelScale
-from agalign.verify.checks import CHECKS, KINDS, AliasPeak, Evidence, alias_peak, is_unchanged, issues_of, seed_fits
+from agalign.verify.checks import CHECKS, AliasPeak, Evidence, alias_peak, is_unchanged, issues_of, seed_fits
 
 from ..builders import grid_px, joint_result, residual_of, texture, whole
 

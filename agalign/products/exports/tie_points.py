@@ -21,7 +21,6 @@ from agalign.values.alignment import Alignment
 from agalign.values.capture import Capture, Georeference
 from agalign.values.choices import PairStatus
 from agalign.values.files import write_csv, write_text
-from agalign.values.pixel_units import FixedFilePx
 from agalign.values.text import escape_controls
 
 _Row = tuple[str, PairStatus, list[float]]
@@ -54,7 +53,7 @@ class TiePoints(Product):
         ]
 
 
-def tie_points(alignment: Alignment[FixedFilePx]) -> NDArray[np.float64]:
+def tie_points(alignment: Alignment) -> NDArray[np.float64]:
     """Return the tie points of a band with windows that were measured under its final mapping (n, 6).
 
     They have the raw pixels (x, y) of the reference and those of the band, (0, 0) the centre of the top-left pixel; the

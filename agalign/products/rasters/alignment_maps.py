@@ -29,7 +29,6 @@ from agalign.values.interpolation import source_positions, tiles
 from agalign.values.lens import Lens
 from agalign.values.mapping import PixelMapping
 from agalign.values.parallax import Relief, rounded
-from agalign.values.pixel_units import FixedFilePx
 from agalign.verify.expected_error import expected_error_px
 
 _LATTICE_PX = 16
@@ -57,7 +56,7 @@ class ErrorMap(Product):
         return self.write_layers(context, layers, blocks, StacAsset("error", GEOTIFF, ("metadata",)))
 
 
-def error_lattice_px(alignment: Alignment[FixedFilePx], reference: Band, grid: OutputGrid) -> NDArray[np.float32]:
+def error_lattice_px(alignment: Alignment, reference: Band, grid: OutputGrid) -> NDArray[np.float32]:
     """Return the expected error (rows, columns) on a lattice over a grid, px of the reference's file; nan where it is
     unknown.
     """
@@ -77,7 +76,7 @@ def error_on_tile(nodes: NDArray[np.float32], grid: OutputGrid, tile: Tile) -> N
     return np.asarray(cv2.remap(nodes, *positions, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE), np.float32)
 
 
-def _error_px(alignment: Alignment[FixedFilePx], reference: Band, grid: OutputGrid) -> NDArray[np.float32]:
+def _error_px(alignment: Alignment, reference: Band, grid: OutputGrid) -> NDArray[np.float32]:
     """Expected error (height, width) on a grid, rounded below its accuracy: the raster compresses better."""
     result, step_px = error_on_tile(error_lattice_px(alignment, reference, grid), grid, grid.tile), 0.001
     return np.asarray(np.round(result / step_px) * step_px, np.float32)
@@ -215,14 +214,14 @@ class ReliefMap(Product):
         return self.write_layers(context, descriptions, blocks, StacAsset("relief", GEOTIFF, ("data",)))
 
 
-def relief_of(alignments: Mapping[str, Alignment[FixedFilePx]]) -> Relief | None:
+def relief_of(alignments: Mapping[str, Alignment]) -> Relief | None:
     """Return the relief of a capture; None if no band is displaced by one."""
     return next((a.mapping.parallax.relief for a in alignments.values() if a.mapping.parallax is not None), None)
 
 
 def relief_layers(
     capture: Capture,
-    alignments: Mapping[str, Alignment[FixedFilePx]],
+    alignments: Mapping[str, Alignment],
     relief: Relief,
     grid: OutputGrid,
     size_px: tuple[int, int] | None = None,
@@ -245,10 +244,7 @@ def relief_layers(
 
 
 def _range_m(
-    capture: Capture,
-    alignments: Mapping[str, Alignment[FixedFilePx]],
-    points: NDArray[np.float64],
-    parallax_px: NDArray[np.float64],
+    capture: Capture, alignments: Mapping[str, Alignment], points: NDArray[np.float64], parallax_px: NDArray[np.float64]
 ) -> NDArray[np.float32]:
     """Range (height, width), nan if baselines, focal length or the orientation of the lenses are unknown."""
     reference, unit_m, known = capture.reference, rig_unit_m(capture.bands), []

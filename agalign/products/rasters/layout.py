@@ -17,7 +17,7 @@ from agalign.values.capture import Band, Capture, Radiometry
 from agalign.values.geometry import Matrix, Points
 from agalign.values.image import Mask, OutputGrid, Tile
 from agalign.values.mapping import PixelMapping
-from agalign.values.pixel_units import SAME_PIXELS, FixedFilePx, PixelScale, Size
+from agalign.values.pixel_units import SAME_PIXELS, PixelScale, Size
 
 _MAX_CELL_PX, _MIN_CELLS = 8, 64
 """The common area is found in cells of at most 8 px, and at least 64 cells along each axis if the image has as many."""
@@ -68,10 +68,7 @@ def flight_limits(flights: Iterable[tuple[Sequence[Capture], Rig | None]]) -> Fl
 
 
 def output_layers(
-    capture: Capture,
-    alignments: Mapping[str, Alignment[FixedFilePx]],
-    settings: WriteSettings,
-    common: OutputGrid | None = None,
+    capture: Capture, alignments: Mapping[str, Alignment], settings: WriteSettings, common: OutputGrid | None = None
 ) -> tuple[list[Layer], OutputGrid]:
     """Return a layer for each band of a capture, given the alignments of its usable moving bands, and their grid: the
     `common` one of the camera, if any.

@@ -15,8 +15,7 @@ from pydantic import BaseModel
 from agalign.products.indices.rasters import IndexReport
 from agalign.products.run.record import RefusalPart
 from agalign.products.sidecar.schema import BandPart, BandResult, CaptureResult, GridPart, OutputPart, Sidecar
-from agalign.values.issues import MISSING_BAND, MOSAICS, OTHER_REFERENCE, UNREADABLE, Remedy
-from agalign.verify.checks import KINDS
+from agalign.values.issues import KINDS, MISSING_BAND, MOSAICS, OTHER_REFERENCE, UNREADABLE, Remedy
 
 _SHIFT_STEP_PX = 0.01
 """Shifts of windows are written as integer multiples of this."""

@@ -27,12 +27,10 @@ from agalign.values.capture import Band
 from agalign.values.choices import CaptureStatus
 from agalign.values.geometry import Points
 from agalign.values.image import OutputGrid
-from agalign.values.issues import Issue
+from agalign.values.issues import KINDS, Issue
 from agalign.values.lens import Lens
 from agalign.values.mapping import DisplacementField, PixelMapping
 from agalign.values.parallax import Parallax, Relief
-from agalign.values.pixel_units import FixedFilePx
-from agalign.verify.checks import KINDS
 
 _GRIDS = ((17, 13), (33, 25), (65, 49), (129, 97))
 """Columns and rows of the sampled mapping, each with the points halfway between those of the one before; the first with
@@ -156,7 +154,7 @@ def _band_part(context: ProductContext, band: Band) -> BandPart:
     return part
 
 
-def _metrics(alignment: Alignment[FixedFilePx]) -> dict[str, Any]:
+def _metrics(alignment: Alignment) -> dict[str, Any]:
     residual, before, after = alignment.residual, dict(alignment.before), dict(alignment.after)
     if residual is None:
         return {"before": before, "after": after, "tiles": []}
@@ -209,7 +207,7 @@ def _grid_px(mapping: PixelMapping, size_px: tuple[int, int]) -> Points:
     return points_px
 
 
-def read_alignment(sidecar: str | Path, band: str) -> Alignment[FixedFilePx]:
+def read_alignment(sidecar: str | Path, band: str) -> Alignment:
     """Return the alignment of a moving band as a sidecar and its relief raster store it.
 
     Its `map`, `inverse` and `warp` are those of the run, between the raw pixels of the files; the relief, and occlusion
@@ -235,17 +233,17 @@ def read_alignment(sidecar: str | Path, band: str) -> Alignment[FixedFilePx]:
     issues = tuple(Issue(KINDS[i.kind], i.value, i.limit) for i in part.issues)
     held_out_px = {} if part.geometry is None else part.geometry.held_out_p95_px
     facts: dict[str, Any] = {"residual": _residual_of(part), "seconds": part.seconds, "moving_size_px": part.size_px}
-    facts["candidates"] = {k: FixedFilePx(math.inf if px is None else px) for k, px in held_out_px.items()}
+    facts["candidates"] = {k: float(math.inf if px is None else px) for k, px in held_out_px.items()}
     return Alignment(mapping, content.reference.size_px, part.status, issues, seed, **facts)
 
 
-def _residual_of(part: BandPart) -> Residual[FixedFilePx] | None:
+def _residual_of(part: BandPart) -> Residual | None:
     tiles = [] if part.metrics is None else [t for t in part.metrics.tiles if t.cell is not None]
     if part.metrics is None or len(tiles) < len(part.metrics.tiles):
         return None
     centres, shifts = np.array([(t.centre_px, t.shift_px) for t in tiles], float).reshape(-1, 2, 2).swapaxes(0, 1)
     peaks, cells = np.array([t.peak_sigma for t in tiles], float), np.array([t.cell for t in tiles], np.int64)
-    return Residual[FixedFilePx].of(centres, shifts, peaks, cells.reshape(-1, 2))
+    return Residual.of(centres, shifts, peaks, cells.reshape(-1, 2))
 
 
 def _parallax_of(path: Path, content: Sidecar, part: ReliefPart, fixed: Lens | None) -> Parallax:

@@ -3,17 +3,20 @@
 import hashlib
 import json
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 from pydantic import ValidationError
 
 from agalign.errors import InputError, SidecarError
-from agalign.products.sidecar.schema import SCHEMA, CaptureResult, Sidecar
+from agalign.products.sidecar.schema import SCHEMA, FilePart, Sidecar, from_version_1
 from agalign.values.files import compact_lists, file_checksum, open_regular, read_regular, write_text
 
 _MAX_BYTES = 1 << 26
 """Limit of a file that is read: ten times the sidecar of many bands."""
+_START_BYTES = 200
+"""A sidecar has its schema in the first bytes."""
 _MAX_QUOTED = 60
 """Characters of a wrong value that a message quotes."""
 
@@ -26,22 +29,19 @@ def write_sidecar(path: Path, sidecar: Sidecar) -> Sidecar:
     return complete
 
 
-def update_products(path: Path, files: Sequence[Path]) -> None:
-    """Update size and checksum of those `files` that the sidecar at `path` lists, after a later command replaced them.
+def file_part(kind: str, path: Path, folder: Path) -> FilePart:
+    """Return the entry of a file below the folder of its sidecar. Raises OutputError."""
+    file = path.relative_to(folder).as_posix()
+    return FilePart(kind=kind, file=file, bytes=path.stat().st_size, sha256=file_checksum(path))
 
-    Raises SidecarError, OutputError.
-    """
-    replaced = {file.name: file for file in files}
-    if not any(part.file in replaced for part in read_result(path).products):
+
+def add_products(path: Path, kind: str, files: Sequence[Path]) -> None:
+    """List files that a later command has written in the sidecar at `path`. Raises SidecarError, OutputError."""
+    if not files:
         return
-    sidecar = read_sidecar(path)
-    products = [
-        part.model_copy(update={"bytes": file.stat().st_size, "sha256": file_checksum(file)})
-        if (file := replaced.get(part.file)) is not None
-        else part
-        for part in sidecar.products
-    ]
-    write_sidecar(path, sidecar.model_copy(update={"products": products}))
+    sidecar, added = read_sidecar(path), [file_part(kind, file, path.parent) for file in files]
+    others = [part for part in sidecar.products if part.file not in {part.file for part in added}]
+    write_sidecar(path, sidecar.model_copy(update={"products": [*others, *added]}))
 
 
 def content_checksum(text: str | bytes) -> str:
@@ -59,13 +59,20 @@ def _without_seconds(part: dict[str, Any]) -> dict[str, Any]:
 
 
 def read_sidecar(path: Path) -> Sidecar:
-    """Return a sidecar. Raises SidecarError with file and field if it is missing, malformed or of another version."""
-    return _read(path, Sidecar)
+    """Return a sidecar of this schema version or of version 1.
 
-
-def read_result(path: Path) -> CaptureResult:
-    """Return a sidecar without its long tables, which take most of the time to read. Raises SidecarError."""
-    return _read(path, CaptureResult)
+    Raises SidecarError with file and field if it is missing, malformed or of another version.
+    """
+    try:
+        text = read_regular(path, _MAX_BYTES)
+        if b'"agalign/1"' in text[:_START_BYTES]:
+            with suppress(KeyError, TypeError, AttributeError, ValueError):  # not a sidecar: refused below
+                text = json.dumps(from_version_1(json.loads(text))).encode()
+        return Sidecar.model_validate_json(text)
+    except OSError as error:
+        raise SidecarError(f"{path}: cannot be read ({error.strerror or error}); delete it and run again") from None
+    except ValidationError as error:
+        raise SidecarError(f"{path}: {_problem(error)}") from None
 
 
 def find_sidecars(folder: Path) -> list[Path]:
@@ -76,7 +83,7 @@ def find_sidecars(folder: Path) -> list[Path]:
             if path.is_dir():
                 continue
             with open_regular(path) as file:
-                if b'"agalign/' not in file.read(200):  # a sidecar starts with its schema
+                if b'"agalign/' not in file.read(_START_BYTES):
                     continue
         except OSError:
             pass
@@ -91,18 +98,6 @@ def run_sidecars(out: Path) -> list[Path]:
         what = "no sidecars there" if out.is_dir() else "is not a folder" if out.exists() else "does not exist"
         raise InputError(f"{out}: {what}; give the output folder of a run")
     return sidecars
-
-
-Model = TypeVar("Model", bound=CaptureResult)
-
-
-def _read(path: Path, model: type[Model]) -> Model:
-    try:
-        return model.model_validate_json(read_regular(path, _MAX_BYTES))
-    except OSError as error:
-        raise SidecarError(f"{path}: cannot be read ({error.strerror or error}); delete it and run again") from None
-    except ValidationError as error:
-        raise SidecarError(f"{path}: {_problem(error)}") from None
 
 
 def _problem(error: ValidationError) -> str:
@@ -134,12 +129,12 @@ def verify_outputs(out: Path) -> Iterator[tuple[Path, list[str]]]:
 
 
 def _problems_of_outputs(path: Path) -> Iterator[str]:
-    sidecar = read_result(path)
+    sidecar = read_sidecar(path)
     if sidecar.checksum is not None and sidecar.checksum != content_checksum(read_regular(path, _MAX_BYTES)):
         yield f"{path}: was changed after it was written; run again with --overwrite"
     for kind in sidecar.not_written:
         yield f"{path}: its {kind} could not be written; run again"
-    for part in sidecar.products:
+    for part in sidecar.files:
         target = path.parent / part.file
         try:
             with open_regular(target) as file:

@@ -1,154 +1,55 @@
-"""The sidecar of a capture, a JSON file next to its aligned stack: schema `agalign/1`.
+"""The sidecar of a capture, a JSON file next to its aligned stack: schema `agalign/2`.
+
+It is the whole result of the estimation, together with the raster of the parallax of a capture that has one: rasters
+are rendered from it and the files of the capture. Its parts are the records of the program themselves (`values`), or
+the models below.
 
 All pixel coordinates are x right, y down, (0, 0) the centre of the top-left pixel. `fixed_to_moving` maps a pixel of
 the reference to a pixel of the moving band; `grid` samples the complete mapping between the raw pixels of the files.
 """
 
-import math
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from functools import partial
+from collections.abc import Iterable, Mapping
+from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
 import numpy as np
-from pydantic import (
-    AfterValidator,
-    BaseModel,
-    ConfigDict,
-    Field,
-    GetCoreSchemaHandler,
-    ValidationInfo,
-    field_validator,
-    model_validator,
+from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, Field, ValidationInfo, field_validator, model_validator
+
+from agalign._version import __version__
+from agalign.config import CheckSettings, Settings
+from agalign.flight.fingerprint import estimation_fingerprint, input_samples
+from agalign.products.sidecar.sampled import sampled_mapping, sampled_parallax
+from agalign.values.alignment import Alignment, JointResult, Prediction, Residual, Seed, Similarity
+from agalign.values.capture import Band, CameraIdentity, Capture, Pose, Position
+from agalign.values.choices import CaptureStatus, Geometry, PairStatus, Space
+from agalign.values.fields import (
+    RECORD,
+    Array,
+    Count,
+    Matrix3x3,
+    Number,
+    Number3,
+    Number4,
+    PointsPx,
+    Positive,
+    RelativeFile,
 )
-from pydantic_core import CoreSchema, core_schema
-
-from agalign.config import CheckSettings
-from agalign.values.alignment import Prediction
-from agalign.values.choices import CaptureStatus, Geometry, ModelFamily, PairStatus, PredictionSource, SeedKind, Space
-from agalign.values.files import is_inside
 from agalign.values.image import OutputGrid
-from agalign.values.issues import MISSING_BAND, IssueKind
-from agalign.values.mapping import POSITION_DECIMALS
+from agalign.values.issues import MISSING_BAND, Issue
+from agalign.values.lens import Lens
+from agalign.values.mapping import DisplacementField, PixelMapping
+from agalign.values.parallax import Parallax, Relief
 from agalign.values.pixel_units import PixelScale
-from agalign.verify.checks import KINDS
 
-SCHEMA = "agalign/1"
-Number = Annotated[float, Field(ge=-1e30, le=1e30)]
-"""Sums and squares of such numbers are finite."""
-Row = tuple[Number, Number, Number]
+SCHEMA = "agalign/2"
 PointPx = tuple[Number, Number]
-Count = Annotated[int, Field(gt=0)]
-Positive = Annotated[Number, Field(gt=0)]
-
-
-@dataclass(frozen=True)
-class _FromProgram:
-    """A conversion of the program's values. Values in a file are in their final form, and validated without it."""
-
-    convert: Callable[[Any], Any]
-
-    def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
-        schema = handler(source)
-        converted = core_schema.no_info_before_validator_function(self.convert, schema)
-        return core_schema.json_or_python_schema(json_schema=schema, python_schema=converted)
-
-
-def _measured(decimals: int | None = None) -> _FromProgram:
-    """Convert a number that is not finite to None, and others to these decimals."""
-
-    def convert(value: object) -> object:
-        if not isinstance(value, float):
-            return value
-        return None if not math.isfinite(value) else value if decimals is None else round(value, decimals)
-
-    return _FromProgram(convert)
-
-
-def _from_array(positions_px: object, decimals: int = POSITION_DECIMALS) -> object:
-    return np.round(np.asarray(positions_px), decimals).tolist()
-
-
-Matrix3x3 = Annotated[tuple[Row, Row, Row], _FromProgram(lambda matrix: np.asarray(matrix).tolist())]
-PointsPx = Annotated[list[PointPx], _FromProgram(_from_array)]
-Coefficients = Annotated[list[PointPx], _FromProgram(partial(_from_array, decimals=9))]
+Coefficients = Annotated[NDArray[np.float64], Array((None, 2), 9)]
 """Nine decimals: they are multiplied by the square of the parallax, up to hundreds of px."""
-Finite = Annotated[Number | None, _measured()]
-Number2 = Annotated[Number, _measured(2)]
-Number3 = Annotated[Number, _measured(3)]
-Fraction4 = Annotated[Number | None, _measured(4)]
-Fraction6 = Annotated[Number | None, _measured(6)]
-"""Digits beyond the sixth depend on the order in which threads add up."""
-
-
-def _inside_folder(name: str) -> str:
-    if not is_inside(name):
-        raise ValueError("names a file outside its folder")
-    return name
-
-
-RelativeFile = Annotated[str, AfterValidator(_inside_folder)]
-"""A file in the sidecar's folder or below. A sidecar may come from anyone, and agalign reads and removes the files that
-it lists.
-"""
 
 
 class _Part(BaseModel):
-    """Validated from the JSON of a sidecar, or from the program's record with attributes of these names."""
-
-    model_config = ConfigDict(
-        extra="forbid", allow_inf_nan=False, populate_by_name=True, use_attribute_docstrings=True, from_attributes=True
-    )
-
-
-def _check_lengths(lists: list[list[PointPx]]) -> list[list[PointPx]]:
-    """Return lists of points. Raises ValueError if they are empty or of different lengths."""
-    lengths = {len(one) for one in lists}
-    if len(lengths) != 1 or 0 in lengths:
-        raise ValueError("its lists of points are empty or of different lengths")
-    return lists
-
-
-class _PointLists(_Part):
-    """A part with lists of corresponding points."""
-
-    @model_validator(mode="after")
-    def _check(self) -> Self:
-        _check_lengths([value for value in vars(self).values() if isinstance(value, list)])
-        return self
-
-
-class _Result(_Part):
-    """A model of a part of the fields: it ignores the others when a sidecar is read."""
-
-    model_config = ConfigDict(extra="ignore")
-
-
-class CameraPart(_Part):
-    """From the tags."""
-
-    make: str
-    """Manufacturer."""
-    model: str
-    """Model."""
-    serial: str
-    """Serial numbers, joined by `+`."""
-
-    @property
-    def name(self) -> str:
-        """Manufacturer and model; empty if both are unknown."""
-        return f"{self.make} {self.model}".strip()
-
-
-class PositionPart(_Part):
-    """GPS position of the reference band."""
-
-    latitude: Number
-    """Degrees, WGS 84."""
-    longitude: Number
-    """Degrees, WGS 84."""
-    altitude_m: Number | None
-    """Altitude in the tags, m."""
+    model_config = ConfigDict(frozen=True, allow_inf_nan=False, **RECORD)
 
 
 class ReferencePart(_Part):
@@ -184,46 +85,7 @@ class HomographyPart(_Part):
     """
 
 
-class SeedPart(_Part):
-    """Initial alignment, in the same space as the homography."""
-
-    kind: SeedKind
-    """`user`; `match` (learned descriptors matched); `model` (median mapping of the flight); `rig` (camera tags);
-    `centre` (optical centres of DJI); `geo` (geotransforms); `structure` (phase correlation); `identity`.
-    """
-    fixed_to_moving: Matrix3x3
-    """As in `homography`."""
-    peak_sigma: Number
-    """Height of its correlation peak, in standard deviations."""
-    runner_up_sigma: Number
-    """The same for the second highest peak."""
-
-
-class LensPart(_Part):
-    """Lens model of a camera, Brown-Conrady in OpenCV's convention, raw pixels of the file."""
-
-    fx_px: Number
-    """Focal length along x."""
-    fy_px: Number
-    """Focal length along y."""
-    cx_px: Number
-    """Optical centre, x."""
-    cy_px: Number
-    """Optical centre, y."""
-    distortion: tuple[Number, ...]
-    """k1, k2, p1, p2, k3, k4, k5, k6; omitted ones are 0."""
-
-
-class FieldPart(_Part):
-    """Displacement field of the raw pixels of the reference."""
-
-    step_px: Positive
-    """Spacing of the nodes, from the centre of the top-left pixel."""
-    displacements_px: Annotated[list[list[PointPx]], AfterValidator(_check_lengths), _FromProgram(_from_array)]
-    """(x, y) by row and column; cubic splines between the nodes."""
-
-
-class GridPart(_PointLists):
+class GridPart(_Part):
     """The complete mapping, sampled at 17 x 13 points, or at up to 129 x 97 points if cubic interpolation (scipy's
     CloughTocher2DInterpolator or RectBivariateSpline) of fewer has errors above 0.02 px (p99). If there is a `relief`,
     use that instead.
@@ -234,115 +96,22 @@ class GridPart(_PointLists):
     moving_px: PointsPx
     """The corresponding raw pixels of the band."""
 
-
-def _known_kind(code: str) -> str:
-    if code not in KINDS:
-        raise ValueError(f"unknown kind of issue {code!r}")
-    return code
-
-
-def _code(kind: object) -> object:
-    return kind.code if isinstance(kind, IssueKind) else kind
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        _check_lengths(self.reference_px, self.moving_px)
+        return self
 
 
-IssueCode = Annotated[
-    str, AfterValidator(_known_kind), _FromProgram(_code), Field(json_schema_extra={"enum": list(KINDS)})
-]
+class MetricsPart(_Part):
+    """Similarity before and after alignment, and shifts of windows."""
 
-
-class IssuePart(_Part):
-    """A reason for not accepting the alignment."""
-
-    kind: IssueCode
-    """Code of the reason."""
-    value: Finite
-    """Measured value."""
-    limit: Finite
-    """Limit of the check."""
-
-
-class JointPart(_Part):
-    """Result of the joint optimisation of descriptor and mapping."""
-
-    accepted: bool = True
-    """False if `homography` and `grid` are those of the seed or the prediction."""
-    loss: Finite
-    """Final loss; null if nothing was learned."""
-    retrieval: Number
-    """Share of held-out patches with the true counterpart as nearest descriptor."""
-    chance: Number
-    """Retrieval expected by chance."""
-    iterations: int
-    """Steps; 0 if nothing was learned."""
-    levels: list[Number]
-    """Scales of the images used; 1 is full resolution."""
-    recipe: str
-    """`flight` (frozen network of the flight), `fast` (learned on this capture), `paper`, or `windows` (windows
-    alone).
-    """
-    model_family: ModelFamily
-    """Mapping that was fitted."""
-    last_step_px: Number
-    """Movement of a corner in the last step, px."""
-    corner_std_px: Annotated[Number, _measured(6)]
-    """Standard error of the least certain corner, px of the reference."""
-    corner_std_xy_px: PointsPx
-    """Standard errors (x, y) at the corners, clockwise from the top left, px of the reference.
-    """
-
-
-class SimilarityPart(_Part):
-    """Similarity of pixels that are valid in both bands; in large images of a sample of at least 250,000."""
-
-    mattes_mi: Fraction6 = None
-    """Negative Mattes mutual information, nats, 32 bins: lower is better."""
-    nmi: Fraction6 = None
-    """Normalised mutual information, 1 to 2: higher is better."""
-    ncc: Fraction6 = None
-    """Normalised cross-correlation; negative if contrast is reversed."""
-    gradient_correlation: Fraction6 = None
-    """Correlation of gradient magnitudes: higher is better."""
-    structure_ssim: Fraction6 = None
-    """SSIM of the structure images: higher is better."""
-    overlap: Fraction6 = None
-    """Share of the image in which both bands are valid."""
-    residual_px: Fraction6 = None
-    """Median length of the shifts of the windows, px of the reference."""
-    residual_p95_px: Fraction6 = None
-    """Their 95th percentile, px of the reference."""
-    residual_coverage: Fraction6 = None
-    """Share of the textured windows with a measured shift."""
-
-
-class ResidualTile(_Part):
-    """Shift of a window after alignment."""
-
-    centre_px: tuple[Number2, Number2]
-    """Centre of the window, px of the reference."""
-    shift_px: tuple[Fraction4, Fraction4]
-    """Shift, px of the reference; null if none could be measured."""
-    peak_sigma: Fraction4 = None
-    """Height of the correlation peak, standard deviations."""
-    cell: tuple[int, int] | None = None
-    """Column and row in the complete grid of windows."""
-
-
-class MetricsResult(_Result):
-    """Similarity before and after alignment."""
-
-    before: SimilarityPart
+    before: Similarity
     """Files as they are."""
-    after: SimilarityPart
+    after: Similarity
     """Bands as written."""
-
-
-class MetricsPart(MetricsResult):
-    """Similarity before and after alignment."""
-
-    model_config = ConfigDict(extra="forbid")
-
-    tiles: list[ResidualTile]
-    """Shifts of the windows; with recipe `windows`, of those left out of the fit."""
+    windows: Residual | None = None
+    """Windows that took no part in the estimation, under the mapping; with recipe `windows`, those left out of the fit.
+    """
 
 
 class GeometryPart(_Part):
@@ -352,7 +121,7 @@ class GeometryPart(_Part):
     """`homography`: nothing; `field`: a smooth displacement field; `relief`: the parallax of the capture;
     `relief and field`: both.
     """
-    held_out_p95_px: dict[Geometry, Fraction4]
+    held_out_p95_px: dict[Geometry, Number4]
     """p95 of the shifts of held-out windows, px, for each geometry that was fitted."""
 
     @property
@@ -366,16 +135,16 @@ class GeometryPart(_Part):
         return self.held_out_p95_px.get(self.kind)
 
 
-class ReliefPart(_PointLists):
+class ReliefPart(_Part):
     """Displacement by the parallax of the capture: a pixel x of the reference with parallax z maps to plane_px(x) + z
     slope(x) + z^2 curvature(x), interpolated by cubic splines.
     """
 
     file: RelativeFile | None
-    """[Raster](#the-relief-raster) with the parallax."""
+    """[Raster](#the-relief-raster) with the parallax, on the grid of the stack; null if it was not written."""
     baseline: PointPx
     """Displacement per px of parallax, undistorted px of the reference; the longest baseline has length 1."""
-    occluded: Annotated[Number, _measured(4)]
+    occluded: Number4
     """Share of the reference pixels that are occluded in the band."""
     reference_px: PointsPx
     """Nodes: those of `grid`."""
@@ -386,18 +155,16 @@ class ReliefPart(_PointLists):
     curvature: Coefficients | None = None
     """The same per px of parallax squared; null in files of earlier versions, which are less accurate."""
 
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        lists = self.reference_px, self.plane_px, self.slope, self.curvature
+        _check_lengths(*(one for one in lists if one is not None))
+        return self
 
-class PredictionPart(_Part):
-    """Mapping that is predicted without the image of the band, or extrapolated from a part of it."""
 
-    source: Annotated[PredictionSource, Field(alias="from")]
-    """`bands` (other bands of the capture), `neighbours` (other captures), `flight` (mean), or `windows` (a part of the
-    image).
-    """
-    std_px: Annotated[Number, _measured(4)]
-    """Standard error over the image (root mean square), px of the band's own file."""
-    off_px: Fraction4
-    """Distance of the image's own alignment from the prediction, px of the band's own file."""
+def _check_lengths(*lists: NDArray[np.float64]) -> None:
+    if len({len(one) for one in lists}) != 1 or not len(lists[0]):
+        raise ValueError("its lists of points are empty or of different lengths")
 
 
 class PlacePart(_Part):
@@ -409,8 +176,8 @@ class PlacePart(_Part):
     """Band in that file, from 1."""
 
 
-class BandResult(_Result):
-    """Result of one band."""
+class BandResult(_Part):
+    """Result of one band, with its complete mapping."""
 
     band: str
     """Name of the band."""
@@ -420,62 +187,134 @@ class BandResult(_Result):
     """Image file."""
     band_index: int
     """Band in that file, from 1."""
+    size_px: tuple[Count, Count] | None = None
+    """Width and height of the file."""
     status: PairStatus
     """`reference`, `aligned`, `predicted`, `seed_only` or `failed`."""
     reason: str | None
     """Why the band is not aligned, in words."""
-    issues: list[IssuePart] = Field(default=[], alias="doubts")
+    issues: tuple[Issue, ...] = ()
     """All reasons for not accepting the alignment; `reason` is the first."""
     homography: HomographyPart | None = None
     """Mapping without lenses and displacements."""
-    seed: SeedPart | None = None
-    """Initial alignment, in the same space as the homography."""
-    joint: JointPart | None = None
-    """Result of the joint optimisation of descriptor and mapping."""
-    metrics: MetricsResult | None = None
-    """Similarity before and after."""
-    geometry: GeometryPart | None = None
-    """What the mapping has in addition to homography and lens models."""
-    prediction: PredictionPart | None = None
-    """Prediction."""
-    place: PlacePart | None = None
-    """Where the aligned pixels of the band are."""
-    seconds: Number3
-    """Share of the capture's processing time, equal for all its bands."""
-    saturated: Fraction4 = None
-    """Share of saturated pixels in the file."""
-
-
-class BandPart(BandResult):
-    """Result of one band, with its complete mapping."""
-
-    model_config = ConfigDict(extra="forbid")
-
-    metrics: MetricsPart | None = None
-    """Similarity and shifts."""
-    lenses: tuple[LensPart, LensPart] | None = None
+    lenses: tuple[Lens, Lens] | None = None
     """Of the reference and the band, if the homography is between undistorted pixels."""
-    field: FieldPart | None = None
+    field: DisplacementField | None = None
     """Displacement field of the raw pixels of the reference."""
     grid: GridPart | None = None
     """The complete mapping, sampled."""
     relief: ReliefPart | None = None
     """Displacement by parallax."""
-    size_px: tuple[Count, Count] | None = None
-    """Width and height of the file."""
-    levels: list[list[Fraction6]] = []
-    """Means of the written pixels in 6 rows of 8 equal blocks; empty for thermal bands and RGB companions."""
+    seed: Seed | None = None
+    """Initial alignment, in the same space as the homography."""
+    joint: JointResult | None = None
+    """Result of the joint optimisation of descriptor and mapping."""
+    metrics: MetricsPart | None = None
+    """Similarity and shifts before and after."""
+    geometry: GeometryPart | None = None
+    """What the mapping has in addition to homography and lens models."""
+    prediction: Prediction | None = None
+    """Mapping that is predicted without the image of the band, or extrapolated from a part of it."""
+    lens_std_px: Annotated[NDArray[np.float64], Array((4,), 6)] | None = None
+    """Standard deviations of the lens shapes that neither tags nor a rig determine, px of the reference."""
+    relief_std_px: Number = 0.0
+    """Spread of the relief of the flight, which a mapping without relief lacks, px of the reference."""
+    place: PlacePart | None = None
+    """Where the aligned pixels of the band are."""
+    saturated: Number4 | None = None
+    """Share of saturated pixels in the file."""
+    seconds: Number3
+    """Share of the capture's processing time, equal for all its bands."""
+
+    @classmethod
+    def of_reference(cls, band: Band) -> Self:
+        """Return the entry of the reference band."""
+        return cls(**_source(band), status="reference", reason=None, seconds=0.0)
+
+    @classmethod
+    def of(cls, band: Band, alignment: Alignment) -> Self:
+        """Return the entry of a moving band."""
+        mapping, relief = alignment.mapping, None
+        grid_px = sampled_mapping(mapping.of_the_plane, alignment.size_px)
+        if mapping.parallax is not None:
+            hidden, baseline = mapping.parallax.hidden, mapping.parallax.baseline
+            occluded = 0.0 if hidden is None else float(hidden.mean())
+            tables = dict(zip(("plane_px", "slope", "curvature"), sampled_parallax(mapping, grid_px), strict=True))
+            relief = ReliefPart(file=None, baseline=baseline, occluded=occluded, reference_px=grid_px, **tables)
+        lenses = (mapping.fixed_lens, mapping.moving_lens)
+        return cls(
+            **_source(band),
+            status=alignment.status,
+            reason=alignment.reason,
+            issues=alignment.issues,
+            homography=HomographyPart(fixed_to_moving=mapping.fixed_to_moving, space=alignment.space),
+            lenses=None if None in lenses else lenses,
+            field=mapping.field,
+            grid=GridPart(reference_px=grid_px, moving_px=mapping(grid_px)),
+            relief=relief,
+            seed=alignment.seed,
+            joint=alignment.joint,
+            metrics=MetricsPart(before=alignment.before, after=_after(alignment), windows=alignment.residual),
+            geometry=GeometryPart(kind=alignment.geometry, held_out_p95_px=dict(alignment.candidates)),
+            prediction=alignment.prediction,
+            lens_std_px=alignment.lens_std_px,
+            relief_std_px=alignment.relief_std_px,
+            seconds=alignment.seconds,
+        )
+
+    def alignment(self, size_px: tuple[int, int], relief: Relief | None) -> Alignment:
+        """Return the alignment of a moving band with a mapping, given (width, height) of the reference and the relief
+        of the capture.
+        """
+        assert self.homography is not None
+        assert self.seed is not None
+        fixed, moving = self.lenses or (None, None)
+        parallax = None
+        if self.relief is not None and relief is not None:
+            parallax = Parallax(relief, self.relief.baseline).with_occlusions()
+        return Alignment(
+            PixelMapping(self.homography.fixed_to_moving, fixed, moving, field=self.field, parallax=parallax),
+            size_px,
+            self.status,
+            self.issues,
+            self.seed,
+            joint=self.joint,
+            residual=None if self.metrics is None else self.metrics.windows,
+            seconds=self.seconds,
+            before=Similarity() if self.metrics is None else self.metrics.before,
+            after=Similarity() if self.metrics is None else self.metrics.after,
+            candidates={} if self.geometry is None else self.geometry.held_out_p95_px,
+            prediction=self.prediction,
+            lens_std_px=self.lens_std_px,
+            relief_std_px=self.relief_std_px,
+            moving_size_px=self.size_px,
+        )
+
+    def is_usable(self, accept_predicted_px: float) -> bool:
+        """Return True for the reference, an aligned band, or a predicted band with an accepted standard error."""
+        if self.status == "predicted":
+            return self.prediction is not None and self.prediction.std_px <= accept_predicted_px
+        return self.status in ("reference", "aligned")
+
+    def without_tables(self) -> Self:
+        """Return the entry without its long tables."""
+        metrics = None if self.metrics is None else self.metrics.model_copy(update={"windows": None})
+        return self.model_copy(update={"grid": None, "field": None, "relief": None, "metrics": metrics})
 
 
-class FilePart(_Part):
-    """File of a single band."""
+def _source(band: Band) -> dict[str, Any]:
+    """The file of a band."""
+    facts = {"band": band.name, "wavelength_nm": band.wavelength_nm, "size_px": band.size_px}
+    return facts | {"file": band.path.name, "band_index": band.band_index}
 
-    file: RelativeFile
-    """Path."""
-    bytes: int
-    """Size."""
-    nodata: float | str | None = None
-    """Nodata value; `"nan"` for NaN."""
+
+def _after(alignment: Alignment) -> Similarity:
+    if (residual := alignment.residual) is None:
+        return alignment.after
+    shifts = Similarity(
+        residual_px=residual.median_px, residual_p95_px=residual.p95_px, residual_coverage=residual.coverage
+    )
+    return alignment.after | shifts
 
 
 class IlluminationPart(_Part):
@@ -494,10 +333,6 @@ class OutputPart(_Part):
 
     file: RelativeFile | None
     """The stack; null with `--layout bands`."""
-    bytes: int | None
-    """Its size."""
-    band_files: list[FilePart] = []
-    """Files of single bands."""
     radiometry: str | None = None
     """Conversion of raw numbers, such as `reflectance by panel and light sensor`."""
     panel_age_s: Number | None = None
@@ -513,8 +348,8 @@ class OutputPart(_Part):
     vignetting_corrected: bool = False
     """True if vignetting is corrected in the files of single bands."""
     nodata: float | str | None
-    """Nodata value of the stack, or of all single bands; null if they differ. Integers without one in the input: 0,
-    or another value that no valid pixel has.
+    """Nodata value of the stack, or of all single bands; null if they differ. `"nan"` for NaN. Integers without one in
+    the input: 0, or another value that no valid pixel has.
     """
 
     @property
@@ -523,12 +358,12 @@ class OutputPart(_Part):
         return OutputGrid(*self.crop, PixelScale(*self.scale), self.undistorted)
 
 
-class ProductPart(_Part):
-    """A file written for the capture."""
+class FilePart(_Part):
+    """A file that belongs to the capture."""
 
     kind: str
-    """`stack`, `band`, `pan_sharpened`, `relief`, `error_map`, `qa`, `tie_points`, `index`, `picture`,
-    `preview` or `stac_item`."""
+    """`parallax` (of the estimation); `stack`, `band`, `pan_sharpened`, `relief`, `error_map`, `qa`, `tie_points`,
+    `index`, `picture` or `preview`."""
     file: RelativeFile
     """Path."""
     bytes: int
@@ -540,7 +375,7 @@ class ProductPart(_Part):
 class ReliefPreviewPart(_Part):
     """Picture of the parallax: first column, last row."""
 
-    parallax_px: tuple[Number2, Number2]
+    parallax_px: tuple[Annotated[Number, Field()], Number]
     """Parallax shown as black and as white (nearest), px."""
     range_m: tuple[Number3, Number3] | None
     """1st and 99th percentile of the range, m; null if unknown."""
@@ -565,10 +400,10 @@ class PreviewPart(_Part):
     """Picture of the relief."""
 
 
-class CaptureResult(_Result):
+class Sidecar(_Part):
     """Result of one capture."""
 
-    schema_: Annotated[Literal["agalign/1"], Field(alias="schema")] = "agalign/1"
+    schema_: Annotated[Literal["agalign/2"], Field(alias="schema")] = "agalign/2"
     """Version of this format."""
     agalign: str
     """Version of the program."""
@@ -580,10 +415,12 @@ class CaptureResult(_Result):
     """Flight id in the tags."""
     captured_at: str
     """Time in the tags, ISO 8601."""
-    position: PositionPart | None = None
+    position: Position | None = None
     """GPS position of the reference band."""
-    camera: CameraPart
-    """From the tags."""
+    pose: Pose | None = None
+    """Orientation and height of the camera."""
+    camera: CameraIdentity
+    """The camera."""
     status: CaptureStatus
     """`ok`: every band is there, and aligned or predicted within `accept_predicted_px`. `failed`: all
     moving bands are `failed`. Else `degraded`.
@@ -592,20 +429,31 @@ class CaptureResult(_Result):
     """Bands that only other captures have."""
     reference: ReferencePart
     """Reference band."""
-    bands: Annotated[Sequence[BandResult], Field(min_length=1)]
+    bands: Annotated[list[BandResult], Field(min_length=1)]
     """One entry per band, the reference included."""
-    output: OutputPart | None
-    """Written rasters; null if all moving bands are `failed`."""
-    preview: PreviewPart | None = None
-    """Preview image."""
+    parallax: FilePart | None = None
+    """Raster of the parallax at every pixel of the reference, from which other grids are rendered; null without relief.
+    """
     accept_predicted_px: Number | None = None
     """Standard error up to which indices may use a predicted band, px."""
-    products: list[ProductPart] = []
-    """All other files of the capture."""
+    estimated_with: str
+    """Fingerprint of the input, options and version that the estimation depends on; a run with the same one keeps it.
+    """
+    output: OutputPart | None = None
+    """Written rasters; null if all moving bands are `failed`, and until rasters are written."""
+    footprint: list[tuple[Number, Number]] | None = None
+    """Longitude and latitude, degrees, of the corners of the written rasters, counter-clockwise; the first is repeated.
+    """
+    footprint_accuracy_m: Number | None = None
+    """Standard error of the farthest corner, m."""
+    preview: PreviewPart | None = None
+    """Preview image."""
+    products: list[FilePart] = []
+    """Files that were rendered."""
     not_written: list[str] = []
     """Kinds of products that could not be written."""
-    settings: str
-    """Fingerprint of options, input and version; a run with the same one skips the capture."""
+    rendered_with: str = ""
+    """Fingerprint of everything that the products depend on; empty until all of them are written."""
     options: dict[str, dict[str, Any]] | None = None
     """Settings that differ from the defaults, by stage and name; null in older sidecars."""
     input_samples: dict[str, str] = {}
@@ -615,9 +463,49 @@ class CaptureResult(_Result):
     checksum: str | None = None
     """SHA-256 of the content as JSON with sorted keys and no spaces, without `checksum` and `seconds`."""
 
+    @classmethod
+    def estimated(
+        cls,
+        capture: Capture,
+        alignments: Mapping[str, Alignment],
+        settings: Settings,
+        parallax: FilePart | None = None,
+        seconds: float = 0.0,
+    ) -> Self:
+        """Return the sidecar of a capture whose bands are aligned, and nothing is rendered."""
+        reference, accept_predicted_px = capture.reference, settings.check.accept_predicted_px
+        bands = [
+            BandResult.of_reference(b) if b is reference else BandResult.of(b, alignments[b.name])
+            for b in capture.bands
+        ]
+        status = capture_status(bands, accept_predicted_px)
+        (width, height), place = reference.size_px, reference.georeference
+        is_mosaic = place is not None and place.accuracy_m is None  # else it was calculated from GPS
+        source = {"band": reference.name, "file": reference.path.name, "band_index": reference.band_index}
+        return cls(
+            agalign=__version__,
+            capture=capture.name,
+            capture_id=capture.capture_id,
+            flight_id=capture.flight_id,
+            captured_at=capture.captured_at,
+            position=capture.position,
+            pose=capture.pose,
+            camera=capture.camera,
+            status="degraded" if status == "ok" and capture.missing_bands else status,
+            missing_bands=list(capture.missing_bands),
+            reference=ReferencePart(**source, width=width, height=height, georeferenced=is_mosaic),
+            bands=bands,
+            parallax=parallax,
+            accept_predicted_px=accept_predicted_px,
+            estimated_with=estimation_fingerprint(capture, settings),
+            options=settings.model_dump(mode="json", exclude_defaults=True),
+            input_samples=input_samples(capture),
+            seconds=seconds,
+        )
+
     @field_validator("bands")
     @classmethod
-    def _has_reference(cls, bands: Sequence[BandResult], given: ValidationInfo) -> Sequence[BandResult]:
+    def _has_reference(cls, bands: list[BandResult], given: ValidationInfo) -> list[BandResult]:
         reference = given.data.get("reference")
         if reference is not None and reference.band not in [b.band for b in bands]:
             raise ValueError(f"none of them is the reference band {reference.band!r}")
@@ -636,32 +524,53 @@ class CaptureResult(_Result):
         return [*moving, *((name, "missing", MISSING_BAND.cause) for name in self.missing_bands)]
 
     @property
-    def files(self) -> dict[str, int]:
-        """Size in bytes of every file that the sidecar lists, by its path relative to the sidecar's folder."""
-        files = {part.file: part.bytes for part in self.products}
-        if self.output is not None:
-            files |= {part.file: part.bytes for part in self.output.band_files}
-            if self.output.file is not None and self.output.bytes is not None:
-                files[self.output.file] = self.output.bytes
-        return files
+    def files(self) -> list[FilePart]:
+        """All files of the capture."""
+        return [*self.products, *([] if self.parallax is None else [self.parallax])]
 
+    def alignments(self, relief: Relief | None) -> dict[str, Alignment]:
+        """Return the alignments of the moving bands by name, given the relief of the capture."""
+        moving = [b for b in self.bands if b.homography is not None and b.seed is not None]
+        return {b.band: b.alignment(self.reference.size_px, relief) for b in moving}
 
-class Sidecar(CaptureResult):
-    """Result of one capture, with the complete mappings of its bands."""
-
-    model_config = ConfigDict(extra="forbid")
-
-    bands: Annotated[list[BandPart], Field(min_length=1)]
-    """One entry per band, the reference included."""
-
-    def result(self) -> CaptureResult:
+    def without_tables(self) -> Self:
         """Return the sidecar without the long tables of its bands: those of a season would not fit into memory."""
-        tables: dict[str, Any] = {**dict.fromkeys(("grid", "field", "relief"), True), "metrics": {"tiles"}}
-        return CaptureResult.model_validate(self.model_dump(by_alias=True, exclude={"bands": {"__all__": tables}}))
+        return self.model_copy(update={"bands": [b.without_tables() for b in self.bands]})
 
 
-def is_usable(status: PairStatus, prediction: Prediction | PredictionPart | None, accept_predicted_px: float) -> bool:
-    """Return True for the reference, an aligned band, or a predicted band with an accepted standard error."""
-    if status == "predicted":
-        return prediction is not None and prediction.std_px <= accept_predicted_px
-    return status in ("reference", "aligned")
+def capture_status(bands: Iterable[BandResult], accept_predicted_px: float) -> CaptureStatus:
+    """Return `ok` if every moving band is usable, `failed` if all failed, else `degraded`."""
+    moving = [b for b in bands if b.status != "reference"]
+    if all(b.is_usable(accept_predicted_px) for b in moving):
+        return "ok"
+    return "failed" if all(b.status == "failed" for b in moving) else "degraded"
+
+
+def from_version_1(facts: dict[str, Any]) -> dict[str, Any]:
+    """Return the JSON of a sidecar of schema version 1 as one of this version: fields have other names and places.
+
+    The captures of such a file are estimated again when they are aligned again.
+    """
+    for band in facts.get("bands", []):
+        band["issues"] = [{"detail": "", **issue} for issue in band.pop("doubts", [])]
+        band.pop("levels", None)
+        if seed := band.get("seed"):
+            seed.setdefault("score", seed["peak_sigma"])
+        if joint := band.get("joint"):
+            joint.setdefault("fixed_to_moving", band["homography"]["fixed_to_moving"])
+            for name in ("accepted", "corner_std_px"):
+                joint.pop(name, None)
+        if prediction := band.get("prediction"):
+            prediction.setdefault("fixed_to_moving", band["homography"]["fixed_to_moving"])
+        if metrics := band.get("metrics"):
+            tiles = metrics.pop("tiles", [])
+            columns = {"centres_px": "centre_px", "shifts_px": "shift_px", "peaks_sigma": "peak_sigma", "cells": "cell"}
+            if all(tile.get("cell") for tile in tiles):
+                metrics["windows"] = {new: [tile[old] for tile in tiles] for new, old in columns.items()}
+            for when in ("before", "after"):
+                metrics[when] = {k: v for k, v in metrics[when].items() if v is not None}
+    if output := facts.get("output"):
+        for name in ("bytes", "band_files"):
+            output.pop(name, None)
+    facts.pop("settings", None)
+    return facts | {"schema": SCHEMA, "estimated_with": "", "products": facts.get("products", [])}

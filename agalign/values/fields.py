@@ -1,0 +1,117 @@
+"""Types of the fields of records that are written to JSON: numbers and arrays with their precision in a file.
+
+A record is a frozen dataclass of pydantic with `RECORD`. The program makes it of any floats and arrays; JSON is
+validated when it is read: numbers are finite and limited, arrays have their shape, and null stands for a number that
+could not be measured.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Annotated, Any
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import AfterValidator, ConfigDict, Field, GetCoreSchemaHandler
+from pydantic_core import CoreSchema, core_schema
+
+from agalign.values.files import is_inside
+
+RECORD = ConfigDict(extra="forbid", use_attribute_docstrings=True, arbitrary_types_allowed=True, validate_by_name=True)
+_MAX = 1e30
+"""Largest number in a file: sums and squares of such numbers are finite."""
+
+
+@dataclass(frozen=True)
+class Measured:
+    """A float with these decimals in JSON, where null stands for `missing`."""
+
+    decimals: int | None = None
+    missing: float = math.nan
+
+    def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
+        in_file = core_schema.nullable_schema(core_schema.float_schema(ge=-_MAX, le=_MAX))
+        return core_schema.json_or_python_schema(
+            core_schema.no_info_after_validator_function(
+                lambda value: self.missing if value is None else value, in_file
+            ),
+            core_schema.any_schema(),
+            serialization=core_schema.plain_serializer_function_ser_schema(
+                self._to_json, return_schema=in_file, when_used="json"
+            ),
+        )
+
+    def _to_json(self, value: float) -> float | None:
+        if not math.isfinite(value):
+            return None
+        return float(value) if self.decimals is None else round(float(value), self.decimals)
+
+
+@dataclass(frozen=True)
+class Array:
+    """An array of a shape, None for any length, as nested lists with these decimals in JSON."""
+
+    shape: tuple[int | None, ...]
+    decimals: int | None = None
+    integers: bool = False
+    nullable: bool = False
+    """In JSON, null stands for nan."""
+
+    def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
+        number = (
+            core_schema.int_schema(ge=0, le=1 << 31) if self.integers else core_schema.float_schema(ge=-_MAX, le=_MAX)
+        )
+        in_file: CoreSchema = core_schema.nullable_schema(number) if self.nullable else number
+        for length in reversed(self.shape):
+            in_file = core_schema.list_schema(in_file, min_length=length, max_length=length)
+        return core_schema.json_or_python_schema(
+            core_schema.no_info_after_validator_function(self._from_json, in_file),
+            core_schema.any_schema(),
+            serialization=core_schema.plain_serializer_function_ser_schema(
+                self._to_json, return_schema=in_file, when_used="json"
+            ),
+        )
+
+    def _from_json(self, values: Sequence[Any]) -> NDArray[Any]:
+        if not values:
+            return np.zeros([length or 0 for length in self.shape], np.int64 if self.integers else np.float64)
+        return np.array(values, np.int64 if self.integers else np.float64)
+
+    def _to_json(self, values: NDArray[Any]) -> Any:
+        if self.integers:
+            return np.asarray(values).tolist()
+        array = np.asarray(values, np.float64)
+        rounded = array if self.decimals is None else np.round(array, self.decimals)
+        if np.isfinite(rounded).all():
+            return rounded.tolist()
+        with_null = rounded.astype(object)
+        with_null[~np.isfinite(rounded)] = None
+        return with_null.tolist()
+
+
+Number = Annotated[float, Field(ge=-_MAX, le=_MAX)]
+Count = Annotated[int, Field(gt=0)]
+Positive = Annotated[float, Field(gt=0, le=_MAX)]
+Number2 = Annotated[float, Measured(2)]
+Number3 = Annotated[float, Measured(3)]
+Number4 = Annotated[float, Measured(4)]
+Number6 = Annotated[float, Measured(6)]
+"""Digits beyond the sixth depend on the order in which threads add up."""
+UpToInfinity = Annotated[float, Measured(6, math.inf)]
+"""A standard error; null if it is infinite."""
+Matrix3x3 = Annotated[NDArray[np.float64], Array((3, 3))]
+POSITION_DECIMALS = 4
+"""Of positions and displacements, px: a hundredth of the error of an alignment."""
+PointsPx = Annotated[NDArray[np.float64], Array((None, 2), POSITION_DECIMALS)]
+
+
+def _inside_folder(name: str) -> str:
+    if not is_inside(name):
+        raise ValueError("names a file outside its folder")
+    return name
+
+
+RelativeFile = Annotated[str, AfterValidator(_inside_folder)]
+"""A file in the sidecar's folder or below. A sidecar may come from anyone, and agalign reads and removes the files that
+it lists.
+"""
