@@ -66,6 +66,7 @@ def test_panels_are_named_and_drawn_and_kept_out(by_panel: Path) -> None:
     page = (by_panel / "index.html").read_text()
     assert "Calibration panels" in page
     assert "IMG_0001.panel.png" in page
+    assert last.sentence in unescape(page)
     excluded = read_json(by_panel / "agalign-run.json")["excluded"]
     assert [part["capture"] for part in excluded] == ["0000SET/000/IMG_0001", "0000SET/000/IMG_0004"]
     assert excluded[0]["evidence"][:2] == ["a QR code", "a homogeneous square in most bands"]

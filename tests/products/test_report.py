@@ -13,11 +13,14 @@ import pytest
 
 import agalign
 from agalign.products.report.charts import CHART_HEIGHT, drifts_of, rig_views
-from agalign.products.report.drawing import ReducedBands
+from agalign.products.report.drawing import ReducedBands, read_reduced_bands
 from agalign.products.report.facts import PairTotals
 from agalign.products.report.pages import pages_exist, write_pages
 from agalign.products.report.preview import ReliefView, preview_bytes, write_preview
+from agalign.products.sidecar.file import read_sidecar
 from agalign.products.sidecar.schema import CaptureResult
+from agalign.values.capture import Band, Capture
+from agalign.values.image import OutputGrid
 
 from ..conftest import read_json, save_known_model, textured_image
 from .conftest import change, table_in
@@ -156,6 +159,21 @@ def capture_data(label: str, offsets: dict[str, tuple[float, float]]) -> dict[st
     return {"label": label, "captured_at": f"2026-06-21T10:00:{label}", "camera": "camera", "bands": bands}
 
 
+def test_the_share_of_saturated_pixels_of_a_band(tmp_path: Path) -> None:
+    plane = np.full((60, 80), 3, np.uint8)
+    plane[:10, :10] = 255
+    cv2.imwrite(str(tmp_path / "a.png"), plane)
+    band = Band("NIR", tmp_path / "a.png", 1, 80, 60, "uint8", saturation_value=255)
+    bands = read_reduced_bands(Capture("a", tmp_path, (band,), 0), {}, OutputGrid(0, 0, 80, 60))
+    assert bands.saturated == {"NIR": pytest.approx(100 / 4800)}
+
+
+@pytest.mark.slow
+def test_sidecars_have_the_share_of_saturated_pixels(aligned_flight: Path) -> None:
+    sidecar = read_sidecar(next(aligned_flight.rglob("IMG_0001.json")))
+    assert all(0 <= band.saturated < 0.05 for band in sidecar.bands)
+
+
 @pytest.mark.slow
 def test_drift_is_drawn_along_its_direction_with_gaps_for_missing_bands() -> None:
     captures = [
@@ -163,7 +181,7 @@ def test_drift_is_drawn_along_its_direction_with_gaps_for_missing_bands() -> Non
         for i in range(7)
     ]
     (drift,) = drifts_of(captures)
-    assert drift.full == pytest.approx(15, abs=0.01)
+    assert drift.full_px == pytest.approx(15, abs=0.01)
     assert [len(line.points) for line in drift.lines] == [2, 1]
     heights = [[float(p.split(",")[1]) for run in line.points for p in run.split()] for line in drift.lines]
     ends = sorted((heights[0][0], heights[0][-1]))

@@ -18,8 +18,6 @@ from agalign.values.image import OutputGrid, reduced_size_px
 
 Grey = NDArray[np.uint8]
 """(height, width)"""
-LEVEL_BLOCKS = 6, 8
-"""Rows and columns: a block of a capture is as large as the error of its georeference."""
 Picture = NDArray[np.uint8]
 """(height, width, 3) red, green, blue."""
 
@@ -34,10 +32,6 @@ class ReducedBands:
     """The aligned pixels of each band that was written."""
     size_px: tuple[int, int]
     """(width, height) of all images."""
-    levels: Mapping[str, NDArray[np.float32]] = field(default_factory=dict)
-    """Means of the aligned pixels in `LEVEL_BLOCKS` (rows, columns) of each band that was written, in the unit of the
-    output; nan without pixels.
-    """
     saturated: Mapping[str, float] = field(default_factory=dict)
     """Share of saturated pixels in the raw file of each band with a known saturation value, after the reduction."""
 
@@ -56,21 +50,9 @@ def read_reduced_bands(capture: Capture, places: Mapping[str, tuple[Path, int]],
             before[band.name] = _grey(plane)
             if band.saturation_value is not None:
                 saturated[band.name] = float((plane >= band.saturation_value).mean())
-    after, levels = {}, {}
-    for name, place in places.items():
-        plane = read_preview(*place, (0, 0, grid.width, grid.height), size_px)
-        after[name], levels[name] = _grey(plane), block_means(plane)
-    return ReducedBands(before, after, size_px, levels, saturated)
-
-
-def block_means(plane: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Return the means of an image (height, width) in `LEVEL_BLOCKS` equal blocks; nan where half is unknown."""
-    is_known = np.isfinite(plane)
-    share, total = (
-        cv2.resize(values, LEVEL_BLOCKS[::-1], interpolation=cv2.INTER_AREA)
-        for values in (is_known.astype(np.float32), np.where(is_known, plane, np.float32(0)))
-    )
-    return np.where(share >= 0.5, total / np.maximum(share, np.float32(0.5)), np.float32(np.nan))
+    whole_px = (0, 0, grid.width, grid.height)
+    after = {name: _grey(read_preview(*place, whole_px, size_px)) for name, place in places.items()}
+    return ReducedBands(before, after, size_px, saturated)
 
 
 def _grey(plane: NDArray[np.float32]) -> Grey:

@@ -17,7 +17,7 @@ from agalign._version import __version__
 from agalign.config import Settings
 from agalign.errors import SidecarError
 from agalign.products.indices.rasters import IndexReport, reports_of_run, update_table
-from agalign.products.report.charts import CaptureLight, drifts_of, light_charts, radiometric_check, rig_views
+from agalign.products.report.charts import drifts_of, rig_views
 from agalign.products.report.facts import BAND_COLUMNS, FlightFacts
 from agalign.products.run.excluded import PANELS_FILE, SKY_FILE, PanelPart, SkyPart, read_excluded
 from agalign.products.run.record import RunPart, read_run_record
@@ -36,7 +36,7 @@ def write_pages(out: Path, on_problem: Callable[[str], None]) -> FlightFacts:
     """
     indices: list[IndexReport] = []
     unreadable: list[str] = []
-    facts, light = FlightFacts(), list[CaptureLight]()
+    facts = FlightFacts()
     for path in find_sidecars(out):
         folder = path.parent.relative_to(out).as_posix()
         try:
@@ -46,7 +46,6 @@ def write_pages(out: Path, on_problem: Callable[[str], None]) -> FlightFacts:
             continue
         indices += reports_of_run(sidecar, folder, out)
         facts.add(folder, sidecar)
-        light.append(CaptureLight.of(facts.captures[-1]["label"], path, sidecar))
     panels: list[PanelPart] = []
     sky: list[SkyPart] = []
     run: RunPart | None = None
@@ -69,8 +68,6 @@ def write_pages(out: Path, on_problem: Callable[[str], None]) -> FlightFacts:
         settings=_changed_settings(run),
         rigs=rig_views(out, unreadable.append),
         drifts=drifts_of(facts.captures),
-        light=light_charts(light),
-        check=radiometric_check(light),
         panels=panels,
         sky=sky,
     )

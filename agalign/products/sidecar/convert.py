@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 from scipy.interpolate import CloughTocher2DInterpolator
 
 from agalign._version import __version__
-from agalign.cameras.base import is_thermal
 from agalign.errors import NoSuchBandError, SidecarError, UnreadableFileError
 from agalign.flight.fingerprint import fingerprint, input_samples
 from agalign.pixels.raster import read_preview
@@ -128,10 +127,7 @@ def _band_part(context: ProductContext, band: Band) -> BandPart:
         "size_px": band.size_px,
     }
     with suppress(UnreadableFileError):  # the preview has failed with this reason
-        is_comparable = not (is_thermal(band) or band.companion)  # companions are exposed automatically
-        levels = context.reduced_bands.levels.get(band.name) if is_comparable else None
         facts["saturated"] = context.reduced_bands.saturated.get(band.name)
-        facts["levels"] = [] if levels is None else levels.tolist()
     if band is context.capture.reference:
         return BandPart.model_validate(facts | {"status": "reference", "reason": None, "seconds": 0.0})
     alignment = context.alignments[band.name]
