@@ -237,7 +237,7 @@ class WriteSettings(SettingsModel):
     statistics: bool = False
     """Store minimum, maximum, mean and standard deviation of aligned bands."""
     qa: bool = False
-    """Write a raster of quality flags (saturated, occluded, glint …), <capture>.qa.tif."""
+    """Write a raster of quality flags (saturated, occluded, predicted …), <capture>.qa.tif."""
     stac: bool = False
     """Write a STAC item per capture and a collection per flight."""
     indices: Annotated[

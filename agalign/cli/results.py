@@ -125,7 +125,7 @@ def _indices(
         index: Names separated by commas: ndvi (the default), ndre, gndvi, ndwi, savi, evi …
         formula: A formula of the bands B, G, R, RE and N, as 'name=(N-R)/(N+R)'; repeatable.
         target: Folder for the rasters; by default next to the stacks.
-        mask_qa: Omit saturated, occluded and glint pixels; the run needs --qa.
+        mask_qa: Omit saturated, occluded and misaligned pixels; the run needs --qa.
         as_json: Print JSON to standard output.
         overwrite: Compute again what an earlier command wrote.
 

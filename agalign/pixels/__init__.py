@@ -1,1 +1,1 @@
-"""Pixels: reading, masks, calibration, resampling, structure images, detection of panels, sky and glint."""
+"""Pixels: reading, masks, calibration, resampling, structure images, detection of panels and sky."""

@@ -116,14 +116,14 @@ def _converted(
     if of_camera is None or not of_camera.is_of_light or choice == "camera":
         return of_camera
     if choice == "sun":
-        return to_reflectance(of_camera)
+        return _to_reflectance(of_camera)
     if by_panel is None:
         return None
     result = _reflectance(of_camera, by_panel.value, "reflectance", by_panel.source)
     return replace(result, panel_age_s=by_panel.age_s)
 
 
-def to_reflectance(radiometry: Radiometry) -> Radiometry | None:
+def _to_reflectance(radiometry: Radiometry) -> Radiometry | None:
     """Return the conversion to reflectance: `radiometry` if it is one, else with the light sensor, else None."""
     if radiometry.quantity in ("reflectance", "relative reflectance"):
         return radiometry

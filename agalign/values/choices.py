@@ -50,9 +50,7 @@ class Quality(IntFlag):
     """The expected error exceeds 0.5 px of the reference, or is unknown."""
     ERROR_OVER_1_PX = 64
     """The expected error exceeds 1 px of the reference, or is unknown."""
-    SUN_GLINT = 128
-    """More than half of the green light is sun glint on water."""
-    MISSING = 256
+    MISSING = 256  # 128 is not used: other programs read these values
     """The band could not be aligned and has no pixels."""
 
 

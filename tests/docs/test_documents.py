@@ -187,6 +187,23 @@ def test_the_recipe_for_plots_has_a_row_of_any_outline(tmp_path: Path, monkeypat
     assert [float(row["mean"]) for row in rows] == pytest.approx([0.5, 0.8, 0.5, 0.8], abs=1e-6)
 
 
+def test_the_recipe_for_water_masks_sun_glint_and_the_shore(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    bands = np.full((2, 20, 30), 0.02, np.float32)  # water
+    bands[:, 5:8, 10:12], bands[1, :, 20:], bands[:, 0] = 0.3, 0.4, np.nan  # sun glint, shore, outside of the image
+    stack = Path("reflectance/0000SET/000/IMG_0001.tif")
+    stack.parent.mkdir(parents=True)
+    write_band(stack, bands, nodata=np.nan)
+    with rasterio.open(stack, "r+") as raster:
+        raster.descriptions = "Green", "NIR"
+    run_python(next(b.text for b in blocks_of(ROOT / "docs" / "radiometry.md") if "# water.py" in b.text))
+    with rasterio.open("water.tif") as water:
+        result = water.read()
+    expected = np.where(bands[1] < 0.05, bands, np.nan)
+    assert np.isfinite(expected[0]).sum() == 19 * 20 - 6
+    np.testing.assert_array_equal(result, expected)
+
+
 def test_the_python_of_the_readme_aligns_pixels() -> None:
     """NIR has reversed contrast, a hole of NaN, and a displacement of 1.5 px that no homography represents."""
 

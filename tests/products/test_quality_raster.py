@@ -10,16 +10,14 @@ import pytest
 import rasterio
 
 import agalign
-from agalign.pixels.sun_glint import sun_glint
 from agalign.products.indices.formulas import index_named, index_of_formula
 from agalign.products.indices.rasters import write_rasters
-from agalign.products.rasters import alignment_maps as quality_raster
 from agalign.products.rasters.alignment_maps import _flags, error_lattice_px, error_on_tile
 from agalign.products.rasters.layout import Layer
 from agalign.products.run.captures import bands_of
 from agalign.products.sidecar.file import read_result
 from agalign.values import geometry, lens
-from agalign.values.capture import Band, Capture, Radiometry
+from agalign.values.capture import Band
 from agalign.values.choices import UNUSABLE_QUALITY, Quality
 from agalign.values.image import OutputGrid
 from agalign.values.lens import Lens
@@ -27,7 +25,7 @@ from agalign.values.mapping import PixelMapping
 
 from ..builders import joint_result, residual_of
 from ..conftest import Shared, seeded, write_band
-from .conftest import aligned, context_of
+from .conftest import aligned
 
 GRID = OutputGrid(4, 2, 60, 40)
 
@@ -81,87 +79,6 @@ def test_expected_errors_and_predictions_are_flagged_and_an_unknown_error_is_a_l
     assert UNUSABLE_QUALITY & Quality.MISSING
 
 
-def water(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    green = rng.normal(0.05, 0.002, (160, 160)).astype(np.float32)
-    return green, rng.normal(0.01, 0.002, (160, 160)).astype(np.float32)
-
-
-def test_glint_is_found_on_water_and_not_on_vegetation_or_bare_soil() -> None:
-    rng = np.random.default_rng(0)
-    green, nir = water(rng)
-    glint = rng.random(green.shape) < 0.05
-    assert np.array_equal(sun_glint(green + 0.3 * glint, nir + 0.3 * glint), glint)
-    on_left, unknown = np.arange(160) < 100, np.float32(np.nan)
-    sand = rng.normal(0.25, 0.01, green.shape).astype(np.float32)
-    for without in (
-        (green, nir),
-        (green + 0.02 * glint, nir + 0.02 * glint),  # as much light of the water as of the surface
-        (green, np.where(on_left, nir, np.float32(0.4))),  # vegetation on the shore
-        (np.where(on_left, green, sand), np.where(on_left, nir, 1.2 * sand)),  # a bright beach
-        (0.2 + 0.3 * glint, 0.3 + 0.3 * glint),  # bare soil
-        (green, np.where(on_left, nir, unknown)),
-        (np.full_like(green, unknown), nir),
-        (green[:20, :20], nir[:20, :20]),
-    ):
-        result = sun_glint(*(band.astype(np.float32) for band in without))
-        assert result.shape == without[0].shape
-        assert not result.any()
-
-
-def test_glint_is_found_where_no_pixel_around_is_free_of_it() -> None:
-    green, nir = (np.tile(band, (2, 2)) for band in water(np.random.default_rng(0)))
-    centre = np.zeros_like(green, dtype=bool)
-    centre[60:260, 60:260] = True
-    waves = centre * np.random.default_rng(1).uniform(0.15, 0.6, centre.shape).astype(np.float32)
-    assert np.array_equal(sun_glint(green + waves, nir + waves), centre)
-    # The same without any water around may be concrete.
-    assert not sun_glint(green + 0.5, nir + 0.55).any()
-    green[:, 100:180], nir[:, 100:180] = 0.04, 0.4  # vegetation
-    green[:, 180:], nir[:, 180:] = 0.3, 0.32  # a road
-    assert not sun_glint(green, nir).any()
-
-
-def scene_with_glint() -> tuple[np.ndarray, np.ndarray]:
-    """Water that becomes darker to the left, with waves of glint, and a shore: green and near infrared."""
-    rng, height, width = np.random.default_rng(2), 301, 411
-    green, nir = (level + rng.normal(0, 0.002, (height, width)) for level in (0.08, 0.03))
-    depth = np.linspace(0, 0.04, width)
-    waves = (rng.random((height, width)) < 0.1) * rng.uniform(0.02, 0.2, (height, width))
-    shore = np.arange(width) + 40 * np.sin(np.arange(height) / 30)[:, None] > 0.7 * width
-    return tuple(
-        np.where(shore, land, band + depth + waves).astype(np.float32) for band, land in ((green, 0.1), (nir, 0.4))
-    )
-
-
-def test_glint_does_not_depend_on_the_size_of_the_image() -> None:
-    """Unknown pixels at the right and the bottom complete the blocks of 16 px, and change no other pixel."""
-    bands = scene_with_glint()
-    padded = (np.pad(band, ((0, 3), (0, 5)), constant_values=np.nan) for band in bands)
-    result, expected = sun_glint(*bands), sun_glint(*padded)[:301, :411]
-    assert 0.02 < result.mean() < 0.2
-    np.testing.assert_array_equal(result[:-16, :-16], expected[:-16, :-16])
-
-
-def test_glint_does_not_depend_on_the_tile(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    reflectance = Radiometry("reflectance", 0.0, 65535.0, 1.0)
-    bands, values = [], scene_with_glint()
-    for name, pixels in zip(("Green", "NIR"), values, strict=True):
-        write_band(tmp_path / f"{name}.tif", np.rint(pixels.clip(0, 1) * 65535).astype(np.uint16))
-        bands.append(Band(name, tmp_path / f"{name}.tif", 1, 411, 301, "uint16", radiometry=reflectance))
-    mapping, capture = PixelMapping(geometry.identity()), Capture("c", Path(), tuple(bands), 0)
-    layers = Layer(bands[0], None, is_reference=True), Layer(bands[1], mapping)
-    alignments, grid = {"NIR": aligned(mapping, (411, 301))}, OutputGrid(3, 5, 400, 290)
-    context = context_of(capture, alignments, tmp_path, layers, grid)
-    flags = []
-    for tile_px in (1000, 64):
-        monkeypatch.setattr(quality_raster, "WORK_TILE_PX", tile_px)
-        (written,) = quality_raster.QualityRaster().write(context)
-        with rasterio.open(written.path) as raster:
-            flags.append(raster.read(1) & Quality.SUN_GLINT > 0)
-    assert 0.02 < flags[0].mean() < 0.2
-    np.testing.assert_array_equal(*flags)
-
-
 def test_the_error_of_an_undistorted_pixel_is_that_of_its_raw_one() -> None:
     """At the corner, 12 px from it."""
     size_px = 640, 480
@@ -201,9 +118,8 @@ def test_a_run_writes_flags_with_their_meaning_for_every_band_of_the_stack(sidec
         assert raster.shape == stack.shape
         tags, flags, pixels = raster.tags(), raster.read(), stack.read()
     masks = [int(m) for m in tags["flag_masks"].split(", ")]
-    assert masks == [1 << i for i in range(len(Quality))]
+    assert masks == [1, 2, 4, 8, 16, 32, 64, 256]
     assert tags["flag_meanings"].split() == [str(Quality(m).name).lower() for m in masks]
-    assert tags["SUN_GLINT"]
     assert np.array_equal(flags[0], np.bitwise_or.reduce(flags[1:]))
     # Whatever is outside is nodata in the stack, and the reverse.
     no_value = flags[1:] & np.uint16(Quality.OUTSIDE | Quality.NODATA | Quality.OCCLUDED | Quality.MISSING) > 0

@@ -11,20 +11,16 @@ from scipy.interpolate import RegularGridInterpolator
 from agalign.cameras import rig_seed
 from agalign.cameras.pix4d import rig_unit_m
 from agalign.errors import GeometryError
-from agalign.pixels.radiometry import to_reflectance
 from agalign.pixels.raster import read_tile
-from agalign.pixels.sun_glint import sun_glint
-from agalign.products.indices.formulas import Role, role_of_band
 from agalign.products.product import GEOTIFF, Product, ProductContext, StacAsset, WrittenFile
-from agalign.products.rasters.aligned_files import layer_pixels
 from agalign.products.rasters.checked_raster import WORK_TILE_PX, LayerDescription
 from agalign.products.rasters.layout import Layer, is_inside
 from agalign.values import geometry, lens
 from agalign.values.alignment import Alignment
-from agalign.values.capture import Band, Capture, Radiometry
+from agalign.values.capture import Band, Capture
 from agalign.values.choices import QUALITY_MEANINGS, Quality
 from agalign.values.geometry import Matrix, Points
-from agalign.values.image import FloatImage, Mask, OutputGrid, Tile
+from agalign.values.image import Mask, OutputGrid, Tile
 from agalign.values.interpolation import source_positions, tiles
 from agalign.values.lens import Lens
 from agalign.values.mapping import PixelMapping
@@ -93,27 +89,15 @@ class QualityRaster(Product):
         """Write <capture>.qa.tif. Raises OutputError, or UnreadableFileError for an input."""
         grid, reference = context.grid, context.capture.reference
         nodes = {name: error_lattice_px(a, reference, grid) for name, a in context.with_pixels.items()}
-        water = _water_bands(context.layers)
-        glint = sun_glint(*(_reflectance(*band, grid.tile) for band in water)) if water else None
         predicted = {name for name, alignment in context.with_pixels.items() if alignment.status == "predicted"}
 
         def flags_on(tile: Tile) -> list[Flags]:
             bands = [
                 _flags(layer, tile, grid, nodes, is_predicted=layer.band.name in predicted) for layer in context.layers
             ]
-            if glint is not None:
-                in_tile = glint[tile.y0 - grid.y0 :, tile.x0 - grid.x0 :][: tile.height, : tile.width]
-                for flags in bands:
-                    flags[in_tile & (flags & Quality.MISSING.value == 0)] |= Quality.SUN_GLINT.value
             return [np.bitwise_or.reduce(bands), *bands]
 
-        method = "water by NDWI > 0 (McFeeters 1996), glint by the excess of near infrared (Hedley et al. 2005)"
-        unknown = "not assessed: the reflectance of green and near infrared is not known"
-        tags = {
-            "flag_masks": ", ".join(str(int(flag)) for flag in Quality),
-            "flag_meanings": QUALITY_MEANINGS,
-            "SUN_GLINT": method if water else unknown,
-        }
+        tags = {"flag_masks": ", ".join(str(int(flag)) for flag in Quality), "flag_meanings": QUALITY_MEANINGS}
         # The first layer has the flags that are set in any band.
         layers = [LayerDescription(name) for name in ("all bands", *(layer.band.name for layer in context.layers))]
         blocks = (
@@ -129,7 +113,7 @@ class QualityRaster(Product):
 def _flags(
     layer: Layer, tile: Tile, grid: OutputGrid, nodes: Mapping[str, NDArray[np.float32]], *, is_predicted: bool
 ) -> Flags:
-    """Flags (height, width) of a band on a tile, except sun glint; `nodes` has the expected error by band."""
+    """Flags (height, width) of a band on a tile; `nodes` has the expected error by band."""
     if layer.is_gap:
         return np.full((tile.height, tile.width), Quality.MISSING.value, np.uint16)
     result = np.full((tile.height, tile.width), Quality.PREDICTED.value if is_predicted else 0, np.uint16)
@@ -176,23 +160,6 @@ def _contributes(mask: Mask, positions: NDArray[np.float32]) -> Mask:
         return np.zeros(positions.shape[:2], dtype=bool)
     weight = cv2.remap(mask.astype(np.float32), positions, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     return np.asarray(weight > 1e-3)  # smaller weights are rounding errors
-
-
-def _water_bands(layers: Sequence[Layer]) -> list[tuple[Layer, Radiometry]]:
-    """The green and the near infrared band, with their conversion to reflectance; empty if either is unknown."""
-    by_role: dict[Role, tuple[Layer, Radiometry]] = {}
-    for layer in layers:
-        role = None if layer.is_gap else role_of_band(layer.band)
-        reflectance = None if layer.band.radiometry is None else to_reflectance(layer.band.radiometry)
-        if role is not None and reflectance is not None:
-            by_role.setdefault(role, (layer, reflectance))
-    return [by_role["green"], by_role["nir"]] if {"green", "nir"} <= by_role.keys() else []
-
-
-def _reflectance(layer: Layer, radiometry: Radiometry, tile: Tile) -> FloatImage:
-    """Reflectance (height, width) on a tile, nan for invalid pixels."""
-    pixels, valid = layer_pixels(layer, tile, "bilinear", radiometry)
-    return np.where(valid, pixels, np.nan).astype(np.float32)
 
 
 class ReliefMap(Product):
