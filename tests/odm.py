@@ -1,11 +1,13 @@
 """A file as OpenDroneMap 3.5 reads it, written from its rules: `ODM_Photo` in opendm/photo.py for the tags, and
-`dn_to_radiance`, `vignette_map` and `compute_irradiance` in opendm/multispectral.py for the numbers.
+`dn_to_radiance`, `vignette_map` and `compute_irradiance` in opendm/multispectral.py for the numbers, and
+`ODM_Reconstruction.detect_multi_camera` in opendm/types.py for the order of the bands.
 
 It looks up XMP values by the prefix that the camera wrote, in each rdf:Description in turn; a later one replaces an
 earlier one. Values are elements, `@` marks attributes, and the items of a sequence are joined by spaces.
 """
 
 import math
+from collections.abc import Iterable
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -66,6 +68,10 @@ class OdmPhoto:
         return "".join(c for c in name if c.isascii() and c.isalnum())
 
     @property
+    def band_index(self) -> str:
+        return self.xmp("DLS:SensorId", "@Camera:RigCameraIndex", "Camera:RigCameraIndex") or "0"
+
+    @property
     def capture_uuid(self) -> str | None:
         return self.xmp(*_UUIDS)
 
@@ -118,3 +124,11 @@ class OdmPhoto:
             signal = signal / np.polynomial.polynomial.polyval(r, (1.0, *k))
         signal = (signal / (1.0 + a2 * y / exposure_s - a3 * y)).clip(0)
         return np.asarray(math.pi * a1 * signal / (gain * exposure_s) / (self.horizontal_irradiance or 1.0))
+
+
+def bands_of_orthophoto(photos: Iterable[OdmPhoto]) -> list[str]:
+    """The names of the bands in the order in which the orthophoto has them; an alpha band follows."""
+    indices: dict[str, str] = {}
+    for photo in photos:
+        indices.setdefault(photo.band_name, photo.band_index)
+    return sorted(indices, key=lambda name: indices[name])

@@ -17,16 +17,16 @@ from agalign.values.mapping import PixelMapping
 
 from .builders import joint_result, residual_of
 
-FUNCTIONS = "align align_capture align_folder discover mosaic open_capture open_flight read_alignment warp_onto"
+FUNCTIONS = "align align_capture align_folder discover open_capture open_flight read_alignment warp_onto"
 SETTINGS = "CheckSettings FlightSettings JointSettings ReliefSettings SeedSettings Settings WriteSettings"
-RESULTS = "Alignment Capture CaptureReport FlightReports FolderScan MosaicReport Prediction Residual Seed"
-OPTIONS_AND_UNITS = "DiscoverOptions RunOptions float float float"
+RESULTS = "Alignment Capture CaptureReport FlightReports FolderScan Prediction Residual Seed"
+OPTIONS = "DiscoverOptions RunOptions"
 ERRORS = """AgalignError ConfigurationError GeometryError InputError NoContrastError NoSuchBandError MemoryLimitError
 NotEnoughTextureError OutputError SidecarError UnreadableFileError WorkerError"""
 
 
 def test_the_public_names() -> None:
-    names = {*f"{FUNCTIONS} {SETTINGS} {RESULTS} {OPTIONS_AND_UNITS} {ERRORS}".split(), "__version__"}
+    names = {*f"{FUNCTIONS} {SETTINGS} {RESULTS} {OPTIONS} {ERRORS}".split(), "__version__"}
     assert set(agalign.__all__) == set(dir(agalign)) == names
     assert len(agalign.__all__) == len(names)
     for name in names:

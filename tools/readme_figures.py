@@ -1,11 +1,10 @@
-"""The pictures of the README and of docs/recipes/field.md: before and after of the demo and of a real capture, the
-report in a browser, and a mosaic.
+"""The pictures of the README: before and after of the demo and of a real capture, and the report in a browser.
 
     python tools/readme_figures.py [DEMO [ALIGNED]]
 
 DEMO is the output of an earlier `agalign demo`, else one is run. ALIGNED is the output of a run on the row crop
 (`DATA/flights/rededge_m_rowcrop`, --ground-elevation 92). Writes demo.jpg, report.jpg and, with ALIGNED, row-crop.jpg
-and mosaic.jpg to docs/figures. The report needs playwright and a Chromium.
+to docs/figures. The report needs playwright and a Chromium.
 """
 
 import shutil
@@ -14,12 +13,8 @@ import sys
 import tempfile
 from pathlib import Path
 
-import numpy as np
-import rasterio
 from PIL import Image
 from playwright.sync_api import sync_playwright
-
-import agalign
 
 FIGURES = Path(__file__).resolve().parents[1] / "docs" / "figures"
 WIDTH_PX, SCREEN_PX = 880, (1100, 1150)
@@ -34,8 +29,6 @@ def main() -> None:
         save(Image.open(aligned / "0000SET" / "000" / "IMG_0001.png"), "demo.jpg", 78)
         if len(sys.argv) > 2:
             save(Image.open(Path(sys.argv[2]) / "IMG_0009.png"), "row-crop.jpg", 78)
-            report = agalign.mosaic(sys.argv[2], Path(folder) / "field.tif")
-            save(false_colour(report.path), "mosaic.jpg", 72)
         with sync_playwright() as playwright:
             path = shutil.which("chromium") or shutil.which("google-chrome")
             browser = playwright.chromium.launch(executable_path=path, args=["--no-sandbox"])
@@ -45,16 +38,6 @@ def main() -> None:
             page.screenshot(path=Path(folder) / "report.png")
             browser.close()
         save(Image.open(Path(folder) / "report.png"), "report.jpg", 72)
-
-
-def false_colour(mosaic: Path) -> Image.Image:
-    """NIR, red and green between their 1st and 99th percentiles; white outside."""
-    with rasterio.open(mosaic) as source:
-        bands = source.read([source.descriptions.index(name) + 1 for name in ("NIR", "Red", "Green")])
-        valid = source.dataset_mask() > 0
-    low, high = np.percentile(bands[:, valid], (1, 99), axis=1)[..., None, None]
-    shown = np.where(valid, np.clip((bands - low) / (high - low), 0, 1), 1)
-    return Image.fromarray((255 * np.moveaxis(shown, 0, -1)).astype(np.uint8))
 
 
 def save(picture: Image.Image, name: str, quality: int) -> None:

@@ -17,13 +17,13 @@ from agalign.cli.command import help_of
 from agalign.cli.doctor import doctor
 from agalign.cli.evaluate import evaluate, learn, surface
 from agalign.cli.info import info
-from agalign.cli.results import export, indices, mosaic, report, verify
+from agalign.cli.results import export, indices, report, verify
 from agalign.cli.terminal import ExitCode, Terminal, options_from, printed
 from agalign.values.processes import limit_default_threads, silence_libraries
 from agalign.values.text import did_you_mean, name_problem
 
 ndvi = replace(indices, alias="ndvi")
-_ALL = align, demo, info, report, verify, indices, ndvi, export, mosaic, onto, doctor, evaluate, surface, learn
+_ALL = align, demo, info, report, verify, indices, ndvi, export, onto, doctor, evaluate, surface, learn
 COMMANDS = {command.name: command for command in _ALL}
 _UsageError: Any = typer.BadParameter.__mro__[1]
 """The class of click, or of the copy of click in typer."""

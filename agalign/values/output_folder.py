@@ -31,11 +31,11 @@ def prepare_output(out: Path) -> None:
 
 
 @contextmanager
-def locked(out: Path, *, below: bool = True) -> Iterator[None]:
+def locked(out: Path) -> Iterator[None]:
     """Create the output folder and lock it for this run. Raises OutputError, also if another run has locked it.
 
-    Partial files of killed processes are removed, with `below` also in the folders below it. The system releases the
-    lock when the process ends, also when it is killed.
+    Partial files of killed processes are removed, also in the folders below it. The system releases the lock when the
+    process ends, also when it is killed.
     """
     prepare_output(out)
     path = out / ".agalign.lock"
@@ -55,10 +55,10 @@ def locked(out: Path, *, below: bool = True) -> Iterator[None]:
     try:
         with suppress(OSError):  # a full disk is reported where a product is written
             path.write_text(f"process {os.getpid()} on {platform.node()}", encoding="utf-8")
-        remove_partial_files(out, below=below)
+        remove_partial_files(out)
         yield
     finally:
-        remove_partial_files(out, below=below)  # of killed workers
+        remove_partial_files(out)  # of killed workers
         with suppress(OSError):
             path.unlink(missing_ok=True)
         lock.release()

@@ -2,7 +2,7 @@
 
     python benchmarks/reliability/strangers.py [--folders 5000] [--listed 1000000] [--tagged 1000]
 
-`report`, `verify`, `export` and `mosaic` run on each changed output folder, and on one with a map and a table
+`report`, `verify` and `export` run on each changed output folder, and on one with a map and a table
 that list very many captures, each in a forked process. Wrong are tracebacks, control characters and NaN in texts, files
 that are written or copied outside of the folders of the command, captures that are missing from a result that is
 reported as complete, and commands that do not end in time or within the memory.
@@ -44,7 +44,7 @@ CAPTURES, SIZE_PX, NAMES = 2, (240, 180), ("IMG_0001", "IMG_0002")
 PLACED = "--georeference", "--ground-elevation=0", "--stac", "--tie-points"
 OPTIONS = *PLACED, "--layout=both", "--error-map", "--qa", "--index=ndvi", "--relief=always", "--relief-map"
 TAG_OPTIONS = *PLACED, "--only-seed", "--bands=green,red", "--relief=never", "-j1", "-v"
-PRELOADED = "pystac", "agalign.cli.align_run", "agalign.products.mosaic.compose"
+PRELOADED = "pystac", "agalign.cli.align_run"
 MAX_S, MAX_BYTES = 60, 4 << 30
 """Limits of a command: time, and memory beyond that of this process."""
 SECRET = "the contents of a file of somebody else"
@@ -170,7 +170,6 @@ COMMAND_LINES = {
     ("verify", "a/b/out"): "",
     ("export", "a/b/out", "--for", "opencv", "-o", "a/b/matrices"): r"\b2 captures, ",
     ("export", "a/b/out", "--for", "odm", "-o", "a/b/files"): r"\b2 captures, ",
-    ("mosaic", "a/b/out", "-o", "a/b/field.tif"): "Mosaic of 2 captures",
 }
 """What a command prints if no capture is missing, by its arguments."""
 

@@ -70,12 +70,11 @@ GREEN = "(did you mean 'Green'?); choose from Blue, Green, Red, NIR, Red edge"
         ("align {flight} -o {tmp}/o --pattern x", 2, "pattern"),
         ("ndiv {tmp}", 2, "did you mean 'ndvi'"),
         ("{tmp}/file {tmp}/other -o {tmp}/o", 2, "give the folder of the images, not the files: agalign {tmp}"),
+        ("verify", 2, "give the output folder of a run; 'agalign verify --help' lists the options"),
         ("nowhere", 1, "nowhere: does not exist; give the folder of the images"),
         ("info nowhere", 1, "nowhere: does not exist; give the folder of the images"),
         ("report nowhere", 1, "nowhere: does not exist; give the output folder of a run"),
         ("ndvi nowhere", 1, "nowhere: does not exist; give the output folder of a run"),
-        ("mosaic", 2, "give the output folder of a run; 'agalign mosaic --help' lists the options"),
-        ("mosaic nowhere", 1, "nowhere: does not exist; give the output folder of a run"),
         ("export nowhere --for odm", 1, "nowhere: does not exist; give the output folder of a run"),
         ("verify {tmp}", 1, "no sidecars there; give the output folder of a run"),
         ("align {flight} -o {tmp}/file", 1, "file"),
@@ -99,7 +98,7 @@ def test_wrong_arguments_are_one_line(flight: Path, tmp_path: Path, command: str
     assert not (tmp_path / "o").exists()
 
 
-@pytest.mark.parametrize("command", ["align x --nope", "x --jobs y", "align", "mosiac"])
+@pytest.mark.parametrize("command", ["align x --nope", "x --jobs y", "align", "exprot"])
 def test_usage_errors_are_events_of_the_json_log(command: str) -> None:
     plain, logged = agalign_here(*command.split()), agalign_here(*command.split(), "--log-json")
     assert plain.returncode == logged.returncode == 2

@@ -3,12 +3,18 @@
 A block of ```sh``` is commands, one a line; one of ```python``` is a script; ```text``` is neither.
 """
 
+import os
 import re
+import shlex
+import subprocess
+import sys
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
+
+from ..program import agalign_here
 
 ROOT = Path(__file__).resolve().parents[2]
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
@@ -55,3 +61,16 @@ def commands_of(block: Block) -> list[str]:
 def program(command: str) -> str:
     """The name of the program that a command starts, whatever is set before it."""
     return next(word for word in command.split() if not re.fullmatch(r"\w+=\S*", word))
+
+
+def run_command(command: str, where: str) -> None:
+    """Run agalign in this process, which has loaded everything, and other programs in a shell; it must succeed."""
+    first, *arguments = shlex.split(command)
+    if first == "agalign":
+        found = [sorted(map(str, Path().glob(a))) if "*" in a else [a] for a in arguments]
+        done = agalign_here(*(argument for part in found for argument in part))
+    else:
+        tools = os.pathsep.join((str(Path(sys.executable).parent), os.environ["PATH"]))
+        variables = os.environ | {"PYTHONPATH": str(ROOT), "PATH": tools}
+        done = subprocess.run(["bash", "-c", command], env=variables, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, f"{where}: {command}\n{done.stdout[-1500:]}{done.stderr[-3000:]}"

@@ -4,7 +4,6 @@ import csv
 import os
 import re
 import runpy
-import shlex
 import shutil
 import subprocess
 import sys
@@ -17,7 +16,6 @@ import geopandas
 import numpy as np
 import pytest
 import rasterio
-from rasterio.enums import ColorInterp
 from rasterio.transform import Affine
 from shapely import Polygon
 from synthetic_flights.cameras import ALTUM
@@ -30,8 +28,7 @@ from ..builders import displaced_views, in_full_run
 from ..cli.test_onto import TRUTH as MOVEMENT
 from ..cli.test_onto import write_mosaic
 from ..conftest import REAL_DATA, Shared, textured_pair, write_band
-from ..program import agalign_here
-from .blocks import PAGES, ROOT, blocks_of, commands_of, each_page, program, text_of
+from .blocks import PAGES, ROOT, blocks_of, commands_of, each_page, program, run_command, text_of
 
 RUN_BY = {"docker": "tools/container.sh", "dask": "tools/dask_cluster.sh", "pip": ".ci/run"}
 """What cannot be run inside a test, and the script that runs it and what stands with it in a block."""
@@ -41,17 +38,14 @@ LONG = re.compile("batch|benchmark-bands|close-range|paper|photogrammetry|python
 """Pages with blocks that take seconds, and of commands that other tests run: only the full run has them."""
 
 
-def write_orthophoto(folder: Path) -> None:
-    """odm_orthophoto.tif with an alpha band, NDVI 0.5 and 0.8, and plots.gpkg: a square in both halves and over the
-    edge, with and without an id, and a self-intersecting outline.
+def write_ndvi_and_plots(folder: Path) -> None:
+    """ndvi.tif with 0.5 and 0.8, and plots.gpkg: a square in both halves and over the edge, with and without an id, and
+    a self-intersecting outline.
     """
-    bands = np.full((5, 60, 100), 1000, np.uint16)
-    bands[3, :, :50], bands[3, :, 50:], bands[4] = 3000, 9000, 65535
-    bands[:, :, :10] = 0  # outside of the flight
+    ndvi = np.full((60, 100), 0.5, np.float32)
+    ndvi[:, 50:], ndvi[:, :10] = 0.8, np.nan  # nan is outside of the flight
     place = {"crs": "EPSG:32633", "transform": Affine(0.1, 0, 500_000, 0, -0.1, 4_000_000)}
-    write_band(folder / "odm_orthophoto.tif", bands, **place)
-    with rasterio.open(folder / "odm_orthophoto.tif", "r+") as orthophoto:
-        orthophoto.colorinterp = [*orthophoto.colorinterp[:4], ColorInterp.alpha]
+    write_band(folder / "ndvi.tif", ndvi, nodata=np.nan, **place)
     rings = {"A1": ((2, 1), (4, 1), (4, 3), (2, 3)), "": ((6, 1), (8, 1), (8, 3), (6, 3))}
     rings |= {"edge": ((0, 4), (2, 4), (2, 6), (0, 6)), "bow tie": ((6, 5), (9, 5), (6, 4), (9, 4))}
     outlines = [Polygon([(500_000 + x, 4_000_000 - y) for x, y in ring]) for ring in rings.values()]
@@ -79,7 +73,7 @@ def originals(shared: Shared, flight: Path) -> Path:
                 cv2.imwrite(str(folder / f"{number}{side}.png"), (image * 40 + 128).clip(1, 254).astype(np.uint8))
             np.savetxt(folder / f"{number}.txt", MOVEMENT)
         (folder / "pairs.csv").write_text("fixed,moving,homography\n1a.png,1b.png,1.txt\n2a.png,2b.png,2.txt\n")
-        write_orthophoto(folder)
+        write_ndvi_and_plots(folder)
         for name in ("examples", "benchmarks"):
             (folder / name).symlink_to(ROOT / name)
         if REAL_DATA.is_dir():
@@ -94,19 +88,6 @@ def desk(originals: Path, aligned_flight: Path, tmp_path: Path) -> Path:
     folder = shutil.copytree(originals, tmp_path / "desk", symlinks=True)
     shutil.copytree(aligned_flight, folder / "aligned")
     return folder
-
-
-def run_command(command: str, where: str) -> None:
-    """Run agalign in this process, which has loaded everything, and other programs in a shell."""
-    first, *arguments = shlex.split(command)
-    if first == "agalign":
-        found = [sorted(map(str, Path().glob(a))) if "*" in a else [a] for a in arguments]
-        done = agalign_here(*(argument for part in found for argument in part))
-    else:
-        tools = os.pathsep.join((str(Path(sys.executable).parent), os.environ["PATH"]))
-        variables = os.environ | {"PYTHONPATH": str(ROOT), "PATH": tools}
-        done = subprocess.run(["bash", "-c", command], env=variables, capture_output=True, text=True, check=False)
-    assert done.returncode == 0, f"{where}: {command}\n{done.stdout[-1500:]}{done.stderr[-3000:]}"
 
 
 def run_python(text: str) -> None:
@@ -178,9 +159,9 @@ def test_an_example(name: str, desk: Path, monkeypatch: pytest.MonkeyPatch, caps
 
 def test_the_recipe_for_plots_has_a_row_of_any_outline(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
-    write_orthophoto(tmp_path)
+    write_ndvi_and_plots(tmp_path)
     text = next(b.text for b in blocks_of(ROOT / "docs" / "recipes" / "field.md") if "# plots.py" in b.text)
-    run_python(text.partition("# An index of")[0])
+    run_python(text)
     rows = list(csv.DictReader(Path("plots.csv").read_text(encoding="utf-8").splitlines()))
     assert [row["plot"] for row in rows] == ["A1", "", "edge", "bow tie"]
     assert [float(row["count"]) for row in rows] == pytest.approx([400, 400, 200, 150], abs=0.1)

@@ -1,12 +1,15 @@
 """Aligned bands as the programs that come next read them: OpenDroneMap, by the rules in `tests/odm.py`, and others."""
 
 import math
+import re
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+import rasterio
 from PIL import Image
+from rasterio.enums import ColorInterp
 
 import agalign
 from agalign.cameras.pix4d import vignetting_on_grid
@@ -21,8 +24,9 @@ from agalign.values.image import OutputGrid
 from agalign.values.mapping import PixelMapping
 
 from ..builders import in_full_run
-from ..conftest import Shared, read_json, seeded
-from ..odm import OdmPhoto, pixels_in
+from ..conftest import Shared, read_json, seeded, write_band
+from ..docs.blocks import ROOT, blocks_of, commands_of, program, run_command
+from ..odm import OdmPhoto, bands_of_orthophoto, pixels_in
 from .conftest import CAMERAS, capture_by
 
 IRRADIANCE = 0.8
@@ -73,6 +77,44 @@ def check_reflectance(photos: list[OdmPhoto], expected: list[OdmPhoto]) -> None:
         errors = np.abs(photo.reflectance()[valid] / values[valid] - 1)
         assert np.median(errors) < 0.002, photo.band_name
         assert np.percentile(errors, 99) < 0.01, photo.band_name
+
+
+@pytest.mark.slow
+def test_the_commands_of_the_recipe_make_an_ndvi_map(
+    flight: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """From a flight to its export, and from an orthophoto with the bands in OpenDroneMap's order to NDVI."""
+    monkeypatch.chdir(tmp_path)
+    Path("flight").symlink_to(flight)
+    page = ROOT / "docs" / "recipes" / "photogrammetry.md"
+    to_export, to_map = [block for block in blocks_of(page) if block.kind == "sh"][:2]
+    for command in commands_of(to_export):
+        run_command(command, to_export.where)
+    odm, rio = commands_of(to_map)
+    assert (program(odm), program(rio)) == ("docker", "rio")
+    assert '-v "$PWD/odm:/datasets/code"' in odm
+    (options,) = re.findall(r"^  (--skip-band-alignment.*)$", Path("odm/README.txt").read_text(), re.MULTILINE)
+    assert options.replace("'", "") in re.sub(r" +", " ", odm)
+
+    photos = [OdmPhoto(path) for path in sorted(Path("odm/images").iterdir())]
+    assert len(photos) == 10
+    first = {p.band_name: p.reflectance().astype(np.float32) for p in photos if "IMG_0001" in p.path.name}
+    bands = np.stack([first[name] for name in bands_of_orthophoto(photos)])
+    is_seen = np.arange(bands.shape[2]) >= 20
+    write_band(Path("orthophoto.tif"), np.concatenate([bands * is_seen, np.full_like(bands[:1], 255) * is_seen]))
+    with rasterio.open("orthophoto.tif", "r+") as dataset:
+        dataset.colorinterp = [*dataset.colorinterp[:-1], ColorInterp.alpha]
+    Path("odm/odm_orthophoto").mkdir()
+    Path("orthophoto.tif").rename("odm/odm_orthophoto/odm_orthophoto.tif")
+    run_command(rio, to_map.where)
+    with rasterio.open("ndvi.tif") as dataset:
+        assert np.isnan(dataset.nodata)
+        ndvi = dataset.read(1)
+    red, nir = first["Red"], first["NIR"]
+    is_known = is_seen & (red + nir > 0)
+    np.testing.assert_allclose(ndvi[is_known], ((nir - red) / (nir + red))[is_known], rtol=1e-5)
+    assert np.isnan(ndvi[:, :20]).all()
+    assert 0.1 < np.median(ndvi[is_known]) < 0.9
 
 
 OUTPUT_PX = geometry.lattice(480, 360, 25, 19)

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import rasterio
-from synthetic_flights.aligned import make_aligned, make_overlapping
+from synthetic_flights.aligned import make_aligned
 
 import agalign
 from agalign.products.exports.programs import export
@@ -28,34 +28,19 @@ REASON = "it has radiance, and 8 of 9 captures have reflectance"
 
 @pytest.fixture(scope="module")
 def run(shared: Shared) -> Path:
-    """Nine overlapping captures: the first is radiance, and two have other sources and times. Their stacks
-    count as files of bands.
-    """
+    """Nine captures; the first is radiance. Their stacks count as files of bands."""
 
     def fill(folder: Path) -> None:
-        make_overlapping(folder)
-        tags = {"RADIOMETRY_SOURCE": "panel", "TIFFTAG_DATETIME": "2026:06:21 01:00:00"}
-        for number, changes in ((1, {"RADIOMETRY": "radiance"}), (2, tags), (3, {"RADIOMETRY_SOURCE": "light sensor"})):
-            with rasterio.open(folder / "0000SET" / f"IMG_000{number}.tif", "r+") as stack:
-                stack.update_tags(**changes)
-                for index in stack.indexes if number == 1 else ():
-                    stack.update_tags(index, QUANTITY="radiance")
+        make_aligned(folder, 9)
+        with rasterio.open(folder / f"{FIRST}.tif", "r+") as stack:
+            stack.update_tags(RADIOMETRY="radiance")
+            for index in stack.indexes:
+                stack.update_tags(index, QUANTITY="radiance")
         for path in find_sidecars(folder):
             output = read_json(path)["output"]
             change(path, output=output | {"band_files": [{"file": path.with_suffix(".tif").name, "bytes": 1}]})
 
     return shared("mixed", fill)
-
-
-def test_the_mosaic_is_of_one_quantity_and_names_both_sources(run: Path, tmp_path: Path) -> None:
-    report = agalign.mosaic(run, tmp_path / "field.tif", indices=["savi"], untied=True, gsd_m=0.4)
-    assert (report.left_out, report.captures) == ([(FIRST, REASON)], 8)
-    assert [index.statistics.unit for index in report.indices] == ["reflectance"]
-    with rasterio.open(report.path) as field:
-        tags = field.tags()
-    assert tags["RADIOMETRY"] == "reflectance"
-    assert tags["RADIOMETRY_SOURCE"] == "light sensor and panel"
-    assert tags["TIFFTAG_DATETIME"] == "2026:06:21 01:00:00"
 
 
 def test_an_export_is_of_one_quantity(run: Path, tmp_path: Path) -> None:

@@ -83,7 +83,6 @@ def files_in(folder: Path) -> set[Path]:
         "verify {out}",
         "indices {out} --index ndvi --formula con=(N-R)/(N+R)",
         "indices {out} --index ndvi -o {new}",
-        "mosaic {out} -o {new}/field.tif --index ndvi",
         "info {in} --json",
         "evaluate {pairs} -m sift -o {new}.csv",
     ],
@@ -97,7 +96,7 @@ def test_every_writer_stays_in_its_folder(hostile_run: Path, tmp_path: Path, com
     places = {"out": out, "new": new, "in": root / "in", "pairs": root / "pairs.csv"}
     result = agalign_here(*(part.format_map(places) for part in command.split()))
     # The bands have other names in each capture.
-    needs_equal_bands = any(word in command for word in ("mosaic", "odm", "metashape", "pix4d"))
+    needs_equal_bands = any(word in command for word in ("odm", "metashape", "pix4d"))
     assert result.returncode == (3 if needs_equal_bands else 0), result.stderr
     written = files_in(tmp_path) - before
     assert all(p.is_relative_to(out) or p.is_relative_to(new) or p.parent == new.parent for p in written), written
@@ -192,7 +191,7 @@ BAD = os.fsdecode(b"f\xf6lder")
 @pytest.mark.skipif(sys.platform != "linux", reason="other systems allow no such names")
 @pytest.mark.parametrize(
     "command",
-    ["info {bad}", "align {bad}", "align {flight} -o {bad}", "report {bad}", "mosaic {flight} -o {bad}/field.tif"],
+    ["info {bad}", "align {bad}", "align {flight} -o {bad}", "report {bad}", "export {flight} --for odm -o {bad}"],
 )
 def test_an_argument_that_is_not_utf_8_is_one_line(command: str, flight: Path, tmp_path: Path) -> None:
     places = {"bad": tmp_path / BAD, "flight": flight}

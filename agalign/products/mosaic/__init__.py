@@ -1,1 +1,0 @@
-"""Quick mosaics of a flight."""
