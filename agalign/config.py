@@ -238,8 +238,6 @@ class WriteSettings(SettingsModel):
     """Store minimum, maximum, mean and standard deviation of aligned bands."""
     qa: bool = False
     """Write a raster of quality flags (saturated, occluded, predicted …), <capture>.qa.tif."""
-    stac: bool = False
-    """Write a STAC item per capture and a collection per flight."""
     indices: Annotated[
         tuple[str, ...], Option("index", type=str | None, parse=lambda text: names_in((text or "").lower()))
     ] = ()

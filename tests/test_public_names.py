@@ -53,8 +53,8 @@ def test_types_in_the_signatures_are_public(name: str) -> None:
 
 def test_settings_print_values_other_than_defaults() -> None:
     assert repr(agalign.Settings()) == "Settings()"
-    changed = agalign.Settings(write=agalign.WriteSettings(layout="both", stac=True))
-    assert repr(changed) == "Settings(write=WriteSettings(layout='both', stac=True))"
+    changed = agalign.Settings(write=agalign.WriteSettings(layout="both", qa=True))
+    assert repr(changed) == "Settings(write=WriteSettings(layout='both', qa=True))"
 
 
 def test_names_in_the_text_of_an_alignment_are_attributes() -> None:

@@ -60,7 +60,7 @@ main()
 @pytest.mark.full
 def test_every_text_is_read_and_written_in_an_encoding_that_is_said(flight: Path, tmp_path: Path) -> None:
     """Where none is said it is the system's, which on Windows is not UTF-8."""
-    options = ["--only-seed", "--layout", "both", "--error-map", "--stac"]
+    options = ["--only-seed", "--layout", "both", "--error-map", "--tie-points"]
     for arguments in (["align", str(flight), "-o", str(tmp_path), *options], ["report", str(tmp_path)]):
         command = [sys.executable, "-X", "warn_default_encoding", "-c", ENCODINGS_SAID, *arguments]
         done = subprocess.run(command, capture_output=True, encoding="utf-8", check=False)

@@ -22,7 +22,7 @@ from common import with_section
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGE = ROOT / "docs" / "licences.md"
-READ = {"atheris": "Apache-2.0", "exifread": "BSD-3-Clause", "odc-stac": "Apache-2.0"}
+READ = {"atheris": "Apache-2.0", "exifread": "BSD-3-Clause"}
 """Licences, from the licence file, of packages with missing or inexact metadata."""
 SPELT = {
     "Apache Software License": "Apache-2.0",

@@ -33,7 +33,7 @@ write() {  # write FILE, from standard input
 
 echo hatchling > "$folder/build.in"
 compile "$folder/build.txt" "$folder/build.in"
-compile "$folder/image.txt" --extra dask --extra stac --extra xarray pyproject.toml
+compile "$folder/image.txt" --extra dask --extra xarray pyproject.toml
 compile "$folder/dev.txt" --extra dev --constraints "$folder/image.txt" pyproject.toml
 
 write build.txt < "$folder/build.txt"

@@ -34,7 +34,6 @@ from agalign.flight.rig_file import read_rig
 from agalign.flight.sky import SkyCapture, sky_captures
 from agalign.method.device import choose_device, limit_threads
 from agalign.pixels.radiometry import with_radiometry
-from agalign.products.exports.stac import write_collections
 from agalign.products.indices.rasters import check_indices
 from agalign.products.product import CapturePaths
 from agalign.products.rasters.layout import FlightLimits, common_grid, flight_limits
@@ -246,8 +245,6 @@ class _FlightRun:
             flight_map.add(by_label[report.label], status, report.result)
             yield report
         flight_map.write()
-        if settings.write.stac:
-            write_collections(captures, out)
 
     def _excluded(
         self, sky: Sequence[SkyCapture], panels: Sequence[PanelReading], record: RunPart

@@ -46,7 +46,6 @@ def _align(
         agalign flight/ --retry-failed  process failed captures again
     """
     from agalign.config import DiscoverOptions, RunOptions, Settings
-    from agalign.products.exports.stac import need_stac
     from agalign.products.indices.formulas import index_named
     from agalign.values.processes import start_server_ahead
 
@@ -56,8 +55,6 @@ def _align(
     dask = given["run"].pop("executor")
     options = RunOptions(**given["run"], command=command_line())
     cores = options.jobs or usable_cores()
-    if settings.write.stac:
-        need_stac()
     for name in settings.write.indices:
         index_named(name)
     load_ahead()
@@ -90,7 +87,7 @@ align = _command(
         "Input": "reference bands order with_rgb pattern ignore_metadata include exclude align_panels max_pixels",
         "Alignment": "seed only_seed relief accept_predicted model",
         "Output": "out interpolation crop undistort resolution layout radiometry panel_albedo pan_sharpen index "
-        "georeference ground_elevation qa statistics stac relief_map fill_occluded error_map tie_points format "
+        "georeference ground_elevation qa statistics relief_map fill_occluded error_map tie_points format "
         "compression",
         "Running": "device jobs dask overwrite retry_failed timeout dry_run config quiet verbose log_json",
         "Expert": "recipe sharing model_family each_alone rng_seed",

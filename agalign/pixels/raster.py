@@ -317,12 +317,6 @@ def gdal_version() -> str:
     return str(rasterio.__gdal_version__)
 
 
-def crs_code(crs_wkt: str) -> str | None:
-    """Return authority and code of a coordinate reference system, such as EPSG:32613; None without one."""
-    authority = rasterio.CRS.from_wkt(crs_wkt).to_authority()
-    return None if authority is None else ":".join(authority)
-
-
 def crs_wkt(code: str) -> str:
     """Return the WKT of a coordinate reference system such as EPSG:32613."""
     return str(rasterio.CRS.from_user_input(code).to_wkt())

@@ -18,8 +18,6 @@ from agalign.values.capture import Capture
 from agalign.values.files import file_checksum
 from agalign.values.image import OutputGrid
 
-GEOTIFF = "image/tiff; application=geotiff"
-
 
 @dataclass(frozen=True)
 class CapturePaths:
@@ -48,23 +46,12 @@ class CapturePaths:
 
 
 @dataclass(frozen=True)
-class StacAsset:
-    """The asset of a file in the capture's STAC item."""
-
-    key: str
-    media_type: str
-    roles: tuple[str, ...]
-
-
-@dataclass(frozen=True)
 class WrittenFile:
     """A complete file that a product has written."""
 
     kind: str
     """The product's `kind`."""
     path: Path
-    asset: StacAsset | None = None
-    """None if the STAC item does not list the file."""
     bands: tuple[str, ...] = ()
     """Names of the bands in a file of aligned pixels, in the order of the file."""
     nodata: float | None = None
@@ -142,8 +129,8 @@ class Product(ABC):
     """One kind of output of a capture.
 
     A new product is a module with a subclass, and an entry in `products/registry.py`. Its files are then listed in the
-    sidecar with size and checksum, verified when a run resumes, removed before a capture is processed again, protected
-    against two captures with the same name, and part of the STAC item.
+    sidecar with size and checksum, verified when a run resumes, removed before a capture is processed again, and
+    protected against two captures with the same name.
     """
 
     kind: ClassVar[str]
@@ -179,12 +166,7 @@ class Product(ABC):
         """
 
     def write_layers(
-        self,
-        context: ProductContext,
-        layers: Sequence[LayerDescription],
-        blocks: Iterable[Block],
-        asset: StacAsset,
-        **options: Any,
+        self, context: ProductContext, layers: Sequence[LayerDescription], blocks: Iterable[Block], **options: Any
     ) -> list[WrittenFile]:
         """Write one raster on the grid of the capture, with these options of `write_on_grid`, and return it.
 
@@ -192,4 +174,4 @@ class Product(ABC):
         """
         path, georeference = context.paths.file(self.suffix), context.capture.reference.georeference
         write_on_grid(path, context.grid, georeference, layers, blocks, **options)
-        return [WrittenFile(self.kind, path, asset)]
+        return [WrittenFile(self.kind, path)]

@@ -1,6 +1,5 @@
 """Every product of a capture, in the order in which they are written."""
 
-from agalign.products.exports.stac import StacItem
 from agalign.products.exports.tie_points import TiePoints
 from agalign.products.indices.rasters import IndexRasters
 from agalign.products.product import Product
@@ -20,6 +19,4 @@ PRODUCTS: tuple[Product, ...] = (
     IndexRasters(),
     BeforeAfterPicture(),
     Preview(),
-    # Last: its assets are the files of the products before it.
-    StacItem(),
 )

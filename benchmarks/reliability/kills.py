@@ -3,7 +3,7 @@
     python benchmarks/reliability/kills.py [--kills 50] [--modes "one job,two jobs,Dask,indices"]
         [--signals SIGKILL,SIGTERM,SIGINT,SIGHUP,SIGSTOP] [--captures 12] [--markdown FILE]
 
-The synthetic flight, `--layout both` with an error map and STAC items, so that every kind of file is at stake; and
+The synthetic flight, `--layout both` with an error map and tie points, so that every kind of file is at stake; and
 `agalign indices` on five times as many aligned captures. `--kills` is the number for each mode. Moments are drawn
 evenly over the time that an undisturbed run takes. Signals go to the run, its fork server, a worker, or all of them.
 SIGSTOP is followed by SIGCONT. Compared are all files that a run writes, byte by byte, but JSON without the
@@ -35,7 +35,7 @@ from agalign.synthetic import flight as synthetic
 from agalign.values.files import RUN_FILE
 
 SIZE_PX = 480, 360
-OPTIONS = "--layout", "both", "--error-map", "--stac"
+OPTIONS = "--layout", "both", "--error-map", "--tie-points"
 INDICES = "indices"
 MODES = {"one job": ("-j", "1"), "two jobs": ("-j", "2"), "Dask": ("-j", "2", "--dask", "local"), INDICES: ("-j", "2")}
 TARGETS = "run", "fork server", "worker", "run and workers"

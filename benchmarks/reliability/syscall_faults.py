@@ -28,7 +28,19 @@ from agalign.products.report.pages import SUMMARY_FILE
 from agalign.synthetic import flight as synthetic
 
 CAPTURES, SIZE_PX = 2, (240, 180)
-OPTIONS = ("--layout", "both", "--error-map", "--stac", "--bands", "green,red", "--relief", "never", "-j", "1", "-q")
+OPTIONS = (
+    "--layout",
+    "both",
+    "--error-map",
+    "--tie-points",
+    "--bands",
+    "green,red",
+    "--relief",
+    "never",
+    "-j",
+    "1",
+    "-q",
+)
 _USUAL = "EIO", "ENOSPC", "EINTR"
 ERRORS = dict.fromkeys(("write", "pwrite64", "fsync", "rename", "openat", "close"), _USUAL)
 ERRORS["rename"] = "EIO", "ENOSPC", "EACCES"

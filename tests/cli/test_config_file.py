@@ -25,14 +25,14 @@ def test_a_file_sets_options_and_the_command_line_comes_first(tmp_path: Path) ->
     synthetic.make_flight(tmp_path / "in", captures=1, size_px=(160, 120))
     config = tmp_path / "agalign.toml"
     config.write_text(
-        '\ufeffradiometry = "sun"\nstac = true\naccept_predicted = 0.5\nindex = "ndvi,NDRE"\nonly-seed = true\n'
+        '\ufeffradiometry = "sun"\nqa = true\naccept_predicted = 0.5\nindex = "ndvi,NDRE"\nonly-seed = true\n'
         'exclude = ["*_1.*", "*_9.*"]\ninclude = "0000SET/*"\nrng-seed = 3\n'
     )
     done = agalign_here(tmp_path / "in", "-o", tmp_path / "out", "--config", config, "--rng-seed", "4")
     assert done.returncode == 3, done.stderr
     settings = read_json(tmp_path / "out" / "agalign-run.json")["settings"]
     write = settings["write"]
-    assert (write["radiometry"], write["stac"], write["indices"]) == ("sun", True, ["ndvi", "ndre"])
+    assert (write["radiometry"], write["qa"], write["indices"]) == ("sun", True, ["ndvi", "ndre"])
     assert (settings["check"]["accept_predicted_px"], settings["joint"]["rng_seed"]) == (0.5, 4)
     bands = read_json(tmp_path / "out" / "0000SET" / "000" / "IMG_0001.json")["bands"]
     assert [band["band"] for band in bands] == ["Green", "Red", "NIR", "Red edge"]
@@ -50,7 +50,7 @@ def test_a_file_sets_options_and_the_command_line_comes_first(tmp_path: Path) ->
         ("jobs = true", "'jobs' takes a text or number"),
         ("exclude = [true]", "'exclude' takes a text or number"),
         ("out = 1979-05-27", "'out' takes a text or number"),
-        ("stac = ''", "'stac' takes true or false"),
+        ("qa = ''", "'qa' takes true or false"),
         ("timeout = inf", "--timeout: "),
         ("ground-elevation = nan", "--ground-elevation: "),
         (f"jobs = {2**63}", "--jobs: "),

@@ -64,10 +64,6 @@ def originals(shared: Shared, flight: Path) -> Path:
         dates = textured_pair(MOVEMENT, 640, 520)
         for name, image, off_m in zip(("spring", "summer"), dates, ((0, 0), (3, -4)), strict=True):
             write_mosaic(folder / f"{name}.tif", image, off_m, bands=2)
-        (folder / "mosaics").mkdir()
-        write_mosaic(folder / "mosaics" / "field.tif", dates[0][:320, :400], (0, 0), bands=3)
-        with rasterio.open(folder / "mosaics" / "field.tif", "r+") as field:
-            field.descriptions = ("green", "red", "nir")
         for number, seed in enumerate((1, 2), start=1):
             for side, image in zip("ab", textured_pair(MOVEMENT, 240, 200, seed), strict=True):
                 cv2.imwrite(str(folder / f"{number}{side}.png"), (image * 40 + 128).clip(1, 254).astype(np.uint8))

@@ -29,7 +29,7 @@ def test_every_fact_that_a_result_depends_on_changes_it(flight: Path) -> None:
     captures = [replace(capture, bands=(replace(band, **changed), *capture.bands[1:])) for changed in changes]
     captures += [capture, replace(capture, reference_index=0)]
     fingerprints = [fingerprint(c, Settings()) for c in captures]
-    fingerprints.append(fingerprint(capture, Settings(write=WriteSettings(stac=True))))
+    fingerprints.append(fingerprint(capture, Settings(write=WriteSettings(qa=True))))
     assert len(set(fingerprints)) == len(fingerprints)
 
 

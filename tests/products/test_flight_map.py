@@ -19,6 +19,7 @@ from agalign.products.run.flight_map import (
     accuracy_of_footprint_m,
     footprint,
     geojson_geometry,
+    ground_m,
     missing_for_footprint,
     pose_errors,
     utm_of_flights,
@@ -54,6 +55,32 @@ def mapped(out: Path, known: Capture, status: str = "ok", result: CaptureResult 
     on_map.add(known, status, result)
     on_map.write()
     return features_of(out)
+
+
+@pytest.mark.parametrize(
+    ("pose", "point_px", "expected_m"),
+    [
+        (Pose(0.0, height_m=100.0, focal_length_px=1000.0), (599.5, 239.5), (28.0, 0.0)),
+        (Pose(0.0, height_m=100.0, focal_length_px=1000.0), (319.5, 0.0), (0.0, 23.95)),
+        (Pose(90.0, height_m=100.0, focal_length_px=1000.0), (319.5, 0.0), (23.95, 0.0)),
+        (Pose(0.0, 10.0, 0.0, 100.0, 1000.0), (319.5, 239.5), (0.0, 17.633)),
+        (Pose(0.0, 10.0, 0.0, 100.0, 1000.0), (319.5, 0.0), (0.0, 43.414)),
+        (Pose(0.0, 0.0, 10.0, 100.0, 1000.0), (319.5, 239.5), (-17.633, 0.0)),
+        (None, (0.0, 0.0), None),
+        (Pose(0.0), (0.0, 0.0), None),
+        (Pose(0.0, 60.0, 0.0, 100.0, 1000.0), (0.0, 0.0), None),
+        (Pose(0.0, height_m=10.0), (0.0, 0.0), None),
+    ],
+)
+def test_position_of_a_pixel_on_the_ground(
+    pose: Pose | None, point_px: tuple[float, float], expected_m: tuple[float, float] | None
+) -> None:
+    green = Band("Green", Path("x.tif"), 1, 640, 480, "uint16")
+    result = ground_m(Capture("a", Path(), (green,), 0, pose=pose), np.array([point_px]))
+    if expected_m is None:
+        assert result is None
+    else:
+        np.testing.assert_allclose(result[0], expected_m, atol=0.01)
 
 
 def test_the_footprint_of_a_camera_that_looks_down_has_the_size_of_its_field_of_view(tmp_path: Path) -> None:
@@ -160,7 +187,7 @@ def test_a_capture_without_footprint_names_what_it_lacks(pose: Pose | None, miss
 def test_a_footprint_across_the_180th_meridian_is_cut_there() -> None:
     """RFC 7946, 3.1.9: two polygons, each on its side; together they have the area of the footprint."""
     ring = np.array([[179.999, 52.0], [-179.998, 52.001], [-179.999, 52.003], [179.998, 52.002], [179.999, 52.0]])
-    shape = geojson_geometry(ring, None, decimals=7)
+    shape = geojson_geometry(ring, None)
     assert shape["type"] == "MultiPolygon"
     west, east = (np.array(part[0]) for part in shape["coordinates"])
     assert (west[:, 0].max(), east[:, 0].min()) == (180.0, -180.0)
@@ -171,7 +198,7 @@ def test_a_footprint_across_the_180th_meridian_is_cut_there() -> None:
     areas = [cv2.contourArea(((one - one[0]) * 1e4).astype(np.float32), oriented=True) for one in (west, east, whole)]
     assert areas[0] + areas[1] == pytest.approx(areas[2], rel=1e-3)
     assert min(areas) > 0
-    assert geojson_geometry(ring % 90, None, decimals=7)["type"] == "Polygon"
+    assert geojson_geometry(ring % 90, None)["type"] == "Polygon"
 
 
 def test_a_flight_across_the_border_of_a_utm_zone_has_one_coordinate_system() -> None:

@@ -211,7 +211,7 @@ def test_the_file_of_a_photograph_does_not_take_the_name_of_the_stack() -> None:
     [
         {"layout": "both", "undistort": True, "resolution": "finest"},
         {"layout": "bands", "format": "cog", "crop": "none", "radiometry": "auto"},
-        {"layout": "both", "radiometry": "auto", "stac": True, "interpolation": "nearest"},
+        {"layout": "both", "radiometry": "auto", "qa": True, "interpolation": "nearest"},
         {"layout": "stack", "format": "cog", "undistort": True, "compression": "none"},
     ],
     ids=str,

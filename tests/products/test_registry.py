@@ -1,4 +1,4 @@
-"""What every product gets from the registry: an entry in the sidecar, an asset, and a place among the files kept."""
+"""What every product gets from the registry: an entry in the sidecar, and a place among the files kept."""
 
 import hashlib
 import json
@@ -10,13 +10,13 @@ import pytest
 import agalign
 from agalign.batch import capture_task as batch_capture
 from agalign.batch.earlier_results import outputs_exist
-from agalign.products.product import Product, ProductContext, StacAsset, WrittenFile
+from agalign.products.product import Product, ProductContext, WrittenFile
 from agalign.products.registry import PRODUCTS
 from agalign.values.files import write_text
 
-from ..conftest import raising, read_json, seeded, write_capture
+from ..conftest import raising, seeded, write_capture
 
-ALL, PLAIN = seeded("identity", layout="both", error_map=True, stac=True), seeded("identity")
+ALL, PLAIN = seeded("identity", layout="both", error_map=True), seeded("identity")
 Align = Callable[..., agalign.CaptureReport]
 
 
@@ -30,7 +30,7 @@ class Histogram(Product):
     def write(self, context: ProductContext) -> list[WrittenFile]:
         path = context.paths.file(self.suffix)
         write_text(path, json.dumps(sorted(context.with_pixels)))
-        return [WrittenFile(self.kind, path, StacAsset("histogram", "application/json", ("metadata",)))]
+        return [WrittenFile(self.kind, path)]
 
 
 @pytest.fixture
@@ -47,20 +47,18 @@ def align(tmp_path: Path) -> Align:
 
 @pytest.fixture
 def with_histogram(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(batch_capture, "PRODUCTS", (*PRODUCTS[:-1], Histogram(), PRODUCTS[-1]))
+    monkeypatch.setattr(batch_capture, "PRODUCTS", (*PRODUCTS, Histogram()))
 
 
 @pytest.mark.usefixtures("with_histogram")
-def test_every_file_is_listed_with_its_checksum_described_and_removed(align: Align, tmp_path: Path) -> None:
-    pytest.importorskip("pystac")
+def test_every_file_is_listed_with_its_checksum_and_removed(align: Align, tmp_path: Path) -> None:
     out, sidecar = tmp_path / "out", align().sidecar
-    kinds = "band band stack error_map picture preview histogram stac_item"
-    files = "f_green.tif f_red.tif f.tif f.error.tif f.png f.preview.jpg f.histogram.json f.stac.json"
+    kinds = "band band stack error_map picture preview histogram"
+    files = "f_green.tif f_red.tif f.tif f.error.tif f.png f.preview.jpg f.histogram.json"
     assert [(p.kind, p.file) for p in sidecar.products] == list(zip(kinds.split(), files.split(), strict=True))
     for part in sidecar.products:
         data = (out / part.file).read_bytes()
         assert (part.bytes, part.sha256) == (len(data), hashlib.sha256(data).hexdigest())
-    assert read_json(out / "f.stac.json")["assets"]["histogram"]["href"] == "f.histogram.json"
     align(PLAIN)
     assert {p.name for p in out.glob("f[._]*")} == {"f.json", "f.tif", "f.png", "f.preview.jpg"}
 
@@ -74,10 +72,9 @@ def test_an_image_is_not_replaced(tmp_path: Path) -> None:
 
 @pytest.mark.usefixtures("with_histogram")
 def test_a_capture_is_kept_only_while_all_its_files_are_there(align: Align) -> None:
-    pytest.importorskip("pystac")
     report = align()
     first, *others = (report.path.with_name(name) for name in report.result.files)
-    assert len(others) == 7
+    assert len(others) == 6
     for path in (first, *others):
         data = path.read_bytes()
         path.write_bytes(data[:-1])

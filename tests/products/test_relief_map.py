@@ -19,7 +19,7 @@ from agalign.cameras import pix4d, rig_seed
 from agalign.cameras.metadata import Tags
 from agalign.products.rasters.alignment_maps import relief_layers
 from agalign.products.sidecar.convert import sidecar_of
-from agalign.products.sidecar.file import read_result, read_sidecar, write_sidecar
+from agalign.products.sidecar.file import find_sidecars, read_result, read_sidecar, write_sidecar
 from agalign.synthetic import cameras
 from agalign.values import geometry, lens
 from agalign.values.alignment import Alignment, PairScales
@@ -107,7 +107,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Run:
 @pytest.fixture(scope="module")
 def written(run: Run, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The sidecar of a run with all layers."""
-    return run.write(tmp_path_factory.mktemp("out"), relief_map=True, stac=True)
+    return run.write(tmp_path_factory.mktemp("out"), relief_map=True)
 
 
 def layers_of(sidecar: Path) -> dict[str, np.ndarray]:
@@ -329,7 +329,7 @@ def assert_same_as_stack(sidecar: Path, inputs: Path, *, occluded_from_outside: 
 
 def test_an_alignment_warps_to_the_bytes_of_a_stack(aligned_flight: Path, flight: Path) -> None:
     """Of a run with default settings."""
-    sidecars = [path for path in aligned_flight.rglob("IMG_*.json") if "stac" not in path.name]
+    sidecars = find_sidecars(aligned_flight)
     assert sum(assert_same_as_stack(s, flight / s.parent.relative_to(aligned_flight)) for s in sidecars) == 8
 
 

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 
 def open_capture(path: str | Path, *, masked: bool = True) -> "xarray.Dataset":
-    """Return the aligned bands of a capture, read lazily with dask, given its sidecar, stack or STAC item.
+    """Return the aligned bands of a capture, read lazily with dask, given its sidecar or stack.
 
     Dimensions are y and x, at pixel centres: map coordinates if the capture is georeferenced (`.rio.crs`), else px of
     the output, with (0, 0) the centre of the top-left pixel. On a rotated grid, as `--georeference` writes it, the map
@@ -35,7 +35,7 @@ def open_capture(path: str | Path, *, masked: bool = True) -> "xarray.Dataset":
     given = Path(path)
     if given.is_dir():
         raise InputError(f"{given}: is a folder; give the sidecar of a capture, or use open_flight")
-    name = re.sub(r"(?:\.stac)?\.json$|\.tiff?$", "", given.name, flags=re.IGNORECASE)
+    name = re.sub(r"\.json$|\.tiff?$", "", given.name, flags=re.IGNORECASE)
     return _dataset(given.with_name(f"{name}.json"), masked=masked)
 
 

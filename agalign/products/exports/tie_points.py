@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from agalign.config import WriteSettings
 from agalign.errors import GeometryError
 from agalign.pixels.raster import transformed
-from agalign.products.product import CapturePaths, Product, ProductContext, StacAsset, WrittenFile
+from agalign.products.product import CapturePaths, Product, ProductContext, WrittenFile
 from agalign.values import geometry
 from agalign.values.alignment import Alignment
 from agalign.values.capture import Capture, Georeference
@@ -47,10 +47,7 @@ class TiePoints(Product):
         cells = ((band, status, *(f"{n:.4f}" for n in point)) for band, status, point in rows)
         write_csv(table, ("band", "status", *positions, "residual_px", "weight"), cells)
         write_text(features, _geojson(rows, context.capture.reference.georeference))
-        return [
-            WrittenFile(self.kind, table, StacAsset("tie_points", "text/csv", ("metadata",))),
-            WrittenFile(self.kind, features, StacAsset("tie_points_geojson", "application/geo+json", ("metadata",))),
-        ]
+        return [WrittenFile(self.kind, table), WrittenFile(self.kind, features)]
 
 
 def tie_points(alignment: Alignment) -> NDArray[np.float64]:

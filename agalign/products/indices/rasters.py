@@ -23,7 +23,7 @@ from agalign.config import WriteSettings
 from agalign.errors import ConfigurationError, InputError
 from agalign.pixels.raster import OpenRaster, open_raster
 from agalign.products.indices.formulas import Index, bands_for, compute, index_named, role_of_band
-from agalign.products.product import GEOTIFF, CapturePaths, Product, ProductContext, StacAsset, WrittenFile
+from agalign.products.product import CapturePaths, Product, ProductContext, WrittenFile
 from agalign.products.rasters.aligned_files import tags_of, to_cog
 from agalign.products.rasters.checked_raster import (
     FLOAT_OPTIONS,
@@ -145,7 +145,7 @@ class IndexRasters(Product):
         reports = write_rasters(bands, indices, context.paths.file(""), context.capture.label)
         for index, report in zip(indices, reports, strict=True):
             if report.path is not None:
-                yield WrittenFile(self.kind, report.path, StacAsset(report.index, GEOTIFF, ("data",)))
+                yield WrittenFile(self.kind, report.path)
                 yield WrittenFile(self.kind, report.path.with_suffix(".png"))
             elif all(not b.problem for b in bands) and _has_bands(context.capture.bands, index):
                 problems.append(report.problem)

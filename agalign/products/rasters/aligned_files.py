@@ -29,7 +29,7 @@ from agalign.pixels.band_resampling import resample_tile
 from agalign.pixels.radiometry import calibrated
 from agalign.pixels.raster import GDAL_ENVIRONMENT, open_raster, read_tile, suffix_format, without_warnings
 from agalign.products.indices.formulas import Role, role_of_band
-from agalign.products.product import GEOTIFF, CapturePaths, Product, ProductContext, StacAsset, WrittenFile
+from agalign.products.product import CapturePaths, Product, ProductContext, WrittenFile
 from agalign.products.rasters.checked_raster import WORK_TILE_PX, Block, LayerDescription, predictor, write_on_grid
 from agalign.products.rasters.layout import Layer, is_inside
 from agalign.values import geometry
@@ -86,7 +86,7 @@ class BandFiles(Product):
             band, path = of_file[0].band, context.paths.folder / name
             vignetting = vignettings.get(band.name)
             tags = band_tags(band, context.capture.reference, context.grid, vignetting, radiometry=not context.is_raw)
-            written.append(_written(self.kind, context, of_file, path, name.as_posix(), tags))
+            written.append(_written(self.kind, context, of_file, path, tags))
         return written
 
 
@@ -152,17 +152,16 @@ class Stack(Product):
     def write(self, context: ProductContext) -> list[WrittenFile]:
         """Write <capture>.tif."""
         tags = capture_tags(context.capture.reference, context.grid)
-        return [_written(self.kind, context, context.layers, context.paths.file(self.suffix), "stack", tags)]
+        return [_written(self.kind, context, context.layers, context.paths.file(self.suffix), tags)]
 
 
 def _written(
-    kind: str, context: ProductContext, layers: Sequence[Layer], path: Path, key: str, tags: TransferredTags
+    kind: str, context: ProductContext, layers: Sequence[Layer], path: Path, tags: TransferredTags
 ) -> WrittenFile:
-    """Write layers as the bands of one file, and return it with its asset `key`."""
+    """Write layers as the bands of one file, and return it."""
     nodata = write_raster(context, layers, path, tags)
-    media_type = f"{GEOTIFF}; profile=cloud-optimized" if context.settings.write.format == "cog" else GEOTIFF
     bands, is_flat = tuple(layer.band.name for layer in layers), any(layer.vignetting for layer in layers)
-    return WrittenFile(kind, path, StacAsset(key, media_type, ("data",)), bands, nodata, is_flat=is_flat)
+    return WrittenFile(kind, path, bands, nodata, is_flat=is_flat)
 
 
 def write_raster(

@@ -12,7 +12,7 @@ from agalign.cameras import rig_seed
 from agalign.cameras.pix4d import rig_unit_m
 from agalign.errors import GeometryError
 from agalign.pixels.raster import read_tile
-from agalign.products.product import GEOTIFF, Product, ProductContext, StacAsset, WrittenFile
+from agalign.products.product import Product, ProductContext, WrittenFile
 from agalign.products.rasters.checked_raster import WORK_TILE_PX, LayerDescription
 from agalign.products.rasters.layout import Layer, is_inside
 from agalign.values import geometry, lens
@@ -49,7 +49,7 @@ class ErrorMap(Product):
             for name, alignment in with_pixels.items()
         ]
         blocks = ((_error_px(a, reference, grid), index, 0, 0) for index, a in enumerate(with_pixels.values(), start=1))
-        return self.write_layers(context, layers, blocks, StacAsset("error", GEOTIFF, ("metadata",)))
+        return self.write_layers(context, layers, blocks)
 
 
 def error_lattice_px(alignment: Alignment, reference: Band, grid: OutputGrid) -> NDArray[np.float32]:
@@ -106,8 +106,8 @@ class QualityRaster(Product):
             for index, flags in enumerate(flags_on(tile), start=1)
         )
         # There is no nodata value: 0 means that no flag is set.
-        options, asset = {"compress": "deflate", "interleave": "band"}, StacAsset("qa", GEOTIFF, ("metadata",))
-        return self.write_layers(context, layers, blocks, asset, tags=tags, dtype="uint16", options=options)
+        options = {"compress": "deflate", "interleave": "band"}
+        return self.write_layers(context, layers, blocks, tags=tags, dtype="uint16", options=options)
 
 
 def _flags(
@@ -178,7 +178,7 @@ class ReliefMap(Product):
             layers = {"parallax": layers["parallax"]}
         descriptions = [LayerDescription(name, RELIEF_UNITS[name]) for name in layers]
         blocks = ((values, index, 0, 0) for index, values in enumerate(layers.values(), start=1))
-        return self.write_layers(context, descriptions, blocks, StacAsset("relief", GEOTIFF, ("data",)))
+        return self.write_layers(context, descriptions, blocks)
 
 
 def relief_of(alignments: Mapping[str, Alignment]) -> Relief | None:

@@ -22,7 +22,7 @@ from agalign.cameras.base import is_thermal
 from agalign.errors import InputError
 from agalign.pixels.masks import data_mask
 from agalign.pixels.raster import OpenRaster, open_raster
-from agalign.products.product import GEOTIFF, Product, ProductContext, StacAsset, WrittenFile
+from agalign.products.product import Product, ProductContext, WrittenFile
 from agalign.products.rasters.aligned_files import with_nodata, write_raster
 from agalign.products.rasters.checked_raster import Block, LayerDescription, predictor
 from agalign.products.rasters.layout import common_grid, output_layers
@@ -77,7 +77,7 @@ class PanSharpened(Product):
                 options = {"compress": "deflate", "predictor": predictor(np.dtype(file.dtypes[0]).kind)}
                 options |= {"interleave": "band", "nodata": file.nodata}
                 more = {"tags": file.tags(), "dtype": file.dtypes[0], "options": options}
-                return self.write_layers(context, descriptions, blocks, StacAsset("pan", GEOTIFF, ("data",)), **more)
+                return self.write_layers(context, descriptions, blocks, **more)
 
 
 def panchromatic(capture: Capture) -> list[Band]:

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from agalign.cameras.base import is_thermal
 from agalign.products.indices.formulas import ROLES
-from agalign.products.product import Product, ProductContext, StacAsset, WrittenFile
+from agalign.products.product import Product, ProductContext, WrittenFile
 from agalign.products.rasters.alignment_maps import error_lattice_px, relief_layers, relief_of
 from agalign.products.report.drawing import Grey, ReducedBands, encoded, side_by_side, titled, write_png
 from agalign.products.sidecar.schema import PreviewPart, ReliefPreviewPart
@@ -179,7 +179,7 @@ class BeforeAfterPicture(Product):
         path, reference = context.paths.file(self.suffix), context.capture.reference
         chosen = choose_bands([b for b in context.capture.moving if b.name in context.with_pixels], reference)
         write_picture(context.reduced_bands, [b.name for b in chosen], path)
-        return [WrittenFile(self.kind, path, StacAsset("picture", "image/png", ("thumbnail",)))]
+        return [WrittenFile(self.kind, path)]
 
 
 def choose_bands(moving: list[Band], reference: Band) -> list[Band]:

@@ -64,13 +64,12 @@ def footprint(capture: Capture, grid: OutputGrid) -> NDArray[np.float64] | None:
         return None
 
 
-def geojson_geometry(
-    ring: NDArray[np.float64] | None, position: Position | None, decimals: int
-) -> dict[str, Any] | None:
-    """Return the GeoJSON geometry of a footprint (n, 2) with these decimals, else of the camera's position, or None.
+def geojson_geometry(ring: NDArray[np.float64] | None, position: Position | None) -> dict[str, Any] | None:
+    """Return the GeoJSON geometry of a footprint (n, 2), else of the camera's position, or None.
 
     A footprint across the 180th meridian is cut there (RFC 7946, 3.1.9).
     """
+    decimals = 7  # of a degree: 1 cm
     if ring is not None and np.ptp(ring[:, 0]) > 180:
         beyond = np.column_stack([ring[:, 0] % 360 - 180, ring[:, 1]])  # degrees east of the meridian
         parts = [_clipped(beyond, side) - np.array([side * 180.0, 0.0]) for side in (-1, 1)]
@@ -251,7 +250,7 @@ class FlightMap:
         ring = footprint(shown, OutputGrid(0, 0, *capture.reference.size_px) if output is None else output.grid)
         position, pose = shown.position, shown.pose
         # RFC 7946: outer rings are counter-clockwise. 1e-7 degrees are a centimetre.
-        shape = geojson_geometry(None if ring is None else ring[::-1], position, decimals=7)
+        shape = geojson_geometry(None if ring is None else ring[::-1], position)
         georeference = capture.reference.georeference
         if georeference is None:
             accuracy_m = None if ring is None else accuracy_of_footprint_m(shown)
