@@ -1,10 +1,9 @@
-"""Align one capture and write its products and its sidecar, also as the task of a worker; the report of it."""
+"""Estimate and render one capture, also as the task of a worker; the report of it."""
 
 import logging
-import re
 import time
 from collections import Counter, defaultdict
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import lru_cache, partial
@@ -13,27 +12,22 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Literal
 
+from agalign.batch.estimate import estimate
+from agalign.batch.render import RenderOptions, refuse_to_overwrite, render
 from agalign.batch.workers import failure_text
-from agalign.capture.align_bands import PairProgress, align_capture_bands
-from agalign.config import Settings, WriteSettings
-from agalign.errors import AgalignError, ConfigurationError, InputError, OutputError, SidecarError, UnreadableFileError
+from agalign.capture.align_bands import PairProgress
+from agalign.config import Settings
+from agalign.errors import InputError, SidecarError, UnreadableFileError
 from agalign.flight.model import FlightModel, load_model
 from agalign.method.device import choose_device, keep_freed_memory, one_memory_error, one_thread
 from agalign.pixels.radiometry import check_pixels
 from agalign.pixels.raster import with_saturation_values
-from agalign.products.indices.rasters import outdated_rasters
-from agalign.products.product import CapturePaths, ProductContext
-from agalign.products.rasters.aligned_files import band_file_names, is_aligned_raster
-from agalign.products.rasters.layout import FlightLimits, output_layers
+from agalign.products.product import CapturePaths
 from agalign.products.registry import PRODUCTS
-from agalign.products.report.preview import preview_bytes
-from agalign.products.sidecar.convert import sidecar_of
-from agalign.products.sidecar.file import read_result, read_sidecar, write_sidecar
-from agalign.products.sidecar.schema import CaptureResult, Sidecar
+from agalign.products.sidecar.file import read_sidecar
+from agalign.products.sidecar.schema import Sidecar
 from agalign.values.capture import Capture
 from agalign.values.choices import RadiometryChoice
-from agalign.values.files import check_inside
-from agalign.values.image import OutputGrid
 from agalign.values.process_pool import A, R
 from agalign.values.text import counted
 
@@ -52,7 +46,7 @@ class CaptureReport:
     """`kept`: an earlier run with the same settings has finished the capture. `panel` and `sky`: the capture shows a
     calibration panel or the sky, and is not aligned.
     """
-    result: CaptureResult | None = field(default=None, repr=False)
+    result: Sidecar | None = field(default=None, repr=False)
     """Content of the sidecar, without the long tables."""
     path: Path | None = None
     """Path of the sidecar."""
@@ -64,6 +58,8 @@ class CaptureReport:
     """Why the capture counts as sky."""
     failed_products: tuple[str, ...] = ()
     """Products that could not be written, and why."""
+    removed: tuple[str, ...] = ()
+    """Files of an earlier command that were removed, and why."""
     seconds: float = 0.0
     """Processing time in this run."""
     stages: Mapping[tuple[str, str], float] = field(default_factory=dict, repr=False)
@@ -99,7 +95,7 @@ class CaptureReport:
         """A short table for notebooks."""
         if self.result is None:
             return f"<p><b>{escape(self.label)}</b>: {escape(self.summary)}</p>"
-        residuals_px = [None if b.metrics is None else b.metrics.after.residual_px for b in self.result.bands]
+        residuals_px = [None if b.metrics is None else b.metrics.after.get("residual_px") for b in self.result.bands]
         rows = "".join(
             f"<tr><td>{escape(b.band)}</td><td>{b.status}</td><td>{'' if px is None else f'{px:.3f}'}</td>"
             f"<td>{escape(b.reason or '')}</td></tr>"
@@ -163,12 +159,9 @@ class Task:
     settings: Settings
     model: Path | None = None
     """File of the model of the flight."""
-    max_preview_bytes: int = preview_bytes(1)
-    """About the largest size of the preview."""
-    limits: FlightLimits = ()
-    """Limits of the flights of the camera."""
-    common: OutputGrid | None = None
-    """Grid of the captures of the camera, if they share one."""
+    rendering: RenderOptions = field(default_factory=RenderOptions)
+    is_estimated: bool = False
+    """An earlier command has estimated it with the same settings: it is only rendered."""
 
     def absolute(self) -> "Task":
         """Return the task with absolute paths: workers may have another working folder."""
@@ -177,7 +170,7 @@ class Task:
 
 
 def process_capture(task: Task, progress: PairProgress = quiet) -> CaptureReport:
-    """Align a capture, write its products and its sidecar, and return its report, without times of stages.
+    """Estimate a capture, unless that is done, and render it; return its report, without times of stages.
 
     The other bands are aligned where one cannot be. With the model of the flight, a network is learned from scratch
     only for bands that the model cannot align.
@@ -186,7 +179,7 @@ def process_capture(task: Task, progress: PairProgress = quiet) -> CaptureReport
     """
     began_s, settings, out = time.perf_counter(), task.settings, task.out
     capture = with_saturation_values(task.capture)
-    paths = CapturePaths.of(capture, out)
+    path = CapturePaths.of(capture, out).sidecar
     refuse_to_overwrite([capture], out, settings.write)
     if missing := missing_radiometry(capture, settings.write.radiometry):
         raise InputError(f"{capture.reference.path}: {missing}")
@@ -196,86 +189,24 @@ def process_capture(task: Task, progress: PairProgress = quiet) -> CaptureReport
     for product in PRODUCTS:
         if product.is_enabled(settings.write):
             product.check(capture)
-    model = None if task.model is None else loaded_model(task.model, settings.joint.device)
-    alignments = align_capture_bands(capture, settings, model, progress)
-    progress(capture.reference.name, "writing", 0.0)
-    whole = OutputGrid(0, 0, *capture.reference.size_px)
-    context = ProductContext(capture, paths, settings, alignments, (), whole, task.max_preview_bytes, task.limits)
-    if context.with_pixels:
-        layers, grid = output_layers(capture, context.with_pixels, settings.write, task.common)
-        context = replace(context, layers=layers, grid=grid)
-    discard_outputs(capture, out, settings.write)
-    failures = _write_products(context)
-    sidecar = write_sidecar(paths.sidecar, sidecar_of(context, list(failures), time.perf_counter() - began_s))
-    # Products that need the same file fail with the same message.
-    lost = (*dict.fromkeys(failures.values()), *lost_reflectance(capture, settings.write.radiometry))
-    result = sidecar.result()
-    return CaptureReport(capture.label, "done", result, paths.sidecar, failed_products=lost, seconds=sidecar.seconds)
-
-
-def _write_products(context: ProductContext) -> dict[str, str]:
-    """Write the enabled products; return {kind: message} of optional ones that failed. Raises like `Product.write`."""
-    failures: dict[str, str] = {}
-    for product in PRODUCTS:
-        if not product.is_enabled(context.settings.write) or (product.needs_layers and not context.layers):
-            continue
-        try:
-            for file in product.write(context):
-                # At once: the sidecar also lists the files before an error, so that they are removed later.
-                context.written.append(file)
-        except AgalignError as error:
-            if product.is_required:
-                raise
-            failures[product.kind] = str(error)
-    return failures
-
-
-def paths_written(capture: Capture, out: Path, settings: WriteSettings) -> list[Path]:
-    """Return the paths of all files that a run with these settings may write or remove for a capture."""
-    paths = CapturePaths.of(capture, out)
-    return [paths.sidecar, *(p for product in PRODUCTS for p in product.paths(capture, paths, settings))]
-
-
-def refuse_to_overwrite(captures: Sequence[Capture], out: Path, settings: WriteSettings) -> None:
-    """Raise ConfigurationError if an output would replace an input image or an output of another capture."""
-    sources = {band.path.resolve() for capture in captures for band in capture.bands}
-    resolved: dict[Path, Path] = {}
-    written: dict[str, Capture] = {}
-    for capture in captures:
-        for path in paths_written(capture, out, settings):
-            if path.parent not in resolved:
-                resolved[path.parent] = check_inside(path.parent, out).resolve()
-            if resolved[path.parent] / path.name in sources:
-                raise ConfigurationError(f"{path}: is an image to be aligned; choose another output folder")
-            other = written.setdefault(str(path).lower(), capture)
-            if other is not capture:
-                raise ConfigurationError(
-                    f"{path}: would be written of {other.label} and of {capture.label}; rename one's files"
-                )
-
-
-def discard_outputs(capture: Capture, out: Path, settings: WriteSettings) -> None:
-    """Remove the outputs of an earlier run for a capture, and the indices calculated from them.
-
-    Otherwise a sidecar could describe rasters of another run, and bands on an old grid could remain among new ones.
-    Anyone may have written the sidecar: of its other files, only aligned rasters named as bands of this capture are
-    removed. Files that cannot be removed are overwritten later, or their writer reports the error.
-    """
-    paths, sources = CapturePaths.of(capture, out), {band.path.resolve() for band in capture.bands}
-    old = paths_written(capture, out, settings)
+    sidecar = None
     with suppress(SidecarError):
-        listed = [paths.folder / name for name in read_result(paths.sidecar).files]
-        # Also of a band that this run leaves out; a file with a sidecar is the stack of another capture.
-        pattern = re.compile(rf"{re.escape(capture.name)}(\d|[._].+)\.tiff?", re.IGNORECASE)
-        own = [p for p in listed if pattern.fullmatch(p.name) and not p.with_suffix(".json").exists()]
-        own += [paths.folder / name for name in band_file_names(capture).values()]
-        old += [p for p in own if p in listed and is_aligned_raster(p)]
-        old += outdated_rasters(paths.file(""))
-    for path in old:
-        with suppress(OSError, OutputError):
-            check_inside(path.parent, out)
-            if path.resolve() not in sources:
-                path.unlink(missing_ok=True)
+        sidecar = read_sidecar(path)
+    if sidecar is None or not task.is_estimated:
+        model = None if task.model is None else loaded_model(task.model, settings.joint.device)
+        sidecar = estimate(capture, out, settings, model, progress, sidecar)
+    progress(capture.reference.name, "writing", 0.0)
+    result = render(capture, out, settings, sidecar, task.rendering)
+    lost = (*result.failures, *lost_reflectance(capture, settings.write.radiometry))
+    return CaptureReport(
+        capture.label,
+        "done",
+        result.sidecar.without_tables(),
+        path,
+        failed_products=lost,
+        removed=result.removed,
+        seconds=time.perf_counter() - began_s,
+    )
 
 
 def missing_radiometry(capture: Capture, choice: RadiometryChoice) -> str:

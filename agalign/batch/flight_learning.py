@@ -68,8 +68,10 @@ def learn_flight(
         return apply(task, arguments)
 
     learned = _FlightLearner(captures, settings, progress, start, apply_in_one_thread, threads).learned()
-    return None if learned is None else replace(
-        learned, fingerprint=learning_fingerprint(flight_camera(captures), captures, settings)
+    return (
+        None
+        if learned is None
+        else replace(learned, fingerprint=learning_fingerprint(flight_camera(captures), captures, settings))
     )
 
 
@@ -278,5 +280,3 @@ def _layout(captures: Iterable[Capture]) -> dict[str, tuple[float, float]]:
                 x, y = band.parallax_direction
                 result.setdefault(band.name, (x - reference[0], y - reference[1]))
     return result
-
-

@@ -10,10 +10,9 @@ import cv2
 from agalign.batch.workers import chosen_run, failure_text, serially
 from agalign.errors import AgalignError
 from agalign.products.indices.formulas import Index
-from agalign.products.indices.rasters import IndexReport, update_table, write_rasters
+from agalign.products.indices.rasters import IndexRasters, IndexReport, update_table, write_rasters
 from agalign.products.run.captures import bands_of
-from agalign.products.run.flight_map import link_indices
-from agalign.products.sidecar.file import read_result, run_sidecars, update_products
+from agalign.products.sidecar.file import add_products, read_result, run_sidecars
 from agalign.values.files import check_inside
 from agalign.values.processes import usable_cores
 
@@ -75,7 +74,7 @@ def run_indices(
                 yield reports
     finally:
         if rows:  # also after an interruption
-            link_indices(tasks[0].target, update_table(tasks[0].target, rows))
+            update_table(tasks[0].target, rows)
 
 
 def do_indices(task: IndexTask) -> list[IndexReport]:
@@ -87,7 +86,8 @@ def do_indices(task: IndexTask) -> list[IndexReport]:
         reports = [*write_rasters(bands, task.indices, base, task.label, overwrite=task.overwrite)]
         if task.target == task.out:
             rasters = [r.path for r in reports if r.path is not None and not r.kept]
-            update_products(task.sidecar, [p for path in rasters for p in (path, path.with_suffix(".png"))])
+            files = [p for path in rasters for p in (path, path.with_suffix(".png"))]
+            add_products(task.sidecar, IndexRasters.kind, files)
     except AgalignError as error:
         reports = _failed(task, str(error))
     return [report.of(sidecar) for report in reports]

@@ -10,22 +10,15 @@ from functools import partial
 from pathlib import Path
 from typing import Self
 
-from agalign.batch.capture_task import (
-    CaptureReport,
-    Task,
-    discard_outputs,
-    do_capture,
-    loaded_model,
-    missing_radiometry,
-    quiet,
-    refuse_to_overwrite,
-)
-from agalign.batch.earlier_results import changes, outputs_exist, refuse_other_captures
-from agalign.batch.flight_learning import learn_flight, learning_fingerprint
+from agalign.batch.capture_task import CaptureReport, Task, do_capture, loaded_model, missing_radiometry, quiet
+from agalign.batch.earlier_results import Remaining, outputs_exist, refuse_other_captures, remaining
+from agalign.batch.flight_learning import learn_flight
+from agalign.batch.render import RenderOptions, refuse_to_overwrite, remove_outputs
 from agalign.batch.workers import Run, chosen_run, failure_text, in_order, serially
 from agalign.cameras.discover import FolderScan
 from agalign.config import RunOptions, Settings, WriteSettings
-from agalign.errors import AgalignError, ConfigurationError, InputError, OutputError, SidecarError
+from agalign.errors import AgalignError, ConfigurationError, InputError, OutputError
+from agalign.flight.fingerprint import learning_fingerprint
 from agalign.flight.groups import camera_key, difference, flight_camera, flights_of, is_flight_of, model_names
 from agalign.flight.model import FlightModel, load_model, save_model
 from agalign.flight.panel_readings import PanelReading, read_panel, reflectance_factors, with_height, with_panels
@@ -39,16 +32,15 @@ from agalign.products.product import CapturePaths
 from agalign.products.rasters.layout import FlightLimits, common_grid, flight_limits
 from agalign.products.report.preview import preview_bytes
 from agalign.products.run.excluded import write_panels, write_sky
-from agalign.products.run.flight_map import (
-    FlightMap,
+from agalign.products.run.footprint import (
     above_elevation,
     missing_for_footprint,
     utm_of_flights,
     with_approximate_georeference,
 )
-from agalign.products.run.record import ExclusionPart, RunPart, begun
+from agalign.products.run.record import RunPart, begun, excluded_part
 from agalign.products.sidecar.file import read_result
-from agalign.products.sidecar.schema import CaptureResult
+from agalign.products.sidecar.schema import FilePart
 from agalign.values.capture import Capture
 from agalign.values.files import check_inside
 from agalign.values.image import OutputGrid
@@ -60,6 +52,9 @@ _MAX_THREADS = 4
 """Maximum number of threads that train a network or process captures; more wait for the interpreter's lock."""
 
 
+_PLANNED = {"nothing": "kept from an earlier run", "render": "to be rendered", "estimate": "to be aligned"}
+_AGAIN = {"render": "rendered", "estimate": "estimated"}
+"""What is done, by step of `Remaining`."""
 _Flight = tuple[list[Capture], Path | None]
 """Captures of a flight, and the file of its model."""
 
@@ -75,7 +70,7 @@ class Listener:
     on_learnt: Callable[[str, float], None] = quiet
     """Camera of the network that was learned, and the seconds that it took."""
     on_again: Callable[[str], object] = quiet
-    """How many finished captures are done again, and what has changed since; called before any is replaced."""
+    """How many finished captures are estimated or rendered again, and why; called before any is replaced."""
 
 
 def run_flight(
@@ -100,7 +95,7 @@ def run_flight(
     run.check()
     if model is not None:
         run = run.starting_from(model)
-    written: dict[str, tuple[Path, Mapping[str, int]]] = {}  # (sidecar, files) by label
+    written: dict[str, tuple[Path, Sequence[FilePart]]] = {}  # (sidecar, files) by label
     with locked(out), _recorded(run) as record:
         for report in run.reports(record):
             record.add(report.label, report.state, report.result, report.problems)
@@ -130,9 +125,10 @@ def plan_run(flight: FolderScan, out: Path, settings: Settings, options: RunOpti
     states = {s.capture.label: "left out as sky" for s in sky}
     states |= {p.capture.label: "read as calibration panels" for p in panels if p.capture.is_of_a_panel}
     for capture in captures:
-        kept, changed = run.earlier(capture)
-        again = f"to be done again; changed since: {', '.join(changed)}" if changed else "to be aligned"
-        states[capture.label] = again if kept is None else "kept from an earlier run"
+        left = run.remaining(capture)
+        states[capture.label] = _PLANNED[left.step]
+        if left.changed:
+            states[capture.label] = f"to be {_AGAIN[left.step]} again; changed since: {', '.join(left.changed)}"
     return {c.label: states[c.label] for c in flight.captures}
 
 
@@ -217,63 +213,42 @@ class _FlightRun:
             raise ConfigurationError(f"--georeference: no capture has {missing_for_footprint(captures[0])}")
         return sky, panels, captures
 
-    def earlier(self, capture: Capture) -> tuple[CaptureResult | None, tuple[str, ...]]:
-        """Return (the result of an earlier run, what has changed since); no result if the capture must be processed
-        (again), also because an output is missing.
-        """
-        path = CapturePaths.of(capture, self.out).sidecar
-        try:
-            earlier = read_result(path)
-        except SidecarError:
-            return None, ()
-        changed = changes(earlier, capture, self.settings)
-        wanted = self.options.overwrite or (self.options.retry_failed and earlier.status != "ok")
-        is_kept = not (changed or wanted or earlier.not_written) and outputs_exist(path, earlier.files)
-        return earlier if is_kept else None, changed
+    def remaining(self, capture: Capture) -> Remaining:
+        """Return what remains to be done for a capture."""
+        return remaining(capture, self.out, self.settings, self.options)
 
     def reports(self, record: RunPart) -> Iterator[CaptureReport]:
         """Yield the report of each capture; add the time of learning to the record."""
-        out, settings, flight_map = self.out, self.settings, FlightMap(self.out)
         sky, panels, captures = self.selected()
         for report, capture in self._excluded(sky, panels, record):
-            discard_outputs(capture, out, settings.write)
-            flight_map.add(capture, report.state)
+            remove_outputs(capture, self.out, self.settings.write)
             yield report
-        by_label = {c.label: c for c in captures}
-        for report in self._aligned(captures, record):
-            status = "failed" if report.result is None else report.result.status
-            flight_map.add(by_label[report.label], status, report.result)
-            yield report
-        flight_map.write()
+        yield from self._aligned(captures, record)
 
     def _excluded(
         self, sky: Sequence[SkyCapture], panels: Sequence[PanelReading], record: RunPart
     ) -> Iterator[tuple[CaptureReport, Capture]]:
         """Write the records of the sky and of the panels; yield the captures that are not aligned, with reports."""
         for excluded, facts in zip(sky, write_sky(sky, self.out), strict=True):
-            record.excluded.append(ExclusionPart(capture=excluded.capture.label, kind="sky", evidence=facts.cues))
+            record.excluded.append(excluded_part(excluded.capture, "sky", facts.cues))
             yield CaptureReport(excluded.capture.label, "sky", sky=facts.sentence), excluded.capture
         for reading, part in zip(panels, write_panels(panels, self.out), strict=True):
             if reading.capture.is_of_a_panel:
-                record.excluded.append(ExclusionPart(capture=reading.capture.label, kind="panel", evidence=part.cues))
+                record.excluded.append(excluded_part(reading.capture, "panel", part.cues))
                 yield CaptureReport(reading.capture.label, "panel", panel=part.sentence), reading.capture
 
     def _aligned(self, captures: Sequence[Capture], record: RunPart) -> Iterator[CaptureReport]:
         """Learn the model of each flight, keep finished captures and process the others; yield their reports as they
         complete.
         """
-        grids: dict[str, OutputGrid | None] = {}  # of kept captures; the results of a season would not fit into memory
-        again: dict[str, tuple[str, ...]] = {}
-        for capture in captures:
-            kept, changed = self.earlier(capture)
-            if changed:
-                again[capture.label] = changed
-            if kept is not None:
-                grids[capture.label] = None if kept.output is None else kept.output.grid
+        left = {capture.label: self.remaining(capture) for capture in captures}
+        # Of the earlier results; the results themselves, of a season, would not fit into memory.
+        grids = {label: grid for label, one in left.items() if (grid := self._earlier_grid(one)) is not None}
+        left = {label: replace(one, earlier=None) for label, one in left.items()}
         groups = flights_of(captures)
         on_cpu = choose_device(self.settings.joint.device).type == "cpu"
         cores = self.options.jobs or (usable_cores() if on_cpu else 1)
-        number, timeout_s = len(captures) - len(grids), self.options.timeout_s
+        number, timeout_s = sum(one.step != "nothing" for one in left.values()), self.options.timeout_s
         processes = min(cores, number // CAPTURES_WORTH_A_PROCESS if timeout_s is None else number)
         threads = min(cores, number, _MAX_THREADS)
         executor = self.options.executor
@@ -283,7 +258,7 @@ class _FlightRun:
             for group, name in zip(groups, model_names(groups), strict=True):
                 path = self.out / "models" / name
                 model = path if path.is_file() else None
-                if any(c.label not in grids for c in group):
+                if any(left[c.label].step == "estimate" for c in group):
                     model = self._model(group, path, learn, record)
                 flights.append((group, model))
             crops = _crops_of_cameras(flights, grids, self.settings.write)
@@ -291,19 +266,33 @@ class _FlightRun:
             tasks = []
             for group, model in flights:
                 for capture in group:
-                    limits, common = crops[_crop_key(capture)]
-                    if common is not None and grids.get(capture.label) not in (None, common):
-                        again[capture.label] = ("crop of the flight",)
-                    elif capture.label in grids:
+                    (limits, common), one = crops[_crop_key(capture)], left[capture.label]
+                    if one.step == "nothing" and common is not None and grids.get(capture.label) not in (None, common):
+                        one = left[capture.label] = Remaining("render", ("crop of the flight",))
+                    if one.step == "nothing":
                         sidecar = CapturePaths.of(capture, self.out).sidecar
                         yield CaptureReport(capture.label, "kept", read_result(sidecar), sidecar)
                         continue
-                    tasks.append(Task(capture, self.out, self.settings, model, max_bytes, limits, common))
-            if again:
-                names = ", ".join(dict.fromkeys(name for changed in again.values() for name in changed))
-                finished = counted(len(again), "finished capture")
-                self.listener.on_again(f"{finished} to be done again; changed since: {names}")
+                    rendering = RenderOptions(max_bytes, limits, common)
+                    tasks.append(
+                        Task(capture, self.out, self.settings, model, rendering, is_estimated=one.step == "render")
+                    )
+            for step in ("estimate", "render"):
+                again = [one.changed for one in left.values() if one.step == step and one.changed]
+                if again:
+                    names = ", ".join(dict.fromkeys(name for changed in again for name in changed))
+                    finished = counted(len(again), "finished capture")
+                    self.listener.on_again(f"{finished} to be {_AGAIN[step]} again; changed since: {names}")
             yield from capture_reports(run, tasks, self.listener, timeout_s)
+
+    def _earlier_grid(self, left: Remaining) -> OutputGrid | None:
+        """Return the grid of the rasters of an earlier result if this run makes the same; None without any."""
+        if left.earlier is None or left.earlier.output is None:
+            return None
+        before = WriteSettings.model_validate((left.earlier.options or {}).get("write", {}))
+        names = "crop", "resolution", "undistort"
+        is_same = all(getattr(before, name) == getattr(self.settings.write, name) for name in names)
+        return left.earlier.output.grid if is_same else None
 
     def _model(
         self, captures: Sequence[Capture], path: Path, learn: Callable[..., FlightModel | None], record: RunPart
@@ -314,7 +303,9 @@ class _FlightRun:
             return None
         if path.is_file():
             with suppress(AgalignError):
-                if loaded_model(path, settings.joint.device).fingerprint == learning_fingerprint(captures, settings):
+                if loaded_model(path, settings.joint.device).fingerprint == learning_fingerprint(
+                    flight_camera(captures), captures, settings
+                ):
                     return path
         began = time.monotonic()
         start = given if given is not None and is_flight_of(captures, given.camera) else None
@@ -334,7 +325,7 @@ def _crop_key(capture: Capture) -> tuple[str, bool]:
 
 
 def _crops_of_cameras(
-    flights: Sequence[_Flight], kept: Mapping[str, OutputGrid | None], settings: WriteSettings
+    flights: Sequence[_Flight], kept: Mapping[str, OutputGrid], settings: WriteSettings
 ) -> dict[tuple[str, bool], tuple[FlightLimits, OutputGrid | None]]:
     """The limits of the flights and the common grid of each camera: that of most of its `kept` captures, given by
     label, if they are enough for a rig, else that of the rigs of its flights.
@@ -350,7 +341,7 @@ def _crops_of_cameras(
     for key, capture in {_crop_key(c): c for c in every}.items():
         limits = flight_limits(by_camera[key[0]])
         grid = common_grid(capture.reference, settings, limits)
-        earlier = Counter(kept[c.label] for c in every if _crop_key(c) == key and kept.get(c.label) is not None)
+        earlier = Counter(kept[c.label] for c in every if _crop_key(c) == key and c.label in kept)
         most, count = next(iter(earlier.most_common(1)), (None, 0))
         # Without rigs, each capture has its own grid.
         if settings.crop == "flight" and count >= MIN_CAPTURES and (grid is not None or len(earlier) == 1):

@@ -1,7 +1,7 @@
 """Alignment of the band pairs of one capture: seeds, joint estimation, verification of each pair."""
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 
@@ -14,7 +14,7 @@ from agalign.capture.full_resolution import at_full_resolution
 from agalign.capture.map_estimate import map_estimate
 from agalign.capture.seeding import Start, corrected, find_seed, image_groups
 from agalign.capture.warped_pair import Candidate, with_metrics
-from agalign.config import Settings
+from agalign.config import SeedSettings, Settings
 from agalign.flight.model import FlightModel
 from agalign.method.device import one_thread
 from agalign.method.joint import Results, align_from_scratch, refine_with
@@ -28,6 +28,7 @@ from agalign.values.alignment import (
     Alignments,
     JointResult,
     RefinedPair,
+    Residual,
     Seed,
 )
 from agalign.values.capture import Band, Capture
@@ -59,7 +60,7 @@ def align_capture_bands(
     result: dict[str, Alignment] = {}
     for pair in pairs:
         progress(pair.name, "measuring", 0.0)
-        measured = with_metrics(aligned[pair.name], pair, with_ties=settings.write.tie_points)
+        measured = with_metrics(aligned[pair.name], pair)
         result |= dict.fromkeys((b.name for b in pair.bands), _between_files(capture, pair, measured))
     size_px = capture.reference.size_px
     for band in capture.moving:
@@ -88,6 +89,23 @@ def _between_files(capture: Capture, pair: BandPair, aligned: Alignment) -> Alig
     if pair.is_reduced and alignment.status == "aligned":
         return at_full_resolution(capture.reference, pair.bands[0], alignment)
     return alignment
+
+
+def tie_windows(capture: Capture, settings: SeedSettings, alignments: Mapping[str, Alignment]) -> dict[str, Residual]:
+    """Return windows of the moving bands that did not fail, measured under their alignments, by band, px of the files.
+
+    They cover the whole image, with those that a mapping was fitted to: small ones if parallax varies within large
+    ones. Raises UnreadableFileError if the reference cannot be read.
+    """
+    result: dict[str, Residual] = {}
+    for pair in read_pairs(capture, settings)[0]:
+        alignment = alignments[pair.bands[0].name]
+        if alignment.status != "failed":
+            mapping = alignment.mapping.rescaled(pair.scales.fixed, pair.scales.moving)
+            windows = pair.windows if mapping.parallax is None else pair.reference.tie_windows
+            residual = windows.residuals(pair.warped_moving(mapping)).in_file_px(pair.scales)
+            result |= dict.fromkeys((band.name for band in pair.bands), residual)
+    return result
 
 
 @one_thread()

@@ -88,8 +88,7 @@ def _refined(
         prediction = replace(prediction, off_px=off_px)
     if issues_of(Evidence(joint, after, size_px, prediction=prediction)):
         return None
-    ties = None if alignment.ties is None else after
-    return replace(alignment, mapping=mapping, joint=joint, residual=after, ties=ties, prediction=prediction)
+    return replace(alignment, mapping=mapping, joint=joint, residual=after, prediction=prediction)
 
 
 def _tiles(reference: Band, alignment: Alignment) -> tuple[list[Tile], list[Tile]]:

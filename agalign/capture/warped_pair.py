@@ -173,14 +173,9 @@ def result_of_windows(fixed_to_moving: Matrix) -> JointResult:
     return JointResult(fixed_to_moving, math.nan, 0.0, 0.0, 0, (1.0,), BY_WINDOWS, "homography", 0.0, std)
 
 
-def with_metrics(alignment: Alignment, pair: BandPair, *, with_ties: bool = False) -> Alignment:
-    """Return the alignment with similarity metrics before (image borders overlaid) and after alignment.
-
-    `with_ties` also measures windows under the final mapping: small ones if parallax varies within large ones.
-    """
+def with_metrics(alignment: Alignment, pair: BandPair) -> Alignment:
+    """Return the alignment with similarity metrics before (image borders overlaid) and after alignment."""
     similarity = pair.reference.similarity
     before = pair.warped_moving(PixelMapping(geometry.overlay(pair.fixed.size_px, pair.moving_image.size_px)))
     after = pair.warped_moving(alignment.mapping)
-    windows = pair.windows if alignment.mapping.parallax is None else pair.reference.tie_windows
-    ties = windows.residuals(after) if with_ties else None
-    return replace(alignment, before=similarity.to(before), after=similarity.to(after), ties=ties)
+    return replace(alignment, before=similarity.to(before), after=similarity.to(after))

@@ -12,8 +12,8 @@ from agalign.config import Settings, WriteSettings
 from agalign.products.rasters.checked_raster import Block, LayerDescription, write_on_grid
 from agalign.products.rasters.layout import FlightLimits, Layer
 from agalign.products.report.drawing import ReducedBands, read_reduced_bands
-from agalign.products.sidecar.schema import PreviewPart, is_usable
-from agalign.values.alignment import Alignment
+from agalign.products.sidecar.schema import PreviewPart, Sidecar
+from agalign.values.alignment import Alignment, Residual
 from agalign.values.capture import Capture
 from agalign.values.files import file_checksum
 from agalign.values.image import OutputGrid
@@ -79,6 +79,8 @@ class ProductContext:
     capture: Capture
     paths: CapturePaths
     settings: Settings
+    sidecar: Sidecar
+    """The result of the estimation."""
     alignments: Mapping[str, Alignment]
     """By moving band, including failed ones."""
     layers: Sequence[Layer]
@@ -90,6 +92,10 @@ class ProductContext:
     """Limits of all flights of the camera, as far as their rigs are known."""
     written: list[WrittenFile] = field(default_factory=list)
     """Files of the products before this one in `PRODUCTS`."""
+    ties: Mapping[str, Residual] = field(default_factory=dict)
+    """Windows by moving band, measured under the mapping; empty unless tie points are written."""
+    lost: dict[Path, str] = field(default_factory=dict)
+    """Files of an earlier command that cannot be rendered again, and why."""
 
     @property
     def is_raw(self) -> bool:
@@ -105,7 +111,8 @@ class ProductContext:
     def usable(self) -> dict[str, Alignment]:
         """The alignments of the aligned bands, and of predicted bands with an accepted standard error."""
         limit_px = self.settings.check.accept_predicted_px
-        return {name: a for name, a in self.with_pixels.items() if is_usable(a.status, a.prediction, limit_px)}
+        usable = {b.band for b in self.sidecar.bands if b.is_usable(limit_px)}
+        return {name: a for name, a in self.with_pixels.items() if name in usable}
 
     @property
     def places(self) -> dict[str, tuple[WrittenFile, int]]:
@@ -129,8 +136,8 @@ class Product(ABC):
     """One kind of output of a capture.
 
     A new product is a module with a subclass, and an entry in `products/registry.py`. Its files are then listed in the
-    sidecar with size and checksum, verified when a run resumes, removed before a capture is processed again, and
-    protected against two captures with the same name.
+    sidecar with size and checksum, verified when a run resumes, rendered again with changed settings, and protected
+    against two captures with the same name.
     """
 
     kind: ClassVar[str]

@@ -343,8 +343,6 @@ class Alignment:
     relief_std_px: float = 0.0
     """Spread of the relief of the flight, px of the reference, which a mapping without relief lacks where no window is
     near."""
-    ties: Residual | None = None
-    """Of all windows under this mapping, including those that it was fitted to; None unless they were requested."""
     moving_size_px: Size | None = None
     """(width, height) of the moving image; None if it is not known, as in sidecars of earlier versions."""
 
@@ -435,7 +433,6 @@ class Alignment:
             residual=None if self.residual is None else self.residual.in_file_px(scales),
             lens_std_px=None if self.lens_std_px is None else self.lens_std_px * up.mean,
             relief_std_px=self.relief_std_px * up.mean,
-            ties=None if self.ties is None else self.ties.in_file_px(scales),
             candidates={kind: float(p95_px * up.mean) for kind, p95_px in self.candidates.items()},
         )
 

@@ -13,7 +13,7 @@ from agalign.pixels.raster import without_warnings
 from agalign.products.rasters.alignment_maps import RELIEF_UNITS
 from agalign.products.run.captures import RunCapture, captures_of_run, exceptions, like_most
 from agalign.products.sidecar.file import read_sidecar
-from agalign.products.sidecar.schema import BandPart
+from agalign.products.sidecar.schema import BandResult
 from agalign.values.capture import CaptureTime
 
 if TYPE_CHECKING:
@@ -142,7 +142,7 @@ def _opened(path: Path, *, masked: bool) -> Any:
         raise UnreadableFileError(f"{path}: cannot be read ({error}); run again") from None
 
 
-def _variable(file: "xarray.DataArray", band: BandPart, index: int, name: str, *, masked: bool) -> "xarray.DataArray":
+def _variable(file: "xarray.DataArray", band: BandResult, index: int, name: str, *, masked: bool) -> "xarray.DataArray":
     if index > file.sizes["band"]:
         raise UnreadableFileError(f"{name}: has no band {index}, as its sidecar says; run again")
     one = file.isel(band=index - 1, drop=True)

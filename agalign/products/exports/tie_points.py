@@ -17,7 +17,7 @@ from agalign.errors import GeometryError
 from agalign.pixels.raster import transformed
 from agalign.products.product import CapturePaths, Product, ProductContext, WrittenFile
 from agalign.values import geometry
-from agalign.values.alignment import Alignment
+from agalign.values.alignment import Alignment, Residual
 from agalign.values.capture import Capture, Georeference
 from agalign.values.choices import PairStatus
 from agalign.values.files import write_csv, write_text
@@ -41,8 +41,12 @@ class TiePoints(Product):
     def write(self, context: ProductContext) -> list[WrittenFile]:
         """Write <capture>.ties.csv and <capture>.ties.geojson."""
         table, features = self.paths(context.capture, context.paths, context.settings.write)
-        of_bands = [(name, a) for name, a in context.with_pixels.items() if a.ties]
-        rows: list[_Row] = [(name, a.status, point) for name, a in of_bands for point in tie_points(a).tolist()]
+        rows: list[_Row] = [
+            (name, alignment.status, point)
+            for name, alignment in context.with_pixels.items()
+            if name in context.ties
+            for point in tie_points(alignment, context.ties[name]).tolist()
+        ]
         positions = [f"{side}_{axis}_px" for side in ("reference", "moving") for axis in "xy"]
         cells = ((band, status, *(f"{n:.4f}" for n in point)) for band, status, point in rows)
         write_csv(table, ("band", "status", *positions, "residual_px", "weight"), cells)
@@ -50,17 +54,15 @@ class TiePoints(Product):
         return [WrittenFile(self.kind, table), WrittenFile(self.kind, features)]
 
 
-def tie_points(alignment: Alignment) -> NDArray[np.float64]:
-    """Return the tie points of a band with windows that were measured under its final mapping (n, 6).
+def tie_points(alignment: Alignment, residual: Residual) -> NDArray[np.float64]:
+    """Return the tie points of a band (n, 6) from the residual of its windows under the mapping.
 
     They have the raw pixels (x, y) of the reference and those of the band, (0, 0) the centre of the top-left pixel; the
     distance from the alignment, px of the reference's file; and the weight, which is the inverse of the variance, 1 for
     the median tie point of the band. The point p of the reference corresponds to p + shift in the warped band, and so
     to mapping(p + shift) in the file of the band.
     """
-    residual = alignment.ties
-    assert residual is not None
-    measured = np.isfinite(residual.shifts_px[:, 0])
+    measured = residual.is_measured
     at_px, shifts_px = residual.centres_px[measured], residual.shifts_px[measured]
     # The standard error of a shift is proportional to 1 / (height of its correlation peak)^2.
     sigma = residual.peaks_sigma[measured]

@@ -22,7 +22,7 @@ from agalign._version import __version__
 from agalign.config import WriteSettings
 from agalign.errors import ConfigurationError, InputError
 from agalign.pixels.raster import OpenRaster, open_raster
-from agalign.products.indices.formulas import Index, bands_for, compute, index_named, role_of_band
+from agalign.products.indices.formulas import Index, bands_for, compute, index_named, index_of_formula, role_of_band
 from agalign.products.product import CapturePaths, Product, ProductContext, WrittenFile
 from agalign.products.rasters.aligned_files import tags_of, to_cog
 from agalign.products.rasters.checked_raster import (
@@ -35,7 +35,7 @@ from agalign.products.rasters.checked_raster import (
 )
 from agalign.products.report.drawing import with_text, write_png
 from agalign.products.run.captures import RAW, AlignedBand, BandReader
-from agalign.products.sidecar.schema import CaptureResult
+from agalign.products.sidecar.schema import Sidecar
 from agalign.values.capture import Band, Capture
 from agalign.values.files import read_regular, write_csv
 from agalign.values.image import Tile, reduced_size_px
@@ -105,7 +105,7 @@ class IndexReport:
         label = PurePosixPath(self.capture)
         return label.parent.as_posix(), label.name, self.index
 
-    def of(self, sidecar: CaptureResult) -> "IndexReport":
+    def of(self, sidecar: Sidecar) -> "IndexReport":
         """Return the report with the time and the position of its capture."""
         place = sidecar.position
         latitude, longitude = (None, None) if place is None else (place.latitude, place.longitude)
@@ -127,30 +127,49 @@ class IndexRasters(Product):
 
     kind = "index"
     is_required = False
-    option = "indices"
 
     def paths(self, capture: Capture, paths: CapturePaths, settings: WriteSettings) -> list[Path]:  # noqa: ARG002
         """Return <capture>_<index>.tif and .png."""
         names = [name.strip().lower() for name in settings.indices]
         return [paths.file(f"_{name}{suffix}") for name in names for suffix in (".tif", ".png")]
 
-    def write(self, context: ProductContext) -> Iterator[WrittenFile]:
-        """Write the indices of which the capture has all bands, usable.
+    def is_enabled(self, settings: WriteSettings) -> bool:  # noqa: ARG002
+        """Return True: rasters that an earlier command wrote are written again."""
+        return True
 
-        Raises InputError if bands are in the wrong unit, OutputError.
+    def write(self, context: ProductContext) -> Iterator[WrittenFile]:
+        """Write the indices that were requested and of which the capture has all bands, usable, and those that an
+        earlier command wrote.
+
+        Raises InputError if bands of a requested index are in the wrong unit, OutputError.
         """
-        bands = list(_bands(context))
-        indices = [index_named(name) for name in context.settings.write.indices]
-        problems = []
-        reports = write_rasters(bands, indices, context.paths.file(""), context.capture.label)
-        for index, report in zip(indices, reports, strict=True):
+        base, label = context.paths.file(""), context.capture.label
+        requested = [index_named(name) for name in context.settings.write.indices]
+        earlier = [raster for raster in index_rasters(base) if raster.name not in {one.name for one in requested}]
+        if not (requested or earlier):
+            return
+        bands, problems = list(_bands(context)), []
+        for index, report in zip(requested, write_rasters(bands, requested, base, label), strict=True):
             if report.path is not None:
-                yield WrittenFile(self.kind, report.path)
-                yield WrittenFile(self.kind, report.path.with_suffix(".png"))
+                yield from self._files(report.path)
             elif all(not b.problem for b in bands) and _has_bands(context.capture.bands, index):
                 problems.append(report.problem)
+        masked = list(_masked(bands, context))
+        for raster in earlier:
+            problem = "its formula is unknown"
+            if raster.index is not None:
+                (report,) = write_rasters(masked if raster.is_masked else bands, [raster.index], base, label)
+                problem = report.problem
+            if problem:
+                context.lost[raster.path] = problem
+            else:
+                yield from self._files(raster.path)
         if problems:
             raise InputError("; ".join(problems))
+
+    def _files(self, raster: Path) -> Iterator[WrittenFile]:
+        yield WrittenFile(self.kind, raster)
+        yield WrittenFile(self.kind, raster.with_suffix(".png"))
 
 
 def check_indices(captures: Sequence[Capture], settings: WriteSettings) -> None:
@@ -182,6 +201,16 @@ def _bands(context: ProductContext) -> Iterator[AlignedBand]:
             yield AlignedBand(band.name, band.wavelength_nm, Path(), 1, problem="not usable")
 
 
+def _masked(bands: Sequence[AlignedBand], context: ProductContext) -> Iterator[AlignedBand]:
+    """Yield bands with the quality raster that this rendering has written."""
+    raster = next((file for file in context.written if file.kind == "qa"), None)
+    for layer, band in enumerate(bands, start=2):  # layer 1 is that of all bands together
+        if raster is None:
+            yield replace(band, problem="its quality raster does not exist")
+        else:
+            yield replace(band, quality=(raster.path, layer, raster.sha256))
+
+
 def write_rasters(
     bands: Sequence[AlignedBand], indices: Sequence[Index], base: Path, label: str, *, overwrite: bool = True
 ) -> Iterator[IndexReport]:
@@ -209,12 +238,41 @@ def write_rasters(
             yield IndexReport(label, index.name, target, statistics, kept=earlier is not None)
 
 
-def outdated_rasters(base: Path) -> Iterator[Path]:
-    """Yield the index rasters of a capture, `base`_<index>.tif, and their pictures."""
-    for path in base.parent.glob(f"{glob.escape(base.name)}_*.tif"):
-        # A file with a sidecar is the stack of another capture.
-        if not path.with_suffix(".json").exists() and _statistics_in(tags_of(path)) is not None:
-            yield from (path, path.with_suffix(".png"))
+@dataclass(frozen=True)
+class IndexRaster:
+    """An index raster that an earlier command wrote."""
+
+    path: Path
+    name: str
+    """Name of the index."""
+    index: Index | None
+    """None if the formula in its tags cannot be evaluated."""
+    is_masked: bool
+    """Its bands were masked by quality flags."""
+
+
+def index_rasters(base: Path) -> list[IndexRaster]:
+    """Return the index rasters of a capture, `base`_<index>.tif."""
+    result = []
+    for path in sorted(base.parent.glob(f"{glob.escape(base.name)}_*.tif")):
+        tags = {} if path.with_suffix(".json").exists() else tags_of(path)  # else the stack of another capture
+        statistics = _statistics_in(tags)
+        if statistics is not None and path.name == f"{base.name}_{tags.get('INDEX')}.tif":
+            is_masked = bool(tags.get("MASKED_BY")) or statistics.masked_share > 0
+            result.append(IndexRaster(path, tags["INDEX"], _index_of(tags), is_masked))
+    return result
+
+
+def _index_of(tags: Mapping[str, str]) -> Index | None:
+    """Return the index with the name and the formula in the tags of a raster."""
+    name, formula = tags["INDEX"], tags.get("INDEX_FORMULA", "")
+    with suppress(ConfigurationError):
+        known = index_named(name)
+        if _formula_text(known) == formula:
+            return known
+    with suppress(ConfigurationError):
+        return index_of_formula(f"{name}={formula}")
+    return None
 
 
 def _bands_of_index(bands: Sequence[AlignedBand], index: Index) -> list[AlignedBand]:
@@ -278,14 +336,15 @@ def _write(
     samples, valid_px, masked_px = [], 0, 0
     unmasked = [replace(band, quality=None) for band in bands]
     is_cog = like.tags(ns="IMAGE_STRUCTURE").get("LAYOUT") == "COG"
-    layers, tags = [LayerDescription(index.name)], _tags(index, like, unit, source)
+    is_masked = list(bands) != unmasked
+    layers, tags = [LayerDescription(index.name)], _tags(index, like, unit, source, is_masked=is_masked)
     with checked_raster(target, profile, layers, tags, to_cog if is_cog else None) as (dataset, write):
         for tile in tiles(Tile(0, 0, like.width, like.height), WORK_TILE_PX):
             values = compute(index, [reader.values(band, tile) for band in bands])
             write(values, 1, tile.x0, tile.y0)
             valid = np.isfinite(values)
             valid_px += int(np.count_nonzero(valid))
-            if list(bands) != unmasked:
+            if is_masked:
                 all_values = compute(index, [reader.values(band, tile) for band in unmasked])
                 masked_px += int(np.count_nonzero(np.isfinite(all_values) & ~valid))
             samples.append(values[::step, ::step][valid[::step, ::step]])
@@ -297,16 +356,21 @@ def _write(
     return statistics
 
 
-def _tags(index: Index, like: OpenRaster, unit: str, source: str) -> dict[str, str]:
+def _formula_text(index: Index) -> str:
+    constants = ", ".join(f"{name} = {value:g}" for name, value in index.constants)
+    return f"{index.formula} with {constants}" if constants else index.formula
+
+
+def _tags(index: Index, like: OpenRaster, unit: str, source: str, *, is_masked: bool) -> dict[str, str]:
     """The tags of a raster, some of which are those of the file of its first band."""
     copied = "CAPTURE_ID", "CAMERA", "TIFFTAG_DATETIME", "RADIOMETRY", "GEOREFERENCE", "GEOREFERENCE_ACCURACY_M"
-    constants = ", ".join(f"{name} = {value:g}" for name, value in index.constants)
     return {k: v for k, v in like.tags().items() if k in copied} | {
         "TIFFTAG_SOFTWARE": "agalign",
         "INDEX": index.name,
         "INDEX_SOURCE": index.source,
-        "INDEX_FORMULA": f"{index.formula} with {constants}" if constants else index.formula,
+        "INDEX_FORMULA": _formula_text(index),
         "INDEX_MADE_FROM": source,
+        "MASKED_BY": "qa" if is_masked else "",
         "INPUT": "raw numbers, not reflectance" if unit == RAW else "",
     }
 
@@ -366,8 +430,8 @@ def _coloured(values: NDArray[Any], span: tuple[float, float], ramp: NDArray[np.
     return np.asarray(result.round(), np.uint8)
 
 
-def reports_of_run(sidecar: CaptureResult, folder: str, out: Path) -> list[IndexReport]:
-    """Return the indices that the run itself wrote, from the tags of the rasters."""
+def reports_of(sidecar: Sidecar, folder: str, out: Path) -> list[IndexReport]:
+    """Return the indices of a capture that its sidecar lists, from the tags of the rasters."""
     result = []
     for part in sidecar.products:
         path = out / folder / part.file
@@ -381,30 +445,40 @@ def reports_of_run(sidecar: CaptureResult, folder: str, out: Path) -> list[Index
 
 
 def read_table(out: Path) -> list[IndexReport]:
-    """Return the rows of OUT/indices.csv whose rasters still exist; empty if there is no table."""
+    """Return the rows of OUT/indices.csv; empty if there is no table."""
     try:
         text = read_regular(out / INDICES_FILE).decode()
         # Lines may have too few or too many cells.
-        rows = [_row(line, out) for line in csv.DictReader(io.StringIO(text))]
+        return [_row(line, out) for line in csv.DictReader(io.StringIO(text))]
     except (OSError, ValueError, KeyError, TypeError, AttributeError, csv.Error):
         return []
-    return [row for row in rows if row.path is None or row.path.is_file()]
 
 
 def update_table(out: Path, rows: Sequence[IndexReport]) -> list[IndexReport]:
-    """Add rows to OUT/indices.csv, replacing those of the same capture and index, and return all rows.
+    """Write OUT/indices.csv: `rows`, and the earlier rows of other captures and indices that are still true.
 
-    An empty table is not written. Raises OutputError.
+    These have a raster that exists and was not written again since, or are of an index that could not be calculated.
+    Return all rows. An empty table is not written. Raises OutputError.
     """
     old = read_table(out)
-    result = list({row.key: row for row in [*old, *rows]}.values())
-    if result and (result != old or not (out / INDICES_FILE).is_file()):
+    kept = [row for row in old if (_is_current(row) if row.path is not None else row.problem)]
+    result = list({row.key: row for row in [*kept, *rows]}.values())
+    if (result or old) and (result != old or not (out / INDICES_FILE).is_file()):
         of_capture = "folder", "capture", "captured_at", "latitude", "longitude"
         of_index = "index", "median", "p5", "p95", "valid_share", "masked_share", "input", "low", "high", "file"
         columns = *of_capture, *of_index, "problem"
         cells = (_cells(row, out) for row in sorted(result, key=lambda row: row.key))
         write_csv(out / INDICES_FILE, columns, ([one[name] for name in columns] for one in cells))
     return result
+
+
+def _is_current(row: IndexReport) -> bool:
+    """Return True if the raster of a row has the statistics of the row."""
+    statistics = None if row.path is None else _statistics_in(tags_of(row.path))
+    return statistics is not None and (statistics.unit, f"{statistics.median:g}") == (
+        row.statistics.unit,
+        f"{row.statistics.median:g}",
+    )
 
 
 def _cells(row: IndexReport, out: Path) -> dict[str, Any]:

@@ -2,6 +2,7 @@
 aligned, grouped by cause, with a remedy for each cause.
 """
 
+import math
 from collections import Counter, defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -10,11 +11,9 @@ from typing import Any
 from urllib.parse import quote
 
 import numpy as np
-from pydantic import BaseModel
-
 from agalign.products.indices.rasters import IndexReport
 from agalign.products.run.record import RefusalPart
-from agalign.products.sidecar.schema import BandPart, BandResult, CaptureResult, GridPart, OutputPart, Sidecar
+from agalign.products.sidecar.schema import BandResult, GeometryPart, GridPart, OutputPart, Sidecar
 from agalign.values.issues import KINDS, MISSING_BAND, MOSAICS, OTHER_REFERENCE, UNREADABLE, Remedy
 
 _SHIFT_STEP_PX = 0.01
@@ -90,7 +89,7 @@ class PairTotals:
     _votes: dict[tuple[str, ...], Counter[str]] = field(default_factory=lambda: defaultdict(Counter))
     """By flight, the number of captures that have a band as the reference, or lack it."""
 
-    def add(self, label: str, result: CaptureResult) -> None:
+    def add(self, label: str, result: Sidecar) -> None:
         """Add the bands of a capture."""
         parts, is_mosaic = {b.band: b for b in result.bands}, result.reference.georeferenced
         for name, status, reason in result.pairs:
@@ -101,8 +100,8 @@ class PairTotals:
                 refusal = RefusalPart(capture=label, band=name, status=status, reason=reason or "")
                 remedy = MISSING_BAND if part is None else _remedy_of(part, is_mosaic=is_mosaic)
                 self._by_cause[status, remedy].append(refusal)
-            elif part and part.metrics and (residual_px := part.metrics.after.residual_px) is not None:
-                band.residuals_px.append(residual_px)
+            elif part and part.metrics and "residual_px" in part.metrics.after:
+                band.residuals_px.append(part.metrics.after["residual_px"])
         camera, reference = result.camera, result.reference.band
         flight = (camera.name, camera.serial, result.flight_id, "" if camera.model else Path(label).parent.as_posix())
         self._references.append((label, flight, reference, {name for name, _, _ in result.pairs}))
@@ -143,7 +142,7 @@ def _remedy_of(band: BandResult, *, is_mosaic: bool) -> Remedy:
     """The remedy of the first issue, which is the one in `reason`."""
     if not band.issues:
         return Remedy("no reason was recorded", "run again with --overwrite")
-    kind = KINDS[band.issues[0].kind]
+    kind = band.issues[0].kind
     return MOSAICS if is_mosaic and kind is not UNREADABLE else kind.remedy
 
 
@@ -164,7 +163,7 @@ class FlightFacts:
         label = Path(folder, sidecar.capture).as_posix()
         self.pairs.add(label, sidecar)
         output, position, path = sidecar.output, sidecar.position, Path(folder)
-        grid = output or OutputPart(file=None, bytes=None, crop=(0, 0, *sidecar.reference.size_px), nodata=None)
+        grid = output or OutputPart(file=None, crop=(0, 0, *sidecar.reference.size_px), nodata=None)
         files = {part.kind: part.file for part in sidecar.products}
         relief = next((b.relief.file for b in sidecar.bands if b.relief is not None), None)
         keys = {"folder": folder, "capture": sidecar.capture, "reference": sidecar.reference.band}
@@ -223,14 +222,15 @@ class FlightFacts:
         facts = {"schema": "agalign-report/1", "captures": self.captures, "shift_step_px": _SHIFT_STEP_PX}
         return facts | {"lattices": [list(centres) for centres in self._lattices]}
 
-    def _pair(self, band: BandPart, sidecar: Sidecar, keys: dict[str, Any]) -> dict[str, Any]:
+    def _pair(self, band: BandResult, sidecar: Sidecar, keys: dict[str, Any]) -> dict[str, Any]:
         """The data of a band. Its row, with `keys`, and its offset are added unless it is the reference."""
         row = {column: value_at(band, path) for column, path in BAND_COLUMNS.items()}
         if band.status != "reference":
             self.rows.append(keys | row)
-        metrics, tiles = band.metrics, [] if band.metrics is None else band.metrics.tiles
+        metrics, windows = band.metrics, None if band.metrics is None else band.metrics.windows
         similarity = {name: (row[f"{name}_before"], row[f"{name}_after"]) for name in _SIMILARITY}
-        lattice = tuple(v for t in tiles for v in t.centre_px)
+        centres_px, shifts_px = ([], []) if windows is None else (windows.centres_px, windows.shifts_px)
+        lattice = tuple(np.round(np.ravel(centres_px), 2).tolist())
         offset_px, offset_length_px = _band_offset(band.grid, sidecar)
         if offset_length_px is not None and band.status != "reference":
             self.pairs.bands[band.band].offsets_px.append(offset_length_px)
@@ -242,32 +242,46 @@ class FlightFacts:
             "offset_length_px": offset_length_px,
             "coverage": row["residual_coverage"],
             "similarity": None if metrics is None else similarity,
-            "prediction": _fields_of(band.prediction),
-            "geometry": _fields_of(band.geometry),
+            "prediction": _prediction(band.prediction),
+            "geometry": _geometry(band.geometry),
             "occluded": value_at(band, "relief.occluded"),
             "lattice": self._lattices.setdefault(lattice, len(self._lattices)),
-            "shifts": [None if v is None else round(v / _SHIFT_STEP_PX) for t in tiles for v in t.shift_px],
+            "shifts": [round(v / _SHIFT_STEP_PX) if np.isfinite(v) else None for v in np.ravel(shifts_px).tolist()],
         }
 
 
 def value_at(part: object, path: str) -> Any:
-    """Return a field of nested models, with four decimals; None if a model on the path is None."""
+    """Return a field of nested records, with four decimals; None if a record on the path is None or lacks it."""
     for name in path.split("."):
-        part = None if part is None else getattr(part, name)
+        part = part.get(name) if isinstance(part, dict) else None if part is None else getattr(part, name)
     return rounded(part)
 
 
 def rounded(value: Any) -> Any:
-    """Return a measured value with the four decimals that tables and the report have; others unchanged."""
-    return round(value, 4) if isinstance(value, float) else value
+    """Return a measured value with the four decimals that tables and the report have, None if it is not finite; others
+    unchanged.
+    """
+    if not isinstance(value, float):
+        return value
+    return round(value, 4) if math.isfinite(value) else None
 
 
 def _link(folder: Path, name: str | None) -> str | None:
     return None if name is None else quote((folder / name).as_posix())
 
 
-def _fields_of(part: BaseModel | None) -> dict[str, Any] | None:
-    return None if part is None else part.model_dump(by_alias=True)
+def _prediction(prediction: Prediction | None) -> dict[str, Any] | None:
+    if prediction is None:
+        return None
+    std_px, off_px = rounded(prediction.std_px), rounded(prediction.off_px)
+    return {"from": prediction.source, "std_px": std_px, "off_px": off_px}
+
+
+def _geometry(geometry: GeometryPart | None) -> dict[str, Any] | None:
+    if geometry is None:
+        return None
+    held_out_px = {kind: rounded(px) for kind, px in geometry.held_out_p95_px.items()}
+    return {"kind": geometry.kind, "held_out_p95_px": held_out_px}
 
 
 def _band_offset(grid: GridPart | None, sidecar: Sidecar) -> tuple[tuple[float, float] | None, float | None]:
@@ -277,7 +291,7 @@ def _band_offset(grid: GridPart | None, sidecar: Sidecar) -> tuple[tuple[float, 
     """
     if grid is None:
         return None, None
-    reference_px, moving_px = np.array(grid.reference_px), np.array(grid.moving_px)
+    reference_px, moving_px = grid.reference_px, grid.moving_px
     offsets, span_px = moving_px - reference_px, np.ptp(reference_px, axis=0)
     if not (np.abs(np.ptp(moving_px, axis=0) - span_px) < 0.1 * span_px).all():
         return None, None

@@ -1,4 +1,4 @@
-"""OUT/index.html, OUT/summary.csv and OUT/indices.csv."""
+"""The views of the sidecars of a folder: index.html, summary.csv, indices.csv and flight.geojson."""
 
 import base64
 import hashlib
@@ -16,10 +16,11 @@ from jinja2 import Environment, PackageLoader, StrictUndefined, select_autoescap
 from agalign._version import __version__
 from agalign.config import Settings
 from agalign.errors import SidecarError
-from agalign.products.indices.rasters import IndexReport, reports_of_run, update_table
+from agalign.products.indices.rasters import IndexReport, reports_of, update_table
 from agalign.products.report.charts import drifts_of, rig_views
 from agalign.products.report.facts import BAND_COLUMNS, FlightFacts
 from agalign.products.run.excluded import PANELS_FILE, SKY_FILE, PanelPart, SkyPart, read_excluded
+from agalign.products.run.flight_map import FlightMap
 from agalign.products.run.record import RunPart, read_run_record
 from agalign.products.sidecar.file import find_sidecars, read_sidecar
 from agalign.values.files import write_csv, write_text
@@ -29,14 +30,15 @@ REPORT_FILE, SUMMARY_FILE = "index.html", "summary.csv"
 
 
 def write_pages(out: Path, on_problem: Callable[[str], None]) -> FlightFacts:
-    """Write OUT/index.html, OUT/summary.csv and OUT/indices.csv from all sidecars below OUT, and return their data.
+    """Write OUT/index.html, OUT/summary.csv, OUT/indices.csv and OUT/flight.geojson from all sidecars below OUT, and
+    return their data.
 
     Unreadable files are reported to `on_problem` and left out; the pages then count as outdated in `pages_exist`.
     Raises OutputError.
     """
     indices: list[IndexReport] = []
     unreadable: list[str] = []
-    facts = FlightFacts()
+    facts, flight_map = FlightFacts(), FlightMap()
     for path in find_sidecars(out):
         folder = path.parent.relative_to(out).as_posix()
         try:
@@ -44,8 +46,9 @@ def write_pages(out: Path, on_problem: Callable[[str], None]) -> FlightFacts:
         except SidecarError as error:
             unreadable.append(str(error))
             continue
-        indices += reports_of_run(sidecar, folder, out)
+        indices += reports_of(sidecar, folder, out)
         facts.add(folder, sidecar)
+        flight_map.add(folder, sidecar)
     panels: list[PanelPart] = []
     sky: list[SkyPart] = []
     run: RunPart | None = None
@@ -58,7 +61,12 @@ def write_pages(out: Path, on_problem: Callable[[str], None]) -> FlightFacts:
         of_capture = {"folder": part.folder, "capture": part.capture, "status": status, "reason": part.sentence}
         facts.rows += [of_capture | {"band": band.band} for band in part.bands]
     write_csv(out / SUMMARY_FILE, SUMMARY_COLUMNS, ([row.get(name) for name in SUMMARY_COLUMNS] for row in facts.rows))
-    facts.add_indices(update_table(out, indices), out)
+    rows = update_table(out, indices)
+    facts.add_indices(rows, out)
+    for excluded in [] if run is None else run.excluded:
+        flight_map.add_excluded(excluded)
+    flight_map.add_indices(rows, out)
+    flight_map.write(out)
     page = _page(
         version=__version__,
         median=median,

@@ -17,7 +17,7 @@ from rasterio.windows import Window
 from agalign.errors import InputError, SidecarError
 from agalign.pixels.raster import OpenRaster, innermost_cause, open_raster
 from agalign.products.sidecar.file import read_result, run_sidecars
-from agalign.products.sidecar.schema import CaptureResult, is_usable
+from agalign.products.sidecar.schema import Sidecar
 from agalign.values.choices import UNUSABLE_QUALITY
 from agalign.values.image import FloatImage, Tile, reduced_size_px
 
@@ -46,7 +46,7 @@ class AlignedBand:
     """Quality raster whose flagged pixels become nan: file, index of the band's layer, checksum of the file."""
 
 
-def bands_of(sidecar: CaptureResult, folder: Path, *, mask_qa: bool = False) -> list[AlignedBand]:
+def bands_of(sidecar: Sidecar, folder: Path, *, mask_qa: bool = False) -> list[AlignedBand]:
     """Return the bands of a capture, given the folder of its sidecar; with `mask_qa` with their quality flags.
 
     Raises InputError with `mask_qa` if the run wrote no quality raster.
@@ -62,7 +62,7 @@ def bands_of(sidecar: CaptureResult, folder: Path, *, mask_qa: bool = False) -> 
         quality = (folder / flags.file, layer, flags.sha256) if mask_qa and flags is not None else None
         checksum = checksums.get(file, "")
         problem = ""
-        if part.place is None or not is_usable(part.status, part.prediction, sidecar.max_predicted_px):
+        if part.place is None or not part.is_usable(sidecar.max_predicted_px):
             limit_px, prediction = sidecar.max_predicted_px, part.prediction
             error = "" if prediction is None else f" to {prediction.std_px:.1f} px, not {limit_px:g}"
             problem = f"{part.band} is {part.status}{error} ({part.reason})"
@@ -148,7 +148,7 @@ class RunCapture:
     """Its name below the output folder of the run."""
     path: Path
     """Path of the sidecar."""
-    result: CaptureResult
+    result: Sidecar
     """The sidecar without its long tables: all of them, of a long flight, would not fit in memory."""
 
     @cached_property

@@ -1,67 +1,114 @@
-"""The footprint of a capture on the ground, by its georeference or the pose of the camera, and OUT/flight.geojson: the
-footprints of the captures of a run, with their results and links to their files.
+"""OUT/flight.geojson: the footprints of the captures of a run, with their results and links to their files.
+
+It is a view of the sidecars, and of the captures in the record of the run that are not aligned.
 """
 
 import json
-import math
 from collections import defaultdict
-from collections.abc import Iterable, Sequence
-from dataclasses import replace
+from collections.abc import Iterable
 from itertools import pairwise
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic_core import from_json
 
-from agalign.errors import GeometryError
-from agalign.flight.groups import flights_of
-from agalign.pixels.raster import crs_wkt, transformed
-from agalign.products.indices.rasters import IndexReport, read_table
-from agalign.products.product import CapturePaths
-from agalign.products.sidecar.schema import CaptureResult
-from agalign.values import geometry
-from agalign.values.capture import Capture, Georeference, HeightSource, Position
-from agalign.values.files import read_regular, write_text
-from agalign.values.geometry import Points
-from agalign.values.image import OutputGrid
+from agalign.products.indices.rasters import IndexReport
+from agalign.products.run.record import ExclusionPart
+from agalign.products.sidecar.schema import Sidecar
+from agalign.values.capture import CameraIdentity, Pose, Position
+from agalign.values.files import write_text
 
 FLIGHT_MAP_FILE = "flight.geojson"
-_MAX_TILT_DEG = 45.0
-"""The footprint of a camera with a larger tilt is not useful, and the tag is often wrong."""
 
 
-class PoseErrors(NamedTuple):
-    """Standard errors of the pose of a camera by its tags."""
+class FlightMap:
+    """The GeoJSON features of the captures of a folder, added one by one."""
 
-    position_m: float
-    """Of a GPS receiver without corrections."""
-    height: float
-    """Relative to the height above ground."""
-    heading: float
-    """Radians, of a magnetic heading."""
-    tilt: float
-    """Radians."""
+    def __init__(self) -> None:
+        self._features: dict[str, dict[str, Any]] = {}
 
+    def add(self, folder: str, sidecar: Sidecar) -> None:
+        """Add a capture, given its folder relative to the output folder.
 
-def footprint(capture: Capture, grid: OutputGrid) -> NDArray[np.float64] | None:
-    """Return a closed ring (5, 2) of (longitude, latitude) in degrees around the pixels of a grid.
+        The geometry is the footprint of the aligned rasters, or of the reference if there are none; else the position
+        of the camera; else null.
+        """
+        path = Path(folder)
+        label = (path / sidecar.capture).as_posix()
+        bands = [b for b in sidecar.bands if b.status != "reference"]
+        after = [b.metrics.after for b in bands if b.metrics is not None]
+        files = [(part.kind, (path / part.file).as_posix()) for part in sidecar.products]
+        facts = _place(sidecar.camera, sidecar.captured_at, sidecar.position, sidecar.pose)
+        self._features[label] = _feature(
+            label,
+            _shape(sidecar.footprint, sidecar.position),
+            {
+                "status": sidecar.status,
+                **facts,
+                "accuracy_m": sidecar.footprint_accuracy_m,
+                "bands": len(bands),
+                "bands_aligned": sum(b.status == "aligned" for b in bands),
+                "bands_predicted": sum(b.status == "predicted" for b in bands),
+                # The largest of a band, px of the reference.
+                "residual_px": max((a["residual_px"] for a in after if "residual_px" in a), default=None),
+                "residual_p95_px": max((a["residual_p95_px"] for a in after if "residual_p95_px" in a), default=None),
+                # Files are relative to the output folder.
+                "sidecar": f"{label}.json",
+                "stack": dict(files).get("stack"),
+                "picture": dict(files).get("picture"),
+                "indices": [],
+            },
+        )
 
-    None if neither a georeference nor the camera's pose is known.
-    """
-    outline = geometry.corners(grid.width + 1, grid.height + 1)[[0, 1, 2, 3, 0]]
-    corners = np.add(outline, (grid.x0, grid.y0)) / grid.scale
-    georeference = capture.reference.georeference
-    try:
-        if georeference is not None:
-            return transformed(geometry.apply(georeference.transform, corners), georeference.crs_wkt, "EPSG:4326")
-        offsets_m, position = ground_m(capture, corners - 0.5), capture.position
-        if offsets_m is None or position is None:
+    def add_excluded(self, part: ExclusionPart) -> None:
+        """Add a capture that is not aligned, as it shows a panel or the sky."""
+        facts = _place(part.camera, part.captured_at, part.position, part.pose)
+        shape = _shape(part.footprint, part.position)
+        accuracy_m = part.footprint_accuracy_m
+        self._features[part.capture] = _feature(
+            part.capture, shape, {"status": part.kind, **facts, "accuracy_m": accuracy_m, "indices": []}
+        )
+
+    def add_indices(self, rows: Iterable[IndexReport], out: Path) -> None:
+        """Link the rasters of an index table, of files below `out`, of captures that were added before."""
+        rasters: dict[str, list[str]] = defaultdict(list)
+        for row in rows:
+            if row.path is not None and row.capture in self._features:
+                rasters[row.capture].append(row.path.relative_to(out).as_posix())
+        for label, files in rasters.items():
+            self._features[label]["properties"]["indices"] = files
+
+    def write(self, out: Path) -> Path | None:
+        """Write the file atomically and return it; None if no capture has a position. Raises OutputError."""
+        features = [self._features[label] for label in sorted(self._features)]
+        if not any(f["geometry"] for f in features):
             return None
-        return transformed(offsets_m, _local_crs(position), "EPSG:4326")
-    except GeometryError:
-        return None
+        lines = ",\n".join(json.dumps(f, ensure_ascii=False) for f in features)
+        text = f'{{"type": "FeatureCollection", "name": "flight", "features": [\n{lines}\n]}}\n'
+        write_text(out / FLIGHT_MAP_FILE, text)
+        return out / FLIGHT_MAP_FILE
+
+
+def _feature(label: str, shape: dict[str, Any] | None, properties: dict[str, Any]) -> dict[str, Any]:
+    return {"type": "Feature", "id": label, "geometry": shape, "properties": {"capture": label, **properties}}
+
+
+def _place(camera: CameraIdentity, captured_at: str, position: Position | None, pose: Pose | None) -> dict[str, Any]:
+    height_m = None if pose is None else pose.height_m
+    return {
+        "camera": camera.name,
+        "captured_at": captured_at,
+        **{name: getattr(position, name, None) for name in ("longitude", "latitude", "altitude_m")},
+        "height_m": None if height_m is None else round(height_m, 1),
+        "height_from": None if pose is None or height_m is None else pose.height_from,
+        "heading_deg": None if pose is None else round(pose.heading_deg, 1) % 360,
+    }
+
+
+def _shape(footprint: list[tuple[float, float]] | None, position: Position | None) -> dict[str, Any] | None:
+    # 1e-7 degrees are a centimetre.
+    return geojson_geometry(None if footprint is None else np.array(footprint), position, decimals=7)
 
 
 def geojson_geometry(ring: NDArray[np.float64] | None, position: Position | None) -> dict[str, Any] | None:
@@ -90,253 +137,3 @@ def _clipped(ring: NDArray[np.float64], side: int) -> NDArray[np.float64]:
         if a[0] * b[0] < 0:
             kept.append(a + (b - a) * a[0] / (a[0] - b[0]))
     return np.array([*kept, kept[0]])
-
-
-def ground_m(capture: Capture, points_px: NDArray[np.float64]) -> NDArray[np.float64] | None:
-    """Project pixels of the reference (n, 2) onto a horizontal plane: (n, 2) metres east and north of the camera.
-
-    None if height, heading or focal length is unknown, or the camera is tilted too much.
-    """
-    pose = capture.pose
-    if pose is None or pose.height_m is None or pose.focal_length_px is None:
-        return None
-    if math.hypot(pose.pitch_deg, pose.roll_deg) > _MAX_TILT_DEG:
-        return None
-    centre = (np.array(capture.reference.size_px) - 1) / 2
-    right, down = ((points_px - centre) / pose.focal_length_px).T
-    # Rays rotated by the pitch, then by the roll: components (forward, right, downward).
-    pitch, roll, heading = np.radians((pose.pitch_deg, pose.roll_deg, pose.heading_deg))
-    forward, downward = -down * np.cos(pitch) + np.sin(pitch), np.cos(pitch) + down * np.sin(pitch)
-    right, downward = (right * np.cos(roll) - downward * np.sin(roll), downward * np.cos(roll) + right * np.sin(roll))
-    if not (downward > 0).all():
-        return None
-    forward_m, right_m = pose.height_m * forward / downward, pose.height_m * right / downward
-    east_m = right_m * np.cos(heading) + forward_m * np.sin(heading)
-    return np.stack([east_m, forward_m * np.cos(heading) - right_m * np.sin(heading)], axis=-1)
-
-
-def missing_for_footprint(capture: Capture) -> str:
-    """Return what `ground_m` lacks of a capture, and the remedy: tags, the height, or a view that is steep enough."""
-    pose, position = capture.pose, capture.position
-    tags = {
-        "a position": position is not None,
-        "a heading": pose is not None,
-        "a focal length": pose is None or pose.focal_length_px is not None,
-    }
-    if lacking := [name for name, known in tags.items() if not known]:
-        return f"{' and '.join(lacking)} in its tags; leave --georeference out"
-    if pose is not None and pose.height_m is not None:
-        return f"a tilt below {_MAX_TILT_DEG:.0f} degrees; leave --georeference out"
-    if position is not None and position.altitude_m is not None:
-        return "a height above the ground; give --ground-elevation, in metres and below the altitude of the camera"
-    return "an altitude or a height above the ground in its tags; leave --georeference out"
-
-
-def above_elevation(capture: Capture, ground_elevation_m: float) -> Capture:
-    """Return the capture with the height above ground of this elevation, if neither tags nor a panel give a height."""
-    return _with_height(capture, ground_elevation_m, math.inf, "ground elevation")
-
-
-def with_assumed_height(capture: Capture) -> Capture:
-    """Return the capture with an upper limit of the height above ground, if no height is known: the altitude above sea
-    level, at most the legal limit.
-    """
-    max_assumed_height_m = 120.0  # legal limit of the height above ground of drones in most countries
-    return _with_height(capture, 0.0, max_assumed_height_m, "assumed")
-
-
-def with_approximate_georeference(capture: Capture, crs: str) -> Capture:
-    """Return the capture with an affine georeference of its reference, if it has none and its height is known.
-
-    `crs` is the WKT of the flight's coordinate system: captures across the border of a UTM zone have one as well.
-    The ground is assumed to be a horizontal plane, lens distortion is neglected, and `accuracy_m` is set.
-    """
-    reference, position = capture.reference, capture.position
-    corners = _outline_px(capture)
-    offsets_m = ground_m(capture, corners - 0.5)
-    if reference.georeference is not None or offsets_m is None or position is None:
-        return capture
-    try:
-        on_map = transformed(offsets_m, _local_crs(position), crs)
-    except GeometryError:
-        return capture
-    design = np.column_stack([corners, np.ones(4)])
-    affine, *_ = np.linalg.lstsq(design, on_map - on_map[0], rcond=None)
-    fit_error_m = float(np.abs(design @ affine - (on_map - on_map[0])).max())
-    transform = np.vstack([affine.T, [0.0, 0.0, 1.0]])
-    transform[:2, 2] += on_map[0]
-    accuracy_m = accuracy_of_footprint_m(capture)
-    assert accuracy_m is not None
-    georeference = Georeference(transform, crs, round(math.hypot(accuracy_m, fit_error_m), 1))
-    bands = tuple(replace(b, georeference=georeference) if b is reference else b for b in capture.bands)
-    return replace(capture, bands=bands)
-
-
-def pose_errors(height_m: float | None, height_from: str | None, *, has_tilt: bool = False) -> PoseErrors:
-    """Return the standard errors of a camera's pose. Without a height, that of the height is zero."""
-    # Assumed height; barometric height over uneven ground. Gimbal or attitude sensor; camera fixed to an aircraft.
-    height = 0.5 if height_from == "assumed" else 5.0 / height_m if height_m else 0.0
-    return PoseErrors(3.0, height, math.radians(5.0), math.radians(2.0 if has_tilt else 7.0))
-
-
-def accuracy_of_footprint_m(capture: Capture) -> float | None:
-    """Return the standard error, metres, of the farthest corner of a footprint by `ground_m`, from the errors of the
-    camera's position, heading, tilt and height. None if `ground_m` returns None.
-    """
-    offsets_m = ground_m(capture, _outline_px(capture) - 0.5)
-    pose = capture.pose
-    if offsets_m is None or pose is None or pose.height_m is None:
-        return None
-    distance_m = float(np.linalg.norm(offsets_m, axis=1).max())
-    tangent = distance_m / pose.height_m  # of the corner's angle from the vertical
-    errors = pose_errors(pose.height_m, pose.height_from, has_tilt=bool(pose.pitch_deg or pose.roll_deg))
-    tilted_m = errors.tilt * pose.height_m * (1 + tangent**2)
-    errors_m = errors.position_m, errors.heading * distance_m, tilted_m, errors.height * pose.height_m * tangent
-    return round(math.hypot(*errors_m), 1)
-
-
-def utm_wkt(longitude: float, latitude: float) -> str:
-    """Return the WKT of the UTM zone of a position, degrees."""
-    zone = min(int((longitude + 180) // 6), 59) + 1
-    return crs_wkt(f"EPSG:{(32600 if latitude >= 0 else 32700) + zone}")
-
-
-def utm_of_flights(captures: Sequence[Capture]) -> dict[str, str]:
-    """Return the WKT of the UTM zone of each capture's flight, by label: that of the flight's first position."""
-    result: dict[str, str] = {}
-    for flight in flights_of(captures):
-        position = next((c.position for c in flight if c.position is not None), None)
-        if position is not None:
-            result |= dict.fromkeys((c.label for c in flight), utm_wkt(position.longitude, position.latitude))
-    return result
-
-
-def _outline_px(capture: Capture) -> Points:
-    """The outer corners (4, 2) of the corner pixels of the reference; (0, 0) is the first one."""
-    width, height = capture.reference.size_px
-    return geometry.corners(width + 1, height + 1)
-
-
-def _with_height(capture: Capture, elevation_m: float, max_height_m: float, source: HeightSource) -> Capture:
-    """The capture with the height of its altitude above an elevation, if none is known and that is above the ground."""
-    pose, altitude_m = capture.pose, capture.altitude_m
-    if pose is None or pose.height_m is not None or altitude_m is None or altitude_m - elevation_m <= 1.0:
-        return capture
-    height_m = min(altitude_m - elevation_m, max_height_m)
-    return replace(capture, pose=replace(pose, height_m=height_m, height_from=source))
-
-
-def _local_crs(position: Position) -> str:
-    """Azimuthal equidistant projection around a position: metres east and north of it."""
-    return f"+proj=aeqd +lat_0={position.latitude:.9f} +lon_0={position.longitude:.9f} +datum=WGS84 +units=m"
-
-
-class FlightMap:
-    """The GeoJSON features of the captures of a run, added one by one."""
-
-    def __init__(self, out: Path) -> None:
-        self._out = out
-        self._features: dict[str, dict[str, Any]] = {}
-
-    def add(self, capture: Capture, status: str, result: CaptureResult | None = None) -> None:
-        """Add a capture, with the result in its sidecar if there is one.
-
-        The geometry is the footprint of the aligned rasters, or of the reference if there are none; else the position
-        of the camera; else null.
-        """
-        # Panels are photographed from 1 m, and the sky is not on the ground.
-        shown = capture if status in ("panel", "sky") else with_assumed_height(capture)
-        output = None if result is None else result.output
-        ring = footprint(shown, OutputGrid(0, 0, *capture.reference.size_px) if output is None else output.grid)
-        position, pose = shown.position, shown.pose
-        # RFC 7946: outer rings are counter-clockwise. 1e-7 degrees are a centimetre.
-        shape = geojson_geometry(None if ring is None else ring[::-1], position)
-        georeference = capture.reference.georeference
-        if georeference is None:
-            accuracy_m = None if ring is None else accuracy_of_footprint_m(shown)
-        else:
-            accuracy_m = georeference.accuracy_m
-        height_m = None if pose is None else pose.height_m
-        bands = [] if result is None else [b for b in result.bands if b.status != "reference"]
-        after = [b.metrics.after for b in bands if b.metrics is not None]
-        paths = CapturePaths.of(capture, Path())
-        products = [] if result is None else result.products
-        files = [(part.kind, (paths.folder / part.file).as_posix()) for part in products]
-        properties = {
-            "capture": capture.label,
-            "status": status,
-            "camera": f"{capture.camera.make} {capture.camera.model}".strip(),
-            "captured_at": capture.captured_at,
-            **{name: getattr(position, name, None) for name in ("longitude", "latitude", "altitude_m")},
-            "height_m": None if height_m is None else round(height_m, 1),
-            "height_from": None if pose is None or height_m is None else pose.height_from,
-            "heading_deg": None if pose is None else round(pose.heading_deg, 1) % 360,
-            "accuracy_m": accuracy_m,
-            "bands": len(bands),
-            "bands_aligned": sum(b.status == "aligned" for b in bands),
-            "bands_predicted": sum(b.status == "predicted" for b in bands),
-            # The largest of a band, px of the reference.
-            "residual_px": max((a.residual_px for a in after if a.residual_px is not None), default=None),
-            "residual_p95_px": max((a.residual_p95_px for a in after if a.residual_p95_px is not None), default=None),
-            # Files are relative to the output folder.
-            "sidecar": None if result is None else paths.sidecar.as_posix(),
-            "stack": dict(files).get("stack"),
-            "picture": dict(files).get("picture"),
-            "indices": [file for kind, file in files if kind == "index" and file.endswith(".tif")],
-        }
-        feature = {"type": "Feature", "id": capture.label, "geometry": shape, "properties": properties}
-        self._features[capture.label] = feature
-
-    def write(self) -> Path | None:
-        """Write the file atomically and return it; None if no capture has a position. Raises OutputError.
-
-        Captures of earlier runs whose sidecars are still in the folder are kept, as in the report. Index rasters that
-        `agalign indices` wrote in earlier commands are linked too.
-        """
-        earlier = {f["id"]: f for f in features_in(self._out) if self._has_sidecar(f["properties"].get("sidecar"))}
-        by_label = earlier | self._features
-        features = [by_label[label] for label in sorted(by_label)]
-        if not any(f.get("geometry") for f in features):
-            return None
-        _write(self._out, features, read_table(self._out))
-        return self._out / FLIGHT_MAP_FILE
-
-    def _has_sidecar(self, file: object) -> bool:
-        return isinstance(file, str) and (self._out / file).is_file()
-
-
-def link_indices(out: Path, rows: Iterable[IndexReport]) -> None:
-    """Link the rasters of an index table in OUT/flight.geojson. Raises OutputError.
-
-    Without the file, or with a file that a run did not write, nothing is changed.
-    """
-    if features := features_in(out):
-        _write(out, features, rows)
-
-
-def features_in(out: Path) -> list[dict[str, Any]]:
-    """The features of OUT/flight.geojson; none if there is no such file, or if a run did not write it."""
-    try:
-        features = from_json(read_regular(out / FLIGHT_MAP_FILE), allow_inf_nan=False)["features"]
-        is_of_a_run = all(
-            isinstance(f["id"], str)
-            and f["id"] == f["properties"]["capture"]
-            and isinstance(f["properties"]["indices"], list)
-            for f in features
-        )
-    except (OSError, ValueError, KeyError, TypeError):
-        return []
-    return features if is_of_a_run else []
-
-
-def _write(out: Path, features: Sequence[dict[str, Any]], rows: Iterable[IndexReport]) -> None:
-    rasters: dict[str, list[str]] = defaultdict(list)
-    for row in rows:
-        if row.path is not None:
-            rasters[row.capture].append(row.path.relative_to(out).as_posix())
-    for feature in features:
-        properties = feature["properties"]
-        properties["indices"] = list(dict.fromkeys([*properties["indices"], *rasters[properties["capture"]]]))
-    lines = ",\n".join(json.dumps(f, ensure_ascii=False) for f in features)
-    text = f'{{"type": "FeatureCollection", "name": "flight", "features": [\n{lines}\n]}}\n'
-    write_text(out / FLIGHT_MAP_FILE, text)

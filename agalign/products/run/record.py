@@ -13,9 +13,11 @@ from pydantic import BaseModel, ConfigDict, Field
 from agalign._version import __version__
 from agalign.config import Settings
 from agalign.flight.groups import CameraOverview, camera_overviews
-from agalign.products.sidecar.schema import CaptureResult
-from agalign.values.capture import Capture
+from agalign.products.run.footprint import accuracy_of_footprint_m, footprint
+from agalign.products.sidecar.schema import Sidecar
+from agalign.values.capture import CameraIdentity, Capture, Pose, Position
 from agalign.values.files import RUN_FILE, read_model, write_model
+from agalign.values.image import OutputGrid
 from agalign.values.processes import usable_cores
 from agalign.values.text import counted, escape_controls
 
@@ -51,6 +53,13 @@ class ExclusionPart(_Part):
     kind: Literal["panel", "sky"]
     evidence: list[str]
     """Independent cues, in words: at least two."""
+    captured_at: str = ""
+    camera: CameraIdentity = CameraIdentity()
+    position: Position | None = None
+    pose: Pose | None = None
+    footprint: list[tuple[float, float]] | None = None
+    """Longitude and latitude, degrees, of the corners of the image."""
+    footprint_accuracy_m: float | None = None
 
 
 class RunPart(_Part):
@@ -82,7 +91,7 @@ class RunPart(_Part):
     problems: list[ProblemPart] = []
     excluded: list[ExclusionPart] = []
 
-    def add(self, label: str, state: str, result: CaptureResult | None, problems: Iterable[str]) -> None:
+    def add(self, label: str, state: str, result: Sidecar | None, problems: Iterable[str]) -> None:
         """Add the result of a capture."""
         self.captures[state] += 1
         for text in problems:
@@ -113,6 +122,25 @@ class RunPart(_Part):
         for name in ("stage_seconds", "capture_seconds"):
             facts[name] = {k: round(v, 3) for k, v in sorted(getattr(self, name).items())}
         write_model(out / RUN_FILE, self.model_copy(update=facts))
+
+
+def excluded_part(capture: Capture, kind: Literal["panel", "sky"], evidence: list[str]) -> ExclusionPart:
+    """Return the record of a capture that is not aligned.
+
+    Its footprint is for a known height only: panels are photographed from 1 m, and the sky is not on the ground.
+    """
+    ring = footprint(capture, OutputGrid(0, 0, *capture.reference.size_px))
+    return ExclusionPart(
+        capture=capture.label,
+        kind=kind,
+        evidence=evidence,
+        captured_at=capture.captured_at,
+        camera=capture.camera,
+        position=capture.position,
+        pose=capture.pose,
+        footprint=None if ring is None else [(x, y) for x, y in ring[::-1].tolist()],
+        footprint_accuracy_m=None if ring is None else accuracy_of_footprint_m(capture),
+    )
 
 
 def begun(folder: Path, settings: Settings, captures: Sequence[Capture] = (), command: str = "") -> RunPart:

@@ -75,6 +75,11 @@ def read_sidecar(path: Path) -> Sidecar:
         raise SidecarError(f"{path}: {_problem(error)}") from None
 
 
+def read_result(path: Path) -> Sidecar:
+    """Return a sidecar without its long tables: those of a season would not fit into memory. Raises SidecarError."""
+    return read_sidecar(path).without_tables()
+
+
 def find_sidecars(folder: Path) -> list[Path]:
     """Return the sidecars below an output folder, sorted; unreadable files are included, other JSON files are not."""
     result = []

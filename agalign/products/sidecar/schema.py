@@ -9,7 +9,6 @@ the reference to a pixel of the moving band; `grid` samples the complete mapping
 """
 
 from collections.abc import Iterable, Mapping
-from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
 import numpy as np

@@ -1,0 +1,48 @@
+"""Estimation: the sidecar of a capture, from its images."""
+
+import time
+from contextlib import suppress
+from pathlib import Path
+
+from agalign.capture.align_bands import PairProgress, align_capture_bands
+from agalign.config import Settings
+from agalign.flight.model import FlightModel
+from agalign.products.product import CapturePaths
+from agalign.products.rasters.alignment_maps import relief_of
+from agalign.products.rasters.parallax_file import PARALLAX_KIND, PARALLAX_SUFFIX, write_parallax
+from agalign.products.sidecar.file import file_part, write_sidecar
+from agalign.products.sidecar.schema import Sidecar
+from agalign.values.capture import Capture
+
+
+def estimate(
+    capture: Capture,
+    out: Path,
+    settings: Settings,
+    model: FlightModel | None,
+    progress: PairProgress,
+    earlier: Sidecar | None = None,
+) -> Sidecar:
+    """Align the bands of a capture; write its sidecar, and its parallax if it has a relief, and return the sidecar.
+
+    It lists the products of the `earlier` sidecar, which describe another estimate, until they are rendered again.
+    Raises UnreadableFileError if the reference cannot be read, and OutputError.
+    """
+    began_s, paths = time.perf_counter(), CapturePaths.of(capture, out)
+    alignments = align_capture_bands(capture, settings, model, progress)
+    progress(capture.reference.name, "writing", 0.0)
+    relief, path, parallax = relief_of(alignments), paths.file(PARALLAX_SUFFIX), None
+    if relief is not None:
+        write_parallax(path, relief, capture.reference.georeference)
+        parallax = file_part(PARALLAX_KIND, path, paths.folder)
+    seconds = time.perf_counter() - began_s
+    result = Sidecar.estimated(capture, alignments, settings, parallax, seconds)
+    if earlier is not None:
+        options = {key: stage for key, stage in (result.options or {}).items() if key != "write"}
+        options |= {key: stage for key, stage in (earlier.options or {}).items() if key == "write"}
+        result = result.model_copy(update={"products": earlier.products, "options": options})
+    result = write_sidecar(paths.sidecar, result)
+    if relief is None:
+        with suppress(OSError):
+            path.unlink(missing_ok=True)
+    return result

@@ -1,0 +1,44 @@
+"""The raster of the parallax of a capture at every pixel of the reference: a part of the result of the estimation.
+
+The relief raster on the grid of the stack is rendered from it, as that grid may be another one.
+"""
+
+from pathlib import Path
+
+import numpy as np
+
+from agalign.errors import SidecarError
+from agalign.pixels.raster import open_raster
+from agalign.products.rasters.checked_raster import LayerDescription, write_on_grid
+from agalign.products.sidecar.schema import Sidecar
+from agalign.values.capture import Georeference
+from agalign.values.image import OutputGrid
+from agalign.values.parallax import Relief, rounded
+
+PARALLAX_KIND, PARALLAX_SUFFIX = "parallax", ".parallax.tif"
+_LAYERS = {"parallax": "px", "confidence": "1", "standard error": "px"}
+"""Units by layer; the last one is written if it is known."""
+
+
+def write_parallax(path: Path, relief: Relief, georeference: Georeference | None) -> None:
+    """Write a relief at the pixels of the reference. Raises OutputError."""
+    values = [relief.parallax_px, relief.confidence, *([] if relief.std_px is None else [relief.std_px])]
+    height, width = relief.parallax_px.shape
+    layers = [LayerDescription(name, unit) for name, unit in list(_LAYERS.items())[: len(values)]]
+    blocks = ((rounded(layer), index, 0, 0) for index, layer in enumerate(values, start=1))
+    write_on_grid(path, OutputGrid(0, 0, width, height), georeference, layers, blocks)
+
+
+def read_relief(sidecar: Sidecar, folder: Path) -> Relief | None:
+    """Return the relief of a capture, given the folder of its sidecar; None if it has none.
+
+    Raises SidecarError for a raster of another size, UnreadableFileError.
+    """
+    if sidecar.parallax is None:
+        return None
+    path = folder / sidecar.parallax.file
+    with open_raster(path) as file:
+        if (file.width, file.height) != sidecar.reference.size_px or file.count < len(_LAYERS) - 1:
+            raise SidecarError(f"{path}: is not the parallax of {sidecar.capture}; run again with --overwrite")
+        parallax_px, confidence, *std_px = np.asarray(file.read(), np.float32)[: len(_LAYERS)]
+    return Relief(parallax_px, confidence, std_px=std_px[0] if std_px else None)
