@@ -121,7 +121,7 @@ took() {  # took WHAT COMMAND: its seconds, which go to standard error with its 
 
 took "build" build
 echo "== size: $(size)"
-for _ in 1 2 3; do took "start" inside "$folder/demo" "$folder/aligned" agalign --version; done
+for _ in 1 2 3; do took "start" inside "$folder/demo" "$folder/aligned" agalign --help; done
 took "demo" inside "$folder/demo" "$folder/demo" agalign demo /data/aligned "$@"
 took "a flight read-only, a root read-only, user $user" \
     inside "$flight" "$folder/aligned" agalign /data/flight -o /data/aligned --quiet

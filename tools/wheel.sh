@@ -47,7 +47,7 @@ unset PYTHONPATH
 cd "$folder"
 where=$(venv/bin/python -c 'import agalign; print(agalign.__file__)')
 case $where in "$folder"/venv/*) ;; *) echo "tried was $where, not the wheel" >&2; exit 1 ;; esac
-test "$(venv/bin/agalign --version)" = "agalign $version"
+test "$(venv/bin/agalign --version | sed -n 1p)" = "agalign $version"
 venv/bin/agalign demo demo --captures 1 --quiet
 test -s demo/aligned/index.html
 echo "the wheel by itself: version, demo"

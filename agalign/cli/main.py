@@ -11,10 +11,8 @@ from typing import Annotated, Any
 import typer
 from typer.core import TyperGroup
 
-from agalign._version import __version__
 from agalign.cli.align_commands import align, demo, onto
 from agalign.cli.command import help_of
-from agalign.cli.doctor import doctor
 from agalign.cli.evaluate import evaluate, learn, surface
 from agalign.cli.info import info
 from agalign.cli.results import export, indices, report, verify
@@ -23,7 +21,7 @@ from agalign.values.processes import limit_default_threads, silence_libraries
 from agalign.values.text import did_you_mean, name_problem
 
 ndvi = replace(indices, alias="ndvi")
-_ALL = align, demo, info, report, verify, indices, ndvi, export, onto, doctor, evaluate, surface, learn
+_ALL = align, demo, info, report, verify, indices, ndvi, export, onto, evaluate, surface, learn
 COMMANDS = {command.name: command for command in _ALL}
 _UsageError: Any = typer.BadParameter.__mro__[1]
 """The class of click, or of the copy of click in typer."""
@@ -85,7 +83,9 @@ def _reworded(error: Any) -> str:
 
 
 def _root(
-    version: Annotated[bool, typer.Option("--version", help="Print the version and exit.", is_eager=True)] = False,
+    version: Annotated[
+        bool, typer.Option("--version", help="Print versions, devices and limits, and exit.", is_eager=True)
+    ] = False,
 ) -> None:
     """Co-register the bands of multispectral drone cameras. 'agalign FOLDER' aligns everything below FOLDER.
 
@@ -94,10 +94,13 @@ def _root(
         agalign info flight/  list captures, bands and missing files
         agalign flight/ -o aligned/  align a flight; 'agalign align --help' lists the options
         agalign indices aligned/  compute spectral indices of the aligned captures
-        agalign doctor  check this machine
+        agalign --version  print versions, devices and limits
     """
     if version:
-        typer.echo(f"agalign {__version__}")
+        from agalign.cli.version import version_lines
+
+        for line in version_lines():
+            typer.echo(line)
         raise typer.Exit
 
 

@@ -31,7 +31,7 @@ def choose_device(name: str) -> torch.device:
     for kind, is_available in (("cuda", torch.cuda.is_available), ("mps", torch.backends.mps.is_available)):
         if device.type == kind and not is_available():
             reason = f"no {kind.upper()} device, or PyTorch without {kind.upper()}"
-            raise ConfigurationError(f"device '{name}' cannot be used: {reason}; 'agalign doctor' lists devices")
+            raise ConfigurationError(f"device '{name}' cannot be used: {reason}; 'agalign --version' lists devices")
     problem = _problem(device)
     if problem:
         raise ConfigurationError(f"device '{name}' cannot be used here: {problem}")

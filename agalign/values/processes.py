@@ -24,6 +24,7 @@ THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"
 """Environment variables with the number of threads that libraries start; they read them once, at their import."""
 MIN_ADDRESS_SPACE_BYTES = 1_800_000_000
 """Below about 1.6 GB the libraries crash, abort or hang, which cannot be caught."""
+_CGROUPS, _OWN_CGROUP = Path("/sys/fs/cgroup"), Path("/proc/self/cgroup")
 _MIN_THREADS, _MIN_THREADS_PER_CORE = 16, 4
 """With fewer, GDAL hangs and OpenMP ends the process. A run on two cores needs 24 processes and threads."""
 
@@ -47,18 +48,24 @@ def limit_default_threads() -> None:
             os.environ.setdefault(name, str(usable_cores()))
 
 
-def cgroup_quota(root: Path = Path("/sys/fs/cgroup"), own: Path = Path("/proc/self/cgroup")) -> float | None:
+def cgroup_quota(root: Path = _CGROUPS, own: Path = _OWN_CGROUP) -> float | None:
     """Return the smallest quota of this process's control group and those above it, in cores; None for no limit.
 
     Version 2 has the file `cpu.max` ("200000 100000": quota and period in microseconds), version 1 one file for each.
     """
-    folders = [root, root / "cpu"]  # a container sees its own group as the root
+    quotas = map(_quota_in, _cgroup_folders("cpu", root, own))
+    return min((quota for quota in quotas if quota is not None), default=None)
+
+
+def _cgroup_folders(controller: str, root: Path, own: Path) -> list[Path]:
+    """The folders of this process's control group and those above it, of both versions."""
+    folders = [root, root / controller]  # a container sees its own group as the root
     for line in _text(own).splitlines():
         _, controllers, path = line.split(":", 2)
-        if not controllers or "cpu" in controllers.split(","):
-            group = (root / "cpu" if controllers else root) / path.lstrip("/")
+        if not controllers or controller in controllers.split(","):
+            group = (root / controller if controllers else root) / path.lstrip("/")
             folders += [group, *group.parents]
-    return min((q for folder in folders if (q := _quota_in(folder)) is not None), default=None)
+    return folders
 
 
 def _quota_in(folder: Path) -> float | None:
@@ -110,6 +117,15 @@ def _address_space_bytes() -> float:
 
     limit_bytes, _ = resource.getrlimit(resource.RLIMIT_AS)
     return math.inf if limit_bytes == resource.RLIM_INFINITY else limit_bytes
+
+
+def memory_limit_bytes(root: Path = _CGROUPS, own: Path = _OWN_CGROUP) -> float:
+    """Return the smallest limit of the memory of this process: of its control groups, and `ulimit -v`; inf without one.
+    Version 1 of control groups has a limit above the memory of any machine instead.
+    """
+    files = ("memory.max", "memory.limit_in_bytes")
+    texts = (_text(folder / name).strip() for folder in _cgroup_folders("memory", root, own) for name in files)
+    return min([_address_space_bytes(), *(float(text) for text in texts if text.isdecimal())])
 
 
 def check_address_space() -> None:

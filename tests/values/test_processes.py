@@ -1,5 +1,6 @@
-"""Limits of the system and of containers: cores and address space."""
+"""Limits of the system and of containers: cores, memory and address space."""
 
+import math
 import platform
 import re
 import subprocess
@@ -11,10 +12,23 @@ import pytest
 
 from agalign.errors import is_out_of_memory
 from agalign.values import processes
-from agalign.values.processes import cgroup_quota, check_threads, limit_default_threads, usable_cores
+from agalign.values.processes import (
+    cgroup_quota,
+    check_threads,
+    limit_default_threads,
+    memory_limit_bytes,
+    usable_cores,
+)
 
 from ..conftest import raising
 from ..program import agalign_here
+
+
+def write_cgroups(root: Path, files: dict[str, str]) -> None:
+    for name, text in files.items():
+        (root / name).parent.mkdir(parents=True, exist_ok=True)
+        (root / name).write_text(f"{text}\n")
+
 
 V1 = {"cpu/docker/ab/cpu.cfs_period_us": "100000"}
 
@@ -32,10 +46,26 @@ V1 = {"cpu/docker/ab/cpu.cfs_period_us": "100000"}
     ],
 )
 def test_quota_of_a_container(tmp_path: Path, groups: str, files: dict[str, str], expected: float | None) -> None:
-    for name, text in {"self": groups, **files}.items():
-        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
-        (tmp_path / name).write_text(f"{text}\n")
+    write_cgroups(tmp_path, {"self": groups, **files})
     assert cgroup_quota(tmp_path, tmp_path / "self") == expected
+
+
+@pytest.mark.parametrize(
+    ("groups", "files", "expected"),
+    [
+        ("0::/", {"memory.max": "max"}, math.inf),
+        ("0::/batch/job", {"batch/job/memory.max": "max", "batch/memory.max": "2000000000"}, 2e9),
+        ("4:memory:/docker/ab", {"memory/docker/ab/memory.limit_in_bytes": "1000000000"}, 1e9),
+    ],
+)
+def test_memory_limit_of_a_container(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, groups: str, files: dict[str, str], expected: float
+) -> None:
+    write_cgroups(tmp_path, {"self": groups, **files})
+    monkeypatch.setattr(processes, "_address_space_bytes", lambda: math.inf)
+    assert memory_limit_bytes(tmp_path, tmp_path / "self") == expected
+    monkeypatch.setattr(processes, "_address_space_bytes", lambda: 5e8)
+    assert memory_limit_bytes(tmp_path, tmp_path / "self") == 5e8
 
 
 @pytest.mark.parametrize(("quota", "expected"), [(None, 8), (2.5, 3), (0.2, 1), (64.0, 8)])

@@ -4,7 +4,6 @@ import platform
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Sequence
 from datetime import UTC, datetime
-from importlib import metadata
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -18,10 +17,9 @@ from agalign.products.sidecar.schema import Sidecar
 from agalign.values.capture import CameraIdentity, Capture, Pose, Position
 from agalign.values.files import RUN_FILE, read_model, write_model
 from agalign.values.image import OutputGrid
+from agalign.values.libraries import library_versions
 from agalign.values.processes import usable_cores
 from agalign.values.text import counted, escape_controls
-
-_LIBRARIES = ("torch", "numpy", "rasterio", "opencv-python-headless", "tifffile", "pydantic")
 
 RunState = Literal["running", "interrupted", "finished"]
 
@@ -145,7 +143,6 @@ def excluded_part(capture: Capture, kind: Literal["panel", "sky"], evidence: lis
 
 def begun(folder: Path, settings: Settings, captures: Sequence[Capture] = (), command: str = "") -> RunPart:
     """Return the record of a run that starts now."""
-    versions = {"python": platform.python_version(), **{name: library_version(name) for name in _LIBRARIES}}
     system = {"system": platform.system(), "release": platform.release(), "processor": platform.machine()}
     return RunPart(
         state="running",
@@ -154,7 +151,7 @@ def begun(folder: Path, settings: Settings, captures: Sequence[Capture] = (), co
         input=escape_controls(str(folder)),
         command=escape_controls(command),
         cameras=camera_overviews(captures),
-        versions={name: version or "unknown" for name, version in versions.items()},
+        versions=library_versions(),
         machine={**system, "cores": usable_cores(), "device": settings.joint.device},
         settings=settings.model_dump(mode="json"),
         captures=Counter(found=len(captures)),
@@ -164,11 +161,3 @@ def begun(folder: Path, settings: Settings, captures: Sequence[Capture] = (), co
 def read_run_record(out: Path) -> RunPart | None:
     """Return the record of the last run into a folder, if any. Raises SidecarError for a file of another format."""
     return read_model(out / RUN_FILE, RunPart)
-
-
-def library_version(distribution: str) -> str | None:
-    """Return the version of an installed distribution; None if there is none."""
-    try:
-        return metadata.version(distribution)
-    except metadata.PackageNotFoundError:
-        return None
