@@ -67,26 +67,22 @@ def _export(
     program: Annotated[ExportProgram, typer.Option("--for")],
     target: Annotated[Path | None, typer.Option("-o", "--out")] = None,
     copy: bool = False,
-    source: Path | None = None,
 ) -> int:
-    """Export aligned captures for photogrammetry programs, MicaSense's notebooks or OpenCV.
+    """Export aligned captures for photogrammetry programs.
 
     Options:
-        program: Band files with tags for odm, metashape or pix4d; warp matrices for micasense or opencv.
+        program: odm (OpenDroneMap), metashape or pix4d.
         target: Output folder; by default OUT with the program's name added.
         copy: Copy the band files instead of creating hard links.
-        source: Folder with the original images, if they were moved; for micasense only.
 
     Examples:
         agalign export aligned/ --for odm  band files in one folder, and the options for OpenDroneMap
-        agalign export aligned/ --for micasense  warp matrices for MicaSense's notebooks
-        agalign export aligned/ --for opencv -o matrices/  homographies and sampled mappings for scripts
     """
     from agalign.products.exports.programs import export as run_export
 
     run_folder = out.resolve()
     folder = target or run_folder.parent / f"{run_folder.name}-{program}"
-    report = run_export(out, folder, program, copy=copy, source=source)
+    report = run_export(out, folder, program, copy=copy)
     _print_left_out(report.left_out, terminal)
     for line in report.notes:
         terminal.result(line)
@@ -105,7 +101,7 @@ def _print_left_out(left_out: Sequence[tuple[str, str]], terminal: Terminal) -> 
 
 report = Command(_report)
 verify = Command(_verify)
-export = Command(_export, {"Output": "program target copy source", "Running": "quiet log_json"})
+export = Command(_export, {"Output": "program target copy", "Running": "quiet log_json"})
 
 
 def _indices(

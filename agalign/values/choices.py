@@ -30,7 +30,7 @@ Layout = Literal["stack", "bands", "both"]
 Resolution = Literal["reference", "finest"]
 RasterFormat = Literal["gtiff", "cog"]
 Compression = Literal["auto", "zstd", "deflate", "none"]
-ExportProgram = Literal["odm", "metashape", "pix4d", "micasense", "opencv"]
+ExportProgram = Literal["odm", "metashape", "pix4d"]
 
 
 class Quality(IntFlag):

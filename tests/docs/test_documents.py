@@ -21,6 +21,9 @@ from shapely import Polygon
 from synthetic_flights.cameras import ALTUM
 
 import agalign
+from agalign.cameras.metadata import read_tags
+from agalign.cameras.pix4d import perspective_lens
+from agalign.products.sidecar.file import read_sidecar
 from agalign.synthetic import flight as synthetic
 from agalign.values import geometry
 
@@ -86,11 +89,13 @@ def desk(originals: Path, aligned_flight: Path, tmp_path: Path) -> Path:
     return folder
 
 
-def run_python(text: str) -> None:
+def run_python(text: str) -> dict[str, Any]:
+    """Run a script with the images `green` and `nir`; return its variables."""
     bands = {name: f"flight/0000SET/000/IMG_0001_{number}.tif" for name, number in (("green", 2), ("nir", 4))}
     names: dict[str, Any] = {name: cv2.imread(path, cv2.IMREAD_UNCHANGED) for name, path in bands.items()}
     with warnings.catch_warnings(action="ignore"):
         exec(text, names)
+    return names
 
 
 def run_page(page: Path) -> None:
@@ -199,6 +204,39 @@ def test_the_python_of_the_readme_aligns_pixels() -> None:
     valid, difference = names["valid"], np.abs(names["nir_on_green"] - (-green + 0.15 * green**2))
     assert valid.mean() > 0.9
     assert np.percentile(difference[valid], 95) < 0.15 * green.std()
+
+
+def test_the_python_guide_has_the_matrices_of_opencv_and_micasense(desk: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Points of the mapping between raw pixels, and undistorted by OpenCV as MicaSense's notebooks undistort images."""
+    monkeypatch.chdir(desk)
+    (text,) = (b.text for b in blocks_of(ROOT / "docs" / "python.md") if "warp_matrices" in b.text)
+    names = run_python(text)
+    folder, sidecar = Path("flight/0000SET/000"), read_sidecar(Path("aligned/0000SET/000/IMG_0001.json"))
+    bands = {band.band: band for band in sidecar.bands}
+    assert [*names["matrices"]] == ["Blue", "Green", "Red", "NIR", "Red edge"]
+    tags = read_tags(folder / "IMG_0001_1.tif")
+    saved = np.load(f"{tags.serial}_warp_matrices_opencv.npy", allow_pickle=True)
+    assert (saved.shape, saved.dtype) == ((5, 3, 3), np.float32)
+
+    def straight(points: list[tuple[float, float]], file: str) -> np.ndarray:
+        lens = perspective_lens(read_tags(folder / file))
+        coefficients = np.array(lens.distortion[:5])
+        new, _ = cv2.getOptimalNewCameraMatrix(lens.matrix, coefficients, (480, 360), 1)
+        return cv2.undistortPoints(np.array(points)[:, None], lens.matrix, coefficients, P=new)[:, 0]
+
+    for number, (name, matrix) in enumerate(names["matrices"].items()):
+        band, warp_matrix = bands[name], names["warp_matrices"][number]
+        np.testing.assert_array_equal(warp_matrix, saved[number])
+        if name == sidecar.reference.band:
+            np.testing.assert_array_equal([matrix, warp_matrix], [np.eye(3)] * 2)
+            continue
+        assert np.abs(geometry.apply(matrix, band.grid.reference_px) - band.grid.moving_px).max() < 2.0
+        reference = straight(band.grid.reference_px, sidecar.reference.file)
+        mapped = geometry.apply(warp_matrix.astype(float), reference)
+        assert np.abs(mapped - straight(band.grid.moving_px, band.file)).max() < 0.5
+        assert np.abs(mapped - reference).max() > 1.0
+    expected, valid = agalign.read_alignment(Path("aligned/0000SET/000/IMG_0001.json"), "NIR").warp(names["nir"])
+    assert np.corrcoef(names["nir_on_green"][valid], expected[valid])[0, 1] > 0.95
 
 
 def test_every_block_has_a_kind() -> None:

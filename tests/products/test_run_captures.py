@@ -47,8 +47,6 @@ def test_an_export_is_of_one_quantity(run: Path, tmp_path: Path) -> None:
     report = export(run, tmp_path / "odm", "odm")
     assert (report.left_out, len(report.files)) == ([(FIRST, REASON)], 8)
     assert "The files contain reflectance by light sensor: OpenDroneMap must not" in report.notes[-1]
-    # Matrices are of the original images.
-    assert export(run, tmp_path / "opencv", "opencv").captures == 9
 
 
 def test_a_flight_has_one_unit(run: Path) -> None:

@@ -78,7 +78,7 @@ def files_in(folder: Path) -> set[Path]:
 @pytest.mark.parametrize(
     "command",
     [
-        *(f"export {{out}} -o {{new}} --for {name}" for name in ("odm", "metashape", "pix4d", "micasense", "opencv")),
+        *(f"export {{out}} -o {{new}} --for {name}" for name in ("odm", "metashape", "pix4d")),
         "report {out}",
         "verify {out}",
         "indices {out} --index ndvi --formula con=(N-R)/(N+R)",
@@ -138,7 +138,6 @@ def test_equal_names_do_not_overwrite_each_other(tmp_path: Path) -> None:
     report = export(out, tmp_path / "images", "odm")
     for files in (report.files, (p for p in out.rglob("*.tif") if p.stem != "IMG_0001")):
         assert sorted(p.read_text() for p in files) == ["0000SET", "0000SET/x", "0000SET_x"]
-    assert len({p.name for p in export(out, tmp_path / "matrices", "opencv").files}) == 4
 
 
 @pytest.mark.skipif(os.name == "nt", reason="links need a privilege on Windows")
