@@ -45,7 +45,7 @@ if TYPE_CHECKING:
     from agalign.errors import WorkerError as WorkerError
     from agalign.products.exports.dataset import open_capture as open_capture
     from agalign.products.exports.dataset import open_flight as open_flight
-    from agalign.products.sidecar.convert import read_alignment as read_alignment
+    from agalign.products.sidecar.alignments import read_alignment as read_alignment
     from agalign.values.alignment import Alignment as Alignment
     from agalign.values.alignment import Prediction as Prediction
     from agalign.values.alignment import Residual as Residual
@@ -61,7 +61,7 @@ _NAMES = {
     "errors": "AgalignError ConfigurationError GeometryError InputError MemoryLimitError NoContrastError "
     "NoSuchBandError NotEnoughTextureError OutputError SidecarError UnreadableFileError WorkerError",
     "products.exports.dataset": "open_capture open_flight",
-    "products.sidecar.convert": "read_alignment",
+    "products.sidecar.alignments": "read_alignment",
     "values.alignment": "Alignment Prediction Residual Seed",
     "values.capture": "Capture",
 }

@@ -1,6 +1,7 @@
 """Estimate and render one capture, also as the task of a worker; the report of it."""
 
 import logging
+import math
 import time
 from collections import Counter, defaultdict
 from collections.abc import Callable, Mapping
@@ -58,7 +59,7 @@ class CaptureReport:
     """Why the capture counts as sky."""
     failed_products: tuple[str, ...] = ()
     """Products that could not be written, and why."""
-    removed: tuple[str, ...] = ()
+    removed: tuple[tuple[Path, str], ...] = ()
     """Files of an earlier command that were removed, and why."""
     seconds: float = 0.0
     """Processing time in this run."""
@@ -95,9 +96,9 @@ class CaptureReport:
         """A short table for notebooks."""
         if self.result is None:
             return f"<p><b>{escape(self.label)}</b>: {escape(self.summary)}</p>"
-        residuals_px = [None if b.metrics is None else b.metrics.after.get("residual_px") for b in self.result.bands]
+        residuals_px = [math.nan if b.metrics is None else b.metrics.after.residual_px for b in self.result.bands]
         rows = "".join(
-            f"<tr><td>{escape(b.band)}</td><td>{b.status}</td><td>{'' if px is None else f'{px:.3f}'}</td>"
+            f"<tr><td>{escape(b.band)}</td><td>{b.status}</td><td>{f'{px:.3f}' if math.isfinite(px) else ''}</td>"
             f"<td>{escape(b.reason or '')}</td></tr>"
             for b, px in zip(self.result.bands, residuals_px, strict=True)
         )

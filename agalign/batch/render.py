@@ -56,7 +56,7 @@ class Rendering:
     sidecar: Sidecar
     failures: tuple[str, ...]
     """Products that could not be written, and why."""
-    removed: tuple[str, ...]
+    removed: tuple[tuple[Path, str], ...]
     """Files of an earlier command that were removed, and why."""
 
 
@@ -96,10 +96,10 @@ def render(capture: Capture, out: Path, settings: Settings, sidecar: Sidecar, op
     for path, _ in removed:
         with suppress(OSError):
             path.unlink(missing_ok=True)
-    lines = [f"{path}: removed: {context.lost.get(path, reason)}" for path, reason in removed if reason]
+    reasons = tuple((path, context.lost.get(path, reason)) for path, reason in removed if reason)
     complete = write_sidecar(paths.sidecar, rendered(context, list(failures)))
     # Products that need the same file fail with the same message.
-    return Rendering(complete, tuple(dict.fromkeys(failures.values())), tuple(lines))
+    return Rendering(complete, tuple(dict.fromkeys(failures.values())), reasons)
 
 
 def _write_products(context: ProductContext) -> dict[str, str]:

@@ -22,7 +22,7 @@ from agalign.config import DiscoverOptions, RunOptions, Settings
 from agalign.errors import InputError, OutputError, SidecarError, WorkerError
 from agalign.flight.groups import camera_overviews
 from agalign.products.product import CapturePaths
-from agalign.products.report.facts import FailureGroup, PairTotals
+from agalign.products.report.facts import FailureGroup, PairTotals, rounded
 from agalign.products.report.pages import REPORT_FILE, pages_exist, write_pages
 from agalign.products.run.record import read_run_record
 from agalign.products.sidecar.file import read_result
@@ -106,6 +106,8 @@ class RunTotals:
     pairs: PairTotals = field(default_factory=PairTotals)
     saturated: dict[str, tuple[float, str]] = field(default_factory=dict)
     """Largest share of saturated pixels, and its capture, of each band."""
+    removed: dict[str, list[Path]] = field(default_factory=lambda: defaultdict(list))
+    """Files of earlier commands that were removed, by reason."""
     panel_ages_s: dict[str, list[float | None]] = field(default_factory=lambda: defaultdict(list))
     """Times between captures and the nearest panel, by the quantity that raw numbers were converted to."""
 
@@ -113,6 +115,8 @@ class RunTotals:
         """Add the report of a capture."""
         self.states[report.state] += 1
         self.is_complete &= report.is_complete
+        for path, reason in report.removed:
+            self.removed[reason].append(path)
         if report.state in ("panel", "sky"):
             self.asked.pop(report.label, None)
         if report.result is None:
@@ -289,7 +293,7 @@ def _print_report(report: "CaptureReport", terminal: Terminal, number: int, coun
 
 
 def _print_pair(capture: str, band: BandResult, terminal: Terminal) -> None:
-    residual = band.metrics.after.residual_px if band.metrics else None
+    residual = rounded(band.metrics.after.residual_px) if band.metrics else None
     measured = "" if residual is None else f", residual {residual:.3f} px"
     terminal.event(
         "pair",
@@ -313,6 +317,8 @@ def conclude(totals: RunTotals, out: Path, terminal: Terminal) -> int:
     if high:
         shares = ", ".join(f"{name} up to {share:.1%} ({label})" for name, share, label in high)
         terminal.result(f"Saturated pixels: {shares}")
+    for reason, paths in totals.removed.items():
+        terminal.problem(f"{counted(len(paths), 'file')} of an earlier command removed, such as {paths[0]}: {reason}")
     record = read_run_record(out)
     for line in [] if record is None else record.exclusions():
         terminal.result(line)

@@ -4,7 +4,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Annotated, TypedDict
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -287,27 +287,33 @@ class Prediction:
     reference's file; null for a rig's."""
 
 
-class Similarity(TypedDict, total=False):
-    """Similarity of the pixels that are valid in both bands; in large images of a sample of at least 250,000."""
+@validated.dataclass(frozen=True, config=RECORD)
+class Similarity:
+    """Similarity of the pixels that are valid in both bands; in large images of a sample of at least 250,000. Values are
+    nan, null in JSON, where they could not be measured.
+    """
 
-    mattes_mi: Number6
+    mattes_mi: Number6 = math.nan
     """Negative Mattes mutual information, nats, 32 bins: lower is better."""
-    nmi: Number6
+    nmi: Number6 = math.nan
     """Normalised mutual information, 1 to 2: higher is better."""
-    ncc: Number6
+    ncc: Number6 = math.nan
     """Normalised cross-correlation; negative if contrast is reversed."""
-    gradient_correlation: Number6
+    gradient_correlation: Number6 = math.nan
     """Correlation of gradient magnitudes: higher is better."""
-    structure_ssim: Number6
+    structure_ssim: Number6 = math.nan
     """SSIM of the structure images: higher is better."""
-    overlap: Number6
+    overlap: Number6 = math.nan
     """Share of the image in which both bands are valid."""
-    residual_px: Number6
+    residual_px: Number6 = math.nan
     """Median length of the shifts of the windows, px of the reference."""
-    residual_p95_px: Number6
+    residual_p95_px: Number6 = math.nan
     """Their 95th percentile, px of the reference."""
-    residual_coverage: Number6
+    residual_coverage: Number6 = math.nan
     """Share of the textured windows with a measured shift."""
+
+
+_NOT_MEASURED = Similarity()
 
 
 @dataclass(frozen=True)
@@ -329,9 +335,9 @@ class Alignment:
     """Of windows that took no part in the estimation."""
     seconds: float = 0.0
     """Share of the capture's processing time, equal for all its bands."""
-    before: Similarity = field(default_factory=lambda: Similarity())
-    """Comparison metrics by name under the seed, such as mutual information."""
-    after: Similarity = field(default_factory=lambda: Similarity())
+    before: Similarity = _NOT_MEASURED
+    """Comparison metrics of the files as they are, such as mutual information."""
+    after: Similarity = _NOT_MEASURED
     """The same under the mapping."""
     candidates: Mapping[Geometry, float] = field(default_factory=dict)
     """p95 of the shifts of held-out windows by each geometry that was fitted; empty if only a homography was."""

@@ -190,11 +190,14 @@ def _flush_to_disk(path: Path) -> None:
 
 
 def compact_lists(text: str) -> str:
-    """Return indented JSON with each list of numbers on one line, which takes a third of the size."""
+    """Return indented JSON with each list of numbers, or of lists of them, on one line, which takes a third of the size."""
     # Numbers, null, true and false start with these characters; keys and texts start with a quote.
     text = re.sub(r"\[\n +(?=[-0-9ntf])", "[", text)
     text = re.sub(r",\n +(?=[-0-9ntf])", ", ", text)
-    return re.sub(r"(?<=[0-9le])\n *\]", "]", text)
+    text = re.sub(r"(?<=[0-9le])\n *\]", "]", text)
+    text = re.sub(r"\[\n +(?=\[)", "[", text)
+    text = re.sub(r"\],\n +(?=\[)", "], ", text)
+    return re.sub(r"\]\n *(?=\])", "]", text)
 
 
 def write_model(path: Path, model: "BaseModel | None") -> None:

@@ -39,8 +39,7 @@ class FixedSimilarity:
     def to(self, moving: Raster) -> Similarity:
         """Compute all metrics over the pixels that are valid in both rasters.
 
-        Keys: mattes_mi (elastix's sign: lower is better), nmi, ncc, gradient_correlation, structure_ssim (higher is
-        better), overlap (share of the grid that is valid in both). Below 256 common pixels only overlap is returned.
+        Below 256 common pixels only the overlap is computed.
         gradient_correlation is Pearson's coefficient of the gradient magnitudes, structure_ssim the SSIM (Wang et
         al. 2004, 11 px Gaussian window) of the standardised ones; neither depends on the sign of contrast.
         """
@@ -50,21 +49,21 @@ class FixedSimilarity:
         valid = np.flatnonzero(both[self.grid])
         min_pixels = 256  # a joint histogram of fewer is noise
         if len(valid) < min_pixels:
-            return {"overlap": overlap}
+            return Similarity(overlap=overlap)
         fixed_values, moving_values = self.sampled[valid], moving.pixels[self.grid].ravel()[valid]
         joint = joint_histogram(self.bins[valid], moving_values, _range(replace(moving, valid=both)))
         gradient = _Gradient.of(moving.pixels, self.grid)
         inside = np.flatnonzero(_eroded(both, 3)[self.grid])
         gradients = self.gradient.sampled[inside], gradient.sampled[inside]
         complete_windows = np.flatnonzero(_eroded(both, _SSIM_WINDOW_PX)[self.grid])
-        return {
-            "mattes_mi": -mutual_information(joint),
-            "nmi": normalised_mutual_information(joint),
-            "ncc": correlation(fixed_values, moving_values),
-            "gradient_correlation": correlation(*gradients) if len(inside) else 0.0,
-            "structure_ssim": _ssim(self.gradient, gradient, valid, complete_windows),
-            "overlap": overlap,
-        }
+        return Similarity(
+            mattes_mi=-mutual_information(joint),
+            nmi=normalised_mutual_information(joint),
+            ncc=correlation(fixed_values, moving_values),
+            gradient_correlation=correlation(*gradients) if len(inside) else 0.0,
+            structure_ssim=_ssim(self.gradient, gradient, valid, complete_windows),
+            overlap=overlap,
+        )
 
 
 def _eroded(valid: Mask, side_px: int) -> Mask:

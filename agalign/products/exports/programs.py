@@ -12,6 +12,7 @@ from agalign.cameras import pix4d
 from agalign.cameras.metadata import read_tags
 from agalign.cameras.read_files import natural_order
 from agalign.errors import ConfigurationError, InputError, OutputError
+from agalign.products.rasters.aligned_files import BandFiles
 from agalign.products.run.captures import LeftOut, RunCapture, captures_of_run, like_most
 from agalign.values.choices import ExportProgram
 from agalign.values.files import check_inside, file_name, remove_partial_files, scratch_file, write_text
@@ -95,12 +96,12 @@ def _write_band_files(captures: Sequence[RunCapture], out: Path, images: Path, *
     """Link or copy the band files. Raises ConfigurationError and OutputError."""
     taken: dict[str, str] = {}
     for capture in captures:
-        output = capture.result.output
-        if output is None or not output.band_files:
+        files = [part for part in capture.result.products if part.kind == BandFiles.kind]
+        if not files:
             raise ConfigurationError(
                 f"{out}: has stacks only; run 'agalign' with --layout bands or both into it, and export again"
             )
-        for part in output.band_files:
+        for part in files:
             source = check_inside(capture.path.parent / part.file, out)
             target = images / file_name((Path(capture.label).parent / part.file).as_posix(), taken)
             target.parent.mkdir(parents=True, exist_ok=True)

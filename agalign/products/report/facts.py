@@ -11,10 +11,12 @@ from typing import Any
 from urllib.parse import quote
 
 import numpy as np
+
 from agalign.products.indices.rasters import IndexReport
 from agalign.products.run.record import RefusalPart
 from agalign.products.sidecar.schema import BandResult, GeometryPart, GridPart, OutputPart, Sidecar
-from agalign.values.issues import KINDS, MISSING_BAND, MOSAICS, OTHER_REFERENCE, UNREADABLE, Remedy
+from agalign.values.alignment import Prediction
+from agalign.values.issues import MISSING_BAND, MOSAICS, OTHER_REFERENCE, UNREADABLE, Remedy
 
 _SHIFT_STEP_PX = 0.01
 """Shifts of windows are written as integer multiples of this."""
@@ -100,8 +102,8 @@ class PairTotals:
                 refusal = RefusalPart(capture=label, band=name, status=status, reason=reason or "")
                 remedy = MISSING_BAND if part is None else _remedy_of(part, is_mosaic=is_mosaic)
                 self._by_cause[status, remedy].append(refusal)
-            elif part and part.metrics and "residual_px" in part.metrics.after:
-                band.residuals_px.append(part.metrics.after["residual_px"])
+            elif part and part.metrics and math.isfinite(part.metrics.after.residual_px):
+                band.residuals_px.append(part.metrics.after.residual_px)
         camera, reference = result.camera, result.reference.band
         flight = (camera.name, camera.serial, result.flight_id, "" if camera.model else Path(label).parent.as_posix())
         self._references.append((label, flight, reference, {name for name, _, _ in result.pairs}))
@@ -229,8 +231,9 @@ class FlightFacts:
             self.rows.append(keys | row)
         metrics, windows = band.metrics, None if band.metrics is None else band.metrics.windows
         similarity = {name: (row[f"{name}_before"], row[f"{name}_after"]) for name in _SIMILARITY}
-        centres_px, shifts_px = ([], []) if windows is None else (windows.centres_px, windows.shifts_px)
-        lattice = tuple(np.round(np.ravel(centres_px), 2).tolist())
+        centres_px = np.empty((0, 2)) if windows is None else windows.centres_px
+        shifts_px = np.empty((0, 2)) if windows is None else windows.shifts_px
+        lattice: tuple[float, ...] = tuple(np.round(centres_px, 2).ravel().tolist())
         offset_px, offset_length_px = _band_offset(band.grid, sidecar)
         if offset_length_px is not None and band.status != "reference":
             self.pairs.bands[band.band].offsets_px.append(offset_length_px)
@@ -246,14 +249,14 @@ class FlightFacts:
             "geometry": _geometry(band.geometry),
             "occluded": value_at(band, "relief.occluded"),
             "lattice": self._lattices.setdefault(lattice, len(self._lattices)),
-            "shifts": [round(v / _SHIFT_STEP_PX) if np.isfinite(v) else None for v in np.ravel(shifts_px).tolist()],
+            "shifts": [round(v / _SHIFT_STEP_PX) if np.isfinite(v) else None for v in shifts_px.ravel().tolist()],
         }
 
 
 def value_at(part: object, path: str) -> Any:
-    """Return a field of nested records, with four decimals; None if a record on the path is None or lacks it."""
+    """Return a field of nested records, with four decimals; None if a record on the path is None."""
     for name in path.split("."):
-        part = part.get(name) if isinstance(part, dict) else None if part is None else getattr(part, name)
+        part = None if part is None else getattr(part, name)
     return rounded(part)
 
 

@@ -4,6 +4,7 @@ It is a view of the sidecars, and of the captures in the record of the run that 
 """
 
 import json
+import math
 from collections import defaultdict
 from collections.abc import Iterable
 from itertools import pairwise
@@ -51,8 +52,8 @@ class FlightMap:
                 "bands_aligned": sum(b.status == "aligned" for b in bands),
                 "bands_predicted": sum(b.status == "predicted" for b in bands),
                 # The largest of a band, px of the reference.
-                "residual_px": max((a["residual_px"] for a in after if "residual_px" in a), default=None),
-                "residual_p95_px": max((a["residual_p95_px"] for a in after if "residual_p95_px" in a), default=None),
+                "residual_px": _largest([a.residual_px for a in after]),
+                "residual_p95_px": _largest([a.residual_p95_px for a in after]),
                 # Files are relative to the output folder.
                 "sidecar": f"{label}.json",
                 "stack": dict(files).get("stack"),
@@ -90,6 +91,10 @@ class FlightMap:
         return out / FLIGHT_MAP_FILE
 
 
+def _largest(values: Iterable[float]) -> float | None:
+    return max((round(value, 4) for value in values if math.isfinite(value)), default=None)
+
+
 def _feature(label: str, shape: dict[str, Any] | None, properties: dict[str, Any]) -> dict[str, Any]:
     return {"type": "Feature", "id": label, "geometry": shape, "properties": {"capture": label, **properties}}
 
@@ -107,8 +112,7 @@ def _place(camera: CameraIdentity, captured_at: str, position: Position | None, 
 
 
 def _shape(footprint: list[tuple[float, float]] | None, position: Position | None) -> dict[str, Any] | None:
-    # 1e-7 degrees are a centimetre.
-    return geojson_geometry(None if footprint is None else np.array(footprint), position, decimals=7)
+    return geojson_geometry(None if footprint is None else np.array(footprint), position)
 
 
 def geojson_geometry(ring: NDArray[np.float64] | None, position: Position | None) -> dict[str, Any] | None:

@@ -9,6 +9,7 @@ the reference to a pixel of the moving band; `grid` samples the complete mapping
 """
 
 from collections.abc import Iterable, Mapping
+from dataclasses import replace
 from typing import Annotated, Any, Literal, Self
 
 import numpy as np
@@ -240,14 +241,14 @@ class BandResult(_Part):
             occluded = 0.0 if hidden is None else float(hidden.mean())
             tables = dict(zip(("plane_px", "slope", "curvature"), sampled_parallax(mapping, grid_px), strict=True))
             relief = ReliefPart(file=None, baseline=baseline, occluded=occluded, reference_px=grid_px, **tables)
-        lenses = (mapping.fixed_lens, mapping.moving_lens)
+        fixed, moving = mapping.fixed_lens, mapping.moving_lens
         return cls(
             **_source(band),
             status=alignment.status,
             reason=alignment.reason,
             issues=alignment.issues,
             homography=HomographyPart(fixed_to_moving=mapping.fixed_to_moving, space=alignment.space),
-            lenses=None if None in lenses else lenses,
+            lenses=None if fixed is None or moving is None else (fixed, moving),
             field=mapping.field,
             grid=GridPart(reference_px=grid_px, moving_px=mapping(grid_px)),
             relief=relief,
@@ -310,10 +311,12 @@ def _source(band: Band) -> dict[str, Any]:
 def _after(alignment: Alignment) -> Similarity:
     if (residual := alignment.residual) is None:
         return alignment.after
-    shifts = Similarity(
-        residual_px=residual.median_px, residual_p95_px=residual.p95_px, residual_coverage=residual.coverage
+    return replace(
+        alignment.after,
+        residual_px=residual.median_px,
+        residual_p95_px=residual.p95_px,
+        residual_coverage=residual.coverage,
     )
-    return alignment.after | shifts
 
 
 class IlluminationPart(_Part):
@@ -480,7 +483,6 @@ class Sidecar(_Part):
         status = capture_status(bands, accept_predicted_px)
         (width, height), place = reference.size_px, reference.georeference
         is_mosaic = place is not None and place.accuracy_m is None  # else it was calculated from GPS
-        source = {"band": reference.name, "file": reference.path.name, "band_index": reference.band_index}
         return cls(
             agalign=__version__,
             capture=capture.name,
@@ -492,7 +494,14 @@ class Sidecar(_Part):
             camera=capture.camera,
             status="degraded" if status == "ok" and capture.missing_bands else status,
             missing_bands=list(capture.missing_bands),
-            reference=ReferencePart(**source, width=width, height=height, georeferenced=is_mosaic),
+            reference=ReferencePart(
+                band=reference.name,
+                file=reference.path.name,
+                band_index=reference.band_index,
+                width=width,
+                height=height,
+                georeferenced=is_mosaic,
+            ),
             bands=bands,
             parallax=parallax,
             accept_predicted_px=accept_predicted_px,
@@ -566,8 +575,6 @@ def from_version_1(facts: dict[str, Any]) -> dict[str, Any]:
             columns = {"centres_px": "centre_px", "shifts_px": "shift_px", "peaks_sigma": "peak_sigma", "cells": "cell"}
             if all(tile.get("cell") for tile in tiles):
                 metrics["windows"] = {new: [tile[old] for tile in tiles] for new, old in columns.items()}
-            for when in ("before", "after"):
-                metrics[when] = {k: v for k, v in metrics[when].items() if v is not None}
     if output := facts.get("output"):
         for name in ("bytes", "band_files"):
             output.pop(name, None)
