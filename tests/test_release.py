@@ -12,7 +12,7 @@ import yaml
 from agalign import __version__
 from agalign.batch.capture_task import Task
 from agalign.batch.run import Listener, capture_reports
-from agalign.batch.workers import chosen_run
+from agalign.batch.workers import open_workers
 from agalign.cameras.discover import discover
 from agalign.method.device import limit_threads
 from agalign.values import processes
@@ -73,5 +73,5 @@ def test_processes_that_start_from_nothing(flight: Path, tmp_path: Path, monkeyp
     """As on Windows and macOS: they do not share the memory of this process."""
     monkeypatch.setattr(processes, "get_all_start_methods", lambda: ["spawn"])
     tasks = [Task(c, tmp_path, seeded()) for c in discover(flight).captures]
-    with chosen_run(None, 2, limit_threads) as run:
+    with open_workers(None, 2, limit_threads) as run:
         assert [r.state for r in capture_reports(run, tasks, Listener(), None)] == ["done"] * len(tasks)

@@ -212,11 +212,11 @@ def process_capture(task: Task, progress: PairProgress = quiet) -> CaptureReport
 
 def missing_radiometry(capture: Capture, choice: RadiometryChoice) -> str:
     """Return what the bands of a capture lack for the radiometry of a run, and the remedy; empty if nothing."""
-    lacking = [b for b in capture.bands if b.radiometry is None and not b.companion]
+    lacking = [b for b in capture.bands if b.radiometry is None and not b.is_from_photograph]
     if choice == "off" or not lacking:
         return ""
-    if uncalibrated := [b for b in lacking if b.uncalibrated]:  # no choice works without a calibration
-        return f"{uncalibrated[0].uncalibrated} in {', '.join(b.name for b in uncalibrated)}; leave --radiometry out"
+    if without := [b for b in lacking if b.missing_calibration]:  # no choice works without a calibration
+        return f"{without[0].missing_calibration} in {', '.join(b.name for b in without)}; leave --radiometry out"
     bands = ", ".join(b.name for b in lacking) + next((f" ({b.implausible})" for b in lacking if b.implausible), "")
     missing = {
         "sun": f"no usable tags of a light sensor in {bands}; choose --radiometry camera or panel",

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import cv2
 
-from agalign.batch.workers import chosen_run, failure_text, serially
+from agalign.batch.workers import failure_text, open_workers, serially
 from agalign.errors import AgalignError
 from agalign.products.indices.formulas import Index
 from agalign.products.indices.rasters import IndexRasters, IndexReport, update_table, write_rasters
@@ -62,7 +62,7 @@ def run_indices(
     processes = min(jobs or usable_cores(), len(tasks) // captures_worth_a_process)
     rows: list[IndexReport] = []
     try:
-        with chosen_run(executor, processes, cv2.setNumThreads, preload=__name__) as run:
+        with open_workers(executor, processes, cv2.setNumThreads, preload=__name__) as run:
             if run is not serially:
                 tasks = [task.absolute() for task in tasks]
             for number, result in run(do_indices, tasks):

@@ -12,7 +12,7 @@ from agalign.batch.capture_task import quiet
 from agalign.capture.align_bands import PairAligner, aligned_groups
 from agalign.capture.band_pair import BandPair, read_pairs
 from agalign.capture.by_rig import observed
-from agalign.capture.seeding import Start, find_seed, image_groups
+from agalign.capture.seeding import SeededPair, find_seed, image_groups
 from agalign.config import Settings
 from agalign.errors import AgalignError
 from agalign.flight.model import FlightModel
@@ -92,7 +92,7 @@ class LoadedCapture:
     capture: Capture
     groups: list[tuple[list[int], ImageGroup]]
     """Groups of images, each with the indices of its pairs in `starts`."""
-    starts: list[Start]
+    starts: list[SeededPair]
 
     @property
     def similarity_sigma(self) -> float:

@@ -14,7 +14,7 @@ from agalign.batch.capture_task import CaptureReport, Task, do_capture, loaded_m
 from agalign.batch.earlier_results import Remaining, outputs_exist, refuse_other_captures, remaining
 from agalign.batch.flight_learning import learn_flight
 from agalign.batch.render import RenderOptions, refuse_to_overwrite, remove_outputs
-from agalign.batch.workers import Run, chosen_run, failure_text, in_order, serially
+from agalign.batch.workers import Run, failure_text, in_order, open_workers, serially
 from agalign.cameras.discover import FolderScan
 from agalign.config import RunOptions, Settings, WriteSettings
 from agalign.errors import AgalignError, ConfigurationError, InputError, OutputError
@@ -252,7 +252,7 @@ class _FlightRun:
         processes = min(cores, number // CAPTURES_WORTH_A_PROCESS if timeout_s is None else number)
         threads = min(cores, number, _MAX_THREADS)
         executor = self.options.executor
-        with chosen_run(executor, processes, limit_threads, threads, has_timeout=timeout_s is not None) as run:
+        with open_workers(executor, processes, limit_threads, threads, has_timeout=timeout_s is not None) as run:
             flights: list[_Flight] = []
             learn = partial(learn_flight, apply=partial(in_order, run), threads=min(_MAX_THREADS, cores))
             for group, name in zip(groups, model_names(groups), strict=True):

@@ -63,7 +63,7 @@ def serially(function: Callable[[A], R], tasks: Sequence[A], /, **_: object) -> 
 
 
 @contextmanager
-def chosen_run(
+def open_workers(
     executor: Executor | None,
     processes: int,
     initializer: Callable[[int], object],

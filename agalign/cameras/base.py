@@ -146,7 +146,7 @@ def colour_bands(stored: Sequence[Band], lens: Lens | None = None, to_rig: Matri
     """Return the bands of the colour photograph that a camera takes with its multispectral bands."""
     names = ["RGB Red", "RGB Green", "RGB Blue"] if len(stored) >= 3 else ["RGB"]
     return tuple(
-        replace(band, name=name, lens=lens, to_rig=to_rig, one_lens=True, companion=True)
+        replace(band, name=name, lens=lens, to_rig=to_rig, one_lens=True, is_from_photograph=True)
         for band, name in zip(stored, names, strict=False)
     )
 

@@ -52,7 +52,7 @@ class FolderScan:
     @property
     def is_complete(self) -> bool:
         """False if a file or capture is left out that is not an exact copy of another."""
-        return all(p.loses_nothing for p in self.problems)
+        return all(p.is_harmless for p in self.problems)
 
     @property
     def eight_bit(self) -> tuple[Capture, ...]:
@@ -245,7 +245,10 @@ def captures_onto(
     for path in moving:
         if path.resolve() == reference.resolve():
             raise InputError(f"{path}: is the reference itself; give the mosaics to be aligned to it")
-        bands = [fixed, *(replace(b, one_lens=True, companion=False) for b in _georeferenced_bands(path, max_pixels))]
+        bands = [
+            fixed,
+            *(replace(b, one_lens=True, is_from_photograph=False) for b in _georeferenced_bands(path, max_pixels)),
+        ]
         captured_at = read_tags(path).captured_at
         captures.append(Capture(path.stem, Path(), tuple(with_unique_band_names(bands)), 0, captured_at=captured_at))
     return with_unique_capture_names(captures)

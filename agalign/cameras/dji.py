@@ -63,7 +63,7 @@ class Dji(Camera):
         if to_colour is None:
             return list(bands)
         to_rig = geometry.invert(to_colour)
-        return [replace(b, to_rig=to_rig) if b.companion and b.to_rig is None else b for b in bands]
+        return [replace(b, to_rig=to_rig) if b.is_from_photograph and b.to_rig is None else b for b in bands]
 
     def pose(self, tags: Tags) -> Pose | None:
         heading_deg, pitch_deg = _heading_deg(tags), tags.number(NAMESPACE, "GimbalPitchDegree")

@@ -56,7 +56,7 @@ def without_copies(files: Sequence[ImageFile]) -> tuple[list[ImageFile], list[Pr
                 text = f"is left out as a changed copy of {original.path.name}: same band and capture; keep one of them"
             else:
                 continue
-            copies[file.path] = Problem(file.path, InputError(f"{file.path}: {text}"), loses_nothing=is_exact)
+            copies[file.path] = Problem(file.path, InputError(f"{file.path}: {text}"), is_harmless=is_exact)
             break
         else:
             kept.setdefault(by_tags, file)
@@ -88,7 +88,7 @@ def with_tags_of_flight(files: Sequence[ImageFile]) -> tuple[list[ImageFile], li
         if lacking:
             some = ", ".join([*lacking][:_MAX_NAMES]) + (", …" if len(lacking) > _MAX_NAMES else "")
             text = f"{file.path}: its XMP packet is damaged and lacks {some}; copy the file from the card again"
-            problems.append(Problem(file.path, InputError(text), loses_nothing=True))
+            problems.append(Problem(file.path, InputError(text), is_harmless=True))
         if "BandName" in lacking and of_band is not None and len(file.bands) == len(of_band.bands) == 1:
             (own,), (band,) = file.bands, of_band.bands
             own = replace(own, name=band.name, wavelength_nm=band.wavelength_nm, bandwidth_nm=band.bandwidth_nm)
@@ -111,7 +111,7 @@ def tag_problems(files: Sequence[ImageFile]) -> list[Problem]:
         others = f", and so in {counted(len(wrong) - 1, 'other file')}" if len(wrong) > 1 else ""
         advice = "lens, rig and radiometry are not used: give the original images"
         texts[wrong[0].path] = f"{wrong[0].other_lens}{others}; {advice}"
-    return [Problem(path, InputError(f"{path}: {text}"), loses_nothing=True) for path, text in texts.items()]
+    return [Problem(path, InputError(f"{path}: {text}"), is_harmless=True) for path, text in texts.items()]
 
 
 def _similar(file: ImageFile) -> tuple[object, object]:
@@ -133,7 +133,7 @@ def group_files(files: Iterable[ImageFile], *, with_rgb: bool = False) -> list[l
     _join_folders(groups)
     _add_files_without_id(groups)
     _drop_copies(groups)
-    return [sorted(group, key=lambda f: f.bands[0].companion) for group in groups.values()]
+    return [sorted(group, key=lambda f: f.bands[0].is_from_photograph) for group in groups.values()]
 
 
 def _join_photographs(groups: dict[_GroupKey, list[ImageFile]], *, with_rgb: bool) -> None:
@@ -218,7 +218,7 @@ def _is_tiff(file: ImageFile) -> bool:
 
 def _is_picture_band(file: ImageFile) -> bool:
     """True for a JPEG or PNG with the name of a band."""
-    return file.camera.name == Generic.name and not _is_tiff(file) and not file.bands[0].companion
+    return file.camera.name == Generic.name and not _is_tiff(file) and not file.bands[0].is_from_photograph
 
 
 def pattern_clashes(files: Sequence[ImageFile], pattern: str) -> list[Problem]:

@@ -69,7 +69,7 @@ class MicaSense(Camera):
             to_rig=rays_to_rig(lens, rotation(*pix4d.rig_degrees(tags))),
             parallax_direction=known_parallax if offset is None else (-offset[0], -offset[1]),
             radiometry=centikelvin if is_thermal(band) else _radiometry(tags),
-            uncalibrated="" if is_thermal(band) else _without_calibration(tags),
+            missing_calibration="" if is_thermal(band) else _without_calibration(tags),
             lens_offset=offset,
         )
         return (band,)

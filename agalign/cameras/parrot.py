@@ -51,7 +51,7 @@ class Sequoia(Camera):
         band = replace(described, name=name, lens=lens, to_rig=to_rig)
         # Parrot's formula for them has not been compared with a reference.
         why = "no tags for radiance (SensorModel and IrradianceList are not used)"
-        return (replace(band, uncalibrated=why if tags.text(pix4d.NAMESPACE, "SensorModel") else ""),)
+        return (replace(band, missing_calibration=why if tags.text(pix4d.NAMESPACE, "SensorModel") else ""),)
 
 
 def _fisheye_lens(tags: Tags, size_px: Size) -> Lens | None:

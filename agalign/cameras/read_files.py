@@ -30,7 +30,7 @@ class Problem:
 
     path: Path
     error: AgalignError
-    loses_nothing: bool = False
+    is_harmless: bool = False
     """True for a file with the same bytes as another one, which takes part, and for a file used with fewer tags."""
 
     @property
@@ -92,7 +92,7 @@ def read_file(path: Path, cameras: Iterable[Camera], options: DiscoverOptions) -
     if len(pages) > 1:
         named = [replace(band, band_index=band.page) for band in named]
     panel, scale = panel_in(tags, size_px), _scale(tags, size_px)
-    used = (replace(b, panel=panel) for b in named if options.with_rgb or not b.companion)
+    used = (replace(b, panel=panel) for b in named if options.with_rgb or not b.is_from_photograph)
     checked = [_with_lens_of_image(band, scale) for band in used]
     other_lens = next((why for _, why in checked if why), "")
     return ImageFile(path, camera, tags, tuple(_with_plausible_tags(band) for band, _ in checked), scale, other_lens)
@@ -121,7 +121,7 @@ def _with_lens_of_image(band: Band, scale: PixelScale) -> tuple[Band, str]:
     why = f"the lens in the tags ({at}) is not that of an image of {width} x {height} px"
     band = replace(band, lens=None, to_rig=None, other_to_rig=None)
     if band.radiometry is not None and band.radiometry.is_of_light:  # its vignetting is of the same image
-        band = replace(band, radiometry=None, uncalibrated=f"no usable tags for radiance ({why})")
+        band = replace(band, radiometry=None, missing_calibration=f"no usable tags for radiance ({why})")
     return band, why
 
 
@@ -131,7 +131,7 @@ def _with_plausible_tags(band: Band) -> Band:
         return band
     radiometry, problem = plausible(band.radiometry, band.size_px)
     reason = f"no usable tags for radiance ({problem})" if radiometry is None else ""
-    return replace(band, radiometry=radiometry, implausible=problem, uncalibrated=reason)
+    return replace(band, radiometry=radiometry, implausible=problem, missing_calibration=reason)
 
 
 def _stored_pages(path: Path, max_pixels: int) -> list[tuple[Band, ...]]:

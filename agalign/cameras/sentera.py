@@ -63,7 +63,7 @@ def _channel_bands(path: Path, tags: Tags, stored: Sequence[Band]) -> tuple[Band
     bandpass = next((k for k in _CHANNELS if k in f"{path.parent.name} {tags.model}".upper()), None)
     if bandpass is None:
         # The colour camera of the Double 4K takes part by default, that of the 6X does not.
-        return tuple(replace(b, companion="6X" in tags.model.upper()) for b in colour_bands(stored))
+        return tuple(replace(b, is_from_photograph="6X" in tags.model.upper()) for b in colour_bands(stored))
     return tuple(
         replace(stored[index - 1], name=name, wavelength_nm=wavelength, one_lens=True)
         for index, (name, wavelength) in _CHANNELS[bandpass].items()

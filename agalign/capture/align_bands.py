@@ -9,10 +9,10 @@ from agalign.capture.band_pair import BandPair, read_pairs
 from agalign.capture.by_relief import aligned_by_relief
 from agalign.capture.by_rig import bands_to_learn, with_predictions
 from agalign.capture.by_windows import aligned_by_windows, with_lens_shapes
-from agalign.capture.decision import at_seed, decided, of_one_geometry, verified, without_result
+from agalign.capture.decision import decided, failed_at_seed, fall_back_to_seed, verified, with_one_geometry
 from agalign.capture.full_resolution import at_full_resolution
 from agalign.capture.map_estimate import map_estimate
-from agalign.capture.seeding import Start, corrected, find_seed, image_groups
+from agalign.capture.seeding import SeededPair, corrected, find_seed, image_groups
 from agalign.capture.warped_pair import Candidate, with_metrics
 from agalign.config import SeedSettings, Settings
 from agalign.flight.model import FlightModel
@@ -147,28 +147,28 @@ class PairAligner:
             self.refine(starts)
             self._learn(starts, capture, scratch=scratch)
             self._align_by_windows(starts)
-            self.result = of_one_geometry(pairs, self.result)
+            self.result = with_one_geometry(pairs, self.result)
         return self.result
 
-    def _seeded(self, pairs: Sequence[BandPair]) -> list[Start]:
+    def _seeded(self, pairs: Sequence[BandPair]) -> list[SeededPair]:
         """Return the pairs with a seed; the other pairs are failed."""
-        starts: list[Start] = []
+        starts: list[SeededPair] = []
         for pair in pairs:
             self.progress(pair.name, "seeding", 0.0)
             seed = find_seed(pair, self.settings.seed, self.model)
             if isinstance(seed, Issue):
                 kind, matrix = next(iter(pair.seed_matrices.items()))
-                self.result[pair.name] = without_result(pair, Seed(kind, matrix, 0.0), seed)
+                self.result[pair.name] = failed_at_seed(pair, Seed(kind, matrix, 0.0), seed)
             else:
                 starts.append((pair, seed))
         return starts
 
-    def _keep_seeds(self, starts: Sequence[Start]) -> None:
+    def _keep_seeds(self, starts: Sequence[SeededPair]) -> None:
         """Use the seeds as results, as the user requested."""
         for pair, seed in starts:
-            self.result[pair.name] = at_seed(pair, seed, (Issue(SEED_ASKED_FOR),), seed_only=True)
+            self.result[pair.name] = fall_back_to_seed(pair, seed, (Issue(SEED_ASKED_FOR),), seed_only=True)
 
-    def refine(self, starts: Sequence[Start]) -> None:
+    def refine(self, starts: Sequence[SeededPair]) -> None:
         """Align the pairs of the bands that the flight's network contains with this network."""
         model = self.model
         if model is None or self.settings.joint.recipe == "paper":
@@ -177,7 +177,7 @@ class PairAligner:
         sides = [model.side(pair.name) or 0 for pair, _ in known]
         patches = PATCHES if model.rig is None else FLIGHT_PATCHES
 
-        def optimised(some: Sequence[Start], of_sides: Sequence[int]) -> Results:
+        def optimised(some: Sequence[SeededPair], of_sides: Sequence[int]) -> Results:
             return self._optimised(
                 some,
                 of_sides,
@@ -191,7 +191,7 @@ class PairAligner:
             results[k] = result if is_retrieved(result) else results[k]
         self.verify(known, results)
 
-    def _learn(self, starts: Sequence[Start], capture: Capture | None, *, scratch: bool) -> None:
+    def _learn(self, starts: Sequence[SeededPair], capture: Capture | None, *, scratch: bool) -> None:
         """Align pairs with networks that are learned from scratch."""
         limit_px = self.settings.check.accept_predicted_px
         done = {name for name, a in self.result.items() if not scratch or is_delivered(a, limit_px)}
@@ -216,14 +216,14 @@ class PairAligner:
         ):
             self.result = before
 
-    def _align_by_windows(self, starts: Sequence[Start]) -> None:
+    def _align_by_windows(self, starts: Sequence[SeededPair]) -> None:
         """Align by windows the pairs without retrieval of held-out patches."""
         if self._may_be_homography:
             for pair, _ in starts:
                 self.result[pair.name] = aligned_by_windows(pair, self.result[pair.name])
 
     def _optimised(
-        self, starts: Sequence[Start], sides: Sequence[int], align: Callable[[ImageGroup, Progress], Results]
+        self, starts: Sequence[SeededPair], sides: Sequence[int], align: Callable[[ImageGroup, Progress], Results]
     ) -> Results:
         """Return the results of the pairs, by image group, with the network's `sides`."""
         if not starts:
@@ -232,7 +232,7 @@ class PairAligner:
         report("refining", 0.0)
         return aligned_groups(image_groups(starts, sides), lambda group: align(group, report))
 
-    def verify(self, starts: Sequence[Start], results: Results) -> None:
+    def verify(self, starts: Sequence[SeededPair], results: Results) -> None:
         """Combine the results of a capture by MAP estimation and verify each one.
 
         For an observation of the rig, no displacement fields are fitted. A model family that the user chose is not
@@ -250,7 +250,7 @@ class PairAligner:
         for name, candidate in ((c.pair.name, c) for c in candidates if c.pair.name not in alignments):
             self.progress(name, "checking", 0.0)
             alignments[name] = verified(candidate, "never" if self.is_observation or name in along_a_line else use)
-        self.result |= of_one_geometry([pair for pair, _ in starts], alignments)
+        self.result |= with_one_geometry([pair for pair, _ in starts], alignments)
 
     def candidates(self, measured: Sequence[Candidate]) -> list[Candidate]:
         """Return candidates after the MAP estimation of all bands of the capture."""
@@ -258,7 +258,10 @@ class PairAligner:
             return list(measured)
         pairs, joint = [c.pair for c in measured], {c.pair.name: c.joint for c in measured}
         residuals = {c.pair.name: c.warped.residual for c in measured}
-        halves = ({name: r.half(black=is_black) for name, r in residuals.items()} for is_black in (True, False))
+        halves = (
+            {name: r.chessboard_half(even=is_even_cell) for name, r in residuals.items()}
+            for is_even_cell in (True, False)
+        )
         rig = None if self.model is None else self.model.rig
         estimates, black, white = (map_estimate(pairs, joint, some, rig) for some in (residuals, *halves))
         return [

@@ -23,11 +23,11 @@ from agalign.capture.common_parallax import (
     MIN_BANDS,
     MIN_PARALLAX_PX,
     common_parallax_px,
-    comparable,
     consistent_bands,
     layout_of,
+    parallax_groups,
 )
-from agalign.capture.decision import decided, predicted, without_result
+from agalign.capture.decision import decided, failed_at_seed, predicted
 from agalign.capture.warped_pair import Candidate, WarpedPair
 from agalign.errors import GeometryError
 from agalign.fit.adjustment import (
@@ -74,7 +74,7 @@ def aligned_by_relief(
     # Along one line, larger common displacements are those of shadows or leaves, not of lenses; a displacement field
     # would follow them too.
     max_line_px = 1.0
-    for group in comparable(candidates):
+    for group in parallax_groups(candidates):
         if len(group) < MIN_BANDS:
             continue
         parallax_px, on_a_line = common_parallax_px(group)
@@ -129,7 +129,7 @@ class _Band:
         """Return the alignment by a mapping with a relief that passes verification in held-out windows."""
         kind: Geometry = "relief" if mapping.field is None else "relief and field"
         p95_px: dict[Geometry, float] = {"homography": self.by_homography.p95_px, kind: held_out.p95_px}
-        without = without_result(self.candidate.pair, self.candidate.seed)
+        without = failed_at_seed(self.candidate.pair, self.candidate.seed)
         lens_std_px = self.candidate.pair.unknown_lens_std_px
         measured = replace(without, mapping=mapping, joint=self.joint, residual=held_out, lens_std_px=lens_std_px)
         return decided(replace(measured, candidates=p95_px))
@@ -183,11 +183,11 @@ def _aligned_group(group: Sequence[Candidate], candidates: Sequence[Candidate]) 
     if estimate is None:
         return {}
     result: Alignments = {}
-    for band, verifying in zip(estimate.bands, cycle(estimate.from_others), strict=False):
+    for band, verifying in zip(estimate.bands, cycle(estimate.verifying_reliefs), strict=False):
         result |= estimate.alignment(band, verifying)
     if not _is_better(estimate.bands, result):
         return {}
-    result |= estimate.for_others(candidates)
+    result |= estimate.align_other_bands(candidates)
     if not any(c.pair.has_rig for c in group):
         result |= {
             name: _with_field(candidate.pair, result[name])
@@ -203,7 +203,7 @@ class _Estimate:
 
     bands: Sequence[_Band]
     relief: Relief
-    from_others: Sequence[Relief]
+    verifying_reliefs: Sequence[Relief]
     """From the bands of `_verifying`: relief i of n verifies the bands i, i + n and so on."""
 
     @classmethod
@@ -238,15 +238,17 @@ class _Estimate:
         if not are_of_lenses(baselines, layout) or (layout is None and are_on_a_line(baselines)):
             return None
         selections = [range(len(bands)), *_verifying(range(len(bands)))]
-        relief, *from_others = matching.refined(_views(bands), selections)
-        result = cls(bands, replace(relief, std_px=_std_px(from_others)), from_others)
+        relief, *verifying_reliefs = matching.refined(_views(bands), selections)
+        result = cls(bands, replace(relief, std_px=_std_px(verifying_reliefs)), verifying_reliefs)
         return result.negated if layout is None and nearer_sign(matched, baselines) < 0 else result
 
     @property
     def negated(self) -> "_Estimate":
         """The estimate with the opposite sign of reliefs and baselines, which has the same parallax."""
         bands = [replace(b, baseline=(-b.baseline[0], -b.baseline[1])) for b in self.bands]
-        return replace(self, bands=bands, relief=self.relief.negated, from_others=[r.negated for r in self.from_others])
+        return replace(
+            self, bands=bands, relief=self.relief.negated, verifying_reliefs=[r.negated for r in self.verifying_reliefs]
+        )
 
     def fitted(self, candidate: Candidate) -> _Band | None:
         """Fit homography and baseline of a band under the relief of the others; None if too few windows are measured.
@@ -268,9 +270,9 @@ class _Estimate:
         if fitted is None or fitted[0].parallax is None:
             return None
         baseline, covariance_px2 = fitted[0].parallax.baseline, fitted[1].covariance_px2[:8, :8]
-        return _Band(candidate, fitted[0].of_the_plane, baseline, covariance_px2)
+        return _Band(candidate, fitted[0].without_parallax, baseline, covariance_px2)
 
-    def for_others(self, candidates: Sequence[Candidate]) -> Alignments:
+    def align_other_bands(self, candidates: Sequence[Candidate]) -> Alignments:
         """Align or predict bands of the same reference where windows allow it, except those of the estimate: a relief
         does not verify a band that it is estimated from.
         """
@@ -304,7 +306,7 @@ class _Estimate:
         if not is_known or warped.alias_peak().ratio > MAX_ALIAS_PEAK:
             return {}
         joint = None if candidate.issue is not None else candidate.joint
-        by_relief = replace(without_result(pair, candidate.seed), mapping=mapping, joint=joint, residual=residual)
+        by_relief = replace(failed_at_seed(pair, candidate.seed), mapping=mapping, joint=joint, residual=residual)
         return {band.name: predicted(by_relief, pair, warped.std_px(band.joint), Issue(OTHER_GEOMETRY), *issues)}
 
 
@@ -325,11 +327,11 @@ def _is_better(bands: Sequence[_Band], result: Alignments) -> bool:
         alignment, plane = result.get(band.name), band.by_homography
         is_fitted = alignment is not None and (alignment.status == "aligned" or plane.p95_px > MAX_SHIFT_PX)
         known = alignment.residual if alignment is not None and is_fitted else None
-        gains.append(-math.inf if known is None else _gain_px(plane, known))
+        gains.append(-math.inf if known is None else _decrease_px(plane, known))
     return median_high(gains) >= 0
 
 
-def _gain_px(plane: Residual, relief: Residual) -> float:
+def _decrease_px(plane: Residual, relief: Residual) -> float:
     """Return the decrease of the p95 of held-out windows by a relief, minus the increase of their median.
 
     If most windows are on the reference plane, the noise of the relief increases the median by some hundredths of a px.

@@ -123,7 +123,7 @@ def _predicted(pair: BandPair, alignment: Alignment, prediction: Prediction, par
         return decided(replace(alignment, mapping=by_rig.mapping, residual=residual, prediction=prediction))
     off_px = distance_px(pair.scales.between_files(rotated), prediction.fixed_to_moving, pair.reference_file_px)
     issues = Issue(UNEXPECTED_PX, off_px, MAX_UNEXPECTED_PX), *alignment.issues
-    return decided(replace(alignment, mapping=alignment.of_the_seed, issues=issues, prediction=None, residual=None))
+    return decided(replace(alignment, mapping=alignment.seed_mapping, issues=issues, prediction=None, residual=None))
 
 
 def _with_added_error(prediction: Prediction, error_px: float) -> Prediction:

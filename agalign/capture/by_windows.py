@@ -57,7 +57,7 @@ def _aligned(pair: BandPair, alignment: Alignment) -> Alignment | None:
     start = WarpedPair.of(pair, pair.mapping(alignment.fixed_to_moving))
     fitted = fit_in_rounds(
         start.mapping,
-        lambda mapping: WarpedPair.of(pair, mapping, start.windows).residual.half(black=True),
+        lambda mapping: WarpedPair.of(pair, mapping, start.windows).residual.chessboard_half(even=True),
         pair.fixed.size_px,
         lambda fit: fit.max_px <= max_step_px,
     )
@@ -65,7 +65,7 @@ def _aligned(pair: BandPair, alignment: Alignment) -> Alignment | None:
         return None
     mapping, fit = fitted
     warped_pair = WarpedPair.of(pair, mapping, start.windows)
-    held_out = warped_pair.residual.half(black=False)
+    held_out = warped_pair.residual.chessboard_half(even=False)
     retrieval, chance = (0.0, 0.0) if alignment.joint is None else (alignment.joint.retrieval, alignment.joint.chance)
     joint = result_of_windows(mapping.fixed_to_moving).with_homography(mapping.fixed_to_moving, fit.covariance_px2)
     joint = replace(joint, retrieval=retrieval, chance=chance, last_step_px=fit.max_px)
@@ -100,7 +100,7 @@ def with_lens_shapes(pairs: Sequence[BandPair], result: Alignments, rig: Rig | N
         is_inaccurate = own is not None and [i.kind for i in alignment.issues] == [INACCURATE]
         if not is_inaccurate or own is None or residual is None or alignment.mapping.parallax is not None:
             continue
-        plane, size_px = alignment.mapping.of_the_plane, pair.fixed.size_px
+        plane, size_px = alignment.mapping.without_parallax, pair.fixed.size_px
         if "geo" in pair.seed_matrices or not unobserved_quarters(
             residual.measured_px, size_px, points_in_frame(plane, *pair.sizes_px)
         ):

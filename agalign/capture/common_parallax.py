@@ -17,7 +17,7 @@ MIN_PARALLAX_PX = 0.3
 """Minimum p95 of the parallax of windows for a relief; windows of flat fields have up to 0.2 px, mostly noise."""
 
 
-def comparable(candidates: Sequence[Candidate]) -> list[list[Candidate]]:
+def parallax_groups(candidates: Sequence[Candidate]) -> list[list[Candidate]]:
     """Group the bands by reference image and space of the homographies; sharp ones only, if these are enough.
 
     Bands without retrieval of held-out patches, with few measured windows or low resolution are excluded.

@@ -41,19 +41,19 @@ def decided(alignment: Alignment, *, is_seed_usable: bool = False) -> Alignment:
     return replace(alignment, status=status, issues=issues)
 
 
-def without_result(pair: BandPair, seed: Seed, *issues: Issue) -> Alignment:
+def failed_at_seed(pair: BandPair, seed: Seed, *issues: Issue) -> Alignment:
     """Return a failed alignment with the mapping of a seed."""
     return decided(Alignment(pair.mapping(seed.fixed_to_moving), pair.fixed.size_px, "failed", issues, seed))
 
 
-def at_seed(pair: BandPair, seed: Seed, issues: Sequence[Issue], *, seed_only: bool = False) -> Alignment:
+def fall_back_to_seed(pair: BandPair, seed: Seed, issues: Sequence[Issue], *, seed_only: bool = False) -> Alignment:
     """Return an alignment with the mapping of the seed, which is usable if it is trusted or with `seed_only`."""
     expected = min(
         ((std_px, kind) for kind, std_px in pair.seed_std_px.items() if kind in pair.seed_matrices), default=None
     )
     if expected is not None and not seed_only and not pair.is_expected(seed.fixed_to_moving):
         seed = Seed(expected[1], pair.seed_matrices[expected[1]], 0.0, trusted=True)
-    result = without_result(pair, seed, *issues)
+    result = failed_at_seed(pair, seed, *issues)
     result = replace(result, residual=WarpedPair.of(pair, result.mapping).residual)
     return decided(result, is_seed_usable=seed.trusted or seed_only)
 
@@ -67,7 +67,7 @@ def predicted(alignment: Alignment, pair: BandPair, std_px: float, *issues: Issu
     return decided(replace(alignment, issues=(*issues, *alignment.issues), prediction=prediction))
 
 
-def of_one_geometry(pairs: Sequence[BandPair], result: Alignments) -> Alignments:
+def with_one_geometry(pairs: Sequence[BandPair], result: Alignments) -> Alignments:
     """Return the alignments by name: if a capture has a relief, homographies that are `aligned` become `predicted`.
 
     A spectral index would mix two geometries otherwise. Thermal bands, which have another reference image, keep theirs.
@@ -90,7 +90,7 @@ def verified(candidate: Candidate, use: ReliefUse) -> Alignment:
     """
     pair, seed = candidate.pair, candidate.seed
     if candidate.issue is not None:
-        return at_seed(pair, seed, [candidate.issue])
+        return fall_back_to_seed(pair, seed, [candidate.issue])
     joint = _unchanged_if_aligned(candidate.joint, pair)
     plane = candidate.warped.with_mapping(pair.mapping(joint.fixed_to_moving))
     if candidate.by_halves is not None and joint is candidate.joint:
@@ -99,9 +99,9 @@ def verified(candidate: Candidate, use: ReliefUse) -> Alignment:
     if _needs_field(use, issues, has_rig=pair.has_rig):
         chosen, issues, p95_px = _with_field(plane, joint, issues)
     if not all(issue.kind in PREDICTED_WITH for issue in issues):
-        return replace(at_seed(pair, seed, issues), joint=joint, candidates=p95_px)
+        return replace(fall_back_to_seed(pair, seed, issues), joint=joint, candidates=p95_px)
     alignment = replace(
-        without_result(pair, seed),
+        failed_at_seed(pair, seed),
         mapping=chosen.mapping,
         issues=issues,
         joint=joint,

@@ -51,7 +51,7 @@ def at_full_resolution(reference: Band, moving: Band, alignment: Alignment) -> A
         refined = _refined(alignment, moving, for_fit, held_out, reference.size_px)
     except UnreadableFileError as error:
         issue = Issue(UNREADABLE, detail=str(error))
-        without = replace(alignment, mapping=alignment.of_the_seed, issues=(issue,), prediction=None)
+        without = replace(alignment, mapping=alignment.seed_mapping, issues=(issue,), prediction=None)
         return decided(replace(without, joint=None, residual=None))
     return alignment if refined is None else refined
 

@@ -23,7 +23,7 @@ from agalign.values.geometry import Matrix
 from agalign.values.issues import BLANK_MOVING, BLANK_REFERENCE, NO_SUCH_SEED, Issue
 from agalign.verify.checks import seed_fits
 
-Start = tuple[BandPair, Seed]
+SeededPair = tuple[BandPair, Seed]
 """A pair with its initial alignment."""
 _MIN_OVERLAP = 0.2
 """Minimum share of the reference that the moving image covers: the correlation is circular and meaningless for small
@@ -89,7 +89,7 @@ def _best_match(pair: BandPair, model: FlightModel | None, best: Seed) -> Seed:
     return best
 
 
-def corrected(start: Start) -> Start | None:
+def corrected(start: SeededPair) -> SeededPair | None:
     """Return a pair with its seed corrected by windows: the scale of tags may be wrong by several px at the corners.
 
     None if the windows do not determine a correction, or if it does not fit them better.
@@ -161,7 +161,7 @@ def _network(pair: BandPair, model: FlightModel | None) -> Descriptor:
     return matching_network(model.net, model.side(pair.name) or 1, channels)
 
 
-def image_groups(starts: Sequence[Start], sides: Sequence[int] = ()) -> list[tuple[list[int], ImageGroup]]:
+def image_groups(starts: Sequence[SeededPair], sides: Sequence[int] = ()) -> list[tuple[list[int], ImageGroup]]:
     """Group the pairs with the same reference image and space for the joint method.
 
     Returns the indices of the pairs and the images of each group. `sides` are the network's sides of the pairs, by

@@ -80,7 +80,7 @@ class WarpedPair:
             residual_under(self.residual, self.mapping, replace(self.mapping, fixed_to_moving=matrix)).shifts_px
             for matrix in by_halves
         )
-        shifts_px = np.where(self.residual.is_black[:, None], by_white_px, by_black_px)
+        shifts_px = np.where(self.residual.is_even_cell[:, None], by_white_px, by_black_px)
         return replace(self, residual=self.residual.with_shifts(shifts_px))
 
     def alias_peak(self) -> AliasPeak:
@@ -95,8 +95,8 @@ class WarpedPair:
 
     def separate_windows(self) -> Residual:
         """Return the residual of windows that cover the image once."""
-        usual, is_black = self.pair.windows, self.residual.is_black
-        is_complete = self.windows is usual and is_black.any() and not is_black.all()  # not one half of them
+        usual, is_even_cell = self.pair.windows, self.residual.is_even_cell
+        is_complete = self.windows is usual and is_even_cell.any() and not is_even_cell.all()  # not one half of them
         return self.residual if is_complete else usual.residuals(self.warped)
 
     def common_px(self) -> Points:

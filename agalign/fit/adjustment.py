@@ -287,7 +287,7 @@ class WindowShifts:
             if with_lens_shapes and mapping.field is not None:
                 shifts[rows, band] += mapping.field(xy)
             peaks[rows, band] = residual.peaks_sigma[measured]
-        points = mappings[0].of_the_plane.undistorted(centres_px)
+        points = mappings[0].without_parallax.undistorted(centres_px)
         return cls(centres_px, points, shifts, peak_weights(peaks))
 
     def __len__(self) -> int:

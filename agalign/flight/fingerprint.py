@@ -15,7 +15,7 @@ from agalign.values.capture import Capture
 from agalign.values.files import open_regular
 from agalign.values.lens import Lens
 
-Fact = str | int | float | bool | None | np.ndarray | Lens | Sequence["Fact"]
+HashInput = str | int | float | bool | None | np.ndarray | Lens | Sequence["HashInput"]
 
 
 def estimation_fingerprint(capture: Capture, settings: Settings) -> str:
@@ -39,7 +39,7 @@ def render_fingerprint(capture: Capture, settings: WriteSettings) -> str:
     """Return the hash of everything that the products of an estimated capture depend on, apart from the list of
     indices, which are independent of each other.
     """
-    facts: list[Fact] = []
+    facts: list[HashInput] = []
     for b in capture.bands:
         calibration = None if b.radiometry is None else (b.radiometry.quantity, b.radiometry.gain)
         georeference = None if b.georeference is None else b.georeference.transform
@@ -49,7 +49,7 @@ def render_fingerprint(capture: Capture, settings: WriteSettings) -> str:
 
 def _fingerprint(capture: Capture, *stages: SettingsModel) -> str:
     """Return the hash of the files of a capture, the tags that the estimation uses, settings and the version."""
-    bands: list[Fact] = []
+    bands: list[HashInput] = []
     for b in capture.bands:
         # A georeference by the pose of the camera is for the output alone.
         is_georeferenced = b.georeference is not None and b.georeference.accuracy_m is None
@@ -57,7 +57,7 @@ def _fingerprint(capture: Capture, *stages: SettingsModel) -> str:
     return hashed(__version__, *(s.model_dump_json() for s in stages), capture.reference_index, bands)
 
 
-def hashed(*facts: Fact) -> str:
+def hashed(*facts: HashInput) -> str:
     """Return the first 16 hexadecimal digits of the SHA-256 of the facts."""
     return hashlib.sha256(json.dumps(facts, default=_plain).encode()).hexdigest()[:16]
 

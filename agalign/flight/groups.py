@@ -116,7 +116,7 @@ class CameraOverview:
     """Median ground sample distance of the reference."""
     radiometry: tuple[RadiometryChoice, ...]
     """Values of `--radiometry` that the tags of all captures support; panels are not considered."""
-    uncalibrated: str = ""
+    missing_calibration: str = ""
     """Missing or unused tags that prevent a calibration, in words."""
     gsd_per_height: float | None = None
     """Ground sample distance per metre of height, from the focal length of the reference."""
@@ -135,7 +135,7 @@ class CameraOverview:
         if self.gsd_m is None and self.gsd_per_height is not None:
             parts.append(f"GSD {1e4 * self.gsd_per_height:.1f} cm at a height of 100 m")
         kinds = {"camera": "radiance by calibration", "sun": "reflectance by light sensor"}
-        none = self.uncalibrated or "none in the tags"
+        none = self.missing_calibration or "none in the tags"
         parts.append(f"radiometry: {', '.join(kinds[r] for r in self.radiometry) or none}")
         return ", ".join(parts)
 
@@ -168,7 +168,9 @@ def _overview(name: str, serial: str, captures: Sequence[Capture]) -> CameraOver
         altitude_m=(min(altitudes_m), max(altitudes_m)) if altitudes_m else None,
         gsd_m=gsd_m,
         gsd_per_height=_gsd_per_height(typical),
-        uncalibrated=next((b.uncalibrated for c in captures for b in c.bands if b.uncalibrated), ""),
+        missing_calibration=next(
+            (b.missing_calibration for c in captures for b in c.bands if b.missing_calibration), ""
+        ),
         radiometry=tuple(choice for choice in choices if all(_supports(c, choice) for c in captures)),
     )
 
@@ -189,7 +191,7 @@ def _gsd_per_height(capture: Capture) -> float | None:
 
 def _supports(capture: Capture, choice: RadiometryChoice) -> bool:
     bands = with_radiometry(capture, choice, {}).bands
-    return all(b.radiometry is not None for b in bands if not b.companion)
+    return all(b.radiometry is not None for b in bands if not b.is_from_photograph)
 
 
 def _key(capture: Capture, bands: Iterable[Band]) -> str:

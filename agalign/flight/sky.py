@@ -67,7 +67,7 @@ def sky_cues(capture: Capture) -> tuple[str, ...]:
     if any(re.search(r"(?:^|[-_. ])sky(?:$|[-_. ])", name, re.IGNORECASE) for name in names):
         cues.append("its folder or name contains 'sky'")
     # The sky has little signal in thermal bands.
-    bands = [b for b in capture.bands if not is_thermal(b) and not b.companion]
+    bands = [b for b in capture.bands if not is_thermal(b) and not b.is_from_photograph]
     if cues and bands and all(map(_is_smooth, bands)):
         cues.append("no band has texture")
     # A single cue also occurs in other captures.

@@ -108,7 +108,7 @@ class LevelBand:
     converged: bool = False
     """True after the first short step on psi; updates continue until those of all images are short."""
 
-    def shows(self, keypoints: Keypoints) -> Tensor:
+    def is_inside_moving(self, keypoints: Keypoints) -> Tensor:
         """Return (N,) True for each keypoint of I with a patch of only valid pixels in I'."""
         magnification = self.h[:2, :2].det().abs().sqrt()
         clearance = self.view.clearance_at(transform(self.h, keypoints.xy))
@@ -117,7 +117,7 @@ class LevelBand:
     def overlaps(self, keypoints: Keypoints) -> Tensor:
         """Return (N,) True for each keypoint of I with a patch of only valid pixels in both images."""
         inside_fixed = self.fixed_view.clearance_at(keypoints.xy) > footprint_radius(keypoints.scale) + 1
-        return inside_fixed & self.shows(keypoints)
+        return inside_fixed & self.is_inside_moving(keypoints)
 
     def patches(self, keypoints: Keypoints) -> Tensor:
         """Return B(w(x; psi); I'), (N, C, 16, 16); the homography maps each sample position, not only the keypoint."""

@@ -136,9 +136,9 @@ def best_shift(net: Descriptor, level: Level, band: LevelBand, keypoints: Keypoi
     Only patches inside both images count. Returns zeros if the decrease of L0 is less than _MIN_GAIN_SIGMA standard
     errors over the patches that are visible with and without the shift.
     """
-    nowhere = band.h.new_zeros(2)
+    no_shift = band.h.new_zeros(2)
     if len(keypoints) < MIN_KEYPOINTS:
-        return nowhere
+        return no_shift
     f = level.fixed.describe(net, keypoints)
     count = int(radius_px / _SEARCH_STEP_PX)
     offsets = torch.arange(-count, count + 1) * _SEARCH_STEP_PX
@@ -146,16 +146,16 @@ def best_shift(net: Descriptor, level: Level, band: LevelBand, keypoints: Keypoi
     shifts = shifts[shifts.norm(dim=1) <= radius_px]
     few = torch.arange(min(_PRESELECTION_PATCHES, len(keypoints)), device=band.h.device)
     means = _means(_shifted_losses(net, band, keypoints[few], f[few], shifts))
-    candidates = torch.cat([nowhere[None], shifts[means.argsort()[:_CANDIDATE_SHIFTS]]])
+    candidates = torch.cat([no_shift[None], shifts[means.argsort()[:_CANDIDATE_SHIFTS]]])
     losses = _shifted_losses(net, band, keypoints, f, candidates)
     means = _means(losses)
     best = int(means.argmin())
     gain = losses[0] - losses[best]
     gain = gain[gain.isfinite()]
     if not bool(means[best].isfinite()) or len(gain) < MIN_KEYPOINTS:
-        return nowhere
+        return no_shift
     is_significant = float(gain.mean()) > _MIN_GAIN_SIGMA * float(gain.std()) / math.sqrt(len(gain))
-    return candidates[best] if is_significant else nowhere
+    return candidates[best] if is_significant else no_shift
 
 
 def _shifted_losses(net: Descriptor, band: LevelBand, keypoints: Keypoints, f: Tensor, shifts: Tensor) -> Tensor:
@@ -166,7 +166,7 @@ def _shifted_losses(net: Descriptor, band: LevelBand, keypoints: Keypoints, f: T
         xy, count = (keypoints.xy + batch[:, None]).reshape(-1, 2), len(batch)
         shifted = Keypoints(xy, keypoints.angle.repeat(count), keypoints.scale.repeat(count))
         loss = distance(f.repeat(count, 1), band.describe(net, shifted))
-        losses.append(loss.masked_fill(~band.shows(shifted), float("nan")).reshape(count, -1))
+        losses.append(loss.masked_fill(~band.is_inside_moving(shifted), float("nan")).reshape(count, -1))
     return torch.cat(losses)
 
 

@@ -101,12 +101,12 @@ def with_radiometry(capture: Capture, choice: RadiometryChoice, by_panel: Mappin
         candidates = "sun", "panel", "camera"
     for candidate in candidates:
         result = {b.name: _converted(b.radiometry, candidate, by_panel.get(b.name)) for b in capture.bands}
-        if all(result[b.name] is not None for b in capture.bands if not b.companion):
+        if all(result[b.name] is not None for b in capture.bands if not b.is_from_photograph):
             break
     bands = []
     for b in capture.bands:
-        why = b.uncalibrated or ("no tags for radiance" if b.radiometry is None else "")
-        bands.append(replace(b, radiometry=result[b.name], uncalibrated=why))
+        why = b.missing_calibration or ("no tags for radiance" if b.radiometry is None else "")
+        bands.append(replace(b, radiometry=result[b.name], missing_calibration=why))
     return replace(capture, bands=tuple(bands))
 
 

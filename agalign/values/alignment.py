@@ -219,13 +219,13 @@ class Residual:
         return math.sqrt(max(rms_px**2 - noise**2, (rms_px / 2) ** 2))
 
     @property
-    def is_black(self) -> NDArray[np.bool_]:
+    def is_even_cell(self) -> NDArray[np.bool_]:
         """(n,) True for alternate windows along both axes of their grid, as on a chessboard."""
         return np.asarray(self.cells.sum(axis=1) % 2 == 0)
 
-    def half(self, *, black: bool) -> "Residual":
+    def chessboard_half(self, *, even: bool) -> "Residual":
         """Return the black or the white windows: one half for a fit, the other for its verification."""
-        return self.where(self.is_black == black)
+        return self.where(self.is_even_cell == even)
 
     def where(self, selected: NDArray[np.bool_]) -> "Residual":
         """Return the windows where a mask (n,) is True."""
@@ -289,8 +289,9 @@ class Prediction:
 
 @validated.dataclass(frozen=True, config=RECORD)
 class Similarity:
-    """Similarity of the pixels that are valid in both bands; in large images of a sample of at least 250,000. Values are
-    nan, null in JSON, where they could not be measured.
+    """Similarity of the pixels that are valid in both bands; in large images of a sample of at least 250,000.
+
+    A value is nan, null in JSON, if it could not be measured.
     """
 
     mattes_mi: Number6 = math.nan
@@ -404,7 +405,7 @@ class Alignment:
         return self.mapping.fixed_to_moving
 
     @property
-    def of_the_seed(self) -> PixelMapping:
+    def seed_mapping(self) -> PixelMapping:
         """The mapping of the seed, with the lenses and without displacements."""
         return PixelMapping(self.seed.fixed_to_moving, self.mapping.fixed_lens, self.mapping.moving_lens)
 

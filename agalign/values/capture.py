@@ -166,7 +166,7 @@ class Band:
     tags do not contain it."""
     one_lens: bool = False
     """The bands of the file share one lens and are aligned as one."""
-    companion: bool = False
+    is_from_photograph: bool = False
     """Part of a colour photograph: used only on request."""
     georeference: Georeference | None = None
     scale_offset: tuple[float, float] = (1.0, 0.0)
@@ -174,7 +174,7 @@ class Band:
     overviews: tuple[int, ...] = ()
     """Reduction factors of the overviews in the file."""
     radiometry: Radiometry | None = None
-    uncalibrated: str = ""
+    missing_calibration: str = ""
     """Why it has no radiometric calibration, with the missing tags; empty if it has one or the camera has none."""
     implausible: str = ""
     """Tag with an implausible value that leaves out `radiometry`, or its factor to reflectance, in words."""

@@ -190,7 +190,7 @@ def _flush_to_disk(path: Path) -> None:
 
 
 def compact_lists(text: str) -> str:
-    """Return indented JSON with each list of numbers, or of lists of them, on one line, which takes a third of the size."""
+    """Return indented JSON with each list of numbers, or of such lists, on one line: it takes a third of the size."""
     # Numbers, null, true and false start with these characters; keys and texts start with a quote.
     text = re.sub(r"\[\n +(?=[-0-9ntf])", "[", text)
     text = re.sub(r",\n +(?=[-0-9ntf])", ", ", text)

@@ -95,7 +95,7 @@ class PixelMapping:
 
     def at_parallax(self, reference_px: ArrayLike, baseline: tuple[float, float], parallax_px: float) -> Points:
         """The same, (..., 2), with one parallax and baseline for all pixels, instead of those of the mapping."""
-        moved = self.of_the_plane.undistorted(reference_px) + np.array(baseline) * parallax_px
+        moved = self.without_parallax.undistorted(reference_px) + np.array(baseline) * parallax_px
         return lens.distort(self.moving_lens, geometry.apply(self.fixed_to_moving, moved))
 
     def undistorted(self, reference_px: ArrayLike) -> Points:
@@ -130,7 +130,7 @@ class PixelMapping:
         return replace(self, parallax=parallax)
 
     @property
-    def of_the_plane(self) -> "PixelMapping":
+    def without_parallax(self) -> "PixelMapping":
         """The mapping without parallax."""
         return self if self.parallax is None else self.with_parallax(None)
 
@@ -163,7 +163,7 @@ class PixelMapping:
     def is_smooth(self, tile: Tile) -> bool:
         """True without parallax, and if the horizon of the homography does not cross the tile."""
         corners = np.array([(tile.x0 + x, tile.y0 + y) for x in (0, tile.width) for y in (0, tile.height)], np.float64)
-        depths = self.of_the_plane.undistorted(corners) @ self.fixed_to_moving[2, :2] + self.fixed_to_moving[2, 2]
+        depths = self.without_parallax.undistorted(corners) @ self.fixed_to_moving[2, :2] + self.fixed_to_moving[2, 2]
         return self.parallax is None and bool((depths > 0).all() or (depths < 0).all())
 
     def positions(self, tile: Tile, dtype: DTypeLike = np.float64, size_px: Size | None = None) -> Points:

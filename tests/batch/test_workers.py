@@ -19,7 +19,7 @@ import agalign
 from agalign.batch import workers
 from agalign.batch.capture_task import CaptureReport, Task
 from agalign.batch.run import Listener, capture_reports, run_flight
-from agalign.batch.workers import DaskExecutor, Run, chosen_run, dask_executor, in_order, on_executor
+from agalign.batch.workers import DaskExecutor, Run, dask_executor, in_order, on_executor, open_workers
 from agalign.cameras.discover import discover
 from agalign.config import RunOptions, Settings
 from agalign.errors import ConfigurationError, WorkerError
@@ -79,7 +79,7 @@ def deadly(task: Task, folder: Path, times: int) -> Task:
 
 def test_a_process_that_is_killed_twice_costs_its_capture(flight: Path, tmp_path: Path) -> None:
     one, other = seeds_only(flight, tmp_path)
-    with chosen_run(None, 1, limit_threads, has_timeout=True) as run:
+    with open_workers(None, 1, limit_threads, has_timeout=True) as run:
         reports = {r.label: (r.state, r.error) for r in reports_of(run, [deadly(one, tmp_path, 2), other])}
     killed = "its worker process was killed (signal 9; out of memory?); run again to process the remaining captures"
     assert reports == {one.capture.label: ("error", killed), other.capture.label: ("done", None)}
@@ -87,11 +87,11 @@ def test_a_process_that_is_killed_twice_costs_its_capture(flight: Path, tmp_path
 
 def test_results_of_learning_tasks_come_in_order_and_a_lost_worker_ends_the_run(tmp_path: Path) -> None:
     """The first argument takes longest; the loss of a worker twice, as by a lack of memory, is one line."""
-    with chosen_run(None, 2, limit_threads) as run:
+    with open_workers(None, 2, limit_threads) as run:
         assert list(in_order(run, sleep, [0.6, 0.0, 0.1])) == [0.6, 0.0, 0.1]
     with ThreadPoolExecutor(2) as threads:
         assert list(in_order(on_executor(threads), sleep, [0.3, 0.0, 0.1])) == [0.3, 0.0, 0.1]
-    with chosen_run(None, 1, limit_threads, has_timeout=True) as run:
+    with open_workers(None, 1, limit_threads, has_timeout=True) as run:
         with pytest.raises(WorkerError, match="the flight cannot be learned: its worker process"):
             list(in_order(run, partial(signal_self, number=signal.SIGKILL, times=2), [tmp_path / "mark"]))
         with pytest.raises(MemoryError):

@@ -20,7 +20,7 @@ from agalign.capture.band_pair import BandPair
 from agalign.capture.by_relief import _is_better, _std_px, aligned_by_relief
 from agalign.capture.by_rig import with_predictions
 from agalign.capture.common_parallax import MIN_PARALLAX_PX, common_parallax_px
-from agalign.capture.decision import at_seed, of_one_geometry
+from agalign.capture.decision import fall_back_to_seed, with_one_geometry
 from agalign.capture.reference import Reference
 from agalign.capture.warped_pair import Candidate, WarpedPair
 from agalign.config import JointSettings, ReliefSettings, Settings
@@ -155,7 +155,7 @@ def test_all_bands_are_aligned_by_one_relief(boxes: Rendered, aligned: Mapping[s
     for band, alignment in aligned.items():
         assert (alignment.status, alignment.issues) == ("aligned", ())
         complete = alignment.mapping
-        errors, plane = (boxes.error_px(band, m) for m in (complete, complete.of_the_plane))
+        errors, plane = (boxes.error_px(band, m) for m in (complete, complete.without_parallax))
         assert np.median(errors) < 0.2
         assert np.percentile(errors, 90) < 0.6
         assert np.percentile(plane, 90) > 3
@@ -241,7 +241,7 @@ def test_a_homography_next_to_a_relief_is_predicted(flat: Rendered, one_relief: 
     assert {a.status for a in one_relief.values()} == {"aligned"}
     pairs = {c.pair.name: c.pair for c in flat.candidates()}
     pairs["Red"] = replace(pairs["Red"], reference=Reference(pairs["Red"].reference.image))
-    result = of_one_geometry(list(pairs.values()), one_relief)
+    result = with_one_geometry(list(pairs.values()), one_relief)
     assert {name: a.status for name, a in result.items()} == {"Blue": "aligned", "Red": "aligned", "NIR": "predicted"}
     assert result["NIR"].prediction.source == "windows"
 
@@ -275,7 +275,7 @@ def test_a_noisy_band_follows_the_relief_of_the_others(
         candidates = [c if c.pair.name != name else Candidate.of(c.pair, c.seed, lost) for c in candidates]
     alignment = aligned_by_relief(candidates, "auto")[0][name]
     assert (alignment.status, alignment.mapping.parallax is None) == (status, False)
-    errors, plane = (scene.error_px(name, m) for m in (alignment.mapping, alignment.mapping.of_the_plane))
+    errors, plane = (scene.error_px(name, m) for m in (alignment.mapping, alignment.mapping.without_parallax))
     assert np.percentile(errors, 90) < 1.2
     assert np.percentile(plane, 90) > 2
     if status == "predicted":
@@ -329,7 +329,7 @@ def test_a_lost_band_is_predicted_with_the_relief(
     none, from_bands_px = (dict.fromkeys(mean, float(value)) for value in (0.0, 0.05))
     rig = Rig(boxes.size_px, mean, baselines, none, none, ("distance",), (), from_bands_px)
     pairs = [c.pair for c in candidates]
-    lost = at_seed(pairs[0], candidates[0].seed, (Issue(RETRIEVAL, 0.0, 0.2),))
+    lost = fall_back_to_seed(pairs[0], candidates[0].seed, (Issue(RETRIEVAL, 0.0, 0.2),))
     result = with_predictions(pairs, {**aligned, "Blue": lost}, rig, Capture("a", Path(), (), 0))
     # The other bands are verified by the rig as before.
     assert {name: a.status for name, a in result.items()} == {"Blue": "predicted", "Red": "aligned", "NIR": "aligned"}

@@ -10,7 +10,7 @@ import agalign
 from agalign.capture import by_windows as module
 from agalign.capture.band_pair import BandPair
 from agalign.capture.by_windows import aligned_by_windows, with_lens_shapes
-from agalign.capture.decision import at_seed, verified
+from agalign.capture.decision import fall_back_to_seed, verified
 from agalign.capture.seeding import find_seed
 from agalign.capture.warped_pair import Candidate
 from agalign.config import SeedSettings
@@ -43,7 +43,7 @@ def pair() -> BandPair:
 
 def unaligned(pair: BandPair, issue: Issue = SILENT) -> Alignment:
     seed = Seed("structure", geometry.translation(5.0, -3.0), 20.0, trusted=True)
-    result = at_seed(pair, seed, (issue,))
+    result = fall_back_to_seed(pair, seed, (issue,))
     assert result.status == "seed_only"
     return result
 

@@ -5,7 +5,7 @@ import pytest
 
 from agalign.capture import warped_pair
 from agalign.capture.band_pair import BandPair
-from agalign.capture.decision import at_seed, decided, verified, without_result
+from agalign.capture.decision import decided, failed_at_seed, fall_back_to_seed, verified
 from agalign.capture.warped_pair import Candidate, WarpedPair
 from agalign.fit.displacement_field import DisplacementResult
 from agalign.values import geometry
@@ -44,7 +44,7 @@ def test_the_status_is_that_of_the_first_row_that_applies(
 ) -> None:
     residual = replace(residual_of(np.zeros((50, 2)), np.zeros((50, 2))), median_px=median_px)
     prediction = Prediction(TRUTH, "windows", 0.1) if is_predicted else None
-    alignment = replace(without_result(pair, SEED, *issues), residual=residual, prediction=prediction)
+    alignment = replace(failed_at_seed(pair, SEED, *issues), residual=residual, prediction=prediction)
     result = decided(alignment, is_seed_usable=is_seed_usable)
     assert result.status == status
     assert (result.issues[-1:] == (Issue(SEED_DOES_NOT_FIT),)) == (is_seed_usable and status == "failed")
@@ -56,11 +56,11 @@ def test_a_seed_that_contradicts_the_tags_is_replaced_by_their_mapping(pair: Ban
     """An image of another capture fits at its own position, far from that of its band."""
     far = replace(SEED, kind="match", fixed_to_moving=geometry.translation(150, 0))
     tagged = replace(pair, seed_std_px={"rig": 5.0})
-    result = at_seed(tagged, far, (Issue(RETRIEVAL),))
+    result = fall_back_to_seed(tagged, far, (Issue(RETRIEVAL),))
     assert (result.status, result.seed.kind) == ("seed_only", "rig")
     np.testing.assert_array_equal(result.fixed_to_moving, RIG["rig"])
-    assert at_seed(pair, far, (Issue(RETRIEVAL),)).seed == far
-    assert at_seed(tagged, far, (Issue(RETRIEVAL),), seed_only=True).seed == far
+    assert fall_back_to_seed(pair, far, (Issue(RETRIEVAL),)).seed == far
+    assert fall_back_to_seed(tagged, far, (Issue(RETRIEVAL),), seed_only=True).seed == far
 
 
 def test_a_converted_residual_equals_a_new_measurement(pair: BandPair) -> None:
@@ -78,7 +78,7 @@ def test_each_colour_is_verified_by_the_estimate_from_the_other(pair: BandPair) 
     warped_pair = WarpedPair.of(pair, pair.mapping(TRUTH))
     by_black, by_white = geometry.translation(6.1, -4), geometry.translation(6, -4.2)
     crossed, before = warped_pair.cross_validated((by_black, by_white)).residual, warped_pair.residual
-    expected_px = np.where(before.is_black[:, None], (0, 0.2), (-0.1, 0))
+    expected_px = np.where(before.is_even_cell[:, None], (0, 0.2), (-0.1, 0))
     np.testing.assert_allclose(crossed.shifts_px - before.shifts_px, expected_px, atol=1e-6)
     candidate = replace(Candidate.of(pair, SEED, GOOD), by_halves=(by_black, by_white))
     assert verified(candidate, "never").residual.median_px > 0.08
@@ -104,7 +104,7 @@ def test_a_result_with_issues_is_replaced_by_the_seed(pair: BandPair) -> None:
     assert (results.status, results.issues[0].code) == ("seed_only", "retrieval")
     np.testing.assert_array_equal(results.fixed_to_moving, SEED.fixed_to_moving)
     assert results.residual.median_px == pytest.approx(np.hypot(1, 1), abs=0.05)
-    missing = at_seed(pair, SEED, (Issue(FEW_KEYPOINTS, 3, 16),))
+    missing = fall_back_to_seed(pair, SEED, (Issue(FEW_KEYPOINTS, 3, 16),))
     assert missing.status == "seed_only"
     assert missing.reason == "only 3 keypoints are in the area that both bands show; the rig seed is used unchanged"
 

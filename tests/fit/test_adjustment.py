@@ -171,7 +171,7 @@ def test_shifts_are_those_of_undistorted_pixels() -> None:
     mapping = PixelMapping(np.eye(3), lens, None, parallax=Parallax(relief, (0.6, -0.8)))
     centre, shift = np.array([[40.0, 30.0]]), np.array([[3.0, 2.0]])
     windows = WindowShifts.of([residual_of(centre, shift)], [mapping])
-    plane = mapping.of_the_plane
+    plane = mapping.without_parallax
     np.testing.assert_allclose(windows.points_px, plane.undistorted(centre))
     expected = plane.undistorted(centre + shift) - plane.undistorted(centre)
     # The shift relative to the plane includes the displacement by the relief.

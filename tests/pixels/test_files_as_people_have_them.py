@@ -170,6 +170,6 @@ def test_colour_images_of_one_lens_are_companions_of_the_bands(tmp_path: Path, n
     (capture,) = discover(tmp_path).captures
     assert {b.name for b in capture.bands} == {"green", "red", "nir"}
     (capture,) = discover(tmp_path, agalign.DiscoverOptions(with_rgb=True)).captures
-    assert {b.name for b in capture.bands if b.companion} == {"RGB Red", "RGB Green", "RGB Blue"}
+    assert {b.name for b in capture.bands if b.is_from_photograph} == {"RGB Red", "RGB Green", "RGB Blue"}
     tifffile.imwrite(tmp_path / "ortho_rgb.tif", colours, photometric="rgb")
     assert {c.name for c in discover(tmp_path).captures} == {"f", "ortho_rgb"}

@@ -91,7 +91,7 @@ def test_the_chosen_radiometry_is_applied(blue: Path) -> None:
 
 def test_photographs_and_thermal_bands_do_not_prevent_reflectance() -> None:
     green = Band("Green", Path("g.tif"), 1, 64, 48, "uint16", radiometry=Radiometry("radiance", 0.0, 1.0, 2.0))
-    colour = Band("RGB Red", Path("c.jpg"), 1, 64, 48, "uint8", companion=True)
+    colour = Band("RGB Red", Path("c.jpg"), 1, 64, 48, "uint8", is_from_photograph=True)
     kelvin = Radiometry("temperature", 27315.0, 1.0, 0.01)
     thermal = Band("LWIR", Path("t.tif"), 1, 160, 120, "uint16", radiometry=kelvin)
     for choice in ("auto", "panel"):

@@ -88,7 +88,7 @@ def test_what_sees_the_others_light_together() -> None:
     def pan(*bands: Band) -> list[str]:
         return [b.name for b in panchromatic(capture_of(*bands))]
 
-    colours = [band(f"RGB {c}", companion=True) for c in ("Red", "Green", "Blue")]
+    colours = [band(f"RGB {c}", is_from_photograph=True) for c in ("Red", "Green", "Blue")]
     assert pan(band("Green", 20), band("Panchro", 463)) == ["Panchro"]
     thermal = band("Green", 20), band("LWIR", 6000, wavelength_nm=11000.0)
     assert pan(*thermal) == []
@@ -132,7 +132,7 @@ def test_a_band_that_is_not_delivered_or_does_not_see_infra_red_sharpens_none(
 ) -> None:
     size_px, identity = (64, 48), PixelMapping(np.eye(3))
     one = Band("b", tmp_path / "b.tif", 1, *size_px, "uint16", wavelength_nm=wavelength_nm)
-    other = Band(pan, tmp_path / "pan.tif", 1, *size_px, "uint16", companion=pan == "RGB Red")
+    other = Band(pan, tmp_path / "pan.tif", 1, *size_px, "uint16", is_from_photograph=pan == "RGB Red")
     for path in (one.path, other.path):
         write_band(path, np.full((48, 64), 500, np.uint16))
     prediction = Prediction(np.eye(3), "flight", std_px)

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import rasterio
 import tifffile
+from agalign.products.sidecar.convert import sidecar_of
 from scipy.ndimage import gaussian_filter
 from synthetic_flights.depth import CLOSE_RANGE, Truth, write_capture
 from synthetic_flights.relief import make_scene
@@ -18,7 +19,6 @@ from agalign.batch import capture_task as batch
 from agalign.cameras import pix4d, rig_seed
 from agalign.cameras.metadata import Tags
 from agalign.products.rasters.alignment_maps import relief_layers
-from agalign.products.sidecar.convert import sidecar_of
 from agalign.products.sidecar.file import find_sidecars, read_result, read_sidecar, write_sidecar
 from agalign.synthetic import cameras
 from agalign.values import geometry, lens
@@ -143,7 +143,7 @@ def test_without_places_of_lenses_there_is_no_range(run: Run) -> None:
 
 
 def test_without_a_relief_nothing_is_written(run: Run, tmp_path: Path) -> None:
-    flat = {n: replace(a, mapping=a.mapping.of_the_plane) for n, a in run.alignments.items()}
+    flat = {n: replace(a, mapping=a.mapping.without_parallax) for n, a in run.alignments.items()}
     sidecar = run.write(tmp_path, flat, relief_map=True)
     assert not list(tmp_path.rglob("*.relief.tif"))
     assert all(b.relief is None for b in read_sidecar(sidecar).bands)

@@ -11,12 +11,12 @@ from typing import Any
 import jsonschema
 import numpy as np
 import pytest
+from agalign.products.sidecar.convert import sidecar_of
 from scipy.interpolate import CloughTocher2DInterpolator, RectBivariateSpline
 
 import agalign
 from agalign.config import CheckSettings, Settings
 from agalign.errors import InputError, OutputError, SidecarError
-from agalign.products.sidecar.convert import sidecar_of
 from agalign.products.sidecar.file import (
     content_checksum,
     find_sidecars,

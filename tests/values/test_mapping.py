@@ -82,9 +82,9 @@ def test_the_displacements_of_lenses_and_the_parallax_add_up_before_the_homograp
     mapping = replace(MAPPING, field=DisplacementField(96.0, np.broadcast_to(off, (6, 8, 2)).copy()))
     edge = np.array([80.0, 100.0])  # the left edge of the box
     plane = lens.undistort(FIXED, edge + off)
-    for each, expected in ((mapping, plane + 12 * np.array(BASELINE)), (mapping.of_the_plane, plane)):
+    for each, expected in ((mapping, plane + 12 * np.array(BASELINE)), (mapping.without_parallax, plane)):
         np.testing.assert_allclose(each(edge), lens.distort(MOVING, geometry.apply(H, expected)), atol=1e-6)
-    assert mapping.of_the_plane.parallax is None
+    assert mapping.without_parallax.parallax is None
 
 
 @pytest.mark.parametrize(
@@ -119,7 +119,7 @@ def test_hidden_is_that_of_the_nearest_pixel() -> None:
     expected = HIDDEN.repeat(2, axis=0).repeat(2, axis=1)
     np.testing.assert_array_equal(doubled.hidden(Tile(0, 0, 640, 480)), expected)
     assert not replace(MAPPING, parallax=replace(MAPPING.parallax, hidden=None)).hidden(tile).any()
-    assert not MAPPING.of_the_plane.hidden(tile).any()
+    assert not MAPPING.without_parallax.hidden(tile).any()
 
 
 def test_beyond_the_image_the_parallax_and_the_mask_are_those_of_the_edge() -> None:

@@ -280,7 +280,7 @@ def role_of(name: str, wavelength_nm: float | None) -> Role | None:
 
 def role_of_band(band: Band) -> Role | None:
     """Return the role of a band; None for a band without one, and for those of the colour photograph."""
-    return None if band.companion else role_of(band.name, band.wavelength_nm)
+    return None if band.is_from_photograph else role_of(band.name, band.wavelength_nm)
 
 
 def compute(index: Index, bands: Sequence[FloatImage]) -> FloatImage:

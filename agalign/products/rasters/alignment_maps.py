@@ -268,7 +268,7 @@ def inverse_range(
     for level in levels:
         total = np.zeros(nodes.shape[:2])
         for mapping, infinite, weight in zip(mappings, at_infinity, weights, strict=True):
-            undistorted = mapping.of_the_plane.undistorted(nodes)
+            undistorted = mapping.without_parallax.undistorted(nodes)
             assert mapping.parallax is not None
             moved = undistorted + level * np.array(mapping.parallax.baseline)
             observed = geometry.apply(geometry.invert(infinite), geometry.apply(mapping.fixed_to_moving, moved))

@@ -82,7 +82,7 @@ def output_layers(
     size_px = round(reference.width_px * frame.scale.x), round(reference.height_px * frame.scale.y)
     layers = [Layer(b, on_frame.get(b.name), size_px, is_reference=b is reference) for b in capture.bands]
     # The crop is calculated without relief, which may leave pixels of single bands without a value.
-    mapped = [(layer.mapping.of_the_plane, layer.band) for layer in layers if layer.mapping is not None]
+    mapped = [(layer.mapping.without_parallax, layer.band) for layer in layers if layer.mapping is not None]
     crop = frame.tile
     if common is None and settings.crop != "none":
         crop = common_area(mapped, frame.width, frame.height) or crop

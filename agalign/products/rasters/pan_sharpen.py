@@ -65,7 +65,9 @@ class PanSharpened(Product):
         context = replace(context, settings=context.settings.model_copy(update={"write": settings}), grid=grid)
         pan = [la for la in layers if la.band in broad]
         others = [
-            la for la in layers if not (la.is_gap or la.band in broad or la.band.companion or is_thermal(la.band))
+            la
+            for la in layers
+            if not (la.is_gap or la.band in broad or la.band.is_from_photograph or is_thermal(la.band))
         ]
         if not any(is_in_range(la.band, broad) for la in others):
             return []
@@ -86,14 +88,14 @@ def panchromatic(capture: Capture) -> list[Band]:
     broad = [
         b for b in capture.bands if b.name.lower().startswith("pan") or (b.bandwidth_nm or 0.0) >= min_pan_width_nm
     ]
-    return [b for b in broad if not is_thermal(b)][:1] or [b for b in capture.bands if b.companion]
+    return [b for b in broad if not is_thermal(b)][:1] or [b for b in capture.bands if b.is_from_photograph]
 
 
 def is_in_range(band: Band, pan: Sequence[Band]) -> bool:
     """True for a band within the spectral range of the panchromatic band, or if either is unknown."""
     if band.wavelength_nm is None:
         return True
-    if pan[0].companion:
+    if pan[0].is_from_photograph:
         low, high = 400.0, 700.0
     else:
         centre, width = pan[0].wavelength_nm, pan[0].bandwidth_nm
@@ -157,7 +159,7 @@ def sharpened(
                 pixels = as_type(values if dtype.kind == "f" else np.nan_to_num(values), dtype)
                 yield pixels if nodata is None else with_nodata(pixels, valid[k], nodata), k + 1, tile.x0, tile.y0
 
-    source, texts = "the colour photograph" if pan[0].companion else pan[0].name, ["no"] * count
+    source, texts = "the colour photograph" if pan[0].is_from_photograph else pan[0].name, ["no"] * count
     for k, weight in zip(in_range, weights.tolist(), strict=True):
         texts[k] = f"weighted Brovey by {source}, weight {weight:.4g}"
     return [

@@ -235,7 +235,7 @@ class BandResult(_Part):
     def of(cls, band: Band, alignment: Alignment) -> Self:
         """Return the entry of a moving band."""
         mapping, relief = alignment.mapping, None
-        grid_px = sampled_mapping(mapping.of_the_plane, alignment.size_px)
+        grid_px = sampled_mapping(mapping.without_parallax, alignment.size_px)
         if mapping.parallax is not None:
             hidden, baseline = mapping.parallax.hidden, mapping.parallax.baseline
             occluded = 0.0 if hidden is None else float(hidden.mean())
