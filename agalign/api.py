@@ -14,7 +14,7 @@ from agalign.batch.run import Listener, run_flight
 from agalign.cameras.discover import discover
 from agalign.capture.align_bands import align_pairs
 from agalign.capture.band_pair import BandPair, SeedMatrices
-from agalign.capture.by_windows import with_lens_shapes
+from agalign.capture.decision import with_lens_shapes
 from agalign.capture.reference import Reference
 from agalign.capture.warped_pair import with_metrics
 from agalign.config import DiscoverOptions, RunOptions, Settings
@@ -101,7 +101,7 @@ def warp_onto(
     if isinstance(fixed_to_moving, Alignment):
         raise InputError("an alignment is more than a homography; use its method warp(moving)")
     mapping = PixelMapping(geometry.normalised(fixed_to_moving))
-    by_homography = Alignment(mapping, fixed_size_px, "aligned", (), Seed("user", mapping.fixed_to_moving, 0.0))
+    by_homography = Alignment(mapping, fixed_size_px, (), Seed("user", mapping.fixed_to_moving, 0.0))
     return by_homography.warp(moving, valid=valid, interpolation=interpolation)
 
 

@@ -7,9 +7,15 @@ from functools import partial
 
 from agalign.capture.band_pair import BandPair, read_pairs
 from agalign.capture.by_relief import aligned_by_relief
-from agalign.capture.by_rig import bands_to_learn, with_predictions
-from agalign.capture.by_windows import aligned_by_windows, with_lens_shapes
-from agalign.capture.decision import decided, failed_at_seed, fall_back_to_seed, verified, with_one_geometry
+from agalign.capture.by_rig import bands_to_learn
+from agalign.capture.decision import (
+    against_rig,
+    by_windows,
+    fall_back_to_seed,
+    verified,
+    with_lens_shapes,
+    with_one_geometry,
+)
 from agalign.capture.full_resolution import at_full_resolution
 from agalign.capture.map_estimate import map_estimate
 from agalign.capture.seeding import SeededPair, corrected, find_seed, image_groups
@@ -54,7 +60,7 @@ def align_capture_bands(
     aligned = align_pairs(pairs, settings, progress, model, capture)
     rig = None if model is None else model.rig
     if rig is not None and not settings.seed.only:
-        aligned = with_predictions(pairs, aligned, rig, capture)
+        aligned = against_rig(pairs, aligned, rig, capture)
     if not settings.seed.only:
         aligned = with_lens_shapes(pairs, aligned, rig)
     result: dict[str, Alignment] = {}
@@ -68,7 +74,7 @@ def align_capture_bands(
             overlay = Seed("identity", geometry.overlay(size_px, band.size_px), 0.0)
             issues = (unusable[band.name],) if band.name in unusable else ()  # none in a band of the reference's lens
             mapping = PixelMapping(overlay.fixed_to_moving)
-            result[band.name] = decided(Alignment(mapping, size_px, "failed", issues, overlay))
+            result[band.name] = Alignment(mapping, size_px, issues, overlay)
     reliefs = (a.mapping.parallax.relief for a in result.values() if a.mapping.parallax is not None)
     relief = next((relief.on_pixels(size_px) for relief in reliefs), None)  # the same in all bands
     seconds = (time.perf_counter() - start_s) / max(1, len(capture.moving))  # most steps are for all bands together
@@ -158,7 +164,7 @@ class PairAligner:
             seed = find_seed(pair, self.settings.seed, self.model)
             if isinstance(seed, Issue):
                 kind, matrix = next(iter(pair.seed_matrices.items()))
-                self.result[pair.name] = failed_at_seed(pair, Seed(kind, matrix, 0.0), seed)
+                self.result[pair.name] = pair.seed_alignment(Seed(kind, matrix, 0.0), seed)
             else:
                 starts.append((pair, seed))
         return starts
@@ -220,7 +226,7 @@ class PairAligner:
         """Align by windows the pairs without retrieval of held-out patches."""
         if self._may_be_homography:
             for pair, _ in starts:
-                self.result[pair.name] = aligned_by_windows(pair, self.result[pair.name])
+                self.result[pair.name] = by_windows(pair, self.result[pair.name])
 
     def _optimised(
         self, starts: Sequence[SeededPair], sides: Sequence[int], align: Callable[[ImageGroup, Progress], Results]

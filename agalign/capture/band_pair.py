@@ -22,7 +22,7 @@ from agalign.pixels.raster import read_for_alignment
 from agalign.pixels.stripes import without_common_stripes
 from agalign.pixels.structure import blur_px
 from agalign.values import geometry
-from agalign.values.alignment import SAME_SCALES, PairScales, Prediction
+from agalign.values.alignment import SAME_SCALES, Alignment, PairScales, Prediction, Seed
 from agalign.values.capture import Band, Capture
 from agalign.values.choices import SeedKind, Space
 from agalign.values.geometry import Matrix
@@ -183,6 +183,18 @@ class BandPair:
         matrix = mapping.fixed_to_moving
         error_px = self.in_moving_file_px(std_px, matrix)
         return Prediction(self.scales.between_files(matrix), "windows", error_px, covariance_px2=covariance_px2)
+
+    def seed_alignment(self, seed: Seed, *issues: Issue) -> Alignment:
+        """Return an alignment with the mapping of a seed, and with these issues."""
+        return Alignment(self.mapping(seed.fixed_to_moving), self.fixed.size_px, issues, seed)
+
+    def predicted_alignment(self, alignment: Alignment, std_px: float, *issues: Issue) -> Alignment:
+        """Return as a prediction, with this standard error, an alignment that its windows do not confirm everywhere.
+
+        `issues` precede its own.
+        """
+        prediction = self.prediction_of(alignment.mapping, std_px)
+        return replace(alignment, issues=(*issues, *alignment.issues), prediction=prediction)
 
     def in_moving_file_px(self, distance_px: float, fixed_to_moving: Matrix) -> float:
         """Convert a distance in the fixed image to the moving file, for a homography between the images."""

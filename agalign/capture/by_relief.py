@@ -27,7 +27,6 @@ from agalign.capture.common_parallax import (
     layout_of,
     parallax_groups,
 )
-from agalign.capture.decision import decided, failed_at_seed, predicted
 from agalign.capture.warped_pair import Candidate, WarpedPair
 from agalign.errors import GeometryError
 from agalign.fit.adjustment import (
@@ -129,10 +128,10 @@ class _Band:
         """Return the alignment by a mapping with a relief that passes verification in held-out windows."""
         kind: Geometry = "relief" if mapping.field is None else "relief and field"
         p95_px: dict[Geometry, float] = {"homography": self.by_homography.p95_px, kind: held_out.p95_px}
-        without = failed_at_seed(self.candidate.pair, self.candidate.seed)
+        at_seed = self.candidate.pair.seed_alignment(self.candidate.seed)
         lens_std_px = self.candidate.pair.unknown_lens_std_px
-        measured = replace(without, mapping=mapping, joint=self.joint, residual=held_out, lens_std_px=lens_std_px)
-        return decided(replace(measured, candidates=p95_px))
+        measured = replace(at_seed, mapping=mapping, joint=self.joint, residual=held_out, lens_std_px=lens_std_px)
+        return replace(measured, candidates=p95_px)
 
 
 def _observed(group: Sequence[Candidate]) -> Alignments:
@@ -306,8 +305,9 @@ class _Estimate:
         if not is_known or warped.alias_peak().ratio > MAX_ALIAS_PEAK:
             return {}
         joint = None if candidate.issue is not None else candidate.joint
-        by_relief = replace(failed_at_seed(pair, candidate.seed), mapping=mapping, joint=joint, residual=residual)
-        return {band.name: predicted(by_relief, pair, warped.std_px(band.joint), Issue(OTHER_GEOMETRY), *issues)}
+        by_relief = replace(pair.seed_alignment(candidate.seed), mapping=mapping, joint=joint, residual=residual)
+        predicted = pair.predicted_alignment(by_relief, warped.std_px(band.joint), Issue(OTHER_GEOMETRY), *issues)
+        return {band.name: predicted}
 
 
 def _with_field(pair: BandPair, alignment: Alignment) -> Alignment:

@@ -1,29 +1,25 @@
-"""Predictions of the flight's rig for the bands of a capture: checks, replacements, and selection of bands to learn."""
+"""Predictions of the bands of a capture by the flight's rig: candidates for `decision`; the bands to learn."""
 
 import math
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from agalign.capture.band_pair import BandPair
-from agalign.capture.decision import decided
-from agalign.capture.seeding import find_rotated
-from agalign.capture.warped_pair import WarpedPair
-from agalign.flight.rig import Observation, Rig, distance_px
+from agalign.flight.rig import Observation, Rig
 from agalign.flight.rig_prediction import predict_band
-from agalign.values.alignment import MIN_TIMES_CHANCE, Alignment, Alignments, Prediction
+from agalign.values.alignment import MIN_TIMES_CHANCE, Alignments, Prediction
 from agalign.values.capture import Capture
 from agalign.values.geometry import Matrix
-from agalign.values.issues import OTHER_CONTENT, UNEXPECTED_PX, Issue
+from agalign.values.mapping import PixelMapping
 from agalign.values.parallax import Parallax
-from agalign.verify.checks import MAX_UNEXPECTED_PX, rig_issues
 
 
 def observed(pairs: Sequence[BandPair], result: Alignments, capture: Capture) -> Observation:
-    """Return the aligned mappings of a capture as an observation of the rig."""
+    """Return the aligned mappings of a capture, between pixels that the rig relates, as an observation of the rig."""
     mappings, std_px, parallax_px = dict[str, Matrix](), dict[str, float](), dict[str, float]()
-    for pair in pairs:
+    for pair in (p for p in pairs if p.has_rig_pixels and p.name in result):
         alignment = result[pair.name]
         if alignment.status != "aligned" or alignment.joint is None:
             continue
@@ -36,20 +32,41 @@ def observed(pairs: Sequence[BandPair], result: Alignments, capture: Capture) ->
     return Observation(capture.time_s, mappings, std_px, capture.altitude_m, capture.motion, parallax_px)
 
 
-def with_predictions(pairs: Sequence[BandPair], result: Alignments, rig: Rig, capture: Capture) -> Alignments:
-    """Return the alignments with the rig's predictions, px of the files; the prediction replaces failed alignments.
+@dataclass(frozen=True)
+class RigPrediction:
+    """The prediction of a band by the rig, and what its own result is compared with."""
 
-    It also replaces results that contradict the rig, because of aliasing in repetitive scenes, and those under a relief
-    that are extrapolated over a quarter of the image. A rotated or scaled image does not fit the rig; its alignment
-    gets an issue and is not replaced. Predictions follow the relief of the capture, if it has one.
-    """
-    known = observed([p for p in pairs if p.has_rig_pixels], result, capture)
+    of_plane: Prediction
+    """Of the reference plane."""
+    of_scene: Prediction
+    """The same, with the error of the relief of the scene."""
+    mapping: PixelMapping
+    """The predicted mapping between the images, with the relief of the capture."""
+    observed: Matrix | None
+    """The homography of the band's own result between the files; None if it is not aligned."""
+    size_px: tuple[int, int]
+    """(width, height) of the reference's file."""
+
+
+def rig_predictions(
+    pairs: Sequence[BandPair], result: Alignments, rig: Rig, known: Observation
+) -> dict[str, RigPrediction]:
+    """Return the prediction of each band of the rig from the `known` mappings of the capture."""
     covered = [p for p in pairs if p.name in rig.mean and p.has_rig_pixels]
     parallaxes = [(p, result[p.name].mapping.parallax) for p in covered if p.name in known.mappings]
-    predicted = {
-        p.name: _with_prediction(p, result[p.name], rig, known, *_parallax_by_rig(p, parallaxes, rig)) for p in covered
-    }
-    return {**result, **predicted}
+    predictions: dict[str, RigPrediction] = {}
+    for pair in covered:
+        parallax, parallax_std_px = _parallax_by_rig(pair, parallaxes, rig)
+        prediction = predict_band(rig, pair.name, known)
+        matrix = pair.scales.between_images(prediction.fixed_to_moving)
+        of_plane = _with_added_error(prediction, pair.in_moving_file_px(parallax_std_px, matrix))
+        # A homography does not follow the relief that captures of the flight have. The plane of a result, which is
+        # compared with the prediction, is not displaced by it.
+        relief_px = rig.parallax_px.get(pair.name, 0.0) if parallax is None else 0.0
+        mapping, own = pair.mapping(matrix).with_parallax(parallax), known.mappings.get(pair.name)
+        of_scene = _with_added_error(of_plane, relief_px)
+        predictions[pair.name] = RigPrediction(of_plane, of_scene, mapping, own, rig.size_px)
+    return predictions
 
 
 def _parallax_by_rig(
@@ -77,57 +94,8 @@ def _parallax_by_rig(
     return Parallax(relief, (x, y)).with_occlusions(), float(math.hypot(error * relief.rms_px, of_relief))
 
 
-def _with_prediction(
-    pair: BandPair,
-    alignment: Alignment,
-    rig: Rig,
-    known: Observation,
-    parallax: Parallax | None,
-    parallax_std_px: float,
-) -> Alignment:
-    """Return the alignment with its distance from the rig's prediction, which replaces it if that contradicts it or is
-    more certain.
-    """
-    prediction = predict_band(rig, pair.name, known)
-    matrix = pair.scales.between_images(prediction.fixed_to_moving)
-    prediction = _with_added_error(prediction, pair.in_moving_file_px(parallax_std_px, matrix))
-    if pair.name in known.mappings and alignment.joint is not None and alignment.residual is not None:
-        off_px = distance_px(known.mappings[pair.name], prediction.fixed_to_moving, rig.size_px)
-        prediction = replace(prediction, off_px=off_px)
-        # The other checks have passed.
-        issues = tuple(rig_issues(prediction))
-        if not issues:
-            return replace(alignment, prediction=prediction)
-        alignment = replace(alignment, issues=issues)
-    if parallax is None:
-        # A homography does not follow the relief that captures of the flight have. The plane of a result, which the
-        # check above compares, is not displaced by it.
-        prediction = _with_added_error(prediction, rig.parallax_px.get(pair.name, 0.0))
-    # Windows of another scene contribute to the mapping of the band, but not to the rig's.
-    is_mixed = any(issue.kind == OTHER_CONTENT for issue in alignment.issues)
-    own = None if is_mixed else alignment.prediction
-    if own is not None and own.std_px <= prediction.std_px:
-        by_windows = pair.scales.between_files(alignment.fixed_to_moving)
-        if distance_px(by_windows, prediction.fixed_to_moving, rig.size_px) <= MAX_UNEXPECTED_PX:
-            return alignment
-    return _predicted(pair, alignment, prediction, parallax)
-
-
-def _predicted(pair: BandPair, alignment: Alignment, prediction: Prediction, parallax: Parallax | None) -> Alignment:
-    """Return the alignment with the mapping of the prediction, unless the image is rotated or scaled relative to it."""
-    mapping = pair.mapping(pair.scales.between_images(prediction.fixed_to_moving))
-    by_rig = WarpedPair.of(pair, mapping.with_parallax(parallax))
-    rotated = find_rotated(by_rig)
-    if rotated is None:
-        residual = by_rig.residual
-        return decided(replace(alignment, mapping=by_rig.mapping, residual=residual, prediction=prediction))
-    off_px = distance_px(pair.scales.between_files(rotated), prediction.fixed_to_moving, pair.reference_file_px)
-    issues = Issue(UNEXPECTED_PX, off_px, MAX_UNEXPECTED_PX), *alignment.issues
-    return decided(replace(alignment, mapping=alignment.seed_mapping, issues=issues, prediction=None, residual=None))
-
-
 def _with_added_error(prediction: Prediction, error_px: float) -> Prediction:
-    return replace(prediction, std_px=float(math.hypot(prediction.std_px, error_px)))
+    return replace(prediction, std_px=math.hypot(prediction.std_px, error_px))
 
 
 def bands_to_learn(
@@ -139,7 +107,7 @@ def bands_to_learn(
     no structure in common with the reference, as over water. Learning helps, for example, in captures from a lower
     height than those of the flight's network.
     """
-    known = observed([p for p in pairs if p.has_rig_pixels and p.name in result], result, capture)
+    known = observed(pairs, result, capture)
     has_relief = any(alignment.mapping.parallax is not None for alignment in result.values())
 
     def is_skipped(pair: BandPair) -> bool:

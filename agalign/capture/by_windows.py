@@ -1,4 +1,4 @@
-"""Alignments from windows where descriptors do not suffice.
+"""Mappings fitted to windows where descriptors do not suffice: candidates for `decision`.
 
 * Blurred, noisy or saturated images: the homography is fitted to half of the windows and verified with the others.
 * Bands with few pixels, such as thermal ones: often only a third of the windows have structure in common with another
@@ -7,47 +7,29 @@
   no residual contains. The lens shapes are estimated too, and the alignment becomes a prediction.
 """
 
-import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
 
 from agalign.capture.band_pair import BandPair
-from agalign.capture.decision import decided, predicted
 from agalign.capture.warped_pair import WarpedPair, result_of_windows
 from agalign.fit.adjustment import WindowFit, fit_in_rounds
-from agalign.flight.rig import Rig
 from agalign.values import geometry
 from agalign.values.alignment import Alignment, Alignments, Residual
-from agalign.values.issues import CORNERS_UNKNOWN, FEW_KEYPOINTS, INACCURATE, NO_CONTRAST, RETRIEVAL
+from agalign.values.issues import CORNERS_UNKNOWN, FEW_KEYPOINTS, NO_CONTRAST, RETRIEVAL
 from agalign.values.mapping import PixelMapping
-from agalign.verify.checks import MAX_ALIAS_PEAK, PREDICTED_WITH, seed_fits
-from agalign.verify.expected_error import points_in_frame, unobserved_quarters
+from agalign.verify.checks import PREDICTED_WITH, seed_fits
+from agalign.verify.expected_error import points_in_frame
 
-_RELIEF_SHARE = 0.15
-"""Standard deviation of the relief of ground without common structure, as a share of its range: crops and trees at low
-altitude, plants and booms at a metre."""
 _MAX_STEP_PX = 16.0
 """Maximum displacement of a corner; larger ones contradict the seed."""
 
 
-def aligned_by_windows(pair: BandPair, alignment: Alignment) -> Alignment:
-    """Return an alignment by windows if the descriptors failed and held-out windows confirm it.
-
-    Else return the prediction of a coarse band by windows that agree with its trusted seed, or else `alignment`.
+def fitted_to_windows(pair: BandPair, alignment: Alignment) -> Alignment | None:
+    """Return an alignment fitted to half of the windows and verified with the others; None if these do not confirm it,
+    or if the descriptors have a result.
     """
-    if alignment.status in ("aligned", "predicted"):
-        return alignment
-    result = _aligned(pair, alignment)
-    if result is None and pair.is_coarse and alignment.seed.trusted:
-        result = _predicted(pair, alignment, pair.mapping(alignment.seed.fixed_to_moving), _is_consistent)
-        if result is not None and WarpedPair.of(pair, result.mapping).alias_peak().ratio > MAX_ALIAS_PEAK:
-            result = None
-    return result or alignment
-
-
-def _aligned(pair: BandPair, alignment: Alignment) -> Alignment | None:
     # With other issues, the descriptors of sharp images have a result that may contradict the windows.
     of_descriptors = {RETRIEVAL, FEW_KEYPOINTS, NO_CONTRAST, CORNERS_UNKNOWN}
     descriptors_failed = pair.is_blurred or any(issue.kind in of_descriptors for issue in alignment.issues)
@@ -75,7 +57,12 @@ def _aligned(pair: BandPair, alignment: Alignment) -> Alignment | None:
         return None
     lens_std_px = pair.unknown_lens_std_px
     result = replace(alignment, mapping=mapping, issues=issues, joint=joint, residual=held_out, lens_std_px=lens_std_px)
-    return predicted(result, pair, verified.std_px(joint)) if issues else decided(result)
+    return pair.predicted_alignment(result, verified.std_px(joint)) if issues else result
+
+
+def agreeing_with_seed(pair: BandPair, alignment: Alignment) -> Alignment | None:
+    """Return the prediction of a coarse band by windows that agree with its seed; None if few do."""
+    return fitted_with_lens_shapes(pair, alignment, pair.mapping(alignment.seed.fixed_to_moving), _is_consistent)
 
 
 def _is_consistent(fit: WindowFit) -> bool:
@@ -87,38 +74,7 @@ def _is_consistent(fit: WindowFit) -> bool:
     return count >= min_windows and bool((fit.residuals_px <= max_close_px).sum() >= min_close_share * count)
 
 
-def with_lens_shapes(pairs: Sequence[BandPair], result: Alignments, rig: Rig | None = None) -> Alignments:
-    """Return the alignments; those that are predicted with a quarter of the image without windows get lens shapes.
-
-    A homography does not extrapolate relief: the spread of that of the flight, or of unknown relief at the range of the
-    capture, is part of the standard error.
-    """
-    fitted, of_range_px = dict(result), _shifts_by_range_px(pairs, result)
-    for pair in pairs:
-        alignment = result[pair.name]
-        own, residual = alignment.prediction, alignment.residual
-        is_inaccurate = own is not None and [i.kind for i in alignment.issues] == [INACCURATE]
-        if not is_inaccurate or own is None or residual is None or alignment.mapping.parallax is not None:
-            continue
-        plane, size_px = alignment.mapping.without_parallax, pair.fixed.size_px
-        if "geo" in pair.seed_matrices or not unobserved_quarters(
-            residual.measured_px, size_px, points_in_frame(plane, *pair.sizes_px)
-        ):
-            continue
-        again = _predicted(pair, alignment, plane)
-        better = (
-            alignment if again is None or again.prediction is None or own.std_px < again.prediction.std_px else again
-        )
-        of_flight_px = 0.0 if rig is None else rig.parallax_px.get(pair.name, 0.0)
-        of_relief_px = max(of_flight_px, float(_RELIEF_SHARE * of_range_px.get(pair.name, 0.0)))
-        if better.prediction is not None and of_relief_px > 0.0:
-            std_px = float(math.hypot(better.prediction.std_px, of_relief_px))
-            better = replace(better, prediction=replace(better.prediction, std_px=std_px, covariance_px2=None))
-        fitted[pair.name] = better
-    return fitted
-
-
-def _shifts_by_range_px(pairs: Sequence[BandPair], result: Alignments) -> dict[str, float]:
+def shifts_by_range_px(pairs: Sequence[BandPair], result: Alignments) -> dict[str, float]:
     """Return by band the shift of the aligned scene, at its range, from one at an infinite distance.
 
     The rig tags contain the mappings at infinity. Their errors have no common direction: the shift is the part of the
@@ -138,7 +94,7 @@ def _shifts_by_range_px(pairs: Sequence[BandPair], result: Alignments) -> dict[s
     return {name: float(common_px * float(np.linalg.norm(layout))) for name, layout in layouts.items()}
 
 
-def _predicted(
+def fitted_with_lens_shapes(
     pair: BandPair, alignment: Alignment, start: PixelMapping, is_accepted: Callable[[WindowFit], bool] = lambda _: True
 ) -> Alignment | None:
     """Return the alignment as `predicted` by a homography and lens shapes, which replace the field of `start`."""
@@ -153,7 +109,7 @@ def _predicted(
     std_px = float(fit.std_px(points_in_frame(mapping, *pair.sizes_px)))
     prediction = pair.prediction_of(mapping, std_px, fit.covariance_px2 * np.outer(to_file_px, to_file_px))
     residual = WarpedPair.of(pair, mapping).residual
-    return decided(replace(alignment, mapping=mapping, residual=residual, prediction=prediction))
+    return replace(alignment, mapping=mapping, residual=residual, prediction=prediction)
 
 
 def _measured(pair: BandPair, mapping: PixelMapping) -> Residual:

@@ -1,86 +1,57 @@
-"""The status of a band: the only place that gives one.
+"""Which mapping a band gets: the one place that chooses between the candidates of a capture.
 
-| status    | the first row that applies                                                                  |
-|-----------|---------------------------------------------------------------------------------------------|
-| aligned   | no check found an issue                                                                     |
-| predicted | the mapping is a prediction with a standard error: by windows, the capture's relief, the rig |
-| seed_only | the mapping is that of a seed that is confirmed by images or tags and fits the windows       |
-| failed    | otherwise                                                                                   |
+`Alignment.status` follows from the evidence for the mapping that is chosen. These are the candidates, in the order in
+which they are made; each replaces the one before it if its row applies.
+
+| candidate                                  | decided by          | used if                                           |
+|--------------------------------------------|---------------------|---------------------------------------------------|
+| homography of descriptors, windows and rig | `verified`          | all issues are in PREDICTED_WITH (none: aligned)  |
+| the same with a displacement field         | `_with_field`       | it has fewer issues or a smaller standard error  |
+| relief of the capture                      | `by_relief`         | it fits half of the bands better; for all bands   |
+| seed                                       | `fall_back_to_seed` | the result has other issues                       |
+| windows without descriptors                | `by_windows`        | the result is the seed, and held-out windows fit |
+| homography beside the relief of the others | `with_one_geometry` | as prediction: indices would mix two geometries   |
+| prediction by the rig of the flight        | `against_rig`       | it contradicts the result, or is more certain     |
+| homography with lens shapes                | `with_lens_shapes`  | a part of the image has no windows                |
 
 A seed that contradicts the tags or the flight is replaced by their mapping: an image of another capture, for example,
 is confirmed at its own position, far from that of its band.
 """
 
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 
 from agalign.capture.band_pair import BandPair
+from agalign.capture.by_rig import RigPrediction, observed, rig_predictions
+from agalign.capture.by_windows import (
+    agreeing_with_seed,
+    fitted_to_windows,
+    fitted_with_lens_shapes,
+    shifts_by_range_px,
+)
+from agalign.capture.seeding import find_rotated
 from agalign.capture.warped_pair import Candidate, WarpedPair
+from agalign.flight.rig import Rig, distance_px
 from agalign.pixels.band_resampling import channel_mean
 from agalign.values.alignment import Alignment, Alignments, JointResult, Seed
-from agalign.values.choices import Geometry, PairStatus, ReliefUse, SeedKind
-from agalign.values.issues import OTHER_GEOMETRY, SEED_DOES_NOT_FIT, Issue
-from agalign.verify.checks import BY_PARALLAX, PREDICTED_WITH, is_unchanged, seed_fits
+from agalign.values.capture import Capture
+from agalign.values.choices import Geometry, ReliefUse, SeedKind
+from agalign.values.issues import INACCURATE, OTHER_CONTENT, OTHER_GEOMETRY, SEED_DOES_NOT_FIT, UNEXPECTED_PX, Issue
+from agalign.verify.checks import (
+    BY_PARALLAX,
+    MAX_ALIAS_PEAK,
+    MAX_UNEXPECTED_PX,
+    PREDICTED_WITH,
+    is_unchanged,
+    rig_issues,
+    seed_fits,
+)
+from agalign.verify.expected_error import points_in_frame, unobserved_quarters
 
-
-def decided(alignment: Alignment, *, is_seed_usable: bool = False) -> Alignment:
-    """Return the alignment with its status.
-
-    A `prediction` together with issues is one of the mapping. `is_seed_usable` is for the mapping of a seed.
-    """
-    status: PairStatus = "failed"
-    issues: tuple[Issue, ...] = alignment.issues
-    if not issues:
-        status = "aligned"
-    elif alignment.prediction is not None:
-        status = "predicted"
-    elif is_seed_usable and alignment.residual is not None and seed_fits(alignment.residual):
-        status = "seed_only"
-    if is_seed_usable and status == "failed":
-        issues += (Issue(SEED_DOES_NOT_FIT),)
-    return replace(alignment, status=status, issues=issues)
-
-
-def failed_at_seed(pair: BandPair, seed: Seed, *issues: Issue) -> Alignment:
-    """Return a failed alignment with the mapping of a seed."""
-    return decided(Alignment(pair.mapping(seed.fixed_to_moving), pair.fixed.size_px, "failed", issues, seed))
-
-
-def fall_back_to_seed(pair: BandPair, seed: Seed, issues: Sequence[Issue], *, seed_only: bool = False) -> Alignment:
-    """Return an alignment with the mapping of the seed, which is usable if it is trusted or with `seed_only`."""
-    expected = min(
-        ((std_px, kind) for kind, std_px in pair.seed_std_px.items() if kind in pair.seed_matrices), default=None
-    )
-    if expected is not None and not seed_only and not pair.is_expected(seed.fixed_to_moving):
-        seed = Seed(expected[1], pair.seed_matrices[expected[1]], 0.0, trusted=True)
-    result = failed_at_seed(pair, seed, *issues)
-    result = replace(result, residual=WarpedPair.of(pair, result.mapping).residual)
-    return decided(result, is_seed_usable=seed.trusted or seed_only)
-
-
-def predicted(alignment: Alignment, pair: BandPair, std_px: float, *issues: Issue) -> Alignment:
-    """Return as `predicted`, with this standard error, an alignment that its windows do not confirm everywhere.
-
-    `issues` precede its own.
-    """
-    prediction = pair.prediction_of(alignment.mapping, std_px)
-    return decided(replace(alignment, issues=(*issues, *alignment.issues), prediction=prediction))
-
-
-def with_one_geometry(pairs: Sequence[BandPair], result: Alignments) -> Alignments:
-    """Return the alignments by name: if a capture has a relief, homographies that are `aligned` become `predicted`.
-
-    A spectral index would mix two geometries otherwise. Thermal bands, which have another reference image, keep theirs.
-    """
-    known = [(pair, result[pair.name]) for pair in pairs if pair.name in result]
-    with_relief = {id(pair.reference) for pair, alignment in known if alignment.mapping.parallax is not None}
-    mixed: Alignments = {}
-    for pair, alignment in known:
-        is_homography = alignment.status == "aligned" and alignment.mapping.parallax is None
-        if is_homography and alignment.joint is not None and id(pair.reference) in with_relief:
-            std_px = WarpedPair.of(pair, alignment.mapping).std_px(alignment.joint)
-            mixed[pair.name] = predicted(alignment, pair, std_px, Issue(OTHER_GEOMETRY))
-    return {**result, **mixed}
+_RELIEF_SHARE = 0.15
+"""Standard deviation of the relief of ground without common structure, as a share of its range: crops and trees at low
+altitude, plants and booms at a metre."""
 
 
 def verified(candidate: Candidate, use: ReliefUse) -> Alignment:
@@ -101,7 +72,7 @@ def verified(candidate: Candidate, use: ReliefUse) -> Alignment:
     if not all(issue.kind in PREDICTED_WITH for issue in issues):
         return replace(fall_back_to_seed(pair, seed, issues), joint=joint, candidates=p95_px)
     alignment = replace(
-        failed_at_seed(pair, seed),
+        pair.seed_alignment(seed),
         mapping=chosen.mapping,
         issues=issues,
         joint=joint,
@@ -110,7 +81,7 @@ def verified(candidate: Candidate, use: ReliefUse) -> Alignment:
         relief_std_px=pair.relief_std_px,
         candidates=p95_px,
     )
-    return predicted(alignment, pair, chosen.std_px(joint)) if issues else decided(alignment)
+    return pair.predicted_alignment(alignment, chosen.std_px(joint)) if issues else alignment
 
 
 def _with_field(
@@ -164,3 +135,124 @@ def _unchanged_if_aligned(joint: JointResult, pair: BandPair) -> JointResult:
         if is_unchanged(joint, given, pair.fixed.size_px, max(pair.scales.fixed)):
             return replace(joint, fixed_to_moving=given)
     return joint
+
+
+def fall_back_to_seed(pair: BandPair, seed: Seed, issues: Sequence[Issue], *, seed_only: bool = False) -> Alignment:
+    """Return an alignment with the mapping of the seed, which is usable if it is trusted or with `seed_only`."""
+    known = min(
+        ((std_px, kind) for kind, std_px in pair.seed_std_px.items() if kind in pair.seed_matrices), default=None
+    )
+    if known is not None and not seed_only and not pair.is_expected(seed.fixed_to_moving):
+        seed = Seed(known[1], pair.seed_matrices[known[1]], 0.0, trusted=True)
+    result = pair.seed_alignment(seed, *issues)
+    residual = WarpedPair.of(pair, result.mapping).residual
+    if not (seed.trusted or seed_only):
+        return replace(result, residual=residual)
+    if not seed_fits(residual):
+        return replace(result, residual=residual, issues=(*issues, Issue(SEED_DOES_NOT_FIT)))
+    return replace(result, residual=residual, is_seed_usable=True)
+
+
+def by_windows(pair: BandPair, alignment: Alignment) -> Alignment:
+    """Return an alignment by windows if the descriptors failed and held-out windows confirm it.
+
+    Else return the prediction of a coarse band by windows that agree with its trusted seed, or else `alignment`.
+    """
+    if alignment.status in ("aligned", "predicted"):
+        return alignment
+    result = fitted_to_windows(pair, alignment)
+    if result is None and pair.is_coarse and alignment.seed.trusted:
+        result = agreeing_with_seed(pair, alignment)
+        if result is not None and WarpedPair.of(pair, result.mapping).alias_peak().ratio > MAX_ALIAS_PEAK:
+            result = None
+    return result or alignment
+
+
+def with_one_geometry(pairs: Sequence[BandPair], result: Alignments) -> Alignments:
+    """Return the alignments by name: if a capture has a relief, homographies that are `aligned` become `predicted`.
+
+    Thermal bands, which have another reference image, keep theirs.
+    """
+    known = [(pair, result[pair.name]) for pair in pairs if pair.name in result]
+    with_relief = {id(pair.reference) for pair, alignment in known if alignment.mapping.parallax is not None}
+    mixed: Alignments = {}
+    for pair, alignment in known:
+        is_homography = alignment.status == "aligned" and alignment.mapping.parallax is None
+        if is_homography and alignment.joint is not None and id(pair.reference) in with_relief:
+            std_px = WarpedPair.of(pair, alignment.mapping).std_px(alignment.joint)
+            mixed[pair.name] = pair.predicted_alignment(alignment, std_px, Issue(OTHER_GEOMETRY))
+    return {**result, **mixed}
+
+
+def against_rig(pairs: Sequence[BandPair], result: Alignments, rig: Rig, capture: Capture) -> Alignments:
+    """Return the alignments with the rig's predictions, px of the files; the prediction replaces failed alignments.
+
+    It also replaces results that contradict the rig, because of aliasing in repetitive scenes, and those under a relief
+    that are extrapolated over a quarter of the image. A rotated or scaled image does not fit the rig; its alignment
+    gets an issue and is not replaced. Predictions follow the relief of the capture, if it has one.
+    """
+    predictions = rig_predictions(pairs, result, rig, observed(pairs, result, capture))
+    by_name = {pair.name: pair for pair in pairs}
+    return {**result, **{name: _against_rig(by_name[name], result[name], p) for name, p in predictions.items()}}
+
+
+def _against_rig(pair: BandPair, alignment: Alignment, of_rig: RigPrediction) -> Alignment:
+    """Return the alignment with its distance from the rig's prediction, which replaces it if that contradicts it or is
+    more certain.
+    """
+    prediction = of_rig.of_plane
+    if of_rig.observed is not None and alignment.joint is not None and alignment.residual is not None:
+        off_px = distance_px(of_rig.observed, prediction.fixed_to_moving, of_rig.size_px)
+        prediction = replace(prediction, off_px=off_px)
+        # The other checks have passed.
+        issues = tuple(rig_issues(prediction))
+        if not issues:
+            return replace(alignment, prediction=prediction)
+        alignment = replace(alignment, issues=issues)
+    prediction = replace(of_rig.of_scene, off_px=prediction.off_px)
+    # Windows of another scene contribute to the mapping of the band, but not to the rig's.
+    is_mixed = any(issue.kind == OTHER_CONTENT for issue in alignment.issues)
+    own = None if is_mixed else alignment.prediction
+    if own is not None and own.std_px <= prediction.std_px:
+        between_files = pair.scales.between_files(alignment.fixed_to_moving)
+        if distance_px(between_files, prediction.fixed_to_moving, of_rig.size_px) <= MAX_UNEXPECTED_PX:
+            return alignment
+    by_rig = WarpedPair.of(pair, of_rig.mapping)
+    rotated = find_rotated(by_rig)
+    if rotated is None:
+        return replace(alignment, mapping=by_rig.mapping, residual=by_rig.residual, prediction=prediction)
+    off_px = distance_px(pair.scales.between_files(rotated), prediction.fixed_to_moving, pair.reference_file_px)
+    unexpected = Issue(UNEXPECTED_PX, off_px, MAX_UNEXPECTED_PX), *alignment.issues
+    at_seed = replace(alignment, mapping=alignment.seed_mapping, issues=unexpected, is_seed_usable=False)
+    return replace(at_seed, prediction=None, residual=None)
+
+
+def with_lens_shapes(pairs: Sequence[BandPair], result: Alignments, rig: Rig | None = None) -> Alignments:
+    """Return the alignments; those that are predicted with a quarter of the image without windows get lens shapes.
+
+    A homography does not extrapolate relief: the spread of that of the flight, or of unknown relief at the range of the
+    capture, is part of the standard error.
+    """
+    decided, of_range_px = dict(result), shifts_by_range_px(pairs, result)
+    for pair in pairs:
+        alignment = result[pair.name]
+        own, residual = alignment.prediction, alignment.residual
+        is_inaccurate = own is not None and [i.kind for i in alignment.issues] == [INACCURATE]
+        if not is_inaccurate or own is None or residual is None or alignment.mapping.parallax is not None:
+            continue
+        plane, size_px = alignment.mapping.without_parallax, pair.fixed.size_px
+        if "geo" in pair.seed_matrices or not unobserved_quarters(
+            residual.measured_px, size_px, points_in_frame(plane, *pair.sizes_px)
+        ):
+            continue
+        again = fitted_with_lens_shapes(pair, alignment, plane)
+        better = (
+            alignment if again is None or again.prediction is None or own.std_px < again.prediction.std_px else again
+        )
+        of_flight_px = 0.0 if rig is None else rig.parallax_px.get(pair.name, 0.0)
+        of_relief_px = max(of_flight_px, _RELIEF_SHARE * of_range_px.get(pair.name, 0.0))
+        if better.prediction is not None and of_relief_px > 0.0:
+            std_px = math.hypot(better.prediction.std_px, of_relief_px)
+            better = replace(better, prediction=replace(better.prediction, std_px=std_px, covariance_px2=None))
+        decided[pair.name] = better
+    return decided

@@ -11,7 +11,6 @@ from dataclasses import replace
 
 import numpy as np
 
-from agalign.capture.decision import decided
 from agalign.errors import UnreadableFileError
 from agalign.fit.adjustment import fit_in_rounds
 from agalign.fit.windows import FixedWindows
@@ -52,7 +51,7 @@ def at_full_resolution(reference: Band, moving: Band, alignment: Alignment) -> A
     except UnreadableFileError as error:
         issue = Issue(UNREADABLE, detail=str(error))
         without = replace(alignment, mapping=alignment.seed_mapping, issues=(issue,), prediction=None)
-        return decided(replace(without, joint=None, residual=None))
+        return replace(without, joint=None, residual=None)
     return alignment if refined is None else refined
 
 

@@ -325,8 +325,6 @@ class Alignment:
     """The complete mapping from raw pixels of the reference to raw pixels of the moving image."""
     size_px: Size
     """(width, height) of the reference; `warp` resamples to its grid."""
-    status: PairStatus
-    """aligned: passed verification; predicted: by rig or extrapolation; seed_only, failed: the seed unchanged."""
     issues: tuple[Issue, ...]
     """Reasons against accepting the alignment, the most important first; empty if it is `aligned`."""
     seed: Seed
@@ -343,7 +341,10 @@ class Alignment:
     candidates: Mapping[Geometry, float] = field(default_factory=dict)
     """p95 of the shifts of held-out windows by each geometry that was fitted; empty if only a homography was."""
     prediction: Prediction | None = None
-    """Prediction by the rig of the flight; None without a rig."""
+    """Prediction of the mapping: by the rig of the flight, or by windows in a part of the image. Together with `issues`
+    it is the mapping; without, the mapping has been compared with it. None without either."""
+    is_seed_usable: bool = False
+    """The mapping is that of the seed, which the images or the tags confirm and which fits the windows."""
     lens_std_px: NDArray[np.float64] | None = None
     """(4,) standard deviations of the lens shapes (`fit.adjustment`) that neither tags nor a rig determine, px of the
     reference; None if they are known, or contained in a prediction."""
@@ -352,6 +353,23 @@ class Alignment:
     near."""
     moving_size_px: Size | None = None
     """(width, height) of the moving image; None if it is not known, as in sidecars of earlier versions."""
+
+    @property
+    def status(self) -> PairStatus:
+        """What the evidence amounts to.
+
+        | status    | the first row that applies                                         |
+        |-----------|--------------------------------------------------------------------|
+        | aligned   | there are no issues: it passed verification                        |
+        | predicted | the mapping is a prediction with a standard error                  |
+        | seed_only | the mapping is that of the seed, which is confirmed                |
+        | failed    | otherwise; the mapping is that of the seed                         |
+        """
+        if not self.issues:
+            return "aligned"
+        if self.prediction is not None:
+            return "predicted"
+        return "seed_only" if self.is_seed_usable else "failed"
 
     def map(self, reference_px: ArrayLike) -> Points:
         """Map raw pixels (..., 2) of the reference to raw pixels of the moving image, (0, 0) a pixel's centre."""

@@ -275,7 +275,6 @@ class BandResult(_Part):
         return Alignment(
             PixelMapping(self.homography.fixed_to_moving, fixed, moving, field=self.field, parallax=parallax),
             size_px,
-            self.status,
             self.issues,
             self.seed,
             joint=self.joint,
@@ -285,6 +284,7 @@ class BandResult(_Part):
             after=Similarity() if self.metrics is None else self.metrics.after,
             candidates={} if self.geometry is None else self.geometry.held_out_p95_px,
             prediction=self.prediction,
+            is_seed_usable=self.status == "seed_only",
             lens_std_px=self.lens_std_px,
             relief_std_px=self.relief_std_px,
             moving_size_px=self.size_px,
