@@ -14,17 +14,7 @@ from pydantic import dataclasses as validated
 from agalign.errors import InputError
 from agalign.values import geometry
 from agalign.values.choices import Geometry, Interpolation, ModelFamily, PairStatus, PredictionSource, SeedKind, Space
-from agalign.values.fields import (
-    POSITION_DECIMALS,
-    RECORD,
-    Array,
-    Matrix3x3,
-    Measured,
-    Number,
-    Number4,
-    Number6,
-    UpToInfinity,
-)
+from agalign.values.fields import RECORD, Array, Matrix3x3, Measured, Number, Number4, Number6, UpToInfinity
 from agalign.values.geometry import Matrix, Points
 from agalign.values.image import Mask
 from agalign.values.interpolation import can_hold, planes_of, resample_planes
@@ -145,10 +135,10 @@ class Residual:
 
     centres_px: Annotated[NDArray[np.float64], Array((None, 2), 2)]
     """Centres of the n windows, px of the reference."""
-    shifts_px: Annotated[NDArray[np.float64], Array((None, 2), POSITION_DECIMALS, nullable=True)]
+    shifts_px: Annotated[NDArray[np.float64], Array((None, 2), 3, nullable=True)]
     """Position of the moving band's structure minus that of the reference's, px of the reference; null where it could
     not be measured."""
-    peaks_sigma: Annotated[NDArray[np.float64], Array((None,), 4, nullable=True)]
+    peaks_sigma: Annotated[NDArray[np.float64], Array((None,), 2, nullable=True)]
     """Height of the correlation peak of each window, in standard deviations; the error of a shift is inversely
     proportional to its square."""
     cells: Annotated[NDArray[np.int64], Array((None, 2), integers=True)]

@@ -193,10 +193,10 @@ def compact_lists(text: str) -> str:
     """Return indented JSON with each list of numbers, or of such lists, on one line: it takes a third of the size."""
     # Numbers, null, true and false start with these characters; keys and texts start with a quote.
     text = re.sub(r"\[\n +(?=[-0-9ntf])", "[", text)
-    text = re.sub(r",\n +(?=[-0-9ntf])", ", ", text)
+    text = re.sub(r",\n +(?=[-0-9ntf])", ",", text)
     text = re.sub(r"(?<=[0-9le])\n *\]", "]", text)
     text = re.sub(r"\[\n +(?=\[)", "[", text)
-    text = re.sub(r"\],\n +(?=\[)", "], ", text)
+    text = re.sub(r"\],\n +(?=\[)", "],", text)
     return re.sub(r"\]\n *(?=\])", "]", text)
 
 

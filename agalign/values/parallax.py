@@ -20,6 +20,9 @@ from scipy.ndimage import map_coordinates
 from agalign.values.image import FloatImage, Mask
 from agalign.values.pixel_units import SAME_PIXELS, PixelScale, Size
 
+RELIEF_STEP = 0.01
+"""Step of the parallax, its standard error (px) and the confidence in files: below their errors."""
+
 
 @dataclass(frozen=True)
 class Relief:
@@ -153,6 +156,5 @@ class Parallax:
 
 
 def rounded(values: NDArray[np.floating]) -> FloatImage:
-    """Return values (height, width) of a relief as they are written: rounded below their errors, which compresses."""
-    step = np.float64(0.01)
-    return np.asarray(np.round(values / step) * step, np.float32)
+    """Return values (height, width) of a relief as they are written: multiples of RELIEF_STEP, which compress."""
+    return np.asarray(np.round(values / np.float64(RELIEF_STEP)) * RELIEF_STEP, np.float32)

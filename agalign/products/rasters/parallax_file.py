@@ -13,7 +13,7 @@ from agalign.products.rasters.checked_raster import LayerDescription, write_on_g
 from agalign.products.sidecar.schema import Sidecar
 from agalign.values.capture import Georeference
 from agalign.values.image import OutputGrid
-from agalign.values.parallax import Relief, rounded
+from agalign.values.parallax import RELIEF_STEP, Relief
 
 PARALLAX_KIND, PARALLAX_SUFFIX = "parallax", ".parallax.tif"
 _LAYERS = {"parallax": "px", "confidence": "1", "standard error": "px"}
@@ -24,9 +24,14 @@ def write_parallax(path: Path, relief: Relief, georeference: Georeference | None
     """Write a relief at the pixels of the reference. Raises OutputError."""
     values = [relief.parallax_px, relief.confidence, *([] if relief.std_px is None else [relief.std_px])]
     height, width = relief.parallax_px.shape
-    layers = [LayerDescription(name, unit) for name, unit in list(_LAYERS.items())[: len(values)]]
-    blocks = ((rounded(layer), index, 0, 0) for index, layer in enumerate(values, start=1))
-    write_on_grid(path, OutputGrid(0, 0, width, height), georeference, layers, blocks)
+    layers = [
+        LayerDescription(name, unit, scale_offset=(RELIEF_STEP, 0.0))
+        for name, unit in list(_LAYERS.items())[: len(values)]
+    ]
+    steps = (np.rint(layer.astype(np.float64) / RELIEF_STEP).astype(np.int32) for layer in values)
+    blocks = ((layer, index, 0, 0) for index, layer in enumerate(steps, start=1))
+    grid, options = OutputGrid(0, 0, width, height), {"compress": "deflate", "predictor": 2, "interleave": "band"}
+    write_on_grid(path, grid, georeference, layers, blocks, dtype="int32", options=options)
 
 
 def read_relief(sidecar: Sidecar, folder: Path) -> Relief | None:
@@ -40,5 +45,6 @@ def read_relief(sidecar: Sidecar, folder: Path) -> Relief | None:
     with open_raster(path) as file:
         if (file.width, file.height) != sidecar.reference.size_px or file.count < len(_LAYERS) - 1:
             raise SidecarError(f"{path}: is not the parallax of {sidecar.capture}; run again with --overwrite")
-        parallax_px, confidence, *std_px = np.asarray(file.read(), np.float32)[: len(_LAYERS)]
+        steps = file.read()[: len(_LAYERS)].astype(np.float64)
+        parallax_px, confidence, *std_px = (steps * RELIEF_STEP).astype(np.float32)
     return Relief(parallax_px, confidence, std_px=std_px[0] if std_px else None)

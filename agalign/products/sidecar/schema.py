@@ -44,8 +44,9 @@ from agalign.values.pixel_units import PixelScale
 
 SCHEMA = "agalign/2"
 PointPx = tuple[Number, Number]
-Coefficients = Annotated[NDArray[np.float64], Array((None, 2), 9)]
-"""Nine decimals: they are multiplied by the square of the parallax, up to hundreds of px."""
+Slopes = Annotated[NDArray[np.float64], Array((None, 2), 7)]
+Curvatures = Annotated[NDArray[np.float64], Array((None, 2), 9)]
+"""They are multiplied by the parallax, up to hundreds of px, and by its square."""
 
 
 class _Part(BaseModel):
@@ -150,9 +151,9 @@ class ReliefPart(_Part):
     """Nodes: those of `grid`."""
     plane_px: PointsPx
     """Where the reference plane maps them, raw px of the moving file."""
-    slope: Coefficients
+    slope: Slopes
     """Px of the moving file per px of parallax."""
-    curvature: Coefficients | None = None
+    curvature: Curvatures | None = None
     """The same per px of parallax squared; null in files of earlier versions, which are less accurate."""
 
     @model_validator(mode="after")
