@@ -27,6 +27,7 @@ from agalign.products.product import CapturePaths
 from agalign.products.registry import PRODUCTS
 from agalign.products.sidecar.file import read_sidecar
 from agalign.products.sidecar.schema import Sidecar
+from agalign.values.alignment import Alignment
 from agalign.values.capture import Capture
 from agalign.values.choices import RadiometryChoice
 from agalign.values.process_pool import A, R
@@ -190,14 +191,14 @@ def process_capture(task: Task, progress: PairProgress = quiet) -> CaptureReport
     for product in PRODUCTS:
         if product.is_enabled(settings.write):
             product.check(capture)
-    sidecar = None
+    sidecar, alignments = None, dict[str, Alignment]()
     with suppress(SidecarError):
         sidecar = read_sidecar(path)
     if sidecar is None or not task.is_estimated:
         model = None if task.model is None else loaded_model(task.model, settings.joint.device)
-        sidecar = estimate(capture, out, settings, model, progress, sidecar)
+        sidecar, alignments = estimate(capture, out, settings, model, progress, sidecar)
     progress(capture.reference.name, "writing", 0.0)
-    result = render(capture, out, settings, sidecar, task.rendering)
+    result = render(capture, out, settings, sidecar, task.rendering, alignments)
     lost = (*result.failures, *lost_reflectance(capture, settings.write.radiometry))
     return CaptureReport(
         capture.label,

@@ -12,6 +12,7 @@ from agalign.products.rasters.alignment_maps import relief_of
 from agalign.products.rasters.parallax_file import PARALLAX_KIND, PARALLAX_SUFFIX, write_parallax
 from agalign.products.sidecar.file import file_part, write_sidecar
 from agalign.products.sidecar.schema import Sidecar
+from agalign.values.alignment import Alignment
 from agalign.values.capture import Capture
 
 
@@ -22,8 +23,9 @@ def estimate(
     model: FlightModel | None,
     progress: PairProgress,
     earlier: Sidecar | None = None,
-) -> Sidecar:
-    """Align the bands of a capture; write its sidecar, and its parallax if it has a relief, and return the sidecar.
+) -> tuple[Sidecar, dict[str, Alignment]]:
+    """Align the bands of a capture; write its sidecar, and its parallax if it has a relief; return the sidecar and the
+    alignments.
 
     It lists the products of the `earlier` sidecar, which describe another estimate, until they are rendered again.
     Raises UnreadableFileError if the reference cannot be read, and OutputError.
@@ -45,4 +47,4 @@ def estimate(
     if relief is None:
         with suppress(OSError):
             path.unlink(missing_ok=True)
-    return result
+    return result, alignments

@@ -23,6 +23,7 @@ from agalign.products.report.preview import preview_bytes
 from agalign.products.sidecar.file import read_result, write_sidecar
 from agalign.products.sidecar.rendered import rendered
 from agalign.products.sidecar.schema import Sidecar
+from agalign.values.alignment import Alignment
 from agalign.values.capture import Capture
 from agalign.values.files import check_inside
 from agalign.values.image import OutputGrid
@@ -69,11 +70,19 @@ def with_earlier_products(settings: WriteSettings, sidecar: Sidecar, folder: Pat
     )
 
 
-def render(capture: Capture, out: Path, settings: Settings, sidecar: Sidecar, options: RenderOptions) -> Rendering:
+def render(
+    capture: Capture,
+    out: Path,
+    settings: Settings,
+    sidecar: Sidecar,
+    options: RenderOptions,
+    estimated: Mapping[str, Alignment] | None = None,
+) -> Rendering:
     """Write the products of an estimated capture, and its sidecar with them.
 
-    `capture` has the radiometry and the saturation values with which it is written. Raises OutputError,
-    UnreadableFileError for an image of the reference or the parallax, and InputError.
+    `capture` has the radiometry and the saturation values with which it is written. The mappings are those in the
+    sidecar; positions that the `estimated` ones hold are used again. Raises OutputError, UnreadableFileError for an
+    image of the reference or the parallax, and InputError.
     """
     paths = CapturePaths.of(capture, out)
     write = with_earlier_products(settings.write, sidecar, paths.folder)
@@ -81,7 +90,10 @@ def render(capture: Capture, out: Path, settings: Settings, sidecar: Sidecar, op
     outdated = outdated_files(capture, out, write, sidecar)
     if sidecar.rendered_with:  # a run that is killed now must render again
         sidecar = write_sidecar(paths.sidecar, sidecar.model_copy(update={"rendered_with": ""}))
-    alignments = sidecar.alignments(read_relief(sidecar, paths.folder))
+    alignments = {
+        name: _with_held_positions(alignment, (estimated or {}).get(name))
+        for name, alignment in sidecar.alignments(read_relief(sidecar, paths.folder)).items()
+    }
     whole = OutputGrid(0, 0, *capture.reference.size_px)
     context = ProductContext(
         capture, paths, settings, sidecar, alignments, (), whole, options.max_preview_bytes, options.limits
@@ -100,6 +112,12 @@ def render(capture: Capture, out: Path, settings: Settings, sidecar: Sidecar, op
     complete = write_sidecar(paths.sidecar, rendered(context, list(failures)))
     # Products that need the same file fail with the same message.
     return Rendering(complete, tuple(dict.fromkeys(failures.values())), reasons)
+
+
+def _with_held_positions(alignment: Alignment, estimated: Alignment | None) -> Alignment:
+    if estimated is None or not alignment.mapping.same_as(estimated.mapping):
+        return alignment
+    return replace(alignment, mapping=estimated.mapping)
 
 
 def _write_products(context: ProductContext) -> dict[str, str]:

@@ -37,7 +37,7 @@ from agalign.values.alignment import (
     Residual,
     Seed,
 )
-from agalign.values.capture import Band, Capture
+from agalign.values.capture import Capture
 from agalign.values.issues import SEED_ASKED_FOR, Issue
 from agalign.values.mapping import PixelMapping
 from agalign.values.parallax import Parallax, Relief
@@ -63,30 +63,31 @@ def align_capture_bands(
         aligned = against_rig(pairs, aligned, rig, capture)
     if not settings.seed.only:
         aligned = with_lens_shapes(pairs, aligned, rig)
+    size_px = capture.reference.size_px
+    between_files = {pair.name: _between_files(capture, pair, aligned[pair.name]) for pair in pairs}
+    reliefs = (a.mapping.parallax.relief for a in between_files.values() if a.mapping.parallax is not None)
+    relief = next((relief.on_pixels(size_px) for relief in reliefs), None)  # the same in all bands
     result: dict[str, Alignment] = {}
     for pair in pairs:
         progress(pair.name, "measuring", 0.0)
-        measured = with_metrics(aligned[pair.name], pair)
-        result |= dict.fromkeys((b.name for b in pair.bands), _between_files(capture, pair, measured))
-    size_px = capture.reference.size_px
+        measured = with_metrics(_as_written(between_files[pair.name], relief), pair)
+        result |= {band.name: replace(measured, moving_size_px=band.size_px) for band in pair.bands}
     for band in capture.moving:
         if band.name not in result:
             overlay = Seed("identity", geometry.overlay(size_px, band.size_px), 0.0)
             issues = (unusable[band.name],) if band.name in unusable else ()  # none in a band of the reference's lens
             mapping = PixelMapping(overlay.fixed_to_moving)
-            result[band.name] = Alignment(mapping, size_px, issues, overlay)
-    reliefs = (a.mapping.parallax.relief for a in result.values() if a.mapping.parallax is not None)
-    relief = next((relief.on_pixels(size_px) for relief in reliefs), None)  # the same in all bands
+            result[band.name] = Alignment(mapping, size_px, issues, overlay, moving_size_px=band.size_px)
     seconds = (time.perf_counter() - start_s) / max(1, len(capture.moving))  # most steps are for all bands together
-    return {b.name: replace(_as_written(result[b.name], b, relief), seconds=seconds) for b in capture.moving}
+    return {b.name: replace(result[b.name], seconds=seconds) for b in capture.moving}
 
 
-def _as_written(alignment: Alignment, band: Band, relief: Relief | None) -> Alignment:
-    """Return the alignment of a band with the relief that is written: a reader of the sidecar has the same mapping."""
-    mapping = alignment.mapping
-    if relief is not None and mapping.parallax is not None:
-        mapping = mapping.with_parallax(Parallax(relief, mapping.parallax.baseline).with_occlusions())
-    return replace(alignment, mapping=mapping, moving_size_px=band.size_px)
+def _as_written(alignment: Alignment, relief: Relief | None) -> Alignment:
+    """Return an alignment with the relief that is written: a reader of the sidecar has the same mapping."""
+    if relief is None or alignment.mapping.parallax is None:
+        return alignment
+    parallax = Parallax(relief, alignment.mapping.parallax.baseline).with_occlusions()
+    return replace(alignment, mapping=alignment.mapping.with_parallax(parallax))
 
 
 def _between_files(capture: Capture, pair: BandPair, aligned: Alignment) -> Alignment:

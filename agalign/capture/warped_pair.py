@@ -174,8 +174,12 @@ def result_of_windows(fixed_to_moving: Matrix) -> JointResult:
 
 
 def with_metrics(alignment: Alignment, pair: BandPair) -> Alignment:
-    """Return the alignment with similarity metrics before (image borders overlaid) and after alignment."""
+    """Return an alignment between the files with similarity metrics of the images before (borders overlaid) and after
+    alignment.
+    """
     similarity = pair.reference.similarity
     before = pair.warped_moving(PixelMapping(geometry.overlay(pair.fixed.size_px, pair.moving_image.size_px)))
-    after = pair.warped_moving(alignment.mapping)
+    mapping = alignment.mapping.rescaled(pair.scales.fixed, pair.scales.moving)
+    mapping.hold_positions(pair.fixed.size_px)
+    after = pair.warped_moving(mapping)
     return replace(alignment, before=similarity.to(before), after=similarity.to(after))

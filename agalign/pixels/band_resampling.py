@@ -72,7 +72,8 @@ def warped(
     moving_scale = PixelScale.between(moving.size_px, small.size_px)
     rescaled, area = mapping.rescaled(fixed_scale, moving_scale), Tile(0, 0, *size_px)
     positions = rescaled.positions(area, np.float32)
-    cv2.patchNaNs(positions, -1e6)  # points on the horizon of the homography: outside of every image
+    if np.isnan(positions).any():
+        positions = np.nan_to_num(positions, nan=-1e6)  # on the horizon of the homography: outside of every image
     pixels = cv2.remap(small.pixels, positions, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     valid = between(positions, np.zeros(2), np.subtract(small.size_px, 1))
     if rescaled.parallax is not None:

@@ -1,10 +1,11 @@
 """The complete mapping between the raw pixels of two images, and its fast evaluation on a grid."""
 
+import dataclasses
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from typing import Annotated
+from typing import Annotated, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
@@ -63,6 +64,11 @@ class DisplacementField:
         values = [map_coordinates(plane, at, order=3, mode="nearest") for plane in planes]
         return self.scale.inverse.displacements(np.stack(values, axis=-1).reshape(points.shape))
 
+    def same_as(self, other: "DisplacementField") -> bool:
+        """Return True if two fields are equal in every number."""
+        steps = (self.step_px, self.scale) == (other.step_px, other.scale)
+        return steps and np.array_equal(self.displacements_px, other.displacements_px)
+
     def rescaled(self, scale: PixelScale) -> "DisplacementField":
         """The same on an image that is resized by `scale`."""
         return replace(self, scale=self.scale.over(scale))
@@ -73,6 +79,15 @@ class DisplacementField:
         They have the decimals of a sidecar, so that a reader of it has the same field.
         """
         return DisplacementField.sampled(lambda points: self(points).round(POSITION_DECIMALS), step_px, size_px)
+
+
+class HeldPositions(NamedTuple):
+    """The positions of all pixels of a reference in the moving image."""
+
+    size_px: Size
+    """(width, height) of the reference."""
+    positions: Points
+    """(height, width, 2) raw px, float32."""
 
 
 @dataclass(frozen=True)
@@ -88,6 +103,8 @@ class PixelMapping:
     """Displacements of raw reference px, applied first."""
     parallax: Parallax | None = None
     """Displacements of undistorted reference px, by the parallax at the raw ones."""
+    held: "HeldPositions | None" = dataclasses.field(default=None, init=False, repr=False, compare=False)
+    """Positions of all pixels, once they are computed (`hold_positions`); a changed mapping does not have them."""
 
     def __call__(self, reference_px: ArrayLike) -> Points:
         """(..., 2) raw reference pixels to raw moving pixels."""
@@ -142,6 +159,8 @@ class PixelMapping:
 
     def rescaled(self, fixed_scale: PixelScale, moving_scale: PixelScale) -> "PixelMapping":
         """The same mapping between images that are resized by `fixed_scale` and `moving_scale`."""
+        if fixed_scale == moving_scale == SAME_PIXELS:
+            return self
         return PixelMapping(
             geometry.rescale(self.fixed_to_moving, fixed_scale, moving_scale),
             lens.rescaled(self.fixed_lens, fixed_scale),
@@ -160,6 +179,29 @@ class PixelMapping:
             or any(map(lens.is_distorting, (self.fixed_lens, self.moving_lens, self.pre_distortion)))
         )
 
+    def hold_positions(self, size_px: Size) -> None:
+        """Compute the positions of all pixels of a reference (width, height) once for the steps that resample it.
+
+        Nothing is done for large images, which are resampled in tiles.
+        """
+        max_held_px = 8_000_000  # 64 MB; images of cameras that are not reduced for the estimation have 5 million
+        if size_px[0] * size_px[1] <= max_held_px and self.held is None:
+            held = HeldPositions(size_px, self.positions(Tile(0, 0, *size_px), np.float32))
+            object.__setattr__(self, "held", held)
+
+    def same_as(self, other: "PixelMapping") -> bool:
+        """Return True if two mappings are equal in every number."""
+        parts = (
+            (m.fixed_lens, m.moving_lens, m.pre_distortion, m.field is None, m.parallax is None) for m in (self, other)
+        )
+        if len({*parts}) > 1 or not np.array_equal(self.fixed_to_moving, other.fixed_to_moving):
+            return False
+        if self.field is not None and other.field is not None and not self.field.same_as(other.field):
+            return False
+        if self.parallax is None or other.parallax is None:
+            return True
+        return self.parallax.same_as(other.parallax)
+
     def is_smooth(self, tile: Tile) -> bool:
         """True without parallax, and if the horizon of the homography does not cross the tile."""
         corners = np.array([(tile.x0 + x, tile.y0 + y) for x in (0, tile.width) for y in (0, tile.height)], np.float64)
@@ -173,6 +215,8 @@ class PixelMapping:
         tile: with it, a pixel has the same position, to the last bit, in any tile.
         """
         width, height = size_px or (tile.x0 + tile.width, tile.y0 + tile.height)
+        if self.held is not None and self.held.size_px == (width, height) and dtype == np.float32:
+            return self.held.positions[tile.y0 : tile.y0 + tile.height, tile.x0 : tile.x0 + tile.width]
         (left, columns), (top, rows) = _blocks(tile.x0, tile.width, width), _blocks(tile.y0, tile.height, height)
         result = np.empty((sum(map(len, rows)), sum(map(len, columns)), 2), dtype)
         for y_px in rows:

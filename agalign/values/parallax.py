@@ -123,6 +123,12 @@ class Parallax:
         is_large[0] = False  # the background
         return replace(self, hidden=np.asarray(is_large[labels]))
 
+    def same_as(self, other: "Parallax") -> bool:
+        """Return True if two reliefs displace a band equally, in every number."""
+        one, two = self.relief, other.relief
+        scales = (self.baseline, one.scale, one.unit) == (other.baseline, two.scale, two.unit)
+        return scales and np.array_equal(one.parallax_px, two.parallax_px)
+
     def hides(self, x_px: NDArray[np.float64], y_px: NDArray[np.float64]) -> Mask:
         """True where raw points of the reference are occluded in the band.
 
