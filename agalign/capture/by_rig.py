@@ -1,71 +1,116 @@
 """Predictions of the bands of a capture by the flight's rig: candidates for `decision`; the bands to learn."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from agalign.capture.band_pair import BandPair
-from agalign.flight.rig import Observation, Rig
+from agalign.flight.rig import Observation, Rig, distance_px
 from agalign.flight.rig_prediction import predict_band
-from agalign.values.alignment import MIN_TIMES_CHANCE, Alignments, Prediction
+from agalign.values.alignment import MIN_TIMES_CHANCE, Alignments, JointResult, Prediction
 from agalign.values.capture import Capture
 from agalign.values.geometry import Matrix
 from agalign.values.mapping import PixelMapping
 from agalign.values.parallax import Parallax
 
 
-def observed(pairs: Sequence[BandPair], result: Alignments, capture: Capture) -> Observation:
-    """Return the aligned mappings of a capture, between pixels that the rig relates, as an observation of the rig."""
-    mappings, std_px, parallax_px = dict[str, Matrix](), dict[str, float](), dict[str, float]()
-    for pair in (p for p in pairs if p.has_rig_pixels and p.name in result):
-        alignment = result[pair.name]
-        if alignment.status != "aligned" or alignment.joint is None:
-            continue
-        matrix, parallax = alignment.fixed_to_moving, alignment.mapping.parallax
-        mappings[pair.name] = pair.scales.between_files(matrix)
-        std_px[pair.name] = pair.in_moving_file_px(alignment.joint.corner_std_px, matrix)
-        if parallax is not None:
-            rms_px = float(parallax.relief.rms_px * math.hypot(*parallax.baseline))
-            parallax_px[pair.name] = pair.in_moving_file_px(rms_px, matrix)
-    return Observation(capture.time_s, mappings, std_px, capture.altitude_m, capture.motion, parallax_px)
-
-
 @dataclass(frozen=True)
 class RigPrediction:
-    """The prediction of a band by the rig, and what its own result is compared with."""
+    """The prediction of a band by the rig of the flight.
 
+    A rig is between px of the files, and the bands of a capture are aligned between px of the images: `observation` and
+    this class are the only places that convert between them.
+    """
+
+    pair: BandPair
     of_plane: Prediction
     """Of the reference plane."""
     of_scene: Prediction
     """The same, with the error of the relief of the scene."""
-    mapping: PixelMapping
-    """The predicted mapping between the images, with the relief of the capture."""
-    observed: Matrix | None
-    """The homography of the band's own result between the files; None if it is not aligned."""
-    size_px: tuple[int, int]
-    """(width, height) of the reference's file."""
+    parallax: Parallax | None
+    """The relief of the capture, with the baseline of the rig."""
+
+    @property
+    def fixed_to_moving(self) -> Matrix:
+        """The predicted homography between the images."""
+        return self.pair.scales.between_images(self.of_plane.fixed_to_moving)
+
+    @property
+    def mapping(self) -> PixelMapping:
+        """The predicted mapping between the images, with the relief of the capture."""
+        return self.pair.mapping(self.fixed_to_moving).with_parallax(self.parallax)
+
+    def std_px(self, fixed_to_moving: Matrix) -> float:
+        """Return the standard error, px of the fixed image, for a homography between the images."""
+        return self.of_plane.std_px / self.pair.in_moving_file_px(1.0, fixed_to_moving)
+
+    def distance_px(self, fixed_to_moving: Matrix) -> float:
+        """Return the RMS distance of a homography between the images from the prediction, px of the moving file."""
+        own = self.pair.scales.between_files(fixed_to_moving)
+        return distance_px(own, self.of_plane.fixed_to_moving, self.pair.reference_file_px)
+
+
+def observation(
+    pairs: Sequence[BandPair], joints: Mapping[str, JointResult], capture: Capture | None = None
+) -> Observation:
+    """Return the results by band, between the images, as an observation of the rig.
+
+    Bands between other pixels than those of the rig are omitted.
+    """
+    mappings, std_px = dict[str, Matrix](), dict[str, float]()
+    for pair in pairs:
+        if pair.has_rig_pixels and pair.name in joints:
+            joint = joints[pair.name]
+            mappings[pair.name] = pair.scales.between_files(joint.fixed_to_moving)
+            std_px[pair.name] = pair.in_moving_file_px(joint.corner_std_px, joint.fixed_to_moving)
+    if capture is None:
+        return Observation(None, mappings, std_px)
+    return Observation(capture.time_s, mappings, std_px, capture.altitude_m, capture.motion)
+
+
+def observed(pairs: Sequence[BandPair], result: Alignments, capture: Capture) -> Observation:
+    """Return the aligned mappings of a capture as an observation of the rig."""
+    known = {
+        name: replace(a.joint, fixed_to_moving=a.fixed_to_moving)
+        for name, a in result.items()
+        if a.status == "aligned" and a.joint is not None
+    }
+    parallax_px = {}
+    for pair in pairs:
+        parallax = result[pair.name].mapping.parallax if pair.name in known else None
+        if parallax is not None:
+            rms_px = parallax.relief.rms_px * math.hypot(*parallax.baseline)
+            parallax_px[pair.name] = pair.in_moving_file_px(rms_px, known[pair.name].fixed_to_moving)
+    return replace(observation(pairs, known, capture), parallax_px=parallax_px)
+
+
+def rig_prediction(pair: BandPair, rig: Rig, known: Observation) -> RigPrediction:
+    """Return the prediction of a band from the `known` bands of the capture, without relief."""
+    prediction = predict_band(rig, pair.name, known)
+    return RigPrediction(pair, prediction, prediction, None)
 
 
 def rig_predictions(
     pairs: Sequence[BandPair], result: Alignments, rig: Rig, known: Observation
 ) -> dict[str, RigPrediction]:
-    """Return the prediction of each band of the rig from the `known` mappings of the capture."""
+    """Return the prediction of each band of the rig from the `known` bands of the capture, with its relief."""
     covered = [p for p in pairs if p.name in rig.mean and p.has_rig_pixels]
     parallaxes = [(p, result[p.name].mapping.parallax) for p in covered if p.name in known.mappings]
     predictions: dict[str, RigPrediction] = {}
     for pair in covered:
-        parallax, parallax_std_px = _parallax_by_rig(pair, parallaxes, rig)
-        prediction = predict_band(rig, pair.name, known)
-        matrix = pair.scales.between_images(prediction.fixed_to_moving)
-        of_plane = _with_added_error(prediction, pair.in_moving_file_px(parallax_std_px, matrix))
+        of_plane, (parallax, parallax_std_px) = (
+            rig_prediction(pair, rig, known),
+            _parallax_by_rig(pair, parallaxes, rig),
+        )
+        error_px = pair.in_moving_file_px(parallax_std_px, of_plane.fixed_to_moving)
+        prediction = _with_added_error(of_plane.of_plane, error_px)
         # A homography does not follow the relief that captures of the flight have. The plane of a result, which is
         # compared with the prediction, is not displaced by it.
         relief_px = rig.parallax_px.get(pair.name, 0.0) if parallax is None else 0.0
-        mapping, own = pair.mapping(matrix).with_parallax(parallax), known.mappings.get(pair.name)
-        of_scene = _with_added_error(of_plane, relief_px)
-        predictions[pair.name] = RigPrediction(of_plane, of_scene, mapping, own, rig.size_px)
+        of_scene = _with_added_error(prediction, relief_px)
+        predictions[pair.name] = RigPrediction(pair, prediction, of_scene, parallax)
     return predictions
 
 

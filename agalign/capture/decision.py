@@ -32,7 +32,7 @@ from agalign.capture.by_windows import (
 )
 from agalign.capture.seeding import find_rotated
 from agalign.capture.warped_pair import Candidate, WarpedPair
-from agalign.flight.rig import Rig, distance_px
+from agalign.flight.rig import Rig
 from agalign.pixels.band_resampling import channel_mean
 from agalign.values.alignment import Alignment, Alignments, JointResult, Seed
 from agalign.values.capture import Capture
@@ -191,38 +191,37 @@ def against_rig(pairs: Sequence[BandPair], result: Alignments, rig: Rig, capture
     that are extrapolated over a quarter of the image. A rotated or scaled image does not fit the rig; its alignment
     gets an issue and is not replaced. Predictions follow the relief of the capture, if it has one.
     """
-    predictions = rig_predictions(pairs, result, rig, observed(pairs, result, capture))
-    by_name = {pair.name: pair for pair in pairs}
-    return {**result, **{name: _against_rig(by_name[name], result[name], p) for name, p in predictions.items()}}
+    known = observed(pairs, result, capture)
+    predictions = rig_predictions(pairs, result, rig, known)
+    decided = {n: _against_rig(result[n], p, is_known=n in known.mappings) for n, p in predictions.items()}
+    return {**result, **decided}
 
 
-def _against_rig(pair: BandPair, alignment: Alignment, of_rig: RigPrediction) -> Alignment:
+def _against_rig(alignment: Alignment, of_rig: RigPrediction, *, is_known: bool) -> Alignment:
     """Return the alignment with its distance from the rig's prediction, which replaces it if that contradicts it or is
     more certain.
     """
-    prediction = of_rig.of_plane
-    if of_rig.observed is not None and alignment.joint is not None and alignment.residual is not None:
-        off_px = distance_px(of_rig.observed, prediction.fixed_to_moving, of_rig.size_px)
-        prediction = replace(prediction, off_px=off_px)
+    off_px = None
+    if is_known and alignment.joint is not None and alignment.residual is not None:
+        off_px = of_rig.distance_px(alignment.fixed_to_moving)
+        prediction = replace(of_rig.of_plane, off_px=off_px)
         # The other checks have passed.
         issues = tuple(rig_issues(prediction))
         if not issues:
             return replace(alignment, prediction=prediction)
         alignment = replace(alignment, issues=issues)
-    prediction = replace(of_rig.of_scene, off_px=prediction.off_px)
+    prediction = replace(of_rig.of_scene, off_px=off_px)
     # Windows of another scene contribute to the mapping of the band, but not to the rig's.
     is_mixed = any(issue.kind == OTHER_CONTENT for issue in alignment.issues)
     own = None if is_mixed else alignment.prediction
-    if own is not None and own.std_px <= prediction.std_px:
-        between_files = pair.scales.between_files(alignment.fixed_to_moving)
-        if distance_px(between_files, prediction.fixed_to_moving, of_rig.size_px) <= MAX_UNEXPECTED_PX:
-            return alignment
-    by_rig = WarpedPair.of(pair, of_rig.mapping)
+    is_certain = own is not None and own.std_px <= prediction.std_px
+    if is_certain and of_rig.distance_px(alignment.fixed_to_moving) <= MAX_UNEXPECTED_PX:
+        return alignment
+    by_rig = WarpedPair.of(of_rig.pair, of_rig.mapping)
     rotated = find_rotated(by_rig)
     if rotated is None:
         return replace(alignment, mapping=by_rig.mapping, residual=by_rig.residual, prediction=prediction)
-    off_px = distance_px(pair.scales.between_files(rotated), prediction.fixed_to_moving, pair.reference_file_px)
-    unexpected = Issue(UNEXPECTED_PX, off_px, MAX_UNEXPECTED_PX), *alignment.issues
+    unexpected = Issue(UNEXPECTED_PX, of_rig.distance_px(rotated), MAX_UNEXPECTED_PX), *alignment.issues
     at_seed = replace(alignment, mapping=alignment.seed_mapping, issues=unexpected, is_seed_usable=False)
     return replace(at_seed, prediction=None, residual=None)
 

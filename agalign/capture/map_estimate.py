@@ -17,11 +17,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agalign.capture.band_pair import BandPair
+from agalign.capture.by_rig import RigPrediction, observation, rig_prediction
 from agalign.fit.adjustment import fit_windows
-from agalign.flight.rig import Observation, Rig, lattice
-from agalign.flight.rig_prediction import predict_band
+from agalign.flight.rig import Rig, lattice
 from agalign.values import geometry
-from agalign.values.alignment import JointResult, Prediction, Residual
+from agalign.values.alignment import JointResult, Residual
 from agalign.values.least_squares import Robust, least_squares
 
 
@@ -32,19 +32,17 @@ def map_estimate(
 
     `residuals` are those of the results. Results without a covariance are returned unchanged.
     """
-    estimates, known, std_px = dict(results), {}, {}
-    for pair in pairs:
-        if pair.name in results and results[pair.name].corner_covariance_px2 is not None:
-            estimates[pair.name] = _by_images(pair, results[pair.name], residuals[pair.name])
-            matrix = estimates[pair.name].fixed_to_moving
-            if pair.has_rig_pixels:
-                known[pair.name] = pair, pair.scales.between_files(matrix)
-                std_px[pair.name] = pair.in_moving_file_px(estimates[pair.name].corner_std_px, matrix)
+    by_images = {
+        pair.name: _by_images(pair, results[pair.name], residuals[pair.name])
+        for pair in pairs
+        if pair.name in results and results[pair.name].corner_covariance_px2 is not None
+    }
+    estimates = {**results, **by_images}
     if rig is not None:
-        observation = Observation(None, {name: matrix for name, (_, matrix) in known.items()}, std_px)
-        for name, (pair, _) in known.items():
-            if name in rig.mean:
-                estimates[name] = _with_prior(pair, estimates[name], predict_band(rig, name, observation))
+        known = observation(pairs, by_images)
+        for pair in pairs:
+            if pair.name in known.mappings and pair.name in rig.mean:
+                estimates[pair.name] = _with_prior(pair, by_images[pair.name], rig_prediction(pair, rig, known))
     return estimates
 
 
@@ -60,16 +58,16 @@ def _by_images(pair: BandPair, result: JointResult, residual: Residual) -> Joint
     return _displaced(pair, result, covariance @ of_windows @ fit.corners_px, covariance)
 
 
-def _with_prior(pair: BandPair, result: JointResult, prior: Prediction) -> JointResult:
+def _with_prior(pair: BandPair, result: JointResult, prior: RigPrediction) -> JointResult:
     """Combine a result with the rig's prediction. Errors of the prediction with equal mean square over the image are
     equally likely.
     """
     assert result.corner_covariance_px2 is not None
     size_px, to_fixed = pair.fixed.size_px, geometry.invert(result.fixed_to_moving)
     corners = geometry.corners(*size_px)
-    expected = geometry.apply(pair.scales.between_images(prior.fixed_to_moving), corners)
+    expected = geometry.apply(prior.fixed_to_moving, corners)
     delta_px = (geometry.apply(to_fixed, expected) - corners).ravel()
-    std_px = prior.std_px / pair.in_moving_file_px(1.0, result.fixed_to_moving)
+    std_px = prior.std_px(result.fixed_to_moving)
     over = geometry.over_corners(lattice(size_px)[0], *size_px)
     information = 8 / std_px**2 * np.einsum("nki,nkj->ij", over, over) / len(over)
     whitening = np.linalg.cholesky(information).T

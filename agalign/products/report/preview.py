@@ -34,6 +34,8 @@ ERROR_FULL_PX = 0.5
 """Expected error that is shown as white."""
 _MAX_TILE_PX = 640
 """Limit of the longer side of a tile."""
+_JPEG_QUALITY = 35
+"""Low: edges, which show misalignment, remain sharp, and the size limits the resolution."""
 _RELIEF_PERCENTILES = 1.0, 99.0
 """Percentiles shown as black and white: a few wrong pixels must not determine the contrast."""
 
@@ -101,13 +103,22 @@ def write_preview(
     """
     longest_px, min_tile_px = max(views.size_px), 96
     tile_px = min(_MAX_TILE_PX, longest_px)
-    for _ in range(6):  # one or two steps are usually sufficient
+
+    def smaller_px(size_bytes: float) -> int:
+        # The size is proportional to the area of a tile.
+        return max(min_tile_px, int(tile_px * 0.97 * (max_bytes / size_bytes) ** 0.5))
+
+    first = next(images[name] for name in bands for images in (views.after, views.before) if name in images)
+    size_px = round(views.size_px[0] * tile_px / longest_px), round(views.size_px[1] * tile_px / longest_px)
+    of_tile = len(encoded(_resized(first, size_px), path, cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY))
+    if 2 * len(bands) * of_tile > max_bytes:
+        tile_px = smaller_px(2 * len(bands) * of_tile)
+    for _ in range(6):  # one step is usually sufficient
         part, sheet = _sheet(views, bands, errors_px, relief, tile_px / longest_px, path.name)
-        data = encoded(sheet, path, cv2.IMWRITE_JPEG_QUALITY, 35)
+        data = encoded(sheet, path, cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY)
         if len(data) <= max_bytes or tile_px <= min_tile_px:
             break
-        # The size is proportional to the area of a tile.
-        tile_px = max(min_tile_px, int(tile_px * 0.97 * (max_bytes / len(data)) ** 0.5))
+        tile_px = smaller_px(len(data))
     with complete_file(path) as partial:
         partial.write_bytes(data)
     return part
