@@ -21,6 +21,7 @@ from agalign.config import Settings
 from agalign.errors import InputError, SidecarError, UnreadableFileError
 from agalign.flight.model import FlightModel, load_model
 from agalign.method.device import choose_device, keep_freed_memory, one_memory_error, one_thread
+from agalign.pixels.capture_pixels import CapturePixels
 from agalign.pixels.radiometry import check_pixels
 from agalign.pixels.raster import with_saturation_values
 from agalign.products.product import CapturePaths
@@ -180,7 +181,8 @@ def process_capture(task: Task, progress: PairProgress = quiet) -> CaptureReport
     installation lacks what a product needs, and OutputError.
     """
     began_s, settings, out = time.perf_counter(), task.settings, task.out
-    capture = with_saturation_values(task.capture)
+    read = CapturePixels().read
+    capture = with_saturation_values(task.capture, read)
     path = CapturePaths.of(capture, out).sidecar
     refuse_to_overwrite([capture], out, settings.write)
     if missing := missing_radiometry(capture, settings.write.radiometry):
@@ -196,9 +198,9 @@ def process_capture(task: Task, progress: PairProgress = quiet) -> CaptureReport
         sidecar = read_sidecar(path)
     if sidecar is None or not task.is_estimated:
         model = None if task.model is None else loaded_model(task.model, settings.joint.device)
-        sidecar, alignments = estimate(capture, out, settings, model, progress, sidecar)
+        sidecar, alignments = estimate(capture, out, settings, model, progress, sidecar, read)
     progress(capture.reference.name, "writing", 0.0)
-    result = render(capture, out, settings, sidecar, task.rendering, alignments)
+    result = render(capture, out, settings, sidecar, task.rendering, alignments, read)
     lost = (*result.failures, *lost_reflectance(capture, settings.write.radiometry))
     return CaptureReport(
         capture.label,

@@ -98,7 +98,8 @@ def remaining(capture: Capture, out: Path, settings: Settings, options: RunOptio
     if earlier.estimated_with != estimation_fingerprint(capture, settings):
         stages = [(key, stage) for key, stage in settings if key != "write"]
         changed = _changed_options(earlier, settings, stages) + _changed_version(earlier)
-        return Remaining("estimate", changed or ("input files or tags",))
+        other = "input files or tags" if earlier.estimated_with else "format of the sidecar"
+        return Remaining("estimate", changed or (other,))
     parallax = [] if earlier.parallax is None else [earlier.parallax]
     wanted = options.overwrite or (options.retry_failed and earlier.status != "ok")
     if wanted or not outputs_exist(path, parallax):

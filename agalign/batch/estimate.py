@@ -7,6 +7,7 @@ from pathlib import Path
 from agalign.capture.align_bands import PairProgress, align_capture_bands
 from agalign.config import Settings
 from agalign.flight.model import FlightModel
+from agalign.pixels.raster import ReadTile, read_tile
 from agalign.products.product import CapturePaths
 from agalign.products.rasters.alignment_maps import relief_of
 from agalign.products.rasters.parallax_file import PARALLAX_KIND, PARALLAX_SUFFIX, write_parallax
@@ -23,15 +24,16 @@ def estimate(
     model: FlightModel | None,
     progress: PairProgress,
     earlier: Sidecar | None = None,
+    read: ReadTile = read_tile,
 ) -> tuple[Sidecar, dict[str, Alignment]]:
     """Align the bands of a capture; write its sidecar, and its parallax if it has a relief; return the sidecar and the
     alignments.
 
     It lists the products of the `earlier` sidecar, which describe another estimate, until they are rendered again.
-    Raises UnreadableFileError if the reference cannot be read, and OutputError.
+    `read` reads the pixels of the files. Raises UnreadableFileError if the reference cannot be read, and OutputError.
     """
     began_s, paths = time.perf_counter(), CapturePaths.of(capture, out)
-    alignments = align_capture_bands(capture, settings, model, progress)
+    alignments = align_capture_bands(capture, settings, model, progress, read)
     progress(capture.reference.name, "writing", 0.0)
     relief, path, parallax = relief_of(alignments), paths.file(PARALLAX_SUFFIX), None
     if relief is not None:

@@ -13,6 +13,7 @@ from pathlib import Path
 from agalign.capture.align_bands import tie_windows
 from agalign.config import Settings, WriteSettings
 from agalign.errors import AgalignError, ConfigurationError, OutputError, SidecarError
+from agalign.pixels.raster import ReadTile, read_tile
 from agalign.products.indices.rasters import index_rasters
 from agalign.products.product import CapturePaths, ProductContext
 from agalign.products.rasters.aligned_files import band_file_names, is_aligned_raster
@@ -77,11 +78,13 @@ def render(
     sidecar: Sidecar,
     options: RenderOptions,
     estimated: Mapping[str, Alignment] | None = None,
+    read: ReadTile = read_tile,
 ) -> Rendering:
     """Write the products of an estimated capture, and its sidecar with them.
 
     `capture` has the radiometry and the saturation values with which it is written. The mappings are those in the
-    sidecar; positions that the `estimated` ones hold are used again. Raises OutputError, UnreadableFileError for an
+    sidecar; positions that the `estimated` ones hold are used again. `read` reads
+    the pixels of the files. Raises OutputError, UnreadableFileError for an
     image of the reference or the parallax, and InputError.
     """
     paths = CapturePaths.of(capture, out)
@@ -96,11 +99,11 @@ def render(
     }
     whole = OutputGrid(0, 0, *capture.reference.size_px)
     context = ProductContext(
-        capture, paths, settings, sidecar, alignments, (), whole, options.max_preview_bytes, options.limits
+        capture, paths, settings, sidecar, alignments, (), whole, options.max_preview_bytes, options.limits, read=read
     )
     if context.with_pixels:
-        layers, grid = output_layers(capture, context.with_pixels, write, options.common)
-        ties = tie_windows(capture, settings.seed, alignments) if write.tie_points else {}
+        layers, grid = output_layers(capture, context.with_pixels, write, options.common, read)
+        ties = tie_windows(capture, settings.seed, alignments, read) if write.tie_points else {}
         context = replace(context, layers=layers, grid=grid, ties=ties)
     failures = _write_products(context)
     written = {file.path for file in context.written}

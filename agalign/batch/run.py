@@ -81,7 +81,8 @@ def run_flight(
     listener: Listener | None = None,
     model: Path | None = None,
 ) -> Iterator[CaptureReport]:
-    """Align the captures and yield the report of each; captures finished by an earlier run are kept.
+    """Align the captures and yield the report of each; captures finished by an earlier run are kept, or rendered again
+    if only settings of the output have changed.
 
     First a model is learned for every camera and flight, starting from `model` if given, and saved below OUT/models. A
     failed capture does not stop the others, and results do not depend on the order of the captures. The run is recorded

@@ -26,6 +26,7 @@ from agalign.method.device import one_thread
 from agalign.method.joint import Results, align_from_scratch, refine_with
 from agalign.method.refine import FLIGHT_PATCHES, PATCHES
 from agalign.method.state import ImageGroup, Progress
+from agalign.pixels.raster import ReadTile
 from agalign.values import geometry
 from agalign.values.alignment import (
     MIN_RETRIEVAL,
@@ -47,16 +48,20 @@ PairProgress = Callable[[str, str, float], None]
 
 
 def align_capture_bands(
-    capture: Capture, settings: Settings, model: FlightModel | None, progress: PairProgress
+    capture: Capture,
+    settings: Settings,
+    model: FlightModel | None,
+    progress: PairProgress,
+    read: ReadTile | None = None,
 ) -> dict[str, Alignment]:
     """Align every moving band of a capture; return the alignments by band, px of the files.
 
-    A band that cannot be read is `failed`; the others are aligned. Raises UnreadableFileError if the reference cannot
-    be read.
+    A band that cannot be read is `failed`; the others are aligned. `read` reads the pixels of the files, by default
+    `read_tile`. Raises UnreadableFileError if the reference cannot be read.
     """
     start_s = time.perf_counter()
     progress(capture.reference.name, "reading", 0.0)
-    pairs, unusable = read_pairs(capture, settings.seed, model)
+    pairs, unusable = read_pairs(capture, settings.seed, model, read)
     aligned = align_pairs(pairs, settings, progress, model, capture)
     rig = None if model is None else model.rig
     if rig is not None and not settings.seed.only:
@@ -98,14 +103,16 @@ def _between_files(capture: Capture, pair: BandPair, aligned: Alignment) -> Alig
     return alignment
 
 
-def tie_windows(capture: Capture, settings: SeedSettings, alignments: Mapping[str, Alignment]) -> dict[str, Residual]:
+def tie_windows(
+    capture: Capture, settings: SeedSettings, alignments: Mapping[str, Alignment], read: ReadTile | None = None
+) -> dict[str, Residual]:
     """Return windows of the moving bands that did not fail, measured under their alignments, by band, px of the files.
 
     They cover the whole image, with those that a mapping was fitted to: small ones if parallax varies within large
     ones. Raises UnreadableFileError if the reference cannot be read.
     """
     result: dict[str, Residual] = {}
-    for pair in read_pairs(capture, settings)[0]:
+    for pair in read_pairs(capture, settings, read=read)[0]:
         alignment = alignments[pair.bands[0].name]
         if alignment.status != "failed":
             mapping = alignment.mapping.rescaled(pair.scales.fixed, pair.scales.moving)

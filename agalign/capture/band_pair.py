@@ -18,7 +18,7 @@ from agalign.fit.windows import FixedWindows
 from agalign.flight.model import FlightModel
 from agalign.flight.rig_prediction import unobserved_error_px
 from agalign.pixels.band_resampling import channel_mean, warped
-from agalign.pixels.raster import read_for_alignment
+from agalign.pixels.raster import ReadTile, read_for_alignment
 from agalign.pixels.stripes import without_common_stripes
 from agalign.pixels.structure import blur_px
 from agalign.values import geometry
@@ -204,14 +204,15 @@ class BandPair:
 
 
 def read_pairs(
-    capture: Capture, settings: SeedSettings, model: FlightModel | None = None
+    capture: Capture, settings: SeedSettings, model: FlightModel | None = None, read: ReadTile | None = None
 ) -> tuple[list[BandPair], dict[str, Issue]]:
     """Read the pairs of a capture, one for each lens; return them and the issues of bands that cannot be used.
 
-    The mappings of a flight's `model` precede those of the tags. Raises UnreadableFileError if the reference cannot be
+    The mappings of a flight's `model` precede those of the tags. `read` reads the pixels of the files, by default
+    `read_tile`. Raises UnreadableFileError if the reference cannot be
     read.
     """
-    references = {_LONGEST_SIDE_PX: Reference(read_for_alignment(capture.reference, _LONGEST_SIDE_PX))}
+    references = {_LONGEST_SIDE_PX: Reference(read_for_alignment(capture.reference, _LONGEST_SIDE_PX, read))}
     pairs: list[BandPair] = []
     unusable: dict[str, Issue] = {}
     for bands in capture.moving_lenses:
@@ -223,7 +224,7 @@ def read_pairs(
             unusable |= dict.fromkeys((b.name for b in bands), issue)
             continue
         try:
-            moving = _mean(read_for_alignment(b, _LONGEST_SIDE_PX) for b in bands)
+            moving = _mean(read_for_alignment(b, _LONGEST_SIDE_PX, read) for b in bands)
         except AgalignError as error:
             unusable |= dict.fromkeys((b.name for b in bands), Issue(UNREADABLE, detail=str(error)))
             continue

@@ -8,6 +8,7 @@ number of tiles, independent of the size of the files.
 import math
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 
@@ -120,7 +121,8 @@ def _residual(moving: Band, mapping: PixelMapping, tiles: _Tiles) -> Residual:
     parts = [Residual(np.empty((0, 2)), np.empty((0, 2)), np.empty(0), np.empty((0, 2), np.int64))]
     with open_raster(moving.path, moving.page) as source:
         for tile, windows in tiles:
-            warped = resample_tile(moving, mapping, tile, "lanczos", dataset=source)
+            # GDAL's block cache serves neighbouring tiles of the open file.
+            warped = resample_tile(moving, mapping, tile, "lanczos", read=partial(read_tile, dataset=source))
             part = windows.residuals(_raster(*warped, moving))
             origin_px = np.array([tile.x0, tile.y0])
             centres_px = part.centres_px + origin_px

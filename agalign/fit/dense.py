@@ -26,6 +26,7 @@ from agalign.pixels.structure import structure_field
 from agalign.values import geometry, lens
 from agalign.values.image import FloatImage, Mask, Raster
 from agalign.values.mapping import PixelMapping
+from agalign.values.memory import MAX_MATCHED_PX
 from agalign.values.parallax import Parallax, Relief
 from agalign.values.pixel_units import PixelScale
 
@@ -82,8 +83,7 @@ class DenseMatching:
     def __init__(self, reference: Raster, views: Sequence[View], window_range_px: tuple[float, float]) -> None:
         """Compute the costs; `reference` has one channel, `window_range_px` is the parallax range of the windows."""
         self.reference, self.views = reference, views
-        max_refined_px = 3_000_000  # larger references are reduced, which limits memory and time
-        self.scale = min(1.0, (max_refined_px / reference.valid.size) ** 0.5)
+        self.scale = min(1.0, (MAX_MATCHED_PX / reference.valid.size) ** 0.5)
         low, high = self._range_px(window_range_px)
         # The time is proportional to the number of levels.
         fine_step_px, coarse_step_px, max_fine_levels, max_levels = 0.5, 1.0, 48, 96

@@ -17,8 +17,7 @@ from agalign.values.mapping import DisplacementField
 
 def rig_to_json(rig: Rig) -> str:
     """Serialise a rig without the values of its displacement fields."""
-    facts = {k: v for k, v in vars(rig).items() if k not in ("mean", "fields", "captures")}
-    facts |= {"mean": rig.mean, "seen": rig.captures}
+    facts = {k: v for k, v in vars(rig).items() if k != "fields"}
     return json.dumps(facts | {"field_steps_px": {b: f.step_px for b, f in rig.fields.items()}}, default=_plain)
 
 
@@ -28,6 +27,8 @@ def rig_from_json(text: str, fields: Mapping[str, NDArray[np.float64]]) -> Rig:
     Raises KeyError, TypeError or ValueError for damaged text.
     """
     facts = json.loads(text)
+    if "seen" in facts:  # the name in files of earlier versions
+        facts["captures"] = facts.pop("seen")
     steps = facts.pop("field_steps_px")
     width, height = facts.pop("size_px")
     facts["mean"] = {b: np.array(m) for b, m in facts["mean"].items()}
@@ -35,7 +36,7 @@ def rig_from_json(text: str, fields: Mapping[str, NDArray[np.float64]]) -> Rig:
     facts["factors"] = tuple(facts["factors"])
     captures = tuple(
         CaptureFactors(**one | {"motion": one["motion"] and tuple(one["motion"]), "factors": tuple(one["factors"])})
-        for one in facts.pop("seen")
+        for one in facts.pop("captures")
     )
     displacements = {b: DisplacementField(steps[b], values) for b, values in fields.items()}
     return Rig(size_px=(int(width), int(height)), captures=captures, fields=displacements, **facts)

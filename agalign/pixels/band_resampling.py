@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agalign.pixels.radiometry import calibrated
-from agalign.pixels.raster import OpenRaster, read_tile
+from agalign.pixels.raster import ReadTile, read_tile
 from agalign.values import geometry, lens
 from agalign.values.capture import Band, Radiometry
 from agalign.values.choices import Interpolation
@@ -30,21 +30,21 @@ def resample_tile(
     radiometry: Radiometry | None = None,
     *,
     size_px: Size | None = None,
-    dataset: OpenRaster | None = None,
+    read: ReadTile = read_tile,
 ) -> tuple[NDArray[np.generic], Mask]:
     """Resample the moving band to a tile of the reference grid; return pixels and mask, each (height, width).
 
     `size_px` is (width, height) of that grid, with which a pixel has the same value in any tile.
 
     The type is that of the band, with integers rounded and clipped, or float32 if calibrated with `radiometry`. A pixel
-    is valid if its position is inside the moving image and not occluded, and no invalid pixel contributes to it. With
-    the open file as `dataset`, GDAL's block cache serves neighbouring tiles. Raises UnreadableFileError.
+    is valid if its position is inside the moving image and not occluded, and no invalid pixel contributes to it.
+    `read` reads the pixels of the file. Raises UnreadableFileError.
     """
     positions, source = source_positions(mapping, tile, size_px, band.size_px)
     if source is None:
         shape = tile.height, tile.width
         return np.zeros(shape, band.dtype if radiometry is None else np.float32), np.zeros(shape, dtype=bool)
-    pixels, valid = read_tile(band, source, dataset)
+    pixels, valid = read(band, source)
     if radiometry is not None:
         pixels = calibrated(pixels, radiometry, source.x0, source.y0)
     resampled, resampled_valid = resample(pixels, valid, positions, source, band.size_px, interpolation)

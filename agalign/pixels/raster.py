@@ -4,7 +4,7 @@ import ctypes
 import math
 import stat
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
@@ -27,6 +27,7 @@ from agalign.values import lens
 from agalign.values.capture import Band, Capture, Georeference
 from agalign.values.choices import MAX_PIXELS
 from agalign.values.image import Mask, Raster, Tile, reduced_size_px
+from agalign.values.memory import GDAL_CACHE_BYTES, MAX_DECODED_PX
 from agalign.values.pixel_units import PixelScale
 from agalign.values.text import name_problem
 
@@ -34,11 +35,9 @@ GDAL_ENVIRONMENT = {
     "GDAL_PAM_ENABLED": "NO",
     "GDAL_DISABLE_READDIR_ON_OPEN": "EMPTY_DIR",
     "GDAL_NUM_THREADS": "ALL_CPUS",
-    "GDAL_CACHEMAX": 256 * 2**20,
+    "GDAL_CACHEMAX": GDAL_CACHE_BYTES,
 }
-"""The block cache is limited per worker, in bytes; the default is 5 % of the machine's memory.
-
-GDAL neither writes auxiliary files next to the images nor reads them: x.tif.ovr may contain anything, such as a
+"""GDAL neither writes auxiliary files next to the images nor reads them: x.tif.ovr may contain anything, such as a
 description that refers to other files or to a server.
 """
 with suppress(AttributeError, OSError):  # builds of GDAL with a libtiff of their own may hide it
@@ -74,6 +73,8 @@ def without_warnings() -> Iterator[None]:
         yield
 
 
+ReadTile = Callable[[Band, Tile], tuple[NDArray[np.generic], Mask]]
+"""Reads a tile inside a band, as `read_tile`; the arrays must not be changed."""
 OpenRaster = rasterio.DatasetReader
 """A file that `open_raster` has opened."""
 
@@ -221,22 +222,23 @@ def _full_scale(dataset: rasterio.DatasetReader, index: int) -> float | None:
     return 2.0 ** int(bits) - 1 if maximum and bits.isdecimal() else maximum
 
 
-def with_saturation_values(capture: Capture) -> Capture:
+def with_saturation_values(capture: Capture, read: ReadTile | None = None) -> Capture:
     """Return the capture with the saturation values that the pixels show: many cameras store 10 or 12 bits in 16.
 
-    Bands with a saturation value by their tags or 8 bits, and those that cannot be read, are unchanged.
+    Bands with a saturation value by their tags or 8 bits, and those that cannot be read, are unchanged. `read` reads
+    the pixels of the files, by default `read_tile`.
     """
-    return replace(capture, bands=tuple(map(_with_saturation_value, capture.bands)))
+    return replace(capture, bands=tuple(_with_saturation_value(band, read or read_tile) for band in capture.bands))
 
 
-def _with_saturation_value(band: Band) -> Band:
+def _with_saturation_value(band: Band, read: ReadTile) -> Band:
     if band.saturation_value not in (_MAXIMA["uint16"], _MAXIMA["int16"]):
         return band
     side_px = 2048  # of the middle of the image, which limits the memory
     width, height = (min(side_px, n) for n in band.size_px)
     try:
         tile = Tile((band.width_px - width) // 2, (band.height_px - height) // 2, width, height)
-        pixels, valid = read_tile(band, tile)
+        pixels, valid = read(band, tile)
     except UnreadableFileError:
         return band
     values = pixels[valid]
@@ -249,17 +251,22 @@ def _with_saturation_value(band: Band) -> Band:
     return replace(band, saturation_value=float(top)) if is_saturated and at_top < values.size else band
 
 
-def read_for_alignment(band: Band, longest_side_px: int) -> Raster:
+def read_for_alignment(band: Band, longest_side_px: int, read: ReadTile | None = None) -> Raster:
     """Read a band as float32, reduced by averaging to at most `longest_side_px`, and its mask.
 
-    Nodata, masked and saturated pixels and constant areas at the border are invalid. Raises UnreadableFileError.
+    Nodata, masked and saturated pixels and constant areas at the border are invalid. `read` reads the pixels of a file
+    that is not reduced, by default `read_tile`. Raises UnreadableFileError.
     """
     reduction = max(1.0, max(band.size_px) / longest_side_px)
     shape = reduced_size_px(band.size_px, reduction)[::-1]
-    with open_raster(band.path, band.page) as dataset:
-        pixels = _reduced(dataset, band, shape) if reduction > 1 else dataset.read(band.index_in_page)
-        valid = data_mask(pixels, band.nodata)
-        valid &= _dataset_mask(dataset, band.index_in_page, out_shape=shape, resampling=Resampling.nearest)
+    if reduction == 1:
+        pixels, mask = (read or read_tile)(band, Tile(0, 0, *band.size_px))
+        valid = mask.copy()
+    else:
+        with open_raster(band.path, band.page) as dataset:
+            pixels = _reduced(dataset, band, shape)
+            valid = data_mask(pixels, band.nodata)
+            valid &= _dataset_mask(dataset, band.index_in_page, out_shape=shape, resampling=Resampling.nearest)
     if band.nodata is None:
         valid &= ~undeclared_fill(pixels)
     valid = learnable(valid, pixels, band.saturation_value)
@@ -273,8 +280,7 @@ def _reduced(dataset: rasterio.DatasetReader, band: Band, shape: tuple[int, int]
     """Read a band reduced to `shape` (height, width) by averaging."""
     # OpenCV resizes no integers of 32 or 64 bits.
     all_valid = band.nodata is None and not band.has_mask and band.dtype in ("uint8", "uint16")
-    read_whole_px = 1 << 26  # images up to this size are decoded completely before averaging: 128 MB in 16 bits
-    if all_valid and band.width_px * band.height_px <= read_whole_px:
+    if all_valid and band.width_px * band.height_px <= MAX_DECODED_PX:
         # GDAL's averaging decodes a JPEG repeatedly, which takes seconds per band.
         return np.asarray(cv2.resize(dataset.read(band.index_in_page), shape[::-1], interpolation=cv2.INTER_AREA))
     return np.asarray(dataset.read(band.index_in_page, out_shape=shape, resampling=Resampling.average))
@@ -308,6 +314,11 @@ def read_preview(
         window = Window(x0, y0, width, height)
         pixels = dataset.read(index, window=window, out_shape=size_px[::-1], resampling=resampling)
         nodata = dataset.nodata
+    return with_nan(pixels, nodata)
+
+
+def with_nan(pixels: NDArray[np.generic], nodata: float | None) -> NDArray[np.float32]:
+    """Return pixels (height, width) as float32 with NaN for nodata."""
     values = pixels.astype(np.float32)
     return values if nodata is None else np.where(data_mask(pixels, nodata), values, np.float32(np.nan))
 

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 from agalign.config import Settings, WriteSettings
+from agalign.pixels.raster import ReadTile, read_tile
 from agalign.products.rasters.checked_raster import Block, LayerDescription, write_on_grid
 from agalign.products.rasters.layout import FlightLimits, Layer
 from agalign.products.report.drawing import ReducedBands, read_reduced_bands
@@ -92,6 +93,8 @@ class ProductContext:
     """Limits of all flights of the camera, as far as their rigs are known."""
     written: list[WrittenFile] = field(default_factory=list)
     """Files of the products before this one in `PRODUCTS`."""
+    read: ReadTile = read_tile
+    """Reads the pixels of the files of the capture."""
     ties: Mapping[str, Residual] = field(default_factory=dict)
     """Windows by moving band, measured under the mapping; empty unless tie points are written."""
     lost: dict[Path, str] = field(default_factory=dict)
@@ -129,7 +132,7 @@ class ProductContext:
     def reduced_bands(self) -> ReducedBands:
         """The bands as reduced grey images, before and after alignment. Raises UnreadableFileError."""
         places = {name: (file.path, index) for name, (file, index) in self.places.items()}
-        return read_reduced_bands(self.capture, places, self.grid)
+        return read_reduced_bands(self.capture, places, self.grid, self.read)
 
 
 class Product(ABC):

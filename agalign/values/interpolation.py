@@ -11,6 +11,7 @@ from agalign.values.choices import Interpolation
 from agalign.values.geometry import Points
 from agalign.values.image import Mask, Tile
 from agalign.values.mapping import PixelMapping
+from agalign.values.memory import RESAMPLED_TILE_PX
 from agalign.values.pixel_units import Size
 
 _KERNEL_PX = {"cubic": 4, "lanczos": 8}
@@ -63,12 +64,12 @@ def resample_planes(
 
     Returns (C, height, width) of the same type, with `fill` where a pixel is not valid, and the mask (height, width).
     """
-    tile_px, max_source_px = 1024, 32_000  # OpenCV limits the sides of one image to 32,767 px
+    max_source_px = 32_000  # OpenCV limits the sides of one image to 32,767 px
     width, height = size_px
     result = np.empty((len(planes), height, width), planes.dtype)
     result_valid = np.empty((height, width), bool)
     moving_size_px = valid.shape[1], valid.shape[0]
-    pending = list(tiles(Tile(0, 0, width, height), tile_px))
+    pending = list(tiles(Tile(0, 0, width, height), RESAMPLED_TILE_PX))
     while pending:
         tile = pending.pop()
         at = np.s_[tile.y0 : tile.y0 + tile.height, tile.x0 : tile.x0 + tile.width]

@@ -19,6 +19,7 @@ from agalign.values.fields import POSITION_DECIMALS, RECORD, Array, Positive
 from agalign.values.geometry import Matrix, Points
 from agalign.values.image import Mask, Tile
 from agalign.values.lens import Lens
+from agalign.values.memory import MAX_HELD_POSITIONS_PX
 from agalign.values.parallax import Parallax
 from agalign.values.pixel_units import SAME_PIXELS, PixelScale, Size
 
@@ -184,8 +185,7 @@ class PixelMapping:
 
         Nothing is done for large images, which are resampled in tiles.
         """
-        max_held_px = 8_000_000  # 64 MB; images of cameras that are not reduced for the estimation have 5 million
-        if size_px[0] * size_px[1] <= max_held_px and self.held is None:
+        if size_px[0] * size_px[1] <= MAX_HELD_POSITIONS_PX and self.held is None:
             held = HeldPositions(size_px, self.positions(Tile(0, 0, *size_px), np.float32))
             object.__setattr__(self, "held", held)
 

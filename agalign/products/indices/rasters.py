@@ -27,7 +27,6 @@ from agalign.products.product import CapturePaths, Product, ProductContext, Writ
 from agalign.products.rasters.aligned_files import tags_of, to_cog
 from agalign.products.rasters.checked_raster import (
     FLOAT_OPTIONS,
-    WORK_TILE_PX,
     LayerDescription,
     check_complete,
     checked_raster,
@@ -40,6 +39,7 @@ from agalign.values.capture import Band, Capture
 from agalign.values.files import read_regular, write_csv
 from agalign.values.image import Tile, reduced_size_px
 from agalign.values.interpolation import tiles
+from agalign.values.memory import WORK_TILE_PX
 from agalign.values.text import without_formula
 
 _STATISTICS_TAG = "INDEX_STATISTICS"

@@ -27,17 +27,18 @@ from agalign.config import WriteSettings
 from agalign.errors import AgalignError, UnreadableFileError
 from agalign.pixels.band_resampling import resample_tile
 from agalign.pixels.radiometry import calibrated
-from agalign.pixels.raster import GDAL_ENVIRONMENT, open_raster, read_tile, suffix_format, without_warnings
+from agalign.pixels.raster import GDAL_ENVIRONMENT, open_raster, suffix_format, without_warnings
 from agalign.products.indices.formulas import Role, role_of_band
 from agalign.products.product import CapturePaths, Product, ProductContext, WrittenFile
-from agalign.products.rasters.checked_raster import WORK_TILE_PX, Block, LayerDescription, predictor, write_on_grid
+from agalign.products.rasters.checked_raster import Block, LayerDescription, compressed, write_on_grid
 from agalign.products.rasters.layout import Layer, is_inside
 from agalign.values import geometry
 from agalign.values.capture import Band, Capture, Quantity, Radiometry
-from agalign.values.choices import Interpolation
+from agalign.values.choices import Compression, Interpolation
 from agalign.values.files import file_name
 from agalign.values.image import Mask, OutputGrid, Tile
 from agalign.values.interpolation import as_type, can_hold, tiles
+from agalign.values.memory import WORK_TILE_PX
 
 _MAX_VIGNETTING_ERROR = 0.01
 """Limit for the tags of aligned files, p95 of corrected pixels: a fifth of the accuracy of the cameras' calibration."""
@@ -178,12 +179,10 @@ def write_raster(
     dtype = np.result_type(*(layer.band.dtype for layer in layers)) if raw else np.dtype(np.float32)
     nodata = nodata_value(context, layers, dtype)
     # Many programs that read files of single bands do not support Zstandard.
-    fits_all = "deflate" if settings.layout == "bands" or len(layers) < len(capture.bands) else "zstd"
+    fits_all: Compression = "deflate" if settings.layout == "bands" or len(layers) < len(capture.bands) else "zstd"
     compression = fits_all if settings.compression == "auto" else settings.compression
     options: dict[str, object] = {"interleave": "band", "photometric": "minisblack", "nodata": nodata}
-    if compression != "none":
-        options |= {"compress": compression, "predictor": predictor(dtype.kind), "zstd_level": 1}
-
+    options |= compressed(dtype.kind, compression)
     overviews = list(capture.reference.overviews) if settings.format == "gtiff" else []
 
     def finish(partial: Path) -> None:
@@ -303,8 +302,9 @@ def layer_pixels(
 ) -> tuple[Pixels, Mask]:
     """Return the pixels of a layer (height, width) on a tile, calibrated if `radiometry` is given, and their mask."""
     if layer.mapping is not None:
-        return resample_tile(layer.band, layer.mapping, tile, interpolation, radiometry, size_px=layer.size_px)
-    pixels, valid = read_tile(layer.band, tile)
+        size_px, read = layer.size_px, layer.read
+        return resample_tile(layer.band, layer.mapping, tile, interpolation, radiometry, size_px=size_px, read=read)
+    pixels, valid = layer.read(layer.band, tile)
     return pixels if radiometry is None else calibrated(pixels, radiometry, tile.x0, tile.y0), valid
 
 
@@ -355,9 +355,8 @@ def _unused_value(layers: Sequence[Layer], grid: OutputGrid, dtype: np.dtype[Any
     Copied pixels then keep their values.
     """
     copied = []
-    for band in (layer.band for layer in layers if layer.is_copied):
-        with open_raster(band.path, band.page) as source:
-            copied += [np.unique(read_tile(band, tile, source)[0]) for tile in tiles(grid.tile, WORK_TILE_PX)]
+    for layer in (one for one in layers if one.is_copied):
+        copied += [np.unique(layer.read(layer.band, tile)[0]) for tile in tiles(grid.tile, WORK_TILE_PX)]
     limits = np.iinfo(str(dtype))
     # All values of a 16-bit type; for larger types the first ones are sufficient.
     candidates = itertools.chain([0, limits.max], range(1, min(limits.max, 1 << 16)))

@@ -11,9 +11,8 @@ from scipy.interpolate import RegularGridInterpolator
 from agalign.cameras import rig_seed
 from agalign.cameras.pix4d import rig_unit_m
 from agalign.errors import GeometryError
-from agalign.pixels.raster import read_tile
 from agalign.products.product import Product, ProductContext, WrittenFile
-from agalign.products.rasters.checked_raster import WORK_TILE_PX, LayerDescription
+from agalign.products.rasters.checked_raster import LayerDescription, compressed
 from agalign.products.rasters.layout import Layer, is_inside
 from agalign.values import geometry, lens
 from agalign.values.alignment import Alignment
@@ -24,6 +23,7 @@ from agalign.values.image import Mask, OutputGrid, Tile
 from agalign.values.interpolation import source_positions, tiles
 from agalign.values.lens import Lens
 from agalign.values.mapping import PixelMapping
+from agalign.values.memory import WORK_TILE_PX
 from agalign.values.parallax import Relief, rounded
 from agalign.verify.expected_error import expected_error_px
 
@@ -106,7 +106,7 @@ class QualityRaster(Product):
             for index, flags in enumerate(flags_on(tile), start=1)
         )
         # There is no nodata value: 0 means that no flag is set.
-        options = {"compress": "deflate", "interleave": "band"}
+        options = compressed("u") | {"interleave": "band"}
         return self.write_layers(context, layers, blocks, tags=tags, dtype="uint16", options=options)
 
 
@@ -131,13 +131,13 @@ def _of_source(layer: Layer, tile: Tile) -> dict[Quality, Mask]:
     """The flags of a band's file on a tile, each (height, width)."""
     band = layer.band
     if layer.mapping is None:
-        pixels, valid = read_tile(band, tile)
+        pixels, valid = layer.read(band, tile)
         return {Quality.NODATA: ~valid, Quality.SATURATED: _saturated(pixels, valid, band.saturation_value)}
     positions, source = source_positions(layer.mapping, tile, layer.size_px, band.size_px)
     inside = is_inside(positions, band)
     if source is None:
         return {Quality.OUTSIDE: ~inside}
-    pixels, valid = read_tile(band, source)
+    pixels, valid = layer.read(band, source)
     in_window = (positions - (source.x0, source.y0)).astype(np.float32)
     saturated = _saturated(pixels, valid, band.saturation_value)
     return {

@@ -22,15 +22,12 @@ from agalign.errors import OutputError
 from agalign.pixels.raster import GDAL_ENVIRONMENT, innermost_cause, is_gdal_error, without_warnings
 from agalign.values import geometry
 from agalign.values.capture import Georeference
+from agalign.values.choices import Compression
 from agalign.values.files import complete_file
 from agalign.values.image import OutputGrid
 
-WORK_TILE_PX = 2048
-"""Side of the tiles that are processed one after another: it limits the memory."""
 _INCOMPLETE = "the file came out incomplete; is the disk full?"
 
-FLOAT_OPTIONS: Mapping[str, Any] = {"compress": "deflate", "predictor": 3, "nodata": math.nan}
-"""Creation options of layers of float32."""
 
 Block = tuple[NDArray[Any], int, int, int]
 """Pixels (height, width), band of the raster from 1, and position (x, y) of their top-left pixel in the raster."""
@@ -118,7 +115,7 @@ def write_on_grid(
     *,
     tags: Mapping[str, str] | None = None,
     dtype: str = "float32",
-    options: Mapping[str, Any] = FLOAT_OPTIONS,
+    options: Mapping[str, Any] | None = None,
     finish: Callable[[Path], None] | None = None,
 ) -> None:
     """Write a tiled raster on an output grid block by block, with the georeference of the reference's file, as
@@ -127,7 +124,10 @@ def write_on_grid(
     A file without a georeference gets no transform: an identity transform would be read as a georeference. Tags mark
     one by the camera's pose as approximate. Raises OutputError.
     """
-    profile, all_tags = tiled_profile(grid.width, grid.height, len(layers), dtype, **options), dict(tags or {})
+    profile, all_tags = (
+        tiled_profile(grid.width, grid.height, len(layers), dtype, **(FLOAT_OPTIONS if options is None else options)),
+        dict(tags or {}),
+    )
     if georeference is not None:
         profile |= georeferenced(georeference, grid)
         if georeference.accuracy_m is not None:
@@ -166,9 +166,20 @@ def georeferenced(georeference: Georeference, grid: OutputGrid) -> dict[str, Any
     return {"transform": Affine(*transform[:2].ravel()), "crs": rasterio.CRS.from_wkt(georeference.crs_wkt)}
 
 
-def predictor(kind: str) -> int:
-    """Return the TIFF predictor for a kind of numpy type: 3 for floating point, 2 for integers."""
-    return 3 if kind == "f" else 2
+def compressed(kind: str, method: Compression = "deflate") -> dict[str, Any]:
+    """Return the creation options of compressed pixels of a kind of numpy type: `f`, `i` or `u`.
+
+    `auto` is not a method: each kind of raster has its own.
+    """
+    if method == "none":
+        return {}
+    # TIFF predictor 3 is for floating point, 2 for integers.
+    options: dict[str, Any] = {"compress": method, "predictor": 3 if kind == "f" else 2}
+    return options | ({"zstd_level": 1} if method == "zstd" else {})  # higher levels take longer, and gain 2 %
+
+
+FLOAT_OPTIONS: Mapping[str, Any] = {**compressed("f"), "nodata": math.nan}
+"""Creation options of layers of float32."""
 
 
 def _checksum(pixels: NDArray[Any]) -> int:

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from agalign.config import WriteSettings
 from agalign.flight.rig import Rig
 from agalign.flight.rig_prediction import extreme_mappings
+from agalign.pixels.raster import ReadTile, read_tile
 from agalign.values import geometry
 from agalign.values.alignment import Alignment
 from agalign.values.capture import Band, Capture, Radiometry
@@ -35,6 +36,8 @@ class Layer:
     size_px: Size | None = None
     """(width, height) of the output before the crop."""
     is_reference: bool = False
+    read: ReadTile = read_tile
+    """Reads the pixels of the file."""
     vignetting: Radiometry | None = None
     """Correction of the vignetting of raw numbers, if their file has no tags for it."""
 
@@ -68,10 +71,14 @@ def flight_limits(flights: Iterable[tuple[Sequence[Capture], Rig | None]]) -> Fl
 
 
 def output_layers(
-    capture: Capture, alignments: Mapping[str, Alignment], settings: WriteSettings, common: OutputGrid | None = None
+    capture: Capture,
+    alignments: Mapping[str, Alignment],
+    settings: WriteSettings,
+    common: OutputGrid | None = None,
+    read: ReadTile = read_tile,
 ) -> tuple[list[Layer], OutputGrid]:
     """Return a layer for each band of a capture, given the alignments of its usable moving bands, and their grid: the
-    `common` one of the camera, if any.
+    `common` one of the camera, if any. `read` reads the pixels of the files.
     """
     reference = capture.reference
     mappings = {b.name: alignments[b.name].mapping for b in capture.moving if b.name in alignments}
@@ -80,7 +87,7 @@ def output_layers(
         mappings[reference.name] = PixelMapping(geometry.identity())  # otherwise the reference is copied
     on_frame = {name: _on_frame(mapping, frame, reference) for name, mapping in mappings.items()}
     size_px = round(reference.width_px * frame.scale.x), round(reference.height_px * frame.scale.y)
-    layers = [Layer(b, on_frame.get(b.name), size_px, is_reference=b is reference) for b in capture.bands]
+    layers = [Layer(b, on_frame.get(b.name), size_px, b is reference, read) for b in capture.bands]
     # The crop is calculated without relief, which may leave pixels of single bands without a value.
     mapped = [(layer.mapping.without_parallax, layer.band) for layer in layers if layer.mapping is not None]
     crop = frame.tile

@@ -24,7 +24,7 @@ from agalign.pixels.masks import data_mask
 from agalign.pixels.raster import OpenRaster, open_raster
 from agalign.products.product import Product, ProductContext, WrittenFile
 from agalign.products.rasters.aligned_files import with_nodata, write_raster
-from agalign.products.rasters.checked_raster import Block, LayerDescription, predictor
+from agalign.products.rasters.checked_raster import Block, LayerDescription, compressed
 from agalign.products.rasters.layout import common_grid, output_layers
 from agalign.values.capture import Band, Capture
 from agalign.values.files import scratch_file
@@ -61,7 +61,7 @@ class PanSharpened(Product):
         fine = {"resolution": "finest", "format": "gtiff", "compression": "none"}
         settings = context.settings.write.model_copy(update=fine)
         common = common_grid(capture.reference, settings, context.limits)
-        layers, grid = output_layers(capture, usable, settings, common)
+        layers, grid = output_layers(capture, usable, settings, common, context.read)
         context = replace(context, settings=context.settings.model_copy(update={"write": settings}), grid=grid)
         pan = [la for la in layers if la.band in broad]
         others = [
@@ -76,8 +76,7 @@ class PanSharpened(Product):
             with open_raster(unsharpened) as file:
                 bands, scale = [la.band for la in others], max(grid.scale)
                 descriptions, blocks = sharpened(file, bands, broad, scale, is_raw=context.is_raw)
-                options = {"compress": "deflate", "predictor": predictor(np.dtype(file.dtypes[0]).kind)}
-                options |= {"interleave": "band", "nodata": file.nodata}
+                options = compressed(np.dtype(file.dtypes[0]).kind) | {"interleave": "band", "nodata": file.nodata}
                 more = {"tags": file.tags(), "dtype": file.dtypes[0], "options": options}
                 return self.write_layers(context, descriptions, blocks, **more)
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from agalign.errors import SidecarError
 from agalign.pixels.raster import open_raster
-from agalign.products.rasters.checked_raster import LayerDescription, write_on_grid
+from agalign.products.rasters.checked_raster import LayerDescription, compressed, write_on_grid
 from agalign.products.sidecar.schema import Sidecar
 from agalign.values.capture import Georeference
 from agalign.values.image import OutputGrid
@@ -30,7 +30,7 @@ def write_parallax(path: Path, relief: Relief, georeference: Georeference | None
     ]
     steps = (np.rint(layer.astype(np.float64) / RELIEF_STEP).astype(np.int32) for layer in values)
     blocks = ((layer, index, 0, 0) for index, layer in enumerate(steps, start=1))
-    grid, options = OutputGrid(0, 0, width, height), {"compress": "deflate", "predictor": 2, "interleave": "band"}
+    grid, options = OutputGrid(0, 0, width, height), compressed("i") | {"interleave": "band"}
     write_on_grid(path, grid, georeference, layers, blocks, dtype="int32", options=options)
 
 

@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
 from agalign.errors import OutputError, UnreadableFileError
-from agalign.pixels.raster import read_preview
+from agalign.pixels.raster import ReadTile, read_preview, read_tile, with_nan
 from agalign.values.capture import Capture
 from agalign.values.files import complete_file
-from agalign.values.image import OutputGrid, reduced_size_px
+from agalign.values.image import OutputGrid, Tile, reduced_size_px
 
 Grey = NDArray[np.uint8]
 """(height, width)"""
@@ -36,8 +36,12 @@ class ReducedBands:
     """Share of saturated pixels in the raw file of each band with a known saturation value, after the reduction."""
 
 
-def read_reduced_bands(capture: Capture, places: Mapping[str, tuple[Path, int]], grid: OutputGrid) -> ReducedBands:
-    """Read the bands of a capture, given file and index of each written band. Raises UnreadableFileError for those."""
+def read_reduced_bands(
+    capture: Capture, places: Mapping[str, tuple[Path, int]], grid: OutputGrid, read: ReadTile = read_tile
+) -> ReducedBands:
+    """Read the bands of a capture, given file and index of each written band, and a function that reads the pixels of
+    the capture's files. Raises UnreadableFileError for the written ones.
+    """
     max_side_px = 2048  # longer side of the images: larger than most screens
     size_px = reduced_size_px((grid.width, grid.height), max(1.0, max(grid.width, grid.height) / max_side_px))
     before, saturated = {}, {}
@@ -45,14 +49,22 @@ def read_reduced_bands(capture: Capture, places: Mapping[str, tuple[Path, int]],
         with suppress(UnreadableFileError):  # the band pair has failed with this reason
             to_band = np.divide(band.size_px, np.multiply(grid.scale, capture.reference.size_px))
             corner, extent = np.rint(np.array([(grid.x0, grid.y0), (grid.width, grid.height)]) * to_band).astype(int)
-            window_px = (*corner.tolist(), *extent.clip(1).tolist())
-            plane = read_preview(band.path, band.index_in_page, window_px, size_px, band.page)
+            window = Tile(*corner.tolist(), *extent.clip(1).tolist())
+            if (window.width, window.height) == size_px and _is_inside(window, band.size_px):
+                plane = with_nan(read(band, window)[0], band.nodata)
+            else:
+                window_px = window.x0, window.y0, window.width, window.height
+                plane = read_preview(band.path, band.index_in_page, window_px, size_px, band.page)
             before[band.name] = _grey(plane)
             if band.saturation_value is not None:
                 saturated[band.name] = float((plane >= band.saturation_value).mean())
     whole_px = (0, 0, grid.width, grid.height)
     after = {name: _grey(read_preview(*place, whole_px, size_px)) for name, place in places.items()}
     return ReducedBands(before, after, size_px, saturated)
+
+
+def _is_inside(tile: Tile, size_px: tuple[int, int]) -> bool:
+    return tile.x0 >= 0 and tile.y0 >= 0 and tile.x0 + tile.width <= size_px[0] and tile.y0 + tile.height <= size_px[1]
 
 
 def _grey(plane: NDArray[np.float32]) -> Grey:
