@@ -23,9 +23,9 @@ from numpy.typing import NDArray
 from scipy.interpolate import RegularGridInterpolator
 
 from agalign.pixels.raster import without_warnings
-from agalign.products.sidecar.convert import read_alignment
+from agalign.products.sidecar.alignments import read_alignment
 from agalign.products.sidecar.file import find_sidecars, read_sidecar
-from agalign.products.sidecar.schema import BandPart, Sidecar, is_usable
+from agalign.products.sidecar.schema import BandResult, Sidecar
 from agalign.values.geometry import Points
 
 Ties = dict[str, dict[str, Any]]
@@ -240,7 +240,7 @@ class BandError:
     """Error of a moving band at its tie points."""
 
     sidecar: Sidecar
-    part: BandPart
+    part: BandResult
     """The band in it."""
     std_px: float
     """Reported standard error; nan without one."""
@@ -256,7 +256,7 @@ class BandError:
     @property
     def is_usable(self) -> bool:
         """Aligned, or predicted within --accept-predicted."""
-        return is_usable(self.part.status, self.part.prediction, self.sidecar.max_predicted_px)
+        return self.part.is_usable(self.sidecar.max_predicted_px)
 
     @property
     def median_px(self) -> float:

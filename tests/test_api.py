@@ -42,7 +42,7 @@ def test_two_arrays_without_any_hint(monkeypatch: pytest.MonkeyPatch) -> None:
     assert (seen, torch.get_num_threads()) == ([1], 2)
     torch.set_num_threads(before)
     assert_aligned(result, 0.1)
-    assert result.after["mattes_mi"] < result.before["mattes_mi"]
+    assert result.after.mattes_mi < result.before.mattes_mi
     assert result.residual.median_px < 0.2
     result.warp(moving[:300])
     with pytest.raises(agalign.InputError, match=r"400 x 320 px, .* 400 x 300 px"):

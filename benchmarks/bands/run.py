@@ -34,7 +34,7 @@ from peers import METHODS, Align, grey_raster, method_named
 from agalign.cameras.discover import discover
 from agalign.pixels.raster import suffix_format
 from agalign.products.sidecar.file import find_sidecars, read_sidecar
-from agalign.products.sidecar.schema import BandPart
+from agalign.products.sidecar.schema import BandResult
 from agalign.values import geometry, lens
 from agalign.values.capture import Band
 from agalign.values.mapping import PixelMapping
@@ -71,7 +71,7 @@ def by_command_line(method: str, paths: Paths, pairs: Sequence[Pair], variant: s
     return [{**claim(bands.get(pair.file)), "seconds": seconds} for pair in pairs]
 
 
-def claim(band: BandPart | None) -> Row:
+def claim(band: BandResult | None) -> Row:
     """Return the mapping of a band in a sidecar, if it has one, and whether it is claimed."""
     if band is None or band.status not in ("aligned", "predicted") or band.grid is None:
         return {}

@@ -59,4 +59,4 @@ def sidecar_of(name: str, number: int, size_px: tuple[int, int], *, raw: bool) -
     if raw:
         content["output"] |= {"radiometry": None, "nodata": None}
     content["products"][0]["sha256"] = f"{number:064x}"
-    return Sidecar.model_validate(content)
+    return Sidecar.model_validate_json(json.dumps(content))

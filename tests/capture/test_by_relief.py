@@ -415,8 +415,9 @@ def test_a_relief_may_not_be_worse_than_its_plane(
     relief_px: tuple[float, float], plane_px: tuple[float, float], is_chosen: bool
 ) -> None:
     """The median of the bands decides; a band that no relief explains counts as one without a gain."""
-    windows = residual_of(np.zeros((9, 2)), (0, 0))
-    plane, relief = (replace(windows, median_px=median, p95_px=p95) for median, p95 in (plane_px, relief_px))
+    # Of 21 windows, the 95th percentile is that of the second largest shift.
+    shifts = (np.array([[median, 0.0]] * 19 + [[p95, 0.0]] * 2) for median, p95 in (plane_px, relief_px))
+    plane, relief = (residual_of(np.zeros((21, 2)), one) for one in shifts)
     bands = [SimpleNamespace(name=name, by_homography=plane) for name in ("Blue", "Red", "NIR")]
     aligned, predicted = (SimpleNamespace(status=status, residual=relief) for status in ("aligned", "predicted"))
     assert _is_better(bands[:1], {"Blue": aligned}) == is_chosen

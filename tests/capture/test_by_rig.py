@@ -20,7 +20,7 @@ from agalign.capture.band_pair import BandPair, read_pairs
 from agalign.capture.by_rig import bands_to_learn, with_predictions
 from agalign.config import CheckSettings, Settings
 from agalign.flight.model import FlightModel, load_model
-from agalign.products.sidecar.convert import capture_status
+from agalign.products.sidecar.schema import capture_status
 from agalign.synthetic.cameras import BANDS, REDEDGE
 from agalign.synthetic.flight import make_flight
 from agalign.values import geometry

@@ -42,7 +42,7 @@ def pair() -> BandPair:
 def test_the_status_is_that_of_the_first_row_that_applies(
     pair: BandPair, issues: tuple[Issue, ...], is_predicted: bool, is_seed_usable: bool, median_px: float, status: str
 ) -> None:
-    residual = replace(residual_of(np.zeros((50, 2)), np.zeros((50, 2))), median_px=median_px)
+    residual = residual_of(np.zeros((50, 2)), (median_px, 0.0))
     prediction = Prediction(TRUTH, "windows", 0.1) if is_predicted else None
     alignment = replace(failed_at_seed(pair, SEED, *issues), residual=residual, prediction=prediction)
     result = decided(alignment, is_seed_usable=is_seed_usable)

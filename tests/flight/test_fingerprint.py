@@ -4,15 +4,30 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import pytest
 
 from agalign.cameras.discover import discover
-from agalign.config import Settings, WriteSettings
-from agalign.flight.fingerprint import fingerprint, hashed
-from agalign.values.capture import Georeference
+from agalign.config import SeedSettings, Settings, WriteSettings
+from agalign.flight.fingerprint import estimation_fingerprint, hashed, render_fingerprint
+from agalign.values.capture import Capture, Georeference
 
 
-def test_every_fact_that_a_result_depends_on_changes_it(flight: Path) -> None:
-    capture = discover(flight).captures[0]
+@pytest.fixture(scope="module")
+def capture(flight: Path) -> Capture:
+    return discover(flight).captures[0]
+
+
+def changed_band(capture: Capture, **facts: object) -> Capture:
+    return replace(capture, bands=(replace(capture.bands[0], **facts), *capture.bands[1:]))
+
+
+def fingerprints(capture: Capture, settings: Settings | None = None) -> tuple[str, str]:
+    """Of the estimation and of the products."""
+    settings = settings or Settings()
+    return estimation_fingerprint(capture, settings), render_fingerprint(capture, settings.write)
+
+
+def test_every_fact_that_an_estimation_depends_on_changes_it(capture: Capture) -> None:
     band = capture.bands[0]
     changes = [
         {"name": "other"},
@@ -21,16 +36,30 @@ def test_every_fact_that_a_result_depends_on_changes_it(flight: Path) -> None:
         {"lens": replace(band.lens, distortion=(0.0,) * 5)},
         {"to_rig": band.to_rig + 1e-12},
         {"georeference": Georeference(np.eye(3), "EPSG:32632")},
+        {"path": band.path.with_name("missing.tif")},
+    ]
+    captures = [capture, replace(capture, reference_index=0), *(changed_band(capture, **facts) for facts in changes)]
+    found = [estimation_fingerprint(c, Settings()) for c in captures]
+    found.append(estimation_fingerprint(capture, Settings(seed=SeedSettings(only=True))))
+    assert len(set(found)) == len(found)
+
+
+def test_facts_of_the_products_change_their_fingerprint_alone(capture: Capture) -> None:
+    band, of_estimation = capture.bands[0], estimation_fingerprint(capture, Settings())
+    by_pose = replace(Georeference(np.eye(3), "EPSG:32632"), accuracy_m=5.0)
+    changes = [
         {"radiometry": None},
         {"radiometry": replace(band.radiometry, gain=2 * band.radiometry.gain)},
         {"radiometry": replace(band.radiometry, quantity="reflectance")},
-        {"path": band.path.with_name("missing.tif")},
+        {"georeference": by_pose},
+        {"georeference": replace(by_pose, transform=2 * np.eye(3))},
     ]
-    captures = [replace(capture, bands=(replace(band, **changed), *capture.bands[1:])) for changed in changes]
-    captures += [capture, replace(capture, reference_index=0)]
-    fingerprints = [fingerprint(c, Settings()) for c in captures]
-    fingerprints.append(fingerprint(capture, Settings(write=WriteSettings(qa=True))))
-    assert len(set(fingerprints)) == len(fingerprints)
+    found = [fingerprints(capture), fingerprints(capture, Settings(write=WriteSettings(qa=True)))]
+    found += [fingerprints(changed_band(capture, **facts)) for facts in changes]
+    assert {estimation for estimation, _ in found} == {of_estimation}
+    assert len({products for _, products in found}) == len(found)
+    # Each index is a file of its own.
+    assert fingerprints(capture, Settings(write=WriteSettings(indices=("ndvi",)))) == found[0]
 
 
 def test_a_file_that_is_written_again_changes_the_fingerprint_and_another_flight_does_not(
@@ -39,14 +68,14 @@ def test_a_file_that_is_written_again_changes_the_fingerprint_and_another_flight
     shutil.copytree(flight, tmp_path / "copy")
     capture = discover(tmp_path / "copy").captures[0]
     path = capture.bands[0].path
-    status, seen = path.stat(), [fingerprint(replace(capture, flight_id="x"), Settings())]
-    assert seen == [fingerprint(capture, Settings())]
+    status, seen = path.stat(), [estimation_fingerprint(replace(capture, flight_id="x"), Settings())]
+    assert seen == [estimation_fingerprint(capture, Settings())]
     os.utime(path, ns=(status.st_atime_ns, status.st_mtime_ns + 1000))
-    seen.append(fingerprint(capture, Settings()))
+    seen.append(estimation_fingerprint(capture, Settings()))
     with path.open("ab") as file:
         file.write(b"\0")
     os.utime(path, ns=(status.st_atime_ns, status.st_mtime_ns))
-    assert len({*seen, fingerprint(capture, Settings())}) == 3
+    assert len({*seen, estimation_fingerprint(capture, Settings())}) == 3
 
 
 def test_different_facts_have_different_hashes() -> None:

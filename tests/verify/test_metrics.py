@@ -5,6 +5,7 @@ import SimpleITK as sitk
 from skimage.metrics import normalized_mutual_information, structural_similarity
 
 from agalign.capture.reference import Reference
+from agalign.values.alignment import Similarity
 from agalign.values.image import Raster
 from agalign.verify.metrics import FixedSimilarity, fixed_bins, joint_histogram, normalised_mutual_information
 
@@ -12,7 +13,7 @@ from ..builders import two_views
 from ..conftest import textured_image
 
 
-def similarity(fixed: np.ndarray, moving: np.ndarray, valid: np.ndarray | None = None) -> dict[str, float]:
+def similarity(fixed: np.ndarray, moving: np.ndarray, valid: np.ndarray | None = None) -> Similarity:
     valid = np.ones(fixed.shape, bool) if valid is None else valid
     return FixedSimilarity(Raster(fixed, valid)).to(Raster(moving, valid))
 
@@ -25,7 +26,7 @@ def test_mattes_mi_is_that_of_itk_with_the_padding_of_elastix() -> None:
     method.SetInterpolator(sitk.sitkLinear)
     method.SetInitialTransform(sitk.TranslationTransform(2))
     theirs = method.MetricEvaluate(sitk.GetImageFromArray(fixed), sitk.GetImageFromArray(moving))
-    actual = similarity(fixed, moving)["mattes_mi"]
+    actual = similarity(fixed, moving).mattes_mi
     assert actual < 0
     # Elastix pads the moving image by one bin and the fixed one by none, ITK both by two: constant for these images.
     assert actual == pytest.approx(1.0169 * theirs, rel=2e-4)
@@ -42,8 +43,8 @@ def test_nmi_is_scikit_image_s_two_for_a_copy_and_one_for_independence() -> None
 
 def test_gradient_correlation_ignores_reversed_contrast() -> None:
     image = textured_image(320, 240)
-    assert similarity(image, -2 * image)["gradient_correlation"] == pytest.approx(1, abs=1e-5)
-    assert abs(similarity(image, textured_image(320, 240, 1))["gradient_correlation"]) < 0.1
+    assert similarity(image, -2 * image).gradient_correlation == pytest.approx(1, abs=1e-5)
+    assert abs(similarity(image, textured_image(320, 240, 1)).gradient_correlation) < 0.1
 
 
 def test_structure_ssim_agrees_with_scikit_image() -> None:
@@ -55,7 +56,7 @@ def test_structure_ssim_agrees_with_scikit_image() -> None:
 
     options = {"gaussian_weights": True, "sigma": 1.5, "use_sample_covariance": False, "full": True}
     _, full = structural_similarity(gradient(a), gradient(b), data_range=1.0, **options)
-    actual = similarity(a, b.astype(np.float32))["structure_ssim"]
+    actual = similarity(a, b.astype(np.float32)).structure_ssim
     assert actual == pytest.approx(full[5:-5, 5:-5].mean(), abs=5e-3)
 
 
@@ -66,11 +67,13 @@ def test_similarity_uses_only_valid_pixels() -> None:
     outlier = fixed.copy()
     outlier[:, :100] = 1e6
     whole = similarity(outlier, moving, valid)
-    assert whole["overlap"] == pytest.approx(0.75)
+    assert whole.overlap == pytest.approx(0.75)
     crop = similarity(fixed[:, 100:].copy(), moving[:, 100:].copy())
-    assert whole["mattes_mi"] == pytest.approx(crop["mattes_mi"], abs=1e-6)
-    assert whole["ncc"] == pytest.approx(crop["ncc"], abs=1e-6)
-    assert similarity(fixed, moving, np.zeros(fixed.shape, bool)) == {"overlap": 0.0}
+    assert whole.mattes_mi == pytest.approx(crop.mattes_mi, abs=1e-6)
+    assert whole.ncc == pytest.approx(crop.ncc, abs=1e-6)
+    nothing = vars(similarity(fixed, moving, np.zeros(fixed.shape, bool)))
+    assert nothing.pop("overlap") == 0.0
+    assert np.isnan(list(nothing.values())).all()
 
 
 @pytest.mark.filterwarnings("error")
