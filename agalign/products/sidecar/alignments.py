@@ -20,7 +20,10 @@ def read_alignment(sidecar: str | Path, band: str) -> Alignment:
     moving = [b.band for b in content.bands if b.status != "reference"]
     if band not in moving:
         raise NoSuchBandError(f"{path}: no moving band {band!r}; choose from {', '.join(moving)}")
-    alignments = content.alignments(read_relief(content, path.parent))
+    relief = read_relief(content, path.parent)
+    if relief is None and any(b.relief is not None for b in content.bands if b.band == band):
+        raise SidecarError(f"{path}: its parallax was not written; run again with --overwrite")
+    alignments = content.alignments(relief)
     if band not in alignments:
         raise SidecarError(f"{path}: has no mapping of the band {band!r}")
     return alignments[band]
