@@ -8,6 +8,7 @@ All pixel coordinates are x right, y down, (0, 0) the centre of the top-left pix
 the reference to a pixel of the moving band; `grid` samples the complete mapping between the raw pixels of the files.
 """
 
+import math
 from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from typing import Annotated, Any, Literal, Self
@@ -28,6 +29,7 @@ from agalign.values.fields import (
     Array,
     Count,
     Matrix3x3,
+    Measured,
     Number,
     Number3,
     Number4,
@@ -122,8 +124,10 @@ class GeometryPart(_Part):
     """`homography`: nothing; `field`: a smooth displacement field; `relief`: the parallax of the capture;
     `relief and field`: both.
     """
-    held_out_p95_px: dict[Geometry, Number4]
-    """p95 of the shifts of held-out windows, px, for each geometry that was fitted."""
+    held_out_p95_px: dict[Geometry, Annotated[float, Measured(4, math.inf)]]
+    """p95 of the shifts of held-out windows, px, for each geometry that was fitted; null if it is infinite, as no shift
+    could be measured.
+    """
 
     @property
     def homography_p95_px(self) -> float | None:
