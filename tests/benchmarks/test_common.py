@@ -10,8 +10,8 @@ from common import band_errors, read_ties, report, watched
 
 from agalign import read_alignment
 from agalign.products.sidecar.file import find_sidecars, read_sidecar, write_sidecar
-from agalign.products.sidecar.schema import PredictionPart
 from agalign.values import geometry
+from agalign.values.alignment import Prediction
 
 pytestmark = pytest.mark.full
 
@@ -21,7 +21,7 @@ def test_the_error_is_that_of_the_mapping_at_the_ties(aligned_flight: Path, tmp_
     """Also if the ties have another reference than the run."""
     (path, *_), copy = find_sidecars(aligned_flight), tmp_path / "IMG_0001.json"
     whole = read_sidecar(path)
-    prediction = PredictionPart.model_validate({"from": "flight", "std_px": 0.7, "off_px": None})
+    prediction = Prediction(np.eye(3), "flight", 0.7)
     changes = {
         "NIR": {"status": "predicted", "prediction": prediction},
         "Red": {"status": "failed", "homography": None},

@@ -23,8 +23,9 @@ from agalign.fit import dense, displacement_field, windows
 from agalign.flight import panel_readings
 from agalign.method import refine
 from agalign.pixels import masks, raster
+from agalign.products.rasters.parallax_file import PARALLAX_KIND
 from agalign.products.registry import PRODUCTS
-from agalign.products.sidecar.schema import ProductPart
+from agalign.products.sidecar.schema import FilePart
 from agalign.values.alignment import MIN_RETRIEVAL, MIN_TIMES_CHANCE
 from agalign.verify import checks, expected_error
 
@@ -206,8 +207,8 @@ def test_extras() -> None:
 
 
 def test_kinds_of_products() -> None:
-    listed = re.findall(r"`(\w+)`", ProductPart.model_fields["kind"].description or "")
-    assert set(listed) == {p.kind for p in PRODUCTS}
+    listed = re.findall(r"`(\w+)`", FilePart.model_fields["kind"].description or "")
+    assert set(listed) == {PARALLAX_KIND, *(p.kind for p in PRODUCTS)}
 
 
 # ---- discouraged phrases, each of which has a plainer or more usual one

@@ -1,6 +1,7 @@
 import csv
 import json
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,7 @@ from agalign.products.indices.formulas import INDICES, Index
 from agalign.products.indices.rasters import IndexReport
 from agalign.products.product import CapturePaths, ProductContext
 from agalign.products.rasters.layout import Layer
+from agalign.products.sidecar.schema import Sidecar
 from agalign.synthetic.cameras import REDEDGE
 from agalign.values.alignment import Alignment, Seed
 from agalign.values.capture import Capture
@@ -50,7 +52,10 @@ def context_of(
     """Of a capture for which nothing was written; its grid is by default that of the reference."""
     paths, settings = CapturePaths(folder, capture.name), Settings(write=WriteSettings(**write))
     grid = grid or OutputGrid(0, 0, *capture.reference.size_px)
-    return ProductContext(capture, paths, settings, alignments, layers, grid, 0)
+    known = tuple(b for b in capture.bands if b is capture.reference or b.name in alignments)
+    part = replace(capture, bands=known, reference_index=known.index(capture.reference))
+    sidecar = Sidecar.estimated(part, alignments, settings)
+    return ProductContext(capture, paths, settings, sidecar, alignments, layers, grid, 0)
 
 
 def table_in(path: Path) -> list[dict[str, str]]:

@@ -18,7 +18,7 @@ from agalign.products.indices.rasters import IndexReport, IndexStatistics, read_
 from agalign.products.report.pages import write_pages
 from agalign.products.run.captures import RAW, AlignedBand
 from agalign.products.sidecar.file import read_sidecar, verify_outputs, write_sidecar
-from agalign.products.sidecar.schema import ProductPart
+from agalign.products.sidecar.schema import FilePart
 
 from ..conftest import write_band
 from .conftest import indices_of, table_in
@@ -212,7 +212,7 @@ def test_the_sidecar_has_the_checksums_of_replaced_rasters(tmp_path: Path) -> No
     """`agalign indices` after `agalign align --index` replaces files that the sidecar lists."""
     make_aligned(tmp_path, 1)
     path = tmp_path / "0000SET" / "IMG_0001.json"
-    old = [ProductPart(kind="index", file=f"IMG_0001_ndvi{end}", bytes=1, sha256="0" * 64) for end in (".tif", ".png")]
+    old = [FilePart(kind="index", file=f"IMG_0001_ndvi{end}", bytes=1, sha256="0" * 64) for end in (".tif", ".png")]
     write_sidecar(path, read_sidecar(path).model_copy(update={"products": old}))
     indices_of(tmp_path, "ndvi", target=tmp_path / "elsewhere")
     assert read_sidecar(path).products == old
