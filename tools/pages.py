@@ -4,8 +4,8 @@ reasons), or check that they are current.
     python tools/pages.py [--check]
 
 Options come from `agalign/config.py` and the command `align`, indices from `agalign/products/indices/formulas.py`,
-fields from `agalign/products/sidecar/schema.py`, reasons from `agalign/values/issues.py` and the checks in
-`agalign/verify`. Each part is between two comments in its page.
+fields from `agalign/products/sidecar/schema.py` and the records that it contains, reasons from
+`agalign/values/issues.py`. Each part is between two comments in its page.
 """
 
 import json
@@ -83,19 +83,19 @@ def type_name(kind: Any) -> str:
 
 
 def fields() -> str:
-    """A list of fields for the sidecar and for each of its parts, with the descriptions of the schema."""
+    """Return a list of fields for the sidecar and for each of its parts, with the descriptions of the schema."""
     schema, parts = sidecar_schema(), []
     of_types = {part["description"] for part in schema["$defs"].values()}
-    for name, part in [("Sidecar", schema), *schema["$defs"].items()]:
-        title = "The file" if name == "Sidecar" else name.removesuffix("Part")
-        parts += [f"### {title}", " ".join(part["description"].split())]
+    for name, part in [("The file", schema), *schema["$defs"].items()]:
+        parts += [f"### {name.removesuffix('Part')}", " ".join(part["description"].split())]
         parts.append("\n".join(field_line(name, field, of_types) for name, field in part["properties"].items()))
     return "\n\n".join(parts) + "\n"
 
 
 def field_line(name: str, field: dict[str, Any], of_types: Container[str]) -> str:
-    """Return a field of the sidecar as an item of a list, without the type of a text, and without a description that is
-    that of its type.
+    """Return a field of the sidecar as an item of a list.
+
+    The type is omitted if it is text, and the description if it is that of the type.
     """
     text, kind = field.get("description", ""), json_type(field)
     of_kind = "" if kind == "text" else f" ({kind})"
@@ -108,20 +108,19 @@ def sidecar_schema() -> dict[str, Any]:
 
 
 def json_type(field: dict[str, Any]) -> str:
-    """Short: `number`, `Seed?` if it may be null, `Band[]` for a list."""
+    """Return a type in short: `number`, `Seed?` if it may be null, `3 x 3 numbers`, `Issue[]` for a list."""
     if "$ref" in field:
         name = field["$ref"].rpartition("/")[2].removesuffix("Part")
         return f"[{name}](#{name.lower()})"
     if "anyOf" in field:
         kinds = [json_type(one) for one in field["anyOf"] if one.get("type") != "null"]
-        return " or ".join(kinds) + ("?" if len(kinds) < len(field["anyOf"]) else "")
+        kind, may_be_null = " or ".join(kinds), len(kinds) < len(field["anyOf"])
+        return kind + ("?" if may_be_null and not kind.endswith("?") else "")
     if field.get("type") == "array":
-        if "prefixItems" in field:
-            count = len(field["prefixItems"])
-            item, null, _ = json_type(field["prefixItems"][0]).partition("?")
-            return f"{count} x {item}" if item[0].isdigit() else f"{count} {item}s{null}"
-        item = json_type(field["items"])
-        return f"({item})[]" if " " in item else f"{item}[]"
+        item, null, _ = json_type((field.get("prefixItems") or [field["items"]])[0]).partition("?")
+        if (count := field.get("minItems", 0)) > 1 and count == field.get("maxItems"):
+            return f"{count} x {item}{null}" if item[0].isdigit() else f"{count} {item}s{null}"
+        return f"({item}{null})[]" if " " in item and not item.endswith("[]") else f"{item}{null}[]"
     return str(field.get("type", "text")).replace("string", "text")
 
 
