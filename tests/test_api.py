@@ -113,7 +113,7 @@ def test_warp_onto() -> None:
 def test_warp_onto_refuses_an_alignment() -> None:
     """Its homography alone would be a part of the mapping."""
     seed = agalign.Seed("user", np.eye(3), 0.0)
-    alignment = agalign.Alignment(PixelMapping(np.eye(3)), (50, 50), "aligned", (), seed)
+    alignment = agalign.Alignment(PixelMapping(np.eye(3)), (50, 50), (), seed)
     with pytest.raises(agalign.InputError, match=r"its method warp\(moving\)"):
         agalign.warp_onto(np.zeros((50, 50)), alignment, (50, 50))
 

@@ -62,7 +62,7 @@ def test_names_in_the_text_of_an_alignment_are_attributes() -> None:
     prediction = agalign.Prediction(np.eye(3), "windows", 0.4)
     facts = {"residual": residual, "joint": joint, "prediction": prediction}
     seed = agalign.Seed("identity", np.eye(3), 0.0)
-    result = agalign.Alignment(PixelMapping(np.eye(3)), (64, 48), "predicted", (Issue(BLANK_MOVING),), seed, **facts)
+    result = agalign.Alignment(PixelMapping(np.eye(3)), (64, 48), (Issue(BLANK_MOVING),), seed, **facts)
     shown = dict(re.findall(r"([\w.]+)=('[^']*'|[^,)]+)", repr(result)))
     assert {"status", "residual.median_px", "joint.corner_std_px", "reason"} == set(shown)
     for name, text in shown.items():

@@ -84,7 +84,7 @@ def test_errors_of_a_rig_are_in_px_of_each_band_s_file(flight: Path) -> None:
     joint, seed = joint_result(std_px=0.2 / 2**0.5), Seed("rig", np.eye(3), 30.0)
     for pixels, std_px in ((1.0, 0.2), (0.1, 0.02)):
         mapping = pair.mapping(np.diag([pixels, pixels, 1.0]))
-        alignment = Alignment(mapping, pair.fixed.size_px, "aligned", (), seed, joint)
+        alignment = Alignment(mapping, pair.fixed.size_px, (), seed, joint)
         known = observed([pair], {pair.name: alignment}, discover(flight).captures[0])
         assert known.std_px[pair.name] == pytest.approx(std_px)
 

@@ -18,9 +18,8 @@ from agalign.capture import align_bands
 from agalign.capture.align_bands import PairAligner
 from agalign.capture.band_pair import BandPair
 from agalign.capture.by_relief import _is_better, _std_px, aligned_by_relief
-from agalign.capture.by_rig import with_predictions
 from agalign.capture.common_parallax import MIN_PARALLAX_PX, common_parallax_px
-from agalign.capture.decision import fall_back_to_seed, with_one_geometry
+from agalign.capture.decision import against_rig, fall_back_to_seed, with_one_geometry
 from agalign.capture.reference import Reference
 from agalign.capture.warped_pair import Candidate, WarpedPair
 from agalign.config import JointSettings, ReliefSettings, Settings
@@ -330,7 +329,7 @@ def test_a_lost_band_is_predicted_with_the_relief(
     rig = Rig(boxes.size_px, mean, baselines, none, none, ("distance",), (), from_bands_px)
     pairs = [c.pair for c in candidates]
     lost = fall_back_to_seed(pairs[0], candidates[0].seed, (Issue(RETRIEVAL, 0.0, 0.2),))
-    result = with_predictions(pairs, {**aligned, "Blue": lost}, rig, Capture("a", Path(), (), 0))
+    result = against_rig(pairs, {**aligned, "Blue": lost}, rig, Capture("a", Path(), (), 0))
     # The other bands are verified by the rig as before.
     assert {name: a.status for name, a in result.items()} == {"Blue": "predicted", "Red": "aligned", "NIR": "aligned"}
     assert result["Blue"].geometry == "relief"

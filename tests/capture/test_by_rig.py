@@ -17,7 +17,8 @@ from agalign.batch.flight_learning import learn_flight
 from agalign.cameras.discover import discover
 from agalign.capture.align_bands import PairAligner, align_capture_bands, align_pairs
 from agalign.capture.band_pair import BandPair, read_pairs
-from agalign.capture.by_rig import bands_to_learn, with_predictions
+from agalign.capture.by_rig import bands_to_learn
+from agalign.capture.decision import against_rig
 from agalign.config import CheckSettings, Settings
 from agalign.flight.model import FlightModel, load_model
 from agalign.products.sidecar.schema import capture_status
@@ -26,7 +27,7 @@ from agalign.synthetic.flight import make_flight
 from agalign.values import geometry
 from agalign.values.alignment import Alignment, Alignments, Prediction
 from agalign.values.capture import Capture
-from agalign.values.issues import Issue
+from agalign.values.issues import RETRIEVAL, Issue
 from agalign.verify.checks import CLOSE_WINDOWS
 
 from ..conftest import Shared, read_json
@@ -103,7 +104,7 @@ def first(captures: Captures, model: FlightModel) -> Estimated:
 def predicted(known: Estimated, model: FlightModel, **of_rig: Any) -> Alignments:
     """The alignments with predictions of a rig with other facts."""
     pairs, result, capture = known
-    return with_predictions(pairs, result, replace(model.rig, **of_rig), capture)
+    return against_rig(pairs, result, replace(model.rig, **of_rig), capture)
 
 
 def test_a_valid_model_is_kept(captures: Captures, model: FlightModel) -> None:
@@ -129,7 +130,7 @@ def test_a_band_that_its_first_seed_does_not_align_is_part_of_the_rig(
     def without_nir(self: PairAligner, *arguments: Any) -> None:
         verify(self, *arguments)
         if self.model is None:
-            self.result["NIR"] = replace(self.result["NIR"], status="seed_only")
+            self.result["NIR"] = replace(self.result["NIR"], issues=(Issue(RETRIEVAL, 0.1, 0.2),), is_seed_usable=True)
 
     monkeypatch.setattr(PairAligner, "verify", without_nir)
     assert "NIR" in learned(captures).rig.mean
@@ -183,7 +184,7 @@ def test_a_more_accurate_prediction_by_windows_is_kept(first: Estimated, model: 
         matrix = geometry.compose(geometry.translation(away_px, 0), nir.fixed_to_moving)
         mapping = replace(nir.mapping, fixed_to_moving=matrix)
         prediction, issues = Prediction(matrix, "windows", std_px), (Issue(CLOSE_WINDOWS, 0.8, 0.9, "1 px"),)
-        of_windows = replace(nir, status="predicted", mapping=mapping, issues=issues, prediction=prediction)
+        of_windows = replace(nir, mapping=mapping, issues=issues, prediction=prediction)
         checked = predicted((pairs, {**result, "NIR": of_windows}, capture), model)["NIR"]
         assert (checked.status, checked.prediction.source) == ("predicted", source)
 
@@ -191,7 +192,8 @@ def test_a_more_accurate_prediction_by_windows_is_kept(first: Estimated, model: 
 def test_a_band_is_learned_from_scratch_if_its_prediction_is_not_usable(first: Estimated, model: FlightModel) -> None:
     """A plane does not contain the parallax of the flight."""
     pairs, result, capture = first
-    lost = replace(result["NIR"], status="seed_only", seed=replace(result["NIR"].seed, trusted=True))
+    seed, issues = replace(result["NIR"].seed, trusted=True), (Issue(RETRIEVAL, 0.1, 0.2),)
+    lost = replace(result["NIR"], issues=issues, is_seed_usable=True, seed=seed)
     for parallax_px, names in ({}, set()), ({"NIR": 10.0}, {"NIR"}):
         rig = replace(model.rig, parallax_px=parallax_px)
         assert bands_to_learn(pairs, {**result, "NIR": lost}, rig, capture, 1.0) == names

@@ -8,9 +8,9 @@ import pytest
 
 import agalign
 from agalign.capture import by_windows as module
+from agalign.capture import decision
 from agalign.capture.band_pair import BandPair
-from agalign.capture.by_windows import aligned_by_windows, with_lens_shapes
-from agalign.capture.decision import fall_back_to_seed, verified
+from agalign.capture.decision import by_windows, fall_back_to_seed, verified, with_lens_shapes
 from agalign.capture.seeding import find_seed
 from agalign.capture.warped_pair import Candidate
 from agalign.config import SeedSettings
@@ -50,7 +50,7 @@ def unaligned(pair: BandPair, issue: Issue = SILENT) -> Alignment:
 
 def test_windows_suffice_where_descriptors_fail(pair: BandPair) -> None:
     before = unaligned(pair)
-    after = aligned_by_windows(pair, before)
+    after = by_windows(pair, before)
     assert (after.status, after.issues, after.joint.recipe) == ("aligned", (), "windows")
     assert geometry.corner_error_px(before.fixed_to_moving, TRUTH, *LARGE) > 1
     assert geometry.corner_error_px(after.fixed_to_moving, TRUTH, *LARGE) < 0.3
@@ -59,21 +59,21 @@ def test_windows_suffice_where_descriptors_fail(pair: BandPair) -> None:
 def test_windows_do_not_override_descriptors_or_other_failures(pair: BandPair, monkeypatch: pytest.MonkeyPatch) -> None:
     before = unaligned(pair)
     others = [unaligned(pair, issue) for issue in (Issue(UNREADABLE, detail="x"), Issue(FOLDS, 9.0, 4.0))]
-    for other in (*others, replace(before, status="aligned", issues=())):
-        assert aligned_by_windows(pair, other) is other
+    for other in (*others, replace(before, issues=())):
+        assert by_windows(pair, other) is other
     monkeypatch.setattr(module, "_MAX_STEP_PX", 0.5)  # less than the error of the seed
-    assert aligned_by_windows(pair, before) is before
+    assert by_windows(pair, before) is before
 
 
 def test_held_out_windows_must_confirm_the_fit() -> None:
     fixed, moving = two_views(TRUTH, *LARGE)
     moving.pixels[:, 480:] = textured_image(320, 640, seed=5)  # unrelated content
     pair = pair_of(fixed, moving)
-    after = aligned_by_windows(pair, unaligned(pair))
+    after = by_windows(pair, unaligned(pair))
     assert (after.status, [issue.code for issue in after.issues]) == ("predicted", ["other_content"])
     moving.pixels[:] = textured_image(*LARGE, seed=5)
     before = unaligned(pair_of(fixed, two_views(TRUTH, *LARGE)[1]))
-    assert aligned_by_windows(pair_of(fixed, moving), before) is before
+    assert by_windows(pair_of(fixed, moving), before) is before
 
 
 # ---- no structure in one half: a prediction with the error of that half
@@ -144,7 +144,7 @@ def test_half_of_the_image_is_extrapolated_with_the_lens_and_its_error(left: tup
 
 def test_covered_images_georeferenced_files_and_failed_pairs_are_unchanged(left: tuple[BandPair, Alignment]) -> None:
     pair, before = left
-    failed, everywhere = replace(before, status="failed", prediction=None), pair_in(WHOLE)
+    failed, everywhere = replace(before, prediction=None), pair_in(WHOLE)
     mosaic = replace(pair, seed_matrices={"geo": np.eye(3)})
     assert aligned(everywhere).status == "aligned"
     for one, alignment in ((everywhere, aligned(everywhere)), (mosaic, before), (pair, failed)):
@@ -182,7 +182,7 @@ def test_unknown_relief_is_a_share_of_the_range(
     pair, before = left
     at_infinity = geometry.compose(geometry.translation(*np.negative(offset_px)), before.fixed_to_moving)
     near = replace(pair, layout=(-1.0, 0.0), seed_matrices={**pair.seed_matrices, "rig": at_infinity})
-    relief_px = module._RELIEF_SHARE * shift_px
+    relief_px = decision._RELIEF_SHARE * shift_px
     std_px = np.hypot(extrapolated(pair, before).prediction.std_px, relief_px)
     assert extrapolated(near, before).prediction.std_px == pytest.approx(std_px, rel=0.01)
 
@@ -219,8 +219,8 @@ def tried(fixed: np.ndarray, moving: np.ndarray) -> tuple[BandPair, Alignment]:
     pair = replace(pair_of(*images, {"identity": geometry.overlay(FIXED_PX, MOVING_PX)}), is_coarse=True)
     seed = find_seed(pair, SeedSettings())
     issue = Issue(RETRIEVAL, 0.0, 0.2)
-    failed = Alignment(pair.mapping(seed.fixed_to_moving), pair.fixed.size_px, "failed", (issue,), seed)
-    return pair, aligned_by_windows(pair, failed)
+    failed = Alignment(pair.mapping(seed.fixed_to_moving), pair.fixed.size_px, (issue,), seed)
+    return pair, by_windows(pair, failed)
 
 
 @pytest.fixture(scope="module")
@@ -238,10 +238,10 @@ def test_a_coarse_band_with_another_field_of_view_is_predicted_with_its_error(
     points = geometry.lattice(*FIXED_PX, 9, 7)
     assert rms(result.map(points) - geometry.apply(COARSE_TRUTH, points)) < result.prediction.std_px < 0.6
     assert "predicted from windows in the image" in result.reason
-    failed = replace(result, status="failed", prediction=None)
+    failed = replace(result, prediction=None)
     untrusted = replace(failed, seed=replace(failed.seed, trusted=False))
-    assert aligned_by_windows(replace(pair, is_coarse=False), failed) is failed  # a band of full resolution
-    assert aligned_by_windows(pair, untrusted) is untrusted
+    assert by_windows(replace(pair, is_coarse=False), failed) is failed  # a band of full resolution
+    assert by_windows(pair, untrusted) is untrusted
 
 
 @pytest.mark.parametrize("kind", ["unrelated", "repetitive"])

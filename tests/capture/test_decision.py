@@ -5,7 +5,7 @@ import pytest
 
 from agalign.capture import warped_pair
 from agalign.capture.band_pair import BandPair
-from agalign.capture.decision import decided, failed_at_seed, fall_back_to_seed, verified
+from agalign.capture.decision import fall_back_to_seed, verified
 from agalign.capture.warped_pair import Candidate, WarpedPair
 from agalign.fit.displacement_field import DisplacementResult
 from agalign.values import geometry
@@ -30,26 +30,31 @@ def pair() -> BandPair:
 
 
 @pytest.mark.parametrize(
-    ("issues", "is_predicted", "is_seed_usable", "median_px", "status"),
+    ("issues", "is_predicted", "is_seed_usable", "status"),
     [
-        ((), True, True, 0.1, "aligned"),
-        ((Issue(RETRIEVAL, 0.1, 0.2),), True, True, 0.1, "predicted"),
-        ((Issue(RETRIEVAL, 0.1, 0.2),), False, True, 0.1, "seed_only"),
-        ((Issue(RETRIEVAL, 0.1, 0.2),), False, False, 0.1, "failed"),
-        ((Issue(RETRIEVAL, 0.1, 0.2),), False, True, 20.0, "failed"),
+        ((), True, True, "aligned"),
+        ((Issue(RETRIEVAL, 0.1, 0.2),), True, True, "predicted"),
+        ((Issue(RETRIEVAL, 0.1, 0.2),), False, True, "seed_only"),
+        ((Issue(RETRIEVAL, 0.1, 0.2),), False, False, "failed"),
     ],
 )
 def test_the_status_is_that_of_the_first_row_that_applies(
-    pair: BandPair, issues: tuple[Issue, ...], is_predicted: bool, is_seed_usable: bool, median_px: float, status: str
+    pair: BandPair, issues: tuple[Issue, ...], is_predicted: bool, is_seed_usable: bool, status: str
 ) -> None:
-    residual = residual_of(np.zeros((50, 2)), (median_px, 0.0))
     prediction = Prediction(TRUTH, "windows", 0.1) if is_predicted else None
-    alignment = replace(failed_at_seed(pair, SEED, *issues), residual=residual, prediction=prediction)
-    result = decided(alignment, is_seed_usable=is_seed_usable)
+    result = replace(pair.seed_alignment(SEED, *issues), prediction=prediction, is_seed_usable=is_seed_usable)
     assert result.status == status
-    assert (result.issues[-1:] == (Issue(SEED_DOES_NOT_FIT),)) == (is_seed_usable and status == "failed")
-    if status == "failed" and is_seed_usable:
-        assert "rig seed is used unchanged, but the seed does not fit either" in result.reason
+
+
+def test_a_trusted_seed_that_does_not_fit_the_windows_is_not_usable(pair: BandPair) -> None:
+    issue = Issue(RETRIEVAL, 0.1, 0.2)
+    assert fall_back_to_seed(pair, SEED, (issue,)).status == "seed_only"
+    far = replace(SEED, fixed_to_moving=geometry.translation(150, 0))
+    result = fall_back_to_seed(pair, far, (issue,))
+    assert (result.status, result.issues) == ("failed", (issue, Issue(SEED_DOES_NOT_FIT)))
+    assert "rig seed is used unchanged, but the seed does not fit either" in result.reason
+    untrusted = fall_back_to_seed(pair, replace(SEED, trusted=False), (issue,))
+    assert (untrusted.status, untrusted.issues) == ("failed", (issue,))
 
 
 def test_a_seed_that_contradicts_the_tags_is_replaced_by_their_mapping(pair: BandPair) -> None:

@@ -9,8 +9,7 @@ import pytest
 
 from agalign.batch.capture_task import quiet
 from agalign.capture.align_bands import PairAligner
-from agalign.capture.by_windows import aligned_by_windows
-from agalign.capture.decision import fall_back_to_seed
+from agalign.capture.decision import by_windows, fall_back_to_seed
 from agalign.capture.reference import Reference
 from agalign.capture.warped_pair import Candidate
 from agalign.config import Settings
@@ -60,7 +59,7 @@ def test_the_fit_of_an_alignment_by_windows_ignores_those_that_verify_it(border_
 
     def aligned(image: np.ndarray) -> Alignment:
         pair = pair_of(whole(fixed), with_border(image, border_px))
-        result = aligned_by_windows(pair, fall_back_to_seed(pair, SEED, (Issue(RETRIEVAL, 0.05, 0.2),)))
+        result = by_windows(pair, fall_back_to_seed(pair, SEED, (Issue(RETRIEVAL, 0.05, 0.2),)))
         assert (result.status, result.joint.recipe) == ("aligned", "windows")
         return result
 

@@ -9,6 +9,7 @@ import pytest
 from agalign.fit.adjustment import CALIBRATED, LENS_STD, WindowFit, fit_windows, jacobian, lens_shapes, lens_std_px
 from agalign.values import geometry
 from agalign.values.alignment import Alignment, Prediction, Residual, Seed
+from agalign.values.issues import RETRIEVAL, Issue
 from agalign.values.mapping import DisplacementField, PixelMapping
 from agalign.verify.expected_error import expected_error_px, points_in_frame, unmodelled_std_px, unobserved_quarters
 
@@ -167,7 +168,7 @@ def test_areas_outside_the_moving_image_need_no_window() -> None:
 
 def alignment(corner_std_px: list[float], residual: Residual | None) -> Alignment:
     joint = joint_result(std_px=0.1, covariance=np.diag(np.repeat(corner_std_px, 2) ** 2))
-    return Alignment(IDENTITY, (640, 480), "aligned", (), Seed("identity", np.eye(3), 1.0), joint, residual)
+    return Alignment(IDENTITY, (640, 480), (), Seed("identity", np.eye(3), 1.0), joint, residual)
 
 
 def expected_px(known: Alignment, *point: float) -> float:
@@ -213,12 +214,13 @@ def test_a_single_wrong_peak_is_no_error_and_noise_is_subtracted() -> None:
 
 def test_predictions_have_their_standard_error_and_seeds_none() -> None:
     known = alignment([0.01] * 4, None)
-    predicted = replace(known, status="predicted", prediction=Prediction(np.eye(3), "bands", 0.4))
+    doubted = replace(known, issues=(Issue(RETRIEVAL, 0.1, 0.2),))
+    predicted = replace(doubted, prediction=Prediction(np.eye(3), "bands", 0.4))
     assert expected_px(predicted, 60.0, 240.0) == pytest.approx(0.4)
     # The standard error of a thermal band is in its own pixels, which are ten times as large.
     thermal = replace(predicted, mapping=PixelMapping(np.diag([0.1, 0.1, 1.0])))
     assert expected_px(thermal, 60.0, 240.0) == pytest.approx(4.0)
-    assert np.isinf(expected_px(replace(known, status="seed_only"), 60.0, 240.0))
+    assert np.isinf(expected_px(replace(doubted, is_seed_usable=True), 60.0, 240.0))
 
 
 @pytest.mark.parametrize(
@@ -231,5 +233,6 @@ def test_chance_peaks_of_a_lost_band_are_no_error(source: str, measured: float, 
     """
     shifts_px = np.where(np.arange(len(CENTRES))[:, None] < measured * len(CENTRES), (15.0, 0.0), (np.nan, np.nan))
     known = alignment([0.01] * 4, residual_of(CENTRES, shifts_px))
-    lost = replace(known, status="predicted", prediction=Prediction(np.eye(3), source, 0.4))
+    issues = (Issue(RETRIEVAL, 0.1, 0.2),)
+    lost = replace(known, issues=issues, prediction=Prediction(np.eye(3), source, 0.4))
     assert expected_px(lost, *CENTRES[0]) == pytest.approx(error_px, rel=0.12)

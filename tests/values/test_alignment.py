@@ -41,7 +41,7 @@ def test_an_alignment_between_images_is_the_same_between_files() -> None:
     facts = seed, JOINT, residual_of(POINTS, (0.1, 0.1)), 1.5, {"ncc": 0.1}, {"ncc": 0.9}
     field = DisplacementField.sampled(lambda xy: np.sin(xy[:, ::-1] / 60), 10.0, (150, 100))
     mapping, candidates = PixelMapping(H, field=field), {"homography": 0.5, "field": 0.25}
-    between_images = Alignment(mapping, (150, 100), "aligned", (), *facts, candidates)
+    between_images = Alignment(mapping, (150, 100), (), *facts, candidates)
     between_files = between_images.in_file_px(SCALES, (300, 400))
     mapped = between_images.map(SCALES.fixed.positions(POINTS))
     assert between_files.mapping.field is not None

@@ -150,7 +150,7 @@ def test_a_relief_of_fewer_pixels_is_one_of_the_whole_image() -> None:
 
 
 def alignment(mapping: PixelMapping, size_px: tuple[int, int] = SIZE) -> Alignment:
-    return Alignment(mapping, size_px, "aligned", (), Seed("user", mapping.fixed_to_moving, 0.0))
+    return Alignment(mapping, size_px, (), Seed("user", mapping.fixed_to_moving, 0.0))
 
 
 def scene(points: np.ndarray) -> np.ndarray:
