@@ -12,7 +12,8 @@ import json
 import re
 import sys
 import typing
-from collections.abc import Callable, Container
+from collections import Counter
+from collections.abc import Callable, Container, Iterator, Mapping
 from functools import partial
 from operator import attrgetter, not_
 from pathlib import Path
@@ -83,23 +84,47 @@ def type_name(kind: Any) -> str:
 
 
 def fields() -> str:
-    """Return a list of fields for the sidecar and for each of its parts, with the descriptions of the schema."""
-    schema, parts = sidecar_schema(), []
-    of_types = {part["description"] for part in schema["$defs"].values()}
-    for name, part in [("The file", schema), *schema["$defs"].items()]:
-        parts += [f"### {name.removesuffix('Part')}", " ".join(part["description"].split())]
-        parts.append("\n".join(field_line(name, field, of_types) for name, field in part["properties"].items()))
-    return "\n\n".join(parts) + "\n"
+    """Return a list of fields for the sidecar and for each of its parts, with the descriptions of the schema.
 
-
-def field_line(name: str, field: dict[str, Any], of_types: Container[str]) -> str:
-    """Return a field of the sidecar as an item of a list.
-
-    The type is omitted if it is text, and the description if it is that of the type.
+    A part without other parts that only one field has is listed below that field.
     """
-    text, kind = field.get("description", ""), json_type(field)
+    schema = sidecar_schema()
+    types = schema["$defs"]
+    owners = [("The file", schema), *types.items()]
+    references = Counter(
+        name for _, owner in owners for field in owner["properties"].values() for name in types_in(field)
+    )
+    inner = {name: part for name, part in types.items() if references[name] == 1 and not types_in(part["properties"])}
+    of_types = {part["description"] for part in types.values()}
+    sections = []
+    for name, part in owners:
+        if name not in inner:
+            lines = (line for item in part["properties"].items() for line in field_lines(*item, inner, of_types))
+            sections += [f"### {name.removesuffix('Part')}", " ".join(part["description"].split()), "\n".join(lines)]
+    return "\n\n".join(sections) + "\n"
+
+
+def types_in(schema: Any) -> set[str]:
+    """Return the names of the types to which a schema refers."""
+    return set(re.findall(r"#/\$defs/(\w+)", json.dumps(schema)))
+
+
+def field_lines(name: str, field: dict[str, Any], inner: Mapping[str, Any], of_types: Container[str]) -> Iterator[str]:
+    """Yield a field of the sidecar as an item of a list, followed by the fields of its type if that is in `inner`.
+
+    The type is omitted if it is text, and the description if it is that of a type with a section of its own. Of the
+    descriptions of a field and of its type in `inner`, the longer one is used.
+    """
+    text, kind = field.get("description", ""), json_type(field, inner)
+    parts = [inner[one] for one in types_in(field) if one in inner]
+    if parts:
+        text = max(text, *(part["description"] for part in parts), key=len)
+    elif text in of_types:
+        text = ""
     of_kind = "" if kind == "text" else f" ({kind})"
-    return f"* `{name}`{of_kind}" + ("" if not text or text in of_types else f": {' '.join(text.split())}")
+    yield f"* `{name}`{of_kind}" + (f": {' '.join(text.split())}" if text else "")
+    for part in parts:
+        yield from (f"  {line}" for item in part["properties"].items() for line in field_lines(*item, inner, of_types))
 
 
 def sidecar_schema() -> dict[str, Any]:
@@ -107,17 +132,21 @@ def sidecar_schema() -> dict[str, Any]:
     return Sidecar.model_json_schema(mode="serialization")
 
 
-def json_type(field: dict[str, Any]) -> str:
-    """Return a type in short: `number`, `Seed?` if it may be null, `3 x 3 numbers`, `Issue[]` for a list."""
+def json_type(field: dict[str, Any], inner: Container[str]) -> str:
+    """Return a type in short: `number`, `Lens?` if it may be null, `3 x 3 numbers`, `text[]` for a list.
+
+    A type in `inner` is an `object`.
+    """
     if "$ref" in field:
-        name = field["$ref"].rpartition("/")[2].removesuffix("Part")
-        return f"[{name}](#{name.lower()})"
+        name = field["$ref"].rpartition("/")[2]
+        title = name.removesuffix("Part")
+        return "object" if name in inner else f"[{title}](#{title.lower()})"
     if "anyOf" in field:
-        kinds = [json_type(one) for one in field["anyOf"] if one.get("type") != "null"]
+        kinds = [json_type(one, inner) for one in field["anyOf"] if one.get("type") != "null"]
         kind, may_be_null = " or ".join(kinds), len(kinds) < len(field["anyOf"])
         return kind + ("?" if may_be_null and not kind.endswith("?") else "")
     if field.get("type") == "array":
-        item, null, _ = json_type((field.get("prefixItems") or [field["items"]])[0]).partition("?")
+        item, null, _ = json_type((field.get("prefixItems") or [field["items"]])[0], inner).partition("?")
         if (count := field.get("minItems", 0)) > 1 and count == field.get("maxItems"):
             return f"{count} x {item}{null}" if item[0].isdigit() else f"{count} {item}s{null}"
         return f"({item}{null})[]" if " " in item and not item.endswith("[]") else f"{item}{null}[]"

@@ -346,14 +346,14 @@ class Alignment:
 
     @property
     def status(self) -> PairStatus:
-        """What the evidence amounts to.
+        """What the evidence amounts to; the first row that applies:
 
-        | status    | the first row that applies                                         |
-        |-----------|--------------------------------------------------------------------|
-        | aligned   | there are no issues: it passed verification                        |
-        | predicted | the mapping is a prediction with a standard error                  |
-        | seed_only | the mapping is that of the seed, which is confirmed                |
-        | failed    | otherwise; the mapping is that of the seed                         |
+        =========  ===================================================
+        aligned    there are no issues: it passed verification
+        predicted  the mapping is a prediction with a standard error
+        seed_only  the mapping is that of the seed, which is confirmed
+        failed     otherwise; the mapping is that of the seed
+        =========  ===================================================
         """
         if not self.issues:
             return "aligned"

@@ -203,7 +203,9 @@ class BandResult(_Part):
     homography: HomographyPart | None = None
     """Mapping without lenses and displacements."""
     lenses: tuple[Lens, Lens] | None = None
-    """Of the reference and the band, if the homography is between undistorted pixels."""
+    """Lens models of the reference and the band, Brown-Conrady in OpenCV's convention, if the homography is between
+    undistorted pixels; raw pixels of the file.
+    """
     field: DisplacementField | None = None
     """Displacement field of the raw pixels of the reference."""
     grid: GridPart | None = None
