@@ -121,7 +121,7 @@ class RunOptions:
     """How to run. Only `align_panels` changes results: with it, calibration panels give no reflectance."""
 
     overwrite: bool = False
-    """Process finished captures again."""
+    """Estimate and render finished captures again."""
     jobs: Annotated[int, Field(ge=0, le=4096), Option(short="-j", default=0)] = 1
     """Captures processed at the same time; 0 is one per core."""
     align_panels: bool = False
@@ -130,7 +130,7 @@ class RunOptions:
     executor: Annotated[Executor | None, Option("dask", type=str | None)] = None
     """Address of a Dask scheduler, as tcp://host:8786; 'local' starts workers on this machine."""
     retry_failed: bool = False
-    """Process captures with bands that are missing or not aligned again."""
+    """Estimate and render captures with missing or unaligned bands again."""
     # An `executor` of the caller ignores it, except `dask_executor`.
     timeout_s: Annotated[float | None, Field(ge=1, le=1e6), Option("timeout")] = None
     """Seconds after which a capture is abandoned; by default unlimited."""

@@ -2,6 +2,7 @@
 
     python benchmarks/speed.py FLIGHT... [--degraded]
     python benchmarks/speed.py FLIGHT... --stages
+    python benchmarks/speed.py FLIGHT... --floor
 
 FLIGHT is a folder with captures. It is aligned without a model, which includes learning one, and again with the learned
 model; SIFT gets all band pairs of each capture. --degraded adds a table of degraded versions of the first capture of
@@ -16,6 +17,7 @@ import json
 import os
 import shutil
 import sys
+import time
 from collections import Counter, defaultdict
 from pathlib import Path
 from statistics import median
@@ -23,12 +25,20 @@ from typing import Any
 
 import cv2
 import numpy as np
+import rasterio
+import torch
 from bands.images import in_other_light
 from common import command, ended, flight_and_out, print_head, print_row, read_band, run, timed, write_band
 from peers import sift
 
+from agalign import Settings, WriteSettings, read_alignment
+from agalign.batch.capture_task import Task, process_capture
 from agalign.cameras.discover import discover
+from agalign.pixels.radiometry import with_radiometry
+from agalign.products.product import CapturePaths
+from agalign.products.rasters.checked_raster import compressed, tiled_profile
 from agalign.values.capture import Capture
+from agalign.values.image import Tile
 
 ROUNDS, MAX_S = 3, 3600
 LOGGED = "-j", "1", "--log-json"
@@ -126,9 +136,59 @@ def print_stages(flight: Path, captures: list[Capture]) -> None:
         print_row(name, f"{median(some):.2f}")
 
 
-def main(flights: list[Path], *, stages: bool = False, degraded: bool = False) -> None:
+def floor_s(capture: Capture, folder: Path) -> float:
+    """Return the CPU seconds of reading the bands of an aligned capture, resampling them and writing the stack."""
+    path = CapturePaths.of(capture, folder).sidecar
+    width, height = capture.reference.size_px
+    known = {b.name: read_alignment(path, b.name).mapping for b in capture.moving}
+    positions = {name: mapping.positions(Tile(0, 0, width, height), np.float32) for name, mapping in known.items()}
+    profile = tiled_profile(width, height, len(capture.bands), capture.reference.dtype, interleave="band")
+    profile |= compressed("u", "zstd")
+    began_s = time.process_time()
+    planes = [read_band(band.path, band.band_index) for band in capture.bands]
+    for k, band in enumerate(capture.bands):
+        if band.name in positions:
+            plane = cv2.remap(planes[k].astype(np.float32), positions[band.name], None, cv2.INTER_LANCZOS4)
+            planes[k] = np.clip(np.rint(plane), 0, 65535).astype(planes[k].dtype)
+    with rasterio.open(folder / "floor.tif", "w", **profile) as file:
+        file.write(np.stack(planes))
+    return time.process_time() - began_s
+
+
+def print_floor(flight: Path, captures: list[Capture]) -> None:
+    """Print the CPU seconds of a capture relative to the least that any program does."""
+    seconds = defaultdict[str, list[float]](list)
+    as_reflectance = Settings(write=WriteSettings(radiometry="sun"))
+    with flight_and_out() as (_, out):
+        run_alone(*command(flight, out, *LOGGED))
+        (model,) = (out / "models").iterdir()
+        in_light = [with_radiometry(capture, "sun", {}) for capture in captures]
+        tasks = {
+            "a capture with a model": [Task(c, out, Settings(), model) for c in captures],
+            "rendered again as reflectance": [Task(c, out, as_reflectance, is_estimated=True) for c in in_light],
+        }
+        process_capture(tasks["a capture with a model"][0])  # loads the model and the libraries
+        for _ in range(ROUNDS):
+            for name, of_kind in tasks.items():
+                for task in of_kind:
+                    began_s = time.process_time()
+                    process_capture(task)
+                    seconds[name].append(time.process_time() - began_s)
+            seconds["floor"] += [floor_s(capture, out) for capture in captures]
+    floor = median(seconds["floor"])
+    for name, some in seconds.items():
+        print_row(flight.name, name, f"{median(some):.2f}", f"{median(some) / floor:.1f}")
+
+
+def main(flights: list[Path], *, stages: bool = False, degraded: bool = False, floor: bool = False) -> None:
     cv2.setNumThreads(1)
     captures = {flight: discover(flight).captures for flight in flights}
+    if floor:
+        torch.set_num_threads(1)
+        print_head("flight", "", "CPU s", "times the floor")
+        for flight in flights:
+            print_floor(flight, captures[flight])
+        return
     if stages:
         for flight in flights:
             print_stages(flight, captures[flight])

@@ -101,9 +101,10 @@ def remaining(capture: Capture, out: Path, settings: Settings, options: RunOptio
         other = "input files or tags" if earlier.estimated_with else "format of the sidecar"
         return Remaining("estimate", changed or (other,))
     parallax = [] if earlier.parallax is None else [earlier.parallax]
-    wanted = options.overwrite or (options.retry_failed and earlier.status != "ok")
-    if wanted or not outputs_exist(path, parallax):
+    if options.overwrite or (options.retry_failed and earlier.status != "ok"):
         return Remaining("estimate")
+    if not outputs_exist(path, parallax):
+        return Remaining("estimate", ("the parallax file",))
     write = with_earlier_products(settings.write, earlier, path.parent)
     all_settings = settings.model_copy(update={"write": write})
     changed = _changed_options(earlier, all_settings, [("write", write)])

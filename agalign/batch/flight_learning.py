@@ -68,11 +68,7 @@ def learn_flight(
         return apply(task, arguments)
 
     learned = _FlightLearner(captures, settings, progress, start, apply_in_one_thread, threads).learned()
-    return (
-        None
-        if learned is None
-        else replace(learned, fingerprint=learning_fingerprint(flight_camera(captures), captures, settings))
-    )
+    return None if learned is None else replace(learned, fingerprint=learning_fingerprint(captures, settings))
 
 
 @dataclass(frozen=True)

@@ -83,9 +83,8 @@ def render(
     """Write the products of an estimated capture, and its sidecar with them.
 
     `capture` has the radiometry and the saturation values with which it is written. The mappings are those in the
-    sidecar; positions that the `estimated` ones hold are used again. `read` reads
-    the pixels of the files. Raises OutputError, UnreadableFileError for an
-    image of the reference or the parallax, and InputError.
+    sidecar; positions that the `estimated` ones hold are used again. `read` reads the pixels of the files. Raises
+    OutputError, UnreadableFileError for an image of the reference or the parallax, and InputError.
     """
     paths = CapturePaths.of(capture, out)
     write = with_earlier_products(settings.write, sidecar, paths.folder)

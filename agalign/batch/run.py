@@ -304,9 +304,7 @@ class _FlightRun:
             return None
         if path.is_file():
             with suppress(AgalignError):
-                if loaded_model(path, settings.joint.device).fingerprint == learning_fingerprint(
-                    flight_camera(captures), captures, settings
-                ):
+                if loaded_model(path, settings.joint.device).fingerprint == learning_fingerprint(captures, settings):
                     return path
         began = time.monotonic()
         start = given if given is not None and is_flight_of(captures, given.camera) else None

@@ -11,6 +11,7 @@ import numpy as np
 
 from agalign._version import __version__
 from agalign.config import Settings, SettingsModel, WriteSettings
+from agalign.flight.groups import flight_camera
 from agalign.values.capture import Capture
 from agalign.values.files import open_regular
 from agalign.values.lens import Lens
@@ -26,13 +27,13 @@ def estimation_fingerprint(capture: Capture, settings: Settings) -> str:
     return _fingerprint(capture, *(stage for key, stage in settings if key != "write"))
 
 
-def learning_fingerprint(camera: str, captures: Sequence[Capture], settings: Settings) -> str:
+def learning_fingerprint(captures: Sequence[Capture], settings: Settings) -> str:
     """Return the hash of everything that the model of a flight depends on.
 
     It contains the labels: files of two folders may have equal names, sizes and times.
     """
     stages = settings.joint, settings.seed, settings.flight
-    return hashed(camera, *((c.label, _fingerprint(c, *stages)) for c in captures))
+    return hashed(flight_camera(captures), *((c.label, _fingerprint(c, *stages)) for c in captures))
 
 
 def render_fingerprint(capture: Capture, settings: WriteSettings) -> str:
