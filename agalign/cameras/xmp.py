@@ -1,11 +1,13 @@
 """XMP packets: reading and changing values by namespace, in any of the forms that cameras write."""
 
 import re
+from bisect import bisect_left
 from collections.abc import Collection, Iterator, Sequence
 from contextlib import suppress
 from copy import deepcopy
 from dataclasses import dataclass
 from functools import lru_cache
+from itertools import pairwise
 from typing import Any
 
 from lxml import etree
@@ -27,6 +29,7 @@ _USUAL = (
 )
 """The prefixes that cameras write, for packets that do not declare them, or wrongly."""
 _PREFIXES = dict(re.findall(r'xmlns:([\w-]+)="([^"]+)"', _USUAL))
+_USUAL_PREFIX = "|".join(_PREFIXES)
 _SAFE = {"resolve_entities": False, "no_network": True, "remove_comments": True, "remove_pis": True}
 _STRICT, _RECOVERING = etree.XMLParser(**_SAFE), etree.XMLParser(**_SAFE, recover=True)
 _ENVELOPE = r"(?:\w+:)?(?:xmpmeta|xapmeta|RDF)\b"
@@ -141,9 +144,10 @@ def _recovered(text: str) -> Packet:
         # Up to the last whole attribute of a start tag that is cut, else up to the last tag.
         start_tag = re.search(r"""<[\w:-]++(?:\s++[\w:-]++\s*+=\s*+(?:"[^"<]*+"|'[^'<]*+'))*+(?=[^<>]*$)""", text)
         text = f"{text[: start_tag.end()]}>" if start_tag else text[: text.rfind(">") + 1]
-    prefix = "|".join(_PREFIXES)
     # Superfluous end tags would close the elements around them, and the usual prefixes are declared here.
-    misleading = rf"""</(?:{_ENVELOPE}|\w+:Description\b)[^<>]*>|\sxmlns:(?:{prefix})\s*=\s*(?:"[^"<>]*"|'[^'<>]*')"""
+    misleading = (
+        rf"""</(?:{_ENVELOPE}|\w+:Description\b)[^<>]*>|\sxmlns:(?:{_USUAL_PREFIX})\s*=\s*(?:"[^"<>]*"|'[^'<>]*')"""
+    )
     plain = re.sub(r"&(?!(?:amp|lt|gt|quot|apos|#\d+|#x[\da-fA-F]+);)", "&amp;", re.sub(misleading, " ", text))
     read = etree.fromstring(f"<packet {_USUAL}>{plain}</packet>", _RECOVERING)
     root = etree.fromstring(f"<x:xmpmeta {_USUAL}><rdf:RDF><rdf:Description/></rdf:RDF></x:xmpmeta>", _STRICT)
@@ -158,11 +162,33 @@ def _recovered(text: str) -> Packet:
         if text.rfind(f"<{last}") > text.rfind(f"</{last}"):
             description.remove(description[-1])
     known = Packet(root).values()
-    # Elements and attributes, unless they are empty.
-    written = rf"""[<\s]({prefix}):([\w-]++)(?!\s*=\s*(?:""|'')|[^<>=]*(?:/>|>\s*</))"""
-    found = re.findall(written, text)
+    found = _values_written(text)
     unread = (name for prefix, name in found if not {*_names(f"{{{_PREFIXES[prefix]}}}{name}")} <= known.keys())
     return Packet(root if len(description) else None, (*(["its end"] if is_cut else ()), *dict.fromkeys(unread)))
+
+
+def _values_written(text: str) -> Iterator[tuple[str, str]]:
+    """Yield (prefix, name) of the elements and attributes in a damaged packet, unless they are empty.
+
+    An element is empty if its start tag ends with "/>" or is followed by an end tag. Each delimiter is examined once: a
+    search from each name to the end of its tag would take quadratic time in a packet that has lost its delimiters.
+    """
+    delimiters = [*(one.start() for one in re.finditer(r"[<>=]", text)), len(text)]
+    is_empty = [_ends_without_value(text, at, following) for at, following in pairwise(delimiters)]
+    for name in re.finditer(rf"[<\s]({_USUAL_PREFIX}):([\w-]++)", text):
+        number = bisect_left(delimiters, name.end())
+        is_attribute = text[delimiters[number] : delimiters[number] + 1] == "="
+        has_text_between = is_attribute and text[name.end() : delimiters[number]].strip()
+        if number == len(is_empty) or has_text_between or not is_empty[number]:
+            yield name[1], name[2]
+
+
+def _ends_without_value(text: str, at: int, following: int) -> bool:
+    """Return True if a delimiter at a position, before the following one, ends an attribute or element without value."""
+    between = text[at + 1 : following].strip()
+    if text[at] == "=":
+        return between[:2] in ('""', "''")
+    return text[at] == ">" and (text[at - 1 : at] == "/" or (not between and text.startswith("</", following)))
 
 
 @lru_cache(maxsize=256)

@@ -1,6 +1,7 @@
 """Damaged XMP packets, lists of bands in tags, and missing tags of the radiance."""
 
 import re
+import signal
 from collections.abc import Callable
 from pathlib import Path
 
@@ -271,3 +272,22 @@ def test_other_folders_with_an_id_are_captures_of_their_own(tmp_path: Path, band
     write_capture(tmp_path / "a")
     write_capture(tmp_path / "b", bands=bands, at=at)
     assert sorted(len(c.bands) for c in discover(tmp_path).captures) == sorted([3, len(bands)])
+
+
+@pytest.mark.parametrize(
+    "part", [" Camera:a", "<Camera:a", " Camera:a=", 'xmlns:a="', "&", "a", "<a ", ">", " Camera:a\n"], ids=repr
+)
+def test_a_packet_without_delimiters_takes_no_quadratic_time(part: str) -> None:
+    """Half a megabyte takes less than a second; a search from each name to the end takes minutes."""
+    text = "<x:xmpmeta><rdf:RDF>" + part * ((1 << 19) // len(part))
+    signal.alarm(60)
+    try:
+        Packet.parse(text)
+    finally:
+        signal.alarm(0)
+
+
+def test_values_that_are_empty_are_not_called_unread() -> None:
+    text = '<x:xmpmeta><Camera:A></Camera:A><Camera:B/><Camera:C> </Camera:C> Camera:D="" Camera:E = "" '
+    assert Packet.parse(text).unread == ("its end",)
+    assert "D" in Packet.parse(text.replace('D=""', 'D="1')).unread
