@@ -115,7 +115,7 @@ def drifts_of(captures: Sequence[dict[str, Any]]) -> list[DriftChart]:
 def _principal_component(offsets_px: Values) -> Values:
     """(n,) differences of offsets (n, 2) from their median along the direction of largest variance; nan for nan."""
     differences = offsets_px - np.nanmedian(offsets_px, axis=0)
-    _, _, directions = np.linalg.svd(differences[np.isfinite(differences).all(axis=1)])
+    _, _, directions = np.linalg.svd(differences[np.isfinite(differences).all(axis=1)], full_matrices=False)
     return np.asarray(differences @ directions[0])
 
 
