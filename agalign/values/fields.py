@@ -23,6 +23,25 @@ _MAX = 1e30
 
 
 @dataclass(frozen=True)
+class _Limited:
+    """A float that is finite and limited in JSON. The program may have any, as those of damaged tags."""
+
+    is_positive: bool = False
+
+    def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
+        in_file = (
+            core_schema.float_schema(le=_MAX, gt=0) if self.is_positive else core_schema.float_schema(ge=-_MAX, le=_MAX)
+        )
+        return core_schema.json_or_python_schema(
+            in_file,
+            core_schema.any_schema(),
+            serialization=core_schema.plain_serializer_function_ser_schema(
+                float, return_schema=in_file, when_used="json"
+            ),
+        )
+
+
+@dataclass(frozen=True)
 class Measured:
     """A float with these decimals in JSON, where null stands for `missing`."""
 
@@ -89,9 +108,9 @@ class Array:
         return with_null.tolist()
 
 
-Number = Annotated[float, Field(ge=-_MAX, le=_MAX)]
+Number = Annotated[float, _Limited()]
 Count = Annotated[int, Field(gt=0)]
-Positive = Annotated[float, Field(gt=0, le=_MAX)]
+Positive = Annotated[float, _Limited(is_positive=True)]
 Number2 = Annotated[float, Measured(2)]
 Number3 = Annotated[float, Measured(3)]
 Number4 = Annotated[float, Measured(4)]
