@@ -250,11 +250,11 @@ def test_many_files_with_one_problem_are_counted(capsys: pytest.CaptureFixture[s
 def test_the_age_of_a_panel_is_printed_and_warned_of(
     radiometry: str, age_s: float | None, text: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    output = {"file": None, "bytes": None, "crop": (0, 0, 10, 8), "nodata": None, "radiometry": radiometry}
+    output = {"file": None, "crop": (0, 0, 10, 8), "nodata": None, "radiometry": radiometry}
     totals = RunTotals(True)
     few_saturated = NIR | {"reason": None, "saturated": 0.001}
     sidecar = example(output=output | {"panel_age_s": age_s}, bands=[few_saturated])
-    totals.add(CaptureReport("IMG_1", "done", sidecar.result()))
+    totals.add(CaptureReport("IMG_1", "done", sidecar))
     conclude(totals, Path("out"), Terminal())
     printed = capsys.readouterr()
     assert f"Written as {radiometry}: {text}" in printed.out.splitlines()
@@ -269,10 +269,8 @@ def test_the_totals_count_missing_bands_and_captures_without_a_result(capsys: py
     blue = {"band": "Blue", "file": "b.tif", "band_index": 1, "width": 10, "height": 8}
     aligned = NIR | {"status": "aligned", "reason": None}
     complete = example(bands=[aligned | {"saturated": 0.031}, aligned | {"band": "Red"}])
-    totals.add(CaptureReport("IMG_0", "done", complete.result()))
-    totals.add(
-        CaptureReport("IMG_1", "done", example(bands=[aligned], missing_bands=["Green"], reference=blue).result())
-    )
+    totals.add(CaptureReport("IMG_0", "done", complete))
+    totals.add(CaptureReport("IMG_1", "done", example(bands=[aligned], missing_bands=["Green"], reference=blue)))
     totals.add(CaptureReport("IMG_2", "panel", panel="a calibration panel"))
     assert conclude(totals, Path("out"), Terminal()) == 3
     printed = capsys.readouterr()

@@ -13,12 +13,12 @@ import rasterio
 from synthetic_flights.aligned import make_aligned
 
 import agalign
-from agalign.products.run.flight_map import (
-    FlightMap,
+from agalign.products.report.pages import write_pages
+from agalign.products.run.flight_map import FlightMap, geojson_geometry
+from agalign.products.run.footprint import (
     above_elevation,
     accuracy_of_footprint_m,
     footprint,
-    geojson_geometry,
     ground_m,
     missing_for_footprint,
     pose_errors,
@@ -27,14 +27,15 @@ from agalign.products.run.flight_map import (
     with_approximate_georeference,
     with_assumed_height,
 )
-from agalign.products.sidecar.file import read_result
-from agalign.products.sidecar.schema import CaptureResult
+from agalign.products.run.record import excluded_part
+from agalign.products.sidecar.rendered import rendered
+from agalign.products.sidecar.schema import Sidecar
 from agalign.values import geometry
 from agalign.values.capture import Band, Capture, Pose, Position
 from agalign.values.image import OutputGrid
 
 from ..conftest import read_json, seeded
-from .conftest import indices_of
+from .conftest import context_of, indices_of
 
 M_PER_DEGREE = 111_250.0  # of latitude, at 52 degrees
 
@@ -49,11 +50,16 @@ def features_of(out: Path) -> list[dict[str, Any]]:
     return read_json(out / "flight.geojson")["features"]
 
 
-def mapped(out: Path, known: Capture, status: str = "ok", result: CaptureResult | None = None) -> list[dict[str, Any]]:
-    """The features after a run of one capture."""
-    on_map = FlightMap(out)
-    on_map.add(known, status, result)
-    on_map.write()
+def sidecar_of(known: Capture, status: str = "ok") -> Sidecar:
+    """That of a capture of which nothing is written."""
+    return rendered(context_of(known, {})).model_copy(update={"status": status})
+
+
+def mapped(out: Path, known: Capture, status: str = "ok") -> list[dict[str, Any]]:
+    """The features of one capture."""
+    on_map = FlightMap()
+    on_map.add("one", sidecar_of(known, status))
+    assert on_map.write(out) == out / "flight.geojson"
     return features_of(out)
 
 
@@ -113,51 +119,43 @@ def test_an_unknown_height_is_assumed_and_marked(tmp_path: Path) -> None:
     assert with_assumed_height(capture(Pose(0.0, focal_length_px=1000.0), 40.0)).pose.height_m == 40.0
 
 
+def features_of_pages(out: Path) -> list[dict[str, Any]]:
+    write_pages(out, pytest.fail)
+    return features_of(out)
+
+
 def test_index_rasters_of_a_later_command_are_linked_and_stay_linked(tmp_path: Path) -> None:
     make_aligned(tmp_path, 1)
-    known = replace(capture(Pose(0.0, height_m=50.0)), name="IMG_0001", folder=Path("0000SET"))
 
-    def links(features: list[dict[str, Any]]) -> list[str]:
-        return sorted(features[0]["properties"]["indices"])
+    def links() -> list[str]:
+        return sorted(features_of_pages(tmp_path)[0]["properties"]["indices"])
 
-    assert links(mapped(tmp_path, known)) == []
+    assert links() == []
     indices_of(tmp_path, "ndvi", "ndre")
     linked = ["0000SET/IMG_0001_ndre.tif", "0000SET/IMG_0001_ndvi.tif"]
-    assert links(features_of(tmp_path)) == links(mapped(tmp_path, known)) == linked
+    assert links() == links() == linked
     (tmp_path / linked[0]).unlink()
-    assert links(mapped(tmp_path, known)) == linked[1:]
+    assert links() == linked[1:]
 
 
 def test_captures_of_an_earlier_run_stay_as_long_as_their_sidecars(tmp_path: Path) -> None:
-    """As the report and summary.csv, which list every sidecar of the folder."""
+    """As in the report and summary.csv, which list every sidecar of the folder."""
     make_aligned(tmp_path, 2)
-    first, second = (replace(capture(None), name=f"IMG_000{n}", folder=Path("0000SET")) for n in (1, 2))
-
-    def labels_after(known: Capture) -> list[str]:
-        return [f["id"] for f in mapped(tmp_path, known, "ok", read_result(tmp_path / f"{known.label}.json"))]
-
-    assert labels_after(first) == ["0000SET/IMG_0001"]
-    assert labels_after(second) == ["0000SET/IMG_0001", "0000SET/IMG_0002"]
+    assert [f["id"] for f in features_of_pages(tmp_path)] == ["0000SET/IMG_0001", "0000SET/IMG_0002"]
     (tmp_path / "0000SET" / "IMG_0001.json").unlink()
-    assert labels_after(second) == ["0000SET/IMG_0002"]
-
-
-def test_a_map_of_another_program_is_not_changed(tmp_path: Path) -> None:
-    make_aligned(tmp_path, 1)
-    for text in ('{"features": [{"properties": {"name": "mine"}}]}', "[]", "not JSON"):
-        (tmp_path / "flight.geojson").write_text(text)
-        indices_of(tmp_path)
-        assert (tmp_path / "flight.geojson").read_text() == text
+    assert [f["id"] for f in features_of_pages(tmp_path)] == ["0000SET/IMG_0002"]
 
 
 def test_captures_without_a_footprint_are_points_or_left_without_a_place(tmp_path: Path) -> None:
-    on_map = FlightMap(tmp_path)
-    on_map.add(replace(capture(None), position=None), "ok")
-    assert on_map.write() is None
-    on_map.add(replace(capture(None), name="b"), "sky")
-    path = on_map.write()
+    on_map = FlightMap()
+    on_map.add("one", sidecar_of(replace(capture(None), position=None)))
+    assert on_map.write(tmp_path) is None
+    assert not list(tmp_path.iterdir())
+    on_map.add_excluded(excluded_part(replace(capture(None), name="b"), "sky", ["blue", "bright"]))
+    path = on_map.write(tmp_path)
     first, second = json.loads(path.read_text())["features"]
-    assert first["geometry"] is None
+    assert (first["id"], first["geometry"]) == ("one/a", None)
+    assert (second["id"], second["properties"]["status"]) == ("one/b", "sky")
     assert second["geometry"] == {"type": "Point", "coordinates": [5.0, 52.0]}
 
 
@@ -223,7 +221,7 @@ def test_the_approximate_georeference_has_the_footprint_of_the_pose(heading_deg:
 def test_a_run_writes_the_map_and_georeferenced_rasters_that_agree(by_sun: Path) -> None:
     features = features_of(by_sun)
     assert {f["geometry"]["type"] for f in features if f["properties"]["status"] == "panel"} == {"Point"}
-    (feature, *_) = [f for f in features if f["properties"]["stack"]]
+    (feature, *_) = [f for f in features if f["properties"].get("stack")]
     assert feature["properties"]["height_from"] == "panel"
     with rasterio.open(by_sun / feature["properties"]["stack"]) as stack:
         assert stack.crs.to_epsg() == 32631

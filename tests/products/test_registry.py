@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 import agalign
-from agalign.batch import capture_task as batch_capture
+from agalign.batch import capture_task, estimate, render
 from agalign.batch.earlier_results import outputs_exist
 from agalign.products.product import Product, ProductContext, WrittenFile
 from agalign.products.registry import PRODUCTS
@@ -47,11 +47,16 @@ def align(tmp_path: Path) -> Align:
 
 @pytest.fixture
 def with_histogram(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(batch_capture, "PRODUCTS", (*PRODUCTS, Histogram()))
+    use_products(monkeypatch, *PRODUCTS, Histogram())
+
+
+def use_products(monkeypatch: pytest.MonkeyPatch, *products: Product) -> None:
+    for module in (capture_task, render):
+        monkeypatch.setattr(module, "PRODUCTS", products)
 
 
 @pytest.mark.usefixtures("with_histogram")
-def test_every_file_is_listed_with_its_checksum_and_removed(align: Align, tmp_path: Path) -> None:
+def test_every_file_is_listed_with_its_checksum_and_written_again_or_removed(align: Align, tmp_path: Path) -> None:
     out, sidecar = tmp_path / "out", align().sidecar
     kinds = "band band stack error_map picture preview histogram"
     files = "f_green.tif f_red.tif f.tif f.error.tif f.png f.preview.jpg f.histogram.json"
@@ -59,8 +64,10 @@ def test_every_file_is_listed_with_its_checksum_and_removed(align: Align, tmp_pa
     for part in sidecar.products:
         data = (out / part.file).read_bytes()
         assert (part.bytes, part.sha256) == (len(data), hashlib.sha256(data).hexdigest())
-    align(PLAIN)
-    assert {p.name for p in out.glob("f[._]*")} == {"f.json", "f.tif", "f.png", "f.preview.jpg"}
+    removed = align(PLAIN).removed
+    kept = {*files.split()} - {"f_green.tif", "f_red.tif"}
+    assert {p.name for p in out.glob("f[._]*")} == {"f.json", *kept}
+    assert sorted((p.name, why) for p, why in removed) == [(f"f_{b}.tif", "--layout stack") for b in ("green", "red")]
 
 
 @pytest.mark.usefixtures("align")
@@ -73,7 +80,7 @@ def test_an_image_is_not_replaced(tmp_path: Path) -> None:
 @pytest.mark.usefixtures("with_histogram")
 def test_a_capture_is_kept_only_while_all_its_files_are_there(align: Align) -> None:
     report = align()
-    first, *others = (report.path.with_name(name) for name in report.result.files)
+    first, *others = (report.path.with_name(part.file) for part in report.result.files)
     assert len(others) == 6
     for path in (first, *others):
         data = path.read_bytes()
@@ -88,19 +95,19 @@ def test_a_capture_is_kept_only_while_all_its_files_are_there(align: Align) -> N
 
 def test_a_required_product_that_fails_costs_the_capture(align: Align, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(Histogram, "write", raising(agalign.OutputError("f.histogram.json: cannot be written")))
-    monkeypatch.setattr(batch_capture, "PRODUCTS", (*PRODUCTS, Histogram()))
+    use_products(monkeypatch, *PRODUCTS, Histogram())
     report = align()
     assert (report.state, report.error) == ("error", "f.histogram.json: cannot be written")
     monkeypatch.setattr(Histogram, "is_required", False)
     report = align()
     assert (report.state, report.failed_products) == ("done", ("f.histogram.json: cannot be written",))
     assert report.result.not_written == ["histogram"]
-    monkeypatch.setattr(batch_capture, "PRODUCTS", PRODUCTS)
+    use_products(monkeypatch, *PRODUCTS)
     assert [align().state for _ in range(2)] == ["done", "kept"]
 
 
 def test_products_are_checked_before_the_alignment(align: Align, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(Histogram, "check", raising(agalign.InputError("f_green.tif: has no histogram")))
-    monkeypatch.setattr(batch_capture, "PRODUCTS", (*PRODUCTS, Histogram()))
-    monkeypatch.setattr(batch_capture, "align_capture_bands", raising(AssertionError("aligned in vain")))
+    use_products(monkeypatch, *PRODUCTS, Histogram())
+    monkeypatch.setattr(estimate, "align_capture_bands", raising(AssertionError("aligned in vain")))
     assert "has no histogram" in (align().error or "")

@@ -4,6 +4,7 @@ import json
 import re
 import shutil
 import subprocess
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +19,7 @@ from agalign.products.report.facts import PairTotals
 from agalign.products.report.pages import pages_exist, write_pages
 from agalign.products.report.preview import ReliefView, preview_bytes, write_preview
 from agalign.products.sidecar.file import read_sidecar
-from agalign.products.sidecar.schema import CaptureResult
+from agalign.products.sidecar.schema import Sidecar
 from agalign.values.capture import Band, Capture
 from agalign.values.image import OutputGrid
 
@@ -59,10 +60,11 @@ def test_the_page_has_the_facts_of_every_capture(flight: Path, aligned_flight: P
             known = np.asarray(ties[part["file"]]["ties"])
             offset_length_px = np.median(np.linalg.norm(known[:, 2:] - known[:, :2], axis=1))
             assert pair["offset_length_px"] == pytest.approx(offset_length_px, abs=0.3)
-            tiles = part["metrics"]["tiles"]
+            windows = part["metrics"]["windows"]
             shifts = [None if v is None else v * facts["shift_step_px"] for v in pair["shifts"]]
-            assert shifts == [v if v is None else pytest.approx(v, abs=0.006) for t in tiles for v in t["shift_px"]]
-            assert facts["lattices"][pair["lattice"]] == [v for t in tiles for v in t["centre_px"]]
+            measured, centres = (list(chain(*windows[name])) for name in ("shifts_px", "centres_px"))
+            assert shifts == [v if v is None else pytest.approx(v, abs=0.006) for v in measured]
+            assert facts["lattices"][pair["lattice"]] == centres
 
 
 def headline(out: Path) -> str:
@@ -238,7 +240,7 @@ def test_every_picture_is_at_the_place_in_the_sidecar(views: ReducedBands, tmp_p
         assert np.median(below[:h, w:]) == pytest.approx(255 * 0.25 / part.error_full_px, abs=3)
     low, high = part.relief.parallax_px
     assert (low, high) == pytest.approx((-2.9, 6.9), abs=0.1)
-    assert part.relief.range_m == (1.235, 2.5)
+    assert part.model_dump(mode="json")["relief"]["range_m"] == [1.235, 2.5]
     assert below[-h:, w:].max() < 4
     shown = low + below[-h // 2, :w].astype(float) / 255 * (high - low)
     np.testing.assert_allclose(shown, np.linspace(-3, 7, w).clip(low, high), atol=0.25)
@@ -261,13 +263,13 @@ def test_images_smaller_than_a_tile_are_shown_as_they_are(tmp_path: Path) -> Non
 # ---- failed bands, grouped by their cause
 
 
-def capture(*bands: tuple[str, str, str | None], missing: tuple[str, ...] = (), **changes: Any) -> CaptureResult:
+def capture(*bands: tuple[str, str, str | None], missing: tuple[str, ...] = (), **changes: Any) -> Sidecar:
     """A capture of bands with (name, status, kind of their issue)."""
     parts = []
     for name, status, kind in bands:
         issues = [] if kind is None else [{"kind": kind, "value": None, "limit": None}]
-        parts.append(NIR | {"band": name, "status": status, "reason": kind, "doubts": issues})
-    return example(bands=parts, missing_bands=missing, **changes).result()
+        parts.append(NIR | {"band": name, "status": status, "reason": kind, "issues": issues})
+    return example(bands=parts, missing_bands=missing, **changes)
 
 
 def test_bands_are_grouped_by_cause_and_status_most_severe_first() -> None:
@@ -295,7 +297,7 @@ def test_bands_are_grouped_by_cause_and_status_most_severe_first() -> None:
     }
 
 
-def with_reference(name: str, missing: tuple[str, ...] = (), flight_id: str = "") -> CaptureResult:
+def with_reference(name: str, missing: tuple[str, ...] = (), flight_id: str = "") -> Sidecar:
     reference = {"band": name, "file": "x.tif", "band_index": 1, "width": 10, "height": 8}
     bands = [(name, "reference", None)]
     bands += [(b, "aligned", None) for b in ("Blue", "Green") if b != name and b not in missing]

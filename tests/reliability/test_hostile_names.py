@@ -13,8 +13,8 @@ from PIL.ExifTags import Base
 from synthetic_flights.aligned import make_aligned
 
 import agalign
-from agalign.batch.capture_task import discard_outputs
 from agalign.batch.index_run import index_tasks, run_indices
+from agalign.batch.render import remove_outputs
 from agalign.cameras.tiff_directory import EXIF, GPS, XMP, add_directories, byte_string, read_directories, text
 from agalign.flight.groups import model_names
 from agalign.products.exports.programs import export
@@ -130,7 +130,7 @@ def test_equal_names_do_not_overwrite_each_other(tmp_path: Path) -> None:
         band["place"] = None
     for folder, name in (("0000SET/x", "y"), ("0000SET", "x_y"), ("0000SET_x", "y")):
         content["capture"] = name
-        content["output"]["band_files"] = [{"file": f"{name}.tif", "bytes": 1}]
+        content["products"] = [{"kind": "band", "file": f"{name}.tif", "bytes": 1, "sha256": ""}]
         (out / folder).mkdir(exist_ok=True)
         (out / folder / f"{name}.tif").write_text(folder)
         (out / folder / f"{name}.json").write_text(json.dumps(content))
@@ -166,7 +166,7 @@ def test_links_in_an_output_folder_are_not_read_written_or_emptied(tmp_path: Pat
     make_aligned(out, 1)
     sidecar = out / "0000SET" / "IMG_0001.json"
     content = read_json(sidecar) | {"status": "ok"}
-    content["output"]["band_files"] = [{"file": "link/key", "bytes": 1}]
+    content["products"] += [{"kind": "band", "file": "link/key", "bytes": 1, "sha256": ""}]
     sidecar.write_text(json.dumps(content))
     (out / "0000SET" / "link").symlink_to(secret)
     with pytest.raises(agalign.OutputError, match="link/key: a link leads out of"):
@@ -177,7 +177,7 @@ def test_links_in_an_output_folder_are_not_read_written_or_emptied(tmp_path: Pat
     (result,) = run_indices(index_tasks(out, [index_named("ndvi")], target))
     assert "a link leads out" in result[0].problem
     band = Band("Green", tmp_path / "IMG_0001_2.tif", 1, 9, 9, "uint16")
-    discard_outputs(Capture("IMG_0001", Path("0000SET"), (band,), 0), out, agalign.WriteSettings())
+    remove_outputs(Capture("IMG_0001", Path("0000SET"), (band,), 0), out, agalign.WriteSettings())
     assert not sidecar.exists()
     assert [p.name for p in secret.iterdir()] == ["key"]
 
