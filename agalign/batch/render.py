@@ -5,6 +5,7 @@ One that cannot be written any more is removed, and the report of the capture sa
 """
 
 import re
+import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -86,7 +87,7 @@ def render(
     sidecar; positions that the `estimated` ones hold are used again. `read` reads the pixels of the files. Raises
     OutputError, UnreadableFileError for an image of the reference or the parallax, and InputError.
     """
-    paths = CapturePaths.of(capture, out)
+    began_s, paths = time.perf_counter(), CapturePaths.of(capture, out)
     write = with_earlier_products(settings.write, sidecar, paths.folder)
     settings = settings.model_copy(update={"write": write})
     outdated = outdated_files(capture, out, write, sidecar)
@@ -111,7 +112,7 @@ def render(
         with suppress(OSError):
             path.unlink(missing_ok=True)
     reasons = tuple((path, context.lost.get(path, reason)) for path, reason in removed if reason)
-    complete = write_sidecar(paths.sidecar, rendered(context, list(failures)))
+    complete = write_sidecar(paths.sidecar, rendered(context, list(failures), time.perf_counter() - began_s))
     # Products that need the same file fail with the same message.
     return Rendering(complete, tuple(dict.fromkeys(failures.values())), reasons)
 
