@@ -1,6 +1,7 @@
 """Results of earlier runs in an output folder: of another capture, of the same one with other options, removed ones."""
 
 import hashlib
+import json
 import re
 import shutil
 from collections.abc import Callable
@@ -21,7 +22,7 @@ from agalign.flight.groups import flights_of, model_names
 from agalign.products.sidecar.file import find_sidecars, read_result
 from agalign.values.image import OutputGrid
 
-from ..conftest import Shared, save_known_model, seeded, textured_image, write_band, write_capture
+from ..conftest import Shared, read_json, save_known_model, seeded, textured_image, write_band, write_capture
 from ..program import agalign_here
 
 pytestmark = pytest.mark.slow
@@ -116,23 +117,25 @@ def test_what_identifies_a_capture(flight: Path, out: Path) -> None:
     assert same({"input_samples": {}}, captured_at="", capture_id="") is None
 
 
-def test_captures_with_other_options_are_done_again_and_this_is_printed_before(flight: Path, out: Path) -> None:
+def test_captures_with_other_options_are_done_again_and_this_is_printed_before(
+    flight: Path, out: Path
+) -> None:
     first, second = find_sidecars(out)
     options = "--seed", "rig", "--only-seed", "--crop", "none", "--qa"
     planned = agalign_here(flight, "-o", out, *options, "--dry-run")
-    assert "2 captures to be done again; changed since: --crop, --qa; nothing was written" in planned.stdout
+    assert "2 captures to be rendered again; changed since: --crop, --qa; nothing was written" in " ".join(planned.stdout.split())
     done = agalign_here(flight, "-o", out, *options)
     lines = done.stderr.splitlines()
-    said = lines.index("2 finished captures to be done again; changed since: --crop, --qa")
+    said = lines.index("2 finished captures to be rendered again; changed since: --crop, --qa")
     assert said < next(k for k, line in enumerate(lines) if line.startswith("[1/2]"))
     assert read_result(first).output.crop == (0, 0, 480, 360)
     again = agalign_here(flight, "-o", out, *options)
-    assert "done again" not in again.stderr
+    assert "again; changed since" not in again.stderr
     assert again.stderr.count("kept from an earlier run") == 2
     text = second.read_text().replace(f'"agalign": "{agalign.__version__}"', '"agalign": "0.0.9"')
-    second.write_text(text.replace(f'"settings": "{read_result(second).settings}"', '"settings": "0"'))
+    second.write_text(text.replace(read_result(second).estimated_with, "0"))
     done = agalign_here(flight, "-o", out, *options)
-    assert "1 finished capture to be done again; changed since: version (agalign 0.0.9 before)" in done.stderr
+    assert "1 finished capture to be estimated again; changed since: version (agalign 0.0.9 before)" in done.stderr
 
 
 def test_a_flight_that_grows_needs_no_option(flight: Path, tmp_path: Path) -> None:
@@ -169,7 +172,7 @@ def test_finished_captures_get_the_crop_of_a_new_rig(flight: Path, out: Path) ->
     (name,) = model_names(flights_of(scan.captures))
     save_known_model(out / "models" / name)
     reports = list(run_flight(scan, out, SEEDS, listener=Listener(on_again=said.append)))
-    assert said == ["2 finished captures to be done again; changed since: crop of the flight"]
+    assert said == ["2 finished captures to be rendered again; changed since: crop of the flight"]
     assert [(r.state, r.result.output.crop) for r in reports] == [("done", reports[0].result.output.crop)] * 2
 
 
@@ -185,10 +188,9 @@ def test_a_sidecar_removes_no_file_but_those_of_its_capture(flight: Path, tmp_pa
     shutil.copy(project / "flight" / "IMG_0002_1.tif", raw)
     sidecar = project / "IMG_0001.json"
     listed = ["flight/IMG_0001_1.tif", "flight/IMG_0002_3.tif", "thesis.txt", "IMG_0001_9.tif", "IMG_0002.tif"]
-    files = ", ".join(f'{{"file": "{name}", "bytes": 1}}' for name in [*listed, "IMG_0001_4.tif"])
-    text = sidecar.read_text()
-    start = text.index('"band_files": [')
-    sidecar.write_text(text[:start] + f'"band_files": [{files}]' + text[text.index("]", start) + 1 :])
+    part = {"kind": "band", "bytes": 1, "sha256": ""}
+    products = [part | {"file": name} for name in [*listed, "IMG_0001_4.tif"]]
+    sidecar.write_text(json.dumps(read_json(sidecar) | {"products": products}))
     stack = (project / "IMG_0002.tif").stat().st_mtime_ns
     before = contents(project / "flight")
     # With the stack alone and two bands, the other files of bands are outdated.

@@ -47,7 +47,7 @@ def aligned_copy(aligned_flight: Path, tmp_path: Path) -> Path:
 
 
 def test_summary_report_and_log(aligned_flight: Path, aligned_copy: Path) -> None:
-    """The command `report` writes the page of the run again; all have the same time of a capture."""
+    """The command `report` writes the page of the run again; all have the time of a capture."""
     rows = list(csv.DictReader((aligned_copy / "summary.csv").read_text().splitlines()))
     assert [r["status"] for r in rows] == ["aligned"] * 8
     assert all(float(r["mattes_mi_after"]) < float(r["mattes_mi_before"]) for r in rows)
@@ -63,8 +63,10 @@ def test_summary_report_and_log(aligned_flight: Path, aligned_copy: Path) -> Non
     assert events[-1]["event"] == "finished"
     reported = json.loads(done.stdout)["captures"]
     seconds = {e["capture"]: e["seconds"] for e in events if e["event"] == "capture"}
-    assert {c["label"]: c["seconds"] for c in reported} == seconds
+    assert {c["label"] for c in reported} == set(seconds)
     assert len(seconds) == 2
+    # Those of the sidecar do not include writing it.
+    assert all(0.9 * seconds[c["label"]] < c["seconds"] <= seconds[c["label"]] for c in reported)
     assert all(c["seconds"] > sum(b["seconds"] for b in c["bands"]) for c in reported)
 
 

@@ -51,7 +51,7 @@ def features_of(out: Path) -> list[dict[str, Any]]:
 
 
 def sidecar_of(known: Capture, status: str = "ok") -> Sidecar:
-    """That of a capture of which nothing is written."""
+    """The sidecar of a capture without rasters."""
     return rendered(context_of(known, {})).model_copy(update={"status": status})
 
 

@@ -141,13 +141,14 @@ def test_indices_go_with_the_stack_that_they_were_made_of(tmp_path: Path) -> Non
     written(tmp_path)
     write_band(out / "f_mine.tif", np.zeros((8, 8), np.float32))
     with rasterio.open(out / "f_mine.tif", "r+") as dataset:
-        dataset.update_tags(INDEX_STATISTICS='{"unit": "reflectance"}')
+        dataset.update_tags(INDEX="mine", INDEX_FORMULA="of a lost table", INDEX_STATISTICS='{"unit": "reflectance"}')
     for name in ("f_mine.png", "f_notes.tif"):
         (out / name).write_bytes(b"x")
     written(tmp_path)
     assert (out / "f_mine.tif").exists(), "nothing was written again"
-    written(tmp_path, overwrite=True)
+    removed = written(tmp_path, overwrite=True).removed
     assert {p.name for p in out.glob("f_*")} == {"f_notes.tif"}
+    assert removed == ((out / "f_mine.tif", "its formula is unknown"),)
 
 
 def test_geo_seed_between_coordinate_systems() -> None:
@@ -261,7 +262,8 @@ def test_indices_of_delivered_bands(
     """A band that `--accept-predicted` counts as delivered is good enough for indices, and no other."""
     make_aligned(tmp_path, 1)
     path = tmp_path / "0000SET" / "IMG_0001.json"
-    of_nir = {"status": status, "prediction": {"from": "flight", "std_px": std_px, "off_px": None}}
+    prediction = {"from": "flight", "std_px": std_px, "fixed_to_moving": np.eye(3).tolist()}
+    of_nir = {"status": status, "prediction": prediction}
     bands = [part | (of_nir if part["band"] == "NIR" else {}) for part in read_json(path)["bands"]]
     change(path, bands=bands, accept_predicted_px=accepted_px)
     (result,) = indices_of(tmp_path)

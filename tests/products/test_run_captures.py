@@ -37,8 +37,8 @@ def run(shared: Shared) -> Path:
             for index in stack.indexes:
                 stack.update_tags(index, QUANTITY="radiance")
         for path in find_sidecars(folder):
-            output = read_json(path)["output"]
-            change(path, output=output | {"band_files": [{"file": path.with_suffix(".tif").name, "bytes": 1}]})
+            (stack,) = read_json(path)["products"]
+            change(path, products=[stack, stack | {"kind": "band"}])
 
     return shared("mixed", fill)
 

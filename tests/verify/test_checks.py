@@ -21,7 +21,7 @@ JOINT = joint_result(std_px=0.07)
 
 
 def measured_in(share: float, shift_px: float = 0.0) -> Residual:
-    """A hundred windows, of which a share has a measured shift along x."""
+    """A hundred windows; the shift along x is measured in a share of them."""
     is_measured = np.arange(100)[:, None] < 100 * share
     return residual_of(np.zeros((100, 2)), np.where(is_measured, (shift_px, 0.0), np.nan))
 
