@@ -36,7 +36,7 @@ from agalign.batch.capture_task import Task, process_capture
 from agalign.cameras.discover import discover
 from agalign.pixels.radiometry import with_radiometry
 from agalign.products.product import CapturePaths
-from agalign.products.rasters.checked_raster import compressed, tiled_profile
+from agalign.products.rasters.geotiff import compressed, tiled_profile
 from agalign.values.capture import Capture
 from agalign.values.image import Tile
 

@@ -15,7 +15,7 @@ from agalign.config import RunOptions, Settings, SettingsModel
 from agalign.errors import ConfigurationError, SidecarError
 from agalign.flight.fingerprint import estimation_fingerprint, input_samples, render_fingerprint
 from agalign.products.product import CapturePaths
-from agalign.products.sidecar.file import read_result
+from agalign.products.sidecar.file import read_without_tables
 from agalign.products.sidecar.schema import FilePart, Sidecar
 from agalign.values.capture import Capture, CaptureTime
 
@@ -55,7 +55,7 @@ def refuse_other_captures(captures: Sequence[Capture], out: Path) -> None:
     elsewhere = [p for p in out.rglob("*.json") if p.stem in by_name and p not in places]
     for path, here in chain(places.items(), ((p, c) for p in elsewhere for c in by_name[p.stem])):
         with suppress(SidecarError):
-            earlier = read_result(path)
+            earlier = read_without_tables(path)
             if is_same(earlier, here) is not (path not in places):
                 continue
             what = f"is of another capture than {here.label} here ({_described(earlier)}; here {_described(here)})"
@@ -92,7 +92,7 @@ def remaining(capture: Capture, out: Path, settings: Settings, options: RunOptio
     """
     path = CapturePaths.of(capture, out).sidecar
     try:
-        earlier = read_result(path)
+        earlier = read_without_tables(path)
     except SidecarError:
         return Remaining("estimate")
     if earlier.estimated_with != estimation_fingerprint(capture, settings):

@@ -19,8 +19,8 @@ from agalign.batch.learning_tasks import (
     portable,
 )
 from agalign.config import Settings
-from agalign.fit.adjustment import lens_std_px
 from agalign.fit.displacement_field import common_field
+from agalign.fit.window_fit import lens_std_px
 from agalign.flight.fingerprint import learning_fingerprint
 from agalign.flight.groups import flight_camera, flight_lenses
 from agalign.flight.learn_rig import learn_rig

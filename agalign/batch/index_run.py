@@ -12,7 +12,7 @@ from agalign.errors import AgalignError
 from agalign.products.indices.formulas import Index
 from agalign.products.indices.rasters import IndexRasters, IndexReport, update_table, write_rasters
 from agalign.products.run.captures import bands_of
-from agalign.products.sidecar.file import add_products, read_result, run_sidecars
+from agalign.products.sidecar.file import add_products, read_without_tables, run_sidecars
 from agalign.values.files import check_inside
 from agalign.values.processes import usable_cores
 
@@ -79,7 +79,7 @@ def run_indices(
 
 def do_indices(task: IndexTask) -> list[IndexReport]:
     """Write the indices of one capture; the reports include errors. Raises SidecarError."""
-    sidecar, base = read_result(task.sidecar), task.target / task.label
+    sidecar, base = read_without_tables(task.sidecar), task.target / task.label
     try:
         check_inside(base.parent, task.target)
         bands = bands_of(sidecar, task.sidecar.parent, mask_qa=task.mask_qa)

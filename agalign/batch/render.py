@@ -18,11 +18,11 @@ from agalign.pixels.raster import ReadTile, read_tile
 from agalign.products.indices.rasters import index_rasters
 from agalign.products.product import CapturePaths, ProductContext
 from agalign.products.rasters.aligned_files import band_file_names, is_aligned_raster
-from agalign.products.rasters.layout import FlightLimits, output_layers
+from agalign.products.rasters.output_grid import FlightLimits, output_layers
 from agalign.products.rasters.parallax_file import PARALLAX_SUFFIX, read_relief
 from agalign.products.registry import PRODUCTS
 from agalign.products.report.preview import preview_bytes
-from agalign.products.sidecar.file import read_result, write_sidecar
+from agalign.products.sidecar.file import read_without_tables, write_sidecar
 from agalign.products.sidecar.rendered import rendered
 from agalign.products.sidecar.schema import Sidecar
 from agalign.values.alignment import Alignment
@@ -204,7 +204,7 @@ def remove_outputs(capture: Capture, out: Path, settings: WriteSettings) -> None
     """Remove the outputs of an earlier run for a capture that this one does not align."""
     paths, sidecar = CapturePaths.of(capture, out), None
     with suppress(SidecarError):
-        sidecar = read_result(paths.sidecar)
+        sidecar = read_without_tables(paths.sidecar)
     for path in [*outdated_files(capture, out, settings, sidecar), paths.sidecar, paths.file(PARALLAX_SUFFIX)]:
         with suppress(OSError, OutputError):
             check_inside(path.parent, out)

@@ -29,7 +29,7 @@ from agalign.method.device import choose_device, limit_threads
 from agalign.pixels.radiometry import with_radiometry
 from agalign.products.indices.rasters import check_indices
 from agalign.products.product import CapturePaths
-from agalign.products.rasters.layout import FlightLimits, common_grid, flight_limits
+from agalign.products.rasters.output_grid import FlightLimits, common_grid, flight_limits
 from agalign.products.report.preview import preview_bytes
 from agalign.products.run.excluded import write_panels, write_sky
 from agalign.products.run.footprint import (
@@ -39,7 +39,7 @@ from agalign.products.run.footprint import (
     with_approximate_georeference,
 )
 from agalign.products.run.record import RunPart, begun, excluded_part
-from agalign.products.sidecar.file import read_result
+from agalign.products.sidecar.file import read_without_tables
 from agalign.products.sidecar.schema import FilePart
 from agalign.values.capture import Capture
 from agalign.values.files import check_inside
@@ -272,7 +272,7 @@ class _FlightRun:
                         one = left[capture.label] = Remaining("render", ("crop of the flight",))
                     if one.step == "nothing":
                         sidecar = CapturePaths.of(capture, self.out).sidecar
-                        yield CaptureReport(capture.label, "kept", read_result(sidecar), sidecar)
+                        yield CaptureReport(capture.label, "kept", read_without_tables(sidecar), sidecar)
                         continue
                     rendering = RenderOptions(max_bytes, limits, common)
                     tasks.append(

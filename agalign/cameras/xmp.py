@@ -184,7 +184,7 @@ def _values_written(text: str) -> Iterator[tuple[str, str]]:
 
 
 def _ends_without_value(text: str, at: int, following: int) -> bool:
-    """Return True if a delimiter at a position, before the following one, ends an attribute or element without value."""
+    """Return True if a delimiter, before the one that follows it, ends an attribute or element without a value."""
     between = text[at + 1 : following].strip()
     if text[at] == "=":
         return between[:2] in ('""', "''")

@@ -13,7 +13,7 @@ from agalign.capture.reference import Reference
 from agalign.capture.tag_seeds import tag_seeds
 from agalign.config import SeedSettings
 from agalign.errors import AgalignError
-from agalign.fit.adjustment import lens_std_px
+from agalign.fit.window_fit import lens_std_px
 from agalign.fit.windows import FixedWindows
 from agalign.flight.model import FlightModel
 from agalign.flight.rig_prediction import unobserved_error_px

@@ -29,7 +29,9 @@ from agalign.capture.common_parallax import (
 )
 from agalign.capture.warped_pair import Candidate, WarpedPair
 from agalign.errors import GeometryError
-from agalign.fit.adjustment import (
+from agalign.fit.dense import DenseMatching, View, nearer_sign
+from agalign.fit.displacement_field import MIN_WINDOWS
+from agalign.fit.window_fit import (
     BaselinePrior,
     WindowFit,
     WindowShifts,
@@ -39,8 +41,6 @@ from agalign.fit.adjustment import (
     fit_in_rounds,
     parallax_of,
 )
-from agalign.fit.dense import DenseMatching, View, nearer_sign
-from agalign.fit.displacement_field import MIN_WINDOWS
 from agalign.pixels.band_resampling import channel_mean
 from agalign.values.alignment import Alignment, Alignments, JointResult, Residual
 from agalign.values.choices import Geometry, ReliefUse

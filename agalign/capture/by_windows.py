@@ -14,7 +14,7 @@ import numpy as np
 
 from agalign.capture.band_pair import BandPair
 from agalign.capture.warped_pair import WarpedPair, result_of_windows
-from agalign.fit.adjustment import WindowFit, fit_in_rounds
+from agalign.fit.window_fit import WindowFit, fit_in_rounds
 from agalign.values import geometry
 from agalign.values.alignment import Alignment, Alignments, Residual
 from agalign.values.issues import CORNERS_UNKNOWN, FEW_KEYPOINTS, NO_CONTRAST, RETRIEVAL

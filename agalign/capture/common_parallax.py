@@ -7,8 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agalign.capture.warped_pair import Candidate
-from agalign.fit.adjustment import Adjustment, WindowShifts, adjust, are_of_lenses, are_on_a_line
 from agalign.fit.displacement_field import MIN_WINDOWS
+from agalign.fit.window_fit import Adjustment, WindowShifts, adjust, are_of_lenses, are_on_a_line
 from agalign.values.alignment import MIN_RETRIEVAL, Residual
 
 MIN_BANDS = 2

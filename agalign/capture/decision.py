@@ -1,6 +1,7 @@
 """Which mapping a band gets: the one place that chooses between the candidates of a capture.
 
-`Alignment.status` follows from the evidence for the mapping that is chosen. These are the candidates, in the order in
+The status follows from the evidence for the mapping that is chosen (`Alignment.status`): `aligned` without issues,
+`predicted` with issues and a standard error, else `seed_only` or `failed`. These are the candidates, in the order in
 which they are made; each replaces the one before it if its row applies.
 
 | candidate                                  | decided by          | used if                                           |

@@ -13,7 +13,7 @@ from functools import partial
 import numpy as np
 
 from agalign.errors import UnreadableFileError
-from agalign.fit.adjustment import fit_in_rounds
+from agalign.fit.window_fit import fit_in_rounds
 from agalign.fit.windows import FixedWindows
 from agalign.flight.rig import distance_px
 from agalign.pixels.band_resampling import resample_tile

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from agalign.capture.band_pair import BandPair
 from agalign.capture.by_rig import RigPrediction, observation, rig_prediction
-from agalign.fit.adjustment import fit_windows
+from agalign.fit.window_fit import fit_windows
 from agalign.flight.rig import Rig, lattice
 from agalign.values import geometry
 from agalign.values.alignment import JointResult, Residual

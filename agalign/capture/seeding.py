@@ -8,7 +8,7 @@ import numpy as np
 from agalign.capture.band_pair import BandPair, SeedMatrices
 from agalign.capture.warped_pair import WarpedPair
 from agalign.config import SeedSettings
-from agalign.fit.adjustment import fit_in_rounds
+from agalign.fit.window_fit import fit_in_rounds
 from agalign.flight.model import FlightModel
 from agalign.method.descriptor import Descriptor
 from agalign.method.match import match_seed, matching_network, starter_for_matching

@@ -25,7 +25,7 @@ from agalign.products.product import CapturePaths
 from agalign.products.report.facts import FailureGroup, PairTotals, rounded
 from agalign.products.report.pages import REPORT_FILE, pages_exist, write_pages
 from agalign.products.run.record import read_run_record
-from agalign.products.sidecar.file import read_result
+from agalign.products.sidecar.file import read_without_tables
 from agalign.products.sidecar.schema import BandResult
 from agalign.values.capture import Capture
 from agalign.values.text import counted, escape_controls
@@ -135,7 +135,7 @@ class RunTotals:
         for capture in (one for one in captures if one.label in added):
             path = CapturePaths.of(capture, out).sidecar
             with suppress(SidecarError):
-                result = read_result(path)
+                result = read_without_tables(path)
                 if outputs_exist(path, result.files):
                     self.pairs.add(capture.label, result)
 

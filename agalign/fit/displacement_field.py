@@ -15,7 +15,7 @@ from scipy.linalg import solveh_banded
 from scipy.sparse import diags, identity, kron, vstack
 from scipy.spatial import cKDTree
 
-from agalign.fit.adjustment import NODE_STEP_PX
+from agalign.fit.window_fit import NODE_STEP_PX
 from agalign.fit.windows import FixedWindows, Shifts, in_standard_errors
 from agalign.pixels.band_resampling import warped
 from agalign.pixels.structure import Field

@@ -14,9 +14,9 @@ from agalign.values import geometry, lens
 from agalign.values.capture import Band, Radiometry
 from agalign.values.choices import Interpolation
 from agalign.values.image import FloatImage, Mask, Raster, Tile
-from agalign.values.interpolation import MIN_VALID_WEIGHT, between, resample, source_positions
 from agalign.values.mapping import PixelMapping
 from agalign.values.pixel_units import SAME_PIXELS, PixelScale, Size
+from agalign.values.resampling import MIN_VALID_WEIGHT, between, resample, source_positions
 
 _MIN_SIDE_PX = 8
 """A moving image is not reduced below this, whatever the scale of the homography."""

@@ -6,7 +6,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from agalign.errors import InputError
 from agalign.values.image import Mask, Raster
-from agalign.values.interpolation import planes_of
+from agalign.values.resampling import planes_of
 
 _MIN_SIDE_PX = 48
 """Smaller images contain too few patches for learning."""

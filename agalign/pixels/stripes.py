@@ -18,7 +18,7 @@ from scipy.ndimage import gaussian_filter1d
 from agalign.pixels.band_resampling import shrink
 from agalign.pixels.structure import correlation_surfaces, find_peak, structure_field, windowed_spectra
 from agalign.values.image import Raster, reduced_size_px
-from agalign.values.interpolation import MIN_VALID_WEIGHT
+from agalign.values.resampling import MIN_VALID_WEIGHT
 
 _LOG = logging.getLogger(__name__)
 _Profile = NDArray[np.float64]

@@ -10,8 +10,8 @@ from typing import Any, ClassVar
 
 from agalign.config import Settings, WriteSettings
 from agalign.pixels.raster import ReadTile, read_tile
-from agalign.products.rasters.checked_raster import Block, LayerDescription, write_on_grid
-from agalign.products.rasters.layout import FlightLimits, Layer
+from agalign.products.rasters.geotiff import Block, LayerDescription, write_on_grid
+from agalign.products.rasters.output_grid import FlightLimits, Layer
 from agalign.products.report.drawing import ReducedBands, read_reduced_bands
 from agalign.products.sidecar.schema import PreviewPart, Sidecar
 from agalign.values.alignment import Alignment, Residual

@@ -17,10 +17,10 @@ from agalign.values.choices import Geometry, Interpolation, ModelFamily, PairSta
 from agalign.values.fields import RECORD, Array, Matrix3x3, Measured, Number, Number4, Number6, UpToInfinity
 from agalign.values.geometry import Matrix, Points
 from agalign.values.image import Mask
-from agalign.values.interpolation import can_hold, planes_of, resample_planes
 from agalign.values.issues import SEED_DOES_NOT_FIT, Issue, sentence
 from agalign.values.mapping import PixelMapping
 from agalign.values.pixel_units import SAME_PIXELS, PixelScale, Size
+from agalign.values.resampling import can_hold, planes_of, resample_planes
 
 COVARIANCE_DECIMALS = 9
 """Of covariances in a sidecar, px squared: a millionth of those of accurate mappings."""
@@ -273,7 +273,7 @@ class Prediction:
     off_px: Number4 | None = None
     """Root mean square distance from the band's own alignment, px of the band's own file; null if there is none."""
     covariance_px2: Annotated[NDArray[np.float64], Array((12, 12), COVARIANCE_DECIMALS)] | None = None
-    """(12, 12) of an extrapolated mapping, over the corners and the lens shapes (`fit.adjustment`), px of the
+    """(12, 12) of an extrapolated mapping, over the corners and the lens shapes (`fit.window_fit`), px of the
     reference's file; null for a rig's."""
 
 
@@ -336,7 +336,7 @@ class Alignment:
     is_seed_usable: bool = False
     """The mapping is that of the seed, which the images or the tags confirm and which fits the windows."""
     lens_std_px: NDArray[np.float64] | None = None
-    """(4,) standard deviations of the lens shapes (`fit.adjustment`) that neither tags nor a rig determine, px of the
+    """(4,) standard deviations of the lens shapes (`fit.window_fit`) that neither tags nor a rig determine, px of the
     reference; None if they are known, or contained in a prediction."""
     relief_std_px: float = 0.0
     """Spread of the relief of the flight, px of the reference, which a mapping without relief lacks where no window is

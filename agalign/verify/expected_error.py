@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from agalign.fit.adjustment import lens_shapes, lens_shift_variance_px2, variance_px2
+from agalign.fit.window_fit import lens_shapes, lens_shift_variance_px2, variance_px2
 from agalign.fit.windows import window_spacing_px
 from agalign.values import geometry
 from agalign.values.alignment import Alignment, Residual, noise_px
@@ -117,7 +117,7 @@ def error_px(
         error^2 = trace(D(x) C D(x)^T) + max(u(x)^2, variance of the parallax)
 
     C is the covariance of the corners (8, 8), or with the lens shapes (12, 12), and D the Jacobian
-    `adjustment.jacobian`. With the standard deviations `lens_std_px` (4,) of unknown lens shapes, C contains what the
+    `window_fit.jacobian`. With the standard deviations `lens_std_px` (4,) of unknown lens shapes, C contains what the
     windows leave unknown of them. `relief_std_px` is the spread of the relief that a mapping without one lacks where no
     window is near. u is the displacement that the model does not contain, by the residual shifts of the
     nearest windows beyond their noise.

@@ -19,7 +19,7 @@ from agalign.cli.align_run import RunTotals, conclude
 from agalign.cli.align_run import run as run_command
 from agalign.cli.terminal import ExitCode, Terminal
 from agalign.flight.groups import flights_of, model_names
-from agalign.products.sidecar.file import find_sidecars, read_result
+from agalign.products.sidecar.file import find_sidecars, read_without_tables
 from agalign.values.image import OutputGrid
 
 from ..conftest import Shared, read_json, save_known_model, seeded, textured_image, write_band, write_capture
@@ -97,7 +97,7 @@ def test_files_without_tags_are_compared_by_their_contents(tmp_path: Path) -> No
 
 def test_what_identifies_a_capture(flight: Path, out: Path) -> None:
     capture = agalign.discover(flight).captures[0]
-    earlier = read_result(find_sidecars(out)[0])
+    earlier = read_without_tables(find_sidecars(out)[0])
 
     def same(result: dict[str, Any], **tags: Any) -> bool | None:
         return is_same(earlier.model_copy(update=result), replace(capture, **tags))
@@ -117,23 +117,23 @@ def test_what_identifies_a_capture(flight: Path, out: Path) -> None:
     assert same({"input_samples": {}}, captured_at="", capture_id="") is None
 
 
-def test_captures_with_other_options_are_done_again_and_this_is_printed_before(
-    flight: Path, out: Path
-) -> None:
+def test_captures_with_other_options_are_done_again_and_this_is_printed_before(flight: Path, out: Path) -> None:
     first, second = find_sidecars(out)
     options = "--seed", "rig", "--only-seed", "--crop", "none", "--qa"
     planned = agalign_here(flight, "-o", out, *options, "--dry-run")
-    assert "2 captures to be rendered again; changed since: --crop, --qa; nothing was written" in " ".join(planned.stdout.split())
+    assert "2 captures to be rendered again; changed since: --crop, --qa; nothing was written" in " ".join(
+        planned.stdout.split()
+    )
     done = agalign_here(flight, "-o", out, *options)
     lines = done.stderr.splitlines()
     said = lines.index("2 finished captures to be rendered again; changed since: --crop, --qa")
     assert said < next(k for k, line in enumerate(lines) if line.startswith("[1/2]"))
-    assert read_result(first).output.crop == (0, 0, 480, 360)
+    assert read_without_tables(first).output.crop == (0, 0, 480, 360)
     again = agalign_here(flight, "-o", out, *options)
     assert "again; changed since" not in again.stderr
     assert again.stderr.count("kept from an earlier run") == 2
     text = second.read_text().replace(f'"agalign": "{agalign.__version__}"', '"agalign": "0.0.9"')
-    second.write_text(text.replace(read_result(second).estimated_with, "0"))
+    second.write_text(text.replace(read_without_tables(second).estimated_with, "0"))
     done = agalign_here(flight, "-o", out, *options)
     assert "1 finished capture to be estimated again; changed since: version (agalign 0.0.9 before)" in done.stderr
 

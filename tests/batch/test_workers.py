@@ -24,7 +24,7 @@ from agalign.cameras.discover import discover
 from agalign.config import RunOptions, Settings
 from agalign.errors import ConfigurationError, WorkerError
 from agalign.method.device import limit_threads
-from agalign.products.sidecar.file import find_sidecars, read_result
+from agalign.products.sidecar.file import find_sidecars, read_without_tables
 
 from ..conftest import raising, seeded
 from ..values.pool_tasks import WhenUnpickled, signal_self, sleep, without_memory
@@ -44,7 +44,7 @@ def test_a_dask_cluster_processes_captures(flight: Path, aligned_flight: Path, t
         processes[0].kill()
         result += reports
     assert [r.is_complete for r in result] == [True, True]
-    here, alone = ([read_result(p) for p in find_sidecars(out)] for out in (tmp_path, aligned_flight))
+    here, alone = ([read_without_tables(p) for p in find_sidecars(out)] for out in (tmp_path, aligned_flight))
     assert [[(b.homography, b.metrics) for b in r.bands] for r in here] == [
         [(b.homography, b.metrics) for b in r.bands] for r in alone
     ]

@@ -14,7 +14,7 @@ from agalign.capture.decision import by_windows, fall_back_to_seed, verified, wi
 from agalign.capture.seeding import find_seed
 from agalign.capture.warped_pair import Candidate
 from agalign.config import SeedSettings
-from agalign.fit.adjustment import lens_shapes
+from agalign.fit.window_fit import lens_shapes
 from agalign.flight.rig import Rig
 from agalign.pixels.masks import raster_of
 from agalign.values import geometry

@@ -15,7 +15,7 @@ from agalign.capture.align_bands import align_capture_bands
 from agalign.capture.full_resolution import at_full_resolution
 from agalign.config import JointSettings, Settings
 from agalign.errors import UnreadableFileError
-from agalign.fit import adjustment
+from agalign.fit import window_fit
 from agalign.flight.rig import distance_px
 from agalign.values import geometry
 from agalign.values.alignment import Alignment, Prediction, Residual, Seed
@@ -84,13 +84,13 @@ def test_the_windows_that_verify_share_no_pixel_with_those_of_the_fit(
     capture: Capture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     fitted: list[np.ndarray] = []
-    fit_windows = adjustment.fit_windows
+    fit_windows = window_fit.fit_windows
 
     def recorded(mapping: PixelMapping, residual: Residual, *rest: Any, **named: Any) -> Any:
         fitted.append(residual.centres_px)
         return fit_windows(mapping, residual, *rest, **named)
 
-    monkeypatch.setattr(adjustment, "fit_windows", recorded)
+    monkeypatch.setattr(window_fit, "fit_windows", recorded)
     residual = refined(capture, aligned_on_reduced_images()).residual
     assert len(residual.centres_px) > 50
     apart = np.abs(residual.centres_px[:, None] - np.concatenate(fitted)[None]).max(axis=-1)

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from agalign.fit.adjustment import Adjustment, WindowShifts, adjust, are_of_lenses, lens_std_px, parallax_of
+from agalign.fit.window_fit import Adjustment, WindowShifts, adjust, are_of_lenses, lens_std_px, parallax_of
 from agalign.synthetic import cameras
 from agalign.values import geometry
 from agalign.values.mapping import PixelMapping

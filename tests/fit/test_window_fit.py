@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from agalign.fit.adjustment import CALIBRATED, LENS_STD, WindowFit, fit_windows, jacobian, lens_shapes, lens_std_px
+from agalign.fit.window_fit import CALIBRATED, LENS_STD, WindowFit, fit_windows, jacobian, lens_shapes, lens_std_px
 from agalign.values import geometry
 from agalign.values.alignment import Alignment, Prediction, Residual, Seed
 from agalign.values.issues import RETRIEVAL, Issue

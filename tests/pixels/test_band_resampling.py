@@ -9,13 +9,13 @@ from hypothesis.extra.numpy import arrays
 
 from agalign.pixels.band_resampling import resample_tile, warped
 from agalign.pixels.raster import probe
-from agalign.products.rasters.layout import _largest_rectangle, common_area
+from agalign.products.rasters.output_grid import _largest_rectangle, common_area
 from agalign.values import geometry
 from agalign.values.capture import Band, Radiometry
 from agalign.values.image import Tile
-from agalign.values.interpolation import resample
 from agalign.values.mapping import PixelMapping
 from agalign.values.pixel_units import PixelScale
+from agalign.values.resampling import resample
 
 from ..builders import texture, two_views
 from ..conftest import write_band

@@ -15,13 +15,14 @@ from agalign.config import Settings, WriteSettings
 from agalign.products.indices.formulas import INDICES, Index
 from agalign.products.indices.rasters import IndexReport
 from agalign.products.product import CapturePaths, ProductContext
-from agalign.products.rasters.layout import Layer
+from agalign.products.rasters.output_grid import Layer
 from agalign.products.sidecar.schema import Sidecar
 from agalign.synthetic.cameras import REDEDGE
-from agalign.values.alignment import Alignment, Seed
+from agalign.values.alignment import Alignment, Prediction, Seed
 from agalign.values.capture import Capture
 from agalign.values.choices import PairStatus
 from agalign.values.image import OutputGrid
+from agalign.values.issues import RETRIEVAL, Issue
 from agalign.values.mapping import PixelMapping
 
 from ..conftest import Shared, read_json, seeded
@@ -37,8 +38,13 @@ def change(path: Path, **changes: object) -> None:
 
 def aligned(mapping: PixelMapping, size_px: tuple[int, int], status: PairStatus = "aligned", **facts: Any) -> Alignment:
     """The alignment of a band to a reference of `size_px` (width, height), equal to its seed."""
-    facts = {"issues": (), "seed": Seed("rig", mapping.fixed_to_moving, 30.0, 30.0, 5.0)} | facts
-    return Alignment(mapping, size_px, status, **facts)
+    prediction = Prediction(mapping.fixed_to_moving, "bands", 0.4) if status == "predicted" else None
+    issues = () if status == "aligned" else (Issue(RETRIEVAL, 0.1, 0.2),)
+    evidence = {"issues": issues, "prediction": prediction, "is_seed_usable": status == "seed_only"}
+    facts = {**evidence, "seed": Seed("rig", mapping.fixed_to_moving, 30.0, 30.0, 5.0)} | facts
+    result = Alignment(mapping, size_px, **facts)
+    assert result.status == status
+    return result
 
 
 def context_of(

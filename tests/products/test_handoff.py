@@ -15,7 +15,7 @@ import agalign
 from agalign.cameras.pix4d import vignetting_on_grid
 from agalign.products.exports.programs import export
 from agalign.products.rasters import aligned_files
-from agalign.products.rasters.layout import Layer
+from agalign.products.rasters.output_grid import Layer
 from agalign.products.sidecar.file import find_sidecars, read_sidecar
 from agalign.synthetic.cameras import CameraSpec
 from agalign.values import geometry

@@ -13,9 +13,9 @@ import agalign
 from agalign.products.indices.formulas import index_named, index_of_formula
 from agalign.products.indices.rasters import write_rasters
 from agalign.products.rasters.alignment_maps import _flags, error_lattice_px, error_on_tile
-from agalign.products.rasters.layout import Layer
+from agalign.products.rasters.output_grid import Layer
 from agalign.products.run.captures import bands_of
-from agalign.products.sidecar.file import read_result
+from agalign.products.sidecar.file import read_without_tables
 from agalign.values import geometry, lens
 from agalign.values.capture import Band
 from agalign.values.choices import UNUSABLE_QUALITY, Quality
@@ -112,7 +112,7 @@ def sidecar(flight: Path, shared: Shared, tmp_path: Path) -> Path:
 @pytest.mark.slow
 def test_a_run_writes_flags_with_their_meaning_for_every_band_of_the_stack(sidecar: Path) -> None:
     path = sidecar.with_suffix(".qa.tif")
-    assert [p.file for p in read_result(sidecar).products if p.kind == "qa"] == [path.name]
+    assert [p.file for p in read_without_tables(sidecar).products if p.kind == "qa"] == [path.name]
     with rasterio.open(path) as raster, rasterio.open(sidecar.with_suffix(".tif")) as stack:
         assert raster.descriptions == ("all bands", *stack.descriptions)
         assert raster.shape == stack.shape
@@ -129,7 +129,7 @@ def test_a_run_writes_flags_with_their_meaning_for_every_band_of_the_stack(sidec
 
 @pytest.mark.slow
 def test_indices_omit_pixels_flagged_in_their_own_bands(sidecar: Path, tmp_path: Path) -> None:
-    result, path = read_result(sidecar), sidecar.with_suffix(".qa.tif")
+    result, path = read_without_tables(sidecar), sidecar.with_suffix(".qa.tif")
     plain, masked = (
         [replace(b, problem="") for b in bands_of(result, sidecar.parent, mask_qa=mask_qa)] for mask_qa in (False, True)
     )

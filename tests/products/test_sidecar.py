@@ -19,8 +19,8 @@ from agalign.errors import InputError, OutputError, SidecarError
 from agalign.products.sidecar.file import (
     content_checksum,
     find_sidecars,
-    read_result,
     read_sidecar,
+    read_without_tables,
     verify_outputs,
     write_sidecar,
 )
@@ -150,7 +150,7 @@ def test_the_reference_is_one_of_the_bands(tmp_path: Path) -> None:
     write_sidecar(path, example())
     data = read_json(path)
     path.write_text(json.dumps(data | {"reference": data["reference"] | {"band": "Ghost"}}))
-    for read in (read_sidecar, read_result):
+    for read in (read_sidecar, read_without_tables):
         with pytest.raises(SidecarError, match=r"a\.json: bands: none of them is the reference band 'Ghost'"):
             read(path)
 

@@ -13,8 +13,8 @@ from agalign.config import WriteSettings
 from agalign.errors import OutputError
 from agalign.flight.rig import CaptureFactors, Rig
 from agalign.products.rasters.aligned_files import write_raster
-from agalign.products.rasters.checked_raster import Block, LayerDescription, write_on_grid
-from agalign.products.rasters.layout import Layer, common_grid, flight_limits, output_layers
+from agalign.products.rasters.geotiff import Block, LayerDescription, write_on_grid
+from agalign.products.rasters.output_grid import Layer, common_grid, flight_limits, output_layers
 from agalign.values import geometry
 from agalign.values.capture import Band, CameraIdentity, Capture, Georeference
 from agalign.values.image import OutputGrid

@@ -24,7 +24,7 @@ from agalign.errors import AgalignError, SidecarError
 from agalign.pixels.raster import probe
 from agalign.products.run.excluded import read_excluded
 from agalign.products.run.record import read_run_record
-from agalign.products.sidecar.file import read_result, read_sidecar
+from agalign.products.sidecar.file import read_sidecar, read_without_tables
 from agalign.values.capture import Band
 from agalign.values.files import RUN_FILE
 from agalign.values.image import OutputGrid
@@ -138,7 +138,7 @@ def test_any_json(tmp_path: Path, data: object, raw: bytes | None) -> None:
     contents = json.dumps(data).encode() if raw is None else raw
     for name, read, given_path in (
         ("a.json", read_sidecar, tmp_path / "a.json"),
-        ("a.json", read_result, tmp_path / "a.json"),
+        ("a.json", read_without_tables, tmp_path / "a.json"),
         ("panels.json", read_excluded, tmp_path),
         (RUN_FILE, read_run_record, tmp_path),
     ):

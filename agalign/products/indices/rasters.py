@@ -25,7 +25,7 @@ from agalign.pixels.raster import OpenRaster, open_raster
 from agalign.products.indices.formulas import Index, bands_for, compute, index_named, index_of_formula, role_of_band
 from agalign.products.product import CapturePaths, Product, ProductContext, WrittenFile
 from agalign.products.rasters.aligned_files import tags_of, to_cog
-from agalign.products.rasters.checked_raster import (
+from agalign.products.rasters.geotiff import (
     FLOAT_OPTIONS,
     LayerDescription,
     check_complete,
@@ -38,8 +38,8 @@ from agalign.products.sidecar.schema import Sidecar
 from agalign.values.capture import Band, Capture
 from agalign.values.files import read_regular, write_csv
 from agalign.values.image import Tile, reduced_size_px
-from agalign.values.interpolation import tiles
 from agalign.values.memory import WORK_TILE_PX
+from agalign.values.resampling import tiles
 from agalign.values.text import without_formula
 
 _STATISTICS_TAG = "INDEX_STATISTICS"

@@ -30,15 +30,15 @@ from agalign.pixels.radiometry import calibrated
 from agalign.pixels.raster import GDAL_ENVIRONMENT, open_raster, suffix_format, without_warnings
 from agalign.products.indices.formulas import Role, role_of_band
 from agalign.products.product import CapturePaths, Product, ProductContext, WrittenFile
-from agalign.products.rasters.checked_raster import Block, LayerDescription, compressed, write_on_grid
-from agalign.products.rasters.layout import Layer, is_inside
+from agalign.products.rasters.geotiff import Block, LayerDescription, compressed, write_on_grid
+from agalign.products.rasters.output_grid import Layer, is_inside
 from agalign.values import geometry
 from agalign.values.capture import Band, Capture, Quantity, Radiometry
 from agalign.values.choices import Compression, Interpolation
 from agalign.values.files import file_name
 from agalign.values.image import Mask, OutputGrid, Tile
-from agalign.values.interpolation import as_type, can_hold, tiles
 from agalign.values.memory import WORK_TILE_PX
+from agalign.values.resampling import as_type, can_hold, tiles
 
 _MAX_VIGNETTING_ERROR = 0.01
 """Limit for the tags of aligned files, p95 of corrected pixels: a fifth of the accuracy of the cameras' calibration."""

@@ -12,19 +12,19 @@ from agalign.cameras import rig_seed
 from agalign.cameras.pix4d import rig_unit_m
 from agalign.errors import GeometryError
 from agalign.products.product import Product, ProductContext, WrittenFile
-from agalign.products.rasters.checked_raster import LayerDescription, compressed
-from agalign.products.rasters.layout import Layer, is_inside
+from agalign.products.rasters.geotiff import LayerDescription, compressed
+from agalign.products.rasters.output_grid import Layer, is_inside
 from agalign.values import geometry, lens
 from agalign.values.alignment import Alignment
 from agalign.values.capture import Band, Capture
 from agalign.values.choices import QUALITY_MEANINGS, Quality
 from agalign.values.geometry import Matrix, Points
 from agalign.values.image import Mask, OutputGrid, Tile
-from agalign.values.interpolation import source_positions, tiles
 from agalign.values.lens import Lens
 from agalign.values.mapping import PixelMapping
 from agalign.values.memory import WORK_TILE_PX
 from agalign.values.parallax import Relief, rounded
+from agalign.values.resampling import source_positions, tiles
 from agalign.verify.expected_error import expected_error_px
 
 _LATTICE_PX = 16

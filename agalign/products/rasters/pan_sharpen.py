@@ -24,12 +24,12 @@ from agalign.pixels.masks import data_mask
 from agalign.pixels.raster import OpenRaster, open_raster
 from agalign.products.product import Product, ProductContext, WrittenFile
 from agalign.products.rasters.aligned_files import with_nodata, write_raster
-from agalign.products.rasters.checked_raster import Block, LayerDescription, compressed
-from agalign.products.rasters.layout import common_grid, output_layers
+from agalign.products.rasters.geotiff import Block, LayerDescription, compressed
+from agalign.products.rasters.output_grid import common_grid, output_layers
 from agalign.values.capture import Band, Capture
 from agalign.values.files import scratch_file
 from agalign.values.image import FloatImage, Mask, Tile
-from agalign.values.interpolation import as_type, tiles
+from agalign.values.resampling import as_type, tiles
 
 _TILE_PX = 1024
 """Side of the tiles that are sharpened one after another, which limits the memory, and of the square in the middle of

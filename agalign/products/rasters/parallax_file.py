@@ -9,7 +9,7 @@ import numpy as np
 
 from agalign.errors import SidecarError
 from agalign.pixels.raster import open_raster
-from agalign.products.rasters.checked_raster import LayerDescription, compressed, write_on_grid
+from agalign.products.rasters.geotiff import LayerDescription, compressed, write_on_grid
 from agalign.products.sidecar.schema import Sidecar
 from agalign.values.capture import Georeference
 from agalign.values.image import OutputGrid

@@ -10,7 +10,7 @@ from typing import Any
 from pydantic import ValidationError
 
 from agalign.errors import InputError, SidecarError
-from agalign.products.sidecar.schema import SCHEMA, FilePart, Sidecar, from_version_1
+from agalign.products.sidecar.schema import SCHEMA, FilePart, Sidecar
 from agalign.values.files import compact_lists, file_checksum, open_regular, read_regular, write_text
 
 _MAX_BYTES = 1 << 26
@@ -75,7 +75,35 @@ def read_sidecar(path: Path) -> Sidecar:
         raise SidecarError(f"{path}: {_problem(error)}") from None
 
 
-def read_result(path: Path) -> Sidecar:
+def from_version_1(facts: dict[str, Any]) -> dict[str, Any]:
+    """Return the JSON of a sidecar of schema version 1 as one of this version: fields have other names and places.
+
+    The captures of such a file are estimated again when they are aligned again.
+    """
+    for band in facts.get("bands", []):
+        band["issues"] = [{"detail": "", **issue} for issue in band.pop("doubts", [])]
+        band.pop("levels", None)
+        if seed := band.get("seed"):
+            seed.setdefault("score", seed["peak_sigma"])
+        if joint := band.get("joint"):
+            joint.setdefault("fixed_to_moving", band["homography"]["fixed_to_moving"])
+            for name in ("accepted", "corner_std_px"):
+                joint.pop(name, None)
+        if prediction := band.get("prediction"):
+            prediction.setdefault("fixed_to_moving", band["homography"]["fixed_to_moving"])
+        if metrics := band.get("metrics"):
+            tiles = metrics.pop("tiles", [])
+            columns = {"centres_px": "centre_px", "shifts_px": "shift_px", "peaks_sigma": "peak_sigma", "cells": "cell"}
+            if all(tile.get("cell") for tile in tiles):
+                metrics["windows"] = {new: [tile[old] for tile in tiles] for new, old in columns.items()}
+    if output := facts.get("output"):
+        for name in ("bytes", "band_files"):
+            output.pop(name, None)
+    facts.pop("settings", None)
+    return facts | {"schema": SCHEMA, "estimated_with": "", "products": facts.get("products", [])}
+
+
+def read_without_tables(path: Path) -> Sidecar:
     """Return a sidecar without its long tables: those of a season would not fit into memory. Raises SidecarError."""
     return read_sidecar(path).without_tables()
 

@@ -113,7 +113,7 @@ class MetricsPart(_Part):
     after: Similarity
     """Bands as written."""
     windows: Residual | None = None
-    """Windows that took no part in the estimation, under the mapping; with recipe `windows`, those left out of the fit.
+    """Shifts of windows that took no part in the estimation, under the mapping; with recipe `windows`, those left out of the fit.
     """
 
 
@@ -559,31 +559,3 @@ def capture_status(bands: Iterable[BandResult], accept_predicted_px: float) -> C
     if all(b.is_usable(accept_predicted_px) for b in moving):
         return "ok"
     return "failed" if all(b.status == "failed" for b in moving) else "degraded"
-
-
-def from_version_1(facts: dict[str, Any]) -> dict[str, Any]:
-    """Return the JSON of a sidecar of schema version 1 as one of this version: fields have other names and places.
-
-    The captures of such a file are estimated again when they are aligned again.
-    """
-    for band in facts.get("bands", []):
-        band["issues"] = [{"detail": "", **issue} for issue in band.pop("doubts", [])]
-        band.pop("levels", None)
-        if seed := band.get("seed"):
-            seed.setdefault("score", seed["peak_sigma"])
-        if joint := band.get("joint"):
-            joint.setdefault("fixed_to_moving", band["homography"]["fixed_to_moving"])
-            for name in ("accepted", "corner_std_px"):
-                joint.pop(name, None)
-        if prediction := band.get("prediction"):
-            prediction.setdefault("fixed_to_moving", band["homography"]["fixed_to_moving"])
-        if metrics := band.get("metrics"):
-            tiles = metrics.pop("tiles", [])
-            columns = {"centres_px": "centre_px", "shifts_px": "shift_px", "peaks_sigma": "peak_sigma", "cells": "cell"}
-            if all(tile.get("cell") for tile in tiles):
-                metrics["windows"] = {new: [tile[old] for tile in tiles] for new, old in columns.items()}
-    if output := facts.get("output"):
-        for name in ("bytes", "band_files"):
-            output.pop(name, None)
-    facts.pop("settings", None)
-    return facts | {"schema": SCHEMA, "estimated_with": "", "products": facts.get("products", [])}

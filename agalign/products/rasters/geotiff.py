@@ -1,4 +1,7 @@
-"""GeoTIFFs that never appear incomplete: each finished file is read back and compared with what was written."""
+"""Writing GeoTIFFs: their profile, compression and metadata.
+
+A file never appears incomplete: each finished one is read back and compared with what was written.
+"""
 
 import errno
 import math

@@ -1,4 +1,4 @@
-"""Interpolation of arrays at fractional positions, tile by tile."""
+"""Resampling of arrays at fractional positions by an interpolation kernel, tile by tile."""
 
 from collections.abc import Iterator
 
