@@ -11,7 +11,7 @@ from agalign.pixels.raster import ReadTile, read_tile
 from agalign.products.product import CapturePaths
 from agalign.products.rasters.alignment_maps import relief_of
 from agalign.products.rasters.parallax_file import PARALLAX_KIND, PARALLAX_SUFFIX, write_parallax
-from agalign.products.sidecar.file import file_part, write_sidecar
+from agalign.products.sidecar.file import file_part, read_sidecar, write_sidecar
 from agalign.products.sidecar.schema import Sidecar
 from agalign.values.alignment import Alignment
 from agalign.values.capture import Capture
@@ -26,8 +26,8 @@ def estimate(
     earlier: Sidecar | None = None,
     read: ReadTile = read_tile,
 ) -> tuple[Sidecar, dict[str, Alignment]]:
-    """Align the bands of a capture; write its sidecar, and its parallax if it has a relief; return the sidecar and the
-    alignments.
+    """Align the bands of a capture; write its sidecar, and its parallax if it has a relief; return the sidecar as it was
+    written, and the alignments.
 
     It lists the products of the `earlier` sidecar, which describe another estimate, until they are rendered again.
     `read` reads the pixels of the files. Raises UnreadableFileError if the reference cannot be read, and OutputError.
@@ -45,8 +45,9 @@ def estimate(
         options = {key: stage for key, stage in (result.options or {}).items() if key != "write"}
         options |= {key: stage for key, stage in (earlier.options or {}).items() if key == "write"}
         result = result.model_copy(update={"products": earlier.products, "options": options})
-    result = write_sidecar(paths.sidecar, result)
+    write_sidecar(paths.sidecar, result)
     if relief is None:
         with suppress(OSError):
             path.unlink(missing_ok=True)
-    return result, alignments
+    # With the decimals of the file: a later command renders the same bytes.
+    return read_sidecar(paths.sidecar), alignments
