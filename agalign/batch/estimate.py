@@ -26,8 +26,9 @@ def estimate(
     earlier: Sidecar | None = None,
     read: ReadTile = read_tile,
 ) -> tuple[Sidecar, dict[str, Alignment]]:
-    """Align the bands of a capture; write its sidecar, and its parallax if it has a relief; return the sidecar as it was
-    written, and the alignments.
+    """Align the bands of a capture; write its sidecar, and its parallax if it has a relief.
+
+    Returns the sidecar as it was written, and the alignments.
 
     It lists the products of the `earlier` sidecar, which describe another estimate, until they are rendered again.
     `read` reads the pixels of the files. Raises UnreadableFileError if the reference cannot be read, and OutputError.

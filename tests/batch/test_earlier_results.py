@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 import agalign
-from agalign.batch.earlier_results import is_same
+from agalign.batch.earlier_results import Remaining, is_same, remaining
 from agalign.batch.run import Listener, _crops_of_cameras, plan_run, run_flight
 from agalign.cli.align_run import RunTotals, conclude
 from agalign.cli.align_run import run as run_command
@@ -136,6 +136,30 @@ def test_captures_with_other_options_are_done_again_and_this_is_printed_before(f
     second.write_text(text.replace(read_without_tables(second).estimated_with, "0"))
     done = agalign_here(flight, "-o", out, *options)
     assert "1 finished capture to be estimated again; changed since: version (agalign 0.0.9 before)" in done.stderr
+
+
+def test_a_result_of_schema_version_1_is_estimated_again(flight: Path, out: Path) -> None:
+    first, second = find_sidecars(out)
+    content = read_json(first)
+    for name in ("estimated_with", "rendered_with", "parallax", "footprint", "footprint_accuracy_m", "pose"):
+        content.pop(name)
+    for band in content["bands"]:
+        band["doubts"] = band.pop("issues")
+        for name in ("lens_std_px", "relief_std_px"):
+            band.pop(name)
+        if band["metrics"] is not None:
+            assert band["metrics"].pop("windows") is not None
+            band["metrics"]["tiles"] = []
+    first.write_text(json.dumps({**content, "schema": "agalign/1", "settings": "0"}))
+    left = {path: remaining_of(flight, path, out) for path in (first, second)}
+    assert [one.step for one in left.values()] == ["estimate", "nothing"]
+    agalign.align_folder(flight, out, settings=SEEDS)
+    assert read_json(first)["schema"] == "agalign/2"
+
+
+def remaining_of(flight: Path, sidecar: Path, out: Path) -> Remaining:
+    (capture,) = (c for c in agalign.discover(flight).captures if c.name == sidecar.stem)
+    return remaining(capture, out, SEEDS, agalign.RunOptions())
 
 
 def test_a_flight_that_grows_needs_no_option(flight: Path, tmp_path: Path) -> None:

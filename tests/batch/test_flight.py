@@ -19,7 +19,7 @@ from agalign.batch.run import _crops_of_cameras, plan_run, run_flight
 from agalign.cameras.discover import FolderScan
 from agalign.config import RunOptions
 from agalign.flight.fingerprint import learning_fingerprint
-from agalign.flight.groups import camera_key, flight_camera, flights_of, model_names
+from agalign.flight.groups import camera_key, flights_of, model_names
 from agalign.flight.model import FlightModel, load_model, save_model
 from agalign.flight.rig import MIN_CAPTURES
 from agalign.flight.rig_file import read_rig
@@ -192,11 +192,10 @@ def test_radiometry_that_no_capture_has_tags_for_is_refused(flight: Path, tmp_pa
 
 def test_a_model_is_learned_again_if_its_input_changed(flight: Path) -> None:
     captures = agalign.discover(flight).captures
-    camera = flight_camera(captures)
-    before = learning_fingerprint(camera, captures, SETTINGS)
-    assert learning_fingerprint(camera, agalign.discover(flight).captures, SETTINGS) == before
+    before = learning_fingerprint(captures, SETTINGS)
+    assert learning_fingerprint(agalign.discover(flight).captures, SETTINGS) == before
     elsewhere = agalign.Settings(flight=agalign.FlightSettings(start_model="another network"))
-    others = (camera, captures[:1], SETTINGS), (camera, captures, elsewhere), ("Another", captures, SETTINGS)
+    others = (captures[:1], SETTINGS), (captures, elsewhere)
     assert before not in [learning_fingerprint(*other) for other in others]
 
 

@@ -135,7 +135,7 @@ def test_a_band_that_is_not_delivered_or_does_not_see_infra_red_sharpens_none(
     other = Band(pan, tmp_path / "pan.tif", 1, *size_px, "uint16", is_from_photograph=pan == "RGB Red")
     for path in (one.path, other.path):
         write_band(path, np.full((48, 64), 500, np.uint16))
-    prediction = Prediction(np.eye(3), "flight", std_px)
+    prediction = None if status == "seed_only" else Prediction(np.eye(3), "flight", std_px)
     context = context_of(
         capture_of(one, other), {pan: aligned(identity, size_px, status, prediction=prediction)}, tmp_path
     )

@@ -155,6 +155,72 @@ def test_the_reference_is_one_of_the_bands(tmp_path: Path) -> None:
             read(path)
 
 
+VERSION_1 = """{
+ "schema": "agalign/1", "agalign": "0.9", "capture": "IMG_1", "capture_id": "x", "flight_id": "", "captured_at": "",
+ "position": null, "camera": {"make": "", "model": "", "serial": ""}, "status": "degraded", "missing_bands": [],
+ "reference": {"band": "Green", "file": "g.tif", "band_index": 1, "width": 64, "height": 48},
+ "bands": [
+  {"band": "Green", "wavelength_nm": 560, "file": "g.tif", "band_index": 1, "status": "reference", "reason": null,
+   "doubts": [], "place": {"file": "IMG_1.tif", "band_index": 1}, "seconds": 0, "saturated": 0, "levels": [[0.5]]},
+  {"band": "NIR", "wavelength_nm": 842, "file": "n.tif", "band_index": 1, "status": "predicted", "reason": "few",
+   "doubts": [{"kind": "few_windows", "value": 3, "limit": 4}],
+   "homography": {"fixed_to_moving": [[1, 0, 3], [0, 1, 4], [0, 0, 1]], "space": "pixel"},
+   "seed": {"kind": "rig", "fixed_to_moving": [[1, 0, 3], [0, 1, 4.5], [0, 0, 1]], "peak_sigma": 30.5,
+            "runner_up_sigma": 5},
+   "joint": {"accepted": false, "loss": null, "retrieval": 0.5, "chance": 0.01, "iterations": 0, "levels": [1],
+             "recipe": "flight", "model_family": "homography", "last_step_px": 0.01, "corner_std_px": 0.5,
+             "corner_std_xy_px": [[0.3, 0.4], [0.3, 0.4], [0.3, 0.4], [0.3, 0.4]]},
+   "metrics": {"before": {"ncc": null}, "after": {"ncc": 0.5, "residual_px": 0.25}, "tiles": [
+     {"centre_px": [20, 20], "shift_px": [0.3, 0.4], "peak_sigma": 12, "cell": [0, 1]},
+     {"centre_px": [40, 20], "shift_px": [null, null], "peak_sigma": null, "cell": [1, 1]}]},
+   "geometry": {"kind": "homography", "held_out_p95_px": {"homography": 0.5}},
+   "prediction": {"from": "bands", "std_px": 0.7, "off_px": null},
+   "place": {"file": "IMG_1.tif", "band_index": 2}, "seconds": 1.5, "saturated": 0.1, "lenses": null, "field": null,
+   "grid": {"reference_px": [[0, 0]], "moving_px": [[3, 4]]}, "relief": null, "size_px": [64, 48], "levels": []}
+ ],
+ "output": {"file": "IMG_1.tif", "bytes": 9, "band_files": [{"file": "n.tif", "bytes": 1, "nodata": 0}],
+            "radiometry": null, "crop": [0, 0, 64, 48], "scale": [1, 1], "nodata": 0},
+ "preview": null, "accept_predicted_px": 1.0,
+ "products": [{"kind": "stack", "file": "IMG_1.tif", "bytes": 9, "sha256": "0"}], "not_written": [],
+ "settings": "0123456789abcdef", "options": {"write": {"qa": true}}, "input_samples": {}, "seconds": 3, "checksum": "0"
+}"""
+
+
+def test_a_sidecar_of_version_1_is_read(tmp_path: Path) -> None:
+    """Commands on finished runs read it; a run estimates the capture again."""
+    path = tmp_path / "IMG_1.json"
+    path.write_text(VERSION_1)
+    sidecar, alignment = read_sidecar(path), agalign.read_alignment(path, "NIR")
+    assert (sidecar.schema_, sidecar.estimated_with, sidecar.rendered_with) == ("agalign/2", "", "")
+    assert [(part.kind, part.file) for part in sidecar.products] == [("stack", "IMG_1.tif")]
+    assert (sidecar.output.crop, sidecar.output.nodata) == ((0, 0, 64, 48), 0)
+    assert sidecar.pairs == [("NIR", "predicted", "few")]
+    np.testing.assert_array_equal(alignment.map([10, 10]), [13, 14])
+    assert [(issue.code, issue.value, issue.limit) for issue in alignment.issues] == [("few_windows", 3, 4)]
+    assert (alignment.status, alignment.prediction.source, alignment.prediction.std_px) == ("predicted", "bands", 0.7)
+    assert (alignment.seed.kind, alignment.seed.peak_sigma, alignment.seed.fixed_to_moving[1][2]) == ("rig", 30.5, 4.5)
+    assert alignment.joint.corner_std_px == pytest.approx(0.5)
+    assert (alignment.residual.median_px, alignment.residual.coverage) == (pytest.approx(0.5), 0.5)
+    np.testing.assert_array_equal(alignment.residual.cells, [[0, 1], [1, 1]])
+    assert (alignment.after.ncc, math.isnan(alignment.before.ncc)) == (0.5, True)
+    # It is written as this version.
+    write_sidecar(tmp_path / "b.json", sidecar)
+    again = read_sidecar(tmp_path / "b.json")
+    assert read_json(tmp_path / "b.json")["schema"] == "agalign/2"
+    assert again.bands[1].model_dump_json() == sidecar.bands[1].model_dump_json()
+
+
+def test_a_relief_of_version_1_is_not_read_as_a_plane(tmp_path: Path) -> None:
+    """Its raster has the parallax on the grid of the stack alone."""
+    content, points = json.loads(VERSION_1), [[0, 0]]
+    content["bands"][1]["relief"] = {"file": "IMG_1.relief.tif", "baseline": [1, 0], "occluded": 0.1, "slope": points}
+    content["bands"][1]["relief"] |= {"reference_px": points, "plane_px": points, "curvature": points}
+    (tmp_path / "a.json").write_text(json.dumps(content))
+    assert read_sidecar(tmp_path / "a.json").bands[1].relief.file == "IMG_1.relief.tif"
+    with pytest.raises(SidecarError, match="its parallax was not written; run again with --overwrite"):
+        agalign.read_alignment(tmp_path / "a.json", "NIR")
+
+
 @pytest.mark.parametrize("name", ["../a.tif", "/vsicurl/http://example.org/a.tif", "C:/a.tif"])
 def test_a_sidecar_names_no_file_elsewhere(tmp_path: Path, name: str) -> None:
     path = tmp_path / "a.json"

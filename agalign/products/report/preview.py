@@ -109,7 +109,7 @@ def write_preview(
         return max(min_tile_px, int(tile_px * 0.97 * (max_bytes / size_bytes) ** 0.5))
 
     first = next(images[name] for name in bands for images in (views.after, views.before) if name in images)
-    size_px = round(views.size_px[0] * tile_px / longest_px), round(views.size_px[1] * tile_px / longest_px)
+    size_px = reduced_size_px(views.size_px, longest_px / tile_px)
     of_tile = len(encoded(_resized(first, size_px), path, cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY))
     if 2 * len(bands) * of_tile > max_bytes:
         tile_px = smaller_px(2 * len(bands) * of_tile)

@@ -113,7 +113,8 @@ class MetricsPart(_Part):
     after: Similarity
     """Bands as written."""
     windows: Residual | None = None
-    """Shifts of windows that took no part in the estimation, under the mapping; with recipe `windows`, those left out of the fit.
+    """Shifts of windows that took no part in the estimation, under the mapping; with recipe `windows`, of windows left
+    out of the fit.
     """
 
 

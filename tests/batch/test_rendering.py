@@ -1,0 +1,318 @@
+"""What is rendered again without estimating: changed options, lost files, and a run that was killed in between."""
+
+import re
+import shutil
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import rasterio
+
+import agalign
+from agalign.batch import capture_task, estimate
+from agalign.batch.run import plan_run
+from agalign.products.sidecar.file import find_sidecars, read_sidecar, verify_outputs
+from agalign.values.alignment import Alignment
+from agalign.values.mapping import DisplacementField
+
+from ..builders import joint_result, residual_of
+from ..conftest import raising, read_json, seeded
+from ..products.conftest import table_in
+from ..products.test_relief_map import SIZE, Run
+from ..program import agalign_here
+
+pytestmark = pytest.mark.slow
+
+THREE = agalign.DiscoverOptions(bands=("Green", "Red", "NIR"))
+SEEDS = seeded("rig")
+OTHER = {
+    "radiometry": "sun",
+    "interpolation": "bilinear",
+    "crop": "none",
+    "layout": "both",
+    "format": "cog",
+    "qa": True,
+    "error_map": True,
+    "tie_points": True,
+}
+
+
+@pytest.fixture
+def without_estimating(monkeypatch: pytest.MonkeyPatch) -> Callable[[], None]:
+    """From its call on, a capture that is estimated is an error."""
+    error = raising(AssertionError("estimated again"))
+    return lambda: monkeypatch.setattr(estimate, "align_capture_bands", error)
+
+
+def files_of(out: Path) -> dict[str, bytes | str]:
+    """The bytes of the files of the captures below a folder; the checksums of their sidecars, without times."""
+    sidecars = find_sidecars(out)
+    paths = (p for folder in {s.parent for s in sidecars} for p in folder.iterdir())
+    return {
+        p.relative_to(out).as_posix(): read_json(p)["checksum"] if p in sidecars else p.read_bytes()
+        for p in paths
+        if p.is_file()
+    }
+
+
+def assert_same_files(out: Path, expected: Path) -> None:
+    one, other = files_of(out), files_of(expected)
+    assert sorted(one) == sorted(other)
+    assert [name for name in one if one[name] != other[name]] == []
+    assert all(problems == [] for _, problems in verify_outputs(out))
+
+
+def test_other_options_render_the_bytes_of_a_direct_run(
+    flight: Path, tmp_path: Path, without_estimating: Callable[[], None]
+) -> None:
+    settings = agalign.Settings(relief=agalign.ReliefSettings(use=False))
+    others = settings.model_copy(update={"write": agalign.WriteSettings.model_validate(OTHER)})
+    out, direct = tmp_path / "out", tmp_path / "direct"
+    agalign.align_folder(flight, direct, settings=others, options=THREE)
+    agalign.align_folder(flight, out, settings=settings, options=THREE)
+    before = files_of(out)
+    without_estimating()
+    reports = agalign.align_folder(flight, out, settings=others, options=THREE)
+    assert [(r.state, r.error, r.removed) for r in reports] == [("done", None, ())] * 2
+    assert_same_files(out, direct)
+    assert all(before[name] != data for name, data in files_of(direct).items() if name in before)
+    again = agalign.align_folder(flight, out, settings=others, options=THREE)
+    assert [r.state for r in again] == ["kept"] * 2
+
+
+def with_field(run: Run) -> dict[str, Alignment]:
+    """Alignments with a displacement field and numbers of many digits, which a sidecar rounds."""
+    rng = np.random.default_rng(0)
+    result = {}
+    for name, alignment in run.alignments.items():
+        field = DisplacementField(48.0, rng.normal(0, 1, (6, 7, 2)))
+        centres_px = rng.uniform((0, 0), SIZE, (30, 2))
+        result[name] = replace(
+            alignment,
+            mapping=replace(alignment.mapping, parallax=None, field=field),
+            residual=residual_of(centres_px, rng.normal(0, 0.1, (30, 2)), sigma=17.123456),
+            joint=joint_result(std_px=0.0512345678, covariance=np.diag(rng.uniform(0, 0.01, 8))),
+            lens_std_px=rng.uniform(0, 0.1, 4),
+        )
+    return result
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Run:
+    return Run(tmp_path_factory.mktemp("relief"))
+
+
+def alignments_of(run: Run, kind: str) -> dict[str, Alignment]:
+    if kind == "field":
+        return with_field(run)
+    rng = np.random.default_rng(1)
+    hill = run.on_hill(decimals=6 if kind == "relief" else 2)
+    joint = joint_result(std_px=0.0512345678)
+    return {n: replace(a, joint=joint, lens_std_px=rng.uniform(0, 0.1, 4)) for n, a in hill.items()}
+
+
+@pytest.mark.parametrize("kind", ["field", "relief"])
+@pytest.mark.parametrize("crop", ["none", "common"])
+def test_relief_and_field_are_rendered_on_another_grid(
+    run: Run,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    without_estimating: Callable[[], None],
+    kind: str,
+    crop: str,
+) -> None:
+    """The parallax is known outside of the rasters that the first run wrote."""
+    folder, out, direct = run.capture.reference.path.parents[2], tmp_path / "out", tmp_path / "direct"
+    alignments = alignments_of(run, kind)
+    monkeypatch.setattr(estimate, "align_capture_bands", lambda *_: alignments)
+    settings = seeded(crop="none" if crop == "common" else "common")
+    others = seeded(**(OTHER | {"crop": crop, "relief_map": True, "fill_occluded": True, "undistort": True}))
+    (first,) = agalign.align_folder(folder, out, settings=settings)
+    assert (first.state, first.error, first.path.with_suffix(".parallax.tif").exists()) == (
+        "done",
+        None,
+        kind == "relief",
+    )
+    agalign.align_folder(folder, direct, settings=others)
+    without_estimating()
+    (report,) = agalign.align_folder(folder, out, settings=others)
+    assert (report.state, report.error) == ("done", None)
+    assert report.result.output.crop != first.result.output.crop
+    assert_same_files(out, direct)
+
+
+@pytest.fixture
+def out(flight: Path, tmp_path: Path) -> Path:
+    agalign.align_folder(flight, tmp_path / "out", settings=SEEDS)
+    return tmp_path / "out"
+
+
+def test_a_deleted_stack_is_rendered_from_its_sidecar(
+    flight: Path, out: Path, without_estimating: Callable[[], None]
+) -> None:
+    before, stack = files_of(out), out / "0000SET" / "000" / "IMG_0002.tif"
+    stack.unlink()
+    without_estimating()
+    plan = plan_run(agalign.discover(flight), out, SEEDS)
+    assert list(plan.values()) == [
+        "kept from an earlier run",
+        "to be rendered again; changed since: files that are missing",
+    ]
+    reports = agalign.align_folder(flight, out, settings=SEEDS)
+    assert [(r.state, r.error) for r in reports] == [("kept", None), ("done", None)]
+    assert files_of(out) == before
+
+
+def test_a_deleted_parallax_is_estimated_again(run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    folder, calls = run.capture.reference.path.parents[2], []
+
+    def align(*_: object) -> dict[str, Alignment]:
+        calls.append(1)
+        return run.on_hill()
+
+    monkeypatch.setattr(estimate, "align_capture_bands", align)
+    for _ in range(2):
+        (report,) = agalign.align_folder(folder, tmp_path, settings=seeded())
+        before = files_of(tmp_path)
+        report.path.with_suffix(".parallax.tif").unlink()
+    assert len(calls) == 2
+    agalign.align_folder(folder, tmp_path, settings=seeded())
+    assert (len(calls), files_of(tmp_path)) == (3, before)
+
+
+def test_a_run_that_is_killed_before_rendering_renders_on_resume(
+    flight: Path, out: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, without_estimating: Callable[[], None]
+) -> None:
+    killed = tmp_path / "killed"
+    with monkeypatch.context() as patch:
+        patch.setattr(capture_task, "render", raising(KeyboardInterrupt()))
+        with pytest.raises(KeyboardInterrupt):
+            agalign.align_folder(flight, killed, settings=SEEDS)
+    (sidecar,) = map(read_sidecar, find_sidecars(killed))
+    assert (sidecar.output, sidecar.products, sidecar.rendered_with) == (None, [], "")
+    plan = plan_run(agalign.discover(flight), killed, SEEDS)
+    assert list(plan.values()) == ["to be rendered", "to be aligned"]
+    without_estimating()
+    first, second = agalign.align_folder(flight, killed, settings=SEEDS)
+    assert (first.state, first.error) == ("done", None)
+    assert "estimated again" in second.error
+    assert {k: v for k, v in files_of(out).items() if "IMG_0001" in k} == files_of(killed)
+
+
+def test_a_run_that_is_killed_while_it_renders_again_renders_on_resume(
+    flight: Path, out: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, without_estimating: Callable[[], None]
+) -> None:
+    """Some files have the new options then, and the sidecar describes the old ones."""
+    others = seeded("rig", qa=True, interpolation="nearest")
+    agalign.align_folder(flight, tmp_path / "direct", settings=others)
+    without_estimating()
+    with monkeypatch.context() as patch:
+        patch.setattr("agalign.products.report.preview.Preview.write", raising(KeyboardInterrupt()))
+        with pytest.raises(KeyboardInterrupt):
+            agalign.align_folder(flight, out, settings=others)
+    unchanged = read_sidecar(find_sidecars(out)[0])
+    assert unchanged.rendered_with == ""
+    for settings, states in ((SEEDS, ["done", "kept"]), (others, ["done", "done"])):
+        reports = agalign.align_folder(flight, out, settings=settings)
+        assert sorted(r.state for r in reports) == states
+    assert_same_files(out, tmp_path / "direct")
+
+
+# ---- spectral indices
+
+
+def values_of(path: Path) -> np.ndarray:
+    with rasterio.open(path) as file:
+        return np.asarray(file.read().astype(float))
+
+
+def ndvi_of_stack(path: Path) -> np.ndarray:
+    with rasterio.open(path) as stack:
+        planes = dict(zip(stack.descriptions, stack.read(masked=True).astype(float), strict=True))
+    return np.asarray(((planes["NIR"] - planes["Red"]) / (planes["NIR"] + planes["Red"])).filled(np.nan))
+
+
+def test_indices_of_a_later_command_are_calculated_of_the_new_pixels(
+    flight: Path, aligned_flight: Path, tmp_path: Path
+) -> None:
+    out = shutil.copytree(aligned_flight, tmp_path / "out")
+    stack = out / "0000SET" / "000" / "IMG_0001.tif"
+    ndvi, savi = (stack.with_name(f"IMG_0001_{name}.tif") for name in ("ndvi", "savi"))
+
+    def rows(index: str) -> list[dict[str, str]]:
+        return [row for row in table_in(out / "indices.csv") if row["index"] == index]
+
+    def indices(names: str) -> None:
+        assert agalign_here("indices", out, "--index", names).returncode == 0
+
+    def align(*options: str) -> str:
+        done = agalign_here(flight, "-o", out, *options)
+        assert done.returncode == 0
+        assert "2 finished captures to be rendered again; changed since: --radiometry" in done.stderr
+        return " ".join(done.stderr.split())
+
+    indices("ndvi")
+    of_raw, (before, _) = values_of(ndvi), rows("ndvi")
+    assert before["input"] == "raw numbers"
+    assert "removed" not in align("--radiometry", "sun")
+    assert not np.allclose(values_of(ndvi), of_raw, atol=0.01, equal_nan=True)
+    known = np.isfinite(values_of(ndvi)[0])
+    assert known.mean() > 0.9
+    np.testing.assert_allclose(values_of(ndvi)[0][known], ndvi_of_stack(stack)[known], atol=1e-5)
+    for row in rows("ndvi"):
+        values = values_of(out / row["file"])
+        assert (row["input"], float(row["median"])) == ("reflectance", pytest.approx(np.nanmedian(values), abs=1e-4))
+    assert abs(float(rows("ndvi")[0]["median"]) - float(before["median"])) > 0.01
+
+    indices("savi")
+    assert len(rows("savi")) == 2
+    said = align("--radiometry", "off")
+    assert "agalign: 2 files of an earlier command removed, such as" in said
+    assert "_savi.tif: savi needs reflectance, and the bands are raw numbers; align with --radiometry" in said
+    assert not list(savi.parent.glob("*_savi.*"))
+    assert rows("savi") == []
+    np.testing.assert_array_equal(values_of(ndvi), of_raw)
+    assert rows("ndvi")[0] == before
+    assert all(problems == [] for _, problems in verify_outputs(out))
+
+
+# ---- what is removed
+
+
+def test_nothing_is_removed_silently_with_another_layout(flight: Path, tmp_path: Path) -> None:
+    def align(**write: Any) -> agalign.CaptureReport:
+        return agalign.align_folder(flight, tmp_path, settings=seeded("rig", **write))[0]
+
+    added = {"qa": True, "error_map": True, "tie_points": True}
+    stack, band = (tmp_path / "0000SET" / "000" / name for name in ("IMG_0001.tif", "IMG_0001_4.tif"))
+    align(**added)
+    before, qa = set(files_of(tmp_path)), stack.with_suffix(".qa.tif").read_bytes()
+    report = align(layout="bands")
+    assert report.removed == ((stack, "--layout bands"),)
+    after = set(files_of(tmp_path))
+    assert before - after == {f"0000SET/000/IMG_000{number}.tif" for number in (1, 2)}
+    assert stack.with_suffix(".qa.tif").read_bytes() == qa
+    assert {part.kind for part in report.result.products} >= {"band", "qa", "tie_points", "error_map"}
+    report = align()
+    assert (band, "--layout stack") in report.removed
+    assert len(report.removed) == 5
+    assert set(files_of(tmp_path)) == before
+
+
+def test_removed_files_are_printed(flight: Path, out: Path) -> None:
+    done = agalign_here(flight, "-o", out, "--seed", "rig", "--only-seed", "--layout", "bands")
+    (line,) = [text for text in " ".join(done.stderr.split()).split("agalign: ") if "removed" in text]
+    assert line.startswith("2 files of an earlier command removed, such as ")
+    assert re.search(r"IMG_000[12]\.tif: --layout bands $", line)
+
+
+# ---- the size of a sidecar
+
+
+def test_a_sidecar_of_five_bands_is_small(aligned_flight: Path) -> None:
+    for path in find_sidecars(aligned_flight):
+        assert len(read_sidecar(path).bands) == 5
+        assert path.stat().st_size < 150_000
