@@ -22,7 +22,7 @@ from agalign.products.rasters.output_grid import FlightLimits, output_layers
 from agalign.products.rasters.parallax_file import PARALLAX_SUFFIX, read_relief
 from agalign.products.registry import PRODUCTS
 from agalign.products.report.preview import preview_bytes
-from agalign.products.sidecar.file import read_without_tables, write_sidecar
+from agalign.products.sidecar.file import is_sidecar, read_without_tables, write_sidecar
 from agalign.products.sidecar.rendered import rendered
 from agalign.products.sidecar.schema import Sidecar
 from agalign.values.alignment import Alignment
@@ -148,7 +148,9 @@ def paths_written(capture: Capture, out: Path, settings: WriteSettings) -> list[
 
 
 def refuse_to_overwrite(captures: Sequence[Capture], out: Path, settings: WriteSettings) -> None:
-    """Raise ConfigurationError if an output would replace an input image or an output of another capture."""
+    """Raise ConfigurationError if an output would replace an input image, an output of another capture, or a file that
+    no run has written.
+    """
     sources = {band.path.resolve() for capture in captures for band in capture.bands}
     resolved: dict[Path, Path] = {}
     written: dict[str, Capture] = {}
@@ -163,6 +165,19 @@ def refuse_to_overwrite(captures: Sequence[Capture], out: Path, settings: WriteS
                 raise ConfigurationError(
                     f"{path}: would be written of {other.label} and of {capture.label}; rename one's files"
                 )
+        if foreign := _foreign_file(CapturePaths.of(capture, out).sidecar, paths_written(capture, out, settings)):
+            raise ConfigurationError(f"{foreign}: was not written by agalign; choose another output folder with -o")
+
+
+def _foreign_file(sidecar: Path, written: Sequence[Path]) -> Path | None:
+    """Return a file in the place of an output that no run has written; None if there is none.
+
+    The sidecar of a capture is written before its products.
+    """
+    if sidecar.is_file():
+        return None if is_sidecar(sidecar) else sidecar
+    others = (path for path in written if path.is_file() and not path.name.endswith(PARALLAX_SUFFIX))
+    return next((path for path in others if not is_aligned_raster(path)), None)
 
 
 def outdated_files(capture: Capture, out: Path, settings: WriteSettings, sidecar: Sidecar | None) -> Mapping[Path, str]:

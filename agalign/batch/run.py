@@ -38,7 +38,7 @@ from agalign.products.run.footprint import (
     utm_of_flights,
     with_approximate_georeference,
 )
-from agalign.products.run.record import RunPart, begun, excluded_part
+from agalign.products.run.record import RunPart, begun, excluded_part, refuse_foreign_pages
 from agalign.products.sidecar.file import read_without_tables
 from agalign.products.sidecar.schema import FilePart
 from agalign.values.capture import Capture
@@ -170,6 +170,7 @@ class _FlightRun:
             raise ConfigurationError(f"{self.out}: is the folder of the images; choose another output folder with -o")
         refuse_to_overwrite(self.flight.captures, self.out, self.settings.write)
         refuse_other_captures(self.flight.captures, self.out)
+        refuse_foreign_pages(self.out)
         check_inside(self.out / "models", self.out)
 
     def starting_from(self, path: Path) -> Self:

@@ -10,6 +10,7 @@ from agalign.cli.command import Command, Given
 from agalign.cli.terminal import Terminal
 from agalign.errors import ConfigurationError
 from agalign.values.choices import Sharing
+from agalign.values.output_folder import refuse_to_replace
 
 Pairs = Annotated[
     Path, typer.Argument(help="A CSV file (fixed, moving, homography), or a folder in the HPatches or Oxford layout.")
@@ -40,6 +41,8 @@ def _evaluate(
     from agalign.evaluation.evaluate import Starts, error_table, evaluate, method_named, precision_table, write_results
     from agalign.evaluation.image_pairs import find_pairs
 
+    if out is not None:
+        refuse_to_replace(out, b"pair,group,method,")
     chosen = methods or [*(f"fast:{sharing}" for sharing in get_args(Sharing)), "sift"]
     joint = given["settings"]["joint"]
     named = {name: method_named(name, **joint, seeding=seeding) for name in chosen}
@@ -86,6 +89,7 @@ def _surface(
 
     if out.suffix.lower() not in (".png", ".jpg", ".jpeg", ".tif", ".tiff"):
         raise ConfigurationError(f"{out}: is not the name of a picture, such as loss-surface.png")
+    refuse_to_replace(out, None)
     known = [p for p in find_pairs(pairs) if p.fixed_to_moving is not None]
     if number > len(known):
         raise ConfigurationError(f"{pairs}: has {len(known)} pairs with a homography, not {number}")
@@ -123,6 +127,7 @@ def _learn(
     from agalign.flight.model import save_model
     from agalign.values.alignment import Alignment
 
+    refuse_to_replace(out, b'{"__metadata__":{"agalign":')
     aligned = 0
 
     def on_pair(name: str, result: Alignment) -> None:

@@ -11,7 +11,7 @@ from pathlib import Path
 
 from filelock import FileLock, Timeout
 
-from agalign.errors import OutputError
+from agalign.errors import ConfigurationError, OutputError
 from agalign.values.files import remove_partial_files
 from agalign.values.text import name_problem
 
@@ -28,6 +28,19 @@ def prepare_output(out: Path) -> None:
         raise OutputError(f"{out}: is a file; choose another folder with -o") from None
     except OSError as error:
         raise OutputError(f"{out}: cannot be made ({error.strerror or error}); choose another folder with -o") from None
+
+
+def refuse_to_replace(path: Path, mark: bytes | None) -> None:
+    """Raise ConfigurationError if a file exists that a command would replace, unless it is one of an earlier command:
+    that has a `mark` near its start. None refuses every file.
+    """
+    with suppress(OSError):
+        start = b""
+        if path.is_file():
+            with path.open("rb") as file:
+                start = file.read(256)
+        if path.exists() and (mark is None or mark not in start):
+            raise ConfigurationError(f"{path}: exists already; choose another name with -o, or delete it")
 
 
 @contextmanager

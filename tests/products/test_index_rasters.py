@@ -1,5 +1,6 @@
 import json
 import os
+import shutil
 import re
 from contextlib import suppress
 from pathlib import Path
@@ -205,6 +206,17 @@ def test_an_index_neither_replaces_a_band_nor_reads_one_of_another_size(
     assert report.path is None
     assert problem in report.problem
     assert sorted(p.name for p in tmp_path.iterdir()) == ["a_green.tif", "a_red.tif"]
+
+
+def test_a_raster_that_is_not_of_agalign_is_not_replaced(tmp_path: Path) -> None:
+    make_aligned(tmp_path / "out", 1)
+    place = tmp_path / "maps" / "0000SET" / "IMG_0001_ndvi.tif"
+    place.parent.mkdir(parents=True)
+    shutil.copy(tmp_path / "out" / "0000SET" / "IMG_0001.tif", place)
+    before = place.read_bytes()
+    (report,) = indices_of(tmp_path / "out", target=tmp_path / "maps", overwrite=True)
+    assert report.problem == f"{place}: was not written by agalign; choose another folder with -o"
+    assert place.read_bytes() == before
 
 
 @pytest.mark.slow

@@ -230,6 +230,8 @@ def write_rasters(
                 earlier = _finished_before(target, source) if may_be_kept else None
                 if earlier is None and target.resolve() in {band.file.resolve() for band in bands}:
                     raise InputError(f"{target}: is the file of a band; give the formula '{index.name}' another name")
+                if earlier is None and target.is_file() and _statistics_in(tags_of(target)) is None:
+                    raise InputError(f"{target}: was not written by agalign; choose another folder with -o")
                 unit = earlier.unit if earlier is not None else _common_unit(index, chosen, reader)
             except InputError as error:
                 yield IndexReport(label, index.name, problem=str(error))

@@ -11,6 +11,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from agalign._version import __version__
 from agalign.config import Settings
+from agalign.errors import ConfigurationError
 from agalign.flight.groups import CameraOverview, camera_overviews
 from agalign.products.run.footprint import accuracy_of_footprint_m, footprint
 from agalign.products.sidecar.schema import Sidecar
@@ -21,6 +22,8 @@ from agalign.values.libraries import library_versions
 from agalign.values.processes import usable_cores
 from agalign.values.text import counted, escape_controls
 
+PAGES = "index.html", "summary.csv", "indices.csv", "flight.geojson"
+"""Files that a run writes for all its captures."""
 RunState = Literal["running", "interrupted", "finished"]
 
 
@@ -156,6 +159,15 @@ def begun(folder: Path, settings: Settings, captures: Sequence[Capture] = (), co
         settings=settings.model_dump(mode="json"),
         captures=Counter(found=len(captures)),
     )
+
+
+def refuse_foreign_pages(out: Path) -> None:
+    """Raise ConfigurationError if a folder without the record of a run has files with the names of its pages."""
+    if (out / RUN_FILE).exists():
+        return
+    for path in (out / name for name in PAGES):
+        if path.is_file():
+            raise ConfigurationError(f"{path}: was not written by agalign; choose another output folder with -o")
 
 
 def read_run_record(out: Path) -> RunPart | None:

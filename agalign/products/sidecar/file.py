@@ -110,18 +110,16 @@ def read_without_tables(path: Path) -> Sidecar:
 
 def find_sidecars(folder: Path) -> list[Path]:
     """Return the sidecars below an output folder, sorted; unreadable files are included, other JSON files are not."""
-    result = []
-    for path in sorted(folder.rglob("*.json")):
-        try:
-            if path.is_dir():
-                continue
-            with open_regular(path) as file:
-                if b'"agalign/' not in file.read(_START_BYTES):
-                    continue
-        except OSError:
-            pass
-        result.append(path)
-    return result
+    return [path for path in sorted(folder.rglob("*.json")) if not path.is_dir() and is_sidecar(path)]
+
+
+def is_sidecar(path: Path) -> bool:
+    """Return True for a file that starts like a sidecar, and for one that cannot be read."""
+    try:
+        with open_regular(path) as file:
+            return b'"agalign/' in file.read(_START_BYTES)
+    except OSError:
+        return True
 
 
 def run_sidecars(out: Path) -> list[Path]:
