@@ -92,7 +92,7 @@ class BandPair:
     @property
     def max_shift_px(self) -> float:
         """Maximum distance of a result from its seed; infinite unless the user specified the seed."""
-        return self.seed_std_px.get("user", float(math.inf)) * _MAX_ERROR_STD
+        return self.seed_std_px.get("user", math.inf) * _MAX_ERROR_STD
 
     @property
     def has_rig(self) -> bool:
@@ -297,7 +297,7 @@ def longest_for(reference: Band, fixed_to_moving: Matrix) -> int:
 def _seed_std_px(band: str, model: FlightModel | None, scale: PixelScale) -> dict[SeedKind, float]:
     """Return the standard errors of mappings by tags and of the flight's mean; `scale` is of the fixed image."""
     tags_std_px = 5.0  # errors on five cameras have a median of 2 px and a maximum of 12 px (docs/cameras.md)
-    result: dict[SeedKind, float] = dict.fromkeys(("rig", "centre"), float(tags_std_px * scale.x))
+    result: dict[SeedKind, float] = dict.fromkeys(("rig", "centre"), tags_std_px * scale.x)
     if model is not None and model.rig is not None and band in model.rig.mean:
         mean, rig = model.rig.mean[band], model.rig
         # The errors of a rig are in px of the band's own file.

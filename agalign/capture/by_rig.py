@@ -136,7 +136,7 @@ def _parallax_by_rig(
     error = float(np.sqrt(((seen - scale * of_rig) ** 2).sum(axis=1).mean()))
     x, y = (scale * np.array(rig.baselines[pair.name])).tolist()
     of_relief = 0.0 if relief.std_px is None else float(np.median(relief.std_px)) * relief.unit * math.hypot(x, y)
-    return Parallax(relief, (x, y)).with_occlusions(), float(math.hypot(error * relief.rms_px, of_relief))
+    return Parallax(relief, (x, y)).with_occlusions(), math.hypot(error * relief.rms_px, of_relief)
 
 
 def _with_added_error(prediction: Prediction, error_px: float) -> Prediction:

@@ -84,7 +84,7 @@ class DisplacementEstimator:
             before_px = 0.0 if field is None else field(shifts.centres_px)
             total = shifts._replace(shifts_px=shifts.shifts_px + before_px)
             if len(total.weights) < MIN_WINDOWS:
-                return DisplacementResult(None, float(math.nan), float(math.nan))
+                return DisplacementResult(None, math.nan, math.nan)
             field = fitted_field(total, _SMOOTHNESS, self.lattice_px, self.size_px)
             if np.median(shifts.distances_px()) <= converged_px:
                 break
@@ -136,8 +136,8 @@ class _Gain(NamedTuple):
     """Decrease of the residuals of held-out windows by a field."""
 
     smoothness: float
-    before_p95_px: float = float(math.nan)
-    after_p95_px: float = float(math.nan)
+    before_p95_px: float = math.nan
+    after_p95_px: float = math.nan
     loss: float = math.inf
     """Mean of `_losses` of the remaining shifts, weighted."""
     sigma: float = 0.0

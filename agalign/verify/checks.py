@@ -82,7 +82,7 @@ class AlignedImages(Protocol):
 
 @dataclass(frozen=True)
 class Evidence:
-    """The input of the checks, on the grid of the images or of the files (`float`)."""
+    """The input of the checks, on the grid of the images or of the files."""
 
     joint: JointResult
     residual: Residual
@@ -300,4 +300,4 @@ def is_unchanged(joint: JointResult, given: Matrix, size_px: tuple[int, int], sc
     # Px of the file, and standard errors of the least certain corner. Resampling would cost more sharpness than such a
     # small correction gains.
     max_unchanged_px, max_unchanged_std = 0.25, 3.0
-    return change_px <= min(float(max_unchanged_px * scale), joint.corner_std_px * max_unchanged_std)
+    return change_px <= min(max_unchanged_px * scale, joint.corner_std_px * max_unchanged_std)
