@@ -17,4 +17,4 @@ for band in outcome.sidecar.bands:
         continue
     # The grid maps pixels of the reference to pixels of the band's own file, lenses included.
     here, there = (points[len(points) // 2] for points in (band.grid.reference_px, band.grid.moving_px))
-    print(f"{band.band}: {band.status}, {here} maps to {there}, residual {band.metrics.after.residual_px} px")
+    print(f"{band.band}: {band.status}, {here} maps to {there}, residual {band.metrics.after.residual_px:.3f} px")

@@ -16,8 +16,8 @@ def main() -> None:
             print(f"{report.label}: {report.error}")
             continue
         for band in report.sidecar.bands:
-            residual = band.metrics.after.residual_px if band.metrics else None
-            print(report.label, band.band, band.status, "" if residual is None else f"{residual:.3f} px")
+            residual = f"{band.metrics.after.residual_px:.3f} px" if band.metrics else ""
+            print(report.label, band.band, band.status, residual)
 
 
 # Worker processes import this file, so the work must not start on import.

@@ -1,7 +1,7 @@
 import json
 import os
-import shutil
 import re
+import shutil
 from contextlib import suppress
 from pathlib import Path
 

@@ -230,7 +230,7 @@ def write_rasters(
                 earlier = _finished_before(target, source) if may_be_kept else None
                 if earlier is None and target.resolve() in {band.file.resolve() for band in bands}:
                     raise InputError(f"{target}: is the file of a band; give the formula '{index.name}' another name")
-                if earlier is None and target.is_file() and _statistics_in(tags_of(target)) is None:
+                if earlier is None and _is_foreign(target):
                     raise InputError(f"{target}: was not written by agalign; choose another folder with -o")
                 unit = earlier.unit if earlier is not None else _common_unit(index, chosen, reader)
             except InputError as error:
@@ -238,6 +238,14 @@ def write_rasters(
                 continue
             statistics = earlier or _write(index, chosen, target, unit, source, reader)
             yield IndexReport(label, index.name, target, statistics, kept=earlier is not None)
+
+
+def _is_foreign(path: Path) -> bool:
+    """Return True for a complete raster that is not an index raster; a damaged one is written again."""
+    with suppress(OSError):
+        check_complete(path)
+        return _statistics_in(tags_of(path)) is None
+    return False
 
 
 @dataclass(frozen=True)
