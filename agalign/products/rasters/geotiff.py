@@ -143,14 +143,17 @@ def write_on_grid(
 
 
 def check_complete(path: Path) -> None:
-    """Raise OSError for a TIFF in which a tile or strip is missing or truncated.
+    """Raise OSError for a TIFF in which a tile, a strip or the value of a tag is missing or truncated.
 
     GDAL flushes when a file is closed, and a failure at that time, such as a full disk, raises nothing.
     """
-    size, segments = path.stat().st_size, []
-    with suppress(tifffile.TiffFileError, struct.error), tifffile.TiffFile(path) as tiff:
+    size, segments, has_tags = path.stat().st_size, [], False
+    with suppress(tifffile.TiffFileError, struct.error, IndexError), tifffile.TiffFile(path) as tiff:
         segments = [s for page in tiff.pages for s in zip(page.dataoffsets, page.databytecounts, strict=True)]
-    if not segments or any(count == 0 or offset + count > size for offset, count in segments):
+        tiff.filehandle.seek(tiff.pages.first.offset)
+        (count,) = struct.unpack(tiff.tiff.tagnoformat, tiff.filehandle.read(tiff.tiff.tagnosize))
+        has_tags = len(tiff.pages.first.tags) == count  # tifffile omits tags with values beyond the end of the file
+    if not has_tags or not segments or any(count == 0 or offset + count > size for offset, count in segments):
         raise OSError(errno.EIO, _INCOMPLETE)
 
 
