@@ -1,8 +1,11 @@
 """The Python API: arrays, one capture, a folder."""
 
 import logging
+import math
 from collections.abc import Callable
 from dataclasses import replace
+from numbers import Real
+from operator import index
 from pathlib import Path
 
 import numpy as np
@@ -24,7 +27,7 @@ from agalign.pixels.radiometry import with_radiometry
 from agalign.values import geometry
 from agalign.values.alignment import Alignment, Seed
 from agalign.values.capture import Capture
-from agalign.values.choices import Interpolation, SeedKind
+from agalign.values.choices import MAX_PIXELS, Interpolation, SeedKind
 from agalign.values.image import Mask
 from agalign.values.mapping import PixelMapping
 from agalign.values.processes import end_if_reimported
@@ -70,6 +73,10 @@ def align(
     Raises InputError for arrays that are not images, GeometryError for a seed that is not a homography.
     """
     settings = settings or Settings()
+    if seed_std_px is not None and seed is None:
+        raise InputError("seed_std_px is the standard error of a seed; give the seed too")
+    if seed_std_px is not None and not (isinstance(seed_std_px, Real) and 0 < seed_std_px < math.inf):
+        raise InputError(f"seed_std_px is {seed_std_px!r}, not a positive number of pixels")
     fixed_raster = raster_of(fixed, fixed_valid, "fixed")
     moving_raster = raster_of(moving, moving_valid, "moving")
     matrices: SeedMatrices = {"identity": geometry.overlay(fixed_raster.size_px, moving_raster.size_px)}
@@ -101,8 +108,21 @@ def warp_onto(
     if isinstance(fixed_to_moving, Alignment):
         raise InputError("an alignment is more than a homography; use its method warp(moving)")
     mapping = PixelMapping(geometry.normalised(fixed_to_moving))
-    by_homography = Alignment(mapping, fixed_size_px, (), Seed("user", mapping.fixed_to_moving, 0.0))
+    by_homography = Alignment(mapping, _size_px(fixed_size_px), (), Seed("user", mapping.fixed_to_moving, 0.0))
     return by_homography.warp(moving, valid=valid, interpolation=interpolation)
+
+
+def _size_px(size_px: object) -> tuple[int, int]:
+    """Return (width, height) as integers. Raises InputError unless they are two positive ones of a feasible image."""
+    try:
+        width, height = map(index, size_px)  # type: ignore[call-overload]
+    except (TypeError, ValueError):
+        width, height = 0, 0
+    if not (width > 0 and height > 0 and width * height <= MAX_PIXELS):
+        raise InputError(
+            f"fixed_size_px is {size_px!r}, not a width and a height of at most {MAX_PIXELS:,} px together"
+        )
+    return width, height
 
 
 def align_capture(capture: Capture, out: str | Path, *, settings: Settings | None = None) -> CaptureReport:

@@ -1,4 +1,8 @@
+import math
+import re
+import warnings
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import pytest
@@ -127,3 +131,40 @@ def test_undeclared_fill_and_a_border_of_zeros_cost_a_good_pair_nothing(seed: np
         fixed, moving = as_uint8(fixed), as_uint8(moving)
         moving[:, :60] = 0
     assert_aligned(agalign.align(fixed, moving, seed=seed))
+
+
+IMAGE = textured_image(64, 64, 1)
+RAGGED = [[1, 2], [3]]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        ({"seed": np.eye(3), "seed_std_px": -1}, "seed_std_px is -1, not a positive number"),
+        ({"seed": np.eye(3), "seed_std_px": math.nan}, "seed_std_px is nan, not a positive number"),
+        ({"seed_std_px": 3.0}, "give the seed too"),
+        ({"fixed": RAGGED}, "fixed is not an array: its rows have different lengths"),
+        ({"fixed_valid": RAGGED}, "fixed_valid is not an array"),
+        ({"fixed": IMAGE.astype(np.float64) * 1e300}, "fixed has only values beyond 1e"),
+    ],
+)
+def test_arguments_that_cannot_be_aligned_are_named(arguments: dict[str, Any], said: str) -> None:
+    with pytest.raises(agalign.InputError, match=re.escape(said)):
+        agalign.align(**{"fixed": IMAGE, "moving": IMAGE} | arguments)
+
+
+def test_half_precision_is_an_image_like_any_other() -> None:
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert raster_of(IMAGE.astype(np.float16), None, "fixed").valid.all()
+
+
+@pytest.mark.parametrize("size_px", [(0, 0), (-5, 5), (10.5, 10), (10,), "ab", None, (10**6, 10**6)], ids=repr)
+def test_a_grid_that_is_not_an_image_is_refused(size_px: Any) -> None:
+    with pytest.raises(agalign.InputError, match="not a width and a height"):
+        agalign.warp_onto(IMAGE, np.eye(3), size_px)
+
+
+def test_an_unknown_interpolation_is_refused() -> None:
+    with pytest.raises(agalign.InputError, match="'magic'; choose from nearest, bilinear, cubic, lanczos"):
+        agalign.warp_onto(IMAGE, np.eye(3), (20, 20), interpolation="magic")

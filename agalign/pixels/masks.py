@@ -6,10 +6,12 @@ from numpy.typing import ArrayLike, NDArray
 
 from agalign.errors import InputError
 from agalign.values.image import Mask, Raster
-from agalign.values.resampling import planes_of
+from agalign.values.resampling import planes_of, rectangular
 
 _MIN_SIDE_PX = 48
 """Smaller images contain too few patches for learning."""
+_MAX_MEASURED = 1e15
+"""Above the values of any sensor, below the fill values of netCDF, GIS and C programs (1e20 and more)."""
 _MIN_SATURATED_PX = 7
 """Minimum width of a masked saturated area: patches around smaller ones contain enough of their surroundings."""
 
@@ -24,9 +26,8 @@ def data_mask(pixels: NDArray[np.generic], nodata: float | None) -> Mask:
         valid &= pixels != nodata
     if nodata is None and (pixels.dtype.kind == "f" or pixels.dtype.itemsize == 8):
         common_fill = -9999.0, -99999.0, -32767.0, -32768.0
-        # Above the values of any sensor, below the fill values of netCDF, GIS and C programs (1e20 and more).
-        max_measured = 1e15
-        valid &= (np.fabs(pixels) < max_measured) & ~np.isin(pixels, common_fill)
+        values = pixels.astype(np.float32) if pixels.dtype == np.float16 else pixels  # float16 ends at 65,504
+        valid &= (np.fabs(values) < _MAX_MEASURED) & ~np.isin(values, common_fill)
     return valid
 
 
@@ -79,13 +80,15 @@ def raster_of(image: ArrayLike, valid: ArrayLike | None, name: str) -> Raster:
     # Sensors deliver 8 or 16 bits: the maximum of a wider type is not saturation.
     is_sensor_type = planes.dtype.kind in "ui" and planes.dtype.itemsize <= 2
     saturation = float(np.iinfo(str(planes.dtype)).max) if is_sensor_type else None
-    mask = np.ones(planes.shape[1:], bool) if valid is None else np.array(valid, bool)
+    mask = np.ones(planes.shape[1:], bool) if valid is None else rectangular(valid, f"{name}_valid").astype(bool)
     if mask.shape != planes.shape[1:]:
         raise InputError(f"{name}_valid is {mask.shape}, the image {planes.shape[1:]}")
     if len(planes) in (2, 4) and saturation is not None and np.isin(planes[-1], (0, saturation)).all():
         mask, planes = mask & (planes[-1] > 0), planes[:-1]
     for plane in planes:
         mask &= data_mask(plane, None)
+    if not mask.any() and np.isfinite(planes).any() and (np.abs(planes[np.isfinite(planes)]) >= _MAX_MEASURED).all():
+        raise InputError(f"{name} has only values beyond {_MAX_MEASURED:g}, which are fill values; rescale it")
     mask &= ~np.logical_and.reduce([undeclared_fill(plane) for plane in planes])
     for plane in planes:
         mask = learnable(mask, plane, saturation)

@@ -20,7 +20,7 @@ from agalign.values.image import Mask
 from agalign.values.issues import SEED_DOES_NOT_FIT, Issue, sentence
 from agalign.values.mapping import PixelMapping
 from agalign.values.pixel_units import SAME_PIXELS, PixelScale, Size
-from agalign.values.resampling import can_hold, planes_of, resample_planes
+from agalign.values.resampling import can_hold, planes_of, rectangular, resample_planes
 
 COVARIANCE_DECIMALS = 9
 """Of covariances in a sidecar, px squared: a millionth of those of accurate mappings."""
@@ -391,7 +391,7 @@ class Alignment:
         if self.moving_size_px not in (None, planes.shape[:0:-1]):
             given, aligned = (f"{width} x {height} px" for width, height in (planes.shape[:0:-1], self.moving_size_px))
             raise InputError(f"moving has {given}, the aligned image {aligned}; give an image of that size")
-        mask = np.ones(planes.shape[1:], bool) if valid is None else np.asarray(valid, bool)
+        mask = np.ones(planes.shape[1:], bool) if valid is None else rectangular(valid, "valid").astype(bool)
         if mask.shape != planes.shape[1:]:
             raise InputError(f"valid is {mask.shape}, the image {planes.shape[1:]}")
         for plane in planes:

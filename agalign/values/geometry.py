@@ -35,7 +35,10 @@ def normalised(matrix: ArrayLike) -> Matrix:
 
     Raises GeometryError where the matrix is not 3x3, not finite, singular, or sends the origin to infinity.
     """
-    h = np.asarray(matrix, dtype=np.float64)
+    try:
+        h = np.asarray(matrix, dtype=np.float64)
+    except (TypeError, ValueError):
+        raise GeometryError(f"a homography is a finite 3x3 matrix, not {matrix!r:.80}") from None
     if h.shape != (3, 3) or not np.isfinite(h).all():
         raise GeometryError(f"a homography is a finite 3x3 matrix, not one of shape {h.shape}: {h.tolist()}")
     if _is_singular(h) or abs(h[2, 2]) < 1e-12 * np.abs(h[2]).max():

@@ -1,6 +1,7 @@
 """Resampling of arrays at fractional positions by an interpolation kernel, tile by tile."""
 
 from collections.abc import Iterator
+from typing import get_args
 
 import cv2
 import numpy as np
@@ -40,7 +41,7 @@ def planes_of(image: ArrayLike, name: str) -> tuple[NDArray[np.generic], bool]:
 
     Raises InputError, with `name`, for any other array.
     """
-    array = np.asarray(image)
+    array = rectangular(image, name)
     if array.dtype.kind not in "uifb" or array.ndim not in (2, 3):
         raise InputError(
             f"{name} must be a numeric (H, W), (H, W, C) or (C, H, W) array, not {array.dtype} {array.shape}"
@@ -50,6 +51,14 @@ def planes_of(image: ArrayLike, name: str) -> tuple[NDArray[np.generic], bool]:
     if len(planes) > _MAX_CHANNELS:
         raise InputError(f"{name} is {array.shape}: images have at most {_MAX_CHANNELS} channels")
     return planes, channels_last
+
+
+def rectangular(values: ArrayLike, name: str) -> NDArray[np.generic]:
+    """Return an array. Raises InputError, with `name`, for nested lists of different lengths."""
+    try:
+        return np.asarray(values)
+    except ValueError:
+        raise InputError(f"{name} is not an array: its rows have different lengths") from None
 
 
 def resample_planes(
@@ -63,7 +72,10 @@ def resample_planes(
     """Resample planes (C, h, w) with the mask `valid` (h, w) to a reference of `size_px` (width, height).
 
     Returns (C, height, width) of the same type, with `fill` where a pixel is not valid, and the mask (height, width).
+    Raises InputError for an unknown interpolation.
     """
+    if interpolation not in get_args(Interpolation):
+        raise InputError(f"unknown interpolation {interpolation!r}; choose from {', '.join(get_args(Interpolation))}")
     max_source_px = 32_000  # OpenCV limits the sides of one image to 32,767 px
     width, height = size_px
     result = np.empty((len(planes), height, width), planes.dtype)
