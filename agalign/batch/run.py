@@ -177,7 +177,13 @@ class _FlightRun:
         """Return the run with a model. Raises ConfigurationError if it does not fit the settings or the cameras."""
         settings = self.settings
         if not settings.learns_flights:
-            raise ConfigurationError("a model needs one network per flight, which recipe paper does not learn")
+            reasons = {
+                "--only-seed stops before a network is used": settings.seed.only,
+                "--each-alone learns a network for each capture": not settings.flight.together,
+                "recipe paper learns no network of a flight": settings.joint.recipe == "paper",
+            }
+            reason = next(text for text, applies in reasons.items() if applies)
+            raise ConfigurationError(f"{path}: is not used, as {reason}; leave --model out, or the other option")
         model = load_model(path, lambda: choose_device(settings.joint.device))
         if model.net.sharing == "unshared" and settings.joint.sharing != "unshared":
             raise ConfigurationError(f"{path}: was learned unshared; add --sharing unshared")

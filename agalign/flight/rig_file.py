@@ -12,7 +12,11 @@ from safetensors import safe_open
 from agalign.errors import InputError
 from agalign.flight.rig import CaptureFactors, Rig
 from agalign.values.files import open_regular
+from agalign.values.geometry import normalised
 from agalign.values.mapping import DisplacementField
+
+_MAX_SIDE_PX, _MAX_FIELD_PX, _MAX_NUMBER = 100_000, 1e4, 1e12
+"""Limits of the sizes, of the displacements, and of all numbers of a rig, of which times are the largest."""
 
 
 def rig_to_json(rig: Rig) -> str:
@@ -24,20 +28,24 @@ def rig_to_json(rig: Rig) -> str:
 def rig_from_json(text: str, fields: Mapping[str, NDArray[np.float64]]) -> Rig:
     """Deserialise a rig; `fields` are the values (rows, columns, 2) of the displacement fields by band.
 
-    Raises KeyError, TypeError or ValueError for damaged text.
+    Raises KeyError, TypeError, ValueError or GeometryError for damaged text, and for values that no rig has.
     """
-    facts = json.loads(text)
+    facts = json.loads(text, parse_float=_bounded, parse_int=_bounded, parse_constant=_bounded)
     if "seen" in facts:  # the name in files of earlier versions
         facts["captures"] = facts.pop("seen")
     steps = facts.pop("field_steps_px")
     width, height = facts.pop("size_px")
-    facts["mean"] = {b: np.array(m) for b, m in facts["mean"].items()}
+    if not all(float(n).is_integer() and 0 < n <= _MAX_SIDE_PX for n in (width, height)):
+        raise ValueError(f"the size of its images is {width:g} x {height:g}")
+    facts["mean"] = {b: normalised(m) for b, m in facts["mean"].items()}
     facts["baselines"] = {b: (x, y) for b, (x, y) in facts["baselines"].items()}
     facts["factors"] = tuple(facts["factors"])
     captures = tuple(
         CaptureFactors(**one | {"motion": one["motion"] and tuple(one["motion"]), "factors": tuple(one["factors"])})
         for one in facts.pop("captures")
     )
+    if not all((np.abs(values) <= _MAX_FIELD_PX).all() for values in fields.values()):  # also False for NaN
+        raise ValueError("a displacement field has values that are NaN or too large")
     displacements = {b: DisplacementField(steps[b], values) for b, values in fields.items()}
     return Rig(size_px=(int(width), int(height)), captures=captures, fields=displacements, **facts)
 
@@ -55,6 +63,13 @@ def read_rig(path: Path) -> tuple[str, Rig | None]:
     except Exception as error:  # damaged files raise errors of many classes
         reason = next(iter(str(error).splitlines()), type(error).__name__)
         raise InputError(f"{path}: its rig cannot be read ({reason})") from None
+
+
+def _bounded(text: str) -> float:
+    number = float(text)
+    if not abs(number) <= _MAX_NUMBER:  # also for NaN
+        raise ValueError(f"it has the number {text}")
+    return number
 
 
 def _plain(value: Any) -> Any:

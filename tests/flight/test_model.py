@@ -1,9 +1,12 @@
 """Model files are read back as written; damaged ones are errors with the name of the file."""
 
+import json
+import math
 import os
 import struct
 from dataclasses import asdict, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -12,8 +15,10 @@ from safetensors import safe_open
 from safetensors.torch import save_file
 
 from agalign.errors import InputError
+from agalign.flight import model as model_module
 from agalign.flight.model import FlightModel, _digest, load_model, save_model
-from agalign.flight.rig_file import read_rig
+from agalign.flight.rig_file import read_rig, rig_to_json
+from agalign.products.report.charts import rig_views
 from agalign.values import geometry
 from agalign.values.mapping import DisplacementField
 
@@ -104,3 +109,30 @@ def test_files_that_are_no_models_are_an_error(tmp_path: Path) -> None:
                 read(path)
     with pytest.raises(InputError, match=r"text\.safetensors: its rig cannot be read"):
         read_rig(text)
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"size_px": [0, 480]}, "the size of its images is 0 x 480"),
+        ({"size_px": [math.nan, 480]}, "it has the number NaN"),
+        ({"size_px": [1e9, 480]}, r"the size of its images is 1e\+09 x 480"),
+        ({"mean": {"NIR": [[0, 0, 0]] * 3}}, "the homography is singular"),
+        ({"from_bands_px": {"NIR": 1e200}}, r"it has the number 1e\+200"),
+    ],
+)
+def test_a_rig_with_values_that_no_camera_has_is_refused(
+    model: FlightModel, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, change: dict[str, Any], said: str
+) -> None:
+    """The report reads it too, without torch, and goes on without it."""
+    text = json.dumps(json.loads(rig_to_json(model.rig)) | change)
+    monkeypatch.setattr(model_module, "rig_to_json", lambda _: text)
+    path = tmp_path / "models" / "changed.safetensors"
+    path.parent.mkdir()
+    save_model(model, path)
+    for read in (load, read_rig):
+        with pytest.raises(InputError, match=rf"changed\.safetensors: .*{said}"):
+            read(path)
+    problems: list[str] = []
+    assert rig_views(tmp_path, problems.append) == []
+    assert len(problems) == 1

@@ -90,7 +90,9 @@ def checked_raster(
             if not is_gdal_error(error) and not isinstance(error, tifffile.TiffFileError):
                 raise
             cause = innermost_cause(error).rstrip(".")
-            raise OutputError(f"{path}: cannot be written ({cause}; is the disk full?)") from None
+            is_refused = any(text in cause for text in ("not permitted", "denied", "Read-only"))
+            hint = "" if is_refused else "; is the disk full?"
+            raise OutputError(f"{path}: cannot be written ({cause}{hint})") from None
 
 
 def _describe(dataset: Any, layers: Sequence[LayerDescription], tags: Mapping[str, str]) -> None:

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from agalign.errors import InputError
+from agalign.errors import GeometryError, InputError
 from agalign.flight.rig import Rig
 from agalign.flight.rig_file import read_rig
 from agalign.flight.rig_prediction import band_summaries
@@ -52,11 +52,11 @@ def rig_views(out: Path, on_problem: Callable[[str], None]) -> list[dict[str, An
     for path in sorted((out / "models").glob("*.safetensors")):
         try:
             _, rig = read_rig(path)
-        except InputError as error:
-            on_problem(str(error))
+            rows = [] if rig is None else band_summaries(rig)
+        except (InputError, GeometryError) as error:
+            on_problem(f"{error}" if isinstance(error, InputError) else f"{path}: its rig cannot be used ({error})")
             continue
         if rig is not None:
-            rows = band_summaries(rig)
             longest = max((math.hypot(*r["baseline"]) for r in rows), default=0.0) or 1.0
             to_plan = 0.36 * PLAN_WIDTH / longest  # leaves space for names
             for number, row in enumerate(rows):
