@@ -22,7 +22,7 @@ from agalign.errors import InputError
 from agalign.pixels.raster import suffix_format
 from agalign.values.capture import Band, CameraIdentity, Capture, CaptureTime, Pose
 from agalign.values.files import RUN_FILE
-from agalign.values.text import counted
+from agalign.values.text import counted, shortened
 
 _GroupKey = tuple[str, str, str]
 """(camera, folder of the capture, the camera's capture key)."""
@@ -45,7 +45,7 @@ def without_copies(files: Sequence[ImageFile]) -> tuple[list[ImageFile], list[Pr
     kept: dict[object, ImageFile] = {}
     copies: dict[Path, Problem] = {}
     for file in sorted(files, key=lambda f: (len(f.path.name), natural_order(f.path.name))):
-        capture_id = file.tags.first_text(file.camera.capture_ids)
+        capture_id = shortened(file.tags.first_text(file.camera.capture_ids))
         folder, bands = file.camera.capture_folder(file.path), tuple(b.name for b in file.bands)
         by_tags = (folder, capture_id, bands) if capture_id else file.path
         for original in (kept[key] for key in (by_tags, *_paths_in_name(file.path)) if key in kept):
@@ -258,8 +258,8 @@ def capture_of(files: Sequence[ImageFile], folder: Path, options: DiscoverOption
         bands=tuple(bands),
         reference_index=next(i for i, b in enumerate(bands) if b is reference),
         camera=CameraIdentity(tags.make, tags.model, _SERIAL_SEPARATOR.join(serials)),
-        capture_id=tags.first_text(camera.capture_ids),
-        flight_id=tags.first_text(camera.flight_ids),
+        capture_id=shortened(tags.first_text(camera.capture_ids)),
+        flight_id=shortened(tags.first_text(camera.flight_ids)),
         captured_at=camera.captured_at(tags),
         position=tags.position,
         pose=_pose(camera, tags, next((f for f in files if f.path == reference.path), first)),

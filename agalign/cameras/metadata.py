@@ -14,7 +14,7 @@ from agalign.cameras.xmp import Name, Packet
 from agalign.errors import UnreadableFileError
 from agalign.pixels.raster import suffix_format
 from agalign.values.capture import Position
-from agalign.values.text import without_controls
+from agalign.values.text import shortened, without_controls
 
 
 @dataclass(frozen=True)
@@ -155,8 +155,7 @@ def _mean(value: Any) -> float | None:
 def _text(value: Any) -> str:
     if isinstance(value, bytes):
         value = value.decode("utf-8", "replace")
-    max_length = 200  # of makes, models and serial numbers; a damaged tag may contain megabytes
-    return without_controls(str(value)).strip()[:max_length] if isinstance(value, (str, int)) else ""
+    return shortened(without_controls(str(value)).strip()) if isinstance(value, (str, int)) else ""
 
 
 def _iso_time(exif: Mapping[str, Any], time: str, offset: str) -> str:

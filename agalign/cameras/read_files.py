@@ -22,6 +22,7 @@ from agalign.values.lens import rescaled
 from agalign.values.pixel_units import SAME_PIXELS, PixelScale, Size
 from agalign.values.process_pool import ProcessPool, WorkerDiedError
 from agalign.values.processes import environment_of_children
+from agalign.values.text import shortened
 
 
 @dataclass(frozen=True)
@@ -91,6 +92,7 @@ def read_file(path: Path, cameras: Iterable[Camera], options: DiscoverOptions) -
         raise UnreadableFileError(f"{path}: {what}; write each page to a file of its own (tiffsplit)")
     if len(pages) > 1:
         named = [replace(band, band_index=band.page) for band in named]
+    named = [replace(band, name=shortened(band.name)) for band in named]
     panel, scale = panel_in(tags, size_px), _scale(tags, size_px)
     used = (replace(b, panel=panel) for b in named if options.with_rgb or not b.is_from_photograph)
     checked = [_with_lens_of_image(band, scale) for band in used]

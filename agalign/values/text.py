@@ -1,4 +1,4 @@
-"""Escaping of texts from files for terminals and spreadsheets."""
+"""Texts from files: limited, and escaped for terminals and spreadsheets."""
 
 import sys
 import unicodedata
@@ -52,6 +52,12 @@ def without_controls(text: str) -> str:
     """Return the text of a tag without control characters, changes of text direction and ends of lines."""
     dropped = "Cc", "Cf", "Cs", "Zl", "Zp"
     return text if text.isprintable() else "".join(c for c in text if unicodedata.category(c) not in dropped)
+
+
+def shortened(text: str) -> str:
+    """Return a name from a file with at most 200 characters: a damaged tag may contain megabytes."""
+    max_length = 200
+    return text if len(text) <= max_length else f"{text[: max_length - 1]}…"
 
 
 def without_formula(value: object) -> object:

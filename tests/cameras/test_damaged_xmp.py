@@ -291,3 +291,8 @@ def test_values_that_are_empty_are_not_called_unread() -> None:
     empty = '<x:xmpmeta><Camera:A></Camera:A><Camera:B/><Camera:C> </Camera:C> Camera:D="" Camera:E = "" '
     assert Packet.parse(empty).unread == ("its end",)
     assert Packet.parse(empty.replace("Camera:B/>", "Camera:B /x>")).unread == ("its end", "B")
+
+
+def test_a_name_of_megabytes_is_shortened(tmp_path: Path) -> None:
+    capture = write_stack(tmp_path / "a.tif", f"{'x' * 100_000},b,c", "500,600,700").captures[0]
+    assert [len(b.name) for b in capture.bands] == [200, 1, 1]
