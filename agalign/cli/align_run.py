@@ -104,6 +104,8 @@ class RunTotals:
     """Number of band pairs of each capture that is to be aligned."""
     states: Counter[str] = field(default_factory=Counter)
     pairs: PairTotals = field(default_factory=PairTotals)
+    has_report: bool = False
+    """The report is written."""
     saturated: dict[str, tuple[float, str]] = field(default_factory=dict)
     """Largest share of saturated pixels, and its capture, of each band."""
     removed: dict[str, list[Path]] = field(default_factory=lambda: defaultdict(list))
@@ -196,23 +198,28 @@ def run(
         finally:
             # Also after an interruption.
             if totals.states:
-                totals.is_complete &= _write_pages(out, terminal, changed=set(totals.states) != {"kept"})
+                _write_pages(out, terminal, totals)
     seconds = round(time.monotonic() - started, 1)
     terminal.event("finished", seconds=seconds, captures=totals.states.total(), **totals.states)
     return totals
 
 
-def _write_pages(out: Path, terminal: Terminal, *, changed: bool) -> bool:
-    """Write report and summary; return False if that fails, or if a sidecar cannot be read."""
+def _write_pages(out: Path, terminal: Terminal, totals: RunTotals) -> None:
+    """Write report and summary. The run is not complete if that fails, or if a sidecar cannot be read; it is if only
+    the memory is too small for the report, which can be written later.
+    """
     problems: list[str] = []
     try:
-        if changed or not pages_exist(out):
+        if set(totals.states) != {"kept"} or not pages_exist(out):
             write_pages(out, problems.append)
+        totals.has_report = True
     except OutputError as error:
         problems.append(str(error))
+    except MemoryError:
+        terminal.problem(f"{out}: the report does not fit into memory; 'agalign report {out}' writes it elsewhere")
     for problem in problems:
         terminal.problem(problem)
-    return not problems
+    totals.is_complete &= not problems
 
 
 def cluster(dask: str | None, jobs: int) -> AbstractContextManager[Executor | None]:
@@ -322,7 +329,8 @@ def conclude(totals: RunTotals, out: Path, terminal: Terminal) -> int:
     record = read_run_record(out)
     for line in [] if record is None else record.exclusions():
         terminal.result(line)
-    terminal.result(f"Report: {out / REPORT_FILE}")
+    if totals.has_report:
+        terminal.result(f"Report: {out / REPORT_FILE}")
     if totals.states and set(totals.states) <= {"panel", "sky"}:
         or_sky = " or the sky" if totals.states["sky"] else ""
         terminal.problem(f"all captures show calibration panels{or_sky}; --align-panels aligns them like any other")

@@ -15,13 +15,13 @@ import typer
 
 from agalign.batch.capture_task import CaptureReport
 from agalign.cameras.discover import FolderScan, Problem, discover
-from agalign.cli import main
+from agalign.cli import align_run, main
 from agalign.cli.align_run import RunTotals, conclude, print_problems
 from agalign.cli.command import Command, help_of
 from agalign.cli.terminal import Terminal, exits
-from agalign.errors import ConfigurationError, InputError, UnreadableFileError
+from agalign.errors import ConfigurationError, InputError, OutputError, UnreadableFileError
 
-from ..conftest import write_capture
+from ..conftest import raising, write_capture
 from ..products.test_sidecar import NIR, example
 from ..program import agalign_here
 
@@ -297,3 +297,30 @@ def test_a_signal_during_an_import_ends_the_command_after_it() -> None:
     with pytest.raises(typer.Exit) as ended:
         command()
     assert (ended.value.exit_code, steps) == (128 + signal.SIGTERM, ["import"])
+
+
+@pytest.mark.parametrize(
+    ("error", "is_complete", "said"),
+    [
+        (MemoryError(), True, "the report does not fit into memory; 'agalign report"),
+        (OutputError("index.html: cannot be written"), False, "index.html: cannot be written"),
+    ],
+)
+def test_a_report_that_cannot_be_written_is_not_announced(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    error: Exception,
+    is_complete: bool,
+    said: str,
+) -> None:
+    """Where only the memory is too small for the report, the run is complete."""
+    monkeypatch.setattr(align_run, "write_pages", raising(error))
+    totals = RunTotals(is_complete=True)
+    totals.add(CaptureReport("a", "done", example(), tmp_path / "a.json"))
+    align_run._write_pages(tmp_path, Terminal(), totals)
+    conclude(totals, tmp_path, Terminal())
+    printed = capsys.readouterr()
+    assert said in printed.err
+    assert "Report:" not in printed.out
+    assert totals.is_complete == is_complete
