@@ -8,6 +8,8 @@ import sys
 
 import agalign
 
+if len(sys.argv) != 2:
+    sys.exit("usage: python examples/ndvi_over_a_flight.py ALIGNED")
 flight = agalign.open_flight(sys.argv[1])
 print(flight)
 

@@ -10,6 +10,8 @@ import agalign
 
 
 def main() -> None:
+    if len(sys.argv) != 4:
+        sys.exit("usage: python examples/next_flight.py FIRST SECOND OUT")
     first, second, out = sys.argv[1], sys.argv[2], Path(sys.argv[3])
     agalign.align_folder(first, out / "first", run=agalign.RunOptions(jobs=0))
     (model,) = (out / "first" / "models").glob("*.safetensors")

@@ -7,6 +7,8 @@ import sys
 
 import agalign
 
+if len(sys.argv) != 3:
+    sys.exit("usage: python examples/one_capture.py FLIGHT OUT")
 flight = agalign.discover(sys.argv[1])
 capture = flight.captures[0]
 print(capture.label, *(band.name for band in capture.bands))

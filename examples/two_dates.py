@@ -14,6 +14,8 @@ from agalign.batch.run import run_flight
 from agalign.cameras.discover import FolderScan, captures_onto
 from agalign.config import FlightSettings, Settings, WriteSettings
 
+if len(sys.argv) != 4:
+    sys.exit("usage: python examples/two_dates.py EARLIER.tif LATER.tif CHANGE.tif")
 earlier, later, target = map(Path, sys.argv[1:4])
 with tempfile.TemporaryDirectory() as folder:
     pair = FolderScan(earlier.parent, tuple(captures_onto(earlier, [later])), ())

@@ -9,6 +9,8 @@ import agalign
 
 
 def main() -> None:
+    if len(sys.argv) != 3:
+        sys.exit("usage: python examples/whole_flight.py FLIGHT OUT")
     settings = agalign.Settings(write=agalign.WriteSettings(format="cog", interpolation="bilinear"))
     # Two captures at a time. RunOptions(executor=...) takes any concurrent.futures executor instead.
     for report in agalign.align_folder(sys.argv[1], sys.argv[2], settings=settings, run=agalign.RunOptions(jobs=2)):

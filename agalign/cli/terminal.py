@@ -11,6 +11,7 @@ import threading
 import traceback
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
+from datetime import UTC, datetime
 from enum import IntEnum
 from types import FrameType
 from typing import TYPE_CHECKING, Annotated, Any
@@ -89,9 +90,10 @@ class Terminal:
         self.err = _console(stderr=True, soft_wrap=not sys.stderr.isatty())
 
     def event(self, kind: str, text: str = "", /, **fields: Any) -> None:
-        """Print a line of progress: JSON with --log-json, else the text unless --quiet."""
+        """Print a line of progress: JSON with the time (UTC) with --log-json, else the text unless --quiet."""
         if self.log_json:
-            line = json.dumps({"event": kind, **{k: in_json(v) for k, v in fields.items()}}, default=str)
+            facts = {"event": kind, "time": datetime.now(UTC).isoformat(timespec="milliseconds")}
+            line = json.dumps(facts | {k: in_json(v) for k, v in fields.items()}, default=str)
             self.err.out(line, highlight=False)
         elif text and not self.quiet:
             self.err.print(escape_controls(text))

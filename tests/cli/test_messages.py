@@ -5,6 +5,7 @@ import json
 import os
 import re
 import signal
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import get_args
 
@@ -103,6 +104,7 @@ def test_usage_errors_are_events_of_the_json_log(command: str) -> None:
     assert plain.returncode == logged.returncode == 2
     event = json.loads(logged.stderr)
     assert plain.stderr == f"agalign: {event['message']}\n"
+    assert abs((datetime.now(UTC) - datetime.fromisoformat(event.pop("time"))).total_seconds()) < 600
     assert event == {"event": "problem", "message": event["message"]}
 
 

@@ -413,6 +413,10 @@ class PreviewPart(_Part):
 class Sidecar(_Part):
     """Result of one capture."""
 
+    model_config = ConfigDict(
+        json_schema_extra={"$schema": "https://json-schema.org/draft/2020-12/schema", "$id": f"urn:{SCHEMA}"}
+    )
+
     schema_: Annotated[Literal["agalign/2"], Field(alias="schema")] = "agalign/2"
     """Version of this format."""
     agalign: str
