@@ -249,10 +249,13 @@ class _FlightRun:
         """Learn the model of each flight, keep finished captures and process the others; yield their reports as they
         complete.
         """
-        left = {capture.label: self.remaining(capture) for capture in captures}
-        # Of the earlier results; the results themselves, of a season, would not fit into memory.
-        grids = {label: grid for label, one in left.items() if (grid := self._earlier_grid(one)) is not None}
-        left = {label: replace(one, earlier=None) for label, one in left.items()}
+        left: dict[str, Remaining] = {}
+        grids: dict[str, OutputGrid] = {}  # of the earlier results, which of a season would not fit into memory
+        for capture in captures:
+            one = self.remaining(capture)
+            left[capture.label] = replace(one, earlier=None)
+            if (grid := self._earlier_grid(one)) is not None:
+                grids[capture.label] = grid
         groups = flights_of(captures)
         on_cpu = choose_device(self.settings.joint.device).type == "cpu"
         cores = self.options.jobs or (usable_cores() if on_cpu else 1)
@@ -297,9 +300,9 @@ class _FlightRun:
         """Return the grid of the rasters of an earlier result if this run makes the same; None without any."""
         if left.earlier is None or left.earlier.output is None:
             return None
-        before = WriteSettings.model_validate((left.earlier.options or {}).get("write", {}))
-        names = "crop", "resolution", "undistort"
-        is_same = all(getattr(before, name) == getattr(self.settings.write, name) for name in names)
+        before = (left.earlier.options or {}).get("write", {})
+        now = self.settings.write.model_dump(mode="json", exclude_defaults=True)
+        is_same = all(before.get(name) == now.get(name) for name in ("crop", "resolution", "undistort"))
         return left.earlier.output.grid if is_same else None
 
     def _model(
