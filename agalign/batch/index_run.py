@@ -85,7 +85,9 @@ def do_indices(task: IndexTask) -> list[IndexReport]:
         bands = bands_of(sidecar, task.sidecar.parent, mask_qa=task.mask_qa)
         reports = [*write_rasters(bands, task.indices, base, task.label, overwrite=task.overwrite)]
         if task.target == task.out:
-            rasters = [r.path for r in reports if r.path is not None and not r.kept]
+            listed = {part.file for part in sidecar.products}
+            # A command that was killed may have written a raster that the sidecar does not list.
+            rasters = [r.path for r in reports if r.path is not None and not (r.kept and r.path.name in listed)]
             files = [p for path in rasters for p in (path, path.with_suffix(".png"))]
             add_products(task.sidecar, IndexRasters.kind, files)
     except AgalignError as error:

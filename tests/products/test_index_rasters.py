@@ -12,6 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from synthetic_flights.aligned import make_aligned
 
+from agalign.batch import index_run
 from agalign.batch.index_run import index_tasks, run_indices
 from agalign.errors import ConfigurationError, InputError
 from agalign.products.indices.formulas import INDICES, bands_for, compute, evaluate, index_named, index_of_formula
@@ -21,7 +22,7 @@ from agalign.products.run.captures import RAW, AlignedBand
 from agalign.products.sidecar.file import read_sidecar, verify_outputs, write_sidecar
 from agalign.products.sidecar.schema import FilePart
 
-from ..conftest import write_band
+from ..conftest import raising, write_band
 from .conftest import indices_of, table_in
 
 NO_FORMULAS = """__import__('os').system('true')\nN.real\n(lambda: N)()\nN if R else B\n[N][0]\nN; R\nN @ R\n'a'*N
@@ -292,3 +293,17 @@ def test_values_and_nodata() -> None:
     noise = compute(INDICES["ndvi"], [np.float32([[-0.01, 0.03]]), np.float32([[0.006, -0.01]])])
     visible = np.float32([[[0.1, 0.05]], [[0.02, 0.04]], [[0.118, 0.19]]])
     assert np.isnan([noise, compute(INDICES["vari"], list(visible))]).all()
+
+
+def test_a_raster_of_a_killed_command_is_listed_by_the_next_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    make_aligned(tmp_path, 1)
+    with monkeypatch.context() as patch:
+        patch.setattr(index_run, "add_products", raising(KeyboardInterrupt()))
+        with pytest.raises(KeyboardInterrupt):
+            indices_of(tmp_path)
+    (report,) = indices_of(tmp_path)
+    assert report.kept
+    listed = read_sidecar(tmp_path / "0000SET" / "IMG_0001.json").products
+    assert [part.file for part in listed if part.kind == "index"] == ["IMG_0001_ndvi.tif", "IMG_0001_ndvi.png"]
