@@ -1,7 +1,7 @@
 """Rendering: the files of a capture, from its images and the result of its estimation.
 
 A product that an earlier command wrote is written again with the settings of this one, whether they ask for it or not.
-One that cannot be written any more is removed, and the report of the capture says so.
+One that cannot be written any more is removed, and the report of the capture names it.
 """
 
 import re
@@ -176,8 +176,9 @@ def _foreign_file(sidecar: Path, written: Sequence[Path]) -> Path | None:
     """
     if sidecar.is_file():
         return None if is_sidecar(sidecar) else sidecar
-    others = (path for path in written if path.is_file() and not path.name.endswith(PARALLAX_SUFFIX))
-    return next((path for path in others if not is_aligned_raster(path)), None)
+    existing = [path for path in written if path.is_file() and not path.name.endswith(PARALLAX_SUFFIX)]
+    # A sidecar may have been deleted to estimate the capture again.
+    return None if any(map(is_aligned_raster, existing)) else next(iter(existing), None)
 
 
 def outdated_files(capture: Capture, out: Path, settings: WriteSettings, sidecar: Sidecar | None) -> Mapping[Path, str]:

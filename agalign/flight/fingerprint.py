@@ -45,7 +45,7 @@ def render_fingerprint(capture: Capture, settings: WriteSettings) -> str:
         calibration = None if b.radiometry is None else (b.radiometry.quantity, b.radiometry.gain)
         georeference = None if b.georeference is None else b.georeference.transform
         facts.append((b.name, calibration, georeference))
-    return hashed(__version__, settings.model_dump_json(exclude={"indices"}), facts)
+    return hashed(__version__, settings.model_dump_json(exclude={"indices"}), repr(capture.pose), facts)
 
 
 def _fingerprint(capture: Capture, *stages: SettingsModel) -> str:

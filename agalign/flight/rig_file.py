@@ -16,7 +16,7 @@ from agalign.values.geometry import normalised
 from agalign.values.mapping import DisplacementField
 
 _MAX_SIDE_PX, _MAX_FIELD_PX, _MAX_NUMBER = 100_000, 1e4, 1e12
-"""Limits of the sizes, of the displacements, and of all numbers of a rig, of which times are the largest."""
+"""Limits of the sizes, of the displacements, and of all numbers of a rig; times are the largest."""
 
 
 def rig_to_json(rig: Rig) -> str:

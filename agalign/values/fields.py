@@ -1,8 +1,8 @@
 """Types of the fields of records that are written to JSON: numbers and arrays with their precision in a file.
 
 A record is a frozen dataclass of pydantic with `RECORD`. The program makes it of any floats and arrays; JSON is
-validated when it is read: numbers are finite and limited, arrays have their shape, and null stands for a number that
-could not be measured.
+validated when it is read: numbers are finite and limited, arrays have their shape, and null is a number that could
+not be measured.
 """
 
 import math
@@ -43,7 +43,7 @@ class _Limited:
 
 @dataclass(frozen=True)
 class Measured:
-    """A float with these decimals in JSON, where null stands for `missing`."""
+    """A float with these decimals in JSON, where null is `missing`."""
 
     decimals: int | None = None
     missing: float = math.nan
@@ -74,7 +74,7 @@ class Array:
     decimals: int | None = None
     integers: bool = False
     nullable: bool = False
-    """In JSON, null stands for nan."""
+    """In JSON, null is nan."""
 
     def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
         number = (

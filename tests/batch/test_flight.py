@@ -118,7 +118,9 @@ def test_a_model_of_another_camera_or_of_no_use_is_refused(flight: Path, model: 
             run(flight, tmp_path / "out", model=path)
         assert str(refused.value) == f"{path}: was learned {difference}; leave --model out"
     alone = agalign.Settings(flight=agalign.FlightSettings(together=False))
-    with pytest.raises(agalign.ConfigurationError, match="needs one network per flight"):
+    with pytest.raises(
+        agalign.ConfigurationError, match="is not used, as --each-alone learns a network for each capture"
+    ):
         run(flight, tmp_path / "out", alone, model=path)
 
 

@@ -124,7 +124,7 @@ def test_files_that_are_no_models_are_an_error(tmp_path: Path) -> None:
 def test_a_rig_with_values_that_no_camera_has_is_refused(
     model: FlightModel, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, change: dict[str, Any], said: str
 ) -> None:
-    """The report reads it too, without torch, and goes on without it."""
+    """The report reads it too, without torch, and omits it."""
     text = json.dumps(json.loads(rig_to_json(model.rig)) | change)
     monkeypatch.setattr(model_module, "rig_to_json", lambda _: text)
     path = tmp_path / "models" / "changed.safetensors"

@@ -43,7 +43,7 @@ def test_a_good_result_has_no_issues() -> None:
 @pytest.mark.parametrize(
     ("joint", "measured", "expected"),
     [
-        ({"retrieval": 0.0}, 1.0, "retrieval"),
+        ({"retrieval": NAN}, 1.0, "retrieval"),
         ({"corner_covariance_px2": np.full((8, 8), NAN)}, 1.0, "inaccurate"),
         ({"corner_std_xy_px": ((float("inf"), 0.1),) * 4}, 1.0, "inaccurate"),
         ({"fixed_to_moving": np.diag([-1.0, 1, 1])}, 1.0, "folds"),

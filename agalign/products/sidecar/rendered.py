@@ -52,7 +52,7 @@ def rendered(context: ProductContext, not_written: Sequence[str] = (), seconds: 
             "not_written": list(not_written),
             "rendered_with": render_fingerprint(capture, context.settings.write),
             "options": options,
-            "seconds": round(sidecar.seconds + seconds, 3),
+            "seconds": round(sum(band.seconds for band in sidecar.bands) + seconds, 3),
         }
     )
 
