@@ -9,7 +9,7 @@ from operator import index
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike, NDArray  # the former in quotes: help() prints its name, not 1,000 characters
 
 from agalign.batch.capture_task import CaptureReport, FlightReports, Task, process_capture, quiet
 from agalign.batch.earlier_results import refuse_other_captures
@@ -38,13 +38,13 @@ _LOG = logging.getLogger(__name__)
 
 
 def align(
-    fixed: ArrayLike,
-    moving: ArrayLike,
+    fixed: "ArrayLike",
+    moving: "ArrayLike",
     *,
-    seed: ArrayLike | None = None,
+    seed: "ArrayLike | None" = None,
     seed_std_px: float | None = None,
-    fixed_valid: ArrayLike | None = None,
-    moving_valid: ArrayLike | None = None,
+    fixed_valid: "ArrayLike | None" = None,
+    moving_valid: "ArrayLike | None" = None,
     settings: Settings | None = None,
 ) -> Alignment:
     """Estimate the homography between two images of the same scene, which may be of different modalities.
@@ -89,11 +89,11 @@ def align(
 
 
 def warp_onto(
-    moving: ArrayLike,
-    fixed_to_moving: ArrayLike,
+    moving: "ArrayLike",
+    fixed_to_moving: "ArrayLike",
     fixed_size_px: tuple[int, int],
     *,
-    valid: ArrayLike | None = None,
+    valid: "ArrayLike | None" = None,
     interpolation: Interpolation = "lanczos",
 ) -> tuple[NDArray[np.generic], Mask]:
     """Resample an image to a grid of (width, height) pixels by a homography (3x3) that maps its pixels to the image.

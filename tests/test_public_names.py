@@ -1,6 +1,7 @@
 """The names that `import agalign` offers, and what its objects print."""
 
 import operator
+import pydoc
 import re
 import typing
 from pathlib import Path
@@ -49,6 +50,11 @@ def test_types_in_the_signatures_are_public(name: str) -> None:
     ours = {t.__name__ for t in own if t.__module__.startswith("agalign") and hasattr(t, "__name__")}
     assert ours
     assert ours <= set(agalign.__all__)
+
+
+@pytest.mark.parametrize("name", [*FUNCTIONS.split(), *RESULTS.split()])
+def test_help_prints_names_of_array_types(name: str) -> None:
+    assert "_NestedSequence" not in pydoc.render_doc(getattr(agalign, name))
 
 
 def test_settings_print_values_other_than_defaults() -> None:

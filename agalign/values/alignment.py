@@ -7,7 +7,7 @@ from functools import cached_property
 from typing import Annotated
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike, NDArray  # the former in quotes: help() prints its name, not 1,000 characters
 from pydantic import Field
 from pydantic import dataclasses as validated
 
@@ -361,11 +361,11 @@ class Alignment:
             return "predicted"
         return "seed_only" if self.is_seed_usable else "failed"
 
-    def map(self, reference_px: ArrayLike) -> Points:
+    def map(self, reference_px: "ArrayLike") -> Points:
         """Map raw pixels (..., 2) of the reference to raw pixels of the moving image, (0, 0) a pixel's centre."""
         return self.mapping(reference_px)
 
-    def inverse(self, moving_px: ArrayLike) -> Points:
+    def inverse(self, moving_px: "ArrayLike") -> Points:
         """Map raw pixels (..., 2) of the moving image to raw pixels of the reference, to 0.001 px.
 
         Where the parallax hides a part of the scene, one of several solutions. NaN where the iteration diverges.
@@ -374,9 +374,9 @@ class Alignment:
 
     def warp(
         self,
-        moving: ArrayLike,
+        moving: "ArrayLike",
         *,
-        valid: ArrayLike | None = None,
+        valid: "ArrayLike | None" = None,
         nodata: float | None = None,
         interpolation: Interpolation = "lanczos",
     ) -> tuple[NDArray[np.generic], Mask]:
