@@ -4,7 +4,7 @@ import platform
 from importlib import metadata
 
 REQUIRED = ("torch", "numpy", "opencv-python-headless", "rasterio", "tifffile", "scikit-image", "scipy", "pydantic")
-OPTIONAL = ("distributed", "itk-elastix", "pystac", "rioxarray", "spyndex", "xarray")
+OPTIONAL = ("distributed", "itk-elastix", "rioxarray", "spyndex", "xarray")
 """Libraries of extras."""
 
 
