@@ -455,7 +455,7 @@ def reports_of(sidecar: Sidecar, folder: str, out: Path) -> list[IndexReport]:
 
 
 def read_table(out: Path) -> list[IndexReport]:
-    """Return the rows of OUT/indices.csv; empty if there is no table."""
+    """Return the rows of OUT/indices.csv, or an empty list if the file does not exist."""
     try:
         text = read_regular(out / INDICES_FILE).decode()
         # Lines may have too few or too many cells.

@@ -32,8 +32,8 @@ class FlightMap:
     def add(self, folder: str, sidecar: Sidecar) -> None:
         """Add a capture, given its folder relative to the output folder.
 
-        The geometry is the footprint of the aligned rasters, or of the reference if there are none; else the position
-        of the camera; else null.
+        The geometry is the footprint of the aligned rasters, or of the reference if there are none. Without a footprint
+        it is the position of the camera, and null if that is unknown.
         """
         path = Path(folder)
         label = (path / sidecar.capture).as_posix()
