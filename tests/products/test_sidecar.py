@@ -136,7 +136,7 @@ def test_the_grid_is_fine_where_a_lens_bends_it() -> None:
     for part in Sidecar.estimated(Capture("c", Path(), bands, 0), alignments, Settings()).bands[1:]:
         reference_px, moving_px = np.array(part.grid.reference_px), np.array(part.grid.moving_px)
         x, y = np.unique(reference_px[:, 0]), np.unique(reference_px[:, 1])
-        assert (len(x), len(y)) == ((49, 37) if part.band == "rgb" else (17, 13))
+        assert (len(x), len(y)) == ((57, 43) if part.band == "rgb" else (17, 13))
         splines = (RectBivariateSpline(y, x, v.reshape(len(y), len(x))) for v in moving_px.T)
         for there in (
             CloughTocher2DInterpolator(reference_px, moving_px)(at_px),

@@ -8,7 +8,7 @@ from agalign.values import geometry
 from agalign.values.geometry import Points
 from agalign.values.mapping import PixelMapping
 
-_GRIDS = ((17, 13), (33, 25), (49, 37), (65, 49), (97, 73), (129, 97))
+_GRIDS = ((17, 13), (25, 19), (33, 25), (41, 31), (49, 37), (57, 43), (65, 49), (97, 73), (129, 97))
 """Columns and rows of the samples; the first with a small enough error is used."""
 _MAX_INTERPOLATION_ERROR_PX, _INTERPOLATION_PERCENTILE = 0.02, 99
 """Maximum of this percentile of the error of cubic interpolation: less than the error of an alignment. The largest
@@ -16,23 +16,30 @@ errors are at the border, where the derivatives are estimated from one side."""
 
 
 def sampled_mapping(mapping: PixelMapping, size_px: tuple[int, int]) -> Points:
-    """Return the points (n, 2) of an image (width, height) from which cubic interpolation reproduces a smooth mapping,
-    or the densest grid.
+    """Return the pixels (n, 2) of an image (width, height) from which cubic interpolation reproduces a smooth mapping,
+    or those of the densest grid, row by row.
 
     Clough-Tocher, which works on any points, is less accurate than splines on the lattice.
     """
-    points_px = geometry.lattice(*size_px, *_GRIDS[0])
+    points_px = _pixel_lattice(size_px, *_GRIDS[0])
     if min(size_px) == 1:
         return points_px  # points on one line have no triangles
     for columns, rows in _GRIDS:
-        points_px = geometry.lattice(*size_px, columns, rows)
-        between_px = geometry.lattice(*size_px, 2 * columns - 1, 2 * rows - 1)
+        points_px = _pixel_lattice(size_px, columns, rows)
+        # The midpoints alone, as the error is 0 at the points themselves.
+        between_px = geometry.lattice(*size_px, 2 * columns - 1, 2 * rows - 1).reshape(2 * rows - 1, -1, 2)[1::2, 1::2]
         interpolated = CloughTocher2DInterpolator(points_px, mapping(points_px))
         error_px = np.abs(interpolated(between_px) - mapping(between_px))
         # Rounding moves some points at the border outside of the triangles: NaN.
         if np.nanpercentile(error_px, _INTERPOLATION_PERCENTILE) <= _MAX_INTERPOLATION_ERROR_PX:
             break
     return points_px
+
+
+def _pixel_lattice(size_px: tuple[int, int], columns: int, rows: int) -> Points:
+    """Centres (n, 2) of pixels that are spaced as evenly as whole numbers allow: fractions would make files larger."""
+    x_px, y_px = (np.unique(np.rint(np.linspace(0, n - 1, k))) for n, k in zip(size_px, (columns, rows), strict=True))
+    return np.stack(np.meshgrid(x_px, y_px), axis=-1).reshape(-1, 2)
 
 
 def sampled_parallax(

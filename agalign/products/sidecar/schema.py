@@ -46,9 +46,11 @@ from agalign.values.pixel_units import PixelScale
 
 SCHEMA = "agalign/2"
 PointPx = tuple[Number, Number]
-Slopes = Annotated[NDArray[np.float64], Array((None, 2), 7)]
-Curvatures = Annotated[NDArray[np.float64], Array((None, 2), 9)]
-"""They are multiplied by the parallax, up to hundreds of px, and by its square."""
+SampledPx = Annotated[NDArray[np.float64], Array((None, 2), 3)]
+"""Their rounding is small compared with the error of interpolation between them."""
+Slopes = Annotated[NDArray[np.float64], Array((None, 2), 5)]
+Curvatures = Annotated[NDArray[np.float64], Array((None, 2), 7)]
+"""They are multiplied by the parallax and by its square: 0.0005 px of rounding each for 100 px."""
 
 
 class _Part(BaseModel):
@@ -96,7 +98,7 @@ class GridPart(_Part):
 
     reference_px: PointsPx
     """Raw pixels of the reference, row by row."""
-    moving_px: PointsPx
+    moving_px: SampledPx
     """The corresponding raw pixels of the band."""
 
     @model_validator(mode="after")
@@ -154,7 +156,7 @@ class ReliefPart(_Part):
     """Share of the reference pixels that are occluded in the band."""
     reference_px: PointsPx
     """Nodes: those of `grid`."""
-    plane_px: PointsPx
+    plane_px: SampledPx
     """Where the reference plane maps them, raw px of the moving file."""
     slope: Slopes
     """Px of the moving file per px of parallax."""
