@@ -189,7 +189,7 @@ def process_capture(task: Task, progress: PairProgress = quiet) -> CaptureReport
         raise InputError(f"{capture.reference.path}: {missing}")
     for band in capture.bands if settings.write.radiometry != "off" else ():
         with suppress(UnreadableFileError):  # the band pair fails with this reason
-            check_pixels(band)
+            check_pixels(band, read)
     for product in PRODUCTS:
         if product.is_enabled(settings.write):
             product.check(capture)

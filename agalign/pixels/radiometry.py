@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from agalign.errors import InputError
-from agalign.pixels.raster import read_for_alignment
+from agalign.pixels.raster import ReadTile, read_for_alignment
 from agalign.values.capture import Band, Capture, PanelFactor, Quantity, Radiometry, RadiometrySource
 from agalign.values.choices import RadiometryChoice
 from agalign.values.image import FloatImage
@@ -40,6 +40,9 @@ light. Single pixels, as of sun glint, are brighter.
 _MAX_BELOW_BLACK = 0.01
 """Minimum median of a band above the black level, negative, relative to the full scale. Water in the near infrared is
 at the black level, which drifts by 0.5 % of the full scale.
+"""
+_STRIP_PX = 1 << 15
+"""Pixels that are calibrated at once: their intermediate results fit into the CPU's cache, which takes half the time.
 """
 
 
@@ -67,15 +70,15 @@ def plausible(radiometry: Radiometry, size_px: tuple[int, int]) -> tuple[Radiome
     return radiometry, ""
 
 
-def check_pixels(band: Band) -> None:
+def check_pixels(band: Band, read: ReadTile) -> None:
     """Raise InputError if the pixels of a band do not fit its calibration, UnreadableFileError if they cannot be read.
 
-    The corrections by position are left out, which are within a factor of 2.
+    The corrections by position are left out, which are within a factor of 2. `read` reads the pixels of the file.
     """
     if band.radiometry is None or band.radiometry.quantity == "temperature":
         return
     longest_side_px, radiometry = 256, band.radiometry
-    image = read_for_alignment(band, longest_side_px)
+    image = read_for_alignment(band, longest_side_px, read)
     raw = float(np.median(image.pixels[image.valid])) if image.valid.any() else radiometry.black_level
     signal = (raw - radiometry.black_level) / radiometry.full_scale
     if signal < -_MAX_BELOW_BLACK:
@@ -148,13 +151,19 @@ def _polynomial(x: NDArray[np.float64], coefficients: Sequence[float]) -> NDArra
 def calibrated(pixels: NDArray[np.generic], radiometry: Radiometry, x0: int, y0: int) -> FloatImage:
     """Calibrate raw pixels (H, W) to float32; the top left pixel is (x0, y0) of the file."""
     height, width = pixels.shape
-    x, y = np.arange(x0, x0 + width, dtype=np.float64), np.arange(y0, y0 + height, dtype=np.float64)
-    signal = (pixels.astype(np.float64) - radiometry.black_level) * (radiometry.gain / radiometry.full_scale)
-    if any(radiometry.vignetting):
-        cx, cy = radiometry.vignetting_centre_px
-        r = np.hypot((x - cx)[None, :], (y - cy)[:, None])
-        falloff = _polynomial(r, (1.0, *radiometry.vignetting))
-        (np.divide if radiometry.vignetting_divides else np.multiply)(signal, falloff, out=signal)
-    if radiometry.row_gradient:
-        signal /= 1.0 + radiometry.row_gradient * y[:, None]
-    return np.asarray(signal, np.float32)
+    result = np.empty((height, width), np.float32)
+    x = np.arange(x0, x0 + width, dtype=np.float64)
+    strip_px = max(1, _STRIP_PX // max(width, 1))
+    for top in range(0, height, strip_px):
+        strip = pixels[top : top + strip_px]
+        y = np.arange(y0 + top, y0 + top + len(strip), dtype=np.float64)
+        signal = (strip.astype(np.float64) - radiometry.black_level) * (radiometry.gain / radiometry.full_scale)
+        if any(radiometry.vignetting):
+            cx, cy = radiometry.vignetting_centre_px
+            r = np.hypot((x - cx)[None, :], (y - cy)[:, None])
+            falloff = _polynomial(r, (1.0, *radiometry.vignetting))
+            (np.divide if radiometry.vignetting_divides else np.multiply)(signal, falloff, out=signal)
+        if radiometry.row_gradient:
+            signal /= 1.0 + radiometry.row_gradient * y[:, None]
+        result[top : top + strip_px] = signal
+    return result

@@ -255,16 +255,20 @@ def read_for_alignment(band: Band, longest_side_px: int, read: ReadTile | None =
     """Read a band as float32, reduced by averaging to at most `longest_side_px`, and its mask.
 
     Nodata, masked and saturated pixels and constant areas at the border are invalid. `read` reads the pixels of a file
-    that is not reduced, by default `read_tile`. Raises UnreadableFileError.
+    that GDAL does not reduce, by default `read_tile`. Raises UnreadableFileError.
     """
     reduction = max(1.0, max(band.size_px) / longest_side_px)
     shape = reduced_size_px(band.size_px, reduction)[::-1]
-    if reduction == 1:
+    # OpenCV resizes no integers of 32 or 64 bits.
+    all_valid = band.nodata is None and not band.has_mask and band.dtype in ("uint8", "uint16")
+    if reduction == 1 or (all_valid and band.width_px * band.height_px <= MAX_DECODED_PX):
         pixels, mask = (read or read_tile)(band, Tile(0, 0, *band.size_px))
         valid = mask.copy()
+        if reduction > 1:  # GDAL's averaging decodes a JPEG repeatedly, which takes seconds per band
+            pixels, valid = cv2.resize(pixels, shape[::-1], interpolation=cv2.INTER_AREA), np.ones(shape, bool)
     else:
         with open_raster(band.path, band.page) as dataset:
-            pixels = _reduced(dataset, band, shape)
+            pixels = dataset.read(band.index_in_page, out_shape=shape, resampling=Resampling.average)
             valid = data_mask(pixels, band.nodata)
             valid &= _dataset_mask(dataset, band.index_in_page, out_shape=shape, resampling=Resampling.nearest)
     if band.nodata is None:
@@ -274,16 +278,6 @@ def read_for_alignment(band: Band, longest_side_px: int, read: ReadTile | None =
     result = pixels.astype(np.float32)
     result[~valid] = 0
     return Raster(result, valid, lens.rescaled(band.lens, scale))
-
-
-def _reduced(dataset: rasterio.DatasetReader, band: Band, shape: tuple[int, int]) -> NDArray[np.generic]:
-    """Read a band reduced to `shape` (height, width) by averaging."""
-    # OpenCV resizes no integers of 32 or 64 bits.
-    all_valid = band.nodata is None and not band.has_mask and band.dtype in ("uint8", "uint16")
-    if all_valid and band.width_px * band.height_px <= MAX_DECODED_PX:
-        # GDAL's averaging decodes a JPEG repeatedly, which takes seconds per band.
-        return np.asarray(cv2.resize(dataset.read(band.index_in_page), shape[::-1], interpolation=cv2.INTER_AREA))
-    return np.asarray(dataset.read(band.index_in_page, out_shape=shape, resampling=Resampling.average))
 
 
 def read_tile(

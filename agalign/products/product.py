@@ -12,7 +12,7 @@ from agalign.config import Settings, WriteSettings
 from agalign.pixels.raster import ReadTile, read_tile
 from agalign.products.rasters.geotiff import Block, LayerDescription, write_on_grid
 from agalign.products.rasters.output_grid import FlightLimits, Layer
-from agalign.products.report.drawing import ReducedBands, read_reduced_bands
+from agalign.products.report.drawing import Grey, ReducedBands, read_reduced_bands
 from agalign.products.sidecar.schema import PreviewPart, Sidecar
 from agalign.values.alignment import Alignment, Residual
 from agalign.values.capture import Capture
@@ -97,6 +97,8 @@ class ProductContext:
     """Reads the pixels of the files of the capture."""
     ties: Mapping[str, Residual] = field(default_factory=dict)
     """Windows by moving band, measured under the mapping; empty unless tie points are written."""
+    written_grey: dict[str, Grey] = field(default_factory=dict)
+    """Written bands as grey images where these need no reduction, so that the files are not decoded for them."""
     lost: dict[Path, str] = field(default_factory=dict)
     """Files of an earlier command that cannot be rendered again, and why."""
 
@@ -132,7 +134,7 @@ class ProductContext:
     def reduced_bands(self) -> ReducedBands:
         """The bands as reduced grey images, before and after alignment. Raises UnreadableFileError."""
         places = {name: (file.path, index) for name, (file, index) in self.places.items()}
-        return read_reduced_bands(self.capture, places, self.grid, self.read)
+        return read_reduced_bands(self.capture, places, self.grid, self.read, self.written_grey)
 
 
 class Product(ABC):

@@ -15,7 +15,7 @@ from agalign.cameras.tiff_directory import EXIF, GPS, XMP, add_directories, byte
 from agalign.config import WriteSettings
 from agalign.errors import InputError
 from agalign.pixels.radiometry import calibrated, check_pixels, plausible, with_radiometry
-from agalign.pixels.raster import probe
+from agalign.pixels.raster import probe, read_tile
 from agalign.values.capture import Band, Capture, PanelFactor, Radiometry
 from agalign.values.choices import RadiometryChoice
 
@@ -146,7 +146,7 @@ def test_pixels_that_do_not_fit_the_calibration_are_refused(tmp_path: Path) -> N
     def check(raw: int, black: float, gain: float) -> None:
         path = tmp_path / "a.tif"
         tifffile.imwrite(path, (raw + np.random.default_rng(0).integers(-50, 50, (60, 80))).astype(np.uint16))
-        check_pixels(replace(probe(path)[0], radiometry=Radiometry("reflectance", black, 65536.0, gain)))
+        check_pixels(replace(probe(path)[0], radiometry=Radiometry("reflectance", black, 65536.0, gain)), read_tile)
 
     crop, water_in_near_infrared, snow = (20000, 4800.0, 1.0), (4700, 4800.0, 1.0), (60000, 4800.0, 1.3)
     for scene in (crop, water_in_near_infrared, snow):

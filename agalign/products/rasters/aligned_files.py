@@ -27,11 +27,12 @@ from agalign.config import WriteSettings
 from agalign.errors import AgalignError, UnreadableFileError
 from agalign.pixels.band_resampling import resample_tile
 from agalign.pixels.radiometry import calibrated
-from agalign.pixels.raster import GDAL_ENVIRONMENT, open_raster, suffix_format, without_warnings
+from agalign.pixels.raster import GDAL_ENVIRONMENT, open_raster, suffix_format, with_nan, without_warnings
 from agalign.products.indices.formulas import Role, role_of_band
 from agalign.products.product import CapturePaths, Product, ProductContext, WrittenFile
 from agalign.products.rasters.geotiff import Block, LayerDescription, compressed, write_on_grid
 from agalign.products.rasters.output_grid import Layer, is_inside
+from agalign.products.report.drawing import MAX_REDUCED_PX, grey
 from agalign.values import geometry
 from agalign.values.capture import Band, Capture, Quantity, Radiometry
 from agalign.values.choices import Compression, Interpolation
@@ -278,6 +279,8 @@ def _blocks(
                 pixels = pixels.astype(dtype, copy=False)
                 if nodata is not None and not (valid.all() and layer.is_copied):
                     pixels = with_nodata(pixels, valid, nodata)
+                if pixels.shape == (grid.height, grid.width) and max(pixels.shape) <= MAX_REDUCED_PX:
+                    context.written_grey[layer.band.name] = grey(with_nan(pixels, nodata))
             yield pixels, index, tile.x0 - grid.x0, tile.y0 - grid.y0
 
 

@@ -20,6 +20,8 @@ Grey = NDArray[np.uint8]
 """(height, width)"""
 Picture = NDArray[np.uint8]
 """(height, width, 3) red, green, blue."""
+MAX_REDUCED_PX = 2048
+"""Longer side of reduced images: larger than most screens."""
 
 
 @dataclass(frozen=True)
@@ -37,13 +39,16 @@ class ReducedBands:
 
 
 def read_reduced_bands(
-    capture: Capture, places: Mapping[str, tuple[Path, int]], grid: OutputGrid, read: ReadTile = read_tile
+    capture: Capture,
+    places: Mapping[str, tuple[Path, int]],
+    grid: OutputGrid,
+    read: ReadTile = read_tile,
+    written: Mapping[str, Grey] | None = None,
 ) -> ReducedBands:
     """Read the bands of a capture, given file and index of each written band, and a function that reads the pixels of
-    the capture's files. Raises UnreadableFileError for the written ones.
+    the capture's files. Those of `written` are known already. Raises UnreadableFileError for the written ones.
     """
-    max_side_px = 2048  # longer side of the images: larger than most screens
-    size_px = reduced_size_px((grid.width, grid.height), max(1.0, max(grid.width, grid.height) / max_side_px))
+    size_px = reduced_size_px((grid.width, grid.height), max(1.0, max(grid.width, grid.height) / MAX_REDUCED_PX))
     before, saturated = {}, {}
     for band in capture.bands:
         with suppress(UnreadableFileError):  # the band pair has failed with this reason
@@ -55,11 +60,14 @@ def read_reduced_bands(
             else:
                 window_px = window.x0, window.y0, window.width, window.height
                 plane = read_preview(band.path, band.index_in_page, window_px, size_px, band.page)
-            before[band.name] = _grey(plane)
+            before[band.name] = grey(plane)
             if band.saturation_value is not None:
                 saturated[band.name] = float((plane >= band.saturation_value).mean())
-    whole_px = (0, 0, grid.width, grid.height)
-    after = {name: _grey(read_preview(*place, whole_px, size_px)) for name, place in places.items()}
+    whole_px, known = (0, 0, grid.width, grid.height), written or {}
+    after = {
+        name: known[name] if name in known else grey(read_preview(*place, whole_px, size_px))
+        for name, place in places.items()
+    }
     return ReducedBands(before, after, size_px, saturated)
 
 
@@ -67,8 +75,10 @@ def _is_inside(tile: Tile, size_px: tuple[int, int]) -> bool:
     return tile.x0 >= 0 and tile.y0 >= 0 and tile.x0 + tile.width <= size_px[0] and tile.y0 + tile.height <= size_px[1]
 
 
-def _grey(plane: NDArray[np.float32]) -> Grey:
-    """The grey values between percentiles of the plane itself: raw numbers and reflectance have different ranges."""
+def grey(plane: NDArray[np.float32]) -> Grey:
+    """Return the grey values of a band (height, width), NaN for nodata, between its own percentiles: raw numbers and
+    reflectance have different ranges.
+    """
     sample_pixels = 20_000  # pixels from which the contrast is calculated: percentiles then have an error of 0.1 %
     sample = plane.ravel()[:: max(1, plane.size // sample_pixels)]
     sample = sample[np.isfinite(sample) & (sample != 0)]

@@ -34,6 +34,8 @@ ERROR_FULL_PX = 0.5
 """Expected error that is shown as white."""
 _MAX_TILE_PX = 640
 """Limit of the longer side of a tile."""
+_DETAIL_SHARE = 0.35
+"""Sides of a detail relative to those of a tile."""
 _JPEG_QUALITY = 35
 """Low: edges, which show misalignment, remain sharp, and the size limits the resolution."""
 _RELIEF_PERCENTILES = 1.0, 99.0
@@ -111,8 +113,9 @@ def write_preview(
     first = next(images[name] for name in bands for images in (views.after, views.before) if name in images)
     size_px = reduced_size_px(views.size_px, longest_px / tile_px)
     of_tile = len(encoded(_resized(first, size_px), path, cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY))
-    if 2 * len(bands) * of_tile > max_bytes:
-        tile_px = smaller_px(2 * len(bands) * of_tile)
+    of_all = 2 * len(bands) * of_tile * (1 + _DETAIL_SHARE**2)
+    if of_all > max_bytes:
+        tile_px = smaller_px(of_all)
     for _ in range(6):  # one step is usually sufficient
         part, sheet = _sheet(views, bands, errors_px, relief, tile_px / longest_px, path.name)
         data = encoded(sheet, path, cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY)
@@ -134,8 +137,7 @@ def _sheet(
 ) -> tuple[PreviewPart, Grey]:
     width, height = views.size_px
     tile_px = _whole_blocks(width * scale, width), _whole_blocks(height * scale, height)
-    detail_share = 0.35  # of a tile
-    detail_px = _whole_blocks(tile_px[0] * detail_share, width), _whole_blocks(tile_px[1] * detail_share, height)
+    detail_px = _whole_blocks(tile_px[0] * _DETAIL_SHARE, width), _whole_blocks(tile_px[1] * _DETAIL_SHARE, height)
     first = next(images[n] for n in bands for images in (views.after, views.before) if n in images)
     x, y = busiest_window(first, detail_px)
     black = np.zeros(views.size_px[::-1], np.uint8)
