@@ -22,6 +22,7 @@ from agalign.method.device import choose_device
 from agalign.method.joint import refine_with
 from agalign.method.refine import FLIGHT_PATCHES
 from agalign.method.state import ImageGroup, JointState
+from agalign.pixels.capture_pixels import CapturePixels
 from agalign.pixels.raster import with_saturation_values
 from agalign.values.alignment import MIN_RETRIEVAL, PairScales, RefinedPair, Residual, Seed
 from agalign.values.capture import Capture
@@ -125,7 +126,7 @@ def load_capture(
     `bands` as index in the network. Seeds of kind `match` use the network of `start`.
     """
     with logged_failure(f"{capture.label} cannot be learned from"):
-        pairs = [p for p in read_pairs(with_saturation_values(capture), settings.seed)[0] if p.has_rig_pixels]
+        pairs = [p for p in _pairs_of(capture, settings) if p.has_rig_pixels]
         seeds_of = [(p, known[p.name].seed if p.name in known else find_seed(p, settings.seed, start)) for p in pairs]
         result = [(p, seed) for p, seed in seeds_of if isinstance(seed, Seed)]
         if result:
@@ -137,6 +138,12 @@ def load_capture(
                         group.moving[k].fixed_to_moving = pair.result.fixed_to_moving
             return LoadedCapture(capture, groups, result)
     return None
+
+
+def _pairs_of(capture: Capture, settings: Settings, model: FlightModel | None = None) -> list[BandPair]:
+    """Return the pairs of a capture that can be read."""
+    read = CapturePixels().read
+    return read_pairs(with_saturation_values(capture, read), settings.seed, model, read)[0]
 
 
 def initial_network(bands: Sequence[str], settings: Settings, start: FlightModel | None) -> Descriptor:
@@ -175,8 +182,7 @@ def choose_and_refine(
 def observe_rig(model: FlightModel, settings: Settings, capture: Capture) -> LearningCapture | None:
     """Align a capture by a model, without its rig's predictions; None if that fails."""
     with logged_failure(f"{capture.label} does not determine the rig"):
-        pairs, _ = read_pairs(with_saturation_values(capture), settings.seed, model)
-        pairs = [p for p in pairs if p.has_rig_pixels]
+        pairs = [p for p in _pairs_of(capture, settings, model) if p.has_rig_pixels]
         aligner = PairAligner(settings, _on_device(model, settings), quiet, is_observation=True)
         aligner.align(pairs, None, scratch=False)
         return LearningCapture.of(capture, pairs, aligner)

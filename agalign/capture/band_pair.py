@@ -209,8 +209,7 @@ def read_pairs(
     """Read the pairs of a capture, one for each lens; return them and the issues of bands that cannot be used.
 
     The mappings of a flight's `model` precede those of the tags. `read` reads the pixels of the files, by default
-    `read_tile`. Raises UnreadableFileError if the reference cannot be
-    read.
+    `read_tile`. Raises UnreadableFileError if the reference cannot be read.
     """
     references = {_LONGEST_SIDE_PX: Reference(read_for_alignment(capture.reference, _LONGEST_SIDE_PX, read))}
     pairs: list[BandPair] = []
@@ -230,7 +229,7 @@ def read_pairs(
             continue
         longest = longest_for(capture.reference, next(iter(matrices.values())))
         if longest not in references:
-            references[longest] = Reference(read_for_alignment(capture.reference, longest))
+            references[longest] = Reference(read_for_alignment(capture.reference, longest, read))
         pairs.append(_pair(capture.reference, references[longest], longest, bands, moving, matrices, model))
     return _without_stripes(pairs, references[_LONGEST_SIDE_PX]), unusable
 

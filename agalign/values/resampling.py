@@ -146,7 +146,8 @@ def resample(
     (H, W) pixels of the same type, with integers rounded and clipped, and their mask.
     """
     start = window.x0, window.y0
-    map_xy = (positions - np.asarray(start, positions.dtype)).astype(np.float32, copy=False)
+    offset = np.asarray(start, positions.dtype)
+    map_xy = (positions - offset if offset.any() else positions).astype(np.float32, copy=False)
     all_valid = bool(valid.all())
     source = _for_remap(pixels if all_valid else _filled(pixels, valid), interpolation)
     flags: dict[Interpolation, int] = {
@@ -190,7 +191,7 @@ def _for_remap(pixels: NDArray[np.generic], interpolation: Interpolation) -> NDA
     if interpolation == "nearest" and pixels.dtype in (np.uint8, np.uint16, np.int16, np.float32, np.float64):
         return pixels
     wide = pixels.dtype in (np.float64, np.int32, np.uint32, np.int64, np.uint64)
-    return pixels.astype(np.float64 if wide else np.float32)
+    return pixels.astype(np.float64 if wide else np.float32, copy=False)
 
 
 def _filled(pixels: NDArray[np.generic], valid: Mask) -> NDArray[np.generic]:
