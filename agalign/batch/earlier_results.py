@@ -109,7 +109,7 @@ def remaining(capture: Capture, out: Path, settings: Settings, options: RunOptio
     all_settings = settings.model_copy(update={"write": write})
     changed = _changed_options(earlier, all_settings, [("write", write)])
     if earlier.rendered_with and earlier.rendered_with != render_fingerprint(capture, write):
-        changed = changed or ("tags or panels",)
+        changed = changed or ("tags, panels or bands of the camera",)
     if not outputs_exist(path, earlier.products):
         changed = (*changed, "files that are missing")
     if changed or earlier.not_written or not earlier.rendered_with:

@@ -301,8 +301,8 @@ def _bands_to_align(files: Sequence[ImageFile], names: Sequence[str]) -> list[Ba
 
 
 def with_missing_bands(captures: Sequence[Capture]) -> list[Capture]:
-    """Return the captures with their `missing_bands`, which at least half of the captures of their camera have: rarer
-    names come from damaged tags.
+    """Return the captures with the bands of their camera, which at least half of its captures have: rarer names come
+    from damaged tags. Those that a capture lacks are its `missing_bands`.
 
     A multiband file has no missing bands. A capture of a dual camera without files of one half gets the serial numbers
     of both.
@@ -311,15 +311,35 @@ def with_missing_bands(captures: Sequence[Capture]) -> list[Capture]:
     members: dict[_CameraKey, list[Capture]] = defaultdict(list)
     for capture, camera in zip(captures, cameras, strict=True):
         members[camera].append(capture)
-    usual = {camera: usual_bands([c for c in some if c.has_several_files]) for camera, some in members.items()}
+    bands = {camera: _camera_bands([c for c in some if c.has_several_files]) for camera, some in members.items()}
     serials = {camera: {c.camera.serial for c in of_camera} for camera, of_camera in members.items()}
     result = []
     for capture, camera in zip(captures, cameras, strict=True):
         own = {b.name for b in capture.bands}
-        missing = tuple(name for name in usual[camera] if name not in own) if capture.has_several_files else ()
+        of_camera = bands[camera] if capture.has_several_files else ()
+        missing = tuple(b.name for b in of_camera if b.name not in own)
         identity = replace(capture.camera, serial=_complete_serial(capture.camera.serial, serials[camera]))
-        result.append(replace(capture, missing_bands=missing, camera=identity))
+        result.append(replace(capture, missing_bands=missing, camera_bands=of_camera, camera=identity))
     return result
+
+
+def _camera_bands(captures: Sequence[Capture]) -> tuple[Band, ...]:
+    """The usual bands of a camera without their files, in the order of the most complete captures: a band that these
+    lack follows the one that it follows in others.
+    """
+    usual, order = set(usual_bands(captures)), list[str]()
+    found: dict[str, Band] = {}
+    for capture in sorted(captures, key=lambda c: -len(usual.intersection(b.name for b in c.bands))):
+        position = 0
+        for band in (b for b in capture.bands if b.name in usual):
+            if band.name not in found:
+                order.insert(position, band.name)
+                about = band.wavelength_nm, band.bandwidth_nm
+                found[band.name] = Band(
+                    band.name, Path(), 1, *band.size_px, band.dtype, wavelength_nm=about[0], bandwidth_nm=about[1]
+                )
+            position = order.index(band.name) + 1
+    return tuple(found[name] for name in order)
 
 
 def usual_bands(captures: Sequence[Capture]) -> list[str]:

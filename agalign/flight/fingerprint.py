@@ -41,7 +41,7 @@ def render_fingerprint(capture: Capture, settings: WriteSettings) -> str:
     indices, which are independent of each other.
     """
     facts: list[HashInput] = []
-    for b in capture.bands:
+    for b in capture.stack_bands:
         calibration = None if b.radiometry is None else (b.radiometry.quantity, b.radiometry.gain)
         georeference = None if b.georeference is None else b.georeference.transform
         facts.append((b.name, calibration, georeference))

@@ -85,7 +85,7 @@ class ProductContext:
     alignments: Mapping[str, Alignment]
     """By moving band, including failed ones."""
     layers: Sequence[Layer]
-    """One for each band, in their order; empty if no moving band can be written."""
+    """One for each of the capture's `stack_bands`; empty if no moving band can be written."""
     grid: OutputGrid
     """Grid of all rasters; that of the reference's file if there are no layers."""
     max_preview_bytes: int

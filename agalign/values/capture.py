@@ -265,6 +265,9 @@ class Capture:
     motion: tuple[float, float] | None = None
     """Velocity of the ground in the image (right, down), focal lengths per second; None if unknown."""
     missing_bands: tuple[str, ...] = ()
+    """Names of bands that other captures of its camera have."""
+    camera_bands: tuple[Band, ...] = ()
+    """Bands of its camera, without files, in the order of the stacks; empty if they are those of the capture."""
     elevation_deg: float | None = None
     """Angle of the optical axis above the horizon: -90 straight down; None if the tags do not contain it."""
 
@@ -286,6 +289,12 @@ class Capture:
     def moving(self) -> tuple[Band, ...]:
         """All bands but the reference."""
         return tuple(b for i, b in enumerate(self.bands) if i != self.reference_index)
+
+    @property
+    def stack_bands(self) -> tuple[Band, ...]:
+        """The bands of a stack: those of the camera, in one order for all its captures, then any others."""
+        own, of_camera = {b.name: b for b in self.bands}, {b.name: b for b in self.camera_bands}
+        return tuple((of_camera | own).values())
 
     @property
     def moving_lenses(self) -> list[tuple[Band, ...]]:

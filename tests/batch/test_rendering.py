@@ -14,6 +14,7 @@ import rasterio
 import agalign
 from agalign.batch import capture_task, estimate
 from agalign.batch.run import plan_run
+from agalign.products.run.captures import bands_of
 from agalign.products.sidecar.file import find_sidecars, read_sidecar, verify_outputs
 from agalign.values.alignment import Alignment
 from agalign.values.mapping import DisplacementField
@@ -316,3 +317,41 @@ def test_a_sidecar_of_five_bands_is_small(aligned_flight: Path) -> None:
     for path in find_sidecars(aligned_flight):
         assert len(read_sidecar(path).bands) == 5
         assert path.stat().st_size < 150_000
+
+
+def test_stacks_of_a_camera_have_the_same_bands_in_the_same_order(flight: Path, tmp_path: Path) -> None:
+    """Also without a file, with an unreadable one, and with a constant band."""
+    folder, out = shutil.copytree(flight, tmp_path / "in"), tmp_path / "out"
+    for number, damage in (("2", Path.unlink), ("4", lambda path: path.write_text("no image")), ("5", _make_constant)):
+        damage(next(folder.rglob(f"IMG_0001_{number}.tif")))
+    settings = seeded("rig", radiometry="camera", qa=True)
+    options = agalign.DiscoverOptions(reference="Blue")
+    agalign.align_folder(folder, out, settings=settings, options=options)
+    lacking, whole = (read_sidecar(path) for path in find_sidecars(out))
+    stacks, qualities = ([path.with_suffix(end) for path in find_sidecars(out)] for end in (".tif", ".qa.tif"))
+    with rasterio.open(stacks[0]) as stack, rasterio.open(stacks[1]) as other:
+        assert stack.descriptions == other.descriptions == ("Blue", "Green", "Red", "NIR", "Red edge")
+        assert np.isnan(stack.read([2, 4, 5])).all()
+        tags = [stack.tags(index) for index in (2, 4, 5)]
+        assert [one["STATUS"] for one in tags] == ["missing", "missing", "failed"]
+        assert [one["wavelength"] for one in tags] == [other.tags(index)["wavelength"] for index in (2, 4, 5)]
+        assert "constant" in tags[2]["REASON"]
+    with rasterio.open(qualities[0]) as quality:
+        assert quality.descriptions == ("all bands", *stack.descriptions)
+    assert [lacking.missing_bands, whole.missing_bands] == [["Green", "NIR"], []]
+    assert lacking.output is not None
+    assert lacking.output.bands == list(stack.descriptions)
+    # A band is read from its own layers.
+    red = {band.name: band for band in bands_of(lacking, stacks[0].parent, mask_qa=True)}["Red"]
+    assert (red.band_index, red.quality and red.quality[1]) == (3, 4)
+    # With the files of the flight again, the capture is estimated again, and its stack has the same bands.
+    shutil.copytree(flight, folder, dirs_exist_ok=True)
+    agalign.align_folder(folder, out, settings=settings, options=options)
+    with rasterio.open(stacks[0]) as stack:
+        assert stack.descriptions == ("Blue", "Green", "Red", "NIR", "Red edge")
+        assert not np.isnan(stack.read()).all(axis=(1, 2)).any()
+
+
+def _make_constant(path: Path) -> None:
+    with rasterio.open(path, "r+") as file:
+        file.write(np.full((1, *file.shape), 20_000, file.dtypes[0]))

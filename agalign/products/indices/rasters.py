@@ -204,11 +204,12 @@ def _bands(context: ProductContext) -> Iterator[AlignedBand]:
 def _masked(bands: Sequence[AlignedBand], context: ProductContext) -> Iterator[AlignedBand]:
     """Yield bands with the quality raster that this rendering has written."""
     raster = next((file for file in context.written if file.kind == "qa"), None)
-    for layer, band in enumerate(bands, start=2):  # layer 1 is that of all bands together
+    layers = {layer.band.name: number for number, layer in enumerate(context.layers, start=2)}  # layer 1: all bands
+    for band in bands:
         if raster is None:
             yield replace(band, problem="its quality raster does not exist")
         else:
-            yield replace(band, quality=(raster.path, layer, raster.sha256))
+            yield replace(band, quality=(raster.path, layers[band.name], raster.sha256))
 
 
 def write_rasters(

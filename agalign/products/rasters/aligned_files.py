@@ -38,6 +38,7 @@ from agalign.values.capture import Band, Capture, Quantity, Radiometry
 from agalign.values.choices import Compression, Interpolation
 from agalign.values.files import file_name
 from agalign.values.image import Mask, OutputGrid, Tile
+from agalign.values.issues import MISSING_BAND
 from agalign.values.memory import WORK_TILE_PX
 from agalign.values.resampling import as_type, can_hold, tiles
 
@@ -142,7 +143,9 @@ def _correction(band: Band) -> Radiometry | None:
 
 
 class Stack(Product):
-    """A raster of all bands in the capture's order; a band that failed is all nodata."""
+    """A raster of the same bands in the same order for all captures of a camera. A band that failed or is missing is
+    all nodata, and its tags STATUS and REASON say why.
+    """
 
     kind = "stack"
     suffix = ".tif"
@@ -199,7 +202,7 @@ def write_raster(
             to_cog(partial, compression)
 
     blocks, georeference = _blocks(context, layers, dtype, nodata), capture.reference.georeference
-    descriptions, own_tags, grid = _descriptions(layers, raw=raw), _tags(capture, layers, raw=raw), context.grid
+    descriptions, own_tags, grid = _descriptions(context, layers), _tags(capture, layers, raw=raw), context.grid
     write_on_grid(
         path, grid, georeference, descriptions, blocks, tags=own_tags, dtype=dtype.name, options=options, finish=finish
     )
@@ -233,12 +236,16 @@ def _tags(capture: Capture, layers: Sequence[Layer], *, raw: bool) -> dict[str, 
     }
 
 
-def _descriptions(layers: Sequence[Layer], *, raw: bool) -> list[LayerDescription]:
-    result = []
+def _descriptions(context: ProductContext, layers: Sequence[Layer]) -> list[LayerDescription]:
+    result, raw = [], context.is_raw
     for layer, colour in zip(layers, _colours(layers), strict=True):
         band = layer.band
         quantity = None if raw or band.radiometry is None else band.radiometry.quantity
         tags, imagery = {} if quantity is None else {"QUANTITY": str(quantity)}, {}
+        if layer.is_gap:
+            alignment = context.alignments.get(band.name)
+            status, reason = ("missing", None) if alignment is None else (alignment.status, alignment.reason)
+            tags |= {"STATUS": status, "REASON": reason or MISSING_BAND.cause}
         if band.wavelength_nm is not None:
             tags |= {"wavelength": f"{band.wavelength_nm:g}", "wavelength_units": "nm"}
             imagery = {"CENTRAL_WAVELENGTH_UM": f"{band.wavelength_nm / 1000:g}"}

@@ -77,8 +77,8 @@ def output_layers(
     common: OutputGrid | None = None,
     read: ReadTile = read_tile,
 ) -> tuple[list[Layer], OutputGrid]:
-    """Return a layer for each band of a capture, given the alignments of its usable moving bands, and their grid: the
-    `common` one of the camera, if any. `read` reads the pixels of the files.
+    """Return a layer for each of a capture's `stack_bands`, given the alignments of its usable moving bands, and their
+    grid: the `common` one of the camera, if any. `read` reads the pixels of the files.
     """
     reference = capture.reference
     mappings = {b.name: alignments[b.name].mapping for b in capture.moving if b.name in alignments}
@@ -87,7 +87,7 @@ def output_layers(
         mappings[reference.name] = PixelMapping(geometry.identity())  # otherwise the reference is copied
     on_frame = {name: _on_frame(mapping, frame, reference) for name, mapping in mappings.items()}
     size_px = round(reference.width_px * frame.scale.x), round(reference.height_px * frame.scale.y)
-    layers = [Layer(b, on_frame.get(b.name), size_px, b is reference, read) for b in capture.bands]
+    layers = [Layer(b, on_frame.get(b.name), size_px, b is reference, read) for b in capture.stack_bands]
     # The crop is calculated without relief, which may leave pixels of single bands without a value.
     mapped = [(layer.mapping.without_parallax, layer.band) for layer in layers if layer.mapping is not None]
     crop = frame.tile

@@ -55,11 +55,13 @@ def bands_of(sidecar: Sidecar, folder: Path, *, mask_qa: bool = False) -> list[A
     if mask_qa and flags is None:
         raise InputError(f"{sidecar.capture}: has no quality raster, which --mask-qa needs; align with --qa")
     checksums = {part.file: part.sha256 for part in sidecar.products}
-    result = []
-    # Layer 1 of the quality raster is that of all bands together.
-    for layer, part in enumerate(sidecar.bands, start=2):
+    result, names = [], [part.band for part in sidecar.bands]
+    if sidecar.output is not None:
+        names = sidecar.output.bands or names
+    layers = {name: number for number, name in enumerate(names, start=2)}  # layer 1 is that of all bands together
+    for part in sidecar.bands:
         file, index = ("", 1) if part.place is None else (part.place.file, part.place.band_index)
-        quality = (folder / flags.file, layer, flags.sha256) if mask_qa and flags is not None else None
+        quality = (folder / flags.file, layers[part.band], flags.sha256) if mask_qa and flags is not None else None
         checksum = checksums.get(file, "")
         problem = ""
         if part.place is None or not part.is_usable(sidecar.max_predicted_px):

@@ -70,6 +70,7 @@ def _output(context: ProductContext) -> OutputPart:
     names = dict.fromkeys(f"{r.quantity} by {r.source}" for r in radiometry.values())
     return OutputPart(
         file=context.paths.relative(stack[0].path) if stack else None,
+        bands=[layer.band.name for layer in context.layers],
         radiometry=" and ".join(names) or None,
         panel_age_s=next((r.panel_age_s for r in radiometry.values() if r.panel_age_s is not None), None),
         illumination=[

@@ -345,6 +345,10 @@ class OutputPart(_Part):
 
     file: RelativeFile | None
     """The stack; null with `--layout bands`."""
+    bands: list[str] = []
+    """Names of the bands of the stack, in its order, which is that of all captures of the camera; missing bands are
+    all nodata. Layers 2, 3 … of the quality raster are of these bands.
+    """
     radiometry: str | None = None
     """Conversion of raw numbers, such as `reflectance by panel and light sensor`."""
     panel_age_s: Number | None = None
@@ -442,7 +446,7 @@ class Sidecar(_Part):
     moving bands are `failed`. Else `degraded`.
     """
     missing_bands: list[str]
-    """Bands that only other captures have."""
+    """Bands that only other captures of the camera have; nodata in the stack."""
     reference: ReferencePart
     """Reference band."""
     bands: Annotated[list[BandResult], Field(min_length=1)]
