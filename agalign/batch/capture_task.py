@@ -31,6 +31,7 @@ from agalign.products.sidecar.schema import Sidecar
 from agalign.values.alignment import Alignment
 from agalign.values.capture import Capture
 from agalign.values.choices import RadiometryChoice
+from agalign.values.files import written_below
 from agalign.values.process_pool import A, R
 from agalign.values.text import counted
 
@@ -247,7 +248,8 @@ def do_capture(task: Task, on_pair: PairProgress = quiet) -> CaptureReport:
     """Process one capture and return its report, which includes errors."""
     label, clock = task.capture.label, StageClock(on_pair)
     try:
-        report = in_one_thread(partial(process_capture, progress=clock), task)
+        with written_below(task.out):
+            report = in_one_thread(partial(process_capture, progress=clock), task)
     except Exception as error:
         # A defect of agalign in one capture must not stop the others.
         report = CaptureReport(label, "error", error=failure_text(error), seconds=clock.seconds)

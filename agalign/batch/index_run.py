@@ -13,7 +13,7 @@ from agalign.products.indices.formulas import Index
 from agalign.products.indices.rasters import IndexRasters, IndexReport, update_table, write_rasters
 from agalign.products.run.captures import bands_of
 from agalign.products.sidecar.file import add_products, read_without_tables, run_sidecars
-from agalign.values.files import check_inside
+from agalign.values.files import written_below
 from agalign.values.processes import usable_cores
 
 
@@ -81,15 +81,15 @@ def do_indices(task: IndexTask) -> list[IndexReport]:
     """Write the indices of one capture; the reports include errors. Raises SidecarError."""
     sidecar, base = read_without_tables(task.sidecar), task.target / task.label
     try:
-        check_inside(base.parent, task.target)
-        bands = bands_of(sidecar, task.sidecar.parent, mask_qa=task.mask_qa)
-        reports = [*write_rasters(bands, task.indices, base, task.label, overwrite=task.overwrite)]
-        if task.target == task.out:
-            listed = {part.file for part in sidecar.products}
-            # A command that was killed may have written a raster that the sidecar does not list.
-            rasters = [r.path for r in reports if r.path is not None and not (r.kept and r.path.name in listed)]
-            files = [p for path in rasters for p in (path, path.with_suffix(".png"))]
-            add_products(task.sidecar, IndexRasters.kind, files)
+        with written_below(task.target):
+            bands = bands_of(sidecar, task.sidecar.parent, mask_qa=task.mask_qa)
+            reports = [*write_rasters(bands, task.indices, base, task.label, overwrite=task.overwrite)]
+            if task.target == task.out:
+                listed = {part.file for part in sidecar.products}
+                # A command that was killed may have written a raster that the sidecar does not list.
+                rasters = [r.path for r in reports if r.path is not None and not (r.kept and r.path.name in listed)]
+                files = [p for path in rasters for p in (path, path.with_suffix(".png"))]
+                add_products(task.sidecar, IndexRasters.kind, files)
     except AgalignError as error:
         reports = _failed(task, str(error))
     return [report.of(sidecar) for report in reports]

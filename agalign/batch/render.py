@@ -109,7 +109,8 @@ def render(
     written = {file.path for file in context.written}
     removed = [(path, reason) for path, reason in outdated.items() if path not in written]
     for path, _ in removed:
-        with suppress(OSError):
+        with suppress(OSError, OutputError):
+            check_inside(path.parent, out)  # a link may have taken the place of the folder meanwhile
             path.unlink(missing_ok=True)
     reasons = tuple((path, context.lost.get(path, reason)) for path, reason in removed if reason)
     complete = write_sidecar(paths.sidecar, rendered(context, list(failures), time.perf_counter() - began_s))

@@ -42,7 +42,7 @@ from agalign.products.run.record import RunPart, begun, excluded_part, refuse_fo
 from agalign.products.sidecar.file import read_without_tables
 from agalign.products.sidecar.schema import FilePart
 from agalign.values.capture import Capture
-from agalign.values.files import check_inside
+from agalign.values.files import check_inside, written_below
 from agalign.values.image import OutputGrid
 from agalign.values.output_folder import is_full, locked
 from agalign.values.processes import CAPTURES_WORTH_A_PROCESS, usable_cores
@@ -324,7 +324,8 @@ class _FlightRun:
         self.listener.on_learnt(path.stem, seconds)
         if model is None:
             return None
-        save_model(model, path)
+        with written_below(self.out):
+            save_model(model, path)
         return path
 
 

@@ -13,6 +13,7 @@ import stat
 import unicodedata
 from collections.abc import Iterable, Iterator, MutableMapping, Sequence
 from contextlib import contextmanager, suppress
+from contextvars import ContextVar
 from io import BufferedReader
 from pathlib import Path, PurePosixPath, PureWindowsPath
 from typing import TYPE_CHECKING, TypeVar
@@ -32,8 +33,22 @@ _PARTIAL = ".agalign-part-"
 """Prefix of partial files; host, process id and a random part follow."""
 _MAX_NAME_BYTES, _MAX_SUFFIX = 120, 12
 """File names have at most 255 bytes: a checksum, and what the writer adds, follow."""
+_WRITTEN_BELOW: ContextVar[Path | None] = ContextVar("written_below", default=None)
+"""Folder that links must not lead out of when a file is written; None where any file may be written."""
 _RESERVED = re.compile(r"(con|prn|aux|nul|(com|lpt)[0-9])(\..*)?", re.IGNORECASE)
 """Names of devices on Windows."""
+
+
+@contextmanager
+def written_below(folder: Path) -> Iterator[None]:
+    """Make `complete_file` and `scratch_file` raise OutputError within the block if a link leads out of a folder, such
+    as one that was put in the place of a subfolder during the run.
+    """
+    token = _WRITTEN_BELOW.set(folder)
+    try:
+        yield
+    finally:
+        _WRITTEN_BELOW.reset(token)
 
 
 @contextmanager
@@ -57,8 +72,10 @@ def scratch_file(neighbour: Path) -> Iterator[Path]:
 
     The file has the suffix of `neighbour`, because some libraries choose the format by it. Its name is unique among
     processes on all machines that share the folder, and hidden, so that it is not read as an image.
-    Raises OutputError for an OSError.
+    Raises OutputError for an OSError, and within `written_below` for a folder elsewhere.
     """
+    if (root := _WRITTEN_BELOW.get()) is not None:
+        check_inside(neighbour.parent, root)
     scratch = neighbour.with_name(f"{_PARTIAL}{_host()}-{os.getpid()}-{secrets.token_hex(8)}{neighbour.suffix}")
     try:
         neighbour.parent.mkdir(parents=True, exist_ok=True)

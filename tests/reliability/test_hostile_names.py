@@ -7,14 +7,17 @@ import shutil
 import sys
 from html import escape
 from pathlib import Path
+from typing import Any
 
 import pytest
 from PIL.ExifTags import Base
 from synthetic_flights.aligned import make_aligned
 
 import agalign
+from agalign.batch import capture_task
 from agalign.batch.index_run import index_tasks, run_indices
 from agalign.batch.render import remove_outputs
+from agalign.batch.run import run_flight
 from agalign.cameras.tiff_directory import EXIF, GPS, XMP, add_directories, byte_string, read_directories, text
 from agalign.flight.groups import model_names
 from agalign.products.exports.programs import export
@@ -156,6 +159,28 @@ def test_links_are_not_followed_out_of_the_folder(flight: Path, tmp_path: Path) 
             agalign.align_folder(flight, out, settings=seeded("rig"))
         (out / name).unlink()
     assert [(p.name, p.read_text()) for p in outside.iterdir()] == [("IMG_0001.json", "{}")]
+
+
+@pytest.mark.skipif(os.name == "nt", reason="links need a privilege on Windows")
+@pytest.mark.parametrize("stage", ["estimate", "render"])
+def test_a_link_in_the_place_of_a_folder_is_not_followed_during_a_run(
+    flight: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, stage: str
+) -> None:
+    outside, out = tmp_path / "outside", tmp_path / "out"
+    outside.mkdir()
+    function = getattr(capture_task, stage)
+
+    def with_link(*args: Any) -> Any:
+        shutil.rmtree(out / "0000SET", ignore_errors=True)
+        (out / "0000SET").symlink_to(outside)
+        return function(*args)
+
+    monkeypatch.setattr(capture_task, stage, with_link)
+    run = run_flight(agalign.discover(flight), out, seeded("rig"), agalign.RunOptions(jobs=1))
+    report = next(run)
+    run.close()
+    assert re.search("out/0000SET/000: a link leads out of", report.error or "")
+    assert not any(outside.iterdir())
 
 
 @pytest.mark.skipif(os.name == "nt", reason="links need a privilege on Windows")
