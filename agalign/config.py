@@ -110,6 +110,8 @@ class DiscoverOptions:
     """Refuse images with more pixels than this, without reading them."""
     jobs: int = 1
     """Processes that read the tags of many files; with more than one the calling script must be importable."""
+    timeout_s: Annotated[float | None, Field(ge=1, le=1e6)] = None
+    """Seconds after which reading the tags of a file is abandoned, in a process of its own; by default unlimited."""
     include: Annotated[tuple[str, ...], _GLOBS] = ()
     """Use only files that match this glob by path or name; repeatable."""
     exclude: Annotated[tuple[str, ...], _GLOBS] = ()
@@ -133,7 +135,7 @@ class RunOptions:
     """Estimate and render captures with missing or unaligned bands again."""
     # An `executor` of the caller ignores it, except `dask_executor`.
     timeout_s: Annotated[float | None, Field(ge=1, le=1e6), Option("timeout")] = None
-    """Seconds after which a capture is abandoned; by default unlimited."""
+    """Seconds after which a capture, or a file whose tags are read, is abandoned; by default unlimited."""
     command: str = ""
     """Command line, for run record and report."""
 

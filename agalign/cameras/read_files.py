@@ -4,6 +4,7 @@ import re
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from functools import partial
 from multiprocessing import get_context
 from pathlib import Path
 
@@ -21,7 +22,7 @@ from agalign.values.capture import Band
 from agalign.values.lens import rescaled
 from agalign.values.pixel_units import SAME_PIXELS, PixelScale, Size
 from agalign.values.process_pool import ProcessPool, WorkerDiedError
-from agalign.values.processes import environment_of_children
+from agalign.values.processes import environment_of_children, silence_libraries
 from agalign.values.text import shortened
 
 
@@ -68,7 +69,7 @@ class ImageFile:
 
 def read_files(paths: Sequence[Path], options: DiscoverOptions) -> Iterator[ImageFile | Problem]:
     """Yield each file with its bands, or the reason why it cannot be used, in the order of `paths`."""
-    if options.jobs > 1 and len(paths) >= _MIN_FILES_FOR_PROCESSES:
+    if options.timeout_s is not None or (options.jobs > 1 and len(paths) >= _MIN_FILES_FOR_PROCESSES):
         yield from _read_in_processes(paths, options)
     else:
         yield from _read_task(paths, options)
@@ -153,14 +154,32 @@ def _read_in_processes(paths: Sequence[Path], options: DiscoverOptions) -> Itera
     tasks = [paths[i : i + _FILES_PER_TASK] for i in range(0, len(paths), _FILES_PER_TASK)]
     processes = min(options.jobs, len(tasks))
     # Not forked: a fork would copy locks that are held by threads of the calling program.
-    with environment_of_children(threads=1), ProcessPool(processes, get_context("spawn")) as pool:
-        futures = [pool.submit(_read_task, task, options) for task in tasks]
+    with environment_of_children(threads=1), ProcessPool(processes, get_context("spawn"), _start_reading) as pool:
+        submit = partial(pool.submit, _read_task, timeout_s=options.timeout_s)
+        futures = [submit(task, options) for task in tasks]
         for task, future in zip(tasks, futures, strict=True):
             try:
                 yield from future.result()
+            except TimeoutError:  # one at a time, to find the file
+                for path, one in [(path, submit([path], options)) for path in task]:
+                    try:
+                        yield from one.result()
+                    except TimeoutError:
+                        yield _unread(path, f"reading it took over {options.timeout_s:g} s (--timeout)")
+                    except WorkerDiedError:
+                        yield _unread(path, "reading it killed the process")
             except WorkerDiedError:
-                what = "reading it, or a file read together with it, killed the process; take it out of the folder"
-                yield from (Problem(path, UnreadableFileError(f"{path}: {what}")) for path in task)
+                what = "reading it, or a file read together with it, killed the process"
+                yield from (_unread(path, what) for path in task)
+
+
+def _start_reading() -> None:
+    """Initialise a worker, which imports this module for it: tasks do not wait for that."""
+    silence_libraries()
+
+
+def _unread(path: Path, what: str) -> Problem:
+    return Problem(path, UnreadableFileError(f"{path}: {what}; take it out of the folder"))
 
 
 def _read_task(paths: Iterable[Path], options: DiscoverOptions) -> list[ImageFile | Problem]:

@@ -60,7 +60,8 @@ def _align(
     load_ahead()
     from agalign.cli.align_run import conclude, find_captures, print_plan, run
 
-    flight = find_captures(folder, DiscoverOptions(**given["discover"], skip=(target,), jobs=cores), terminal)
+    reading = DiscoverOptions(**given["discover"], skip=(target,), jobs=cores, timeout_s=options.timeout_s)
+    flight = find_captures(folder, reading, terminal)
     if not dask and not dry_run:
         start_server_ahead(len(flight.captures), cores)
     raw_numbers = any(b.dtype[0] in "ui" for c in flight.captures for b in c.bands)

@@ -295,6 +295,28 @@ def test_several_processes_find_what_one_finds(tmp_path: Path, monkeypatch: pyte
     assert [p.text for p in one.problems] == [p.text for p in several.problems]
 
 
+@pytest.mark.slow
+def test_a_file_that_takes_too_long_is_left_out(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    folder, modules = tmp_path / "flight", tmp_path / "modules"
+    write_all(folder, *(f"f{number}_{band}" for number in range(2) for band in ("green", "red", "nir")))
+    modules.mkdir()
+    # A process imports it at its start.
+    (modules / "sitecustomize.py").write_text(
+        "import io, time\n"
+        "now = io.open\n"
+        "def late(path, *given, **named):\n"
+        "    time.sleep(60 if str(path).endswith('f1_nir.tif') else 0)\n"
+        "    return now(path, *given, **named)\n"
+        "io.open = late\n"
+    )
+    monkeypatch.syspath_prepend(str(modules))
+    found = discover(folder, DiscoverOptions(timeout_s=2))
+    assert [p.text for p in found.problems] == [
+        f"{folder / 'f1_nir.tif'}: reading it took over 2 s (--timeout); take it out of the folder"
+    ]
+    assert [c.missing_bands for c in found.captures] == [(), ("nir",)]
+
+
 @pytest.mark.parametrize(
     ("names", "expected"),
     [("a a a", "a a-2 a-3"), ("a a a-2", "a a-3 a-2"), ("a a-2 a", "a a-2 a-3"), ("a-2 a a a-2", "a-2 a a-3 a-2-2")],
