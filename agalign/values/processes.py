@@ -27,6 +27,10 @@ MIN_ADDRESS_SPACE_BYTES = 1_800_000_000
 _CGROUPS, _OWN_CGROUP = Path("/sys/fs/cgroup"), Path("/proc/self/cgroup")
 _MIN_THREADS, _MIN_THREADS_PER_CORE = 16, 4
 """With fewer, GDAL hangs and OpenMP ends the process. A run on two cores needs 24 processes and threads."""
+_MAX_LOW_LIMIT = 4096
+"""Limits of processes that administrators set for users and containers are at most this. Without one, a user may start
+half of what the memory of the machine allows: 7,800 with 2 GB.
+"""
 
 
 def usable_cores() -> int:
@@ -89,10 +93,11 @@ def _text(path: Path) -> str:
 def check_threads() -> None:
     """Raise ConfigurationError if the system allows too few processes (`ulimit -u`, or a container's limit).
 
-    It starts threads, because the limits do not show how many can be started: that of a user includes the processes of
-    other containers. Not checked with a limit of the address space: each thread reserves 8 MB of it for its stack.
+    Under a low limit, it starts threads, because the limit does not show how many can be started: that of a user
+    includes the processes of other containers. Not checked with a limit of the address space: each thread reserves 8 MB
+    of it for its stack.
     """
-    if _address_space_bytes() < math.inf:
+    if _process_limit() > _MAX_LOW_LIMIT or _address_space_bytes() < math.inf:
         return
     end, started, needed = threading.Event(), 0, _MIN_THREADS + _MIN_THREADS_PER_CORE * usable_cores()
     with ThreadPoolExecutor(needed) as threads:
@@ -109,14 +114,24 @@ def check_threads() -> None:
             end.set()
 
 
+def _process_limit() -> float:
+    """Return the smallest limit of processes and threads, of the user and of the control groups; inf without one."""
+    texts = (_text(folder / "pids.max").strip() for folder in _cgroup_folders("pids", _CGROUPS, _OWN_CGROUP))
+    return min([_resource_limit("RLIMIT_NPROC"), *(float(text) for text in texts if text.isdecimal())])
+
+
 def _address_space_bytes() -> float:
     """Return the limit of the address space (`ulimit -v`); inf without one."""
+    return _resource_limit("RLIMIT_AS")
+
+
+def _resource_limit(name: str) -> float:
     if sys.platform == "win32":
         return math.inf
     import resource
 
-    limit_bytes, _ = resource.getrlimit(resource.RLIMIT_AS)
-    return math.inf if limit_bytes == resource.RLIM_INFINITY else limit_bytes
+    limit, _ = resource.getrlimit(getattr(resource, name))
+    return math.inf if limit == resource.RLIM_INFINITY else limit
 
 
 def memory_limit_bytes(root: Path = _CGROUPS, own: Path = _OWN_CGROUP) -> float:

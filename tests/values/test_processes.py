@@ -6,11 +6,12 @@ import re
 import subprocess
 import sys
 import threading
+from contextlib import nullcontext
 from pathlib import Path
 
 import pytest
 
-from agalign.errors import is_out_of_memory
+from agalign.errors import ConfigurationError, is_out_of_memory
 from agalign.values import processes
 from agalign.values.processes import (
     cgroup_quota,
@@ -121,6 +122,7 @@ def test_what_libraries_raise_when_memory_is_short(text: str) -> None:
 
 
 def test_too_few_threads_are_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(processes, "_process_limit", lambda: 100.0)
     check_threads()
     before, start = threading.active_count(), threading.Thread.start
 
@@ -134,3 +136,19 @@ def test_too_few_threads_are_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
     assert done.returncode == 2
     assert re.match(r"agalign: only 5 more processes and threads .* raise the limit .*ulimit -u.*\n$", done.stderr)
     assert threading.active_count() == before
+
+
+@pytest.mark.parametrize(
+    ("of_user", "of_container", "is_low"),
+    [(resource.RLIM_INFINITY, "max", False), (96_000, "10000", False), (100, "max", True), (96_000, "100", True)],
+)
+def test_threads_are_only_tried_under_a_low_limit(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, of_user: int, of_container: str, is_low: bool
+) -> None:
+    write_cgroups(tmp_path, {"pids.max": of_container})
+    monkeypatch.setattr(processes, "_CGROUPS", tmp_path)
+    limits = {resource.RLIMIT_NPROC: of_user, resource.RLIMIT_AS: resource.RLIM_INFINITY}
+    monkeypatch.setattr(resource, "getrlimit", lambda kind: (limits[kind],) * 2)
+    monkeypatch.setattr(threading.Thread, "start", raising(RuntimeError("can't start new thread")))
+    with pytest.raises(ConfigurationError, match="only 0 more") if is_low else nullcontext():
+        check_threads()
