@@ -118,6 +118,7 @@ def read_json(path: Path) -> Any:
 
 def save_known_model(path: Path, *, has_rig: bool = True) -> None:
     """Save a model with a rig that is learned from four captures at known heights."""
+    from agalign.flight.groups import FlightCamera
     from agalign.flight.learn_rig import learn_rig
     from agalign.flight.model import FlightModel, save_model
     from agalign.flight.rig import Observation
@@ -130,7 +131,8 @@ def save_known_model(path: Path, *, has_rig: bool = True) -> None:
         captures.append(Observation(float(k), mappings, dict.fromkeys(mappings, 0.05)))
     rig = learn_rig(captures, (640, 480), {}) if has_rig else None
     net = Descriptor("pseudo-siamese", (1, 1, 1), half_rectified=True, unit_length=True)
-    save_model(FlightModel(net, "Camera 7", ("NIR", "[Red]"), {}, "", rig), path)
+    camera = FlightCamera("Camera 7", (("Green", 640, 480), ("NIR", 640, 480), ("[Red]", 640, 480)))
+    save_model(FlightModel(net, camera, ("NIR", "[Red]"), {}, "", rig), path)
 
 
 def write_band(path: Path, pixels: np.ndarray, **profile: object) -> None:

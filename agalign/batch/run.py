@@ -188,7 +188,7 @@ class _FlightRun:
         if model.net.sharing == "unshared" and settings.joint.sharing != "unshared":
             raise ConfigurationError(f"{path}: was learned unshared; add --sharing unshared")
         flights = flights_of(self.flight.captures)
-        if flights and not any(is_flight_of(captures, model.camera) for captures in flights):
+        if flights and model.camera is not None and not any(is_flight_of(c, model.camera) for c in flights):
             what = difference(model.camera, flight_camera(flights[0]))
             raise ConfigurationError(f"{path}: {what}; leave --model out")
         flight_settings = settings.flight.model_copy(update={"start_model": model.fingerprint})

@@ -148,7 +148,7 @@ def _show_model(path: Path, terminal: Terminal, *, as_json: bool) -> None:
     captures, factors = (0, ()) if model.rig is None else (len(model.rig.captures), model.rig.factors)
     if as_json:
         rig = {"captures": captures, "factors": factors, "bands": rows} if rows else None
-        facts = {"model": str(path), "camera": model.camera, "bands": list(model.bands), "rig": rig}
+        facts = {"model": str(path), "camera": str(model.camera or ""), "bands": list(model.bands), "rig": rig}
         terminal.facts(facts)
         return
     terminal.result(f"{model.camera or 'any camera'}: a network for {', '.join(model.bands) or 'any bands'}")

@@ -63,7 +63,7 @@ def learn_descriptor(
         net = state.fast_descriptor([*channels.pop()])
         _learn(net, examples, state, steps_a_pair * len(examples))
     weights = (value.cpu().numpy() for value in net.state_dict().values())
-    return FlightModel(net, "", ("moving",), {}, hashed(*weights))
+    return FlightModel(net, None, ("moving",), {}, hashed(*weights))
 
 
 def _example(state: JointState, pair: BandPair, fixed_to_moving: Matrix) -> _Example:

@@ -33,7 +33,7 @@ def learning_fingerprint(captures: Sequence[Capture], settings: Settings) -> str
     It contains the labels: files of two folders may have equal names, sizes and times.
     """
     stages = settings.joint, settings.seed, settings.flight
-    return hashed(flight_camera(captures), *((c.label, _fingerprint(c, *stages)) for c in captures))
+    return hashed(str(flight_camera(captures)), *((c.label, _fingerprint(c, *stages)) for c in captures))
 
 
 def render_fingerprint(capture: Capture, settings: WriteSettings) -> str:

@@ -4,6 +4,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from itertools import count
 from statistics import median, mode
+from typing import Self
 
 from agalign.cameras.grouping import usual_bands
 from agalign.pixels.radiometry import with_radiometry
@@ -12,9 +13,34 @@ from agalign.values.choices import RadiometryChoice
 from agalign.values.files import file_name
 
 
+@dataclass(frozen=True)
+class FlightCamera:
+    """The camera of a flight, with all bands in its captures."""
+
+    name: str
+    """Make, model and serial number; empty if the tags contain none of them."""
+    bands: tuple[tuple[str, int, int], ...]
+    """Name, width and height in px of each band, the reference first."""
+
+    @classmethod
+    def of(cls, capture: Capture, bands: Iterable[Band]) -> Self:
+        """Return the camera of a capture, with these bands."""
+        camera = capture.camera
+        name = f"{camera.make} {camera.model} {camera.serial}".strip()
+        return cls(name, tuple((b.name, *b.size_px) for b in bands))
+
+    @property
+    def described_bands(self) -> list[str]:
+        """Name and size of each band, in words."""
+        return [f"{name} {width}x{height}" for name, width, height in self.bands]
+
+    def __str__(self) -> str:
+        return f"{self.name} [{', '.join(self.described_bands)}]"
+
+
 def camera_key(capture: Capture) -> str:
     """Return the camera and the reference band; captures of one flight have equal keys."""
-    return _key(capture, [capture.reference])
+    return str(FlightCamera.of(capture, [capture.reference]))
 
 
 def flight_key(capture: Capture) -> tuple[str, str]:
@@ -22,12 +48,12 @@ def flight_key(capture: Capture) -> tuple[str, str]:
     return camera_key(capture), capture.flight_id
 
 
-def flight_camera(captures: Sequence[Capture]) -> str:
+def flight_camera(captures: Sequence[Capture]) -> FlightCamera:
     """Return the camera of a flight and all bands in its captures, the reference first."""
     bands = {captures[0].reference.name: captures[0].reference}
     for band in (b for c in _by_completeness(captures) for b in c.moving):
         bands.setdefault(band.name, band)
-    return _key(captures[0], bands.values())
+    return FlightCamera.of(captures[0], bands.values())
 
 
 def flight_lenses(captures: Sequence[Capture]) -> tuple[str, ...]:
@@ -35,30 +61,26 @@ def flight_lenses(captures: Sequence[Capture]) -> tuple[str, ...]:
     return tuple(dict.fromkeys(bands[0].name for c in _by_completeness(captures) for bands in c.moving_lenses))
 
 
-def is_flight_of(captures: Sequence[Capture], camera: str) -> bool:
+def is_flight_of(captures: Sequence[Capture], camera: FlightCamera | None) -> bool:
     """Return True if a model learned for `camera`, a `flight_camera`, contains all bands of a flight.
 
-    An empty `camera` fits every flight.
+    A model that was learned for no camera in particular, None, fits every flight.
     """
-    return not camera or not difference(camera, flight_camera(captures))
+    return camera is None or not difference(camera, flight_camera(captures))
 
 
-def difference(learned: str, here: str) -> str:
+def difference(learned: FlightCamera, here: FlightCamera) -> str:
     """Return in words why a model, learned for a `flight_camera`, does not contain all bands of another; empty if it
     does.
     """
-    (camera, bands), (own_camera, own_bands) = map(_camera_and_bands, (learned, here))
-    if camera != own_camera:
-        return f"was learned for {camera}; the images here are of {own_camera}"
+    names = [camera.name or "a camera without tags" for camera in (learned, here)]
+    bands, own_bands = learned.described_bands, here.described_bands
+    if learned.name != here.name:
+        return f"was learned for {names[0]}; the images here are of {names[1]}"
     if bands[0] != own_bands[0]:
         return f"was learned with the reference {bands[0]}; the reference here is {own_bands[0]}"
     missing = [b for b in own_bands if b not in bands]
     return f"was learned without {', '.join(missing)}" if missing else ""
-
-
-def _camera_and_bands(text: str) -> tuple[str, list[str]]:
-    camera, _, bands = text.removesuffix("]").partition("[")
-    return camera.strip() or "a camera without tags", bands.split(", ")
 
 
 def flights_of(captures: Iterable[Capture]) -> list[list[Capture]]:
@@ -192,11 +214,6 @@ def _gsd_per_height(capture: Capture) -> float | None:
 def _supports(capture: Capture, choice: RadiometryChoice) -> bool:
     bands = with_radiometry(capture, choice, {}).bands
     return all(b.radiometry is not None for b in bands if not b.is_from_photograph)
-
-
-def _key(capture: Capture, bands: Iterable[Band]) -> str:
-    camera, with_sizes = capture.camera, (f"{b.name} {b.width_px}x{b.height_px}" for b in bands)
-    return f"{camera.make} {camera.model} {camera.serial}".strip() + f" [{', '.join(with_sizes)}]"
 
 
 def _by_completeness(captures: Sequence[Capture]) -> list[Capture]:

@@ -19,8 +19,9 @@ from safetensors.torch import save
 
 from agalign._version import __version__
 from agalign.errors import InputError, is_out_of_memory
+from agalign.flight.groups import FlightCamera
 from agalign.flight.rig import Rig
-from agalign.flight.rig_file import rig_from_json, rig_to_json
+from agalign.flight.rig_file import camera_in, rig_from_json, rig_to_json
 from agalign.method.descriptor import Descriptor
 from agalign.values.files import complete_file, open_regular
 from agalign.values.geometry import Matrix, normalised
@@ -33,8 +34,8 @@ class FlightModel:
     """A learned network, the mappings of the bands and the rig of one camera."""
 
     net: Descriptor
-    camera: str
-    """`groups.flight_camera` of the captures; empty if it was learned on pairs of several cameras."""
+    camera: FlightCamera | None
+    """`groups.flight_camera` of the captures; None if it was learned on pairs of several cameras."""
     bands: tuple[str, ...]
     """Names of the moving bands, in the order of the network's sides from 1."""
     mappings: Mapping[str, Matrix]
@@ -58,7 +59,8 @@ def save_model(model: FlightModel, path: Path) -> None:
     facts = {
         "format": _FORMAT,
         "agalign": __version__,
-        "camera": model.camera,
+        "camera": "" if model.camera is None else model.camera.name,
+        "camera_bands": "" if model.camera is None else json.dumps(model.camera.bands),
         "bands": json.dumps(model.bands),
         "sharing": model.net.sharing,
         "channels": json.dumps(model.net.channels),
@@ -98,7 +100,7 @@ def _read_model(path: Path) -> FlightModel:
     fields = {band: values.numpy() for band, values in _with_prefix("field.", tensors).items()}
     return FlightModel(
         net,
-        camera=facts["camera"],
+        camera=camera_in(facts),
         bands=tuple(map(str, json.loads(facts["bands"]))),
         mappings={band: normalised(matrix.numpy()) for band, matrix in _with_prefix("mapping.", tensors).items()},
         fingerprint=facts["fingerprint"],

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from safetensors import safe_open
 
 from agalign.errors import InputError
+from agalign.flight.groups import FlightCamera
 from agalign.flight.rig import CaptureFactors, Rig
 from agalign.values.files import open_regular
 from agalign.values.geometry import normalised
@@ -50,7 +51,20 @@ def rig_from_json(text: str, fields: Mapping[str, NDArray[np.float64]]) -> Rig:
     return Rig(size_px=(int(width), int(height)), captures=captures, fields=displacements, **facts)
 
 
-def read_rig(path: Path) -> tuple[str, Rig | None]:
+def camera_in(facts: Mapping[str, str]) -> FlightCamera | None:
+    """Return the camera in the metadata of a model file; None if it was learned for no camera in particular.
+
+    Raises ValueError or TypeError for damaged text, and for the metadata of an earlier version.
+    """
+    if not facts.get("camera_bands"):
+        if facts["camera"]:
+            raise ValueError("an earlier version wrote it; learn it again")
+        return None
+    bands = json.loads(facts["camera_bands"])
+    return FlightCamera(facts["camera"], tuple((str(name), int(width), int(height)) for name, width, height in bands))
+
+
+def read_rig(path: Path) -> tuple[FlightCamera | None, Rig | None]:
     """Return the camera and the rig of a model file, or None for a model without a rig. Raises InputError."""
     try:
         open_regular(path).close()
@@ -59,7 +73,7 @@ def read_rig(path: Path) -> tuple[str, Rig | None]:
             names = [n for n in file.keys() if n.startswith("field.")]  # noqa: SIM118
             fields = {n.removeprefix("field."): np.asarray(file.get_tensor(n)) for n in names}
         rig = rig_from_json(facts["rig"], fields) if facts.get("rig") else None
-        return str(facts.get("camera", "")), rig
+        return camera_in(facts), rig
     except Exception as error:  # damaged files raise errors of many classes
         reason = next(iter(str(error).splitlines()), type(error).__name__)
         raise InputError(f"{path}: its rig cannot be read ({reason})") from None

@@ -105,14 +105,16 @@ def test_a_model_is_used_again(
 
 def test_a_model_of_another_camera_or_of_no_use_is_refused(flight: Path, model: FlightModel, tmp_path: Path) -> None:
     path = tmp_path / "m.safetensors"
-    camera, _, bands = model.camera.removesuffix("]").partition(" [")
-    reference, first, *others = bands.split(", ")
-    differences = {
-        "Another 1 [Green 10x10]": f"for Another 1; the images here are of {camera}",
-        f"{camera} [{first}, {reference}]": f"with the reference {first}; the reference here is {reference}",
-        f"{camera} [{reference}, {first}]": f"without {', '.join(others)}",
-    }
-    for other, difference in differences.items():
+    assert model.camera is not None
+    camera, (reference, first, *others) = model.camera.name, model.camera.described_bands
+    strange = replace(model.camera, name="Another [1, 2]")
+    for other, difference in {
+        strange: f"for Another [1, 2]; the images here are of {camera}",
+        replace(model.camera, bands=model.camera.bands[1::-1]): (
+            f"with the reference {first}; the reference here is {reference}"
+        ),
+        replace(model.camera, bands=model.camera.bands[:2]): f"without {', '.join(others)}",
+    }.items():
         save_model(replace(model, camera=other), path)
         with pytest.raises(agalign.ConfigurationError) as refused:
             run(flight, tmp_path / "out", model=path)

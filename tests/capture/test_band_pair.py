@@ -93,7 +93,7 @@ def test_the_error_of_a_rig_is_converted_to_px_of_the_reference() -> None:
     rig = Rig(
         (800, 600), {"LWIR": np.diag([0.1, 0.1, 1.0])}, {"LWIR": (1.0, 0.0)}, {"LWIR": 0.0}, {}, (), (), {"LWIR": 0.5}
     )
-    model = FlightModel(None, "", ("LWIR",), {}, "", rig)
+    model = FlightModel(None, None, ("LWIR",), {}, "", rig)
     assert _seed_std_px("LWIR", model, PixelScale(0.5, 0.5))["model"] == pytest.approx(0.5 / 0.1 * 0.5)
 
 

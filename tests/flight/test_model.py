@@ -76,6 +76,8 @@ def test_equal_models_have_equal_bytes_with_and_without_a_rig(model: FlightModel
         ({"format": "other/1"}, "is not a model of agalign"),
         ({"channels": "[1]"}, "invalid numbers of channels"),
         ({"channels": "[0, 1, 1]"}, "invalid numbers of channels"),
+        ({"camera_bands": ""}, "an earlier version wrote it"),
+        ({"camera_bands": '[["Green", 640]]'}, "cannot be read as a model"),
         (None, "no checksum"),
     ],
 )
