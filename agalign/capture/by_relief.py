@@ -1,9 +1,10 @@
-"""Relief of a capture: a candidate for the geometry of all its bands, compared with displacement fields.
+"""Relief of a capture: a candidate for the geometry of all its bands, compared with their homographies.
 
-The relief of half of the lenses verifies the other half, in windows that took no part in the fit of planes and
-baselines. A band that the relief of the others does not explain, as it was exposed at another time or is noisy, gets a
-homography and a baseline of its own under that relief, and is predicted by them if they do not pass verification.
-Either all bands of the capture use the relief, or none.
+A relief that was estimated without a band verifies the band, in windows that took no part in the fit of planes and
+baselines: with few bands the relief of all others, else that of half of the bands. A band that the relief of the others
+does not explain, as it was exposed at another time or is noisy, gets a homography and a baseline of its own under that
+relief, and is predicted by them if they do not pass verification. Either all bands with the same reference image use
+the relief, or none: bands of much lower resolution have another one.
 """
 
 import math
@@ -60,8 +61,8 @@ def aligned_by_relief(
 ) -> tuple[Alignments, set[str]]:
     """Align bands by one relief of the capture, with lens shapes where no rig contains the distortion.
 
-    Return the bands that are aligned, and the names of those with common displacements along a line that neither a
-    relief nor displacement fields must follow.
+    Return the bands that are aligned or predicted, and the names of those with common displacements along a line that
+    neither a relief nor displacement fields must follow.
     Bands without a result, and those with another kind of lens model, follow the relief too.
     With `use` "auto" a relief is only estimated if the residuals of the homographies contain common parallax. For an
     observation of the rig, only the homographies matter, and the parallax of windows suffices.
@@ -121,7 +122,7 @@ class _Band:
 
     @cached_property
     def by_homography(self) -> Residual:
-        """Of the held-out windows with the homography of the candidate."""
+        """The residual of the held-out windows under the homography of the candidate."""
         return self.candidate.held_out_residual(self.candidate.warped.mapping)
 
     def aligned(self, mapping: PixelMapping, held_out: Residual) -> Alignment:
@@ -174,7 +175,7 @@ def _observed(group: Sequence[Candidate]) -> Alignments:
 
 
 def _aligned_group(group: Sequence[Candidate], candidates: Sequence[Candidate]) -> Alignments:
-    """Align a group by its relief, and the other bands by it too; empty if another geometry explains the group better.
+    """Align a group by its relief, and the other bands by it too; empty if their homographies fit the group better.
 
     Raises GeometryError.
     """
@@ -207,7 +208,7 @@ class _Estimate:
 
     @classmethod
     def of(cls, group: Sequence[Candidate]) -> "_Estimate | None":
-        """Estimate the relief from bands with common parallax; None if the windows do not determine the baselines.
+        """Estimate the relief from bands with common parallax; None if their windows determine no baselines of lenses.
 
         Raises GeometryError.
         """
@@ -250,7 +251,7 @@ class _Estimate:
         )
 
     def fitted(self, candidate: Candidate) -> _Band | None:
-        """Fit homography and baseline of a band under the relief of the others; None if too few windows are measured.
+        """Fit homography and baseline of a band under the relief of the others; None if its windows determine none.
 
         The layout of the lenses, scaled to the baselines of the others, is the prior of the baseline. Raises
         GeometryError.
@@ -290,7 +291,7 @@ class _Estimate:
         """Align a band by the relief of all bands, or predict it.
 
         The held-out windows of a band of the estimate are measured by the relief `verifying` of other bands. Empty if
-        half of them are not aligned, or if the scene repeats.
+        they are few, half of them are not aligned, or the scene repeats.
         """
         candidate, pair = band.candidate, band.candidate.pair
         mapping = band.mapping(self.relief, with_occlusions=True)

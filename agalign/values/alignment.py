@@ -27,11 +27,11 @@ COVARIANCE_DECIMALS = 9
 MIN_RETRIEVAL = 0.2
 """Minimum held-out retrieval: below it psi is not updated and no result is accepted. Chance is below 0.01; unrelated
 images reach 0.05."""
+MIN_TIMES_CHANCE = 5.0
+"""`MIN_RETRIEVAL` as a multiple of chance, which is high where few keypoints can be drawn."""
 _NOISE_PX_SIGMA2 = 48.0
 """RMS noise of the shift of a window times the squared height of its peak, in windows of 40 to 64 px: the median shift
 of aligned windows is 0.7 to 1.35 of that noise in sharp, noisy and blurred scenes, with peaks of 8 sigma to 30."""
-MIN_TIMES_CHANCE = 5.0
-"""The same limit as a multiple of chance, which is high where few keypoints can be drawn."""
 
 
 def noise_px(peaks_sigma: ArrayLike) -> NDArray[np.float64]:
@@ -49,21 +49,25 @@ class Seed:
     fixed_to_moving: Matrix3x3
     """Between undistorted px if both lenses are known, else between raw px."""
     score: Number
-    """Height of the correlation at this mapping, in standard deviations; candidates are compared by it."""
+    """Height of the correlation at this mapping, in standard deviations; candidates are compared by it. 0 for a mapping
+    of the tags or the flight that replaced another seed."""
     peak_sigma: Number = 0.0
     """Height of the correlation peak above its surroundings, in standard deviations."""
     runner_up_sigma: Number = 0.0
     """The same for the second highest separate peak."""
     trusted: bool = False
-    """The images confirm that it is accurate to a few pixels."""
+    """The images confirm that it is accurate to a few pixels, or it is the mapping of the tags or the flight that
+    replaced a seed which contradicts it."""
 
 
 @validated.dataclass(frozen=True, config=RECORD)
 class JointResult:
-    """The result of the joint optimisation of descriptor and mapping."""
+    """The estimate of a band: by the joint optimisation of descriptor and mapping, then together with the windows, the
+    other bands and the rig, or by windows alone.
+    """
 
     fixed_to_moving: Matrix3x3
-    """Homography before it was combined with a prediction, between the same px as the seed."""
+    """Homography, between the same px as the seed. A prediction may have replaced it in the mapping of the band."""
     loss: Annotated[float, Measured()]
     """Final loss; null if nothing was learned."""
     retrieval: Number
@@ -83,13 +87,13 @@ class JointResult:
     """Movement of a corner in the last step, px of the reference."""
     corner_std_xy_px: Annotated[tuple[tuple[UpToInfinity, UpToInfinity], ...], Field(min_length=4, max_length=4)]
     """Standard errors (x, y) of the mapping at the corners of the reference, clockwise from the top left, px of the
-    reference: from the curvature at the solution and the scatter of the patches."""
+    reference."""
     corner_covariance_px2: Annotated[NDArray[np.float64], Array((8, 8), COVARIANCE_DECIMALS)] | None = None
     """(8, 8) of (x, y) of those corners, for a homography whatever the family; null if it is not known."""
 
     @property
     def corner_std_px(self) -> float:
-        """Standard error of the mapping at the least certain corner: root mean square over both axes together."""
+        """Standard error of the mapping at the least certain corner: root mean square distance, of x and y together."""
         return max(math.hypot(*std) for std in self.corner_std_xy_px)
 
     @property
@@ -131,7 +135,7 @@ class RefinedPair:
 
 @validated.dataclass(frozen=True, config=RECORD)
 class Residual:
-    """Shifts of windows that remain after alignment, measured independently of the estimation."""
+    """Shifts of windows under a mapping, measured by phase correlation without the learned descriptors."""
 
     centres_px: Annotated[NDArray[np.float64], Array((None, 2), 2)]
     """Centres of the n windows, px of the reference."""
@@ -261,20 +265,20 @@ SAME_SCALES = PairScales()
 
 @validated.dataclass(frozen=True, config=RECORD)
 class Prediction:
-    """Mapping of a band by the rig of the flight, or by extrapolation."""
+    """Mapping of a band by the rig of the flight, or by windows that do not confirm it everywhere."""
 
     fixed_to_moving: Matrix3x3
-    """Between the files; between undistorted pixels if the mappings of the rig are."""
+    """Between the files; between undistorted pixels if both lenses are known."""
     source: Annotated[PredictionSource, Field(alias="from")]
-    """`bands` (other bands of the capture), `neighbours` (other captures), `flight` (mean), or `windows` (a part of the
-    image)."""
+    """`bands` (other bands of the capture), `neighbours` (other captures), `flight` (mean), or `windows` (in the image
+    of the band)."""
     std_px: Number4
     """Standard error over the image (root mean square), px of the band's own file."""
     off_px: Number4 | None = None
     """Root mean square distance from the band's own alignment, px of the band's own file; null if there is none."""
     covariance_px2: Annotated[NDArray[np.float64], Array((12, 12), COVARIANCE_DECIMALS)] | None = None
-    """(12, 12) of an extrapolated mapping, over the corners and the lens shapes (`fit.window_fit`), px of the
-    reference's file; null for a rig's."""
+    """(12, 12) over the corners and the lens shapes (`fit.window_fit`), px of the reference's file, of a mapping that
+    was extrapolated with lens shapes; else null."""
 
 
 @validated.dataclass(frozen=True, config=RECORD)
@@ -319,22 +323,23 @@ class Alignment:
     """Reasons against accepting the alignment, the most important first; empty if it is `aligned`."""
     seed: Seed
     joint: JointResult | None = None
-    """Result of the optimisation with its standard error; None if it was not run or failed."""
+    """The band's own estimate with its standard error; None without one."""
     residual: Residual | None = None
-    """Of windows that took no part in the estimation."""
+    """Shifts of windows, each under a mapping that was estimated without the window; of all windows under a seed or a
+    prediction of the rig."""
     seconds: float = 0.0
     """Share of the capture's processing time, equal for all its bands."""
     before: Similarity = _NOT_MEASURED
-    """Comparison metrics of the files as they are, such as mutual information."""
+    """Measures of similarity of the images as they are, their borders overlaid."""
     after: Similarity = _NOT_MEASURED
     """The same under the mapping."""
     candidates: Mapping[Geometry, float] = field(default_factory=dict)
     """p95 of the shifts of held-out windows by each geometry that was fitted; empty if only a homography was."""
     prediction: Prediction | None = None
-    """Prediction of the mapping: by the rig of the flight, or by windows in a part of the image. Together with `issues`
-    it is the mapping; without, the mapping has been compared with it. None without either."""
+    """Prediction of the mapping, by the rig of the flight or by windows. With `issues` it is the mapping; without, the
+    mapping has been compared with it. None if there is no prediction."""
     is_seed_usable: bool = False
-    """The mapping is that of the seed, which the images or the tags confirm and which fits the windows."""
+    """The mapping is that of the seed, which is trusted or requested, and which fits the windows."""
     lens_std_px: NDArray[np.float64] | None = None
     """(4,) standard deviations of the lens shapes (`fit.window_fit`) that neither tags nor a rig determine, px of the
     reference; None if they are known, or contained in a prediction."""
@@ -351,7 +356,7 @@ class Alignment:
         =========  ===================================================
         aligned    there are no issues: it passed verification
         predicted  the mapping is a prediction with a standard error
-        seed_only  the mapping is that of the seed, which is confirmed
+        seed_only  the mapping is that of the seed, which is usable
         failed     otherwise; the mapping is that of the seed
         =========  ===================================================
         """

@@ -6,7 +6,8 @@ maps to
     H_b (x + t_b z(x))
 
 in band b. H_b is the homography that the reference plane induces. The parallax z is one number for each pixel, and the
-same in all bands: it is proportional to 1 / range minus that of the plane. t_b is the direction of the band's lens.
+same in all bands: it is proportional to 1 / range minus that of the plane. t_b is the baseline of the band's lens, as a
+displacement in the reference.
 """
 
 import math
@@ -100,7 +101,11 @@ class Parallax:
     """On the raster of the relief: pixels that nearer parts of the scene occlude in this band. None hides nothing."""
 
     def with_occlusions(self) -> "Parallax":
-        """The same with the pixels hidden where a nearer one, of larger parallax, is displaced to the same position."""
+        """The same with the pixels hidden where a nearer one, of larger parallax, is displaced to the same position.
+
+        Surfaces that are displaced by less than `min_width_px` relative to each other do not hide one another. Gaps
+        between hidden pixels are closed, and then areas smaller than `min_area_px` are not hidden.
+        """
         min_width_px = 1.5  # smaller differences of parallax are slopes of one surface, or noise
         min_area_px = 16  # smaller areas are single pixels with wrong parallax
         z_px, (t_x, t_y) = self.relief.parallax_px, np.multiply(self.baseline, self.relief.scale)
@@ -124,7 +129,7 @@ class Parallax:
         return replace(self, hidden=np.asarray(is_large[labels]))
 
     def same_as(self, other: "Parallax") -> bool:
-        """Return True if two reliefs displace a band equally, in every number."""
+        """Return True if two parallaxes displace the band equally, in every number."""
         one, two = self.relief, other.relief
         scales = (self.baseline, one.scale, one.unit) == (other.baseline, two.scale, two.unit)
         return scales and np.array_equal(one.parallax_px, two.parallax_px)
