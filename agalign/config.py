@@ -135,7 +135,7 @@ class RunOptions:
     """Estimate and render captures with missing or unaligned bands again."""
     # An `executor` of the caller ignores it, except `dask_executor`.
     timeout_s: Annotated[float | None, Field(ge=1, le=1e6), Option("timeout")] = None
-    """Seconds after which a capture, or a file whose tags are read, is abandoned; by default unlimited."""
+    """Seconds after which a capture, or the reading of the tags of a file, is abandoned; by default unlimited."""
     command: str = ""
     """Command line, for run record and report."""
 
