@@ -123,7 +123,8 @@ def _radiometry(tags: Tags) -> Radiometry | None:
         k if centre else (),
         vignetting_divides=False,
         by_sun=(1 / irradiance, "relative reflectance") if irradiance > 0 else None,
-        tags={"sensor gain": gain, "gain adjustment": adjusted, "exposure time (s)": exposure_us / 1e6},
+        tags={"sensor gain": gain, "gain adjustment": adjusted, "exposure time (s)": exposure_us / 1e6}
+        | ({"relative irradiance": irradiance} if irradiance else {}),  # 0 without a reading
     )
 
 

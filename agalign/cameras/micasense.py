@@ -89,7 +89,8 @@ def _radiometry(tags: Tags) -> Radiometry | None:
     iso = finite(tags.exif.get("ISOSpeed", tags.exif.get("ISOSpeedRatings")))
     if len(a) != 3 or not exposure_s or tags.black_level is None or not iso:
         return None
-    by_sensor = irradiance(tags)
+    measured, by_sensor = math.prod(_measured_irradiance(tags) or (0.0,)), irradiance(tags)
+    of_sensor = {"irradiance (W / m^2 / nm)": measured} if measured else {}  # 0 without a reading
     centre, k = tags.numbers(pix4d.NAMESPACE, "VignettingCenter"), tags.numbers(pix4d.NAMESPACE, "VignettingPolynomial")
     has_vignetting = len(centre) == 2
     return Radiometry(
@@ -102,7 +103,7 @@ def _radiometry(tags: Tags) -> Radiometry | None:
         True,
         a[1] / exposure_s - a[2],
         (math.pi / math.prod(by_sensor), "reflectance") if by_sensor else None,
-        tags={"calibration coefficient": a[0], "sensor gain": iso / 100, "exposure time (s)": exposure_s},
+        tags={"calibration coefficient": a[0], "sensor gain": iso / 100, "exposure time (s)": exposure_s} | of_sensor,
     )
 
 
@@ -120,7 +121,15 @@ def _without_calibration(tags: Tags) -> str:
 
 def irradiance(tags: Tags) -> tuple[float, float] | None:
     """Return (irradiance on a horizontal plane in the unit of the tags, this unit in W / m^2 / nm); None if there is no
-    plausible one.
+    positive one.
+    """
+    measured = _measured_irradiance(tags)
+    # Products of damaged tags underflow.
+    return None if measured is None or not math.prod(measured) > 0 else measured
+
+
+def _measured_irradiance(tags: Tags) -> tuple[float, float] | None:
+    """The irradiance as `irradiance`, also one that is not positive; None if there is none.
 
     Older sensors measure only in their own plane: the time, the place and the attitude then give the horizontal one.
     """
@@ -128,14 +137,16 @@ def irradiance(tags: Tags) -> tuple[float, float] | None:
     is_clock_set = time is not None and time.utc.year > 1970  # others count from 1970
     sun = sun_position(tags.position, time.utc.timestamp()) if tags.position and time and is_clock_set else None
     scale = tags.number(_DLS, "IrradianceScaleToSIUnits")
-    value, unit = _measured_horizontal(tags, sun), scale or 0.01  # the unit without a tag
-    if value is None or value <= 0:
-        value, unit = tags.number(_DLS, "SpectralIrradiance"), scale or 1.0
-        value = tags.number(pix4d.NAMESPACE, "Irradiance") if value is None else value
-        if value is not None and sun is not None:
-            value = horizontal_irradiance(value, _sensor_attitude_deg(tags), sun)
-    # Products of damaged tags underflow.
-    return None if value is None or not value * unit > 0 else (value, unit)
+    horizontal = _measured_horizontal(tags, sun)
+    if horizontal is not None and horizontal > 0:
+        return horizontal, scale or 0.01  # the unit without a tag
+    value = tags.number(_DLS, "SpectralIrradiance")
+    value = tags.number(pix4d.NAMESPACE, "Irradiance") if value is None else value
+    if value is None:
+        return None if horizontal is None else (horizontal, scale or 0.01)
+    if sun is not None:
+        value = horizontal_irradiance(value, _sensor_attitude_deg(tags), sun)
+    return None if math.isnan(value) else (value, scale or 1.0)
 
 
 def _measured_horizontal(tags: Tags, sun: tuple[float, float] | None) -> float | None:

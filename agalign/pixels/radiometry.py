@@ -61,7 +61,7 @@ def plausible(radiometry: Radiometry, size_px: tuple[int, int]) -> tuple[Radiome
     values["row gradient"] = 1.0 + radiometry.row_gradient * np.array([0.0, height])
     if radiometry.by_sun is not None:
         kind = "irradiance (W / m^2 / nm)" if radiometry.by_sun[1] == "reflectance" else "relative irradiance"
-        values[kind] = radiometry.irradiance or 0.0
+        values.setdefault(kind, radiometry.irradiance or 0.0)
     for name, value in values.items() if radiometry.is_of_light else ():
         low, high = _PLAUSIBLE[name]
         for wrong in (v for v in np.ravel(value).tolist() if not low <= v <= high):
