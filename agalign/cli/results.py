@@ -131,6 +131,7 @@ def _indices(
     """
     from agalign.batch.index_run import index_tasks, run_indices
     from agalign.cli.align_run import cluster, progress
+    from agalign.errors import OutputError
     from agalign.products.report.pages import REPORT_FILE, write_pages
     from agalign.values.output_folder import locked
 
@@ -141,26 +142,40 @@ def _indices(
     dask = given["run"]["executor"]
     with locked(folder), cluster(dask, jobs) as executor, progress(terminal, len(tasks)) as show:
         reports: list[IndexReport] = []
-        for number, done in enumerate(run_indices(tasks, jobs, executor), start=1):
-            terminal.check()
-            if any(r.raw_numbers for r in done) and not any(r.raw_numbers for r in reports):
-                terminal.problem(RAW_NUMBERS)
-            reports += done
-            for report in done:
-                _print(report, terminal)
-            show(number, done[0].capture, 0)
-        if target is None and (out / REPORT_FILE).is_file():
-            write_pages(out, terminal.problem)
-    return _conclude([one.name for one in chosen], reports, folder, terminal, as_json=as_json)
+        unwritten = ""
+        try:
+            for number, done in enumerate(run_indices(tasks, jobs, executor), start=1):
+                terminal.check()
+                if any(r.raw_numbers for r in done) and not any(r.raw_numbers for r in reports):
+                    terminal.problem(RAW_NUMBERS)
+                reports += done
+                for report in done:
+                    _print(report, terminal)
+                show(number, done[0].capture, 0)
+            if target is None and (out / REPORT_FILE).is_file():
+                write_pages(out, terminal.problem)
+        except OutputError as error:  # of the table or the report: the rasters and their statistics exist
+            unwritten = str(error)
+    return _conclude([one.name for one in chosen], reports, folder, terminal, unwritten, as_json=as_json)
 
 
 def _conclude(
-    names: Sequence[str], reports: "Sequence[IndexReport]", folder: Path, terminal: Terminal, *, as_json: bool
+    names: Sequence[str],
+    reports: "Sequence[IndexReport]",
+    folder: Path,
+    terminal: Terminal,
+    unwritten: str = "",
+    *,
+    as_json: bool,
 ) -> int:
-    """Print the statistics of all indices, and return the exit code."""
+    """Print the statistics of all indices, and return the exit code; `unwritten` says why the table or the report could
+    not be written.
+    """
     from agalign.products.indices.rasters import INDICES_FILE
 
     written = [r for r in reports if r.path is not None]
+    if unwritten:
+        terminal.problem(unwritten)
     if as_json:
         terminal.facts({"folder": str(folder), "indices": [_facts(r) for r in reports]})
     elif written:
@@ -168,8 +183,10 @@ def _conclude(
         if masked := sorted({r.capture for r in written if r.statistics.masked_share > 1 / 3}):
             more = f" and {len(masked) - 1} more captures" if masked[1:] else ""
             terminal.problem(f"--mask-qa leaves out more than a third of {masked[0]}{more}: look at the .qa.tif")
-        terminal.result(f"Statistics: {folder / INDICES_FILE}")
-    return ExitCode.NOTHING if not written else ExitCode.OK if len(written) == len(reports) else ExitCode.PARTIAL
+        if not unwritten:
+            terminal.result(f"Statistics: {folder / INDICES_FILE}")
+    is_complete = len(written) == len(reports) and not unwritten
+    return ExitCode.NOTHING if not written else ExitCode.OK if is_complete else ExitCode.PARTIAL
 
 
 indices = Command(

@@ -10,9 +10,10 @@ import pytest
 from synthetic_flights.aligned import make_aligned
 
 from agalign.cli import main
+from agalign.errors import OutputError
 from agalign.synthetic import flight as synthetic
 
-from ..conftest import read_json
+from ..conftest import raising, read_json
 from ..program import agalign_here
 
 
@@ -167,3 +168,12 @@ def test_reports_as_json(tmp_path: Path) -> None:
     assert ndvi["p5"] < ndvi["median"] < ndvi["p95"]
     assert (evi["path"], evi["median"]) == (None, None)
     assert "evi needs a blue band" in evi["problem"]
+
+
+def test_indices_are_printed_if_their_table_cannot_be_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    make_aligned(tmp_path, 1)
+    full = OutputError(f"{tmp_path / 'indices.csv'}: cannot be written (No space left on device)")
+    monkeypatch.setattr("agalign.batch.index_run.update_table", raising(full))
+    done = agalign_here("indices", tmp_path, "--json")
+    assert (done.returncode, done.stderr) == (3, f"agalign: {full}\n")
+    assert [one["index"] for one in json.loads(done.stdout)["indices"]] == ["ndvi"]
