@@ -59,7 +59,7 @@ def matches(fixed: Raster, moving: Raster, truth: Matrix) -> NDArray[np.uint8]:
     drawn = rng.choice(len(keypoints), DRAWN, replace=False)
     rows = []
     for name, title in (("fast:pseudo-siamese", "learned on this pair"), ("sift", "SIFT")):
-        describe, _ = method_named(name)(fixed, moving, start)
+        describe, _ = method_named(name).apply(fixed, moving, start)
         assert describe is not None
         f, f_prime = describe(keypoints, truth)
         nearest = ((f[:, None] - f_prime[None]) ** 2).sum(-1).argmin(1).numpy()

@@ -42,7 +42,7 @@ def write_pairs(folder: Path) -> None:
     rng, rough = np.random.default_rng(SPLIT_SEED), []
     for number, fixed, moving, truth in mixed[:LEARNED]:
         longer_side_px = max(read_image(fixed).size_px)
-        ((_, start),) = Starts((0.05,)).of(np.loadtxt(truth), longer_side_px, rng)
+        ((_, _, start),) = Starts((0.05,)).of(np.loadtxt(truth), longer_side_px, rng)
         rough.append((number, fixed, moving, " ".join(map(str, start.ravel()))))
     for name, rows in (("pairs", pairs), ("learn", rough), ("test", mixed[LEARNED:])):
         with Path(f"{name}.csv").open("w", newline="", encoding="utf-8") as file:

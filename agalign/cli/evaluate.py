@@ -11,6 +11,7 @@ from agalign.cli.terminal import Terminal
 from agalign.errors import ConfigurationError
 from agalign.values.choices import Sharing
 from agalign.values.output_folder import refuse_to_replace
+from agalign.values.text import counted
 
 Pairs = Annotated[
     Path, typer.Argument(help="A CSV file (fixed, moving, homography), or a folder in the HPatches or Oxford layout.")
@@ -35,26 +36,41 @@ def _evaluate(
         shift: Distances of the start from the truth, % of the longer side, separated by commas.
         directions: Directions of the start for each distance.
         seeding: Correct the start by the initial alignment first, as a run does.
-        out: CSV file with a row per pair and method.
+        out: CSV file with a row per pair, method and start; rows that it has are not measured again.
         device: auto, cpu, cuda, cuda:1 …
     """
-    from agalign.evaluation.evaluate import Starts, error_table, evaluate, method_named, precision_table, write_results
+    from agalign.evaluation.evaluate import (
+        Starts,
+        append_result,
+        error_table,
+        evaluate,
+        method_named,
+        precision_table,
+        read_results,
+        write_results,
+    )
     from agalign.evaluation.image_pairs import find_pairs
 
     if out is not None:
         refuse_to_replace(out, b"pair,group,method,")
     chosen = methods or [*(f"fast:{sharing}" for sharing in get_args(Sharing)), "sift"]
-    joint = given["settings"]["joint"]
-    named = {name: method_named(name, **joint, seeding=seeding) for name in chosen}
-    results = []
-    try:
-        for result in evaluate(find_pairs(pairs), named, Starts(_shares(shift), directions), joint["rng_seed"]):
-            results.append(result)
-            line = f"{result.pair}, {result.method}: mAP {result.average_precision:.3f}, {result.error_px:.3f} px"
-            terminal.event("result", line if terminal.verbose else "", **vars(result))
-    finally:
-        if out is not None and results:
-            write_results(out, results)
+    joint, start = given["settings"]["joint"], ", initial alignment" if seeding else ""
+    named = {f"{name}{start}": method_named(name, **joint, seeding=seeding) for name in chosen}
+    known, every = find_pairs(pairs), Starts(_shares(shift), directions)
+    numbers = {pair.name: number for number, pair in enumerate(known, start=1)}
+    results = [] if out is None else read_results(out)
+    if out is not None:
+        write_results(out, results)  # without a last line that was not written to its end
+    if results:
+        text = f"{out}: {counted(len(results), 'result')} of an earlier command kept"
+        terminal.event("kept", text, results=len(results))
+    for result in evaluate(known, named, every, joint["rng_seed"], results.copy()):
+        results.append(result)
+        if out is not None:
+            append_result(out, result)
+        text = f"mAP {result.average_precision:.3f}, {result.error_px:.3f} px, {result.seconds:.1f} s"
+        line = f"[{numbers[result.pair]}/{len(known)}] {result.pair}, {result.method}, {result.shift:.1%} off: {text}"
+        terminal.event("result", line, **vars(result))
     for title, rows in (("Mean average precision", precision_table(results)), ("Homography", error_table(results))):
         if len(rows) > 1:
             terminal.table(rows[0], rows[1:], title)

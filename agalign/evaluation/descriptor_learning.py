@@ -11,7 +11,7 @@ from pathlib import Path
 import torch
 
 from agalign.capture.align_bands import align_pairs
-from agalign.capture.band_pair import BandPair
+from agalign.capture.band_pair import BandPair, SeedMatrices
 from agalign.capture.reference import Reference
 from agalign.config import Settings
 from agalign.errors import InputError, NoContrastError, NotEnoughTextureError
@@ -101,12 +101,12 @@ def _learn(net: Descriptor, examples: Sequence[_Example], state: JointState, ste
 def read_rough_pairs(source: Path) -> list[BandPair]:
     """Return the pairs of a CSV file or folder (`find_pairs`), with their homographies as seeds.
 
-    Without a homography, the seed maps the outlines of the images onto each other. Raises InputError.
+    Without a homography, any rotation, scale and shift is searched, as by `agalign.align`. Raises InputError.
     """
     result = []
     for files in find_pairs(source):
         fixed, moving = read_image(files.fixed), read_image(files.moving)
         known = files.fixed_to_moving
-        start = geometry.overlay(fixed.size_px, moving.size_px) if known is None else known
-        result.append(BandPair(files.name, Reference(fixed), moving, {"user": start}))
+        overlay: SeedMatrices = {"identity": geometry.overlay(fixed.size_px, moving.size_px)}
+        result.append(BandPair(files.name, Reference(fixed), moving, overlay if known is None else {"user": known}))
     return result

@@ -2,16 +2,19 @@
 learned on the pair, pretrained and hand-crafted descriptors, and elastix.
 """
 
+import csv
 import importlib
 import importlib.util
+import io
 import math
 import re
 import time
 import zlib
+from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import astuple, dataclass, fields, replace
 from functools import partial
-from itertools import product
+from itertools import islice, product
 from pathlib import Path
 from statistics import fmean
 from typing import get_args
@@ -27,7 +30,14 @@ from agalign.capture.band_pair import BandPair
 from agalign.capture.reference import Reference
 from agalign.capture.seeding import best_seed, image_groups
 from agalign.config import JointSettings
-from agalign.errors import ConfigurationError, GeometryError, InputError, NoContrastError, NotEnoughTextureError
+from agalign.errors import (
+    ConfigurationError,
+    GeometryError,
+    InputError,
+    NoContrastError,
+    NotEnoughTextureError,
+    OutputError,
+)
 from agalign.evaluation.image_pairs import PairFiles, read_image
 from agalign.flight.model import load_model
 from agalign.method.descriptor import Descriptor
@@ -40,21 +50,35 @@ from agalign.method.patches import Keypoints, bilinear, patch_positions, transfo
 from agalign.method.refine import refine
 from agalign.method.state import JointState, MovingImage
 from agalign.pixels.band_resampling import channel_mean, luma, warped
+from agalign.pixels.landmarks import landmarks, matched_homography
 from agalign.values import geometry
 from agalign.values.alignment import JointResult, Seed
 from agalign.values.choices import Sharing
-from agalign.values.files import write_csv
+from agalign.values.files import read_regular, write_csv
 from agalign.values.geometry import Matrix
 from agalign.values.image import Raster
 from agalign.values.mapping import PixelMapping
+from agalign.values.text import without_formula
 
 Describe = Callable[[Keypoints, Matrix], tuple[Tensor, Tensor]]
 """Return descriptors (f, f'), each (N, D), of the patches around keypoints of the first image, and of the patches of
 the second image that a homography maps them to."""
 Outcome = tuple[Describe | None, Matrix | None]
 """Descriptors and homography (fixed_to_moving) of a pair, as far as a method has them."""
-Method = Callable[[Raster, Raster, Matrix], Outcome]
-"""Return the outcome for two images and the initial homography, px."""
+
+
+@dataclass(frozen=True)
+class Method:
+    """A method that is evaluated."""
+
+    apply: Callable[[Raster, Raster, Matrix], Outcome]
+    """Return the outcome for two images and the initial homography, px."""
+    uses_start: bool = True
+    """False if the outcome does not depend on the initial homography."""
+
+
+RECIPES = "fast", "scratch", "paper"
+"""Recipes by which descriptors are learned on a pair."""
 
 
 def method_named(name: str, device: str = "auto", rng_seed: int = 0, *, seeding: bool = False) -> Method:
@@ -64,34 +88,33 @@ def method_named(name: str, device: str = "auto", rng_seed: int = 0, *, seeding:
 
     * `fast`, `scratch` or `paper`, a colon and the sharing (`siamese`, `pseudo-siamese`, `unshared`): learned on the
       pair by that recipe. `:grey` added: on grey images.
-    * `sift`, `daisy`, `elastix`.
+    * `sift` (its homography is that of MAGSAC++), `daisy`, `elastix`.
     * FILE.safetensors: a network of this program. FILE.pt: a TorchScript module that takes (N, 1, P, P) in [0, 1]; P is
       32, or what follows an @, as in hardnet.pt@32.
 
     Raises ConfigurationError for other names, InputError for a file that cannot be used.
     """
     fixed_names: dict[str, Method] = {
-        "sift": _from_patches(64, sift_of_patches),
+        "sift": _from_patches(64, sift_of_patches, homography_by_sift),
         "daisy": _from_patches(64, daisy_of_patches),
-        "elastix": _elastix,
+        "elastix": Method(_elastix),
     }
     if name == "elastix" and importlib.util.find_spec("itk") is None:
         raise ConfigurationError(f"{name} needs more than is installed; in a checkout: pip install '.[evaluate]'")
     if name in fixed_names:
         return fixed_names[name]
-    learned = re.fullmatch(r"(fast|scratch|paper):([a-z-]+)(:grey)?", name)
+    learned = re.fullmatch(rf"({'|'.join(RECIPES)}):([a-z-]+)(:grey)?", name)
     if learned and learned[2] in get_args(Sharing):
         facts = {"recipe": learned[1], "sharing": learned[2], "device": device, "rng_seed": rng_seed}
         settings = JointSettings.model_validate(facts)
-        return partial(_learned_on_pair, settings=settings, colour=learned[3] is None, seeding=seeding)
+        return Method(partial(_learned_on_pair, settings=settings, colour=learned[3] is None, seeding=seeding))
     if ".safetensors" in name:
         return _saved_network(Path(name))
     if ".pt" in name:
         file, _, side = name.partition("@")
         return _torchscript(Path(file), int(side) if side.isdigit() else 32)
-    raise ConfigurationError(
-        f"unknown method '{name}'; choose from sift, daisy, elastix, RECIPE:SHARING or a network file"
-    )
+    known = [*fixed_names, *(f"{recipe}:{sharing}" for recipe in RECIPES for sharing in get_args(Sharing))]
+    raise ConfigurationError(f"unknown method '{name}'; choose from {', '.join(known)} or a network file")
 
 
 # ---- descriptors of agalign
@@ -137,7 +160,7 @@ def _saved_network(path: Path) -> Method:
     """Return a network of `agalign learn` or of an earlier run; images with another number of channels become grey."""
     model = load_model(path, lambda: torch.device("cpu"))
 
-    def method(one: Raster, other: Raster, _: Matrix) -> Outcome:
+    def apply(one: Raster, other: Raster, _: Matrix) -> Outcome:
         fixed, moving = (
             r if r.channels == channels else _without_colour(r)
             for r, channels in zip((one, other), model.net.channels, strict=False)
@@ -146,24 +169,34 @@ def _saved_network(path: Path) -> Method:
         state = JointState(JointSettings(device="cpu"), lambda *_: None)
         return _by_network(net, state, fixed, moving), None
 
-    return method
+    return Method(apply, uses_start=False)
 
 
 # ---- other methods
 
 
-def _from_patches(side: int, describe_patches: Callable[[Tensor], Tensor]) -> Method:
-    """Return the method of a descriptor of patches (N, 1, side, side) in [0, 1]."""
+def _from_patches(
+    side: int,
+    describe_patches: Callable[[Tensor], Tensor],
+    homography: Callable[[Raster, Raster], Matrix | None] = lambda *_: None,
+) -> Method:
+    """Return the method of a descriptor of patches (N, 1, side, side) in [0, 1], with the homography of two images."""
 
-    def method(fixed: Raster, moving: Raster, _: Matrix) -> Outcome:
+    def apply(fixed: Raster, moving: Raster, _: Matrix) -> Outcome:
         def describe(keypoints: Keypoints, fixed_to_moving: Matrix) -> tuple[Tensor, Tensor]:
             grid = patch_positions(keypoints, side)
             mapped = transform(torch.tensor(fixed_to_moving, dtype=torch.float32), grid)
             return describe_patches(grey_patches(fixed, grid)), describe_patches(grey_patches(moving, mapped))
 
-        return describe, None
+        return describe, homography(fixed, moving)
 
-    return method
+    return Method(apply, uses_start=False)
+
+
+def homography_by_sift(fixed: Raster, moving: Raster) -> Matrix | None:
+    """Return fixed_to_moving of the keypoints of SIFT in the full images, as `matched_homography`."""
+    one, other = (landmarks(r, "image", longest_side_px=max(r.size_px)) for r in (fixed, moving))
+    return matched_homography(one, other, fixed.size_px)
 
 
 def _mosaic(patches: Tensor) -> tuple[NDArray[np.float32], int, int]:
@@ -283,14 +316,14 @@ class Starts:
     directions: int = 1
     """Number of directions for each shift, evenly spaced from a random one for each pair."""
 
-    def of(self, truth: Matrix, longer_side_px: int, rng: np.random.Generator) -> Iterator[tuple[float, Matrix]]:
-        """Yield (shift, fixed_to_moving) of every initial homography."""
+    def of(self, truth: Matrix, longer_side_px: int, rng: np.random.Generator) -> Iterator[tuple[float, float, Matrix]]:
+        """Yield (shift, its direction in degrees, fixed_to_moving) of every initial homography."""
         first = rng.uniform(0, 2 * math.pi)
         for shift in self.shifts:
             for k in range(1 if shift == 0 else self.directions):
                 angle = first + 2 * math.pi * k / self.directions
                 dx, dy = shift * longer_side_px * np.array([math.cos(angle), math.sin(angle)])
-                yield shift, geometry.compose(truth, geometry.translation(dx, dy))
+                yield shift, math.degrees(angle) % 360, geometry.compose(truth, geometry.translation(dx, dy))
 
 
 @dataclass(frozen=True)
@@ -302,23 +335,41 @@ class Result:
     method: str
     shift: float
     """Shift of the initial homography as a share of the longer side."""
+    direction_deg: float
+    """Direction of the shift."""
     keypoints: int
-    average_precision: float
+    average_precision: float = math.nan
     """nan for a method without descriptors."""
-    error_px: float
+    error_px: float = math.nan
     """Mean over the keypoints; nan for a method without a homography."""
-    error_share: float
+    error_share: float = math.nan
     """`error_px` divided by the longer side of the second image."""
-    seconds: float
+    seconds: float = math.nan
+
+    @property
+    def cells(self) -> list[str]:
+        """The values as they are written to a table."""
+        return [f"{v:.5g}" if isinstance(v, float) else str(v) for v in astuple(self)]
+
+    @property
+    def key(self) -> tuple[str, ...]:
+        """Pair, method and start, as they are in a table."""
+        pair, _, method, *start = map(str, map(without_formula, self.cells[:5]))
+        return pair, method, *start
 
 
 def evaluate(
-    pairs: Sequence[PairFiles], methods: Mapping[str, Method], starts: Starts, rng_seed: int = 0
+    pairs: Sequence[PairFiles],
+    methods: Mapping[str, Method],
+    starts: Starts,
+    rng_seed: int = 0,
+    earlier: Sequence[Result] = (),
 ) -> Iterator[Result]:
-    """Yield the results pair by pair; methods without a homography do not depend on the start and are run once.
+    """Yield the results pair by pair, without the `earlier` ones; methods that do not depend on the start are run once.
 
     Raises InputError for a pair without a homography or an image that cannot be read.
     """
+    known = Counter(result.key for result in earlier)  # pairs may have equal names
     for pair in pairs:
         truth = pair.fixed_to_moving
         if truth is None:
@@ -328,10 +379,15 @@ def evaluate(
         points_px = keypoints.xy.numpy().astype(np.float64)
         for name, method in methods.items():
             rng = np.random.default_rng((rng_seed, zlib.crc32(pair.name.encode())))
-            for shift, start in starts.of(truth, max(fixed.size_px), rng):
+            of_pair = starts.of(truth, max(fixed.size_px), rng)
+            for shift, direction_deg, start in of_pair if method.uses_start else islice(of_pair, 1):
+                empty = Result(pair.name, pair.group, name, shift, direction_deg, len(keypoints))
+                if known[empty.key]:
+                    known[empty.key] -= 1
+                    continue
                 began = time.perf_counter()
                 with one_thread(), one_memory_error():
-                    describe, result = method(fixed, moving, start)
+                    describe, result = method.apply(fixed, moving, start)
                 seconds = time.perf_counter() - began
                 precision = error_px = math.nan
                 if describe is not None and len(keypoints):
@@ -339,15 +395,44 @@ def evaluate(
                 if result is not None and len(keypoints):
                     error_px = homography_error_px(result, truth, points_px)
                 share = error_px / max(moving.size_px)
-                yield Result(pair.name, pair.group, name, shift, len(keypoints), precision, error_px, share, seconds)
-                if result is None:
-                    break
+                yield replace(empty, average_precision=precision, error_px=error_px, error_share=share, seconds=seconds)
+
+
+_COLUMNS = [f.name for f in fields(Result)]
+
+
+def read_results(path: Path) -> list[Result]:
+    """Return the results in a table of an earlier evaluation, without a line that was not written to its end; none if
+    the file does not exist. Raises ConfigurationError for another file.
+    """
+    try:
+        text = read_regular(path).decode()
+    except FileNotFoundError:
+        return []
+    except (OSError, UnicodeDecodeError) as error:
+        raise ConfigurationError(f"{path}: cannot be read ({error}); choose another name with -o") from None
+    header, *rows = csv.reader(io.StringIO(text[: text.rfind("\n") + 1]))
+    try:
+        if header != _COLUMNS:
+            raise ValueError
+        kinds = [f.type for f in fields(Result)]
+        return [Result(*(kind(cell) for kind, cell in zip(kinds, row, strict=True))) for row in rows]  # type: ignore[operator]
+    except ValueError:
+        raise ConfigurationError(f"{path}: is not a table of this version; choose another name with -o") from None
 
 
 def write_results(path: Path, results: Sequence[Result]) -> None:
     """Write the results as CSV, one row per result. Raises OutputError."""
-    rows = ([f"{v:.5g}" if isinstance(v, float) else v for v in astuple(r)] for r in results)
-    write_csv(path, [f.name for f in fields(Result)], rows)
+    write_csv(path, _COLUMNS, (result.cells for result in results))
+
+
+def append_result(path: Path, result: Result) -> None:
+    """Add a row to a table of `write_results`. Raises OutputError."""
+    try:
+        with path.open("a", encoding="utf-8", newline="") as file:
+            csv.writer(file, lineterminator="\n").writerow(map(without_formula, result.cells))
+    except OSError as error:
+        raise OutputError(f"{path}: cannot be written ({error.strerror or error})") from None
 
 
 def precision_table(results: Sequence[Result]) -> list[list[str]]:

@@ -49,10 +49,12 @@ class Landmarks:
         return Landmarks(lens.undistort(model, self.xy), self.descriptors)
 
 
-def landmarks(raster: Raster, view: LandmarkInput, max_keypoints: int = _MAX_KEYPOINTS) -> Landmarks:
-    """Detect the strongest landmarks in the mean of an image's channels."""
+def landmarks(
+    raster: Raster, view: LandmarkInput, max_keypoints: int = _MAX_KEYPOINTS, longest_side_px: int = _LONGEST_SIDE_PX
+) -> Landmarks:
+    """Detect the strongest landmarks in the mean of an image's channels; larger images are reduced."""
     width, height = raster.size_px
-    scale = min(1.0, _LONGEST_SIDE_PX / max(width, height))
+    scale = min(1.0, longest_side_px / max(width, height))
     small = shrink(channel_mean(raster), (max(8, round(width * scale)), max(8, round(height * scale))))
     image, valid = small.pixels, small.valid
     if view == "edges":

@@ -85,24 +85,35 @@ def test_hand_made_descriptors_find_copies_and_nothing_in_unrelated_images(
     fixed, other = texture(), texture(seed=5)
     keypoints = visible_in_both(sift_keypoints(fixed, maximum=200), np.eye(3), fixed, fixed)
     for moving, low, high in ((fixed, 0.95, 1.0), (other, 0.0, 0.05)):
-        describe, _ = evaluation.method_named(name)(fixed, moving, np.eye(3))
+        describe, _ = evaluation.method_named(name).apply(fixed, moving, np.eye(3))
         assert describe is not None
         assert low <= evaluation.average_precision(*describe(keypoints, np.eye(3))) <= high
     with pytest.raises(InputError, match=r"mean\.pt: not a TorchScript module of 64 x 64 patches"):
         evaluation.method_named("mean.pt@64")
 
 
+def test_sift_is_evaluated_once_with_its_own_homography(tmp_path: Path) -> None:
+    pair = write_pair(tmp_path, TRUTH, 5)
+    image = cv2.imread(str(pair.fixed), cv2.IMREAD_GRAYSCALE)
+    cv2.imwrite(str(pair.moving), cv2.warpPerspective(image, TRUTH, image.shape[::-1]))
+    starts = evaluation.Starts((0.05, 0.1), directions=2)
+    (result,) = evaluation.evaluate([pair], {"sift": evaluation.method_named("sift")}, starts)
+    assert result.error_px < 0.1
+    assert list(evaluation.evaluate([pair], {"sift": evaluation.method_named("sift")}, starts, earlier=[result])) == []
+
+
 def test_starts_have_the_requested_error() -> None:
     starts = list(evaluation.Starts((0.0, 0.1), directions=4).of(TRUTH, 400, np.random.default_rng(0)))
-    assert [share for share, _ in starts] == [0.0, 0.1, 0.1, 0.1, 0.1]
-    shifts = [geometry.apply(geometry.compose(geometry.invert(TRUTH), m), [[0.0, 0.0]])[0] for _, m in starts]
+    assert [share for share, _, _ in starts] == [0.0, 0.1, 0.1, 0.1, 0.1]
+    shifts = [geometry.apply(geometry.compose(geometry.invert(TRUTH), m), [[0.0, 0.0]])[0] for _, _, m in starts]
     np.testing.assert_allclose([np.hypot(*s) for s in shifts], [0, 40, 40, 40, 40], atol=1e-9)
     np.testing.assert_allclose(sum(shifts[1:]), 0, atol=1e-9)
 
 
 def test_names_of_methods(tmp_path: Path) -> None:
-    for name in ("surf", "fast:twins"):
-        with pytest.raises(ConfigurationError, match=f"unknown method '{name}'"):
+    for name in ("surf", "fast", "fast:twins"):
+        known = "sift, daisy, elastix, fast:siamese, fast:pseudo-siamese, fast:unshared, scratch:"
+        with pytest.raises(ConfigurationError, match=f"unknown method '{name}'; choose from {known}"):
             evaluation.method_named(name)
     for name, message in (("none.pt", r"none\.pt: not a TorchScript module"), ("none.safetensors", r"none\.safe")):
         with pytest.raises(InputError, match=message):
@@ -196,6 +207,19 @@ def test_a_descriptor_learned_on_a_pair_beats_sift_with_reversed_contrast(tmp_pa
     assert sift["error_px"] == "nan"
     assert "Mean average precision" in done.stdout
     assert re.findall(r"^│ (\S+)", done.stdout, re.MULTILINE) == ["fast:pseudo-siamese", "sift", "fast:pseudo-siamese"]
+    lines = [line for line in done.stderr.splitlines() if line.startswith("[1/1] 3a 3b, ")]
+    assert ["sift" in line for line in lines] == [False, True]
+    # A command that was killed while it wrote a row continues there.
+    rows = tmp_path / "rows.csv"
+    whole = rows.read_text()
+    rows.write_text(whole[:-5])
+    done = agalign_here("evaluate", table, *methods, "-o", rows, "--device", "cpu")
+    assert "1 result of an earlier command kept" in done.stderr
+    assert "[1/1] 3a 3b, fast" not in done.stderr
+    without_times = [[line.rpartition(",")[0] for line in text.splitlines()] for text in (whole, rows.read_text())]
+    assert without_times[0] == without_times[1]
+    rows.write_text("pair,group,method,shift\n")
+    assert agalign_here("evaluate", table, "-o", rows).returncode == 2
     for wrong in ("evaluate -m surf", "evaluate --shift far", "learn --sharing twins", "surface -o picture"):
         command, *options = wrong.split()
         assert agalign_here(command, table, *options).returncode == 2
@@ -203,14 +227,16 @@ def test_a_descriptor_learned_on_a_pair_beats_sift_with_reversed_contrast(tmp_pa
 
 def test_learn_writes_a_network_and_reports_its_pairs(tmp_path: Path) -> None:
     write_pair(tmp_path, TRUTH, 3)
+    write_pair(tmp_path, turned(25.0), 4)
     cv2.imwrite(str(tmp_path / "blank.png"), np.zeros((320, 400), np.uint8))
     table, network = tmp_path / "pairs.csv", tmp_path / "net.safetensors"
-    table.write_text("fixed,moving\n3a.png,3b.png\n3a.png,blank.png\n")
+    table.write_text("fixed,moving\n3a.png,3b.png\n4a.png,4b.png\n3a.png,blank.png\n")
     done = agalign_here("learn", table, "-o", network, "--steps", "5", "-v")
     assert done.returncode == 0, done.stderr
     assert "3a 3b: aligned" in done.stderr
-    assert "learned from 1 of 2 pairs" in done.stderr
-    assert load_model(network, lambda: torch.device("cpu")).camera == ""
+    assert "4a 4b: aligned" in done.stderr
+    assert "learned from 2 of 3 pairs" in done.stderr
+    assert load_model(network, lambda: torch.device("cpu")).camera is None
 
 
 def test_an_unshared_network_keeps_its_own_trunk_when_it_matches() -> None:
