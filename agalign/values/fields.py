@@ -126,7 +126,7 @@ PointsPx = Annotated[NDArray[np.float64], Array((None, 2), POSITION_DECIMALS)]
 
 def _inside_folder(name: str) -> str:
     if not is_inside(name):
-        raise ValueError("names a file outside its folder")
+        raise ValueError("names a file outside its folder, or has too long a name")
     return name
 
 

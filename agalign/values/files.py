@@ -35,6 +35,8 @@ _MAX_NAME_BYTES, _MAX_SUFFIX = 120, 12
 """File names have at most 255 bytes: a checksum, and what the writer adds, follow."""
 _WRITTEN_BELOW: ContextVar[Path | None] = ContextVar("written_below", default=None)
 """Folder that links must not lead out of when a file is written; None where any file may be written."""
+_MAX_PATH_BYTES, _MAX_PART_BYTES = 1024, 255
+"""Of a relative path in a file that is read: file systems allow parts of 255 bytes, and systems paths of 4,096."""
 _RESERVED = re.compile(r"(con|prn|aux|nul|(com|lpt)[0-9])(\..*)?", re.IGNORECASE)
 """Names of devices on Windows."""
 
@@ -155,9 +157,12 @@ def _host() -> str:
 
 
 def is_inside(name: str) -> bool:
-    """True for a relative path that stays inside its folder on POSIX and on Windows."""
+    """True for a relative path that stays inside its folder on POSIX and on Windows, and is not too long for a file."""
     posix, windows = PurePosixPath(name), PureWindowsPath(name)
     anchored = posix.is_absolute() or bool(windows.drive or windows.root)
+    path_bytes, *parts_bytes = (len(text.encode(errors="surrogatepass")) for text in (name, *posix.parts))
+    if path_bytes > _MAX_PATH_BYTES or max(parts_bytes, default=0) > _MAX_PART_BYTES:
+        return False
     return bool(name) and not anchored and ".." not in windows.parts and "\0" not in name
 
 

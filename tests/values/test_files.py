@@ -87,7 +87,20 @@ def test_two_threads_at_a_time_do_not_meet(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "name", ["", "../a", "a/../../b", "/etc/passwd", "/vsicurl/http://x/y", r"C:\a", r"\\host\a", r"a\..\..\b", "a\0b"]
+    "name",
+    [
+        "",
+        "../a",
+        "a/../../b",
+        "/etc/passwd",
+        "/vsicurl/http://x/y",
+        r"C:\a",
+        r"\\host\a",
+        r"a\..\..\b",
+        "a\0b",
+        "9" * 5000,
+        "9/" * 1000,
+    ],
 )
 def test_names_outside_a_folder(name: str) -> None:
     assert not is_inside(name)
