@@ -69,7 +69,8 @@ def align(
     of `moving`, `inverse` maps back: x right, y down, (0, 0) the centre of the top-left pixel. Check its `status`: only
     `aligned` has passed verification. With `predicted`, the mapping is extrapolated over a part of the image without
     measurements, with the standard error `prediction.std_px`. With `seed_only` and `failed`, the mapping is that of the
-    seed. `reason` explains each of the three.
+    seed. `reason` explains each of the three. `before` and `after` have measures of similarity of the images as they
+    are and under the mapping, `residual` the shifts of windows that remain.
     Raises InputError for arrays that are not images, GeometryError for a seed that is not a homography.
     """
     settings = settings or Settings()

@@ -1035,19 +1035,17 @@ function numbers(capture) {
   return tableOf(heads, rows, (i) => i > 2);
 }
 
-/** @type {[string, string, number][]} Name, column, and the sign that makes higher better. */
-const SIMILARITIES = [["mattes_mi", "Mutual information", -1], ["nmi", "NMI", 1], ["ncc", "NCC", 1], ["gradient_correlation", "Gradients", 1], ["structure_ssim", "SSIM", 1]];
+/** @type {[string, string][]} Name and column. */
+const SIMILARITIES = [["mattes_mi", "Mattes MI"], ["nmi", "NMI"], ["ncc", "NCC"], ["gradient_correlation", "Gradients"], ["structure_ssim", "SSIM"]];
 
 /** @param {Capture} capture */
 function similarities(capture) {
-  /** @param {number | null | undefined} value @param {number} sign */
-  const signed = (value, sign) => (value === null || value === undefined ? "–" : fixed(sign * value || 0, 3));
-  const rows = moving(capture).map((pair) => [pair.band, ...SIMILARITIES.map(([name, , sign]) => {
+  const rows = moving(capture).map((pair) => [pair.band, ...SIMILARITIES.map(([name]) => {
     const [before, after] = pair.similarity?.[name] ?? [null, null];
-    return `${signed(before, sign)} → ${signed(after, sign)}`;
+    return `${fixed(before, 3)} → ${fixed(after, 3)}`;
   })]);
   const heads = ["Band", ...SIMILARITIES.map(([, title]) => title)];
-  return el("details", { class: "more" }, el("summary", {}, "Similarity of the images before → after alignment"), tableOf(heads, rows, (i) => i > 0));
+  return el("details", { class: "more" }, el("summary", {}, "Similarity of the images before → after alignment (Mattes MI: lower is better, others: higher)"), tableOf(heads, rows, (i) => i > 0));
 }
 
 // ---- what happens
