@@ -17,12 +17,13 @@ from typing import TYPE_CHECKING
 from agalign.batch.earlier_results import outputs_exist
 from agalign.batch.workers import dask_executor
 from agalign.cameras.discover import FolderScan, discover
+from agalign.cli.problem_groups import explain
 from agalign.cli.terminal import MAX_LISTED, ExitCode, Terminal
 from agalign.config import DiscoverOptions, RunOptions, Settings
 from agalign.errors import InputError, OutputError, SidecarError, WorkerError
 from agalign.flight.groups import camera_overviews
 from agalign.products.product import CapturePaths
-from agalign.products.report.facts import FailureGroup, PairTotals, rounded
+from agalign.products.report.facts import PairTotals, rounded
 from agalign.products.report.pages import REPORT_FILE, pages_exist, write_pages
 from agalign.products.run.record import read_run_record
 from agalign.products.sidecar.file import read_without_tables
@@ -364,23 +365,6 @@ def _print_totals(totals: RunTotals, terminal: Terminal) -> None:
                 f"{quantity}: the light may have changed in {age_s / 60:.0f} min; record a panel before and after each "
                 "flight, or use a light sensor (--radiometry sun)"
             )
-
-
-def explain(failures: Sequence[FailureGroup], terminal: Terminal) -> None:
-    """Print each group of failures: number of bands, cause, captures, and remedy."""
-    max_named = 3
-    for group in failures:
-        status, first = group.status.replace("_", " "), group.bands[0]
-        if len(group.bands) == 1:
-            text, named = f"{first.capture} {first.band}: {status}: {first.reason}", []
-        else:
-            bands, captures = counted(len(group.bands), "band"), counted(group.captures, "capture")
-            text = f"{status}: {bands} of {captures}: {group.remedy.cause}"
-            names = [f"{b.capture} {b.band}" for b in group.bands]
-            more = f" and {len(names) - max_named} more" if len(names) > max_named else ""
-            named = [f"{', '.join(names[:max_named])}{more}: {first.reason}"]
-        counts = {"bands": len(group.bands), "captures": group.captures}
-        terminal.problem(text, (*named, f"try: {group.advice}"), status=group.status, **counts, advice=group.advice)
 
 
 def _print_table(pairs: PairTotals, title: str, terminal: Terminal) -> None:

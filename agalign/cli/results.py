@@ -1,7 +1,9 @@
 """The commands that use the output folder of a run: `report`, `verify`, `export` and `indices`."""
 
+import heapq
 import math
 from collections.abc import Sequence
+from operator import itemgetter
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -26,8 +28,9 @@ def _report(terminal: Terminal, out: Annotated[Path, typer.Argument()], as_json:
         out: Output folder of an earlier run.
         as_json: Print the content of the report as JSON.
     """
-    from agalign.cli.align_run import explain
-    from agalign.products.report.pages import REPORT_FILE, SUMMARY_FILE, write_pages
+    from agalign.cli.problem_groups import explain
+    from agalign.products.report.facts import SUMMARY_FILE
+    from agalign.products.report.pages import REPORT_FILE, write_pages
     from agalign.products.sidecar.file import run_sidecars
     from agalign.values.output_folder import locked
 
@@ -38,11 +41,12 @@ def _report(terminal: Terminal, out: Annotated[Path, typer.Argument()], as_json:
     for text in unreadable:
         terminal.problem(text)
     if as_json:
-        terminal.facts(facts.as_json())
+        for line in facts.json_lines():
+            typer.echo(line)
     else:
         explain(facts.pairs.groups(), terminal)
-        slowest = sorted(facts.captures, key=lambda c: -c["seconds"])[:5]
-        terminal.table(("Slowest", "Seconds"), [(c["label"], f"{c['seconds']:.1f}") for c in slowest])
+        slowest = heapq.nlargest(5, facts.seconds.items(), key=itemgetter(1))
+        terminal.table(("Slowest", "Seconds"), [(label, f"{seconds:.1f}") for label, seconds in slowest])
         for name in (REPORT_FILE, SUMMARY_FILE):
             terminal.result(str(out / name))
     return ExitCode.PARTIAL if unreadable else ExitCode.OK

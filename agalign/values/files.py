@@ -242,10 +242,26 @@ def read_model(path: Path, model: type[_Model]) -> _Model | None:
         raise SidecarError(f"{path}: cannot be read{reason}; delete it and run again") from None
 
 
+class CsvTable:
+    """A table that is collected row by row as text, which takes little memory, and then written as CSV."""
+
+    def __init__(self, columns: Sequence[str]) -> None:
+        self._text = io.StringIO()
+        self._writer = csv.writer(self._text, lineterminator="\n")
+        self._writer.writerow(columns)
+
+    def add(self, row: Sequence[object]) -> None:
+        """Add a row; None becomes an empty cell, and formulas are quoted."""
+        self._writer.writerow(map(without_formula, row))
+
+    def write(self, path: Path) -> None:
+        """Write the table atomically. Raises OutputError."""
+        write_text(path, self._text.getvalue())
+
+
 def write_csv(path: Path, columns: Sequence[str], rows: Iterable[Sequence[object]]) -> None:
     """Write a table atomically; None becomes an empty cell, and formulas are quoted. Raises OutputError."""
-    table = io.StringIO()
-    writer = csv.writer(table, lineterminator="\n")
-    writer.writerow(columns)
-    writer.writerows(map(without_formula, row) for row in rows)
-    write_text(path, table.getvalue())
+    table = CsvTable(columns)
+    for row in rows:
+        table.add(row)
+    table.write(path)

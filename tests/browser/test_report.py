@@ -13,6 +13,7 @@ import tifffile
 
 import agalign
 from agalign.config import Settings, WriteSettings
+from agalign.products.report import facts
 from agalign.products.report.drawing import ReducedBands
 from agalign.products.report.pages import write_pages
 from agalign.products.report.preview import ReliefView, preview_bytes, write_preview
@@ -314,6 +315,70 @@ def test_the_table_sorts_and_filters(page: Any) -> None:
     assert "0000SET/000/IMG_0001" not in labels()
 
 
+def test_a_season_is_loaded_in_parts(browser: Any, out: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(facts, "_DETAILS_PER_PART", 2)
+    monkeypatch.setattr(facts, "_ROWS_PER_PART", 5)
+    sidecar = json.loads((out / "0000SET" / "000" / "IMG_0001.json").read_text())
+    for number in range(12):
+        position = sidecar["position"] | {"latitude": 52 + 1e-4 * number}
+        changed = sidecar | {"capture": f"IMG_{number:04}", "position": position}
+        (tmp_path / f"IMG_{number:04}.json").write_text(json.dumps(changed))
+    shutil.copy(out / "0000SET" / "000" / "IMG_0001.preview.jpg", tmp_path)
+    write_pages(tmp_path, pytest.fail)
+    page, loaded = browser.new_page(), []
+    page.on("request", lambda r: loaded.append(r.url.rsplit("/", 1)[1]))
+    page.goto((tmp_path / "index.html").as_uri() + "#capture=IMG_0011")
+    page.wait_for_function("() => document.querySelector('#capture-title').textContent.includes('IMG_0011')")
+    assert page.locator("#count").inner_text() == "12 of 12 shown"
+    assert page.locator("#map circle").count() == 12
+    assert [name.rpartition("-")[0] for name in loaded if name.endswith(".js")] == ["rows-2", "rows-3", "details-6"]
+    choose(page, "Overlay", "vectors")
+    look_at(page, "IMG_0003")
+    shutil.rmtree(tmp_path / "report-data")
+    page.reload()
+    page.wait_for_function("() => document.querySelector('#count').textContent.includes('copy the folder report-data')")
+    page.close()
+
+
+def test_the_table_has_pages(page: Any) -> None:
+    page.evaluate(
+        "() => { for (let i = 0; i < 450; i += 1) captures.push({ ...captures[0], label: `z${i}` }); tableBody(); }"
+    )
+    rows = page.locator("#table tbody tr")
+    assert (rows.count(), page.locator("#table-pages").inner_text()) == (200, "Earlier rows\nLater rows\n1 to 200")
+    page.get_by_role("button", name="Later rows").click()
+    page.get_by_role("button", name="Later rows").click()
+    assert (rows.count(), rows.last.locator("th").inner_text()) == (53, "z449")
+    assert page.get_by_role("button", name="Later rows").is_disabled()
+    page.locator("#find").fill("z44")
+    assert rows.count() == 11
+    assert page.locator("#table-pages").is_hidden()
+
+
+@pytest.mark.parametrize("width", [375, 1100])
+def test_no_table_is_cut_off(browser: Any, out: Path, tmp_path: Path, width: int) -> None:
+    sidecar = json.loads((out / "0000SET" / "000" / "IMG_0001.json").read_text())
+    relief = {"file": "a.relief.tif", "baseline": [0.5, 0.5], "occluded": 0.0125}
+    relief |= {name: [[0.0, 0.0]] for name in ("reference_px", "plane_px", "slope")}
+    kinds = "homography", "field", "relief", "relief and field"
+    geometry = {"kind": kinds[-1], "held_out_p95_px": dict.fromkeys(kinds, 1.2345)}
+    for band in sidecar["bands"]:
+        if band["status"] != "reference":
+            band |= {"relief": relief, "geometry": geometry}
+    failed = sidecar["bands"][-1]
+    failed |= {"status": "failed", "reason": "the bands do not show the same scene", "issues": []}
+    (tmp_path / "IMG_0001.json").write_text(json.dumps(sidecar | {"status": "degraded"}))
+    shutil.copytree(out / "models", tmp_path / "models")
+    write_pages(tmp_path, pytest.fail)
+    page = opened(browser, tmp_path, width=width)
+    page.locator("details.more summary").click()
+    cut = "[...document.querySelectorAll('.scroll')].filter((e) => e.scrollWidth > e.clientWidth).length"
+    assert page.evaluate(cut) == 0
+    assert page.evaluate("document.documentElement.scrollWidth") <= width
+    assert page.locator("#capture table").first.is_visible()
+    page.close()
+
+
 def test_the_map_leads_to_the_captures(page: Any) -> None:
     dots = page.locator("#map circle")
     assert dots.count() == 2, "one has no position"
@@ -323,7 +388,7 @@ def test_the_map_leads_to_the_captures(page: Any) -> None:
     page.locator("#map-colour").select_option("residual_px")
     assert dots.nth(0).get_attribute("fill") != before
     assert page.locator("#map-legend").inner_text().split("\n")[0].startswith("0.00 px0.50 px1.00 px and more")
-    residual_px = page.evaluate("worst(captures.find((c) => c.label.endsWith('IMG_0001')), 'residual_px')")
+    residual_px = page.evaluate("captures.find((c) => c.label.endsWith('IMG_0001')).residual_px")
     assert 0 < residual_px < 0.3
     colour = page.locator("#map circle", has_text="IMG_0001").get_attribute("fill")
     assert colour == f"hsl({round(200 - 200 * residual_px)} 70% 45%)", "the scale is the same in all reports"

@@ -251,11 +251,12 @@ def test_the_report_has_the_indices(tmp_path: Path) -> None:
     write_pages(tmp_path, pytest.fail)
     page = (tmp_path / "index.html").read_text()
     facts = json.loads(page.split('id="facts">')[1].split("</script>")[0])
-    names = [[i["name"] for i in c["indices"]] for c in facts["captures"]]
+    names = [[i["name"] for i in c["indices"]] for c in facts["details"]["records"]]
     assert names == [["ndre", "ndvi"]] * 2
-    ndvi = facts["captures"][0]["indices"][1]
+    ndvi = facts["details"]["records"][0]["indices"][1]
     assert ndvi["span"] == [-0.2, 1.0]
     assert ndvi["picture"] == "0000SET/IMG_0001_ndvi.png"
+    assert facts["rows"]["records"][0]["indices"]["ndvi"] == ndvi["median"]
 
 
 NAMES = ("Blue-444", "Blue", "Green", "Red-650", "Red", "Red edge-705", "Red edge", "NIR")

@@ -4,6 +4,7 @@ import json
 import re
 import shutil
 import subprocess
+import tracemalloc
 from itertools import chain
 from pathlib import Path
 from typing import Any
@@ -13,12 +14,13 @@ import numpy as np
 import pytest
 
 import agalign
+from agalign.products.report import facts as facts_module
 from agalign.products.report.charts import CHART_HEIGHT, drifts_of, rig_views
 from agalign.products.report.drawing import ReducedBands, read_reduced_bands
-from agalign.products.report.facts import PairTotals
+from agalign.products.report.facts import CameraOffsets, PairTotals
 from agalign.products.report.pages import pages_exist, write_pages
 from agalign.products.report.preview import ReliefView, preview_bytes, write_preview
-from agalign.products.sidecar.file import read_sidecar
+from agalign.products.sidecar.file import read_sidecar, write_sidecar
 from agalign.products.sidecar.schema import Sidecar
 from agalign.values.capture import Band, Capture
 from agalign.values.image import OutputGrid
@@ -36,17 +38,27 @@ def out(aligned_flight: Path, tmp_path: Path) -> Path:
 
 
 def facts_of(folder: Path) -> dict[str, Any]:
+    """The data in the page."""
     page = (folder / "index.html").read_text(encoding="utf-8")
     return json.loads(page.partition('<script type="application/json" id="facts">')[2].partition("</script>")[0])
+
+
+def script_of(file: Path) -> dict[str, Any]:
+    """The data in a script next to the page."""
+    return json.loads(file.read_text(encoding="utf-8").partition("(")[2].rpartition(")")[0])
 
 
 @pytest.mark.slow
 def test_the_page_has_the_facts_of_every_capture(flight: Path, aligned_flight: Path) -> None:
     facts = facts_of(aligned_flight)
-    assert facts["schema"] == "agalign-report/1"
-    assert [c["label"] for c in facts["captures"]] == [f"0000SET/000/IMG_000{i}" for i in (1, 2)]
+    labels = [f"0000SET/000/IMG_000{i}" for i in (1, 2)]
+    details = facts["details"]
+    assert [[c["label"] for c in facts[part]["records"]] for part in ("rows", "details")] == [labels, labels]
     truth = read_json(flight / "truth.json")
-    for capture in facts["captures"]:
+    for capture, row in zip(details["records"], facts["rows"]["records"], strict=True):
+        known = [b["residual_px"] for b in capture["bands"] if b["status"] == "aligned"]
+        assert row["residual_px"] == max(known)
+        assert row["bands"] == [[b["band"], b["status"]] for b in capture["bands"] if b["status"] != "reference"]
         sidecar = read_json(aligned_flight / f"{capture['label']}.json")
         assert capture["preview"]["file"] == f"{capture['label']}.preview.jpg"
         assert capture["crop"] == sidecar["output"]["crop"]
@@ -64,7 +76,7 @@ def test_the_page_has_the_facts_of_every_capture(flight: Path, aligned_flight: P
             shifts = [None if v is None else v * facts["shift_step_px"] for v in pair["shifts"]]
             measured, centres = (list(chain(*windows[name])) for name in ("shifts_px", "centres_px"))
             assert shifts == [v if v is None else pytest.approx(v, abs=0.006) for v in measured]
-            assert facts["lattices"][pair["lattice"]] == centres
+            assert details["lattices"][pair["lattice"]] == centres
 
 
 def headline(out: Path) -> str:
@@ -109,26 +121,101 @@ def test_the_page_has_the_relief(aligned_flight: Path, tmp_path: Path) -> None:
     (tmp_path / "a b").mkdir()
     (tmp_path / "a b" / "IMG_0001.json").write_text(json.dumps(sidecar))
     write_pages(tmp_path, pytest.fail)
-    (capture,) = facts_of(tmp_path)["captures"]
+    (capture,) = facts_of(tmp_path)["details"]["records"]
     assert capture["relief"] == "a%20b/IMG_0001.relief.tif"
     assert capture["preview"]["relief"] == sidecar["preview"]["relief"]
     occluded = {pair["band"]: pair["occluded"] for pair in capture["bands"]}
     assert occluded == {"Blue": None, "Green": None, "Red": 0.0125, "NIR": 0.0125, "Red edge": None}
 
 
+def small_parts(monkeypatch: pytest.MonkeyPatch, details: int, rows: int) -> None:
+    """Make parts of a report with few captures."""
+    monkeypatch.setattr(facts_module, "_DETAILS_PER_PART", details)
+    monkeypatch.setattr(facts_module, "_ROWS_PER_PART", rows)
+
+
+def many_captures(aligned_flight: Path, out: Path, count: int) -> list[str]:
+    """Write copies of a sidecar with other names, and return them."""
+    sidecar = read_json(aligned_flight / "0000SET" / "000" / "IMG_0001.json")
+    names = [f"IMG_{number:04d}" for number in range(count)]
+    for name in names:
+        (out / f"{name}.json").write_text(json.dumps(sidecar | {"capture": name}))
+    return names
+
+
 @pytest.mark.slow
-def test_a_page_is_small_and_loads_nothing(aligned_flight: Path, tmp_path: Path) -> None:
-    """A capture adds 4 kB."""
-    page = (aligned_flight / "index.html").read_text(encoding="utf-8")
+def test_the_page_of_a_season_is_as_small_as_that_of_a_day(
+    aligned_flight: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A part has 400 bytes a row, and 6 kB a capture; the others are scripts of the same size."""
+    small_parts(monkeypatch, 5, 10)
+    names = many_captures(aligned_flight, tmp_path, 12)
+    write_pages(tmp_path, pytest.fail)
+    before = (tmp_path / "index.html").stat().st_size
+    names = many_captures(aligned_flight, tmp_path, 43)
+    write_pages(tmp_path, pytest.fail)
+    page = (tmp_path / "index.html").read_text(encoding="utf-8")
     assert not re.findall(r"(?:src|href)=\"(?:https?:)?//", page)
     assert "default-src 'none'" in page
-    sidecar = read_json(aligned_flight / "0000SET" / "000" / "IMG_0001.json")
-    for number in range(50):
-        (tmp_path / f"IMG_{number:04d}.json").write_text(json.dumps(sidecar | {"capture": f"IMG_{number:04d}"}))
+    assert len(page.encode()) - before < 3000  # names of files, points of a chart; 31 captures have 200 kB
+    facts = facts_of(tmp_path)
+    assert (len(facts["row_files"]), len(facts["detail_files"])) == (4, 8)
+    for kind, files in (("rows", facts["row_files"]), ("details", facts["detail_files"])):
+        parts = [facts[kind], *(script_of(tmp_path / file) for file in files)]
+        assert [c["label"] for part in parts for c in part["records"]] == names
+        assert [part["from"] for part in parts] == [i * len(facts[kind]["records"]) for i in range(len(parts))]
+        assert all((tmp_path / file).stat().st_size < 400 + 10 * 1000 + 5 * 7000 for file in files)
+    # Files of the earlier page are removed; without one of its files, a page is not complete.
+    listed = {Path(file).name for file in (*facts["row_files"], *facts["detail_files"])}
+    assert {path.name for path in (tmp_path / "report-data").iterdir()} == listed
+    assert pages_exist(tmp_path)
+    (tmp_path / facts["row_files"][1]).unlink()
+    assert not pages_exist(tmp_path)
+    for name in names[5:]:
+        (tmp_path / f"{name}.json").unlink()
     write_pages(tmp_path, pytest.fail)
-    many = (tmp_path / "index.html").stat().st_size
-    # Bands that the usual windows do not show everywhere have up to 168 small ones, 1 kB more for a capture.
-    assert (many - len(page.encode())) / (50 - 2) < 6500
+    assert not (tmp_path / "report-data").exists()
+
+
+@pytest.mark.slow
+def test_the_memory_of_a_report_is_that_of_a_few_captures(
+    aligned_flight: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What is kept of a capture is a small part of the 200 kB of its data in memory."""
+    small_parts(monkeypatch, 5, 10)
+    peaks = []
+    for count in (20, 120):
+        many_captures(aligned_flight, tmp_path, count)
+        tracemalloc.start()
+        write_pages(tmp_path, pytest.fail)
+        peaks.append(tracemalloc.get_traced_memory()[1])
+        tracemalloc.stop()
+    assert (peaks[1] - peaks[0]) / 100 < 10_000
+
+
+@pytest.mark.slow
+def test_the_report_as_json_has_every_capture(
+    aligned_flight: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    small_parts(monkeypatch, 2, 2)
+    names = many_captures(aligned_flight, tmp_path, 5)
+    facts = json.loads("".join(write_pages(tmp_path, pytest.fail).json_lines()))
+    assert facts["schema"] == "agalign-report/1"
+    assert [c["label"] for c in facts["captures"]] == names
+    sidecar = read_json(tmp_path / "IMG_0004.json")
+    for pair, part in zip(facts["captures"][4]["bands"], sidecar["bands"], strict=True):
+        if part["status"] != "reference":
+            assert facts["lattices"][pair["lattice"]] == list(chain(*part["metrics"]["windows"]["centres_px"]))
+
+
+def test_long_lists_are_cut_in_the_page(tmp_path: Path) -> None:
+    for number in range(120):
+        part = NIR | {"band": "NIR", "status": "failed", "reason": "it shows nothing"}
+        write_sidecar(tmp_path / f"IMG_{number}.json", example(capture=f"IMG_{number}", bands=[part], missing_bands=()))
+    write_pages(tmp_path, pytest.fail)
+    page = (tmp_path / "index.html").read_text(encoding="utf-8")
+    assert page.count("<td>it shows nothing</td>") == 100
+    assert 'The first 100 of 120; all are in <a href="summary.csv">' in page
 
 
 @pytest.mark.slow
@@ -156,11 +243,6 @@ def test_rigs_are_drawn_of_models_that_can_be_read(tmp_path: Path) -> None:
     assert "b.safetensors" in problem
 
 
-def capture_data(label: str, offsets: dict[str, tuple[float, float]]) -> dict[str, object]:
-    bands = [{"band": name, "status": "aligned", "offset_px": offset} for name, offset in offsets.items()]
-    return {"label": label, "captured_at": f"2026-06-21T10:00:{label}", "camera": "camera", "bands": bands}
-
-
 def test_the_share_of_saturated_pixels_of_a_band(tmp_path: Path) -> None:
     plane = np.full((60, 80), 3, np.uint8)
     plane[:10, :10] = 255
@@ -178,11 +260,12 @@ def test_sidecars_have_the_share_of_saturated_pixels(aligned_flight: Path) -> No
 
 @pytest.mark.slow
 def test_drift_is_drawn_along_its_direction_with_gaps_for_missing_bands() -> None:
-    captures = [
-        capture_data(f"{i:02d}", {"NIR": (10 + 3 * i, 4 * i), "Blue": (-i, 0)} if i != 3 else {"Blue": (-3, 0)})
-        for i in range(7)
-    ]
-    (drift,) = drifts_of(captures)
+    offsets = [{"NIR": (10 + 3 * i, 4 * i), "Blue": (-i, 0)} if i != 3 else {"Blue": (-3, 0)} for i in range(7)]
+    labels = [(f"2026-06-21T10:00:{i:02d}", f"{i:02d}") for i in range(7)]
+    # In the order of time, whatever that of the captures is.
+    known = CameraOffsets(labels[::-1], offsets[::-1])
+    (drift,) = drifts_of({"camera": known})
+    assert drift.ends == ("00", "06")
     assert drift.full_px == pytest.approx(15, abs=0.01)
     assert [len(line.points) for line in drift.lines] == [2, 1]
     heights = [[float(p.split(",")[1]) for run in line.points for p in run.split()] for line in drift.lines]
@@ -190,7 +273,7 @@ def test_drift_is_drawn_along_its_direction_with_gaps_for_missing_bands() -> Non
     assert ends == pytest.approx([CHART_HEIGHT / 2 * (1 - 0.92 * s) for s in (1, -1)], abs=0.1)
     # Along the same baseline in the other direction, a band is drawn next to the first, not opposite to it.
     assert np.sign(np.diff(heights[0])).tolist() == np.sign(np.diff(heights[1][:3] + heights[1][4:])).tolist()
-    assert drifts_of(captures[:2]) == []
+    assert drifts_of({"camera": CameraOffsets(labels[:2], offsets[:2])}) == []
 
 
 @pytest.mark.slow

@@ -8,7 +8,7 @@ import hashlib
 import io
 import json
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path, PurePosixPath
@@ -465,15 +465,27 @@ def read_table(out: Path) -> list[IndexReport]:
         return []
 
 
-def update_table(out: Path, rows: Sequence[IndexReport]) -> list[IndexReport]:
-    """Write OUT/indices.csv: `rows`, and the earlier rows of other captures and indices that are still true.
+def current_rows(out: Path) -> list[IndexReport]:
+    """Return the rows of OUT/indices.csv that are still true: they have a raster that exists and was not written again
+    since, or are of an index that could not be calculated.
+    """
+    return [row for row in read_table(out) if (_is_current(row) if row.path is not None else row.problem)]
 
-    These have a raster that exists and was not written again since, or are of an index that could not be calculated.
+
+def merged(rows: Iterable[IndexReport], newer: Iterable[IndexReport]) -> list[IndexReport]:
+    """Return rows of which the newer ones replace those of the same capture and index."""
+    return list({row.key: row for row in [*rows, *newer]}.values())
+
+
+def update_table(
+    out: Path, rows: Sequence[IndexReport], earlier: Sequence[IndexReport] | None = None
+) -> list[IndexReport]:
+    """Write OUT/indices.csv: `rows`, and the `current_rows` of other captures and indices, which may be given.
+
     Return all rows. An empty table is not written. Raises OutputError.
     """
     old = read_table(out)
-    kept = [row for row in old if (_is_current(row) if row.path is not None else row.problem)]
-    result = list({row.key: row for row in [*kept, *rows]}.values())
+    result = merged(current_rows(out) if earlier is None else earlier, rows)
     if (result or old) and (result != old or not (out / INDICES_FILE).is_file()):
         of_capture = "folder", "capture", "captured_at", "latitude", "longitude"
         of_index = "index", "median", "p5", "p95", "valid_share", "masked_share", "input", "low", "high", "file"

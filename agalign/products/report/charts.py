@@ -1,7 +1,7 @@
 """Drawings of the rig of a flight, and charts of the offsets of its bands over the captures, in SVG units."""
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -13,6 +13,7 @@ from agalign.errors import GeometryError, InputError
 from agalign.flight.rig import Rig
 from agalign.flight.rig_file import read_rig
 from agalign.flight.rig_prediction import band_summaries
+from agalign.products.report.facts import CameraOffsets
 from agalign.values import geometry
 
 PLAN_WIDTH, FIELD_WIDTH, CHART_WIDTH, CHART_HEIGHT = 200.0, 160.0, 640.0, 130.0
@@ -83,15 +84,14 @@ def _hue(number: int, count: int) -> float:
     return round(205 + 360 * number / max(count, 1)) % 360
 
 
-def drifts_of(captures: Sequence[dict[str, Any]]) -> list[DriftChart]:
-    """Return a chart of the offsets, px, for each camera with three captures or more, given the report's data."""
+def drifts_of(cameras: Mapping[str, CameraOffsets]) -> list[DriftChart]:
+    """Return a chart of the offsets, px, for each camera with three captures or more, given by name."""
     result = []
-    for camera in dict.fromkeys(c["camera"] for c in captures):
-        in_order = sorted((c for c in captures if c["camera"] == camera), key=lambda c: (c["captured_at"], c["label"]))
-        usable = [[b for b in c["bands"] if b["status"] in ("aligned", "predicted")] for c in in_order]
-        offsets = [{b["band"]: b["offset_px"] for b in bands if b["offset_px"]} for bands in usable]
+    for camera, known in cameras.items():
+        order = sorted(range(len(known.labels)), key=known.labels.__getitem__)
+        offsets = [known.offsets_px[i] for i in order]
         names = list(dict.fromkeys(name for of_capture in offsets for name in of_capture))
-        if len(in_order) < 3 or not names:
+        if len(order) < 3 or not names:
             continue
         missing = (np.nan, np.nan)
         differences = [
@@ -102,12 +102,12 @@ def drifts_of(captures: Sequence[dict[str, Any]]) -> list[DriftChart]:
         aligned = np.array([d if np.nansum(differences[0] * d) >= 0 else -d for d in differences])
         min_full_px = 0.2  # smaller drifts are noise
         full_px = float(np.nanmax(np.abs(aligned), initial=min_full_px))
-        step = max(1, math.ceil(len(in_order) / 400))  # more points than that are not distinguishable
+        step = max(1, math.ceil(len(order) / 400))  # more points than that are not distinguishable
         lines = (
             Line(name, _hue(number, len(names)), _polylines(of_band, full_px, step))
             for number, (name, of_band) in enumerate(zip(names, aligned, strict=True))
         )
-        ends = in_order[0]["label"], in_order[-1]["label"]
+        ends = known.labels[order[0]][1], known.labels[order[-1]][1]
         result.append(DriftChart(f"{camera} from capture to capture", full_px, tuple(lines), ends))
     return result
 

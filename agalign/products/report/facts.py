@@ -1,10 +1,9 @@
-"""The data that the report shows about each capture, compact enough for a thousand captures, and the bands that are not
-aligned, grouped by cause, with a remedy for each cause.
-"""
+"""The data that the report shows about each capture, and the bands that are not aligned, by cause, with its remedy."""
 
+import json
 import math
 from collections import Counter, defaultdict
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -13,9 +12,11 @@ from urllib.parse import quote
 import numpy as np
 
 from agalign.products.indices.rasters import IndexReport
+from agalign.products.report.data_files import DataParts
 from agalign.products.run.record import RefusalPart
 from agalign.products.sidecar.schema import BandResult, GeometryPart, GridPart, OutputPart, Sidecar
 from agalign.values.alignment import Prediction
+from agalign.values.files import CsvTable
 from agalign.values.issues import MISSING_BAND, MOSAICS, OTHER_REFERENCE, UNREADABLE, Remedy
 
 _SHIFT_STEP_PX = 0.01
@@ -42,6 +43,8 @@ BAND_COLUMNS = {
     "seconds": "seconds",
 }
 """Field of a band in the sidecar by column of OUT/summary.csv."""
+SUMMARY_FILE = "summary.csv"
+SUMMARY_COLUMNS = ("folder", "capture", *BAND_COLUMNS, "reference")
 
 
 @dataclass(frozen=True)
@@ -148,20 +151,48 @@ def _remedy_of(band: BandResult, *, is_mosaic: bool) -> Remedy:
     return MOSAICS if is_mosaic and kind is not UNREADABLE else kind.remedy
 
 
+_DETAILS_PER_PART = 50
+"""Captures whose details are loaded together: 300 kB."""
+_ROWS_PER_PART = 1000
+"""Captures whose rows of the table are loaded together: 400 kB."""
+
+
 @dataclass
+class CameraOffsets:
+    """Offsets of the bands of a camera, for the chart over its captures."""
+
+    labels: list[tuple[str, str]] = field(default_factory=list)
+    """(time, label) of each capture."""
+    offsets_px: list[dict[str, tuple[float, float]]] = field(default_factory=list)
+    """(x, y) by aligned or predicted band, of each capture."""
+
+
 class FlightFacts:
-    """The data of the captures below an output folder, which are added one by one."""
+    """The data of the captures below an output folder, which are added one by one. What the page shows of a single
+    capture is written to files meanwhile: that of a season does not fit into memory.
+    """
 
-    captures: list[dict[str, Any]] = field(default_factory=list)
-    """As in the data of the report."""
-    pairs: PairTotals = field(default_factory=PairTotals)
-    rows: list[dict[str, Any]] = field(default_factory=list)
-    """The rows of the pairs in OUT/summary.csv."""
-    _lattices: dict[tuple[float, ...], int] = field(default_factory=dict)
-    """Centres of windows, which many pairs share, and their index in the data of the report."""
+    def __init__(self, out: Path) -> None:
+        self.out = out
+        self.pairs = PairTotals()
+        self.statuses: Counter[str] = Counter()
+        """Number of captures by status."""
+        self.cameras: dict[str, CameraOffsets] = {}
+        """By name."""
+        self.seconds: dict[str, float] = {}
+        """Processing time of each capture, by label."""
+        self.placed = 0
+        """Number of captures with a position."""
+        self._summary = CsvTable(SUMMARY_COLUMNS)
+        self._rows = DataParts(out, "rows", _ROWS_PER_PART)
+        self._details = DataParts(out, "details", _DETAILS_PER_PART)
+        self._masked: dict[str, list[float]] = defaultdict(list)
+        self._lattices: dict[bytes, int] = {}
+        """Centres of windows, which many pairs share, and their index, of the current part of the details."""
+        self._first_lattice = 0
 
-    def add(self, folder: str, sidecar: Sidecar) -> None:
-        """Add a capture, given its folder relative to the output folder."""
+    def add(self, folder: str, sidecar: Sidecar, indices: Sequence[IndexReport] = ()) -> None:
+        """Add a capture, given its folder relative to the output folder, and its indices. Raises OutputError."""
         label = Path(folder, sidecar.capture).as_posix()
         self.pairs.add(label, sidecar)
         output, position, path = sidecar.output, sidecar.position, Path(folder)
@@ -193,50 +224,109 @@ class FlightFacts:
             "picture": _link(path, files.get("picture")),
             "preview": preview,
             "bands": [self._pair(b, sidecar, keys) for b in sidecar.bands],
-            "indices": [],
+            "indices": [self._index(row) for row in indices if row.path is not None],
         }
-        self.captures.append(facts)
         missing = keys | {"status": "missing", "reason": MISSING_BAND.cause}
-        self.rows += [missing | {"band": name} for name in sidecar.missing_bands]
+        for name in sidecar.missing_bands:
+            self.add_row(missing | {"band": name})
+        self._count(facts)
+        if self._rows.add(_row_of(facts)):
+            self._rows.flush()
+        if self._details.add(facts):
+            self._flush_details()
 
-    def add_indices(self, rows: Sequence[IndexReport], out: Path) -> None:
-        """Add the spectral indices, of files below `out`, of captures that were added before."""
-        by_label = {c["label"]: c["indices"] for c in self.captures}
-        for row in rows:
-            if row.path is not None and row.capture in by_label:
-                known = row.statistics.as_json()
-                facts = {name: rounded(known[name]) for name in ("median", "p5", "p95")} | {"name": row.index}
-                facts |= {"valid": known["valid_share"], "unit": known["unit"], "masked": known["masked_share"]}
-                facts |= {"span": (known["low"], known["high"]), "raw": row.raw_numbers}
-                file = row.path.relative_to(out)
-                links = {"file": quote(file.as_posix()), "picture": quote(file.with_suffix(".png").as_posix())}
-                by_label[row.capture].append(facts | links)
+    def _count(self, facts: dict[str, Any]) -> None:
+        label, camera = facts["label"], self.cameras.setdefault(facts["camera"], CameraOffsets())
+        self.statuses[facts["status"]] += 1
+        self.seconds[label] = facts["seconds"]
+        self.placed += facts["position"] is not None
+        usable = [b for b in facts["bands"] if b["status"] in ("aligned", "predicted") and b["offset_px"]]
+        camera.labels.append((facts["captured_at"], label))
+        camera.offsets_px.append({b["band"]: b["offset_px"] for b in usable})
+
+    def _index(self, row: IndexReport) -> dict[str, Any]:
+        assert row.path is not None
+        known = row.statistics.as_json()
+        if row.statistics.masked_share > 0:
+            self._masked[row.index].append(rounded(row.statistics.masked_share))
+        file = row.path.relative_to(self.out)
+        return {name: rounded(known[name]) for name in ("median", "p5", "p95")} | {
+            "name": row.index,
+            "valid": known["valid_share"],
+            "unit": known["unit"],
+            "masked": known["masked_share"],
+            "span": (known["low"], known["high"]),
+            "raw": row.raw_numbers,
+            "file": quote(file.as_posix()),
+            "picture": quote(file.with_suffix(".png").as_posix()),
+        }
+
+    def _flush_details(self) -> None:
+        lattices = [np.frombuffer(centres).tolist() for centres in self._lattices]
+        self._details.flush({"first_lattice": self._first_lattice, "lattices": lattices})
+        self._first_lattice += len(lattices)
+        self._lattices = {}
+
+    def add_row(self, row: Mapping[str, Any]) -> None:
+        """Add a row to OUT/summary.csv, given by column."""
+        self._summary.add([row.get(name) for name in SUMMARY_COLUMNS])
+
+    def write_summary(self) -> None:
+        """Write OUT/summary.csv. Raises OutputError."""
+        self._summary.write(self.out / SUMMARY_FILE)
+
+    def flush(self) -> None:
+        """Write the last parts. Raises OutputError."""
+        self._rows.flush()
+        self._flush_details()
+
+    @property
+    def files(self) -> list[str]:
+        """Names of the data files that the page needs, relative to the output folder."""
+        return [*self._rows.files, *self._details.files]
 
     def masked_shares(self) -> dict[str, list[float]]:
         """Return the sorted shares of pixels that only the quality flags mask, by index."""
-        shares: dict[str, list[float]] = defaultdict(list)
-        for index in (index for capture in self.captures for index in capture["indices"] if index["masked"] > 0):
-            shares[index["name"]].append(index["masked"])
-        return {name: sorted(of_index) for name, of_index in shares.items()}
+        return {name: sorted(of_index) for name, of_index in self._masked.items()}
 
-    def as_json(self) -> dict[str, Any]:
-        """Return the data of the schema `agalign-report/1`. The script of the page declares their types."""
-        facts = {"schema": "agalign-report/1", "captures": self.captures, "shift_step_px": _SHIFT_STEP_PX}
-        return facts | {"lattices": [list(centres) for centres in self._lattices]}
+    def in_page(self) -> dict[str, Any]:
+        """Return the data in the page, after `flush`. The script of the page declares their types."""
+        return {
+            "captures": self.statuses.total(),
+            "shift_step_px": _SHIFT_STEP_PX,
+            "rows": self._rows.first,
+            "details": self._details.first,
+            "details_per_part": _DETAILS_PER_PART,
+            "row_files": self._rows.files,
+            "detail_files": self._details.files,
+        }
+
+    def json_lines(self) -> Iterator[str]:
+        """Yield the lines of a JSON object of the schema `agalign-report/1` with the details of all captures."""
+        yield f'{{"schema": "agalign-report/1", "shift_step_px": {_SHIFT_STEP_PX}, "captures": ['
+        for key, end in (("records", '], "lattices": ['), ("lattices", "]}")):
+            before = ""
+            for part in self._details.parts():
+                for record in part[key]:
+                    yield before + json.dumps(record, allow_nan=False)
+                    before = ","
+            yield end
 
     def _pair(self, band: BandResult, sidecar: Sidecar, keys: dict[str, Any]) -> dict[str, Any]:
         """The data of a band. Its row, with `keys`, and its offset are added unless it is the reference."""
         row = {column: value_at(band, path) for column, path in BAND_COLUMNS.items()}
         if band.status != "reference":
-            self.rows.append(keys | row)
+            self.add_row(keys | row)
         metrics, windows = band.metrics, None if band.metrics is None else band.metrics.windows
         similarity = {name: (row[f"{name}_before"], row[f"{name}_after"]) for name in _SIMILARITY}
         centres_px = np.empty((0, 2)) if windows is None else windows.centres_px
         shifts_px = np.empty((0, 2)) if windows is None else windows.shifts_px
-        lattice: tuple[float, ...] = tuple(np.round(centres_px, 2).ravel().tolist())
+        lattice = np.round(centres_px, 2).tobytes()
         offset_px, offset_length_px = _band_offset(band.grid, sidecar)
         if offset_length_px is not None and band.status != "reference":
             self.pairs.bands[band.band].offsets_px.append(offset_length_px)
+        is_measured = np.isfinite(shifts_px).ravel().tolist()
+        steps = np.rint(np.nan_to_num(shifts_px) / _SHIFT_STEP_PX).astype(int).ravel().tolist()
         # The first nine columns of the table have the same names here.
         return {name: row[name] for name in tuple(BAND_COLUMNS)[:9]} | {
             "seconds": round(band.seconds, 2),
@@ -248,9 +338,26 @@ class FlightFacts:
             "prediction": _prediction(band.prediction),
             "geometry": _geometry(band.geometry),
             "occluded": value_at(band, "relief.occluded"),
-            "lattice": self._lattices.setdefault(lattice, len(self._lattices)),
-            "shifts": [round(v / _SHIFT_STEP_PX) if np.isfinite(v) else None for v in shifts_px.ravel().tolist()],
+            "lattice": self._first_lattice + self._lattices.setdefault(lattice, len(self._lattices)),
+            "shifts": [step if known else None for step, known in zip(steps, is_measured, strict=True)],
         }
+
+
+def _row_of(facts: dict[str, Any]) -> dict[str, Any]:
+    """The row of a capture in the table of the page, and its dot on the map."""
+    moving = [b for b in facts["bands"] if b["status"] != "reference"]
+    aligned = [b for b in moving if b["status"] == "aligned"]
+    largest = {
+        name: max((b[name] for b in aligned if b[name] is not None), default=None)
+        for name in ("residual_px", "corner_std_px")
+    }
+    same = "label", "captured_at", "camera", "status", "position", "altitude_m", "missing", "seconds", "stack"
+    return {name: facts[name] for name in same} | {
+        "bands": [(b["band"], b["status"]) for b in moving],
+        **largest,
+        "indices": {i["name"]: i["median"] for i in facts["indices"]},
+        "raw": any(i["raw"] for i in facts["indices"]),
+    }
 
 
 def value_at(part: object, path: str) -> Any:

@@ -1,9 +1,10 @@
 // @ts-check
 "use strict";
 /**
- * What moves on the report: the map, the table, and the capture that is looked at. Everything that is shown comes from
- * the facts in the page itself; the only files that are loaded are the previews next to the rasters, one as it is looked
- * at. Canvases are drawn on and never read, which a page from a file may not do.
+ * What moves on the report: the map, the table, and the capture that is looked at. The page contains the rows of the first
+ * captures and the details of fewer; the scripts in the folder report-data contain those of the others. The rows are
+ * loaded after the page is shown, details and previews when a capture is looked at. Canvases are drawn on and never read,
+ * which a page from a file may not do.
  */
 
 /**
@@ -25,14 +26,93 @@
  *   crop: [number, number, number, number], scale: [number, number], stack: string | null, sidecar: string,
  *   relief: string | null,
  *   picture: string | null, preview: Preview | null, bands: Pair[], indices: Index[]}} Capture
- * @typedef {{schema: string, captures: Capture[], shift_step_px: number, lattices: number[][]}} FlightFacts
+ * @typedef {{label: string, captured_at: string, camera: string, status: string, position: [number, number] | null,
+ *   altitude_m: number | null, missing: string[], seconds: number, stack: string | null, bands: [string, string][],
+ *   residual_px: number | null, corner_std_px: number | null, indices: Record<string, number | null>, raw: boolean}} Row
+ *   The row of a capture in the table, with name and status of each moving band, and the largest errors of aligned ones.
+ * @typedef {{from: number, records: Row[]}} Rows
+ * @typedef {{from: number, records: Capture[], first_lattice: number, lattices: number[][]}} Details
+ *   `from` is the number of captures before the part, `first_lattice` the number of lattices.
+ * @typedef {{captures: number, shift_step_px: number, rows: Rows | null, details: Details | null, details_per_part: number,
+ *   row_files: string[], detail_files: string[]}} FlightFacts The first part of rows and details, and the files of others.
  * @typedef {{column: number, colour: string, inverted?: boolean}} Channel
  * @typedef {"before" | "after"} When
  */
 
 /** @type {FlightFacts} */
 const facts = JSON.parse(byId("facts").textContent ?? "");
-const captures = facts.captures;
+/** The rows that are loaded, in the order of the labels. @type {Row[]} */
+const captures = [];
+/** The details that are loaded, by the number of their part. @type {Map<number, Details>} */
+const details = new Map();
+
+// ---- parts of the data, which the scripts in the folder report-data pass to these two functions
+
+/** @param {Rows} part */
+function add_rows(part) {
+  captures.push(...part.records);
+}
+
+/** @param {Details} part */
+function add_details(part) {
+  details.set(part.from / facts.details_per_part, part);
+}
+
+/**
+ * Load a script.
+ * @param {string} file @param {() => void} then @param {() => void} failed
+ */
+function load(file, then, failed) {
+  const script = el("script", { src: file });
+  script.addEventListener("load", then);
+  script.addEventListener("error", failed);
+  document.head.append(script);
+}
+
+/**
+ * The centres of the windows of a pair of the capture that is looked at: x, y, x, y …
+ * @param {Pair} pair
+ */
+function latticeOf(pair) {
+  return look.part?.lattices[pair.lattice - look.part.first_lattice] ?? [];
+}
+
+/** @param {string} file */
+function notLoaded(file) {
+  return `${file} cannot be loaded: copy the folder report-data together with this page, or make the report again.`;
+}
+
+/** Load the rows that are not in the page, one file after another, then show them. @param {number} number Of the file. */
+function loadRows(number) {
+  const file = facts.row_files[number];
+  if (file === undefined) {
+    tableBody();
+    drawMap();
+    if (look.capture === null) followOrChoose();
+    return;
+  }
+  byId("count").textContent = `${captures.length} of ${facts.captures} loaded`;
+  load(file, () => loadRows(number + 1), () => { byId("count").textContent = notLoaded(file); });
+}
+
+/**
+ * Pass on the details of a capture, which may have to be loaded first.
+ * @param {Row} row @param {(capture: Capture, part: Details) => void} then
+ */
+function withDetails(row, then) {
+  const number = captures.indexOf(row);
+  const part = Math.floor(number / facts.details_per_part);
+  const loaded = details.get(part);
+  if (loaded !== undefined) {
+    then(loaded.records[number - loaded.from], loaded);
+    return;
+  }
+  const file = facts.detail_files[part - 1];
+  load(file, () => withDetails(row, then), () => {
+    byId("capture").hidden = false;
+    byId("capture").replaceChildren(el("h2", { id: "capture-title" }, row.label), el("p", {}, notLoaded(file)));
+  });
+}
 
 // ---- small things
 
@@ -96,7 +176,17 @@ function tableRow(cells, isNumber) {
 /** @param {string[]} heads @param {(Node | string)[][]} rows @param {(column: number) => boolean} isNumber */
 function tableOf(heads, rows, isNumber) {
   const head = el("tr", {}, ...heads.map((text, i) => el("th", { scope: "col", class: isNumber(i) ? "n" : "" }, text)));
-  return el("div", { class: "scroll" }, el("table", {}, el("thead", {}, head), el("tbody", {}, ...rows.map((cells) => tableRow(cells, isNumber)))));
+  const made = el("table", {}, el("thead", {}, head), el("tbody", {}, ...rows.map((cells) => tableRow(cells, isNumber))));
+  labelCells(made);
+  return el("div", { class: "scroll" }, made);
+}
+
+/** Give each cell the head of its column, which stands before it on a narrow screen. @param {HTMLTableElement} made */
+function labelCells(made) {
+  const heads = [...made.querySelectorAll("thead th")].map((head) => head.textContent ?? "");
+  made.querySelectorAll("tbody tr").forEach((line) => {
+    [...line.children].forEach((cell, i) => { set(cell, { "data-head": heads[i] }); });
+  });
 }
 
 /** @param {number | null | undefined} value @param {number} [digits] */
@@ -119,50 +209,43 @@ function moving(capture) {
   return capture.bands.filter((b) => b.status !== "reference");
 }
 
-/**
- * The largest of what the aligned pairs of a capture have.
- * @param {Capture} capture @param {"residual_px" | "corner_std_px"} what @returns {number | null}
- */
-function worst(capture, what) {
-  const known = moving(capture).flatMap((b) => (b.status === "aligned" ? (b[what] ?? []) : []));
-  return known.length ? Math.max(...known) : null;
-}
-
 /** @param {string} captured_at Cameras count from 1970 until their clock is set; without an offset, it is that clock. */
 function taken(captured_at) {
   const zone = captured_at.slice(19).replace(/^\.\d+/, "").replace("+00:00", "UTC");
   return captured_at < "1971" ? "unknown time" : `${captured_at.slice(0, 19).replace("T", " ")} ${zone}`.trim();
 }
 
-/** @param {Capture} capture */
-function address(capture) {
-  return `#capture=${encodeURIComponent(capture.label)}`;
+/** @param {{label: string}} row */
+function address(row) {
+  return `#capture=${encodeURIComponent(row.label)}`;
 }
 
 // ---- the table
 
-/** @type {{title: string, numeric: boolean, value: (c: Capture) => string | number | null, cell: (c: Capture) => Node | string}[]} */
+/** @type {{title: string, numeric: boolean, wide?: boolean, value: (c: Row) => string | number | null, cell: (c: Row) => Node | string}[]} */
 const columns = [
   { title: "Capture", numeric: false, value: (c) => c.label, cell: (c) => el("a", { href: address(c) }, c.label) },
   { title: "Status", numeric: false, value: (c) => ["failed", "degraded", "ok"].indexOf(c.status), cell: (c) => badge(c.status) },
-  { title: "Bands", numeric: false, value: (c) => moving(c).filter((b) => b.status === "aligned").length / Math.max(1, moving(c).length + c.missing.length), cell: chips },
-  { title: "Largest residual, px", numeric: true, value: (c) => worst(c, "residual_px"), cell: (c) => fixed(worst(c, "residual_px"), 3) },
-  { title: "Corner error, px", numeric: true, value: (c) => worst(c, "corner_std_px"), cell: (c) => fixed(worst(c, "corner_std_px"), 3) },
-  { title: "Taken", numeric: false, value: (c) => c.captured_at, cell: (c) => taken(c.captured_at) },
-  { title: "Seconds", numeric: true, value: (c) => c.seconds, cell: (c) => c.seconds.toFixed(1) },
+  { title: "Bands", numeric: false, value: (c) => c.bands.filter(([, status]) => status === "aligned").length / Math.max(1, c.bands.length + c.missing.length), cell: chips },
+  { title: "Largest residual, px", numeric: true, value: (c) => c.residual_px, cell: (c) => fixed(c.residual_px, 3) },
+  { title: "Corner error, px", numeric: true, wide: true, value: (c) => c.corner_std_px, cell: (c) => fixed(c.corner_std_px, 3) },
+  { title: "Taken", numeric: false, wide: true, value: (c) => c.captured_at, cell: (c) => taken(c.captured_at) },
+  { title: "Seconds", numeric: true, wide: true, value: (c) => c.seconds, cell: (c) => c.seconds.toFixed(1) },
 ];
-const table = { sorted: 0, up: true, /** @type {Map<Capture, HTMLTableRowElement>} */ rows: new Map() };
+const PAGE_ROWS = 200; // of the table: more make the page slow
+const table = { sorted: 0, up: true, page: 0, /** @type {Map<Row, HTMLTableRowElement>} */ rows: new Map() };
+const inOrder = new Intl.Collator(undefined, { numeric: true });
 
 /** @param {string} status */
 function badge(status) {
   return el("span", { class: `badge ${status}` }, inWords(status));
 }
 
-/** @param {Capture} capture */
-function chips(capture) {
+/** @param {Row} row */
+function chips(row) {
   const line = el("span");
-  for (const b of moving(capture)) line.append(el("span", { class: `chip ${b.status}`, title: `${b.band}: ${inWords(b.status)}` }, b.band), " ");
-  for (const name of capture.missing) line.append(el("span", { class: "chip missing", title: `${name}: missing` }, name), " ");
+  for (const [name, status] of row.bands) line.append(el("span", { class: `chip ${status}`, title: `${name}: ${inWords(status)}` }, name), " ");
+  for (const name of row.missing) line.append(el("span", { class: "chip missing", title: `${name}: missing` }, name), " ");
   return line;
 }
 
@@ -172,16 +255,19 @@ function tableHead() {
     const sort = () => {
       table.up = table.sorted === i ? !table.up : true;
       table.sorted = i;
+      table.page = 0;
       tableBody();
     };
-    line.append(el("th", { scope: "col", class: column.numeric ? "n" : "" }, button(column.title, sort)));
+    line.append(el("th", { scope: "col", class: `${column.numeric ? "n" : ""}${column.wide ? " wide-only" : ""}` }, button(column.title, sort)));
   });
   byId("table").querySelector("thead")?.replaceChildren(line);
 }
 
-/** @param {Capture} capture */
+/** @param {Row} capture */
 function row(capture) {
   const made = table.rows.get(capture) ?? tableRow(columns.map((c) => c.cell(capture)), (i) => columns[i].numeric);
+  columns.forEach((column, i) => { made.children[i].classList.toggle("wide-only", column.wide ?? false); });
+  made.classList.toggle("open", capture.label === look.capture?.label);
   table.rows.set(capture, made);
   return made;
 }
@@ -194,26 +280,34 @@ function chosen() {
   const sign = table.up ? 1 : -1;
   return captures
     .filter((c) => !text || `${c.label} ${c.captured_at} ${c.camera}`.toLowerCase().includes(text))
-    .filter((c) => only === "all" || only === c.status || (only === "short" && isShort(c)) || (only === "predicted" && moving(c).some((b) => b.status === "predicted")))
+    .filter((c) => only === "all" || only === c.status || (only === "short" && isShort(c)) || (only === "predicted" && c.bands.some(([, status]) => status === "predicted")))
     .sort((a, b) => {
       const [x, y] = [value(a), value(b)];
       if (x === null || y === null) return Number(x === null) - Number(y === null);
-      return sign * (typeof x === "string" ? x.localeCompare(String(y), undefined, { numeric: true }) : Number(x) - Number(y));
+      return sign * (typeof x === "string" ? inOrder.compare(x, String(y)) : Number(x) - Number(y));
     });
 }
 
-/** @param {Capture} capture */
-function isShort(capture) {
-  return capture.missing.length > 0 || moving(capture).some((b) => b.status !== "aligned");
+/** @param {Row} row */
+function isShort(row) {
+  return row.missing.length > 0 || row.bands.some(([, status]) => status !== "aligned");
 }
 
 function tableBody() {
   const shown = chosen();
-  byId("table").querySelector("tbody")?.replaceChildren(...shown.map(row));
+  const pages = Math.max(1, Math.ceil(shown.length / PAGE_ROWS));
+  table.page = Math.min(table.page, pages - 1);
+  const first = table.page * PAGE_ROWS;
+  table.rows.clear();
+  byId("table").querySelector("tbody")?.replaceChildren(...shown.slice(first, first + PAGE_ROWS).map(row));
+  /** @param {string} text @param {number} to */
+  const turn = (text, to) => button(text, () => { table.page = to; tableBody(); }, { class: "button", disabled: to < 0 || to >= pages });
+  byId("table-pages").hidden = pages === 1;
+  byId("table-pages").replaceChildren(turn("Earlier rows", table.page - 1), turn("Later rows", table.page + 1), `${first + 1} to ${Math.min(first + PAGE_ROWS, shown.length)}`);
   byId("table").querySelectorAll("thead th").forEach((head, i) => {
     set(head, { "aria-sort": i !== table.sorted ? "none" : table.up ? "ascending" : "descending" });
   });
-  byId("count").textContent = `${shown.length} of ${captures.length} shown`;
+  byId("count").textContent = `${shown.length} of ${facts.captures} shown`;
 }
 
 // ---- the map
@@ -226,7 +320,7 @@ const NEUTRAL_STOPS = [[20, 20, 20], [245, 245, 245]];
 const MISSING_COLOUR = "#c9a";
 const RAW_NOTE = "Of raw numbers, not reflectance: values of different captures are not comparable.";
 const STATUS_COLOURS = { ok: "#2f9e61", degraded: "#d98a1b", failed: "#d43c3c" };
-/** @type {Map<Capture, Element>} */
+/** @type {Map<Row, Element>} */
 const dots = new Map();
 
 /** The captures where they were taken, metres along and across; drawn without any map behind it. */
@@ -234,12 +328,13 @@ function drawMap() {
   const place = document.getElementById("map-place");
   if (place === null) return;
   const placed = captures.filter((c) => c.position !== null);
+  if (!placed.length) return;
   const [lat, lon] = [0, 1].map((i) => placed.reduce((sum, c) => sum + (c.position ?? [0, 0])[i], 0) / placed.length);
   const metres = placed.map((c) => {
     const [y, x] = c.position ?? [0, 0];
     return [(x - lon) * 111320 * Math.cos((lat * Math.PI) / 180), (y - lat) * 110540];
   });
-  const reach = [0, 1].map((i) => Math.max(...metres.map((m) => Math.abs(m[i])), 1e-9));
+  const reach = [0, 1].map((i) => metres.reduce((largest, m) => Math.max(largest, Math.abs(m[i])), 1e-9));
   if (Math.max(...reach) < ONE_PLACE_M) {
     place.replaceChildren(el("p", {}, `All at ${lat.toFixed(6)}, ${lon.toFixed(6)}.`));
     byId("map").querySelectorAll("label, #map-legend").forEach((part) => { part.remove(); });
@@ -252,6 +347,7 @@ function drawMap() {
   const inTime = placed.map((c, i) => ({ c, at: at[i] })).sort((a, b) => a.c.captured_at.localeCompare(b.c.captured_at));
   const steps = inTime.slice(1).map((p, i) => Math.hypot(p.at[0] - inTime[i].at[0], p.at[1] - inTime[i].at[1])).sort((a, b) => a - b);
   const radius = Math.min(8, Math.max(2.5, 0.5 * (steps[Math.floor(steps.length / 2)] ?? 8)));
+  dots.clear();
   const drawn = svg("svg", { viewBox: `0 0 ${width} ${height}`, role: "img", "aria-label": `Positions of ${placed.length} captures; the table below has the same captures` });
   drawn.append(svg("polyline", { class: "track", points: inTime.map((p) => p.at.map((v) => v.toFixed(1)).join(",")).join(" ") }));
   for (const { c, at: [x, y] } of inTime) {
@@ -262,9 +358,10 @@ function drawMap() {
   }
   drawn.append(...scaleBar(scale, width, height));
   place.replaceChildren(drawn);
-  const colour = byId("map-colour");
-  for (const name of indexNames()) colour.append(el("option", { value: `index:${name}` }, `median ${name.toUpperCase()}`));
-  colour.addEventListener("change", colourMap);
+  const known = [...byId("map-colour").querySelectorAll("option")].map((option) => option.value);
+  for (const name of indexNames().filter((one) => !known.includes(`index:${one}`))) {
+    byId("map-colour").append(el("option", { value: `index:${name}` }, `median ${name.toUpperCase()}`));
+  }
   colourMap();
 }
 
@@ -295,7 +392,7 @@ function colourMap() {
     return;
   }
   for (const [c, dot] of dots) {
-    const value = worst(c, /** @type {"residual_px"} */ (what));
+    const value = c[/** @type {"residual_px"} */ (what)];
     set(dot, { fill: value === null ? MISSING_COLOUR : ramp(value / MAP_FULL_PX) });
   }
   const steps = [0, 0.5, 1].map((s) => key(ramp(s), `${(s * MAP_FULL_PX).toFixed(2)} px${s === 1 ? " and more" : ""}`));
@@ -307,13 +404,11 @@ function colourMap() {
  * @param {string} name @param {HTMLElement} legend
  */
 function colourByIndex(name, legend) {
-  /** @param {Capture} c */
-  const of = (c) => c.indices.find((i) => i.name === name);
-  const known = [...dots.keys()].flatMap((c) => of(c)?.median ?? []);
-  const [low, high] = [Math.min(...known), Math.max(...known)];
-  const raw = captures.some((c) => of(c)?.raw);
+  const known = [...dots.keys()].flatMap((c) => c.indices[name] ?? []);
+  const [low, high] = known.reduce(([a, b], v) => [Math.min(a, v), Math.max(b, v)], [Infinity, -Infinity]);
+  const raw = captures.some((c) => name in c.indices && c.raw);
   for (const [c, dot] of dots) {
-    const value = of(c)?.median ?? null;
+    const value = c.indices[name] ?? null;
     set(dot, { fill: value === null ? MISSING_COLOUR : medianColour((value - low) / (high - low || 1), raw) });
   }
   const steps = known.length ? [0, 0.5, 1].map((s) => key(medianColour(s, raw), (low + s * (high - low)).toFixed(3))) : [];
@@ -322,7 +417,7 @@ function colourByIndex(name, legend) {
 
 /** The names of all indices, of whichever captures have them. */
 function indexNames() {
-  return [...new Set(captures.flatMap((c) => c.indices.map((i) => i.name)))];
+  return [...new Set(captures.flatMap((c) => Object.keys(c.indices)))];
 }
 
 /**
@@ -351,8 +446,8 @@ function saveMap() {
     geometry: { type: "Point", coordinates: [c.position?.[1], c.position?.[0], ...(c.altitude_m === null ? [] : [c.altitude_m])] },
     properties: {
       capture: c.label, captured_at: c.captured_at, camera: c.camera, status: c.status, stack: c.stack,
-      residual_px: worst(c, "residual_px"), corner_std_px: worst(c, "corner_std_px"),
-      ...Object.fromEntries(c.indices.map((i) => [`${i.name}_median`, i.median])),
+      residual_px: c.residual_px, corner_std_px: c.corner_std_px,
+      ...Object.fromEntries(Object.entries(c.indices).map(([name, median]) => [`${name}_median`, median])),
     },
   }));
   const text = JSON.stringify({ type: "FeatureCollection", features });
@@ -399,6 +494,7 @@ const CLOSE_ENOUGH = 1.5; // as wide as the small picture has pixels, the detail
 /** What is looked at, and how; it stays from capture to capture. */
 const look = {
   /** @type {Capture | null} */ capture: null,
+  /** @type {Details | null} */ part: null, // of the details of the capture
   /** @type {HTMLImageElement | null} */ sheet: null,
   /** @type {[string, string, string] | null} */ wanted: null, // kept for the captures that have these bands
   /** @type {[string, string, string]} */ bands: ["", "", ""],
@@ -414,37 +510,50 @@ const look = {
 /** @type {HTMLCanvasElement} */
 const stage = el("canvas", { tabindex: 0, role: "img", "aria-label": "The composite before and after" });
 
-/** @param {Capture} capture */
-function show(capture) {
-  const before = look.capture;
-  if (before !== null) {
-    table.rows.get(before)?.classList.remove("open");
-    dots.get(before)?.classList.remove("open");
-  }
+/** The row that is looked at. @type {Row | null} */
+let open_row = null;
+
+/**
+ * Show a capture, as soon as its details are loaded.
+ * @param {Row} row @param {() => void} [then]
+ */
+function show(row, then = () => {}) {
+  open_row = row;
+  withDetails(row, (capture, part) => {
+    if (open_row !== row) return;
+    showDetails(row, capture, part);
+    then();
+  });
+}
+
+/** @param {Row} row @param {Capture} capture @param {Details} part */
+function showDetails(row, capture, part) {
+  for (const one of [...table.rows.values(), ...dots.values()]) one.classList.remove("open");
   look.capture = capture;
+  look.part = part;
   look.sheet = null;
   look.composed = {};
   look.indices = {};
   if (look.overlay.startsWith("index:") && !indexOf(capture)) look.overlay = "none";
   const names = capture.bands.map((b) => b.band);
-  look.wanted ??= presets(captures.find((c) => c.missing.length === 0) ?? capture)[0].bands;
+  look.wanted ??= presets(facts.details?.records.find((c) => c.missing.length === 0) ?? capture)[0].bands;
   look.bands = look.wanted.every((b) => names.includes(b)) ? look.wanted : presets(capture)[0].bands;
   if (!names.includes(look.overlayBand)) look.overlayBand = moving(capture)[0]?.band ?? "";
-  table.rows.get(capture)?.classList.add("open");
-  const dot = dots.get(capture);
+  table.rows.get(row)?.classList.add("open");
+  const dot = dots.get(row);
   dot?.classList.add("open");
   dot?.parentNode?.append(dot); // drawn on top
   const place = byId("capture");
   place.hidden = false;
-  place.replaceChildren(...heading(capture), ...pictures(capture), ...indexTable(capture), words(capture), numbers(capture), similarities(capture));
+  place.replaceChildren(...heading(row, capture), ...pictures(capture), ...indexTable(capture), words(capture), numbers(capture), similarities(capture));
   paint();
 }
 
-/** @param {Capture} capture */
-function heading(capture) {
+/** @param {Row} row @param {Capture} capture */
+function heading(row, capture) {
   const order = chosen();
-  const at = order.indexOf(capture);
-  /** @param {string} text @param {Capture | undefined} to */
+  const at = order.indexOf(row);
+  /** @param {string} text @param {Row | undefined} to */
   const step = (text, to) => button(text, () => { if (to !== undefined) location.hash = address(to); }, { class: "button", disabled: to === undefined });
   const where = capture.position === null ? "" : ` · ${capture.position.map((v) => v.toFixed(6)).join(", ")}${capture.altitude_m === null ? "" : `, ${capture.altitude_m.toFixed(0)} m`}`;
   const files = el("span", {}, capture.radiometry === null ? "" : ` · ${capture.radiometry}`);
@@ -794,7 +903,7 @@ function over(pen, capture, at) {
  * @param {(u: number, v: number) => [number, number]} at
  */
 function overVectors(pen, capture, pair, at) {
-  const lattice = facts.lattices[pair.lattice];
+  const lattice = latticeOf(pair);
   const [x0, y0, width, height] = capture.crop;
   const [sx, sy] = capture.scale;
   const apart = 0.5 * nearest(lattice);
@@ -842,7 +951,7 @@ function overIndex(pen, capture, at) {
  * @param {(u: number, v: number) => [number, number]} at
  */
 function overHeat(pen, capture, pair, at) {
-  const lattice = facts.lattices[pair.lattice];
+  const lattice = latticeOf(pair);
   const [x0, y0, width, height] = capture.crop;
   const [sx, sy] = capture.scale;
   const columns = edges(lattice.filter((_, i) => i % 2 === 0));
@@ -1032,7 +1141,8 @@ function numbers(capture) {
       pair.occluded === null ? "–" : percent(pair.occluded), pair.seconds.toFixed(1),
     ];
   });
-  return tableOf(heads, rows, (i) => i > 2);
+  const words = heads.indexOf("Geometry, 95 %");
+  return tableOf(heads, rows, (i) => i > 2 && i !== words);
 }
 
 /** @type {[string, string][]} Name and column. */
@@ -1052,11 +1162,18 @@ function similarities(capture) {
 
 function follow() {
   const wanted = location.hash.startsWith("#capture=") ? decodeURIComponent(location.hash.slice(9)) : null;
-  const capture = wanted === null ? undefined : captures.find((c) => c.label === wanted);
-  if (capture === undefined) return;
-  show(capture);
-  byId("capture").scrollIntoView({ block: "start" });
-  byId("capture").focus({ preventScroll: true });
+  const row = wanted === null ? undefined : captures.find((c) => c.label === wanted);
+  if (row === undefined) return;
+  show(row, () => {
+    byId("capture").scrollIntoView({ block: "start" });
+    byId("capture").focus({ preventScroll: true });
+  });
+}
+
+/** Show the capture of the address, else one with a failed band. */
+function followOrChoose() {
+  if (location.hash.startsWith("#capture=")) follow();
+  else if (captures.length) show(captures.find((c) => c.status === "failed") ?? captures.find(isShort) ?? captures[0]);
 }
 
 /**
@@ -1074,14 +1191,18 @@ function forPaper(paper) {
   else if (failed.length) byId("table").querySelector("tbody")?.replaceChildren(...failed.map(row));
 }
 
+if (facts.rows !== null) add_rows(facts.rows);
+if (facts.details !== null) add_details(facts.details);
+document.querySelectorAll("table").forEach(labelCells);
 tableHead();
 tableBody();
 drawMap();
+document.getElementById("map-colour")?.addEventListener("change", colourMap);
 document.getElementById("map-save")?.addEventListener("click", saveMap);
 window.matchMedia("print").addEventListener("change", (event) => forPaper(event.matches));
 listenToStage();
 byId("find").addEventListener("input", tableBody);
 byId("only").addEventListener("change", tableBody);
 window.addEventListener("hashchange", follow);
-if (location.hash.startsWith("#capture=")) follow();
-else if (captures.length) show(captures.find((c) => c.status === "failed") ?? captures.find(isShort) ?? captures[0]);
+followOrChoose();
+if (facts.row_files.length) loadRows(0);

@@ -4,6 +4,7 @@ import base64
 import hashlib
 import json
 import os
+from collections import defaultdict
 from collections.abc import Callable
 from contextlib import suppress
 from importlib import resources
@@ -16,29 +17,37 @@ from jinja2 import Environment, PackageLoader, StrictUndefined, select_autoescap
 from agalign._version import __version__
 from agalign.config import Settings
 from agalign.errors import SidecarError
-from agalign.products.indices.rasters import IndexReport, reports_of, update_table
+from agalign.products.indices.rasters import IndexReport, current_rows, merged, reports_of, update_table
 from agalign.products.report.charts import drifts_of, rig_views
-from agalign.products.report.facts import BAND_COLUMNS, FlightFacts
+from agalign.products.report.data_files import data_files_exist, remove_other_data_files
+from agalign.products.report.facts import SUMMARY_FILE, FlightFacts
 from agalign.products.run.excluded import PANELS_FILE, SKY_FILE, PanelPart, SkyPart, read_excluded
 from agalign.products.run.flight_map import FlightMap
 from agalign.products.run.record import RunPart, read_run_record
 from agalign.products.sidecar.file import find_sidecars, read_sidecar
-from agalign.values.files import write_csv, write_text
+from agalign.values.files import write_text
 
-SUMMARY_COLUMNS = ("folder", "capture", *BAND_COLUMNS, "reference")
-REPORT_FILE, SUMMARY_FILE = "index.html", "summary.csv"
+REPORT_FILE = "index.html"
+_MAX_LISTED = 100
+"""Entries of a list in the page; OUT/summary.csv and OUT/agalign-run.json have all."""
+_MAX_EXCLUDED = 20
+"""Captures of panels, and of the sky, with a table in the page; OUT/panels.json and OUT/sky.json have all."""
 
 
 def write_pages(out: Path, on_problem: Callable[[str], None]) -> FlightFacts:
-    """Write OUT/index.html, OUT/summary.csv, OUT/indices.csv and OUT/flight.geojson from all sidecars below OUT, and
-    return their data.
+    """Write OUT/index.html with OUT/report-data, OUT/summary.csv, OUT/indices.csv and OUT/flight.geojson from all
+    sidecars below OUT, and return their data.
 
     Unreadable files are reported to `on_problem` and left out; the pages then count as outdated in `pages_exist`.
     Raises OutputError.
     """
+    earlier = current_rows(out)
+    rows_of: dict[str, list[IndexReport]] = defaultdict(list)
+    for row in earlier:
+        rows_of[row.capture].append(row)
     indices: list[IndexReport] = []
     unreadable: list[str] = []
-    facts, flight_map = FlightFacts(), FlightMap()
+    facts, flight_map = FlightFacts(out), FlightMap()
     for path in find_sidecars(out):
         folder = path.parent.relative_to(out).as_posix()
         try:
@@ -46,9 +55,12 @@ def write_pages(out: Path, on_problem: Callable[[str], None]) -> FlightFacts:
         except SidecarError as error:
             unreadable.append(str(error))
             continue
-        indices += reports_of(sidecar, folder, out)
-        facts.add(folder, sidecar)
+        of_capture = reports_of(sidecar, folder, out)
+        indices += of_capture
+        label = Path(folder, sidecar.capture).as_posix()
+        facts.add(folder, sidecar, merged(rows_of.get(label, []), of_capture))
         flight_map.add(folder, sidecar)
+    facts.flush()
     panels: list[PanelPart] = []
     sky: list[SkyPart] = []
     run: RunPart | None = None
@@ -58,28 +70,31 @@ def write_pages(out: Path, on_problem: Callable[[str], None]) -> FlightFacts:
         unreadable.append(str(error))
     not_aligned = [("panel", part) for part in panels if not part.in_scene] + [("sky", part) for part in sky]
     for status, part in not_aligned:
-        of_capture = {"folder": part.folder, "capture": part.capture, "status": status, "reason": part.sentence}
-        facts.rows += [of_capture | {"band": band.band} for band in part.bands]
-    write_csv(out / SUMMARY_FILE, SUMMARY_COLUMNS, ([row.get(name) for name in SUMMARY_COLUMNS] for row in facts.rows))
-    rows = update_table(out, indices)
-    facts.add_indices(rows, out)
-    for excluded in [] if run is None else run.excluded:
-        flight_map.add_excluded(excluded)
+        excluded = {"folder": part.folder, "capture": part.capture, "status": status, "reason": part.sentence}
+        for band in part.bands:
+            facts.add_row(excluded | {"band": band.band})
+    facts.write_summary()
+    rows = update_table(out, indices, earlier)
+    for one in [] if run is None else run.excluded:
+        flight_map.add_excluded(one)
     flight_map.add_indices(rows, out)
     flight_map.write(out)
     page = _page(
         version=__version__,
         median=median,
         flight=facts,
-        facts=facts.as_json(),
+        facts=facts.in_page(),
+        max_listed=_MAX_LISTED,
+        max_excluded=_MAX_EXCLUDED,
         run=run,
         settings=_changed_settings(run),
         rigs=rig_views(out, unreadable.append),
-        drifts=drifts_of(facts.captures),
+        drifts=drifts_of(facts.cameras),
         panels=panels,
         sky=sky,
     )
     write_text(out / REPORT_FILE, page)
+    remove_other_data_files(out, facts.files)
     if unreadable:
         with suppress(OSError):
             os.utime(out / REPORT_FILE, (0, 0))
@@ -93,8 +108,9 @@ def pages_exist(out: Path) -> bool:
     try:
         written = min((out / name).stat().st_mtime_ns for name in (REPORT_FILE, SUMMARY_FILE))
         entries = [*find_sidecars(out), *(out / f for f in (PANELS_FILE, SKY_FILE) if (out / f).exists())]
-        return all(path.stat().st_mtime_ns < written for path in entries)
-    except OSError:
+        is_newer = all(path.stat().st_mtime_ns < written for path in entries)
+        return is_newer and data_files_exist(out / REPORT_FILE)
+    except (OSError, UnicodeDecodeError):
         return False
 
 
