@@ -12,7 +12,7 @@ from agalign.errors import AgalignError
 from agalign.products.indices.formulas import Index
 from agalign.products.indices.rasters import IndexRasters, IndexReport, update_table, write_rasters
 from agalign.products.run.captures import bands_of
-from agalign.products.sidecar.file import add_products, read_without_tables, run_sidecars
+from agalign.products.sidecar.file import add_products, label_of, read_without_tables, run_sidecars
 from agalign.values.files import written_below
 from agalign.values.processes import usable_cores
 
@@ -38,7 +38,7 @@ class IndexTask:
     @property
     def label(self) -> str:
         """The capture's name, with its folder relative to `out`."""
-        return self.sidecar.relative_to(self.out).with_suffix("").as_posix()
+        return label_of(self.sidecar, self.out)
 
 
 def index_tasks(

@@ -96,20 +96,28 @@ def run_flight(
     run.check()
     if model is not None:
         run = run.starting_from(model)
-    written: dict[str, tuple[Path, Sequence[FilePart]]] = {}  # (sidecar, files) by label
+    # (path of the sidecar, its files, state, statuses of the pairs) by label; sidecars would not fit into memory.
+    written: dict[str, tuple[Path, Sequence[FilePart], str, list[str]]] = {}
+    gone: list[str] = []
     with locked(out), _recorded(run) as record:
-        for report in run.reports(record):
-            record.add(report.label, report.state, report.result, report.problems)
-            if report.state == "done":
-                record.capture_seconds[report.label] = report.seconds
-            for (_, stage), seconds in report.stages.items():
-                record.stage_seconds[stage] += seconds
-            yield report
-            if report.problems and is_full(out):
-                raise OutputError(f"{out}: the disk is full; free space, then the same command resumes the run")
-            if report.result is not None and report.path is not None:
-                written[report.label] = report.path, report.result.files
-        gone = [label for label, (path, files) in written.items() if not outputs_exist(path, files)]
+        try:
+            for report in run.reports(record):
+                record.add(report.label, report.state, report.result, report.problems)
+                if report.state == "done":
+                    record.capture_seconds[report.label] = report.seconds
+                for (_, stage), seconds in report.stages.items():
+                    record.stage_seconds[stage] += seconds
+                if report.result is not None and report.path is not None:
+                    statuses = [status for _, status, _ in report.result.pairs]
+                    written[report.label] = report.path, report.result.files, report.state, statuses
+                yield report
+                if report.problems and is_full(out):
+                    raise OutputError(f"{out}: the disk is full; free space, then the same command resumes the run")
+        finally:
+            for label, (path, files, state, statuses) in written.items():
+                if not outputs_exist(path, files):
+                    gone.append(label)
+                    record.retract(label, state, statuses)
         if gone:
             what = f"outputs of {counted(len(gone), 'capture')} were removed during the run, such as of {gone[0]}"
             raise OutputError(f"{out}: {what}; the same command writes them again")

@@ -104,6 +104,9 @@ class RunTotals:
     asked: dict[str, int] = field(default_factory=dict)
     """Number of band pairs of each capture that is to be aligned."""
     states: Counter[str] = field(default_factory=Counter)
+    """Number of captures by state."""
+    written: dict[str, str] = field(default_factory=dict)
+    """State of each capture with a result, by label."""
     pairs: PairTotals = field(default_factory=PairTotals)
     has_report: bool = False
     """The report is written."""
@@ -125,6 +128,7 @@ class RunTotals:
         if report.result is None:
             return
         self.pairs.add(report.label, report.result)
+        self.written[report.label] = report.state
         output = report.result.output
         if output is not None and output.radiometry is not None:
             self.panel_ages_s[output.radiometry].append(output.panel_age_s)
@@ -133,14 +137,18 @@ class RunTotals:
             self.saturated[band.band] = max(self.saturated.get(band.band, (0.0, "")), (share, report.label))
 
     def recount(self, captures: Sequence[Capture], out: Path) -> None:
-        """Count the pairs of captures that have all their files: outputs may have been removed."""
-        added, self.pairs = self.pairs.captures, PairTotals()
-        for capture in (one for one in captures if one.label in added):
+        """Count only captures that have all their files, and the others as errors: outputs may have been removed."""
+        self.pairs = PairTotals()
+        for capture in (one for one in captures if one.label in self.written):
             path = CapturePaths.of(capture, out).sidecar
             with suppress(SidecarError):
                 result = read_without_tables(path)
                 if outputs_exist(path, result.files):
                     self.pairs.add(capture.label, result)
+                    continue
+            self.states.subtract([self.written.pop(capture.label)])
+            self.states["error"] += 1
+        self.states = +self.states  # without zeros
 
 
 def run(

@@ -2,7 +2,7 @@
 
 import heapq
 import math
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from operator import itemgetter
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -40,6 +40,7 @@ def _report(terminal: Terminal, out: Annotated[Path, typer.Argument()], as_json:
         facts = write_pages(out, unreadable.append)
     for text in unreadable:
         terminal.problem(text)
+    is_unfinished = _print_unfinished(out, facts.seconds, terminal)
     if as_json:
         for line in facts.json_lines():
             typer.echo(line)
@@ -49,20 +50,41 @@ def _report(terminal: Terminal, out: Annotated[Path, typer.Argument()], as_json:
         terminal.table(("Slowest", "Seconds"), [(label, f"{seconds:.1f}") for label, seconds in slowest])
         for name in (REPORT_FILE, SUMMARY_FILE):
             terminal.result(str(out / name))
-    return ExitCode.PARTIAL if unreadable else ExitCode.OK
+    return ExitCode.PARTIAL if unreadable or is_unfinished else ExitCode.OK
+
+
+def _print_unfinished(out: Path, labels: Collection[str], terminal: Terminal) -> bool:
+    """Print what the last run into a folder did not do, given the labels of the captures with a result; return True if
+    there is such.
+    """
+    from agalign.errors import SidecarError
+    from agalign.products.run.record import unfinished_of
+
+    try:
+        unfinished = unfinished_of(out, labels)
+    except SidecarError as error:
+        terminal.problem(str(error))
+        return True
+    if unfinished is None or not unfinished.sentence:
+        return False
+    facts = {"state": unfinished.state, "missing": unfinished.missing}
+    terminal.problem(f"{out}: {unfinished.sentence}", **facts)
+    return True
 
 
 def _verify(terminal: Terminal, out: Out) -> int:
     """Compare the files of a run with their checksums."""
-    from agalign.products.sidecar.file import verify_outputs
+    from agalign.products.sidecar.file import label_of, verify_outputs
 
-    captures = damaged = 0
-    for _, problems in verify_outputs(out):
-        captures, damaged = captures + 1, damaged + bool(problems)
+    labels, damaged = [], 0
+    for path, problems in verify_outputs(out):
+        labels.append(label_of(path, out))
+        damaged += bool(problems)
         for text in problems:
             terminal.problem(text)
-    terminal.result(f"{captures - damaged} of {captures} captures match their checksums")
-    return ExitCode.PARTIAL if damaged else ExitCode.OK
+    is_unfinished = _print_unfinished(out, set(labels), terminal)
+    terminal.result(f"{len(labels) - damaged} of {len(labels)} captures match their checksums")
+    return ExitCode.PARTIAL if damaged or is_unfinished else ExitCode.OK
 
 
 def _export(
@@ -83,16 +105,19 @@ def _export(
         agalign export aligned/ --for odm  band files in one folder, and the options for OpenDroneMap
     """
     from agalign.products.exports.programs import export as run_export
+    from agalign.products.sidecar.file import label_of, run_sidecars
 
     run_folder = out.resolve()
     folder = target or run_folder.parent / f"{run_folder.name}-{program}"
     report = run_export(out, folder, program, copy=copy)
     _print_left_out(report.left_out, terminal)
+    labels = {label_of(path, out) for path in run_sidecars(out)}
+    is_unfinished = _print_unfinished(out, labels, terminal)
     for line in report.notes:
         terminal.result(line)
     terminal.event("export", captures=report.captures, files=len(report.files), folder=str(folder))
     terminal.result(f"{report.captures} captures, {len(report.files)} files in {folder}")
-    return ExitCode.PARTIAL if report.left_out else ExitCode.OK
+    return ExitCode.PARTIAL if report.left_out or is_unfinished else ExitCode.OK
 
 
 def _print_left_out(left_out: Sequence[tuple[str, str]], terminal: Terminal) -> None:
@@ -160,7 +185,9 @@ def _indices(
                 write_pages(out, terminal.problem)
         except OutputError as error:  # of the table or the report: the rasters and their statistics exist
             unwritten = str(error)
-    return _conclude([one.name for one in chosen], reports, folder, terminal, unwritten, as_json=as_json)
+    is_unfinished = _print_unfinished(out, {task.label for task in tasks}, terminal)
+    code = _conclude([one.name for one in chosen], reports, folder, terminal, unwritten, as_json=as_json)
+    return ExitCode.PARTIAL if is_unfinished and code == ExitCode.OK else code
 
 
 def _conclude(

@@ -254,6 +254,12 @@ def test_outputs_removed_during_the_run_are_reported_and_not_counted(
     removed = f"{tmp_path}: outputs of 1 capture were removed during the run, such as of 0000SET/000/IMG_0001; the same"
     assert removed in printed.err
     assert "2 of 4 band pairs aligned; 1 capture not written" in printed.out
+    assert totals.states == {"done": 1, "error": 1}
+    record = read_json(tmp_path / "agalign-run.json")
+    assert record["captures"] == {"found": 2, "done": 1, "error": 1}
+    assert record["pairs"] == {"aligned": 2}
+    assert [*record["capture_seconds"]] == ["0000SET/000/IMG_0002"]
+    assert [part["of"] for part in record["problems"]] == ["0000SET/000/IMG_0001"]
     assert [r.state for r in agalign.align_folder(flight, tmp_path, options=THREE)] == ["kept", "done"]
 
 
@@ -264,3 +270,6 @@ def test_a_run_fails_if_its_output_folder_is_removed(
     when_the_second_is_reported(monkeypatch, lambda: shutil.rmtree(out))
     totals = run_command(agalign.discover(flight), out, SEEDS, terminal, agalign.RunOptions())
     assert conclude(totals, out, terminal) == ExitCode.NOTHING
+    assert totals.states == {"error": 2}
+    record = read_json(out / "agalign-run.json")
+    assert (record["captures"], record["pairs"], record["refused"]) == ({"found": 2, "error": 2}, {}, [])

@@ -473,7 +473,7 @@ def current_rows(out: Path) -> list[IndexReport]:
 
 
 def merged(rows: Iterable[IndexReport], newer: Iterable[IndexReport]) -> list[IndexReport]:
-    """Return rows of which the newer ones replace those of the same capture and index."""
+    """Return all rows; a newer one replaces that of the same capture and index."""
     return list({row.key: row for row in [*rows, *newer]}.values())
 
 

@@ -181,7 +181,7 @@ function tableOf(heads, rows, isNumber) {
   return el("div", { class: "scroll" }, made);
 }
 
-/** Give each cell the head of its column, which stands before it on a narrow screen. @param {HTMLTableElement} made */
+/** Give each cell the head of its column, which a narrow screen shows before it. @param {HTMLTableElement} made */
 function labelCells(made) {
   const heads = [...made.querySelectorAll("thead th")].map((head) => head.textContent ?? "");
   made.querySelectorAll("tbody tr").forEach((line) => {

@@ -68,7 +68,7 @@ def write_pages(out: Path, on_problem: Callable[[str], None]) -> FlightFacts:
         (panels, sky), run = read_excluded(out), read_run_record(out)
     except SidecarError as error:
         unreadable.append(str(error))
-    not_aligned = [("panel", part) for part in panels if not part.in_scene] + [("sky", part) for part in sky]
+    not_aligned = [("panel", part) for part in panels if part.is_left_out] + [("sky", part) for part in sky]
     for status, part in not_aligned:
         excluded = {"folder": part.folder, "capture": part.capture, "status": status, "reason": part.sentence}
         for band in part.bands:

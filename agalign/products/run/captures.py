@@ -16,7 +16,7 @@ from rasterio.windows import Window
 
 from agalign.errors import InputError, SidecarError
 from agalign.pixels.raster import OpenRaster, innermost_cause, open_raster
-from agalign.products.sidecar.file import read_without_tables, run_sidecars
+from agalign.products.sidecar.file import label_of, read_without_tables, run_sidecars
 from agalign.products.sidecar.schema import Sidecar
 from agalign.values.choices import UNUSABLE_QUALITY
 from agalign.values.image import FloatImage, Tile, reduced_size_px
@@ -181,7 +181,7 @@ def captures_of_run(out: Path) -> tuple[list[RunCapture], LeftOut]:
     """
     captures, left_out = [], []
     for path in run_sidecars(out):
-        label = path.relative_to(out).with_suffix("").as_posix()
+        label = label_of(path, out)
         try:
             captures.append(RunCapture(label, path, read_without_tables(path)))
         except SidecarError as error:

@@ -57,6 +57,11 @@ class _CapturePart(_Part):
     capture: str
     captured_at: str
 
+    @property
+    def is_left_out(self) -> bool:
+        """True if the capture is not aligned."""
+        return True
+
 
 class PanelPart(_CapturePart):
     """One capture of a panel."""
@@ -73,6 +78,11 @@ class PanelPart(_CapturePart):
     fits_sensor: bool = True
     """False if the scale or its range over the bands is implausible; panels are then not combined with the sensor."""
     bands: list[PanelBandPart]
+
+    @property
+    def is_left_out(self) -> bool:
+        """True if the capture is not aligned."""
+        return not self.in_scene
 
     @property
     def sentence(self) -> str:

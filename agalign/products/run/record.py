@@ -2,7 +2,8 @@
 
 import platform
 from collections import Counter, defaultdict
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Sequence
+from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -13,6 +14,7 @@ from agalign._version import __version__
 from agalign.config import Settings
 from agalign.errors import ConfigurationError
 from agalign.flight.groups import CameraOverview, camera_overviews
+from agalign.products.run.excluded import read_excluded
 from agalign.products.run.footprint import accuracy_of_footprint_m, footprint
 from agalign.products.sidecar.schema import Sidecar
 from agalign.values.capture import CameraIdentity, Capture, Pose, Position
@@ -80,8 +82,11 @@ class RunPart(_Part):
     versions: dict[str, str]
     machine: dict[str, str | int]
     settings: dict[str, Any]
+    labels: list[str] = []
+    """Labels of the captures found; empty in older records."""
     captures: Counter[str] = Counter()
-    """Number of captures found, done, kept, panel, sky, and error."""
+    """Number of captures found, done, kept, panel, sky, and error. A capture is counted as error if its files were
+    removed before the end of the run."""
     pairs: Counter[str] = Counter()
     """Number of band pairs by status."""
     stage_seconds: defaultdict[str, float] = defaultdict(float)
@@ -101,6 +106,18 @@ class RunPart(_Part):
             self.pairs[status] += 1
             if status != "aligned":
                 self.refused.append(RefusalPart(capture=label, band=band, status=status, reason=reason))
+
+    def retract(self, label: str, state: str, statuses: Iterable[str]) -> None:
+        """Count a capture that was added with this state, and these statuses of its pairs, as an error, because its
+        files do not exist.
+        """
+        self.captures[state] -= 1
+        self.captures["error"] += 1
+        self.pairs.subtract(statuses)
+        self.captures, self.pairs = +self.captures, +self.pairs  # without zeros
+        self.refused = [part for part in self.refused if part.capture != label]
+        self.capture_seconds.pop(label, None)
+        self.add_problem(label, "its files were removed during the run; the same command writes them again")
 
     def add_problem(self, what: str, text: str) -> None:
         """Add a problem of a file or capture; characters that are not printable are escaped."""
@@ -157,6 +174,7 @@ def begun(folder: Path, settings: Settings, captures: Sequence[Capture] = (), co
         versions=library_versions(),
         machine={**system, "cores": usable_cores(), "device": settings.joint.device},
         settings=settings.model_dump(mode="json"),
+        labels=[capture.label for capture in captures],
         captures=Counter(found=len(captures)),
     )
 
@@ -173,3 +191,49 @@ def refuse_foreign_pages(out: Path) -> None:
 def read_run_record(out: Path) -> RunPart | None:
     """Return the record of the last run into a folder, if any. Raises SidecarError for a file of another format."""
     return read_model(out / RUN_FILE, RunPart)
+
+
+@dataclass(frozen=True)
+class UnfinishedRun:
+    """What the last run into a folder did not do."""
+
+    state: RunState
+    found: int
+    """Number of captures that were to be aligned."""
+    missing: list[str]
+    """Labels of those without a result."""
+
+    @property
+    def sentence(self) -> str:
+        """Describe what is missing, without a full stop; empty if there is none."""
+        states = {
+            "running": "the run did not end: it was killed, or is still running",
+            "interrupted": "the run was stopped before its end",
+            "finished": "",
+        }
+        parts = [text for text in (states[self.state], self._without_result) if text]
+        return "; ".join([*parts, "the same command resumes it"]) if parts else ""
+
+    @property
+    def _without_result(self) -> str:
+        max_named = 10
+        if not self.missing:
+            return ""
+        named, more = ", ".join(self.missing[:max_named]), len(self.missing) - max_named
+        and_more = f" and {more} more" if more > 0 else ""
+        verb = "has" if len(self.missing) == 1 else "have"
+        return f"{len(self.missing)} of {counted(self.found, 'capture')} {verb} no result: {named}{and_more}"
+
+
+def unfinished_of(out: Path, labels: Collection[str]) -> UnfinishedRun | None:
+    """Return what the last run into a folder did not do, given the labels of the captures that have a result; None
+    without a record. Raises SidecarError for a file of another format.
+    """
+    record, (panels, sky) = read_run_record(out), read_excluded(out)
+    if record is None:
+        return None
+    excluded = {part.capture for part in record.excluded}
+    # A killed run has written these files, and not the end of its record.
+    excluded |= {Path(part.folder, part.capture).as_posix() for part in (*panels, *sky) if part.is_left_out}
+    wanted = [label for label in record.labels if label not in excluded]
+    return UnfinishedRun(record.state, len(wanted), [label for label in wanted if label not in labels])

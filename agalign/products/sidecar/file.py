@@ -122,6 +122,11 @@ def is_sidecar(path: Path) -> bool:
         return True
 
 
+def label_of(sidecar: Path, out: Path) -> str:
+    """Return the label of the capture with this sidecar below the output folder of a run."""
+    return sidecar.relative_to(out).with_suffix("").as_posix()
+
+
 def run_sidecars(out: Path) -> list[Path]:
     """Return the sidecars below the output folder of a run. Raises InputError if there are none."""
     sidecars = find_sidecars(out) if out.is_dir() else []
@@ -161,7 +166,9 @@ def verify_outputs(out: Path) -> Iterator[tuple[Path, list[str]]]:
 
 def _problems_of_outputs(path: Path) -> Iterator[str]:
     sidecar = read_sidecar(path)
-    if sidecar.checksum is not None and sidecar.checksum != content_checksum(read_regular(path, _MAX_BYTES)):
+    if sidecar.checksum is None:
+        yield f"{path}: has no checksum, so that changes cannot be found; run again with --overwrite"
+    elif sidecar.checksum != content_checksum(read_regular(path, _MAX_BYTES)):
         yield f"{path}: was changed after it was written; run again with --overwrite"
     for kind in sidecar.not_written:
         yield f"{path}: its {kind} could not be written; run again"
