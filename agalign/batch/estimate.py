@@ -41,7 +41,8 @@ def estimate(
         write_parallax(path, relief, capture.reference.georeference)
         parallax = file_part(PARALLAX_KIND, path, paths.folder)
     seconds = time.perf_counter() - began_s
-    result = Sidecar.estimated(capture, alignments, settings, parallax, seconds)
+    fingerprint = "" if model is None else model.fingerprint
+    result = Sidecar.estimated(capture, alignments, settings, parallax, seconds, fingerprint)
     if earlier is not None:
         options = {key: stage for key, stage in (result.options or {}).items() if key != "write"}
         options |= {key: stage for key, stage in (earlier.options or {}).items() if key == "write"}

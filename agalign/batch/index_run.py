@@ -10,8 +10,9 @@ import cv2
 from agalign.batch.workers import failure_text, open_workers, serially
 from agalign.errors import AgalignError
 from agalign.products.indices.formulas import Index
-from agalign.products.indices.rasters import IndexRasters, IndexReport, update_table, write_rasters
+from agalign.products.indices.rasters import IndexRasters, IndexReport, to_check, update_table, write_rasters
 from agalign.products.run.captures import bands_of
+from agalign.products.run.cautions import RunFacts
 from agalign.products.sidecar.file import add_products, label_of, read_without_tables, run_sidecars
 from agalign.values.files import written_below
 from agalign.values.processes import usable_cores
@@ -90,6 +91,8 @@ def do_indices(task: IndexTask) -> list[IndexReport]:
                 rasters = [r.path for r in reports if r.path is not None and not (r.kept and r.path.name in listed)]
                 files = [p for path in rasters for p in (path, path.with_suffix(".png"))]
                 add_products(task.sidecar, IndexRasters.kind, files)
+        run, by_name = RunFacts.of(task.out), {index.name: index for index in task.indices}
+        reports = [r if r.problem else replace(r, problem=to_check(by_name[r.index], sidecar, run)) for r in reports]
     except AgalignError as error:
         reports = _failed(task, str(error))
     return [report.of(sidecar) for report in reports]

@@ -25,6 +25,7 @@ from agalign.flight.groups import camera_overviews
 from agalign.products.product import CapturePaths
 from agalign.products.report.facts import PairTotals, rounded
 from agalign.products.report.pages import REPORT_FILE, pages_exist, write_pages
+from agalign.products.run.cautions import RunFacts
 from agalign.products.run.record import read_run_record
 from agalign.products.sidecar.file import read_without_tables
 from agalign.products.sidecar.schema import BandResult
@@ -108,10 +109,9 @@ class RunTotals:
     written: dict[str, str] = field(default_factory=dict)
     """State of each capture with a result, by label."""
     pairs: PairTotals = field(default_factory=PairTotals)
+    """The pairs of captures with a result."""
     has_report: bool = False
     """The report is written."""
-    saturated: dict[str, tuple[float, str]] = field(default_factory=dict)
-    """Largest share of saturated pixels, and its capture, of each band."""
     removed: dict[str, list[Path]] = field(default_factory=lambda: defaultdict(list))
     """Files of earlier commands that were removed, by reason."""
     panel_ages_s: dict[str, list[float | None]] = field(default_factory=lambda: defaultdict(list))
@@ -132,13 +132,10 @@ class RunTotals:
         output = report.result.output
         if output is not None and output.radiometry is not None:
             self.panel_ages_s[output.radiometry].append(output.panel_age_s)
-        for band in report.result.bands:
-            share = band.saturated or 0.0
-            self.saturated[band.band] = max(self.saturated.get(band.band, (0.0, "")), (share, report.label))
 
     def recount(self, captures: Sequence[Capture], out: Path) -> None:
         """Count only captures that have all their files, and the others as errors: outputs may have been removed."""
-        self.pairs = PairTotals()
+        self.pairs = PairTotals(self.pairs.run)
         for capture in (one for one in captures if one.label in self.written):
             path = CapturePaths.of(capture, out).sidecar
             with suppress(SidecarError):
@@ -195,6 +192,8 @@ def run(
         try:
             for report in run_flight(flight, out, settings, options, listener, model):
                 terminal.check()
+                if not totals.written:  # panels and models are written before the first result
+                    totals.pairs.run = RunFacts.of(out)
                 totals.add(report)
                 show(0.0, report.label)
                 _print_report(report, terminal, totals.states.total(), len(flight.captures))
@@ -328,11 +327,6 @@ def _print_pair(capture: str, band: BandResult, terminal: Terminal) -> None:
 def conclude(totals: RunTotals, out: Path, terminal: Terminal) -> int:
     """Print the table of bands and the failures; return the exit code."""
     _print_totals(totals, terminal)
-    max_saturated_share = 0.005  # sun glint and roofs saturate fewer pixels of most captures
-    high = [(name, *one) for name, one in totals.saturated.items() if one[0] > max_saturated_share]
-    if high:
-        shares = ", ".join(f"{name} up to {share:.1%} ({label})" for name, share, label in high)
-        terminal.result(f"Saturated pixels: {shares}")
     for reason, paths in totals.removed.items():
         terminal.problem(f"{counted(len(paths), 'file')} of an earlier command removed, such as {paths[0]}: {reason}")
     record = read_run_record(out)
@@ -362,17 +356,10 @@ def _print_totals(totals: RunTotals, terminal: Terminal) -> None:
     if lost:
         of_all = f"{lost} of {counted(lost + len(written), 'capture')}"
         terminal.problem(f"{of_all} could not be written, for the reasons above; the same command tries again")
-    # Under a clear sky with the sun above 40 degrees, the irradiance changes by up to 10 % in half an hour.
-    max_panel_age_s = 30 * 60.0
     for quantity, ages_s in totals.panel_ages_s.items():
         age_s = max((one for one in ages_s if one is not None), default=None)
         age = "" if age_s is None else f", at most {age_s / 60:.0f} min from a panel"
         terminal.result(f"Written as {quantity}: {counted(len(ages_s), 'capture')}{age}")
-        if age_s is not None and age_s > max_panel_age_s and "light sensor" not in quantity:
-            terminal.problem(
-                f"{quantity}: the light may have changed in {age_s / 60:.0f} min; record a panel before and after each "
-                "flight, or use a light sensor (--radiometry sun)"
-            )
 
 
 def _print_table(pairs: PairTotals, title: str, terminal: Terminal) -> None:

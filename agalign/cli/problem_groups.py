@@ -1,4 +1,4 @@
-"""The groups of failed bands in the terminal. The module imports nothing that the alignment needs, so that
+"""What to check in the results of a run, in the terminal. The module imports nothing that the alignment needs, so that
 `agalign report` takes half the memory.
 """
 
@@ -9,21 +9,27 @@ from agalign.values.text import counted
 
 if TYPE_CHECKING:
     from agalign.cli.terminal import Terminal
-    from agalign.products.report.facts import FailureGroup
+    from agalign.products.report.facts import CautionGroup
 
 
-def explain(failures: "Sequence[FailureGroup]", terminal: "Terminal") -> None:
-    """Print each group of failures: number of bands, cause, captures, and remedy."""
+def explain(groups: "Sequence[CautionGroup]", terminal: "Terminal") -> None:
+    """Print what to check, the largest effect first: number of bands, cause, size, captures, and remedy."""
     max_named = 3
-    for group in failures:
+    if groups:
+        terminal.event("check", "Check these, the largest effect first:", causes=len(groups))
+    for group in groups:
         status, first = group.status.replace("_", " "), group.bands[0]
         if len(group.bands) == 1:
-            text, named = f"{first.capture} {first.band}: {status}: {first.reason}", []
+            name = f"{first.capture} {first.band}".rstrip()
+            text, named = f"{name}: {status}: {first.reason}", []
         else:
             bands, captures = counted(len(group.bands), "band"), counted(group.captures, "capture")
-            text = f"{status}: {bands} of {captures}: {group.remedy.cause}"
-            names = [f"{b.capture} {b.band}" for b in group.bands]
+            what = captures if group.status == "no_result" else f"{bands} of {captures}"
+            size = f" ({group.size})" if group.size else ""
+            text = f"{status}: {what}: {group.remedy.cause}{size}"
+            names = [f"{b.capture} {b.band}".rstrip() for b in group.bands]
             more = f" and {len(names) - max_named} more" if len(names) > max_named else ""
             named = [f"{', '.join(names[:max_named])}{more}: {first.reason}"]
-        counts = {"bands": len(group.bands), "captures": group.captures}
-        terminal.problem(text, (*named, f"try: {group.advice}"), status=group.status, **counts, advice=group.advice)
+        facts = {"bands": len(group.bands), "captures": group.captures, "advice": group.advice}
+        facts |= {"cause": group.remedy.cause, "size": group.size, "effect": round(group.effect, 4)}
+        terminal.problem(text, (*named, f"try: {group.advice}"), status=group.status, **facts)

@@ -12,6 +12,7 @@ import typer
 from agalign.cli.command import Command, Given
 from agalign.cli.terminal import MAX_LISTED, RAW_NUMBERS, ExitCode, Terminal
 from agalign.values.choices import ExportProgram
+from agalign.values.text import counted
 
 if TYPE_CHECKING:
     from agalign.products.indices.formulas import Index
@@ -45,7 +46,7 @@ def _report(terminal: Terminal, out: Annotated[Path, typer.Argument()], as_json:
         for line in facts.json_lines():
             typer.echo(line)
     else:
-        explain(facts.pairs.groups(), terminal)
+        explain(facts.groups(), terminal)
         slowest = heapq.nlargest(5, facts.seconds.items(), key=itemgetter(1))
         terminal.table(("Slowest", "Seconds"), [(label, f"{seconds:.1f}") for label, seconds in slowest])
         for name in (REPORT_FILE, SUMMARY_FILE):
@@ -58,10 +59,12 @@ def _print_unfinished(out: Path, labels: Collection[str], terminal: Terminal) ->
     there is such.
     """
     from agalign.errors import SidecarError
-    from agalign.products.run.record import unfinished_of
+    from agalign.products.run.excluded import read_excluded
+    from agalign.products.run.record import read_run_record, unfinished_run
 
     try:
-        unfinished = unfinished_of(out, labels)
+        panels, sky = read_excluded(out)
+        unfinished = unfinished_run(read_run_record(out), (*panels, *sky), labels)
     except SidecarError as error:
         terminal.problem(str(error))
         return True
@@ -214,6 +217,10 @@ def _conclude(
         if masked := sorted({r.capture for r in written if r.statistics.masked_share > 1 / 3}):
             more = f" and {len(masked) - 1} more captures" if masked[1:] else ""
             terminal.problem(f"--mask-qa leaves out more than a third of {masked[0]}{more}: look at the .qa.tif")
+        if doubtful := [r for r in written if r.problem]:
+            first = f"{doubtful[0].capture} {doubtful[0].index}: {doubtful[0].problem}"
+            rasters = counted(len(doubtful), "raster")
+            terminal.problem(f"{rasters} with bands to check (column problem of {INDICES_FILE}), such as {first}")
         if not unwritten:
             terminal.result(f"Statistics: {folder / INDICES_FILE}")
     is_complete = len(written) == len(reports) and not unwritten
@@ -242,7 +249,7 @@ def _chosen_indices(names: str | None, formulas: Sequence[str]) -> "list[Index]"
 
 
 def _print(report: "IndexReport", terminal: Terminal) -> None:
-    if report.problem:
+    if report.path is None:
         terminal.problem(f"{report.capture}: {report.problem}", capture=report.capture, index=report.index)
         return
     kept = ", kept" if report.kept else ""

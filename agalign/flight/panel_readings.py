@@ -19,7 +19,7 @@ from agalign.values.pixel_units import PixelScale
 
 Albedos = Mapping[str, float]
 """Reflectance of the panel as the user gives it, by band in lower case; the empty name is the default."""
-_MAX_TIME_DIFFERENCE_S = 6 * 3600.0
+MAX_TIME_DIFFERENCE_S = 6 * 3600.0
 """A panel does not represent the illumination many hours later."""
 _MIN_HEIGHT_M = 3.0
 """Lower heights are within the error of the altitudes."""
@@ -200,7 +200,7 @@ def _within_hours(readings: Iterable[PanelReading], capture: Capture) -> list[tu
     """Return (seconds after a capture, reading) of the panels close to it in time; none if its time is unknown."""
     time_s = math.nan if capture.time_s is None else capture.time_s
     timed = [(panel_time_s - time_s, r) for r in readings if (panel_time_s := r.capture.time_s) is not None]
-    return [(later_s, r) for later_s, r in timed if abs(later_s) <= _MAX_TIME_DIFFERENCE_S]
+    return [(later_s, r) for later_s, r in timed if abs(later_s) <= MAX_TIME_DIFFERENCE_S]
 
 
 def _interpolated(samples: list[tuple[float, float]]) -> float:

@@ -79,6 +79,19 @@ def read_rig(path: Path) -> tuple[FlightCamera | None, Rig | None]:
         raise InputError(f"{path}: its rig cannot be read ({reason})") from None
 
 
+def model_fingerprint(path: Path) -> str:
+    """Return the fingerprint of a model file: a hash of the captures and settings from which it was learned. Raises
+    InputError.
+    """
+    try:
+        open_regular(path).close()
+        with safe_open(path, framework="np") as file:
+            return str((file.metadata() or {})["fingerprint"])
+    except Exception as error:  # damaged files raise errors of many classes
+        reason = next(iter(str(error).splitlines()), type(error).__name__)
+        raise InputError(f"{path}: cannot be read as a model ({reason})") from None
+
+
 def _bounded(text: str) -> float:
     number = float(text)
     if not abs(number) <= _MAX_NUMBER:  # also for NaN

@@ -120,7 +120,7 @@ def opened(browser: Any, out: Path, label: str = "", width: int = 1400, **option
 
 
 def test_what_failed_is_shown_first_in_words_and_in_numbers(page: Any) -> None:
-    assert page.locator("section h2").first.inner_text() == "Problems"
+    assert page.locator("section h2").first.inner_text() == "Check these"
     assert "IMG_0002" in page.locator("#capture-title").inner_text()
     assert page.locator(".short").count() >= 2
     assert "Remedy" in page.locator(".short p").first.inner_text()

@@ -260,8 +260,9 @@ def test_the_age_of_a_panel_is_printed_and_warned_of(
     conclude(totals, Path("out"), Terminal())
     printed = capsys.readouterr()
     assert f"Written as {radiometry}: {text}" in printed.out.splitlines()
-    assert "Saturated" not in printed.out
-    is_warned = "the light may have changed in 53 min; record a panel before and after" in printed.err
+    assert "saturated" not in printed.err
+    text = "check: 2 bands of 1 capture: the light may have changed since the nearest calibration panel (up to 53 min)"
+    is_warned = text in printed.err and "try: record a panel before and after each flight" in printed.err
     assert is_warned == (radiometry == "reflectance by panel" and age_s == 3180.0)
 
 
@@ -281,7 +282,7 @@ def test_the_totals_count_missing_bands_and_captures_without_a_result(capsys: py
     reference = "IMG_1 Blue: other reference: on the grid of Blue; most captures of the flight are on that of Green"
     assert reference in printed.err
     assert "1 of 3 captures could not be written" in printed.err
-    assert "Saturated pixels: NIR up to 3.1% (IMG_0)" in printed.out
+    assert "IMG_0 NIR: check: 3.1% of the pixels are saturated" in printed.err
 
 
 @pytest.mark.skipif(os.name == "nt", reason="signals are POSIX")

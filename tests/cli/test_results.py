@@ -7,7 +7,8 @@ from pathlib import Path
 import pytest
 
 import agalign
-from agalign.products.run.record import read_run_record, unfinished_of
+from agalign.products.run.excluded import read_excluded
+from agalign.products.run.record import read_run_record, unfinished_run
 from agalign.products.sidecar.file import find_sidecars, read_sidecar, write_sidecar
 
 from ..conftest import Shared, seeded
@@ -66,7 +67,8 @@ def test_captures_of_panels_and_of_the_sky_need_no_result(out: Path) -> None:
     identity = {"folder": "0000SET/000", "captured_at": "", "cues": ["a"]}
     sky = [{**identity, "capture": "IMG_0002", "bands": []}]
     (out / "sky.json").write_text(json.dumps({"schema": "agalign-sky/1", "captures": sky}))
-    unfinished = unfinished_of(out, {FIRST})
+    panels, sky = read_excluded(out)
+    unfinished = unfinished_run(read_run_record(out), (*panels, *sky), {FIRST})
     assert (unfinished.found, unfinished.missing, unfinished.sentence) == (1, [], "")
 
 

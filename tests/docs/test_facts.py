@@ -12,6 +12,7 @@ import tomllib
 from collections import Counter
 from collections.abc import Iterator
 from functools import cache
+from itertools import chain
 from pathlib import Path
 
 import pytest
@@ -118,7 +119,7 @@ def calls(module: str, function: str) -> Iterator[ast.Call]:
 
 def test_events_of_a_run_and_their_fields() -> None:
     fields: dict[str, set[str]] = {}
-    for call in calls("cli/align_run.py", "event"):
+    for call in chain(calls("cli/align_run.py", "event"), calls("cli/problem_groups.py", "event")):
         if isinstance(call.args[0], ast.Constant):
             names = {k.arg for k in call.keywords if k.arg is not None}
             fields.setdefault(str(call.args[0].value), set()).update(names)
@@ -164,7 +165,7 @@ LIMITS = {
         f"The largest parallax is {dense._SEARCH_NEARER:.0%} of".replace("%", " %"),
         f"and {dense._SEARCH_FARTHER:.0%} behind it".replace("%", " %"),
     ),
-    "radiometry.md": (f"calibration panels at most {panel_readings._MAX_TIME_DIFFERENCE_S / 3600:g} hours away",),
+    "radiometry.md": (f"calibration panels at most {panel_readings.MAX_TIME_DIFFERENCE_S / 3600:g} hours away",),
     "reliability.md": (f"{raster._MAX_BANDS} bands per file",),
 }
 """{page: sentences with a limit of the program}."""

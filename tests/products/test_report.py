@@ -94,10 +94,18 @@ def test_headline_and_summary_count_what_was_to_be_aligned(out: Path) -> None:
     assert headline(out).startswith("8 of 8 band pairs are aligned. 1 file or capture took no part. The median")
     change(record, problems=[{"of": "0000SET/000/IMG_0002", "problem": "IMG_0002.png: cannot be written"}])
     assert headline(out).startswith("8 of 8 band pairs are aligned. 1 output was not written. The median")
-    change(record, problems=[], state="interrupted", captures={"found": 4, "done": 2})
+    labels = [f"0000SET/000/IMG_000{number}" for number in (1, 2, 3, 4)]
+    change(record, problems=[], state="interrupted", labels=labels)
     assert headline(out).startswith("8 of 8 band pairs are aligned.")
-    assert "stopped before its end, 2 of 4 captures were not tried: the same command resumes it" in headline(out)
-    change(record, state="finished", captures={"found": 2, "done": 2})
+    without = f"2 of 4 captures have no result: {labels[2]}, {labels[3]}; the same command resumes it."
+    assert f"The run was stopped before its end; {without}" in headline(out)
+    assert [(r["capture"], r["status"]) for r in table_in(out / "summary.csv")[8:]] == [
+        ("IMG_0003", "no_result"),
+        ("IMG_0004", "no_result"),
+    ]
+    change(record, state="running")
+    assert f"The run did not end: it was killed, or is still running; {without}" in headline(out)
+    change(record, state="finished", labels=labels[:2])
     change(sidecar, status="degraded", missing_bands=["Thermal", "Pan"])
     assert headline(out).startswith("8 of 10 band pairs are aligned, 2 are missing. The median")
     rows = table_in(out / "summary.csv")
@@ -351,7 +359,9 @@ def capture(*bands: tuple[str, str, str | None], missing: tuple[str, ...] = (), 
     parts = []
     for name, status, kind in bands:
         issues = [] if kind is None else [{"kind": kind, "value": None, "limit": None}]
-        parts.append(NIR | {"band": name, "status": status, "reason": kind, "issues": issues})
+        prediction = {"fixed_to_moving": np.eye(3).tolist(), "from": "bands", "std_px": 0.1}
+        facts = {"band": name, "status": status, "reason": kind, "issues": issues}
+        parts.append(NIR | facts | {"prediction": prediction if status == "predicted" else None})
     return example(bands=parts, missing_bands=missing, **changes)
 
 
@@ -370,6 +380,7 @@ def test_bands_are_grouped_by_cause_and_status_most_severe_first() -> None:
     assert groups[-1].advice.startswith(
         "indices use those with a standard error (prediction.std_px) within --accept-predicted"
     )
+    assert groups[-1].size == "standard error up to 0.10 px"
     assert "card" in groups[0].advice
     assert result.statuses == {"aligned": 1, "predicted": 2, "failed": 1, "missing": 1, "seed_only": 2}
     assert {name: dict(band.statuses) for name, band in result.bands.items()} == {

@@ -34,6 +34,7 @@ from agalign.products.rasters.geotiff import (
 )
 from agalign.products.report.drawing import with_text, write_png
 from agalign.products.run.captures import RAW, AlignedBand, BandReader
+from agalign.products.run.cautions import RunFacts
 from agalign.products.sidecar.schema import Sidecar
 from agalign.values.capture import Band, Capture
 from agalign.values.files import read_regular, write_csv
@@ -83,6 +84,7 @@ class IndexReport:
     """The raster; None if it could not be written."""
     statistics: IndexStatistics = IndexStatistics()
     problem: str = ""
+    """Why it could not be written; of a written raster, what to check in its bands."""
     kept: bool = field(default=False, compare=False)
     """True if an earlier command wrote the raster from the same bands with the same formula."""
     captured_at: str = ""
@@ -441,17 +443,32 @@ def _coloured(values: NDArray[Any], span: tuple[float, float], ramp: NDArray[np.
     return np.asarray(result.round(), np.uint8)
 
 
-def reports_of(sidecar: Sidecar, folder: str, out: Path) -> list[IndexReport]:
+def to_check(index: Index | None, sidecar: Sidecar, run: RunFacts) -> str:
+    """Return what to check in the bands of an index of a capture, given its run; empty if there is nothing, or if the
+    formula is unknown.
+    """
+    if index is None:
+        return ""
+    with suppress(InputError):  # other bands than those of the sidecar
+        names = [b.band for b in sidecar.bands]
+        used = {names[i] for i in bands_for(index, names, [b.wavelength_nm for b in sidecar.bands])}
+        return "; ".join(f"{c.band}: {c.reason}" for c in run.cautions(sidecar) if c.band in used)
+    return ""
+
+
+def reports_of(sidecar: Sidecar, folder: str, out: Path, run: RunFacts) -> list[IndexReport]:
     """Return the indices of a capture that its sidecar lists, from the tags of the rasters."""
     result = []
     for part in sidecar.products:
         path = out / folder / part.file
         if part.kind == "index" and path.suffix == ".tif":
             name = path.stem.removeprefix(f"{Path(sidecar.capture).name}_")
-            statistics = _statistics_in(tags_of(path))
+            tags = tags_of(path)
+            statistics = _statistics_in(tags)
             if statistics is not None:
                 label = Path(folder, sidecar.capture).as_posix()
-                result.append(IndexReport(label, name, path, statistics).of(sidecar))
+                problem = to_check(_index_of(tags) if "INDEX" in tags else None, sidecar, run)
+                result.append(IndexReport(label, name, path, statistics, problem).of(sidecar))
     return result
 
 

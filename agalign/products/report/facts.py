@@ -4,20 +4,20 @@ import json
 import math
 from collections import Counter, defaultdict
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 from urllib.parse import quote
 
 import numpy as np
 
 from agalign.products.indices.rasters import IndexReport
 from agalign.products.report.data_files import DataParts
-from agalign.products.run.record import RefusalPart
+from agalign.products.run.cautions import NO_RESULT, Caution, RunFacts
 from agalign.products.sidecar.schema import BandResult, GeometryPart, GridPart, OutputPart, Sidecar
 from agalign.values.alignment import Prediction
 from agalign.values.files import CsvTable
-from agalign.values.issues import MISSING_BAND, MOSAICS, OTHER_REFERENCE, UNREADABLE, Remedy
+from agalign.values.issues import MISSING_BAND, OTHER_REFERENCE, Remedy
 
 _SHIFT_STEP_PX = 0.01
 """Shifts of windows are written as integer multiples of this."""
@@ -44,16 +44,42 @@ BAND_COLUMNS = {
 }
 """Field of a band in the sidecar by column of OUT/summary.csv."""
 SUMMARY_FILE = "summary.csv"
-SUMMARY_COLUMNS = ("folder", "capture", *BAND_COLUMNS, "reference")
+SUMMARY_COLUMNS = ("folder", "capture", *BAND_COLUMNS, "reference", "check")
 
 
-@dataclass(frozen=True)
-class FailureGroup:
-    """The bands of a run with the same status and the same cause."""
+class BandToCheck(NamedTuple):
+    """A band of a capture, and why to check it."""
+
+    capture: str
+    band: str
+    """Empty for the whole capture."""
+    status: str
+    reason: str
+
+
+@dataclass
+class CautionGroup:
+    """The bands of a run with the same status and the same cause for a check."""
 
     status: str
     remedy: Remedy
-    bands: list[RefusalPart]
+    effect: float = 0.0
+    """Share of the values of all bands of the run that are missing, displaced or wrong, by `Caution.lost`."""
+    bands: list[BandToCheck] = field(default_factory=list)
+    _largest: float = -math.inf
+    _size_text: str = ""
+
+    def add(self, label: str, caution: Caution) -> None:
+        """Add a band of a capture."""
+        self.bands.append(BandToCheck(label, caution.band, self.status, caution.reason))
+        self.effect += caution.lost
+        if caution.size > self._largest:
+            self._largest, self._size_text = caution.size, caution.size_text
+
+    @property
+    def size(self) -> str:
+        """How large it is, in words; empty if it has no size."""
+        return self._size_text.format(self._largest)
 
     @property
     def advice(self) -> str:
@@ -85,32 +111,39 @@ class BandTotals:
 
 @dataclass
 class PairTotals:
-    """The band pairs of a run. Captures are added one by one, and not kept, which limits memory."""
+    """The band pairs of a run, and what to check in them. Captures are added one by one, and not kept, which limits
+    memory.
+    """
 
+    run: RunFacts = field(default_factory=RunFacts)
     bands: dict[str, BandTotals] = field(default_factory=lambda: defaultdict(BandTotals))
-    _by_cause: dict[tuple[str, Remedy], list[RefusalPart]] = field(default_factory=lambda: defaultdict(list))
+    _by_cause: dict[tuple[str, Remedy], CautionGroup] = field(default_factory=dict)
     _references: list[tuple[str, tuple[str, ...], str, set[str]]] = field(default_factory=list)
     """(capture, flight, reference band, its other bands with the missing ones)."""
     _votes: dict[tuple[str, ...], Counter[str]] = field(default_factory=lambda: defaultdict(Counter))
     """By flight, the number of captures that have a band as the reference, or lack it."""
 
-    def add(self, label: str, result: Sidecar) -> None:
-        """Add the bands of a capture."""
-        parts, is_mosaic = {b.band: b for b in result.bands}, result.reference.georeferenced
-        for name, status, reason in result.pairs:
+    def add(self, label: str, result: Sidecar) -> list[Caution]:
+        """Add the bands of a capture, and return the cautions about them."""
+        parts = {b.band: b for b in result.bands}
+        for name, status, _ in result.pairs:
             band, part = self.bands[name], parts.get(name)
             band.statuses[status] += 1
             band.seconds += [] if part is None else [part.seconds]
-            if status != "aligned":
-                refusal = RefusalPart(capture=label, band=name, status=status, reason=reason or "")
-                remedy = MISSING_BAND if part is None else _remedy_of(part, is_mosaic=is_mosaic)
-                self._by_cause[status, remedy].append(refusal)
-            elif part and part.metrics and math.isfinite(part.metrics.after.residual_px):
+            if status == "aligned" and part and part.metrics and math.isfinite(part.metrics.after.residual_px):
                 band.residuals_px.append(part.metrics.after.residual_px)
+        cautions = list(self.run.cautions(result))
+        for caution in cautions:
+            self._add_caution(label, caution)
         camera, reference = result.camera, result.reference.band
         flight = (camera.name, camera.serial, result.flight_id, "" if camera.model else Path(label).parent.as_posix())
         self._references.append((label, flight, reference, {name for name, _, _ in result.pairs}))
         self._votes[flight].update((reference, *result.missing_bands))
+        return cautions
+
+    def _add_caution(self, label: str, caution: Caution) -> None:
+        cause = caution.status, caution.remedy
+        self._by_cause.setdefault(cause, CautionGroup(*cause)).add(label, caution)
 
     @property
     def statuses(self) -> Counter[str]:
@@ -126,29 +159,28 @@ class PairTotals:
         """Return the residuals of all aligned pairs, sorted."""
         return sorted(px for band in self.bands.values() for px in band.residuals_px)
 
-    def groups(self) -> list[FailureGroup]:
-        """Return the failures by cause, and the captures with another reference than most of their flight; the most
-        severe first, and the largest first of those.
+    def groups(self, without_result: Sequence[str] = ()) -> list[CautionGroup]:
+        """Return what to check, by cause, the largest effect first: the cautions about bands, the captures with another
+        reference than most of their flight, and those without a result, given by label.
         """
-        groups = [FailureGroup(*cause, bands) for cause, bands in self._by_cause.items()]
-        exceptions = []
+        groups = [replace(group) for group in self._by_cause.values()]
+        pairs = self.statuses.total()
+        pairs_per_capture = pairs / max(1, len(self._references))
+        other = CautionGroup("other_reference", OTHER_REFERENCE)
         for label, flight, band, others in self._references:
             usual = self._votes[flight].most_common(1)[0][0]
             if usual in others:
                 reason = f"on the grid of {band}; most captures of the flight are on that of {usual}"
-                exceptions.append(RefusalPart(capture=label, band=band, status="other_reference", reason=reason))
-        if exceptions:
-            groups.append(FailureGroup("other_reference", OTHER_REFERENCE, exceptions))
-        severity = "failed", "seed_only", "missing", "other_reference", "predicted"
-        return sorted(groups, key=lambda g: (severity.index(g.status), -len(g.bands), g.remedy.cause))
-
-
-def _remedy_of(band: BandResult, *, is_mosaic: bool) -> Remedy:
-    """The remedy of the first issue, which is the one in `reason`."""
-    if not band.issues:
-        return Remedy("no reason was recorded", "run again with --overwrite")
-    kind = band.issues[0].kind
-    return MOSAICS if is_mosaic and kind is not UNREADABLE else kind.remedy
+                # Each of its values is at another place than in other captures.
+                other.add(label, Caution(band, other.status, OTHER_REFERENCE, reason, pairs_per_capture))
+        lost = CautionGroup("no_result", NO_RESULT)
+        for label in without_result:
+            lost.add(label, Caution("", lost.status, NO_RESULT, NO_RESULT.cause, max(1.0, pairs_per_capture)))
+        groups += [group for group in (other, lost) if group.bands]
+        for group in groups:
+            group.effect /= max(1.0, pairs + max(1.0, pairs_per_capture) * len(without_result))
+        severity = "no_result", "failed", "seed_only", "missing", "other_reference", "predicted", "check"
+        return sorted(groups, key=lambda g: (-g.effect, severity.index(g.status), -len(g.bands), g.remedy.cause))
 
 
 _DETAILS_PER_PART = 50
@@ -174,7 +206,7 @@ class FlightFacts:
 
     def __init__(self, out: Path) -> None:
         self.out = out
-        self.pairs = PairTotals()
+        self.pairs = PairTotals(RunFacts.of(out))
         self.statuses: Counter[str] = Counter()
         """Number of captures by status."""
         self.cameras: dict[str, CameraOffsets] = {}
@@ -183,6 +215,8 @@ class FlightFacts:
         """Processing time of each capture, by label."""
         self.placed = 0
         """Number of captures with a position."""
+        self.without_result: Sequence[str] = ()
+        """Labels of the captures of the run that have no sidecar."""
         self._summary = CsvTable(SUMMARY_COLUMNS)
         self._rows = DataParts(out, "rows", _ROWS_PER_PART)
         self._details = DataParts(out, "details", _DETAILS_PER_PART)
@@ -194,7 +228,9 @@ class FlightFacts:
     def add(self, folder: str, sidecar: Sidecar, indices: Sequence[IndexReport] = ()) -> None:
         """Add a capture, given its folder relative to the output folder, and its indices. Raises OutputError."""
         label = Path(folder, sidecar.capture).as_posix()
-        self.pairs.add(label, sidecar)
+        checks: dict[str, list[str]] = defaultdict(list)
+        for caution in self.pairs.add(label, sidecar):
+            checks[caution.band].append(caution.reason)
         output, position, path = sidecar.output, sidecar.position, Path(folder)
         grid = output or OutputPart(file=None, crop=(0, 0, *sidecar.reference.size_px), nodata=None)
         files = {part.kind: part.file for part in sidecar.products}
@@ -223,10 +259,10 @@ class FlightFacts:
             "sidecar": _link(path, f"{sidecar.capture}.json"),
             "picture": _link(path, files.get("picture")),
             "preview": preview,
-            "bands": [self._pair(b, sidecar, keys) for b in sidecar.bands],
+            "bands": [self._pair(b, sidecar, keys, checks[b.band]) for b in sidecar.bands],
             "indices": [self._index(row) for row in indices if row.path is not None],
         }
-        missing = keys | {"status": "missing", "reason": MISSING_BAND.cause}
+        missing = keys | {"status": "missing", "reason": MISSING_BAND.cause, "check": MISSING_BAND.cause}
         for name in sidecar.missing_bands:
             self.add_row(missing | {"band": name})
         self._count(facts)
@@ -275,6 +311,17 @@ class FlightFacts:
         """Write OUT/summary.csv. Raises OutputError."""
         self._summary.write(self.out / SUMMARY_FILE)
 
+    def add_without_result(self, labels: Sequence[str]) -> None:
+        """Add the captures of the run that have no sidecar."""
+        self.without_result = labels
+        facts = {"status": "no_result", "reason": NO_RESULT.cause, "check": NO_RESULT.cause}
+        for path in map(Path, labels):
+            self.add_row({"folder": path.parent.as_posix(), "capture": path.name, **facts})
+
+    def groups(self) -> list[CautionGroup]:
+        """Return what to check, by cause, the largest effect first."""
+        return self.pairs.groups(self.without_result)
+
     def flush(self) -> None:
         """Write the last parts. Raises OutputError."""
         self._rows.flush()
@@ -312,11 +359,11 @@ class FlightFacts:
                     before = ","
             yield end
 
-    def _pair(self, band: BandResult, sidecar: Sidecar, keys: dict[str, Any]) -> dict[str, Any]:
+    def _pair(self, band: BandResult, sidecar: Sidecar, keys: dict[str, Any], checks: Sequence[str]) -> dict[str, Any]:
         """The data of a band. Its row, with `keys`, and its offset are added unless it is the reference."""
         row = {column: value_at(band, path) for column, path in BAND_COLUMNS.items()}
         if band.status != "reference":
-            self.add_row(keys | row)
+            self.add_row(keys | row | {"check": "; ".join(checks)})
         metrics, windows = band.metrics, None if band.metrics is None else band.metrics.windows
         similarity = {name: (row[f"{name}_before"], row[f"{name}_after"]) for name in _SIMILARITY}
         centres_px = np.empty((0, 2)) if windows is None else windows.centres_px
@@ -338,6 +385,7 @@ class FlightFacts:
             "prediction": _prediction(band.prediction),
             "geometry": _geometry(band.geometry),
             "occluded": value_at(band, "relief.occluded"),
+            "check": [text for text in checks if text != band.reason],
             "lattice": self._first_lattice + self._lattices.setdefault(lattice, len(self._lattices)),
             "shifts": [step if known else None for step, known in zip(steps, is_measured, strict=True)],
         }
@@ -357,6 +405,7 @@ def _row_of(facts: dict[str, Any]) -> dict[str, Any]:
         **largest,
         "indices": {i["name"]: i["median"] for i in facts["indices"]},
         "raw": any(i["raw"] for i in facts["indices"]),
+        "check": bool(facts["missing"]) or any(b["check"] or b["reason"] for b in facts["bands"]),
     }
 
 

@@ -14,7 +14,8 @@
  *   seconds: number, written: boolean, offset_px: [number, number] | null, offset_length_px: number | null,
  *   residual_px: number | null, residual_p95_px: number | null, coverage: number | null, retrieval: number | null,
  *   corner_std_px: number | null, similarity: Record<string, [number | null, number | null]> | null,
- *   prediction: Prediction | null, geometry: Geometry | null, occluded: number | null, lattice: number, shifts: (number | null)[]}} Pair
+ *   prediction: Prediction | null, geometry: Geometry | null, occluded: number | null, check: string[], lattice: number,
+ *   shifts: (number | null)[]}} Pair
  * @typedef {{name: string, median: number | null, p5: number | null, p95: number | null, valid: number, masked: number,
  *   span: [number, number], unit: string, raw: boolean, file: string, picture: string}} Index
  * @typedef {{file: string, tile_px: [number, number], detail_px: [number, number],
@@ -28,7 +29,8 @@
  *   picture: string | null, preview: Preview | null, bands: Pair[], indices: Index[]}} Capture
  * @typedef {{label: string, captured_at: string, camera: string, status: string, position: [number, number] | null,
  *   altitude_m: number | null, missing: string[], seconds: number, stack: string | null, bands: [string, string][],
- *   residual_px: number | null, corner_std_px: number | null, indices: Record<string, number | null>, raw: boolean}} Row
+ *   residual_px: number | null, corner_std_px: number | null, indices: Record<string, number | null>, raw: boolean,
+ *   check: boolean}} Row
  *   The row of a capture in the table, with name and status of each moving band, and the largest errors of aligned ones.
  * @typedef {{from: number, records: Row[]}} Rows
  * @typedef {{from: number, records: Capture[], first_lattice: number, lattices: number[][]}} Details
@@ -280,7 +282,7 @@ function chosen() {
   const sign = table.up ? 1 : -1;
   return captures
     .filter((c) => !text || `${c.label} ${c.captured_at} ${c.camera}`.toLowerCase().includes(text))
-    .filter((c) => only === "all" || only === c.status || (only === "short" && isShort(c)) || (only === "predicted" && c.bands.some(([, status]) => status === "predicted")))
+    .filter((c) => only === "all" || only === c.status || (only === "check" && c.check) || (only === "short" && isShort(c)) || (only === "predicted" && c.bands.some(([, status]) => status === "predicted")))
     .sort((a, b) => {
       const [x, y] = [value(a), value(b)];
       if (x === null || y === null) return Number(x === null) - Number(y === null);
@@ -1102,6 +1104,7 @@ function indexTable(capture) {
 function words(capture) {
   const list = el("ul", { class: "words" });
   for (const pair of moving(capture)) list.append(el("li", {}, el("b", {}, pair.band), ` ${sentence(pair, capture)}`));
+  for (const band of capture.bands.filter((b) => b.check.length)) list.append(el("li", {}, "Check ", el("b", {}, band.band), `: ${band.check.join("; ")}.`));
   for (const name of capture.missing) list.append(el("li", {}, el("b", {}, name), " is missing: other captures of this camera have it."));
   return list;
 }
@@ -1117,7 +1120,7 @@ function sentence(pair, capture) {
     if (left === null) return `${offset}is aligned; no window could measure a residual.`;
     const most = pair.residual_p95_px === null ? "" : `, 95 % ${fixed(pair.residual_p95_px)} px`;
     const seen = pair.occluded === null ? "" : ` The relief of the capture is corrected; ${percent(pair.occluded)} of its image is occluded.`;
-    return `${offset}is aligned: median residual ${fixed(left)} px${most}; the expected error is at most 0.5 px in 90 % of the image, suitable for indices of single plants.${seen}`;
+    return `${offset}is aligned: median residual ${fixed(left)} px${most}; where it has texture, the expected error is at most 0.5 px in 90 % of the image, suitable for indices of single plants.${seen}`;
   }
   if (pair.status === "predicted") {
     const std = pair.prediction?.std_px ?? Infinity;

@@ -23,7 +23,7 @@ from agalign.products.report.data_files import data_files_exist, remove_other_da
 from agalign.products.report.facts import SUMMARY_FILE, FlightFacts
 from agalign.products.run.excluded import PANELS_FILE, SKY_FILE, PanelPart, SkyPart, read_excluded
 from agalign.products.run.flight_map import FlightMap
-from agalign.products.run.record import RunPart, read_run_record
+from agalign.products.run.record import RunPart, read_run_record, unfinished_run
 from agalign.products.sidecar.file import find_sidecars, read_sidecar
 from agalign.values.files import write_text
 
@@ -55,12 +55,11 @@ def write_pages(out: Path, on_problem: Callable[[str], None]) -> FlightFacts:
         except SidecarError as error:
             unreadable.append(str(error))
             continue
-        of_capture = reports_of(sidecar, folder, out)
+        of_capture = reports_of(sidecar, folder, out, facts.pairs.run)
         indices += of_capture
         label = Path(folder, sidecar.capture).as_posix()
         facts.add(folder, sidecar, merged(rows_of.get(label, []), of_capture))
         flight_map.add(folder, sidecar)
-    facts.flush()
     panels: list[PanelPart] = []
     sky: list[SkyPart] = []
     run: RunPart | None = None
@@ -73,6 +72,9 @@ def write_pages(out: Path, on_problem: Callable[[str], None]) -> FlightFacts:
         excluded = {"folder": part.folder, "capture": part.capture, "status": status, "reason": part.sentence}
         for band in part.bands:
             facts.add_row(excluded | {"band": band.band})
+    unfinished = unfinished_run(run, (*panels, *sky), facts.seconds)
+    facts.add_without_result([] if unfinished is None else unfinished.missing)
+    facts.flush()
     facts.write_summary()
     rows = update_table(out, indices, earlier)
     for one in [] if run is None else run.excluded:
@@ -87,6 +89,7 @@ def write_pages(out: Path, on_problem: Callable[[str], None]) -> FlightFacts:
         max_listed=_MAX_LISTED,
         max_excluded=_MAX_EXCLUDED,
         run=run,
+        unfinished="" if unfinished is None else unfinished.sentence,
         settings=_changed_settings(run),
         rigs=rig_views(out, unreadable.append),
         drifts=drifts_of(facts.cameras),

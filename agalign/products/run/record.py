@@ -14,7 +14,7 @@ from agalign._version import __version__
 from agalign.config import Settings
 from agalign.errors import ConfigurationError
 from agalign.flight.groups import CameraOverview, camera_overviews
-from agalign.products.run.excluded import read_excluded
+from agalign.products.run.excluded import PanelPart, SkyPart
 from agalign.products.run.footprint import accuracy_of_footprint_m, footprint
 from agalign.products.sidecar.schema import Sidecar
 from agalign.values.capture import CameraIdentity, Capture, Pose, Position
@@ -225,15 +225,16 @@ class UnfinishedRun:
         return f"{len(self.missing)} of {counted(self.found, 'capture')} {verb} no result: {named}{and_more}"
 
 
-def unfinished_of(out: Path, labels: Collection[str]) -> UnfinishedRun | None:
-    """Return what the last run into a folder did not do, given the labels of the captures that have a result; None
-    without a record. Raises SidecarError for a file of another format.
+def unfinished_run(
+    record: RunPart | None, not_aligned: Iterable[PanelPart | SkyPart], labels: Collection[str]
+) -> UnfinishedRun | None:
+    """Return what the last run into a folder did not do, given its panels and captures of the sky, and the labels of
+    the captures that have a result; None without a record.
     """
-    record, (panels, sky) = read_run_record(out), read_excluded(out)
     if record is None:
         return None
     excluded = {part.capture for part in record.excluded}
     # A killed run has written these files, and not the end of its record.
-    excluded |= {Path(part.folder, part.capture).as_posix() for part in (*panels, *sky) if part.is_left_out}
+    excluded |= {Path(part.folder, part.capture).as_posix() for part in not_aligned if part.is_left_out}
     wanted = [label for label in record.labels if label not in excluded]
     return UnfinishedRun(record.state, len(wanted), [label for label in wanted if label not in labels])

@@ -8,7 +8,7 @@ from agalign.errors import UnreadableFileError
 from agalign.flight.fingerprint import render_fingerprint
 from agalign.products.product import ProductContext
 from agalign.products.rasters.aligned_files import BandFiles, Stack
-from agalign.products.rasters.alignment_maps import ReliefMap
+from agalign.products.rasters.alignment_maps import ReliefMap, share_over_1_px
 from agalign.products.run.footprint import accuracy_of_footprint_m, footprint, with_assumed_height
 from agalign.products.sidecar.schema import FilePart, IlluminationPart, OutputPart, PlacePart, Sidecar
 
@@ -28,9 +28,12 @@ def rendered(context: ProductContext, not_written: Sequence[str] = (), seconds: 
     relief = next((context.paths.relative(f.path) for f in context.written if f.kind == ReliefMap.kind), None)
     bands = []
     for band in sidecar.bands:
-        facts: dict[str, Any] = {"place": None, "saturated": saturated.get(band.band)}
+        facts: dict[str, Any] = {"place": None, "saturated": saturated.get(band.band), "share_over_1_px": None}
         if (place := places.get(band.band)) is not None:  # None if all pixels are nodata
             facts["place"] = PlacePart(file=context.paths.relative(place[0].path), band_index=place[1])
+            if band.band in context.with_pixels:
+                alignment = context.with_pixels[band.band]
+                facts["share_over_1_px"] = share_over_1_px(alignment, capture.reference, context.grid)
         if band.relief is not None:
             facts["relief"] = band.relief.model_copy(update={"file": relief})
         bands.append(band.model_copy(update=facts))

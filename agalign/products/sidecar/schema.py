@@ -233,6 +233,10 @@ class BandResult(_Part):
     """Where the aligned pixels of the band are."""
     saturated: Number4 | None = None
     """Share of saturated pixels in the file."""
+    share_over_1_px: Number4 | None = None
+    """Share of the written pixels that may be displaced by more than 1 px of the reference: their expected error is
+    larger, or unknown; null if none were written, and in older sidecars.
+    """
     seconds: Number3
     """Share of the capture's processing time, equal for all its bands."""
 
@@ -459,6 +463,8 @@ class Sidecar(_Part):
     estimated_with: str
     """Fingerprint of the input, options and version that the estimation depends on; a run with the same one keeps it.
     """
+    model: str = ""
+    """Fingerprint of the model of the flight that was used; empty without one, and in older sidecars."""
     output: OutputPart | None = None
     """Written rasters; null if all moving bands are `failed`, and until rasters are written."""
     footprint: list[tuple[Number, Number]] | None = None
@@ -491,6 +497,7 @@ class Sidecar(_Part):
         settings: Settings,
         parallax: FilePart | None = None,
         seconds: float = 0.0,
+        model: str = "",
     ) -> Self:
         """Return the sidecar of a capture whose bands are aligned, and nothing is rendered."""
         reference, accept_predicted_px = capture.reference, settings.check.accept_predicted_px
@@ -524,6 +531,7 @@ class Sidecar(_Part):
             parallax=parallax,
             accept_predicted_px=accept_predicted_px,
             estimated_with=estimation_fingerprint(capture, settings),
+            model=model,
             options=settings.model_dump(mode="json", exclude_defaults=True),
             input_samples=input_samples(capture),
             seconds=seconds,
