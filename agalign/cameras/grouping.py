@@ -286,6 +286,14 @@ def _tags_of(reference: Band, files: Sequence[ImageFile]) -> Tags:
     return replace(tags, xmp={k: v for f in reversed(files) for k, v in f.tags.xmp.items()} | dict(tags.xmp))
 
 
+def companion_advice(path: Path) -> str:
+    """Return what to do about a file that is the only band of its capture."""
+    capture, _, band = path.stem.rpartition("_")
+    if capture and band:
+        return f"copy the other files of {capture} from the card, or give --pattern"
+    return "name files '<capture>_<band>.tif' or give --pattern"
+
+
 def _bands_to_align(files: Sequence[ImageFile], names: Sequence[str]) -> list[Band]:
     """The bands with these names, ignoring case, or all. Raises InputError if there is nothing to align."""
     first = files[0]
@@ -294,7 +302,7 @@ def _bands_to_align(files: Sequence[ImageFile], names: Sequence[str]) -> list[Ba
     if len(bands) < 2 and names:
         raise InputError(f"{first.path}: of this capture, --bands leaves {listed(bands) or 'nothing'}")
     if len(bands) < 2:
-        raise InputError(f"{first.path}: a band with no companion; name files '<capture>_<band>.tif' or give --pattern")
+        raise InputError(f"{first.path}: a band with no companion; {companion_advice(first.path)}")
     if len(files) == 1 and first.bands[0].one_lens:
         raise InputError(f"{first.path}: its bands come through one lens; there is nothing to align")
     return bands

@@ -44,8 +44,8 @@ UNLIKE = Remedy(
 )
 MOSAICS = Remedy(
     "the mosaics differ by more than a pixel of REFERENCE, or show too little in common",
-    "resample both mosaics to the pixel size that you need (gdalwarp -r average -tr 0.1 0.1); compare a band in which "
-    "the field changed little (--reference)",
+    "resample both mosaics to larger pixels, of the size that you need (gdalwarp -r average -tr SIZE SIZE); compare a "
+    "band in which the field changed little (--reference)",
 )
 """For georeferenced rasters instead of remedies that concern cameras and flights."""
 MISSING_BAND = Remedy("a band is missing that other captures of this camera have", "copy the files from the card again")
@@ -139,6 +139,11 @@ REPEATS = IssueKind(
     ),
 )
 
+CONTRADICTED = frozenset(
+    kind.remedy
+    for kind in (FOLDS, COVERAGE, CLOSE_WINDOWS, CLUSTER, INACCURATE, UNEXPECTED_PX, OTHER_CONTENT, OTHER_GEOMETRY)
+)
+"""Remedies for a band with another view of the scene, which bands have that were exposed at other times."""
 
 KINDS: Mapping[str, IssueKind] = {
     kind.code: kind

@@ -140,7 +140,7 @@ def test_a_folder_without_captures_is_described(tmp_path: Path) -> None:
     assert "2 .raw files: not an image that agalign reads" in said
     assert "1 .txt file: not" in said
     assert "1 .jpg file: a colour photograph" in said
-    assert "1 .tif file: a band with no companion" in said
+    assert "1 .tif file: a band with no companion; copy the other files of single from the card" in said
     assert "agalign info" not in done.stderr
 
 

@@ -1,6 +1,7 @@
 """What to check before the results of a run are used: one list, which report, tables, console and log print."""
 
 import json
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -8,6 +9,7 @@ import numpy as np
 import pytest
 from synthetic_flights.aligned import make_aligned
 
+from agalign.cameras.discover import discover
 from agalign.cli.problem_groups import explain
 from agalign.cli.terminal import Terminal
 from agalign.flight.rig_file import model_fingerprint
@@ -17,7 +19,7 @@ from agalign.products.report.pages import write_pages
 from agalign.products.run.cautions import BLURRED, Caution, RunFacts
 from agalign.products.run.excluded import PanelPart
 from agalign.products.sidecar.file import read_sidecar, write_sidecar
-from agalign.products.sidecar.schema import Sidecar
+from agalign.products.sidecar.schema import Sidecar, _exposed_after_s
 from agalign.values.alignment import Alignment, Residual, Seed
 from agalign.values.capture import Band
 from agalign.values.image import OutputGrid
@@ -110,6 +112,22 @@ def test_a_predicted_band_has_other_advice_than_a_failed_one() -> None:
     assert caution.remedy == BLURRED
     (caution,) = cautions(band | {"status": "failed"})
     assert caution.remedy == TEXTURELESS
+
+
+@pytest.mark.parametrize(("apart_s", "advice"), [(30.0, "look at the times in the tags"), (0.28, "fly higher")])
+def test_the_advice_fits_the_time_between_exposures(apart_s: float, advice: str) -> None:
+    (caution,) = cautions({"status": "failed", "reason": "", "issues": issue("cluster"), "exposed_after_s": apart_s})
+    assert caution.remedy.advice.startswith(advice)
+
+
+@pytest.mark.slow
+def test_the_time_between_exposures_is_that_in_the_tags(flight: Path, tmp_path: Path) -> None:
+    folder = Path(shutil.copytree(flight / "0000SET" / "000", tmp_path / "in"))
+    path = folder / "IMG_0001_4.tif"
+    (capture, *_) = discover(folder).captures
+    assert _exposed_after_s(capture.bands[3], capture.reference) == 0
+    path.write_bytes(path.read_bytes().replace(b"2026:06:21 10:00:01", b"2026:06:21 10:00:31"))
+    assert _exposed_after_s(capture.bands[3], capture.reference) == 30
 
 
 def test_a_panel_that_contradicts_the_sensor_concerns_the_reflectance_of_its_flight() -> None:

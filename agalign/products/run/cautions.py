@@ -16,7 +16,7 @@ from agalign.flight.rig_file import model_fingerprint
 from agalign.products.run.excluded import PanelPart, read_excluded
 from agalign.products.sidecar.schema import BandResult, Sidecar
 from agalign.values.capture import CaptureTime
-from agalign.values.issues import MISSING_BAND, MOSAICS, TEXTURELESS, UNEXPECTED_PX, UNREADABLE, Remedy
+from agalign.values.issues import CONTRADICTED, MISSING_BAND, MOSAICS, TEXTURELESS, UNEXPECTED_PX, UNREADABLE, Remedy
 
 MAX_PIXEL_ERROR_PX = 1.0
 """Beyond it, a spectral index mixes neighbouring plants."""
@@ -177,6 +177,14 @@ def _of_alignment(band: BandResult, sidecar: Sidecar) -> Iterator[Caution]:
         yield Caution(band.band, status, UNEXPECTED_PX.remedy, reason, lost, prediction.off_px, text)
 
 
+_MIN_APART_S = 2.0
+"""Between the exposures of two bands: times in tags may have whole seconds, and those of one capture differ by less."""
+_APART = Remedy(
+    "the band was exposed at another time than the reference, while the camera or the scene moved",
+    "look at the times in the tags; --pattern assigns files to captures, --bands omits the band",
+)
+
+
 def remedy_of(band: BandResult, *, is_mosaic: bool) -> Remedy:
     """Return the remedy of the first issue of a band that is not aligned, which is the one in `reason`."""
     if not band.issues:
@@ -184,4 +192,6 @@ def remedy_of(band: BandResult, *, is_mosaic: bool) -> Remedy:
     kind = band.issues[0].kind
     if is_mosaic and kind is not UNREADABLE:
         return MOSAICS
+    if abs(band.exposed_after_s or 0.0) >= _MIN_APART_S and kind.remedy in CONTRADICTED:
+        return _APART
     return BLURRED if band.status == "predicted" and kind.remedy is TEXTURELESS else kind.remedy

@@ -10,6 +10,7 @@ the reference to a pixel of the moving band; `grid` samples the complete mapping
 
 import math
 from collections.abc import Iterable, Mapping
+from contextlib import suppress
 from dataclasses import replace
 from typing import Annotated, Any, Literal, Self
 
@@ -18,11 +19,13 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, ValidationInfo, field_validator, model_validator
 
 from agalign._version import __version__
+from agalign.cameras.metadata import read_tags
 from agalign.config import CheckSettings, Settings
+from agalign.errors import UnreadableFileError
 from agalign.flight.fingerprint import estimation_fingerprint, input_samples
 from agalign.products.sidecar.sampled import sampled_mapping, sampled_parallax
 from agalign.values.alignment import Alignment, JointResult, Prediction, Residual, Seed, Similarity
-from agalign.values.capture import Band, CameraIdentity, Capture, Pose, Position
+from agalign.values.capture import Band, CameraIdentity, Capture, CaptureTime, Pose, Position
 from agalign.values.choices import CaptureStatus, Geometry, PairStatus, Space
 from agalign.values.fields import (
     RECORD,
@@ -225,6 +228,10 @@ class BandResult(_Part):
     """What the mapping has in addition to homography and lens models."""
     prediction: Prediction | None = None
     """Mapping that is predicted without the image of the band, or extrapolated from a part of it."""
+    exposed_after_s: Number3 | None = None
+    """Time of the exposure after that of the reference, by the tags of both files, s; null if the band is aligned,
+    without tags, and in older sidecars.
+    """
     lens_std_px: Annotated[NDArray[np.float64], Array((4,), 6)] | None = None
     """Standard deviations of the lens shapes that neither tags nor a rig determine, px of the reference."""
     relief_std_px: Number = 0.0
@@ -246,7 +253,7 @@ class BandResult(_Part):
         return cls(**_source(band), status="reference", reason=None, seconds=0.0)
 
     @classmethod
-    def of(cls, band: Band, alignment: Alignment) -> Self:
+    def of(cls, band: Band, alignment: Alignment, reference: Band) -> Self:
         """Return the entry of a moving band."""
         mapping, relief = alignment.mapping, None
         grid_px = sampled_mapping(mapping.without_parallax, alignment.size_px)
@@ -271,6 +278,7 @@ class BandResult(_Part):
             metrics=MetricsPart(before=alignment.before, after=_after(alignment), windows=alignment.residual),
             geometry=GeometryPart(kind=alignment.geometry, held_out_p95_px=dict(alignment.candidates)),
             prediction=alignment.prediction,
+            exposed_after_s=None if alignment.status == "aligned" else _exposed_after_s(band, reference),
             lens_std_px=alignment.lens_std_px,
             relief_std_px=alignment.relief_std_px,
             seconds=alignment.seconds,
@@ -320,6 +328,14 @@ def _source(band: Band) -> dict[str, Any]:
     """The file of a band."""
     facts = {"band": band.name, "wavelength_nm": band.wavelength_nm, "size_px": band.size_px}
     return facts | {"file": band.path.name, "band_index": band.band_index}
+
+
+def _exposed_after_s(band: Band, reference: Band) -> float | None:
+    with suppress(UnreadableFileError):
+        times = [CaptureTime.of(read_tags(b.path, b.page).captured_at) for b in (band, reference)]
+        if times[0] is not None and times[1] is not None:
+            return (times[0].utc - times[1].utc).total_seconds()
+    return None
 
 
 def _after(alignment: Alignment) -> Similarity:
@@ -502,7 +518,7 @@ class Sidecar(_Part):
         """Return the sidecar of a capture whose bands are aligned, and nothing is rendered."""
         reference, accept_predicted_px = capture.reference, settings.check.accept_predicted_px
         bands = [
-            BandResult.of_reference(b) if b is reference else BandResult.of(b, alignments[b.name])
+            BandResult.of_reference(b) if b is reference else BandResult.of(b, alignments[b.name], reference)
             for b in capture.bands
         ]
         status = capture_status(bands, accept_predicted_px)
