@@ -68,7 +68,8 @@ def _described(capture: Capture | Sidecar) -> str:
     """Camera, time and id, as far as they are known."""
     camera = capture.camera
     name = " ".join(filter(None, (camera.make, camera.model, camera.serial)))
-    known = filter(None, (name, capture.captured_at, capture.capture_id))
+    time = capture.captured_at if isinstance(capture, Sidecar) else capture.known_time
+    known = filter(None, (name, time, capture.capture_id))
     return ", ".join(known) or "without tags"
 
 

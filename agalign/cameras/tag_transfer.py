@@ -24,7 +24,7 @@ from agalign.cameras.tiff_directory import (
 )
 from agalign.cameras.xmp import Name, Packet
 from agalign.errors import UnreadableFileError
-from agalign.values.capture import Band
+from agalign.values.capture import Band, is_clock_set
 from agalign.values.image import OutputGrid
 
 _CAPTURE_TAGS: set[int] = {Base.Make, Base.Model, Base.DateTime, Base.Copyright, Base.CameraSerialNumber}
@@ -70,7 +70,7 @@ def capture_tags(reference: Band, grid: OutputGrid) -> TransferredTags:
     first = _some(source[0], _CAPTURE_TAGS | {Base.Orientation})
     times = {tag for tag in Base if tag.name.startswith(("DateTime", "OffsetTime", "SubsecTime"))}
     exif = _some(source[EXIF], times | {Base.ExifVersion, Base.BodySerialNumber, Base.LensModel})
-    return first, _on_grid(exif, source[EXIF], grid), source[GPS]
+    return _without_unset_clock(first), _on_grid(exif, source[EXIF], grid), source[GPS]
 
 
 def band_tags(
@@ -95,7 +95,14 @@ def band_tags(
         _put_radiometry(packet, own_tags, vignetting, radiometry=radiometry)
         if serialised := packet.serialised():
             first[XMP] = byte_string(serialised)
-    return first, _on_grid(exif, of_reference[EXIF], grid), own[GPS]
+    return _without_unset_clock(first), _on_grid(exif, of_reference[EXIF], grid), own[GPS]
+
+
+def _without_unset_clock(first: Directory) -> Directory:
+    """The first directory without the time of a clock that was not set, like `Capture.known_time`."""
+    if Base.DateTime in first and not is_clock_set(first[Base.DateTime].data.decode("latin-1")):
+        return {tag: entry for tag, entry in first.items() if tag != Base.DateTime}
+    return first
 
 
 def _put_geometry(packet: Packet, reference: Band, tags: Tags, grid: OutputGrid) -> None:

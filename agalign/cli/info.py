@@ -193,7 +193,7 @@ def _facts(capture: "Capture") -> dict[str, Any]:
         "label": capture.label,
         "camera": f"{capture.camera.make} {capture.camera.model}".strip() or "unknown",
         "serial": capture.camera.serial,
-        "captured_at": capture.captured_at,
+        "captured_at": capture.known_time,
         "capture_id": capture.capture_id,
         "flight_id": capture.flight_id,
         "bands": bands,

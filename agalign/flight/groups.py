@@ -174,7 +174,7 @@ def camera_overviews(captures: Sequence[Capture]) -> list[CameraOverview]:
 def _overview(name: str, serial: str, captures: Sequence[Capture]) -> CameraOverview:
     height_m, gsd_m = _median_height_and_gsd_m(captures)
     altitudes_m = [c.altitude_m for c in captures if c.altitude_m is not None]
-    times = sorted({c.captured_at for c in captures} - {""}) or [""]
+    times = sorted({c.known_time for c in captures} - {""}) or [""]
     choices: tuple[RadiometryChoice, ...] = ("camera", "sun")
     reference = mode(c.reference.name for c in captures)
     typical = next(c for c in captures if c.reference.name == reference)

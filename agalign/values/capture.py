@@ -101,6 +101,11 @@ class CaptureTime(NamedTuple):
         return None
 
 
+def is_clock_set(time: str) -> bool:
+    """Return False for a time, which begins with the year, of a clock that was not set: cameras count from 1970."""
+    return time >= "1971"
+
+
 class PanelFactor(NamedTuple):
     """Reflectance per radiance of a band by panels."""
 
@@ -325,6 +330,13 @@ class Capture:
         """Unix time of the capture, s, as `CaptureTime`; None if it is unknown."""
         moment = CaptureTime.of(self.captured_at)
         return None if moment is None else moment.utc.timestamp()
+
+    @property
+    def known_time(self) -> str:
+        """`captured_at` as all files and messages have it: empty if the clock of the camera was not set and counts from
+        1970.
+        """
+        return self.captured_at if is_clock_set(self.captured_at) else ""
 
     @property
     def label(self) -> str:

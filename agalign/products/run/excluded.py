@@ -172,7 +172,7 @@ def read_excluded(out: Path) -> tuple[list[PanelPart], list[SkyPart]]:
 
 
 def _identity(capture: Capture) -> dict[str, Any]:
-    return {"folder": capture.folder.as_posix(), "capture": capture.name, "captured_at": capture.captured_at}
+    return {"folder": capture.folder.as_posix(), "capture": capture.name, "captured_at": capture.known_time}
 
 
 def _panel_band(reading: BandReading) -> dict[str, Any]:

@@ -152,7 +152,7 @@ def excluded_part(capture: Capture, kind: Literal["panel", "sky"], evidence: lis
         capture=capture.label,
         kind=kind,
         evidence=evidence,
-        captured_at=capture.captured_at,
+        captured_at=capture.known_time,
         camera=capture.camera,
         position=capture.position,
         pose=capture.pose,

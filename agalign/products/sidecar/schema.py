@@ -454,7 +454,7 @@ class Sidecar(_Part):
     flight_id: str
     """Flight id in the tags."""
     captured_at: str
-    """Time in the tags, ISO 8601."""
+    """Time in the tags, ISO 8601; empty without one, and if the clock of the camera was not set."""
     position: Position | None = None
     """GPS position of the reference band."""
     pose: Pose | None = None
@@ -529,7 +529,7 @@ class Sidecar(_Part):
             capture=capture.name,
             capture_id=capture.capture_id,
             flight_id=capture.flight_id,
-            captured_at=capture.captured_at,
+            captured_at=capture.known_time,
             position=capture.position,
             pose=capture.pose,
             camera=capture.camera,
