@@ -8,18 +8,21 @@ import tracemalloc
 from itertools import chain
 from pathlib import Path
 from typing import Any
+from urllib.parse import quote
 
 import cv2
 import numpy as np
 import pytest
 
 import agalign
+from agalign.config import Settings
 from agalign.products.report import facts as facts_module
 from agalign.products.report.charts import CHART_HEIGHT, drifts_of, rig_views
 from agalign.products.report.drawing import ReducedBands, read_reduced_bands
 from agalign.products.report.facts import CameraOffsets, PairTotals
 from agalign.products.report.pages import pages_exist, write_pages
 from agalign.products.report.preview import ReliefView, preview_bytes, write_preview
+from agalign.products.run.record import begun
 from agalign.products.sidecar.file import read_sidecar, write_sidecar
 from agalign.products.sidecar.schema import Sidecar
 from agalign.values.capture import Band, Capture
@@ -214,6 +217,26 @@ def test_the_report_as_json_has_every_capture(
     for pair, part in zip(facts["captures"][4]["bands"], sidecar["bands"], strict=True):
         if part["status"] != "reference":
             assert facts["lattices"][pair["lattice"]] == list(chain(*part["metrics"]["windows"]["centres_px"]))
+
+
+def test_the_page_has_no_control_characters(tmp_path: Path) -> None:
+    """Names and tags may have terminal escapes and changes of text direction, which show one name as another."""
+    name, hostile = "IMG_\u202egnp.1", "a\x1b[2J\u202eb\x07"
+    band = NIR | {"band": hostile, "status": "failed", "reason": f"{hostile} is blank"}
+    camera = {"make": hostile, "model": hostile, "serial": hostile}
+    sidecar = example(capture=name, bands=[band], camera=camera, missing_bands=[f"{hostile}2"], captured_at=hostile)
+    write_sidecar(tmp_path / f"{name}.json", sidecar)
+    record = begun(Path(hostile), Settings(), command=hostile).model_copy(update={"labels": [name, hostile]})
+    record.write(tmp_path, "running", 0.0)
+    write_pages(tmp_path, pytest.fail)
+    page = (tmp_path / "index.html").read_text(encoding="utf-8")
+    assert [c for c in page if not (c.isprintable() or c == "\n")] == []
+    (row,) = facts_of(tmp_path)["rows"]["records"]
+    assert row["label"] == r"IMG_\u202egnp.1"
+    assert f'href="#capture={quote(row["label"])}"' in page
+    assert not any(c in json.dumps(facts_of(tmp_path), ensure_ascii=False) for c in "\u202e\x1b\x07")
+    assert json.dumps(facts_of(tmp_path)).count("u001b") == 0
+    assert facts_of(tmp_path)["details"]["records"][0]["sidecar"] == quote(f"{name}.json")
 
 
 def test_long_lists_are_cut_in_the_page(tmp_path: Path) -> None:

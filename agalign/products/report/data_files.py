@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from agalign.values.files import check_inside, write_text
+from agalign.values.text import escape_controls
 
 DATA_FOLDER = "report-data"
 _NAME = re.compile(r"[a-z]+-\d+-[0-9a-f]{16}\.js")
@@ -35,8 +36,8 @@ class DataParts:
     _count: int = 0
 
     def add(self, record: dict[str, Any]) -> bool:
-        """Add a record; return True if the part is full, and `flush` must follow."""
-        self._records.append(record)
+        """Add a record, with control characters escaped; return True if the part is full, and `flush` must follow."""
+        self._records.append(printable(record))
         self._count += 1
         return len(self._records) == self.size
 
@@ -64,6 +65,18 @@ class DataParts:
         for file in self.files:
             text = (self.out / file).read_text("utf-8")
             yield json.loads(text[text.index("(") + 1 : text.rindex(")")])
+
+
+def printable(value: Any) -> Any:
+    """Return a value for the page with control characters, such as changes of text direction, escaped in all texts."""
+    if isinstance(value, str):
+        return escape_controls(value)
+    if isinstance(value, dict):
+        return {escape_controls(key): printable(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        has_texts = {str, dict, list, tuple} & set(map(type, value))  # not in the long lists of numbers
+        return [printable(item) for item in value] if has_texts else value
+    return value
 
 
 def data_files_exist(page: Path) -> bool:

@@ -18,6 +18,7 @@ from agalign.products.sidecar.schema import BandResult, GeometryPart, GridPart, 
 from agalign.values.alignment import Prediction
 from agalign.values.files import CsvTable
 from agalign.values.issues import MISSING_BAND, OTHER_REFERENCE, Remedy
+from agalign.values.text import escape_controls
 
 _SHIFT_STEP_PX = 0.01
 """Shifts of windows are written as integer multiples of this."""
@@ -229,7 +230,8 @@ class FlightFacts:
         """Add a capture, given its folder relative to the output folder, and its indices. Raises OutputError."""
         label = Path(folder, sidecar.capture).as_posix()
         checks: dict[str, list[str]] = defaultdict(list)
-        for caution in self.pairs.add(label, sidecar):
+        # The page has links by the label that it shows.
+        for caution in self.pairs.add(escape_controls(label), sidecar):
             checks[caution.band].append(caution.reason)
         output, position, path = sidecar.output, sidecar.position, Path(folder)
         grid = output or OutputPart(file=None, crop=(0, 0, *sidecar.reference.size_px), nodata=None)

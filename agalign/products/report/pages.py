@@ -13,13 +13,14 @@ from statistics import median
 from typing import Any
 
 from jinja2 import Environment, PackageLoader, StrictUndefined, select_autoescape
+from markupsafe import Markup
 
 from agalign._version import __version__
 from agalign.config import Settings
 from agalign.errors import SidecarError
 from agalign.products.indices.rasters import IndexReport, current_rows, merged, reports_of, update_table
 from agalign.products.report.charts import drifts_of, rig_views
-from agalign.products.report.data_files import data_files_exist, remove_other_data_files
+from agalign.products.report.data_files import data_files_exist, printable, remove_other_data_files
 from agalign.products.report.facts import SUMMARY_FILE, FlightFacts
 from agalign.products.run.excluded import PANELS_FILE, SKY_FILE, PanelPart, SkyPart, read_excluded
 from agalign.products.run.flight_map import FlightMap
@@ -125,6 +126,8 @@ def _page(**values: Any) -> str:
         trim_blocks=True,
         lstrip_blocks=True,
         undefined=StrictUndefined,
+        # What is not markup comes from files.
+        finalize=lambda value: value if isinstance(value, Markup) else printable(value),
     )
     environment.policies["json.dumps_kwargs"] = {"separators": (",", ":"), "ensure_ascii": False, "allow_nan": False}
     style, script = (resources.files(__package__).joinpath(f"page.{kind}").read_text("utf-8") for kind in ("css", "js"))
