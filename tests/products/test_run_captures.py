@@ -14,7 +14,7 @@ from synthetic_flights.aligned import make_aligned
 
 import agalign
 from agalign.products.exports.programs import export
-from agalign.products.rasters.aligned_files import to_cog
+from agalign.products.rasters.geotiff import to_cog
 from agalign.products.run.captures import exceptions
 from agalign.products.sidecar.file import find_sidecars
 

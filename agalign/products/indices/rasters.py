@@ -24,13 +24,14 @@ from agalign.errors import ConfigurationError, InputError
 from agalign.pixels.raster import OpenRaster, open_raster
 from agalign.products.indices.formulas import Index, bands_for, compute, index_named, index_of_formula, role_of_band
 from agalign.products.product import CapturePaths, Product, ProductContext, WrittenFile
-from agalign.products.rasters.aligned_files import tags_of, to_cog
+from agalign.products.rasters.aligned_files import tags_of
 from agalign.products.rasters.geotiff import (
     FLOAT_OPTIONS,
     LayerDescription,
     check_complete,
     checked_raster,
     tiled_profile,
+    to_cog,
 )
 from agalign.products.report.drawing import with_text, write_png
 from agalign.products.run.captures import RAW, AlignedBand, BandReader

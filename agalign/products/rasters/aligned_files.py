@@ -17,7 +17,6 @@ import rasterio
 from numpy.typing import NDArray
 from rasterio.enums import ColorInterp, Resampling
 from rasterio.fill import fillnodata
-from rasterio.shutil import copy as copy_dataset
 
 from agalign.cameras.metadata import read_tags
 from agalign.cameras.pix4d import GridVignetting, vignetting_of, vignetting_on_grid
@@ -30,12 +29,12 @@ from agalign.pixels.radiometry import calibrated
 from agalign.pixels.raster import GDAL_ENVIRONMENT, open_raster, suffix_format, with_nan, without_warnings
 from agalign.products.indices.formulas import Role, role_of_band
 from agalign.products.product import CapturePaths, Product, ProductContext, WrittenFile
-from agalign.products.rasters.geotiff import Block, LayerDescription, compressed, write_on_grid
+from agalign.products.rasters.geotiff import Block, LayerDescription, compressed, compression_of, to_cog, write_on_grid
 from agalign.products.rasters.output_grid import Layer, is_inside
 from agalign.products.report.drawing import MAX_REDUCED_PX, grey
 from agalign.values import geometry
 from agalign.values.capture import Band, Capture, Quantity, Radiometry
-from agalign.values.choices import Compression, Interpolation
+from agalign.values.choices import Interpolation
 from agalign.values.files import file_name
 from agalign.values.image import Mask, OutputGrid, Tile
 from agalign.values.issues import MISSING_BAND
@@ -182,9 +181,8 @@ def write_raster(
     capture, settings, raw = context.capture, context.settings.write, context.is_raw
     dtype = np.result_type(*(layer.band.dtype for layer in layers)) if raw else np.dtype(np.float32)
     nodata = nodata_value(context, layers, dtype)
-    # Many programs that read files of single bands do not support Zstandard.
-    fits_all: Compression = "deflate" if settings.layout == "bands" or len(layers) < len(capture.bands) else "zstd"
-    compression = fits_all if settings.compression == "auto" else settings.compression
+    is_stack = settings.layout != "bands" and len(layers) >= len(capture.bands)
+    compression = compression_of(settings.compression, is_stack=is_stack)
     options: dict[str, object] = {"interleave": "band", "photometric": "minisblack", "nodata": nodata}
     options |= compressed(dtype.kind, compression)
     overviews = list(capture.reference.overviews) if settings.format == "gtiff" else []
@@ -316,19 +314,6 @@ def layer_pixels(
         return resample_tile(layer.band, layer.mapping, tile, interpolation, radiometry, size_px=size_px, read=read)
     pixels, valid = layer.read(layer.band, tile)
     return pixels if radiometry is None else calibrated(pixels, radiometry, tile.x0, tile.y0), valid
-
-
-def to_cog(path: Path, compression: str = "deflate") -> None:
-    """Replace a GeoTIFF by a cloud-optimised one with overviews. Errors are those of rasterio."""
-    cog = path.with_name(f"{path.name}.cog")
-    options = {"blocksize": 512, "bigtiff": "if_safer"}  # GDAL's default size of blocks
-    if compression != "none":
-        options |= {"compress": compression, "predictor": "yes"}
-    try:
-        copy_dataset(path, cog, driver="COG", **options)
-        cog.replace(path)
-    finally:
-        cog.unlink(missing_ok=True)
 
 
 def nodata_value(context: ProductContext, layers: Sequence[Layer], dtype: np.dtype[Any]) -> float | None:

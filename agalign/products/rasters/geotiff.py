@@ -18,6 +18,7 @@ import rasterio
 import tifffile
 from numpy.typing import NDArray
 from rasterio.enums import ColorInterp
+from rasterio.shutil import copy as copy_dataset
 from rasterio.transform import Affine
 from rasterio.windows import Window
 
@@ -30,6 +31,8 @@ from agalign.values.files import complete_file
 from agalign.values.image import OutputGrid
 
 _INCOMPLETE = "the file came out incomplete; is the disk full?"
+_ZSTD_LEVEL = 1
+"""Higher levels take longer, and gain 2 %."""
 
 
 Block = tuple[NDArray[Any], int, int, int]
@@ -174,16 +177,38 @@ def georeferenced(georeference: Georeference, grid: OutputGrid) -> dict[str, Any
     return {"transform": Affine(*transform[:2].ravel()), "crs": rasterio.CRS.from_wkt(georeference.crs_wkt)}
 
 
+def compression_of(choice: Compression, *, is_stack: bool) -> Compression:
+    """Return the method for aligned bands: with `auto`, zstd for a stack of all bands of a capture, else deflate."""
+    if choice != "auto":
+        return choice
+    return "zstd" if is_stack else "deflate"  # programs that read files of single bands often lack Zstandard
+
+
 def compressed(kind: str, method: Compression = "deflate") -> dict[str, Any]:
     """Return the creation options of compressed pixels of a kind of numpy type: `f`, `i` or `u`.
 
-    `auto` is not a method: each kind of raster has its own.
+    `method` is not `auto`, which `compression_of` resolves.
     """
     if method == "none":
         return {}
     # TIFF predictor 3 is for floating point, 2 for integers.
     options: dict[str, Any] = {"compress": method, "predictor": 3 if kind == "f" else 2}
-    return options | ({"zstd_level": 1} if method == "zstd" else {})  # higher levels take longer, and gain 2 %
+    return options | ({"zstd_level": _ZSTD_LEVEL} if method == "zstd" else {})
+
+
+def to_cog(path: Path, compression: str = "deflate") -> None:
+    """Replace a GeoTIFF by a cloud-optimised one with overviews. Errors are those of rasterio."""
+    cog = path.with_name(f"{path.name}.cog")
+    options = {"blocksize": 512, "bigtiff": "if_safer"}  # GDAL's default size of blocks
+    if compression != "none":
+        options |= {"compress": compression, "predictor": "yes"}
+    if compression == "zstd":
+        options["level"] = _ZSTD_LEVEL
+    try:
+        copy_dataset(path, cog, driver="COG", **options)
+        cog.replace(path)
+    finally:
+        cog.unlink(missing_ok=True)
 
 
 FLOAT_OPTIONS: Mapping[str, Any] = {**compressed("f"), "nodata": math.nan}
