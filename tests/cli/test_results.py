@@ -63,6 +63,14 @@ def test_the_commands_on_a_run_name_its_state_and_the_captures_without_a_result(
         shutil.rmtree(out.parent / "exported", ignore_errors=True)
 
 
+def test_a_run_without_results_is_no_other_folder(out: Path) -> None:
+    for path in find_sidecars(out):
+        path.unlink()
+    done = agalign_here("verify", out)
+    assert (done.returncode, done.stdout) == (1, "")
+    assert f"{out}: the run there has no results: it was stopped, or all captures failed; run it again" in done.stderr
+
+
 def test_captures_of_panels_and_of_the_sky_need_no_result(out: Path) -> None:
     identity = {"folder": "0000SET/000", "captured_at": "", "cues": ["a"]}
     sky = [{**identity, "capture": "IMG_0002", "bands": []}]

@@ -11,7 +11,7 @@ from pydantic import ValidationError
 
 from agalign.errors import InputError, SidecarError
 from agalign.products.sidecar.schema import SCHEMA, FilePart, Sidecar
-from agalign.values.files import compact_lists, file_checksum, open_regular, read_regular, write_text
+from agalign.values.files import RUN_FILE, compact_lists, file_checksum, open_regular, read_regular, write_text
 
 _MAX_BYTES = 1 << 26
 """Limit of a file that is read: ten times the sidecar of many bands."""
@@ -130,6 +130,8 @@ def label_of(sidecar: Path, out: Path) -> str:
 def run_sidecars(out: Path) -> list[Path]:
     """Return the sidecars below the output folder of a run. Raises InputError if there are none."""
     sidecars = find_sidecars(out) if out.is_dir() else []
+    if not sidecars and (out / RUN_FILE).is_file():
+        raise InputError(f"{out}: the run there has no results: it was stopped, or all captures failed; run it again")
     if not sidecars:
         what = "no sidecars there" if out.is_dir() else "is not a folder" if out.exists() else "does not exist"
         raise InputError(f"{out}: {what}; give the output folder of a run")
