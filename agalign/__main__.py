@@ -1,14 +1,17 @@
 """Entry point of `agalign` and `python -m agalign`."""
 
 import os
+import signal
 import sys
 
 
 def main() -> None:
     """Run the command line."""
     _open_missing_streams()
+    # While modules are imported, the system ends the process: an exception in a callback of an import lock is lost.
+    if signal.getsignal(signal.SIGINT) == signal.default_int_handler:
+        signal.signal(signal.SIGINT, signal.SIG_DFL)
     try:
-        # Inside the try block, because the import takes time, in which SIGINT may arrive.
         from agalign.cli.main import main as command_line
 
         command_line()

@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 import typer
 
+from agalign import __main__
 from agalign.batch.capture_task import CaptureReport
 from agalign.cameras.discover import FolderScan, Problem, discover
 from agalign.cli import align_run, main
@@ -327,3 +328,17 @@ def test_a_report_that_cannot_be_written_is_not_announced(
     assert said in printed.err
     assert "Report:" not in printed.out
     assert totals.is_complete == is_complete
+
+
+def test_the_system_ends_the_program_at_the_interrupt_key_while_modules_are_imported(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Python ignores the exception in callbacks of its import locks: the run would go on."""
+    handlers = []
+    monkeypatch.setattr(main, "main", lambda: handlers.append(signal.getsignal(signal.SIGINT)))
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        __main__.main()
+    finally:
+        signal.signal(signal.SIGINT, before)
+    assert handlers == [signal.SIG_DFL]
