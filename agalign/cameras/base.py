@@ -20,6 +20,7 @@ from agalign.values import geometry
 from agalign.values.capture import Band, CaptureTime, Pose
 from agalign.values.geometry import Matrix
 from agalign.values.lens import Lens
+from agalign.values.spectrum import band_key
 from agalign.values.text import did_you_mean
 
 
@@ -97,14 +98,14 @@ def default_reference(bands: Sequence[Band]) -> int:
 
 
 def reference_index(bands: Sequence[Band], wanted: str | None, path: Path) -> int:
-    """Return the index of the band with the name `wanted`, ignoring case; of the default if it is None or 'auto'.
+    """Return the index of the band with the name `wanted` in any spelling; of the default if it is None or 'auto'.
 
     Raises NoSuchBandError, which names `path`, if no band has the name.
     """
     if wanted is None or wanted.lower() == "auto":
         return default_reference(bands)
     for index, band in enumerate(bands):
-        if band.name.lower() == wanted.lower():
+        if band_key(band.name) == band_key(wanted):
             return index
     similar = did_you_mean(wanted, [b.name for b in bands])
     raise NoSuchBandError(f"{path}: no band '{wanted}', as --reference asks{similar}; choose from {listed(bands)}")

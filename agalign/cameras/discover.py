@@ -27,6 +27,7 @@ from agalign.cameras.grouping import (
     with_unique_capture_names,
     without_copies,
 )
+from agalign.cameras.identity import contradictions, with_one_spelling
 from agalign.cameras.metadata import read_tags
 from agalign.cameras.read_files import ImageFile, Problem, natural_order, read_files
 from agalign.config import DiscoverOptions
@@ -36,6 +37,7 @@ from agalign.values import geometry
 from agalign.values.capture import Band, Capture
 from agalign.values.choices import MAX_MOSAIC_PIXELS
 from agalign.values.files import RUN_FILE
+from agalign.values.spectrum import band_key
 from agalign.values.text import did_you_mean
 
 __all__ = ["DiscoverOptions", "FolderScan", "Problem", "discover"]
@@ -75,9 +77,10 @@ def discover(folder: str | Path, options: DiscoverOptions | None = None) -> Fold
     paths, problems = _chosen_images(folder, options)
     files, copies = without_copies(_read(paths, options, problems))
     files, damaged = with_tags_of_flight(files)
-    problems += copies + damaged + tag_problems(files)
+    files = with_one_spelling(files)
     captures: list[Capture] = []
     groups = group_files(files, with_rgb=options.with_rgb)
+    problems += copies + damaged + tag_problems(files) + contradictions(groups)
     _check_bands(groups, options.bands, folder)
     for group in groups:
         if options.pattern is not None:
@@ -131,15 +134,15 @@ def _check_bands(groups: Sequence[Sequence[ImageFile]], chosen: Sequence[str], f
     two of each capture.
     """
     by_capture = [[b.name for file in group for b in file.bands] for group in groups]
-    known = {name.lower(): name for names in by_capture for name in names}
+    known = {band_key(name): name for names in by_capture for name in names}
     if not chosen or not known:
         return
     for name in chosen:
-        if name.lower() not in known:
+        if band_key(name) not in known:
             what = f"no capture has a band '{name}', as --bands asks{did_you_mean(name, known.values())}"
             raise NoSuchBandError(f"{folder}: {what}; choose from {', '.join(known.values())}")
-    wanted = {name.lower() for name in chosen}
-    if all(sum(name.lower() in wanted for name in names) < 2 for names in by_capture):
+    wanted = {band_key(name) for name in chosen}
+    if all(sum(band_key(name) in wanted for name in names) < 2 for names in by_capture):
         what = f"--bands {','.join(chosen)}: leaves less than the two bands of a capture that alignment needs"
         raise ConfigurationError(f"{folder}: {what}; choose from {', '.join(known.values())}")
 

@@ -21,6 +21,7 @@ import numpy as np
 
 from agalign.cameras import pix4d
 from agalign.cameras.base import FULL_SCALE, Camera, colour_bands
+from agalign.cameras.known import MAVIC_3, PHANTOM_4
 from agalign.cameras.metadata import Tags
 from agalign.errors import GeometryError
 from agalign.values import geometry
@@ -28,7 +29,7 @@ from agalign.values.capture import Band, Pose, Radiometry
 from agalign.values.geometry import Matrix
 from agalign.values.lens import Lens
 
-_MAVIC_3_BAND = r"_(?:MS_(?P<band>G|RE?|NIR)|D)$"
+_MAVIC_3_BAND = rf"_(?:MS_(?:{'|'.join(MAVIC_3.bands)})|D)$"
 NAMESPACE = "dji.com/drone-dji"
 
 
@@ -133,11 +134,9 @@ def _is_mavic_3(tags: Tags) -> bool:
 
 
 def _band_in_name(path: Path) -> str:
-    mavic = re.search(_MAVIC_3_BAND, path.stem, re.IGNORECASE)
-    part = mavic["band"] or "" if mavic else path.stem[-1]
-    names = {"1": "Blue", "2": "Green", "3": "Red", "4": "RedEdge", "5": "NIR"}
-    names |= {"G": "Green", "R": "Red", "RE": "RedEdge", "NIR": "NIR"}
-    return names.get(part.upper(), path.stem)
+    part = Dji.band_in_name.search(path.stem)
+    known = {**PHANTOM_4.bands, **MAVIC_3.bands}.get(part[0].upper().removeprefix("_MS_")) if part else None
+    return known[0] if known else path.stem
 
 
 def pair(tags: Tags, name: str) -> tuple[float, float] | None:

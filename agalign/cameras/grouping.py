@@ -14,6 +14,8 @@ from types import MappingProxyType
 from agalign.cameras import camera_of
 from agalign.cameras.base import Camera, colour_bands, listed, reference_index
 from agalign.cameras.generic import Generic
+from agalign.cameras.identity import name_end
+from agalign.cameras.known import lacking
 from agalign.cameras.metadata import Tags
 from agalign.cameras.pix4d import NAMESPACE, listed_names
 from agalign.cameras.read_files import ImageFile, Problem, natural_order
@@ -22,6 +24,7 @@ from agalign.errors import InputError
 from agalign.pixels.raster import suffix_format
 from agalign.values.capture import Band, CameraIdentity, Capture, CaptureTime, Pose
 from agalign.values.files import RUN_FILE
+from agalign.values.spectrum import band_key
 from agalign.values.text import counted, shortened
 
 _GroupKey = tuple[str, str, str]
@@ -117,7 +120,7 @@ def tag_problems(files: Sequence[ImageFile]) -> list[Problem]:
 def _similar(file: ImageFile) -> tuple[object, object]:
     """Keys that files of the same camera and band, and of the same camera, share."""
     camera = file.camera.name, file.tags.make, file.tags.model, suffix_format(file.path)
-    return (*camera, file.path.stem.removeprefix(file.camera.capture_name(file.path))), camera
+    return (*camera, name_end(file)), camera
 
 
 def group_files(files: Iterable[ImageFile], *, with_rgb: bool = False) -> list[list[ImageFile]]:
@@ -264,8 +267,16 @@ def capture_of(files: Sequence[ImageFile], folder: Path, options: DiscoverOption
         position=tags.position,
         pose=_pose(camera, tags, next((f for f in files if f.path == reference.path), first)),
         motion=camera.motion(tags),
+        missing_bands=_lacking(files, tags.model, options.bands),
         elevation_deg=camera.elevation_deg(tags),
     )
+
+
+def _lacking(files: Sequence[ImageFile], model: str, names: Sequence[str]) -> tuple[str, ...]:
+    """The bands with these names, or all, that the camera of a capture of several files records, and it lacks."""
+    wanted = {band_key(name) for name in names}
+    missing = lacking(model, [(name_end(f), f.bands[0]) for f in files]) if model and len(files) > 1 else []
+    return tuple(name for name in missing if not wanted or band_key(name) in wanted)
 
 
 def _pose(camera: Camera, tags: Tags, file: ImageFile) -> Pose | None:
@@ -297,8 +308,8 @@ def companion_advice(path: Path) -> str:
 def _bands_to_align(files: Sequence[ImageFile], names: Sequence[str]) -> list[Band]:
     """The bands with these names, ignoring case, or all. Raises InputError if there is nothing to align."""
     first = files[0]
-    wanted = {name.lower() for name in names}
-    bands = [b for file in files for b in file.bands if not wanted or b.name.lower() in wanted]
+    wanted = {band_key(name) for name in names}
+    bands = [b for file in files for b in file.bands if not wanted or band_key(b.name) in wanted]
     if len(bands) < 2 and names:
         raise InputError(f"{first.path}: of this capture, --bands leaves {listed(bands) or 'nothing'}")
     if len(bands) < 2:
@@ -310,7 +321,8 @@ def _bands_to_align(files: Sequence[ImageFile], names: Sequence[str]) -> list[Ba
 
 def with_missing_bands(captures: Sequence[Capture]) -> list[Capture]:
     """Return the captures with the bands of their camera, which at least half of its captures have: rarer names come
-    from damaged tags. Those that a capture lacks are its `missing_bands`.
+    from damaged tags. Those that a capture lacks, and those that the camera is known to record, are its
+    `missing_bands`.
 
     A multiband file has no missing bands. A capture of a dual camera without files of one half gets the serial numbers
     of both.
@@ -323,9 +335,10 @@ def with_missing_bands(captures: Sequence[Capture]) -> list[Capture]:
     serials = {camera: {c.camera.serial for c in of_camera} for camera, of_camera in members.items()}
     result = []
     for capture, camera in zip(captures, cameras, strict=True):
-        own = {b.name for b in capture.bands}
+        own = {band_key(b.name) for b in capture.bands}
         of_camera = bands[camera] if capture.has_several_files else ()
-        missing = tuple(b.name for b in of_camera if b.name not in own)
+        of_flight = [b.name for b in of_camera if band_key(b.name) not in own]
+        missing = tuple({band_key(name): name for name in (*capture.missing_bands, *of_flight)}.values())
         identity = replace(capture.camera, serial=_complete_serial(capture.camera.serial, serials[camera]))
         result.append(replace(capture, missing_bands=missing, camera_bands=of_camera, camera=identity))
     return result

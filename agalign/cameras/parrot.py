@@ -17,6 +17,7 @@ import numpy as np
 
 from agalign.cameras import pix4d
 from agalign.cameras.base import Camera, colour_bands, rays_to_rig, rotation
+from agalign.cameras.known import SEQUOIA
 from agalign.cameras.metadata import Tags
 from agalign.values.capture import Band
 from agalign.values.geometry import Matrix
@@ -30,7 +31,7 @@ class Sequoia(Camera):
     name = "Parrot Sequoia"
     capture_ids = ((pix4d.NAMESPACE, "CaptureUUID"),)
     flight_ids = ((pix4d.NAMESPACE, "FlightUUID"),)
-    band_in_name = re.compile(r"_(GRE|RED|REG|NIR|RGB)$", re.IGNORECASE)
+    band_in_name = re.compile(rf"_({'|'.join(SEQUOIA.bands)}|RGB)$", re.IGNORECASE)
 
     def recognises(self, tags: Tags) -> bool:
         return tags.make.lower() == "parrot" or tags.text(pix4d.NAMESPACE, "RigName").lower().startswith("sequoia")
@@ -45,9 +46,9 @@ class Sequoia(Camera):
         if len(stored) > 1:
             return colour_bands(stored, lens, to_rig)
         suffix = self.band_in_name.search(path.stem)
-        names = {"GRE": "Green", "RED": "Red", "REG": "Red edge", "NIR": "NIR"}
         described = pix4d.described(stored[0], tags, path.stem)
-        name = names.get(suffix[1].upper(), suffix[1]) if suffix else described.name
+        known = SEQUOIA.bands.get(suffix[1].upper()) if suffix else None
+        name = known[0] if known else suffix[1] if suffix else described.name
         band = replace(described, name=name, lens=lens, to_rig=to_rig)
         # Parrot's formula for them has not been compared with a reference.
         why = "no tags for radiance (SensorModel and IrradianceList are not used)"

@@ -11,6 +11,7 @@ from agalign.cli.align_commands import align
 from agalign.cli.command import Command, Given, config_text
 from agalign.cli.terminal import MAX_LISTED, ExitCode, Terminal, in_json
 from agalign.errors import ConfigurationError, UnreadableFileError
+from agalign.values.issues import MISSING_BAND
 from agalign.values.text import counted
 
 if TYPE_CHECKING:
@@ -95,6 +96,8 @@ def _show_captures(rows: Sequence[dict[str, Any]], problems: int, terminal: Term
         missing = [*row["missing_bands"], *(f"{name} (unreadable)" for name in row["unreadable_files"])]
         table.append((row["label"], row["camera"], taken, bands, seeds, ", ".join(missing)))
     terminal.table(headers, table)
+    if any(row["missing_bands"] for row in rows):
+        terminal.result(f"missing: {MISSING_BAND.cause}; {MISSING_BAND.advice}")
     for row in rows:
         if row["panel"] is not None:
             where = ", aligned as well" if row["panel_in_scene"] else ""

@@ -48,7 +48,7 @@ MOSAICS = Remedy(
     "band in which the field changed little (--reference)",
 )
 """For georeferenced rasters instead of remedies that concern cameras and flights."""
-MISSING_BAND = Remedy("a band is missing that other captures of this camera have", "copy the files from the card again")
+MISSING_BAND = Remedy("a band of this camera is missing", "copy the files from the card; apps may not list all of them")
 OTHER_REFERENCE = Remedy(
     "another reference band than in most captures of the flight: pixels are on the grid of that band",
     "copy missing files from the card again, or give --reference with a band that all captures have",

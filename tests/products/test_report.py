@@ -117,7 +117,7 @@ def test_headline_and_summary_count_what_was_to_be_aligned(out: Path) -> None:
     assert [(r["folder"], r["capture"], r["band"]) for r in rows[8:]] == [
         ("0000SET/000", "IMG_0002", name) for name in ("Thermal", "Pan")
     ]
-    assert "other captures of this camera have" in rows[-1]["reason"]
+    assert "a band of this camera is missing" in rows[-1]["reason"]
 
 
 @pytest.mark.slow

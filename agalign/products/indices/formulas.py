@@ -14,13 +14,13 @@ from dataclasses import dataclass, replace
 from functools import cache, cached_property, lru_cache
 from importlib import metadata
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Any
 
 import numpy as np
 
 from agalign.errors import ConfigurationError, InputError
-from agalign.values.capture import Band
 from agalign.values.image import FloatImage
+from agalign.values.spectrum import ROLES, Role, role_of
 from agalign.values.text import did_you_mean
 
 _MAX_LENGTH = 300
@@ -37,32 +37,6 @@ _OPERATORS: Mapping[type, Callable[..., Any]] = {
 _FUNCTIONS: Mapping[str, Callable[[Any], Any]] = {"sqrt": np.sqrt, "log": np.log, "exp": np.exp, "abs": np.abs}
 _NOISE = 0.02
 """Noise of reflectance relative to its value: a difference below this share of its terms has no certain sign."""
-Role = Literal["blue", "green", "red", "red edge", "nir"]
-"""The part of the spectrum that a band of an index is from."""
-
-
-class SpectralRange(NamedTuple):
-    """The bands of a role."""
-
-    shortest_nm: float
-    nominal_nm: float
-    longest_nm: float
-    """Limits of the centre wavelength."""
-    symbols: tuple[str, ...]
-    """Names in formulas, as in the catalogue Awesome Spectral Indices."""
-    names: tuple[str, ...]
-    """Names of bands without a wavelength."""
-
-
-ROLES: Mapping[Role, SpectralRange] = {
-    "blue": SpectralRange(430, 475, 510, ("B",), ("blue", "blu", "b")),
-    "green": SpectralRange(520, 560, 590, ("G",), ("green", "gre", "grn", "g")),
-    "red": SpectralRange(620, 668, 695, ("R",), ("red", "r")),
-    "red edge": SpectralRange(
-        697, 717, 760, ("RE", "RE1"), ("red edge", "rededge", "red_edge", "red-edge", "reg", "re")
-    ),
-    "nir": SpectralRange(765, 840, 920, ("N",), ("nir", "near infrared", "near infra-red", "near-infrared", "n")),
-}
 _ROLE_OF_SYMBOL = {symbol: role for role, spectral_range in ROLES.items() for symbol in spectral_range.symbols}
 
 
@@ -262,25 +236,13 @@ def bands_for(index: Index, names: Sequence[str], wavelengths_nm: Sequence[float
         candidates = [i for i, own_role in enumerate(roles) if own_role == role]
         if not candidates:
             raise InputError(f"{index.name} needs a {role} band; there are {', '.join(names)}")
-        # Bands with a known wavelength first.
-        distances_nm = [math.inf if w is None else abs(w - ROLES[role].nominal_nm) for w in wavelengths_nm]
-        result.append(min(candidates, key=distances_nm.__getitem__))
+        # Bands with a known wavelength first; of two with the same wavelength that with the name of the role.
+        distances = [
+            (math.inf if w is None else abs(w - ROLES[role].nominal_nm), role_of(name, None) != role)
+            for name, w in zip(names, wavelengths_nm, strict=True)
+        ]
+        result.append(min(candidates, key=distances.__getitem__))
     return result
-
-
-def role_of(name: str, wavelength_nm: float | None) -> Role | None:
-    """Return the role of a band by its wavelength if that is known, else by its name; None for a band without one."""
-    if name.lower().startswith(("pan", "rgb", "lwir", "thermal")):  # whatever the centre wavelength
-        return None
-    for role, (shortest_nm, _, longest_nm, _, names) in ROLES.items():
-        if name.lower() in names if wavelength_nm is None else shortest_nm <= wavelength_nm <= longest_nm:
-            return role
-    return None
-
-
-def role_of_band(band: Band) -> Role | None:
-    """Return the role of a band; None for a band without one, and for those of the colour photograph."""
-    return None if band.is_from_photograph else role_of(band.name, band.wavelength_nm)
 
 
 def compute(index: Index, bands: Sequence[FloatImage]) -> FloatImage:

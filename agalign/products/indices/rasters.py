@@ -22,7 +22,7 @@ from agalign._version import __version__
 from agalign.config import WriteSettings
 from agalign.errors import ConfigurationError, InputError
 from agalign.pixels.raster import OpenRaster, open_raster
-from agalign.products.indices.formulas import Index, bands_for, compute, index_named, index_of_formula, role_of_band
+from agalign.products.indices.formulas import Index, bands_for, compute, index_named, index_of_formula
 from agalign.products.product import CapturePaths, Product, ProductContext, WrittenFile
 from agalign.products.rasters.aligned_files import tags_of
 from agalign.products.rasters.geotiff import (
@@ -42,6 +42,7 @@ from agalign.values.files import read_regular, write_csv
 from agalign.values.image import Tile, reduced_size_px
 from agalign.values.memory import WORK_TILE_PX
 from agalign.values.resampling import tiles
+from agalign.values.spectrum import role_of_band
 from agalign.values.text import without_formula
 
 _STATISTICS_TAG = "INDEX_STATISTICS"

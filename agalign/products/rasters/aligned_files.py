@@ -27,7 +27,6 @@ from agalign.errors import AgalignError, UnreadableFileError
 from agalign.pixels.band_resampling import resample_tile
 from agalign.pixels.radiometry import calibrated
 from agalign.pixels.raster import GDAL_ENVIRONMENT, open_raster, suffix_format, with_nan, without_warnings
-from agalign.products.indices.formulas import Role, role_of_band
 from agalign.products.product import CapturePaths, Product, ProductContext, WrittenFile
 from agalign.products.rasters.geotiff import Block, LayerDescription, compressed, compression_of, to_cog, write_on_grid
 from agalign.products.rasters.output_grid import Layer, is_inside
@@ -40,6 +39,7 @@ from agalign.values.image import Mask, OutputGrid, Tile
 from agalign.values.issues import MISSING_BAND
 from agalign.values.memory import WORK_TILE_PX
 from agalign.values.resampling import as_type, can_hold, tiles
+from agalign.values.spectrum import Role, role_of_band
 
 _MAX_VIGNETTING_ERROR = 0.01
 """Limit for the tags of aligned files, p95 of corrected pixels: a fifth of the accuracy of the cameras' calibration."""

@@ -1105,7 +1105,7 @@ function words(capture) {
   const list = el("ul", { class: "words" });
   for (const pair of moving(capture)) list.append(el("li", {}, el("b", {}, pair.band), ` ${sentence(pair, capture)}`));
   for (const band of capture.bands.filter((b) => b.check.length)) list.append(el("li", {}, "Check ", el("b", {}, band.band), `: ${band.check.join("; ")}.`));
-  for (const name of capture.missing) list.append(el("li", {}, el("b", {}, name), " is missing: other captures of this camera have it."));
+  for (const name of capture.missing) list.append(el("li", {}, el("b", {}, name), " is missing: this camera records it."));
   return list;
 }
 

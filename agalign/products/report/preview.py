@@ -21,7 +21,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agalign.cameras.base import is_thermal
-from agalign.products.indices.formulas import ROLES
 from agalign.products.product import Product, ProductContext, WrittenFile
 from agalign.products.rasters.alignment_maps import error_lattice_px, relief_layers, relief_of
 from agalign.products.report.drawing import Grey, ReducedBands, encoded, side_by_side, titled, write_png
@@ -29,6 +28,7 @@ from agalign.products.sidecar.schema import PreviewPart, ReliefPreviewPart
 from agalign.values.capture import Band
 from agalign.values.files import complete_file
 from agalign.values.image import reduced_size_px
+from agalign.values.spectrum import ROLES
 
 ERROR_FULL_PX = 0.5
 """Expected error that is shown as white."""

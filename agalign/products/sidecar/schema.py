@@ -466,7 +466,7 @@ class Sidecar(_Part):
     moving bands are `failed`. Else `degraded`.
     """
     missing_bands: list[str]
-    """Bands that only other captures of the camera have; nodata in the stack."""
+    """Bands of the camera that the capture lacks; nodata in the stack if other captures have them."""
     reference: ReferencePart
     """Reference band."""
     bands: Annotated[list[BandResult], Field(min_length=1)]
