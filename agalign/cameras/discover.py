@@ -25,6 +25,7 @@ from agalign.cameras.grouping import (
     with_tags_of_flight,
     with_unique_band_names,
     with_unique_capture_names,
+    without_copied_captures,
     without_copies,
 )
 from agalign.cameras.identity import contradictions, with_one_spelling
@@ -79,8 +80,8 @@ def discover(folder: str | Path, options: DiscoverOptions | None = None) -> Fold
     files, damaged = with_tags_of_flight(files)
     files = with_one_spelling(files)
     captures: list[Capture] = []
-    groups = group_files(files, with_rgb=options.with_rgb)
-    problems += copies + damaged + tag_problems(files) + contradictions(groups)
+    groups, copied = without_copied_captures(group_files(files, with_rgb=options.with_rgb))
+    problems += copies + copied + damaged + tag_problems(files) + contradictions(groups)
     _check_bands(groups, options.bands, folder)
     for group in groups:
         if options.pattern is not None:

@@ -47,10 +47,13 @@ def without_copies(files: Sequence[ImageFile]) -> tuple[list[ImageFile], list[Pr
     """
     kept: dict[object, ImageFile] = {}
     copies: dict[Path, Problem] = {}
-    for file in sorted(files, key=lambda f: (len(f.path.name), natural_order(f.path.name))):
-        capture_id = shortened(file.tags.first_text(file.camera.capture_ids))
+    ids = {f.path: shortened(f.tags.first_text(f.camera.capture_ids)) for f in files}
+    # A file that was copied over one of another capture has the name of the wrong siblings.
+    of_name = Counter((ids[f.path], f.camera.capture_name(f.path)) for f in files if ids[f.path])
+    siblings = {f.path: of_name[ids[f.path], f.camera.capture_name(f.path)] for f in files if ids[f.path]}
+    for file in sorted(files, key=lambda f: (-siblings.get(f.path, 0), len(f.path.name), natural_order(f.path.name))):
         folder, bands = file.camera.capture_folder(file.path), tuple(b.name for b in file.bands)
-        by_tags = (folder, capture_id, bands) if capture_id else file.path
+        by_tags = (folder, ids[file.path], bands) if ids[file.path] else file.path
         for original in (kept[key] for key in (by_tags, *_paths_in_name(file.path)) if key in kept):
             is_exact = same_bytes(original.path, file.path, shallow=False)
             if is_exact:
@@ -65,6 +68,49 @@ def without_copies(files: Sequence[ImageFile]) -> tuple[list[ImageFile], list[Pr
             kept.setdefault(by_tags, file)
             kept[file.path] = file
     return [f for f in files if f.path not in copies], list(copies.values())
+
+
+def without_copied_captures(groups: Sequence[list[ImageFile]]) -> tuple[list[list[ImageFile]], list[Problem]]:
+    """Return the files of each capture without captures that another folder has too, and a problem for each folder with
+    such copies.
+
+    Copies have the same capture id and time, or without an id the same names and bytes. The folder with the shortest
+    path is kept. Bands that only a copy has are moved to the capture that is kept.
+    """
+    kept: dict[object, tuple[list[ImageFile], list[tuple[str, int]]]] = {}
+    copies: dict[tuple[Path, Path], list[bool]] = defaultdict(list)
+    for group in sorted(groups, key=lambda g: (len(str(g[0].path.parent)), natural_order(str(g[0].path)))):
+        path, tags = group[0].path, group[0].tags
+        capture_id = tags.first_text(group[0].camera.capture_ids)
+        files = [(f.path.name, f.path.stat().st_size) for f in group]
+        key = (group[0].camera.name, capture_id, tags.captured_at) if capture_id else (_end_of(path), *files)
+        original, their_files = kept.setdefault(key, (group, files))
+        if original[0].path.parent == path.parent or not (capture_id or _are_same_captures(original, group)):
+            continue
+        copies[path.parent, original[0].path.parent].append(files == their_files)
+        bands = {b.name for f in original for b in f.bands}
+        original += [f for f in group if bands.isdisjoint(b.name for b in f.bands)]
+        original.sort(key=lambda f: (f.bands[0].is_from_photograph, natural_order(f.path.name)))
+        group.clear()
+    problems = []
+    for (folder, first), exact in copies.items():
+        text = f"{folder}: left out {counted(len(exact), 'capture')} that {first} has"
+        problems.append(Problem(folder, InputError(text), is_harmless=all(exact)))
+    return [group for group in groups if group], problems
+
+
+def _are_same_captures(one: Sequence[ImageFile], other: Sequence[ImageFile]) -> bool:
+    """Return True for captures of equally many files with the same bytes; False for a single band, which is none."""
+    has_bands = len(one) > 1 or one[0].is_whole_capture
+    return has_bands and all(same_bytes(a.path, b.path, False) for a, b in zip(one, other, strict=True))
+
+
+def _end_of(path: Path) -> bytes:
+    """Return the last bytes of a file, which distinguish most images of equal name and size."""
+    count = 4096
+    with path.open("rb") as file:
+        file.seek(max(0, path.stat().st_size - count))
+        return file.read()
 
 
 def _paths_in_name(path: Path) -> list[Path]:

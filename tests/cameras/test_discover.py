@@ -114,6 +114,34 @@ def test_a_copy_is_used_where_its_original_is_missing_or_unreadable(images: Path
     assert found(images) == before
 
 
+@pytest.mark.parametrize("name", ["000 - Copy", "Copy of 000", "backup/card 2/000"])
+def test_a_folder_copied_next_to_itself_counts_once(flight: Path, tmp_path: Path, name: str) -> None:
+    shutil.copytree(flight, tmp_path / "in")
+    first = write_all(tmp_path / "in" / "0000SET" / "000", "plot_red", "plot_nir", "field")
+    write(first / "ortho.tif", bands=3)
+    before, copy = found(tmp_path / "in"), tmp_path / "in" / "0000SET" / name
+    shutil.copytree(first, copy)
+    (first / "IMG_0001_4.tif").unlink()  # the copy has it
+    result = discover(tmp_path / "in")
+    assert {c.label: [b.name for b in c.bands] for c in result.captures} == before
+    (problem,) = [p for p in result.problems if "field" not in p.text]
+    assert problem.text == f"{copy}: left out 4 captures that {first} has"
+    assert not problem.is_harmless
+    write(copy / "ortho.tif", bands=4)
+    assert len(discover(tmp_path / "in").captures) == len(before) + 1
+
+
+def test_of_equal_files_the_one_among_its_siblings_is_kept(images: Path) -> None:
+    before = found(images)
+    shutil.copy(images / "IMG_0002_4.tif", images / "IMG_0001_4.tif")
+    result = discover(images)
+    first, second = result.captures
+    assert (first.name, first.missing_bands, second.name) == ("IMG_0001", ("NIR",), "IMG_0002")
+    assert [b.name for b in second.bands] == before["IMG_0002"]
+    (problem,) = result.problems
+    assert "IMG_0001_4.tif: is left out, because it is a copy of IMG_0002_4.tif" in problem.text
+
+
 def test_the_overview_of_a_camera_is_that_of_most_captures() -> None:
     """The first one lacks green, and has a band that the others lack."""
     first = replace(capture("first", "RM01", ("Blue", "Red", "Blue-2")), reference_index=0)
