@@ -34,6 +34,8 @@ class Camera(ABC):
     """The XMP values that identify a flight, tried in turn."""
     band_in_name: re.Pattern[str]
     """The end of a file's name, without suffix, that differs between the bands of a capture."""
+    has_free_names = False
+    """True if users choose the names of its files."""
     clock_is_utc = False
     """True if its Exif times are in UTC."""
     utc_times: tuple[Name, ...] = ()
@@ -49,7 +51,7 @@ class Camera(ABC):
 
     def capture_name(self, path: Path) -> str:
         """Return the part of a file name that all bands of a capture share."""
-        return self.band_in_name.sub("", path.stem)
+        return self.band_in_name.sub("", own_stem(path))
 
     def capture_key(self, path: Path, tags: Tags) -> str:
         """Return a text that is the same for all files of a capture, and unique for a camera and folder."""
@@ -138,6 +140,13 @@ def other_rig_seed(reference: Band, moving: Band) -> Matrix | None:
 
 
 # ---- for the modules of the cameras
+
+
+def own_stem(path: Path) -> str:
+    """Return the name of a file without suffix, and without the end that copies have, such as ' (1)' or ' - Copy'."""
+    end = r" ?\((?:\d+|copy)\)$|(?: ?[-\N{EN DASH}]| ) ?(?:copy|kopie|copie|copia)(?: ?\(?\d+\)?)?$"
+    return re.sub(end, "", path.stem, flags=re.IGNORECASE) or path.stem
+
 
 FULL_SCALE = 65536.0
 """Divisor of pixel values in the radiometric models of the makers: bands are stored as 16 bits."""

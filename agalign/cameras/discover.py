@@ -14,13 +14,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agalign.cameras.base import reference_index
-from agalign.cameras.generic import Generic, compile_pattern
+from agalign.cameras.generic import Generic
 from agalign.cameras.grouping import (
     band_file_owners,
     capture_of,
     group_files,
     pattern_clashes,
     tag_problems,
+    with_bands_of_names,
     with_missing_bands,
     with_tags_of_flight,
     with_unique_band_names,
@@ -78,7 +79,7 @@ def discover(folder: str | Path, options: DiscoverOptions | None = None) -> Fold
     paths, problems = _chosen_images(folder, options)
     files, copies = without_copies(_read(paths, options, problems))
     files, damaged = with_tags_of_flight(files)
-    files = with_one_spelling(files)
+    files = with_one_spelling(with_bands_of_names(files))
     captures: list[Capture] = []
     groups, copied = without_copied_captures(group_files(files, with_rgb=options.with_rgb))
     problems += copies + copied + damaged + tag_problems(files) + contradictions(groups)
@@ -150,7 +151,8 @@ def _check_bands(groups: Sequence[Sequence[ImageFile]], chosen: Sequence[str], f
 
 def _check_pattern(pattern: str | None, paths: Sequence[Path], folder: Path) -> None:
     """Raise ConfigurationError if a pattern matches no file."""
-    if pattern is not None and not any(one.fullmatch(p.name) for one in compile_pattern(pattern) for p in paths):
+    camera = Generic(pattern)
+    if pattern is not None and not any(camera.split(p)[1] for p in paths):
         what = f"--pattern '{pattern}' matches none of {len(paths)} images, such as {paths[0].name}"
         raise ConfigurationError(f"{folder}: {what}")
 

@@ -20,7 +20,7 @@ from pathlib import Path
 import numpy as np
 
 from agalign.cameras import pix4d
-from agalign.cameras.base import FULL_SCALE, Camera, colour_bands
+from agalign.cameras.base import FULL_SCALE, Camera, colour_bands, own_stem
 from agalign.cameras.known import MAVIC_3, PHANTOM_4
 from agalign.cameras.metadata import Tags
 from agalign.errors import GeometryError
@@ -45,7 +45,7 @@ class Dji(Camera):
         return tags.make.upper() == "DJI" or (NAMESPACE, "CaptureUUID") in tags.xmp
 
     def bands(self, path: Path, tags: Tags, stored: Sequence[Band]) -> tuple[Band, ...]:
-        is_mavic = _is_mavic_3(tags) or bool(re.search(_MAVIC_3_BAND, path.stem, re.IGNORECASE))
+        is_mavic = _is_mavic_3(tags) or bool(re.search(_MAVIC_3_BAND, own_stem(path), re.IGNORECASE))
         centre = pair(tags, "RelativeOpticalCenter")
         by_centres = None if centre is None else geometry.translation(-centre[0], -centre[1])
         calibrated = _matrix(tags, "CalibratedHMatrix")
@@ -134,7 +134,7 @@ def _is_mavic_3(tags: Tags) -> bool:
 
 
 def _band_in_name(path: Path) -> str:
-    part = Dji.band_in_name.search(path.stem)
+    part = Dji.band_in_name.search(own_stem(path))
     known = {**PHANTOM_4.bands, **MAVIC_3.bands}.get(part[0].upper().removeprefix("_MS_")) if part else None
     return known[0] if known else path.stem
 

@@ -12,8 +12,8 @@ from pathlib import Path
 from types import MappingProxyType
 
 from agalign.cameras import camera_of
-from agalign.cameras.base import Camera, colour_bands, listed, reference_index
-from agalign.cameras.generic import Generic
+from agalign.cameras.base import Camera, colour_bands, listed, own_stem, reference_index
+from agalign.cameras.generic import Generic, Layout, is_band_name, split_elsewhere
 from agalign.cameras.identity import name_end
 from agalign.cameras.known import lacking
 from agalign.cameras.metadata import Tags
@@ -58,7 +58,9 @@ def without_copies(files: Sequence[ImageFile]) -> tuple[list[ImageFile], list[Pr
             is_exact = same_bytes(original.path, file.path, shallow=False)
             if is_exact:
                 text = f"is left out, because it is a copy of {original.path.name}"
-            elif original is kept.get(by_tags) and original.path in _paths_in_name(file.path):
+            elif original.path in _paths_in_name(file.path) and (
+                original is kept.get(by_tags) if ids[file.path] else original.path.stem == own_stem(file.path)
+            ):
                 text = f"is left out as a changed copy of {original.path.name}: same band and capture; keep one of them"
             else:
                 continue
@@ -185,6 +187,30 @@ def group_files(files: Iterable[ImageFile], *, with_rgb: bool = False) -> list[l
     return [sorted(group, key=lambda f: f.bands[0].is_from_photograph) for group in groups.values()]
 
 
+def with_bands_of_names(files: Sequence[ImageFile]) -> list[ImageFile]:
+    """Return the files, those of single bands without tags with the band of their folder or of the beginning of their
+    name, if names of other bands agree otherwise: nir/7.tif and red/7.tif, or NIR07.tif and RED07.tif.
+    """
+    result = {file.path: file for file in files}
+    layouts: tuple[Layout, ...] = "start", "folder"
+    for layout in layouts:
+        camera = Generic(layout=layout)
+        captures: dict[tuple[Path, str], dict[str, list[ImageFile]]] = defaultdict(lambda: defaultdict(list))
+        for file in (f for f in files if f.camera.has_free_names and len(f.bands) == 1):
+            if (parts := split_elsewhere(file.path, layout)) is not None:
+                captures[camera.capture_folder(file.path), parts[0]][band_key(parts[1])].append(file)
+        several = [(folder, name) for (folder, name), found in captures.items() if len(found) > 1]
+        numbered = Counter(folder for folder, _ in several)
+        for folder, name in several:
+            # A number alone may be that of a band: red1.tif, red2.tif.
+            is_sure = layout == "folder" or not name.isdecimal() or numbered[folder] > 1
+            found = list(captures[folder, name].values())
+            for file in (f for files_of_band in found for f in files_of_band if is_sure and max(map(len, found)) == 1):
+                bands = camera.bands(file.path, file.tags, [replace(file.bands[0], name="")])
+                result[file.path] = replace(file, camera=camera, bands=bands)
+    return list(result.values())
+
+
 def _join_photographs(groups: dict[_GroupKey, list[ImageFile]], *, with_rgb: bool) -> None:
     """Join colour TIFFs of 8 bits with the single bands of the same capture name, or remove them."""
     for key, (file, *_) in list(groups.items()):
@@ -300,7 +326,7 @@ def capture_of(files: Sequence[ImageFile], folder: Path, options: DiscoverOption
     tags = _tags_of(reference, files)
     camera = camera_of(tags)
     serials = sorted({f.tags.serial for f in files if f.tags.serial})
-    own_folder = first.camera.capture_folder(first.path)  # above the input if that is the folder of one band
+    own_folder = _capture_folder(files)  # above the input if that is the folder of one band
     return Capture(
         name=(first.path.stem if len(files) == 1 else first.camera.capture_name(first.path)) or "capture",
         folder=own_folder.relative_to(folder) if own_folder.is_relative_to(folder) else Path(),
@@ -316,6 +342,14 @@ def capture_of(files: Sequence[ImageFile], folder: Path, options: DiscoverOption
         missing_bands=_lacking(files, tags.model, options.bands),
         elevation_deg=camera.elevation_deg(tags),
     )
+
+
+def _capture_folder(files: Sequence[ImageFile]) -> Path:
+    """The folder of a capture: that above the folders of its bands."""
+    folders = {f.path.parent for f in files}
+    if len(folders) > 1 and len({p.parent for p in folders}) == 1 and all(is_band_name(p.name) for p in folders):
+        return files[0].path.parent.parent
+    return files[0].camera.capture_folder(files[0].path)
 
 
 def _lacking(files: Sequence[ImageFile], model: str, names: Sequence[str]) -> tuple[str, ...]:

@@ -7,6 +7,7 @@ from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 
+from agalign.cameras.base import own_stem
 from agalign.cameras.known import SAME_BAND_NM
 from agalign.cameras.pix4d import NAMESPACE
 from agalign.cameras.read_files import ImageFile, Problem
@@ -37,13 +38,14 @@ def with_one_spelling(files: Sequence[ImageFile]) -> list[ImageFile]:
 
 
 def _camera(file: ImageFile) -> tuple[object, ...]:
-    """Make and model, or the folder without a model."""
-    return (file.tags.make, file.tags.model) if file.tags.model else (file.camera.capture_folder(file.path),)
+    """Make and model, or the folder without a model; multiband files apart from those of single bands."""
+    known = (file.tags.make, file.tags.model) if file.tags.model else (file.camera.capture_folder(file.path),)
+    return (*known, len(file.bands) > 1)
 
 
 def name_end(file: ImageFile) -> str:
     """Return the end of a file's name that differs between the bands of a capture, without separators."""
-    return file.path.stem.removeprefix(file.camera.capture_name(file.path)).strip("_- ")
+    return own_stem(file.path).removeprefix(file.camera.capture_name(file.path)).strip("_- ")
 
 
 def _position(file: ImageFile) -> str:

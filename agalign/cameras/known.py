@@ -51,6 +51,21 @@ halves of a dual camera differ by 12 nm.
 """
 
 
+_OWN_NAMING = (
+    (re.compile(r"_MS_(G|RE?|NIR)(?![a-z0-9])", re.IGNORECASE), MAVIC_3),
+    (re.compile(r"(?<=_\d{6}_\d{6}_\d{4})_(GRE|RED|REG|NIR)(?![a-z0-9])", re.IGNORECASE), SEQUOIA),
+)
+"""The part of a file's name, by which a camera distinguishes its bands, that no other name has."""
+
+
+def named_by_camera(text: str) -> tuple[str, str]:
+    """Return (text without the band, band) of a text with a camera's own name of a file; no band for other texts."""
+    for pattern, camera in _OWN_NAMING:
+        if match := pattern.search(text):  # in linear time, because the text may be a damaged tag
+            return text[: match.start()] + text[match.end() :], camera.bands[match[1].upper()][0]
+    return text, ""
+
+
 def lacking(model: str, bands: Sequence[tuple[str, Band]]) -> list[str]:
     """Return the names of the bands that a camera of this model records and a capture lacks, given its bands with the
     end of the file's name. The half of a dual camera without any band lacks none.

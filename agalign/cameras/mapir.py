@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from agalign.cameras.base import Camera
+from agalign.cameras.base import Camera, own_stem
 from agalign.cameras.metadata import Tags
 from agalign.values.capture import Band
 
@@ -29,7 +29,7 @@ class Mapir(Camera):
             return tuple(replace(b, name=f"band_{b.band_index}", one_lens=True) for b in stored)
         bandpass = re.search(r"-F(?P<wavelength>\d{3,4})$", tags.model)
         if not bandpass:
-            file = _FILE.match(path.stem)
+            file = _FILE.match(own_stem(path))
             return (replace(stored[0], name=f"band_{file['serial']}" if file else path.stem),)
         wavelength_nm = float(bandpass["wavelength"])
         longest_nm = {"Blue": 500, "Green": 600, "Red": 690, "Red edge": 760, "NIR": 1100}
@@ -37,5 +37,5 @@ class Mapir(Camera):
         return (replace(stored[0], name=name, wavelength_nm=wavelength_nm),)
 
     def capture_name(self, path: Path) -> str:
-        file = _FILE.match(path.stem)
+        file = _FILE.match(own_stem(path))
         return f"capture_{file['moment']}" if file else path.stem

@@ -25,7 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agalign.cameras import pix4d
-from agalign.cameras.base import FULL_SCALE, Camera, is_thermal, rays_to_rig, rotation
+from agalign.cameras.base import FULL_SCALE, Camera, is_thermal, own_stem, rays_to_rig, rotation
 from agalign.cameras.metadata import Tags, finite
 from agalign.values.capture import Band, CaptureTime, Pose, Position, Radiometry
 
@@ -55,7 +55,7 @@ class MicaSense(Camera):
         return tags.make.lower() == "micasense" or (NAMESPACE, "CaptureId") in tags.xmp
 
     def bands(self, path: Path, tags: Tags, stored: Sequence[Band]) -> tuple[Band, ...]:
-        numbered = self.band_in_name.search(path.stem)
+        numbered = self.band_in_name.search(own_stem(path))
         band = pix4d.described(stored[0], tags, f"band{numbered[0]}" if numbered else path.stem)
         lens = pix4d.perspective_lens(tags)
         offset = pix4d.lens_offset(tags)

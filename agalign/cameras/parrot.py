@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from agalign.cameras import pix4d
-from agalign.cameras.base import Camera, colour_bands, rays_to_rig, rotation
+from agalign.cameras.base import Camera, colour_bands, own_stem, rays_to_rig, rotation
 from agalign.cameras.known import SEQUOIA
 from agalign.cameras.metadata import Tags
 from agalign.values.capture import Band
@@ -45,7 +45,7 @@ class Sequoia(Camera):
         to_rig = rays_to_rig(lens, rotation(*pix4d.rig_degrees(tags)) @ to_camera)
         if len(stored) > 1:
             return colour_bands(stored, lens, to_rig)
-        suffix = self.band_in_name.search(path.stem)
+        suffix = self.band_in_name.search(own_stem(path))
         described = pix4d.described(stored[0], tags, path.stem)
         known = SEQUOIA.bands.get(suffix[1].upper()) if suffix else None
         name = known[0] if known else suffix[1] if suffix else described.name

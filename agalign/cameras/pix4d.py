@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from agalign.cameras.known import named_by_camera
 from agalign.cameras.metadata import Tags, finite
 from agalign.pixels.radiometry import plausible
 from agalign.values.capture import Band, Panel, Pose, Radiometry
@@ -93,10 +94,12 @@ def rig_unit_m(bands: Iterable[Band]) -> float:
 
 
 def described(band: Band, tags: Tags, name: str) -> Band:
-    """Return the band with the name in its tags, else `name`, and the centre wavelength and bandwidth in them, nm."""
+    """Return the band with the name in its tags or description, else `name`, and the centre wavelength and bandwidth in
+    the tags, nm.
+    """
     return replace(
         band,
-        name=tags.text(NAMESPACE, "BandName") or name,
+        name=tags.text(NAMESPACE, "BandName") or named_by_camera(band.name)[1] or name,
         wavelength_nm=tags.number(NAMESPACE, "CentralWavelength"),
         bandwidth_nm=tags.number(NAMESPACE, "WavelengthFWHM"),
     )

@@ -151,6 +151,9 @@ def test_the_overview_of_a_camera_is_that_of_most_captures() -> None:
     assert (set(overview.bands), overview.size_px) == (set(RED), (64, 48))
 
 
+EDGE_AND_GREEN = ["Red edge", "Green"]
+
+
 @pytest.mark.parametrize(
     ("names", "pattern", "expected"),
     [
@@ -162,6 +165,28 @@ def test_the_overview_of_a_camera_is_that_of_most_captures() -> None:
         # Files of other names and equal bytes are no copies: two sensors that are covered record the same.
         ("I_1_1 I_1_10 f_red f_red_edge", None, {"I_1": ["1", "10"], "f": ["red", "red_edge"]}),
         ("plot_7/red plot_7/nir", None, {"plot_7/plot_7": ["nir", "red"]}),
+        # A folder for each band, with the same names or with the band in each name.
+        ("nir/f7 red/f7 nir/f9 red/f9", None, {"f7": ["nir", "red"], "f9": ["nir", "red"]}),
+        ("a/R/1 a/G/1 a/MS_NIR/1 a/RE/1", None, {"a/1": ["G", "MS_NIR", "R", "RE"]}),
+        ("550nm/i_01 840nm/i_01 550nm/i_02", None, {"i_01": ["550nm", "840nm"]}),
+        ("green/f_1_GRE nir/f_1_NIR", None, {"f_1": ["GRE", "NIR"]}),
+        ("nir/f_red nir/f_green red/f_red red/f_blue", None, {"nir/f": ["green", "red"], "red/f": ["blue", "red"]}),
+        ("nir/f7 red/f7", "{band}/{capture}.tif", {"f7": ["nir", "red"]}),
+        ("d1/a/7 d1/b/7 d2/a/8 d2/b/8", "{band}/{capture}.tif", {"d1/7": ["a", "b"], "d2/8": ["a", "b"]}),
+        # The band at the beginning of each name.
+        ("GRN01 NIR01 GRN11 NIR11", None, {"01": ["GRN", "NIR"], "11": ["GRN", "NIR"]}),
+        ("Red_IMG_7 Green_IMG_7", None, {"IMG_7": ["Green", "Red"]}),
+        ("r-1 g-1 nir-1 r-2 g-2 nir-2", None, {"1": ["g", "nir", "r"], "2": ["g", "nir", "r"]}),
+        ("blue red1 red2 nir1", None, {"": ["blue", "nir1", "red1", "red2"]}),
+        ("GRN01 NIR01 GRN11 NIR11", "{band}{capture}.tif", {"01": ["GRN", "NIR"], "11": ["GRN", "NIR"]}),
+        ("CHA01 CHB01 CHA11", "{band}{capture}.tif", {"01": ["CHA", "CHB"]}),
+        ("01RedEdge 01NIR 11NIR 11red", "{capture}{band}.tif", {"01": ["NIR", "RedEdge"], "11": ["NIR", "red"]}),
+        # The end that a browser adds to the only copy is no part of the name; a unit belongs to the wavelength.
+        ("f_red f_green#(1) f_nir#-#Copy", None, {"f": ["green", "nir", "red"]}),
+        ("c_0475_nm c_0560_nm c_842-nm", None, {"c": ["0475_nm", "0560_nm", "842-nm"]}),
+        # A camera's own names, without tags.
+        ("DJI_1_MS_R_clip DJI_1_MS_NIR_clip", None, {"DJI_1_clip": ["NIR", "Red"]}),
+        ("IMG_180413_080658_0000_REG IMG_180413_080658_0000_GRE", None, {"IMG_180413_080658_0000": EDGE_AND_GREEN}),
         ("I_7_1 I_7_2 f_red_edge f_red", "{capture}_{band}.tif", {"I_7": ["1", "2"], "f": ["red", "red_edge"]}),
         ("A-of-7 B-of-7 A-of-8 B-of-8", "{band}-of-{capture}.tif", {"7": ["A", "B"], "8": ["A", "B"]}),
         ("a_1.png a_2.png", "{capture}_{band}.png", {"a": ["1", "2"]}),
@@ -174,8 +199,13 @@ def test_the_overview_of_a_camera_is_that_of_most_captures() -> None:
 def test_captures_by_the_names_of_files(
     tmp_path: Path, names: str, pattern: str | None, expected: dict[str, list[str]]
 ) -> None:
-    assert found(write_all(tmp_path, *names.split()), pattern=pattern) == expected
-    assert discover(tmp_path, DiscoverOptions(pattern=pattern)).problems == ()
+    write_all(tmp_path, *(name.replace("#", " ") for name in names.split()))
+    result = {label: sorted(bands) for label, bands in found(tmp_path, pattern=pattern).items()}
+    assert result == {label or tmp_path.name: sorted(bands) for label, bands in expected.items()}
+    problems = discover(tmp_path, DiscoverOptions(pattern=pattern)).problems
+    assert [p.path.name for p in problems] == ["i_02.tif"] * ("550nm/i_02" in names) + ["CHA11.tif"] * (
+        "CHA11" in names
+    )
 
 
 def test_a_band_without_tags_joins_the_capture_of_its_name(images: Path) -> None:

@@ -1,17 +1,27 @@
 """Bands and captures are recognised by evidence: what is known of the camera, tags and names together."""
 
 import shutil
+import signal
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
+import rasterio
 
 from agalign.cameras.discover import DiscoverOptions, discover
+from agalign.cameras.generic import Generic
+from agalign.cameras.metadata import Tags
 from agalign.cameras.pix4d import NAMESPACE
 from agalign.cameras.tiff_directory import byte_string, text
 from agalign.errors import InputError
+from agalign.pixels.raster import probe
 from agalign.products.indices.formulas import bands_for, index_named
+from agalign.values.capture import Band
+from agalign.values.spectrum import role_of
 
+from ..conftest import write_band
 from .test_vendors import MICASENSE, VENDORS, packet, tagged, write_capture, write_file
 
 pytestmark = pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
@@ -115,3 +125,77 @@ def test_spellings_of_a_name_are_one_band(tmp_path: Path) -> None:
     assert {(c.reference.name, c.missing_bands) for c in result.captures} == {("Red edge", ())}
     assert not result.problems
     assert len(discover(tmp_path, DiscoverOptions(bands=("nir", "rededge"))).captures[0].bands) == 2
+
+
+@pytest.mark.parametrize(
+    ("file", "description", "expected"),
+    [
+        ("ms_crop_nir", "DJI_20251128093951_0003_MS_NIR", "NIR"),
+        ("ms_crop_2", "DJI_20251128093951_0003_MS_RE", "RedEdge"),
+        ("clip_b2", "IMG_180413_080658_0000_GRE", "Green"),
+        ("clip_nir", "IMG_0007_4", "nir"),
+        ("clip_red", "ortho crop", "red"),
+        ("clip_red", "field_nir", "nir"),
+        ("clip_red", "NIR", "NIR"),
+        ("clip_2", "yield", "2"),
+    ],
+)
+def test_a_description_that_is_a_file_s_name_gives_way_to_the_band_in_it(
+    tmp_path: Path, file: str, description: str, expected: str
+) -> None:
+    write_band(tmp_path / f"{file}.tif", np.ones((8, 8), np.uint16))
+    with rasterio.open(tmp_path / f"{file}.tif", "r+") as image:
+        image.descriptions = (description,)
+    (band,) = Generic().bands(tmp_path / f"{file}.tif", Tags(), probe(tmp_path / f"{file}.tif"))
+    assert band.name == expected
+
+
+def test_descriptions_of_layers_that_are_files_names_are_bands(tmp_path: Path) -> None:
+    write_band(tmp_path / "a.tif", np.ones((3, 8, 8), np.uint16))
+    for parts, expected in ((("MS_R", "MS_RE", "MS_NIR"), ["Red", "RedEdge", "NIR"]), (("a", "MS_R", "MS_R"), None)):
+        names = [f"DJI_20251128093951_0003_{part}" for part in parts]
+        with rasterio.open(tmp_path / "a.tif", "r+") as image:
+            image.descriptions = tuple(names)
+        bands = Generic().bands(tmp_path / "a.tif", Tags(), probe(tmp_path / "a.tif"))
+        assert [b.name for b in bands] == (expected or names)
+
+
+def test_tagged_files_in_a_folder_for_each_band_are_named_without_it(tmp_path: Path) -> None:
+    write_capture(tmp_path, VENDORS["Mavic 3"])
+    for path in list(tmp_path.glob("*.TIF")):
+        folder = tmp_path / "flight" / path.stem.rpartition("_")[2]
+        folder.mkdir(parents=True)
+        path.rename(folder / path.name)
+    (capture,) = discover(tmp_path).captures
+    assert (capture.label, len(capture.bands)) == (f"flight/{VENDORS['Mavic 3'].capture}", 4)
+
+
+@pytest.mark.parametrize("name", ["IMG_0007_2 (1)", "IMG_0007_2 - Copy", "IMG_0007_2 copy 2"])
+def test_the_name_of_the_only_copy_is_read_without_its_end(tmp_path: Path, name: str) -> None:
+    write_capture(tmp_path, VENDORS["RedEdge"], damage="missing")
+    (tmp_path / "IMG_0007_2.tif").rename(tmp_path / f"{name}.tif")
+    (capture,) = discover(tmp_path).captures
+    assert (capture.name, {b.name for b in capture.bands}) == ("IMG_0007", {f"band_{k}" for k in range(1, 6)})
+
+
+def test_a_changed_copy_without_tags_is_left_out_next_to_its_original(tmp_path: Path) -> None:
+    for k, name in enumerate(("f_red", "f_nir", "f_red (1)")):
+        write_band(tmp_path / f"{name}.tif", np.full((8, 8), k, np.uint16))
+    assert [[b.name for b in c.bands] for c in discover(tmp_path).captures] == [["nir", "red"]]
+    (text_,) = texts(tmp_path)
+    assert "f_red (1).tif: is left out as a changed copy of f_red.tif" in text_
+
+
+def test_long_tags_take_no_quadratic_time(tmp_path: Path) -> None:
+    """Two megabytes take less than a second; file systems limit the names of files."""
+    stored = Band("", tmp_path / "a_red.tif", 1, 8, 8, "uint16")
+    signal.alarm(60)
+    try:
+        for part in ("_", " ", "red", "(1)", " - copy", "_MS_", "1", "_MS_R1", "_180413"):
+            long = part * ((1 << 21) // len(part))
+            tags = Tags(xmp={(NAMESPACE, "BandName"): (long,)})
+            Generic().bands(stored.path, tags, [replace(stored, name=long)])
+            Generic().bands(stored.path, tags, [replace(stored, name=long)] * 2)
+            assert role_of(long, 560.0) == "green"
+    finally:
+        signal.alarm(0)
