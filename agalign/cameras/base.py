@@ -49,6 +49,10 @@ class Camera(ABC):
     def bands(self, path: Path, tags: Tags, stored: Sequence[Band]) -> tuple[Band, ...]:
         """Return the bands in one of its files, with lens and `to_rig`; `stored` is from `pixels.raster.probe`."""
 
+    def has_one_lens(self, tags: Tags) -> bool:
+        """Return True for a camera whose files of several bands are from one lens, also with more than 8 bits."""
+        return False
+
     def capture_name(self, path: Path) -> str:
         """Return the part of a file name that all bands of a capture share."""
         return self.band_in_name.sub("", own_stem(path))

@@ -212,9 +212,9 @@ def with_bands_of_names(files: Sequence[ImageFile]) -> list[ImageFile]:
 
 
 def _join_photographs(groups: dict[_GroupKey, list[ImageFile]], *, with_rgb: bool) -> None:
-    """Join colour TIFFs of 8 bits with the single bands of the same capture name, or remove them."""
+    """Join colour TIFFs with the single bands of the same capture name, or remove them."""
     for key, (file, *_) in list(groups.items()):
-        colours = [(b.name, b.dtype) for b in file.bands] == [(c, "uint8") for c in ("Red", "Green", "Blue")]
+        colours = [b.name for b in file.bands] == ["Red", "Green", "Blue"]
         named = re.sub(r"[ _-]?(rgb|vis)$", "", file.path.stem, flags=re.IGNORECASE)
         if colours and file.is_whole_capture and (bands := groups.get((key[0], key[1], named))):
             del groups[key]
@@ -395,7 +395,9 @@ def _bands_to_align(files: Sequence[ImageFile], names: Sequence[str]) -> list[Ba
     if len(bands) < 2:
         raise InputError(f"{first.path}: a band with no companion; {companion_advice(first.path)}")
     if len(files) == 1 and first.bands[0].one_lens:
-        raise InputError(f"{first.path}: its bands come through one lens; there is nothing to align")
+        other = " (a second camera needs files of the same names in another folder, named by its filter)"
+        advice = other if first.camera.has_one_lens(first.tags) else ""
+        raise InputError(f"{first.path}: its bands come through one lens; there is nothing to align{advice}")
     return bands
 
 

@@ -45,6 +45,18 @@ KNOWN_CAMERAS = (
         },
     ),
 )
+Channels = Mapping[int, tuple[str, float]]
+"""{channel of a photograph, from 1: (band, centre wavelength in nm)}."""
+SENTERA_FILTERS: Mapping[str, Channels] = {
+    "NDRE": {1: ("Red edge", 720.0), 3: ("NIR", 840.0)},
+    "NDVI": {1: ("Red", 625.0), 3: ("NIR", 850.0)},
+}
+SURVEY3_FILTERS: Mapping[str, Channels] = {
+    "RGN": {1: ("Red", 660.0), 2: ("Green", 550.0), 3: ("NIR", 850.0)},
+    "OCN": {1: ("Orange", 615.0), 2: ("Cyan", 490.0), 3: ("NIR", 808.0)},
+    "NGB": {1: ("NIR", 850.0), 2: ("Green", 550.0), 3: ("Blue", 475.0)},
+    "RGB": {1: ("Red", 660.0), 2: ("Green", 550.0), 3: ("Blue", 475.0)},
+}
 SAME_BAND_NM = 8.0
 """Largest difference of the wavelengths that firmware versions write for a band (840 and 842 nm); those of the two
 halves of a dual camera differ by 12 nm.

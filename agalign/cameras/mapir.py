@@ -2,6 +2,7 @@
 
 File names are `capture_<serial>_<sequence>_<date>_<time>_<fraction>.tiff`; the part after the serial number identifies
 the capture. The model `LATT-<sensor>-<lens>-F<filter>` contains the wavelength. There are no rig tags.
+Files of two Survey3 are joined if they have one name, in a folder for each camera that is named by its filter (RGN).
 """
 
 import re
@@ -10,6 +11,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from agalign.cameras.base import Camera, own_stem
+from agalign.cameras.known import SURVEY3_FILTERS
 from agalign.cameras.metadata import Tags
 from agalign.values.capture import Band
 
@@ -24,9 +26,14 @@ class Mapir(Camera):
     def recognises(self, tags: Tags) -> bool:
         return "mapir" in tags.make.lower() or tags.model.upper().startswith(("LATT-", "SURVEY3"))
 
+    def has_one_lens(self, tags: Tags) -> bool:
+        return tags.model.upper().startswith("SURVEY3")
+
     def bands(self, path: Path, tags: Tags, stored: Sequence[Band]) -> tuple[Band, ...]:
         if len(stored) > 1:
-            return tuple(replace(b, name=f"band_{b.band_index}", one_lens=True) for b in stored)
+            channels = SURVEY3_FILTERS.get(tags.model.upper().rpartition("_")[2], {})
+            named = [(b, *channels.get(b.band_index, (f"band_{b.band_index}", None))) for b in stored]
+            return tuple(replace(b, name=name, wavelength_nm=nm, one_lens=True) for b, name, nm in named)
         bandpass = re.search(r"-F(?P<wavelength>\d{3,4})$", tags.model)
         if not bandpass:
             file = _FILE.match(own_stem(path))
@@ -35,6 +42,9 @@ class Mapir(Camera):
         longest_nm = {"Blue": 500, "Green": 600, "Red": 690, "Red edge": 760, "NIR": 1100}
         name = next((n for n, nm in longest_nm.items() if wavelength_nm <= nm), f"{wavelength_nm:g}nm")
         return (replace(stored[0], name=name, wavelength_nm=wavelength_nm),)
+
+    def capture_folder(self, path: Path) -> Path:
+        return path.parent.parent if path.parent.name.upper() in SURVEY3_FILTERS else path.parent
 
     def capture_name(self, path: Path) -> str:
         file = _FILE.match(own_stem(path))

@@ -81,10 +81,11 @@ def read_file(path: Path, cameras: Iterable[Camera], options: DiscoverOptions) -
     stored, size_px = pages[0], pages[0][0].size_px
     tags = read_tags(path, stored[0].page)
     # A stack was made by software, even if its tags name a camera: cameras write single bands and photographs.
-    is_photograph = stored[0].dtype == "uint8" and len(stored) in (3, 4)
-    is_stack = suffix_format(path) == "TIFF" and len(stored) > 1 and not is_photograph
     *_, generic = cameras
-    camera = generic if is_stack else next(c for c in cameras if c.recognises(tags))
+    camera = next(c for c in cameras if c.recognises(tags))
+    is_photograph = (stored[0].dtype == "uint8" or camera.has_one_lens(tags)) and len(stored) in (3, 4)
+    if suffix_format(path) == "TIFF" and len(stored) > 1 and not is_photograph:
+        camera = generic
     named = list(camera.bands(path, tags, stored))
     for page in pages[1:]:
         named += camera.bands(path, read_tags(path, page[0].page), page)

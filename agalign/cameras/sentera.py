@@ -14,12 +14,11 @@ import numpy as np
 
 from agalign.cameras import pix4d
 from agalign.cameras.base import Camera, colour_bands
+from agalign.cameras.known import SENTERA_FILTERS
 from agalign.cameras.metadata import Tags
 from agalign.values.capture import Band, Pose
 
 _BAND_FOLDER = re.compile(r"^(?:\d+-)?(?P<name>[A-Za-z ]+?)-(?P<wavelength>\d{3,4})(?:-(?P<width>\d+))?$")
-_CHANNELS = {"NDRE": {1: ("Red edge", 720.0), 3: ("NIR", 840.0)}, "NDVI": {1: ("Red", 625.0), 3: ("NIR", 850.0)}}
-"""Bands of single-lens cameras by the filter: {channel, from 1: (name, centre wavelength in nm)}."""
 _SENTERA = "sentera.com"
 
 
@@ -60,13 +59,13 @@ class Sentera(Camera):
 
 def _channel_bands(path: Path, tags: Tags, stored: Sequence[Band]) -> tuple[Band, ...]:
     """The bands of a photograph by the filter in the name of its folder or model, else red, green and blue."""
-    bandpass = next((k for k in _CHANNELS if k in f"{path.parent.name} {tags.model}".upper()), None)
+    bandpass = next((k for k in SENTERA_FILTERS if k in f"{path.parent.name} {tags.model}".upper()), None)
     if bandpass is None:
         # The colour camera of the Double 4K takes part by default, that of the 6X does not.
         return tuple(replace(b, is_from_photograph="6X" in tags.model.upper()) for b in colour_bands(stored))
     return tuple(
         replace(stored[index - 1], name=name, wavelength_nm=wavelength, one_lens=True)
-        for index, (name, wavelength) in _CHANNELS[bandpass].items()
+        for index, (name, wavelength) in SENTERA_FILTERS[bandpass].items()
         if index <= len(stored)
     )
 

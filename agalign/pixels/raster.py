@@ -176,14 +176,13 @@ def _bands(path: Path, dataset: rasterio.DatasetReader, max_pixels: int) -> tupl
     if dataset.tags(ns="IMAGE_STRUCTURE").get("MINISWHITE") == "YES":
         remedy = "export it with 0 as black (photometric interpretation MinIsBlack)"
         raise UnreadableFileError(f"{path}: is stored inverted (photometric interpretation MinIsWhite); {remedy}")
-    has_alpha = count > 1 and ColorInterp.alpha in dataset.colorinterp
-    alpha = dataset.colorinterp.index(ColorInterp.alpha) + 1 if has_alpha else None
+    alpha = _alpha_index(dataset)
     indices = [i for i in dataset.indexes if i != alpha]
     colours = [dataset.colorinterp[i - 1].name.capitalize() for i in indices]
     is_colour = sorted(colours) == ["Blue", "Green", "Red"]
     if is_colour and suffix_format(path) == "TIFF" and _is_grey(dataset, indices):
         indices, is_colour = indices[:1], False
-    has_mask = MaskFlags.per_dataset in dataset.mask_flag_enums[0]
+    has_mask = alpha is not None or MaskFlags.per_dataset in dataset.mask_flag_enums[0]
     georeference, overviews = _georeference(dataset), tuple(dataset.overviews(1))
     return tuple(
         Band(
@@ -342,9 +341,17 @@ def transformed(points: NDArray[np.float64], from_crs: str, to_crs: str) -> NDAr
 
 def _dataset_mask(dataset: rasterio.DatasetReader, index: int, **reading: Any) -> Mask | np.bool_:
     """Return the mask of a file, read with these options of `read_masks`; True for a file without a mask."""
-    if MaskFlags.per_dataset not in dataset.mask_flag_enums[index - 1]:
-        return np.True_
-    return np.asarray(dataset.read_masks(index, **reading) > 0)
+    if MaskFlags.per_dataset in dataset.mask_flag_enums[index - 1]:
+        return np.asarray(dataset.read_masks(index, **reading) > 0)
+    # GDAL reports the alpha band as a mask only for files of 2 or 4 bands.
+    alpha = _alpha_index(dataset)
+    return np.True_ if alpha is None else np.asarray(dataset.read(alpha, **reading) > 0)
+
+
+def _alpha_index(dataset: rasterio.DatasetReader) -> int | None:
+    """Return the index of the alpha band of a file of several bands, from 1; None without one."""
+    colours = dataset.colorinterp
+    return colours.index(ColorInterp.alpha) + 1 if len(colours) > 1 and ColorInterp.alpha in colours else None
 
 
 def _georeference(dataset: rasterio.DatasetReader) -> Georeference | None:

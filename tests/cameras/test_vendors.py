@@ -286,12 +286,30 @@ def test_a_double_4k_lists_its_bands_and_calls_one_garbage(tmp_path: Path) -> No
         assert Sentera().capture_folder(path) == tmp_path
 
 
-def test_three_bands_of_one_lens_are_no_capture(tmp_path: Path) -> None:
-    path = tmp_path / "survey.tif"
-    tifffile.imwrite(path, np.zeros((120, 160, 3), np.uint8), photometric="rgb", metadata=None)
-    add_directories(path, {271: text("MAPIR"), 272: text("Survey3W_RGN")}, {}, {})
+def survey3(path: Path, camera: str, dtype: str) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    tifffile.imwrite(path, np.zeros((120, 160, 3), dtype), photometric="rgb", metadata=None)
+    add_directories(path, {271: text("MAPIR"), 272: text(camera)}, {}, {})
+
+
+@pytest.mark.parametrize("dtype", ["uint8", "uint16"])
+def test_three_bands_of_one_lens_are_no_capture(tmp_path: Path, dtype: str) -> None:
+    survey3(tmp_path / "survey.tif", "Survey3W_RGN", dtype)
     result = discover(tmp_path)
     assert (result.captures, "one lens" in result.problems[0].text) == ((), True)
+    assert "a second camera needs files of the same names in another folder" in result.problems[0].text
+
+
+def test_two_cameras_of_one_lens_each_are_a_capture(tmp_path: Path) -> None:
+    for filter_ in ("RGN", "OCN", "NGB"):
+        survey3(tmp_path / filter_ / "2021_0827_193517_009.tif", f"Survey3N_{filter_}", "uint16")
+    capture = only_capture(tmp_path)
+    wavelengths = {(b.path.parent.name, b.band_index): b.wavelength_nm for b in capture.bands}
+    assert [wavelengths["RGN", k] for k in (1, 2, 3)] == [660, 550, 850]
+    assert [wavelengths["OCN", k] for k in (1, 2, 3)] == [615, 490, 808]
+    assert [wavelengths["NGB", k] for k in (1, 2, 3)] == [850, 550, 475]
+    assert len(capture.moving_lenses) == 2
+    assert capture.label == "2021_0827_193517_009"
 
 
 def test_dji_radiometry_is_the_guides_formula(tmp_path: Path) -> None:

@@ -15,10 +15,11 @@ from agalign.cameras.generic import Generic
 from agalign.cameras.metadata import Tags
 from agalign.cameras.pix4d import NAMESPACE
 from agalign.errors import UnreadableFileError
-from agalign.pixels.raster import probe, with_saturation_values
+from agalign.pixels.raster import probe, read_for_alignment, read_tile, with_saturation_values
 from agalign.products.sidecar.file import find_sidecars, read_without_tables
 from agalign.values.capture import Band, Capture
 from agalign.values.choices import Quality
+from agalign.values.image import Tile
 
 from ..cameras.test_vendors import packet, tagged
 from ..conftest import textured_image, write_band, write_capture
@@ -162,10 +163,30 @@ def test_an_inverted_image_is_refused(tmp_path: Path) -> None:
         probe(tmp_path / "a.tif")
 
 
-@pytest.mark.parametrize("name", ["f.tif", "f_RGB.tif"])
-def test_colour_images_of_one_lens_are_companions_of_the_bands(tmp_path: Path, name: str) -> None:
+@pytest.mark.parametrize(("bands", "alpha"), [(1, 2), (3, 4), (4, 5), (5, 1), (5, 6), (9, 3)])
+def test_an_alpha_band_is_the_mask_of_any_number_of_bands(tmp_path: Path, bands: int, alpha: int) -> None:
+    planes = np.stack([texture_numbers(seed=k) for k in range(bands + 1)])
+    planes[alpha - 1] = 0
+    planes[alpha - 1, :, 100:] = 65535
+    write_band(tmp_path / "a.tif", planes)
+    with rasterio.open(tmp_path / "a.tif", "r+") as file:
+        colours = [ColorInterp.gray] + [ColorInterp.undefined] * bands
+        colours[alpha - 1] = ColorInterp.alpha
+        file.colorinterp = colours
+    stored = probe(tmp_path / "a.tif")
+    assert [b.band_index for b in stored] == [k for k in range(1, bands + 2) if k != alpha]
+    assert all(b.has_mask for b in stored)
+    for band in stored:
+        _, valid = read_tile(band, Tile(0, 0, 320, 240))
+        assert valid[:, 100:].all()
+        assert not valid[:, :100].any()
+        assert not read_for_alignment(band, 160).valid[:, :48].any()
+
+
+@pytest.mark.parametrize(("name", "dtype"), [("f.tif", "uint8"), ("f_RGB.tif", "uint8"), ("f_RGB.tif", "uint16")])
+def test_colour_images_of_one_lens_are_companions_of_the_bands(tmp_path: Path, name: str, dtype: str) -> None:
     write_capture(tmp_path, "green", "red", "nir")
-    colours = np.stack([texture_numbers(seed=k) // 16 for k in range(3)], axis=-1).astype(np.uint8)
+    colours = np.stack([texture_numbers(seed=k) // 16 for k in range(3)], axis=-1).astype(dtype)
     tifffile.imwrite(tmp_path / name, colours, photometric="rgb")
     (capture,) = discover(tmp_path).captures
     assert {b.name for b in capture.bands} == {"green", "red", "nir"}
