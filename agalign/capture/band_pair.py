@@ -17,7 +17,7 @@ from agalign.fit.window_fit import lens_std_px
 from agalign.fit.windows import FixedWindows
 from agalign.flight.model import FlightModel
 from agalign.flight.rig_prediction import unobserved_error_px
-from agalign.pixels.band_resampling import channel_mean, warped
+from agalign.pixels.band_resampling import MIN_VALID_SHARE, channel_mean, textured, warped
 from agalign.pixels.raster import ReadTile, read_for_alignment
 from agalign.pixels.stripes import without_common_stripes
 from agalign.pixels.structure import blur_px
@@ -27,7 +27,7 @@ from agalign.values.capture import Band, Capture
 from agalign.values.choices import SeedKind, Space
 from agalign.values.geometry import Matrix
 from agalign.values.image import Raster
-from agalign.values.issues import NO_SUCH_SEED, UNREADABLE, Issue
+from agalign.values.issues import BLANK_MOVING, FEW_VALID, NO_SUCH_SEED, UNREADABLE, Issue, IssueKind
 from agalign.values.mapping import DisplacementField, PixelMapping
 from agalign.values.pixel_units import PixelScale
 
@@ -223,14 +223,19 @@ def read_pairs(
             unusable |= dict.fromkeys((b.name for b in bands), issue)
             continue
         try:
-            moving = _mean(read_for_alignment(b, _LONGEST_SIDE_PX, read) for b in bands)
+            images = [read_for_alignment(b, _LONGEST_SIDE_PX, read) for b in bands]
         except AgalignError as error:
             unusable |= dict.fromkeys((b.name for b in bands), Issue(UNREADABLE, detail=str(error)))
             continue
         longest = longest_for(capture.reference, next(iter(matrices.values())))
         if longest not in references:
             references[longest] = Reference(read_for_alignment(capture.reference, longest, read))
-        pairs.append(_pair(capture.reference, references[longest], longest, bands, moving, matrices, model))
+        by_name = {b.name: image for b, image in zip(bands, images, strict=True)}
+        usable = {name: image for name, image in by_name.items() if textured(image)} or by_name
+        unusable |= {n: blank_issue(image, BLANK_MOVING) for n, image in by_name.items() if n not in usable}
+        moving = _mean(_mostly_valid(list(usable.values())))
+        pair = _pair(capture.reference, references[longest], longest, bands, moving, matrices, model)
+        pairs.append(replace(pair, bands=tuple(b for b in bands if b.name in usable)))
     return _without_stripes(pairs, references[_LONGEST_SIDE_PX]), unusable
 
 
@@ -305,6 +310,20 @@ def _seed_std_px(band: str, model: FlightModel | None, scale: PixelScale) -> dic
         min_std_px = 1.0  # of the mean: captures differ by this in height and tilt
         result["model"] = float(max(error_px, min_std_px) * scale.x)
     return result
+
+
+def blank_issue(image: Raster, kind: IssueKind) -> Issue:
+    """Return the issue of an image that is not `textured`: few valid pixels, or `kind` if all are invalid or equal."""
+    share = float(image.valid.mean())
+    name = kind.code.removeprefix("blank_")
+    return Issue(FEW_VALID, share, MIN_VALID_SHARE, name) if 0 < share <= MIN_VALID_SHARE else Issue(kind)
+
+
+def _mostly_valid(images: Sequence[Raster]) -> list[Raster]:
+    """Return the images without those that are valid in less than half of the area of another: they would mask it."""
+    min_share = 0.5
+    areas = [np.count_nonzero(image.valid) for image in images]
+    return [image for image, area in zip(images, areas, strict=True) if area >= min_share * max(areas)]
 
 
 def _mean(rasters: Iterable[Raster]) -> Raster:

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from agalign.capture.band_pair import BandPair, SeedMatrices
+from agalign.capture.band_pair import BandPair, SeedMatrices, blank_issue
 from agalign.capture.warped_pair import WarpedPair
 from agalign.config import SeedSettings
 from agalign.fit.window_fit import fit_in_rounds
@@ -38,9 +38,9 @@ thermal and a blue image to three quarters."""
 def find_seed(pair: BandPair, settings: SeedSettings, model: FlightModel | None = None) -> Seed | Issue:
     """Return the best seed of a pair, or the issue that prevents one. A `match` uses the network of `model`."""
     if not pair.reference.is_textured:
-        return Issue(BLANK_REFERENCE)
+        return blank_issue(pair.reference.image, BLANK_REFERENCE)
     if not textured(pair.moving):
-        return Issue(BLANK_MOVING)
+        return blank_issue(pair.moving, BLANK_MOVING)
     matrices = pair.seed_matrices
     # With a flight's mapping, the forced kind was already used in the captures from which the flight was learned.
     force = None if "model" in matrices else settings.force

@@ -84,9 +84,13 @@ def warped(
     return Raster(np.asarray(pixels, np.float32), np.asarray(valid))
 
 
-def textured(raster: Raster, min_share: float = 0.02) -> bool:
-    """Return True if more than `min_share` of the pixels are valid and not all of them are equal."""
-    if np.count_nonzero(raster.valid) <= min_share * raster.valid.size:
+MIN_VALID_SHARE = 0.02
+"""Of the pixels of an image that can be aligned: windows need areas that are valid."""
+
+
+def textured(raster: Raster) -> bool:
+    """Return True if more than MIN_VALID_SHARE of the pixels are valid and not all of them are equal."""
+    if np.count_nonzero(raster.valid) <= MIN_VALID_SHARE * raster.valid.size:
         return False
     mask = raster.valid.astype(np.uint8)
     return any(float(cv2.meanStdDev(plane, mask=mask)[1].item()) > 0 for plane in raster.planes)

@@ -68,6 +68,14 @@ UNREADABLE = IssueKind(
 )
 BLANK_REFERENCE = IssueKind("blank_reference", "the reference band is constant or all invalid", _BLANK)
 BLANK_MOVING = IssueKind("blank_moving", "the moving band is constant or all invalid", _BLANK)
+FEW_VALID = IssueKind(
+    "few_valid",
+    "only {value:.2%} of the {detail} band is valid",
+    Remedy(
+        "too few valid pixels: nodata, an alpha band or saturation masks the rest",
+        "crop the file to its data (gdal_translate -projwin), and look at its nodata value and its alpha band",
+    ),
+)
 NO_SUCH_SEED = IssueKind("no_such_seed", "this band has no {detail} seed; omit --seed", _ASKED)
 SEED_ASKED_FOR = IssueKind("seed_asked_for", "only the seed was requested", _ASKED)
 NO_CONTRAST = IssueKind("no_contrast", "no pixel of the reference band has enough contrast to learn from", TEXTURELESS)
@@ -94,6 +102,9 @@ OTHER_GEOMETRY = IssueKind(
     ),
 )
 """Reported for a band that only a homography or displacement field aligns, in a capture with a relief."""
+
+OF_FILES = frozenset((UNREADABLE, BLANK_REFERENCE, BLANK_MOVING, FEW_VALID))
+"""Kinds of issues of a single file, with remedies that hold for mosaics too."""
 
 # ---- kinds of issues that checks report
 
@@ -151,6 +162,7 @@ KINDS: Mapping[str, IssueKind] = {
         UNREADABLE,
         BLANK_REFERENCE,
         BLANK_MOVING,
+        FEW_VALID,
         NO_SUCH_SEED,
         SEED_ASKED_FOR,
         NO_CONTRAST,

@@ -1,3 +1,4 @@
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,16 +12,20 @@ import agalign
 from agalign.cameras.discover import discover
 from agalign.capture.band_pair import _seed_std_px, longest_for, read_pairs
 from agalign.capture.by_rig import observed
+from agalign.capture.seeding import find_seed
 from agalign.config import SeedSettings
 from agalign.flight.model import FlightModel
 from agalign.flight.rig import Rig
+from agalign.pixels.raster import probe
 from agalign.synthetic.flight import score_against_truth
 from agalign.values import geometry
 from agalign.values.alignment import Alignment, Seed
-from agalign.values.capture import Band
+from agalign.values.capture import Band, Capture
+from agalign.values.issues import Issue, sentence
 from agalign.values.pixel_units import PixelScale
 
 from ..builders import joint_result, pair_of, whole
+from ..conftest import textured_image, write_band
 
 pytestmark = pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
 
@@ -31,6 +36,54 @@ def test_the_reference_is_computed_once_for_all_bands(flight: Path) -> None:
     assert len(pairs) == 4
     assert len({id(p.reference) for p in pairs}) == 1
     assert all(p.space == "undistorted" for p in pairs)
+
+
+def mosaic(path: Path, change: Callable[[np.ndarray], None]) -> Capture:
+    """A reference, and four bands of one lens that `change` modifies."""
+    scene = 1000 + 300 * textured_image(160, 120, 0)
+    planes = np.stack([scene + 10 * k for k in range(4)]).astype(np.uint16)
+    change(planes)
+    write_band(path / "reference.tif", scene.astype(np.uint16))
+    write_band(path / "mosaic.tif", planes, nodata=0)
+    moving = [replace(b, name=f"b{b.band_index}", one_lens=True) for b in probe(path / "mosaic.tif")]
+    return Capture("mosaic", Path(), (*probe(path / "reference.tif"), *moving), 0)
+
+
+@pytest.mark.parametrize(
+    ("number", "value", "reason"),
+    [
+        (3, np.s_[:, :], "the moving band is constant or all invalid"),
+        (0, np.s_[:, 2:], "only 1.25% of the moving band is valid"),
+        (1, np.s_[1:, :], "only 0.83% of the moving band is valid"),
+        (2, np.s_[:, 64:], ""),
+    ],
+)
+@pytest.mark.parametrize("fill", [0, 65535])
+def test_one_bad_band_of_a_lens_does_not_mask_the_others(
+    tmp_path: Path, number: int, value: tuple[slice, slice], reason: str, fill: int
+) -> None:
+    def change(planes: np.ndarray) -> None:
+        planes[(number, *value)] = fill
+
+    (pair,), unusable = read_pairs(mosaic(tmp_path, change), SeedSettings(force="identity"))
+    assert pair.moving.valid.mean() > 0.9
+    assert pair.name == "b1"
+    bad = f"b{number + 1}"
+    assert (bad in unusable, bad in {b.name for b in pair.bands}) == (bool(reason), not reason)
+    assert len(pair.bands) == (3 if reason else 4)
+    if reason and fill == 0:
+        assert sentence(unusable[bad]) == reason
+
+
+def test_a_file_with_few_valid_pixels_says_how_few(tmp_path: Path) -> None:
+    def change(planes: np.ndarray) -> None:
+        planes[:, 2:] = 0
+
+    (pair,), unusable = read_pairs(mosaic(tmp_path, change), SeedSettings(force="identity"))
+    assert not unusable
+    issue = find_seed(pair, SeedSettings(force="identity"))
+    assert isinstance(issue, Issue)
+    assert sentence(issue) == "only 1.66% of the moving band is valid"
 
 
 def test_without_one_lens_neither_is_corrected(flight: Path) -> None:

@@ -16,7 +16,7 @@ from agalign.flight.rig_file import model_fingerprint
 from agalign.products.run.excluded import PanelPart, read_excluded
 from agalign.products.sidecar.schema import BandResult, Sidecar
 from agalign.values.capture import CaptureTime
-from agalign.values.issues import CONTRADICTED, MISSING_BAND, MOSAICS, TEXTURELESS, UNEXPECTED_PX, UNREADABLE, Remedy
+from agalign.values.issues import CONTRADICTED, MISSING_BAND, MOSAICS, OF_FILES, TEXTURELESS, UNEXPECTED_PX, Remedy
 
 MAX_PIXEL_ERROR_PX = 1.0
 """Beyond it, a spectral index mixes neighbouring plants."""
@@ -190,7 +190,7 @@ def remedy_of(band: BandResult, *, is_mosaic: bool) -> Remedy:
     if not band.issues:
         return Remedy("no reason was recorded", "run again with --overwrite")
     kind = band.issues[0].kind
-    if is_mosaic and kind is not UNREADABLE:
+    if is_mosaic and kind not in OF_FILES:
         return MOSAICS
     if abs(band.exposed_after_s or 0.0) >= _MIN_APART_S and kind.remedy in CONTRADICTED:
         return _APART
