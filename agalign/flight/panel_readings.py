@@ -258,22 +258,24 @@ def _detect(band: Band, *, without_code: bool) -> DetectedPanel | None:
     except AgalignError:
         return None
     result = find_panel(replace(image, lens=None), without_code=without_code)
-    if result is None:
-        return None
+    if result is None or not result.area_px:
+        return result
     in_file_px = PixelScale.between(band.size_px, image.size_px).inverse.positions(result.area_px)
     return replace(result, area_px=tuple((x, y) for x, y in in_file_px.tolist()))
 
 
 def _read(band: Band, albedos: Albedos) -> BandReading:
-    panel = band.panel
+    panel, problem = band.panel, "it was not found in this band"
     if panel is not None and not panel.corners_px:
         # Firmware that recognises a panel does not always write its position.
         detected = _detect(band, without_code=True)
         panel = panel if detected is None else replace(panel, corners_px=detected.area_px)
+        if detected is not None and detected.is_ambiguous:
+            problem = "several squares of different brightness may be the panel; none is used"
         band = replace(band, panel=panel)
     albedo = albedos.get(band.name.lower(), albedos.get("", None if panel is None else panel.albedo))
     if panel is None or not panel.corners_px:
-        return BandReading(band, albedo, problem="it was not found in this band")
+        return BandReading(band, albedo, problem=problem)
     try:
         return BandReading(band, albedo, *_radiance(band, panel))
     except AgalignError as error:

@@ -40,6 +40,10 @@ _CODE_AREA_RATIOS = (0.3, 6.0)
 """Minimum and maximum area of the panel, relative to that of its code."""
 _CODE_DISTANCE = 3.0
 """Maximum distance between the centres of panel and code, in sides of the code."""
+_TARGET_RATIO = 0.5
+"""Minimum area of another square of a target, relative to the largest."""
+_TARGET_CONTRAST = 1.2
+"""Minimum ratio of the brightness of two squares of a target: evenly lit pixels of one panel differ by less."""
 _IMAGE_SHARES = (0.004, 0.3)
 """Minimum and maximum area of a panel without a code, relative to the image."""
 _AIMED_SHARE = 0.02
@@ -58,6 +62,8 @@ class DetectedPanel:
     """(x, y) of the corners of the area to measure, inside the panel; empty if only the code was detected."""
     in_scene: bool = False
     """The panel is small and far from the image centre: the camera was aimed at something else."""
+    is_ambiguous: bool = False
+    """Several squares of different brightness may be the panel, as of a target with several reflectances."""
 
 
 def find_panel(image: Raster, *, without_code: bool = False) -> DetectedPanel | None:
@@ -70,9 +76,13 @@ def find_panel(image: Raster, *, without_code: bool = False) -> DetectedPanel | 
     if not code and not without_code:
         return None
     smooth = np.asarray(cv2.GaussianBlur(stretched, (0, 0), 2.0), np.uint8)  # dark panels are noisy
-    largest = _largest_panel(smooth, code_corners)
+    squares = _squares(smooth, code_corners)
+    largest = next((s for s in squares if _is_panel(smooth, s)), None)
     if largest is None:
         return None if code_corners is None else DetectedPanel(code, (), _is_in_scene(code_corners, smooth))
+    others = [s for s in squares if code_corners is None and _is_of_one_target(smooth, largest, s)]
+    if any(_is_panel(smooth, other) for other in others):
+        return DetectedPanel("", (), _is_in_scene(largest, smooth), is_ambiguous=True)
     area = tuple((x, y) for x, y in _scaled(largest).tolist())
     return DetectedPanel(code, area, _is_in_scene(largest, smooth))
 
@@ -84,12 +94,19 @@ def _is_in_scene(square: Corners, image: NDArray[np.uint8]) -> bool:
     return bool(off_centre > _OFF_CENTRE and _area(square) < _AIMED_SHARE * image.size)
 
 
-def _largest_panel(image: NDArray[np.uint8], code: Corners | None) -> Corners | None:
-    """Return the largest square that may be a panel, next to the code if there is one; None without any."""
+def _squares(image: NDArray[np.uint8], code: Corners | None) -> list[Corners]:
+    """Return the squares of the size of a panel, the largest first, next to the code if there is one."""
     limits = _IMAGE_SHARES if code is None else tuple(share * _area(code) / image.size for share in _CODE_AREA_RATIOS)
     squares = _quadrilaterals(image, limits[0] * image.size, limits[1] * image.size)
-    squares = [s for s in squares if code is None or _is_next_to(s, code)]
-    return next((s for s in sorted(squares, key=_area, reverse=True) if _is_panel(image, s)), None)
+    return sorted((s for s in squares if code is None or _is_next_to(s, code)), key=_area, reverse=True)
+
+
+def _is_of_one_target(image: NDArray[np.uint8], largest: Corners, other: Corners) -> bool:
+    """Return True for another square of similar size and different brightness beside the largest."""
+    centres = np.array([largest.mean(axis=0), other.mean(axis=0)])
+    dark, bright = sorted(float(image[y, x]) for x, y in np.rint(centres).astype(int))
+    is_beside = np.linalg.norm(centres[1] - centres[0]) > _area(largest) ** 0.5
+    return bool(is_beside and _area(other) > _TARGET_RATIO * _area(largest) and bright > _TARGET_CONTRAST * dark)
 
 
 def albedo_of(code: str, wavelength_nm: float | None) -> float | None:

@@ -46,6 +46,21 @@ def test_a_square_without_a_code_is_detected_only_on_request(panel: np.ndarray) 
     assert panel[inside(result.area_px, panel.shape)].mean() == pytest.approx(0.51, abs=0.005)
 
 
+TARGETS = {(0.03, 0.21, 0.45, 0.86): True, (0.45, 0.86): True, (0.2, 0.3, 0.5): True, (0.5, 0.5): False, (0.5,): False}
+
+
+@pytest.mark.parametrize(("reflectances", "is_ambiguous"), TARGETS.items())
+def test_of_several_squares_of_different_brightness_none_is_the_panel(
+    reflectances: tuple[float, ...], is_ambiguous: bool
+) -> None:
+    scene = np.full((300, 400), 0.08)
+    for k, reflectance_ in enumerate(reflectances):
+        x, y = 140 + 60 * (k % 2), 90 + 60 * (k // 2)
+        scene[y : y + 50, x : x + 50] = reflectance_
+    result = find_panel(raster(scene), without_code=True)
+    assert (result.is_ambiguous, result.area_px == ()) == (is_ambiguous, is_ambiguous)
+
+
 @pytest.mark.parametrize(("at", "in_scene"), [((0, 0), True), ((540, 405), True), ((270, 200), False)])
 def test_a_small_panel_far_from_the_centre_is_part_of_a_scene(
     panel: np.ndarray, at: tuple[int, int], in_scene: bool
