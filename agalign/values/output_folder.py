@@ -12,7 +12,7 @@ from pathlib import Path
 from filelock import FileLock, Timeout
 
 from agalign.errors import ConfigurationError, OutputError
-from agalign.values.files import remove_partial_files
+from agalign.values.files import remove_partial_files, scratch_file
 from agalign.values.text import name_problem
 
 
@@ -51,6 +51,7 @@ def locked(out: Path) -> Iterator[None]:
     process ends, also when it is killed.
     """
     prepare_output(out)
+    _check_file_system(out)
     path = out / ".agalign.lock"
     # The existence of a file as lock (`SoftFileLock`) would outlast a killed process.
     lock = FileLock(path, thread_local=False, fallback_to_soft=False)
@@ -75,6 +76,28 @@ def locked(out: Path) -> Iterator[None]:
         with suppress(OSError):
             path.unlink(missing_ok=True)
         lock.release()
+
+
+def _check_file_system(out: Path) -> None:
+    """Raise OutputError if files in a folder cannot be changed at any position or renamed, as in a mounted bucket.
+
+    Other errors, such as of a full disk, are reported where a product is written.
+    """
+    unsupported = errno.ENOSYS, errno.ENOTSUP, errno.EOPNOTSUPP, errno.EPERM, errno.EINVAL, errno.ESPIPE
+    reason = ""
+    with suppress(OutputError), scratch_file(out / "old") as old, scratch_file(out / "new") as new:
+        for path in (old, new):
+            path.write_bytes(b"agalign")
+        try:
+            with new.open("r+b") as file:
+                file.seek(1)
+                file.write(b"A")
+            new.replace(old)
+        except OSError as error:
+            reason = error.strerror or "" if error.errno in unsupported else ""
+    if reason:
+        what = f"its file system cannot rename files or write to any position in them ({reason}), like a mounted bucket"
+        raise OutputError(f"{out}: {what}; choose a local folder with -o, and copy it afterwards")
 
 
 def is_full(out: Path) -> bool:
