@@ -17,6 +17,7 @@ from agalign.cameras.metadata import Tags
 from agalign.cameras.xmp import Name
 from agalign.errors import GeometryError, NoSuchBandError
 from agalign.values import geometry
+from agalign.values.band_names import own_stem
 from agalign.values.capture import Band, CaptureTime, Pose
 from agalign.values.geometry import Matrix
 from agalign.values.lens import Lens
@@ -50,7 +51,7 @@ class Camera(ABC):
         """Return the bands in one of its files, with lens and `to_rig`; `stored` is from `pixels.raster.probe`."""
 
     def has_one_lens(self, tags: Tags) -> bool:
-        """Return True for a camera whose files of several bands are from one lens, also with more than 8 bits."""
+        """Return True for a camera with one lens for all bands of a file, also of more than 8 bits."""
         return False
 
     def capture_name(self, path: Path) -> str:
@@ -144,12 +145,6 @@ def other_rig_seed(reference: Band, moving: Band) -> Matrix | None:
 
 
 # ---- for the modules of the cameras
-
-
-def own_stem(path: Path) -> str:
-    """Return the name of a file without suffix, and without the end that copies have, such as ' (1)' or ' - Copy'."""
-    end = r" ?\((?:\d+|copy)\)$|(?: ?[-\N{EN DASH}]| ) ?(?:copy|kopie|copie|copia)(?: ?\(?\d+\)?)?$"
-    return re.sub(end, "", path.stem, flags=re.IGNORECASE) or path.stem
 
 
 FULL_SCALE = 65536.0

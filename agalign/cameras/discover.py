@@ -19,6 +19,7 @@ from agalign.cameras.grouping import (
     band_file_owners,
     capture_of,
     group_files,
+    join_folders,
     pattern_clashes,
     tag_problems,
     with_bands_of_names,
@@ -26,7 +27,6 @@ from agalign.cameras.grouping import (
     with_tags_of_flight,
     with_unique_band_names,
     with_unique_capture_names,
-    without_copied_captures,
     without_copies,
 )
 from agalign.cameras.identity import contradictions, with_one_spelling
@@ -81,7 +81,7 @@ def discover(folder: str | Path, options: DiscoverOptions | None = None) -> Fold
     files, damaged = with_tags_of_flight(files)
     files = with_one_spelling(with_bands_of_names(files))
     captures: list[Capture] = []
-    groups, copied = without_copied_captures(group_files(files, with_rgb=options.with_rgb))
+    groups, copied = join_folders(group_files(files, with_rgb=options.with_rgb))
     problems += copies + copied + damaged + tag_problems(files) + contradictions(groups)
     _check_bands(groups, options.bands, folder)
     for group in groups:
@@ -151,8 +151,7 @@ def _check_bands(groups: Sequence[Sequence[ImageFile]], chosen: Sequence[str], f
 
 def _check_pattern(pattern: str | None, paths: Sequence[Path], folder: Path) -> None:
     """Raise ConfigurationError if a pattern matches no file."""
-    camera = Generic(pattern)
-    if pattern is not None and not any(camera.split(p)[1] for p in paths):
+    if pattern is not None and not any(Generic(pattern).split(p)[1] for p in paths):
         what = f"--pattern '{pattern}' matches none of {len(paths)} images, such as {paths[0].name}"
         raise ConfigurationError(f"{folder}: {what}")
 

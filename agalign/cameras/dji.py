@@ -20,16 +20,17 @@ from pathlib import Path
 import numpy as np
 
 from agalign.cameras import pix4d
-from agalign.cameras.base import FULL_SCALE, Camera, colour_bands, own_stem
+from agalign.cameras.base import FULL_SCALE, Camera, colour_bands
 from agalign.cameras.known import MAVIC_3, PHANTOM_4
 from agalign.cameras.metadata import Tags
 from agalign.errors import GeometryError
 from agalign.values import geometry
+from agalign.values.band_names import own_stem
 from agalign.values.capture import Band, Pose, Radiometry
 from agalign.values.geometry import Matrix
 from agalign.values.lens import Lens
 
-_MAVIC_3_BAND = rf"_(?:MS_(?:{'|'.join(MAVIC_3.bands)})|D)$"
+_MAVIC_3_BAND = rf"_(?:MS_(?:{'|'.join(MAVIC_3)})|D)$"
 NAMESPACE = "dji.com/drone-dji"
 
 
@@ -135,7 +136,7 @@ def _is_mavic_3(tags: Tags) -> bool:
 
 def _band_in_name(path: Path) -> str:
     part = Dji.band_in_name.search(own_stem(path))
-    known = {**PHANTOM_4.bands, **MAVIC_3.bands}.get(part[0].upper().removeprefix("_MS_")) if part else None
+    known = {**PHANTOM_4, **MAVIC_3}.get(part[0].upper().removeprefix("_MS_")) if part else None
     return known[0] if known else path.stem
 
 

@@ -1,6 +1,7 @@
 """Grouping of image files into captures: its files, reference band, missing bands and unique names."""
 
 import math
+import os
 import re
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Mapping, Sequence
@@ -12,8 +13,8 @@ from pathlib import Path
 from types import MappingProxyType
 
 from agalign.cameras import camera_of
-from agalign.cameras.base import Camera, colour_bands, listed, own_stem, reference_index
-from agalign.cameras.generic import Generic, Layout, is_band_name, split_elsewhere
+from agalign.cameras.base import Camera, colour_bands, listed, reference_index
+from agalign.cameras.generic import Generic, split_elsewhere
 from agalign.cameras.identity import name_end
 from agalign.cameras.known import lacking
 from agalign.cameras.metadata import Tags
@@ -22,16 +23,15 @@ from agalign.cameras.read_files import ImageFile, Problem, natural_order
 from agalign.config import DiscoverOptions
 from agalign.errors import InputError
 from agalign.pixels.raster import suffix_format
+from agalign.values.band_names import is_band_name, own_stem
 from agalign.values.capture import Band, CameraIdentity, Capture, CaptureTime, Pose
 from agalign.values.files import RUN_FILE
 from agalign.values.spectrum import band_key
-from agalign.values.text import counted, shortened
+from agalign.values.text import counted, shortened, some_of
 
 _GroupKey = tuple[str, str, str]
 """(camera, folder of the capture, the camera's capture key)."""
 _CameraKey = tuple[str, ...]
-_MAX_NAMES = 6
-"""Of tags in a message."""
 _MAX_HALVES_APART = timedelta(seconds=1)
 """Between the exposures of a dual camera, which are simultaneous; an id may occur again in another flight."""
 _SERIAL_SEPARATOR = "+"
@@ -72,46 +72,55 @@ def without_copies(files: Sequence[ImageFile]) -> tuple[list[ImageFile], list[Pr
     return [f for f in files if f.path not in copies], list(copies.values())
 
 
-def without_copied_captures(groups: Sequence[list[ImageFile]]) -> tuple[list[list[ImageFile]], list[Problem]]:
-    """Return the files of each capture without captures that another folder has too, and a problem for each folder with
-    such copies.
+def join_folders(groups: Sequence[list[ImageFile]]) -> tuple[list[list[ImageFile]], list[Problem]]:
+    """Return the files of each capture, with those of other folders that belong to it, and a problem for each folder
+    with copies, which are left out.
 
-    Copies have the same capture id and time, or without an id the same names and bytes. The folder with the shortest
-    path is kept. Bands that only a copy has are moved to the capture that is kept.
+    Files belong to a capture with the same id and time: the halves of a dual camera, which write to a card each, and
+    copies of folders. Without an id, copies have the same names and bytes. The folder with the shortest path is kept.
     """
-    kept: dict[object, tuple[list[ImageFile], list[tuple[str, int]]]] = {}
+    kept: dict[object, list[list[ImageFile]]] = defaultdict(list)
     copies: dict[tuple[Path, Path], list[bool]] = defaultdict(list)
     for group in sorted(groups, key=lambda g: (len(str(g[0].path.parent)), natural_order(str(g[0].path)))):
-        path, tags = group[0].path, group[0].tags
-        capture_id = tags.first_text(group[0].camera.capture_ids)
+        capture_id, here = group[0].tags.first_text(group[0].camera.capture_ids), group[0].path.parent
         files = [(f.path.name, f.path.stat().st_size) for f in group]
-        key = (group[0].camera.name, capture_id, tags.captured_at) if capture_id else (_end_of(path), *files)
-        original, their_files = kept.setdefault(key, (group, files))
-        if original[0].path.parent == path.parent or not (capture_id or _are_same_captures(original, group)):
+        of_key = kept[(group[0].camera.name, capture_id) if capture_id else (_end_of(group[0].path), *files)]
+        is_one = _is_of_one_moment if capture_id else _has_same_bytes
+        elsewhere = [o for o in of_key if o[0].path.parent != here and is_one(o, group)]
+        if not elsewhere:
+            of_key.append(group)
             continue
-        copies[path.parent, original[0].path.parent].append(files == their_files)
-        bands = {b.name for f in original for b in f.bands}
-        original += [f for f in group if bands.isdisjoint(b.name for b in f.bands)]
-        original.sort(key=lambda f: (f.bands[0].is_from_photograph, natural_order(f.path.name)))
+        original = elsewhere[0]
+        names = {f.path.stem for f in original} | {b.name for f in original for b in f.bands}
+        new = [f for f in group if names.isdisjoint((f.path.stem, *(b.name for b in f.bands)))]
+        if len(new) < len(group):
+            known = {(f.path.name, f.path.stat().st_size) for f in original}
+            copies[here, original[0].path.parent].append(known.issuperset(files))
+        original[:] = sorted((*original, *new), key=lambda f: natural_order(f.path.name))
         group.clear()
-    problems = []
-    for (folder, first), exact in copies.items():
-        text = f"{folder}: left out {counted(len(exact), 'capture')} that {first} has"
-        problems.append(Problem(folder, InputError(text), is_harmless=all(exact)))
-    return [group for group in groups if group], problems
+    problems = [
+        Problem(here, InputError(f"{here}: left out {counted(len(n), 'capture')} that {there} has"), is_harmless=all(n))
+        for (here, there), n in copies.items()
+    ]
+    # Colour photographs come last.
+    return [sorted(group, key=lambda f: f.bands[0].is_from_photograph) for group in groups if group], problems
 
 
-def _are_same_captures(one: Sequence[ImageFile], other: Sequence[ImageFile]) -> bool:
-    """Return True for captures of equally many files with the same bytes; False for a single band, which is none."""
-    has_bands = len(one) > 1 or one[0].is_whole_capture
-    return has_bands and all(same_bytes(a.path, b.path, False) for a, b in zip(one, other, strict=True))
+def _is_of_one_moment(one: Sequence[ImageFile], other: Sequence[ImageFile]) -> bool:
+    before, now = (CaptureTime.of(files[0].tags.captured_at) for files in (one, other))
+    return before == now or bool(before and now and abs(before.utc - now.utc) < _MAX_HALVES_APART)
+
+
+def _has_same_bytes(one: Sequence[ImageFile], other: Sequence[ImageFile]) -> bool:
+    """Return True for copies of a capture; a single band is none."""
+    same = (same_bytes(a.path, b.path, False) for a, b in zip(one, other, strict=True))
+    return (len(one) > 1 or one[0].is_whole_capture) and all(same)
 
 
 def _end_of(path: Path) -> bytes:
-    """Return the last bytes of a file, which distinguish most images of equal name and size."""
-    count = 4096
+    """Return the last 4096 bytes of a file, which distinguish most images of equal name and size."""
     with path.open("rb") as file:
-        file.seek(max(0, path.stat().st_size - count))
+        file.seek(-min(4096, path.stat().st_size), os.SEEK_END)
         return file.read()
 
 
@@ -137,9 +146,8 @@ def with_tags_of_flight(files: Sequence[ImageFile]) -> tuple[list[ImageFile], li
         if similar := of_band or of_camera:
             lacking |= dict.fromkeys(name for key, name in similar.tags.xmp if (key, name) not in file.tags.xmp)
         if lacking:
-            some = ", ".join([*lacking][:_MAX_NAMES]) + (", …" if len(lacking) > _MAX_NAMES else "")
-            text = f"{file.path}: its XMP packet is damaged and lacks {some}; copy the file from the card again"
-            problems.append(Problem(file.path, InputError(text), is_harmless=True))
+            text = f"its XMP packet is damaged and lacks {some_of(lacking)}; copy the file from the card again"
+            problems.append(Problem(file.path, InputError(f"{file.path}: {text}"), is_harmless=True))
         if "BandName" in lacking and of_band is not None and len(file.bands) == len(of_band.bands) == 1:
             (own,), (band,) = file.bands, of_band.bands
             own = replace(own, name=band.name, wavelength_nm=band.wavelength_nm, bandwidth_nm=band.bandwidth_nm)
@@ -172,7 +180,7 @@ def _similar(file: ImageFile) -> tuple[object, object]:
 
 
 def group_files(files: Iterable[ImageFile], *, with_rgb: bool = False) -> list[list[ImageFile]]:
-    """Return the files of each capture: same camera, folder and key. Colour photographs come last.
+    """Return the files of each capture: same camera, folder and key.
 
     Those in TIFFs next to bands of the same capture are left out unless `with_rgb`, as other photographs are.
     """
@@ -181,10 +189,9 @@ def group_files(files: Iterable[ImageFile], *, with_rgb: bool = False) -> list[l
         key = file.path.name if file.is_whole_capture else file.camera.capture_key(file.path, file.tags)
         groups[file.camera.name, str(file.camera.capture_folder(file.path)), key].append(file)
     _join_photographs(groups, with_rgb=with_rgb)
-    _join_folders(groups)
     _add_files_without_id(groups)
     _drop_copies(groups)
-    return [sorted(group, key=lambda f: f.bands[0].is_from_photograph) for group in groups.values()]
+    return list(groups.values())
 
 
 def with_bands_of_names(files: Sequence[ImageFile]) -> list[ImageFile]:
@@ -192,8 +199,7 @@ def with_bands_of_names(files: Sequence[ImageFile]) -> list[ImageFile]:
     name, if names of other bands agree otherwise: nir/7.tif and red/7.tif, or NIR07.tif and RED07.tif.
     """
     result = {file.path: file for file in files}
-    layouts: tuple[Layout, ...] = "start", "folder"
-    for layout in layouts:
+    for layout in ("start", "folder"):
         camera = Generic(layout=layout)
         captures: dict[tuple[Path, str], dict[str, list[ImageFile]]] = defaultdict(lambda: defaultdict(list))
         for file in (f for f in files if f.camera.has_free_names and len(f.bands) == 1):
@@ -204,8 +210,8 @@ def with_bands_of_names(files: Sequence[ImageFile]) -> list[ImageFile]:
         for folder, name in several:
             # A number alone may be that of a band: red1.tif, red2.tif.
             is_sure = layout == "folder" or not name.isdecimal() or numbered[folder] > 1
-            found = list(captures[folder, name].values())
-            for file in (f for files_of_band in found for f in files_of_band if is_sure and max(map(len, found)) == 1):
+            found = [files_of_band for files_of_band in captures[folder, name].values() if is_sure]
+            for file in (of_band[0] for of_band in found if max(map(len, found)) == 1):
                 bands = camera.bands(file.path, file.tags, [replace(file.bands[0], name="")])
                 result[file.path] = replace(file, camera=camera, bands=bands)
     return list(result.values())
@@ -219,22 +225,6 @@ def _join_photographs(groups: dict[_GroupKey, list[ImageFile]], *, with_rgb: boo
         if colours and file.is_whole_capture and (bands := groups.get((key[0], key[1], named))):
             del groups[key]
             bands += [replace(file, bands=colour_bands(file.bands))] if with_rgb else []
-
-
-def _join_folders(groups: dict[_GroupKey, list[ImageFile]]) -> None:
-    """Join groups of different folders with one capture id, the same time, and different bands and names of files: the
-    halves of a dual camera, which write to a card each.
-    """
-    first: dict[tuple[str, str], _GroupKey] = {}
-    for key, group in list(groups.items()):
-        if group[0].is_whole_capture or not group[0].tags.first_text(group[0].camera.capture_ids):
-            continue
-        joined = groups[first.setdefault((key[0], key[2]), key)]
-        names = [{f.path.stem for f in files} | {b.name for f in files for b in f.bands} for files in (joined, group)]
-        before, now = (CaptureTime.of(files[0].tags.captured_at) for files in (joined, group))
-        is_now = before == now or (before and now and abs(before.utc - now.utc) < _MAX_HALVES_APART)
-        if joined is not group and is_now and names[0].isdisjoint(names[1]):
-            joined += groups.pop(key)
 
 
 def _add_files_without_id(groups: dict[_GroupKey, list[ImageFile]]) -> None:
@@ -326,7 +316,11 @@ def capture_of(files: Sequence[ImageFile], folder: Path, options: DiscoverOption
     tags = _tags_of(reference, files)
     camera = camera_of(tags)
     serials = sorted({f.tags.serial for f in files if f.tags.serial})
-    own_folder = _capture_folder(files)  # above the input if that is the folder of one band
+    folders, own_folder = {f.path.parent for f in files}, first.camera.capture_folder(first.path)
+    if len(folders) > 1 and all(is_band_name(p.name) for p in folders):
+        own_folder = first.path.parent.parent  # above the input if that is the folder of one band
+    wanted = {band_key(name) for name in options.bands}
+    missing = lacking(tags.model, [(name_end(f), f.bands[0]) for f in files if tags.model and len(files) > 1])
     return Capture(
         name=(first.path.stem if len(files) == 1 else first.camera.capture_name(first.path)) or "capture",
         folder=own_folder.relative_to(folder) if own_folder.is_relative_to(folder) else Path(),
@@ -339,24 +333,9 @@ def capture_of(files: Sequence[ImageFile], folder: Path, options: DiscoverOption
         position=tags.position,
         pose=_pose(camera, tags, next((f for f in files if f.path == reference.path), first)),
         motion=camera.motion(tags),
-        missing_bands=_lacking(files, tags.model, options.bands),
+        missing_bands=tuple(name for name in missing if not wanted or band_key(name) in wanted),
         elevation_deg=camera.elevation_deg(tags),
     )
-
-
-def _capture_folder(files: Sequence[ImageFile]) -> Path:
-    """The folder of a capture: that above the folders of its bands."""
-    folders = {f.path.parent for f in files}
-    if len(folders) > 1 and len({p.parent for p in folders}) == 1 and all(is_band_name(p.name) for p in folders):
-        return files[0].path.parent.parent
-    return files[0].camera.capture_folder(files[0].path)
-
-
-def _lacking(files: Sequence[ImageFile], model: str, names: Sequence[str]) -> tuple[str, ...]:
-    """The bands with these names, or all, that the camera of a capture of several files records, and it lacks."""
-    wanted = {band_key(name) for name in names}
-    missing = lacking(model, [(name_end(f), f.bands[0]) for f in files]) if model and len(files) > 1 else []
-    return tuple(name for name in missing if not wanted or band_key(name) in wanted)
 
 
 def _pose(camera: Camera, tags: Tags, file: ImageFile) -> Pose | None:

@@ -2,49 +2,28 @@
 
 import re
 from collections.abc import Mapping, Sequence
-from typing import NamedTuple
 
 from agalign.values.capture import Band
 from agalign.values.spectrum import band_key
 
-
-class KnownCamera(NamedTuple):
-    """A camera with a file for each band."""
-
-    model: str
-    """A regular expression that matches the beginning of EXIF's model."""
-    bands: Mapping[str, tuple[str, float]]
-    """(name that the firmware writes, centre wavelength in nm) by the part of a file's name, or its number, that
-    distinguishes the bands of a capture."""
-
-
-MAVIC_3 = KnownCamera("M3M", {"G": ("Green", 560), "R": ("Red", 650), "RE": ("RedEdge", 730), "NIR": ("NIR", 860)})
-PHANTOM_4 = KnownCamera(
-    "FC6360", {"1": ("Blue", 450), "2": ("Green", 560), "3": ("Red", 650), "4": ("RedEdge", 730), "5": ("NIR", 840)}
+KnownBands = Mapping[str, tuple[str, float]]
+"""(name that the firmware writes, centre wavelength in nm) by the part of a file's name, or its number, that tells the
+bands of a capture apart.
+"""
+MAVIC_3: KnownBands = {"G": ("Green", 560), "R": ("Red", 650), "RE": ("RedEdge", 730), "NIR": ("NIR", 860)}
+PHANTOM_4 = {"1": ("Blue", 450), "2": ("Green", 560), "3": ("Red", 650), "4": ("RedEdge", 730), "5": ("NIR", 840)}
+SEQUOIA: KnownBands = {"GRE": ("Green", 550), "RED": ("Red", 660), "REG": ("Red edge", 735), "NIR": ("NIR", 790)}
+_6X = {"0": ("Blue", 475), "1": ("Green", 550), "2": ("Red", 670), "3": ("RedEdge", 715), "4": ("NIR", 840)}
+_REDEDGE = {"1": ("Blue", 475), "2": ("Green", 560), "3": ("Red", 668), "4": ("NIR", 840), "5": ("Red edge", 717)}
+# The second half of a dual camera has the model of the first.
+_REDEDGE_BLUE = {"6": ("Blue-444", 444), "7": ("Green-531", 531), "8": ("Red-650", 650)}
+_REDEDGE_BLUE |= {"9": ("Red edge-705", 705), "10": ("Red edge-740", 740)}
+_KNOWN: Sequence[tuple[str, KnownBands]] = (
+    *(("M3M", MAVIC_3), ("FC6360", PHANTOM_4), ("Sequoia", SEQUOIA)),
+    *((".*6X", _6X), ("RedEdge", _REDEDGE), ("RedEdge-M", _REDEDGE_BLUE)),
 )
-SEQUOIA = KnownCamera(
-    "Sequoia", {"GRE": ("Green", 550), "RED": ("Red", 660), "REG": ("Red edge", 735), "NIR": ("NIR", 790)}
-)
-KNOWN_CAMERAS = (
-    MAVIC_3,
-    PHANTOM_4,
-    SEQUOIA,
-    KnownCamera(
-        ".*6X", {"0": ("Blue", 475), "1": ("Green", 550), "2": ("Red", 670), "3": ("RedEdge", 715), "4": ("NIR", 840)}
-    ),
-    KnownCamera(
-        "RedEdge",
-        {"1": ("Blue", 475), "2": ("Green", 560), "3": ("Red", 668), "4": ("NIR", 840), "5": ("Red edge", 717)},
-    ),
-    # The second half of a dual camera, which has the model of the first.
-    KnownCamera(
-        "RedEdge-M",
-        {
-            **{"6": ("Blue-444", 444), "7": ("Green-531", 531), "8": ("Red-650", 650)},
-            **{"9": ("Red edge-705", 705), "10": ("Red edge-740", 740)},
-        },
-    ),
-)
+"""(regular expression of the beginning of EXIF's model, bands) of the cameras with a file for each band."""
+
 Channels = Mapping[int, tuple[str, float]]
 """{channel of a photograph, from 1: (band, centre wavelength in nm)}."""
 SENTERA_FILTERS: Mapping[str, Channels] = {
@@ -72,25 +51,21 @@ _OWN_NAMING = (
 
 def named_by_camera(text: str) -> tuple[str, str]:
     """Return (text without the band, band) of a text with a camera's own name of a file; no band for other texts."""
-    for pattern, camera in _OWN_NAMING:
+    for pattern, bands in _OWN_NAMING:
         if match := pattern.search(text):  # in linear time, because the text may be a damaged tag
-            return text[: match.start()] + text[match.end() :], camera.bands[match[1].upper()][0]
+            return text[: match.start()] + text[match.end() :], bands[match[1].upper()][0]
     return text, ""
 
 
-def lacking(model: str, bands: Sequence[tuple[str, Band]]) -> list[str]:
+def lacking(model: str, own: Sequence[tuple[str, Band]]) -> list[str]:
     """Return the names of the bands that a camera of this model records and a capture lacks, given its bands with the
     end of the file's name. The half of a dual camera without any band lacks none.
     """
-    keys, wavelengths = {band_key(b.name) for _, b in bands}, [b.wavelength_nm for _, b in bands if b.wavelength_nm]
-    unnamed = {part for part, b in bands if b.wavelength_nm is None}
-
-    def has(part: str, name: str, wavelength_nm: float) -> bool:
-        is_near = any(abs(nm - wavelength_nm) <= SAME_BAND_NM for nm in wavelengths)
-        return part in unnamed or band_key(name) in keys or is_near
-
+    keys, nms = {band_key(b.name) for _, b in own}, [b.wavelength_nm for _, b in own if b.wavelength_nm]
+    unnamed = {part for part, b in own if b.wavelength_nm is None}
     result: list[str] = []
-    for known in (camera.bands for camera in KNOWN_CAMERAS if re.match(camera.model, model, re.IGNORECASE)):
-        missing = [band[0] for part, band in known.items() if not has(part, *band)]
+    for known in (bands for start, bands in _KNOWN if re.match(start, model, re.IGNORECASE)):
+        named = {p: name for p, (name, _) in known.items() if p not in unnamed and band_key(name) not in keys}
+        missing = [name for p, name in named.items() if all(abs(known[p][1] - nm) > SAME_BAND_NM for nm in nms)]
         result += missing if len(missing) < len(known) else []
     return result

@@ -10,9 +10,10 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from agalign.cameras.base import Camera, own_stem
+from agalign.cameras.base import Camera
 from agalign.cameras.known import SURVEY3_FILTERS
 from agalign.cameras.metadata import Tags
+from agalign.values.band_names import own_stem
 from agalign.values.capture import Band
 
 _FILE = re.compile(r"^capture_(?P<serial>[^_]+)_(?P<moment>.+)$", re.IGNORECASE)

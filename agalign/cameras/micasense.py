@@ -25,8 +25,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agalign.cameras import pix4d
-from agalign.cameras.base import FULL_SCALE, Camera, is_thermal, own_stem, rays_to_rig, rotation
+from agalign.cameras.base import FULL_SCALE, Camera, is_thermal, rays_to_rig, rotation
 from agalign.cameras.metadata import Tags, finite
+from agalign.values.band_names import own_stem
 from agalign.values.capture import Band, CaptureTime, Pose, Position, Radiometry
 
 NAMESPACE, _DLS = "micasense.com/MicaSense", "micasense.com/DLS"

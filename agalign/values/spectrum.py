@@ -39,7 +39,7 @@ def band_key(name: str) -> str:
 
 def role_of(name: str, wavelength_nm: float | None) -> Role | None:
     """Return the role of a band by its wavelength if that is known, else by its name; None for a band without one, and
-    for a band whose name and wavelength contradict each other.
+    for a band with a name that contradicts its wavelength.
     """
     if name.lower().startswith(("pan", "rgb", "lwir", "thermal")):  # whatever the centre wavelength
         return None

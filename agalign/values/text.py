@@ -12,6 +12,12 @@ def counted(number: int, what: str) -> str:
     return f"{number:,} {what}{'' if number == 1 else 's'}"
 
 
+def some_of(names: Iterable[str]) -> str:
+    """Return the first six of several names, for a message."""
+    max_names, known = 6, list(names)
+    return ", ".join(known[:max_names]) + (", …" if len(known) > max_names else "")
+
+
 def did_you_mean(text: str, choices: Iterable[str]) -> str:
     """Return " (did you mean 'x'?)" with the choice that is most similar, ignoring case; empty if none is similar."""
 
