@@ -16,6 +16,7 @@ from scipy.interpolate import CloughTocher2DInterpolator, RectBivariateSpline
 import agalign
 from agalign.config import CheckSettings, Settings
 from agalign.errors import InputError, OutputError, SidecarError
+from agalign.products.run.captures import bands_of
 from agalign.products.sidecar.file import (
     content_checksum,
     find_sidecars,
@@ -38,6 +39,7 @@ from .conftest import aligned
 SHIPPED = Path(agalign.__file__).with_name("sidecar.schema.json")
 
 
+ALIGNED = {"status": "aligned", "reason": None}
 NIR = {"band": "NIR", "file": "n.tif", "band_index": 1, "status": "failed", "seconds": 0, "wavelength_nm": None}
 
 
@@ -268,6 +270,12 @@ def test_damage_is_found_by_checksums_and_named(out: Path) -> None:
     assert problems(out) == ["IMG_1.tif: cannot be read (it is not a regular file); run again"]
     write_sidecar(sidecar, example(not_written=["picture"]))
     assert problems(out) == ["IMG_1.json: its picture could not be written; run again"]
+    write_sidecar(sidecar, example(output=None))
+    assert problems(out) == ["IMG_1.json: its rasters were not written; run again"]
+    assert [b.problem for b in bands_of(example(bands=[NIR | ALIGNED], output=None), out)] == [
+        f"the pixels of {name} were not written; run again" for name in ("NIR", "Green")
+    ]
+    write_sidecar(sidecar, example(not_written=["picture"]))
     sidecar.write_text(sidecar.read_text().replace('"width": 10', '"width": 11'))
     assert "IMG_1.json: was changed after it was written; run again with --overwrite" in problems(out)
     sidecar.unlink()

@@ -64,7 +64,9 @@ def bands_of(sidecar: Sidecar, folder: Path, *, mask_qa: bool = False) -> list[A
         quality = (folder / flags.file, layers[part.band], flags.sha256) if mask_qa and flags is not None else None
         checksum = checksums.get(file, "")
         problem = ""
-        if part.place is None or not part.is_usable(sidecar.max_predicted_px):
+        if part.place is None and part.is_usable(sidecar.max_predicted_px):
+            problem = f"the pixels of {part.band} were not written; run again"
+        elif part.place is None or not part.is_usable(sidecar.max_predicted_px):
             limit_px, prediction = sidecar.max_predicted_px, part.prediction
             error = "" if prediction is None else f" to {prediction.std_px:.1f} px, not {limit_px:g}"
             problem = f"{part.band} is {part.status}{error} ({part.reason})"

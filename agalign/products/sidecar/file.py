@@ -172,6 +172,8 @@ def _problems_of_outputs(path: Path) -> Iterator[str]:
         yield f"{path}: has no checksum, so that changes cannot be found; run again with --overwrite"
     elif sidecar.checksum != content_checksum(read_regular(path, _MAX_BYTES)):
         yield f"{path}: was changed after it was written; run again with --overwrite"
+    if sidecar.output is None and sidecar.status != "failed":
+        yield f"{path}: its rasters were not written; run again"
     for kind in sidecar.not_written:
         yield f"{path}: its {kind} could not be written; run again"
     for part in sidecar.files:
