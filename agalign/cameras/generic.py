@@ -82,7 +82,7 @@ def split_elsewhere(path: Path, layout: str) -> tuple[str, str] | None:
     stem = own_stem(path)
     (capture, band), prefixed = split_stem(stem), split_start(stem)
     if layout == "folder" and is_band_name(path.parent.name):
-        return (capture, band) if is_band_name(band) else (stem, path.parent.name)
+        return (capture, band) if is_band_name(band) else (stem, split_end(path.parent.name)[1])
     return prefixed if layout == "start" and not (capture and is_band_name(band)) else None
 
 

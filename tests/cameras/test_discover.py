@@ -167,7 +167,7 @@ EDGE_AND_GREEN = ["Red edge", "Green"]
         ("plot_7/red plot_7/nir", None, {"plot_7/plot_7": ["nir", "red"]}),
         # A folder for each band, with the same names or with the band in each name.
         ("nir/f7 red/f7 nir/f9 red/f9", None, {"f7": ["nir", "red"], "f9": ["nir", "red"]}),
-        ("a/R/1 a/G/1 a/MS_NIR/1 a/RE/1", None, {"a/1": ["G", "MS_NIR", "R", "RE"]}),
+        ("a/R/1 a/G/1 a/MS_NIR/1 a/RE/1", None, {"a/1": ["G", "NIR", "R", "RE"]}),
         ("550nm/i_01 840nm/i_01 550nm/i_02", None, {"i_01": ["550nm", "840nm"]}),
         ("green/f_1_GRE nir/f_1_NIR", None, {"f_1": ["GRE", "NIR"]}),
         ("nir/f_red nir/f_green red/f_red red/f_blue", None, {"nir/f": ["green", "red"], "red/f": ["blue", "red"]}),
