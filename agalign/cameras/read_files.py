@@ -33,7 +33,8 @@ class Problem:
     path: Path
     error: AgalignError
     is_harmless: bool = False
-    """True for a file with the same bytes as another one, which takes part, and for a file used with fewer tags."""
+    """True for a file with the same bytes, or the same capture id, name and size, as another one, which takes part, and
+    for a file used with fewer tags."""
 
     @property
     def text(self) -> str:
