@@ -364,6 +364,8 @@ class FlightFacts:
     def _pair(self, band: BandResult, sidecar: Sidecar, keys: dict[str, Any], checks: Sequence[str]) -> dict[str, Any]:
         """The data of a band. Its row, with `keys`, and its offset are added unless it is the reference."""
         row = {column: value_at(band, path) for column, path in BAND_COLUMNS.items()}
+        if band.status != "predicted":
+            row["prediction_from"] = None  # its mapping has only been compared with the prediction
         if band.status != "reference":
             self.add_row(keys | row | {"check": "; ".join(checks)})
         metrics, windows = band.metrics, None if band.metrics is None else band.metrics.windows
