@@ -211,6 +211,8 @@ def with_bands_of_names(files: Sequence[ImageFile]) -> list[ImageFile]:
             # A number alone may be that of a band: red1.tif, red2.tif.
             is_sure = layout == "folder" or not name.isdecimal() or numbered[folder] > 1
             found = [files_of_band for files_of_band in captures[folder, name].values() if is_sure]
+            if layout == "folder" and len({file.path.parent for of_band in found for file in of_band}) == 1:
+                continue  # a folder that happens to have the name of a band
             for file in (of_band[0] for of_band in found if max(map(len, found)) == 1):
                 bands = camera.bands(file.path, file.tags, [replace(file.bands[0], name="")])
                 result[file.path] = replace(file, camera=camera, bands=bands)

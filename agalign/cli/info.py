@@ -11,7 +11,6 @@ from agalign.cli.align_commands import align
 from agalign.cli.command import Command, Given, config_text
 from agalign.cli.terminal import MAX_LISTED, ExitCode, Terminal, in_json
 from agalign.errors import ConfigurationError, UnreadableFileError
-from agalign.values.issues import MISSING_BAND
 from agalign.values.text import counted
 
 if TYPE_CHECKING:
@@ -88,6 +87,8 @@ def _rows(flight: "FolderScan") -> list[dict[str, Any]]:
 
 def _show_captures(rows: Sequence[dict[str, Any]], problems: int, terminal: Terminal) -> None:
     """Print the captures of a folder as a table, the calibration panels and sky captures, and a line of totals."""
+    from agalign.values.issues import MISSING_BAND
+
     headers = ("Capture", "Camera", "Taken", "Bands (reference in brackets)", "Seeds", "Missing")
     table = []
     for row in rows:
