@@ -17,6 +17,9 @@ if TYPE_CHECKING:
     from agalign.api import align as align
     from agalign.api import align_capture as align_capture
     from agalign.api import align_folder as align_folder
+    from agalign.api import export as export
+    from agalign.api import indices as indices
+    from agalign.api import onto as onto
     from agalign.api import warp_onto as warp_onto
     from agalign.batch.capture_task import CaptureReport as CaptureReport
     from agalign.batch.capture_task import FlightReports as FlightReports
@@ -45,6 +48,8 @@ if TYPE_CHECKING:
     from agalign.errors import WorkerError as WorkerError
     from agalign.products.exports.dataset import open_capture as open_capture
     from agalign.products.exports.dataset import open_flight as open_flight
+    from agalign.products.exports.programs import ExportReport as ExportReport
+    from agalign.products.indices.rasters import IndexReport as IndexReport
     from agalign.products.sidecar.alignments import read_alignment as read_alignment
     from agalign.values.alignment import Alignment as Alignment
     from agalign.values.alignment import Prediction as Prediction
@@ -53,7 +58,7 @@ if TYPE_CHECKING:
     from agalign.values.capture import Capture as Capture
 
 _NAMES = {
-    "api": "align align_capture align_folder warp_onto",
+    "api": "align align_capture align_folder export indices onto warp_onto",
     "batch.capture_task": "CaptureReport FlightReports",
     "cameras.discover": "FolderScan discover",
     "config": "CheckSettings DiscoverOptions FlightSettings JointSettings ReliefSettings RunOptions SeedSettings "
@@ -61,6 +66,8 @@ _NAMES = {
     "errors": "AgalignError ConfigurationError GeometryError InputError MemoryLimitError NoContrastError "
     "NoSuchBandError NotEnoughTextureError OutputError SidecarError UnreadableFileError WorkerError",
     "products.exports.dataset": "open_capture open_flight",
+    "products.exports.programs": "ExportReport",
+    "products.indices.rasters": "IndexReport",
     "products.sidecar.alignments": "read_alignment",
     "values.alignment": "Alignment Prediction Residual Seed",
     "values.capture": "Capture",

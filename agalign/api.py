@@ -2,7 +2,7 @@
 
 import logging
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from numbers import Real
 from operator import index
@@ -13,8 +13,9 @@ from numpy.typing import ArrayLike, NDArray  # the former in quotes: help() prin
 
 from agalign.batch.capture_task import CaptureReport, FlightReports, Task, process_capture, quiet
 from agalign.batch.earlier_results import refuse_other_captures
+from agalign.batch.index_run import index_tasks, run_indices
 from agalign.batch.run import Listener, run_flight
-from agalign.cameras.discover import discover
+from agalign.cameras.discover import FolderScan, discover, mosaics_onto
 from agalign.capture.align_bands import align_pairs
 from agalign.capture.band_pair import BandPair, SeedMatrices
 from agalign.capture.decision import with_lens_shapes
@@ -24,12 +25,17 @@ from agalign.config import DiscoverOptions, RunOptions, Settings
 from agalign.errors import InputError
 from agalign.pixels.masks import raster_of
 from agalign.pixels.radiometry import with_radiometry
+from agalign.products.exports.programs import ExportReport
+from agalign.products.exports.programs import export as export_run
+from agalign.products.indices.formulas import chosen_indices
+from agalign.products.indices.rasters import IndexReport
 from agalign.values import geometry
 from agalign.values.alignment import Alignment, Seed
 from agalign.values.capture import Capture
-from agalign.values.choices import MAX_PIXELS, Interpolation, SeedKind
+from agalign.values.choices import MAX_PIXELS, ExportProgram, Interpolation, SeedKind
 from agalign.values.image import Mask
 from agalign.values.mapping import PixelMapping
+from agalign.values.output_folder import locked
 from agalign.values.processes import end_if_reimported
 
 Progress = Callable[[CaptureReport, int, int], object]
@@ -159,17 +165,87 @@ def align_folder(
     Raises InputError if the folder does not exist, OutputError if `out` cannot be written, ConfigurationError
     for a model of another camera, and if `out` has results of other captures of the same name.
     """
+    end_if_reimported()
+    flight = discover(Path(folder), options or DiscoverOptions(skip=(Path(out),)))
+    start = None if model is None else Path(model)
+    return _run(flight, Path(out), settings or Settings(), run or RunOptions(), progress, start)
+
+
+def onto(
+    reference: str | Path,
+    moving: Sequence[str | Path],
+    out: str | Path,
+    *,
+    band: str | None = None,
+    settings: Settings | None = None,
+    run: RunOptions | None = None,
+) -> FlightReports:
+    """Align georeferenced mosaics of other dates or sensors to the grid of the mosaic `reference`, and write a raster
+    and a sidecar of each to `out`: one band of the reference, then all bands of the mosaic.
+
+    `band` is the name of the band of the reference to compare with; by default green. A mosaic is aligned if its
+    windows are within a pixel of the reference. Returns a report for each mosaic, in the order in which they were
+    finished. Raises UnreadableFileError, InputError for a file without georeference, NoSuchBandError, OutputError.
+    """
+    end_if_reimported()
+    flight = mosaics_onto(Path(reference), [Path(path) for path in moving], band)
+    options = replace(run or RunOptions(), align_panels=True)  # a mosaic is not a panel
+    return _run(flight, Path(out), (settings or Settings()).for_mosaics, options)
+
+
+def _run(
+    flight: FolderScan,
+    out: Path,
+    settings: Settings,
+    run: RunOptions,
+    progress: Progress | None = None,
+    start: Path | None = None,
+) -> FlightReports:
     from agalign.products.report.pages import write_pages
 
-    end_if_reimported()
-    source, target = Path(folder), Path(out)
-    result = discover(source, options or DiscoverOptions(skip=(target,)))
-    start = None if model is None else Path(model)
     reports = FlightReports()
-    for report in run_flight(result, target, settings or Settings(), run, Listener(on_again=_LOG.info), start):
+    for report in run_flight(flight, out, settings, run, Listener(on_again=_LOG.info), start):
         reports.append(report)
-        _LOG.info("%d of %d: %s: %s", len(reports), len(result.captures), report.label, report.summary)
+        _LOG.info("%d of %d: %s: %s", len(reports), len(flight.captures), report.label, report.summary)
         if progress is not None:
-            progress(report, len(reports), len(result.captures))
-    write_pages(target, _LOG.warning)
+            progress(report, len(reports), len(flight.captures))
+    write_pages(out, _LOG.warning)
     return reports
+
+
+def indices(
+    out: str | Path,
+    names: Sequence[str] = ("ndvi",),
+    *,
+    formulas: Sequence[str] = (),
+    target: str | Path | None = None,
+    mask_qa: bool = False,
+    run: RunOptions | None = None,
+) -> list[IndexReport]:
+    """Compute spectral indices of the aligned captures in the output folder of a run, and write a raster and a picture
+    of each, and the table indices.csv, to `target` (by default `out`).
+
+    `names` are those of `agalign indices --index`; `formulas` are texts such as "mine=(N-RE)/(N+RE)" of the bands B, G,
+    R, RE and N. `mask_qa` leaves out saturated, occluded and misaligned pixels, and needs a run with quality rasters
+    (`WriteSettings(qa=True)`). Returns a report for each capture and index; `problem` says why one could not be
+    computed. Raises InputError if there is no run, ConfigurationError for an unknown index, OutputError.
+    """
+    end_if_reimported()
+    folder, options = Path(out if target is None else target), run or RunOptions()
+    chosen = chosen_indices(names, formulas)
+    tasks = index_tasks(Path(out), chosen, folder, overwrite=options.overwrite, mask_qa=mask_qa)
+    with locked(folder):
+        return [report for done in run_indices(tasks, options.jobs, options.executor) for report in done]
+
+
+def export(out: str | Path, target: str | Path, program: ExportProgram, *, copy: bool = False) -> ExportReport:
+    """Export the captures with status `ok` in the output folder of a run into a new folder, for a photogrammetry
+    program: "odm" (OpenDroneMap, WebODM), "metashape" or "pix4d".
+
+    The captures have the same bands and quantities as most. Files are hard links if the file system allows that, and
+    copies otherwise or with `copy`. Returns an ExportReport; its `notes` are instructions for the program, and
+    `left_out` lists the other captures. Raises InputError if there is no run or nothing to export, ConfigurationError
+    if the run wrote no band files (`WriteSettings(layout="bands")`), OutputError if `target` is not empty or cannot be
+    written.
+    """
+    return export_run(Path(out), Path(target), program, copy=copy)

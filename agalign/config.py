@@ -278,6 +278,12 @@ class Settings(SettingsModel):
     write: WriteSettings = WriteSettings()
 
     @property
+    def for_mosaics(self) -> "Settings":
+        """The settings for mosaics, which are not captures of one flight and keep the grid of their reference."""
+        flight = self.flight.model_copy(update={"together": False})
+        return self.model_copy(update={"flight": flight, "write": self.write.model_copy(update={"crop": "none"})})
+
+    @property
     def learns_flights(self) -> bool:
         """True if one network is learned for a flight before its captures are aligned."""
         return self.joint.recipe != "paper" and self.flight.together and not self.seed.only

@@ -10,17 +10,13 @@ from pathlib import Path
 import numpy as np
 import rasterio
 
-from agalign.batch.run import run_flight
-from agalign.cameras.discover import FolderScan, captures_onto
-from agalign.config import FlightSettings, Settings, WriteSettings
+import agalign
 
 if len(sys.argv) != 4:
     sys.exit("usage: python examples/two_dates.py EARLIER.tif LATER.tif CHANGE.tif")
 earlier, later, target = map(Path, sys.argv[1:4])
 with tempfile.TemporaryDirectory() as folder:
-    pair = FolderScan(earlier.parent, tuple(captures_onto(earlier, [later])), ())
-    settings = Settings(flight=FlightSettings(together=False), write=WriteSettings(crop="none"))
-    (report,) = run_flight(pair, Path(folder), settings)
+    (report,) = agalign.onto(earlier, [later], folder)
     moving = report.sidecar.bands[1]
     if moving.status != "aligned":
         sys.exit(f"{later} cannot be aligned to {earlier}: {moving.reason}")

@@ -18,9 +18,10 @@ from agalign.values.mapping import PixelMapping
 
 from .builders import joint_result, residual_of
 
-FUNCTIONS = "align align_capture align_folder discover open_capture open_flight read_alignment warp_onto"
+FUNCTIONS = "align align_capture align_folder discover export indices onto open_capture open_flight"
+FUNCTIONS += " read_alignment warp_onto"
 SETTINGS = "CheckSettings FlightSettings JointSettings ReliefSettings SeedSettings Settings WriteSettings"
-RESULTS = "Alignment Capture CaptureReport FlightReports FolderScan Prediction Residual Seed"
+RESULTS = "Alignment Capture CaptureReport ExportReport FlightReports FolderScan IndexReport Prediction Residual Seed"
 OPTIONS = "DiscoverOptions RunOptions"
 ERRORS = """AgalignError ConfigurationError GeometryError InputError NoContrastError NoSuchBandError MemoryLimitError
 NotEnoughTextureError OutputError SidecarError UnreadableFileError WorkerError"""
@@ -43,7 +44,7 @@ def test_all_errors_and_settings_are_public() -> None:
     assert stages | {"Settings"} == set(SETTINGS.split())
 
 
-@pytest.mark.parametrize("name", ["align", "align_capture", "align_folder"])
+@pytest.mark.parametrize("name", ["align", "align_capture", "align_folder", "export", "indices", "onto"])
 def test_types_in_the_signatures_are_public(name: str) -> None:
     hints = typing.get_type_hints(getattr(api, name))
     own = {t for hint in hints.values() for t in (hint, *typing.get_args(hint)) if hasattr(t, "__module__")}

@@ -234,9 +234,9 @@ def _is_input_folder(folder: Path, skipped: set[Path]) -> bool:
 # ---- mosaics
 
 
-def captures_onto(
+def mosaics_onto(
     reference: Path, moving: Sequence[Path], band: str | None = None, max_pixels: int = MAX_MOSAIC_PIXELS
-) -> list[Capture]:
+) -> FolderScan:
     """Return a capture for each moving mosaic: the reference's `band` (None for the default, green) and all bands of
     the moving mosaic, which share one mapping.
 
@@ -256,7 +256,7 @@ def captures_onto(
         ]
         captured_at = read_tags(path).captured_at
         captures.append(Capture(path.stem, Path(), tuple(with_unique_band_names(bands)), 0, captured_at=captured_at))
-    return with_unique_capture_names(captures)
+    return FolderScan(reference.parent, tuple(with_unique_capture_names(captures)), ())
 
 
 def distance_km(fixed: Band, moving: Band) -> float:

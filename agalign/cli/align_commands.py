@@ -161,15 +161,13 @@ def _onto(
         overwrite: Process finished mosaics again.
         max_pixels: Refuse mosaics with more pixels than this, without reading them.
     """
-    from agalign.cameras.discover import FolderScan, captures_onto, distance_km
+    from agalign.cameras.discover import distance_km, mosaics_onto
     from agalign.cli.align_run import conclude, run
     from agalign.config import RunOptions, Settings
 
     target = out or reference.absolute().parent / f"{reference.stem}-aligned"
-    given["settings"]["write"]["crop"] = "none"
-    settings = Settings.model_validate({**given["settings"], "flight": {"together": False}})
-    captures = captures_onto(reference, moving, band, given["discover"]["max_pixels"])
-    flight = FolderScan(reference.parent, tuple(captures), ())
+    settings = Settings.model_validate(given["settings"]).for_mosaics
+    flight = mosaics_onto(reference, moving, band, given["discover"]["max_pixels"])
     for capture in flight.captures:
         offset_km = distance_km(capture.reference, capture.moving[0])
         if offset_km:

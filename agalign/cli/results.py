@@ -15,7 +15,6 @@ from agalign.values.choices import ExportProgram
 from agalign.values.text import counted
 
 if TYPE_CHECKING:
-    from agalign.products.indices.formulas import Index
     from agalign.products.indices.rasters import IndexReport
 
 Out = Annotated[Path, typer.Argument(help="Output folder of a run.")]
@@ -164,10 +163,12 @@ def _indices(
     from agalign.batch.index_run import index_tasks, run_indices
     from agalign.cli.align_run import cluster, progress
     from agalign.errors import OutputError
+    from agalign.products.indices.formulas import chosen_indices
     from agalign.products.report.pages import REPORT_FILE, write_pages
     from agalign.values.output_folder import locked
 
-    chosen = _chosen_indices(index, formula or [])
+    names = (index or ("" if formula else "ndvi")).split(",")
+    chosen = chosen_indices(names, formula or [])
     folder, jobs = target or out, given["run"]["jobs"]
     tasks = index_tasks(out, chosen, folder, overwrite=given["run"]["overwrite"], mask_qa=mask_qa)
     terminal.event("found", captures=len(tasks), indices=len(chosen))
@@ -232,20 +233,6 @@ indices = Command(
     {"Output": "index formula target mask_qa", "Running": "jobs dask overwrite as_json quiet verbose log_json"},
     on_interrupt="interrupted; written indices are kept, and the same command resumes the run",
 )
-
-
-def _chosen_indices(names: str | None, formulas: Sequence[str]) -> "list[Index]":
-    """Return the indices of names and formulas, or the default one. Raises ConfigurationError."""
-    from agalign.errors import ConfigurationError
-    from agalign.products.indices.formulas import index_named, index_of_formula
-
-    requested = (names or ("" if formulas else "ndvi")).split(",")
-    chosen = [index_named(name) for name in requested if name.strip()] + [index_of_formula(f) for f in formulas]
-    repeated = [one.name for i, one in enumerate(chosen) if one.name in [c.name for c in chosen[:i]]]
-    if repeated or not chosen:
-        problem = f"'{repeated[0]}' is given twice" if repeated else "--index is empty"
-        raise ConfigurationError(f"{problem}; give names such as ndvi,ndre, or formulas as 'name=(N-R)/(N+R)'")
-    return chosen
 
 
 def _print(report: "IndexReport", terminal: Terminal) -> None:

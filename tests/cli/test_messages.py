@@ -49,7 +49,7 @@ GREEN = "(did you mean 'Green'?); choose from Blue, Green, Red, NIR, Red edge"
         ("align {flight} -o {tmp}/o --index nvdi", 2, "unknown index 'nvdi' (did you mean 'ndvi'?); choose from ndvi"),
         ("indices {flight} --index nvdi", 2, "unknown index 'nvdi' (did you mean 'ndvi'?); choose from ndvi"),
         ("indices {flight} --index ndvi,ndvi", 2, "'ndvi' is given twice"),
-        ("indices {flight} --index ,", 2, "--index is empty"),
+        ("indices {flight} --index ,", 2, "no index is given"),
         ("indices {flight} --formula import", 2, "is not a formula"),
         ("indices {flight} --formula N/R --formula N/G", 2, "'formula' is given twice"),
         ("align {flight} -o {flight}", 2, "is the folder of the images"),

@@ -8,6 +8,8 @@ import rasterio
 from rasterio.enums import ColorInterp
 from rasterio.transform import Affine
 
+import agalign
+from agalign import ReliefSettings, Settings
 from agalign.values import geometry
 from agalign.values.issues import MOSAICS
 
@@ -110,6 +112,13 @@ def test_unusable_mosaics_are_one_line(mosaics: Path, tmp_path: Path) -> None:
         done = onto(mosaics, moving, tmp_path / "out")
         (line,) = done.stderr.splitlines()
         assert (done.returncode, problem in line) == (1, True)
+
+
+def test_python_aligns_mosaics_as_the_command(mosaics: Path, tmp_path: Path) -> None:
+    settings = Settings(relief=ReliefSettings(use="never"))
+    (report,) = agalign.onto(mosaics / "spring.tif", [str(mosaics / "summer.tif")], tmp_path, settings=settings)
+    assert (report.state, report.result.status) == ("done", "ok")
+    assert (tmp_path / "summer.tif").read_bytes() == (mosaics / "out" / "summer.tif").read_bytes()
 
 
 def test_a_distant_mosaic_is_reported(mosaics: Path, tmp_path: Path) -> None:

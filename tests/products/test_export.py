@@ -6,11 +6,13 @@ from pathlib import Path
 import pytest
 
 import agalign
+from agalign.cli.terminal import ExitCode
 from agalign.products.exports.programs import export
 from agalign.products.sidecar.file import find_sidecars
 from agalign.values.choices import ExportProgram
 
 from ..conftest import Shared, read_json, seeded
+from ..program import agalign_here
 from .conftest import change
 
 pytestmark = pytest.mark.slow
@@ -43,6 +45,19 @@ def test_band_files_are_linked_under_names_of_their_own(run: Path, tmp_path: Pat
     copied = export(run, tmp_path / "copies", program, copy=True).files[3]
     assert not source.samefile(copied)
     assert copied.read_bytes() == source.read_bytes()
+
+
+def test_python_exports_and_computes_indices_as_the_commands(run: Path, aligned_flight: Path, tmp_path: Path) -> None:
+    report = agalign.export(str(run), tmp_path / "to", "odm")
+    assert (report.captures, len(report.files)) == (1, 5)
+    reports = agalign.indices(aligned_flight, ["ndvi", "ndre"], formulas=["mine=N-R"], target=tmp_path / "by_python")
+    assert {r.index for r in reports if r.path is not None} == {"ndvi", "ndre", "mine"}
+    assert agalign_here("indices", aligned_flight, "-o", tmp_path / "by_command").returncode == ExitCode.OK
+    for folder in ("by_python", "by_command"):
+        (path, *_) = sorted((tmp_path / folder).rglob("*_ndvi.tif"))
+        assert path.read_bytes() == next((tmp_path / "by_command").rglob(path.name)).read_bytes()
+    with pytest.raises(agalign.ConfigurationError, match="'ndvi' is given twice"):
+        agalign.indices(run, ["ndvi", "NDVI"])
 
 
 def test_captures_that_cannot_be_exported_are_one_line(run: Path, tmp_path: Path) -> None:
