@@ -1,4 +1,4 @@
-# The program in a virtual environment, without what built it. How it is run: docs/container.md.
+# The program in a virtual environment, without what built it. How it is run: docs/how-to/docker.md.
 #
 # The base may be any Debian or Ubuntu whose python3 is 3.11, of which locks/torch-cpu.txt has the hashes.
 ARG BASE=debian:bookworm-slim

@@ -69,9 +69,9 @@ def align(
     settings
         By default `Settings()`; `settings.write` has no effect.
 
-    The method is that of docs/method.md: a descriptor learned on both images while the homography is optimised by the
-    same loss, then refined and verified by windows. Returns an Alignment on the grid of `fixed`; its matrices are
-    float64. `warp` resamples `moving` to it, `map` maps pixels of `fixed` to pixels
+    The method is that of docs/explanation/method.md: a descriptor learned on both images while the homography is
+    optimised by the same loss, then refined and verified by windows. Returns an Alignment on the grid of `fixed`; its
+    matrices are float64. `warp` resamples `moving` to it, `map` maps pixels of `fixed` to pixels
     of `moving`, `inverse` maps back: x right, y down, (0, 0) the centre of the top-left pixel. Check its `status`: only
     `aligned` has passed verification. With `predicted`, the mapping is extrapolated over a part of the image without
     measurements, with the standard error `prediction.std_px`. With `seed_only` and `failed`, the mapping is that of the

@@ -1,8 +1,8 @@
 """Settings and options: one immutable model for each stage, for the search for captures and for the run.
 
 An unknown name of a setting or an invalid value raises pydantic's ValidationError. The docstring of a field is also the
-help text of its command-line option, and its row in docs/options.md. Other parameters are constants in the modules that
-use them, with their reasons.
+help text of its command-line option, and its row in docs/reference/settings.md. Other parameters are constants in the
+modules that use them, with their reasons.
 """
 
 from collections.abc import Callable, Iterator, Mapping

@@ -1,4 +1,4 @@
-"""The figures of docs/paper.md and docs/method.md that are made of synthetic images: matches, loss surface, relief.
+"""The figures in docs/explanation/ that are made of synthetic images: matches, loss surface, relief.
 
     python benchmarks/figures.py [FOLDER]
 

@@ -1,4 +1,4 @@
-"""Errors of the seeds of each camera: the table of docs/cameras.md.
+"""Errors of the seeds of each camera: the table of docs/reference/cameras.md.
 
     python benchmarks/seeds.py DATA
 

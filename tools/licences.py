@@ -1,4 +1,4 @@
-"""Write or check the table of the licences of dependencies in docs/licences.md.
+"""Write or check the table of the licences of dependencies in docs/project/licences.md.
 
     python tools/licences.py           # writes; everything of pyproject.toml must be installed
     python tools/licences.py --check   # exit code 1 where the page lacks a library, or one that is not permissive
@@ -21,7 +21,7 @@ from bands.score import table
 from common import with_section
 
 ROOT = Path(__file__).resolve().parents[1]
-PAGE = ROOT / "docs" / "licences.md"
+PAGE = ROOT / "docs" / "project" / "licences.md"
 READ = {"atheris": "Apache-2.0", "exifread": "BSD-3-Clause"}
 """Licences, from the licence file, of packages with missing or inexact metadata."""
 SPELT = {
@@ -39,7 +39,7 @@ def main() -> None:
     every_run, extras = requirements()
     if "--check" in sys.argv[1:]:
         problems = check(every_run, extras)
-        print("\n".join(problems) or f"licences: {len(every_run | extras)} libraries, as in docs/licences.md")
+        print("\n".join(problems) or f"licences: {len(every_run | extras)} libraries, as in docs/project/licences.md")
         sys.exit(1 if problems else 0)
     columns = {text: ([], []) for text in sorted(set(map(licence, every_run | extras)))}
     for column, names in enumerate((every_run, extras)):
@@ -74,11 +74,11 @@ def check(every_run: set[str], extras: set[str]) -> list[str]:
     rows = re.findall(r"^\| (?!licence|---).* \| (.*) \| (.*) \|$", page.partition("<!-- end of")[0], re.MULTILINE)
     listed = (set(re.findall(r"[\w.-]+", " ".join(column))) for column in zip(*rows, strict=True))
     wrong = sorted(set().union(*(one ^ other for one, other in zip((every_run, extras), listed, strict=True))))
-    problems = [f"docs/licences.md: {name}: run python tools/licences.py" for name in wrong]
+    problems = [f"docs/project/licences.md: {name}: run python tools/licences.py" for name in wrong]
     for name in sorted({d.name.lower() for d in distributions()}):
         with suppress(PackageNotFoundError):
             if NOT_PERMISSIVE.search(licence(name)) and name not in page:
-                problems.append(f"{name} is under {licence(name)}: add it to docs/licences.md")
+                problems.append(f"{name} is under {licence(name)}: add it to docs/project/licences.md")
     return problems
 
 

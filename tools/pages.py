@@ -176,12 +176,12 @@ def indices() -> str:
 
 
 PARTS: tuple[tuple[str, str, Callable[[], str]], ...] = (
-    ("options.md", "Settings", partial(options, "settings")),
-    ("options.md", "DiscoverOptions", partial(options, "discover")),
-    ("options.md", "RunOptions", partial(options, "run")),
-    ("radiometry.md", "indices", indices),
-    ("sidecar.md", "fields", fields),
-    ("troubleshooting.md", "reasons", reasons),
+    ("reference/settings.md", "Settings", partial(options, "settings")),
+    ("reference/settings.md", "DiscoverOptions", partial(options, "discover")),
+    ("reference/settings.md", "RunOptions", partial(options, "run")),
+    ("how-to/reflectance.md", "indices", indices),
+    ("reference/sidecar.md", "fields", fields),
+    ("how-to/troubleshooting.md", "reasons", reasons),
 )
 """Page, mark of the part in it, and the function that makes its content."""
 

@@ -300,7 +300,7 @@ def longest_for(reference: Band, fixed_to_moving: Matrix) -> int:
 
 def _seed_std_px(band: str, model: FlightModel | None, scale: PixelScale) -> dict[SeedKind, float]:
     """Return the standard errors of mappings by tags and of the flight's mean; `scale` is of the fixed image."""
-    tags_std_px = 5.0  # errors on five cameras have a median of 2 px and a maximum of 12 px (docs/cameras.md)
+    tags_std_px = 5.0  # errors on five cameras have a median of 2 px and a maximum of 12 px (docs/reference/cameras.md)
     result: dict[SeedKind, float] = dict.fromkeys(("rig", "centre"), tags_std_px * scale.x)
     if model is not None and model.rig is not None and band in model.rig.mean:
         mean, rig = model.rig.mean[band], model.rig

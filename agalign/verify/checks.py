@@ -285,7 +285,7 @@ def issues_of(evidence: Evidence) -> tuple[Issue, ...]:
 
 def seed_fits(residual: Residual) -> bool:
     """Return True if the residual of a seed is small enough for the status `seed_only`."""
-    # Rig tags have errors of a few px (docs/cameras.md).
+    # Rig tags have errors of a few px (docs/reference/cameras.md).
     max_median_px = 8.0
     return residual.coverage >= MIN_COMMON_COVERAGE and residual.median_px <= max_median_px
 

@@ -1,1 +1,1 @@
-"""A benchmark of band-to-band alignment: sets, variants, methods and a scorer (docs/benchmark-bands.md)."""
+"""A benchmark of band-to-band alignment: sets, variants, methods and a scorer (docs/explanation/comparison.md)."""

@@ -35,7 +35,7 @@ from .blocks import PAGES, ROOT, blocks_of, commands_of, each_page, program, run
 
 RUN_BY = {"docker": "tools/container.sh", "dask": "tools/dask_cluster.sh", "pip": ".ci/run"}
 """What cannot be run inside a test, and the script that runs it and what stands with it in a block."""
-KINDS = {"sh", "python", "text", "{toctree}", "{include} ../CONTRIBUTING.md", "{include} ../CHANGELOG.md"}
+KINDS = {"sh", "python", "text", "{toctree}", "{include} ../../CONTRIBUTING.md", "{include} ../../CHANGELOG.md"}
 RUNNABLE = [page for page in PAGES if any(b.kind in ("sh", "python") for b in blocks_of(page))]
 LONG = re.compile("batch|benchmark-bands|close-range|paper|photogrammetry|python|qgis|quickstart|radiometry|thermal")
 """Pages with blocks that take seconds, and of commands that other tests run: only the full run has them."""
@@ -161,7 +161,7 @@ def test_an_example(name: str, desk: Path, monkeypatch: pytest.MonkeyPatch, caps
 def test_the_recipe_for_plots_has_a_row_of_any_outline(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     write_ndvi_and_plots(tmp_path)
-    text = next(b.text for b in blocks_of(ROOT / "docs" / "recipes" / "field.md") if "# plots.py" in b.text)
+    text = next(b.text for b in blocks_of(ROOT / "docs" / "how-to" / "plots.md") if "# plots.py" in b.text)
     run_python(text)
     rows = list(csv.DictReader(Path("plots.csv").read_text(encoding="utf-8").splitlines()))
     assert [row["plot"] for row in rows] == ["A1", "", "edge", "bow tie"]
@@ -178,7 +178,7 @@ def test_the_recipe_for_water_masks_sun_glint_and_the_shore(tmp_path: Path, monk
     write_band(stack, bands, nodata=np.nan)
     with rasterio.open(stack, "r+") as raster:
         raster.descriptions = "Green", "NIR"
-    run_python(next(b.text for b in blocks_of(ROOT / "docs" / "radiometry.md") if "# water.py" in b.text))
+    run_python(next(b.text for b in blocks_of(ROOT / "docs" / "how-to" / "reflectance.md") if "# water.py" in b.text))
     with rasterio.open("water.tif") as water:
         result = water.read()
     expected = np.where(bands[1] < 0.05, bands, np.nan)
@@ -209,7 +209,7 @@ def test_the_python_of_the_readme_aligns_pixels() -> None:
 def test_the_python_guide_has_the_matrices_of_opencv_and_micasense(desk: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Points of the mapping between raw pixels, and undistorted by OpenCV as MicaSense's notebooks undistort images."""
     monkeypatch.chdir(desk)
-    (text,) = (b.text for b in blocks_of(ROOT / "docs" / "python.md") if "warp_matrices" in b.text)
+    (text,) = (b.text for b in blocks_of(ROOT / "docs" / "how-to" / "python.md") if "warp_matrices" in b.text)
     names = run_python(text)
     folder, sidecar = Path("flight/0000SET/000"), read_sidecar(Path("aligned/0000SET/000/IMG_0001.json"))
     bands = {band.band: band for band in sidecar.bands}

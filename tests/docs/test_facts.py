@@ -9,7 +9,6 @@ import operator
 import re
 import signal
 import tomllib
-from collections import Counter
 from collections.abc import Iterator
 from functools import cache
 from itertools import chain
@@ -49,6 +48,9 @@ NOT_A_MESSAGE = re.compile(r"(agalign|python3?|pip|docker|sphinx-build|if __name
 def code_in(page: Path) -> list[str]:
     """The code in the text of a page."""
     return re.findall(r"`([^`]+)`", re.sub(r"\s+", " ", text_of(page)))
+
+
+BATCH = "how-to/large-flights.md"
 
 
 def table(page: str, head: str) -> list[list[str]]:
@@ -102,7 +104,7 @@ def test_options_in_the_text_exist(page: Path, monkeypatch: pytest.MonkeyPatch) 
 def test_exit_codes() -> None:
     signals = {int(ExitCode.SIGNAL + n) for n in (signal.SIGHUP, signal.SIGINT, signal.SIGTERM)}
     codes = {int(c) for c in ExitCode if c is not ExitCode.SIGNAL} | signals
-    listed = {int(code) for codes_of_a_row, _ in table("batch.md", "exit code") for code in codes_of_a_row.split(", ")}
+    listed = {int(code) for codes_of_a_row, _ in table(BATCH, "exit code") for code in codes_of_a_row.split(", ")}
     assert listed == codes
     for page in PAGES:
         named = re.findall(r"exit code[s]? (\d+)", text_of(page), re.IGNORECASE)
@@ -123,7 +125,7 @@ def test_events_of_a_run_and_their_fields() -> None:
         if isinstance(call.args[0], ast.Constant):
             names = {k.arg for k in call.keywords if k.arg is not None}
             fields.setdefault(str(call.args[0].value), set()).update(names)
-    listed = {row[0].strip("`"): set(re.findall(r"`(\w+)`", row[1])) for row in table("batch.md", "event")}
+    listed = {row[0].strip("`"): set(re.findall(r"`(\w+)`", row[1])) for row in table(BATCH, "event")}
     # Their names are in a loop; a problem is an event of the terminal.
     assert set(listed) == {*fields, "panel", "sky", "problem"}
     for event, names in fields.items():
@@ -137,12 +139,12 @@ def test_stages_of_a_capture() -> None:
         for name in ("progress", "report"):
             for call in calls(str(path.relative_to(PACKAGE)), name):
                 stages |= {str(a.value) for a in call.args if isinstance(a, ast.Constant) and isinstance(a.value, str)}
-    row = next(row for row in table("batch.md", "event") if row[0] == "`stage`")
+    row = next(row for row in table(BATCH, "event") if row[0] == "`stage`")
     assert set(re.findall(r"`(\w+)`", row[1].partition("`stage` (")[2].partition(")")[0])) == stages - {""}
 
 
 LIMITS = {
-    "method.md": (
+    "explanation/method.md": (
         f"| at least {MIN_RETRIEVAL:g}, and {MIN_TIMES_CHANCE:g} times chance |",
         f"at most {checks._MAX_ERROR_PX:g} px in {checks._MIN_ACCURATE_SHARE:.0%} of the image".replace("%", " %"),
         f"windows with structure ({windows._WINDOW_PX} px at most)",
@@ -161,12 +163,14 @@ LIMITS = {
         f"Images above {band_pair._LONGEST_SIDE_PX} px",
         f"fewer than {band_pair._COARSE_RATIO:g} pixels per reference pixel",
     ),
-    "benchmarks.md": (
+    "explanation/accuracy.md": (
         f"The largest parallax is {dense._SEARCH_NEARER:.0%} of".replace("%", " %"),
         f"and {dense._SEARCH_FARTHER:.0%} behind it".replace("%", " %"),
     ),
-    "radiometry.md": (f"calibration panels at most {panel_readings.MAX_TIME_DIFFERENCE_S / 3600:g} hours away",),
-    "reliability.md": (f"{raster._MAX_BANDS} bands per file",),
+    "how-to/reflectance.md": (
+        f"calibration panels at most {panel_readings.MAX_TIME_DIFFERENCE_S / 3600:g} hours away",
+    ),
+    "explanation/reliability.md": (f"{raster._MAX_BANDS} bands per file",),
 }
 """{page: sentences with a limit of the program}."""
 
@@ -187,7 +191,7 @@ def test_files_in_the_text_exist(page: Path) -> None:
 def test_equations_of_the_paper() -> None:
     """Each name in the table is in the module before it, and its docstring names the equation of its row."""
     names = []
-    for row in table("paper.md", "the paper"):
+    for row in table("explanation/paper.md", "the paper"):
         equations, module = re.findall(r"Eq\. \d+", row[0]), None
         for code in re.findall(r"`([^`]+)`", row[1]):
             if code.endswith(".py"):
@@ -201,7 +205,9 @@ def test_equations_of_the_paper() -> None:
 
 def test_extras() -> None:
     extras = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]["optional-dependencies"]
-    assert {name for row in table("install.md", "extra") for name in re.findall(r"`(\w+)`", row[0])} == set(extras)
+    assert {name for row in table("tutorial/install.md", "extra") for name in re.findall(r"`(\w+)`", row[0])} == set(
+        extras
+    )
     commands = re.findall(r"pip install '?\.\[([\w,]+)\]", "".join(page.read_text(encoding="utf-8") for page in PAGES))
     assert commands
     assert {name for names in commands for name in names.split(",")} <= set(extras)
@@ -210,47 +216,3 @@ def test_extras() -> None:
 def test_kinds_of_products() -> None:
     listed = re.findall(r"`(\w+)`", FilePart.model_fields["kind"].description or "")
     assert set(listed) == {PARALLAX_KIND, *(p.kind for p in PRODUCTS)}
-
-
-# ---- discouraged phrases, each of which has a plainer or more usual one
-
-
-THINGS = (
-    "command|fault|file|folder|image|index|letter|limit|list|mistake|model|name|option|reflectance|regular|run|sidecar|"
-    "table|toml"
-)
-DISCOURAGED = re.compile(
-    rf"""\b(?:
-    beside | whom | whose | thereof | whereby | of[ ]which | lies | lay | lays | laid | lain | told | tells | foretells?
-    | fell[ ]short | shortfall | so[ ]many[ ]times | as[ ]it[ ]stands | want[ ]of | bears | nobody | or[ ]not[ ]at[ ]all
-    | stands[ ](?:in|on|for|there|beside|above|against) | what[ ]to[ ]try | what[ ]is[ ]left | error[ ]bars? | vouch\w*
-    | judged? | believed? | speaks?[ ](?:of|against) | knows?[ ](?:of|nothing|no|where|what) | (?:to|can)[ ]be[ ]had
-    | (?:gives?|given)[ ]up | goes[ ]on | worked[ ]out | anew | turned[ ]by | known[ ]to[ ]\d | nothing[ ](?:of|but)
-    | says?[ ](?:of|that|so|what|where|which|who) | is[ ]no[ ](?:{THINGS}) | for[ ]ever | without[ ]a[ ]word
-    )\b""",
-    re.IGNORECASE | re.VERBOSE,
-)
-MAX_IN_DOCUMENTS = 2
-MAX_IN_CODE = {"agalign": 26, "benchmarks": 0, "qgis": 0, "recipe": 0, "tests": 1, "tools": 0}
-SUFFIXES = {".j2", ".js", ".json", ".py", ".sh", ".yaml"}
-
-
-def count(paths: list[Path]) -> tuple[int, str]:
-    texts = ((path.relative_to(ROOT), path.read_text(encoding="utf-8").replace("_", " ")) for path in paths)
-    found = Counter(f"{path}: {phrase.lower()}" for path, text in texts for phrase in DISCOURAGED.findall(text))
-    return found.total(), "\n".join(f"{number} {where}" for where, number in found.items())
-
-
-def test_the_documents_are_in_plain_terms() -> None:
-    examples = sorted(path for path in (ROOT / "examples").iterdir() if path.is_file())
-    total, where = count([*PAGES, ROOT / "CHANGELOG.md", ROOT / "docs" / "api.rst", *examples])
-    assert total <= MAX_IN_DOCUMENTS, f"{total} discouraged phrases:\n{where}"
-
-
-@pytest.mark.parametrize("folder", MAX_IN_CODE)
-def test_code_is_in_plain_terms(folder: str) -> None:
-    """Comments, docstrings and names."""
-    paths = [p for p in sorted((ROOT / folder).rglob("*")) if p.suffix in SUFFIXES and p != Path(__file__)]
-    assert paths
-    total, where = count(paths)
-    assert total <= MAX_IN_CODE[folder], f"{total} discouraged phrases:\n{where}"

@@ -86,7 +86,7 @@ def test_the_commands_of_the_recipe_make_an_ndvi_map(
     """From a flight to its export, and from an orthophoto with the bands in OpenDroneMap's order to NDVI."""
     monkeypatch.chdir(tmp_path)
     Path("flight").symlink_to(flight)
-    page = ROOT / "docs" / "recipes" / "photogrammetry.md"
+    page = ROOT / "docs" / "how-to" / "photogrammetry.md"
     to_export, to_map = [block for block in blocks_of(page) if block.kind == "sh"][:2]
     for command in commands_of(to_export):
         run_command(command, to_export.where)
