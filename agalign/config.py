@@ -93,11 +93,11 @@ class DiscoverOptions:
     """Options of `discover`."""
 
     pattern: str | None = None
-    """Pattern of file names of other cameras, as '{capture}_{band}.tif'."""
+    """File names of a camera that is not recognised, as '{capture}_{band}.tif'."""
     reference: str | None = None
-    """Name of the reference band; by default green."""
+    """Name of the reference band, to whose pixel grid the others are aligned; by default green."""
     ignore_metadata: bool = False
-    """Use no lens or rig tags."""
+    """Ignore the lens and rig tags of the camera."""
     with_rgb: bool = False
     """Also align the camera's colour photograph (JPEG), as three bands."""
     bands: Annotated[tuple[str, ...], Option(type=str | None, parse=names_in)] = ()
@@ -105,13 +105,13 @@ class DiscoverOptions:
     order: choices.BandOrder = "index"
     """Order of the bands: as numbered by the camera, by wavelength, or by name."""
     skip: tuple[Path, ...] = ()
-    """Folders to leave out, such as the output folder."""
+    """Folders to skip, such as the output folder."""
     max_pixels: Annotated[int, Field(ge=1)] = choices.MAX_PIXELS
     """Refuse images with more pixels than this, without reading them."""
     jobs: int = 1
-    """Processes that read the tags of many files; with more than one the calling script must be importable."""
+    """Number of processes that read tags; with more than one, the calling script must be importable."""
     timeout_s: Annotated[float | None, Field(ge=1, le=1e6)] = None
-    """Seconds after which reading the tags of a file is abandoned, in a process of its own; by default unlimited."""
+    """Seconds after which reading the tags of a file is abandoned; by default unlimited. Needs a separate process."""
     include: Annotated[tuple[str, ...], _GLOBS] = ()
     """Use only files that match this glob by path or name; repeatable."""
     exclude: Annotated[tuple[str, ...], _GLOBS] = ()
@@ -123,16 +123,16 @@ class RunOptions:
     """How to run. Only `align_panels` changes results: with it, calibration panels give no reflectance."""
 
     overwrite: bool = False
-    """Estimate and render finished captures again."""
+    """Process finished captures again."""
     jobs: Annotated[int, Field(ge=0, le=4096), Option(short="-j", default=0)] = 1
-    """Captures processed at the same time; 0 is one per core."""
+    """Number of captures processed at the same time; 0 is one per core."""
     align_panels: bool = False
-    """Also align captures of panels and of the sky, and use no panel for reflectance."""
+    """Also align captures of calibration panels and of the sky; panels then give no reflectance."""
     # Any executor in Python, such as `dask_executor`.
     executor: Annotated[Executor | None, Option("dask", type=str | None)] = None
     """Address of a Dask scheduler, as tcp://host:8786; 'local' starts workers on this machine."""
     retry_failed: bool = False
-    """Estimate and render captures with missing or unaligned bands again."""
+    """Process captures with missing or unaligned bands again."""
     # An `executor` of the caller ignores it, except `dask_executor`.
     timeout_s: Annotated[float | None, Field(ge=1, le=1e6), Option("timeout")] = None
     """Seconds after which a capture, or the reading of the tags of a file, is abandoned; by default unlimited."""
@@ -161,22 +161,22 @@ class JointSettings(SettingsModel):
     """Joint optimisation of the descriptor and the homographies."""
 
     recipe: choices.Recipe = "fast"
-    """Algorithm: fast, the same from random weights (scratch), or the published one (paper)."""
+    """Algorithm: fast, the same from random network weights (scratch), or as published by Dong et al. 2018 (paper)."""
     sharing: choices.Sharing = "pseudo-siamese"
-    """Layers that the networks of both bands share: all, all but the first, or none."""
+    """Network layers that both bands share: all (siamese), all but the first (pseudo-siamese) or none (unshared)."""
     model_family: choices.FamilyChoice = "auto"
-    """Mapping to fit; auto is the most general one that the images determine."""
+    """Mapping to fit; auto uses the most general one that the images determine."""
     device: str = "auto"
     """Torch device: auto, cpu, cuda, cuda:1 …"""
     rng_seed: Annotated[int, Field(ge=0, le=choices.MAX_RNG_SEED)] = 0
-    """Seed of all random numbers."""
+    """Seed of the random number generator."""
 
 
 class FlightSettings(SettingsModel):
     """One network for many captures."""
 
     together: Annotated[bool, Option("each_alone", default=False, parse=not_)] = True
-    """Learn a network for each capture, not one for a flight."""
+    """Train a network for each capture instead of one for a flight."""
     start_model: str = ""
     """Fingerprint of the model that a run starts from, set by `run_flight`; runs with another one repeat a capture."""
 
@@ -188,7 +188,8 @@ class SeedSettings(SettingsModel):
         choices.SeedKind | None,
         Option("seed", type=choices.SeedChoice, default="auto", parse=lambda kind: None if kind == "auto" else kind),
     ] = None
-    """Use only this kind of initial alignment; auto is the best of all."""
+    """Source of the initial alignment: camera tags (rig), georeference (geo), correlation of image structure
+    (structure), matched features (match) or none (identity); auto uses the candidate with the highest score."""
     only: Annotated[bool, Option("only_seed")] = False
     """Stop after the initial alignment."""
 
@@ -197,7 +198,7 @@ class CheckSettings(SettingsModel):
     """Acceptance of predicted bands. The limits of the checks are in their modules in `verify`."""
 
     accept_predicted_px: Annotated[float, Field(ge=0), Option("accept_predicted")] = 1.0
-    """Largest standard error, px, at which indices may use a predicted band."""
+    """Largest standard error, px, of a predicted band that indices may use."""
 
 
 class ReliefSettings(SettingsModel):
@@ -208,8 +209,8 @@ class ReliefSettings(SettingsModel):
     use: Annotated[
         choices.ReliefUse, _yes_or_no("always", "never"), Option("relief", alone="always", former="--local")
     ] = "auto"
-    """Correct parallax (trees, terraces, close range) by one relief for all bands of a capture. auto: if windows show
-    parallax. --relief alone means always."""
+    """Correct parallax (trees, terraces, close range) by one parallax map for all bands of a capture: always, never, or
+    if the windows show parallax (auto). --relief alone means always."""
 
 
 class WriteSettings(SettingsModel):
@@ -220,22 +221,22 @@ class WriteSettings(SettingsModel):
     interpolation: choices.Interpolation = "lanczos"
     """Resampling of the moving bands."""
     crop: choices.Crop = "flight"
-    """Area to write: shared by all bands of all captures of a camera (flight) or of the capture (common), or the whole
-    reference (none)."""
+    """Area to write: covered by all bands in all captures of a camera (flight) or in this capture (common), or the
+    whole reference band (none)."""
     format: choices.RasterFormat = "gtiff"
     """Write tiled GeoTIFF or cloud-optimised GeoTIFF."""
     compression: choices.Compression = "auto"
     """Lossless compression; auto is zstd for stacks and deflate for single bands."""
     undistort: bool = False
-    """Remove the lens distortion of the reference from the output."""
+    """Remove the lens distortion of the reference band from the output."""
     layout: choices.Layout = "stack"
-    """Write one stack per capture, one file with tags per input file, or both."""
+    """Write one multiband file per capture (stack), one file with the camera's tags per band (bands), or both."""
     resolution: choices.Resolution = "reference"
-    """Pixel size: of the reference or of the finest band."""
+    """Pixel size of the output: of the reference band or of the band with the smallest pixels (finest)."""
     georeference: bool = False
     """Write an approximate georeference from GPS, altitude and yaw."""
     ground_elevation_m: Annotated[float | None, Field(ge=-1000, le=9000), Option("ground_elevation")] = None
-    """Elevation of the ground, m, in the height system of the GPS, if the tags lack the height above ground."""
+    """Elevation of the ground, m, in the height system of the GPS; used if the tags lack the height above ground."""
     statistics: bool = False
     """Store minimum, maximum, mean and standard deviation of aligned bands."""
     qa: bool = False
@@ -243,28 +244,28 @@ class WriteSettings(SettingsModel):
     indices: Annotated[
         tuple[str, ...], Option("index", type=str | None, parse=lambda text: names_in((text or "").lower()))
     ] = ()
-    """Also write spectral indices, names separated by commas: ndvi, ndre …; 'agalign indices' adds others."""
+    """Spectral indices to write, names separated by commas: ndvi, ndre …; 'agalign indices' computes others later."""
     pan_sharpen: bool = False
-    """Also write bands at the resolution of the panchromatic band, or with --with-rgb of the photograph:
-    <capture>.pan.tif."""
+    """Write <capture>.pan.tif: the bands at the resolution of the panchromatic band, or with --with-rgb of the
+    photograph."""
     error_map: bool = False
     """Write a raster of the expected error at every pixel, <capture>.error.tif."""
     tie_points: bool = False
     """Write the tie points of each band with residual and weight: <capture>.ties.csv and .ties.geojson."""
     relief_map: bool = False
-    """Add confidence and range (m) to the raster of a capture's relief."""
+    """Add confidence and range (m) to the parallax map, <capture>.relief.tif."""
     fill_occluded: bool = False
     """Interpolate pixels that are occluded in a band; by default they are nodata."""
     radiometry: Annotated[choices.RadiometryChoice, _yes_or_no("auto", "off"), Option(alone="auto")] = "off"
-    """Write float32: radiance by the camera's calibration (camera), reflectance by light sensor (sun) or by calibration
-    panel and light sensor if any (panel), or panel, sun, camera, the first that is available (auto; --radiometry
-    alone). Thermal bands: degrees C."""
+    """Convert raw numbers: to radiance by the camera's calibration (camera), to reflectance by the light sensor (sun),
+    or to reflectance by a calibration panel and the light sensor, if any (panel). auto, or --radiometry alone, uses the
+    first of panel, sun and camera that the files allow. Thermal bands become degrees C."""
     # (band in lower case, reflectance); an empty name means all other bands.
     panel_albedo: Annotated[
         tuple[tuple[str, Annotated[float, Field(gt=0, le=1)]], ...], Option(type=str | None, parse=albedos)
     ] = ()
-    """Reflectance of the calibration panel, as 0.51 or Blue=0.51,NIR=0.49; by default from tags or QR code. Also
-    recognises panels without either."""
+    """Reflectance of the calibration panel, as 0.51 or Blue=0.51,NIR=0.49; by default from tags or QR code. With
+    this option, panels without either are recognised too."""
 
 
 class Settings(SettingsModel):

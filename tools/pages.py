@@ -1,13 +1,14 @@
-"""Write the schema of the sidecar and the parts of docs/ that repeat the program (options, indices, sidecar fields,
-reasons), or check that they are current.
+"""Write the schema of the sidecar and the parts of docs/ that repeat the program (commands, settings, indices, sidecar
+fields, reasons), or check that they are current.
 
     python tools/pages.py [--check]
 
-Options come from `agalign/config.py` and the command `align`, indices from `agalign/products/indices/formulas.py`,
+Commands and their options come from `agalign/cli/` and `agalign/config.py`, indices from `agalign/products/indices/formulas.py`,
 fields from `agalign/products/sidecar/schema.py` and the records that it contains, reasons from
 `agalign/values/issues.py`. Each part is between two comments in its page.
 """
 
+import inspect
 import json
 import re
 import sys
@@ -25,9 +26,9 @@ from bands.score import table
 from common import with_section
 
 import agalign
-from agalign.cli.command import field_options
+from agalign.cli.command import Command, field_options, help_of, value_name
 from agalign.cli.main import COMMANDS
-from agalign.config import DiscoverOptions, Option, RunOptions, Settings
+from agalign.config import DiscoverOptions, RunOptions, Settings
 from agalign.products.indices.formulas import INDICES
 from agalign.products.sidecar.schema import Sidecar
 from agalign.values.issues import KINDS, Issue, sentence
@@ -36,51 +37,83 @@ DOCS = Path(__file__).resolve().parents[1] / "docs"
 SCHEMA = Path(agalign.__file__).parent / "sidecar.schema.json"
 
 
-def options(owner: str) -> str:
-    """One row per option of a model in `Given`: its name, the Python name, type and default, and help text.
-
-    Options of the command line only are in the table of `run`.
+def command_options() -> str:
+    """Return a section per command: what it does, its usage, a table of options for each panel of its help, and its
+    examples. Options that `align` has with the same text are described there only.
     """
-    rows = [("option", "Python", "value", "effect")]
-    defaults = {"settings": Settings(), "discover": DiscoverOptions(), "run": RunOptions()}[owner]
-    for parameter in COMMANDS["align"].parameters():
-        option = field_options().get(parameter.name)
-        if owner != (option.path[0] if option else "run") or parameter.name == "folder":
-            continue
+    return "\n".join(section(command) for command in COMMANDS.values() if not command.alias)
+
+
+def section(command: Command) -> str:
+    """Return the section of a command."""
+    text, _, examples = help_of(command.function)
+    built = command.built()
+    usage = " ".join(built.collect_usage_pieces(built.make_context(command.name, [], resilient_parsing=True)))
+    panels = {name: panel for panel, names in command.panels.items() for name in names.split()}
+    by_panel: dict[str, list[Row]] = {}
+    shared = [] if command is COMMANDS["align"] else [row for _, row in option_rows(COMMANDS["align"])]
+    same = []
+    for name, row in option_rows(command):
+        if row in shared:
+            same.append(row[0].split(",")[0])
+        else:
+            by_panel.setdefault(panels.get(name, ""), []).append(row)
+    parts = [f"## {command.name}", effect(text), f"```text\nagalign {command.name} {usage}\n```"]
+    for panel, rows in by_panel.items():
+        parts.append(table([(panel.lower() or "argument", "value", "effect"), *rows]))
+    if same:
+        parts.append(f"As in [`align`](#align): {', '.join(same)}.")
+    if examples:
+        parts.append("\n".join(f"* `{line}`: {what}" for line, what in (e.split("  ") for e in examples)))
+    return "\n\n".join(parts) + "\n"
+
+
+Row = tuple[str, str, str]
+
+
+def option_rows(command: Command) -> Iterator[tuple[str, Row]]:
+    """Yield the name of each parameter of a command and (names on the command line, values, help text)."""
+    for parameter, param in zip(command.parameters(), command.built().params, strict=True):
         kind, info = typing.get_args(parameter.annotation)
-        python, value = f"argument `{parameter.name}`" if parameter.name in ("model", "out") else "", type_name(kind)
-        if option is not None:
-            name, opposite = ".".join(option.path[1:]), " (opposite)" if option.parse is not_ else ""
-            python = f"`{name}`{opposite}"
-            value = with_default(value, option, parameter.default, attrgetter(name)(defaults))
-        rows.append((f"`--{parameter.name.replace('_', '-')}`", python, value, effect(info.help)))
-    return table(rows) + "\n"
+        values = value_name(kind)
+        values = ", ".join(f"`{value}`" for value in values.split("|")) if "|" in values else values.lower()
+        names = [param.metavar] if param.param_type_name == "argument" else sorted(param.opts, key=len, reverse=True)
+        if param.required and param.param_type_name == "option":
+            values += " (required)"
+        row = ", ".join(f"`{one}`" for one in names), with_default(values, parameter.default), effect(info.help)
+        yield parameter.name, row
 
 
-def with_default(values: str, option: Option, given: Any, in_python: Any) -> str:
-    """Return the values of an option with its default in bold, and that of its field if it gives another result."""
-    if given is None or given is False:
+def with_default(values: str, given: Any) -> str:
+    """Return the values of an option with its default in bold, if it has one."""
+    if given is inspect.Parameter.empty or given is None or given is False:
         return values
     if f"`{given}`" in values:
         return values.replace(f"`{given}`", f"**`{given}`**")
-    differs = option.parse(given) != in_python
-    return f"{values}, **`{given}`**" + (f" (in Python **`{in_python}`**)" if differs else "")
+    return f"{values}, **`{given}`**"
+
+
+def python_names(owner: str) -> str:
+    """Return a table of the fields of a model in `Given`: Python name, default, and option of `agalign align`."""
+    rows = [("Python", "default", "option")]
+    defaults = {"settings": Settings(), "discover": DiscoverOptions(), "run": RunOptions()}[owner]
+    for option in field_options().values():
+        name = ".".join(option.path[1:])
+        if option.path[0] != owner or option.path[-1] in NOT_OPTIONS[owner]:
+            continue
+        opposite = " (opposite)" if option.parse is not_ else ""
+        rows.append((f"`{name}`", f"`{attrgetter(name)(defaults)!r}`", f"`{option.flag}`{opposite}"))
+    return table(rows) + "\n"
+
+
+NOT_OPTIONS = {"settings": ("start_model",), "discover": ("skip", "jobs", "timeout_s"), "run": ("command",)}
+"""Fields without an option of their own."""
 
 
 def effect(text: str) -> str:
-    """Return a help text as Markdown."""
-    return re.sub(r"(?<![`<\w])(--[a-z-]+)", r"`\1`", text).replace("<", "\\<")
-
-
-def type_name(kind: Any) -> str:
-    """Return the value as a user writes it."""
-    kinds = [k for k in (typing.get_args(kind) or (kind,)) if k is not type(None)]
-    if typing.get_origin(kind) is list:
-        return "repeatable"
-    if typing.get_origin(kinds[0]) is typing.Literal or isinstance(kinds[0], str):
-        values = kinds if isinstance(kinds[0], str) else typing.get_args(kinds[0])
-        return ", ".join(f"`{value}`" for value in values)
-    return {bool: "", int: "integer", float: "number", str: "text", Path: "path"}.get(kinds[0], "text")
+    """Return a help text as Markdown: quoted commands, options and `<capture>.tif` as code."""
+    code = r"'agalign [^']+'|(?<![`<\w])--[a-z-]+|<capture>[\w.]*\w|OUT/[\w/….]*\w"
+    return re.sub(code, lambda found: "`" + found[0].strip("'") + "`", text)
 
 
 def fields() -> str:
@@ -176,9 +209,10 @@ def indices() -> str:
 
 
 PARTS: tuple[tuple[str, str, Callable[[], str]], ...] = (
-    ("reference/settings.md", "Settings", partial(options, "settings")),
-    ("reference/settings.md", "DiscoverOptions", partial(options, "discover")),
-    ("reference/settings.md", "RunOptions", partial(options, "run")),
+    ("reference/commands.md", "commands", command_options),
+    ("reference/settings.md", "Settings", partial(python_names, "settings")),
+    ("reference/settings.md", "DiscoverOptions", partial(python_names, "discover")),
+    ("reference/settings.md", "RunOptions", partial(python_names, "run")),
     ("how-to/reflectance.md", "indices", indices),
     ("reference/sidecar.md", "fields", fields),
     ("how-to/troubleshooting.md", "reasons", reasons),

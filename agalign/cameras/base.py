@@ -104,10 +104,10 @@ def default_reference(bands: Sequence[Band]) -> int:
     return min(known)[1] if known else next(iter(reflective), 0)
 
 
-def reference_index(bands: Sequence[Band], wanted: str | None, path: Path) -> int:
+def reference_index(bands: Sequence[Band], wanted: str | None, path: Path, option: str = "--reference") -> int:
     """Return the index of the band with the name `wanted` in any spelling; of the default if it is None or 'auto'.
 
-    Raises NoSuchBandError, which names `path`, if no band has the name.
+    Raises NoSuchBandError, which names `path` and the command-line `option`, if no band has the name.
     """
     if wanted is None or wanted.lower() == "auto":
         return default_reference(bands)
@@ -115,7 +115,7 @@ def reference_index(bands: Sequence[Band], wanted: str | None, path: Path) -> in
         if band_key(band.name) == band_key(wanted):
             return index
     similar = did_you_mean(wanted, [b.name for b in bands])
-    raise NoSuchBandError(f"{path}: no band '{wanted}', as --reference asks{similar}; choose from {listed(bands)}")
+    raise NoSuchBandError(f"{path}: no band '{wanted}', as {option} asks{similar}; choose from {listed(bands)}")
 
 
 def listed(bands: Sequence[Band]) -> str:

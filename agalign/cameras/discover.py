@@ -243,7 +243,7 @@ def mosaics_onto(
     Raises UnreadableFileError, InputError if a mosaic is not georeferenced, NoSuchBandError.
     """
     reference_bands = _georeferenced_bands(reference, max_pixels)
-    fixed = reference_bands[reference_index(reference_bands, band, reference)]
+    fixed = reference_bands[reference_index(reference_bands, band, reference, "--band")]
     # By its wavelength, it would be displayed, and taken for indices, with the bands of another date.
     fixed = replace(fixed, name=f"{reference.stem} {fixed.name}", wavelength_nm=None, bandwidth_nm=None)
     captures = []

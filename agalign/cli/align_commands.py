@@ -32,10 +32,10 @@ def _align(
 
     Options:
         folder: Folder with the images, sub-folders included.
-        model: Reuse the network and rig of an earlier flight of the same camera: OUT/models/….
+        model: Start from the network and rig of an earlier flight of the same camera (OUT/models/….safetensors).
         out: Output folder; by default FOLDER-aligned.
-        dry_run: Print what would be done, and write nothing.
-        config: Read these options from a TOML file; 'agalign info --options' prints one.
+        dry_run: Print which captures would be processed, and write nothing.
+        config: TOML file with values of these options; 'agalign info --options' prints one.
 
     Examples:
         agalign flight/  align the bands of all captures, into flight-aligned/
@@ -105,9 +105,8 @@ def _demo(
     """Make a synthetic flight, align it, and compare the result with the ground truth.
 
     Options:
-        out: Folder to make.
-        captures: Captures to make.
-        device: auto, cpu, cuda, cuda:1 …
+        out: Output folder.
+        captures: Number of captures.
     """
     from agalign.cli.align_run import conclude, find_captures, run
     from agalign.config import DiscoverOptions, RunOptions, Settings
@@ -139,25 +138,25 @@ def _onto(
     reference: Annotated[Path, typer.Argument()],
     moving: Annotated[list[Path], typer.Argument()],
     out: Annotated[Path | None, typer.Option("--out", "-o")] = None,
-    band: Annotated[str | None, typer.Option("--reference", "--band")] = None,
+    band: Annotated[str | None, typer.Option("--band")] = None,
 ) -> int:
     """Align georeferenced mosaics of other dates or sensors to the grid of REFERENCE.
 
     Grids, resolutions and coordinate reference systems may differ. A mosaic is aligned if its windows are within a
     pixel of REFERENCE: resample both to the pixel size that you need. For each MOVING, agalign writes a sidecar and a
-    raster on the grid of REFERENCE, with one band of REFERENCE (--reference) and all bands of MOVING.
+    raster on the grid of REFERENCE, with one band of REFERENCE (--band) and all bands of MOVING.
 
     Options:
         reference: The mosaic with the output grid.
         moving: Mosaics of other dates or sensors.
         out: Output folder; by default REFERENCE-aligned.
-        band: Band of the mosaic REFERENCE to compare with; by default green.
-        relief: Add a smooth displacement field to the homography. auto: if windows not used in its fit confirm it.
+        band: Band of REFERENCE that the bands of MOVING are aligned to; by default green.
+        relief: Add a smooth displacement field to the homography (always), never, or if it reduces the residuals of
+            held-out windows (auto).
         interpolation: Resampling of the moving mosaics.
         format: Tiled GeoTIFF or cloud-optimised GeoTIFF.
         compression: Lossless compression.
-        device: auto, cpu, cuda, cuda:1 …
-        jobs: Mosaics processed at the same time; 0 is one per core.
+        jobs: Number of mosaics processed at the same time; 0 is one per core.
         overwrite: Process finished mosaics again.
         max_pixels: Refuse mosaics with more pixels than this, without reading them.
     """

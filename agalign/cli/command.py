@@ -14,10 +14,12 @@ from dataclasses import dataclass, field, replace
 from functools import cache
 from itertools import pairwise
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, get_args, get_origin
+from types import NoneType, UnionType
+from typing import TYPE_CHECKING, Annotated, Any, Literal, Union, get_args, get_origin
 
 import typer
 from typer.core import TyperCommand
+from typer.models import OptionInfo
 
 from agalign.cli.terminal import Terminal, exits
 from agalign.values.files import read_regular
@@ -79,7 +81,7 @@ def help_of(function: Any) -> tuple[str, dict[str, str], list[str]]:
 
 def _on_command_line(parameter: inspect.Parameter, text: str | None, panel: str | None) -> inspect.Parameter:
     """Return a parameter, which may have an option of typer as annotation, as one of the command line in a panel of
-    its help. The help text replaces that of the annotation.
+    its help. The help text replaces that of the annotation. The help shows the kind of value as `value_name` names it.
     """
     kind, info = parameter.annotation, typer.Option()
     if kind is bool:
@@ -88,7 +90,25 @@ def _on_command_line(parameter: inspect.Parameter, text: str | None, panel: str 
         kind, info = get_args(kind)
     info = copy.copy(info)
     info.help, info.rich_help_panel = text or info.help, panel
+    if isinstance(info, OptionInfo):
+        info.metavar = value_name(kind)
+    else:
+        info.metavar = f"{parameter.name.upper()}{'...' if get_origin(kind) is list else ''}"
     return parameter.replace(kind=inspect.Parameter.KEYWORD_ONLY, annotation=Annotated[kind, info])
+
+
+def value_name(kind: Any) -> str:
+    """Return how a help text names the value of an option of this type, "" for a flag; None is no value.
+
+    >>> value_name(Path | None), value_name(list[str] | None), value_name(Literal["odm", "pix4d"])
+    ('PATH', 'TEXT', 'odm|pix4d')
+    """
+    if get_origin(kind) in (Union, UnionType):
+        kind = next(one for one in get_args(kind) if one is not NoneType)
+    if get_origin(kind) is Literal:
+        return "|".join(get_args(kind))
+    kind = get_args(kind)[0] if get_origin(kind) is list else kind
+    return {bool: "", int: "INTEGER", float: "NUMBER", Path: "PATH"}.get(kind, "TEXT")
 
 
 @dataclass(frozen=True)
@@ -150,10 +170,11 @@ class Command:
                     values["given"] = given
                 raise typer.Exit(self.function(terminal, **values) or 0)
 
-        call.__doc__, _, examples = help_of(self.function)
+        text, _, examples = help_of(self.function)
+        call.__doc__ = re.sub(r"(?<!\n)\n(?!\n)", " ", text)  # the lines of a paragraph are wrapped to the terminal
         call.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
         app = typer.Typer(add_completion=False, rich_markup_mode="rich", pretty_exceptions_enable=False)
-        cls = _LenientCommand if fields else TyperCommand
+        cls = _LenientCommand if fields else _Command
         epilog = "\n\n".join(["Examples:", *map(_highlighted, examples)]) if examples else None
         app.command(self.name, cls=cls, epilog=epilog, hidden=bool(self.alias))(call)
         return typer.main.get_command(app)
@@ -165,7 +186,26 @@ def _highlighted(example: str) -> str:
     return f"[bold]{command}[/]  {what}"
 
 
-class _LenientCommand(TyperCommand):
+class _Command(TyperCommand):
+    """A command with a help that shows no types of flags and arguments."""
+
+    def get_params(self, ctx: Any) -> list[Any]:
+        """Return the parameters with that of --help."""
+        params = super().get_params(ctx)
+        for param in params:
+            if param.param_type_name == "argument":
+                vars(param)["display_type_rich"] = lambda ctx: None  # noqa: ARG005
+            elif param.name == "help":
+                param.metavar = ""
+        return params
+
+    def collect_usage_pieces(self, ctx: Any) -> list[str]:
+        """Return the parts of the line "Usage:", with arguments as they are named in the text."""
+        arguments = (param for param in self.get_params(ctx) if param.param_type_name == "argument")
+        return ["[OPTIONS]", *(a.metavar if a.required else f"[{a.metavar}]" for a in arguments)]
+
+
+class _LenientCommand(_Command):
     """A command that takes options under their former names, and some options without a value."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:

@@ -37,7 +37,6 @@ def _evaluate(
         directions: Directions of the start for each distance.
         seeding: Correct the start by the initial alignment first, as a run does.
         out: CSV file with a row per pair, method and start; rows that it has are not measured again.
-        device: auto, cpu, cuda, cuda:1 …
     """
     from agalign.evaluation.evaluate import (
         Starts,
@@ -94,7 +93,6 @@ def _surface(
         reach: Largest offset, px.
         points: Offsets along each axis.
         epochs: Training epochs for each offset.
-        device: auto, cpu, cuda, cuda:1 …
     """
     import numpy as np
 
@@ -136,7 +134,6 @@ def _learn(
     Options:
         out: Network to write.
         steps: Training steps per aligned pair.
-        device: auto, cpu, cuda, cuda:1 …
     """
     from agalign.config import Settings
     from agalign.evaluation.descriptor_learning import learn_descriptor, read_rough_pairs

@@ -30,7 +30,7 @@ def _info(
     Options:
         folder: Folder with images, or the model of a run (OUT/models/….safetensors).
         as_json: Print JSON to standard output.
-        options: Print a --config file with all options of 'agalign align'.
+        options: Print a configuration file (--config) with all options of align.
     """
     if options:
         typer.echo(config_text(align.built()))

@@ -26,7 +26,7 @@ def _report(terminal: Terminal, out: Annotated[Path, typer.Argument()], as_json:
 
     Options:
         out: Output folder of an earlier run.
-        as_json: Print the content of the report as JSON.
+        as_json: Print the content of the report as JSON lines.
     """
     from agalign.cli.problem_groups import explain
     from agalign.products.report.facts import SUMMARY_FILE
@@ -99,7 +99,7 @@ def _export(
     """Export aligned captures for photogrammetry programs.
 
     Options:
-        program: odm (OpenDroneMap), metashape or pix4d.
+        program: Program that reads the files; odm is OpenDroneMap.
         target: Output folder; by default OUT with the program's name added.
         copy: Copy the band files instead of creating hard links.
 
@@ -153,7 +153,7 @@ def _indices(
         target: Folder for the rasters; by default next to the stacks.
         mask_qa: Omit saturated, occluded and misaligned pixels; the run needs --qa.
         as_json: Print JSON to standard output.
-        overwrite: Compute again what an earlier command wrote.
+        overwrite: Compute indices again that an earlier command wrote.
 
     Examples:
         agalign indices aligned/  NDVI of every capture, next to its stack

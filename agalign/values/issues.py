@@ -45,7 +45,7 @@ UNLIKE = Remedy(
 MOSAICS = Remedy(
     "the mosaics differ by more than a pixel of REFERENCE, or show too little in common",
     "resample both mosaics to larger pixels, of the size that you need (gdalwarp -r average -tr SIZE SIZE); compare a "
-    "band in which the field changed little (--reference)",
+    "band in which the field changed little (--band)",
 )
 """For georeferenced rasters instead of remedies that concern cameras and flights."""
 MISSING_BAND = Remedy("a band of this camera is missing", "copy the files from the card; apps may not list all of them")
