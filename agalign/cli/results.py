@@ -26,7 +26,7 @@ def _report(terminal: Terminal, out: Annotated[Path, typer.Argument()], as_json:
 
     Options:
         out: Output folder of an earlier run.
-        as_json: Print the content of the report as JSON lines.
+        as_json: Print the content of the report as JSON.
     """
     from agalign.cli.problem_groups import explain
     from agalign.products.report.facts import SUMMARY_FILE
