@@ -7,8 +7,6 @@ copyright = "the agalign authors"
 version = release = __version__
 extensions = ["myst_parser", "sphinx.ext.autodoc"]
 myst_heading_anchors = 3
-# Pages link to files of the repository that are not part of the site; a test checks that they exist.
-suppress_warnings = ["myst.xref_missing"]
 autodoc_typehints = "description"
 exclude_patterns = ["_build"]
 autodoc_member_order = "bysource"

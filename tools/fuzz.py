@@ -1,7 +1,7 @@
 """Coverage-guided fuzzing of what is read from a card: tags, XMP packets, and the names of files.
 
     pip install atheris
-    python tools/fuzz.py [--inputs 200000] [--markdown docs/explanation/reliability.md]
+    python tools/fuzz.py [--inputs 200000] [--markdown FILE]
     python tools/fuzz.py --target xmp --inputs 10000       one target, with libFuzzer's own output
 
 An input fails where anything but an AgalignError is raised, where it takes longer than a second, or where the process

@@ -3,19 +3,21 @@ fields, reasons), or check that they are current.
 
     python tools/pages.py [--check]
 
-Commands and their options come from `agalign/cli/` and `agalign/config.py`, indices from `agalign/products/indices/formulas.py`,
-fields from `agalign/products/sidecar/schema.py` and the records that it contains, reasons from
-`agalign/values/issues.py`. Each part is between two comments in its page.
+Commands and their options come from `agalign/cli/` and `agalign/config.py`, indices from
+`agalign/products/indices/formulas.py`, fields from `agalign/products/sidecar/schema.py` and the records that it
+contains, reasons from `agalign/values/issues.py`, measured figures from `docs/figures/figures.csv` and
+`benchmarks/bands/results.csv`. Each part is between two comments in its page.
 """
 
+import csv
 import inspect
 import json
 import re
 import sys
 import typing
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Callable, Container, Iterator, Mapping
-from functools import partial
+from functools import cache, partial
 from operator import attrgetter, not_
 from pathlib import Path
 from typing import Any
@@ -35,6 +37,32 @@ from agalign.values.issues import KINDS, Issue, sentence
 
 DOCS = Path(__file__).resolve().parents[1] / "docs"
 SCHEMA = Path(agalign.__file__).parent / "sidecar.schema.json"
+FIGURES = DOCS / "figures" / "figures.csv"
+RESULTS = DOCS.parent / "benchmarks" / "bands" / "results.csv"
+VARIANTS = {
+    "as it is": "unchanged",
+    "lens-corrected": "lens-corrected",
+    "blur 3 px": "blur 3 px",
+    "motion 25 px": "motion 25 px",
+    "noise 30 %": "noise 30 %",
+    "half saturated": "half saturated",
+    "turn 3": "rotated 3°",
+    "turn 10": "rotated 10°",
+    "turn 20": "rotated 20°",
+    "scale 0.8": "scaled 0.8",
+    "lost": "noise only",
+}
+"""Names of the variants of the benchmark on the page."""
+TABLES = {
+    "accuracy": (
+        *("accuracy", "standard errors", "simulated cameras", "scenes with depth", "poses", "CPU time", "runs"),
+        "captures with depth",
+    ),
+    "failures": ("synthetic pairs", "planted grids", "starts", "difficult captures", "predicted bands"),
+    "comparison": ("comparison",),
+    "verification": ("reliability",),
+}
+"""Tables of `figures.csv` by page of docs/explanation."""
 
 
 def command_options() -> str:
@@ -208,6 +236,63 @@ def indices() -> str:
     return table(rows) + "\n"
 
 
+@cache
+def figures() -> dict[str, dict[str, str]]:
+    """Return the rows of docs/figures/figures.csv by fact: table / row / column."""
+    with FIGURES.open(encoding="utf-8", newline="") as file:
+        return {row["fact"]: row for row in csv.DictReader(file)}
+
+
+def figures_of(name: str) -> str:
+    """Return a table of docs/figures/figures.csv, with the command that makes it: below, or in a column if the rows
+    have different ones.
+    """
+    parts = [(*fact.split(" / ")[1:], row) for fact, row in figures().items() if fact.startswith(f"{name} / ")]
+    columns = list(dict.fromkeys((column, row["unit"]) for _, column, row in parts))
+    by_row: dict[str, dict[str, dict[str, str]]] = {}
+    for line, column, row in parts:
+        by_row.setdefault(line, {})[column] = row
+    commands = list(dict.fromkeys(row["command"] for *_, row in parts))
+    heads = [f"{column}, {unit}" if unit else column for column, unit in columns]
+    rows = [("", "n", *heads, *(["command"] if commands[1:] else []))]
+    for line, cells in by_row.items():
+        (first, *_), values = cells.values(), [cells[column]["value"] or "-" for column, _ in columns]
+        rows.append((line, first["n"], *values, *([f"`{first['command']}`"] if commands[1:] else [])))
+    return table(rows) + "\n" + ("" if commands[1:] else f"\n`{commands[0]}`\n")
+
+
+def scores(by: str) -> str:
+    """Return a table of benchmarks/bands/results.csv by "variant", or by "set" for unchanged images: a row per method
+    but the simplest.
+    """
+    by_set = by == "set"
+    with RESULTS.open(encoding="utf-8", newline="") as file:
+        results = [row for row in csv.DictReader(file) if not by_set or row["variant"] == "as it is"]
+    cells = defaultdict[str, dict[str, list[dict[str, str]]]](lambda: defaultdict(list))
+    for row in results:
+        if row["method"] not in ("phase correlation", *(() if by_set else ("identity",))):
+            cells[row["method"]][row[by]].append(row)
+    columns = list(dict.fromkeys(column for of_method in cells.values() for column in of_method))
+    columns = columns if by_set else [v for v in VARIANTS if v in columns]
+
+    def cell(of_cell: list[dict[str, str]]) -> str:
+        if not of_cell:
+            return "-"
+        wrong = sum(int(row["wrong_claims"]) for row in of_cell)
+        if by_set:
+            return f"{float(of_cell[0]['median_px'] or 'nan'):.2f}, {wrong}".replace("nan", "-")
+        good = sum(round(float(row["under_half_px"] or 0) * int(row["pairs"])) for row in of_cell)
+        return f"{good}, {wrong}"
+
+    def pairs(column: str) -> int:
+        return max(sum(int(row["pairs"]) for row in of_method[column]) for of_method in cells.values())
+
+    names = {column: VARIANTS.get(column, column.replace("_", " ")) for column in columns}
+    rows = [("", *(f"{names[column]} ({pairs(column)})" for column in columns))]
+    rows += [(method, *(cell(of_method[column]) for column in columns)) for method, of_method in cells.items()]
+    return table(rows) + "\n"
+
+
 PARTS: tuple[tuple[str, str, Callable[[], str]], ...] = (
     ("reference/commands.md", "commands", command_options),
     ("reference/settings.md", "Settings", partial(python_names, "settings")),
@@ -216,6 +301,9 @@ PARTS: tuple[tuple[str, str, Callable[[], str]], ...] = (
     ("how-to/reflectance.md", "indices", indices),
     ("reference/sidecar.md", "fields", fields),
     ("how-to/troubleshooting.md", "reasons", reasons),
+    ("explanation/comparison.md", "scores by variant", partial(scores, "variant")),
+    ("explanation/comparison.md", "scores by set", partial(scores, "set")),
+    *((f"explanation/{page}.md", name, partial(figures_of, name)) for page, names in TABLES.items() for name in names),
 )
 """Page, mark of the part in it, and the function that makes its content."""
 

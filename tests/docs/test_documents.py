@@ -282,6 +282,6 @@ def test_the_site_builds_without_warnings(tmp_path: Path) -> None:
     """Every page, and what the docstrings say, without a warning."""
     pytest.importorskip("sphinx")
     python("-m", "sphinx", "-q", "-W", "--keep-going", ROOT / "docs", tmp_path / "site")
-    page = (tmp_path / "site" / "api.html").read_text(encoding="utf-8")
+    page = (tmp_path / "site" / "reference" / "api.html").read_text(encoding="utf-8")
     described = set(re.findall(r'descname"><span class="pre">(\w+)<', page))
     assert set(agalign.__all__) - {"__version__"} <= described

@@ -23,8 +23,10 @@ from agalign.fit import dense, displacement_field, windows
 from agalign.flight import panel_readings
 from agalign.method import refine
 from agalign.pixels import masks, raster
+from agalign.products.indices.rasters import INDICES_FILE, IndexReport, update_table
 from agalign.products.rasters.parallax_file import PARALLAX_KIND
 from agalign.products.registry import PRODUCTS
+from agalign.products.report.facts import SUMMARY_COLUMNS
 from agalign.products.sidecar.schema import FilePart
 from agalign.values.alignment import MIN_RETRIEVAL, MIN_TIMES_CHANCE
 from agalign.verify import checks, expected_error
@@ -35,8 +37,7 @@ from .blocks import PAGES, ROOT, each_page, text_of
 PACKAGE = ROOT / "agalign"
 OPTIONS_OF_OTHERS = {
     *("--cpus", "--gpus", "--read-only", "--tmpfs", "--user"),  # docker run
-    *("--degraded", "--grids", "--kinds", "--markdown", "--pairs", "--plot", "--ranges", "--scenes"),  # benchmarks
-    *("--size", "--stages"),
+    *("--floor", "--grids", "--kinds", "--pairs", "--plot", "--ranges", "--scenes", "--size"),  # benchmarks
     *("--extra-index-url", "--strict"),  # pip, mypy
 }
 """Options in the text of pages that are not those of agalign."""
@@ -145,23 +146,26 @@ def test_stages_of_a_capture() -> None:
 
 LIMITS = {
     "explanation/method.md": (
-        f"| at least {MIN_RETRIEVAL:g}, and {MIN_TIMES_CHANCE:g} times chance |",
-        f"at most {checks._MAX_ERROR_PX:g} px in {checks._MIN_ACCURATE_SHARE:.0%} of the image".replace("%", " %"),
-        f"windows with structure ({windows._WINDOW_PX} px at most)",
-        f"| {expected_error.MIN_COMMON_COVERAGE:.0%} |".replace("%", " %"),
-        f"| {checks._MIN_CLOSE_SHARE:.0%}; adjacent windows beyond: fewer than {checks._MIN_CLUSTER}, or than "
-        f"{checks._MAX_CLUSTER_SHARE:.0%} of the windows |".replace("%", " %"),
         f"narrower than {masks._MIN_SATURATED_PX} px are not masked",
         f"standard deviation of {displacement_field._NOISE_PX / displacement_field._SMOOTHNESS**0.5:.2f} px",
-        f"| {checks.MAX_ALIAS_PEAK:.0%} of the first".replace("%", " %"),
-        f"| the larger of {checks.MAX_UNEXPECTED_PX:g} px and {checks._MAX_UNEXPECTED_STD:g} standard errors |",
-        f"in blurred images they have {reference._LARGE_WINDOW_PX} px",
         f"by more than {refine._FINAL_CONVERGED_PX:g} px",
         f"the p95 of the windows' parallax is at least {common_parallax.MIN_PARALLAX_PX:g} px",
         f"nodes every {displacement_field._LATTICE_PX} px",
         f"fitted to windows of {displacement_field._WINDOW_PX} px",
         f"Images above {band_pair._LONGEST_SIDE_PX} px",
         f"fewer than {band_pair._COARSE_RATIO:g} pixels per reference pixel",
+    ),
+    "explanation/verification.md": (
+        f"| at least {MIN_RETRIEVAL:g}, and {MIN_TIMES_CHANCE:g} times chance |",
+        f"at most {checks._MAX_ERROR_PX:g} px in {checks._MIN_ACCURATE_SHARE:.0%} of the image".replace("%", " %"),
+        f"windows with structure ({windows._WINDOW_PX} px at most)",
+        f"| {expected_error.MIN_COMMON_COVERAGE:.0%} |".replace("%", " %"),
+        f"| {checks._MIN_CLOSE_SHARE:.0%}; adjacent windows beyond: fewer than {checks._MIN_CLUSTER}, or than "
+        f"{checks._MAX_CLUSTER_SHARE:.0%} of the windows |".replace("%", " %"),
+        f"| {checks.MAX_ALIAS_PEAK:.0%} of the first".replace("%", " %"),
+        f"| the larger of {checks.MAX_UNEXPECTED_PX:g} px and {checks._MAX_UNEXPECTED_STD:g} standard errors |",
+        f"in blurred images they have {reference._LARGE_WINDOW_PX} px",
+        f"{raster._MAX_BANDS} bands per file",
     ),
     "explanation/accuracy.md": (
         f"The largest parallax is {dense._SEARCH_NEARER:.0%} of".replace("%", " %"),
@@ -170,7 +174,6 @@ LIMITS = {
     "how-to/reflectance.md": (
         f"calibration panels at most {panel_readings.MAX_TIME_DIFFERENCE_S / 3600:g} hours away",
     ),
-    "explanation/reliability.md": (f"{raster._MAX_BANDS} bands per file",),
 }
 """{page: sentences with a limit of the program}."""
 
@@ -211,6 +214,19 @@ def test_extras() -> None:
     commands = re.findall(r"pip install '?\.\[([\w,]+)\]", "".join(page.read_text(encoding="utf-8") for page in PAGES))
     assert commands
     assert {name for names in commands for name in names.split(",")} <= set(extras)
+
+
+def columns(page: str, heading: str) -> set[str]:
+    """The names in the first column of the first table below a heading."""
+    below = text_of(ROOT / "docs" / page).partition(f"\n## {heading}\n")[2].partition("\n## ")[0]
+    return set(re.findall(r"`(\w+)`", " ".join(line.split("|")[1] for line in below.splitlines() if line[:2] == "| ")))
+
+
+def test_columns_of_the_tables_that_a_run_writes(tmp_path: Path) -> None:
+    assert columns("reference/outputs.md", "summary.csv") == set(SUMMARY_COLUMNS)
+    update_table(tmp_path, [IndexReport("a", "ndvi")], [])
+    head = (tmp_path / INDICES_FILE).read_text(encoding="utf-8-sig").splitlines()[0]
+    assert columns("reference/outputs.md", "indices.csv") == set(head.split(","))
 
 
 def test_kinds_of_products() -> None:

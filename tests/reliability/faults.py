@@ -1,8 +1,8 @@
 """Faults of cards, disks, machines and files, and the results that the program must have.
 
 Each fault is done to a small flight of two good captures, `a` and `b`, and the program is run on it. `python -m
-tests.reliability.faults` prints the result of each fault, and with `--markdown docs/explanation/reliability.md` updates
-the table of that page. test_faults.py compares the result of each fault with the expected one.
+tests.reliability.faults` prints the result of each fault, and with `--markdown docs/explanation/verification.md`
+updates the table of that page. test_faults.py compares the result of each fault with the expected one.
 """
 
 import contextlib
@@ -38,7 +38,7 @@ from agalign.values.files import RUN_FILE
 from ..conftest import raising, textured_pair
 from ..program import agalign_here
 
-DOCUMENT = Path(__file__).resolve().parents[2] / "docs" / "explanation" / "reliability.md"
+DOCUMENT = Path(__file__).resolve().parents[2] / "docs" / "explanation" / "verification.md"
 SHIFT = np.array([[1, 0, 6.0], [0, 1, -4.0], [0, 0, 1]])
 SIZE_PX = 320, 240
 ALL = "abcdefghijkl"
@@ -756,7 +756,7 @@ def documented() -> dict[str, str]:
 
 
 def main() -> None:
-    """Print the result of each fault, and write the table of docs/explanation/reliability.md."""
+    """Print the result of each fault, and write the table of docs/explanation/verification.md."""
     sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "benchmarks"))
     from common import report
 

@@ -1,4 +1,4 @@
-"""Each fault of the list has the expected result, and docs/explanation/reliability.md reports it."""
+"""Each fault of the list has the expected result, and docs/explanation/verification.md reports it."""
 
 from pathlib import Path
 

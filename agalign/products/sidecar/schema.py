@@ -152,7 +152,7 @@ class ReliefPart(_Part):
     """
 
     file: RelativeFile | None
-    """[Raster](#the-relief-raster) with the parallax, on the grid of the stack; null if it was not written."""
+    """[Raster](outputs.md#parallax) with the parallax, on the grid of the stack; null if it was not written."""
     baseline: PointPx
     """Displacement per px of parallax, undistorted px of the reference; the longest baseline has length 1."""
     occluded: Number4
