@@ -132,8 +132,10 @@ def main() -> None:
             code = app(args=arguments, prog_name="agalign", standalone_mode=False)
         except _UsageError as error:
             if arguments:
-                text = f"{_reworded(error)}{options_from(error.ctx.params.get('config'))}"
-                _usage_problem(f"{text}; '{error.ctx.command_path} --help' lists the options")
+                context = error.ctx  # None for an option without its value
+                path = f"agalign {arguments[0]}" if context is None else context.command_path
+                config = None if context is None else context.params.get("config")
+                _usage_problem(f"{_reworded(error)}{options_from(config)}; '{path} --help' lists the options")
             else:
                 typer.echo(error.message, err=True)  # the help
             code = ExitCode.USAGE

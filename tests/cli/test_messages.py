@@ -41,6 +41,7 @@ GREEN = "(did you mean 'Green'?); choose from Blue, Green, Red, NIR, Red edge"
         ("align x --nope", 2, "no such option: --nope"),
         ("align", 2, "folder is missing"),
         ("--nope", 2, "no such option: --nope"),
+        ("align x -o", 2, "option '-o' requires an argument; 'agalign align --help' lists the options"),
         ("align x y", 2, "got unexpected extra argument(s) (y)"),
         ("export nowhere --for excel", 2, "--for: 'excel' is unknown"),
         ("align x --radiometry refl", 2, "--radiometry: 'refl' is unknown; choose from off, auto, camera, sun, panel"),
