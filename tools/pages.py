@@ -55,7 +55,7 @@ VARIANTS = {
 """Names of the variants of the benchmark on the page."""
 TABLES = {
     "accuracy": (
-        *("accuracy", "standard errors", "simulated cameras", "scenes with depth", "poses", "CPU time", "runs"),
+        *("accuracy", "standard errors", "simulated cameras", "scenes with depth", "CPU time", "runs"),
         "captures with depth",
     ),
     "failures": ("synthetic pairs", "planted grids", "starts", "difficult captures", "predicted bands"),
@@ -261,35 +261,23 @@ def figures_of(name: str) -> str:
     return table(rows) + "\n" + ("" if commands[1:] else f"\n`{commands[0]}`\n")
 
 
-def scores(by: str) -> str:
-    """Return a table of benchmarks/bands/results.csv by "variant", or by "set" for unchanged images: a row per method
-    but the simplest.
-    """
-    by_set = by == "set"
-    with RESULTS.open(encoding="utf-8", newline="") as file:
-        results = [row for row in csv.DictReader(file) if not by_set or row["variant"] == "as it is"]
+def scores() -> str:
+    """Return a table of benchmarks/bands/results.csv by variant: a row per method but the simplest."""
     cells = defaultdict[str, dict[str, list[dict[str, str]]]](lambda: defaultdict(list))
-    for row in results:
-        if row["method"] not in ("phase correlation", *(() if by_set else ("identity",))):
-            cells[row["method"]][row[by]].append(row)
-    columns = list(dict.fromkeys(column for of_method in cells.values() for column in of_method))
-    columns = columns if by_set else [v for v in VARIANTS if v in columns]
+    with RESULTS.open(encoding="utf-8", newline="") as file:
+        for row in csv.DictReader(file):
+            if row["method"] not in ("phase correlation", "identity"):
+                cells[row["method"]][row["variant"]].append(row)
 
     def cell(of_cell: list[dict[str, str]]) -> str:
-        if not of_cell:
-            return "-"
-        wrong = sum(int(row["wrong_claims"]) for row in of_cell)
-        if by_set:
-            return f"{float(of_cell[0]['median_px'] or 'nan'):.2f}, {wrong}".replace("nan", "-")
         good = sum(round(float(row["under_half_px"] or 0) * int(row["pairs"])) for row in of_cell)
-        return f"{good}, {wrong}"
+        return f"{good}, {sum(int(row['wrong_claims']) for row in of_cell)}" if of_cell else "-"
 
-    def pairs(column: str) -> int:
-        return max(sum(int(row["pairs"]) for row in of_method[column]) for of_method in cells.values())
+    def pairs(variant: str) -> int:
+        return max(sum(int(row["pairs"]) for row in of_method[variant]) for of_method in cells.values())
 
-    names = {column: VARIANTS.get(column, column.replace("_", " ")) for column in columns}
-    rows = [("", *(f"{names[column]} ({pairs(column)})" for column in columns))]
-    rows += [(method, *(cell(of_method[column]) for column in columns)) for method, of_method in cells.items()]
+    rows = [("", *(f"{name} ({pairs(variant)})" for variant, name in VARIANTS.items()))]
+    rows += [(method, *(cell(of_method[variant]) for variant in VARIANTS)) for method, of_method in cells.items()]
     return table(rows) + "\n"
 
 
@@ -301,8 +289,7 @@ PARTS: tuple[tuple[str, str, Callable[[], str]], ...] = (
     ("how-to/reflectance.md", "indices", indices),
     ("reference/sidecar.md", "fields", fields),
     ("how-to/troubleshooting.md", "reasons", reasons),
-    ("explanation/comparison.md", "scores by variant", partial(scores, "variant")),
-    ("explanation/comparison.md", "scores by set", partial(scores, "set")),
+    ("explanation/comparison.md", "scores by variant", scores),
     *((f"explanation/{page}.md", name, partial(figures_of, name)) for page, names in TABLES.items() for name in names),
 )
 """Page, mark of the part in it, and the function that makes its content."""

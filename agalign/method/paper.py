@@ -32,8 +32,7 @@ from agalign.values.alignment import JointResult
 from agalign.values.issues import Issue
 
 _COARSEST_PX = 80
-"""Longer side of the coarsest level. With 64, where few patches fit, psi moves half as far (docs/explanation/paper.md).
-"""
+"""Longer side of the coarsest level. With 64, where few patches fit, psi moves half as far."""
 _OCTAVES = 4.0
 """log2 of the patch scale s is uniform in [0, _OCTAVES]."""
 _MARGIN = 1.0
