@@ -1,43 +1,109 @@
-"""The pictures of the README: before and after of the demo and of a real capture, and the report in a browser.
+"""Make the pictures of the pages: NDVI before and after alignment and the pictures of the demo, a real capture, and the
+report in a browser.
 
     python tools/readme_figures.py [DEMO [ALIGNED]]
 
-DEMO is the output of an earlier `agalign demo`, else one is run. ALIGNED is the output of a run on the row crop
-(`DATA/flights/rededge_m_rowcrop`, --ground-elevation 92). Writes demo.jpg, report.jpg and, with ALIGNED, row-crop.jpg
-to docs/figures. The report needs playwright and a Chromium.
+DEMO is the output of an earlier `agalign demo`; without it, a demo is run. ALIGNED is the output of a run on the row
+crop (`DATA/flights/rededge_m_rowcrop`, --ground-elevation 92). Writes ndvi.jpg, demo.jpg, report.jpg and, with ALIGNED,
+row-crop.jpg to docs/figures. The report needs playwright and a Chromium; without them report.jpg is not written.
 """
 
+import importlib.util
 import shutil
 import subprocess
 import sys
 import tempfile
 from pathlib import Path
 
+import cv2
+import numpy as np
+import rasterio
+from numpy.typing import NDArray
 from PIL import Image
-from playwright.sync_api import sync_playwright
+
+from agalign.cameras.discover import discover
+from agalign.pixels.radiometry import calibrated
+from agalign.products.indices.formulas import INDICES, compute
+from agalign.products.report.drawing import with_text
+from agalign.products.sidecar.file import read_sidecar
+from agalign.values.capture import Band
 
 FIGURES = Path(__file__).resolve().parents[1] / "docs" / "figures"
-WIDTH_PX, SCREEN_PX = 880, (1100, 1150)
+WIDTH_PX, SCREEN_PX = 880, (1000, 900)
+CAPTURE = Path("0000SET/000/IMG_0001")
 
 
 def main() -> None:
+    """Make the pictures."""
     with tempfile.TemporaryDirectory() as folder:
         demo = Path(sys.argv[1]) if len(sys.argv) > 1 else Path(folder)
         if len(sys.argv) == 1:
-            subprocess.run([sys.executable, "-m", "agalign", "demo", str(demo), "--captures", "12"], check=True)
-        aligned = demo / "aligned"
-        save(Image.open(aligned / "0000SET" / "000" / "IMG_0001.png"), "demo.jpg", 78)
+            agalign("demo", demo, "--captures", "4")
+        # An earlier demo stays as it is.
+        aligned = shutil.copytree(demo / "aligned", Path(folder) / "with-ndvi")
+        agalign("align", demo / "flight", "-o", aligned, "--radiometry", "auto", "--index", "ndvi")
+        save(ndvi_before_and_after(demo / "flight", aligned), "ndvi.jpg", 85)
+        save(Image.open((demo / "aligned" / CAPTURE).with_suffix(".png")), "demo.jpg", 72)
         if len(sys.argv) > 2:
             save(Image.open(Path(sys.argv[2]) / "IMG_0009.png"), "row-crop.jpg", 78)
-        with sync_playwright() as playwright:
-            path = shutil.which("chromium") or shutil.which("google-chrome")
-            browser = playwright.chromium.launch(executable_path=path, args=["--no-sandbox"])
-            page = browser.new_page(viewport=dict(zip(("width", "height"), SCREEN_PX, strict=True)))
-            page.goto((aligned / "index.html").absolute().as_uri() + "#capture=0000SET%2F000%2FIMG_0001")
-            page.wait_for_timeout(1000)
-            page.screenshot(path=Path(folder) / "report.png")
-            browser.close()
-        save(Image.open(Path(folder) / "report.png"), "report.jpg", 72)
+        if importlib.util.find_spec("playwright"):
+            save(screenshot(demo / "aligned", Path(folder) / "report.png"), "report.jpg", 48)
+
+
+def agalign(*arguments: str | Path) -> None:
+    """Run the program."""
+    subprocess.run([sys.executable, "-m", "agalign", *arguments], check=True)
+
+
+def ndvi_before_and_after(flight: Path, aligned: Path, size_px: tuple[int, int] = (440, 330)) -> Image.Image:
+    """Return NDVI of a part of one capture, enlarged twice: by pixels of the raw files, and of the aligned stack."""
+    bands = {b.name: b for c in discover(flight).captures if c.name == CAPTURE.name for b in c.bands}
+    reflectances = [reflectance(bands[name]) for name in ("NIR", "Red")]
+    with rasterio.open((aligned / CAPTURE).with_name(f"{CAPTURE.name}_ndvi.tif")) as raster:
+        after = raster.read(1)
+    x0, y0, width, height = read_sidecar((aligned / CAPTURE).with_suffix(".json")).output.crop
+    before = compute(INDICES["ndvi"], reflectances)[y0 : y0 + height, x0 : x0 + width]
+    left, top = (width - size_px[0]) // 2, (height - size_px[1]) // 2
+    sides = []
+    for title, values in (("NDVI before alignment", before), ("NDVI after alignment", after)):
+        part = coloured(values[top : top + size_px[1], left : left + size_px[0]])
+        large = cv2.resize(part, None, fx=2, fy=2, interpolation=cv2.INTER_NEAREST)
+        sheet = np.full((large.shape[0] + 48, *large.shape[1:]), 255, np.uint8)
+        sheet[48:] = large
+        sides.append(with_text(sheet, title, (8, 32), 28))
+    gap = np.full((sides[0].shape[0], 16, 3), 255, np.uint8)
+    return Image.fromarray(np.hstack([sides[0], gap, sides[1]]))
+
+
+def reflectance(band: Band) -> NDArray[np.float32]:
+    """Return the reflectance of a band's raw pixels by the light sensor."""
+    with rasterio.open(band.path) as raster:
+        return calibrated(raster.read(1), band.radiometry, 0, 0) * band.radiometry.by_sun[0]
+
+
+def coloured(ndvi: NDArray[np.float32]) -> NDArray[np.uint8]:
+    """Return NDVI from 0 (brown) to 1 (green) as RGB."""
+    ramp = np.array([(140, 81, 10), (223, 194, 125), (245, 245, 220), (120, 190, 90), (0, 90, 50)], float)
+    stops = np.linspace(0, 1, len(ramp))
+    return np.stack([np.interp(np.nan_to_num(ndvi), stops, c) for c in ramp.T], axis=-1).round().astype(np.uint8)
+
+
+def screenshot(aligned: Path, picture: Path) -> Image.Image:
+    """Return a report down to the pictures of the capture that is selected."""
+    from playwright.sync_api import sync_playwright
+
+    with sync_playwright() as playwright:
+        path = shutil.which("chromium") or shutil.which("google-chrome")
+        browser = playwright.chromium.launch(executable_path=path, args=["--no-sandbox"])
+        page = browser.new_page(viewport=dict(zip(("width", "height"), SCREEN_PX, strict=True)))
+        page.goto((aligned / "index.html").absolute().as_uri() + f"#capture={str(CAPTURE).replace('/', '%2F')}")
+        page.wait_for_timeout(1500)
+        end = page.locator("input[type=range]").first.bounding_box()
+        height = end["y"] + end["height"] + page.evaluate("window.scrollY") + 8
+        clip = {"x": 0, "y": 0, "width": SCREEN_PX[0], "height": height}
+        page.screenshot(path=picture, full_page=True, clip=clip)
+        browser.close()
+    return Image.open(picture)
 
 
 def save(picture: Image.Image, name: str, quality: int) -> None:

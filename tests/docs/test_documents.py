@@ -37,7 +37,10 @@ RUN_BY = {"docker": "tools/container.sh", "dask": "tools/dask_cluster.sh", "pip"
 """What cannot be run inside a test, and the script that runs it and what stands with it in a block."""
 KINDS = {"sh", "python", "text", "{toctree}", "{include} ../../CONTRIBUTING.md", "{include} ../../CHANGELOG.md"}
 RUNNABLE = [page for page in PAGES if any(b.kind in ("sh", "python") for b in blocks_of(page))]
-LONG = re.compile("batch|benchmark-bands|close-range|paper|photogrammetry|python|qgis|quickstart|radiometry|thermal")
+LONG = re.compile(
+    "altum|close-range|comparison|first-flight|large-flights|mavic-3m|paper|phantom-4|photogrammetry|python|qgis|rededge|"
+    "reflectance|sentera|sequoia|thermal"
+)
 """Pages with blocks that take seconds, and of commands that other tests run: only the full run has them."""
 
 

@@ -51,7 +51,7 @@ def code_in(page: Path) -> list[str]:
     return re.findall(r"`([^`]+)`", re.sub(r"\s+", " ", text_of(page)))
 
 
-BATCH = "how-to/large-flights.md"
+EXIT_CODES = "reference/exit-codes.md"
 
 
 def table(page: str, head: str) -> list[list[str]]:
@@ -105,7 +105,7 @@ def test_options_in_the_text_exist(page: Path, monkeypatch: pytest.MonkeyPatch) 
 def test_exit_codes() -> None:
     signals = {int(ExitCode.SIGNAL + n) for n in (signal.SIGHUP, signal.SIGINT, signal.SIGTERM)}
     codes = {int(c) for c in ExitCode if c is not ExitCode.SIGNAL} | signals
-    listed = {int(code) for codes_of_a_row, _ in table(BATCH, "exit code") for code in codes_of_a_row.split(", ")}
+    listed = {int(code) for codes_of_a_row, _ in table(EXIT_CODES, "exit code") for code in codes_of_a_row.split(", ")}
     assert listed == codes
     for page in PAGES:
         named = re.findall(r"exit code[s]? (\d+)", text_of(page), re.IGNORECASE)
@@ -126,7 +126,7 @@ def test_events_of_a_run_and_their_fields() -> None:
         if isinstance(call.args[0], ast.Constant):
             names = {k.arg for k in call.keywords if k.arg is not None}
             fields.setdefault(str(call.args[0].value), set()).update(names)
-    listed = {row[0].strip("`"): set(re.findall(r"`(\w+)`", row[1])) for row in table(BATCH, "event")}
+    listed = {row[0].strip("`"): set(re.findall(r"`(\w+)`", row[1])) for row in table(EXIT_CODES, "event")}
     # Their names are in a loop; a problem is an event of the terminal.
     assert set(listed) == {*fields, "panel", "sky", "problem"}
     for event, names in fields.items():
@@ -140,7 +140,7 @@ def test_stages_of_a_capture() -> None:
         for name in ("progress", "report"):
             for call in calls(str(path.relative_to(PACKAGE)), name):
                 stages |= {str(a.value) for a in call.args if isinstance(a, ast.Constant) and isinstance(a.value, str)}
-    row = next(row for row in table(BATCH, "event") if row[0] == "`stage`")
+    row = next(row for row in table(EXIT_CODES, "event") if row[0] == "`stage`")
     assert set(re.findall(r"`(\w+)`", row[1].partition("`stage` (")[2].partition(")")[0])) == stages - {""}
 
 
