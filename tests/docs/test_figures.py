@@ -60,6 +60,9 @@ def test_tables_of_the_readme() -> None:
             name, *cells = (cell.strip(" *") for cell in row.strip("|").split("|"))
             for column, cell in zip(heads[1:], cells, strict=True):
                 facts = [f for f in figures() if f.split(" / ")[1:] == [name, column.partition(", ")[0]]]
+                if number := re.match(r"\d+", heads[0]):  # the number of cases, as in "275 band pairs"
+                    facts = [f for f in facts if figures()[f]["n"].split()[0] == number[0]]
+                    assert facts, f"{heads[0]}: {name}, {column}"
                 for fact in facts:
                     quoted += 1
                     assert is_quoted(cell, figures()[fact]["value"]), f"{cell}: {fact}"
