@@ -1,6 +1,4 @@
-"""Facts that pages state are those of the program: messages, options, exit codes, events, stages, limits, paths; all
-text of the project is in plain terms.
-"""
+"""Facts that pages state are those of the program: messages, options, exit codes, events, stages, limits, paths."""
 
 import ast
 import importlib
