@@ -88,7 +88,7 @@ def section(command: Command) -> str:
             by_panel.setdefault(panels.get(name, ""), []).append(row)
     parts = [f"## {command.name}", effect(text), f"```text\nagalign {command.name} {usage}\n```"]
     for panel, rows in by_panel.items():
-        parts.append(table([(panel.lower() or "argument", "value", "effect"), *rows]))
+        parts.append(table([(panel.lower() or "argument or option", "value", "effect"), *rows]))
     if same:
         parts.append(f"As in [`align`](#align): {', '.join(same)}.")
     if examples:
