@@ -95,19 +95,19 @@ class DiscoverOptions:
     pattern: str | None = None
     """File names of a camera that is not recognised, as '{capture}_{band}.tif'."""
     reference: str | None = None
-    """Name of the reference band, to whose pixel grid the others are aligned; by default green."""
+    """Reference band, to whose pixel grid the others are aligned; by default green."""
     ignore_metadata: bool = False
     """Ignore the lens and rig tags of the camera."""
     with_rgb: bool = False
     """Also align the camera's colour photograph (JPEG), as three bands."""
     bands: Annotated[tuple[str, ...], Option(type=str | None, parse=names_in)] = ()
-    """Names of the bands to align, separated by commas; by default all."""
+    """Bands to align, separated by commas; by default all."""
     order: choices.BandOrder = "index"
-    """Order of the bands: as numbered by the camera, by wavelength, or by name."""
+    """Order of the bands: camera's numbers, wavelength or name."""
     skip: tuple[Path, ...] = ()
     """Folders to skip, such as the output folder."""
     max_pixels: Annotated[int, Field(ge=1)] = choices.MAX_PIXELS
-    """Refuse images with more pixels than this, without reading them."""
+    """Refuse images with more pixels, without reading them."""
     jobs: int = 1
     """Number of processes that read tags; with more than one, the calling script must be importable."""
     timeout_s: Annotated[float | None, Field(ge=1, le=1e6)] = None
@@ -125,7 +125,7 @@ class RunOptions:
     overwrite: bool = False
     """Process finished captures again."""
     jobs: Annotated[int, Field(ge=0, le=4096), Option(short="-j", default=0)] = 1
-    """Number of captures processed at the same time; 0 is one per core."""
+    """Captures processed at the same time; 0 is one per core."""
     align_panels: bool = False
     """Also align captures of calibration panels and of the sky; panels then give no reflectance."""
     # Any executor in Python, such as `dask_executor`.
@@ -188,8 +188,8 @@ class SeedSettings(SettingsModel):
         choices.SeedKind | None,
         Option("seed", type=choices.SeedChoice, default="auto", parse=lambda kind: None if kind == "auto" else kind),
     ] = None
-    """Source of the initial alignment: camera tags (rig), georeference (geo), correlation of image structure
-    (structure), matched features (match) or none (identity); auto uses the candidate with the highest score."""
+    """Initial alignment: by camera tags (rig), georeference (geo), image structure (structure), matched features
+    (match), or none (identity); auto uses the one with the highest score."""
     only: Annotated[bool, Option("only_seed")] = False
     """Stop after the initial alignment."""
 
@@ -209,8 +209,8 @@ class ReliefSettings(SettingsModel):
     use: Annotated[
         choices.ReliefUse, _yes_or_no("always", "never"), Option("relief", alone="always", former="--local")
     ] = "auto"
-    """Correct parallax (trees, terraces, close range) by one parallax map for all bands of a capture: always, never, or
-    if the windows show parallax (auto). --relief alone means always."""
+    """Correct parallax (trees, terraces, close range) by a parallax map: always, never, or if the windows show parallax
+    (auto). --relief alone means always."""
 
 
 class WriteSettings(SettingsModel):
@@ -224,7 +224,7 @@ class WriteSettings(SettingsModel):
     """Area to write: covered by all bands in all captures of a camera (flight) or in this capture (common), or the
     whole reference band (none)."""
     format: choices.RasterFormat = "gtiff"
-    """Write tiled GeoTIFF or cloud-optimised GeoTIFF."""
+    """Tiled GeoTIFF or cloud-optimised GeoTIFF."""
     compression: choices.Compression = "auto"
     """Lossless compression; auto is zstd for stacks and deflate for single bands."""
     undistort: bool = False
@@ -232,40 +232,40 @@ class WriteSettings(SettingsModel):
     layout: choices.Layout = "stack"
     """Write one multiband file per capture (stack), one file with the camera's tags per band (bands), or both."""
     resolution: choices.Resolution = "reference"
-    """Pixel size of the output: of the reference band or of the band with the smallest pixels (finest)."""
+    """Pixel size: of the reference band, or the smallest of all bands (finest)."""
     georeference: bool = False
     """Write an approximate georeference from GPS, altitude and yaw."""
     ground_elevation_m: Annotated[float | None, Field(ge=-1000, le=9000), Option("ground_elevation")] = None
-    """Elevation of the ground, m, in the height system of the GPS; used if the tags lack the height above ground."""
+    """Elevation of the ground, m, in the GPS height system, if the tags lack the height above ground."""
     statistics: bool = False
-    """Store minimum, maximum, mean and standard deviation of aligned bands."""
+    """Store statistics (minimum, maximum, mean, standard deviation) in the files."""
     qa: bool = False
-    """Write a raster of quality flags (saturated, occluded, predicted …), <capture>.qa.tif."""
+    """Write quality flags (saturated, occluded, predicted …): <capture>.qa.tif."""
     indices: Annotated[
         tuple[str, ...], Option("index", type=str | None, parse=lambda text: names_in((text or "").lower()))
     ] = ()
-    """Spectral indices to write, names separated by commas: ndvi, ndre …; 'agalign indices' computes others later."""
+    """Spectral indices, separated by commas: ndvi, ndre …; 'agalign indices' computes others later."""
     pan_sharpen: bool = False
     """Write <capture>.pan.tif: the bands at the resolution of the panchromatic band, or with --with-rgb of the
     photograph."""
     error_map: bool = False
-    """Write a raster of the expected error at every pixel, <capture>.error.tif."""
+    """Write the expected error of each pixel: <capture>.error.tif."""
     tie_points: bool = False
-    """Write the tie points of each band with residual and weight: <capture>.ties.csv and .ties.geojson."""
+    """Write the tie points: <capture>.ties.csv and .ties.geojson."""
     relief_map: bool = False
-    """Add confidence and range (m) to the parallax map, <capture>.relief.tif."""
+    """Add confidence and range (m) to <capture>.relief.tif."""
     fill_occluded: bool = False
-    """Interpolate pixels that are occluded in a band; by default they are nodata."""
+    """Interpolate occluded pixels; by default they are nodata."""
     radiometry: Annotated[choices.RadiometryChoice, _yes_or_no("auto", "off"), Option(alone="auto")] = "off"
-    """Convert raw numbers: to radiance by the camera's calibration (camera), to reflectance by the light sensor (sun),
-    or to reflectance by a calibration panel and the light sensor, if any (panel). auto, or --radiometry alone, uses the
-    first of panel, sun and camera that the files allow. Thermal bands become degrees C."""
+    """Convert raw numbers to radiance (camera), or to reflectance by the light sensor (sun) or by a calibration panel
+    and the light sensor, if any (panel). auto, or --radiometry alone, uses the first of panel, sun and camera that the
+    files allow. Thermal bands become degrees C."""
     # (band in lower case, reflectance); an empty name means all other bands.
     panel_albedo: Annotated[
         tuple[tuple[str, Annotated[float, Field(gt=0, le=1)]], ...], Option(type=str | None, parse=albedos)
     ] = ()
-    """Reflectance of the calibration panel, as 0.51 or Blue=0.51,NIR=0.49; by default from tags or QR code. With
-    this option, panels without either are recognised too."""
+    """Reflectance of the calibration panel, as 0.51 or Blue=0.51,NIR=0.49; needed for panels without tags or QR code.
+    """
 
 
 class Settings(SettingsModel):

@@ -18,6 +18,7 @@ import typing
 from collections import Counter, defaultdict
 from collections.abc import Callable, Container, Iterator, Mapping
 from functools import cache, partial
+from itertools import groupby, takewhile
 from operator import attrgetter, not_
 from pathlib import Path
 from typing import Any
@@ -66,10 +67,14 @@ TABLES = {
 
 
 def command_options() -> str:
-    """Return a section per command: what it does, its usage, a table of options for each panel of its help, and its
-    examples. Options that `align` has with the same text are described there only.
+    """Return a section per command: what it does, its usage, a list of options for each panel of its help, and its
+    examples. Options that a command of `DESCRIBED` has with the same text are described there only.
     """
     return "\n".join(section(command) for command in COMMANDS.values() if not command.alias)
+
+
+DESCRIBED = ("align", "evaluate")
+"""Commands whose options are not repeated."""
 
 
 def section(command: Command) -> str:
@@ -78,60 +83,52 @@ def section(command: Command) -> str:
     built = command.built()
     usage = " ".join(built.collect_usage_pieces(built.make_context(command.name, [], resilient_parsing=True)))
     panels = {name: panel for panel, names in command.panels.items() for name in names.split()}
-    by_panel: dict[str, list[Row]] = {}
-    shared = [] if command is COMMANDS["align"] else [row for _, row in option_rows(COMMANDS["align"])]
-    same = []
-    for name, row in option_rows(command):
-        if row in shared:
-            same.append(row[0].split(",")[0])
+    by_panel: dict[str, list[str]] = {}
+    same: dict[str, list[str]] = {}
+    earlier = takewhile(lambda name: name != command.name, DESCRIBED)
+    known = [(name, dict(option_lines(COMMANDS[name])).values()) for name in earlier]
+    for name, line in option_lines(command):
+        if owner := next((one for one, lines in known if line in lines), None):
+            same.setdefault(owner, []).append("`" + re.findall(r"--[a-z-]+|[A-Z]+", line)[0] + "`")
         else:
-            by_panel.setdefault(panels.get(name, ""), []).append(row)
-    parts = [f"## {command.name}", effect(text), f"```text\nagalign {command.name} {usage}\n```"]
-    for panel, rows in by_panel.items():
-        parts.append(table([(panel.lower() or "argument or option", "value", "effect"), *rows]))
+            by_panel.setdefault(panels.get(name, ""), []).append(line)
+    parts = [f"## {command.name}", f"`agalign {command.name} {usage}`: " + effect(text)]
+    for panel, lines in by_panel.items():
+        parts += [f"**{panel}**"] * bool(panel) + ["\n".join(f"* {line}" for line in lines)]
     if same:
-        parts.append(f"As in [`align`](#align): {', '.join(same)}.")
+        owners = "; ".join(f"[`{owner}`](#{owner}): {', '.join(names)}" for owner, names in same.items())
+        parts.append(f"As in {owners}.")
     if examples:
-        parts.append("\n".join(f"* `{line}`: {what}" for line, what in (e.split("  ") for e in examples)))
+        parts.append("```text\n" + "\n".join(line.replace("  ", "  # ") for line in examples) + "\n```")
     return "\n\n".join(parts) + "\n"
 
 
-Row = tuple[str, str, str]
-
-
-def option_rows(command: Command) -> Iterator[tuple[str, Row]]:
-    """Yield the name of each parameter of a command and (names on the command line, values, help text)."""
+def option_lines(command: Command) -> Iterator[tuple[str, str]]:
+    """Yield the name of each parameter of a command and a line: names on the command line, values, default, help."""
     for parameter, param in zip(command.parameters(), command.built().params, strict=True):
         kind, info = typing.get_args(parameter.annotation)
-        values = value_name(kind)
-        values = ", ".join(f"`{value}`" for value in values.split("|")) if "|" in values else values.lower()
-        names = [param.metavar] if param.param_type_name == "argument" else sorted(param.opts, key=len, reverse=True)
+        if param.param_type_name == "argument":
+            names = str(param.metavar)
+        else:
+            names = f"{', '.join(sorted(param.opts, key=len))} {value_name(kind)}".strip()
         if param.required and param.param_type_name == "option":
-            values += " (required)"
-        row = ", ".join(f"`{one}`" for one in names), with_default(values, parameter.default), effect(info.help)
-        yield parameter.name, row
-
-
-def with_default(values: str, given: Any) -> str:
-    """Return the values of an option with its default in bold, if it has one."""
-    if given is inspect.Parameter.empty or given is None or given is False:
-        return values
-    if f"`{given}`" in values:
-        return values.replace(f"`{given}`", f"**`{given}`**")
-    return f"{values}, **`{given}`**"
+            names += "` (required)`"
+        has_default = not any(parameter.default is one for one in (inspect.Parameter.empty, None, False))
+        default = f" ({parameter.default})" if has_default else ""
+        yield parameter.name, f"`{names}`{default}: {effect(info.help)}".replace("``", "")
 
 
 def python_names(owner: str) -> str:
-    """Return a table of the fields of a model in `Given`: Python name, default, and option of `agalign align`."""
-    rows = [("Python", "default", "option")]
+    """Return a list of the fields of a model in `Given` with their defaults and the options of `agalign align`."""
+    lines = []
     defaults = {"settings": Settings(), "discover": DiscoverOptions(), "run": RunOptions()}[owner]
     for option in field_options().values():
         name = ".".join(option.path[1:])
         if option.path[0] != owner or option.path[-1] in NOT_OPTIONS[owner]:
             continue
         opposite = " (opposite)" if option.parse is not_ else ""
-        rows.append((f"`{name}`", f"`{attrgetter(name)(defaults)!r}`", f"`{option.flag}`{opposite}"))
-    return table(rows) + "\n"
+        lines.append(f"* `{name}={attrgetter(name)(defaults)!r}`: `{option.flag}`{opposite}")
+    return "\n".join(lines) + "\n"
 
 
 NOT_OPTIONS = {"settings": ("start_model",), "discover": ("skip", "jobs", "timeout_s"), "run": ("command",)}
@@ -159,10 +156,19 @@ def fields() -> str:
     of_types = {part["description"] for part in types.values()}
     sections = []
     for name, part in owners:
-        if name not in inner:
-            lines = (line for item in part["properties"].items() for line in field_lines(*item, inner, of_types))
+        if name not in inner and name not in NOT_LISTED:
+            lines = field_lines(part, inner, of_types)
             sections += [f"### {name.removesuffix('Part')}", " ".join(part["description"].split()), "\n".join(lines)]
     return "\n\n".join(sections) + "\n"
+
+
+NOT_LISTED = {
+    *("PreviewPart", "Similarity"),
+    *("preview", "estimated_with", "rendered_with", "input_samples", "model"),
+    *("loss", "chance", "iterations", "levels", "last_step_px", "cells"),
+    *("corner_covariance_px2", "covariance_px2", "lens_std_px", "relief_std_px"),
+}
+"""Parts that another page describes, and fields that only agalign needs: for the report, resumed runs and errors."""
 
 
 def types_in(schema: Any) -> set[str]:
@@ -170,22 +176,36 @@ def types_in(schema: Any) -> set[str]:
     return set(re.findall(r"#/\$defs/(\w+)", json.dumps(schema)))
 
 
-def field_lines(name: str, field: dict[str, Any], inner: Mapping[str, Any], of_types: Container[str]) -> Iterator[str]:
-    """Yield a field of the sidecar as an item of a list, followed by the fields of its type if that is in `inner`.
+def field_lines(part: Mapping[str, Any], inner: Mapping[str, Any], of_types: Container[str]) -> Iterator[str]:
+    """Yield the fields of a part as items of a list, each followed by the fields of its type if that is in `inner`.
 
-    The type is omitted if it is text, and the description if it is that of a type with a section of its own. Of the
-    descriptions of a field and of its type in `inner`, the longer one is used.
+    Adjacent fields with the same type and description have one item. The type is omitted if it is a number or
+    text, and the description if it is that of a type with a section of its own. Of the descriptions of a field and of
+    its type in `inner`, the longer one is used.
     """
-    text, kind = field.get("description", ""), json_type(field, inner)
-    parts = [inner[one] for one in types_in(field) if one in inner]
-    if parts:
+    for (text, kind), fields in groupby(listed(part), lambda item: described(item[1], inner, of_types)):
+        items = dict(fields)
+        names = ", ".join(f"`{name}`" for name in items)
+        kind = re.sub(r"^(number|integer|text)(?=\??$)", "", kind)
+        yield f"* {names}" + (f" ({kind})" if kind else "") + (f": {text}" if text else "")
+        for type_name in sorted({one for field in items.values() for one in types_in(field)} & set(inner)):
+            yield from (f"  {line}" for line in field_lines(inner[type_name], inner, of_types))
+
+
+def listed(part: Mapping[str, Any]) -> list[tuple[str, Any]]:
+    """Return the fields of a part that the page lists; a camera's `model` is one."""
+    internal = NOT_LISTED - ({"model"} if "make" in part["properties"] else set())
+    return [(name, field) for name, field in part["properties"].items() if name not in internal]
+
+
+def described(field: Mapping[str, Any], inner: Mapping[str, Any], of_types: Container[str]) -> tuple[str, str]:
+    """Return the description and the type of a field."""
+    text = field.get("description", "")
+    if parts := [inner[one] for one in types_in(field) if one in inner]:
         text = max(text, *(part["description"] for part in parts), key=len)
     elif text in of_types:
         text = ""
-    of_kind = "" if kind == "text" else f" ({kind})"
-    yield f"* `{name}`{of_kind}" + (f": {' '.join(text.split())}" if text else "")
-    for part in parts:
-        yield from (f"  {line}" for item in part["properties"].items() for line in field_lines(*item, inner, of_types))
+    return " ".join(text.split()), json_type(field, inner)
 
 
 def sidecar_schema() -> dict[str, Any]:
@@ -193,7 +213,7 @@ def sidecar_schema() -> dict[str, Any]:
     return Sidecar.model_json_schema(mode="serialization")
 
 
-def json_type(field: dict[str, Any], inner: Container[str]) -> str:
+def json_type(field: Mapping[str, Any], inner: Container[str]) -> str:
     """Return a type in short: `number`, `Lens?` if it may be null, `3 x 3 numbers`, `text[]` for a list.
 
     A type in `inner` is an `object`.
@@ -201,7 +221,8 @@ def json_type(field: dict[str, Any], inner: Container[str]) -> str:
     if "$ref" in field:
         name = field["$ref"].rpartition("/")[2]
         title = name.removesuffix("Part")
-        return "object" if name in inner else f"[{title}](#{title.lower()})"
+        target = "outputs.md#summarycsv" if name in NOT_LISTED else f"#{title.lower()}"
+        return "object" if name in inner else f"[{title}]({target})"
     if "anyOf" in field:
         kinds = [json_type(one, inner) for one in field["anyOf"] if one.get("type") != "null"]
         kind, may_be_null = " or ".join(kinds), len(kinds) < len(field["anyOf"])

@@ -43,7 +43,6 @@ def _align(
         agalign flight/ -o aligned/ --layout bands  write a file per band with its tags, for photogrammetry
         agalign orchard/ --relief --error-map  correct parallax of trees; map the expected error
         agalign flight/ --model earlier/models/CAMERA.safetensors  reuse the network and rig of an earlier flight
-        agalign flight/ --retry-failed  process failed captures again
     """
     from agalign.config import DiscoverOptions, RunOptions, Settings
     from agalign.products.indices.formulas import index_named
@@ -143,8 +142,8 @@ def _onto(
     """Align georeferenced mosaics of other dates or sensors to the grid of REFERENCE.
 
     Grids, resolutions and coordinate reference systems may differ. A mosaic is aligned if its windows are within a
-    pixel of REFERENCE: resample both to the pixel size that you need. For each MOVING, agalign writes a sidecar and a
-    raster on the grid of REFERENCE, with one band of REFERENCE (--band) and all bands of MOVING.
+    pixel of REFERENCE: resample both to the pixel size that you need. Each raster has one band of REFERENCE (--band)
+    and all bands of MOVING.
 
     Options:
         reference: The mosaic with the output grid.
@@ -153,12 +152,9 @@ def _onto(
         band: Band of REFERENCE that the bands of MOVING are aligned to; by default green.
         relief: Add a smooth displacement field to the homography (always), never, or if it reduces the residuals of
             held-out windows (auto).
-        interpolation: Resampling of the moving mosaics.
-        format: Tiled GeoTIFF or cloud-optimised GeoTIFF.
-        compression: Lossless compression.
-        jobs: Number of mosaics processed at the same time; 0 is one per core.
+        jobs: Mosaics processed at the same time; 0 is one per core.
         overwrite: Process finished mosaics again.
-        max_pixels: Refuse mosaics with more pixels than this, without reading them.
+        max_pixels: Refuse mosaics with more pixels, without reading them.
     """
     from agalign.cameras.discover import distance_km, mosaics_onto
     from agalign.cli.align_run import conclude, run

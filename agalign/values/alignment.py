@@ -41,7 +41,7 @@ def noise_px(peaks_sigma: ArrayLike) -> NDArray[np.float64]:
 
 @validated.dataclass(frozen=True, config=RECORD)
 class Seed:
-    """Initial alignment, with the correlation of the images under it."""
+    """Initial alignment."""
 
     kind: SeedKind
     """`user`; `match` (learned descriptors matched); `model` (median mapping of the flight); `rig` (camera tags);
@@ -49,47 +49,43 @@ class Seed:
     fixed_to_moving: Matrix3x3
     """Between undistorted px if both lenses are known, else between raw px."""
     score: Number
-    """Height of the correlation at this mapping, in standard deviations; candidates are compared by it. 0 for a mapping
-    of the tags or the flight that replaced another seed."""
+    """Correlation at this mapping, in standard deviations; 0 if it replaced a seed that contradicts it."""
     peak_sigma: Number = 0.0
-    """Height of the correlation peak above its surroundings, in standard deviations."""
+    """Height of the correlation peak, in standard deviations."""
     runner_up_sigma: Number = 0.0
-    """The same for the second highest separate peak."""
+    """The same for the second peak."""
     trusted: bool = False
-    """The images confirm that it is accurate to a few pixels, or it is the mapping of the tags or the flight that
-    replaced a seed which contradicts it."""
+    """The images confirm it to a few pixels, or it is that of tags or flight and replaced a seed that contradicts it.
+    """
 
 
 @validated.dataclass(frozen=True, config=RECORD)
 class JointResult:
-    """The estimate of a band: by the joint optimisation of descriptor and mapping, then together with the windows, the
-    other bands and the rig, or by windows alone.
-    """
+    """Estimate from descriptors, windows, other bands and rig, or from windows alone."""
 
     fixed_to_moving: Matrix3x3
-    """Homography, between the same px as the seed. A prediction may have replaced it in the mapping of the band."""
+    """Between the same px as the seed. A prediction may have replaced it."""
     loss: Annotated[float, Measured()]
-    """Final loss; null if nothing was learned."""
+    """Final loss."""
     retrieval: Number
-    """Share of held-out patches with the corresponding patch as nearest descriptor in the other image."""
+    """Share of held-out patches whose nearest descriptor is the corresponding one."""
     chance: Number
-    """The retrieval that guessing would give."""
+    """Retrieval by guessing."""
     iterations: int
-    """Steps; 0 if nothing was learned."""
+    """Training steps."""
     levels: tuple[Number, ...]
-    """Resolutions of the image pyramid, coarse to fine; 1 is full."""
+    """Resolutions of the image pyramid; 1 is full."""
     recipe: str
     """`flight` (frozen network of the flight), `fast` (learned on this capture), `paper`, or `windows` (windows
     alone)."""
     model_family: ModelFamily
     """Mapping that was fitted."""
     last_step_px: Number
-    """Movement of a corner in the last step, px of the reference."""
+    """Movement of a corner in the last step."""
     corner_std_xy_px: Annotated[tuple[tuple[UpToInfinity, UpToInfinity], ...], Field(min_length=4, max_length=4)]
-    """Standard errors (x, y) of the mapping at the corners of the reference, clockwise from the top left, px of the
-    reference."""
+    """Standard errors (x, y) at the corners of the reference, clockwise from the top left, px."""
     corner_covariance_px2: Annotated[NDArray[np.float64], Array((8, 8), COVARIANCE_DECIMALS)] | None = None
-    """(8, 8) of (x, y) of those corners, for a homography whatever the family; null if it is not known."""
+    """Their covariance."""
 
     @property
     def corner_std_px(self) -> float:
@@ -135,18 +131,16 @@ class RefinedPair:
 
 @validated.dataclass(frozen=True, config=RECORD)
 class Residual:
-    """Shifts of windows under a mapping, measured by phase correlation without the learned descriptors."""
+    """Shifts of windows under a mapping, by phase correlation."""
 
     centres_px: Annotated[NDArray[np.float64], Array((None, 2), 2)]
     """Centres of the n windows, px of the reference."""
     shifts_px: Annotated[NDArray[np.float64], Array((None, 2), 3, nullable=True)]
-    """Position of the moving band's structure minus that of the reference's, px of the reference; null where it could
-    not be measured."""
+    """Position in the band minus position in the reference, px of the reference."""
     peaks_sigma: Annotated[NDArray[np.float64], Array((None,), 2, nullable=True)]
-    """Height of the correlation peak of each window, in standard deviations; the error of a shift is inversely
-    proportional to its square."""
+    """Height of the correlation peak of each window, in standard deviations."""
     cells: Annotated[NDArray[np.int64], Array((None, 2), integers=True)]
-    """Column and row of each window in the complete grid, whichever windows of it are measured."""
+    """Column and row of each window in their grid."""
 
     def __post_init__(self) -> None:
         """Raise ValueError for arrays of different lengths."""
@@ -265,28 +259,24 @@ SAME_SCALES = PairScales()
 
 @validated.dataclass(frozen=True, config=RECORD)
 class Prediction:
-    """Mapping of a band by the rig of the flight, or by windows that do not confirm it everywhere."""
+    """Mapping by the rig of the flight, or extrapolated from a part of the image."""
 
     fixed_to_moving: Matrix3x3
-    """Between the files; between undistorted pixels if both lenses are known."""
+    """Between the same px as the seed."""
     source: Annotated[PredictionSource, Field(alias="from")]
     """`bands` (other bands of the capture), `neighbours` (other captures), `flight` (mean), or `windows` (in the image
     of the band)."""
     std_px: Number4
-    """Standard error over the image (root mean square), px of the band's own file."""
+    """Standard error (RMS over the image), px of the band."""
     off_px: Number4 | None = None
-    """Root mean square distance from the band's own alignment, px of the band's own file; null if there is none."""
+    """RMS distance from the band's own alignment, px of the band."""
     covariance_px2: Annotated[NDArray[np.float64], Array((12, 12), COVARIANCE_DECIMALS)] | None = None
-    """(12, 12) over the corners and the lens shapes (`fit.window_fit`), px of the reference's file, of a mapping that
-    was extrapolated with lens shapes; else null."""
+    """Covariance of corners and lens shapes, px of the reference, if these were extrapolated."""
 
 
 @validated.dataclass(frozen=True, config=RECORD)
 class Similarity:
-    """Similarity of the pixels that are valid in both bands; in large images of a sample of at least 250,000.
-
-    A value is nan, null in JSON, if it could not be measured.
-    """
+    """Similarity of the pixels that are valid in both bands; null: not measured. Large images are sampled."""
 
     mattes_mi: Number6 = math.nan
     """Negative Mattes mutual information, nats, 32 bins: lower is better."""
@@ -295,15 +285,15 @@ class Similarity:
     ncc: Number6 = math.nan
     """Normalised cross-correlation; negative if contrast is reversed."""
     gradient_correlation: Number6 = math.nan
-    """Correlation of gradient magnitudes: higher is better."""
+    """Correlation of gradient magnitudes."""
     structure_ssim: Number6 = math.nan
-    """SSIM of the structure images: higher is better."""
+    """SSIM of structure images."""
     overlap: Number6 = math.nan
     """Share of the image in which both bands are valid."""
     residual_px: Number6 = math.nan
-    """Median length of the shifts of the windows, px of the reference."""
+    """Median length of the windows' shifts, px of the reference."""
     residual_p95_px: Number6 = math.nan
-    """Their 95th percentile, px of the reference."""
+    """Their 95th percentile."""
     residual_coverage: Number6 = math.nan
     """Share of the textured windows with a measured shift."""
 
@@ -328,7 +318,7 @@ class Alignment:
     """Shifts of windows, each under a mapping that was estimated without the window; of all windows under a seed or a
     prediction of the rig."""
     seconds: float = 0.0
-    """Share of the capture's processing time, equal for all its bands."""
+    """Share of the capture's processing time."""
     before: Similarity = _NOT_MEASURED
     """Measures of similarity of the images as they are, their borders overlaid."""
     after: Similarity = _NOT_MEASURED

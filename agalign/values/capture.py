@@ -210,7 +210,7 @@ class Position:
     longitude: Number
     """Degrees, WGS 84."""
     altitude_m: Number | None = None
-    """Altitude in the tags, m above the datum of the camera."""
+    """Altitude in the tags, m above the camera's datum."""
 
 
 HeightSource = Literal["tags", "panel", "ground elevation", "assumed"]
@@ -225,7 +225,7 @@ class Pose:
     pitch_deg: Number = 0.0
     """Angle of the optical axis ahead of nadir, degrees."""
     roll_deg: Number = 0.0
-    """Angle of the optical axis to the left of nadir, degrees: positive if the right side of the aircraft is down."""
+    """Angle of the optical axis to the left of nadir, degrees."""
     height_m: Number | None = None
     """Height above the ground, m."""
     focal_length_px: Number | None = None
@@ -236,12 +236,12 @@ class Pose:
 
 @validated.dataclass(frozen=True, config=RECORD)
 class CameraIdentity:
-    """The camera, from the tags of the images."""
+    """Camera, from the tags."""
 
     make: str = ""
-    """Manufacturer."""
+    """From the tags."""
     model: str = ""
-    """Model."""
+    """From the tags."""
     serial: str = ""
     """Serial numbers, joined by `+`."""
 

@@ -213,11 +213,11 @@ class Issue:
     kind: Annotated[IssueKind, _ByCode()]
     """Code of the reason."""
     value: Annotated[float, Measured()] | None = None
-    """Measured value, in the unit of the kind: px, a share, a count."""
+    """Measured value: px, a share or a count."""
     limit: Annotated[float, Measured()] | None = None
     """Minimum or maximum accepted value."""
     detail: str = ""
-    """A file's error, the seed that was requested, or the distance that a share refers to."""
+    """Error of a file, requested seed, or distance that a share refers to."""
 
     @property
     def code(self) -> str:

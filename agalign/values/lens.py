@@ -26,18 +26,18 @@ from agalign.values.pixel_units import SAME_PIXELS, PixelScale, Size
 
 @validated.dataclass(frozen=True, config=RECORD)
 class Lens:
-    """Lens model of a camera, raw pixels of the file: x_px = fx * x / z + cx, after Brown-Conrady distortion."""
+    """Lens model for raw pixels: x_px = fx * x / z + cx, after Brown-Conrady distortion."""
 
     fx_px: Number
-    """Focal length along x."""
+    """Focal length."""
     fy_px: Number
-    """Focal length along y."""
+    """Focal length."""
     cx_px: Number
-    """Optical centre, x."""
+    """Principal point."""
     cy_px: Number
-    """Optical centre, y."""
+    """Principal point."""
     distortion: tuple[Number, ...] = ()
-    """k1, k2, p1, p2, k3, k4, k5, k6 in OpenCV's order and for normalised coordinates; omitted ones are 0."""
+    """k1, k2, p1, p2, k3, k4, k5, k6; omitted ones are 0."""
 
     @property
     def matrix(self) -> Matrix:

@@ -34,13 +34,13 @@ contains most scenes."""
 
 @validated.dataclass(frozen=True, config=RECORD)
 class DisplacementField:
-    """A smooth field of displacements of the raw pixels of an image, px, by its values on a lattice."""
+    """Smooth displacements of raw pixels, by values on a lattice."""
 
     step_px: Positive
-    """Distance of the lattice's nodes, px of the image that it was made for."""
+    """Distance of the nodes, px."""
     displacements_px: Annotated[NDArray[np.float64], Array((None, None, 2), POSITION_DECIMALS)]
-    """(x, y) by row and column, px of that image; the first node is the centre of its top-left pixel, with cubic
-    splines between the nodes."""
+    """(x, y) by row and column, px; the first node is the centre of the top-left pixel, with cubic splines between
+    nodes."""
     scale: Annotated[PixelScale, Field(exclude=True)] = SAME_PIXELS
     """Size of that image relative to the one on which the field is evaluated."""
 

@@ -162,8 +162,8 @@ def test_without_a_relief_nothing_is_written(run: Run, tmp_path: Path) -> None:
 
 
 def documented_reader() -> Callable[..., np.ndarray]:
-    """`mapped` in docs/reference/sidecar.md."""
-    (block,) = (b for b in blocks_of(ROOT / "docs" / "reference" / "sidecar.md") if "def mapped(" in b.text)
+    """`mapped` in docs/how-to/python.md."""
+    (block,) = (b for b in blocks_of(ROOT / "docs" / "how-to" / "python.md") if "def mapped(" in b.text)
     names: dict[str, Any] = {}
     exec(block.text, names)
     reader: Callable[..., np.ndarray] = names["mapped"]

@@ -64,17 +64,17 @@ class ReferencePart(_Part):
     """Reference band."""
 
     band: str
-    """Name of the band."""
+    """Name."""
     file: str
     """Image file."""
     band_index: Count
-    """Band in that file, from 1."""
+    """Band of the file, from 1."""
     width: Count
-    """Width of the file, px."""
+    """Size of the file, px."""
     height: Count
-    """Height of the file, px."""
+    """Size of the file, px."""
     georeferenced: bool = False
-    """True if the file has map coordinates, as a mosaic has."""
+    """True if the file has map coordinates."""
 
     @property
     def size_px(self) -> tuple[int, int]:
@@ -86,17 +86,14 @@ class HomographyPart(_Part):
     """Homography."""
 
     fixed_to_moving: Matrix3x3
-    """Maps a pixel of the reference to one of the moving band."""
+    """Maps pixels of the reference to the band."""
     space: Space
-    """`pixel`: between raw pixels. `undistorted`: between pixels without lens distortion (same focal length and
-    principal point).
-    """
+    """`pixel` (raw), or `undistorted` (without lens distortion; same focal length and principal point)."""
 
 
 class GridPart(_Part):
-    """The complete mapping, sampled at 17 x 13 points, or at up to 129 x 97 points if cubic interpolation (scipy's
-    CloughTocher2DInterpolator or RectBivariateSpline) of fewer has errors above 0.02 px (p99). If there is a `relief`,
-    use that instead.
+    """The complete mapping on a lattice: 17 x 13 points, or up to 129 x 97 if cubic interpolation of fewer has errors
+    above 0.02 px (p99). If there is a `relief`, use that instead.
     """
 
     reference_px: PointsPx
@@ -118,22 +115,16 @@ class MetricsPart(_Part):
     after: Similarity
     """Bands as written."""
     windows: Residual | None = None
-    """Shifts of windows that took no part in the estimation, under the mapping; with recipe `windows`, of windows left
-    out of the fit.
-    """
+    """Shifts of windows that the fit did not use, under the mapping."""
 
 
 class GeometryPart(_Part):
-    """What the mapping has in addition to homography and lens models."""
+    """Addition to homography and lens models."""
 
     kind: Geometry
-    """`homography`: nothing; `field`: a smooth displacement field; `relief`: the parallax of the capture;
-    `relief and field`: both.
-    """
+    """`homography` (nothing), `field` (displacements), `relief` (parallax), or `relief and field`."""
     held_out_p95_px: dict[Geometry, Annotated[float, Measured(4, math.inf)]]
-    """p95 of the shifts of held-out windows, px, for each geometry that was fitted; null if it is infinite, as no shift
-    could be measured.
-    """
+    """p95 of the shifts of held-out windows, px, by geometry."""
 
     @property
     def homography_p95_px(self) -> float | None:
@@ -147,24 +138,24 @@ class GeometryPart(_Part):
 
 
 class ReliefPart(_Part):
-    """Displacement by the parallax of the capture: a pixel x of the reference with parallax z maps to plane_px(x) + z
-    slope(x) + z^2 curvature(x), interpolated by cubic splines.
+    """Mapping with parallax: pixel x of the reference with parallax z maps to plane_px(x) + z slope(x) + z^2
+    curvature(x), interpolated by cubic splines.
     """
 
     file: RelativeFile | None
-    """[Raster](outputs.md#parallax) with the parallax, on the grid of the stack; null if it was not written."""
+    """[Parallax](outputs.md#parallax) on the grid of the stack."""
     baseline: PointPx
     """Displacement per px of parallax, undistorted px of the reference; the longest baseline has length 1."""
     occluded: Number4
-    """Share of the reference pixels that are occluded in the band."""
+    """Share of occluded pixels."""
     reference_px: PointsPx
     """Nodes: those of `grid`."""
     plane_px: SampledPx
-    """Where the reference plane maps them, raw px of the moving file."""
+    """Their positions at parallax 0, raw px of the band."""
     slope: Slopes
-    """Px of the moving file per px of parallax."""
+    """Px of the band per px of parallax."""
     curvature: Curvatures | None = None
-    """The same per px of parallax squared; null in files of earlier versions, which are less accurate."""
+    """The same per px of parallax squared."""
 
     @model_validator(mode="after")
     def _check(self) -> Self:
@@ -184,20 +175,20 @@ class PlacePart(_Part):
     file: RelativeFile
     """Path."""
     band_index: Count
-    """Band in that file, from 1."""
+    """Band of the file, from 1."""
 
 
 class BandResult(_Part):
     """Result of one band, with its complete mapping."""
 
     band: str
-    """Name of the band."""
+    """Name."""
     wavelength_nm: Number | None
     """Centre wavelength, nm."""
     file: str
     """Image file."""
     band_index: int
-    """Band in that file, from 1."""
+    """Band of the file, from 1."""
     size_px: tuple[Count, Count] | None = None
     """Width and height of the file."""
     status: PairStatus
@@ -205,47 +196,42 @@ class BandResult(_Part):
     reason: str | None
     """Why the band is not aligned, in words."""
     issues: tuple[Issue, ...] = ()
-    """All reasons for not accepting the alignment; `reason` is the first."""
+    """All reasons; `reason` is the first."""
     homography: HomographyPart | None = None
     """Mapping without lenses and displacements."""
     lenses: tuple[Lens, Lens] | None = None
-    """Lens models of the reference and the band, Brown-Conrady in OpenCV's convention, if the homography is between
-    undistorted pixels; raw pixels of the file.
-    """
+    """Lenses of reference and band (Brown-Conrady, OpenCV's convention), if the homography is between undistorted
+    pixels."""
     field: DisplacementField | None = None
-    """Displacement field of the raw pixels of the reference."""
+    """Displacements of the reference's pixels."""
     grid: GridPart | None = None
     """The complete mapping, sampled."""
     relief: ReliefPart | None = None
     """Displacement by parallax."""
     seed: Seed | None = None
-    """Initial alignment, in the same space as the homography."""
+    """Initial alignment."""
     joint: JointResult | None = None
-    """Result of the joint optimisation of descriptor and mapping."""
+    """Estimate from descriptors and windows."""
     metrics: MetricsPart | None = None
     """Similarity and shifts before and after."""
     geometry: GeometryPart | None = None
-    """What the mapping has in addition to homography and lens models."""
+    """Addition to homography and lens models."""
     prediction: Prediction | None = None
-    """Mapping that is predicted without the image of the band, or extrapolated from a part of it."""
+    """Mapping by the rig, or extrapolated from a part of the image."""
     exposed_after_s: Number3 | None = None
-    """Time of the exposure after that of the reference, by the tags of both files, s; null if the band is aligned,
-    without tags, and in older sidecars.
-    """
+    """Delay of the exposure relative to the reference, s; null if the band is aligned."""
     lens_std_px: Annotated[NDArray[np.float64], Array((4,), 6)] | None = None
     """Standard deviations of the lens shapes that neither tags nor a rig determine, px of the reference."""
     relief_std_px: Number = 0.0
-    """Spread of the relief of the flight, which a mapping without relief lacks, px of the reference."""
+    """Spread of the flight's parallax, which a mapping without relief lacks, px of the reference."""
     place: PlacePart | None = None
     """Where the aligned pixels of the band are."""
     saturated: Number4 | None = None
     """Share of saturated pixels in the file."""
     share_over_1_px: Number4 | None = None
-    """Share of the written pixels that may be displaced by more than 1 px of the reference: their expected error is
-    larger, or unknown; null if none were written, and in older sidecars.
-    """
+    """Share of the written pixels whose expected error exceeds 1 px of the reference or is unknown."""
     seconds: Number3
-    """Share of the capture's processing time, equal for all its bands."""
+    """Share of the capture's processing time."""
 
     @classmethod
     def of_reference(cls, band: Band) -> Self:
@@ -355,7 +341,7 @@ class IlluminationPart(_Part):
     band: str
     """Its name."""
     irradiance: Number | None = None
-    """By the light sensor, on a horizontal plane, W / m^2 / nm (DJI: relative)."""
+    """By the light sensor, horizontal plane, W/m²/nm (DJI: relative)."""
     reflectance_per_radiance: Positive
     """Factor by which radiance was multiplied."""
 
@@ -366,9 +352,7 @@ class OutputPart(_Part):
     file: RelativeFile | None
     """The stack; null with `--layout bands`."""
     bands: list[str] = []
-    """Names of the bands of the stack, in its order, which is that of all captures of the camera; missing bands are
-    all nodata. Layers 2, 3 … of the quality raster are of these bands.
-    """
+    """Bands of the stack, in order; missing ones are nodata."""
     radiometry: str | None = None
     """Conversion of raw numbers, such as `reflectance by panel and light sensor`."""
     panel_age_s: Number | None = None
@@ -384,9 +368,7 @@ class OutputPart(_Part):
     vignetting_corrected: bool = False
     """True if vignetting is corrected in the files of single bands."""
     nodata: float | str | None
-    """Nodata value of the stack, or of all single bands; null if they differ. `"nan"` for NaN. Integers without one in
-    the input: 0, or another value that no valid pixel has.
-    """
+    """Nodata value (`"nan"` for NaN); null if it differs between single bands."""
 
     @property
     def grid(self) -> OutputGrid:
@@ -418,16 +400,16 @@ class ReliefPreviewPart(_Part):
 
 
 class PreviewPart(_Part):
-    """Pictures for the report, a column per band. Rows: input, output, a detail of each, expected errors (if
-    `error_full_px` is not null), relief (if any).
+    """Pictures for the report, a column per band. Rows: input, output, a detail of each, expected errors, relief (if
+    any).
     """
 
     file: RelativeFile
     """Path."""
     tile_px: tuple[Count, Count]
-    """Width and height of a whole picture."""
+    """Width and height of picture and detail."""
     detail_px: tuple[Count, Count]
-    """Width and height of a detail."""
+    """Width and height of picture and detail."""
     detail: tuple[Number, Number, Number, Number]
     """x0, y0, width, height of the detail, as shares of the image."""
     error_full_px: Number | None = None
@@ -444,17 +426,17 @@ class Sidecar(_Part):
     )
 
     schema_: Annotated[Literal["agalign/2"], Field(alias="schema")] = "agalign/2"
-    """Version of this format."""
+    """Version of the format."""
     agalign: str
     """Version of the program."""
     capture: RelativeFile
     """Name of the capture."""
     capture_id: str
-    """Capture id in the tags."""
+    """From the tags."""
     flight_id: str
-    """Flight id in the tags."""
+    """From the tags."""
     captured_at: str
-    """Time in the tags, ISO 8601; empty without one, and if the clock of the camera was not set."""
+    """Time in the tags, ISO 8601; empty if unknown or the clock was not set."""
     position: Position | None = None
     """GPS position of the reference band."""
     pose: Pose | None = None
@@ -462,48 +444,44 @@ class Sidecar(_Part):
     camera: CameraIdentity
     """The camera."""
     status: CaptureStatus
-    """`ok`: every band is there, and aligned or predicted within `accept_predicted_px`. `failed`: all
-    moving bands are `failed`. Else `degraded`.
-    """
+    """`ok`: all bands exist, `aligned`, or `predicted` within `accept_predicted_px`. `failed`: all moving bands are.
+    Else `degraded`."""
     missing_bands: list[str]
-    """Bands of the camera that the capture lacks; nodata in the stack if other captures have them."""
+    """Bands that the capture lacks."""
     reference: ReferencePart
     """Reference band."""
     bands: Annotated[list[BandResult], Field(min_length=1)]
     """One entry per band, the reference included."""
     parallax: FilePart | None = None
-    """Raster of the parallax at every pixel of the reference, from which other grids are rendered; null without relief.
-    """
+    """Parallax raster on the pixels of the reference."""
     accept_predicted_px: Number | None = None
-    """Standard error up to which indices may use a predicted band, px."""
+    """Largest standard error of a predicted band for indices, px."""
     estimated_with: str
-    """Fingerprint of the input, options and version that the estimation depends on; a run with the same one keeps it.
-    """
+    """Fingerprint of everything that the estimation depends on."""
     model: str = ""
-    """Fingerprint of the model of the flight that was used; empty without one, and in older sidecars."""
+    """Fingerprint of the model of the flight; empty without one."""
     output: OutputPart | None = None
-    """Written rasters; null if all moving bands are `failed`, and until rasters are written."""
+    """Written rasters."""
     footprint: list[tuple[Number, Number]] | None = None
-    """Longitude and latitude, degrees, of the corners of the written rasters, counter-clockwise; the first is repeated.
-    """
+    """Longitude and latitude of the corners of the rasters, degrees, counter-clockwise; the first is repeated."""
     footprint_accuracy_m: Number | None = None
     """Standard error of the farthest corner, m."""
     preview: PreviewPart | None = None
     """Preview image."""
     products: list[FilePart] = []
-    """Files that were rendered."""
+    """Rendered files."""
     not_written: list[str] = []
     """Kinds of products that could not be written."""
     rendered_with: str = ""
-    """Fingerprint of everything that the products depend on; empty until all of them are written."""
+    """Fingerprint of everything that the products depend on; empty until all are written."""
     options: dict[str, dict[str, Any]] | None = None
-    """Settings that differ from the defaults, by stage and name; null in older sidecars."""
+    """Settings that differ from the defaults."""
     input_samples: dict[str, str] = {}
-    """Hash of some bytes of the file of each band: it identifies captures without tags."""
+    """Hash of some bytes of each band's file."""
     seconds: Number3 = 0.0
-    """Processing time, with reading and writing."""
+    """Processing time."""
     checksum: str | None = None
-    """SHA-256 of the content as JSON with sorted keys and no spaces, without `checksum` and `seconds`."""
+    """SHA-256 of the JSON with sorted keys and no spaces, without `checksum` and `seconds`."""
 
     @classmethod
     def estimated(
