@@ -66,13 +66,16 @@ TABLES = {
 """Tables of `figures.csv` by page of docs/explanation."""
 
 
-def command_options() -> str:
+def command_options(of_experiments: bool) -> str:
     """Return a section per command: what it does, its usage, a list of options for each panel of its help, and its
     examples. Options that a command of `DESCRIBED` has with the same text are described there only.
     """
-    return "\n".join(section(command) for command in COMMANDS.values() if not command.alias)
+    commands = (c for c in COMMANDS.values() if not c.alias and (c.name in EXPERIMENTS) is of_experiments)
+    return "\n".join(section(command) for command in commands)
 
 
+EXPERIMENTS = ("evaluate", "surface", "learn")
+"""Commands on the page of the paper."""
 DESCRIBED = ("align", "evaluate")
 """Commands whose options are not repeated."""
 
@@ -92,11 +95,14 @@ def section(command: Command) -> str:
             same.setdefault(owner, []).append("`" + re.findall(r"--[a-z-]+|[A-Z]+", line)[0] + "`")
         else:
             by_panel.setdefault(panels.get(name, ""), []).append(line)
-    parts = [f"## {command.name}", f"`agalign {command.name} {usage}`: " + effect(text)]
+    depth = "###" if command.name in EXPERIMENTS else "##"
+    parts = [f"{depth} {command.name}", f"`agalign {command.name} {usage}`: " + effect(text)]
     for panel, lines in by_panel.items():
         parts += [f"**{panel}**"] * bool(panel) + ["\n".join(f"* {line}" for line in lines)]
     if same:
-        owners = "; ".join(f"[`{owner}`](#{owner}): {', '.join(names)}" for owner, names in same.items())
+        folder = "../reference/commands.md" if command.name in EXPERIMENTS else ""
+        links = {owner: f"[`{owner}`]({'' if owner in EXPERIMENTS else folder}#{owner})" for owner in same}
+        owners = "; ".join(f"{links[owner]}: {', '.join(names)}" for owner, names in same.items())
         parts.append(f"As in {owners}.")
     if examples:
         parts.append("```text\n" + "\n".join(line.replace("  ", "  # ") for line in examples) + "\n```")
@@ -186,9 +192,11 @@ def field_lines(part: Mapping[str, Any], inner: Mapping[str, Any], of_types: Con
     for (text, kind), fields in groupby(listed(part), lambda item: described(item[1], inner, of_types)):
         items = dict(fields)
         names = ", ".join(f"`{name}`" for name in items)
-        kind = re.sub(r"^(number|integer|text)(?=\??$)", "", kind)
-        yield f"* {names}" + (f" ({kind})" if kind else "") + (f": {text}" if text else "")
-        for type_name in sorted({one for field in items.values() for one in types_in(field)} & set(inner)):
+        inside = sorted({one for field in items.values() for one in types_in(field)} & set(inner))
+        kind = re.sub(rf"^(number|integer|text{'|object' if inside else ''})(?=\??$)", "", kind)
+        of_kind = f" ({kind})" if kind.strip("?") else kind
+        yield f"* {names}{of_kind}" + (f": {text}" if text else "")
+        for type_name in inside:
             yield from (f"  {line}" for line in field_lines(inner[type_name], inner, of_types))
 
 
@@ -303,7 +311,8 @@ def scores() -> str:
 
 
 PARTS: tuple[tuple[str, str, Callable[[], str]], ...] = (
-    ("reference/commands.md", "commands", command_options),
+    ("reference/commands.md", "commands", partial(command_options, of_experiments=False)),
+    ("explanation/paper.md", "experiments", partial(command_options, of_experiments=True)),
     ("reference/settings.md", "Settings", partial(python_names, "settings")),
     ("reference/settings.md", "DiscoverOptions", partial(python_names, "discover")),
     ("reference/settings.md", "RunOptions", partial(python_names, "run")),
