@@ -5,8 +5,8 @@ fields, reasons), or check that they are current.
 
 Commands and their options come from `agalign/cli/` and `agalign/config.py`, indices from
 `agalign/products/indices/formulas.py`, fields from `agalign/products/sidecar/schema.py` and the records that it
-contains, reasons from `agalign/values/issues.py`, measured figures from `docs/figures/figures.csv` and
-`benchmarks/bands/results.csv`. Each part is between two comments in its page.
+contains, reasons from `agalign/values/issues.py`, measured figures from
+`docs/figures/figures.csv`. Each part is between two comments in its page.
 """
 
 import csv
@@ -15,7 +15,7 @@ import json
 import re
 import sys
 import typing
-from collections import Counter, defaultdict
+from collections import Counter
 from collections.abc import Callable, Container, Iterator, Mapping
 from functools import cache, partial
 from itertools import groupby, takewhile
@@ -39,21 +39,6 @@ from agalign.values.issues import KINDS, Issue, sentence
 DOCS = Path(__file__).resolve().parents[1] / "docs"
 SCHEMA = Path(agalign.__file__).parent / "sidecar.schema.json"
 FIGURES = DOCS / "figures" / "figures.csv"
-RESULTS = DOCS.parent / "benchmarks" / "bands" / "results.csv"
-VARIANTS = {
-    "as it is": "unchanged",
-    "lens-corrected": "lens-corrected",
-    "blur 3 px": "blur 3 px",
-    "motion 25 px": "motion 25 px",
-    "noise 30 %": "noise 30 %",
-    "half saturated": "half saturated",
-    "turn 3": "rotated 3°",
-    "turn 10": "rotated 10°",
-    "turn 20": "rotated 20°",
-    "scale 0.8": "scaled 0.8",
-    "lost": "noise only",
-}
-"""Names of the variants of the benchmark on the page."""
 TABLES = {
     "accuracy": (
         *("accuracy", "standard errors", "simulated cameras", "scenes with depth", "CPU time", "runs"),
@@ -244,16 +229,15 @@ def json_type(field: Mapping[str, Any], inner: Container[str]) -> str:
 
 
 def reasons() -> str:
-    """Return a table of the reasons, causes and remedies of band pairs; numbers and details are dots."""
+    """Return a list of the reasons, causes and remedies of band pairs; numbers and details are dots."""
     grouped: dict[Any, list[str]] = {}
     for kind in KINDS.values():
         detail = "FILE: cannot be read (\0)" if kind.code == "unreadable" else "\0"
         text = sentence(Issue(kind, 0.0, 0.0, detail))
         text = re.sub(r"\d+(\.\d+)?", "…", text.replace("\0", "…"))
         grouped.setdefault(kind.remedy, []).append(f"`{text}`")
-    rows = [("reason", "usual cause: remedy")]
-    rows += [("; ".join(texts), f"{remedy.cause}: {remedy.advice}") for remedy, texts in grouped.items()]
-    return table(rows) + "\n"
+    lines = (f"* {'; '.join(texts)}: **{remedy.cause}**: {remedy.advice}" for remedy, texts in grouped.items())
+    return "\n".join(lines) + "\n"
 
 
 def indices() -> str:
@@ -283,31 +267,15 @@ def figures_of(name: str) -> str:
         by_row.setdefault(line, {})[column] = row
     commands = list(dict.fromkeys(row["command"] for *_, row in parts))
     heads = [f"{column}, {unit}" if unit else column for column, unit in columns]
-    rows = [("", "n", *heads, *(["command"] if commands[1:] else []))]
+    counts = {line: next(iter(cells.values()))["n"] for line, cells in by_row.items()}
+    units = {count.partition(" ")[2].removesuffix("s") for count in counts.values()}
+    of_one_unit = f"{units.pop()}s" if len(units) == 1 else ""
+    rows = [("", of_one_unit or "n", *heads, *(["command"] if commands[1:] else []))]
     for line, cells in by_row.items():
-        (first, *_), values = cells.values(), [cells[column]["value"] or "-" for column, _ in columns]
-        rows.append((line, first["n"], *values, *([f"`{first['command']}`"] if commands[1:] else [])))
+        first, values = next(iter(cells.values())), [cells[column]["value"] or "-" for column, _ in columns]
+        count = counts[line].partition(" ")[0] if of_one_unit else counts[line]
+        rows.append((line, count, *values, *([f"`{first['command']}`"] if commands[1:] else [])))
     return table(rows) + "\n" + ("" if commands[1:] else f"\n`{commands[0]}`\n")
-
-
-def scores() -> str:
-    """Return a table of benchmarks/bands/results.csv by variant: a row per method but the simplest."""
-    cells = defaultdict[str, dict[str, list[dict[str, str]]]](lambda: defaultdict(list))
-    with RESULTS.open(encoding="utf-8", newline="") as file:
-        for row in csv.DictReader(file):
-            if row["method"] not in ("phase correlation", "identity"):
-                cells[row["method"]][row["variant"]].append(row)
-
-    def cell(of_cell: list[dict[str, str]]) -> str:
-        good = sum(round(float(row["under_half_px"] or 0) * int(row["pairs"])) for row in of_cell)
-        return f"{good}, {sum(int(row['wrong_claims']) for row in of_cell)}" if of_cell else "-"
-
-    def pairs(variant: str) -> int:
-        return max(sum(int(row["pairs"]) for row in of_method[variant]) for of_method in cells.values())
-
-    rows = [("", *(f"{name} ({pairs(variant)})" for variant, name in VARIANTS.items()))]
-    rows += [(method, *(cell(of_method[variant]) for variant in VARIANTS)) for method, of_method in cells.items()]
-    return table(rows) + "\n"
 
 
 PARTS: tuple[tuple[str, str, Callable[[], str]], ...] = (
@@ -319,7 +287,6 @@ PARTS: tuple[tuple[str, str, Callable[[], str]], ...] = (
     ("how-to/reflectance.md", "indices", indices),
     ("reference/sidecar.md", "fields", fields),
     ("how-to/troubleshooting.md", "reasons", reasons),
-    ("explanation/comparison.md", "scores by variant", scores),
     *((f"explanation/{page}.md", name, partial(figures_of, name)) for page, names in TABLES.items() for name in names),
 )
 """Page, mark of the part in it, and the function that makes its content."""
