@@ -9,6 +9,20 @@ The first writes to the current folder: pairs.csv with the pairs, learn.csv with
 off, and test.csv with the others. The second runs `agalign evaluate` with the options given for each pair alone, in
 --jobs processes, and prints its table for all pairs; results are files in FOLDER, and those which are there are not
 computed again. The third draws results: a line for each method of each file or folder.
+
+The tables of docs/explanation/paper.md:
+
+    git clone https://github.com/JasonLi-UCAS/NIR-VIS-RS
+    python benchmarks/paper.py NIR-VIS-RS/Dataset/Aerial                  # pairs.csv; its parts learn.csv, test.csv
+    agalign evaluate pairs.csv -m fast:siamese:grey -m sift -m daisy      # RGB and near infra-red: each row
+    agalign evaluate pairs.csv -m scratch:pseudo-siamese --shift 2.5,5,10
+    S="--shift 0,2.5,5,7.5,10,15,20"
+    agalign evaluate pairs.csv -m fast:pseudo-siamese $S -o alone.csv     # convergence; also with --seeding
+    agalign evaluate pairs.csv -m elastix $S -o elastix.csv
+    python benchmarks/paper.py pairs.csv --pieces paper-5 --jobs 2 -m paper:pseudo-siamese --shift 5   # 90 minutes
+    python benchmarks/paper.py alone.csv elastix.csv paper-5 --plot robustness.png
+    agalign learn learn.csv -o net.safetensors                            # without labels; also --sharing siamese
+    agalign evaluate test.csv -m net.safetensors -m sift
 """
 
 import csv

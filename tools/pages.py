@@ -158,6 +158,7 @@ NOT_LISTED = {
     *("preview", "estimated_with", "rendered_with", "input_samples", "model"),
     *("loss", "chance", "iterations", "levels", "last_step_px", "cells"),
     *("corner_covariance_px2", "covariance_px2", "lens_std_px", "relief_std_px"),
+    *("trusted", "runner_up_sigma", "vignetting_corrected", "exposed_after_s", "not_written"),
 }
 """Parts that another page describes, and fields that only agalign needs: for the report, resumed runs and errors."""
 
