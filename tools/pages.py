@@ -81,7 +81,7 @@ def section(command: Command) -> str:
         else:
             by_panel.setdefault(panels.get(name, ""), []).append(line)
     depth = "###" if command.name in EXPERIMENTS else "##"
-    parts = [f"{depth} {command.name}", f"`agalign {command.name} {usage}`: " + effect(text)]
+    parts = [f"{depth} {command.name}", f"`agalign {command.name} {usage.removeprefix('[OPTIONS] ')}`: " + effect(text)]
     for panel, lines in by_panel.items():
         parts += [f"**{panel}**"] * bool(panel) + ["\n".join(f"* {line}" for line in lines)]
     if same:
@@ -158,7 +158,7 @@ NOT_LISTED = {
     *("preview", "estimated_with", "rendered_with", "input_samples", "model"),
     *("loss", "chance", "iterations", "levels", "last_step_px", "cells"),
     *("corner_covariance_px2", "covariance_px2", "lens_std_px", "relief_std_px"),
-    *("trusted", "runner_up_sigma", "vignetting_corrected", "exposed_after_s", "not_written"),
+    *("trusted", "runner_up_sigma", "vignetting_corrected", "exposed_after_s", "not_written", "seconds"),
 }
 """Parts that another page describes, and fields that only agalign needs: for the report, resumed runs and errors."""
 

@@ -42,7 +42,6 @@ def _align(
         agalign flight/ -o aligned/ --radiometry  write reflectance, if the camera's tags are sufficient
         agalign flight/ -o aligned/ --layout bands  write a file per band with its tags, for photogrammetry
         agalign orchard/ --relief --error-map  correct parallax of trees; map the expected error
-        agalign flight/ --model earlier/models/CAMERA.safetensors  reuse the network and rig of an earlier flight
     """
     from agalign.config import DiscoverOptions, RunOptions, Settings
     from agalign.products.indices.formulas import index_named
@@ -147,10 +146,10 @@ def _onto(
 
     Options:
         reference: The mosaic with the output grid.
-        moving: Mosaics of other dates or sensors.
+        moving: Mosaics to align.
         out: Output folder; by default REFERENCE-aligned.
         band: Band of REFERENCE that the bands of MOVING are aligned to; by default green.
-        relief: Add a smooth displacement field to the homography (always), never, or if it reduces the residuals of
+        relief: Add a smooth displacement field to the homography: always, never, or if it reduces the residuals of
             held-out windows (auto).
         jobs: Mosaics processed at the same time; 0 is one per core.
         overwrite: Process finished mosaics again.

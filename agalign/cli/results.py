@@ -148,17 +148,16 @@ def _indices(
     """Compute spectral indices of aligned captures: rasters, pictures and a table of statistics.
 
     Options:
-        index: Names separated by commas: ndvi (the default), ndre, gndvi, ndwi, savi, evi …
+        index: Names separated by commas, as ndvi (the default), ndre, savi …
         formula: A formula of the bands B, G, R, RE and N, as 'name=(N-R)/(N+R)'; repeatable.
         target: Folder for the rasters; by default next to the stacks.
         mask_qa: Omit saturated, occluded and misaligned pixels; the run needs --qa.
         as_json: Print JSON to standard output.
-        overwrite: Compute indices again that an earlier command wrote.
+        overwrite: Compute finished indices again.
 
     Examples:
         agalign indices aligned/  NDVI of every capture, next to its stack
         agalign indices aligned/ --index ndvi,ndre,savi -o indices/  three indices, into another folder
-        agalign indices aligned/ --formula 'mine=(N-RE)/(N+RE)'  a formula of the bands B, G, R, RE and N
     """
     from agalign.batch.index_run import index_tasks, run_indices
     from agalign.cli.align_run import cluster, progress
