@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from agalign.api import warp_onto as warp_onto
     from agalign.batch.capture_task import CaptureReport as CaptureReport
     from agalign.batch.capture_task import FlightReports as FlightReports
+    from agalign.batch.workers import dask_executor as dask_executor
     from agalign.cameras.discover import FolderScan as FolderScan
     from agalign.cameras.discover import discover as discover
     from agalign.config import CheckSettings as CheckSettings
@@ -60,6 +61,7 @@ if TYPE_CHECKING:
 _NAMES = {
     "api": "align align_capture align_folder export indices onto warp_onto",
     "batch.capture_task": "CaptureReport FlightReports",
+    "batch.workers": "dask_executor",
     "cameras.discover": "FolderScan discover",
     "config": "CheckSettings DiscoverOptions FlightSettings JointSettings ReliefSettings RunOptions SeedSettings "
     "Settings WriteSettings",

@@ -53,31 +53,57 @@ def align(
     moving_valid: "ArrayLike | None" = None,
     settings: Settings | None = None,
 ) -> Alignment:
-    """Estimate the homography between two images of the same scene, which may be of different modalities.
+    """Estimate the mapping between two images of the same scene, also between spectral bands with reversed contrast.
 
-    fixed, moving
-        (H, W), (H, W, C) or (C, H, W) arrays of any numeric type; their sizes may differ. The largest value of an
-        integer type counts as saturated. nan, and constant areas at the border, are ignored.
+    The images are aligned by learned descriptors, then by phase correlation in windows; windows that were left out of
+    the estimate verify it (docs/explanation/method.md). A pair that cannot be aligned raises no error.
+
+    Parameters
+    ----------
+    fixed
+        Reference image, (H, W), (H, W, C) or (C, H, W), of any numeric type. NaN and constant areas at the border are
+        ignored, and so is the largest value of 8 and 16 bit integers, which counts as saturated.
+    moving
+        The other image, likewise. Its size may differ from that of `fixed`.
     seed
-        Initial `fixed_to_moving` (3x3), accurate to about 10 % of the image size; None: estimated from the images.
+        Initial alignment: homography (3, 3) from pixels of `fixed` to pixels of `moving`, accurate to about 10 % of the
+        image size. By default it is estimated from the images.
     seed_std_px
-        Standard error of the seed, px of `fixed`. It decides between several matches in a repetitive scene, which is
+        Standard error of `seed`, px of `fixed`. It selects one of several matches in a repetitive scene, which is
         otherwise not aligned.
-    fixed_valid, moving_valid
-        (H, W), False where pixels must not be used.
-
+    fixed_valid
+        (H, W), False for pixels of `fixed` that must not be used.
+    moving_valid
+        (H, W), False for pixels of `moving` that must not be used.
     settings
-        By default `Settings()`; `settings.write` has no effect.
+        By default `Settings()`. `settings.write` has no effect.
 
-    The method is that of docs/explanation/method.md: a descriptor learned on both images while the homography is
-    optimised by the same loss, then refined and verified by windows. Returns an Alignment on the grid of `fixed`; its
-    matrices are float64. `warp` resamples `moving` to it, `map` maps pixels of `fixed` to pixels
-    of `moving`, `inverse` maps back: x right, y down, (0, 0) the centre of the top-left pixel. Check its `status`: only
-    `aligned` has passed verification. With `predicted`, the mapping is extrapolated over a part of the image without
-    measurements, with the standard error `prediction.std_px`. With `seed_only` and `failed`, the mapping is that of the
-    seed. `reason` explains each of the three. `before` and `after` have measures of similarity of the images as they
-    are and under the mapping, `residual` the shifts of windows that remain.
-    Raises InputError for arrays that are not images, GeometryError for a seed that is not a homography.
+    Returns
+    -------
+    Alignment
+        The mapping from pixels of `fixed` to pixels of `moving` (x right, y down, (0, 0) the centre of the top-left
+        pixel), its standard error and its `status`. Only `aligned` has passed verification. With `predicted`, the
+        mapping is extrapolated over a part of the image, with the standard error `prediction.std_px`. With `seed_only`
+        and `failed` it is the initial alignment; `reason` explains why.
+
+    Raises
+    ------
+    InputError
+        An array is not an image, a mask has a different size from its image, or `seed_std_px` is not a positive number
+        or has no `seed`.
+    GeometryError
+        `seed` is not an invertible homography.
+
+    Examples
+    --------
+    >>> from scipy.ndimage import gaussian_filter
+    >>> scene = gaussian_filter(np.random.default_rng(0).normal(size=(208, 208)), 1.5)
+    >>> green, nir = scene[8:, 8:], -scene[:-8, :-8]  # reversed contrast, offset by 8 px along both axes
+    >>> result = agalign.align(green, nir)
+    >>> result.status
+    'aligned'
+    >>> result.map([100, 60]).round()
+    array([108.,  68.])
     """
     settings = settings or Settings()
     if seed_std_px is not None and seed is None:
@@ -103,14 +129,45 @@ def warp_onto(
     valid: "ArrayLike | None" = None,
     interpolation: Interpolation = "lanczos",
 ) -> tuple[NDArray[np.generic], Mask]:
-    """Resample an image to a grid of (width, height) pixels by a homography (3x3) that maps its pixels to the image.
+    """Resample an image to the grid of another one by a homography.
 
-    moving, valid
-        (H, W), (H, W, C) or (C, H, W) of any numeric type, and (H, W), False for pixels that must not be used.
+    Use `Alignment.warp` for an alignment, which may have lenses, a displacement field or a parallax map in addition.
 
-    Returns the pixels in the layout and type of `moving`, NaN or 0 where they are unknown, and their mask (height,
-    width). An alignment may have lenses, a displacement field or a relief in addition: use `Alignment.warp` for it.
-    Raises InputError, also for an Alignment, and GeometryError.
+    Parameters
+    ----------
+    moving
+        Image, (H, W), (H, W, C) or (C, H, W), of any numeric type.
+    fixed_to_moving
+        Homography (3, 3) from pixels of the output to pixels of `moving`: x right, y down, (0, 0) the centre of the
+        top-left pixel.
+    fixed_size_px
+        (width, height) of the output, px.
+    valid
+        (H, W), False for pixels of `moving` that must not be used.
+    interpolation
+        `nearest`, `bilinear`, `cubic` or `lanczos`.
+
+    Returns
+    -------
+    pixels
+        The resampled image, in the layout and type of `moving`; NaN or, for integers, 0 where it is unknown.
+    known
+        (height, width), True where all channels of `pixels` are known.
+
+    Raises
+    ------
+    InputError
+        `moving` is not an image, `valid` has a different size, `fixed_size_px` is not a size, or `fixed_to_moving` is
+        an Alignment.
+    GeometryError
+        `fixed_to_moving` is not an invertible homography.
+
+    Examples
+    --------
+    >>> image = np.arange(12.0).reshape(3, 4)
+    >>> pixels, known = agalign.warp_onto(image, [[1, 0, 1], [0, 1, 0], [0, 0, 1]], (4, 3), interpolation="nearest")
+    >>> pixels[0], known[0]
+    (array([ 1.,  2.,  3., nan]), array([ True,  True,  True, False]))
     """
     if isinstance(fixed_to_moving, Alignment):
         raise InputError("an alignment is more than a homography; use its method warp(moving)")
@@ -133,12 +190,41 @@ def _size_px(size_px: object) -> tuple[int, int]:
 
 
 def align_capture(capture: Capture, out: str | Path, *, settings: Settings | None = None) -> CaptureReport:
-    """Align a capture that `discover` returned (an element of `FolderScan.captures`), and write its stack and sidecar
-    below `out`.
+    """Align one capture, without the network and rig of its flight, and write its rasters and sidecar.
 
-    Returns a CaptureReport with the state `done`; bands that are not aligned are in its `result`, not raised. Raises
-    UnreadableFileError if its reference band cannot be read, ConfigurationError if `out` has the result of another
-    capture in its place, and OutputError.
+    A band that cannot be aligned raises no error: its status and reason are in `result` of the report.
+
+    Parameters
+    ----------
+    capture
+        An element of `captures` of the FolderScan that `discover` returns.
+    out
+        Output folder. The files are written to the same subfolder as in the input folder.
+    settings
+        By default `Settings()`.
+
+    Returns
+    -------
+    CaptureReport
+        Its state is `done`.
+
+    Raises
+    ------
+    UnreadableFileError
+        The reference band cannot be read.
+    InputError
+        The capture lacks the tags that a setting needs, such as those for radiance.
+    ConfigurationError
+        `out` contains the result of a different capture with the same name.
+    OutputError
+        A file cannot be written.
+
+    Examples
+    --------
+    >>> flight = agalign.discover("flight", agalign.DiscoverOptions(bands=("Green", "NIR")))
+    >>> report = agalign.align_capture(flight.captures[0], "one")
+    >>> [(band.band, band.status) for band in report.sidecar.bands]
+    [('Green', 'reference'), ('NIR', 'aligned')]
     """
     settings = settings or Settings()
     refuse_other_captures([capture], Path(out))
@@ -155,15 +241,54 @@ def align_folder(
     model: str | Path | None = None,
     progress: Progress | None = None,
 ) -> FlightReports:
-    """Align every capture below `folder`, and write results, summary and report to `out`.
+    """Align every capture below a folder, and write rasters, sidecars, summary and report.
 
-    `run` sets the number of processes, or the executor; with several processes the calling script must be
-    importable (`if __name__ == "__main__":`). `model` is a file from the `models` folder of an earlier run.
-    `progress` is called after each capture with its report, the number of finished captures and their total; the
-    logger `agalign` logs each capture at the level INFO.
-    Returns the reports in the order in which the captures were finished.
-    Raises InputError if the folder does not exist, OutputError if `out` cannot be written, ConfigurationError
-    for a model of another camera, and if `out` has results of other captures of the same name.
+    This is the command `agalign FOLDER -o OUT`. A network and a rig are learned for each camera and flight. Captures
+    that an earlier run has finished with the same settings are kept. The logger `agalign` logs each capture at level
+    INFO.
+
+    Parameters
+    ----------
+    folder
+        Input folder, with subfolders.
+    out
+        Output folder; it is created, and skipped if it is below `folder`.
+    settings
+        Settings that change results. By default `Settings()`.
+    options
+        Selection of files and bands. By default all images below `folder`; options of your own must name an output
+        folder below `folder` in `skip`.
+    run
+        Number of processes or executor, and what to process again. With several processes the calling script must be
+        importable: call this function below `if __name__ == "__main__":`.
+    model
+        File from the folder `models` of an earlier run with the same camera; its network and rig are reused.
+    progress
+        Called after each capture with its CaptureReport, the number of finished captures, and the number of captures.
+
+    Returns
+    -------
+    FlightReports
+        A CaptureReport for each capture, in the order in which they finished.
+
+    Raises
+    ------
+    InputError
+        `folder` does not exist or contains no images, or `model` cannot be read.
+    ConfigurationError
+        `model` belongs to a different camera, no capture has a requested band or the tags that a setting needs, or
+        `out` contains results of different captures with the same names.
+    OutputError
+        `out` cannot be written, another run writes to it, or the disk is full.
+    WorkerError
+        The worker processes cannot be started, or several end one after another.
+
+    Examples
+    --------
+    >>> settings = agalign.Settings(write=agalign.WriteSettings(layout="both"))
+    >>> reports = agalign.align_folder("flight", "aligned", settings=settings)
+    >>> sorted((report.label, report.result.status) for report in reports)
+    [('0000SET/000/IMG_0001', 'ok'), ('0000SET/000/IMG_0002', 'ok')]
     """
     end_if_reimported()
     flight = discover(Path(folder), options or DiscoverOptions(skip=(Path(out),)))
@@ -180,12 +305,47 @@ def onto(
     settings: Settings | None = None,
     run: RunOptions | None = None,
 ) -> FlightReports:
-    """Align georeferenced mosaics of other dates or sensors to the grid of the mosaic `reference`, and write a raster
-    and a sidecar of each to `out`: one band of the reference, then all bands of the mosaic.
+    """Align georeferenced mosaics from other dates or sensors to the grid of a reference mosaic.
 
-    `band` is the name of the band of the reference to compare with; by default green. A mosaic is aligned if its
-    windows are within a pixel of the reference. Returns a report for each mosaic, in the order in which they were
-    finished. Raises UnreadableFileError, InputError for a file without georeference, NoSuchBandError, OutputError.
+    A raster and a sidecar of each mosaic are written to `out`. The raster contains one band of the reference, then all
+    bands of the mosaic. A mosaic is aligned if its windows are within a pixel of the reference.
+
+    Parameters
+    ----------
+    reference
+        Reference mosaic, a raster with georeference.
+    moving
+        Mosaics to align, rasters with georeference.
+    out
+        Output folder.
+    band
+        Name of the band of `reference` to align to. By default green.
+    settings
+        By default `Settings()`.
+    run
+        Number of processes or executor. By default `RunOptions()`.
+
+    Returns
+    -------
+    FlightReports
+        A CaptureReport for each mosaic, in the order in which they finished.
+
+    Raises
+    ------
+    UnreadableFileError
+        A mosaic does not exist or cannot be read.
+    InputError
+        A mosaic has no georeference, or is the reference itself.
+    NoSuchBandError
+        `reference` has no band `band`.
+    OutputError
+        `out` cannot be written.
+
+    Examples
+    --------
+    >>> (report,) = agalign.onto("june.tif", ["july.tif"], "july_on_june")
+    >>> [(band.band, band.status) for band in report.sidecar.bands]
+    [('june band_1', 'reference'), ('band_1', 'aligned')]
     """
     end_if_reimported()
     flight = mosaics_onto(Path(reference), [Path(path) for path in moving], band)
@@ -222,13 +382,45 @@ def indices(
     mask_qa: bool = False,
     run: RunOptions | None = None,
 ) -> list[IndexReport]:
-    """Compute spectral indices of the aligned captures in the output folder of a run, and write a raster and a picture
-    of each, and the table indices.csv, to `target` (by default `out`).
+    """Compute spectral indices of the aligned captures of a run, and write a raster and a picture of each.
 
-    `names` are those of `agalign indices --index`; `formulas` are texts such as "mine=(N-RE)/(N+RE)" of the bands B, G,
-    R, RE and N. `mask_qa` leaves out saturated, occluded and misaligned pixels, and needs a run with quality rasters
-    (`WriteSettings(qa=True)`). Returns a report for each capture and index; `problem` says why one could not be
-    computed. Raises InputError if there is no run, ConfigurationError for an unknown index, OutputError.
+    The table indices.csv has a row for each capture and index.
+
+    Parameters
+    ----------
+    out
+        Output folder of a run.
+    names
+        Names of indices, such as ndvi or ndre; `agalign indices --help` lists them.
+    formulas
+        Further indices as "name=formula", such as "mine=(N-RE)/(N+RE)", of the bands B, G, R, RE and N.
+    target
+        Folder for the rasters, pictures and the table. By default `out`.
+    mask_qa
+        Mask saturated, occluded and misaligned pixels. The run must have written quality rasters
+        (`WriteSettings(qa=True)`).
+    run
+        Number of processes or executor, and whether to compute existing indices again. By default `RunOptions()`.
+
+    Returns
+    -------
+    list of IndexReport
+        A report for each capture and index. If an index could not be computed, `problem` says why.
+
+    Raises
+    ------
+    InputError
+        `out` is not the output folder of a run.
+    ConfigurationError
+        An index is unknown, or a formula is invalid.
+    OutputError
+        `target` cannot be written.
+
+    Examples
+    --------
+    >>> reports = agalign.indices("aligned", ["ndvi"], formulas=["mine=(N-RE)/(N+RE)"])
+    >>> [(report.index, report.path.name, report.problem) for report in reports[:2]]
+    [('ndvi', 'IMG_0001_ndvi.tif', ''), ('mine', 'IMG_0001_mine.tif', '')]
     """
     end_if_reimported()
     folder, options = Path(out if target is None else target), run or RunOptions()
@@ -239,13 +431,39 @@ def indices(
 
 
 def export(out: str | Path, target: str | Path, program: ExportProgram, *, copy: bool = False) -> ExportReport:
-    """Export the captures with status `ok` in the output folder of a run into a new folder, for a photogrammetry
-    program: "odm" (OpenDroneMap, WebODM), "metashape" or "pix4d".
+    """Export the captures with status `ok` of a run to a new folder for a photogrammetry program.
 
-    The captures have the same bands and quantities as most. Files are hard links if the file system allows that, and
-    copies otherwise or with `copy`. Returns an ExportReport; its `notes` are instructions for the program, and
-    `left_out` lists the other captures. Raises InputError if there is no run or nothing to export, ConfigurationError
-    if the run wrote no band files (`WriteSettings(layout="bands")`), OutputError if `target` is not empty or cannot be
-    written.
+    Captures whose bands or quantity differ from most others are skipped and listed.
+
+    Parameters
+    ----------
+    out
+        Output folder of a run that wrote band files (`WriteSettings(layout="bands")` or `"both"`).
+    target
+        Folder to create; it may exist if it is empty.
+    program
+        `odm` (OpenDroneMap, WebODM), `metashape` (Agisoft Metashape) or `pix4d` (Pix4Dmapper, Pix4Dfields).
+    copy
+        Copy the files. By default they are hard links if the file system supports them.
+
+    Returns
+    -------
+    ExportReport
+        The exported files, the skipped captures, and `notes` with instructions for the program.
+
+    Raises
+    ------
+    InputError
+        `out` is not the output folder of a run, or no capture has the status `ok`.
+    ConfigurationError
+        The run wrote no band files.
+    OutputError
+        `target` is not empty or cannot be written.
+
+    Examples
+    --------
+    >>> report = agalign.export("aligned", "for_odm", "odm")
+    >>> report.captures, report.files[0].as_posix(), report.left_out
+    (2, 'for_odm/images/0000SET_000_IMG_0001_1.tif', [])
     """
     return export_run(Path(out), Path(target), program, copy=copy)

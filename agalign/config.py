@@ -90,7 +90,16 @@ _GLOBS = Option(type=list[str] | None, parse=lambda globs: tuple(globs or ()))
 
 @validated.dataclass(frozen=True, config=ConfigDict(use_attribute_docstrings=True))
 class DiscoverOptions:
-    """Options of `discover`."""
+    """Options of `discover` and `align_folder`: which files and bands are used.
+
+    In Python, names and globs are tuples, instead of texts with commas or repeated options.
+
+    Examples
+    --------
+    >>> options = agalign.DiscoverOptions(bands=("Red", "NIR"), exclude=("*_0002_*",))
+    >>> [capture.name for capture in agalign.discover("flight", options).captures]
+    ['IMG_0001']
+    """
 
     pattern: str | None = None
     """File names of a camera that is not recognised, as '{capture}_{band}.tif'."""
@@ -120,7 +129,15 @@ class DiscoverOptions:
 
 @validated.dataclass(frozen=True, config=ConfigDict(use_attribute_docstrings=True, arbitrary_types_allowed=True))
 class RunOptions:
-    """How to run. Only `align_panels` changes results: with it, calibration panels give no reflectance."""
+    """How to run. Only `align_panels` changes results: with it, calibration panels give no reflectance.
+
+    In Python, `executor` is a concurrent.futures executor, such as that of `dask_executor`, instead of an address.
+
+    Examples
+    --------
+    >>> run = agalign.RunOptions(jobs=1, retry_failed=True)
+    >>> reports = agalign.align_folder("flight", "aligned", run=run)
+    """
 
     overwrite: bool = False
     """Process finished captures again."""
@@ -128,7 +145,7 @@ class RunOptions:
     """Captures processed at the same time; 0 is one per core."""
     align_panels: bool = False
     """Also align captures of calibration panels and of the sky; panels then give no reflectance."""
-    # Any executor in Python, such as `dask_executor`.
+    # Any concurrent.futures executor in Python, such as `agalign.dask_executor`.
     executor: Annotated[Executor | None, Option("dask", type=str | None)] = None
     """Address of a Dask scheduler, as tcp://host:8786; 'local' starts workers on this machine."""
     retry_failed: bool = False
@@ -173,7 +190,7 @@ class JointSettings(SettingsModel):
 
 
 class FlightSettings(SettingsModel):
-    """One network for many captures."""
+    """One network for many captures; `together=False` trains one for each capture (option --each-alone)."""
 
     together: Annotated[bool, Option("each_alone", default=False, parse=not_)] = True
     """Train a network for each capture instead of one for a flight."""
@@ -269,7 +286,16 @@ class WriteSettings(SettingsModel):
 
 
 class Settings(SettingsModel):
-    """All settings that change results."""
+    """All settings that change results, one immutable model for each stage.
+
+    An unknown name or an invalid value raises pydantic's ValidationError.
+
+    Examples
+    --------
+    >>> settings = agalign.Settings(write=agalign.WriteSettings(format="cog", qa=True))
+    >>> settings.write.format, settings.write.interpolation
+    ('cog', 'lanczos')
+    """
 
     seed: SeedSettings = SeedSettings()
     joint: JointSettings = JointSettings()

@@ -4,7 +4,16 @@ import re
 
 
 class AgalignError(Exception):
-    """Base of the exceptions of agalign; the text is one line for the user."""
+    """Base of the exceptions of agalign. The text is one line with the cause and the remedy.
+
+    Examples
+    --------
+    >>> try:
+    ...     agalign.discover("no/such/folder")
+    ... except agalign.AgalignError as error:
+    ...     print(error)
+    no/such/folder: does not exist; give the folder of the images
+    """
 
 
 class InputError(AgalignError):
@@ -28,7 +37,7 @@ class GeometryError(AgalignError):
 
 
 class NotEnoughTextureError(AgalignError):
-    """Too few keypoints are in the area that both bands show to learn from them."""
+    """Too few keypoints are in the common area of two bands to learn from."""
 
     def __init__(self, keypoints: int, minimum: int) -> None:
         super().__init__(keypoints, minimum)
@@ -46,7 +55,7 @@ class NoContrastError(AgalignError):
 
 
 class SidecarError(InputError):
-    """A sidecar is missing, malformed or of another schema version."""
+    """A sidecar is missing or malformed, or has an unknown schema version."""
 
 
 class OutputError(AgalignError):
@@ -54,7 +63,7 @@ class OutputError(AgalignError):
 
 
 class WorkerError(AgalignError):
-    """The worker processes cannot be started, or end one after another; or the cluster is lost."""
+    """The worker processes cannot be started, several end one after another, or the cluster is lost."""
 
 
 class MemoryLimitError(AgalignError):

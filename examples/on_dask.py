@@ -7,14 +7,13 @@ python examples/on_dask.py FLIGHT OUT [tcp://SCHEDULER:8786]
 import sys
 
 import agalign
-from agalign.batch.workers import dask_executor
 
 
 def main() -> None:
     if len(sys.argv) < 3:
         sys.exit("usage: python examples/on_dask.py FLIGHT OUT [tcp://SCHEDULER:8786]")
     address = sys.argv[3] if len(sys.argv) > 3 else "local"
-    with dask_executor(address, jobs=2) as executor:
+    with agalign.dask_executor(address, jobs=2) as executor:
         for report in agalign.align_folder(sys.argv[1], sys.argv[2], run=agalign.RunOptions(executor=executor)):
             print(report.label, report.state, report.error or "")
 

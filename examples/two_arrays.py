@@ -1,20 +1,19 @@
-"""Align two arrays: images of one scene in different modalities.
+"""Align two arrays: a synthetic scene, and the scene rotated by 2 degrees with reversed contrast.
 
 python examples/two_arrays.py
 """
 
-import tempfile
-from pathlib import Path
-
-import tifffile
+import numpy as np
+from scipy.ndimage import affine_transform, gaussian_filter
 
 import agalign
-from agalign.synthetic.flight import make_flight
 
-with tempfile.TemporaryDirectory() as folder:
-    make_flight(Path(folder), captures=1, size_px=(640, 480))
-    green = tifffile.imread(Path(folder) / "0000SET/000/IMG_0001_2.tif")
-    nir = tifffile.imread(Path(folder) / "0000SET/000/IMG_0001_4.tif")
+noise = np.random.default_rng(0).normal(size=(520, 680))
+scene = gaussian_filter(noise, 1.5) + 2 * gaussian_filter(noise, 6)
+angle = np.radians(2)
+rotation = [[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]]
+green = scene[20:500, 20:660]
+nir = -affine_transform(scene, rotation, offset=(12, -6))[20:500, 20:660]
 
 result = agalign.align(green, nir)
 print(f"{result.status}: seed {result.seed.kind}, residual {result.residual.median_px:.3f} px")

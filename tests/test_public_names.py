@@ -18,7 +18,7 @@ from agalign.values.mapping import PixelMapping
 
 from .builders import joint_result, residual_of
 
-FUNCTIONS = "align align_capture align_folder discover export indices onto open_capture open_flight"
+FUNCTIONS = "align align_capture align_folder dask_executor discover export indices onto open_capture open_flight"
 FUNCTIONS += " read_alignment warp_onto"
 SETTINGS = "CheckSettings FlightSettings JointSettings ReliefSettings SeedSettings Settings WriteSettings"
 RESULTS = "Alignment Capture CaptureReport ExportReport FlightReports FolderScan IndexReport Prediction Residual Seed"

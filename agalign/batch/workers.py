@@ -179,12 +179,35 @@ def failure_text(error: Exception, timeout_s: float | None = None) -> str:
 
 @contextmanager
 def dask_executor(address: str, jobs: int = 0) -> Iterator[Executor]:
-    """Connect to a Dask cluster as an executor. Its workers need this version of agalign and the same folders.
+    """Connect to a Dask cluster and return its executor, for `RunOptions(executor=...)`; use it in a `with` block.
 
-    `address` is that of a scheduler, such as tcp://host:8786, or `local` for `jobs` worker processes on this machine; 0
-    is one per core. Tasks of a lost worker are repeated by another. A capture that exceeds the timeout ends its worker,
-    which its nanny restarts; the scheduler retries the capture as often as its setting `allowed-failures` permits.
-    Raises ConfigurationError if Dask is not installed, the scheduler does not answer, or a worker has another version.
+    The workers need the same version of agalign and the same folders under the same paths. The tasks of a lost worker
+    are repeated by the others. A capture that exceeds the timeout ends its worker, which its nanny restarts; the
+    scheduler retries the capture as often as its setting `allowed-failures` permits.
+
+    Parameters
+    ----------
+    address
+        Address of a Dask scheduler, such as tcp://host:8786, or `local` to start workers on this machine.
+    jobs
+        Number of worker processes with `local`; 0 is one per core.
+
+    Returns
+    -------
+    context manager of concurrent.futures.Executor
+        The connection, and with `local` the workers, end with the `with` block.
+
+    Raises
+    ------
+    ConfigurationError
+        Dask is not installed, the scheduler does not answer, or a worker has a different version of agalign.
+
+    Examples
+    --------
+    >>> with agalign.dask_executor("local", jobs=1) as executor:
+    ...     reports = agalign.align_folder("flight", "aligned", run=agalign.RunOptions(executor=executor))
+    >>> len(reports)
+    2
     """
     try:
         import dask

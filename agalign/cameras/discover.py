@@ -47,15 +47,18 @@ __all__ = ["DiscoverOptions", "FolderScan", "Problem", "discover"]
 
 @dataclass(frozen=True)
 class FolderScan:
-    """The captures and the problems below a folder."""
+    """The captures and the problems below a folder, as `discover` returns them."""
 
     folder: Path
+    """The input folder."""
     captures: tuple[Capture, ...]
+    """Sorted by folder and name."""
     problems: tuple[Problem, ...]
+    """Files and captures that are skipped, or used with fewer tags: each has a `path`, an `error` and a `text`."""
 
     @property
     def is_complete(self) -> bool:
-        """False if a file or capture is left out that is not an exact copy of another."""
+        """False if a file or capture is skipped that is not an exact copy of another."""
         return all(p.is_harmless for p in self.problems)
 
     @property
@@ -69,10 +72,37 @@ class FolderScan:
 
 
 def discover(folder: str | Path, options: DiscoverOptions | None = None) -> FolderScan:
-    """Return all captures below `folder`, sorted by folder and name, and the problems.
+    """Find the captures below a folder: the bands, the camera, and the metadata from the tags of the files.
 
-    Raises InputError if the folder does not exist or contains no image, ConfigurationError for a band that no capture
-    has.
+    Output folders of earlier runs are skipped. Pixels are not read.
+
+    Parameters
+    ----------
+    folder
+        Input folder, with subfolders.
+    options
+        Selection of files and bands. By default all images.
+
+    Returns
+    -------
+    FolderScan
+        `captures`, sorted by folder and name, and `problems` of files that are skipped or used with fewer tags.
+
+    Raises
+    ------
+    InputError
+        `folder` does not exist, is not local, or contains no image that `options` selects.
+    ConfigurationError
+        `options.pattern` matches no file, or `options.bands` leaves fewer than two bands of each capture.
+    NoSuchBandError
+        No capture has a band that `options` names.
+
+    Examples
+    --------
+    >>> flight = agalign.discover("flight")
+    >>> capture = flight.captures[0]
+    >>> len(flight.captures), capture.label, [band.name for band in capture.bands]
+    (2, '0000SET/000/IMG_0001', ['Blue', 'Green', 'Red', 'NIR', 'Red edge'])
     """
     folder, options = Path(folder), options or DiscoverOptions()
     check_folder(folder)

@@ -303,7 +303,21 @@ _NOT_MEASURED = Similarity()
 
 @dataclass(frozen=True)
 class Alignment:
-    """Mapping of one band pair, between the images or between the files, and how it was estimated and verified."""
+    """The mapping from a reference image to a moving image, and how it was estimated and verified.
+
+    `align` returns it for two arrays, `read_alignment` for a band of an aligned capture. Positions are raw pixels: x
+    right, y down, (0, 0) the centre of the top-left pixel.
+
+    Examples
+    --------
+    `green` and `nir` are the arrays of the example of `align`.
+
+    >>> result = agalign.align(green, nir)
+    >>> result.status, result.reason, result.size_px
+    ('aligned', None, (200, 200))
+    >>> bool(result.residual.median_px < 0.1), bool(result.joint.corner_std_px < 0.2)
+    (True, True)
+    """
 
     mapping: PixelMapping
     """The complete mapping from raw pixels of the reference to raw pixels of the moving image."""
@@ -312,6 +326,7 @@ class Alignment:
     issues: tuple[Issue, ...]
     """Reasons against accepting the alignment, the most important first; empty if it is `aligned`."""
     seed: Seed
+    """The initial alignment."""
     joint: JointResult | None = None
     """The band's own estimate with its standard error; None without one."""
     residual: Residual | None = None
@@ -357,13 +372,46 @@ class Alignment:
         return "seed_only" if self.is_seed_usable else "failed"
 
     def map(self, reference_px: "ArrayLike") -> Points:
-        """Map raw pixels (..., 2) of the reference to raw pixels of the moving image, (0, 0) a pixel's centre."""
+        """Map positions in the reference to positions in the moving image.
+
+        Parameters
+        ----------
+        reference_px
+            (..., 2): x and y, raw px of the reference; (0, 0) is the centre of the top-left pixel.
+
+        Returns
+        -------
+        array
+            (..., 2), float64: x and y, raw px of the moving image.
+
+        Examples
+        --------
+        >>> result = agalign.align(green, nir)  # the arrays of the example of `align`
+        >>> result.map([[0, 0], [100, 60]]).round()
+        array([[  8.,   8.],
+               [108.,  68.]])
+        """
         return self.mapping(reference_px)
 
     def inverse(self, moving_px: "ArrayLike") -> Points:
-        """Map raw pixels (..., 2) of the moving image to raw pixels of the reference, to 0.001 px.
+        """Map positions in the moving image to positions in the reference.
 
-        Where the parallax hides a part of the scene, one of several solutions. NaN where the iteration diverges.
+        Parameters
+        ----------
+        moving_px
+            (..., 2): x and y, raw px of the moving image; (0, 0) is the centre of the top-left pixel.
+
+        Returns
+        -------
+        array
+            (..., 2), float64: x and y, raw px of the reference, to 0.001 px; NaN where the iteration diverges. Where
+            parallax occludes a part of the scene, it is one of several solutions.
+
+        Examples
+        --------
+        >>> result = agalign.align(green, nir)  # the arrays of the example of `align`
+        >>> result.inverse(result.map([100, 60])).round(2)
+        array([100.,  60.])
         """
         return self.mapping.inverse(moving_px)
 
@@ -375,12 +423,40 @@ class Alignment:
         nodata: float | None = None,
         interpolation: Interpolation = "lanczos",
     ) -> tuple[NDArray[np.generic], Mask]:
-        """Resample the moving image, (H, W), (H, W, C) or (C, H, W) of any numeric type, to the grid of the reference.
+        """Resample the moving image to the grid of the reference.
 
-        `valid` (H, W) is False for pixels that must not be used; NaN and `nodata` are never used. Returns the pixels in
-        the layout and type of `moving`, and their mask (height, width): True where all channels are known, inside the
-        moving image and not occluded. Other pixels are `nodata`, by default NaN or, for integers, 0. Raises InputError
-        for an array that is not an image or has another size, or a `nodata` that its type cannot hold.
+        Parameters
+        ----------
+        moving
+            Image, (H, W), (H, W, C) or (C, H, W), of any numeric type and the size of the aligned moving image.
+        valid
+            (H, W), False for pixels that must not be used. NaN and `nodata` are never used.
+        nodata
+            Value of unknown pixels in the input and the output. By default NaN or, for integers, 0 in the output.
+        interpolation
+            `nearest`, `bilinear`, `cubic` or `lanczos`.
+
+        Returns
+        -------
+        pixels
+            The resampled image, in the layout and type of `moving`.
+        known
+            (height, width) of the reference: True where all channels are known, inside the moving image and not
+            occluded.
+
+        Raises
+        ------
+        InputError
+            `moving` is not an image or has a different size, or its type cannot hold `nodata`.
+
+        Examples
+        --------
+        >>> result = agalign.align(green, nir)  # the arrays of the example of `align`
+        >>> nir_on_green, known = result.warp(nir)
+        >>> nir_on_green.shape == green.shape
+        True
+        >>> bool(np.corrcoef(nir_on_green[known], green[known])[0, 1] < -0.99)  # reversed contrast
+        True
         """
         planes, channels_last = planes_of(moving, "moving")
         if self.moving_size_px not in (None, planes.shape[:0:-1]):

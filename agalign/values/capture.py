@@ -253,20 +253,28 @@ class CameraIdentity:
 
 @dataclass(frozen=True)
 class Capture:
-    """All bands of one moment; one of them is the reference."""
+    """All bands of one moment; one of them is the reference. `discover` returns captures."""
 
     name: str
+    """Common part of the names of its files, such as IMG_0001."""
     folder: Path
     """Folder relative to the input folder; outputs are written to the same folder below the output folder."""
     bands: tuple[Band, ...]
+    """File, size and metadata of each band."""
     reference_index: int
+    """Index of the reference in `bands`, from 0."""
     camera: CameraIdentity = field(default_factory=CameraIdentity)
+    """Manufacturer, model and serial number, as far as the tags contain them."""
     capture_id: str = ""
+    """Identifier in the tags; empty if there is none."""
     flight_id: str = ""
+    """Identifier of the flight in the tags; empty if there is none."""
     captured_at: str = ""
     """ISO 8601, with the offset from UTC if the tags or the camera's maker define it, else by the camera's clock."""
     position: Position | None = None
+    """GPS position; None if the tags do not contain it."""
     pose: Pose | None = None
+    """Orientation and height of the camera; None if the tags do not contain them."""
     motion: tuple[float, float] | None = None
     """Velocity of the ground in the image (right, down), focal lengths per second; None if unknown."""
     missing_bands: tuple[str, ...] = ()
@@ -317,7 +325,7 @@ class Capture:
 
     @property
     def is_of_a_panel(self) -> bool:
-        """True for an image that is left out because it shows a calibration panel; False for a scene with one."""
+        """True for an image that is not aligned because it shows a calibration panel; False for a scene with one."""
         return self.panel is not None and not self.panel.in_scene
 
     @property

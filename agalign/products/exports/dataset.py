@@ -21,16 +21,44 @@ if TYPE_CHECKING:
 
 
 def open_capture(path: str | Path, *, masked: bool = True) -> "xarray.Dataset":
-    """Return the aligned bands of a capture, read lazily with dask, given its sidecar or stack.
+    """Open the aligned bands of a capture as an xarray Dataset, read lazily with dask.
 
-    Dimensions are y and x, at pixel centres: map coordinates if the capture is georeferenced (`.rio.crs`), else px of
-    the output, with (0, 0) the centre of the top-left pixel. On a rotated grid, as `--georeference` writes it, the map
-    coordinates are `xc` and `yc`, of every pixel. A variable has the name of its band and the attributes
-    `wavelength_nm`, `units` and `status`. Values are float32 with nan for nodata. With `masked=False` they have the
-    type of the file, with its nodata value as `_FillValue`; differences of unsigned integers then wrap around.
-    Bands without pixels are left out. A capture with a relief has the variable `parallax` (px along a baseline of
-    length 1, larger for nearer objects) and, if the run wrote them, `confidence` and `range` (m).
-    Raises SidecarError, UnreadableFileError, InputError for a folder, and ConfigurationError without xarray.
+    Parameters
+    ----------
+    path
+        Sidecar (<capture>.json) or stack (<capture>.tif) of the capture.
+    masked
+        Return float32 with NaN for nodata. False: the type of the file, with its nodata value as `_FillValue`;
+        differences of unsigned integers then wrap around.
+
+    Returns
+    -------
+    xarray.Dataset
+        A variable (y, x) for each band with pixels, with the attributes `wavelength_nm`, `units` and `status`. The
+        coordinates are pixel centres: map coordinates if the capture is georeferenced (`.rio.crs`), else px of the
+        output, with (0, 0) the centre of the top-left pixel. On a rotated grid, as `--georeference` writes it, the map
+        coordinates of every pixel are `xc` and `yc`. A capture with a parallax map has the variable `parallax` (px
+        along a baseline of length 1, larger for nearer objects) and, if the run wrote them, `confidence` and `range`
+        (m).
+
+    Raises
+    ------
+    SidecarError
+        The sidecar is missing or malformed.
+    UnreadableFileError
+        A raster cannot be read.
+    InputError
+        `path` is a folder.
+    ConfigurationError
+        xarray, rioxarray or dask is not installed.
+
+    Examples
+    --------
+    >>> capture = agalign.open_capture("aligned/0000SET/000/IMG_0001.json")
+    >>> list(capture.data_vars)
+    ['Blue', 'Green', 'Red', 'NIR', 'Red edge']
+    >>> capture["NIR"].dtype.name, capture["NIR"].attrs["status"]
+    ('float32', 'aligned')
     """
     given = Path(path)
     if given.is_dir():
@@ -40,14 +68,39 @@ def open_capture(path: str | Path, *, masked: bool = True) -> "xarray.Dataset":
 
 
 def open_flight(out: str | Path, *, masked: bool = True) -> "xarray.Dataset":
-    """Return all captures below the output folder of a run, stacked along `capture`, read lazily with dask.
+    """Open all captures of a run as one xarray Dataset, read lazily with dask.
 
-    The coordinates of `capture` are its label, `time` (UTC, or by the camera's clock, as its attribute `source` says),
-    `latitude`, `longitude` and `altitude_m`, as far as the camera wrote them; `status` has the dimensions (capture,
-    band). So that a variable has one unit, captures with other bands or another quantity than most are left out, as are
-    unreadable ones: a UserWarning names them.
-    Raises InputError if there is no run or its captures differ in size (write with crop 'flight'), and the errors of
-    `open_capture`.
+    Captures that cannot be read, or whose bands or quantity differ from most others, are skipped with a UserWarning
+    that lists them: a variable has one unit.
+
+    Parameters
+    ----------
+    out
+        Output folder of a run. Its captures must have one size, as `WriteSettings(crop="flight")` (default) writes.
+    masked
+        As for `open_capture`.
+
+    Returns
+    -------
+    xarray.Dataset
+        A variable (capture, y, x) for each band; y and x are px of the output, with (0, 0) the centre of the top-left
+        pixel. The coordinates of `capture` are its label, `time` (attribute `source`: UTC, or by the camera's clock),
+        `latitude` and `longitude` (degrees, WGS 84) and `altitude_m`; NaT or NaN if they are unknown. `status`
+        (capture, band) is the status of each band.
+
+    Raises
+    ------
+    InputError
+        `out` contains no aligned captures, or they differ in size.
+    SidecarError, UnreadableFileError, ConfigurationError
+        As for `open_capture`.
+
+    Examples
+    --------
+    >>> flight = agalign.open_flight("aligned")
+    >>> ndvi = (flight["NIR"] - flight["Red"]) / (flight["NIR"] + flight["Red"])
+    >>> ndvi.dims, ndvi.sizes["capture"]
+    (('capture', 'y', 'x'), 2)
     """
     xr = import_xarray()
     captures = _captures_with_output(Path(out))

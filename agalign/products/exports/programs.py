@@ -39,11 +39,14 @@ Radiometric processing needs raw numbers and the captures of the panel from the 
 
 @dataclass(frozen=True)
 class ExportReport:
-    """Result of an export."""
+    """Result of `export`."""
 
     captures: int
+    """Number of exported captures."""
     files: list[Path]
+    """The exported files."""
     left_out: LeftOut
+    """The skipped captures: (label, reason)."""
     notes: list[str]
     """Instructions for the other program, one per line."""
 

@@ -82,16 +82,21 @@ class IndexReport:
     capture: str
     """Label of the capture: its folder, relative to the output folder of the run, and its name."""
     index: str
+    """Name of the index."""
     path: Path | None = None
     """The raster; None if it could not be written."""
     statistics: IndexStatistics = IndexStatistics()
+    """Median, percentiles and unit of the raster, and its share of valid pixels."""
     problem: str = ""
-    """Why it could not be written; of a written raster, what to check in its bands."""
+    """Why it could not be written; for a written raster, what to check in its bands."""
     kept: bool = field(default=False, compare=False)
     """True if an earlier command wrote the raster from the same bands with the same formula."""
     captured_at: str = ""
+    """Time of the capture, ISO 8601; empty if it is unknown."""
     latitude: float | None = None
+    """Degrees, WGS 84; None if it is unknown."""
     longitude: float | None = None
+    """Degrees, WGS 84; None if it is unknown."""
 
     @property
     def median(self) -> float:

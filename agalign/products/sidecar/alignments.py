@@ -9,11 +9,36 @@ from agalign.values.alignment import Alignment
 
 
 def read_alignment(sidecar: str | Path, band: str) -> Alignment:
-    """Return the alignment of a moving band as a sidecar and the raster of its parallax store it.
+    """Read the alignment of a band from the sidecar of its capture and, if there is one, the parallax map.
 
-    Its `map`, `inverse` and `warp` are those of the run, between the raw pixels of the files. Raises SidecarError for a
-    file that is not a sidecar or lacks the mapping, NoSuchBandError for a band that is not a moving band of the
-    capture, UnreadableFileError for a parallax that cannot be read.
+    Parameters
+    ----------
+    sidecar
+        The sidecar, <capture>.json.
+    band
+        Name of a moving band.
+
+    Returns
+    -------
+    Alignment
+        The mapping of the run, from raw pixels of the reference band's file to raw pixels of the band's file.
+
+    Raises
+    ------
+    SidecarError
+        `sidecar` is missing or not a sidecar, or lacks the mapping of the band or its parallax map.
+    NoSuchBandError
+        The capture has no moving band of this name.
+    UnreadableFileError
+        The parallax map cannot be read.
+
+    Examples
+    --------
+    >>> result = agalign.read_alignment("aligned/0000SET/000/IMG_0001.json", "NIR")
+    >>> result.status, result.size_px
+    ('aligned', (480, 360))
+    >>> result.map([[0, 0], [479, 359]]).shape
+    (2, 2)
     """
     path = Path(sidecar)
     content = read_sidecar(path)

@@ -1,0 +1,129 @@
+"""Docstrings of the public names: they are complete, and their examples run."""
+
+import ast
+import doctest
+import inspect
+import re
+import shutil
+import textwrap
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import agalign
+from agalign.config import WriteSettings
+from agalign.values import geometry
+
+from .builders import in_full_run
+from .conftest import textured_pair, write_band
+from .test_public_names import ERRORS, FUNCTIONS, OPTIONS, RESULTS, ROOT, SETTINGS
+
+CLASSES = f"{RESULTS} {OPTIONS} {SETTINGS}".split()
+METHODS = ["Alignment.map", "Alignment.inverse", "Alignment.warp"]
+CALLABLES = [*FUNCTIONS.split(), *METHODS]
+WITH_EXAMPLES = [*CALLABLES, "Alignment", "DiscoverOptions", "RunOptions", "Settings", "AgalignError"]
+NEEDS = {"dask_executor": ("distributed",), "open_capture": ("rioxarray",), "open_flight": ("rioxarray",)}
+
+
+def public(name: str) -> Any:
+    value: Any = agalign
+    for part in name.split("."):
+        value = getattr(value, part)
+    return value
+
+
+@pytest.mark.parametrize("name", CALLABLES)
+def test_arguments_and_results_are_described(name: str) -> None:
+    text, function = inspect.getdoc(public(name)) or "", public(name)
+    sections = dict(re.findall(r"^(\w+)\n-+\n(.*?)(?=^\w+\n-+\n|\Z)", text, re.M | re.S))
+    described = re.findall(r"^(\w+)$", sections["Parameters"], re.M)
+    assert described == [parameter for parameter in inspect.signature(function).parameters if parameter != "self"]
+    assert sections["Returns"].strip()
+    named = re.findall(r"^([\w, ]+)$", sections.get("Raises", ""), re.M)
+    assert {error for line in named for error in line.split(", ")} <= set(ERRORS.split())
+    assert named or name in ("Alignment.map", "Alignment.inverse")
+    assert ">>> " in sections["Examples"]
+
+
+def undescribed(cls: type) -> Iterator[str]:
+    """Yield the fields of a class without a docstring below them, and its public methods without one."""
+    (body,) = ast.parse(textwrap.dedent(inspect.getsource(cls))).body
+    assert isinstance(body, ast.ClassDef)
+    for one, following in zip(body.body, [*body.body[1:], ast.Pass()], strict=True):
+        if isinstance(one, ast.AnnAssign) and isinstance(one.target, ast.Name) and not one.target.id.startswith("_"):
+            is_described = isinstance(following, ast.Expr) and isinstance(following.value, ast.Constant)
+            if not is_described and cls is not agalign.Settings:  # each stage is a class with a docstring
+                yield one.target.id
+        elif isinstance(one, ast.FunctionDef) and not one.name.startswith("_") and not ast.get_docstring(one):
+            yield one.name
+
+
+@pytest.mark.parametrize("name", [*CLASSES, *ERRORS.split()])
+def test_fields_and_methods_are_described(name: str) -> None:
+    assert list(undescribed(public(name))) == []
+    assert public(name).__doc__
+
+
+def test_the_api_page_has_every_public_name() -> None:
+    text = (ROOT / "docs" / "reference" / "api.rst").read_text(encoding="utf-8")
+    listed = re.findall(r"^\.\. auto(?:function|class|exception):: agalign\.(\w+)$", text, re.M)
+    assert sorted([*listed, "__version__"]) == agalign.__all__
+
+
+@pytest.mark.parametrize("path", sorted((ROOT / "examples").glob("*.py")), ids=lambda path: path.stem)
+def test_examples_use_public_names_alone(path: Path) -> None:
+    text = path.read_text(encoding="utf-8")
+    assert not re.search(r"agalign\.\w+ import|from agalign import|import agalign\.", text)
+    assert set(re.findall(r"\bagalign\.(\w+)", text)) <= set(agalign.__all__)
+
+
+@pytest.fixture(scope="module")
+def run_folder(flight: Path, aligned_flight: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folders and files of the examples: a flight, its results with band files, and two mosaics."""
+    folder = tmp_path_factory.mktemp("examples")
+    shutil.copytree(flight, folder / "flight")
+    shutil.copytree(aligned_flight, folder / "aligned")
+    agalign.align_folder(
+        folder / "flight", folder / "aligned", settings=agalign.Settings(write=WriteSettings(layout="both"))
+    )
+    june, july = textured_pair(geometry.translation(6, -4), 320, 260)
+    for name, image in (("june", june), ("july", july)):
+        place = {"crs": "EPSG:32633", "transform": (0.1, 0, 500_000, 0, -0.1, 4_000_000)}
+        write_band(folder / f"{name}.tif", np.float32(1000 + 100 * image), **place)
+    return folder
+
+
+def run_examples(name: str, names: dict[str, Any]) -> None:
+    """Run the example in a docstring, whose variables are added to `names`."""
+    (test,) = doctest.DocTestFinder(recurse=False).find(public(name), name, module=False, globs={})
+    test.globs, output = names, list[str]()
+    result = doctest.DocTestRunner().run(test, out=output.append, clear_globs=False)
+    assert (result.failed, "".join(output)) == (0, "")
+    assert 1 <= result.attempted <= 6
+
+
+@pytest.fixture(scope="module")
+def arrays() -> dict[str, Any]:
+    """The variables after the example of `align`."""
+    names = {"agalign": agalign, "np": np}
+    run_examples("align", names)
+    return names
+
+
+@pytest.fixture
+def in_run_folder(run_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Make a copy of the folder the current one, so that no example depends on another."""
+    monkeypatch.chdir(shutil.copytree(run_folder, tmp_path / "examples"))
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("in_run_folder")
+@pytest.mark.parametrize("name", [in_full_run(n) if n == "dask_executor" else n for n in WITH_EXAMPLES])
+def test_the_example_of_a_docstring(name: str, arrays: dict[str, Any]) -> None:
+    for module in NEEDS.get(name, ()):
+        pytest.importorskip(module)
+    if name != "align":  # which has run
+        run_examples(name, {key: arrays[key] for key in ("agalign", "np", "green", "nir")})
