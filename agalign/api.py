@@ -340,6 +340,8 @@ def onto(
         `reference` has no band `band`.
     OutputError
         `out` cannot be written.
+    WorkerError
+        The worker processes cannot be started, or several end one after another.
 
     Examples
     --------
@@ -415,6 +417,8 @@ def indices(
         An index is unknown, or a formula is invalid.
     OutputError
         `target` cannot be written.
+    WorkerError
+        The worker processes cannot be started, or several end one after another.
 
     Examples
     --------

@@ -199,7 +199,7 @@ class FlightSettings(SettingsModel):
 
 
 class SeedSettings(SettingsModel):
-    """Initial alignment."""
+    """Initial alignment. In Python, `force=None` stands for `auto`."""
 
     force: Annotated[
         choices.SeedKind | None,
@@ -212,7 +212,9 @@ class SeedSettings(SettingsModel):
 
 
 class CheckSettings(SettingsModel):
-    """Acceptance of predicted bands. The limits of the checks are in their modules in `verify`."""
+    """Acceptance of predicted bands."""
+
+    # The limits of the checks are constants in `verify`.
 
     accept_predicted_px: Annotated[float, Field(ge=0), Option("accept_predicted")] = 1.0
     """Largest standard error, px, of a predicted band that indices may use."""
@@ -231,7 +233,11 @@ class ReliefSettings(SettingsModel):
 
 
 class WriteSettings(SettingsModel):
-    """Output files."""
+    """Output files.
+
+    In Python, `indices` is a tuple of names, and `panel_albedo` a tuple of (band in lower case, reflectance), where an
+    empty name stands for all other bands.
+    """
 
     # RMS error on a random image of waves of up to 0.25 cycles/px, relative to its standard deviation: Lanczos 1.4 %,
     # OpenCV's cubic kernel 3.0 %, bilinear 16 %.

@@ -28,10 +28,12 @@ from agalign.values.text import shortened
 
 @dataclass(frozen=True)
 class Problem:
-    """A file or capture that is left out, or used with fewer tags, and the reason."""
+    """A file or capture that is skipped, or used with fewer tags, and the reason."""
 
     path: Path
+    """The file."""
     error: AgalignError
+    """The reason."""
     is_harmless: bool = False
     """True for a file with the same bytes, or the same capture id, name and size, as another one, which takes part, and
     for a file used with fewer tags."""

@@ -298,9 +298,6 @@ class Similarity:
     """Share of the textured windows with a measured shift."""
 
 
-_NOT_MEASURED = Similarity()
-
-
 @dataclass(frozen=True)
 class Alignment:
     """The mapping from a reference image to a moving image, and how it was estimated and verified.
@@ -334,9 +331,9 @@ class Alignment:
     prediction of the rig."""
     seconds: float = 0.0
     """Share of the capture's processing time."""
-    before: Similarity = _NOT_MEASURED
+    before: Similarity = field(default_factory=Similarity)
     """Measures of similarity of the images as they are, their borders overlaid."""
-    after: Similarity = _NOT_MEASURED
+    after: Similarity = field(default_factory=Similarity)
     """The same under the mapping."""
     candidates: Mapping[Geometry, float] = field(default_factory=dict)
     """p95 of the shifts of held-out windows by each geometry that was fitted; empty if only a homography was."""
@@ -356,7 +353,7 @@ class Alignment:
 
     @property
     def status(self) -> PairStatus:
-        """What the evidence amounts to; the first row that applies:
+        """Result of the verification; the first row that applies:
 
         =========  ===================================================
         aligned    there are no issues: it passed verification

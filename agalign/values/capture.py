@@ -140,13 +140,19 @@ class Band:
     """One band of a capture: its file and its metadata."""
 
     name: str
+    """Name of the band, such as NIR; unique in its capture."""
     path: Path
+    """Image file."""
     band_index: int
     """Index within the file, from 1; the page, if each band has a page of its own."""
     width_px: int
+    """Width of the image."""
     height_px: int
+    """Height of the image."""
     dtype: str
+    """Type of the pixels, such as uint16."""
     nodata: float | None = None
+    """Value of pixels without data; None if the file declares none."""
     has_mask: bool = False
     """True if the file has a mask or an alpha band."""
     colour: str = ""
@@ -154,10 +160,13 @@ class Band:
     page: int = 0
     """Number of its page in a TIFF with several, from 1; 0 in files with one."""
     wavelength_nm: float | None = None
+    """Central wavelength; None if it is unknown."""
     bandwidth_nm: float | None = None
+    """Width of the spectral band; None if it is unknown."""
     saturation_value: float | None = None
     """Raw value at and above which a pixel counts as saturated."""
     lens: Lens | None = None
+    """Lens model from the tags."""
     to_rig: Matrix | None = None
     """Homography from this file's undistorted pixels (raw ones without a lens model) to a plane that all bands of the
     rig share, from the tags."""
@@ -174,16 +183,19 @@ class Band:
     is_from_photograph: bool = False
     """Part of a colour photograph: used only on request."""
     georeference: Georeference | None = None
+    """Georeference of the file."""
     scale_offset: tuple[float, float] = (1.0, 0.0)
     """(scale, offset): value = scale * number in the file + offset."""
     overviews: tuple[int, ...] = ()
     """Reduction factors of the overviews in the file."""
     radiometry: Radiometry | None = None
+    """Radiometric calibration from the tags."""
     missing_calibration: str = ""
     """Why it has no radiometric calibration, with the missing tags; empty if it has one or the camera has none."""
     implausible: str = ""
     """Tag with an implausible value that leaves out `radiometry`, or its factor to reflectance, in words."""
     panel: Panel | None = None
+    """Calibration panel in the image."""
 
     @property
     def size_px(self) -> tuple[int, int]:

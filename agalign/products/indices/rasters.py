@@ -58,9 +58,13 @@ class IndexStatistics:
     """The values of an index raster; nan if no pixel is valid."""
 
     median: float = math.nan
+    """Median of the valid pixels."""
     p5: float = math.nan
+    """5th percentile of the valid pixels."""
     p95: float = math.nan
+    """95th percentile of the valid pixels."""
     valid_share: float = 0.0
+    """Share of the pixels that are valid, 0 to 1."""
     unit: str = ""
     """Unit of the bands: reflectance, radiance, or raw numbers."""
     low: float = math.nan
@@ -85,7 +89,7 @@ class IndexReport:
     """Name of the index."""
     path: Path | None = None
     """The raster; None if it could not be written."""
-    statistics: IndexStatistics = IndexStatistics()
+    statistics: IndexStatistics = field(default_factory=IndexStatistics)
     """Median, percentiles and unit of the raster, and its share of valid pixels."""
     problem: str = ""
     """Why it could not be written; for a written raster, what to check in its bands."""
