@@ -47,11 +47,11 @@ class CaptureReport:
     label: str
     """Folder and number of the capture, as 0000SET/000/IMG_0001."""
     state: Literal["done", "kept", "error", "panel", "sky"]
-    """`kept`: an earlier run with the same settings has finished the capture. `panel` and `sky`: the capture shows a
-    calibration panel or the sky, and is not aligned.
+    """`done`: processed in this run. `kept`: an earlier run with the same settings has finished the capture. `error`:
+    there is no result. `panel` and `sky`: the capture shows a calibration panel or the sky, and is not aligned.
     """
     result: Sidecar | None = field(default=None, repr=False)
-    """Content of the sidecar, without the long tables."""
+    """Content of the sidecar, without the long tables; None without a result."""
     path: Path | None = None
     """Path of the sidecar."""
     error: str | None = None
@@ -65,7 +65,7 @@ class CaptureReport:
     removed: tuple[tuple[Path, str], ...] = ()
     """Files of an earlier command that were removed, and why."""
     seconds: float = 0.0
-    """Processing time in this run."""
+    """Processing time in this run, s."""
     stages: Mapping[tuple[str, str], float] = field(default_factory=dict, repr=False)
     """Processing time by (band, stage), s."""
 
@@ -110,7 +110,7 @@ class CaptureReport:
 
 
 class FlightReports(list[CaptureReport]):
-    """The reports of a run, which a notebook shows as a table."""
+    """The reports of a run: a list, which a notebook shows as a table."""
 
     def _repr_html_(self) -> str:
         max_rows = 20

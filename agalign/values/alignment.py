@@ -47,13 +47,14 @@ class Seed:
     """`user`; `match` (learned descriptors matched); `model` (median mapping of the flight); `rig` (camera tags);
     `centre` (optical centres of DJI); `geo` (geotransforms); `structure` (phase correlation); `identity`."""
     fixed_to_moving: Matrix3x3
-    """Between undistorted px if both lenses are known, else between raw px."""
+    """Homography (3, 3) from the reference to the moving image: between undistorted px if both lenses are known, else
+    between raw px."""
     score: Number
     """Correlation at this mapping, in standard deviations; 0 if it replaced a seed that contradicts it."""
     peak_sigma: Number = 0.0
     """Height of the correlation peak, in standard deviations."""
     runner_up_sigma: Number = 0.0
-    """The same for the second peak."""
+    """Height of the second highest separate peak, in standard deviations."""
     trusted: bool = False
     """The images confirm it to a few pixels, or it is that of tags or flight and replaced a seed that contradicts it.
     """
@@ -134,13 +135,15 @@ class Residual:
     """Shifts of windows under a mapping, by phase correlation."""
 
     centres_px: Annotated[NDArray[np.float64], Array((None, 2), 2)]
-    """Centres of the n windows, px of the reference."""
+    """(n, 2) centres of the windows, px of the reference."""
     shifts_px: Annotated[NDArray[np.float64], Array((None, 2), 3, nullable=True)]
-    """Position in the band minus position in the reference, px of the reference."""
+    """(n, 2) position of the moving band's structure minus that of the reference's, px of the reference; NaN, null in
+    JSON, where it could not be measured."""
     peaks_sigma: Annotated[NDArray[np.float64], Array((None,), 2, nullable=True)]
-    """Height of the correlation peak of each window, in standard deviations."""
+    """(n,) height of the correlation peak of each window, in standard deviations; the error of a shift is inversely
+    proportional to its square."""
     cells: Annotated[NDArray[np.int64], Array((None, 2), integers=True)]
-    """Column and row of each window in their grid."""
+    """(n, 2) column and row of each window in the complete grid, whichever windows of it are measured."""
 
     def __post_init__(self) -> None:
         """Raise ValueError for arrays of different lengths."""
@@ -168,17 +171,17 @@ class Residual:
 
     @cached_property
     def lengths_px(self) -> NDArray[np.float64]:
-        """(m,) lengths of the measured shifts."""
+        """(m,) lengths of the measured shifts, px of the reference."""
         return np.asarray(np.linalg.norm(self.shifts_px[self.is_measured], axis=1))
 
     @property
     def median_px(self) -> float:
-        """Median length of the measured shifts; infinite without any."""
+        """Median length of the measured shifts, px of the reference; infinite without any."""
         return self._percentiles_px[0]
 
     @property
     def p95_px(self) -> float:
-        """95th percentile of the lengths of the measured shifts; infinite without any."""
+        """95th percentile of the lengths of the measured shifts, px of the reference; infinite without any."""
         return self._percentiles_px[1]
 
     @cached_property
@@ -193,11 +196,12 @@ class Residual:
 
     @property
     def std_px(self) -> float:
-        """Standard error that the windows show: their RMS shift beyond the noise of their peaks; infinite without any.
+        """Standard error estimated from the windows, px: their RMS shift beyond the noise of their peaks; infinite
+        without any.
 
         A fifth of the windows may be wrong peaks or at depth edges: the RMS is the larger of those of a normal
-        distribution with the same median, and with the same 80th percentile. Half of it remains at least, as the noise
-        is known to a factor.
+        distribution with the same median, and with the same 80th percentile. At least half of it is kept, because the
+        noise is known only to a factor.
         """
         if not len(self.lengths_px):
             return math.inf
@@ -222,7 +226,7 @@ class Residual:
 
     @property
     def measured_px(self) -> NDArray[np.float64]:
-        """(m, 2) centres of the windows in which a shift was measured."""
+        """(m, 2) centres of the windows in which a shift was measured, px of the reference."""
         return self.centres_px[self.is_measured]
 
     def in_file_px(self, scales: "PairScales") -> "Residual":
@@ -259,10 +263,11 @@ SAME_SCALES = PairScales()
 
 @validated.dataclass(frozen=True, config=RECORD)
 class Prediction:
-    """Mapping by the rig of the flight, or extrapolated from a part of the image."""
+    """Mapping of a band by the rig of the flight, or by windows that do not confirm it everywhere."""
 
     fixed_to_moving: Matrix3x3
-    """Between the same px as the seed."""
+    """Homography (3, 3) from the reference's file to the band's file: between undistorted px if both lenses are known,
+    else between raw px."""
     source: Annotated[PredictionSource, Field(alias="from")]
     """`bands` (other bands of the capture), `neighbours` (other captures), `flight` (mean), or `windows` (in the image
     of the band)."""
@@ -330,7 +335,7 @@ class Alignment:
     """Shifts of windows, each under a mapping that was estimated without the window; of all windows under a seed or a
     prediction of the rig."""
     seconds: float = 0.0
-    """Share of the capture's processing time."""
+    """Share of the capture's processing time, s, equal for all its bands."""
     before: Similarity = field(default_factory=Similarity)
     """Measures of similarity of the images as they are, their borders overlaid."""
     after: Similarity = field(default_factory=Similarity)
@@ -494,7 +499,7 @@ class Alignment:
 
     @property
     def space(self) -> Space:
-        """The pixels between which the homography is."""
+        """The pixels that the homography maps: raw (`pixel`) or undistorted ones."""
         return "pixel" if self.mapping.fixed_lens is None else "undistorted"
 
     def in_file_px(self: "Alignment", scales: "PairScales", size_px: Size) -> "Alignment":

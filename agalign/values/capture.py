@@ -347,7 +347,7 @@ class Capture:
 
     @property
     def time_s(self) -> float | None:
-        """Unix time of the capture, s, as `CaptureTime`; None if it is unknown."""
+        """Unix time of the capture, s, by the camera's clock if its time zone is unknown; None if it is unknown."""
         moment = CaptureTime.of(self.captured_at)
         return None if moment is None else moment.utc.timestamp()
 
