@@ -97,10 +97,10 @@ def test_settings_cannot_be_changed() -> None:
 
 
 def test_every_setting_has_an_option() -> None:
-    """The table of options, which test_documents.py compares with the command line, has them all."""
+    """The list of options, which test_documents.py compares with the command line, has them all."""
     text = (ROOT / "docs" / "reference" / "settings.md").read_text(encoding="utf-8")
     stages = {stage: type(value) for stage, value in vars(Settings()).items()}
     settings = {f"{stage}.{name}" for stage, fields in stages.items() for name in fields.model_fields}
     settings.remove("flight.start_model")  # the fingerprint of a given model: set by the run
-    assert settings == set(re.findall(r"\| `([a-z_]+\.[a-z_]+)`", text))
+    assert settings == set(re.findall(r"^\* `([a-z_]+\.[a-z_]+)\b", text, re.MULTILINE))
     assert 15 < len(settings) <= 30
