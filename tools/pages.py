@@ -5,8 +5,8 @@ fields, reasons), or check that they are current.
 
 Commands and their options come from `agalign/cli/` and `agalign/config.py`, indices from
 `agalign/products/indices/formulas.py`, fields from `agalign/products/sidecar/schema.py` and the records that it
-contains, reasons from `agalign/values/issues.py`, measured figures from
-`docs/figures/figures.csv`. Each part is between two comments in its page.
+contains, reasons from `agalign/values/issues.py`, measured figures from `docs/figures/figures.csv`. Each part is
+between two comments in its page.
 """
 
 import csv
@@ -149,7 +149,7 @@ def fields() -> str:
     for name, part in owners:
         if name not in inner and name not in NOT_LISTED:
             lines = field_lines(part, inner, of_types)
-            sections += [f"### {name.removesuffix('Part')}", " ".join(part["description"].split()), "\n".join(lines)]
+            sections += [f"## {name.removesuffix('Part')}", " ".join(part["description"].split()), "\n".join(lines)]
     return "\n\n".join(sections) + "\n"
 
 
