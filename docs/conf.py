@@ -34,11 +34,27 @@ html_static_path = ["_static"]
 html_css_files = ["site.css"]
 html_title = f"agalign {__version__}"
 
+ROOT_PAGES = {"../CONTRIBUTING.md": "project/contributing.md", "../CHANGELOG.md": "project/changelog.md"}
+"""Pages that are outside of docs/, and the pages that include them."""
+
+
+def add_navigation(_app: Sphinx, page: str, source: list[str]) -> None:
+    """Add the lists of index.md to the navigation of the site; GitHub would show a toctree as a raw block."""
+    if page != "index":
+        return
+    for path, included_by in ROOT_PAGES.items():
+        source[0] = source[0].replace(f"]({path})", f"]({included_by})")
+    for part in source[0].split("\n## ")[1:]:
+        group, *links = part.splitlines()
+        pages = re.findall(r"^\* \[.*\]\((\S+)\.\w+\)$", "\n".join(links), re.MULTILINE)
+        source[0] += "\n".join(["\n```{toctree}", ":hidden:", f":caption: {group}", *pages, "```\n"])
+
 
 def setup(app: Sphinx) -> None:
-    """Convert docstrings, hide arguments of results, and simplify the types of what the reference of the API lists."""
+    """Add the navigation; convert docstrings, hide arguments of results, and simplify types in the API reference."""
     app.connect("autodoc-process-docstring", convert_sections)
     app.connect("autodoc-process-signature", hide_arguments_of_results)
+    app.connect("source-read", add_navigation)
     page = Path(__file__).with_name("reference") / "api.rst"
     for module, name in re.findall(r"^\.\. auto\w+:: ([\w.]+)\.(\w+)$", page.read_text(encoding="utf-8"), re.M):
         listed = resolve_name(f"{module}:{name}")

@@ -38,6 +38,8 @@ from agalign.values.issues import KINDS, Issue, sentence
 
 DOCS = Path(__file__).resolve().parents[1] / "docs"
 SCHEMA = Path(agalign.__file__).parent / "sidecar.schema.json"
+API = DOCS / "reference" / "api.rst"
+NAMES, END_OF_NAMES = ".. Written by tools/pages.py: names\n", ".. end of names\n"
 FIGURES = DOCS / "figures" / "figures.csv"
 TABLES = {
     "accuracy": (
@@ -279,6 +281,17 @@ def figures_of(name: str) -> str:
     return table(rows) + "\n" + ("" if commands[1:] else f"\n`{commands[0]}`\n")
 
 
+def public_names() -> str:
+    """Return lists of the public functions, classes and errors in reStructuredText."""
+    public = {name: getattr(agalign, name) for name in sorted(agalign.__all__) if name != "__version__"}
+    errors = [name for name, value in public.items() if isinstance(value, type) and issubclass(value, Exception)]
+    classes = [name for name, value in public.items() if isinstance(value, type) and name not in errors]
+    functions = [name for name in public if name not in (*errors, *classes)]
+    groups = {"functions": functions, "classes": classes, "errors": errors}
+    lines = (f"* {kind}: {', '.join(f'``{name}``' for name in names)}\n" for kind, names in groups.items())
+    return "\n" + "".join(lines) + "\n"
+
+
 PARTS: tuple[tuple[str, str, Callable[[], str]], ...] = (
     ("reference/commands.md", "commands", partial(command_options, of_experiments=False)),
     ("explanation/paper.md", "experiments", partial(command_options, of_experiments=True)),
@@ -294,10 +307,12 @@ PARTS: tuple[tuple[str, str, Callable[[], str]], ...] = (
 
 
 def main() -> None:
-    """Write the schema and the pages, or check them with --check."""
+    """Write the schema and the parts of pages, or check them with --check."""
     write_or_check(SCHEMA, json.dumps(sidecar_schema(), indent=1) + "\n")
     for name, mark, content in PARTS:
         write_or_check(DOCS / name, with_section(DOCS / name, mark, content()))
+    before, _, rest = API.read_text(encoding="utf-8").partition(NAMES)
+    write_or_check(API, before + NAMES + public_names() + END_OF_NAMES + rest.partition(END_OF_NAMES)[2])
 
 
 def write_or_check(path: Path, text: str) -> None:

@@ -38,7 +38,7 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as folder:
         demo = Path(sys.argv[1]) if len(sys.argv) > 1 else Path(folder)
         if len(sys.argv) == 1:
-            agalign("demo", demo, "--captures", "4")
+            agalign("demo", demo)
         # An earlier demo stays as it is.
         aligned = shutil.copytree(demo / "aligned", Path(folder) / "with-ndvi")
         agalign("align", demo / "flight", "-o", aligned, "--radiometry", "auto", "--index", "ndvi")

@@ -169,7 +169,7 @@ def _by_method(corner: str, scores: Mapping[tuple[str, str], Score], cell: Calla
 
 
 def draw(scored: Sequence[Scored], path: Path) -> None:
-    """Two heat maps, methods by variants: the share of pairs claimed to half a px, and of wrong claims."""
+    """Draw two heat maps, methods by variants: shares of pairs accepted within 0.5 px, and of wrong pairs."""
     scores = summary(scored, "all sets")
     methods, variants = (list(dict.fromkeys(getattr(s, name) for s in scores)) for name in ("method", "variant"))
     grids = np.full((2, len(methods), len(variants)), np.nan)
@@ -177,9 +177,10 @@ def draw(scored: Sequence[Scored], path: Path) -> None:
         grids[:, methods.index(s.method), variants.index(s.variant)] = s.under_half_px, s.wrong_claims / s.pairs
     size = 13, 1.7 + 0.42 * len(methods)
     figure, axes = pyplot().subplots(1, 2, figsize=size, sharey=True, layout="constrained")
-    titles = "claimed, and within 0.5 px: % of pairs", "wrong claims, more than 1 px off: % of pairs"
+    titles = "accepted, error up to 0.5 px: % of pairs", "accepted, wrong by more than 1 px: % of pairs"
+    names = [score.VARIANT_NAMES.get(v, v) for v in variants]
     for axis, grid, title, colours in zip(axes, grids, titles, ("Greens", "Reds"), strict=True):
-        heat_map(axis, grid, methods, variants, cmap=colours)
+        heat_map(axis, grid, methods, names, cmap=colours)
         axis.set_title(title, fontsize=11)
     figure.savefig(path, dpi=85)
 

@@ -30,6 +30,20 @@ Points = NDArray[np.float64]
 SETS = Path(__file__).parent / "sets"
 AS_IT_IS = "as it is"
 LOST = "lost"
+VARIANT_NAMES = {
+    "as it is": "unchanged",
+    "lens-corrected": "lens-corrected",
+    "blur 3 px": "blur 3 px",
+    "motion 25 px": "motion 25 px",
+    "noise 30 %": "noise 30 %",
+    "half saturated": "half saturated",
+    "turn 3": "rotated 3°",
+    "turn 10": "rotated 10°",
+    "turn 20": "rotated 20°",
+    "scale 0.8": "scaled 0.8",
+    "lost": "noise only",
+}
+"""Names of the variants of the benchmark in tables and figures."""
 WRONG_PX = 1.0
 """A claimed pair with a larger median error is a wrong claim."""
 GOOD_PX = 0.5
