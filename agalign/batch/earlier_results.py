@@ -58,7 +58,8 @@ def refuse_other_captures(captures: Sequence[Capture], out: Path) -> None:
             earlier = read_without_tables(path)
             if is_same(earlier, here) is not (path not in places):
                 continue
-            what = f"belongs to a different capture from {here.label} here ({_described(earlier)}; here {_described(here)})"
+            facts = f"({_described(earlier)}; here {_described(here)})"
+            what = f"belongs to a different capture from {here.label} here {facts}"
             if path not in places:
                 what = f"is of the same capture as {here.label} here, by a run on a folder above or below the one here"
             raise ConfigurationError(f"{path}: {what}; choose another output folder with -o")

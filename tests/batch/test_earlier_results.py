@@ -61,7 +61,8 @@ def test_another_capture_of_the_same_name_is_refused_before_anything_is_written(
     for options in ((), ("--dry-run",), ("--overwrite",), ("--align-panels", "--crop", "none")):
         done = agalign_here(other, "-o", out, "--only-seed", *options)
         assert done.returncode == ExitCode.USAGE
-        line = rf"(?m)^agalign: .*IMG_0001\.json: belongs to a different capture from 0000SET/000/IMG_0001.*{named}.*with -o$"
+        other_capture = "belongs to a different capture from 0000SET/000/IMG_0001"
+        line = rf"(?m)^agalign: .*IMG_0001\.json: {other_capture}.*{named}.*with -o$"
         assert len(re.findall(line, done.stderr)) == done.stderr.count("agalign: ") == 1
     with pytest.raises(agalign.ConfigurationError, match="belongs to a different capture"):
         agalign.align_capture(agalign.discover(other).captures[0], out, settings=SEEDS)
