@@ -149,7 +149,7 @@ class RunOptions:
     executor: Annotated[Executor | None, Option("dask", type=str | None)] = None
     """Address of a Dask scheduler, as tcp://host:8786; 'local' starts workers on this machine."""
     retry_failed: bool = False
-    """Process captures with missing or unaligned bands again."""
+    """Process captures again whose status is not `ok`."""
     # An `executor` of the caller ignores it, except `dask_executor`.
     timeout_s: Annotated[float | None, Field(ge=1, le=1e6), Option("timeout")] = None
     """Seconds after which a capture, or the reading of the tags of a file, is abandoned; by default unlimited."""

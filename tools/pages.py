@@ -43,7 +43,7 @@ NAMES, END_OF_NAMES = ".. Written by tools/pages.py: names\n", ".. end of names\
 FIGURES = DOCS / "figures" / "figures.csv"
 TABLES = {
     "accuracy": (
-        *("accuracy", "standard errors", "simulated cameras", "scenes with depth", "CPU time", "runs"),
+        *("accuracy", "standard errors", "simulated cameras", "scenes with depth", "runs"),
         "captures with depth",
     ),
     "failures": ("synthetic pairs", "planted grids", "starts", "difficult captures", "predicted bands"),
