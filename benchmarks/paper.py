@@ -19,7 +19,7 @@ The tables of docs/explanation/paper.md:
     S="--shift 0,2.5,5,7.5,10,15,20"
     agalign evaluate pairs.csv -m fast:pseudo-siamese $S -o alone.csv     # convergence; also with --seeding
     agalign evaluate pairs.csv -m elastix $S -o elastix.csv
-    python benchmarks/paper.py pairs.csv --pieces paper-5 --jobs 2 -m paper:pseudo-siamese --shift 5   # 90 minutes
+    python benchmarks/paper.py pairs.csv --pieces paper-5 --jobs 2 -m paper:pseudo-siamese --shift 5   # 42 minutes
     python benchmarks/paper.py alone.csv elastix.csv paper-5 --plot robustness.png
     agalign learn learn.csv -o net.safetensors                            # without labels; also --sharing siamese
     agalign evaluate test.csv -m net.safetensors -m sift
