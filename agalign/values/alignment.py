@@ -269,8 +269,8 @@ class Prediction:
     """Homography (3, 3) from the reference's file to the band's file: between undistorted px if both lenses are known,
     else between raw px."""
     source: Annotated[PredictionSource, Field(alias="from")]
-    """`bands` (other bands of the capture), `neighbours` (captures around it), `flight` (mean of the flight), or `windows`
-    (windows in the image)."""
+    """`bands` (other bands of the capture), `neighbours` (captures around it), `flight` (mean of the flight), or
+    `windows` (windows in the image)."""
     std_px: Number4
     """Standard error (RMS over the image), px of the band."""
     off_px: Number4 | None = None
