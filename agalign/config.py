@@ -228,8 +228,8 @@ class ReliefSettings(SettingsModel):
     use: Annotated[
         choices.ReliefUse, _yes_or_no("always", "never"), Option("relief", alone="always", former="--local")
     ] = "auto"
-    """Correct parallax (trees, terraces, close range) by a parallax map: always, never, or if the windows show parallax
-    (auto). --relief alone means always."""
+    """Correct parallax (trees, terraces, close range) by a parallax map or a displacement field: always, never, or if
+    the windows show parallax (auto). --relief alone means always."""
 
 
 class WriteSettings(SettingsModel):
@@ -281,8 +281,8 @@ class WriteSettings(SettingsModel):
     """Interpolate occluded pixels; by default they are nodata."""
     radiometry: Annotated[choices.RadiometryChoice, _yes_or_no("auto", "off"), Option(alone="auto")] = "off"
     """Convert raw numbers to radiance (camera), or to reflectance by the light sensor (sun) or by a calibration panel
-    and the light sensor, if any (panel). auto, or --radiometry alone, uses the first of panel, sun and camera that the
-    files allow. Thermal bands become degrees C."""
+    and the light sensor, if any (panel). auto, or --radiometry alone, uses the first that all
+    bands have: panel with light sensor, sun, panel alone, camera. Thermal bands become degrees C."""
     # (band in lower case, reflectance); an empty name means all other bands.
     panel_albedo: Annotated[
         tuple[tuple[str, Annotated[float, Field(gt=0, le=1)]], ...], Option(type=str | None, parse=albedos)
