@@ -98,7 +98,7 @@ def _on_command_line(parameter: inspect.Parameter, text: str | None, panel: str 
 
 
 def value_name(kind: Any) -> str:
-    """Return how a help text names the value of an option of this type, "" for a flag; None is no value.
+    """Return how a help text names the value of an option of this type, "" for a flag; `None` is ignored.
 
     >>> value_name(Path | None), value_name(list[str] | None), value_name(Literal["odm", "pix4d"])
     ('PATH', 'TEXT', 'odm|pix4d')

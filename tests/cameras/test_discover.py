@@ -181,7 +181,7 @@ EDGE_AND_GREEN = ["Red edge", "Green"]
         ("GRN01 NIR01 GRN11 NIR11", "{band}{capture}.tif", {"01": ["GRN", "NIR"], "11": ["GRN", "NIR"]}),
         ("CHA01 CHB01 CHA11", "{band}{capture}.tif", {"01": ["CHA", "CHB"]}),
         ("01RedEdge 01NIR 11NIR 11red", "{capture}{band}.tif", {"01": ["NIR", "RedEdge"], "11": ["NIR", "red"]}),
-        # The end that a browser adds to the only copy is no part of the name; a unit belongs to the wavelength.
+        # The suffix that a browser adds is ignored; the unit belongs to the wavelength.
         ("f_red f_green#(1) f_nir#-#Copy", None, {"f": ["green", "nir", "red"]}),
         ("c_0475_nm c_0560_nm c_842-nm", None, {"c": ["0475_nm", "0560_nm", "842-nm"]}),
         # A camera's own names, without tags.

@@ -172,7 +172,7 @@ class PairTotals:
             usual = self._votes[flight].most_common(1)[0][0]
             if usual in others:
                 reason = f"on the grid of {band}; most captures of the flight are on that of {usual}"
-                # Each of its values is at another place than in other captures.
+                # All its values are displaced from those of the other captures.
                 other.add(label, Caution(band, other.status, OTHER_REFERENCE, reason, pairs_per_capture))
         lost = CautionGroup("no_result", NO_RESULT)
         for label in without_result:

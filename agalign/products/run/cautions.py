@@ -180,7 +180,7 @@ def _of_alignment(band: BandResult, sidecar: Sidecar) -> Iterator[Caution]:
 _MIN_APART_S = 2.0
 """Between the exposures of two bands: times in tags may have whole seconds, and those of one capture differ by less."""
 _APART = Remedy(
-    "the band was exposed at another time than the reference, while the camera or the scene moved",
+    "the band and the reference were exposed at different times, while the camera or the scene moved",
     "look at the times in the tags; --pattern assigns files to captures, --bands omits the band",
 )
 
