@@ -1,12 +1,13 @@
 """Entry point of `agalign` and `python -m agalign`."""
 
 import os
-import signal
 import sys
 
 
 def main() -> None:
     """Run the command line."""
+    import signal  # not a `signal.py` in the working folder, which `python -m` searches until this function runs
+
     _open_missing_streams()
     # While modules are imported, the system ends the process: an exception in a callback of an import lock is lost.
     if signal.getsignal(signal.SIGINT) == signal.default_int_handler:
