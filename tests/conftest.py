@@ -18,6 +18,7 @@ from threadpoolctl import threadpool_limits
 from agalign.config import SeedSettings, Settings, WriteSettings
 from agalign.synthetic import flight as synthetic
 from agalign.values import geometry
+from agalign.values.processes import usable_cores
 
 from .program import agalign
 
@@ -45,6 +46,11 @@ hypothesis.settings.register_profile("full", max_examples=150, deadline=None)
 def pytest_configure(config: pytest.Config) -> None:
     """More examples are tried in the run of all tests."""
     hypothesis.settings.load_profile("short" if config.option.markexpr else "full")
+
+
+def pytest_xdist_auto_num_workers() -> int:
+    """One worker more than there are cores: many tests wait for processes that they start."""
+    return usable_cores() + 1
 
 
 Shared = Callable[[str, Callable[[Path], object]], Path]

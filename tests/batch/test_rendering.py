@@ -19,7 +19,7 @@ from agalign.products.sidecar.file import find_sidecars, read_sidecar, verify_ou
 from agalign.values.alignment import Alignment
 from agalign.values.mapping import DisplacementField
 
-from ..builders import joint_result, residual_of
+from ..builders import in_full_run, joint_result, residual_of
 from ..conftest import raising, read_json, seeded
 from ..products.conftest import table_in
 from ..products.test_relief_map import SIZE, Run
@@ -115,8 +115,10 @@ def alignments_of(run: Run, kind: str) -> dict[str, Alignment]:
     return {n: replace(a, joint=joint, lens_std_px=rng.uniform(0, 0.1, 4)) for n, a in hill.items()}
 
 
-@pytest.mark.parametrize("kind", ["field", "relief"])
-@pytest.mark.parametrize("crop", ["none", "common"])
+@pytest.mark.parametrize(
+    ("kind", "crop"),
+    [("field", "none"), ("relief", "common"), in_full_run("field", "common"), in_full_run("relief", "none")],
+)
 def test_relief_and_field_are_rendered_on_another_grid(
     run: Run,
     tmp_path: Path,

@@ -675,10 +675,10 @@ USUAL = (
     wrong_use("a random seed beyond 64 bits", asking("--rng-seed", "9" * 30), "--rng-seed: give"),
     wrong_use("a torch device without data", asking("--device", "meta"), "device 'meta' cannot be used"),
     wrong_use("an empty name for the folder", commanding(" -o {out}"), "the name of the folder is empty"),
-    Fault("a worker killed by SIGKILL", when_begun(to_busiest(psutil.Process.kill), *_IN_TIME), finished=ALL),
-    interrupted("the interrupt key", when_begun(signalled(signal.SIGINT), "-j", "2")),
 )
 LONG = (
+    Fault("a worker killed by SIGKILL", when_begun(to_busiest(psutil.Process.kill), *_IN_TIME), finished=ALL),
+    interrupted("the interrupt key", when_begun(signalled(signal.SIGINT), "-j", "2")),
     Fault("the system's folder on a card", forbidden("flight/lost+found")),
     Fault("an input that may only be read", read_only),
     Fault("XMP nested 1200 deep", xmp("<a>" * 1200 + "</a>" * 1200)),

@@ -3,6 +3,7 @@
 import os
 import subprocess
 import sys
+from collections.abc import Callable
 from itertools import product
 from pathlib import Path
 
@@ -11,13 +12,16 @@ import pytest
 from agalign.cameras.read_files import _MIN_FILES_FOR_PROCESSES
 from agalign.synthetic import flight as synthetic
 
+from ..builders import in_full_run
 from ..conftest import Shared
 
 pytestmark = pytest.mark.slow
 
 CONSOLE_SCRIPT = [str(Path(sys.executable).with_name("agalign"))]
 MODULE = [sys.executable, "-m", "agalign"]
-OPTIONS = "-j", "2", "--bands", "green,nir", "--relief", "never"
+RUN = "-j", "2", "--bands", "green,nir", "--relief", "never", "-o", "out"
+INFO = ("info",)
+Names = Callable[[tuple[str, ...]], set[str]]
 NAMES_OF_A_RUN = """
 import atexit, sys
 atexit.register(lambda: print(*sys.modules))
@@ -52,15 +56,18 @@ def four_captures(shared: Shared) -> Path:
 
 
 @pytest.fixture(scope="module")
-def names(shared: Shared, four_captures: Path) -> set[str]:
-    """The names of all modules that a run imports, without packages' names."""
+def names(shared: Shared, four_captures: Path) -> Names:
+    """Call with the arguments of a command: the names of all modules that it imports, without packages' names."""
 
-    def list_modules(folder: Path) -> None:
-        (folder / "script.py").write_text(NAMES_OF_A_RUN)
-        command = folder / "script.py", four_captures, "-o", folder / "out", *OPTIONS
-        (folder / "names").write_text(output(sys.executable, *command))
+    def of(arguments: tuple[str, ...]) -> set[str]:
+        def list_modules(folder: Path) -> None:
+            (folder / "script.py").write_text(NAMES_OF_A_RUN)
+            command = sys.executable, folder / "script.py", *arguments, four_captures
+            (folder / "names").write_text(output(*command, folder=folder))
 
-    return modules((shared("names_of_a_run", list_modules) / "names").read_text())
+        return modules((shared(f"names_{len(arguments)}", list_modules) / "names").read_text())
+
+    return of
 
 
 def plant(names: set[str], folder: Path) -> Path:
@@ -72,29 +79,28 @@ def plant(names: set[str], folder: Path) -> Path:
     return log
 
 
-@pytest.mark.parametrize("command", [CONSOLE_SCRIPT, pytest.param(MODULE, marks=pytest.mark.full)])
+@pytest.mark.parametrize(
+    ("command", "arguments"), [(MODULE, INFO), in_full_run(CONSOLE_SCRIPT, RUN), in_full_run(MODULE, RUN)]
+)
 def test_no_module_is_imported_from_the_working_folder(
-    command: list[str], names: set[str], four_captures: Path, tmp_path: Path
+    command: list[str], arguments: tuple[str, ...], names: Names, four_captures: Path, tmp_path: Path
 ) -> None:
+    imported = names(arguments)
     if command == MODULE:  # Python itself imports these from there, before any code of the package
-        names = names - modules(output(sys.executable, "-c", "import runpy, sys; print('agalign', *sys.modules)"))
-    assert {"rasterio", "click", "torch", "typing", "socket", "multiprocessing"} <= names
+        imported -= modules(output(sys.executable, "-c", "import runpy, sys; print('agalign', *sys.modules)"))
+    assert {"rasterio", "click", "typing", "socket", "multiprocessing"} <= imported
     folder = tmp_path / "working folder"
-    log = plant(names, folder)
-    output(*command, four_captures, "-o", tmp_path / "out", *OPTIONS, folder=folder)
-    assert not log.exists(), log.read_text()
+    log = plant(imported, folder)
     for path, k in product(four_captures.rglob("*.tif"), range(_MIN_FILES_FOR_PROCESSES // 20)):
         os.link(path, folder / f"{k}{path.name}")
-    output(*command, "info", ".", folder=folder)
+    output(*command, *arguments, four_captures if arguments == RUN else ".", folder=folder)
     assert not log.exists(), log.read_text()
 
 
 @pytest.mark.full
-def test_workers_of_a_script_import_what_the_script_imports(
-    names: set[str], four_captures: Path, tmp_path: Path
-) -> None:
+def test_workers_of_a_script_import_what_the_script_imports(names: Names, four_captures: Path, tmp_path: Path) -> None:
     """From the folder of the script, but nothing from the working folder."""
-    log, script = plant(names, tmp_path / "working folder"), tmp_path / "script" / "script.py"
+    log, script = plant(names(RUN), tmp_path / "working folder"), tmp_path / "script" / "script.py"
     script.parent.mkdir()
     (script.parent / "helper_of_script.py").touch()
     script.write_text(SCRIPT)
