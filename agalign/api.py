@@ -308,7 +308,7 @@ def onto(
     """Align georeferenced mosaics from other dates or sensors to the grid of a reference mosaic.
 
     A raster and a sidecar of each mosaic are written to `out`. The raster contains one band of the reference, then all
-    bands of the mosaic. A mosaic is aligned if its windows are within a pixel of the reference.
+    bands of the mosaic. The sidecar has the status of each band.
 
     Parameters
     ----------

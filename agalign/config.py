@@ -190,10 +190,10 @@ class JointSettings(SettingsModel):
 
 
 class FlightSettings(SettingsModel):
-    """One network for many captures; `together=False` trains one for each capture (option --each-alone)."""
+    """One network and rig for the captures of a flight; `together=False` uses neither (option --each-alone)."""
 
     together: Annotated[bool, Option("each_alone", default=False, parse=not_)] = True
-    """Train a network for each capture instead of one for a flight."""
+    """Align each capture without the network and rig of its flight."""
     start_model: str = ""
     """Fingerprint of the model that a run starts from, set by `run_flight`; runs with another one repeat a capture."""
 
@@ -217,7 +217,7 @@ class CheckSettings(SettingsModel):
     # The limits of the checks are constants in `verify`.
 
     accept_predicted_px: Annotated[float, Field(ge=0), Option("accept_predicted")] = 1.0
-    """Largest standard error, px, of a predicted band that indices may use."""
+    """Largest standard error, px of the band's file, of a predicted band that indices may use."""
 
 
 class ReliefSettings(SettingsModel):

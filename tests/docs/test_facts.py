@@ -36,7 +36,7 @@ PACKAGE = ROOT / "agalign"
 OPTIONS_OF_OTHERS = {
     *("--cpus", "--gpus", "--read-only", "--tmpfs", "--user"),  # docker run
     *("--floor", "--grids", "--kinds", "--pairs", "--plot", "--ranges", "--scenes", "--size"),  # benchmarks
-    *("--extra-index-url", "--strict"),  # pip, mypy
+    *("--extra-index-url", "--index-url", "--strict"),  # pip, mypy
 }
 """Options in the text of pages that are not those of agalign."""
 WORDS_OF_A_MESSAGE = 4
@@ -156,13 +156,14 @@ LIMITS = {
     "explanation/verification.md": (
         f"| at least {MIN_RETRIEVAL:g}, and {MIN_TIMES_CHANCE:g} times chance |",
         f"at most {checks._MAX_ERROR_PX:g} px in {checks._MIN_ACCURATE_SHARE:.0%} of the image".replace("%", " %"),
-        f"windows with structure ({windows._WINDOW_PX} px at most)",
-        f"| {expected_error.MIN_COMMON_COVERAGE:.0%} |".replace("%", " %"),
-        f"| {checks._MIN_CLOSE_SHARE:.0%}; adjacent windows beyond: fewer than {checks._MIN_CLUSTER}, or than "
-        f"{checks._MAX_CLUSTER_SHARE:.0%} of the windows |".replace("%", " %"),
-        f"| {checks.MAX_ALIAS_PEAK:.0%} of the first".replace("%", " %"),
-        f"| the larger of {checks.MAX_UNEXPECTED_PX:g} px and {checks._MAX_UNEXPECTED_STD:g} standard errors |",
-        f"in blurred images they have {reference._LARGE_WINDOW_PX} px",
+        f"Their side is at most {windows._WINDOW_PX} px, and {reference._LARGE_WINDOW_PX} px in blurred images",
+        f"| at least {expected_error.MIN_COMMON_COVERAGE:.0%} |".replace("%", " %"),
+        f"| at least {checks._MIN_CLOSE_SHARE:.0%} |".replace("%", " %"),
+        f"| fewer than {checks._MIN_CLUSTER}, or fewer than {checks._MAX_CLUSTER_SHARE:.0%} of the windows |".replace(
+            "%", " %"
+        ),
+        f"| at most {checks.MAX_ALIAS_PEAK:.0%} of the first".replace("%", " %"),
+        f"| at most the larger of {checks.MAX_UNEXPECTED_PX:g} px and {checks._MAX_UNEXPECTED_STD:g} standard errors |",
         f"{raster._MAX_BANDS} bands per file",
     ),
     "explanation/accuracy.md": (
