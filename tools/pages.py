@@ -160,7 +160,8 @@ NOT_LISTED = {
     *("preview", "estimated_with", "rendered_with", "input_samples", "model"),
     *("loss", "chance", "iterations", "levels", "last_step_px", "cells"),
     *("corner_covariance_px2", "covariance_px2", "lens_std_px", "relief_std_px"),
-    *("trusted", "runner_up_sigma", "vignetting_corrected", "exposed_after_s", "not_written", "seconds"),
+    *("score", "peak_sigma", "trusted", "runner_up_sigma", "windows", "held_out_p95_px"),
+    *("vignetting_corrected", "exposed_after_s", "not_written", "seconds"),
 }
 """Parts that another page describes, and fields that only agalign needs: for the report, resumed runs and errors."""
 
@@ -232,15 +233,17 @@ def json_type(field: Mapping[str, Any], inner: Container[str]) -> str:
 
 
 def reasons() -> str:
-    """Return a list of the reasons, causes and remedies of band pairs; numbers and details are dots."""
+    """Return a table of the reasons, causes and remedies of band pairs; numbers and details are dots."""
     grouped: dict[Any, list[str]] = {}
     for kind in KINDS.values():
         detail = "FILE: cannot be read (\0)" if kind.code == "unreadable" else "\0"
         text = sentence(Issue(kind, 0.0, 0.0, detail))
         text = re.sub(r"\d+(\.\d+)?", "…", text.replace("\0", "…"))
         grouped.setdefault(kind.remedy, []).append(f"`{text}`")
-    lines = (f"* {'; '.join(texts)}: **{remedy.cause}**: {remedy.advice}" for remedy, texts in grouped.items())
-    return "\n".join(lines) + "\n"
+    options = r"--model OUT/models/…|--seed match|--relief never|--[a-z-]+|gdal_translate -projwin"
+    advice = {remedy: re.sub(options, r"`\g<0>`", remedy.advice) for remedy in grouped}
+    rows = (("; ".join(texts), remedy.cause, advice[remedy]) for remedy, texts in grouped.items())
+    return table([("reason", "cause", "remedy"), *rows]) + "\n"
 
 
 def indices() -> str:

@@ -98,7 +98,7 @@ OTHER_GEOMETRY = IssueKind(
     "the relief that aligns the other bands does not align this one",
     Remedy(
         "a band was exposed at another time, or parts of the scene moved",
-        "look at the picture; --bands omits the band, --relief never aligns all bands without a relief",
+        "look at the picture; --bands omits the band, --relief never aligns all bands without a parallax map",
     ),
 )
 """Reported for a band that only a homography or displacement field aligns, in a capture with a relief."""
