@@ -35,11 +35,17 @@ html_css_files = ["site.css"]
 html_title = f"agalign {__version__}"
 
 ROOT_PAGES = {"../CONTRIBUTING.md": "project/contributing.md", "../CHANGELOG.md": "project/changelog.md"}
-"""Pages that are outside of docs/, and the pages that include them."""
+"""Pages that are outside of docs/, and the pages that include them on the site and link to them on GitHub."""
 
 
 def add_navigation(_app: Sphinx, page: str, source: list[str]) -> None:
-    """Add the lists of index.md to the navigation of the site; GitHub would show a toctree as a raw block."""
+    """Add the lists of index.md to the navigation of the site, and include the pages that are outside of docs/.
+
+    GitHub would show a toctree or include as a raw block.
+    """
+    for path, included_by in ROOT_PAGES.items():
+        if included_by == f"{page}.md":
+            source[0] = f"```{{include}} ../{path}\n:relative-docs: docs/\n:relative-images:\n```\n"
     if page != "index":
         return
     for path, included_by in ROOT_PAGES.items():

@@ -35,7 +35,7 @@ from .blocks import PAGES, ROOT, blocks_of, commands_of, each_page, program, run
 
 RUN_BY = {"docker": "tools/container.sh", "dask": "tools/dask_cluster.sh", "pip": ".ci/run"}
 """What cannot be run inside a test, and the script that runs it and what stands with it in a block."""
-KINDS = {"sh", "python", "text", "{toctree}", "{include} ../../CONTRIBUTING.md", "{include} ../../CHANGELOG.md"}
+KINDS = {"sh", "python", "text"}
 RUNNABLE = [page for page in PAGES if any(b.kind in ("sh", "python") for b in blocks_of(page))]
 LONG = re.compile(
     "altum|close-range|comparison|first-flight|large-flights|mavic-3m|paper|phantom-4|photogrammetry|python|qgis|rededge|"
