@@ -55,8 +55,8 @@ def align(
 ) -> Alignment:
     """Estimate the mapping between two images of the same scene, also between spectral bands with reversed contrast.
 
-    The images are aligned by learned descriptors, then by phase correlation in windows; windows that were left out of
-    the estimate verify it (docs/explanation/method.md). A pair that cannot be aligned raises no error.
+    The images are aligned by learned descriptors, then by phase correlation in windows; windows that the estimate does
+    not use verify it (docs/explanation/method.md). A pair that cannot be aligned raises no error.
 
     Parameters
     ----------

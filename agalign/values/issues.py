@@ -43,14 +43,14 @@ UNLIKE = Remedy(
     "offsets; --model OUT/models/… uses the rig of an earlier flight",
 )
 MOSAICS = Remedy(
-    "the mosaics differ by more than a pixel of REFERENCE, or show too little in common",
+    "the mosaics differ by more than a pixel of REFERENCE, or have too little common structure",
     "resample both mosaics to larger pixels, of the size that you need (gdalwarp -r average -tr SIZE SIZE); compare a "
     "band in which the field changed little (--band)",
 )
 """For georeferenced rasters instead of remedies that concern cameras and flights."""
 MISSING_BAND = Remedy("a band of this camera is missing", "copy the files from the card; apps may not list all of them")
 OTHER_REFERENCE = Remedy(
-    "another reference band than in most captures of the flight: pixels are on the grid of that band",
+    "the reference band differs from that of most captures of the flight: pixels are on its grid",
     "copy missing files from the card again, or give --reference with a band that all captures have",
 )
 
@@ -123,9 +123,9 @@ INACCURATE = IssueKind(
 )
 OTHER_CONTENT = IssueKind(
     "other_content",
-    "an area with {value:.0%} of the windows shows something else in this band",
+    "an area with {value:.0%} of the windows shows a different scene in this band",
     Remedy(
-        "a part of the image shows another scene (a file written in part, an object near the camera, waves)",
+        "a part of the image shows a different scene (an incomplete file, an object near the camera, waves)",
         "look at the picture; copy the file from the card again; --bands omits a band",
     ),
 )
@@ -143,7 +143,7 @@ UNEXPECTED_PX = IssueKind(
 )
 REPEATS = IssueKind(
     "repeats",
-    "the scene repeats: a shift of {value:.0f} px fits nearly as well, and no prior information decides",
+    "the scene is repetitive: a shift of {value:.0f} px fits nearly as well, and no prior information decides",
     Remedy(
         "a repetitive scene (plant rows, solar panels)",
         "keep the metadata of the camera, without --ignore-metadata, or give --model OUT/models/… of an earlier flight",
