@@ -49,7 +49,7 @@ from agalign.values.image import FloatImage
 from agalign.values.issues import OTHER_GEOMETRY, Issue
 from agalign.values.mapping import PixelMapping
 from agalign.values.parallax import Parallax, Relief
-from agalign.verify.checks import BY_PARALLAX, BY_WINDOWS, MAX_ALIAS_PEAK, MAX_SHIFT_PX
+from agalign.verify.checks import BY_PARALLAX, BY_WINDOWS, MAX_ALIAS_PEAK, MAX_SHIFT_PX, relief_issues
 
 _MIN_OBSERVED_SHARE = 0.75
 """Minimum share of aligned windows for an observation of a rig, which contains no depth edges: 0.79 or more in scenes
@@ -290,8 +290,9 @@ class _Estimate:
     def alignment(self, band: _Band, verifying: Relief | None = None) -> Alignments:
         """Align a band by the relief of all bands, or predict it.
 
-        The held-out windows of a band of the estimate are measured by the relief `verifying` of other bands. Empty if
-        they are few, half of them are not aligned, or the scene repeats.
+        The held-out windows of a band of the estimate are measured by the relief `verifying` of other bands. A band is
+        also predicted if the quality raster would flag most of the image. Empty if the windows are few, half of them
+        are not aligned, or the scene repeats.
         """
         candidate, pair = band.candidate, band.candidate.pair
         mapping = band.mapping(self.relief, with_occlusions=True)
@@ -299,6 +300,10 @@ class _Estimate:
         warped = WarpedPair.of(pair, by_others, pair.reference.white_windows)
         residual = warped.residual
         issues = warped.issues(band.joint)
+        if not issues:
+            # With the standard error of the written relief, which the error map has.
+            warped = replace(warped, mapping=mapping)
+            issues = tuple(relief_issues(warped.evidence(band.joint)))
         if not issues:
             return {band.name: band.aligned(mapping, residual)}
         is_known = len(residual.measured_px) >= MIN_WINDOWS

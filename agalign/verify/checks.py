@@ -45,6 +45,10 @@ MAX_ALIAS_PEAK = 0.75
 _MAX_ERROR_PX, _MIN_ACCURATE_SHARE = 0.5, 0.9
 """`aligned` means an expected error of at most this in this share of the pixels with texture. Errors of 0.5 px RMS are
 beyond 1 px in 2 % of the pixels."""
+_MAX_FLAGGED_SHARE = 0.5
+"""Share of the image whose expected error with a relief is beyond MAX_SHIFT_PX, as the quality raster flags it, from
+which a band is not `aligned`. Held-out windows verify the relief; its standard error is also large at depth edges and
+without texture, where no window has a shift: it may exceed the limit above, but not in most of the image."""
 MAX_SHIFT_PX = 1.0
 """Maximum residual shift of an aligned window: beyond it, a spectral index mixes neighbours."""
 _MAX_NOISE_STD = 2.0
@@ -175,6 +179,15 @@ def _error_issues(evidence: Evidence) -> Iterator[Issue]:
         share = float((evidence.error_px(points_px) <= max_px).mean())
         if not share >= _MIN_ACCURATE_SHARE:
             yield Issue(INACCURATE, 1 - share, 1 - _MIN_ACCURATE_SHARE, f"{_MAX_ERROR_PX:g} px")
+
+
+def relief_issues(evidence: Evidence) -> Iterator[Issue]:
+    """The expected error with the standard error of the written relief, which no window shows in most of the image."""
+    points_px = evidence.residual.centres_px if evidence.images is None else evidence.images.common_px()
+    if len(points_px):
+        share = float((evidence.error_px(points_px) > MAX_SHIFT_PX * evidence.file_pixel_size_px).mean())
+        if share > _MAX_FLAGGED_SHARE:
+            yield Issue(INACCURATE, share, _MAX_FLAGGED_SHARE, f"{MAX_SHIFT_PX:g} px")
 
 
 def _content_issues(evidence: Evidence) -> Iterator[Issue]:

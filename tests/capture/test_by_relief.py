@@ -318,6 +318,29 @@ def test_a_relief_does_not_verify_a_band_that_it_is_estimated_from(
     np.testing.assert_array_equal(result["NIR"].residual.shifts_px, aligned["NIR"].residual.shifts_px)
 
 
+@pytest.mark.parametrize(("uncertain_share", "status"), [(0.3, "aligned"), (0.7, "predicted")])
+def test_no_band_is_aligned_whose_relief_is_uncertain_in_most_of_the_image(
+    candidates: Sequence[Candidate], monkeypatch: pytest.MonkeyPatch, uncertain_share: float, status: str
+) -> None:
+    """Its windows pass, and the quality raster would flag most of its pixels."""
+
+    def uncertain(reliefs: Sequence[Relief]) -> np.ndarray:
+        std_px = np.zeros_like(reliefs[0].parallax_px)
+        std_px[:, : round(uncertain_share * std_px.shape[1])] = 10.0
+        return std_px
+
+    monkeypatch.setattr("agalign.capture.by_relief._std_px", uncertain)
+    result = aligned_by_relief(candidates, "auto")[0]
+    assert {a.status for a in result.values()} == {status}
+    for alignment in result.values():
+        points = geometry.lattice(*alignment.size_px, 40, 30)
+        share = (expected_error_px(alignment, alignment.size_px, points) > 1).mean()
+        assert share == pytest.approx(uncertain_share, abs=0.05)
+        if status == "predicted":
+            assert "inaccurate" in {issue.kind.code for issue in alignment.issues}
+            assert alignment.prediction.std_px > 1
+
+
 def test_a_lost_band_is_predicted_with_the_relief(
     boxes: Rendered, candidates: Sequence[Candidate], aligned: Mapping[str, Alignment]
 ) -> None:
