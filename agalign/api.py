@@ -338,6 +338,8 @@ def onto(
         A mosaic has no georeference, or is the reference itself.
     NoSuchBandError
         `reference` has no band `band`.
+    ConfigurationError
+        `out` contains results of different mosaics with the same names, or the device of `settings` cannot be used.
     OutputError
         `out` cannot be written.
     WorkerError

@@ -7,7 +7,9 @@ import re
 import shutil
 import textwrap
 from collections.abc import Iterator
+from functools import cached_property
 from pathlib import Path
+from types import FunctionType, SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -19,14 +21,14 @@ from agalign.values import geometry
 
 from .builders import in_full_run
 from .conftest import textured_pair, write_band
-from .test_public_names import ERRORS, FUNCTIONS, OPTIONS, RESULTS, ROOT, SETTINGS
+from .test_public_names import ERRORS, FUNCTIONS, ROOT
 
 API_PAGE = (ROOT / "docs" / "reference" / "api.rst").read_text(encoding="utf-8")
-PARTS = re.findall(r"^\.\. autoclass:: agalign\.(\w+\.[\w.]+)$", API_PAGE, re.M)
-CLASSES = [*f"{RESULTS} {OPTIONS} {SETTINGS} {ERRORS}".split(), *PARTS]
-METHODS = ["Alignment.map", "Alignment.inverse", "Alignment.warp"]
-CALLABLES = [*FUNCTIONS.split(), *METHODS]
-WITH_EXAMPLES = [*CALLABLES, "Alignment", "DiscoverOptions", "RunOptions", "Settings", "AgalignError"]
+LISTED = re.findall(r"^\.\. auto(?:class|exception):: agalign\.([\w.]+)\n((?: +:.*\n)*)", API_PAGE, re.M)
+HIDDEN = {name: re.findall(r"\w+", options.partition(":exclude-members:")[2]) for name, options in LISTED}
+"""Members of each class that the page does not show."""
+CLASSES = [*HIDDEN]
+ERROR_NAMES = set(ERRORS.split())
 NEEDS = {"dask_executor": ("distributed",), "open_capture": ("rioxarray",), "open_flight": ("rioxarray",)}
 
 
@@ -37,6 +39,18 @@ def public(name: str) -> Any:
     return value
 
 
+def shown_members(name: str) -> dict[str, Any]:
+    """The public methods and properties of a class that the API page shows."""
+    kinds = (property, cached_property, classmethod, FunctionType)
+    members = {key: value for key, value in vars(public(name)).items() if isinstance(value, kinds)}
+    return {key: value for key, value in members.items() if key[0] != "_" and key not in HIDDEN[name]}
+
+
+METHODS = [f"{n}.{key}" for n in CLASSES for key, value in shown_members(n).items() if isinstance(value, FunctionType)]
+CALLABLES = [*FUNCTIONS.split(), *METHODS]
+WITH_EXAMPLES = [*CALLABLES, "Alignment", "DiscoverOptions", "RunOptions", "Settings", "AgalignError"]
+
+
 @pytest.mark.parametrize("name", CALLABLES)
 def test_arguments_and_results_are_described(name: str) -> None:
     text, function = inspect.getdoc(public(name)) or "", public(name)
@@ -45,9 +59,43 @@ def test_arguments_and_results_are_described(name: str) -> None:
     assert described == [parameter for parameter in inspect.signature(function).parameters if parameter != "self"]
     assert sections["Returns"].strip()
     named = re.findall(r"^([\w, ]+)$", sections.get("Raises", ""), re.M)
-    assert {error for line in named for error in line.split(", ")} <= set(ERRORS.split())
-    assert named or name in ("Alignment.map", "Alignment.inverse")
+    assert {error for line in named for error in line.split(", ")} <= ERROR_NAMES
+    assert not_documented(function, sections.get("Raises", "")) == set()
     assert ">>> " in sections["Examples"]
+
+
+def raised_errors(function: Any) -> set[str]:
+    """Names of the public errors that a function raises. Of the functions that it calls, the docstrings say what they
+    raise; those without a "Raises" are searched too. Calls whose errors it handles, and methods, are not.
+    """
+    names, function = set[str](), inspect.unwrap(function)
+    tree = ast.parse(textwrap.dedent(inspect.getsource(function)))
+    tried = [line for node in ast.walk(tree) if isinstance(node, ast.Try) for line in node.body]
+    handled = {node for line in tried for node in ast.walk(line)}
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Raise):
+            names |= {part.id for part in ast.walk(node) if isinstance(part, ast.Name)}
+        elif isinstance(node, ast.Call) and node not in handled:
+            module, _, name = ast.unparse(node.func).rpartition(".")
+            owner = function.__globals__.get(module) if module else SimpleNamespace(**function.__globals__)
+            called = getattr(owner, name, None)
+            if inspect.isfunction(called) and called.__module__.startswith("agalign.") and called is not function:
+                documented = re.findall(r"[Rr]aises\s[^.]*", inspect.getdoc(called) or "")
+                names |= set(re.findall(r"\w+Error", " ".join(documented))) if documented else raised_errors(called)
+    return names & ERROR_NAMES
+
+
+def not_documented(function: Any, text: str) -> set[str]:
+    """Names of the errors that a function raises and a text does not name, neither themselves nor a base of theirs."""
+    named = tuple(getattr(agalign, name) for name in re.findall(r"\w+Error", text) if name in ERROR_NAMES)
+    return {name for name in raised_errors(function) if not issubclass(getattr(agalign, name), named)}
+
+
+@pytest.mark.parametrize("name", CLASSES)
+def test_errors_of_properties_are_documented(name: str) -> None:
+    for key, member in shown_members(name).items():
+        if function := getattr(member, "fget", getattr(member, "func", None)):
+            assert (key, not_documented(function, function.__doc__ or "")) == (key, set())
 
 
 def undescribed(cls: type) -> Iterator[str]:
