@@ -135,8 +135,12 @@ class RunOptions:
 
     Examples
     --------
+    `settings` is that of the example of `align_folder`.
+
     >>> run = agalign.RunOptions(jobs=1, retry_failed=True)
-    >>> reports = agalign.align_folder("flight", "aligned", run=run)
+    >>> reports = agalign.align_folder("flight", "aligned", settings=settings, run=run)
+    >>> [report.state for report in reports]  # the run of the example has finished them
+    ['kept', 'kept']
     """
 
     overwrite: bool = False
@@ -175,7 +179,14 @@ class SettingsModel(BaseModel):
 
 
 class JointSettings(SettingsModel):
-    """Joint optimisation of the descriptor and the homographies."""
+    """Joint optimisation of the descriptor and the homographies.
+
+    Examples
+    --------
+    >>> joint = agalign.JointSettings(model_family="affine", rng_seed=7)
+    >>> agalign.Settings(joint=joint)
+    Settings(joint=JointSettings(model_family='affine', rng_seed=7))
+    """
 
     recipe: choices.Recipe = "fast"
     """Algorithm: fast, the same from random network weights (scratch), or as published by Dong et al. 2018 (paper)."""
@@ -190,7 +201,14 @@ class JointSettings(SettingsModel):
 
 
 class FlightSettings(SettingsModel):
-    """One network and rig for the captures of a flight; `together=False` uses neither (option --each-alone)."""
+    """One network and rig for the captures of a flight; `together=False` uses neither (option --each-alone).
+
+    Examples
+    --------
+    >>> settings = agalign.Settings(flight=agalign.FlightSettings(together=False))
+    >>> settings.flight.together
+    False
+    """
 
     together: Annotated[bool, Option("each_alone", default=False, parse=not_)] = True
     """Align each capture without the network and rig of its flight."""
@@ -199,7 +217,14 @@ class FlightSettings(SettingsModel):
 
 
 class SeedSettings(SettingsModel):
-    """Initial alignment. In Python, `force=None` stands for `auto`."""
+    """Initial alignment. In Python, `force=None` stands for `auto`.
+
+    Examples
+    --------
+    >>> settings = agalign.Settings(seed=agalign.SeedSettings(force="rig"))
+    >>> settings.seed.force, agalign.SeedSettings().force
+    ('rig', None)
+    """
 
     force: Annotated[
         choices.SeedKind | None,
@@ -212,7 +237,14 @@ class SeedSettings(SettingsModel):
 
 
 class CheckSettings(SettingsModel):
-    """Acceptance of predicted bands."""
+    """Acceptance of predicted bands.
+
+    Examples
+    --------
+    >>> settings = agalign.Settings(check=agalign.CheckSettings(accept_predicted_px=0.5))
+    >>> settings.check.accept_predicted_px
+    0.5
+    """
 
     # The limits of the checks are constants in `verify`.
 
@@ -221,7 +253,14 @@ class CheckSettings(SettingsModel):
 
 
 class ReliefSettings(SettingsModel):
-    """Correction of parallax over trees, terraces, buildings and benches."""
+    """Correction of parallax over trees, terraces, buildings and benches.
+
+    Examples
+    --------
+    >>> settings = agalign.Settings(relief=agalign.ReliefSettings(use="always"))
+    >>> settings.relief.use
+    'always'
+    """
 
     # A single moving lens gets a smooth displacement field instead, if left-out windows confirm it: no other band can
     # verify its relief.
@@ -237,6 +276,13 @@ class WriteSettings(SettingsModel):
 
     In Python, `indices` is a tuple of names, and `panel_albedo` a tuple of (band in lower case, reflectance), where an
     empty name stands for all other bands.
+
+    Examples
+    --------
+    >>> agalign.WriteSettings(layout="bands", indices=("ndvi", "ndre"), radiometry="panel", panel_albedo=(("", 0.51),))
+    WriteSettings(layout='bands', indices=('ndvi', 'ndre'), radiometry='panel', panel_albedo=(('', 0.51),))
+    >>> agalign.WriteSettings().interpolation, agalign.WriteSettings().compression
+    ('lanczos', 'auto')
     """
 
     # RMS error on a random image of waves of up to 0.25 cycles/px, relative to its standard deviation: Lanczos 1.4 %,

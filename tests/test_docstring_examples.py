@@ -1,6 +1,7 @@
 """Docstrings of the public names: they are complete, and their examples run."""
 
 import ast
+import contextlib
 import doctest
 import inspect
 import re
@@ -16,7 +17,6 @@ import numpy as np
 import pytest
 
 import agalign
-from agalign.config import WriteSettings
 from agalign.values import geometry
 
 from .builders import in_full_run
@@ -48,7 +48,6 @@ def shown_members(name: str) -> dict[str, Any]:
 
 METHODS = [f"{n}.{key}" for n in CLASSES for key, value in shown_members(n).items() if isinstance(value, FunctionType)]
 CALLABLES = [*FUNCTIONS.split(), *METHODS]
-WITH_EXAMPLES = [*CALLABLES, "Alignment", "DiscoverOptions", "RunOptions", "Settings", "AgalignError"]
 
 
 @pytest.mark.parametrize("name", CALLABLES)
@@ -92,10 +91,24 @@ def not_documented(function: Any, text: str) -> set[str]:
 
 
 @pytest.mark.parametrize("name", CLASSES)
+def test_examples_of_a_class_use_its_members(name: str) -> None:
+    examples = doctest.DocTestParser().get_examples(inspect.getdoc(public(name)) or "")
+    assert examples
+    code = " ".join(example.source for example in examples)
+    assert [key for key in shown_members(name) if f"{name}.{key}" not in METHODS and f".{key}" not in code] == []
+
+
+@pytest.mark.parametrize("name", CLASSES)
 def test_errors_of_properties_are_documented(name: str) -> None:
     for key, member in shown_members(name).items():
         if function := getattr(member, "fget", getattr(member, "func", None)):
             assert (key, not_documented(function, function.__doc__ or "")) == (key, set())
+
+
+def test_arguments_of_an_error_are_described() -> None:
+    arguments = list(inspect.signature(agalign.NotEnoughTextureError).parameters)
+    assert re.findall(r"^(\w+)$", inspect.getdoc(agalign.NotEnoughTextureError) or "", re.M)[1:-1] == arguments
+    assert [n for n in ERROR_NAMES if "__init__" in vars(public(n))] == ["NotEnoughTextureError"]  # others have a text
 
 
 def undescribed(cls: type) -> Iterator[str]:
@@ -129,22 +142,6 @@ def test_examples_use_public_names_alone(path: Path) -> None:
     assert set(re.findall(r"\bagalign\.(\w+)", text)) <= set(agalign.__all__)
 
 
-@pytest.fixture(scope="module")
-def run_folder(flight: Path, aligned_flight: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The folders and files of the examples: a flight, its results with band files, and two mosaics."""
-    folder = tmp_path_factory.mktemp("examples")
-    shutil.copytree(flight, folder / "flight")
-    shutil.copytree(aligned_flight, folder / "aligned")
-    agalign.align_folder(
-        folder / "flight", folder / "aligned", settings=agalign.Settings(write=WriteSettings(layout="both"))
-    )
-    june, july = textured_pair(geometry.translation(6, -4), 320, 260)
-    for name, image in (("june", june), ("july", july)):
-        place = {"crs": "EPSG:32633", "transform": (0.1, 0, 500_000, 0, -0.1, 4_000_000)}
-        write_band(folder / f"{name}.tif", np.float32(1000 + 100 * image), **place)
-    return folder
-
-
 def run_examples(name: str, names: dict[str, Any]) -> None:
     """Run the example in a docstring, whose variables are added to `names`."""
     (test,) = doctest.DocTestFinder(recurse=False).find(public(name), name, module=False, globs={})
@@ -155,11 +152,28 @@ def run_examples(name: str, names: dict[str, Any]) -> None:
 
 
 @pytest.fixture(scope="module")
-def arrays() -> dict[str, Any]:
-    """The variables after the example of `align`."""
+def names() -> dict[str, Any]:
+    """The variables after the example of `align`; `run_folder` adds those of `align_folder`."""
     names = {"agalign": agalign, "np": np}
     run_examples("align", names)
     return names
+
+
+@pytest.fixture(scope="module")
+def run_folder(
+    flight: Path, aligned_flight: Path, tmp_path_factory: pytest.TempPathFactory, names: dict[str, Any]
+) -> Path:
+    """The files of the examples: a flight, its results by the example of `align_folder`, and two mosaics."""
+    folder = tmp_path_factory.mktemp("examples")
+    shutil.copytree(flight, folder / "flight")
+    shutil.copytree(aligned_flight, folder / "aligned")
+    with contextlib.chdir(folder):
+        run_examples("align_folder", names)
+    june, july = textured_pair(geometry.translation(6, -4), 320, 260)
+    for name, image in (("june", june), ("july", july)):
+        place = {"crs": "EPSG:32633", "transform": (0.1, 0, 500_000, 0, -0.1, 4_000_000)}
+        write_band(folder / f"{name}.tif", np.float32(1000 + 100 * image), **place)
+    return folder
 
 
 @pytest.fixture
@@ -168,11 +182,16 @@ def in_run_folder(run_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPa
     monkeypatch.chdir(shutil.copytree(run_folder, tmp_path / "examples"))
 
 
+SHARED_EXAMPLES = ("align", "align_folder")
+"""Their variables are used by other examples."""
+
+
 @pytest.mark.slow
 @pytest.mark.usefixtures("in_run_folder")
-@pytest.mark.parametrize("name", [in_full_run(n) if n == "dask_executor" else n for n in WITH_EXAMPLES])
-def test_the_example_of_a_docstring(name: str, arrays: dict[str, Any]) -> None:
+@pytest.mark.parametrize("name", [in_full_run(n) if n == "dask_executor" else n for n in (*CALLABLES, *CLASSES)])
+def test_the_example_of_a_docstring(name: str, names: dict[str, Any]) -> None:
     for module in NEEDS.get(name, ()):
         pytest.importorskip(module)
-    if name != "align":  # which has run
-        run_examples(name, {key: arrays[key] for key in ("agalign", "np", "green", "nir")})
+    if name not in SHARED_EXAMPLES:  # which have run
+        shared = ("agalign", "np", "green", "nir", "result", "settings", "reports")
+        run_examples(name, {key: names[key] for key in shared})

@@ -206,8 +206,11 @@ def described(field: Mapping[str, Any], inner: Mapping[str, Any], of_types: Cont
 
 
 def sidecar_schema() -> dict[str, Any]:
-    """Return the JSON Schema of the sidecar."""
-    return Sidecar.model_json_schema(mode="serialization")
+    """Return the JSON Schema of the sidecar, without the examples of docstrings, which are Python."""
+    schema = Sidecar.model_json_schema(mode="serialization")
+    for part in schema["$defs"].values():
+        part["description"] = part["description"].partition("\n\nExamples\n")[0]
+    return schema
 
 
 def json_type(field: Mapping[str, Any], inner: Container[str]) -> str:

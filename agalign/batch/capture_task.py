@@ -42,7 +42,21 @@ def quiet(*_: object) -> None:
 
 @dataclass(frozen=True)
 class CaptureReport:
-    """State and result of one capture."""
+    """State and result of one capture.
+
+    Examples
+    --------
+    `reports` is that of the example of `align_folder`.
+
+    >>> report = reports[0]
+    >>> report.state, report.is_complete, report.problems
+    ('done', True, ())
+    >>> report.summary
+    'done, 4 aligned'
+    >>> nir = next(band for band in report.sidecar.bands if band.band == "NIR")
+    >>> nir.status, nir.metrics.after.residual_px < 0.5
+    ('aligned', True)
+    """
 
     label: str
     """Folder and number of the capture, as 0000SET/000/IMG_0001."""
@@ -110,7 +124,17 @@ class CaptureReport:
 
 
 class FlightReports(list[CaptureReport]):
-    """The reports of a run: a list, which a notebook shows as a table."""
+    """The reports of a run: a list, which a notebook shows as a table.
+
+    Examples
+    --------
+    `reports` is that of the example of `align_folder`.
+
+    >>> [report.state for report in reports]
+    ['done', 'done']
+    >>> [report.label for report in reports if not report.is_complete]
+    []
+    """
 
     def _repr_html_(self) -> str:
         max_rows = 20

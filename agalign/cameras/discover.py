@@ -47,7 +47,14 @@ __all__ = ["DiscoverOptions", "FolderScan", "Problem", "discover"]
 
 @dataclass(frozen=True)
 class FolderScan:
-    """The captures and the problems below a folder, as `discover` returns them."""
+    """The captures and the problems below a folder, as `discover` returns them.
+
+    Examples
+    --------
+    >>> flight = agalign.discover("flight")
+    >>> len(flight.captures), flight.problems, flight.is_complete
+    (2, (), True)
+    """
 
     folder: Path
     """The input folder."""

@@ -28,7 +28,16 @@ from agalign.values.text import shortened
 
 @dataclass(frozen=True)
 class Problem:
-    """A file or capture that is skipped, or used with fewer tags, and the reason."""
+    """A file or capture that is skipped, or used with fewer tags, and the reason.
+
+    Examples
+    --------
+    >>> from pathlib import Path
+    >>> _ = Path("flight/IMG_0009_1.tif").write_bytes(b"")
+    >>> (problem,) = agalign.discover("flight").problems
+    >>> problem.text, problem.is_harmless
+    ('flight/IMG_0009_1.tif: is empty; copy it from the card again', False)
+    """
 
     path: Path
     """The file."""

@@ -41,7 +41,20 @@ def noise_px(peaks_sigma: ArrayLike) -> NDArray[np.float64]:
 
 @validated.dataclass(frozen=True, config=RECORD)
 class Seed:
-    """Initial alignment."""
+    """Initial alignment.
+
+    Examples
+    --------
+    `result` is that of the example of `align`.
+
+    >>> seed = result.seed
+    >>> seed.kind, seed.trusted, seed.peak_sigma > 10 * seed.runner_up_sigma
+    ('structure', True, True)
+    >>> seed.fixed_to_moving.round()
+    array([[1., 0., 8.],
+           [0., 1., 8.],
+           [0., 0., 1.]])
+    """
 
     kind: SeedKind
     """`user`; `match` (learned descriptors matched); `model` (median mapping of the flight); `rig` (camera tags);
@@ -62,7 +75,18 @@ class Seed:
 
 @validated.dataclass(frozen=True, config=RECORD)
 class JointResult:
-    """Estimate from descriptors, windows, other bands and rig, or from windows alone."""
+    """Estimate from descriptors, windows, other bands and rig, or from windows alone.
+
+    Examples
+    --------
+    `result` is that of the example of `align`.
+
+    >>> joint = result.joint
+    >>> joint.recipe, joint.model_family, joint.retrieval > 10 * joint.chance
+    ('fast', 'homography', True)
+    >>> len(joint.corner_std_xy_px), joint.corner_std_px < 0.2
+    (4, True)
+    """
 
     fixed_to_moving: Matrix3x3
     """Between the same px as the seed. A prediction may have replaced it."""
@@ -132,7 +156,19 @@ class RefinedPair:
 
 @validated.dataclass(frozen=True, config=RECORD)
 class Residual:
-    """Shifts of windows under a mapping, by phase correlation."""
+    """Shifts of windows under a mapping, by phase correlation.
+
+    Examples
+    --------
+    `result` is that of the example of `align`.
+
+    >>> residual = result.residual
+    >>> residual.median_px < 0.1, residual.p95_px < 0.1, residual.std_px < 0.1, residual.coverage
+    (True, True, True, 1.0)
+    >>> residual.shifts_px.shape, residual.lengths_px.shape, int(residual.is_measured.sum())
+    ((24, 2), (24,), 24)
+    >>> x_px, y_px = residual.measured_px[residual.lengths_px.argmax()]  # window with the largest shift
+    """
 
     centres_px: Annotated[NDArray[np.float64], Array((None, 2), 2)]
     """(n, 2) centres of the windows, px of the reference."""
@@ -263,7 +299,16 @@ SAME_SCALES = PairScales()
 
 @validated.dataclass(frozen=True, config=RECORD)
 class Prediction:
-    """Mapping of a band by the rig of the flight, or by windows that do not confirm it everywhere."""
+    """Mapping of a band by the rig of the flight, or by windows that do not confirm it everywhere.
+
+    Examples
+    --------
+    `Alignment.prediction` is one. Indices use a predicted band if its standard error is small enough:
+
+    >>> prediction = agalign.Prediction(np.eye(3), "neighbours", std_px=0.42, off_px=0.3)
+    >>> prediction.std_px <= agalign.CheckSettings().accept_predicted_px
+    True
+    """
 
     fixed_to_moving: Matrix3x3
     """Homography (3, 3) from the reference's file to the band's file: between undistorted px if both lenses are known,
@@ -281,7 +326,17 @@ class Prediction:
 
 @validated.dataclass(frozen=True, config=RECORD)
 class Similarity:
-    """Similarity of the pixels that are valid in both bands; null: not measured. Large images are sampled."""
+    """Similarity of the pixels that are valid in both bands; null: not measured. Large images are sampled.
+
+    Examples
+    --------
+    `result` is that of the example of `align`.
+
+    >>> result.before.nmi < 1.01, result.after.nmi > 1.4
+    (True, True)
+    >>> round(result.after.ncc, 2), round(result.after.gradient_correlation, 2)  # reversed contrast, equal edges
+    (-1.0, 1.0)
+    """
 
     mattes_mi: Number6 = math.nan
     """Negative Mattes mutual information, nats, 32 bins: lower is better."""
@@ -312,13 +367,17 @@ class Alignment:
 
     Examples
     --------
-    `green` and `nir` are the arrays of the example of `align`.
+    `result` is that of the example of `align`.
 
-    >>> result = agalign.align(green, nir)
     >>> result.status, result.reason, result.size_px
     ('aligned', None, (200, 200))
-    >>> bool(result.residual.median_px < 0.1), bool(result.joint.corner_std_px < 0.2)
+    >>> result.residual.median_px < 0.1, result.joint.corner_std_px < 0.2
     (True, True)
+    >>> result.geometry, result.space, result.fixed_to_moving.shape
+    ('field', 'pixel', (3, 3))
+    >>> unknown = agalign.align(np.ones_like(green), nir)  # raises no error
+    >>> unknown.status, unknown.reason
+    ('failed', 'the reference band is constant or all invalid')
     """
 
     mapping: PixelMapping
@@ -388,7 +447,8 @@ class Alignment:
 
         Examples
         --------
-        >>> result = agalign.align(green, nir)  # the arrays of the example of `align`
+        `result` is that of the example of `align`.
+
         >>> result.map([[0, 0], [100, 60]]).round()
         array([[  8.,   8.],
                [108.,  68.]])
@@ -411,7 +471,8 @@ class Alignment:
 
         Examples
         --------
-        >>> result = agalign.align(green, nir)  # the arrays of the example of `align`
+        `result` is that of the example of `align`.
+
         >>> result.inverse(result.map([100, 60])).round(2)
         array([100.,  60.])
         """
@@ -453,7 +514,8 @@ class Alignment:
 
         Examples
         --------
-        >>> result = agalign.align(green, nir)  # the arrays of the example of `align`
+        `green`, `nir` and `result` are those of the example of `align`.
+
         >>> nir_on_green, known = result.warp(nir)
         >>> nir_on_green.shape == green.shape
         True

@@ -137,7 +137,17 @@ class Panel:
 
 @dataclass(frozen=True)
 class Band:
-    """One band of a capture: its file and its metadata."""
+    """One band of a capture: its file and its metadata.
+
+    Examples
+    --------
+    >>> capture = agalign.discover("flight").captures[0]
+    >>> nir = next(band for band in capture.bands if band.name == "NIR")
+    >>> nir.size_px, nir.dtype, nir.wavelength_nm
+    ((480, 360), 'uint16', 840.0)
+    >>> nir.address, nir.lens is not None
+    ('IMG_0001_4.tif', True)
+    """
 
     name: str
     """Name of the band, such as NIR; unique in its capture."""
@@ -215,7 +225,14 @@ class Band:
 
 @validated.dataclass(frozen=True, config=RECORD)
 class Position:
-    """GPS position of the camera."""
+    """GPS position of the camera.
+
+    Examples
+    --------
+    >>> position = agalign.discover("flight").captures[0].position
+    >>> position.latitude, position.longitude, round(position.altitude_m, 1)
+    (52.0, 5.0, 23.0)
+    """
 
     latitude: Number
     """Degrees, WGS 84."""
@@ -230,7 +247,16 @@ HeightSource = Literal["tags", "panel", "ground elevation", "assumed"]
 
 @validated.dataclass(frozen=True, config=RECORD)
 class Pose:
-    """Orientation of the camera, and its height."""
+    """Orientation of the camera, and its height.
+
+    Examples
+    --------
+    >>> pose = agalign.discover("flight").captures[0].pose
+    >>> round(pose.heading_deg), round(pose.pitch_deg), pose.focal_length_px
+    (-95, -1, 545.0)
+    >>> pose.height_m is None  # the tags do not contain it
+    True
+    """
 
     heading_deg: Number
     """Direction of the image's top, degrees clockwise from north."""
@@ -248,7 +274,14 @@ class Pose:
 
 @validated.dataclass(frozen=True, config=RECORD)
 class CameraIdentity:
-    """Camera, from the tags."""
+    """Camera, from the tags.
+
+    Examples
+    --------
+    >>> camera = agalign.discover("flight").captures[0].camera
+    >>> camera.name, camera.serial
+    ('MicaSense RedEdge-M', 'SY01-0000001-AG')
+    """
 
     make: str = ""
     """From the tags."""
@@ -265,7 +298,18 @@ class CameraIdentity:
 
 @dataclass(frozen=True)
 class Capture:
-    """All bands of one moment; one of them is the reference. `discover` returns captures."""
+    """All bands of one moment; one of them is the reference. `discover` returns captures.
+
+    Examples
+    --------
+    >>> capture = agalign.discover("flight").captures[0]
+    >>> capture.label, capture.reference.name, [band.name for band in capture.moving]
+    ('0000SET/000/IMG_0001', 'Green', ['Blue', 'Red', 'NIR', 'Red edge'])
+    >>> capture.captured_at, capture.time_s, round(capture.altitude_m, 1)
+    ('2026-06-21T10:00:01+00:00', 1782036001.0, 23.0)
+    >>> capture.panel is None, capture.is_of_a_panel
+    (True, False)
+    """
 
     name: str
     """Common part of the names of its files, such as IMG_0001."""

@@ -67,9 +67,9 @@ def test_round_trip(tmp_path: Path) -> None:
         write_sidecar(path / "IMG_1.json", example())
 
 
-def test_the_shipped_schema_is_the_models_and_accepts_and_refuses() -> None:
+def test_the_shipped_schema_accepts_and_refuses() -> None:
+    """That it is the schema of the model is tested by `tools/pages.py --check`."""
     schema = read_json(SHIPPED)
-    assert schema == Sidecar.model_json_schema(mode="serialization")
     data = example().model_dump(by_alias=True, mode="json")
     jsonschema.validate(data, schema)
     for change in ({"status": "fine"}, {"schema": "agalign/1"}, {"bands": [{"band": "x"}]}):

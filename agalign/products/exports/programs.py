@@ -39,7 +39,16 @@ Radiometric processing needs raw numbers and the captures of the panel from the 
 
 @dataclass(frozen=True)
 class ExportReport:
-    """Result of `export`."""
+    """Result of `export`.
+
+    Examples
+    --------
+    >>> report = agalign.export("aligned", "for_metashape", "metashape")
+    >>> report.captures, len(report.files), report.left_out
+    (2, 10, [])
+    >>> report.notes[-1]
+    'Tools, Set Primary Channel: Green.'
+    """
 
     captures: int
     """Number of exported captures."""

@@ -55,7 +55,16 @@ _NEUTRAL = np.array([(20, 20, 20), (245, 245, 245)], float)
 
 @dataclass(frozen=True)
 class IndexStatistics:
-    """The values of an index raster; nan if no pixel is valid."""
+    """The values of an index raster; nan if no pixel is valid.
+
+    Examples
+    --------
+    >>> statistics = agalign.indices("aligned", ["ndvi"])[0].statistics
+    >>> statistics.p5 < statistics.median < statistics.p95, statistics.valid_share
+    (True, 1.0)
+    >>> statistics.unit, statistics.masked_share
+    ('raw numbers', 0.0)
+    """
 
     median: float = math.nan
     """Median of the valid pixels."""
@@ -81,7 +90,16 @@ class IndexStatistics:
 
 @dataclass(frozen=True)
 class IndexReport:
-    """One index of one capture."""
+    """One index of one capture.
+
+    Examples
+    --------
+    >>> report = agalign.indices("aligned", ["ndvi"])[0]
+    >>> report.capture, report.index, report.path.as_posix()
+    ('0000SET/000/IMG_0001', 'ndvi', 'aligned/0000SET/000/IMG_0001_ndvi.tif')
+    >>> report.raw_numbers, -1 < report.median < 1  # the run converted no bands to reflectance
+    (True, True)
+    """
 
     capture: str
     """Label of the capture: its folder, relative to the output folder of the run, and its name."""
