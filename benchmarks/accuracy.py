@@ -1,6 +1,6 @@
 """Error of every band next to the error that the run claims, for flights as they are and damaged, and time.
 
-    python benchmarks/accuracy.py DATA [SET ...] [--damage NAME,...] [--bands]
+    python benchmarks/accuracy.py DATA [SET ...] [--damage NAME,...] [--bands] [--figures]
 
 A set is a folder with images below DATA. The error is measured at reference tie points (`ties.json` in the folder); in
 damaged copies without them it is the distance from the mapping of the undamaged run, for bands that are aligned there.
@@ -19,6 +19,7 @@ import numpy as np
 import typer
 from bands.images import in_other_light
 from common import BandError, Ties, cell, print_head, print_row
+from figures_csv import FiguresOption, TableRow, title_of, write_figures
 from numpy.typing import NDArray
 
 from agalign import read_alignment
@@ -101,7 +102,7 @@ def print_bands(name: str, bands: list[BandError]) -> None:
         print_row(name, *what, *errors, beyond, claim, f"{row.part.seconds:.1f}")
 
 
-def summary(name: str, rows: list[BandError]) -> tuple[object, ...]:
+def summary(name: str, rows: list[BandError]) -> tuple[Any, ...]:
     aligned, usable = [r for r in rows if r.part.status == "aligned"], [r for r in rows if r.is_usable]
     medians, p95s = ([np.percentile(r.error_px, q) for r in aligned if len(r.error_px)] for q in (50, 95))
     pairs = [np.stack([r.error_px, r.claim_px]) for r in usable]
@@ -113,12 +114,26 @@ def summary(name: str, rows: list[BandError]) -> tuple[object, ...]:
     return name, *counts, *errors, *shares, cell([r.part.seconds for r in aligned], ".1f")
 
 
+def table_row(folder: Path, rows: list[BandError]) -> TableRow:
+    """Return the row of an undamaged flight in docs/figures/figures.csv."""
+    _, aligned, usable, wrong, median, worst, p95, within, *_ = summary("", rows)
+    heads = "aligned", "predicted, usable", "wrong", "median error, px", "worst pair, px", "95th percentile, px"
+    values = aligned.partition(" ")[0], usable, wrong, median, worst, p95
+    cells = {**dict(zip(heads, values, strict=True)), "within 2 standard errors, %": within.rstrip("%")}
+    return TableRow("accuracy", title_of(folder), f"{len(rows)} pairs", cells)
+
+
 def main(
-    data: Path, sets: Annotated[list[str] | None, typer.Argument()] = None, damage: str = "", *, bands: bool = False
+    data: Path,
+    sets: Annotated[list[str] | None, typer.Argument()] = None,
+    damage: str = "",
+    *,
+    bands: bool = False,
+    figures: FiguresOption = False,
 ) -> None:
     folders = sorted({p.parent for p in data.rglob("*") if p.suffix.lower() in (".tif", ".jpg", ".jpeg")})
     folders = [f for f in folders if (f.name in sets if sets else (f / "ties.json").exists())]
-    lines = []
+    lines, undamaged = [], []
     if bands:
         print_head("set", "band", "status", "geometry", "", "p50, px", "p68", "p90", "> 1 px", "claim", "seconds")
     for folder in folders:
@@ -137,11 +152,14 @@ def main(
             if bands:
                 print_bands(title, rows)
             lines.append(summary(title, rows))
+            undamaged += [] if name else [table_row(folder, rows)]
     print()
     shares = "error <= 2 claims", "claim < 0.3, error > 1"
     print_head("set", "aligned", "usable predictions", "wrong", "median, px", "worst", "95 %", *shares, "s per pair")
     for line in lines:
         print_row(*line)
+    if figures:
+        write_figures(undamaged, "DATA", [data])
 
 
 if __name__ == "__main__":

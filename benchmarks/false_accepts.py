@@ -1,6 +1,6 @@
 """Aligns synthetic pairs, about half of them without a correct alignment, and prints the number of wrong decisions.
 
-    python benchmarks/false_accepts.py [pairs, by default 200] [first] [--grids]
+    python benchmarks/false_accepts.py [pairs, by default 200] [first] [--grids] [--figures]
 
 The bad: two different fields, two captures of one field at different places, water (a moving texture of its own in
 each image), 8 % of overlap, a band that is almost all saturated, and one with a third of it displaced by 15 px. The
@@ -21,6 +21,7 @@ from typing import Any
 import cv2
 import numpy as np
 from common import WRONG_PX, Number, cell, print_head, print_row, run, timed
+from figures_csv import FiguresOption, TableRow, write_figures
 from numpy.typing import NDArray
 
 import agalign
@@ -159,7 +160,29 @@ def seeded_pair(kind: str, rng: np.random.Generator) -> Pair:
 # ---- decisions
 
 
-def main(count: Number = 200, first: Number = 0, *, grids: bool = False) -> None:
+SYNTHETIC, PLANTED = "synthetic pairs", "planted grids"
+GROUPS = {
+    "unchanged, or blur, noise, saturation, shift of 5 %": GOOD,
+    "another field or place, water, 8 % overlap, saturated, a third displaced": BAD,
+}
+GROUPS_OF_GRIDS = {
+    "no initial alignment": ("none",),
+    "initial alignment accurate to a sixth of a period": ("good",),
+    "initial alignment wrong by whole periods": ("bad",),
+}
+"""Kinds of pairs by the rows of docs/figures/figures.csv."""
+
+
+def table_row(table: str, name: str, pairs: list[tuple[str, float, float]]) -> TableRow:
+    """Return a row of decisions, which are (status, error in px, seconds)."""
+    errors_px = np.array([error_px for status, error_px, _ in pairs if status == "aligned"])
+    cells: dict[str, object] = {"aligned": len(errors_px), "wrong": int((~(errors_px <= WRONG_PX)).sum())}
+    if table == SYNTHETIC:
+        cells["worst error, px"] = cell(errors_px, ".2f", np.max)
+    return TableRow(table, name, f"{len(pairs)} pairs", cells)
+
+
+def main(count: Number = 200, first: Number = 0, *, grids: bool = False, figures: FiguresOption = False) -> None:
     kinds, pair_of = (("none", "good", "bad"), seeded_pair) if grids else ((*BAD, *GOOD, GRID), pair_with_error)
     rows: dict[str, list[tuple[str, float, float]]] = {kind: [] for kind in kinds}
     for number in range(first, first + count):
@@ -175,6 +198,10 @@ def main(count: Number = 200, first: Number = 0, *, grids: bool = False) -> None
         counts = [sum(status == one for status, *_ in some) for one in statuses]
         wrong, worst_px = sum(not error <= WRONG_PX for error in errors), max(errors, default=np.nan)
         print_row(kind, len(some), *counts, wrong, f"{worst_px:.2f}", cell([s for *_, s in some], ".1f"))
+    if figures:
+        table, groups = (PLANTED, GROUPS_OF_GRIDS) if grids else (SYNTHETIC, GROUPS)
+        grouped = {name: [pair for kind in kinds for pair in rows[kind]] for name, kinds in groups.items()}
+        write_figures([table_row(table, name, pairs) for name, pairs in grouped.items()])
 
 
 if __name__ == "__main__":

@@ -1,10 +1,11 @@
 """Results for bands without texture, and for captures over water, in an otherwise normal flight.
 
-    python benchmarks/lost_bands.py FLIGHT...
+    python benchmarks/lost_bands.py FLIGHT... [--figures]
 
 In one run each capture of the flight loses another band, to noise; in another one whole capture is water. The rows are
-of the lost bands. Errors are those at the reference tie points in ties.json. Without that file, they are the distances
-from the mappings of the undamaged run, and the damaged runs use its model.
+of the lost bands; the last one is of those that are predicted within --accept-predicted, which indices use. Errors are
+those at the reference tie points in ties.json. Without that file, they are the distances from the mappings of the
+undamaged run, and the damaged runs use its model.
 """
 
 from collections import defaultdict
@@ -19,7 +20,11 @@ import numpy as np
 from accuracy import ties_of
 from bands.images import without_scene
 from common import BandError, Ties
+from figures_csv import FiguresOption, TableRow, title_of, write_figures
 from numpy.typing import NDArray
+
+USABLE = "all with a standard error up to 1 px"
+"""Bands that indices use by default."""
 
 
 def water(pixels: NDArray[Any], rng: np.random.Generator) -> NDArray[Any]:
@@ -35,12 +40,23 @@ def losses(truth: Ties) -> Iterator[tuple[str, list[str], Any]]:
     for file, entry in truth.items():
         captures[entry["reference"]].append(file)
     for turn in range(max(map(len, captures.values()))):
-        yield "a band", [files[(turn + k) % len(files)] for k, files in enumerate(captures.values())], without_scene
+        lost = [files[(turn + k) % len(files)] for k, files in enumerate(captures.values())]
+        yield "one band of each capture", lost, without_scene
     for reference, files in captures.items():
-        yield "a capture", [reference, *files], water
+        yield "a whole capture", [reference, *files], water
 
 
-def main(flights: list[Path]) -> None:
+def table_row(name: str, bands: list[BandError]) -> TableRow:
+    """Return the row of a group: errors are medians over a band's tie points."""
+    errors_px, std_px = np.array([(b.median_px, b.std_px) for b in bands]).T
+    median_px, p95_px, worst_px = (f"{value:.2f}" for value in np.percentile(errors_px, (50, 95, 100)))
+    within = [f"{np.mean(errors_px <= times * std_px):.0%}".rstrip("%") for times in (1, 2)]
+    cells = {"median error, px": median_px, "95th percentile of bands, px": p95_px, "worst band, px": worst_px}
+    cells |= dict(zip(("within 1 standard error, %", "within 2, %"), within, strict=True))
+    return TableRow("predicted bands", name, f"{len(bands)} bands", cells)
+
+
+def main(flights: list[Path], *, figures: FiguresOption = False) -> None:
     rng, result = np.random.default_rng(0), defaultdict[str, list[BandError]](list)
     for flight in flights:
         truth, options = common.read_ties(flight / "ties.json"), list[str]()
@@ -55,8 +71,12 @@ def main(flights: list[Path]) -> None:
                         common.change_band(next(copy.rglob(file)), partial(change, rng=rng))
                     common.align(copy, out, *options)
                     known = {file: truth[file] for file in lost if file in truth}
-                    result[f"{flight.name}, {name}"] += common.band_errors(out, known)
+                    result[f"{title_of(flight)}: {name}"] += common.band_errors(out, known)
+    of_all = [band for bands in result.values() for band in bands]
+    result[USABLE] = [band for band in of_all if band.part.status == "predicted" and band.is_usable]
     common.print_errors(result)
+    if figures:
+        write_figures([table_row(name, bands) for name, bands in result.items()], "FLIGHT...", flights)
 
 
 if __name__ == "__main__":

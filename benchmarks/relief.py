@@ -1,6 +1,6 @@
 """Alignment of scenes with depth, against their exact geometry: terraces, plants and boxes from 1-2 m and from 20 m.
 
-    python benchmarks/relief.py [--scenes N] [--kinds flat,boxes] [--ranges close,far] [--size 640x480]
+    python benchmarks/relief.py [--scenes N] [--kinds flat,boxes] [--ranges close,far] [--size 640x480] [--figures]
     python benchmarks/relief.py --fooled N
 
 Each scene is one capture of a synthetic RedEdge in a folder of its own, aligned by the command line with its defaults.
@@ -22,6 +22,7 @@ import numpy as np
 import tifffile
 import typer
 from common import WRONG_PX, cell, layer, print_head, print_row
+from figures_csv import FiguresOption, TableRow, write_figures
 from numpy.typing import NDArray
 from peers import dis_flow
 from synthetic_flights.depth import BandTruth, Scene, Truth, write_capture
@@ -197,6 +198,25 @@ def print_table(scores: Sequence[Score]) -> None:
         print(f"  {s.place}, {s.band}, {s.method}: {off}")
 
 
+def table_rows(scores: Sequence[Score]) -> Iterator[TableRow]:
+    """Yield the rows of docs/figures/figures.csv: each kind of scene, and all of them by each other method."""
+    groups = {kind: [s for s in scores if (s.kind, s.method) == (kind, DEFAULT)] for kind in GEOMETRIES}
+    others = {START: "all, one homography per band", FLOW: "all, DIS optical flow"}
+    groups |= {name: [s for s in scores if s.method == method] for method, name in others.items()}
+    heads = {
+        "median error, px": ("median_px", ".3f"),
+        "p90, px": ("p90_px", ".2f"),
+        "beyond 1 px, %": ("beyond_1_px", ".1%"),
+        "error of the range, %": ("range_error", ".2%"),
+    }
+    for name, some in ((name, some) for name, some in groups.items() if some):
+        aligned = sum(s.status == "aligned" for s in some) if some[0].method == DEFAULT else "-"
+        values = {
+            head: cell([getattr(s, field) for s in some], style).rstrip("%") for head, (field, style) in heads.items()
+        }
+        yield TableRow("scenes with depth", name, f"{len(some)} bands", {"aligned": aligned, **values})
+
+
 def main(
     scenes: int = 2,
     kinds: str = ",".join(GEOMETRIES),
@@ -204,7 +224,11 @@ def main(
     size: str = "640x480",
     fooled: Annotated[int, typer.Option(help="count wrong bands on this number of fooling scenes")] = 0,
     first: Annotated[int, typer.Option(help="number of the first scene")] = 0,
+    *,
+    figures: FiguresOption = False,
 ) -> None:
+    if figures and fooled:
+        sys.exit("--figures writes no figures of --fooled; omit one of them")
     width_px, height_px = map(int, size.split("x"))
     methods = [DEFAULT] if fooled else [DEFAULT, START, FLOW]
     if fooled:
@@ -220,6 +244,8 @@ def main(
         print(f"{blank.place}: {statuses}", file=sys.stderr, flush=True)
         scores += result
     print_table(scores)
+    if figures:
+        write_figures(table_rows(scores))
 
 
 if __name__ == "__main__":

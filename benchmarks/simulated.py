@@ -1,6 +1,6 @@
 """Errors of synthetic flights at their true ties: with and without faults, and of cameras without public ground truth.
 
-    python benchmarks/simulated.py FLIGHT... [--captures N] [--rng-seed N]
+    python benchmarks/simulated.py FLIGHT... [--captures N] [--rng-seed N] [--figures]
 
 FLIGHT is one of plain, troubled, "two headings" (a camera that exposes its bands one after another, and lakes), mavic,
 mavic-3m, altum, altum-pt, 6x. Bands are grouped by the fault of their capture; without faults by name, with errors in
@@ -18,6 +18,7 @@ from pathlib import Path
 import common
 import numpy as np
 from common import BandError, Ties, print_head, print_row
+from figures_csv import FiguresOption, TableRow, write_figures
 from synthetic_flights.cameras import ALTUM, ALTUM_PT, MAVIC, MAVIC_3M, SENTERA_6X
 from synthetic_flights.troubles import make_troubled_flight, make_two_headings
 
@@ -51,6 +52,21 @@ FLIGHTS: dict[str, Flight] = {
 }
 
 
+TROUBLED = {
+    "none": "not degraded",
+    "panel": "calibration panel in the image",
+    **dict.fromkeys(("take-off", "landing"), "take-off, landing"),
+    "a lake": "lake",
+    "blur, 3 px": "blur 3 px",
+    "motion, 25 px": "motion 25 px",
+    "noise, 30 %": "noise 30 %",
+    **dict.fromkeys(("no NIR", "NIR lost", "Blue lost"), "a band missing or lost"),
+}
+TWO_HEADINGS = {"none": "bands exposed 25 ms apart, field", "a lake": "bands exposed 25 ms apart, water"}
+"""Rows of docs/figures/figures.csv by faults; that of another fault is named after it."""
+MODELS = {"mavic": "Mavic 3M", "mavic-3m": "Mavic 3M", "altum": "Altum", "altum-pt": "Altum-PT", "6x": "6X"}
+
+
 def by_fault(bands: list[BandError], truth: Ties) -> dict[str, list[BandError]]:
     groups = defaultdict[str, list[BandError]](list)
     for band in bands:
@@ -71,8 +87,53 @@ def by_band(bands: list[BandError], camera: CameraSpec) -> dict[str, list[BandEr
     return groups
 
 
-def print_corners(out: Path, truth: Ties) -> None:
-    """Print a table of the errors at the corners and their standard deviations."""
+def rows_of_faults(groups: dict[str, list[BandError]], names: dict[str, str]) -> list[TableRow]:
+    """Return the rows of faults in docs/figures/figures.csv."""
+    pooled = defaultdict[str, list[BandError]](list)
+    for fault, bands in groups.items():
+        pooled[names.get(fault, fault)] += bands
+    rows = []
+    for name, bands in pooled.items():
+        cells = {one: sum(b.part.status == one for b in bands) for one in ("aligned", "predicted")}
+        errors_px = [b.median_px for b in bands]
+        cells |= {"median error, px": f"{np.median(errors_px):.3f}", "worst band, px": f"{max(errors_px):.3f}"}
+        rows.append(TableRow("difficult captures", name, f"{len(bands)} bands", cells))
+    return rows
+
+
+def rows_of_cameras(by_camera: dict[str, list[BandError]]) -> list[TableRow]:
+    """Return the rows of cameras in docs/figures/figures.csv: all narrow bands, and each other kind of a camera."""
+    narrow, others = list[list[float]](), defaultdict[str, list[tuple[float, float, str]]](list)
+    for flight, bands in by_camera.items():
+        camera = FLIGHTS[flight][1]
+        for spec in camera.bands:
+            scale = spec.size_ratio[0] / spec.view * camera.bands[camera.reference].view
+            own = [b for b in bands if b.part.band == spec.name]
+            kind = {"colour": "colour photograph", "heat": "thermal band"}.get(spec.sees)
+            kind = kind or ("panchromatic band" if spec.size_ratio[0] > 1 else None)
+            if kind and own:
+                others[f"{kind}, {MODELS[flight]}"] += [
+                    (b.median_px / scale, b.median_px, b.sidecar.capture) for b in own
+                ]
+            elif own:
+                narrow.append([b.median_px / scale for b in own])
+    medians, worst_px = [np.median(errors_px) for errors_px in narrow], max(map(max, narrow))
+    heads = [f"{what}, {px}, px" for px in ("reference", "band") for what in ("median error", "worst capture")]
+    values = f"{min(medians):.3f} to {max(medians):.3f}", f"{worst_px:.3f}", "-", "-"
+    *first, last = dict.fromkeys(MODELS[flight] for flight in by_camera)
+    name = "narrow bands of " + (f"{', '.join(first)} and {last}" if first else last)
+    rows = [
+        TableRow("simulated cameras", name, f"{sum(map(len, narrow))} bands", dict(zip(heads, values, strict=True)))
+    ]
+    for name, errors in others.items():
+        captures = len({capture for *_, capture in errors})
+        values = [f"{statistic([e[k] for e in errors]):.3f}" for k in (0, 1) for statistic in (np.median, np.max)]
+        rows.append(TableRow("simulated cameras", name, f"{captures} captures", dict(zip(heads, values, strict=True))))
+    return rows
+
+
+def print_corners(out: Path, truth: Ties) -> TableRow:
+    """Print a table of the errors at the corners and their standard deviations; return its last row for the figures."""
     bands = defaultdict[str, list[np.ndarray]](list)
     for sidecar in map(read_sidecar, find_sidecars(out)):
         corners = geometry.corners(sidecar.reference.width, sidecar.reference.height)
@@ -88,10 +149,15 @@ def print_corners(out: Path, truth: Ties) -> None:
     for name, some in bands.items():
         error, std = np.concatenate(some, axis=1).reshape(2, -1)
         within = [f"{(error <= times * std).mean():.0%}" for times in (1, 1.96)]
-        print_row(name, error.size, *within, *(f"{np.sqrt((values**2).mean()):.3f}" for values in (error, std)))
+        rms_px = [f"{np.sqrt((values**2).mean()):.3f}" for values in (error, std)]
+        print_row(name, error.size, *within, *rms_px)
+    heads = "within 1 standard error, %", "within 1.96, %", "RMS error, px", "RMS standard error, px"
+    cells = dict(zip(heads, (*(share.rstrip("%") for share in within), *rms_px), strict=True))
+    return TableRow("standard errors", "errors at corners, along each axis", f"{error.size} errors", cells)
 
 
-def main(flights: list[str], captures: int = 0, rng_seed: int = 0) -> None:
+def main(flights: list[str], captures: int = 0, rng_seed: int = 0, *, figures: FiguresOption = False) -> None:
+    rows, by_camera = list[TableRow](), dict[str, list[BandError]]()
     for name in flights:
         make, camera, usual = FLIGHTS[name]
         count = captures or usual
@@ -103,7 +169,13 @@ def main(flights: list[str], captures: int = 0, rng_seed: int = 0) -> None:
             has_faults = any(entry["trouble"] for entry in truth.values())
             common.print_errors(by_fault(bands, truth) if has_faults else by_band(bands, camera))
             if name == "plain":
-                print_corners(out, truth)
+                rows.append(print_corners(out, truth))
+            elif has_faults:
+                rows += rows_of_faults(by_fault(bands, truth), TROUBLED if name == "troubled" else TWO_HEADINGS)
+            else:
+                by_camera[name] = bands
+    if figures:
+        write_figures([*rows, *(rows_of_cameras(by_camera) if by_camera else ())])
 
 
 if __name__ == "__main__":

@@ -1,6 +1,6 @@
 """Time of a run on one core, and of SIFT + RANSAC on the same images.
 
-    python benchmarks/speed.py FLIGHT... [--degraded]
+    python benchmarks/speed.py FLIGHT... [--degraded] [--figures]
     python benchmarks/speed.py FLIGHT... --stages
     python benchmarks/speed.py FLIGHT... --floor
 
@@ -29,6 +29,7 @@ import rasterio
 import torch
 from bands.images import in_other_light
 from common import command, ended, flight_and_out, print_head, print_row, read_band, run, timed, write_band
+from figures_csv import FiguresOption, TableRow, title_of, write_figures
 from peers import sift
 
 from agalign import Settings, WriteSettings, read_alignment
@@ -77,8 +78,8 @@ def runs(flight: Path) -> list[tuple[float, Events]]:
         return [first, run_alone(*command(flight, again, *LOGGED, *with_model[:2]))]
 
 
-def print_flight(folder: Path, captures: list[Capture]) -> None:
-    """Print medians over the captures of a flight."""
+def print_flight(folder: Path, captures: list[Capture]) -> TableRow:
+    """Print medians over the captures of a flight, and return them for the figures."""
     (_, without), (_, with_model) = runs(folder)
     first_s, again_s = (median(e["seconds"] for e in events["capture"]) for events in (without, with_model))
     sift_s = median(sift_seconds(c, len(c.moving), 5000) for c in captures)
@@ -86,6 +87,9 @@ def print_flight(folder: Path, captures: list[Capture]) -> None:
     aligned = "{aligned} of {pairs}".format(**with_model["capture"][0])
     cells = [f"{s:.1f}" for s in times_s] + [f"{s / sift_s:.2f}" for s in times_s[:2]]
     print_row(folder.name, len(captures), aligned, *cells)
+    heads = "without a model, s", "with a model, s", "SIFT + RANSAC, s"
+    n = f"{len(captures)} capture{'s' if len(captures) > 1 else ''}"
+    return TableRow("captures with depth", title_of(folder), n, dict(zip(heads, cells[:3], strict=True)))
 
 
 def print_degraded(captures: list[Capture]) -> None:
@@ -180,7 +184,16 @@ def print_floor(flight: Path, captures: list[Capture]) -> None:
         print_row(flight.name, name, f"{median(some):.2f}", f"{median(some) / floor:.1f}")
 
 
-def main(flights: list[Path], *, stages: bool = False, degraded: bool = False, floor: bool = False) -> None:
+def main(
+    flights: list[Path],
+    *,
+    stages: bool = False,
+    degraded: bool = False,
+    floor: bool = False,
+    figures: FiguresOption = False,
+) -> None:
+    if figures and (stages or floor):
+        sys.exit("--figures writes no figures of --stages and --floor; omit them")
     cv2.setNumThreads(1)
     captures = {flight: discover(flight).captures for flight in flights}
     if floor:
@@ -195,8 +208,9 @@ def main(flights: list[Path], *, stages: bool = False, degraded: bool = False, f
         return
     times = "without a model, s a capture", "with a model", "SIFT + RANSAC", "without / SIFT", "with / SIFT"
     print_head("flight", "captures", "aligned in the first", *times)
-    for flight in flights:
-        print_flight(flight, captures[flight])
+    rows = [print_flight(flight, captures[flight]) for flight in flights]
+    if figures:
+        write_figures(rows, "FLIGHT...", flights)
     if degraded:
         print(f"\nThe first capture of {flights[0].name}:\n", flush=True)
         print_degraded(captures[flights[0]])

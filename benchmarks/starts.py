@@ -1,6 +1,6 @@
 """Success of methods by initial shift, rotation and scale of the moving band, without tags.
 
-    pip install -e '.[bench]' && python benchmarks/starts.py DATA... [--pairs 3] [--plot FILE]
+    pip install -e '.[bench]' && python benchmarks/starts.py DATA... [--pairs 3] [--plot FILE] [--figures]
 
 DATA holds flights with `ties.json` or `truth.json` (benchmarks/accuracy.py says how); of each, and of a synthetic
 flight, so many pairs are taken. The moving band is shifted within its frame by a share of its width, then turned and
@@ -17,6 +17,7 @@ import cv2
 import numpy as np
 from bands import images
 from common import WRONG_PX, cell, heat_map, print_head, print_row, pyplot, read_ties, run, timed
+from figures_csv import FiguresOption, TableRow, write_figures
 from numpy.typing import NDArray
 from peers import elastix, sift
 
@@ -94,8 +95,16 @@ def chosen(folder: Path, count: int) -> Iterator[tuple[Raster, Raster, NDArray[n
         yield fixed, moving, np.hstack(ties)
 
 
-def main(data: list[Path], pairs: int = 3, methods: str = ";".join(METHODS), plot: Path | None = None) -> None:
+def main(
+    data: list[Path],
+    pairs: int = 3,
+    methods: str = ";".join(METHODS),
+    plot: Path | None = None,
+    *,
+    figures: FiguresOption = False,
+) -> None:
     shares: Shares = {name: {} for name in methods.split(";")}
+    counts = {name: np.zeros(3, int) for name in shares}
     kind = "method", "shift", "turn", "scale"
     print_head(*kind, "found", "median, px", "worst sure, px", "wrong though sure", "s")
     with tempfile.TemporaryDirectory() as folder:
@@ -110,11 +119,19 @@ def main(data: list[Path], pairs: int = 3, methods: str = ";".join(METHODS), plo
         off, sure, seconds = map(np.array, zip(*rows, strict=True))
         hit = off <= FOUND_PX
         of_method[start] = float(hit.mean())
+        counts[name] += len(hit), hit.sum(), (sure & (off > WRONG_PX)).sum()
         errors = cell(off, ".3f"), cell(off[sure], ".2f", np.max), (sure & (off > WRONG_PX)).sum(), cell(seconds, ".1f")
         moved_by = f"{start[0]:.0%}", f"{start[1]:g}°", f"{start[2]:g}"
         print_row(name, *moved_by, f"{hit.sum()} of {len(hit)}", *errors)
     if plot is not None:
         draw(shares, plot)
+    if figures:
+        heads = f"median error up to {FOUND_PX:g} px", f"wrong by more than {WRONG_PX:g} px"
+        rows = [
+            TableRow("starts", name, f"{n} starts", dict(zip(heads, found_and_wrong, strict=True)))
+            for name, (n, *found_and_wrong) in counts.items()
+        ]
+        write_figures(rows, "DATA...", data)
 
 
 def draw(shares: Shares, path: Path) -> None:

@@ -1,7 +1,7 @@
 """Coverage-guided fuzzing of what is read from a card: tags, XMP packets, and the names of files.
 
     pip install atheris
-    python tools/fuzz.py [--inputs 200000] [--markdown FILE]
+    python tools/fuzz.py [--inputs 200000] [--figures]
     python tools/fuzz.py --target xmp --inputs 10000       one target, with libFuzzer's own output
 
 An input fails where anything but an AgalignError is raised, where it takes longer than a second, or where the process
@@ -25,6 +25,8 @@ import tifffile
 import typer
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "benchmarks"))
+
+from figures_csv import FiguresOption, TableRow, write_figures
 
 SHARES = {"xmp": 0.5, "tags": 0.35, "names": 0.15}
 MAX_SECONDS, MAX_MEGABYTES = 1, 500
@@ -125,11 +127,14 @@ def main(
     inputs: int = 200_000,
     target: Literal["xmp", "tags", "names"] | None = None,
     corpus: Path | None = None,
-    markdown: Path | None = None,
     libfuzzer: Annotated[list[str] | None, typer.Argument(help="options and files for libFuzzer")] = None,
+    *,
+    figures: FiguresOption = False,
 ) -> None:
-    from common import report, timed
+    from common import timed
 
+    if figures and target:
+        sys.exit("--figures writes the figures of all targets; omit --target")
     if target and corpus:
         fuzz(target, corpus, [f"-runs={inputs}", *(libfuzzer or ())])
     with tempfile.TemporaryDirectory() as folder:
@@ -139,7 +144,10 @@ def main(
             seconds, (part, error) = timed(fuzz_in_process, one, round(inputs * share), Path(folder, one))
             parts.append(part.format(seconds=round(seconds)))
             errors += [error] if error else []
-        report("fuzz", markdown, f"Inputs: {', '.join(parts)}.")
+        print(f"Inputs: {', '.join(parts)}.")
+        if figures:
+            name = "random tags, XMP and file names"
+            write_figures([TableRow("reliability", name, f"{inputs:,} inputs", {"failures": len(errors)})])
         if errors:
             raise SystemExit("\n".join(errors))
 

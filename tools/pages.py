@@ -47,7 +47,7 @@ TABLES = {
         "captures with depth",
     ),
     "failures": ("synthetic pairs", "planted grids", "starts", "difficult captures", "predicted bands"),
-    "comparison": ("comparison",),
+    "comparison": ("comparison", "comparison on published sets"),
     "verification": ("reliability",),
 }
 """Tables of `figures.csv` by page of docs/explanation."""

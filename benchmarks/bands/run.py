@@ -1,11 +1,13 @@
 """Runs methods on the band pairs of the sets that are on disk, and scores what they claim.
 
-    pip install -e '.[bench]' && python benchmarks/bands/run.py DATA [-o results.csv] [--plot FILE]
+    pip install -e '.[bench]' && python benchmarks/bands/run.py DATA [-o results.csv] [--plot FILE] [--figures]
         [--methods 'SIFT + RANSAC;mine.py:align'] [--sets p4m_forest,...] [--variants 'as it is,turn 10,...']
 
 DATA is any folder: images are recognised by their checksums, and missing sets are listed with their publisher. Each
 method runs in a process of its own with as many threads as it takes; one that raises has refused the pair. Scores are
-written to -o, and as tables next to it (.md); the mapping of each pair to --mappings, in the format of score.py.
+written to -o, and as tables next to it (.md); the mapping of each pair to --mappings, in the format of score.py. With
+--figures, those of the methods that were run also replace the scores of these methods in results.csv next to this file,
+from which the comparison in docs/figures/figures.csv is counted.
 """
 
 import csv
@@ -29,6 +31,7 @@ import typer
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # run as a file, its package is not found
 
 from common import align, flight_and_out, heat_map, pyplot, run, timed, write_band
+from figures_csv import FiguresOption, TableRow, write_figures
 from peers import METHODS, Align, grey_raster, method_named
 
 from agalign.cameras.discover import discover
@@ -45,6 +48,11 @@ from bands.score import AS_IT_IS, Pair, Score, Scored, summary, table
 WHOLE = {"agalign, capture": (), "agalign, capture, no tags": ("--ignore-metadata",)}
 """Runs of the command line on a whole flight, with its files and tags: options by name."""
 ALL_METHODS = (*METHODS, *WHOLE)
+RESULTS = Path(__file__).with_name("results.csv")
+COMMAND = "python benchmarks/bands/run.py DATA"
+"""Runs of some methods add up to this one."""
+SHORT = "agalign, pair", "SIFT + RANSAC", "ECC on gradients", "agalign, capture"
+"""Methods in the table of the published sets."""
 Row = dict[str, Any]
 _FIELDS = ("method", "set", "capture", "file", "variant", "claimed", "seconds", "homography", "grid")
 
@@ -247,6 +255,34 @@ def write_mappings(rows: Iterable[Row], path: Path) -> None:
             writer.writerow({k: json.dumps(v) if k in ("homography", "grid") else v for k, v in row.items()})
 
 
+# ---- figures
+
+
+def replace_scores(path: Path, scores: Sequence[Score]) -> list[Score]:
+    """Replace the scores of some methods in a file, keep those of others and the order, and return all."""
+    by_method: dict[str, list[Score]] = {}
+    for s in score.read_scores(path):
+        by_method.setdefault(s.method, []).append(s)
+    by_method |= {method: [s for s in scores if s.method == method] for method in {s.method: s for s in scores}}
+    result = [s for some in by_method.values() for s in some]
+    score.write_csv(result, path)
+    return result
+
+
+def comparison(scores: Sequence[Score], sets: Mapping[str, Any]) -> Iterable[TableRow]:
+    """Yield the rows of methods on all sets, and on the published ones; the identity aligns nothing."""
+    published = [s for s in scores if "repository" in sets[s.set]["published"] and s.method in SHORT]
+    for name, some in (("comparison", scores), ("comparison on published sets", published)):
+        for method in {s.method: s for s in some if s.method != "identity"}:
+            own = [s for s in some if s.method == method]
+            cells = {
+                "accepted": sum(s.claimed for s in own),
+                "wrong by more than 1 px": sum(s.wrong_claims for s in own),
+                "accepted within 0.5 px": sum(round(s.under_half_px * s.pairs) for s in own),
+            }
+            yield TableRow(name, method, f"{sum(s.pairs for s in own)} pairs", cells)
+
+
 def main(
     data: Path,
     output: Annotated[Path, typer.Option("-o", "--output")] = Path("results.csv"),
@@ -256,7 +292,11 @@ def main(
     jobs: Annotated[int, typer.Option(help="methods at a time; above one, seconds mean little")] = 1,
     mappings: Path | None = None,
     plot: Path | None = None,
+    *,
+    figures: FiguresOption = False,
 ) -> None:
+    if figures and (sets or variants != ",".join(VARIANTS)):
+        sys.exit("--figures needs all sets and variants; omit --sets and --variants")
     known = score.read_sets()
     if sets:
         known = {name: known[name] for name in sets.split(",")}
@@ -275,6 +315,8 @@ def main(
         write_mappings(rows, mappings)
     scored = score.score_pairs(rows, known)
     score.write_csv(summary(scored), output)
+    if figures:
+        write_figures(comparison(replace_scores(RESULTS, summary(scored)), known), command=COMMAND)
     text = tables(scored, {name: gigabytes for name, (some, gigabytes) in result.items() if some})
     output.with_suffix(".md").write_text(text, encoding="utf-8")
     print(text)

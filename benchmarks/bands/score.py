@@ -285,6 +285,13 @@ def write_csv(scores: Sequence[Score], path: Path) -> None:
         writer.writerows([_cell(v, 4) for v in astuple(s)] for s in scores)
 
 
+def read_scores(path: Path) -> list[Score]:
+    """Return the scores in a file of `write_csv`."""
+    kinds = {f.name: f.type for f in fields(Score)}
+    with path.open(encoding="utf-8", newline="") as file:
+        return [Score(**{k: kinds[k](v or "nan") for k, v in row.items()}) for row in csv.DictReader(file)]
+
+
 def table(rows: Sequence[Sequence[object]]) -> str:
     """Return a Markdown table; the first row is the head."""
     cells = [[str(cell).replace("|", "\\|").replace("\n", " ") for cell in row] for row in rows]

@@ -1,7 +1,7 @@
 """A Dask cluster on this machine that loses one of its two worker processes half-way: is every capture done, and are
 the files equal to those of a run without a cluster?
 
-    python benchmarks/reliability/cluster.py [--captures 40] [--markdown FILE]
+    python benchmarks/reliability/cluster.py [--captures 40] [--figures]
 """
 
 import json
@@ -14,7 +14,8 @@ import psutil
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from common import align, command, ended, flight_and_out, report, run
+from common import align, command, ended, flight_and_out, run
+from figures_csv import FiguresOption, TableRow, write_figures
 from kills import differences, snapshot
 
 from agalign.products.sidecar.file import find_sidecars
@@ -29,7 +30,7 @@ def dask(program: str, address_file: Path, *arguments: str) -> psutil.Popen:
     return psutil.Popen([*module, "--no-dashboard", *arguments], **quiet)
 
 
-def main(captures: int = 40, markdown: Path | None = None) -> None:
+def main(captures: int = 40, *, figures: FiguresOption = False) -> None:
     with flight_and_out() as (flight, out):
         alone, address_file = (out.with_name(name) for name in ("alone", "scheduler.json"))
         synthetic.make_flight(flight, captures, SIZE_PX, rng_seed=5)
@@ -58,15 +59,19 @@ def main(captures: int = 40, markdown: Path | None = None) -> None:
             for one in processes:
                 one.terminate()
         result = differences(out, snapshot(alone))
-        report(
-            "cluster",
-            markdown,
+        finished = len(find_sidecars(out))
+        print(
             f"{captures} captures of {SIZE_PX[0]} x {SIZE_PX[1]} on a scheduler and two worker processes; one, "
             f"with its nanny, killed by SIGKILL when {done} captures were done: exit code {ending.code}, "
-            f"{len(find_sidecars(out))} captures done in {ending.seconds:.0f} s (a run on this machine's two cores "
+            f"{finished} captures done in {ending.seconds:.0f} s (a run on this machine's two cores "
             f"without a cluster: {alone_s:.0f} s). Files compared with that run: {result['missing']} missing, "
-            f"{result['left over']} left over, {result['corrupt']} corrupt, {result['different']} different.",
+            f"{result['left over']} left over, {result['corrupt']} corrupt, {result['different']} different."
         )
+    if figures:
+        # A capture that is not done has missing files.
+        failures = result.total() + (ending.code != 0)
+        name = "Dask cluster that loses one of two workers"
+        write_figures([TableRow("reliability", name, f"{captures} captures", {"failures": failures})])
 
 
 if __name__ == "__main__":

@@ -2,12 +2,12 @@
 must not be left out, and images that are hard to search for panels and relief.
 
     python benchmarks/reliability/inputs.py [--images 60] [--changes 40] [--captures 500] [--data FOLDER]
-        [--markdown FILE]
+        [--figures]
 
 Each file of a strange capture is in a sidecar or in a message. An index is that of an undisturbed run, or a message
 names its capture. The captures of `--data` are cropped,
 darkened and turned, in a folder named after the sky: none is one of the sky or of a panel. A search hangs that takes
-over three times as long as in a texture of the same size.
+over three times the CPU time of a texture of the same size.
 """
 
 import os
@@ -31,7 +31,8 @@ from numpy.typing import NDArray
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from common import command, ended, read_band, report, run, timed
+from common import command, ended, read_band, run, table, timed
+from figures_csv import FiguresOption, TableRow, write_figures
 from kills import HUNG_S, contents
 from synthetic_flights.aligned import make_aligned
 
@@ -50,6 +51,14 @@ Writer = Callable[[Path, Image], object]
 
 
 FAULTS = "tracebacks", "silent losses", "hangs"
+ROWS = {
+    "images": "images of unusual formats and sizes",
+    "rasters that change": "rasters that change while indices are computed",
+    "ordinary captures": "ordinary captures mistaken for panel or sky",
+    "search for a panel": "images that are slow to search for a panel",
+    "relief": "images that are slow to search for parallax",
+}
+"""Names of the attacks in docs/figures/figures.csv."""
 
 
 @dataclass
@@ -57,6 +66,7 @@ class Attack:
     """A row of the table."""
 
     name: str
+    unit: str
     tried: int = 0
     worst_s: float = 0.0
     faults: Counter[str] = field(default_factory=Counter)
@@ -137,7 +147,7 @@ def write_strange(folder: Path, number: int, rng: np.random.Generator) -> None:
 
 
 def attack_images(count: int, rng: np.random.Generator, folder: Path) -> Iterator[Attack]:
-    result, model = Attack("images", count), []
+    result, model = Attack("images", "images", count), []
     for first in range(-9, count, 9):
         flight, out = folder / f"flight{first}", folder / f"out{first}"
         flight.mkdir()
@@ -161,7 +171,7 @@ def attack_images(count: int, rng: np.random.Generator, folder: Path) -> Iterato
 
 def attack_rasters(count: int, rng: np.random.Generator, folder: Path) -> Iterator[Attack]:
     """Change a third of the stacks at random times of `agalign indices`."""
-    result, captures = Attack("rasters that change"), 12
+    result, captures = Attack("rasters that change", "rasters"), 12
     aligned, out, expected = folder / "aligned", folder / "indices", {}
     make_aligned(aligned, captures, (1600, 1200))
     while result.tried < count:
@@ -215,7 +225,7 @@ def exclusion(capture: Capture) -> str:
 
 def attack_exclusions(count: int, rng: np.random.Generator, folder: Path, data: Path) -> Iterator[Attack]:
     """Derive captures from those of the data that are neither of the sky nor of a panel."""
-    result = Attack("ordinary captures", count)
+    result = Attack("ordinary captures", "captures", count)
     found = [c for part in ("captures", "flights") for c in discover(data / part).captures]
     ordinary = [c for c in with_panels(sky_captures(found)[1]) if c.panel is None]
     for number in range(count):
@@ -250,11 +260,18 @@ def relief(image: Raster) -> object:
     return DenseMatching(image, views, (-4.0, 4.0)).matched(range(2))
 
 
+def cpu_seconds(function: Callable[[Raster], object], image: Raster) -> float:
+    """Return the CPU time of a call, to which other programs add nothing."""
+    began_s = time.process_time()
+    function(image)
+    return time.process_time() - began_s
+
+
 def attack_searches(rng: np.random.Generator) -> Iterator[Attack]:
     for name, function in (("search for a panel", lambda i: find_panel(i, without_code=True)), ("relief", relief)):
         images = {k: np.asarray(pixels, np.float32) for k, pixels in hostile((1600, 1200), rng).items()}
-        seconds = {k: timed(function, Raster(i, np.isfinite(i), None))[0] for k, i in images.items()}
-        result, normal_s = Attack(name, len(images), worst_s=max(seconds.values())), seconds["texture 1"]
+        seconds = {k: cpu_seconds(function, Raster(i, np.isfinite(i), None)) for k, i in images.items()}
+        result, normal_s = Attack(name, "images", len(images), worst_s=max(seconds.values())), seconds["texture 1"]
         for kind, s in seconds.items():
             if s > 3 * normal_s:
                 result.count("hangs", f"{kind}: {s:.2f} s, {s / normal_s:.1f} times as long as a texture")
@@ -262,20 +279,28 @@ def attack_searches(rng: np.random.Generator) -> Iterator[Attack]:
 
 
 def main(
-    images: int = 60, changes: int = 40, captures: int = 500, data: Path | None = None, markdown: Path | None = None
+    images: int = 60,
+    changes: int = 40,
+    captures: int = 500,
+    data: Path | None = None,
+    *,
+    figures: FiguresOption = False,
 ) -> None:
     rng = np.random.default_rng(0)
     warnings.simplefilter("ignore")
-    rows = [("attack", "tried", *FAULTS, "worst, s")]
+    head = "attack", "tried", *FAULTS, "worst, s"
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         attacks = [attack_searches(rng), attack_rasters(changes, rng, folder), attack_images(images, rng, folder)]
         if data:
             attacks.append(attack_exclusions(captures, rng, folder, data))
-        for row in chain(*attacks):
-            rows.append((row.name, row.tried, *(row.faults[kind] for kind in FAULTS), f"{row.worst_s:.2f}"))
-            print(rows[-1], flush=True)
-    report("inputs", markdown, rows)
+        done = list(chain(*attacks))
+    print(table([head, *((a.name, a.tried, *(a.faults[kind] for kind in FAULTS), f"{a.worst_s:.2f}") for a in done)]))
+    if figures:
+        rows = [
+            TableRow("reliability", ROWS[a.name], f"{a.tried} {a.unit}", {"failures": a.faults.total()}) for a in done
+        ]
+        write_figures(rows, "DATA", [data] if data else [])
 
 
 if __name__ == "__main__":

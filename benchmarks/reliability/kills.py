@@ -1,7 +1,7 @@
 """Send a signal to a run at random moments, run the same command again, and compare with an undisturbed run.
 
     python benchmarks/reliability/kills.py [--kills 50] [--modes "one job,two jobs,Dask,indices"]
-        [--signals SIGKILL,SIGTERM,SIGINT,SIGHUP,SIGSTOP] [--captures 12] [--markdown FILE]
+        [--signals SIGKILL,SIGTERM,SIGINT,SIGHUP,SIGSTOP] [--captures 12] [--figures]
 
 The synthetic flight, `--layout both` with an error map and tie points, so that every kind of file is at stake; and
 `agalign indices` on five times as many aligned captures. `--kills` is the number for each mode. Moments are drawn
@@ -27,7 +27,8 @@ import psutil
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from common import command, ended, report, run
+from common import command, ended, run, table
+from figures_csv import FiguresOption, TableRow, write_figures
 from synthetic_flights.aligned import make_aligned
 
 from agalign.products.sidecar.file import find_sidecars, verify_outputs
@@ -126,7 +127,8 @@ def main(
     signals: str = "SIGKILL",
     captures: int = 12,
     rng_seed: int = 0,
-    markdown: Path | None = None,
+    *,
+    figures: FiguresOption = False,
 ) -> None:
     rng = random.Random(rng_seed)
     rows = [("run", "signals to", "signals", "while it ran", "seconds of a run", "faults")]
@@ -165,8 +167,12 @@ def main(
                 counts[target] += here + Counter(strikes=1, faults=sum(wrong.values()))
             for target, n in counts.items():
                 rows.append((mode, target, n["strikes"], n["hit"], f"{whole.seconds:.0f}", n["faults"]))
-    report("kills", markdown, rows)
-    if any(faults for *_, faults in rows[1:]):
+    print(table(rows))
+    sent, failures = (sum(row[column] for row in rows[1:]) for column in (2, -1))
+    if figures:
+        name = "signals at random moments of a run, then the same command again"
+        write_figures([TableRow("reliability", name, f"{sent} signals", {"failures": failures})])
+    if failures:
         raise SystemExit("something is wrong")
 
 

@@ -1,6 +1,6 @@
 """Limit the address space of a run, as `ulimit -v` does, from too little to load the libraries to enough.
 
-    python benchmarks/reliability/memory_limits.py [--from 1.0] [--to 2.0] [--step 0.05] [--markdown FILE]
+    python benchmarks/reliability/memory_limits.py [--from 1.0] [--to 2.0] [--step 0.05] [--figures]
 
 A run must finish, or end within a minute with a line that gives the reason. Linux only.
 """
@@ -18,7 +18,8 @@ import typer
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from common import command, ended, flight_and_out, report, run
+from common import command, ended, flight_and_out, run, table
+from figures_csv import FiguresOption, TableRow, write_figures
 
 from agalign.synthetic import flight as synthetic
 
@@ -48,7 +49,8 @@ def main(
     first_gb: Annotated[float, typer.Option("--from")] = 1.0,
     last_gb: Annotated[float, typer.Option("--to")] = 2.0,
     step_gb: Annotated[float, typer.Option("--step")] = 0.05,
-    markdown: Path | None = None,
+    *,
+    figures: FiguresOption = False,
 ) -> None:
     rows: dict[tuple[str, str], list[tuple[float, float]]] = defaultdict(list)
     with flight_and_out() as (flight, out):
@@ -62,12 +64,17 @@ def main(
                 how, line, seconds = run_within(limit_gb, flight, new, "-j", str(jobs), *workers)
                 print(f"-j {jobs} {limit_gb:.2f} GB: {how}, {seconds:.1f} s: {line}", flush=True)
                 rows[how, line].append((limit_gb, seconds))
-    table = [("limit, GB", "runs", "slowest, s", "how it ended", "first line")]
+    lines = [("limit, GB", "runs", "slowest, s", "how it ended", "first line")]
     for (how, line), seen in rows.items():
         limits_gb, seconds_of = zip(*seen, strict=True)
         ends = dict.fromkeys(f"{gb:.2f}" for gb in (min(limits_gb), max(limits_gb)))
-        table.append((" to ".join(ends), len(seen), f"{max(seconds_of):.0f}", how, line))
-    report("memory limits", markdown, table)
+        lines.append((" to ".join(ends), len(seen), f"{max(seconds_of):.0f}", how, line))
+    print(table(lines))
+    if figures:
+        runs = sum(map(len, rows.values()))
+        failures = sum(len(seen) for (how, _), seen in rows.items() if not re.fullmatch(r"exit code \d+", how))
+        name = f"address space limited to {first_gb:g} to {last_gb:g} GB"
+        write_figures([TableRow("reliability", name, f"{runs} runs", {"failures": failures})])
 
 
 if __name__ == "__main__":

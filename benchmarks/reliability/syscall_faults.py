@@ -1,6 +1,6 @@
 """Let single system calls of a run fail, run the same command again, and compare with an undisturbed run.
 
-    python benchmarks/reliability/syscall_faults.py [--faults 200] [--markdown FILE]
+    python benchmarks/reliability/syscall_faults.py [--faults 200] [--figures]
 
 `strace` lists the calls of an undisturbed run that have a file or folder below the output folder as their argument.
 In each further run it makes one of them fail, drawn at random: `-P FILE -e inject=write:error=EIO:when=3`. Temporary
@@ -21,7 +21,8 @@ from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from common import Ending, ended, report, run
+from common import Ending, ended, run, table
+from figures_csv import FiguresOption, TableRow, write_figures
 from kills import differences, snapshot, torn
 
 from agalign.products.report.pages import SUMMARY_FILE
@@ -111,7 +112,7 @@ def faults_of(ending: Ending, out: Path, expected: dict[str, object]) -> Counter
     return result
 
 
-def main(faults: int = 200, rng_seed: int = 0, markdown: Path | None = None) -> None:
+def main(faults: int = 200, rng_seed: int = 0, *, figures: FiguresOption = False) -> None:
     if shutil.which("strace") is None or sys.platform != "linux":
         raise SystemExit("strace is not installed (apt-get install strace)")
     rng, rows = random.Random(rng_seed), defaultdict[str, Counter[str]](Counter)
@@ -151,16 +152,13 @@ def main(faults: int = 200, rng_seed: int = 0, markdown: Path | None = None) -> 
             if wrong:
                 print(ending.errors, "\nafterwards:", again.code, again.errors, flush=True)
     kinds = "runs", "refused", "as if nothing happened", "violations"
-    report(
-        "syscall faults",
-        markdown,
-        f"{sum(r['runs'] for r in rows.values())} runs over {CAPTURES} captures of {SIZE_PX[0]} x {SIZE_PX[1]}, "
-        "one failed call each, followed by the same command without a fault.",
-        [
-            ("call", "runs", "error reported", "finished", "violations"),
-            *((call, *(row[kind] for kind in kinds)) for call, row in rows.items()),
-        ],
-    )
+    runs, _, _, violations = (sum(row[kind] for row in rows.values()) for kind in kinds)
+    head = "call", "runs", "error reported", "finished", "violations"
+    print(table([head, *((call, *(row[kind] for kind in kinds)) for call, row in rows.items())]))
+    print(f"\n{runs} runs over {CAPTURES} captures of {SIZE_PX[0]} x {SIZE_PX[1]}, one failed call each")
+    if figures:
+        name = "one failing system call on an output file, then the same command again"
+        write_figures([TableRow("reliability", name, f"{runs} runs", {"failures": violations})])
 
 
 if __name__ == "__main__":

@@ -1,6 +1,6 @@
 """Kill one worker process after another, at random moments, and look at what became of every task.
 
-    python benchmarks/reliability/worker_kills.py [--kills 1000] [--markdown FILE]
+    python benchmarks/reliability/worker_kills.py [--kills 1000] [--figures]
 
 The pool alone: eight workers on any number of cores, tasks of some milliseconds with arguments and results of up to
 400 kB, so that kills also come while a task or a result is on its way. kills.py kills the workers of runs.
@@ -21,6 +21,8 @@ from pathlib import Path
 import psutil
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+from figures_csv import FiguresOption, TableRow, write_figures
 
 from agalign.errors import WorkerError
 from agalign.values.process_pool import ProcessPool, WorkerDiedError
@@ -99,18 +101,22 @@ def run_tiny(kills: int, rng: random.Random) -> Counter[str]:
     return result
 
 
-def main(kills: int = 1000, rng_seed: int = 0, markdown: Path | None = None) -> None:
+def main(kills: int = 1000, rng_seed: int = 0, *, figures: FiguresOption = False) -> None:
     os.environ.setdefault("OMP_NUM_THREADS", "1")
     result = run_tiny(kills, random.Random(rng_seed))
     counted = ("runs", "tasks", "kills", "reported as killed", "runs ended with a reason", *KINDS)
     heads = (name.replace("runs ended", "ended") for name in counted)
-    report("worker kills", markdown, [[*heads], [result[name] for name in counted]])
-    if any(result[kind] for kind in KINDS):
+    print(table([[*heads], [result[name] for name in counted]]))
+    failures = sum(result[kind] for kind in KINDS)
+    if figures:
+        name = "SIGKILL to workers of a pool of eight"
+        write_figures([TableRow("reliability", name, f"{result['kills']} kills", {"failures": failures})])
+    if failures:
         raise SystemExit("something was lost, hung, wrong or left over")
 
 
 if __name__ == "__main__":
     # Each worker imports this module: what loads slowly is imported here.
-    from common import report, run
+    from common import run, table
 
     run(main)
