@@ -8,7 +8,7 @@ those at the reference tie points in ties.json. Without that file, they are the 
 undamaged run, and the damaged runs use its model.
 """
 
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
@@ -23,7 +23,7 @@ from common import BandError, Ties
 from figures_csv import FiguresOption, TableRow, title_of, write_figures
 from numpy.typing import NDArray
 
-USABLE = "all with a standard error up to 1 px"
+USABLE = "standard error up to 1 px"
 """Bands that indices use by default."""
 
 
@@ -41,23 +41,26 @@ def losses(truth: Ties) -> Iterator[tuple[str, list[str], Any]]:
         captures[entry["reference"]].append(file)
     for turn in range(max(map(len, captures.values()))):
         lost = [files[(turn + k) % len(files)] for k, files in enumerate(captures.values())]
-        yield "one band of each capture", lost, without_scene
+        yield "one band each", lost, without_scene
     for reference, files in captures.items():
-        yield "a whole capture", [reference, *files], water
+        yield "a capture", [reference, *files], water
 
 
-def table_row(name: str, bands: list[BandError]) -> TableRow:
-    """Return the row of a group: errors are medians over a band's tie points."""
-    errors_px, std_px = np.array([(b.median_px, b.std_px) for b in bands]).T
-    median_px, p95_px, worst_px = (f"{value:.2f}" for value in np.percentile(errors_px, (50, 95, 100)))
+def table_row(name: str, bands: list[BandError], lost: int) -> TableRow:
+    """Return the row of a number of lost bands, some of which may have no prediction: errors are medians over a band's
+    tie points.
+    """
+    errors_px, std_px = np.array([(b.median_px, b.std_px) for b in bands if b.part.status == "predicted"]).T
+    cells: dict[str, object] = {"predicted": len(errors_px)}
+    heads = "median error, px", "p95, px", "worst band, px"
+    cells |= {head: f"{px:.2f}" for head, px in zip(heads, np.percentile(errors_px, (50, 95, 100)), strict=True)}
     within = [f"{np.mean(errors_px <= times * std_px):.0%}".rstrip("%") for times in (1, 2)]
-    cells = {"median error, px": median_px, "95th percentile of bands, px": p95_px, "worst band, px": worst_px}
     cells |= dict(zip(("within 1 standard error, %", "within 2, %"), within, strict=True))
-    return TableRow("predicted bands", name, f"{len(bands)} bands", cells)
+    return TableRow("predicted bands", name, f"{lost} bands", cells)
 
 
 def main(flights: list[Path], *, figures: FiguresOption = False) -> None:
-    rng, result = np.random.default_rng(0), defaultdict[str, list[BandError]](list)
+    rng, result, counts = np.random.default_rng(0), defaultdict[str, list[BandError]](list), Counter[str]()
     for flight in flights:
         truth, options = common.read_ties(flight / "ties.json"), list[str]()
         with common.flight_and_out() as (_, undamaged):
@@ -71,12 +74,15 @@ def main(flights: list[Path], *, figures: FiguresOption = False) -> None:
                         common.change_band(next(copy.rglob(file)), partial(change, rng=rng))
                     common.align(copy, out, *options)
                     known = {file: truth[file] for file in lost if file in truth}
-                    result[f"{title_of(flight)}: {name}"] += common.band_errors(out, known)
+                    group = f"{title_of(flight)}: {name}"
+                    result[group] += common.band_errors(out, known)
+                    counts[group] += len(known)
     of_all = [band for bands in result.values() for band in bands]
     result[USABLE] = [band for band in of_all if band.part.status == "predicted" and band.is_usable]
+    counts[USABLE] = len(result[USABLE])
     common.print_errors(result)
     if figures:
-        write_figures([table_row(name, bands) for name, bands in result.items()], "FLIGHT...", flights)
+        write_figures([table_row(name, bands, counts[name]) for name, bands in result.items()], "FLIGHT...", flights)
 
 
 if __name__ == "__main__":
