@@ -35,7 +35,7 @@ from .blocks import PAGES, ROOT, each_page, text_of
 PACKAGE = ROOT / "agalign"
 OPTIONS_OF_OTHERS = {
     *("--cpus", "--gpus", "--read-only", "--tmpfs", "--user"),  # docker run
-    *("--floor", "--grids", "--kinds", "--pairs", "--plot", "--ranges", "--scenes", "--size"),  # benchmarks
+    *("--faults", "--floor", "--grids", "--kinds", "--pairs", "--plot", "--ranges", "--scenes", "--size"),  # benchmarks
     *("--extra-index-url", "--index-url", "--strict"),  # pip, mypy
 }
 """Options in the text of pages that are not those of agalign."""
