@@ -222,7 +222,9 @@ class PixelMapping:
         for y_px in rows:
             of_row = result[int(y_px[0] - rows[0][0]) :][: len(y_px)]
             for x_px in columns:
-                of_row[:, int(x_px[0] - columns[0][0]) :][:, : len(x_px)] = self.at_crossings(x_px, y_px, dtype)
+                block, target = self.at_crossings(x_px, y_px, dtype), of_row[:, int(x_px[0] - columns[0][0]) :]
+                for axis in (0, 1):  # both at once take ten times as long
+                    target[:, : len(x_px), axis] = block[..., axis]
         return result[top : top + tile.height, left : left + tile.width]
 
     def at_crossings(self, x_px: Points, y_px: Points, dtype: DTypeLike = np.float64) -> Points:
