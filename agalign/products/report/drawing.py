@@ -62,7 +62,7 @@ def read_reduced_bands(
                 plane = read_preview(band.path, band.index_in_page, window_px, size_px, band.page)
             before[band.name] = grey(plane)
             if band.saturation_value is not None:
-                saturated[band.name] = float((plane >= band.saturation_value).mean())
+                saturated[band.name] = np.count_nonzero(plane >= band.saturation_value) / plane.size
     whole_px, known = (0, 0, grid.width, grid.height), written or {}
     after = {
         name: known[name] if name in known else grey(read_preview(*place, whole_px, size_px))

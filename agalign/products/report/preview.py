@@ -211,7 +211,7 @@ def write_picture(views: ReducedBands, names: Sequence[str], path: Path) -> None
     """Write the picture of three bands as red, green and blue: before and after alignment, each with an overview of
     480 px and a detail, which is enlarged from 160 px, below it. Raises OutputError.
     """
-    before, after = (np.stack([bands[name] for name in names], axis=-1) for bands in (views.before, views.after))
+    before, after = (cv2.merge([bands[name] for name in names]) for bands in (views.before, views.after))
     width, height = views.size_px
     size_px, gap_px = (480, max(1, round(480 * height / width))), 8
     detail_width = min(width, 160)
