@@ -27,6 +27,7 @@ from agalign.cameras.grouping import (
     with_tags_of_flight,
     with_unique_band_names,
     with_unique_capture_names,
+    with_unreadable_bands,
     without_copies,
 )
 from agalign.cameras.identity import contradictions, with_one_spelling
@@ -134,6 +135,7 @@ def discover(folder: str | Path, options: DiscoverOptions | None = None) -> Fold
             raise unknown_band
     captures.sort(key=lambda c: (c.folder.as_posix(), c.name))
     captures = with_missing_bands(with_unique_capture_names(captures, band_file_owners(captures)))
+    captures = with_unreadable_bands(captures, files, problems)
     return FolderScan(folder, tuple(captures), tuple(problems))
 
 

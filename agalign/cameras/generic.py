@@ -64,7 +64,7 @@ class Generic(Camera):
         return self.split(path)[0] or path.absolute().parent.name
 
     def capture_folder(self, path: Path) -> Path:
-        return path.parents[self._folders]
+        return path.parents[min(self._folders, len(path.parents) - 1)]
 
     def split(self, path: Path) -> tuple[str, str]:
         """Return (capture, band) from the file name; the band is empty if the name contains none."""

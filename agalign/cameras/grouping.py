@@ -15,13 +15,13 @@ from types import MappingProxyType
 from agalign.cameras import camera_of
 from agalign.cameras.base import Camera, colour_bands, listed, reference_index
 from agalign.cameras.generic import Generic, split_elsewhere
-from agalign.cameras.identity import name_end
-from agalign.cameras.known import lacking
+from agalign.cameras.identity import end_of, name_end
+from agalign.cameras.known import band_at, lacking
 from agalign.cameras.metadata import Tags
 from agalign.cameras.pix4d import NAMESPACE, listed_names
 from agalign.cameras.read_files import ImageFile, Problem, natural_order
 from agalign.config import DiscoverOptions
-from agalign.errors import InputError
+from agalign.errors import InputError, UnreadableFileError
 from agalign.pixels.raster import suffix_format
 from agalign.values.band_names import is_band_name, own_stem
 from agalign.values.capture import Band, CameraIdentity, Capture, CaptureTime, Pose
@@ -405,6 +405,45 @@ def with_missing_bands(captures: Sequence[Capture]) -> list[Capture]:
         identity = replace(capture.camera, serial=_complete_serial(capture.camera.serial, serials[camera]))
         result.append(replace(capture, missing_bands=missing, camera_bands=of_camera, camera=identity))
     return result
+
+
+def with_unreadable_bands(
+    captures: Sequence[Capture], files: Iterable[ImageFile], problems: Iterable[Problem]
+) -> list[Capture]:
+    """Return the captures with the reasons why files of their missing bands cannot be read. The name of such a file
+    tells its capture and, by the readable `files` or what is known of the camera, its band.
+    """
+    if not (unreadable := [p for p in problems if isinstance(p.error, UnreadableFileError)]):
+        return list(captures)
+    of_path = {file.path: file for file in files}
+    names = {_place(f.path, f.camera): f.bands[0].name for f in of_path.values() if len(f.bands) == 1}
+    by_camera: dict[Camera, dict[tuple[Path, str], dict[Path, str]]] = {}
+    result = []
+    for capture in captures:
+        path = capture.reference.path
+        camera = of_path[path].camera
+        if camera not in by_camera:
+            by_camera[camera] = defaultdict(dict)
+            for one in unreadable:
+                key = camera.capture_folder(one.path), camera.capture_name(one.path)
+                by_camera[camera][key][one.path] = one.text.removeprefix(f"{one.path}: ")
+        of_capture = by_camera[camera].get((camera.capture_folder(path), camera.capture_name(path)), {})
+        missing, reasons = {band_key(name): name for name in capture.missing_bands}, dict[str, str]()
+        for file, reason in of_capture.items() if capture.has_several_files else ():
+            without_tags = replace(capture.reference, name="", path=file, wavelength_nm=None)
+            found = [names.get(_place(file, camera), ""), band_at(capture.camera.model, end_of(file, camera))]
+            found += [band.name for band in camera.bands(file, Tags(), (without_tags,))]
+            for own in map(band_key, found):
+                if own in missing:
+                    reasons[missing[own]] = f"{file.name}: {reason}"
+                    break
+        result.append(replace(capture, unreadable_bands=reasons) if reasons else capture)
+    return result
+
+
+def _place(path: Path, camera: Camera) -> tuple[str, Path, str]:
+    """What distinguishes the file of a band from those of the other bands of a capture."""
+    return camera.name, path.parent.relative_to(camera.capture_folder(path)), end_of(path, camera)
 
 
 def _camera_bands(captures: Sequence[Capture]) -> tuple[Band, ...]:

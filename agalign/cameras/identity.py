@@ -6,6 +6,7 @@ from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 
+from agalign.cameras.base import Camera
 from agalign.cameras.known import SAME_BAND_NM
 from agalign.cameras.pix4d import NAMESPACE
 from agalign.cameras.read_files import ImageFile, Problem
@@ -36,7 +37,12 @@ def with_one_spelling(files: Sequence[ImageFile]) -> list[ImageFile]:
 
 def name_end(file: ImageFile) -> str:
     """Return the end of a file's name that differs between the bands of a capture, without separators."""
-    return own_stem(file.path).removeprefix(file.camera.capture_name(file.path)).strip("_- ")
+    return end_of(file.path, file.camera)
+
+
+def end_of(path: Path, camera: Camera) -> str:
+    """Return the same of a file that only its name assigns to a camera."""
+    return own_stem(path).removeprefix(camera.capture_name(path)).strip("_- ")
 
 
 def _position(file: ImageFile) -> str:

@@ -57,6 +57,14 @@ def named_by_camera(text: str) -> tuple[str, str]:
     return text, ""
 
 
+def band_at(model: str, part: str) -> str:
+    """Return the name of the band that a camera of this model records in the files with this part in their names; empty
+    if it is unknown.
+    """
+    known = (bands for start, bands in _KNOWN if re.match(start, model, re.IGNORECASE))
+    return next((bands[part][0] for bands in known if part in bands), "")
+
+
 def lacking(model: str, own: Sequence[tuple[str, Band]]) -> list[str]:
     """Return the names of the bands that a camera of this model records and a capture lacks, given its bands with the
     end of the file's name. The half of a dual camera without any band lacks none.

@@ -55,7 +55,8 @@ def _fingerprint(capture: Capture, *stages: SettingsModel) -> str:
         # A georeference by the pose of the camera is for the output alone.
         is_georeferenced = b.georeference is not None and b.georeference.accuracy_m is None
         bands.append((b.name, b.address, b.lens, b.to_rig, is_georeferenced, _state(b.path)))
-    return hashed(__version__, *(s.model_dump_json() for s in stages), capture.reference_index, bands)
+    unreadable = sorted(capture.unreadable_bands)
+    return hashed(__version__, *(s.model_dump_json() for s in stages), capture.reference_index, bands, *unreadable)
 
 
 def hashed(*facts: HashInput) -> str:

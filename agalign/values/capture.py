@@ -335,6 +335,8 @@ class Capture:
     """Velocity of the ground in the image (right, down), focal lengths per second; None if unknown."""
     missing_bands: tuple[str, ...] = ()
     """Names of bands that other captures of its camera have."""
+    unreadable_bands: Mapping[str, str] = field(default_factory=dict)
+    """Those of `missing_bands` with a file that cannot be read, and why."""
     camera_bands: tuple[Band, ...] = ()
     """Bands of its camera, without files, in the order of the stacks; empty if they are those of the capture."""
     elevation_deg: float | None = None

@@ -61,11 +61,8 @@ _BLANK = Remedy(
 )
 _ASKED = Remedy("only the seed was requested", "omit --seed and --only-seed")
 
-UNREADABLE = IssueKind(
-    "unreadable",
-    "{detail}",
-    Remedy("a file cannot be read", "copy it from the card again; the other bands are aligned without it"),
-)
+UNREADABLE_BAND = Remedy("a file cannot be read", "copy it from the card again; the other bands are aligned without it")
+UNREADABLE = IssueKind("unreadable", "{detail}", UNREADABLE_BAND)
 BLANK_REFERENCE = IssueKind("blank_reference", "the reference band is constant or all invalid", _BLANK)
 BLANK_MOVING = IssueKind("blank_moving", "the moving band is constant or all invalid", _BLANK)
 FEW_VALID = IssueKind(

@@ -15,6 +15,7 @@ import agalign
 from agalign.batch import capture_task, estimate
 from agalign.batch.run import plan_run
 from agalign.products.run.captures import bands_of
+from agalign.products.run.cautions import RunFacts
 from agalign.products.sidecar.file import find_sidecars, read_sidecar, verify_outputs
 from agalign.values.alignment import Alignment
 from agalign.values.mapping import DisplacementField
@@ -337,10 +338,16 @@ def test_stacks_of_a_camera_have_the_same_bands_in_the_same_order(flight: Path, 
         tags = [stack.tags(index) for index in (2, 4, 5)]
         assert [one["STATUS"] for one in tags] == ["missing", "missing", "failed"]
         assert [one["wavelength"] for one in tags] == [other.tags(index)["wavelength"] for index in (2, 4, 5)]
+        assert tags[0]["REASON"] == "a band of this camera is missing"
+        assert tags[1]["REASON"].startswith("IMG_0001_4.tif: is not a TIFF")
         assert "constant" in tags[2]["REASON"]
     with rasterio.open(qualities[0]) as quality:
         assert quality.descriptions == ("all bands", *stack.descriptions)
     assert [lacking.missing_bands, whole.missing_bands] == [["Green", "NIR"], []]
+    reasons = {name: reason for name, status, reason in lacking.pairs if status == "missing"}
+    assert reasons == {name: tag["REASON"] for name, tag in zip(("Green", "NIR"), tags, strict=False)}
+    causes = {c.band: c.remedy.cause for c in RunFacts().cautions(lacking) if c.status == "missing"}
+    assert causes == {"Green": "a band of this camera is missing", "NIR": "a file cannot be read"}
     assert lacking.output is not None
     assert lacking.output.bands == list(stack.descriptions)
     # A band is read from its own layers.

@@ -50,11 +50,31 @@ def test_the_bands_of_a_known_camera_are_missing_even_in_all_captures(
 ) -> None:
     write_capture(tmp_path, VENDORS[vendor])
     assert missing(tmp_path) == [()]
-    for path in [p for p in tmp_path.rglob("*.*") if any(part in p.stem for part in lost.split())]:
+    lost_files = [p for p in tmp_path.rglob("*.*") if any(part in p.stem for part in lost.split())]
+    for path in lost_files:
+        path.write_text("no image")
+    (capture,) = discover(tmp_path).captures
+    assert set(capture.missing_bands) == set(capture.unreadable_bands) == expected
+    reasons = sorted(capture.unreadable_bands.values())
+    assert [reason.split(": is not a TIFF")[0] for reason in reasons] == sorted(p.name for p in lost_files)
+    for path in lost_files:
         path.unlink()
     assert [set(names) for names in missing(tmp_path)] == [expected]
+    assert not discover(tmp_path).captures[0].unreadable_bands
     chosen = [b.name for b in discover(tmp_path).captures[0].bands]
     assert missing(tmp_path, bands=chosen) == [()]
+
+
+@pytest.mark.parametrize("name", ["{capture}_{band}.tif", "{band}/{capture}.tif", "{band}{capture}.tif"])
+def test_an_unreadable_file_is_known_by_its_name(tmp_path: Path, name: str) -> None:
+    for capture in ("0011", "0012", "0013"):
+        for band in ("red", "green", "nir"):
+            write_band(tmp_path / name.format(capture=capture, band=band), np.ones((1, 48, 64), np.uint16))
+    lost = tmp_path / name.format(capture="0012", band="nir")
+    lost.write_text("no image")
+    (damaged,) = (c for c in discover(tmp_path).captures if c.missing_bands)
+    assert damaged.missing_bands == ("nir",)
+    assert damaged.unreadable_bands["nir"].startswith(f"{lost.name}: is not a TIFF")
 
 
 def write_rededge(folder: Path, number: int, bands: Mapping[int, tuple[str, int]], serial: str = "RP01") -> None:

@@ -17,7 +17,7 @@ from agalign.products.run.cautions import NO_RESULT, Caution, RunFacts
 from agalign.products.sidecar.schema import BandResult, GeometryPart, GridPart, OutputPart, Sidecar
 from agalign.values.alignment import Prediction
 from agalign.values.files import CsvTable
-from agalign.values.issues import MISSING_BAND, OTHER_REFERENCE, Remedy
+from agalign.values.issues import OTHER_REFERENCE, Remedy
 from agalign.values.text import escape_controls
 
 _SHIFT_STEP_PX = 0.01
@@ -264,9 +264,9 @@ class FlightFacts:
             "bands": [self._pair(b, sidecar, keys, checks[b.band]) for b in sidecar.bands],
             "indices": [self._index(row) for row in indices if row.path is not None],
         }
-        missing = keys | {"status": "missing", "reason": MISSING_BAND.cause, "check": MISSING_BAND.cause}
-        for name in sidecar.missing_bands:
-            self.add_row(missing | {"band": name})
+        for name, status, reason in sidecar.pairs:
+            if status == "missing":
+                self.add_row(keys | {"band": name, "status": status, "reason": reason, "check": reason})
         self._count(facts)
         if self._rows.add(_row_of(facts)):
             self._rows.flush()

@@ -16,7 +16,16 @@ from agalign.flight.rig_file import model_fingerprint
 from agalign.products.run.excluded import PanelPart, read_excluded
 from agalign.products.sidecar.schema import BandResult, Sidecar
 from agalign.values.capture import CaptureTime
-from agalign.values.issues import CONTRADICTED, MISSING_BAND, MOSAICS, OF_FILES, TEXTURELESS, UNEXPECTED_PX, Remedy
+from agalign.values.issues import (
+    CONTRADICTED,
+    MISSING_BAND,
+    MOSAICS,
+    OF_FILES,
+    TEXTURELESS,
+    UNEXPECTED_PX,
+    UNREADABLE_BAND,
+    Remedy,
+)
 
 MAX_PIXEL_ERROR_PX = 1.0
 """Beyond it, a spectral index mixes neighbouring plants."""
@@ -111,7 +120,8 @@ class RunFacts:
                 size_text = "up to {:.1%} of a band"
                 yield Caution(band.band, "check", _SATURATED, reason, band.saturated, band.saturated, size_text)
         for name in sidecar.missing_bands:
-            yield Caution(name, "missing", MISSING_BAND, MISSING_BAND.cause, 1.0)
+            remedy = UNREADABLE_BAND if name in sidecar.unreadable_bands else MISSING_BAND
+            yield Caution(name, "missing", remedy, sidecar.unreadable_bands.get(name, remedy.cause), 1.0)
         yield from self._of_light(sidecar)
         if sidecar.model and self.models and sidecar.model not in self.models:
             for band in (b for b in sidecar.bands if b.status != "reference"):

@@ -356,7 +356,7 @@ class OutputPart(_Part):
     radiometry: str | None = None
     """Conversion of raw numbers, such as `reflectance by panel and light sensor`."""
     panel_age_s: Number | None = None
-    """Time to the nearest panel, if one was used."""
+    """Time to the nearest panel."""
     illumination: list[IlluminationPart] = []
     """Bands that were converted to reflectance."""
     crop: tuple[int, int, Count, Count]
@@ -364,7 +364,7 @@ class OutputPart(_Part):
     scale: tuple[Positive, Positive] = (1.0, 1.0)
     """Output pixels per reference pixel along x and y."""
     undistorted: bool = False
-    """True for the lens-corrected grid of the reference."""
+    """True for a lens-corrected reference grid."""
     vignetting_corrected: bool = False
     """True if vignetting is corrected in the files of single bands."""
     nodata: float | str | None
@@ -448,6 +448,8 @@ class Sidecar(_Part):
     Else `degraded`."""
     missing_bands: list[str]
     """Bands that the capture lacks."""
+    unreadable_bands: dict[str, str] = {}
+    """Why missing bands are unreadable."""
     reference: ReferencePart
     """Reference band."""
     bands: Annotated[list[BandResult], Field(min_length=1)]
@@ -513,6 +515,7 @@ class Sidecar(_Part):
             camera=capture.camera,
             status="degraded" if status == "ok" and capture.missing_bands else status,
             missing_bands=list(capture.missing_bands),
+            unreadable_bands=dict(capture.unreadable_bands),
             reference=ReferencePart(
                 band=reference.name,
                 file=reference.path.name,
@@ -549,7 +552,8 @@ class Sidecar(_Part):
     def pairs(self) -> list[tuple[str, str, str | None]]:
         """(band, status, reason) of every band that is to be aligned; missing bands have the status `missing`."""
         moving = [(b.band, str(b.status), b.reason) for b in self.bands if b.status != "reference"]
-        return [*moving, *((name, "missing", MISSING_BAND.cause) for name in self.missing_bands)]
+        unreadable = self.unreadable_bands
+        return [*moving, *((name, "missing", unreadable.get(name, MISSING_BAND.cause)) for name in self.missing_bands)]
 
     @property
     def files(self) -> list[FilePart]:
