@@ -5,8 +5,9 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
+from multiprocessing import get_context
 from pathlib import Path
 from typing import Self
 
@@ -21,7 +22,14 @@ from agalign.errors import AgalignError, ConfigurationError, InputError, OutputE
 from agalign.flight.fingerprint import learning_fingerprint
 from agalign.flight.groups import camera_key, difference, flight_camera, flights_of, is_flight_of, model_names
 from agalign.flight.model import FlightModel, load_model, save_model
-from agalign.flight.panel_readings import PanelReading, read_panel, reflectance_factors, with_height, with_panels
+from agalign.flight.panel_readings import (
+    READERS,
+    PanelReading,
+    read_panel,
+    reflectance_factors,
+    with_height,
+    with_panels,
+)
 from agalign.flight.rig import MIN_CAPTURES, Rig
 from agalign.flight.rig_file import read_rig
 from agalign.flight.sky import SkyCapture, sky_captures
@@ -45,7 +53,8 @@ from agalign.values.capture import Capture
 from agalign.values.files import check_inside, written_below
 from agalign.values.image import OutputGrid
 from agalign.values.output_folder import is_full, locked
-from agalign.values.processes import CAPTURES_WORTH_A_PROCESS, usable_cores
+from agalign.values.process_pool import ProcessPool, R, WorkerDiedError
+from agalign.values.processes import CAPTURES_WORTH_A_PROCESS, environment_of_children, silence_libraries, usable_cores
 from agalign.values.text import counted
 
 _MAX_THREADS = 4
@@ -130,8 +139,9 @@ def plan_run(flight: FolderScan, out: Path, settings: Settings, options: RunOpti
     """
     run = _FlightRun(flight, out, settings, options or RunOptions())
     run.check()
-    sky, panels, captures = run.selected()
-    states = {s.capture.label: "left out as sky" for s in sky}
+    with run.examining() as examine:
+        sky, panels, captures = run.selected(examine)
+    states = examine.abandoned | {s.capture.label: "left out as sky" for s in sky}
     states |= {p.capture.label: "read as calibration panels" for p in panels if p.capture.is_of_a_panel}
     for capture in captures:
         left = run.remaining(capture)
@@ -202,9 +212,20 @@ class _FlightRun:
         flight_settings = settings.flight.model_copy(update={"start_model": model.fingerprint})
         return replace(self, given=model, settings=settings.model_copy(update={"flight": flight_settings}))
 
-    def selected(self) -> tuple[list[SkyCapture], list[PanelReading], list[Capture]]:
+    @contextmanager
+    def examining(self) -> "Iterator[_Examination]":
+        """Provide how the images of captures are read before the alignment: with a time limit, in worker processes."""
+        timeout_s, processes = self.options.timeout_s, min(READERS, usable_cores())
+        if timeout_s is None:
+            yield _Examination()
+            return
+        with environment_of_children(threads=1), ProcessPool(processes, get_context("spawn"), _start_examining) as pool:
+            yield _Examination(pool, timeout_s)
+
+    def selected(self, examine: "_Examination") -> tuple[list[SkyCapture], list[PanelReading], list[Capture]]:
         """Return (captures of the sky, readings of calibration panels, captures to align, with their radiometry and
-        georeference); a scene that contains a panel is in both of the last two.
+        georeference); a scene that contains a panel is in both of the last two. Captures that `examine` has abandoned
+        are in none.
 
         Raises ConfigurationError if no capture has the metadata for a georeference that the settings ask for.
         """
@@ -213,10 +234,11 @@ class _FlightRun:
         panels: list[PanelReading] = []
         captures = list(self.flight.captures)
         if not self.options.align_panels:
-            sky, captures = sky_captures(captures)
-            captures = list(with_panels(captures, without_code=bool(albedos)))
-            panels = [read_panel(c, albedos) for c in captures if c.panel is not None]
-            captures = [c for c in captures if not c.is_of_a_panel]
+            sky, captures = sky_captures(captures, examine)
+            captures = list(with_panels(captures, without_code=bool(albedos), examine=examine))
+            readings = [examine(read_panel, c, albedos) for c in captures if c.panel is not None]
+            panels = [reading for reading in readings if reading is not None]
+            captures = [c for c in captures if not c.is_of_a_panel and c.label not in examine.abandoned]
         captures = [_calibrated(capture, panels, write) for capture in captures]
         if write.georeference:
             crs = utm_of_flights(captures)
@@ -235,7 +257,10 @@ class _FlightRun:
 
     def reports(self, record: RunPart) -> Iterator[CaptureReport]:
         """Yield the report of each capture; add the time of learning to the record."""
-        sky, panels, captures = self.selected()
+        with self.examining() as examine:
+            sky, panels, captures = self.selected(examine)
+        for label, reason in examine.abandoned.items():
+            yield CaptureReport(label, "error", error=reason)
         for report, capture in self._excluded(sky, panels, record):
             remove_outputs(capture, self.out, self.settings.write)
             yield report
@@ -335,6 +360,30 @@ class _FlightRun:
         with written_below(self.out):
             save_model(model, path)
         return path
+
+
+@dataclass(frozen=True)
+class _Examination:
+    """Calls functions that read the images of captures, as `flight.panel_readings.Examine`."""
+
+    pool: ProcessPool | None = None
+    timeout_s: float | None = None
+    abandoned: dict[str, str] = field(default_factory=dict)
+    """Why a capture was abandoned, by label."""
+
+    def __call__(self, function: Callable[..., R], capture: Capture, /, *arguments: object) -> R | None:
+        if self.pool is None:
+            return function(capture, *arguments)
+        try:
+            return self.pool.submit(function, capture, *arguments, timeout_s=self.timeout_s).result()
+        except (TimeoutError, WorkerDiedError, MemoryError) as error:
+            self.abandoned[capture.label] = failure_text(error, self.timeout_s)
+            return None
+
+
+def _start_examining() -> None:
+    """Initialise a worker, which imports this module for it: tasks do not wait for that."""
+    silence_libraries()
 
 
 def _crop_key(capture: Capture) -> tuple[str, bool]:

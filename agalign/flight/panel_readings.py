@@ -2,9 +2,10 @@
 
 import math
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from typing import Protocol, TypeVar
 
 import numpy as np
 
@@ -17,10 +18,13 @@ from agalign.values.capture import Band, Capture, Panel, PanelFactor, PanelSourc
 from agalign.values.image import Tile
 from agalign.values.pixel_units import PixelScale
 
+R = TypeVar("R")
 Albedos = Mapping[str, float]
 """Reflectance of the panel as the user gives it, by band in lower case; the empty name is the default."""
 MAX_TIME_DIFFERENCE_S = 6 * 3600.0
 """A panel does not represent the illumination many hours later."""
+READERS = 4
+"""Number of captures whose images are read at a time: more would wait for the disk."""
 _MIN_HEIGHT_M = 3.0
 """Lower heights are within the error of the altitudes."""
 
@@ -81,7 +85,20 @@ class PanelReading:
         return self.capture.panel
 
 
-def with_panels(captures: Sequence[Capture], *, without_code: bool = False) -> list[Capture]:
+class Examine(Protocol):
+    """Calls a function that reads the images of a capture; returns None if that takes longer than a time limit."""
+
+    def __call__(self, function: Callable[..., R], capture: Capture, /, *arguments: object) -> R | None: ...
+
+
+def examined_here(function: Callable[..., R], capture: Capture, /, *arguments: object) -> R | None:
+    """Call a function in this process, which has no time limit."""
+    return function(capture, *arguments)
+
+
+def with_panels(
+    captures: Sequence[Capture], *, without_code: bool = False, examine: Examine = examined_here
+) -> list[Capture]:
     """Return the captures with their panels.
 
     Panels are known from the tags or detected in the first and last captures of each flight by their QR code; with
@@ -90,12 +107,11 @@ def with_panels(captures: Sequence[Capture], *, without_code: bool = False) -> l
     flights = flights_of(captures)
     ends = [end for flight in flights for end in _from_both_ends(flight)]
     medians_m = {c.label: median_m for flight in flights for median_m in [_median_altitude_m(flight)] for c in flight}
-    reader_count = 4  # threads
-    with without_warnings(), ThreadPoolExecutor(reader_count) as pool:
-        results = pool.map(lambda end: _captures_of_panels(end, without_code), ends)
+    with without_warnings(), ThreadPoolExecutor(READERS) as pool:
+        results = pool.map(lambda end: _captures_of_panels(end, without_code, examine), ends)
         of_panels = [c for result in results for c in result]
-        judged = pool.map(lambda c: with_cues(c, medians_m[c.label]), of_panels)
-        by_label = {c.label: c for c in judged}
+        judged = pool.map(lambda c: examine(with_cues, c, medians_m[c.label]), of_panels)
+        by_label = {c.label: c for c in judged if c is not None}
     return [by_label.get(c.label, c) for c in captures]
 
 
@@ -217,7 +233,7 @@ def _from_both_ends(flight: Sequence[Capture]) -> tuple[list[Capture], list[Capt
     return ordered[:middle], ordered[middle:][::-1]
 
 
-def _captures_of_panels(half: Sequence[Capture], without_code: bool) -> list[Capture]:
+def _captures_of_panels(half: Sequence[Capture], without_code: bool, examine: Examine) -> list[Capture]:
     """Return the captures with a panel, searched until several captures in a row contain none."""
     max_without_panel = 3  # panels are recorded before and after a flight
     result: list[Capture] = []
@@ -225,7 +241,7 @@ def _captures_of_panels(half: Sequence[Capture], without_code: bool) -> list[Cap
     for capture in half:
         # Mosaics contain no panels and take long to read.
         is_known = capture.panel is not None or capture.reference.georeference is not None
-        examined = capture if is_known else _with_detected_panel(capture, without_code)
+        examined = capture if is_known else examine(_with_detected_panel, capture, without_code) or capture
         without_panel = 0 if examined.panel is not None else without_panel + 1
         result += [examined] if examined.panel is not None else []
         if without_panel == max_without_panel:

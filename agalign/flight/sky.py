@@ -8,6 +8,7 @@ import numpy as np
 
 from agalign.cameras.base import is_thermal
 from agalign.errors import AgalignError
+from agalign.flight.panel_readings import Examine, examined_here
 from agalign.pixels.radiometry import calibrated
 from agalign.pixels.raster import read_for_alignment, read_tile, without_warnings
 from agalign.values.capture import Band, Capture
@@ -53,7 +54,7 @@ class SkyCapture:
     cues: tuple[str, ...]
 
 
-def sky_cues(capture: Capture) -> tuple[str, ...]:
+def sky_cues(capture: Capture, examine: Examine = examined_here) -> tuple[str, ...]:
     """Return the reasons to classify a capture as one of the sky; empty if fewer than two of three hold.
 
     The camera points above the horizon according to the tags; the name of a folder or the file contains `sky`; no band
@@ -66,18 +67,18 @@ def sky_cues(capture: Capture) -> tuple[str, ...]:
     names = *capture.folder.parts, capture.name
     if any(re.search(r"(?:^|[-_. ])sky(?:$|[-_. ])", name, re.IGNORECASE) for name in names):
         cues.append("its folder or name contains 'sky'")
-    # The sky has little signal in thermal bands.
-    bands = [b for b in capture.bands if not is_thermal(b) and not b.is_from_photograph]
-    if cues and bands and all(map(_is_smooth, bands)):
+    if cues and bool(examine(_has_no_texture, capture)):
         cues.append("no band has texture")
     # A single cue also occurs in other captures.
     return tuple(cues) if len(cues) >= 2 else ()
 
 
-def sky_captures(captures: Iterable[Capture]) -> tuple[list[SkyCapture], list[Capture]]:
+def sky_captures(
+    captures: Iterable[Capture], examine: Examine = examined_here
+) -> tuple[list[SkyCapture], list[Capture]]:
     """Separate captures into (captures of the sky, other captures), both in their order."""
     with without_warnings():
-        classified = [SkyCapture(capture, sky_cues(capture)) for capture in captures]
+        classified = [SkyCapture(capture, sky_cues(capture, examine)) for capture in captures]
     return [c for c in classified if c.cues], [c.capture for c in classified if not c.cues]
 
 
@@ -94,6 +95,12 @@ def sky_radiance(band: Band) -> float | None:
     if valid.mean() < _MIN_SHARE:
         return None
     return float(np.median(calibrated(pixels, band.radiometry, 0, 0)[valid]))
+
+
+def _has_no_texture(capture: Capture) -> bool:
+    """True if no band has texture, apart from thermal bands, in which the sky has little signal."""
+    bands = [b for b in capture.bands if not is_thermal(b) and not b.is_from_photograph]
+    return bool(bands) and all(map(_is_smooth, bands))
 
 
 def _is_smooth(band: Band) -> bool:

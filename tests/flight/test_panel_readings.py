@@ -1,3 +1,5 @@
+import os
+import sys
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -19,6 +21,8 @@ from agalign.pixels.panel_detection import DetectedPanel
 from agalign.pixels.radiometry import with_radiometry
 from agalign.products.run.excluded import write_panels
 from agalign.values.capture import Band, CameraIdentity, Capture, Panel, Pose, Position, Quantity, Radiometry
+
+from ..program import agalign
 
 AREA = ((20.0, 10.0), (39.0, 10.0), (39.0, 29.0), (20.0, 29.0))
 PLAIN = Radiometry("radiance", 1000.0, 65536.0, 2.0)
@@ -222,3 +226,21 @@ def test_two_cues_leave_out_a_capture_of_a_panel(
     assert len(result.panel.cues) == len(cues)
     assert all(cue in text for cue, text in zip(cues, result.panel.cues, strict=True))
     assert result.is_of_a_panel is (len(cues) > 1)
+
+
+@pytest.mark.slow
+def test_a_capture_that_the_search_for_panels_cannot_finish_is_abandoned(flight: Path, tmp_path: Path) -> None:
+    """A worker process that never opens its image is ended at the time limit; the other capture is planned."""
+    # A process imports it at its start.
+    (tmp_path / "sitecustomize.py").write_text(
+        "import io, time, traceback\n"
+        "now = io.open\n"
+        "def late(path, *given, **named):\n"
+        "    searched = any(frame.f_code.co_name == '_detect' for frame, _ in traceback.walk_stack(None))\n"
+        "    time.sleep(60 if searched and str(path).endswith('IMG_0002_2.tif') else 0)\n"
+        "    return now(path, *given, **named)\n"
+        "io.open = late\n"
+    )
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join((str(tmp_path), *sys.path))}
+    done = agalign(flight, "-o", tmp_path / "out", "--timeout", 3, "--dry-run", env=environment, timeout=50)
+    assert "1 capture to be aligned, 1 capture stopped after 3 s (--timeout)" in done.stdout
