@@ -1,5 +1,6 @@
 """What is known of the cameras: the bands of each, their wavelengths, and what names of files and tags call them."""
 
+import math
 import re
 from collections.abc import Mapping, Sequence
 
@@ -7,20 +8,27 @@ from agalign.values.capture import Band
 from agalign.values.spectrum import band_key
 
 KnownBands = Mapping[str, tuple[str, float]]
-"""(name that the firmware writes, centre wavelength in nm) by the part of a file's name, or its number, that tells the
-bands of a capture apart.
+"""(name that the firmware writes, centre wavelength in nm or nan) by the part of a file's name, or its number, that
+tells the bands of a capture apart; by another text if the part is unknown.
 """
 MAVIC_3: KnownBands = {"G": ("Green", 560), "R": ("Red", 650), "RE": ("RedEdge", 730), "NIR": ("NIR", 860)}
 PHANTOM_4 = {"1": ("Blue", 450), "2": ("Green", 560), "3": ("Red", 650), "4": ("RedEdge", 730), "5": ("NIR", 840)}
 SEQUOIA: KnownBands = {"GRE": ("Green", 550), "RED": ("Red", 660), "REG": ("Red edge", 735), "NIR": ("NIR", 790)}
 _6X = {"0": ("Blue", 475), "1": ("Green", 550), "2": ("Red", 670), "3": ("RedEdge", 715), "4": ("NIR", 840)}
 _REDEDGE = {"1": ("Blue", 475), "2": ("Green", 560), "3": ("Red", 668), "4": ("NIR", 840), "5": ("Red edge", 717)}
+_UNKNOWN_NM = math.nan  # of bands of the Altum, whose names are known
+_ALTUM = {"1": ("Blue", _UNKNOWN_NM), "2": ("Green", _UNKNOWN_NM), "3": ("Red", _UNKNOWN_NM), "4": ("NIR", _UNKNOWN_NM)}
+_ALTUM |= {"5": ("Red edge", _UNKNOWN_NM), "6": ("LWIR", 11000)}
+_UNNUMBERED = "pan", "thermal"  # in place of the numbers of two files of the Altum-PT, which are unknown
+_ALTUM_PT = {part: band for part, band in _ALTUM.items() if part != "6"}
+_ALTUM_PT |= dict(zip(_UNNUMBERED, (("Pan", _UNKNOWN_NM), ("LWIR", 11000)), strict=True))
 # The second half of a dual camera has the model of the first.
 _REDEDGE_BLUE = {"6": ("Blue-444", 444), "7": ("Green-531", 531), "8": ("Red-650", 650)}
 _REDEDGE_BLUE |= {"9": ("Red edge-705", 705), "10": ("Red edge-740", 740)}
 _KNOWN: Sequence[tuple[str, KnownBands]] = (
     *(("M3M", MAVIC_3), ("FC6360", PHANTOM_4), ("Sequoia", SEQUOIA)),
     *((".*6X", _6X), ("RedEdge", _REDEDGE), ("RedEdge-M", _REDEDGE_BLUE)),
+    *(("Altum$", _ALTUM), ("Altum-PT", _ALTUM_PT)),
 )
 """(regular expression of the beginning of EXIF's model, bands) of the cameras with a file for each band."""
 
@@ -69,11 +77,23 @@ def lacking(model: str, own: Sequence[tuple[str, Band]]) -> list[str]:
     """Return the names of the bands that a camera of this model records and a capture lacks, given its bands with the
     end of the file's name. The half of a dual camera without any band lacks none.
     """
-    keys, nms = {band_key(b.name) for _, b in own}, [b.wavelength_nm for _, b in own if b.wavelength_nm]
+    keys, nms = {_kind(b.name) for _, b in own}, [b.wavelength_nm for _, b in own if b.wavelength_nm]
     unnamed = {part for part, b in own if b.wavelength_nm is None}
     result: list[str] = []
     for known in (bands for start, bands in _KNOWN if re.match(start, model, re.IGNORECASE)):
-        named = {p: name for p, (name, _) in known.items() if p not in unnamed and band_key(name) not in keys}
-        missing = [name for p, name in named.items() if all(abs(known[p][1] - nm) > SAME_BAND_NM for nm in nms)]
+        # A file without tags and of another number may be a band whose number is unknown.
+        found = unnamed if unnamed <= known.keys() else {*unnamed, *_UNNUMBERED}
+        named = {p: name for p, (name, _) in known.items() if p not in found and _kind(name) not in keys}
+        missing = [name for p, name in named.items() if not any(abs(known[p][1] - nm) <= SAME_BAND_NM for nm in nms)]
         result += missing if len(missing) < len(known) else []
     return result
+
+
+def _kind(name: str) -> str:
+    """A text that is equal for all names of a band; panchromatic and thermal bands have several."""
+    key = band_key(name)
+    return next((kind for start, kind in _KINDS if key.startswith(start)), key)
+
+
+_KINDS = (("pan", "pan"), ("thermal", "lwir"), ("lwir", "lwir"))
+"""(beginning of a name, as `band_key`, kind of the band)."""

@@ -65,6 +65,34 @@ def test_the_bands_of_a_known_camera_are_missing_even_in_all_captures(
     assert missing(tmp_path, bands=chosen) == [()]
 
 
+ALTUM = {"1": "Blue", "2": "Green", "3": "Red", "4": "NIR", "5": "Red edge"}
+
+
+@pytest.mark.parametrize(
+    ("model", "others", "without_tags", "lost", "expected"),
+    [
+        ("Altum", {"6": "LWIR"}, "", "", set()),
+        ("Altum", {"6": "LWIR"}, "3", "2 5 6", {"Green", "Red edge", "LWIR"}),
+        ("Altum-PT", {"6": "Panchro", "7": "LWIR"}, "", "", set()),
+        ("Altum-PT", {"6": "Panchro", "7": "LWIR"}, "", "6", {"Pan"}),
+        ("Altum-PT", {"6": "PAN", "7": "Thermal"}, "", "3", {"Red"}),
+        ("Altum-PT", {"6": "Panchro", "7": "LWIR"}, "", "6 7", {"Pan", "LWIR"}),
+        ("Altum-PT", {"6": "Panchro", "7": "LWIR"}, "6 7", "4", {"NIR"}),
+    ],
+)
+def test_the_bands_of_an_altum_are_missing_as_those_of_other_cameras(
+    tmp_path: Path, model: str, others: Mapping[str, str], without_tags: str, lost: str, expected: set[str]
+) -> None:
+    """With any name of the panchromatic and the thermal band, and with files that have lost their tags."""
+    for part, band in (ALTUM | dict(others)).items():
+        nm = {} if part in "12345" else {(NAMESPACE, "CentralWavelength"): ("11000" if part == "7" else "634",)}
+        values = tagged(MICASENSE, CaptureId="id") | {(NAMESPACE, "BandName"): (band,)} | nm
+        first = {271: text("MicaSense"), 272: text(model), 700: byte_string(packet(values, "attributes"))}
+        if part not in lost.split():
+            write_file(tmp_path / f"IMG_0001_{part}.tif", {} if part in without_tags.split() else first)
+    assert [set(names) for names in missing(tmp_path)] == [expected]
+
+
 @pytest.mark.parametrize("name", ["{capture}_{band}.tif", "{band}/{capture}.tif", "{band}{capture}.tif"])
 def test_an_unreadable_file_is_known_by_its_name(tmp_path: Path, name: str) -> None:
     for capture in ("0011", "0012", "0013"):
