@@ -30,7 +30,7 @@ from agalign.cameras.grouping import (
     with_unreadable_bands,
     without_copies,
 )
-from agalign.cameras.identity import contradictions, with_one_spelling
+from agalign.cameras.identity import contradictions, files_of_one_band, with_one_spelling
 from agalign.cameras.metadata import read_tags
 from agalign.cameras.read_files import ImageFile, Problem, natural_order, read_files
 from agalign.config import DiscoverOptions
@@ -121,6 +121,7 @@ def discover(folder: str | Path, options: DiscoverOptions | None = None) -> Fold
     captures: list[Capture] = []
     groups, copied = join_folders(group_files(files, with_rgb=options.with_rgb))
     problems += copies + copied + damaged + tag_problems(files) + contradictions(groups)
+    problems += files_of_one_band(groups) if options.pattern is None else []
     _check_bands(groups, options.bands, folder)
     for group in groups:
         if options.pattern is not None:

@@ -78,6 +78,28 @@ def contradictions(groups: Iterable[Sequence[ImageFile]]) -> list[Problem]:
     return [Problem(path, InputError(f"{path}: {text}")) for path, text in texts]
 
 
+def files_of_one_band(groups: Iterable[Sequence[ImageFile]]) -> list[Problem]:
+    """Return a problem for each band that captures have from two files, as of different naming: f_red.tif and
+    red/f_red.tif. `groups` are the files of each capture; bands of one name and other wavelengths are two bands.
+    """
+    clashes: dict[str, list[tuple[Path, Path]]] = defaultdict(list)
+    for group in groups:
+        first: dict[str, ImageFile] = {}
+        for file in (f for f in group if len(f.bands) == 1):
+            other = first.setdefault(band_key(file.bands[0].name), file)
+            nms = [b.wavelength_nm for b in (*other.bands, *file.bands) if b.wavelength_nm is not None]
+            if other is not file and max(nms, default=0.0) - min(nms, default=0.0) <= SAME_BAND_NM:
+                clashes[file.bands[0].name].append((other.path, file.path))
+    problems = []
+    for name, pairs in clashes.items():
+        other_path, path = pairs[0]
+        others = f", and so in {counted(len(pairs) - 1, 'other file')}" if len(pairs) > 1 else ""
+        twin = other_path.name if other_path.name != path.name else other_path
+        text = f"is band '{name}' of one capture as {twin} is{others}; both are aligned: move one of them elsewhere"
+        problems.append(Problem(path, InputError(f"{path}: {text}")))
+    return problems
+
+
 def _doubtful(bands: Sequence[Band]) -> list[tuple[str, Path]]:
     """(what contradicts, file) of the bands of a capture."""
     known = sorted(((b, b.wavelength_nm) for b in bands if b.wavelength_nm is not None), key=lambda pair: pair[1])

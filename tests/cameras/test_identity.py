@@ -163,6 +163,31 @@ def test_names_and_wavelengths_that_contradict_each_other_have_a_line(
         assert [names[i] for i in bands_for(index_named("ndvi"), names, wavelengths)] == used
 
 
+@pytest.mark.parametrize(
+    ("names", "first", "second"),
+    [
+        ("f_red f_nir red/f_red nir/f_nir", "f_red.tif", "red/f_red.tif"),
+        ("f_red red/f nir/f", "f_red.tif", "red/f.tif"),
+        ("f_red red_f nir_f", "f_red.tif", "red_f.tif"),
+        ("f_NIR f_red f-nir", "f-nir.tif", "f_NIR.tif"),
+    ],
+)
+def test_two_files_of_one_band_of_a_capture_have_a_line(tmp_path: Path, names: str, first: str, second: str) -> None:
+    for number, name in enumerate(names.split()):
+        write_band(tmp_path / f"{name}.tif", np.full((1, 48, 64), number + 1, np.uint16))
+    result = discover(tmp_path)
+    assert len(result.captures) == 1
+    assert not result.is_complete
+    lines = [p.text for p in result.problems if p.text.startswith(f"{tmp_path / second}: ")]
+    assert len(lines) == 1
+    assert f"of one capture as {first} is; both are aligned" in lines[0].replace(f"{tmp_path}/", "")
+
+
+def test_bands_of_one_name_in_the_halves_of_a_dual_camera_have_no_line(tmp_path: Path) -> None:
+    write_rededge(tmp_path, 1, {1: ("Blue", 475), 2: GREEN, 6: ("Blue", 444), 7: ("Green", 531)})
+    assert texts(tmp_path) == []
+
+
 def test_spellings_of_a_name_are_one_band(tmp_path: Path) -> None:
     for number, edge in enumerate(("Red edge", "Red Edge", "REDEDGE", "Red edge ")):
         nir = "NIR " if number == 1 else "NIR"
