@@ -25,6 +25,7 @@ from agalign.flight.rig_file import camera_in, rig_from_json, rig_to_json
 from agalign.method.descriptor import Descriptor
 from agalign.values.files import complete_file, open_regular
 from agalign.values.geometry import Matrix, normalised
+from agalign.values.text import shortened
 
 _FORMAT = "agalign-model/1"
 
@@ -82,7 +83,7 @@ def load_model(path: Path, device: Callable[[], torch.device]) -> FlightModel:
         if is_out_of_memory(error):
             raise MemoryError(str(error)) from None
         text = error.strerror if isinstance(error, OSError) else str(error)
-        reason = next(iter((text or "").splitlines()), type(error).__name__)
+        reason = shortened(next(iter((text or "").splitlines()), type(error).__name__))
         raise InputError(
             f"{path}: cannot be read as a model ({reason}); give a file of an earlier run's models folder"
         ) from None

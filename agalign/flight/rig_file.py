@@ -15,6 +15,7 @@ from agalign.flight.rig import CaptureFactors, Rig
 from agalign.values.files import open_regular
 from agalign.values.geometry import normalised
 from agalign.values.mapping import DisplacementField
+from agalign.values.text import shortened
 
 _MAX_SIDE_PX, _MAX_FIELD_PX, _MAX_NUMBER = 100_000, 1e4, 1e12
 """Limits of the sizes, of the displacements, and of all numbers of a rig; times are the largest."""
@@ -75,7 +76,7 @@ def read_rig(path: Path) -> tuple[FlightCamera | None, Rig | None]:
         rig = rig_from_json(facts["rig"], fields) if facts.get("rig") else None
         return camera_in(facts), rig
     except Exception as error:  # damaged files raise errors of many classes
-        reason = next(iter(str(error).splitlines()), type(error).__name__)
+        reason = shortened(next(iter(str(error).splitlines()), type(error).__name__))
         raise InputError(f"{path}: its rig cannot be read ({reason})") from None
 
 
@@ -88,7 +89,7 @@ def model_fingerprint(path: Path) -> str:
         with safe_open(path, framework="np") as file:
             return str((file.metadata() or {})["fingerprint"])
     except Exception as error:  # damaged files raise errors of many classes
-        reason = next(iter(str(error).splitlines()), type(error).__name__)
+        reason = shortened(next(iter(str(error).splitlines()), type(error).__name__))
         raise InputError(f"{path}: cannot be read as a model ({reason})") from None
 
 

@@ -10,7 +10,7 @@ from typing import Literal, NamedTuple
 
 from pydantic import dataclasses as validated
 
-from agalign.values.fields import RECORD, Number
+from agalign.values.fields import RECORD, Name, Number
 from agalign.values.geometry import Matrix
 from agalign.values.lens import Lens
 from agalign.values.pixel_units import PixelScale
@@ -283,11 +283,11 @@ class CameraIdentity:
     ('MicaSense RedEdge-M', 'SY01-0000001-AG')
     """
 
-    make: str = ""
+    make: Name = ""
     """From the tags."""
-    model: str = ""
+    model: Name = ""
     """From the tags."""
-    serial: str = ""
+    serial: Name = ""
     """Serial numbers, joined by `+`."""
 
     @property

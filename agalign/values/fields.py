@@ -16,6 +16,7 @@ from pydantic import AfterValidator, ConfigDict, Field, GetCoreSchemaHandler
 from pydantic_core import CoreSchema, core_schema
 
 from agalign.values.files import is_inside
+from agalign.values.text import shortened_message, shortened_name
 
 RECORD = ConfigDict(extra="forbid", use_attribute_docstrings=True, arbitrary_types_allowed=True, validate_by_name=True)
 _MAX = 1e30
@@ -108,6 +109,10 @@ class Array:
         return with_null.tolist()
 
 
+Name = Annotated[str, AfterValidator(shortened_name)]
+"""A name, or another short text, of which a file may have any length."""
+Message = Annotated[str, AfterValidator(shortened_message)]
+"""A sentence, of which a file may have any length."""
 Number = Annotated[float, _Limited()]
 Count = Annotated[int, Field(gt=0)]
 Positive = Annotated[float, _Limited(is_positive=True)]

@@ -8,7 +8,7 @@ from pydantic import GetCoreSchemaHandler
 from pydantic import dataclasses as validated
 from pydantic_core import CoreSchema, core_schema
 
-from agalign.values.fields import RECORD, Measured
+from agalign.values.fields import RECORD, Measured, Message
 
 
 @dataclass(frozen=True)
@@ -213,7 +213,7 @@ class Issue:
     """Measured value: px, a share or a count."""
     limit: Annotated[float, Measured()] | None = None
     """Minimum or maximum accepted value."""
-    detail: str = ""
+    detail: Message = ""
     """Error of a file, requested seed, or distance that a share refers to."""
 
     @property

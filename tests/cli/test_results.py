@@ -86,3 +86,42 @@ def test_a_sidecar_without_a_checksum_is_no_match(out: Path) -> None:
     assert done.returncode == 3
     assert "IMG_0001.json: has no checksum, so that changes cannot be found" in done.stderr
     assert "1 of 2 captures match their checksums" in done.stdout
+
+
+LONG = "x" * 5000
+
+
+TEXTS = ["band", "reason", "radiometry", "captured_at", "capture_id", "flight_id", "make", "model", "serial", "agalign"]
+
+
+def with_long_texts(part: object, key: str = "") -> object:
+    """A part of a sidecar with 5000 characters more in its names and sentences."""
+    if isinstance(part, dict):
+        return {k: with_long_texts(value, k) for k, value in part.items()}
+    if isinstance(part, list):
+        return [item + LONG if isinstance(item, str) else with_long_texts(item) for item in part]
+    return part + LONG if key in TEXTS and isinstance(part, str) else part
+
+
+@pytest.mark.parametrize("command", [*COMMANDS, "align"])
+@pytest.mark.parametrize("edited", ["texts", "unknown key", "schema"])
+def test_long_texts_of_an_edited_sidecar_make_no_long_lines(command: str, edited: str, out: Path, flight: Path) -> None:
+    path = out / f"{FIRST}.json"
+    facts = json.loads(path.read_text())
+    if edited == "texts":
+        facts = with_long_texts(facts | {"missing_bands": ["Pan"], "status": "degraded"})
+        facts["bands"][1] |= {"status": "failed", "reason": LONG, "issues": [{"kind": "unreadable", "detail": LONG}]}
+    elif edited == "schema":
+        facts["schema"] = "agalign/2" + LONG
+    else:
+        facts["bands"][1][LONG] = 1
+    path.write_text(json.dumps(facts))
+    run = (
+        ["align", flight, "-o", out, "--only-seed", "--dry-run", "-v"]
+        if command == "align"
+        else arguments(command, out)
+    )
+    done = agalign_here(*run)
+    lines = (done.stdout + done.stderr).splitlines()
+    assert "please report" not in done.stderr
+    assert max(map(len, lines)) < 2500, "a sentence with some names"

@@ -43,7 +43,7 @@ from agalign.values.image import Tile, reduced_size_px
 from agalign.values.memory import WORK_TILE_PX
 from agalign.values.resampling import tiles
 from agalign.values.spectrum import role_of_band
-from agalign.values.text import without_formula
+from agalign.values.text import shortened, without_formula
 
 _STATISTICS_TAG = "INDEX_STATISTICS"
 INDICES_FILE = "indices.csv"
@@ -147,7 +147,7 @@ def _statistics_in(tags: Mapping[str, str]) -> IndexStatistics | None:
     """Return the statistics in the tags of a raster; None if there are none."""
     try:
         fields: dict[str, Any] = json.loads(tags[_STATISTICS_TAG])
-        unit = str(fields.pop("unit"))
+        unit = shortened(str(fields.pop("unit")))
         return IndexStatistics(unit=unit, **{k: math.nan if v is None else float(v) for k, v in fields.items()})
     except (KeyError, ValueError, TypeError):
         return None

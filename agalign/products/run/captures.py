@@ -20,6 +20,7 @@ from agalign.products.sidecar.file import label_of, read_without_tables, run_sid
 from agalign.products.sidecar.schema import Sidecar
 from agalign.values.choices import UNUSABLE_QUALITY
 from agalign.values.image import FloatImage, Tile, reduced_size_px
+from agalign.values.text import shortened
 
 RAW = "raw numbers"
 """Unit of bands that are neither reflectance nor radiance."""
@@ -92,7 +93,7 @@ class BandReader(ExitStack):
     def quantity(self, band: AlignedBand) -> str:
         """Return the quantity of a band's numbers by the tags of its file; empty without any. Raises InputError."""
         source = self.file(band.file, band.band_index)
-        return str(source.tags(band.band_index).get("QUANTITY") or source.tags().get("RADIOMETRY") or "")
+        return shortened(source.tags(band.band_index).get("QUANTITY") or source.tags().get("RADIOMETRY") or "")
 
     def units(self, band: AlignedBand) -> list[str]:
         """Return the units of a band's numbers: one, unless the tag of a stack lists several.

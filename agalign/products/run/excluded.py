@@ -15,6 +15,7 @@ from agalign.flight.sky import SkyCapture, sky_radiance
 from agalign.pixels.raster import read_preview
 from agalign.products.report.drawing import Picture, side_by_side, titled, write_png
 from agalign.values.capture import Band, Capture, PanelSource
+from agalign.values.fields import Message, Name
 from agalign.values.files import check_inside, read_model, write_model
 from agalign.values.pixel_units import PixelScale
 
@@ -28,8 +29,8 @@ class _Part(BaseModel):
 class PanelBandPart(_Part):
     """Measurement on the panel in one band."""
 
-    band: str
-    file: str
+    band: Name
+    file: Name
     area_px: list[tuple[float, float]]
     """Corners (x, y) of the measured area, raw pixels of the file."""
     albedo: float | None
@@ -39,15 +40,15 @@ class PanelBandPart(_Part):
     reflectance_per_radiance: float | None
     sensor_scale: float | None = None
     """Irradiance on the panel divided by that of the light sensor."""
-    problem: str | None
+    problem: Message | None
     """Reason why the band cannot be used."""
 
 
 class SkyBandPart(_Part):
     """One band of a capture of the sky."""
 
-    band: str
-    file: str
+    band: Name
+    file: Name
     radiance: float | None
     """Median over the image, W / m^2 / sr / nm; null if it is unknown or half of the band is saturated."""
 
@@ -55,7 +56,7 @@ class SkyBandPart(_Part):
 class _CapturePart(_Part):
     folder: str
     capture: str
-    captured_at: str
+    captured_at: Name
 
     @property
     def is_left_out(self) -> bool:
@@ -67,11 +68,11 @@ class PanelPart(_CapturePart):
     """One capture of a panel."""
 
     seen_by: PanelSource
-    serial: str
+    serial: Name
     picture: str
     in_scene: bool = False
     """The capture shows a scene that contains the panel, or only one cue indicates it: it is aligned."""
-    cues: list[str] = []
+    cues: list[Name] = []
     """Evidence that the capture shows a panel, in words."""
     sensor_scale: float | None = None
     """Irradiance on the panel divided by that of the light sensor, the median of the bands."""
@@ -108,7 +109,7 @@ class PanelPart(_CapturePart):
 class SkyPart(_CapturePart):
     """One capture of the sky."""
 
-    cues: list[str]
+    cues: list[Name]
     """Evidence that the capture shows the sky, in words."""
     bands: list[SkyBandPart]
 

@@ -22,7 +22,7 @@ from agalign.values.files import RUN_FILE, read_model, write_model
 from agalign.values.image import OutputGrid
 from agalign.values.libraries import library_versions
 from agalign.values.processes import usable_cores
-from agalign.values.text import counted, escape_controls
+from agalign.values.text import counted, escape_controls, shortened
 
 PAGES = "index.html", "summary.csv", "indices.csv", "flight.geojson"
 """Files that a run writes for all its captures."""
@@ -219,7 +219,7 @@ class UnfinishedRun:
         max_named = 10
         if not self.missing:
             return ""
-        named, more = ", ".join(self.missing[:max_named]), len(self.missing) - max_named
+        named, more = ", ".join(map(shortened, self.missing[:max_named])), len(self.missing) - max_named
         and_more = f" and {more} more" if more > 0 else ""
         verb = "has" if len(self.missing) == 1 else "have"
         return f"{len(self.missing)} of {counted(self.found, 'capture')} {verb} no result: {named}{and_more}"

@@ -12,6 +12,7 @@ from pydantic import ValidationError
 from agalign.errors import InputError, SidecarError
 from agalign.products.sidecar.schema import SCHEMA, FilePart, Sidecar
 from agalign.values.files import RUN_FILE, compact_lists, file_checksum, open_regular, read_regular, write_text
+from agalign.values.text import shortened
 
 _MAX_BYTES = 1 << 26
 """Limit of a file that is read: ten times the sidecar of many bands."""
@@ -143,15 +144,14 @@ def _problem(error: ValidationError) -> str:
     problems = {".".join(map(str, e["loc"])): e for e in error.errors(include_url=False)}
     (field, first), *_ = problems.items()
     if first["type"] == "json_invalid":
-        return f"not valid JSON ({first['msg']}); delete it and run again"
+        return f"not valid JSON ({shortened(first['msg'])}); delete it and run again"
     if not field:
         return f"not a sidecar of schema {SCHEMA!r}; delete it and run again"
     if "schema" in problems:
         schema = problems["schema"]
         value = repr(None if schema["type"] == "missing" else schema["input"])
-        quoted = value if len(value) <= _MAX_QUOTED else f"{value[:_MAX_QUOTED]}…"
-        return f"schema is {quoted}, not {SCHEMA!r}; run again with --overwrite"
-    return f"{field}: {first['msg'].removeprefix('Value error, ')}; run again with --overwrite"
+        return f"schema is {shortened(value, _MAX_QUOTED)}, not {SCHEMA!r}; run again with --overwrite"
+    return f"{shortened(field)}: {shortened(first['msg'].removeprefix('Value error, '))}; run again with --overwrite"
 
 
 def verify_outputs(out: Path) -> Iterator[tuple[Path, list[str]]]:

@@ -33,6 +33,8 @@ from agalign.values.fields import (
     Count,
     Matrix3x3,
     Measured,
+    Message,
+    Name,
     Number,
     Number3,
     Number4,
@@ -63,9 +65,9 @@ class _Part(BaseModel):
 class ReferencePart(_Part):
     """Reference band."""
 
-    band: str
+    band: Name
     """Name."""
-    file: str
+    file: Name
     """Image file."""
     band_index: Count
     """Band of the file, from 1."""
@@ -181,11 +183,11 @@ class PlacePart(_Part):
 class BandResult(_Part):
     """Result of one band, with its complete mapping."""
 
-    band: str
+    band: Name
     """Name."""
     wavelength_nm: Number | None
     """Centre wavelength, nm."""
-    file: str
+    file: Name
     """Image file."""
     band_index: int
     """Band of the file, from 1."""
@@ -193,7 +195,7 @@ class BandResult(_Part):
     """Width and height of the file."""
     status: PairStatus
     """`reference`, `aligned`, `predicted`, `seed_only` or `failed`."""
-    reason: str | None
+    reason: Message | None
     """Why the band is not aligned, in words."""
     issues: tuple[Issue, ...] = ()
     """All reasons; `reason` is the first."""
@@ -338,7 +340,7 @@ def _after(alignment: Alignment) -> Similarity:
 class IlluminationPart(_Part):
     """Illumination of a band."""
 
-    band: str
+    band: Name
     """Its name."""
     irradiance: Number | None = None
     """By the light sensor, horizontal plane, W/m²/nm (DJI: relative)."""
@@ -351,9 +353,9 @@ class OutputPart(_Part):
 
     file: RelativeFile | None
     """The stack; null with `--layout bands`."""
-    bands: list[str] = []
+    bands: list[Name] = []
     """Bands of the stack, in order; missing ones are nodata."""
-    radiometry: str | None = None
+    radiometry: Name | None = None
     """Conversion of raw numbers, such as `reflectance by panel and light sensor`."""
     panel_age_s: Number | None = None
     """Time to the nearest panel."""
@@ -367,7 +369,7 @@ class OutputPart(_Part):
     """True for a lens-corrected reference grid."""
     vignetting_corrected: bool = False
     """True if vignetting is corrected in the files of single bands."""
-    nodata: float | str | None
+    nodata: float | Name | None
     """Nodata value (`"nan"` for NaN); null if it differs between single bands."""
 
     @property
@@ -379,7 +381,7 @@ class OutputPart(_Part):
 class FilePart(_Part):
     """A file that belongs to the capture."""
 
-    kind: str
+    kind: Name
     """`parallax` (of the estimation); `stack`, `band`, `pan_sharpened`, `relief`, `error_map`, `qa`, `tie_points`,
     `index`, `picture` or `preview`."""
     file: RelativeFile
@@ -427,15 +429,15 @@ class Sidecar(_Part):
 
     schema_: Annotated[Literal["agalign/2"], Field(alias="schema")] = "agalign/2"
     """Version of the format."""
-    agalign: str
+    agalign: Name
     """Version of the program."""
     capture: RelativeFile
     """Name of the capture."""
-    capture_id: str
+    capture_id: Name
     """From the tags."""
-    flight_id: str
+    flight_id: Name
     """From the tags."""
-    captured_at: str
+    captured_at: Name
     """Time in the tags, ISO 8601; empty if unknown or the clock was not set."""
     position: Position | None = None
     """GPS position of the reference band."""
@@ -446,9 +448,9 @@ class Sidecar(_Part):
     status: CaptureStatus
     """`ok`: all bands exist, `aligned`, or `predicted` within `accept_predicted_px`. `failed`: all moving bands are.
     Else `degraded`."""
-    missing_bands: list[str]
+    missing_bands: list[Name]
     """Bands that the capture lacks."""
-    unreadable_bands: dict[str, str] = {}
+    unreadable_bands: dict[Name, Message] = {}
     """Why missing bands are unreadable."""
     reference: ReferencePart
     """Reference band."""
@@ -472,7 +474,7 @@ class Sidecar(_Part):
     """Preview image."""
     products: list[FilePart] = []
     """Rendered files."""
-    not_written: list[str] = []
+    not_written: list[Name] = []
     """Kinds of products that could not be written."""
     rendered_with: str = ""
     """Fingerprint of everything that the products depend on; empty until all are written."""
