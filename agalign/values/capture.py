@@ -247,7 +247,7 @@ HeightSource = Literal["tags", "panel", "ground elevation", "assumed"]
 
 @validated.dataclass(frozen=True, config=RECORD)
 class Pose:
-    """Orientation of the camera, and its height.
+    """Orientation and height of the camera.
 
     Examples
     --------
