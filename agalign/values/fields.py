@@ -8,6 +8,7 @@ not be measured.
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import chain
 from typing import Annotated, Any
 
 import numpy as np
@@ -84,18 +85,32 @@ class Array:
         in_file: CoreSchema = core_schema.nullable_schema(number) if self.nullable else number
         for length in reversed(self.shape):
             in_file = core_schema.list_schema(in_file, min_length=length, max_length=length)
+        read = in_file
+        if self._is_table:
+            row = core_schema.tuple_positional_schema([core_schema.float_schema()] * (self.shape[1] or 0))
+            read = core_schema.list_schema(row, min_length=self.shape[0], max_length=self.shape[0])
         return core_schema.json_or_python_schema(
-            core_schema.no_info_after_validator_function(self._from_json, in_file),
+            core_schema.no_info_after_validator_function(self._from_json, read),
             core_schema.any_schema(),
             serialization=core_schema.plain_serializer_function_ser_schema(
                 self._to_json, return_schema=in_file, when_used="json"
             ),
         )
 
+    @property
+    def _is_table(self) -> bool:
+        """True for rows of one length, which are read in half the time of other lists, and then checked together."""
+        return len(self.shape) == 2 and bool(self.shape[1]) and not self.integers and not self.nullable
+
     def _from_json(self, values: Sequence[Any]) -> NDArray[Any]:
         if not values:
             return np.zeros([length or 0 for length in self.shape], np.int64 if self.integers else np.float64)
-        return np.array(values, np.int64 if self.integers else np.float64)
+        if not self._is_table:
+            return np.array(values, np.int64 if self.integers else np.float64)
+        table = np.fromiter(chain.from_iterable(values), np.float64).reshape(len(values), -1)
+        if not (np.abs(table) <= _MAX).all():  # also for nan
+            raise ValueError("Input should be finite numbers")
+        return table
 
     def _to_json(self, values: NDArray[Any]) -> Any:
         if self.integers:

@@ -36,21 +36,24 @@ class DataParts:
     _count: int = 0
 
     def add(self, record: dict[str, Any]) -> bool:
-        """Add a record, with control characters escaped; return True if the part is full, and `flush` must follow."""
-        self._records.append(printable(record))
+        """Add a record; return True if the part is full, and `flush` must follow."""
+        self._records.append(record)
         self._count += 1
         return len(self._records) == self.size
 
     def flush(self, also: Mapping[str, Any] | None = None) -> None:
-        """End the current part, with further data of it. Raises OutputError."""
+        """End the current part, with further data of it, and control characters escaped. Raises OutputError."""
         if not self._records and self.first is not None:
             return
         part = {"from": self._count - len(self._records), "records": self._records, **(also or {})}
         self._records = []
+        text = _in_json(part)
+        if "\\" in text or not text.isprintable():  # few parts, so that most texts are searched at once
+            part["records"] = printable(part["records"])
+            text = _in_json(part)
         if self.first is None:
             self.first = part
             return
-        text = json.dumps(part, separators=(",", ":"), ensure_ascii=False, allow_nan=False)
         # The name contains a checksum: the earlier page, and its data, stand until the new page replaces it.
         digest = hashlib.sha256(text.encode()).hexdigest()[:16]
         file = f"{DATA_FOLDER}/{self.kind}-{len(self.files) + 2}-{digest}.js"
@@ -65,6 +68,10 @@ class DataParts:
         for file in self.files:
             text = (self.out / file).read_text("utf-8")
             yield json.loads(text[text.index("(") + 1 : text.rindex(")")])
+
+
+def _in_json(part: Mapping[str, Any]) -> str:
+    return json.dumps(part, separators=(",", ":"), ensure_ascii=False, allow_nan=False)
 
 
 def printable(value: Any) -> Any:

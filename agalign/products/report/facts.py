@@ -6,10 +6,12 @@ from collections import Counter, defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from statistics import median
 from typing import Any, NamedTuple
 from urllib.parse import quote
 
 import numpy as np
+from numpy.typing import NDArray
 
 from agalign.products.indices.rasters import IndexReport
 from agalign.products.report.data_files import DataParts
@@ -376,8 +378,10 @@ class FlightFacts:
         offset_px, offset_length_px = _band_offset(band.grid, sidecar)
         if offset_length_px is not None and band.status != "reference":
             self.pairs.bands[band.band].offsets_px.append(offset_length_px)
-        is_measured = np.isfinite(shifts_px).ravel().tolist()
-        steps = np.rint(np.nan_to_num(shifts_px) / _SHIFT_STEP_PX).astype(int).ravel().tolist()
+        is_measured = np.isfinite(shifts_px)
+        known_px = np.where(is_measured, shifts_px, 0.0)
+        steps = np.rint(known_px / _SHIFT_STEP_PX).astype(int).ravel().tolist()
+        shifts = zip(steps, is_measured.ravel().tolist(), strict=True)
         # The first nine columns of the table have the same names here.
         return {name: row[name] for name in tuple(BAND_COLUMNS)[:9]} | {
             "seconds": round(band.seconds, 2),
@@ -391,7 +395,7 @@ class FlightFacts:
             "occluded": value_at(band, "relief.occluded"),
             "check": [text for text in checks if text != band.reason],
             "lattice": self._first_lattice + self._lattices.setdefault(lattice, len(self._lattices)),
-            "shifts": [step if known else None for step, known in zip(steps, is_measured, strict=True)],
+            "shifts": [step if known else None for step, known in shifts],
         }
 
 
@@ -452,12 +456,16 @@ def _band_offset(grid: GridPart | None, sidecar: Sidecar) -> tuple[tuple[float, 
 
     None if the scales of the two files differ by 10 % or more.
     """
-    if grid is None:
+    if grid is None or not len(grid.reference_px):
         return None, None
     reference_px, moving_px = grid.reference_px, grid.moving_px
-    offsets, span_px = moving_px - reference_px, np.ptp(reference_px, axis=0)
-    if not (np.abs(np.ptp(moving_px, axis=0) - span_px) < 0.1 * span_px).all():
+    offsets, span_px = moving_px - reference_px, reference_px.max(axis=0) - reference_px.min(axis=0)
+    if not (np.abs(moving_px.max(axis=0) - moving_px.min(axis=0) - span_px) < 0.1 * span_px).all():
         return None, None
     centre = (np.array(sidecar.reference.size_px) - 1) / 2
-    dx, dy = offsets[np.linalg.norm(reference_px - centre, axis=1).argmin()].tolist()
-    return (round(dx, 3), round(dy, 3)), round(float(np.median(np.linalg.norm(offsets, axis=1))), 3)
+    dx, dy = offsets[_lengths(reference_px - centre).argmin()].tolist()
+    return (round(dx, 3), round(dy, 3)), round(median(_lengths(offsets).tolist()), 3)
+
+
+def _lengths(vectors: NDArray[np.float64]) -> NDArray[np.float64]:
+    return np.asarray(np.sqrt((vectors * vectors).sum(axis=1)))
