@@ -27,5 +27,5 @@ def test_fault(fault: Fault, model: Path, tmp_path: Path) -> None:
 
 def test_the_document_has_the_exit_codes_of_the_most_common_faults() -> None:
     assert f"injects {len(FAULTS)} faults" in DOCUMENT.read_text()
-    assert len(documented()) > 5
+    assert documented()
     assert documented().items() <= {(f.name, str(f.code)) for f in FAULTS}
