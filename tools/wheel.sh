@@ -3,8 +3,8 @@
 #
 #     tools/wheel.sh [OUT]        # OUT keeps them
 #
-# The wheel is installed without dependencies; they come from the active environment (the dev extra), because their
-# installation takes minutes.
+# The builds and the wheel use the packages of the active environment (the dev extra), because their installation takes
+# minutes.
 set -euo pipefail
 cd "$(dirname "$0")/.."
 
@@ -12,8 +12,8 @@ folder=$(mktemp -d)
 trap 'rm -rf "$folder"' EXIT
 out=${1:-$folder/dist}
 
-python3 -m build --outdir "$out" . > "$folder/build.log" 2>&1 || { cat "$folder/build.log"; exit 1; }
-python3 -m build --wheel --outdir "$folder/direct" . > "$folder/build.log" 2>&1 || { cat "$folder/build.log"; exit 1; }
+python3 -m build --no-isolation --outdir "$out" . > "$folder/build.log" 2>&1 || { cat "$folder/build.log"; exit 1; }
+python3 -m build --no-isolation --wheel --outdir "$folder/direct" . > "$folder/build.log" 2>&1 || { cat "$folder/build.log"; exit 1; }
 version=$(sed -n 's/^__version__ = "\(.*\)"/\1/p' agalign/_version.py)
 sdist=$out/agalign-$version.tar.gz wheel=$out/agalign-$version-py3-none-any.whl
 cmp "$wheel" "$folder/direct/$(basename "$wheel")"

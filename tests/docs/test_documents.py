@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Any
 
 import cv2
-import geopandas
 import numpy as np
 import pytest
 import rasterio
@@ -56,6 +55,8 @@ def write_ndvi_and_plots(folder: Path) -> None:
     rings |= {"edge": ((0, 4), (2, 4), (2, 6), (0, 6)), "bow tie": ((6, 5), (9, 5), (6, 4), (9, 4))}
     outlines = [Polygon([(500_000 + x, 4_000_000 - y) for x, y in ring]) for ring in rings.values()]
     ids = {"plot": [name or None for name in rings]}
+    import geopandas  # late: it takes a second in each process of the tests
+
     frame = geopandas.GeoDataFrame(ids, geometry=outlines, crs="EPSG:32633")
     frame.to_crs("EPSG:4326").to_file(folder / "plots.gpkg")
 

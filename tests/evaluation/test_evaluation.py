@@ -194,6 +194,7 @@ def test_matching_finds_nothing_in_unrelated_images() -> None:
 # ---- the commands
 
 
+@pytest.mark.full
 def test_a_descriptor_learned_on_a_pair_beats_sift_with_reversed_contrast(tmp_path: Path) -> None:
     write_pair(tmp_path, TRUTH, 3)
     table, numbers = tmp_path / "pairs.csv", " ".join(f"{v}" for v in TRUTH.ravel())

@@ -4,7 +4,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 import rasterio
-import rioxarray  # noqa: F401
 
 import agalign
 
@@ -72,6 +71,8 @@ def test_a_place_on_the_map_and_masked_pixels_follow(tmp_path: Path) -> None:
             dataset.write(np.zeros((40, 40), np.uint16), 1, window=rasterio.windows.Window(0, 0, 40, 40))
     agalign.align_folder(tmp_path / "in", tmp_path / "out", settings=seeded())
     raw = agalign.open_capture(tmp_path / "out" / "f.json", masked=False)
+    import rioxarray  # noqa: F401  (imported late: it takes a second in each process of the tests)
+
     assert raw.red.rio.crs.to_epsg() == 32631
     assert raw.red.dtype == np.uint16
     assert (raw.red.attrs["_FillValue"], raw.red.attrs["units"]) == (0, "count")
