@@ -358,6 +358,7 @@ def test_a_lost_band_is_predicted_with_the_relief(
     assert result["Blue"].geometry == "relief"
 
 
+@pytest.mark.full
 def test_the_relief_follows_planes_that_its_windows_move() -> None:
     """The first planes of this scene are several steps of the refinement off: large shifts are measured in steps."""
     size_px = 448, 336

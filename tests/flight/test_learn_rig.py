@@ -173,6 +173,7 @@ def test_too_few_known_times_have_the_typical_error(known_times: int) -> None:
     assert error_px(rig, "NIR", Observation(None, {}, {}, altitude_m=86.5), mappings(1.75)["NIR"])[0] < 0.3
 
 
+@pytest.mark.full
 def test_a_band_in_few_captures_has_a_finite_error() -> None:
     """25 captures, three of them with NIR, twelve apart like the folds of the cross-validation."""
     rng = np.random.default_rng(1)
