@@ -67,9 +67,8 @@ def read_sidecar(path: Path) -> Sidecar:
     try:
         text = read_regular(path, _MAX_BYTES)
         if b'"agalign/1"' in text[:_START_BYTES]:
-            with suppress(
-                KeyError, TypeError, AttributeError, ValueError, RecursionError
-            ):  # not a sidecar: refused below
+            # What is not a sidecar is refused below.
+            with suppress(KeyError, TypeError, AttributeError, ValueError, RecursionError):
                 text = json.dumps(from_version_1(json.loads(text))).encode()
         return Sidecar.model_validate_json(text)
     except OSError as error:
