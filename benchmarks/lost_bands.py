@@ -3,7 +3,7 @@
     python benchmarks/lost_bands.py FLIGHT... [--figures]
 
 In one run each capture of the flight loses another band, to noise; in another one whole capture is water. The rows are
-of the lost bands; the last one is of those that are predicted within --accept-predicted, which indices use. Errors are
+of the lost bands. The last row has those that indices use: predicted within --accept-predicted. Errors are
 those at the reference tie points in ties.json. Without that file, they are the distances from the mappings of the
 undamaged run, and the damaged runs use its model.
 """
