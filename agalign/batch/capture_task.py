@@ -248,8 +248,8 @@ def missing_radiometry(capture: Capture, choice: RadiometryChoice) -> str:
     bands = ", ".join(b.name for b in lacking) + next((f" ({b.implausible})" for b in lacking if b.implausible), "")
     missing = {
         "sun": f"no usable tags of a light sensor in {bands}; choose --radiometry camera or panel",
-        "panel": f"no usable calibration panel of known reflectance was recorded within hours for {bands}; give "
-        "--panel-albedo for a panel without QR code, or choose --radiometry sun or camera",
+        "panel": f"no calibration panel for {bands}: {capture.without_panel or 'none was measured'}; or choose "
+        "--radiometry sun or camera",
     }
     return missing.get(choice, f"no tags for radiance in {bands}; leave --radiometry out")
 

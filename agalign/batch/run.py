@@ -25,6 +25,7 @@ from agalign.flight.model import FlightModel, load_model, save_model
 from agalign.flight.panel_readings import (
     READERS,
     PanelReading,
+    missing_panel,
     read_panel,
     reflectance_factors,
     with_height,
@@ -36,8 +37,9 @@ from agalign.flight.sky import SkyCapture, sky_captures
 from agalign.method.device import choose_device, limit_threads
 from agalign.pixels.radiometry import with_radiometry
 from agalign.products.indices.rasters import check_indices
-from agalign.products.product import CapturePaths
+from agalign.products.product import CapturePaths, Product
 from agalign.products.rasters.output_grid import FlightLimits, common_grid, flight_limits
+from agalign.products.registry import PRODUCTS
 from agalign.products.report.preview import preview_bytes
 from agalign.products.run.excluded import write_panels, write_sky
 from agalign.products.run.footprint import (
@@ -105,12 +107,20 @@ def run_flight(
     run.check()
     if model is not None:
         run = run.starting_from(model)
+    with locked(out):
+        # What can be refused is refused before the record and the pages of an earlier run are touched.
+        yield from _run_selected(run, run.selection())
+
+
+def _run_selected(run: "_FlightRun", selection: "_Selection") -> Iterator[CaptureReport]:
+    """Process the captures of a run, record it, and yield the report of each capture. Raises as `run_flight`."""
+    out = run.out
     # (path of the sidecar, its files, state, statuses of the pairs) by label; sidecars would not fit into memory.
     written: dict[str, tuple[Path, Sequence[FilePart], str, list[str]]] = {}
     gone: list[str] = []
-    with locked(out), _recorded(run) as record:
+    with _recorded(run) as record:
         try:
-            for report in run.reports(record):
+            for report in run.reports(selection, record):
                 record.add(report.label, report.state, report.result, report.problems)
                 if report.state == "done":
                     record.capture_seconds[report.label] = report.seconds
@@ -139,11 +149,10 @@ def plan_run(flight: FolderScan, out: Path, settings: Settings, options: RunOpti
     """
     run = _FlightRun(flight, out, settings, options or RunOptions())
     run.check()
-    with run.examining() as examine:
-        sky, panels, captures = run.selected(examine)
-    states = examine.abandoned | {s.capture.label: "left out as sky" for s in sky}
-    states |= {p.capture.label: "read as calibration panels" for p in panels if p.capture.is_of_a_panel}
-    for capture in captures:
+    selection = run.selection()
+    states = dict(selection.abandoned) | {s.capture.label: "left out as sky" for s in selection.sky}
+    states |= {p.capture.label: "read as calibration panels" for p in selection.panels if p.capture.is_of_a_panel}
+    for capture in selection.captures:
         left = run.remaining(capture)
         states[capture.label] = _PLANNED[left.step]
         if left.changed:
@@ -222,13 +231,26 @@ class _FlightRun:
         with environment_of_children(threads=1), ProcessPool(processes, get_context("spawn"), _start_examining) as pool:
             yield _Examination(pool, timeout_s)
 
-    def selected(self, examine: "_Examination") -> tuple[list[SkyCapture], list[PanelReading], list[Capture]]:
-        """Return (captures of the sky, readings of calibration panels, captures to align, with their radiometry and
-        georeference); a scene that contains a panel is in both of the last two. Captures that `examine` has abandoned
-        are in none.
+    def selection(self) -> "_Selection":
+        """Return what the run does with each capture.
 
-        Raises ConfigurationError if no capture has the metadata for a georeference that the settings ask for.
+        Raises ConfigurationError if no capture has what the settings ask for: the radiometry, the metadata for a
+        georeference, or the bands for a product.
         """
+        with self.examining() as examine:
+            result = self._selected(examine)
+        write, captures = self.settings.write, result.captures
+        missing = [missing_radiometry(capture, write.radiometry) for capture in captures]
+        if captures and all(missing):
+            raise ConfigurationError(f"--radiometry {write.radiometry}: {missing[0]}")
+        if write.georeference and captures and all(c.reference.georeference is None for c in captures):
+            raise ConfigurationError(f"--georeference: no capture has {missing_for_footprint(captures[0])}")
+        for product in (one for one in PRODUCTS if one.is_enabled(write)):
+            _check_product(product, captures)
+        return result
+
+    def _selected(self, examine: "_Examination") -> "_Selection":
+        """Return the captures by what they show, those to align with their radiometry and georeference."""
         write, albedos = self.settings.write, dict(self.settings.write.panel_albedo)
         sky: list[SkyCapture] = []
         panels: list[PanelReading] = []
@@ -243,28 +265,20 @@ class _FlightRun:
         if write.georeference:
             crs = utm_of_flights(captures)
             captures = [with_approximate_georeference(c, crs[c.label]) if c.label in crs else c for c in captures]
-        missing = [missing_radiometry(capture, write.radiometry) for capture in captures]
-        if captures and all(missing):
-            refused = [f"; {p.capture.label} {b.band.name}: {b.problem}" for p in panels for b in p.bands if b.problem]
-            raise ConfigurationError(f"--radiometry {write.radiometry}: {missing[0]}" + "".join(refused[:1]))
-        if write.georeference and captures and all(c.reference.georeference is None for c in captures):
-            raise ConfigurationError(f"--georeference: no capture has {missing_for_footprint(captures[0])}")
-        return sky, panels, captures
+        return _Selection(sky, panels, captures, examine.abandoned)
 
     def remaining(self, capture: Capture) -> Remaining:
         """Return what remains to be done for a capture."""
         return remaining(capture, self.out, self.settings, self.options)
 
-    def reports(self, record: RunPart) -> Iterator[CaptureReport]:
+    def reports(self, selection: "_Selection", record: RunPart) -> Iterator[CaptureReport]:
         """Yield the report of each capture; add the time of learning to the record."""
-        with self.examining() as examine:
-            sky, panels, captures = self.selected(examine)
-        for label, reason in examine.abandoned.items():
+        for label, reason in selection.abandoned.items():
             yield CaptureReport(label, "error", error=reason)
-        for report, capture in self._excluded(sky, panels, record):
+        for report, capture in self._excluded(selection.sky, selection.panels, record):
             remove_outputs(capture, self.out, self.settings.write)
             yield report
-        yield from self._aligned(captures, record)
+        yield from self._aligned(selection.captures, record)
 
     def _excluded(
         self, sky: Sequence[SkyCapture], panels: Sequence[PanelReading], record: RunPart
@@ -363,6 +377,19 @@ class _FlightRun:
 
 
 @dataclass(frozen=True)
+class _Selection:
+    """What a run does with the captures of its input."""
+
+    sky: Sequence[SkyCapture]
+    panels: Sequence[PanelReading]
+    """A scene that contains a panel is in `captures` too."""
+    captures: Sequence[Capture]
+    """Those to align."""
+    abandoned: Mapping[str, str]
+    """Why the search for sky and panels was abandoned, by label; these captures are in no other list."""
+
+
+@dataclass(frozen=True)
 class _Examination:
     """Calls functions that read the images of captures, as `flight.panel_readings.Examine`."""
 
@@ -417,11 +444,26 @@ def _crops_of_cameras(
     return result
 
 
+def _check_product(product: Product, captures: Sequence[Capture]) -> None:
+    """Raise ConfigurationError if no capture has what a product needs."""
+    problem: AgalignError | None = None
+    for capture in captures:
+        try:
+            product.check(capture)
+            return
+        except AgalignError as error:
+            problem = problem or error
+    if problem is not None:
+        raise ConfigurationError(str(problem))
+
+
 def _calibrated(capture: Capture, panels: Sequence[PanelReading], settings: WriteSettings) -> Capture:
     """Return the capture with its radiometry, and its height above the ground if the elevation of the ground or a panel
     determines it.
     """
     capture = with_radiometry(capture, settings.radiometry, reflectance_factors(capture, panels))
+    if settings.radiometry == "panel":
+        capture = replace(capture, without_panel=missing_panel(capture, panels))
     if settings.ground_elevation_m is not None:
         capture = above_elevation(capture, settings.ground_elevation_m)
     return with_height(capture, panels)

@@ -195,6 +195,47 @@ def reflectance_factors(capture: Capture, readings: Iterable[PanelReading]) -> d
     return result
 
 
+def missing_panel(capture: Capture, readings: Sequence[PanelReading]) -> str:
+    """Return why no reading gives the reflectance of all bands of a capture, and the remedy; empty if they do."""
+    lacking = {b.name for b in capture.bands if not b.is_from_photograph} - reflectance_factors(
+        capture, readings
+    ).keys()
+    if not lacking:
+        return ""
+    if not readings:
+        return (
+            "no capture of a calibration panel was found; photograph the panel before and after the flight, or give "
+            "--panel-albedo for a panel without QR code"
+        )
+    of_camera = [r for r in readings if camera_key(r.capture) == camera_key(capture)]
+    if not of_camera:
+        other = readings[0].capture
+        return f"the panel in {other.label} was photographed by {camera_key(other)}, not by {camera_key(capture)}"
+    if not (near := _within_hours(of_camera, capture)):
+        return _far_in_time(capture, of_camera)
+    readable = [(r.capture.label, b) for _, r in near for b in r.bands if b.band.name in lacking]
+    for label, reading in sorted(readable, key=lambda one: not one[1].problem):
+        if reading.problem:
+            return f"{reading.band.name} of the panel in {label}: {reading.problem}"
+        if reading.albedo is None:
+            return f"the reflectance of the panel in {label} is unknown in {reading.band.name}; give --panel-albedo"
+    return f"the panel in {near[0][1].capture.label} has no reflectance in {', '.join(sorted(lacking))}"
+
+
+def _far_in_time(capture: Capture, readings: Sequence[PanelReading]) -> str:
+    """Return in words how far the nearest panel is from a capture, or which time is unknown."""
+    time_s, panels = capture.time_s, [r.capture for r in readings]
+    if time_s is None or all(panel.time_s is None for panel in panels):
+        unknown = capture if time_s is None else panels[0]
+        return f"the time of {unknown.label} is unknown, so that no panel is known to be of the flight"
+    later = [(panel.time_s - time_s, panel) for panel in panels if panel.time_s is not None]
+    later_s, nearest = min(later, key=lambda one: abs(one[0]))
+    hours = abs(later_s) / 3600
+    age = f"{hours / 24:.0f} days" if hours >= 48 else f"{hours:.0f} hours"
+    limit = f"a panel counts for {MAX_TIME_DIFFERENCE_S / 3600:.0f} hours, because the light changes"
+    return f"the nearest panel, in {nearest.label}, is {age} {'older' if later_s < 0 else 'newer'}; {limit}"
+
+
 def with_height(capture: Capture, readings: Iterable[PanelReading]) -> Capture:
     """Return the capture with its height above the ground from the altitude of a panel.
 

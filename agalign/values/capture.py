@@ -341,6 +341,8 @@ class Capture:
     """Bands of its camera, without files, in the order of the stacks; empty if they are those of the capture."""
     elevation_deg: float | None = None
     """Angle of the optical axis above the horizon: -90 straight down; None if the tags do not contain it."""
+    without_panel: str = ""
+    """Why no calibration panel gives its reflectance, and the remedy; empty if one does, or if none was searched."""
 
     def with_absolute_paths(self) -> "Capture":
         """Return the capture with absolute paths, for processes with another working folder."""

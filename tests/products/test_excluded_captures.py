@@ -2,8 +2,11 @@
 
 import json
 import shutil
+from dataclasses import replace
+from datetime import datetime, timedelta
 from html import unescape
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -15,6 +18,7 @@ from pydantic import ValidationError
 import agalign
 from agalign.config import RunOptions, WriteSettings
 from agalign.errors import SidecarError
+from agalign.flight.panel_readings import PanelReading, missing_panel, read_panel, with_panels
 from agalign.products.report.pages import write_pages
 from agalign.products.run.excluded import PANELS_FILE, SKY_FILE, read_excluded
 
@@ -98,6 +102,48 @@ def test_another_run_keeps_results_and_can_align_panels(between_panels: Path, tm
 def test_without_a_panel_none_is_made_up(flight: Path, tmp_path: Path) -> None:
     with pytest.raises(agalign.ConfigurationError, match="--panel-albedo"):
         agalign.align_folder(flight, tmp_path, settings=seeded(radiometry="panel"))
+
+
+def files_of(out: Path) -> dict[str, tuple[bytes, int]]:
+    """Contents and times of all files below a folder."""
+    return {p.name: (p.read_bytes(), p.stat().st_mtime_ns) for p in out.rglob("*") if p.is_file()}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("write", [{"radiometry": "panel"}, {"pan_sharpen": True, "qa": True}])
+def test_refused_options_leave_a_finished_folder_as_it_is(
+    flight: Path, tmp_path: Path, write: dict[str, object]
+) -> None:
+    agalign.align_folder(flight, tmp_path, settings=seeded("rig"))
+    before = files_of(tmp_path)
+    with pytest.raises(agalign.ConfigurationError):
+        agalign.align_folder(flight, tmp_path, settings=seeded("rig", **write))
+    assert files_of(tmp_path) == before
+    assert agalign_here("verify", tmp_path).returncode == 0
+
+
+def test_why_a_panel_is_not_used(between_panels: Path) -> None:
+    panel, capture, *_ = agalign.discover(between_panels).captures
+    read = read_panel(with_panels([panel, capture])[0], {})
+    assert missing_panel(capture, [read]) == ""
+    start = datetime.fromisoformat(capture.captured_at)
+
+    def without(capture: agalign.Capture = capture, albedo: float | None = 0.5, **changes: Any) -> str:
+        bands = tuple(replace(b, albedo=albedo) for b in read.bands)
+        return missing_panel(capture, [PanelReading(replace(read.capture, **changes), bands)])
+
+    assert without() == ""
+    older = without(captured_at=(start - timedelta(days=13)).isoformat())
+    assert older.startswith(f"the nearest panel, in {panel.label}, is 13 days older; a panel counts for 6 hours")
+    assert "is 7 hours newer" in without(captured_at=(start + timedelta(hours=7)).isoformat())
+    assert without(captured_at="").startswith(f"the time of {panel.label} is unknown")
+    assert without(replace(capture, captured_at="")).startswith(f"the time of {capture.label} is unknown")
+    other = without(camera=replace(panel.camera, serial="B2"))
+    assert f"the panel in {panel.label} was photographed by " in other
+    assert "B2" in other
+    assert "--panel-albedo" not in older + other
+    assert without(albedo=None).endswith("is unknown in Blue; give --panel-albedo")
+    assert "no capture of a calibration panel was found" in missing_panel(capture, [])
 
 
 @pytest.mark.parametrize("albedo", [0.0, -0.5, 1.01, float("nan")])
