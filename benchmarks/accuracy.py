@@ -70,7 +70,7 @@ def ties_of(out: Path) -> Ties:
         for band in (b for b in sidecar.bands if b.status == "aligned"):
             points = geometry.lattice(*sidecar.reference.size_px, 64, 48)
             ties = np.hstack([points, read_alignment(path, band.band).map(points)])
-            result[band.file] = {"ties": ties, "reference": sidecar.reference.file}
+            result[Path(band.file).name] = {"ties": ties, "reference": Path(sidecar.reference.file).name}
     return result
 
 
@@ -80,8 +80,8 @@ def known_errors(out: Path, ties: Ties, of_a_run: Ties) -> list[BandError]:
     """
     result = []
     for band in common.band_errors(out, of_a_run | ties):
-        file = band.part.file
-        is_reference = (of_a_run | ties)[file]["reference"] == band.sidecar.reference.file
+        file = Path(band.part.file).name
+        is_reference = (of_a_run | ties)[file]["reference"] == Path(band.sidecar.reference.file).name
         claim_px = np.hypot(band.claim_px, TIE_NOISE_PX * (1 if is_reference else 2))
         known = np.isfinite(band.error_px) & (file in ties or np.isfinite(claim_px))
         result.append(replace(band, error_px=band.error_px[known], claim_px=claim_px[known]))

@@ -286,14 +286,15 @@ def band_errors(out: Path, truth: Ties) -> list[BandError]:
     result = []
     for path in find_sidecars(out):
         sidecar = read_sidecar(path)
-        references = {b.file: b.band for b in sidecar.bands if b.status != "reference"}
+        references = {Path(b.file).name: b.band for b in sidecar.bands if b.status != "reference"}
         for band in sidecar.bands:
-            if band.file not in truth or band.status == "reference" or band.homography is None:
+            file = Path(band.file).name
+            if file not in truth or band.status == "reference" or band.homography is None:
                 continue
             alignment, prediction = read_alignment(path, band.band), band.prediction
-            points, target = np.hsplit(np.array(truth[band.file]["ties"]), 2)
-            if truth[band.file]["reference"] in references:
-                points = read_alignment(path, references[truth[band.file]["reference"]]).inverse(points)
+            points, target = np.hsplit(np.array(truth[file]["ties"]), 2)
+            if truth[file]["reference"] in references:
+                points = read_alignment(path, references[truth[file]["reference"]]).inverse(points)
             std_px = prediction.std_px if prediction else band.joint.corner_std_px if band.joint else None
             known_std_px = std_px if band.status in ("aligned", "predicted") and std_px is not None else np.nan
             error_px = np.linalg.norm(alignment.map(points) - target, axis=1)

@@ -152,10 +152,11 @@ def flow_scores(flight: Path, out: Path, truth: Truth, blank: Score) -> list[Sco
     """Return the scores of the dense flow from the mappings of a run; a band without a mapping has none."""
     images = {p.name: tifffile.imread(p).astype(np.float32) for p in flight.rglob("*.tif")}
     (path, sidecar), scores, total_s = common.only_sidecar(out), [], 0.0
-    reference = images[sidecar.reference.file]
+    reference = images[Path(sidecar.reference.file).name]
     for band in (b for b in sidecar.bands if b.status != "reference"):
         start = mapping_of(path, band.band, sidecar.reference.size_px)
-        seconds, mapping = (0.0, None) if start is None else common.timed(dis_flow, reference, images[band.file], start)
+        moving = images[Path(band.file).name]
+        seconds, mapping = (0.0, None) if start is None else common.timed(dis_flow, reference, moving, start)
         total_s += seconds
         values = residuals(mapping, truth.bands[band.band], common.window_of(sidecar))
         scores.append(replace(blank, band=band.band, **values))

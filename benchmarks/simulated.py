@@ -70,7 +70,7 @@ MODELS = {"mavic": "Mavic 3M", "mavic-3m": "Mavic 3M", "altum": "Altum", "altum-
 def by_fault(bands: list[BandError], truth: Ties) -> dict[str, list[BandError]]:
     groups = defaultdict[str, list[BandError]](list)
     for band in bands:
-        groups[truth[band.part.file]["trouble"] or "none"].append(band)
+        groups[truth[Path(band.part.file).name]["trouble"] or "none"].append(band)
     return groups
 
 
@@ -138,7 +138,7 @@ def print_corners(out: Path, truth: Ties) -> TableRow:
     for sidecar in map(read_sidecar, find_sidecars(out)):
         corners = geometry.corners(sidecar.reference.width, sidecar.reference.height)
         for band in (b for b in sidecar.bands if b.status == "aligned"):
-            true = geometry.invert(np.array(truth[band.file]["fixed_to_moving"]))
+            true = geometry.invert(np.array(truth[Path(band.file).name]["fixed_to_moving"]))
             back = geometry.compose(true, np.array(band.homography.fixed_to_moving))
             error = np.abs(geometry.apply(back, corners) - corners)
             bands[band.band].append(np.stack([error, band.joint.corner_std_xy_px]))

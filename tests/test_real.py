@@ -28,7 +28,8 @@ pytestmark = [pytest.mark.real, pytest.mark.slow]
 
 def pair_medians(out: Path, ties_path: Path) -> dict[str, float]:
     """Median tie error of each pair that was delivered as aligned, by moving file."""
-    return {b.part.file: b.median_px for b in band_errors(out, read_ties(ties_path)) if b.part.status == "aligned"}
+    errors = band_errors(out, read_ties(ties_path))
+    return {Path(b.part.file).name: b.median_px for b in errors if b.part.status == "aligned"}
 
 
 DOCUMENTED = {

@@ -295,7 +295,8 @@ def mosaics_onto(
             *(replace(b, one_lens=True, is_from_photograph=False) for b in _georeferenced_bands(path, max_pixels)),
         ]
         captured_at = read_tags(path).captured_at
-        captures.append(Capture(path.stem, Path(), tuple(with_unique_band_names(bands)), 0, captured_at=captured_at))
+        unique, root = tuple(with_unique_band_names(bands)), reference.parent
+        captures.append(Capture(path.stem, Path(), unique, 0, captured_at=captured_at, root=root))
     return FolderScan(reference.parent, tuple(with_unique_capture_names(captures)), ())
 
 

@@ -325,6 +325,7 @@ def capture_of(files: Sequence[ImageFile], folder: Path, options: DiscoverOption
     missing = lacking(tags.model, [(name_end(f), f.bands[0]) for f in files if tags.model and len(files) > 1])
     return Capture(
         name=(first.path.stem if len(files) == 1 else first.camera.capture_name(first.path)) or "capture",
+        root=folder,
         folder=own_folder.relative_to(folder) if own_folder.is_relative_to(folder) else Path(),
         bands=tuple(bands),
         reference_index=next(i for i, b in enumerate(bands) if b is reference),

@@ -232,7 +232,7 @@ def score_against_truth(out: Path, truth_path: Path) -> list[Score]:
         if sidecar.capture not in truth:  # of an earlier demo with more captures in the same folder
             continue
         for band in sidecar.bands:
-            known = truth[sidecar.capture]["bands"].get(band.file)
+            known = truth[sidecar.capture]["bands"].get(Path(band.file).name)
             if known is None or band.grid is None:
                 continue
             fixed_px, moving_px = np.hsplit(np.asarray(known["ties"], dtype=np.float64), 2)

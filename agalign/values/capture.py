@@ -343,10 +343,21 @@ class Capture:
     """Angle of the optical axis above the horizon: -90 straight down; None if the tags do not contain it."""
     without_panel: str = ""
     """Why no calibration panel gives its reflectance, and the remedy; empty if one does, or if none was searched."""
+    root: Path | None = None
+    """Input folder, which files are named relative to; None if it is unknown."""
 
     def with_absolute_paths(self) -> "Capture":
         """Return the capture with absolute paths, for processes with another working folder."""
-        return replace(self, bands=tuple(replace(b, path=b.path.absolute()) for b in self.bands))
+        root = None if self.root is None else self.root.absolute()
+        return replace(self, root=root, bands=tuple(replace(b, path=b.path.absolute()) for b in self.bands))
+
+    def file_of(self, band: Band) -> str:
+        """Return the path of the file of a band, with forward slashes: relative to the input folder if it is there,
+        else absolute.
+        """
+        if self.root is not None and band.path.is_relative_to(self.root):
+            return band.path.relative_to(self.root).as_posix()
+        return band.path.absolute().as_posix()
 
     @property
     def reference(self) -> Band:

@@ -150,6 +150,8 @@ def _inside_folder(name: str) -> str:
     return name
 
 
+SourceFile = Annotated[str, Field(max_length=4096)]
+"""Path of an input file, of the length that Linux allows. It is not opened."""
 RelativeFile = Annotated[str, AfterValidator(_inside_folder)]
 """A file in the sidecar's folder or below. A sidecar may come from anyone, and agalign reads and removes the files that
 it lists.

@@ -34,7 +34,9 @@ contains most scenes."""
 
 @validated.dataclass(frozen=True, config=RECORD)
 class DisplacementField:
-    """Smooth displacements of raw pixels, by values on a lattice."""
+    """Smooth displacements of raw pixels of the reference, added before its lens and the homography: values on a
+    lattice.
+    """
 
     step_px: Positive
     """Distance of the nodes, px."""

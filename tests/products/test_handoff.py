@@ -223,7 +223,7 @@ def test_bands_place_time_and_camera_are_as_before(aligned: Aligned) -> None:
 def test_the_principal_point_is_on_the_pixel_that_it_was_on(aligned: Aligned) -> None:
     camera, before, after, export_folder = aligned
     data = read_json(find_sidecars(export_folder.parent / "out")[0])
-    here, there = (next(p for p in ps if p.path.name == data["reference"]["file"]) for ps in (before, after))
+    here, there = (next(p for p in ps if p.path.name == Path(data["reference"]["file"]).name) for ps in (before, after))
     old, new = xmp_of(here), xmp_of(there)
     if camera.maker == "MicaSense":
         density = there.exif_number("EXIF FocalPlaneXResolution")

@@ -319,7 +319,7 @@ def assert_same_as_stack(sidecar: Path, inputs: Path) -> int:
             if part.status == "reference":
                 continue
             alignment = agalign.read_alignment(sidecar, part.band)
-            with rasterio.open(inputs / part.file) as file:
+            with rasterio.open(inputs / Path(part.file).name) as file:
                 image = file.read(part.band_index)
             if alignment.mapping.parallax is None:
                 at = geometry.lattice(*content.reference.size_px, 30, 20)

@@ -72,7 +72,7 @@ def test_the_page_has_the_facts_of_every_capture(flight: Path, aligned_flight: P
             if pair["status"] == "reference":
                 continue
             # The initial offset of the files is known exactly here.
-            known = np.asarray(ties[part["file"]]["ties"])
+            known = np.asarray(ties[Path(part["file"]).name]["ties"])
             offset_length_px = np.median(np.linalg.norm(known[:, 2:] - known[:, :2], axis=1))
             assert pair["offset_length_px"] == pytest.approx(offset_length_px, abs=0.3)
             windows = part["metrics"]["windows"]

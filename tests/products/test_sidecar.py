@@ -4,6 +4,7 @@ import hashlib
 import json
 import math
 import os
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -55,6 +56,25 @@ def example(**changes: Any) -> Sidecar:
     if name not in [band["band"] for band in facts["bands"]]:
         facts["bands"] = [*facts["bands"], NIR | {"reason": None, "band": name, "status": "reference"}]
     return Sidecar.model_validate_json(to_json(facts))
+
+
+@pytest.mark.slow
+def test_a_sidecar_names_its_images(flight: Path, aligned_flight: Path) -> None:
+    folder = Path(read_json(aligned_flight / "agalign-run.json")["input"])
+    assert folder == flight
+    for path in find_sidecars(aligned_flight):
+        content = read_json(path)
+        for part in (content["reference"], *content["bands"]):
+            assert (folder / part["file"]).is_file()
+
+
+def test_files_of_equal_names_in_two_folders_are_distinct() -> None:
+    bands = tuple(Band(name, Path("in", name, "IMG_6.jpg"), 1, 10, 8, "uint8") for name in ("RGB", "NDRE"))
+    capture = Capture("IMG_6", Path(), bands, 0, root=Path("in"))
+    assert [capture.file_of(b) for b in bands] == ["RGB/IMG_6.jpg", "NDRE/IMG_6.jpg"]
+    there = capture.with_absolute_paths()
+    assert [there.file_of(b) for b in there.bands] == ["RGB/IMG_6.jpg", "NDRE/IMG_6.jpg"]
+    assert replace(capture, root=None).file_of(bands[0]) == Path("in/RGB/IMG_6.jpg").absolute().as_posix()
 
 
 def test_round_trip(tmp_path: Path) -> None:

@@ -23,7 +23,7 @@ def tie_errors(report: agalign.CaptureReport, flight: Path) -> dict[str, np.ndar
     for band in report.sidecar.bands:
         if band.status == "reference":
             continue
-        ties = np.array(truth[band.file]["ties"])
+        ties = np.array(truth[Path(band.file).name]["ties"])
         known = CloughTocher2DInterpolator(ties[:, :2], ties[:, 2:])
         reference, moving = (
             np.array([[float(r[f"{side}_{axis}_px"]) for axis in "xy"] for r in rows if r["band"] == band.band])

@@ -15,7 +15,7 @@ from agalign.flight.sky import SkyCapture, sky_radiance
 from agalign.pixels.raster import read_preview
 from agalign.products.report.drawing import Picture, side_by_side, titled, write_png
 from agalign.values.capture import Band, Capture, PanelSource
-from agalign.values.fields import Message, Name
+from agalign.values.fields import Message, Name, SourceFile
 from agalign.values.files import check_inside, read_model, write_model
 from agalign.values.pixel_units import PixelScale
 
@@ -30,7 +30,8 @@ class PanelBandPart(_Part):
     """Measurement on the panel in one band."""
 
     band: Name
-    file: Name
+    file: SourceFile
+    """Image file, relative to the input folder that the run record names."""
     area_px: list[tuple[float, float]]
     """Corners (x, y) of the measured area, raw pixels of the file."""
     albedo: float | None
@@ -48,7 +49,8 @@ class SkyBandPart(_Part):
     """One band of a capture of the sky."""
 
     band: Name
-    file: Name
+    file: SourceFile
+    """Image file, relative to the input folder that the run record names."""
     radiance: float | None
     """Median over the image, W / m^2 / sr / nm; null if it is unknown or half of the band is saturated."""
 
@@ -143,7 +145,7 @@ def write_panels(readings: Sequence[PanelReading], out: Path) -> list[PanelPart]
         picture = check_inside(out / reading.capture.folder, out) / f"{reading.capture.name}.panel.png"
         write_png(side_by_side([_tile(b) for b in reading.bands], gap_px=6), picture)
         panel, scales = reading.panel, reading.sensor_scales
-        bands = [_panel_band(b) | {"sensor_scale": scales.get(b.band.name)} for b in reading.bands]
+        bands = [_panel_band(b, reading.capture) | {"sensor_scale": scales.get(b.band.name)} for b in reading.bands]
         facts = {"seen_by": panel.seen_by, "serial": panel.serial, "in_scene": panel.in_scene, "cues": panel.cues}
         facts |= {"sensor_scale": float(np.median([*scales.values()])) if scales else None}
         facts |= {"fits_sensor": reading.fits_sensor, "bands": bands}
@@ -157,7 +159,7 @@ def write_sky(sky: Sequence[SkyCapture], out: Path) -> list[SkyPart]:
     """Write OUT/sky.json and return its captures; without any, remove that of an earlier run. Raises OutputError."""
     parts = []
     for one in sky:
-        bands = [{"band": b.name, "file": b.path.name, "radiance": _radiance(b)} for b in one.capture.bands]
+        bands = [{"band": b.name, "file": one.capture.file_of(b), "radiance": _radiance(b)} for b in one.capture.bands]
         parts.append(SkyPart.model_validate(_identity(one.capture) | {"cues": one.cues, "bands": bands}))
     write_model(out / SKY_FILE, SkyFile(captures=parts) if parts else None)
     return parts
@@ -176,11 +178,11 @@ def _identity(capture: Capture) -> dict[str, Any]:
     return {"folder": capture.folder.as_posix(), "capture": capture.name, "captured_at": capture.known_time}
 
 
-def _panel_band(reading: BandReading) -> dict[str, Any]:
+def _panel_band(reading: BandReading, capture: Capture) -> dict[str, Any]:
     band, factor = reading.band, reading.factor
     return {
         "band": band.name,
-        "file": band.path.name,
+        "file": capture.file_of(band),
         "area_px": [] if band.panel is None else [(round(x, 2), round(y, 2)) for x, y in band.panel.corners_px],
         "albedo": reading.albedo,
         "radiance": reading.radiance,

@@ -75,6 +75,7 @@ class RunPart(_Part):
     """ISO 8601, UTC."""
     seconds: float
     input: str
+    """The input folder. Sidecars name images relative to it."""
     command: str = ""
     """The command line; empty for a run from Python."""
     cameras: list[CameraOverview] = []
@@ -168,7 +169,7 @@ def begun(folder: Path, settings: Settings, captures: Sequence[Capture] = (), co
         state="running",
         started_at=datetime.now(UTC).isoformat(timespec="seconds"),
         seconds=0.0,
-        input=escape_controls(str(folder)),
+        input=escape_controls(str(folder.resolve())),
         command=escape_controls(command),
         cameras=camera_overviews(captures),
         versions=library_versions(),

@@ -41,6 +41,7 @@ from agalign.values.fields import (
     PointsPx,
     Positive,
     RelativeFile,
+    SourceFile,
 )
 from agalign.values.image import OutputGrid
 from agalign.values.issues import MISSING_BAND, Issue
@@ -67,8 +68,8 @@ class ReferencePart(_Part):
 
     band: Name
     """Name."""
-    file: Name
-    """Image file."""
+    file: SourceFile
+    """Image file, relative to the input folder that the run record names; absolute if it is elsewhere."""
     band_index: Count
     """Band of the file, from 1."""
     width: Count
@@ -187,8 +188,8 @@ class BandResult(_Part):
     """Name."""
     wavelength_nm: Number | None
     """Centre wavelength, nm."""
-    file: Name
-    """Image file."""
+    file: SourceFile
+    """Image file, relative to the input folder that the run record names; absolute if it is elsewhere."""
     band_index: int
     """Band of the file, from 1."""
     size_px: tuple[Count, Count] | None = None
@@ -236,13 +237,13 @@ class BandResult(_Part):
     """Share of the capture's processing time."""
 
     @classmethod
-    def of_reference(cls, band: Band) -> Self:
-        """Return the entry of the reference band."""
-        return cls(**_source(band), status="reference", reason=None, seconds=0.0)
+    def of_reference(cls, capture: Capture) -> Self:
+        """Return the entry of the reference band of a capture."""
+        return cls(**_source(capture, capture.reference), status="reference", reason=None, seconds=0.0)
 
     @classmethod
-    def of(cls, band: Band, alignment: Alignment, reference: Band) -> Self:
-        """Return the entry of a moving band."""
+    def of(cls, band: Band, alignment: Alignment, capture: Capture) -> Self:
+        """Return the entry of a moving band of a capture."""
         mapping, relief = alignment.mapping, None
         grid_px = sampled_mapping(mapping.without_parallax, alignment.size_px)
         if mapping.parallax is not None:
@@ -252,7 +253,7 @@ class BandResult(_Part):
             relief = ReliefPart(file=None, baseline=baseline, occluded=occluded, reference_px=grid_px, **tables)
         fixed, moving = mapping.fixed_lens, mapping.moving_lens
         return cls(
-            **_source(band),
+            **_source(capture, band),
             status=alignment.status,
             reason=alignment.reason,
             issues=alignment.issues,
@@ -266,7 +267,7 @@ class BandResult(_Part):
             metrics=MetricsPart(before=alignment.before, after=_after(alignment), windows=alignment.residual),
             geometry=GeometryPart(kind=alignment.geometry, held_out_p95_px=dict(alignment.candidates)),
             prediction=alignment.prediction,
-            exposed_after_s=None if alignment.status == "aligned" else _exposed_after_s(band, reference),
+            exposed_after_s=None if alignment.status == "aligned" else _exposed_after_s(band, capture.reference),
             lens_std_px=alignment.lens_std_px,
             relief_std_px=alignment.relief_std_px,
             seconds=alignment.seconds,
@@ -312,10 +313,10 @@ class BandResult(_Part):
         return self.model_copy(update={"grid": None, "field": None, "relief": None, "metrics": metrics})
 
 
-def _source(band: Band) -> dict[str, Any]:
+def _source(capture: Capture, band: Band) -> dict[str, Any]:
     """The file of a band."""
     facts = {"band": band.name, "wavelength_nm": band.wavelength_nm, "size_px": band.size_px}
-    return facts | {"file": band.path.name, "band_index": band.band_index}
+    return facts | {"file": capture.file_of(band), "band_index": band.band_index}
 
 
 def _exposed_after_s(band: Band, reference: Band) -> float | None:
@@ -500,7 +501,7 @@ class Sidecar(_Part):
         """Return the sidecar of a capture whose bands are aligned, and nothing is rendered."""
         reference, accept_predicted_px = capture.reference, settings.check.accept_predicted_px
         bands = [
-            BandResult.of_reference(b) if b is reference else BandResult.of(b, alignments[b.name], reference)
+            BandResult.of_reference(capture) if b is reference else BandResult.of(b, alignments[b.name], capture)
             for b in capture.bands
         ]
         status = capture_status(bands, accept_predicted_px)
@@ -520,7 +521,7 @@ class Sidecar(_Part):
             unreadable_bands=dict(capture.unreadable_bands),
             reference=ReferencePart(
                 band=reference.name,
-                file=reference.path.name,
+                file=capture.file_of(reference),
                 band_index=reference.band_index,
                 width=width,
                 height=height,
