@@ -13,6 +13,7 @@ from agalign.products.indices.formulas import Index
 from agalign.products.indices.rasters import IndexRasters, IndexReport, to_check, update_table, write_rasters
 from agalign.products.run.captures import bands_of
 from agalign.products.run.cautions import RunFacts
+from agalign.products.run.record import counted_sidecars
 from agalign.products.sidecar.file import add_products, label_of, read_without_tables, run_sidecars
 from agalign.values.files import written_below
 from agalign.values.processes import usable_cores
@@ -46,7 +47,8 @@ def index_tasks(
     out: Path, indices: Sequence[Index], target: Path, *, overwrite: bool = False, mask_qa: bool = False
 ) -> list[IndexTask]:
     """Return a task for each capture of a run. Raises InputError if the folder contains no run."""
-    return [IndexTask(out, path, target, tuple(indices), overwrite, mask_qa) for path in run_sidecars(out)]
+    paths = counted_sidecars(run_sidecars(out), out)
+    return [IndexTask(out, path, target, tuple(indices), overwrite, mask_qa) for path in paths]
 
 
 def run_indices(
@@ -92,7 +94,8 @@ def do_indices(task: IndexTask) -> list[IndexReport]:
                 files = [p for path in rasters for p in (path, path.with_suffix(".png"))]
                 add_products(task.sidecar, IndexRasters.kind, files)
         run, by_name = RunFacts.of(task.out), {index.name: index for index in task.indices}
-        reports = [r if r.problem else replace(r, problem=to_check(by_name[r.index], sidecar, run)) for r in reports]
+        checks = [to_check(by_name[r.index], sidecar, run, task.label) for r in reports]
+        reports = [r if r.problem else replace(r, problem=check) for r, check in zip(reports, checks, strict=True)]
     except AgalignError as error:
         reports = _failed(task, str(error))
     return [report.of(sidecar) for report in reports]

@@ -14,11 +14,12 @@ from typing import Self
 from agalign.batch.capture_task import CaptureReport, Task, do_capture, loaded_model, missing_radiometry, quiet
 from agalign.batch.earlier_results import Remaining, outputs_exist, refuse_other_captures, remaining
 from agalign.batch.flight_learning import learn_flight
+from agalign.batch.other_results import labels_of_other_inputs, results_not_in_input
 from agalign.batch.render import RenderOptions, refuse_to_overwrite, remove_outputs
 from agalign.batch.workers import Run, failure_text, in_order, open_workers, serially
 from agalign.cameras.discover import FolderScan
 from agalign.config import RunOptions, Settings, WriteSettings
-from agalign.errors import AgalignError, ConfigurationError, InputError, OutputError
+from agalign.errors import AgalignError, ConfigurationError, InputError, OutputError, SidecarError
 from agalign.flight.fingerprint import learning_fingerprint
 from agalign.flight.groups import camera_key, difference, flight_camera, flights_of, is_flight_of, model_names
 from agalign.flight.model import FlightModel, load_model, save_model
@@ -40,6 +41,7 @@ from agalign.products.indices.rasters import check_indices
 from agalign.products.product import CapturePaths, Product
 from agalign.products.rasters.output_grid import FlightLimits, common_grid, flight_limits
 from agalign.products.registry import PRODUCTS
+from agalign.products.report.pages import outdate_pages
 from agalign.products.report.preview import preview_bytes
 from agalign.products.run.excluded import write_panels, write_sky
 from agalign.products.run.footprint import (
@@ -48,7 +50,7 @@ from agalign.products.run.footprint import (
     utm_of_flights,
     with_approximate_georeference,
 )
-from agalign.products.run.record import RunPart, begun, excluded_part, refuse_foreign_pages
+from agalign.products.run.record import RunPart, begun, excluded_part, read_run_record, refuse_foreign_pages
 from agalign.products.sidecar.file import read_without_tables
 from agalign.products.sidecar.schema import FilePart
 from agalign.values.capture import Capture
@@ -163,8 +165,12 @@ def plan_run(flight: FolderScan, out: Path, settings: Settings, options: RunOpti
 @contextmanager
 def _recorded(run: "_FlightRun") -> Iterator[RunPart]:
     """Write the run record at the beginning and at the end of a run, also after an interruption."""
-    began = time.monotonic()
+    began, earlier = time.monotonic(), None
+    with suppress(SidecarError):  # it is replaced
+        earlier = read_run_record(run.out)
     record = begun(run.flight.folder, run.settings, run.flight.captures, run.options.command)
+    record.other_inputs = labels_of_other_inputs(earlier, record)
+    record.not_in_input = list(results_not_in_input(run.flight, run.out, record.other_inputs))
     for problem in run.flight.problems:
         record.add_problem(str(problem.path), problem.text)
     record.write(run.out, "running", 0.0)
@@ -172,9 +178,11 @@ def _recorded(run: "_FlightRun") -> Iterator[RunPart]:
         yield record
     except BaseException:
         with suppress(OutputError):
-            record.write(run.out, "interrupted", time.monotonic() - began)
+            record.end(run.out, "interrupted", time.monotonic() - began, earlier)
         raise
-    record.write(run.out, "finished", time.monotonic() - began)
+    record.end(run.out, "finished", time.monotonic() - began, earlier)
+    if earlier is not None and not record.has_same_results(earlier):
+        outdate_pages(run.out)
 
 
 @dataclass(frozen=True)

@@ -332,6 +332,8 @@ def conclude(totals: RunTotals, out: Path, terminal: Terminal) -> int:
     record = read_run_record(out)
     for line in [] if record is None else record.exclusions():
         terminal.result(line)
+    for line in [] if record is None else record.notes_on_input():
+        terminal.problem(f"{out}: {line}")
     if totals.has_report:
         terminal.result(f"Report: {out / REPORT_FILE}")
     if totals.states and set(totals.states) <= {"panel", "sky"}:

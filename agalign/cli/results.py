@@ -54,8 +54,8 @@ def _report(terminal: Terminal, out: Annotated[Path, typer.Argument()], as_json:
 
 
 def _print_unfinished(out: Path, labels: Collection[str], terminal: Terminal) -> bool:
-    """Print what the last run into a folder did not do, given the labels of the captures with a result; return True if
-    there is such.
+    """Print what the last run into a folder did not do, given the labels of the captures with a result, and which of
+    them are not in its input; return True if it did not do all.
     """
     from agalign.errors import SidecarError
     from agalign.products.run.excluded import read_excluded
@@ -63,23 +63,27 @@ def _print_unfinished(out: Path, labels: Collection[str], terminal: Terminal) ->
 
     try:
         panels, sky = read_excluded(out)
-        unfinished = unfinished_run(read_run_record(out), (*panels, *sky), labels)
+        record = read_run_record(out)
+        unfinished = unfinished_run(record, (*panels, *sky), labels)
     except SidecarError as error:
         terminal.problem(str(error))
         return True
+    for line in [] if record is None else record.notes_on_input():
+        terminal.problem(f"{out}: {line}")
     if unfinished is None or not unfinished.sentence:
         return False
-    facts = {"state": unfinished.state, "missing": unfinished.missing}
+    facts = {"state": unfinished.state, "missing": unfinished.missing, "erroneous": unfinished.erroneous}
     terminal.problem(f"{out}: {unfinished.sentence}", **facts)
     return True
 
 
 def _verify(terminal: Terminal, out: Out) -> int:
     """Compare the files of a run with their checksums."""
-    from agalign.products.sidecar.file import label_of, verify_outputs
+    from agalign.products.run.record import counted_sidecars
+    from agalign.products.sidecar.file import label_of, run_sidecars, verify_outputs
 
     labels, damaged = [], 0
-    for path, problems in verify_outputs(out):
+    for path, problems in verify_outputs(out, counted_sidecars(run_sidecars(out), out)):
         labels.append(label_of(path, out))
         damaged += bool(problems)
         for text in problems:

@@ -5,14 +5,18 @@ import shutil
 from pathlib import Path
 
 import pytest
+import rasterio
 
 import agalign
+from agalign.batch import capture_task
+from agalign.products.run.captures import captures_of_run
 from agalign.products.run.excluded import read_excluded
 from agalign.products.run.record import read_run_record, unfinished_run
 from agalign.products.sidecar.file import find_sidecars, read_sidecar, write_sidecar
 
-from ..conftest import Shared, seeded
-from ..products.conftest import change
+from ..builders import in_full_run
+from ..conftest import Shared, raising, seeded, write_band
+from ..products.conftest import change, table_in
 from ..program import agalign_here
 
 pytestmark = pytest.mark.slow
@@ -21,16 +25,21 @@ FIRST, SECOND = "0000SET/000/IMG_0001", "0000SET/000/IMG_0002"
 ALIGNED = {"status": "aligned", "reason": None, "issues": ()}
 
 
+def accept_seeds(out: Path) -> None:
+    """Make the captures of a run that estimates nothing count as `ok`."""
+    for path in find_sidecars(out):
+        sidecar = read_sidecar(path)
+        bands = [b if b.status == "reference" else b.model_copy(update=ALIGNED) for b in sidecar.bands]
+        write_sidecar(path, sidecar.model_copy(update={"status": "ok", "bands": bands}))
+
+
 @pytest.fixture
 def out(flight: Path, shared: Shared, tmp_path: Path) -> Path:
     """The output of a run, by the tags alone to save time: its captures count as `ok`."""
 
     def fill(folder: Path) -> None:
         agalign.align_folder(flight, folder, settings=seeded("rig", layout="both"))
-        for path in find_sidecars(folder):
-            sidecar = read_sidecar(path)
-            bands = [b if b.status == "reference" else b.model_copy(update=ALIGNED) for b in sidecar.bands]
-            write_sidecar(path, sidecar.model_copy(update={"status": "ok", "bands": bands}))
+        accept_seeds(folder)
 
     return shutil.copytree(shared("finished_run", fill), tmp_path / "out")
 
@@ -61,6 +70,108 @@ def test_the_commands_on_a_run_name_its_state_and_the_captures_without_a_result(
         assert done.returncode == 3
         assert f"agalign: {out}: {line}\n" in done.stderr
         shutil.rmtree(out.parent / "exported", ignore_errors=True)
+
+
+def images_of_first(folder: Path) -> list[Path]:
+    return sorted(folder.rglob("IMG_0001_*.tif"))
+
+
+def without_tags(source: str, target: str) -> None:
+    with rasterio.open(source) as file:
+        write_band(Path(target), file.read())
+
+
+def captures_in(table: Path) -> set[str]:
+    return {row["capture"] for row in table_in(table)}
+
+
+@pytest.mark.parametrize("has_id", [True, in_full_run(False)])
+def test_a_renamed_exposure_counts_once(flight: Path, tmp_path: Path, has_id: bool) -> None:
+    out = tmp_path / "out"
+    folder = shutil.copytree(flight, tmp_path / "in", copy_function=shutil.copyfile)
+    for path in [] if has_id else folder.rglob("*.tif"):
+        without_tags(str(path), str(path))
+    settings = seeded("rig" if has_id else None, layout="both")
+    agalign.align_folder(folder, out, settings=settings)
+    if has_id:
+        accept_seeds(out)
+        assert agalign_here(*arguments("indices", out)).returncode == 0
+    for path in images_of_first(folder):
+        path.rename(path.with_name(path.name.replace("IMG_0001", "IMG_0009")))
+    before = {path: path.read_bytes() for path in out.rglob("IMG_0001*")}
+    agalign.align_folder(folder, out, settings=settings)
+    assert {path: path.read_bytes() for path in out.rglob("IMG_0001*")} == before
+    renamed = f"{FIRST[:-1]}9"
+    assert [(part.capture, part.same_as) for part in read_run_record(out).not_in_input] == [(FIRST, renamed)]
+    line = f"{FIRST} (now {renamed})"
+    done = agalign_here("verify", out)
+    assert (done.returncode, line in done.stderr) == (0, True)
+    assert "2 of 2 captures match their checksums" in done.stdout
+    assert captures_in(out / "summary.csv") == {"IMG_0002", "IMG_0009"}
+    assert line in (out / "index.html").read_text()
+    assert {c.label for c in captures_of_run(out)[0]} == {SECOND, renamed}
+    if has_id:
+        accept_seeds(out)
+        for command, captures in (("report", {"IMG_0002"}), ("indices", {"IMG_0002", "IMG_0009"})):
+            done = agalign_here(*arguments(command, out))
+            assert (done.returncode, line in done.stderr) == (0, True)
+            assert captures_in(out / "indices.csv") == captures
+    # Without a result under its new name, the exposure has its earlier one.
+    (out / f"{renamed}.json").unlink()
+    assert {c.label for c in captures_of_run(out)[0]} == {FIRST, SECOND}
+
+
+def test_a_capture_that_the_input_no_longer_has_is_named_and_kept(out: Path, flight: Path) -> None:
+    folder, settings = shutil.copytree(flight, out.parent / "in"), seeded("rig", layout="both")
+    agalign.align_folder(folder, out, settings=settings)
+    # Images that an option leaves out are in the input.
+    options = agalign.DiscoverOptions(exclude=("IMG_0001*",))
+    agalign.align_folder(folder, out, settings=settings, options=options)
+    assert read_run_record(out).not_in_input == []
+    for path in images_of_first(folder):
+        path.unlink()
+    line = f"1 capture of earlier runs is not in the input of the last run, and still counted: {FIRST}; delete the"
+    done = agalign_here(folder, "-o", out, "--seed", "rig", "--only-seed", "--layout", "both")
+    assert line in " ".join(done.stderr.split())
+    assert line in (out / "index.html").read_text()
+    first = [row for row in table_in(out / "summary.csv") if row["capture"] == "IMG_0001"]
+    assert len(first) == 4
+    assert all("the input of the last run does not have this capture" in row["check"] for row in first)
+    for command in COMMANDS:
+        assert line in agalign_here(*arguments(command, out)).stderr
+
+
+def test_a_season_may_be_aligned_folder_by_folder(flight: Path, tmp_path: Path) -> None:
+    out, days = tmp_path / "out", [tmp_path / name for name in ("day 1", "day 2")]
+    for number, day in enumerate(days, start=1):
+        for path in flight.rglob(f"IMG_000{number}_*.tif"):
+            day.mkdir(exist_ok=True)
+            shutil.copyfile(path, day / path.name)
+        agalign.align_folder(day, out, settings=seeded("rig"))
+    record = read_run_record(out)
+    assert (record.labels, record.other_inputs) == (["IMG_0002"], {str(days[0].resolve()): ["IMG_0001"]})
+    assert record.notes_on_input() == []
+    assert captures_in(out / "summary.csv") == {"IMG_0001", "IMG_0002"}
+
+
+def test_after_a_failed_rendering_the_results_are_not_called_good(
+    flight: Path, out: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with monkeypatch.context() as patch:
+        patch.setattr(capture_task, "render", raising(agalign.OutputError("the disk is full")))
+        agalign.align_folder(flight, out, settings=seeded("rig", layout="both", radiometry="sun"))
+    record = read_run_record(out)
+    assert (record.state, record.settings["write"]["radiometry"]) == ("finished", "off")
+    line = f"errors in 2 of 2 captures, whose files may be of an earlier run: {FIRST}, {SECOND}; the same command"
+    assert line in (out / "index.html").read_text().replace("Errors", "errors")
+    for command in COMMANDS:
+        done = agalign_here(*arguments(command, out))
+        assert done.returncode == 3
+        assert f"agalign: {out}: {line}" in done.stderr
+    # A run without errors changes the page, though it keeps all captures.
+    agalign_here(flight, "-o", out, "--seed", "rig", "--only-seed", "--layout", "both")
+    assert agalign_here("verify", out).returncode == 0
+    assert "whose files may be" not in (out / "index.html").read_text()
 
 
 def test_a_run_without_results_is_no_other_folder(out: Path) -> None:

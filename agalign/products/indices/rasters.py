@@ -36,6 +36,7 @@ from agalign.products.rasters.geotiff import (
 from agalign.products.report.drawing import with_text, write_png
 from agalign.products.run.captures import RAW, AlignedBand, BandReader
 from agalign.products.run.cautions import RunFacts
+from agalign.products.run.record import renamed_captures
 from agalign.products.sidecar.schema import Sidecar
 from agalign.values.capture import Band, Capture
 from agalign.values.files import read_regular, write_csv
@@ -472,16 +473,16 @@ def _coloured(values: NDArray[Any], span: tuple[float, float], ramp: NDArray[np.
     return np.asarray(result.round(), np.uint8)
 
 
-def to_check(index: Index | None, sidecar: Sidecar, run: RunFacts) -> str:
-    """Return what to check in the bands of an index of a capture, given its run; empty if there is nothing, or if the
-    formula is unknown.
+def to_check(index: Index | None, sidecar: Sidecar, run: RunFacts, label: str) -> str:
+    """Return what to check in the bands of an index of a capture, given its run and label; empty if there is nothing,
+    or if the formula is unknown.
     """
     if index is None:
         return ""
     with suppress(InputError):  # other bands than those of the sidecar
         names = [b.band for b in sidecar.bands]
         used = {names[i] for i in bands_for(index, names, [b.wavelength_nm for b in sidecar.bands])}
-        return "; ".join(f"{c.band}: {c.reason}" for c in run.cautions(sidecar) if c.band in used)
+        return "; ".join(f"{c.band}: {c.reason}" for c in run.cautions(sidecar, label) if c.band in used)
     return ""
 
 
@@ -496,7 +497,7 @@ def reports_of(sidecar: Sidecar, folder: str, out: Path, run: RunFacts) -> list[
             statistics = _statistics_in(tags)
             if statistics is not None:
                 label = Path(folder, sidecar.capture).as_posix()
-                problem = to_check(_index_of(tags) if "INDEX" in tags else None, sidecar, run)
+                problem = to_check(_index_of(tags) if "INDEX" in tags else None, sidecar, run, label)
                 result.append(IndexReport(label, name, path, statistics, problem).of(sidecar))
     return result
 
@@ -513,9 +514,11 @@ def read_table(out: Path) -> list[IndexReport]:
 
 def current_rows(out: Path) -> list[IndexReport]:
     """Return the rows of OUT/indices.csv that are still true: they have a raster that exists and was not written again
-    since, or are of an index that could not be calculated.
+    since, or are of an index that could not be calculated; and they are not of a renamed capture.
     """
-    return [row for row in read_table(out) if (_is_current(row) if row.path is not None else row.problem)]
+    renamed = renamed_captures(out)
+    rows = [row for row in read_table(out) if row.capture not in renamed]
+    return [row for row in rows if (_is_current(row) if row.path is not None else row.problem)]
 
 
 def merged(rows: Iterable[IndexReport], newer: Iterable[IndexReport]) -> list[IndexReport]:

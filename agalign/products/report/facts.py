@@ -135,7 +135,7 @@ class PairTotals:
             band.seconds += [] if part is None else [part.seconds]
             if status == "aligned" and part and part.metrics and math.isfinite(part.metrics.after.residual_px):
                 band.residuals_px.append(part.metrics.after.residual_px)
-        cautions = list(self.run.cautions(result))
+        cautions = list(self.run.cautions(result, label))
         for caution in cautions:
             self._add_caution(label, caution)
         camera, reference = result.camera, result.reference.band

@@ -24,7 +24,7 @@ from agalign.products.report.data_files import data_files_exist, printable, remo
 from agalign.products.report.facts import SUMMARY_FILE, FlightFacts
 from agalign.products.run.excluded import PANELS_FILE, SKY_FILE, PanelPart, SkyPart, read_excluded
 from agalign.products.run.flight_map import FlightMap
-from agalign.products.run.record import RunPart, read_run_record, unfinished_run
+from agalign.products.run.record import RunPart, counted_sidecars, read_run_record, unfinished_run
 from agalign.products.sidecar.file import find_sidecars, read_sidecar
 from agalign.values.files import write_text
 
@@ -49,7 +49,7 @@ def write_pages(out: Path, on_problem: Callable[[str], None]) -> FlightFacts:
     indices: list[IndexReport] = []
     unreadable: list[str] = []
     facts, flight_map = FlightFacts(out), FlightMap()
-    for path in find_sidecars(out):
+    for path in counted_sidecars(find_sidecars(out), out):
         folder = path.parent.relative_to(out).as_posix()
         try:
             sidecar = read_sidecar(path)
@@ -91,6 +91,7 @@ def write_pages(out: Path, on_problem: Callable[[str], None]) -> FlightFacts:
         max_excluded=_MAX_EXCLUDED,
         run=run,
         unfinished="" if unfinished is None else unfinished.sentence,
+        notes=[] if run is None else run.notes_on_input(),
         settings=_changed_settings(run),
         rigs=rig_views(out, unreadable.append),
         drifts=drifts_of(facts.cameras),
@@ -100,11 +101,16 @@ def write_pages(out: Path, on_problem: Callable[[str], None]) -> FlightFacts:
     write_text(out / REPORT_FILE, page)
     remove_other_data_files(out, facts.files)
     if unreadable:
-        with suppress(OSError):
-            os.utime(out / REPORT_FILE, (0, 0))
+        outdate_pages(out)
     for text in unreadable:
         on_problem(text)
     return facts
+
+
+def outdate_pages(out: Path) -> None:
+    """Make `pages_exist` return False for the pages of an earlier run."""
+    with suppress(OSError):
+        os.utime(out / REPORT_FILE, (0, 0))
 
 
 def pages_exist(out: Path) -> bool:

@@ -16,6 +16,7 @@ from rasterio.windows import Window
 
 from agalign.errors import InputError, SidecarError
 from agalign.pixels.raster import OpenRaster, innermost_cause, open_raster
+from agalign.products.run.record import counted_sidecars
 from agalign.products.sidecar.file import label_of, read_without_tables, run_sidecars
 from agalign.products.sidecar.schema import Sidecar
 from agalign.values.choices import UNUSABLE_QUALITY
@@ -183,7 +184,7 @@ def captures_of_run(out: Path) -> tuple[list[RunCapture], LeftOut]:
     Raises InputError if `out` has no sidecars.
     """
     captures, left_out = [], []
-    for path in run_sidecars(out):
+    for path in counted_sidecars(run_sidecars(out), out):
         label = label_of(path, out)
         try:
             captures.append(RunCapture(label, path, read_without_tables(path)))

@@ -14,6 +14,7 @@ from agalign.errors import InputError, SidecarError
 from agalign.flight.panel_readings import MAX_TIME_DIFFERENCE_S
 from agalign.flight.rig_file import model_fingerprint
 from agalign.products.run.excluded import PanelPart, read_excluded
+from agalign.products.run.record import read_run_record
 from agalign.products.sidecar.schema import BandResult, Sidecar
 from agalign.values.capture import CaptureTime
 from agalign.values.issues import (
@@ -64,6 +65,9 @@ _OLD_MODEL = Remedy(
     "aligned with an earlier model of the flight, which fewer captures determine",
     "--overwrite aligns all captures with the model of the whole flight",
 )
+_NOT_IN_INPUT = Remedy(
+    "the input of the last run does not have this capture", "delete its files in the output folder if it is not needed"
+)
 _SATURATED = Remedy(
     "saturated pixels", "--qa and then 'agalign indices --mask-qa' leave them out; expose the next flight for less time"
 )
@@ -97,20 +101,25 @@ class RunFacts:
     """Those that contradict the light sensor."""
     models: frozenset[str] = frozenset()
     """Fingerprints of the models in OUT/models."""
+    not_in_input: frozenset[str] = frozenset()
+    """Labels of the captures that the input of the last run does not have."""
 
     @classmethod
     def of(cls, out: Path) -> "RunFacts":
         """Read the facts of a run; files that cannot be read are left out."""
         panels: list[PanelPart] = []
-        models = set()
+        models, gone = set(), frozenset[str]()
         with suppress(SidecarError):
             panels = read_excluded(out)[0]
+        with suppress(SidecarError):
+            record = read_run_record(out)
+            gone = frozenset(part.capture for part in record.not_in_input) if record is not None else gone
         for path in (out / "models").glob("*.safetensors"):
             with suppress(InputError):
                 models.add(model_fingerprint(path))
-        return cls(tuple(p for p in panels if not p.fits_sensor), frozenset(models))
+        return cls(tuple(p for p in panels if not p.fits_sensor), frozenset(models), gone)
 
-    def cautions(self, sidecar: Sidecar) -> Iterator[Caution]:
+    def cautions(self, sidecar: Sidecar, label: str = "") -> Iterator[Caution]:
         """Yield the cautions about a capture, which are in the sidecar or follow from these facts."""
         for band in sidecar.bands:
             if band.status != "reference":
@@ -123,9 +132,11 @@ class RunFacts:
             remedy = UNREADABLE_BAND if name in sidecar.unreadable_bands else MISSING_BAND
             yield Caution(name, "missing", remedy, sidecar.unreadable_bands.get(name, remedy.cause), 1.0)
         yield from self._of_light(sidecar)
+        of_capture = [_NOT_IN_INPUT] if label in self.not_in_input else []
         if sidecar.model and self.models and sidecar.model not in self.models:
-            for band in (b for b in sidecar.bands if b.status != "reference"):
-                yield Caution(band.band, "check", _OLD_MODEL, _OLD_MODEL.cause, 0.0)
+            of_capture.append(_OLD_MODEL)
+        for band in (b for b in sidecar.bands if b.status != "reference"):
+            yield from (Caution(band.band, "check", remedy, remedy.cause, 0.0) for remedy in of_capture)
 
     def _of_light(self, sidecar: Sidecar) -> Iterator[Caution]:
         """The cautions about the reflectance of all bands."""

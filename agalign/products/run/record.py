@@ -3,6 +3,7 @@
 import platform
 from collections import Counter, defaultdict
 from collections.abc import Collection, Iterable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
@@ -12,10 +13,11 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from agalign._version import __version__
 from agalign.config import Settings
-from agalign.errors import ConfigurationError
+from agalign.errors import ConfigurationError, SidecarError
 from agalign.flight.groups import CameraOverview, camera_overviews
 from agalign.products.run.excluded import PanelPart, SkyPart
 from agalign.products.run.footprint import accuracy_of_footprint_m, footprint
+from agalign.products.sidecar.file import label_of
 from agalign.products.sidecar.schema import Sidecar
 from agalign.values.capture import CameraIdentity, Capture, Pose, Position
 from agalign.values.files import RUN_FILE, read_model, write_model
@@ -47,6 +49,14 @@ class ProblemPart(_Part):
 
     of: str
     problem: str
+
+
+class NotInInputPart(_Part):
+    """A result of an earlier run, of a capture that is not in the input."""
+
+    capture: str
+    same_as: str = ""
+    """Capture of the input with the same exposure, whose result counts instead; empty if there is none."""
 
 
 class ExclusionPart(_Part):
@@ -83,6 +93,7 @@ class RunPart(_Part):
     versions: dict[str, str]
     machine: dict[str, str | int]
     settings: dict[str, Any]
+    """Those with which the captures were processed; if none could be, those of the run before."""
     labels: list[str] = []
     """Labels of the captures found; empty in older records."""
     captures: Counter[str] = Counter()
@@ -97,6 +108,9 @@ class RunPart(_Part):
     refused: list[RefusalPart] = []
     problems: list[ProblemPart] = []
     excluded: list[ExclusionPart] = []
+    other_inputs: dict[str, list[str]] = {}
+    """Labels of captures that earlier runs found in other input folders, by folder."""
+    not_in_input: list[NotInInputPart] = []
 
     def add(self, label: str, state: str, result: Sidecar | None, problems: Iterable[str]) -> None:
         """Add the result of a capture."""
@@ -134,6 +148,31 @@ class RunPart(_Part):
                 evidence = ", ".join(f"{cue} ({number})" for cue, number in counts.items())
                 lines.append(f"Left out: {counted(len(of_kind), 'capture')} of {shows}, by {evidence}")
         return lines
+
+    def notes_on_input(self) -> list[str]:
+        """Return a line about the results of captures that the input no longer has, and one about renamed captures."""
+        gone = [part.capture for part in self.not_in_input if not part.same_as]
+        twice = [f"{part.capture} (now {part.same_as})" for part in self.not_in_input if part.same_as]
+        lines = []
+        if gone:
+            have = f"{counted(len(gone), 'capture')} of earlier runs {'is' if len(gone) == 1 else 'are'}"
+            lines.append(f"{have} not in the input of the last run, and still counted: {_named(gone)}")
+        if twice:
+            have = f"{counted(len(twice), 'capture')} of earlier runs {'has' if len(twice) == 1 else 'have'}"
+            lines.append(f"{have} another name in the input, and not counted twice: {_named(twice)}")
+        return [f"{line}; delete the files that are not needed" for line in lines]
+
+    def end(self, out: Path, state: RunState, seconds: float, earlier: "RunPart | None") -> None:
+        """Write the record at the end of a run, given that of the run before. Raises OutputError."""
+        # Rasters that no capture has were not made with the settings of this run.
+        if earlier is not None and not self.captures["done"] + self.captures["kept"]:
+            self.settings = earlier.settings
+        self.write(out, state, seconds)
+
+    def has_same_results(self, earlier: "RunPart") -> bool:
+        """Return True if the pages of an earlier run are true of this one, if the results have not changed."""
+        names = "settings", "labels", "problems", "excluded", "not_in_input"
+        return earlier.state == "finished" and all(getattr(self, name) == getattr(earlier, name) for name in names)
 
     def write(self, out: Path, state: RunState, seconds: float) -> None:
         """Write OUT/agalign-run.json with the results so far. Raises OutputError."""
@@ -194,6 +233,23 @@ def read_run_record(out: Path) -> RunPart | None:
     return read_model(out / RUN_FILE, RunPart)
 
 
+def renamed_captures(out: Path) -> frozenset[str]:
+    """Return the labels of results below an output folder that do not count, because the exposure has a result under
+    its present name.
+    """
+    record = None
+    with suppress(SidecarError):  # named by the commands that need it
+        record = read_run_record(out)
+    renamed = [part for part in ([] if record is None else record.not_in_input) if part.same_as]
+    return frozenset(part.capture for part in renamed if (out / f"{part.same_as}.json").is_file())
+
+
+def counted_sidecars(sidecars: Iterable[Path], out: Path) -> list[Path]:
+    """Return the sidecars below an output folder without those of renamed captures."""
+    renamed = renamed_captures(out)
+    return [path for path in sidecars if label_of(path, out) not in renamed]
+
+
 @dataclass(frozen=True)
 class UnfinishedRun:
     """What the last run into a folder did not do."""
@@ -203,6 +259,8 @@ class UnfinishedRun:
     """Number of captures that were to be aligned."""
     missing: list[str]
     """Labels of those without a result."""
+    erroneous: list[str]
+    """Labels of those with a result and an error: some or all of their files are of an earlier run."""
 
     @property
     def sentence(self) -> str:
@@ -212,18 +270,29 @@ class UnfinishedRun:
             "interrupted": "the run was stopped before its end",
             "finished": "",
         }
-        parts = [text for text in (states[self.state], self._without_result) if text]
+        parts = [text for text in (states[self.state], self._without_result, self._with_error) if text]
         return "; ".join([*parts, "the same command resumes it"]) if parts else ""
 
     @property
     def _without_result(self) -> str:
-        max_named = 10
         if not self.missing:
             return ""
-        named, more = ", ".join(map(shortened, self.missing[:max_named])), len(self.missing) - max_named
-        and_more = f" and {more} more" if more > 0 else ""
         verb = "has" if len(self.missing) == 1 else "have"
-        return f"{len(self.missing)} of {counted(self.found, 'capture')} {verb} no result: {named}{and_more}"
+        of_all = f"{len(self.missing)} of {counted(self.found, 'capture')}"
+        return f"{of_all} {verb} no result: {_named(self.missing)}"
+
+    @property
+    def _with_error(self) -> str:
+        if not self.erroneous:
+            return ""
+        of_all = f"{len(self.erroneous)} of {counted(self.found, 'capture')}"
+        return f"errors in {of_all}, whose files may be of an earlier run: {_named(self.erroneous)}"
+
+
+def _named(labels: Sequence[str]) -> str:
+    max_named = 10
+    more = len(labels) - max_named
+    return ", ".join(map(shortened, labels[:max_named])) + (f" and {more} more" if more > 0 else "")
 
 
 def unfinished_run(
@@ -238,4 +307,7 @@ def unfinished_run(
     # A killed run has written these files, and not the end of its record.
     excluded |= {Path(part.folder, part.capture).as_posix() for part in not_aligned if part.is_left_out}
     wanted = [label for label in record.labels if label not in excluded]
-    return UnfinishedRun(record.state, len(wanted), [label for label in wanted if label not in labels])
+    with_problem = {part.of for part in record.problems}
+    missing = [label for label in wanted if label not in labels]
+    erroneous = [label for label in wanted if label in labels and escape_controls(label) in with_problem]
+    return UnfinishedRun(record.state, len(wanted), missing, erroneous)

@@ -155,12 +155,13 @@ def _problem(error: ValidationError) -> str:
     return f"{shortened(field)}: {shortened(first['msg'].removeprefix('Value error, '))}; run again with --overwrite"
 
 
-def verify_outputs(out: Path) -> Iterator[tuple[Path, list[str]]]:
-    """Yield (sidecar, problems of the sidecar and the files that it lists) for every capture below `out`.
+def verify_outputs(out: Path, sidecars: Sequence[Path] | None = None) -> Iterator[tuple[Path, list[str]]]:
+    """Yield (sidecar, problems of the sidecar and the files that it lists) for these captures, by default all below
+    `out`.
 
     Raises InputError if there is no sidecar.
     """
-    for path in run_sidecars(out):
+    for path in run_sidecars(out) if sidecars is None else sidecars:
         try:
             yield path, list(_problems_of_outputs(path))
         except SidecarError as error:
