@@ -5,7 +5,7 @@ import os
 import re
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from datetime import timedelta
 from filecmp import cmp as same_bytes
 from itertools import count
@@ -80,7 +80,7 @@ def join_folders(groups: Sequence[list[ImageFile]]) -> tuple[list[list[ImageFile
     copies of folders. Without an id, copies have the same names and bytes. The folder with the shortest path is kept.
     """
     kept: dict[object, list[list[ImageFile]]] = defaultdict(list)
-    copies: dict[tuple[Path, Path], list[bool]] = defaultdict(list)
+    copies: dict[tuple[Path, Path], _CopiedFolder] = defaultdict(_CopiedFolder)
     for group in sorted(groups, key=lambda g: (len(str(g[0].path.parent)), natural_order(str(g[0].path)))):
         capture_id, here = group[0].tags.first_text(group[0].camera.capture_ids), group[0].path.parent
         files = [(f.path.name, f.path.stat().st_size) for f in group]
@@ -95,15 +95,42 @@ def join_folders(groups: Sequence[list[ImageFile]]) -> tuple[list[list[ImageFile
         new = [f for f in group if names.isdisjoint((f.path.stem, *(b.name for b in f.bands)))]
         if len(new) < len(group):
             known = {(f.path.name, f.path.stat().st_size) for f in original}
-            copies[here, original[0].path.parent].append(known.issuperset(files))
+            used = [f.path.name for f in new]
+            copy = copies[here, original[0].path.parent]
+            copy.captures += 1
+            copy.used += used
+            copy.different += [name for name, size in files if name not in used and (name, size) not in known]
         original[:] = sorted((*original, *new), key=lambda f: natural_order(f.path.name))
         group.clear()
     problems = [
-        Problem(here, InputError(f"{here}: left out {counted(len(n), 'capture')} that {there} has"), is_harmless=all(n))
-        for (here, there), n in copies.items()
+        Problem(here, InputError(f"{here}: {copy.sentence(there)}"), is_harmless=not copy.different)
+        for (here, there), copy in copies.items()
     ]
     # Colour photographs come last.
     return [sorted(group, key=lambda f: f.bands[0].is_from_photograph) for group in groups if group], problems
+
+
+@dataclass
+class _CopiedFolder:
+    """What a folder has of captures that are in another folder too."""
+
+    captures: int = 0
+    """Number of such captures."""
+    used: list[str] = field(default_factory=list)
+    """Names of files that the other folder lacks."""
+    different: list[str] = field(default_factory=list)
+    """Names of files that the other folder has under another name or with another size."""
+
+    def sentence(self, other: Path) -> str:
+        """Return in words what is left out and what is used, given the other folder."""
+        text = f"left out {counted(self.captures, 'capture')} that {other} has"
+        if self.used:
+            text += f", except for {counted(len(self.used), 'file')} that it lacks: {some_of(self.used)}"
+        if self.different:
+            differ = "differs" if len(self.different) == 1 else "differ"
+            text += f"; {counted(len(self.different), 'file')} {differ} in name or size: {some_of(self.different)}; "
+            text += "keep one of the folders"
+        return text
 
 
 def _is_of_one_moment(one: Sequence[ImageFile], other: Sequence[ImageFile]) -> bool:

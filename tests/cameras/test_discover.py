@@ -125,8 +125,13 @@ def test_a_folder_copied_next_to_itself_counts_once(flight: Path, tmp_path: Path
     result = discover(tmp_path / "in")
     assert {c.label: [b.name for b in c.bands] for c in result.captures} == before
     (problem,) = [p for p in result.problems if "field" not in p.text]
-    assert problem.text == f"{copy}: left out 4 captures that {first} has"
-    assert not problem.is_harmless
+    text = f"{copy}: left out 4 captures that {first} has, except for 1 file that it lacks: IMG_0001_4.tif"
+    assert (problem.text, problem.is_harmless) == (text, True)
+    with (copy / "IMG_0002_3.tif").open("ab") as file:
+        file.write(b"\0")
+    (problem,) = [p for p in discover(tmp_path / "in").problems if "field" not in p.text]
+    reason = "1 file differs in name or size: IMG_0002_3.tif; keep one of the folders"
+    assert (problem.text, problem.is_harmless) == (f"{text}; {reason}", False)
     write(copy / "ortho.tif", bands=4)
     assert len(discover(tmp_path / "in").captures) == len(before) + 1
 

@@ -62,7 +62,7 @@ _OLD_PANEL = Remedy(
     "record a panel before and after each flight, or use a light sensor (--radiometry sun)",
 )
 _OLD_MODEL = Remedy(
-    "aligned with an earlier model of the flight, which fewer captures determine",
+    "aligned with an earlier model of the flight: images, captures or options have changed since",
     "--overwrite aligns all captures with the model of the whole flight",
 )
 _NOT_IN_INPUT = Remedy(
