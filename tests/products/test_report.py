@@ -121,6 +121,18 @@ def test_headline_and_summary_count_what_was_to_be_aligned(out: Path) -> None:
 
 
 @pytest.mark.slow
+def test_what_to_check_in_the_reference_has_a_row(out: Path) -> None:
+    sidecar = out / "0000SET" / "000" / "IMG_0002.json"
+    bands = read_json(sidecar)["bands"]
+    change(sidecar, bands=[b | {"saturated": 0.2 if b["status"] == "reference" else None} for b in bands])
+    assert "Every band of every capture is aligned" in headline(out)
+    rows = table_in(out / "summary.csv")
+    assert [r["status"] for r in rows].count("aligned") == 8
+    (row,) = (r for r in rows if r["status"] == "reference")
+    assert (row["capture"], row["band"], row["check"]) == ("IMG_0002", "Green", "20.0% of the pixels are saturated")
+
+
+@pytest.mark.slow
 def test_the_page_has_the_relief(aligned_flight: Path, tmp_path: Path) -> None:
     sidecar = read_json(aligned_flight / "0000SET" / "000" / "IMG_0001.json")
     part = {"file": "IMG_0001.relief.tif", "baseline": [0.5, 0.5], "occluded": 0.0125}

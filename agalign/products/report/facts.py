@@ -364,11 +364,13 @@ class FlightFacts:
             yield end
 
     def _pair(self, band: BandResult, sidecar: Sidecar, keys: dict[str, Any], checks: Sequence[str]) -> dict[str, Any]:
-        """The data of a band. Its row, with `keys`, and its offset are added unless it is the reference."""
+        """The data of a band. Its row, with `keys`, is added, that of the reference only if there is something to check;
+        and its offset, unless it is the reference.
+        """
         row = {column: value_at(band, path) for column, path in BAND_COLUMNS.items()}
         if band.status != "predicted":
             row["prediction_from"] = None  # its mapping has only been compared with the prediction
-        if band.status != "reference":
+        if band.status != "reference" or checks:
             self.add_row(keys | row | {"check": "; ".join(checks)})
         metrics, windows = band.metrics, None if band.metrics is None else band.metrics.windows
         similarity = {name: (row[f"{name}_before"], row[f"{name}_after"]) for name in _SIMILARITY}
