@@ -290,8 +290,8 @@ class WriteSettings(SettingsModel):
     interpolation: choices.Interpolation = "lanczos"
     """Resampling of the moving bands."""
     crop: choices.Crop = "flight"
-    """Area to write: covered by all bands in all captures of a camera (flight) or in this capture (common), or the
-    whole reference band (none)."""
+    """Area to write: covered by all bands in all captures of a camera (flight; in each capture, if its flights have no
+    rig, as with fewer than three captures) or in this capture (common), or the whole reference band (none)."""
     format: choices.RasterFormat = "gtiff"
     """Tiled GeoTIFF or cloud-optimised GeoTIFF."""
     compression: choices.Compression = "auto"

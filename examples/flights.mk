@@ -1,4 +1,5 @@
-# Align many flights on one machine: each folder below FLIGHTS that is not finished. A second call resumes.
+# Align many flights on one machine: each folder below FLIGHTS that is not finished. A second call resumes. A flight that
+# fails does not stop the others: make reports it, and returns exit code 2 at the end.
 # Make splits names at spaces: the names of the folders must not contain any.
 #
 #     make -f examples/flights.mk FLIGHTS=season OUT=aligned
@@ -8,6 +9,8 @@ OUT ?= aligned
 OPTIONS ?= --radiometry auto --index ndvi
 
 DONE := $(patsubst $(FLIGHTS)/%/,$(OUT)/%.done,$(sort $(wildcard $(FLIGHTS)/*/)))
+
+MAKEFLAGS += --keep-going
 
 all: $(DONE)
 

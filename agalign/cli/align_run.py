@@ -357,7 +357,7 @@ def _print_totals(totals: RunTotals, terminal: Terminal) -> None:
     explain(totals.pairs.groups(), terminal)
     if lost:
         of_all = f"{lost} of {counted(lost + len(written), 'capture')}"
-        terminal.problem(f"{of_all} could not be written, for the reasons above; the same command tries again")
+        terminal.problem(f"{of_all} could not be written, for the reasons above; mend them, and repeat the command")
     for quantity, ages_s in totals.panel_ages_s.items():
         age_s = max((one for one in ages_s if one is not None), default=None)
         age = "" if age_s is None else f", at most {age_s / 60:.0f} min from a panel"

@@ -63,7 +63,7 @@ GREEN = "(did you mean 'Green'?); choose from Blue, Green, Red, NIR, Red edge"
         ("align {flight} -o {tmp}/o --pattern {{capture}}_{{band}}.png", 2, "matches none of 10 images, such as IMG_"),
         ("align {flight} -o {tmp}/o --include *.xyz", 1, "none of 10 images, such as 0000SET/000/IMG_0001_1.tif"),
         ("align {flight} --dry-run --georeference", 2, "no capture has a height above the ground; give --ground-elev"),
-        ("align {flight} --dry-run --radiometry panel", 2, "--radiometry panel: no usable calibration panel of known"),
+        ("align {flight} --dry-run --radiometry panel", 2, "--radiometry panel: no calibration panel for Blue, Green"),
         ("align {flight} -o {tmp}/o --model nosuch", 1, "nosuch: cannot be read as a model (No such file or directory"),
         ("align {flight} -o {tmp}/o --model {tmp}", 1, "cannot be read as a model (it is not a regular file); give"),
         ("align {flight} -o {tmp}/o --device gpu", 2, "unknown device 'gpu'; use auto, cpu, cuda"),

@@ -364,8 +364,8 @@ class FlightFacts:
             yield end
 
     def _pair(self, band: BandResult, sidecar: Sidecar, keys: dict[str, Any], checks: Sequence[str]) -> dict[str, Any]:
-        """The data of a band. Its row, with `keys`, is added, that of the reference only if there is something to check;
-        and its offset, unless it is the reference.
+        """The data of a band. Its row, with `keys`, and its offset are added: for the reference only a row, if there is
+        something to check.
         """
         row = {column: value_at(band, path) for column, path in BAND_COLUMNS.items()}
         if band.status != "predicted":
