@@ -1,10 +1,12 @@
 """Learn the model of a flight: one network for all its captures, from a few of them, and its rig."""
 
+import os
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import partial
+from pathlib import Path
 
 import numpy as np
 
@@ -68,7 +70,15 @@ def learn_flight(
         return apply(task, arguments)
 
     learned = _FlightLearner(captures, settings, progress, start, apply_in_one_thread, threads).learned()
-    return None if learned is None else replace(learned, fingerprint=learning_fingerprint(captures, settings))
+    if learned is None:
+        return None
+    times = sorted(c.known_time for c in captures if c.known_time)
+    return replace(
+        learned,
+        fingerprint=learning_fingerprint(captures, settings),
+        folder=Path(os.path.commonpath([c.folder for c in captures])).as_posix(),
+        captured_at=tuple(dict.fromkeys((times[0], times[-1]))) if times else (),
+    )
 
 
 @dataclass(frozen=True)

@@ -153,9 +153,13 @@ def _show_model(path: Path, terminal: Terminal, *, as_json: bool) -> None:
     if as_json:
         rig = {"captures": captures, "factors": factors, "bands": rows} if rows else None
         facts = {"model": str(path), "camera": str(model.camera or ""), "bands": list(model.bands), "rig": rig}
+        facts |= {"folder": model.folder, "captured_at": list(model.captured_at)}
         terminal.facts(facts)
         return
     terminal.result(f"{model.camera or 'any camera'}: a network for {', '.join(model.bands) or 'any bands'}")
+    if model.folder or model.captured_at:
+        times = " to ".join(time[:19].replace("T", " ") for time in model.captured_at) or "at an unknown time"
+        terminal.result(f"flight: {times}, in the folder {model.folder} of its input")
     if not rows:
         terminal.result("no rig: too few captures were aligned")
         return

@@ -45,6 +45,10 @@ class FlightModel:
     """Hash of the captures and settings from which it was learned."""
     rig: Rig | None = None
     """Geometry of the camera; None if too few captures determine it."""
+    folder: str = ""
+    """Folder of the flight, relative to its input folder."""
+    captured_at: tuple[str, ...] = ()
+    """Times of the first and the last capture of the flight, ISO 8601; empty if they are unknown."""
 
     def side(self, band: str) -> int | None:
         """Return the network's side of a moving band; None for an unknown band."""
@@ -67,6 +71,8 @@ def save_model(model: FlightModel, path: Path) -> None:
         "channels": json.dumps(model.net.channels),
         "fingerprint": model.fingerprint,
         "rig": "" if model.rig is None else rig_to_json(model.rig),
+        "folder": model.folder,
+        "captured_at": json.dumps(model.captured_at),
     }
     contents = _with_sorted_header(save(tensors, facts | {"digest": _digest(tensors, facts)}))
     with complete_file(path) as partial:
@@ -106,6 +112,8 @@ def _read_model(path: Path) -> FlightModel:
         mappings={band: normalised(matrix.numpy()) for band, matrix in _with_prefix("mapping.", tensors).items()},
         fingerprint=facts["fingerprint"],
         rig=rig_from_json(facts["rig"], fields) if facts.get("rig") else None,
+        folder=shortened(facts.get("folder", "")),
+        captured_at=tuple(shortened(str(time)) for time in json.loads(facts.get("captured_at", "[]"))),
     )
 
 

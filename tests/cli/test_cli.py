@@ -119,6 +119,14 @@ def test_info_shows_the_rig_of_a_model(tmp_path: Path) -> None:
     assert "no rig" in agalign_here("info", path).stdout
 
 
+@pytest.mark.slow
+def test_info_tells_the_flights_of_models_apart(model_path: Path) -> None:
+    lines = agalign_here("info", model_path).stdout.splitlines()
+    assert "flight: 2026-06-21 10:00:01 to 2026-06-21 10:00:02, in the folder 0000SET/000 of its input" in lines
+    facts = json.loads(agalign_here("info", model_path, "--json").stdout)
+    assert (facts["folder"], len(facts["captured_at"])) == ("0000SET/000", 2)
+
+
 def test_the_names_of_the_package_and_the_help_import_nothing_that_is_slow_to_load() -> None:
     code = """
 import agalign, sys

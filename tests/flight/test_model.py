@@ -38,7 +38,8 @@ def model(tmp_path: Path) -> FlightModel:
     known = load(tmp_path / "known.safetensors")
     one_band = {"extrapolation_px": 0.7, "parallax_px": 3.0, "fields": FIELD}
     rig = replace(known.rig, **{name: {"NIR": value} for name, value in one_band.items()})
-    return replace(known, rig=rig, mappings={"NIR": geometry.translation(3, 4)}, fingerprint="0f")
+    of_flight = {"folder": "0000SET", "captured_at": ("2026-06-21T10:00:00", "2026-06-21T10:20:00")}
+    return replace(known, rig=rig, mappings={"NIR": geometry.translation(3, 4)}, fingerprint="0f", **of_flight)
 
 
 @pytest.fixture
