@@ -5,17 +5,17 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import partial
-from multiprocessing import get_context
 from pathlib import Path
 from typing import Self
 
-from agalign.batch.capture_task import CaptureReport, Task, do_capture, loaded_model, missing_radiometry, quiet
+from agalign.batch.capture_task import CaptureReport, Task, do_capture, loaded_model, quiet
 from agalign.batch.earlier_results import Remaining, outputs_exist, refuse_other_captures, remaining
 from agalign.batch.flight_learning import learn_flight
 from agalign.batch.other_results import labels_of_other_inputs, results_not_in_input
 from agalign.batch.render import RenderOptions, refuse_to_overwrite, remove_outputs
+from agalign.batch.selection import Selection, select_captures
 from agalign.batch.workers import Run, failure_text, in_order, open_workers, serially
 from agalign.cameras.discover import FolderScan
 from agalign.config import RunOptions, Settings, WriteSettings
@@ -23,33 +23,17 @@ from agalign.errors import AgalignError, ConfigurationError, InputError, OutputE
 from agalign.flight.fingerprint import learning_fingerprint
 from agalign.flight.groups import camera_key, difference, flight_camera, flights_of, is_flight_of, model_names
 from agalign.flight.model import FlightModel, load_model, save_model
-from agalign.flight.panel_readings import (
-    READERS,
-    PanelReading,
-    missing_panel,
-    read_panel,
-    reflectance_factors,
-    with_height,
-    with_panels,
-)
+from agalign.flight.panel_readings import PanelReading
 from agalign.flight.rig import MIN_CAPTURES, Rig
 from agalign.flight.rig_file import read_rig
-from agalign.flight.sky import SkyCapture, sky_captures
+from agalign.flight.sky import SkyCapture
 from agalign.method.device import choose_device, limit_threads
-from agalign.pixels.radiometry import with_radiometry
 from agalign.products.indices.rasters import check_indices
-from agalign.products.product import CapturePaths, Product
+from agalign.products.product import CapturePaths
 from agalign.products.rasters.output_grid import FlightLimits, common_grid, flight_limits
-from agalign.products.registry import PRODUCTS
 from agalign.products.report.pages import outdate_pages
 from agalign.products.report.preview import preview_bytes
 from agalign.products.run.excluded import write_panels, write_sky
-from agalign.products.run.footprint import (
-    above_elevation,
-    missing_for_footprint,
-    utm_of_flights,
-    with_approximate_georeference,
-)
 from agalign.products.run.record import RunPart, begun, excluded_part, read_run_record, refuse_foreign_pages
 from agalign.products.sidecar.file import read_without_tables
 from agalign.products.sidecar.schema import FilePart
@@ -57,8 +41,7 @@ from agalign.values.capture import Capture
 from agalign.values.files import check_inside, written_below
 from agalign.values.image import OutputGrid
 from agalign.values.output_folder import is_full, locked
-from agalign.values.process_pool import ProcessPool, R, WorkerDiedError
-from agalign.values.processes import CAPTURES_WORTH_A_PROCESS, environment_of_children, silence_libraries, usable_cores
+from agalign.values.processes import CAPTURES_WORTH_A_PROCESS, usable_cores
 from agalign.values.text import counted
 
 _MAX_THREADS = 4
@@ -111,10 +94,10 @@ def run_flight(
         run = run.starting_from(model)
     with locked(out):
         # What can be refused is refused before the record and the pages of an earlier run are touched.
-        yield from _run_selected(run, run.selection())
+        yield from _run_selected(run, select_captures(run.flight, run.settings.write, run.options))
 
 
-def _run_selected(run: "_FlightRun", selection: "_Selection") -> Iterator[CaptureReport]:
+def _run_selected(run: "_FlightRun", selection: Selection) -> Iterator[CaptureReport]:
     """Process the captures of a run, record it, and yield the report of each capture. Raises as `run_flight`."""
     out = run.out
     # (path of the sidecar, its files, state, statuses of the pairs) by label; sidecars would not fit into memory.
@@ -151,7 +134,7 @@ def plan_run(flight: FolderScan, out: Path, settings: Settings, options: RunOpti
     """
     run = _FlightRun(flight, out, settings, options or RunOptions())
     run.check()
-    selection = run.selection()
+    selection = select_captures(run.flight, run.settings.write, run.options)
     states = dict(selection.abandoned) | {s.capture.label: "left out as sky" for s in selection.sky}
     states |= {p.capture.label: "read as calibration panels" for p in selection.panels if p.capture.is_of_a_panel}
     for capture in selection.captures:
@@ -229,57 +212,11 @@ class _FlightRun:
         flight_settings = settings.flight.model_copy(update={"start_model": model.fingerprint})
         return replace(self, given=model, settings=settings.model_copy(update={"flight": flight_settings}))
 
-    @contextmanager
-    def examining(self) -> "Iterator[_Examination]":
-        """Provide how the images of captures are read before the alignment: with a time limit, in worker processes."""
-        timeout_s, processes = self.options.timeout_s, min(READERS, usable_cores())
-        if timeout_s is None:
-            yield _Examination()
-            return
-        with environment_of_children(threads=1), ProcessPool(processes, get_context("spawn"), _start_examining) as pool:
-            yield _Examination(pool, timeout_s)
-
-    def selection(self) -> "_Selection":
-        """Return what the run does with each capture.
-
-        Raises ConfigurationError if no capture has what the settings ask for: the radiometry, the metadata for a
-        georeference, or the bands for a product.
-        """
-        with self.examining() as examine:
-            result = self._selected(examine)
-        write, captures = self.settings.write, result.captures
-        missing = [missing_radiometry(capture, write.radiometry) for capture in captures]
-        if captures and all(missing):
-            raise ConfigurationError(f"--radiometry {write.radiometry}: {missing[0]}")
-        if write.georeference and captures and all(c.reference.georeference is None for c in captures):
-            raise ConfigurationError(f"--georeference: no capture has {missing_for_footprint(captures[0])}")
-        for product in (one for one in PRODUCTS if one.is_enabled(write)):
-            _check_product(product, captures)
-        return result
-
-    def _selected(self, examine: "_Examination") -> "_Selection":
-        """Return the captures by what they show, those to align with their radiometry and georeference."""
-        write, albedos = self.settings.write, dict(self.settings.write.panel_albedo)
-        sky: list[SkyCapture] = []
-        panels: list[PanelReading] = []
-        captures = list(self.flight.captures)
-        if not self.options.align_panels:
-            sky, captures = sky_captures(captures, examine)
-            captures = list(with_panels(captures, without_code=bool(albedos), examine=examine))
-            readings = [examine(read_panel, c, albedos) for c in captures if c.panel is not None]
-            panels = [reading for reading in readings if reading is not None]
-            captures = [c for c in captures if not c.is_of_a_panel and c.label not in examine.abandoned]
-        captures = [_calibrated(capture, panels, write) for capture in captures]
-        if write.georeference:
-            crs = utm_of_flights(captures)
-            captures = [with_approximate_georeference(c, crs[c.label]) if c.label in crs else c for c in captures]
-        return _Selection(sky, panels, captures, examine.abandoned)
-
     def remaining(self, capture: Capture) -> Remaining:
         """Return what remains to be done for a capture."""
         return remaining(capture, self.out, self.settings, self.options)
 
-    def reports(self, selection: "_Selection", record: RunPart) -> Iterator[CaptureReport]:
+    def reports(self, selection: Selection, record: RunPart) -> Iterator[CaptureReport]:
         """Yield the report of each capture; add the time of learning to the record."""
         for label, reason in selection.abandoned.items():
             yield CaptureReport(label, "error", error=reason)
@@ -384,43 +321,6 @@ class _FlightRun:
         return path
 
 
-@dataclass(frozen=True)
-class _Selection:
-    """What a run does with the captures of its input."""
-
-    sky: Sequence[SkyCapture]
-    panels: Sequence[PanelReading]
-    """A scene that contains a panel is in `captures` too."""
-    captures: Sequence[Capture]
-    """Those to align."""
-    abandoned: Mapping[str, str]
-    """Why the search for sky and panels was abandoned, by label; these captures are in no other list."""
-
-
-@dataclass(frozen=True)
-class _Examination:
-    """Calls functions that read the images of captures, as `flight.panel_readings.Examine`."""
-
-    pool: ProcessPool | None = None
-    timeout_s: float | None = None
-    abandoned: dict[str, str] = field(default_factory=dict)
-    """Why a capture was abandoned, by label."""
-
-    def __call__(self, function: Callable[..., R], capture: Capture, /, *arguments: object) -> R | None:
-        if self.pool is None:
-            return function(capture, *arguments)
-        try:
-            return self.pool.submit(function, capture, *arguments, timeout_s=self.timeout_s).result()
-        except (TimeoutError, WorkerDiedError, MemoryError) as error:
-            self.abandoned[capture.label] = failure_text(error, self.timeout_s)
-            return None
-
-
-def _start_examining() -> None:
-    """Initialise a worker, which imports this module for it: tasks do not wait for that."""
-    silence_libraries()
-
-
 def _crop_key(capture: Capture) -> tuple[str, bool]:
     """The camera, and whether its reference can be undistorted."""
     return camera_key(capture), capture.reference.lens is None
@@ -450,31 +350,6 @@ def _crops_of_cameras(
             grid = most
         result[key] = limits, grid
     return result
-
-
-def _check_product(product: Product, captures: Sequence[Capture]) -> None:
-    """Raise ConfigurationError if no capture has what a product needs."""
-    problem: AgalignError | None = None
-    for capture in captures:
-        try:
-            product.check(capture)
-            return
-        except AgalignError as error:
-            problem = problem or error
-    if problem is not None:
-        raise ConfigurationError(str(problem))
-
-
-def _calibrated(capture: Capture, panels: Sequence[PanelReading], settings: WriteSettings) -> Capture:
-    """Return the capture with its radiometry, and its height above the ground if the elevation of the ground or a panel
-    determines it.
-    """
-    capture = with_radiometry(capture, settings.radiometry, reflectance_factors(capture, panels))
-    if settings.radiometry == "panel":
-        capture = replace(capture, without_panel=missing_panel(capture, panels))
-    if settings.ground_elevation_m is not None:
-        capture = above_elevation(capture, settings.ground_elevation_m)
-    return with_height(capture, panels)
 
 
 def capture_reports(

@@ -1,0 +1,145 @@
+"""Selection of the captures of a run: which are aligned, with their radiometry, and which show a panel or the sky."""
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
+from multiprocessing import get_context
+
+from agalign.batch.capture_task import missing_radiometry
+from agalign.batch.workers import failure_text
+from agalign.cameras.discover import FolderScan
+from agalign.config import RunOptions, WriteSettings
+from agalign.errors import AgalignError, ConfigurationError
+from agalign.flight.panel_readings import (
+    READERS,
+    PanelReading,
+    missing_panel,
+    read_panel,
+    reflectance_factors,
+    with_height,
+    with_panels,
+)
+from agalign.flight.sky import SkyCapture, sky_captures
+from agalign.pixels.radiometry import with_radiometry
+from agalign.products.product import Product
+from agalign.products.registry import PRODUCTS
+from agalign.products.run.footprint import (
+    above_elevation,
+    missing_for_footprint,
+    utm_of_flights,
+    with_approximate_georeference,
+)
+from agalign.values.capture import Capture
+from agalign.values.process_pool import ProcessPool, R, WorkerDiedError
+from agalign.values.processes import environment_of_children, silence_libraries, usable_cores
+
+
+@dataclass(frozen=True)
+class Selection:
+    """What a run does with the captures of its input."""
+
+    sky: Sequence[SkyCapture]
+    panels: Sequence[PanelReading]
+    """A scene that contains a panel is in `captures` too."""
+    captures: Sequence[Capture]
+    """Those to align."""
+    abandoned: Mapping[str, str]
+    """Why the search for sky and panels was abandoned, by label; these captures are in no other list."""
+
+
+def select_captures(flight: FolderScan, write: WriteSettings, options: RunOptions) -> Selection:
+    """Return what the run does with each capture.
+
+    Raises ConfigurationError if no capture has what the settings ask for: the radiometry, the metadata for a
+    georeference, or the bands for a product.
+    """
+    with _examining(options.timeout_s) as examine:
+        result = _selected(flight, write, options, examine)
+    captures = result.captures
+    missing = [missing_radiometry(capture, write.radiometry) for capture in captures]
+    if captures and all(missing):
+        raise ConfigurationError(f"--radiometry {write.radiometry}: {missing[0]}")
+    if write.georeference and captures and all(c.reference.georeference is None for c in captures):
+        raise ConfigurationError(f"--georeference: no capture has {missing_for_footprint(captures[0])}")
+    for product in (one for one in PRODUCTS if one.is_enabled(write)):
+        _check_product(product, captures)
+    return result
+
+
+def _selected(flight: FolderScan, write: WriteSettings, options: RunOptions, examine: "_Examination") -> Selection:
+    """Return the captures by what they show, those to align with their radiometry and georeference."""
+    albedos = dict(write.panel_albedo)
+    sky: list[SkyCapture] = []
+    panels: list[PanelReading] = []
+    captures = list(flight.captures)
+    if not options.align_panels:
+        sky, captures = sky_captures(captures, examine)
+        captures = list(with_panels(captures, without_code=bool(albedos), examine=examine))
+        readings = [examine(read_panel, c, albedos) for c in captures if c.panel is not None]
+        panels = [reading for reading in readings if reading is not None]
+        captures = [c for c in captures if not c.is_of_a_panel and c.label not in examine.abandoned]
+    captures = [_calibrated(capture, panels, write) for capture in captures]
+    if write.georeference:
+        crs = utm_of_flights(captures)
+        captures = [with_approximate_georeference(c, crs[c.label]) if c.label in crs else c for c in captures]
+    return Selection(sky, panels, captures, examine.abandoned)
+
+
+def _calibrated(capture: Capture, panels: Sequence[PanelReading], settings: WriteSettings) -> Capture:
+    """Return the capture with its radiometry, and its height above the ground if the elevation of the ground or a panel
+    determines it.
+    """
+    capture = with_radiometry(capture, settings.radiometry, reflectance_factors(capture, panels))
+    if settings.radiometry == "panel":
+        capture = replace(capture, without_panel=missing_panel(capture, panels))
+    if settings.ground_elevation_m is not None:
+        capture = above_elevation(capture, settings.ground_elevation_m)
+    return with_height(capture, panels)
+
+
+def _check_product(product: Product, captures: Sequence[Capture]) -> None:
+    """Raise ConfigurationError if no capture has what a product needs."""
+    problem: AgalignError | None = None
+    for capture in captures:
+        try:
+            product.check(capture)
+            return
+        except AgalignError as error:
+            problem = problem or error
+    if problem is not None:
+        raise ConfigurationError(str(problem))
+
+
+@dataclass(frozen=True)
+class _Examination:
+    """Calls functions that read the images of captures, as `flight.panel_readings.Examine`."""
+
+    pool: ProcessPool | None = None
+    timeout_s: float | None = None
+    abandoned: dict[str, str] = field(default_factory=dict)
+    """Why a capture was abandoned, by label."""
+
+    def __call__(self, function: Callable[..., R], capture: Capture, /, *arguments: object) -> R | None:
+        if self.pool is None:
+            return function(capture, *arguments)
+        try:
+            return self.pool.submit(function, capture, *arguments, timeout_s=self.timeout_s).result()
+        except (TimeoutError, WorkerDiedError, MemoryError) as error:
+            self.abandoned[capture.label] = failure_text(error, self.timeout_s)
+            return None
+
+
+@contextmanager
+def _examining(timeout_s: float | None) -> Iterator[_Examination]:
+    """Provide how the images of captures are read before the alignment: with a time limit, in worker processes."""
+    processes = min(READERS, usable_cores())
+    if timeout_s is None:
+        yield _Examination()
+        return
+    with environment_of_children(threads=1), ProcessPool(processes, get_context("spawn"), _start_examining) as pool:
+        yield _Examination(pool, timeout_s)
+
+
+def _start_examining() -> None:
+    """Initialise a worker, which imports this module for it: tasks do not wait for that."""
+    silence_libraries()
