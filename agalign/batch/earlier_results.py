@@ -44,15 +44,15 @@ def is_same(earlier: Sidecar, capture: Capture) -> bool | None:
     return bool(earlier.input_samples.items() & input_samples(capture).items())
 
 
-def refuse_other_captures(captures: Sequence[Capture], out: Path) -> None:
+def refuse_other_captures(captures: Sequence[Capture], out: Path, *, is_same_input: bool = False) -> None:
     """Raise ConfigurationError if the place of a capture has the result of another one, or if another place has its
-    result, as of a run on the folder above.
+    result, as of a run on the folder above. With the input folder of the last run, the images were moved in it instead.
     """
     places = {CapturePaths.of(c, out).sidecar: c for c in captures}
     by_name: dict[str, list[Capture]] = {}
     for capture in captures:
         by_name.setdefault(capture.name, []).append(capture)
-    elsewhere = [p for p in out.rglob("*.json") if p.stem in by_name and p not in places]
+    elsewhere = [] if is_same_input else [p for p in out.rglob("*.json") if p.stem in by_name and p not in places]
     for path, here in chain(places.items(), ((p, c) for p in elsewhere for c in by_name[p.stem])):
         with suppress(SidecarError):
             earlier = read_without_tables(path)

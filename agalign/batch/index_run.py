@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator, Sequence
 from concurrent.futures import Executor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import cv2
@@ -32,6 +32,8 @@ class IndexTask:
     overwrite: bool
     mask_qa: bool = False
     """Mask pixels that the quality raster flags as unusable."""
+    run: RunFacts = field(default_factory=RunFacts)
+    """Facts of the run, which are read once for all captures."""
 
     def absolute(self) -> "IndexTask":
         """Return the task with absolute paths: workers may have another working folder."""
@@ -48,7 +50,8 @@ def index_tasks(
 ) -> list[IndexTask]:
     """Return a task for each capture of a run. Raises InputError if the folder contains no run."""
     paths = counted_sidecars(run_sidecars(out), out)
-    return [IndexTask(out, path, target, tuple(indices), overwrite, mask_qa) for path in paths]
+    run = RunFacts.of(out)
+    return [IndexTask(out, path, target, tuple(indices), overwrite, mask_qa, run) for path in paths]
 
 
 def run_indices(
@@ -93,8 +96,8 @@ def do_indices(task: IndexTask) -> list[IndexReport]:
                 rasters = [r.path for r in reports if r.path is not None and not (r.kept and r.path.name in listed)]
                 files = [p for path in rasters for p in (path, path.with_suffix(".png"))]
                 add_products(task.sidecar, IndexRasters.kind, files)
-        run, by_name = RunFacts.of(task.out), {index.name: index for index in task.indices}
-        checks = [to_check(by_name[r.index], sidecar, run, task.label) for r in reports]
+        by_name = {index.name: index for index in task.indices}
+        checks = [to_check(by_name[r.index], sidecar, task.run, task.label) for r in reports]
         reports = [r if r.problem else replace(r, problem=check) for r, check in zip(reports, checks, strict=True)]
     except AgalignError as error:
         reports = _failed(task, str(error))

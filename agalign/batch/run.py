@@ -19,7 +19,7 @@ from agalign.batch.selection import Selection, select_captures
 from agalign.batch.workers import Run, failure_text, in_order, open_workers, serially
 from agalign.cameras.discover import FolderScan
 from agalign.config import RunOptions, Settings, WriteSettings
-from agalign.errors import AgalignError, ConfigurationError, InputError, OutputError, SidecarError
+from agalign.errors import AgalignError, ConfigurationError, InputError, OutputError
 from agalign.flight.fingerprint import learning_fingerprint
 from agalign.flight.groups import camera_key, difference, flight_camera, flights_of, is_flight_of, model_names
 from agalign.flight.model import FlightModel, load_model, save_model
@@ -34,7 +34,7 @@ from agalign.products.rasters.output_grid import FlightLimits, common_grid, flig
 from agalign.products.report.pages import outdate_pages
 from agalign.products.report.preview import preview_bytes
 from agalign.products.run.excluded import write_panels, write_sky
-from agalign.products.run.record import RunPart, begun, excluded_part, read_run_record, refuse_foreign_pages
+from agalign.products.run.record import RunPart, begun, excluded_part, input_name, last_record, refuse_foreign_pages
 from agalign.products.sidecar.file import read_without_tables
 from agalign.products.sidecar.schema import FilePart
 from agalign.values.capture import Capture
@@ -148,9 +148,7 @@ def plan_run(flight: FolderScan, out: Path, settings: Settings, options: RunOpti
 @contextmanager
 def _recorded(run: "_FlightRun") -> Iterator[RunPart]:
     """Write the run record at the beginning and at the end of a run, also after an interruption."""
-    began, earlier = time.monotonic(), None
-    with suppress(SidecarError):  # it is replaced
-        earlier = read_run_record(run.out)
+    began, earlier = time.monotonic(), last_record(run.out)
     record = begun(run.flight.folder, run.settings, run.flight.captures, run.options.command)
     record.other_inputs = labels_of_other_inputs(earlier, record)
     record.not_in_input = list(results_not_in_input(run.flight, run.out, record.other_inputs))
@@ -187,7 +185,9 @@ class _FlightRun:
         if self.out.resolve() == self.flight.folder.resolve():
             raise ConfigurationError(f"{self.out}: is the folder of the images; choose another output folder with -o")
         refuse_to_overwrite(self.flight.captures, self.out, self.settings.write)
-        refuse_other_captures(self.flight.captures, self.out)
+        earlier = last_record(self.out)
+        is_same_input = earlier is not None and earlier.input == input_name(self.flight.folder)
+        refuse_other_captures(self.flight.captures, self.out, is_same_input=is_same_input)
         refuse_foreign_pages(self.out)
         check_inside(self.out / "models", self.out)
 

@@ -121,6 +121,19 @@ def test_a_renamed_exposure_counts_once(flight: Path, tmp_path: Path, has_id: bo
     assert {c.label for c in captures_of_run(out)[0]} == {FIRST, SECOND}
 
 
+def test_a_moved_folder_counts_once(flight: Path, tmp_path: Path) -> None:
+    folder, out = shutil.copytree(flight, tmp_path / "in"), tmp_path / "out"
+    agalign.align_folder(folder, out, settings=seeded("rig"))
+    (folder / "0000SET").rename(folder / "flight A")
+    agalign.align_folder(folder, out, settings=seeded("rig"))
+    moved = [(label, label.replace("0000SET", "flight A")) for label in (FIRST, SECOND)]
+    assert [(part.capture, part.same_as) for part in read_run_record(out).not_in_input] == moved
+    assert "2 of 2 captures match" in agalign_here("verify", out).stdout
+    # On the folder below, all captures would be there twice.
+    with pytest.raises(agalign.ConfigurationError, match="by a run on a folder above or below"):
+        agalign.align_folder(folder / "flight A", out, settings=seeded("rig"))
+
+
 def test_a_capture_that_the_input_no_longer_has_is_named_and_kept(out: Path, flight: Path) -> None:
     folder, settings = shutil.copytree(flight, out.parent / "in"), seeded("rig", layout="both")
     agalign.align_folder(folder, out, settings=settings)

@@ -14,7 +14,7 @@ from agalign.errors import InputError, SidecarError
 from agalign.flight.panel_readings import MAX_TIME_DIFFERENCE_S
 from agalign.flight.rig_file import model_fingerprint
 from agalign.products.run.excluded import PanelPart, read_excluded
-from agalign.products.run.record import read_run_record
+from agalign.products.run.record import last_record
 from agalign.products.sidecar.schema import BandResult, Sidecar
 from agalign.values.capture import CaptureTime
 from agalign.values.issues import (
@@ -108,15 +108,13 @@ class RunFacts:
     def of(cls, out: Path) -> "RunFacts":
         """Read the facts of a run; files that cannot be read are left out."""
         panels: list[PanelPart] = []
-        models, gone = set(), frozenset[str]()
+        models, record = set(), last_record(out)
         with suppress(SidecarError):
             panels = read_excluded(out)[0]
-        with suppress(SidecarError):
-            record = read_run_record(out)
-            gone = frozenset(part.capture for part in record.not_in_input) if record is not None else gone
         for path in (out / "models").glob("*.safetensors"):
             with suppress(InputError):
                 models.add(model_fingerprint(path))
+        gone = frozenset[str]() if record is None else frozenset(part.capture for part in record.not_in_input)
         return cls(tuple(p for p in panels if not p.fits_sensor), frozenset(models), gone)
 
     def cautions(self, sidecar: Sidecar, label: str = "") -> Iterator[Caution]:

@@ -201,6 +201,11 @@ def excluded_part(capture: Capture, kind: Literal["panel", "sky"], evidence: lis
     )
 
 
+def input_name(folder: Path) -> str:
+    """Return the path of an input folder as the record has it."""
+    return escape_controls(str(folder.resolve()))
+
+
 def begun(folder: Path, settings: Settings, captures: Sequence[Capture] = (), command: str = "") -> RunPart:
     """Return the record of a run that starts now."""
     system = {"system": platform.system(), "release": platform.release(), "processor": platform.machine()}
@@ -208,7 +213,7 @@ def begun(folder: Path, settings: Settings, captures: Sequence[Capture] = (), co
         state="running",
         started_at=datetime.now(UTC).isoformat(timespec="seconds"),
         seconds=0.0,
-        input=escape_controls(str(folder.resolve())),
+        input=input_name(folder),
         command=escape_controls(command),
         cameras=camera_overviews(captures),
         versions=library_versions(),
@@ -233,13 +238,20 @@ def read_run_record(out: Path) -> RunPart | None:
     return read_model(out / RUN_FILE, RunPart)
 
 
+def last_record(out: Path) -> RunPart | None:
+    """Return the record of the last run into a folder; None without one, and for one that cannot be read, which the
+    commands that need it name.
+    """
+    with suppress(SidecarError):
+        return read_run_record(out)
+    return None
+
+
 def renamed_captures(out: Path) -> frozenset[str]:
     """Return the labels of results below an output folder that do not count, because the exposure has a result under
     its present name.
     """
-    record = None
-    with suppress(SidecarError):  # named by the commands that need it
-        record = read_run_record(out)
+    record = last_record(out)
     renamed = [part for part in ([] if record is None else record.not_in_input) if part.same_as]
     return frozenset(part.capture for part in renamed if (out / f"{part.same_as}.json").is_file())
 
