@@ -351,14 +351,6 @@ class Capture:
         root = None if self.root is None else self.root.absolute()
         return replace(self, root=root, bands=tuple(replace(b, path=b.path.absolute()) for b in self.bands))
 
-    def file_of(self, band: Band) -> str:
-        """Return the path of the file of a band, with forward slashes: relative to the input folder if it is there,
-        else absolute.
-        """
-        if self.root is not None and band.path.is_relative_to(self.root):
-            return band.path.relative_to(self.root).as_posix()
-        return band.path.absolute().as_posix()
-
     @property
     def reference(self) -> Band:
         """The reference band."""
@@ -421,3 +413,12 @@ class Capture:
     def label(self) -> str:
         """The capture's name below its folder, with forward slashes."""
         return (self.folder / self.name).as_posix()
+
+
+def source_file(capture: Capture, band: Band) -> str:
+    """Return the path of the file of a band, with forward slashes: relative to the input folder if it is there, else
+    absolute.
+    """
+    if capture.root is not None and band.path.is_relative_to(capture.root):
+        return band.path.relative_to(capture.root).as_posix()
+    return band.path.absolute().as_posix()

@@ -28,7 +28,7 @@ from agalign.products.sidecar.file import (
 )
 from agalign.products.sidecar.schema import FilePart, Sidecar
 from agalign.values import geometry
-from agalign.values.capture import Band, Capture
+from agalign.values.capture import Band, Capture, source_file
 from agalign.values.issues import COVERAGE, RETRIEVAL, Issue
 from agalign.values.lens import Lens
 from agalign.values.mapping import PixelMapping
@@ -71,10 +71,10 @@ def test_a_sidecar_names_its_images(flight: Path, aligned_flight: Path) -> None:
 def test_files_of_equal_names_in_two_folders_are_distinct() -> None:
     bands = tuple(Band(name, Path("in", name, "IMG_6.jpg"), 1, 10, 8, "uint8") for name in ("RGB", "NDRE"))
     capture = Capture("IMG_6", Path(), bands, 0, root=Path("in"))
-    assert [capture.file_of(b) for b in bands] == ["RGB/IMG_6.jpg", "NDRE/IMG_6.jpg"]
+    assert [source_file(capture, b) for b in bands] == ["RGB/IMG_6.jpg", "NDRE/IMG_6.jpg"]
     there = capture.with_absolute_paths()
-    assert [there.file_of(b) for b in there.bands] == ["RGB/IMG_6.jpg", "NDRE/IMG_6.jpg"]
-    assert replace(capture, root=None).file_of(bands[0]) == Path("in/RGB/IMG_6.jpg").absolute().as_posix()
+    assert [source_file(there, b) for b in there.bands] == ["RGB/IMG_6.jpg", "NDRE/IMG_6.jpg"]
+    assert source_file(replace(capture, root=None), bands[0]) == Path("in/RGB/IMG_6.jpg").absolute().as_posix()
 
 
 def test_round_trip(tmp_path: Path) -> None:

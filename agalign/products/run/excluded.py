@@ -14,7 +14,7 @@ from agalign.flight.panel_readings import BandReading, PanelReading
 from agalign.flight.sky import SkyCapture, sky_radiance
 from agalign.pixels.raster import read_preview
 from agalign.products.report.drawing import Picture, side_by_side, titled, write_png
-from agalign.values.capture import Band, Capture, PanelSource
+from agalign.values.capture import Band, Capture, PanelSource, source_file
 from agalign.values.fields import Message, Name, SourceFile
 from agalign.values.files import check_inside, read_model, write_model
 from agalign.values.pixel_units import PixelScale
@@ -159,7 +159,9 @@ def write_sky(sky: Sequence[SkyCapture], out: Path) -> list[SkyPart]:
     """Write OUT/sky.json and return its captures; without any, remove that of an earlier run. Raises OutputError."""
     parts = []
     for one in sky:
-        bands = [{"band": b.name, "file": one.capture.file_of(b), "radiance": _radiance(b)} for b in one.capture.bands]
+        bands = [
+            {"band": b.name, "file": source_file(one.capture, b), "radiance": _radiance(b)} for b in one.capture.bands
+        ]
         parts.append(SkyPart.model_validate(_identity(one.capture) | {"cues": one.cues, "bands": bands}))
     write_model(out / SKY_FILE, SkyFile(captures=parts) if parts else None)
     return parts
@@ -182,7 +184,7 @@ def _panel_band(reading: BandReading, capture: Capture) -> dict[str, Any]:
     band, factor = reading.band, reading.factor
     return {
         "band": band.name,
-        "file": capture.file_of(band),
+        "file": source_file(capture, band),
         "area_px": [] if band.panel is None else [(round(x, 2), round(y, 2)) for x, y in band.panel.corners_px],
         "albedo": reading.albedo,
         "radiance": reading.radiance,

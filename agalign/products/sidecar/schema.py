@@ -25,7 +25,7 @@ from agalign.errors import UnreadableFileError
 from agalign.flight.fingerprint import estimation_fingerprint, input_samples
 from agalign.products.sidecar.sampled import sampled_mapping, sampled_parallax
 from agalign.values.alignment import Alignment, JointResult, Prediction, Residual, Seed, Similarity
-from agalign.values.capture import Band, CameraIdentity, Capture, CaptureTime, Pose, Position
+from agalign.values.capture import Band, CameraIdentity, Capture, CaptureTime, Pose, Position, source_file
 from agalign.values.choices import CaptureStatus, Geometry, PairStatus, Space
 from agalign.values.fields import (
     RECORD,
@@ -316,7 +316,7 @@ class BandResult(_Part):
 def _source(capture: Capture, band: Band) -> dict[str, Any]:
     """The file of a band."""
     facts = {"band": band.name, "wavelength_nm": band.wavelength_nm, "size_px": band.size_px}
-    return facts | {"file": capture.file_of(band), "band_index": band.band_index}
+    return facts | {"file": source_file(capture, band), "band_index": band.band_index}
 
 
 def _exposed_after_s(band: Band, reference: Band) -> float | None:
@@ -521,7 +521,7 @@ class Sidecar(_Part):
             unreadable_bands=dict(capture.unreadable_bands),
             reference=ReferencePart(
                 band=reference.name,
-                file=capture.file_of(reference),
+                file=source_file(capture, reference),
                 band_index=reference.band_index,
                 width=width,
                 height=height,
