@@ -36,7 +36,7 @@ from agalign.products.report.preview import preview_bytes
 from agalign.products.run.excluded import write_panels, write_sky
 from agalign.products.run.record import RunPart, begun, excluded_part, input_name, last_record, refuse_foreign_pages
 from agalign.products.sidecar.file import read_without_tables
-from agalign.products.sidecar.schema import FilePart
+from agalign.products.sidecar.schema import FilePart, Sidecar
 from agalign.values.capture import Capture
 from agalign.values.files import check_inside, written_below
 from agalign.values.image import OutputGrid
@@ -242,12 +242,15 @@ class _FlightRun:
         complete.
         """
         left: dict[str, Remaining] = {}
+        modelled = set[str]()  # those whose earlier result used the network of the flight
         grids: dict[str, OutputGrid] = {}  # of the earlier results, which of a season would not fit into memory
         for capture in captures:
             one = self.remaining(capture)
             left[capture.label] = replace(one, earlier=None)
             if (grid := self._earlier_grid(one)) is not None:
                 grids[capture.label] = grid
+            if one.earlier is not None and _used_network_of_flight(one.earlier):
+                modelled.add(capture.label)
         groups = flights_of(captures)
         on_cpu = choose_device(self.settings.joint.device).type == "cpu"
         cores = self.options.jobs or (usable_cores() if on_cpu else 1)
@@ -260,8 +263,11 @@ class _FlightRun:
             learn = partial(learn_flight, apply=partial(in_order, run), threads=min(_MAX_THREADS, cores))
             for group, name in zip(groups, model_names(groups), strict=True):
                 path = self.out / "models" / name
-                model = path if path.is_file() else None
-                if any(left[c.label].step == "estimate" for c in group):
+                model = path if _is_model(path) else None
+                steps = {left[c.label].step for c in group}
+                # Without the model, which may be damaged or deleted, captures that are rendered get another crop.
+                is_lost = model is None and any(c.label in modelled for c in group)
+                if "estimate" in steps or ("render" in steps and is_lost):
                     model = self._model(group, path, learn, record)
                 flights.append((group, model))
             crops = _crops_of_cameras(flights, grids, self.settings.write)
@@ -319,6 +325,18 @@ class _FlightRun:
         with written_below(self.out):
             save_model(model, path)
         return path
+
+
+def _used_network_of_flight(sidecar: Sidecar) -> bool:
+    return any(band.joint is not None and band.joint.recipe == "flight" for band in sidecar.bands)
+
+
+def _is_model(path: Path) -> bool:
+    """True for a model file that can be read."""
+    with suppress(InputError):
+        read_rig(path)
+        return True
+    return False
 
 
 def _crop_key(capture: Capture) -> tuple[str, bool]:

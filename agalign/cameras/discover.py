@@ -35,7 +35,8 @@ from agalign.cameras.metadata import read_tags
 from agalign.cameras.read_files import ImageFile, Problem, natural_order, read_files
 from agalign.config import DiscoverOptions
 from agalign.errors import ConfigurationError, InputError, NoSuchBandError
-from agalign.pixels.raster import probe, suffix_format, transformed
+from agalign.pixels.coordinates import transformed
+from agalign.pixels.raster import probe, suffix_format
 from agalign.values import geometry
 from agalign.values.capture import Band, Capture
 from agalign.values.choices import MAX_MOSAIC_PIXELS

@@ -6,7 +6,7 @@ from contextlib import suppress
 from agalign.cameras import other_rig_seed, rig_seed
 from agalign.config import SeedSettings
 from agalign.errors import GeometryError
-from agalign.pixels.raster import transformed
+from agalign.pixels.coordinates import transformed
 from agalign.values import geometry
 from agalign.values.capture import Band
 from agalign.values.choices import SeedKind

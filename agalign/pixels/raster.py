@@ -14,14 +14,15 @@ import cv2
 import numpy as np
 import rasterio
 from numpy.typing import NDArray
-from rasterio import crs, warp
+from rasterio import crs
 from rasterio.enums import ColorInterp, MaskFlags, Resampling
 from rasterio.errors import NotGeoreferencedWarning
 from rasterio.transform import Affine
 from rasterio.vrt import WarpedVRT
 from rasterio.windows import Window
 
-from agalign.errors import GeometryError, UnreadableFileError
+from agalign.errors import UnreadableFileError
+from agalign.pixels.coordinates import ensure_proj_data
 from agalign.pixels.masks import data_mask, learnable, undeclared_fill
 from agalign.values import lens
 from agalign.values.capture import Band, Capture, Georeference
@@ -83,8 +84,10 @@ OpenRaster = rasterio.DatasetReader
 def open_raster(path: Path, page: int = 0) -> Iterator[rasterio.DatasetReader]:
     """Open a TIFF, JPEG or PNG, or a page of a TIFF (from 1), for reading; south-up maps are flipped to north-up.
 
-    Raises UnreadableFileError for other files and those that GDAL cannot read.
+    Raises UnreadableFileError for other files and those that GDAL cannot read, and ConfigurationError without the data
+    of PROJ.
     """
+    ensure_proj_data()
     driver, name = _driver_of(path), f"GTIFF_DIR:{page}:{path}" if page else path
     try:
         with without_warnings(), rasterio.Env(**GDAL_ENVIRONMENT), rasterio.open(name, driver=driver) as dataset:
@@ -319,24 +322,6 @@ def with_nan(pixels: NDArray[np.generic], nodata: float | None) -> NDArray[np.fl
 def gdal_version() -> str:
     """Return the version of rasterio's GDAL."""
     return str(rasterio.__gdal_version__)
-
-
-def crs_wkt(code: str) -> str:
-    """Return the WKT of a coordinate reference system such as EPSG:32613."""
-    return str(rasterio.CRS.from_user_input(code).to_wkt())
-
-
-def transformed(points: NDArray[np.float64], from_crs: str, to_crs: str) -> NDArray[np.float64]:
-    """Transform map coordinates (n, 2), x or longitude first, to another CRS (WKT or EPSG:number).
-
-    Raises GeometryError if GDAL cannot transform them.
-    """
-    try:
-        source, target = (rasterio.CRS.from_user_input(system) for system in (from_crs, to_crs))
-        x, y = warp.transform(source, target, points[:, 0], points[:, 1])
-    except Exception as error:  # GDAL's errors have no public class
-        raise GeometryError(f"coordinates cannot be transformed ({error})") from None
-    return np.stack([x, y], axis=-1)
 
 
 def _dataset_mask(dataset: rasterio.DatasetReader, index: int, **reading: Any) -> Mask | np.bool_:

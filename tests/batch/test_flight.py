@@ -148,6 +148,19 @@ def test_a_second_run_reuses_the_model_and_retries_failed_captures(flight: Path,
     assert path.stat().st_mtime_ns == before
 
 
+@pytest.mark.parametrize("is_damaged", [True, False], ids=["damaged", "deleted"])
+def test_a_lost_model_is_learned_again_for_captures_that_are_rendered(
+    is_damaged: bool, flight: Path, aligned_copy: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its rig determines the crop that the captures of a flight share."""
+    monkeypatch.setattr(batch_learn, "learn", partial(learn, schedule=Schedule(max_steps=1)))
+    (path,) = (aligned_copy / "models").iterdir()
+    path.write_text("damaged") if is_damaged else path.unlink()
+    undistorted = agalign.Settings(write=agalign.WriteSettings(undistort=True))
+    assert states(run(flight, aligned_copy, undistorted)) == ["done", "done"]
+    assert load_model(path, cpu).camera is not None
+
+
 def test_captures_of_one_camera_and_flight_are_a_group_with_a_model_name_of_its_own(flight: Path) -> None:
     one, two = agalign.discover(flight).captures
 

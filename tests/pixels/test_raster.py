@@ -7,8 +7,7 @@ import pytest
 import rasterio
 from rasterio._env import get_gdal_config
 
-from agalign.errors import GeometryError
-from agalign.pixels.raster import open_raster, probe, read_for_alignment, transformed
+from agalign.pixels.raster import open_raster, probe, read_for_alignment
 from agalign.values.capture import Band
 
 from ..conftest import textured_image, write_band
@@ -40,13 +39,6 @@ def test_images_of_each_type_are_reduced(tmp_path: Path, dtype: str) -> None:
     half = read_for_alignment(band, 32)
     assert half.valid.all()
     np.testing.assert_allclose(half.pixels, 75, atol=1)
-
-
-def test_coordinates_between_reference_systems() -> None:
-    result = transformed(np.array([[0.0, 1000.0]]), "+proj=aeqd +lat_0=52 +lon_0=5 +datum=WGS84", "EPSG:4326")
-    np.testing.assert_allclose(result, [[5.0, 52.00899]], atol=1e-4)
-    with pytest.raises(GeometryError, match="cannot be transformed"):
-        transformed(np.zeros((1, 2)), "EPSG:0", "EPSG:4326")
 
 
 def test_metadata_of_a_file_is_read(tmp_path: Path) -> None:

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from agalign.errors import ConfigurationError, InputError, UnreadableFileError
+from agalign.pixels.coordinates import ensure_proj_data
 from agalign.pixels.raster import without_warnings
 from agalign.products.rasters.alignment_maps import RELIEF_UNITS
 from agalign.products.run.captures import RunCapture, captures_of_run, exceptions, like_most
@@ -185,6 +186,7 @@ def _opened(path: Path, *, masked: bool) -> Any:
     """The array of a file."""
     import rioxarray
 
+    ensure_proj_data()
     try:
         with without_warnings():
             # Some of GDAL's other drivers open files or addresses that the contents of a file name.

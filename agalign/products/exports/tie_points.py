@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from agalign.config import WriteSettings
 from agalign.errors import GeometryError
-from agalign.pixels.raster import transformed
+from agalign.pixels.coordinates import transformed
 from agalign.products.product import CapturePaths, Product, ProductContext, WrittenFile
 from agalign.values import geometry
 from agalign.values.alignment import Alignment, Residual

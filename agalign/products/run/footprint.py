@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from agalign.errors import GeometryError
 from agalign.flight.groups import flights_of
-from agalign.pixels.raster import crs_wkt, transformed
+from agalign.pixels.coordinates import crs_wkt, transformed
 from agalign.values import geometry
 from agalign.values.capture import Capture, Georeference, HeightSource, Position
 from agalign.values.geometry import Points
