@@ -4,9 +4,9 @@ import logging
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from numbers import Real
 from operator import index
 from pathlib import Path
+from reprlib import repr as shortened_repr
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray  # the former in quotes: help() prints its name, not 1,000 characters
@@ -31,18 +31,21 @@ from agalign.products.indices.formulas import chosen_indices
 from agalign.products.indices.rasters import IndexReport
 from agalign.values import geometry
 from agalign.values.alignment import Alignment, Seed
+from agalign.values.arguments import checked
 from agalign.values.capture import Capture
 from agalign.values.choices import MAX_PIXELS, ExportProgram, Interpolation, SeedKind
 from agalign.values.image import Mask
 from agalign.values.mapping import PixelMapping
-from agalign.values.output_folder import locked
+from agalign.values.output_folder import locked, prepare_output
 from agalign.values.processes import end_if_reimported
+from agalign.values.resampling import array_of
 
 Progress = Callable[[CaptureReport, int, int], object]
 """Called with the report of a capture, how many captures are finished, and how many there are."""
 _LOG = logging.getLogger(__name__)
 
 
+@checked
 def align(
     fixed: "ArrayLike",
     moving: "ArrayLike",
@@ -61,8 +64,9 @@ def align(
     Parameters
     ----------
     fixed
-        Reference image, (H, W), (H, W, C) or (C, H, W), of any numeric type. NaN and constant areas at the border are
-        ignored, and so is the largest value of 8 and 16 bit integers, which counts as saturated.
+        Reference image, (H, W), (H, W, C) or (C, H, W), of any numeric type, also a PyTorch tensor. NaN, masked pixels
+        (`numpy.ma`) and constant areas at the border are ignored, and so is the largest value of 8 and 16 bit integers,
+        which counts as saturated.
     moving
         The other image, likewise. Its size may differ from that of `fixed`.
     seed
@@ -108,19 +112,20 @@ def align(
     settings = settings or Settings()
     if seed_std_px is not None and seed is None:
         raise InputError("seed_std_px is the standard error of a seed; give the seed too")
-    if seed_std_px is not None and not (isinstance(seed_std_px, Real) and 0 < seed_std_px < math.inf):
+    if seed_std_px is not None and not 0 < seed_std_px < math.inf:
         raise InputError(f"seed_std_px is {seed_std_px!r}, not a positive number of pixels")
     fixed_raster = raster_of(fixed, fixed_valid, "fixed")
     moving_raster = raster_of(moving, moving_valid, "moving")
     matrices: SeedMatrices = {"identity": geometry.overlay(fixed_raster.size_px, moving_raster.size_px)}
     if seed is not None:
-        matrices = {"user": geometry.normalised(seed)}
+        matrices = {"user": geometry.normalised(array_of(seed, "seed"))}
     seed_std: dict[SeedKind, float] = {} if seed_std_px is None else {"user": float(seed_std_px)}
     pair = BandPair("moving", Reference(fixed_raster), moving_raster, matrices, seed_std_px=seed_std)
     result = with_lens_shapes([pair], align_pairs([pair], settings, quiet))
     return replace(with_metrics(result["moving"], pair), moving_size_px=moving_raster.size_px)
 
 
+@checked
 def warp_onto(
     moving: "ArrayLike",
     fixed_to_moving: "ArrayLike",
@@ -171,7 +176,7 @@ def warp_onto(
     """
     if isinstance(fixed_to_moving, Alignment):
         raise InputError("an alignment is more than a homography; use its method warp(moving)")
-    mapping = PixelMapping(geometry.normalised(fixed_to_moving))
+    mapping = PixelMapping(geometry.normalised(array_of(fixed_to_moving, "fixed_to_moving")))
     by_homography = Alignment(mapping, _size_px(fixed_size_px), (), Seed("user", mapping.fixed_to_moving, 0.0))
     return by_homography.warp(moving, valid=valid, interpolation=interpolation)
 
@@ -183,12 +188,12 @@ def _size_px(size_px: object) -> tuple[int, int]:
     except (TypeError, ValueError):
         width, height = 0, 0
     if not (width > 0 and height > 0 and width * height <= MAX_PIXELS):
-        raise InputError(
-            f"fixed_size_px is {size_px!r}, not a width and a height of at most {MAX_PIXELS:,} px together"
-        )
+        limit = f"at most {MAX_PIXELS:,} px together"
+        raise InputError(f"fixed_size_px is {shortened_repr(size_px)}, not a width and a height of {limit}")
     return width, height
 
 
+@checked
 def align_capture(capture: Capture, out: str | Path, *, settings: Settings | None = None) -> CaptureReport:
     """Align one capture, without the network and rig of its flight, and write its rasters and sidecar.
 
@@ -227,10 +232,12 @@ def align_capture(capture: Capture, out: str | Path, *, settings: Settings | Non
     [('Green', 'reference'), ('NIR', 'aligned')]
     """
     settings = settings or Settings()
+    prepare_output(Path(out))
     refuse_other_captures([capture], Path(out))
     return process_capture(Task(with_radiometry(capture, settings.write.radiometry, {}), Path(out), settings))
 
 
+@checked
 def align_folder(
     folder: str | Path,
     out: str | Path,
@@ -296,6 +303,7 @@ def align_folder(
     return _run(flight, Path(out), settings or Settings(), run or RunOptions(), progress, start)
 
 
+@checked
 def onto(
     reference: str | Path,
     moving: Sequence[str | Path],
@@ -377,6 +385,7 @@ def _run(
     return reports
 
 
+@checked
 def indices(
     out: str | Path,
     names: Sequence[str] = ("ndvi",),
@@ -436,6 +445,7 @@ def indices(
         return [report for done in run_indices(tasks, options.jobs, options.executor) for report in done]
 
 
+@checked
 def export(out: str | Path, target: str | Path, program: ExportProgram, *, copy: bool = False) -> ExportReport:
     """Export the captures with status `ok` of a run to a new folder for a photogrammetry program.
 

@@ -145,7 +145,7 @@ class RunOptions:
 
     overwrite: bool = False
     """Process finished captures again."""
-    jobs: Annotated[int, Field(ge=0, le=4096), Option(short="-j", default=0)] = 1
+    jobs: Annotated[int, Field(ge=0, le=choices.MAX_JOBS), Option(short="-j", default=0)] = 1
     """Captures processed at the same time; 0 is one per core."""
     align_panels: bool = False
     """Also align captures of calibration panels and of the sky; panels then give no reflectance."""

@@ -24,6 +24,8 @@ from typing import Any, Protocol, TypeAlias
 from agalign._version import __version__
 from agalign.errors import AgalignError, ConfigurationError, WorkerError
 from agalign.pixels.raster import without_warnings
+from agalign.values.arguments import checked
+from agalign.values.choices import MAX_JOBS
 from agalign.values.process_pool import A, ProcessPool, R, WorkerDiedError
 from agalign.values.processes import (
     WORKER_MODULE,
@@ -177,6 +179,7 @@ def failure_text(error: Exception, timeout_s: float | None = None) -> str:
     return f"agalign failed on it ({type(error).__name__}: {first_line}); please report this"
 
 
+@checked
 @contextmanager
 def dask_executor(address: str, jobs: int = 0) -> Iterator[Executor]:
     """Connect to a Dask cluster and return its executor, for `RunOptions(executor=...)`; use it in a `with` block.
@@ -200,7 +203,8 @@ def dask_executor(address: str, jobs: int = 0) -> Iterator[Executor]:
     Raises
     ------
     ConfigurationError
-        Dask is not installed, the scheduler does not answer, or a worker has a different version of agalign.
+        `jobs` is out of range, Dask is not installed, the scheduler does not answer, or a worker has a different
+        version of agalign.
 
     Examples
     --------
@@ -209,6 +213,8 @@ def dask_executor(address: str, jobs: int = 0) -> Iterator[Executor]:
     >>> len(reports)
     2
     """
+    if not 0 <= jobs <= MAX_JOBS:
+        raise ConfigurationError(f"jobs is {jobs}; give 1 to {MAX_JOBS}, or 0 for one per core")
     try:
         import dask
         from distributed import Client, LocalCluster, fire_and_forget
@@ -230,14 +236,17 @@ def dask_executor(address: str, jobs: int = 0) -> Iterator[Executor]:
                         threads_per_worker=1,
                         processes=True,
                         dashboard_address=None,
+                        # Its HTTP server runs without dashboard too: any free port, of this machine alone.
+                        scheduler_kwargs={"dashboard_address": "127.0.0.1:0"},
                         silence_logs=logging.CRITICAL,
                     )
                 address = stack.enter_context(cluster).scheduler_address
             client = Client(address, set_as_default=False, timeout=_DASK_TIMEOUT_S)
         except RuntimeError as error:
             raise ConfigurationError(f"no Dask cluster can be started here ({error})") from None
-        except (OSError, ValueError) as error:
-            raise ConfigurationError(f"no Dask scheduler answers at {address} ({error})") from None
+        except Exception as error:  # Dask's, of many classes
+            reason = str(error) or type(error).__name__
+            raise ConfigurationError(f"no Dask scheduler answers at {address} ({reason})") from None
         _check_versions(stack.enter_context(client))
         # Workers import their libraries while this process learns the flight.
         for worker in client.ncores():

@@ -38,6 +38,7 @@ from agalign.errors import ConfigurationError, InputError, NoSuchBandError
 from agalign.pixels.coordinates import transformed
 from agalign.pixels.raster import probe, suffix_format
 from agalign.values import geometry
+from agalign.values.arguments import checked
 from agalign.values.capture import Band, Capture
 from agalign.values.choices import MAX_MOSAIC_PIXELS
 from agalign.values.files import RUN_FILE
@@ -80,6 +81,7 @@ class FolderScan:
         )
 
 
+@checked
 def discover(folder: str | Path, options: DiscoverOptions | None = None) -> FolderScan:
     """Find the captures below a folder: the bands, the camera, and the metadata from the tags of the files.
 

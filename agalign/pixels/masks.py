@@ -6,7 +6,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from agalign.errors import InputError
 from agalign.values.image import Mask, Raster
-from agalign.values.resampling import planes_of, rectangular
+from agalign.values.resampling import planes_of, valid_of
 
 _MIN_SIDE_PX = 48
 """Smaller images contain too few patches for learning."""
@@ -76,13 +76,11 @@ def raster_of(image: ArrayLike, valid: ArrayLike | None, name: str) -> Raster:
     """
     planes, _ = planes_of(image, name)
     if min(planes.shape[1:]) < _MIN_SIDE_PX:
-        raise InputError(f"{name} is {np.shape(image)}: images need {_MIN_SIDE_PX} px a side")
+        raise InputError(f"{name} is {planes.shape[1:]}: images need {_MIN_SIDE_PX} px a side")
     # Sensors deliver 8 or 16 bits: the maximum of a wider type is not saturation.
     is_sensor_type = planes.dtype.kind in "ui" and planes.dtype.itemsize <= 2
     saturation = float(np.iinfo(str(planes.dtype)).max) if is_sensor_type else None
-    mask = np.ones(planes.shape[1:], bool) if valid is None else rectangular(valid, f"{name}_valid").astype(bool)
-    if mask.shape != planes.shape[1:]:
-        raise InputError(f"{name}_valid is {mask.shape}, the image {planes.shape[1:]}")
+    mask = valid_of(image, valid, (planes.shape[1], planes.shape[2]), name)
     if len(planes) in (2, 4) and saturation is not None and np.isin(planes[-1], (0, saturation)).all():
         mask, planes = mask & (planes[-1] > 0), planes[:-1]
     for plane in planes:

@@ -13,14 +13,16 @@ from pydantic import dataclasses as validated
 
 from agalign.errors import InputError
 from agalign.values import geometry
+from agalign.values.arguments import checked
 from agalign.values.choices import Geometry, Interpolation, ModelFamily, PairStatus, PredictionSource, SeedKind, Space
+from agalign.values.equality import equal
 from agalign.values.fields import RECORD, Array, Matrix3x3, Measured, Number, Number4, Number6, UpToInfinity
 from agalign.values.geometry import Matrix, Points
 from agalign.values.image import Mask
 from agalign.values.issues import SEED_DOES_NOT_FIT, Issue, sentence
 from agalign.values.mapping import PixelMapping
 from agalign.values.pixel_units import SAME_PIXELS, PixelScale, Size
-from agalign.values.resampling import can_hold, planes_of, rectangular, resample_planes
+from agalign.values.resampling import can_hold, planes_of, positions_of, resample_planes, valid_of
 
 COVARIANCE_DECIMALS = 9
 """Of covariances in a sidecar, px squared: a millionth of those of accurate mappings."""
@@ -56,6 +58,8 @@ class Seed:
            [0., 0., 1.]])
     """
 
+    __eq__ = equal
+
     kind: SeedKind
     """`user`; `match` (learned descriptors matched); `model` (median mapping of the flight); `rig` (camera tags);
     `centre` (optical centres of DJI); `geo` (geotransforms); `structure` (phase correlation); `identity`."""
@@ -87,6 +91,8 @@ class JointResult:
     >>> len(joint.corner_std_xy_px), joint.corner_std_px < 0.2
     (4, True)
     """
+
+    __eq__ = equal
 
     fixed_to_moving: Matrix3x3
     """Between the same px as the seed. A prediction may have replaced it."""
@@ -169,6 +175,8 @@ class Residual:
     ((24, 2), (24,), 24)
     >>> x_px, y_px = residual.measured_px[residual.lengths_px.argmax()]  # window with the largest shift
     """
+
+    __eq__ = equal
 
     centres_px: Annotated[NDArray[np.float64], Array((None, 2), 2)]
     """(n, 2) centres of the windows, px of the reference."""
@@ -310,6 +318,8 @@ class Prediction:
     True
     """
 
+    __eq__ = equal
+
     fixed_to_moving: Matrix3x3
     """Homography (3, 3) from the reference's file to the band's file: between undistorted px if both lenses are known,
     else between raw px."""
@@ -337,6 +347,8 @@ class Similarity:
     >>> round(result.after.ncc, 2), round(result.after.gradient_correlation, 2)  # reversed contrast, equal edges
     (-1.0, 1.0)
     """
+
+    __eq__ = equal
 
     mattes_mi: Number6 = math.nan
     """Negative Mattes mutual information, nats, 32 bins: lower is better."""
@@ -379,6 +391,8 @@ class Alignment:
     >>> unknown.status, unknown.reason
     ('failed', 'the reference band is constant or all invalid')
     """
+
+    __eq__ = equal
 
     mapping: PixelMapping
     """The complete mapping from raw pixels of the reference to raw pixels of the moving image."""
@@ -445,6 +459,11 @@ class Alignment:
         array
             (..., 2), float64: x and y, raw px of the moving image.
 
+        Raises
+        ------
+        InputError
+            `reference_px` is not an array (..., 2) of numbers.
+
         Examples
         --------
         `result` is that of the example of `align`.
@@ -453,7 +472,7 @@ class Alignment:
         array([[  8.,   8.],
                [108.,  68.]])
         """
-        return self.mapping(reference_px)
+        return self.mapping(positions_of(reference_px, "reference_px"))
 
     def inverse(self, moving_px: "ArrayLike") -> Points:
         """Map positions in the moving image to positions in the reference.
@@ -469,6 +488,11 @@ class Alignment:
             (..., 2), float64: x and y, raw px of the reference, to 0.001 px; NaN where the iteration diverges. Where
             parallax occludes a part of the scene, it is one of several solutions.
 
+        Raises
+        ------
+        InputError
+            `moving_px` is not an array (..., 2) of numbers.
+
         Examples
         --------
         `result` is that of the example of `align`.
@@ -476,8 +500,9 @@ class Alignment:
         >>> result.inverse(result.map([100, 60])).round(2)
         array([100.,  60.])
         """
-        return self.mapping.inverse(moving_px)
+        return self.mapping.inverse(positions_of(moving_px, "moving_px"))
 
+    @checked
     def warp(
         self,
         moving: "ArrayLike",
@@ -493,7 +518,7 @@ class Alignment:
         moving
             Image, (H, W), (H, W, C) or (C, H, W), of any numeric type and the size of the aligned moving image.
         valid
-            (H, W), False for pixels that must not be used. NaN and `nodata` are never used.
+            (H, W), False for pixels that must not be used. NaN, `nodata` and masked pixels are never used.
         nodata
             Value of unknown pixels in the input and the output. By default NaN or, for integers, 0 in the output.
         interpolation
@@ -526,9 +551,7 @@ class Alignment:
         if self.moving_size_px not in (None, planes.shape[:0:-1]):
             given, aligned = (f"{width} x {height} px" for width, height in (planes.shape[:0:-1], self.moving_size_px))
             raise InputError(f"moving has {given}, the aligned image {aligned}; give an image of that size")
-        mask = np.ones(planes.shape[1:], bool) if valid is None else rectangular(valid, "valid").astype(bool)
-        if mask.shape != planes.shape[1:]:
-            raise InputError(f"valid is {mask.shape}, the image {planes.shape[1:]}")
+        mask = valid_of(moving, valid, (planes.shape[1], planes.shape[2]))
         for plane in planes:
             mask = mask & (np.isfinite(plane) if plane.dtype.kind == "f" else True) & (plane != nodata)
         fill = nodata if nodata is not None else math.nan if planes.dtype.kind == "f" else 0

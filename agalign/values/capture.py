@@ -10,6 +10,7 @@ from typing import Literal, NamedTuple
 
 from pydantic import dataclasses as validated
 
+from agalign.values.equality import equal
 from agalign.values.fields import RECORD, Name, Number
 from agalign.values.geometry import Matrix
 from agalign.values.lens import Lens
@@ -310,6 +311,8 @@ class Capture:
     >>> capture.panel is None, capture.is_of_a_panel
     (True, False)
     """
+
+    __eq__ = equal
 
     name: str
     """Common part of the names of its files, such as IMG_0001."""

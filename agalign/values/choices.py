@@ -3,6 +3,8 @@
 from enum import IntFlag
 from typing import Literal
 
+MAX_JOBS = 4096
+"""Maximum number of processes."""
 MAX_RNG_SEED = 2**63 - 1
 MAX_PIXELS = 250_000_000
 """Default limit for one image: more than any camera has."""

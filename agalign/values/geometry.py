@@ -5,6 +5,8 @@ Every matrix is a 3x3 float64 array that maps homogeneous column vectors (x, y, 
 maps a pixel of the fixed (reference) image to a pixel of the moving image.
 """
 
+from reprlib import repr as shortened_repr
+
 import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -37,10 +39,11 @@ def normalised(matrix: ArrayLike) -> Matrix:
     """
     try:
         h = np.asarray(matrix, dtype=np.float64)
-    except (TypeError, ValueError):
-        raise GeometryError(f"a homography is a finite 3x3 matrix, not {matrix!r:.80}") from None
+    except (TypeError, ValueError, OverflowError):
+        raise GeometryError(f"a homography is a finite 3x3 matrix, not {shortened_repr(matrix)}") from None
     if h.shape != (3, 3) or not np.isfinite(h).all():
-        raise GeometryError(f"a homography is a finite 3x3 matrix, not one of shape {h.shape}: {h.tolist()}")
+        text = shortened_repr(h.tolist())
+        raise GeometryError(f"a homography is a finite 3x3 matrix, not one of shape {h.shape}: {text}")
     if _is_singular(h) or abs(h[2, 2]) < 1e-12 * np.abs(h[2]).max():
         raise GeometryError(f"the homography is singular: {h.tolist()}")
     return np.asarray(h / h[2, 2])

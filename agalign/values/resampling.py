@@ -1,7 +1,7 @@
 """Resampling of arrays at fractional positions by an interpolation kernel, tile by tile."""
 
 from collections.abc import Iterator
-from typing import get_args
+from typing import Any
 
 import cv2
 import numpy as np
@@ -41,7 +41,7 @@ def planes_of(image: ArrayLike, name: str) -> tuple[NDArray[np.generic], bool]:
 
     Raises InputError, with `name`, for any other array.
     """
-    array = rectangular(image, name)
+    array = array_of(image, name)
     if array.dtype.kind not in "uifb" or array.ndim not in (2, 3):
         raise InputError(
             f"{name} must be a numeric (H, W), (H, W, C) or (C, H, W) array, not {array.dtype} {array.shape}"
@@ -53,12 +53,48 @@ def planes_of(image: ArrayLike, name: str) -> tuple[NDArray[np.generic], bool]:
     return planes, channels_last
 
 
-def rectangular(values: ArrayLike, name: str) -> NDArray[np.generic]:
-    """Return an array. Raises InputError, with `name`, for nested lists of different lengths."""
+def array_of(values: ArrayLike, name: str) -> NDArray[np.generic]:
+    """Return an array, also of a tensor of PyTorch. Raises InputError, with `name`, for what is not an array."""
+    given: Any = values
     try:
-        return np.asarray(values)
+        if hasattr(given, "detach") and hasattr(given, "cpu"):  # a tensor: with a gradient, on a GPU
+            given = given.detach().cpu()
+        try:
+            return np.asarray(given)
+        except TypeError:  # numpy lacks types of tensors, such as bfloat16
+            return np.asarray(given.float() if hasattr(given, "float") else given)
     except ValueError:
         raise InputError(f"{name} is not an array: its rows have different lengths") from None
+    except Exception as error:  # libraries of arrays raise errors of many classes
+        raise InputError(f"{name} cannot be converted to an array ({str(error).partition(chr(10))[0]})") from None
+
+
+def positions_of(values: ArrayLike, name: str) -> NDArray[np.float64]:
+    """Return positions (..., 2), px. Raises InputError, with `name`, for anything else."""
+    array = array_of(values, name)
+    if array.dtype.kind not in "uifb" or array.shape[-1:] != (2,):
+        raise InputError(f"{name} must be positions x, y (..., 2), not {array.dtype} {array.shape}")
+    return array.astype(np.float64)
+
+
+def valid_of(image: ArrayLike, valid: ArrayLike | None, size: tuple[int, int], name: str = "") -> Mask:
+    """Return the mask (height, width) `size` of an image: True where `valid` is, and a masked array is not masked.
+
+    Raises InputError, with the `name` of the image, for a mask that has another size.
+    """
+    mask_name = f"{name}_valid" if name else "valid"
+    mask = np.ones(size, bool)
+    if valid is not None:
+        given = array_of(np.ma.filled(valid, False) if isinstance(valid, np.ma.MaskedArray) else valid, mask_name)
+        if given.dtype.kind not in "uifb":
+            raise InputError(f"{mask_name} must be a mask (H, W), not {given.dtype} {given.shape}")
+        mask = given.astype(bool)
+    if mask.shape != size:
+        raise InputError(f"{mask_name} is {mask.shape}, the image {size}")
+    if isinstance(image, np.ma.MaskedArray):
+        hidden, _ = planes_of(np.ma.getmaskarray(image), name)
+        mask &= ~hidden.any(axis=0)
+    return mask
 
 
 def resample_planes(
@@ -72,10 +108,7 @@ def resample_planes(
     """Resample planes (C, h, w) with the mask `valid` (h, w) to a reference of `size_px` (width, height).
 
     Returns (C, height, width) of the same type, with `fill` where a pixel is not valid, and the mask (height, width).
-    Raises InputError for an unknown interpolation.
     """
-    if interpolation not in get_args(Interpolation):
-        raise InputError(f"unknown interpolation {interpolation!r}; choose from {', '.join(get_args(Interpolation))}")
     max_source_px = 32_000  # OpenCV limits the sides of one image to 32,767 px
     width, height = size_px
     result = np.empty((len(planes), height, width), planes.dtype)

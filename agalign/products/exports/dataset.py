@@ -15,12 +15,14 @@ from agalign.products.rasters.alignment_maps import RELIEF_UNITS
 from agalign.products.run.captures import RunCapture, captures_of_run, exceptions, like_most
 from agalign.products.sidecar.file import read_sidecar
 from agalign.products.sidecar.schema import BandResult
+from agalign.values.arguments import checked
 from agalign.values.capture import CaptureTime
 
 if TYPE_CHECKING:
     import xarray
 
 
+@checked
 def open_capture(path: str | Path, *, masked: bool = True) -> "xarray.Dataset":
     """Open the aligned bands of a capture as an xarray Dataset, read lazily with dask.
 
@@ -68,6 +70,7 @@ def open_capture(path: str | Path, *, masked: bool = True) -> "xarray.Dataset":
     return _dataset(given.with_name(f"{name}.json"), masked=masked)
 
 
+@checked
 def open_flight(out: str | Path, *, masked: bool = True) -> "xarray.Dataset":
     """Open all captures of a run as one xarray Dataset, read lazily with dask.
 
@@ -139,7 +142,7 @@ def _captures_with_output(folder: Path) -> list[RunCapture]:
         raise InputError(f"{folder}: its captures differ in size ({'; '.join(map(': '.join, sizes[:3]))}); {remedy}")
     alike, differing = like_most([c for c, _ in crops])
     if lines := [f"{label}: left out: {reason}" for label, reason in [*left_out, *differing]]:
-        warnings.warn("\n".join(lines), stacklevel=3)
+        warnings.warn("\n".join(lines), stacklevel=4)
     if not alike:
         raise InputError(f"{folder}: no aligned captures there; give the output folder of a run")
     return alike

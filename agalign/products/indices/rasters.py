@@ -39,6 +39,7 @@ from agalign.products.run.cautions import RunFacts
 from agalign.products.run.record import renamed_captures
 from agalign.products.sidecar.schema import Sidecar
 from agalign.values.capture import Band, Capture
+from agalign.values.equality import equal
 from agalign.values.files import read_regular, write_csv
 from agalign.values.image import Tile, reduced_size_px
 from agalign.values.memory import WORK_TILE_PX
@@ -101,6 +102,8 @@ class IndexReport:
     >>> report.raw_numbers, -1 < report.median < 1  # the run converted no bands to reflectance
     (True, True)
     """
+
+    __eq__ = equal
 
     capture: str
     """Label of the capture: its folder, relative to the output folder of the run, and its name."""

@@ -6,8 +6,10 @@ from agalign.errors import NoSuchBandError, SidecarError
 from agalign.products.rasters.parallax_file import read_relief
 from agalign.products.sidecar.file import read_sidecar
 from agalign.values.alignment import Alignment
+from agalign.values.arguments import checked
 
 
+@checked
 def read_alignment(sidecar: str | Path, band: str) -> Alignment:
     """Read the alignment of a band from the sidecar of its capture and, if there is one, the parallax map.
 

@@ -27,6 +27,7 @@ from agalign.products.sidecar.sampled import sampled_mapping, sampled_parallax
 from agalign.values.alignment import Alignment, JointResult, Prediction, Residual, Seed, Similarity
 from agalign.values.capture import Band, CameraIdentity, Capture, CaptureTime, Pose, Position, source_file
 from agalign.values.choices import CaptureStatus, Geometry, PairStatus, Space
+from agalign.values.equality import equal
 from agalign.values.fields import (
     RECORD,
     Array,
@@ -61,6 +62,7 @@ Curvatures = Annotated[NDArray[np.float64], Array((None, 2), 7)]
 
 class _Part(BaseModel):
     model_config = ConfigDict(frozen=True, allow_inf_nan=False, **RECORD)
+    __eq__ = equal
 
 
 class ReferencePart(_Part):
