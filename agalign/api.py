@@ -23,6 +23,8 @@ from agalign.capture.reference import Reference
 from agalign.capture.warped_pair import with_metrics
 from agalign.config import DiscoverOptions, RunOptions, Settings
 from agalign.errors import InputError
+from agalign.flight.panel_readings import with_panels
+from agalign.flight.sky import sky_captures
 from agalign.pixels.masks import raster_of
 from agalign.pixels.radiometry import with_radiometry
 from agalign.products.exports.programs import ExportReport
@@ -218,7 +220,8 @@ def align_capture(capture: Capture, out: str | Path, *, settings: Settings | Non
     UnreadableFileError
         The reference band cannot be read.
     InputError
-        The capture lacks the tags that a setting needs, such as those for radiance.
+        The capture lacks the tags that a setting needs, such as those for radiance, or shows a calibration panel or the
+        sky.
     ConfigurationError
         `out` contains the result of a different capture with the same name.
     OutputError
@@ -232,6 +235,11 @@ def align_capture(capture: Capture, out: str | Path, *, settings: Settings | Non
     [('Green', 'reference'), ('NIR', 'aligned')]
     """
     settings = settings or Settings()
+    (judged,) = with_panels([capture])
+    sky, _ = sky_captures([judged])
+    if sky or judged.is_of_a_panel:
+        what = "the sky" if sky else "a calibration panel"
+        raise InputError(f"{capture.label}: shows {what}; align another capture, or all with align_panels=True")
     prepare_output(Path(out))
     refuse_other_captures([capture], Path(out))
     return process_capture(Task(with_radiometry(capture, settings.write.radiometry, {}), Path(out), settings))
@@ -276,7 +284,8 @@ def align_folder(
     Returns
     -------
     FlightReports
-        A CaptureReport for each capture, in the order in which they finished.
+        A CaptureReport for each capture, in the order in which they finished. Those of calibration panels and of the
+        sky are in its attribute `excluded` instead.
 
     Raises
     ------
@@ -377,10 +386,13 @@ def _run(
 
     reports = FlightReports()
     for report in run_flight(flight, out, settings, run, Listener(on_again=_LOG.info), start):
-        reports.append(report)
-        _LOG.info("%d of %d: %s: %s", len(reports), len(flight.captures), report.label, report.summary)
+        if not reports.add(report):  # before the others
+            _LOG.info("%s: %s", report.label, report.summary)
+            continue
+        captures = len(flight.captures) - len(reports.excluded)
+        _LOG.info("%d of %d: %s: %s", len(reports), captures, report.label, report.summary)
         if progress is not None:
-            progress(report, len(reports), len(flight.captures))
+            progress(report, len(reports), captures)
     write_pages(out, _LOG.warning)
     return reports
 

@@ -14,10 +14,10 @@ def main() -> None:
     settings = agalign.Settings(write=agalign.WriteSettings(format="cog", interpolation="bilinear"))
     # Two captures at a time. RunOptions(executor=...) takes any concurrent.futures executor instead.
     for report in agalign.align_folder(sys.argv[1], sys.argv[2], settings=settings, run=agalign.RunOptions(jobs=2)):
-        if report.sidecar is None:
+        if report.result is None:
             print(f"{report.label}: {report.error}")
             continue
-        for band in report.sidecar.bands:
+        for band in report.result.bands:
             residual = f"{band.metrics.after.residual_px:.3f} px" if band.metrics else ""
             print(report.label, band.band, band.status, residual)
 

@@ -4,7 +4,7 @@ import logging
 import math
 import time
 from collections import Counter, defaultdict
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import lru_cache, partial
@@ -65,7 +65,7 @@ class CaptureReport:
     there is no result. `panel` and `sky`: captures of a calibration panel or of the sky are not aligned.
     """
     result: Sidecar | None = field(default=None, repr=False)
-    """Content of the sidecar, without the long tables; None without a result."""
+    """Content of the sidecar, without the long tables; None if `error` says why there is no result."""
     path: Path | None = None
     """Path of the sidecar."""
     error: str | None = None
@@ -124,7 +124,7 @@ class CaptureReport:
 
 
 class FlightReports(list[CaptureReport]):
-    """The reports of a run: a list, which a notebook shows as a table.
+    """The reports of the captures of a run: a list, which a notebook shows as a table.
 
     Examples
     --------
@@ -134,11 +134,29 @@ class FlightReports(list[CaptureReport]):
     ['done', 'done']
     >>> [report.label for report in reports if not report.is_complete]
     []
+    >>> [report.panel for report in reports.excluded]  # this flight has no calibration panel
+    []
     """
+
+    excluded: list[CaptureReport]
+    """The reports of the captures of calibration panels and of the sky, which are not aligned and not in the list."""
+
+    def __init__(self, reports: Iterable[CaptureReport] = ()) -> None:
+        super().__init__()
+        self.excluded = []
+        for report in reports:
+            self.add(report)
+
+    def add(self, report: CaptureReport) -> bool:
+        """Append a report to the list or to `excluded`; return True for the list."""
+        is_capture = report.state not in ("panel", "sky")
+        (self if is_capture else self.excluded).append(report)
+        return is_capture
 
     def _repr_html_(self) -> str:
         max_rows = 20
         counts = Counter(report.state for report in self)
+        counts.update(report.state for report in self.excluded)
         total = ", ".join(f"{number} {state}" for state, number in counts.items())
         head = "<tr><th>capture</th><th>state</th><th>bands</th></tr>"
         rows = "".join(

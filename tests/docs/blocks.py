@@ -8,7 +8,7 @@ import re
 import shlex
 import subprocess
 import sys
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -63,8 +63,10 @@ def program(command: str) -> str:
     return next(word for word in command.split() if not re.fullmatch(r"\w+=\S*", word))
 
 
-def run_command(command: str, where: str) -> None:
-    """Run agalign in this process, which has loaded everything, and other programs in a shell; it must succeed."""
+def run_command(command: str, where: str, codes: Sequence[int] = (0,)) -> None:
+    """Run agalign in this process, which has loaded everything, and other programs in a shell; it must succeed, or
+    return one of these exit codes.
+    """
     first, *arguments = shlex.split(command)
     if first == "agalign":
         found = [sorted(map(str, Path().glob(a))) if "*" in a else [a] for a in arguments]
@@ -73,4 +75,4 @@ def run_command(command: str, where: str) -> None:
         tools = os.pathsep.join((str(Path(sys.executable).parent), os.environ["PATH"]))
         variables = os.environ | {"PYTHONPATH": str(ROOT), "PATH": tools}
         done = subprocess.run(["bash", "-c", command], env=variables, capture_output=True, text=True, check=False)
-    assert done.returncode == 0, f"{where}: {command}\n{done.stdout[-1500:]}{done.stderr[-3000:]}"
+    assert done.returncode in codes, f"{where}: {command}\n{done.stdout[-1500:]}{done.stderr[-3000:]}"

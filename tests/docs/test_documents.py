@@ -8,6 +8,7 @@ import shutil
 import subprocess
 import sys
 import warnings
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -15,9 +16,11 @@ import cv2
 import numpy as np
 import pytest
 import rasterio
+import tifffile
 from rasterio.transform import Affine
 from shapely import Polygon
-from synthetic_flights.cameras import ALTUM
+from synthetic_flights.cameras import ALTUM, MAVIC_3M
+from synthetic_flights.troubles import make_flight_between_panels
 
 import agalign
 from agalign.cameras.metadata import read_tags
@@ -30,6 +33,7 @@ from ..builders import displaced_views, in_full_run
 from ..cli.test_onto import TRUTH as MOVEMENT
 from ..cli.test_onto import write_mosaic
 from ..conftest import REAL_DATA, Shared, textured_pair, write_band
+from ..program import agalign_here
 from .blocks import PAGES, ROOT, blocks_of, commands_of, each_page, program, run_command, text_of
 
 RUN_BY = {"docker": "tools/container.sh", "dask": "tools/dask_cluster.sh", "pip": ".ci/run"}
@@ -102,8 +106,8 @@ def run_python(text: str) -> dict[str, Any]:
     return names
 
 
-def run_page(page: Path) -> None:
-    """Run the blocks of a page from top to bottom, in the current folder."""
+def run_page(page: Path, codes: Sequence[int] = (0,)) -> None:
+    """Run the blocks of a page from top to bottom, in the current folder; commands return one of these exit codes."""
     for block in blocks_of(page):
         if named := re.match(r"# (\w+\.py)\n", block.text):
             Path(named[1]).write_text(block.text, encoding="utf-8")
@@ -114,7 +118,7 @@ def run_page(page: Path) -> None:
             pytest.skip(f"{block.where} is about real captures, which are not at {REAL_DATA}")
         if not any(program(command) in RUN_BY for command in commands):
             for command in commands:
-                run_command(command, block.where)
+                run_command(command, block.where, codes)
 
 
 @pytest.mark.slow
@@ -129,6 +133,50 @@ def test_the_blocks_of_a_page_run(page: Path, desk: Path, monkeypatch: pytest.Mo
 def test_a_page_by_itself(page: Path, originals: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(shutil.copytree(originals, tmp_path / "desk", symlinks=True))
     run_page(page)
+
+
+@pytest.fixture(scope="session")
+def mixed_flight(shared: Shared) -> Path:
+    """A flight of two cameras with four kinds of captures of the first: aligned, without a readable reference, with
+    constant bands, and of a calibration panel.
+    """
+
+    def fill(folder: Path) -> None:
+        make_flight_between_panels(folder, 4, (640, 480), sun=(1.0, 1.0))
+        files = folder / "0000SET" / "000"
+        for path in sorted(files.glob("IMG_*.tif")):  # the panel is IMG_0000 and IMG_0005
+            path.rename(path.with_name(f"IMG_{int(path.name[4:8]) - 1:04d}{path.name[8:]}"))
+        with tifffile.TiffFile(files / "IMG_0003_2.tif", mode="r+") as reference:
+            offsets = reference.pages.first.tags["StripOffsets"]
+            offsets.overwrite([1 << 30] * offsets.count)  # beyond the end of the file
+        for number in (1, 3, 4, 5):
+            with rasterio.open(files / f"IMG_0004_{number}.tif", "r+") as band:
+                band.write(np.full_like(band.read(), 2000))
+        synthetic.make_flight(folder / "second", captures=2, size_px=(640, 480), rng_seed=4, camera=MAVIC_3M)
+
+    return shared("mixed flight", fill)
+
+
+@pytest.fixture(scope="session")
+def mixed_originals(shared: Shared, originals: Path, mixed_flight: Path) -> Path:
+    """`originals` with another flight, and the flight aligned."""
+
+    def fill(folder: Path) -> None:
+        shutil.copytree(originals, folder, symlinks=True, dirs_exist_ok=True)
+        shutil.rmtree(folder / "flight")
+        shutil.copytree(mixed_flight, folder / "flight")
+        assert agalign_here(folder / "flight", "-o", folder / "aligned").returncode == 3
+
+    return shared("mixed desk", fill)
+
+
+@pytest.mark.full
+@each_page(page for page in RUNNABLE if page.parent.name in ("how-to", "tutorial"))
+def test_a_page_on_a_flight_with_panel_two_cameras_and_failed_captures(
+    page: Path, mixed_originals: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(shutil.copytree(mixed_originals, tmp_path / "desk", symlinks=True))
+    run_page(page, codes=(0, 3))
 
 
 EXAMPLES = {
@@ -160,6 +208,37 @@ def test_an_example(name: str, desk: Path, monkeypatch: pytest.MonkeyPatch, caps
         with rasterio.open("change.tif") as change, rasterio.open("spring.tif") as first:
             assert (change.shape, change.transform) == (first.shape, first.transform)
             assert np.isfinite(change.read(1)).mean() > 0.8
+
+
+ON_MIXED_FLIGHT = {
+    "one_capture.py": ("flight one", ""),
+    "whole_flight.py": ("flight whole", "IMG_0003: "),
+    "ndvi_over_a_flight.py": ("aligned", ""),
+    "next_flight.py": ("flight flight next", "IMG_0003: "),
+    "on_dask.py": ("flight dask", "IMG_0003 error "),
+}
+"""{name: (arguments, a part of what it prints)}."""
+
+
+@pytest.mark.full
+@pytest.mark.parametrize("name", ON_MIXED_FLIGHT)
+def test_an_example_on_a_flight_with_panel_two_cameras_and_failed_captures(
+    name: str,
+    mixed_originals: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    """A reason in one line may end it, as `sys.exit` prints it."""
+    arguments, text = ON_MIXED_FLIGHT[name]
+    monkeypatch.chdir(shutil.copytree(mixed_originals, tmp_path / "desk", symlinks=True))
+    monkeypatch.setattr(sys, "argv", [name, *arguments.split()])
+    with warnings.catch_warnings(action="ignore"):
+        runpy.run_path(str(ROOT / "examples" / name), run_name="__main__")
+    printed = capsys.readouterr().out
+    assert text in printed
+    assert not re.search("IMG_000[05]", printed)
+    assert not re.search(": None$", printed, re.MULTILINE)
 
 
 def test_the_recipe_for_plots_has_a_row_of_any_outline(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,6 +1,7 @@
 """Captures of a panel and of the sky in a flight, start to end."""
 
 import json
+import pickle
 import shutil
 from dataclasses import replace
 from datetime import datetime, timedelta
@@ -75,6 +76,26 @@ def test_panels_are_named_and_drawn_and_kept_out(by_panel: Path) -> None:
     assert [part["capture"] for part in excluded] == ["0000SET/000/IMG_0001", "0000SET/000/IMG_0004"]
     assert excluded[0]["evidence"][:2] == ["a QR code", "a homogeneous square in most bands"]
     assert "Left out: 2 captures of a calibration panel, by a QR code (2), a homogeneous square" in unescape(page)
+
+
+@pytest.mark.slow
+def test_panels_are_not_among_the_captures_of_the_api(between_panels: Path, tmp_path: Path) -> None:
+    finished: list[tuple[str, int, int]] = []
+    reports = agalign.align_folder(
+        between_panels,
+        tmp_path,
+        settings=seeded(),
+        progress=lambda report, *done: finished.append((report.label, *done)),
+    )
+    names = ["0000SET/000/IMG_0002", "0000SET/000/IMG_0003"]
+    assert [report.result.capture for report in reports if report.result] == ["IMG_0002", "IMG_0003"]
+    assert finished == [(names[0], 1, 2), (names[1], 2, 2)]
+    assert [report.state for report in reports.excluded] == ["panel", "panel"]
+    copied = pickle.loads(pickle.dumps(reports))
+    assert (copied, copied.excluded) == (reports, reports.excluded)
+    assert "2 done, 2 panel" in reports._repr_html_()
+    with pytest.raises(agalign.InputError, match="IMG_0001: shows a calibration panel; align another capture"):
+        agalign.align_capture(agalign.discover(between_panels).captures[0], tmp_path)
 
 
 @pytest.mark.slow
@@ -169,8 +190,12 @@ def with_sky(flight: Path, tmp_path: Path) -> Path:
 def test_the_sky_is_left_out_and_named(with_sky: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
     reports = agalign.align_folder(with_sky, out, settings=seeded())
-    assert {r.label: r.state for r in reports} == {"sky/S1": "sky", "IMG_0001": "done"}
-    assert next(r for r in reports if r.state == "sky").is_complete
+    assert {r.label: r.state for r in reports} == {"IMG_0001": "done"}
+    (of_sky,) = reports.excluded
+    assert (of_sky.label, of_sky.state, of_sky.is_complete) == ("sky/S1", "sky", True)
+    (capture,) = (c for c in agalign.discover(with_sky).captures if c.label == "sky/S1")
+    with pytest.raises(agalign.InputError, match=r"sky/S1: shows the sky; align another capture"):
+        agalign.align_capture(capture, out)
     _, (part,) = read_excluded(out)
     assert (part.folder, part.capture, [b.band for b in part.bands]) == ("sky", "S1", ["Blue", "Green", "NIR"])
     assert part.cues == ["its folder or name contains 'sky'", "no band has texture"]

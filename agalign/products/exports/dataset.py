@@ -136,11 +136,11 @@ def open_flight(out: str | Path, *, masked: bool = True) -> "xarray.Dataset":
 def _captures_with_output(folder: Path) -> list[RunCapture]:
     """The captures with rasters, which have one size and the same contents. Raises InputError."""
     captures, left_out = captures_of_run(folder)
-    crops = [(c, c.result.output.crop) for c in captures if c.result.output is not None]
+    alike, differing = like_most([c for c in captures if c.result.output is not None])
+    crops = [(c, c.result.output.crop) for c in alike if c.result.output is not None]
     if sizes := exceptions({c.label: (f"{crop[2]} x {crop[3]} px",) for c, crop in crops}):
         remedy = "align again with --crop none, or each camera into a folder of its own, or use open_capture"
         raise InputError(f"{folder}: its captures differ in size ({'; '.join(map(': '.join, sizes[:3]))}); {remedy}")
-    alike, differing = like_most([c for c, _ in crops])
     if lines := [f"{label}: left out: {reason}" for label, reason in [*left_out, *differing]]:
         warnings.warn("\n".join(lines), stacklevel=4)
     if not alike:
