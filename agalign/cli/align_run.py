@@ -344,7 +344,8 @@ def conclude(totals: RunTotals, out: Path, terminal: Terminal) -> int:
     if not statuses["aligned"] + statuses["predicted"]:
         terminal.problem("no band pair could be aligned" if statuses else "no capture could be processed")
         return ExitCode.PARTIAL if statuses else ExitCode.NOTHING
-    return ExitCode.OK if totals.is_complete else ExitCode.PARTIAL
+    is_usable = not any(group.is_unusable for group in totals.pairs.groups())
+    return ExitCode.OK if totals.is_complete and is_usable else ExitCode.PARTIAL
 
 
 def _print_totals(totals: RunTotals, terminal: Terminal) -> None:

@@ -54,7 +54,8 @@ def _show_folder(folder: Path, options: dict[str, Any], terminal: Terminal, *, a
     from agalign.flight.groups import camera_overviews
 
     flight = discover(folder, DiscoverOptions(**options))
-    rows, cameras = _rows(flight), camera_overviews(flight.captures)
+    rows, captures = _rows(flight)
+    cameras = camera_overviews(captures)
     if as_json:
         problems = [{"file": str(p.path), "problem": p.text} for p in flight.problems]
         facts = {"folder": str(folder), "cameras": [vars(c) for c in cameras], "captures": rows, "problems": problems}
@@ -70,8 +71,8 @@ def _show_folder(folder: Path, options: dict[str, Any], terminal: Terminal, *, a
     return ExitCode.NOTHING if not rows else ExitCode.OK if flight.is_complete else ExitCode.PARTIAL
 
 
-def _rows(flight: "FolderScan") -> list[dict[str, Any]]:
-    """Return what `info` prints about the captures of a folder, as JSON objects."""
+def _rows(flight: "FolderScan") -> tuple[list[dict[str, Any]], list["Capture"]]:
+    """Return what `info` prints about the captures of a folder, as JSON objects, and the captures with their panels."""
     from agalign.flight.panel_readings import with_panels
     from agalign.flight.sky import sky_captures
 
@@ -79,10 +80,9 @@ def _rows(flight: "FolderScan") -> list[dict[str, Any]]:
     sky_cues = {s.capture.label: list(s.cues) for s in sky}
     by_label = {c.label: c for c in (*with_panels(others), *(s.capture for s in sky))}
     unreadable = _unreadable_files(flight)
-    return [
-        _facts(by_label[c.label]) | {"sky": sky_cues.get(c.label, []), "unreadable_files": unreadable[c.label]}
-        for c in flight.captures
-    ]
+    captures = [by_label[c.label] for c in flight.captures]
+    rows = [_facts(c) | {"sky": sky_cues.get(c.label, []), "unreadable_files": unreadable[c.label]} for c in captures]
+    return rows, captures
 
 
 def _show_captures(rows: Sequence[dict[str, Any]], problems: int, terminal: Terminal) -> None:

@@ -137,7 +137,8 @@ class CameraOverview:
     gsd_m: float | None
     """Median ground sample distance of the reference."""
     radiometry: tuple[RadiometryChoice, ...]
-    """Values of `--radiometry` that the tags of all captures support; panels are not considered."""
+    """Values of `--radiometry` that the tags of all captures support, except those of a panel; `panel` if a capture
+    shows one, whose reflectance may have to be given."""
     missing_calibration: str = ""
     """Missing or unused tags that prevent a calibration, in words."""
     gsd_per_height: float | None = None
@@ -156,7 +157,11 @@ class CameraOverview:
             parts.append(f"altitude {' to '.join(bounds_m)} m, height above the ground unknown")
         if self.gsd_m is None and self.gsd_per_height is not None:
             parts.append(f"GSD {1e4 * self.gsd_per_height:.1f} cm at a height of 100 m")
-        kinds = {"camera": "radiance by calibration", "sun": "reflectance by light sensor"}
+        kinds = {
+            "camera": "radiance by calibration",
+            "sun": "reflectance by light sensor",
+            "panel": "reflectance by calibration panel",
+        }
         none = self.missing_calibration or "none in the tags"
         parts.append(f"radiometry: {', '.join(kinds[r] for r in self.radiometry) or none}")
         return ", ".join(parts)
@@ -175,7 +180,11 @@ def _overview(name: str, serial: str, captures: Sequence[Capture]) -> CameraOver
     height_m, gsd_m = _median_height_and_gsd_m(captures)
     altitudes_m = [c.altitude_m for c in captures if c.altitude_m is not None]
     times = sorted({c.known_time for c in captures} - {""}) or [""]
+    to_align = [c for c in captures if not c.is_of_a_panel] or captures
     choices: tuple[RadiometryChoice, ...] = ("camera", "sun")
+    supported = [choice for choice in choices if all(_supports(c, choice) for c in to_align)]
+    if "camera" in supported and any(c.panel is not None for c in captures):
+        supported.append("panel")
     reference = mode(c.reference.name for c in captures)
     typical = next(c for c in captures if c.reference.name == reference)
     return CameraOverview(
@@ -193,7 +202,7 @@ def _overview(name: str, serial: str, captures: Sequence[Capture]) -> CameraOver
         missing_calibration=next(
             (b.missing_calibration for c in captures for b in c.bands if b.missing_calibration), ""
         ),
-        radiometry=tuple(choice for choice in choices if all(_supports(c, choice) for c in captures)),
+        radiometry=tuple(supported),
     )
 
 

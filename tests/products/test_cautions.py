@@ -145,6 +145,28 @@ def test_a_panel_that_contradicts_the_sensor_concerns_the_reflectance_of_its_fli
     assert caution.size == pytest.approx(1.0)
 
 
+@pytest.mark.parametrize(
+    ("choice", "source", "said", "is_unusable"),
+    [
+        ("sun", "light sensor", "if the panels had the light of the flight, align again with --radiometry panel", True),
+        ("panel", "panel", "if the light sensor had the light of the flight, align again with --radiometry sun", False),
+        ("auto", "light sensor", "align again with --radiometry panel (the panels alone) or sun", True),
+    ],
+)
+def test_a_contradiction_has_a_remedy_that_was_not_tried(
+    choice: str, source: str, said: str, is_unusable: bool
+) -> None:
+    output = OUTPUT | {"radiometry": f"reflectance by {source}"}
+    options = {"write": {"radiometry": choice}}
+    (caution, *_) = cautions(run=RunFacts((panel(NIR=15.46),)), output=output, options=options)
+    assert caution.size_text.format(caution.size) == "reflectance is uncertain by up to 1446%"
+    assert caution.remedy.advice.startswith(said)
+    assert f"--radiometry {choice}" not in caution.remedy.advice.partition(" or ")[0]
+    assert caution.is_unusable == is_unusable
+    (caution, *_) = cautions(run=RunFacts((panel(NIR=1.5),)), output=output, options=options)
+    assert not caution.is_unusable
+
+
 def test_captures_of_an_earlier_model_are_named(tmp_path: Path) -> None:
     save_known_model(tmp_path / "models" / "a.safetensors")
     run = RunFacts.of(tmp_path)

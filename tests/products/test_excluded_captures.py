@@ -21,6 +21,7 @@ from agalign.config import RunOptions, WriteSettings
 from agalign.errors import SidecarError
 from agalign.flight.panel_readings import PanelReading, missing_panel, read_panel, with_panels
 from agalign.products.report.pages import write_pages
+from agalign.products.run import cautions as run_cautions
 from agalign.products.run.excluded import PANELS_FILE, SKY_FILE, read_excluded
 
 from ..conftest import Shared, read_json, seeded
@@ -96,6 +97,25 @@ def test_panels_are_not_among_the_captures_of_the_api(between_panels: Path, tmp_
     assert "2 done, 2 panel" in reports._repr_html_()
     with pytest.raises(agalign.InputError, match="IMG_0001: shows a calibration panel; align another capture"):
         agalign.align_capture(agalign.discover(between_panels).captures[0], tmp_path)
+
+
+@pytest.mark.slow
+def test_info_names_the_reflectance_that_a_panel_gives(between_panels: Path) -> None:
+    text = " ".join(agalign_here("info", between_panels).stdout.split())
+    kinds = "radiance by calibration, reflectance by light sensor, reflectance by calibration panel"
+    assert f"radiometry: {kinds}" in text
+
+
+@pytest.mark.full
+def test_a_run_with_unusable_reflectance_is_not_complete(
+    between_panels: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    arguments = (between_panels, "-o", tmp_path / "out", "--relief", "never", "--radiometry", "sun", "--jobs", "1")
+    assert agalign_here(*arguments).returncode == 0
+    monkeypatch.setattr(run_cautions, "_MAX_REFLECTANCE_ERROR", 0.5)
+    done = agalign_here(*arguments)
+    assert done.returncode == 3
+    assert "reflectance is uncertain by up to 67%" in done.stderr
 
 
 @pytest.mark.slow

@@ -69,6 +69,8 @@ class CautionGroup:
     effect: float = 0.0
     """Share of the values of all bands of the run that are missing, displaced or wrong, by `Caution.lost`."""
     bands: list[BandToCheck] = field(default_factory=list)
+    is_unusable: bool = False
+    """The values of a band are too uncertain for any use."""
     _largest: float = -math.inf
     _size_text: str = ""
 
@@ -76,6 +78,7 @@ class CautionGroup:
         """Add a band of a capture."""
         self.bands.append(BandToCheck(label, caution.band, self.status, caution.reason))
         self.effect += caution.lost
+        self.is_unusable |= caution.is_unusable
         if caution.size > self._largest:
             self._largest, self._size_text = caution.size, caution.size_text
 

@@ -52,11 +52,19 @@ _INACCURATE = Remedy(
     "a part of the image may be off by more than 1 px",
     "look at the error map (--error-map); --qa and then 'agalign indices --mask-qa' leave these pixels out",
 )
-_PANEL = Remedy(
-    "calibration panel and light sensor contradict each other: one was in other light, or is wrong in a band",
-    "align again with --radiometry panel (the panels alone) or sun (the sensor alone), whichever had the light of the "
-    "flight",
+_CONTRADICTION = (
+    "calibration panel and light sensor contradict each other: one was in other light, or is wrong in a band"
 )
+_PANEL_ADVICE = {
+    "sun": "if the panels had the light of the flight, align again with --radiometry panel (the panels alone); if not, "
+    "--exclude their captures",
+    "panel": "if the light sensor had the light of the flight, align again with --radiometry sun (the sensor alone)",
+    "auto": "align again with --radiometry panel (the panels alone) or sun (the sensor alone), whichever had the light "
+    "of the flight",
+}
+"""By the `--radiometry` of the run."""
+_MAX_REFLECTANCE_ERROR = 1.0
+"""Of a usable reflectance: a factor of 2 changes every index."""
 _OLD_PANEL = Remedy(
     "the light may have changed since the nearest calibration panel",
     "record a panel before and after each flight, or use a light sensor (--radiometry sun)",
@@ -91,6 +99,8 @@ class Caution:
     size: float = math.nan
     size_text: str = ""
     """Template of how large it is, for the largest `size` of many bands; empty without a size."""
+    is_unusable: bool = False
+    """The values are too uncertain for any use: the run returns exit code 3."""
 
 
 @dataclass(frozen=True)
@@ -143,6 +153,8 @@ class RunFacts:
             return
         scales = self._sensor_scales(sidecar.captured_at)
         age_s = output.panel_age_s or 0.0
+        choice = (sidecar.options or {}).get("write", {}).get("radiometry", "auto")
+        remedy = Remedy(_CONTRADICTION, _PANEL_ADVICE.get(choice, _PANEL_ADVICE["auto"]))
         is_old = age_s > _MAX_PANEL_AGE_S and "light sensor" not in (output.radiometry or "")
         for band in sidecar.bands:
             if band.band in scales:
@@ -150,7 +162,8 @@ class RunFacts:
                 error = max(scale, 1 / scale) - 1
                 reason = f"the irradiance on the panel is {scale:.2f} times that of the light sensor"
                 text = "reflectance is uncertain by up to {:.0%}"
-                yield Caution(band.band, "check", _PANEL, reason, min(1.0, error), error, text)
+                is_unusable = error > _MAX_REFLECTANCE_ERROR and "light sensor" in (output.radiometry or "")
+                yield Caution(band.band, "check", remedy, reason, min(1.0, error), error, text, is_unusable)
             if is_old:
                 lost = min(1.0, _CHANGE_OF_LIGHT * age_s / _MAX_PANEL_AGE_S)
                 reason = f"the nearest panel is {age_s / 60:.0f} min away"
