@@ -1,11 +1,13 @@
 """Captures in worker processes, of agalign and of a Dask cluster, and after the end of a worker."""
 
 import signal
+import socket
 import subprocess
 import sys
 import tempfile
 from collections.abc import Iterator
 from concurrent.futures import Future, ProcessPoolExecutor, ThreadPoolExecutor
+from contextlib import suppress
 from dataclasses import replace
 from functools import partial
 from multiprocessing import get_context
@@ -32,8 +34,21 @@ from ..values.pool_tasks import WhenUnpickled, signal_self, sleep, without_memor
 pytestmark = pytest.mark.slow
 
 
+@pytest.mark.filterwarnings("ignore:unclosed:ResourceWarning")
+def test_a_dask_cluster_starts_without_a_warning_if_the_port_of_dask_is_in_use(
+    recwarn: pytest.WarningsRecorder,
+) -> None:
+    with socket.socket() as taken:
+        with suppress(OSError):  # another program has the port already
+            taken.bind(("", 8787))
+            taken.listen()
+        with dask_executor("local", 1):
+            pass
+    assert [w for w in recwarn if "in use" in str(w.message)] == []
+
+
 @pytest.mark.full
-@pytest.mark.filterwarnings("ignore:Port .* is already in use", "ignore:unclosed:ResourceWarning")
+@pytest.mark.filterwarnings("ignore:unclosed:ResourceWarning")
 def test_a_dask_cluster_processes_captures(flight: Path, aligned_flight: Path, tmp_path: Path) -> None:
     """Two worker processes; one is killed while it processes a capture."""
     with dask_executor("local", 2) as executor:
