@@ -220,8 +220,7 @@ def align_capture(capture: Capture, out: str | Path, *, settings: Settings | Non
     UnreadableFileError
         The reference band cannot be read.
     InputError
-        The capture lacks the tags that a setting needs, such as those for radiance, or shows a calibration panel or the
-        sky.
+        The capture lacks the tags that a setting needs (such as those for radiance), or shows a panel or the sky.
     ConfigurationError
         `out` contains the result of a different capture with the same name.
     OutputError
@@ -386,9 +385,11 @@ def _run(
 
     reports = FlightReports()
     for report in run_flight(flight, out, settings, run, Listener(on_again=_LOG.info), start):
-        if not reports.add(report):  # before the others
+        if report.state in ("panel", "sky"):  # before the others
+            reports.excluded.append(report)
             _LOG.info("%s: %s", report.label, report.summary)
             continue
+        reports.append(report)
         captures = len(flight.captures) - len(reports.excluded)
         _LOG.info("%d of %d: %s: %s", len(reports), captures, report.label, report.summary)
         if progress is not None:

@@ -142,16 +142,8 @@ class FlightReports(list[CaptureReport]):
     """The reports of the captures of calibration panels and of the sky, which are not aligned and not in the list."""
 
     def __init__(self, reports: Iterable[CaptureReport] = ()) -> None:
-        super().__init__()
+        super().__init__(reports)
         self.excluded = []
-        for report in reports:
-            self.add(report)
-
-    def add(self, report: CaptureReport) -> bool:
-        """Append a report to the list or to `excluded`; return True for the list."""
-        is_capture = report.state not in ("panel", "sky")
-        (self if is_capture else self.excluded).append(report)
-        return is_capture
 
     def _repr_html_(self) -> str:
         max_rows = 20
