@@ -9,9 +9,10 @@ import pytest
 
 from agalign.capture.band_pair import BandPair
 from agalign.capture.reference import Reference
-from agalign.values.alignment import JointResult, Residual
+from agalign.values.alignment import JointResult
 from agalign.values.image import Raster
 from agalign.values.lens import Lens
+from agalign.values.residual import Residual
 
 from .conftest import textured_image, textured_pair
 

@@ -20,7 +20,6 @@ from agalign.batch.learning_tasks import (
 )
 from agalign.config import Settings
 from agalign.fit.displacement_field import common_field
-from agalign.fit.window_fit import lens_std_px
 from agalign.flight.fingerprint import learning_fingerprint
 from agalign.flight.groups import flight_camera, flight_lenses
 from agalign.flight.learn_rig import learn_rig
@@ -33,11 +32,12 @@ from agalign.method.fast import learn
 from agalign.method.state import JointState, Progress
 from agalign.pixels.raster import without_warnings
 from agalign.values import geometry
-from agalign.values.alignment import Residual
 from agalign.values.capture import Capture
 from agalign.values.geometry import Matrix
+from agalign.values.lens_shapes import lens_std_px
 from agalign.values.process_pool import A, Apply, R
-from agalign.verify.expected_error import unmodelled_std_px
+from agalign.values.residual import Residual
+from agalign.verify.coverage import unmodelled_std_px
 
 _MIN_RIG_CAPTURES, _MAX_RIG_CAPTURES = 6, 48
 """The factors of the rig need the minimum; more than the maximum do not improve it."""

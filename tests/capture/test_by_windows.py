@@ -14,13 +14,13 @@ from agalign.capture.decision import by_windows, fall_back_to_seed, verified, wi
 from agalign.capture.seeding import find_seed
 from agalign.capture.warped_pair import Candidate
 from agalign.config import SeedSettings
-from agalign.fit.window_fit import lens_shapes
 from agalign.flight.rig import Rig
 from agalign.pixels.masks import raster_of
 from agalign.values import geometry
 from agalign.values.alignment import Alignment, Seed
 from agalign.values.issues import FOLDS, RETRIEVAL, UNREADABLE, Issue
-from agalign.verify.expected_error import expected_error_px
+from agalign.values.lens_shapes import lens_shapes
+from agalign.verify.coverage import expected_error_px
 
 from ..builders import joint_result, pair_of, rms, two_views, whole
 from ..conftest import textured_image

@@ -16,11 +16,12 @@ from agalign.config import Settings
 from agalign.fit.windows import FixedWindows, Shifts
 from agalign.pixels.masks import raster_of
 from agalign.values import geometry
-from agalign.values.alignment import Alignment, Residual, Seed
+from agalign.values.alignment import Alignment, Seed
 from agalign.values.geometry import Points
 from agalign.values.image import Raster
 from agalign.values.issues import RETRIEVAL, Issue
 from agalign.values.mapping import DisplacementField, PixelMapping
+from agalign.values.residual import Residual
 
 from ..builders import in_full_run, joint_result, pair_of, texture, whole
 from ..conftest import textured_image

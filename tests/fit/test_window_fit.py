@@ -6,12 +6,14 @@ import cv2
 import numpy as np
 import pytest
 
-from agalign.fit.window_fit import CALIBRATED, LENS_STD, WindowFit, fit_windows, jacobian, lens_shapes, lens_std_px
+from agalign.fit.window_fit import WindowFit, fit_windows
 from agalign.values import geometry
-from agalign.values.alignment import Alignment, Prediction, Residual, Seed
+from agalign.values.alignment import Alignment, Prediction, Seed
 from agalign.values.issues import RETRIEVAL, Issue
+from agalign.values.lens_shapes import CALIBRATED, LENS_STD, jacobian, lens_shapes, lens_std_px
 from agalign.values.mapping import DisplacementField, PixelMapping
-from agalign.verify.expected_error import expected_error_px, points_in_frame, unmodelled_std_px, unobserved_quarters
+from agalign.values.residual import Residual
+from agalign.verify.coverage import expected_error_px, points_in_frame, unmodelled_std_px, unobserved_quarters
 
 from ..builders import grid_px, joint_result, residual_of, rms
 

@@ -9,9 +9,10 @@ import pytest
 import agalign
 from agalign.pixels.structure import structure_field, windowed_spectra
 from agalign.values import geometry, issues
-from agalign.values.alignment import Prediction, Residual
+from agalign.values.alignment import Prediction
 from agalign.values.issues import sentence
 from agalign.values.pixel_units import PixelScale
+from agalign.values.residual import Residual
 from agalign.verify.checks import AliasPeak, Evidence, alias_peak, is_unchanged, issues_of, seed_fits
 
 from ..builders import grid_px, joint_result, residual_of, texture, whole
