@@ -65,8 +65,10 @@ def align_capture_bands(
         if band.name not in result:
             overlay = Seed("identity", geometry.overlay(size_px, band.size_px), 0.0)
             issues = (unusable[band.name],) if band.name in unusable else ()  # none in a band of the reference's lens
-            mapping, error = PixelMapping(overlay.fixed_to_moving), None if issues else MappingError(size_px)
-            result[band.name] = Alignment(mapping, size_px, issues, overlay, moving_size_px=band.size_px, error=error)
+            of_lens = Alignment(
+                PixelMapping(overlay.fixed_to_moving), size_px, issues, overlay, moving_size_px=band.size_px
+            )
+            result[band.name] = of_lens if issues else replace(of_lens, error=MappingError(size_px), std_px=0.0)
     seconds = (time.perf_counter() - start_s) / max(1, len(capture.moving))  # most steps are for all bands together
     return {b.name: replace(result[b.name], seconds=seconds) for b in capture.moving}
 

@@ -52,7 +52,7 @@ class RigPrediction:
         """The predicted mapping; the windows under it say nothing about it, as the band did not pass verification."""
         std_px = self.of_scene.std_px / self.pair.in_moving_file_px(1.0, self.fixed_to_moving)
         mapping = self._warped.mapping
-        error = MappingError(self.pair.fixed.size_px, std_px=std_px, parallax=mapping.parallax)
+        error = MappingError(self.pair.fixed.size_px, rig_std_px=std_px, parallax=mapping.parallax)
         return Candidate("rig", self.pair, mapping, error, self._warped.residual)
 
     @cached_property

@@ -101,6 +101,7 @@ class _Choice:
             candidates={**p95_px, **chosen.p95_px},
             prediction=_prediction(chosen, self.compared) if self.issues else self.compared,
             error=chosen.error,
+            std_px=chosen.std_px,
         )
 
 

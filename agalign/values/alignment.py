@@ -223,6 +223,9 @@ class Alignment:
     """The mapping is that of the seed, which is trusted or requested, and which fits the windows."""
     error: MappingError | None = None
     """What the error of the mapping is made of; None for `seed_only` and `failed`, whose error is unknown."""
+    std_px: float = math.inf
+    """Standard error: the RMS of `error_px` over the area that both images show, px of the reference; infinite if it is
+    unknown."""
     moving_size_px: Size | None = None
     """(width, height) of the moving image; None if it is not known, as in sidecars of earlier versions."""
 
@@ -378,8 +381,8 @@ class Alignment:
     def error_px(self, reference_px: "ArrayLike") -> NDArray[np.float64]:
         """Return the expected error at positions in the reference.
 
-        The standard error of a prediction is the RMS of it over the area that both images show; the limits of
-        `aligned`, the error map and the quality flags are limits of it.
+        `std_px` is its RMS over the area that both images show; the limits of `aligned`, the error map and the quality
+        flags are limits of it.
 
         Parameters
         ----------
@@ -448,6 +451,7 @@ class Alignment:
             joint=None if self.joint is None else self.joint.in_file_px(scales),
             residual=None if self.residual is None else self.residual.in_file_px(scales),
             error=None if self.error is None else self.error.in_file_px(scales, size_px, mapping.parallax),
+            std_px=self.std_px * up.mean,
             candidates={kind: float(p95_px * up.mean) for kind, p95_px in self.candidates.items()},
         )
 

@@ -32,7 +32,7 @@ _FAR_SPACINGS = 3.0
 class MappingError:
     """What the error of one mapping is made of, px of the reference.
 
-        error(x)^2 = std^2 + trace(D(x) C D(x)^T) (1 + 11 far(x)) + far(x) (field^2 + relief^2) + max(u(x)^2, z(x)^2)
+        error(x)^2 = rig^2 + trace(D(x) C D(x)^T) (1 + 11 far(x)) + far(x) (field^2 + relief^2) + max(u(x)^2, z(x)^2)
 
     D is the Jacobian `lens_shapes.jacobian`, far(x) rises from 0 within one spacing of the measured windows to 1, u is
     the displacement that the mapping does not contain, by the residual shifts of the nearest windows beyond their
@@ -46,7 +46,7 @@ class MappingError:
     (12, 12); None for a prediction by other bands or captures."""
     windows: Residual | None = None
     """Shifts of windows that the fit did not use, under the mapping; None if they say nothing about it."""
-    std_px: float = 0.0
+    rig_std_px: float = 0.0
     """Standard error of a prediction by other bands or captures, the same everywhere."""
     lens_std_px: NDArray[np.float64] | None = None
     """(4,) standard deviations of lens shapes that neither tags nor a rig determine; None if they are known or in C."""
@@ -66,7 +66,7 @@ class MappingError:
     def smooth_px2(self, points_px: Points) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return the parts (n,) of the square that vary smoothly: all but u and z, and u, at points (n, 2)."""
         far = self._far(points_px)
-        modelled_px2 = self.std_px**2 + self._covariance_px2(points_px) * (1 + far * (_COMMON_ERROR_FACTOR - 1))
+        modelled_px2 = self.rig_std_px**2 + self._covariance_px2(points_px) * (1 + far * (_COMMON_ERROR_FACTOR - 1))
         modelled_px2 = modelled_px2 + far * (self.field_std_px**2 + self.relief_std_px**2)
         # The windows are measured with a relief from other bands: their shifts contain its error.
         return modelled_px2, self._unmodelled_px2(points_px, far)
@@ -90,7 +90,7 @@ class MappingError:
             size_px=size_px,
             covariance_px2=_scaled(self.covariance_px2, per_axis),
             windows=None if self.windows is None else self.windows.in_file_px(scales),
-            std_px=self.std_px * up.mean,
+            rig_std_px=self.rig_std_px * up.mean,
             lens_std_px=None if self.lens_std_px is None else self.lens_std_px * up.mean,
             field_std_px=self.field_std_px * up.mean,
             relief_std_px=self.relief_std_px * up.mean,

@@ -178,10 +178,12 @@ class ErrorPart(_Part):
     standard error of the parallax are parts of it too.
     """
 
+    std_px: Number4
+    """Standard error: RMS of the expected error over the area that both images show."""
     covariance_px2: Annotated[NDArray[np.float64], Array((None, None), COVARIANCE_DECIMALS)] | None = None
     """Covariance of the corners (8 x 8), clockwise from the top left, x and y in turn, or with lens shapes (12 x 12);
     null for a prediction by other bands or captures, whose windows are no part of the error."""
-    std_px: Number4 = 0.0
+    rig_std_px: Number4 = 0.0
     """Standard error of a prediction by other bands or captures, the same everywhere."""
     lens_std_px: Annotated[NDArray[np.float64], Array((4,), 6)] | None = None
     """Standard deviations of the lens shapes that neither tags nor a rig determine."""
@@ -198,13 +200,15 @@ class ErrorPart(_Part):
         return covariance
 
     @classmethod
-    def of(cls, error: MappingError) -> Self | None:
-        """Return the entry of an error; None if it is unknown: infinite."""
-        if error.covariance_px2 is not None and not np.isfinite(error.covariance_px2).all():
+    def of(cls, alignment: Alignment) -> Self | None:
+        """Return the entry of an alignment; None if its error is unknown."""
+        error = alignment.error
+        if error is None or not math.isfinite(alignment.std_px):
             return None
         return cls(
+            std_px=alignment.std_px,
             covariance_px2=error.covariance_px2,
-            std_px=error.std_px,
+            rig_std_px=error.rig_std_px,
             lens_std_px=error.lens_std_px,
             field_std_px=error.field_std_px,
             relief_std_px=error.relief_std_px,
@@ -216,7 +220,7 @@ class ErrorPart(_Part):
             size_px,
             self.covariance_px2,
             None if self.covariance_px2 is None else windows,
-            self.std_px,
+            self.rig_std_px,
             self.lens_std_px,
             self.field_std_px,
             self.relief_std_px,
@@ -318,7 +322,7 @@ class BandResult(_Part):
             geometry=GeometryPart(kind=alignment.geometry, held_out_p95_px=dict(alignment.candidates)),
             prediction=alignment.prediction,
             exposed_after_s=None if alignment.status == "aligned" else _exposed_after_s(band, reference),
-            error=None if alignment.error is None else ErrorPart.of(alignment.error),
+            error=ErrorPart.of(alignment),
             seconds=alignment.seconds,
         )
 
@@ -347,6 +351,7 @@ class BandResult(_Part):
             prediction=self.prediction,
             is_seed_usable=self.status == "seed_only",
             error=None if self.error is None else self.error.mapping_error(size_px, residual, parallax),
+            std_px=math.inf if self.error is None else self.error.std_px,
             moving_size_px=self.size_px,
         )
 
