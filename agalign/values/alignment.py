@@ -408,21 +408,17 @@ class Alignment:
             return np.full(points_px.shape[:-1], np.inf)
         return self.error.error_px(points_px.reshape(-1, 2)).reshape(points_px.shape[:-1])
 
-    def error_map(self) -> FloatImage:
-        """Return the expected error at every pixel of the reference.
+    @property
+    def error_map_px(self) -> FloatImage:
+        """The expected error at every pixel of the reference: (height, width), float32.
 
-        Returns
-        -------
-        array
-            (height, width) of the reference, float32: `error_px`, but for the parallax at nodes every 16 px, between
-            which it is interpolated linearly.
+        It is `error_px`, but for the part of the parallax at nodes every 16 px, between which it is linear.
 
         Examples
         --------
         `result` is that of the example of `align`.
 
-        >>> error_px = result.error_map()
-        >>> error_px.shape, bool((error_px < 0.5).mean() > 0.9)
+        >>> result.error_map_px.shape, bool((result.error_map_px < 0.5).mean() > 0.9)
         ((200, 200), True)
         """
         if self.error is None:
@@ -430,7 +426,25 @@ class Alignment:
         return ErrorOnGrid.of(self.error, self.size_px).on_tile(Tile(0, 0, *self.size_px))
 
     def is_usable(self, accept_predicted_px: float) -> bool:
-        """Return True if the band is aligned, or predicted with a standard error of at most this, px of the band."""
+        """Return True if the band is aligned, or predicted with a small standard error.
+
+        Parameters
+        ----------
+        accept_predicted_px
+            Largest standard error of a prediction, px of the band, such as `CheckSettings.accept_predicted_px`.
+
+        Returns
+        -------
+        bool
+            True for a band that indices use.
+
+        Examples
+        --------
+        `result` is that of the example of `align`.
+
+        >>> result.is_usable(1.0)
+        True
+        """
         return is_usable(self.status, self.prediction, accept_predicted_px)
 
     def in_file_px(self, scales: PairScales, size_px: Size) -> "Alignment":

@@ -37,6 +37,16 @@ class MappingError:
     D is the Jacobian `lens_shapes.jacobian`, far(x) rises from 0 within one spacing of the measured windows to 1, u is
     the displacement that the mapping does not contain, by the residual shifts of the nearest windows beyond their
     noise, and z the standard error of the parallax times the baseline.
+
+    Examples
+    --------
+    `result` is that of the example of `align`.
+
+    >>> error = result.error
+    >>> error.size_px, error.covariance_px2.shape, error.rig_std_px, error.parallax
+    ((200, 200), (8, 8), 0.0, None)
+    >>> error.windows.coverage, error.lens_std_px is None, error.field_std_px < 0.1, error.relief_std_px
+    (1.0, False, True, 0.0)
     """
 
     size_px: Size
@@ -58,7 +68,25 @@ class MappingError:
     """Parallax of the mapping, with its standard error."""
 
     def error_px(self, points_px: Points) -> NDArray[np.float64]:
-        """Return the expected RMS error (n,) at points (n, 2) of the reference, raw px of its file or image."""
+        """Return the expected RMS error at points of the reference.
+
+        Parameters
+        ----------
+        points_px
+            (n, 2): x and y, raw px of the reference; (0, 0) is the centre of the top-left pixel.
+
+        Returns
+        -------
+        array
+            (n,), float64: px of the reference.
+
+        Examples
+        --------
+        `result` is that of the example of `align`.
+
+        >>> result.error.error_px(np.array([[100.0, 100.0]])).shape
+        (1,)
+        """
         z_px2 = np.zeros(len(points_px)) if self.parallax is None else self.parallax.variance_px2(points_px)
         modelled_px2, unmodelled_px2 = self.smooth_px2(points_px)
         return np.asarray(np.sqrt(modelled_px2 + np.maximum(unmodelled_px2, z_px2)))
@@ -72,7 +100,25 @@ class MappingError:
         return modelled_px2, self._unmodelled_px2(points_px, far)
 
     def rms_px(self, points_px: Points) -> float:
-        """Return the RMS of the expected error over points (n, 2): the standard error of the mapping."""
+        """Return the RMS of the expected error over points: the standard error of the mapping there.
+
+        Parameters
+        ----------
+        points_px
+            (n, 2): x and y, raw px of the reference.
+
+        Returns
+        -------
+        float
+            Px of the reference; infinite without points.
+
+        Examples
+        --------
+        `result` is that of the example of `align`.
+
+        >>> result.error.rms_px(np.array([[20.0, 20.0], [180.0, 180.0]])) < 0.2
+        True
+        """
         return float(np.sqrt(np.square(self.error_px(points_px)).mean())) if len(points_px) else math.inf
 
     def distortion_px(self, points_px: Points) -> float:
