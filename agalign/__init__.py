@@ -54,9 +54,10 @@ if TYPE_CHECKING:
     from agalign.products.sidecar.alignments import read_alignment as read_alignment
     from agalign.values.alignment import Alignment as Alignment
     from agalign.values.alignment import Prediction as Prediction
-    from agalign.values.alignment import Residual as Residual
     from agalign.values.alignment import Seed as Seed
     from agalign.values.capture import Capture as Capture
+    from agalign.values.mapping_error import MappingError as MappingError
+    from agalign.values.residual import Residual as Residual
 
 _NAMES = {
     "api": "align align_capture align_folder export indices onto warp_onto",
@@ -71,8 +72,10 @@ _NAMES = {
     "products.exports.programs": "ExportReport",
     "products.indices.rasters": "IndexReport",
     "products.sidecar.alignments": "read_alignment",
-    "values.alignment": "Alignment Prediction Residual Seed",
+    "values.alignment": "Alignment Prediction Seed",
     "values.capture": "Capture",
+    "values.mapping_error": "MappingError",
+    "values.residual": "Residual",
 }
 """Public names by module. A module is imported at the first use of one of its names (PEP 562): torch takes seconds."""
 _MODULES = {name: module for module, names in _NAMES.items() for name in names.split()}

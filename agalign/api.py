@@ -18,7 +18,6 @@ from agalign.batch.run import Listener, run_flight
 from agalign.cameras.discover import FolderScan, discover, mosaics_onto
 from agalign.capture.align_bands import align_pairs
 from agalign.capture.band_pair import BandPair, SeedMatrices
-from agalign.capture.decision import with_lens_shapes
 from agalign.capture.reference import Reference
 from agalign.capture.warped_pair import with_metrics
 from agalign.config import DiscoverOptions, RunOptions, Settings
@@ -123,7 +122,7 @@ def align(
         matrices = {"user": geometry.normalised(array_of(seed, "seed"))}
     seed_std: dict[SeedKind, float] = {} if seed_std_px is None else {"user": float(seed_std_px)}
     pair = BandPair("moving", Reference(fixed_raster), moving_raster, matrices, seed_std_px=seed_std)
-    result = with_lens_shapes([pair], align_pairs([pair], settings, quiet))
+    result = align_pairs([pair], settings, quiet)
     return replace(with_metrics(result["moving"], pair), moving_size_px=moving_raster.size_px)
 
 

@@ -1,17 +1,24 @@
 """Rasters, pairs and results that the tests of several packages build."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from functools import cache
 
 import cv2
 import numpy as np
 import pytest
 
+from agalign.batch.capture_task import quiet
+from agalign.capture.align_bands import CaptureEstimation
 from agalign.capture.band_pair import BandPair
+from agalign.capture.candidate import BandCandidates, Candidate, RefinedBand
+from agalign.capture.decision import decide
 from agalign.capture.reference import Reference
-from agalign.values.alignment import JointResult, Residual
+from agalign.config import Settings
+from agalign.values.alignment import Alignment, JointResult, Seed
 from agalign.values.image import Raster
+from agalign.values.issues import Issue
 from agalign.values.lens import Lens
+from agalign.values.residual import Residual
 
 from .conftest import textured_image, textured_pair
 
@@ -49,6 +56,25 @@ def joint_result(
     facts = {"loss": 0.1, "retrieval": 0.9, "chance": 0.004, "iterations": 0, "levels": (1.0,), "recipe": "fast"}
     facts |= {"model_family": "homography", "last_step_px": 0.01, "corner_std_xy_px": ((std_px, std_px),) * 4}
     return JointResult(np.eye(3) if matrix is None else matrix, **facts | changes, corner_covariance_px2=covariance)
+
+
+def decided(pair: BandPair, seed: Seed, candidates: Iterable[Candidate] = (), issue: Issue | None = None) -> Alignment:
+    """The alignment that one band gets with these candidates, without a relief and a rig."""
+    (result,) = decide([BandCandidates(pair, seed, issue, list(candidates))]).values()
+    return result
+
+
+def estimation_of(band: BandCandidates, refined: RefinedBand | None = None) -> CaptureEstimation:
+    """The estimation of a capture with one moving band, without model."""
+    known = {} if refined is None else {band.pair.name: refined}
+    return CaptureEstimation(Settings(), None, quiet, bands={band.pair.name: band}, refined=known)
+
+
+def fitted_to_windows(band: BandCandidates, refined: RefinedBand | None = None) -> Alignment:
+    """The alignment of a band after the estimators that are fitted to windows."""
+    estimation = estimation_of(band, refined)
+    estimation._fit_windows()
+    return estimation.decided()[band.pair.name]
 
 
 def residual_of(centres_px: np.ndarray, shifts_px: np.ndarray, sigma: float = 20.0) -> Residual:

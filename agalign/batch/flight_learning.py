@@ -22,7 +22,6 @@ from agalign.batch.learning_tasks import (
 )
 from agalign.config import Settings
 from agalign.fit.displacement_field import common_field
-from agalign.fit.window_fit import lens_std_px
 from agalign.flight.fingerprint import learning_fingerprint
 from agalign.flight.groups import flight_camera, flight_lenses
 from agalign.flight.learn_rig import learn_rig
@@ -35,11 +34,12 @@ from agalign.method.fast import learn
 from agalign.method.state import JointState, Progress
 from agalign.pixels.raster import without_warnings
 from agalign.values import geometry
-from agalign.values.alignment import Residual
 from agalign.values.capture import Capture
 from agalign.values.geometry import Matrix
+from agalign.values.lens_shapes import lens_std_px
 from agalign.values.process_pool import A, Apply, R
-from agalign.verify.expected_error import unmodelled_std_px
+from agalign.values.residual import Residual
+from agalign.verify.coverage import unmodelled_std_px
 
 _MIN_RIG_CAPTURES, _MAX_RIG_CAPTURES = 6, 48
 """The factors of the rig need the minimum; more than the maximum do not improve it."""
@@ -141,17 +141,17 @@ class _FlightLearner:
     def _holds(self, model: FlightModel) -> bool:
         """Return True if an earlier model fits this flight, so that none must be learned.
 
-        It does if two captures can be aligned, and its rig predicts each aligned band from the others with a standard
-        error of at most `accept_predicted_px`.
+        It does if two captures, or the only one, can be aligned, and its rig predicts each aligned band from the others
+        with a standard error of at most `accept_predicted_px`.
         """
         if model.rig is None or not set(self._bands) <= set(model.bands):
             return False
-        some = [self.captures[len(self.captures) * k // 3] for k in (1, 2)]
+        some = [self.captures[k] for k in dict.fromkeys(len(self.captures) * third // 3 for third in (1, 2))]
         tests = list(filter(None, self.apply(partial(observe_rig, portable(model), self.settings), some)))
         known = [(band, one.observation) for one in tests for band in one.residuals]
         limit_px = self.settings.check.accept_predicted_px
         is_accurate = all(predict_band(model.rig, band, o).std_px <= limit_px for band, o in known)
-        return len(tests) == len(some) and len(known) >= len(self._bands) and is_accurate
+        return len(tests) == len(some) and 2 * len(known) >= len(some) * len(self._bands) and is_accurate
 
     def _network(self) -> tuple[Descriptor, list[LearningCapture]] | None:
         """Return (the network, captures with mappings refined by it); None if no capture can be used.

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from agalign.batch.capture_task import quiet
-from agalign.capture.align_bands import PairAligner, aligned_groups
+from agalign.capture.align_bands import CaptureEstimation, aligned_groups
 from agalign.capture.band_pair import BandPair, read_pairs
 from agalign.capture.by_rig import observed
 from agalign.capture.seeding import SeededPair, find_seed, image_groups
@@ -24,9 +24,10 @@ from agalign.method.refine import FLIGHT_PATCHES
 from agalign.method.state import ImageGroup, JointState
 from agalign.pixels.capture_pixels import CapturePixels
 from agalign.pixels.raster import with_saturation_values
-from agalign.values.alignment import MIN_RETRIEVAL, PairScales, RefinedPair, Residual, Seed
+from agalign.values.alignment import MIN_RETRIEVAL, RefinedPair, Seed
 from agalign.values.capture import Capture
-from agalign.values.geometry import Matrix
+from agalign.values.geometry import Matrix, PairScales
+from agalign.values.residual import Residual
 
 
 @contextmanager
@@ -68,12 +69,18 @@ class LearningCapture:
     """True if all bands that could be read are aligned."""
 
     @classmethod
-    def of(cls, capture: Capture, pairs: Sequence[BandPair], aligner: PairAligner) -> "LearningCapture":
+    def of(cls, capture: Capture, pairs: Sequence[BandPair], estimation: CaptureEstimation) -> "LearningCapture":
         """Collect the results for the pairs of a capture."""
-        in_file_px = {p.name: aligner.result[p.name].in_file_px(p.scales, p.reference_file_px) for p in pairs}
+        result = estimation.decided()
+        in_file_px = {p.name: result[p.name].in_file_px(p.scales, p.reference_file_px) for p in pairs}
         residuals = {b: a.residual for b, a in in_file_px.items() if a.status == "aligned" and a.residual is not None}
-        observation = observed(pairs, aligner.result, capture)
-        return cls(capture, aligner.refined, residuals, observation, is_aligned=len(residuals) == len(pairs))
+        observation = observed(pairs, result, capture)
+        refined = {
+            name: RefinedPair(b.seed, b.joint, b.pair.sizes_px)
+            for name, b in estimation.refined.items()
+            if b.issue is None
+        }
+        return cls(capture, refined, residuals, observation, is_aligned=len(residuals) == len(pairs))
 
     @property
     def mappings(self) -> dict[str, Matrix]:
@@ -107,10 +114,10 @@ class LoadedCapture:
 
     def refined_by(self, net: Descriptor, settings: Settings) -> LearningCapture:
         """Refine the pairs by a network and verify them, as observations of the rig; return them without images."""
-        aligner = PairAligner(settings, None, quiet, is_observation=True)
+        estimation = CaptureEstimation(settings, None, quiet, is_observation=True)
         results = aligned_groups(self.groups, lambda g: refine_with(net, g, settings.joint, quiet, FLIGHT_PATCHES))
-        aligner.verify(self.starts, results)
-        return LearningCapture.of(self.capture, [pair for pair, _ in self.starts], aligner)
+        estimation.add(self.starts, results)
+        return LearningCapture.of(self.capture, [pair for pair, _ in self.starts], estimation)
 
 
 def load_capture(
@@ -183,7 +190,7 @@ def observe_rig(model: FlightModel, settings: Settings, capture: Capture) -> Lea
     """Align a capture by a model, without its rig's predictions; None if that fails."""
     with logged_failure(f"{capture.label} does not determine the rig"):
         pairs = [p for p in _pairs_of(capture, settings, model) if p.has_rig_pixels]
-        aligner = PairAligner(settings, _on_device(model, settings), quiet, is_observation=True)
-        aligner.align(pairs, None, scratch=False)
-        return LearningCapture.of(capture, pairs, aligner)
+        estimation = CaptureEstimation(settings, _on_device(model, settings), quiet, is_observation=True)
+        estimation.align(pairs, None, scratch=False)
+        return LearningCapture.of(capture, pairs, estimation)
     return None

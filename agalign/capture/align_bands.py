@@ -1,4 +1,4 @@
-"""Alignment of the band pairs of one capture: seeds, joint estimation, verification of each pair."""
+"""Alignment of the bands of one capture: seeds, estimators, and the decision among what they find."""
 
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -6,20 +6,16 @@ from dataclasses import dataclass, field, replace
 from functools import partial
 
 from agalign.capture.band_pair import BandPair, read_pairs
-from agalign.capture.by_relief import aligned_by_relief
-from agalign.capture.by_rig import bands_to_learn
-from agalign.capture.decision import (
-    against_rig,
-    by_windows,
-    fall_back_to_seed,
-    verified,
-    with_lens_shapes,
-    with_one_geometry,
-)
+from agalign.capture.by_descriptors import by_descriptors
+from agalign.capture.by_relief import ReliefCandidates, by_relief
+from agalign.capture.by_rig import RigPrediction, bands_to_learn, observed, rig_predictions
+from agalign.capture.by_windows import agreeing_with_seed, extrapolated, fitted_to_windows, spreads_of_relief_px
+from agalign.capture.candidate import BandCandidates, RefinedBand
+from agalign.capture.decision import decide
 from agalign.capture.full_resolution import at_full_resolution
 from agalign.capture.map_estimate import map_estimate
 from agalign.capture.seeding import SeededPair, corrected, find_seed, image_groups
-from agalign.capture.warped_pair import Candidate, with_metrics
+from agalign.capture.warped_pair import with_metrics
 from agalign.config import SeedSettings, Settings
 from agalign.flight.model import FlightModel
 from agalign.method.device import one_thread
@@ -28,20 +24,14 @@ from agalign.method.refine import FLIGHT_PATCHES, PATCHES
 from agalign.method.state import ImageGroup, Progress
 from agalign.pixels.raster import ReadTile
 from agalign.values import geometry
-from agalign.values.alignment import (
-    MIN_RETRIEVAL,
-    MIN_TIMES_CHANCE,
-    Alignment,
-    Alignments,
-    JointResult,
-    RefinedPair,
-    Residual,
-    Seed,
-)
+from agalign.values.alignment import MIN_RETRIEVAL, MIN_TIMES_CHANCE, Alignment, Alignments, JointResult, Seed
 from agalign.values.capture import Capture
+from agalign.values.geometry import Matrix
 from agalign.values.issues import SEED_ASKED_FOR, Issue
 from agalign.values.mapping import PixelMapping
+from agalign.values.mapping_error import MappingError
 from agalign.values.parallax import Parallax, Relief
+from agalign.values.residual import Residual
 
 PairProgress = Callable[[str, str, float], None]
 """Called with the name of the band, the stage and its completed share, 0 to 1."""
@@ -59,17 +49,11 @@ def align_capture_bands(
     A band that cannot be read is `failed`; the others are aligned. `read` reads the pixels of the files, by default
     `read_tile`. Raises UnreadableFileError if the reference cannot be read.
     """
-    start_s = time.perf_counter()
+    start_s, size_px = time.perf_counter(), capture.reference.size_px
     progress(capture.reference.name, "reading", 0.0)
     pairs, unusable = read_pairs(capture, settings.seed, model, read)
     aligned = align_pairs(pairs, settings, progress, model, capture)
-    rig = None if model is None else model.rig
-    if rig is not None and not settings.seed.only:
-        aligned = against_rig(pairs, aligned, rig, capture)
-    if not settings.seed.only:
-        aligned = with_lens_shapes(pairs, aligned, rig)
-    size_px = capture.reference.size_px
-    between_files = {pair.name: _between_files(capture, pair, aligned[pair.name]) for pair in pairs}
+    between_files = {pair.name: aligned[pair.name].in_file_px(pair.scales, size_px) for pair in pairs}
     reliefs = (a.mapping.parallax.relief for a in between_files.values() if a.mapping.parallax is not None)
     relief = next((relief.on_pixels(size_px) for relief in reliefs), None)  # the same in all bands
     result: dict[str, Alignment] = {}
@@ -81,8 +65,10 @@ def align_capture_bands(
         if band.name not in result:
             overlay = Seed("identity", geometry.overlay(size_px, band.size_px), 0.0)
             issues = (unusable[band.name],) if band.name in unusable else ()  # none in a band of the reference's lens
-            mapping = PixelMapping(overlay.fixed_to_moving)
-            result[band.name] = Alignment(mapping, size_px, issues, overlay, moving_size_px=band.size_px)
+            of_lens = Alignment(
+                PixelMapping(overlay.fixed_to_moving), size_px, issues, overlay, moving_size_px=band.size_px
+            )
+            result[band.name] = of_lens if issues else replace(of_lens, error=MappingError(size_px), std_px=0.0)
     seconds = (time.perf_counter() - start_s) / max(1, len(capture.moving))  # most steps are for all bands together
     return {b.name: replace(result[b.name], seconds=seconds) for b in capture.moving}
 
@@ -92,15 +78,8 @@ def _as_written(alignment: Alignment, relief: Relief | None) -> Alignment:
     if relief is None or alignment.mapping.parallax is None:
         return alignment
     parallax = Parallax(relief, alignment.mapping.parallax.baseline).with_occlusions()
-    return replace(alignment, mapping=alignment.mapping.with_parallax(parallax))
-
-
-def _between_files(capture: Capture, pair: BandPair, aligned: Alignment) -> Alignment:
-    """Convert the alignment of a pair to px of the files of its bands; refine it if the files have more pixels."""
-    alignment = aligned.in_file_px(pair.scales, capture.reference.size_px)
-    if pair.is_reduced and alignment.status == "aligned":
-        return at_full_resolution(capture.reference, pair.bands[0], alignment)
-    return alignment
+    error = None if alignment.error is None else replace(alignment.error, parallax=parallax)
+    return replace(alignment, mapping=alignment.mapping.with_parallax(parallax), error=error)
 
 
 def tie_windows(
@@ -131,22 +110,27 @@ def align_pairs(
     capture: Capture | None = None,
 ) -> Alignments:
     """Align the pairs of one `capture`; return the alignments by name, px of the images."""
-    return PairAligner(settings, model, progress).align(pairs, capture)
+    return CaptureEstimation(settings, model, progress).align(pairs, capture)
 
 
 @dataclass
-class PairAligner:
-    """The steps of `align_pairs`; each adds its alignments to `result`."""
+class CaptureEstimation:
+    """The estimators of a capture, in their order; `decide` chooses among what they find.
+
+    Costly ones are for bands that are not delivered without them.
+    """
 
     settings: Settings
     model: FlightModel | None
     progress: PairProgress
     is_observation: bool = False
     """True while a flight is learned: residual lens distortion is fitted to all its captures together."""
-    refined: dict[str, RefinedPair] = field(default_factory=dict)
-    """Results by band of the last optimisation, before they are combined with those of other bands and the rig."""
-    result: Alignments = field(default_factory=dict)
-    """Alignments by band."""
+    bands: dict[str, BandCandidates] = field(default_factory=dict)
+    """What was found, by band."""
+    reliefs: list[ReliefCandidates] = field(default_factory=list)
+    """What was found under the reliefs of the capture."""
+    refined: dict[str, RefinedBand] = field(default_factory=dict)
+    """Results of the last optimisation by band, before they are combined with those of other bands and the rig."""
 
     def align(self, pairs: Sequence[BandPair], capture: Capture | None, *, scratch: bool = True) -> Alignments:
         """Take all steps; return the alignments.
@@ -156,31 +140,31 @@ class PairAligner:
         """
         starts = self._seeded(pairs)
         if self.settings.seed.only:
-            self._keep_seeds(starts)
-        else:
-            self.refine(starts)
-            self._learn(starts, capture, scratch=scratch)
-            self._align_by_windows(starts)
-            self.result = with_one_geometry(pairs, self.result)
-        return self.result
+            return self.decided()
+        self.refine(starts)
+        self._learn(starts, capture, scratch=scratch)
+        self._fit_windows()
+        if self.is_observation or capture is None:
+            return self.decided()
+        self._refine_on_files(capture)
+        return self.decided(self._predictions(pairs, capture))
+
+    def decided(self, predictions: Mapping[str, RigPrediction] | None = None) -> Alignments:
+        """Return the alignments by what has been found."""
+        limit_px = self.settings.check.accept_predicted_px
+        return decide(list(self.bands.values()), self.reliefs, predictions, limit_px)
 
     def _seeded(self, pairs: Sequence[BandPair]) -> list[SeededPair]:
-        """Return the pairs with a seed; the other pairs are failed."""
+        """Find the seeds; return the pairs that have one."""
         starts: list[SeededPair] = []
         for pair in pairs:
             self.progress(pair.name, "seeding", 0.0)
             seed = find_seed(pair, self.settings.seed, self.model)
-            if isinstance(seed, Issue):
-                kind, matrix = next(iter(pair.seed_matrices.items()))
-                self.result[pair.name] = pair.seed_alignment(Seed(kind, matrix, 0.0), seed)
-            else:
+            is_asked_for = self.settings.seed.only and isinstance(seed, Seed)
+            self.bands[pair.name] = BandCandidates(pair, seed, Issue(SEED_ASKED_FOR) if is_asked_for else None)
+            if isinstance(seed, Seed):
                 starts.append((pair, seed))
         return starts
-
-    def _keep_seeds(self, starts: Sequence[SeededPair]) -> None:
-        """Use the seeds as results, as the user requested."""
-        for pair, seed in starts:
-            self.result[pair.name] = fall_back_to_seed(pair, seed, (Issue(SEED_ASKED_FOR),), seed_only=True)
 
     def refine(self, starts: Sequence[SeededPair]) -> None:
         """Align the pairs of the bands that the flight's network contains with this network."""
@@ -203,38 +187,68 @@ class PairAligner:
         again = {k: start for k, r in enumerate(results) if not is_retrieved(r) and (start := corrected(known[k]))}
         for k, result in zip(again, optimised(list(again.values()), [sides[k] for k in again]), strict=True):
             results[k] = result if is_retrieved(result) else results[k]
-        self.verify(known, results)
+        self.add(known, results)
 
     def _learn(self, starts: Sequence[SeededPair], capture: Capture | None, *, scratch: bool) -> None:
         """Align pairs with networks that are learned from scratch."""
-        limit_px = self.settings.check.accept_predicted_px
-        done = {name for name, a in self.result.items() if not scratch or is_delivered(a, limit_px)}
+        result, limit_px = self.decided(), self.settings.check.accept_predicted_px
+        done = {name for name in self.refined if not scratch or result[name].is_usable(limit_px)}
         remaining = [s for s in starts if s[0].name not in done]
         rig = None if self.model is None else self.model.rig
         if remaining and capture is not None and rig is not None:
-            pairs = [pair for pair, _ in starts]
-            names = bands_to_learn(pairs, self.result, rig, capture, limit_px)
+            names = bands_to_learn([pair for pair, _ in starts], result, rig, capture, limit_px)
             remaining = [s for s in remaining if s[0].name in names]
-        results = self._optimised(
-            remaining, [], lambda group, report: align_from_scratch(group, self.settings.joint, report)
-        )
-        if all(alignment.mapping.parallax is None for alignment in self.result.values()):
-            self.verify(remaining, results)
-            return
-        # All bands have one relief: it is estimated again, and used if it delivers more of them.
-        before, learned = dict(self.result), {pair.name: r for (pair, _), r in zip(remaining, results, strict=True)}
-        known = [s for s in starts if s[0].name in learned or s[0].name in self.refined]
-        self.verify(known, [learned.get(pair.name) or self.refined[pair.name].result for pair, _ in known])
-        if sum(is_delivered(a, limit_px) for a in self.result.values()) <= sum(
-            is_delivered(a, limit_px) for a in before.values()
-        ):
-            self.result = before
+        if remaining:
+            results = self._optimised(
+                remaining, [], lambda group, report: align_from_scratch(group, self.settings.joint, report)
+            )
+            self.add(remaining, results)
 
-    def _align_by_windows(self, starts: Sequence[SeededPair]) -> None:
-        """Align by windows the pairs without retrieval of held-out patches."""
-        if self._may_be_homography:
-            for pair, _ in starts:
-                self.result[pair.name] = by_windows(pair, self.result[pair.name])
+    def _fit_windows(self) -> None:
+        """Fit windows alone where the descriptors have no result, and lens shapes where a part has no windows."""
+        if not self._may_be_homography:
+            return
+        for name, alignment in self.decided().items():
+            band = self.bands[name]
+            if alignment.status in ("aligned", "predicted"):
+                continue
+            by_windows = fitted_to_windows(band)
+            if by_windows is None or not by_windows.may_predict:
+                by_windows = agreeing_with_seed(band)
+            band.candidates += [] if by_windows is None else [by_windows]
+        if not self.is_observation:
+            spreads_px = self._spreads_of_relief_px()
+            for band in self.bands.values():
+                accepted = [c for c in band.candidates if not c.issues]
+                shaped = [extrapolated(c, spreads_px[band.pair.name]) for c in band.candidates[-1:] if not accepted]
+                band.candidates += [candidate for candidate in shaped if candidate is not None]
+
+    def _spreads_of_relief_px(self) -> dict[str, float]:
+        """Return the relief that homographies lack, by band."""
+        known = {name: r.joint.fixed_to_moving for name, r in self.refined.items() if is_retrieved(r.joint)}
+        return spreads_of_relief_px([band.pair for band in self.bands.values()], known)
+
+    def _predictions(self, pairs: Sequence[BandPair], capture: Capture) -> dict[str, RigPrediction]:
+        """Return the predictions of the rig of the flight from the aligned bands of the capture."""
+        rig = None if self.model is None else self.model.rig
+        if rig is None:
+            return {}
+        result = self.decided()
+        return rig_predictions(pairs, result, rig, observed(pairs, result, capture))
+
+    def _refine_on_files(self, capture: Capture) -> None:
+        """Refine aligned bands on tiles of the files, if these have more pixels than the images."""
+        result = self.decided()
+        for name, band in self.bands.items():
+            accepted = [c for c in band.candidates if not c.issues]
+            is_wanted = band.pair.is_reduced and accepted and result[name].mapping.parallax is None
+            if not is_wanted or result[name].status != "aligned":
+                continue
+            refined = at_full_resolution(capture.reference, band, accepted[-1])
+            if isinstance(refined, Issue):
+                band.issue, band.candidates = refined, []
+            elif refined is not None:
+                band.candidates.append(refined)
 
     def _optimised(
         self, starts: Sequence[SeededPair], sides: Sequence[int], align: Callable[[ImageGroup, Progress], Results]
@@ -246,54 +260,51 @@ class PairAligner:
         report("refining", 0.0)
         return aligned_groups(image_groups(starts, sides), lambda group: align(group, report))
 
-    def verify(self, starts: Sequence[SeededPair], results: Results) -> None:
-        """Combine the results of a capture by MAP estimation and verify each one.
+    def add(self, starts: Sequence[SeededPair], results: Results) -> None:
+        """Combine the results of some pairs with those of the other bands by MAP estimation, and add the candidates.
 
         For an observation of the rig, no displacement fields are fitted. A model family that the user chose is not
         replaced by a relief or a displacement field.
         """
-        self.refined |= {
-            pair.name: RefinedPair(seed, result, pair.sizes_px)
-            for (pair, seed), result in zip(starts, results, strict=True)
-            if isinstance(result, JointResult)
-        }
+        for (pair, seed), result in zip(starts, results, strict=True):
+            found = self.bands.setdefault(pair.name, BandCandidates(pair, seed))
+            found.issue = result if isinstance(result, Issue) else None
+            self.refined[pair.name] = RefinedBand.of(pair, seed, result)
         use = self.settings.relief.use if self._may_be_homography else "never"
-        candidates = self.candidates([Candidate.of(*start, r) for start, r in zip(starts, results, strict=True)])
+        bands, by_halves = self._combined()
         self.progress(starts[0][0].name if starts else "", "relief", 0.0)
-        alignments, along_a_line = aligned_by_relief(candidates, use, is_observation=self.is_observation)
-        for name, candidate in ((c.pair.name, c) for c in candidates if c.pair.name not in alignments):
+        reliefs, along_a_line = by_relief(bands, use, is_observation=self.is_observation)
+        self.reliefs += reliefs
+        under = {name for relief in reliefs if relief.fits_better for name in relief.candidates}
+        new = {pair.name for pair, _ in starts}
+        for band in (b for b in bands if b.pair.name in new and b.pair.name not in under and b.issue is None):
+            name = band.pair.name
             self.progress(name, "checking", 0.0)
-            alignments[name] = verified(candidate, "never" if self.is_observation or name in along_a_line else use)
-        self.result |= with_one_geometry([pair for pair, _ in starts], alignments)
+            field_use = "never" if self.is_observation or name in along_a_line else use
+            self.bands[name].candidates += by_descriptors(band, by_halves.get(name), field_use)
 
-    def candidates(self, measured: Sequence[Candidate]) -> list[Candidate]:
-        """Return candidates after the MAP estimation of all bands of the capture."""
+    def _combined(self) -> tuple[list[RefinedBand], dict[str, tuple[Matrix, Matrix]]]:
+        """Return the refined bands after the MAP estimation of all bands of the capture, and the homographies by each
+        half of the windows.
+        """
+        bands = self.refined
         if not self._may_be_homography:  # as the MAP estimate is
-            return list(measured)
-        pairs, joint = [c.pair for c in measured], {c.pair.name: c.joint for c in measured}
-        residuals = {c.pair.name: c.warped.residual for c in measured}
+            return list(bands.values()), {}
+        pairs, joint = [b.pair for b in bands.values()], {name: b.joint for name, b in bands.items()}
+        residuals = {name: b.warped.residual for name, b in bands.items()}
         halves = (
             {name: r.chessboard_half(even=is_even_cell) for name, r in residuals.items()}
             for is_even_cell in (True, False)
         )
         rig = None if self.model is None else self.model.rig
         estimates, black, white = (map_estimate(pairs, joint, some, rig) for some in (residuals, *halves))
-        return [
-            replace(c, joint=estimates[n], by_halves=(black[n].fixed_to_moving, white[n].fixed_to_moving))
-            for n, c in zip(joint, measured, strict=True)
-        ]
+        by_halves = {n: (black[n].fixed_to_moving, white[n].fixed_to_moving) for n in bands}
+        return [replace(b, joint=estimates[name]) for name, b in bands.items()], by_halves
 
     @property
     def _may_be_homography(self) -> bool:
         """False if the user chose a model family with fewer parameters."""
         return self.settings.joint.model_family in ("auto", "homography")
-
-
-def is_delivered(alignment: Alignment, limit_px: float) -> bool:
-    """Return True if a band is aligned, or predicted with a standard error of at most the limit."""
-    if alignment.status == "predicted" and alignment.prediction is not None:
-        return alignment.prediction.std_px <= limit_px
-    return alignment.status == "aligned"
 
 
 def is_retrieved(result: JointResult | Issue) -> bool:

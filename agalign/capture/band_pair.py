@@ -13,7 +13,6 @@ from agalign.capture.reference import Reference
 from agalign.capture.tag_seeds import tag_seeds
 from agalign.config import SeedSettings
 from agalign.errors import AgalignError
-from agalign.fit.window_fit import lens_std_px
 from agalign.fit.windows import FixedWindows
 from agalign.flight.model import FlightModel
 from agalign.flight.rig_prediction import unobserved_error_px
@@ -22,12 +21,12 @@ from agalign.pixels.raster import ReadTile, read_for_alignment
 from agalign.pixels.stripes import without_common_stripes
 from agalign.pixels.structure import blur_px
 from agalign.values import geometry
-from agalign.values.alignment import SAME_SCALES, Alignment, PairScales, Prediction, Seed
 from agalign.values.capture import Band, Capture
 from agalign.values.choices import SeedKind, Space
-from agalign.values.geometry import Matrix
+from agalign.values.geometry import SAME_SCALES, Matrix, PairScales
 from agalign.values.image import Raster
 from agalign.values.issues import BLANK_MOVING, FEW_VALID, NO_SUCH_SEED, UNREADABLE, Issue, IssueKind
+from agalign.values.lens_shapes import lens_std_px
 from agalign.values.mapping import DisplacementField, PixelMapping
 from agalign.values.pixel_units import PixelScale
 
@@ -172,29 +171,6 @@ class BandPair:
         """(width, height) of the reference's file."""
         width, height = (round(n / s) for n, s in zip(self.fixed.size_px, self.scales.fixed, strict=True))
         return width, height
-
-    def prediction_of(
-        self, mapping: PixelMapping, std_px: float, covariance_px2: NDArray[np.float64] | None = None
-    ) -> Prediction:
-        """Return the prediction of a mapping between the images with this standard error.
-
-        `covariance_px2` (12, 12) is that of an extrapolated mapping, px of the reference's file.
-        """
-        matrix = mapping.fixed_to_moving
-        error_px = self.in_moving_file_px(std_px, matrix)
-        return Prediction(self.scales.between_files(matrix), "windows", error_px, covariance_px2=covariance_px2)
-
-    def seed_alignment(self, seed: Seed, *issues: Issue) -> Alignment:
-        """Return an alignment with the mapping of a seed, and with these issues."""
-        return Alignment(self.mapping(seed.fixed_to_moving), self.fixed.size_px, issues, seed)
-
-    def predicted_alignment(self, alignment: Alignment, std_px: float, *issues: Issue) -> Alignment:
-        """Return as a prediction, with this standard error, an alignment that its windows do not confirm everywhere.
-
-        `issues` precede its own.
-        """
-        prediction = self.prediction_of(alignment.mapping, std_px)
-        return replace(alignment, issues=(*issues, *alignment.issues), prediction=prediction)
 
     def in_moving_file_px(self, distance_px: float, fixed_to_moving: Matrix) -> float:
         """Convert a distance in the fixed image to the moving file, for a homography between the images."""

@@ -1,14 +1,14 @@
-"""Relief of a capture: a candidate for the geometry of all its bands, compared with their homographies.
+"""Candidates under the relief of a capture, a geometry of all its bands that is compared with their homographies.
 
 A relief that was estimated without a band verifies the band, in windows that took no part in the fit of planes and
 baselines: with few bands the relief of all others, else that of half of the bands. A band that the relief of the others
 does not explain, as it was exposed at another time or is noisy, gets a homography and a baseline of its own under that
-relief, and is predicted by them if they do not pass verification. Either all bands with the same reference image use
-the relief, or none: bands of much lower resolution have another one.
+relief. Either all bands with the same reference image use the relief, or none: bands of much lower resolution have
+another one.
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -19,7 +19,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from agalign.capture.band_pair import BandPair
+from agalign.capture.candidate import Candidate, RefinedBand, mapping_error
 from agalign.capture.common_parallax import (
     MIN_BANDS,
     MIN_PARALLAX_PX,
@@ -28,7 +28,8 @@ from agalign.capture.common_parallax import (
     layout_of,
     parallax_groups,
 )
-from agalign.capture.warped_pair import Candidate, WarpedPair
+from agalign.capture.reference import Reference
+from agalign.capture.warped_pair import WarpedPair
 from agalign.errors import GeometryError
 from agalign.fit.dense import DenseMatching, View, nearer_sign
 from agalign.fit.displacement_field import MIN_WINDOWS
@@ -43,38 +44,55 @@ from agalign.fit.window_fit import (
     parallax_of,
 )
 from agalign.pixels.band_resampling import channel_mean
-from agalign.values.alignment import Alignment, Alignments, JointResult, Residual
+from agalign.values.alignment import JointResult
 from agalign.values.choices import Geometry, ReliefUse
 from agalign.values.image import FloatImage
-from agalign.values.issues import OTHER_GEOMETRY, Issue
 from agalign.values.mapping import PixelMapping
-from agalign.values.parallax import Parallax, Relief
-from agalign.verify.checks import BY_PARALLAX, BY_WINDOWS, MAX_ALIAS_PEAK, MAX_SHIFT_PX, relief_issues
+from agalign.values.parallax import RELIEF_STEP, Parallax, Relief
+from agalign.values.residual import Residual
+from agalign.verify.checks import BY_PARALLAX, BY_WINDOWS, MAX_ALIAS_PEAK, MAX_SHIFT_PX
 
 _MIN_OBSERVED_SHARE = 0.75
 """Minimum share of aligned windows for an observation of a rig, which contains no depth edges: 0.79 or more in scenes
 with booms and plants at 1 m."""
 
 
-def aligned_by_relief(
-    candidates: Sequence[Candidate], use: ReliefUse, *, is_observation: bool = False
-) -> tuple[Alignments, set[str]]:
-    """Align bands by one relief of the capture, with lens shapes where no rig contains the distortion.
+@dataclass(frozen=True)
+class ReliefCandidates:
+    """The candidates of the bands of a capture under one relief."""
 
-    Return the bands that are aligned or predicted, and the names of those with common displacements along a line that
-    neither a relief nor displacement fields must follow.
+    reference: Reference
+    """The reference image that they have in common."""
+    candidates: Mapping[str, Candidate]
+    """By band."""
+    gain_px: float
+    """Decrease of the shifts of held-out windows relative to the homographies, in half of the bands or more."""
+
+    @property
+    def fits_better(self) -> bool:
+        """True if the relief fits half of the bands at least as well as their homographies."""
+        return self.gain_px >= 0
+
+
+def by_relief(
+    bands: Sequence[RefinedBand], use: ReliefUse, *, is_observation: bool = False
+) -> tuple[list[ReliefCandidates], set[str]]:
+    """Return the candidates under the reliefs of a capture, with lens shapes where no rig contains the distortion.
+
+    Bands with different kinds of lens models determine a relief each. Also return the names of bands with common
+    displacements along a line, which neither a relief nor displacement fields must follow.
     Bands without a result, and those with another kind of lens model, follow the relief too.
     With `use` "auto" a relief is only estimated if the residuals of the homographies contain common parallax. For an
     observation of the rig, only the homographies matter, and the parallax of windows suffices.
     """
-    alignments: Alignments = {}
+    result: list[ReliefCandidates] = []
     along_a_line: set[str] = set()
     if use == "never":
-        return alignments, along_a_line
+        return result, along_a_line
     # Along one line, larger common displacements are those of shadows or leaves, not of lenses; a displacement field
     # would follow them too.
     max_line_px = 1.0
-    for group in parallax_groups(candidates):
+    for group in parallax_groups(bands):
         if len(group) < MIN_BANDS:
             continue
         parallax_px, on_a_line = common_parallax_px(group)
@@ -82,15 +100,16 @@ def aligned_by_relief(
             along_a_line |= {c.pair.name for c in group}
         elif use == "always" or parallax_px >= MIN_PARALLAX_PX:
             with suppress(GeometryError):
-                alignments |= _observed(group) if is_observation else _aligned_group(group, candidates)
-    return alignments, along_a_line
+                relief = _observed(group) if is_observation else _of_group(group, bands)
+                result += [] if relief is None else [relief]
+    return result, along_a_line
 
 
 @dataclass(frozen=True)
 class _Band:
     """One band with the mapping of its reference plane and its baseline."""
 
-    candidate: Candidate
+    refined: RefinedBand
     plane: PixelMapping
     baseline: tuple[float, float] = (0.0, 0.0)
     covariance_px2: NDArray[np.float64] | None = None
@@ -99,7 +118,7 @@ class _Band:
     @property
     def name(self) -> str:
         """Name of the pair."""
-        return self.candidate.pair.name
+        return self.refined.pair.name
 
     def mapping(self, relief: Relief, *, with_occlusions: bool = False) -> PixelMapping:
         """Return the mapping with a relief; verification excludes occluded pixels, robust fits do not need to."""
@@ -117,84 +136,89 @@ class _Band:
     def joint(self) -> JointResult:
         """The result with the homography of the plane, which is fitted to windows and verified with others."""
         assert self.covariance_px2 is not None
-        joint = replace(self.candidate.joint, recipe=BY_WINDOWS)
+        joint = replace(self.refined.joint, recipe=BY_WINDOWS)
         return joint.with_homography(self.plane.fixed_to_moving, self.covariance_px2)
 
     @cached_property
     def by_homography(self) -> Residual:
-        """The residual of the held-out windows under the homography of the candidate."""
-        return self.candidate.held_out_residual(self.candidate.warped.mapping)
+        """The residual of the held-out windows under the homography of the descriptors."""
+        return self.refined.held_out_residual(self.refined.warped.mapping)
 
-    def aligned(self, mapping: PixelMapping, held_out: Residual) -> Alignment:
-        """Return the alignment by a mapping with a relief that passes verification in held-out windows."""
+    def held_out(self, relief: Relief) -> WarpedPair:
+        """Measure the windows that take no part in the fit, with a relief of other bands."""
+        pair = self.refined.pair
+        return WarpedPair.of(pair, self.mapping(relief, with_occlusions=True), pair.reference.white_windows)
+
+    def candidate(self, mapping: PixelMapping, held_out: WarpedPair) -> Candidate:
+        """Return the candidate by a mapping with a relief; its windows are held out, under a relief of other bands."""
         kind: Geometry = "relief" if mapping.field is None else "relief and field"
-        p95_px: dict[Geometry, float] = {"homography": self.by_homography.p95_px, kind: held_out.p95_px}
-        at_seed = self.candidate.pair.seed_alignment(self.candidate.seed)
-        lens_std_px = self.candidate.pair.unknown_lens_std_px
-        measured = replace(at_seed, mapping=mapping, joint=self.joint, residual=held_out, lens_std_px=lens_std_px)
-        return replace(measured, candidates=p95_px)
+        p95_px: dict[Geometry, float] = {"homography": self.by_homography.p95_px, kind: held_out.residual.p95_px}
+        pair, windows = self.refined.pair, held_out.residual
+        error = mapping_error(pair, mapping, self.joint.covariance_px2, windows)
+        return Candidate("relief", pair, mapping, error, windows, self.joint, held_out, p95_px=p95_px)
 
 
-def _observed(group: Sequence[Candidate]) -> Alignments:
+def _observed(group: Sequence[RefinedBand]) -> ReliefCandidates | None:
     """Align a group by the planes of its bands and the parallax of windows, without a relief of every pixel.
 
-    The parallax of a held-out window is that by the other bands. Empty if no parallax or the homographies alone explain
-    the windows better. Raises GeometryError.
+    The parallax of a held-out window is that by the other bands. None without parallax. Raises GeometryError.
     """
     bands, reference = [_Band(c, c.warped.mapping) for c in group], group[0].pair.reference
     rounds, model = 2, None  # large shifts are measured in steps
     for _ in range(rounds):
-        consistent = consistent_bands(_window_shifts(bands), [b.candidate for b in bands])
+        consistent = consistent_bands(_window_shifts(bands), [b.refined for b in bands])
         if consistent is None:
-            return {}
+            return None
         kept, model = consistent
         bands = [bands[k].fitted(fit) for k, fit in zip(kept, model.fits, strict=True)]
     assert model is not None
-    if layout_of([b.candidate for b in bands]) is None and are_on_a_line(model.baselines):
-        return {}
-    warped = [band.candidate.pair.warped_moving(band.plane) for band in bands]
+    if layout_of([b.refined for b in bands]) is None and are_on_a_line(model.baselines):
+        return None
+    warped = [band.refined.pair.warped_moving(band.plane) for band in bands]
     residuals = [reference.white_windows.residuals(image) for image in warped]
-    windows, result = WindowShifts.of(residuals, [band.plane for band in bands]), dict[str, Alignment]()
+    windows, result = WindowShifts.of(residuals, [band.plane for band in bands]), dict[str, Candidate]()
     if not windows.are_enough(MIN_WINDOWS):
-        return {}
+        return None
     relief = windows.relief(parallax_of(windows.shifts_px, model.baselines, windows.weights), reference.grey.size_px)
     for number, band in enumerate(bands):
         others = np.delete(np.arange(len(bands)), number)
         by_others_px = parallax_of(windows.shifts_px[:, others], model.baselines[others], windows.weights[:, others])
         shifts_px = windows.shifts_of(residuals[number], by_others_px[:, None] * model.baselines[number])
         held_out = residuals[number].with_shifts(residuals[number].shifts_px - shifts_px)
-        pair, mapping = band.candidate.pair, band.mapping(relief)
+        pair, mapping = band.refined.pair, band.mapping(relief)
         # Planes of different depth resemble a repetition in images without relief.
         verified = WarpedPair(pair, mapping, pair.warped_moving(mapping), reference.white_windows, held_out)
+        candidate = band.candidate(mapping, verified)
         # A window across a depth edge contains the parallax of neither side.
-        issues = [issue for issue in verified.issues(band.joint) if issue.kind not in BY_PARALLAX]
+        issues = [issue for issue in candidate.issues if issue.kind not in BY_PARALLAX]
         aligned_share = float((held_out.lengths_px <= MAX_SHIFT_PX * pair.file_pixel_size_px).mean())
         if not issues and aligned_share >= _MIN_OBSERVED_SHARE:
-            result[band.name] = band.aligned(mapping, held_out)
-    return result if _is_better(bands, result) else {}
+            result[band.name] = replace(candidate, ignored=BY_PARALLAX)
+    return ReliefCandidates(reference, result, _gain_px(bands, result))
 
 
-def _aligned_group(group: Sequence[Candidate], candidates: Sequence[Candidate]) -> Alignments:
-    """Align a group by its relief, and the other bands by it too; empty if their homographies fit the group better.
+def _of_group(group: Sequence[RefinedBand], others: Sequence[RefinedBand]) -> ReliefCandidates | None:
+    """Return the candidates of a group under its relief, and those of the other bands; None without a relief.
 
     Raises GeometryError.
     """
     estimate = _Estimate.of(group)
     if estimate is None:
-        return {}
-    result: Alignments = {}
-    for band, verifying in zip(estimate.bands, cycle(estimate.verifying_reliefs), strict=False):
-        result |= estimate.alignment(band, verifying)
-    if not _is_better(estimate.bands, result):
-        return {}
-    result |= estimate.align_other_bands(candidates)
-    if not any(c.pair.has_rig for c in group):
-        result |= {
-            name: _with_field(candidate.pair, result[name])
-            for candidate in candidates
-            if (name := candidate.pair.name) in result
-        }
-    return result
+        return None
+    held_out = [
+        band.held_out(verifying)
+        for band, verifying in zip(estimate.bands, cycle(estimate.verifying_reliefs), strict=False)
+    ]
+    estimate = estimate.with_std_px(held_out)
+    result: dict[str, Candidate] = {}
+    for band, warped in zip(estimate.bands, held_out, strict=True):
+        result |= estimate.candidate(band, warped)
+    gain_px = _gain_px(estimate.bands, result)
+    if gain_px >= 0:
+        result |= estimate.of_other_bands(others)
+        if not any(c.pair.has_rig for c in group):
+            result = {name: _with_field(candidate) for name, candidate in result.items()}
+    return ReliefCandidates(group[0].pair.reference, result, gain_px)
 
 
 @dataclass(frozen=True)
@@ -207,7 +231,7 @@ class _Estimate:
     """From the bands of `_verifying`: relief i of n verifies the bands i, i + n and so on."""
 
     @classmethod
-    def of(cls, group: Sequence[Candidate]) -> "_Estimate | None":
+    def of(cls, group: Sequence[RefinedBand]) -> "_Estimate | None":
         """Estimate the relief from bands with common parallax; None if their windows determine no baselines of lenses.
 
         Raises GeometryError.
@@ -239,7 +263,7 @@ class _Estimate:
             return None
         selections = [range(len(bands)), *_verifying(range(len(bands)))]
         relief, *verifying_reliefs = matching.refined(_views(bands), selections)
-        result = cls(bands, replace(relief, std_px=_std_px(verifying_reliefs)), verifying_reliefs)
+        result = cls(bands, relief, verifying_reliefs)
         return result.negated if layout is None and nearer_sign(matched, baselines) < 0 else result
 
     @property
@@ -250,13 +274,25 @@ class _Estimate:
             self, bands=bands, relief=self.relief.negated, verifying_reliefs=[r.negated for r in self.verifying_reliefs]
         )
 
-    def fitted(self, candidate: Candidate) -> _Band | None:
+    def with_std_px(self, held_out: Sequence[WarpedPair]) -> "_Estimate":
+        """Return the estimate with the standard error of its relief, given the held-out windows of its bands.
+
+        Where the bands disagree by more than the windows do, the difference of the reliefs says little: nine of ten
+        windows where it is above 2 px have shifts below 4 px, and two of three below 1 px (a bench with plants, boxes
+        and a boom). The p95 of the windows, by the baselines, is the largest standard error.
+        """
+        lengths = np.linalg.norm(_baselines(self.bands), axis=1)
+        p95_px = [warped.residual.p95_px for warped in held_out]
+        max_std_px = float(np.median(p95_px / np.maximum(lengths, 1e-6)))
+        return replace(self, relief=replace(self.relief, std_px=_std_px(self.verifying_reliefs, max_std_px)))
+
+    def fitted(self, candidate: RefinedBand) -> _Band | None:
         """Fit homography and baseline of a band under the relief of the others; None if its windows determine none.
 
         The layout of the lenses, scaled to the baselines of the others, is the prior of the baseline. Raises
         GeometryError.
         """
-        prior, layout = BaselinePrior(), layout_of([candidate, *(b.candidate for b in self.bands)])
+        prior, layout = BaselinePrior(), layout_of([candidate, *(b.refined for b in self.bands)])
         if layout is not None:
             own, others, baselines = layout[0], layout[1:], _baselines(self.bands)
             layout_std = 0.3  # of lens positions without tags, which deviate by up to 0.1 of the longest baseline
@@ -272,69 +308,59 @@ class _Estimate:
         baseline, covariance_px2 = fitted[0].parallax.baseline, fitted[1].covariance_px2[:8, :8]
         return _Band(candidate, fitted[0].without_parallax, baseline, covariance_px2)
 
-    def align_other_bands(self, candidates: Sequence[Candidate]) -> Alignments:
-        """Align or predict bands of the same reference where windows allow it, except those of the estimate: a relief
-        does not verify a band that it is estimated from.
+    def of_other_bands(self, others: Sequence[RefinedBand]) -> dict[str, Candidate]:
+        """Return the candidates of bands of the same reference where windows allow it, except those of the estimate: a
+        relief does not verify a band that it is estimated from.
         """
-        names, reference = {band.name for band in self.bands}, self.bands[0].candidate.pair.reference
-        result: Alignments = {}
-        for candidate in candidates:
-            pair = candidate.pair
+        names, reference = {band.name for band in self.bands}, self.bands[0].refined.pair.reference
+        result: dict[str, Candidate] = {}
+        for other in others:
+            pair = other.pair
             if pair.name in names or pair.is_coarse or pair.reference is not reference:
                 continue
             with suppress(GeometryError):
-                band = self.fitted(candidate)
-                result |= {} if band is None else self.alignment(band)
+                band = self.fitted(other)
+                result |= {} if band is None else self.candidate(band, band.held_out(self.relief))
         return result
 
-    def alignment(self, band: _Band, verifying: Relief | None = None) -> Alignments:
-        """Align a band by the relief of all bands, or predict it.
+    def candidate(self, band: _Band, held_out: WarpedPair) -> dict[str, Candidate]:
+        """Return the candidate of a band by the relief of all bands, with its name, and with its held-out windows.
 
-        The held-out windows of a band of the estimate are measured by the relief `verifying` of other bands. A band is
-        also predicted if the quality raster would flag most of the image. Empty if the windows are few, half of them
-        are not aligned, or the scene repeats.
+        Empty if the checks find issues, and the windows are few, half of them are not aligned, or the scene repeats.
         """
-        candidate, pair = band.candidate, band.candidate.pair
+        pair = band.refined.pair
         mapping = band.mapping(self.relief, with_occlusions=True)
-        by_others = mapping if verifying is None else band.mapping(verifying, with_occlusions=True)
-        warped = WarpedPair.of(pair, by_others, pair.reference.white_windows)
-        residual = warped.residual
-        issues = warped.issues(band.joint)
-        if not issues:
-            # With the standard error of the written relief, which the error map has.
-            warped = replace(warped, mapping=mapping)
-            issues = tuple(relief_issues(warped.evidence(band.joint)))
-        if not issues:
-            return {band.name: band.aligned(mapping, residual)}
-        is_known = len(residual.measured_px) >= MIN_WINDOWS
-        is_known &= residual.median_px <= MAX_SHIFT_PX * pair.file_pixel_size_px
-        if not is_known or warped.alias_peak().ratio > MAX_ALIAS_PEAK:
-            return {}
-        joint = None if candidate.issue is not None else candidate.joint
-        by_relief = replace(pair.seed_alignment(candidate.seed), mapping=mapping, joint=joint, residual=residual)
-        predicted = pair.predicted_alignment(by_relief, warped.std_px(band.joint), Issue(OTHER_GEOMETRY), *issues)
-        return {band.name: predicted}
+        candidate = band.candidate(mapping, held_out)
+        windows = candidate.windows
+        is_known = len(windows.measured_px) >= MIN_WINDOWS
+        is_known &= windows.median_px <= MAX_SHIFT_PX * pair.file_pixel_size_px
+        if not candidate.issues or (is_known and held_out.alias_peak().ratio <= MAX_ALIAS_PEAK):
+            return {band.name: replace(candidate, is_confirmed=True)}
+        return {}
 
 
-def _with_field(pair: BandPair, alignment: Alignment) -> Alignment:
+def _with_field(candidate: Candidate) -> Candidate:
     """Add the displacement field that its relief and lens shapes leave, if held-out windows confirm it."""
-    mapping = alignment.mapping
+    pair, mapping = candidate.pair, candidate.mapping
     displacement = pair.reference.displacement_field.refine(channel_mean(pair.moving_image), mapping)
-    return replace(alignment, mapping=replace(mapping, field=displacement.field)) if displacement.field else alignment
+    if displacement.field is None:
+        return candidate
+    p95_px = {**candidate.p95_px, "relief and field": displacement.after_p95_px}
+    return replace(candidate, mapping=replace(mapping, field=displacement.field), p95_px=p95_px)
 
 
-def _is_better(bands: Sequence[_Band], result: Alignments) -> bool:
-    """Return True if a relief fits half of the bands better than their homographies.
+def _gain_px(bands: Sequence[_Band], result: Mapping[str, Candidate]) -> float:
+    """Return the decrease of the shifts of held-out windows by a relief, in half of the bands or more.
 
     A band that it predicts counts only if a homography cannot align it: fields follow small parallax better.
     """
     gains = []
     for band in bands:
-        alignment, plane = result.get(band.name), band.by_homography
-        is_fitted = alignment is not None and (alignment.status == "aligned" or plane.p95_px > MAX_SHIFT_PX)
-        known = alignment.residual if alignment is not None and is_fitted else None
+        candidate, plane = result.get(band.name), band.by_homography
+        is_fitted = candidate is not None and (not candidate.issues or plane.p95_px > MAX_SHIFT_PX)
+        known = candidate.windows if candidate is not None and is_fitted else None
         gains.append(-math.inf if known is None else _decrease_px(plane, known))
-    return median_high(gains) >= 0
+    return median_high(gains)
 
 
 def _decrease_px(plane: Residual, relief: Residual) -> float:
@@ -357,17 +383,22 @@ def _verifying(bands: Sequence[int]) -> list[list[int]]:
     return [[b for b in bands if b % 2 != parity] for parity in (0, 1)]
 
 
-def _std_px(reliefs: Sequence[Relief]) -> FloatImage:
+def _std_px(reliefs: Sequence[Relief], max_std_px: float) -> FloatImage:
     """Return the standard error (height, width) of a relief from those of n selections of its bands.
 
-    It is the delete-a-group jackknife, sqrt((n - 1) / n sum |z_i - mean|^2), as RMS over the surroundings: reliefs from
-    different bands differ at depth edges and in areas without texture.
+    It is the delete-a-group jackknife, sqrt((n - 1) / n sum |z_i - mean|^2), as the median over the surroundings:
+    reliefs from different bands differ at depth edges and in areas without texture, by values that single pixels do not
+    have in common. It approaches `max_std_px`, as the harmonic sum of both variances.
     """
     surroundings_px = 17  # the distance of the nodes of an error map
     values = np.stack([relief.parallax_px for relief in reliefs])
-    square = (len(values) - 1) * np.square(values - values.mean(axis=0)).mean(axis=0)
-    # The running sums of the filter may be just below 0.
-    return np.asarray(np.sqrt(np.maximum(cv2.blur(square, (surroundings_px, surroundings_px)), 0)))
+    std_px = np.sqrt((len(values) - 1) * np.square(values - values.mean(axis=0)).mean(axis=0))
+    # The median of bytes is fast; a byte is a step of 3.5 %, and the median does not depend on the scale.
+    least_px, steps_per_octave = RELIEF_STEP, 20
+    octaves = np.log2(np.maximum(std_px, least_px) / least_px)
+    median = cv2.medianBlur(np.clip(octaves * steps_per_octave, 0, 255).astype(np.uint8), surroundings_px)
+    median_px = least_px * np.exp2(median.astype(np.float32) / steps_per_octave)
+    return np.asarray(median_px / np.sqrt(1 + np.square(median_px / max_std_px)), np.float32)
 
 
 def _window_shifts(
@@ -375,7 +406,7 @@ def _window_shifts(
 ) -> WindowShifts:
     """Measure the windows of the fit with the planes of the bands, or with a relief."""
     mappings = [b.plane if relief is None else b.mapping(relief) for b in bands]
-    residuals = [b.candidate.fit_residual(m) for b, m in zip(bands, mappings, strict=True)]
+    residuals = [b.refined.fit_residual(m) for b, m in zip(bands, mappings, strict=True)]
     return WindowShifts.of(residuals, mappings, with_lens_shapes=with_lens_shapes)
 
 
@@ -386,4 +417,4 @@ def _baselines(bands: Sequence[_Band]) -> NDArray[np.float64]:
 
 def _views(bands: Sequence[_Band]) -> list[View]:
     """Return the bands as input of dense matching."""
-    return [View(channel_mean(b.candidate.pair.moving_image), b.plane, b.baseline) for b in bands]
+    return [View(channel_mean(b.refined.pair.moving_image), b.plane, b.baseline) for b in bands]

@@ -3,16 +3,21 @@
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
 from agalign.capture.band_pair import BandPair
+from agalign.capture.candidate import Candidate
+from agalign.capture.seeding import find_rotated
+from agalign.capture.warped_pair import WarpedPair
 from agalign.flight.rig import Observation, Rig, distance_px
 from agalign.flight.rig_prediction import predict_band
 from agalign.values.alignment import MIN_TIMES_CHANCE, Alignments, JointResult, Prediction
 from agalign.values.capture import Capture
 from agalign.values.geometry import Matrix
 from agalign.values.mapping import PixelMapping
+from agalign.values.mapping_error import MappingError
 from agalign.values.parallax import Parallax
 
 
@@ -41,6 +46,23 @@ class RigPrediction:
     def mapping(self) -> PixelMapping:
         """The predicted mapping between the images, with the relief of the capture."""
         return self.pair.mapping(self.fixed_to_moving).with_parallax(self.parallax)
+
+    @cached_property
+    def candidate(self) -> Candidate:
+        """The predicted mapping; the windows under it say nothing about it, as the band did not pass verification."""
+        std_px = self.of_scene.std_px / self.pair.in_moving_file_px(1.0, self.fixed_to_moving)
+        mapping = self._warped.mapping
+        error = MappingError(self.pair.fixed.size_px, rig_std_px=std_px, parallax=mapping.parallax)
+        return Candidate("rig", self.pair, mapping, error, self._warped.residual)
+
+    @cached_property
+    def rotated(self) -> Matrix | None:
+        """The homography of an image that is rotated or scaled relative to its rig; None of one that is not."""
+        return find_rotated(self._warped)
+
+    @cached_property
+    def _warped(self) -> WarpedPair:
+        return WarpedPair.of(self.pair, self.mapping)
 
     def std_px(self, fixed_to_moving: Matrix) -> float:
         """Return the standard error, px of the fixed image, for a homography between the images."""
@@ -117,10 +139,8 @@ def rig_predictions(
 def _parallax_by_rig(
     pair: BandPair, parallaxes: Sequence[tuple[BandPair, Parallax | None]], rig: Rig
 ) -> tuple[Parallax | None, float]:
-    """Return the relief of the other bands with the baseline of the rig, scaled to theirs, and its standard error.
-
-    The error is that of the baseline and of the relief in half of the pixels; the error map has those at depth edges.
-    None and 0 without a relief.
+    """Return the relief of the other bands with the baseline of the rig, scaled to theirs, and the standard error that
+    the baseline causes; that of the relief is in the relief. None and 0 without a relief.
     """
     others = {
         other.name: parallax
@@ -135,8 +155,7 @@ def _parallax_by_rig(
     scale = float((seen * of_rig).sum() / max((of_rig**2).sum(), 1e-12))
     error = float(np.sqrt(((seen - scale * of_rig) ** 2).sum(axis=1).mean()))
     x, y = (scale * np.array(rig.baselines[pair.name])).tolist()
-    of_relief = 0.0 if relief.std_px is None else float(np.median(relief.std_px)) * relief.unit * math.hypot(x, y)
-    return Parallax(relief, (x, y)).with_occlusions(), math.hypot(error * relief.rms_px, of_relief)
+    return Parallax(relief, (x, y)).with_occlusions(), error * relief.rms_px
 
 
 def _with_added_error(prediction: Prediction, error_px: float) -> Prediction:

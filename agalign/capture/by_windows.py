@@ -1,42 +1,49 @@
-"""Mappings fitted to windows where descriptors do not suffice: candidates for `decision`.
+"""Candidates that are fitted to windows, where descriptors do not suffice.
 
 * Blurred, noisy or saturated images: the homography is fitted to half of the windows and verified with the others.
 * Bands with few pixels, such as thermal ones: often only a third of the windows have structure in common with another
-  band. If nearly all of these agree with a trusted seed, they predict the mapping with its standard error.
+  band. If nearly all of these agree with a trusted seed, they predict the mapping.
 * Images without common structure in one part: differences of lens distortion cause errors of the homography there that
-  no residual contains. The lens shapes are estimated too, and the alignment becomes a prediction.
+  no residual contains. The lens shapes are estimated too, and the mapping is a prediction.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
 
 from agalign.capture.band_pair import BandPair
-from agalign.capture.warped_pair import WarpedPair, result_of_windows
+from agalign.capture.candidate import BandCandidates, Candidate, mapping_error, result_of_windows
+from agalign.capture.warped_pair import WarpedPair
 from agalign.fit.window_fit import WindowFit, fit_in_rounds
 from agalign.values import geometry
-from agalign.values.alignment import Alignment, Alignments, Residual
-from agalign.values.issues import CORNERS_UNKNOWN, FEW_KEYPOINTS, NO_CONTRAST, RETRIEVAL
+from agalign.values.alignment import JointResult
+from agalign.values.geometry import Matrix
+from agalign.values.issues import CORNERS_UNKNOWN, FEW_KEYPOINTS, INACCURATE, NO_CONTRAST, RETRIEVAL, Issue
 from agalign.values.mapping import PixelMapping
-from agalign.verify.checks import PREDICTED_WITH, seed_fits
-from agalign.verify.expected_error import points_in_frame
+from agalign.values.residual import Residual
+from agalign.verify.checks import MAX_ALIAS_PEAK
+from agalign.verify.coverage import points_in_frame, unobserved_quarters
 
 _MAX_STEP_PX = 16.0
 """Maximum displacement of a corner; larger ones contradict the seed."""
+_RELIEF_SHARE = 0.15
+"""Standard deviation of the relief of ground without common structure, as a share of its range: crops and trees at low
+altitude, plants and booms at a metre."""
 
 
-def fitted_to_windows(pair: BandPair, alignment: Alignment) -> Alignment | None:
-    """Return an alignment fitted to half of the windows and verified with the others; None if these do not confirm it,
-    or if the descriptors have a result.
+def fitted_to_windows(band: BandCandidates) -> Candidate | None:
+    """Return the candidate that is fitted to half of the windows, the others verify it; None if the descriptors have a
+    result, or if the windows determine none.
     """
+    pair = band.pair
     # With other issues, the descriptors of sharp images have a result that may contradict the windows.
     of_descriptors = {RETRIEVAL, FEW_KEYPOINTS, NO_CONTRAST, CORNERS_UNKNOWN}
-    descriptors_failed = pair.is_blurred or any(issue.kind in of_descriptors for issue in alignment.issues)
-    if not descriptors_failed or alignment.residual is None or not seed_fits(alignment.residual):
+    descriptors_failed = pair.is_blurred or any(issue.kind in of_descriptors for issue in band.rejected)
+    if not descriptors_failed or not band.does_start_fit:
         return None
     max_step_px = min(_MAX_STEP_PX, pair.max_shift_px)
-    start = WarpedPair.of(pair, pair.mapping(alignment.fixed_to_moving))
+    start = WarpedPair.of(pair, pair.mapping(band.start.fixed_to_moving))
     fitted = fit_in_rounds(
         start.mapping,
         lambda mapping: WarpedPair.of(pair, mapping, start.windows).residual.chessboard_half(even=True),
@@ -46,23 +53,27 @@ def fitted_to_windows(pair: BandPair, alignment: Alignment) -> Alignment | None:
     if fitted is None:
         return None
     mapping, fit = fitted
-    warped_pair = WarpedPair.of(pair, mapping, start.windows)
-    held_out = warped_pair.residual.chessboard_half(even=False)
-    retrieval, chance = (0.0, 0.0) if alignment.joint is None else (alignment.joint.retrieval, alignment.joint.chance)
+    warped = WarpedPair.of(pair, mapping, start.windows)
+    held_out = warped.residual.chessboard_half(even=False)
+    known = band.joint
+    retrieval, chance = (0.0, 0.0) if known is None else (known.retrieval, known.chance)
     joint = result_of_windows(mapping.fixed_to_moving).with_homography(mapping.fixed_to_moving, fit.covariance_px2)
     joint = replace(joint, retrieval=retrieval, chance=chance, last_step_px=fit.max_px)
-    verified = replace(warped_pair, residual=held_out)
-    issues = verified.issues(joint)
-    if not all(issue.kind in PREDICTED_WITH for issue in issues):
+    return Candidate.of("windows", replace(warped, residual=held_out), joint)
+
+
+def agreeing_with_seed(band: BandCandidates) -> Candidate | None:
+    """Return the candidate of a coarse band by windows that agree with its trusted seed; None if few do, or in a
+    repetitive scene.
+    """
+    pair = band.pair
+    if not (pair.is_coarse and band.is_start_trusted):
         return None
-    lens_std_px = pair.unknown_lens_std_px
-    result = replace(alignment, mapping=mapping, issues=issues, joint=joint, residual=held_out, lens_std_px=lens_std_px)
-    return pair.predicted_alignment(result, verified.std_px(joint)) if issues else result
-
-
-def agreeing_with_seed(pair: BandPair, alignment: Alignment) -> Alignment | None:
-    """Return the prediction of a coarse band by windows that agree with its seed; None if few do."""
-    return fitted_with_lens_shapes(pair, alignment, pair.mapping(alignment.seed.fixed_to_moving), _is_consistent)
+    start = pair.mapping(band.start.fixed_to_moving)
+    result = _with_lens_shapes(pair, start, band.joint, band.rejected, is_accepted=_is_consistent)
+    if result is not None and WarpedPair.of(pair, result.mapping).alias_peak().ratio > MAX_ALIAS_PEAK:
+        return None
+    return result
 
 
 def _is_consistent(fit: WindowFit) -> bool:
@@ -74,42 +85,77 @@ def _is_consistent(fit: WindowFit) -> bool:
     return count >= min_windows and bool((fit.residuals_px <= max_close_px).sum() >= min_close_share * count)
 
 
-def shifts_by_range_px(pairs: Sequence[BandPair], result: Alignments) -> dict[str, float]:
-    """Return by band the shift of the aligned scene, at its range, from one at an infinite distance.
+def extrapolated(plane: Candidate, relief_std_px: float) -> Candidate | None:
+    """Return a candidate with lens shapes instead of one that is only inaccurate, without windows in a quarter of the
+    image; None for others.
 
-    The rig tags contain the mappings at infinity. Their errors have no common direction: the shift is the part of the
-    bands' differences from them that is proportional to the layout of the lenses.
+    A homography does not extrapolate relief: `relief_std_px`, px of the fixed image, is the spread of it.
     """
-    layouts, offsets_px = {}, []
+    pair = plane.pair
+    if [issue.kind for issue in plane.issues] != [INACCURATE] or plane.mapping.parallax is not None:
+        return None
+    in_frame_px = points_in_frame(plane.mapping, *pair.sizes_px)
+    if "geo" in pair.seed_matrices or not unobserved_quarters(
+        plane.windows.measured_px, pair.fixed.size_px, in_frame_px
+    ):
+        return None
+    return _with_lens_shapes(pair, plane.mapping, plane.joint, plane.issues, relief_std_px=relief_std_px)
+
+
+def spreads_of_relief_px(pairs: Sequence[BandPair], homographies: Mapping[str, Matrix]) -> dict[str, float]:
+    """Return the spread of the relief that the homographies between the images lack, by band, px of the fixed image.
+
+    It is that of the flight, or that of unknown relief at the range of the capture, if this is larger. The rig tags
+    contain the mappings at infinity. Their errors have no common direction: the shift of the scene from infinity is the
+    part of the bands' differences from the tags that is proportional to the layout of the lenses.
+    """
+    layouts, offsets_px = dict[str, np.ndarray](), []
     for pair in pairs:
-        if pair.layout is None or "rig" not in pair.seed_matrices or result[pair.name].joint is None:
+        if pair.layout is None or "rig" not in pair.seed_matrices or pair.name not in homographies:
             continue
         centre = (np.array(pair.reference_file_px) - 1) / 2
-        found, at_infinity = result[pair.name].fixed_to_moving, pair.seed_matrices["rig"]
+        found, at_infinity = homographies[pair.name], pair.seed_matrices["rig"]
         at_centre = [geometry.apply(pair.scales.between_files(m), centre) for m in (found, at_infinity)]
         layouts[pair.name] = np.array(pair.layout)
         offsets_px.append(at_centre[0] - at_centre[1])
     along, known = np.ravel(offsets_px), np.ravel(list(layouts.values()))
     common_px = max(0.0, float(along @ known)) / max(float(known @ known), 1e-12)
-    return {name: float(common_px * float(np.linalg.norm(layout))) for name, layout in layouts.items()}
+
+    def spread_px(pair: BandPair) -> float:
+        if pair.name not in layouts:
+            return pair.relief_std_px
+        shift_px = (
+            common_px * float(np.linalg.norm(layouts[pair.name])) / pair.in_moving_file_px(1.0, homographies[pair.name])
+        )
+        return max(pair.relief_std_px, _RELIEF_SHARE * shift_px)
+
+    return {pair.name: spread_px(pair) for pair in pairs}
 
 
-def fitted_with_lens_shapes(
-    pair: BandPair, alignment: Alignment, start: PixelMapping, is_accepted: Callable[[WindowFit], bool] = lambda _: True
-) -> Alignment | None:
-    """Return the alignment as `predicted` by a homography and lens shapes, which replace the field of `start`."""
-    size_px, to_file = pair.fixed.size_px, pair.scales.fixed.inverse
+def _with_lens_shapes(
+    pair: BandPair,
+    start: PixelMapping,
+    joint: JointResult | None,
+    issues: Sequence[Issue],
+    *,
+    is_accepted: Callable[[WindowFit], bool] = lambda _: True,
+    relief_std_px: float = 0.0,
+) -> Candidate | None:
+    """Return the candidate with a homography and lens shapes instead of `start` and its field, for these issues."""
     fitted = fit_in_rounds(
-        replace(start, field=None), lambda mapping: _measured(pair, mapping), size_px, is_accepted, pair.lens_std_px
+        replace(start, field=None),
+        lambda mapping: _measured(pair, mapping),
+        pair.fixed.size_px,
+        is_accepted,
+        pair.lens_std_px,
     )
     if fitted is None:
         return None
     mapping, fit = fitted
-    to_file_px = np.r_[np.tile(to_file, 4), np.full(4, to_file.mean)]
-    std_px = float(fit.std_px(points_in_frame(mapping, *pair.sizes_px)))
-    prediction = pair.prediction_of(mapping, std_px, fit.covariance_px2 * np.outer(to_file_px, to_file_px))
-    residual = WarpedPair.of(pair, mapping).residual
-    return replace(alignment, mapping=mapping, residual=residual, prediction=prediction)
+    windows = _measured(pair, mapping)
+    error = mapping_error(pair, mapping, fit.covariance_px2, windows, relief_std_px=relief_std_px)
+    error = replace(error, field_std_px=0.0)  # its shapes are in the covariance
+    return Candidate("lens shapes", pair, mapping, error, windows, joint, replaces=tuple(issues))
 
 
 def _measured(pair: BandPair, mapping: PixelMapping) -> Residual:

@@ -6,10 +6,11 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from agalign.capture.warped_pair import Candidate
+from agalign.capture.candidate import RefinedBand
 from agalign.fit.displacement_field import MIN_WINDOWS
 from agalign.fit.window_fit import Adjustment, WindowShifts, adjust, are_of_lenses, are_on_a_line
-from agalign.values.alignment import MIN_RETRIEVAL, Residual
+from agalign.values.alignment import MIN_RETRIEVAL
+from agalign.values.residual import Residual
 
 MIN_BANDS = 2
 """Minimum number of moving lenses: a relief is verified with the other lenses."""
@@ -17,22 +18,22 @@ MIN_PARALLAX_PX = 0.3
 """Minimum p95 of the parallax of windows for a relief; windows of flat fields have up to 0.2 px, mostly noise."""
 
 
-def parallax_groups(candidates: Sequence[Candidate]) -> list[list[Candidate]]:
+def parallax_groups(bands: Sequence[RefinedBand]) -> list[list[RefinedBand]]:
     """Group the bands by reference image and space of the homographies; sharp ones only, if these are enough.
 
     Bands without retrieval of held-out patches, with few measured windows or low resolution are excluded.
     """
-    groups: dict[tuple[int, str], list[Candidate]] = {}
-    for candidate in candidates:
-        pair, residual = candidate.pair, candidate.warped.residual
-        is_reliable = candidate.joint.retrieval >= MIN_RETRIEVAL and len(residual.measured_px) >= MIN_WINDOWS
+    groups: dict[tuple[int, str], list[RefinedBand]] = {}
+    for band in bands:
+        pair, residual = band.pair, band.warped.residual
+        is_reliable = band.joint.retrieval >= MIN_RETRIEVAL and len(residual.measured_px) >= MIN_WINDOWS
         if is_reliable and not pair.is_coarse:
-            groups.setdefault((id(pair.reference), pair.space), []).append(candidate)
+            groups.setdefault((id(pair.reference), pair.space), []).append(band)
     sharp = [[c for c in group if not c.pair.is_blurred] for group in groups.values()]
     return [some if len(some) >= MIN_BANDS else group for some, group in zip(sharp, groups.values(), strict=True)]
 
 
-def common_parallax_px(group: Sequence[Candidate]) -> tuple[float, bool]:
+def common_parallax_px(group: Sequence[RefinedBand]) -> tuple[float, bool]:
     """Return the p95 of the parallax that is common to the bands, 0 if there is none, and if the baselines are on one
     line without tags that confirm them.
     """
@@ -49,7 +50,7 @@ def common_parallax_px(group: Sequence[Candidate]) -> tuple[float, bool]:
     return parallax_px, layout_of([group[band] for band in bands]) is None and are_on_a_line(model.baselines)
 
 
-def _common_residuals(group: Sequence[Candidate]) -> list[Residual]:
+def _common_residuals(group: Sequence[RefinedBand]) -> list[Residual]:
     """Return the residuals of all bands in the same windows: large ones if any band is blurred, else the smallest that
     the residual of any band uses.
     """
@@ -58,14 +59,14 @@ def _common_residuals(group: Sequence[Candidate]) -> list[Residual]:
     return [c.warped.residual if c.warped.windows is common else common.residuals(c.warped.warped) for c in group]
 
 
-def layout_of(group: Sequence[Candidate]) -> NDArray[np.float64] | None:
+def layout_of(group: Sequence[RefinedBand]) -> NDArray[np.float64] | None:
     """Return the layouts (bands, 2) of bands; None if the tags lack one."""
     layouts = [candidate.pair.layout for candidate in group]
     return None if any(layout is None for layout in layouts) else np.array(layouts, float)
 
 
 def consistent_bands(
-    windows: WindowShifts, group: Sequence[Candidate], lens_std: NDArray[np.float64] | None = None
+    windows: WindowShifts, group: Sequence[RefinedBand], lens_std: NDArray[np.float64] | None = None
 ) -> tuple[list[int], Adjustment] | None:
     """Adjust the model to the bands with common parallax; return their indices and the model, or None.
 

@@ -12,20 +12,20 @@ from functools import partial
 
 import numpy as np
 
+from agalign.capture.candidate import BandCandidates, Candidate, mapping_error
 from agalign.errors import UnreadableFileError
-from agalign.fit.window_fit import fit_in_rounds
+from agalign.fit.window_fit import WindowFit, fit_in_rounds
 from agalign.fit.windows import FixedWindows
-from agalign.flight.rig import distance_px
 from agalign.pixels.band_resampling import resample_tile
 from agalign.pixels.masks import learnable
 from agalign.pixels.raster import OpenRaster, open_raster, read_tile
 from agalign.pixels.structure import structure_field
-from agalign.values.alignment import Alignment, Residual
 from agalign.values.capture import Band
 from agalign.values.image import Raster, Tile
 from agalign.values.issues import UNREADABLE, Issue
 from agalign.values.mapping import PixelMapping
-from agalign.verify.checks import Evidence, issues_of
+from agalign.values.pixel_units import Size
+from agalign.values.residual import Residual
 
 _TILE_PX = 640
 """Side of a tile with 36 windows; an error of a few pixels of the reduced images does not move their content out of
@@ -35,25 +35,36 @@ _Tiles = Sequence[tuple[Tile, FixedWindows]]
 """Tiles with the windows of the reference."""
 
 
-def at_full_resolution(reference: Band, moving: Band, alignment: Alignment) -> Alignment:
-    """Refine an alignment between the files of two bands that was estimated on reduced images.
+def at_full_resolution(reference: Band, band: BandCandidates, start: Candidate) -> Candidate | Issue | None:
+    """Return the candidate of a band that is fitted to tiles of the files, from one by the reduced images.
 
-    It is returned unchanged if the tiles have too little structure or the refined one does not pass verification. It is
-    `failed` if a tile of the moving file cannot be read, because its pixels could not be written either. Raises
+    None if the tiles have too little structure, or if the shifts of the other tiles do not decrease. The issue
+    UNREADABLE if a tile of the moving file cannot be read, because its pixels could not be written either. Raises
     UnreadableFileError for the reference.
     """
+    pair = band.pair
+    up = pair.scales.fixed.inverse, pair.scales.moving.inverse
+    residual, mapping = start.windows.in_file_px(pair.scales), start.mapping.rescaled(*up)
     with open_raster(reference.path, reference.page) as source:
         for_fit, held_out = (
             [(tile, _windows(source, reference, tile)) for tile in of_colour]
-            for of_colour in _tiles(reference, alignment)
+            for of_colour in _tiles(residual, reference.size_px)
         )
     try:
-        refined = _refined(alignment, moving, for_fit, held_out, reference.size_px)
-    except UnreadableFileError as error:
-        issue = Issue(UNREADABLE, detail=str(error))
-        without = replace(alignment, mapping=alignment.seed_mapping, issues=(issue,), prediction=None)
-        return replace(without, joint=None, residual=None)
-    return alignment if refined is None else refined
+        refined = _refined(mapping, pair.bands[0], for_fit, held_out, reference.size_px)
+    except UnreadableFileError as unreadable:
+        return Issue(UNREADABLE, detail=str(unreadable))
+    if refined is None or start.joint is None:
+        return None
+    fitted, fit, after = refined
+    down, scale = fitted.rescaled(pair.scales.fixed, pair.scales.moving), pair.scales.fixed
+    factors = np.tile(scale, 4)
+    joint = start.joint.with_homography(down.fixed_to_moving, fit.covariance_px2 * np.outer(factors, factors))
+    windows = replace(
+        after, centres_px=scale.positions(after.centres_px), shifts_px=scale.displacements(after.shifts_px)
+    )
+    error = mapping_error(pair, down, joint.covariance_px2, windows)
+    return Candidate("full resolution", pair, down, error, windows, joint)
 
 
 def _windows(source: OpenRaster, reference: Band, tile: Tile) -> FixedWindows:
@@ -62,40 +73,26 @@ def _windows(source: OpenRaster, reference: Band, tile: Tile) -> FixedWindows:
 
 
 def _refined(
-    alignment: Alignment, moving: Band, for_fit: _Tiles, held_out: _Tiles, size_px: tuple[int, int]
-) -> Alignment | None:
-    """Return the alignment fitted to half of the tiles, with its covariance and the residual of the other half.
-
-    None if the median shift of that half does not decrease or a check finds an issue. Raises UnreadableFileError.
+    start: PixelMapping, moving: Band, for_fit: _Tiles, held_out: _Tiles, size_px: Size
+) -> tuple[PixelMapping, WindowFit, Residual] | None:
+    """Return the mapping between the files that is fitted to half of the tiles, the fit, and the residual of the other
+    half; None if the median shift of that half does not decrease. Raises UnreadableFileError.
     """
     max_step_px = 40.0  # a larger displacement of a corner contradicts the alignment of the reduced images
     fitted = fit_in_rounds(
-        alignment.mapping,
-        lambda mapping: _residual(moving, mapping, for_fit),
-        size_px,
-        lambda fit: fit.max_px <= max_step_px,
+        start, lambda mapping: _residual(moving, mapping, for_fit), size_px, lambda fit: fit.max_px <= max_step_px
     )
-    if fitted is None or alignment.joint is None:
+    if fitted is None:
         return None
     mapping, fit = fitted
-    before, after = (_residual(moving, m, held_out) for m in (alignment.mapping, mapping))
-    if not after.median_px < before.median_px:
-        return None
-    joint = alignment.joint.with_homography(mapping.fixed_to_moving, fit.covariance_px2)
-    prediction = alignment.prediction
-    if prediction is not None:
-        off_px = distance_px(mapping.fixed_to_moving, prediction.fixed_to_moving, size_px)
-        prediction = replace(prediction, off_px=off_px)
-    if issues_of(Evidence(joint, after, size_px, prediction=prediction)):
-        return None
-    return replace(alignment, mapping=mapping, joint=joint, residual=after, prediction=prediction)
+    before, after = (_residual(moving, m, held_out) for m in (start, mapping))
+    return (mapping, fit, after) if after.median_px < before.median_px else None
 
 
-def _tiles(reference: Band, alignment: Alignment) -> tuple[list[Tile], list[Tile]]:
-    """Return, for each cell, a tile around the window with the highest peak in the reduced images, by colour."""
-    residual, size_px = alignment.residual, reference.size_px
-    if residual is None:
-        return [], []
+def _tiles(residual: Residual, size_px: Size) -> tuple[list[Tile], list[Tile]]:
+    """Return, for each cell of the reference (width, height), a tile around the window with the highest peak in the
+    reduced images, by colour.
+    """
     # (columns, rows) of cells with one tile each: half of them determine eight parameters, all of them fit into memory.
     min_cells, max_cells = (4, 3), (8, 6)
     counts = [min(max(n // _TILE_PX, low), high) for n, low, high in zip(size_px, min_cells, max_cells, strict=True)]

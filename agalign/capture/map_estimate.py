@@ -21,8 +21,9 @@ from agalign.capture.by_rig import RigPrediction, observation, rig_prediction
 from agalign.fit.window_fit import fit_windows
 from agalign.flight.rig import Rig, lattice
 from agalign.values import geometry
-from agalign.values.alignment import JointResult, Residual
+from agalign.values.alignment import JointResult
 from agalign.values.least_squares import Robust, least_squares
+from agalign.values.residual import Residual
 
 
 def map_estimate(

@@ -117,7 +117,9 @@ class Reference:
     @cached_property
     def white_windows(self) -> FixedWindows:
         """Windows in the white fields, for the verification of a fit to the black ones."""
-        return FixedWindows.on_chessboard(self.grey.valid, self.structure, _HELD_OUT_PX, white=True)
+        return FixedWindows.on_chessboard(
+            self.grey.valid, self.structure, _HELD_OUT_PX, white=True, min_valid_share=0.9
+        )
 
     @cached_property
     def similarity(self) -> FixedSimilarity:

@@ -1,6 +1,5 @@
-"""A band pair on one grid: the residual of its windows, the issues of an alignment, and results to be compared."""
+"""A band pair on one grid: the moving image under a mapping, and the residual of its windows."""
 
-import math
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -10,13 +9,13 @@ from agalign.fit.windows import FixedWindows, residual_under
 from agalign.pixels.band_resampling import shrink
 from agalign.pixels.structure import structure_field, windowed_spectra
 from agalign.values import geometry
-from agalign.values.alignment import Alignment, JointResult, Residual, Seed
+from agalign.values.alignment import Alignment
 from agalign.values.geometry import Matrix, Points
 from agalign.values.image import Raster
-from agalign.values.issues import Issue
 from agalign.values.mapping import PixelMapping
-from agalign.verify.checks import BY_WINDOWS, AliasPeak, Evidence, alias_peak, issues_of
-from agalign.verify.expected_error import points_in_frame, unobserved_quarters
+from agalign.values.residual import Residual
+from agalign.verify.checks import AliasPeak, alias_peak
+from agalign.verify.coverage import points_in_frame, unobserved_quarters
 
 
 @dataclass(frozen=True)
@@ -107,70 +106,6 @@ class WarpedPair:
         if "geo" in self.pair.seed_matrices:
             return self.windows.visible_px(self.warped)
         return points_in_frame(self.mapping, *self.pair.sizes_px)
-
-    def evidence(self, joint: JointResult) -> Evidence:
-        """Return the evidence for a result with this mapping."""
-        pair = self.pair
-        return Evidence(
-            joint,
-            self.residual,
-            pair.fixed.size_px,
-            images=self,
-            field=self.mapping.field,
-            parallax=self.mapping.parallax,
-            lens_std_px=pair.unknown_lens_std_px,
-            relief_std_px=pair.relief_std_px,
-            file_pixel_size_px=pair.file_pixel_size_px,
-        )
-
-    def issues(self, joint: JointResult) -> tuple[Issue, ...]:
-        """Return the issues of the result with this mapping."""
-        return issues_of(self.evidence(joint))
-
-    def std_px(self, joint: JointResult) -> float:
-        """Return the standard error of the mapping: the RMS of the expected error over the common area."""
-        points_px = self.common_px()
-        points_px = points_px if len(points_px) else self.residual.centres_px
-        return float(np.sqrt(np.square(self.evidence(joint).error_px(points_px)).mean()))
-
-
-@dataclass(frozen=True)
-class Candidate:
-    """A band with the residual of its windows under the result of the joint optimisation, or under its seed."""
-
-    pair: BandPair
-    seed: Seed
-    joint: JointResult
-    """Without evidence of descriptors, at the seed, if the optimisation has no result."""
-    warped: WarpedPair
-    issue: Issue | None = None
-    """Why the optimisation has no result."""
-    by_halves: tuple[Matrix, Matrix] | None = None
-    """Homographies from half of the windows (`WarpedPair.cross_validated`)."""
-
-    @classmethod
-    def of(cls, pair: BandPair, seed: Seed, result: JointResult | Issue) -> "Candidate":
-        """Measure the windows with the homography of a result."""
-        issue = result if isinstance(result, Issue) else None
-        joint = result_of_windows(seed.fixed_to_moving) if isinstance(result, Issue) else result
-        return cls(pair, seed, joint, WarpedPair.of(pair, pair.mapping(joint.fixed_to_moving)), issue)
-
-    def fit_residual(self, mapping: PixelMapping) -> Residual:
-        """Measure the windows of the fit with a mapping."""
-        return self.pair.reference.black_windows.residuals(self._warped(mapping))
-
-    def held_out_residual(self, mapping: PixelMapping) -> Residual:
-        """Measure the windows that take no part in the fit."""
-        return self.pair.reference.white_windows.residuals(self._warped(mapping))
-
-    def _warped(self, mapping: PixelMapping) -> Raster:
-        return self.warped.warped if mapping is self.warped.mapping else self.pair.warped_moving(mapping)
-
-
-def result_of_windows(fixed_to_moving: Matrix) -> JointResult:
-    """Return a result without evidence of descriptors, with an infinite standard error."""
-    std = ((math.inf, math.inf),) * 4
-    return JointResult(fixed_to_moving, math.nan, 0.0, 0.0, 0, (1.0,), BY_WINDOWS, "homography", 0.0, std)
 
 
 def with_metrics(alignment: Alignment, pair: BandPair) -> Alignment:

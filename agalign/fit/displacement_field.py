@@ -19,11 +19,11 @@ from agalign.fit.window_fit import NODE_STEP_PX
 from agalign.fit.windows import FixedWindows, Shifts, in_standard_errors
 from agalign.pixels.band_resampling import warped
 from agalign.pixels.structure import Field
-from agalign.values.alignment import Residual, noise_px
 from agalign.values.geometry import Points
 from agalign.values.image import Mask, Raster
 from agalign.values.least_squares import cauchy_weights, shift_scale_px
 from agalign.values.mapping import DisplacementField, PixelMapping
+from agalign.values.residual import Residual, noise_px
 
 _WINDOW_PX = 40
 """Side of the windows in which shifts are measured. On reference tie points of three cameras, smaller ones are as

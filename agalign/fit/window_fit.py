@@ -20,7 +20,8 @@ is known, positive parallax is nearer to the camera.
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from functools import partial
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,28 +30,20 @@ from scipy.spatial import cKDTree
 from agalign.errors import GeometryError
 from agalign.fit.windows import Shifts, peak_weights
 from agalign.values import geometry
-from agalign.values.alignment import Residual
 from agalign.values.geometry import Points
 from agalign.values.least_squares import MIN_SHIFT_SCALE_PX, Robust, cauchy_weights, least_squares, shift_scale_px
+from agalign.values.lens_shapes import jacobian, lens_shapes, shift_variance_px2, variance_px2
 from agalign.values.mapping import DisplacementField, PixelMapping
 from agalign.values.parallax import Parallax, Relief
 from agalign.values.pixel_units import PixelScale
+from agalign.values.residual import Residual
 
 Array = NDArray[np.float64]
 
-LENS_STD = (1.3e-3, 0.7e-3, 1.2e-3, 1.2e-3)
-"""Standard deviation of each shape at the corners, as a share of half the diagonal. The lenses of 28 band pairs of six
-cameras (RedEdge-3, RedEdge-M, RedEdge-MX dual, Sequoia; calibrations in the tags) differ by 1.0, 0.6, 1.0 and 1.0 px
-at 800 px from the centre."""
-CALIBRATED = 0.4
-"""Factor on LENS_STD if both lenses are calibrated; measured on reference tie points of 45 RedEdge pairs."""
 NODE_STEP_PX = 48
 """Spacing of the nodes of a displacement field of lenses, as their distortion varies over hundreds of pixels."""
 _CAUCHY_SCALES = 2.0
 """Residual of a window at which its robust weight is one half, in residual scales."""
-_LENS_VARIANCE_FACTOR = 12.0
-"""Factor on the variance of shifts for lens shapes: these extrapolate errors by relief, which neighbouring windows have
-in common."""
 _RELIEF_STEP_PX = 32
 """Spacing of a relief by windows."""
 _COMMON_STD_PX = 0.01
@@ -121,37 +114,6 @@ class WindowFit:
         return mapping
 
 
-def lens_shapes(points_px: Points, size_px: tuple[int, int]) -> Array:
-    """Return (n, 2, 4) the displacements by each shape at points (n, 2) of an image (width, height).
-
-    The shapes are radial of third and fifth order, and the two of decentring. Their length is 1 at the corners.
-    """
-    centre = (np.array(size_px, dtype=np.float64) - 1) / 2
-    u, v = ((points_px - centre) / np.linalg.norm(centre)).T
-    square = u * u + v * v
-    dx = np.stack([u * square, u * square**2, square + 2 * u * u, 2 * u * v], axis=-1)
-    dy = np.stack([v * square, v * square**2, 2 * u * v, square + 2 * v * v], axis=-1)
-    # The length of the decentring shapes is up to 3 along their axis.
-    return np.asarray(np.stack([dx, dy], axis=1) * np.array([1.0, 1.0, 1 / 3, 1 / 3]))
-
-
-def lens_std_px(size_px: tuple[int, int], *, calibrated: bool) -> Array:
-    """Return (4,) the standard deviation of each shape on an image (width, height), px."""
-    return np.array(LENS_STD) * float(np.hypot(*size_px)) / 2 * (CALIBRATED if calibrated else 1.0)
-
-
-def jacobian(points_px: Points, size_px: tuple[int, int], parameters: int = 12) -> Array:
-    """Return (n, 2, 8 or 12) the derivative of displacements of points by those of the corners, and by lens shapes."""
-    of_corners = geometry.over_corners(points_px, *size_px)
-    return of_corners if parameters == 8 else np.concatenate([of_corners, lens_shapes(points_px, size_px)], axis=2)
-
-
-def variance_px2(points_px: Points, covariance_px2: Array, size_px: tuple[int, int]) -> Array:
-    """Return (n,) the variance at points (n, 2) by the covariance of the corners (8, 8), or with shapes (12, 12)."""
-    design = jacobian(points_px, size_px, len(covariance_px2))
-    return np.asarray(np.einsum("nki,ij,nkj->n", design, covariance_px2, design))
-
-
 def fit_windows(
     mapping: PixelMapping,
     residual: Residual,
@@ -171,9 +133,9 @@ def fit_windows(
     if lens_std_px is None and len(raw.centres_px) < min_windows:
         return None
     points_px, shifted_px = (mapping.undistorted(p) for p in (raw.centres_px, raw.centres_px + raw.shifts_px))
-    shifts_px, std_px, factor = shifted_px - points_px, np.full(8, np.inf), 1.0
+    shifts_px, std_px, with_shapes = shifted_px - points_px, np.full(8, np.inf), lens_std_px is not None
     if lens_std_px is not None:
-        std_px, factor = np.r_[np.full(8, _CORNER_STD_PX), lens_std_px], _LENS_VARIANCE_FACTOR
+        std_px = np.r_[np.full(8, _CORNER_STD_PX), lens_std_px]
     count = len(std_px)
     design = jacobian(points_px, size_px, count)
     mean = np.zeros(count)
@@ -182,21 +144,10 @@ def fit_windows(
         shifts_px = shifts_px + parallax_px[:, None] * np.array(mapping.parallax.baseline)
         design, std_px = _with_parallax(design, parallax_px), np.r_[std_px, [baseline.std] * 2]
         mean = np.r_[mean, baseline.mean]
-    robust = Robust(_CAUCHY_SCALES, shift_scale_px, lambda scale_px: _shift_variance_px2(scale_px, factor))
+    robust = Robust(_CAUCHY_SCALES, shift_scale_px, partial(shift_variance_px2, with_shapes=with_shapes))
     estimate = least_squares(design, shifts_px, raw.weights, np.diag(std_px**-2.0), mean, robust=robust)
     covariance_px2 = estimate.covariance[:count, :count] + _COMMON_STD_PX**2 * np.eye(count)
     return _window_fit(estimate.mean, estimate.residuals, size_px, covariance_px2)
-
-
-def lens_shift_variance_px2(scale_px: float) -> float:
-    """Return the variance along an axis of shifts with residuals of this scale that lens shapes are fitted to."""
-    return float(_shift_variance_px2(scale_px, _LENS_VARIANCE_FACTOR))
-
-
-def _shift_variance_px2(scale_px: float | Array, factor: float = 1.0) -> Any:
-    """Return the variance along an axis of shifts with residuals of this scale, multiplied by `factor`."""
-    axis_share = 1 / 3  # of the squared scale of lengths; normally distributed: 1 / 3.05
-    return factor * axis_share * scale_px**2 + MIN_SHIFT_SCALE_PX**2
 
 
 def _window_fit(mean: Array, residuals_px: Array, size_px: tuple[int, int], covariance_px2: Array) -> WindowFit:
@@ -361,7 +312,7 @@ def adjust(
         precisions = np.minimum(1, (np.median(scales) / scales) ** 2)
         parallax, of_windows = _parallax(relative, baselines, weights * precisions)
         parallax = parallax - plane @ _reference_plane(parallax, plane, of_windows)
-        absolute = weights.T / _shift_variance_px2(scales)[:, None]
+        absolute = weights.T / shift_variance_px2(scales)[:, None]
         by_band = least_squares(_with_parallax(design, parallax), shifts.swapaxes(0, 1), absolute, prior)
         smooth, baselines = by_band.mean[:, :count], by_band.mean[:, count:]
         longest = np.linalg.norm(baselines, axis=1).max()

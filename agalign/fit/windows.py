@@ -8,7 +8,6 @@ import cv2
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from agalign.pixels.structure import (
     Field,
@@ -19,10 +18,10 @@ from agalign.pixels.structure import (
     whitened_cross_spectra,
     windowed_spectra,
 )
-from agalign.values.alignment import Residual
 from agalign.values.geometry import Points
 from agalign.values.image import Mask, Raster
 from agalign.values.mapping import PixelMapping
+from agalign.values.residual import Residual
 
 _Element = TypeVar("_Element", bound=np.generic)
 
@@ -47,6 +46,7 @@ class FixedWindows:
         side_px: int = _WINDOW_PX,
         step_px: int | None = None,
         origins: NDArray[np.int64] | None = None,
+        min_valid_share: float = _MIN_VALID_SHARE,
     ) -> None:
         """Cut the structure field (height, width) of the reference into windows.
 
@@ -59,7 +59,7 @@ class FixedWindows:
         self.side = max(MIN_WINDOW_PX, min(side_px, width // 4, height // 4))
         if origins is None and step_px is None:
             self.side = _covering_side(self.side, width, height)
-        self.min_valid = min(1.0, max(_MIN_VALID_SHARE, (MIN_WINDOW_PX / self.side) ** 2))
+        self.min_valid = min(1.0, max(min_valid_share, (MIN_WINDOW_PX / self.side) ** 2))
         """Minimum share of valid pixels: at least as many as the smallest windows have."""
         if origins is None:
             origins = _grid(*(_starts(length, self.side, step_px) for length in (width, height)))
@@ -72,7 +72,9 @@ class FixedWindows:
         self.spectra = windowed_spectra(windows)
 
     @classmethod
-    def on_chessboard(cls, valid: Mask, structure: Field, side_px: int, *, white: bool) -> "FixedWindows":
+    def on_chessboard(
+        cls, valid: Mask, structure: Field, side_px: int, *, white: bool, min_valid_share: float = _MIN_VALID_SHARE
+    ) -> "FixedWindows":
         """Create 3 x 3 windows in each of the black or white fields of a chessboard over a mask (height, width).
 
         Windows of different colours share no pixels, so those of one colour can verify a fit to the other.
@@ -83,7 +85,7 @@ class FixedWindows:
         corners = corners[corners.sum(axis=1) // field_px % 2 == int(white)]
         starts = range(0, field_px - side_px + 1, (field_px - side_px) // 2)
         origins = (corners[:, None] + _grid(starts, starts)).reshape(-1, 2)
-        return cls(valid, structure, side_px, origins=origins)
+        return cls(valid, structure, side_px, origins=origins, min_valid_share=min_valid_share)
 
     def residuals(self, moving: Raster) -> Residual:
         """Measure the shift of each window in a moving band on the reference grid, px; NaN without a clear peak.
@@ -166,12 +168,6 @@ def _relative_to_overlap(cross: Field, fixed: Mask, moving: Mask) -> Field:
     min_share = 0.5  # of that at zero shift: smaller overlaps would amplify noise
     surfaces = inverse_transform(cross).real * (at_zero / np.maximum(share, min_share * at_zero))
     return forward_transform(surfaces.astype(np.complex64))
-
-
-def window_spacing_px(centres_px: Points) -> float:
-    """Return the median distance of window centres (n, 2) from the nearest other one, 0 for a single window."""
-    nearest, _ = cKDTree(centres_px).query(centres_px, k=min(2, len(centres_px)))
-    return float(np.median(nearest.reshape(len(centres_px), -1)[:, -1]))
 
 
 class Shifts(NamedTuple):

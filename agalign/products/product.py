@@ -14,10 +14,11 @@ from agalign.products.rasters.geotiff import Block, LayerDescription, write_on_g
 from agalign.products.rasters.output_grid import FlightLimits, Layer
 from agalign.products.report.drawing import Grey, ReducedBands, read_reduced_bands
 from agalign.products.sidecar.schema import PreviewPart, Sidecar
-from agalign.values.alignment import Alignment, Residual
+from agalign.values.alignment import Alignment
 from agalign.values.capture import Capture
 from agalign.values.files import file_checksum
 from agalign.values.image import OutputGrid
+from agalign.values.residual import Residual
 
 
 @dataclass(frozen=True)

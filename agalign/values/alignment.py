@@ -1,9 +1,8 @@
 """Results of aligning a band pair, and their uncertainty."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from functools import cached_property
 from typing import Annotated
 
 import numpy as np
@@ -12,33 +11,28 @@ from pydantic import Field
 from pydantic import dataclasses as validated
 
 from agalign.errors import InputError
-from agalign.values import geometry
 from agalign.values.arguments import checked
 from agalign.values.choices import Geometry, Interpolation, ModelFamily, PairStatus, PredictionSource, SeedKind, Space
 from agalign.values.equality import equal
-from agalign.values.fields import RECORD, Array, Matrix3x3, Measured, Number, Number4, Number6, UpToInfinity
-from agalign.values.geometry import Matrix, Points
-from agalign.values.image import Mask
+from agalign.values.fields import RECORD, Matrix3x3, Measured, Number, Number4, UpToInfinity
+from agalign.values.geometry import Matrix, PairScales, Points
+from agalign.values.image import FloatImage, Mask, Tile
 from agalign.values.issues import SEED_DOES_NOT_FIT, Issue, sentence
 from agalign.values.mapping import PixelMapping
-from agalign.values.pixel_units import SAME_PIXELS, PixelScale, Size
+from agalign.values.mapping_error import ErrorOnGrid, MappingError
+from agalign.values.pixel_units import Size
 from agalign.values.resampling import can_hold, planes_of, positions_of, resample_planes, valid_of
+from agalign.values.residual import Residual, Similarity
 
 COVARIANCE_DECIMALS = 9
 """Of covariances in a sidecar, px squared: a millionth of those of accurate mappings."""
+STD_DECIMALS = 4
+"""Of standard errors: a limit of them holds for what is written."""
 MIN_RETRIEVAL = 0.2
 """Minimum held-out retrieval: below it psi is not updated and no result is accepted. Chance is below 0.01; unrelated
 images reach 0.05."""
 MIN_TIMES_CHANCE = 5.0
 """`MIN_RETRIEVAL` as a multiple of chance, which is high where few keypoints can be drawn."""
-_NOISE_PX_SIGMA2 = 48.0
-"""RMS noise of the shift of a window times the squared height of its peak, in windows of 40 to 64 px: the median shift
-of aligned windows is 0.7 to 1.35 of that noise in sharp, noisy and blurred scenes, with peaks of 8 sigma to 30."""
-
-
-def noise_px(peaks_sigma: ArrayLike) -> NDArray[np.float64]:
-    """Return the RMS noise (n,) of the length of measured shifts from the heights (n,) of their correlation peaks."""
-    return np.asarray(_NOISE_PX_SIGMA2 / np.square(peaks_sigma))
 
 
 @validated.dataclass(frozen=True, config=RECORD)
@@ -115,8 +109,8 @@ class JointResult:
     """Movement of a corner in the last step."""
     corner_std_xy_px: Annotated[tuple[tuple[UpToInfinity, UpToInfinity], ...], Field(min_length=4, max_length=4)]
     """Standard errors (x, y) at the corners of the reference, clockwise from the top left, px."""
-    corner_covariance_px2: Annotated[NDArray[np.float64], Array((8, 8), COVARIANCE_DECIMALS)] | None = None
-    """Their covariance."""
+    corner_covariance_px2: Annotated[NDArray[np.float64] | None, Field(exclude=True)] = None
+    """Their covariance; a sidecar has that of the mapping, in `error`."""
 
     @property
     def corner_std_px(self) -> float:
@@ -137,7 +131,7 @@ class JointResult:
             self, fixed_to_moving=fixed_to_moving, corner_covariance_px2=covariance_px2, corner_std_xy_px=std
         )
 
-    def in_file_px(self, scales: "PairScales") -> "JointResult":
+    def in_file_px(self, scales: PairScales) -> "JointResult":
         """Convert the result between the images to one between the files."""
         up = scales.fixed.inverse
         per_axis = np.outer(np.tile(up, 4), np.tile(up, 4))
@@ -158,151 +152,6 @@ class RefinedPair:
     result: JointResult
     sizes_px: tuple[tuple[int, int], tuple[int, int]]
     """(width, height) of the fixed and the moving image."""
-
-
-@validated.dataclass(frozen=True, config=RECORD)
-class Residual:
-    """Shifts of windows under a mapping, by phase correlation.
-
-    Examples
-    --------
-    `result` is that of the example of `align`.
-
-    >>> residual = result.residual
-    >>> residual.median_px < 0.1, residual.p95_px < 0.1, residual.std_px < 0.1, residual.coverage
-    (True, True, True, 1.0)
-    >>> residual.shifts_px.shape, residual.lengths_px.shape, int(residual.is_measured.sum())
-    ((24, 2), (24,), 24)
-    >>> x_px, y_px = residual.measured_px[residual.lengths_px.argmax()]  # window with the largest shift
-    """
-
-    __eq__ = equal
-
-    centres_px: Annotated[NDArray[np.float64], Array((None, 2), 2)]
-    """(n, 2) centres of the windows, px of the reference."""
-    shifts_px: Annotated[NDArray[np.float64], Array((None, 2), 3, nullable=True)]
-    """(n, 2) position of the moving band's structure minus that of the reference's, px of the reference; NaN, null in
-    JSON, where it could not be measured."""
-    peaks_sigma: Annotated[NDArray[np.float64], Array((None,), 2, nullable=True)]
-    """(n,) height of the correlation peak of each window, in standard deviations; the error of a shift is inversely
-    proportional to its square."""
-    cells: Annotated[NDArray[np.int64], Array((None, 2), integers=True)]
-    """(n, 2) column and row of each window in the complete grid, whichever windows of it are measured."""
-
-    def __post_init__(self) -> None:
-        """Raise ValueError for arrays of different lengths."""
-        if len({len(column) for column in (self.centres_px, self.shifts_px, self.peaks_sigma, self.cells)}) > 1:
-            raise ValueError("its lists have different lengths")
-
-    @classmethod
-    def joined(cls, several: Sequence["Residual"]) -> "Residual":
-        """Return the windows of several residuals as one."""
-        return cls(
-            np.concatenate([one.centres_px for one in several]),
-            np.concatenate([one.shifts_px for one in several]),
-            np.concatenate([one.peaks_sigma for one in several]),
-            np.concatenate([one.cells for one in several]),
-        )
-
-    def with_shifts(self, shifts_px: NDArray[np.float64]) -> "Residual":
-        """Return the same windows with other shifts (n, 2)."""
-        return replace(self, shifts_px=shifts_px)
-
-    @property
-    def is_measured(self) -> NDArray[np.bool_]:
-        """(n,) True for windows in which a shift was measured."""
-        return np.isfinite(self.shifts_px[:, 0])
-
-    @cached_property
-    def lengths_px(self) -> NDArray[np.float64]:
-        """(m,) lengths of the measured shifts, px of the reference."""
-        return np.asarray(np.linalg.norm(self.shifts_px[self.is_measured], axis=1))
-
-    @property
-    def median_px(self) -> float:
-        """Median length of the measured shifts, px of the reference; infinite without any."""
-        return self._percentiles_px[0]
-
-    @property
-    def p95_px(self) -> float:
-        """95th percentile of the lengths of the measured shifts, px of the reference; infinite without any."""
-        return self._percentiles_px[1]
-
-    @cached_property
-    def _percentiles_px(self) -> tuple[float, float]:
-        median, p95 = np.percentile(self.lengths_px, (50, 95)).tolist() if len(self.lengths_px) else (np.inf, np.inf)
-        return median, p95
-
-    @property
-    def coverage(self) -> float:
-        """Share of the textured windows in which a shift could be measured."""
-        return float(self.is_measured.mean()) if len(self.shifts_px) else 0.0
-
-    @property
-    def std_px(self) -> float:
-        """Standard error estimated from the windows, px: their RMS shift beyond the noise of their peaks; infinite
-        without any.
-
-        A fifth of the windows may be wrong peaks or at depth edges: the RMS is the larger of those of a normal
-        distribution with the same median, and with the same 80th percentile. At least half of it is kept, because the
-        noise is known only to a factor.
-        """
-        if not len(self.lengths_px):
-            return math.inf
-        noise = float(np.median(noise_px(self.peaks_sigma[self.is_measured])))
-        # Of a Rayleigh distribution: sqrt(-2 log(1 - p)) for the quantile p, and sqrt(2) for the RMS.
-        rms_px = max(float(np.quantile(self.lengths_px, p)) / math.sqrt(-math.log(1 - p)) for p in (0.5, 0.8))
-        return math.sqrt(max(rms_px**2 - noise**2, (rms_px / 2) ** 2))
-
-    @property
-    def is_even_cell(self) -> NDArray[np.bool_]:
-        """(n,) True for alternate windows along both axes of their grid, as on a chessboard."""
-        return np.asarray(self.cells.sum(axis=1) % 2 == 0)
-
-    def chessboard_half(self, *, even: bool) -> "Residual":
-        """Return the black or the white windows: one half for a fit, the other for its verification."""
-        return self.where(self.is_even_cell == even)
-
-    def where(self, selected: NDArray[np.bool_]) -> "Residual":
-        """Return the windows where a mask (n,) is True."""
-        shifts_px, peaks_sigma, cells = self.shifts_px[selected], self.peaks_sigma[selected], self.cells[selected]
-        return Residual(self.centres_px[selected], shifts_px, peaks_sigma, cells)
-
-    @property
-    def measured_px(self) -> NDArray[np.float64]:
-        """(m, 2) centres of the windows in which a shift was measured, px of the reference."""
-        return self.centres_px[self.is_measured]
-
-    def in_file_px(self, scales: "PairScales") -> "Residual":
-        """Convert the residual to px of the reference band's file."""
-        up = scales.fixed.inverse
-        centres_px, shifts_px = up.positions(self.centres_px), up.displacements(self.shifts_px)
-        return replace(self, centres_px=centres_px, shifts_px=shifts_px)
-
-
-@dataclass(frozen=True)
-class PairScales:
-    """The sizes of the two images of a band pair, each relative to its file."""
-
-    fixed: PixelScale = SAME_PIXELS
-    moving: PixelScale = SAME_PIXELS
-
-    @classmethod
-    def of(cls, files_px: tuple[Size, Size], images_px: tuple[Size, Size]) -> "PairScales":
-        """The scales for the sizes (width, height) of the two files and of their images."""
-        return cls(*map(PixelScale.between, files_px, images_px))
-
-    def between_files(self, fixed_to_moving: Matrix) -> Matrix:
-        """A homography between the images as one between their files."""
-        return geometry.rescale(fixed_to_moving, self.fixed.inverse, self.moving.inverse)
-
-    def between_images(self, fixed_to_moving: Matrix) -> Matrix:
-        """A homography between the files as one between the images."""
-        return geometry.rescale(fixed_to_moving, self.fixed, self.moving)
-
-
-SAME_SCALES = PairScales()
-"""Both images have the pixels of their files."""
 
 
 @validated.dataclass(frozen=True, config=RECORD)
@@ -327,47 +176,9 @@ class Prediction:
     """`bands` (other bands of the capture), `neighbours` (captures around it), `flight` (mean of the flight), or
     `windows` (windows in the image)."""
     std_px: Number4
-    """Standard error (RMS over the image), px of the band."""
+    """Standard error: RMS of the expected error over the common area, px of the band."""
     off_px: Number4 | None = None
     """RMS distance from the band's own alignment, px of the band."""
-    covariance_px2: Annotated[NDArray[np.float64], Array((12, 12), COVARIANCE_DECIMALS)] | None = None
-    """Covariance of corners and lens shapes, px of the reference, if these were extrapolated."""
-
-
-@validated.dataclass(frozen=True, config=RECORD)
-class Similarity:
-    """Similarity of the pixels that are valid in both bands; null: not measured. Large images are sampled.
-
-    Examples
-    --------
-    `result` is that of the example of `align`.
-
-    >>> result.before.nmi < 1.01, result.after.nmi > 1.4
-    (True, True)
-    >>> round(result.after.ncc, 2), round(result.after.gradient_correlation, 2)  # reversed contrast, equal edges
-    (-1.0, 1.0)
-    """
-
-    __eq__ = equal
-
-    mattes_mi: Number6 = math.nan
-    """Negative Mattes mutual information, nats, 32 bins: lower is better."""
-    nmi: Number6 = math.nan
-    """Normalised mutual information, 1 to 2: higher is better."""
-    ncc: Number6 = math.nan
-    """Normalised cross-correlation; negative if contrast is reversed."""
-    gradient_correlation: Number6 = math.nan
-    """Correlation of gradient magnitudes."""
-    structure_ssim: Number6 = math.nan
-    """SSIM of structure images."""
-    overlap: Number6 = math.nan
-    """Share of the image in which both bands are valid."""
-    residual_px: Number6 = math.nan
-    """Median length of the windows' shifts, px of the reference."""
-    residual_p95_px: Number6 = math.nan
-    """Their 95th percentile."""
-    residual_coverage: Number6 = math.nan
-    """Share of the textured windows with a measured shift."""
 
 
 @dataclass(frozen=True)
@@ -420,12 +231,11 @@ class Alignment:
     mapping has been compared with it. None if there is no prediction."""
     is_seed_usable: bool = False
     """The mapping is that of the seed, which is trusted or requested, and which fits the windows."""
-    lens_std_px: NDArray[np.float64] | None = None
-    """(4,) standard deviations of the lens shapes (`fit.window_fit`) that neither tags nor a rig determine, px of the
-    reference; None if they are known, or contained in a prediction."""
-    relief_std_px: float = 0.0
-    """Spread of the relief of the flight, px of the reference, which a mapping without relief lacks where no window is
-    near."""
+    error: MappingError | None = None
+    """What the error of the mapping is made of; None for `seed_only` and `failed`, whose error is unknown."""
+    std_px: float = math.inf
+    """Standard error: the RMS of `error_px` over the area that both images show, px of the reference; infinite if it is
+    unknown."""
     moving_size_px: Size | None = None
     """(width, height) of the moving image; None if it is not known, as in sidecars of earlier versions."""
 
@@ -587,7 +397,81 @@ class Alignment:
         """The pixels that the homography maps: raw (`pixel`) or undistorted ones."""
         return "pixel" if self.mapping.fixed_lens is None else "undistorted"
 
-    def in_file_px(self: "Alignment", scales: "PairScales", size_px: Size) -> "Alignment":
+    def error_px(self, reference_px: "ArrayLike") -> NDArray[np.float64]:
+        """Return the expected error at positions in the reference.
+
+        `std_px` is its RMS over the area that both images show; the limits of `aligned`, the error map and the quality
+        flags are limits of it.
+
+        Parameters
+        ----------
+        reference_px
+            (..., 2): x and y, raw px of the reference; (0, 0) is the centre of the top-left pixel.
+
+        Returns
+        -------
+        array
+            (...), float64: RMS distance of mapped from true positions, px of the reference; infinite where it is
+            unknown, as in bands that are `seed_only` or `failed`.
+
+        Raises
+        ------
+        InputError
+            `reference_px` are not positions.
+
+        Examples
+        --------
+        `result` is that of the example of `align`.
+
+        >>> at_centre, at_corner = result.error_px([[100, 100], [0, 0]])
+        >>> bool(0 < at_centre < 0.2), bool(at_corner < 0.5)
+        (True, True)
+        """
+        points_px = positions_of(reference_px, "reference_px")
+        if self.error is None:
+            return np.full(points_px.shape[:-1], np.inf)
+        return self.error.error_px(points_px.reshape(-1, 2)).reshape(points_px.shape[:-1])
+
+    @property
+    def error_map_px(self) -> FloatImage:
+        """The expected error at every pixel of the reference: (height, width), float32.
+
+        It is `error_px`, but for the part of the parallax at nodes every 16 px, between which it is linear.
+
+        Examples
+        --------
+        `result` is that of the example of `align`.
+
+        >>> result.error_map_px.shape, bool((result.error_map_px < 0.5).mean() > 0.9)
+        ((200, 200), True)
+        """
+        if self.error is None:
+            return np.full(self.size_px[::-1], np.inf, np.float32)
+        return ErrorOnGrid.of(self.error, self.size_px).on_tile(Tile(0, 0, *self.size_px))
+
+    def is_usable(self, accept_predicted_px: float) -> bool:
+        """Return True if the band is aligned, or predicted with a small standard error.
+
+        Parameters
+        ----------
+        accept_predicted_px
+            Largest standard error of a prediction, px of the band, such as `CheckSettings.accept_predicted_px`.
+
+        Returns
+        -------
+        bool
+            True for a band that indices use.
+
+        Examples
+        --------
+        `result` is that of the example of `align`.
+
+        >>> result.is_usable(1.0)
+        True
+        """
+        return is_usable(self.status, self.prediction, accept_predicted_px)
+
+    def in_file_px(self, scales: PairScales, size_px: Size) -> "Alignment":
         """The same between the files of the two bands; `size_px` is (width, height) of the reference's file.
 
         A displacement field gets a lattice on the file, as a sidecar has it.
@@ -604,8 +488,8 @@ class Alignment:
             seed=replace(self.seed, fixed_to_moving=scales.between_files(self.seed.fixed_to_moving)),
             joint=None if self.joint is None else self.joint.in_file_px(scales),
             residual=None if self.residual is None else self.residual.in_file_px(scales),
-            lens_std_px=None if self.lens_std_px is None else self.lens_std_px * up.mean,
-            relief_std_px=self.relief_std_px * up.mean,
+            error=None if self.error is None else self.error.in_file_px(scales, size_px, mapping.parallax),
+            std_px=self.std_px * up.mean,
             candidates={kind: float(p95_px * up.mean) for kind, p95_px in self.candidates.items()},
         )
 
@@ -636,6 +520,15 @@ class Alignment:
         std = "" if self.joint is None else f", joint.corner_std_px={self.joint.corner_std_px:.3g}"
         reason = "" if self.reason is None else f", reason={self.reason!r}"
         return f"Alignment(status={self.status!r}{residual}{std}{reason})"
+
+
+def is_usable(status: PairStatus, prediction: Prediction | None, accept_predicted_px: float) -> bool:
+    """Return True for the reference, an aligned band, or a predicted one with a standard error of at most
+    `accept_predicted_px`, px of the band: the one definition of a delivered band.
+    """
+    if status == "predicted":
+        return prediction is not None and prediction.std_px <= accept_predicted_px
+    return status in ("reference", "aligned")
 
 
 Alignments = dict[str, Alignment]

@@ -5,6 +5,7 @@ Every matrix is a 3x3 float64 array that maps homogeneous column vectors (x, y, 
 maps a pixel of the fixed (reference) image to a pixel of the moving image.
 """
 
+from dataclasses import dataclass
 from reprlib import repr as shortened_repr
 
 import cv2
@@ -12,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from agalign.errors import GeometryError
-from agalign.values.pixel_units import PixelScale, Size
+from agalign.values.pixel_units import SAME_PIXELS, PixelScale, Size
 
 Matrix = NDArray[np.float64]
 """(3, 3) homography."""
@@ -166,3 +167,28 @@ def _over_elements(points_px: Points, width_px: int, height_px: int) -> NDArray[
     along_x = np.stack([u, v, one, zero, zero, zero, -u * u, -u * v], axis=1) * width_px
     along_y = np.stack([zero, zero, zero, u, v, one, -u * v, -v * v], axis=1) * height_px
     return np.stack([along_x, along_y], axis=1)
+
+
+@dataclass(frozen=True)
+class PairScales:
+    """The sizes of the two images of a band pair, each relative to its file."""
+
+    fixed: PixelScale = SAME_PIXELS
+    moving: PixelScale = SAME_PIXELS
+
+    @classmethod
+    def of(cls, files_px: tuple[Size, Size], images_px: tuple[Size, Size]) -> "PairScales":
+        """The scales for the sizes (width, height) of the two files and of their images."""
+        return cls(*map(PixelScale.between, files_px, images_px))
+
+    def between_files(self, fixed_to_moving: Matrix) -> Matrix:
+        """A homography between the images as one between their files."""
+        return rescale(fixed_to_moving, self.fixed.inverse, self.moving.inverse)
+
+    def between_images(self, fixed_to_moving: Matrix) -> Matrix:
+        """A homography between the files as one between the images."""
+        return rescale(fixed_to_moving, self.fixed, self.moving)
+
+
+SAME_SCALES = PairScales()
+"""Both images have the pixels of their files."""

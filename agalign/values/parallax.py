@@ -161,6 +161,14 @@ class Parallax:
         std_px = replace(relief, parallax_px=relief.std_px)(points_px)
         return np.asarray((std_px * np.hypot(*self.baseline)) ** 2)
 
+    def variance_at_crossings(self, x_px: NDArray[np.float64], y_px: NDArray[np.float64]) -> FloatImage:
+        """Return the same (m, n) at all crossings of columns x (n,) and rows y (m,), faster than at points."""
+        relief = self.relief
+        if relief.std_px is None:
+            return np.zeros((len(y_px), len(x_px)), np.float32)
+        std_px = replace(relief, parallax_px=relief.std_px).at_crossings(x_px, y_px)
+        return np.asarray(np.square(std_px * np.float32(np.hypot(*self.baseline))))
+
     def displacements(self, points_px: ArrayLike) -> NDArray[np.float64]:
         """t_b z (..., 2) at raw points (..., 2), undistorted px."""
         return np.asarray(self.relief(points_px)[..., None] * np.array(self.baseline))

@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 from agalign.errors import InputError
 from agalign.values.choices import Interpolation
 from agalign.values.geometry import Points
-from agalign.values.image import Mask, Tile
+from agalign.values.image import FloatImage, Mask, Tile
 from agalign.values.mapping import PixelMapping
 from agalign.values.memory import RESAMPLED_TILE_PX
 from agalign.values.pixel_units import Size
@@ -23,6 +23,8 @@ MIN_VALID_WEIGHT = 0.999
 """Minimum weight of valid pixels in a valid resampled or reduced pixel: float32 weights do not sum to exactly 1."""
 _MAX_FLOAT32_PX = 1 << 15
 """Positions in images of longer sides need float64: their last bit in float32 is above 0.002 px."""
+NODES_PX = 16
+"""Distance of the nodes at which a smooth value, such as an expected error, is calculated."""
 _MAX_CHANNELS = 16
 """Distinguishes (H, W, C) from (C, H, W): images have more rows than this."""
 
@@ -34,6 +36,21 @@ def tiles(area: Tile, side_px: int) -> Iterator[Tile]:
             width = min(side_px, area.x0 + area.width - x)
             height = min(side_px, area.y0 + area.height - y)
             yield Tile(x, y, width, height)
+
+
+def nodes_along(length_px: int) -> int:
+    """Return the number of nodes along an axis of an image, at least every NODES_PX, for `between_nodes`."""
+    return max(2, -(-length_px // NODES_PX))
+
+
+def between_nodes(nodes: NDArray[np.float32], size_px: Size, tile: Tile) -> FloatImage:
+    """Interpolate values at nodes (rows, columns) linearly to the pixels (height, width) of a tile.
+
+    The nodes are spread evenly over an image (width, height), from corner to corner.
+    """
+    x, y = (np.linspace(0, n - 1, m, dtype=np.float32) for n, m in zip(nodes.shape[::-1], size_px, strict=True))
+    at = np.meshgrid(x[tile.x0 : tile.x0 + tile.width], y[tile.y0 : tile.y0 + tile.height])
+    return np.asarray(cv2.remap(nodes, *at, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE), np.float32)
 
 
 def planes_of(image: ArrayLike, name: str) -> tuple[NDArray[np.generic], bool]:

@@ -6,7 +6,6 @@ A new check is one function, which yields issues, and one line in `CHECKS`. The 
 
 import math
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass
 from typing import NamedTuple, Protocol
 
 import cv2
@@ -15,7 +14,7 @@ from numpy.typing import NDArray
 
 from agalign.pixels.structure import Field, correlation_surfaces
 from agalign.values import geometry
-from agalign.values.alignment import MIN_RETRIEVAL, MIN_TIMES_CHANCE, JointResult, Prediction, Residual, noise_px
+from agalign.values.alignment import MIN_RETRIEVAL, MIN_TIMES_CHANCE, JointResult, Prediction
 from agalign.values.geometry import Matrix, Points
 from agalign.values.issues import (
     CLOSE_WINDOWS,
@@ -30,10 +29,11 @@ from agalign.values.issues import (
     UNEXPECTED_PX,
     Issue,
 )
-from agalign.values.mapping import DisplacementField
-from agalign.values.parallax import Parallax
+from agalign.values.mapping import PixelMapping
+from agalign.values.mapping_error import MappingError
 from agalign.values.pixel_units import SAME_PIXELS, PixelScale
-from agalign.verify.expected_error import MIN_COMMON_COVERAGE, error_px
+from agalign.values.residual import Residual, noise_px
+from agalign.verify.coverage import MIN_COMMON_COVERAGE
 
 BY_WINDOWS = "windows"
 """Recipe of a result that is fitted to windows; its residual contains the windows that were left out of the fit."""
@@ -45,10 +45,6 @@ MAX_ALIAS_PEAK = 0.75
 _MAX_ERROR_PX, _MIN_ACCURATE_SHARE = 0.5, 0.9
 """`aligned` means an expected error of at most this in this share of the pixels with texture. Errors of 0.5 px RMS are
 beyond 1 px in 2 % of the pixels."""
-_MAX_FLAGGED_SHARE = 0.5
-"""Share of the image whose expected error with a relief is beyond MAX_SHIFT_PX, as the quality raster flags it, from
-which a band is not `aligned`. Held-out windows verify the relief; its standard error is also large at depth edges and
-without texture, where no window has a shift: it may exceed the limit above, but not in most of the image."""
 MAX_SHIFT_PX = 1.0
 """Maximum residual shift of an aligned window: beyond it, a spectral index mixes neighbours."""
 _MAX_NOISE_STD = 2.0
@@ -80,58 +76,51 @@ class AlignedImages(Protocol):
     def separate_windows(self) -> Residual:
         """Return the residual of windows that cover the image once."""
 
-    def common_px(self) -> Points:
-        """Return the points (n, 2) of a grid over the reference that the moving image covers."""
+
+class Verifiable(Protocol):
+    """The mapping that is checked, on the grid of the images or of the files: `capture.candidate.Candidate`."""
+
+    @property
+    def mapping(self) -> PixelMapping:
+        """From the reference to the moving image."""
+
+    @property
+    def joint(self) -> JointResult | None:
+        """The homography, and evidence of descriptors."""
+
+    @property
+    def windows(self) -> Residual:
+        """Shifts of windows after alignment."""
+
+    @property
+    def error(self) -> MappingError:
+        """The expected error."""
+
+    @property
+    def textured_px(self) -> Points:
+        """Points (n, 2) of the reference whose errors are limited."""
+
+    @property
+    def file_pixel_size_px(self) -> float:
+        """Size of a pixel of the reference's file on this grid; limits of shifts and errors are in px of the file."""
+
+    @property
+    def images(self) -> AlignedImages | None:
+        """None omits the checks that use pixels."""
 
 
-@dataclass(frozen=True)
-class Evidence:
-    """The input of the checks, on the grid of the images or of the files."""
-
-    joint: JointResult
-    residual: Residual
-    """Residual shifts of windows after alignment."""
-    size_px: tuple[int, int]
-    """(width, height) of the fixed image."""
-    images: AlignedImages | None = None
-    """None omits the checks that use pixels."""
-    prediction: Prediction | None = None
-    """Prediction by the rig, with the distance `off_px` of the result; None without a rig."""
-    field: DisplacementField | None = None
-    """Displacement field of the mapping."""
-    parallax: Parallax | None = None
-    """Relief of the mapping."""
-    lens_std_px: NDArray[np.float64] | None = None
-    """(4,) standard deviations of unknown lens shapes; None if the lenses are known."""
-    relief_std_px: float = 0.0
-    """Spread of the relief that a mapping without one lacks."""
-    file_pixel_size_px: float = 1.0
-    """Size of a pixel of the reference's file on this grid; the limits of residual shifts are in px of the file."""
-
-    def error_px(self, points_px: Points) -> NDArray[np.float64]:
-        """Return the expected error (n,) at points (n, 2)."""
-        return error_px(
-            self.joint.covariance_px2,
-            self.residual,
-            self.size_px,
-            points_px,
-            lens_std_px=self.lens_std_px,
-            field=self.field,
-            parallax=self.parallax,
-            relief_std_px=self.relief_std_px,
-        )
-
-
-def _mapping_issues(evidence: Evidence) -> Iterator[Issue]:
+def _mapping_issues(candidate: Verifiable) -> Iterator[Issue]:
     max_stretch = 4.0  # of the largest magnification relative to the smallest; beyond it, a homography is degenerate
-    scale = geometry.local_scale(evidence.joint.fixed_to_moving, *evidence.size_px)
+    scale = geometry.local_scale(candidate.mapping.fixed_to_moving, *candidate.error.size_px)
     if not (scale.min() > 0 and scale.max() <= max_stretch * scale.min()):
         yield Issue(FOLDS, float(scale.max() / scale.min()), max_stretch)
 
 
-def _descriptor_issues(evidence: Evidence) -> Iterator[Issue]:
+def _descriptor_issues(candidate: Verifiable) -> Iterator[Issue]:
     """Retrieval of held-out patches, or held-out windows of a result that is fitted to windows."""
-    joint, residual = evidence.joint, evidence.residual
+    joint, residual = candidate.joint, candidate.windows
+    if joint is None:
+        return
     # With a measured shift, if they are the only evidence: in unrelated images one in a thousand is aligned.
     min_held_out_windows = 12
     is_confirmed = joint.recipe == BY_WINDOWS and len(residual.measured_px) >= min_held_out_windows
@@ -140,9 +129,9 @@ def _descriptor_issues(evidence: Evidence) -> Iterator[Issue]:
         yield Issue(RETRIEVAL, joint.retrieval, minimum)
 
 
-def _window_issues(evidence: Evidence) -> Iterator[Issue]:
+def _window_issues(candidate: Verifiable) -> Iterator[Issue]:
     """Residual shifts of windows, which are independent of the estimation."""
-    residual = evidence.residual
+    residual = candidate.windows
     min_windows = 4  # with structure; fewer cannot cover all corners of the image
     if len(residual.centres_px) < min_windows:
         yield Issue(FEW_WINDOWS, len(residual.centres_px), min_windows)
@@ -151,7 +140,7 @@ def _window_issues(evidence: Evidence) -> Iterator[Issue]:
         yield Issue(COVERAGE, residual.coverage, MIN_COMMON_COVERAGE)
     measured = len(residual.measured_px)
     count = max(measured, 1)
-    is_far = is_misaligned(residual, evidence.file_pixel_size_px)
+    is_far = is_misaligned(residual, candidate.file_pixel_size_px)
     close = 1 - float(is_far.sum()) / count
     if not close >= _MIN_CLOSE_SHARE:
         yield Issue(CLOSE_WINDOWS, close, _MIN_CLOSE_SHARE, f"{MAX_SHIFT_PX:g} px")
@@ -171,31 +160,21 @@ def is_misaligned(residual: Residual, pixel_px: float = 1.0) -> NDArray[np.bool_
     return np.asarray(lengths_px > np.hypot(MAX_SHIFT_PX * pixel_px, _MAX_NOISE_STD * noise))
 
 
-def _error_issues(evidence: Evidence) -> Iterator[Issue]:
+def _error_issues(candidate: Verifiable) -> Iterator[Issue]:
     """The expected error where the reference has texture and both images are valid."""
-    points_px = evidence.residual.centres_px if evidence.images is None else evidence.images.common_px()
-    if len(points_px):
-        max_px = _MAX_ERROR_PX * evidence.file_pixel_size_px
-        share = float((evidence.error_px(points_px) <= max_px).mean())
+    if len(candidate.textured_px):
+        max_px = _MAX_ERROR_PX * candidate.file_pixel_size_px
+        share = float((candidate.error.error_px(candidate.textured_px) <= max_px).mean())
         if not share >= _MIN_ACCURATE_SHARE:
             yield Issue(INACCURATE, 1 - share, 1 - _MIN_ACCURATE_SHARE, f"{_MAX_ERROR_PX:g} px")
 
 
-def relief_issues(evidence: Evidence) -> Iterator[Issue]:
-    """The expected error with the standard error of the written relief, which no window shows in most of the image."""
-    points_px = evidence.residual.centres_px if evidence.images is None else evidence.images.common_px()
-    if len(points_px):
-        share = float((evidence.error_px(points_px) > MAX_SHIFT_PX * evidence.file_pixel_size_px).mean())
-        if share > _MAX_FLAGGED_SHARE:
-            yield Issue(INACCURATE, share, _MAX_FLAGGED_SHARE, f"{MAX_SHIFT_PX:g} px")
-
-
-def _content_issues(evidence: Evidence) -> Iterator[Issue]:
+def _content_issues(candidate: Verifiable) -> Iterator[Issue]:
     """An area with texture in both bands and no common peak shows something else. Single windows are normal."""
-    if evidence.images is None:
+    if candidate.images is None:
         return
-    residual = evidence.images.separate_windows()
-    is_lost = ~np.isfinite(residual.shifts_px[:, 0]) | is_misaligned(residual, evidence.file_pixel_size_px)
+    residual = candidate.images.separate_windows()
+    is_lost = ~np.isfinite(residual.shifts_px[:, 0]) | is_misaligned(residual, candidate.file_pixel_size_px)
     area = _solid_area(residual.cells, is_lost)
     if area:
         yield Issue(OTHER_CONTENT, area / len(is_lost), 0.0)
@@ -236,9 +215,9 @@ def rig_issues(prediction: Prediction) -> Iterator[Issue]:
             yield Issue(UNEXPECTED_PX, prediction.off_px, limit_px)
 
 
-def _repetition_issues(evidence: Evidence) -> Iterator[Issue]:
+def _repetition_issues(candidate: Verifiable) -> Iterator[Issue]:
     """Another shift fits nearly as well in an orchard or on solar panels, and no prior information excludes it."""
-    images = evidence.images
+    images = candidate.images
     if images is None:
         return
     alias = images.alias_peak()
@@ -273,7 +252,7 @@ def alias_peak(fixed: Field, moving: Field, scale: PixelScale = SAME_PIXELS) -> 
 class Check(NamedTuple):
     """One check: the function that returns its issues."""
 
-    issues: Callable[[Evidence], Iterable[Issue]]
+    issues: Callable[[Verifiable], Iterable[Issue]]
     is_costly: bool = False
     """Run only if no other check returns an issue."""
 
@@ -283,17 +262,16 @@ CHECKS = (
     Check(_descriptor_issues),
     Check(_window_issues),
     Check(_error_issues),
-    Check(lambda evidence: () if evidence.prediction is None else rig_issues(evidence.prediction)),
     Check(_content_issues, is_costly=True),
     Check(_repetition_issues, is_costly=True),
 )
 """In the order in which their issues are listed; the first issue is the reason in the sidecar."""
 
 
-def issues_of(evidence: Evidence) -> tuple[Issue, ...]:
+def issues_of(candidate: Verifiable) -> tuple[Issue, ...]:
     """Return every reason for not accepting a result; empty if it passes verification."""
-    result = tuple(i for check in CHECKS if not check.is_costly for i in check.issues(evidence))
-    return result or tuple(i for check in CHECKS if check.is_costly for i in check.issues(evidence))
+    result = tuple(i for check in CHECKS if not check.is_costly for i in check.issues(candidate))
+    return result or tuple(i for check in CHECKS if check.is_costly for i in check.issues(candidate))
 
 
 def seed_fits(residual: Residual) -> bool:

@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from scipy.special import entr
 
 from agalign.pixels.structure import gradient_magnitude
-from agalign.values.alignment import Similarity
 from agalign.values.image import FloatImage, Mask, Raster
+from agalign.values.residual import Similarity
 
 _BINS = 32
 """Bins of each axis of the joint histogram, as in elastix."""

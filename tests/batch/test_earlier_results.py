@@ -146,8 +146,7 @@ def test_a_result_of_schema_version_1_is_estimated_again(flight: Path, out: Path
         content.pop(name)
     for band in content["bands"]:
         band["doubts"] = band.pop("issues")
-        for name in ("lens_std_px", "relief_std_px"):
-            band.pop(name)
+        band.pop("error")
         if band["metrics"] is not None:
             assert band["metrics"].pop("windows") is not None
             band["metrics"]["tiles"] = []

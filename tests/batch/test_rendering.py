@@ -19,6 +19,7 @@ from agalign.products.run.cautions import RunFacts
 from agalign.products.sidecar.file import find_sidecars, read_sidecar, verify_outputs
 from agalign.values.alignment import Alignment
 from agalign.values.mapping import DisplacementField
+from agalign.values.mapping_error import MappingError
 
 from ..builders import in_full_run, joint_result, residual_of
 from ..conftest import raising, read_json, seeded
@@ -90,15 +91,19 @@ def with_field(run: Run) -> dict[str, Alignment]:
     rng = np.random.default_rng(0)
     result = {}
     for name, alignment in run.alignments.items():
-        field = DisplacementField(48.0, rng.normal(0, 1, (6, 7, 2)))
+        mapping = replace(alignment.mapping, parallax=None, field=DisplacementField(48.0, rng.normal(0, 1, (6, 7, 2))))
         centres_px = rng.uniform((0, 0), SIZE, (30, 2))
-        result[name] = replace(
-            alignment,
-            mapping=replace(alignment.mapping, parallax=None, field=field),
-            residual=residual_of(centres_px, rng.normal(0, 0.1, (30, 2)), sigma=17.123456),
-            joint=joint_result(std_px=0.0512345678, covariance=np.diag(rng.uniform(0, 0.01, 8))),
+        residual = residual_of(centres_px, rng.normal(0, 0.1, (30, 2)), sigma=17.123456)
+        joint = joint_result(std_px=0.0512345678, covariance=np.diag(rng.uniform(0, 0.01, 8)))
+        error = MappingError(
+            alignment.size_px,
+            joint.covariance_px2,
+            residual,
             lens_std_px=rng.uniform(0, 0.1, 4),
+            field_std_px=1.23456789,
+            relief_std_px=0.23456789,
         )
+        result[name] = replace(alignment, mapping=mapping, residual=residual, joint=joint, error=error)
     return result
 
 
@@ -113,7 +118,14 @@ def alignments_of(run: Run, kind: str) -> dict[str, Alignment]:
     rng = np.random.default_rng(1)
     hill = run.on_hill(decimals=6 if kind == "relief" else 2)
     joint = joint_result(std_px=0.0512345678)
-    return {n: replace(a, joint=joint, lens_std_px=rng.uniform(0, 0.1, 4)) for n, a in hill.items()}
+    result = {}
+    for name, alignment in hill.items():
+        lens_std_px, parallax = rng.uniform(0, 0.1, 4), alignment.mapping.parallax
+        error = MappingError(
+            alignment.size_px, joint.covariance_px2, alignment.residual, lens_std_px=lens_std_px, parallax=parallax
+        )
+        result[name] = replace(alignment, joint=joint, error=error)
+    return result
 
 
 @pytest.mark.parametrize(

@@ -35,7 +35,7 @@ from agalign.values.image import Raster
 from agalign.values.issues import NO_CONTRAST, RETRIEVAL, Issue
 from agalign.values.mapping import PixelMapping
 from agalign.values.parallax import Parallax, Relief
-from agalign.verify.expected_error import expected_error_px
+from agalign.verify.coverage import expected_error_px
 
 from ..builders import in_full_run, joint_result, residual_of, whole
 from ..conftest import Shared, textured_image

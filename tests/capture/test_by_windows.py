@@ -8,21 +8,19 @@ import pytest
 
 import agalign
 from agalign.capture import by_windows as module
-from agalign.capture import decision
 from agalign.capture.band_pair import BandPair
-from agalign.capture.decision import by_windows, fall_back_to_seed, verified, with_lens_shapes
+from agalign.capture.by_descriptors import by_descriptors
+from agalign.capture.by_windows import extrapolated
+from agalign.capture.candidate import BandCandidates, Candidate, RefinedBand
 from agalign.capture.seeding import find_seed
-from agalign.capture.warped_pair import Candidate
 from agalign.config import SeedSettings
-from agalign.fit.window_fit import lens_shapes
-from agalign.flight.rig import Rig
 from agalign.pixels.masks import raster_of
 from agalign.values import geometry
 from agalign.values.alignment import Alignment, Seed
 from agalign.values.issues import FOLDS, RETRIEVAL, UNREADABLE, Issue
-from agalign.verify.expected_error import expected_error_px
+from agalign.values.lens_shapes import lens_shapes
 
-from ..builders import joint_result, pair_of, rms, two_views, whole
+from ..builders import decided, fitted_to_windows, joint_result, pair_of, rms, two_views, whole
 from ..conftest import textured_image
 
 SIZE = 640, 480
@@ -34,6 +32,7 @@ LARGE = 800, 640
 TRUTH = geometry.compose(
     geometry.translation(5.0, -3.0), np.array([[1.004, 0.002, 0], [-0.003, 0.998, 0], [0, 0, 1.0]])
 )
+GOOD = joint_result(TRUTH)
 
 
 @pytest.fixture(scope="module")
@@ -41,39 +40,43 @@ def pair() -> BandPair:
     return pair_of(*two_views(TRUTH, *LARGE))
 
 
-def unaligned(pair: BandPair, issue: Issue = SILENT) -> Alignment:
-    seed = Seed("structure", geometry.translation(5.0, -3.0), 20.0, trusted=True)
-    result = fall_back_to_seed(pair, seed, (issue,))
-    assert result.status == "seed_only"
-    return result
+SEED = Seed("structure", geometry.translation(5.0, -3.0), 20.0, trusted=True)
+
+
+def lost(pair: BandPair, issue: Issue = SILENT) -> BandCandidates:
+    """A band without a result of the descriptors, whose seed fits."""
+    band = BandCandidates(pair, SEED, issue)
+    assert band.does_start_fit
+    return band
 
 
 def test_windows_suffice_where_descriptors_fail(pair: BandPair) -> None:
-    before = unaligned(pair)
-    after = by_windows(pair, before)
+    after = fitted_to_windows(lost(pair))
     assert (after.status, after.issues, after.joint.recipe) == ("aligned", (), "windows")
-    assert geometry.corner_error_px(before.fixed_to_moving, TRUTH, *LARGE) > 1
+    assert geometry.corner_error_px(SEED.fixed_to_moving, TRUTH, *LARGE) > 1
     assert geometry.corner_error_px(after.fixed_to_moving, TRUTH, *LARGE) < 0.3
 
 
 def test_windows_do_not_override_descriptors_or_other_failures(pair: BandPair, monkeypatch: pytest.MonkeyPatch) -> None:
-    before = unaligned(pair)
-    others = [unaligned(pair, issue) for issue in (Issue(UNREADABLE, detail="x"), Issue(FOLDS, 9.0, 4.0))]
-    for other in (*others, replace(before, issues=())):
-        assert by_windows(pair, other) is other
+    for issue in (Issue(UNREADABLE, detail="x"), Issue(FOLDS, 9.0, 4.0)):
+        assert fitted_to_windows(lost(pair, issue)).status == "seed_only"
+    aligned_already = BandCandidates(pair, SEED)
+    aligned_already.candidates = [Candidate.of("descriptors", RefinedBand.of(pair, SEED, GOOD).warped, GOOD)]
+    assert fitted_to_windows(aligned_already).joint.recipe == "fast"
+    assert len(aligned_already.candidates) == 1
     monkeypatch.setattr(module, "_MAX_STEP_PX", 0.5)  # less than the error of the seed
-    assert by_windows(pair, before) is before
+    assert fitted_to_windows(lost(pair)).status == "seed_only"
 
 
-def test_held_out_windows_must_confirm_the_fit() -> None:
+def test_held_out_windows_must_confirm_the_fit(pair: BandPair) -> None:
     fixed, moving = two_views(TRUTH, *LARGE)
     moving.pixels[:, 480:] = textured_image(320, 640, seed=5)  # unrelated content
-    pair = pair_of(fixed, moving)
-    after = by_windows(pair, unaligned(pair))
+    after = fitted_to_windows(lost(pair_of(fixed, moving)))
     assert (after.status, [issue.code for issue in after.issues]) == ("predicted", ["other_content"])
     moving.pixels[:] = textured_image(*LARGE, seed=5)
-    before = unaligned(pair_of(fixed, two_views(TRUTH, *LARGE)[1]))
-    assert by_windows(pair_of(fixed, moving), before) is before
+    unrelated = BandCandidates(pair_of(fixed, moving), SEED, SILENT)
+    vars(unrelated)["start_residual"] = lost(pair).start_residual  # that of a seed that fits
+    assert fitted_to_windows(unrelated).status == "seed_only"
 
 
 # ---- no structure in one half: a prediction with the error of that half
@@ -105,29 +108,32 @@ def true_positions(points: np.ndarray) -> np.ndarray:
     return geometry.apply(MATRIX, points + lens_shapes(points, SIZE) @ LENS_PX)
 
 
-def aligned(pair: BandPair) -> Alignment:
-    """An alignment with a homography fitted to the common part."""
+def refined(pair: BandPair) -> RefinedBand:
+    """The band with a homography fitted to the common part."""
     points = geometry.lattice(*SIZE, 40, 30)
     seen = points[pair.fixed.valid[points[:, 1].astype(int), points[:, 0].astype(int)]]
     matrix = geometry.fit_homography(seen, true_positions(seen))
     joint = joint_result(matrix, covariance=0.0025 * np.eye(8))
-    return verified(Candidate.of(pair, Seed("structure", matrix, 20.0), joint), "never")
+    return RefinedBand.of(pair, Seed("structure", matrix, 20.0), joint)
+
+
+def by_homography(band: RefinedBand) -> Candidate:
+    (plane,) = by_descriptors(band, None, "never")
+    return plane
+
+
+def with_lens_shapes(band: RefinedBand) -> Alignment:
+    return fitted_to_windows(BandCandidates(band.pair, band.seed, None, [by_homography(band)]), band)
 
 
 @pytest.fixture(scope="module")
-def left() -> tuple[BandPair, Alignment]:
-    """The pair with pixels in its left half, and its alignment."""
-    pair = pair_in(LEFT)
-    return pair, aligned(pair)
+def left() -> RefinedBand:
+    """The band with pixels in its left half."""
+    return refined(pair_in(LEFT))
 
 
-def extrapolated(pair: BandPair, before: Alignment, rig: Rig | None = None) -> Alignment:
-    return with_lens_shapes([pair], {"moving": before}, rig)["moving"]
-
-
-def test_half_of_the_image_is_extrapolated_with_the_lens_and_its_error(left: tuple[BandPair, Alignment]) -> None:
-    pair, before = left
-    after = extrapolated(pair, before)
+def test_half_of_the_image_is_extrapolated_with_the_lens_and_its_error(left: RefinedBand) -> None:
+    before, after = decided(left.pair, left.seed, [by_homography(left)]), with_lens_shapes(left)
     assert (after.status, after.prediction.source) == ("predicted", "windows")
     assert [issue.code for issue in after.issues] == ["inaccurate"]
     assert "the expected error is above 0.5 px in" in after.reason
@@ -137,18 +143,19 @@ def test_half_of_the_image_is_extrapolated_with_the_lens_and_its_error(left: tup
     right = points[:, 0] > 330
     assert rms(errors) < 0.5 < rms(homography_errors[right])
     assert 0.5 * rms(errors) < after.prediction.std_px < 1.0
-    expected = expected_error_px(after, SIZE, points)
+    expected = after.error_px(points)
     assert np.median(expected[right]) > 2 * np.median(expected[points[:, 0] < 300])
     assert (np.linalg.norm(errors, axis=1) < 3 * expected).mean() > 0.95
 
 
-def test_covered_images_georeferenced_files_and_failed_pairs_are_unchanged(left: tuple[BandPair, Alignment]) -> None:
-    pair, before = left
-    failed, everywhere = replace(before, prediction=None), pair_in(WHOLE)
-    mosaic = replace(pair, seed_matrices={"geo": np.eye(3)})
-    assert aligned(everywhere).status == "aligned"
-    for one, alignment in ((everywhere, aligned(everywhere)), (mosaic, before), (pair, failed)):
-        assert extrapolated(one, alignment) is alignment
+def test_covered_images_georeferenced_files_and_failed_pairs_are_unchanged(left: RefinedBand) -> None:
+    everywhere, plane = by_homography(refined(pair_in(WHOLE))), by_homography(left)
+    assert everywhere.issues == ()
+    assert extrapolated(plane, 0.0) is not None
+    mosaic = replace(plane, pair=replace(left.pair, seed_matrices={"geo": np.eye(3)}))
+    failed = replace(plane, joint=replace(plane.joint, retrieval=0.1))
+    for one in (everywhere, mosaic, failed):
+        assert extrapolated(one, 0.0) is None
 
 
 @pytest.mark.parametrize(
@@ -160,13 +167,14 @@ def test_covered_images_georeferenced_files_and_failed_pairs_are_unchanged(left:
     ],
 )
 def test_a_rig_of_the_whole_image_without_relief_prevents_extrapolation(
-    left: tuple[BandPair, Alignment], facts: dict[str, object], status: str
+    left: RefinedBand, facts: dict[str, object], status: str
 ) -> None:
-    after = aligned(replace(left[0], seed_std_px={"model": 1.0}, **facts))
+    band = refined(replace(left.pair, seed_std_px={"model": 1.0}, **facts))
+    after = decided(band.pair, band.seed, [by_homography(band)])
     assert after.status == status
     if "relief_std_px" in facts:
         assert after.prediction.std_px > 1.5
-        assert expected_error_px(after, SIZE, np.array([[620.0, 240.0]]))[0] > 3.5
+        assert after.error_px([620.0, 240.0]) > 3.5
 
 
 @pytest.mark.slow
@@ -176,15 +184,22 @@ def test_a_rig_of_the_whole_image_without_relief_prevents_extrapolation(
     ids=["along the layout", "error of the tags", "beyond infinity"],
 )
 def test_unknown_relief_is_a_share_of_the_range(
-    left: tuple[BandPair, Alignment], offset_px: tuple[float, float], shift_px: float
+    left: RefinedBand, offset_px: tuple[float, float], shift_px: float
 ) -> None:
-    """The nearer the scene, the larger its shift from the mapping at infinity, along the layout of the lenses."""
-    pair, before = left
-    at_infinity = geometry.compose(geometry.translation(*np.negative(offset_px)), before.fixed_to_moving)
+    """The nearer the scene, the larger its shift from the mapping at infinity, along the layout of the lenses.
+
+    The relief is unknown where no window is near.
+    """
+    pair, matrix = left.pair, left.joint.fixed_to_moving
+    at_infinity = geometry.compose(geometry.translation(*np.negative(offset_px)), matrix)
     near = replace(pair, layout=(-1.0, 0.0), seed_matrices={**pair.seed_matrices, "rig": at_infinity})
-    relief_px = decision._RELIEF_SHARE * shift_px
-    std_px = np.hypot(extrapolated(pair, before).prediction.std_px, relief_px)
-    assert extrapolated(near, before).prediction.std_px == pytest.approx(std_px, rel=0.01)
+    without, with_relief = (with_lens_shapes(replace(left, pair=one)) for one in (pair, near))
+    relief_px = module._RELIEF_SHARE * shift_px
+    for point, expected_px in (((630.0, 240.0), relief_px), ((60.0, 240.0), 0.0)):
+        squares = [a.error_px(point) ** 2 for a in (with_relief, without)]
+        assert squares[0] - squares[1] == pytest.approx(expected_px**2, abs=0.01)
+    assert without.prediction.std_px <= with_relief.prediction.std_px
+    assert with_relief.prediction.std_px <= np.hypot(without.prediction.std_px, relief_px)
 
 
 def test_half_masked_arrays_are_predicted() -> None:
@@ -214,13 +229,10 @@ def thermal(scene: np.ndarray, other_share: float) -> np.ndarray:
     return np.asarray(np.where(mask > np.quantile(mask, other_share), -seen / seen.std(), other / other.std()))
 
 
-def tried(fixed: np.ndarray, moving: np.ndarray) -> tuple[BandPair, Alignment]:
+def coarse_band(fixed: np.ndarray, moving: np.ndarray) -> BandCandidates:
     images = (whole((1000 + 100 * pixels).astype(np.float32)) for pixels in (fixed, moving))
     pair = replace(pair_of(*images, {"identity": geometry.overlay(FIXED_PX, MOVING_PX)}), is_coarse=True)
-    seed = find_seed(pair, SeedSettings())
-    issue = Issue(RETRIEVAL, 0.0, 0.2)
-    failed = Alignment(pair.mapping(seed.fixed_to_moving), pair.fixed.size_px, (issue,), seed)
-    return pair, by_windows(pair, failed)
+    return BandCandidates(pair, find_seed(pair, SeedSettings()), Issue(RETRIEVAL, 0.0, 0.2))
 
 
 @pytest.fixture(scope="module")
@@ -233,20 +245,21 @@ def scene() -> np.ndarray:
 def test_a_coarse_band_with_another_field_of_view_is_predicted_with_its_error(
     scene: np.ndarray, other_share: float
 ) -> None:
-    pair, result = tried(scene[100:340, 100:420], thermal(scene, other_share))
+    band = coarse_band(scene[100:340, 100:420], thermal(scene, other_share))
+    result = fitted_to_windows(band)
     assert result.status == "predicted"
     points = geometry.lattice(*FIXED_PX, 9, 7)
     assert rms(result.map(points) - geometry.apply(COARSE_TRUTH, points)) < result.prediction.std_px < 0.6
     assert "predicted from windows in the image" in result.reason
-    failed = replace(result, prediction=None)
-    untrusted = replace(failed, seed=replace(failed.seed, trusted=False))
-    assert by_windows(replace(pair, is_coarse=False), failed) is failed  # a band of full resolution
-    assert by_windows(pair, untrusted) is untrusted
+    of_full_resolution = replace(band.pair, is_coarse=False)
+    untrusted = replace(band.seed, trusted=False)
+    for pair, seed in ((of_full_resolution, band.seed), (band.pair, untrusted)):
+        assert fitted_to_windows(BandCandidates(pair, seed, band.issue)).prediction is None
 
 
 @pytest.mark.parametrize("kind", ["unrelated", "repetitive"])
 def test_unrelated_and_repetitive_coarse_bands_are_not_predicted(scene: np.ndarray, kind: str) -> None:
     tile = np.tile(textured_image(40, 40, seed=4), (11, 13))
     fixed = textured_image(*FIXED_PX, seed=11) if kind == "unrelated" else tile[100:340, 100:420]
-    _, result = tried(fixed, thermal(scene if kind == "unrelated" else tile, 0.2))
+    result = fitted_to_windows(coarse_band(fixed, thermal(scene if kind == "unrelated" else tile, 0.2)))
     assert (result.status, result.prediction) == ("failed", None)

@@ -1,214 +1,385 @@
-from dataclasses import replace
+"""`decide` on candidates that are made by hand: which mapping a band gets, its status and its standard error."""
+
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field, replace
+from functools import cache
 
 import numpy as np
 import pytest
 
-from agalign.capture import warped_pair
 from agalign.capture.band_pair import BandPair
-from agalign.capture.decision import fall_back_to_seed, verified
-from agalign.capture.warped_pair import Candidate, WarpedPair
-from agalign.fit.displacement_field import DisplacementResult
+from agalign.capture.by_relief import ReliefCandidates
+from agalign.capture.by_rig import RigPrediction
+from agalign.capture.candidate import BandCandidates, Candidate, mapping_error
+from agalign.capture.decision import decide
+from agalign.capture.reference import Reference
 from agalign.values import geometry
-from agalign.values.alignment import Prediction, Seed
-from agalign.values.choices import ReliefUse
+from agalign.values.alignment import Alignment, Prediction, Seed
+from agalign.values.geometry import Matrix
 from agalign.values.image import Raster
-from agalign.values.issues import FEW_KEYPOINTS, RETRIEVAL, SEED_DOES_NOT_FIT, Issue
-from agalign.values.mapping import DisplacementField
+from agalign.values.issues import FEW_KEYPOINTS, OTHER_CONTENT, RETRIEVAL, SEED_ASKED_FOR, SEED_DOES_NOT_FIT, Issue
+from agalign.values.mapping import PixelMapping
+from agalign.values.parallax import Parallax, Relief
+from agalign.values.residual import Residual
+from agalign.verify.checks import CLOSE_WINDOWS
+from agalign.verify.coverage import points_in_frame
 
-from ..builders import displaced_views, joint_result, pair_of, residual_of, texture, two_views, whole
+from ..builders import decided, joint_result, pair_of, residual_of, rms, two_views
 
+SIZE = 400, 320
 TRUTH = geometry.translation(6, -4)
 SEED = Seed("rig", geometry.translation(5, -3), 30.0, 30.0, 5.0, trusted=True)
-CENTRED = replace(SEED, fixed_to_moving=np.eye(3))
+FAR = replace(SEED, fixed_to_moving=geometry.translation(150, 0))
 RIG = {"rig": SEED.fixed_to_moving}
-GOOD = joint_result(TRUTH)
+LOST = Issue(RETRIEVAL, 0.1, 0.2)
+IN_PART = Issue(CLOSE_WINDOWS, 0.8, 0.9, "1 px")
 
 
-@pytest.fixture(scope="module")
-def pair() -> BandPair:
-    return pair_of(*two_views(TRUTH), RIG)
+@cache
+def pair(name: str = "NIR") -> BandPair:
+    """A pair with the same reference, whatever its name."""
+    return replace(_pair(), name=name)
+
+
+@cache
+def _pair() -> BandPair:
+    return pair_of(*two_views(TRUTH, *SIZE), RIG)
+
+
+def windows(shift_px: float = 0.0) -> Residual:
+    return residual_of(geometry.lattice(*SIZE, 12, 9), (shift_px, 0.0))
+
+
+def candidate(
+    name: str = "NIR",
+    *,
+    matrix: Matrix = TRUTH,
+    std_px: float = 0.05,
+    shift_px: float = 0.0,
+    relief: Relief | None = None,
+    **facts: object,
+) -> Candidate:
+    """A mapping with this standard error at the corners, and with windows that all have this shift."""
+    parallax = None if relief is None else Parallax(relief, (1.0, 0.0))
+    mapping, joint = pair().mapping(matrix).with_parallax(parallax), joint_result(matrix, std_px=std_px)
+    error = mapping_error(pair(name), mapping, joint.covariance_px2, windows(shift_px))
+    estimator = "descriptors" if relief is None else "relief"
+    return replace(Candidate(estimator, pair(name), mapping, error, windows(shift_px), joint), **facts)
+
+
+def in_part(std_px: float = 0.05, issue: Issue = IN_PART, **facts: object) -> Candidate:
+    """A mapping that the images confirm in a part of the image."""
+    return candidate(std_px=std_px, replaces=(issue,), **facts)
+
+
+def unconfirmed(**facts: object) -> Candidate:
+    """A mapping that held-out descriptors do not confirm."""
+    return candidate(joint=joint_result(retrieval=0.1), **facts)
+
+
+def rig_prediction(
+    matrix: Matrix = TRUTH, std_px: float = 0.3, rotated: Matrix | None = None, of: BandPair | None = None
+) -> RigPrediction:
+    """A prediction by the rig, and what landmarks find of an image that is rotated relative to it."""
+    prediction = Prediction(matrix, "bands", std_px)
+    result = RigPrediction(of or pair(), prediction, prediction, None)
+    vars(result)["rotated"] = rotated  # else found in the images
+    return result
+
+
+def against(of_rig: RigPrediction, *candidates: Candidate) -> Alignment:
+    """The alignment of a band with these candidates, and with a prediction by the rig."""
+    return decide([BandCandidates(pair(), SEED, None, list(candidates))], (), {"NIR": of_rig})["NIR"]
+
+
+def rms_error_px(alignment: Alignment, moving_size_px: tuple[int, int] = SIZE) -> float:
+    points_px = points_in_frame(alignment.mapping, SIZE, moving_size_px)
+    return float(np.sqrt(np.square(alignment.error_px(points_px)).mean()))
+
+
+# ---- without a relief and a rig
+
+
+@dataclass(frozen=True)
+class Case:
+    candidates: Iterable[Candidate]
+    status: str
+    matrix: Matrix
+    issues: tuple[str, ...] = ()
+    seed: Seed = SEED
+    issue: Issue | None = None
+
+
+NEAR, AWAY = geometry.translation(6.1, -4), geometry.translation(6.2, -4)
+CASES = {
+    "aligned": lambda: Case([candidate()], "aligned", TRUTH),
+    "the last that passes": lambda: Case([candidate(), candidate(matrix=NEAR), unconfirmed()], "aligned", NEAR),
+    "the more certain prediction": lambda: Case(
+        [in_part(0.4), in_part(0.2, matrix=NEAR), in_part(0.3, matrix=AWAY)], "predicted", NEAR, ("close_windows",)
+    ),
+    "by windows that are off": lambda: Case(
+        [candidate(shift_px=1.5)], "predicted", TRUTH, ("close_windows", "cluster", "inaccurate")
+    ),
+    "one that passes before a prediction": lambda: Case([candidate(), in_part(0.001, matrix=NEAR)], "aligned", TRUTH),
+    "no prediction of an unknown error": lambda: Case(
+        [in_part(np.inf)], "seed_only", SEED.fixed_to_moving, ("close_windows",)
+    ),
+    "the seed": lambda: Case([unconfirmed()], "seed_only", SEED.fixed_to_moving, ("retrieval",)),
+    "the seed without a result": lambda: Case([], "seed_only", SEED.fixed_to_moving, ("retrieval",), issue=LOST),
+    "an untrusted seed": lambda: Case(
+        [unconfirmed()], "failed", SEED.fixed_to_moving, ("retrieval",), replace(SEED, trusted=False)
+    ),
+    "a seed that does not fit": lambda: Case(
+        [unconfirmed()], "failed", FAR.fixed_to_moving, ("retrieval", "seed_does_not_fit"), FAR
+    ),
+}
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_the_first_row_of_the_table_that_applies(name: str) -> None:
+    case = CASES[name]()
+    result = decided(pair(), case.seed, case.candidates, case.issue)
+    assert (result.status, tuple(issue.code for issue in result.issues)) == (case.status, case.issues)
+    np.testing.assert_array_equal(result.fixed_to_moving, case.matrix)
+    assert (result.error is not None) == (case.status in ("aligned", "predicted"))
+    if result.prediction is not None:
+        assert result.prediction.source == "windows"
+        assert result.prediction.std_px == pytest.approx(rms_error_px(result), abs=6e-5)
+    if result.error is None:
+        assert np.isinf(rms_error_px(result))
+        assert np.isinf(result.error_map()).all()
 
 
 @pytest.mark.parametrize(
     ("issues", "is_predicted", "is_seed_usable", "status"),
     [
         ((), True, True, "aligned"),
-        ((Issue(RETRIEVAL, 0.1, 0.2),), True, True, "predicted"),
-        ((Issue(RETRIEVAL, 0.1, 0.2),), False, True, "seed_only"),
-        ((Issue(RETRIEVAL, 0.1, 0.2),), False, False, "failed"),
+        ((LOST,), True, True, "predicted"),
+        ((LOST,), False, True, "seed_only"),
+        ((LOST,), False, False, "failed"),
     ],
 )
 def test_the_status_is_that_of_the_first_row_that_applies(
-    pair: BandPair, issues: tuple[Issue, ...], is_predicted: bool, is_seed_usable: bool, status: str
+    issues: tuple[Issue, ...], is_predicted: bool, is_seed_usable: bool, status: str
 ) -> None:
     prediction = Prediction(TRUTH, "windows", 0.1) if is_predicted else None
-    result = replace(pair.seed_alignment(SEED, *issues), prediction=prediction, is_seed_usable=is_seed_usable)
-    assert result.status == status
+    result = decided(pair(), SEED, (), LOST)
+    assert replace(result, issues=issues, prediction=prediction, is_seed_usable=is_seed_usable).status == status
 
 
-def test_a_trusted_seed_that_does_not_fit_the_windows_is_not_usable(pair: BandPair) -> None:
-    issue = Issue(RETRIEVAL, 0.1, 0.2)
-    assert fall_back_to_seed(pair, SEED, (issue,)).status == "seed_only"
-    far = replace(SEED, fixed_to_moving=geometry.translation(150, 0))
-    result = fall_back_to_seed(pair, far, (issue,))
-    assert (result.status, result.issues) == ("failed", (issue, Issue(SEED_DOES_NOT_FIT)))
+def test_a_trusted_seed_that_does_not_fit_the_windows_is_not_usable() -> None:
+    assert decided(pair(), SEED, (), LOST).status == "seed_only"
+    result = decided(pair(), FAR, (), LOST)
+    assert (result.status, result.issues) == ("failed", (LOST, Issue(SEED_DOES_NOT_FIT)))
     assert "rig seed is used unchanged, but the seed does not fit either" in result.reason
-    untrusted = fall_back_to_seed(pair, replace(SEED, trusted=False), (issue,))
-    assert (untrusted.status, untrusted.issues) == ("failed", (issue,))
+    untrusted = decided(pair(), replace(SEED, trusted=False), (), LOST)
+    assert (untrusted.status, untrusted.issues) == ("failed", (LOST,))
 
 
-def test_a_seed_that_contradicts_the_tags_is_replaced_by_their_mapping(pair: BandPair) -> None:
+def test_a_seed_that_contradicts_the_tags_is_replaced_by_their_mapping() -> None:
     """An image of another capture fits at its own position, far from that of its band."""
-    far = replace(SEED, kind="match", fixed_to_moving=geometry.translation(150, 0))
-    tagged = replace(pair, seed_std_px={"rig": 5.0})
-    result = fall_back_to_seed(tagged, far, (Issue(RETRIEVAL),))
+    far, asked_for = replace(FAR, kind="match"), Issue(SEED_ASKED_FOR)
+    tagged = replace(pair(), seed_std_px={"rig": 5.0})
+    result = decided(tagged, far, (), LOST)
     assert (result.status, result.seed.kind) == ("seed_only", "rig")
     np.testing.assert_array_equal(result.fixed_to_moving, RIG["rig"])
-    assert fall_back_to_seed(pair, far, (Issue(RETRIEVAL),)).seed == far
-    assert fall_back_to_seed(tagged, far, (Issue(RETRIEVAL),), seed_only=True).seed == far
+    assert decided(pair(), far, (), LOST).seed == far
+    assert decided(tagged, far, (), asked_for).seed == far
+    assert decided(pair(), replace(SEED, trusted=False), (), asked_for).status == "seed_only"
 
 
-def test_a_converted_residual_equals_a_new_measurement(pair: BandPair) -> None:
-    warped_pair = WarpedPair.of(pair, pair.mapping(geometry.translation(5.95, -3.95)))
-    mapping = pair.mapping(np.array([[1.0001, 0, 6.0], [0, 0.9999, -4.0], [0, 0, 1.0]]))
-    near, again = warped_pair.with_mapping(mapping), WarpedPair.of(pair, mapping)
-    assert near.warped is warped_pair.warped
-    np.testing.assert_allclose(near.residual.shifts_px, again.residual.shifts_px, atol=0.04)
-    assert near.residual.median_px == pytest.approx(again.residual.median_px, abs=0.04)
-    far = pair.mapping(geometry.translation(9, -4))
-    assert warped_pair.with_mapping(far).warped is not warped_pair.warped
+def test_a_band_without_a_seed_has_failed() -> None:
+    no_seed = Issue(FEW_KEYPOINTS, 3, 16)
+    (result,) = decide([BandCandidates(pair(), no_seed)]).values()
+    assert (result.status, result.issues, result.seed.kind) == ("failed", (no_seed,), "rig")
 
 
-def test_each_colour_is_verified_by_the_estimate_from_the_other(pair: BandPair) -> None:
-    warped_pair = WarpedPair.of(pair, pair.mapping(TRUTH))
-    by_black, by_white = geometry.translation(6.1, -4), geometry.translation(6, -4.2)
-    crossed, before = warped_pair.cross_validated((by_black, by_white)).residual, warped_pair.residual
-    expected_px = np.where(before.is_even_cell[:, None], (0, 0.2), (-0.1, 0))
-    np.testing.assert_allclose(crossed.shifts_px - before.shifts_px, expected_px, atol=1e-6)
-    candidate = replace(Candidate.of(pair, SEED, GOOD), by_halves=(by_black, by_white))
-    assert verified(candidate, "never").residual.median_px > 0.08
-
-
-def test_of_two_mappings_the_better_has_smaller_shifts_in_more_of_the_same_windows(pair: BandPair) -> None:
-    given, large = WarpedPair.of(pair, pair.mapping(TRUTH)), pair.reference.large_windows
-
-    def pair_with(shift_px: float, measured: int) -> WarpedPair:
-        shifts = np.where(np.arange(10)[:, None] < measured, (shift_px, 0.0), np.nan)
-        return replace(given, residual=residual_of(np.zeros((10, 2)), shifts))
-
-    assert pair_with(0.5, 10).is_better_than(pair_with(0.6, 10))
-    assert pair_with(0.5, 10).is_better_than(pair_with(0.4, 5))
-    assert not pair_with(0.5, 5).is_better_than(pair_with(0.4, 5))
-    assert not pair_with(0.5, 0).is_better_than(pair_with(3.0, 1))
-    # Residuals of two grids are not compared: the other mapping is measured again, so its 9 px do not count.
-    assert not pair_with(0.5, 10).is_better_than(replace(pair_with(9.0, 10), windows=large))
-
-
-def test_a_result_with_issues_is_replaced_by_the_seed(pair: BandPair) -> None:
-    results = verified(Candidate.of(pair, SEED, replace(GOOD, retrieval=0.01)), "always")
-    assert (results.status, results.issues[0].code) == ("seed_only", "retrieval")
-    np.testing.assert_array_equal(results.fixed_to_moving, SEED.fixed_to_moving)
-    assert results.residual.median_px == pytest.approx(np.hypot(1, 1), abs=0.05)
-    missing = fall_back_to_seed(pair, SEED, (Issue(FEW_KEYPOINTS, 3, 16),))
+def test_a_result_with_issues_is_replaced_by_the_seed() -> None:
+    result = decided(pair(), SEED, [unconfirmed()])
+    assert (result.status, result.issues[0].code, result.joint.retrieval) == ("seed_only", "retrieval", 0.1)
+    assert result.residual.median_px == pytest.approx(np.hypot(1, 1), abs=0.05)
+    missing = decided(pair(), SEED, (), Issue(FEW_KEYPOINTS, 3, 16))
     assert missing.status == "seed_only"
     assert missing.reason == "only 3 keypoints are in the area that both bands show; the rig seed is used unchanged"
 
 
-@pytest.mark.parametrize("kind", ["noise", "structure"])
-def test_an_unrelated_image_is_not_aligned_by_a_seed_or_a_field(kind: str) -> None:
-    noise = np.random.default_rng(3).normal(size=(320, 400)).astype(np.float32)
-    pair = pair_of(texture(), whole(noise) if kind == "noise" else texture(seed=9), RIG)
-    failed = verified(Candidate.of(pair, SEED, joint_result(retrieval=0.01)), "always")
-    assert failed.status == "failed"
-    assert failed.reason.endswith("but the seed does not fit either")
-    results = verified(Candidate.of(pair, SEED, joint_result(SEED.fixed_to_moving)), "always")
-    assert results.status not in ("aligned", "predicted")
-    assert results.geometry == "homography"
+# ---- reliefs
 
 
-def test_verification_is_repeated_with_a_displacement_field(pair: BandPair, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A field that leaves the windows misaligned must not be accepted."""
-    wild = np.zeros((11, 14, 2))
-    wild[..., 0] = 3.0
-    result = DisplacementResult(DisplacementField(32.0, wild), 1.0, 0.5)
-    monkeypatch.setattr(pair.reference.displacement_field, "refine", lambda *_, **__: result)
-    results = verified(Candidate.of(pair, SEED, GOOD), "always")
-    assert (results.status, results.geometry) == ("aligned", "homography")
-    assert results.candidates == {"homography": 1.0, "field": 0.5}
-    assert results.residual.median_px < 0.1
-    monkeypatch.setattr(warped_pair, "issues_of", lambda *_: ())
-    assert verified(Candidate.of(pair, SEED, GOOD), "always").geometry == "field"
+def flat_relief() -> Relief:
+    ones = np.ones(SIZE[::-1], np.float32)
+    return Relief(ones, ones, std_px=0.2 * ones)
 
 
-def displaced_pair(height_px: float, wavelength_px: float | None = None) -> BandPair:
-    """A pair with a smooth bump in the centre or waves everywhere, which no homography represents."""
+@dataclass
+class Together:
+    """Three bands of one reference, with the status that each has without a relief."""
 
-    def displacement(points: np.ndarray) -> np.ndarray:
-        bump = np.exp(-(((points - (320, 240)) / 110) ** 2).sum(-1))
-        form = bump if wavelength_px is None else np.prod(np.sin(2 * np.pi * points / wavelength_px), axis=-1)
-        return height_px * form[..., None] * np.array([1.0, -0.6])
+    bands: dict[str, BandCandidates] = field(
+        default_factory=lambda: {n: BandCandidates(pair(n), SEED, None, [candidate(n)]) for n in ("Blue", "Red", "NIR")}
+    )
 
-    return pair_of(*displaced_views(displacement), {"rig": np.eye(3)})
+    def decided(self, *reliefs: ReliefCandidates, accept_predicted_px: float = np.inf) -> dict[str, Alignment]:
+        return decide(list(self.bands.values()), reliefs, None, accept_predicted_px)
+
+
+def relief_of(*names: str, gain_px: float = 0.0, predicted: Mapping[str, float] | None = None) -> ReliefCandidates:
+    """One relief under which some bands are aligned, and others predicted with a standard error."""
+    relief = flat_relief()
+    found = {n: candidate(n, relief=relief) for n in names}
+    found |= {n: candidate(n, relief=relief, std_px=s, replaces=(IN_PART,)) for n, s in (predicted or {}).items()}
+    return ReliefCandidates(pair().reference, found, gain_px)
+
+
+@pytest.mark.parametrize(("gain_px", "is_chosen"), [(-0.001, False), (0.0, True), (2.0, True)])
+def test_a_relief_is_chosen_if_it_fits_at_least_as_well(gain_px: float, is_chosen: bool) -> None:
+    result = Together().decided(relief_of("Blue", "Red", "NIR", gain_px=gain_px))
+    assert {a.status for a in result.values()} == {"aligned"}
+    assert {a.geometry for a in result.values()} == {"relief" if is_chosen else "homography"}
+    if is_chosen:
+        assert len({id(a.mapping.parallax.relief) for a in result.values()}) == 1
+
+
+def test_a_homography_beside_a_relief_is_predicted_with_its_own_error() -> None:
+    """It passes all checks, but is another geometry than that of the other bands; a thermal one has another grid."""
+    together = Together()
+    thermal = replace(pair("LWIR"), reference=Reference(pair().reference.image))
+    together.bands["LWIR"] = BandCandidates(thermal, SEED, None, [candidate("LWIR", pair=thermal)])
+    result = together.decided(relief_of("Blue", "Red"))
+    expected = {"Blue": "aligned", "Red": "aligned", "NIR": "predicted", "LWIR": "aligned"}
+    assert {name: a.status for name, a in result.items()} == expected
+    nir = result["NIR"]
+    assert ([i.code for i in nir.issues], nir.geometry) == (["other_geometry"], "homography")
+    assert nir.prediction.source == "windows"
+    assert nir.prediction.std_px == pytest.approx(rms_error_px(nir), abs=6e-5)
+
+
+def test_a_band_under_the_relief_is_predicted_with_the_error_of_the_relief() -> None:
+    """Even if a homography alone would be aligned."""
+    result = Together().decided(relief_of("Blue", "Red", predicted={"NIR": 0.05}))["NIR"]
+    assert (result.status, result.geometry) == ("predicted", "relief")
+    assert [i.code for i in result.issues] == ["other_geometry", "close_windows"]
+    assert 0.2 < result.prediction.std_px == pytest.approx(rms_error_px(result), abs=6e-5)
 
 
 @pytest.mark.parametrize(
-    ("displaced", "use", "status", "geometry"),
+    ("first", "second", "accept_predicted_px", "chosen"),
     [
-        ((4.0,), "auto", "aligned", "field"),
-        ((4.0,), "always", "aligned", "field"),
-        ((4.0,), "never", "predicted", "homography"),
-        # Shorter waves are not predicted without the windows that overlap one of verification.
-        ((2.5, 300.0), "auto", "aligned", "field"),
+        (("Blue",), ("Blue", "Red"), 0.0, 1),
+        (("Blue", "Red"), ("Blue",), 0.0, 0),
+        # Without accepted predictions the bands beside a relief are not delivered; with them, all are, and the first
+        # relief stays.
+        (("Blue",), ("Blue", "Red"), 1.0, 0),
+        (("Blue",), ("Red",), 0.0, 0),
     ],
 )
-def test_a_field_is_fitted_where_a_part_of_the_image_is_misaligned(
-    displaced: tuple[float, ...], use: ReliefUse, status: str, geometry: str
+def test_of_two_reliefs_the_one_that_delivers_more_bands_is_that_of_all(
+    first: tuple[str, ...], second: tuple[str, ...], accept_predicted_px: float, chosen: int
 ) -> None:
-    results = verified(Candidate.of(displaced_pair(*displaced), CENTRED, joint_result()), use)
-    assert (results.status, results.geometry) == (status, geometry)
-    if status == "aligned":  # the residual is that of held-out windows
-        assert results.residual.median_px < (0.1 if displaced == (4.0,) else 0.4)
+    reliefs = [relief_of(*names) for names in (first, second)]
+    result = Together().decided(*reliefs, accept_predicted_px=accept_predicted_px)
+    used = {id(a.mapping.parallax.relief) for a in result.values() if a.mapping.parallax is not None}
+    assert used == {id(c.mapping.parallax.relief) for c in reliefs[chosen].candidates.values()}
 
 
-@pytest.mark.parametrize(("rig_known", "tried"), [(True, False), (False, True)])
-def test_a_field_is_tried_without_a_rig_and_rejected_without_need(rig_known: bool, tried: bool) -> None:
-    pair = replace(displaced_pair(0.0), seed_std_px={"model": 1.0} if rig_known else {})
-    plain = verified(Candidate.of(pair, CENTRED, joint_result()), "auto")
-    assert (plain.status, "field" in plain.candidates, plain.geometry) == ("aligned", tried, "homography")
+def test_a_relief_that_fits_worse_is_no_option() -> None:
+    """Even if it would deliver more bands."""
+    result = Together().decided(relief_of("Blue", "Red", "NIR", gain_px=-0.1), relief_of("Blue"), accept_predicted_px=0)
+    assert {name: a.geometry for name, a in result.items()} == {
+        "Blue": "relief",
+        "Red": "homography",
+        "NIR": "homography",
+    }
 
 
-def test_issues_that_a_field_cannot_remove_are_reported() -> None:
-    """A third of the image 15 px off."""
-    fixed, moving = two_views(TRUTH)
-    moving.pixels[:, 270:] = np.roll(moving.pixels, 15, axis=0)[:, 270:]
-    results = verified(Candidate.of(pair_of(fixed, moving, RIG), SEED, GOOD), "auto")
-    assert results.status != "aligned"
-    assert {"close_windows", "cluster"} & {d.code for d in results.issues}
-    assert "of the windows" in results.reason
+# ---- the rig of the flight
 
 
-def test_smaller_windows_are_measured_where_valid_areas_are_small() -> None:
-    fixed, moving = two_views(np.eye(3), 640, 480)
-    scattered = np.ones((480, 640), bool)
-    scattered[np.arange(480) % 60 < 12] = False
-    scattered[:, np.arange(640) % 60 < 12] = False
-    usual, pair = pair_of(fixed, moving), pair_of(Raster(fixed.pixels, scattered), moving)
-    residual = WarpedPair.of(pair, pair.mapping(np.eye(3))).residual
-    assert residual.coverage > 0.9
-    assert residual.median_px < 0.1
-    usual_windows = WarpedPair.of(usual, usual.mapping(np.eye(3))).residual
-    assert len(usual_windows.centres_px) == len(usual.reference.windows.origins)
+def test_an_alignment_that_agrees_with_the_rig_is_compared_with_it() -> None:
+    result = against(rig_prediction(NEAR), candidate())
+    assert (result.status, result.geometry, result.prediction.source) == ("aligned", "homography", "bands")
+    assert result.prediction.off_px == pytest.approx(0.1)
+    np.testing.assert_array_equal(result.fixed_to_moving, TRUTH)
 
 
-def test_a_field_is_verified_in_held_out_windows(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A field may fit any shifts of its own windows."""
-    pair = displaced_pair(2.5)
-    good = pair.reference.displacement_field.refine(pair.moving_image, pair.mapping(np.eye(3)))
-    accepted = verified(Candidate.of(pair, CENTRED, joint_result()), "always")
-    assert accepted.status == "aligned"
-    np.testing.assert_array_equal(accepted.residual.shifts_px, good.held_out.shifts_px)
-    misaligned = good.held_out.with_shifts(good.held_out.shifts_px + 1.5)
-    monkeypatch.setattr(pair.reference.displacement_field, "refine", lambda *_: replace(good, held_out=misaligned))
-    refused = verified(Candidate.of(pair, CENTRED, joint_result()), "always")
-    assert (refused.status, refused.geometry) == ("predicted", "homography")
-    assert refused.prediction.std_px < good.held_out.median_px + 1.5
+AT_RIG = geometry.translation(5.8, -4)
+"""Where the rig predicts the band, close to its true mapping."""
+
+
+@pytest.mark.parametrize(
+    ("own", "source", "codes"),
+    [
+        (
+            lambda: [candidate(matrix=geometry.translation(31, -4))],
+            "bands",
+            ["unexpected_px"],
+        ),  # one period of the scene off
+        (lambda: [in_part(0.5)], "bands", ["close_windows"]),  # the rig is more certain
+        (lambda: [in_part(0.01)], "windows", ["close_windows"]),  # the images are
+        (
+            lambda: [in_part(0.01, matrix=geometry.translation(9.5, -4))],
+            "bands",
+            ["close_windows"],
+        ),  # but they contradict it
+        (
+            lambda: [in_part(0.01, Issue(OTHER_CONTENT, 0.2))],
+            "bands",
+            ["other_content"],
+        ),  # windows of the other scene count
+        (lambda: [unconfirmed()], "bands", ["retrieval"]),
+    ],
+    ids=["contradiction", "rig more certain", "own more certain", "far from the rig", "other scene", "failed"],
+)
+def test_the_rig_replaces_what_contradicts_it_and_what_is_less_certain(
+    own: Callable[[], list[Candidate]], source: str, codes: list[str]
+) -> None:
+    result = against(rig_prediction(AT_RIG), *own())
+    assert (result.status, result.prediction.source, [i.code for i in result.issues]) == ("predicted", source, codes)
+    np.testing.assert_array_equal(result.fixed_to_moving, AT_RIG if source == "bands" else TRUTH)
+    assert result.prediction.std_px == pytest.approx(rms_error_px(result), abs=6e-5)
+    if source == "bands":
+        assert result.prediction.std_px == 0.3
+        assert result.error.windows is None
+    if codes == ["unexpected_px"]:
+        assert result.issues[0].value == result.prediction.off_px == pytest.approx(25.2)
+
+
+def test_the_relief_of_a_scene_is_part_of_the_error_and_not_of_the_comparison() -> None:
+    """A plane that is compared with the rig is not displaced by the relief that it does not follow."""
+    certain = rig_prediction(geometry.translation(10, -4), std_px=0.1)
+    of_rig = replace(certain, of_scene=replace(certain.of_scene, std_px=2.0))
+    vars(of_rig)["rotated"] = None
+    result = against(of_rig, candidate())
+    assert (result.status, result.issues[0].code) == ("predicted", "unexpected_px")
+    assert (result.issues[0].limit, result.prediction.std_px) == (3.0, 2.0)
+
+
+def test_a_rotated_image_has_failed_and_the_rig_does_not_replace_it() -> None:
+    """Not even the seed, which is trusted and fits, may be used."""
+    turned = geometry.compose(TRUTH, np.array([[0.98, -0.17, 30], [0.17, 0.98, -30], [0, 0, 1.0]]))
+    of_rig = rig_prediction(rotated=turned)
+    result = against(of_rig, unconfirmed())
+    assert (result.status, [i.code for i in result.issues]) == ("failed", ["unexpected_px", "retrieval"])
+    assert result.issues[0].value == pytest.approx(of_rig.distance_px(turned))
+    assert (result.prediction, result.residual, result.error) == (None, None, None)
+    np.testing.assert_array_equal(result.fixed_to_moving, SEED.fixed_to_moving)
+    # What the images confirm, and the rig too, is not compared with landmarks.
+    assert against(of_rig, candidate()).status == "aligned"
+
+
+def test_the_standard_error_is_in_pixels_of_the_band() -> None:
+    """Pixels of a thermal band are ten times as large as those of the reference."""
+    matrix = np.diag([0.1, 0.1, 1.0])
+    fixed = pair().reference.image
+    thermal = pair_of(fixed, Raster(fixed.pixels[:32, :40], fixed.valid[:32, :40]), {"identity": matrix})
+    of_rig = {"moving": rig_prediction(matrix, 0.4, of=thermal)}
+    lost = BandCandidates(thermal, replace(SEED, fixed_to_moving=matrix), LOST)
+    result = decide([lost], (), of_rig)["moving"]
+    assert (result.status, result.prediction.std_px) == ("predicted", pytest.approx(0.4))
+    assert rms_error_px(result, (40, 32)) == pytest.approx(4.0)
+
+
+def test_the_mapping_of_a_prediction_is_that_of_the_files() -> None:
+    result = against(rig_prediction(AT_RIG), in_part(0.01))
+    points = geometry.lattice(*SIZE, 5, 4)
+    assert rms(PixelMapping(result.prediction.fixed_to_moving)(points) - result.map(points)) < 1e-9

@@ -18,9 +18,10 @@ from agalign.errors import UnreadableFileError
 from agalign.fit import window_fit
 from agalign.flight.rig import distance_px
 from agalign.values import geometry
-from agalign.values.alignment import Alignment, Prediction, Residual, Seed
+from agalign.values.alignment import Alignment, Prediction, Seed
 from agalign.values.capture import Capture
 from agalign.values.mapping import PixelMapping
+from agalign.values.residual import Residual
 
 from ..builders import joint_result, residual_of, two_views
 

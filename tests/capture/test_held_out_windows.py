@@ -7,22 +7,19 @@ import cv2
 import numpy as np
 import pytest
 
-from agalign.batch.capture_task import quiet
-from agalign.capture.align_bands import PairAligner
-from agalign.capture.decision import by_windows, fall_back_to_seed
+from agalign.capture.candidate import BandCandidates, RefinedBand
 from agalign.capture.reference import Reference
-from agalign.capture.warped_pair import Candidate
-from agalign.config import Settings
 from agalign.fit.windows import FixedWindows, Shifts
 from agalign.pixels.masks import raster_of
 from agalign.values import geometry
-from agalign.values.alignment import Alignment, Residual, Seed
+from agalign.values.alignment import Alignment, Seed
 from agalign.values.geometry import Points
 from agalign.values.image import Raster
 from agalign.values.issues import RETRIEVAL, Issue
 from agalign.values.mapping import DisplacementField, PixelMapping
+from agalign.values.residual import Residual
 
-from ..builders import in_full_run, joint_result, pair_of, texture, whole
+from ..builders import estimation_of, fitted_to_windows, in_full_run, joint_result, pair_of, texture, whole
 from ..conftest import textured_image
 
 BLURRED_PX, SHARP_PX = 160, 100
@@ -59,7 +56,7 @@ def test_the_fit_of_an_alignment_by_windows_ignores_those_that_verify_it(border_
 
     def aligned(image: np.ndarray) -> Alignment:
         pair = pair_of(whole(fixed), with_border(image, border_px))
-        result = by_windows(pair, fall_back_to_seed(pair, SEED, (Issue(RETRIEVAL, 0.05, 0.2),)))
+        result = fitted_to_windows(BandCandidates(pair, SEED, Issue(RETRIEVAL, 0.05, 0.2)))
         assert (result.status, result.joint.recipe) == ("aligned", "windows")
         return result
 
@@ -79,8 +76,8 @@ def test_the_map_estimate_without_a_colour_ignores_its_windows(border_px: int) -
 
     def halves(image: np.ndarray) -> tuple[np.ndarray, ...]:
         pair = pair_of(whole(fixed), with_border(image, border_px))
-        (candidate,) = PairAligner(Settings(), None, quiet).candidates([Candidate.of(pair, SEED, result)])
-        return candidate.by_halves or ()
+        estimation = estimation_of(BandCandidates(pair, SEED), RefinedBand.of(pair, SEED, result))
+        return estimation._combined()[1]["moving"]
 
     def change_px(one: np.ndarray, other: np.ndarray) -> float:
         return geometry.corner_error_px(one, other, *fixed.shape[::-1])

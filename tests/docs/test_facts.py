@@ -27,7 +27,7 @@ from agalign.products.registry import PRODUCTS
 from agalign.products.report.facts import SUMMARY_COLUMNS
 from agalign.products.sidecar.schema import FilePart
 from agalign.values.alignment import MIN_RETRIEVAL, MIN_TIMES_CHANCE
-from agalign.verify import checks, expected_error
+from agalign.verify import checks, coverage
 
 from ..program import agalign_here
 from .blocks import PAGES, ROOT, each_page, text_of
@@ -157,7 +157,7 @@ LIMITS = {
         f"| at least {MIN_RETRIEVAL:g}, and {MIN_TIMES_CHANCE:g} times chance |",
         f"at most {checks._MAX_ERROR_PX:g} px in {checks._MIN_ACCURATE_SHARE:.0%} of the image".replace("%", " %"),
         f"Their side is at most {windows._WINDOW_PX} px, and {reference._LARGE_WINDOW_PX} px in blurred images",
-        f"| at least {expected_error.MIN_COMMON_COVERAGE:.0%} |".replace("%", " %"),
+        f"| at least {coverage.MIN_COMMON_COVERAGE:.0%} |".replace("%", " %"),
         f"| at least {checks._MIN_CLOSE_SHARE:.0%} |".replace("%", " %"),
         f"| fewer than {checks._MIN_CLUSTER}, or fewer than {checks._MAX_CLUSTER_SHARE:.0%} of the windows |".replace(
             "%", " %"

@@ -5,9 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from agalign.fit.window_fit import Adjustment, WindowShifts, adjust, are_of_lenses, lens_std_px, parallax_of
+from agalign.fit.window_fit import Adjustment, WindowShifts, adjust, are_of_lenses, parallax_of
 from agalign.synthetic import cameras
 from agalign.values import geometry
+from agalign.values.lens_shapes import lens_std_px
 from agalign.values.mapping import PixelMapping
 from agalign.values.parallax import Parallax, Relief
 

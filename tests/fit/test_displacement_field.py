@@ -6,8 +6,8 @@ from agalign.fit.displacement_field import DisplacementEstimator, _Gain, common_
 from agalign.fit.windows import Shifts
 from agalign.pixels.structure import structure_field
 from agalign.values import geometry
-from agalign.values.alignment import Residual
 from agalign.values.mapping import DisplacementField, PixelMapping
+from agalign.values.residual import Residual
 
 from ..builders import displaced_views, grid_px, residual_of, rms, texture
 

@@ -6,14 +6,14 @@ import cv2
 import numpy as np
 import pytest
 
-from agalign.fit.window_fit import CALIBRATED, LENS_STD, WindowFit, fit_windows, jacobian, lens_shapes, lens_std_px
+from agalign.fit.window_fit import WindowFit, fit_windows
 from agalign.values import geometry
-from agalign.values.alignment import Alignment, Prediction, Residual, Seed
-from agalign.values.issues import RETRIEVAL, Issue
+from agalign.values.lens_shapes import CALIBRATED, LENS_STD, jacobian, lens_shapes, lens_std_px
 from agalign.values.mapping import DisplacementField, PixelMapping
-from agalign.verify.expected_error import expected_error_px, points_in_frame, unmodelled_std_px, unobserved_quarters
+from agalign.values.residual import Residual
+from agalign.verify.coverage import points_in_frame, unmodelled_std_px, unobserved_quarters
 
-from ..builders import grid_px, joint_result, residual_of, rms
+from ..builders import grid_px, residual_of, rms
 
 SIZE = 1280, 960
 CENTRES = grid_px(np.arange(56, 1280, 112), np.arange(56, 960, 112))
@@ -161,78 +161,3 @@ def test_areas_outside_the_moving_image_need_no_window() -> None:
     assert frame[:, 0].max() < 640
     assert unobserved_quarters(LEFT, SIZE, frame) == []
     assert len(points_in_frame(IDENTITY, SIZE, SIZE)) == 24 * 18
-
-
-# ---- expected errors near windows and far from them, of predictions and of seeds
-
-
-def alignment(corner_std_px: list[float], residual: Residual | None) -> Alignment:
-    joint = joint_result(std_px=0.1, covariance=np.diag(np.repeat(corner_std_px, 2) ** 2))
-    return Alignment(IDENTITY, (640, 480), (), Seed("identity", np.eye(3), 1.0), joint, residual)
-
-
-def expected_px(known: Alignment, *point: float) -> float:
-    return float(expected_error_px(known, (640, 480), np.array([point]))[0])
-
-
-def columns(count: int) -> Residual:
-    """Columns of windows with a shift of 0.3 px."""
-    return residual_of(grid_px(50 + 100 * np.arange(count), 50 + 100 * np.arange(4)), (0.3, 0.0))
-
-
-def test_the_expected_error_is_the_covariance_at_corners_and_the_residual_near_windows() -> None:
-    known = alignment([0.1, 0.5, 0.5, 0.1], None)
-    for x, std_px in ((0.0, 0.1), (639.0, 0.5)):
-        assert expected_px(known, x, 0.0) == pytest.approx(np.sqrt(2) * std_px)
-    half, everywhere = (alignment([0.01] * 4, columns(count)) for count in (3, 7))
-    for covered in (half, everywhere):
-        assert 0.25 < expected_px(covered, 60.0, 240.0) < 0.4
-    assert 0.25 < expected_px(everywhere, 620.0, 240.0) < 0.4
-
-
-def test_the_error_far_from_windows_is_that_of_unknown_lenses_and_of_the_field() -> None:
-    half = alignment([0.01] * 4, columns(3))
-    prior_px = lens_std_px((640, 480), calibrated=False)
-    far = expected_px(half, 620.0, 240.0)
-    assert expected_px(replace(half, lens_std_px=3 * prior_px), 620.0, 240.0) > far + 0.3
-    field = DisplacementField(640.0, np.array([[[0, 0], [4, 0]], [[0, 0], [4, 0]]], float))
-    with_field = replace(half, mapping=replace(half.mapping, field=field))
-    assert expected_px(with_field, 620.0, 240.0) > far + 0.2
-    assert expected_px(with_field, 60.0, 240.0) == pytest.approx(expected_px(half, 60.0, 240.0))
-
-
-def test_a_single_wrong_peak_is_no_error_and_noise_is_subtracted() -> None:
-    centres_px = grid_px(50 + 100 * np.arange(7), 50 + 100 * np.arange(4))
-    shifts_px = np.zeros_like(centres_px)
-    shifts_px[10] = 20.0, 0.0
-    assert expected_px(alignment([0.01] * 4, residual_of(centres_px, shifts_px)), *centres_px[10]) < 0.1
-    noise = np.random.default_rng(0).normal(0, 0.98 / np.sqrt(2), centres_px.shape)
-    known = alignment([0.01] * 4, residual_of(centres_px, noise, sigma=7.0))
-    errors_px = expected_error_px(known, (640, 480), centres_px)
-    assert np.median(errors_px) < 0.6
-
-
-def test_predictions_have_their_standard_error_and_seeds_none() -> None:
-    known = alignment([0.01] * 4, None)
-    doubted = replace(known, issues=(Issue(RETRIEVAL, 0.1, 0.2),))
-    predicted = replace(doubted, prediction=Prediction(np.eye(3), "bands", 0.4))
-    assert expected_px(predicted, 60.0, 240.0) == pytest.approx(0.4)
-    # The standard error of a thermal band is in its own pixels, which are ten times as large.
-    thermal = replace(predicted, mapping=PixelMapping(np.diag([0.1, 0.1, 1.0])))
-    assert expected_px(thermal, 60.0, 240.0) == pytest.approx(4.0)
-    assert np.isinf(expected_px(replace(doubted, is_seed_usable=True), 60.0, 240.0))
-
-
-@pytest.mark.parametrize(
-    ("source", "measured", "error_px"), [("bands", 0.1, 0.4), ("bands", 0.9, 16.5), ("windows", 0.1, 16.5)]
-)
-def test_chance_peaks_of_a_lost_band_are_no_error(source: str, measured: float, error_px: float) -> None:
-    """The rig predicts a band that shows nothing; with common structure, its windows contradict the prediction.
-
-    A thermal band that few windows predict has their error.
-    """
-    shifts_px = np.where(np.arange(len(CENTRES))[:, None] < measured * len(CENTRES), (15.0, 0.0), (np.nan, np.nan))
-    known = alignment([0.01] * 4, residual_of(CENTRES, shifts_px))
-    issues = (Issue(RETRIEVAL, 0.1, 0.2),)
-    lost = replace(known, issues=issues, prediction=Prediction(np.eye(3), source, 0.4))
-    assert expected_px(lost, *CENTRES[0]) == pytest.approx(error_px, rel=0.12)

@@ -18,12 +18,14 @@ from agalign.products.product import CapturePaths, ProductContext
 from agalign.products.rasters.output_grid import Layer
 from agalign.products.sidecar.schema import Sidecar
 from agalign.synthetic.cameras import REDEDGE
+from agalign.values import geometry
 from agalign.values.alignment import Alignment, Prediction, Seed
 from agalign.values.capture import Capture
 from agalign.values.choices import PairStatus
 from agalign.values.image import OutputGrid
 from agalign.values.issues import RETRIEVAL, Issue
 from agalign.values.mapping import PixelMapping
+from agalign.values.mapping_error import MappingError
 
 from ..conftest import Shared, read_json, seeded
 
@@ -40,7 +42,12 @@ def aligned(mapping: PixelMapping, size_px: tuple[int, int], status: PairStatus 
     """The alignment of a band to a reference of `size_px` (width, height), equal to its seed."""
     prediction = Prediction(mapping.fixed_to_moving, "bands", 0.4) if status == "predicted" else None
     issues = () if status == "aligned" else (Issue(RETRIEVAL, 0.1, 0.2),)
-    evidence = {"issues": issues, "prediction": prediction, "is_seed_usable": status == "seed_only"}
+    error = None
+    if status in ("aligned", "predicted"):
+        std_px = 0.4 / geometry.magnification(mapping.fixed_to_moving, *size_px) if prediction else 0.0
+        windows = None if prediction else facts.get("residual")
+        error = MappingError(size_px, windows=windows, std_px=std_px, parallax=mapping.parallax)
+    evidence = {"issues": issues, "prediction": prediction, "is_seed_usable": status == "seed_only", "error": error}
     facts = {**evidence, "seed": Seed("rig", mapping.fixed_to_moving, 30.0, 30.0, 5.0)} | facts
     result = Alignment(mapping, size_px, **facts)
     assert result.status == status

@@ -20,11 +20,12 @@ from agalign.products.run.cautions import BLURRED, Caution, RunFacts
 from agalign.products.run.excluded import PanelPart
 from agalign.products.sidecar.file import read_sidecar, write_sidecar
 from agalign.products.sidecar.schema import Sidecar, _exposed_after_s
-from agalign.values.alignment import Alignment, Residual, Seed
+from agalign.values.alignment import Alignment, Seed
 from agalign.values.capture import Band
 from agalign.values.image import OutputGrid
 from agalign.values.issues import TEXTURELESS
 from agalign.values.mapping import PixelMapping
+from agalign.values.residual import Residual
 
 from ..conftest import read_json, save_known_model
 from .conftest import indices_of, table_in

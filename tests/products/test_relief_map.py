@@ -23,8 +23,9 @@ from agalign.products.sidecar.file import find_sidecars, read_sidecar, read_with
 from agalign.products.sidecar.schema import Sidecar
 from agalign.synthetic import cameras
 from agalign.values import geometry
-from agalign.values.alignment import Alignment, PairScales
+from agalign.values.alignment import Alignment
 from agalign.values.capture import Band, Capture
+from agalign.values.geometry import PairScales
 from agalign.values.image import OutputGrid, Tile
 from agalign.values.issues import RETRIEVAL, Issue
 from agalign.values.mapping import DisplacementField, PixelMapping

@@ -7,7 +7,8 @@ import pytest
 from numpy.testing import assert_allclose
 
 from agalign.values import geometry
-from agalign.values.alignment import Alignment, PairScales, Seed
+from agalign.values.alignment import Alignment, Seed
+from agalign.values.geometry import PairScales
 from agalign.values.mapping import DisplacementField, PixelMapping
 from agalign.values.pixel_units import PixelScale
 

@@ -1,6 +1,6 @@
 """The checks: each finds its issue, alone and at its limit, and issues decide the status."""
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -9,10 +9,13 @@ import pytest
 import agalign
 from agalign.pixels.structure import structure_field, windowed_spectra
 from agalign.values import geometry, issues
-from agalign.values.alignment import Prediction, Residual
+from agalign.values.alignment import JointResult, Prediction
 from agalign.values.issues import sentence
+from agalign.values.mapping import PixelMapping
+from agalign.values.mapping_error import MappingError
 from agalign.values.pixel_units import PixelScale
-from agalign.verify.checks import AliasPeak, Evidence, alias_peak, is_unchanged, issues_of, seed_fits
+from agalign.values.residual import Residual
+from agalign.verify.checks import AliasPeak, AlignedImages, alias_peak, is_unchanged, issues_of, rig_issues, seed_fits
 
 from ..builders import grid_px, joint_result, residual_of, texture, whole
 
@@ -27,13 +30,37 @@ def measured_in(share: float, shift_px: float = 0.0) -> Residual:
 
 
 RESIDUAL = measured_in(1.0)
-GOOD = Evidence(JOINT, RESIDUAL, SIZE)
+
+
+@dataclass(frozen=True)
+class Checked:
+    """What the checks need of a candidate whose error is limited at its windows."""
+
+    joint: JointResult | None = JOINT
+    windows: Residual = RESIDUAL
+    images: AlignedImages | None = None
+    file_pixel_size_px: float = 1.0
+
+    @property
+    def mapping(self) -> PixelMapping:
+        return PixelMapping(np.eye(3) if self.joint is None else self.joint.fixed_to_moving)
+
+    @property
+    def error(self) -> MappingError:
+        return MappingError(SIZE, None if self.joint is None else self.joint.covariance_px2, self.windows)
+
+    @property
+    def textured_px(self) -> np.ndarray:
+        return self.windows.centres_px
+
+
+GOOD = Checked()
 STRETCHED = np.array([[1.0, 0, 0], [0, 1, 0], [-5e-4, 0, 1]])
 NAN = float("nan")
 
 
-def codes(evidence: Evidence = GOOD, residual: Residual | None = None) -> list[str]:
-    return [issue.code for issue in issues_of(replace(evidence, residual=residual or evidence.residual))]
+def codes(checked: Checked = GOOD, residual: Residual | None = None) -> list[str]:
+    return [issue.code for issue in issues_of(replace(checked, windows=residual or checked.windows))]
 
 
 def test_a_good_result_has_no_issues() -> None:
@@ -54,7 +81,7 @@ def test_a_good_result_has_no_issues() -> None:
 def test_values_that_are_not_finite_and_mirrored_mappings_are_issues(
     joint: dict[str, object], measured: float, expected: str
 ) -> None:
-    issues = issues_of(Evidence(replace(JOINT, **joint), measured_in(measured), SIZE))
+    issues = issues_of(Checked(replace(JOINT, **joint), measured_in(measured)))
     assert [issue.code for issue in issues] == expected.split()
     assert all(sentence(d) for d in issues)
 
@@ -82,7 +109,7 @@ def shifted(count_off: int, off_px: float, total: int = 100) -> Residual:
 def test_results_and_windows_pass_at_their_limits(
     within: object, beyond: object, code: str, value: float, limit: float
 ) -> None:
-    part = "residual" if isinstance(within, Residual) else "joint"
+    part = "windows" if isinstance(within, Residual) else "joint"
     assert issues_of(replace(GOOD, **{part: within})) == ()
     (issue,) = issues_of(replace(GOOD, **{part: beyond}))
     assert (issue.code, issue.limit) == (code, limit)
@@ -104,7 +131,7 @@ def test_results_and_windows_pass_at_their_limits(
 )
 def test_without_descriptors_more_windows_are_required(recipe: str, residual: Residual, is_accepted: bool) -> None:
     joint = joint_result(retrieval=0.05, recipe=recipe, std_px=0.1)
-    assert codes(replace(GOOD, joint=joint, residual=residual)) == ([] if is_accepted else ["retrieval"])
+    assert codes(replace(GOOD, joint=joint, windows=residual)) == ([] if is_accepted else ["retrieval"])
 
 
 @pytest.mark.parametrize(
@@ -113,11 +140,11 @@ def test_without_descriptors_more_windows_are_required(recipe: str, residual: Re
 )
 def test_a_result_far_from_the_rig_is_an_issue(off_px: float | None, std_px: float, is_issue: bool) -> None:
     prediction = Prediction(np.eye(3), "bands", std_px, off_px=off_px)
-    assert codes(replace(GOOD, prediction=prediction)) == ["unexpected_px"] * is_issue
+    assert [issue.code for issue in rig_issues(prediction)] == ["unexpected_px"] * is_issue
 
 
 def test_the_limit_is_a_pixel_of_the_file_where_the_images_are_reduced() -> None:
-    within = replace(GOOD, residual=shifted(11, 0.7))
+    within = replace(GOOD, windows=shifted(11, 0.7))
     assert codes(within) == []
     assert codes(replace(within, file_pixel_size_px=0.65)) == ["close_windows"]
 
@@ -153,7 +180,7 @@ def test_aligned_means_an_error_of_half_a_pixel_in_nine_tenths_of_the_image() ->
     assert codes(nearly_all) == []
     assert codes(replace(nearly_all, joint=joint_result(covariance=np.diag(np.full(8, 0.6))))) == ["inaccurate"]
     residual = residual_of(geometry.lattice(*SIZE, 10, 10), (0.0, 0.0))
-    (issue,) = issues_of(replace(GOOD, joint=joint_result(covariance=covariance), residual=residual))
+    (issue,) = issues_of(replace(GOOD, joint=joint_result(covariance=covariance), windows=residual))
     assert (issue.code, issue.limit) == ("inaccurate", pytest.approx(0.1))
     assert 0.1 < issue.value < 0.6
 
@@ -172,9 +199,6 @@ class Images:
 
     def separate_windows(self) -> Residual:
         return self.residual
-
-    def common_px(self) -> np.ndarray:
-        return self.residual.centres_px
 
 
 def test_an_area_without_common_peaks_shows_something_else_but_scattered_windows_do_not() -> None:
@@ -233,9 +257,6 @@ class RepetitiveImages:
 
     def separate_windows(self) -> Residual:
         return RESIDUAL
-
-    def common_px(self) -> np.ndarray:
-        return RESIDUAL.centres_px
 
 
 def test_a_repetitive_scene_is_an_issue_unless_aliases_are_excluded() -> None:

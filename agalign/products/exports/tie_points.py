@@ -17,10 +17,11 @@ from agalign.errors import GeometryError
 from agalign.pixels.coordinates import transformed
 from agalign.products.product import CapturePaths, Product, ProductContext, WrittenFile
 from agalign.values import geometry
-from agalign.values.alignment import Alignment, Residual
+from agalign.values.alignment import Alignment
 from agalign.values.capture import Capture, Georeference
 from agalign.values.choices import PairStatus
 from agalign.values.files import write_csv, write_text
+from agalign.values.residual import Residual
 from agalign.values.text import escape_controls
 
 _Row = tuple[str, PairStatus, list[float]]

@@ -22,13 +22,11 @@ from agalign.values.geometry import Matrix, Points
 from agalign.values.image import Mask, OutputGrid, Tile
 from agalign.values.lens import Lens
 from agalign.values.mapping import PixelMapping
+from agalign.values.mapping_error import ErrorOnGrid
 from agalign.values.memory import WORK_TILE_PX
 from agalign.values.parallax import Relief, rounded
 from agalign.values.resampling import source_positions, tiles
-from agalign.verify.expected_error import expected_error_px
 
-_LATTICE_PX = 16
-"""Distance of the nodes at which the error, which is smooth, is calculated."""
 _SHARE_LATTICE_PX = 64
 """Distance of the nodes for a share of the image: 300 nodes of a RedEdge determine it to 2 %, in 2 ms."""
 RELIEF_UNITS = {"parallax": "px", "confidence": "1", "range": "m"}
@@ -54,15 +52,25 @@ class ErrorMap(Product):
         return self.write_layers(context, layers, blocks)
 
 
-def error_lattice_px(
-    alignment: Alignment, reference: Band, grid: OutputGrid, step_px: int = _LATTICE_PX
-) -> NDArray[np.float32]:
+def error_map(alignment: Alignment, reference: Band, grid: OutputGrid) -> ErrorOnGrid | None:
+    """Return the expected error of a band on a grid, px of the reference's file; None if it is unknown."""
+    if alignment.error is None:
+        return None
+
+    def to_reference(positions_px: Points) -> Points:
+        return grid.reference_positions(positions_px, reference.lens)
+
+    is_along_axes = not (grid.undistorted and reference.lens is not None)
+    return ErrorOnGrid.of(alignment.error, (grid.width, grid.height), to_reference, is_along_axes=is_along_axes)
+
+
+def error_lattice_px(alignment: Alignment, reference: Band, grid: OutputGrid, step_px: int) -> NDArray[np.float32]:
     """Return the expected error (rows, columns) on a lattice over a grid, px of the reference's file; nan where it is
     unknown.
     """
     columns, rows = (max(2, -(-n // step_px)) for n in (grid.width, grid.height))
     points = grid.reference_positions(geometry.lattice(grid.width, grid.height, columns, rows), reference.lens)
-    nodes = expected_error_px(alignment, reference.size_px, points).reshape(rows, columns)
+    nodes = alignment.error_px(points).reshape(rows, columns)
     return np.where(np.isfinite(nodes), nodes, np.nan).astype(np.float32)
 
 
@@ -71,19 +79,12 @@ def share_over_1_px(alignment: Alignment, reference: Band, grid: OutputGrid) -> 
     return float((~(error_lattice_px(alignment, reference, grid, _SHARE_LATTICE_PX) <= 1.0)).mean())
 
 
-def error_on_tile(nodes: NDArray[np.float32], grid: OutputGrid, tile: Tile) -> NDArray[np.float32]:
-    """Return the expected error (height, width) on a tile of a grid, linearly interpolated from `error_lattice_px`."""
-    rows, columns = nodes.shape
-    # Positions of the pixels of the grid, in nodes.
-    x, y = (np.linspace(0, n - 1, m, dtype=np.float32) for n, m in ((columns, grid.width), (rows, grid.height)))
-    x0, y0 = tile.x0 - grid.x0, tile.y0 - grid.y0
-    positions = np.meshgrid(x[x0 : x0 + tile.width], y[y0 : y0 + tile.height])
-    return np.asarray(cv2.remap(nodes, *positions, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE), np.float32)
-
-
 def _error_px(alignment: Alignment, reference: Band, grid: OutputGrid) -> NDArray[np.float32]:
     """Expected error (height, width) on a grid, rounded below its accuracy: the raster compresses better."""
-    result, step_px = error_on_tile(error_lattice_px(alignment, reference, grid), grid, grid.tile), 0.001
+    error = error_map(alignment, reference, grid)
+    if error is None:
+        return np.full((grid.height, grid.width), np.nan, np.float32)
+    result, step_px = error.on_tile(Tile(0, 0, grid.width, grid.height)), 0.001
     return np.asarray(np.round(result / step_px) * step_px, np.float32)
 
 
@@ -97,12 +98,12 @@ class QualityRaster(Product):
     def write(self, context: ProductContext) -> list[WrittenFile]:
         """Write <capture>.qa.tif. Raises OutputError, or UnreadableFileError for an input."""
         grid, reference = context.grid, context.capture.reference
-        nodes = {name: error_lattice_px(a, reference, grid) for name, a in context.with_pixels.items()}
+        errors = {name: error_map(a, reference, grid) for name, a in context.with_pixels.items()}
         predicted = {name for name, alignment in context.with_pixels.items() if alignment.status == "predicted"}
 
         def flags_on(tile: Tile) -> list[Flags]:
             bands = [
-                _flags(layer, tile, grid, nodes, is_predicted=layer.band.name in predicted) for layer in context.layers
+                _flags(layer, tile, grid, errors, is_predicted=layer.band.name in predicted) for layer in context.layers
             ]
             return [np.bitwise_or.reduce(bands), *bands]
 
@@ -120,17 +121,19 @@ class QualityRaster(Product):
 
 
 def _flags(
-    layer: Layer, tile: Tile, grid: OutputGrid, nodes: Mapping[str, NDArray[np.float32]], *, is_predicted: bool
+    layer: Layer, tile: Tile, grid: OutputGrid, errors: Mapping[str, ErrorOnGrid | None], *, is_predicted: bool
 ) -> Flags:
-    """Flags (height, width) of a band on a tile; `nodes` has the expected error by band."""
+    """Flags (height, width) of a band on a tile; `errors` has the expected error by band, None if it is unknown."""
     if layer.is_gap:
         return np.full((tile.height, tile.width), Quality.MISSING.value, np.uint16)
     result = np.full((tile.height, tile.width), Quality.PREDICTED.value if is_predicted else 0, np.uint16)
     masks = _of_source(layer, tile)
-    if layer.band.name in nodes:
-        error_px = error_on_tile(nodes[layer.band.name], grid, tile)
-        masks[Quality.ERROR_OVER_HALF_PX] = np.isnan(error_px) | (error_px > 0.5)
-        masks[Quality.ERROR_OVER_1_PX] = np.isnan(error_px) | (error_px > 1.0)
+    if layer.band.name in errors:
+        error = errors[layer.band.name]
+        on_grid = Tile(tile.x0 - grid.x0, tile.y0 - grid.y0, tile.width, tile.height)
+        error_px = np.full((tile.height, tile.width), np.inf) if error is None else error.on_tile(on_grid)
+        masks[Quality.ERROR_OVER_HALF_PX] = error_px > 0.5
+        masks[Quality.ERROR_OVER_1_PX] = error_px > 1.0
     for flag, mask in masks.items():
         result[mask] |= flag.value
     return result

@@ -28,6 +28,7 @@ from agalign.products.sidecar.schema import PreviewPart, ReliefPreviewPart
 from agalign.values.capture import Band
 from agalign.values.files import complete_file
 from agalign.values.image import reduced_size_px
+from agalign.values.resampling import NODES_PX
 from agalign.values.spectrum import ROLES
 
 ERROR_FULL_PX = 0.5
@@ -70,7 +71,7 @@ class Preview(Product):
         path, reference = context.paths.file(self.suffix), context.capture.reference
         bands = [b.name for b in context.capture.bands]
         mapped = context.with_pixels if context.settings.write.error_map else {}
-        errors_px = {name: error_lattice_px(a, reference, context.grid) for name, a in mapped.items()}
+        errors_px = {name: error_lattice_px(a, reference, context.grid, NODES_PX) for name, a in mapped.items()}
         part = write_preview(
             context.reduced_bands, bands, errors_px, path, context.max_preview_bytes, relief_view(context)
         )

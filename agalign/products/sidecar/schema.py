@@ -24,7 +24,7 @@ from agalign.config import CheckSettings, Settings
 from agalign.errors import UnreadableFileError
 from agalign.flight.fingerprint import estimation_fingerprint, input_samples
 from agalign.products.sidecar.sampled import sampled_mapping, sampled_parallax
-from agalign.values.alignment import Alignment, JointResult, Prediction, Residual, Seed, Similarity
+from agalign.values.alignment import COVARIANCE_DECIMALS, Alignment, JointResult, Prediction, Seed, is_usable
 from agalign.values.capture import Band, CameraIdentity, Capture, CaptureTime, Pose, Position, source_file
 from agalign.values.choices import CaptureStatus, Geometry, PairStatus, Space
 from agalign.values.equality import equal
@@ -48,8 +48,10 @@ from agalign.values.image import OutputGrid
 from agalign.values.issues import MISSING_BAND, Issue
 from agalign.values.lens import Lens
 from agalign.values.mapping import DisplacementField, PixelMapping
+from agalign.values.mapping_error import MappingError
 from agalign.values.parallax import Parallax, Relief
-from agalign.values.pixel_units import PixelScale
+from agalign.values.pixel_units import PixelScale, Size
+from agalign.values.residual import Residual, Similarity
 
 SCHEMA = "agalign/2"
 PointPx = tuple[Number, Number]
@@ -174,6 +176,61 @@ def _check_lengths(*lists: NDArray[np.float64]) -> None:
         raise ValueError("its lists of points are empty or of different lengths")
 
 
+class ErrorPart(_Part):
+    """What the expected error of a mapping is made of, px of the reference. The shifts of `metrics.windows` and the
+    standard error of the parallax are parts of it too.
+    """
+
+    std_px: Number4
+    """Standard error: RMS of the expected error over the area that both images show."""
+    covariance_px2: Annotated[NDArray[np.float64], Array((None, None), COVARIANCE_DECIMALS)] | None = None
+    """Covariance of the corners (8 x 8), clockwise from the top left, x and y in turn, or with lens shapes (12 x 12);
+    null for a prediction by other bands or captures, whose windows are no part of the error."""
+    rig_std_px: Number4 = 0.0
+    """Standard error of a prediction by other bands or captures, the same everywhere."""
+    lens_std_px: Annotated[NDArray[np.float64], Array((4,), 6)] | None = None
+    """Standard deviations of the lens shapes that neither tags nor a rig determine."""
+    field_std_px: Number4 = 0.0
+    """Spread of the displacement field."""
+    relief_std_px: Number4 = 0.0
+    """Spread of the parallax that a mapping without it lacks, where no window is near."""
+
+    @field_validator("covariance_px2")
+    @classmethod
+    def _has_size(cls, covariance: NDArray[np.float64] | None) -> NDArray[np.float64] | None:
+        if covariance is not None and covariance.shape not in ((8, 8), (12, 12)):
+            raise ValueError("it is neither 8 x 8 nor 12 x 12")
+        return covariance
+
+    @classmethod
+    def of(cls, alignment: Alignment) -> Self | None:
+        """Return the entry of an alignment; None if its error is unknown."""
+        error = alignment.error
+        if error is None or not math.isfinite(alignment.std_px):
+            return None
+        return cls(
+            std_px=alignment.std_px,
+            covariance_px2=error.covariance_px2,
+            rig_std_px=error.rig_std_px,
+            lens_std_px=error.lens_std_px,
+            field_std_px=error.field_std_px,
+            relief_std_px=error.relief_std_px,
+        )
+
+    def mapping_error(self, size_px: Size, windows: Residual | None, parallax: Parallax | None) -> MappingError:
+        """Return the error of a mapping of a reference (width, height), with the windows and parallax of the band."""
+        return MappingError(
+            size_px,
+            self.covariance_px2,
+            None if self.covariance_px2 is None else windows,
+            self.rig_std_px,
+            self.lens_std_px,
+            self.field_std_px,
+            self.relief_std_px,
+            parallax,
+        )
+
+
 class PlacePart(_Part):
     """Where the aligned pixels of the band are."""
 
@@ -225,10 +282,8 @@ class BandResult(_Part):
     """Mapping by the rig, or extrapolated from a part of the image."""
     exposed_after_s: Number3 | None = None
     """Delay of the exposure relative to the reference, s; null if the band is aligned."""
-    lens_std_px: Annotated[NDArray[np.float64], Array((4,), 6)] | None = None
-    """Standard deviations of the lens shapes that neither tags nor a rig determine, px of the reference."""
-    relief_std_px: Number = 0.0
-    """Spread of the flight's parallax, which a mapping without relief lacks, px of the reference."""
+    error: ErrorPart | None = None
+    """What the expected error of the mapping is made of; null if it is unknown."""
     place: PlacePart | None = None
     """Where the aligned pixels of the band are."""
     saturated: Number4 | None = None
@@ -270,8 +325,7 @@ class BandResult(_Part):
             geometry=GeometryPart(kind=alignment.geometry, held_out_p95_px=dict(alignment.candidates)),
             prediction=alignment.prediction,
             exposed_after_s=None if alignment.status == "aligned" else _exposed_after_s(band, capture.reference),
-            lens_std_px=alignment.lens_std_px,
-            relief_std_px=alignment.relief_std_px,
+            error=ErrorPart.of(alignment),
             seconds=alignment.seconds,
         )
 
@@ -285,29 +339,28 @@ class BandResult(_Part):
         parallax = None
         if self.relief is not None and relief is not None:
             parallax = Parallax(relief, self.relief.baseline).with_occlusions()
+        residual = None if self.metrics is None else self.metrics.windows
         return Alignment(
             PixelMapping(self.homography.fixed_to_moving, fixed, moving, field=self.field, parallax=parallax),
             size_px,
             self.issues,
             self.seed,
             joint=self.joint,
-            residual=None if self.metrics is None else self.metrics.windows,
+            residual=residual,
             seconds=self.seconds,
             before=Similarity() if self.metrics is None else self.metrics.before,
             after=Similarity() if self.metrics is None else self.metrics.after,
             candidates={} if self.geometry is None else self.geometry.held_out_p95_px,
             prediction=self.prediction,
             is_seed_usable=self.status == "seed_only",
-            lens_std_px=self.lens_std_px,
-            relief_std_px=self.relief_std_px,
+            error=None if self.error is None else self.error.mapping_error(size_px, residual, parallax),
+            std_px=math.inf if self.error is None else self.error.std_px,
             moving_size_px=self.size_px,
         )
 
     def is_usable(self, accept_predicted_px: float) -> bool:
         """Return True for the reference, an aligned band, or a predicted band with an accepted standard error."""
-        if self.status == "predicted":
-            return self.prediction is not None and self.prediction.std_px <= accept_predicted_px
-        return self.status in ("reference", "aligned")
+        return is_usable(self.status, self.prediction, accept_predicted_px)
 
     def without_tables(self) -> Self:
         """Return the entry without its long tables."""

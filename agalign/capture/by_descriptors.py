@@ -1,0 +1,67 @@
+"""Candidates by the descriptors, combined with windows and rig: a homography, and a displacement field on top of it."""
+
+from collections.abc import Iterator
+from dataclasses import replace
+
+from agalign.capture.band_pair import BandPair
+from agalign.capture.candidate import Candidate, RefinedBand
+from agalign.capture.warped_pair import WarpedPair
+from agalign.pixels.band_resampling import channel_mean
+from agalign.values.alignment import JointResult
+from agalign.values.choices import Geometry, ReliefUse, SeedKind
+from agalign.values.geometry import Matrix
+from agalign.verify.checks import BY_PARALLAX, is_unchanged
+
+
+def by_descriptors(band: RefinedBand, by_halves: tuple[Matrix, Matrix] | None, use: ReliefUse) -> Iterator[Candidate]:
+    """Yield the homography of a band, then the same with a displacement field.
+
+    `by_halves` are the homographies from each half of the windows (`WarpedPair.cross_validated`). A field is fitted if
+    parallax may cause all issues of the homography, or if there are none and no rig contains the distortion of the
+    lenses; always with `use` "always", not with "never".
+    """
+    pair = band.pair
+    joint = _unchanged_if_aligned(band.joint, pair)
+    warped = band.warped.with_mapping(pair.mapping(joint.fixed_to_moving))
+    if by_halves is not None and joint is band.joint:
+        warped = warped.cross_validated(by_halves)
+    plane = Candidate.of("descriptors", warped, joint)
+    yield plane
+    is_wanted = use == "always" or (use == "auto" and (bool(plane.issues) or not pair.has_rig))
+    if is_wanted and all(issue.kind in BY_PARALLAX for issue in plane.issues):
+        yield from _with_field(plane, warped, joint)
+
+
+def _with_field(plane: Candidate, warped: WarpedPair, joint: JointResult) -> Iterator[Candidate]:
+    """Yield the candidate with a displacement field, if it reduces the shifts of windows that it is not fitted to.
+
+    These windows, which are smaller, verify it, or those of the homography if it passes in these.
+    """
+    pair = plane.pair
+    displacement = pair.reference.displacement_field.refine(channel_mean(pair.moving_image), plane.mapping)
+    p95_px: dict[Geometry, float] = {"homography": displacement.before_p95_px, "field": displacement.after_p95_px}
+    if displacement.field is None:
+        return
+    displaced = WarpedPair.of(pair, replace(plane.mapping, field=displacement.field), warped.windows)
+    held_out = Candidate.of("field", displaced, joint, displacement.held_out)
+    in_all = replace(held_out, other_windows=displaced.residual, p95_px=p95_px)
+    if in_all.issues and not plane.issues:
+        # The homography is verified, and the field reduces the shifts of held-out windows.
+        by_homography = Candidate.of("field", displaced, joint, plane.windows)
+        yield replace(by_homography, other_windows=displaced.residual, p95_px=p95_px)
+    else:
+        yield in_all
+
+
+def _unchanged_if_aligned(joint: JointResult, pair: BandPair) -> JointResult:
+    """Replace the mapping by the one given by the files if it does not differ significantly.
+
+    Input that is aligned already is returned unchanged instead of resampled by a small shift.
+    """
+    kinds: tuple[SeedKind, ...] = ("geo", "identity")
+    for given in (pair.seed_matrices[kind] for kind in kinds if kind in pair.seed_matrices):
+        if pair.mapping(given).is_curved:
+            continue  # with lens distortion the files are not aligned
+        if is_unchanged(joint, given, pair.fixed.size_px, max(pair.scales.fixed)):
+            return replace(joint, fixed_to_moving=given)
+    return joint

@@ -1,0 +1,238 @@
+"""Candidates: the mappings that a band may get, each with its error and the windows that verify it."""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from agalign.capture.band_pair import BandPair
+from agalign.capture.warped_pair import WarpedPair
+from agalign.values.alignment import JointResult, Seed
+from agalign.values.choices import Geometry
+from agalign.values.geometry import Matrix, Points
+from agalign.values.image import Raster
+from agalign.values.issues import SEED_ASKED_FOR, Issue, IssueKind
+from agalign.values.mapping import PixelMapping
+from agalign.values.mapping_error import MappingError
+from agalign.values.residual import Residual
+from agalign.verify.checks import BY_WINDOWS, PREDICTED_WITH, issues_of, seed_fits
+from agalign.verify.coverage import points_in_frame
+
+Estimator = Literal["descriptors", "field", "relief", "windows", "lens shapes", "full resolution", "rig"]
+"""What a mapping was estimated by."""
+
+
+_PARALLAX_STEP_PX = 8
+"""Distance of the points at which the error of a mapping with parallax is averaged: half of the length at which it
+varies; the error of others is smooth."""
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """A mapping that a band may get, px of the images. `decision.decide` chooses one for each band."""
+
+    estimator: Estimator
+    pair: BandPair
+    mapping: PixelMapping
+    error: MappingError
+    windows: Residual
+    """Windows that the fit did not use, under the mapping."""
+    joint: JointResult | None = None
+    """Evidence of descriptors or windows; None for a prediction by the rig."""
+    images: WarpedPair | None = None
+    """The images under the mapping; None omits the checks that use pixels."""
+    other_windows: Residual | None = None
+    """More windows, which also have to pass the checks: those of another size, in which the mapping was not chosen."""
+    p95_px: Mapping[Geometry, float] = field(default_factory=dict)
+    """p95 of the shifts of held-out windows by each geometry that was fitted; empty if only a homography was."""
+    is_confirmed: bool = False
+    """Windows confirm it in half of the image: it may be a prediction, whatever the checks find."""
+    ignored: frozenset[IssueKind] = frozenset()
+    """Kinds of issues that do not matter: those by parallax, in an observation of the rig."""
+    replaces: tuple[Issue, ...] = ()
+    """Issues of the candidate that it extrapolates: it is a prediction, as windows see a part of the image only."""
+
+    @classmethod
+    def of(
+        cls, estimator: Estimator, warped: WarpedPair, joint: JointResult, windows: Residual | None = None
+    ) -> "Candidate":
+        """Return the candidate with the homography and covariance of a result, and with the mapping of `warped`, whose
+        windows verify it unless others are given.
+        """
+        windows = warped.residual if windows is None else windows
+        error = mapping_error(warped.pair, warped.mapping, joint.covariance_px2, windows)
+        return cls(estimator, warped.pair, warped.mapping, error, windows, joint, warped)
+
+    @cached_property
+    def issues(self) -> tuple[Issue, ...]:
+        """What the checks find; empty if it passes verification."""
+        if self.replaces:
+            return self.replaces
+        issues = tuple(issue for issue in issues_of(self) if issue.kind not in self.ignored)
+        if issues or self.other_windows is None:
+            return issues
+        error = replace(self.error, windows=self.other_windows)
+        return replace(self, windows=self.other_windows, error=error, other_windows=None).issues
+
+    @property
+    def may_predict(self) -> bool:
+        """True if the images confirm the mapping, though not everywhere: it predicts the others."""
+        is_confirmed = self.is_confirmed or bool(self.replaces)
+        is_confirmed = is_confirmed or all(issue.kind in PREDICTED_WITH for issue in self.issues)
+        return is_confirmed and math.isfinite(self.std_px)
+
+    @property
+    def file_pixel_size_px(self) -> float:
+        """Size of a pixel of the reference's file, px of the fixed image."""
+        return self.pair.file_pixel_size_px
+
+    @cached_property
+    def std_px(self) -> float:
+        """Standard error: the RMS of the expected error over the common area, px of the fixed image."""
+        points_px = self.common_px
+        if self.mapping.parallax is not None:
+            points_px = points_in_frame(self.mapping, *self.pair.sizes_px, step_px=_PARALLAX_STEP_PX)
+        return self.error.rms_px(points_px if len(points_px) else self.windows.centres_px)
+
+    @cached_property
+    def common_px(self) -> Points:
+        """Points (n, 2) of a grid over the reference that the moving image covers."""
+        return points_in_frame(self.mapping, *self.pair.sizes_px) if self.images is None else self.images.common_px()
+
+    @property
+    def textured_px(self) -> Points:
+        """Points (n, 2) whose errors are limited: those of the windows under a relief, whose error at a pixel without
+        texture no image shows; without one, the error is smooth, and the whole common area counts.
+        """
+        return self.common_px if self.mapping.parallax is None else self.windows.centres_px
+
+
+def mapping_error(
+    pair: BandPair,
+    mapping: PixelMapping,
+    covariance_px2: NDArray[np.float64],
+    windows: Residual,
+    *,
+    relief_std_px: float | None = None,
+) -> MappingError:
+    """Return the error of a mapping that was estimated on the images of a pair.
+
+    Unknown lens shapes are part of it, unless the covariance (12, 12) contains them, and so is the relief that a
+    mapping without one lacks: by default that of the flight.
+    """
+    spread_px = 0.0
+    if mapping.field is not None and windows.is_measured.any():
+        displacements_px = mapping.field(windows.measured_px)
+        spread_px = float(np.sqrt(displacements_px.var(axis=0).sum()))
+    return MappingError(
+        pair.fixed.size_px,
+        covariance_px2,
+        windows,
+        lens_std_px=pair.unknown_lens_std_px if len(covariance_px2) == 8 else None,
+        field_std_px=spread_px,
+        relief_std_px=(
+            0.0 if mapping.parallax is not None else pair.relief_std_px if relief_std_px is None else relief_std_px
+        ),
+        parallax=mapping.parallax,
+    )
+
+
+@dataclass(frozen=True)
+class RefinedBand:
+    """A band with its windows under the result of the joint optimisation, or under its seed."""
+
+    pair: BandPair
+    seed: Seed
+    joint: JointResult
+    """Without evidence of descriptors, at the seed, if the optimisation has no result."""
+    warped: WarpedPair
+    issue: Issue | None = None
+    """Why the optimisation has no result."""
+
+    @classmethod
+    def of(cls, pair: BandPair, seed: Seed, result: JointResult | Issue) -> "RefinedBand":
+        """Measure the windows with the homography of a result."""
+        issue = result if isinstance(result, Issue) else None
+        joint = result_of_windows(seed.fixed_to_moving) if isinstance(result, Issue) else result
+        return cls(pair, seed, joint, WarpedPair.of(pair, pair.mapping(joint.fixed_to_moving)), issue)
+
+    def fit_residual(self, mapping: PixelMapping) -> Residual:
+        """Measure the windows of the fit with a mapping."""
+        return self.pair.reference.black_windows.residuals(self._warped(mapping))
+
+    def held_out_residual(self, mapping: PixelMapping) -> Residual:
+        """Measure the windows that take no part in the fit."""
+        return self.pair.reference.white_windows.residuals(self._warped(mapping))
+
+    def _warped(self, mapping: PixelMapping) -> Raster:
+        return self.warped.warped if mapping is self.warped.mapping else self.pair.warped_moving(mapping)
+
+
+def result_of_windows(fixed_to_moving: Matrix) -> JointResult:
+    """Return a result without evidence of descriptors, with an infinite standard error."""
+    std = ((math.inf, math.inf),) * 4
+    return JointResult(fixed_to_moving, math.nan, 0.0, 0.0, 0, (1.0,), BY_WINDOWS, "homography", 0.0, std)
+
+
+@dataclass
+class BandCandidates:
+    """All that the estimators found for a band."""
+
+    pair: BandPair
+    seed: Seed | Issue
+    """The initial alignment, or why there is none."""
+    issue: Issue | None = None
+    """Why the last optimisation has no result, or that the user asked for the seed only."""
+    candidates: list[Candidate] = field(default_factory=list)
+    """Without those under a relief, in the order in which they were made."""
+
+    @cached_property
+    def start(self) -> Seed:
+        """The seed; that of tags or flight if it contradicts them, or if there is none."""
+        matrices, std_px = self.pair.seed_matrices, self.pair.seed_std_px
+        if isinstance(self.seed, Issue):
+            kind, matrix = next(iter(matrices.items()))
+            return Seed(kind, matrix, 0.0)
+        known = min(((std_px[kind], kind) for kind in std_px if kind in matrices), default=None)
+        if known is None or self._is_asked_for or self.pair.is_expected(self.seed.fixed_to_moving):
+            return self.seed
+        return Seed(known[1], matrices[known[1]], 0.0, trusted=True)
+
+    @cached_property
+    def start_residual(self) -> Residual | None:
+        """The windows under the seed; None if there is none."""
+        if isinstance(self.seed, Issue):
+            return None
+        return WarpedPair.of(self.pair, self.pair.mapping(self.start.fixed_to_moving)).residual
+
+    @property
+    def is_start_trusted(self) -> bool:
+        """True if the seed may be used unchanged, provided that it fits the windows."""
+        return not isinstance(self.seed, Issue) and (self.start.trusted or self._is_asked_for)
+
+    @property
+    def does_start_fit(self) -> bool:
+        """True if the windows agree with the seed."""
+        return self.start_residual is not None and seed_fits(self.start_residual)
+
+    @property
+    def rejected(self) -> Sequence[Issue]:
+        """Why the last estimate of the images was not accepted."""
+        if isinstance(self.seed, Issue):
+            return (self.seed,)
+        if self.issue is not None:
+            return (self.issue,)
+        return self.candidates[-1].issues if self.candidates else ()
+
+    @property
+    def joint(self) -> JointResult | None:
+        """The last result of the optimisation."""
+        return self.candidates[-1].joint if self.candidates else None
+
+    @property
+    def _is_asked_for(self) -> bool:
+        return self.issue is not None and self.issue.kind == SEED_ASKED_FOR

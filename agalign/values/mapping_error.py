@@ -1,0 +1,274 @@
+"""The expected error of a mapping: all that is known of it, in one record, and its value at any point.
+
+Status, standard error, error map, quality flags, report and `Alignment.error_px` are this one quantity.
+"""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from agalign.values import geometry
+from agalign.values.geometry import PairScales, Points
+from agalign.values.image import FloatImage, Tile
+from agalign.values.lens_shapes import lens_shapes, shift_variance_px2, variance_px2
+from agalign.values.parallax import Parallax
+from agalign.values.pixel_units import Size
+from agalign.values.resampling import between_nodes, nodes_along
+from agalign.values.residual import Residual, noise_px
+
+_COMMON_ERROR_FACTOR = 12.0
+"""Factor on the variance of a mapping where it is extrapolated: the errors that neighbouring windows and patches have
+in common average out between them only."""
+_FAR_SPACINGS = 3.0
+"""Window spacings, beyond the first, over which a mapping becomes an extrapolation."""
+
+
+@dataclass(frozen=True)
+class MappingError:
+    """What the error of one mapping is made of, px of the reference.
+
+        error(x)^2 = rig^2 + trace(D(x) C D(x)^T) (1 + 11 far(x)) + far(x) (field^2 + relief^2) + max(u(x)^2, z(x)^2)
+
+    D is the Jacobian `lens_shapes.jacobian`, far(x) rises from 0 within one spacing of the measured windows to 1, u is
+    the displacement that the mapping does not contain, by the residual shifts of the nearest windows beyond their
+    noise, and z the standard error of the parallax times the baseline.
+
+    Examples
+    --------
+    `result` is that of the example of `align`.
+
+    >>> error = result.error
+    >>> error.size_px, error.covariance_px2.shape, error.rig_std_px, error.parallax
+    ((200, 200), (8, 8), 0.0, None)
+    >>> error.windows.coverage, error.lens_std_px is None, error.field_std_px < 0.1, error.relief_std_px
+    (1.0, False, True, 0.0)
+    """
+
+    size_px: Size
+    """(width, height) of the reference."""
+    covariance_px2: NDArray[np.float64] | None = None
+    """C: covariance of the corners (8, 8), clockwise from the top left, x and y in turn, or with the lens shapes
+    (12, 12); None for a prediction by other bands or captures."""
+    windows: Residual | None = None
+    """Shifts of windows that the fit did not use, under the mapping; None if they say nothing about it."""
+    rig_std_px: float = 0.0
+    """Standard error of a prediction by other bands or captures, the same everywhere."""
+    lens_std_px: NDArray[np.float64] | None = None
+    """(4,) standard deviations of lens shapes that neither tags nor a rig determine; None if they are known or in C."""
+    field_std_px: float = 0.0
+    """Spread of the displacement field at the windows: elsewhere it continues by chance."""
+    relief_std_px: float = 0.0
+    """Spread of the relief, which a mapping without one lacks where no window is near."""
+    parallax: Parallax | None = None
+    """Parallax of the mapping, with its standard error."""
+
+    def error_px(self, points_px: Points) -> NDArray[np.float64]:
+        """Return the expected RMS error at points of the reference.
+
+        Parameters
+        ----------
+        points_px
+            (n, 2): x and y, raw px of the reference; (0, 0) is the centre of the top-left pixel.
+
+        Returns
+        -------
+        array
+            (n,), float64: px of the reference.
+
+        Examples
+        --------
+        `result` is that of the example of `align`.
+
+        >>> result.error.error_px(np.array([[100.0, 100.0]])).shape
+        (1,)
+        """
+        z_px2 = np.zeros(len(points_px)) if self.parallax is None else self.parallax.variance_px2(points_px)
+        modelled_px2, unmodelled_px2 = self.smooth_px2(points_px)
+        return np.asarray(np.sqrt(modelled_px2 + np.maximum(unmodelled_px2, z_px2)))
+
+    def smooth_px2(self, points_px: Points) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return the parts (n,) of the square that vary smoothly: all but u and z, and u, at points (n, 2)."""
+        far = self._far(points_px)
+        modelled_px2 = self.rig_std_px**2 + self._covariance_px2(points_px) * (1 + far * (_COMMON_ERROR_FACTOR - 1))
+        modelled_px2 = modelled_px2 + far * (self.field_std_px**2 + self.relief_std_px**2)
+        # The windows are measured with a relief from other bands: their shifts contain its error.
+        return modelled_px2, self._unmodelled_px2(points_px, far)
+
+    def rms_px(self, points_px: Points) -> float:
+        """Return the RMS of the expected error over points: the standard error of the mapping there.
+
+        Parameters
+        ----------
+        points_px
+            (n, 2): x and y, raw px of the reference.
+
+        Returns
+        -------
+        float
+            Px of the reference; infinite without points.
+
+        Examples
+        --------
+        `result` is that of the example of `align`.
+
+        >>> result.error.rms_px(np.array([[20.0, 20.0], [180.0, 180.0]])) < 0.2
+        True
+        """
+        return float(np.sqrt(np.square(self.error_px(points_px)).mean())) if len(points_px) else math.inf
+
+    def distortion_px(self, points_px: Points) -> float:
+        """Return the RMS over points (n, 2) of the error by corners and lenses alone, as if no window were far."""
+        return float(np.sqrt(self._covariance_px2(points_px).mean()))
+
+    def in_file_px(self, scales: PairScales, size_px: Size, parallax: Parallax | None) -> "MappingError":
+        """Convert the error between images to one between their files; `size_px` is that of the reference's file, and
+        `parallax` that between the files.
+        """
+        up = scales.fixed.inverse
+        per_axis = np.r_[np.tile(up, 4), np.full(4, up.mean)]
+        return replace(
+            self,
+            size_px=size_px,
+            covariance_px2=_scaled(self.covariance_px2, per_axis),
+            windows=None if self.windows is None else self.windows.in_file_px(scales),
+            rig_std_px=self.rig_std_px * up.mean,
+            lens_std_px=None if self.lens_std_px is None else self.lens_std_px * up.mean,
+            field_std_px=self.field_std_px * up.mean,
+            relief_std_px=self.relief_std_px * up.mean,
+            parallax=parallax,
+        )
+
+    @cached_property
+    def _measured(self) -> Residual | None:
+        """The windows with a measured shift; None without any."""
+        if self.windows is None or not self.windows.is_measured.any():
+            return None
+        return self.windows.where(self.windows.is_measured)
+
+    @cached_property
+    def _spacing_px(self) -> float:
+        return 1.0 if self.windows is None else self.windows.spacing_px
+
+    @cached_property
+    def _tree(self) -> cKDTree:
+        assert self._measured is not None
+        return cKDTree(self._measured.centres_px)
+
+    def _far(self, points_px: Points) -> NDArray[np.float64]:
+        """Return (n,) from 0 to 1 how far points (n, 2) are from measured windows: 0 within one spacing of these."""
+        if self._measured is None:
+            return np.zeros(len(points_px))
+        distance_px, _ = self._tree.query(points_px)
+        return np.asarray(np.clip((distance_px / self._spacing_px - 1) / _FAR_SPACINGS, 0, 1))
+
+    def _covariance_px2(self, points_px: Points) -> NDArray[np.float64]:
+        """Return the variance (n,) at points (n, 2) by the covariance of corners and lens shapes."""
+        covariance = self._with_lenses
+        return np.zeros(len(points_px)) if covariance is None else variance_px2(points_px, covariance, self.size_px)
+
+    @cached_property
+    def _with_lenses(self) -> NDArray[np.float64] | None:
+        """The covariance (8, 8) of the corners, or (12, 12) with unknown lens shapes, given the windows.
+
+        A homography fitted to the windows follows the lens shapes where the windows are, so that their errors cancel
+        there and not elsewhere. The windows also limit the shapes that are possible.
+        """
+        if self.covariance_px2 is None or self.lens_std_px is None or self._measured is None:
+            return self.covariance_px2
+        centres_px = self._measured.centres_px
+        flat_corners = geometry.over_corners(centres_px, *self.size_px).reshape(-1, 8)
+        flat_lenses = lens_shapes(centres_px, self.size_px).reshape(-1, 4)
+        damping = 1e-9 * np.trace(flat_corners.T @ flat_corners) * np.eye(8)
+        followed = np.linalg.solve(flat_corners.T @ flat_corners + damping, flat_corners.T @ flat_lenses)
+        remaining = flat_lenses - flat_corners @ followed
+        information = remaining.T @ remaining / shift_variance_px2(self._measured.std_px, with_shapes=True)
+        of_lenses = np.linalg.inv(np.diag(self.lens_std_px**-2.0) + information)
+        result = np.zeros((12, 12))
+        result[:8, :8] = self.covariance_px2[:8, :8] + followed @ of_lenses @ followed.T
+        result[:8, 8:] = -followed @ of_lenses
+        result[8:, :8], result[8:, 8:] = result[:8, 8:].T, of_lenses
+        return result
+
+    def _unmodelled_px2(self, points_px: Points, far: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return u^2 (n,): the expected squared shift at points that the mapping does not contain.
+
+        It is the median of the nearest windows, so that a single wrong peak does not count, minus their noise. It is
+        shrunk towards the value of all windows, which is used alone far from them.
+        """
+        measured = self._measured
+        if measured is None:
+            return np.zeros(len(points_px))
+        noise_px2 = np.square(noise_px(measured.peaks_sigma))
+        squares = np.square(measured.shifts_px).sum(axis=1)
+        count = min(8, len(squares))  # nearest windows, weighted by their distance
+        distance, index = (values.reshape(-1, count) for values in self._tree.query(points_px, k=count))
+        weight = np.exp(-0.5 * (distance / self._spacing_px) ** 2) + 1e-12
+        order = np.argsort(squares[index], axis=1)
+        cumulative = np.cumsum(np.take_along_axis(weight, order, axis=1), axis=1)
+        middle = (cumulative >= cumulative[:, -1:] / 2).argmax(axis=1)[:, None]
+        median_px2 = np.take_along_axis(squares[index], np.take_along_axis(order, middle, axis=1), axis=1)[:, 0]
+        mean_noise_px2 = (weight * noise_px2[index]).sum(axis=1) / weight.sum(axis=1)
+        # The median square of a shift with two normally distributed components is log(2) times its mean square.
+        local_px2 = np.maximum(median_px2 / math.log(2) - mean_noise_px2, 0.0)
+        prior_windows = 4.0  # weight of all windows relative to one of the nearest
+        all_px2, total = measured.std_px**2, weight.sum(axis=1)
+        near_px2 = (total * local_px2 + prior_windows * all_px2) / (total + prior_windows)
+        return np.asarray((1 - far) * near_px2 + far * all_px2)
+
+
+@dataclass(frozen=True)
+class ErrorOnGrid:
+    """The expected error at the pixels of a grid: its smooth parts at nodes, that of the parallax at each pixel."""
+
+    error: MappingError
+    size_px: Size
+    """(width, height) of the grid."""
+    nodes_px2: NDArray[np.float32]
+    """(2, rows, columns) the smooth parts of the square at nodes."""
+    to_reference: Callable[[Points], Points] = np.asarray
+    """Raw positions (n, 2) in the reference of positions on the grid; by default the grid is the reference's own."""
+    is_along_axes: bool = True
+    """Rows and columns of the grid are rows and columns of the reference."""
+
+    @classmethod
+    def of(
+        cls,
+        error: MappingError,
+        size_px: Size,
+        to_reference: Callable[[Points], Points] = np.asarray,
+        *,
+        is_along_axes: bool = True,
+    ) -> "ErrorOnGrid":
+        """Calculate the nodes of a map; the arguments are the fields."""
+        columns, rows = (nodes_along(n) for n in size_px)
+        points_px = to_reference(geometry.lattice(*size_px, columns, rows))
+        nodes_px2 = np.reshape(error.smooth_px2(points_px), (2, rows, columns)).astype(np.float32)
+        return cls(error, size_px, nodes_px2, to_reference, is_along_axes)
+
+    def on_tile(self, tile: Tile) -> FloatImage:
+        """Return the expected error (height, width) on a tile of the grid, px of the reference."""
+        modelled_px2, unmodelled_px2 = (between_nodes(plane, self.size_px, tile) for plane in self.nodes_px2)
+        if self.error.parallax is not None:
+            unmodelled_px2 = np.maximum(unmodelled_px2, self._z_px2(self.error.parallax, tile))
+        return np.asarray(np.sqrt(modelled_px2 + unmodelled_px2), np.float32)
+
+    def _z_px2(self, parallax: Parallax, tile: Tile) -> FloatImage:
+        x_px, y_px = np.arange(tile.x0, tile.x0 + tile.width), np.arange(tile.y0, tile.y0 + tile.height)
+        if self.is_along_axes:
+            columns = self.to_reference(np.stack([x_px, np.zeros(tile.width)], axis=-1))[:, 0]
+            rows = self.to_reference(np.stack([np.zeros(tile.height), y_px], axis=-1))[:, 1]
+            return parallax.variance_at_crossings(columns, rows)
+        points_px = self.to_reference(np.stack(np.meshgrid(x_px, y_px), axis=-1).reshape(-1, 2).astype(np.float64))
+        return np.asarray(parallax.variance_px2(points_px).reshape(tile.height, tile.width), np.float32)
+
+
+def _scaled(covariance: NDArray[np.float64] | None, per_parameter: NDArray[np.float64]) -> NDArray[np.float64] | None:
+    if covariance is None:
+        return None
+    factors = per_parameter[: len(covariance)]
+    return np.asarray(covariance * np.outer(factors, factors))

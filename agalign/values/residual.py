@@ -1,0 +1,188 @@
+"""What remains after an alignment: shifts of windows between the two images, and the similarity of their pixels."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+from functools import cached_property
+from typing import Annotated
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from pydantic import dataclasses as validated
+from scipy.spatial import cKDTree
+
+from agalign.values.equality import equal
+from agalign.values.fields import RECORD, Array, Number6
+from agalign.values.geometry import PairScales
+
+_NOISE_PX_SIGMA2 = 48.0
+"""RMS noise of the shift of a window times the squared height of its peak, in windows of 40 to 64 px: the median shift
+of aligned windows is 0.7 to 1.35 of that noise in sharp, noisy and blurred scenes, with peaks of 8 sigma to 30."""
+
+
+def noise_px(peaks_sigma: ArrayLike) -> NDArray[np.float64]:
+    """Return the RMS noise (n,) of the length of measured shifts from the heights (n,) of their correlation peaks."""
+    return np.asarray(_NOISE_PX_SIGMA2 / np.square(peaks_sigma))
+
+
+@validated.dataclass(frozen=True, config=RECORD)
+class Residual:
+    """Shifts of windows under a mapping, by phase correlation.
+
+    Examples
+    --------
+    `result` is that of the example of `align`.
+
+    >>> residual = result.residual
+    >>> residual.median_px < 0.1, residual.p95_px < 0.1, residual.std_px < 0.1, residual.coverage
+    (True, True, True, 1.0)
+    >>> residual.shifts_px.shape, residual.lengths_px.shape, int(residual.is_measured.sum())
+    ((24, 2), (24,), 24)
+    >>> x_px, y_px = residual.measured_px[residual.lengths_px.argmax()]  # window with the largest shift
+    """
+
+    __eq__ = equal
+
+    centres_px: Annotated[NDArray[np.float64], Array((None, 2), 2)]
+    """(n, 2) centres of the windows, px of the reference."""
+    shifts_px: Annotated[NDArray[np.float64], Array((None, 2), 3, nullable=True)]
+    """(n, 2) position of the moving band's structure minus that of the reference's, px of the reference; NaN, null in
+    JSON, where it could not be measured."""
+    peaks_sigma: Annotated[NDArray[np.float64], Array((None,), 2, nullable=True)]
+    """(n,) height of the correlation peak of each window, in standard deviations; the error of a shift is inversely
+    proportional to its square."""
+    cells: Annotated[NDArray[np.int64], Array((None, 2), integers=True)]
+    """(n, 2) column and row of each window in the complete grid, whichever windows of it are measured."""
+
+    def __post_init__(self) -> None:
+        """Raise ValueError for arrays of different lengths."""
+        if len({len(column) for column in (self.centres_px, self.shifts_px, self.peaks_sigma, self.cells)}) > 1:
+            raise ValueError("its lists have different lengths")
+
+    @classmethod
+    def joined(cls, several: Sequence["Residual"]) -> "Residual":
+        """Return the windows of several residuals as one."""
+        return cls(
+            np.concatenate([one.centres_px for one in several]),
+            np.concatenate([one.shifts_px for one in several]),
+            np.concatenate([one.peaks_sigma for one in several]),
+            np.concatenate([one.cells for one in several]),
+        )
+
+    def with_shifts(self, shifts_px: NDArray[np.float64]) -> "Residual":
+        """Return the same windows with other shifts (n, 2)."""
+        return replace(self, shifts_px=shifts_px)
+
+    @property
+    def is_measured(self) -> NDArray[np.bool_]:
+        """(n,) True for windows in which a shift was measured."""
+        return np.isfinite(self.shifts_px[:, 0])
+
+    @cached_property
+    def lengths_px(self) -> NDArray[np.float64]:
+        """(m,) lengths of the measured shifts, px of the reference."""
+        return np.asarray(np.linalg.norm(self.shifts_px[self.is_measured], axis=1))
+
+    @property
+    def median_px(self) -> float:
+        """Median length of the measured shifts, px of the reference; infinite without any."""
+        return self._percentiles_px[0]
+
+    @property
+    def p95_px(self) -> float:
+        """95th percentile of the lengths of the measured shifts, px of the reference; infinite without any."""
+        return self._percentiles_px[1]
+
+    @cached_property
+    def _percentiles_px(self) -> tuple[float, float]:
+        median, p95 = np.percentile(self.lengths_px, (50, 95)).tolist() if len(self.lengths_px) else (np.inf, np.inf)
+        return median, p95
+
+    @property
+    def coverage(self) -> float:
+        """Share of the textured windows in which a shift could be measured."""
+        return float(self.is_measured.mean()) if len(self.shifts_px) else 0.0
+
+    @property
+    def std_px(self) -> float:
+        """Standard error estimated from the windows, px: their RMS shift beyond the noise of their peaks; infinite
+        without any.
+
+        A fifth of the windows may be wrong peaks or at depth edges: the RMS is the larger of those of a normal
+        distribution with the same median, and with the same 80th percentile. At least half of it is kept, because the
+        noise is known only to a factor.
+        """
+        if not len(self.lengths_px):
+            return math.inf
+        noise = float(np.median(noise_px(self.peaks_sigma[self.is_measured])))
+        # Of a Rayleigh distribution: sqrt(-2 log(1 - p)) for the quantile p, and sqrt(2) for the RMS.
+        rms_px = max(float(np.quantile(self.lengths_px, p)) / math.sqrt(-math.log(1 - p)) for p in (0.5, 0.8))
+        return math.sqrt(max(rms_px**2 - noise**2, (rms_px / 2) ** 2))
+
+    @property
+    def is_even_cell(self) -> NDArray[np.bool_]:
+        """(n,) True for alternate windows along both axes of their grid, as on a chessboard."""
+        return np.asarray(self.cells.sum(axis=1) % 2 == 0)
+
+    def chessboard_half(self, *, even: bool) -> "Residual":
+        """Return the black or the white windows: one half for a fit, the other for its verification."""
+        return self.where(self.is_even_cell == even)
+
+    def where(self, selected: NDArray[np.bool_]) -> "Residual":
+        """Return the windows where a mask (n,) is True."""
+        shifts_px, peaks_sigma, cells = self.shifts_px[selected], self.peaks_sigma[selected], self.cells[selected]
+        return Residual(self.centres_px[selected], shifts_px, peaks_sigma, cells)
+
+    @property
+    def measured_px(self) -> NDArray[np.float64]:
+        """(m, 2) centres of the windows in which a shift was measured, px of the reference."""
+        return self.centres_px[self.is_measured]
+
+    @cached_property
+    def spacing_px(self) -> float:
+        """Median distance from a window to its nearest neighbour, px; at least 1."""
+        if len(self.centres_px) < 2:
+            return 1.0
+        return max(1.0, float(np.median(cKDTree(self.centres_px).query(self.centres_px, k=2)[0][:, 1])))
+
+    def in_file_px(self, scales: PairScales) -> "Residual":
+        """Convert the residual to px of the reference band's file."""
+        up = scales.fixed.inverse
+        centres_px, shifts_px = up.positions(self.centres_px), up.displacements(self.shifts_px)
+        return replace(self, centres_px=centres_px, shifts_px=shifts_px)
+
+
+@validated.dataclass(frozen=True, config=RECORD)
+class Similarity:
+    """Similarity of the pixels that are valid in both bands; null: not measured. Large images are sampled.
+
+    Examples
+    --------
+    `result` is that of the example of `align`.
+
+    >>> result.before.nmi < 1.01, result.after.nmi > 1.4
+    (True, True)
+    >>> round(result.after.ncc, 2), round(result.after.gradient_correlation, 2)  # reversed contrast, equal edges
+    (-1.0, 1.0)
+    """
+
+    __eq__ = equal
+
+    mattes_mi: Number6 = math.nan
+    """Negative Mattes mutual information, nats, 32 bins: lower is better."""
+    nmi: Number6 = math.nan
+    """Normalised mutual information, 1 to 2: higher is better."""
+    ncc: Number6 = math.nan
+    """Normalised cross-correlation; negative if contrast is reversed."""
+    gradient_correlation: Number6 = math.nan
+    """Correlation of gradient magnitudes."""
+    structure_ssim: Number6 = math.nan
+    """SSIM of structure images."""
+    overlap: Number6 = math.nan
+    """Share of the image in which both bands are valid."""
+    residual_px: Number6 = math.nan
+    """Median length of the windows' shifts, px of the reference."""
+    residual_p95_px: Number6 = math.nan
+    """Their 95th percentile."""
+    residual_coverage: Number6 = math.nan
+    """Share of the textured windows with a measured shift."""

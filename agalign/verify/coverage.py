@@ -1,0 +1,66 @@
+"""Parts of an image that a moving image covers, and that the windows of a residual observe."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from agalign.values import geometry
+from agalign.values.geometry import Points
+from agalign.values.mapping import PixelMapping
+from agalign.values.mapping_error import MappingError
+from agalign.values.residual import Residual
+
+MIN_COMMON_COVERAGE = 0.3
+"""Minimum share of the windows with a measured shift; in a band of noise, a tenth has one by chance."""
+_LATTICE = 24, 18
+"""Columns and rows of the points of an image at which its coverage and the lens distortion are evaluated."""
+
+
+def points_in_frame(
+    mapping: PixelMapping, size_px: tuple[int, int], moving_size_px: tuple[int, int], step_px: int | None = None
+) -> Points:
+    """Return the points (n, 2) of a grid over the reference that are mapped into the moving image.
+
+    Sizes are (width, height). The points of the grid have about the distance `step_px`, by default a twentieth of the
+    image.
+    """
+    columns, rows = _LATTICE if step_px is None else (max(2, n // step_px) for n in size_px)
+    points_px = geometry.lattice(*size_px, columns, rows)
+    mapped = mapping(points_px)
+    return points_px[((mapped >= -0.5) & (mapped <= np.subtract(moving_size_px, 0.5))).all(axis=1)]
+
+
+def unobserved_quarters(centres_px: Points, size_px: tuple[int, int], in_frame_px: Points | None = None) -> list[str]:
+    """Return the quarters of an image (width, height) with fewer than two of the centres (n, 2).
+
+    `in_frame_px` are the points of the image that the moving image covers, all of them by default.
+    """
+    lattice = geometry.lattice(*size_px, *_LATTICE)
+    covered = lattice if in_frame_px is None else in_frame_px
+    # Names, and signs of x and y relative to the centre.
+    quarters = (("top left", -1, -1), ("top right", 1, -1), ("bottom right", 1, 1), ("bottom left", -1, 1))
+
+    def count(points_px: Points, *signs: int) -> int:
+        size = np.array(size_px, dtype=np.float64)
+        from_centre = (points_px - (size - 1) / 2) / size * signs
+        # With windows nearer to the image's axes only, most of a quarter would still be extrapolated.
+        min_share_of_side = 1 / 8
+        return int((from_centre > min_share_of_side).all(axis=1).sum())
+
+    min_share_in_frame = 0.5  # of a quarter's points; others are not checked
+    min_windows = 2  # a single one may be a wrong peak
+    return [
+        name
+        for name, *signs in quarters
+        if count(covered, *signs) >= min_share_in_frame * count(lattice, *signs)
+        and count(centres_px, *signs) < min_windows
+    ]
+
+
+def unmodelled_std_px(residual: Residual, size_px: tuple[int, int], lens_std_px: NDArray[np.float64]) -> float:
+    """Return the RMS lens distortion, px, that a homography fitted to the windows of a residual does not model.
+
+    It is averaged over the whole image (width, height). `lens_std_px` (4,) are the standard deviations of the lens
+    shapes, which the windows limit.
+    """
+    error = MappingError(size_px, np.zeros((8, 8)), residual, lens_std_px=lens_std_px)
+    return error.distortion_px(geometry.lattice(*size_px, *_LATTICE))

@@ -1,0 +1,150 @@
+"""Candidates by descriptors: a homography, and a displacement field where windows require and confirm it."""
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from agalign.capture import candidate as module
+from agalign.capture.band_pair import BandPair
+from agalign.capture.by_descriptors import by_descriptors
+from agalign.capture.candidate import RefinedBand
+from agalign.capture.warped_pair import WarpedPair
+from agalign.fit.displacement_field import DisplacementResult
+from agalign.values import geometry
+from agalign.values.alignment import Alignment, JointResult, Seed
+from agalign.values.choices import ReliefUse
+from agalign.values.geometry import Matrix
+from agalign.values.mapping import DisplacementField
+
+from ..builders import decided, displaced_views, joint_result, pair_of, texture, two_views, whole
+
+TRUTH = geometry.translation(6, -4)
+SEED = Seed("rig", geometry.translation(5, -3), 30.0, 30.0, 5.0, trusted=True)
+CENTRED = replace(SEED, fixed_to_moving=np.eye(3))
+RIG = {"rig": SEED.fixed_to_moving}
+GOOD = joint_result(TRUTH)
+
+
+@pytest.fixture(scope="module")
+def pair() -> BandPair:
+    return pair_of(*two_views(TRUTH), RIG)
+
+
+def aligned(
+    pair: BandPair,
+    joint: JointResult,
+    use: ReliefUse,
+    seed: Seed = SEED,
+    by_halves: tuple[Matrix, Matrix] | None = None,
+) -> Alignment:
+    """The alignment of a band by the result of the joint optimisation."""
+    return decided(pair, seed, by_descriptors(RefinedBand.of(pair, seed, joint), by_halves, use))
+
+
+def test_each_colour_is_verified_by_the_estimate_from_the_other(pair: BandPair) -> None:
+    warped_pair = WarpedPair.of(pair, pair.mapping(TRUTH))
+    by_black, by_white = geometry.translation(6.1, -4), geometry.translation(6, -4.2)
+    crossed, before = warped_pair.cross_validated((by_black, by_white)).residual, warped_pair.residual
+    expected_px = np.where(before.is_even_cell[:, None], (0, 0.2), (-0.1, 0))
+    np.testing.assert_allclose(crossed.shifts_px - before.shifts_px, expected_px, atol=1e-6)
+    assert aligned(pair, GOOD, "never", by_halves=(by_black, by_white)).residual.median_px > 0.08
+
+
+@pytest.mark.parametrize("kind", ["noise", "structure"])
+def test_an_unrelated_image_is_not_aligned_by_a_seed_or_a_field(kind: str) -> None:
+    noise = np.random.default_rng(3).normal(size=(320, 400)).astype(np.float32)
+    pair = pair_of(texture(), whole(noise) if kind == "noise" else texture(seed=9), RIG)
+    failed = aligned(pair, joint_result(retrieval=0.01), "always")
+    assert failed.status == "failed"
+    assert failed.reason.endswith("but the seed does not fit either")
+    results = aligned(pair, joint_result(SEED.fixed_to_moving), "always")
+    assert results.status not in ("aligned", "predicted")
+    assert results.geometry == "homography"
+
+
+def test_verification_is_repeated_with_a_displacement_field(pair: BandPair, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A field that leaves the windows misaligned must not be accepted."""
+    wild = np.zeros((11, 14, 2))
+    wild[..., 0] = 3.0
+    result = DisplacementResult(DisplacementField(32.0, wild), 1.0, 0.5)
+    monkeypatch.setattr(pair.reference.displacement_field, "refine", lambda *_, **__: result)
+    results = aligned(pair, GOOD, "always")
+    assert (results.status, results.geometry) == ("aligned", "homography")
+    assert results.candidates == {"homography": 1.0, "field": 0.5}
+    assert results.residual.median_px < 0.1
+    monkeypatch.setattr(module, "issues_of", lambda *_: ())
+    assert aligned(pair, GOOD, "always").geometry == "field"
+
+
+def displaced_pair(height_px: float, wavelength_px: float | None = None) -> BandPair:
+    """A pair with a smooth bump in the centre or waves everywhere, which no homography represents."""
+
+    def displacement(points: np.ndarray) -> np.ndarray:
+        bump = np.exp(-(((points - (320, 240)) / 110) ** 2).sum(-1))
+        form = bump if wavelength_px is None else np.prod(np.sin(2 * np.pi * points / wavelength_px), axis=-1)
+        return height_px * form[..., None] * np.array([1.0, -0.6])
+
+    return pair_of(*displaced_views(displacement), {"rig": np.eye(3)})
+
+
+@pytest.mark.parametrize(
+    ("displaced", "use", "status", "geometry"),
+    [
+        ((4.0,), "auto", "aligned", "field"),
+        ((4.0,), "always", "aligned", "field"),
+        ((4.0,), "never", "predicted", "homography"),
+        # Shorter waves are not predicted without the windows that overlap one of verification.
+        ((2.5, 300.0), "auto", "aligned", "field"),
+    ],
+)
+def test_a_field_is_fitted_where_a_part_of_the_image_is_misaligned(
+    displaced: tuple[float, ...], use: ReliefUse, status: str, geometry: str
+) -> None:
+    results = aligned(displaced_pair(*displaced), joint_result(), use, CENTRED)
+    assert (results.status, results.geometry) == (status, geometry)
+    if status == "aligned":  # the residual is that of held-out windows
+        assert results.residual.median_px < (0.1 if displaced == (4.0,) else 0.4)
+
+
+@pytest.mark.parametrize(("rig_known", "tried"), [(True, False), (False, True)])
+def test_a_field_is_tried_without_a_rig_and_rejected_without_need(
+    rig_known: bool, tried: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pair = replace(displaced_pair(0.0), seed_std_px={"model": 1.0} if rig_known else {})
+    estimator, fields = pair.reference.displacement_field, list[DisplacementField | None]()
+    refine = estimator.refine
+
+    def recorded(*arguments: Any) -> DisplacementResult:
+        result = refine(*arguments)
+        fields.append(result.field)
+        return result
+
+    monkeypatch.setattr(estimator, "refine", recorded)
+    plain = aligned(pair, joint_result(), "auto", CENTRED)
+    assert (plain.status, plain.geometry, fields) == ("aligned", "homography", [None] * tried)
+
+
+def test_issues_that_a_field_cannot_remove_are_reported() -> None:
+    """A third of the image 15 px off."""
+    fixed, moving = two_views(TRUTH)
+    moving.pixels[:, 270:] = np.roll(moving.pixels, 15, axis=0)[:, 270:]
+    results = aligned(pair_of(fixed, moving, RIG), GOOD, "auto")
+    assert results.status != "aligned"
+    assert {"close_windows", "cluster"} & {d.code for d in results.issues}
+    assert "of the windows" in results.reason
+
+
+def test_a_field_is_verified_in_held_out_windows(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A field may fit any shifts of its own windows."""
+    pair = displaced_pair(2.5)
+    good = pair.reference.displacement_field.refine(pair.moving_image, pair.mapping(np.eye(3)))
+    accepted = aligned(pair, joint_result(), "always", CENTRED)
+    assert accepted.status == "aligned"
+    np.testing.assert_array_equal(accepted.residual.shifts_px, good.held_out.shifts_px)
+    misaligned = good.held_out.with_shifts(good.held_out.shifts_px + 1.5)
+    monkeypatch.setattr(pair.reference.displacement_field, "refine", lambda *_: replace(good, held_out=misaligned))
+    refused = aligned(pair, joint_result(), "always", CENTRED)
+    assert (refused.status, refused.geometry) == ("predicted", "homography")
+    assert refused.prediction.std_px < good.held_out.median_px + 1.5

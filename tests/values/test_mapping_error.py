@@ -1,0 +1,149 @@
+"""The expected error of a mapping: near windows and far from them, of predictions, under a relief, on a grid."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from agalign.values import geometry
+from agalign.values.geometry import PairScales
+from agalign.values.image import Tile
+from agalign.values.lens_shapes import lens_std_px
+from agalign.values.mapping_error import ErrorOnGrid, MappingError
+from agalign.values.parallax import Parallax, Relief
+from agalign.values.pixel_units import PixelScale
+from agalign.values.residual import Residual
+
+from ..builders import grid_px, residual_of
+
+SIZE = 640, 480
+PIXELS = geometry.lattice(*SIZE, *SIZE)
+SAME, HALF = PixelScale(1.0, 1.0), PixelScale(0.5, 0.5)
+
+
+def error_of(corner_std_px: list[float], windows: Residual | None) -> MappingError:
+    return MappingError(SIZE, np.diag(np.repeat(corner_std_px, 2) ** 2), windows)
+
+
+def expected_px(error: MappingError, *point: float) -> float:
+    return float(error.error_px(np.array([point]))[0])
+
+
+def columns(count: int) -> Residual:
+    """Columns of windows with a shift of 0.3 px."""
+    return residual_of(grid_px(50 + 100 * np.arange(count), 50 + 100 * np.arange(4)), (0.3, 0.0))
+
+
+def test_the_expected_error_is_the_covariance_at_corners_and_the_residual_near_windows() -> None:
+    known = error_of([0.1, 0.5, 0.5, 0.1], None)
+    for x, std_px in ((0.0, 0.1), (639.0, 0.5)):
+        assert expected_px(known, x, 0.0) == pytest.approx(np.sqrt(2) * std_px)
+    half, everywhere = (error_of([0.01] * 4, columns(count)) for count in (3, 7))
+    for covered in (half, everywhere):
+        assert 0.25 < expected_px(covered, 60.0, 240.0) < 0.4
+    assert 0.25 < expected_px(everywhere, 620.0, 240.0) < 0.4
+
+
+@pytest.mark.parametrize(
+    ("facts", "added_px"), [({"field_std_px": 2.0}, 2.0), ({"relief_std_px": 3.0}, 3.0), ({"std_px": 0.4}, None)]
+)
+def test_the_error_far_from_windows_is_that_of_unknown_lenses_of_the_field_and_of_the_relief(
+    facts: dict[str, float], added_px: float | None
+) -> None:
+    half = error_of([0.01] * 4, columns(2))
+    prior_px = lens_std_px(SIZE, calibrated=False)
+    far, near = ((620.0, 240.0), (60.0, 240.0))
+    assert expected_px(replace(half, lens_std_px=3 * prior_px), *far) > expected_px(half, *far) + 0.3
+    with_facts = replace(half, **facts)
+    for point, expected in ((far, added_px or 0.4), (near, 0.0 if added_px else 0.4)):
+        added_px2 = expected_px(with_facts, *point) ** 2 - expected_px(half, *point) ** 2
+        assert added_px2 == pytest.approx(expected**2, abs=1e-9)
+
+
+def test_a_single_wrong_peak_is_no_error_and_noise_is_subtracted() -> None:
+    centres_px = grid_px(50 + 100 * np.arange(7), 50 + 100 * np.arange(4))
+    shifts_px = np.zeros_like(centres_px)
+    shifts_px[10] = 20.0, 0.0
+    assert expected_px(error_of([0.01] * 4, residual_of(centres_px, shifts_px)), *centres_px[10]) < 0.1
+    noise = np.random.default_rng(0).normal(0, 0.98 / np.sqrt(2), centres_px.shape)
+    known = error_of([0.01] * 4, residual_of(centres_px, noise, sigma=7.0))
+    assert np.median(known.error_px(centres_px)) < 0.6
+
+
+def test_a_prediction_by_others_has_its_standard_error_everywhere() -> None:
+    predicted = MappingError(SIZE, std_px=0.4)
+    np.testing.assert_allclose(predicted.error_px(PIXELS[::997]), 0.4)
+    assert predicted.rms_px(PIXELS[::997]) == pytest.approx(0.4)
+    assert predicted.rms_px(np.empty((0, 2))) == np.inf
+    np.testing.assert_allclose(MappingError(SIZE).error_px(PIXELS[:3]), 0.0)  # bands of one lens
+
+
+@pytest.mark.parametrize("measured", [0.0, 0.1])
+def test_few_windows_that_contradict_the_mapping_are_its_error(measured: float) -> None:
+    """A thermal band that few windows predict has their error; without any, that of the covariance is left."""
+    centres_px = grid_px(np.arange(56, 640, 56), np.arange(56, 480, 56))
+    is_measured = np.arange(len(centres_px))[:, None] < measured * len(centres_px)
+    error = error_of([0.01] * 4, residual_of(centres_px, np.where(is_measured, (15.0, 0.0), np.nan)))
+    expected = 16.5 if measured else 0.01
+    assert expected_px(error, *centres_px[0]) == pytest.approx(expected, rel=0.3)
+
+
+def with_steps(scale: PixelScale = SAME) -> Parallax:
+    """A relief whose standard error changes from pixel to pixel, on a raster of this scale."""
+    width, height = (round(n * s) for n, s in zip(SIZE, scale, strict=True))
+    std_px = np.random.default_rng(0).uniform(0, 0.5, (height, width)).astype(np.float32)
+    ones = np.ones((height, width), np.float32)
+    return Parallax(Relief(ones, ones, scale, 1 / scale.mean, std_px), (0.6, 0.8))
+
+
+@pytest.mark.parametrize("scale", [SAME, HALF])
+def test_the_error_of_the_relief_counts_where_it_is_larger_than_that_of_the_windows(scale: PixelScale) -> None:
+    parallax, plain = with_steps(scale), error_of([0.05] * 4, columns(7))
+    points = np.random.default_rng(1).uniform(0, SIZE, (500, 2))
+    modelled_px2, unmodelled_px2 = plain.smooth_px2(points)
+    z_px2 = parallax.variance_px2(points)
+    assert 0.1 < (z_px2 > unmodelled_px2).mean() < 0.9
+    expected = np.sqrt(modelled_px2 + np.maximum(z_px2, unmodelled_px2))
+    np.testing.assert_allclose(replace(plain, parallax=parallax).error_px(points), expected)
+
+
+@pytest.mark.parametrize("parallax", [None, with_steps(), with_steps(HALF)])
+def test_the_error_on_a_grid_is_that_of_its_pixels(parallax: Parallax | None) -> None:
+    """Also on a tile, and on another grid than that of the reference, whose axes may be bent by a lens."""
+    error = replace(error_of([0.1, 0.5, 0.3, 0.1], columns(4)), parallax=parallax)
+    tile = Tile(100, 60, 300, 200)
+    at = (np.stack(np.meshgrid(np.arange(100, 400), np.arange(60, 260)), -1)).reshape(-1, 2).astype(float)
+    complete = ErrorOnGrid.of(error, SIZE).on_tile(Tile(0, 0, *SIZE))
+    ratio = complete.ravel() / error.error_px(PIXELS)
+    # Between the nodes the median of windows has steps.
+    assert np.percentile(np.abs(ratio - 1), 99) < 0.02
+    assert np.abs(ratio - 1).max() < 0.1
+    assert np.sqrt(np.square(complete).mean()) == pytest.approx(error.rms_px(PIXELS), rel=0.003)
+    np.testing.assert_allclose(ErrorOnGrid.of(error, SIZE).on_tile(tile), complete[60:260, 100:400], rtol=1e-6)
+
+    def to_reference(points_px: np.ndarray) -> np.ndarray:
+        return 0.5 * points_px + (20.0, 10.0)
+
+    for is_along_axes in (True, False):
+        on_grid = ErrorOnGrid.of(error, SIZE, to_reference, is_along_axes=is_along_axes)
+        np.testing.assert_allclose(on_grid.on_tile(tile).ravel(), error.error_px(to_reference(at)), rtol=0.02)
+
+
+def test_the_error_between_images_is_that_between_files() -> None:
+    """In px of the file, which are smaller."""
+    scales = PairScales(HALF, PixelScale(0.25, 0.25))
+    between_images = MappingError(
+        SIZE,
+        np.diag(np.linspace(0.01, 0.1, 8)),
+        columns(4),
+        0.2,
+        lens_std_px(SIZE, calibrated=False),
+        0.3,
+        0.4,
+        with_steps(),
+    )
+    parallax = with_steps().rescaled(PixelScale(2.0, 2.0))
+    between_files = between_images.in_file_px(scales, (1280, 960), parallax)
+    points = np.random.default_rng(2).uniform(1, (638, 478), (200, 2))
+    expected = 2 * between_images.error_px(points)
+    np.testing.assert_allclose(between_files.error_px(2 * points + 0.5), expected, rtol=0.01)
