@@ -43,6 +43,7 @@ from agalign.values.equality import equal
 from agalign.values.files import read_regular, write_csv
 from agalign.values.image import Tile, reduced_size_px
 from agalign.values.memory import WORK_TILE_PX
+from agalign.values.own_files import SOFTWARE, is_own_file
 from agalign.values.resampling import tiles
 from agalign.values.spectrum import role_of_band
 from agalign.values.text import shortened, without_formula
@@ -277,11 +278,13 @@ def write_rasters(
 
 
 def _is_foreign(path: Path) -> bool:
-    """Return True for a complete raster that is not an index raster; a damaged one is written again."""
+    """Return True for a file that is not an index raster; a damaged one is written again."""
+    if not path.exists():
+        return False
     with suppress(OSError):
         check_complete(path)
         return _statistics_in(tags_of(path)) is None
-    return False
+    return not is_own_file(path)
 
 
 @dataclass(frozen=True)
@@ -411,7 +414,7 @@ def _tags(index: Index, like: OpenRaster, unit: str, source: str, *, is_masked: 
     """The tags of a raster, some of which are those of the file of its first band."""
     copied = "CAPTURE_ID", "CAMERA", "TIFFTAG_DATETIME", "RADIOMETRY", "GEOREFERENCE", "GEOREFERENCE_ACCURACY_M"
     return {k: v for k, v in like.tags().items() if k in copied} | {
-        "TIFFTAG_SOFTWARE": "agalign",
+        "TIFFTAG_SOFTWARE": SOFTWARE,
         "INDEX": index.name,
         "INDEX_SOURCE": index.source,
         "INDEX_FORMULA": _formula_text(index),
