@@ -12,28 +12,22 @@ PNG_MARK = b"Software\0" + SOFTWARE.encode()
 """Text chunk of every PNG file: keyword and text."""
 JPEG_MARK = b"\xff\xfe" + (2 + len(SOFTWARE)).to_bytes(2) + SOFTWARE.encode()
 """Comment of every JPEG file, with its marker and length."""
-TIES_COLUMNS = (
-    "band",
-    "status",
-    "reference_x_px",
-    "reference_y_px",
-    "moving_x_px",
-    "moving_y_px",
-    "residual_px",
-    "weight",
-)
+_POSITIONS = "reference_x_px", "reference_y_px", "moving_x_px", "moving_y_px"
+TIES_COLUMNS = "band", "status", *_POSITIONS, "residual_px", "weight"
 """Columns of tables of tie points."""
 TIES_MEMBER = "coordinates_in"
 """First member of tie points as GeoJSON, which has none of this name."""
+_TIFF_MARKS = SOFTWARE.encode() + b"\0", b'<Item name="REFERENCE_BAND">'
+"""The tag Software; that of GDAL's metadata in files of single bands, which keep the camera's software."""
 _MARKS = {
-    b"II": SOFTWARE.encode() + b"\0",
-    b"MM": SOFTWARE.encode() + b"\0",
-    b"\x89P": PNG_MARK,
-    b"\xff\xd8": JPEG_MARK,
-    b"ba": ",".join(TIES_COLUMNS).encode(),
-    b'{"': f'{{"type": "FeatureCollection", "{TIES_MEMBER}"'.encode(),
+    b"II": _TIFF_MARKS,
+    b"MM": _TIFF_MARKS,
+    b"\x89P": (PNG_MARK,),
+    b"\xff\xd8": (JPEG_MARK,),
+    b"ba": (",".join(TIES_COLUMNS).encode(),),
+    b'{"': (f'{{"type": "FeatureCollection", "{TIES_MEMBER}"'.encode(),),
 }
-"""Mark by the first two bytes of a file: TIFF in both orders of bytes, PNG, JPEG, CSV, GeoJSON."""
+"""Marks by the first two bytes of a file: TIFF in both orders of bytes, PNG, JPEG, CSV, GeoJSON."""
 _SEARCHED_BYTES = 1 << 16
 """The mark is near the start of a file, or near its end in a TIFF to which tags were added."""
 
@@ -43,6 +37,6 @@ def is_own_file(path: Path) -> bool:
     with suppress(OSError), open_regular(path) as file:
         start, size = file.read(_SEARCHED_BYTES), file.seek(0, os.SEEK_END)
         file.seek(max(0, size - _SEARCHED_BYTES))
-        mark = _MARKS.get(start[:2])
-        return not size or (mark is not None and (mark in start or mark in file.read()))
+        end = file.read()
+        return not size or any(mark in start or mark in end for mark in _MARKS.get(start[:2], ()))
     return False
