@@ -17,6 +17,7 @@ from agalign.products.sidecar.file import find_sidecars, read_sidecar, verify_ou
 from agalign.values.alignment import Alignment
 from agalign.values.own_files import is_own_file
 
+from ..builders import in_full_run
 from ..conftest import Shared, read_json, seeded, write_capture
 from ..products.conftest import table_in
 from ..products.test_relief_map import Run
@@ -78,9 +79,11 @@ def test_other_contents_of_equal_size_are_another_input(copy: Path, out: Path, w
     assert "1 finished capture to be estimated again; changed since: input files\n" in done.stderr
 
 
-@pytest.mark.parametrize("harm", ["removed", "empty", "cut short"])
-@pytest.mark.parametrize("harmed", [GREEN, NIR], ids=["reference", "moving band"])
-def test_a_result_with_more_bands_is_kept(copy: Path, out: Path, harm: str, harmed: Path) -> None:
+@pytest.mark.parametrize(
+    ("harmed", "harm"),
+    [(GREEN, "empty"), (NIR, "removed"), (NIR, "cut short"), in_full_run(GREEN, "removed"), in_full_run(NIR, "empty")],
+)
+def test_a_result_with_more_bands_is_kept(copy: Path, out: Path, harmed: Path, harm: str) -> None:
     before, path = captures_in(out), copy / harmed
     if harm == "removed":
         path.unlink()
