@@ -331,3 +331,23 @@ def test_a_deleted_index_is_reported_until_its_command_restores_it(
     agalign_here(*command)
     assert raster.exists()
     assert problems(out) == []
+
+
+def test_the_table_of_indices_has_no_unmasked_row_among_masked_ones(
+    flight: Path, aligned_flight: Path, tmp_path: Path
+) -> None:
+    out = shutil.copytree(aligned_flight, tmp_path / "out")
+    command = "indices", out, "--formula", "sum=G+R"
+    agalign_here(flight, "-o", out, "--qa")
+    agalign_here(*command)
+    raster = out / FOLDER / "IMG_0002.qa.tif"
+    raster.unlink()
+    assert agalign_here(*command, "--mask-qa").returncode == 3
+    first, second = table_in(out / "indices.csv")
+    assert first["median"]
+    assert (second["median"], second["file"]) == ("", "")
+    assert "not masked by quality flags, unlike those of most captures" in second["problem"]
+    agalign_here(flight, "-o", out)
+    assert agalign_here(*command, "--mask-qa").returncode == 0
+    assert all(row["median"] and row["file"] for row in table_in(out / "indices.csv"))
+    assert problems(out) == []
