@@ -60,7 +60,7 @@ def refuse_to_overwrite(
 def _foreign_file(capture: Capture, out: Path, settings: WriteSettings, listed: Sequence[FilePart]) -> Path | None:
     """Return a file in the place of an output that no run has written; None if there is none."""
     paths = CapturePaths.of(capture, out)
-    if paths.sidecar.is_file() and not is_sidecar(paths.sidecar):
+    if paths.sidecar.is_file() and not (is_sidecar(paths.sidecar) or is_own_file(paths.sidecar)):
         return paths.sidecar
     known = {paths.folder / part.file for part in listed}
     enabled = [product for product in PRODUCTS if product.is_enabled(settings)]

@@ -22,12 +22,12 @@ from agalign.cameras.tiff_directory import EXIF, GPS, XMP, add_directories, byte
 from agalign.flight.groups import model_names
 from agalign.products.exports.programs import export
 from agalign.products.indices.formulas import index_named
-from agalign.products.sidecar.file import content_checksum, find_sidecars
+from agalign.products.sidecar.file import find_sidecars
 from agalign.values.capture import Band, CameraIdentity, Capture
 from agalign.values.files import file_name
 from agalign.values.text import without_controls
 
-from ..conftest import Shared, read_json, seeded
+from ..conftest import Shared, read_json, seeded, write_signed
 from ..program import agalign_here
 
 HOSTILE = ("../../pwn", "/tmp/p", "..", "a\r\n\x1b[31mb", "x" * 300, "CON", "", ".hidden", "a/b", "a:b", "C:\\b", "é‮/")
@@ -62,8 +62,7 @@ def hostile_run(flight: Path, shared: Shared) -> Path:
         assert [r.error for r in reports] == [None] * len(HOSTILE)
         for path in find_sidecars(folder / "deep"):
             content = path.read_text().replace('"degraded"', '"ok"').replace('"seed_only"', '"aligned"')
-            checksum = content_checksum(content)
-            path.write_text(json.dumps(json.loads(content) | {"checksum": checksum}))
+            write_signed(path, content)
 
     return shared("hostile", fill)
 
@@ -192,7 +191,7 @@ def test_links_in_an_output_folder_are_not_read_written_or_emptied(tmp_path: Pat
     sidecar = out / "0000SET" / "IMG_0001.json"
     content = read_json(sidecar) | {"status": "ok"}
     content["products"] += [{"kind": "band", "file": "link/key", "bytes": 1, "sha256": ""}]
-    sidecar.write_text(json.dumps(content))
+    write_signed(sidecar, json.dumps(content))
     (out / "0000SET" / "link").symlink_to(secret)
     with pytest.raises(agalign.OutputError, match="link/key: a link leads out of"):
         export(out, tmp_path / "to", "odm")
