@@ -53,8 +53,7 @@ def refuse_to_overwrite(
                     f"{path}: would be written of {other.label} and of {capture.label}; rename one's files"
                 )
         if foreign := _foreign_file(capture, out, settings, listed.get(CapturePaths.of(capture, out).sidecar, ())):
-            what = "was not written by agalign; move it, or choose another output folder with -o"
-            raise ConfigurationError(f"{foreign}: {what}")
+            raise ConfigurationError(f"{foreign}: was not written by agalign; choose another output folder with -o")
 
 
 def _foreign_file(capture: Capture, out: Path, settings: WriteSettings, listed: Sequence[FilePart]) -> Path | None:

@@ -14,6 +14,7 @@ from agalign.capture.align_bands import tie_windows
 from agalign.config import Settings, WriteSettings
 from agalign.errors import AgalignError
 from agalign.pixels.raster import ReadTile, read_tile
+from agalign.products.indices.rasters import index_rasters
 from agalign.products.product import CapturePaths, ProductContext
 from agalign.products.rasters.output_grid import FlightLimits, output_layers
 from agalign.products.rasters.parallax_file import read_relief
@@ -87,7 +88,7 @@ def render(
     write = with_earlier_products(settings.write, sidecar)
     settings = settings.model_copy(update={"write": write})
     outdated = outdated_files(capture, out, write, sidecar.products)
-    gone = _gone_indices(sidecar, paths.folder)
+    gone = _gone_indices(sidecar, paths)
     if sidecar.rendered_with:  # a run that is killed now must render again
         sidecar = write_sidecar(paths.sidecar, sidecar.model_copy(update={"rendered_with": ""}))
     alignments = {
@@ -107,15 +108,19 @@ def render(
     removed = [(path, reason) for path, reason in outdated.items() if path not in written]
     remove_files([path for path, _ in removed], out)
     reasons = tuple((path, context.lost.get(path, reason)) for path, reason in removed if reason)
+    gone = [part for part in gone if paths.folder / part.file not in written]
     complete = write_sidecar(paths.sidecar, rendered(context, list(failures), time.perf_counter() - began_s, gone))
     # Products that need the same file fail with the same message.
     return Rendering(complete, tuple(dict.fromkeys(failures.values())), reasons)
 
 
-def _gone_indices(sidecar: Sidecar, folder: Path) -> list[FilePart]:
-    """Return the entries of deleted index rasters, and of their pictures: `agalign indices` knows their formulas."""
+def _gone_indices(sidecar: Sidecar, paths: CapturePaths) -> list[FilePart]:
+    """Return the entries of index rasters that were deleted or damaged, and of their pictures: only `agalign indices`
+    knows their formulas.
+    """
+    here = {paths.relative(raster.path) for raster in index_rasters(paths.file(""))}
     parts = [part for part in sidecar.products if part.kind == "index"]
-    gone = {p.file.removesuffix(".tif") for p in parts if p.file.endswith(".tif") and not (folder / p.file).exists()}
+    gone = {part.file.removesuffix(".tif") for part in parts if part.file.endswith(".tif") and part.file not in here}
     return [part for part in parts if part.file.removesuffix(".tif").removesuffix(".png") in gone]
 
 

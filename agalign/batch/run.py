@@ -118,7 +118,9 @@ def _run_selected(run: "_FlightRun", selection: Selection) -> Iterator[CaptureRe
                     record.stage_seconds[stage] += seconds
                 if report.result is not None and report.path is not None:
                     statuses = [status for _, status, _ in report.result.pairs]
-                    written[report.label] = report.path, report.result.files, report.state, statuses
+                    # A kept capture may lack an index raster, which only `agalign indices` restores.
+                    here = [part for part in report.result.files if outputs_exist(report.path, [part])]
+                    written[report.label] = report.path, here, report.state, statuses
                 yield report
                 if report.problems and is_full(out):
                     raise OutputError(f"{out}: the disk is full; free space, then the same command resumes the run")

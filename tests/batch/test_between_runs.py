@@ -150,7 +150,7 @@ def test_files_of_the_user_are_kept_or_refused(flight: Path, out: Path, name: st
     assert mine.read_bytes() == data
     done = agalign_here(flight, "-o", out, *COMMAND, option)
     assert done.returncode == 2
-    assert f"{name}: was not written by agalign; move it" in done.stderr
+    assert f"{name}: was not written by agalign; choose another output folder with -o" in done.stderr
     assert mine.read_bytes() == data
 
 

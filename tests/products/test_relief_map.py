@@ -393,5 +393,5 @@ def test_a_band_that_cannot_be_rebuilt(run: Run, tmp_path: Path) -> None:
     ):
         agalign.read_alignment(path, "NIR")
     parallax.unlink()
-    with pytest.raises(agalign.UnreadableFileError, match=r"\.parallax\.tif"):
+    with pytest.raises(agalign.SidecarError, match=r"\.parallax\.tif: cannot be read; run again"):
         agalign.read_alignment(path, "NIR")

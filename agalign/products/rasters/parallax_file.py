@@ -46,7 +46,7 @@ def read_relief(sidecar: Sidecar, folder: Path) -> Relief | None:
     try:
         is_listed = file_checksum(path) == sidecar.parallax.sha256
     except OutputError:
-        raise SidecarError(f"{path}: cannot be read; run again with --overwrite") from None
+        raise SidecarError(f"{path}: cannot be read; run again") from None
     if not is_listed:
         raise SidecarError(f"{path}: is not what was written; delete it and run again")
     with open_raster(path) as file:

@@ -18,7 +18,7 @@ from agalign.errors import ConfigurationError, SidecarError
 from agalign.flight.groups import CameraOverview, camera_overviews
 from agalign.products.run.excluded import PanelPart, SkyPart
 from agalign.products.run.footprint import accuracy_of_footprint_m, footprint
-from agalign.products.sidecar.file import label_of
+from agalign.products.sidecar.file import find_sidecars, label_of
 from agalign.products.sidecar.schema import Sidecar
 from agalign.values.capture import CameraIdentity, Capture, Pose, Position
 from agalign.values.files import RUN_FILE, read_model, read_regular, write_model
@@ -228,8 +228,10 @@ def begun(folder: Path, settings: Settings, captures: Sequence[Capture] = (), co
 
 
 def refuse_foreign_pages(out: Path) -> None:
-    """Raise ConfigurationError if a folder without the record of a run has files with the names of its pages."""
-    if (out / RUN_FILE).exists():
+    """Raise ConfigurationError if a folder without record and results of a run has files with the names of its
+    pages.
+    """
+    if (out / RUN_FILE).exists() or find_sidecars(out):
         return
     for path in (out / name for name in PAGES):
         if path.is_file():
