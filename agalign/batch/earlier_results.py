@@ -165,7 +165,7 @@ def remaining(
     if files.changed:
         return Remaining("estimate", ("input files",))
     status = capture_status(earlier.bands, capture.missing_bands, settings.check.accept_predicted_px)
-    if options.overwrite or (options.retry_failed and status != "ok"):
+    if options.overwrite or (options.retry_failed and {earlier.status, status} != {"ok"}):
         return Remaining("estimate")
     return _to_render(capture, path, settings, earlier)
 

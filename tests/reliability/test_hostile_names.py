@@ -16,7 +16,7 @@ from synthetic_flights.aligned import make_aligned
 import agalign
 from agalign.batch import capture_task
 from agalign.batch.index_run import index_tasks, run_indices
-from agalign.batch.render import remove_outputs
+from agalign.batch.output_files import remove_outputs
 from agalign.batch.run import run_flight
 from agalign.cameras.tiff_directory import EXIF, GPS, XMP, add_directories, byte_string, read_directories, text
 from agalign.flight.groups import model_names
@@ -135,7 +135,7 @@ def test_equal_names_do_not_overwrite_each_other(tmp_path: Path) -> None:
         content["products"] = [{"kind": "band", "file": f"{name}.tif", "bytes": 1, "sha256": ""}]
         (out / folder).mkdir(exist_ok=True)
         (out / folder / f"{name}.tif").write_text(folder)
-        (out / folder / f"{name}.json").write_text(json.dumps(content))
+        write_signed(out / folder / f"{name}.json", json.dumps(content))
     (out / "0000SET" / "IMG_0001.json").unlink()
     report = export(out, tmp_path / "images", "odm")
     for files in (report.files, (p for p in out.rglob("*.tif") if p.stem != "IMG_0001")):
