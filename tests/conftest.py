@@ -122,6 +122,13 @@ def read_json(path: Path) -> Any:
     return json.loads(path.read_text(encoding="utf-8"))
 
 
+def write_signed(path: Path, text: str) -> None:
+    """Write the JSON of a sidecar with the checksum of its content, as commands do."""
+    from agalign.products.sidecar.file import content_checksum
+
+    path.write_text(json.dumps(json.loads(text) | {"checksum": content_checksum(text)}), encoding="utf-8")
+
+
 def save_known_model(path: Path, *, has_rig: bool = True) -> None:
     """Save a model with a rig that is learned from four captures at known heights."""
     from agalign.flight.groups import FlightCamera

@@ -14,7 +14,8 @@ from pathlib import Path
 from typing import Literal
 
 from agalign.batch.estimate import estimate
-from agalign.batch.render import RenderOptions, refuse_to_overwrite, render
+from agalign.batch.output_files import refuse_to_overwrite
+from agalign.batch.render import RenderOptions, render
 from agalign.batch.workers import failure_text
 from agalign.capture.align_bands import PairProgress
 from agalign.config import Settings
@@ -26,12 +27,13 @@ from agalign.pixels.radiometry import check_pixels
 from agalign.pixels.raster import with_saturation_values
 from agalign.products.product import CapturePaths
 from agalign.products.registry import PRODUCTS
-from agalign.products.sidecar.file import read_sidecar
+from agalign.products.sidecar.file import read_sidecar, read_with_change
 from agalign.products.sidecar.schema import Sidecar
 from agalign.values.alignment import Alignment
 from agalign.values.capture import Capture
 from agalign.values.choices import RadiometryChoice
 from agalign.values.files import written_below
+from agalign.values.own_files import is_own_file
 from agalign.values.process_pool import A, R
 from agalign.values.text import counted
 
@@ -219,7 +221,9 @@ def process_capture(task: Task, progress: PairProgress = quiet) -> CaptureReport
     read = CapturePixels().read
     capture = with_saturation_values(task.capture, read)
     path = CapturePaths.of(capture, out).sidecar
-    refuse_to_overwrite([capture], out, settings.write)
+    earlier, is_intact = _earlier(path)
+    listed = [] if earlier is None else earlier.files
+    refuse_to_overwrite([capture], out, settings.write, {path: listed})
     if missing := missing_radiometry(capture, settings.write.radiometry):
         raise InputError(f"{capture.reference.path}: {missing}")
     for band in capture.bands if settings.write.radiometry != "off" else ():
@@ -228,12 +232,10 @@ def process_capture(task: Task, progress: PairProgress = quiet) -> CaptureReport
     for product in PRODUCTS:
         if product.is_enabled(settings.write):
             product.check(capture)
-    sidecar, alignments = None, dict[str, Alignment]()
-    with suppress(SidecarError):
-        sidecar = read_sidecar(path)
-    if sidecar is None or not task.is_estimated:
+    sidecar, alignments = earlier, dict[str, Alignment]()
+    if sidecar is None or not (is_intact and task.is_estimated):
         model = None if task.model is None else loaded_model(task.model, settings.joint.device)
-        sidecar, alignments = estimate(capture, out, settings, model, progress, sidecar, read)
+        sidecar, alignments = estimate(capture, out, settings, model, progress, earlier, read)
     progress(capture.reference.name, "writing", 0.0)
     result = render(capture, out, settings, sidecar, task.rendering, alignments, read)
     lost = (*result.failures, *lost_reflectance(capture, settings.write.radiometry))
@@ -246,6 +248,18 @@ def process_capture(task: Task, progress: PairProgress = quiet) -> CaptureReport
         removed=result.removed,
         seconds=time.perf_counter() - began_s,
     )
+
+
+def _earlier(path: Path) -> tuple[Sidecar | None, bool]:
+    """Return the sidecar of an earlier run, None if it cannot be read, and whether it is as it was written.
+
+    A changed one lists only files with the mark of the program: the next sidecar confirms no others.
+    """
+    with suppress(SidecarError):
+        sidecar, change = read_with_change(path)
+        own = [part for part in sidecar.products if not change or is_own_file(path.parent / part.file)]
+        return sidecar.model_copy(update={"products": own}), not change
+    return None, False
 
 
 def missing_radiometry(capture: Capture, choice: RadiometryChoice) -> str:

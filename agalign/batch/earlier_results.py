@@ -1,6 +1,8 @@
 """Results of earlier runs in the output folder: whether they are of the same captures, and what has changed since."""
 
+import pickle
 import stat
+import zlib
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
@@ -12,15 +14,28 @@ from typing import Literal
 from agalign._version import __version__
 from agalign.batch.render import with_earlier_products
 from agalign.config import RunOptions, Settings, SettingsModel
-from agalign.errors import ConfigurationError, SidecarError
-from agalign.flight.fingerprint import estimation_fingerprint, input_samples, render_fingerprint
+from agalign.errors import ConfigurationError, OutputError, SidecarError, UnreadableFileError
+from agalign.flight.fingerprint import (
+    RENDER_STAGES,
+    estimation_fingerprint,
+    input_digests,
+    input_samples,
+    input_states,
+    render_fingerprint,
+)
+from agalign.pixels.raster import read_tile
 from agalign.products.product import CapturePaths
-from agalign.products.sidecar.file import read_without_tables
-from agalign.products.sidecar.schema import FilePart, Sidecar
-from agalign.values.capture import Capture, CaptureTime
+from agalign.products.sidecar.file import read_with_change
+from agalign.products.sidecar.schema import FilePart, Sidecar, capture_status
+from agalign.values.capture import Band, Capture, CaptureTime
+from agalign.values.files import file_checksum
+from agalign.values.image import Tile
+from agalign.values.memory import WORK_TILE_PX
+from agalign.values.resampling import tiles
 
 _MAX_APART = timedelta(seconds=1)
 """The bands of a capture are exposed within 0.3 s, and its time is that of the reference, which an option chooses."""
+_DAMAGED = "the sidecar (edited or damaged)"
 
 
 def is_same(earlier: Sidecar, capture: Capture) -> bool | None:
@@ -44,10 +59,44 @@ def is_same(earlier: Sidecar, capture: Capture) -> bool | None:
     return bool(earlier.input_samples.items() & input_samples(capture).items())
 
 
-def refuse_other_captures(captures: Sequence[Capture], out: Path, *, is_same_input: bool = False) -> None:
+class EarlierResults:
+    """The sidecars of earlier runs, each of which is read and compared with its checksum once unless it changes."""
+
+    def __init__(self) -> None:
+        self._read: dict[Path, tuple[tuple[int, int, int], bytes]] = {}
+        """State of the file, and the compressed result, 4 kB: those of a season fit into memory."""
+
+    def __call__(self, path: Path) -> tuple[Sidecar, str]:
+        """Return a sidecar without its long tables, and why it is not as it was written (`read_with_change`).
+
+        Raises SidecarError.
+        """
+        state = 0, 0, 0
+        with suppress(OSError):
+            status = path.stat()
+            state = status.st_size, status.st_mtime_ns, status.st_ino
+        known = self._read.get(path)
+        if known is None or known[0] != state:
+            sidecar, change = read_with_change(path)
+            packed = zlib.compress(pickle.dumps((sidecar.without_tables(), change)), 1)
+            known = self._read[path] = state, packed
+        result: tuple[Sidecar, str] = pickle.loads(zlib.decompress(known[1]))
+        return result
+
+    def files(self, path: Path) -> list[FilePart]:
+        """Return the files that a sidecar lists; none if it cannot be read."""
+        with suppress(SidecarError):
+            return self(path)[0].files
+        return []
+
+
+def refuse_other_captures(
+    captures: Sequence[Capture], out: Path, results: EarlierResults | None = None, *, is_same_input: bool = False
+) -> None:
     """Raise ConfigurationError if the place of a capture has the result of another one, or if another place has its
     result, as of a run on the folder above. With the input folder of the last run, the images were moved in it instead.
     """
+    results = results or EarlierResults()
     places = {CapturePaths.of(c, out).sidecar: c for c in captures}
     by_name: dict[str, list[Capture]] = {}
     for capture in captures:
@@ -55,7 +104,7 @@ def refuse_other_captures(captures: Sequence[Capture], out: Path, *, is_same_inp
     elsewhere = [] if is_same_input else [p for p in out.rglob("*.json") if p.stem in by_name and p not in places]
     for path, here in chain(places.items(), ((p, c) for p in elsewhere for c in by_name[p.stem])):
         with suppress(SidecarError):
-            earlier = read_without_tables(path)
+            earlier, _ = results(path)
             if is_same(earlier, here) is not (path not in places):
                 continue
             facts = f"({_described(earlier)}; here {_described(here)})"
@@ -78,45 +127,145 @@ def _described(capture: Capture | Sidecar) -> str:
 class Remaining:
     """What remains to be done for a capture."""
 
-    step: Literal["nothing", "render", "estimate"]
-    """The first step; rendering follows the estimation."""
+    step: Literal["nothing", "keep", "render", "estimate"]
+    """The first step; rendering follows the estimation. `keep`: files of an earlier result are lost, so that this run
+    would replace it by one with fewer bands.
+    """
     changed: tuple[str, ...] = ()
     """What has changed since an earlier command has done it; empty if none has."""
     earlier: Sidecar | None = None
     """The result of the earlier command, without its tables, if the estimation is kept."""
+    why_kept: str = ""
+    """The lost files and the remedy, for the step `keep`."""
 
 
-def remaining(capture: Capture, out: Path, settings: Settings, options: RunOptions) -> Remaining:
+def remaining(
+    capture: Capture, out: Path, settings: Settings, options: RunOptions, results: EarlierResults | None = None
+) -> Remaining:
     """Return what remains to be done for a capture, given what the output folder has of it.
 
-    The estimation is kept if all that it depends on is unchanged: options, version, input. So are products, if their
-    files exist too, and there are all those that the settings ask for.
+    The estimation is kept if all that it depends on is unchanged: options, version, contents of the input files. So are
+    products, if their files exist too, and there are all those that the settings ask for.
     """
-    path = CapturePaths.of(capture, out).sidecar
+    results, path = results or EarlierResults(), CapturePaths.of(capture, out).sidecar
     try:
-        earlier = read_without_tables(path)
+        earlier, change = results(path)
     except SidecarError:
-        return Remaining("estimate")
+        return _after_damage(path, capture, options)
+    files = _compared_files(earlier, capture)
+    if files.lost and not options.overwrite:
+        return _kept(files.lost, f"the sidecar {change}" if change else "", None if change else earlier)
+    if change and earlier.estimated_with:  # a sidecar of schema version 1 has none
+        return Remaining("estimate", (_DAMAGED,))
     if earlier.estimated_with != estimation_fingerprint(capture, settings):
-        stages = [(key, stage) for key, stage in settings if key != "write"]
+        stages = [(key, stage) for key, stage in settings if key not in RENDER_STAGES]
         changed = _changed_options(earlier, settings, stages) + _changed_version(earlier)
-        other = "input files or tags" if earlier.estimated_with else "format of the sidecar"
-        return Remaining("estimate", changed or (other,))
-    parallax = [] if earlier.parallax is None else [earlier.parallax]
-    if options.overwrite or (options.retry_failed and earlier.status != "ok"):
+        other = _changed_selection(earlier, capture) if earlier.estimated_with else ("format of the sidecar",)
+        return Remaining("estimate", changed or (("input files",) if files.changed else other))
+    if files.changed:
+        return Remaining("estimate", ("input files",))
+    status = capture_status(earlier.bands, capture.missing_bands, settings.check.accept_predicted_px)
+    if options.overwrite or (options.retry_failed and {earlier.status, status} != {"ok"}):
         return Remaining("estimate")
+    return _to_render(capture, path, settings, earlier)
+
+
+def _after_damage(path: Path, capture: Capture, options: RunOptions) -> Remaining:
+    """Return what remains to be done for a capture whose sidecar is missing or cannot be read."""
+    if not path.exists():
+        return Remaining("estimate")
+    reasons = {name: reason.partition(";")[0] for name, reason in capture.unreadable_bands.items()}
+    lost = [reasons.get(name, f"{name} is missing") for name in capture.missing_bands]
+    if lost and not options.overwrite:
+        return _kept(lost, "the sidecar cannot be read", None)
+    return Remaining("estimate", (_DAMAGED,))
+
+
+def _kept(lost: Sequence[str], damage: str, earlier: Sidecar | None) -> Remaining:
+    remedy = "copy such files from the card again, or align without them by --overwrite"
+    state = f"not processed, as {damage.partition(';')[0]}" if damage else "kept as aligned before"
+    return Remaining("keep", (), earlier, f"{state}, and now {'; '.join(lost)}; {remedy}")
+
+
+def _to_render(capture: Capture, path: Path, settings: Settings, earlier: Sidecar) -> Remaining:
+    """Return what remains to be done for a capture whose mappings are kept."""
+    parallax = [] if earlier.parallax is None else [earlier.parallax]
     if not outputs_exist(path, parallax):
         return Remaining("estimate", ("the parallax file",))
-    write = with_earlier_products(settings.write, earlier, path.parent)
+    write = with_earlier_products(settings.write, earlier)
     all_settings = settings.model_copy(update={"write": write})
-    changed = _changed_options(earlier, all_settings, [("write", write)])
-    if earlier.rendered_with and earlier.rendered_with != render_fingerprint(capture, write):
+    stages = [(key, stage) for key, stage in all_settings if key in RENDER_STAGES]
+    changed = _changed_options(earlier, all_settings, stages)
+    if earlier.rendered_with and earlier.rendered_with != render_fingerprint(capture, write, settings.check):
         changed = changed or ("tags, panels or bands of the camera",)
-    if not outputs_exist(path, earlier.products):
+    requested = {f"{capture.name}_{name}.tif" for name in write.indices}
+    if not outputs_exist(path, [part for part in earlier.products if part.kind != "index" or part.file in requested]):
         changed = (*changed, "files that are missing")
-    if changed or earlier.not_written or not earlier.rendered_with:
-        return Remaining("render", changed, earlier)
-    return Remaining("nothing", (), earlier)
+    if not (changed or earlier.not_written or not earlier.rendered_with):
+        return Remaining("nothing", (), earlier)
+    # A checksum takes milliseconds, and a parallax of another capture may have the same size.
+    with suppress(OutputError):
+        if all(file_checksum(path.parent / part.file) == part.sha256 for part in parallax):
+            return Remaining("render", changed, earlier)
+    return Remaining("estimate", ("the parallax file",))
+
+
+@dataclass(frozen=True)
+class _ComparedFiles:
+    """The input files of a capture, compared with those of an earlier result."""
+
+    changed: bool
+    """Some have other contents."""
+    lost: list[str]
+    """Those that are missing or cannot be read, and why."""
+
+
+def _compared_files(earlier: Sidecar, capture: Capture) -> _ComparedFiles:
+    """Compare the contents of the input files with those of an earlier result.
+
+    Of each file, size, times and samples are compared, and if the times differ, the checksum. A band that the options
+    leave out, whose file exists, is not lost.
+    """
+    changed, lost, here = set[str](), list[str](), {b.name: b for b in capture.bands}
+    samples, states, digests = input_samples(capture), input_states(capture), dict[str, str]()
+    for part in earlier.bands:
+        name, file = part.band, Path(part.file).name
+        if name not in here:
+            is_found = any((folder / file).exists() for folder in {b.path.parent for b in capture.bands})
+            if reason := capture.unreadable_bands.get(name):
+                lost.append(reason.partition(";")[0])
+            elif name in capture.missing_bands or not is_found:
+                lost.append(f"{file} is missing")
+        elif name not in states:
+            lost.append(f"{file} cannot be read")
+        elif samples.get(name) != earlier.input_samples.get(name):
+            changed.add(name)
+        elif states[name] != earlier.input_states.get(name):
+            digests = digests or input_digests(capture)
+            if digests.get(name) != earlier.input_digests.get(name):
+                changed.add(name)
+    for name in changed:
+        if problem := _unreadable(here[name]):
+            lost.append(problem)
+    return _ComparedFiles(bool(changed), lost)
+
+
+def _unreadable(band: Band) -> str:
+    """Return why the pixels of a band cannot be read; empty if they can."""
+    try:
+        for tile in tiles(Tile(0, 0, *band.size_px), WORK_TILE_PX):
+            read_tile(band, tile)
+    except UnreadableFileError as error:
+        return str(error).partition(";")[0]
+    return ""
+
+
+def _changed_selection(earlier: Sidecar, capture: Capture) -> tuple[str, ...]:
+    """Return the options of the selection of files by which a capture has other bands or another reference."""
+    bands = {b.band for b in earlier.bands}, {b.name for b in capture.bands}
+    if bands[0] != bands[1]:
+        return ("--bands, or the bands of the capture",)
+    return ("--reference",) if earlier.reference.band != capture.reference.name else ("tags of the camera",)
 
 
 def _changed_options(

@@ -6,6 +6,7 @@ from pathlib import Path
 
 from agalign.capture.align_bands import PairProgress, align_capture_bands
 from agalign.config import Settings
+from agalign.flight.fingerprint import RENDER_STAGES
 from agalign.flight.model import FlightModel
 from agalign.pixels.raster import ReadTile, read_tile
 from agalign.products.product import CapturePaths
@@ -15,6 +16,7 @@ from agalign.products.sidecar.file import file_part, read_sidecar, write_sidecar
 from agalign.products.sidecar.schema import Sidecar
 from agalign.values.alignment import Alignment
 from agalign.values.capture import Capture
+from agalign.values.own_files import is_own_file
 
 
 def estimate(
@@ -31,6 +33,7 @@ def estimate(
     Returns the sidecar as it was written, and the alignments.
 
     It lists the products of the `earlier` sidecar, which describe another estimate, until they are rendered again.
+    A parallax file without the mark of the program is kept.
     `read` reads the pixels of the files. Raises UnreadableFileError if the reference cannot be read, and OutputError.
     """
     began_s, paths = time.perf_counter(), CapturePaths.of(capture, out)
@@ -44,11 +47,11 @@ def estimate(
     fingerprint = "" if model is None else model.fingerprint
     result = Sidecar.estimated(capture, alignments, settings, parallax, seconds, fingerprint)
     if earlier is not None:
-        options = {key: stage for key, stage in (result.options or {}).items() if key != "write"}
-        options |= {key: stage for key, stage in (earlier.options or {}).items() if key == "write"}
+        options = {key: stage for key, stage in (result.options or {}).items() if key not in RENDER_STAGES}
+        options |= {key: stage for key, stage in (earlier.options or {}).items() if key in RENDER_STAGES}
         result = result.model_copy(update={"products": earlier.products, "options": options})
     write_sidecar(paths.sidecar, result)
-    if relief is None:
+    if relief is None and is_own_file(path):
         with suppress(OSError):
             path.unlink(missing_ok=True)
     # With the decimals of the file: a later command renders the same bytes.

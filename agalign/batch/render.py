@@ -4,30 +4,27 @@ A product that an earlier command wrote is written again with the settings of th
 One that cannot be written any more is removed, and the report of the capture names it.
 """
 
-import re
 import time
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+from agalign.batch.output_files import outdated_files, remove_files
 from agalign.capture.align_bands import tie_windows
 from agalign.config import Settings, WriteSettings
-from agalign.errors import AgalignError, ConfigurationError, OutputError, SidecarError
+from agalign.errors import AgalignError
 from agalign.pixels.raster import ReadTile, read_tile
 from agalign.products.indices.rasters import index_rasters
 from agalign.products.product import CapturePaths, ProductContext
-from agalign.products.rasters.aligned_files import band_file_names, is_aligned_raster
 from agalign.products.rasters.output_grid import FlightLimits, output_layers
-from agalign.products.rasters.parallax_file import PARALLAX_SUFFIX, read_relief
+from agalign.products.rasters.parallax_file import read_relief
 from agalign.products.registry import PRODUCTS
 from agalign.products.report.preview import preview_bytes
-from agalign.products.sidecar.file import is_sidecar, read_without_tables, write_sidecar
+from agalign.products.sidecar.file import write_sidecar
 from agalign.products.sidecar.rendered import rendered
-from agalign.products.sidecar.schema import Sidecar
+from agalign.products.sidecar.schema import FilePart, Sidecar
 from agalign.values.alignment import Alignment
 from agalign.values.capture import Capture
-from agalign.values.files import check_inside
 from agalign.values.image import OutputGrid
 
 _ADDED = {
@@ -63,9 +60,9 @@ class Rendering:
     """Files of an earlier command that were removed, and why."""
 
 
-def with_earlier_products(settings: WriteSettings, sidecar: Sidecar, folder: Path) -> WriteSettings:
-    """Return the settings with the products that an earlier command has added and that still exist."""
-    kinds = {part.kind for part in sidecar.products if (folder / part.file).is_file()}
+def with_earlier_products(settings: WriteSettings, sidecar: Sidecar) -> WriteSettings:
+    """Return the settings with the products that an earlier command has added; deleted ones are restored."""
+    kinds = {part.kind for part in sidecar.products}
     earlier = (sidecar.options or {}).get("write", {})
     return settings.model_copy(
         update={name: True for name, kind in _ADDED.items() if earlier.get(name) and kind in kinds}
@@ -88,9 +85,10 @@ def render(
     OutputError, UnreadableFileError for an image of the reference or the parallax, and InputError.
     """
     began_s, paths = time.perf_counter(), CapturePaths.of(capture, out)
-    write = with_earlier_products(settings.write, sidecar, paths.folder)
+    write = with_earlier_products(settings.write, sidecar)
     settings = settings.model_copy(update={"write": write})
-    outdated = outdated_files(capture, out, write, sidecar)
+    outdated = outdated_files(capture, out, write, sidecar.products)
+    gone = _gone_indices(sidecar, paths)
     if sidecar.rendered_with:  # a run that is killed now must render again
         sidecar = write_sidecar(paths.sidecar, sidecar.model_copy(update={"rendered_with": ""}))
     alignments = {
@@ -108,14 +106,22 @@ def render(
     failures = _write_products(context)
     written = {file.path for file in context.written}
     removed = [(path, reason) for path, reason in outdated.items() if path not in written]
-    for path, _ in removed:
-        with suppress(OSError, OutputError):
-            check_inside(path.parent, out)  # a link may have taken the place of the folder meanwhile
-            path.unlink(missing_ok=True)
+    remove_files([path for path, _ in removed], out)
     reasons = tuple((path, context.lost.get(path, reason)) for path, reason in removed if reason)
-    complete = write_sidecar(paths.sidecar, rendered(context, list(failures), time.perf_counter() - began_s))
+    gone = [part for part in gone if paths.folder / part.file not in written]
+    complete = write_sidecar(paths.sidecar, rendered(context, list(failures), time.perf_counter() - began_s, gone))
     # Products that need the same file fail with the same message.
     return Rendering(complete, tuple(dict.fromkeys(failures.values())), reasons)
+
+
+def _gone_indices(sidecar: Sidecar, paths: CapturePaths) -> list[FilePart]:
+    """Return the entries of index rasters that were deleted or damaged, and of their pictures: only `agalign indices`
+    knows their formulas.
+    """
+    here = {paths.relative(raster.path) for raster in index_rasters(paths.file(""))}
+    parts = [part for part in sidecar.products if part.kind == "index"]
+    gone = {part.file.removesuffix(".tif") for part in parts if part.file.endswith(".tif") and part.file not in here}
+    return [part for part in parts if part.file.removesuffix(".tif").removesuffix(".png") in gone]
 
 
 def _with_held_positions(alignment: Alignment, estimated: Alignment | None) -> Alignment:
@@ -139,90 +145,3 @@ def _write_products(context: ProductContext) -> dict[str, str]:
                 raise
             failures[product.kind] = str(error)
     return failures
-
-
-def paths_written(capture: Capture, out: Path, settings: WriteSettings) -> list[Path]:
-    """Return the paths of all files that a run with these settings may write or remove for a capture."""
-    paths = CapturePaths.of(capture, out)
-    own = [paths.sidecar, paths.file(PARALLAX_SUFFIX)]
-    return [*own, *(p for product in PRODUCTS for p in product.paths(capture, paths, settings))]
-
-
-def refuse_to_overwrite(captures: Sequence[Capture], out: Path, settings: WriteSettings) -> None:
-    """Raise ConfigurationError if an output would replace an input image, an output of another capture, or a file that
-    no run has written.
-    """
-    sources = {band.path.resolve() for capture in captures for band in capture.bands}
-    resolved: dict[Path, Path] = {}
-    written: dict[str, Capture] = {}
-    for capture in captures:
-        for path in paths_written(capture, out, settings):
-            if path.parent not in resolved:
-                resolved[path.parent] = check_inside(path.parent, out).resolve()
-            if resolved[path.parent] / path.name in sources:
-                raise ConfigurationError(f"{path}: is an image to be aligned; choose another output folder")
-            other = written.setdefault(str(path).lower(), capture)
-            if other is not capture:
-                raise ConfigurationError(
-                    f"{path}: would be written of {other.label} and of {capture.label}; rename one's files"
-                )
-        if foreign := _foreign_file(CapturePaths.of(capture, out).sidecar, paths_written(capture, out, settings)):
-            raise ConfigurationError(f"{foreign}: was not written by agalign; choose another output folder with -o")
-
-
-def _foreign_file(sidecar: Path, written: Sequence[Path]) -> Path | None:
-    """Return a file in the place of an output that no run has written; None if there is none.
-
-    The sidecar of a capture is written before its products.
-    """
-    if sidecar.is_file():
-        return None if is_sidecar(sidecar) else sidecar
-    existing = [path for path in written if path.is_file() and not path.name.endswith(PARALLAX_SUFFIX)]
-    # A sidecar may have been deleted to estimate the capture again.
-    return None if any(map(is_aligned_raster, existing)) else next(iter(existing), None)
-
-
-def outdated_files(capture: Capture, out: Path, settings: WriteSettings, sidecar: Sidecar | None) -> Mapping[Path, str]:
-    """Return the files of an earlier command for a capture, which are removed unless they are written again, and why.
-
-    Otherwise a sidecar could describe rasters of another run, and bands on an old grid could remain among new ones.
-    Anyone may have written the sidecar: of its other files, only aligned rasters named as bands of this capture are
-    returned. The reason is empty for files that users do not miss.
-    """
-    return {
-        path: reason
-        for path, reason in _outdated(capture, out, settings, sidecar)
-        if path.is_file() and path.resolve() not in {band.path.resolve() for band in capture.bands}
-    }
-
-
-def _outdated(
-    capture: Capture, out: Path, settings: WriteSettings, sidecar: Sidecar | None
-) -> Iterator[tuple[Path, str]]:
-    paths = CapturePaths.of(capture, out)
-    with suppress(OutputError):
-        check_inside(paths.folder, out)
-        for product in PRODUCTS:
-            is_unwanted = product.option is None and not product.is_enabled(settings)
-            reason = f"--layout {settings.layout}" if is_unwanted else f"{product.kind} is not written again"
-            yield from ((path, reason) for path in product.paths(capture, paths, settings))
-        listed = [] if sidecar is None else [paths.folder / part.file for part in sidecar.products]
-        # Also of a band that this run leaves out; a file with a sidecar is the stack of another capture.
-        pattern = re.compile(rf"{re.escape(capture.name)}(\d|[._].+)\.tiff?", re.IGNORECASE)
-        own = [p for p in listed if pattern.fullmatch(p.name) and not p.with_suffix(".json").exists()]
-        own += [paths.folder / name for name in band_file_names(capture).values()]
-        yield from ((p, f"--layout {settings.layout}") for p in own if p in listed and is_aligned_raster(p))
-        for raster in index_rasters(paths.file("")):
-            yield raster.path, "its bands are not aligned"
-            yield raster.path.with_suffix(".png"), ""
-
-
-def remove_outputs(capture: Capture, out: Path, settings: WriteSettings) -> None:
-    """Remove the outputs of an earlier run for a capture that this one does not align."""
-    paths, sidecar = CapturePaths.of(capture, out), None
-    with suppress(SidecarError):
-        sidecar = read_without_tables(paths.sidecar)
-    for path in [*outdated_files(capture, out, settings, sidecar), paths.sidecar, paths.file(PARALLAX_SUFFIX)]:
-        with suppress(OSError, OutputError):
-            check_inside(path.parent, out)
-            path.unlink(missing_ok=True)

@@ -5,21 +5,22 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import Self
 
 from agalign.batch.capture_task import CaptureReport, Task, do_capture, loaded_model, quiet
-from agalign.batch.earlier_results import Remaining, outputs_exist, refuse_other_captures, remaining
+from agalign.batch.earlier_results import EarlierResults, Remaining, outputs_exist, refuse_other_captures, remaining
 from agalign.batch.flight_learning import learn_flight
 from agalign.batch.other_results import labels_of_other_inputs, results_not_in_input
-from agalign.batch.render import RenderOptions, refuse_to_overwrite, remove_outputs
+from agalign.batch.output_files import refuse_to_overwrite, remove_outputs
+from agalign.batch.render import RenderOptions
 from agalign.batch.selection import Selection, select_captures
 from agalign.batch.workers import Run, failure_text, in_order, open_workers, serially
 from agalign.cameras.discover import FolderScan
 from agalign.config import RunOptions, Settings, WriteSettings
-from agalign.errors import AgalignError, ConfigurationError, InputError, OutputError
+from agalign.errors import AgalignError, ConfigurationError, InputError, OutputError, SidecarError
 from agalign.flight.fingerprint import learning_fingerprint
 from agalign.flight.groups import camera_key, difference, flight_camera, flights_of, is_flight_of, model_names
 from agalign.flight.model import FlightModel, load_model, save_model
@@ -35,7 +36,6 @@ from agalign.products.report.pages import outdate_pages
 from agalign.products.report.preview import preview_bytes
 from agalign.products.run.excluded import write_panels, write_sky
 from agalign.products.run.record import RunPart, begun, excluded_part, input_name, last_record, refuse_foreign_pages
-from agalign.products.sidecar.file import read_without_tables
 from agalign.products.sidecar.schema import FilePart, Sidecar
 from agalign.values.capture import Capture
 from agalign.values.files import check_inside, written_below
@@ -48,7 +48,12 @@ _MAX_THREADS = 4
 """Maximum number of threads that train a network or process captures; more wait for the interpreter's lock."""
 
 
-_PLANNED = {"nothing": "kept from an earlier run", "render": "to be rendered", "estimate": "to be aligned"}
+_PLANNED = {
+    "nothing": "kept from an earlier run",
+    "keep": "kept from an earlier run, as input files are missing or damaged now",
+    "render": "to be rendered",
+    "estimate": "to be aligned",
+}
 _AGAIN = {"render": "rendered", "estimate": "estimated"}
 """What is done, by step of `Remaining`."""
 _Flight = tuple[list[Capture], Path | None]
@@ -113,7 +118,9 @@ def _run_selected(run: "_FlightRun", selection: Selection) -> Iterator[CaptureRe
                     record.stage_seconds[stage] += seconds
                 if report.result is not None and report.path is not None:
                     statuses = [status for _, status, _ in report.result.pairs]
-                    written[report.label] = report.path, report.result.files, report.state, statuses
+                    # A kept capture may lack an index raster, which only `agalign indices` restores.
+                    here = [part for part in report.result.files if outputs_exist(report.path, [part])]
+                    written[report.label] = report.path, here, report.state, statuses
                 yield report
                 if report.problems and is_full(out):
                     raise OutputError(f"{out}: the disk is full; free space, then the same command resumes the run")
@@ -177,6 +184,7 @@ class _FlightRun:
     listener: Listener = Listener()
     given: FlightModel | None = None
     """Model to start from."""
+    results: EarlierResults = field(default_factory=EarlierResults)
 
     def check(self) -> None:
         """Raise ConfigurationError for a device, an index or an output folder that cannot be used."""
@@ -184,10 +192,12 @@ class _FlightRun:
         check_indices(self.flight.captures, self.settings.write)
         if self.out.resolve() == self.flight.folder.resolve():
             raise ConfigurationError(f"{self.out}: is the folder of the images; choose another output folder with -o")
-        refuse_to_overwrite(self.flight.captures, self.out, self.settings.write)
         earlier = last_record(self.out)
         is_same_input = earlier is not None and earlier.input == input_name(self.flight.folder)
-        refuse_other_captures(self.flight.captures, self.out, is_same_input=is_same_input)
+        refuse_other_captures(self.flight.captures, self.out, self.results, is_same_input=is_same_input)
+        sidecars = [CapturePaths.of(capture, self.out).sidecar for capture in self.flight.captures]
+        listed = {path: self.results.files(path) for path in sidecars}
+        refuse_to_overwrite(self.flight.captures, self.out, self.settings.write, listed)
         refuse_foreign_pages(self.out)
         check_inside(self.out / "models", self.out)
 
@@ -214,15 +224,16 @@ class _FlightRun:
 
     def remaining(self, capture: Capture) -> Remaining:
         """Return what remains to be done for a capture."""
-        return remaining(capture, self.out, self.settings, self.options)
+        return remaining(capture, self.out, self.settings, self.options, self.results)
 
     def reports(self, selection: Selection, record: RunPart) -> Iterator[CaptureReport]:
         """Yield the report of each capture; add the time of learning to the record."""
         for label, reason in selection.abandoned.items():
             yield CaptureReport(label, "error", error=reason)
         for report, capture in self._excluded(selection.sky, selection.panels, record):
-            remove_outputs(capture, self.out, self.settings.write)
-            yield report
+            removed = remove_outputs(capture, self.out, self.settings.write)
+            reason = f"captures of a calibration panel or the sky are not aligned, as {capture.label}"
+            yield replace(report, removed=tuple((path, reason) for path in removed))
         yield from self._aligned(selection.captures, record)
 
     def _excluded(
@@ -254,7 +265,8 @@ class _FlightRun:
         groups = flights_of(captures)
         on_cpu = choose_device(self.settings.joint.device).type == "cpu"
         cores = self.options.jobs or (usable_cores() if on_cpu else 1)
-        number, timeout_s = sum(one.step != "nothing" for one in left.values()), self.options.timeout_s
+        number = sum(one.step in ("render", "estimate") for one in left.values())
+        timeout_s = self.options.timeout_s
         processes = min(cores, number // CAPTURES_WORTH_A_PROCESS if timeout_s is None else number)
         threads = min(cores, number, _MAX_THREADS)
         executor = self.options.executor
@@ -278,9 +290,8 @@ class _FlightRun:
                     (limits, common), one = crops[_crop_key(capture)], left[capture.label]
                     if one.step == "nothing" and common is not None and grids.get(capture.label) not in (None, common):
                         one = left[capture.label] = Remaining("render", ("crop of the flight",))
-                    if one.step == "nothing":
-                        sidecar = CapturePaths.of(capture, self.out).sidecar
-                        yield CaptureReport(capture.label, "kept", read_without_tables(sidecar), sidecar)
+                    if one.step in ("nothing", "keep"):
+                        yield self._kept(capture, one)
                         continue
                     rendering = RenderOptions(max_bytes, limits, common)
                     tasks.append(
@@ -293,6 +304,17 @@ class _FlightRun:
                     finished = counted(len(again), "finished capture")
                     self.listener.on_again(f"{finished} to be {_AGAIN[step]} again; changed since: {names}")
             yield from capture_reports(run, tasks, self.listener, timeout_s)
+
+    def _kept(self, capture: Capture, left: Remaining) -> CaptureReport:
+        """Return the report of a capture that this run does not process."""
+        path = CapturePaths.of(capture, self.out).sidecar
+        problems = (left.why_kept,) if left.why_kept else ()
+        with suppress(SidecarError):
+            sidecar, change = self.results(path)
+            if not change:
+                return CaptureReport(capture.label, "kept", sidecar, path, failed_products=problems)
+        why = left.why_kept or f"{path}: was changed during the run; the same command estimates the capture again"
+        return CaptureReport(capture.label, "error", error=why)
 
     def _earlier_grid(self, left: Remaining) -> OutputGrid | None:
         """Return the grid of the rasters of an earlier result if this run makes the same; None without any."""

@@ -3,14 +3,15 @@
 import hashlib
 import json
 import os
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
+from io import BufferedReader
 from pathlib import Path
 
 import numpy as np
 
 from agalign._version import __version__
-from agalign.config import Settings, SettingsModel, WriteSettings
+from agalign.config import CheckSettings, Settings, SettingsModel, WriteSettings
 from agalign.flight.groups import flight_camera
 from agalign.values.capture import Capture
 from agalign.values.files import open_regular
@@ -19,24 +20,30 @@ from agalign.values.lens import Lens
 HashInput = str | int | float | bool | None | np.ndarray | Lens | Sequence["HashInput"]
 
 
+RENDER_STAGES = "write", "check"
+"""Stages of the settings that change no mapping: a result with other ones is rendered again."""
+
+
 def estimation_fingerprint(capture: Capture, settings: Settings) -> str:
-    """Return the hash of everything that the estimation of a capture depends on.
+    """Return the hash of what the estimation of a capture depends on, apart from the contents of its files: settings,
+    version, choice of bands, and the tags that are used.
 
     That is not the other captures of the flight, so results remain valid when captures are added.
     """
-    return _fingerprint(capture, *(stage for key, stage in settings if key != "write"))
+    return _fingerprint(capture, *(stage for key, stage in settings if key not in RENDER_STAGES))
 
 
 def learning_fingerprint(captures: Sequence[Capture], settings: Settings) -> str:
     """Return the hash of everything that the model of a flight depends on.
 
-    It contains the labels: files of two folders may have equal names, sizes and times.
+    Files are compared by `input_samples`.
     """
     stages = settings.joint, settings.seed, settings.flight
-    return hashed(str(flight_camera(captures)), *((c.label, _fingerprint(c, *stages)) for c in captures))
+    facts = ((c.label, _fingerprint(c, *stages), sorted(input_samples(c).items())) for c in captures)
+    return hashed(str(flight_camera(captures)), *facts)
 
 
-def render_fingerprint(capture: Capture, settings: WriteSettings) -> str:
+def render_fingerprint(capture: Capture, write: WriteSettings, check: CheckSettings) -> str:
     """Return the hash of everything that the products of an estimated capture depend on, apart from the list of
     indices, which are independent of each other.
     """
@@ -45,16 +52,17 @@ def render_fingerprint(capture: Capture, settings: WriteSettings) -> str:
         calibration = None if b.radiometry is None else (b.radiometry.quantity, b.radiometry.gain)
         georeference = None if b.georeference is None else b.georeference.transform
         facts.append((b.name, calibration, georeference))
-    return hashed(__version__, settings.model_dump_json(exclude={"indices"}), repr(capture.pose), facts)
+    options = write.model_dump_json(exclude={"indices"}), check.model_dump_json()
+    return hashed(__version__, *options, repr(capture.pose), facts)
 
 
 def _fingerprint(capture: Capture, *stages: SettingsModel) -> str:
-    """Return the hash of the files of a capture, the tags that the estimation uses, settings and the version."""
+    """Return the hash of the bands of a capture, the tags that the estimation uses, settings and the version."""
     bands: list[HashInput] = []
     for b in capture.bands:
         # A georeference by the pose of the camera is for the output alone.
         is_georeferenced = b.georeference is not None and b.georeference.accuracy_m is None
-        bands.append((b.name, b.address, b.lens, b.to_rig, is_georeferenced, _state(b.path)))
+        bands.append((b.name, b.address, b.lens, b.to_rig, is_georeferenced))
     unreadable = sorted(capture.unreadable_bands)
     return hashed(__version__, *(s.model_dump_json() for s in stages), capture.reference_index, bands, *unreadable)
 
@@ -69,24 +77,43 @@ def input_samples(capture: Capture) -> dict[str, str]:
 
     Files that cannot be read are left out.
     """
-    part_bytes = 1 << 14
-    samples: dict[Path, str] = {}
+    return _of_files(capture, _samples)
+
+
+def input_digests(capture: Capture) -> dict[str, str]:
+    """Return the SHA-256 of the file of each band. Files that cannot be read are left out."""
+    return _of_files(capture, lambda file: hashlib.file_digest(file, "sha256").hexdigest())
+
+
+def input_states(capture: Capture) -> dict[str, str]:
+    """Return the size of the file of each band, and the times of its last modification and change, ns.
+
+    Any write changes the second time on POSIX systems, also if the first is set back. Files that cannot be read are
+    left out.
+    """
+    return _of_files(capture, _state)
+
+
+def _of_files(capture: Capture, function: Callable[[BufferedReader], str]) -> dict[str, str]:
+    """Return the result of a function of an open file for each band."""
+    facts: dict[Path, str] = {}
     for path in {b.path for b in capture.bands}:
         with suppress(OSError), open_regular(path) as file:
-            size = file.seek(0, os.SEEK_END)
-            parts = [file.read(part_bytes) for k in range(3) if file.seek(k * max(0, size - part_bytes) // 2) >= 0]
-            samples[path] = hashlib.sha256(b"%d " % size + b"".join(parts)).hexdigest()[:16]
-    return {b.name: samples[b.path] for b in capture.bands if b.path in samples}
+            facts[path] = function(file)
+    return {b.name: facts[b.path] for b in capture.bands if b.path in facts}
+
+
+def _samples(file: BufferedReader) -> str:
+    part_bytes, size = 1 << 14, file.seek(0, os.SEEK_END)
+    parts = [file.read(part_bytes) for k in range(3) if file.seek(k * max(0, size - part_bytes) // 2) >= 0]
+    return hashlib.sha256(b"%d " % size + b"".join(parts)).hexdigest()[:16]
+
+
+def _state(file: BufferedReader) -> str:
+    status = os.fstat(file.fileno())
+    return f"{status.st_size} {status.st_mtime_ns} {status.st_ctime_ns}"
 
 
 def _plain(fact: np.ndarray | Lens) -> object:
     """Return an array as a list and a lens as its fields, for `json.dumps`."""
     return fact.tolist() if isinstance(fact, np.ndarray) else vars(fact)
-
-
-def _state(path: Path) -> tuple[int, int]:
-    """Return the size and the modification time of a file, zeros if it cannot be read."""
-    with suppress(OSError):
-        status = path.stat()
-        return status.st_size, status.st_mtime_ns
-    return 0, 0

@@ -33,7 +33,7 @@ from agalign.synthetic.flight import make_flight
 from agalign.values.capture import Capture
 
 from ..builders import in_full_run
-from ..conftest import Shared, raising, save_known_model, seeded
+from ..conftest import Shared, raising, save_known_model, seeded, write_signed
 
 # The program itself reads files without a georeference quietly.
 pytestmark = [pytest.mark.slow, pytest.mark.filterwarnings("error:Dataset has no geotransform")]
@@ -141,7 +141,7 @@ def test_a_second_run_reuses_the_model_and_retries_failed_captures(flight: Path,
     before = path.stat().st_mtime_ns
     first, second = find_sidecars(aligned_copy)
     first.unlink()
-    second.write_text(second.read_text().replace('"status": "ok"', '"status": "degraded"', 1))
+    write_signed(second, second.read_text().replace('"status": "ok"', '"status": "degraded"', 1))
     assert sorted(states(run(flight, aligned_copy))) == ["done", "kept"]
     again = run(flight, aligned_copy, options=RunOptions(retry_failed=True))
     assert sorted((r.state, r.is_complete) for r in again) == [("done", True), ("kept", True)]

@@ -160,10 +160,10 @@ def test_a_capture_over_water_is_predicted_without_learning(run: Run) -> None:
     assert {b.joint.recipe for b in water.bands if b.joint} <= {"flight"}
     # The user's limit decides which predictions are accepted; here none is. The blue and red edge bands are missing.
     sidecars = [reports[f"IMG_000{k}"].sidecar for k in (1, 3, 5)]
-    assert [capture_status(s.bands, s.max_predicted_px) for s in sidecars] == ["ok", "degraded", "degraded"]
+    assert [capture_status(s.bands, (), s.max_predicted_px) for s in sidecars] == ["ok", "degraded", "degraded"]
     assert {s.status for s in sidecars} == {"degraded"}
     assert sidecars[0].missing_bands == ["Blue", "Red edge"]
-    assert capture_status(reports["IMG_0003"].sidecar.bands, 50.0) == "ok"
+    assert capture_status(reports["IMG_0003"].sidecar.bands, (), 50.0) == "ok"
     rows = list(csv.DictReader((out / "summary.csv").read_text().splitlines()))
     (nir,) = [r for r in rows if r["capture"] == "IMG_0003" and r["band"] == "NIR"]
     assert (nir["status"], nir["prediction_from"]) == ("predicted", "bands")

@@ -8,7 +8,14 @@ import pytest
 
 from agalign.cameras.discover import discover
 from agalign.config import SeedSettings, Settings, WriteSettings
-from agalign.flight.fingerprint import estimation_fingerprint, hashed, render_fingerprint
+from agalign.flight.fingerprint import (
+    estimation_fingerprint,
+    hashed,
+    input_digests,
+    input_samples,
+    input_states,
+    render_fingerprint,
+)
 from agalign.values.capture import Capture, Georeference
 
 
@@ -24,7 +31,7 @@ def changed_band(capture: Capture, **facts: object) -> Capture:
 def fingerprints(capture: Capture, settings: Settings | None = None) -> tuple[str, str]:
     """Of the estimation and of the products."""
     settings = settings or Settings()
-    return estimation_fingerprint(capture, settings), render_fingerprint(capture, settings.write)
+    return estimation_fingerprint(capture, settings), render_fingerprint(capture, settings.write, settings.check)
 
 
 def test_every_fact_that_an_estimation_depends_on_changes_it(capture: Capture) -> None:
@@ -62,20 +69,26 @@ def test_facts_of_the_products_change_their_fingerprint_alone(capture: Capture) 
     assert fingerprints(capture, Settings(write=WriteSettings(indices=("ndvi",)))) == found[0]
 
 
-def test_a_file_that_is_written_again_changes_the_fingerprint_and_another_flight_does_not(
-    flight: Path, tmp_path: Path
-) -> None:
+def test_contents_and_times_of_files_are_compared_and_the_flight_is_not(flight: Path, tmp_path: Path) -> None:
     shutil.copytree(flight, tmp_path / "copy")
     capture = discover(tmp_path / "copy").captures[0]
-    path = capture.bands[0].path
-    status, seen = path.stat(), [estimation_fingerprint(replace(capture, flight_id="x"), Settings())]
-    assert seen == [estimation_fingerprint(capture, Settings())]
-    os.utime(path, ns=(status.st_atime_ns, status.st_mtime_ns + 1000))
-    seen.append(estimation_fingerprint(capture, Settings()))
-    with path.open("ab") as file:
+    band = capture.bands[0]
+
+    def facts() -> tuple[str, ...]:
+        functions = input_samples, input_digests, input_states
+        return estimation_fingerprint(capture, Settings()), *(function(capture)[band.name] for function in functions)
+
+    before, status = facts(), band.path.stat()
+    assert estimation_fingerprint(replace(capture, flight_id="x"), Settings()) == before[0]
+    os.utime(band.path, ns=(status.st_atime_ns, status.st_mtime_ns + 1000))
+    assert [a == b for a, b in zip(facts(), before, strict=True)] == [True, True, True, False]
+    data = bytearray(band.path.read_bytes())
+    data[len(data) // 4] ^= 1  # between the samples
+    band.path.write_bytes(data)
+    assert [a == b for a, b in zip(facts(), before, strict=True)] == [True, True, False, False]
+    with band.path.open("ab") as file:
         file.write(b"\0")
-    os.utime(path, ns=(status.st_atime_ns, status.st_mtime_ns))
-    assert len({*seen, estimation_fingerprint(capture, Settings())}) == 3
+    assert [a == b for a, b in zip(facts(), before, strict=True)] == [True, False, False, False]
 
 
 def test_different_facts_have_different_hashes() -> None:

@@ -27,15 +27,15 @@ from agalign.values.issues import RETRIEVAL, Issue
 from agalign.values.mapping import PixelMapping
 from agalign.values.mapping_error import MappingError
 
-from ..conftest import Shared, read_json, seeded
+from ..conftest import Shared, read_json, seeded, write_signed
 
 SUN = 1.0, 0.6
 CAMERAS = {"RedEdge": REDEDGE, "M3M calibrated": MAVIC, "M3M": MAVIC_3M, "6X": SENTERA_6X}
 
 
 def change(path: Path, **changes: object) -> None:
-    """Replace entries of the JSON object in a file."""
-    path.write_text(json.dumps(read_json(path) | changes))
+    """Replace entries of a sidecar, and its checksum."""
+    write_signed(path, json.dumps(read_json(path) | changes))
 
 
 def aligned(mapping: PixelMapping, size_px: tuple[int, int], status: PairStatus = "aligned", **facts: Any) -> Alignment:

@@ -140,6 +140,19 @@ def test_another_run_keeps_results_and_can_align_panels(between_panels: Path, tm
 
 
 @pytest.mark.slow
+def test_outputs_of_a_panel_are_removed_with_a_line(between_panels: Path, tmp_path: Path) -> None:
+    run = agalign.RunOptions(align_panels=True)
+    agalign.align_folder(between_panels, tmp_path, settings=seeded(), run=run)
+    folder = tmp_path / "0000SET" / "000"
+    mine = Path(shutil.copy(between_panels / "0000SET" / "000" / "IMG_0001_4.tif", folder / "IMG_0001.qa.tif"))
+    done = agalign_here(between_panels, "-o", tmp_path, "--only-seed")
+    assert "files of an earlier command removed, such as" in done.stderr
+    assert "captures of a calibration panel or the sky are not aligned, as 0000SET/000/IMG_0001" in done.stderr
+    assert not (folder / "IMG_0001.json").exists()
+    assert mine.exists()
+
+
+@pytest.mark.slow
 def test_without_a_panel_none_is_made_up(flight: Path, tmp_path: Path) -> None:
     with pytest.raises(agalign.ConfigurationError, match="--panel-albedo"):
         agalign.align_folder(flight, tmp_path, settings=seeded(radiometry="panel"))

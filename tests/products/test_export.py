@@ -11,7 +11,7 @@ from agalign.products.exports.programs import export
 from agalign.products.sidecar.file import find_sidecars
 from agalign.values.choices import ExportProgram
 
-from ..conftest import Shared, read_json, seeded
+from ..conftest import Shared, read_json, seeded, write_signed
 from ..program import agalign_here
 from .conftest import change
 
@@ -25,7 +25,7 @@ def run(flight: Path, shared: Shared) -> Path:
     def fill(out: Path) -> None:
         agalign.align_folder(flight, out, settings=seeded("rig", layout="both"))
         first = find_sidecars(out)[0]
-        first.write_text(first.read_text().replace('"status": "degraded"', '"status": "ok"', 1))
+        write_signed(first, first.read_text().replace('"status": "degraded"', '"status": "ok"', 1))
 
     return shared("export", fill)
 

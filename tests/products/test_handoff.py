@@ -24,7 +24,7 @@ from agalign.values.image import OutputGrid
 from agalign.values.mapping import PixelMapping
 
 from ..builders import in_full_run
-from ..conftest import Shared, read_json, seeded, write_band
+from ..conftest import Shared, read_json, seeded, write_band, write_signed
 from ..docs.blocks import ROOT, blocks_of, commands_of, program, run_command
 from ..odm import OdmPhoto, bands_of_orthophoto, pixels_in
 from .conftest import CAMERAS, capture_by
@@ -37,7 +37,7 @@ def exported(shared: Shared, out: Path, camera: str = "RedEdge", **write: object
     """The files of an export of one capture."""
     agalign.align_folder(capture_by(camera, shared), out / "out", settings=seeded(layout="bands", **write))
     for path in find_sidecars(out / "out"):
-        path.write_text(path.read_text().replace('"degraded"', '"ok"'))
+        write_signed(path, path.read_text().replace('"degraded"', '"ok"'))
     return [OdmPhoto(path) for path in export(out / "out", out / "export", "odm").files]
 
 

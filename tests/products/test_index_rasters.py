@@ -22,7 +22,7 @@ from agalign.products.run.captures import RAW, AlignedBand
 from agalign.products.sidecar.file import read_sidecar, verify_outputs, write_sidecar
 from agalign.products.sidecar.schema import FilePart
 
-from ..conftest import raising, write_band
+from ..conftest import raising, write_band, write_signed
 from .conftest import indices_of, table_in
 
 NO_FORMULAS = """__import__('os').system('true')\nN.real\n(lambda: N)()\nN if R else B\n[N][0]\nN; R\nN @ R\n'a'*N
@@ -153,7 +153,7 @@ def test_only_new_indices_are_calculated(tmp_path: Path) -> None:
     os.truncate(rasters[0], rasters[0].stat().st_size - 300)
     rasters[1].with_suffix(".png").unlink()
     sidecar = rasters[2].with_name("IMG_0003.json")
-    sidecar.write_text(sidecar.read_text().replace(f"{3:064x}", f"{9:064x}"))  # another stack
+    write_signed(sidecar, sidecar.read_text().replace(f"{3:064x}", f"{9:064x}"))  # another stack
     assert [r.kept for r in indices_of(tmp_path)] == [False] * 3
     assert [r.kept for r in indices_of(tmp_path)] == [True] * 3
     changed = index_of_formula("x=N/R"), index_of_formula("x=N/G")

@@ -141,13 +141,18 @@ def test_indices_go_with_the_stack_that_they_were_made_of(tmp_path: Path) -> Non
     written(tmp_path)
     write_band(out / "f_mine.tif", np.zeros((8, 8), np.float32))
     with rasterio.open(out / "f_mine.tif", "r+") as dataset:
-        dataset.update_tags(INDEX="mine", INDEX_FORMULA="of a lost table", INDEX_STATISTICS='{"unit": "reflectance"}')
+        dataset.update_tags(
+            TIFFTAG_SOFTWARE="agalign",
+            INDEX="mine",
+            INDEX_FORMULA="of a lost table",
+            INDEX_STATISTICS='{"unit": "reflectance"}',
+        )
     for name in ("f_mine.png", "f_notes.tif"):
         (out / name).write_bytes(b"x")
     written(tmp_path)
     assert (out / "f_mine.tif").exists(), "nothing was written again"
     removed = written(tmp_path, overwrite=True).removed
-    assert {p.name for p in out.glob("f_*")} == {"f_notes.tif"}
+    assert {p.name for p in out.glob("f_*")} == {"f_mine.png", "f_notes.tif"}
     assert removed == ((out / "f_mine.tif", "its formula is unknown"),)
 
 

@@ -16,18 +16,18 @@ from synthetic_flights.aligned import make_aligned
 import agalign
 from agalign.batch import capture_task
 from agalign.batch.index_run import index_tasks, run_indices
-from agalign.batch.render import remove_outputs
+from agalign.batch.output_files import remove_outputs
 from agalign.batch.run import run_flight
 from agalign.cameras.tiff_directory import EXIF, GPS, XMP, add_directories, byte_string, read_directories, text
 from agalign.flight.groups import model_names
 from agalign.products.exports.programs import export
 from agalign.products.indices.formulas import index_named
-from agalign.products.sidecar.file import content_checksum, find_sidecars
+from agalign.products.sidecar.file import find_sidecars
 from agalign.values.capture import Band, CameraIdentity, Capture
 from agalign.values.files import file_name
 from agalign.values.text import without_controls
 
-from ..conftest import Shared, read_json, seeded
+from ..conftest import Shared, read_json, seeded, write_signed
 from ..program import agalign_here
 
 HOSTILE = ("../../pwn", "/tmp/p", "..", "a\r\n\x1b[31mb", "x" * 300, "CON", "", ".hidden", "a/b", "a:b", "C:\\b", "é‮/")
@@ -62,8 +62,7 @@ def hostile_run(flight: Path, shared: Shared) -> Path:
         assert [r.error for r in reports] == [None] * len(HOSTILE)
         for path in find_sidecars(folder / "deep"):
             content = path.read_text().replace('"degraded"', '"ok"').replace('"seed_only"', '"aligned"')
-            checksum = content_checksum(content)
-            path.write_text(json.dumps(json.loads(content) | {"checksum": checksum}))
+            write_signed(path, content)
 
     return shared("hostile", fill)
 
@@ -136,7 +135,7 @@ def test_equal_names_do_not_overwrite_each_other(tmp_path: Path) -> None:
         content["products"] = [{"kind": "band", "file": f"{name}.tif", "bytes": 1, "sha256": ""}]
         (out / folder).mkdir(exist_ok=True)
         (out / folder / f"{name}.tif").write_text(folder)
-        (out / folder / f"{name}.json").write_text(json.dumps(content))
+        write_signed(out / folder / f"{name}.json", json.dumps(content))
     (out / "0000SET" / "IMG_0001.json").unlink()
     report = export(out, tmp_path / "images", "odm")
     for files in (report.files, (p for p in out.rglob("*.tif") if p.stem != "IMG_0001")):
@@ -192,7 +191,7 @@ def test_links_in_an_output_folder_are_not_read_written_or_emptied(tmp_path: Pat
     sidecar = out / "0000SET" / "IMG_0001.json"
     content = read_json(sidecar) | {"status": "ok"}
     content["products"] += [{"kind": "band", "file": "link/key", "bytes": 1, "sha256": ""}]
-    sidecar.write_text(json.dumps(content))
+    write_signed(sidecar, json.dumps(content))
     (out / "0000SET" / "link").symlink_to(secret)
     with pytest.raises(agalign.OutputError, match="link/key: a link leads out of"):
         export(out, tmp_path / "to", "odm")

@@ -21,6 +21,7 @@ from agalign.values.alignment import Alignment
 from agalign.values.capture import Capture, Georeference
 from agalign.values.choices import PairStatus
 from agalign.values.files import write_csv, write_text
+from agalign.values.own_files import TIES_COLUMNS, TIES_MEMBER
 from agalign.values.residual import Residual
 from agalign.values.text import escape_controls
 
@@ -48,9 +49,8 @@ class TiePoints(Product):
             if name in context.ties
             for point in tie_points(alignment, context.ties[name]).tolist()
         ]
-        positions = [f"{side}_{axis}_px" for side in ("reference", "moving") for axis in "xy"]
         cells = ((band, status, *(f"{n:.4f}" for n in point)) for band, status, point in rows)
-        write_csv(table, ("band", "status", *positions, "residual_px", "weight"), cells)
+        write_csv(table, TIES_COLUMNS, cells)
         write_text(features, _geojson(rows, context.capture.reference.georeference))
         return [WrittenFile(self.kind, table), WrittenFile(self.kind, features)]
 
@@ -89,4 +89,4 @@ def _geojson(rows: Sequence[_Row], georeference: Georeference | None) -> str:
         properties |= {"moving_px": (moving_x, moving_y), "residual_px": residual_px, "weight": weight}
         shape = {"type": "Point", "coordinates": place}
         features.append({"type": "Feature", "geometry": shape, "properties": properties})
-    return json.dumps({"type": "FeatureCollection", "coordinates_in": unit, "features": features}) + "\n"
+    return json.dumps({"type": "FeatureCollection", TIES_MEMBER: unit, "features": features}) + "\n"

@@ -8,6 +8,7 @@ import hashlib
 import io
 import json
 import math
+from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
@@ -43,6 +44,7 @@ from agalign.values.equality import equal
 from agalign.values.files import read_regular, write_csv
 from agalign.values.image import Tile, reduced_size_px
 from agalign.values.memory import WORK_TILE_PX
+from agalign.values.own_files import SOFTWARE, is_own_file
 from agalign.values.resampling import tiles
 from agalign.values.spectrum import role_of_band
 from agalign.values.text import shortened, without_formula
@@ -117,6 +119,8 @@ class IndexReport:
     """Why it could not be written; for a written raster, what to check in its bands."""
     kept: bool = field(default=False, compare=False)
     """True if an earlier command wrote the raster from the same bands with the same formula."""
+    is_masked: bool = field(default=False, compare=False)
+    """True if quality flags mask its bands."""
     captured_at: str = ""
     """Time of the capture, ISO 8601; empty if it is unknown."""
     latitude: float | None = None
@@ -273,15 +277,18 @@ def write_rasters(
                 yield IndexReport(label, index.name, problem=str(error))
                 continue
             statistics = earlier or _write(index, chosen, target, unit, source, reader)
-            yield IndexReport(label, index.name, target, statistics, kept=earlier is not None)
+            is_masked = any(band.quality is not None for band in chosen)
+            yield IndexReport(label, index.name, target, statistics, kept=earlier is not None, is_masked=is_masked)
 
 
 def _is_foreign(path: Path) -> bool:
-    """Return True for a complete raster that is not an index raster; a damaged one is written again."""
+    """Return True for a file that is not an index raster; a damaged one is written again."""
+    if not path.exists():
+        return False
     with suppress(OSError):
         check_complete(path)
         return _statistics_in(tags_of(path)) is None
-    return False
+    return not is_own_file(path)
 
 
 @dataclass(frozen=True)
@@ -411,7 +418,7 @@ def _tags(index: Index, like: OpenRaster, unit: str, source: str, *, is_masked: 
     """The tags of a raster, some of which are those of the file of its first band."""
     copied = "CAPTURE_ID", "CAMERA", "TIFFTAG_DATETIME", "RADIOMETRY", "GEOREFERENCE", "GEOREFERENCE_ACCURACY_M"
     return {k: v for k, v in like.tags().items() if k in copied} | {
-        "TIFFTAG_SOFTWARE": "agalign",
+        "TIFFTAG_SOFTWARE": SOFTWARE,
         "INDEX": index.name,
         "INDEX_SOURCE": index.source,
         "INDEX_FORMULA": _formula_text(index),
@@ -501,7 +508,8 @@ def reports_of(sidecar: Sidecar, folder: str, out: Path, run: RunFacts) -> list[
             if statistics is not None:
                 label = Path(folder, sidecar.capture).as_posix()
                 problem = to_check(_index_of(tags) if "INDEX" in tags else None, sidecar, run, label)
-                result.append(IndexReport(label, name, path, statistics, problem).of(sidecar))
+                is_masked = bool(tags.get("MASKED_BY"))
+                result.append(IndexReport(label, name, path, statistics, problem, is_masked=is_masked).of(sidecar))
     return result
 
 
@@ -521,7 +529,7 @@ def current_rows(out: Path) -> list[IndexReport]:
     """
     renamed = renamed_captures(out)
     rows = [row for row in read_table(out) if row.capture not in renamed]
-    return [row for row in rows if (_is_current(row) if row.path is not None else row.problem)]
+    return [current for row in rows if (current := _current(row)) is not None]
 
 
 def merged(rows: Iterable[IndexReport], newer: Iterable[IndexReport]) -> list[IndexReport]:
@@ -537,7 +545,7 @@ def update_table(
     Return all rows. An empty table is not written. Raises OutputError.
     """
     old = read_table(out)
-    result = merged(current_rows(out) if earlier is None else earlier, rows)
+    result = _masked_alike(merged(current_rows(out) if earlier is None else earlier, rows))
     if (result or old) and (result != old or not (out / INDICES_FILE).is_file()):
         of_capture = "folder", "capture", "captured_at", "latitude", "longitude"
         of_index = "index", "median", "p5", "p95", "valid_share", "masked_share", "input", "low", "high", "file"
@@ -547,13 +555,32 @@ def update_table(
     return result
 
 
-def _is_current(row: IndexReport) -> bool:
-    """Return True if the raster of a row has the statistics of the row."""
-    statistics = None if row.path is None else _statistics_in(tags_of(row.path))
-    return statistics is not None and (statistics.unit, f"{statistics.median:g}") == (
-        row.statistics.unit,
-        f"{row.statistics.median:g}",
-    )
+def _current(row: IndexReport) -> IndexReport | None:
+    """Return a row if its raster has the statistics of the row, or if it has a problem instead; else None."""
+    if row.path is None:
+        return row if row.problem else None
+    tags = tags_of(row.path)
+    statistics = _statistics_in(tags)
+    if statistics is None or statistics.unit != row.statistics.unit:
+        return None
+    is_same = f"{statistics.median:g}" == f"{row.statistics.median:g}"
+    return replace(row, is_masked=bool(tags.get("MASKED_BY"))) if is_same else None
+
+
+def _masked_alike(rows: Sequence[IndexReport]) -> list[IndexReport]:
+    """Return the rows without the values of rasters that are not masked like most, of an equal number like the masked:
+    statistics with and without quality flags are not comparable.
+    """
+    counts: Counter[tuple[str, bool]] = Counter((row.index, row.is_masked) for row in rows if row.path is not None)
+    result = []
+    for row in rows:
+        are_masked = counts[row.index, True] >= counts[row.index, False]
+        if row.path is not None and row.is_masked != are_masked:
+            state = "masked" if row.is_masked else "not masked"
+            problem = f"its raster is {state} by quality flags, unlike those of most captures; compute the index again"
+            row = replace(row, path=None, statistics=IndexStatistics(), problem=problem)
+        result.append(row)
+    return result
 
 
 def _cells(row: IndexReport, out: Path) -> dict[str, Any]:

@@ -223,7 +223,6 @@ def _tags(capture: Capture, layers: Sequence[Layer], *, raw: bool) -> dict[str, 
     """The tags of a file."""
     known = [] if raw else [layer.band.radiometry for layer in layers if layer.band.radiometry is not None]
     return {
-        "TIFFTAG_SOFTWARE": "agalign",
         "TIFFTAG_DATETIME": capture.known_time[:19].replace("-", ":").replace("T", " "),
         "CAPTURE_ID": capture.capture_id,
         "CAMERA": f"{capture.camera.make} {capture.camera.model}".strip(),

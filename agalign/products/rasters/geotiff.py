@@ -29,6 +29,7 @@ from agalign.values.capture import Georeference
 from agalign.values.choices import Compression
 from agalign.values.files import complete_file
 from agalign.values.image import OutputGrid
+from agalign.values.own_files import SOFTWARE
 
 _INCOMPLETE = "the file came out incomplete; is the disk full?"
 _ZSTD_LEVEL = 1
@@ -130,11 +131,11 @@ def write_on_grid(
     `checked_raster` does.
 
     A file without a georeference gets no transform: an identity transform would be read as a georeference. Tags mark
-    one by the camera's pose as approximate. Raises OutputError.
+    one by the camera's pose as approximate. The tag of the software identifies the file. Raises OutputError.
     """
     profile, all_tags = (
         tiled_profile(grid.width, grid.height, len(layers), dtype, **(FLOAT_OPTIONS if options is None else options)),
-        dict(tags or {}),
+        {"TIFFTAG_SOFTWARE": SOFTWARE, **(tags or {})},
     )
     if georeference is not None:
         profile |= georeferenced(georeference, grid)

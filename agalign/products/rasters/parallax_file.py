@@ -7,11 +7,12 @@ from pathlib import Path
 
 import numpy as np
 
-from agalign.errors import SidecarError
+from agalign.errors import OutputError, SidecarError
 from agalign.pixels.raster import open_raster
 from agalign.products.rasters.geotiff import LayerDescription, compressed, write_on_grid
 from agalign.products.sidecar.schema import Sidecar
 from agalign.values.capture import Georeference
+from agalign.values.files import file_checksum
 from agalign.values.image import OutputGrid
 from agalign.values.parallax import RELIEF_STEP, Relief
 
@@ -37,11 +38,17 @@ def write_parallax(path: Path, relief: Relief, georeference: Georeference | None
 def read_relief(sidecar: Sidecar, folder: Path) -> Relief | None:
     """Return the relief of a capture, given the folder of its sidecar; None if it has none.
 
-    Raises SidecarError for a raster of another size, UnreadableFileError.
+    Raises SidecarError for a file that is missing or not the one that the sidecar lists, UnreadableFileError.
     """
     if sidecar.parallax is None:
         return None
     path = folder / sidecar.parallax.file
+    try:
+        is_listed = file_checksum(path) == sidecar.parallax.sha256
+    except OutputError:
+        raise SidecarError(f"{path}: cannot be read; run again") from None
+    if not is_listed:
+        raise SidecarError(f"{path}: is not what was written; delete it and run again")
     with open_raster(path) as file:
         if (file.width, file.height) != sidecar.reference.size_px or file.count < len(_LAYERS) - 1:
             raise SidecarError(f"{path}: is not the parallax of {sidecar.capture}; run again with --overwrite")

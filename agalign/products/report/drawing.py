@@ -1,5 +1,7 @@
 """The bands of a capture as reduced grey images, pictures with text, and PNG files."""
 
+import struct
+import zlib
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
@@ -15,6 +17,7 @@ from agalign.pixels.raster import ReadTile, read_preview, read_tile, with_nan
 from agalign.values.capture import Capture
 from agalign.values.files import complete_file
 from agalign.values.image import OutputGrid, Tile, reduced_size_px
+from agalign.values.own_files import JPEG_MARK, PNG_MARK
 
 Grey = NDArray[np.uint8]
 """(height, width)"""
@@ -100,7 +103,19 @@ def encoded(image: Picture, path: Path, *options: int) -> bytes:
     is_encoded, data = cv2.imencode(path.suffix, image, options)
     if not is_encoded:
         raise OutputError(f"{path}: cannot be encoded")
-    return bytes(data.tobytes())
+    return _marked(data.tobytes())
+
+
+def _marked(data: bytes) -> bytes:
+    """Return a PNG or JPEG file with the name of the program, by which later commands recognise it: a text after the
+    header of a PNG (13 bytes, and 12 of the chunk), or a comment after that of a JPEG.
+    """
+    if data.startswith(b"\x89PNG"):
+        at, text = 8 + 12 + 13, b"tEXt" + PNG_MARK
+        part = struct.pack(">I", len(PNG_MARK)) + text + struct.pack(">I", zlib.crc32(text))
+    else:
+        at, part = 4 + int.from_bytes(data[4:6]), JPEG_MARK
+    return data[:at] + part + data[at:]
 
 
 def with_text(

@@ -86,7 +86,10 @@ class BandReader(ExitStack):
     def file(self, path: Path, index: int) -> OpenRaster:
         """Return the open file. Raises InputError if it cannot be read or has no band `index`, counted from 1."""
         if path not in self._files:
-            self._files[path] = self.enter_context(open_raster(path))
+            try:
+                self._files[path] = self.enter_context(open_raster(path))
+            except InputError as error:  # whose remedy is that of an image of the camera
+                raise InputError(f"{str(error).partition(';')[0]}; delete it and run again") from None
         if index > self._files[path].count:
             raise InputError(f"{path}: has no band {index}, as its sidecar says; run again")
         return self._files[path]

@@ -1,5 +1,6 @@
 """OUT/agalign-run.json: command, settings, versions, machine and results of a run; the first file that a run writes."""
 
+import json
 import platform
 from collections import Counter, defaultdict
 from collections.abc import Collection, Iterable, Sequence
@@ -17,10 +18,10 @@ from agalign.errors import ConfigurationError, SidecarError
 from agalign.flight.groups import CameraOverview, camera_overviews
 from agalign.products.run.excluded import PanelPart, SkyPart
 from agalign.products.run.footprint import accuracy_of_footprint_m, footprint
-from agalign.products.sidecar.file import label_of
+from agalign.products.sidecar.file import find_sidecars, label_of
 from agalign.products.sidecar.schema import Sidecar
 from agalign.values.capture import CameraIdentity, Capture, Pose, Position
-from agalign.values.files import RUN_FILE, read_model, write_model
+from agalign.values.files import RUN_FILE, read_model, read_regular, write_model
 from agalign.values.image import OutputGrid
 from agalign.values.libraries import library_versions
 from agalign.values.processes import usable_cores
@@ -28,11 +29,13 @@ from agalign.values.text import counted, escape_controls, shortened
 
 PAGES = "index.html", "summary.csv", "indices.csv", "flight.geojson"
 """Files that a run writes for all its captures."""
+_SCHEMA = "agalign-run/1"
 RunState = Literal["running", "interrupted", "finished"]
 
 
 class _Part(BaseModel):
-    model_config = ConfigDict(extra="forbid", allow_inf_nan=False)
+    # Records of other versions with the same schema have further fields, or lack some.
+    model_config = ConfigDict(extra="ignore", allow_inf_nan=False)
 
 
 class RefusalPart(_Part):
@@ -90,9 +93,9 @@ class RunPart(_Part):
     """The command line; empty for a run from Python."""
     cameras: list[CameraOverview] = []
     """Summary of the captures of each camera, as `agalign info` prints it."""
-    versions: dict[str, str]
-    machine: dict[str, str | int]
-    settings: dict[str, Any]
+    versions: dict[str, str] = {}
+    machine: dict[str, str | int] = {}
+    settings: dict[str, Any] = {}
     """Those with which the captures were processed; if none could be, those of the run before."""
     labels: list[str] = []
     """Labels of the captures found; empty in older records."""
@@ -225,8 +228,10 @@ def begun(folder: Path, settings: Settings, captures: Sequence[Capture] = (), co
 
 
 def refuse_foreign_pages(out: Path) -> None:
-    """Raise ConfigurationError if a folder without the record of a run has files with the names of its pages."""
-    if (out / RUN_FILE).exists():
+    """Raise ConfigurationError if a folder without record and results of a run has files with the names of its
+    pages.
+    """
+    if (out / RUN_FILE).exists() or find_sidecars(out):
         return
     for path in (out / name for name in PAGES):
         if path.is_file():
@@ -235,7 +240,23 @@ def refuse_foreign_pages(out: Path) -> None:
 
 def read_run_record(out: Path) -> RunPart | None:
     """Return the record of the last run into a folder, if any. Raises SidecarError for a file of another format."""
-    return read_model(out / RUN_FILE, RunPart)
+    try:
+        return read_model(out / RUN_FILE, RunPart)
+    except SidecarError:
+        if version := _other_version(out / RUN_FILE):
+            what = f"was written by agalign {version} and cannot be read by agalign {__version__}"
+            raise SidecarError(f"{out / RUN_FILE}: {what}; run again into a new folder") from None
+        raise
+
+
+def _other_version(path: Path) -> str:
+    """Return the version that wrote a record, if it is another one or has another schema; empty if it is unknown."""
+    with suppress(OSError, ValueError):
+        facts = json.loads(read_regular(path))
+        if isinstance(facts, dict) and str(facts.get("schema", "")).startswith("agalign-run/"):
+            version = shortened(str(facts.get("agalign", "of unknown version")))
+            return "" if (facts["schema"], version) == (_SCHEMA, __version__) else version
+    return ""
 
 
 def last_record(out: Path) -> RunPart | None:

@@ -28,11 +28,10 @@ def read_alignment(sidecar: str | Path, band: str) -> Alignment:
     Raises
     ------
     SidecarError
-        `sidecar` is missing or not a sidecar, or lacks the mapping of the band or its parallax map.
+        `sidecar` is missing or not a sidecar, or lacks the mapping of the band, or its parallax map is missing or not
+        the one that was written.
     NoSuchBandError
         The capture has no moving band of this name.
-    UnreadableFileError
-        The parallax map cannot be read.
 
     Examples
     --------

@@ -37,10 +37,13 @@ def file_part(kind: str, path: Path, folder: Path) -> FilePart:
 
 
 def add_products(path: Path, kind: str, files: Sequence[Path]) -> None:
-    """List files that a later command has written in the sidecar at `path`. Raises SidecarError, OutputError."""
+    """List files that a later command has written in the sidecar at `path`.
+
+    Raises SidecarError, also for a sidecar that `read_checked` refuses, and OutputError.
+    """
     if not files:
         return
-    sidecar, added = read_sidecar(path), [file_part(kind, file, path.parent) for file in files]
+    sidecar, added = read_checked(path), [file_part(kind, file, path.parent) for file in files]
     others = [part for part in sidecar.products if part.file not in {part.file for part in added}]
     write_sidecar(path, sidecar.model_copy(update={"products": [*others, *added]}))
 
@@ -64,15 +67,47 @@ def read_sidecar(path: Path) -> Sidecar:
 
     Raises SidecarError with file and field if it is missing, malformed or of another version.
     """
+    return _parsed(path, _contents(path))
+
+
+def read_checked(path: Path) -> Sidecar:
+    """Return a sidecar as `read_sidecar` does. Raises SidecarError also if it is not as a command wrote it."""
+    sidecar, change = read_with_change(path)
+    if change:
+        raise SidecarError(f"{path}: {change}")
+    return sidecar
+
+
+def read_with_change(path: Path) -> tuple[Sidecar, str]:
+    """Return a sidecar, and why it is not as a command wrote it at this place, with the remedy; empty if it is.
+
+    Raises SidecarError like `read_sidecar`.
+    """
+    text = _contents(path)
+    sidecar = _parsed(path, text)
+    if Path(sidecar.capture).name != path.stem:
+        return sidecar, f"belongs to {shortened(sidecar.capture)}; delete it and run again"
+    if sidecar.checksum is None:
+        return sidecar, "has no checksum, so that changes cannot be found; run again"
+    if sidecar.checksum != content_checksum(text):
+        return sidecar, "was changed after it was written; run again"
+    return sidecar, ""
+
+
+def _contents(path: Path) -> bytes:
     try:
-        text = read_regular(path, _MAX_BYTES)
+        return read_regular(path, _MAX_BYTES)
+    except OSError as error:
+        raise SidecarError(f"{path}: cannot be read ({error.strerror or error}); delete it and run again") from None
+
+
+def _parsed(path: Path, text: bytes) -> Sidecar:
+    try:
         if b'"agalign/1"' in text[:_START_BYTES]:
             # What is not a sidecar is refused below.
             with suppress(KeyError, TypeError, AttributeError, ValueError, RecursionError):
                 text = json.dumps(from_version_1(json.loads(text))).encode()
         return Sidecar.model_validate_json(text)
-    except OSError as error:
-        raise SidecarError(f"{path}: cannot be read ({error.strerror or error}); delete it and run again") from None
     except ValidationError as error:
         raise SidecarError(f"{path}: {_problem(error)}") from None
 
@@ -106,8 +141,11 @@ def from_version_1(facts: dict[str, Any]) -> dict[str, Any]:
 
 
 def read_without_tables(path: Path) -> Sidecar:
-    """Return a sidecar without its long tables: those of a season would not fit into memory. Raises SidecarError."""
-    return read_sidecar(path).without_tables()
+    """Return a sidecar without its long tables: those of a season would not fit into memory.
+
+    Raises SidecarError, also for a sidecar that `read_checked` refuses.
+    """
+    return read_checked(path).without_tables()
 
 
 def find_sidecars(folder: Path) -> list[Path]:
@@ -169,11 +207,9 @@ def verify_outputs(out: Path, sidecars: Sequence[Path] | None = None) -> Iterato
 
 
 def _problems_of_outputs(path: Path) -> Iterator[str]:
-    sidecar = read_sidecar(path)
-    if sidecar.checksum is None:
-        yield f"{path}: has no checksum, so that changes cannot be found; run again with --overwrite"
-    elif sidecar.checksum != content_checksum(read_regular(path, _MAX_BYTES)):
-        yield f"{path}: was changed after it was written; run again with --overwrite"
+    sidecar, change = read_with_change(path)
+    if change:
+        yield f"{path}: {change}"
     if sidecar.output is None and sidecar.status != "failed":
         yield f"{path}: its rasters were not written; run again"
     for kind in sidecar.not_written:
@@ -184,7 +220,8 @@ def _problems_of_outputs(path: Path) -> Iterator[str]:
             with open_regular(target) as file:
                 digest = hashlib.file_digest(file, "sha256").hexdigest()
         except OSError as error:
-            yield f"{target}: cannot be read ({error.strerror or error}); run again"
+            again = "run 'agalign indices' again" if part.kind == "index" else "run again"
+            yield f"{target}: cannot be read ({error.strerror or error}); {again}"
         else:
             if digest != part.sha256:
                 yield f"{target}: is not what was written; delete it and run again"

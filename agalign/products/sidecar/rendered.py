@@ -5,21 +5,24 @@ from contextlib import suppress
 from typing import Any
 
 from agalign.errors import UnreadableFileError
-from agalign.flight.fingerprint import render_fingerprint
+from agalign.flight.fingerprint import RENDER_STAGES, render_fingerprint
 from agalign.products.product import ProductContext
 from agalign.products.rasters.aligned_files import BandFiles, Stack
 from agalign.products.rasters.alignment_maps import ReliefMap, share_over_1_px
 from agalign.products.run.footprint import accuracy_of_footprint_m, footprint, with_assumed_height
-from agalign.products.sidecar.schema import FilePart, IlluminationPart, OutputPart, PlacePart, Sidecar
+from agalign.products.sidecar.schema import FilePart, IlluminationPart, OutputPart, PlacePart, Sidecar, capture_status
 
 _FOOTPRINT_DECIMALS = 7
 """Of degrees: a centimetre."""
 
 
-def rendered(context: ProductContext, not_written: Sequence[str] = (), seconds: float = 0.0) -> Sidecar:
+def rendered(
+    context: ProductContext, not_written: Sequence[str] = (), seconds: float = 0.0, gone: Sequence[FilePart] = ()
+) -> Sidecar:
     """Return the sidecar of a capture after its products were written.
 
-    `not_written` has the kinds that failed, and `seconds` is the time of rendering. Raises OutputError.
+    `not_written` has the kinds that failed, `seconds` is the time of rendering, and `gone` has files that were deleted
+    and that only another command can write. Raises OutputError.
     """
     sidecar, capture, places = context.sidecar, context.capture, context.places
     saturated: dict[str, float] = {}
@@ -39,25 +42,35 @@ def rendered(context: ProductContext, not_written: Sequence[str] = (), seconds: 
         bands.append(band.model_copy(update=facts))
     shown = with_assumed_height(capture)
     ring = footprint(shown, context.grid)
-    options = {key: stage for key, stage in (sidecar.options or {}).items() if key != "write"}
-    if written := context.settings.write.model_dump(mode="json", exclude_defaults=True):
-        options["write"] = written
+    accept_predicted_px = context.settings.check.accept_predicted_px
     return sidecar.model_copy(
         update={
             "bands": bands,
+            "status": capture_status(bands, capture.missing_bands, accept_predicted_px),
+            # Captures with further bands may have been added since the estimation.
+            "missing_bands": list(capture.missing_bands),
+            "unreadable_bands": dict(capture.unreadable_bands),
+            "accept_predicted_px": accept_predicted_px,
             "pose": shown.pose,
             "output": _output(context) if context.layers else None,
             # RFC 7946: outer rings are counter-clockwise.
             "footprint": None if ring is None else [(x, y) for x, y in ring[::-1].round(_FOOTPRINT_DECIMALS).tolist()],
             "footprint_accuracy_m": None if ring is None else accuracy_of_footprint_m(shown),
             "preview": next((f.preview for f in context.written if f.preview is not None), None),
-            "products": [_file(context, file.kind, file) for file in context.written],
+            "products": [*(_file(context, file.kind, file) for file in context.written), *gone],
             "not_written": list(not_written),
-            "rendered_with": render_fingerprint(capture, context.settings.write),
-            "options": options,
+            "rendered_with": render_fingerprint(capture, context.settings.write, context.settings.check),
+            "options": _options(context),
             "seconds": round(sum(band.seconds for band in sidecar.bands) + seconds, 3),
         }
     )
+
+
+def _options(context: ProductContext) -> dict[str, Any]:
+    """The settings that differ from the defaults: of the estimation, and of this rendering."""
+    now = context.settings.model_dump(mode="json", exclude_defaults=True)
+    estimated = {k: v for k, v in (context.sidecar.options or {}).items() if k not in RENDER_STAGES}
+    return estimated | {k: v for k, v in now.items() if k in RENDER_STAGES}
 
 
 def _file(context: ProductContext, kind: str, file: Any) -> FilePart:

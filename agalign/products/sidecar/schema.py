@@ -9,7 +9,7 @@ the reference to a pixel of the moving band; `grid` samples the complete mapping
 """
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from typing import Annotated, Any, Literal, Self
@@ -22,7 +22,7 @@ from agalign._version import __version__
 from agalign.cameras.metadata import read_tags
 from agalign.config import CheckSettings, Settings
 from agalign.errors import UnreadableFileError
-from agalign.flight.fingerprint import estimation_fingerprint, input_samples
+from agalign.flight.fingerprint import estimation_fingerprint, input_digests, input_samples, input_states
 from agalign.products.sidecar.sampled import sampled_mapping, sampled_parallax
 from agalign.values.alignment import COVARIANCE_DECIMALS, Alignment, JointResult, Prediction, Seed, is_usable
 from agalign.values.capture import Band, CameraIdentity, Capture, CaptureTime, Pose, Position, source_file
@@ -517,7 +517,7 @@ class Sidecar(_Part):
     accept_predicted_px: Number | None = None
     """Largest standard error of a predicted band for indices, px."""
     estimated_with: str
-    """Fingerprint of everything that the estimation depends on."""
+    """Fingerprint of everything that the estimation depends on, apart from the contents of the files."""
     model: str = ""
     """Fingerprint of the model of the flight; empty without one."""
     output: OutputPart | None = None
@@ -538,6 +538,10 @@ class Sidecar(_Part):
     """Settings that differ from the defaults."""
     input_samples: dict[str, str] = {}
     """Hash of some bytes of each band's file."""
+    input_digests: dict[str, str] = {}
+    """SHA-256 of each band's file."""
+    input_states: dict[str, str] = {}
+    """Size of each band's file, and the times of its modification and of its last change, ns."""
     seconds: Number3 = 0.0
     """Processing time."""
     checksum: str | None = None
@@ -559,7 +563,7 @@ class Sidecar(_Part):
             BandResult.of_reference(capture) if b is reference else BandResult.of(b, alignments[b.name], capture)
             for b in capture.bands
         ]
-        status = capture_status(bands, accept_predicted_px)
+        status = capture_status(bands, capture.missing_bands, accept_predicted_px)
         (width, height), place = reference.size_px, reference.georeference
         is_mosaic = place is not None and place.accuracy_m is None  # else it was calculated from GPS
         return cls(
@@ -571,7 +575,7 @@ class Sidecar(_Part):
             position=capture.position,
             pose=capture.pose,
             camera=capture.camera,
-            status="degraded" if status == "ok" and capture.missing_bands else status,
+            status=status,
             missing_bands=list(capture.missing_bands),
             unreadable_bands=dict(capture.unreadable_bands),
             reference=ReferencePart(
@@ -589,6 +593,8 @@ class Sidecar(_Part):
             model=model,
             options=settings.model_dump(mode="json", exclude_defaults=True),
             input_samples=input_samples(capture),
+            input_digests=input_digests(capture),
+            input_states=input_states(capture),
             seconds=seconds,
         )
 
@@ -628,9 +634,11 @@ class Sidecar(_Part):
         return self.model_copy(update={"bands": [b.without_tables() for b in self.bands]})
 
 
-def capture_status(bands: Iterable[BandResult], accept_predicted_px: float) -> CaptureStatus:
-    """Return `ok` if every moving band is usable, `failed` if all failed, else `degraded`."""
+def capture_status(
+    bands: Iterable[BandResult], missing_bands: Sequence[str], accept_predicted_px: float
+) -> CaptureStatus:
+    """Return `ok` if every moving band is usable and none is missing, `failed` if all failed, else `degraded`."""
     moving = [b for b in bands if b.status != "reference"]
     if all(b.is_usable(accept_predicted_px) for b in moving):
-        return "ok"
+        return "degraded" if missing_bands else "ok"
     return "failed" if all(b.status == "failed" for b in moving) else "degraded"
