@@ -1,7 +1,7 @@
 import csv
 import pickle
 import shutil
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -12,22 +12,24 @@ import rasterio
 import torch
 
 import agalign
-from agalign.batch.capture_task import CaptureReport
+from agalign.batch.capture_task import CaptureReport, quiet
 from agalign.batch.flight_learning import learn_flight
 from agalign.cameras.discover import discover
-from agalign.capture.align_bands import PairAligner, align_capture_bands, align_pairs
+from agalign.capture.align_bands import CaptureEstimation, align_capture_bands
 from agalign.capture.band_pair import BandPair, read_pairs
+from agalign.capture.by_relief import ReliefCandidates
 from agalign.capture.by_rig import bands_to_learn
-from agalign.capture.decision import against_rig
+from agalign.capture.candidate import BandCandidates, Candidate
 from agalign.config import CheckSettings, Settings
 from agalign.flight.model import FlightModel, load_model
 from agalign.products.sidecar.schema import capture_status
 from agalign.synthetic.cameras import BANDS, REDEDGE
 from agalign.synthetic.flight import make_flight
 from agalign.values import geometry
-from agalign.values.alignment import Alignment, Alignments, Prediction
+from agalign.values.alignment import Alignment, Alignments, Seed
 from agalign.values.capture import Capture
 from agalign.values.issues import RETRIEVAL, Issue
+from agalign.values.mapping_error import MappingError
 from agalign.verify.checks import CLOSE_WINDOWS
 
 from ..conftest import Shared, read_json
@@ -87,24 +89,43 @@ def bands_of(capture: Capture, model: FlightModel) -> dict[str, Alignment]:
     return align_capture_bands(capture, Settings(), model, lambda *_: None)
 
 
-Estimated = tuple[list[BandPair], Alignments, Capture]
+@dataclass(frozen=True)
+class Estimated:
+    """A capture with all candidates of its bands."""
+
+    capture: Capture
+    pairs: list[BandPair]
+    estimation: CaptureEstimation
+
+    @classmethod
+    def of(cls, capture: Capture, model: FlightModel) -> "Estimated":
+        pairs, _ = read_pairs(capture, Settings().seed, model)
+        estimation = CaptureEstimation(Settings(), model, quiet)
+        estimation.align(pairs, capture)
+        return cls(capture, pairs, estimation)
+
+    def with_nir(self, *candidates: Candidate, issue: Issue | None = None, seed: Seed | None = None) -> "Estimated":
+        """The same with other candidates of the NIR."""
+        known = self.estimation.bands["NIR"]
+        nir = BandCandidates(known.pair, seed or known.seed, issue, list(candidates))
+        reliefs = [without_nir(relief) for relief in self.estimation.reliefs]
+        bands = {**self.estimation.bands, "NIR": nir}
+        return replace(self, estimation=replace(self.estimation, bands=bands, reliefs=reliefs))
+
+    def predicted(self, **of_rig: Any) -> Alignments:
+        """The alignments with predictions of a rig with other facts."""
+        model = self.estimation.model
+        changed = replace(self.estimation, model=replace(model, rig=replace(model.rig, **of_rig)))
+        return changed.decided(changed._predictions(self.pairs, self.capture))
 
 
-def estimated(capture: Capture, model: FlightModel) -> Estimated:
-    """The pairs of a capture and their alignments before predictions."""
-    pairs, _ = read_pairs(capture, Settings().seed, model)
-    return pairs, align_pairs(pairs, Settings(), lambda *_: None, model, capture), capture
+def without_nir(relief: ReliefCandidates) -> ReliefCandidates:
+    return replace(relief, candidates={name: c for name, c in relief.candidates.items() if name != "NIR"})
 
 
 @pytest.fixture(scope="module")
 def first(captures: Captures, model: FlightModel) -> Estimated:
-    return estimated(captures[0], model)
-
-
-def predicted(known: Estimated, model: FlightModel, **of_rig: Any) -> Alignments:
-    """The alignments with predictions of a rig with other facts."""
-    pairs, result, capture = known
-    return against_rig(pairs, result, replace(model.rig, **of_rig), capture)
+    return Estimated.of(captures[0], model)
 
 
 def test_a_valid_model_is_kept(captures: Captures, model: FlightModel) -> None:
@@ -125,20 +146,22 @@ def test_a_band_that_its_first_seed_does_not_align_is_part_of_the_rig(
     captures: Captures, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Where a capture is lower than the others, its bands start too far off; the model's mappings are nearer."""
-    verify = PairAligner.verify
+    add = CaptureEstimation.add
 
-    def without_nir(self: PairAligner, *arguments: Any) -> None:
-        verify(self, *arguments)
+    def with_nir_failed(self: CaptureEstimation, *arguments: Any) -> None:
+        add(self, *arguments)
         if self.model is None:
-            self.result["NIR"] = replace(self.result["NIR"], issues=(Issue(RETRIEVAL, 0.1, 0.2),), is_seed_usable=True)
+            self.bands["NIR"].candidates.clear()
+            self.bands["NIR"].issue = Issue(RETRIEVAL, 0.1, 0.2)
+            self.reliefs = [without_nir(relief) for relief in self.reliefs]
 
-    monkeypatch.setattr(PairAligner, "verify", without_nir)
+    monkeypatch.setattr(CaptureEstimation, "add", with_nir_failed)
     assert "NIR" in learned(captures).rig.mean
 
 
 def test_a_failed_band_is_predicted_with_a_standard_error(five: Path, captures: Captures, model: FlightModel) -> None:
-    third = estimated(captures[2], model)
-    result = predicted(third, model)
+    third = Estimated.of(captures[2], model)
+    result = third.predicted()
     nir = result["NIR"]
     assert (nir.status, nir.prediction.source) == ("predicted", "bands")
     truth = read_json(five / "truth.json")["IMG_0003"]["bands"]["IMG_0003_4.tif"]["fixed_to_moving"]
@@ -146,8 +169,8 @@ def test_a_failed_band_is_predicted_with_a_standard_error(five: Path, captures: 
     assert "from the capture's other bands" in (nir.reason or "")
     assert (result["Red"].status, result["Red"].prediction.off_px is None) == ("aligned", False)
     # The prediction of a plane contains the parallax of the flight.
-    with_relief = predicted(third, model, parallax_px=dict.fromkeys(model.rig.mean, 3.0))["NIR"]
-    assert with_relief.prediction.std_px == pytest.approx(np.hypot(nir.prediction.std_px, 3.0))
+    with_relief = third.predicted(parallax_px=dict.fromkeys(model.rig.mean, 3.0))["NIR"]
+    assert with_relief.prediction.std_px == pytest.approx(np.hypot(nir.prediction.std_px, 3.0), abs=1e-4)
 
 
 def test_a_capture_over_water_is_predicted_without_learning(run: Run) -> None:
@@ -174,32 +197,31 @@ def test_a_capture_over_water_is_predicted_without_learning(run: Run) -> None:
 def test_an_alignment_that_contradicts_the_rig_is_rejected(first: Estimated, model: FlightModel) -> None:
     """The images match with a shift of one period, which contradicts the other bands, in a flight with relief too."""
     moved = {**model.rig.mean, "NIR": geometry.compose(geometry.translation(25, 0), model.rig.mean["NIR"])}
-    result = predicted(first, model, mean=moved, parallax_px={"NIR": 10.0})
+    result = first.predicted(mean=moved, parallax_px={"NIR": 10.0})
     assert (result["NIR"].status, result["NIR"].issues[0].code) == ("predicted", "unexpected_px")
     assert result["NIR"].issues[0].value == pytest.approx(25, abs=3)
 
 
-def test_a_more_accurate_prediction_by_windows_is_kept(first: Estimated, model: FlightModel) -> None:
+def test_a_more_accurate_prediction_by_windows_is_kept(first: Estimated) -> None:
     """A displacement field with many misaligned windows is `predicted` too; the rig does not contain relief."""
-    pairs, result, capture = first
-    nir = result["NIR"]
+    nir, pair = first.estimation.decided()["NIR"], first.estimation.bands["NIR"].pair
+    issues = (Issue(CLOSE_WINDOWS, 0.8, 0.9, "1 px"),)
     for std_px, away_px, source in ((0.001, 0.0, "windows"), (50.0, 0.0, "bands"), (0.001, 40.0, "bands")):
         matrix = geometry.compose(geometry.translation(away_px, 0), nir.fixed_to_moving)
-        mapping = replace(nir.mapping, fixed_to_moving=matrix)
-        prediction, issues = Prediction(matrix, "windows", std_px), (Issue(CLOSE_WINDOWS, 0.8, 0.9, "1 px"),)
-        of_windows = replace(nir, mapping=mapping, issues=issues, prediction=prediction)
-        checked = predicted((pairs, {**result, "NIR": of_windows}, capture), model)["NIR"]
+        mapping = replace(nir.mapping, fixed_to_moving=matrix).without_parallax
+        error = MappingError(pair.fixed.size_px, std_px**2 / 2 * np.eye(8))
+        of_windows = Candidate("windows", pair, mapping, error, nir.residual, nir.joint, replaces=issues)
+        checked = first.with_nir(of_windows).predicted()["NIR"]
         assert (checked.status, checked.prediction.source) == ("predicted", source)
 
 
 def test_a_band_is_learned_from_scratch_if_its_prediction_is_not_usable(first: Estimated, model: FlightModel) -> None:
     """A plane does not contain the parallax of the flight."""
-    pairs, result, capture = first
-    seed, issues = replace(result["NIR"].seed, trusted=True), (Issue(RETRIEVAL, 0.1, 0.2),)
-    lost = replace(result["NIR"], issues=issues, is_seed_usable=True, seed=seed)
+    seed = replace(first.estimation.bands["NIR"].start, trusted=True)
+    lost = first.with_nir(issue=Issue(RETRIEVAL, 0.1, 0.2), seed=seed).estimation.decided()
     for parallax_px, names in ({}, set()), ({"NIR": 10.0}, {"NIR"}):
         rig = replace(model.rig, parallax_px=parallax_px)
-        assert bands_to_learn(pairs, {**result, "NIR": lost}, rig, capture, 1.0) == names
+        assert bands_to_learn(first.pairs, lost, rig, first.capture, 1.0) == names
 
 
 def test_a_rotated_band_is_not_predicted_by_the_rig(five: Path, model: FlightModel, tmp_path: Path) -> None:

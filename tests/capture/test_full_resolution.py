@@ -5,14 +5,21 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
+import rasterio
 import tifffile
 
 from agalign.cameras.discover import discover
 from agalign.capture import full_resolution
 from agalign.capture.align_bands import align_capture_bands
+from agalign.capture.band_pair import BandPair
+from agalign.capture.by_rig import RigPrediction
+from agalign.capture.candidate import BandCandidates, Candidate, mapping_error
+from agalign.capture.decision import decide
 from agalign.capture.full_resolution import at_full_resolution
+from agalign.capture.reference import Reference
 from agalign.config import JointSettings, Settings
 from agalign.errors import UnreadableFileError
 from agalign.fit import window_fit
@@ -20,14 +27,16 @@ from agalign.flight.rig import distance_px
 from agalign.values import geometry
 from agalign.values.alignment import Alignment, Prediction, Seed
 from agalign.values.capture import Capture
+from agalign.values.geometry import PairScales
 from agalign.values.mapping import PixelMapping
 from agalign.values.residual import Residual
 
-from ..builders import joint_result, residual_of, two_views
+from ..builders import joint_result, residual_of, two_views, whole
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")]
 
-SIZE = 1000, 800
+SIZE, HALF_PX = (1000, 800), (500, 400)
+SEED = Seed("identity", np.eye(3), 30.0)
 TRUTH = np.array([[1.002, 0.004, 12.4], [-0.003, 0.999, -7.7], [1e-6, -1e-6, 1.0]])
 
 
@@ -40,17 +49,38 @@ def capture(tmp_path_factory: pytest.TempPathFactory) -> Capture:
     return discover(folder).captures[0]
 
 
-def aligned_on_reduced_images() -> Alignment:
+@pytest.fixture(scope="module")
+def pair(capture: Capture) -> BandPair:
+    """Images of half the size of the files."""
+    reference, nir = capture.reference, capture.moving[0]
+    images = [whole(cv2.resize(rasterio.open(b.path).read(1), HALF_PX).astype(np.float32)) for b in (reference, nir)]
+    scales = PairScales.of((SIZE, SIZE), (HALF_PX, HALF_PX))
+    seeds = {"identity": np.eye(3)}
+    return BandPair("nir", Reference(images[0]), images[1], seeds, (nir,), scales, is_lens_known=True)
+
+
+def on_reduced_images(pair: BandPair, **joint: Any) -> Candidate:
     """An alignment of reduced images with an error of several px of the files."""
     off = geometry.compose(TRUTH, geometry.translation(1.2, -0.6))
-    centres = geometry.lattice(*SIZE, 12, 9) * 0.9 + np.array(SIZE) * 0.05
-    residual = residual_of(centres, (0.0, 0.0))
-    joint = joint_result(off, std_px=1.0, covariance=np.eye(8))
-    return Alignment(PixelMapping(off), SIZE, (), Seed("identity", np.eye(3), 30.0), joint, residual, 2.5)
+    windows = residual_of(geometry.lattice(*HALF_PX, 12, 9) * 0.9 + np.array(HALF_PX) * 0.05, (0.0, 0.0))
+    result = joint_result(pair.scales.between_images(off), std_px=1.0, covariance=0.001 * np.eye(8), **joint)
+    mapping = pair.mapping(result.fixed_to_moving)
+    error = mapping_error(pair, mapping, result.covariance_px2, windows)
+    return Candidate("descriptors", pair, mapping, error, windows, result)
 
 
-def refined(capture: Capture, alignment: Alignment) -> Alignment:
-    return at_full_resolution(capture.reference, capture.moving[0], alignment)
+def refined(capture: Capture, start: Candidate) -> Candidate:
+    result = at_full_resolution(capture.reference, BandCandidates(start.pair, SEED), start)
+    assert isinstance(result, Candidate)
+    return result
+
+
+def in_files(*candidates: Candidate, of_rig: Prediction | None = None) -> Alignment:
+    """The alignment between the files with these candidates."""
+    pair = candidates[0].pair
+    predictions = {} if of_rig is None else {"nir": RigPrediction(pair, of_rig, of_rig, None)}
+    result = decide([BandCandidates(pair, SEED, None, list(candidates))], (), predictions)
+    return result["nir"].in_file_px(pair.scales, SIZE)
 
 
 def test_bands_are_refined_on_the_files_and_one_with_an_unreadable_tile_fails(
@@ -72,17 +102,22 @@ def test_bands_are_refined_on_the_files_and_one_with_an_unreadable_tile_fails(
     assert result["red"].residual.centres_px.max() > 700  # px of the file
 
 
-def test_a_refinement_that_fails_verification_leaves_the_earlier_result(capture: Capture) -> None:
-    good = aligned_on_reduced_images()
-    better = refined(capture, good)
+def test_a_refinement_that_fails_verification_leaves_the_earlier_result(capture: Capture, pair: BandPair) -> None:
+    good = on_reduced_images(pair)
+    assert good.issues == ()
+    better = in_files(good, refined(capture, good))
     assert geometry.corner_error_px(better.fixed_to_moving, TRUTH, *SIZE) < 0.05
     assert better.joint.corner_std_px < 0.1
-    unsure = replace(good, joint=replace(good.joint, retrieval=0.05))
-    assert refined(capture, unsure) is unsure
+    assert better.residual.centres_px.max() > 700
+    unsure = refined(capture, on_reduced_images(pair, retrieval=0.05))
+    assert unsure.issues != ()
+    kept = in_files(good, unsure)
+    assert kept.status == "aligned"
+    np.testing.assert_allclose(kept.fixed_to_moving, in_files(good).fixed_to_moving)
 
 
 def test_the_windows_that_verify_share_no_pixel_with_those_of_the_fit(
-    capture: Capture, monkeypatch: pytest.MonkeyPatch
+    capture: Capture, pair: BandPair, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     fitted: list[np.ndarray] = []
     fit_windows = window_fit.fit_windows
@@ -92,24 +127,28 @@ def test_the_windows_that_verify_share_no_pixel_with_those_of_the_fit(
         return fit_windows(mapping, residual, *rest, **named)
 
     monkeypatch.setattr(window_fit, "fit_windows", recorded)
-    residual = refined(capture, aligned_on_reduced_images()).residual
+    residual = in_files(refined(capture, on_reduced_images(pair))).residual
     assert len(residual.centres_px) > 50
     apart = np.abs(residual.centres_px[:, None] - np.concatenate(fitted)[None]).max(axis=-1)
     assert len(np.unique(residual.cells, axis=0)) == len(residual.cells)  # windows of several tiles have own cells
     assert apart.min() >= 50  # the side of the windows: five in each of four tiles
 
 
-def test_a_refinement_is_compared_with_the_prediction_of_the_rig(capture: Capture) -> None:
+def test_a_refinement_is_compared_with_the_prediction_of_the_rig(capture: Capture, pair: BandPair) -> None:
     expected, elsewhere = (geometry.compose(TRUTH, geometry.translation(off_px, 0.0)) for off_px in (0.5, 4.0))
-    prediction = Prediction(expected, "bands", 0.4, off_px=99.0)
-    result = refined(capture, replace(aligned_on_reduced_images(), prediction=prediction))
+    good = on_reduced_images(pair)
+    candidates = good, refined(capture, good)
+    result = in_files(*candidates, of_rig=Prediction(expected, "bands", 0.4))
     assert result.prediction.off_px == pytest.approx(distance_px(result.fixed_to_moving, expected, SIZE))
     assert result.prediction.off_px == pytest.approx(0.5, abs=0.05)
-    contradicted = replace(result, prediction=Prediction(elsewhere, "bands", 0.2, off_px=2.9))
-    assert refined(capture, contradicted) is contradicted
+    contradicted = in_files(*candidates, of_rig=Prediction(elsewhere, "bands", 0.2))
+    assert (contradicted.status, contradicted.issues[0].code) == ("predicted", "unexpected_px")
+    np.testing.assert_allclose(contradicted.fixed_to_moving, elsewhere)
 
 
-def test_each_tile_of_the_reference_is_read_once(capture: Capture, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_each_tile_of_the_reference_is_read_once(
+    capture: Capture, pair: BandPair, monkeypatch: pytest.MonkeyPatch
+) -> None:
     reads: Counter[Any] = Counter()
     read_tile = full_resolution.read_tile
 
@@ -119,13 +158,13 @@ def test_each_tile_of_the_reference_is_read_once(capture: Capture, monkeypatch: 
         return read_tile(band, tile, dataset)
 
     monkeypatch.setattr(full_resolution, "read_tile", counted)
-    refined(capture, aligned_on_reduced_images())
+    refined(capture, on_reduced_images(pair))
     assert len(reads) >= 8
     assert set(reads.values()) == {1}
 
 
-def test_an_unreadable_reference_is_an_error_of_the_capture(capture: Capture, tmp_path: Path) -> None:
+def test_an_unreadable_reference_is_an_error_of_the_capture(capture: Capture, pair: BandPair, tmp_path: Path) -> None:
     (tmp_path / "broken.tif").write_bytes(b"II*\0")
     reference = replace(capture.reference, path=tmp_path / "broken.tif")
     with pytest.raises(UnreadableFileError, match=r"broken\.tif"):
-        at_full_resolution(reference, capture.moving[0], aligned_on_reduced_images())
+        at_full_resolution(reference, BandCandidates(pair, SEED), on_reduced_images(pair))

@@ -25,6 +25,7 @@ from agalign.values.capture import Band
 from agalign.values.image import OutputGrid
 from agalign.values.issues import TEXTURELESS
 from agalign.values.mapping import PixelMapping
+from agalign.values.mapping_error import MappingError
 from agalign.values.residual import Residual
 
 from ..conftest import read_json, save_known_model
@@ -259,8 +260,9 @@ def test_the_share_of_a_band_is_that_of_the_quality_raster() -> None:
     shifts = np.where(centres[:, :1] < 160, 3.0, 0.0) * np.ones(2)
     cells = (centres // 80).astype(int)
     residual = Residual(centres, shifts, np.full(len(centres), 50.0), cells)
-    alignment = Alignment(PixelMapping(np.eye(3)), size_px, (), Seed("rig", np.eye(3), 9.0), residual=residual)
+    seed, error = Seed("rig", np.eye(3), 9.0), MappingError(size_px, windows=residual)
+    alignment = Alignment(PixelMapping(np.eye(3)), size_px, (), seed, residual=residual, error=error)
     reference, grid = Band("Green", Path("a.tif"), 1, *size_px, "uint16"), OutputGrid(0, 0, *size_px)
     share = share_over_1_px(alignment, reference, grid)
-    assert share == pytest.approx((error_lattice_px(alignment, reference, grid) > 1).mean(), abs=0.03)
+    assert share == pytest.approx((error_lattice_px(alignment, reference, grid, 16) > 1).mean(), abs=0.03)
     assert 0.1 < share < 0.2

@@ -12,7 +12,7 @@ import rasterio
 import agalign
 from agalign.products.indices.formulas import index_named, index_of_formula
 from agalign.products.indices.rasters import write_rasters
-from agalign.products.rasters.alignment_maps import _flags, error_lattice_px, error_on_tile
+from agalign.products.rasters.alignment_maps import _flags, error_map
 from agalign.products.rasters.output_grid import Layer
 from agalign.products.run.captures import bands_of
 from agalign.products.sidecar.file import read_without_tables
@@ -22,8 +22,9 @@ from agalign.values.choices import UNUSABLE_QUALITY, Quality
 from agalign.values.image import OutputGrid
 from agalign.values.lens import Lens
 from agalign.values.mapping import PixelMapping
+from agalign.values.mapping_error import ErrorOnGrid, MappingError
 
-from ..builders import joint_result, residual_of
+from ..builders import residual_of
 from ..conftest import Shared, seeded, write_band
 from .conftest import aligned
 
@@ -38,8 +39,10 @@ def band(path: Path) -> Band:
     return Band("NIR", path, 1, 80, 60, "uint16", nodata=7.0, saturation_value=65535.0)
 
 
-def flags_of(layer: Layer, nodes: dict[str, np.ndarray] | None = None, *, is_predicted: bool = False) -> np.ndarray:
-    return _flags(layer, GRID.tile, GRID, nodes or {}, is_predicted=is_predicted)
+def flags_of(
+    layer: Layer, errors: dict[str, ErrorOnGrid | None] | None = None, *, is_predicted: bool = False
+) -> np.ndarray:
+    return _flags(layer, GRID.tile, GRID, errors or {}, is_predicted=is_predicted)
 
 
 def test_flags_of_a_moved_band_are_where_its_pixels_are(tmp_path: Path) -> None:
@@ -65,13 +68,15 @@ def test_flags_of_the_reference_are_those_of_its_own_pixels(tmp_path: Path) -> N
 
 def test_expected_errors_and_predictions_are_flagged_and_an_unknown_error_is_a_large_one(tmp_path: Path) -> None:
     layer = Layer(band(tmp_path / "a.tif"), PixelMapping(geometry.identity()))
-    nodes = {"NIR": np.array([[0.0, 2.0], [0.0, 2.0]], np.float32)}
-    flags = flags_of(layer, nodes, is_predicted=True)
+    size_px, nodes_px2 = (GRID.width, GRID.height), np.zeros((2, 2, 2), np.float32)
+    nodes_px2[0, :, 1] = 4.0
+    error = ErrorOnGrid(MappingError(size_px), size_px, nodes_px2)
+    flags = flags_of(layer, {"NIR": error}, is_predicted=True)
     assert (flags & Quality.PREDICTED > 0).all()
-    expected_px = np.linspace(0, 2, 60)
+    expected_px = np.sqrt(np.linspace(0, 4, 60))
     assert ((flags & Quality.ERROR_OVER_HALF_PX) > 0)[5].tolist() == (expected_px > 0.5).tolist()
     assert ((flags & Quality.ERROR_OVER_1_PX) > 0)[5].tolist() == (expected_px > 1).tolist()
-    unknown = flags_of(layer, {"NIR": np.full((2, 2), np.nan, np.float32)})
+    unknown = flags_of(layer, {"NIR": None})
     assert (unknown & Quality.ERROR_OVER_1_PX > 0).all()
     failed = flags_of(Layer(layer.band, None))
     assert (failed == Quality.MISSING).all()
@@ -84,14 +89,12 @@ def test_the_error_of_an_undistorted_pixel_is_that_of_its_raw_one() -> None:
     size_px = 640, 480
     lens_of_reference = Lens(600, 600, 320, 240, (-0.1, 0.0, 0.0, 0.0, 0.0))
     reference = Band("Green", Path(), 1, *size_px, "uint16", lens=lens_of_reference)
-    joint = joint_result(covariance=np.diag(np.arange(1.0, 9.0)))
     residual = residual_of(geometry.lattice(*size_px, 8, 6), (0.1, 0.1))
+    error = MappingError(size_px, np.diag(np.arange(1.0, 9.0)), residual)
     mapping = PixelMapping(geometry.identity(), lens_of_reference, lens_of_reference)
-    alignment = aligned(mapping, size_px, joint=joint, residual=residual)
+    alignment = aligned(mapping, size_px, residual=residual, error=error)
     raw, undistorted = OutputGrid(0, 0, *size_px), OutputGrid(0, 0, *size_px, undistorted=True)
-    on_raw, on_undistorted = (
-        error_on_tile(error_lattice_px(alignment, reference, g), g, g.tile) for g in (raw, undistorted)
-    )
+    on_raw, on_undistorted = (error_map(alignment, reference, g).on_tile(g.tile) for g in (raw, undistorted))
     pixels = np.stack(np.meshgrid(*(np.arange(n) for n in size_px)), axis=-1)
     at = lens.distort(lens_of_reference, pixels).astype(np.float32)
     inside = ((at > 20) & (at < np.subtract(size_px, 20))).all(axis=-1)

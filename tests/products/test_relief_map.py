@@ -62,12 +62,18 @@ def alignments_of(capture: Capture, truth: Truth) -> dict[str, Alignment]:
     return result
 
 
+def scene_in(folder: Path, size_px: tuple[int, int]) -> tuple[Capture, Truth]:
+    """A capture of boxes that is written to a folder, and its truth."""
+    truth = write_capture(folder, make_scene("boxes", 8, width_px=size_px[0]), size_px=size_px)
+    (capture,) = agalign.discover(folder).captures
+    return capture, truth
+
+
 class Run:
     """A capture, its true alignments, and what is written with any settings."""
 
     def __init__(self, folder: Path) -> None:
-        self.truth = write_capture(folder / "in", make_scene("boxes", 8, width_px=SIZE[0]), size_px=SIZE)
-        (self.capture,) = agalign.discover(folder / "in").captures
+        self.capture, self.truth = scene_in(folder / "in", SIZE)
         self.alignments = alignments_of(self.capture, self.truth)
 
     @property

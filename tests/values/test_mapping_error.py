@@ -45,7 +45,7 @@ def test_the_expected_error_is_the_covariance_at_corners_and_the_residual_near_w
 
 
 @pytest.mark.parametrize(
-    ("facts", "added_px"), [({"field_std_px": 2.0}, 2.0), ({"relief_std_px": 3.0}, 3.0), ({"std_px": 0.4}, None)]
+    ("facts", "added_px"), [({"field_std_px": 2.0}, 2.0), ({"relief_std_px": 3.0}, 3.0), ({"rig_std_px": 0.4}, None)]
 )
 def test_the_error_far_from_windows_is_that_of_unknown_lenses_of_the_field_and_of_the_relief(
     facts: dict[str, float], added_px: float | None
@@ -71,7 +71,7 @@ def test_a_single_wrong_peak_is_no_error_and_noise_is_subtracted() -> None:
 
 
 def test_a_prediction_by_others_has_its_standard_error_everywhere() -> None:
-    predicted = MappingError(SIZE, std_px=0.4)
+    predicted = MappingError(SIZE, rig_std_px=0.4)
     np.testing.assert_allclose(predicted.error_px(PIXELS[::997]), 0.4)
     assert predicted.rms_px(PIXELS[::997]) == pytest.approx(0.4)
     assert predicted.rms_px(np.empty((0, 2))) == np.inf
@@ -129,19 +129,13 @@ def test_the_error_on_a_grid_is_that_of_its_pixels(parallax: Parallax | None) ->
         np.testing.assert_allclose(on_grid.on_tile(tile).ravel(), error.error_px(to_reference(at)), rtol=0.02)
 
 
-def test_the_error_between_images_is_that_between_files() -> None:
-    """In px of the file, which are smaller."""
-    scales = PairScales(HALF, PixelScale(0.25, 0.25))
-    between_images = MappingError(
-        SIZE,
-        np.diag(np.linspace(0.01, 0.1, 8)),
-        columns(4),
-        0.2,
-        lens_std_px(SIZE, calibrated=False),
-        0.3,
-        0.4,
-        with_steps(),
-    )
+@pytest.mark.parametrize("sigma", [1000.0, pytest.param(10.0, marks=pytest.mark.xfail(strict=True))])
+def test_the_error_between_images_is_that_between_files(sigma: float) -> None:
+    """In px of the file, which are smaller; the noise of peaks too."""
+    scales, peaks_sigma = PairScales(HALF, HALF), np.full(16, sigma)
+    lens_px, windows = lens_std_px(SIZE, calibrated=False), replace(columns(4), peaks_sigma=peaks_sigma)
+    covariance_px2 = np.diag(np.linspace(0.01, 0.1, 8))
+    between_images = MappingError(SIZE, covariance_px2, windows, 0.2, lens_px, 0.3, 0.4, with_steps())
     parallax = with_steps().rescaled(PixelScale(2.0, 2.0))
     between_files = between_images.in_file_px(scales, (1280, 960), parallax)
     points = np.random.default_rng(2).uniform(1, (638, 478), (200, 2))
