@@ -172,28 +172,28 @@ def test_an_unknown_interpolation_is_refused() -> None:
 
 
 def test_the_error_at_points_is_that_of_the_error_map() -> None:
-    """Where half of the images is masked, the expected error rises with the distance from the windows."""
+    """Where two thirds of the image are masked, the expected error rises with the distance from the windows."""
     fixed, moving = map(as_uint8, textured_pair(TRUTH))
     known = np.ones(fixed.shape, bool)
-    known[:, 200:] = False
+    known[:, 130:] = False
     for valid in (None, known):
         result = agalign.align(fixed, moving, fixed_valid=valid)
-        error_px, (height, width) = result.error_map(), fixed.shape
+        error_px, (height, width) = result.error_map_px, fixed.shape
         assert (error_px.shape, error_px.dtype) == (fixed.shape, np.float32)
         rows, columns = (at.ravel() for at in np.mgrid[3:height:31, 5:width:29])
         at_points = result.error_px(np.stack([columns, rows], axis=-1))
-        np.testing.assert_allclose(error_px[rows, columns], at_points, rtol=0.05)
+        np.testing.assert_allclose(error_px[rows, columns], at_points, rtol=0.1)
+        assert np.median(np.abs(error_px[rows, columns] / at_points - 1)) < 0.01
         assert result.error_px([[[0, 0], [399, 319]]]).shape == (1, 2)
         assert result.error_px([0, 0]) == pytest.approx(error_px[0, 0], rel=1e-4)
         inside = points_in_frame(result.mapping, (width, height), (width, height))
         assert result.std_px == pytest.approx(result.error.rms_px(inside), rel=1e-6)
-    assert result.status == "predicted"
-    assert error_px[:, 350:].mean() > 3 * error_px[:, 50:150].mean()
+    assert error_px[:, 350:].mean() > 3 * error_px[:, 30:100].mean()
 
 
 def test_the_error_of_a_failed_alignment_is_infinite() -> None:
     result = agalign.align(np.ones((320, 400), np.uint8), as_uint8(textured_image(400, 320)))
     assert (result.status, result.std_px) == ("failed", np.inf)
-    assert np.isinf(result.error_map()).all()
+    assert np.isinf(result.error_map_px).all()
     assert np.isinf(result.error_px([[0, 0], [5, 7]])).all()
     assert not result.is_usable(np.inf)

@@ -147,7 +147,7 @@ def test_the_first_row_of_the_table_that_applies(name: str) -> None:
         assert result.prediction.std_px == pytest.approx(rms_error_px(result), abs=6e-5)
     if result.error is None:
         assert np.isinf(rms_error_px(result))
-        assert np.isinf(result.error_map()).all()
+        assert np.isinf(result.error_map_px).all()
 
 
 @pytest.mark.parametrize(
