@@ -220,8 +220,10 @@ class CaptureEstimation:
             spreads_px = self._spreads_of_relief_px()
             for band in self.bands.values():
                 accepted = [c for c in band.candidates if not c.issues]
-                shaped = [extrapolated(c, spreads_px[band.pair.name]) for c in band.candidates[-1:] if not accepted]
-                band.candidates += [candidate for candidate in shaped if candidate is not None]
+                spread_px = spreads_px[band.pair.name]
+                for shaped in [extrapolated(c, spread_px) for c in band.candidates[-1:] if not accepted]:
+                    if shaped is not None:
+                        band.candidates = [*(c.with_relief_std_px(spread_px) for c in band.candidates), shaped]
 
     def _spreads_of_relief_px(self) -> dict[str, float]:
         """Return the relief that homographies lack, by band."""

@@ -14,10 +14,10 @@ from agalign.capture.warped_pair import WarpedPair
 from agalign.values.alignment import JointResult, Seed
 from agalign.values.choices import Geometry
 from agalign.values.geometry import Matrix, Points
-from agalign.values.image import Raster
+from agalign.values.image import Raster, Tile
 from agalign.values.issues import SEED_ASKED_FOR, Issue, IssueKind
 from agalign.values.mapping import PixelMapping
-from agalign.values.mapping_error import MappingError
+from agalign.values.mapping_error import ErrorOnGrid, MappingError
 from agalign.values.residual import Residual
 from agalign.verify.checks import BY_WINDOWS, PREDICTED_WITH, issues_of, seed_fits
 from agalign.verify.coverage import points_in_frame
@@ -26,9 +26,9 @@ Estimator = Literal["descriptors", "field", "relief", "windows", "lens shapes", 
 """What a mapping was estimated by."""
 
 
-_PARALLAX_STEP_PX = 8
-"""Distance of the points at which the error of a mapping with parallax is averaged: half of the length at which it
-varies; the error of others is smooth."""
+_STEP_PX = 4
+"""Distance of the pixels of the map of expected errors that are averaged: the error is largest at the border of the
+common area, which they follow to a half of it."""
 
 
 @dataclass(frozen=True)
@@ -51,6 +51,8 @@ class Candidate:
     """p95 of the shifts of held-out windows by each geometry that was fitted; empty if only a homography was."""
     is_confirmed: bool = False
     """Windows confirm it in half of the image: it may be a prediction, whatever the checks find."""
+    replaced: "Candidate | None" = None
+    """The candidate that it refines."""
     ignored: frozenset[IssueKind] = frozenset()
     """Kinds of issues that do not matter: those by parallax, in an observation of the rig."""
     replaces: tuple[Issue, ...] = ()
@@ -93,10 +95,19 @@ class Candidate:
     @cached_property
     def std_px(self) -> float:
         """Standard error: the RMS of the expected error over the common area, px of the fixed image."""
-        points_px = self.common_px
-        if self.mapping.parallax is not None:
-            points_px = points_in_frame(self.mapping, *self.pair.sizes_px, step_px=_PARALLAX_STEP_PX)
-        return self.error.rms_px(points_px if len(points_px) else self.windows.centres_px)
+        size_px, points_px = self.pair.fixed.size_px, self.common_px
+        if "geo" not in self.pair.seed_matrices:
+            points_px = points_in_frame(self.mapping, *self.pair.sizes_px, step_px=_STEP_PX)
+        if not len(points_px):
+            return self.error.rms_px(self.windows.centres_px)
+        x, y = np.rint(points_px).astype(int).T
+        error_px = ErrorOnGrid.of(self.error, size_px).on_tile(Tile(0, 0, *size_px))[y, x]
+        return float(np.sqrt(np.square(error_px, dtype=np.float64).mean()))
+
+    def with_relief_std_px(self, relief_std_px: float) -> "Candidate":
+        """Return the candidate with at least this spread of the relief where no window is near, px."""
+        relief_std_px = max(relief_std_px, self.error.relief_std_px)
+        return replace(self, error=replace(self.error, relief_std_px=relief_std_px))
 
     @cached_property
     def common_px(self) -> Points:

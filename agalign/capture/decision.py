@@ -27,7 +27,7 @@ from agalign.capture.by_relief import ReliefCandidates
 from agalign.capture.by_rig import RigPrediction
 from agalign.capture.candidate import BandCandidates, Candidate
 from agalign.values.alignment import STD_DECIMALS, Alignment, Alignments, Prediction
-from agalign.values.issues import OTHER_CONTENT, OTHER_GEOMETRY, SEED_DOES_NOT_FIT, UNEXPECTED_PX, Issue
+from agalign.values.issues import OTHER_CONTENT, OTHER_GEOMETRY, SEED_DOES_NOT_FIT, UNEXPECTED_PX, UNREADABLE, Issue
 from agalign.verify.checks import MAX_UNEXPECTED_PX, rig_issues
 
 
@@ -54,9 +54,10 @@ def _aligned(
     """Return the alignments with one relief, or with none."""
     result: Alignments = {}
     for band in bands:
-        choice = _of_images(band, relief)
-        of_rig = predictions.get(band.pair.name)
-        result[band.pair.name] = (choice if of_rig is None else _against_rig(choice, of_rig)).alignment
+        choice, of_rig = _of_images(band, relief), predictions.get(band.pair.name)
+        if of_rig is not None and not choice.is_seed_refused:
+            choice = _against_rig(choice, of_rig)
+        result[band.pair.name] = choice.alignment
     return result
 
 
@@ -115,7 +116,9 @@ def _prediction(chosen: Candidate, compared: Prediction | None) -> Prediction:
 
 
 def _of_images(band: BandCandidates, relief: ReliefCandidates | None) -> _Choice:
-    """Choose from what the images of the capture show."""
+    """Choose from what the images of the capture show; nothing if the pixels of the band cannot be read."""
+    if band.issue is not None and band.issue.kind == UNREADABLE:
+        return _Choice(band, None, (band.issue,), is_seed_refused=True)
     under = None if relief is None else relief.candidates.get(band.pair.name)
     if under is not None:
         return _Choice(band, under, (Issue(OTHER_GEOMETRY), *under.issues) if under.issues else ())
@@ -139,6 +142,8 @@ def _against_rig(choice: _Choice, of_rig: RigPrediction) -> _Choice:
         issues = tuple(rig_issues(compared))
         if not issues:
             return replace(choice, compared=compared)
+        if own.replaced is not None:  # the refinement on the files contradicts the rig
+            return _against_rig(replace(choice, candidate=own.replaced), of_rig)
         choice, own = replace(choice, issues=issues), None
     # Windows of another scene contribute to the mapping of the band, but not to the rig's.
     is_mixed = any(issue.kind == OTHER_CONTENT for issue in choice.issues)

@@ -60,11 +60,9 @@ def at_full_resolution(reference: Band, band: BandCandidates, start: Candidate) 
     down, scale = fitted.rescaled(pair.scales.fixed, pair.scales.moving), pair.scales.fixed
     factors = np.tile(scale, 4)
     joint = start.joint.with_homography(down.fixed_to_moving, fit.covariance_px2 * np.outer(factors, factors))
-    windows = replace(
-        after, centres_px=scale.positions(after.centres_px), shifts_px=scale.displacements(after.shifts_px)
-    )
+    windows = after.rescaled(scale)
     error = mapping_error(pair, down, joint.covariance_px2, windows)
-    return Candidate("full resolution", pair, down, error, windows, joint)
+    return Candidate("full resolution", pair, down, error, windows, joint, replaced=start)
 
 
 def _windows(source: OpenRaster, reference: Band, tile: Tile) -> FixedWindows:

@@ -198,6 +198,8 @@ class Alignment:
     (True, True)
     >>> result.geometry, result.space, result.fixed_to_moving.shape
     ('field', 'pixel', (3, 3))
+    >>> result.std_px < 0.2, result.error_map_px.shape  # expected error, px
+    (True, (200, 200))
     >>> unknown = agalign.align(np.ones_like(green), nir)  # raises no error
     >>> unknown.status, unknown.reason
     ('failed', 'the reference band is constant or all invalid')

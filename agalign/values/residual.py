@@ -14,6 +14,7 @@ from scipy.spatial import cKDTree
 from agalign.values.equality import equal
 from agalign.values.fields import RECORD, Array, Number6
 from agalign.values.geometry import PairScales
+from agalign.values.pixel_units import PixelScale
 
 _NOISE_PX_SIGMA2 = 48.0
 """RMS noise of the shift of a window times the squared height of its peak, in windows of 40 to 64 px: the median shift
@@ -50,7 +51,7 @@ class Residual:
     JSON, where it could not be measured."""
     peaks_sigma: Annotated[NDArray[np.float64], Array((None,), 2, nullable=True)]
     """(n,) height of the correlation peak of each window, in standard deviations; the error of a shift is inversely
-    proportional to its square."""
+    proportional to its square. In px of a file that was reduced, the height of a shift with the same error."""
     cells: Annotated[NDArray[np.int64], Array((None, 2), integers=True)]
     """(n, 2) column and row of each window in the complete grid, whichever windows of it are measured."""
 
@@ -147,9 +148,16 @@ class Residual:
 
     def in_file_px(self, scales: PairScales) -> "Residual":
         """Convert the residual to px of the reference band's file."""
-        up = scales.fixed.inverse
-        centres_px, shifts_px = up.positions(self.centres_px), up.displacements(self.shifts_px)
-        return replace(self, centres_px=centres_px, shifts_px=shifts_px)
+        return self.rescaled(scales.fixed.inverse)
+
+    def rescaled(self, scale: PixelScale) -> "Residual":
+        """Return the same on a reference that is resized by `scale`; peaks have the height that belongs to the noise of
+        their shifts there.
+        """
+        centres_px, shifts_px = scale.positions(self.centres_px), scale.displacements(self.shifts_px)
+        return replace(
+            self, centres_px=centres_px, shifts_px=shifts_px, peaks_sigma=self.peaks_sigma / math.sqrt(scale.mean)
+        )
 
 
 @validated.dataclass(frozen=True, config=RECORD)

@@ -3,7 +3,6 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from agalign.values import geometry
 from agalign.values.geometry import Points
 from agalign.values.mapping import PixelMapping
 from agalign.values.mapping_error import MappingError
@@ -23,8 +22,7 @@ def points_in_frame(
     Sizes are (width, height). The points of the grid have about the distance `step_px`, by default a twentieth of the
     image.
     """
-    columns, rows = _LATTICE if step_px is None else (max(2, n // step_px) for n in size_px)
-    points_px = geometry.lattice(*size_px, columns, rows)
+    points_px = _cells(size_px, *(_LATTICE if step_px is None else (max(2, n // step_px) for n in size_px)))
     mapped = mapping(points_px)
     return points_px[((mapped >= -0.5) & (mapped <= np.subtract(moving_size_px, 0.5))).all(axis=1)]
 
@@ -34,7 +32,7 @@ def unobserved_quarters(centres_px: Points, size_px: tuple[int, int], in_frame_p
 
     `in_frame_px` are the points of the image that the moving image covers, all of them by default.
     """
-    lattice = geometry.lattice(*size_px, *_LATTICE)
+    lattice = _cells(size_px, *_LATTICE)
     covered = lattice if in_frame_px is None else in_frame_px
     # Names, and signs of x and y relative to the centre.
     quarters = (("top left", -1, -1), ("top right", 1, -1), ("bottom right", 1, 1), ("bottom left", -1, 1))
@@ -63,4 +61,12 @@ def unmodelled_std_px(residual: Residual, size_px: tuple[int, int], lens_std_px:
     shapes, which the windows limit.
     """
     error = MappingError(size_px, np.zeros((8, 8)), residual, lens_std_px=lens_std_px)
-    return error.distortion_px(geometry.lattice(*size_px, *_LATTICE))
+    return error.distortion_px(_cells(size_px, *_LATTICE))
+
+
+def _cells(size_px: tuple[int, int], columns: int, rows: int) -> Points:
+    """Return the centres (n, 2) of equal cells of an image (width, height), row by row: their mean is that over it."""
+    x, y = (
+        (np.arange(count) + 0.5) * length / count - 0.5 for length, count in zip(size_px, (columns, rows), strict=True)
+    )
+    return np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)

@@ -117,7 +117,7 @@ def rms(values: np.ndarray) -> float:
 @pytest.mark.parametrize(
     ("output", "kinds", "rel"),
     [
-        ("with_relief", {("aligned", None), ("predicted", "windows"), ("predicted", "bands")}, 0.05),
+        ("with_relief", {("aligned", None), ("predicted", "windows"), ("predicted", "bands")}, 0.02),
         ("without_relief", {("aligned", None), ("predicted", "windows"), ("predicted", "bands")}, 0.01),
     ],
 )
@@ -161,7 +161,8 @@ def test_a_band_is_delivered_by_the_standard_error_that_is_written(
     candidate = Candidate("windows", pair, mapping, error, windows, joint_result(), replaces=(issue,))
     estimated = decided(pair, Seed("rig", np.eye(3), 30.0), [candidate])
     reference, nir = (Band(name, Path(f"{name}.tif"), 1, 64, 48, "uint16") for name in ("Green", "NIR"))
-    written = BandResult.model_validate_json(BandResult.of(nir, estimated, reference).model_dump_json(by_alias=True))
+    capture = Capture("a", Path(), (reference, nir), 0)
+    written = BandResult.model_validate_json(BandResult.of(nir, estimated, capture).model_dump_json(by_alias=True))
     again = written.alignment((64, 48), None)
     assert again.prediction.std_px == estimated.prediction.std_px
     assert again.status == estimated.status == written.status == "predicted"
