@@ -20,15 +20,10 @@ from agalign.values.mapping import PixelMapping
 from agalign.values.mapping_error import ErrorOnGrid, MappingError
 from agalign.values.residual import Residual
 from agalign.verify.checks import BY_WINDOWS, PREDICTED_WITH, issues_of, seed_fits
-from agalign.verify.coverage import points_in_frame
+from agalign.verify.coverage import pixels_in_frame, points_in_frame
 
 Estimator = Literal["descriptors", "field", "relief", "windows", "lens shapes", "full resolution", "rig"]
 """What a mapping was estimated by."""
-
-
-_STEP_PX = 4
-"""Distance of the pixels of the map of expected errors that are averaged: the error is largest at the border of the
-common area, which they follow to a half of it."""
 
 
 @dataclass(frozen=True)
@@ -95,14 +90,14 @@ class Candidate:
     @cached_property
     def std_px(self) -> float:
         """Standard error: the RMS of the expected error over the common area, px of the fixed image."""
-        size_px, points_px = self.pair.fixed.size_px, self.common_px
-        if "geo" not in self.pair.seed_matrices:
-            points_px = points_in_frame(self.mapping, *self.pair.sizes_px, step_px=_STEP_PX)
-        if not len(points_px):
+        if "geo" in self.pair.seed_matrices:
+            return self.error.rms_px(self.common_px if len(self.common_px) else self.windows.centres_px)
+        size_px = self.pair.fixed.size_px
+        is_common = pixels_in_frame(self.mapping, *self.pair.sizes_px)
+        if not is_common.any():
             return self.error.rms_px(self.windows.centres_px)
-        x, y = np.rint(points_px).astype(int).T
-        error_px = ErrorOnGrid.of(self.error, size_px).on_tile(Tile(0, 0, *size_px))[y, x]
-        return float(np.sqrt(np.square(error_px, dtype=np.float64).mean()))
+        error_px = ErrorOnGrid.of(self.error, size_px).on_tile(Tile(0, 0, *size_px))[is_common]
+        return float(np.sqrt(np.square(error_px).mean(dtype=np.float64)))
 
     def with_relief_std_px(self, relief_std_px: float) -> "Candidate":
         """Return the candidate with at least this spread of the relief where no window is near, px."""

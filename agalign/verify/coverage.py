@@ -3,9 +3,13 @@
 import numpy as np
 from numpy.typing import NDArray
 
+from agalign.values import geometry
 from agalign.values.geometry import Points
+from agalign.values.image import Mask, Tile
 from agalign.values.mapping import PixelMapping
 from agalign.values.mapping_error import MappingError
+from agalign.values.pixel_units import Size
+from agalign.values.resampling import between_nodes, nodes_along
 from agalign.values.residual import Residual
 
 MIN_COMMON_COVERAGE = 0.3
@@ -14,17 +18,29 @@ _LATTICE = 24, 18
 """Columns and rows of the points of an image at which its coverage and the lens distortion are evaluated."""
 
 
-def points_in_frame(
-    mapping: PixelMapping, size_px: tuple[int, int], moving_size_px: tuple[int, int], step_px: int | None = None
-) -> Points:
+def points_in_frame(mapping: PixelMapping, size_px: Size, moving_size_px: Size) -> Points:
     """Return the points (n, 2) of a grid over the reference that are mapped into the moving image.
 
-    Sizes are (width, height). The points of the grid have about the distance `step_px`, by default a twentieth of the
-    image.
+    Sizes are (width, height).
     """
-    points_px = _cells(size_px, *(_LATTICE if step_px is None else (max(2, n // step_px) for n in size_px)))
-    mapped = mapping(points_px)
-    return points_px[((mapped >= -0.5) & (mapped <= np.subtract(moving_size_px, 0.5))).all(axis=1)]
+    points_px = _cells(size_px, *_LATTICE)
+    return points_px[_to_border_px(mapping(points_px), moving_size_px) >= 0]
+
+
+def pixels_in_frame(mapping: PixelMapping, size_px: Size, moving_size_px: Size) -> Mask:
+    """Return the mask (height, width) of the pixels of the reference that are mapped into the moving image.
+
+    The distance from its border is interpolated between nodes.
+    """
+    columns, rows = (nodes_along(n) for n in size_px)
+    distance_px = _to_border_px(mapping(geometry.lattice(*size_px, columns, rows)), moving_size_px)
+    nodes = distance_px.reshape(rows, columns).astype(np.float32)
+    return between_nodes(nodes, size_px, Tile(0, 0, *size_px)) >= 0
+
+
+def _to_border_px(moving_px: Points, size_px: Size) -> NDArray[np.float64]:
+    """Return the distance (n,) of points (n, 2) from the border of an image (width, height), negative outside."""
+    return np.minimum(moving_px + 0.5, np.subtract(size_px, 0.5) - moving_px).min(axis=1)
 
 
 def unobserved_quarters(centres_px: Points, size_px: tuple[int, int], in_frame_px: Points | None = None) -> list[str]:
