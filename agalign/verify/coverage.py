@@ -40,7 +40,7 @@ def pixels_in_frame(mapping: PixelMapping, size_px: Size, moving_size_px: Size) 
 
 def _to_border_px(moving_px: Points, size_px: Size) -> NDArray[np.float64]:
     """Return the distance (n,) of points (n, 2) from the border of an image (width, height), negative outside."""
-    return np.minimum(moving_px + 0.5, np.subtract(size_px, 0.5) - moving_px).min(axis=1)
+    return np.asarray(np.minimum(moving_px + 0.5, np.subtract(size_px, 0.5) - moving_px).min(axis=1))
 
 
 def unobserved_quarters(centres_px: Points, size_px: tuple[int, int], in_frame_px: Points | None = None) -> list[str]:
