@@ -22,7 +22,7 @@ from agalign.values.mapping import PixelMapping
 from agalign.values.parallax import Parallax, Relief
 from agalign.values.residual import Residual
 from agalign.verify.checks import CLOSE_WINDOWS
-from agalign.verify.coverage import points_in_frame
+from agalign.verify.coverage import pixels_in_frame
 
 from ..builders import decided, joint_result, pair_of, residual_of, rms, two_views
 
@@ -93,8 +93,8 @@ def against(of_rig: RigPrediction, *candidates: Candidate) -> Alignment:
 
 
 def rms_error_px(alignment: Alignment, moving_size_px: tuple[int, int] = SIZE) -> float:
-    points_px = points_in_frame(alignment.mapping, SIZE, moving_size_px)
-    return float(np.sqrt(np.square(alignment.error_px(points_px)).mean()))
+    inside = pixels_in_frame(alignment.mapping, SIZE, moving_size_px)
+    return float(np.sqrt(np.square(alignment.error_map_px[inside]).mean()))
 
 
 # ---- without a relief and a rig

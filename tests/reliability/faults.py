@@ -35,7 +35,7 @@ from agalign.errors import SidecarError
 from agalign.products.sidecar.file import find_sidecars, read_sidecar
 from agalign.values.files import RUN_FILE
 
-from ..conftest import raising, textured_pair
+from ..conftest import raising, textured_pair, write_signed
 from ..program import agalign_here
 
 DOCUMENT = Path(__file__).resolve().parents[2] / "docs" / "explanation" / "verification.md"
@@ -358,7 +358,7 @@ def with_sidecar(pattern: str, new: str) -> Inject:
     def inject(scene: Scene) -> None:
         first_run(scene)
         path = scene.out / "b.json"
-        path.write_text(re.sub(pattern, new, path.read_text()))
+        write_signed(path, re.sub(pattern, new, path.read_text()))
 
     return inject
 

@@ -32,6 +32,8 @@ def read_alignment(sidecar: str | Path, band: str) -> Alignment:
         the one that was written.
     NoSuchBandError
         The capture has no moving band of this name.
+    UnreadableFileError
+        The parallax map cannot be read.
 
     Examples
     --------
