@@ -24,7 +24,7 @@ from agalign.flight.model import FlightModel, load_model
 from agalign.method.device import choose_device, keep_freed_memory, one_memory_error, one_thread
 from agalign.pixels.capture_pixels import CapturePixels
 from agalign.pixels.radiometry import check_pixels
-from agalign.pixels.raster import with_saturation_values
+from agalign.pixels.raster import with_missing_parts, with_saturation_values
 from agalign.products.product import CapturePaths
 from agalign.products.registry import PRODUCTS
 from agalign.products.sidecar.file import read_sidecar, read_with_change
@@ -219,7 +219,7 @@ def process_capture(task: Task, progress: PairProgress = quiet) -> CaptureReport
     """
     began_s, settings, out = time.perf_counter(), task.settings, task.out
     read = CapturePixels().read
-    capture = with_saturation_values(task.capture, read)
+    capture = with_saturation_values(with_missing_parts(task.capture, read), read)
     path = CapturePaths.of(capture, out).sidecar
     earlier, is_intact = _earlier(path)
     listed = [] if earlier is None else earlier.files

@@ -23,7 +23,7 @@ from agalign.method.joint import refine_with
 from agalign.method.refine import FLIGHT_PATCHES
 from agalign.method.state import ImageGroup, JointState
 from agalign.pixels.capture_pixels import CapturePixels
-from agalign.pixels.raster import with_saturation_values
+from agalign.pixels.raster import with_missing_parts, with_saturation_values
 from agalign.values.alignment import MIN_RETRIEVAL, RefinedPair, Seed
 from agalign.values.capture import Capture
 from agalign.values.geometry import Matrix, PairScales
@@ -150,7 +150,8 @@ def load_capture(
 def _pairs_of(capture: Capture, settings: Settings, model: FlightModel | None = None) -> list[BandPair]:
     """Return the pairs of a capture that can be read."""
     read = CapturePixels().read
-    return read_pairs(with_saturation_values(capture, read), settings.seed, model, read)[0]
+    capture = with_saturation_values(with_missing_parts(capture, read), read)
+    return read_pairs(capture, settings.seed, model, read)[0]
 
 
 def initial_network(bands: Sequence[str], settings: Settings, start: FlightModel | None) -> Descriptor:

@@ -4,6 +4,7 @@ These are files that the sidecar of the capture lists, and files with the mark o
 Others are kept, whatever their names.
 """
 
+import os
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
@@ -19,7 +20,7 @@ from agalign.products.registry import PRODUCTS
 from agalign.products.sidecar.file import is_sidecar, read_checked
 from agalign.products.sidecar.schema import FilePart
 from agalign.values.capture import Capture
-from agalign.values.files import check_inside
+from agalign.values.files import check_inside, max_name_bytes
 from agalign.values.own_files import is_own_file
 
 
@@ -34,15 +35,18 @@ def refuse_to_overwrite(
     captures: Sequence[Capture], out: Path, settings: WriteSettings, listed: Mapping[Path, Sequence[FilePart]]
 ) -> None:
     """Raise ConfigurationError if an output would replace an input image, an output of another capture, or a file that
-    no run has written.
+    no run has written, or if its name is too long.
 
     `listed` has the files that a sidecar lists, by its path.
     """
-    sources = {band.path.resolve() for capture in captures for band in capture.bands}
+    sources, max_bytes = {band.path.resolve() for capture in captures for band in capture.bands}, max_name_bytes(out)
     resolved: dict[Path, Path] = {}
     written: dict[str, Capture] = {}
     for capture in captures:
         for path in paths_written(capture, out, settings):
+            if (name_bytes := len(os.fsencode(path.name))) > max_bytes:
+                what = f"{path.name} would have {name_bytes} bytes, and file systems take {max_bytes}"
+                raise ConfigurationError(f"{capture.reference.path}: the name of its output {what}; rename its files")
             if path.parent not in resolved:
                 resolved[path.parent] = check_inside(path.parent, out).resolve()
             if resolved[path.parent] / path.name in sources:

@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from agalign.cameras.metadata import Tags
+from agalign.cameras.sun import Sun
 from agalign.cameras.xmp import Name
 from agalign.errors import GeometryError, NoSuchBandError
 from agalign.values import geometry
@@ -34,7 +35,8 @@ class Camera(ABC):
     flight_ids: tuple[Name, ...] = ()
     """The XMP values that identify a flight, tried in turn."""
     band_in_name: re.Pattern[str]
-    """The end of a file's name, without suffix, that differs between the bands of a capture."""
+    """The part of a file's name, without suffix, that differs between the bands of a capture: the first match. Apps and
+    users may add to the names of a camera."""
     has_free_names = False
     """True if users choose the names of its files."""
     clock_is_utc = False
@@ -56,7 +58,7 @@ class Camera(ABC):
 
     def capture_name(self, path: Path) -> str:
         """Return the part of a file name that all bands of a capture share."""
-        return self.band_in_name.sub("", own_stem(path))
+        return self.band_in_name.sub("", own_stem(path), count=1)
 
     def capture_key(self, path: Path, tags: Tags) -> str:
         """Return a text that is the same for all files of a capture, and unique for a camera and folder."""
@@ -80,6 +82,10 @@ class Camera(ABC):
         if (pose := self.pose(tags)) is None:
             return None
         return -math.degrees(math.asin(math.cos(math.radians(pose.pitch_deg)) * math.cos(math.radians(pose.roll_deg))))
+
+    def sun(self, tags: Tags) -> Sun | None:
+        """Return the position of the sun by its light sensor; None if the tags lack it."""
+        return None
 
     def motion(self, tags: Tags) -> tuple[float, float] | None:
         """Return the velocity (right, down) of the ground in the image, focal lengths per second; None if unknown."""
@@ -145,10 +151,6 @@ def other_rig_seed(reference: Band, moving: Band) -> Matrix | None:
 
 
 # ---- for the modules of the cameras
-
-
-FULL_SCALE = 65536.0
-"""Divisor of pixel values in the radiometric models of the makers: bands are stored as 16 bits."""
 
 
 def colour_bands(stored: Sequence[Band], lens: Lens | None = None, to_rig: Matrix | None = None) -> tuple[Band, ...]:

@@ -2,18 +2,15 @@
 of georeferenced mosaics.
 """
 
-import os
-import re
-from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from fnmatch import fnmatchcase
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from agalign.cameras.base import reference_index
+from agalign.cameras.consistency import contradictions, doubtful_files, exposed_apart, files_of_one_band, list_problems
 from agalign.cameras.generic import Generic
 from agalign.cameras.grouping import (
     band_file_owners,
@@ -21,7 +18,6 @@ from agalign.cameras.grouping import (
     group_files,
     join_folders,
     pattern_clashes,
-    tag_problems,
     with_bands_of_names,
     with_missing_bands,
     with_tags_of_flight,
@@ -30,9 +26,18 @@ from agalign.cameras.grouping import (
     with_unreadable_bands,
     without_copies,
 )
-from agalign.cameras.identity import contradictions, files_of_one_band, with_one_spelling
+from agalign.cameras.identity import with_one_spelling
+from agalign.cameras.image_file import ImageFile, Problem
+from agalign.cameras.image_search import (
+    IMAGE_KINDS,
+    check_folder,
+    image_files,
+    is_chosen,
+    other_files,
+    without_companions,
+)
 from agalign.cameras.metadata import read_tags
-from agalign.cameras.read_files import ImageFile, Problem, natural_order, read_files
+from agalign.cameras.read_files import read_files
 from agalign.config import DiscoverOptions
 from agalign.errors import ConfigurationError, InputError, NoSuchBandError
 from agalign.pixels.coordinates import transformed
@@ -41,7 +46,6 @@ from agalign.values import geometry
 from agalign.values.arguments import checked
 from agalign.values.capture import Band, Capture
 from agalign.values.choices import MAX_MOSAIC_PIXELS
-from agalign.values.files import RUN_FILE
 from agalign.values.spectrum import band_key
 from agalign.values.text import did_you_mean
 
@@ -123,7 +127,8 @@ def discover(folder: str | Path, options: DiscoverOptions | None = None) -> Fold
     files = with_one_spelling(with_bands_of_names(files))
     captures: list[Capture] = []
     groups, copied = join_folders(group_files(files, with_rgb=options.with_rgb))
-    problems += copies + copied + damaged + tag_problems(files) + contradictions(groups)
+    problems += copies + copied + damaged + list_problems(files) + doubtful_files(files)
+    problems += contradictions(groups) + exposed_apart(groups)
     problems += files_of_one_band(groups) if options.pattern is None else []
     _check_bands(groups, options.bands, folder)
     for group in groups:
@@ -146,6 +151,8 @@ def discover(folder: str | Path, options: DiscoverOptions | None = None) -> Fold
 def _chosen_images(folder: Path, options: DiscoverOptions) -> tuple[list[Path], list[Problem]]:
     """(the images to read, problems of folders that cannot be listed). Raises InputError without images."""
     images, problems = image_files(folder, options.skip)
+    images, companions = without_companions(images, folder)
+    problems += companions
     paths = [p for p in images if is_chosen(p.relative_to(folder), options.include, options.exclude)]
     if not paths and problems:
         raise problems[0].error
@@ -197,81 +204,6 @@ def _check_pattern(pattern: str | None, paths: Sequence[Path], folder: Path) -> 
     if pattern is not None and not any(Generic(pattern).split(p)[1] for p in paths):
         what = f"--pattern '{pattern}' matches none of {len(paths)} images, such as {paths[0].name}"
         raise ConfigurationError(f"{folder}: {what}")
-
-
-IMAGE_KINDS = ".tif, .tiff, .jpg, .jpeg or .png"
-
-
-def check_folder(folder: Path) -> None:
-    """Raise InputError if `folder` is not a folder that can be listed."""
-    if folder.as_posix().startswith("/vsi"):
-        raise InputError(f"{folder}: is one of GDAL's virtual paths; mount or unpack it, and give the folder")
-    # A Path writes s3://bucket or https://host with one slash; a drive has one letter.
-    if re.match(r"[A-Za-z][A-Za-z0-9+.-]+:/", folder.as_posix()):
-        address = folder.as_posix().replace(":/", "://", 1)
-        raise InputError(f"{address}: only local folders can be read; mount it or copy the images, and give the folder")
-    try:
-        if folder.is_dir():
-            return
-        what = "is a file" if folder.exists() else "does not exist"
-    except OSError as error:
-        what = f"cannot be looked into ({error.strerror or error})"
-    raise InputError(f"{folder}: {what}; give the folder of the images")
-
-
-def image_files(folder: Path, skip: Sequence[Path]) -> tuple[list[Path], list[Problem]]:
-    """Return (image files below a folder, problems of folders that cannot be listed)."""
-    skipped = {p.resolve() for p in skip}
-    result: list[Path] = []
-    problems: list[Problem] = []
-
-    def refuse(error: OSError) -> None:
-        path = Path(error.filename)
-        problems.append(Problem(path, InputError(f"{path}: cannot be looked into ({error.strerror}); left out")))
-
-    for parent, folders, names in os.walk(folder, onerror=refuse):
-        here = Path(parent)
-        folders[:] = sorted(d for d in folders if _is_input_folder(here / d, skipped))
-        images = [n for n in names if suffix_format(Path(n)) and not n.startswith(".")]
-        result.extend(here / n for n in sorted(images, key=natural_order))
-    return result, problems
-
-
-def is_chosen(path: Path, include: Sequence[str], exclude: Sequence[str]) -> bool:
-    """Return True for a path that matches a glob of `include`, or `include` is empty, and no glob of `exclude`.
-
-    A glob is compared with the path relative to the input folder and with the file name; * matches / too.
-    """
-
-    def matches(globs: Sequence[str]) -> bool:
-        return any(fnmatchcase(name, glob) for name in (path.as_posix(), path.name) for glob in globs)
-
-    return (not include or matches(include)) and not matches(exclude)
-
-
-def other_files(folder: Path) -> Counter[str]:
-    """Return the number of other files below a folder by suffix, in lower case."""
-    suffixes: Counter[str] = Counter()
-    for _, folders, names in os.walk(folder):
-        folders[:] = [d for d in folders if not d.startswith(".")]
-        others = (Path(n) for n in names if not n.startswith(".") and not suffix_format(Path(n)))
-        suffixes.update(other.suffix.lower() or "no suffix" for other in others)
-    return suffixes
-
-
-def _is_input_folder(folder: Path, skipped: set[Path]) -> bool:
-    """False for hidden folders, those of operating systems on memory cards, and the output folder of a run.
-
-    A run writes RUN_FILE first, so the output of a killed run is recognised too.
-    """
-    of_system = "lost+found", "System Volume Information", "$RECYCLE.BIN"
-    if folder.name.startswith(".") or folder.name in of_system or folder.resolve() in skipped:
-        return False
-    try:
-        entries = {entry.name for entry in os.scandir(folder)}
-    except OSError:
-        return True
-    return RUN_FILE not in entries and not {"summary.csv", "index.html"} <= entries
 
 
 # ---- mosaics

@@ -20,8 +20,9 @@ from pathlib import Path
 import numpy as np
 
 from agalign.cameras import pix4d
-from agalign.cameras.base import FULL_SCALE, Camera, colour_bands
-from agalign.cameras.known import MAVIC_3, PHANTOM_4
+from agalign.cameras.base import Camera, colour_bands
+from agalign.cameras.consistency import full_scale, raw_step_of
+from agalign.cameras.known import MAVIC_3_PART, PHANTOM_4, named_by_camera
 from agalign.cameras.metadata import Tags
 from agalign.errors import GeometryError
 from agalign.values import geometry
@@ -30,7 +31,7 @@ from agalign.values.capture import Band, Pose, Radiometry
 from agalign.values.geometry import Matrix
 from agalign.values.lens import Lens
 
-_MAVIC_3_BAND = rf"_(?:MS_(?:{'|'.join(MAVIC_3)})|D)$"
+_MAVIC_3_BAND = rf"{MAVIC_3_PART}|(?<=_\d{{4}})_D(?![a-z0-9])|_D$"
 NAMESPACE = "dji.com/drone-dji"
 
 
@@ -39,7 +40,7 @@ class Dji(Camera):
 
     name = "DJI"
     capture_ids = ((NAMESPACE, "CaptureUUID"),)
-    band_in_name = re.compile(rf"{_MAVIC_3_BAND}|(?<=\d)\d$", re.IGNORECASE)
+    band_in_name = re.compile(rf"{_MAVIC_3_BAND}|(?<=DJI_\d{{3}})\d(?!\d)|(?<=\d)\d$", re.IGNORECASE)
     utc_times = ((NAMESPACE, "UTCAtExposure"),)
 
     def recognises(self, tags: Tags) -> bool:
@@ -54,7 +55,7 @@ class Dji(Camera):
         if len(stored) > 1:
             return colour_bands(stored, lens, None if is_mavic else by_centres)
         band = pix4d.described(stored[0], tags, tags.text(NAMESPACE, "BandName") or _band_in_name(path))
-        band = replace(band, lens=lens, radiometry=_radiometry(tags))
+        band = replace(band, lens=lens, radiometry=_radiometry(tags, stored[0]))
         if calibrated is None or lens is None:
             return (replace(band, to_rig=by_centres),)
         return (replace(band, to_rig=calibrated, other_to_rig=by_centres),)
@@ -104,8 +105,8 @@ def _height_m(tags: Tags) -> float | None:
     return height_m if height_m and height_m > 0 else None
 
 
-def _radiometry(tags: Tags) -> Radiometry | None:
-    """The signal is (raw - black) / 65536 (1 + k1 r + ... + k6 r^6) / (gain exposure). By DJI's guide, signal *
+def _radiometry(tags: Tags, stored: Band) -> Radiometry | None:
+    """The signal is (raw - black) / 2^bits (1 + k1 r + ... + k6 r^6) / (gain exposure). By DJI's guide, signal *
     SensorGainAdjustment / Irradiance is proportional to reflectance, with the same factor for all bands.
     """
     gain, exposure_us = tags.number(NAMESPACE, "SensorGain"), tags.number(NAMESPACE, "ExposureTime")
@@ -119,12 +120,13 @@ def _radiometry(tags: Tags) -> Radiometry | None:
     return Radiometry(
         "relative radiance",
         black,
-        FULL_SCALE,
+        full_scale(stored),
         adjusted / (gain * exposure_us / 1e6),
         centre or (0.0, 0.0),
         k if centre else (),
         vignetting_divides=False,
         by_sun=(1 / irradiance, "relative reflectance") if irradiance > 0 else None,
+        raw_step=raw_step_of(tags, stored),
         tags={"sensor gain": gain, "gain adjustment": adjusted, "exposure time (s)": exposure_us / 1e6}
         | ({"relative irradiance": irradiance} if irradiance else {}),  # 0 without a reading
     )
@@ -135,8 +137,10 @@ def _is_mavic_3(tags: Tags) -> bool:
 
 
 def _band_in_name(path: Path) -> str:
+    if of_mavic := named_by_camera(own_stem(path))[1]:
+        return of_mavic
     part = Dji.band_in_name.search(own_stem(path))
-    known = {**PHANTOM_4, **MAVIC_3}.get(part[0].upper().removeprefix("_MS_")) if part else None
+    known = PHANTOM_4.get(part[0]) if part else None
     return known[0] if known else path.stem
 
 

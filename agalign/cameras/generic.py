@@ -5,7 +5,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from agalign.cameras.base import Camera, colour_bands
-from agalign.cameras.known import named_by_camera
+from agalign.cameras.known import filter_channels, named_by_camera
 from agalign.cameras.metadata import Tags
 from agalign.cameras.pix4d import NAMESPACE, listed_bands
 from agalign.pixels.raster import suffix_format
@@ -38,6 +38,10 @@ class Generic(Camera):
             name = self.split(path)[1]
             return (replace(stored[0], name=name, wavelength_nm=wavelength_in(name)),)
         if len(stored) > 1:
+            # The channels of a camera with a filter have other bands than their colours, whatever the pattern.
+            channels = filter_channels(tags.model)
+            if len(stored) == len(channels):
+                stored = [replace(b, name=(c := channels[b.band_index])[0], wavelength_nm=c[1]) for b in stored]
             listed = listed_bands(tags, stored)
             own = [named_by_camera(b.name)[1] for b in listed]
             names = own if all(own) and len(set(own)) == len(own) else [b.name for b in listed]

@@ -14,12 +14,11 @@ from types import MappingProxyType
 
 from agalign.cameras import camera_of
 from agalign.cameras.base import Camera, colour_bands, listed, reference_index
-from agalign.cameras.generic import Generic, split_elsewhere
+from agalign.cameras.generic import Generic, split_elsewhere, split_stem
 from agalign.cameras.identity import end_of, name_end
+from agalign.cameras.image_file import ImageFile, Problem, natural_order
 from agalign.cameras.known import band_at, lacking
 from agalign.cameras.metadata import Tags
-from agalign.cameras.pix4d import NAMESPACE, listed_names
-from agalign.cameras.read_files import ImageFile, Problem, natural_order
 from agalign.config import DiscoverOptions
 from agalign.errors import InputError, UnreadableFileError
 from agalign.pixels.raster import suffix_format
@@ -34,6 +33,10 @@ _GroupKey = tuple[str, str, str]
 _CameraKey = tuple[str, ...]
 _MAX_HALVES_APART = timedelta(seconds=1)
 """Between the exposures of a dual camera, which are simultaneous; an id may occur again in another flight."""
+_BEFORE_SUFFIX = " (-.~@+"
+"""Characters before the suffixes that file managers and synchronisation add to the names of copies; an underscore
+separates parts of the names that cameras and users give.
+"""
 _SERIAL_SEPARATOR = "+"
 """Between the serial numbers of the two halves of a dual camera."""
 
@@ -42,8 +45,9 @@ def without_copies(files: Sequence[ImageFile]) -> tuple[list[ImageFile], list[Pr
     """Return the files that are not copies of others, and a problem for each copy.
 
     A copy agrees with a file of a shorter name in two of three respects: its name contains that of the other file, as
-    file managers and browsers make it in all languages ('IMG_1 - Copy.tif', 'IMG_1 copie 2.tif', 'IMG_1 (1).tif',
-    'Copy of IMG_1.tif'); its bands and capture id in the tags; its bytes.
+    file managers, browsers and synchronisation make it in all languages ('IMG_1 - Copy.tif', 'IMG_1 copie 2.tif',
+    'IMG_1 (1).tif', 'Copy of IMG_1.tif', 'IMG_1.sync-conflict-20210827.tif', 'IMG_1-HOST.tif'); its bands and capture
+    id in the tags; its bytes. Without an id, the name of a single band with a suffix is that of a copy.
     """
     kept: dict[object, ImageFile] = {}
     copies: dict[Path, Problem] = {}
@@ -59,7 +63,7 @@ def without_copies(files: Sequence[ImageFile]) -> tuple[list[ImageFile], list[Pr
             if is_exact:
                 text = f"is left out, because it is a copy of {original.path.name}"
             elif original.path in _paths_in_name(file.path) and (
-                original is kept.get(by_tags) if ids[file.path] else original.path.stem == own_stem(file.path)
+                original is kept.get(by_tags) if ids[file.path] else _is_plain_name(original, file.path)
             ):
                 text = f"is left out as a changed copy of {original.path.name}: same band and capture; keep one of them"
             else:
@@ -110,6 +114,12 @@ def join_folders(groups: Sequence[list[ImageFile]]) -> tuple[list[list[ImageFile
     return [sorted(group, key=lambda f: f.bands[0].is_from_photograph) for group in groups if group], problems
 
 
+def _is_plain_name(original: ImageFile, copy: Path) -> bool:
+    """Return True for a file with the name of a band, which another name has with a suffix, as programs name copies."""
+    has_band = bool(split_stem(own_stem(original.path))[1]) and len(original.bands) == 1
+    return original.path.stem == own_stem(copy) or (has_band and copy.stem.startswith(original.path.stem))
+
+
 @dataclass
 class _CopiedFolder:
     """What a folder has of captures that are in another folder too."""
@@ -152,9 +162,18 @@ def _end_of(path: Path) -> bytes:
 
 
 def _paths_in_name(path: Path) -> list[Path]:
-    """The files that this one may be a copy of: their names are its own before or after a space or bracket."""
-    parts = (part for i, c in enumerate(path.stem) if c in " (" for part in (path.stem[:i], path.stem[i + 1 :]))
+    """The files that this one may be a copy of: their names are its own before a separator and text that is no band, or
+    after a space or bracket.
+    """
+    stem = path.stem
+    parts = [stem[:i] for i, c in enumerate(stem) if c in _BEFORE_SUFFIX and not _is_band_part(stem[i + 1 :])]
+    parts += [stem[i + 1 :] for i, c in enumerate(stem) if c in " ("]
     return [path.with_name(part + path.suffix) for part in parts if part]
+
+
+def _is_band_part(text: str) -> bool:
+    """True for a text that may tell the bands of a capture apart: the name or number of a band."""
+    return is_band_name(text) or bool(re.fullmatch(r"[a-z]?\d{1,2}", text, re.IGNORECASE))
 
 
 def with_tags_of_flight(files: Sequence[ImageFile]) -> tuple[list[ImageFile], list[Problem]]:
@@ -180,24 +199,6 @@ def with_tags_of_flight(files: Sequence[ImageFile]) -> tuple[list[ImageFile], li
             own = replace(own, name=band.name, wavelength_nm=band.wavelength_nm, bandwidth_nm=band.bandwidth_nm)
             result[i] = replace(file, bands=(own,))
     return result, problems
-
-
-def tag_problems(files: Sequence[ImageFile]) -> list[Problem]:
-    """Return a problem for each multiband file with tags that list another number of names or wavelengths, and one for
-    all files with tags of another lens or image size, which names the first of them.
-    """
-    texts: dict[Path, str] = {}
-    for file in files:
-        names, wavelengths = len(listed_names(file.tags)), len(file.tags.numbers(NAMESPACE, "CentralWavelength"))
-        bands = len(file.bands)
-        if file.is_whole_capture and isinstance(file.camera, Generic) and not {names, wavelengths} <= {0, bands}:
-            counts = f"{counted(names, 'name')} and {counted(wavelengths, 'wavelength')} of bands"
-            texts[file.path] = f"has {bands} bands, and its tags list {counts}; lists of other lengths are not used"
-    if wrong := [file for file in files if file.other_lens]:
-        others = f", and so in {counted(len(wrong) - 1, 'other file')}" if len(wrong) > 1 else ""
-        advice = "lens, rig and radiometry are not used: give the original images"
-        texts[wrong[0].path] = f"{wrong[0].other_lens}{others}; {advice}"
-    return [Problem(path, InputError(f"{path}: {text}"), is_harmless=True) for path, text in texts.items()]
 
 
 def _similar(file: ImageFile) -> tuple[object, object]:
@@ -373,7 +374,7 @@ def _pose(camera: Camera, tags: Tags, file: ImageFile) -> Pose | None:
     pose = camera.pose(tags)
     if pose is None or pose.focal_length_px is None:
         return pose
-    return replace(pose, focal_length_px=None if file.other_lens else pose.focal_length_px * file.scale.mean)
+    return replace(pose, focal_length_px=None if file.has_other_lens else pose.focal_length_px * file.scale.mean)
 
 
 def _tags_of(reference: Band, files: Sequence[ImageFile]) -> Tags:

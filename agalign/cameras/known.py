@@ -32,6 +32,19 @@ _KNOWN: Sequence[tuple[str, KnownBands]] = (
 )
 """(regular expression of the beginning of EXIF's model, bands) of the cameras with a file for each band."""
 
+_SIZES_PX = (
+    *(("M3M", ((2592, 1944),)), ("FC6360", ((1600, 1300),)), ("Sequoia", ((1280, 960),))),
+    *(("RedEdge-P", ((1456, 1088), (2464, 2056))), ("RedEdge(?!-P)", ((1280, 960),))),
+    *(("Altum$", ((2064, 1544), (160, 120))), ("Altum-PT", ((2064, 1544), (4112, 3008), (320, 256)))),
+)
+"""(regular expression of the beginning of EXIF's model, (width, height) of its images): those of the bands, then of the
+panchromatic and the thermal one.
+"""
+_RAW_STEPS = (("RedEdge(?!-P)", 16), ("FC6360", 64))
+"""(regular expression of the beginning of EXIF's model, common divisor of the raw numbers in 16 bits): sensors of 12
+and 10 bits, as the files of seven cameras show; that of other models is unknown.
+"""
+
 Channels = Mapping[int, tuple[str, float]]
 """{channel of a photograph, from 1: (band, centre wavelength in nm)}."""
 SENTERA_FILTERS: Mapping[str, Channels] = {
@@ -44,16 +57,33 @@ SURVEY3_FILTERS: Mapping[str, Channels] = {
     "NGB": {1: ("NIR", 850.0), 2: ("Green", 550.0), 3: ("Blue", 475.0)},
     "RGB": {1: ("Red", 660.0), 2: ("Green", 550.0), 3: ("Blue", 475.0)},
 }
+
+
+def filter_channels(model: str) -> Channels:
+    """Return the bands in the channels of a MAPIR Survey3 by the filter in its model; empty for other models."""
+    name, _, of_filter = model.upper().rpartition("_")
+    return SURVEY3_FILTERS.get(of_filter, {}) if name.startswith("SURVEY3") else {}
+
+
+def sizes_px(model: str) -> tuple[tuple[int, int], ...]:
+    """Return the sizes (width, height) of the images that a camera of this model writes; empty if they are unknown."""
+    return next((sizes for start, sizes in _SIZES_PX if re.match(start, model, re.IGNORECASE)), ())
+
+
+def raw_step(model: str) -> int:
+    """Return the common divisor of all raw numbers of a camera of this model in 16 bits; 1 if it is unknown."""
+    return next((step for start, step in _RAW_STEPS if re.match(start, model, re.IGNORECASE)), 1)
+
+
 SAME_BAND_NM = 8.0
 """Largest difference of the wavelengths that firmware versions write for a band (840 and 842 nm); those of the two
 halves of a dual camera differ by 12 nm.
 """
 
 
-_OWN_NAMING = (
-    (re.compile(r"_MS_(G|RE?|NIR)(?![a-z0-9])", re.IGNORECASE), MAVIC_3),
-    (re.compile(r"(?<=_\d{6}_\d{6}_\d{4})_(GRE|RED|REG|NIR)(?![a-z0-9])", re.IGNORECASE), SEQUOIA),
-)
+MAVIC_3_PART = rf"_MS_({'|'.join(sorted(MAVIC_3, reverse=True))})(?![a-z0-9])"
+SEQUOIA_PART = rf"(?<=_\d{{6}}_\d{{6}}_\d{{4}})_({'|'.join(SEQUOIA)})(?![a-z0-9])"
+_OWN_NAMING = ((re.compile(MAVIC_3_PART, re.IGNORECASE), MAVIC_3), (re.compile(SEQUOIA_PART, re.IGNORECASE), SEQUOIA))
 """The part of a file's name, by which a camera distinguishes its bands, that no other name has."""
 
 

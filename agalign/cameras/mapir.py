@@ -11,7 +11,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from agalign.cameras.base import Camera
-from agalign.cameras.known import SURVEY3_FILTERS
+from agalign.cameras.known import SURVEY3_FILTERS, filter_channels
 from agalign.cameras.metadata import Tags
 from agalign.values.band_names import own_stem
 from agalign.values.capture import Band
@@ -32,7 +32,7 @@ class Mapir(Camera):
 
     def bands(self, path: Path, tags: Tags, stored: Sequence[Band]) -> tuple[Band, ...]:
         if len(stored) > 1:
-            channels = SURVEY3_FILTERS.get(tags.model.upper().rpartition("_")[2], {})
+            channels = filter_channels(tags.model)
             named = [(b, *channels.get(b.band_index, (f"band_{b.band_index}", None))) for b in stored]
             return tuple(replace(b, name=name, wavelength_nm=nm, one_lens=True) for b, name, nm in named)
         bandpass = re.search(r"-F(?P<wavelength>\d{3,4})$", tags.model)

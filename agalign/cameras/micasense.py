@@ -25,10 +25,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agalign.cameras import pix4d
-from agalign.cameras.base import FULL_SCALE, Camera, is_thermal, rays_to_rig, rotation
+from agalign.cameras.base import Camera, is_thermal, rays_to_rig, rotation
+from agalign.cameras.consistency import clock_error, full_scale, raw_step_of
 from agalign.cameras.metadata import Tags, finite
+from agalign.cameras.sun import Sun, sun_position
 from agalign.values.band_names import own_stem
-from agalign.values.capture import Band, CaptureTime, Pose, Position, Radiometry
+from agalign.values.capture import Band, CaptureTime, Pose, Radiometry, is_clock_set
 
 NAMESPACE, _DLS = "micasense.com/MicaSense", "micasense.com/DLS"
 _REDEDGE_M_PARALLAX = {
@@ -49,7 +51,7 @@ class MicaSense(Camera):
     name = "MicaSense"
     capture_ids = ((NAMESPACE, "CaptureId"),)
     flight_ids = ((NAMESPACE, "FlightId"),)
-    band_in_name = re.compile(r"_\d+$")
+    band_in_name = re.compile(r"(?<=IMG_\d{4})_\d{1,2}(?![a-z0-9])|_\d+$", re.IGNORECASE)
     clock_is_utc = True
 
     def recognises(self, tags: Tags) -> bool:
@@ -62,14 +64,14 @@ class MicaSense(Camera):
         offset = pix4d.lens_offset(tags)
         known_parallax = _REDEDGE_M_PARALLAX.get(band.name) if tags.model == "RedEdge-M" else None
         centikelvin = Radiometry("temperature", 27315.0, 1.0, 0.01)  # in agreement with the Altum's SceneTemperature
-        max_twelve_bit_value = 65520.0  # stored in the upper bits of uint16
+        saturation, max_twelve_bit_value = stored[0].saturation_value, 65520.0  # stored in the upper bits of uint16
         band = replace(
             band,
-            saturation_value=max_twelve_bit_value if band.dtype == "uint16" else band.saturation_value,
+            saturation_value=saturation if saturation is None else min(saturation, max_twelve_bit_value),
             lens=lens,
             to_rig=rays_to_rig(lens, rotation(*pix4d.rig_degrees(tags))),
             parallax_direction=known_parallax if offset is None else (-offset[0], -offset[1]),
-            radiometry=centikelvin if is_thermal(band) else _radiometry(tags),
+            radiometry=centikelvin if is_thermal(band) else _radiometry(tags, stored[0]),
             missing_calibration="" if is_thermal(band) else _without_calibration(tags),
             lens_offset=offset,
         )
@@ -80,10 +82,13 @@ class MicaSense(Camera):
         by_sensor = Pose(*_sensor_attitude_deg(tags), focal_length_px=pix4d.focal_length_px(tags))
         return pix4d.pose_of(tags) or (None if tags.number(_DLS, "Yaw") is None else by_sensor)
 
+    def sun(self, tags: Tags) -> Sun | None:
+        return _sun_by_sensor(tags)
 
-def _radiometry(tags: Tags) -> Radiometry | None:
-    """L = V a1 / g (p - p_black) / (t + a2 y - a3 t y) with p = raw / 65536, vignetting V, gain g = ISO / 100, exposure
-    time t and row y; reflectance = pi L / E with the irradiance E of the light sensor on a horizontal plane.
+
+def _radiometry(tags: Tags, stored: Band) -> Radiometry | None:
+    """L = V a1 / g (p - p_black) / (t + a2 y - a3 t y) with p = raw / 2^bits, vignetting V, gain g = ISO / 100,
+    exposure time t and row y; reflectance = pi L / E with the irradiance E of the light sensor on a horizontal plane.
     """
     a = tags.numbers(NAMESPACE, "RadiometricCalibration")
     exposure_s = finite(tags.exif.get("ExposureTime"))
@@ -97,13 +102,14 @@ def _radiometry(tags: Tags) -> Radiometry | None:
     return Radiometry(
         "radiance",
         tags.black_level,
-        FULL_SCALE,
+        full_scale(stored),
         a[0] / (iso / 100) / exposure_s,
         (centre[0], centre[1]) if has_vignetting else (0.0, 0.0),
         k if has_vignetting else (),
         True,
         a[1] / exposure_s - a[2],
         (math.pi / math.prod(by_sensor), "reflectance") if by_sensor else None,
+        raw_step=raw_step_of(tags, stored),
         tags={"calibration coefficient": a[0], "sensor gain": iso / 100, "exposure time (s)": exposure_s} | of_sensor,
     )
 
@@ -134,17 +140,20 @@ def _measured_irradiance(tags: Tags) -> tuple[float, float] | None:
 
     Older sensors measure only in their own plane: the time, the place and the attitude then give the horizontal one.
     """
-    time = CaptureTime.of(tags.captured_at)
-    is_clock_set = time is not None and time.utc.year > 1970  # others count from 1970
-    sun = sun_position(tags.position, time.utc.timestamp()) if tags.position and time and is_clock_set else None
+    time, by_sensor = CaptureTime.of(tags.captured_at), _sun_by_sensor(tags)
+    is_known = tags.position is not None and time is not None and is_clock_set(tags.captured_at)
+    sun = sun_position(tags.position, time.utc.timestamp()) if tags.position and time and is_known else None
+    is_clock_wrong = bool(clock_error(tags.position, tags.captured_at, by_sensor))
     scale = tags.number(_DLS, "IrradianceScaleToSIUnits")
-    horizontal = _measured_horizontal(tags, sun)
+    horizontal = _measured_horizontal(tags, None if is_clock_wrong else sun)
     if horizontal is not None and horizontal > 0:
         return horizontal, scale or 0.01  # the unit without a tag
     value = tags.number(_DLS, "SpectralIrradiance")
     value = tags.number(pix4d.NAMESPACE, "Irradiance") if value is None else value
     if value is None:
         return None if horizontal is None else (horizontal, scale or 0.01)
+    if is_clock_wrong and by_sensor is not None:
+        sun = None if by_sensor.azimuth is None else (by_sensor.elevation, by_sensor.azimuth)
     if sun is not None:
         value = horizontal_irradiance(value, _sensor_attitude_deg(tags), sun)
     return None if math.isnan(value) else (value, scale or 1.0)
@@ -164,6 +173,12 @@ def _measured_horizontal(tags: Tags, sun: tuple[float, float] | None) -> float |
     return horizontal if abs(horizontal - calculated) < max_horizontal_error * horizontal else calculated
 
 
+def _sun_by_sensor(tags: Tags) -> Sun | None:
+    """The position of the sun by the light sensor; None if the tags lack it, or have zeros in its place."""
+    elevation, azimuth = tags.number(_DLS, "SolarElevation"), tags.number(_DLS, "SolarAzimuth")
+    return Sun(elevation, azimuth) if elevation and elevation > 0 else None
+
+
 def _sensor_attitude_deg(tags: Tags) -> tuple[float, float, float]:
     """(yaw, pitch, roll) of the light sensor; zeros if they are missing, as in MicaSense's library."""
     yaw, pitch, roll = (math.degrees(tags.number(_DLS, name) or 0.0) for name in ("Yaw", "Pitch", "Roll"))
@@ -171,33 +186,6 @@ def _sensor_attitude_deg(tags: Tags) -> tuple[float, float, float]:
 
 
 # ---- the light sensor
-
-
-def sun_position(position: Position, time_s: float) -> tuple[float, float]:
-    """Return (elevation, azimuth clockwise from north) of the sun without refraction at a Unix time.
-
-    Equations of NOAA's solar calculator (gml.noaa.gov/grad/solcalc, after Meeus, Astronomical Algorithms), which are
-    accurate to 0.01 degrees.
-    """
-    days = (time_s - 946728000) / 86400  # since noon on 1 January 2000
-    t = days / 36525
-    anomaly = math.radians(357.52911 + t * (35999.05029 - 0.0001537 * t))
-    centre_deg = math.sin(anomaly) * (1.914602 - 0.004817 * t) + math.sin(2 * anomaly) * 0.019993
-    node = math.radians(125.04 - 1934.136 * t)
-    longitude_deg = 280.46646 + t * 36000.76983 + centre_deg + 0.000289 * math.sin(3 * anomaly) - 0.00569
-    longitude = math.radians(longitude_deg - 0.00478 * math.sin(node))
-    obliquity = math.radians(23.439291 - 0.0130042 * t + 0.00256 * math.cos(node))
-    declination = math.asin(math.sin(obliquity) * math.sin(longitude))
-    right_ascension = math.atan2(math.cos(obliquity) * math.sin(longitude), math.cos(longitude))
-    sidereal_deg = 280.46061837 + 360.98564736629 * days  # Meeus, equation 12.4
-    hour_angle = math.radians(sidereal_deg + position.longitude) - right_ascension
-    latitude = math.radians(position.latitude)
-    north = math.cos(latitude) * math.sin(declination)
-    north -= math.sin(latitude) * math.cos(declination) * math.cos(hour_angle)
-    east = -math.cos(declination) * math.sin(hour_angle)
-    up = math.sin(latitude) * math.sin(declination)
-    up += math.cos(latitude) * math.cos(declination) * math.cos(hour_angle)
-    return math.atan2(up, math.hypot(north, east)), math.atan2(east, north) % math.tau
 
 
 def horizontal_irradiance(measured: float, attitude_deg: tuple[float, float, float], sun: tuple[float, float]) -> float:

@@ -17,7 +17,7 @@ import numpy as np
 
 from agalign.cameras import pix4d
 from agalign.cameras.base import Camera, colour_bands, rays_to_rig, rotation
-from agalign.cameras.known import SEQUOIA
+from agalign.cameras.known import SEQUOIA, SEQUOIA_PART
 from agalign.cameras.metadata import Tags
 from agalign.values.band_names import own_stem
 from agalign.values.capture import Band
@@ -32,7 +32,9 @@ class Sequoia(Camera):
     name = "Parrot Sequoia"
     capture_ids = ((pix4d.NAMESPACE, "CaptureUUID"),)
     flight_ids = ((pix4d.NAMESPACE, "FlightUUID"),)
-    band_in_name = re.compile(rf"_({'|'.join(SEQUOIA)}|RGB)$", re.IGNORECASE)
+    band_in_name = re.compile(
+        rf"{SEQUOIA_PART}|(?<=_\d{{4}})_RGB(?![a-z0-9])|_({'|'.join(SEQUOIA)}|RGB)$", re.IGNORECASE
+    )
 
     def recognises(self, tags: Tags) -> bool:
         return tags.make.lower() == "parrot" or tags.text(pix4d.NAMESPACE, "RigName").lower().startswith("sequoia")
@@ -48,7 +50,7 @@ class Sequoia(Camera):
             return colour_bands(stored, lens, to_rig)
         suffix = self.band_in_name.search(own_stem(path))
         described = pix4d.described(stored[0], tags, path.stem)
-        name = SEQUOIA.get(suffix[1].upper(), (suffix[1], 0.0))[0] if suffix else described.name
+        name = SEQUOIA.get(suffix[0][1:].upper(), (suffix[0][1:], 0.0))[0] if suffix else described.name
         band = replace(described, name=name, lens=lens, to_rig=to_rig)
         # Parrot's formula for them has not been compared with a reference.
         why = "no tags for radiance (SensorModel and IrradianceList are not used)"

@@ -1,82 +1,43 @@
 """Reading the tags and bands of many image files, in one process or several."""
 
-import re
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from multiprocessing import get_context
 from pathlib import Path
 
 from agalign.cameras import known_cameras
 from agalign.cameras.base import Camera
+from agalign.cameras.consistency import (
+    clock_doubt,
+    clock_error,
+    full_scale,
+    lens_of_other_image,
+    normalized,
+    part_of_image,
+    pixel_scale,
+)
+from agalign.cameras.image_file import Doubt, ImageFile, Problem
 from agalign.cameras.metadata import Tags, read_tags
 from agalign.cameras.pix4d import panel_in
 from agalign.cameras.tiff_directory import image_pages
 from agalign.config import DiscoverOptions
-from agalign.errors import AgalignError, UnreadableFileError
+from agalign.errors import UnreadableFileError
 from agalign.pixels.radiometry import plausible
-from agalign.pixels.raster import probe, suffix_format
+from agalign.pixels.raster import probe, suffix_format, value_step
 from agalign.values import geometry
 from agalign.values.capture import Band
 from agalign.values.lens import rescaled
-from agalign.values.pixel_units import SAME_PIXELS, PixelScale, Size
+from agalign.values.pixel_units import SAME_PIXELS, PixelScale
 from agalign.values.process_pool import ProcessPool, WorkerDiedError
 from agalign.values.processes import environment_of_children, silence_libraries
 from agalign.values.text import shortened
-
-
-@dataclass(frozen=True)
-class Problem:
-    """A file or capture that is skipped, or used with fewer tags, and the reason.
-
-    Examples
-    --------
-    >>> from pathlib import Path
-    >>> _ = Path("flight/IMG_0009_1.tif").write_bytes(b"")
-    >>> (problem,) = agalign.discover("flight").problems
-    >>> problem.text, problem.is_harmless
-    ('flight/IMG_0009_1.tif: is empty; copy it from the card again', False)
-    """
-
-    path: Path
-    """The file."""
-    error: AgalignError
-    """The reason."""
-    is_harmless: bool = False
-    """True for a file with the same bytes, or the same capture id, name and size, as another one, which takes part, and
-    for a file used with fewer tags."""
-
-    @property
-    def text(self) -> str:
-        """The message, one line with the file and the remedy."""
-        return str(self.error)
-
 
 _FILES_PER_TASK = 100
 """If a file crashes the process, the other files of its task are lost; smaller tasks take more time per file."""
 _MIN_FILES_FOR_PROCESSES = 1000
 """Reading fewer files takes less time than starting processes."""
-
-
-@dataclass(frozen=True)
-class ImageFile:
-    """One image file with its tags and bands."""
-
-    path: Path
-    camera: Camera
-    tags: Tags
-    bands: tuple[Band, ...]
-    """Empty if the file contains no band that takes part."""
-    scale: PixelScale = SAME_PIXELS
-    """Size of the image relative to that of the camera, by EXIF, from which the tags in pixels were rescaled."""
-    other_lens: str = ""
-    """Why the lens in the tags is not that of the image, in words; it is left out with what depends on it."""
-
-    @property
-    def is_whole_capture(self) -> bool:
-        """True for a file of several bands with a lens each."""
-        return len(self.bands) > 1 and not self.bands[0].one_lens
 
 
 def read_files(paths: Sequence[Path], options: DiscoverOptions) -> Iterator[ImageFile | Problem]:
@@ -107,18 +68,47 @@ def read_file(path: Path, cameras: Iterable[Camera], options: DiscoverOptions) -
     if len(pages) > 1:
         named = [replace(band, band_index=band.page) for band in named]
     named = [replace(band, name=shortened(band.name)) for band in named]
-    panel, scale = panel_in(tags, size_px), _scale(tags, size_px)
+    panel = panel_in(tags, size_px)
     used = (replace(b, panel=panel) for b in named if options.with_rgb or not b.is_from_photograph)
-    checked = [_with_lens_of_image(band, scale) for band in used]
-    other_lens = next((why for _, why in checked if why), "")
-    return ImageFile(path, camera, tags, tuple(_with_plausible_tags(band) for band, _ in checked), scale, other_lens)
+    checked = [_of_image(band, tags, is_raw=_has_few_bits(stored[0])) for band in used]
+    bands = tuple(_with_plausible_tags(band, tags) for band, _, _ in checked)
+    scale = checked[0][1] if checked else SAME_PIXELS
+    other_lens = next((why for *_, why in checked if why), "")
+    return ImageFile(
+        path, camera, tags, bands, scale, bool(other_lens), tuple(_doubts(camera, tags, bands, other_lens))
+    )
 
 
-def _scale(tags: Tags, size_px: Size) -> PixelScale:
-    """The scale of an image of (width, height) that was resized, by the camera's own size in EXIF."""
-    scale = PixelScale.between(tags.camera_size_px or size_px, size_px)
-    is_resized = abs(scale.x - scale.y) * max(size_px) < 2 * max(scale)  # sides of whole pixels
-    return scale if is_resized else SAME_PIXELS
+def _doubts(camera: Camera, tags: Tags, bands: Sequence[Band], other_lens: str) -> Iterator[Doubt]:
+    """What two sources in a file give differently."""
+    if other_lens:
+        yield Doubt(other_lens, "lens, rig and radiometry are not used: give the original images")
+    if error := clock_error(tags.position, tags.captured_at, camera.sun(tags)):
+        yield clock_doubt(error)
+    if (text := normalized(tags)) and any(text in band.missing_calibration for band in bands):
+        yield Doubt(text, "radiometry is not used: give the original images")
+
+
+def _has_few_bits(stored: Band) -> bool:
+    """True for a file that declares fewer bits than its type has, as only cameras write it."""
+    return stored.dtype == "uint16" and full_scale(stored) < 1 << 16
+
+
+def _of_image(band: Band, tags: Tags, *, is_raw: bool) -> tuple[Band, PixelScale, str]:
+    """Return the band with what its tags give in pixels as it is for its image, the size of this relative to the
+    camera's, and why these tags are not used; empty if they are.
+    """
+    min_step = 4  # of raw numbers in 16 bits, 16 to 64; averages have all values
+
+    def has_steps() -> bool:
+        return is_raw or (band.dtype == "uint16" and value_step(band) >= min_step)
+
+    scale = pixel_scale(tags, band, has_steps)
+    if scale is None:
+        why = part_of_image(tags, band)
+        return _without_lens(band, why), SAME_PIXELS, why
+    result, why = _with_lens_of_image(band, scale)
+    return result, scale, why
 
 
 def _with_lens_of_image(band: Band, scale: PixelScale) -> tuple[Band, str]:
@@ -128,23 +118,27 @@ def _with_lens_of_image(band: Band, scale: PixelScale) -> tuple[Band, str]:
     if scale != SAME_PIXELS:
         planes = band.to_rig, band.other_to_rig
         to_rig, other = (None if h is None else geometry.rescale(h, scale, SAME_PIXELS) for h in planes)
-        radiometry = band.radiometry and band.radiometry.rescaled(scale)
+        radiometry = band.radiometry and replace(band.radiometry.rescaled(scale), raw_step=1)
         band = replace(band, lens=rescaled(band.lens, scale), to_rig=to_rig, other_to_rig=other, radiometry=radiometry)
     if band.lens is None or band.lens.is_plausible(band.size_px):
         return band, ""
-    (width, height), lens = band.size_px, band.lens
-    at = f"focal length {lens.fx_px:.0f} px, optical centre {lens.cx_px:.0f}, {lens.cy_px:.0f} px"
-    why = f"the lens in the tags ({at}) is not that of an image of {width} x {height} px"
+    why = lens_of_other_image(band)
+    return _without_lens(band, why), why
+
+
+def _without_lens(band: Band, why: str) -> Band:
     band = replace(band, lens=None, to_rig=None, other_to_rig=None)
     if band.radiometry is not None and band.radiometry.is_of_light:  # its vignetting is of the same image
         band = replace(band, radiometry=None, missing_calibration=f"no usable tags for radiance ({why})")
-    return band, why
+    return band
 
 
-def _with_plausible_tags(band: Band) -> Band:
+def _with_plausible_tags(band: Band, tags: Tags) -> Band:
     """The band without a calibration, or its factor to reflectance, by implausible tags."""
     if band.radiometry is None:
         return band
+    if band.radiometry.is_of_light and (problem := normalized(tags)):
+        return replace(band, radiometry=None, missing_calibration=f"no usable tags for radiance ({problem})")
     radiometry, problem = plausible(band.radiometry, band.size_px)
     reason = f"no usable tags for radiance ({problem})" if radiometry is None else ""
     return replace(band, radiometry=radiometry, implausible=problem, missing_calibration=reason)
@@ -204,9 +198,3 @@ def _read_task(paths: Iterable[Path], options: DiscoverOptions) -> list[ImageFil
         except UnreadableFileError as error:
             result.append(Problem(path, error))
     return result
-
-
-def natural_order(name: str) -> list[tuple[bool, int, str]]:
-    """Return a sort key that puts `_2` before `_10`."""
-    parts = re.split(r"(\d+)", name)
-    return [(part.isdecimal(), int(part) if part.isdecimal() else 0, part.lower()) for part in parts]

@@ -265,6 +265,8 @@ def _read_toml(path: Path) -> dict[str, Any]:
         return tomllib.loads(read_regular(path).decode("utf-8-sig"))
     except FileNotFoundError:
         raise typer.BadParameter(f"{path} does not exist") from None
+    except UnicodeDecodeError:
+        raise typer.BadParameter(f"{path} is not in UTF-8; save it as UTF-8") from None
     except (OSError, ValueError, RecursionError) as error:
         reason = getattr(error, "strerror", None) or error
         raise typer.BadParameter(f"{path} cannot be read as TOML ({reason})") from None

@@ -123,7 +123,7 @@ def _unreadable_files(flight: "FolderScan") -> dict[str, list[str]]:
 
 def _show_unused(flight: "FolderScan", terminal: Terminal) -> None:
     """Print what a folder without captures contains, and why none of it is used."""
-    from agalign.cameras.discover import IMAGE_KINDS, image_files, other_files
+    from agalign.cameras.image_search import IMAGE_KINDS, image_files, other_files
 
     reasons: Counter[tuple[str, str]] = Counter()
     known = {p.path: p.text.removeprefix(f"{p.path}: ") for p in flight.problems}

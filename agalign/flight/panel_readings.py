@@ -177,11 +177,13 @@ def reflectance_factors(capture: Capture, readings: Iterable[PanelReading]) -> d
         factor = albedo / (radiance of the panel) * E_p / E
 
     E_p / E is 1 without a sensor, and if the sensor was not in the same light as one of the panels. Between the panels
-    of the camera, the reciprocals are interpolated linearly in time; they are constant outside. Empty if the time of
-    the capture or of all panels is unknown.
+    of the camera, the reciprocals are interpolated linearly in time; they are constant outside. Without a time of the
+    capture or of the panels, `_without_clock` may tell the panel; else empty.
     """
-    near = [(s, r) for s, r in _within_hours(readings, capture) if camera_key(r.capture) == camera_key(capture)]
-    age_s = min((abs(later_s) for later_s, _ in near), default=0.0)
+    of_camera = [r for r in readings if camera_key(r.capture) == camera_key(capture)]
+    timed = _within_hours(of_camera, capture)
+    near = timed or _without_clock(of_camera, capture)
+    age_s = min((abs(later_s) for later_s, _ in timed), default=None)
     fits_sensor, result = all(r.fits_sensor for _, r in near), {}
     for band in capture.bands:
         samples = [(s, b) for s, r in near for b in r.bands if b.band.name == band.name]
@@ -211,7 +213,7 @@ def missing_panel(capture: Capture, readings: Sequence[PanelReading]) -> str:
     if not of_camera:
         other = readings[0].capture
         return f"the panel in {other.label} was photographed by {camera_key(other)}, not by {camera_key(capture)}"
-    if not (near := _within_hours(of_camera, capture)):
+    if not (near := _within_hours(of_camera, capture) or _without_clock(of_camera, capture)):
         return _far_in_time(capture, of_camera)
     readable = [(r.capture.label, b) for _, r in near for b in r.bands if b.band.name in lacking]
     for label, reading in sorted(readable, key=lambda one: not one[1].problem):
@@ -225,6 +227,9 @@ def missing_panel(capture: Capture, readings: Sequence[PanelReading]) -> str:
 def _far_in_time(capture: Capture, readings: Sequence[PanelReading]) -> str:
     """Return in words how far the nearest panel is from a capture, or which time is unknown."""
     time_s, panels = capture.time_s, [r.capture for r in readings]
+    unset = [c for c in (capture, *panels) if c.captured_at and not c.known_time]
+    if unset and len(unset) <= len(panels):
+        return f"the clock of {unset[0].label} was not set, so that no panel is known to be of the flight"
     if time_s is None or all(panel.time_s is None for panel in panels):
         unknown = capture if time_s is None else panels[0]
         return f"the time of {unknown.label} is unknown, so that no panel is known to be of the flight"
@@ -258,6 +263,27 @@ def _within_hours(readings: Iterable[PanelReading], capture: Capture) -> list[tu
     time_s = math.nan if capture.time_s is None else capture.time_s
     timed = [(panel_time_s - time_s, r) for r in readings if (panel_time_s := r.capture.time_s) is not None]
     return [(later_s, r) for later_s, r in timed if abs(later_s) <= MAX_TIME_DIFFERENCE_S]
+
+
+def _without_clock(readings: Sequence[PanelReading], capture: Capture) -> list[tuple[float, PanelReading]]:
+    """Return (0, reading) of the panel that a capture has if the clock of one of the two was not set: the only panel of
+    the camera, or the next one by the number in its name, in the folder of the capture.
+    """
+    unset = [r for r in readings if bool(r.capture.known_time) != bool(capture.known_time)]
+    if len(readings) == 1:
+        return [(0.0, r) for r in unset]
+    numbers = [(r, _number(r.capture)) for r in unset if r.capture.folder == capture.folder]
+    own = _number(capture)
+    distances = [
+        (abs(number - own), i) for i, (_, number) in enumerate(numbers) if number is not None and own is not None
+    ]
+    return [(0.0, numbers[min(distances)[1]][0])] if distances else []
+
+
+def _number(capture: Capture) -> int | None:
+    """The last number in the name of a capture."""
+    found = re.findall(r"\d{1,9}", capture.name)
+    return int(found[-1]) if found else None
 
 
 def _interpolated(samples: list[tuple[float, float]]) -> float:

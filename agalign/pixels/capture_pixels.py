@@ -1,7 +1,5 @@
 """The pixels of the files of one capture, each file read once for all steps that use it."""
 
-from pathlib import Path
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -15,7 +13,7 @@ class CapturePixels:
     """Reads the bands of a capture, and holds them as long as they fit into MAX_CAPTURE_BYTES."""
 
     def __init__(self) -> None:
-        self._held: dict[tuple[Path, int, int], tuple[NDArray[np.generic], Mask]] = {}
+        self._held: dict[tuple[object, ...], tuple[NDArray[np.generic], Mask]] = {}
         self._bytes = 0
 
     def read(self, band: Band, tile: Tile) -> tuple[NDArray[np.generic], Mask]:
@@ -23,7 +21,7 @@ class CapturePixels:
 
         They are parts of held arrays and must not be changed. Raises UnreadableFileError.
         """
-        key = band.path, band.page, band.band_index
+        key = band.path, band.page, band.band_index, band.missing
         if key not in self._held:
             size_bytes = band.width_px * band.height_px * (np.dtype(band.dtype).itemsize + 1)
             if self._bytes + size_bytes > MAX_CAPTURE_BYTES:

@@ -18,7 +18,7 @@ from agalign.errors import InputError
 from agalign.pixels.raster import ReadTile, read_for_alignment
 from agalign.values.capture import Band, Capture, PanelFactor, Quantity, Radiometry, RadiometrySource
 from agalign.values.choices import RadiometryChoice
-from agalign.values.image import FloatImage
+from agalign.values.image import FloatImage, Tile
 
 _PLAUSIBLE: Mapping[str, tuple[float, float]] = {
     "exposure time (s)": (1e-6, 1.0),  # images of a moving camera are blurred from 0.01 s
@@ -40,6 +40,12 @@ light. Single pixels, as of sun glint, are brighter.
 _MAX_BELOW_BLACK = 0.01
 """Minimum median of a band above the black level, negative, relative to the full scale. Water in the near infrared is
 at the black level, which drifts by 0.5 % of the full scale.
+"""
+_MAX_SHARE_OFF_STEPS = 0.05
+"""Of the pixels: retouched hot pixels and edges of masks are fewer."""
+_MIN_FLOOR, _MIN_FLOOR_SHARE = 0.04, 0.25
+"""Of the darkest pixels without a black level, relative to the full scale and the median: sensors have a black level of
+0.06 of the full scale, and scenes have shadows.
 """
 _STRIP_PX = 1 << 15
 """Pixels that are calibrated at once: their intermediate results fit into the CPU's cache, which takes half the time.
@@ -78,6 +84,8 @@ def check_pixels(band: Band, read: ReadTile) -> None:
     if band.radiometry is None or band.radiometry.quantity == "temperature":
         return
     longest_side_px, radiometry = 256, band.radiometry
+    if problem := _processed(band, read):
+        raise InputError(f"{band.path}: {problem}; give the original image, or leave --radiometry out")
     image = read_for_alignment(band, longest_side_px, read)
     raw = float(np.median(image.pixels[image.valid])) if image.valid.any() else radiometry.black_level
     signal = (raw - radiometry.black_level) / radiometry.full_scale
@@ -88,6 +96,27 @@ def check_pixels(band: Band, read: ReadTile) -> None:
     else:
         return
     raise InputError(f"{band.path}: {problem}; take the capture out, or leave --radiometry out")
+
+
+def _processed(band: Band, read: ReadTile) -> str:
+    """Return in words how the pixels of a band differ from raw numbers, which its tags are for; empty if they do not.
+
+    Raises UnreadableFileError.
+    """
+    radiometry = band.radiometry
+    if radiometry is None or not (radiometry.raw_step > 1 or radiometry.black_level == 0):
+        return ""
+    pixels, valid = read(band, Tile(0, 0, *band.size_px))
+    values = pixels[valid]
+    if not values.size:
+        return ""
+    if radiometry.raw_step > 1 and (share := np.mean(values % radiometry.raw_step != 0)) > _MAX_SHARE_OFF_STEPS:
+        what = f"{share:.0%} of its pixels are not multiples of {radiometry.raw_step}"
+        return f"{what}, as raw numbers of this camera are: a program has calibrated or changed them"
+    floor, median = np.percentile(values.astype(np.float64), (0.1, 50.0)).tolist()
+    if radiometry.black_level == 0 and floor > max(_MIN_FLOOR * radiometry.full_scale, _MIN_FLOOR_SHARE * median):
+        return f"its darkest pixels ({floor:.0f}) are far above its black level of 0: a program has changed one of them"
+    return ""
 
 
 def with_radiometry(capture: Capture, choice: RadiometryChoice, by_panel: Mapping[str, PanelFactor]) -> Capture:

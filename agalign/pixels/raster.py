@@ -4,6 +4,7 @@ import ctypes
 import math
 import stat
 import warnings
+from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import replace
@@ -23,7 +24,7 @@ from rasterio.windows import Window
 
 from agalign.errors import UnreadableFileError
 from agalign.pixels.coordinates import ensure_proj_data
-from agalign.pixels.masks import data_mask, learnable, undeclared_fill
+from agalign.pixels.masks import data_mask, learnable, missing_end, undeclared_fill, without_parts
 from agalign.values import lens
 from agalign.values.capture import Band, Capture, Georeference
 from agalign.values.choices import MAX_PIXELS
@@ -253,6 +254,46 @@ def _with_saturation_value(band: Band, read: ReadTile) -> Band:
     return replace(band, saturation_value=float(top)) if is_saturated and at_top < values.size else band
 
 
+def with_missing_parts(capture: Capture, read: ReadTile | None = None) -> Capture:
+    """Return the capture with the parts that the files of single bands lack at their end (`masks.missing_end`).
+
+    Stacks, maps and floating-point images, which programs fill at their borders, and files with a mask or a nodata
+    value are unchanged, and bands that cannot be read. `read` reads the pixels, by default `read_tile`.
+    """
+    bands_of = Counter((b.path, b.page) for b in capture.bands)
+    is_single = [bands_of[b.path, b.page] == b.index_in_page == 1 for b in capture.bands]
+    bands = zip(capture.bands, is_single, strict=True)
+    return replace(capture, bands=tuple(_with_missing_parts(b, read or read_tile) if one else b for b, one in bands))
+
+
+def _with_missing_parts(band: Band, read: ReadTile) -> Band:
+    is_raw = band.nodata is None and not band.has_mask and band.georeference is None
+    if not is_raw or np.dtype(band.dtype).kind not in "ui":
+        return band
+    corner_px = min(16, band.width_px)  # rows of images have several values
+    try:
+        last, _ = read(band, Tile(band.width_px - corner_px, band.height_px - 1, corner_px, 1))
+        if (last != last[0, 0]).any():
+            return band
+        pixels, _ = read(band, Tile(0, 0, *band.size_px))
+        with open_raster(band.path, band.page) as dataset:
+            block_height, block_width = dataset.block_shapes[band.index_in_page - 1]
+    except UnreadableFileError:
+        return band
+    parts = missing_end(pixels, (block_width, block_height), band.saturation_value)
+    return replace(band, missing=tuple(parts))
+
+
+def value_step(band: Band) -> int:
+    """Return the greatest common divisor of all pixels of a band of integers, such as 16 for 12 bits in the upper bits
+    of 16; 1 for other types. Raises UnreadableFileError.
+    """
+    if np.dtype(band.dtype).kind not in "ui":
+        return 1
+    pixels, valid = read_tile(band, Tile(0, 0, *band.size_px))
+    return max(1, int(np.gcd.reduce(np.unique(pixels[valid]).astype(np.int64), initial=0)))
+
+
 def read_for_alignment(band: Band, longest_side_px: int, read: ReadTile | None = None) -> Raster:
     """Read a band as float32, reduced by averaging to at most `longest_side_px`, and its mask.
 
@@ -275,6 +316,7 @@ def read_for_alignment(band: Band, longest_side_px: int, read: ReadTile | None =
             valid &= _dataset_mask(dataset, band.index_in_page, out_shape=shape, resampling=Resampling.nearest)
     if band.nodata is None:
         valid &= ~undeclared_fill(pixels)
+    valid = without_parts(valid, band.missing, Tile(0, 0, *band.size_px))
     valid = learnable(valid, pixels, band.saturation_value)
     scale = PixelScale.between(band.size_px, (shape[1], shape[0]))
     result = pixels.astype(np.float32)
@@ -294,7 +336,8 @@ def read_tile(
             return read_tile(band, tile, opened)
     window = Window(tile.x0, tile.y0, tile.width, tile.height)
     pixels = dataset.read(band.index_in_page, window=window)
-    return pixels, data_mask(pixels, band.nodata) & _dataset_mask(dataset, band.index_in_page, window=window)
+    valid = data_mask(pixels, band.nodata) & _dataset_mask(dataset, band.index_in_page, window=window)
+    return pixels, without_parts(valid, band.missing, tile)
 
 
 def read_preview(

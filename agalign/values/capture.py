@@ -13,6 +13,7 @@ from pydantic import dataclasses as validated
 from agalign.values.equality import equal
 from agalign.values.fields import RECORD, Name, Number
 from agalign.values.geometry import Matrix
+from agalign.values.image import Tile
 from agalign.values.lens import Lens
 from agalign.values.pixel_units import PixelScale
 
@@ -59,7 +60,10 @@ class Radiometry:
     factor: float = 1.0
     """The factor from radiance to reflectance, which `gain` includes."""
     panel_age_s: float | None = None
-    """Time between the capture and the nearest panel, if `source` includes a panel."""
+    """Time between the capture and the nearest panel, if `source` includes a panel and it is known."""
+    raw_step: int = 1
+    """Common divisor of all raw numbers of the camera, such as 16 for 12 bits in the upper bits of 16; 1 if none is
+    known."""
     tags: Mapping[str, float] = field(default_factory=dict)
     """The values of tags that `gain` is calculated from, with the names of `pixels.radiometry`."""
 
@@ -102,6 +106,12 @@ class CaptureTime(NamedTuple):
         return None
 
 
+MIN_APART_S = 2.0
+"""Between the exposures of two bands that are not of one moment: times in tags may have whole seconds, and those of one
+capture differ by less.
+"""
+
+
 def is_clock_set(time: str) -> bool:
     """Return False for a time, which begins with the year, of a clock that was not set: cameras count from 1970."""
     return time >= "1971"
@@ -112,8 +122,8 @@ class PanelFactor(NamedTuple):
 
     value: float
     source: RadiometrySource
-    age_s: float
-    """Time between the capture and the nearest panel."""
+    age_s: float | None
+    """Time between the capture and the nearest panel; None if one of their clocks was not set."""
 
 
 PanelSource = Literal["tags", "QR code", "look"]
@@ -197,6 +207,9 @@ class Band:
     """Georeference of the file."""
     scale_offset: tuple[float, float] = (1.0, 0.0)
     """(scale, offset): value = scale * number in the file + offset."""
+    missing: tuple[Tile, ...] = ()
+    """Parts at the end of a damaged file that it has no pixels of: all have one value. Known of the bands that
+    `pixels.raster.with_missing_parts` returns."""
     overviews: tuple[int, ...] = ()
     """Reduction factors of the overviews in the file."""
     radiometry: Radiometry | None = None
@@ -212,6 +225,11 @@ class Band:
     def size_px(self) -> tuple[int, int]:
         """(width, height) in pixels."""
         return self.width_px, self.height_px
+
+    @property
+    def missing_rows(self) -> int:
+        """Number of rows at the end of the image that lack pixels, all or some."""
+        return self.height_px - min((part.y0 for part in self.missing), default=self.height_px)
 
     @property
     def index_in_page(self) -> int:

@@ -189,6 +189,14 @@ def file_name(text: str, taken: MutableMapping[str, str] | None = None) -> str:
     return stem + suffix
 
 
+def max_name_bytes(folder: Path) -> int:
+    """Return how many bytes a file's name may have in a folder, which may not exist yet: 255, or fewer on some NAS."""
+    existing = next((p for p in (folder, *folder.absolute().parents) if p.exists()), folder)
+    with suppress(OSError, ValueError, AttributeError):  # other systems have no pathconf
+        return min(_MAX_PART_BYTES, os.pathconf(existing, "PC_NAME_MAX"))
+    return _MAX_PART_BYTES
+
+
 def check_inside(path: Path, folder: Path) -> Path:
     """Return a path below a folder. Raises OutputError if a symbolic link leads out of the folder."""
     if not Path(os.path.realpath(path)).is_relative_to(os.path.realpath(folder)):

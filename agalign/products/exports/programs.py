@@ -9,8 +9,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from agalign.cameras import pix4d
+from agalign.cameras.image_file import natural_order
 from agalign.cameras.metadata import read_tags
-from agalign.cameras.read_files import natural_order
 from agalign.errors import ConfigurationError, InputError, OutputError
 from agalign.products.rasters.aligned_files import BandFiles
 from agalign.products.run.captures import LeftOut, RunCapture, captures_of_run, like_most

@@ -105,7 +105,7 @@ def band_file_names(capture: Capture) -> dict[str, Path]:
     has_namesakes = len({p.stem for p in files}) < len(files)
     by_folder = has_namesakes and len({p.parent for p in files}) > 1
     names: dict[str, Path] = {}
-    taken: dict[Path, Path] = {}
+    taken: dict[str, Path] = {}  # in lower case: some file systems ignore it
     band_names: dict[str, str] = {}
     for band in capture.bands:
         stem = f"{band.path.stem}_{file_name(band.name, band_names)}" if band.path in split else band.path.stem
@@ -113,9 +113,10 @@ def band_file_names(capture: Capture) -> dict[str, Path]:
         suffix = band.path.suffix if suffix_format(band.path) == "TIFF" else ".tif"
         name = Path(folder, f"{stem}{suffix}")
         # The name of the stack, or of another input file with a different suffix.
-        if name == Path(f"{capture.name}.tif") or taken.get(name, band.path) != band.path:
+        is_stack = str(name).lower() == f"{capture.name}.tif".lower()
+        if is_stack or taken.get(str(name).lower(), band.path) != band.path:
             name = Path(folder, f"{stem}_{band.path.suffix[1:].lower()}.tif")
-        taken[name] = band.path
+        taken[str(name).lower()] = band.path
         names[band.name] = name
     return names
 
@@ -325,7 +326,9 @@ def nodata_value(context: ProductContext, layers: Sequence[Layer], dtype: np.dty
         return declared
     if dtype.kind == "f":
         return math.nan  # input files may contain nan without declaring it
-    may_lack_pixels = any(la.is_gap or la.band.nodata is not None or la.band.has_mask for la in layers)
+    may_lack_pixels = any(
+        la.is_gap or la.band.nodata is not None or la.band.has_mask or la.band.missing for la in layers
+    )
     return _unused_value(layers, grid, dtype) if grid.has_gaps or may_lack_pixels else None
 
 
@@ -351,7 +354,8 @@ def _unused_value(layers: Sequence[Layer], grid: OutputGrid, dtype: np.dtype[Any
     """
     copied = []
     for layer in (one for one in layers if one.is_copied):
-        copied += [np.unique(layer.read(layer.band, tile)[0]) for tile in tiles(grid.tile, WORK_TILE_PX)]
+        read = (layer.read(layer.band, tile) for tile in tiles(grid.tile, WORK_TILE_PX))
+        copied += [np.unique(pixels[valid] if layer.band.missing else pixels) for pixels, valid in read]
     limits = np.iinfo(str(dtype))
     # All values of a 16-bit type; for larger types the first ones are sufficient.
     candidates = itertools.chain([0, limits.max], range(1, min(limits.max, 1 << 16)))

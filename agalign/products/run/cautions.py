@@ -16,17 +16,8 @@ from agalign.flight.rig_file import model_fingerprint
 from agalign.products.run.excluded import PanelPart, read_excluded
 from agalign.products.run.record import last_record
 from agalign.products.sidecar.schema import BandResult, Sidecar
-from agalign.values.capture import CaptureTime
-from agalign.values.issues import (
-    CONTRADICTED,
-    MISSING_BAND,
-    MOSAICS,
-    OF_FILES,
-    TEXTURELESS,
-    UNEXPECTED_PX,
-    UNREADABLE_BAND,
-    Remedy,
-)
+from agalign.values.capture import MIN_APART_S, CaptureTime
+from agalign.values.issues import MISSING_BAND, MOSAICS, OF_FILES, TEXTURELESS, UNEXPECTED_PX, UNREADABLE_BAND, Remedy
 
 MAX_PIXEL_ERROR_PX = 1.0
 """Beyond it, a spectral index mixes neighbouring plants."""
@@ -69,6 +60,10 @@ _OLD_PANEL = Remedy(
     "the light may have changed since the nearest calibration panel",
     "record a panel before and after each flight, or use a light sensor (--radiometry sun)",
 )
+_PANEL_WITHOUT_TIME = Remedy(
+    "the clock of the calibration panel was not set: the only panel, or the next one by its number, is used",
+    "make sure that the panel is of this flight; --exclude leaves its capture out",
+)
 _OLD_MODEL = Remedy(
     "aligned with an earlier model of the flight: images, captures or options have changed since",
     "--overwrite aligns all captures with the model of the whole flight",
@@ -78,6 +73,11 @@ _NOT_IN_INPUT = Remedy(
 )
 _SATURATED = Remedy(
     "saturated pixels", "--qa and then 'agalign indices --mask-qa' leave them out; expose the next flight for less time"
+)
+
+
+_INCOMPLETE_FILE = Remedy(
+    "a file is incomplete at its end: the rows that it lacks are nodata", "copy the file from the card again"
 )
 
 
@@ -136,6 +136,11 @@ class RunFacts:
                 reason = f"{band.saturated:.1%} of the pixels are saturated"
                 size_text = "up to {:.1%} of a band"
                 yield Caution(band.band, "check", _SATURATED, reason, band.saturated, band.saturated, size_text)
+            if band.missing_rows and band.size_px is not None:
+                lost = band.missing_rows / band.size_px[1]
+                rows = f"the last {band.missing_rows} rows of {Path(band.file).name}"
+                reason = f"{rows} are empty, all of one value: copy it again"
+                yield Caution(band.band, "check", _INCOMPLETE_FILE, reason, lost, lost, "up to {:.0%} of a band")
         for name in sidecar.missing_bands:
             remedy = UNREADABLE_BAND if name in sidecar.unreadable_bands else MISSING_BAND
             yield Caution(name, "missing", remedy, sidecar.unreadable_bands.get(name, remedy.cause), 1.0)
@@ -156,7 +161,10 @@ class RunFacts:
         choice = (sidecar.options or {}).get("write", {}).get("radiometry", "auto")
         remedy = Remedy(_CONTRADICTION, _PANEL_ADVICE.get(choice, _PANEL_ADVICE["auto"]))
         is_old = age_s > _MAX_PANEL_AGE_S and "light sensor" not in (output.radiometry or "")
+        is_by_panel = "panel" in (output.radiometry or "")
         for band in sidecar.bands:
+            if is_by_panel and output.panel_age_s is None:
+                yield Caution(band.band, "check", _PANEL_WITHOUT_TIME, _PANEL_WITHOUT_TIME.cause, 0.0)
             if band.band in scales:
                 scale = scales[band.band]
                 error = max(scale, 1 / scale) - 1
@@ -194,7 +202,11 @@ def _of_alignment(band: BandResult, sidecar: Sidecar) -> Iterator[Caution]:
             size, size_text = band.prediction.std_px, "standard error up to {:.2f} px"
             if band.is_usable(sidecar.max_predicted_px):
                 lost = max(over_1_px, _UNVERIFIED_PIXELS if remedy is BLURRED else 0.0)
-        yield Caution(band.band, band.status, remedy, band.reason or "", lost, size, size_text)
+        reason = band.reason or ""
+        if remedy is _APART and band.exposed_after_s is not None:
+            way = "after" if band.exposed_after_s > 0 else "before"
+            reason = f"exposed {abs(band.exposed_after_s):.0f} s {way} the reference; {reason}"
+        yield Caution(band.band, band.status, remedy, reason, lost, size, size_text)
     elif over_1_px > _MIN_SHARE_OVER_1_PX:
         reason = f"{over_1_px:.0%} of the pixels may be off by more than {MAX_PIXEL_ERROR_PX:g} px"
         yield Caution(band.band, "check", _INACCURATE, reason, over_1_px, over_1_px, "up to {:.0%} of a band")
@@ -209,8 +221,6 @@ def _of_alignment(band: BandResult, sidecar: Sidecar) -> Iterator[Caution]:
         yield Caution(band.band, status, UNEXPECTED_PX.remedy, reason, lost, prediction.off_px, text)
 
 
-_MIN_APART_S = 2.0
-"""Between the exposures of two bands: times in tags may have whole seconds, and those of one capture differ by less."""
 _APART = Remedy(
     "the band and the reference were exposed at different times, while the camera or the scene moved",
     "look at the times in the tags; --pattern assigns files to captures, --bands omits the band",
@@ -224,6 +234,10 @@ def remedy_of(band: BandResult, *, is_mosaic: bool) -> Remedy:
     kind = band.issues[0].kind
     if is_mosaic and kind not in OF_FILES:
         return MOSAICS
-    if abs(band.exposed_after_s or 0.0) >= _MIN_APART_S and kind.remedy in CONTRADICTED:
+    if _is_exposed_apart(band) and kind not in OF_FILES:
         return _APART
     return BLURRED if band.status == "predicted" and kind.remedy is TEXTURELESS else kind.remedy
+
+
+def _is_exposed_apart(band: BandResult) -> bool:
+    return abs(band.exposed_after_s or 0.0) >= MIN_APART_S

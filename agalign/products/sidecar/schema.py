@@ -288,6 +288,8 @@ class BandResult(_Part):
     """Where the aligned pixels of the band are."""
     saturated: Number4 | None = None
     """Share of saturated pixels in the file."""
+    missing_rows: int = 0
+    """Rows at the end of the file without pixels, as an incomplete transfer leaves them; they are nodata."""
     share_over_1_px: Number4 | None = None
     """Share of the written pixels whose expected error exceeds 1 px of the reference or is unknown."""
     seconds: Number3
@@ -371,6 +373,7 @@ class BandResult(_Part):
 def _source(capture: Capture, band: Band) -> dict[str, Any]:
     """The file of a band."""
     facts = {"band": band.name, "wavelength_nm": band.wavelength_nm, "size_px": band.size_px}
+    facts |= {"missing_rows": band.missing_rows}
     return facts | {"file": source_file(capture, band), "band_index": band.band_index}
 
 
@@ -637,8 +640,9 @@ class Sidecar(_Part):
 def capture_status(
     bands: Iterable[BandResult], missing_bands: Sequence[str], accept_predicted_px: float
 ) -> CaptureStatus:
-    """Return `ok` if every moving band is usable and none is missing, `failed` if all failed, else `degraded`."""
+    """Return `ok` if all moving bands are usable and no band or row is missing, `failed` if all failed, else `degraded`."""
+    bands = list(bands)
     moving = [b for b in bands if b.status != "reference"]
     if all(b.is_usable(accept_predicted_px) for b in moving):
-        return "degraded" if missing_bands else "ok"
+        return "degraded" if missing_bands or any(b.missing_rows for b in bands) else "ok"
     return "failed" if all(b.status == "failed" for b in moving) else "degraded"

@@ -1,0 +1,300 @@
+"""Facts that are known twice: clock and sun, image size and camera, bits and saturation, raw numbers and tags, name and
+band, number and time. Each comparison says what contradicts what; the more reliable source is used.
+
+Contradictions within a file are its `doubts`, which `doubtful_files` reports; those between files are problems. Pixels
+are compared with the tags by `pixels.radiometry.check_pixels`.
+"""
+
+import math
+from collections import defaultdict
+from collections.abc import Callable, Iterable, Sequence
+from datetime import timedelta
+from itertools import pairwise
+from pathlib import Path
+from statistics import median_low
+
+from agalign.cameras.generic import Generic
+from agalign.cameras.identity import name_end
+from agalign.cameras.image_file import Doubt, ImageFile, Problem
+from agalign.cameras.known import SAME_BAND_NM, raw_step, sizes_px
+from agalign.cameras.metadata import Tags
+from agalign.cameras.pix4d import NAMESPACE, listed_names
+from agalign.cameras.sun import Sun, sun_position
+from agalign.errors import InputError
+from agalign.values.capture import MIN_APART_S, Band, CaptureTime, Position, is_clock_set
+from agalign.values.pixel_units import SAME_PIXELS, PixelScale, Size
+from agalign.values.spectrum import band_key, contradicts
+from agalign.values.text import counted, some_of
+
+_SAME_NM = 0.5
+"""Between the wavelengths of two bands that are called equal."""
+_MAX_SUN_ERROR = 0.02
+"""Radians between the sun by the tags and by the clock: they agree within 0.001 on four cameras, and the sun moves by
+this in five minutes.
+"""
+_GPS_ROLLOVER_H = 1024 * 7 * 24.0
+"""Hours after which the week number of GPS repeats."""
+_MAX_OFF_CENTRE = 0.1
+"""Distance of the optical centre from the middle of the camera's image, relative to its longer side; cameras have up to
+0.08.
+"""
+
+
+# ---- clock and sun
+
+
+def clock_error(position: Position | None, captured_at: str, by_tags: Sun | None) -> str:
+    """Return in words how wrong a clock is that contradicts the position of the sun in the tags; empty if it does not,
+    or if one of them is unknown. `captured_at` is as in `Capture`.
+    """
+    time = CaptureTime.of(captured_at)
+    if position is None or time is None or by_tags is None or not is_clock_set(captured_at):
+        return ""
+    time_s = time.utc.timestamp()
+
+    def error(later_h: float) -> float:
+        return by_tags.angle_to(sun_position(position, time_s + 3600 * later_h))
+
+    if error(0.0) < _MAX_SUN_ERROR:
+        return ""
+    steps_per_hour, max_hours = 4, 24  # time zones differ by quarters of an hour
+    near_first = sorted(range(-max_hours * steps_per_hour, max_hours * steps_per_hour + 1), key=abs)
+    fits = (h for step in near_first if error(h := step / steps_per_hour) < _MAX_SUN_ERROR)
+    if (later_h := next(fits, None)) is not None:
+        return f"is about {abs(later_h):g} hours {'behind' if later_h > 0 else 'ahead'}"
+    for later_h, way in ((_GPS_ROLLOVER_H, "behind"), (-_GPS_ROLLOVER_H, "ahead")):
+        if error(later_h) < _MAX_SUN_ERROR:
+            return (
+                f"is about {_GPS_ROLLOVER_H:,.0f} hours {way} (1024 weeks, after which the week number of GPS repeats)"
+            )
+    return "is wrong by hours or months"
+
+
+def clock_doubt(error: str) -> Doubt:
+    """Return the doubt of a `clock_error`."""
+    text = f"its clock {error}, by the position of the sun in the tags of the light sensor"
+    return Doubt(text, "the irradiance is used as measured; correct the time for what depends on it")
+
+
+# ---- size of the image and of the camera
+
+
+def pixel_scale(tags: Tags, band: Band, is_raw: Callable[[], bool]) -> PixelScale | None:
+    """Return the size of an image relative to that which its tags in pixels are for; None if it is a part of it.
+
+    A program that resizes or crops images may leave the tags as they are. Both can keep the ratio of the sides;
+    `is_raw` tells whether the pixels still have the steps of a sensor, which averaging removes.
+    """
+    centre_px = optical_centre_px(band)
+    camera_px = _camera_size_px(tags, band.size_px, centre_px)
+    if camera_px is None or camera_px == band.size_px:
+        return SAME_PIXELS
+    scale = PixelScale.between(camera_px, band.size_px)
+    is_of_one_ratio = abs(scale.x - scale.y) * max(band.size_px) < 2 * max(scale)  # sides of whole pixels
+    if centre_px is None or not _is_near_middle(centre_px, camera_px):
+        return scale if is_of_one_ratio and tags.camera_size_px else SAME_PIXELS
+    return scale if is_of_one_ratio and not is_raw() else None
+
+
+def optical_centre_px(band: Band) -> tuple[float, float] | None:
+    """Return the optical centre of a band's image by its lens, else by its vignetting; None if both are unknown."""
+    if band.lens is not None:
+        return band.lens.cx_px, band.lens.cy_px
+    has_vignetting = band.radiometry is not None and any(band.radiometry.vignetting)
+    return band.radiometry.vignetting_centre_px if band.radiometry is not None and has_vignetting else None
+
+
+def lens_of_other_image(band: Band) -> str:
+    """Return in words that the lens in the tags, or its vignetting, is not that of a band's image."""
+    (width, height), (x, y) = band.size_px, optical_centre_px(band) or (math.nan, math.nan)
+    focal = "" if band.lens is None else f"focal length {band.lens.fx_px:.0f} px, "
+    at = f"{focal}optical centre {x:.0f}, {y:.0f} px"
+    return f"the lens in the tags ({at}) is not that of an image of {width} x {height} px"
+
+
+def part_of_image(tags: Tags, band: Band) -> str:
+    """Return the same of an image that is a part of the one that its tags are for."""
+    width, height = _camera_size_px(tags, band.size_px, optical_centre_px(band)) or band.size_px
+    return f"{lens_of_other_image(band)}, cropped or reduced from {width} x {height} px"
+
+
+def _camera_size_px(tags: Tags, size_px: Size, centre_px: tuple[float, float] | None) -> Size | None:
+    """The size of the camera's image by EXIF, else by the model: that of the image, or with this centre."""
+    if tags.camera_size_px is not None:
+        return tags.camera_size_px
+    known = sizes_px(tags.model)
+    near = [size for size in known if centre_px is not None and _is_near_middle(centre_px, size)]
+    return size_px if size_px in known else next(iter(near), None)
+
+
+def _is_near_middle(centre_px: tuple[float, float], size_px: Size) -> bool:
+    max_px = _MAX_OFF_CENTRE * max(size_px)
+    return all(abs(c - side / 2) < max_px for c, side in zip(centre_px, size_px, strict=True))
+
+
+# ---- bits and saturation
+
+
+def full_scale(band: Band) -> float:
+    """Return the divisor of pixel values in the radiometric models of the makers: 2 ** bits, 16 in most files."""
+    largest = 65535.0 if band.saturation_value is None or band.dtype == "int16" else band.saturation_value
+    return largest + 1.0
+
+
+def raw_step_of(tags: Tags, band: Band) -> int:
+    """Return the common divisor of the raw numbers in a file; 1 if it is unknown, or if the file has fewer bits."""
+    return raw_step(tags.model) if full_scale(band) == 65536.0 and band.dtype == "uint16" else 1
+
+
+# ---- raw numbers and tags
+
+
+def normalized(tags: Tags) -> str:
+    """Return in words that the tags declare pixels that are not raw numbers; empty if they do not."""
+    if tags.number(NAMESPACE, "IsNormalized") == 1:
+        return "the tag IsNormalized says that the pixels are calibrated already"
+    return ""
+
+
+# ---- what several files say
+
+
+def doubtful_files(files: Sequence[ImageFile]) -> list[Problem]:
+    """Return a problem for each kind of doubt, which names the first file with it."""
+    by_advice: dict[str, list[tuple[ImageFile, str]]] = defaultdict(list)
+    for file in files:
+        for doubt in file.doubts:
+            by_advice[doubt.advice].append((file, doubt.text))
+    problems = []
+    for advice, found in by_advice.items():
+        (file, text), *rest = found
+        others = f", and so in {counted(len(rest), 'other file')}" if rest else ""
+        error = InputError(f"{file.path}: {text}{others}; {advice}")
+        problems.append(Problem(file.path, error, is_harmless=True))
+    return problems
+
+
+def list_problems(files: Sequence[ImageFile]) -> list[Problem]:
+    """Return a problem for each multiband file with tags that list another number of names or wavelengths."""
+    problems = []
+    for file in files:
+        names, wavelengths = len(listed_names(file.tags)), len(file.tags.numbers(NAMESPACE, "CentralWavelength"))
+        bands = len(file.bands)
+        if file.is_whole_capture and isinstance(file.camera, Generic) and not {names, wavelengths} <= {0, bands}:
+            counts = f"{counted(names, 'name')} and {counted(wavelengths, 'wavelength')} of bands"
+            text = f"has {bands} bands, and its tags list {counts}; lists of other lengths are not used"
+            problems.append(Problem(file.path, InputError(f"{file.path}: {text}"), is_harmless=True))
+    return problems
+
+
+def _position(file: ImageFile) -> str:
+    """The evidence of a band's position in the rig, in words; empty if there is none."""
+    index, end = file.tags.text(NAMESPACE, "RigCameraIndex"), name_end(file)
+    return f"RigCameraIndex {index}" if index else f"'{end}' at the end of the name" if end else ""
+
+
+def contradictions(groups: Iterable[Sequence[ImageFile]]) -> list[Problem]:
+    """Return a problem for each position in the rig of one camera that changes its tags, and for bands with a name or
+    wavelength that others contradict. `groups` are the files of each capture.
+    """
+    tags: dict[tuple[str, ...], dict[str, list[ImageFile]]] = defaultdict(lambda: defaultdict(list))
+    doubtful: dict[str, list[Path]] = defaultdict(list)
+    for group in groups:
+        for file in (f for f in group if len(f.bands) == 1 and f.tags.text(NAMESPACE, "BandName")):
+            if file.tags.unread is None and (position := _position(file)):
+                serial = file.tags.serial or str(file.camera.capture_folder(file.path))
+                tags[file.tags.make, file.tags.model, serial, position][_label(file.bands[0])].append(file)
+        for text, path in _doubtful([b for file in group for b in file.bands if not b.is_from_photograph]):
+            doubtful[text].append(path)
+    texts = [(p[0], f"{text}, in {counted(len(p), 'file')}; correct the tags") for text, p in doubtful.items()]
+    for (*_, position), by_label in tags.items():
+        bands = [files[0].bands[0] for files in by_label.values()]
+        wavelengths = [b.wavelength_nm for b in bands if b.wavelength_nm is not None]
+        is_one_name = len({band_key(b.name) for b in bands}) == 1
+        if not is_one_name or max(wavelengths, default=0.0) - min(wavelengths, default=0.0) > SAME_BAND_NM:
+            captures = {label: (f.camera.capture_name(f.path) for f in files) for label, files in by_label.items()}
+            what = " and ".join(f"{label} in {some_of(dict.fromkeys(names))}" for label, names in captures.items())
+            advice = "one of the names is wrong: compare the images and correct the tags"
+            path = [*by_label.values()][-1][0].path
+            texts.append((path, f"files with {position} of one camera are {what}; {advice}"))
+    return [Problem(path, InputError(f"{path}: {text}")) for path, text in texts]
+
+
+def files_of_one_band(groups: Iterable[Sequence[ImageFile]]) -> list[Problem]:
+    """Return a problem for each band that captures have from two files, as of different naming: f_red.tif and
+    red/f_red.tif. `groups` are the files of each capture; bands of one name and other wavelengths are two bands.
+    """
+    clashes: dict[str, list[tuple[Path, Path]]] = defaultdict(list)
+    for group in groups:
+        first: dict[str, ImageFile] = {}
+        for file in (f for f in group if len(f.bands) == 1):
+            other = first.setdefault(band_key(file.bands[0].name), file)
+            nms = [b.wavelength_nm for b in (*other.bands, *file.bands) if b.wavelength_nm is not None]
+            if other is not file and max(nms, default=0.0) - min(nms, default=0.0) <= SAME_BAND_NM:
+                clashes[file.bands[0].name].append((other.path, file.path))
+    problems = []
+    for name, pairs in clashes.items():
+        other_path, path = pairs[0]
+        others = f", and so in {counted(len(pairs) - 1, 'other file')}" if len(pairs) > 1 else ""
+        twin = other_path.name if other_path.name != path.name else other_path
+        text = f"is band '{name}' of one capture as {twin} is{others}; both are aligned: move one of them elsewhere"
+        problems.append(Problem(path, InputError(f"{path}: {text}")))
+    return problems
+
+
+def _doubtful(bands: Sequence[Band]) -> list[tuple[str, Path]]:
+    """(what contradicts, file) of the bands of a capture."""
+    known = sorted(((b, b.wavelength_nm) for b in bands if b.wavelength_nm is not None), key=lambda pair: pair[1])
+    wrong = ((b, nm) for b, nm in known if contradicts(b.name, nm))
+    text = "the name '{}' contradicts its wavelength of {:g} nm, so that no index uses it"
+    result = [(text.format(band.name, nm), band.path) for band, nm in wrong]
+    for (one, nm), (other, other_nm) in pairwise(known):
+        if other_nm - nm < _SAME_NM and band_key(one.name) != band_key(other.name):
+            text = f"the bands {one.name} and {other.name} of a capture have one wavelength, {nm:g} nm"
+            result.append((text, other.path))
+    return result
+
+
+def _label(band: Band) -> str:
+    return band.name if band.wavelength_nm is None else f"{band.name} ({band.wavelength_nm:g} nm)"
+
+
+# ---- number and time
+
+
+def exposed_apart(groups: Sequence[Sequence[ImageFile]]) -> list[Problem]:
+    """Return a problem for each band, by the end of its files' names, that was exposed at another time than the other
+    bands of its captures, and the number of the capture that its time fits, if that is a neighbour. `groups` are the
+    files of each capture, whose numbers put them together.
+    """
+    apart: dict[str, list[tuple[ImageFile, float]]] = defaultdict(list)
+    others: dict[str, list[tuple[Path, float]]] = defaultdict(list)
+    for group in (g for g in groups if len(g) > 1 and not g[0].tags.first_text(g[0].camera.capture_ids)):
+        times = {f.path: time_s for f in group if (time_s := _time_s(f)) is not None}
+        usual_s = median_low(times.values()) if times else 0.0
+        for file in (f for f in group if f.path in times):
+            later_s = times[file.path] - usual_s
+            if abs(later_s) >= MIN_APART_S:
+                apart[name_end(file)].append((file, later_s))
+            else:
+                others[file.camera.capture_name(file.path)].append((file.path, times[file.path]))
+    return [_of_other_time(found, others) for found in apart.values()]
+
+
+def _of_other_time(found: Sequence[tuple[ImageFile, float]], others: dict[str, list[tuple[Path, float]]]) -> Problem:
+    (file, later_s), *rest = found
+    when = timedelta(seconds=round(abs(later_s)))
+    length = f"{abs(later_s):.0f} s" if abs(later_s) < 600 else str(when)
+    text = f"was exposed {length} {'after' if later_s > 0 else 'before'} the other bands of its number"
+    text += f", and so {counted(len(rest), 'other file')} of its band" if rest else ""
+    own = file.camera.capture_name(file.path)
+    near = ((abs(t - (_time_s(file) or 0.0)), name) for name, of in others.items() for _, t in of if name != own)
+    off_s, fitting = min(near, default=(math.inf, ""))
+    fits = f"; by its time it belongs to {fitting}: the numbers of the band are shifted" if off_s < MIN_APART_S else ""
+    return Problem(file.path, InputError(f"{file.path}: {text}{fits}; rename the files, or give --bands without it"))
+
+
+def _time_s(file: ImageFile) -> float | None:
+    """The Unix time of a file; None if it is unknown or its clock was not set."""
+    time = CaptureTime.of(file.tags.captured_at) if is_clock_set(file.tags.captured_at) else None
+    return None if time is None else time.utc.timestamp()

@@ -1,0 +1,143 @@
+"""The image files below a folder, without those in output folders of earlier runs."""
+
+import os
+import re
+from collections import Counter
+from collections.abc import Sequence
+from fnmatch import fnmatchcase
+from pathlib import Path
+
+from agalign.cameras.image_file import Problem, natural_order
+from agalign.errors import InputError
+from agalign.pixels.raster import suffix_format
+from agalign.values.files import RUN_FILE
+from agalign.values.text import counted
+
+IMAGE_KINDS = ".tif, .tiff, .jpg, .jpeg or .png"
+
+
+def check_folder(folder: Path) -> None:
+    """Raise InputError if `folder` is not a folder that can be listed."""
+    if folder.as_posix().startswith("/vsi"):
+        raise InputError(f"{folder}: is one of GDAL's virtual paths; mount or unpack it, and give the folder")
+    # A Path writes s3://bucket or https://host with one slash; a drive has one letter.
+    if re.match(r"[A-Za-z][A-Za-z0-9+.-]+:/", folder.as_posix()):
+        address = folder.as_posix().replace(":/", "://", 1)
+        raise InputError(f"{address}: only local folders can be read; mount it or copy the images, and give the folder")
+    try:
+        if folder.is_dir():
+            return
+        what = "is a file" if folder.exists() else "does not exist"
+    except OSError as error:
+        what = f"cannot be looked into ({error.strerror or error})"
+    raise InputError(f"{folder}: {what}; give the folder of the images")
+
+
+def image_files(folder: Path, skip: Sequence[Path]) -> tuple[list[Path], list[Problem]]:
+    """Return (image files below a folder, problems of folders that cannot be listed).
+
+    Linked folders are read after the others: each folder once, by its own path if that is below `folder`.
+    """
+    skipped = {p.resolve() for p in skip}
+    result: list[Path] = []
+    problems: list[Problem] = []
+
+    def refuse(error: OSError) -> None:
+        path = Path(error.filename)
+        problems.append(Problem(path, InputError(f"{path}: cannot be looked into ({error.strerror}); left out")))
+
+    listed, starts = set[tuple[int, int]](), [folder]
+    for start in starts:  # links add to it
+        for parent, folders, names in os.walk(start, onerror=refuse):
+            here = Path(parent)
+            if not _is_first_time(here, listed):
+                folders.clear()
+                continue
+            folders[:] = sorted(d for d in folders if _is_input_folder(here / d, skipped))
+            starts += [here / d for d in folders if (here / d).is_symlink()]
+            images = [n for n in names if suffix_format(Path(n)) and not n.startswith(".")]
+            result.extend(here / n for n in sorted(images, key=natural_order))
+    return result, problems
+
+
+def _is_first_time(folder: Path, listed: set[tuple[int, int]]) -> bool:
+    """Return False for a folder that is in the set `listed` by device and file number, to which it is added."""
+    try:
+        status = folder.stat()
+    except OSError:
+        return True
+    key = status.st_dev, status.st_ino
+    is_first = key not in listed
+    listed.add(key)
+    return is_first
+
+
+def without_companions(images: Sequence[Path], folder: Path) -> tuple[list[Path], list[Problem]]:
+    """Return (the images below a folder without the masks and small copies that programs and NAS keep beside them, a
+    problem that counts these).
+
+    Their folder has a name that such programs use, or their name is that of an image in the same folder, or in the one
+    above, and what such programs add.
+    """
+    stems = {(path.parent, path.stem) for path in images}
+    elsewhere = {path.name for path in images if not _MASK_FOLDER.fullmatch(path.parent.name)}
+
+    def is_companion(path: Path) -> bool:
+        if _MASK_FOLDER.fullmatch(path.parent.name) and path.name in elsewhere:
+            return True
+        end = _COMPANION_END.search(path.stem)
+        of_image = "" if end is None else path.stem[: end.start()]
+        return any((there, of_image) in stems for there in (path.parent, path.parent.parent))
+
+    known = [
+        p for p in images if any(map(_SMALL_COPIES.fullmatch, p.relative_to(folder).parts[:-1])) or is_companion(p)
+    ]
+    if not known:
+        return list(images), []
+    skipped = set(known)
+    text = f"masks and thumbnails beside the images are skipped, {counted(len(known), 'file')} in all"
+    problem = Problem(known[0], InputError(f"{known[0]}: {text}"), is_harmless=True)
+    return [path for path in images if path not in skipped], [problem]
+
+
+_SMALL_COPIES = re.compile(r"@eadir|[.@]*_*thumb(?:nail)?s?|#?@?recycle", re.IGNORECASE)
+"""Folders that NAS and programs make for small copies of images, and for deleted ones."""
+_MASK_FOLDER = re.compile(r"masks?", re.IGNORECASE)
+_COMPANION_END = re.compile(r"[ _-](?:masks?|thumb(?:nail)?)$", re.IGNORECASE)
+
+
+def is_chosen(path: Path, include: Sequence[str], exclude: Sequence[str]) -> bool:
+    """Return True for a path that matches a glob of `include`, or `include` is empty, and no glob of `exclude`.
+
+    A glob is compared with the path relative to the input folder and with the file name; * matches / too.
+    """
+
+    def matches(globs: Sequence[str]) -> bool:
+        return any(fnmatchcase(name, glob) for name in (path.as_posix(), path.name) for glob in globs)
+
+    return (not include or matches(include)) and not matches(exclude)
+
+
+def other_files(folder: Path) -> Counter[str]:
+    """Return the number of other files below a folder by suffix, in lower case."""
+    suffixes: Counter[str] = Counter()
+    for _, folders, names in os.walk(folder):
+        folders[:] = [d for d in folders if not d.startswith(".")]
+        others = (Path(n) for n in names if not n.startswith(".") and not suffix_format(Path(n)))
+        suffixes.update(other.suffix.lower() or "no suffix" for other in others)
+    return suffixes
+
+
+def _is_input_folder(folder: Path, skipped: set[Path]) -> bool:
+    """False for hidden folders, those of operating systems on memory cards, and the output folder of a run.
+
+    A run writes RUN_FILE first, so the output of a killed run is recognised too.
+    """
+    of_system = "lost+found", "System Volume Information", "$RECYCLE.BIN"
+    if folder.name.startswith(".") or folder.name in of_system or folder.resolve() in skipped:
+        return False
+    try:
+        entries = {entry.name for entry in os.scandir(folder)}
+    except OSError:
+        return True
+    return RUN_FILE not in entries and not {"summary.csv", "index.html"} <= entries
