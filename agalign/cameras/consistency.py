@@ -149,6 +149,16 @@ def raw_step_of(tags: Tags, band: Band) -> int:
 # ---- raw numbers and tags
 
 
+def min_raw_step(tags: Tags, band: Band) -> int:
+    """Return the step from which the pixels of a file are raw numbers: 1 for one with fewer bits than its type, which
+    only cameras write.
+    """
+    usual_step = 16  # of 12 bits in 16; averages of a few numbers have smaller steps
+    if full_scale(band) < 1 << 16:
+        return 1
+    return max(raw_step_of(tags, band), usual_step)
+
+
 def normalized(tags: Tags) -> str:
     """Return in words that the tags declare pixels that are not raw numbers; empty if they do not."""
     if tags.number(NAMESPACE, "IsNormalized") == 1:
@@ -268,7 +278,7 @@ def exposed_apart(groups: Sequence[Sequence[ImageFile]]) -> list[Problem]:
     files of each capture, whose numbers put them together.
     """
     apart: dict[str, list[tuple[ImageFile, float]]] = defaultdict(list)
-    others: dict[str, list[tuple[Path, float]]] = defaultdict(list)
+    others: dict[str, list[float]] = defaultdict(list)
     for group in (g for g in groups if len(g) > 1 and not g[0].tags.first_text(g[0].camera.capture_ids)):
         times = {f.path: time_s for f in group if (time_s := _time_s(f)) is not None}
         usual_s = median_low(times.values()) if times else 0.0
@@ -277,21 +287,24 @@ def exposed_apart(groups: Sequence[Sequence[ImageFile]]) -> list[Problem]:
             if abs(later_s) >= MIN_APART_S:
                 apart[name_end(file)].append((file, later_s))
             else:
-                others[file.camera.capture_name(file.path)].append((file.path, times[file.path]))
+                others[file.camera.capture_name(file.path)].append(times[file.path])
     return [_of_other_time(found, others) for found in apart.values()]
 
 
-def _of_other_time(found: Sequence[tuple[ImageFile, float]], others: dict[str, list[tuple[Path, float]]]) -> Problem:
+def _of_other_time(found: Sequence[tuple[ImageFile, float]], others: dict[str, list[float]]) -> Problem:
     (file, later_s), *rest = found
     when = timedelta(seconds=round(abs(later_s)))
     length = f"{abs(later_s):.0f} s" if abs(later_s) < 600 else str(when)
     text = f"was exposed {length} {'after' if later_s > 0 else 'before'} the other bands of its number"
     text += f", and so {counted(len(rest), 'other file')} of its band" if rest else ""
-    own = file.camera.capture_name(file.path)
-    near = ((abs(t - (_time_s(file) or 0.0)), name) for name, of in others.items() for _, t in of if name != own)
-    off_s, fitting = min(near, default=(math.inf, ""))
-    fits = f"; by its time it belongs to {fitting}: the numbers of the band are shifted" if off_s < MIN_APART_S else ""
-    return Problem(file.path, InputError(f"{file.path}: {text}{fits}; rename the files, or give --bands without it"))
+    for one, _ in found:
+        own, time_s = one.camera.capture_name(one.path), _time_s(one) or 0.0
+        near = ((abs(other_s - time_s), name) for name, of in others.items() for other_s in of if name != own)
+        off_s, fitting = min(near, default=(math.inf, ""))
+        if off_s < MIN_APART_S:
+            text += f"; by its time {one.path.name} belongs to {fitting}: the numbers of the band are shifted"
+            break
+    return Problem(file.path, InputError(f"{file.path}: {text}; rename the files, or give --bands without the band"))
 
 
 def _time_s(file: ImageFile) -> float | None:

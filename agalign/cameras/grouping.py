@@ -33,9 +33,9 @@ _GroupKey = tuple[str, str, str]
 _CameraKey = tuple[str, ...]
 _MAX_HALVES_APART = timedelta(seconds=1)
 """Between the exposures of a dual camera, which are simultaneous; an id may occur again in another flight."""
-_BEFORE_SUFFIX = " (-.~@+"
-"""Characters before the suffixes that file managers and synchronisation add to the names of copies; an underscore
-separates parts of the names that cameras and users give.
+_BEFORE_SUFFIX = "-.~@+"
+"""Characters before the suffixes that synchronisation adds to the names of copies, besides spaces and brackets; an
+underscore separates parts of the names that cameras and users give.
 """
 _SERIAL_SEPARATOR = "+"
 """Between the serial numbers of the two halves of a dual camera."""
@@ -117,7 +117,9 @@ def join_folders(groups: Sequence[list[ImageFile]]) -> tuple[list[list[ImageFile
 def _is_plain_name(original: ImageFile, copy: Path) -> bool:
     """Return True for a file with the name of a band, which another name has with a suffix, as programs name copies."""
     has_band = bool(split_stem(own_stem(original.path))[1]) and len(original.bands) == 1
-    return original.path.stem == own_stem(copy) or (has_band and copy.stem.startswith(original.path.stem))
+    added = copy.stem.removeprefix(original.path.stem)
+    is_suffix = added != copy.stem and not _is_band_part(added[1:])
+    return original.path.stem == own_stem(copy) or (has_band and is_suffix)
 
 
 @dataclass
@@ -162,12 +164,12 @@ def _end_of(path: Path) -> bytes:
 
 
 def _paths_in_name(path: Path) -> list[Path]:
-    """The files that this one may be a copy of: their names are its own before a separator and text that is no band, or
-    after a space or bracket.
+    """The files that this one may be a copy of: their names are its own before or after a space or bracket, or before
+    another separator and a text that is no band.
     """
     stem = path.stem
     parts = [stem[:i] for i, c in enumerate(stem) if c in _BEFORE_SUFFIX and not _is_band_part(stem[i + 1 :])]
-    parts += [stem[i + 1 :] for i, c in enumerate(stem) if c in " ("]
+    parts += [part for i, c in enumerate(stem) if c in " (" for part in (stem[:i], stem[i + 1 :])]
     return [path.with_name(part + path.suffix) for part in parts if part]
 
 

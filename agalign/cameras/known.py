@@ -40,7 +40,7 @@ _SIZES_PX = (
 """(regular expression of the beginning of EXIF's model, (width, height) of its images): those of the bands, then of the
 panchromatic and the thermal one.
 """
-_RAW_STEPS = (("RedEdge(?!-P)", 16), ("FC6360", 64))
+_RAW_STEPS = (("RedEdge(?!-P)", 16), ("FC6360", 64), ("Sequoia", 64))
 """(regular expression of the beginning of EXIF's model, common divisor of the raw numbers in 16 bits): sensors of 12
 and 10 bits, as the files of seven cameras show; that of other models is unknown.
 """

@@ -12,8 +12,8 @@ from agalign.cameras.base import Camera
 from agalign.cameras.consistency import (
     clock_doubt,
     clock_error,
-    full_scale,
     lens_of_other_image,
+    min_raw_step,
     normalized,
     part_of_image,
     pixel_scale,
@@ -70,7 +70,7 @@ def read_file(path: Path, cameras: Iterable[Camera], options: DiscoverOptions) -
     named = [replace(band, name=shortened(band.name)) for band in named]
     panel = panel_in(tags, size_px)
     used = (replace(b, panel=panel) for b in named if options.with_rgb or not b.is_from_photograph)
-    checked = [_of_image(band, tags, is_raw=_has_few_bits(stored[0])) for band in used]
+    checked = [_of_image(band, tags, min_raw_step(tags, stored[0])) for band in used]
     bands = tuple(_with_plausible_tags(band, tags) for band, _, _ in checked)
     scale = checked[0][1] if checked else SAME_PIXELS
     other_lens = next((why for *_, why in checked if why), "")
@@ -89,21 +89,11 @@ def _doubts(camera: Camera, tags: Tags, bands: Sequence[Band], other_lens: str) 
         yield Doubt(text, "radiometry is not used: give the original images")
 
 
-def _has_few_bits(stored: Band) -> bool:
-    """True for a file that declares fewer bits than its type has, as only cameras write it."""
-    return stored.dtype == "uint16" and full_scale(stored) < 1 << 16
-
-
-def _of_image(band: Band, tags: Tags, *, is_raw: bool) -> tuple[Band, PixelScale, str]:
+def _of_image(band: Band, tags: Tags, raw_step: int) -> tuple[Band, PixelScale, str]:
     """Return the band with what its tags give in pixels as it is for its image, the size of this relative to the
-    camera's, and why these tags are not used; empty if they are.
+    camera's, and why these tags are not used; empty if they are. Raw numbers are multiples of `raw_step`.
     """
-    min_step = 4  # of raw numbers in 16 bits, 16 to 64; averages have all values
-
-    def has_steps() -> bool:
-        return is_raw or (band.dtype == "uint16" and value_step(band) >= min_step)
-
-    scale = pixel_scale(tags, band, has_steps)
+    scale = pixel_scale(tags, band, lambda: band.dtype == "uint16" and value_step(band) % raw_step == 0)
     if scale is None:
         why = part_of_image(tags, band)
         return _without_lens(band, why), SAME_PIXELS, why

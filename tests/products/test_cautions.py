@@ -158,7 +158,7 @@ def test_a_panel_that_contradicts_the_sensor_concerns_the_reflectance_of_its_fli
 def test_a_contradiction_has_a_remedy_that_was_not_tried(
     choice: str, source: str, said: str, is_unusable: bool
 ) -> None:
-    output = OUTPUT | {"radiometry": f"reflectance by {source}"}
+    output = OUTPUT | {"radiometry": f"reflectance by {source}", "panel_age_s": 60.0}
     options = {"write": {"radiometry": choice}}
     (caution, *_) = cautions(run=RunFacts((panel(NIR=15.46),)), output=output, options=options)
     assert caution.size_text.format(caution.size) == "reflectance is uncertain by up to 1446%"
@@ -191,7 +191,7 @@ def test_sidecars_have_the_model_and_the_share_of_uncertain_pixels(aligned_fligh
 def groups() -> Any:
     """A run with a failed band, three blurred ones, and a panel that contradicts the sensor by 10 %."""
     totals = PairTotals(RunFacts((panel(Red=1.1),)))
-    output = OUTPUT | {"radiometry": "reflectance by panel"}
+    output = OUTPUT | {"radiometry": "reflectance by panel", "panel_age_s": 60.0}
     blurred = {"status": "predicted", "reason": "blurred", "issues": issue("retrieval"), "prediction": prediction(0.02)}
     for number in range(3):
         red = ALIGNED | {"band": "Red"} | ({"status": "failed", "reason": "blank"} if number == 0 else {})
