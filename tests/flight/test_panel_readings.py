@@ -11,6 +11,7 @@ import tifffile
 from agalign.flight.panel_readings import (
     BandReading,
     PanelReading,
+    missing_panel,
     read_panel,
     reflectance_factors,
     with_cues,
@@ -244,3 +245,40 @@ def test_a_capture_that_the_search_for_panels_cannot_finish_is_abandoned(flight:
     environment = os.environ | {"PYTHONPATH": os.pathsep.join((str(tmp_path), *sys.path))}
     done = agalign(flight, "-o", tmp_path / "out", "--timeout", 3, "--dry-run", env=environment, timeout=50)
     assert "1 capture to be aligned, 1 capture stopped after 3 s (--timeout)" in done.stdout
+
+
+# ---- clocks that were not set
+
+
+def numbered(name: str, moment: str, folder: str = "000") -> Capture:
+    return replace(capture(GREEN, moment), name=name, folder=Path(folder))
+
+
+def before_fix(name: str, factor: float = 2.0, folder: str = "000") -> PanelReading:
+    """A panel that was photographed before the first GPS fix."""
+    return replace(reading("1970-01-01T00:01:21", factor), capture=numbered(name, "1970-01-01T00:01:21", folder))
+
+
+@pytest.mark.parametrize(("panel", "name"), [("IMG_0000", "IMG_0007"), ("DJI_001", "DJI_250"), ("panel", "f_3")])
+def test_the_only_panel_is_used_if_its_clock_was_not_set(panel: str, name: str) -> None:
+    later = numbered(name, "2026-06-21T10:00:00", "001")
+    assert reflectance_factors(later, [before_fix(panel)]) == {"Green": (pytest.approx(2.0), "panel", None)}
+    assert missing_panel(later, [before_fix(panel)]) == ""
+
+
+@pytest.mark.parametrize(("name", "factor"), [("IMG_0003", 2.0), ("IMG_0090", 4.0)])
+def test_of_several_panels_the_next_by_number_is_used(name: str, factor: float) -> None:
+    panels = [before_fix("IMG_0001", 2.0), before_fix("IMG_0088", 4.0)]
+    flown = numbered(name, "2026-06-21T10:00:00")
+    assert reflectance_factors(flown, panels)["Green"].value == pytest.approx(factor)
+    elsewhere = replace(flown, folder=Path("001"))
+    assert reflectance_factors(elsewhere, panels) == {}
+    assert missing_panel(elsewhere, panels).startswith("the clock of 000/IMG_0001 was not set")
+
+
+def test_a_panel_with_a_time_is_preferred(tmp_path: Path) -> None:
+    flown = numbered("IMG_0003", "2026-06-21T10:00:00")
+    timed = replace(reading("2026-06-21T09:50:00", 3.0), capture=numbered("IMG_0500", "2026-06-21T09:50:00"))
+    assert reflectance_factors(flown, [before_fix("IMG_0001"), timed]) == {"Green": (pytest.approx(3.0), "panel", 600)}
+    far = numbered("IMG_0003", "2026-06-28T10:00:00")
+    assert "is 7 days older" in missing_panel(far, [timed])
