@@ -21,7 +21,8 @@ from scipy.spatial.transform import Rotation
 
 from agalign.cameras.discover import discover
 from agalign.cameras.metadata import Tags, read_tags
-from agalign.cameras.micasense import horizontal_irradiance, sun_position
+from agalign.cameras.micasense import horizontal_irradiance
+from agalign.cameras.sun import sun_position
 from agalign.flight import panel_readings
 from agalign.flight.groups import camera_key
 from agalign.pixels.landmarks import landmarks, matched_homography, matches

@@ -261,12 +261,16 @@ def load_config(ctx: typer.Context, path: Path | None) -> Path | None:
 def _read_toml(path: Path) -> dict[str, Any]:
     import tomllib
 
+    not_utf_8 = typer.BadParameter(f"{path} is not in UTF-8; save it as UTF-8")
     try:
-        return tomllib.loads(read_regular(path).decode("utf-8-sig"))
+        contents = read_regular(path)
+        if b"\0" in contents:  # UTF-16 of plain text is valid UTF-8
+            raise not_utf_8
+        return tomllib.loads(contents.decode("utf-8-sig"))
     except FileNotFoundError:
         raise typer.BadParameter(f"{path} does not exist") from None
     except UnicodeDecodeError:
-        raise typer.BadParameter(f"{path} is not in UTF-8; save it as UTF-8") from None
+        raise not_utf_8 from None
     except (OSError, ValueError, RecursionError) as error:
         reason = getattr(error, "strerror", None) or error
         raise typer.BadParameter(f"{path} cannot be read as TOML ({reason})") from None

@@ -111,14 +111,21 @@ def _show_captures(rows: Sequence[dict[str, Any]], problems: int, terminal: Term
 
 
 def _unreadable_files(flight: "FolderScan") -> dict[str, list[str]]:
-    """Return the unreadable files of each capture by label: those with names that begin with the capture's name."""
+    """Return the unreadable files of each capture by label: those of its bands, and others with names that begin with
+    the capture's name.
+    """
     result: dict[str, list[str]] = defaultdict(list)
     for path in (p.path for p in flight.problems if isinstance(p.error, UnreadableFileError)):
         in_folder = [c for c in flight.captures if c.reference.path.parent == path.parent]
-        candidates = [c for c in in_folder if path.name.startswith(c.name)]
+        candidates = [c for c in in_folder if path.name.startswith(c.name) or _is_of(path, c)]
         if candidates:
             result[max(candidates, key=lambda c: len(c.name)).label].append(path.name)
     return result
+
+
+def _is_of(path: Path, capture: "Capture") -> bool:
+    """Return True for the file of a band of a capture that cannot be read."""
+    return any(reason.startswith(f"{path.name}: ") for reason in capture.unreadable_bands.values())
 
 
 def _show_unused(flight: "FolderScan", terminal: Terminal) -> None:

@@ -12,8 +12,9 @@ from agalign.cameras import default_reference, known_cameras, rig_seed
 from agalign.cameras.generic import Generic
 from agalign.cameras.mapir import Mapir
 from agalign.cameras.metadata import Tags, read_tags
-from agalign.cameras.micasense import MicaSense, horizontal_irradiance, sun_position, transmission
+from agalign.cameras.micasense import MicaSense, horizontal_irradiance, transmission
 from agalign.cameras.pix4d import NAMESPACE, panel_in
+from agalign.cameras.sun import sun_position
 from agalign.errors import ConfigurationError
 from agalign.pixels.raster import probe
 from agalign.synthetic import cameras

@@ -74,6 +74,18 @@ def test_a_wrong_file_is_one_line(tmp_path: Path, text: str | None, said: str) -
     assert str(config) in line
 
 
+@pytest.mark.parametrize(
+    ("encoding", "comment"), [("utf-16", ""), ("utf-16-le", ""), ("utf-16-be", "größer"), ("latin-1", "größer")]
+)
+def test_a_file_in_another_encoding_is_to_be_saved_as_utf_8(tmp_path: Path, encoding: str, comment: str) -> None:
+    """PowerShell 5 writes UTF-16 where it redirects output."""
+    config = tmp_path / "agalign.toml"
+    config.write_bytes(f'# {comment}\r\nreference = "Red"\r\n'.encode(encoding))
+    done = agalign_here("align", "x", "--config", config)
+    (line,) = done.stderr.splitlines()
+    assert (done.returncode, f"{config} is not in UTF-8; save it as UTF-8" in line) == (2, True)
+
+
 @pytest.mark.full
 def test_any_value_of_any_option_is_taken_or_one_line(tmp_path: Path) -> None:
     synthetic.make_flight(tmp_path / "in", captures=1, size_px=(32, 24))

@@ -122,6 +122,17 @@ def test_the_advice_fits_the_time_between_exposures(apart_s: float, advice: str)
     assert caution.remedy.advice.startswith(advice)
 
 
+@pytest.mark.parametrize(
+    ("kind", "apart_s", "said"), [("few_windows", -20.0, "20 s before"), ("repeats", 3.4, "3 s after")]
+)
+def test_the_time_between_exposures_is_the_reason(kind: str, apart_s: float, said: str) -> None:
+    (caution,) = cautions(
+        {"status": "failed", "reason": "too little", "issues": issue(kind), "exposed_after_s": apart_s}
+    )
+    assert caution.reason == f"exposed {said} the reference; too little"
+    assert "exposed at different times" in caution.remedy.cause
+
+
 @pytest.mark.slow
 def test_the_time_between_exposures_is_that_in_the_tags(flight: Path, tmp_path: Path) -> None:
     folder = Path(shutil.copytree(flight / "0000SET" / "000", tmp_path / "in"))

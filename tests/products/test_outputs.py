@@ -11,7 +11,9 @@ from synthetic_flights.aligned import make_aligned
 from synthetic_flights.troubles import make_terraces
 
 import agalign
+from agalign.batch.render import refuse_to_overwrite
 from agalign.capture.tag_seeds import geo_seed
+from agalign.errors import ConfigurationError
 from agalign.products.rasters.aligned_files import band_file_names
 from agalign.products.run.captures import RAW, AlignedBand, BandReader
 from agalign.products.sidecar.file import verify_outputs
@@ -209,6 +211,31 @@ def test_the_file_of_a_photograph_does_not_take_the_name_of_the_stack() -> None:
     photograph = Band("RGB Red", Path("field.jpg"), 1, 9, 9, "uint8", one_lens=True)
     names = band_file_names(Capture("field", Path(), (green, photograph), 0))
     assert names == {"green": Path("field_green.tif"), "RGB Red": Path("field_jpg.tif")}
+
+
+@pytest.mark.parametrize(("stem", "other"), [("field", "field_green"), ("Field", "field_red"), ("x", "X_red")])
+def test_names_differ_in_more_than_case(stem: str, other: str) -> None:
+    bands = [
+        Band(str(k), Path(name), 1, 9, 9, "uint8")
+        for k, name in enumerate((f"{stem}.TIF", f"{other}.tif", "x_red.TIF"))
+    ]
+    names = band_file_names(Capture(stem.lower(), Path(), tuple(bands), 0)).values()
+    assert len({str(name).lower() for name in (*names, f"{stem}.tif")}) == 4
+
+
+@pytest.mark.parametrize("length", [241, 243, 245])
+def test_a_name_that_is_too_long_is_refused_at_the_start(tmp_path: Path, length: int) -> None:
+    name = "é" * (length // 2)
+    write_capture(tmp_path / "in", "green", "red", name="f")
+    for path in (tmp_path / "in").iterdir():
+        path.rename(path.with_name(path.name.replace("f_", f"{name}_")))
+    scan = agalign.discover(tmp_path / "in")
+    if too_long := len(f"{scan.captures[0].name}.parallax.tif".encode()) > 255:
+        with pytest.raises(ConfigurationError, match=r"parallax.tif would have \d+ bytes, and file systems take"):
+            refuse_to_overwrite(scan.captures, tmp_path / "out", agalign.WriteSettings())
+    else:
+        refuse_to_overwrite(scan.captures, tmp_path / "out", agalign.WriteSettings())
+    assert too_long == (length > 243)
 
 
 @pytest.mark.full
