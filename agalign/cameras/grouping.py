@@ -33,10 +33,8 @@ _GroupKey = tuple[str, str, str]
 _CameraKey = tuple[str, ...]
 _MAX_HALVES_APART = timedelta(seconds=1)
 """Between the exposures of a dual camera, which are simultaneous; an id may occur again in another flight."""
-_BEFORE_SUFFIX = "-.~@+"
-"""Characters before the suffixes that synchronisation adds to the names of copies, besides spaces and brackets; an
-underscore separates parts of the names that cameras and users give.
-"""
+_BEFORE_SUFFIX = "-.~@+_"
+"""Characters before what synchronisation and users add to the names of copies, besides spaces and brackets."""
 _SERIAL_SEPARATOR = "+"
 """Between the serial numbers of the two halves of a dual camera."""
 
@@ -118,7 +116,8 @@ def _is_plain_name(original: ImageFile, copy: Path) -> bool:
     """Return True for a file with the name of a band, which another name has with a suffix, as programs name copies."""
     has_band = bool(split_stem(own_stem(original.path))[1]) and len(original.bands) == 1
     added = copy.stem.removeprefix(original.path.stem)
-    is_suffix = added != copy.stem and not _is_band_part(added[1:])
+    # Without tags, an underscore may separate parts of a name that has no band.
+    is_suffix = added != copy.stem and added[:1] != "_" and not is_band_name(split_stem(copy.stem)[1])
     return original.path.stem == own_stem(copy) or (has_band and is_suffix)
 
 
@@ -168,14 +167,15 @@ def _paths_in_name(path: Path) -> list[Path]:
     another separator and a text that is no band.
     """
     stem = path.stem
-    parts = [stem[:i] for i, c in enumerate(stem) if c in _BEFORE_SUFFIX and not _is_band_part(stem[i + 1 :])]
+    is_band = is_band_name(split_stem(stem)[1])  # f_red-edge is no copy of f_red
+    places = [] if is_band else [i for i, c in enumerate(stem) if c in _BEFORE_SUFFIX]
+    parts = [stem[:i] for i in places if not _is_number_of_band(stem[i + 1 :])]
     parts += [part for i, c in enumerate(stem) if c in " (" for part in (stem[:i], stem[i + 1 :])]
     return [path.with_name(part + path.suffix) for part in parts if part]
 
 
-def _is_band_part(text: str) -> bool:
-    """True for a text that may tell the bands of a capture apart: the name or number of a band."""
-    return is_band_name(text) or bool(re.fullmatch(r"[a-z]?\d{1,2}", text, re.IGNORECASE))
+def _is_number_of_band(text: str) -> bool:
+    return bool(re.fullmatch(r"[a-z]?\d{1,2}", text, re.IGNORECASE))
 
 
 def with_tags_of_flight(files: Sequence[ImageFile]) -> tuple[list[ImageFile], list[Problem]]:

@@ -373,7 +373,7 @@ SUFFIXES = [
     " (conflicted copy 2021-08-27 193457)",
     "~backup",
 ]
-SUFFIXES += ["-Kopie", " [Konflikt]", "@eaStream"]
+SUFFIXES += ["-Kopie", " [Konflikt]", "@eaStream", "_old"]
 
 
 @pytest.mark.parametrize("suffix", SUFFIXES)
@@ -409,6 +409,17 @@ def test_a_copy_without_tags_is_no_band_either(tmp_path: Path, suffix: str) -> N
 
 def test_a_name_with_a_band_after_that_of_another_file_is_a_band(tmp_path: Path) -> None:
     rng = np.random.default_rng(0)
-    for name in ("f_1", "f_1-1", "f_1-2", "plot", "plot-nir", "plot-red", "IMG_1-R", "IMG_1-NIR"):
+    for name in (
+        "f_1",
+        "f_1-1",
+        "f_1-2",
+        "plot",
+        "plot-nir",
+        "plot-red",
+        "IMG_1-R",
+        "IMG_1-NIR",
+        "f_red",
+        "f_red-edge",
+    ):
         write_band(tmp_path / f"{name}.tif", rng.integers(1, 4000, (64, 80), dtype=np.uint16))
     assert not [p.text for p in discover(tmp_path).problems if "copy of" in p.text]
