@@ -11,7 +11,7 @@ from synthetic_flights.aligned import make_aligned
 from synthetic_flights.troubles import make_terraces
 
 import agalign
-from agalign.batch.render import refuse_to_overwrite
+from agalign.batch.output_files import refuse_to_overwrite
 from agalign.capture.tag_seeds import geo_seed
 from agalign.errors import ConfigurationError
 from agalign.products.rasters.aligned_files import band_file_names
@@ -232,9 +232,9 @@ def test_a_name_that_is_too_long_is_refused_at_the_start(tmp_path: Path, length:
     scan = agalign.discover(tmp_path / "in")
     if too_long := len(f"{scan.captures[0].name}.parallax.tif".encode()) > 255:
         with pytest.raises(ConfigurationError, match=r"parallax.tif would have \d+ bytes, and file systems take"):
-            refuse_to_overwrite(scan.captures, tmp_path / "out", agalign.WriteSettings())
+            refuse_to_overwrite(scan.captures, tmp_path / "out", agalign.WriteSettings(), {})
     else:
-        refuse_to_overwrite(scan.captures, tmp_path / "out", agalign.WriteSettings())
+        refuse_to_overwrite(scan.captures, tmp_path / "out", agalign.WriteSettings(), {})
     assert too_long == (length > 243)
 
 

@@ -640,7 +640,7 @@ class Sidecar(_Part):
 def capture_status(
     bands: Iterable[BandResult], missing_bands: Sequence[str], accept_predicted_px: float
 ) -> CaptureStatus:
-    """Return `ok` if all moving bands are usable and no band or row is missing, `failed` if all failed, else `degraded`."""
+    """Return `ok` if all moving bands are usable and nothing is missing, `failed` if all failed, else `degraded`."""
     bands = list(bands)
     moving = [b for b in bands if b.status != "reference"]
     if all(b.is_usable(accept_predicted_px) for b in moving):
