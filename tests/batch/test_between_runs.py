@@ -154,6 +154,7 @@ def test_files_of_the_user_are_kept_or_refused(flight: Path, out: Path, name: st
     assert mine.read_bytes() == data
 
 
+@pytest.mark.full
 def test_a_file_with_the_name_of_a_stack_is_kept(flight: Path, tmp_path: Path) -> None:
     agalign.align_folder(flight, tmp_path, settings=seeded("rig", layout="bands"))
     mine = tmp_path / FOLDER / "IMG_0001.tif"
@@ -164,6 +165,7 @@ def test_a_file_with_the_name_of_a_stack_is_kept(flight: Path, tmp_path: Path) -
     assert mine.read_bytes() == data
 
 
+@pytest.mark.full
 def test_every_output_has_the_mark_of_the_program(flight: Path, tmp_path: Path) -> None:
     """A run that is killed leaves files that no sidecar lists; the same command replaces them."""
     others = {"error_map": True, "tie_points": True, "indices": ("ndre",), "radiometry": "sun"}
@@ -333,6 +335,7 @@ def test_a_deleted_index_is_reported_until_its_command_restores_it(
     assert problems(out) == []
 
 
+@pytest.mark.full
 def test_the_table_of_indices_has_no_unmasked_row_among_masked_ones(
     flight: Path, aligned_flight: Path, tmp_path: Path
 ) -> None:

@@ -298,6 +298,7 @@ def test_indices_of_a_later_command_are_calculated_of_the_new_pixels(
 # ---- what is removed
 
 
+@pytest.mark.full
 def test_nothing_is_removed_silently_with_another_layout(flight: Path, tmp_path: Path) -> None:
     def align(**write: Any) -> agalign.CaptureReport:
         return agalign.align_folder(flight, tmp_path, settings=seeded("rig", **write))[0]

@@ -34,6 +34,7 @@ from ..values.pool_tasks import WhenUnpickled, signal_self, sleep, without_memor
 pytestmark = pytest.mark.slow
 
 
+@pytest.mark.full
 @pytest.mark.filterwarnings("ignore:unclosed:ResourceWarning")
 def test_a_dask_cluster_starts_without_a_warning_if_the_port_of_dask_is_in_use(
     recwarn: pytest.WarningsRecorder,

@@ -303,7 +303,7 @@ def test_the_relief_is_estimated_once_if_nothing_is_learned(
     assert calls == [len(candidates)]
 
 
-@pytest.mark.slow
+@pytest.mark.full
 def test_bands_with_and_without_a_lens_model_have_one_relief(four_lenses: Rendered) -> None:
     """Two bands of each kind: either kind determines a relief, and one of these is that of all bands."""
     bands = []
@@ -344,6 +344,7 @@ def test_a_noisy_band_follows_the_relief_of_the_others(
         assert 0.5 * np.percentile(errors, 68) < alignment.prediction.std_px <= 1
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("name", ["Blue", in_full_run("NIR")])
 def test_a_band_that_shows_nothing_in_a_part_claims_the_error_there(four_lenses: Rendered, name: str) -> None:
     image = four_lenses.images[name].copy()

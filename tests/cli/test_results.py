@@ -121,6 +121,7 @@ def test_a_renamed_exposure_counts_once(flight: Path, tmp_path: Path, has_id: bo
     assert {c.label for c in captures_of_run(out)[0]} == {FIRST, SECOND}
 
 
+@pytest.mark.full
 def test_a_moved_folder_counts_once(flight: Path, tmp_path: Path) -> None:
     folder, out = shutil.copytree(flight, tmp_path / "in"), tmp_path / "out"
     agalign.align_folder(folder, out, settings=seeded("rig"))

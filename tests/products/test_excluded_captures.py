@@ -139,7 +139,7 @@ def test_another_run_keeps_results_and_can_align_panels(between_panels: Path, tm
     assert not (tmp_path / PANELS_FILE).exists()
 
 
-@pytest.mark.slow
+@pytest.mark.full
 def test_outputs_of_a_panel_are_removed_with_a_line(between_panels: Path, tmp_path: Path) -> None:
     run = agalign.RunOptions(align_panels=True)
     agalign.align_folder(between_panels, tmp_path, settings=seeded(), run=run)

@@ -26,7 +26,7 @@ from agalign.values.geometry import Matrix
 from agalign.values.issues import CLOSE_WINDOWS, Issue
 from agalign.values.mapping_error import MappingError
 
-from ..builders import decided, joint_result, pair_of, residual_of, texture
+from ..builders import decided, in_full_run, joint_result, pair_of, residual_of, texture
 from ..capture.test_by_relief import REFERENCE, Rendered
 from ..conftest import Shared
 from .test_relief_map import scene_in
@@ -117,7 +117,7 @@ def rms(values: np.ndarray) -> float:
 @pytest.mark.parametrize(
     ("output", "kinds", "rel"),
     [
-        ("with_relief", {("aligned", None), ("predicted", "windows"), ("predicted", "bands")}, 0.02),
+        in_full_run("with_relief", {("aligned", None), ("predicted", "windows"), ("predicted", "bands")}, 0.02),
         ("without_relief", {("aligned", None), ("predicted", "windows"), ("predicted", "bands")}, 0.01),
     ],
 )
