@@ -67,7 +67,7 @@ class CaptureReport:
     there is no result. `panel` and `sky`: captures of a calibration panel or of the sky are not aligned.
     """
     result: Sidecar | None = field(default=None, repr=False)
-    """Content of the sidecar, without the long tables; None if `error` says why there is no result."""
+    """Content of the sidecar without its long tables; None for a capture with an `error`."""
     path: Path | None = None
     """Path of the sidecar."""
     error: str | None = None

@@ -273,9 +273,10 @@ def _label(band: Band) -> str:
 
 
 def exposed_apart(groups: Sequence[Sequence[ImageFile]]) -> list[Problem]:
-    """Return a problem for each band, by the end of its files' names, that was exposed at another time than the other
-    bands of its captures, and the number of the capture that its time fits, if that is a neighbour. `groups` are the
-    files of each capture, whose numbers put them together.
+    """Return a problem for each band whose exposures are seconds apart from those of the other bands.
+
+    The problem names the band by the end of its file names, and the neighbouring capture whose time it fits. `groups`
+    are the files of each capture, which were grouped by their numbers.
     """
     apart: dict[str, list[tuple[ImageFile, float]]] = defaultdict(list)
     others: dict[str, list[float]] = defaultdict(list)

@@ -163,11 +163,13 @@ def _end_of(path: Path) -> bytes:
 
 
 def _paths_in_name(path: Path) -> list[Path]:
-    """The files that this one may be a copy of: their names are its own before or after a space or bracket, or before
-    another separator and a text that is no band.
+    """Return the files that this one may be a copy of.
+
+    Their names are the part of its own name before or after a space or bracket, or before another separator if the text
+    after it does not name a band.
     """
     stem = path.stem
-    is_band = is_band_name(split_stem(stem)[1])  # f_red-edge is no copy of f_red
+    is_band = is_band_name(split_stem(stem)[1])  # f_red-edge is a band, not a copy of f_red
     places = [] if is_band else [i for i, c in enumerate(stem) if c in _BEFORE_SUFFIX]
     parts = [stem[:i] for i in places if not _is_number_of_band(stem[i + 1 :])]
     parts += [part for i, c in enumerate(stem) if c in " (" for part in (stem[:i], stem[i + 1 :])]

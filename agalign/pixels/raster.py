@@ -285,8 +285,8 @@ def _with_missing_parts(band: Band, read: ReadTile) -> Band:
 
 
 def value_step(band: Band) -> int:
-    """Return the greatest common divisor of all pixels of a band of integers, such as 16 for 12 bits in the upper bits
-    of 16; 1 for other types. Raises UnreadableFileError.
+    """Return the greatest common divisor of all pixels of a band, such as 16 if 12 bits are stored as the upper bits of
+    16. It is 1 for floats. Raises UnreadableFileError.
     """
     if np.dtype(band.dtype).kind not in "ui":
         return 1

@@ -109,7 +109,7 @@ def test_the_error_of_the_relief_counts_where_it_is_larger_than_that_of_the_wind
 
 @pytest.mark.parametrize("parallax", [None, with_steps(), with_steps(HALF)])
 def test_the_error_on_a_grid_is_that_of_its_pixels(parallax: Parallax | None) -> None:
-    """Also on a tile, and on another grid than that of the reference, whose axes may be bent by a lens."""
+    """This also holds on a tile, and on a grid that differs from the reference's, with axes bent by a lens."""
     error = replace(error_of([0.1, 0.5, 0.3, 0.1], columns(4)), parallax=parallax)
     tile = Tile(100, 60, 300, 200)
     at = (np.stack(np.meshgrid(np.arange(100, 400), np.arange(60, 260)), -1)).reshape(-1, 2).astype(float)
