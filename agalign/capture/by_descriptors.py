@@ -33,7 +33,8 @@ def by_descriptors(band: RefinedBand, by_halves: tuple[Matrix, Matrix] | None, u
 
 
 def _with_field(plane: Candidate, warped: WarpedPair, joint: JointResult) -> Iterator[Candidate]:
-    """Yield the candidate with a displacement field, if it reduces the shifts of windows that it is not fitted to.
+    """Yield the candidate with a displacement field, if it reduces the shifts of windows that it is not fitted to; else
+    the same without one.
 
     These windows, which are smaller, verify it, or those of the homography if it passes in these.
     """
@@ -41,6 +42,7 @@ def _with_field(plane: Candidate, warped: WarpedPair, joint: JointResult) -> Ite
     displacement = pair.reference.displacement_field.refine(channel_mean(pair.moving_image), plane.mapping)
     p95_px: dict[Geometry, float] = {"homography": displacement.before_p95_px, "field": displacement.after_p95_px}
     if displacement.field is None:
+        yield replace(plane, p95_px=p95_px)
         return
     displaced = WarpedPair.of(pair, replace(plane.mapping, field=displacement.field), warped.windows)
     held_out = Candidate.of("field", displaced, joint, displacement.held_out)

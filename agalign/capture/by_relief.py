@@ -283,7 +283,7 @@ class _Estimate:
         """
         lengths = np.linalg.norm(_baselines(self.bands), axis=1)
         p95_px = [warped.residual.p95_px for warped in held_out]
-        max_std_px = float(np.median(p95_px / np.maximum(lengths, 1e-6)))
+        max_std_px = max(RELIEF_STEP, float(np.median(p95_px / np.maximum(lengths, 1e-6))))
         return replace(self, relief=replace(self.relief, std_px=_std_px(self.verifying_reliefs, max_std_px)))
 
     def fitted(self, candidate: RefinedBand) -> _Band | None:
@@ -345,8 +345,11 @@ def _with_field(candidate: Candidate) -> Candidate:
     displacement = pair.reference.displacement_field.refine(channel_mean(pair.moving_image), mapping)
     if displacement.field is None:
         return candidate
+    assert candidate.error.covariance_px2 is not None
+    mapping = replace(mapping, field=displacement.field)
+    error = mapping_error(pair, mapping, candidate.error.covariance_px2, candidate.windows)
     p95_px = {**candidate.p95_px, "relief and field": displacement.after_p95_px}
-    return replace(candidate, mapping=replace(mapping, field=displacement.field), p95_px=p95_px)
+    return replace(candidate, mapping=mapping, error=error, p95_px=p95_px)
 
 
 def _gain_px(bands: Sequence[_Band], result: Mapping[str, Candidate]) -> float:

@@ -32,7 +32,7 @@ from agalign.fit.windows import Shifts, peak_weights
 from agalign.values import geometry
 from agalign.values.geometry import Points
 from agalign.values.least_squares import MIN_SHIFT_SCALE_PX, Robust, cauchy_weights, least_squares, shift_scale_px
-from agalign.values.lens_shapes import jacobian, lens_shapes, shift_variance_px2, variance_px2
+from agalign.values.lens_shapes import jacobian, lens_shapes, shift_variance_px2
 from agalign.values.mapping import DisplacementField, PixelMapping
 from agalign.values.parallax import Parallax, Relief
 from agalign.values.pixel_units import PixelScale
@@ -91,11 +91,6 @@ class WindowFit:
     def scale_px(self) -> float:
         """Robust standard deviation of the residuals."""
         return shift_scale_px(self.residuals_px[np.isfinite(self.residuals_px)])
-
-    def std_px(self, points_px: Points) -> float:
-        """Return the RMS error over points (n, 2), including the residual of single windows."""
-        of_mapping_px2 = variance_px2(points_px, self.covariance_px2, self.size_px).mean()
-        return float(np.sqrt(of_mapping_px2 + self.scale_px**2))
 
     def applied_to(self, mapping: PixelMapping) -> PixelMapping:
         """Correct a homography; lens shapes and baseline replace those of the mapping. Raises GeometryError."""

@@ -383,11 +383,6 @@ class Alignment:
         return self.mapping.fixed_to_moving
 
     @property
-    def seed_mapping(self) -> PixelMapping:
-        """The mapping of the seed, with the lenses and without displacements."""
-        return PixelMapping(self.seed.fixed_to_moving, self.mapping.fixed_lens, self.mapping.moving_lens)
-
-    @property
     def geometry(self) -> Geometry:
         """What the mapping has in addition to the homography and the lenses of the tags."""
         if self.mapping.parallax is not None:

@@ -147,12 +147,6 @@ REPEATS = IssueKind(
     ),
 )
 
-CONTRADICTED = frozenset(
-    kind.remedy
-    for kind in (FOLDS, COVERAGE, CLOSE_WINDOWS, CLUSTER, INACCURATE, UNEXPECTED_PX, OTHER_CONTENT, OTHER_GEOMETRY)
-)
-"""Remedies for a band with another view of the scene, which bands have that were exposed at other times."""
-
 KINDS: Mapping[str, IssueKind] = {
     kind.code: kind
     for kind in (

@@ -241,7 +241,7 @@ def test_a_relief_is_chosen_if_it_fits_at_least_as_well(gain_px: float, is_chose
 
 
 def test_a_homography_beside_a_relief_is_predicted_with_its_own_error() -> None:
-    """Its geometry differs from that of the other bands, although it passes all checks. A thermal band has its own grid."""
+    """Its geometry differs from that of the others, although it passes all checks. A thermal band has its own grid."""
     together = Together()
     thermal = replace(pair("LWIR"), reference=Reference(pair().reference.image))
     together.bands["LWIR"] = BandCandidates(thermal, SEED, None, [candidate("LWIR", pair=thermal)])
