@@ -197,8 +197,9 @@ class MappingError:
     def _unmodelled_px2(self, points_px: Points, far: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return u^2 (n,): the expected squared shift at points that the mapping does not contain.
 
-        It is the median of the nearest windows, so that a single wrong peak does not count, minus their noise. It is
-        shrunk towards the value of all windows, which is used alone far from them.
+        It is the median of the nearest windows, minus their noise, with the value of all windows as one more, so that a
+        single wrong peak does not count, even far from the others. It is shrunk towards the value of all windows, which
+        is used alone far from them.
         """
         measured = self._measured
         if measured is None:
@@ -208,15 +209,18 @@ class MappingError:
         count = min(8, len(squares))  # nearest windows, weighted by their distance
         distance, index = (values.reshape(-1, count) for values in self._tree.query(points_px, k=count))
         weight = np.exp(-0.5 * (distance / self._spacing_px) ** 2) + 1e-12
-        order = np.argsort(squares[index], axis=1)
-        cumulative = np.cumsum(np.take_along_axis(weight, order, axis=1), axis=1)
-        middle = (cumulative >= cumulative[:, -1:] / 2).argmax(axis=1)[:, None]
-        median_px2 = np.take_along_axis(squares[index], np.take_along_axis(order, middle, axis=1), axis=1)[:, 0]
-        mean_noise_px2 = (weight * noise_px2[index]).sum(axis=1) / weight.sum(axis=1)
         # The median square of a shift with two normally distributed components is log(2) times its mean square.
+        all_px2, total = measured.std_px**2, weight.sum(axis=1)
+        of_all_px2 = math.log(2) * (all_px2 + np.median(noise_px2))
+        near_squares = np.column_stack([squares[index], np.full(len(index), of_all_px2)])
+        order = np.argsort(near_squares, axis=1)
+        weights = np.column_stack([weight, np.ones(len(index))])
+        cumulative = np.cumsum(np.take_along_axis(weights, order, axis=1), axis=1)
+        middle = (cumulative >= cumulative[:, -1:] / 2).argmax(axis=1)[:, None]
+        median_px2 = np.take_along_axis(near_squares, np.take_along_axis(order, middle, axis=1), axis=1)[:, 0]
+        mean_noise_px2 = (weight * noise_px2[index]).sum(axis=1) / total
         local_px2 = np.maximum(median_px2 / math.log(2) - mean_noise_px2, 0.0)
         prior_windows = 4.0  # weight of all windows relative to one of the nearest
-        all_px2, total = measured.std_px**2, weight.sum(axis=1)
         near_px2 = (total * local_px2 + prior_windows * all_px2) / (total + prior_windows)
         return np.asarray((1 - far) * near_px2 + far * all_px2)
 

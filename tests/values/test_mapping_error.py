@@ -65,6 +65,12 @@ def test_a_single_wrong_peak_is_no_error_and_noise_is_subtracted() -> None:
     shifts_px = np.zeros_like(centres_px)
     shifts_px[10] = 20.0, 0.0
     assert expected_px(error_of([0.01] * 4, residual_of(centres_px, shifts_px)), *centres_px[10]) < 0.1
+    alone_px = np.vstack([columns(4).centres_px, [[540.0, 250.0]]])
+    of_alone = np.zeros_like(alone_px)
+    of_alone[-1] = 12.0, 0.0
+    assert expected_px(error_of([0.01] * 4, residual_of(alone_px, of_alone)), 540.0, 250.0) < 0.1
+    of_alone[-5:] = 12.0, 0.0  # a column of such shifts is one
+    assert expected_px(error_of([0.01] * 4, residual_of(alone_px, of_alone)), *alone_px[-3]) > 1.0
     noise = np.random.default_rng(0).normal(0, 0.98 / np.sqrt(2), centres_px.shape)
     known = error_of([0.01] * 4, residual_of(centres_px, noise, sigma=7.0))
     assert np.median(known.error_px(centres_px)) < 0.6
