@@ -21,8 +21,8 @@ if TYPE_CHECKING:
     from agalign.api import indices as indices
     from agalign.api import onto as onto
     from agalign.api import warp_onto as warp_onto
-    from agalign.batch.capture_task import CaptureReport as CaptureReport
-    from agalign.batch.capture_task import FlightReports as FlightReports
+    from agalign.batch.capture_report import CaptureReport as CaptureReport
+    from agalign.batch.capture_report import FlightReports as FlightReports
     from agalign.batch.workers import dask_executor as dask_executor
     from agalign.cameras.discover import FolderScan as FolderScan
     from agalign.cameras.discover import discover as discover
@@ -39,7 +39,6 @@ if TYPE_CHECKING:
     from agalign.errors import ConfigurationError as ConfigurationError
     from agalign.errors import GeometryError as GeometryError
     from agalign.errors import InputError as InputError
-    from agalign.errors import MemoryLimitError as MemoryLimitError
     from agalign.errors import NoContrastError as NoContrastError
     from agalign.errors import NoSuchBandError as NoSuchBandError
     from agalign.errors import NotEnoughTextureError as NotEnoughTextureError
@@ -47,11 +46,11 @@ if TYPE_CHECKING:
     from agalign.errors import SidecarError as SidecarError
     from agalign.errors import UnreadableFileError as UnreadableFileError
     from agalign.errors import WorkerError as WorkerError
-    from agalign.products.exports.dataset import open_capture as open_capture
-    from agalign.products.exports.dataset import open_flight as open_flight
-    from agalign.products.exports.programs import ExportReport as ExportReport
-    from agalign.products.indices.rasters import IndexReport as IndexReport
-    from agalign.products.sidecar.alignments import read_alignment as read_alignment
+    from agalign.exports.dataset import open_capture as open_capture
+    from agalign.exports.dataset import open_flight as open_flight
+    from agalign.exports.programs import ExportReport as ExportReport
+    from agalign.indices.rasters import IndexReport as IndexReport
+    from agalign.rasters.read_alignment import read_alignment as read_alignment
     from agalign.values.alignment import Alignment as Alignment
     from agalign.values.alignment import Prediction as Prediction
     from agalign.values.alignment import Seed as Seed
@@ -61,17 +60,17 @@ if TYPE_CHECKING:
 
 _NAMES = {
     "api": "align align_capture align_folder export indices onto warp_onto",
-    "batch.capture_task": "CaptureReport FlightReports",
+    "batch.capture_report": "CaptureReport FlightReports",
     "batch.workers": "dask_executor",
     "cameras.discover": "FolderScan discover",
     "config": "CheckSettings DiscoverOptions FlightSettings JointSettings ReliefSettings RunOptions SeedSettings "
     "Settings WriteSettings",
-    "errors": "AgalignError ConfigurationError GeometryError InputError MemoryLimitError NoContrastError "
+    "errors": "AgalignError ConfigurationError GeometryError InputError NoContrastError "
     "NoSuchBandError NotEnoughTextureError OutputError SidecarError UnreadableFileError WorkerError",
-    "products.exports.dataset": "open_capture open_flight",
-    "products.exports.programs": "ExportReport",
-    "products.indices.rasters": "IndexReport",
-    "products.sidecar.alignments": "read_alignment",
+    "exports.dataset": "open_capture open_flight",
+    "exports.programs": "ExportReport",
+    "indices.rasters": "IndexReport",
+    "rasters.read_alignment": "read_alignment",
     "values.alignment": "Alignment Prediction Seed",
     "values.capture": "Capture",
     "values.mapping_error": "MappingError",

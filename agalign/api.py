@@ -11,7 +11,8 @@ from reprlib import repr as shortened_repr
 import numpy as np
 from numpy.typing import ArrayLike, NDArray  # the former in quotes: help() prints its name, not 1,000 characters
 
-from agalign.batch.capture_task import CaptureReport, FlightReports, Task, process_capture, quiet
+from agalign.batch.capture_report import CaptureReport, FlightReports
+from agalign.batch.capture_task import Task, process_capture, quiet
 from agalign.batch.earlier_results import refuse_other_captures
 from agalign.batch.index_run import index_tasks, run_indices
 from agalign.batch.run import Listener, run_flight
@@ -22,14 +23,16 @@ from agalign.capture.reference import Reference
 from agalign.capture.warped_pair import with_metrics
 from agalign.config import DiscoverOptions, RunOptions, Settings
 from agalign.errors import InputError
+from agalign.exports.programs import ExportReport
+from agalign.exports.programs import export as export_run
 from agalign.flight.panel_readings import with_panels
 from agalign.flight.sky import sky_captures
+from agalign.host.output_folder import locked, prepare_output
+from agalign.host.processes import end_if_reimported
+from agalign.indices.formulas import chosen_indices
+from agalign.indices.rasters import IndexReport
 from agalign.pixels.masks import raster_of
 from agalign.pixels.radiometry import with_radiometry
-from agalign.products.exports.programs import ExportReport
-from agalign.products.exports.programs import export as export_run
-from agalign.products.indices.formulas import chosen_indices
-from agalign.products.indices.rasters import IndexReport
 from agalign.values import geometry
 from agalign.values.alignment import Alignment, Seed
 from agalign.values.arguments import checked
@@ -37,8 +40,6 @@ from agalign.values.capture import Capture
 from agalign.values.choices import MAX_PIXELS, ExportProgram, Interpolation, SeedKind
 from agalign.values.image import Mask
 from agalign.values.mapping import PixelMapping
-from agalign.values.output_folder import locked, prepare_output
-from agalign.values.processes import end_if_reimported
 from agalign.values.resampling import array_of
 
 Progress = Callable[[CaptureReport, int, int], object]
@@ -380,7 +381,7 @@ def _run(
     progress: Progress | None = None,
     start: Path | None = None,
 ) -> FlightReports:
-    from agalign.products.report.pages import write_pages
+    from agalign.report.pages import write_pages
 
     reports = FlightReports()
     for report in run_flight(flight, out, settings, run, Listener(on_again=_LOG.info), start):

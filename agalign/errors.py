@@ -165,18 +165,6 @@ class WorkerError(AgalignError):
     """
 
 
-class MemoryLimitError(AgalignError):
-    """The system limits the memory of this process to less than the libraries need.
-
-    Only the command `agalign` raises it.
-
-    Examples
-    --------
-    >>> issubclass(agalign.MemoryLimitError, agalign.AgalignError)
-    True
-    """
-
-
 def is_out_of_memory(error: BaseException) -> bool:
     """Return True for MemoryError and for other errors with the message of a library that is out of memory."""
     messages = (

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 from agalign import read_alignment
 from agalign.cameras.discover import discover
-from agalign.products.sidecar.file import find_sidecars, read_sidecar
+from agalign.records.sidecar_file import find_sidecars, read_sidecar
 from agalign.values import geometry
 
 TIE_NOISE_PX = 0.05

@@ -23,9 +23,9 @@ from numpy.typing import NDArray
 from scipy.interpolate import RegularGridInterpolator
 
 from agalign.pixels.raster import without_warnings
-from agalign.products.sidecar.alignments import read_alignment
-from agalign.products.sidecar.file import find_sidecars, read_sidecar
-from agalign.products.sidecar.schema import BandResult, Sidecar
+from agalign.rasters.read_alignment import read_alignment
+from agalign.records.sidecar import BandResult, Sidecar
+from agalign.records.sidecar_file import find_sidecars, read_sidecar
 from agalign.values.geometry import Points
 
 Ties = dict[str, dict[str, Any]]
@@ -256,7 +256,7 @@ class BandError:
     @property
     def is_usable(self) -> bool:
         """Aligned, or predicted within --accept-predicted."""
-        return self.part.is_usable(self.sidecar.max_predicted_px)
+        return self.part.is_usable(self.sidecar.accept_predicted_px)
 
     @property
     def median_px(self) -> float:

@@ -25,7 +25,7 @@ from agalign.evaluation.surface import draw_surface, loss_surface
 from agalign.method.match import sift_keypoints, to_8_bit, visible_in_both
 from agalign.method.paper import Training
 from agalign.pixels.band_resampling import eight_bit
-from agalign.products.report.drawing import with_text
+from agalign.rasters.drawing import with_text
 from agalign.synthetic import cameras
 from agalign.synthetic import flight as synthetic
 from agalign.values import geometry

@@ -22,7 +22,7 @@ from agalign.cameras import known_cameras
 from agalign.cameras.discover import discover
 from agalign.cameras.read_files import read_file
 from agalign.config import DiscoverOptions
-from agalign.products.sidecar.file import find_sidecars, read_sidecar
+from agalign.records.sidecar_file import find_sidecars, read_sidecar
 from agalign.values.capture import Band
 
 _SHOWN_PERCENTILES = 0.5, 99.5

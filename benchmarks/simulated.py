@@ -22,7 +22,7 @@ from figures_csv import FiguresOption, TableRow, write_figures
 from synthetic_flights.cameras import ALTUM, ALTUM_PT, MAVIC, MAVIC_3M, SENTERA_6X
 from synthetic_flights.troubles import make_troubled_flight, make_two_headings
 
-from agalign.products.sidecar.file import find_sidecars, read_sidecar
+from agalign.records.sidecar_file import find_sidecars, read_sidecar
 from agalign.synthetic.cameras import REDEDGE, CameraSpec
 from agalign.synthetic.flight import make_flight
 from agalign.values import geometry

@@ -36,8 +36,8 @@ from agalign import Settings, WriteSettings, read_alignment
 from agalign.batch.capture_task import Task, process_capture
 from agalign.cameras.discover import discover
 from agalign.pixels.radiometry import with_radiometry
-from agalign.products.product import CapturePaths
-from agalign.products.rasters.geotiff import compressed, tiled_profile
+from agalign.rasters.geotiff import compressed, tiled_profile
+from agalign.rasters.product import CapturePaths
 from agalign.values.capture import Capture
 from agalign.values.image import Tile
 

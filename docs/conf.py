@@ -1,6 +1,7 @@
 """The site of these pages: pip install '.[docs]' && sphinx-build -W docs site."""
 
 import inspect
+import json
 import re
 from functools import reduce
 from operator import or_
@@ -14,6 +15,7 @@ from sphinx.application import Sphinx
 from sphinx.ext.napoleon import Config, NumpyDocstring
 
 from agalign import __version__
+from agalign.records.sidecar import Sidecar
 
 # The site has this name instead of a union of ten types. No module of agalign has imported it so far.
 numpy.typing.ArrayLike = type("ArrayLike", (), {"__module__": "numpy.typing"})
@@ -61,6 +63,7 @@ def setup(app: Sphinx) -> None:
     app.connect("autodoc-process-docstring", convert_sections)
     app.connect("autodoc-process-signature", hide_arguments_of_results)
     app.connect("source-read", add_navigation)
+    app.connect("build-finished", write_schema)
     page = Path(__file__).with_name("reference") / "api.rst"
     for module, name in re.findall(r"^\.\. auto\w+:: ([\w.]+)\.(\w+)$", page.read_text(encoding="utf-8"), re.M):
         listed = resolve_name(f"{module}:{name}")
@@ -68,6 +71,12 @@ def setup(app: Sphinx) -> None:
         for value in (listed, *members, *(getattr(m, "fget", getattr(m, "func", None)) for m in members)):
             hints = getattr(value, "__annotations__", {})
             hints.update({name: without_constraints(hint) for name, hint in hints.items()})
+
+
+def write_schema(app: Sphinx, _error: Exception | None) -> None:
+    """Write the JSON Schema of sidecars beside the pages."""
+    text = json.dumps(Sidecar.json_schema(), indent=1)
+    (Path(app.outdir) / "sidecar.schema.json").write_text(text, encoding="utf-8")
 
 
 def without_constraints(hint: Any) -> Any:

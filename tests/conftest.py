@@ -13,12 +13,14 @@ import numpy as np
 import pytest
 import rasterio
 from filelock import FileLock
+from synthetic_flights.troubles import make_flight_between_panels
 from threadpoolctl import threadpool_limits
 
+from agalign import align_folder
 from agalign.config import SeedSettings, Settings, WriteSettings
+from agalign.host.processes import usable_cores
 from agalign.synthetic import flight as synthetic
 from agalign.values import geometry
-from agalign.values.processes import usable_cores
 
 from .program import agalign
 
@@ -28,6 +30,8 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 threadpool_limits(1)
 cv2.setNumThreads(1)
 
+SUN = 1.0, 0.6
+"""Irradiance at the panel before and after the captures, relative to noon."""
 REAL_DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
 
 
@@ -124,7 +128,7 @@ def read_json(path: Path) -> Any:
 
 def write_signed(path: Path, text: str) -> None:
     """Write the JSON of a sidecar with the checksum of its content, as commands do."""
-    from agalign.products.sidecar.file import content_checksum
+    from agalign.records.sidecar_file import content_checksum
 
     path.write_text(json.dumps(json.loads(text) | {"checksum": content_checksum(text)}), encoding="utf-8")
 
@@ -205,3 +209,16 @@ def mean_error_px(one: np.ndarray, other: np.ndarray, width: int, height: int) -
     """Mean distance between where two homographies send the pixels of an image."""
     points = geometry.lattice(width, height, 40, 30)
     return float(np.linalg.norm(geometry.apply(one, points) - geometry.apply(other, points), axis=1).mean())
+
+
+@pytest.fixture(scope="session")
+def between_panels(shared: Shared) -> Path:
+    """The panel, two captures, and the panel again, while the sun goes down."""
+    return shared("between_panels", lambda folder: make_flight_between_panels(folder, 2, (640, 480), sun=SUN))
+
+
+@pytest.fixture(scope="session")
+def by_sun(between_panels: Path, shared: Shared) -> Path:
+    """The two captures as georeferenced reflectance by the light sensor, mapped by their tags."""
+    settings = seeded(radiometry="sun", georeference=True)
+    return shared("by_sun", lambda out: align_folder(between_panels, out, settings=settings))

@@ -13,7 +13,7 @@ import torch
 
 import agalign
 from agalign.pixels.masks import raster_of
-from agalign.products.sidecar.file import read_sidecar
+from agalign.records.sidecar_file import read_sidecar
 from agalign.values.arguments import checked
 from agalign.values.mapping import PixelMapping
 

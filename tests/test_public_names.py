@@ -24,7 +24,7 @@ SETTINGS = "CheckSettings FlightSettings JointSettings ReliefSettings SeedSettin
 RESULTS = "Alignment Capture CaptureReport ExportReport FlightReports FolderScan IndexReport MappingError Prediction"
 RESULTS += " Residual Seed"
 OPTIONS = "DiscoverOptions RunOptions"
-ERRORS = """AgalignError ConfigurationError GeometryError InputError NoContrastError NoSuchBandError MemoryLimitError
+ERRORS = """AgalignError ConfigurationError GeometryError InputError NoContrastError NoSuchBandError
 NotEnoughTextureError OutputError SidecarError UnreadableFileError WorkerError"""
 
 

@@ -14,8 +14,8 @@ from agalign.batch.capture_task import Task
 from agalign.batch.run import Listener, capture_reports
 from agalign.batch.workers import open_workers
 from agalign.cameras.discover import discover
+from agalign.host import processes
 from agalign.method.device import limit_threads
-from agalign.values import processes
 
 from .conftest import seeded
 

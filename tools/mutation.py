@@ -35,7 +35,7 @@ except ImportError:
     sys.exit('mutmut is not installed: pip install "mutmut>=3.8,<4"')
 
 ROOT = Path(__file__).resolve().parents[1]
-CALLERS = "batch", "cameras", "capture", "flight", "pixels", "test_api.py", "products/test_sidecar.py"
+CALLERS = "batch", "cameras", "capture", "flight", "pixels", "test_api.py", "records/test_sidecar.py"
 """Tests of the callers, relative to tests/."""
 NOT_COPIED = (".git", ".*_cache", "__pycache__", ".hypothesis", ".venv", "build", "dist", "site", "*.egg-info")
 TIMEOUT_S = 600.0

@@ -1,10 +1,10 @@
-"""Write the schema of the sidecar and the parts of docs/ that repeat the program (commands, settings, indices, sidecar
-fields, reasons), or check that they are current.
+"""Write the parts of docs/ that repeat the program (commands, settings, indices, sidecar fields, reasons), or check
+that they are current.
 
     python tools/pages.py [--check]
 
 Commands and their options come from `agalign/cli/` and `agalign/config.py`, indices from
-`agalign/products/indices/formulas.py`, fields from `agalign/products/sidecar/schema.py` and the records that it
+`agalign/indices/formulas.py`, fields from `agalign/records/sidecar.py` and the records that it
 contains, reasons from `agalign/values/issues.py`, measured figures from `docs/figures/figures.csv`. Each part is
 between two comments in its page.
 """
@@ -32,12 +32,11 @@ import agalign
 from agalign.cli.command import Command, field_options, help_of, value_name
 from agalign.cli.main import COMMANDS
 from agalign.config import DiscoverOptions, RunOptions, Settings
-from agalign.products.indices.formulas import INDICES
-from agalign.products.sidecar.schema import Sidecar
+from agalign.indices.formulas import INDICES
+from agalign.records.sidecar import Sidecar
 from agalign.values.issues import KINDS, Issue, sentence
 
 DOCS = Path(__file__).resolve().parents[1] / "docs"
-SCHEMA = Path(agalign.__file__).parent / "sidecar.schema.json"
 API = DOCS / "reference" / "api.rst"
 NAMES, END_OF_NAMES = ".. Written by tools/pages.py: names\n", ".. end of names\n"
 FIGURES = DOCS / "figures" / "figures.csv"
@@ -139,7 +138,7 @@ def fields() -> str:
 
     A part without other parts that only one field has is listed below that field.
     """
-    schema = sidecar_schema()
+    schema = Sidecar.json_schema()
     types = schema["$defs"]
     owners = [("The file", schema), *types.items()]
     references = Counter(
@@ -203,14 +202,6 @@ def described(field: Mapping[str, Any], inner: Mapping[str, Any], of_types: Cont
     elif text in of_types:
         text = ""
     return " ".join(text.split()), json_type(field, inner)
-
-
-def sidecar_schema() -> dict[str, Any]:
-    """Return the JSON Schema of the sidecar, without the examples of docstrings, which are Python."""
-    schema = Sidecar.model_json_schema(mode="serialization")
-    for part in schema["$defs"].values():
-        part["description"] = part["description"].partition("\n\nExamples\n")[0]
-    return schema
 
 
 def json_type(field: Mapping[str, Any], inner: Container[str]) -> str:
@@ -313,8 +304,7 @@ PARTS: tuple[tuple[str, str, Callable[[], str]], ...] = (
 
 
 def main() -> None:
-    """Write the schema and the parts of pages, or check them with --check."""
-    write_or_check(SCHEMA, json.dumps(sidecar_schema(), indent=1) + "\n")
+    """Write the parts of pages, or check them with --check."""
     for name, mark, content in PARTS:
         write_or_check(DOCS / name, with_section(DOCS / name, mark, content()))
     before, _, rest = API.read_text(encoding="utf-8").partition(NAMES)

@@ -23,14 +23,14 @@ from agalign.flight.fingerprint import (
     input_states,
     render_fingerprint,
 )
+from agalign.host.files import file_checksum
+from agalign.host.memory import WORK_TILE_PX
 from agalign.pixels.raster import read_tile
-from agalign.products.product import CapturePaths
-from agalign.products.sidecar.file import read_with_change
-from agalign.products.sidecar.schema import FilePart, Sidecar, capture_status
+from agalign.rasters.product import CapturePaths
+from agalign.records.sidecar import FilePart, Sidecar, capture_status
+from agalign.records.sidecar_file import read_with_change
 from agalign.values.capture import Band, Capture, CaptureTime
-from agalign.values.files import file_checksum
 from agalign.values.image import Tile
-from agalign.values.memory import WORK_TILE_PX
 from agalign.values.resampling import tiles
 
 _MAX_APART = timedelta(seconds=1)
@@ -155,13 +155,13 @@ def remaining(
     files = _compared_files(earlier, capture)
     if files.lost and not options.overwrite:
         return _kept(files.lost, f"the sidecar {change}" if change else "", None if change else earlier)
-    if change and earlier.estimated_with:  # a sidecar of schema version 1 has none
+    if change:
         return Remaining("estimate", (_DAMAGED,))
     if earlier.estimated_with != estimation_fingerprint(capture, settings):
         stages = [(key, stage) for key, stage in settings if key not in RENDER_STAGES]
         changed = _changed_options(earlier, settings, stages) + _changed_version(earlier)
-        other = _changed_selection(earlier, capture) if earlier.estimated_with else ("format of the sidecar",)
-        return Remaining("estimate", changed or (("input files",) if files.changed else other))
+        other = ("input files",) if files.changed else _changed_selection(earlier, capture)
+        return Remaining("estimate", changed or other)
     if files.changed:
         return Remaining("estimate", ("input files",))
     status = capture_status(earlier.bands, capture.missing_bands, settings.check.accept_predicted_px)

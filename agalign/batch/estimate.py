@@ -3,20 +3,22 @@
 import time
 from contextlib import suppress
 from pathlib import Path
+from typing import Any
 
+from agalign.cameras.metadata import exposed_after_s
 from agalign.capture.align_bands import PairProgress, align_capture_bands
 from agalign.config import Settings
-from agalign.flight.fingerprint import RENDER_STAGES
+from agalign.flight.fingerprint import RENDER_STAGES, input_digests, input_samples, input_states
 from agalign.flight.model import FlightModel
+from agalign.host.own_files import is_own_file
 from agalign.pixels.raster import ReadTile, read_tile
-from agalign.products.product import CapturePaths
-from agalign.products.rasters.alignment_maps import relief_of
-from agalign.products.rasters.parallax_file import PARALLAX_KIND, PARALLAX_SUFFIX, write_parallax
-from agalign.products.sidecar.file import file_part, read_sidecar, write_sidecar
-from agalign.products.sidecar.schema import Sidecar
+from agalign.rasters.alignment_maps import relief_of
+from agalign.rasters.parallax_file import PARALLAX_KIND, PARALLAX_SUFFIX, write_parallax
+from agalign.rasters.product import CapturePaths
+from agalign.records.sidecar import Sidecar
+from agalign.records.sidecar_file import file_part, read_sidecar, write_sidecar
 from agalign.values.alignment import Alignment
 from agalign.values.capture import Capture
-from agalign.values.own_files import is_own_file
 
 
 def estimate(
@@ -43,14 +45,22 @@ def estimate(
     if relief is not None:
         write_parallax(path, relief, capture.reference.georeference)
         parallax = file_part(PARALLAX_KIND, path, paths.folder)
-    seconds = time.perf_counter() - began_s
-    fingerprint = "" if model is None else model.fingerprint
-    result = Sidecar.estimated(capture, alignments, settings, parallax, seconds, fingerprint)
+    delayed = [b for b in capture.moving if alignments[b.name].status != "aligned"]
+    delays_s = {b.name: s for b in delayed if (s := exposed_after_s(b, capture.reference)) is not None}
+    result = Sidecar.estimated(capture, alignments, settings, delays_s)
+    facts: dict[str, Any] = {
+        "parallax": parallax,
+        "model": "" if model is None else model.fingerprint,
+        "input_samples": input_samples(capture),
+        "input_digests": input_digests(capture),
+        "input_states": input_states(capture),
+        "seconds": time.perf_counter() - began_s,
+    }
     if earlier is not None:
         options = {key: stage for key, stage in (result.options or {}).items() if key not in RENDER_STAGES}
         options |= {key: stage for key, stage in (earlier.options or {}).items() if key in RENDER_STAGES}
-        result = result.model_copy(update={"products": earlier.products, "options": options})
-    write_sidecar(paths.sidecar, result)
+        facts |= {"products": earlier.products, "options": options}
+    write_sidecar(paths.sidecar, result.model_copy(update=facts))
     if relief is None and is_own_file(path):
         with suppress(OSError):
             path.unlink(missing_ok=True)

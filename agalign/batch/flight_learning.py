@@ -28,6 +28,7 @@ from agalign.flight.learn_rig import learn_rig
 from agalign.flight.model import FlightModel
 from agalign.flight.rig import MIN_CAPTURES, Rig, median_mapping
 from agalign.flight.rig_prediction import predict_band
+from agalign.host.process_pool import A, Apply, R
 from agalign.method.descriptor import Descriptor
 from agalign.method.device import keep_freed_memory, one_memory_error, one_thread
 from agalign.method.fast import learn
@@ -37,7 +38,6 @@ from agalign.values import geometry
 from agalign.values.capture import Capture
 from agalign.values.geometry import Matrix
 from agalign.values.lens_shapes import lens_std_px
-from agalign.values.process_pool import A, Apply, R
 from agalign.values.residual import Residual
 from agalign.verify.coverage import unmodelled_std_px
 

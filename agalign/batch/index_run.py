@@ -9,14 +9,14 @@ import cv2
 
 from agalign.batch.workers import failure_text, open_workers, serially
 from agalign.errors import AgalignError
-from agalign.products.indices.formulas import Index
-from agalign.products.indices.rasters import IndexRasters, IndexReport, to_check, update_table, write_rasters
-from agalign.products.run.captures import bands_of
-from agalign.products.run.cautions import RunFacts
-from agalign.products.run.record import counted_sidecars
-from agalign.products.sidecar.file import add_products, label_of, read_without_tables, run_sidecars
-from agalign.values.files import written_below
-from agalign.values.processes import usable_cores
+from agalign.host.files import written_below
+from agalign.host.processes import usable_cores
+from agalign.indices.formulas import Index
+from agalign.indices.rasters import IndexRasters, IndexReport, to_check, update_table, write_rasters
+from agalign.records.captures import bands_of
+from agalign.records.cautions import RunFacts
+from agalign.records.run_record import counted_sidecars
+from agalign.records.sidecar_file import add_products, label_of, read_without_tables, run_sidecars
 
 
 @dataclass(frozen=True)

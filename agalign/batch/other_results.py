@@ -8,9 +8,9 @@ from agalign.batch.earlier_results import is_same
 from agalign.cameras.discover import FolderScan
 from agalign.errors import SidecarError
 from agalign.flight.fingerprint import input_samples
-from agalign.products.run.record import NotInInputPart, RunPart
-from agalign.products.sidecar.file import find_sidecars, label_of, read_without_tables
-from agalign.products.sidecar.schema import Sidecar
+from agalign.records.run_record import NotInInputPart, RunPart
+from agalign.records.sidecar import Sidecar
+from agalign.records.sidecar_file import find_sidecars, label_of, read_without_tables
 from agalign.values.capture import Capture
 
 

@@ -1,6 +1,6 @@
 """Files of earlier commands in the output folder: which of them a run may replace or remove.
 
-These are files that the sidecar of the capture lists, and files with the mark of the program (`values/own_files.py`).
+These are files that the sidecar of the capture lists, and files with the mark of the program (`host/own_files.py`).
 Others are kept, whatever their names.
 """
 
@@ -10,18 +10,18 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 
+from agalign.batch.products import PRODUCTS
 from agalign.config import WriteSettings
 from agalign.errors import ConfigurationError, OutputError, SidecarError
-from agalign.products.indices.rasters import index_rasters
-from agalign.products.product import CapturePaths
-from agalign.products.rasters.aligned_files import band_file_names, is_aligned_raster
-from agalign.products.rasters.parallax_file import PARALLAX_SUFFIX
-from agalign.products.registry import PRODUCTS
-from agalign.products.sidecar.file import is_sidecar, read_checked
-from agalign.products.sidecar.schema import FilePart
+from agalign.host.files import check_inside, max_name_bytes
+from agalign.host.own_files import is_own_file
+from agalign.indices.rasters import index_rasters
+from agalign.rasters.aligned_files import band_file_names, is_aligned_raster
+from agalign.rasters.parallax_file import PARALLAX_SUFFIX
+from agalign.rasters.product import CapturePaths
+from agalign.records.sidecar import FilePart
+from agalign.records.sidecar_file import is_sidecar, read_checked
 from agalign.values.capture import Capture
-from agalign.values.files import check_inside, max_name_bytes
-from agalign.values.own_files import is_own_file
 
 
 def paths_written(capture: Capture, out: Path, settings: WriteSettings) -> list[Path]:

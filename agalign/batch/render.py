@@ -10,19 +10,19 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from agalign.batch.output_files import outdated_files, remove_files
+from agalign.batch.products import PRODUCTS
 from agalign.capture.align_bands import tie_windows
 from agalign.config import Settings, WriteSettings
 from agalign.errors import AgalignError
+from agalign.indices.rasters import index_rasters
 from agalign.pixels.raster import ReadTile, read_tile
-from agalign.products.indices.rasters import index_rasters
-from agalign.products.product import CapturePaths, ProductContext
-from agalign.products.rasters.output_grid import FlightLimits, output_layers
-from agalign.products.rasters.parallax_file import read_relief
-from agalign.products.registry import PRODUCTS
-from agalign.products.report.preview import preview_bytes
-from agalign.products.sidecar.file import write_sidecar
-from agalign.products.sidecar.rendered import rendered
-from agalign.products.sidecar.schema import FilePart, Sidecar
+from agalign.rasters.output_grid import FlightLimits, output_layers
+from agalign.rasters.parallax_file import read_relief
+from agalign.rasters.preview import preview_bytes
+from agalign.rasters.product import CapturePaths, ProductContext
+from agalign.rasters.rendered import rendered
+from agalign.records.sidecar import FilePart, Sidecar
+from agalign.records.sidecar_file import write_sidecar
 from agalign.values.alignment import Alignment
 from agalign.values.capture import Capture
 from agalign.values.image import OutputGrid

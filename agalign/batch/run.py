@@ -10,7 +10,8 @@ from functools import partial
 from pathlib import Path
 from typing import Self
 
-from agalign.batch.capture_task import CaptureReport, Task, do_capture, loaded_model, quiet
+from agalign.batch.capture_report import CaptureReport
+from agalign.batch.capture_task import Task, do_capture, loaded_model, quiet
 from agalign.batch.earlier_results import EarlierResults, Remaining, outputs_exist, refuse_other_captures, remaining
 from agalign.batch.flight_learning import learn_flight
 from agalign.batch.other_results import labels_of_other_inputs, results_not_in_input
@@ -28,21 +29,21 @@ from agalign.flight.panel_readings import PanelReading
 from agalign.flight.rig import MIN_CAPTURES, Rig
 from agalign.flight.rig_file import read_rig
 from agalign.flight.sky import SkyCapture
+from agalign.host.files import check_inside, written_below
+from agalign.host.output_folder import is_full, locked
+from agalign.host.processes import CAPTURES_WORTH_A_PROCESS, usable_cores
+from agalign.host.text import counted
+from agalign.indices.rasters import check_indices
 from agalign.method.device import choose_device, limit_threads
-from agalign.products.indices.rasters import check_indices
-from agalign.products.product import CapturePaths
-from agalign.products.rasters.output_grid import FlightLimits, common_grid, flight_limits
-from agalign.products.report.pages import outdate_pages
-from agalign.products.report.preview import preview_bytes
-from agalign.products.run.excluded import write_panels, write_sky
-from agalign.products.run.record import RunPart, begun, excluded_part, input_name, last_record, refuse_foreign_pages
-from agalign.products.sidecar.schema import FilePart, Sidecar
+from agalign.rasters.output_grid import FlightLimits, common_grid, flight_limits
+from agalign.rasters.preview import preview_bytes
+from agalign.rasters.product import CapturePaths
+from agalign.records.run_record import RunPart, begun, excluded_part, input_name, last_record, refuse_foreign_pages
+from agalign.records.sidecar import FilePart, Sidecar
+from agalign.report.excluded import write_panels, write_sky
+from agalign.report.pages import outdate_pages
 from agalign.values.capture import Capture
-from agalign.values.files import check_inside, written_below
 from agalign.values.image import OutputGrid
-from agalign.values.output_folder import is_full, locked
-from agalign.values.processes import CAPTURES_WORTH_A_PROCESS, usable_cores
-from agalign.values.text import counted
 
 _MAX_THREADS = 4
 """Maximum number of threads that train a network or process captures; more wait for the interpreter's lock."""

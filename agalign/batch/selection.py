@@ -6,10 +6,17 @@ from dataclasses import dataclass, field, replace
 from multiprocessing import get_context
 
 from agalign.batch.capture_task import missing_radiometry
+from agalign.batch.products import PRODUCTS
 from agalign.batch.workers import failure_text
 from agalign.cameras.discover import FolderScan
 from agalign.config import RunOptions, WriteSettings
 from agalign.errors import AgalignError, ConfigurationError
+from agalign.flight.footprint import (
+    above_elevation,
+    missing_for_footprint,
+    utm_of_flights,
+    with_approximate_georeference,
+)
 from agalign.flight.panel_readings import (
     READERS,
     PanelReading,
@@ -20,18 +27,11 @@ from agalign.flight.panel_readings import (
     with_panels,
 )
 from agalign.flight.sky import SkyCapture, sky_captures
+from agalign.host.process_pool import ProcessPool, R, WorkerDiedError
+from agalign.host.processes import environment_of_children, silence_libraries, usable_cores
 from agalign.pixels.radiometry import with_radiometry
-from agalign.products.product import Product
-from agalign.products.registry import PRODUCTS
-from agalign.products.run.footprint import (
-    above_elevation,
-    missing_for_footprint,
-    utm_of_flights,
-    with_approximate_georeference,
-)
+from agalign.rasters.product import Product
 from agalign.values.capture import Capture
-from agalign.values.process_pool import ProcessPool, R, WorkerDiedError
-from agalign.values.processes import environment_of_children, silence_libraries, usable_cores
 
 
 @dataclass(frozen=True)

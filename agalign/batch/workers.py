@@ -23,17 +23,17 @@ from typing import Any, Protocol, TypeAlias
 
 from agalign._version import __version__
 from agalign.errors import AgalignError, ConfigurationError, WorkerError
-from agalign.pixels.raster import without_warnings
-from agalign.values.arguments import checked
-from agalign.values.choices import MAX_JOBS
-from agalign.values.process_pool import A, ProcessPool, R, WorkerDiedError
-from agalign.values.processes import (
+from agalign.host.process_pool import A, ProcessPool, R, WorkerDiedError
+from agalign.host.processes import (
     WORKER_MODULE,
     environment_of_children,
     usable_cores,
     without_interrupt_key,
     worker_context,
 )
+from agalign.pixels.raster import without_warnings
+from agalign.values.arguments import checked
+from agalign.values.choices import MAX_JOBS
 
 _DASK_TIMEOUT_S = 10
 _POLL_INTERVAL_S = 1.0

@@ -17,13 +17,13 @@ from agalign.cameras.metadata import Tags
 from agalign.cameras.sun import Sun
 from agalign.cameras.xmp import Name
 from agalign.errors import GeometryError, NoSuchBandError
+from agalign.host.text import did_you_mean
 from agalign.values import geometry
 from agalign.values.band_names import own_stem
 from agalign.values.capture import Band, CaptureTime, Pose
 from agalign.values.geometry import Matrix
 from agalign.values.lens import Lens
 from agalign.values.spectrum import band_key
-from agalign.values.text import did_you_mean
 
 
 class Camera(ABC):

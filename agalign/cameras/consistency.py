@@ -21,10 +21,10 @@ from agalign.cameras.metadata import Tags
 from agalign.cameras.pix4d import NAMESPACE, listed_names
 from agalign.cameras.sun import Sun, sun_position
 from agalign.errors import InputError
+from agalign.host.text import counted, some_of
 from agalign.values.capture import MIN_APART_S, Band, CaptureTime, Position, is_clock_set
 from agalign.values.pixel_units import SAME_PIXELS, PixelScale, Size
 from agalign.values.spectrum import band_key, contradicts
-from agalign.values.text import counted, some_of
 
 _SAME_NM = 0.5
 """Between the wavelengths of two bands that are called equal."""

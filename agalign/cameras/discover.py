@@ -40,6 +40,7 @@ from agalign.cameras.metadata import read_tags
 from agalign.cameras.read_files import read_files
 from agalign.config import DiscoverOptions
 from agalign.errors import ConfigurationError, InputError, NoSuchBandError
+from agalign.host.text import did_you_mean
 from agalign.pixels.coordinates import transformed
 from agalign.pixels.raster import probe, suffix_format
 from agalign.values import geometry
@@ -47,7 +48,6 @@ from agalign.values.arguments import checked
 from agalign.values.capture import Band, Capture
 from agalign.values.choices import MAX_MOSAIC_PIXELS
 from agalign.values.spectrum import band_key
-from agalign.values.text import did_you_mean
 
 __all__ = ["DiscoverOptions", "FolderScan", "Problem", "discover"]
 

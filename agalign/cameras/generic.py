@@ -8,10 +8,10 @@ from agalign.cameras.base import Camera, colour_bands
 from agalign.cameras.known import filter_channels, named_by_camera
 from agalign.cameras.metadata import Tags
 from agalign.cameras.pix4d import NAMESPACE, listed_bands
+from agalign.host.text import shortened
 from agalign.pixels.raster import suffix_format
 from agalign.values.band_names import compile_pattern, is_band_name, own_stem, split_end, split_start, wavelength_in
 from agalign.values.capture import Band
-from agalign.values.text import shortened
 
 
 class Generic(Camera):

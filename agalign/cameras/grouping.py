@@ -21,12 +21,12 @@ from agalign.cameras.known import band_at, lacking
 from agalign.cameras.metadata import Tags
 from agalign.config import DiscoverOptions
 from agalign.errors import InputError, UnreadableFileError
+from agalign.host.files import RUN_FILE
+from agalign.host.text import counted, shortened, some_of
 from agalign.pixels.raster import suffix_format
 from agalign.values.band_names import is_band_name, own_stem
 from agalign.values.capture import Band, CameraIdentity, Capture, CaptureTime, Pose
-from agalign.values.files import RUN_FILE
 from agalign.values.spectrum import band_key
-from agalign.values.text import counted, shortened, some_of
 
 _GroupKey = tuple[str, str, str]
 """(camera, folder of the capture, the camera's capture key)."""

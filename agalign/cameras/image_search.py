@@ -9,9 +9,9 @@ from pathlib import Path
 
 from agalign.cameras.image_file import Problem, natural_order
 from agalign.errors import InputError
+from agalign.host.files import RUN_FILE
+from agalign.host.text import counted
 from agalign.pixels.raster import suffix_format
-from agalign.values.files import RUN_FILE
-from agalign.values.text import counted
 
 IMAGE_KINDS = ".tif, .tiff, .jpg, .jpeg or .png"
 

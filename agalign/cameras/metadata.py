@@ -3,6 +3,7 @@
 import math
 import re
 from collections.abc import Iterable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -12,9 +13,9 @@ from PIL import ExifTags
 from agalign.cameras.tiff_directory import EXIF, GPS, read_directories, values
 from agalign.cameras.xmp import Name, Packet
 from agalign.errors import UnreadableFileError
+from agalign.host.text import shortened, without_controls
 from agalign.pixels.raster import suffix_format
-from agalign.values.capture import Position
-from agalign.values.text import shortened, without_controls
+from agalign.values.capture import Band, CaptureTime, Position
 
 
 @dataclass(frozen=True)
@@ -108,6 +109,15 @@ def read_tags(path: Path, page: int = 0) -> Tags:
         exif=exif,
         unread=packet.unread,
     )
+
+
+def exposed_after_s(band: Band, reference: Band) -> float | None:
+    """Return the delay of the exposure of a band relative to the reference by their tags, s; None if it is unknown."""
+    with suppress(UnreadableFileError):
+        times = [CaptureTime.of(read_tags(b.path, b.page).captured_at) for b in (band, reference)]
+        if times[0] is not None and times[1] is not None:
+            return (times[0].utc - times[1].utc).total_seconds()
+    return None
 
 
 def _size(directory: Mapping[str, Any], *sides: str) -> tuple[int, int] | None:

@@ -24,15 +24,15 @@ from agalign.cameras.pix4d import panel_in
 from agalign.cameras.tiff_directory import image_pages
 from agalign.config import DiscoverOptions
 from agalign.errors import UnreadableFileError
+from agalign.host.process_pool import ProcessPool, WorkerDiedError
+from agalign.host.processes import environment_of_children, silence_libraries
+from agalign.host.text import shortened
 from agalign.pixels.radiometry import plausible
 from agalign.pixels.raster import probe, suffix_format, value_step
 from agalign.values import geometry
 from agalign.values.capture import Band
 from agalign.values.lens import rescaled
 from agalign.values.pixel_units import SAME_PIXELS, PixelScale
-from agalign.values.process_pool import ProcessPool, WorkerDiedError
-from agalign.values.processes import environment_of_children, silence_libraries
-from agalign.values.text import shortened
 
 _FILES_PER_TASK = 100
 """If a file crashes the process, the other files of its task are lost; smaller tasks take more time per file."""

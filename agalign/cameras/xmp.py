@@ -12,7 +12,7 @@ from typing import Any
 
 from lxml import etree
 
-from agalign.values.text import without_controls
+from agalign.host.text import without_controls
 
 Name = tuple[str, str]
 """(namespace, name). A namespace is its URI without scheme, `www.`, version and final slash, which differ between

@@ -11,8 +11,8 @@ import typer
 
 from agalign.cli.command import Command, Given, load_config
 from agalign.cli.terminal import RAW_NUMBERS, Terminal, command_line
+from agalign.host.processes import usable_cores
 from agalign.values.choices import MAX_MOSAIC_PIXELS
-from agalign.values.processes import usable_cores
 
 _command = partial(
     Command, on_interrupt="interrupted; finished captures are kept, and the same command resumes the run"
@@ -44,8 +44,8 @@ def _align(
         agalign orchard/ --relief --error-map  correct parallax of trees; map the expected error
     """
     from agalign.config import DiscoverOptions, RunOptions, Settings
-    from agalign.products.indices.formulas import index_named
-    from agalign.values.processes import start_server_ahead
+    from agalign.host.processes import start_server_ahead
+    from agalign.indices.formulas import index_named
 
     source = folder.resolve()
     target = out or source.parent / f"{source.name}-aligned"
@@ -108,8 +108,8 @@ def _demo(
     """
     from agalign.cli.align_run import conclude, find_captures, run
     from agalign.config import DiscoverOptions, RunOptions, Settings
+    from agalign.host.output_folder import prepare_output
     from agalign.synthetic.flight import make_flight, score_against_truth
-    from agalign.values.output_folder import prepare_output
 
     source, target = out / "flight", out / "aligned"
     prepare_output(source)

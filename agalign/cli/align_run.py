@@ -22,18 +22,18 @@ from agalign.cli.terminal import MAX_LISTED, ExitCode, Terminal
 from agalign.config import DiscoverOptions, RunOptions, Settings
 from agalign.errors import InputError, OutputError, SidecarError, WorkerError
 from agalign.flight.groups import camera_overviews
-from agalign.products.product import CapturePaths
-from agalign.products.report.facts import PairTotals, rounded
-from agalign.products.report.pages import REPORT_FILE, pages_exist, write_pages
-from agalign.products.run.cautions import RunFacts
-from agalign.products.run.record import read_run_record
-from agalign.products.sidecar.file import read_without_tables
-from agalign.products.sidecar.schema import BandResult
+from agalign.host.text import counted, escape_controls
+from agalign.rasters.product import CapturePaths
+from agalign.records.cautions import RunFacts
+from agalign.records.run_record import read_run_record
+from agalign.records.sidecar import BandResult
+from agalign.records.sidecar_file import read_without_tables
+from agalign.report.facts import PairTotals, rounded
+from agalign.report.pages import REPORT_FILE, pages_exist, write_pages
 from agalign.values.capture import Capture
-from agalign.values.text import counted, escape_controls
 
 if TYPE_CHECKING:
-    from agalign.batch.capture_task import CaptureReport
+    from agalign.batch.capture_report import CaptureReport
 
 
 def find_captures(folder: Path, options: DiscoverOptions, terminal: Terminal) -> FolderScan:

@@ -22,9 +22,8 @@ from typer.core import TyperCommand
 from typer.models import OptionInfo
 
 from agalign.cli.terminal import Terminal, exits
-from agalign.values.files import read_regular
-from agalign.values.processes import check_address_space, check_threads
-from agalign.values.text import did_you_mean
+from agalign.host.files import read_regular
+from agalign.host.text import did_you_mean
 
 if TYPE_CHECKING:
     from agalign.config import Option
@@ -161,8 +160,6 @@ class Command:
         def call(**values: Any) -> None:
             terminal = Terminal(**{name: values.pop(name, False) for name in _TERMINAL})
             with exits(terminal, self.on_interrupt, values.get("config")):
-                check_address_space()
-                check_threads()
                 given: Given = {}
                 for name in fields:
                     _store(field_options()[name], values.pop(name), given)

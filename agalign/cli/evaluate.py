@@ -9,9 +9,9 @@ import typer
 from agalign.cli.command import Command, Given
 from agalign.cli.terminal import Terminal
 from agalign.errors import ConfigurationError
+from agalign.host.output_folder import refuse_to_replace
+from agalign.host.text import counted
 from agalign.values.choices import Sharing
-from agalign.values.output_folder import refuse_to_replace
-from agalign.values.text import counted
 
 Pairs = Annotated[
     Path, typer.Argument(help="A CSV file (fixed, moving, homography), or a folder in the HPatches or Oxford layout.")

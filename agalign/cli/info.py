@@ -11,7 +11,7 @@ from agalign.cli.align_commands import align
 from agalign.cli.command import Command, Given, config_text
 from agalign.cli.terminal import MAX_LISTED, ExitCode, Terminal, in_json
 from agalign.errors import ConfigurationError, UnreadableFileError
-from agalign.values.text import counted
+from agalign.host.text import counted
 
 if TYPE_CHECKING:
     from agalign.cameras.discover import FolderScan

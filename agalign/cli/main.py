@@ -17,8 +17,8 @@ from agalign.cli.evaluate import evaluate, learn, surface
 from agalign.cli.info import info
 from agalign.cli.results import export, indices, report, verify
 from agalign.cli.terminal import ExitCode, Terminal, options_from, printed
-from agalign.values.processes import limit_default_threads, silence_libraries
-from agalign.values.text import did_you_mean, name_problem
+from agalign.host.processes import limit_default_threads, silence_libraries
+from agalign.host.text import did_you_mean, name_problem
 
 ndvi = replace(indices, alias="ndvi")
 _ALL = align, demo, info, report, verify, indices, ndvi, export, onto, evaluate, surface, learn

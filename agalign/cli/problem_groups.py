@@ -5,11 +5,11 @@
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
-from agalign.values.text import counted
+from agalign.host.text import counted
 
 if TYPE_CHECKING:
     from agalign.cli.terminal import Terminal
-    from agalign.products.report.facts import CautionGroup
+    from agalign.report.facts import CautionGroup
 
 
 def explain(groups: "Sequence[CautionGroup]", terminal: "Terminal") -> None:

@@ -11,11 +11,11 @@ import typer
 
 from agalign.cli.command import Command, Given
 from agalign.cli.terminal import MAX_LISTED, RAW_NUMBERS, ExitCode, Terminal
+from agalign.host.text import counted
 from agalign.values.choices import ExportProgram
-from agalign.values.text import counted
 
 if TYPE_CHECKING:
-    from agalign.products.indices.rasters import IndexReport
+    from agalign.indices.rasters import IndexReport
 
 Out = Annotated[Path, typer.Argument(help="Output folder of a run.")]
 Json = Annotated[bool, typer.Option("--json")]
@@ -29,10 +29,10 @@ def _report(terminal: Terminal, out: Annotated[Path, typer.Argument()], as_json:
         as_json: Print the content of the report as JSON.
     """
     from agalign.cli.problem_groups import explain
-    from agalign.products.report.facts import SUMMARY_FILE
-    from agalign.products.report.pages import REPORT_FILE, write_pages
-    from agalign.products.sidecar.file import run_sidecars
-    from agalign.values.output_folder import locked
+    from agalign.host.output_folder import locked
+    from agalign.records.sidecar_file import run_sidecars
+    from agalign.report.facts import SUMMARY_FILE
+    from agalign.report.pages import REPORT_FILE, write_pages
 
     run_sidecars(out)
     unreadable: list[str] = []
@@ -58,8 +58,8 @@ def _print_unfinished(out: Path, labels: Collection[str], terminal: Terminal) ->
     them are not in its input; return True if it did not do all.
     """
     from agalign.errors import SidecarError
-    from agalign.products.run.excluded import read_excluded
-    from agalign.products.run.record import read_run_record, unfinished_run
+    from agalign.records.excluded import read_excluded
+    from agalign.records.run_record import read_run_record, unfinished_run
 
     try:
         panels, sky = read_excluded(out)
@@ -79,8 +79,8 @@ def _print_unfinished(out: Path, labels: Collection[str], terminal: Terminal) ->
 
 def _verify(terminal: Terminal, out: Out) -> int:
     """Compare the files of a run with their checksums."""
-    from agalign.products.run.record import counted_sidecars
-    from agalign.products.sidecar.file import label_of, run_sidecars, verify_outputs
+    from agalign.records.run_record import counted_sidecars
+    from agalign.records.sidecar_file import label_of, run_sidecars, verify_outputs
 
     labels, damaged = [], 0
     for path, problems in verify_outputs(out, counted_sidecars(run_sidecars(out), out)):
@@ -110,8 +110,8 @@ def _export(
     Examples:
         agalign export aligned/ --for odm  band files in one folder, and the options for OpenDroneMap
     """
-    from agalign.products.exports.programs import export as run_export
-    from agalign.products.sidecar.file import label_of, run_sidecars
+    from agalign.exports.programs import export as run_export
+    from agalign.records.sidecar_file import label_of, run_sidecars
 
     run_folder = out.resolve()
     folder = target or run_folder.parent / f"{run_folder.name}-{program}"
@@ -166,9 +166,9 @@ def _indices(
     from agalign.batch.index_run import index_tasks, run_indices
     from agalign.cli.align_run import cluster, progress
     from agalign.errors import OutputError
-    from agalign.products.indices.formulas import chosen_indices
-    from agalign.products.report.pages import REPORT_FILE, write_pages
-    from agalign.values.output_folder import locked
+    from agalign.host.output_folder import locked
+    from agalign.indices.formulas import chosen_indices
+    from agalign.report.pages import REPORT_FILE, write_pages
 
     names = (index or ("" if formula else "ndvi")).split(",")
     chosen = chosen_indices(names, formula or [])
@@ -209,7 +209,7 @@ def _conclude(
     """Print the statistics of all indices, and return the exit code; `unwritten` says why the table or the report could
     not be written.
     """
-    from agalign.products.indices.rasters import INDICES_FILE
+    from agalign.indices.rasters import INDICES_FILE
 
     written = [r for r in reports if r.path is not None]
     if unwritten:
@@ -264,7 +264,7 @@ def _print_table(names: Sequence[str], reports: "Sequence[IndexReport]", termina
     """Print a row per index: statistics of the medians of its captures."""
     from statistics import median
 
-    from agalign.products.run.captures import exceptions
+    from agalign.records.captures import exceptions
 
     written, rows = [r for r in reports if r.path is not None], []
     for name in names:

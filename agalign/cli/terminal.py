@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from agalign.errors import AgalignError, ConfigurationError, is_out_of_memory
-from agalign.values.text import escape_controls
+from agalign.host.text import escape_controls
 
 if TYPE_CHECKING:
     from rich.console import Console

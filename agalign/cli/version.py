@@ -7,9 +7,8 @@ from collections.abc import Iterator
 from contextlib import suppress
 
 from agalign._version import __version__
-from agalign.errors import MemoryLimitError
-from agalign.values.libraries import library_versions
-from agalign.values.processes import check_address_space, memory_limit_bytes, usable_cores
+from agalign.host.libraries import library_versions
+from agalign.host.processes import memory_limit_bytes, usable_cores
 
 
 def version_lines() -> Iterator[str]:
@@ -34,7 +33,6 @@ def _memory() -> str:
 def _lines_of_compiled_libraries() -> Iterator[str]:
     """The version of GDAL, and the devices; or why a library cannot be loaded."""
     try:
-        check_address_space()  # with too little, the libraries end the process
         from agalign.pixels.raster import gdal_version
 
         yield f"gdal {gdal_version()}"
@@ -44,6 +42,6 @@ def _lines_of_compiled_libraries() -> Iterator[str]:
             threads = f", {device.threads} threads" if device.threads else ""
             problem = f"; cannot be used: {device.problem}" if device.problem else ""
             yield f"device {device.name}: {device.what}{threads}{problem}"
-    except (MemoryLimitError, ImportError, OSError, RuntimeError) as error:
+    except (ImportError, OSError, RuntimeError) as error:
         problem, *_ = f"{error}".splitlines() or [type(error).__name__]
         yield f"device unknown: {problem}"

@@ -40,6 +40,8 @@ from agalign.errors import (
 )
 from agalign.evaluation.image_pairs import PairFiles, read_image
 from agalign.flight.model import load_model
+from agalign.host.files import read_regular, write_csv
+from agalign.host.text import without_formula
 from agalign.method.descriptor import Descriptor
 from agalign.method.device import one_memory_error, one_thread
 from agalign.method.fast import learn
@@ -54,11 +56,9 @@ from agalign.pixels.landmarks import landmarks, matched_homography
 from agalign.values import geometry
 from agalign.values.alignment import JointResult, Seed
 from agalign.values.choices import Sharing
-from agalign.values.files import read_regular, write_csv
 from agalign.values.geometry import Matrix
 from agalign.values.image import Raster
 from agalign.values.mapping import PixelMapping
-from agalign.values.text import without_formula
 
 Describe = Callable[[Keypoints, Matrix], tuple[Tensor, Tensor]]
 """Return descriptors (f, f'), each (N, D), of the patches around keypoints of the first image, and of the patches of

@@ -14,7 +14,7 @@ from agalign.method.device import one_memory_error, one_thread
 from agalign.method.levels import make_level
 from agalign.method.paper import DEFAULT_TRAINING, Training, descend
 from agalign.method.state import JointState, MovingImage
-from agalign.products.report.drawing import with_text, write_png
+from agalign.rasters.drawing import with_text, write_png
 from agalign.values import geometry
 from agalign.values.geometry import Matrix
 from agalign.values.image import Raster

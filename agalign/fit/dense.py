@@ -21,12 +21,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from agalign.host.memory import MAX_MATCHED_PX
 from agalign.pixels.band_resampling import shrink
 from agalign.pixels.structure import structure_field
 from agalign.values import geometry, lens
 from agalign.values.image import FloatImage, Mask, Raster
 from agalign.values.mapping import PixelMapping
-from agalign.values.memory import MAX_MATCHED_PX
 from agalign.values.parallax import Parallax, Relief
 from agalign.values.pixel_units import PixelScale
 

@@ -13,8 +13,8 @@ import numpy as np
 from agalign._version import __version__
 from agalign.config import CheckSettings, Settings, SettingsModel, WriteSettings
 from agalign.flight.groups import flight_camera
+from agalign.host.files import open_regular
 from agalign.values.capture import Capture
-from agalign.values.files import open_regular
 from agalign.values.lens import Lens
 
 HashInput = str | int | float | bool | None | np.ndarray | Lens | Sequence["HashInput"]

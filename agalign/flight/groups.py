@@ -7,10 +7,10 @@ from statistics import median, mode
 from typing import Self
 
 from agalign.cameras.grouping import usual_bands
+from agalign.host.files import file_name
 from agalign.pixels.radiometry import with_radiometry
 from agalign.values.capture import Band, Capture
 from agalign.values.choices import RadiometryChoice
-from agalign.values.files import file_name
 
 
 @dataclass(frozen=True)

@@ -8,8 +8,8 @@ from numpy.typing import NDArray
 
 from agalign.flight import rig
 from agalign.flight.rig import MIN_CAPTURES, CaptureFactors, Factor, Observation, Rig, capture_factors, design_tensor
+from agalign.host.process_pool import Apply
 from agalign.values.least_squares import least_squares
-from agalign.values.process_pool import Apply
 
 Array = NDArray[np.float64]
 LensLayout = Mapping[str, tuple[float, float]]

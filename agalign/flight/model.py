@@ -22,10 +22,10 @@ from agalign.errors import InputError, is_out_of_memory
 from agalign.flight.groups import FlightCamera
 from agalign.flight.rig import Rig
 from agalign.flight.rig_file import camera_in, rig_from_json, rig_to_json
+from agalign.host.files import complete_file, open_regular
+from agalign.host.text import shortened
 from agalign.method.descriptor import Descriptor
-from agalign.values.files import complete_file, open_regular
 from agalign.values.geometry import Matrix, normalised
-from agalign.values.text import shortened
 
 _FORMAT = "agalign-model/1"
 

@@ -12,10 +12,10 @@ from safetensors import safe_open
 from agalign.errors import InputError
 from agalign.flight.groups import FlightCamera
 from agalign.flight.rig import CaptureFactors, Rig
-from agalign.values.files import open_regular
+from agalign.host.files import open_regular
+from agalign.host.text import shortened
 from agalign.values.geometry import normalised
 from agalign.values.mapping import DisplacementField
-from agalign.values.text import shortened
 
 _MAX_SIDE_PX, _MAX_FIELD_PX, _MAX_NUMBER = 100_000, 1e4, 1e12
 """Limits of the sizes, of the displacements, and of all numbers of a rig; times are the largest."""

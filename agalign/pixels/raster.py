@@ -23,15 +23,15 @@ from rasterio.vrt import WarpedVRT
 from rasterio.windows import Window
 
 from agalign.errors import UnreadableFileError
+from agalign.host.memory import GDAL_CACHE_BYTES, MAX_DECODED_PX
+from agalign.host.text import name_problem
 from agalign.pixels.coordinates import ensure_proj_data
 from agalign.pixels.masks import data_mask, learnable, missing_end, undeclared_fill, without_parts
 from agalign.values import lens
 from agalign.values.capture import Band, Capture, Georeference
 from agalign.values.choices import MAX_PIXELS
 from agalign.values.image import Mask, Raster, Tile, reduced_size_px
-from agalign.values.memory import GDAL_CACHE_BYTES, MAX_DECODED_PX
 from agalign.values.pixel_units import PixelScale
-from agalign.values.text import name_problem
 
 GDAL_ENVIRONMENT = {
     "GDAL_PAM_ENABLED": "NO",

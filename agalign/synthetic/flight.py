@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import CloughTocher2DInterpolator
 
-from agalign.products.sidecar.file import find_sidecars, read_sidecar
+from agalign.records.sidecar_file import find_sidecars, read_sidecar
 from agalign.synthetic import cameras
 from agalign.synthetic.cameras import REDEDGE, BandSpec, CameraSpec, Exposure, Pose, place_and_rays, true_homography
 from agalign.synthetic.ground import Field, Ground, map_px, on_ground, paint_ground, reflectance

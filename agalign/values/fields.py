@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 from pydantic import AfterValidator, ConfigDict, Field, GetCoreSchemaHandler
 from pydantic_core import CoreSchema, core_schema
 
-from agalign.values.files import is_inside
-from agalign.values.text import shortened_message, shortened_name
+from agalign.host.files import is_inside
+from agalign.host.text import shortened_message, shortened_name
 
 RECORD = ConfigDict(extra="forbid", use_attribute_docstrings=True, arbitrary_types_allowed=True, validate_by_name=True)
 _MAX = 1e30

@@ -14,12 +14,12 @@ from pydantic import dataclasses as validated
 from scipy.interpolate import CubicSpline
 from scipy.ndimage import map_coordinates
 
+from agalign.host.memory import MAX_HELD_POSITIONS_PX
 from agalign.values import geometry, lens
 from agalign.values.fields import POSITION_DECIMALS, RECORD, Array, Positive
 from agalign.values.geometry import Matrix, Points
 from agalign.values.image import Mask, Tile
 from agalign.values.lens import Lens
-from agalign.values.memory import MAX_HELD_POSITIONS_PX
 from agalign.values.parallax import Parallax
 from agalign.values.pixel_units import SAME_PIXELS, PixelScale, Size
 

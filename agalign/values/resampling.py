@@ -8,11 +8,11 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from agalign.errors import InputError
+from agalign.host.memory import RESAMPLED_TILE_PX
 from agalign.values.choices import Interpolation
 from agalign.values.geometry import Points
 from agalign.values.image import FloatImage, Mask, Tile
 from agalign.values.mapping import PixelMapping
-from agalign.values.memory import RESAMPLED_TILE_PX
 from agalign.values.pixel_units import Size
 
 _KERNEL_PX = {"cubic": 4, "lanczos": 8}

@@ -10,10 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 from synthetic_flights import troubles
 
+from agalign.host.files import file_checksum
 from agalign.pixels.band_resampling import warped
 from agalign.synthetic.ground import Field
 from agalign.values import lens
-from agalign.values.files import file_checksum
 from agalign.values.image import Raster
 from agalign.values.mapping import PixelMapping
 from bands.score import AS_IT_IS, LOST, Pair, movement

@@ -36,8 +36,8 @@ from peers import METHODS, Align, grey_raster, method_named
 
 from agalign.cameras.discover import discover
 from agalign.pixels.raster import suffix_format
-from agalign.products.sidecar.file import find_sidecars, read_sidecar
-from agalign.products.sidecar.schema import BandResult
+from agalign.records.sidecar import BandResult
+from agalign.records.sidecar_file import find_sidecars, read_sidecar
 from agalign.values import geometry, lens
 from agalign.values.capture import Band
 from agalign.values.mapping import PixelMapping

@@ -29,7 +29,7 @@ from figures_csv import FiguresOption, TableRow, write_figures
 
 from agalign.cli import main as cli
 from agalign.cli.terminal import ExitCode
-from agalign.products.sidecar.file import find_sidecars, read_sidecar, verify_outputs, write_sidecar
+from agalign.records.sidecar_file import find_sidecars, read_sidecar, verify_outputs, write_sidecar
 from agalign.synthetic import flight as synthetic
 
 SIZE_PX = 240, 180

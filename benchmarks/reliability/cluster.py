@@ -18,7 +18,7 @@ from common import align, command, ended, flight_and_out, run
 from figures_csv import FiguresOption, TableRow, write_figures
 from kills import differences, snapshot
 
-from agalign.products.sidecar.file import find_sidecars
+from agalign.records.sidecar_file import find_sidecars
 from agalign.synthetic import flight as synthetic
 
 SIZE_PX, MAX_S = (480, 360), 1800

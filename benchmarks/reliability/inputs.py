@@ -41,7 +41,7 @@ from agalign.fit.dense import DenseMatching, View
 from agalign.flight.panel_readings import with_panels
 from agalign.flight.sky import sky_captures
 from agalign.pixels.panel_detection import find_panel
-from agalign.products.sidecar.file import find_sidecars
+from agalign.records.sidecar_file import find_sidecars
 from agalign.values.capture import Capture
 from agalign.values.image import Raster
 from agalign.values.mapping import PixelMapping

@@ -32,9 +32,9 @@ from common import command, ended, run, table
 from figures_csv import FiguresOption, TableRow, write_figures
 from synthetic_flights.aligned import make_aligned
 
-from agalign.products.sidecar.file import find_sidecars, verify_outputs
+from agalign.host.files import RUN_FILE
+from agalign.records.sidecar_file import find_sidecars, verify_outputs
 from agalign.synthetic import flight as synthetic
-from agalign.values.files import RUN_FILE
 
 SIZE_PX = 480, 360
 OPTIONS = "--layout", "both", "--error-map", "--tie-points"

@@ -37,7 +37,7 @@ from common import Ending, align, run
 
 from agalign.cameras import tiff_directory as tiff
 from agalign.cli.main import main as agalign_main
-from agalign.products.sidecar.file import content_checksum, find_sidecars
+from agalign.records.sidecar_file import content_checksum, find_sidecars
 from agalign.synthetic import flight as synthetic
 
 CAPTURES, SIZE_PX, NAMES = 2, (240, 180), ("IMG_0001", "IMG_0002")

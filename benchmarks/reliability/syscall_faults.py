@@ -25,7 +25,7 @@ from common import Ending, ended, run, table
 from figures_csv import FiguresOption, TableRow, write_figures
 from kills import differences, snapshot, torn
 
-from agalign.products.report.pages import SUMMARY_FILE
+from agalign.report.pages import SUMMARY_FILE
 from agalign.synthetic import flight as synthetic
 
 CAPTURES, SIZE_PX = 2, (240, 180)
@@ -49,7 +49,7 @@ MAX_S = 60
 PROGRAM = """
 import itertools, os, secrets, types
 from agalign.cli.main import main
-from agalign.values import files
+from agalign.host import files
 
 # Names of partial files contain both.
 numbers = itertools.count()

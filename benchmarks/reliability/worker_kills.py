@@ -25,7 +25,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from figures_csv import FiguresOption, TableRow, write_figures
 
 from agalign.errors import WorkerError
-from agalign.values.process_pool import ProcessPool, WorkerDiedError
+from agalign.host.process_pool import ProcessPool, WorkerDiedError
 
 WORKERS, TASKS = 8, 400
 MAX_BYTES = 400_000

@@ -7,8 +7,8 @@ import numpy as np
 import rasterio
 
 from agalign.pixels.raster import without_warnings
-from agalign.products.sidecar.file import write_sidecar
-from agalign.products.sidecar.schema import Sidecar
+from agalign.records.sidecar import Sidecar
+from agalign.records.sidecar_file import write_sidecar
 
 BANDS = {"Green": (560, 0.12, 0.1), "Red": (668, 0.2, 0.05), "NIR": (842, 0.3, 0.52), "Red edge": (717, 0.24, 0.3)}
 """Wavelength in nm, and reflectance of soil and of vegetation."""

@@ -12,16 +12,16 @@ import pytest
 
 import agalign
 from agalign.batch import estimate
-from agalign.products.sidecar import file as sidecar_file
-from agalign.products.sidecar.file import find_sidecars, read_sidecar, verify_outputs
+from agalign.host.own_files import is_own_file
+from agalign.records import sidecar_file
+from agalign.records.sidecar_file import find_sidecars, read_sidecar, verify_outputs
 from agalign.values.alignment import Alignment
-from agalign.values.own_files import is_own_file
 
 from ..builders import in_full_run
 from ..conftest import Shared, read_json, seeded, write_capture
-from ..products.conftest import table_in
-from ..products.test_relief_map import Run
 from ..program import agalign_here
+from ..rasters.test_relief_map import Run
+from ..run_outputs import table_in
 
 pytestmark = pytest.mark.slow
 

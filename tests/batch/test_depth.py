@@ -14,7 +14,7 @@ from agalign.cameras.discover import discover
 from agalign.config import Settings
 from agalign.flight.model import load_model
 
-from ..products.test_relief_map import assert_same_as_stack
+from ..rasters.test_relief_map import assert_same_as_stack
 
 pytestmark = pytest.mark.full
 

@@ -14,7 +14,7 @@ from rasterio.errors import NotGeoreferencedWarning
 import agalign
 from agalign.batch import flight_learning as batch_learn
 from agalign.batch import learning_tasks
-from agalign.batch.capture_task import CaptureReport
+from agalign.batch.capture_report import CaptureReport
 from agalign.batch.run import _crops_of_cameras, plan_run, run_flight
 from agalign.cameras.discover import FolderScan
 from agalign.config import RunOptions
@@ -27,8 +27,8 @@ from agalign.flight.rig_prediction import extreme_mappings
 from agalign.method import joint as method_joint
 from agalign.method import state as method_state
 from agalign.method.fast import Schedule, learn
-from agalign.products.run.record import read_run_record
-from agalign.products.sidecar.file import find_sidecars, read_sidecar
+from agalign.records.run_record import read_run_record
+from agalign.records.sidecar_file import find_sidecars, read_sidecar
 from agalign.synthetic.flight import make_flight
 from agalign.values.capture import Capture
 

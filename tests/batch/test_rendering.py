@@ -14,18 +14,18 @@ import rasterio
 import agalign
 from agalign.batch import capture_task, estimate
 from agalign.batch.run import plan_run
-from agalign.products.run.captures import bands_of
-from agalign.products.run.cautions import RunFacts
-from agalign.products.sidecar.file import find_sidecars, read_sidecar, verify_outputs
+from agalign.records.captures import bands_of
+from agalign.records.cautions import RunFacts
+from agalign.records.sidecar_file import find_sidecars, read_sidecar, verify_outputs
 from agalign.values.alignment import Alignment
 from agalign.values.mapping import DisplacementField
 from agalign.values.mapping_error import MappingError
 
 from ..builders import in_full_run, joint_result, residual_of
 from ..conftest import raising, read_json, seeded
-from ..products.conftest import table_in
-from ..products.test_relief_map import SIZE, Run
 from ..program import agalign_here
+from ..rasters.test_relief_map import SIZE, Run
+from ..run_outputs import table_in
 
 pytestmark = pytest.mark.slow
 
@@ -226,7 +226,7 @@ def test_a_run_that_is_killed_while_it_renders_again_renders_on_resume(
     agalign.align_folder(flight, tmp_path / "direct", settings=others)
     without_estimating()
     with monkeypatch.context() as patch:
-        patch.setattr("agalign.products.report.preview.Preview.write", raising(KeyboardInterrupt()))
+        patch.setattr("agalign.rasters.preview.Preview.write", raising(KeyboardInterrupt()))
         with pytest.raises(KeyboardInterrupt):
             agalign.align_folder(flight, out, settings=others)
     unchanged = read_sidecar(find_sidecars(out)[0])

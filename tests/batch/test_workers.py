@@ -19,14 +19,15 @@ import pytest
 
 import agalign
 from agalign.batch import workers
-from agalign.batch.capture_task import CaptureReport, Task
+from agalign.batch.capture_report import CaptureReport
+from agalign.batch.capture_task import Task
 from agalign.batch.run import Listener, capture_reports, run_flight
 from agalign.batch.workers import DaskExecutor, Run, dask_executor, in_order, on_executor, open_workers
 from agalign.cameras.discover import discover
 from agalign.config import RunOptions, Settings
 from agalign.errors import ConfigurationError, WorkerError
 from agalign.method.device import limit_threads
-from agalign.products.sidecar.file import find_sidecars, read_without_tables
+from agalign.records.sidecar_file import find_sidecars, read_without_tables
 
 from ..conftest import raising, seeded
 from ..values.pool_tasks import WhenUnpickled, signal_self, sleep, without_memory

@@ -18,7 +18,7 @@ from peers import UnavailableError, identity, method_named
 from synthetic_flights.aligned import sidecar_of
 
 from agalign.cameras.discover import discover
-from agalign.products.sidecar.schema import GridPart
+from agalign.records.sidecar import GridPart
 from agalign.values import geometry
 
 from ..conftest import raising

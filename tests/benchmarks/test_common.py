@@ -9,7 +9,7 @@ import pytest
 from common import band_errors, read_ties, report, watched
 
 from agalign import read_alignment
-from agalign.products.sidecar.file import find_sidecars, read_sidecar, write_sidecar
+from agalign.records.sidecar_file import find_sidecars, read_sidecar, write_sidecar
 from agalign.values import geometry
 from agalign.values.alignment import Prediction
 

@@ -13,10 +13,10 @@ import tifffile
 
 import agalign
 from agalign.config import Settings, WriteSettings
-from agalign.products.report import facts
-from agalign.products.report.drawing import ReducedBands
-from agalign.products.report.pages import write_pages
-from agalign.products.report.preview import ReliefView, preview_bytes, write_preview
+from agalign.rasters.drawing import ReducedBands
+from agalign.rasters.preview import ReliefView, preview_bytes, write_preview
+from agalign.report import facts
+from agalign.report.pages import write_pages
 from agalign.synthetic import flight as synthetic
 
 sync_api = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")

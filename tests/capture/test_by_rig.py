@@ -12,7 +12,8 @@ import rasterio
 import torch
 
 import agalign
-from agalign.batch.capture_task import CaptureReport, quiet
+from agalign.batch.capture_report import CaptureReport
+from agalign.batch.capture_task import quiet
 from agalign.batch.flight_learning import learn_flight
 from agalign.cameras.discover import discover
 from agalign.capture.align_bands import CaptureEstimation, align_capture_bands
@@ -22,7 +23,7 @@ from agalign.capture.by_rig import bands_to_learn
 from agalign.capture.candidate import BandCandidates, Candidate
 from agalign.config import CheckSettings, Settings
 from agalign.flight.model import FlightModel, load_model
-from agalign.products.sidecar.schema import capture_status
+from agalign.records.sidecar import capture_status
 from agalign.synthetic.cameras import BANDS, REDEDGE
 from agalign.synthetic.flight import make_flight
 from agalign.values import geometry
@@ -183,7 +184,7 @@ def test_a_capture_over_water_is_predicted_without_learning(run: Run) -> None:
     assert {b.joint.recipe for b in water.bands if b.joint} <= {"flight"}
     # The user's limit decides which predictions are accepted; here none is. The blue and red edge bands are missing.
     sidecars = [reports[f"IMG_000{k}"].sidecar for k in (1, 3, 5)]
-    assert [capture_status(s.bands, (), s.max_predicted_px) for s in sidecars] == ["ok", "degraded", "degraded"]
+    assert [capture_status(s.bands, (), s.accept_predicted_px) for s in sidecars] == ["ok", "degraded", "degraded"]
     assert {s.status for s in sidecars} == {"degraded"}
     assert sidecars[0].missing_bands == ["Blue", "Red edge"]
     assert capture_status(reports["IMG_0003"].sidecar.bands, (), 50.0) == "ok"

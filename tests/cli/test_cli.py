@@ -1,7 +1,6 @@
 """End to end, through the same entry point as a user's."""
 
 import csv
-import functools
 import json
 import shutil
 import subprocess
@@ -14,10 +13,10 @@ import pytest
 import rasterio
 from scipy.interpolate import CloughTocher2DInterpolator
 
-import agalign as agalign_package
+from agalign.records.sidecar import Sidecar
 
 from ..conftest import read_json, save_known_model, textured_image, write_band, write_capture
-from ..program import agalign, agalign_here
+from ..program import agalign_here
 
 pytestmark = pytest.mark.slow
 
@@ -25,7 +24,7 @@ pytestmark = pytest.mark.slow
 @pytest.mark.parametrize("name", ["IMG_0001", "IMG_0002"])
 def test_a_flight_is_aligned(flight: Path, aligned_flight: Path, name: str) -> None:
     data = read_json(aligned_flight / "0000SET" / "000" / f"{name}.json")
-    jsonschema.validate(data, read_json(Path(agalign_package.__file__).parent / "sidecar.schema.json"))
+    jsonschema.validate(data, Sidecar.json_schema())
     assert (data["status"], data["output"]["nodata"]) == ("ok", None)
     assert [b["band"] for b in data["bands"] if b["status"] == "reference"] == ["Green"]
     assert [b["status"] for b in data["bands"]].count("aligned") == 4
@@ -91,15 +90,6 @@ def test_a_blank_input_and_a_damaged_output_are_done_again_when_they_are_repaire
     assert again.returncode == 0
     assert "kept" not in again.stderr
     assert stack.stat().st_size == size
-
-
-def test_too_little_address_space_is_refused_before_libraries_are_loaded(tmp_path: Path) -> None:
-    resource = pytest.importorskip("resource", reason="limits of resources are POSIX")
-    limit = functools.partial(resource.setrlimit, resource.RLIMIT_AS, (1_200_000_000, 1_200_000_000))
-    done = agalign(tmp_path, "-o", tmp_path / "out", preexec_fn=limit)
-    assert done.returncode == 1
-    limits = "is limited to 1.20 GB (ulimit -v); agalign needs 1.8 GB or more"
-    assert done.stderr.startswith(f"agalign: the address space of this process {limits}")
 
 
 def test_info_shows_the_rig_of_a_model(tmp_path: Path) -> None:

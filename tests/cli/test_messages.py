@@ -15,7 +15,7 @@ import pytest
 import typer
 
 from agalign import __main__
-from agalign.batch.capture_task import CaptureReport
+from agalign.batch.capture_report import CaptureReport
 from agalign.cameras.discover import FolderScan, Problem, discover
 from agalign.cli import align_run, main
 from agalign.cli.align_run import RunTotals, conclude, print_problems
@@ -24,8 +24,8 @@ from agalign.cli.terminal import Terminal, exits
 from agalign.errors import ConfigurationError, InputError, OutputError, UnreadableFileError
 
 from ..conftest import raising, write_capture
-from ..products.test_sidecar import NIR, example
 from ..program import agalign_here
+from ..records.test_sidecar import NIR, example
 
 GREEN = "(did you mean 'Green'?); choose from Blue, Green, Red, NIR, Red edge"
 

@@ -9,15 +9,15 @@ import rasterio
 
 import agalign
 from agalign.batch import capture_task
-from agalign.products.run.captures import captures_of_run
-from agalign.products.run.excluded import read_excluded
-from agalign.products.run.record import read_run_record, unfinished_run
-from agalign.products.sidecar.file import find_sidecars, read_sidecar, write_sidecar
+from agalign.records.captures import captures_of_run
+from agalign.records.excluded import read_excluded
+from agalign.records.run_record import read_run_record, unfinished_run
+from agalign.records.sidecar_file import find_sidecars, read_sidecar, write_sidecar
 
 from ..builders import in_full_run
 from ..conftest import Shared, raising, seeded, write_band
-from ..products.conftest import change, table_in
 from ..program import agalign_here
+from ..run_outputs import change, table_in
 
 pytestmark = pytest.mark.slow
 

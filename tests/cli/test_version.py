@@ -7,10 +7,8 @@ from importlib import metadata
 import pytest
 
 import agalign
-from agalign.errors import MemoryLimitError
-from agalign.values import libraries
+from agalign.host import libraries
 
-from ..conftest import raising
 from ..program import agalign_here
 
 
@@ -38,12 +36,6 @@ def test_a_library_that_cannot_be_loaded_is_named(monkeypatch: pytest.MonkeyPatc
     assert last.startswith("device unknown: ")
     assert "torch" in last
     assert f"numpy {metadata.version('numpy')}" in others
-
-
-def test_a_small_address_space_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
-    error = MemoryLimitError("raise that limit")
-    monkeypatch.setattr("agalign.cli.version.check_address_space", raising(error))
-    assert version_lines()[-1] == "device unknown: raise that limit"
 
 
 @pytest.mark.parametrize(

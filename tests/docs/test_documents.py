@@ -25,7 +25,7 @@ from synthetic_flights.troubles import make_flight_between_panels
 import agalign
 from agalign.cameras.metadata import read_tags
 from agalign.cameras.pix4d import perspective_lens
-from agalign.products.sidecar.file import read_sidecar
+from agalign.records.sidecar_file import read_sidecar
 from agalign.synthetic import flight as synthetic
 from agalign.values import geometry
 

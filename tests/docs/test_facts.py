@@ -14,18 +14,18 @@ from pathlib import Path
 
 import pytest
 
+from agalign.batch.products import PRODUCTS
 from agalign.capture import band_pair, common_parallax, reference
 from agalign.cli.main import COMMANDS
 from agalign.cli.terminal import ExitCode
 from agalign.fit import dense, displacement_field, windows
 from agalign.flight import panel_readings
+from agalign.indices.rasters import INDICES_FILE, IndexReport, update_table
 from agalign.method import refine
 from agalign.pixels import masks, raster
-from agalign.products.indices.rasters import INDICES_FILE, IndexReport, update_table
-from agalign.products.rasters.parallax_file import PARALLAX_KIND
-from agalign.products.registry import PRODUCTS
-from agalign.products.report.facts import SUMMARY_COLUMNS
-from agalign.products.sidecar.schema import FilePart
+from agalign.rasters.parallax_file import PARALLAX_KIND
+from agalign.records.sidecar import FilePart
+from agalign.report.facts import SUMMARY_COLUMNS
 from agalign.values.alignment import MIN_RETRIEVAL, MIN_TIMES_CHANCE
 from agalign.verify import checks, coverage
 

@@ -6,7 +6,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from agalign.fit.dense import nearer_sign
-from agalign.products.rasters.alignment_maps import inverse_range
+from agalign.rasters.alignment_maps import inverse_range
 from agalign.values import lens
 from agalign.values.image import Mask
 from agalign.values.lens import Lens

@@ -18,7 +18,7 @@ from agalign.errors import InputError
 from agalign.flight import model as model_module
 from agalign.flight.model import FlightModel, _digest, load_model, save_model
 from agalign.flight.rig_file import read_rig, rig_to_json
-from agalign.products.report.charts import rig_views
+from agalign.report.charts import rig_views
 from agalign.values import geometry
 from agalign.values.mapping import DisplacementField
 

@@ -9,7 +9,7 @@ from hypothesis.extra.numpy import arrays
 
 from agalign.pixels.band_resampling import resample_tile, warped
 from agalign.pixels.raster import probe
-from agalign.products.rasters.output_grid import _largest_rectangle, common_area
+from agalign.rasters.output_grid import _largest_rectangle, common_area
 from agalign.values import geometry
 from agalign.values.capture import Band, Radiometry
 from agalign.values.image import Tile

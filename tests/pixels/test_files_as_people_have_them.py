@@ -16,7 +16,7 @@ from agalign.cameras.metadata import Tags
 from agalign.cameras.pix4d import NAMESPACE
 from agalign.errors import UnreadableFileError
 from agalign.pixels.raster import probe, read_for_alignment, read_tile, with_saturation_values
-from agalign.products.sidecar.file import find_sidecars, read_without_tables
+from agalign.records.sidecar_file import find_sidecars, read_without_tables
 from agalign.values.capture import Band, Capture
 from agalign.values.choices import Quality
 from agalign.values.image import Tile

@@ -12,9 +12,9 @@ import agalign
 from agalign.pixels.capture_pixels import CapturePixels
 from agalign.pixels.masks import missing_end, without_parts
 from agalign.pixels.raster import probe, read_for_alignment, with_missing_parts
-from agalign.products.rasters.alignment_maps import Quality
-from agalign.products.run.cautions import RunFacts
-from agalign.products.sidecar.file import find_sidecars, read_sidecar
+from agalign.rasters.alignment_maps import Quality
+from agalign.records.cautions import RunFacts
+from agalign.records.sidecar_file import find_sidecars, read_sidecar
 from agalign.values.capture import Capture
 from agalign.values.image import Tile
 

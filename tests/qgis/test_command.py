@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from agalign._version import __version__
-from agalign.values.processes import is_running
+from agalign.host.processes import is_running
 
 ROOT = Path(__file__).resolve().parents[2]
 PLUGIN = ROOT / "qgis" / "agalign_provider"

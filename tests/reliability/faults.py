@@ -32,8 +32,8 @@ import tifffile
 
 from agalign.cli import align_run as cli_run
 from agalign.errors import SidecarError
-from agalign.products.sidecar.file import find_sidecars, read_sidecar
-from agalign.values.files import RUN_FILE
+from agalign.host.files import RUN_FILE
+from agalign.records.sidecar_file import find_sidecars, read_sidecar
 
 from ..conftest import raising, textured_pair, write_signed
 from ..program import agalign_here
@@ -398,7 +398,7 @@ def output_is_a_folder(name: str) -> Inject:
 def held_by_another(scene: Scene) -> None:
     scene.out.mkdir()
     code = (
-        "import sys, time; from pathlib import Path; from agalign.values.output_folder import locked\n"
+        "import sys, time; from pathlib import Path; from agalign.host.output_folder import locked\n"
         "with locked(Path(sys.argv[1])): print('held', flush=True); time.sleep(60)"
     )
     other = subprocess.Popen([sys.executable, "-c", code, str(scene.out)], stdout=subprocess.PIPE, text=True)
@@ -594,7 +594,7 @@ _ENDLESS_LENS = (
 )
 _LINE = np.random.default_rng(0).integers(0, 60000, (1, 100000), np.uint16)
 _MAKER, _NODATA = (271, 2, 0, "Maker", True), [(42113, 2, 2, "0", True)]
-_DEEP = '{"schema": "agalign/1", "bands": ' + "[" * 200_000
+_DEEP = '{"schema": "agalign/3", "bands": ' + "[" * 200_000
 _POSSIBLE_NAMES = "a", "b", "-rf", "new\nline", "\x1b[31mred\a", "x" * 200
 _IN_TIME = "-j", "2", "--timeout", "100"
 _FILES_ELSEWHERE = '"band_files": [{"file": "../a", "bytes": 1}]'

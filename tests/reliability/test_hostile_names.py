@@ -19,13 +19,13 @@ from agalign.batch.index_run import index_tasks, run_indices
 from agalign.batch.output_files import remove_outputs
 from agalign.batch.run import run_flight
 from agalign.cameras.tiff_directory import EXIF, GPS, XMP, add_directories, byte_string, read_directories, text
+from agalign.exports.programs import export
 from agalign.flight.groups import model_names
-from agalign.products.exports.programs import export
-from agalign.products.indices.formulas import index_named
-from agalign.products.sidecar.file import find_sidecars
+from agalign.host.files import file_name
+from agalign.host.text import without_controls
+from agalign.indices.formulas import index_named
+from agalign.records.sidecar_file import find_sidecars
 from agalign.values.capture import Band, CameraIdentity, Capture
-from agalign.values.files import file_name
-from agalign.values.text import without_controls
 
 from ..conftest import Shared, read_json, seeded, write_signed
 from ..program import agalign_here

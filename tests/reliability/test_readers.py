@@ -21,12 +21,12 @@ from agalign.cameras.tag_transfer import capture_tags
 from agalign.cameras.xmp import Packet
 from agalign.config import albedos
 from agalign.errors import AgalignError, SidecarError
+from agalign.host.files import RUN_FILE
 from agalign.pixels.raster import probe
-from agalign.products.run.excluded import read_excluded
-from agalign.products.run.record import read_run_record
-from agalign.products.sidecar.file import read_sidecar, read_without_tables
+from agalign.records.excluded import read_excluded
+from agalign.records.run_record import read_run_record
+from agalign.records.sidecar_file import read_sidecar, read_without_tables
 from agalign.values.capture import Band
-from agalign.values.files import RUN_FILE
 from agalign.values.image import OutputGrid
 
 pytestmark = [pytest.mark.slow, pytest.mark.filterwarnings("ignore::UserWarning")]

@@ -23,15 +23,15 @@ from agalign.cameras.pix4d import NAMESPACE, focal_length_px
 from agalign.cameras.read_files import _with_lens_of_image
 from agalign.errors import SidecarError
 from agalign.flight.model import FlightModel, load_model, save_model
-from agalign.products.indices.rasters import INDICES_FILE, read_table
-from agalign.products.run.excluded import PANELS_FILE, SKY_FILE, read_excluded
-from agalign.products.run.record import read_run_record
-from agalign.products.sidecar.file import find_sidecars
+from agalign.host.files import RUN_FILE, write_csv
+from agalign.host.text import without_controls
+from agalign.indices.rasters import INDICES_FILE, read_table
+from agalign.records.excluded import PANELS_FILE, SKY_FILE, read_excluded
+from agalign.records.run_record import read_run_record
+from agalign.records.sidecar_file import find_sidecars
 from agalign.synthetic import flight as synthetic
 from agalign.values import geometry
-from agalign.values.files import RUN_FILE, write_csv
 from agalign.values.pixel_units import SAME_PIXELS
-from agalign.values.text import without_controls
 
 from ..conftest import Shared, raising, read_json, seeded
 from ..program import agalign_here

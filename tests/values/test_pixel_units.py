@@ -21,7 +21,7 @@ REJECTED = {
 }
 ACCEPTED = "1.0 * 3.0 >= 0.5"
 PREAMBLE = """
-from agalign.products.exports.tie_points import tie_points
+from agalign.exports.tie_points import tie_points
 from agalign.values.alignment import Alignment
 def check(between_images: Alignment) -> None:
 """

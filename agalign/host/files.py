@@ -1,0 +1,280 @@
+"""Atomic writing of files, tables and models among them, partial files of killed processes, and checks of paths."""
+
+import csv
+import errno
+import hashlib
+import io
+import os
+import platform
+import re
+import secrets
+import shutil
+import stat
+import unicodedata
+from collections.abc import Iterable, Iterator, MutableMapping, Sequence
+from contextlib import contextmanager, suppress
+from contextvars import ContextVar
+from io import BufferedReader
+from pathlib import Path, PurePosixPath, PureWindowsPath
+from typing import TYPE_CHECKING, TypeVar
+
+from agalign.errors import OutputError, SidecarError
+from agalign.host.processes import is_running
+from agalign.host.text import without_formula
+
+if TYPE_CHECKING:  # `agalign --help` does without pydantic
+    from pydantic import BaseModel
+
+_Model = TypeVar("_Model", bound="BaseModel")
+
+RUN_FILE = "agalign-run.json"
+"""Name of the run record. It is written first, and identifies an output folder."""
+_PARTIAL = ".agalign-part-"
+"""Prefix of partial files; host, process id and a random part follow."""
+_MAX_NAME_BYTES, _MAX_SUFFIX = 120, 12
+"""File names have at most 255 bytes: a checksum, and what the writer adds, follow."""
+_WRITTEN_BELOW: ContextVar[Path | None] = ContextVar("written_below", default=None)
+"""Folder that links must not lead out of when a file is written; None where any file may be written."""
+_MAX_PATH_BYTES, _MAX_PART_BYTES = 1024, 255
+"""Of a relative path in a file that is read: file systems allow parts of 255 bytes, and systems paths of 4,096."""
+_RESERVED = re.compile(r"(con|prn|aux|nul|(com|lpt)[0-9])(\..*)?", re.IGNORECASE)
+"""Names of devices on Windows."""
+
+
+@contextmanager
+def written_below(folder: Path) -> Iterator[None]:
+    """Make `complete_file` and `scratch_file` raise OutputError within the block if a link leads out of a folder, such
+    as one that was put in the place of a subfolder during the run.
+    """
+    token = _WRITTEN_BELOW.set(folder)
+    try:
+        yield
+    finally:
+        _WRITTEN_BELOW.reset(token)
+
+
+@contextmanager
+def complete_file(path: Path) -> Iterator[Path]:
+    """Yield a temporary path to write to, which is renamed to `path` if the block succeeds, and else removed.
+
+    The contents are flushed to disk before the renaming: after a power failure, `path` is either the old file or the
+    complete new one. Raises OutputError for an OSError.
+    """
+    with scratch_file(path) as partial:
+        yield partial
+        _flush_to_disk(partial)
+        partial.replace(path)
+        _flush_to_disk(path.parent)
+
+
+@contextmanager
+def scratch_file(neighbour: Path) -> Iterator[Path]:
+    """Yield a temporary path in the folder of `neighbour`, which is created; the file or folder that the block makes
+    there is removed after it.
+
+    The file has the suffix of `neighbour`, because some libraries choose the format by it. Its name is unique among
+    processes on all machines that share the folder, and hidden, so that it is not read as an image.
+    Raises OutputError for an OSError, and within `written_below` for a folder elsewhere.
+    """
+    if (root := _WRITTEN_BELOW.get()) is not None:
+        check_inside(neighbour.parent, root)
+    scratch = neighbour.with_name(f"{_PARTIAL}{_host()}-{os.getpid()}-{secrets.token_hex(8)}{neighbour.suffix}")
+    try:
+        neighbour.parent.mkdir(parents=True, exist_ok=True)
+        yield scratch
+    except OSError as error:
+        raise OutputError(f"{neighbour}: cannot be written ({error.strerror or error})") from None
+    finally:
+        _remove(scratch)
+
+
+def write_text(path: Path, text: str) -> None:
+    """Write a UTF-8 text file atomically, with line feeds on every system. Raises OutputError."""
+    with complete_file(path) as partial:
+        partial.write_text(text, encoding="utf-8", newline="\n")
+
+
+def file_checksum(path: Path) -> str:
+    """Return the SHA-256 of an output file as hexadecimal digits. Raises OutputError."""
+    try:
+        with path.open("rb") as file:
+            return hashlib.file_digest(file, "sha256").hexdigest()
+    except OSError as error:
+        raise OutputError(f"{path}: cannot be read back ({error.strerror or error})") from None
+
+
+def open_regular(path: Path) -> BufferedReader:
+    """Open a regular file for reading. Raises OSError, also for pipes, sockets and devices, which could block."""
+    descriptor = os.open(path, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0))
+    if not stat.S_ISREG(os.fstat(descriptor).st_mode):
+        os.close(descriptor)
+        raise OSError(errno.EINVAL, "it is not a regular file")
+    return open(descriptor, "rb")  # noqa: PTH123 - the descriptor that was checked
+
+
+def read_regular(path: Path, max_bytes: int = 1 << 28) -> bytes:
+    """Return the contents of a regular file. Raises OSError, also for a file with more bytes than that: the default is
+    ten times the record of a run of 100,000 captures.
+    """
+    with open_regular(path) as file:
+        contents = file.read(max_bytes + 1)
+    if len(contents) > max_bytes:
+        raise OSError(errno.EFBIG, f"over {max_bytes >> 20} MB are too many for this file")
+    return contents
+
+
+def remove_partial_files(folder: Path, *, below: bool = True) -> None:
+    """Remove partial files and folders in a folder, and in those `below` it, from this process and from processes of
+    this machine that have ended.
+
+    Partial files in output folders of other runs, of running processes and of other machines are kept.
+    """
+    for parent, folders, names in os.walk(folder):
+        for name in (*folders, *names):
+            if name.startswith(_PARTIAL) and _is_left_over(name):
+                _remove(Path(parent, name))
+        folders[:] = [f for f in folders if below and not Path(parent, f, RUN_FILE).exists()]
+
+
+def _remove(path: Path) -> None:
+    """Remove a file or a folder, if it can be."""
+    with suppress(OSError):
+        path.unlink(missing_ok=True)
+    shutil.rmtree(path, ignore_errors=True)
+
+
+def _is_left_over(partial: str) -> bool:
+    host, _, rest = partial.removeprefix(_PARTIAL).partition("-")
+    process = rest.partition("-")[0]
+    if host != _host() or not process.isdigit():
+        return False
+    return int(process) == os.getpid() or not is_running(int(process))
+
+
+def _host() -> str:
+    """Return the letters and digits of the host name, up to 40, because file names have at most 255 bytes."""
+    return "".join(c for c in platform.node() if c.isalnum())[:40] or "host"
+
+
+_PLAIN_NAME = re.compile(r"\w[\w.-]{0,80}", re.ASCII)
+
+
+def is_inside(name: str) -> bool:
+    """True for a relative path that stays inside its folder on POSIX and on Windows, and is not too long for a file."""
+    if _PLAIN_NAME.fullmatch(name):  # most names, in a tenth of the time
+        return True
+    posix, windows = PurePosixPath(name), PureWindowsPath(name)
+    anchored = posix.is_absolute() or bool(windows.drive or windows.root)
+    path_bytes, *parts_bytes = (len(text.encode(errors="surrogatepass")) for text in (name, *posix.parts))
+    if path_bytes > _MAX_PATH_BYTES or max(parts_bytes, default=0) > _MAX_PART_BYTES:
+        return False
+    return bool(name) and not anchored and ".." not in windows.parts and "\0" not in name
+
+
+def file_name(text: str, taken: MutableMapping[str, str] | None = None) -> str:
+    """Return a text from a file as (a part of) a file name: letters, digits and `._-`, of bounded length, without a dot
+    at its ends, not a name that Windows reserves, and not empty. A suffix is kept.
+
+    `taken` has the text of each name, in lower case, that was given in a folder: another text gets another name, which
+    ends in a checksum.
+    """
+    allowed = re.sub(r"[^\w.-]+", "_", unicodedata.normalize("NFKC", text)).strip(".")
+    stem, suffix = os.path.splitext(allowed)  # noqa: PTH122 - a path would be empty without text
+    stem = stem.encode()[:_MAX_NAME_BYTES].decode(errors="ignore").strip(".") or "_"
+    suffix = suffix[:_MAX_SUFFIX]
+    if _RESERVED.fullmatch(stem + suffix):
+        stem = f"_{stem}"
+    while taken is not None and taken.setdefault(f"{stem}{suffix}".lower(), text) != text:
+        stem += f"-{hashlib.sha256(text.encode(errors='surrogatepass')).hexdigest()[:8]}"
+    return stem + suffix
+
+
+def max_name_bytes(folder: Path) -> int:
+    """Return how many bytes a file's name may have in a folder, which may not exist yet: 255, or fewer on some NAS."""
+    existing = next((p for p in (folder, *folder.absolute().parents) if p.exists()), folder)
+    with suppress(OSError, ValueError, AttributeError):  # other systems have no pathconf
+        return min(_MAX_PART_BYTES, os.pathconf(existing, "PC_NAME_MAX"))
+    return _MAX_PART_BYTES
+
+
+def check_inside(path: Path, folder: Path) -> Path:
+    """Return a path below a folder. Raises OutputError if a symbolic link leads out of the folder."""
+    if not Path(os.path.realpath(path)).is_relative_to(os.path.realpath(folder)):
+        raise OutputError(f"{path}: a link leads out of {folder}; remove the link, or choose another folder with -o")
+    return path
+
+
+def _flush_to_disk(path: Path) -> None:
+    """Flush a file, or the entries of a folder where the system supports that, to disk (fsync)."""
+    folder = path.is_dir()
+    if folder and os.name == "nt":
+        return
+    descriptor = os.open(path, os.O_RDONLY if os.name != "nt" else os.O_RDWR)
+    try:
+        os.fsync(descriptor)
+    except OSError as error:
+        if not (
+            folder and error.errno in (errno.EINVAL, errno.ENOTSUP)
+        ):  # network file systems without fsync of folders
+            raise
+    finally:
+        os.close(descriptor)
+
+
+# ---- tables as CSV, and pydantic models as JSON that is read back
+
+
+def compact_lists(text: str) -> str:
+    """Return indented JSON with each list of numbers, or of such lists, on one line: it takes a third of the size."""
+    # Numbers, null, true and false start with these characters; keys and texts start with a quote.
+    text = re.sub(r"\[\n +(?=[-0-9ntf])", "[", text)
+    text = re.sub(r",\n +(?=[-0-9ntf])", ",", text)
+    text = re.sub(r"(?<=[0-9le])\n *\]", "]", text)
+    text = re.sub(r"\[\n +(?=\[)", "[", text)
+    text = re.sub(r"\],\n +(?=\[)", "],", text)
+    return re.sub(r"\]\n *(?=\])", "]", text)
+
+
+def write_model(path: Path, model: "BaseModel | None") -> None:
+    """Write a model atomically as indented JSON; None removes the file of an earlier run. Raises OutputError."""
+    if model is None:
+        with suppress(OSError):
+            path.unlink(missing_ok=True)
+        return
+    write_text(path, compact_lists(model.model_dump_json(by_alias=True, indent=1)) + "\n")
+
+
+def read_model(path: Path, model: type[_Model]) -> _Model | None:
+    """Return the model in a file, or None if the file does not exist. Raises SidecarError for any other content."""
+    try:
+        return model.model_validate_json(read_regular(path))
+    except FileNotFoundError:
+        return None
+    except (OSError, ValueError) as error:  # pydantic's ValidationError is a ValueError
+        reason = f" ({error.strerror})" if isinstance(error, OSError) else ""
+        raise SidecarError(f"{path}: cannot be read{reason}; delete it and run again") from None
+
+
+class CsvTable:
+    """A table that is collected row by row as text, which takes little memory, and then written as CSV."""
+
+    def __init__(self, columns: Sequence[str]) -> None:
+        self._text = io.StringIO()
+        self._writer = csv.writer(self._text, lineterminator="\n")
+        self._writer.writerow(columns)
+
+    def add(self, row: Sequence[object]) -> None:
+        """Add a row; None becomes an empty cell, and formulas are quoted."""
+        self._writer.writerow(map(without_formula, row))
+
+    def write(self, path: Path) -> None:
+        """Write the table atomically. Raises OutputError."""
+        write_text(path, self._text.getvalue())
+
+
+def write_csv(path: Path, columns: Sequence[str], rows: Iterable[Sequence[object]]) -> None:
+    """Write a table atomically; None becomes an empty cell, and formulas are quoted. Raises OutputError."""
+    table = CsvTable(columns)
+    for row in rows:
+        table.add(row)
+    table.write(path)

@@ -1,0 +1,42 @@
+"""The mark by which a command recognises the files that an earlier one wrote, whatever their names."""
+
+import os
+from contextlib import suppress
+from pathlib import Path
+
+from agalign.host.files import open_regular
+
+SOFTWARE = "agalign"
+"""Value of the tag Software of every raster."""
+PNG_MARK = b"Software\0" + SOFTWARE.encode()
+"""Text chunk of every PNG file: keyword and text."""
+JPEG_MARK = b"\xff\xfe" + (2 + len(SOFTWARE)).to_bytes(2) + SOFTWARE.encode()
+"""Comment of every JPEG file, with its marker and length."""
+_POSITIONS = "reference_x_px", "reference_y_px", "moving_x_px", "moving_y_px"
+TIES_COLUMNS = "band", "status", *_POSITIONS, "residual_px", "weight"
+"""Columns of tables of tie points."""
+TIES_MEMBER = "coordinates_in"
+"""First member of tie points as GeoJSON, which has none of this name."""
+_TIFF_MARKS = SOFTWARE.encode() + b"\0", b'<Item name="REFERENCE_BAND">'
+"""The tag Software; that of GDAL's metadata in files of single bands, which keep the camera's software."""
+_MARKS = {
+    b"II": _TIFF_MARKS,
+    b"MM": _TIFF_MARKS,
+    b"\x89P": (PNG_MARK,),
+    b"\xff\xd8": (JPEG_MARK,),
+    b"ba": (",".join(TIES_COLUMNS).encode(),),
+    b'{"': (f'{{"type": "FeatureCollection", "{TIES_MEMBER}"'.encode(),),
+}
+"""Marks by the first two bytes of a file: TIFF in both orders of bytes, PNG, JPEG, CSV, GeoJSON."""
+_SEARCHED_BYTES = 1 << 16
+"""The mark is near the start of a file, or near its end in a TIFF to which tags were added."""
+
+
+def is_own_file(path: Path) -> bool:
+    """Return True for an output of agalign other than JSON records, and for an empty file, which holds nothing."""
+    with suppress(OSError), open_regular(path) as file:
+        start, size = file.read(_SEARCHED_BYTES), file.seek(0, os.SEEK_END)
+        file.seek(max(0, size - _SEARCHED_BYTES))
+        end = file.read()
+        return not size or any(mark in start or mark in end for mark in _MARKS.get(start[:2], ()))
+    return False

@@ -1,0 +1,219 @@
+"""Cores and memory that this process may use, and its workers: start method, environment, SIGINT, and end with their
+parent.
+"""
+
+import logging
+import math
+import os
+import signal
+import sys
+import tempfile
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from enum import IntEnum
+from multiprocessing import current_process, get_all_start_methods, get_context, parent_process, resource_tracker
+from multiprocessing.context import BaseContext
+from pathlib import Path
+
+THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+"""Environment variables with the number of threads that libraries start; they read them once, at their import."""
+_CGROUPS, _OWN_CGROUP = Path("/sys/fs/cgroup"), Path("/proc/self/cgroup")
+
+
+def usable_cores() -> int:
+    """Return the number of cores: those of the machine, or fewer where an affinity (taskset, a batch system) or the
+    quota of a control group (`docker run --cpus`, a Kubernetes limit) allows fewer. A share of a core counts as one.
+    """
+    cores = len(os.sched_getaffinity(0)) if sys.platform == "linux" else os.cpu_count() or 1
+    quota = cgroup_quota()
+    return cores if quota is None else max(1, min(cores, math.ceil(quota)))
+
+
+def limit_default_threads() -> None:
+    """Limit the threads of libraries that are imported later to the quota of the control group, which they do not read.
+
+    Environment variables that the user has set are kept.
+    """
+    if cgroup_quota() is not None:
+        for name in THREAD_VARIABLES:
+            os.environ.setdefault(name, str(usable_cores()))
+
+
+def cgroup_quota(root: Path = _CGROUPS, own: Path = _OWN_CGROUP) -> float | None:
+    """Return the smallest quota of this process's control group and those above it, in cores; None for no limit.
+
+    Version 2 has the file `cpu.max` ("200000 100000": quota and period in microseconds), version 1 one file for each.
+    """
+    quotas = map(_quota_in, _cgroup_folders("cpu", root, own))
+    return min((quota for quota in quotas if quota is not None), default=None)
+
+
+def _cgroup_folders(controller: str, root: Path, own: Path) -> list[Path]:
+    """The folders of this process's control group and those above it, of both versions."""
+    folders = [root, root / controller]  # a container sees its own group as the root
+    for line in _text(own).splitlines():
+        _, controllers, path = line.split(":", 2)
+        if not controllers or controller in controllers.split(","):
+            group = (root / controller if controllers else root) / path.lstrip("/")
+            folders += [group, *group.parents]
+    return folders
+
+
+def _quota_in(folder: Path) -> float | None:
+    quota, _, period = _text(folder / "cpu.max").strip().partition(" ")
+    if not quota:
+        quota, period = (_text(folder / f"cpu.cfs_{name}_us").strip() for name in ("quota", "period"))
+    try:
+        cores = float(quota) / float(period)
+    except (ValueError, ZeroDivisionError):  # "max", or no such file
+        return None
+    return cores if cores > 0 else None
+
+
+def _text(path: Path) -> str:
+    try:
+        return path.read_text(encoding="utf-8")
+    except OSError:
+        return ""
+
+
+def memory_limit_bytes(root: Path = _CGROUPS, own: Path = _OWN_CGROUP) -> float:
+    """Return the smallest limit of the memory of this process's control groups; inf without one. Version 1 has a limit
+    above the memory of any machine instead.
+    """
+    files = ("memory.max", "memory.limit_in_bytes")
+    texts = (_text(folder / name).strip() for folder in _cgroup_folders("memory", root, own) for name in files)
+    return min((float(text) for text in texts if text.isdecimal()), default=math.inf)
+
+
+# ---- workers
+
+
+def silence_libraries() -> None:
+    """Drop what libraries log about damaged files: it is raised as an error too, or the file can be used."""
+    for name in ("rasterio", "tifffile"):
+        logging.getLogger(name).setLevel(logging.CRITICAL)
+
+
+def follow_parent() -> None:
+    """In a worker process: ignore SIGINT, and end when the parent process ends."""
+    silence_libraries()
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    parent = parent_process()
+    assert parent is not None
+
+    def end_with_parent() -> None:
+        parent.join()
+        os._exit(1)
+
+    threading.Thread(target=end_with_parent, daemon=True).start()
+
+
+def is_running(process: int) -> bool:
+    """True if a process of this machine runs. A zombie does not run: it waits for its parent, which may be slow.
+
+    False on Windows, where open files cannot be removed anyway.
+    """
+    if os.name == "nt":
+        return False
+    with suppress(PermissionError):  # another user's process
+        try:
+            os.kill(process, 0)
+        except ProcessLookupError:
+            return False
+    state = _text(Path(f"/proc/{process}/stat")).rpartition(")")[2].split()
+    return not state or state[0] not in "ZX"
+
+
+class ExitCode(IntEnum):
+    """Exit codes of workers."""
+
+    OUT_OF_MEMORY = 71
+    """The worker has no memory for its result."""
+    REIMPORTED = 72
+    """The worker imports the calling script again."""
+    LOST_SERVER = 255
+    """The fork server of the worker was killed; the worker itself may still run."""
+
+
+def end_if_reimported() -> None:
+    """End a worker process that imports the calling script again: without `if __name__ == "__main__":` around the
+    calls of the script, each worker would start workers.
+    """
+    if getattr(current_process(), "_inheriting", False):  # the test that `multiprocessing` itself uses
+        os._exit(ExitCode.REIMPORTED)
+
+
+@contextmanager
+def without_interrupt_key() -> Iterator[None]:
+    """Block SIGINT; processes started inside the block inherit that."""
+    if not hasattr(signal, "pthread_sigmask"):
+        yield
+        return
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        resource_tracker.ensure_running()  # unblocks SIGINT in this thread
+        signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+WORKER_MODULE = "agalign.batch.preload"
+"""Module that imports all that the workers of a run need."""
+
+
+def worker_context(preload: str) -> BaseContext:
+    """Return the start method of worker processes: forked from a fork server, which is started and imports the module
+    `preload`, or spawned. Call it within `environment_of_children`.
+
+    Processes are spawned on macOS, where a fork of a process with Apple's libraries may crash or hang, and without a
+    temporary folder, in which the fork server needs a socket.
+    """
+    temporary_folder = ""
+    with suppress(OSError):
+        temporary_folder = tempfile.gettempdir()
+    if sys.platform == "darwin" or "forkserver" not in get_all_start_methods() or not temporary_folder:
+        return get_context("spawn")
+    from multiprocessing import forkserver
+
+    context = get_context("forkserver")
+    context.set_forkserver_preload([preload])
+    with suppress(OSError, RuntimeError), without_interrupt_key():  # the workers report why it cannot be started
+        forkserver.ensure_running()
+    return context
+
+
+CAPTURES_WORTH_A_PROCESS = 2
+"""Minimum number of captures per process: starting one takes the time of one capture, while a flight is learned."""
+
+
+def start_server_ahead(captures: int, cores: int) -> None:
+    """Start the fork server early if a run of this many captures will use workers: it imports WORKER_MODULE while this
+    process imports the same.
+    """
+    processes = min(cores, captures // CAPTURES_WORTH_A_PROCESS)
+    if processes > 1:
+        with environment_of_children(cores // processes):
+            worker_context(WORKER_MODULE)
+
+
+@contextmanager
+def environment_of_children(threads: int) -> Iterator[None]:
+    """Set the number of threads that libraries in child processes start, and where these search for modules.
+
+    More threads than cores, over all processes, double the time. Child processes search where this process does: until
+    Python 3.12.9, `multiprocessing` sends the path to workers, but not to the fork server. Without PYTHONSAFEPATH, they
+    search the working folder first, and run a `rasterio.py` that is there.
+    """
+    values = dict.fromkeys(THREAD_VARIABLES, str(threads))
+    values |= {"PYTHONSAFEPATH": "1", "PYTHONPATH": os.pathsep.join(map(str, sys.path))}
+    before = {name: os.environ[name] for name in values if name in os.environ}
+    os.environ.update(values)
+    try:
+        yield
+    finally:
+        for name in values:
+            os.environ.pop(name, None)
+        os.environ.update(before)

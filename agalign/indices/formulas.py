@@ -1,0 +1,269 @@
+"""Spectral indices, their formulas, and the choice of their bands by wavelength or name.
+
+Formulas such as (N-R)/(N+R) are parsed as Python and evaluated without executing code.
+"""
+
+import ast
+import json
+import math
+import re
+import warnings
+from collections import defaultdict
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cache, cached_property, lru_cache
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from agalign.errors import ConfigurationError, InputError
+from agalign.host.text import did_you_mean
+from agalign.values.image import FloatImage
+from agalign.values.spectrum import ROLES, Role, role_of
+
+_MAX_LENGTH = 300
+"""Characters of a formula: longer ones could exhaust Python's recursion limit."""
+_OPERATORS: Mapping[type, Callable[..., Any]] = {
+    ast.Add: np.add,
+    ast.Sub: np.subtract,
+    ast.Mult: np.multiply,
+    ast.Div: np.divide,
+    ast.Pow: np.power,
+    ast.UAdd: np.positive,
+    ast.USub: np.negative,
+}
+_FUNCTIONS: Mapping[str, Callable[[Any], Any]] = {"sqrt": np.sqrt, "log": np.log, "exp": np.exp, "abs": np.abs}
+_NOISE = 0.02
+"""Noise of reflectance relative to its value: a difference below this share of its terms has no certain sign."""
+_ROLE_OF_SYMBOL = {symbol: role for role, spectral_range in ROLES.items() for symbol in spectral_range.symbols}
+
+
+def symbols_of(formula: str) -> tuple[str, ...]:
+    """Return the different names in a formula, in the order of their first use.
+
+    Allowed are names, numbers, + - * / ** (or ^), parentheses, and sqrt, log, exp and abs. Raises ConfigurationError
+    for anything else.
+    """
+    # The evaluation adds an entry for each name that it reads.
+    used: dict[str, FloatImage] = defaultdict(lambda: np.ones((1, 1), np.float32))
+    evaluate(formula, used)
+    return tuple(used)
+
+
+def evaluate(formula: str, values: Mapping[str, FloatImage]) -> FloatImage:
+    """Return the value (height, width) of a formula, given an array of that shape for each name.
+
+    Not finite where it is undefined. Raises ConfigurationError for anything but arithmetic.
+    """
+    with np.errstate(all="ignore"):
+        return np.asarray(_value(_parsed(formula), values), np.float32)
+
+
+@lru_cache(maxsize=64)
+def _parsed(formula: str) -> ast.expr:
+    if len(formula) > _MAX_LENGTH:
+        raise ConfigurationError(f"the formula has {len(formula)} characters; at most {_MAX_LENGTH} are allowed")
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # of Python, such as that a number is not callable
+            return ast.parse(formula.strip().replace("^", "**"), mode="eval").body
+    except (SyntaxError, ValueError, RecursionError, MemoryError):
+        raise ConfigurationError(f"'{formula}' is not a formula; write one like (N-R)/(N+R)") from None
+
+
+def _value(node: ast.expr, values: Mapping[str, FloatImage]) -> Any:
+    max_number = 1e30  # numbers must fit into float32
+    match node:
+        case ast.Name(id=name):
+            return values[name]
+        case ast.Constant(value=int() | float() as value) if abs(value) < max_number:
+            # float32 overflows to infinity; Python's integers would grow without limit, as in 9**9**9.
+            return np.float32(value)
+        case ast.BinOp(left=left, op=ast.Div(), right=right):
+            dividend = _value(left, values)
+            # nan where a denominator of bands is not positive beyond the noise of its terms.
+            divisor, magnitude = _sum(right, values)
+            if any(isinstance(part, ast.Name) for part in ast.walk(right)):
+                divisor = np.where(divisor > _NOISE * magnitude, divisor, np.float32(np.nan))
+            return dividend / divisor
+        case ast.BinOp(left=left, op=op, right=right) if type(op) in _OPERATORS:
+            return _OPERATORS[type(op)](_value(left, values), _value(right, values))
+        case ast.UnaryOp(op=op, operand=operand) if type(op) in _OPERATORS:
+            return _OPERATORS[type(op)](_value(operand, values))
+        case ast.Call(func=ast.Name(id=name), args=[argument], keywords=[]) if name in _FUNCTIONS:
+            return _FUNCTIONS[name](_value(argument, values))
+    raise ConfigurationError(
+        f"'{ast.unparse(node)}' is not allowed in a formula; use band letters, numbers, + - * / **, parentheses, "
+        f"{', '.join(_FUNCTIONS)}"
+    )
+
+
+def _sum(node: ast.expr, values: Mapping[str, FloatImage]) -> tuple[Any, Any]:
+    """Return the value of a sum, and the sum of the absolute values of its terms.
+
+    Each term is calculated once: the time of nested denominators would otherwise double with each level.
+    """
+    match node:
+        case ast.BinOp(left=left, op=(ast.Add() | ast.Sub()) as op, right=right):
+            one, other = _sum(left, values), _sum(right, values)
+            return _OPERATORS[type(op)](one[0], other[0]), one[1] + other[1]
+    value = _value(node, values)
+    return value, np.abs(value)
+
+
+@dataclass(frozen=True)
+class Index:
+    """A spectral index of reflectances."""
+
+    name: str
+    formula: str
+    """Arithmetic of the bands B, G, R, RE and N, and of `constants`."""
+    span: tuple[float, float] | None = None
+    """Range of the colour scale of a picture; None for the 2nd and 98th percentile of the values."""
+    source: str = ""
+    constants: tuple[tuple[str, float], ...] = ()
+    any_unit: bool = True
+    """False if the formula applies to reflectance only."""
+
+    @cached_property
+    def symbols(self) -> tuple[str, ...]:
+        """The bands in the formula, in the order of their first use."""
+        return tuple(s for s in symbols_of(self.formula) if s not in dict(self.constants))
+
+    @property
+    def roles(self) -> tuple[Role, ...]:
+        """The roles of `symbols`."""
+        return tuple(_ROLE_OF_SYMBOL[s.upper()] for s in self.symbols)
+
+
+INDICES: Mapping[str, Index] = {
+    index.name: index
+    for index in (
+        Index("ndvi", "(N - R) / (N + R)", (-0.2, 1.0), "Rouse et al. 1974"),
+        Index("ndre", "(N - RE) / (N + RE)", (-0.2, 0.8), "Gitelson and Merzlyak 1994"),
+        Index("gndvi", "(N - G) / (N + G)", (-0.2, 1.0), "Gitelson et al. 1996"),
+        Index("ndwi", "(G - N) / (G + N)", (-1.0, 0.5), "McFeeters 1996"),
+        Index("cire", "N / RE - 1", (0.0, 4.0), "Gitelson et al. 2003"),
+        Index("cig", "N / G - 1", (0.0, 10.0), "Gitelson et al. 2003"),
+        Index("vari", "(G - R) / (G + R - B)", (-0.5, 0.5), "Gitelson et al. 2002"),
+        Index("savi", "1.5 * (N - R) / (N + R + 0.5)", (-0.2, 1.0), "Huete 1988", any_unit=False),
+        Index("osavi", "(N - R) / (N + R + 0.16)", (-0.2, 1.0), "Rondeaux et al. 1996", any_unit=False),
+        Index(
+            "msavi",
+            "(2 * N + 1 - sqrt((2 * N + 1) ** 2 - 8 * (N - R))) / 2",
+            (-0.2, 1.0),
+            "Qi et al. 1994",
+            any_unit=False,
+        ),
+        Index("evi", "2.5 * (N - R) / (N + 6 * R - 7.5 * B + 1)", (-0.2, 1.0), "Huete et al. 2002", any_unit=False),
+    )
+}
+
+
+def chosen_indices(names: Sequence[str], formulas: Sequence[str] = ()) -> list[Index]:
+    """Return the indices of names and formulas. Raises ConfigurationError for none, an unknown or a repeated one."""
+    chosen = [index_named(name) for name in names if name.strip()] + [index_of_formula(f) for f in formulas]
+    repeated = [one.name for i, one in enumerate(chosen) if one.name in [c.name for c in chosen[:i]]]
+    if repeated or not chosen:
+        problem = f"index '{repeated[0]}' is given twice" if repeated else "no index is given"
+        raise ConfigurationError(f"{problem}; give names such as ndvi,ndre, or formulas as 'name=(N-R)/(N+R)'")
+    return chosen
+
+
+def index_named(name: str) -> Index:
+    """Return an index by name: one of `INDICES`, or of the catalogue of spyndex if that is installed.
+
+    Raises ConfigurationError for an unknown name, or for an index of bands that drone cameras do not have.
+    """
+    wanted = name.strip().lower()
+    if wanted in INDICES:
+        return INDICES[wanted]
+    entries = _data_of_spyndex("spectral-indices-dict.json").get("SpectralIndices", {})
+    catalogue = {key.lower(): entry for key, entry in entries.items()}
+    if wanted in catalogue:
+        return _of_catalogue(wanted, catalogue[wanted])
+    more = "a name in the catalogue of spyndex" if catalogue else "install more in a checkout: pip install '.[indices]'"
+    similar = did_you_mean(wanted, [*INDICES, *catalogue])
+    raise ConfigurationError(f"unknown index '{name}'{similar}; choose from {', '.join(INDICES)}, or {more}")
+
+
+def index_of_formula(text: str) -> Index:
+    """Return the index of a text 'name=(N-R)/(N+R)'; the default name is 'formula'. Raises ConfigurationError."""
+    name, equals, formula = text.partition("=")
+    name, formula = (name.strip().lower(), formula) if equals else ("formula", text)
+    if not re.fullmatch(r"[a-z][a-z0-9_]{0,30}", name) or name in INDICES:
+        raise ConfigurationError(f"'{name}' cannot name a formula; use letters, digits and _, and no index's name")
+    index = Index(name, formula.strip(), source="formula of the user")
+    _check_bands(index)
+    return index
+
+
+@cache
+def _data_of_spyndex(file: str) -> dict[str, Any]:
+    """The data of spyndex, read without executing its code; empty if it is not installed."""
+    try:
+        path = Path(str(metadata.distribution("spyndex").locate_file(f"spyndex/data/{file}")))
+        return dict(json.loads(path.read_text(encoding="utf-8")))
+    except (metadata.PackageNotFoundError, OSError, ValueError):
+        return {}
+
+
+def _of_catalogue(name: str, entry: Mapping[str, Any]) -> Index:
+    formula = str(entry["formula"])
+    defaults = {k: v.get("default") for k, v in _data_of_spyndex("constants.json").items()}
+    constants = tuple((s, float(defaults[s])) for s in symbols_of(formula) if defaults.get(s) is not None)
+    index = Index(name, formula, source=str(entry.get("reference", "")), constants=constants)
+    _check_bands(index)
+    return replace(index, any_unit=_is_of_any_unit(index))
+
+
+def _check_bands(index: Index) -> None:
+    """Raise ConfigurationError if the formula has no band, or a name that is not that of a band."""
+    unknown = [s for s in index.symbols if s.upper() not in _ROLE_OF_SYMBOL]
+    if unknown or not index.symbols:
+        used = ", ".join(unknown) or "no band"
+        raise ConfigurationError(f"index '{index.name}', {index.formula}, uses {used}; the bands are B, G, R, RE and N")
+
+
+def _is_of_any_unit(index: Index) -> bool:
+    """True if the value does not change when all bands are multiplied by the same number."""
+    bands = [np.array([0.1 * k, 0.5 / k], np.float32) for k in range(1, len(index.symbols) + 1)]
+    scaled = [b * np.float32(1000) for b in bands]
+    return bool(np.allclose(compute(index, bands), compute(index, scaled), rtol=1e-4, equal_nan=True))
+
+
+def bands_for(index: Index, names: Sequence[str], wavelengths_nm: Sequence[float | None]) -> list[int]:
+    """Return the positions of the bands of an index, in the order of `index.symbols`, among bands with these names.
+
+    If several bands have a role, that nearest to the nominal wavelength is used. Raises InputError, which names the
+    missing role.
+    """
+    roles = [role_of(name, wavelength_nm) for name, wavelength_nm in zip(names, wavelengths_nm, strict=True)]
+    result = []
+    for role in index.roles:
+        candidates = [i for i, own_role in enumerate(roles) if own_role == role]
+        if not candidates:
+            raise InputError(f"{index.name} needs a {role} band; there are {', '.join(names)}")
+        # Bands with a known wavelength first; of two with the same wavelength that with the name of the role.
+        distances = [
+            (math.inf if w is None else abs(w - ROLES[role].nominal_nm), role_of(name, None) != role)
+            for name, w in zip(names, wavelengths_nm, strict=True)
+        ]
+        result.append(min(candidates, key=distances.__getitem__))
+    return result
+
+
+def compute(index: Index, bands: Sequence[FloatImage]) -> FloatImage:
+    """Return the index (height, width) of its bands.
+
+    It is nan where a band is nan or negative, which no reflectance is, and where a denominator is not positive beyond
+    its noise.
+    """
+    values: dict[str, FloatImage] = {
+        symbol: np.where(band >= 0, band, np.float32(np.nan)) for symbol, band in zip(index.symbols, bands, strict=True)
+    }
+    values |= {name: np.asarray(number, np.float32) for name, number in index.constants}
+    value = evaluate(index.formula, values)
+    return np.where(np.isfinite(value), value, np.float32(np.nan))

@@ -1,0 +1,615 @@
+"""Spectral indices of a capture: a float32 raster and a picture of each, with their statistics; as the product of
+`agalign align --index`, and for `agalign indices`. OUT/indices.csv has a row for each.
+"""
+
+import csv
+import glob
+import hashlib
+import io
+import json
+import math
+from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, field, replace
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from agalign._version import __version__
+from agalign.config import WriteSettings
+from agalign.errors import ConfigurationError, InputError
+from agalign.host.files import read_regular, write_csv
+from agalign.host.memory import WORK_TILE_PX
+from agalign.host.own_files import SOFTWARE, is_own_file
+from agalign.host.text import shortened, without_formula
+from agalign.indices.formulas import Index, bands_for, compute, index_named, index_of_formula
+from agalign.pixels.raster import OpenRaster, open_raster
+from agalign.rasters.aligned_files import tags_of
+from agalign.rasters.band_reader import RAW, BandReader
+from agalign.rasters.drawing import with_text, write_png
+from agalign.rasters.geotiff import (
+    FLOAT_OPTIONS,
+    LayerDescription,
+    check_complete,
+    checked_raster,
+    tiled_profile,
+    to_cog,
+)
+from agalign.rasters.product import CapturePaths, Product, ProductContext, WrittenFile
+from agalign.records.captures import AlignedBand
+from agalign.records.cautions import RunFacts
+from agalign.records.run_record import renamed_captures
+from agalign.records.sidecar import Sidecar
+from agalign.values.capture import Band, Capture
+from agalign.values.equality import equal
+from agalign.values.image import Tile, reduced_size_px
+from agalign.values.resampling import tiles
+from agalign.values.spectrum import role_of_band
+
+_STATISTICS_TAG = "INDEX_STATISTICS"
+INDICES_FILE = "indices.csv"
+_COLOURS = np.array([(38, 70, 148), (120, 74, 40), (214, 190, 120), (250, 245, 170), (90, 180, 80), (0, 90, 40)], float)
+"""Red, green, blue from the low to the high end of the scale: water, soil, sparse to dense vegetation."""
+_NEUTRAL = np.array([(20, 20, 20), (245, 245, 245)], float)
+"""Greys for raw numbers, whose values do not distinguish soil and vegetation."""
+
+
+@dataclass(frozen=True)
+class IndexStatistics:
+    """The values of an index raster; nan if no pixel is valid.
+
+    Examples
+    --------
+    >>> statistics = agalign.indices("aligned", ["ndvi"])[0].statistics
+    >>> statistics.p5 < statistics.median < statistics.p95, statistics.valid_share
+    (True, 1.0)
+    >>> statistics.unit, statistics.masked_share
+    ('raw numbers', 0.0)
+    """
+
+    median: float = math.nan
+    """Median of the valid pixels."""
+    p5: float = math.nan
+    """5th percentile of the valid pixels."""
+    p95: float = math.nan
+    """95th percentile of the valid pixels."""
+    valid_share: float = 0.0
+    """Share of the pixels that are valid, 0 to 1."""
+    unit: str = ""
+    """Unit of the bands: reflectance, radiance, or raw numbers."""
+    low: float = math.nan
+    """Value at the lower end of the colour scale of the picture."""
+    high: float = math.nan
+    """Value at the upper end of the colour scale."""
+    masked_share: float = 0.0
+    """Share of the pixels that only the quality flags mask."""
+
+    def as_json(self) -> dict[str, float | str | None]:
+        """Return the fields by name, with null for nan, which JSON does not have."""
+        return {k: v if isinstance(v, str) or math.isfinite(v) else None for k, v in vars(self).items()}
+
+
+@dataclass(frozen=True)
+class IndexReport:
+    """One index of one capture.
+
+    Examples
+    --------
+    >>> report = agalign.indices("aligned", ["ndvi"])[0]
+    >>> report.capture, report.index, report.path.as_posix()
+    ('0000SET/000/IMG_0001', 'ndvi', 'aligned/0000SET/000/IMG_0001_ndvi.tif')
+    >>> report.raw_numbers, -1 < report.median < 1  # the run converted no bands to reflectance
+    (True, True)
+    """
+
+    __eq__ = equal
+
+    capture: str
+    """Label of the capture: its folder, relative to the output folder of the run, and its name."""
+    index: str
+    """Name of the index."""
+    path: Path | None = None
+    """The raster; None if it could not be written."""
+    statistics: IndexStatistics = field(default_factory=IndexStatistics)
+    """Median, percentiles and unit of the raster, and its share of valid pixels."""
+    problem: str = ""
+    """Why it could not be written; for a written raster, what to check in its bands."""
+    kept: bool = field(default=False, compare=False)
+    """True if an earlier command wrote the raster from the same bands with the same formula."""
+    is_masked: bool = field(default=False, compare=False)
+    """True if quality flags mask its bands."""
+    captured_at: str = ""
+    """Time of the capture, ISO 8601; empty if it is unknown."""
+    latitude: float | None = None
+    """Degrees, WGS 84; None if it is unknown."""
+    longitude: float | None = None
+    """Degrees, WGS 84; None if it is unknown."""
+
+    @property
+    def median(self) -> float:
+        """Median of the valid pixels."""
+        return self.statistics.median
+
+    @property
+    def raw_numbers(self) -> bool:
+        """True if the bands are neither reflectance nor radiance."""
+        return self.statistics.unit == RAW
+
+    @property
+    def key(self) -> tuple[str, str, str]:
+        """Identify the row in the table: (folder, capture, index)."""
+        label = PurePosixPath(self.capture)
+        return label.parent.as_posix(), label.name, self.index
+
+    def of(self, sidecar: Sidecar) -> "IndexReport":
+        """Return the report with the time and the position of its capture."""
+        place = sidecar.position
+        latitude, longitude = (None, None) if place is None else (place.latitude, place.longitude)
+        return replace(self, captured_at=sidecar.captured_at, latitude=latitude, longitude=longitude)
+
+
+def _statistics_in(tags: Mapping[str, str]) -> IndexStatistics | None:
+    """Return the statistics in the tags of a raster; None if there are none."""
+    try:
+        fields: dict[str, Any] = json.loads(tags[_STATISTICS_TAG])
+        unit = shortened(str(fields.pop("unit")))
+        return IndexStatistics(unit=unit, **{k: math.nan if v is None else float(v) for k, v in fields.items()})
+    except (KeyError, ValueError, TypeError):
+        return None
+
+
+class IndexRasters(Product):
+    """A raster and a picture of each requested index whose bands are aligned."""
+
+    kind = "index"
+    is_required = False
+
+    def paths(self, capture: Capture, paths: CapturePaths, settings: WriteSettings) -> list[Path]:  # noqa: ARG002
+        """Return <capture>_<index>.tif and .png."""
+        names = [name.strip().lower() for name in settings.indices]
+        return [paths.file(f"_{name}{suffix}") for name in names for suffix in (".tif", ".png")]
+
+    def is_enabled(self, settings: WriteSettings) -> bool:  # noqa: ARG002
+        """Return True: rasters that an earlier command wrote are written again."""
+        return True
+
+    def write(self, context: ProductContext) -> Iterator[WrittenFile]:
+        """Write the indices that were requested and of which the capture has all bands, usable, and those that an
+        earlier command wrote.
+
+        Raises InputError if bands of a requested index are in the wrong unit, OutputError.
+        """
+        base, label = context.paths.file(""), context.capture.label
+        requested = [index_named(name) for name in context.settings.write.indices]
+        earlier = [raster for raster in index_rasters(base) if raster.name not in {one.name for one in requested}]
+        if not (requested or earlier):
+            return
+        bands, problems = list(_bands(context)), []
+        for index, report in zip(requested, write_rasters(bands, requested, base, label), strict=True):
+            if report.path is not None:
+                yield from self._files(report.path)
+            elif all(not b.problem for b in bands) and _has_bands(context.capture.bands, index):
+                problems.append(report.problem)
+        masked = list(_masked(bands, context))
+        for raster in earlier:
+            problem = "its formula is unknown"
+            if raster.index is not None:
+                (report,) = write_rasters(masked if raster.is_masked else bands, [raster.index], base, label)
+                problem = report.problem
+            if problem:
+                context.lost[raster.path] = problem
+            else:
+                yield from self._files(raster.path)
+        if problems:
+            raise InputError("; ".join(problems))
+
+    def _files(self, raster: Path) -> Iterator[WrittenFile]:
+        yield WrittenFile(self.kind, raster)
+        yield WrittenFile(self.kind, raster.with_suffix(".png"))
+
+
+def check_indices(captures: Sequence[Capture], settings: WriteSettings) -> None:
+    """Raise ConfigurationError for an unknown index, and for an index that no capture has the bands or unit for."""
+    for name in settings.indices:
+        index = index_named(name)
+        suitable = [c for c in captures if _has_bands(c.bands, index)]
+        if captures and not suitable:
+            names = ", ".join(dict.fromkeys(b.name for c in captures for b in c.bands))
+            raise ConfigurationError(
+                f"--index {name}: needs bands {', '.join(index.roles)}, and no capture has them all; there are {names}"
+            )
+        are_integers = all(np.dtype(b.dtype).kind in "ui" for c in suitable for b in c.bands)
+        if suitable and settings.radiometry == "off" and are_integers and not index.any_unit:
+            raise ConfigurationError(f"--index {name}: needs reflectance; add --radiometry")
+
+
+def _has_bands(bands: Sequence[Band], index: Index) -> bool:
+    return {role_of_band(band) for band in bands} >= set(index.roles)
+
+
+def _bands(context: ProductContext) -> Iterator[AlignedBand]:
+    places, usable = context.places, {context.capture.reference.name, *context.usable}
+    for band in context.capture.bands:
+        if band.name in usable and band.name in places:
+            file, index = places[band.name]
+            yield AlignedBand(band.name, band.wavelength_nm, file.path, index, file.sha256)
+        else:
+            yield AlignedBand(band.name, band.wavelength_nm, Path(), 1, problem="not usable")
+
+
+def _masked(bands: Sequence[AlignedBand], context: ProductContext) -> Iterator[AlignedBand]:
+    """Yield bands with the quality raster that this rendering has written."""
+    raster = next((file for file in context.written if file.kind == "qa"), None)
+    layers = {layer.band.name: number for number, layer in enumerate(context.layers, start=2)}  # layer 1: all bands
+    for band in bands:
+        if raster is None:
+            yield replace(band, problem="its quality raster does not exist")
+        else:
+            yield replace(band, quality=(raster.path, layers[band.name], raster.sha256))
+
+
+def write_rasters(
+    bands: Sequence[AlignedBand], indices: Sequence[Index], base: Path, label: str, *, overwrite: bool = True
+) -> Iterator[IndexReport]:
+    """Write `base`_<index>.tif and .png of a capture's bands, each atomically.
+
+    Without `overwrite`, rasters that an earlier command wrote from the same bands with the same formula are kept. If a
+    band of an index is missing, not usable or not in the unit that the index needs, the report has the problem.
+    Raises OutputError, or InputError for a file that cannot be read.
+    """
+    with BandReader() as reader:
+        for index in indices:
+            target = base.with_name(f"{base.name}_{index.name}.tif")
+            try:
+                chosen = _bands_of_index(bands, index)
+                source = _fingerprint(index, chosen)
+                may_be_kept = not overwrite and all(band.sha256 for band in chosen)
+                earlier = _finished_before(target, source) if may_be_kept else None
+                if earlier is None and target.resolve() in {band.file.resolve() for band in bands}:
+                    raise InputError(f"{target}: is the file of a band; give the formula '{index.name}' another name")
+                if earlier is None and _is_foreign(target):
+                    raise InputError(f"{target}: was not written by agalign; choose another folder with -o")
+                unit = earlier.unit if earlier is not None else _common_unit(index, chosen, reader)
+            except InputError as error:
+                yield IndexReport(label, index.name, problem=str(error))
+                continue
+            statistics = earlier or _write(index, chosen, target, unit, source, reader)
+            is_masked = any(band.quality is not None for band in chosen)
+            yield IndexReport(label, index.name, target, statistics, kept=earlier is not None, is_masked=is_masked)
+
+
+def _is_foreign(path: Path) -> bool:
+    """Return True for a file that is not an index raster; a damaged one is written again."""
+    if not path.exists():
+        return False
+    with suppress(OSError):
+        check_complete(path)
+        return _statistics_in(tags_of(path)) is None
+    return not is_own_file(path)
+
+
+@dataclass(frozen=True)
+class IndexRaster:
+    """An index raster that an earlier command wrote."""
+
+    path: Path
+    name: str
+    """Name of the index."""
+    index: Index | None
+    """None if the formula in its tags cannot be evaluated."""
+    is_masked: bool
+    """Its bands were masked by quality flags."""
+
+
+def index_rasters(base: Path) -> list[IndexRaster]:
+    """Return the index rasters of a capture, `base`_<index>.tif."""
+    result = []
+    for path in sorted(base.parent.glob(f"{glob.escape(base.name)}_*.tif")):
+        tags = {} if path.with_suffix(".json").exists() else tags_of(path)  # else the stack of another capture
+        statistics = _statistics_in(tags)
+        if statistics is not None and path.name == f"{base.name}_{tags.get('INDEX')}.tif":
+            is_masked = bool(tags.get("MASKED_BY")) or statistics.masked_share > 0
+            result.append(IndexRaster(path, tags["INDEX"], _index_of(tags), is_masked))
+    return result
+
+
+def _index_of(tags: Mapping[str, str]) -> Index | None:
+    """Return the index with the name and the formula in the tags of a raster."""
+    name, formula = tags["INDEX"], tags.get("INDEX_FORMULA", "")
+    with suppress(ConfigurationError):
+        known = index_named(name)
+        if _formula_text(known) == formula:
+            return known
+    with suppress(ConfigurationError):
+        return index_of_formula(f"{name}={formula}")
+    return None
+
+
+def _bands_of_index(bands: Sequence[AlignedBand], index: Index) -> list[AlignedBand]:
+    """Return the bands of an index. Raises InputError if one is missing or not usable."""
+    chosen = [bands[i] for i in bands_for(index, [b.name for b in bands], [b.wavelength_nm for b in bands])]
+    for band in chosen:
+        if band.problem:
+            raise InputError(f"{index.name} is left out: {band.problem}")
+    return chosen
+
+
+def _fingerprint(index: Index, bands: Sequence[AlignedBand]) -> str:
+    """Sixteen hexadecimal digits of everything that an index raster depends on."""
+    sources = [(b.sha256, b.band_index) for b in bands]
+    masks = [(b.quality[2], b.quality[1]) for b in bands if b.quality is not None]
+    facts = json.dumps([__version__, index.formula, index.constants, index.span, sources, *([masks] if masks else [])])
+    return hashlib.sha256(facts.encode()).hexdigest()[:16]
+
+
+def _finished_before(target: Path, source: str) -> IndexStatistics | None:
+    """The statistics of a complete raster with its picture and this fingerprint; None if there is none."""
+    with suppress(OSError):
+        check_complete(target)
+        tags = tags_of(target)
+        if tags.get("INDEX_MADE_FROM") == source and target.with_suffix(".png").is_file():
+            return _statistics_in(tags)
+    return None
+
+
+def _common_unit(index: Index, bands: Sequence[AlignedBand], reader: BandReader) -> str:
+    """Return the unit of the bands of an index.
+
+    Raises InputError if units or sizes differ, also of quality flags, or if the index needs another unit.
+    """
+    files = [(band.file, band.band_index) for band in bands]
+    files += [band.quality[:2] for band in bands if band.quality is not None]
+    expected = reader.file(*files[0]).shape
+    for path, layer in files:
+        if reader.file(path, layer).shape != expected:
+            raise InputError(f"{path}: differs in size from {files[0][0].name}; run again")
+    units = {unit for band in bands for unit in reader.units(band)}
+    if len(units) > 1:
+        raise InputError(f"{index.name} is left out: its bands are in different units ({', '.join(sorted(units))})")
+    (unit,) = units
+    if not index.any_unit and unit != "reflectance":
+        raise InputError(f"{index.name} needs reflectance, and the bands are {unit}; align with --radiometry")
+    return unit
+
+
+def _write(
+    index: Index, bands: Sequence[AlignedBand], target: Path, unit: str, source: str, reader: BandReader
+) -> IndexStatistics:
+    """Write the raster tile by tile, and its picture. Raises OutputError, InputError for a band."""
+    like = reader.file(bands[0].file, bands[0].band_index)
+    profile = tiled_profile(like.width, like.height, 1, "float32", **FLOAT_OPTIONS)
+    if like.crs is not None and not like.transform.is_identity:
+        profile |= {"crs": like.crs, "transform": like.transform}
+    # Percentiles of larger rasters are calculated from every second, third … row and column.
+    max_statistics_px = 4_000_000
+    step = max(1, math.ceil(math.sqrt(like.width * like.height / max_statistics_px)))
+    samples, valid_px, masked_px = [], 0, 0
+    unmasked = [replace(band, quality=None) for band in bands]
+    is_cog = like.tags(ns="IMAGE_STRUCTURE").get("LAYOUT") == "COG"
+    is_masked = list(bands) != unmasked
+    layers, tags = [LayerDescription(index.name)], _tags(index, like, unit, source, is_masked=is_masked)
+    with checked_raster(target, profile, layers, tags, to_cog if is_cog else None) as (dataset, write):
+        for tile in tiles(Tile(0, 0, like.width, like.height), WORK_TILE_PX):
+            values = compute(index, [reader.values(band, tile) for band in bands])
+            write(values, 1, tile.x0, tile.y0)
+            valid = np.isfinite(values)
+            valid_px += int(np.count_nonzero(valid))
+            if is_masked:
+                all_values = compute(index, [reader.values(band, tile) for band in unmasked])
+                masked_px += int(np.count_nonzero(np.isfinite(all_values) & ~valid))
+            samples.append(values[::step, ::step][valid[::step, ::step]])
+        sample = np.concatenate(samples)
+        shares = (pixels / (like.width * like.height) for pixels in (valid_px, masked_px))
+        statistics = _statistics(index, unit, sample, *shares)
+        dataset.update_tags(**{_STATISTICS_TAG: json.dumps(statistics.as_json())})
+    _draw(index, target, sample, statistics)
+    return statistics
+
+
+def _formula_text(index: Index) -> str:
+    constants = ", ".join(f"{name} = {value:g}" for name, value in index.constants)
+    return f"{index.formula} with {constants}" if constants else index.formula
+
+
+def _tags(index: Index, like: OpenRaster, unit: str, source: str, *, is_masked: bool) -> dict[str, str]:
+    """The tags of a raster, some of which are those of the file of its first band."""
+    copied = "CAPTURE_ID", "CAMERA", "TIFFTAG_DATETIME", "RADIOMETRY", "GEOREFERENCE", "GEOREFERENCE_ACCURACY_M"
+    return {k: v for k, v in like.tags().items() if k in copied} | {
+        "TIFFTAG_SOFTWARE": SOFTWARE,
+        "INDEX": index.name,
+        "INDEX_SOURCE": index.source,
+        "INDEX_FORMULA": _formula_text(index),
+        "INDEX_MADE_FROM": source,
+        "MASKED_BY": "qa" if is_masked else "",
+        "INPUT": "raw numbers, not reflectance" if unit == RAW else "",
+    }
+
+
+def _statistics(
+    index: Index, unit: str, sample: NDArray[np.float32], valid_share: float, masked_share: float
+) -> IndexStatistics:
+    masked_share = round(masked_share, 6)
+    if not sample.size:
+        return IndexStatistics(unit=unit, low=0.0, high=1.0, masked_share=masked_share)
+    low, p5, median, p95, high = (round(float(v), 6) for v in np.percentile(sample, (2, 5, 50, 95, 98)))
+    if index.span is not None and unit != RAW:
+        low, high = index.span
+    # The ends of the colour scale must differ.
+    return IndexStatistics(median, p5, p95, round(valid_share, 6), unit, low, max(high, low + 1e-3), masked_share)
+
+
+def _draw(index: Index, raster: Path, sample: NDArray[np.float32], statistics: IndexStatistics) -> None:
+    """Write the picture of a raster, and the histogram of a sample of its values in the same colours.
+
+    Raw numbers are drawn in greys. Raises OutputError.
+    """
+    with open_raster(raster) as dataset:
+        size_px = dataset.width, dataset.height
+        # Longer side of the image at the top left of the picture; the report overlays it on the composite.
+        picture_px = 720
+        values = dataset.read(1, out_shape=reduced_size_px(size_px, max(1.0, max(size_px) / picture_px))[::-1])
+    span, ramp = (statistics.low, statistics.high), _NEUTRAL if statistics.unit == RAW else _COLOURS
+    shape = values.shape
+    width, margin, bars, bins = max(shape[1], 360), 24, 90, 120
+    # In float64: a value clipped in float32 may be just outside the span.
+    counts = np.histogram(sample.astype(float).clip(*span), bins, span)[0]
+    sheet = np.full((shape[0] + bars + 2 * margin + 8, width, 3), 255, np.uint8)
+    sheet[: shape[0], : shape[1]] = _coloured(values, span, ramp)
+    base = shape[0] + margin + bars
+    edges = np.linspace(margin, width - margin, bins + 1).round().astype(int)
+    centres = np.linspace(*span, 2 * bins + 1, dtype=np.float32)[1::2]
+    colours = _coloured(centres[None], span, ramp)[0]
+    # The first and last bins also contain the values beyond the span.
+    heights = (bars * counts / max(int(counts[1:-1].max(initial=1)), 1)).clip(0, bars).round().astype(int)
+    for left, right, height, colour in zip(edges, edges[1:], heights.tolist(), colours.tolist(), strict=False):
+        cv2.rectangle(sheet, (int(left), base - height), (int(right) - 1, base), colour, -1)
+    for value in np.linspace(*span, 5):
+        at = round(margin + (value - span[0]) / (span[1] - span[0]) * (width - 2 * margin))
+        sheet = with_text(sheet, f"{value:.3g}" if abs(value) >= 100 else f"{value:.2f}", (at, base + 18), anchor="ms")
+    note = ": raw numbers, not reflectance" if statistics.unit == RAW else ""
+    title = f"{index.name.upper()} of {raster.stem.removesuffix(f'_{index.name}')}{note}"
+    write_png(with_text(sheet, title, (margin, shape[0] + 18), 16), raster.with_suffix(".png"))
+
+
+def _coloured(values: NDArray[Any], span: tuple[float, float], ramp: NDArray[np.float64]) -> NDArray[np.uint8]:
+    """Values (height, width) as colours (height, width, 3)."""
+    share = np.nan_to_num(np.clip((values - span[0]) / (span[1] - span[0]), 0, 1))
+    stops = np.linspace(0, 1, len(ramp))
+    result = np.stack([np.interp(share, stops, channel) for channel in ramp.T], axis=-1)
+    result[~np.isfinite(values)] = (225, 190, 215)
+    return np.asarray(result.round(), np.uint8)
+
+
+def to_check(index: Index | None, sidecar: Sidecar, run: RunFacts, label: str) -> str:
+    """Return what to check in the bands of an index of a capture, given its run and label; empty if there is nothing,
+    or if the formula is unknown.
+    """
+    if index is None:
+        return ""
+    with suppress(InputError):  # other bands than those of the sidecar
+        names = [b.band for b in sidecar.bands]
+        used = {names[i] for i in bands_for(index, names, [b.wavelength_nm for b in sidecar.bands])}
+        return "; ".join(f"{c.band}: {c.reason}" for c in run.cautions(sidecar, label) if c.band in used)
+    return ""
+
+
+def reports_of(sidecar: Sidecar, folder: str, out: Path, run: RunFacts) -> list[IndexReport]:
+    """Return the indices of a capture that its sidecar lists, from the tags of the rasters."""
+    result = []
+    for part in sidecar.products:
+        path = out / folder / part.file
+        if part.kind == "index" and path.suffix == ".tif":
+            name = path.stem.removeprefix(f"{Path(sidecar.capture).name}_")
+            tags = tags_of(path)
+            statistics = _statistics_in(tags)
+            if statistics is not None:
+                label = Path(folder, sidecar.capture).as_posix()
+                problem = to_check(_index_of(tags) if "INDEX" in tags else None, sidecar, run, label)
+                is_masked = bool(tags.get("MASKED_BY"))
+                result.append(IndexReport(label, name, path, statistics, problem, is_masked=is_masked).of(sidecar))
+    return result
+
+
+def read_table(out: Path) -> list[IndexReport]:
+    """Return the rows of OUT/indices.csv, or an empty list if the file does not exist."""
+    try:
+        text = read_regular(out / INDICES_FILE).decode()
+        # Lines may have too few or too many cells.
+        return [_row(line, out) for line in csv.DictReader(io.StringIO(text))]
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, csv.Error):
+        return []
+
+
+def current_rows(out: Path) -> list[IndexReport]:
+    """Return the rows of OUT/indices.csv that are still true: they have a raster that exists and was not written again
+    since, or are of an index that could not be calculated; and they are not of a renamed capture.
+    """
+    renamed = renamed_captures(out)
+    rows = [row for row in read_table(out) if row.capture not in renamed]
+    return [current for row in rows if (current := _current(row)) is not None]
+
+
+def merged(rows: Iterable[IndexReport], newer: Iterable[IndexReport]) -> list[IndexReport]:
+    """Return all rows; a newer one replaces that of the same capture and index."""
+    return list({row.key: row for row in [*rows, *newer]}.values())
+
+
+def update_table(
+    out: Path, rows: Sequence[IndexReport], earlier: Sequence[IndexReport] | None = None
+) -> list[IndexReport]:
+    """Write OUT/indices.csv: `rows`, and the `current_rows` of other captures and indices, which may be given.
+
+    Return all rows. An empty table is not written. Raises OutputError.
+    """
+    old = read_table(out)
+    result = _masked_alike(merged(current_rows(out) if earlier is None else earlier, rows))
+    if (result or old) and (result != old or not (out / INDICES_FILE).is_file()):
+        of_capture = "folder", "capture", "captured_at", "latitude", "longitude"
+        of_index = "index", "median", "p5", "p95", "valid_share", "masked_share", "input", "low", "high", "file"
+        columns = *of_capture, *of_index, "problem"
+        cells = (_cells(row, out) for row in sorted(result, key=lambda row: row.key))
+        write_csv(out / INDICES_FILE, columns, ([one[name] for name in columns] for one in cells))
+    return result
+
+
+def _current(row: IndexReport) -> IndexReport | None:
+    """Return a row if its raster has the statistics of the row, or if it has a problem instead; else None."""
+    if row.path is None:
+        return row if row.problem else None
+    tags = tags_of(row.path)
+    statistics = _statistics_in(tags)
+    if statistics is None or statistics.unit != row.statistics.unit:
+        return None
+    is_same = f"{statistics.median:g}" == f"{row.statistics.median:g}"
+    return replace(row, is_masked=bool(tags.get("MASKED_BY"))) if is_same else None
+
+
+def _masked_alike(rows: Sequence[IndexReport]) -> list[IndexReport]:
+    """Return the rows without the values of rasters that are not masked like most, of an equal number like the masked:
+    statistics with and without quality flags are not comparable.
+    """
+    counts: Counter[tuple[str, bool]] = Counter((row.index, row.is_masked) for row in rows if row.path is not None)
+    result = []
+    for row in rows:
+        are_masked = counts[row.index, True] >= counts[row.index, False]
+        if row.path is not None and row.is_masked != are_masked:
+            state = "masked" if row.is_masked else "not masked"
+            problem = f"its raster is {state} by quality flags, unlike those of most captures; compute the index again"
+            row = replace(row, path=None, statistics=IndexStatistics(), problem=problem)
+        result.append(row)
+    return result
+
+
+def _cells(row: IndexReport, out: Path) -> dict[str, Any]:
+    folder, capture, _ = row.key
+    place = {"folder": folder, "capture": capture, "input": row.statistics.unit}
+    file = "" if row.path is None else row.path.relative_to(out).as_posix()
+    return vars(row) | row.statistics.as_json() | place | {"file": file}
+
+
+def _row(cells: Mapping[str, str], out: Path) -> IndexReport:
+    cells = {k: _unquoted(v) for k, v in cells.items()}
+    numbers = {k: float(cells[k] or "nan") for k in ("median", "p5", "p95", "valid_share", "low", "high")}
+    numbers["masked_share"] = float(cells.get("masked_share") or 0)  # older tables do not have it
+    path = out / cells["file"]
+    path.relative_to(out)  # raises ValueError for an absolute path, which no table has
+    latitude, longitude = (float(cells[k]) if cells[k] else None for k in ("latitude", "longitude"))
+    return IndexReport(
+        Path(cells["folder"], cells["capture"]).as_posix(),
+        path=path if cells["file"] else None,
+        statistics=IndexStatistics(unit=cells["input"], **numbers),
+        index=cells["index"],
+        problem=cells["problem"],
+        captured_at=cells["captured_at"],
+        latitude=latitude,
+        longitude=longitude,
+    )
+
+
+def _unquoted(text: str) -> str:
+    """The text that `without_formula` quoted."""
+    return text[1:] if text.startswith("'") and without_formula(text[1:]) != text[1:] else text

@@ -1,1 +1,0 @@
-"""Outputs in the formats of other programs and libraries."""

@@ -1,1 +1,0 @@
-"""Spectral indices: formulas, rasters, statistics and table."""

@@ -1,1 +1,0 @@
-"""Rasters on the output grid of a capture."""

@@ -1,1 +1,0 @@
-"""The report of a run, its summary as CSV, and the pictures in it."""

@@ -1,1 +1,0 @@
-"""The sidecar of a capture: its schema, values and file."""

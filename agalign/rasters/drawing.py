@@ -1,0 +1,141 @@
+"""The bands of a capture as reduced grey images, pictures with text, and PNG files."""
+
+import struct
+import zlib
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image, ImageDraw, ImageFont
+
+from agalign.errors import OutputError, UnreadableFileError
+from agalign.host.files import complete_file
+from agalign.host.own_files import JPEG_MARK, PNG_MARK
+from agalign.pixels.raster import ReadTile, read_preview, read_tile, with_nan
+from agalign.values.capture import Capture
+from agalign.values.image import OutputGrid, Tile, reduced_size_px
+
+Grey = NDArray[np.uint8]
+"""(height, width)"""
+Picture = NDArray[np.uint8]
+"""(height, width, 3) red, green, blue."""
+MAX_REDUCED_PX = 2048
+"""Longer side of reduced images: larger than most screens."""
+
+
+@dataclass(frozen=True)
+class ReducedBands:
+    """The bands of a capture on its output grid, reduced to the size of a screen."""
+
+    before: Mapping[str, Grey]
+    """The raw file, resized to that of the reference, of each band that can be read."""
+    after: Mapping[str, Grey]
+    """The aligned pixels of each band that was written."""
+    size_px: tuple[int, int]
+    """(width, height) of all images."""
+    saturated: Mapping[str, float] = field(default_factory=dict)
+    """Share of saturated pixels in the raw file of each band with a known saturation value, after the reduction."""
+
+
+def read_reduced_bands(
+    capture: Capture,
+    places: Mapping[str, tuple[Path, int]],
+    grid: OutputGrid,
+    read: ReadTile = read_tile,
+    written: Mapping[str, Grey] | None = None,
+) -> ReducedBands:
+    """Read the bands of a capture, given file and index of each written band, and a function that reads the pixels of
+    the capture's files. Those of `written` are known already. Raises UnreadableFileError for the written ones.
+    """
+    size_px = reduced_size_px((grid.width, grid.height), max(1.0, max(grid.width, grid.height) / MAX_REDUCED_PX))
+    before, saturated = {}, {}
+    for band in capture.bands:
+        with suppress(UnreadableFileError):  # the band pair has failed with this reason
+            to_band = np.divide(band.size_px, np.multiply(grid.scale, capture.reference.size_px))
+            corner, extent = np.rint(np.array([(grid.x0, grid.y0), (grid.width, grid.height)]) * to_band).astype(int)
+            window = Tile(*corner.tolist(), *extent.clip(1).tolist())
+            if (window.width, window.height) == size_px and _is_inside(window, band.size_px):
+                plane = with_nan(read(band, window)[0], band.nodata)
+            else:
+                window_px = window.x0, window.y0, window.width, window.height
+                plane = read_preview(band.path, band.index_in_page, window_px, size_px, band.page)
+            before[band.name] = grey(plane)
+            if band.saturation_value is not None:
+                saturated[band.name] = np.count_nonzero(plane >= band.saturation_value) / plane.size
+    whole_px, known = (0, 0, grid.width, grid.height), written or {}
+    after = {
+        name: known[name] if name in known else grey(read_preview(*place, whole_px, size_px))
+        for name, place in places.items()
+    }
+    return ReducedBands(before, after, size_px, saturated)
+
+
+def _is_inside(tile: Tile, size_px: tuple[int, int]) -> bool:
+    return tile.x0 >= 0 and tile.y0 >= 0 and tile.x0 + tile.width <= size_px[0] and tile.y0 + tile.height <= size_px[1]
+
+
+def grey(plane: NDArray[np.float32]) -> Grey:
+    """Return the grey values of a band (height, width), NaN for nodata, between its own percentiles: raw numbers and
+    reflectance have different ranges.
+    """
+    sample_pixels = 20_000  # pixels from which the contrast is calculated: percentiles then have an error of 0.1 %
+    sample = plane.ravel()[:: max(1, plane.size // sample_pixels)]
+    sample = sample[np.isfinite(sample) & (sample != 0)]
+    low, high = np.percentile(sample, (1.5, 98.5)).tolist() if sample.size else (0.0, 1.0)
+    scaled = np.subtract(plane, np.float32(low))
+    scaled *= np.float32(255.0 / max(high - low, 1e-9))
+    cv2.patchNaNs(scaled, 0.0)
+    return np.asarray(np.clip(scaled, 0, 255, out=scaled).astype(np.uint8))
+
+
+def write_png(image: Picture, path: Path) -> None:
+    """Write a picture atomically. Raises OutputError."""
+    with complete_file(path) as partial:
+        partial.write_bytes(encoded(image[..., ::-1], path))
+
+
+def encoded(image: Picture, path: Path, *options: int) -> bytes:
+    """Return an image, in OpenCV's order of colours, in the format of the path's suffix. Raises OutputError."""
+    is_encoded, data = cv2.imencode(path.suffix, image, options)
+    if not is_encoded:
+        raise OutputError(f"{path}: cannot be encoded")
+    return _marked(data.tobytes())
+
+
+def _marked(data: bytes) -> bytes:
+    """Return a PNG or JPEG file with the name of the program, by which later commands recognise it: a text after the
+    header of a PNG (13 bytes, and 12 of the chunk), or a comment after that of a JPEG.
+    """
+    if data.startswith(b"\x89PNG"):
+        at, text = 8 + 12 + 13, b"tEXt" + PNG_MARK
+        part = struct.pack(">I", len(PNG_MARK)) + text + struct.pack(">I", zlib.crc32(text))
+    else:
+        at, part = 4 + int.from_bytes(data[4:6]), JPEG_MARK
+    return data[:at] + part + data[at:]
+
+
+def with_text(
+    image: Picture, text: str, at_px: tuple[float, float], size_px: float = 14, anchor: str = "ls"
+) -> Picture:
+    """Return the picture with a line of text; `anchor` is Pillow's, by default the left end of the baseline."""
+    drawn = Image.fromarray(image)
+    ImageDraw.Draw(drawn).text(at_px, text, (40, 40, 40), ImageFont.load_default(size_px), anchor)
+    return np.asarray(drawn)
+
+
+def titled(picture: Picture, title: str, height_px: int) -> Picture:
+    """Return the picture below a white strip of this height with a line of text."""
+    strip = np.full((height_px, picture.shape[1], 3), 255, np.uint8)
+    return np.vstack([with_text(strip, title, (2, round(0.7 * height_px))), picture])
+
+
+def side_by_side(pictures: Sequence[Picture], gap_px: int) -> Picture:
+    """Return the pictures in a row, aligned at the top, with white gaps."""
+    height = max(picture.shape[0] for picture in pictures)
+    pads = [((0, height - picture.shape[0]), (0, gap_px), (0, 0)) for picture in pictures]
+    padded = [np.pad(picture, pad, constant_values=255) for picture, pad in zip(pictures, pads, strict=True)]
+    return np.hstack(padded)[:, :-gap_px]

@@ -1,0 +1,242 @@
+"""The preview of a capture: all bands in grey, before and after alignment, on one JPEG, from which the report composes
+colour pictures of any three bands; and the before/after picture, three bands as red, green and blue, so that
+misalignment shows as colour.
+
+The JPEG has a column for each band of the sidecar, in its order, and these rows:
+
+    0  the raw files, each resized to the reference's file
+    1  the written bands; black for a band that was not written
+    2  a detail of row 0, where there are most edges, at the resolution of the reduced bands
+    3  the same detail of row 1
+    4  if error maps are written: the expected error, white for `ERROR_FULL_PX` and more
+    5  (4 without error maps) in the first column, if the capture has a relief: its parallax, white for the nearest
+"""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from agalign.cameras.base import is_thermal
+from agalign.host.files import complete_file
+from agalign.rasters.alignment_maps import error_lattice_px, relief_layers, relief_of
+from agalign.rasters.drawing import Grey, ReducedBands, encoded, side_by_side, titled, write_png
+from agalign.rasters.product import Product, ProductContext, WrittenFile
+from agalign.records.sidecar import PreviewPart, ReliefPreviewPart
+from agalign.values.capture import Band
+from agalign.values.image import reduced_size_px
+from agalign.values.resampling import NODES_PX
+from agalign.values.spectrum import ROLES
+
+ERROR_FULL_PX = 0.5
+"""Expected error that is shown as white."""
+_MAX_TILE_PX = 640
+"""Limit of the longer side of a tile."""
+_DETAIL_SHARE = 0.35
+"""Sides of a detail relative to those of a tile."""
+_JPEG_QUALITY = 35
+"""Low: edges, which show misalignment, remain sharp, and the size limits the resolution."""
+_RELIEF_PERCENTILES = 1.0, 99.0
+"""Percentiles shown as black and white: a few wrong pixels must not determine the contrast."""
+
+
+def preview_bytes(captures: int) -> int:
+    """Return the largest size in bytes of the preview of a capture in a run of this many captures."""
+    # The report of a season, which contains all previews, must be small enough for an e-mail.
+    return min(600_000, 44_000_000 // max(captures, 1))
+
+
+class ReliefView(NamedTuple):
+    """The relief of a capture, reduced to the size of a tile."""
+
+    parallax_px: NDArray[np.float32]
+    """(height, width)"""
+    range_m: tuple[float, float] | None
+    """Smallest and largest range; None if it is unknown."""
+
+
+class Preview(Product):
+    """The bands for the report; also of a failed capture, where they help to find the reason."""
+
+    kind = "preview"
+    suffix = ".preview.jpg"
+    is_required = False
+    needs_layers = False
+
+    def write(self, context: ProductContext) -> list[WrittenFile]:
+        """Write <capture>.preview.jpg."""
+        path, reference = context.paths.file(self.suffix), context.capture.reference
+        bands = [b.name for b in context.capture.bands]
+        mapped = context.with_pixels if context.settings.write.error_map else {}
+        errors_px = {name: error_lattice_px(a, reference, context.grid, NODES_PX) for name, a in mapped.items()}
+        part = write_preview(
+            context.reduced_bands, bands, errors_px, path, context.max_preview_bytes, relief_view(context)
+        )
+        return [WrittenFile(self.kind, path, preview=part)]
+
+
+def relief_view(context: ProductContext) -> ReliefView | None:
+    """Return the reduced relief of a capture; None if no band is displaced by one."""
+    relief = relief_of(context.with_pixels)
+    if relief is None:
+        return None
+    reduction = max(1.0, max(context.grid.width, context.grid.height) / _MAX_TILE_PX)
+    size_px = reduced_size_px((context.grid.width, context.grid.height), reduction)
+    layers = relief_layers(context.capture, context.with_pixels, relief, context.grid, size_px)
+    range_m = layers["range"][np.isfinite(layers["range"])]
+    limits_m = tuple(np.percentile(range_m, _RELIEF_PERCENTILES).tolist()) if range_m.size else None
+    return ReliefView(layers["parallax"], limits_m)
+
+
+def write_preview(
+    views: ReducedBands,
+    bands: Sequence[str],
+    errors_px: Mapping[str, NDArray[np.float32]],
+    path: Path,
+    max_bytes: int,
+    relief: ReliefView | None = None,
+) -> PreviewPart:
+    """Write the preview, with tiles as large as `max_bytes` allows.
+
+    The detail is where the first of the bands has most edges. `errors_px` has the expected error (rows, columns) by
+    band, or is empty. Raises OutputError.
+    """
+    longest_px, min_tile_px = max(views.size_px), 96
+    tile_px = min(_MAX_TILE_PX, longest_px)
+
+    def smaller_px(size_bytes: float) -> int:
+        # The size is proportional to the area of a tile.
+        return max(min_tile_px, int(tile_px * 0.97 * (max_bytes / size_bytes) ** 0.5))
+
+    first = next(images[name] for name in bands for images in (views.after, views.before) if name in images)
+    size_px = reduced_size_px(views.size_px, longest_px / tile_px)
+    of_tile = len(encoded(_resized(first, size_px), path, cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY))
+    of_all = 2 * len(bands) * of_tile * (1 + _DETAIL_SHARE**2)
+    if of_all > max_bytes:
+        tile_px = smaller_px(of_all)
+    for _ in range(6):  # one step is usually sufficient
+        part, sheet = _sheet(views, bands, errors_px, relief, tile_px / longest_px, path.name)
+        data = encoded(sheet, path, cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY)
+        if len(data) <= max_bytes or tile_px <= min_tile_px:
+            break
+        tile_px = smaller_px(len(data))
+    with complete_file(path) as partial:
+        partial.write_bytes(data)
+    return part
+
+
+def _sheet(
+    views: ReducedBands,
+    bands: Sequence[str],
+    errors_px: Mapping[str, NDArray[np.float32]],
+    relief: ReliefView | None,
+    scale: float,
+    name: str,
+) -> tuple[PreviewPart, Grey]:
+    width, height = views.size_px
+    tile_px = _whole_blocks(width * scale, width), _whole_blocks(height * scale, height)
+    detail_px = _whole_blocks(tile_px[0] * _DETAIL_SHARE, width), _whole_blocks(tile_px[1] * _DETAIL_SHARE, height)
+    first = next(images[n] for n in bands for images in (views.after, views.before) if n in images)
+    x, y = busiest_window(first, detail_px)
+    black = np.zeros(views.size_px[::-1], np.uint8)
+    before, after = ([images.get(n, black) for n in bands] for images in (views.before, views.after))
+    rows = [[_resized(image, tile_px) for image in images] for images in (before, after)]
+    rows += [[image[y : y + detail_px[1], x : x + detail_px[0]] for image in images] for images in (before, after)]
+    if errors_px:
+        errors = {name: np.nan_to_num(e / ERROR_FULL_PX, nan=1.0).clip(0, 1) * 255 for name, e in errors_px.items()}
+        rows.append([_resized(np.asarray(errors.get(n, black), np.uint8), tile_px) for n in bands])
+    relief_part = None
+    if relief is not None:
+        low, high = np.percentile(relief.parallax_px, _RELIEF_PERCENTILES).tolist()
+        high = max(high, low + 1e-3)
+        grey = np.rint(((relief.parallax_px - low) / (high - low)).clip(0, 1) * 255)
+        rows.append([_resized(np.asarray(grey, np.uint8), tile_px)])
+        relief_part = ReliefPreviewPart(parallax_px=(low, high), range_m=relief.range_m)
+    strips = [np.hstack(row) for row in rows]
+    sheet_width = max(s.shape[1] for s in strips)
+    sheet = np.vstack([np.pad(s, ((0, 0), (0, sheet_width - s.shape[1]))) for s in strips])
+    part = PreviewPart(
+        file=name,
+        tile_px=tile_px,
+        detail_px=detail_px,
+        detail=(x / width, y / height, detail_px[0] / width, detail_px[1] / height),
+        error_full_px=ERROR_FULL_PX if errors_px else None,
+        relief=relief_part,
+    )
+    return part, np.asarray(sheet, np.uint8)
+
+
+def _whole_blocks(length_px: float, max_px: int) -> int:
+    """A multiple of the side of a JPEG block, so that compression does not mix neighbouring tiles."""
+    block_px = 8
+    return min(max_px, max(block_px, int(length_px / block_px) * block_px))
+
+
+def _resized(image: Grey, size_px: tuple[int, int]) -> Grey:
+    """The image at a size (width, height)."""
+    larger = size_px[0] > image.shape[1]
+    return np.asarray(cv2.resize(image, size_px, interpolation=cv2.INTER_LINEAR if larger else cv2.INTER_AREA))
+
+
+class BeforeAfterPicture(Product):
+    """The bands before and after alignment, with a detail of each."""
+
+    kind = "picture"
+    suffix = ".png"
+    is_required = False
+
+    def write(self, context: ProductContext) -> list[WrittenFile]:
+        """Write <capture>.png."""
+        path, reference = context.paths.file(self.suffix), context.capture.reference
+        chosen = choose_bands([b for b in context.capture.moving if b.name in context.with_pixels], reference)
+        write_picture(context.reduced_bands, [b.name for b in chosen], path)
+        return [WrittenFile(self.kind, path)]
+
+
+def choose_bands(moving: list[Band], reference: Band) -> list[Band]:
+    """Return three bands for red, green and blue: the longest wavelength, the one nearest to red, and the reference."""
+    known = sorted((b for b in moving if b.wavelength_nm is not None), key=lambda b: b.wavelength_nm or 0.0)
+    candidates = known if len(known) >= 2 else moving
+    # Vegetation has few edges in a thermal band.
+    longest = max(candidates, key=lambda b: 0.0 if is_thermal(b) else b.wavelength_nm or 0.0)
+    rest = [b for b in candidates if b is not longest]
+    red_nm = ROLES["red"].nominal_nm
+    nearest_to_red = min(rest, key=lambda b: abs((b.wavelength_nm or red_nm) - red_nm)) if rest else reference
+    return [longest, nearest_to_red, reference]
+
+
+def write_picture(views: ReducedBands, names: Sequence[str], path: Path) -> None:
+    """Write the picture of three bands as red, green and blue: before and after alignment, each with an overview of
+    480 px and a detail, which is enlarged from 160 px, below it. Raises OutputError.
+    """
+    before, after = (cv2.merge([bands[name] for name in names]) for bands in (views.before, views.after))
+    width, height = views.size_px
+    size_px, gap_px = (480, max(1, round(480 * height / width))), 8
+    detail_width = min(width, 160)
+    detail_height = max(1, min(height, round(detail_width * height / width)))
+    x0, y0 = busiest_window(after[..., 2], (detail_width, detail_height))
+    x1, y1 = x0 + detail_width, y0 + detail_height
+    scale = size_px[0] / width
+    columns = []
+    for image, title in ((before, f"before: {', '.join(names)} as red, green, blue"), (after, "after")):
+        overview = cv2.resize(image, size_px, interpolation=cv2.INTER_AREA)
+        corners = (round(x0 * scale), round(y0 * scale)), (round(x1 * scale), round(y1 * scale))
+        cv2.rectangle(overview, *corners, (255, 255, 255), 1)
+        detail = cv2.resize(image[y0:y1, x0:x1], size_px, interpolation=cv2.INTER_NEAREST)
+        gap = np.full((gap_px, size_px[0], 3), 255, np.uint8)
+        columns.append(titled(np.vstack([overview, gap, detail]), title, height_px=26))
+    write_png(side_by_side(columns, gap_px), path)
+
+
+def busiest_window(image: Grey, size_px: tuple[int, int]) -> tuple[int, int]:
+    """Return the top-left pixel (x, y) of the window (width, height) with the most edges, where misalignment shows."""
+    (height, width), (window_width, window_height) = image.shape, size_px
+    # Single strong edges must not determine the position.
+    edges = np.abs(cv2.Laplacian(image.astype(np.float32), cv2.CV_32F)).clip(0, 60)
+    density = cv2.boxFilter(edges, -1, size_px, anchor=(0, 0), normalize=True)
+    inside = density[: height - window_height + 1, : width - window_width + 1]
+    y, x = np.unravel_index(int(inside.argmax()), inside.shape)
+    return int(x), int(y)

@@ -1,0 +1,134 @@
+"""Captures of calibration panels and of the sky: OUT/panels.json and OUT/sky.json."""
+
+from pathlib import Path
+from typing import Annotated, Literal
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from agalign.host.files import read_model
+from agalign.values.capture import PanelSource
+from agalign.values.fields import Message, Name, SourceFile
+
+PANELS_FILE, SKY_FILE = "panels.json", "sky.json"
+
+
+class _Part(BaseModel):
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+
+class PanelBandPart(_Part):
+    """Measurement on the panel in one band."""
+
+    band: Name
+    file: SourceFile
+    """Image file, relative to the input folder that the run record names."""
+    area_px: list[tuple[float, float]]
+    """Corners (x, y) of the measured area, raw pixels of the file."""
+    albedo: float | None
+    """Reflectance of the panel, 0 to 1."""
+    radiance: float | None
+    """Mean over the area, in the unit of the camera's calibration."""
+    reflectance_per_radiance: float | None
+    sensor_scale: float | None = None
+    """Irradiance on the panel divided by that of the light sensor."""
+    problem: Message | None
+    """Reason why the band cannot be used."""
+
+
+class SkyBandPart(_Part):
+    """One band of a capture of the sky."""
+
+    band: Name
+    file: SourceFile
+    """Image file, relative to the input folder that the run record names."""
+    radiance: float | None
+    """Median over the image, W / m^2 / sr / nm; null if it is unknown or half of the band is saturated."""
+
+
+class _CapturePart(_Part):
+    folder: str
+    capture: str
+    captured_at: Name
+
+    @property
+    def is_left_out(self) -> bool:
+        """True if the capture is not aligned."""
+        return True
+
+
+class PanelPart(_CapturePart):
+    """One capture of a panel."""
+
+    seen_by: PanelSource
+    serial: Name
+    picture: str
+    in_scene: bool = False
+    """The capture shows a scene that contains the panel, or only one cue indicates it: it is aligned."""
+    cues: list[Name] = []
+    """Evidence that the capture shows a panel, in words."""
+    sensor_scale: float | None = None
+    """Irradiance on the panel divided by that of the light sensor, the median of the bands."""
+    fits_sensor: bool = True
+    """False if the scale or its range over the bands is implausible; panels are then not combined with the sensor."""
+    bands: list[PanelBandPart]
+
+    @property
+    def is_left_out(self) -> bool:
+        """True if the capture is not aligned."""
+        return not self.in_scene
+
+    @property
+    def sentence(self) -> str:
+        """Describe the capture for the summary and the report."""
+        albedos = sorted({f"{b.albedo:.2f}" for b in self.bands if b.albedo is not None})
+        # The smallest and the largest value, or the only one.
+        reflectance = " to ".join(dict.fromkeys((albedos[0], albedos[-1]))) if albedos else "not known"
+        name = f"calibration panel {self.serial}".strip()
+        use = "aligned, as it shows a scene or by one cue only" if self.in_scene else "not aligned"
+        recognised = ", ".join(self.cues) or self.seen_by
+        scale = self.sensor_scale
+        sensor = "" if scale is None else f"; irradiance {scale:.2f} times that of the light sensor"
+        if not self.fits_sensor:
+            by_band = sorted((b.sensor_scale, b.band) for b in self.bands if b.sensor_scale)
+            extremes = " to ".join(f"{value:.2f} in {band}" for value, band in by_band[:: max(1, len(by_band) - 1)])
+            sensor += f"{extremes and f' ({extremes})'}, which was in other light or is wrong in a band: "
+            sensor += "--radiometry auto uses the sensor alone, panel the panels alone"
+        refused = {b.problem: [o.band for o in self.bands if o.problem == b.problem] for b in self.bands if b.problem}
+        unused = "".join(f"; not used in {', '.join(bands)}: {why}" for why, bands in refused.items() if albedos)
+        return f"{name} (reflectance {reflectance}; recognised by {recognised}): {use}{sensor}{unused}"
+
+
+class SkyPart(_CapturePart):
+    """One capture of the sky."""
+
+    cues: list[Name]
+    """Evidence that the capture shows the sky, in words."""
+    bands: list[SkyBandPart]
+
+    @property
+    def sentence(self) -> str:
+        """State in words why the capture is not aligned."""
+        return f"shows the sky ({', '.join(self.cues)}): not aligned"
+
+
+class PanelsFile(_Part):
+    """All captures of panels of a run."""
+
+    schema_: Annotated[Literal["agalign-panels/1"], Field(alias="schema")] = "agalign-panels/1"
+    panels: list[PanelPart]
+
+
+class SkyFile(_Part):
+    """All captures of the sky of a run."""
+
+    schema_: Annotated[Literal["agalign-sky/1"], Field(alias="schema")] = "agalign-sky/1"
+    captures: list[SkyPart]
+
+
+def read_excluded(out: Path) -> tuple[list[PanelPart], list[SkyPart]]:
+    """Return the captures of panels and those of the sky of an earlier run.
+
+    Raises SidecarError for a file that agalign did not write.
+    """
+    panels, sky = read_model(out / PANELS_FILE, PanelsFile), read_model(out / SKY_FILE, SkyFile)
+    return ([] if panels is None else panels.panels), ([] if sky is None else sky.captures)

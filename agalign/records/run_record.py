@@ -1,0 +1,345 @@
+"""OUT/agalign-run.json: command, settings, versions, machine and results of a run; the first file that a run writes."""
+
+import json
+import platform
+from collections import Counter, defaultdict
+from collections.abc import Collection, Iterable, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from agalign._version import __version__
+from agalign.config import Settings
+from agalign.errors import ConfigurationError, SidecarError
+from agalign.flight.footprint import accuracy_of_footprint_m, footprint
+from agalign.flight.groups import CameraOverview, camera_overviews
+from agalign.host.files import RUN_FILE, read_model, read_regular, write_model
+from agalign.host.libraries import library_versions
+from agalign.host.processes import usable_cores
+from agalign.host.text import counted, escape_controls, shortened
+from agalign.records.excluded import PanelPart, SkyPart
+from agalign.records.sidecar import Sidecar
+from agalign.records.sidecar_file import find_sidecars, label_of
+from agalign.values.capture import CameraIdentity, Capture, Pose, Position
+from agalign.values.image import OutputGrid
+
+PAGES = "index.html", "summary.csv", "indices.csv", "flight.geojson"
+"""Files that a run writes for all its captures."""
+_SCHEMA = "agalign-run/2"
+RunState = Literal["running", "interrupted", "finished"]
+
+
+class _Part(BaseModel):
+    model_config = ConfigDict(extra="forbid", allow_inf_nan=False)
+
+
+class RefusalPart(_Part):
+    """A band of a capture that is not aligned or missing, and why."""
+
+    capture: str
+    band: str
+    status: str
+    reason: str | None
+
+
+class ProblemPart(_Part):
+    """A file that was left out or a capture that failed, and the reason."""
+
+    of: str
+    problem: str
+
+
+class NotInInputPart(_Part):
+    """A result of an earlier run, of a capture that is not in the input."""
+
+    capture: str
+    same_as: str = ""
+    """Capture of the input with the same exposure, whose result counts instead; empty if there is none."""
+
+
+class ExclusionPart(_Part):
+    """A capture that is not aligned because of what it shows."""
+
+    capture: str
+    kind: Literal["panel", "sky"]
+    evidence: list[str]
+    """Independent cues, in words: at least two."""
+    captured_at: str = ""
+    camera: CameraIdentity = CameraIdentity()
+    position: Position | None = None
+    pose: Pose | None = None
+    footprint: list[tuple[float, float]] | None = None
+    """Longitude and latitude, degrees, of the corners of the image."""
+    footprint_accuracy_m: float | None = None
+
+
+class RunPart(_Part):
+    """Record of one run. A run that was killed leaves the state `running`."""
+
+    schema_: Annotated[Literal["agalign-run/2"], Field(alias="schema")] = "agalign-run/2"
+    agalign: str = __version__
+    state: RunState
+    started_at: str
+    """ISO 8601, UTC."""
+    seconds: float
+    input: str
+    """The input folder. Sidecars name images relative to it."""
+    command: str = ""
+    """The command line; empty for a run from Python."""
+    cameras: list[CameraOverview] = []
+    """Summary of the captures of each camera, as `agalign info` prints it."""
+    versions: dict[str, str] = {}
+    machine: dict[str, str | int] = {}
+    settings: dict[str, Any] = {}
+    """Those with which the captures were processed; if none could be, those of the run before."""
+    labels: list[str] = []
+    """Labels of the captures found."""
+    captures: Counter[str] = Counter()
+    """Number of captures found, done, kept, panel, sky, and error. A capture is counted as error if its files were
+    removed before the end of the run."""
+    pairs: Counter[str] = Counter()
+    """Number of band pairs by status."""
+    stage_seconds: defaultdict[str, float] = defaultdict(float)
+    """Processing time by stage, summed over workers; includes learning the flight."""
+    capture_seconds: dict[str, float] = {}
+    """Processing time by capture."""
+    refused: list[RefusalPart] = []
+    problems: list[ProblemPart] = []
+    excluded: list[ExclusionPart] = []
+    other_inputs: dict[str, list[str]] = {}
+    """Labels of captures that earlier runs found in other input folders, by folder."""
+    not_in_input: list[NotInInputPart] = []
+
+    def add(self, label: str, state: str, result: Sidecar | None, problems: Iterable[str]) -> None:
+        """Add the result of a capture."""
+        self.captures[state] += 1
+        for text in problems:
+            self.add_problem(label, text)
+        for band, status, reason in [] if result is None else result.pairs:
+            self.pairs[status] += 1
+            if status != "aligned":
+                self.refused.append(RefusalPart(capture=label, band=band, status=status, reason=reason))
+
+    def retract(self, label: str, state: str, statuses: Iterable[str]) -> None:
+        """Count a capture that was added with this state, and these statuses of its pairs, as an error, because its
+        files do not exist.
+        """
+        self.captures[state] -= 1
+        self.captures["error"] += 1
+        self.pairs.subtract(statuses)
+        self.captures, self.pairs = +self.captures, +self.pairs  # without zeros
+        self.refused = [part for part in self.refused if part.capture != label]
+        self.capture_seconds.pop(label, None)
+        self.add_problem(label, "its files were removed during the run; the same command writes them again")
+
+    def add_problem(self, what: str, text: str) -> None:
+        """Add a problem of a file or capture; characters that are not printable are escaped."""
+        self.problems.append(ProblemPart(of=escape_controls(what), problem=escape_controls(text)))
+
+    def exclusions(self) -> list[str]:
+        """Return a line for each kind of exclusion: number of captures, and of those with each cue."""
+        lines = []
+        for kind, shows in (("panel", "a calibration panel"), ("sky", "the sky")):
+            of_kind = [part for part in self.excluded if part.kind == kind]
+            counts = Counter(cue for part in of_kind for cue in part.evidence)
+            if of_kind:
+                evidence = ", ".join(f"{cue} ({number})" for cue, number in counts.items())
+                lines.append(f"Left out: {counted(len(of_kind), 'capture')} of {shows}, by {evidence}")
+        return lines
+
+    def notes_on_input(self) -> list[str]:
+        """Return a line about the results of captures that the input no longer has, and one about renamed captures."""
+        gone = [part.capture for part in self.not_in_input if not part.same_as]
+        twice = [f"{part.capture} (now {part.same_as})" for part in self.not_in_input if part.same_as]
+        lines = []
+        if gone:
+            have = f"{counted(len(gone), 'capture')} of earlier runs {'is' if len(gone) == 1 else 'are'}"
+            lines.append(f"{have} not in the input of the last run, and still counted: {_named(gone)}")
+        if twice:
+            have = f"{counted(len(twice), 'capture')} of earlier runs {'has' if len(twice) == 1 else 'have'}"
+            lines.append(f"{have} another name in the input, and not counted twice: {_named(twice)}")
+        return [f"{line}; delete the files that are not needed" for line in lines]
+
+    def end(self, out: Path, state: RunState, seconds: float, earlier: "RunPart | None") -> None:
+        """Write the record at the end of a run, given that of the run before. Raises OutputError."""
+        # Rasters that no capture has were not made with the settings of this run.
+        if earlier is not None and not self.captures["done"] + self.captures["kept"]:
+            self.settings = earlier.settings
+        self.write(out, state, seconds)
+
+    def has_same_results(self, earlier: "RunPart") -> bool:
+        """Return True if the pages of an earlier run are true of this one, if the results have not changed."""
+        names = "settings", "labels", "problems", "excluded", "not_in_input"
+        return earlier.state == "finished" and all(getattr(self, name) == getattr(earlier, name) for name in names)
+
+    def write(self, out: Path, state: RunState, seconds: float) -> None:
+        """Write OUT/agalign-run.json with the results so far. Raises OutputError."""
+        facts: dict[str, Any] = {"state": state, "seconds": round(seconds, 2)}
+        for name in ("stage_seconds", "capture_seconds"):
+            facts[name] = {k: round(v, 3) for k, v in sorted(getattr(self, name).items())}
+        write_model(out / RUN_FILE, self.model_copy(update=facts))
+
+
+def excluded_part(capture: Capture, kind: Literal["panel", "sky"], evidence: list[str]) -> ExclusionPart:
+    """Return the record of a capture that is not aligned.
+
+    Its footprint is for a known height only: panels are photographed from 1 m, and the sky is not on the ground.
+    """
+    ring = footprint(capture, OutputGrid(0, 0, *capture.reference.size_px))
+    return ExclusionPart(
+        capture=capture.label,
+        kind=kind,
+        evidence=evidence,
+        captured_at=capture.known_time,
+        camera=capture.camera,
+        position=capture.position,
+        pose=capture.pose,
+        footprint=None if ring is None else [(x, y) for x, y in ring[::-1].tolist()],
+        footprint_accuracy_m=None if ring is None else accuracy_of_footprint_m(capture),
+    )
+
+
+def input_name(folder: Path) -> str:
+    """Return the path of an input folder as the record has it."""
+    return escape_controls(str(folder.resolve()))
+
+
+def begun(folder: Path, settings: Settings, captures: Sequence[Capture] = (), command: str = "") -> RunPart:
+    """Return the record of a run that starts now."""
+    system = {"system": platform.system(), "release": platform.release(), "processor": platform.machine()}
+    return RunPart(
+        state="running",
+        started_at=datetime.now(UTC).isoformat(timespec="seconds"),
+        seconds=0.0,
+        input=input_name(folder),
+        command=escape_controls(command),
+        cameras=camera_overviews(captures),
+        versions=library_versions(),
+        machine={**system, "cores": usable_cores(), "device": settings.joint.device},
+        settings=settings.model_dump(mode="json"),
+        labels=[capture.label for capture in captures],
+        captures=Counter(found=len(captures)),
+    )
+
+
+def refuse_foreign_pages(out: Path) -> None:
+    """Raise ConfigurationError if a folder without record and results of a run has files with the names of its
+    pages.
+    """
+    if (out / RUN_FILE).exists() or find_sidecars(out):
+        return
+    for path in (out / name for name in PAGES):
+        if path.is_file():
+            raise ConfigurationError(f"{path}: was not written by agalign; choose another output folder with -o")
+
+
+def read_run_record(out: Path) -> RunPart | None:
+    """Return the record of the last run into a folder, if any. Raises SidecarError for a file of another format."""
+    try:
+        return read_model(out / RUN_FILE, RunPart)
+    except SidecarError:
+        if version := _other_version(out / RUN_FILE):
+            what = f"was written by agalign {version} and cannot be read by agalign {__version__}"
+            raise SidecarError(f"{out / RUN_FILE}: {what}; run again into a new folder") from None
+        raise
+
+
+def _other_version(path: Path) -> str:
+    """Return the version that wrote a record, if it is another one or has another schema; empty if it is unknown."""
+    with suppress(OSError, ValueError):
+        facts = json.loads(read_regular(path))
+        if isinstance(facts, dict) and str(facts.get("schema", "")).startswith("agalign-run/"):
+            version = shortened(str(facts.get("agalign", "of unknown version")))
+            return "" if (facts["schema"], version) == (_SCHEMA, __version__) else version
+    return ""
+
+
+def last_record(out: Path) -> RunPart | None:
+    """Return the record of the last run into a folder; None without one, and for one that cannot be read, which the
+    commands that need it name.
+    """
+    with suppress(SidecarError):
+        return read_run_record(out)
+    return None
+
+
+def renamed_captures(out: Path) -> frozenset[str]:
+    """Return the labels of results below an output folder that do not count, because the exposure has a result under
+    its present name.
+    """
+    record = last_record(out)
+    renamed = [part for part in ([] if record is None else record.not_in_input) if part.same_as]
+    return frozenset(part.capture for part in renamed if (out / f"{part.same_as}.json").is_file())
+
+
+def counted_sidecars(sidecars: Iterable[Path], out: Path) -> list[Path]:
+    """Return the sidecars below an output folder without those of renamed captures."""
+    renamed = renamed_captures(out)
+    return [path for path in sidecars if label_of(path, out) not in renamed]
+
+
+@dataclass(frozen=True)
+class UnfinishedRun:
+    """What the last run into a folder did not do."""
+
+    state: RunState
+    found: int
+    """Number of captures that were to be aligned."""
+    missing: list[str]
+    """Labels of those without a result."""
+    erroneous: list[str]
+    """Labels of those with a result and an error: some or all of their files are of an earlier run."""
+
+    @property
+    def sentence(self) -> str:
+        """Describe what is missing, without a full stop; empty if there is none."""
+        states = {
+            "running": "the run did not end: it was killed, or is still running",
+            "interrupted": "the run was stopped before its end",
+            "finished": "",
+        }
+        parts = [text for text in (states[self.state], self._without_result, self._with_error) if text]
+        return "; ".join([*parts, "the same command resumes it"]) if parts else ""
+
+    @property
+    def _without_result(self) -> str:
+        if not self.missing:
+            return ""
+        verb = "has" if len(self.missing) == 1 else "have"
+        of_all = f"{len(self.missing)} of {counted(self.found, 'capture')}"
+        return f"{of_all} {verb} no result: {_named(self.missing)}"
+
+    @property
+    def _with_error(self) -> str:
+        if not self.erroneous:
+            return ""
+        of_all = f"{len(self.erroneous)} of {counted(self.found, 'capture')}"
+        return f"errors in {of_all}, whose files may be of an earlier run: {_named(self.erroneous)}"
+
+
+def _named(labels: Sequence[str]) -> str:
+    max_named = 10
+    more = len(labels) - max_named
+    return ", ".join(map(shortened, labels[:max_named])) + (f" and {more} more" if more > 0 else "")
+
+
+def unfinished_run(
+    record: RunPart | None, not_aligned: Iterable[PanelPart | SkyPart], labels: Collection[str]
+) -> UnfinishedRun | None:
+    """Return what the last run into a folder did not do, given its panels and captures of the sky, and the labels of
+    the captures that have a result; None without a record.
+    """
+    if record is None:
+        return None
+    excluded = {part.capture for part in record.excluded}
+    # A killed run has written these files, and not the end of its record.
+    excluded |= {Path(part.folder, part.capture).as_posix() for part in not_aligned if part.is_left_out}
+    wanted = [label for label in record.labels if label not in excluded]
+    with_problem = {part.of for part in record.problems}
+    missing = [label for label in wanted if label not in labels]
+    erroneous = [label for label in wanted if label in labels and escape_controls(label) in with_problem]
+    return UnfinishedRun(record.state, len(wanted), missing, erroneous)

@@ -1,0 +1,635 @@
+"""The sidecar of a capture, a JSON file next to its aligned stack: schema `agalign/3`.
+
+It is the whole result of the estimation, together with the raster of the parallax of a capture that has one: rasters
+are rendered from it and the files of the capture. Its parts are the records of the program themselves (`values`), or
+the models below.
+
+All pixel coordinates are x right, y down, (0, 0) the centre of the top-left pixel. `fixed_to_moving` maps a pixel of
+the reference to a pixel of the moving band; `grid` samples the complete mapping between the raw pixels of the files.
+"""
+
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
+from typing import Annotated, Any, Literal, Self
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, Field, ValidationInfo, field_validator, model_validator
+
+from agalign._version import __version__
+from agalign.config import Settings
+from agalign.flight.fingerprint import estimation_fingerprint
+from agalign.records.sidecar_samples import sampled_mapping, sampled_parallax
+from agalign.values.alignment import COVARIANCE_DECIMALS, Alignment, JointResult, Prediction, Seed, is_usable
+from agalign.values.capture import Band, CameraIdentity, Capture, Pose, Position, source_file
+from agalign.values.choices import CaptureStatus, Geometry, PairStatus, Space
+from agalign.values.equality import equal
+from agalign.values.fields import (
+    RECORD,
+    Array,
+    Count,
+    Matrix3x3,
+    Measured,
+    Message,
+    Name,
+    Number,
+    Number3,
+    Number4,
+    PointsPx,
+    Positive,
+    RelativeFile,
+    SourceFile,
+)
+from agalign.values.image import OutputGrid
+from agalign.values.issues import MISSING_BAND, Issue
+from agalign.values.lens import Lens
+from agalign.values.mapping import DisplacementField, PixelMapping
+from agalign.values.mapping_error import MappingError
+from agalign.values.parallax import Parallax, Relief
+from agalign.values.pixel_units import PixelScale, Size
+from agalign.values.residual import Residual, Similarity
+
+SCHEMA = "agalign/3"
+PointPx = tuple[Number, Number]
+SampledPx = Annotated[NDArray[np.float64], Array((None, 2), 3)]
+"""Their rounding is small compared with the error of interpolation between them."""
+Slopes = Annotated[NDArray[np.float64], Array((None, 2), 5)]
+Curvatures = Annotated[NDArray[np.float64], Array((None, 2), 7)]
+"""They are multiplied by the parallax and by its square: 0.0005 px of rounding each for 100 px."""
+
+
+class _Part(BaseModel):
+    model_config = ConfigDict(frozen=True, allow_inf_nan=False, **RECORD)
+    __eq__ = equal
+
+
+class ReferencePart(_Part):
+    """Reference band."""
+
+    band: Name
+    """Name."""
+    file: SourceFile
+    """Image file, relative to the input folder that the run record names; absolute if it is elsewhere."""
+    band_index: Count
+    """Band of the file, from 1."""
+    width: Count
+    """Size of the file, px."""
+    height: Count
+    """Size of the file, px."""
+    georeferenced: bool = False
+    """True if the file has map coordinates."""
+
+    @property
+    def size_px(self) -> tuple[int, int]:
+        """(width, height) of the file."""
+        return self.width, self.height
+
+
+class HomographyPart(_Part):
+    """Homography."""
+
+    fixed_to_moving: Matrix3x3
+    """Maps pixels of the reference to the band."""
+    space: Space
+    """`pixel` (raw), or `undistorted` (without lens distortion; same focal length and principal point)."""
+
+
+class GridPart(_Part):
+    """The complete mapping on a lattice: 17 x 13 points, or up to 129 x 97 if cubic interpolation of fewer has errors
+    above 0.02 px (p99). If there is a `relief`, use that instead.
+    """
+
+    reference_px: PointsPx
+    """Raw pixels of the reference, row by row."""
+    moving_px: SampledPx
+    """The corresponding raw pixels of the band."""
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        _check_lengths(self.reference_px, self.moving_px)
+        return self
+
+
+class MetricsPart(_Part):
+    """Similarity before and after alignment, and shifts of windows."""
+
+    before: Similarity
+    """Files as they are."""
+    after: Similarity
+    """Bands as written."""
+    windows: Residual | None = None
+    """Shifts of windows that the fit did not use, under the mapping."""
+
+
+class GeometryPart(_Part):
+    """Addition to homography and lens models."""
+
+    kind: Geometry
+    """`homography` (nothing), `field` (displacements), `relief` (parallax), or `relief and field`."""
+    held_out_p95_px: dict[Geometry, Annotated[float, Measured(4, math.inf)]]
+    """p95 of the shifts of held-out windows, px, by geometry."""
+
+    @property
+    def homography_p95_px(self) -> float | None:
+        """The p95 of a homography."""
+        return self.held_out_p95_px.get("homography")
+
+    @property
+    def p95_px(self) -> float | None:
+        """The p95 of the geometry that was chosen."""
+        return self.held_out_p95_px.get(self.kind)
+
+
+class ReliefPart(_Part):
+    """Mapping with parallax: pixel x of the reference with parallax z maps to plane_px(x) + z slope(x) + z^2
+    curvature(x), interpolated by cubic splines.
+    """
+
+    file: RelativeFile | None
+    """[Parallax](outputs.md#parallax) on the grid of the stack."""
+    baseline: PointPx
+    """Displacement per px of parallax, undistorted px of the reference; the longest baseline has length 1."""
+    occluded: Number4
+    """Share of occluded pixels."""
+    reference_px: PointsPx
+    """Nodes: those of `grid`."""
+    plane_px: SampledPx
+    """Their positions at parallax 0, raw px of the band."""
+    slope: Slopes
+    """Px of the band per px of parallax."""
+    curvature: Curvatures | None = None
+    """The same per px of parallax squared."""
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        lists = self.reference_px, self.plane_px, self.slope, self.curvature
+        _check_lengths(*(one for one in lists if one is not None))
+        return self
+
+
+def _check_lengths(*lists: NDArray[np.float64]) -> None:
+    if len({len(one) for one in lists}) != 1 or not len(lists[0]):
+        raise ValueError("its lists of points are empty or of different lengths")
+
+
+class ErrorPart(_Part):
+    """What the expected error of a mapping is made of, px of the reference. The shifts of `metrics.windows` and the
+    standard error of the parallax are parts of it too.
+    """
+
+    std_px: Number4
+    """Standard error: RMS of the expected error over the area that both images show."""
+    covariance_px2: Annotated[NDArray[np.float64], Array((None, None), COVARIANCE_DECIMALS)] | None = None
+    """Covariance of the corners (8 x 8), clockwise from the top left, x and y in turn, or with lens shapes (12 x 12);
+    null for a prediction by other bands or captures, whose windows are no part of the error."""
+    rig_std_px: Number4 = 0.0
+    """Standard error of a prediction by other bands or captures, the same everywhere."""
+    lens_std_px: Annotated[NDArray[np.float64], Array((4,), 6)] | None = None
+    """Standard deviations of the lens shapes that neither tags nor a rig determine."""
+    field_std_px: Number4 = 0.0
+    """Spread of the displacement field."""
+    relief_std_px: Number4 = 0.0
+    """Spread of the parallax that a mapping without it lacks, where no window is near."""
+
+    @field_validator("covariance_px2")
+    @classmethod
+    def _has_size(cls, covariance: NDArray[np.float64] | None) -> NDArray[np.float64] | None:
+        if covariance is not None and covariance.shape not in ((8, 8), (12, 12)):
+            raise ValueError("it is neither 8 x 8 nor 12 x 12")
+        return covariance
+
+    @classmethod
+    def of(cls, alignment: Alignment) -> Self | None:
+        """Return the entry of an alignment; None if its error is unknown."""
+        error = alignment.error
+        if error is None or not math.isfinite(alignment.std_px):
+            return None
+        return cls(
+            std_px=alignment.std_px,
+            covariance_px2=error.covariance_px2,
+            rig_std_px=error.rig_std_px,
+            lens_std_px=error.lens_std_px,
+            field_std_px=error.field_std_px,
+            relief_std_px=error.relief_std_px,
+        )
+
+    def mapping_error(self, size_px: Size, windows: Residual | None, parallax: Parallax | None) -> MappingError:
+        """Return the error of a mapping of a reference (width, height), with the windows and parallax of the band."""
+        return MappingError(
+            size_px,
+            self.covariance_px2,
+            None if self.covariance_px2 is None else windows,
+            self.rig_std_px,
+            self.lens_std_px,
+            self.field_std_px,
+            self.relief_std_px,
+            parallax,
+        )
+
+
+class PlacePart(_Part):
+    """Where the aligned pixels of the band are."""
+
+    file: RelativeFile
+    """Path."""
+    band_index: Count
+    """Band of the file, from 1."""
+
+
+class BandResult(_Part):
+    """Result of one band, with its complete mapping."""
+
+    band: Name
+    """Name."""
+    wavelength_nm: Number | None
+    """Centre wavelength, nm."""
+    file: SourceFile
+    """Image file, relative to the input folder that the run record names; absolute if it is elsewhere."""
+    band_index: int
+    """Band of the file, from 1."""
+    size_px: tuple[Count, Count] | None = None
+    """Width and height of the file."""
+    status: PairStatus
+    """`reference`, `aligned`, `predicted`, `seed_only` or `failed`."""
+    reason: Message | None
+    """Why the band is not aligned, in words."""
+    issues: tuple[Issue, ...] = ()
+    """All reasons; `reason` is the first."""
+    homography: HomographyPart | None = None
+    """Mapping without lenses and displacements."""
+    lenses: tuple[Lens, Lens] | None = None
+    """Lenses of reference and band (Brown-Conrady, OpenCV's convention), if the homography is between undistorted
+    pixels."""
+    field: DisplacementField | None = None
+    """Displacements of the reference's pixels."""
+    grid: GridPart | None = None
+    """The complete mapping, sampled."""
+    relief: ReliefPart | None = None
+    """Displacement by parallax."""
+    seed: Seed | None = None
+    """Initial alignment."""
+    joint: JointResult | None = None
+    """Estimate from descriptors and windows."""
+    metrics: MetricsPart | None = None
+    """Similarity and shifts before and after."""
+    geometry: GeometryPart | None = None
+    """Addition to homography and lens models."""
+    prediction: Prediction | None = None
+    """Mapping by the rig, or extrapolated from a part of the image."""
+    exposed_after_s: Number3 | None = None
+    """Delay of the exposure relative to the reference, s; null if the band is aligned."""
+    error: ErrorPart | None = None
+    """What the expected error of the mapping is made of; null if it is unknown."""
+    place: PlacePart | None = None
+    """Where the aligned pixels of the band are."""
+    saturated: Number4 | None = None
+    """Share of saturated pixels in the file."""
+    missing_rows: int = 0
+    """Rows at the end of the file without pixels, as an incomplete transfer leaves them; they are nodata."""
+    share_over_1_px: Number4 | None = None
+    """Share of the written pixels whose expected error exceeds 1 px of the reference or is unknown."""
+    seconds: Number3
+    """Share of the capture's processing time."""
+
+    @classmethod
+    def of_reference(cls, capture: Capture) -> Self:
+        """Return the entry of the reference band of a capture."""
+        return cls(**_source(capture, capture.reference), status="reference", reason=None, seconds=0.0)
+
+    @classmethod
+    def of(cls, band: Band, alignment: Alignment, capture: Capture) -> Self:
+        """Return the entry of a moving band of a capture."""
+        mapping, relief = alignment.mapping, None
+        grid_px = sampled_mapping(mapping.without_parallax, alignment.size_px)
+        if mapping.parallax is not None:
+            hidden, baseline = mapping.parallax.hidden, mapping.parallax.baseline
+            occluded = 0.0 if hidden is None else float(hidden.mean())
+            tables = dict(zip(("plane_px", "slope", "curvature"), sampled_parallax(mapping, grid_px), strict=True))
+            relief = ReliefPart(file=None, baseline=baseline, occluded=occluded, reference_px=grid_px, **tables)
+        fixed, moving = mapping.fixed_lens, mapping.moving_lens
+        return cls(
+            **_source(capture, band),
+            status=alignment.status,
+            reason=alignment.reason,
+            issues=alignment.issues,
+            homography=HomographyPart(fixed_to_moving=mapping.fixed_to_moving, space=alignment.space),
+            lenses=None if fixed is None or moving is None else (fixed, moving),
+            field=mapping.field,
+            grid=GridPart(reference_px=grid_px, moving_px=mapping(grid_px)),
+            relief=relief,
+            seed=alignment.seed,
+            joint=alignment.joint,
+            metrics=MetricsPart(before=alignment.before, after=_after(alignment), windows=alignment.residual),
+            geometry=GeometryPart(kind=alignment.geometry, held_out_p95_px=dict(alignment.candidates)),
+            prediction=alignment.prediction,
+            error=ErrorPart.of(alignment),
+            seconds=alignment.seconds,
+        )
+
+    def alignment(self, size_px: tuple[int, int], relief: Relief | None) -> Alignment:
+        """Return the alignment of a moving band with a mapping, given (width, height) of the reference and the relief
+        of the capture.
+        """
+        assert self.homography is not None
+        assert self.seed is not None
+        fixed, moving = self.lenses or (None, None)
+        parallax = None
+        if self.relief is not None and relief is not None:
+            parallax = Parallax(relief, self.relief.baseline).with_occlusions()
+        residual = None if self.metrics is None else self.metrics.windows
+        return Alignment(
+            PixelMapping(self.homography.fixed_to_moving, fixed, moving, field=self.field, parallax=parallax),
+            size_px,
+            self.issues,
+            self.seed,
+            joint=self.joint,
+            residual=residual,
+            seconds=self.seconds,
+            before=Similarity() if self.metrics is None else self.metrics.before,
+            after=Similarity() if self.metrics is None else self.metrics.after,
+            candidates={} if self.geometry is None else self.geometry.held_out_p95_px,
+            prediction=self.prediction,
+            is_seed_usable=self.status == "seed_only",
+            error=None if self.error is None else self.error.mapping_error(size_px, residual, parallax),
+            std_px=math.inf if self.error is None else self.error.std_px,
+            moving_size_px=self.size_px,
+        )
+
+    def is_usable(self, accept_predicted_px: float) -> bool:
+        """Return True for the reference, an aligned band, or a predicted band with an accepted standard error."""
+        return is_usable(self.status, self.prediction, accept_predicted_px)
+
+    def without_tables(self) -> Self:
+        """Return the entry without its long tables."""
+        metrics = None if self.metrics is None else self.metrics.model_copy(update={"windows": None})
+        return self.model_copy(update={"grid": None, "field": None, "relief": None, "metrics": metrics})
+
+
+def _source(capture: Capture, band: Band) -> dict[str, Any]:
+    """The file of a band."""
+    facts = {"band": band.name, "wavelength_nm": band.wavelength_nm, "size_px": band.size_px}
+    facts |= {"missing_rows": band.missing_rows}
+    return facts | {"file": source_file(capture, band), "band_index": band.band_index}
+
+
+def _after(alignment: Alignment) -> Similarity:
+    if (residual := alignment.residual) is None:
+        return alignment.after
+    return replace(
+        alignment.after,
+        residual_px=residual.median_px,
+        residual_p95_px=residual.p95_px,
+        residual_coverage=residual.coverage,
+    )
+
+
+class IlluminationPart(_Part):
+    """Illumination of a band."""
+
+    band: Name
+    """Its name."""
+    irradiance: Number | None = None
+    """By the light sensor, horizontal plane, W/m²/nm (DJI: relative)."""
+    reflectance_per_radiance: Positive
+    """Factor by which radiance was multiplied."""
+
+
+class OutputPart(_Part):
+    """Written rasters."""
+
+    file: RelativeFile | None
+    """The stack; null with `--layout bands`."""
+    bands: list[Name] = []
+    """Bands of the stack, in order; missing ones are nodata."""
+    radiometry: Name | None = None
+    """Conversion of raw numbers, such as `reflectance by panel and light sensor`."""
+    panel_age_s: Number | None = None
+    """Time to the nearest panel."""
+    illumination: list[IlluminationPart] = []
+    """Bands that were converted to reflectance."""
+    crop: tuple[int, int, Count, Count]
+    """x0, y0, width, height on the reference grid times `scale`."""
+    scale: tuple[Positive, Positive] = (1.0, 1.0)
+    """Output pixels per reference pixel along x and y."""
+    undistorted: bool = False
+    """True for a lens-corrected reference grid."""
+    vignetting_corrected: bool = False
+    """True if vignetting is corrected in the files of single bands."""
+    nodata: float | Name | None
+    """Nodata value (`"nan"` for NaN); null if it differs between single bands."""
+
+    @property
+    def grid(self) -> OutputGrid:
+        """The grid of the rasters."""
+        return OutputGrid(*self.crop, PixelScale(*self.scale), self.undistorted)
+
+
+class FilePart(_Part):
+    """A file that belongs to the capture."""
+
+    kind: Name
+    """`parallax` (of the estimation); `stack`, `band`, `pan_sharpened`, `relief`, `error_map`, `qa`, `tie_points`,
+    `index`, `picture` or `preview`."""
+    file: RelativeFile
+    """Path."""
+    bytes: int
+    """Size."""
+    sha256: str
+    """Checksum."""
+
+
+class ReliefPreviewPart(_Part):
+    """Picture of the parallax: first column, last row."""
+
+    parallax_px: tuple[Annotated[Number, Field()], Number]
+    """Parallax shown as black and as white (nearest), px."""
+    range_m: tuple[Number3, Number3] | None
+    """1st and 99th percentile of the range, m; null if unknown."""
+
+
+class PreviewPart(_Part):
+    """Pictures for the report, a column per band. Rows: input, output, a detail of each, expected errors, relief (if
+    any).
+    """
+
+    file: RelativeFile
+    """Path."""
+    tile_px: tuple[Count, Count]
+    """Width and height of picture and detail."""
+    detail_px: tuple[Count, Count]
+    """Width and height of picture and detail."""
+    detail: tuple[Number, Number, Number, Number]
+    """x0, y0, width, height of the detail, as shares of the image."""
+    error_full_px: Number | None = None
+    """Expected error shown as white, px."""
+    relief: ReliefPreviewPart | None = None
+    """Picture of the relief."""
+
+
+class Sidecar(_Part):
+    """Result of one capture."""
+
+    model_config = ConfigDict(
+        json_schema_extra={"$schema": "https://json-schema.org/draft/2020-12/schema", "$id": f"urn:{SCHEMA}"}
+    )
+
+    schema_: Annotated[Literal["agalign/3"], Field(alias="schema")] = "agalign/3"
+    """Version of the format."""
+    agalign: Name
+    """Version of the program."""
+    capture: RelativeFile
+    """Name of the capture."""
+    capture_id: Name
+    """From the tags."""
+    flight_id: Name
+    """From the tags."""
+    captured_at: Name
+    """Time in the tags, ISO 8601; empty if unknown or the clock was not set."""
+    position: Position | None = None
+    """GPS position of the reference band."""
+    pose: Pose | None = None
+    """Orientation and height of the camera."""
+    camera: CameraIdentity
+    """The camera."""
+    status: CaptureStatus
+    """`ok`: all bands exist, `aligned`, or `predicted` within `accept_predicted_px`. `failed`: all moving bands are.
+    Else `degraded`."""
+    missing_bands: list[Name]
+    """Bands that the capture lacks."""
+    unreadable_bands: dict[Name, Message] = {}
+    """Why missing bands are unreadable."""
+    reference: ReferencePart
+    """Reference band."""
+    bands: Annotated[list[BandResult], Field(min_length=1)]
+    """One entry per band, the reference included."""
+    parallax: FilePart | None = None
+    """Parallax raster on the pixels of the reference."""
+    accept_predicted_px: Number
+    """Largest standard error of a predicted band for indices, px."""
+    estimated_with: str
+    """Fingerprint of everything that the estimation depends on, apart from the contents of the files."""
+    model: str = ""
+    """Fingerprint of the model of the flight; empty without one."""
+    output: OutputPart | None = None
+    """Written rasters."""
+    footprint: list[tuple[Number, Number]] | None = None
+    """Longitude and latitude of the corners of the rasters, degrees, counter-clockwise; the first is repeated."""
+    footprint_accuracy_m: Number | None = None
+    """Standard error of the farthest corner, m."""
+    preview: PreviewPart | None = None
+    """Preview image."""
+    products: list[FilePart] = []
+    """Rendered files."""
+    not_written: list[Name] = []
+    """Kinds of products that could not be written."""
+    rendered_with: str = ""
+    """Fingerprint of everything that the products depend on; empty until all are written."""
+    options: dict[str, dict[str, Any]] | None = None
+    """Settings that differ from the defaults."""
+    input_samples: dict[str, str] = {}
+    """Hash of some bytes of each band's file."""
+    input_digests: dict[str, str] = {}
+    """SHA-256 of each band's file."""
+    input_states: dict[str, str] = {}
+    """Size of each band's file, and the times of its modification and of its last change, ns."""
+    seconds: Number3 = 0.0
+    """Processing time."""
+    checksum: str | None = None
+    """SHA-256 of the JSON with sorted keys and no spaces, without `checksum` and `seconds`."""
+
+    @classmethod
+    def estimated(
+        cls,
+        capture: Capture,
+        alignments: Mapping[str, Alignment],
+        settings: Settings,
+        exposed_after_s: Mapping[str, float] | None = None,
+    ) -> Self:
+        """Return the sidecar of a capture whose bands are aligned, and nothing is rendered, without facts about files.
+
+        `exposed_after_s` are the delays of bands that are not aligned, relative to the reference.
+        """
+        reference, accept_predicted_px = capture.reference, settings.check.accept_predicted_px
+        bands = [
+            BandResult.of_reference(capture) if b is reference else BandResult.of(b, alignments[b.name], capture)
+            for b in capture.bands
+        ]
+        delays_s = exposed_after_s or {}
+        bands = [b.model_copy(update={"exposed_after_s": delays_s.get(b.band)}) for b in bands]
+        status = capture_status(bands, capture.missing_bands, accept_predicted_px)
+        (width, height), place = reference.size_px, reference.georeference
+        is_mosaic = place is not None and place.accuracy_m is None  # else it was calculated from GPS
+        return cls(
+            agalign=__version__,
+            capture=capture.name,
+            capture_id=capture.capture_id,
+            flight_id=capture.flight_id,
+            captured_at=capture.known_time,
+            position=capture.position,
+            pose=capture.pose,
+            camera=capture.camera,
+            status=status,
+            missing_bands=list(capture.missing_bands),
+            unreadable_bands=dict(capture.unreadable_bands),
+            reference=ReferencePart(
+                band=reference.name,
+                file=source_file(capture, reference),
+                band_index=reference.band_index,
+                width=width,
+                height=height,
+                georeferenced=is_mosaic,
+            ),
+            bands=bands,
+            accept_predicted_px=accept_predicted_px,
+            estimated_with=estimation_fingerprint(capture, settings),
+            options=settings.model_dump(mode="json", exclude_defaults=True),
+        )
+
+    @field_validator("bands")
+    @classmethod
+    def _has_reference(cls, bands: list[BandResult], given: ValidationInfo) -> list[BandResult]:
+        reference = given.data.get("reference")
+        if reference is not None and reference.band not in [b.band for b in bands]:
+            raise ValueError(f"none of them is the reference band {reference.band!r}")
+        return bands
+
+    @property
+    def pairs(self) -> list[tuple[str, str, str | None]]:
+        """(band, status, reason) of every band that is to be aligned; missing bands have the status `missing`."""
+        moving = [(b.band, str(b.status), b.reason) for b in self.bands if b.status != "reference"]
+        unreadable = self.unreadable_bands
+        return [*moving, *((name, "missing", unreadable.get(name, MISSING_BAND.cause)) for name in self.missing_bands)]
+
+    @property
+    def files(self) -> list[FilePart]:
+        """All files of the capture."""
+        return [*self.products, *([] if self.parallax is None else [self.parallax])]
+
+    def alignments(self, relief: Relief | None) -> dict[str, Alignment]:
+        """Return the alignments of the moving bands by name, given the relief of the capture."""
+        moving = [b for b in self.bands if b.homography is not None and b.seed is not None]
+        return {b.band: b.alignment(self.reference.size_px, relief) for b in moving}
+
+    @classmethod
+    def json_schema(cls) -> dict[str, Any]:
+        """Return the JSON Schema of the file, without the examples of docstrings, which are Python."""
+        schema = cls.model_json_schema(mode="serialization")
+        for part in schema["$defs"].values():
+            part["description"] = part["description"].partition("\n\nExamples\n")[0]
+        return schema
+
+    def without_tables(self) -> Self:
+        """Return the sidecar without the long tables of its bands: those of a season would not fit into memory."""
+        return self.model_copy(update={"bands": [b.without_tables() for b in self.bands]})
+
+
+def capture_status(
+    bands: Iterable[BandResult], missing_bands: Sequence[str], accept_predicted_px: float
+) -> CaptureStatus:
+    """Return `ok` if all moving bands are usable and nothing is missing, `failed` if all failed, else `degraded`."""
+    bands = list(bands)
+    moving = [b for b in bands if b.status != "reference"]
+    if all(b.is_usable(accept_predicted_px) for b in moving):
+        return "degraded" if missing_bands or any(b.missing_rows for b in bands) else "ok"
+    return "failed" if all(b.status == "failed" for b in moving) else "degraded"

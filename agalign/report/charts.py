@@ -1,0 +1,132 @@
+"""Drawings of the rig of a flight, and charts of the offsets of its bands over the captures, in SVG units."""
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from agalign.errors import GeometryError, InputError
+from agalign.flight.rig import Rig
+from agalign.flight.rig_file import read_rig
+from agalign.flight.rig_prediction import band_summaries
+from agalign.report.facts import CameraOffsets
+from agalign.values import geometry
+
+PLAN_WIDTH, FIELD_WIDTH, CHART_WIDTH, CHART_HEIGHT = 200.0, 160.0, 640.0, 130.0
+Values = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Line:
+    """One band over a flight, as drawn in a chart."""
+
+    name: str
+    hue: float
+    points: tuple[str, ...]
+    """The `points` of an SVG polyline for each sequence of captures in which the band is known."""
+
+
+@dataclass(frozen=True)
+class DriftChart:
+    """Offsets of the bands of a camera over its captures, in the order of time."""
+
+    title: str
+    full_px: float
+    """Offset at the upper end of the axis."""
+    lines: tuple[Line, ...]
+    ends: tuple[str, str]
+    """Labels of the first and the last capture."""
+
+
+def rig_views(out: Path, on_problem: Callable[[str], None]) -> list[dict[str, Any]]:
+    """Return the rigs of the models below OUT/models; unreadable models are reported to `on_problem`.
+
+    Each has `camera`, number of `captures`, `shared` factors in words, `field_height`, and `bands`: rows of
+    `band_summaries` with `hue`, the position `x`, `y` of the lens in the plan of the rig, and `arrows` (x1, y1, x2, y2)
+    of its displacement field.
+    """
+    views = []
+    for path in sorted((out / "models").glob("*.safetensors")):
+        try:
+            _, rig = read_rig(path)
+            rows = [] if rig is None else band_summaries(rig)
+        except (InputError, GeometryError) as error:
+            on_problem(f"{error}" if isinstance(error, InputError) else f"{path}: its rig cannot be used ({error})")
+            continue
+        if rig is not None:
+            longest = max((math.hypot(*r["baseline"]) for r in rows), default=0.0) or 1.0
+            to_plan = 0.36 * PLAN_WIDTH / longest  # leaves space for names
+            for number, row in enumerate(rows):
+                x, y = (PLAN_WIDTH / 2 + to_plan * v for v in row["baseline"])
+                row |= {"hue": _hue(number, len(rows)), "x": x, "y": y, "arrows": _arrows(rig, row["band"])}
+            size = {"field_height": FIELD_WIDTH * rig.size_px[1] / rig.size_px[0], "captures": len(rig.captures)}
+            views.append({"camera": path.stem, "shared": ", ".join(rig.factors) or "nothing", "bands": rows, **size})
+    return views
+
+
+def _arrows(rig: Rig, band: str) -> tuple[tuple[float, float, float, float], ...]:
+    if band not in rig.fields:
+        return ()
+    columns, rows = 13, 10
+    points = geometry.lattice(*rig.size_px, columns, rows)
+    starts, field = points * (FIELD_WIDTH / rig.size_px[0]), rig.fields[band](points)
+    max_length = 11.0  # nearly the distance of the arrows
+    arrows = field * max_length / max(float(np.linalg.norm(field, axis=1).max()), 1e-6)
+    return tuple((x, y, x + dx, y + dy) for (x, y), (dx, dy) in zip(starts.tolist(), arrows.tolist(), strict=True))
+
+
+def _hue(number: int, count: int) -> float:
+    """One of `count` equally spaced hues, degrees."""
+    return round(205 + 360 * number / max(count, 1)) % 360
+
+
+def drifts_of(cameras: Mapping[str, CameraOffsets]) -> list[DriftChart]:
+    """Return a chart of the offsets, px, for each camera with three captures or more, given by name."""
+    result = []
+    for camera, known in cameras.items():
+        order = sorted(range(len(known.labels)), key=known.labels.__getitem__)
+        offsets = [known.offsets_px[i] for i in order]
+        names = list(dict.fromkeys(name for of_capture in offsets for name in of_capture))
+        if len(order) < 3 or not names:
+            continue
+        missing = (np.nan, np.nan)
+        differences = [
+            _principal_component(np.array([of_capture.get(name, missing) for of_capture in offsets], np.float64))
+            for name in names
+        ]
+        # The sign of a principal component is arbitrary: choose that of the first band.
+        aligned = np.array([d if np.nansum(differences[0] * d) >= 0 else -d for d in differences])
+        min_full_px = 0.2  # smaller drifts are noise
+        full_px = float(np.nanmax(np.abs(aligned), initial=min_full_px))
+        step = max(1, math.ceil(len(order) / 400))  # more points than that are not distinguishable
+        lines = (
+            Line(name, _hue(number, len(names)), _polylines(of_band, full_px, step))
+            for number, (name, of_band) in enumerate(zip(names, aligned, strict=True))
+        )
+        ends = known.labels[order[0]][1], known.labels[order[-1]][1]
+        result.append(DriftChart(f"{camera} from capture to capture", full_px, tuple(lines), ends))
+    return result
+
+
+def _principal_component(offsets_px: Values) -> Values:
+    """(n,) differences of offsets (n, 2) from their median along the direction of largest variance; nan for nan."""
+    differences = offsets_px - np.nanmedian(offsets_px, axis=0)
+    _, _, directions = np.linalg.svd(differences[np.isfinite(differences).all(axis=1)], full_matrices=False)
+    return np.asarray(differences @ directions[0])
+
+
+def _polylines(values: Values, full: float, step: int) -> tuple[str, ...]:
+    """SVG points of each sequence of known values; `step` neighbouring values are averaged."""
+    groups = [values[i : i + step] for i in range(0, len(values), step)]
+    lines: list[list[str]] = [[]]
+    for i, group in enumerate(groups):
+        if np.isnan(group).all():
+            lines.append([])
+            continue
+        x, y = CHART_WIDTH * (i + 0.5) / len(groups), 1 - 0.92 * float(np.nanmean(group)) / full
+        lines[-1].append(f"{x:.1f},{CHART_HEIGHT / 2 * y:.1f}")
+    return tuple(" ".join(line if line[1:] else line * 2) for line in lines if line)  # a single point is a dot

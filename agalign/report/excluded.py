@@ -1,0 +1,91 @@
+"""Writes the captures of calibration panels and of the sky, with a picture of each panel."""
+
+from collections.abc import Sequence
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from agalign.errors import AgalignError
+from agalign.flight.panel_readings import BandReading, PanelReading
+from agalign.flight.sky import SkyCapture, sky_radiance
+from agalign.host.files import check_inside, write_model
+from agalign.pixels.raster import read_preview
+from agalign.rasters.drawing import Picture, side_by_side, titled, write_png
+from agalign.records.excluded import PANELS_FILE, SKY_FILE, PanelPart, PanelsFile, SkyFile, SkyPart
+from agalign.values.capture import Band, Capture, source_file
+from agalign.values.pixel_units import PixelScale
+
+
+def write_panels(readings: Sequence[PanelReading], out: Path) -> list[PanelPart]:
+    """Write OUT/panels.json and <capture>.panel.png, and return the captures; without any, remove an earlier file.
+
+    Raises OutputError.
+    """
+    parts = []
+    for reading in readings:
+        picture = check_inside(out / reading.capture.folder, out) / f"{reading.capture.name}.panel.png"
+        write_png(side_by_side([_tile(b) for b in reading.bands], gap_px=6), picture)
+        panel, scales = reading.panel, reading.sensor_scales
+        bands = [_panel_band(b, reading.capture) | {"sensor_scale": scales.get(b.band.name)} for b in reading.bands]
+        facts = {"seen_by": panel.seen_by, "serial": panel.serial, "in_scene": panel.in_scene, "cues": panel.cues}
+        facts |= {"sensor_scale": float(np.median([*scales.values()])) if scales else None}
+        facts |= {"fits_sensor": reading.fits_sensor, "bands": bands}
+        facts |= _identity(reading.capture) | {"picture": picture.relative_to(out).as_posix()}
+        parts.append(PanelPart.model_validate(facts))
+    write_model(out / PANELS_FILE, PanelsFile(panels=parts) if parts else None)
+    return parts
+
+
+def write_sky(sky: Sequence[SkyCapture], out: Path) -> list[SkyPart]:
+    """Write OUT/sky.json and return its captures; without any, remove that of an earlier run. Raises OutputError."""
+    parts = []
+    for one in sky:
+        bands = [
+            {"band": b.name, "file": source_file(one.capture, b), "radiance": _radiance(b)} for b in one.capture.bands
+        ]
+        parts.append(SkyPart.model_validate(_identity(one.capture) | {"cues": one.cues, "bands": bands}))
+    write_model(out / SKY_FILE, SkyFile(captures=parts) if parts else None)
+    return parts
+
+
+def _identity(capture: Capture) -> dict[str, Any]:
+    return {"folder": capture.folder.as_posix(), "capture": capture.name, "captured_at": capture.known_time}
+
+
+def _panel_band(reading: BandReading, capture: Capture) -> dict[str, Any]:
+    band, factor = reading.band, reading.factor
+    return {
+        "band": band.name,
+        "file": source_file(capture, band),
+        "area_px": [] if band.panel is None else [(round(x, 2), round(y, 2)) for x, y in band.panel.corners_px],
+        "albedo": reading.albedo,
+        "radiance": reading.radiance,
+        "reflectance_per_radiance": factor,
+        "problem": reading.problem or (None if factor is not None else "its reflectance or the band's is not known"),
+    }
+
+
+def _radiance(band: Band) -> float | None:
+    with suppress(AgalignError):
+        return sky_radiance(band)
+    return None
+
+
+def _tile(reading: BandReading) -> Picture:
+    """A band with its name, the albedo and the measured area."""
+    band = reading.band
+    scale = 320 / band.width_px
+    size = 320, max(1, round(band.height_px * scale))
+    pixels = read_preview(band.path, band.index_in_page, (0, 0, *band.size_px), size, band.page)
+    # A few hot pixels must not determine the contrast.
+    low, high = np.nanpercentile(pixels, (1.0, 99.5)) if np.isfinite(pixels).any() else (0.0, 1.0)
+    grey = np.clip(np.nan_to_num((pixels - low) / max(high - low, 1e-9)), 0, 1) * 255
+    image = np.repeat(grey.astype(np.uint8)[..., None], 3, axis=2)
+    if band.panel is not None and band.panel.corners_px:
+        corners = PixelScale(scale, scale).positions(band.panel.corners_px).round().astype(np.int32)
+        cv2.polylines(image, [corners], isClosed=True, color=(255, 64, 32), thickness=2, lineType=cv2.LINE_AA)
+    title = f"{band.name}: " + ("?" if reading.albedo is None else f"{reading.albedo:.3f}")
+    return titled(image, title, height_px=24)

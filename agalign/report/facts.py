@@ -1,0 +1,476 @@
+"""The data that the report shows about each capture, and the bands that are not aligned, by cause, with its remedy."""
+
+import json
+import math
+from collections import Counter, defaultdict
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from statistics import median
+from typing import Any, NamedTuple
+from urllib.parse import quote
+
+import numpy as np
+from numpy.typing import NDArray
+
+from agalign.host.files import CsvTable
+from agalign.host.text import escape_controls
+from agalign.indices.rasters import IndexReport
+from agalign.records.cautions import NO_RESULT, Caution, RunFacts
+from agalign.records.sidecar import BandResult, GeometryPart, GridPart, OutputPart, Sidecar
+from agalign.report.data_files import DataParts
+from agalign.values.alignment import Prediction
+from agalign.values.issues import OTHER_REFERENCE, Remedy
+
+_SHIFT_STEP_PX = 0.01
+"""Shifts of windows are written as integer multiples of this."""
+_SIMILARITY = ("mattes_mi", "nmi", "ncc", "gradient_correlation", "structure_ssim")
+BAND_COLUMNS = {
+    "band": "band",
+    "wavelength_nm": "wavelength_nm",
+    "status": "status",
+    "reason": "reason",
+    "seed": "seed.kind",
+    "retrieval": "joint.retrieval",
+    "corner_std_px": "joint.corner_std_px",
+    "residual_px": "metrics.after.residual_px",
+    "residual_p95_px": "metrics.after.residual_p95_px",
+    "residual_coverage": "metrics.after.residual_coverage",
+    "geometry": "geometry.kind",
+    "homography_p95_px": "geometry.homography_p95_px",
+    "geometry_p95_px": "geometry.p95_px",
+    "prediction_from": "prediction.source",
+    "prediction_std_px": "prediction.std_px",
+    "prediction_off_px": "prediction.off_px",
+    **{f"{name}_{when}": f"metrics.{when}.{name}" for name in _SIMILARITY for when in ("before", "after")},
+    "seconds": "seconds",
+}
+"""Field of a band in the sidecar by column of OUT/summary.csv."""
+SUMMARY_FILE = "summary.csv"
+SUMMARY_COLUMNS = ("folder", "capture", *BAND_COLUMNS, "reference", "check")
+
+
+class BandToCheck(NamedTuple):
+    """A band of a capture, and why to check it."""
+
+    capture: str
+    band: str
+    """Empty for the whole capture."""
+    status: str
+    reason: str
+
+
+@dataclass
+class CautionGroup:
+    """The bands of a run with the same status and the same cause for a check."""
+
+    status: str
+    remedy: Remedy
+    effect: float = 0.0
+    """Share of the values of all bands of the run that are missing, displaced or wrong, by `Caution.lost`."""
+    bands: list[BandToCheck] = field(default_factory=list)
+    is_unusable: bool = False
+    """The values of a band are too uncertain for any use."""
+    _largest: float = -math.inf
+    _size_text: str = ""
+
+    def add(self, label: str, caution: Caution) -> None:
+        """Add a band of a capture."""
+        self.bands.append(BandToCheck(label, caution.band, self.status, caution.reason))
+        self.effect += caution.lost
+        self.is_unusable |= caution.is_unusable
+        if caution.size > self._largest:
+            self._largest, self._size_text = caution.size, caution.size_text
+
+    @property
+    def size(self) -> str:
+        """How large it is, in words; empty if it has no size."""
+        return self._size_text.format(self._largest)
+
+    @property
+    def advice(self) -> str:
+        """The remedy; for predicted bands, also when they may be used as they are."""
+        if self.status != "predicted":
+            return self.remedy.advice
+        usable = "indices use those with a standard error (prediction.std_px) within --accept-predicted"
+        return f"{usable}; {self.remedy.advice}"
+
+    @property
+    def captures(self) -> int:
+        """Number of captures with such a band."""
+        return len({b.capture for b in self.bands})
+
+
+@dataclass
+class BandTotals:
+    """One band over all captures."""
+
+    statuses: Counter[str] = field(default_factory=Counter)
+    """Number of captures by the status of the band."""
+    residuals_px: list[float] = field(default_factory=list)
+    """Of the captures in which it is aligned."""
+    offsets_px: list[float] = field(default_factory=list)
+    """Lengths of its offset between the raw files; for the report only."""
+    seconds: list[float] = field(default_factory=list)
+    """Processing times."""
+
+
+@dataclass
+class PairTotals:
+    """The band pairs of a run, and what to check in them. Captures are added one by one, and not kept, which limits
+    memory.
+    """
+
+    run: RunFacts = field(default_factory=RunFacts)
+    bands: dict[str, BandTotals] = field(default_factory=lambda: defaultdict(BandTotals))
+    _by_cause: dict[tuple[str, Remedy], CautionGroup] = field(default_factory=dict)
+    _references: list[tuple[str, tuple[str, ...], str, set[str]]] = field(default_factory=list)
+    """(capture, flight, reference band, its other bands with the missing ones)."""
+    _votes: dict[tuple[str, ...], Counter[str]] = field(default_factory=lambda: defaultdict(Counter))
+    """By flight, the number of captures that have a band as the reference, or lack it."""
+
+    def add(self, label: str, result: Sidecar) -> list[Caution]:
+        """Add the bands of a capture, and return the cautions about them."""
+        parts = {b.band: b for b in result.bands}
+        for name, status, _ in result.pairs:
+            band, part = self.bands[name], parts.get(name)
+            band.statuses[status] += 1
+            band.seconds += [] if part is None else [part.seconds]
+            if status == "aligned" and part and part.metrics and math.isfinite(part.metrics.after.residual_px):
+                band.residuals_px.append(part.metrics.after.residual_px)
+        cautions = list(self.run.cautions(result, label))
+        for caution in cautions:
+            self._add_caution(label, caution)
+        camera, reference = result.camera, result.reference.band
+        flight = (camera.name, camera.serial, result.flight_id, "" if camera.model else Path(label).parent.as_posix())
+        self._references.append((label, flight, reference, {name for name, _, _ in result.pairs}))
+        self._votes[flight].update((reference, *result.missing_bands))
+        return cautions
+
+    def _add_caution(self, label: str, caution: Caution) -> None:
+        cause = caution.status, caution.remedy
+        self._by_cause.setdefault(cause, CautionGroup(*cause)).add(label, caution)
+
+    @property
+    def statuses(self) -> Counter[str]:
+        """Number of pairs by status, with those of missing bands."""
+        return sum((band.statuses for band in self.bands.values()), Counter())
+
+    @property
+    def captures(self) -> set[str]:
+        """Labels of the captures."""
+        return {label for label, *_ in self._references}
+
+    def residuals_px(self) -> list[float]:
+        """Return the residuals of all aligned pairs, sorted."""
+        return sorted(px for band in self.bands.values() for px in band.residuals_px)
+
+    def groups(self, without_result: Sequence[str] = ()) -> list[CautionGroup]:
+        """Return what to check, by cause, the largest effect first: the cautions about bands, the captures with another
+        reference than most of their flight, and those without a result, given by label.
+        """
+        groups = [replace(group) for group in self._by_cause.values()]
+        pairs = self.statuses.total()
+        pairs_per_capture = pairs / max(1, len(self._references))
+        other = CautionGroup("other_reference", OTHER_REFERENCE)
+        for label, flight, band, others in self._references:
+            usual = self._votes[flight].most_common(1)[0][0]
+            if usual in others:
+                reason = f"on the grid of {band}; most captures of the flight are on that of {usual}"
+                # All its values are displaced from those of the other captures.
+                other.add(label, Caution(band, other.status, OTHER_REFERENCE, reason, pairs_per_capture))
+        lost = CautionGroup("no_result", NO_RESULT)
+        for label in without_result:
+            lost.add(label, Caution("", lost.status, NO_RESULT, NO_RESULT.cause, max(1.0, pairs_per_capture)))
+        groups += [group for group in (other, lost) if group.bands]
+        for group in groups:
+            group.effect /= max(1.0, pairs + max(1.0, pairs_per_capture) * len(without_result))
+        severity = "no_result", "failed", "seed_only", "missing", "other_reference", "predicted", "check"
+        return sorted(groups, key=lambda g: (-g.effect, severity.index(g.status), -len(g.bands), g.remedy.cause))
+
+
+_DETAILS_PER_PART = 50
+"""Captures whose details are loaded together: 300 kB."""
+_ROWS_PER_PART = 1000
+"""Captures whose rows of the table are loaded together: 400 kB."""
+
+
+@dataclass
+class CameraOffsets:
+    """Offsets of the bands of a camera, for the chart over its captures."""
+
+    labels: list[tuple[str, str]] = field(default_factory=list)
+    """(time, label) of each capture."""
+    offsets_px: list[dict[str, tuple[float, float]]] = field(default_factory=list)
+    """(x, y) by aligned or predicted band, of each capture."""
+
+
+class FlightFacts:
+    """The data of the captures below an output folder, which are added one by one. What the page shows of a single
+    capture is written to files meanwhile: that of a season does not fit into memory.
+    """
+
+    def __init__(self, out: Path) -> None:
+        self.out = out
+        self.pairs = PairTotals(RunFacts.of(out))
+        self.statuses: Counter[str] = Counter()
+        """Number of captures by status."""
+        self.cameras: dict[str, CameraOffsets] = {}
+        """By name."""
+        self.seconds: dict[str, float] = {}
+        """Processing time of each capture, by label."""
+        self.placed = 0
+        """Number of captures with a position."""
+        self.without_result: Sequence[str] = ()
+        """Labels of the captures of the run that have no sidecar."""
+        self._summary = CsvTable(SUMMARY_COLUMNS)
+        self._rows = DataParts(out, "rows", _ROWS_PER_PART)
+        self._details = DataParts(out, "details", _DETAILS_PER_PART)
+        self._masked: dict[str, list[float]] = defaultdict(list)
+        self._lattices: dict[bytes, int] = {}
+        """Centres of windows, which many pairs share, and their index, of the current part of the details."""
+        self._first_lattice = 0
+
+    def add(self, folder: str, sidecar: Sidecar, indices: Sequence[IndexReport] = ()) -> None:
+        """Add a capture, given its folder relative to the output folder, and its indices. Raises OutputError."""
+        label = Path(folder, sidecar.capture).as_posix()
+        checks: dict[str, list[str]] = defaultdict(list)
+        # The page has links by the label that it shows.
+        for caution in self.pairs.add(escape_controls(label), sidecar):
+            checks[caution.band].append(caution.reason)
+        output, position, path = sidecar.output, sidecar.position, Path(folder)
+        grid = output or OutputPart(file=None, crop=(0, 0, *sidecar.reference.size_px), nodata=None)
+        files = {part.kind: part.file for part in sidecar.products}
+        relief = next((b.relief.file for b in sidecar.bands if b.relief is not None), None)
+        keys = {"folder": folder, "capture": sidecar.capture, "reference": sidecar.reference.band}
+        preview: dict[str, Any] | None = None
+        if sidecar.preview is not None:
+            detail = [round(v, 5) for v in sidecar.preview.detail]
+            preview = sidecar.preview.model_dump() | {"file": _link(path, sidecar.preview.file), "detail": detail}
+        facts = {
+            "label": label,
+            "captured_at": sidecar.captured_at,
+            "camera": sidecar.camera.name or "unknown camera",
+            "status": sidecar.status,
+            "position": None if position is None else (position.latitude, position.longitude),
+            "altitude_m": None if position is None else position.altitude_m,
+            "missing": sidecar.missing_bands,
+            "reference": sidecar.reference.band,
+            "seconds": sidecar.seconds,
+            "accept_predicted_px": sidecar.accept_predicted_px,
+            "crop": grid.crop,
+            "scale": grid.scale,
+            "radiometry": grid.radiometry,
+            "stack": _link(path, files.get("stack")),
+            "relief": _link(path, relief),
+            "sidecar": _link(path, f"{sidecar.capture}.json"),
+            "picture": _link(path, files.get("picture")),
+            "preview": preview,
+            "bands": [self._pair(b, sidecar, keys, checks[b.band]) for b in sidecar.bands],
+            "indices": [self._index(row) for row in indices if row.path is not None],
+        }
+        for name, status, reason in sidecar.pairs:
+            if status == "missing":
+                self.add_row(keys | {"band": name, "status": status, "reason": reason, "check": reason})
+        self._count(facts)
+        if self._rows.add(_row_of(facts)):
+            self._rows.flush()
+        if self._details.add(facts):
+            self._flush_details()
+
+    def _count(self, facts: dict[str, Any]) -> None:
+        label, camera = facts["label"], self.cameras.setdefault(facts["camera"], CameraOffsets())
+        self.statuses[facts["status"]] += 1
+        self.seconds[label] = facts["seconds"]
+        self.placed += facts["position"] is not None
+        usable = [b for b in facts["bands"] if b["status"] in ("aligned", "predicted") and b["offset_px"]]
+        camera.labels.append((facts["captured_at"], label))
+        camera.offsets_px.append({b["band"]: b["offset_px"] for b in usable})
+
+    def _index(self, row: IndexReport) -> dict[str, Any]:
+        assert row.path is not None
+        known = row.statistics.as_json()
+        if row.statistics.masked_share > 0:
+            self._masked[row.index].append(rounded(row.statistics.masked_share))
+        file = row.path.relative_to(self.out)
+        return {name: rounded(known[name]) for name in ("median", "p5", "p95")} | {
+            "name": row.index,
+            "valid": known["valid_share"],
+            "unit": known["unit"],
+            "masked": known["masked_share"],
+            "span": (known["low"], known["high"]),
+            "raw": row.raw_numbers,
+            "file": quote(file.as_posix()),
+            "picture": quote(file.with_suffix(".png").as_posix()),
+        }
+
+    def _flush_details(self) -> None:
+        lattices = [np.frombuffer(centres).tolist() for centres in self._lattices]
+        self._details.flush({"first_lattice": self._first_lattice, "lattices": lattices})
+        self._first_lattice += len(lattices)
+        self._lattices = {}
+
+    def add_row(self, row: Mapping[str, Any]) -> None:
+        """Add a row to OUT/summary.csv, given by column."""
+        self._summary.add([row.get(name) for name in SUMMARY_COLUMNS])
+
+    def write_summary(self) -> None:
+        """Write OUT/summary.csv. Raises OutputError."""
+        self._summary.write(self.out / SUMMARY_FILE)
+
+    def add_without_result(self, labels: Sequence[str]) -> None:
+        """Add the captures of the run that have no sidecar."""
+        self.without_result = labels
+        facts = {"status": "no_result", "reason": NO_RESULT.cause, "check": NO_RESULT.cause}
+        for path in map(Path, labels):
+            self.add_row({"folder": path.parent.as_posix(), "capture": path.name, **facts})
+
+    def groups(self) -> list[CautionGroup]:
+        """Return what to check, by cause, the largest effect first."""
+        return self.pairs.groups(self.without_result)
+
+    def flush(self) -> None:
+        """Write the last parts. Raises OutputError."""
+        self._rows.flush()
+        self._flush_details()
+
+    @property
+    def files(self) -> list[str]:
+        """Names of the data files that the page needs, relative to the output folder."""
+        return [*self._rows.files, *self._details.files]
+
+    def masked_shares(self) -> dict[str, list[float]]:
+        """Return the sorted shares of pixels that only the quality flags mask, by index."""
+        return {name: sorted(of_index) for name, of_index in self._masked.items()}
+
+    def in_page(self) -> dict[str, Any]:
+        """Return the data in the page, after `flush`. The script of the page declares their types."""
+        return {
+            "captures": self.statuses.total(),
+            "shift_step_px": _SHIFT_STEP_PX,
+            "rows": self._rows.first,
+            "details": self._details.first,
+            "details_per_part": _DETAILS_PER_PART,
+            "row_files": self._rows.files,
+            "detail_files": self._details.files,
+        }
+
+    def json_lines(self) -> Iterator[str]:
+        """Yield the lines of a JSON object of the schema `agalign-report/1` with the details of all captures."""
+        yield f'{{"schema": "agalign-report/1", "shift_step_px": {_SHIFT_STEP_PX}, "captures": ['
+        for key, end in (("records", '], "lattices": ['), ("lattices", "]}")):
+            before = ""
+            for part in self._details.parts():
+                for record in part[key]:
+                    yield before + json.dumps(record, allow_nan=False)
+                    before = ","
+            yield end
+
+    def _pair(self, band: BandResult, sidecar: Sidecar, keys: dict[str, Any], checks: Sequence[str]) -> dict[str, Any]:
+        """The data of a band. Its row, with `keys`, and its offset are added: for the reference only a row, if there is
+        something to check.
+        """
+        row = {column: value_at(band, path) for column, path in BAND_COLUMNS.items()}
+        if band.status != "predicted":
+            row["prediction_from"] = None  # its mapping has only been compared with the prediction
+        if band.status != "reference" or checks:
+            self.add_row(keys | row | {"check": "; ".join(checks)})
+        metrics, windows = band.metrics, None if band.metrics is None else band.metrics.windows
+        similarity = {name: (row[f"{name}_before"], row[f"{name}_after"]) for name in _SIMILARITY}
+        centres_px = np.empty((0, 2)) if windows is None else windows.centres_px
+        shifts_px = np.empty((0, 2)) if windows is None else windows.shifts_px
+        lattice = np.round(centres_px, 2).tobytes()
+        offset_px, offset_length_px = _band_offset(band.grid, sidecar)
+        if offset_length_px is not None and band.status != "reference":
+            self.pairs.bands[band.band].offsets_px.append(offset_length_px)
+        is_measured = np.isfinite(shifts_px)
+        known_px = np.where(is_measured, shifts_px, 0.0)
+        steps = np.rint(known_px / _SHIFT_STEP_PX).astype(int).ravel().tolist()
+        shifts = zip(steps, is_measured.ravel().tolist(), strict=True)
+        # The first nine columns of the table have the same names here.
+        return {name: row[name] for name in tuple(BAND_COLUMNS)[:9]} | {
+            "seconds": round(band.seconds, 2),
+            "written": band.place is not None,
+            "offset_px": offset_px,
+            "offset_length_px": offset_length_px,
+            "coverage": row["residual_coverage"],
+            "similarity": None if metrics is None else similarity,
+            "prediction": _prediction(band.prediction),
+            "geometry": _geometry(band.geometry),
+            "occluded": value_at(band, "relief.occluded"),
+            "check": [text for text in checks if text != band.reason],
+            "lattice": self._first_lattice + self._lattices.setdefault(lattice, len(self._lattices)),
+            "shifts": [step if known else None for step, known in shifts],
+        }
+
+
+def _row_of(facts: dict[str, Any]) -> dict[str, Any]:
+    """The row of a capture in the table of the page, and its dot on the map."""
+    moving = [b for b in facts["bands"] if b["status"] != "reference"]
+    aligned = [b for b in moving if b["status"] == "aligned"]
+    largest = {
+        name: max((b[name] for b in aligned if b[name] is not None), default=None)
+        for name in ("residual_px", "corner_std_px")
+    }
+    same = "label", "captured_at", "camera", "status", "position", "altitude_m", "missing", "seconds", "stack"
+    return {name: facts[name] for name in same} | {
+        "bands": [(b["band"], b["status"]) for b in moving],
+        **largest,
+        "indices": {i["name"]: i["median"] for i in facts["indices"]},
+        "raw": any(i["raw"] for i in facts["indices"]),
+        "check": bool(facts["missing"]) or any(b["check"] or b["reason"] for b in facts["bands"]),
+    }
+
+
+def value_at(part: object, path: str) -> Any:
+    """Return a field of nested records, with four decimals; None if a record on the path is None."""
+    for name in path.split("."):
+        part = None if part is None else getattr(part, name)
+    return rounded(part)
+
+
+def rounded(value: Any) -> Any:
+    """Return a measured value with the four decimals that tables and the report have, None if it is not finite; others
+    unchanged.
+    """
+    if not isinstance(value, float):
+        return value
+    return round(value, 4) if math.isfinite(value) else None
+
+
+def _link(folder: Path, name: str | None) -> str | None:
+    return None if name is None else quote((folder / name).as_posix())
+
+
+def _prediction(prediction: Prediction | None) -> dict[str, Any] | None:
+    if prediction is None:
+        return None
+    std_px, off_px = rounded(prediction.std_px), rounded(prediction.off_px)
+    return {"from": prediction.source, "std_px": std_px, "off_px": off_px}
+
+
+def _geometry(geometry: GeometryPart | None) -> dict[str, Any] | None:
+    if geometry is None:
+        return None
+    held_out_px = {kind: rounded(px) for kind, px in geometry.held_out_p95_px.items()}
+    return {"kind": geometry.kind, "held_out_p95_px": held_out_px}
+
+
+def _band_offset(grid: GridPart | None, sidecar: Sidecar) -> tuple[tuple[float, float] | None, float | None]:
+    """(offset (x, y) of a band's raw file in the centre of the reference, median length of the offset), px.
+
+    None if the scales of the two files differ by 10 % or more.
+    """
+    if grid is None or not len(grid.reference_px):
+        return None, None
+    reference_px, moving_px = grid.reference_px, grid.moving_px
+    offsets, span_px = moving_px - reference_px, reference_px.max(axis=0) - reference_px.min(axis=0)
+    if not (np.abs(moving_px.max(axis=0) - moving_px.min(axis=0) - span_px) < 0.1 * span_px).all():
+        return None, None
+    centre = (np.array(sidecar.reference.size_px) - 1) / 2
+    dx, dy = offsets[_lengths(reference_px - centre).argmin()].tolist()
+    return (round(dx, 3), round(dy, 3)), round(median(_lengths(offsets).tolist()), 3)
+
+
+def _lengths(vectors: NDArray[np.float64]) -> NDArray[np.float64]:
+    return np.asarray(np.sqrt((vectors * vectors).sum(axis=1)))

@@ -1,0 +1,143 @@
+"""OUT/flight.geojson: the footprints of the captures of a run, with their results and links to their files.
+
+It is a view of the sidecars, and of the captures in the record of the run that are not aligned.
+"""
+
+import json
+import math
+from collections import defaultdict
+from collections.abc import Iterable
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from agalign.host.files import write_text
+from agalign.indices.rasters import IndexReport
+from agalign.records.run_record import ExclusionPart
+from agalign.records.sidecar import Sidecar
+from agalign.values.capture import CameraIdentity, Pose, Position
+
+FLIGHT_MAP_FILE = "flight.geojson"
+
+
+class FlightMap:
+    """The GeoJSON features of the captures of a folder, added one by one."""
+
+    def __init__(self) -> None:
+        self._features: dict[str, dict[str, Any]] = {}
+
+    def add(self, folder: str, sidecar: Sidecar) -> None:
+        """Add a capture, given its folder relative to the output folder.
+
+        The geometry is the footprint of the aligned rasters, or of the reference if there are none. Without a footprint
+        it is the position of the camera, and null if that is unknown.
+        """
+        path = Path(folder)
+        label = (path / sidecar.capture).as_posix()
+        bands = [b for b in sidecar.bands if b.status != "reference"]
+        after = [b.metrics.after for b in bands if b.metrics is not None]
+        files = [(part.kind, (path / part.file).as_posix()) for part in sidecar.products]
+        facts = _place(sidecar.camera, sidecar.captured_at, sidecar.position, sidecar.pose)
+        self._features[label] = _feature(
+            label,
+            _shape(sidecar.footprint, sidecar.position),
+            {
+                "status": sidecar.status,
+                **facts,
+                "accuracy_m": sidecar.footprint_accuracy_m,
+                "bands": len(bands),
+                "bands_aligned": sum(b.status == "aligned" for b in bands),
+                "bands_predicted": sum(b.status == "predicted" for b in bands),
+                # The largest of a band, px of the reference.
+                "residual_px": _largest([a.residual_px for a in after]),
+                "residual_p95_px": _largest([a.residual_p95_px for a in after]),
+                # Files are relative to the output folder.
+                "sidecar": f"{label}.json",
+                "stack": dict(files).get("stack"),
+                "picture": dict(files).get("picture"),
+                "indices": [],
+            },
+        )
+
+    def add_excluded(self, part: ExclusionPart) -> None:
+        """Add a capture that is not aligned, as it shows a panel or the sky."""
+        facts = _place(part.camera, part.captured_at, part.position, part.pose)
+        shape = _shape(part.footprint, part.position)
+        accuracy_m = part.footprint_accuracy_m
+        self._features[part.capture] = _feature(
+            part.capture, shape, {"status": part.kind, **facts, "accuracy_m": accuracy_m, "indices": []}
+        )
+
+    def add_indices(self, rows: Iterable[IndexReport], out: Path) -> None:
+        """Link the rasters of an index table, of files below `out`, of captures that were added before."""
+        rasters: dict[str, list[str]] = defaultdict(list)
+        for row in rows:
+            if row.path is not None and row.capture in self._features:
+                rasters[row.capture].append(row.path.relative_to(out).as_posix())
+        for label, files in rasters.items():
+            self._features[label]["properties"]["indices"] = files
+
+    def write(self, out: Path) -> Path | None:
+        """Write the file atomically and return it; None if no capture has a position. Raises OutputError."""
+        features = [self._features[label] for label in sorted(self._features)]
+        if not any(f["geometry"] for f in features):
+            return None
+        lines = ",\n".join(json.dumps(f, ensure_ascii=False) for f in features)
+        text = f'{{"type": "FeatureCollection", "name": "flight", "features": [\n{lines}\n]}}\n'
+        write_text(out / FLIGHT_MAP_FILE, text)
+        return out / FLIGHT_MAP_FILE
+
+
+def _largest(values: Iterable[float]) -> float | None:
+    return max((round(value, 4) for value in values if math.isfinite(value)), default=None)
+
+
+def _feature(label: str, shape: dict[str, Any] | None, properties: dict[str, Any]) -> dict[str, Any]:
+    return {"type": "Feature", "id": label, "geometry": shape, "properties": {"capture": label, **properties}}
+
+
+def _place(camera: CameraIdentity, captured_at: str, position: Position | None, pose: Pose | None) -> dict[str, Any]:
+    height_m = None if pose is None else pose.height_m
+    return {
+        "camera": camera.name,
+        "captured_at": captured_at,
+        **{name: getattr(position, name, None) for name in ("longitude", "latitude", "altitude_m")},
+        "height_m": None if height_m is None else round(height_m, 1),
+        "height_from": None if pose is None or height_m is None else pose.height_from,
+        "heading_deg": None if pose is None else round(pose.heading_deg, 1) % 360,
+    }
+
+
+def _shape(footprint: list[tuple[float, float]] | None, position: Position | None) -> dict[str, Any] | None:
+    return geojson_geometry(None if footprint is None else np.array(footprint), position)
+
+
+def geojson_geometry(ring: NDArray[np.float64] | None, position: Position | None) -> dict[str, Any] | None:
+    """Return the GeoJSON geometry of a footprint (n, 2), else of the camera's position, or None.
+
+    A footprint across the 180th meridian is cut there (RFC 7946, 3.1.9).
+    """
+    decimals = 7  # of a degree: 1 cm
+    if ring is not None and np.ptp(ring[:, 0]) > 180:
+        beyond = np.column_stack([ring[:, 0] % 360 - 180, ring[:, 1]])  # degrees east of the meridian
+        parts = [_clipped(beyond, side) - np.array([side * 180.0, 0.0]) for side in (-1, 1)]
+        return {"type": "MultiPolygon", "coordinates": [[part.round(decimals).tolist()] for part in parts]}
+    if ring is not None:
+        return {"type": "Polygon", "coordinates": [ring.round(decimals).tolist()]}
+    if position is not None:
+        return {"type": "Point", "coordinates": [position.longitude, position.latitude]}
+    return None
+
+
+def _clipped(ring: NDArray[np.float64], side: int) -> NDArray[np.float64]:
+    """Return the part of a closed ring (n, 2) with negative (`side` -1) or positive x."""
+    kept = []
+    for a, b in pairwise(ring):
+        if side * a[0] >= 0:
+            kept.append(a)
+        if a[0] * b[0] < 0:
+            kept.append(a + (b - a) * a[0] / (a[0] - b[0]))
+    return np.array([*kept, kept[0]])

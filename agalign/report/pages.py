@@ -1,0 +1,164 @@
+"""The views of the sidecars of a folder: index.html, summary.csv, indices.csv and flight.geojson."""
+
+import base64
+import hashlib
+import json
+import os
+from collections import defaultdict
+from collections.abc import Callable
+from contextlib import suppress
+from importlib import resources
+from pathlib import Path
+from statistics import median
+from typing import Any
+
+from jinja2 import Environment, FileSystemBytecodeCache, PackageLoader, StrictUndefined, Template, select_autoescape
+from markupsafe import Markup
+
+from agalign._version import __version__
+from agalign.config import Settings
+from agalign.errors import SidecarError
+from agalign.host.files import write_text
+from agalign.indices.rasters import IndexReport, current_rows, merged, reports_of, update_table
+from agalign.records.excluded import PANELS_FILE, SKY_FILE, PanelPart, SkyPart, read_excluded
+from agalign.records.run_record import RunPart, counted_sidecars, read_run_record, unfinished_run
+from agalign.records.sidecar_file import find_sidecars, read_sidecar
+from agalign.report.charts import drifts_of, rig_views
+from agalign.report.data_files import data_files_exist, printable, remove_other_data_files
+from agalign.report.facts import SUMMARY_FILE, FlightFacts
+from agalign.report.flight_map import FlightMap
+
+REPORT_FILE = "index.html"
+_MAX_LISTED = 100
+"""Entries of a list in the page; OUT/summary.csv and OUT/agalign-run.json have all."""
+_MAX_EXCLUDED = 20
+"""Captures of panels, and of the sky, with a table in the page; OUT/panels.json and OUT/sky.json have all."""
+
+
+def write_pages(out: Path, on_problem: Callable[[str], None]) -> FlightFacts:
+    """Write OUT/index.html with OUT/report-data, OUT/summary.csv, OUT/indices.csv and OUT/flight.geojson from all
+    sidecars below OUT, and return their data.
+
+    Unreadable files are reported to `on_problem` and left out; the pages then count as outdated in `pages_exist`.
+    Raises OutputError.
+    """
+    earlier = current_rows(out)
+    rows_of: dict[str, list[IndexReport]] = defaultdict(list)
+    for row in earlier:
+        rows_of[row.capture].append(row)
+    indices: list[IndexReport] = []
+    unreadable: list[str] = []
+    facts, flight_map = FlightFacts(out), FlightMap()
+    for path in counted_sidecars(find_sidecars(out), out):
+        folder = path.parent.relative_to(out).as_posix()
+        try:
+            sidecar = read_sidecar(path)
+        except SidecarError as error:
+            unreadable.append(str(error))
+            continue
+        of_capture = reports_of(sidecar, folder, out, facts.pairs.run)
+        indices += of_capture
+        label = Path(folder, sidecar.capture).as_posix()
+        facts.add(folder, sidecar, merged(rows_of.get(label, []), of_capture))
+        flight_map.add(folder, sidecar)
+    panels: list[PanelPart] = []
+    sky: list[SkyPart] = []
+    run: RunPart | None = None
+    try:
+        (panels, sky), run = read_excluded(out), read_run_record(out)
+    except SidecarError as error:
+        unreadable.append(str(error))
+    not_aligned = [("panel", part) for part in panels if part.is_left_out] + [("sky", part) for part in sky]
+    for status, part in not_aligned:
+        excluded = {"folder": part.folder, "capture": part.capture, "status": status, "reason": part.sentence}
+        for band in part.bands:
+            facts.add_row(excluded | {"band": band.band})
+    unfinished = unfinished_run(run, (*panels, *sky), facts.seconds)
+    facts.add_without_result([] if unfinished is None else unfinished.missing)
+    facts.flush()
+    facts.write_summary()
+    rows = update_table(out, indices, earlier)
+    for one in [] if run is None else run.excluded:
+        flight_map.add_excluded(one)
+    flight_map.add_indices(rows, out)
+    flight_map.write(out)
+    page = _page(
+        version=__version__,
+        median=median,
+        flight=facts,
+        facts=facts.in_page(),
+        max_listed=_MAX_LISTED,
+        max_excluded=_MAX_EXCLUDED,
+        run=run,
+        unfinished="" if unfinished is None else unfinished.sentence,
+        notes=[] if run is None else run.notes_on_input(),
+        settings=_changed_settings(run),
+        rigs=rig_views(out, unreadable.append),
+        drifts=drifts_of(facts.cameras),
+        panels=panels,
+        sky=sky,
+    )
+    write_text(out / REPORT_FILE, page)
+    remove_other_data_files(out, facts.files)
+    if unreadable:
+        outdate_pages(out)
+    for text in unreadable:
+        on_problem(text)
+    return facts
+
+
+def outdate_pages(out: Path) -> None:
+    """Make `pages_exist` return False for the pages of an earlier run."""
+    with suppress(OSError):
+        os.utime(out / REPORT_FILE, (0, 0))
+
+
+def pages_exist(out: Path) -> bool:
+    """Return True if the pages of an earlier run are complete and newer than all files that they describe."""
+    try:
+        written = min((out / name).stat().st_mtime_ns for name in (REPORT_FILE, SUMMARY_FILE))
+        entries = [*find_sidecars(out), *(out / f for f in (PANELS_FILE, SKY_FILE) if (out / f).exists())]
+        is_newer = all(path.stat().st_mtime_ns < written for path in entries)
+        return is_newer and data_files_exist(out / REPORT_FILE)
+    except (OSError, UnicodeDecodeError):
+        return False
+
+
+def _page(**values: Any) -> str:
+    """The page of the template, which gets these values."""
+    style, script = (resources.files(__package__).joinpath(f"page.{kind}").read_text("utf-8") for kind in ("css", "js"))
+    digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
+    return _template().render(style=style, script=script, script_hash=digest, **values)
+
+
+def _template() -> Template:
+    """The template of the page; its bytecode is kept in the user's folder of temporary files, if there is one."""
+    environment = Environment(
+        loader=PackageLoader(__package__, "."),
+        autoescape=select_autoescape(["j2"]),
+        trim_blocks=True,
+        lstrip_blocks=True,
+        undefined=StrictUndefined,
+        # What is not markup comes from files.
+        finalize=lambda value: value if isinstance(value, Markup) else printable(value),
+    )
+    environment.policies["json.dumps_kwargs"] = {"separators": (",", ":"), "ensure_ascii": False, "allow_nan": False}
+    with suppress(OSError, RuntimeError):  # without a temporary folder, and if it is full
+        environment.bytecode_cache = FileSystemBytecodeCache()
+        return environment.get_template("page.html.j2")
+    environment.bytecode_cache = None
+    return environment.get_template("page.html.j2")
+
+
+def _changed_settings(run: RunPart | None) -> list[tuple[str, str]]:
+    """(Python name, value) of the settings of a run that differ from the defaults."""
+    if run is None:
+        return []
+    defaults = Settings().model_dump(mode="json")
+    return [
+        (f"{stage}.{name}", json.dumps(value, ensure_ascii=False))
+        for stage, values in run.settings.items()
+        if isinstance(values, dict)
+        for name, value in values.items()
+        if value != defaults.get(stage, {}).get(name) and (stage, name) != ("flight", "start_model")
+    ]

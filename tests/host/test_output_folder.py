@@ -1,0 +1,39 @@
+import errno
+import os
+from pathlib import Path
+
+import pytest
+
+from agalign.errors import OutputError
+from agalign.host.output_folder import locked
+
+from ..conftest import raising
+
+
+@pytest.mark.parametrize("code", [errno.ENOSYS, errno.EPERM, errno.EOPNOTSUPP])
+@pytest.mark.parametrize("missing", ["replace", "open"])
+def test_a_file_system_that_cannot_rename_or_change_files_is_named_at_the_start(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, missing: str, code: int
+) -> None:
+    fails = raising(OSError(code, os.strerror(code)))
+    real = Path.open
+
+    def opened(self: Path, mode: str = "r", *rest: object, **more: object) -> object:
+        return fails() if "+" in mode else real(self, mode, *rest, **more)
+
+    monkeypatch.setattr(Path, missing, fails if missing == "replace" else opened)
+    for _ in range(2):
+        message = r"its file system cannot rename files .* choose a local folder with -o"
+        with pytest.raises(OutputError, match=message), locked(tmp_path / "out"):
+            pass
+        assert not list((tmp_path / "out").iterdir())
+
+
+@pytest.mark.parametrize("code", [errno.ENOSPC, errno.EIO])
+def test_other_errors_are_reported_where_a_file_is_written(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, code: int
+) -> None:
+    monkeypatch.setattr(Path, "replace", raising(OSError(code, os.strerror(code))))
+    with locked(tmp_path / "out"):
+        pass
+    assert not list((tmp_path / "out").iterdir())

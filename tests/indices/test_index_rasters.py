@@ -1,0 +1,311 @@
+import json
+import os
+import re
+import shutil
+from contextlib import suppress
+from pathlib import Path
+
+import numpy as np
+import pytest
+import rasterio
+from hypothesis import given
+from hypothesis import strategies as st
+from synthetic_flights.aligned import make_aligned
+
+from agalign.batch import index_run
+from agalign.batch.index_run import index_tasks, run_indices
+from agalign.errors import ConfigurationError, InputError
+from agalign.indices.formulas import INDICES, bands_for, compute, evaluate, index_named, index_of_formula
+from agalign.indices.rasters import IndexReport, IndexStatistics, read_table, update_table, write_rasters
+from agalign.rasters.band_reader import RAW
+from agalign.records.captures import AlignedBand
+from agalign.records.sidecar import FilePart
+from agalign.records.sidecar_file import read_sidecar, verify_outputs, write_sidecar
+from agalign.report.pages import write_pages
+
+from ..conftest import raising, write_band, write_signed
+from ..run_outputs import indices_of, table_in
+
+NO_FORMULAS = """__import__('os').system('true')\nN.real\n(lambda: N)()\nN if R else B\n[N][0]\nN; R\nN @ R\n'a'*N
+sqrt(N, R)\nopen(N)\nN < R\nf'{N}'\n1e40*N\nN and R"""
+
+
+@pytest.mark.parametrize(
+    ("text", "problem"),
+    [
+        *((text, "formula") for text in NO_FORMULAS.splitlines()),
+        *((text, "formula") for text in ("", "N\0", "\ud800", "(" * 200, "N" * 400, "-" * 290 + "(")),
+        ("Q+N", "uses Q; the bands are B, G, R, RE and N"),
+        ("1+1", "uses no band"),
+        ("ndvi=N/R", "'ndvi' cannot name"),
+        ("../x=N/R", "'../x' cannot name"),
+        ("N+", "is not a formula"),
+    ],
+)
+def test_a_formula_is_arithmetic_of_bands_and_nothing_else(text: str, problem: str) -> None:
+    with pytest.raises(ConfigurationError, match=problem):
+        index_of_formula(text)
+
+
+ARITHMETIC = st.recursive(
+    st.sampled_from(["B", "G", "R", "RE", "N", "0.5", "9"]),
+    lambda inner: st.tuples(
+        st.sampled_from(["(", "-(", "sqrt(", "log("]),
+        inner,
+        st.sampled_from(["+", "-", "*", "/", "^"]),
+        inner,
+        st.just(")"),
+    ).map("".join),
+)
+SCRAPS = st.sampled_from(
+    [*re.split(r"\s", NO_FORMULAS), *"()[]{}.,;:=#~@%&|<>^'", "**", "//", "1e400", "1j", "\0", "\ud800"]
+)
+
+
+@given(text=ARITHMETIC | st.lists(ARITHMETIC | SCRAPS, max_size=5).map("".join))
+def test_any_formula_is_refused_or_has_one_value_per_pixel(text: str) -> None:
+    with suppress(ConfigurationError):
+        index = index_of_formula(text)
+        bands = [np.full((2, 3), 0.1 * k, np.float32) for k, _ in enumerate(index.symbols)]
+        assert compute(index, bands).shape == (2, 3)
+
+
+def test_a_formula_has_the_value_of_its_arithmetic() -> None:
+    n, r = np.float32([[0.5, 0.0, 0.2]]), np.float32([[0.1, 0.0, -0.2]])
+    value = evaluate("-(N - R)^2 / (N + R) + sqrt(4) * 1.5e0", {"N": n, "R": r})
+    assert value.dtype == np.float32
+    assert value[0, 0] == pytest.approx(-(0.4**2) / 0.6 + 3, rel=1e-6)
+    assert not np.isfinite(value[0, 1:]).any()
+    assert np.isinf(evaluate("9**9**9 + 0*N", {"N": n})).all(), "and takes no time"
+    golden_ratio = evaluate("1/(1+" * 40 + "N" + ")" * 40, {"N": n})
+    np.testing.assert_allclose(golden_ratio[0, ::2], (5**0.5 - 1) / 2, rtol=1e-6)
+
+
+def test_the_catalogue_gives_names_and_constants() -> None:
+    pytest.importorskip("spyndex")
+    wdrvi = index_named("WDRVI")
+    assert (wdrvi.symbols, wdrvi.constants, wdrvi.any_unit) == (("N", "R"), (("alpha", 0.1),), True)
+    assert not index_named("evi2").any_unit
+    with pytest.raises(ConfigurationError, match="uses S1"):
+        index_named("ndbi")
+
+
+@pytest.mark.parametrize("name", INDICES)
+def test_a_built_in_index_has_the_value_of_the_catalogue(name: str) -> None:
+    spyndex = pytest.importorskip("spyndex")
+    entry = spyndex.indices[{"ndre": "NDREI"}.get(name, name.upper())]
+    rng = np.random.default_rng(0)
+    values = {"RE1" if s == "RE" else s: rng.uniform(0.02, 0.3, 50) for s in INDICES[name].symbols}
+    values |= {"N": rng.uniform(0.3, 0.6, 50)} if "N" in values else {}
+    constants = {s: spyndex.constants[s].default for s in entry.bands if s not in values}
+    constants |= {"L": 0.5} if name == "savi" else {}  # Huete's; the catalogue's default of L is that of EVI
+    expected = spyndex.computeIndex(entry.short_name, values | constants)
+    result = compute(INDICES[name], [np.float32(v)[None] for v in values.values()])[0]
+    known = np.isfinite(result)
+    assert known.mean() > 0.7
+    np.testing.assert_allclose(result[known], expected[known], rtol=1e-4, atol=1e-5)
+
+
+def test_values_statistics_and_tags_of_a_raster(tmp_path: Path) -> None:
+    make_aligned(tmp_path, 1)
+    mine = index_of_formula("mine = (N-RE)/(N+RE)")
+    ndvi, ndre, by_formula = indices_of(tmp_path, "ndvi", "ndre", mine)
+    with rasterio.open(tmp_path / "0000SET" / "IMG_0001.tif") as stack:
+        _, red, nir, _ = stack.read().astype(float)
+    truth = (nir - red) / (nir + red)
+    with rasterio.open(ndvi.path) as dataset:
+        np.testing.assert_allclose(dataset.read(1), truth, rtol=1e-5)
+        tags = dataset.tags()
+    known = ndvi.statistics
+    assert [known.p5, known.median, known.p95] == pytest.approx(np.percentile(truth, (5, 50, 95)), abs=1e-5)
+    assert (known.valid_share, known.unit, known.low, known.high) == (1.0, "reflectance", -0.2, 1.0)
+    assert json.loads(tags["INDEX_STATISTICS"])["median"] == known.median
+    assert tags["INDEX_FORMULA"] == "(N - R) / (N + R)"
+    assert "INPUT" not in tags
+    assert by_formula.median == ndre.median
+
+
+def test_raw_numbers_are_named_and_drawn_in_neutral_greys(tmp_path: Path) -> None:
+    import cv2
+
+    folders = tmp_path / "raw", tmp_path / "reflectance"
+    for folder in folders:
+        make_aligned(folder, 1, raw=folder.name == "raw")
+    (of_raw,), (of_reflectance,) = map(indices_of, folders)
+    assert [report.statistics.unit for report in (of_raw, of_reflectance)] == [RAW, "reflectance"]
+    with rasterio.open(of_raw.path) as dataset:
+        assert dataset.tags()["INPUT"] == "raw numbers, not reflectance"
+        low, high = np.percentile(dataset.read(1), (2, 98))
+    assert (of_raw.statistics.low, of_raw.statistics.high) == pytest.approx((low, high), abs=1e-4)
+    pictures = (cv2.imread(str(r.path.with_suffix(".png"))) for r in (of_raw, of_reflectance))
+    grey, colour = (picture[:120, :160].astype(int) for picture in pictures)
+    assert np.ptp(grey, axis=2).max() == 0
+    assert np.ptp(colour, axis=2).max() > 50
+    assert np.ptp(grey) > 150, "stretched over all greys"
+
+
+def test_only_new_indices_are_calculated(tmp_path: Path) -> None:
+    make_aligned(tmp_path, 3)
+    assert [r.kept for r in indices_of(tmp_path)] == [False] * 3
+    rasters = sorted(tmp_path.rglob("*_ndvi.tif"))
+    before = [p.stat().st_mtime_ns for p in rasters]
+    assert [r.kept for r in indices_of(tmp_path, "ndvi", "ndre")] == [True, False] * 3
+    assert [p.stat().st_mtime_ns for p in rasters] == before
+    os.truncate(rasters[0], rasters[0].stat().st_size - 300)
+    rasters[1].with_suffix(".png").unlink()
+    sidecar = rasters[2].with_name("IMG_0003.json")
+    write_signed(sidecar, sidecar.read_text().replace(f"{3:064x}", f"{9:064x}"))  # another stack
+    assert [r.kept for r in indices_of(tmp_path)] == [False] * 3
+    assert [r.kept for r in indices_of(tmp_path)] == [True] * 3
+    changed = index_of_formula("x=N/R"), index_of_formula("x=N/G")
+    assert [r.kept for index in changed for r in indices_of(tmp_path, index)] == [False] * 6
+    assert [r.kept for r in indices_of(tmp_path, changed[1], overwrite=True)] == [False] * 3
+
+
+def test_the_table_has_a_row_per_capture_and_index(tmp_path: Path) -> None:
+    make_aligned(tmp_path / "out", 2)
+    target = tmp_path / "indices"
+    indices_of(tmp_path / "out", "ndvi", target=target)
+    indices_of(tmp_path / "out", "ndre", target=target)
+    rows = table_in(target / "indices.csv")
+    names = [(capture, index) for capture in ("IMG_0001", "IMG_0002") for index in ("ndre", "ndvi")]
+    assert [(r["capture"], r["index"]) for r in rows] == names
+    assert [(r["latitude"], r["valid_share"], r["input"]) for r in rows] == [("52.0", "1.0", "reflectance")] * 4
+    assert float(rows[1]["p5"]) < float(rows[1]["median"]) < float(rows[1]["p95"])
+    assert not list((tmp_path / "out").rglob("*ndvi*"))
+    (target / rows[0]["file"]).unlink()
+    assert len(update_table(target, [])) == len(read_table(target)) == 3
+
+
+@pytest.mark.parametrize("line", [",,", "," * 40 + "x", "a\0b", "1,2,3", f"{'x' * 200_000},y"])
+def test_a_damaged_table_is_written_again(tmp_path: Path, line: str) -> None:
+    statistics = IndexStatistics(masked_share=0.25)
+    update_table(tmp_path, [IndexReport("IMG_0001", "ndvi", None, statistics, "left out")])
+    assert [row.statistics.masked_share for row in read_table(tmp_path)] == [0.25]
+    path = tmp_path / "indices.csv"
+    path.write_text(f"{path.read_text()}{line}\n")
+    assert read_table(tmp_path) == []
+
+
+def test_one_damaged_stack_costs_only_its_own_indices(tmp_path: Path) -> None:
+    make_aligned(tmp_path, 2)
+    os.truncate(tmp_path / "0000SET" / "IMG_0001.tif", 3000)
+    bad, good = indices_of(tmp_path)
+    assert "IMG_0001.tif" in bad.problem
+    assert good.path is not None
+
+
+@pytest.mark.parametrize(("name", "problem"), [("green", "file of a band"), ("mine", "differs in size")])
+def test_an_index_neither_replaces_a_band_nor_reads_one_of_another_size(
+    tmp_path: Path, name: str, problem: str
+) -> None:
+    bands = []
+    for band, size_px in (("green", (160, 120)), ("red", (320, 240))):
+        path = tmp_path / f"a_{band}.tif"
+        write_band(path, np.full(size_px[::-1], 0.1, np.float32))
+        bands.append(AlignedBand(band, None, path, 1))
+    (report,) = write_rasters(bands, [index_of_formula(f"{name}=(G-R)/(G+R)")], tmp_path / "a", "a")
+    assert report.path is None
+    assert problem in report.problem
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["a_green.tif", "a_red.tif"]
+
+
+def test_a_raster_that_is_not_of_agalign_is_not_replaced(tmp_path: Path) -> None:
+    make_aligned(tmp_path / "out", 1)
+    place = tmp_path / "maps" / "0000SET" / "IMG_0001_ndvi.tif"
+    place.parent.mkdir(parents=True)
+    shutil.copy(tmp_path / "out" / "0000SET" / "IMG_0001.tif", place)
+    before = place.read_bytes()
+    (report,) = indices_of(tmp_path / "out", target=tmp_path / "maps", overwrite=True)
+    assert report.problem == f"{place}: was not written by agalign; choose another folder with -o"
+    assert place.read_bytes() == before
+
+
+@pytest.mark.slow
+def test_the_sidecar_has_the_checksums_of_replaced_rasters(tmp_path: Path) -> None:
+    """`agalign indices` after `agalign align --index` replaces files that the sidecar lists."""
+    make_aligned(tmp_path, 1)
+    path = tmp_path / "0000SET" / "IMG_0001.json"
+    old = [FilePart(kind="index", file=f"IMG_0001_ndvi{end}", bytes=1, sha256="0" * 64) for end in (".tif", ".png")]
+    write_sidecar(path, read_sidecar(path).model_copy(update={"products": old}))
+    indices_of(tmp_path, "ndvi", target=tmp_path / "elsewhere")
+    assert read_sidecar(path).products == old
+    indices_of(tmp_path, "ndvi", "ndre")
+    assert list(verify_outputs(tmp_path)) == [(path, [])]
+    listed = [f"IMG_0001_{name}.{suffix}" for name in ("ndvi", "ndre") for suffix in ("tif", "png")]
+    assert [part.file for part in read_sidecar(path).products] == listed
+
+
+def test_processes_write_what_one_process_writes(tmp_path: Path) -> None:
+    make_aligned(tmp_path, 20)
+    serial = {r.capture: r.statistics for r in indices_of(tmp_path, target=tmp_path / "a")}
+    tasks = index_tasks(tmp_path, [INDICES["ndvi"]], tmp_path / "b")
+    parallel = {r.capture: r.statistics for d in run_indices(tasks, jobs=2) for r in d}
+    assert parallel == serial
+    one, other = (tmp_path / n / "0000SET" / "IMG_0007_ndvi.tif" for n in "ab")
+    assert one.read_bytes() == other.read_bytes()
+
+
+def test_the_report_has_the_indices(tmp_path: Path) -> None:
+    make_aligned(tmp_path, 2)
+    indices_of(tmp_path, "ndvi", "ndre")
+    write_pages(tmp_path, pytest.fail)
+    page = (tmp_path / "index.html").read_text()
+    facts = json.loads(page.split('id="facts">')[1].split("</script>")[0])
+    names = [[i["name"] for i in c["indices"]] for c in facts["details"]["records"]]
+    assert names == [["ndre", "ndvi"]] * 2
+    ndvi = facts["details"]["records"][0]["indices"][1]
+    assert ndvi["span"] == [-0.2, 1.0]
+    assert ndvi["picture"] == "0000SET/IMG_0001_ndvi.png"
+    assert facts["rows"]["records"][0]["indices"]["ndvi"] == ndvi["median"]
+
+
+NAMES = ("Blue-444", "Blue", "Green", "Red-650", "Red", "Red edge-705", "Red edge", "NIR")
+NM = (444.0, 475.0, 560.0, 650.0, 668.0, 705.0, 717.0, 842.0)
+
+
+@pytest.mark.parametrize(
+    ("index", "names", "wavelengths_nm", "expected"),
+    [
+        ("ndvi", NAMES, NM, "NIR, Red"),
+        ("ndre", NAMES, NM, "NIR, Red edge"),
+        ("evi", NAMES, NM, "NIR, Red, Blue"),
+        ("ndre", ("red", "NIR", "RedEdge"), (None,) * 3, "NIR, RedEdge"),
+    ],
+)
+def test_bands_are_those_nearest_to_the_nominal_wavelength_or_with_the_name(
+    index: str, names: tuple[str, ...], wavelengths_nm: tuple[float | None, ...], expected: str
+) -> None:
+    assert ", ".join(names[i] for i in bands_for(INDICES[index], names, wavelengths_nm)) == expected
+
+
+def test_a_missing_band_is_named() -> None:
+    with pytest.raises(InputError, match="ndre needs a red edge band; there are Red, NIR"):
+        bands_for(INDICES["ndre"], ("Red", "NIR"), (668.0, 840.0))
+    with pytest.raises(InputError, match="needs a red band"):
+        bands_for(INDICES["ndvi"], ("Blue", "Panchro", "NIR"), (475.0, 634.5, 842.0))
+    assert index_named(" NDVI ").name == "ndvi"
+
+
+def test_values_and_nodata() -> None:
+    nir, red = np.float32([[0.5, 0.0, np.nan, 0.3]]), np.float32([[0.1, 0.0, 0.2, -0.3]])
+    assert compute(INDICES["ndvi"], [nir, red]).dtype == np.float32
+    np.testing.assert_allclose(compute(INDICES["ndvi"], [nir, red]), [[0.4 / 0.6, *[np.nan] * 3]], rtol=1e-6)
+    # Noise around zero has no index.
+    noise = compute(INDICES["ndvi"], [np.float32([[-0.01, 0.03]]), np.float32([[0.006, -0.01]])])
+    visible = np.float32([[[0.1, 0.05]], [[0.02, 0.04]], [[0.118, 0.19]]])
+    assert np.isnan([noise, compute(INDICES["vari"], list(visible))]).all()
+
+
+def test_a_raster_of_a_killed_command_is_listed_by_the_next_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    make_aligned(tmp_path, 1)
+    with monkeypatch.context() as patch:
+        patch.setattr(index_run, "add_products", raising(KeyboardInterrupt()))
+        with pytest.raises(KeyboardInterrupt):
+            indices_of(tmp_path)
+    (report,) = indices_of(tmp_path)
+    assert report.kept
+    listed = read_sidecar(tmp_path / "0000SET" / "IMG_0001.json").products
+    assert [part.file for part in listed if part.kind == "index"] == ["IMG_0001_ndvi.tif", "IMG_0001_ndvi.png"]

@@ -1,0 +1,280 @@
+"""What to check before the results of a run are used: one list, which report, tables, console and log print."""
+
+import json
+import shutil
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from synthetic_flights.aligned import make_aligned
+
+from agalign.cameras.discover import discover
+from agalign.cameras.metadata import exposed_after_s
+from agalign.cli.problem_groups import explain
+from agalign.cli.terminal import Terminal
+from agalign.flight.rig_file import model_fingerprint
+from agalign.rasters.alignment_maps import error_lattice_px, share_over_1_px
+from agalign.records.cautions import BLURRED, Caution, RunFacts
+from agalign.records.excluded import PanelPart
+from agalign.records.sidecar import Sidecar
+from agalign.records.sidecar_file import read_sidecar, write_sidecar
+from agalign.report.facts import PairTotals
+from agalign.report.pages import write_pages
+from agalign.values.alignment import Alignment, Seed
+from agalign.values.capture import Band
+from agalign.values.image import OutputGrid
+from agalign.values.issues import TEXTURELESS
+from agalign.values.mapping import PixelMapping
+from agalign.values.mapping_error import MappingError
+from agalign.values.residual import Residual
+
+from ..conftest import read_json, save_known_model
+from ..run_outputs import indices_of, table_in
+from .test_sidecar import NIR, example
+
+ALIGNED = NIR | {"status": "aligned", "reason": None}
+IDENTITY = np.eye(3).tolist()
+
+
+def cautions(band: dict[str, Any] | None = None, run: RunFacts | None = None, **changes: Any) -> list[Caution]:
+    """The cautions about a capture with one moving band."""
+    return list((run or RunFacts()).cautions(example(bands=[ALIGNED | (band or {})], **changes)))
+
+
+def prediction(std_px: float, off_px: float | None = None) -> dict[str, Any]:
+    return {"fixed_to_moving": IDENTITY, "from": "bands", "std_px": std_px, "off_px": off_px}
+
+
+def panel(captured_at: str = "", **scales: float) -> PanelPart:
+    bands = [
+        {"band": name, "file": "", "area_px": [], "albedo": 0.5, "radiance": 1.0, "reflectance_per_radiance": 0.5}
+        | {"sensor_scale": scale, "problem": None}
+        for name, scale in scales.items()
+    ]
+    facts = {"folder": ".", "capture": "P", "captured_at": captured_at, "seen_by": "tags", "serial": "", "picture": ""}
+    return PanelPart.model_validate(facts | {"fits_sensor": False, "bands": bands})
+
+
+def issue(kind: str) -> list[dict[str, Any]]:
+    return [{"kind": kind, "value": 0.02, "limit": 0.5}]
+
+
+OUTPUT = {"file": "a.tif", "crop": (0, 0, 10, 8), "nodata": None}
+
+
+def test_a_good_band_needs_no_check() -> None:
+    good = {"prediction": prediction(0.1, 0.2), "share_over_1_px": 0.005, "saturated": 0.001}
+    output = OUTPUT | {"radiometry": "reflectance by panel", "panel_age_s": 600.0}
+    assert cautions(good, output=output) == []
+
+
+@pytest.mark.parametrize(
+    ("band", "reason", "lost", "size"),
+    [
+        ({"share_over_1_px": 0.25}, "25% of the pixels may be off by more than 1 px", 0.25, "up to 25% of a band"),
+        ({"saturated": 0.125}, "12.5% of the pixels are saturated", 0.125, "up to 12.5% of a band"),
+        ({"prediction": prediction(0.1, 7.42)}, "its own image is aligned 7.4 px from", 0.5, "up to 7.4 px"),
+        ({"status": "failed", "reason": "it is blank", "issues": issue("coverage")}, "it is blank", 1.0, ""),
+        (
+            {"status": "predicted", "reason": "dim", "issues": issue("retrieval"), "prediction": prediction(0.02)},
+            "dim",
+            0.5,
+            "standard error up to 0.02 px",
+        ),
+        (
+            {"status": "predicted", "reason": "so", "issues": issue("cluster"), "prediction": prediction(0.4)}
+            | {"share_over_1_px": 0.125},
+            "so",
+            0.125,
+            "standard error up to 0.40 px",
+        ),
+        (
+            {"status": "predicted", "reason": "so", "issues": issue("cluster"), "prediction": prediction(4.0)},
+            "so",
+            1.0,
+            "standard error up to 4.00 px",
+        ),
+    ],
+)
+def test_each_kind_has_its_size_and_its_effect(band: dict[str, Any], reason: str, lost: float, size: str) -> None:
+    (caution,) = cautions(band)
+    assert caution.reason.startswith(reason)
+    assert caution.lost == pytest.approx(lost)
+    assert (caution.size_text and caution.size_text.format(caution.size)) == size
+
+
+def test_an_error_of_the_prediction_explains_the_distance_from_it() -> None:
+    assert cautions({"prediction": prediction(1.0, 2.9)}) == []
+    assert cautions({"prediction": prediction(0.01, 0.9)}) == []
+
+
+def test_a_predicted_band_has_other_advice_than_a_failed_one() -> None:
+    band = {"status": "predicted", "reason": "", "issues": issue("retrieval"), "prediction": prediction(0.02)}
+    (caution,) = cautions(band)
+    assert caution.remedy == BLURRED
+    (caution,) = cautions(band | {"status": "failed"})
+    assert caution.remedy == TEXTURELESS
+
+
+@pytest.mark.parametrize(("apart_s", "advice"), [(30.0, "look at the times in the tags"), (0.28, "fly higher")])
+def test_the_advice_fits_the_time_between_exposures(apart_s: float, advice: str) -> None:
+    (caution,) = cautions({"status": "failed", "reason": "", "issues": issue("cluster"), "exposed_after_s": apart_s})
+    assert caution.remedy.advice.startswith(advice)
+
+
+@pytest.mark.parametrize(
+    ("kind", "apart_s", "said"), [("few_windows", -20.0, "20 s before"), ("repeats", 3.4, "3 s after")]
+)
+def test_the_time_between_exposures_is_the_reason(kind: str, apart_s: float, said: str) -> None:
+    (caution,) = cautions(
+        {"status": "failed", "reason": "too little", "issues": issue(kind), "exposed_after_s": apart_s}
+    )
+    assert caution.reason == f"exposed {said} the reference; too little"
+    assert "exposed at different times" in caution.remedy.cause
+
+
+@pytest.mark.slow
+def test_the_time_between_exposures_is_that_in_the_tags(flight: Path, tmp_path: Path) -> None:
+    folder = Path(shutil.copytree(flight / "0000SET" / "000", tmp_path / "in"))
+    path = folder / "IMG_0001_4.tif"
+    (capture, *_) = discover(folder).captures
+    assert exposed_after_s(capture.bands[3], capture.reference) == 0
+    path.write_bytes(path.read_bytes().replace(b"2026:06:21 10:00:01", b"2026:06:21 10:00:31"))
+    assert exposed_after_s(capture.bands[3], capture.reference) == 30
+
+
+def test_a_panel_that_contradicts_the_sensor_concerns_the_reflectance_of_its_flight() -> None:
+    run = RunFacts((panel("2026-06-21T10:00:00", NIR=1.59, Green=1.0),))
+    output = OUTPUT | {"radiometry": "reflectance by light sensor"}
+    time = {"captured_at": "2026-06-21T11:00:00"}
+    (caution,) = (c for c in cautions(run=run, output=output, **time) if c.band == "NIR")
+    assert caution.reason == "the irradiance on the panel is 1.59 times that of the light sensor"
+    assert caution.lost == pytest.approx(0.59)
+    assert caution.size_text.format(caution.size) == "reflectance is uncertain by up to 59%"
+    assert cautions(run=run, output=output, captured_at="2026-06-22T11:00:00") == []
+    assert cautions(run=run, output=OUTPUT, **time) == []
+    assert cautions(run=run, output=output, captured_at="") != [], "a clock that was not set"
+    (caution, *_) = cautions(run=RunFacts((panel(NIR=0.5),)), output=output)
+    assert caution.size == pytest.approx(1.0)
+
+
+@pytest.mark.parametrize(
+    ("choice", "source", "said", "is_unusable"),
+    [
+        ("sun", "light sensor", "if the panels had the light of the flight, align again with --radiometry panel", True),
+        ("panel", "panel", "if the light sensor had the light of the flight, align again with --radiometry sun", False),
+        ("auto", "light sensor", "align again with --radiometry panel (the panels alone) or sun", True),
+    ],
+)
+def test_a_contradiction_has_a_remedy_that_was_not_tried(
+    choice: str, source: str, said: str, is_unusable: bool
+) -> None:
+    output = OUTPUT | {"radiometry": f"reflectance by {source}", "panel_age_s": 60.0}
+    options = {"write": {"radiometry": choice}}
+    (caution, *_) = cautions(run=RunFacts((panel(NIR=15.46),)), output=output, options=options)
+    assert caution.size_text.format(caution.size) == "reflectance is uncertain by up to 1446%"
+    assert caution.remedy.advice.startswith(said)
+    assert f"--radiometry {choice}" not in caution.remedy.advice.partition(" or ")[0]
+    assert caution.is_unusable == is_unusable
+    (caution, *_) = cautions(run=RunFacts((panel(NIR=1.5),)), output=output, options=options)
+    assert not caution.is_unusable
+
+
+def test_captures_of_an_earlier_model_are_named(tmp_path: Path) -> None:
+    save_known_model(tmp_path / "models" / "a.safetensors")
+    run = RunFacts.of(tmp_path)
+    (current,) = run.models
+    assert cautions(run=run, model=current) == cautions(run=run) == cautions(model="other") == []
+    (caution,) = cautions(run=run, model="other")
+    assert "earlier model of the flight" in caution.remedy.cause
+    assert caution.lost == 0
+
+
+@pytest.mark.slow
+def test_sidecars_have_the_model_and_the_share_of_uncertain_pixels(aligned_flight: Path) -> None:
+    (path,) = (aligned_flight / "models").glob("*.safetensors")
+    sidecar = read_sidecar(next(aligned_flight.rglob("IMG_0001.json")))
+    assert sidecar.model == model_fingerprint(path)
+    shares = {b.band: b.share_over_1_px for b in sidecar.bands}
+    assert shares == {"Green": None, "Blue": 0.0, "Red": 0.0, "NIR": 0.0, "Red edge": 0.0}
+
+
+def groups() -> Any:
+    """A run with a failed band, three blurred ones, and a panel that contradicts the sensor by 10 %."""
+    totals = PairTotals(RunFacts((panel(Red=1.1),)))
+    output = OUTPUT | {"radiometry": "reflectance by panel", "panel_age_s": 60.0}
+    blurred = {"status": "predicted", "reason": "blurred", "issues": issue("retrieval"), "prediction": prediction(0.02)}
+    for number in range(3):
+        red = ALIGNED | {"band": "Red"} | ({"status": "failed", "reason": "blank"} if number == 0 else {})
+        totals.add(f"IMG_{number}", example(bands=[ALIGNED | blurred, red], output=output))
+    return totals.groups(["IMG_3"])
+
+
+def test_the_largest_effect_comes_first() -> None:
+    result = groups()
+    assert [g.status for g in result] == ["no_result", "predicted", "failed", "check"]
+    # Of eight band images with those of the missing capture.
+    assert [g.effect for g in result] == pytest.approx([2 / 8, 1.5 / 8, 1 / 8, 0.3 / 8])
+
+
+def test_console_and_log_print_the_list(capsys: pytest.CaptureFixture[str]) -> None:
+    explain(groups(), Terminal())
+    printed = capsys.readouterr().err
+    assert printed.splitlines()[:3] == [
+        "Check these, the largest effect first:",
+        "agalign: IMG_3: no result: the run has no result of the capture",
+        "    try: the same command resumes the run",
+    ]
+    assert "blur or noise in one of the bands (standard error up to 0.02 px)" in printed
+    explain(groups(), Terminal(log_json=True))
+    lines = [json.loads(line) for line in capsys.readouterr().err.splitlines()]
+    assert [(e["status"], e["size"]) for e in lines[1:]] == [
+        ("no_result", ""),
+        ("predicted", "standard error up to 0.02 px"),
+        ("failed", ""),
+        ("check", "reflectance is uncertain by up to 10%"),
+    ]
+    assert lines[1]["effect"] == 0.25
+    assert all(e["advice"] and e["cause"] for e in lines[1:])
+
+
+def test_report_and_tables_have_what_to_check(tmp_path: Path) -> None:
+    """A capture counts as `ok`, and its index is written: NDRE with a band that is blurred, NDVI without it."""
+    make_aligned(tmp_path, 2)
+    path = tmp_path / "0000SET" / "IMG_0001.json"
+    sidecar = read_json(path)
+    reason = "the descriptors do not distinguish held-out patches (retrieval 0.02)"
+    for band in sidecar["bands"]:
+        if band["band"] == "Red edge":
+            blurred = {"status": "predicted", "issues": issue("retrieval"), "prediction": prediction(0.02)}
+            band |= blurred | {"reason": reason}
+    write_sidecar(path, Sidecar.model_validate_json(json.dumps(sidecar)))
+    reports = {(r.capture, r.index): r for r in indices_of(tmp_path, "ndvi", "ndre")}
+    ndre = reports["0000SET/IMG_0001", "ndre"]
+    assert ndre.path is not None
+    for _ in range(2):
+        rows = {(r["capture"], r["index"]): r["problem"] for r in table_in(tmp_path / "indices.csv")}
+        assert rows.pop(("IMG_0001", "ndre")) == f"Red edge: {reason}"
+        assert [*rows.values()] == [""] * 3
+        write_pages(tmp_path, pytest.fail)
+    checks = {(r["capture"], r["band"]): r["check"] for r in table_in(tmp_path / "summary.csv") if r["check"]}
+    assert checks == {("IMG_0001", "Red edge"): reason}
+    page = (tmp_path / "index.html").read_text()
+    assert page.index("Check these") < page.index("By band")
+    assert "standard error up to 0.02 px" in page
+
+
+def test_the_share_of_a_band_is_that_of_the_quality_raster() -> None:
+    """An eighth of the image has windows with shifts of 4 px."""
+    size_px = 1280, 960
+    centres = np.stack(np.meshgrid(np.arange(40, 1280, 80.0), np.arange(40, 960, 80.0)), axis=-1).reshape(-1, 2)
+    shifts = np.where(centres[:, :1] < 160, 3.0, 0.0) * np.ones(2)
+    cells = (centres // 80).astype(int)
+    residual = Residual(centres, shifts, np.full(len(centres), 50.0), cells)
+    seed, error = Seed("rig", np.eye(3), 9.0), MappingError(size_px, windows=residual)
+    alignment = Alignment(PixelMapping(np.eye(3)), size_px, (), seed, residual=residual, error=error)
+    reference, grid = Band("Green", Path("a.tif"), 1, *size_px, "uint16"), OutputGrid(0, 0, *size_px)
+    share = share_over_1_px(alignment, reference, grid)
+    assert share == pytest.approx((error_lattice_px(alignment, reference, grid, 16) > 1).mean(), abs=0.03)
+    assert 0.1 < share < 0.2
