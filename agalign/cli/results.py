@@ -209,7 +209,7 @@ def _conclude(
     """Print the statistics of all indices, and return the exit code; `unwritten` says why the table or the report could
     not be written.
     """
-    from agalign.indices.rasters import INDICES_FILE
+    from agalign.indices.table import INDICES_FILE
 
     written = [r for r in reports if r.path is not None]
     if unwritten:

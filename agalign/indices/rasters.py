@@ -1,15 +1,12 @@
 """Spectral indices of a capture: a float32 raster and a picture of each, with their statistics; as the product of
-`agalign align --index`, and for `agalign indices`. OUT/indices.csv has a row for each.
+`agalign align --index`, and for `agalign indices`.
 """
 
-import csv
 import glob
 import hashlib
-import io
 import json
 import math
-from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path, PurePosixPath
@@ -22,10 +19,9 @@ from numpy.typing import NDArray
 from agalign._version import __version__
 from agalign.config import WriteSettings
 from agalign.errors import ConfigurationError, InputError
-from agalign.host.files import read_regular, write_csv
 from agalign.host.memory import WORK_TILE_PX
 from agalign.host.own_files import SOFTWARE, is_own_file
-from agalign.host.text import shortened, without_formula
+from agalign.host.text import shortened
 from agalign.indices.formulas import Index, bands_for, compute, index_named, index_of_formula
 from agalign.pixels.raster import OpenRaster, open_raster
 from agalign.rasters.aligned_files import tags_of
@@ -41,8 +37,6 @@ from agalign.rasters.geotiff import (
 )
 from agalign.rasters.product import CapturePaths, Product, ProductContext, WrittenFile
 from agalign.records.captures import AlignedBand
-from agalign.records.cautions import RunFacts
-from agalign.records.run_record import renamed_captures
 from agalign.records.sidecar import Sidecar
 from agalign.values.capture import Band, Capture
 from agalign.values.equality import equal
@@ -51,7 +45,6 @@ from agalign.values.resampling import tiles
 from agalign.values.spectrum import role_of_band
 
 _STATISTICS_TAG = "INDEX_STATISTICS"
-INDICES_FILE = "indices.csv"
 _COLOURS = np.array([(38, 70, 148), (120, 74, 40), (214, 190, 120), (250, 245, 170), (90, 180, 80), (0, 90, 40)], float)
 """Red, green, blue from the low to the high end of the scale: water, soil, sparse to dense vegetation."""
 _NEUTRAL = np.array([(20, 20, 20), (245, 245, 245)], float)
@@ -152,7 +145,7 @@ class IndexReport:
         return replace(self, captured_at=sidecar.captured_at, latitude=latitude, longitude=longitude)
 
 
-def _statistics_in(tags: Mapping[str, str]) -> IndexStatistics | None:
+def statistics_in(tags: Mapping[str, str]) -> IndexStatistics | None:
     """Return the statistics in the tags of a raster; None if there are none."""
     try:
         fields: dict[str, Any] = json.loads(tags[_STATISTICS_TAG])
@@ -288,7 +281,7 @@ def _is_foreign(path: Path) -> bool:
         return False
     with suppress(OSError):
         check_complete(path)
-        return _statistics_in(tags_of(path)) is None
+        return statistics_in(tags_of(path)) is None
     return not is_own_file(path)
 
 
@@ -310,14 +303,14 @@ def index_rasters(base: Path) -> list[IndexRaster]:
     result = []
     for path in sorted(base.parent.glob(f"{glob.escape(base.name)}_*.tif")):
         tags = {} if path.with_suffix(".json").exists() else tags_of(path)  # else the stack of another capture
-        statistics = _statistics_in(tags)
+        statistics = statistics_in(tags)
         if statistics is not None and path.name == f"{base.name}_{tags.get('INDEX')}.tif":
             is_masked = bool(tags.get("MASKED_BY")) or statistics.masked_share > 0
-            result.append(IndexRaster(path, tags["INDEX"], _index_of(tags), is_masked))
+            result.append(IndexRaster(path, tags["INDEX"], index_of(tags), is_masked))
     return result
 
 
-def _index_of(tags: Mapping[str, str]) -> Index | None:
+def index_of(tags: Mapping[str, str]) -> Index | None:
     """Return the index with the name and the formula in the tags of a raster."""
     name, formula = tags["INDEX"], tags.get("INDEX_FORMULA", "")
     with suppress(ConfigurationError):
@@ -352,7 +345,7 @@ def _finished_before(target: Path, source: str) -> IndexStatistics | None:
         check_complete(target)
         tags = tags_of(target)
         if tags.get("INDEX_MADE_FROM") == source and target.with_suffix(".png").is_file():
-            return _statistics_in(tags)
+            return statistics_in(tags)
     return None
 
 
@@ -482,134 +475,3 @@ def _coloured(values: NDArray[Any], span: tuple[float, float], ramp: NDArray[np.
     result = np.stack([np.interp(share, stops, channel) for channel in ramp.T], axis=-1)
     result[~np.isfinite(values)] = (225, 190, 215)
     return np.asarray(result.round(), np.uint8)
-
-
-def to_check(index: Index | None, sidecar: Sidecar, run: RunFacts, label: str) -> str:
-    """Return what to check in the bands of an index of a capture, given its run and label; empty if there is nothing,
-    or if the formula is unknown.
-    """
-    if index is None:
-        return ""
-    with suppress(InputError):  # other bands than those of the sidecar
-        names = [b.band for b in sidecar.bands]
-        used = {names[i] for i in bands_for(index, names, [b.wavelength_nm for b in sidecar.bands])}
-        return "; ".join(f"{c.band}: {c.reason}" for c in run.cautions(sidecar, label) if c.band in used)
-    return ""
-
-
-def reports_of(sidecar: Sidecar, folder: str, out: Path, run: RunFacts) -> list[IndexReport]:
-    """Return the indices of a capture that its sidecar lists, from the tags of the rasters."""
-    result = []
-    for part in sidecar.products:
-        path = out / folder / part.file
-        if part.kind == "index" and path.suffix == ".tif":
-            name = path.stem.removeprefix(f"{Path(sidecar.capture).name}_")
-            tags = tags_of(path)
-            statistics = _statistics_in(tags)
-            if statistics is not None:
-                label = Path(folder, sidecar.capture).as_posix()
-                problem = to_check(_index_of(tags) if "INDEX" in tags else None, sidecar, run, label)
-                is_masked = bool(tags.get("MASKED_BY"))
-                result.append(IndexReport(label, name, path, statistics, problem, is_masked=is_masked).of(sidecar))
-    return result
-
-
-def read_table(out: Path) -> list[IndexReport]:
-    """Return the rows of OUT/indices.csv, or an empty list if the file does not exist."""
-    try:
-        text = read_regular(out / INDICES_FILE).decode()
-        # Lines may have too few or too many cells.
-        return [_row(line, out) for line in csv.DictReader(io.StringIO(text))]
-    except (OSError, ValueError, KeyError, TypeError, AttributeError, csv.Error):
-        return []
-
-
-def current_rows(out: Path) -> list[IndexReport]:
-    """Return the rows of OUT/indices.csv that are still true: they have a raster that exists and was not written again
-    since, or are of an index that could not be calculated; and they are not of a renamed capture.
-    """
-    renamed = renamed_captures(out)
-    rows = [row for row in read_table(out) if row.capture not in renamed]
-    return [current for row in rows if (current := _current(row)) is not None]
-
-
-def merged(rows: Iterable[IndexReport], newer: Iterable[IndexReport]) -> list[IndexReport]:
-    """Return all rows; a newer one replaces that of the same capture and index."""
-    return list({row.key: row for row in [*rows, *newer]}.values())
-
-
-def update_table(
-    out: Path, rows: Sequence[IndexReport], earlier: Sequence[IndexReport] | None = None
-) -> list[IndexReport]:
-    """Write OUT/indices.csv: `rows`, and the `current_rows` of other captures and indices, which may be given.
-
-    Return all rows. An empty table is not written. Raises OutputError.
-    """
-    old = read_table(out)
-    result = _masked_alike(merged(current_rows(out) if earlier is None else earlier, rows))
-    if (result or old) and (result != old or not (out / INDICES_FILE).is_file()):
-        of_capture = "folder", "capture", "captured_at", "latitude", "longitude"
-        of_index = "index", "median", "p5", "p95", "valid_share", "masked_share", "input", "low", "high", "file"
-        columns = *of_capture, *of_index, "problem"
-        cells = (_cells(row, out) for row in sorted(result, key=lambda row: row.key))
-        write_csv(out / INDICES_FILE, columns, ([one[name] for name in columns] for one in cells))
-    return result
-
-
-def _current(row: IndexReport) -> IndexReport | None:
-    """Return a row if its raster has the statistics of the row, or if it has a problem instead; else None."""
-    if row.path is None:
-        return row if row.problem else None
-    tags = tags_of(row.path)
-    statistics = _statistics_in(tags)
-    if statistics is None or statistics.unit != row.statistics.unit:
-        return None
-    is_same = f"{statistics.median:g}" == f"{row.statistics.median:g}"
-    return replace(row, is_masked=bool(tags.get("MASKED_BY"))) if is_same else None
-
-
-def _masked_alike(rows: Sequence[IndexReport]) -> list[IndexReport]:
-    """Return the rows without the values of rasters that are not masked like most, of an equal number like the masked:
-    statistics with and without quality flags are not comparable.
-    """
-    counts: Counter[tuple[str, bool]] = Counter((row.index, row.is_masked) for row in rows if row.path is not None)
-    result = []
-    for row in rows:
-        are_masked = counts[row.index, True] >= counts[row.index, False]
-        if row.path is not None and row.is_masked != are_masked:
-            state = "masked" if row.is_masked else "not masked"
-            problem = f"its raster is {state} by quality flags, unlike those of most captures; compute the index again"
-            row = replace(row, path=None, statistics=IndexStatistics(), problem=problem)
-        result.append(row)
-    return result
-
-
-def _cells(row: IndexReport, out: Path) -> dict[str, Any]:
-    folder, capture, _ = row.key
-    place = {"folder": folder, "capture": capture, "input": row.statistics.unit}
-    file = "" if row.path is None else row.path.relative_to(out).as_posix()
-    return vars(row) | row.statistics.as_json() | place | {"file": file}
-
-
-def _row(cells: Mapping[str, str], out: Path) -> IndexReport:
-    cells = {k: _unquoted(v) for k, v in cells.items()}
-    numbers = {k: float(cells[k] or "nan") for k in ("median", "p5", "p95", "valid_share", "low", "high")}
-    numbers["masked_share"] = float(cells.get("masked_share") or 0)  # older tables do not have it
-    path = out / cells["file"]
-    path.relative_to(out)  # raises ValueError for an absolute path, which no table has
-    latitude, longitude = (float(cells[k]) if cells[k] else None for k in ("latitude", "longitude"))
-    return IndexReport(
-        Path(cells["folder"], cells["capture"]).as_posix(),
-        path=path if cells["file"] else None,
-        statistics=IndexStatistics(unit=cells["input"], **numbers),
-        index=cells["index"],
-        problem=cells["problem"],
-        captured_at=cells["captured_at"],
-        latitude=latitude,
-        longitude=longitude,
-    )
-
-
-def _unquoted(text: str) -> str:
-    """The text that `without_formula` quoted."""
-    return text[1:] if text.startswith("'") and without_formula(text[1:]) != text[1:] else text

@@ -20,7 +20,8 @@ from agalign.cli.main import COMMANDS
 from agalign.cli.terminal import ExitCode
 from agalign.fit import dense, displacement_field, windows
 from agalign.flight import panel_readings
-from agalign.indices.rasters import INDICES_FILE, IndexReport, update_table
+from agalign.indices.rasters import IndexReport
+from agalign.indices.table import INDICES_FILE, update_table
 from agalign.method import refine
 from agalign.pixels import masks, raster
 from agalign.rasters.parallax_file import PARALLAX_KIND
