@@ -2,7 +2,7 @@
 
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
@@ -174,6 +174,32 @@ def _recorded(run: "_FlightRun") -> Iterator[RunPart]:
         outdate_pages(run.out)
 
 
+@dataclass
+class _Plan:
+    """What a run has to do with each capture, given the results of earlier runs."""
+
+    captures: Sequence[Capture]
+    left: dict[str, Remaining] = field(default_factory=dict)
+    """What remains to be done, by label, without the earlier results."""
+    grids: dict[str, OutputGrid] = field(default_factory=dict)
+    """Grids of the earlier results, whose sidecars of a season would not fit into memory."""
+    modelled: set[str] = field(default_factory=set)
+    """Captures whose earlier result used the network of the flight."""
+
+    @property
+    def number(self) -> int:
+        """Number of captures that are processed."""
+        return sum(one.step in ("render", "estimate") for one in self.left.values())
+
+    def changes(self) -> Iterator[str]:
+        """Yield, in words, which finished captures are processed again, and why."""
+        for step in ("estimate", "render"):
+            again = [one.changed for one in self.left.values() if one.step == step and one.changed]
+            if again:
+                names = ", ".join(dict.fromkeys(name for changed in again for name in changed))
+                yield f"{counted(len(again), 'finished capture')} to be {_AGAIN[step]} again; changed since: {names}"
+
+
 @dataclass(frozen=True)
 class _FlightRun:
     """The steps of `run_flight`."""
@@ -253,58 +279,66 @@ class _FlightRun:
         """Learn the model of each flight, keep finished captures and process the others; yield their reports as they
         complete.
         """
-        left: dict[str, Remaining] = {}
-        modelled = set[str]()  # those whose earlier result used the network of the flight
-        grids: dict[str, OutputGrid] = {}  # of the earlier results, which of a season would not fit into memory
-        for capture in captures:
-            one = self.remaining(capture)
-            left[capture.label] = replace(one, earlier=None)
-            if (grid := self._earlier_grid(one)) is not None:
-                grids[capture.label] = grid
-            if one.earlier is not None and _used_network_of_flight(one.earlier):
-                modelled.add(capture.label)
-        groups = flights_of(captures)
+        plan, timeout_s = self._plan(captures), self.options.timeout_s
         on_cpu = choose_device(self.settings.joint.device).type == "cpu"
         cores = self.options.jobs or (usable_cores() if on_cpu else 1)
-        number = sum(one.step in ("render", "estimate") for one in left.values())
-        timeout_s = self.options.timeout_s
+        number = plan.number
         processes = min(cores, number // CAPTURES_WORTH_A_PROCESS if timeout_s is None else number)
         threads = min(cores, number, _MAX_THREADS)
         executor = self.options.executor
         with open_workers(executor, processes, limit_threads, threads, has_timeout=timeout_s is not None) as run:
-            flights: list[_Flight] = []
             learn = partial(learn_flight, apply=partial(in_order, run), threads=min(_MAX_THREADS, cores))
-            for group, name in zip(groups, model_names(groups), strict=True):
-                path = self.out / "models" / name
-                model = path if _is_model(path) else None
-                steps = {left[c.label].step for c in group}
-                # Without the model, which may be damaged or deleted, captures that are rendered get another crop.
-                is_lost = model is None and any(c.label in modelled for c in group)
-                if "estimate" in steps or ("render" in steps and is_lost):
-                    model = self._model(group, path, learn, record)
-                flights.append((group, model))
-            crops = _crops_of_cameras(flights, grids, self.settings.write)
-            max_bytes = preview_bytes(len(self.flight.captures))
             tasks = []
-            for group, model in flights:
-                for capture in group:
-                    (limits, common), one = crops[_crop_key(capture)], left[capture.label]
-                    if one.step == "nothing" and common is not None and grids.get(capture.label) not in (None, common):
-                        one = left[capture.label] = Remaining("render", ("crop of the flight",))
-                    if one.step in ("nothing", "keep"):
-                        yield self._kept(capture, one)
-                        continue
-                    rendering = RenderOptions(max_bytes, limits, common)
-                    tasks.append(
-                        Task(capture, self.out, self.settings, model, rendering, is_estimated=one.step == "render")
-                    )
-            for step in ("estimate", "render"):
-                again = [one.changed for one in left.values() if one.step == step and one.changed]
-                if again:
-                    names = ", ".join(dict.fromkeys(name for changed in again for name in changed))
-                    finished = counted(len(again), "finished capture")
-                    self.listener.on_again(f"{finished} to be {_AGAIN[step]} again; changed since: {names}")
+            for capture, model, rendering in self._renderings(self._flights(plan, learn, record), plan):
+                one = plan.left[capture.label]
+                if one.step in ("nothing", "keep"):
+                    yield self._kept(capture, one)
+                    continue
+                is_estimated = one.step == "render"
+                tasks.append(Task(capture, self.out, self.settings, model, rendering, is_estimated=is_estimated))
+            for message in plan.changes():
+                self.listener.on_again(message)
             yield from capture_reports(run, tasks, self.listener, timeout_s)
+
+    def _plan(self, captures: Sequence[Capture]) -> "_Plan":
+        """Compare the captures with the results of earlier runs."""
+        plan = _Plan(captures)
+        for capture in captures:
+            one = self.remaining(capture)
+            plan.left[capture.label] = replace(one, earlier=None)
+            if (grid := self._earlier_grid(one)) is not None:
+                plan.grids[capture.label] = grid
+            if one.earlier is not None and _used_network_of_flight(one.earlier):
+                plan.modelled.add(capture.label)
+        return plan
+
+    def _flights(self, plan: "_Plan", learn: Callable[..., FlightModel | None], record: RunPart) -> Iterator[_Flight]:
+        """Yield the flights with the files of their models, which are learned where something needs them."""
+        groups = flights_of(plan.captures)
+        for group, name in zip(groups, model_names(groups), strict=True):
+            path = self.out / "models" / name
+            model = path if _is_model(path) else None
+            steps = {plan.left[c.label].step for c in group}
+            # Without the model, which may be damaged or deleted, captures that are rendered get another crop.
+            is_lost = model is None and any(c.label in plan.modelled for c in group)
+            if "estimate" in steps or ("render" in steps and is_lost):
+                model = self._model(group, path, learn, record)
+            yield group, model
+
+    def _renderings(
+        self, flights: Iterable[_Flight], plan: "_Plan"
+    ) -> Iterator[tuple[Capture, Path | None, RenderOptions]]:
+        """Yield each capture with the model of its flight and how it is rendered; with another crop, it is again."""
+        flights = list(flights)
+        crops = _crops_of_cameras(flights, plan.grids, self.settings.write)
+        max_bytes = preview_bytes(len(self.flight.captures))
+        for group, model in flights:
+            for capture in group:
+                limits, common = crops[_crop_key(capture)]
+                is_finished = plan.left[capture.label].step == "nothing"
+                if is_finished and common is not None and plan.grids.get(capture.label) not in (None, common):
+                    plan.left[capture.label] = Remaining("render", ("crop of the flight",))
+                yield capture, model, RenderOptions(max_bytes, limits, common)
 
     def _kept(self, capture: Capture, left: Remaining) -> CaptureReport:
         """Return the report of a capture that this run does not process."""

@@ -34,6 +34,7 @@ from agalign.values.capture import Capture
 
 if TYPE_CHECKING:
     from agalign.batch.capture_report import CaptureReport
+    from agalign.batch.run import Listener
 
 
 def find_captures(folder: Path, options: DiscoverOptions, terminal: Terminal) -> FolderScan:
@@ -162,7 +163,7 @@ def run(
 
     Raises OutputError or WorkerError if no capture could be processed.
     """
-    from agalign.batch.run import Listener, run_flight
+    from agalign.batch.run import run_flight
 
     asked = {c.label: len(c.moving) + len(c.missing_bands) for c in flight.captures}
     totals, started = RunTotals(flight.is_complete, asked), time.monotonic()
@@ -173,22 +174,7 @@ def run(
             skipped = totals.states["kept"] + totals.states["panel"] + totals.states["sky"]
             show_line(totals.states.total() + share, text, skipped)
 
-        def on_learning(camera: str, share: float) -> None:
-            terminal.check()
-            show(0.0, f"learning from {camera}: {share:.0%} at most")
-
-        def on_pair(capture: Capture, band: str, stage: str, share: float) -> None:
-            terminal.check()
-            names = [*(b.name for b in capture.moving), band]
-            finished = names.index(band) + (0.85 * share if stage in ("learning", "refining") else 0.0)
-            show(finished / max(len(capture.moving), 1), f"{capture.label} {band}: {stage}")
-
-        listener = Listener(
-            on_pair,
-            on_learning,
-            on_learnt=lambda camera, seconds: terminal.event("learnt", camera=camera, seconds=round(seconds, 2)),
-            on_again=lambda text: terminal.event("again", text, message=text),
-        )
+        listener = _listener(terminal, show)
         try:
             for report in run_flight(flight, out, settings, options, listener, model):
                 terminal.check()
@@ -210,6 +196,28 @@ def run(
     seconds = round(time.monotonic() - started, 1)
     terminal.event("finished", seconds=seconds, captures=totals.states.total(), **totals.states)
     return totals
+
+
+def _listener(terminal: Terminal, show: Callable[[float, str], None]) -> "Listener":
+    """Return what hears of the progress of a run, and shows it as a share of a capture and a text."""
+    from agalign.batch.run import Listener
+
+    def on_learning(camera: str, share: float) -> None:
+        terminal.check()
+        show(0.0, f"learning from {camera}: {share:.0%} at most")
+
+    def on_pair(capture: Capture, band: str, stage: str, share: float) -> None:
+        terminal.check()
+        names = [*(b.name for b in capture.moving), band]
+        finished = names.index(band) + (0.85 * share if stage in ("learning", "refining") else 0.0)
+        show(finished / max(len(capture.moving), 1), f"{capture.label} {band}: {stage}")
+
+    return Listener(
+        on_pair,
+        on_learning,
+        on_learnt=lambda camera, seconds: terminal.event("learnt", camera=camera, seconds=round(seconds, 2)),
+        on_again=lambda text: terminal.event("again", text, message=text),
+    )
 
 
 def _write_pages(out: Path, terminal: Terminal, totals: RunTotals) -> None:
