@@ -18,8 +18,8 @@ import pycolmap
 from common import print_head, print_row, read_band, run
 from numpy.typing import NDArray
 
-from agalign.cameras import known_cameras
 from agalign.cameras.discover import discover
+from agalign.cameras.makers import known_cameras
 from agalign.cameras.read_files import read_file
 from agalign.config import DiscoverOptions
 from agalign.records.sidecar_file import find_sidecars, read_sidecar

@@ -11,7 +11,7 @@ from scipy.interpolate import CloughTocher2DInterpolator
 
 import agalign
 from agalign.batch.capture_task import Task, process_capture
-from agalign.cameras import rig_seed
+from agalign.cameras.base import rig_seed
 from agalign.cameras.discover import DiscoverOptions, discover
 from agalign.cameras.metadata import read_tags
 from agalign.cameras.micasense import MicaSense

@@ -61,7 +61,8 @@ def fuzz(target: str, corpus: Path, arguments: list[str]) -> None:
     import atheris
 
     with atheris.instrument_imports(include=["agalign.cameras", "agalign.values", "tifffile"]):
-        from agalign.cameras import discover, known_cameras, metadata, pix4d, read_files, tag_transfer, xmp
+        from agalign.cameras import discover, metadata, pix4d, read_files, tag_transfer, xmp
+        from agalign.cameras.makers import known_cameras
         from agalign.cameras.tiff_directory import read_directories
     from agalign.errors import AgalignError
     from agalign.values.capture import Band

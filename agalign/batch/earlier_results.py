@@ -24,7 +24,7 @@ from agalign.flight.fingerprint import (
     render_fingerprint,
 )
 from agalign.host.files import file_checksum
-from agalign.host.memory import WORK_TILE_PX
+from agalign.host.memory_limits import WORK_TILE_PX
 from agalign.pixels.raster import read_tile
 from agalign.rasters.product import CapturePaths
 from agalign.records.sidecar import FilePart, Sidecar, capture_status

@@ -12,12 +12,11 @@ from agalign.flight.fingerprint import RENDER_STAGES, input_digests, input_sampl
 from agalign.flight.model import FlightModel
 from agalign.host.own_files import is_own_file
 from agalign.pixels.raster import ReadTile, read_tile
-from agalign.rasters.alignment_maps import relief_of
 from agalign.rasters.parallax_file import PARALLAX_KIND, PARALLAX_SUFFIX, write_parallax
 from agalign.rasters.product import CapturePaths
 from agalign.records.sidecar import Sidecar
 from agalign.records.sidecar_file import file_part, read_sidecar, write_sidecar
-from agalign.values.alignment import Alignment
+from agalign.values.alignment import Alignment, relief_of
 from agalign.values.capture import Capture
 
 

@@ -12,8 +12,8 @@ from agalign.errors import AgalignError
 from agalign.host.files import written_below
 from agalign.host.processes import usable_cores
 from agalign.indices.formulas import Index
+from agalign.indices.indices_csv import to_check, update_table
 from agalign.indices.rasters import IndexRasters, IndexReport, write_rasters
-from agalign.indices.table import to_check, update_table
 from agalign.records.captures import bands_of
 from agalign.records.cautions import RunFacts
 from agalign.records.run_record import counted_sidecars

@@ -20,7 +20,7 @@ from agalign.rasters.output_grid import FlightLimits, output_layers
 from agalign.rasters.parallax_file import read_relief
 from agalign.rasters.preview import preview_bytes
 from agalign.rasters.product import CapturePaths, ProductContext
-from agalign.rasters.rendered import rendered
+from agalign.rasters.rendered_sidecar import rendered
 from agalign.records.sidecar import FilePart, Sidecar
 from agalign.records.sidecar_file import write_sidecar
 from agalign.values.alignment import Alignment

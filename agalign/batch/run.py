@@ -18,7 +18,7 @@ from agalign.batch.other_results import labels_of_other_inputs, results_not_in_i
 from agalign.batch.output_files import refuse_to_overwrite, remove_outputs
 from agalign.batch.render import RenderOptions
 from agalign.batch.selection import Selection, select_captures
-from agalign.batch.workers import Run, failure_text, in_order, open_workers, serially
+from agalign.batch.workers import MAX_THREADS, Run, failure_text, in_order, numbers_of_workers, open_workers, serially
 from agalign.cameras.discover import FolderScan
 from agalign.config import RunOptions, Settings, WriteSettings
 from agalign.errors import AgalignError, ConfigurationError, InputError, OutputError, SidecarError
@@ -31,7 +31,7 @@ from agalign.flight.rig_file import read_rig
 from agalign.flight.sky import SkyCapture
 from agalign.host.files import check_inside, written_below
 from agalign.host.output_folder import is_full, locked
-from agalign.host.processes import CAPTURES_WORTH_A_PROCESS, usable_cores
+from agalign.host.processes import usable_cores
 from agalign.host.text import counted
 from agalign.indices.rasters import check_indices
 from agalign.method.device import choose_device, limit_threads
@@ -44,10 +44,6 @@ from agalign.report.excluded import write_panels, write_sky
 from agalign.report.pages import outdate_pages
 from agalign.values.capture import Capture
 from agalign.values.image import OutputGrid
-
-_MAX_THREADS = 4
-"""Maximum number of threads that train a network or process captures; more wait for the interpreter's lock."""
-
 
 _PLANNED = {
     "nothing": "kept from an earlier run",
@@ -282,12 +278,10 @@ class _FlightRun:
         plan, timeout_s = self._plan(captures), self.options.timeout_s
         on_cpu = choose_device(self.settings.joint.device).type == "cpu"
         cores = self.options.jobs or (usable_cores() if on_cpu else 1)
-        number = plan.number
-        processes = min(cores, number // CAPTURES_WORTH_A_PROCESS if timeout_s is None else number)
-        threads = min(cores, number, _MAX_THREADS)
-        executor = self.options.executor
-        with open_workers(executor, processes, limit_threads, threads, has_timeout=timeout_s is not None) as run:
-            learn = partial(learn_flight, apply=partial(in_order, run), threads=min(_MAX_THREADS, cores))
+        has_timeout = timeout_s is not None
+        processes, threads = numbers_of_workers(plan.number, cores, has_timeout=has_timeout)
+        with open_workers(self.options.executor, processes, limit_threads, threads, has_timeout=has_timeout) as run:
+            learn = partial(learn_flight, apply=partial(in_order, run), threads=min(MAX_THREADS, cores))
             tasks = []
             for capture, model, rendering in self._renderings(self._flights(plan, learn, record), plan):
                 one = plan.left[capture.label]

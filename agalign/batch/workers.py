@@ -25,6 +25,7 @@ from agalign._version import __version__
 from agalign.errors import AgalignError, ConfigurationError, WorkerError
 from agalign.host.process_pool import A, ProcessPool, R, WorkerDiedError
 from agalign.host.processes import (
+    CAPTURES_WORTH_A_PROCESS,
     WORKER_MODULE,
     environment_of_children,
     usable_cores,
@@ -38,6 +39,8 @@ from agalign.values.choices import MAX_JOBS
 _DASK_TIMEOUT_S = 10
 _POLL_INTERVAL_S = 1.0
 """Interval at which the loss of workers is checked while no task completes. On Windows, SIGINT waits as long."""
+MAX_THREADS = 4
+"""Maximum number of threads that train a network or process captures; more wait for the interpreter's lock."""
 _MAX_WAITING_TASKS = 1000
 """Maximum number of tasks submitted to an executor at a time: enough for any cluster, and little memory."""
 
@@ -62,6 +65,14 @@ def serially(function: Callable[[A], R], tasks: Sequence[A], /, **_: object) -> 
     """Run the tasks in this process and thread: each when its result is requested."""
     for number, task in enumerate(tasks):
         yield number, partial(function, task)
+
+
+def numbers_of_workers(captures: int, cores: int, *, has_timeout: bool) -> tuple[int, int]:
+    """Return (processes, threads) for `open_workers` that process these captures: with few, a process is not worth its
+    start, but only processes can be stopped at a timeout.
+    """
+    processes = min(cores, captures if has_timeout else captures // CAPTURES_WORTH_A_PROCESS)
+    return processes, min(cores, captures, MAX_THREADS)
 
 
 @contextmanager
@@ -143,7 +154,7 @@ def _submitted(executor: Executor, function: Callable[[A], R], task: A) -> "Futu
 
 
 def in_order(run: Run, function: Callable[[A], R], tasks: Sequence[A], /) -> Iterator[R]:
-    """Yield the results in the order of the tasks, as `values.process_pool.Apply`."""
+    """Yield the results in the order of the tasks, as `host.process_pool.Apply`."""
     waiting: dict[int, Callable[[], R]] = {}
     following = 0
     for number, result in run(function, tasks):

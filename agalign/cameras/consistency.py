@@ -13,11 +13,11 @@ from itertools import pairwise
 from pathlib import Path
 from statistics import median_low
 
+from agalign.cameras.band_identity import name_end
 from agalign.cameras.generic import Generic
-from agalign.cameras.identity import name_end
 from agalign.cameras.image_file import Doubt, ImageFile, Problem
-from agalign.cameras.known import SAME_BAND_NM, raw_step, sizes_px
 from agalign.cameras.metadata import Tags
+from agalign.cameras.model_tables import SAME_BAND_NM, raw_step, sizes_px
 from agalign.cameras.pix4d import NAMESPACE, listed_names
 from agalign.cameras.sun import Sun, sun_position
 from agalign.errors import InputError

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from agalign.cameras.band_identity import with_one_spelling
 from agalign.cameras.base import reference_index
 from agalign.cameras.consistency import contradictions, doubtful_files, exposed_apart, files_of_one_band, list_problems
 from agalign.cameras.generic import Generic
@@ -26,7 +27,6 @@ from agalign.cameras.grouping import (
     with_unreadable_bands,
     without_copies,
 )
-from agalign.cameras.identity import with_one_spelling
 from agalign.cameras.image_file import ImageFile, Problem
 from agalign.cameras.image_search import (
     IMAGE_KINDS,

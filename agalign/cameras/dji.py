@@ -22,8 +22,8 @@ import numpy as np
 from agalign.cameras import pix4d
 from agalign.cameras.base import Camera, colour_bands
 from agalign.cameras.consistency import full_scale, raw_step_of
-from agalign.cameras.known import MAVIC_3_PART, PHANTOM_4, named_by_camera
 from agalign.cameras.metadata import Tags
+from agalign.cameras.model_tables import MAVIC_3_PART, PHANTOM_4, named_by_camera
 from agalign.errors import GeometryError
 from agalign.values import geometry
 from agalign.values.band_names import own_stem

@@ -5,8 +5,8 @@ from dataclasses import replace
 from pathlib import Path
 
 from agalign.cameras.base import Camera, colour_bands
-from agalign.cameras.known import filter_channels, named_by_camera
 from agalign.cameras.metadata import Tags
+from agalign.cameras.model_tables import filter_channels, named_by_camera
 from agalign.cameras.pix4d import NAMESPACE, listed_bands
 from agalign.host.text import shortened
 from agalign.pixels.raster import suffix_format

@@ -12,13 +12,13 @@ from itertools import count
 from pathlib import Path
 from types import MappingProxyType
 
-from agalign.cameras import camera_of
+from agalign.cameras.band_identity import end_of, name_end
 from agalign.cameras.base import Camera, colour_bands, listed, reference_index
 from agalign.cameras.generic import Generic, split_elsewhere, split_stem
-from agalign.cameras.identity import end_of, name_end
 from agalign.cameras.image_file import ImageFile, Problem, natural_order
-from agalign.cameras.known import band_at, lacking
+from agalign.cameras.makers import camera_of
 from agalign.cameras.metadata import Tags
+from agalign.cameras.model_tables import band_at, lacking
 from agalign.config import DiscoverOptions
 from agalign.errors import InputError, UnreadableFileError
 from agalign.host.files import RUN_FILE

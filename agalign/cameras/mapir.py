@@ -11,8 +11,8 @@ from dataclasses import replace
 from pathlib import Path
 
 from agalign.cameras.base import Camera
-from agalign.cameras.known import SURVEY3_FILTERS, filter_channels
 from agalign.cameras.metadata import Tags
+from agalign.cameras.model_tables import SURVEY3_FILTERS, filter_channels
 from agalign.values.band_names import own_stem
 from agalign.values.capture import Band
 

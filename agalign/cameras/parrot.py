@@ -17,8 +17,8 @@ import numpy as np
 
 from agalign.cameras import pix4d
 from agalign.cameras.base import Camera, colour_bands, rays_to_rig, rotation
-from agalign.cameras.known import SEQUOIA, SEQUOIA_PART
 from agalign.cameras.metadata import Tags
+from agalign.cameras.model_tables import SEQUOIA, SEQUOIA_PART
 from agalign.values.band_names import own_stem
 from agalign.values.capture import Band
 from agalign.values.geometry import Matrix

@@ -5,8 +5,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from agalign.cameras.known import named_by_camera
 from agalign.cameras.metadata import Tags, finite
+from agalign.cameras.model_tables import named_by_camera
 from agalign.pixels.radiometry import plausible
 from agalign.values.capture import Band, Panel, Pose, Radiometry
 from agalign.values.geometry import Points

@@ -7,7 +7,6 @@ from functools import partial
 from multiprocessing import get_context
 from pathlib import Path
 
-from agalign.cameras import known_cameras
 from agalign.cameras.base import Camera
 from agalign.cameras.consistency import (
     clock_doubt,
@@ -19,6 +18,7 @@ from agalign.cameras.consistency import (
     pixel_scale,
 )
 from agalign.cameras.image_file import Doubt, ImageFile, Problem
+from agalign.cameras.makers import known_cameras
 from agalign.cameras.metadata import Tags, read_tags
 from agalign.cameras.pix4d import panel_in
 from agalign.cameras.tiff_directory import image_pages

@@ -14,8 +14,8 @@ import numpy as np
 
 from agalign.cameras import pix4d
 from agalign.cameras.base import Camera, colour_bands
-from agalign.cameras.known import SENTERA_FILTERS
 from agalign.cameras.metadata import Tags
+from agalign.cameras.model_tables import SENTERA_FILTERS
 from agalign.values.capture import Band, Pose
 
 _BAND_FOLDER = re.compile(r"^(?:\d+-)?(?P<name>[A-Za-z ]+?)-(?P<wavelength>\d{3,4})(?:-(?P<width>\d+))?$")

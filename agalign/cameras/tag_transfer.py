@@ -7,7 +7,8 @@ from contextlib import suppress
 
 from PIL.ExifTags import Base
 
-from agalign.cameras import camera_of, dji, micasense, pix4d
+from agalign.cameras import dji, micasense, pix4d
+from agalign.cameras.makers import camera_of
 from agalign.cameras.metadata import Tags, finite, read_tags
 from agalign.cameras.parrot import Sequoia
 from agalign.cameras.pix4d import GridVignetting

@@ -24,7 +24,7 @@ from agalign.method.refine import FLIGHT_PATCHES, PATCHES
 from agalign.method.state import ImageGroup, Progress
 from agalign.pixels.raster import ReadTile
 from agalign.values import geometry
-from agalign.values.alignment import MIN_RETRIEVAL, MIN_TIMES_CHANCE, Alignment, Alignments, JointResult, Seed
+from agalign.values.alignment import Alignment, Alignments, JointResult, Seed
 from agalign.values.capture import Capture
 from agalign.values.geometry import Matrix
 from agalign.values.issues import SEED_ASKED_FOR, Issue
@@ -277,7 +277,8 @@ class CaptureEstimation:
         self.progress(starts[0][0].name if starts else "", "relief", 0.0)
         reliefs, along_a_line = by_relief(bands, use, is_observation=self.is_observation)
         self.reliefs += reliefs
-        under = {name for relief in reliefs if relief.fits_better for name in relief.candidates}
+        fitting = [set(relief.candidates) for relief in reliefs if relief.fits_better]
+        under = set.intersection(*fitting) if fitting else set()  # whichever of them is chosen
         new = {pair.name for pair, _ in starts}
         for band in (b for b in bands if b.pair.name in new and b.pair.name not in under and b.issue is None):
             name = band.pair.name
@@ -311,7 +312,7 @@ class CaptureEstimation:
 
 def is_retrieved(result: JointResult | Issue) -> bool:
     """Return True if the descriptors distinguish held-out patches."""
-    return isinstance(result, JointResult) and result.retrieval >= max(MIN_RETRIEVAL, MIN_TIMES_CHANCE * result.chance)
+    return isinstance(result, JointResult) and result.is_retrieved
 
 
 def aligned_groups(groups: Sequence[tuple[list[int], ImageGroup]], align: Callable[[ImageGroup], Results]) -> Results:

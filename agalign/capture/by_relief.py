@@ -393,7 +393,7 @@ def _std_px(reliefs: Sequence[Relief], max_std_px: float) -> FloatImage:
     reliefs from different bands differ at depth edges and in areas without texture, by values that single pixels do not
     have in common. It approaches `max_std_px`, as the harmonic sum of both variances.
     """
-    surroundings_px = 17  # the distance of the nodes of an error map
+    surroundings_px = 17  # about the distance of the nodes of an error map (NODES_PX), and odd
     values = np.stack([relief.parallax_px for relief in reliefs])
     std_px = np.sqrt((len(values) - 1) * np.square(values - values.mean(axis=0)).mean(axis=0))
     # The median of bytes is fast; a byte is a step of 3.5 %, and the median does not depend on the scale.

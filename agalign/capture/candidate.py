@@ -35,7 +35,9 @@ class Candidate:
     mapping: PixelMapping
     error: MappingError
     windows: Residual
-    """Windows that the fit did not use, under the mapping."""
+    """Windows that the fit of the homography did not use, under the mapping without a displacement field, which other
+    held-out windows verify. Lens shapes are fitted to them: such a candidate only predicts.
+    """
     joint: JointResult | None = None
     """Evidence of descriptors or windows; None for a prediction by the rig."""
     images: WarpedPair | None = None

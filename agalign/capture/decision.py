@@ -4,19 +4,21 @@ The estimators propose; `decide` chooses. For each band, the first row that appl
 
 | chosen                                    | if                                               | status      |
 |-------------------------------------------|--------------------------------------------------|-------------|
-| the candidate under the relief            | the capture has a relief, and the band has one   | see below   |
-| the last candidate without issues         | there is one                                     | see below   |
+| the candidate under the relief            | the capture has a relief, and the band has one   | (1)         |
+| the last candidate without issues         | there is one                                     | (2)         |
 | the candidate of the least standard error | the images confirm it in parts (`may_predict`)   | `predicted` |
 | the seed                                  | it is trusted or requested, and fits the windows | `seed_only` |
 | the seed                                  | otherwise                                        | `failed`    |
 
 A capture has a relief if one fits half of its bands at least as well as their homographies, and of several the one that
-delivers most bands: all bands then have this geometry. A candidate without issues is `aligned`, but beside a relief it
-is `predicted` (indices would mix two geometries). Every standard error is the RMS of `Candidate.error`.
+delivers most bands: all bands of its reference image then have this geometry. (1) The candidate under it is `aligned`
+without issues, else `predicted`. (2) A candidate without issues is `aligned`, but beside a relief it is `predicted`, as
+indices would mix two geometries. Every standard error is the RMS of `Candidate.error`. `Alignment.status` follows from
+the issues and the prediction that are set here.
 
-The prediction of the rig of the flight replaces what contradicts it, what has failed, and predictions that are less
-certain or show another scene in a part of the image. An image that is rotated or scaled relative to its rig does not
-fit it: it has `failed`, and the rig does not replace it.
+The prediction of the rig of the flight replaces what contradicts it, seeds, what has failed, and predictions that are
+less certain or show another scene in a part of the image. An image that is rotated or scaled relative to its rig does
+not fit it: it has `failed`, and the rig does not replace it.
 """
 
 import math
@@ -76,7 +78,7 @@ class _Choice:
 
     @property
     def alignment(self) -> Alignment:
-        """The alignment: this is the only place that makes those of a capture."""
+        """The alignment: this is the only place that makes those of pairs of images."""
         band, chosen = self.band, self.candidate
         pair, p95_px = band.pair, {kind: p95 for c in band.candidates for kind, p95 in c.p95_px.items()}
         if chosen is None:

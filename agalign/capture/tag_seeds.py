@@ -3,7 +3,7 @@
 from collections.abc import Callable
 from contextlib import suppress
 
-from agalign.cameras import other_rig_seed, rig_seed
+from agalign.cameras.base import other_rig_seed, rig_seed
 from agalign.config import SeedSettings
 from agalign.errors import GeometryError
 from agalign.pixels.coordinates import transformed

@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from agalign.cli.command import Command, Given
-from agalign.cli.terminal import MAX_LISTED, RAW_NUMBERS, ExitCode, Terminal
+from agalign.cli.exit_codes import ExitCode
+from agalign.cli.terminal import MAX_LISTED, RAW_NUMBERS, Terminal
 from agalign.host.text import counted
 from agalign.values.choices import ExportProgram
 
@@ -28,7 +29,7 @@ def _report(terminal: Terminal, out: Annotated[Path, typer.Argument()], as_json:
         out: Output folder of an earlier run.
         as_json: Print the content of the report as JSON.
     """
-    from agalign.cli.problem_groups import explain
+    from agalign.cli.print_cautions import explain
     from agalign.host.output_folder import locked
     from agalign.records.sidecar_file import run_sidecars
     from agalign.report.facts import SUMMARY_FILE
@@ -209,7 +210,7 @@ def _conclude(
     """Print the statistics of all indices, and return the exit code; `unwritten` says why the table or the report could
     not be written.
     """
-    from agalign.indices.table import INDICES_FILE
+    from agalign.indices.indices_csv import INDICES_FILE
 
     written = [r for r in reports if r.path is not None]
     if unwritten:

@@ -1,4 +1,4 @@
-"""Output of the commands: results, progress, problems, signals and exit codes."""
+"""Output of the commands: results, progress and problems; signals."""
 
 import io
 import json
@@ -12,12 +12,12 @@ import traceback
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from datetime import UTC, datetime
-from enum import IntEnum
 from types import FrameType
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from agalign.cli.exit_codes import ExitCode
 from agalign.errors import AgalignError, ConfigurationError, is_out_of_memory
 from agalign.host.text import escape_controls
 
@@ -30,17 +30,6 @@ RAW_NUMBERS = (
     "the bands are raw numbers, not reflectance: their indices are not comparable between captures or cameras, and are "
     "far from the indices of reflectance; align with --radiometry auto where the camera's tags allow it"
 )
-
-
-class ExitCode(IntEnum):
-    """What a command returns to the shell."""
-
-    OK = 0
-    NOTHING = 1
-    USAGE = 2
-    PARTIAL = 3
-    SIGNAL = 128
-    """Added to the number of the signal that ended the program, as shells do: 130 for SIGINT, 143 for SIGTERM."""
 
 
 def command_line() -> str:

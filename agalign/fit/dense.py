@@ -21,7 +21,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from agalign.host.memory import MAX_MATCHED_PX
+from agalign.host.memory_limits import MAX_MATCHED_PX
 from agalign.pixels.band_resampling import shrink
 from agalign.pixels.structure import structure_field
 from agalign.values import geometry, lens
@@ -41,7 +41,7 @@ _SEARCH_NEARER, _SEARCH_FARTHER = 0.06, 0.03
 half that range, and the floor."""
 _SEARCH_STEP_PX = 2.0
 """Half a pixel of the reduced images; the correlation peak is about one pixel wide."""
-_WINDOW_PX = 7
+_MATCH_WINDOW_PX = 7
 """Side of the correlation windows at reduced resolution."""
 _UNIT_COST = int(MAX_LARGE / 0.4)
 """Integer cost of zero correlation, as high as the range of semi-global matching permits: large steps of the parallax
@@ -91,7 +91,7 @@ class DenseMatching:
         self.step_px = max(fine_step_px if is_fine else coarse_step_px, (high - low) / max_levels)
         self.levels_px = np.arange(low, high + self.step_px, self.step_px)
         relative_scale = 0.5  # of semi-global matching
-        fixed = _FixedBand(reference, self.scale * relative_scale, _WINDOW_PX)
+        fixed = _FixedBand(reference, self.scale * relative_scale, _MATCH_WINDOW_PX)
         self.match_scale = fixed.scale
         self.costs = [_MovingBand(fixed, view, (low, high)).costs(self.levels_px) for view in views]
         self._matched: dict[tuple[int, ...], Relief] = {}
@@ -140,7 +140,7 @@ class DenseMatching:
         high = max(_SEARCH_NEARER * longer_side_px, windows_px[1])
         levels = np.arange(low, high + _SEARCH_STEP_PX, _SEARCH_STEP_PX)
         relative_scale = 0.25  # of the wide search
-        fixed = _FixedBand(self.reference, self.scale * relative_scale, _WINDOW_PX)
+        fixed = _FixedBand(self.reference, self.scale * relative_scale, _MATCH_WINDOW_PX)
         costs = [_MovingBand(fixed, view, (low, levels[-1])).costs(levels) for view in self.views]
         parallax_px, confidence = _semi_global_match(costs, range(len(costs)), levels)
         min_correlation = 0.6  # pixels with a lower one (occlusions, noise) do not extend the range

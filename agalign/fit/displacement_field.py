@@ -25,7 +25,7 @@ from agalign.values.least_squares import cauchy_weights, shift_scale_px
 from agalign.values.mapping import DisplacementField, PixelMapping
 from agalign.values.residual import Residual, noise_px
 
-_WINDOW_PX = 40
+_FIELD_WINDOW_PX = 40
 """Side of the windows in which shifts are measured. On reference tie points of three cameras, smaller ones are as
 accurate, and larger ones less."""
 _LATTICE_PX = 24
@@ -62,11 +62,11 @@ class DisplacementEstimator:
     def __init__(self, valid: Mask, structure: Field) -> None:
         """Cut windows from the structure field (height, width) of the reference with the mask `valid`."""
         max_windows = 5500  # limits the time: their spacing grows in images above 2 megapixels
-        step_px = max(_WINDOW_PX // 2, round((valid.size / max_windows) ** 0.5))
+        step_px = max(_FIELD_WINDOW_PX // 2, round((valid.size / max_windows) ** 0.5))
         min_node_spacings = 0.75  # of windows, which do not determine more nodes
         self.size_px = valid.shape[1], valid.shape[0]
         self.lattice_px = max(_LATTICE_PX, round(min_node_spacings * step_px))
-        self.windows = FixedWindows(valid, structure, _WINDOW_PX, step_px)
+        self.windows = FixedWindows(valid, structure, _FIELD_WINDOW_PX, step_px)
         verification_px = 48  # side of windows without overlap; larger ones are farther from those of the fit
         self.verification = FixedWindows(valid, structure, verification_px)
 

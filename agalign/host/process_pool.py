@@ -23,7 +23,7 @@ from queue import SimpleQueue
 from typing import Any, Protocol, Self, TypeVar
 
 from agalign.errors import WorkerError, is_out_of_memory
-from agalign.host.processes import ExitCode, follow_parent, silence_libraries, without_interrupt_key
+from agalign.host.processes import WorkerExit, follow_parent, silence_libraries, without_interrupt_key
 
 _MAX_DEATHS = 3
 """Maximum number of workers that end in a row without a finished task between them; then no more are started."""
@@ -147,7 +147,7 @@ class _Worker:
         self._has_ended = bool(wait([self._process.sentinel], _ENDS_WITHIN_S))
         with _PROCESS_LOCK:
             code: int | None = self._process.exitcode
-        return None if code == ExitCode.LOST_SERVER else code
+        return None if code == WorkerExit.LOST_SERVER else code
 
 
 def _work(pipe: Connection, initializer: Callable[[], object]) -> None:
@@ -160,7 +160,7 @@ def _work(pipe: Connection, initializer: Callable[[], object]) -> None:
     except (EOFError, OSError):
         return
     except MemoryError:
-        os._exit(ExitCode.OUT_OF_MEMORY)
+        os._exit(WorkerExit.OUT_OF_MEMORY)
 
 
 def _call(task: bytes) -> object:
@@ -282,7 +282,7 @@ class ProcessPool:
         except WorkerDiedError as death:
             if death.by_signal:
                 raise
-            if death.exit_code == ExitCode.REIMPORTED:
+            if death.exit_code == WorkerExit.REIMPORTED:
                 guard = "put its calls below a line 'if __name__ == \"__main__\":'"
                 self.loss = f"the calling script runs again in each worker process; {guard}"
             raise WorkerError(f"ended with {death}") from None
@@ -303,7 +303,7 @@ class ProcessPool:
                 task.future.set_exception(error)
                 return
             except WorkerDiedError as error:
-                out_of_memory = error.exit_code == ExitCode.OUT_OF_MEMORY
+                out_of_memory = error.exit_code == WorkerExit.OUT_OF_MEMORY
                 if error.by_signal and task.tries < _MAX_TRIES:
                     self._tasks.put(task)
                 else:

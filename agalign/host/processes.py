@@ -126,7 +126,7 @@ def is_running(process: int) -> bool:
     return not state or state[0] not in "ZX"
 
 
-class ExitCode(IntEnum):
+class WorkerExit(IntEnum):
     """Exit codes of workers."""
 
     OUT_OF_MEMORY = 71
@@ -142,7 +142,7 @@ def end_if_reimported() -> None:
     calls of the script, each worker would start workers.
     """
     if getattr(current_process(), "_inheriting", False):  # the test that `multiprocessing` itself uses
-        os._exit(ExitCode.REIMPORTED)
+        os._exit(WorkerExit.REIMPORTED)
 
 
 @contextmanager

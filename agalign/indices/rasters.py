@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from agalign._version import __version__
 from agalign.config import WriteSettings
 from agalign.errors import ConfigurationError, InputError
-from agalign.host.memory import WORK_TILE_PX
+from agalign.host.memory_limits import WORK_TILE_PX
 from agalign.host.own_files import SOFTWARE, is_own_file
 from agalign.host.text import shortened
 from agalign.indices.formulas import Index, bands_for, compute, index_named, index_of_formula

@@ -23,7 +23,7 @@ from rasterio.vrt import WarpedVRT
 from rasterio.windows import Window
 
 from agalign.errors import UnreadableFileError
-from agalign.host.memory import GDAL_CACHE_BYTES, MAX_DECODED_PX
+from agalign.host.memory_limits import GDAL_CACHE_BYTES, MAX_DECODED_PX
 from agalign.host.text import name_problem
 from agalign.pixels.coordinates import ensure_proj_data
 from agalign.pixels.masks import data_mask, learnable, missing_end, undeclared_fill, without_parts

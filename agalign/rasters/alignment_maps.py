@@ -8,15 +8,15 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import RegularGridInterpolator
 
-from agalign.cameras import rig_seed
+from agalign.cameras.base import rig_seed
 from agalign.cameras.pix4d import rig_unit_m
 from agalign.errors import GeometryError
-from agalign.host.memory import WORK_TILE_PX
+from agalign.host.memory_limits import WORK_TILE_PX
 from agalign.rasters.geotiff import LayerDescription, compressed
 from agalign.rasters.output_grid import Layer, is_inside
 from agalign.rasters.product import Product, ProductContext, WrittenFile
 from agalign.values import geometry, lens
-from agalign.values.alignment import Alignment
+from agalign.values.alignment import Alignment, relief_of
 from agalign.values.capture import Band, Capture
 from agalign.values.choices import QUALITY_MEANINGS, Quality
 from agalign.values.geometry import Matrix, Points
@@ -191,11 +191,6 @@ class ReliefMap(Product):
         descriptions = [LayerDescription(name, RELIEF_UNITS[name]) for name in layers]
         blocks = ((values, index, 0, 0) for index, values in enumerate(layers.values(), start=1))
         return self.write_layers(context, descriptions, blocks)
-
-
-def relief_of(alignments: Mapping[str, Alignment]) -> Relief | None:
-    """Return the relief of a capture; None if no band is displaced by one."""
-    return next((a.mapping.parallax.relief for a in alignments.values() if a.mapping.parallax is not None), None)
 
 
 def relief_layers(

@@ -22,10 +22,11 @@ from numpy.typing import NDArray
 
 from agalign.cameras.base import is_thermal
 from agalign.host.files import complete_file
-from agalign.rasters.alignment_maps import error_lattice_px, relief_layers, relief_of
+from agalign.rasters.alignment_maps import error_lattice_px, relief_layers
 from agalign.rasters.drawing import Grey, ReducedBands, encoded, side_by_side, titled, write_png
 from agalign.rasters.product import Product, ProductContext, WrittenFile
 from agalign.records.sidecar import PreviewPart, ReliefPreviewPart
+from agalign.values.alignment import relief_of
 from agalign.values.capture import Band
 from agalign.values.image import reduced_size_px
 from agalign.values.resampling import NODES_PX

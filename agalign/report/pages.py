@@ -19,8 +19,8 @@ from agalign._version import __version__
 from agalign.config import Settings
 from agalign.errors import SidecarError
 from agalign.host.files import write_text
+from agalign.indices.indices_csv import current_rows, merged, reports_of, update_table
 from agalign.indices.rasters import IndexReport
-from agalign.indices.table import current_rows, merged, reports_of, update_table
 from agalign.records.excluded import PANELS_FILE, SKY_FILE, PanelPart, SkyPart, read_excluded
 from agalign.records.run_record import RunPart, counted_sidecars, read_run_record, unfinished_run
 from agalign.records.sidecar_file import find_sidecars, read_sidecar

@@ -20,6 +20,7 @@ from agalign.values.image import FloatImage, Mask, Tile
 from agalign.values.issues import SEED_DOES_NOT_FIT, Issue, sentence
 from agalign.values.mapping import PixelMapping
 from agalign.values.mapping_error import ErrorOnGrid, MappingError
+from agalign.values.parallax import Relief
 from agalign.values.pixel_units import Size
 from agalign.values.resampling import can_hold, planes_of, positions_of, resample_planes, valid_of
 from agalign.values.residual import Residual, Similarity
@@ -29,8 +30,8 @@ COVARIANCE_DECIMALS = 9
 STD_DECIMALS = 4
 """Of standard errors: a limit of them holds for what is written."""
 MIN_RETRIEVAL = 0.2
-"""Minimum held-out retrieval: below it psi is not updated and no result is accepted. Chance is below 0.01; unrelated
-images reach 0.05."""
+"""Minimum held-out retrieval: below it psi is not updated, and only windows that no fit used confirm a result. Chance
+is below 0.01; unrelated images reach 0.05."""
 MIN_TIMES_CHANCE = 5.0
 """`MIN_RETRIEVAL` as a multiple of chance, which is high where few keypoints can be drawn."""
 
@@ -116,6 +117,16 @@ class JointResult:
     def corner_std_px(self) -> float:
         """Standard error of the mapping at the least certain corner: root mean square distance, of x and y together."""
         return max(math.hypot(*std) for std in self.corner_std_xy_px)
+
+    @property
+    def min_retrieval(self) -> float:
+        """The retrieval of held-out patches from which the descriptors distinguish them, 0 to 1."""
+        return max(MIN_RETRIEVAL, MIN_TIMES_CHANCE * self.chance)
+
+    @property
+    def is_retrieved(self) -> bool:
+        """True if the descriptors distinguish held-out patches."""
+        return self.retrieval >= self.min_retrieval
 
     @property
     def covariance_px2(self) -> NDArray[np.float64]:
@@ -530,3 +541,8 @@ def is_usable(status: PairStatus, prediction: Prediction | None, accept_predicte
 
 Alignments = dict[str, Alignment]
 """Alignments between images by band."""
+
+
+def relief_of(alignments: Mapping[str, Alignment]) -> Relief | None:
+    """Return the relief of a capture; None if no band is displaced by one."""
+    return next((a.mapping.parallax.relief for a in alignments.values() if a.mapping.parallax is not None), None)

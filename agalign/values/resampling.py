@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from agalign.errors import InputError
-from agalign.host.memory import RESAMPLED_TILE_PX
+from agalign.host.memory_limits import RESAMPLED_TILE_PX
 from agalign.values.choices import Interpolation
 from agalign.values.geometry import Points
 from agalign.values.image import FloatImage, Mask, Tile

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from agalign.pixels.structure import Field, correlation_surfaces
 from agalign.values import geometry
-from agalign.values.alignment import MIN_RETRIEVAL, MIN_TIMES_CHANCE, JointResult, Prediction
+from agalign.values.alignment import JointResult, Prediction
 from agalign.values.geometry import Matrix, Points
 from agalign.values.issues import (
     CLOSE_WINDOWS,
@@ -43,8 +43,8 @@ MAX_ALIAS_PEAK = 0.75
 """Ratio of the heights of the next correlation peak and that of the result, above which the scene is repetitive."""
 
 _MAX_ERROR_PX, _MIN_ACCURATE_SHARE = 0.5, 0.9
-"""`aligned` means an expected error of at most this in this share of the pixels with texture. Errors of 0.5 px RMS are
-beyond 1 px in 2 % of the pixels."""
+"""`aligned` means an expected error of at most this in this share of the common area, under a relief of that
+of the windows. Errors of 0.5 px RMS are beyond 1 px in 2 % of the pixels."""
 MAX_SHIFT_PX = 1.0
 """Maximum residual shift of an aligned window: beyond it, a spectral index mixes neighbours."""
 _MAX_NOISE_STD = 2.0
@@ -102,7 +102,9 @@ class Verifiable(Protocol):
 
     @property
     def file_pixel_size_px(self) -> float:
-        """Size of a pixel of the reference's file on this grid; limits of shifts and errors are in px of the file."""
+        """Size of a pixel of the reference's file on this grid: limits of shifts and errors are in px of the file, for
+        bands of much lower resolution in px of the reduced reference.
+        """
 
     @property
     def images(self) -> AlignedImages | None:
@@ -124,9 +126,8 @@ def _descriptor_issues(candidate: Verifiable) -> Iterator[Issue]:
     # With a measured shift, if they are the only evidence: in unrelated images one in a thousand is aligned.
     min_held_out_windows = 12
     is_confirmed = joint.recipe == BY_WINDOWS and len(residual.measured_px) >= min_held_out_windows
-    minimum = max(MIN_RETRIEVAL, MIN_TIMES_CHANCE * joint.chance)
-    if not (joint.retrieval >= minimum or is_confirmed):
-        yield Issue(RETRIEVAL, joint.retrieval, minimum)
+    if not (joint.is_retrieved or is_confirmed):
+        yield Issue(RETRIEVAL, joint.retrieval, joint.min_retrieval)
 
 
 def _window_issues(candidate: Verifiable) -> Iterator[Issue]:
@@ -161,7 +162,7 @@ def is_misaligned(residual: Residual, pixel_px: float = 1.0) -> NDArray[np.bool_
 
 
 def _error_issues(candidate: Verifiable) -> Iterator[Issue]:
-    """The expected error where the reference has texture and both images are valid."""
+    """The expected error over the common area, under a relief over that of the windows."""
     if len(candidate.textured_px):
         max_px = _MAX_ERROR_PX * candidate.file_pixel_size_px
         share = float((candidate.error.error_px(candidate.textured_px) <= max_px).mean())

@@ -8,8 +8,9 @@ import pytest
 import rasterio
 from rasterio.enums import ColorInterp
 
-from agalign.cameras import default_reference, known_cameras, rig_seed
+from agalign.cameras.base import default_reference, rig_seed
 from agalign.cameras.generic import Generic
+from agalign.cameras.makers import known_cameras
 from agalign.cameras.mapir import Mapir
 from agalign.cameras.metadata import Tags, read_tags
 from agalign.cameras.micasense import MicaSense, horizontal_irradiance, transmission

@@ -14,7 +14,7 @@ import tifffile
 
 from agalign.cameras.consistency import clock_error
 from agalign.cameras.discover import DiscoverOptions, FolderScan, discover
-from agalign.cameras.known import filter_channels, sizes_px
+from agalign.cameras.model_tables import filter_channels, sizes_px
 from agalign.cameras.sun import Sun, sun_position
 from agalign.cameras.tiff_directory import EXIF, GPS, XMP, Entry, add_directories, byte_string, read_directories, text
 from agalign.errors import InputError

@@ -12,7 +12,7 @@ import pytest
 import tifffile
 from PIL import Image
 
-from agalign.cameras import other_rig_seed, rig_seed
+from agalign.cameras.base import other_rig_seed, rig_seed
 from agalign.cameras.discover import DiscoverOptions, discover
 from agalign.cameras.dji import Dji
 from agalign.cameras.metadata import Tags, read_tags

@@ -13,15 +13,15 @@ from itertools import chain
 from pathlib import Path
 
 import pytest
+from agalign.indices.table import INDICES_FILE, update_table
 
 from agalign.batch.products import PRODUCTS
 from agalign.capture import band_pair, common_parallax, reference
+from agalign.cli.exit_codes import ExitCode
 from agalign.cli.main import COMMANDS
-from agalign.cli.terminal import ExitCode
 from agalign.fit import dense, displacement_field, windows
 from agalign.flight import panel_readings
 from agalign.indices.rasters import IndexReport
-from agalign.indices.table import INDICES_FILE, update_table
 from agalign.method import refine
 from agalign.pixels import masks, raster
 from agalign.rasters.parallax_file import PARALLAX_KIND

@@ -16,8 +16,8 @@ from agalign.batch import index_run
 from agalign.batch.index_run import index_tasks, run_indices
 from agalign.errors import ConfigurationError, InputError
 from agalign.indices.formulas import INDICES, bands_for, compute, evaluate, index_named, index_of_formula
+from agalign.indices.indices_csv import read_table, update_table
 from agalign.indices.rasters import IndexReport, IndexStatistics, write_rasters
-from agalign.indices.table import read_table, update_table
 from agalign.rasters.band_reader import RAW
 from agalign.records.captures import AlignedBand
 from agalign.records.sidecar import FilePart

@@ -16,7 +16,8 @@ from synthetic_flights.relief import make_scene
 import agalign
 from agalign.batch import capture_task as batch
 from agalign.batch import estimate
-from agalign.cameras import pix4d, rig_seed
+from agalign.cameras import pix4d
+from agalign.cameras.base import rig_seed
 from agalign.cameras.metadata import Tags
 from agalign.rasters.alignment_maps import relief_layers
 from agalign.records.sidecar import Sidecar

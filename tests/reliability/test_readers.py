@@ -14,8 +14,8 @@ import tifffile
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from agalign.cameras import known_cameras
 from agalign.cameras.discover import discover
+from agalign.cameras.makers import known_cameras
 from agalign.cameras.metadata import Tags, read_tags
 from agalign.cameras.tag_transfer import capture_tags
 from agalign.cameras.xmp import Packet

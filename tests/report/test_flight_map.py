@@ -25,7 +25,7 @@ from agalign.flight.footprint import (
     with_approximate_georeference,
     with_assumed_height,
 )
-from agalign.rasters.rendered import rendered
+from agalign.rasters.rendered_sidecar import rendered
 from agalign.records.run_record import excluded_part
 from agalign.records.sidecar import Sidecar
 from agalign.report.flight_map import FlightMap, geojson_geometry
