@@ -305,6 +305,7 @@ def test_records_of_other_versions(out: Path) -> None:
 # ---- deleted products
 
 
+@pytest.mark.full
 def test_a_deleted_quality_raster_is_restored_by_the_last_command(flight: Path, out: Path) -> None:
     agalign.align_folder(flight, out, settings=seeded("rig", qa=True))
     raster = out / FOLDER / "IMG_0001.qa.tif"
@@ -319,6 +320,7 @@ def test_a_deleted_quality_raster_is_restored_by_the_last_command(flight: Path, 
     assert raster.read_bytes() == data
 
 
+@pytest.mark.full
 def test_a_deleted_index_is_reported_until_its_command_restores_it(
     flight: Path, aligned_flight: Path, tmp_path: Path
 ) -> None:

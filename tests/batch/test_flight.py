@@ -216,6 +216,7 @@ def test_a_model_is_learned_again_if_its_input_changed(flight: Path) -> None:
     assert before not in [learning_fingerprint(*other) for other in others]
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("fault", [cv2.error("of OpenCV"), in_full_run(agalign.GeometryError("no homography"))])
 def test_a_fault_while_learning_only_loses_the_network_of_the_flight(
     learned_flight: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, fault: Exception
@@ -226,6 +227,7 @@ def test_a_fault_while_learning_only_loses_the_network_of_the_flight(
     assert {b.joint.recipe for r in reports for b in r.sidecar.bands if b.joint} == {"fast"}
 
 
+@pytest.mark.full
 def test_a_band_of_noise_in_one_capture_does_not_change_the_network(learned_flight: Path, tmp_path: Path) -> None:
     """It is trained on the capture, but aligns no more bands of it then."""
     folder = shutil.copytree(learned_flight, tmp_path / "in")

@@ -218,6 +218,7 @@ def test_a_run_that_is_killed_before_rendering_renders_on_resume(
     assert {k: v for k, v in files_of(out).items() if "IMG_0001" in k} == files_of(killed)
 
 
+@pytest.mark.full
 def test_a_run_that_is_killed_while_it_renders_again_renders_on_resume(
     flight: Path, out: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, without_estimating: Callable[[], None]
 ) -> None:
@@ -251,6 +252,7 @@ def ndvi_of_stack(path: Path) -> np.ndarray:
     return np.asarray(((planes["NIR"] - planes["Red"]) / (planes["NIR"] + planes["Red"])).filled(np.nan))
 
 
+@pytest.mark.full
 def test_indices_of_a_later_command_are_calculated_of_the_new_pixels(
     flight: Path, aligned_flight: Path, tmp_path: Path
 ) -> None:

@@ -259,6 +259,7 @@ def test_a_changed_copy_without_tags_is_left_out_next_to_its_original(tmp_path: 
     assert "f_red (1).tif: is left out as a changed copy of f_red.tif" in text_
 
 
+@pytest.mark.full
 def test_long_tags_take_no_quadratic_time(tmp_path: Path) -> None:
     """Half a megabyte takes a fraction of a second; file systems limit the names of files."""
     stored = Band("", tmp_path / "a_red.tif", 1, 8, 8, "uint16")

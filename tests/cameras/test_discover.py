@@ -358,7 +358,7 @@ def test_several_processes_find_what_one_finds(tmp_path: Path, monkeypatch: pyte
     assert [p.text for p in one.problems] == [p.text for p in several.problems]
 
 
-@pytest.mark.slow
+@pytest.mark.full
 def test_a_file_that_takes_too_long_is_left_out(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     folder, modules = tmp_path / "flight", tmp_path / "modules"
     write_all(folder, *(f"f{number}_{band}" for number in range(2) for band in ("green", "red", "nir")))

@@ -246,6 +246,7 @@ def add(estimation: CaptureEstimation, bands: Sequence[RefinedBand]) -> None:
     estimation.add([(b.pair, b.seed) for b in bands], [b.issue or b.joint for b in bands])
 
 
+@pytest.mark.full
 @pytest.mark.parametrize(("family", "is_allowed"), [("auto", True), ("translation", False), ("affine", False)])
 @pytest.mark.parametrize("use", ["auto", in_full_run("always")])
 def test_neither_relief_nor_field_replaces_another_model_family(

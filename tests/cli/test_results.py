@@ -85,6 +85,7 @@ def captures_in(table: Path) -> set[str]:
     return {row["capture"] for row in table_in(table)}
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("has_id", [True, in_full_run(False)])
 def test_a_renamed_exposure_counts_once(flight: Path, tmp_path: Path, has_id: bool) -> None:
     out = tmp_path / "out"

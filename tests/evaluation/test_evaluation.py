@@ -92,6 +92,7 @@ def test_hand_made_descriptors_find_copies_and_nothing_in_unrelated_images(
         evaluation.method_named("mean.pt@64")
 
 
+@pytest.mark.full
 def test_sift_is_evaluated_once_with_its_own_homography(tmp_path: Path) -> None:
     pair = write_pair(tmp_path, TRUTH, 5)
     image = cv2.imread(str(pair.fixed), cv2.IMREAD_GRAYSCALE)

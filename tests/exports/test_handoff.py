@@ -55,7 +55,7 @@ def test_its_reflectance_is_that_of_this_program(undistort: bool, shared: Shared
     assert light == [pytest.approx((IRRADIANCE, math.pi / IRRADIANCE))] * len(photos)
 
 
-@pytest.mark.slow
+@pytest.mark.full
 def test_vignetting_that_no_polynomial_follows_is_corrected_in_all_bands(
     shared: Shared, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -229,7 +229,7 @@ def test_two_cues_leave_out_a_capture_of_a_panel(
     assert result.is_of_a_panel is (len(cues) > 1)
 
 
-@pytest.mark.slow
+@pytest.mark.full
 def test_a_capture_that_the_search_for_panels_cannot_finish_is_abandoned(flight: Path, tmp_path: Path) -> None:
     """A worker process that never opens its image is ended at the time limit; the other capture is planned."""
     # A process imports it at its start.

@@ -237,6 +237,7 @@ def test_the_sidecar_has_the_checksums_of_replaced_rasters(tmp_path: Path) -> No
     assert [part.file for part in read_sidecar(path).products] == listed
 
 
+@pytest.mark.full
 def test_processes_write_what_one_process_writes(tmp_path: Path) -> None:
     make_aligned(tmp_path, 20)
     serial = {r.capture: r.statistics for r in indices_of(tmp_path, target=tmp_path / "a")}

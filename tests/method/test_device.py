@@ -89,7 +89,7 @@ def assert_equal_on_gpu(monkeypatch: pytest.MonkeyPatch) -> AssertEqualOnGpu:
     return check
 
 
-@pytest.mark.slow
+@pytest.mark.full
 @pytest.mark.parametrize(
     ("recipe", "has_float64"), [("fast", False), in_full_run("fast", True), in_full_run("paper", False)]
 )

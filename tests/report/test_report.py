@@ -200,7 +200,7 @@ def test_the_page_of_a_season_is_as_small_as_that_of_a_day(
     assert not (tmp_path / "report-data").exists()
 
 
-@pytest.mark.slow
+@pytest.mark.full
 def test_the_memory_of_a_report_is_that_of_a_few_captures(
     aligned_flight: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
