@@ -1,1 +1,4 @@
-"""The command line: parses, calls the library, prints."""
+"""The command line: parses, calls the library, prints.
+
+In: arguments. Out: text, and an exit code.
+"""
