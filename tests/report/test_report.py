@@ -30,9 +30,9 @@ from agalign.values.image import OutputGrid
 
 from ..conftest import read_json, save_known_model, textured_image
 from ..run_outputs import change, table_in
-from .test_sidecar import NIR, example
+from ..records.test_sidecar import NIR, example
 
-PAGE = Path(agalign.__file__).parent / "products" / "report"
+PAGE = Path(agalign.__file__).parent / "report"
 
 
 @pytest.fixture
