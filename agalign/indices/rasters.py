@@ -36,7 +36,7 @@ from agalign.rasters.geotiff import (
     to_cog,
 )
 from agalign.rasters.product import CapturePaths, Product, ProductContext, WrittenFile
-from agalign.records.captures import AlignedBand
+from agalign.records.captures import AlignedBand, bands_of
 from agalign.records.sidecar import Sidecar
 from agalign.values.capture import Band, Capture
 from agalign.values.equality import equal
@@ -329,6 +329,18 @@ def _bands_of_index(bands: Sequence[AlignedBand], index: Index) -> list[AlignedB
         if band.problem:
             raise InputError(f"{index.name} is left out: {band.problem}")
     return chosen
+
+
+def reason_not_written(index: Index, sidecar: Sidecar, folder: Path) -> str:
+    """Return why an index of a capture cannot be calculated from its aligned bands, given the folder of the sidecar;
+    empty if it can.
+    """
+    with BandReader() as reader:
+        try:
+            _common_unit(index, _bands_of_index(bands_of(sidecar, folder), index), reader)
+        except InputError as error:
+            return str(error)
+    return ""
 
 
 def _fingerprint(index: Index, bands: Sequence[AlignedBand]) -> str:

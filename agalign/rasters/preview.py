@@ -32,8 +32,8 @@ from agalign.values.image import reduced_size_px
 from agalign.values.resampling import NODES_PX
 from agalign.values.spectrum import ROLES
 
-ERROR_FULL_PX = 0.5
-"""Expected error that is shown as white."""
+ERROR_FULL_PX = 2.0
+"""Expected error that is shown as white: twice the largest with which indices use a band."""
 _MAX_TILE_PX = 640
 """Limit of the longer side of a tile."""
 _DETAIL_SHARE = 0.35

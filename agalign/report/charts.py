@@ -1,8 +1,9 @@
 """Drawings of the rig of a flight, and charts of the offsets of its bands over the captures, in SVG units."""
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import cycle
 from pathlib import Path
 from typing import Any
 
@@ -15,9 +16,14 @@ from agalign.flight.rig_file import read_rig
 from agalign.flight.rig_prediction import band_summaries
 from agalign.report.facts import CameraOffsets
 from agalign.values import geometry
+from agalign.values.spectrum import Role, role_of
 
 PLAN_WIDTH, FIELD_WIDTH, CHART_WIDTH, CHART_HEIGHT = 200.0, 160.0, 640.0, 130.0
 Values = NDArray[np.float64]
+_HUES: Mapping[Role, float] = {"blue": 215, "green": 130, "red": 0, "red edge": 325, "nir": 280}
+"""Degrees: the colours of the bands, and two that no visible band has for those that the eye does not see."""
+_FREE_HUES = 45, 180, 85, 250, 20, 300, 155, 235
+"""For other bands, in their order."""
 
 
 @dataclass(frozen=True)
@@ -45,14 +51,14 @@ class DriftChart:
 def rig_views(out: Path, on_problem: Callable[[str], None]) -> list[dict[str, Any]]:
     """Return the rigs of the models below OUT/models; unreadable models are reported to `on_problem`.
 
-    Each has `camera`, number of `captures`, `shared` factors in words, `field_height`, and `bands`: rows of
-    `band_summaries` with `hue`, the position `x`, `y` of the lens in the plan of the rig, and `arrows` (x1, y1, x2, y2)
-    of its displacement field.
+    Each has `camera`, number of `captures`, `shared` factors in words, `field_height`, the `reference` band with
+    `reference_hue` and `reference_y` of its label, and `bands`: rows of `band_summaries` with `hue`, the position `x`,
+    `y` of the lens in the plan of the rig, and `arrows` (x1, y1, x2, y2) of its displacement field.
     """
     views = []
     for path in sorted((out / "models").glob("*.safetensors")):
         try:
-            _, rig = read_rig(path)
+            camera, rig = read_rig(path)
             rows = [] if rig is None else band_summaries(rig)
         except (InputError, GeometryError) as error:
             on_problem(f"{error}" if isinstance(error, InputError) else f"{path}: its rig cannot be used ({error})")
@@ -60,11 +66,17 @@ def rig_views(out: Path, on_problem: Callable[[str], None]) -> list[dict[str, An
         if rig is not None:
             longest = max((math.hypot(*r["baseline"]) for r in rows), default=0.0) or 1.0
             to_plan = 0.36 * PLAN_WIDTH / longest  # leaves space for names
-            for number, row in enumerate(rows):
+            reference = camera.bands[0][0] if camera is not None and camera.bands else ""
+            hues = hues_of([reference, *(row["band"] for row in rows)])
+            for row in rows:
                 x, y = (PLAN_WIDTH / 2 + to_plan * v for v in row["baseline"])
-                row |= {"hue": _hue(number, len(rows)), "x": x, "y": y, "arrows": _arrows(rig, row["band"])}
+                row |= {"hue": hues[row["band"]], "x": x, "y": y, "arrows": _arrows(rig, row["band"])}
+            is_above = sum(row["y"] - PLAN_WIDTH / 2 for row in rows) > 0  # most lenses are below
+            view = {"reference": reference, "reference_hue": hues[reference]}
+            view |= {"reference_y": PLAN_WIDTH / 2 + (-11 if is_above else 21)}
             size = {"field_height": FIELD_WIDTH * rig.size_px[1] / rig.size_px[0], "captures": len(rig.captures)}
-            views.append({"camera": path.stem, "shared": ", ".join(rig.factors) or "nothing", "bands": rows, **size})
+            shared = ", ".join(rig.factors) or "nothing"
+            views.append({"camera": path.stem, "shared": shared, "bands": rows, **view, **size})
     return views
 
 
@@ -79,9 +91,17 @@ def _arrows(rig: Rig, band: str) -> tuple[tuple[float, float, float, float], ...
     return tuple((x, y, x + dx, y + dy) for (x, y), (dx, dy) in zip(starts.tolist(), arrows.tolist(), strict=True))
 
 
-def _hue(number: int, count: int) -> float:
-    """One of `count` equally spaced hues, degrees."""
-    return round(205 + 360 * number / max(count, 1)) % 360
+def hues_of(bands: Sequence[str]) -> dict[str, float]:
+    """Return the hue of each band, degrees: that of its colour by its name; each of the others, and each further band
+    of the same colour, gets a free one.
+    """
+    hues: dict[str, float] = {}
+    free = cycle(_FREE_HUES)
+    for band in bands:
+        role = role_of(band, None)
+        hue = None if role is None else _HUES[role]
+        hues[band] = next(free) if hue is None or hue in hues.values() else hue
+    return hues
 
 
 def drifts_of(cameras: Mapping[str, CameraOffsets]) -> list[DriftChart]:
@@ -103,9 +123,10 @@ def drifts_of(cameras: Mapping[str, CameraOffsets]) -> list[DriftChart]:
         min_full_px = 0.2  # smaller drifts are noise
         full_px = float(np.nanmax(np.abs(aligned), initial=min_full_px))
         step = max(1, math.ceil(len(order) / 400))  # more points than that are not distinguishable
+        hues = hues_of(names)
         lines = (
-            Line(name, _hue(number, len(names)), _polylines(of_band, full_px, step))
-            for number, (name, of_band) in enumerate(zip(names, aligned, strict=True))
+            Line(name, hues[name], _polylines(of_band, full_px, step))
+            for name, of_band in zip(names, aligned, strict=True)
         )
         ends = known.labels[order[0]][1], known.labels[order[-1]][1]
         result.append(DriftChart(f"{camera} from capture to capture", full_px, tuple(lines), ends))

@@ -19,6 +19,7 @@ from agalign.indices.rasters import IndexReport
 from agalign.records.cautions import NO_RESULT, Caution, RunFacts
 from agalign.records.sidecar import BandResult, GeometryPart, GridPart, OutputPart, Sidecar
 from agalign.report.data_files import DataParts
+from agalign.report.verdict import Verdict, is_by_prediction, unwritten_indices, usable_bands
 from agalign.values.alignment import Prediction
 from agalign.values.issues import OTHER_REFERENCE, Remedy
 
@@ -213,8 +214,9 @@ class FlightFacts:
     def __init__(self, out: Path) -> None:
         self.out = out
         self.pairs = PairTotals(RunFacts.of(out))
+        self.verdict = Verdict()
         self.statuses: Counter[str] = Counter()
-        """Number of captures by status."""
+        """Number of captures by status as the page shows it: `ok_by_prediction` is not `ok`."""
         self.cameras: dict[str, CameraOffsets] = {}
         """By name."""
         self.seconds: dict[str, float] = {}
@@ -238,6 +240,7 @@ class FlightFacts:
         # The page has links by the label that it shows.
         for caution in self.pairs.add(escape_controls(label), sidecar):
             checks[caution.band].append(caution.reason)
+        self.verdict.add(escape_controls(label), sidecar)
         output, position, path = sidecar.output, sidecar.position, Path(folder)
         grid = output or OutputPart(file=None, crop=(0, 0, *sidecar.reference.size_px), nodata=None)
         files = {part.kind: part.file for part in sidecar.products}
@@ -247,11 +250,16 @@ class FlightFacts:
         if sidecar.preview is not None:
             detail = [round(v, 5) for v in sidecar.preview.detail]
             preview = sidecar.preview.model_dump() | {"file": _link(path, sidecar.preview.file), "detail": detail}
+        unwritten = list(unwritten_indices(sidecar, self.out / path, indices))
+        for index, why in unwritten:
+            self.verdict.add_unwritten(escape_controls(label), index, why)
+        errors_px = [b.error.std_px for b in usable_bands(sidecar) if b.error is not None]
         facts = {
             "label": label,
             "captured_at": sidecar.captured_at,
             "camera": sidecar.camera.name or "unknown camera",
             "status": sidecar.status,
+            "shown": "ok_by_prediction" if is_by_prediction(sidecar) else sidecar.status,
             "position": None if position is None else (position.latitude, position.longitude),
             "altitude_m": None if position is None else position.altitude_m,
             "missing": sidecar.missing_bands,
@@ -268,6 +276,8 @@ class FlightFacts:
             "preview": preview,
             "bands": [self._pair(b, sidecar, keys, checks[b.band]) for b in sidecar.bands],
             "indices": [self._index(row) for row in indices if row.path is not None],
+            "unwritten": unwritten,
+            "error_px": rounded(max(errors_px, default=None)),
         }
         for name, status, reason in sidecar.pairs:
             if status == "missing":
@@ -280,7 +290,7 @@ class FlightFacts:
 
     def _count(self, facts: dict[str, Any]) -> None:
         label, camera = facts["label"], self.cameras.setdefault(facts["camera"], CameraOffsets())
-        self.statuses[facts["status"]] += 1
+        self.statuses[facts["shown"]] += 1
         self.seconds[label] = facts["seconds"]
         self.placed += facts["position"] is not None
         usable = [b for b in facts["bands"] if b["status"] in ("aligned", "predicted") and b["offset_px"]]
@@ -387,12 +397,15 @@ class FlightFacts:
         known_px = np.where(is_measured, shifts_px, 0.0)
         steps = np.rint(known_px / _SHIFT_STEP_PX).astype(int).ravel().tolist()
         shifts = zip(steps, is_measured.ravel().tolist(), strict=True)
+        error_px = None if band.error is None else rounded(band.error.std_px)
         # The first nine columns of the table have the same names here.
         return {name: row[name] for name in tuple(BAND_COLUMNS)[:9]} | {
             "seconds": round(band.seconds, 2),
             "written": band.place is not None,
             "offset_px": offset_px,
             "offset_length_px": offset_length_px,
+            "error_px": error_px,
+            "over_1_px": band.share_over_1_px,
             "coverage": row["residual_coverage"],
             "similarity": None if metrics is None else similarity,
             "prediction": _prediction(band.prediction),
@@ -408,17 +421,13 @@ def _row_of(facts: dict[str, Any]) -> dict[str, Any]:
     """The row of a capture in the table of the page, and its dot on the map."""
     moving = [b for b in facts["bands"] if b["status"] != "reference"]
     aligned = [b for b in moving if b["status"] == "aligned"]
-    largest = {
-        name: max((b[name] for b in aligned if b[name] is not None), default=None)
-        for name in ("residual_px", "corner_std_px")
-    }
-    same = "label", "captured_at", "camera", "status", "position", "altitude_m", "missing", "seconds", "stack"
-    return {name: facts[name] for name in same} | {
+    same = "label", "captured_at", "camera", "status", "shown", "position", "altitude_m", "missing", "seconds", "stack"
+    return {name: facts[name] for name in (*same, "error_px")} | {
         "bands": [(b["band"], b["status"]) for b in moving],
-        **largest,
+        "residual_px": max((b["residual_px"] for b in aligned if b["residual_px"] is not None), default=None),
         "indices": {i["name"]: i["median"] for i in facts["indices"]},
         "raw": any(i["raw"] for i in facts["indices"]),
-        "check": bool(facts["missing"]) or any(b["check"] or b["reason"] for b in facts["bands"]),
+        "check": bool(facts["missing"] or facts["unwritten"]) or any(b["check"] or b["reason"] for b in facts["bands"]),
     }
 
 

@@ -12,8 +12,8 @@
  * @typedef {{kind: string, held_out_p95_px: Record<string, number | null>}} Geometry
  * @typedef {{band: string, wavelength_nm: number | null, status: string, reason: string | null, seed: string | null,
  *   seconds: number, written: boolean, offset_px: [number, number] | null, offset_length_px: number | null,
- *   residual_px: number | null, residual_p95_px: number | null, coverage: number | null, retrieval: number | null,
- *   corner_std_px: number | null, similarity: Record<string, [number | null, number | null]> | null,
+ *   residual_px: number | null, residual_p95_px: number | null, error_px: number | null, over_1_px: number | null,
+ *   coverage: number | null, retrieval: number | null, corner_std_px: number | null, similarity: Record<string, [number | null, number | null]> | null,
  *   prediction: Prediction | null, geometry: Geometry | null, occluded: number | null, check: string[], lattice: number,
  *   shifts: (number | null)[]}} Pair
  * @typedef {{name: string, median: number | null, p5: number | null, p95: number | null, valid: number, masked: number,
@@ -21,17 +21,19 @@
  * @typedef {{file: string, tile_px: [number, number], detail_px: [number, number],
  *   detail: [number, number, number, number], error_full_px: number | null,
  *   relief: {parallax_px: [number, number], range_m: [number, number] | null} | null}} Preview
- * @typedef {{label: string, captured_at: string, camera: string, status: string, position: [number, number] | null,
+ * @typedef {{label: string, captured_at: string, camera: string, status: string, shown: string, position: [number, number] | null,
  *   accept_predicted_px: number,
  *   radiometry: string | null, altitude_m: number | null, missing: string[], reference: string, seconds: number,
  *   crop: [number, number, number, number], scale: [number, number], stack: string | null, sidecar: string,
  *   relief: string | null,
- *   picture: string | null, preview: Preview | null, bands: Pair[], indices: Index[]}} Capture
- * @typedef {{label: string, captured_at: string, camera: string, status: string, position: [number, number] | null,
+ *   picture: string | null, preview: Preview | null, bands: Pair[], indices: Index[],
+ *   unwritten: [string, string][]}} Capture `shown` is its status, or "ok_by_prediction"; `unwritten` has index and reason.
+ * @typedef {{label: string, captured_at: string, camera: string, status: string, shown: string, position: [number, number] | null,
  *   altitude_m: number | null, missing: string[], seconds: number, stack: string | null, bands: [string, string][],
- *   residual_px: number | null, corner_std_px: number | null, indices: Record<string, number | null>, raw: boolean,
+ *   residual_px: number | null, error_px: number | null, indices: Record<string, number | null>, raw: boolean,
  *   check: boolean}} Row
- *   The row of a capture in the table, with name and status of each moving band, and the largest errors of aligned ones.
+ *   The row of a capture in the table, with name and status of each moving band, the largest residual of
+ *   the aligned ones, and the largest expected error of those that indices can use.
  * @typedef {{from: number, records: Row[]}} Rows
  * @typedef {{from: number, records: Capture[], first_lattice: number, lattices: number[][]}} Details
  *   `from` is the number of captures before the part, `first_lattice` the number of lattices.
@@ -39,6 +41,7 @@
  *   row_files: string[], detail_files: string[]}} FlightFacts The first part of rows and details, and the files of others.
  * @typedef {{column: number, colour: string, inverted?: boolean}} Channel
  * @typedef {"before" | "after"} When
+ * @typedef {[text: string, term?: string]} Head The head of a column, and its term in the help of the page.
  */
 
 /** @type {FlightFacts} */
@@ -175,9 +178,14 @@ function tableRow(cells, isNumber) {
   return el("tr", {}, ...cells.map((cell, i) => (i === 0 ? el("th", { scope: "row" }, cell) : el("td", { class: isNumber(i) ? "n" : "" }, cell))));
 }
 
-/** @param {string[]} heads @param {(Node | string)[][]} rows @param {(column: number) => boolean} isNumber */
+/** The meaning of a term in the help of the page; false without a term. @param {string} [term] */
+function meaning(term) {
+  return term !== undefined && (byId(`term-${term}`).textContent ?? "");
+}
+
+/** @param {Head[]} heads @param {(Node | string)[][]} rows @param {(column: number) => boolean} isNumber */
 function tableOf(heads, rows, isNumber) {
-  const head = el("tr", {}, ...heads.map((text, i) => el("th", { scope: "col", class: isNumber(i) ? "n" : "" }, text)));
+  const head = el("tr", {}, ...heads.map(([text, term], i) => el("th", { scope: "col", class: isNumber(i) ? "n" : "", title: meaning(term) }, text)));
   const made = el("table", {}, el("thead", {}, head), el("tbody", {}, ...rows.map((cells) => tableRow(cells, isNumber))));
   labelCells(made);
   return el("div", { class: "scroll" }, made);
@@ -203,7 +211,7 @@ function percent(share) {
 
 /** @param {string} status */
 function inWords(status) {
-  return status.replace("_", " ");
+  return status.replaceAll("_", " ");
 }
 
 /** @param {Capture} capture @returns {Pair[]} */
@@ -224,13 +232,14 @@ function address(row) {
 
 // ---- the table
 
-/** @type {{title: string, numeric: boolean, wide?: boolean, value: (c: Row) => string | number | null, cell: (c: Row) => Node | string}[]} */
+const STATUS_COLOURS = { failed: "#d43c3c", degraded: "#d98a1b", ok_by_prediction: "#3b7dd8", ok: "#2f9e61" }; // worst first
+/** @type {{title: string, term?: string, numeric: boolean, wide?: boolean, value: (c: Row) => string | number | null, cell: (c: Row) => Node | string}[]} */
 const columns = [
   { title: "Capture", numeric: false, value: (c) => c.label, cell: (c) => el("a", { href: address(c) }, c.label) },
-  { title: "Status", numeric: false, value: (c) => ["failed", "degraded", "ok"].indexOf(c.status), cell: (c) => badge(c.status) },
+  { title: "Status", numeric: false, value: (c) => Object.keys(STATUS_COLOURS).indexOf(c.shown), cell: captureBadge },
   { title: "Bands", numeric: false, value: (c) => c.bands.filter(([, status]) => status === "aligned").length / Math.max(1, c.bands.length + c.missing.length), cell: chips },
-  { title: "Largest residual, px", numeric: true, value: (c) => c.residual_px, cell: (c) => fixed(c.residual_px, 3) },
-  { title: "Corner error, px", numeric: true, wide: true, value: (c) => c.corner_std_px, cell: (c) => fixed(c.corner_std_px, 3) },
+  { title: "Expected error, px", term: "expected_error", numeric: true, value: (c) => c.error_px, cell: (c) => fixed(c.error_px, 3) },
+  { title: "Largest residual, px", term: "residual", numeric: true, wide: true, value: (c) => c.residual_px, cell: (c) => fixed(c.residual_px, 3) },
   { title: "Taken", numeric: false, wide: true, value: (c) => c.captured_at, cell: (c) => taken(c.captured_at) },
   { title: "Seconds", numeric: true, wide: true, value: (c) => c.seconds, cell: (c) => c.seconds.toFixed(1) },
 ];
@@ -238,9 +247,19 @@ const PAGE_ROWS = 200; // of the table: more make the page slow
 const table = { sorted: 0, up: true, page: 0, /** @type {Map<Row, HTMLTableRowElement>} */ rows: new Map() };
 const inOrder = new Intl.Collator(undefined, { numeric: true });
 
-/** @param {string} status */
-function badge(status) {
-  return el("span", { class: `badge ${status}` }, inWords(status));
+/** @param {string} status @param {string} [term] */
+function badge(status, term = status) {
+  return el("span", { class: `badge ${status}`, title: meaning(term) }, inWords(status));
+}
+
+/** @param {{shown: string}} row */
+function captureBadge(row) {
+  return badge(row.shown, row.shown === "failed" ? "degraded" : row.shown);
+}
+
+/** @param {Pair} pair */
+function bandBadge(pair) {
+  return badge(pair.status, pair.status === "failed" ? "seed_only" : pair.status);
 }
 
 /** @param {Row} row */
@@ -260,7 +279,7 @@ function tableHead() {
       table.page = 0;
       tableBody();
     };
-    line.append(el("th", { scope: "col", class: `${column.numeric ? "n" : ""}${column.wide ? " wide-only" : ""}` }, button(column.title, sort)));
+    line.append(el("th", { scope: "col", class: `${column.numeric ? "n" : ""}${column.wide ? " wide-only" : ""}`, title: meaning(column.term) }, button(column.title, sort)));
   });
   byId("table").querySelector("thead")?.replaceChildren(line);
 }
@@ -282,7 +301,7 @@ function chosen() {
   const sign = table.up ? 1 : -1;
   return captures
     .filter((c) => !text || `${c.label} ${c.captured_at} ${c.camera}`.toLowerCase().includes(text))
-    .filter((c) => only === "all" || only === c.status || (only === "check" && c.check) || (only === "short" && isShort(c)) || (only === "predicted" && c.bands.some(([, status]) => status === "predicted")))
+    .filter((c) => only === "all" || only === c.shown || (only === "check" && c.check) || (only === "short" && isShort(c)) || (only === "predicted" && c.bands.some(([, status]) => status === "predicted")))
     .sort((a, b) => {
       const [x, y] = [value(a), value(b)];
       if (x === null || y === null) return Number(x === null) - Number(y === null);
@@ -320,8 +339,7 @@ const MAP_FULL_PX = 1; // fixed, so that colours mean the same in every report; 
 const INDEX_STOPS = [[38, 70, 148], [120, 74, 40], [214, 190, 120], [250, 245, 170], [90, 180, 80], [0, 90, 40]];
 const NEUTRAL_STOPS = [[20, 20, 20], [245, 245, 245]];
 const MISSING_COLOUR = "#c9a";
-const RAW_NOTE = "Of raw numbers, not reflectance: values of different captures are not comparable.";
-const STATUS_COLOURS = { ok: "#2f9e61", degraded: "#d98a1b", failed: "#d43c3c" };
+const RAW_NOTE = "From raw numbers, not reflectance: values of different captures are not comparable.";
 /** @type {Map<Row, Element>} */
 const dots = new Map();
 
@@ -384,9 +402,9 @@ function colourMap() {
   const what = /** @type {HTMLSelectElement} */ (byId("map-colour")).value;
   const legend = byId("map-legend");
   if (what === "status") {
-    for (const [c, dot] of dots) set(dot, { fill: colourOf(c.status) });
-    const present = Object.keys(STATUS_COLOURS).filter((s) => captures.some((c) => c.status === s));
-    legend.replaceChildren(...present.map((s) => key(colourOf(s), s)));
+    for (const [c, dot] of dots) set(dot, { fill: colourOf(c.shown) });
+    const present = Object.keys(STATUS_COLOURS).filter((s) => captures.some((c) => c.shown === s)).reverse();
+    legend.replaceChildren(...present.map((s) => key(colourOf(s), inWords(s))));
     return;
   }
   if (what.startsWith("index:")) {
@@ -394,7 +412,7 @@ function colourMap() {
     return;
   }
   for (const [c, dot] of dots) {
-    const value = c[/** @type {"residual_px"} */ (what)];
+    const value = c[/** @type {"residual_px" | "error_px"} */ (what)];
     set(dot, { fill: value === null ? MISSING_COLOUR : ramp(value / MAP_FULL_PX) });
   }
   const steps = [0, 0.5, 1].map((s) => key(ramp(s), `${(s * MAP_FULL_PX).toFixed(2)} px${s === 1 ? " and more" : ""}`));
@@ -448,7 +466,7 @@ function saveMap() {
     geometry: { type: "Point", coordinates: [c.position?.[1], c.position?.[0], ...(c.altitude_m === null ? [] : [c.altitude_m])] },
     properties: {
       capture: c.label, captured_at: c.captured_at, camera: c.camera, status: c.status, stack: c.stack,
-      residual_px: c.residual_px, corner_std_px: c.corner_std_px,
+      residual_px: c.residual_px, expected_error_px: c.error_px,
       ...Object.fromEntries(Object.entries(c.indices).map(([name, median]) => [`${name}_median`, median])),
     },
   }));
@@ -475,17 +493,21 @@ function ramp(share) {
 
 const CHANNELS = ["#f00", "#0f0", "#00f"];
 const LARGEST_ZOOM = 40;
-const FULL_PX = 0.5; // a residual's colour and arrow are full
+const ERROR_FULL_PX = 2; // a residual's colour is full, as in the previews: twice the limit for any use
+const ERROR_MARKS_PX = [0, 0.5, 1, 2];
+const SMALL = [0, 32, 77]; // colours of errors; no vegetation has them, neither in true nor in false colour
+const LARGE = [255, 234, 70];
+const ARROW_FULL_PX = 0.5; // the arrow of a residual is full
 const FAR = [25, 35, 150]; // colours of the relief; between them the lightness grows with the parallax
 const NEAR = [205, 250, 45];
 const INDEX_OPACITY = 0.9;
 const INDEX_PICTURE_PX = 720; // longer side of the image in the picture of an index; the histogram is below it
-const RELIEF_OPACITY = 0.75; // edges of the picture show through
+const MAP_OPACITY = 0.75; // of errors and relief: edges of the picture show through
 /** @type {Record<string, string>} */
 const NOTES = {
-  vectors: `Residual shift of each window; an arrow of ${FULL_PX} px reaches most of the way to the next window. Grey: none could be measured.`,
-  heat: `Residual shift of each window, full at ${FULL_PX} px.`,
-  error: "The error to be expected at every pixel, as far as it is known: the more orange, the larger, full at 0.5 px.",
+  vectors: `Residual shift of each window; an arrow of ${ARROW_FULL_PX} px or more reaches most of the way to the next window. Grey: none could be measured.`,
+  heat: "Residual shift of each window:",
+  error: "Expected error at every pixel (unknown: as the largest):",
   relief: "Parallax relative to the plane that most of the scene is on: the lighter, the nearer.",
 };
 const BLINK_MS = 700;
@@ -563,7 +585,7 @@ function heading(row, capture) {
     if (file !== null) files.append(" · ", el("a", { href: String(file) }, String(name)));
   }
   return [
-    el("div", { class: "heading" }, el("h2", { id: "capture-title" }, capture.label, " ", badge(capture.status)), step("Previous", at < 0 ? undefined : order[at - 1]), step("Next", at < 0 ? undefined : order[at + 1])),
+    el("div", { class: "heading" }, el("h2", { id: "capture-title" }, capture.label, " ", captureBadge(capture)), step("Previous", at < 0 ? undefined : order[at - 1]), step("Next", at < 0 ? undefined : order[at + 1])),
     el("p", { class: "soft" }, `${capture.camera} · ${taken(capture.captured_at)}${where} · reference ${capture.reference}`, files),
   ];
 }
@@ -659,14 +681,15 @@ function viewTools() {
 /** @param {Capture} capture */
 function overlayTools(capture) {
   const line = el("div", { class: "tools" });
-  const overlays = [["none", "nothing"], ["vectors", "residual vectors"], ["heat", "residual heat map"]];
-  if (capture.preview?.error_full_px) overlays.push(["error", "error to be expected"]);
-  if (capture.preview?.relief) overlays.push(["relief", "relief of all bands"]);
+  const overlays = [["none", "none"], ["vectors", "residual vectors"], ["heat", "residual heat map"]];
+  if (capture.preview?.error_full_px) overlays.push(["error", "expected error"]);
+  if (capture.preview?.relief) overlays.push(["relief", "parallax of the capture"]);
   for (const index of capture.indices) overlays.push([`index:${index.name}`, index.name.toUpperCase()]);
-  line.append(
-    choice("Overlay", overlays, look.overlay, (value) => { look.overlay = value; paint(); }, "Overlay"),
-    choice("of", moving(capture).map((b) => [b.band, b.band]), look.overlayBand, (value) => { look.overlayBand = value; paint(); }, "Band of the overlay"),
-  );
+  const band = choice("for band", moving(capture).map((b) => [b.band, b.band]), look.overlayBand, (value) => { look.overlayBand = value; paint(); }, "Band of the overlay");
+  /** The other overlays are of all bands. */
+  const showBand = () => { band.hidden = !["vectors", "heat", "error"].includes(look.overlay); };
+  line.append(choice("Overlay", overlays, look.overlay, (value) => { look.overlay = value; showBand(); paint(); }, "Overlay"), band);
+  showBand();
   return line;
 }
 
@@ -741,7 +764,17 @@ function onSheet(preview, column, line) {
 
 /** @param {number} share From far to near. */
 function reliefColour(share) {
-  return `rgb(${FAR.map((far, i) => Math.round(far + share * (NEAR[i] - far))).join(" ")})`;
+  return mixed(FAR, NEAR, share);
+}
+
+/** @param {number} px An expected error, or the length of a residual. @param {number} [full_px] */
+function errorColour(px, full_px = ERROR_FULL_PX) {
+  return mixed(SMALL, LARGE, Math.min(1, px / full_px));
+}
+
+/** @param {number[]} from @param {number[]} to @param {number} share */
+function mixed(from, to, share) {
+  return `rgb(${from.map((v, i) => Math.round(v + share * (to[i] - v))).join(" ")})`;
 }
 
 /**
@@ -782,6 +815,14 @@ function composed(line, channels) {
   const key = `${line} ${channels.map((c) => c.column).join(" ")}`;
   look.composed[key] ??= compose(look.sheet, preview, line, channels);
   return look.composed[key];
+}
+
+/**
+ * A grey picture of a row in colours from that of black to that of white.
+ * @param {number} line @param {number} column @param {string} black @param {string} white
+ */
+function dyed(line, column, black, white) {
+  return composed(line, [{ column, colour: white }, { column, colour: black, inverted: true }]);
 }
 
 function paint() {
@@ -832,7 +873,10 @@ function channelNote(capture) {
  * @param {Preview} preview
  */
 function legend(preview) {
-  if (["vectors", "heat"].includes(look.overlay)) return [0, 0.5, 1].map((share) => key(ramp(share), `${(share * FULL_PX).toFixed(2)} px`));
+  if (["vectors", "heat", "error"].includes(look.overlay)) {
+    const full_px = look.overlay === "error" ? preview.error_full_px ?? 0 : ERROR_FULL_PX;
+    return ERROR_MARKS_PX.filter((px) => px <= full_px).map((px) => key(errorColour(px, full_px), `${px} px${px === full_px ? " and more" : ""}`));
+  }
   const index = look.capture ? indexOf(look.capture) : undefined;
   if (index) {
     const [low, high] = index.span;
@@ -890,9 +934,8 @@ function over(pen, capture, at) {
   else if (look.overlay === "heat") overHeat(pen, capture, pair, at);
   else if (look.overlay === "vectors") overVectors(pen, capture, pair, at);
   else {
-    const made = look.overlay === "relief" ? relief(capture) : capture.preview?.error_full_px ? composed(4, [{ column, colour: "#ff5a1f" }]) : null;
-    if (look.overlay === "error") pen.globalCompositeOperation = "screen";
-    else pen.globalAlpha = RELIEF_OPACITY;
+    const made = look.overlay === "relief" ? relief(capture) : capture.preview?.error_full_px ? dyed(4, column, mixed(SMALL, LARGE, 0), mixed(SMALL, LARGE, 1)) : null;
+    pen.globalAlpha = MAP_OPACITY;
     const [x, y] = at(0, 0);
     const [right, bottom] = at(1, 1);
     if (made) pen.drawImage(made, x, y, right - x, bottom - y);
@@ -914,8 +957,8 @@ function overVectors(pen, capture, pair, at) {
     const [dx, dy] = [pair.shifts[i], pair.shifts[i + 1]];
     const [x, y] = at((sx * (lattice[i] + 0.5) - x0) / width, (sy * (lattice[i + 1] + 0.5) - y0) / height);
     const shift = dx === null || dy === null ? null : [dx * facts.shift_step_px, dy * facts.shift_step_px];
-    pen.fillStyle = shift === null ? "#bbb" : ramp(Math.hypot(...shift) / FULL_PX);
-    arrow(pen, x, y, shift === null ? [0, 0] : shift.map((v, k) => 1.6 * cell[k] * v / Math.max(FULL_PX, Math.hypot(...shift))));
+    pen.fillStyle = shift === null ? "#bbb" : errorColour(Math.hypot(...shift));
+    arrow(pen, x, y, shift === null ? [0, 0] : shift.map((v, k) => 1.6 * cell[k] * v / Math.max(ARROW_FULL_PX, Math.hypot(...shift))));
   }
 }
 
@@ -962,13 +1005,13 @@ function overHeat(pen, capture, pair, at) {
   const toX = (px) => Math.round(at((sx * (px + 0.5) - x0) / width, 0)[0]);
   /** @param {number} px */
   const toY = (px) => Math.round(at(0, (sy * (px + 0.5) - y0) / height)[1]);
-  pen.globalAlpha = 0.75;
+  pen.globalAlpha = MAP_OPACITY;
   for (let i = 0; i < lattice.length; i += 2) {
     const [dx, dy] = [pair.shifts[i], pair.shifts[i + 1]];
     const [column, line] = [columns.get(lattice[i]), rows.get(lattice[i + 1])];
     if (dx === null || dy === null || !column || !line) continue;
     const [left, right, top, bottom] = [toX(column[0]), toX(column[1]), toY(line[0]), toY(line[1])];
-    pen.fillStyle = ramp(Math.hypot(dx, dy) * facts.shift_step_px / FULL_PX);
+    pen.fillStyle = errorColour(Math.hypot(dx, dy) * facts.shift_step_px);
     pen.fillRect(left, top, right - left, bottom - top);
   }
 }
@@ -993,7 +1036,7 @@ function edges(places) {
 function relief(capture) {
   const preview = capture.preview;
   if (!preview?.relief) return null;
-  return composed(preview.error_full_px ? 5 : 4, [{ column: 0, colour: reliefColour(1) }, { column: 0, colour: reliefColour(0), inverted: true }]);
+  return dyed(preview.error_full_px ? 5 : 4, 0, reliefColour(0), reliefColour(1));
 }
 
 /**
@@ -1091,13 +1134,15 @@ function listenToStage() {
 
 /** @param {Capture} capture */
 function indexTable(capture) {
-  if (!capture.indices.length) return [];
-  const heads = ["Index", "Median", "5th percentile", "95th percentile", "Valid pixels", "Masked by flags", "Of"];
+  const absent = capture.unwritten.map(([name, reason]) => el("p", { class: "unwritten" }, el("b", {}, name.toUpperCase()), ` was not written: ${reason}.`));
+  if (!capture.indices.length) return absent;
+  /** @type {Head[]} */
+  const heads = [["Index"], ["Median"], ["5th percentile"], ["95th percentile"], ["Valid pixels"], ["Masked by quality flags"], ["Unit of the bands"]];
   const rows = capture.indices.map((index) => [
     el("a", { href: index.file }, index.name.toUpperCase()), fixed(index.median, 3), fixed(index.p5, 3), fixed(index.p95, 3),
     percent(index.valid), percent(index.masked), index.unit,
   ]);
-  return [el("div", { id: "indices" }, tableOf(heads, rows, (i) => i > 0 && i < 6))];
+  return [el("div", { id: "indices" }, tableOf(heads, rows, (i) => i > 0 && i < 6)), ...absent];
 }
 
 /** @param {Capture} capture */
@@ -1109,24 +1154,28 @@ function words(capture) {
   return list;
 }
 
+const MIN_OVER_1_PX = 0.005; // smaller shares are at the edges
+
 /**
  * What became of a band, for the user of the map.
  * @param {Pair} pair @param {Capture} capture
  */
 function sentence(pair, capture) {
   const offset = pair.offset_length_px === null || pair.offset_length_px < 0.05 ? "" : `had an offset of ${fixed(pair.offset_length_px, pair.offset_length_px < 10 ? 1 : 0)} px from ${capture.reference} and `;
+  const over = pair.over_1_px === null || pair.over_1_px < MIN_OVER_1_PX ? "" : ` ${percent(pair.over_1_px)} of its pixels may be off by more than 1 px.`;
   if (pair.status === "aligned") {
     const left = pair.residual_px;
     if (left === null) return `${offset}is aligned; no window could measure a residual.`;
     const most = pair.residual_p95_px === null ? "" : `, 95 % ${fixed(pair.residual_p95_px)} px`;
     const seen = pair.occluded === null ? "" : ` The relief of the capture is corrected; ${percent(pair.occluded)} of its image is occluded.`;
-    return `${offset}is aligned: median residual ${fixed(left)} px${most}; where it has texture, the expected error is at most 0.5 px in 90 % of the image, suitable for indices of single plants.${seen}`;
+    const error = pair.error_px === null ? "" : `expected error ${fixed(pair.error_px)} px (RMS), and `;
+    return `${offset}is aligned: ${error}at most 0.5 px in 90 % of the area with texture, suitable for indices of single plants. Median residual ${fixed(left)} px${most}.${over}${seen}`;
   }
   if (pair.status === "predicted") {
     const std = pair.prediction?.std_px ?? Infinity;
-    const use = std <= capture.accept_predicted_px ? "suitable for indices within that error" : "not suitable for indices";
+    const use = std <= capture.accept_predicted_px ? "indices can use it, but its own image does not confirm it" : "not suitable for indices";
     const how = pair.prediction?.from === "windows" ? "is predicted by its windows" : "is predicted by the rig of the flight";
-    return `${offset}${how}, standard error ${fixed(std)} px (${use}): ${pair.reason ?? "no reason was recorded"}.`;
+    return `${offset}${how}, standard error ${fixed(std)} px (${use}): ${pair.reason ?? "no reason was recorded"}.${over}`;
   }
   if (pair.status === "seed_only") return `is not aligned: ${pair.reason ?? "no reason was recorded"}. Only its seed is applied; exclude it from indices.`;
   return `failed: ${pair.reason ?? "no reason was recorded"}. It is nodata in the output.`;
@@ -1134,17 +1183,21 @@ function sentence(pair, capture) {
 
 /** @param {Capture} capture */
 function numbers(capture) {
-  const heads = ["Band", "Status", "Seed", "Residual, px", "95 %, px", "Coverage", "Corner error, px", "Retrieval", "Geometry, 95 %", "Relief, occluded", "Seconds"];
+  /** @type {Head[]} */
+  const heads = [
+    ["Band"], ["Status"], ["Start", "seed"], ["Expected error, px", "expected_error"], ["Over 1 px", "over_1_px"], ["Residual, median, px", "residual"],
+    ["Residual, p95, px", "residual"], ["Windows measured", "coverage"], ["Retrieval", "retrieval"], ["Geometry, p95, px", "geometry"], ["Occluded", "occluded"], ["Seconds"],
+  ];
   const rows = moving(capture).map((pair) => {
     const heldOut = pair.geometry === null ? {} : pair.geometry.held_out_p95_px;
     const geometry = pair.geometry === null ? "–" : `${pair.geometry.kind}${Object.keys(heldOut).length > 1 ? ` (${Object.entries(heldOut).map(([kind, px]) => `${kind} ${fixed(px)}`).join(", ")})` : ""}`;
     return [
-      pair.band, badge(pair.status), pair.seed ?? "–", fixed(pair.residual_px, 3), fixed(pair.residual_p95_px, 3),
-      pair.coverage === null ? "–" : `${Math.round(pair.coverage * 100)} %`, fixed(pair.corner_std_px, 3), fixed(pair.retrieval), geometry,
+      pair.band, bandBadge(pair), pair.seed ?? "–", fixed(pair.error_px, 3), pair.over_1_px === null ? "–" : percent(pair.over_1_px),
+      fixed(pair.residual_px, 3), fixed(pair.residual_p95_px, 3), pair.coverage === null ? "–" : `${Math.round(pair.coverage * 100)} %`, fixed(pair.retrieval), geometry,
       pair.occluded === null ? "–" : percent(pair.occluded), pair.seconds.toFixed(1),
     ];
   });
-  const words = heads.indexOf("Geometry, 95 %");
+  const words = heads.findIndex(([, term]) => term === "geometry");
   return tableOf(heads, rows, (i) => i > 2 && i !== words);
 }
 
@@ -1157,7 +1210,8 @@ function similarities(capture) {
     const [before, after] = pair.similarity?.[name] ?? [null, null];
     return `${fixed(before, 3)} → ${fixed(after, 3)}`;
   })]);
-  const heads = ["Band", ...SIMILARITIES.map(([, title]) => title)];
+  /** @type {Head[]} */
+  const heads = [["Band"], ...SIMILARITIES.map(([, title]) => /** @type {Head} */ ([title, "similarity"]))];
   return el("details", { class: "more" }, el("summary", {}, "Similarity of the images before → after alignment (Mattes MI: lower is better, others: higher)"), tableOf(heads, rows, (i) => i > 0));
 }
 

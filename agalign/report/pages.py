@@ -28,6 +28,7 @@ from agalign.report.charts import drifts_of, rig_views
 from agalign.report.data_files import data_files_exist, printable, remove_other_data_files
 from agalign.report.facts import SUMMARY_FILE, FlightFacts
 from agalign.report.flight_map import FlightMap
+from agalign.report.terms import PAGES, TERMS
 
 REPORT_FILE = "index.html"
 _MAX_LISTED = 100
@@ -88,6 +89,8 @@ def write_pages(out: Path, on_problem: Callable[[str], None]) -> FlightFacts:
         median=median,
         flight=facts,
         facts=facts.in_page(),
+        terms=TERMS,
+        pages=PAGES,
         max_listed=_MAX_LISTED,
         max_excluded=_MAX_EXCLUDED,
         run=run,

@@ -29,8 +29,8 @@ from agalign.values.capture import Band, Capture
 from agalign.values.image import OutputGrid
 
 from ..conftest import read_json, save_known_model, textured_image
-from ..run_outputs import change, table_in
 from ..records.test_sidecar import NIR, example
+from ..run_outputs import change, table_in
 
 PAGE = Path(agalign.__file__).parent / "report"
 

@@ -1,0 +1,115 @@
+"""The verdict about a flight: which band pairs indices can use, how accurate they are expected to be, and which indices
+were requested and not written.
+"""
+
+from collections import Counter, defaultdict
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from statistics import median
+from typing import NamedTuple
+
+from agalign.errors import ConfigurationError
+from agalign.indices.formulas import index_named
+from agalign.indices.rasters import IndexReport, reason_not_written
+from agalign.records.sidecar import BandResult, Sidecar
+
+_NO_RASTER = "its raster does not exist; 'agalign indices' writes it"
+
+
+class ExpectedError(NamedTuple):
+    """The expected error of a band of a capture."""
+
+    std_px: float
+    """RMS over the area that both images show, px of the reference."""
+    capture: str
+    band: str
+    share_over_1_px: float | None
+    """Share of the written pixels whose expected error is larger than 1 px or unknown; None if none was written."""
+
+
+@dataclass
+class Verdict:
+    """The moving bands that indices can use, over all captures, and the indices that were not written."""
+
+    usable: Counter[str] = field(default_factory=Counter)
+    """Number of usable moving bands by status: aligned, or predicted within the accepted standard error."""
+    errors_px: dict[str, list[float]] = field(default_factory=lambda: defaultdict(list))
+    """Expected errors of the usable moving bands, by name of the band."""
+    largest: ExpectedError | None = None
+    """The largest of them."""
+    unwritten: dict[tuple[str, str], list[str]] = field(default_factory=lambda: defaultdict(list))
+    """Labels of the captures by requested index that was not written, and the reason."""
+
+    def add(self, label: str, sidecar: Sidecar) -> None:
+        """Add the bands of a capture."""
+        for band in usable_bands(sidecar):
+            self.usable[str(band.status)] += 1
+            if band.error is None:
+                continue
+            error = ExpectedError(band.error.std_px, label, band.band, band.share_over_1_px)
+            self.errors_px[band.band].append(error.std_px)
+            if self.largest is None or error.std_px > self.largest.std_px:
+                self.largest = error
+
+    def add_unwritten(self, label: str, index: str, reason: str) -> None:
+        """Add a requested index of a capture that was not written."""
+        self.unwritten[index, reason].append(label)
+
+    @property
+    def median_px(self) -> float | None:
+        """Median of the expected errors; None if none is known."""
+        errors_px = [px for of_band in self.errors_px.values() for px in of_band]
+        return median(errors_px) if errors_px else None
+
+    @property
+    def unknown(self) -> int:
+        """Number of usable bands without a known expected error."""
+        return self.usable.total() - sum(map(len, self.errors_px.values()))
+
+    def unusable(self, statuses: Mapping[str, int]) -> list[str]:
+        """Return the numbers of moving bands that indices cannot use, in words, given those of all by status."""
+        too_uncertain = statuses["predicted"] - self.usable["predicted"]
+        counts = {"predicted with a larger error": too_uncertain}
+        counts |= {status.replace("_", " "): statuses[status] for status in ("seed_only", "failed", "missing")}
+        return [f"{count} {word}" for word, count in counts.items() if count]
+
+    @property
+    def unwritten_captures(self) -> dict[str, int]:
+        """Number of captures by index that was not written."""
+        counts: Counter[str] = Counter()
+        for (index, _), labels in self.unwritten.items():
+            counts[index] += len(labels)
+        return dict(counts)
+
+
+def usable_bands(sidecar: Sidecar) -> list[BandResult]:
+    """Return the moving bands of a capture that indices can use."""
+    limit_px = sidecar.accept_predicted_px
+    return [b for b in sidecar.bands if b.status != "reference" and b.is_usable(limit_px)]
+
+
+def is_by_prediction(sidecar: Sidecar) -> bool:
+    """Return True for a capture that is `ok`, but with a predicted band, which its own image did not confirm."""
+    return sidecar.status == "ok" and any(b.status == "predicted" for b in sidecar.bands)
+
+
+def unwritten_indices(sidecar: Sidecar, folder: Path, reports: Sequence[IndexReport]) -> Iterator[tuple[str, str]]:
+    """Yield (name, reason) of the indices without a raster: those that the last rendering of the capture requested, and
+    those that `agalign indices` could not write, given the folder of the sidecar and the reports of the capture.
+    """
+    by_name = {report.index: report for report in reports}
+    requested = (sidecar.options or {}).get("write", {}).get("indices", [])
+    for name in dict.fromkeys([*(str(one).strip().lower() for one in requested), *by_name]):
+        report = by_name.get(name)
+        if report is None:
+            yield name, _reason(name, sidecar, folder)
+        elif report.path is None:
+            yield name, report.problem
+
+
+def _reason(name: str, sidecar: Sidecar, folder: Path) -> str:
+    try:
+        return reason_not_written(index_named(name), sidecar, folder) or _NO_RASTER
+    except ConfigurationError:  # an index of another version
+        return _NO_RASTER
