@@ -293,7 +293,7 @@ def test_the_table_sorts_and_filters(page: Any) -> None:
         return page.locator("#table tbody th").all_inner_texts()
 
     def residuals() -> list[float]:
-        cells = page.locator("#table tbody tr td:nth-child(4)").all_inner_texts()
+        cells = page.locator("#table tbody tr td:nth-child(5)").all_inner_texts()
         return [float(text) for text in cells if text[0].isdigit()]
 
     assert len(labels()) == 3

@@ -5,6 +5,7 @@ import re
 import shutil
 import subprocess
 import tracemalloc
+from html import unescape
 from itertools import chain
 from pathlib import Path
 from typing import Any
@@ -16,15 +17,17 @@ import pytest
 
 import agalign
 from agalign.config import Settings
+from agalign.indices.rasters import IndexReport, update_table
 from agalign.rasters.drawing import ReducedBands, read_reduced_bands
 from agalign.rasters.preview import ReliefView, preview_bytes, write_preview
 from agalign.records.run_record import begun
 from agalign.records.sidecar import Sidecar
 from agalign.records.sidecar_file import read_sidecar, write_sidecar
 from agalign.report import facts as facts_module
-from agalign.report.charts import CHART_HEIGHT, drifts_of, rig_views
+from agalign.report.charts import CHART_HEIGHT, drifts_of, hues_of, rig_views
 from agalign.report.facts import CameraOffsets, PairTotals
 from agalign.report.pages import pages_exist, write_pages
+from agalign.report.terms import PAGES, TERMS
 from agalign.values.capture import Band, Capture
 from agalign.values.image import OutputGrid
 
@@ -60,6 +63,7 @@ def test_the_page_has_the_facts_of_every_capture(flight: Path, aligned_flight: P
     truth = read_json(flight / "truth.json")
     for capture, row in zip(details["records"], facts["rows"]["records"], strict=True):
         known = [b["residual_px"] for b in capture["bands"] if b["status"] == "aligned"]
+        assert row["error_px"] == max(b["error_px"] for b in capture["bands"] if b["status"] == "aligned")
         assert row["residual_px"] == max(known)
         assert row["bands"] == [[b["band"], b["status"]] for b in capture["bands"] if b["status"] != "reference"]
         sidecar = read_json(aligned_flight / f"{capture['label']}.json")
@@ -91,12 +95,13 @@ def headline(out: Path) -> str:
 
 @pytest.mark.slow
 def test_headline_and_summary_count_what_was_to_be_aligned(out: Path) -> None:
-    assert headline(out).startswith("Every band of every capture is aligned. The median residual is")
+    assert headline(out).startswith("Every band of every capture is aligned. Expected error: 0.")
     record, sidecar = out / "agalign-run.json", out / "0000SET" / "000" / "IMG_0002.json"
     change(record, problems=[{"of": "IMG_0003_1.tif", "problem": "cannot be read"}])
-    assert headline(out).startswith("8 of 8 band pairs are aligned. 1 file or capture took no part. The median")
+    assert headline(out).startswith("8 of 8 band pairs are aligned. Expected error: ")
+    assert headline(out).endswith(" 1 file or capture took no part.")
     change(record, problems=[{"of": "0000SET/000/IMG_0002", "problem": "IMG_0002.png: cannot be written"}])
-    assert headline(out).startswith("8 of 8 band pairs are aligned. 1 output was not written. The median")
+    assert headline(out).endswith(" 1 output was not written.")
     labels = [f"0000SET/000/IMG_000{number}" for number in (1, 2, 3, 4)]
     change(record, problems=[], state="interrupted", labels=labels)
     assert headline(out).startswith("8 of 8 band pairs are aligned.")
@@ -110,7 +115,7 @@ def test_headline_and_summary_count_what_was_to_be_aligned(out: Path) -> None:
     assert f"The run did not end: it was killed, or is still running; {without}" in headline(out)
     change(record, state="finished", labels=labels[:2])
     change(sidecar, status="degraded", missing_bands=["Thermal", "Pan"])
-    assert headline(out).startswith("8 of 10 band pairs are aligned, 2 are missing. The median")
+    assert headline(out).startswith("8 of 10 band pairs are aligned; indices cannot use the rest (2 missing). Expected")
     rows = table_in(out / "summary.csv")
     assert [r["status"] for r in rows] == ["aligned"] * 8 + ["missing"] * 2
     assert {r["reference"] for r in rows} == {"Green"}
@@ -118,6 +123,109 @@ def test_headline_and_summary_count_what_was_to_be_aligned(out: Path) -> None:
         ("0000SET/000", "IMG_0002", name) for name in ("Thermal", "Pan")
     ]
     assert "a band of this camera is missing" in rows[-1]["reason"]
+
+
+def with_band(bands: list[dict[str, Any]], name: str, **facts: Any) -> list[dict[str, Any]]:
+    """The bands of a sidecar with other facts about one of them."""
+    return [b | facts if b["band"] == name else b for b in bands]
+
+
+def prediction(std_px: float, **facts: Any) -> dict[str, Any]:
+    """The facts about a band that is predicted with this error."""
+    known = {"fixed_to_moving": np.eye(3).tolist(), "from": "bands", "std_px": std_px}
+    return {"status": "predicted", "reason": "noise", "prediction": known, "error": {"std_px": std_px}} | facts
+
+
+@pytest.mark.slow
+def test_the_verdict_is_the_expected_error_of_the_bands_that_indices_use(out: Path) -> None:
+    sidecar = out / "0000SET" / "000" / "IMG_0002.json"
+    paths = sidecar.with_name("IMG_0001.json"), sidecar
+    known = {
+        (band["error"]["std_px"], path.stem, band["band"])
+        for path in paths
+        for band in read_json(path)["bands"]
+        if band["status"] == "aligned"
+    }
+    typical_px = np.median([px for px, *_ in known])
+    largest_px, capture, band = max(known)
+    assert f"Expected error: {typical_px:.2f} px for the median band pair, {largest_px:.2f} px" in headline(out)
+    assert f"({band} of 0000SET/000/{capture})." in headline(out)
+    bands = read_json(sidecar)["bands"]
+    change(sidecar, bands=with_band(bands, "NIR", **prediction(0.934, share_over_1_px=0.14)))
+    text = headline(out)
+    assert text.startswith("7 of 8 band pairs are aligned, 1 is predicted accurately enough for indices. Expected")
+    over = "where 14 % of the pixels may be off by more than 1 px"
+    assert f"0.93 px for the worst of those that indices can use (NIR of 0000SET/000/IMG_0002, {over})." in text
+    change(sidecar, bands=with_band(bands, "NIR", **prediction(1.01)), status="degraded")
+    text = headline(out)
+    assert "indices cannot use the rest (1 predicted with a larger error). Expected error" in text
+    assert "1.01" not in text
+    change(sidecar, bands=with_band(bands, "NIR", error=None))
+    assert headline(out).endswith("; unknown for 1.")
+
+
+@pytest.mark.slow
+def test_a_capture_that_is_ok_by_prediction_is_not_shown_as_ok(out: Path) -> None:
+    sidecar = out / "0000SET" / "000" / "IMG_0002.json"
+    change(sidecar, bands=with_band(read_json(sidecar)["bands"], "NIR", **prediction(0.9)))
+    write_pages(out, pytest.fail)
+    facts = facts_of(out)
+    for part in ("rows", "details"):
+        assert [c["shown"] for c in facts[part]["records"]] == ["ok", "ok_by_prediction"]
+        assert [c["status"] for c in facts[part]["records"]] == ["ok", "ok"]
+        assert facts[part]["records"][1]["error_px"] == 0.9
+    page = (out / "index.html").read_text(encoding="utf-8")
+    assert re.search(r"<dt>captures ok</dt><dd>1 of 2</dd>", page)
+    assert re.search(r"<dt>ok by prediction</dt><dd>1</dd>", page)
+
+
+@pytest.mark.slow
+def test_indices_that_were_not_written_are_named_with_the_reason(out: Path) -> None:
+    sidecar = out / "0000SET" / "000" / "IMG_0002.json"
+    contents = read_json(sidecar)
+    options = {"options": {"write": {"indices": ["NDVI "]}}}
+    failed = {"status": "failed", "reason": "the file is black", "issues": [], "place": None}
+    change(sidecar, bands=with_band(contents["bands"], "Red", **failed), status="degraded", **options)
+    table = (out / "indices.csv").is_file()
+    assert "NDVI was not written for 1 of 2 captures." in headline(out)
+    reason = "ndvi is left out: Red is failed (the file is black)"
+    first, second = facts_of(out)["details"]["records"]
+    assert (first["unwritten"], second["unwritten"]) == ([], [["ndvi", reason]])
+    assert facts_of(out)["rows"]["records"][1]["check"]
+    page = (out / "index.html").read_text(encoding="utf-8")
+    assert f"<b>NDVI of 1 capture</b>: {reason}" in page
+    assert (out / "indices.csv").is_file() == table, "the table is not changed"
+    # The bands can be used; the raster was deleted, or its disk was full.
+    change(sidecar, bands=contents["bands"], status="ok", **options)
+    write_pages(out, pytest.fail)
+    ((_, reason),) = facts_of(out)["details"]["records"][1]["unwritten"]
+    assert "does not exist; 'agalign indices' writes it" in reason
+    # A row of the table without a raster, as `agalign indices` writes it.
+    change(sidecar, options=None)
+    update_table(out, [IndexReport("0000SET/000/IMG_0002", "ndre", problem="the disk is full")])
+    write_pages(out, pytest.fail)
+    assert facts_of(out)["details"]["records"][1]["unwritten"] == [["ndre", "the disk is full"]]
+
+
+@pytest.mark.slow
+def test_each_term_of_a_column_is_explained_in_the_help(out: Path) -> None:
+    write_pages(out, pytest.fail)
+    page = (out / "index.html").read_text(encoding="utf-8")
+    script = (PAGE / "page.js").read_text(encoding="utf-8")
+    assert '<a href="#help">' in page.partition("</header>")[0]
+    assert 'id="help"' in page
+    heads = re.findall(r'<th scope="col"[^>]* title="([^"]+)">', page)
+    assert len(heads) >= 6
+    assert {unescape(head) for head in heads} <= {term.meaning for term in TERMS.values()}
+    used = set(re.findall(r'\["[^"\]]+", "(\w+)"\]', script.partition("const heads = [\n")[2].partition("];")[0]))
+    used |= set(re.findall(r'term: "(\w+)"', script))
+    assert used <= set(TERMS)
+    assert len(used) >= 8
+    for name in TERMS:
+        assert f'<dd id="term-{name}">' in page
+    for _, file, _ in PAGES:
+        assert (Path(agalign.__file__).parents[1] / file).is_file()
+        assert file in page
 
 
 @pytest.mark.slow
@@ -282,6 +390,8 @@ def test_rigs_are_drawn_of_models_that_can_be_read(tmp_path: Path) -> None:
     problems: list[str] = []
     (view,) = rig_views(tmp_path, problems.append)
     assert [b["band"] for b in view["bands"]] == ["NIR", "[Red]"]
+    assert (view["reference"], view["reference_hue"]) == ("Green", 130)
+    assert view["bands"][0]["hue"] == 280
     (problem,) = problems
     assert "b.safetensors" in problem
 
@@ -299,6 +409,23 @@ def test_the_share_of_saturated_pixels_of_a_band(tmp_path: Path) -> None:
 def test_sidecars_have_the_share_of_saturated_pixels(aligned_flight: Path) -> None:
     sidecar = read_sidecar(next(aligned_flight.rglob("IMG_0001.json")))
     assert all(0 <= band.saturated < 0.05 for band in sidecar.bands)
+
+
+def test_bands_are_drawn_in_their_colours() -> None:
+    hues = hues_of(["Red", "Blue", "green", "RedEdge", "NIR", "B1", "B2"])
+    assert list(hues.values())[:5] == [0, 215, 130, 325, 280]
+    assert len(set(hues.values())) == 7
+    assert hues_of(["Blue", "blu"])["blu"] != 215, "a second blue has another colour"
+
+
+def test_the_rig_has_the_name_of_its_reference(tmp_path: Path) -> None:
+    save_known_model(tmp_path / "models" / "a.safetensors")
+    write_pages(tmp_path, pytest.fail)
+    page = (tmp_path / "index.html").read_text(encoding="utf-8")
+    drawing = page.partition('<section class="rig">')[2].partition("</figure>")[0]
+    assert 'class="name">Green</text>' in drawing
+    assert "Green, the reference</span>" in drawing
+    assert 'class="origin" style="--hue:130"' in drawing
 
 
 @pytest.mark.slow
@@ -343,7 +470,7 @@ def views() -> ReducedBands:
 def test_every_picture_is_at_the_place_in_the_sidecar(views: ReducedBands, tmp_path: Path, has_errors: bool) -> None:
     parallax_px = np.linspace(-3, 7, 320, dtype=np.float32)[None].repeat(240, axis=0)
     parallax_px[:2, :2] = 1000.0  # wrong pixels take no contrast
-    errors = {"NIR": np.full((4, 5), 0.25, np.float32)} if has_errors else {}
+    errors = {"NIR": np.full((4, 5), 1.5, np.float32)} if has_errors else {}
     relief = ReliefView(parallax_px, (1.23456, 2.5))
     part = write_preview(views, ["Green", "NIR"], errors, tmp_path / "a.preview.jpg", preview_bytes(1), relief)
     sheet = cv2.imread(str(tmp_path / part.file), cv2.IMREAD_GRAYSCALE)
@@ -363,7 +490,8 @@ def test_every_picture_is_at_the_place_in_the_sidecar(views: ReducedBands, tmp_p
     assert like(detail[:dh, dw : 2 * dw], views.before["NIR"][y : y + dh, x : x + dw]) > 0.98
     assert like(detail[dh:, :dw], views.after["Green"][y : y + dh, x : x + dw]) > 0.98
     if has_errors:
-        assert np.median(below[:h, w:]) == pytest.approx(255 * 0.25 / part.error_full_px, abs=3)
+        assert part.error_full_px == 2, "errors beyond the limits for use are distinguished too"
+        assert np.median(below[:h, w:]) == pytest.approx(255 * 1.5 / 2, abs=3)
     low, high = part.relief.parallax_px
     assert (low, high) == pytest.approx((-2.9, 6.9), abs=0.1)
     assert part.model_dump(mode="json")["relief"]["range_m"] == [1.235, 2.5]
