@@ -33,8 +33,13 @@ CAMERAS = {"RedEdge": REDEDGE, "M3M calibrated": MAVIC, "M3M": MAVIC_3M, "6X": S
 
 
 def change(path: Path, **changes: object) -> None:
-    """Replace entries of a sidecar, and its checksum."""
-    write_signed(path, json.dumps(read_json(path) | changes))
+    """Replace entries of a sidecar, and its checksum, or of the record of a run, which has none."""
+    contents = read_json(path)
+    text = json.dumps(contents | changes)
+    if "checksum" in contents:
+        write_signed(path, text)
+    else:
+        path.write_text(text, encoding="utf-8")
 
 
 def aligned(mapping: PixelMapping, size_px: tuple[int, int], status: PairStatus = "aligned", **facts: Any) -> Alignment:

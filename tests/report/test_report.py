@@ -17,7 +17,8 @@ import pytest
 
 import agalign
 from agalign.config import Settings
-from agalign.indices.rasters import IndexReport, update_table
+from agalign.indices.indices_csv import update_table
+from agalign.indices.rasters import IndexReport
 from agalign.rasters.drawing import ReducedBands, read_reduced_bands
 from agalign.rasters.preview import ReliefView, preview_bytes, write_preview
 from agalign.records.run_record import begun
