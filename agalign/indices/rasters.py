@@ -22,6 +22,7 @@ from agalign.errors import ConfigurationError, InputError
 from agalign.host.memory_limits import WORK_TILE_PX
 from agalign.host.own_files import SOFTWARE, is_own_file
 from agalign.host.text import shortened
+from agalign.indices.before_alignment import index_before
 from agalign.indices.formulas import Index, bands_for, compute, index_named, index_of_formula
 from agalign.pixels.raster import OpenRaster, open_raster
 from agalign.rasters.aligned_files import tags_of
@@ -184,6 +185,7 @@ class IndexRasters(Product):
         bands, problems = list(_bands(context)), []
         for index, report in zip(requested, write_rasters(bands, requested, base, label), strict=True):
             if report.path is not None:
+                self._add_before(context, index, report)
                 yield from self._files(report.path)
             elif all(not b.problem for b in bands) and _has_bands(context.capture.bands, index):
                 problems.append(report.problem)
@@ -193,12 +195,20 @@ class IndexRasters(Product):
             if raster.index is not None:
                 (report,) = write_rasters(masked if raster.is_masked else bands, [raster.index], base, label)
                 problem = report.problem
+                if not problem:
+                    self._add_before(context, raster.index, report)
             if problem:
                 context.lost[raster.path] = problem
             else:
                 yield from self._files(raster.path)
         if problems:
             raise InputError("; ".join(problems))
+
+    def _add_before(self, context: ProductContext, index: Index, report: IndexReport) -> None:
+        """Add the index of the unaligned bands for the report, if they have the pixels of the grid."""
+        before = index_before(context, index, (report.statistics.low, report.statistics.high))
+        if before is not None:
+            context.indices_before[index.name] = before
 
     def _files(self, raster: Path) -> Iterator[WrittenFile]:
         yield WrittenFile(self.kind, raster)

@@ -39,6 +39,9 @@ class ReducedBands:
     """(width, height) of all images."""
     saturated: Mapping[str, float] = field(default_factory=dict)
     """Share of saturated pixels in the raw file of each band with a known saturation value, after the reduction."""
+    indices_before: Mapping[str, Grey] = field(default_factory=dict)
+    """Indices of the unaligned bands, by name, on the output grid, not reduced: 0 and 255 are the ends of their colour
+    scale."""
 
 
 def read_reduced_bands(

@@ -10,6 +10,7 @@ The JPEG has a column for each band of the sidecar, in its order, and these rows
     3  the same detail of row 1
     4  if error maps are written: the expected error, white for `ERROR_FULL_PX` and more
     5  (4 without error maps) in the first column, if the capture has a relief: its parallax, white for the nearest
+    6  or the next row: the indices of the unaligned bands, a column for each, white for the upper end of the colours
 """
 
 from collections.abc import Mapping, Sequence
@@ -156,6 +157,9 @@ def _sheet(
         grey = np.rint(((relief.parallax_px - low) / (high - low)).clip(0, 1) * 255)
         rows.append([_resized(np.asarray(grey, np.uint8), tile_px)])
         relief_part = ReliefPreviewPart(parallax_px=(low, high), range_m=relief.range_m)
+    if views.indices_before:
+        # Like the picture of the index of the aligned bands, which is not smoothed either.
+        rows.append([cv2.resize(i, tile_px, interpolation=cv2.INTER_NEAREST) for i in views.indices_before.values()])
     strips = [np.hstack(row) for row in rows]
     sheet_width = max(s.shape[1] for s in strips)
     sheet = np.vstack([np.pad(s, ((0, 0), (0, sheet_width - s.shape[1]))) for s in strips])
@@ -166,6 +170,7 @@ def _sheet(
         detail=(x / width, y / height, detail_px[0] / width, detail_px[1] / height),
         error_full_px=ERROR_FULL_PX if errors_px else None,
         relief=relief_part,
+        indices=list(views.indices_before),
     )
     return part, np.asarray(sheet, np.uint8)
 

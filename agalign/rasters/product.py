@@ -3,7 +3,7 @@
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any, ClassVar
@@ -100,6 +100,8 @@ class ProductContext:
     """Windows by moving band, measured under the mapping; empty unless tie points are written."""
     written_grey: dict[str, Grey] = field(default_factory=dict)
     """Written bands as grey images where these need no reduction, so that the files are not decoded for them."""
+    indices_before: dict[str, Grey] = field(default_factory=dict)
+    """Indices of the unaligned bands, by name, as `ReducedBands.indices_before`."""
     lost: dict[Path, str] = field(default_factory=dict)
     """Files of an earlier command that cannot be rendered again, and why."""
 
@@ -135,7 +137,8 @@ class ProductContext:
     def reduced_bands(self) -> ReducedBands:
         """The bands as reduced grey images, before and after alignment. Raises UnreadableFileError."""
         places = {name: (file.path, index) for name, (file, index) in self.places.items()}
-        return read_reduced_bands(self.capture, places, self.grid, self.read, self.written_grey)
+        bands = read_reduced_bands(self.capture, places, self.grid, self.read, self.written_grey)
+        return replace(bands, indices_before=self.indices_before)
 
 
 class Product(ABC):

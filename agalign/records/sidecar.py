@@ -449,8 +449,8 @@ class ReliefPreviewPart(_Part):
 
 
 class PreviewPart(_Part):
-    """Pictures for the report, a column per band. Rows: input, output, a detail of each, expected errors, relief (if
-    any).
+    """Pictures for the report, a column per band. Rows: input, output, a detail of each, expected errors, relief,
+    indices of the input (if any).
     """
 
     file: RelativeFile
@@ -465,6 +465,8 @@ class PreviewPart(_Part):
     """Expected error shown as white, px."""
     relief: ReliefPreviewPart | None = None
     """Picture of the relief."""
+    indices: list[Name] = []
+    """Indices of the unaligned bands, a column each; black and white are the ends of their colour scale."""
 
 
 class Sidecar(_Part):

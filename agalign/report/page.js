@@ -20,7 +20,8 @@
  *   span: [number, number], unit: string, raw: boolean, file: string, picture: string}} Index
  * @typedef {{file: string, tile_px: [number, number], detail_px: [number, number],
  *   detail: [number, number, number, number], error_full_px: number | null,
- *   relief: {parallax_px: [number, number], range_m: [number, number] | null} | null}} Preview
+ *   relief: {parallax_px: [number, number], range_m: [number, number] | null} | null,
+ *   indices: string[]}} Preview
  * @typedef {{label: string, captured_at: string, camera: string, status: string, shown: string, position: [number, number] | null,
  *   accept_predicted_px: number,
  *   radiometry: string | null, altitude_m: number | null, missing: string[], reference: string, seconds: number,
@@ -39,7 +40,7 @@
  *   `from` is the number of captures before the part, `first_lattice` the number of lattices.
  * @typedef {{captures: number, shift_step_px: number, rows: Rows | null, details: Details | null, details_per_part: number,
  *   row_files: string[], detail_files: string[]}} FlightFacts The first part of rows and details, and the files of others.
- * @typedef {{column: number, colour: string, inverted?: boolean}} Channel
+ * @typedef {{column: number, colour: string}} Channel
  * @typedef {"before" | "after"} When
  * @typedef {[text: string, term?: string]} Head The head of a column, and its term in the help of the page.
  */
@@ -788,15 +789,10 @@ function compose(sheet, preview, line, channels) {
   const sum = /** @type {CanvasRenderingContext2D} */ (whole.getContext("2d"));
   sum.fillRect(0, 0, width, height);
   sum.globalCompositeOperation = "lighter";
-  for (const { column, colour, inverted } of channels) {
+  for (const { column, colour } of channels) {
     const one = el("canvas", { width, height });
     const dyed = /** @type {CanvasRenderingContext2D} */ (one.getContext("2d"));
     dyed.drawImage(sheet, ...onSheet(preview, column, line), 0, 0, width, height);
-    if (inverted) {
-      dyed.globalCompositeOperation = "difference";
-      dyed.fillStyle = "#fff";
-      dyed.fillRect(0, 0, width, height);
-    }
     dyed.globalCompositeOperation = "multiply";
     dyed.fillStyle = colour;
     dyed.fillRect(0, 0, width, height);
@@ -818,11 +814,14 @@ function composed(line, channels) {
 }
 
 /**
- * A grey picture of a row in colours from that of black to that of white.
- * @param {number} line @param {number} column @param {string} black @param {string} white
+ * A picture of the sheet in the colours of stops, made when it is first needed.
+ * @param {Preview} preview @param {number} line @param {number} column @param {number[][]} stops
  */
-function dyed(line, column, black, white) {
-  return composed(line, [{ column, colour: white }, { column, colour: black, inverted: true }]);
+function dyed(preview, line, column, stops) {
+  if (look.sheet === null) return null;
+  const key = `stops ${line} ${column}`;
+  look.composed[key] ??= inStops(look.sheet, onSheet(preview, column, line), stops);
+  return look.composed[key];
 }
 
 function paint() {
@@ -922,6 +921,7 @@ function picture(pen, capture, when, origin, from, width) {
   pen.strokeStyle = "#fff8";
   pen.strokeRect(...at(x, y), w * look.zoom * frame, h * look.zoom * high);
   if (when === "after") over(pen, capture, at);
+  else overIndexBefore(pen, capture, at);
   pen.restore();
 }
 
@@ -934,7 +934,8 @@ function over(pen, capture, at) {
   else if (look.overlay === "heat") overHeat(pen, capture, pair, at);
   else if (look.overlay === "vectors") overVectors(pen, capture, pair, at);
   else {
-    const made = look.overlay === "relief" ? relief(capture) : capture.preview?.error_full_px ? dyed(4, column, mixed(SMALL, LARGE, 0), mixed(SMALL, LARGE, 1)) : null;
+    const preview = capture.preview;
+    const made = look.overlay === "relief" ? relief(capture) : preview?.error_full_px ? dyed(preview, 4, column, [SMALL, LARGE]) : null;
     pen.globalAlpha = MAP_OPACITY;
     const [x, y] = at(0, 0);
     const [right, bottom] = at(1, 1);
@@ -991,6 +992,59 @@ function overIndex(pen, capture, at) {
 }
 
 /**
+ * The index of the unaligned bands, in the last row of the sheet; nothing where there is none.
+ * @param {CanvasRenderingContext2D} pen @param {Capture} capture @param {(u: number, v: number) => [number, number]} at
+ */
+function overIndexBefore(pen, capture, at) {
+  const [preview, index] = [capture.preview, indexOf(capture)];
+  const column = preview && index ? preview.indices.indexOf(index.name) : -1;
+  if (!preview || !index || column < 0) return;
+  const line = 4 + Number(Boolean(preview.error_full_px)) + Number(preview.relief !== null);
+  const made = dyed(preview, line, column, index.raw ? NEUTRAL_STOPS : INDEX_STOPS);
+  const [x, y] = at(0, 0);
+  const [right, bottom] = at(1, 1);
+  pen.globalAlpha = INDEX_OPACITY;
+  if (made) pen.drawImage(made, x, y, right - x, bottom - y);
+}
+
+/**
+ * A grey picture in the colours of stops at equal distances: the sum of the first stop and of each step to the next one
+ * times how far the grey is between them. A canvas that is never read adds and multiplies by its blend modes.
+ * @param {HTMLImageElement} sheet @param {[number, number, number, number]} place @param {number[][]} stops
+ */
+function inStops(sheet, place, stops) {
+  const [, , width, height] = place;
+  const sum = el("canvas", { width, height });
+  fill(sum, "source-over", stops[0]);
+  const step = 1 / (stops.length - 1);
+  stops.slice(1).forEach((stop, k) => {
+    for (const sign of [1, -1]) {
+      const difference = stop.map((v, i) => Math.max(0, sign * (v - stops[k][i])));
+      if (!difference.some(Boolean)) continue;
+      const part = el("canvas", { width, height });
+      part.getContext("2d")?.drawImage(sheet, ...place, 0, 0, width, height);
+      fill(part, "difference", [255, 255, 255]);
+      fill(part, "lighter", [k, k, k].map((n) => 255 * n * step)); // white up to the stop before
+      fill(part, "difference", [255, 255, 255]);
+      fill(part, "color-dodge", [255, 255, 255].map((v) => v * (1 - step))); // divides by the distance of the stops
+      fill(part, "multiply", difference);
+      const pen = /** @type {CanvasRenderingContext2D} */ (sum.getContext("2d"));
+      pen.globalCompositeOperation = sign > 0 ? "lighter" : "difference";
+      pen.drawImage(part, 0, 0);
+    }
+  });
+  return sum;
+}
+
+/** @param {HTMLCanvasElement} canvas @param {GlobalCompositeOperation} blend @param {number[]} colour */
+function fill(canvas, blend, colour) {
+  const pen = /** @type {CanvasRenderingContext2D} */ (canvas.getContext("2d"));
+  pen.globalCompositeOperation = blend;
+  pen.fillStyle = mixed(colour, colour, 0);
+  pen.fillRect(0, 0, canvas.width, canvas.height);
+}
+
+/**
  * A cell for each window, up to the middle between it and the next one, on whole pixels: cells neither overlap nor part.
  * @param {CanvasRenderingContext2D} pen @param {Capture} capture @param {Pair} pair
  * @param {(u: number, v: number) => [number, number]} at
@@ -1036,7 +1090,7 @@ function edges(places) {
 function relief(capture) {
   const preview = capture.preview;
   if (!preview?.relief) return null;
-  return dyed(preview.error_full_px ? 5 : 4, 0, reliefColour(0), reliefColour(1));
+  return dyed(preview, preview.error_full_px ? 5 : 4, 0, [FAR, NEAR]);
 }
 
 /**
