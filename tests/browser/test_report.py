@@ -128,6 +128,8 @@ def test_what_failed_is_shown_first_in_words_and_in_numbers(page: Any) -> None:
     assert "suitable for indices of single plants" in words
     assert "NIR failed" in words
     assert "NIR was not written" in page.locator("#over-note").inner_text()
+    assert "NDVI was not written: ndvi is left out: NIR is failed" in page.locator("#capture .unwritten").inner_text()
+    assert "NDVI was not written for 1 of 3 captures" in page.locator(".verdict").inner_text()
     page.locator("details.more summary").click()
     assert "→" in page.locator("details.more table").inner_text()
 
@@ -226,6 +228,107 @@ def test_overlays_of_the_picture(viewer: Any, overlay: str) -> None:
     before = press_on_slider(viewer, "End")
     choose(viewer, "Overlay", "none")
     assert np.abs(drawn(viewer) - before).mean() < 0.3, "residuals are those of after"
+
+
+def test_errors_have_colours_that_no_vegetation_has_up_to_2_px(browser: Any, out: Path, tmp_path: Path) -> None:
+    sidecar = json.loads((out / "0000SET" / "000" / "IMG_0001.json").read_text())
+    black, bands = np.zeros((360, 480), np.uint8), [b["band"] for b in sidecar["bands"]]
+    views = ReducedBands(dict.fromkeys(bands, black), dict.fromkeys(bands, black), (480, 360))
+    errors_px = {"NIR": np.array([[0.0, 0.0, 1.0, 1.0, 2.0, 2.0]] * 2, np.float32)}
+    part = write_preview(views, bands, errors_px, tmp_path / "a.preview.jpg", preview_bytes(1))
+    sidecar |= {"capture": "a", "preview": part.model_dump(mode="json")}
+    (tmp_path / "a.json").write_text(json.dumps(sidecar))
+    write_pages(tmp_path, pytest.fail)
+    page = opened(browser, tmp_path)
+    look_at(page, "a")
+    assert page.get_by_label("Band of the overlay").is_hidden(), "without an overlay it would mean nothing"
+    choose(page, "Overlay", "error")
+    assert page.get_by_label("Band of the overlay").is_visible()
+    choose(page, "Band of the overlay", "NIR")
+    image = press_on_slider(page, "Home")[100:-20]  # blue, green, red
+    width = image.shape[1]
+    small, middle, large = (
+        np.median(image[:, round(x * width) - 20 : round(x * width) + 20], axis=(0, 1)) for x in (0.08, 0.5, 0.92)
+    )
+    assert small == pytest.approx((0.75 * 77, 0.75 * 32, 0), abs=8)
+    assert middle == pytest.approx(0.75 * np.array([73.5, 133, 127.5]), abs=10)
+    assert large == pytest.approx((0.75 * 70, 0.75 * 234, 0.75 * 255), abs=8)
+    note = page.locator("#over-note").inner_text()
+    assert all(text in note for text in ("0 px", "0.5 px", "1 px", "2 px and more"))
+    choose(page, "Overlay", "heat")
+    assert "2 px and more" in page.locator("#over-note").inner_text()
+    page.close()
+
+
+def test_an_index_has_a_picture_before_alignment(viewer: Any) -> None:
+    """Its scene is that of the picture after alignment, in the same colours, and it is wrong at edges."""
+    choose(viewer, "Overlay", "index:ndvi")
+    viewer.wait_for_timeout(300)
+    before, after = (press_on_slider(viewer, key)[60:-10, 10:-10] for key in ("End", "Home"))
+    assert np.ptp(before, axis=2).mean() < 12, "raw numbers are neutral greys"
+    assert 15 < np.abs(before - after).mean() < 80
+    lightness = [cv2.GaussianBlur(image.mean(axis=2), (0, 0), 12).ravel() for image in (before, after)]
+    assert np.corrcoef(*lightness)[0, 1] > 0.6
+
+
+def test_pictures_in_stops_are_exact(viewer: Any) -> None:
+    """Blend modes make the colours between the stops, of grey values from 0 to 255."""
+    viewer.evaluate(
+        """() => {
+          const grey = document.createElement("canvas");
+          [grey.width, grey.height] = [256, 8];
+          const pen = grey.getContext("2d");
+          for (let v = 0; v < 256; v += 1) { pen.fillStyle = `rgb(${v} ${v} ${v})`; pen.fillRect(v, 0, 1, 8); }
+          window.made = [INDEX_STOPS, NEUTRAL_STOPS, [FAR, NEAR]].map((stops) => {
+            const made = inStops(grey, [0, 0, 256, 8], stops).getContext("2d").getImageData(0, 4, 256, 1).data;
+            const wanted = [...Array(256).keys()].map((v) => {
+              const at = v / 255 * (stops.length - 1);
+              const k = Math.min(stops.length - 2, Math.floor(at));
+              return stops[k].map((c, i) => c + (at - k) * (stops[k + 1][i] - c));
+            });
+            return Math.max(...wanted.flatMap((c, v) => c.map((one, i) => Math.abs(one - made[4 * v + i]))));
+          });
+        }"""
+    )
+    assert max(viewer.evaluate("window.made")) < 8
+
+
+def test_captures_that_are_ok_by_prediction_have_their_own_colour(browser: Any, out: Path, tmp_path: Path) -> None:
+    sidecar = json.loads((out / "0000SET" / "000" / "IMG_0001.json").read_text())
+    prediction = {"fixed_to_moving": np.eye(3).tolist(), "from": "bands", "std_px": 0.93}
+    for number, name in enumerate(("a", "b")):
+        position = sidecar["position"] | {"latitude": 52 + 1e-4 * number}
+        changed = sidecar | {"capture": name, "position": position}
+        (tmp_path / f"{name}.json").write_text(json.dumps(changed))
+        sidecar["bands"][-1] |= {"status": "predicted", "reason": "blur", "prediction": prediction}
+    write_pages(tmp_path, pytest.fail)
+    page = opened(browser, tmp_path)
+    fills = [page.locator("#map circle", has_text=name).get_attribute("fill") for name in ("a", "b")]
+    assert fills[0] != fills[1]
+    assert page.locator("#map-legend .key").all_inner_texts() == ["ok", "ok by prediction"]
+    badges = page.locator("#table .badge")
+    assert badges.all_inner_texts() == ["ok", "ok by prediction"]
+    back = [badges.nth(i).evaluate("e => getComputedStyle(e).backgroundColor") for i in (0, 1)]
+    assert back[0] != back[1]
+    page.locator("#only").select_option("ok")
+    assert page.locator("#table tbody th").all_inner_texts() == ["a"]
+    page.locator("#only").select_option("ok_by_prediction")
+    assert page.locator("#table tbody th").all_inner_texts() == ["b"]
+    look_at(page, "b")
+    assert "indices can use it, but its own image does not confirm it" in page.locator(".words").inner_text()
+    page.close()
+
+
+def test_heads_of_columns_explain_themselves(viewer: Any) -> None:
+    viewer.locator("details.more summary").click()
+    heads = viewer.locator("thead th[title]")
+    assert heads.count() >= 20
+    help_texts = viewer.locator("#help dd").all_inner_texts()
+    assert {heads.nth(i).get_attribute("title") for i in range(heads.count())} <= set(help_texts)
+    viewer.locator("header a", has_text="help").click()
+    viewer.wait_for_timeout(200)
+    assert viewer.locator("#help").bounding_box()["y"] < 900
+    assert "IMG_0001" in viewer.locator("#capture-title").inner_text(), "the capture stays"
 
 
 def test_an_index_over_the_picture_and_on_the_map(viewer: Any) -> None:

@@ -3,6 +3,7 @@ import os
 import re
 import shutil
 from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -15,20 +16,48 @@ from synthetic_flights.aligned import make_aligned
 from agalign.batch import index_run
 from agalign.batch.index_run import index_tasks, run_indices
 from agalign.errors import ConfigurationError, InputError
+from agalign.indices.before_alignment import index_before
 from agalign.indices.formulas import INDICES, bands_for, compute, evaluate, index_named, index_of_formula
 from agalign.indices.indices_csv import read_table, update_table
 from agalign.indices.rasters import IndexReport, IndexStatistics, write_rasters
 from agalign.rasters.band_reader import RAW
+from agalign.rasters.output_grid import Layer
 from agalign.records.captures import AlignedBand
 from agalign.records.sidecar import FilePart
 from agalign.records.sidecar_file import read_sidecar, verify_outputs, write_sidecar
 from agalign.report.pages import write_pages
+from agalign.values import geometry
+from agalign.values.capture import Band, Capture
+from agalign.values.image import OutputGrid
+from agalign.values.mapping import PixelMapping
 
 from ..conftest import raising, write_band, write_signed
-from ..run_outputs import indices_of, table_in
+from ..run_outputs import aligned, context_of, indices_of, table_in
 
 NO_FORMULAS = """__import__('os').system('true')\nN.real\n(lambda: N)()\nN if R else B\n[N][0]\nN; R\nN @ R\n'a'*N
 sqrt(N, R)\nopen(N)\nN < R\nf'{N}'\n1e40*N\nN and R"""
+
+
+def test_the_index_before_alignment_is_that_of_the_files(tmp_path: Path) -> None:
+    random = np.random.default_rng(0)
+    raw = {name: random.integers(1, 900, (30, 40)).astype(np.uint16) for name in ("Red", "NIR")}
+    bands = []
+    for name, wavelength_nm in (("Red", 668.0), ("NIR", 840.0)):
+        write_band(tmp_path / f"{name}.tif", raw[name])
+        bands.append(Band(name, tmp_path / f"{name}.tif", 1, 40, 30, "uint16", wavelength_nm=wavelength_nm))
+    capture, mapping = Capture("a", tmp_path, tuple(bands), 0), PixelMapping(geometry.translation(3, 2))
+    layers = [Layer(bands[0], None, is_reference=True), Layer(bands[1], mapping)]
+    grid, ndvi = OutputGrid(4, 5, 32, 20), INDICES["ndvi"]
+    context = context_of(capture, {"NIR": aligned(mapping, (40, 30))}, layers=layers, grid=grid)
+    red, nir = (raw[name][5:25, 4:36].astype(float) for name in ("Red", "NIR"))
+    expected = ((nir - red) / (nir + red) + 1) / 2 * 255
+    np.testing.assert_allclose(index_before(context, ndvi, (-1.0, 1.0)), expected, atol=0.51)
+    # Bands of another size have no pixels at the same places.
+    small = replace(capture, bands=(bands[0], replace(bands[1], width_px=20, height_px=15)))
+    layers = [layers[0], replace(layers[1], band=small.bands[1])]
+    assert index_before(replace(context, capture=small, layers=layers), ndvi, (-1.0, 1.0)) is None
+    outside = replace(context, grid=OutputGrid(-1, 0, 32, 20))
+    assert index_before(outside, ndvi, (-1.0, 1.0)) is None
 
 
 @pytest.mark.parametrize(
