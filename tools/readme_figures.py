@@ -1,5 +1,5 @@
-"""Make the pictures of the pages: NDVI before and after alignment and the pictures of the demo, a real capture, and the
-report in a browser.
+"""Make the pictures of the pages: NDVI before and after alignment and the pictures of the demo, a real capture, and, in
+a browser, the report of a demo flight with two damaged files.
 
     python tools/readme_figures.py [DEMO [ALIGNED]]
 
@@ -18,6 +18,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import rasterio
+import tifffile
 from numpy.typing import NDArray
 from PIL import Image
 
@@ -47,7 +48,14 @@ def main() -> None:
         if len(sys.argv) > 2:
             save(Image.open(Path(sys.argv[2]) / "IMG_0009.png"), "row-crop.jpg", 78)
         if importlib.util.find_spec("playwright"):
-            save(screenshot(demo / "aligned", Path(folder) / "report.png"), "report.jpg", 48)
+            flight, damaged = (
+                damaged_flight(demo / "flight", Path(folder) / "damaged"),
+                Path(folder) / "damaged-aligned",
+            )
+            model = next((demo / "aligned" / "models").glob("*.safetensors"))
+            options = "--relief", "never", "--radiometry", "auto", "--index", "ndvi", "--error-map"
+            agalign("align", flight, "-o", damaged, "--model", model, *options)
+            save(screenshot(damaged, Path(folder) / "report.png"), "report.jpg", 48)
 
 
 def agalign(*arguments: str | Path) -> None:
@@ -88,8 +96,23 @@ def coloured(ndvi: NDArray[np.float32]) -> NDArray[np.uint8]:
     return np.stack([np.interp(np.nan_to_num(ndvi), stops, c) for c in ramp.T], axis=-1).round().astype(np.uint8)
 
 
+def damaged_flight(flight: Path, copy: Path) -> Path:
+    """Copy a demo flight: NIR of the second capture becomes noise, and Red of the third is missing."""
+    shutil.copytree(flight, copy)
+    second, third = (copy / CAPTURE.with_name(f"IMG_000{number}") for number in (2, 3))
+    with tifffile.TiffFile(second.with_name("IMG_0002_4.tif"), mode="r+b") as file:
+        page = file.pages[0]
+        pixels = page.asarray()
+        noise = np.random.default_rng(0).normal(pixels.mean(), pixels.std(), pixels.shape)
+        # Raw numbers of this camera are multiples of 16.
+        file.filehandle.seek(page.dataoffsets[0])
+        file.filehandle.write((noise.clip(0, 65535).astype(pixels.dtype) // 16 * 16).tobytes())
+    third.with_name("IMG_0003_3.tif").unlink()
+    return copy
+
+
 def screenshot(aligned: Path, picture: Path) -> Image.Image:
-    """Return a report down to the pictures of the capture that is selected."""
+    """Return a report down to the pictures of the first capture, with NDVI before and after alignment."""
     from playwright.sync_api import sync_playwright
 
     with sync_playwright() as playwright:
@@ -98,6 +121,8 @@ def screenshot(aligned: Path, picture: Path) -> Image.Image:
         page = browser.new_page(viewport=dict(zip(("width", "height"), SCREEN_PX, strict=True)))
         page.goto((aligned / "index.html").absolute().as_uri() + f"#capture={str(CAPTURE).replace('/', '%2F')}")
         page.wait_for_timeout(1500)
+        page.get_by_label("Overlay", exact=True).select_option("index:ndvi")
+        page.wait_for_timeout(1000)
         end = page.locator("input[type=range]").first.bounding_box()
         height = end["y"] + end["height"] + page.evaluate("window.scrollY") + 8
         clip = {"x": 0, "y": 0, "width": SCREEN_PX[0], "height": height}
