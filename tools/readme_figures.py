@@ -48,19 +48,18 @@ def main() -> None:
         if len(sys.argv) > 2:
             save(Image.open(Path(sys.argv[2]) / "IMG_0009.png"), "row-crop.jpg", 78)
         if importlib.util.find_spec("playwright"):
-            flight, damaged = (
-                damaged_flight(demo / "flight", Path(folder) / "damaged"),
-                Path(folder) / "damaged-aligned",
-            )
+            flight, damaged = damaged_flight(demo / "flight", Path(folder) / "damaged"), Path(folder) / "with-problems"
             model = next((demo / "aligned" / "models").glob("*.safetensors"))
             options = "--relief", "never", "--radiometry", "auto", "--index", "ndvi", "--error-map"
-            agalign("align", flight, "-o", damaged, "--model", model, *options)
+            agalign("align", flight, "-o", damaged, "--model", model, *options, code=3)
             save(screenshot(damaged, Path(folder) / "report.png"), "report.jpg", 48)
 
 
-def agalign(*arguments: str | Path) -> None:
-    """Run the program."""
-    subprocess.run([sys.executable, "-m", "agalign", *arguments], check=True)
+def agalign(*arguments: str | Path, code: int = 0) -> None:
+    """Run the program, which must return this exit code."""
+    done = subprocess.run([sys.executable, "-m", "agalign", *arguments], check=False)
+    if done.returncode != code:
+        raise SystemExit(f"agalign {arguments[0]}: exit code {done.returncode} instead of {code}")
 
 
 def ndvi_before_and_after(flight: Path, aligned: Path, size_px: tuple[int, int] = (440, 330)) -> Image.Image:
@@ -97,7 +96,7 @@ def coloured(ndvi: NDArray[np.float32]) -> NDArray[np.uint8]:
 
 
 def damaged_flight(flight: Path, copy: Path) -> Path:
-    """Copy a demo flight: NIR of the second capture becomes noise, and Red of the third is missing."""
+    """Copy a demo flight: NIR of the second capture becomes noise, and the file of Red of the third is cut off."""
     shutil.copytree(flight, copy)
     second, third = (copy / CAPTURE.with_name(f"IMG_000{number}") for number in (2, 3))
     with tifffile.TiffFile(second.with_name("IMG_0002_4.tif"), mode="r+b") as file:
@@ -107,7 +106,8 @@ def damaged_flight(flight: Path, copy: Path) -> Path:
         # Raw numbers of this camera are multiples of 16.
         file.filehandle.seek(page.dataoffsets[0])
         file.filehandle.write((noise.clip(0, 65535).astype(pixels.dtype) // 16 * 16).tobytes())
-    third.with_name("IMG_0003_3.tif").unlink()
+    cut_off = third.with_name("IMG_0003_3.tif")
+    cut_off.write_bytes(cut_off.read_bytes()[:60_000])
     return copy
 
 
