@@ -580,8 +580,11 @@ def test_it_prints_and_fits_a_telephone(browser: Any, out: Path) -> None:
     page.wait_for_function("() => document.querySelectorAll('#table tbody th').length === 3")
 
 
-def test_no_table_is_cut_on_a_screen(browser: Any, out: Path) -> None:
-    page = opened(browser, out, "IMG_0001")
+@pytest.mark.parametrize("width", [1000, 1400])
+def test_no_table_is_cut_on_a_screen(browser: Any, out: Path, width: int) -> None:
+    page = opened(browser, out, "IMG_0001", width)
+    table = page.locator(".scroll:has(#table)")
+    assert table.evaluate("e => e.scrollWidth <= e.clientWidth")
     page.locator("details").evaluate_all("all => all.forEach((d) => { d.open = true; })")
     cut = "[...document.querySelectorAll('#capture .scroll')].filter((s) => s.scrollWidth > s.clientWidth).length"
     assert page.evaluate(cut) == 0
