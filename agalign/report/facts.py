@@ -19,7 +19,7 @@ from agalign.indices.rasters import IndexReport
 from agalign.records.cautions import NO_RESULT, Caution, RunFacts
 from agalign.records.sidecar import BandResult, GeometryPart, GridPart, OutputPart, Sidecar
 from agalign.report.data_files import DataParts
-from agalign.report.verdict import Verdict, is_by_prediction, unwritten_indices, usable_bands
+from agalign.report.verdict import Verdict, is_by_prediction, largest_error_px, unwritten_indices
 from agalign.values.alignment import Prediction
 from agalign.values.issues import OTHER_REFERENCE, Remedy
 
@@ -240,20 +240,13 @@ class FlightFacts:
         # The page has links by the label that it shows.
         for caution in self.pairs.add(escape_controls(label), sidecar):
             checks[caution.band].append(caution.reason)
-        self.verdict.add(escape_controls(label), sidecar)
         output, position, path = sidecar.output, sidecar.position, Path(folder)
         grid = output or OutputPart(file=None, crop=(0, 0, *sidecar.reference.size_px), nodata=None)
         files = {part.kind: part.file for part in sidecar.products}
         relief = next((b.relief.file for b in sidecar.bands if b.relief is not None), None)
         keys = {"folder": folder, "capture": sidecar.capture, "reference": sidecar.reference.band}
-        preview: dict[str, Any] | None = None
-        if sidecar.preview is not None:
-            detail = [round(v, 5) for v in sidecar.preview.detail]
-            preview = sidecar.preview.model_dump() | {"file": _link(path, sidecar.preview.file), "detail": detail}
         unwritten = list(unwritten_indices(sidecar, self.out / path, indices))
-        for index, why in unwritten:
-            self.verdict.add_unwritten(escape_controls(label), index, why)
-        errors_px = [b.error.std_px for b in usable_bands(sidecar) if b.error is not None]
+        self.verdict.add(escape_controls(label), sidecar, unwritten)
         facts = {
             "label": label,
             "captured_at": sidecar.captured_at,
@@ -273,11 +266,11 @@ class FlightFacts:
             "relief": _link(path, relief),
             "sidecar": _link(path, f"{sidecar.capture}.json"),
             "picture": _link(path, files.get("picture")),
-            "preview": preview,
+            "preview": _preview(sidecar, path),
             "bands": [self._pair(b, sidecar, keys, checks[b.band]) for b in sidecar.bands],
             "indices": [self._index(row) for row in indices if row.path is not None],
             "unwritten": unwritten,
-            "error_px": rounded(max(errors_px, default=None)),
+            "error_px": rounded(largest_error_px(sidecar)),
         }
         for name, status, reason in sidecar.pairs:
             if status == "missing":
@@ -445,6 +438,13 @@ def rounded(value: Any) -> Any:
     if not isinstance(value, float):
         return value
     return round(value, 4) if math.isfinite(value) else None
+
+
+def _preview(sidecar: Sidecar, folder: Path) -> dict[str, Any] | None:
+    if sidecar.preview is None:
+        return None
+    detail = [round(v, 5) for v in sidecar.preview.detail]
+    return sidecar.preview.model_dump() | {"file": _link(folder, sidecar.preview.file), "detail": detail}
 
 
 def _link(folder: Path, name: str | None) -> str | None:

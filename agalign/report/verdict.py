@@ -3,7 +3,7 @@ were requested and not written.
 """
 
 from collections import Counter, defaultdict
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from statistics import median
@@ -41,9 +41,11 @@ class Verdict:
     unwritten: dict[tuple[str, str], list[str]] = field(default_factory=lambda: defaultdict(list))
     """Labels of the captures by requested index that was not written, and the reason."""
 
-    def add(self, label: str, sidecar: Sidecar) -> None:
-        """Add the bands of a capture."""
-        for band in usable_bands(sidecar):
+    def add(self, label: str, sidecar: Sidecar, unwritten: Iterable[tuple[str, str]] = ()) -> None:
+        """Add the bands of a capture, and the (name, reason) of its indices that were not written."""
+        for index, reason in unwritten:
+            self.unwritten[index, reason].append(label)
+        for band in _usable_bands(sidecar):
             self.usable[str(band.status)] += 1
             if band.error is None:
                 continue
@@ -51,10 +53,6 @@ class Verdict:
             self.errors_px[band.band].append(error.std_px)
             if self.largest is None or error.std_px > self.largest.std_px:
                 self.largest = error
-
-    def add_unwritten(self, label: str, index: str, reason: str) -> None:
-        """Add a requested index of a capture that was not written."""
-        self.unwritten[index, reason].append(label)
 
     @property
     def median_px(self) -> float | None:
@@ -83,8 +81,15 @@ class Verdict:
         return dict(counts)
 
 
-def usable_bands(sidecar: Sidecar) -> list[BandResult]:
-    """Return the moving bands of a capture that indices can use."""
+def largest_error_px(sidecar: Sidecar) -> float | None:
+    """Return the largest expected error of the moving bands of a capture that indices can use, px; None if none is
+    known.
+    """
+    return max((b.error.std_px for b in _usable_bands(sidecar) if b.error is not None), default=None)
+
+
+def _usable_bands(sidecar: Sidecar) -> list[BandResult]:
+    """The moving bands of a capture that indices can use."""
     limit_px = sidecar.accept_predicted_px
     return [b for b in sidecar.bands if b.status != "reference" and b.is_usable(limit_px)]
 
