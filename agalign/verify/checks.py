@@ -162,10 +162,14 @@ def is_misaligned(residual: Residual, pixel_px: float = 1.0) -> NDArray[np.bool_
 
 
 def _error_issues(candidate: Verifiable) -> Iterator[Issue]:
-    """The expected error over the common area, under a relief over that of the windows."""
+    """The expected error over the common area, under a relief over that of the windows, which must also have a shift: the
+    relief is that of other bands, and a part of the image that shows something else has an error by them alone.
+    """
     if len(candidate.textured_px):
         max_px = _MAX_ERROR_PX * candidate.file_pixel_size_px
         share = float((candidate.error.error_px(candidate.textured_px) <= max_px).mean())
+        if candidate.mapping.parallax is not None:
+            share = min(share, candidate.windows.coverage)
         if not share >= _MIN_ACCURATE_SHARE:
             yield Issue(INACCURATE, 1 - share, 1 - _MIN_ACCURATE_SHARE, f"{_MAX_ERROR_PX:g} px")
 

@@ -13,6 +13,7 @@ from agalign.values.alignment import JointResult, Prediction
 from agalign.values.issues import sentence
 from agalign.values.mapping import PixelMapping
 from agalign.values.mapping_error import MappingError
+from agalign.values.parallax import Parallax, Relief
 from agalign.values.pixel_units import PixelScale
 from agalign.values.residual import Residual
 from agalign.verify.checks import AliasPeak, AlignedImages, alias_peak, is_unchanged, issues_of, rig_issues, seed_fits
@@ -54,6 +55,16 @@ class Checked:
         return self.windows.centres_px
 
 
+@dataclass(frozen=True)
+class UnderRelief(Checked):
+    """A candidate under a flat relief of other bands."""
+
+    @property
+    def mapping(self) -> PixelMapping:
+        relief = Relief(np.zeros((SIZE[1], SIZE[0]), np.float32), np.ones((SIZE[1], SIZE[0]), np.float32))
+        return super().mapping.with_parallax(Parallax(relief, (1.0, 0.0)))
+
+
 GOOD = Checked()
 STRETCHED = np.array([[1.0, 0, 0], [0, 1, 0], [-5e-4, 0, 1]])
 NAN = float("nan")
@@ -84,6 +95,12 @@ def test_values_that_are_not_finite_and_mirrored_mappings_are_issues(
     issues = issues_of(Checked(replace(JOINT, **joint), measured_in(measured)))
     assert [issue.code for issue in issues] == expected.split()
     assert all(sentence(d) for d in issues)
+
+
+def test_a_part_of_the_image_that_the_relief_of_other_bands_does_not_align_is_an_issue() -> None:
+    assert codes(UnderRelief(), measured_in(0.9)) == []
+    assert codes(UnderRelief(), measured_in(0.89)) == ["inaccurate"]
+    assert codes(GOOD, measured_in(0.89)) == []
 
 
 def shifted(count_off: int, off_px: float, total: int = 100) -> Residual:
