@@ -162,8 +162,8 @@ def is_misaligned(residual: Residual, pixel_px: float = 1.0) -> NDArray[np.bool_
 
 
 def _error_issues(candidate: Verifiable) -> Iterator[Issue]:
-    """The expected error over the common area, under a relief over that of the windows, which must also have a shift: the
-    relief is that of other bands, and a part of the image that shows something else has an error by them alone.
+    """The expected error over the common area; under a relief over that of the windows, which must also have a shift, as
+    the relief of other bands has an error where this band shows something else.
     """
     if len(candidate.textured_px):
         max_px = _MAX_ERROR_PX * candidate.file_pixel_size_px
