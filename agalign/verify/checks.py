@@ -162,8 +162,8 @@ def is_misaligned(residual: Residual, pixel_px: float = 1.0) -> NDArray[np.bool_
 
 
 def _error_issues(candidate: Verifiable) -> Iterator[Issue]:
-    """The expected error over the common area; under a relief over that of the windows, which must also have a shift, as
-    the relief of other bands has an error where this band shows something else.
+    """The expected error over the common area. Under a relief: over that of the windows, and they must have a shift, as
+    a relief of other bands is no error where this band shows something else.
     """
     if len(candidate.textured_px):
         max_px = _MAX_ERROR_PX * candidate.file_pixel_size_px
