@@ -32,8 +32,8 @@ def _report(terminal: Terminal, out: Annotated[Path, typer.Argument()], as_json:
     from agalign.cli.print_cautions import explain
     from agalign.host.output_folder import locked
     from agalign.records.sidecar_file import run_sidecars
-    from agalign.report.facts import SUMMARY_FILE
     from agalign.report.pages import REPORT_FILE, write_pages
+    from agalign.report.summary_csv import SUMMARY_FILE
 
     run_sidecars(out)
     unreadable: list[str] = []

@@ -18,37 +18,14 @@ from agalign.host.text import escape_controls
 from agalign.indices.rasters import IndexReport
 from agalign.records.cautions import NO_RESULT, Caution, RunFacts
 from agalign.records.sidecar import BandResult, GeometryPart, GridPart, OutputPart, Sidecar
-from agalign.report.data_files import DataParts
+from agalign.report.page_data import DataParts
+from agalign.report.summary_csv import BAND_COLUMNS, SIMILARITY, SUMMARY_COLUMNS, SUMMARY_FILE
 from agalign.report.verdict import Verdict, is_by_prediction, largest_error_px, unwritten_indices
 from agalign.values.alignment import Prediction
 from agalign.values.issues import OTHER_REFERENCE, Remedy
 
 _SHIFT_STEP_PX = 0.01
 """Shifts of windows are written as integer multiples of this."""
-_SIMILARITY = ("mattes_mi", "nmi", "ncc", "gradient_correlation", "structure_ssim")
-BAND_COLUMNS = {
-    "band": "band",
-    "wavelength_nm": "wavelength_nm",
-    "status": "status",
-    "reason": "reason",
-    "seed": "seed.kind",
-    "retrieval": "joint.retrieval",
-    "corner_std_px": "joint.corner_std_px",
-    "residual_px": "metrics.after.residual_px",
-    "residual_p95_px": "metrics.after.residual_p95_px",
-    "residual_coverage": "metrics.after.residual_coverage",
-    "geometry": "geometry.kind",
-    "homography_p95_px": "geometry.homography_p95_px",
-    "geometry_p95_px": "geometry.p95_px",
-    "prediction_from": "prediction.source",
-    "prediction_std_px": "prediction.std_px",
-    "prediction_off_px": "prediction.off_px",
-    **{f"{name}_{when}": f"metrics.{when}.{name}" for name in _SIMILARITY for when in ("before", "after")},
-    "seconds": "seconds",
-}
-"""Field of a band in the sidecar by column of OUT/summary.csv."""
-SUMMARY_FILE = "summary.csv"
-SUMMARY_COLUMNS = ("folder", "capture", *BAND_COLUMNS, "reference", "check")
 
 
 class BandToCheck(NamedTuple):
@@ -379,7 +356,7 @@ class FlightFacts:
         if band.status != "reference" or checks:
             self.add_row(keys | row | {"check": "; ".join(checks)})
         metrics, windows = band.metrics, None if band.metrics is None else band.metrics.windows
-        similarity = {name: (row[f"{name}_before"], row[f"{name}_after"]) for name in _SIMILARITY}
+        similarity = {name: (row[f"{name}_before"], row[f"{name}_after"]) for name in SIMILARITY}
         centres_px = np.empty((0, 2)) if windows is None else windows.centres_px
         shifts_px = np.empty((0, 2)) if windows is None else windows.shifts_px
         lattice = np.round(centres_px, 2).tobytes()

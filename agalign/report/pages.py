@@ -25,9 +25,10 @@ from agalign.records.excluded import PANELS_FILE, SKY_FILE, PanelPart, SkyPart, 
 from agalign.records.run_record import RunPart, counted_sidecars, read_run_record, unfinished_run
 from agalign.records.sidecar_file import find_sidecars, read_sidecar
 from agalign.report.charts import drifts_of, rig_views
-from agalign.report.data_files import data_files_exist, printable, remove_other_data_files
-from agalign.report.facts import SUMMARY_FILE, FlightFacts
+from agalign.report.facts import FlightFacts
 from agalign.report.flight_map import FlightMap
+from agalign.report.page_data import data_files_exist, printable, remove_other_data_files
+from agalign.report.summary_csv import SUMMARY_FILE
 from agalign.report.terms import PAGES, TERMS
 
 REPORT_FILE = "index.html"

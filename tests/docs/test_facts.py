@@ -26,7 +26,7 @@ from agalign.method import refine
 from agalign.pixels import masks, raster
 from agalign.rasters.parallax_file import PARALLAX_KIND
 from agalign.records.sidecar import FilePart
-from agalign.report.facts import SUMMARY_COLUMNS
+from agalign.report.summary_csv import SUMMARY_COLUMNS
 from agalign.values.alignment import MIN_RETRIEVAL, MIN_TIMES_CHANCE
 from agalign.verify import checks, coverage
 
