@@ -30,7 +30,7 @@ from agalign.method.device import limit_threads
 from agalign.records.sidecar_file import find_sidecars, read_without_tables
 
 from ..conftest import raising, seeded
-from ..values.pool_tasks import WhenUnpickled, signal_self, sleep, without_memory
+from ..host.pool_tasks import WhenUnpickled, signal_self, sleep, without_memory
 
 pytestmark = pytest.mark.slow
 

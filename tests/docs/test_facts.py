@@ -13,7 +13,7 @@ from itertools import chain
 from pathlib import Path
 
 import pytest
-from agalign.indices.table import INDICES_FILE, update_table
+from agalign.indices.indices_csv import INDICES_FILE, update_table
 
 from agalign.batch.products import PRODUCTS
 from agalign.capture import band_pair, common_parallax, reference
@@ -150,7 +150,7 @@ LIMITS = {
         f"by more than {refine._FINAL_CONVERGED_PX:g} px",
         f"the p95 of the windows' parallax is at least {common_parallax.MIN_PARALLAX_PX:g} px",
         f"nodes every {displacement_field._LATTICE_PX} px",
-        f"fitted to windows of {displacement_field._WINDOW_PX} px",
+        f"fitted to windows of {displacement_field._FIELD_WINDOW_PX} px",
         f"Images above {band_pair._LONGEST_SIDE_PX} px",
         f"fewer than {band_pair._COARSE_RATIO:g} pixels per reference pixel",
     ),

@@ -29,7 +29,7 @@ from agalign.values.mapping_error import MappingError
 from ..builders import decided, in_full_run, joint_result, pair_of, residual_of, texture
 from ..capture.test_by_relief import REFERENCE, Rendered
 from ..conftest import Shared
-from .test_relief_map import scene_in
+from ..rasters.test_relief_map import scene_in
 
 SIZE = 640, 480
 
