@@ -2,6 +2,7 @@
 were requested and not written.
 """
 
+import os
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -115,6 +116,7 @@ def unwritten_indices(sidecar: Sidecar, folder: Path, reports: Sequence[IndexRep
 
 def _reason(name: str, sidecar: Sidecar, folder: Path) -> str:
     try:
-        return reason_not_written(index_named(name), sidecar, folder) or _NO_RASTER
+        # The page may be opened elsewhere: files are relative to their capture.
+        return reason_not_written(index_named(name), sidecar, folder).replace(f"{folder}{os.sep}", "") or _NO_RASTER
     except ConfigurationError:  # an index of another version
         return _NO_RASTER
