@@ -49,8 +49,8 @@ if TYPE_CHECKING:
     from agalign.exports.dataset import open_capture as open_capture
     from agalign.exports.dataset import open_flight as open_flight
     from agalign.exports.programs import ExportReport as ExportReport
-    from agalign.indices.rasters import IndexReport as IndexReport
     from agalign.rasters.read_alignment import read_alignment as read_alignment
+    from agalign.spectral_indices.rasters import IndexReport as IndexReport
     from agalign.values.alignment import Alignment as Alignment
     from agalign.values.alignment import Prediction as Prediction
     from agalign.values.alignment import Seed as Seed
@@ -69,7 +69,7 @@ _NAMES = {
     "NoSuchBandError NotEnoughTextureError OutputError SidecarError UnreadableFileError WorkerError",
     "exports.dataset": "open_capture open_flight",
     "exports.programs": "ExportReport",
-    "indices.rasters": "IndexReport",
+    "spectral_indices.rasters": "IndexReport",
     "rasters.read_alignment": "read_alignment",
     "values.alignment": "Alignment Prediction Seed",
     "values.capture": "Capture",

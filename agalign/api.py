@@ -29,10 +29,10 @@ from agalign.flight.panel_readings import with_panels
 from agalign.flight.sky import sky_captures
 from agalign.host.output_folder import locked, prepare_output
 from agalign.host.processes import end_if_reimported
-from agalign.indices.formulas import chosen_indices
-from agalign.indices.rasters import IndexReport
 from agalign.pixels.masks import raster_of
 from agalign.pixels.radiometry import with_radiometry
+from agalign.spectral_indices.formulas import chosen_indices
+from agalign.spectral_indices.rasters import IndexReport
 from agalign.values import geometry
 from agalign.values.alignment import Alignment, Seed
 from agalign.values.arguments import checked

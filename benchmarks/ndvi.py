@@ -10,9 +10,9 @@ import agalign
 from agalign.batch.index_run import index_tasks, run_indices
 from agalign.cameras.discover import discover
 from agalign.config import Settings, WriteSettings
-from agalign.indices.formulas import INDICES, compute
 from agalign.pixels.radiometry import calibrated
 from agalign.records.sidecar_file import read_sidecar
+from agalign.spectral_indices.formulas import INDICES, compute
 from agalign.synthetic import cameras
 from agalign.synthetic import flight as synthetic
 from agalign.synthetic.ground import reflectance

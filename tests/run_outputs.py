@@ -12,11 +12,11 @@ from synthetic_flights.troubles import make_two_headings
 
 from agalign.batch.index_run import index_tasks, run_indices
 from agalign.config import Settings, WriteSettings
-from agalign.indices.formulas import INDICES, Index
-from agalign.indices.rasters import IndexReport
 from agalign.rasters.output_grid import Layer
 from agalign.rasters.product import CapturePaths, ProductContext
 from agalign.records.sidecar import Sidecar
+from agalign.spectral_indices.formulas import INDICES, Index
+from agalign.spectral_indices.rasters import IndexReport
 from agalign.synthetic.cameras import REDEDGE
 from agalign.values import geometry
 from agalign.values.alignment import Alignment, Prediction, Seed

@@ -4,7 +4,7 @@ that they are current.
     python tools/pages.py [--check]
 
 Commands and their options come from `agalign/cli/` and `agalign/config.py`, indices from
-`agalign/indices/formulas.py`, fields from `agalign/records/sidecar.py` and the records that it
+`agalign/spectral_indices/formulas.py`, fields from `agalign/records/sidecar.py` and the records that it
 contains, reasons from `agalign/values/issues.py`, measured figures from `docs/figures/figures.csv`. Each part is
 between two comments in its page.
 """
@@ -32,8 +32,8 @@ import agalign
 from agalign.cli.command import Command, field_options, help_of, value_name
 from agalign.cli.main import COMMANDS
 from agalign.config import DiscoverOptions, RunOptions, Settings
-from agalign.indices.formulas import INDICES
 from agalign.records.sidecar import Sidecar
+from agalign.spectral_indices.formulas import INDICES
 from agalign.values.issues import KINDS, Issue, sentence
 
 DOCS = Path(__file__).resolve().parents[1] / "docs"

@@ -23,10 +23,10 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from agalign.cameras.discover import discover
-from agalign.indices.formulas import INDICES, compute
 from agalign.pixels.radiometry import calibrated
 from agalign.rasters.drawing import with_text
 from agalign.records.sidecar_file import read_sidecar
+from agalign.spectral_indices.formulas import INDICES, compute
 from agalign.values.capture import Band
 
 FIGURES = Path(__file__).resolve().parents[1] / "docs" / "figures"

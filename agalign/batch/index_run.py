@@ -11,13 +11,13 @@ from agalign.batch.workers import failure_text, open_workers, serially
 from agalign.errors import AgalignError
 from agalign.host.files import written_below
 from agalign.host.processes import usable_cores
-from agalign.indices.formulas import Index
-from agalign.indices.indices_csv import to_check, update_table
-from agalign.indices.rasters import IndexRasters, IndexReport, write_rasters
 from agalign.records.captures import bands_of
 from agalign.records.cautions import RunFacts
 from agalign.records.run_record import counted_sidecars
 from agalign.records.sidecar_file import add_products, label_of, read_without_tables, run_sidecars
+from agalign.spectral_indices.formulas import Index
+from agalign.spectral_indices.indices_csv import to_check, update_table
+from agalign.spectral_indices.rasters import IndexRasters, IndexReport, write_rasters
 
 
 @dataclass(frozen=True)

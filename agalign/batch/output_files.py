@@ -15,12 +15,12 @@ from agalign.config import WriteSettings
 from agalign.errors import ConfigurationError, OutputError, SidecarError
 from agalign.host.files import check_inside, max_name_bytes
 from agalign.host.own_files import is_own_file
-from agalign.indices.rasters import index_rasters
 from agalign.rasters.aligned_files import band_file_names, is_aligned_raster
 from agalign.rasters.parallax_file import PARALLAX_SUFFIX
 from agalign.rasters.product import CapturePaths
 from agalign.records.sidecar import FilePart
 from agalign.records.sidecar_file import is_sidecar, read_checked
+from agalign.spectral_indices.rasters import index_rasters
 from agalign.values.capture import Capture
 
 

@@ -14,7 +14,6 @@ from agalign.batch.products import PRODUCTS
 from agalign.capture.align_bands import tie_windows
 from agalign.config import Settings, WriteSettings
 from agalign.errors import AgalignError
-from agalign.indices.rasters import index_rasters
 from agalign.pixels.raster import ReadTile, read_tile
 from agalign.rasters.output_grid import FlightLimits, output_layers
 from agalign.rasters.parallax_file import read_relief
@@ -23,6 +22,7 @@ from agalign.rasters.product import CapturePaths, ProductContext
 from agalign.rasters.rendered_sidecar import rendered
 from agalign.records.sidecar import FilePart, Sidecar
 from agalign.records.sidecar_file import write_sidecar
+from agalign.spectral_indices.rasters import index_rasters
 from agalign.values.alignment import Alignment
 from agalign.values.capture import Capture
 from agalign.values.image import OutputGrid

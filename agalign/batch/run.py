@@ -33,7 +33,6 @@ from agalign.host.files import check_inside, written_below
 from agalign.host.output_folder import is_full, locked
 from agalign.host.processes import usable_cores
 from agalign.host.text import counted
-from agalign.indices.rasters import check_indices
 from agalign.method.device import choose_device, limit_threads
 from agalign.rasters.output_grid import FlightLimits, common_grid, flight_limits
 from agalign.rasters.preview import preview_bytes
@@ -42,6 +41,7 @@ from agalign.records.run_record import RunPart, begun, excluded_part, input_name
 from agalign.records.sidecar import FilePart, Sidecar
 from agalign.report.excluded import write_panels, write_sky
 from agalign.report.pages import outdate_pages
+from agalign.spectral_indices.rasters import check_indices
 from agalign.values.capture import Capture
 from agalign.values.image import OutputGrid
 

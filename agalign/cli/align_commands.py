@@ -45,7 +45,7 @@ def _align(
     """
     from agalign.config import DiscoverOptions, RunOptions, Settings
     from agalign.host.processes import start_server_ahead
-    from agalign.indices.formulas import index_named
+    from agalign.spectral_indices.formulas import index_named
 
     source = folder.resolve()
     target = out or source.parent / f"{source.name}-aligned"

@@ -16,7 +16,7 @@ from agalign.host.text import counted
 from agalign.values.choices import ExportProgram
 
 if TYPE_CHECKING:
-    from agalign.indices.rasters import IndexReport
+    from agalign.spectral_indices.rasters import IndexReport
 
 Out = Annotated[Path, typer.Argument(help="Output folder of a run.")]
 Json = Annotated[bool, typer.Option("--json")]
@@ -168,8 +168,8 @@ def _indices(
     from agalign.cli.align_run import cluster, progress
     from agalign.errors import OutputError
     from agalign.host.output_folder import locked
-    from agalign.indices.formulas import chosen_indices
     from agalign.report.pages import REPORT_FILE, write_pages
+    from agalign.spectral_indices.formulas import chosen_indices
 
     names = (index or ("" if formula else "ndvi")).split(",")
     chosen = chosen_indices(names, formula or [])
@@ -210,7 +210,7 @@ def _conclude(
     """Print the statistics of all indices, and return the exit code; `unwritten` says why the table or the report could
     not be written.
     """
-    from agalign.indices.indices_csv import INDICES_FILE
+    from agalign.spectral_indices.indices_csv import INDICES_FILE
 
     written = [r for r in reports if r.path is not None]
     if unwritten:

@@ -15,12 +15,12 @@ from numpy.typing import NDArray
 
 from agalign.host.files import CsvTable
 from agalign.host.text import escape_controls
-from agalign.indices.rasters import IndexReport
 from agalign.records.cautions import NO_RESULT, Caution, RunFacts
 from agalign.records.sidecar import BandResult, GeometryPart, GridPart, OutputPart, Sidecar
 from agalign.report.page_data import DataParts
 from agalign.report.summary_csv import BAND_COLUMNS, SIMILARITY, SUMMARY_COLUMNS, SUMMARY_FILE
 from agalign.report.verdict import Verdict, is_by_prediction, largest_error_px, unwritten_indices
+from agalign.spectral_indices.rasters import IndexReport
 from agalign.values.alignment import Prediction
 from agalign.values.issues import OTHER_REFERENCE, Remedy
 

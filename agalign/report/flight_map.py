@@ -15,9 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agalign.host.files import write_text
-from agalign.indices.rasters import IndexReport
 from agalign.records.run_record import ExclusionPart
 from agalign.records.sidecar import Sidecar
+from agalign.spectral_indices.rasters import IndexReport
 from agalign.values.capture import CameraIdentity, Pose, Position
 
 FLIGHT_MAP_FILE = "flight.geojson"

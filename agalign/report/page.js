@@ -442,7 +442,7 @@ function indexNames() {
 }
 
 /**
- * As agalign/indices/rasters.py has them.
+ * As agalign/spectral_indices/rasters.py has them.
  * @param {number} share @param {boolean} raw
  */
 function indexColour(share, raw) {

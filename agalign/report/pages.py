@@ -19,8 +19,6 @@ from agalign._version import __version__
 from agalign.config import Settings
 from agalign.errors import SidecarError
 from agalign.host.files import write_text
-from agalign.indices.indices_csv import current_rows, merged, reports_of, update_table
-from agalign.indices.rasters import IndexReport
 from agalign.records.excluded import PANELS_FILE, SKY_FILE, PanelPart, SkyPart, read_excluded
 from agalign.records.run_record import RunPart, counted_sidecars, read_run_record, unfinished_run
 from agalign.records.sidecar_file import find_sidecars, read_sidecar
@@ -30,6 +28,8 @@ from agalign.report.flight_map import FlightMap
 from agalign.report.page_data import data_files_exist, printable, remove_other_data_files
 from agalign.report.summary_csv import SUMMARY_FILE
 from agalign.report.terms import PAGES, TERMS
+from agalign.spectral_indices.indices_csv import current_rows, merged, reports_of, update_table
+from agalign.spectral_indices.rasters import IndexReport
 
 REPORT_FILE = "index.html"
 _MAX_LISTED = 100

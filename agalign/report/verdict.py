@@ -11,9 +11,9 @@ from statistics import median
 from typing import NamedTuple
 
 from agalign.errors import ConfigurationError
-from agalign.indices.formulas import index_named
-from agalign.indices.rasters import IndexReport, reason_not_written
 from agalign.records.sidecar import BandResult, Sidecar
+from agalign.spectral_indices.formulas import index_named
+from agalign.spectral_indices.rasters import IndexReport, reason_not_written
 
 _NO_RASTER = "its raster does not exist; 'agalign indices' writes it"
 

@@ -83,6 +83,8 @@ class JointResult:
     >>> joint = result.joint
     >>> joint.recipe, joint.model_family, joint.retrieval > 10 * joint.chance
     ('fast', 'homography', True)
+    >>> joint.min_retrieval, joint.is_retrieved
+    (0.2, True)
     >>> len(joint.corner_std_xy_px), joint.corner_std_px < 0.2
     (4, True)
     """

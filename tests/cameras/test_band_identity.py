@@ -16,8 +16,8 @@ from agalign.cameras.metadata import Tags
 from agalign.cameras.pix4d import NAMESPACE
 from agalign.cameras.tiff_directory import byte_string, text
 from agalign.errors import InputError
-from agalign.indices.formulas import bands_for, index_named
 from agalign.pixels.raster import probe
+from agalign.spectral_indices.formulas import bands_for, index_named
 from agalign.values.capture import Band
 from agalign.values.spectrum import role_of
 

@@ -13,7 +13,6 @@ from itertools import chain
 from pathlib import Path
 
 import pytest
-from agalign.indices.indices_csv import INDICES_FILE, update_table
 
 from agalign.batch.products import PRODUCTS
 from agalign.capture import band_pair, common_parallax, reference
@@ -21,12 +20,13 @@ from agalign.cli.exit_codes import ExitCode
 from agalign.cli.main import COMMANDS
 from agalign.fit import dense, displacement_field, windows
 from agalign.flight import panel_readings
-from agalign.indices.rasters import IndexReport
 from agalign.method import refine
 from agalign.pixels import masks, raster
 from agalign.rasters.parallax_file import PARALLAX_KIND
 from agalign.records.sidecar import FilePart
 from agalign.report.summary_csv import SUMMARY_COLUMNS
+from agalign.spectral_indices.indices_csv import INDICES_FILE, update_table
+from agalign.spectral_indices.rasters import IndexReport
 from agalign.values.alignment import MIN_RETRIEVAL, MIN_TIMES_CHANCE
 from agalign.verify import checks, coverage
 
@@ -121,7 +121,7 @@ def calls(module: str, function: str) -> Iterator[ast.Call]:
 
 def test_events_of_a_run_and_their_fields() -> None:
     fields: dict[str, set[str]] = {}
-    for call in chain(calls("cli/align_run.py", "event"), calls("cli/problem_groups.py", "event")):
+    for call in chain(calls("cli/align_run.py", "event"), calls("cli/print_cautions.py", "event")):
         if isinstance(call.args[0], ast.Constant):
             names = {k.arg for k in call.keywords if k.arg is not None}
             fields.setdefault(str(call.args[0].value), set()).update(names)
@@ -156,7 +156,7 @@ LIMITS = {
     ),
     "explanation/verification.md": (
         f"| at least {MIN_RETRIEVAL:g}, and {MIN_TIMES_CHANCE:g} times chance |",
-        f"at most {checks._MAX_ERROR_PX:g} px in {checks._MIN_ACCURATE_SHARE:.0%} of the area with texture".replace(
+        f"at most {checks._MAX_ERROR_PX:g} px in {checks._MIN_ACCURATE_SHARE:.0%} of the common area".replace(
             "%", " %"
         ),
         f"Their side is at most {windows._WINDOW_PX} px, and {reference._LARGE_WINDOW_PX} px in blurred images",

@@ -10,12 +10,12 @@ import pytest
 import rasterio
 
 import agalign
-from agalign.indices.formulas import index_named, index_of_formula
-from agalign.indices.rasters import write_rasters
 from agalign.rasters.alignment_maps import _flags, error_map
 from agalign.rasters.output_grid import Layer
 from agalign.records.captures import bands_of
 from agalign.records.sidecar_file import read_without_tables
+from agalign.spectral_indices.formulas import index_named, index_of_formula
+from agalign.spectral_indices.rasters import write_rasters
 from agalign.values import geometry, lens
 from agalign.values.capture import Band
 from agalign.values.choices import UNUSABLE_QUALITY, Quality

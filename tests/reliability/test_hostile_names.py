@@ -23,8 +23,8 @@ from agalign.exports.programs import export
 from agalign.flight.groups import model_names
 from agalign.host.files import file_name
 from agalign.host.text import without_controls
-from agalign.indices.formulas import index_named
 from agalign.records.sidecar_file import find_sidecars
+from agalign.spectral_indices.formulas import index_named
 from agalign.values.capture import Band, CameraIdentity, Capture
 
 from ..conftest import Shared, read_json, seeded, write_signed

@@ -17,8 +17,6 @@ import pytest
 
 import agalign
 from agalign.config import Settings
-from agalign.indices.indices_csv import update_table
-from agalign.indices.rasters import IndexReport
 from agalign.rasters.drawing import ReducedBands, read_reduced_bands
 from agalign.rasters.preview import ReliefView, preview_bytes, write_preview
 from agalign.records.run_record import begun
@@ -29,6 +27,8 @@ from agalign.report.charts import CHART_HEIGHT, drifts_of, hues_of, rig_views
 from agalign.report.facts import CameraOffsets, PairTotals
 from agalign.report.pages import pages_exist, write_pages
 from agalign.report.terms import PAGES, TERMS
+from agalign.spectral_indices.indices_csv import update_table
+from agalign.spectral_indices.rasters import IndexReport
 from agalign.values.capture import Band, Capture
 from agalign.values.image import OutputGrid
 

@@ -12,12 +12,12 @@ from typing import Any
 from agalign.errors import InputError
 from agalign.host.files import read_regular, write_csv
 from agalign.host.text import without_formula
-from agalign.indices.formulas import Index, bands_for
-from agalign.indices.rasters import IndexReport, IndexStatistics, index_of, statistics_in
 from agalign.rasters.aligned_files import tags_of
 from agalign.records.cautions import RunFacts
 from agalign.records.run_record import renamed_captures
 from agalign.records.sidecar import Sidecar
+from agalign.spectral_indices.formulas import Index, bands_for
+from agalign.spectral_indices.rasters import IndexReport, IndexStatistics, index_of, statistics_in
 
 INDICES_FILE = "indices.csv"
 

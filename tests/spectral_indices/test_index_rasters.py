@@ -16,16 +16,16 @@ from synthetic_flights.aligned import make_aligned
 from agalign.batch import index_run
 from agalign.batch.index_run import index_tasks, run_indices
 from agalign.errors import ConfigurationError, InputError
-from agalign.indices.before_alignment import index_before
-from agalign.indices.formulas import INDICES, bands_for, compute, evaluate, index_named, index_of_formula
-from agalign.indices.indices_csv import read_table, update_table
-from agalign.indices.rasters import IndexReport, IndexStatistics, write_rasters
 from agalign.rasters.band_reader import RAW
 from agalign.rasters.output_grid import Layer
 from agalign.records.captures import AlignedBand
 from agalign.records.sidecar import FilePart
 from agalign.records.sidecar_file import read_sidecar, verify_outputs, write_sidecar
 from agalign.report.pages import write_pages
+from agalign.spectral_indices.before_alignment import index_before
+from agalign.spectral_indices.formulas import INDICES, bands_for, compute, evaluate, index_named, index_of_formula
+from agalign.spectral_indices.indices_csv import read_table, update_table
+from agalign.spectral_indices.rasters import IndexReport, IndexStatistics, write_rasters
 from agalign.values import geometry
 from agalign.values.capture import Band, Capture
 from agalign.values.image import OutputGrid

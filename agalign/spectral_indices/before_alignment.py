@@ -5,9 +5,9 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from agalign.indices.formulas import Index, bands_for, compute
 from agalign.rasters.aligned_files import layer_pixels
 from agalign.rasters.product import ProductContext
+from agalign.spectral_indices.formulas import Index, bands_for, compute
 from agalign.values.pixel_units import SAME_PIXELS
 
 

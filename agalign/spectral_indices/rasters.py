@@ -22,8 +22,6 @@ from agalign.errors import ConfigurationError, InputError
 from agalign.host.memory_limits import WORK_TILE_PX
 from agalign.host.own_files import SOFTWARE, is_own_file
 from agalign.host.text import shortened
-from agalign.indices.before_alignment import index_before
-from agalign.indices.formulas import Index, bands_for, compute, index_named, index_of_formula
 from agalign.pixels.raster import OpenRaster, open_raster
 from agalign.rasters.aligned_files import tags_of
 from agalign.rasters.band_reader import RAW, BandReader
@@ -39,6 +37,8 @@ from agalign.rasters.geotiff import (
 from agalign.rasters.product import CapturePaths, Product, ProductContext, WrittenFile
 from agalign.records.captures import AlignedBand, bands_of
 from agalign.records.sidecar import Sidecar
+from agalign.spectral_indices.before_alignment import index_before
+from agalign.spectral_indices.formulas import Index, bands_for, compute, index_named, index_of_formula
 from agalign.values.capture import Band, Capture
 from agalign.values.equality import equal
 from agalign.values.image import Tile, reduced_size_px
