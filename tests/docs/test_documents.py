@@ -47,17 +47,17 @@ LONG = re.compile(
 """Pages with blocks that take seconds, and of commands that other tests run: only the full run has them."""
 
 
-def write_ndvi_and_plots(folder: Path) -> None:
+def write_ndvi_and_plots(folder: Path, rotation_deg: float = 0.0) -> None:
     """ndvi.tif with 0.5 and 0.8, and plots.gpkg: a square in both halves and over the edge, with and without an id, and
-    a self-intersecting outline.
+    a self-intersecting outline; all rotated about the top left corner.
     """
     ndvi = np.full((60, 100), 0.5, np.float32)
     ndvi[:, 50:], ndvi[:, :10] = 0.8, np.nan  # nan is outside of the flight
-    place = {"crs": "EPSG:32633", "transform": Affine(0.1, 0, 500_000, 0, -0.1, 4_000_000)}
-    write_band(folder / "ndvi.tif", ndvi, nodata=np.nan, **place)
+    transform = Affine.translation(500_000, 4_000_000) @ Affine.rotation(rotation_deg) @ Affine.scale(0.1, -0.1)
+    write_band(folder / "ndvi.tif", ndvi, nodata=np.nan, crs="EPSG:32633", transform=transform)
     rings = {"A1": ((2, 1), (4, 1), (4, 3), (2, 3)), "": ((6, 1), (8, 1), (8, 3), (6, 3))}
     rings |= {"edge": ((0, 4), (2, 4), (2, 6), (0, 6)), "bow tie": ((6, 5), (9, 5), (6, 4), (9, 4))}
-    outlines = [Polygon([(500_000 + x, 4_000_000 - y) for x, y in ring]) for ring in rings.values()]
+    outlines = [Polygon([transform @ (10 * x, 10 * y) for x, y in ring]) for ring in rings.values()]
     ids = {"plot": [name or None for name in rings]}
     import geopandas  # late: it takes a second in each process of the tests
 
@@ -243,14 +243,19 @@ def test_an_example_on_a_flight_with_panel_two_cameras_and_failed_captures(
     assert not re.search(": None$", printed, re.MULTILINE)
 
 
-def test_the_recipe_for_plots_has_a_row_of_any_outline(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("rotation_deg", [0.0, 31.0, 90.0])
+def test_the_recipe_for_plots_has_a_row_of_any_outline(
+    rotation_deg: float, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Rasters of single captures are rotated: resampled, their plots have the same values, up to pixels at an edge."""
     monkeypatch.chdir(tmp_path)
-    write_ndvi_and_plots(tmp_path)
+    write_ndvi_and_plots(tmp_path, rotation_deg)
     text = next(b.text for b in blocks_of(ROOT / "docs" / "how-to" / "plots.md") if "# plots.py" in b.text)
     run_python(text)
     rows = list(csv.DictReader(Path("plots.csv").read_text(encoding="utf-8").splitlines()))
     assert [row["plot"] for row in rows] == ["A1", "", "edge", "bow tie"]
-    assert [float(row["count"]) for row in rows] == pytest.approx([400, 400, 200, 150], abs=0.1)
+    tolerance = 0.1 if rotation_deg == 0 else 1
+    assert [float(row["count"]) for row in rows] == pytest.approx([400, 400, 200, 150], abs=tolerance)
     assert [float(row["mean"]) for row in rows] == pytest.approx([0.5, 0.8, 0.5, 0.8], abs=1e-6)
 
 
