@@ -13,23 +13,25 @@ from agalign.values.pixel_units import PixelScale
 
 _HALVINGS = 3, 2, 1, 0
 """Levels of the pyramid: how often the images are halved."""
-_MIN_SIDE_PX = 100
-"""Smaller images have too few edges to determine a homography: the iteration diverges."""
 _CRITERIA = cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 100, 1e-6
 
 
 def homography_by_ecc(fixed: Raster, moving: Raster, start: Matrix) -> Matrix | None:
-    """Return fixed_to_moving, refined from `start`; None if the iteration diverges."""
+    """Return fixed_to_moving, refined from `start`; None if the iteration diverges at full resolution.
+
+    A coarser level at which it diverges, for lack of edges, is skipped.
+    """
     edges, matrix = [_gradient_magnitude(raster) for raster in (fixed, moving)], start
-    smallest_px = min(*fixed.size_px, *moving.size_px)
-    for halvings in (n for n in _HALVINGS if n == 0 or smallest_px >= _MIN_SIDE_PX << n):
+    for halvings in _HALVINGS:
         scale = PixelScale(0.5**halvings, 0.5**halvings)
         small = [cv2.resize(e, None, fx=scale.x, fy=scale.y, interpolation=cv2.INTER_AREA) for e in edges]
         initial = geometry.rescale(matrix, scale, scale).astype(np.float32)
         try:
             _, result = cv2.findTransformECC(*small, initial, cv2.MOTION_HOMOGRAPHY, _CRITERIA, None, 1)
         except cv2.error:
-            return None
+            if halvings == 0:
+                return None
+            continue
         matrix = geometry.rescale(np.asarray(result, float), scale.inverse, scale.inverse)
     return matrix
 
