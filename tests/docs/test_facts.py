@@ -156,7 +156,7 @@ LIMITS = {
     ),
     "explanation/verification.md": (
         f"| at least {MIN_RETRIEVAL:g}, and {MIN_TIMES_CHANCE:g} times chance |",
-        f"at most {checks._MAX_ERROR_PX:g} px in {checks._MIN_ACCURATE_SHARE:.0%} of the area with texture",
+        f"at most {checks._MAX_ERROR_PX:g} px in {checks._MIN_ACCURATE_SHARE:.0%} of the common area",
         f"Their side is at most {windows._WINDOW_PX} px, and {reference._LARGE_WINDOW_PX} px in blurred images",
         f"| at least {coverage.MIN_COMMON_COVERAGE:.0%} |",
         f"| at least {checks._MIN_CLOSE_SHARE:.0%} |",
