@@ -13,7 +13,6 @@ from itertools import chain
 from pathlib import Path
 
 import pytest
-from agalign.indices.indices_csv import INDICES_FILE, update_table
 
 from agalign.batch.products import PRODUCTS
 from agalign.capture import band_pair, common_parallax, reference
@@ -21,6 +20,7 @@ from agalign.cli.exit_codes import ExitCode
 from agalign.cli.main import COMMANDS
 from agalign.fit import dense, displacement_field, windows
 from agalign.flight import panel_readings
+from agalign.indices.indices_csv import INDICES_FILE, update_table
 from agalign.indices.rasters import IndexReport
 from agalign.method import refine
 from agalign.pixels import masks, raster

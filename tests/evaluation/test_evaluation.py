@@ -105,6 +105,9 @@ def test_sift_is_evaluated_once_with_its_own_homography(tmp_path: Path) -> None:
 
 def test_ecc_is_evaluated_from_each_start(tmp_path: Path) -> None:
     pair, starts = write_pair(tmp_path, TRUTH, 5), evaluation.Starts((0.0, 0.01))
+    image = cv2.imread(str(pair.fixed), cv2.IMREAD_GRAYSCALE)
+    moving = cv2.warpPerspective(image, TRUTH, image.shape[::-1], borderMode=cv2.BORDER_REFLECT)
+    cv2.imwrite(str(pair.moving), moving)
     results = list(evaluation.evaluate([pair], {"ecc": evaluation.method_named("ecc")}, starts))
     assert len(results) == 2
     assert max(result.error_px for result in results) < 0.1
