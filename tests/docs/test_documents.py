@@ -264,7 +264,7 @@ def test_the_recipe_for_plots_has_a_row_of_any_outline(
 
 def test_the_line_that_chooses_a_day(flight: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
-    for path in shutil.copytree(flight, "flight").rglob("*.tif"):
+    for path in Path(shutil.copytree(flight, "flight")).rglob("*.tif"):
         day = "2026-06-21" if "IMG_0001" in path.name else "2026-06-22"
         seconds = datetime.fromisoformat(f"{day}T10:00").timestamp()
         os.utime(path, (seconds, seconds))
