@@ -121,7 +121,7 @@ def calls(module: str, function: str) -> Iterator[ast.Call]:
 
 def test_events_of_a_run_and_their_fields() -> None:
     fields: dict[str, set[str]] = {}
-    for call in chain(calls("cli/align_run.py", "event"), calls("cli/problem_groups.py", "event")):
+    for call in chain(calls("cli/align_run.py", "event"), calls("cli/print_cautions.py", "event")):
         if isinstance(call.args[0], ast.Constant):
             names = {k.arg for k in call.keywords if k.arg is not None}
             fields.setdefault(str(call.args[0].value), set()).update(names)
@@ -162,7 +162,7 @@ LIMITS = {
         f"| at least {checks._MIN_CLOSE_SHARE:.0%} |",
         f"| fewer than {checks._MIN_CLUSTER}, or fewer than {checks._MAX_CLUSTER_SHARE:.0%} of the windows |",
         f"| at most {checks.MAX_ALIAS_PEAK:.0%} of the first",
-        f"| at most the larger of {checks.MAX_UNEXPECTED_PX:g} px and {checks._MAX_UNEXPECTED_STD:g} standard errors |",
+        f"| at most the larger of {checks.MAX_UNEXPECTED_PX:g} px and {checks._MAX_UNEXPECTED_STD:g} standard errors",
         f"{raster._MAX_BANDS} bands per file",
     ),
     "explanation/accuracy.md": (
