@@ -158,8 +158,8 @@ def warp_onto(
     -------
     pixels
         The resampled image, in the layout and type of `moving`; NaN or, for integers, 0 where it is unknown.
-    known
-        (height, width), True where all channels of `pixels` are known.
+    valid
+        (height, width), True where all channels of `pixels` have a value.
 
     Raises
     ------
@@ -172,8 +172,8 @@ def warp_onto(
     Examples
     --------
     >>> image = np.arange(12.0).reshape(3, 4)
-    >>> pixels, known = agalign.warp_onto(image, [[1, 0, 1], [0, 1, 0], [0, 0, 1]], (4, 3), interpolation="nearest")
-    >>> pixels[0], known[0]
+    >>> pixels, valid = agalign.warp_onto(image, [[1, 0, 1], [0, 1, 0], [0, 0, 1]], (4, 3), interpolation="nearest")
+    >>> pixels[0], valid[0]
     (array([ 1.,  2.,  3., nan]), array([ True,  True,  True, False]))
     """
     if isinstance(fixed_to_moving, Alignment):

@@ -102,7 +102,7 @@ class DiscoverOptions:
     """
 
     pattern: str | None = None
-    """File names of a camera that is not recognised, as '{capture}_{band}.tif'."""
+    """File names of a camera that is not recognised, for example '{capture}_{band}.tif'."""
     reference: str | None = None
     """Reference band, to whose pixel grid the others are aligned; by default green."""
     ignore_metadata: bool = False
@@ -151,7 +151,7 @@ class RunOptions:
     """Also align captures of calibration panels and of the sky; panels then give no reflectance."""
     # Any concurrent.futures executor in Python, such as `agalign.dask_executor`.
     executor: Annotated[Executor | None, Option("dask", type=str | None)] = None
-    """Address of a Dask scheduler, as tcp://host:8786; 'local' starts workers on this machine."""
+    """Address of a Dask scheduler, such as tcp://host:8786; 'local' starts workers on this machine."""
     retry_failed: bool = False
     """Process captures again whose status is not `ok`."""
     # An `executor` of the caller ignores it, except `dask_executor`.
@@ -333,8 +333,7 @@ class WriteSettings(SettingsModel):
     panel_albedo: Annotated[
         tuple[tuple[str, Annotated[float, Field(gt=0, le=1)]], ...], Option(type=str | None, parse=albedos)
     ] = ()
-    """Reflectance of the calibration panel, as 0.51 or Blue=0.51,NIR=0.49; needed for panels without tags or QR code.
-    """
+    """Reflectance of the calibration panel, such as 0.51 or Blue=0.51,NIR=0.49; for panels without tags or QR code."""
 
 
 class Settings(SettingsModel):

@@ -54,7 +54,7 @@ def add_navigation(_app: Sphinx, page: str, source: list[str]) -> None:
         source[0] = source[0].replace(f"]({path})", f"]({included_by})")
     for part in source[0].split("\n## ")[1:]:
         group, *links = part.splitlines()
-        pages = re.findall(r"^\* \[.*\]\((\S+)\.\w+\)$", "\n".join(links), re.MULTILINE)
+        pages = re.findall(r"^\* \[.*?\]\((\S+)\.\w+\)", "\n".join(links), re.MULTILINE)
         source[0] += "\n".join(["\n```{toctree}", ":hidden:", f":caption: {group}", *pages, "```\n"])
 
 

@@ -6,7 +6,7 @@
 #
 FLIGHTS ?= flights
 OUT ?= aligned
-OPTIONS ?= --radiometry auto --index ndvi
+OPTIONS ?= --radiometry auto --qa
 
 DONE := $(patsubst $(FLIGHTS)/%/,$(OUT)/%.done,$(sort $(wildcard $(FLIGHTS)/*/)))
 
@@ -18,6 +18,7 @@ all: $(DONE)
 $(OUT)/%.done: $(FLIGHTS)/%/
 	@mkdir -p $(OUT)
 	agalign $< -o $(OUT)/$* $(OPTIONS); code=$$?; \
+	case $$code in 0|3) agalign indices $(OUT)/$* --index ndvi --mask-qa;; esac; \
 	if [ $$code -eq 3 ]; then echo $* >> $(OUT)/incomplete.txt; elif [ $$code -ne 0 ]; then exit $$code; fi
 	@touch $@
 

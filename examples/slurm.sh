@@ -13,8 +13,9 @@ set -uo pipefail
 trap : TERM  # at the time limit, SLURM signals this script too: wait for agalign, and requeue
 flight=$(ls -d "$FLIGHTS"/*/ | sed -n "${SLURM_ARRAY_TASK_ID:?start it with sbatch --array}p")
 name=$(basename "$flight")
-agalign "$flight" -o "$OUT/$name" --jobs "${SLURM_CPUS_PER_TASK:-1}" --radiometry auto --index ndvi
+agalign "$flight" -o "$OUT/$name" --jobs "${SLURM_CPUS_PER_TASK:-1}" --radiometry auto --qa
 code=$?
+case $code in 0 | 3) agalign indices "$OUT/$name" --index ndvi --mask-qa ;; esac
 
 case $code in
     0) ;;

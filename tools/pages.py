@@ -18,7 +18,7 @@ import typing
 from collections import Counter
 from collections.abc import Callable, Container, Iterator, Mapping
 from functools import cache, partial
-from itertools import groupby, takewhile
+from itertools import groupby
 from operator import attrgetter, not_
 from pathlib import Path
 from typing import Any
@@ -52,46 +52,36 @@ TABLES = {
 """Tables of `figures.csv` by page of docs/explanation."""
 
 
-def command_options(of_experiments: bool) -> str:
-    """Return a section per command: what it does, its usage, a list of options for each panel of its help, and its
-    examples. Options that a command of `DESCRIBED` has with the same text are described there only.
+def command_options() -> str:
+    """Return a section per command: what it does, its usage, and a list of options for each panel of its help. Options
+    that `align` has with the same text are described there only.
     """
-    commands = (c for c in COMMANDS.values() if not c.alias and (c.name in EXPERIMENTS) is of_experiments)
-    return "\n".join(section(command) for command in commands)
+    return "\n".join(section(c) for c in COMMANDS.values() if not c.alias and c.name not in EXPERIMENTS)
 
 
 EXPERIMENTS = ("evaluate", "surface", "learn")
-"""Commands on the page of the paper."""
-DESCRIBED = ("align", "evaluate")
-"""Commands whose options are not repeated."""
+"""Commands without a section."""
 
 
 def section(command: Command) -> str:
     """Return the section of a command."""
-    text, _, examples = help_of(command.function)
+    text, *_ = help_of(command.function)
     built = command.built()
     usage = " ".join(built.collect_usage_pieces(built.make_context(command.name, [], resilient_parsing=True)))
     panels = {name: panel for panel, names in command.panels.items() for name in names.split()}
     by_panel: dict[str, list[str]] = {}
-    same: dict[str, list[str]] = {}
-    earlier = takewhile(lambda name: name != command.name, DESCRIBED)
-    known = [(name, dict(option_lines(COMMANDS[name])).values()) for name in earlier]
+    same: list[str] = []
+    known = [] if command.name == "align" else dict(option_lines(COMMANDS["align"])).values()
     for name, line in option_lines(command):
-        if owner := next((one for one, lines in known if line in lines), None):
-            same.setdefault(owner, []).append("`" + re.findall(r"--[a-z-]+|[A-Z]+", line)[0] + "`")
+        if line in known:
+            same.append("`" + re.findall(r"--[a-z-]+|[A-Z]+", line)[0] + "`")
         else:
             by_panel.setdefault(panels.get(name, ""), []).append(line)
-    depth = "###" if command.name in EXPERIMENTS else "##"
-    parts = [f"{depth} {command.name}", f"`agalign {command.name} {usage.removeprefix('[OPTIONS] ')}`: " + effect(text)]
+    parts = [f"## {command.name}", f"`agalign {command.name} {usage.removeprefix('[OPTIONS] ')}`: " + effect(text)]
     for panel, lines in by_panel.items():
         parts += [f"**{panel}**"] * bool(panel) + ["\n".join(f"* {line}" for line in lines)]
     if same:
-        folder = "../reference/commands.md" if command.name in EXPERIMENTS else ""
-        links = {owner: f"[`{owner}`]({'' if owner in EXPERIMENTS else folder}#{owner})" for owner in same}
-        owners = "; ".join(f"{links[owner]}: {', '.join(names)}" for owner, names in same.items())
-        parts.append(f"As in {owners}.")
-    if examples:
-        parts.append("```text\n" + "\n".join(line.replace("  ", "  # ") for line in examples) + "\n```")
+        parts.append(f"As in [`align`](#align): {', '.join(same)}.")
     return "\n\n".join(parts) + "\n"
 
 
@@ -160,6 +150,7 @@ NOT_LISTED = {
     *("loss", "chance", "iterations", "levels", "last_step_px", "cells"),
     *("corner_covariance_px2", "covariance_px2", "lens_std_px", "relief_std_px"),
     *("score", "peak_sigma", "trusted", "runner_up_sigma", "windows", "held_out_p95_px"),
+    *("joint", "rig_std_px", "field_std_px", "input_digests", "input_states", "bytes", "sha256"),
     *("vignetting_corrected", "exposed_after_s", "not_written", "seconds"),
 }
 """Parts that another page describes, and fields that only agalign needs: for the report, resumed runs and errors."""
@@ -290,8 +281,7 @@ def public_names() -> str:
 
 
 PARTS: tuple[tuple[str, str, Callable[[], str]], ...] = (
-    ("reference/commands.md", "commands", partial(command_options, of_experiments=False)),
-    ("explanation/paper.md", "experiments", partial(command_options, of_experiments=True)),
+    ("reference/commands.md", "commands", command_options),
     ("reference/settings.md", "Settings", partial(python_names, "settings")),
     ("reference/settings.md", "DiscoverOptions", partial(python_names, "discover")),
     ("reference/settings.md", "RunOptions", partial(python_names, "run")),

@@ -1,11 +1,12 @@
-"""Make the pictures of the pages: NDVI before and after alignment and the pictures of the demo, a real capture, and, in
-a browser, the report of a demo flight with two damaged files.
+"""Make the pictures of the pages: NDVI of a real capture before and after alignment, the capture, one of the demo, and,
+in a browser, the report of a demo flight with two damaged files.
 
-    python tools/readme_figures.py [DEMO [ALIGNED]]
+    python tools/readme_figures.py [DEMO [FLIGHT ALIGNED]]
 
-DEMO is the output of an earlier `agalign demo`; without it, a demo is run. ALIGNED is the output of a run on the row
-crop (`DATA/flights/rededge_m_rowcrop`, --ground-elevation 92). Writes ndvi.jpg, demo.jpg, report.jpg and, with ALIGNED,
-row-crop.jpg to docs/figures. The report needs playwright and a Chromium; without them report.jpg is not written.
+DEMO is the output of an earlier `agalign demo`; without it, a demo is run. FLIGHT is the row crop
+(`DATA/flights/rededge_m_rowcrop`), ALIGNED the output of `agalign FLIGHT -o ALIGNED --radiometry auto --qa` and
+`agalign indices ALIGNED --mask-qa`. Writes demo.jpg, report.jpg and, with FLIGHT, ndvi.jpg and row-crop.jpg to
+docs/figures. The report needs playwright and a Chromium; without them report.jpg is not written.
 """
 
 import importlib.util
@@ -32,6 +33,10 @@ from agalign.values.capture import Band
 FIGURES = Path(__file__).resolve().parents[1] / "docs" / "figures"
 WIDTH_PX, SCREEN_PX = 880, (1000, 900)
 CAPTURE = Path("0000SET/000/IMG_0001")
+ROW_CROP, PART_PX, ENLARGED = "IMG_0009", (330, 590, 260, 220), 3
+"""Capture, the part of its stack (left, top, width, height), and the side of its pixels in the picture."""
+_RAMP = np.array([(140, 81, 10), (223, 194, 125), (245, 245, 220), (120, 190, 90), (0, 90, 50)], float)
+"""Colours of NDVI from 0 to 1."""
 
 
 def main() -> None:
@@ -40,13 +45,10 @@ def main() -> None:
         demo = Path(sys.argv[1]) if len(sys.argv) > 1 else Path(folder)
         if len(sys.argv) == 1:
             agalign("demo", demo)
-        # An earlier demo stays as it is.
-        aligned = shutil.copytree(demo / "aligned", Path(folder) / "with-ndvi")
-        agalign("align", demo / "flight", "-o", aligned, "--radiometry", "auto", "--index", "ndvi")
-        save(ndvi_before_and_after(demo / "flight", aligned), "ndvi.jpg", 85)
         save(Image.open((demo / "aligned" / CAPTURE).with_suffix(".png")), "demo.jpg", 72)
-        if len(sys.argv) > 2:
-            save(Image.open(Path(sys.argv[2]) / "IMG_0009.png"), "row-crop.jpg", 78)
+        if len(sys.argv) > 3:
+            save(ndvi_before_and_after(Path(sys.argv[2]), Path(sys.argv[3])), "ndvi.jpg", 80)
+            save(Image.open(Path(sys.argv[3]) / f"{ROW_CROP}.png"), "row-crop.jpg", 78)
         if importlib.util.find_spec("playwright"):
             flight, damaged = damaged_flight(demo / "flight", Path(folder) / "damaged"), Path(folder) / "with-problems"
             model = next((demo / "aligned" / "models").glob("*.safetensors"))
@@ -62,24 +64,38 @@ def agalign(*arguments: str | Path, code: int = 0) -> None:
         raise SystemExit(f"agalign {arguments[0]}: exit code {done.returncode} instead of {code}")
 
 
-def ndvi_before_and_after(flight: Path, aligned: Path, size_px: tuple[int, int] = (440, 330)) -> Image.Image:
-    """Return NDVI of a part of one capture, enlarged twice: by pixels of the raw files, and of the aligned stack."""
-    bands = {b.name: b for c in discover(flight).captures if c.name == CAPTURE.name for b in c.bands}
+def ndvi_before_and_after(flight: Path, aligned: Path) -> Image.Image:
+    """Return NDVI of a part of the row crop: by pixels of the raw files, and of the index raster."""
+    bands = {b.name: b for c in discover(flight).captures if c.name == ROW_CROP for b in c.bands}
     reflectances = [reflectance(bands[name]) for name in ("NIR", "Red")]
-    with rasterio.open((aligned / CAPTURE).with_name(f"{CAPTURE.name}_ndvi.tif")) as raster:
+    with rasterio.open(aligned / f"{ROW_CROP}_ndvi.tif") as raster:
         after = raster.read(1)
-    x0, y0, width, height = read_sidecar((aligned / CAPTURE).with_suffix(".json")).output.crop
+    x0, y0, width, height = read_sidecar(aligned / f"{ROW_CROP}.json").output.crop
     before = compute(INDICES["ndvi"], reflectances)[y0 : y0 + height, x0 : x0 + width]
-    left, top = (width - size_px[0]) // 2, (height - size_px[1]) // 2
+    left, top, columns, rows = PART_PX
     sides = []
     for title, values in (("NDVI before alignment", before), ("NDVI after alignment", after)):
-        part = coloured(values[top : top + size_px[1], left : left + size_px[0]])
-        large = cv2.resize(part, None, fx=2, fy=2, interpolation=cv2.INTER_NEAREST)
-        sheet = np.full((large.shape[0] + 48, *large.shape[1:]), 255, np.uint8)
-        sheet[48:] = large
-        sides.append(with_text(sheet, title, (8, 32), 28))
-    gap = np.full((sides[0].shape[0], 16, 3), 255, np.uint8)
-    return Image.fromarray(np.hstack([sides[0], gap, sides[1]]))
+        part = coloured(values[top : top + rows, left : left + columns])
+        large = cv2.resize(part, None, fx=ENLARGED, fy=ENLARGED, interpolation=cv2.INTER_NEAREST)
+        sides += [with_title(large, title), np.full((large.shape[0] + 48, 16, 3), 255, np.uint8)]
+    return Image.fromarray(np.hstack([*sides, colour_bar(ENLARGED * rows)]))
+
+
+def with_title(image: NDArray[np.uint8], title: str) -> NDArray[np.uint8]:
+    """Return an image below its title."""
+    sheet = np.full((image.shape[0] + 48, *image.shape[1:]), 255, np.uint8)
+    sheet[48:] = image
+    return with_text(sheet, title, (8, 32), 28)
+
+
+def colour_bar(height_px: int) -> NDArray[np.uint8]:
+    """Return the colours of NDVI from 1 (top) to 0 with numbers, beside images of this height with titles."""
+    sheet = np.full((height_px + 48, 130, 3), 255, np.uint8)
+    sheet[48:, :40] = coloured(np.linspace(1, 0, height_px, dtype=np.float32)[:, None])
+    for value in np.linspace(0, 1, 6):
+        y = 48 + round((1 - value) * (height_px - 28)) + 24
+        sheet = with_text(sheet, f"{value:.1f}", (52, y), 28)
+    return sheet
 
 
 def reflectance(band: Band) -> NDArray[np.float32]:
@@ -89,10 +105,11 @@ def reflectance(band: Band) -> NDArray[np.float32]:
 
 
 def coloured(ndvi: NDArray[np.float32]) -> NDArray[np.uint8]:
-    """Return NDVI from 0 (brown) to 1 (green) as RGB."""
-    ramp = np.array([(140, 81, 10), (223, 194, 125), (245, 245, 220), (120, 190, 90), (0, 90, 50)], float)
-    stops = np.linspace(0, 1, len(ramp))
-    return np.stack([np.interp(np.nan_to_num(ndvi), stops, c) for c in ramp.T], axis=-1).round().astype(np.uint8)
+    """Return NDVI from 0 (brown) to 1 (green) as RGB; NaN is grey."""
+    stops = np.linspace(0, 1, len(_RAMP))
+    result = np.stack([np.interp(np.nan_to_num(ndvi), stops, c) for c in _RAMP.T], axis=-1)
+    result[np.isnan(ndvi)] = 160
+    return result.round().astype(np.uint8)
 
 
 def damaged_flight(flight: Path, copy: Path) -> Path:

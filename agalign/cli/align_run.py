@@ -384,5 +384,5 @@ def _print_table(pairs: PairTotals, title: str, terminal: Terminal) -> None:
         residuals = (f"{median(px):.3f}", f"{max(px):.3f}") if px else ("-", "-")
         rows.append((name, *(str(band.statuses[status]) for status in columns), *residuals, seconds))
     titles = (status.replace("_", " ").capitalize() for status in columns)
-    headers = ("Band", *titles, "Residual px, median", "Worst", "Seconds a pair")
+    headers = ("Band", *titles, "Residual px, median", "Worst", "Seconds per pair")
     terminal.table(headers, rows, title, texts=1)

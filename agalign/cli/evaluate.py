@@ -31,7 +31,7 @@ def _evaluate(
     """Evaluate descriptors and homographies on pairs with ground truth (Dong et al., 2018).
 
     Options:
-        methods: Recipe and sharing (fast:siamese; fast:siamese:grey for grey images), sift, daisy, elastix, or a
+        methods: Recipe and sharing (fast:siamese; fast:siamese:grey for grey images), sift, daisy, ecc, elastix, or a
             network file; repeatable.
         shift: Distances of the start from the truth, % of the longer side, separated by commas.
         directions: Directions of the start for each distance.
@@ -126,7 +126,7 @@ def _learn(
     terminal: Terminal,
     given: Given,
     pairs: Pairs,
-    out: Annotated[Path, typer.Option("--out", "-o")] = Path("learnt.safetensors"),
+    out: Annotated[Path, typer.Option("--out", "-o")] = Path("learned.safetensors"),
     steps: Annotated[int, typer.Option(min=1)] = 200,
 ) -> None:
     """Learn one descriptor from pairs without labels, using those that can be aligned.
@@ -153,7 +153,7 @@ def _learn(
     result = read_rough_pairs(pairs)
     model = learn_descriptor(result, Settings.model_validate(given["settings"]), steps_a_pair=steps, on_pair=on_pair)
     save_model(model, out)
-    terminal.event("learnt", f"{out}: learned from {aligned} of {len(result)} pairs", file=str(out))
+    terminal.event("learned", f"{out}: learned from {aligned} of {len(result)} pairs", file=str(out))
 
 
 _command = partial(

@@ -153,8 +153,8 @@ def _indices(
     """Compute spectral indices of aligned captures: rasters, pictures and a table of statistics.
 
     Options:
-        index: Names separated by commas, as ndvi (the default), ndre, savi …
-        formula: A formula of the bands B, G, R, RE and N, as 'name=(N-R)/(N+R)'; repeatable.
+        index: Names separated by commas: ndvi (the default), ndre, savi …
+        formula: A formula of the bands B, G, R, RE and N, such as 'name=(N-R)/(N+R)'; repeatable.
         target: Folder for the rasters; by default next to the stacks.
         mask_qa: Omit saturated, occluded and misaligned pixels; the run needs --qa.
         as_json: Print JSON to standard output.

@@ -1,5 +1,5 @@
 """Evaluation of methods on pairs from several initial homographies, and tables of the results. The methods: descriptors
-learned on the pair, pretrained and hand-crafted descriptors, and elastix.
+learned on the pair, pretrained and hand-crafted descriptors, ECC and elastix.
 """
 
 import csv
@@ -38,6 +38,7 @@ from agalign.errors import (
     NotEnoughTextureError,
     OutputError,
 )
+from agalign.evaluation.ecc import homography_by_ecc
 from agalign.evaluation.image_pairs import PairFiles, read_image
 from agalign.flight.model import load_model
 from agalign.host.files import read_regular, write_csv
@@ -88,7 +89,7 @@ def method_named(name: str, device: str = "auto", rng_seed: int = 0, *, seeding:
 
     * `fast`, `scratch` or `paper`, a colon and the sharing (`siamese`, `pseudo-siamese`, `unshared`): learned on the
       pair by that recipe. `:grey` added: on grey images.
-    * `sift` (its homography is that of MAGSAC++), `daisy`, `elastix`.
+    * `sift` (its homography is that of MAGSAC++), `daisy`, `ecc` (on gradient magnitudes), `elastix`.
     * FILE.safetensors: a network of this program. FILE.pt: a TorchScript module that takes (N, 1, P, P) in [0, 1]; P is
       32, or what follows an @, as in hardnet.pt@32.
 
@@ -97,6 +98,7 @@ def method_named(name: str, device: str = "auto", rng_seed: int = 0, *, seeding:
     fixed_names: dict[str, Method] = {
         "sift": _from_patches(64, sift_of_patches, homography_by_sift),
         "daisy": _from_patches(64, daisy_of_patches),
+        "ecc": Method(lambda fixed, moving, start: (None, homography_by_ecc(fixed, moving, start))),
         "elastix": Method(_elastix),
     }
     if name == "elastix" and importlib.util.find_spec("itk") is None:

@@ -353,8 +353,8 @@ class Alignment:
         -------
         pixels
             The resampled image, in the layout and type of `moving`.
-        known
-            (height, width) of the reference: True where all channels are known, inside the moving image and not
+        valid
+            (height, width) of the reference: True where all channels have a value, inside the moving image and not
             occluded.
 
         Raises
@@ -366,10 +366,10 @@ class Alignment:
         --------
         `green`, `nir` and `result` are those of the example of `align`.
 
-        >>> nir_on_green, known = result.warp(nir)
+        >>> nir_on_green, valid = result.warp(nir)
         >>> nir_on_green.shape == green.shape
         True
-        >>> bool(np.corrcoef(nir_on_green[known], green[known])[0, 1] < -0.99)  # reversed contrast
+        >>> bool(np.corrcoef(nir_on_green[valid], green[valid])[0, 1] < -0.99)  # reversed contrast
         True
         """
         planes, channels_last = planes_of(moving, "moving")

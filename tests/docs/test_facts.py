@@ -156,22 +156,18 @@ LIMITS = {
     ),
     "explanation/verification.md": (
         f"| at least {MIN_RETRIEVAL:g}, and {MIN_TIMES_CHANCE:g} times chance |",
-        f"at most {checks._MAX_ERROR_PX:g} px in {checks._MIN_ACCURATE_SHARE:.0%} of the common area".replace(
-            "%", " %"
-        ),
+        f"at most {checks._MAX_ERROR_PX:g} px in {checks._MIN_ACCURATE_SHARE:.0%} of the common area",
         f"Their side is at most {windows._WINDOW_PX} px, and {reference._LARGE_WINDOW_PX} px in blurred images",
-        f"| at least {coverage.MIN_COMMON_COVERAGE:.0%} |".replace("%", " %"),
-        f"| at least {checks._MIN_CLOSE_SHARE:.0%} |".replace("%", " %"),
-        f"| fewer than {checks._MIN_CLUSTER}, or fewer than {checks._MAX_CLUSTER_SHARE:.0%} of the windows |".replace(
-            "%", " %"
-        ),
-        f"| at most {checks.MAX_ALIAS_PEAK:.0%} of the first".replace("%", " %"),
-        f"| at most the larger of {checks.MAX_UNEXPECTED_PX:g} px and {checks._MAX_UNEXPECTED_STD:g} standard errors |",
+        f"| at least {coverage.MIN_COMMON_COVERAGE:.0%} |",
+        f"| at least {checks._MIN_CLOSE_SHARE:.0%} |",
+        f"| fewer than {checks._MIN_CLUSTER}, or fewer than {checks._MAX_CLUSTER_SHARE:.0%} of the windows |",
+        f"| at most {checks.MAX_ALIAS_PEAK:.0%} of the first",
+        f"| at most the larger of {checks.MAX_UNEXPECTED_PX:g} px and {checks._MAX_UNEXPECTED_STD:g} standard errors",
         f"{raster._MAX_BANDS} bands per file",
     ),
     "explanation/accuracy.md": (
-        f"The largest parallax is {dense._SEARCH_NEARER:.0%} of".replace("%", " %"),
-        f"and {dense._SEARCH_FARTHER:.0%} behind it".replace("%", " %"),
+        f"The largest parallax is {dense._SEARCH_NEARER:.0%} of",
+        f"and {dense._SEARCH_FARTHER:.0%} behind it",
     ),
     "how-to/reflectance.md": (
         f"calibration panels at most {panel_readings.MAX_TIME_DIFFERENCE_S / 3600:g} hours away",

@@ -103,6 +103,16 @@ def test_sift_is_evaluated_once_with_its_own_homography(tmp_path: Path) -> None:
     assert list(evaluation.evaluate([pair], {"sift": evaluation.method_named("sift")}, starts, earlier=[result])) == []
 
 
+def test_ecc_is_evaluated_from_each_start(tmp_path: Path) -> None:
+    pair, starts = write_pair(tmp_path, TRUTH, 5), evaluation.Starts((0.0, 0.01))
+    image = cv2.imread(str(pair.fixed), cv2.IMREAD_GRAYSCALE)
+    moving = cv2.warpPerspective(image, TRUTH, image.shape[::-1], borderMode=cv2.BORDER_REFLECT)
+    cv2.imwrite(str(pair.moving), moving)
+    results = list(evaluation.evaluate([pair], {"ecc": evaluation.method_named("ecc")}, starts))
+    assert len(results) == 2
+    assert max(result.error_px for result in results) < 0.1
+
+
 def test_starts_have_the_requested_error() -> None:
     starts = list(evaluation.Starts((0.0, 0.1), directions=4).of(TRUTH, 400, np.random.default_rng(0)))
     assert [share for share, _, _ in starts] == [0.0, 0.1, 0.1, 0.1, 0.1]
@@ -113,7 +123,7 @@ def test_starts_have_the_requested_error() -> None:
 
 def test_names_of_methods(tmp_path: Path) -> None:
     for name in ("surf", "fast", "fast:twins"):
-        known = "sift, daisy, elastix, fast:siamese, fast:pseudo-siamese, fast:unshared, scratch:"
+        known = "sift, daisy, ecc, elastix, fast:siamese, fast:pseudo-siamese, fast:unshared, scratch:"
         with pytest.raises(ConfigurationError, match=f"unknown method '{name}'; choose from {known}"):
             evaluation.method_named(name)
     for name, message in (("none.pt", r"none\.pt: not a TorchScript module"), ("none.safetensors", r"none\.safe")):
