@@ -69,7 +69,8 @@ def run_command(command: str, where: str, codes: Sequence[int] = (0,)) -> None:
     """
     first, *arguments = shlex.split(command)
     if first == "agalign":
-        found = [sorted(map(str, Path().glob(a))) if "*" in a else [a] for a in arguments]
+        is_glob = ["*" in a and f"'{a}'" not in command for a in arguments]  # a shell does not expand quoted ones
+        found = [sorted(map(str, Path().glob(a))) if g else [a] for a, g in zip(arguments, is_glob, strict=True)]
         done = agalign_here(*(argument for part in found for argument in part))
     else:
         tools = os.pathsep.join((str(Path(sys.executable).parent), os.environ["PATH"]))
