@@ -269,6 +269,8 @@ def figures_of(name: str) -> str:
     columns if the rows have different ones.
     """
     parts = [(*fact.split(" / ")[1:], row) for fact, row in figures().items() if fact.startswith(f"{name} / ")]
+    if not parts:
+        return "\nNot measured.\n"
     columns = list(dict.fromkeys((column, row["unit"]) for _, column, row in parts))
     by_row: dict[str, dict[str, dict[str, str]]] = {}
     for line, column, row in parts:
