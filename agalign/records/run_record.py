@@ -34,7 +34,8 @@ RunState = Literal["running", "interrupted", "finished"]
 
 
 class _Part(BaseModel):
-    model_config = ConfigDict(extra="forbid", allow_inf_nan=False)
+    # A later version may add fields without another schema.
+    model_config = ConfigDict(extra="ignore", allow_inf_nan=False)
 
 
 class RefusalPart(_Part):

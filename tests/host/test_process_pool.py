@@ -290,7 +290,7 @@ import signal
 import sys
 from multiprocessing import get_context
 from agalign.host.process_pool import ProcessPool
-from tests.values.pool_tasks import sleep
+from tests.host.pool_tasks import sleep
 # A shell starts jobs in the background with this signal ignored.
 signal.signal(signal.SIGINT, signal.default_int_handler)
 with ProcessPool(4, get_context(sys.argv[1])) as workers:
