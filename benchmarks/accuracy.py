@@ -5,7 +5,7 @@
 A set is a folder with images below DATA. The error is measured at reference tie points (`ties.json` in the folder); in
 damaged copies without them it is the distance from the mapping of the undamaged run, for bands that are aligned there.
 The claim at a point is the value of the error map (`--error-map`). A usable band is aligned, or predicted within
---accept-predicted; it is wrong if more than a tenth of its points are off by more than 1 px and by two claims.
+--accept-predicted; it is overconfident if more than a tenth of its points are off by more than 1 px and by two claims.
 """
 
 from dataclasses import replace
@@ -88,17 +88,17 @@ def known_errors(out: Path, ties: Ties, of_a_run: Ties) -> list[BandError]:
     return result
 
 
-def is_wrong(band: BandError) -> bool:
+def is_overconfident(band: BandError) -> bool:
     off = (band.error_px > 1) & ~(band.error_px <= 2 * band.claim_px)
     return band.is_usable and bool(off.sum() > 0.1 * len(off))
 
 
 def print_bands(name: str, bands: list[BandError]) -> None:
     for row in bands:
-        wrong = "WRONG" if is_wrong(row) else "usable" if row.is_usable else ""
+        verdict = "OVERCONFIDENT" if is_overconfident(row) else "usable" if row.is_usable else ""
         errors = [cell(row.error_px, ".3f", partial(np.percentile, q=q)) for q in (50, 68, 90)]
         beyond, claim = cell(row.error_px > 1, ".0%", np.mean), cell(row.claim_px, ".3f")
-        what = row.name, row.part.status, row.part.geometry.kind, wrong
+        what = row.name, row.part.status, row.part.geometry.kind, verdict
         print_row(name, *what, *errors, beyond, claim, f"{row.part.seconds:.1f}")
 
 
@@ -108,7 +108,7 @@ def summary(name: str, rows: list[BandError]) -> tuple[Any, ...]:
     pairs = [np.stack([r.error_px, r.claim_px]) for r in usable]
     error, claim = np.concatenate([np.empty((2, 0)), *pairs], axis=1)
     error, claim = error[np.isfinite(claim)], claim[np.isfinite(claim)]
-    counts = f"{len(aligned)} of {len(rows)}", len(usable) - len(aligned), sum(map(is_wrong, rows))
+    counts = f"{len(aligned)} of {len(rows)}", len(usable) - len(aligned), sum(map(is_overconfident, rows))
     errors = cell(medians, ".3f"), cell(medians, ".3f", np.max), cell(p95s, ".2f")
     shares = cell(error <= 2 * claim, ".0%", np.mean), cell((claim < 0.3) & (error > 1), ".1%", np.mean)
     return name, *counts, *errors, *shares, cell([r.part.seconds for r in aligned], ".1f")
@@ -116,9 +116,9 @@ def summary(name: str, rows: list[BandError]) -> tuple[Any, ...]:
 
 def table_row(folder: Path, rows: list[BandError]) -> TableRow:
     """Return the row of an undamaged flight in docs/figures/figures.csv."""
-    _, aligned, usable, wrong, median, worst, p95, within, *_ = summary("", rows)
-    heads = "aligned", "predicted, usable", "wrong", "median error, px", "worst pair, px", "95th percentile, px"
-    values = aligned.partition(" ")[0], usable, wrong, median, worst, p95
+    _, aligned, usable, overconfident, median, worst, p95, within, *_ = summary("", rows)
+    heads = "aligned", "predicted, usable", "overconfident", "median error, px", "worst pair, px", "95th percentile, px"
+    values = aligned.partition(" ")[0], usable, overconfident, median, worst, p95
     cells = {**dict(zip(heads, values, strict=True)), "within 2 standard errors, %": within.rstrip("%")}
     return TableRow("accuracy", title_of(folder), f"{len(rows)} pairs", cells)
 
@@ -155,7 +155,9 @@ def main(
             undamaged += [] if name else [table_row(folder, rows)]
     print()
     shares = "error <= 2 claims", "claim < 0.3, error > 1"
-    print_head("set", "aligned", "usable predictions", "wrong", "median, px", "worst", "95 %", *shares, "s per pair")
+    print_head(
+        "set", "aligned", "usable predictions", "overconfident", "median, px", "worst", "95 %", *shares, "s per pair"
+    )
     for line in lines:
         print_row(*line)
     if figures:

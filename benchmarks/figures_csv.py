@@ -1,17 +1,24 @@
-"""The table of measured figures from which pages quote; a benchmark with --figures replaces the rows of its command."""
+"""The table of measured figures from which pages quote; a benchmark with --figures replaces the rows of its command.
+
+Each row has the version of the packages that it depends on: `tools/pages.py` marks tables that were measured by another
+version.
+"""
 
 import csv
+import hashlib
+import subprocess
 import sys
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, NamedTuple
 
 import typer
 
 ROOT = Path(__file__).resolve().parents[1]
 FIGURES = ROOT / "docs" / "figures" / "figures.csv"
-HEAD = "fact", "value", "unit", "n", "command"
+HEAD = "fact", "value", "unit", "n", "command", "commit", "digest"
 UNITS = "px", "%", "s", "GB"
 FiguresOption = Annotated[
     bool, typer.Option("--figures", help="write the rows of this command in docs/figures/figures.csv")
@@ -37,6 +44,50 @@ def title_of(folder: Path) -> str:
     return TITLES.get(folder.name, folder.name)
 
 
+ESTIMATOR = "config.py", "values", "pixels", "cameras", "fit", "method", "flight", "verify", "capture"
+"""Modules and packages of agalign on which every figure depends."""
+RENDERING = "rasters", "indices"
+"""What figures of runs depend on as well."""
+DEPENDS_ON = {"runs": RENDERING, "captures with depth": RENDERING, "reliability": ("host", "batch", *RENDERING)}
+"""Other packages on which the figures of a table depend."""
+
+
+class Provenance(NamedTuple):
+    """The version of the code by which a figure was measured."""
+
+    commit: str
+    """The last commit that changed the packages."""
+    digest: str
+    """Of the files of the packages."""
+
+    @classmethod
+    def of(cls, table: str) -> "Provenance":
+        """Return the version of this checkout that the figures of a table depend on. Raises OSError without git."""
+        packages = (*ESTIMATOR, *DEPENDS_ON.get(table, ()))
+        paths = [f"agalign/{name}" for name in packages]
+        log = ["git", "log", "-1", "--format=%h", "--abbrev=8", "--", *paths]
+        done = subprocess.run(log, cwd=ROOT, capture_output=True, text=True, check=False)
+        return cls(done.stdout.strip(), digest_of(packages))
+
+
+def is_current(table: str, digest: str) -> bool:
+    """Return whether the packages that the figures of a table depend on are those that were measured."""
+    return digest == digest_of((*ESTIMATOR, *DEPENDS_ON.get(table, ())))
+
+
+@cache
+def digest_of(packages: Sequence[str]) -> str:
+    """Return a digest of the files of some packages."""
+    found = hashlib.sha256()
+    for top in packages:
+        path = ROOT / "agalign" / top
+        for file in sorted(path.rglob("*"), key=Path.as_posix) if path.is_dir() else [path]:
+            if file.is_file() and file.suffix != ".pyc":
+                found.update(file.relative_to(ROOT).as_posix().encode() + b"\0")
+                found.update(file.read_bytes().replace(b"\r\n", b"\n"))
+    return found.hexdigest()[:12]
+
+
 @dataclass(frozen=True)
 class TableRow:
     """A row of a table of figures."""
@@ -47,6 +98,8 @@ class TableRow:
     """Number of cases and what they are: `16 pairs`."""
     cells: Mapping[str, object]
     """Values by column, with its unit after a comma; "-" and "" are unknown."""
+    measured: Provenance | None = None
+    """By this version; by default, by that of this checkout."""
 
 
 def write_figures(
@@ -59,13 +112,12 @@ def write_figures(
     """Replace the rows of a command, and those with the same facts; all others stay as they are.
 
     The command is by default the running one without --figures, with `placeholder` instead of its arguments that are
-    `folders`. New rows keep the order of the old ones with the same facts, and are written where the first replaced row
-    is.
+    `folders`, or before their names if it ends with a slash. New rows keep the order of the old ones with the same
+    facts, and are written where the first replaced row is.
     """
     command = command or command_line(placeholder, folders)
     facts = [line for row in rows for line in _lines(row, command)]
-    with path.open(encoding="utf-8", newline="") as file:
-        old = list(csv.DictReader(file))
+    old = read_figures(path)
     order = {line["fact"]: index for index, line in enumerate(old)}
     facts.sort(key=lambda line: order.get(line["fact"], len(old)))
     new = {line["fact"] for line in facts}
@@ -80,19 +132,26 @@ def write_figures(
 
 def _lines(row: TableRow, command: str) -> Iterable[dict[str, str]]:
     """Yield the lines of a row in the file, one for each cell."""
+    measured = row.measured or Provenance.of(row.table)
     for head, value in row.cells.items():
         column, _, unit = head.rpartition(", ")
         column, unit = (column, unit) if unit in UNITS else (head, "")
-        values = {"value": "" if value == "-" else str(value), "unit": unit, "n": row.n}
-        yield {"fact": f"{row.table} / {row.name} / {column}", **values, "command": command}
+        values = {"value": "" if value == "-" else str(value), "unit": unit, "n": row.n, "command": command}
+        yield {"fact": f"{row.table} / {row.name} / {column}", **values, **measured._asdict()}
 
 
 def command_line(placeholder: str = "", folders: Sequence[Path] = ()) -> str:
-    """Return the running command without --figures, with a placeholder for its folders."""
-    script = Path(sys.argv[0]).resolve().relative_to(ROOT).as_posix()
-    words = ["python", script]
+    """Return the running command without --figures and without the paths of this machine."""
+    words = ["python", Path(sys.argv[0]).resolve().relative_to(ROOT).as_posix()]
     for argument in sys.argv[1:]:
-        word = placeholder if Path(argument) in folders else f'"{argument}"' if " " in argument else argument
-        if argument != "--figures" and not (word == placeholder == words[-1]):
+        name = Path(argument).name if placeholder.endswith("/") else ""
+        word = placeholder + name if Path(argument) in folders else f'"{argument}"' if " " in argument else argument
+        if argument != "--figures":
             words.append(word)
     return " ".join(words)
+
+
+def read_figures(path: Path = FIGURES) -> list[dict[str, str]]:
+    """Return the lines of the file."""
+    with path.open(encoding="utf-8", newline="") as file:
+        return list(csv.DictReader(file))

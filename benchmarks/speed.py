@@ -1,4 +1,4 @@
-"""Time of a run on one core, and of SIFT + RANSAC on the same images.
+"""Time of a run on one core, and of SIFT + MAGSAC on the same images.
 
     python benchmarks/speed.py FLIGHT... [--degraded] [--figures]
     python benchmarks/speed.py FLIGHT... --stages
@@ -50,11 +50,11 @@ DEGRADED = ("unchanged", "blur 3 px", "half saturated", "noise 30 %", "stale")
 """`stale` is one band with the image of the next capture."""
 
 
-def sift_seconds(capture: Capture, pairs: int, features: int) -> float:
-    """Return the seconds of SIFT + RANSAC on the reference of a capture with some of its other bands at full size."""
+def sift_seconds(capture: Capture, pairs: int) -> float:
+    """Return the seconds of SIFT + MAGSAC on the reference of a capture with some of its other bands at full size."""
     bands = capture.reference, *capture.moving[:pairs]
     fixed, *others = (read_band(band.path, band.band_index) for band in bands)
-    return sum(timed(sift, fixed, other, features)[0] for other in others)
+    return sum(timed(sift, fixed, other)[0] for other in others)
 
 
 def run_alone(*argv: str) -> tuple[float, Events]:
@@ -82,12 +82,12 @@ def print_flight(folder: Path, captures: list[Capture]) -> TableRow:
     """Print medians over the captures of a flight, and return them for the figures."""
     (_, without), (_, with_model) = runs(folder)
     first_s, again_s = (median(e["seconds"] for e in events["capture"]) for events in (without, with_model))
-    sift_s = median(sift_seconds(c, len(c.moving), 5000) for c in captures)
+    sift_s = median(sift_seconds(c, len(c.moving)) for c in captures)
     times_s = total_s(without["learnt"]) / len(captures) + first_s, again_s, sift_s
     aligned = "{aligned} of {pairs}".format(**with_model["capture"][0])
     cells = [f"{s:.1f}" for s in times_s] + [f"{s / sift_s:.2f}" for s in times_s[:2]]
     print_row(folder.name, len(captures), aligned, *cells)
-    heads = "without a model, s", "with a model, s", "SIFT + RANSAC, s"
+    heads = "without a model, s", "with a model, s", "SIFT + MAGSAC, s"
     n = f"{len(captures)} capture{'s' if len(captures) > 1 else ''}"
     return TableRow("captures with depth", title_of(folder), n, dict(zip(heads, cells[:3], strict=True)))
 
@@ -119,7 +119,7 @@ def print_stages(flight: Path, captures: list[Capture]) -> None:
     middle = captures[len(captures) // 2]  # the first may show the sky or a panel
     seconds = defaultdict[str, list[float]](list)
     for _ in range(ROUNDS):
-        seconds["SIFT + RANSAC, a pair"].append(sift_seconds(middle, 1, 8000))
+        seconds["SIFT + MAGSAC, a pair"].append(sift_seconds(middle, 1))
         seconds["imports of the libraries"].append(run_alone(sys.executable, "-c", IMPORTS)[0])
         (whole_s, _), (again_s, events) = runs(flight)
         by_capture = defaultdict[str, Counter[str]](Counter)
@@ -206,11 +206,11 @@ def main(
         for flight in flights:
             print_stages(flight, captures[flight])
         return
-    times = "without a model, s a capture", "with a model", "SIFT + RANSAC", "without / SIFT", "with / SIFT"
+    times = "without a model, s a capture", "with a model", "SIFT + MAGSAC", "without / SIFT", "with / SIFT"
     print_head("flight", "captures", "aligned in the first", *times)
     rows = [print_flight(flight, captures[flight]) for flight in flights]
     if figures:
-        write_figures(rows, "FLIGHT...", flights)
+        write_figures(rows, "DATA/", flights)
     if degraded:
         print(f"\nThe first capture of {flights[0].name}:\n", flush=True)
         print_degraded(captures[flights[0]])

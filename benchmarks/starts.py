@@ -57,6 +57,11 @@ def ours(fixed: Raster, moving: Raster) -> tuple[Matrix | None, bool]:
     return result.fixed_to_moving, result.status == "aligned"
 
 
+def by_sift(fixed: Raster, moving: Raster) -> tuple[Matrix | None, bool]:
+    result = sift(fixed.pixels, moving.pixels)
+    return None if result is None else result.fixed_to_moving, True
+
+
 def by_elastix(fixed: Raster, moving: Raster) -> tuple[Matrix | None, bool]:
     """Register the moving image, resampled to the size of the fixed one, by elastix."""
     overlay = geometry.overlay(fixed.size_px, moving.size_px)
@@ -65,11 +70,7 @@ def by_elastix(fixed: Raster, moving: Raster) -> tuple[Matrix | None, bool]:
     return None if result is None else geometry.compose(overlay, result), True
 
 
-METHODS: dict[str, Aligner] = {
-    "agalign": ours,
-    "SIFT + RANSAC": lambda fixed, moving: (sift(fixed.pixels, moving.pixels), True),
-    "elastix affine": by_elastix,
-}
+METHODS: dict[str, Aligner] = {"agalign": ours, "SIFT + MAGSAC": by_sift, "elastix affine": by_elastix}
 
 
 def error_px(ties: NDArray[np.float64], to_moved: Matrix, result: Matrix | None) -> float:
@@ -131,7 +132,7 @@ def main(
             TableRow("starts", name, f"{n} starts", dict(zip(heads, found_and_wrong, strict=True)))
             for name, (n, *found_and_wrong) in counts.items()
         ]
-        write_figures(rows, "DATA...", data)
+        write_figures(rows, "DATA/", data)
 
 
 def draw(shares: Shares, path: Path) -> None:

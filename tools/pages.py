@@ -27,6 +27,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "benchmarks"))
 
 from bands.score import table
 from common import with_section
+from figures_csv import FIGURES, is_current
 
 import agalign
 from agalign.cli.command import Command, field_options, help_of, value_name
@@ -39,14 +40,16 @@ from agalign.values.issues import KINDS, Issue, sentence
 DOCS = Path(__file__).resolve().parents[1] / "docs"
 API = DOCS / "reference" / "api.rst"
 NAMES, END_OF_NAMES = ".. Written by tools/pages.py: names\n", ".. end of names\n"
-FIGURES = DOCS / "figures" / "figures.csv"
 TABLES = {
     "accuracy": (
         *("accuracy", "standard errors", "simulated cameras", "scenes with depth", "runs"),
         "captures with depth",
     ),
     "failures": ("synthetic pairs", "planted grids", "starts", "difficult captures", "predicted bands"),
-    "comparison": ("comparison", "comparison on published sets"),
+    "comparison": (
+        *("comparison, originals", "comparison, originals with tags", "comparison, degraded copies"),
+        *("public sets, originals", "public sets, degraded copies"),
+    ),
     "verification": ("reliability",),
 }
 """Tables of `figures.csv` by page of docs/explanation."""
@@ -247,26 +250,42 @@ def figures() -> dict[str, dict[str, str]]:
         return {row["fact"]: row for row in csv.DictReader(file)}
 
 
+TERMS = "[terms](../reference/glossary.md)"
+
+
 def figures_of(name: str) -> str:
-    """Return a table of docs/figures/figures.csv, with the command that makes it: below, or in a column if the rows
-    have different ones.
+    """Return a table of docs/figures/figures.csv with a link to the definitions of its terms.
+
+    The command that makes it, and the commit at which it was measured if the code has changed since, are below, or in
+    columns if the rows have different ones.
     """
     parts = [(*fact.split(" / ")[1:], row) for fact, row in figures().items() if fact.startswith(f"{name} / ")]
+    if not parts:
+        return "\nNot measured.\n"
     columns = list(dict.fromkeys((column, row["unit"]) for _, column, row in parts))
     by_row: dict[str, dict[str, dict[str, str]]] = {}
     for line, column, row in parts:
         by_row.setdefault(line, {})[column] = row
-    commands = list(dict.fromkeys(row["command"] for *_, row in parts))
+    first = {line: next(iter(cells.values())) for line, cells in by_row.items()}
+    notes = {line: (f"`{row['command']}`", measured_at(name, row)) for line, row in first.items()}
+    commands, measured = (list(dict.fromkeys(some)) for some in zip(*notes.values(), strict=True))
+    further = [("command", commands), ("measured at", measured)]
     heads = [f"{column}, {unit}" if unit else column for column, unit in columns]
-    counts = {line: next(iter(cells.values()))["n"] for line, cells in by_row.items()}
-    units = {count.partition(" ")[2].removesuffix("s") for count in counts.values()}
+    units = {row["n"].partition(" ")[2].removesuffix("s") for row in first.values()}
     of_one_unit = f"{units.pop()}s" if len(units) == 1 else ""
-    rows = [("", of_one_unit or "n", *heads, *(["command"] if commands[1:] else []))]
+    rows = [("", of_one_unit or "n", *heads, *(head for head, some in further if some[1:]))]
     for line, cells in by_row.items():
-        first, values = next(iter(cells.values())), [cells[column]["value"] or "-" for column, _ in columns]
-        count = counts[line].partition(" ")[0] if of_one_unit else counts[line]
-        rows.append((line, count, *values, *([f"`{first['command']}`"] if commands[1:] else [])))
-    return table(rows) + "\n" + ("" if commands[1:] else f"\n`{commands[0]}`\n")
+        values = [cells[column]["value"] or "-" if column in cells else "-" for column, _ in columns]
+        count = first[line]["n"].partition(" ")[0] if of_one_unit else first[line]["n"]
+        rows.append((line, count, *values, *(n for n, (_, some) in zip(notes[line], further, strict=True) if some[1:])))
+    below = [TERMS] if commands[1:] else [commands[0], TERMS]
+    below += [f"measured at {measured[0]}"] if measured[0] and not measured[1:] else []
+    return table(rows) + "\n\n" + ", ".join(below) + "\n"
+
+
+def measured_at(table_name: str, row: Mapping[str, str]) -> str:
+    """Return the commit of a figure in code if the packages that it depends on have changed since, else nothing."""
+    return "" if is_current(table_name, row["digest"]) else f"`{row['commit']}`"
 
 
 def public_names() -> str:

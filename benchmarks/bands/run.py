@@ -1,25 +1,30 @@
 """Runs methods on the band pairs of the sets that are on disk, and scores what they claim.
 
     pip install -e '.[bench]' && python benchmarks/bands/run.py DATA [-o results.csv] [--plot FILE] [--figures]
-        [--methods 'SIFT + RANSAC;mine.py:align'] [--sets p4m_forest,...] [--variants 'as it is,turn 10,...']
+        [--methods 'SIFT + MAGSAC;mine.py:align'] [--sets p4m_forest,...] [--variants 'as it is,turn 10,...']
 
 DATA is any folder: images are recognised by their checksums, and missing sets are listed with their publisher. Each
-method runs in a process of its own with as many threads as it takes; one that raises has refused the pair. Scores are
-written to -o, and as tables next to it (.md); the mapping of each pair to --mappings, in the format of score.py. With
---figures, those of the methods that were run also replace the scores of these methods in results.csv next to this file,
-from which the comparison in docs/figures/figures.csv is counted.
+method runs in a process of its own with one thread; one that raises has refused the pair. ALIKED needs its weights: the
+path of aliked-n16rot.pth (github.com/Shiaoming/ALIKED, models/) in the environment variable ALIKED_WEIGHTS.
+
+The result of each pair is written to -o after each method and variant, and tables of all results in the file next to it
+(.md): a run can be continued with other methods and variants. Results of the same method by another version of the
+estimator are removed. The mapping of each pair goes to --mappings, in the format of score.py. With --figures, the
+results are added to results.csv next to this file, from which the comparison in docs/figures/figures.csv is counted.
 """
 
 import csv
 import json
+import os
 import resource
 import shutil
 import sys
 import tempfile
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
 from functools import partial
+from itertools import product
 from multiprocessing import get_context
 from pathlib import Path
 from typing import Annotated, Any
@@ -30,11 +35,14 @@ import typer
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # run as a file, its package is not found
 
-from common import align, flight_and_out, heat_map, pyplot, run, timed, write_band
-from figures_csv import FiguresOption, TableRow, write_figures
-from peers import METHODS, Align, grey_raster, method_named
+from common import align, cpu_timed, flight_and_out, heat_map, pyplot, run, write_band
+from figures_csv import FiguresOption, write_figures
+from peers import METHODS, WITH_TAGS, Align, Rated, grey_raster, method_named
 
 from agalign.cameras.discover import discover
+from agalign.capture.tag_seeds import tag_seeds
+from agalign.config import SeedSettings
+from agalign.method.device import limit_threads
 from agalign.pixels.raster import suffix_format
 from agalign.records.sidecar import BandResult
 from agalign.records.sidecar_file import find_sidecars, read_sidecar
@@ -43,18 +51,15 @@ from agalign.values.capture import Band
 from agalign.values.mapping import PixelMapping
 from bands import score
 from bands.images import LENS_CORRECTED, VARIANTS, Image, Paths, degraded, locate, read, straightened
+from bands.results import WHOLE, Result, add_results, comparison
 from bands.score import AS_IT_IS, Pair, Score, Scored, summary, table
 
-WHOLE = {"agalign, capture": (), "agalign, capture, no tags": ("--ignore-metadata",)}
-"""Runs of the command line on a whole flight, with its files and tags: options by name."""
 ALL_METHODS = (*METHODS, *WHOLE)
 RESULTS = Path(__file__).with_name("results.csv")
 COMMAND = "python benchmarks/bands/run.py DATA"
 """Runs of some methods add up to this one."""
-SHORT = "agalign, pair", "SIFT + RANSAC", "ECC on gradients", "agalign, capture"
-"""Methods in the table of the published sets."""
 Row = dict[str, Any]
-_FIELDS = ("method", "set", "capture", "file", "variant", "claimed", "seconds", "homography", "grid")
+_FIELDS = ("method", "set", "capture", "file", "variant", "claimed", "rating", "seconds", "homography", "grid")
 
 
 def _grid(reference_px: Any, moving_px: Any) -> Row:
@@ -74,9 +79,16 @@ def by_command_line(method: str, paths: Paths, pairs: Sequence[Pair], variant: s
             shutil.copyfile(path, flight / name)
         for pair in pairs if variant != AS_IT_IS else ():
             write_band(flight / pair.file, degraded(read(paths[pair.file]), pair, variant))
-        seconds = align(flight, out, *WHOLE[method]) / (len(paths) - len({p.reference for p in pairs}))
+        before_s = _seconds_of_children()
+        align(flight, out, "-j", "1", *WHOLE[method])
+        seconds = (_seconds_of_children() - before_s) / (len(paths) - len({p.reference for p in pairs}))
         bands = {band.file: band for path in find_sidecars(out) for band in read_sidecar(path).bands}
     return [{**claim(bands.get(pair.file)), "seconds": seconds} for pair in pairs]
+
+
+def _seconds_of_children() -> float:
+    used = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return used.ru_utime + used.ru_stime
 
 
 def claim(band: BandResult | None) -> Row:
@@ -110,37 +122,47 @@ def lens_corrected(method: Align, fixed: tuple[Image, Band], moving: tuple[Image
     The correction is not included in its seconds.
     """
     images = [straightened(replace(grey_raster(image), lens=band.lens)) for image, band in (fixed, moving)]
-    seconds, matrix = timed(method, images[0].pixels, images[1].pixels)
-    if matrix is None:
-        return {"seconds": seconds}
+    row = mapped_by(method, images[0].pixels, images[1].pixels)
+    if "homography" not in row:
+        return row
     here = geometry.lattice(*images[0].size_px, 33, 25)
-    there = PixelMapping(geometry.normalised(matrix), fixed[1].lens, moving[1].lens)(here)
-    return {"grid": _grid(here, there), "seconds": seconds}
+    matrix = geometry.normalised(np.array(row.pop("homography")))
+    return row | {"grid": _grid(here, PixelMapping(matrix, fixed[1].lens, moving[1].lens)(here))}
+
+
+def mapped_by(method: Align, fixed: Image, moving: Image) -> Row:
+    """Return the homography of two images by a method, its rating and CPU seconds."""
+    seconds, result = cpu_timed(method, fixed, moving)
+    rating = {"rating": result.rating} if isinstance(result, Rated) else {}
+    matrix = result.fixed_to_moving if isinstance(result, Rated) else result
+    found = {} if matrix is None else {"homography": np.asarray(matrix, float).tolist()}
+    return {"seconds": seconds, **rating, **found}
 
 
 def asked(method: Align, pair: Pair, variant: str, paths: Paths, bands: Mapping[str, Band]) -> Row:
     """Return the mapping of a pair by a pair method; an exception is a refusal."""
     fixed, moving = read(paths[pair.reference]), degraded(read(paths[pair.file]), pair, variant)
+    if method in WITH_TAGS:
+        both = [bands[name] for name in (pair.reference, pair.file) if bands]
+        method = partial(method, tags=tag_seeds(*both, SeedSettings()) if both else {"identity": np.eye(3)})
     try:
         if variant == LENS_CORRECTED:
             return lens_corrected(method, (fixed, bands[pair.reference]), (moving, bands[pair.file]))
-        seconds, matrix = timed(method, fixed, moving)
+        return mapped_by(method, fixed, moving)
     except Exception as error:  # any exception of a method
         print(f"{pair.key}, {variant}: refused ({type(error).__name__}: {error})", file=sys.stderr)
         return {}
-    return {"seconds": seconds} | ({} if matrix is None else {"homography": np.asarray(matrix, float).tolist()})
 
 
 # ---- tables and a figure
 
 
-def tables(scored: Sequence[Scored], gigabytes: Mapping[str, float]) -> str:
-    """An overview; unmodified images by set; each variant with the sets pooled; and the memory of each method."""
+def tables(scored: Sequence[Scored]) -> str:
+    """An overview; unmodified images by set; and each variant with the sets pooled."""
     pooled = summary([s for s in scored if s.variant != AS_IT_IS], "all sets")
     by_variant = {variant: [s for s in pooled if s.variant == variant] for variant in VARIANTS}
     parts = [f"### {variant}\n\n{score.markdown(scores)}\n" for variant, scores in by_variant.items() if scores]
-    memory = "; ".join(f"{name} {value:.1f}" for name, value in gigabytes.items())
-    return "\n".join([overview(scored), by_set(scored), *parts, f"Largest process, GB: {memory}.\n"])
+    return "\n".join([overview(scored), by_set(scored), *parts])
 
 
 def overview(scored: Sequence[Scored]) -> str:
@@ -204,38 +226,34 @@ def applies(name: str, variant: str, pairs: Sequence[Pair], bands: Mapping[str, 
     return name not in WHOLE or has_tags(paths)
 
 
-def run_method(
-    located: Mapping[str, Paths], sets: dict[str, Any], variants: Sequence[str], name: str
-) -> tuple[list[Row], float]:
-    """Return (rows of one method for all pairs, memory of the largest process in GB). Raises UnavailableError."""
+def run_method(located: Mapping[str, Paths], sets: dict[str, Any], variant: str, name: str) -> list[Row]:
+    """Return the rows of a method for all pairs of a variant. Raises UnavailableError."""
     cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_ERROR)  # it warns of every unknown tag
+    limit_threads(1)
     method = None if name in WHOLE else method_named(name)
     rows: list[Row] = []
     for set_name, paths in located.items():
-        bands = bands_of(paths)
-        for variant in variants:
-            pairs = score.pairs_of(sets[set_name], variant)
-            if not applies(name, variant, pairs, bands, paths):
-                continue
-            if method is None:
-                mapped = by_command_line(name, paths, pairs, variant)
-            else:
-                mapped = [asked(method, pair, variant, paths, bands) for pair in pairs]
-            for pair, row in zip(pairs, mapped, strict=True):
-                key = dict(zip(("set", "capture", "file"), pair.key, strict=True))
-                rows.append({"method": name, "variant": variant, **key, **row})
-    processes = resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN
-    return rows, max(resource.getrusage(one).ru_maxrss for one in processes) / 1e6
+        bands, pairs = bands_of(paths), score.pairs_of(sets[set_name], variant)
+        if not applies(name, variant, pairs, bands, paths):
+            continue
+        if method is None:
+            mapped = by_command_line(name, paths, pairs, variant)
+        else:
+            mapped = [asked(method, pair, variant, paths, bands) for pair in pairs]
+        for pair, row in zip(pairs, mapped, strict=True):
+            key = dict(zip(("set", "capture", "file"), pair.key, strict=True))
+            rows.append({"method": name, "variant": variant, **key, **row})
+    return rows
 
 
-def in_its_process(function: Any, name: str) -> tuple[list[Row], float]:
+def in_its_process(function: Callable[..., list[Row]], *arguments: Any) -> list[Row]:
     """Return the result of a method in a process of its own, which may crash; no rows without a result."""
     try:
         with ProcessPoolExecutor(1, get_context("spawn")) as pool:
-            return pool.submit(function, name).result()
+            return pool.submit(function, *arguments).result()
     except Exception as error:  # any exception of a method
-        print(f"{name}: left out ({error})", file=sys.stderr)
-        return [], 0.0
+        print(f"{arguments[-1]}: left out ({error})", file=sys.stderr)
+        return []
 
 
 def print_missing(missing: Mapping[str, Sequence[str]], sets: dict[str, Any]) -> None:
@@ -255,32 +273,7 @@ def write_mappings(rows: Iterable[Row], path: Path) -> None:
             writer.writerow({k: json.dumps(v) if k in ("homography", "grid") else v for k, v in row.items()})
 
 
-# ---- figures
-
-
-def replace_scores(path: Path, scores: Sequence[Score]) -> list[Score]:
-    """Replace the scores of some methods in a file, keep those of others and the order, and return all."""
-    by_method: dict[str, list[Score]] = {}
-    for s in score.read_scores(path):
-        by_method.setdefault(s.method, []).append(s)
-    by_method |= {method: [s for s in scores if s.method == method] for method in {s.method: s for s in scores}}
-    result = [s for some in by_method.values() for s in some]
-    score.write_csv(result, path)
-    return result
-
-
-def comparison(scores: Sequence[Score], sets: Mapping[str, Any]) -> Iterable[TableRow]:
-    """Yield the rows of methods on all sets, and on the published ones; the identity aligns nothing."""
-    published = [s for s in scores if "repository" in sets[s.set]["published"] and s.method in SHORT]
-    for name, some in (("comparison", scores), ("comparison on published sets", published)):
-        for method in {s.method: s for s in some if s.method != "identity"}:
-            own = [s for s in some if s.method == method]
-            cells = {
-                "accepted": sum(s.claimed for s in own),
-                "wrong by more than 1 px": sum(s.wrong_claims for s in own),
-                "accepted within 0.5 px": sum(round(s.under_half_px * s.pairs) for s in own),
-            }
-            yield TableRow(name, method, f"{sum(s.pairs for s in own)} pairs", cells)
+# ---- command line
 
 
 def main(
@@ -289,14 +282,13 @@ def main(
     methods: Annotated[str, typer.Option(help="separated by ;, FILE.py:FUNCTION among them")] = ";".join(ALL_METHODS),
     sets: Annotated[str, typer.Option(help="separated by commas; by default all")] = "",
     variants: Annotated[str, typer.Option(help="separated by commas")] = ",".join(VARIANTS),
-    jobs: Annotated[int, typer.Option(help="methods at a time; above one, seconds mean little")] = 1,
     mappings: Path | None = None,
     plot: Path | None = None,
     *,
     figures: FiguresOption = False,
 ) -> None:
-    if figures and (sets or variants != ",".join(VARIANTS)):
-        sys.exit("--figures needs all sets and variants; omit --sets and --variants")
+    if figures and sets:
+        sys.exit("--figures needs all sets; omit --sets")
     known = score.read_sets()
     if sets:
         known = {name: known[name] for name in sets.split(",")}
@@ -306,22 +298,23 @@ def main(
     print_missing(missing, known)
     if not located:
         sys.exit(f"{data}: contains no complete set")
-    names = methods.split(";")
-    one = partial(in_its_process, partial(run_method, located, known, variants.split(",")))
-    with ThreadPoolExecutor(jobs) as pool:
-        result = dict(zip(names, pool.map(one, names), strict=True))
-    rows = [row for some, _ in result.values() for row in some]
+    os.environ["OMP_NUM_THREADS"] = "1"  # of the processes
+    rows: list[Row] = []
+    results: list[Result] = []
+    order = [(name, variant) for name in ALL_METHODS for variant in VARIANTS]
+    for variant, name in product(variants.split(","), methods.split(";")):
+        rows += (new := in_its_process(run_method, located, known, variant, name))
+        scored = score.score_pairs(new, known)
+        results = add_results(output, scored, order)
+        if figures:
+            write_figures(comparison(add_results(RESULTS, scored, order), known), command=COMMAND)
     if mappings:
         write_mappings(rows, mappings)
-    scored = score.score_pairs(rows, known)
-    score.write_csv(summary(scored), output)
-    if figures:
-        write_figures(comparison(replace_scores(RESULTS, summary(scored)), known), command=COMMAND)
-    text = tables(scored, {name: gigabytes for name, (some, gigabytes) in result.items() if some})
+    text = tables(results)
     output.with_suffix(".md").write_text(text, encoding="utf-8")
     print(text)
     if plot:
-        draw(scored, plot)
+        draw(results, plot)
 
 
 if __name__ == "__main__":

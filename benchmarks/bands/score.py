@@ -6,7 +6,8 @@ RESULTS is CSV with a header, or JSON with a list of objects. A row is a band pa
 one), and `homography` (nine numbers, row by row) or `grid` (JSON {"reference_px": [[x, y], ...], "moving_px": ...}:
 where the mapping sends some pixels of the reference). Both map a raw pixel of the reference file to a raw pixel of the
 moving file: x right, y down, (0, 0) the centre of the top-left pixel. A row with neither is a refusal. Optional are
-`method`, `variant`, `seconds`, and `claimed`: "no" for an estimate that the method itself does not accept.
+`method`, `variant`, `seconds`, `rating` (what the method says about the pair, high is good), and `claimed`: "no" for an
+estimate that the method itself does not accept.
 """
 
 import argparse
@@ -16,7 +17,7 @@ import re
 import sys
 from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import astuple, dataclass, fields
+from dataclasses import astuple, dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -78,15 +79,29 @@ class Pair:
 class Scored:
     """Result of one pair."""
 
+    method: str
     set: str
     variant: str
-    method: str
+    capture: str
+    file: str
     claimed: bool
     given: bool
     """An estimate is there, claimed or not."""
     median_px: float
     p95_px: float
+    rating: float
+    """What the method says about the pair: number of inliers, or ECC's coefficient; nan without one."""
     seconds: float
+
+    @property
+    def is_wrong(self) -> bool:
+        """Claimed, and more than 1 px off in the median."""
+        return self.claimed and self.median_px > WRONG_PX
+
+    @property
+    def key(self) -> tuple[str, str, str]:
+        """The pair of bands, in whatever variant."""
+        return self.set, self.capture, self.file
 
 
 @dataclass(frozen=True)
@@ -243,11 +258,29 @@ def _scored(row: Mapping[str, Any], pair: Pair, variant: str, method: str) -> Sc
         error = errors_px(row, pair)
     except (ValueError, KeyError, TypeError) as problem:
         raise ValueError(f"{method}: {pair.key}: no mapping ({problem})") from None
-    given, seconds = error is not None, float(row.get("seconds", "nan"))
+    given = error is not None
+    rating, seconds = (float(row.get(name, "nan")) for name in ("rating", "seconds"))
     # Of the order statistics the upper one, for between a number and inf nothing can be interpolated.
     quantiles_px = np.percentile(error, (50, 95), method="higher").tolist() if given else (np.nan, np.nan)
     claimed = given and str(row.get("claimed", "yes")).lower() not in ("no", "false", "0")
-    return Scored(pair.set, variant, method, claimed, given, *quantiles_px, seconds)
+    return Scored(method, pair.set, variant, *pair.key[1:], claimed, given, *quantiles_px, rating, seconds)
+
+
+def limited(scored: Sequence[Scored], sets: Mapping[str, Mapping[str, Any]]) -> list[Scored]:
+    """Return the results of the methods that rate pairs, claimed only above a limit.
+
+    Every other pair of all sets, with its copies, is one half. The limit for a half is the highest rating of a wrong
+    claim in the other one, so that all claims there would be right.
+    """
+    pairs = (pair for description in sets.values() for pair in pairs_of(description))
+    half = {pair.key: index % 2 for index, pair in enumerate(pairs)}
+    result = []
+    for method in dict.fromkeys(s.method for s in scored if not np.isnan(s.rating)):
+        own = [s for s in scored if s.method == method]
+        limits = [max((s.rating for s in own if half[s.key] != h and s.is_wrong), default=-np.inf) for h in (0, 1)]
+        name = f"{method}, with a limit"
+        result += [replace(s, method=name, claimed=s.claimed and s.rating > limits[half[s.key]]) for s in own]
+    return result
 
 
 def summary(scored: Sequence[Scored], name: str | None = None) -> list[Score]:
@@ -277,19 +310,12 @@ def _median(values: Iterable[float]) -> float:
 # ---- tables
 
 
-def write_csv(scores: Sequence[Score], path: Path) -> None:
-    """Write every score as CSV; unknown values are empty."""
+def write_csv(scores: Sequence[Score] | Sequence[Scored], path: Path) -> None:
+    """Write scores as CSV; unknown values are empty."""
     with path.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file, lineterminator="\n")
-        writer.writerow([f.name for f in fields(Score)])
+        writer.writerow([f.name for f in fields(scores[0])] if scores else [])
         writer.writerows([_cell(v, 4) for v in astuple(s)] for s in scores)
-
-
-def read_scores(path: Path) -> list[Score]:
-    """Return the scores in a file of `write_csv`."""
-    kinds = {f.name: f.type for f in fields(Score)}
-    with path.open(encoding="utf-8", newline="") as file:
-        return [Score(**{k: kinds[k](v or "nan") for k, v in row.items()}) for row in csv.DictReader(file)]
 
 
 def table(rows: Sequence[Sequence[object]]) -> str:

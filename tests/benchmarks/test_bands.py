@@ -12,9 +12,11 @@ import numpy as np
 import pytest
 from bands import score
 from bands.images import VARIANTS, degraded, locate, read
+from bands.results import add_results, comparison, read_results
 from bands.run import asked, claim, lens_corrected, write_mappings
 from common import read_ties
-from peers import UnavailableError, identity, method_named
+from figures_csv import Provenance
+from peers import METHODS, WEIGHTS, Rated, UnavailableError, method_named, sift
 from synthetic_flights.aligned import sidecar_of
 
 from agalign.cameras.discover import discover
@@ -177,7 +179,8 @@ def test_a_method_that_raises_has_refused(pair: score.Pair, tmp_path: Path, caps
         cv2.imwrite(str(path), np.full((480, 640), 9, np.uint8))
     assert asked(raising(RuntimeError("out of luck")), pair, score.AS_IT_IS, paths, {}) == {}
     assert "refused (RuntimeError: out of luck)" in capsys.readouterr().err
-    assert asked(identity, pair, score.AS_IT_IS, paths, {})["homography"] == np.eye(3).tolist()
+    result = asked(lambda _f, _m: Rated(np.eye(3), 7.0), pair, score.AS_IT_IS, paths, {})
+    assert (result["homography"], result["rating"]) == (np.eye(3).tolist(), 7.0)
 
 
 def test_a_method_is_loaded_from_a_file(tmp_path: Path) -> None:
@@ -187,6 +190,75 @@ def test_a_method_is_loaded_from_a_file(tmp_path: Path) -> None:
     for name in ("no such method", f"{tmp_path}/other.py:align"):
         with pytest.raises(UnavailableError):
             method_named(name)
+
+
+def test_a_limit_is_chosen_on_the_other_half_of_the_pairs(sets: dict[str, Any]) -> None:
+    """Pairs 1_r and 2_r are one half, 1_n and 2_n the other, whose highest rating of a wrong claim is 6."""
+    rows = [
+        row("1_r.png", homography=TRUE.tolist(), rating=5),
+        row("2_r.png", homography=TRUE.tolist(), rating=7),
+        row("1_n.png", homography=shifted(9, 0).tolist(), rating=6),
+        row("2_n.png", homography=TRUE.tolist(), rating=2),
+    ]
+    limited = score.limited(score.score_pairs(rows, sets), sets)
+    assert {(s.file, s.claimed) for s in limited} == {
+        ("1_r.png", False),
+        ("2_r.png", True),
+        ("1_n.png", True),
+        ("2_n.png", True),
+    }
+    assert {s.method for s in limited} == {"m, with a limit"}
+
+
+def test_results_are_added_and_those_of_another_version_removed(
+    sets: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path, order = tmp_path / "results.csv", [("m", score.AS_IT_IS), ("m", "turn 10")]
+    plain = score.score_pairs([row("1_r.png", homography=TRUE.tolist(), seconds=0.5)], sets)
+    turned = score.score_pairs([row("1_r.png", variant="turn 10")], sets)
+    add_results(path, turned, order)
+    assert [r.variant for r in add_results(path, plain, order)] == [score.AS_IT_IS] * 4 + ["turn 10"] * 2
+    assert read_results(path)[0].median_px == 0
+    monkeypatch.setattr("bands.results.Provenance.of", lambda _: Provenance("later", "other"))
+    assert {r.commit for r in add_results(path, plain, order)} == {"later"}
+    assert len(read_results(path)) == 4
+    (first, *_) = comparison(read_results(path), {"field": {**sets["field"], "published": {}}})
+    assert (first.table, first.name, first.n) == ("comparison, originals", "m", "4 pairs")
+    assert first.cells == {
+        "accepted": 1,
+        "wrong": 0,
+        "accepted within 0.5 px": 1,
+        "median error, px": "0.000",
+        "CPU time, s": "0.5",
+    }
+
+
+def test_the_weights_of_aliked_are_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("peers._NEEDS", {})
+    monkeypatch.delenv(WEIGHTS, raising=False)
+    with pytest.raises(UnavailableError, match="set ALIKED_WEIGHTS to the path of aliked-n16rot"):
+        method_named("ALIKED + MAGSAC")
+
+
+@pytest.mark.parametrize("name", ["ECC, identity", "ECC, agalign's start", "MicaSense"])
+def test_ecc_finds_a_small_shift_and_rates_it(name: str) -> None:
+    fixed = cv2.GaussianBlur(np.random.default_rng(2).uniform(0, 60000, (240, 320)), (0, 0), 3)
+    fixed = (1 + 60000 * (fixed - fixed.min()) / np.ptp(fixed)).astype(np.uint16)
+    moving = cv2.warpAffine(fixed, np.array([[1, 0, 3.0], [0, 1, -2.0]]), (320, 240), borderMode=cv2.BORDER_REFLECT)
+    tags = ({"identity": np.eye(3)},) if name != "ECC, identity" else ()
+    result = METHODS[name](fixed, moving, *tags)
+    assert result.fixed_to_moving[:2, 2] == pytest.approx([3, -2], abs=0.1)
+    assert 0.8 < result.rating <= 1
+
+
+def test_sift_has_no_bias_after_half_a_turn() -> None:
+    """OpenCV's key points are off by a quarter of a pixel without precise upscaling."""
+    rng = np.random.default_rng(1)
+    noise = sum(cv2.resize(rng.normal(size=(n, n)), (400, 400), interpolation=cv2.INTER_CUBIC) for n in (25, 50, 100))
+    fixed = (128 + 30 * noise).clip(1, 255).astype(np.uint8)
+    result = sift(fixed, np.ascontiguousarray(fixed[::-1, ::-1]))
+    there = geometry.apply(result.fixed_to_moving, np.array([[200.0, 200.0]]))
+    assert there == pytest.approx(np.array([[199.0, 199.0]]), abs=0.05)
 
 
 def test_only_what_is_called_aligned_is_claimed() -> None:

@@ -5,13 +5,14 @@ with its fact: `0.050<!-- accuracy / RedEdge-M, row crop / median error --> px`.
 and columns of a table of figures.csv are compared without comments.
 """
 
-import csv
 import re
-from collections import Counter
 from functools import cache
 from pathlib import Path
 
-import pytest
+from bands.results import comparison, read_results
+from bands.run import RESULTS
+from bands.score import read_sets
+from figures_csv import HEAD, is_current, read_figures
 
 from .blocks import ROOT, each_page
 
@@ -21,9 +22,8 @@ MARKED = re.compile(r"([\d.,]*\d)\**<!-- ([^/>]+ / [^>]+) -->")
 @cache
 def figures() -> dict[str, dict[str, str]]:
     """{fact: row} of the table of all figures."""
-    with (ROOT / "docs" / "figures" / "figures.csv").open(encoding="utf-8", newline="") as file:
-        rows = list(csv.DictReader(file))
-    assert [*rows[0]] == ["fact", "value", "unit", "n", "command"]
+    rows = read_figures()
+    assert [*rows[0]] == [*HEAD]
     assert len({row["fact"] for row in rows}) == len(rows)
     return {row["fact"]: row for row in rows}
 
@@ -71,29 +71,42 @@ def test_tables_of_the_readme() -> None:
     assert quoted
 
 
-@pytest.mark.parametrize(
-    ("table", "unpublished"), [("comparison", ""), ("comparison on published sets", "rededge_altitudes")]
-)
-def test_the_comparison_counts_the_results_of_the_benchmark(table: str, unpublished: str) -> None:
-    totals = {name: Counter[str]() for name in ("pairs", "claimed", "wrong_claims", "good")}
-    with (ROOT / "benchmarks" / "bands" / "results.csv").open(encoding="utf-8", newline="") as file:
-        for row in (row for row in csv.DictReader(file) if row["set"] != unpublished):
-            good = round(float(row["under_half_px"] or 0) * int(row["pairs"]))
-            for name, count in totals.items():
-                count[row["method"]] += good if name == "good" else int(row[name])
-    columns = {"claimed": "accepted", "wrong_claims": "wrong by more than 1 px", "good": "accepted within 0.5 px"}
-    methods = {fact.split(" / ")[1] for fact in figures() if fact.startswith(f"{table} / ")}
-    assert len(methods) > 3
-    for method in methods:
-        for name, column in columns.items():
-            row = figures()[f"{table} / {method} / {column}"]
-            assert (row["value"], row["n"]) == (str(totals[name][method]), f"{totals['pairs'][method]} pairs")
+def test_every_figure_has_the_version_that_was_measured() -> None:
+    for fact, row in figures().items():
+        assert re.fullmatch("[0-9a-f]{8}", row["commit"]), fact
+        assert re.fullmatch("[0-9a-f]{12}", row["digest"]), fact
+
+
+def test_pages_mark_figures_of_other_versions() -> None:
+    pages = [page.read_text(encoding="utf-8") for page in (ROOT / "docs" / "explanation").glob("*.md")]
+    tables = {fact.split(" / ")[0] for fact in figures()}
+    shown = {name: text for name in tables for page in pages if (text := section_of(page, name))}
+    assert len(shown) > 10
+    for name, text in shown.items():
+        rows = [row for fact, row in figures().items() if fact.startswith(f"{name} / ")]
+        stale = {row["commit"] for row in rows if not is_current(name, row["digest"])}
+        marked = {row["commit"] for row in rows if f"`{row['commit']}`" in text}
+        assert marked == stale, f"{name}: run python tools/pages.py"
+
+
+def section_of(page: str, name: str) -> str:
+    """Return the table of a page between the comments with its name."""
+    return page.partition(f"<!-- {name} -->")[2].partition("<!-- end of")[0]
+
+
+def test_the_comparison_counts_the_results_of_the_benchmark() -> None:
+    rows = [*comparison(read_results(RESULTS), read_sets())]
+    assert rows
+    for row in rows:
+        for head, value in row.cells.items():
+            found = figures()[f"{row.table} / {row.name} / {head.rpartition(', ')[0] or head}"]
+            assert (found["value"] or "-", found["n"]) == (str(value), row.n)
 
 
 def test_rounded_quotes() -> None:
     assert is_quoted("0.05", "0.050")
     assert is_quoted("0.1", "0.092")
     assert not is_quoted("0.06", "0.051")
-    assert MARKED.findall("**220**<!-- comparison / agalign, pair / accepted --> of 275") == [
-        ("220", "comparison / agalign, pair / accepted")
+    assert MARKED.findall("**74**<!-- comparison / agalign, pair / accepted --> of 74") == [
+        ("74", "comparison / agalign, pair / accepted")
     ]
