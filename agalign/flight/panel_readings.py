@@ -176,10 +176,10 @@ def reflectance_factors(capture: Capture, readings: Iterable[PanelReading]) -> d
 
         factor = albedo / (radiance of the panel) * E_p / E
 
-    E_p / E is 1 without a sensor, and if the sensor was not in the same light as one of the panels. Between the panels
-    of the camera, the reciprocals are interpolated linearly in time, and constant before the first and after the last.
-    If the time of the capture or of the panels is unknown, `_without_clock` chooses the panel; without one the result
-    is empty.
+    E_p / E is 1 without a sensor, and if the sensor was not in the same light as one of the panels. Between the
+    panels of the camera, the reciprocals are interpolated linearly in time; before the first and after the last, they
+    are constant. If the time of the capture or of the panels is unknown, `_without_clock` chooses the panel; without
+    one the result is empty.
     """
     of_camera = [r for r in readings if camera_key(r.capture) == camera_key(capture)]
     timed = _within_hours(of_camera, capture)

@@ -47,7 +47,7 @@ class Quality(IntFlag):
     OCCLUDED = 8
     """Nearer parts of the scene occlude it in the band; the value is nodata, or interpolated."""
     PREDICTED = 16
-    """The band is predicted: its image does not verify the whole mapping, or has another geometry than the others."""
+    """The band is predicted: its image does not verify the whole mapping, or its geometry differs from the others."""
     ERROR_OVER_HALF_PX = 32
     """The expected error exceeds 0.5 px of the reference, or is unknown."""
     ERROR_OVER_1_PX = 64

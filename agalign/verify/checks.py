@@ -43,8 +43,8 @@ MAX_ALIAS_PEAK = 0.75
 """Ratio of the heights of the next correlation peak and that of the result, above which the scene is repetitive."""
 
 _MAX_ERROR_PX, _MIN_ACCURATE_SHARE = 0.5, 0.9
-"""`aligned` means an expected error of at most this in this share of the common area, under a relief of that
-of the windows. Errors of 0.5 px RMS are beyond 1 px in 2 % of the pixels."""
+"""`aligned` means an expected error of at most this in this share of the common area; under a relief, at this share of
+the windows. If the RMS error is 0.5 px, 2 % of the pixels are off by more than 1 px."""
 MAX_SHIFT_PX = 1.0
 """Maximum residual shift of an aligned window: beyond it, a spectral index mixes neighbours."""
 _MAX_NOISE_STD = 2.0
@@ -162,8 +162,10 @@ def is_misaligned(residual: Residual, pixel_px: float = 1.0) -> NDArray[np.bool_
 
 
 def _error_issues(candidate: Verifiable) -> Iterator[Issue]:
-    """The expected error over the common area. Under a relief: over that of the windows, and they must have a shift, as
-    a relief of other bands is no error where this band shows something else.
+    """Check the expected error over the common area.
+
+    A relief comes from other bands, so its error is small even where this band shows a different scene. Under a relief,
+    the error is therefore checked at the windows, and the band must have a measured shift in them.
     """
     if len(candidate.textured_px):
         max_px = _MAX_ERROR_PX * candidate.file_pixel_size_px
