@@ -2,7 +2,7 @@
 
 from functools import partial
 from pathlib import Path
-from typing import Annotated, get_args
+from typing import TYPE_CHECKING, Annotated, get_args
 
 import typer
 
@@ -12,6 +12,9 @@ from agalign.errors import ConfigurationError
 from agalign.host.output_folder import refuse_to_replace
 from agalign.host.text import counted
 from agalign.values.choices import Sharing
+
+if TYPE_CHECKING:
+    from agalign.evaluation.evaluate import Result
 
 Pairs = Annotated[
     Path, typer.Argument(help="A CSV file (fixed, moving, homography), or a folder in the HPatches or Oxford layout.")
@@ -38,31 +41,15 @@ def _evaluate(
         seeding: Correct the start by the initial alignment first, as a run does.
         out: CSV file with a row per pair, method and start; rows that it has are not measured again.
     """
-    from agalign.evaluation.evaluate import (
-        Starts,
-        append_result,
-        error_table,
-        evaluate,
-        method_named,
-        precision_table,
-        read_results,
-        write_results,
-    )
+    from agalign.evaluation.evaluate import Starts, append_result, error_table, evaluate, method_named, precision_table
     from agalign.evaluation.image_pairs import find_pairs
 
-    if out is not None:
-        refuse_to_replace(out, b"pair,group,method,")
     chosen = methods or [*(f"fast:{sharing}" for sharing in get_args(Sharing)), "sift"]
     joint, start = given["settings"]["joint"], ", initial alignment" if seeding else ""
     named = {f"{name}{start}": method_named(name, **joint, seeding=seeding) for name in chosen}
     known, every = find_pairs(pairs), Starts(_shares(shift), directions)
     numbers = {pair.name: number for number, pair in enumerate(known, start=1)}
-    results = [] if out is None else read_results(out)
-    if out is not None:
-        write_results(out, results)  # without a last line that was not written to its end
-    if results:
-        text = f"{out}: {counted(len(results), 'result')} of an earlier command kept"
-        terminal.event("kept", text, results=len(results))
+    results = [] if out is None else _kept_results(out, terminal)
     for result in evaluate(known, named, every, joint["rng_seed"], results.copy()):
         results.append(result)
         if out is not None:
@@ -73,6 +60,19 @@ def _evaluate(
     for title, rows in (("Mean average precision", precision_table(results)), ("Homography", error_table(results))):
         if len(rows) > 1:
             terminal.table(rows[0], rows[1:], title)
+
+
+def _kept_results(out: Path, terminal: Terminal) -> "list[Result]":
+    """Read the results of an earlier command, without a last line that was not written to its end."""
+    from agalign.evaluation.evaluate import read_results, write_results
+
+    refuse_to_replace(out, b"pair,group,method,")
+    results = read_results(out)
+    write_results(out, results)
+    if results:
+        text = f"{out}: {counted(len(results), 'result')} of an earlier command kept"
+        terminal.event("kept", text, results=len(results))
+    return results
 
 
 def _surface(

@@ -176,18 +176,13 @@ def _indices(
     folder, jobs = target or out, given["run"]["jobs"]
     tasks = index_tasks(out, chosen, folder, overwrite=given["run"]["overwrite"], mask_qa=mask_qa)
     terminal.event("found", captures=len(tasks), indices=len(chosen))
-    dask = given["run"]["executor"]
+    dask, unwritten = given["run"]["executor"], ""
+    reports: list[IndexReport] = []
     with locked(folder), cluster(dask, jobs) as executor, progress(terminal, len(tasks)) as show:
-        reports: list[IndexReport] = []
-        unwritten = ""
         try:
             for number, done in enumerate(run_indices(tasks, jobs, executor), start=1):
-                terminal.check()
-                if any(r.raw_numbers for r in done) and not any(r.raw_numbers for r in reports):
-                    terminal.problem(RAW_NUMBERS)
+                _print_capture(done, reports, terminal)
                 reports += done
-                for report in done:
-                    _print(report, terminal)
                 show(number, done[0].capture, 0)
             if target is None and (out / REPORT_FILE).is_file():
                 write_pages(out, terminal.problem)
@@ -239,13 +234,18 @@ indices = Command(
 )
 
 
-def _print(report: "IndexReport", terminal: Terminal) -> None:
-    if report.path is None:
-        terminal.problem(f"{report.capture}: {report.problem}", capture=report.capture, index=report.index)
-        return
-    kept = ", kept" if report.kept else ""
-    text = f"{report.capture} {report.index}: median {report.median:.3f}{kept}"
-    terminal.event("index", text if terminal.verbose else "", **_facts(report))
+def _print_capture(reports: "Sequence[IndexReport]", earlier: "Sequence[IndexReport]", terminal: Terminal) -> None:
+    """Print the indices of a capture, after those of `earlier` ones."""
+    terminal.check()
+    if any(r.raw_numbers for r in reports) and not any(r.raw_numbers for r in earlier):
+        terminal.problem(RAW_NUMBERS)
+    for report in reports:
+        if report.path is None:
+            terminal.problem(f"{report.capture}: {report.problem}", capture=report.capture, index=report.index)
+            continue
+        kept = ", kept" if report.kept else ""
+        text = f"{report.capture} {report.index}: median {report.median:.3f}{kept}"
+        terminal.event("index", text if terminal.verbose else "", **_facts(report))
 
 
 def _facts(report: "IndexReport") -> dict[str, Any]:

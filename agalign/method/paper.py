@@ -30,6 +30,7 @@ from agalign.method.state import ImageGroup, JointState
 from agalign.values import geometry
 from agalign.values.alignment import JointResult
 from agalign.values.issues import Issue
+from agalign.values.pixel_units import Size
 
 _COARSEST_PX = 80
 """Longer side of the coarsest level. With 64, where few patches fit, psi moves half as far."""
@@ -117,11 +118,9 @@ def descend(
     """
     size_px, band = level.fixed.size_px, level.bands[0]
     psi = psi_from_homography(to_float64(band.h), *size_px).to(level.fixed.image).requires_grad_()
-    is_free = torch.zeros_like(psi)
+    is_free, steps, momentum = torch.zeros_like(psi), 0, 0.9
     if update_psi:
         is_free[list(FAMILY_PARAMETERS[state.family or "homography"])] = 1.0
-    steps = 0
-    momentum = 0.9
     learning_rate = 1e-4  # annealed by a cosine to 0 within each level
     optimiser = torch.optim.SGD([*net.parameters(), psi], learning_rate, momentum)
     annealing = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, training.epochs)
@@ -130,7 +129,7 @@ def descend(
         band.h = homography_from_psi(psi.detach(), *size_px)
         x, x_false, is_negative = _draw(level, pool, training.keypoints)
         batches = torch.split(torch.arange(len(x) // _BATCH * _BATCH), _BATCH)
-        pass_loss = 0.0
+        epoch_loss = 0.0
         for rows in batches:
             h = homography_from_psi(psi, *size_px)
             loss = _loss(net, level, h, x[rows], x_false[rows], is_negative[rows])
@@ -140,15 +139,19 @@ def descend(
             psi.grad *= is_free
             before = psi.detach().clone()
             optimiser.step()
-            pass_loss += float(loss.detach())
+            epoch_loss += float(loss.detach())
         annealing.step()
         steps += len(batches)
-        loss_value = pass_loss / (len(batches) * _BATCH)
+        loss_value = epoch_loss / (len(batches) * _BATCH)
         state.progress("learning", float(np.interp(epoch + 1, (0, training.epochs), shares)))
     band.h, h_before = (homography_from_psi(q, *size_px).detach() for q in (psi, before))
-    corners = torch.tensor(geometry.corners(*size_px)).to(band.h)
-    last_step = (transform(band.h, corners) - transform(h_before, corners)).norm(dim=1).max()
-    return steps, loss_value, float(last_step)
+    return steps, loss_value, _largest_px(band.h, h_before, size_px)
+
+
+def _largest_px(h: Tensor, h_before: Tensor, size_px: Size) -> float:
+    """The largest displacement of a corner by a change of the homography."""
+    corners = torch.tensor(geometry.corners(*size_px)).to(h)
+    return float((transform(h, corners) - transform(h_before, corners)).norm(dim=1).max())
 
 
 def _draw(level: Level, pool: Pool, count: int) -> tuple[Keypoints, Keypoints, Tensor]:

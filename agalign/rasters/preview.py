@@ -152,11 +152,8 @@ def _sheet(
         rows.append([_resized(np.asarray(errors.get(n, black), np.uint8), tile_px) for n in bands])
     relief_part = None
     if relief is not None:
-        low, high = np.percentile(relief.parallax_px, _RELIEF_PERCENTILES).tolist()
-        high = max(high, low + 1e-3)
-        grey = np.rint(((relief.parallax_px - low) / (high - low)).clip(0, 1) * 255)
-        rows.append([_resized(np.asarray(grey, np.uint8), tile_px)])
-        relief_part = ReliefPreviewPart(parallax_px=(low, high), range_m=relief.range_m)
+        grey, relief_part = _relief_tile(relief)
+        rows.append([_resized(grey, tile_px)])
     if views.indices_before:
         # Like the picture of the index of the aligned bands, which is not smoothed either.
         rows.append([cv2.resize(i, tile_px, interpolation=cv2.INTER_NEAREST) for i in views.indices_before.values()])
@@ -173,6 +170,13 @@ def _sheet(
         indices=list(views.indices_before),
     )
     return part, np.asarray(sheet, np.uint8)
+
+
+def _relief_tile(relief: ReliefView) -> tuple[Grey, ReliefPreviewPart]:
+    low, high = np.percentile(relief.parallax_px, _RELIEF_PERCENTILES).tolist()
+    high = max(high, low + 1e-3)
+    grey = np.rint(((relief.parallax_px - low) / (high - low)).clip(0, 1) * 255)
+    return np.asarray(grey, np.uint8), ReliefPreviewPart(parallax_px=(low, high), range_m=relief.range_m)
 
 
 def _whole_blocks(length_px: float, max_px: int) -> int:

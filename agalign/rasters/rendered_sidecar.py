@@ -10,7 +10,15 @@ from agalign.flight.footprint import accuracy_of_footprint_m, footprint, with_as
 from agalign.rasters.aligned_files import BandFiles, Stack
 from agalign.rasters.alignment_maps import ReliefMap, share_over_1_px
 from agalign.rasters.product import ProductContext
-from agalign.records.sidecar import FilePart, IlluminationPart, OutputPart, PlacePart, Sidecar, capture_status
+from agalign.records.sidecar import (
+    BandResult,
+    FilePart,
+    IlluminationPart,
+    OutputPart,
+    PlacePart,
+    Sidecar,
+    capture_status,
+)
 
 _FOOTPRINT_DECIMALS = 7
 """Of degrees: a centimetre."""
@@ -24,22 +32,7 @@ def rendered(
     `not_written` has the kinds that failed, `seconds` is the time of rendering, and `gone` has files that were deleted
     and that only another command can write. Raises OutputError.
     """
-    sidecar, capture, places = context.sidecar, context.capture, context.places
-    saturated: dict[str, float] = {}
-    with suppress(UnreadableFileError):  # the preview has failed with this reason
-        saturated = dict(context.reduced_bands.saturated)
-    relief = next((context.paths.relative(f.path) for f in context.written if f.kind == ReliefMap.kind), None)
-    bands = []
-    for band in sidecar.bands:
-        facts: dict[str, Any] = {"place": None, "saturated": saturated.get(band.band), "share_over_1_px": None}
-        if (place := places.get(band.band)) is not None:  # None if all pixels are nodata
-            facts["place"] = PlacePart(file=context.paths.relative(place[0].path), band_index=place[1])
-            if band.band in context.with_pixels:
-                alignment = context.with_pixels[band.band]
-                facts["share_over_1_px"] = share_over_1_px(alignment, capture.reference, context.grid)
-        if band.relief is not None:
-            facts["relief"] = band.relief.model_copy(update={"file": relief})
-        bands.append(band.model_copy(update=facts))
+    sidecar, capture, bands = context.sidecar, context.capture, _bands(context)
     shown = with_assumed_height(capture)
     ring = footprint(shown, context.grid)
     accept_predicted_px = context.settings.check.accept_predicted_px
@@ -64,6 +57,26 @@ def rendered(
             "seconds": round(sum(band.seconds for band in sidecar.bands) + seconds, 3),
         }
     )
+
+
+def _bands(context: ProductContext) -> list[BandResult]:
+    """The entries of the bands, with what is known of their pixels."""
+    saturated: dict[str, float] = {}
+    with suppress(UnreadableFileError):  # the preview has failed with this reason
+        saturated = dict(context.reduced_bands.saturated)
+    relief = next((context.paths.relative(f.path) for f in context.written if f.kind == ReliefMap.kind), None)
+    result = []
+    for band in context.sidecar.bands:
+        facts: dict[str, Any] = {"place": None, "saturated": saturated.get(band.band), "share_over_1_px": None}
+        if (place := context.places.get(band.band)) is not None:  # None if all pixels are nodata
+            facts["place"] = PlacePart(file=context.paths.relative(place[0].path), band_index=place[1])
+            if band.band in context.with_pixels:
+                alignment = context.with_pixels[band.band]
+                facts["share_over_1_px"] = share_over_1_px(alignment, context.capture.reference, context.grid)
+        if band.relief is not None:
+            facts["relief"] = band.relief.model_copy(update={"file": relief})
+        result.append(band.model_copy(update=facts))
+    return result
 
 
 def _options(context: ProductContext) -> dict[str, Any]:

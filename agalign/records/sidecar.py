@@ -80,6 +80,21 @@ class ReferencePart(_Part):
     georeferenced: bool = False
     """True if the file has map coordinates."""
 
+    @classmethod
+    def of(cls, capture: Capture) -> Self:
+        """Return the entry of the reference of a capture."""
+        band, (width, height) = capture.reference, capture.reference.size_px
+        place = band.georeference
+        is_mosaic = place is not None and place.accuracy_m is None  # else it was calculated from GPS
+        return cls(
+            band=band.name,
+            file=source_file(capture, band),
+            band_index=band.band_index,
+            width=width,
+            height=height,
+            georeferenced=is_mosaic,
+        )
+
     @property
     def size_px(self) -> tuple[int, int]:
         """(width, height) of the file."""
@@ -560,8 +575,6 @@ class Sidecar(_Part):
         delays_s = exposed_after_s or {}
         bands = [b.model_copy(update={"exposed_after_s": delays_s.get(b.band)}) for b in bands]
         status = capture_status(bands, capture.missing_bands, accept_predicted_px)
-        (width, height), place = reference.size_px, reference.georeference
-        is_mosaic = place is not None and place.accuracy_m is None  # else it was calculated from GPS
         return cls(
             agalign=__version__,
             capture=capture.name,
@@ -574,14 +587,7 @@ class Sidecar(_Part):
             status=status,
             missing_bands=list(capture.missing_bands),
             unreadable_bands=dict(capture.unreadable_bands),
-            reference=ReferencePart(
-                band=reference.name,
-                file=source_file(capture, reference),
-                band_index=reference.band_index,
-                width=width,
-                height=height,
-                georeferenced=is_mosaic,
-            ),
+            reference=ReferencePart.of(capture),
             bands=bands,
             accept_predicted_px=accept_predicted_px,
             estimated_with=estimation_fingerprint(capture, settings),

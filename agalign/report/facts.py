@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from agalign.host.files import CsvTable
 from agalign.host.text import escape_controls
 from agalign.records.cautions import NO_RESULT, Caution, RunFacts
+from agalign.records.excluded import PanelPart, SkyPart
 from agalign.records.sidecar import BandResult, GeometryPart, GridPart, OutputPart, Sidecar
 from agalign.report.page_data import DataParts
 from agalign.report.summary_csv import BAND_COLUMNS, SIMILARITY, SUMMARY_COLUMNS, SUMMARY_FILE
@@ -217,41 +218,17 @@ class FlightFacts:
         # The page has links by the label that it shows.
         for caution in self.pairs.add(escape_controls(label), sidecar):
             checks[caution.band].append(caution.reason)
-        output, position, path = sidecar.output, sidecar.position, Path(folder)
-        grid = output or OutputPart(file=None, crop=(0, 0, *sidecar.reference.size_px), nodata=None)
-        files = {part.kind: part.file for part in sidecar.products}
-        relief = next((b.relief.file for b in sidecar.bands if b.relief is not None), None)
         keys = {"folder": folder, "capture": sidecar.capture, "reference": sidecar.reference.band}
-        unwritten = list(unwritten_indices(sidecar, self.out / path, indices))
+        unwritten = list(unwritten_indices(sidecar, self.out / folder, indices))
         self.verdict.add(escape_controls(label), sidecar, unwritten)
-        facts = {
-            "label": label,
-            "captured_at": sidecar.captured_at,
-            "camera": sidecar.camera.name or "unknown camera",
-            "status": sidecar.status,
-            "shown": "ok_by_prediction" if is_by_prediction(sidecar) else sidecar.status,
-            "position": None if position is None else (position.latitude, position.longitude),
-            "altitude_m": None if position is None else position.altitude_m,
-            "missing": sidecar.missing_bands,
-            "reference": sidecar.reference.band,
-            "seconds": sidecar.seconds,
-            "accept_predicted_px": sidecar.accept_predicted_px,
-            "crop": grid.crop,
-            "scale": grid.scale,
-            "radiometry": grid.radiometry,
-            "stack": _link(path, files.get("stack")),
-            "relief": _link(path, relief),
-            "sidecar": _link(path, f"{sidecar.capture}.json"),
-            "picture": _link(path, files.get("picture")),
-            "preview": _preview(sidecar, path),
+        facts = _of_capture(Path(folder), label, sidecar) | {
             "bands": [self._pair(b, sidecar, keys, checks[b.band]) for b in sidecar.bands],
             "indices": [self._index(row) for row in indices if row.path is not None],
             "unwritten": unwritten,
-            "error_px": rounded(largest_error_px(sidecar)),
         }
         for name, status, reason in sidecar.pairs:
             if status == "missing":
-                self.add_row(keys | {"band": name, "status": status, "reason": reason, "check": reason})
+                self._add_row(keys | {"band": name, "status": status, "reason": reason, "check": reason})
         self._count(facts)
         if self._rows.add(_row_of(facts)):
             self._rows.flush()
@@ -290,29 +267,34 @@ class FlightFacts:
         self._first_lattice += len(lattices)
         self._lattices = {}
 
-    def add_row(self, row: Mapping[str, Any]) -> None:
+    def add_excluded(self, panels: Sequence[PanelPart], sky: Sequence[SkyPart]) -> None:
+        """Add the bands of captures that were not aligned, as they show a panel or the sky."""
+        not_aligned = [("panel", part) for part in panels if part.is_left_out] + [("sky", part) for part in sky]
+        for status, part in not_aligned:
+            row = {"folder": part.folder, "capture": part.capture, "status": status, "reason": part.sentence}
+            for band in part.bands:
+                self._add_row(row | {"band": band.band})
+
+    def _add_row(self, row: Mapping[str, Any]) -> None:
         """Add a row to OUT/summary.csv, given by column."""
         self._summary.add([row.get(name) for name in SUMMARY_COLUMNS])
-
-    def write_summary(self) -> None:
-        """Write OUT/summary.csv. Raises OutputError."""
-        self._summary.write(self.out / SUMMARY_FILE)
 
     def add_without_result(self, labels: Sequence[str]) -> None:
         """Add the captures of the run that have no sidecar."""
         self.without_result = labels
         facts = {"status": "no_result", "reason": NO_RESULT.cause, "check": NO_RESULT.cause}
         for path in map(Path, labels):
-            self.add_row({"folder": path.parent.as_posix(), "capture": path.name, **facts})
+            self._add_row({"folder": path.parent.as_posix(), "capture": path.name, **facts})
 
     def groups(self) -> list[CautionGroup]:
         """Return what to check, by cause, the largest effect first."""
         return self.pairs.groups(self.without_result)
 
-    def flush(self) -> None:
-        """Write the last parts. Raises OutputError."""
+    def write(self) -> None:
+        """Write OUT/summary.csv, and the last parts of the data of the page. Raises OutputError."""
         self._rows.flush()
         self._flush_details()
+        self._summary.write(self.out / SUMMARY_FILE)
 
     @property
     def files(self) -> list[str]:
@@ -324,7 +306,7 @@ class FlightFacts:
         return {name: sorted(of_index) for name, of_index in self._masked.items()}
 
     def in_page(self) -> dict[str, Any]:
-        """Return the data in the page, after `flush`. The script of the page declares their types."""
+        """Return the data in the page, after `write`. The script of the page declares their types."""
         return {
             "captures": self.statuses.total(),
             "shift_step_px": _SHIFT_STEP_PX,
@@ -354,7 +336,7 @@ class FlightFacts:
         if band.status != "predicted":
             row["prediction_from"] = None  # its mapping has only been compared with the prediction
         if band.status != "reference" or checks:
-            self.add_row(keys | row | {"check": "; ".join(checks)})
+            self._add_row(keys | row | {"check": "; ".join(checks)})
         metrics, windows = band.metrics, None if band.metrics is None else band.metrics.windows
         similarity = {name: (row[f"{name}_before"], row[f"{name}_after"]) for name in SIMILARITY}
         centres_px = np.empty((0, 2)) if windows is None else windows.centres_px
@@ -385,6 +367,36 @@ class FlightFacts:
             "lattice": self._first_lattice + self._lattices.setdefault(lattice, len(self._lattices)),
             "shifts": [step if known else None for step, known in shifts],
         }
+
+
+def _of_capture(folder: Path, label: str, sidecar: Sidecar) -> dict[str, Any]:
+    """The data of a capture without those of its bands and indices."""
+    output, position = sidecar.output, sidecar.position
+    grid = output or OutputPart(file=None, crop=(0, 0, *sidecar.reference.size_px), nodata=None)
+    files = {part.kind: part.file for part in sidecar.products}
+    relief = next((b.relief.file for b in sidecar.bands if b.relief is not None), None)
+    return {
+        "label": label,
+        "captured_at": sidecar.captured_at,
+        "camera": sidecar.camera.name or "unknown camera",
+        "status": sidecar.status,
+        "shown": "ok_by_prediction" if is_by_prediction(sidecar) else sidecar.status,
+        "position": None if position is None else (position.latitude, position.longitude),
+        "altitude_m": None if position is None else position.altitude_m,
+        "missing": sidecar.missing_bands,
+        "reference": sidecar.reference.band,
+        "seconds": sidecar.seconds,
+        "accept_predicted_px": sidecar.accept_predicted_px,
+        "crop": grid.crop,
+        "scale": grid.scale,
+        "radiometry": grid.radiometry,
+        "stack": _link(folder, files.get("stack")),
+        "relief": _link(folder, relief),
+        "sidecar": _link(folder, f"{sidecar.capture}.json"),
+        "picture": _link(folder, files.get("picture")),
+        "preview": _preview(sidecar, folder),
+        "error_px": rounded(largest_error_px(sidecar)),
+    }
 
 
 def _row_of(facts: dict[str, Any]) -> dict[str, Any]:

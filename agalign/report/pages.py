@@ -45,25 +45,9 @@ def write_pages(out: Path, on_problem: Callable[[str], None]) -> FlightFacts:
     Unreadable files are reported to `on_problem` and left out; the pages then count as outdated in `pages_exist`.
     Raises OutputError.
     """
-    earlier = current_rows(out)
-    rows_of: dict[str, list[IndexReport]] = defaultdict(list)
-    for row in earlier:
-        rows_of[row.capture].append(row)
-    indices: list[IndexReport] = []
     unreadable: list[str] = []
     facts, flight_map = FlightFacts(out), FlightMap()
-    for path in counted_sidecars(find_sidecars(out), out):
-        folder = path.parent.relative_to(out).as_posix()
-        try:
-            sidecar = read_sidecar(path)
-        except SidecarError as error:
-            unreadable.append(str(error))
-            continue
-        of_capture = reports_of(sidecar, folder, out, facts.pairs.run)
-        indices += of_capture
-        label = Path(folder, sidecar.capture).as_posix()
-        facts.add(folder, sidecar, merged(rows_of.get(label, []), of_capture))
-        flight_map.add(folder, sidecar)
+    rows = _add_captures(out, facts, flight_map, unreadable.append)
     panels: list[PanelPart] = []
     sky: list[SkyPart] = []
     run: RunPart | None = None
@@ -71,29 +55,17 @@ def write_pages(out: Path, on_problem: Callable[[str], None]) -> FlightFacts:
         (panels, sky), run = read_excluded(out), read_run_record(out)
     except SidecarError as error:
         unreadable.append(str(error))
-    not_aligned = [("panel", part) for part in panels if part.is_left_out] + [("sky", part) for part in sky]
-    for status, part in not_aligned:
-        excluded = {"folder": part.folder, "capture": part.capture, "status": status, "reason": part.sentence}
-        for band in part.bands:
-            facts.add_row(excluded | {"band": band.band})
+    facts.add_excluded(panels, sky)
     unfinished = unfinished_run(run, (*panels, *sky), facts.seconds)
     facts.add_without_result([] if unfinished is None else unfinished.missing)
-    facts.flush()
-    facts.write_summary()
-    rows = update_table(out, indices, earlier)
+    facts.write()
     for one in [] if run is None else run.excluded:
         flight_map.add_excluded(one)
     flight_map.add_indices(rows, out)
     flight_map.write(out)
     page = _page(
-        version=__version__,
-        median=median,
         flight=facts,
         facts=facts.in_page(),
-        terms=TERMS,
-        pages=PAGES,
-        max_listed=_MAX_LISTED,
-        max_excluded=_MAX_EXCLUDED,
         run=run,
         unfinished="" if unfinished is None else unfinished.sentence,
         notes=[] if run is None else run.notes_on_input(),
@@ -110,6 +82,30 @@ def write_pages(out: Path, on_problem: Callable[[str], None]) -> FlightFacts:
     for text in unreadable:
         on_problem(text)
     return facts
+
+
+def _add_captures(
+    out: Path, facts: FlightFacts, flight_map: FlightMap, on_problem: Callable[[str], None]
+) -> list[IndexReport]:
+    """Add all captures with a sidecar below OUT, and write OUT/indices.csv; return its rows."""
+    earlier = current_rows(out)
+    rows_of: dict[str, list[IndexReport]] = defaultdict(list)
+    for row in earlier:
+        rows_of[row.capture].append(row)
+    indices: list[IndexReport] = []
+    for path in counted_sidecars(find_sidecars(out), out):
+        folder = path.parent.relative_to(out).as_posix()
+        try:
+            sidecar = read_sidecar(path)
+        except SidecarError as error:
+            on_problem(str(error))
+            continue
+        of_capture = reports_of(sidecar, folder, out, facts.pairs.run)
+        indices += of_capture
+        label = Path(folder, sidecar.capture).as_posix()
+        facts.add(folder, sidecar, merged(rows_of.get(label, []), of_capture))
+        flight_map.add(folder, sidecar)
+    return update_table(out, indices, earlier)
 
 
 def outdate_pages(out: Path) -> None:
@@ -130,10 +126,18 @@ def pages_exist(out: Path) -> bool:
 
 
 def _page(**values: Any) -> str:
-    """The page of the template, which gets these values."""
+    """The page of the template, which gets these values and those of every page."""
     style, script = (resources.files(__package__).joinpath(f"page.{kind}").read_text("utf-8") for kind in ("css", "js"))
     digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
-    return _template().render(style=style, script=script, script_hash=digest, **values)
+    of_every_page = {
+        "version": __version__,
+        "median": median,
+        "terms": TERMS,
+        "pages": PAGES,
+        "max_listed": _MAX_LISTED,
+        "max_excluded": _MAX_EXCLUDED,
+    }
+    return _template().render(style=style, script=script, script_hash=digest, **of_every_page, **values)
 
 
 def _template() -> Template:
