@@ -11,10 +11,10 @@ from scipy.interpolate import CloughTocher2DInterpolator
 
 import agalign
 from agalign.batch.capture_task import Task, process_capture
-from agalign.cameras.base import rig_seed
 from agalign.cameras.discover import DiscoverOptions, discover
 from agalign.cameras.metadata import read_tags
 from agalign.cameras.micasense import MicaSense
+from agalign.cameras.tag_seeds import rig_seed
 from agalign.config import FlightSettings, SeedSettings, Settings
 from agalign.flight.panel_readings import read_panel, with_panels
 from agalign.pixels.radiometry import calibrated

@@ -1,9 +1,11 @@
-"""Results of earlier runs in the output folder: whether they are of the same captures, and what has changed since."""
+"""Results of earlier runs in the output folder: whether they are of the same captures, what has changed since, and
+which are of captures that the input no longer has.
+"""
 
 import pickle
 import stat
 import zlib
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from datetime import timedelta
@@ -13,6 +15,7 @@ from typing import Literal
 
 from agalign._version import __version__
 from agalign.batch.render import with_earlier_products
+from agalign.cameras.discover import FolderScan
 from agalign.config import RunOptions, Settings, SettingsModel
 from agalign.errors import ConfigurationError, OutputError, SidecarError, UnreadableFileError
 from agalign.flight.fingerprint import (
@@ -27,8 +30,9 @@ from agalign.host.files import file_checksum
 from agalign.host.memory_limits import WORK_TILE_PX
 from agalign.pixels.raster import read_tile
 from agalign.rasters.product import CapturePaths
+from agalign.records.run_record import NotInInputPart, RunPart
 from agalign.records.sidecar import FilePart, Sidecar, capture_status
-from agalign.records.sidecar_file import read_with_change
+from agalign.records.sidecar_file import find_sidecars, label_of, read_with_change, read_without_tables
 from agalign.values.capture import Band, Capture, CaptureTime
 from agalign.values.image import Tile
 from agalign.values.resampling import tiles
@@ -300,3 +304,56 @@ def outputs_exist(sidecar: Path, files: Sequence[FilePart]) -> bool:
     except OSError:
         return False
     return sidecar.is_file() and all(stat.S_ISREG(one.st_mode) and one.st_size == size for one, size in states)
+
+
+# ---- results of captures that the input of this run does not have
+
+
+def labels_of_other_inputs(earlier: RunPart | None, record: RunPart) -> dict[str, list[str]]:
+    """Return the labels of the captures that earlier runs found in other input folders, by folder, without those of
+    this run; flights may be aligned folder by folder into one output folder.
+    """
+    if earlier is None:
+        return {}
+    found, own = {**earlier.other_inputs, earlier.input: earlier.labels}, set(record.labels)
+    others = {folder: [label for label in labels if label not in own] for folder, labels in found.items()}
+    return {folder: labels for folder, labels in others.items() if labels and folder != record.input}
+
+
+def results_not_in_input(
+    flight: FolderScan, out: Path, other_inputs: Mapping[str, Sequence[str]]
+) -> Iterator[NotInInputPart]:
+    """Yield the results of captures that are in no input folder: their images were removed, or have another name and
+    are a capture of this run. Images that exist, and are not selected, are in the input.
+    """
+    own, others = {c.label for c in flight.captures}, {label for labels in other_inputs.values() for label in labels}
+    exposures: _Exposures | None = None
+    for path in find_sidecars(out):
+        if (label := label_of(path, out)) in own:
+            continue
+        with suppress(SidecarError):  # named by the commands that read it
+            result = read_without_tables(path)
+            exposures = exposures or _Exposures(flight.captures)
+            if same := exposures.same_as(result):
+                yield NotInInputPart(capture=label, same_as=same)
+            elif label not in others and not any((flight.folder / b.file).is_file() for b in result.bands):
+                yield NotInInputPart(capture=label)
+
+
+class _Exposures:
+    """The captures of a run by what identifies their exposure: the id in the tags, else the contents of a file."""
+
+    def __init__(self, captures: Sequence[Capture]) -> None:
+        self._captures = captures
+        self._by_sample: dict[tuple[str, str], str] | None = None
+
+    def same_as(self, result: Sidecar) -> str:
+        """Return the label of the capture that is the same exposure as a result; empty if there is none."""
+        if result.capture_id:
+            of_id = (c for c in self._captures if c.capture_id == result.capture_id and is_same(result, c))
+            return next((c.label for c in of_id), "")
+        if self._by_sample is None:
+            without_id = [c for c in self._captures if not c.capture_id]
+            self._by_sample = {sample: c.label for c in without_id for sample in input_samples(c).items()}
+        by_sample = self._by_sample
+        return next((by_sample[sample] for sample in result.input_samples.items() if sample in by_sample), "")

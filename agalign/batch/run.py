@@ -12,9 +12,16 @@ from typing import Self
 
 from agalign.batch.capture_report import CaptureReport
 from agalign.batch.capture_task import Task, do_capture, loaded_model, quiet
-from agalign.batch.earlier_results import EarlierResults, Remaining, outputs_exist, refuse_other_captures, remaining
+from agalign.batch.earlier_results import (
+    EarlierResults,
+    Remaining,
+    labels_of_other_inputs,
+    outputs_exist,
+    refuse_other_captures,
+    remaining,
+    results_not_in_input,
+)
 from agalign.batch.flight_learning import learn_flight
-from agalign.batch.other_results import labels_of_other_inputs, results_not_in_input
 from agalign.batch.output_files import refuse_to_overwrite, remove_outputs
 from agalign.batch.render import RenderOptions
 from agalign.batch.selection import Selection, select_captures
@@ -39,8 +46,8 @@ from agalign.rasters.preview import preview_bytes
 from agalign.rasters.product import CapturePaths
 from agalign.records.run_record import RunPart, begun, excluded_part, input_name, last_record, refuse_foreign_pages
 from agalign.records.sidecar import FilePart, Sidecar
-from agalign.report.excluded import write_panels, write_sky
 from agalign.report.pages import outdate_pages
+from agalign.report.panels_and_sky import write_panels, write_sky
 from agalign.spectral_indices.rasters import check_indices
 from agalign.values.capture import Capture
 from agalign.values.image import OutputGrid

@@ -135,21 +135,6 @@ def is_thermal(band: Band) -> bool:
     return by_wavelength or band.name.lower().startswith(("lwir", "thermal"))
 
 
-def rig_seed(reference: Band, moving: Band) -> Matrix | None:
-    """Return `fixed_to_moving` (3, 3) between undistorted pixels from tags alone; None if the tags lack it."""
-    if reference.to_rig is None or moving.to_rig is None:
-        return None
-    return geometry.compose(geometry.invert(moving.to_rig), reference.to_rig)
-
-
-def other_rig_seed(reference: Band, moving: Band) -> Matrix | None:
-    """Return `rig_seed` by the second set of tags that some makers write; None if both bands lack it."""
-    if reference.other_to_rig is None and moving.other_to_rig is None:
-        return None
-    others = (b if b.other_to_rig is None else replace(b, to_rig=b.other_to_rig) for b in (reference, moving))
-    return rig_seed(*others)
-
-
 # ---- for the modules of the cameras
 
 

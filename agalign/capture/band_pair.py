@@ -9,8 +9,8 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from agalign.cameras.tag_seeds import tag_seeds
 from agalign.capture.reference import Reference
-from agalign.capture.tag_seeds import tag_seeds
 from agalign.config import SeedSettings
 from agalign.errors import AgalignError
 from agalign.fit.windows import FixedWindows

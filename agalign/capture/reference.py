@@ -4,18 +4,13 @@ from dataclasses import replace
 from functools import cached_property
 
 from agalign.fit.displacement_field import DisplacementEstimator
-from agalign.fit.windows import MIN_WINDOW_PX, FixedWindows
+from agalign.fit.windows import FIT_WINDOW_PX, HELD_OUT_WINDOW_PX, LARGE_WINDOW_PX, MIN_WINDOW_PX, FixedWindows
 from agalign.pixels.band_resampling import channel_mean, shrink, textured
 from agalign.pixels.landmarks import LandmarkInput, Landmarks, landmarks
 from agalign.pixels.structure import Field, blur_px, structure_field, windowed_spectra
 from agalign.values.image import Raster
 from agalign.values.pixel_units import PixelScale
-from agalign.verify.metrics import FixedSimilarity
-
-_HELD_OUT_PX = 64
-"""Side of the windows that verify a relief; larger, because their shifts have less noise."""
-_LARGE_WINDOW_PX = 168
-"""Side of windows in blurred images: 15 x 10 blurs of 3 px."""
+from agalign.verify.similarity import FixedSimilarity
 
 
 class Reference:
@@ -81,7 +76,7 @@ class Reference:
     @cached_property
     def large_windows(self) -> FixedWindows:
         """Larger windows, for blurred images."""
-        return FixedWindows(self.grey.valid, self.structure, _LARGE_WINDOW_PX)
+        return FixedWindows(self.grey.valid, self.structure, LARGE_WINDOW_PX)
 
     @cached_property
     def blur_px(self) -> float:
@@ -101,7 +96,7 @@ class Reference:
     @cached_property
     def tie_windows(self) -> FixedWindows:
         """Windows of the size of those that verify a relief, over the whole image."""
-        return FixedWindows(self.grey.valid, self.structure, _HELD_OUT_PX)
+        return FixedWindows(self.grey.valid, self.structure, HELD_OUT_WINDOW_PX)
 
     @cached_property
     def displacement_field(self) -> DisplacementEstimator:
@@ -111,14 +106,13 @@ class Reference:
     @cached_property
     def black_windows(self) -> FixedWindows:
         """Windows in the black fields of a chessboard, for the fit of planes and baselines."""
-        side_px = 48  # small, so that most windows contain a single surface
-        return FixedWindows.on_chessboard(self.grey.valid, self.structure, side_px, white=False)
+        return FixedWindows.on_chessboard(self.grey.valid, self.structure, FIT_WINDOW_PX, white=False)
 
     @cached_property
     def white_windows(self) -> FixedWindows:
         """Windows in the white fields, for the verification of a fit to the black ones."""
         return FixedWindows.on_chessboard(
-            self.grey.valid, self.structure, _HELD_OUT_PX, white=True, min_valid_share=0.9
+            self.grey.valid, self.structure, HELD_OUT_WINDOW_PX, white=True, min_valid_share=0.9
         )
 
     @cached_property

@@ -29,8 +29,9 @@ from agalign.records.cautions import RunFacts
 from agalign.records.run_record import read_run_record
 from agalign.records.sidecar import BandResult
 from agalign.records.sidecar_file import read_without_tables
-from agalign.report.facts import PairTotals, rounded
+from agalign.report.facts import PairTotals
 from agalign.report.pages import REPORT_FILE, pages_exist, write_pages
+from agalign.report.summary_csv import rounded
 from agalign.values.capture import Capture
 
 if TYPE_CHECKING:

@@ -186,7 +186,7 @@ def _show_model(path: Path, terminal: Terminal, *, as_json: bool) -> None:
 
 def _facts(capture: "Capture") -> dict[str, Any]:
     """Return what `info` prints about a capture, as a JSON object."""
-    from agalign.capture.tag_seeds import tag_seeds
+    from agalign.cameras.tag_seeds import tag_seeds
     from agalign.config import SeedSettings
 
     offered = {kind for b in capture.moving for kind in tag_seeds(capture.reference, b, SeedSettings())}

@@ -26,14 +26,21 @@ from agalign.values.residual import Residual
 _Element = TypeVar("_Element", bound=np.generic)
 
 _WINDOW_PX = 112
-"""Side of the windows: large enough for a clear peak over crops, small enough to localise misalignment."""
+"""Side of the windows that verify an alignment: large enough for a clear peak over crops, small enough to localise
+misalignment."""
+LARGE_WINDOW_PX = 168
+"""Side of those in blurred images: 15 x 10 blurs of 3 px."""
+FIT_WINDOW_PX = 48
+"""Side of the windows that planes and baselines are fitted to: small, so that most contain a single surface."""
+HELD_OUT_WINDOW_PX = 64
+"""Side of the windows that verify a relief; larger, because their shifts have less noise."""
+MIN_WINDOW_PX = 32
+"""Side of windows between saturated areas, and minimum in small images; smaller windows have no reliable peak."""
 _MIN_VALID_SHARE = 0.3
 """Minimum share of valid pixels in a window. With 0.4, shifts of windows of 112 px have errors of 0.09 px instead of
 0.05 px (a row crop with a known shift)."""
 _MAX_IGNORED_SHARE = 0.01
 """Share of masked pixels in a window that does not bias its shift."""
-MIN_WINDOW_PX = 32
-"""Side of windows between saturated areas, and minimum in small images; smaller windows have no reliable peak."""
 
 
 class FixedWindows:

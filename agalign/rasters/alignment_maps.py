@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import RegularGridInterpolator
 
-from agalign.cameras.base import rig_seed
 from agalign.cameras.pix4d import rig_unit_m
+from agalign.cameras.tag_seeds import rig_seed
 from agalign.errors import GeometryError
 from agalign.host.memory_limits import WORK_TILE_PX
 from agalign.rasters.geotiff import LayerDescription, compressed

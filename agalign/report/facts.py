@@ -3,7 +3,7 @@
 import json
 import math
 from collections import Counter, defaultdict
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from statistics import median
@@ -13,13 +13,12 @@ from urllib.parse import quote
 import numpy as np
 from numpy.typing import NDArray
 
-from agalign.host.files import CsvTable
 from agalign.host.text import escape_controls
 from agalign.records.cautions import NO_RESULT, Caution, RunFacts
 from agalign.records.excluded import PanelPart, SkyPart
 from agalign.records.sidecar import BandResult, GeometryPart, GridPart, OutputPart, Sidecar
 from agalign.report.page_data import DataParts
-from agalign.report.summary_csv import BAND_COLUMNS, SIMILARITY, SUMMARY_COLUMNS, SUMMARY_FILE
+from agalign.report.summary_csv import BAND_COLUMNS, SIMILARITY, SummaryTable, rounded, row_of, value_at
 from agalign.report.verdict import Verdict, is_by_prediction, largest_error_px, unwritten_indices
 from agalign.spectral_indices.rasters import IndexReport
 from agalign.values.alignment import Prediction
@@ -203,7 +202,7 @@ class FlightFacts:
         """Number of captures with a position."""
         self.without_result: Sequence[str] = ()
         """Labels of the captures of the run that have no sidecar."""
-        self._summary = CsvTable(SUMMARY_COLUMNS)
+        self._summary = SummaryTable()
         self._rows = DataParts(out, "rows", _ROWS_PER_PART)
         self._details = DataParts(out, "details", _DETAILS_PER_PART)
         self._masked: dict[str, list[float]] = defaultdict(list)
@@ -228,9 +227,9 @@ class FlightFacts:
         }
         for name, status, reason in sidecar.pairs:
             if status == "missing":
-                self._add_row(keys | {"band": name, "status": status, "reason": reason, "check": reason})
+                self._summary.add(keys | {"band": name, "status": status, "reason": reason, "check": reason})
         self._count(facts)
-        if self._rows.add(_row_of(facts)):
+        if self._rows.add(_map_row(facts)):
             self._rows.flush()
         if self._details.add(facts):
             self._flush_details()
@@ -273,18 +272,14 @@ class FlightFacts:
         for status, part in not_aligned:
             row = {"folder": part.folder, "capture": part.capture, "status": status, "reason": part.sentence}
             for band in part.bands:
-                self._add_row(row | {"band": band.band})
-
-    def _add_row(self, row: Mapping[str, Any]) -> None:
-        """Add a row to OUT/summary.csv, given by column."""
-        self._summary.add([row.get(name) for name in SUMMARY_COLUMNS])
+                self._summary.add(row | {"band": band.band})
 
     def add_without_result(self, labels: Sequence[str]) -> None:
         """Add the captures of the run that have no sidecar."""
         self.without_result = labels
         facts = {"status": "no_result", "reason": NO_RESULT.cause, "check": NO_RESULT.cause}
         for path in map(Path, labels):
-            self._add_row({"folder": path.parent.as_posix(), "capture": path.name, **facts})
+            self._summary.add({"folder": path.parent.as_posix(), "capture": path.name, **facts})
 
     def groups(self) -> list[CautionGroup]:
         """Return what to check, by cause, the largest effect first."""
@@ -294,7 +289,7 @@ class FlightFacts:
         """Write OUT/summary.csv, and the last parts of the data of the page. Raises OutputError."""
         self._rows.flush()
         self._flush_details()
-        self._summary.write(self.out / SUMMARY_FILE)
+        self._summary.write(self.out)
 
     @property
     def files(self) -> list[str]:
@@ -332,11 +327,9 @@ class FlightFacts:
         """The data of a band. Its row, with `keys`, and its offset are added: for the reference only a row, if there is
         something to check.
         """
-        row = {column: value_at(band, path) for column, path in BAND_COLUMNS.items()}
-        if band.status != "predicted":
-            row["prediction_from"] = None  # its mapping has only been compared with the prediction
+        row = row_of(band)
         if band.status != "reference" or checks:
-            self._add_row(keys | row | {"check": "; ".join(checks)})
+            self._summary.add(keys | row | {"check": "; ".join(checks)})
         metrics, windows = band.metrics, None if band.metrics is None else band.metrics.windows
         similarity = {name: (row[f"{name}_before"], row[f"{name}_after"]) for name in SIMILARITY}
         centres_px = np.empty((0, 2)) if windows is None else windows.centres_px
@@ -399,7 +392,7 @@ def _of_capture(folder: Path, label: str, sidecar: Sidecar) -> dict[str, Any]:
     }
 
 
-def _row_of(facts: dict[str, Any]) -> dict[str, Any]:
+def _map_row(facts: dict[str, Any]) -> dict[str, Any]:
     """The row of a capture in the table of the page, and its dot on the map."""
     moving = [b for b in facts["bands"] if b["status"] != "reference"]
     aligned = [b for b in moving if b["status"] == "aligned"]
@@ -411,22 +404,6 @@ def _row_of(facts: dict[str, Any]) -> dict[str, Any]:
         "raw": any(i["raw"] for i in facts["indices"]),
         "check": bool(facts["missing"] or facts["unwritten"]) or any(b["check"] or b["reason"] for b in facts["bands"]),
     }
-
-
-def value_at(part: object, path: str) -> Any:
-    """Return a field of nested records, with four decimals; None if a record on the path is None."""
-    for name in path.split("."):
-        part = None if part is None else getattr(part, name)
-    return rounded(part)
-
-
-def rounded(value: Any) -> Any:
-    """Return a measured value with the four decimals that tables and the report have, None if it is not finite; others
-    unchanged.
-    """
-    if not isinstance(value, float):
-        return value
-    return round(value, 4) if math.isfinite(value) else None
 
 
 def _preview(sidecar: Sidecar, folder: Path) -> dict[str, Any] | None:

@@ -1,4 +1,12 @@
-"""The columns of OUT/summary.csv, which has a row for each band of each capture."""
+"""OUT/summary.csv: a row for each band of each capture."""
+
+import math
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from agalign.host.files import CsvTable
+from agalign.records.sidecar import BandResult
 
 SIMILARITY = ("mattes_mi", "nmi", "ncc", "gradient_correlation", "structure_ssim")
 BAND_COLUMNS = {
@@ -24,3 +32,42 @@ BAND_COLUMNS = {
 """Field of a band in the sidecar by column of OUT/summary.csv."""
 SUMMARY_FILE = "summary.csv"
 SUMMARY_COLUMNS = ("folder", "capture", *BAND_COLUMNS, "reference", "check")
+
+
+class SummaryTable:
+    """The rows of OUT/summary.csv."""
+
+    def __init__(self) -> None:
+        self._table = CsvTable(SUMMARY_COLUMNS)
+
+    def add(self, row: Mapping[str, Any]) -> None:
+        """Add a row, given by column."""
+        self._table.add([row.get(name) for name in SUMMARY_COLUMNS])
+
+    def write(self, out: Path) -> None:
+        """Write OUT/summary.csv. Raises OutputError."""
+        self._table.write(out / SUMMARY_FILE)
+
+
+def row_of(band: BandResult) -> dict[str, Any]:
+    """Return the values of BAND_COLUMNS."""
+    row = {column: value_at(band, path) for column, path in BAND_COLUMNS.items()}
+    if band.status != "predicted":
+        row["prediction_from"] = None  # its mapping has only been compared with the prediction
+    return row
+
+
+def value_at(part: object, path: str) -> Any:
+    """Return a field of nested records, with four decimals; None if a record on the path is None."""
+    for name in path.split("."):
+        part = None if part is None else getattr(part, name)
+    return rounded(part)
+
+
+def rounded(value: Any) -> Any:
+    """Return a measured value with the four decimals that tables and the report have, None if it is not finite; others
+    unchanged.
+    """
+    if not isinstance(value, float):
+        return value
+    return round(value, 4) if math.isfinite(value) else None

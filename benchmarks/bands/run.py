@@ -40,7 +40,7 @@ from figures_csv import FiguresOption, write_figures
 from peers import METHODS, WITH_TAGS, Align, Rated, grey_raster, method_named
 
 from agalign.cameras.discover import discover
-from agalign.capture.tag_seeds import tag_seeds
+from agalign.cameras.tag_seeds import tag_seeds
 from agalign.config import SeedSettings
 from agalign.method.device import limit_threads
 from agalign.pixels.raster import suffix_format

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from synthetic_flights.cameras import ALTUM, ALTUM_PT, MAVIC, MAVIC_3M, SENTERA_6X
 
-from agalign.cameras.base import rig_seed
 from agalign.cameras.discover import DiscoverOptions, discover
+from agalign.cameras.tag_seeds import rig_seed
 from agalign.synthetic.cameras import REDEDGE, CameraSpec, Pose, true_homography
 from agalign.synthetic.flight import Shot, write_shots
 from agalign.synthetic.ground import paint_ground

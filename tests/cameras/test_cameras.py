@@ -8,7 +8,7 @@ import pytest
 import rasterio
 from rasterio.enums import ColorInterp
 
-from agalign.cameras.base import default_reference, rig_seed
+from agalign.cameras.base import default_reference
 from agalign.cameras.generic import Generic
 from agalign.cameras.makers import known_cameras
 from agalign.cameras.mapir import Mapir
@@ -16,6 +16,7 @@ from agalign.cameras.metadata import Tags, read_tags
 from agalign.cameras.micasense import MicaSense, horizontal_irradiance, transmission
 from agalign.cameras.pix4d import NAMESPACE, panel_in
 from agalign.cameras.sun import sun_position
+from agalign.cameras.tag_seeds import rig_seed
 from agalign.errors import ConfigurationError
 from agalign.pixels.raster import probe
 from agalign.synthetic import cameras

@@ -12,15 +12,14 @@ import pytest
 import tifffile
 from PIL import Image
 
-from agalign.cameras.base import other_rig_seed, rig_seed
 from agalign.cameras.discover import DiscoverOptions, discover
 from agalign.cameras.dji import Dji
 from agalign.cameras.metadata import Tags, read_tags
 from agalign.cameras.parrot import Sequoia
 from agalign.cameras.pix4d import NAMESPACE
 from agalign.cameras.sentera import Sentera
+from agalign.cameras.tag_seeds import other_rig_seed, rig_seed, tag_seeds
 from agalign.cameras.tiff_directory import Entry, add_directories, byte_string, rational, short, text
-from agalign.capture.tag_seeds import tag_seeds
 from agalign.config import SeedSettings
 from agalign.pixels.raster import probe
 from agalign.values import geometry, lens

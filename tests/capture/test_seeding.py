@@ -5,10 +5,10 @@ import cv2
 import numpy as np
 import pytest
 
+from agalign.cameras.tag_seeds import geo_seed
 from agalign.capture import seeding
 from agalign.capture.band_pair import BandPair, SeedMatrices
 from agalign.capture.seeding import best_seed, corrected, find_rotated, find_seed
-from agalign.capture.tag_seeds import geo_seed
 from agalign.capture.warped_pair import WarpedPair
 from agalign.config import SeedSettings
 from agalign.errors import GeometryError

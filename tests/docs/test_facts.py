@@ -15,7 +15,7 @@ from pathlib import Path
 import pytest
 
 from agalign.batch.products import PRODUCTS
-from agalign.capture import band_pair, common_parallax, reference
+from agalign.capture import band_pair, common_parallax
 from agalign.cli.exit_codes import ExitCode
 from agalign.cli.main import COMMANDS
 from agalign.fit import dense, displacement_field, windows
@@ -157,7 +157,7 @@ LIMITS = {
     "explanation/verification.md": (
         f"| at least {MIN_RETRIEVAL:g}, and {MIN_TIMES_CHANCE:g} times chance |",
         f"at most {checks._MAX_ERROR_PX:g} px in {checks._MIN_ACCURATE_SHARE:.0%} of the common area",
-        f"Their side is at most {windows._WINDOW_PX} px, and {reference._LARGE_WINDOW_PX} px in blurred images",
+        f"Their side is at most {windows._WINDOW_PX} px, and {windows.LARGE_WINDOW_PX} px in blurred images",
         f"| at least {coverage.MIN_COMMON_COVERAGE:.0%} |",
         f"| at least {checks._MIN_CLOSE_SHARE:.0%} |",
         f"| fewer than {checks._MIN_CLUSTER}, or fewer than {checks._MAX_CLUSTER_SHARE:.0%} of the windows |",

@@ -20,7 +20,7 @@ from agalign.flight.panel_readings import (
 )
 from agalign.pixels.panel_detection import DetectedPanel
 from agalign.pixels.radiometry import with_radiometry
-from agalign.report.excluded import write_panels
+from agalign.report.panels_and_sky import write_panels
 from agalign.values.capture import Band, CameraIdentity, Capture, Panel, Pose, Position, Quantity, Radiometry
 
 from ..program import agalign

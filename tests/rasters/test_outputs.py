@@ -12,7 +12,7 @@ from synthetic_flights.troubles import make_terraces
 
 import agalign
 from agalign.batch.output_files import refuse_to_overwrite
-from agalign.capture.tag_seeds import geo_seed
+from agalign.cameras.tag_seeds import geo_seed
 from agalign.errors import ConfigurationError
 from agalign.rasters.aligned_files import band_file_names
 from agalign.rasters.band_reader import RAW, BandReader

@@ -17,8 +17,8 @@ import agalign
 from agalign.batch import capture_task as batch
 from agalign.batch import estimate
 from agalign.cameras import pix4d
-from agalign.cameras.base import rig_seed
 from agalign.cameras.metadata import Tags
+from agalign.cameras.tag_seeds import rig_seed
 from agalign.rasters.alignment_maps import relief_layers
 from agalign.records.sidecar import Sidecar
 from agalign.records.sidecar_file import find_sidecars, read_sidecar, read_without_tables, write_sidecar

@@ -13,6 +13,7 @@ import rasterio
 from synthetic_flights.aligned import make_aligned
 
 import agalign
+from agalign.batch.render import rendered_sidecar
 from agalign.flight.footprint import (
     above_elevation,
     accuracy_of_footprint_m,
@@ -25,7 +26,6 @@ from agalign.flight.footprint import (
     with_approximate_georeference,
     with_assumed_height,
 )
-from agalign.rasters.rendered_sidecar import rendered
 from agalign.records.run_record import excluded_part
 from agalign.records.sidecar import Sidecar
 from agalign.report.flight_map import FlightMap, geojson_geometry
@@ -52,7 +52,7 @@ def features_of(out: Path) -> list[dict[str, Any]]:
 
 def sidecar_of(known: Capture, status: str = "ok") -> Sidecar:
     """The sidecar of a capture without rasters."""
-    return rendered(context_of(known, {})).model_copy(update={"status": status})
+    return rendered_sidecar(context_of(known, {})).model_copy(update={"status": status})
 
 
 def mapped(out: Path, known: Capture, status: str = "ok") -> list[dict[str, Any]]:

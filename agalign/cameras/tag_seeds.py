@@ -1,9 +1,9 @@
-"""Initial mappings from the metadata of the files."""
+"""Initial mappings of a band pair from the metadata of the files."""
 
 from collections.abc import Callable
 from contextlib import suppress
+from dataclasses import replace
 
-from agalign.cameras.base import other_rig_seed, rig_seed
 from agalign.config import SeedSettings
 from agalign.errors import GeometryError
 from agalign.pixels.coordinates import transformed
@@ -33,6 +33,21 @@ def tag_seeds(reference: Band, moving: Band, settings: SeedSettings) -> dict[See
     if settings.force in ("rig", "geo", "identity"):
         return {kind: matrix for kind, matrix in matrices.items() if kind == settings.force}
     return matrices
+
+
+def rig_seed(reference: Band, moving: Band) -> Matrix | None:
+    """Return `fixed_to_moving` (3, 3) between undistorted pixels from tags alone; None if the tags lack it."""
+    if reference.to_rig is None or moving.to_rig is None:
+        return None
+    return geometry.compose(geometry.invert(moving.to_rig), reference.to_rig)
+
+
+def other_rig_seed(reference: Band, moving: Band) -> Matrix | None:
+    """Return `rig_seed` by the second set of tags that some makers write; None if both bands lack it."""
+    if reference.other_to_rig is None and moving.other_to_rig is None:
+        return None
+    others = (b if b.other_to_rig is None else replace(b, to_rig=b.other_to_rig) for b in (reference, moving))
+    return rig_seed(*others)
 
 
 def geo_seed(reference: Band, moving: Band) -> Matrix | None:

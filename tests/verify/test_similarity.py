@@ -7,7 +7,7 @@ from skimage.metrics import normalized_mutual_information, structural_similarity
 from agalign.capture.reference import Reference
 from agalign.values.image import Raster
 from agalign.values.residual import Similarity
-from agalign.verify.metrics import FixedSimilarity, fixed_bins, joint_histogram, normalised_mutual_information
+from agalign.verify.similarity import FixedSimilarity, fixed_bins, joint_histogram, normalised_mutual_information
 
 from ..builders import two_views
 from ..conftest import textured_image
