@@ -297,6 +297,13 @@ def _changed_version(earlier: Sidecar) -> tuple[str, ...]:
     return () if earlier.agalign == __version__ else (f"version (agalign {earlier.agalign} before)",)
 
 
+def existing_files(sidecar: Path, result: Sidecar) -> list[FilePart]:
+    """Return the files of a sidecar that exist. A finished capture may lack an index raster, which only `agalign
+    indices` restores.
+    """
+    return [part for part in result.files if outputs_exist(sidecar, [part])]
+
+
 def outputs_exist(sidecar: Path, files: Sequence[FilePart]) -> bool:
     """Return True if a sidecar and files that it lists exist, these with their sizes; checksums would take minutes."""
     try:

@@ -15,6 +15,7 @@ from agalign.batch.capture_task import Task, do_capture, loaded_model, quiet
 from agalign.batch.earlier_results import (
     EarlierResults,
     Remaining,
+    existing_files,
     labels_of_other_inputs,
     outputs_exist,
     refuse_other_captures,
@@ -122,8 +123,7 @@ def _run_selected(run: "_FlightRun", selection: Selection) -> Iterator[CaptureRe
                     record.stage_seconds[stage] += seconds
                 if report.result is not None and report.path is not None:
                     statuses = [status for _, status, _ in report.result.pairs]
-                    # A kept capture may lack an index raster, which only `agalign indices` restores.
-                    here = [part for part in report.result.files if outputs_exist(report.path, [part])]
+                    here = existing_files(report.path, report.result)
                     written[report.label] = report.path, here, report.state, statuses
                 yield report
                 if report.problems and is_full(out):

@@ -44,10 +44,23 @@ def decide(
     `predictions` are those of the rig by band; a predicted band is delivered with a standard error of at most
     `accept_predicted_px`, px of the band.
     """
-    options = [_aligned(bands, relief, predictions or {}) for relief in reliefs if relief.fits_better]
-    if not options:
-        return _aligned(bands, None, predictions or {})
-    return max(options, key=lambda option: sum(a.is_usable(accept_predicted_px) for a in option.values()))
+    predictions = predictions or {}
+    return _aligned(bands, _chosen_relief(bands, reliefs, predictions, accept_predicted_px), predictions)
+
+
+def _chosen_relief(
+    bands: Sequence[BandCandidates],
+    reliefs: Sequence[ReliefCandidates],
+    predictions: Mapping[str, RigPrediction],
+    accept_predicted_px: float,
+) -> ReliefCandidates | None:
+    """The relief of the capture; None if no relief fits half of the bands."""
+    fitting = [relief for relief in reliefs if relief.fits_better]
+
+    def delivered(relief: ReliefCandidates) -> int:
+        return sum(a.is_usable(accept_predicted_px) for a in _aligned(bands, relief, predictions).values())
+
+    return max(fitting, key=delivered) if len(fitting) > 1 else next(iter(fitting), None)
 
 
 def _aligned(

@@ -14,7 +14,7 @@ from pathlib import Path
 from statistics import median
 from typing import TYPE_CHECKING
 
-from agalign.batch.earlier_results import outputs_exist
+from agalign.batch.earlier_results import existing_files, outputs_exist
 from agalign.batch.workers import dask_executor
 from agalign.cameras.discover import FolderScan, discover
 from agalign.cli.exit_codes import ExitCode
@@ -24,10 +24,9 @@ from agalign.config import DiscoverOptions, RunOptions, Settings
 from agalign.errors import InputError, OutputError, SidecarError, WorkerError
 from agalign.flight.groups import camera_overviews
 from agalign.host.text import counted, escape_controls
-from agalign.rasters.product import CapturePaths
 from agalign.records.cautions import RunFacts
 from agalign.records.run_record import read_run_record
-from agalign.records.sidecar import BandResult
+from agalign.records.sidecar import BandResult, FilePart
 from agalign.records.sidecar_file import read_without_tables
 from agalign.report.facts import PairTotals
 from agalign.report.pages import REPORT_FILE, pages_exist, write_pages
@@ -109,8 +108,8 @@ class RunTotals:
     """Number of band pairs of each capture that is to be aligned."""
     states: Counter[str] = field(default_factory=Counter)
     """Number of captures by state."""
-    written: dict[str, str] = field(default_factory=dict)
-    """State of each capture with a result, by label."""
+    written: dict[str, tuple[str, Path, Sequence[FilePart]]] = field(default_factory=dict)
+    """State, sidecar and files of each capture with a result, by label."""
     pairs: PairTotals = field(default_factory=PairTotals)
     """The pairs of captures with a result."""
     has_report: bool = False
@@ -128,25 +127,24 @@ class RunTotals:
             self.removed[reason].append(path)
         if report.state in ("panel", "sky"):
             self.asked.pop(report.label, None)
-        if report.result is None:
+        if report.result is None or report.path is None:
             return
         self.pairs.add(report.label, report.result)
-        self.written[report.label] = report.state
+        self.written[report.label] = report.state, report.path, existing_files(report.path, report.result)
         output = report.result.output
         if output is not None and output.radiometry is not None:
             self.panel_ages_s[output.radiometry].append(output.panel_age_s)
 
-    def recount(self, captures: Sequence[Capture], out: Path) -> None:
-        """Count only captures that have all their files, and the others as errors: outputs may have been removed."""
+    def recount(self) -> None:
+        """Count only captures that still have their files, and the others as errors, as the record of the run does."""
         self.pairs = PairTotals(self.pairs.run)
-        for capture in (one for one in captures if one.label in self.written):
-            path = CapturePaths.of(capture, out).sidecar
+        for label, (state, path, files) in list(self.written.items()):
             with suppress(SidecarError):
-                result = read_without_tables(path)
-                if outputs_exist(path, result.files):
-                    self.pairs.add(capture.label, result)
+                if outputs_exist(path, files):
+                    self.pairs.add(label, read_without_tables(path))
                     continue
-            self.states.subtract([self.written.pop(capture.label)])
+            del self.written[label]
+            self.states.subtract([state])
             self.states["error"] += 1
         self.states = +self.states  # without zeros
 
@@ -190,7 +188,7 @@ def run(
                 raise
             terminal.problem(str(error))
             totals.is_complete = False
-            totals.recount(flight.captures, out)
+            totals.recount()
         finally:
             # Also after an interruption.
             if totals.states:

@@ -265,12 +265,12 @@ def _print_table(names: Sequence[str], reports: "Sequence[IndexReport]", termina
     """Print a row per index: statistics of the medians of its captures."""
     from statistics import median
 
-    from agalign.records.captures import exceptions
+    from agalign.records.captures import differing_from_most
 
     written, rows = [r for r in reports if r.path is not None], []
     for name in names:
         of_index = [r for r in written if r.index == name and math.isfinite(r.median)]
-        differing = dict(exceptions({r.capture: (r.statistics.unit,) for r in of_index}))
+        differing = dict(differing_from_most({r.capture: (r.statistics.unit,) for r in of_index}))
         for label, reason in differing.items():
             terminal.problem(f"{label} {name}: not in the medians of captures: {reason}", capture=label)
         values = [r.median for r in of_index if r.capture not in differing]

@@ -13,7 +13,7 @@ from agalign.pixels.coordinates import ensure_proj_data
 from agalign.pixels.raster import without_warnings
 from agalign.rasters.alignment_maps import RELIEF_UNITS
 from agalign.rasters.band_reader import like_most
-from agalign.records.captures import RunCapture, captures_of_run, exceptions
+from agalign.records.captures import RunCapture, captures_of_run, differing_from_most
 from agalign.records.sidecar import BandResult
 from agalign.records.sidecar_file import read_sidecar
 from agalign.values.arguments import checked
@@ -139,7 +139,7 @@ def _captures_with_output(folder: Path) -> list[RunCapture]:
     captures, left_out = captures_of_run(folder)
     alike, differing = like_most([c for c in captures if c.result.output is not None])
     crops = [(c, c.result.output.crop) for c in alike if c.result.output is not None]
-    if sizes := exceptions({c.label: (f"{crop[2]} x {crop[3]} px",) for c, crop in crops}):
+    if sizes := differing_from_most({c.label: (f"{crop[2]} x {crop[3]} px",) for c, crop in crops}):
         remedy = "align again with --crop none, or each camera into a folder of its own, or use open_capture"
         raise InputError(f"{folder}: its captures differ in size ({'; '.join(map(': '.join, sizes[:3]))}); {remedy}")
     if lines := [f"{label}: left out: {reason}" for label, reason in [*left_out, *differing]]:

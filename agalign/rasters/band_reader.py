@@ -13,7 +13,7 @@ from rasterio.windows import Window
 from agalign.errors import InputError
 from agalign.host.text import shortened
 from agalign.pixels.raster import OpenRaster, innermost_cause, open_raster
-from agalign.records.captures import AlignedBand, LeftOut, RunCapture, exceptions
+from agalign.records.captures import AlignedBand, LeftOut, RunCapture, differing_from_most
 from agalign.values.choices import UNUSABLE_QUALITY
 from agalign.values.image import FloatImage, Tile, reduced_size_px
 
@@ -123,6 +123,6 @@ def like_most(captures: Sequence[RunCapture]) -> tuple[list[RunCapture], LeftOut
             contents[capture.label] = contents_of(capture)
         except InputError as error:
             left_out.append((capture.label, str(error)))
-    left_out += exceptions(contents)
+    left_out += differing_from_most(contents)
     labels = {label for label, _ in left_out}
     return [c for c in captures if c.label not in labels], left_out

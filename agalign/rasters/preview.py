@@ -47,7 +47,7 @@ _RELIEF_PERCENTILES = 1.0, 99.0
 
 def preview_bytes(captures: int) -> int:
     """Return the largest size in bytes of the preview of a capture in a run of this many captures."""
-    # The report of a season, which contains all previews, must be small enough for an e-mail.
+    # Report and previews of a season together must be small enough for an e-mail.
     return min(600_000, 44_000_000 // max(captures, 1))
 
 

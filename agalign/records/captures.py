@@ -50,7 +50,7 @@ def bands_of(sidecar: Sidecar, folder: Path, *, mask_qa: bool = False) -> list[A
         problem = ""
         if part.place is None and part.is_usable(sidecar.accept_predicted_px):
             problem = f"the pixels of {part.band} were not written; run again"
-        elif part.place is None or not part.is_usable(sidecar.accept_predicted_px):
+        elif not part.is_usable(sidecar.accept_predicted_px):
             limit_px, prediction = sidecar.accept_predicted_px, part.prediction
             error = "" if prediction is None else f" to {prediction.std_px:.1f} px, not {limit_px:g}"
             problem = f"{part.band} is {part.status}{error} ({part.reason})"
@@ -90,7 +90,7 @@ def captures_of_run(out: Path) -> tuple[list[RunCapture], LeftOut]:
     return captures, left_out
 
 
-def exceptions(facts: Mapping[str, tuple[str, ...]]) -> LeftOut:
+def differing_from_most(facts: Mapping[str, tuple[str, ...]]) -> LeftOut:
     """Return the captures that differ from most, given the facts about each by label, and how they differ."""
     usual, count = max(Counter(facts.values()).items(), key=lambda item: item[1], default=((), 0))
     most = f"{count} of {len(facts)} captures have"

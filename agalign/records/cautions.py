@@ -21,7 +21,7 @@ from agalign.values.issues import MISSING_BAND, MOSAICS, OF_FILES, TEXTURELESS, 
 
 MAX_PIXEL_ERROR_PX = 1.0
 """Beyond it, a spectral index mixes neighbouring plants."""
-_MIN_SHARE_OVER_1_PX = 0.01
+MIN_SHARE_OVER_1_PX = 0.01
 """Share of the pixels of a band that may be off by more; smaller shares are at its edges."""
 _MIN_OFF_STD = 3.0
 """Distance from the prediction relative to its standard error: normal errors are larger in 1 % of the bands."""
@@ -207,7 +207,7 @@ def _of_alignment(band: BandResult, sidecar: Sidecar) -> Iterator[Caution]:
             way = "after" if band.exposed_after_s > 0 else "before"
             reason = f"exposed {abs(band.exposed_after_s):.0f} s {way} the reference; {reason}"
         yield Caution(band.band, band.status, remedy, reason, lost, size, size_text)
-    elif over_1_px > _MIN_SHARE_OVER_1_PX:
+    elif over_1_px > MIN_SHARE_OVER_1_PX:
         reason = f"{over_1_px:.0%} of the pixels may be off by more than {MAX_PIXEL_ERROR_PX:g} px"
         yield Caution(band.band, "check", _INACCURATE, reason, over_1_px, over_1_px, "up to {:.0%} of a band")
     prediction = band.prediction

@@ -455,9 +455,9 @@ class FilePart(_Part):
 
 
 class ReliefPreviewPart(_Part):
-    """Picture of the parallax: first column, last row."""
+    """Picture of the parallax: first column, below the expected errors."""
 
-    parallax_px: tuple[Annotated[Number, Field()], Number]
+    parallax_px: tuple[Number, Number]
     """Parallax shown as black and as white (nearest), px."""
     range_m: tuple[Number3, Number3] | None
     """1st and 99th percentile of the range, m; null if unknown."""
@@ -471,9 +471,9 @@ class PreviewPart(_Part):
     file: RelativeFile
     """Path."""
     tile_px: tuple[Count, Count]
-    """Width and height of picture and detail."""
+    """Width and height of a picture."""
     detail_px: tuple[Count, Count]
-    """Width and height of picture and detail."""
+    """Width and height of a detail."""
     detail: tuple[Number, Number, Number, Number]
     """x0, y0, width, height of the detail, as shares of the image."""
     error_full_px: Number | None = None
@@ -608,6 +608,12 @@ class Sidecar(_Part):
         moving = [(b.band, str(b.status), b.reason) for b in self.bands if b.status != "reference"]
         unreadable = self.unreadable_bands
         return [*moving, *((name, "missing", unreadable.get(name, MISSING_BAND.cause)) for name in self.missing_bands)]
+
+    def largest_residual(self, measure: Literal["residual_px", "residual_p95_px"]) -> float | None:
+        """Return the largest residual of the aligned bands, px of the reference; None if no window measures one."""
+        measured = (b.metrics.after for b in self.bands if b.status == "aligned" and b.metrics is not None)
+        known_px = (px for after in measured if math.isfinite(px := getattr(after, measure)))
+        return max(known_px, default=None)
 
     @property
     def files(self) -> list[FilePart]:

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agalign.host.text import escape_controls
-from agalign.records.cautions import NO_RESULT, Caution, RunFacts
+from agalign.records.cautions import MIN_SHARE_OVER_1_PX, NO_RESULT, Caution, RunFacts
 from agalign.records.excluded import PanelPart, SkyPart
 from agalign.records.sidecar import BandResult, GeometryPart, GridPart, OutputPart, Sidecar
 from agalign.report.page_data import DataParts
@@ -305,6 +305,7 @@ class FlightFacts:
         return {
             "captures": self.statuses.total(),
             "shift_step_px": _SHIFT_STEP_PX,
+            "min_share_over_1_px": MIN_SHARE_OVER_1_PX,
             "rows": self._rows.first,
             "details": self._details.first,
             "details_per_part": _DETAILS_PER_PART,
@@ -376,7 +377,7 @@ def _of_capture(folder: Path, label: str, sidecar: Sidecar) -> dict[str, Any]:
         "shown": "ok_by_prediction" if is_by_prediction(sidecar) else sidecar.status,
         "position": None if position is None else (position.latitude, position.longitude),
         "altitude_m": None if position is None else position.altitude_m,
-        "missing": sidecar.missing_bands,
+        "missing": [(name, reason) for name, status, reason in sidecar.pairs if status == "missing"],
         "reference": sidecar.reference.band,
         "seconds": sidecar.seconds,
         "accept_predicted_px": sidecar.accept_predicted_px,
@@ -388,6 +389,7 @@ def _of_capture(folder: Path, label: str, sidecar: Sidecar) -> dict[str, Any]:
         "sidecar": _link(folder, f"{sidecar.capture}.json"),
         "picture": _link(folder, files.get("picture")),
         "preview": _preview(sidecar, folder),
+        "residual_px": rounded(sidecar.largest_residual("residual_px")),
         "error_px": rounded(largest_error_px(sidecar)),
     }
 
@@ -395,11 +397,10 @@ def _of_capture(folder: Path, label: str, sidecar: Sidecar) -> dict[str, Any]:
 def _map_row(facts: dict[str, Any]) -> dict[str, Any]:
     """The row of a capture in the table of the page, and its dot on the map."""
     moving = [b for b in facts["bands"] if b["status"] != "reference"]
-    aligned = [b for b in moving if b["status"] == "aligned"]
     same = "label", "captured_at", "camera", "status", "shown", "position", "altitude_m", "missing", "seconds", "stack"
     return {name: facts[name] for name in (*same, "error_px")} | {
         "bands": [(b["band"], b["status"]) for b in moving],
-        "residual_px": max((b["residual_px"] for b in aligned if b["residual_px"] is not None), default=None),
+        "residual_px": facts["residual_px"],
         "indices": {i["name"]: i["median"] for i in facts["indices"]},
         "raw": any(i["raw"] for i in facts["indices"]),
         "check": bool(facts["missing"] or facts["unwritten"]) or any(b["check"] or b["reason"] for b in facts["bands"]),

@@ -4,7 +4,6 @@ It is a view of the sidecars, and of the captures in the record of the run that 
 """
 
 import json
-import math
 from collections import defaultdict
 from collections.abc import Iterable
 from itertools import pairwise
@@ -17,6 +16,7 @@ from numpy.typing import NDArray
 from agalign.host.files import write_text
 from agalign.records.run_record import ExclusionPart
 from agalign.records.sidecar import Sidecar
+from agalign.report.summary_csv import rounded
 from agalign.spectral_indices.rasters import IndexReport
 from agalign.values.capture import CameraIdentity, Pose, Position
 
@@ -38,7 +38,6 @@ class FlightMap:
         path = Path(folder)
         label = (path / sidecar.capture).as_posix()
         bands = [b for b in sidecar.bands if b.status != "reference"]
-        after = [b.metrics.after for b in bands if b.metrics is not None]
         files = [(part.kind, (path / part.file).as_posix()) for part in sidecar.products]
         facts = _place(sidecar.camera, sidecar.captured_at, sidecar.position, sidecar.pose)
         self._features[label] = _feature(
@@ -51,9 +50,9 @@ class FlightMap:
                 "bands": len(bands),
                 "bands_aligned": sum(b.status == "aligned" for b in bands),
                 "bands_predicted": sum(b.status == "predicted" for b in bands),
-                # The largest of a band, px of the reference.
-                "residual_px": _largest([a.residual_px for a in after]),
-                "residual_p95_px": _largest([a.residual_p95_px for a in after]),
+                # Of the worst aligned band, px of the reference.
+                "residual_px": rounded(sidecar.largest_residual("residual_px")),
+                "residual_p95_px": rounded(sidecar.largest_residual("residual_p95_px")),
                 # Files are relative to the output folder.
                 "sidecar": f"{label}.json",
                 "stack": dict(files).get("stack"),
@@ -89,10 +88,6 @@ class FlightMap:
         text = f'{{"type": "FeatureCollection", "name": "flight", "features": [\n{lines}\n]}}\n'
         write_text(out / FLIGHT_MAP_FILE, text)
         return out / FLIGHT_MAP_FILE
-
-
-def _largest(values: Iterable[float]) -> float | None:
-    return max((round(value, 4) for value in values if math.isfinite(value)), default=None)
 
 
 def _feature(label: str, shape: dict[str, Any] | None, properties: dict[str, Any]) -> dict[str, Any]:

@@ -24,13 +24,13 @@
  *   indices: string[]}} Preview
  * @typedef {{label: string, captured_at: string, camera: string, status: string, shown: string, position: [number, number] | null,
  *   accept_predicted_px: number,
- *   radiometry: string | null, altitude_m: number | null, missing: string[], reference: string, seconds: number,
+ *   radiometry: string | null, altitude_m: number | null, missing: [string, string][], reference: string, seconds: number,
  *   crop: [number, number, number, number], scale: [number, number], stack: string | null, sidecar: string,
  *   relief: string | null,
  *   picture: string | null, preview: Preview | null, bands: Pair[], indices: Index[],
  *   unwritten: [string, string][]}} Capture `shown` is its status, or "ok_by_prediction"; `unwritten` has index and reason.
  * @typedef {{label: string, captured_at: string, camera: string, status: string, shown: string, position: [number, number] | null,
- *   altitude_m: number | null, missing: string[], seconds: number, stack: string | null, bands: [string, string][],
+ *   altitude_m: number | null, missing: [string, string][], seconds: number, stack: string | null, bands: [string, string][],
  *   residual_px: number | null, error_px: number | null, indices: Record<string, number | null>, raw: boolean,
  *   check: boolean}} Row
  *   The row of a capture in the table, with name and status of each moving band, the largest residual of
@@ -38,7 +38,7 @@
  * @typedef {{from: number, records: Row[]}} Rows
  * @typedef {{from: number, records: Capture[], first_lattice: number, lattices: number[][]}} Details
  *   `from` is the number of captures before the part, `first_lattice` the number of lattices.
- * @typedef {{captures: number, shift_step_px: number, rows: Rows | null, details: Details | null, details_per_part: number,
+ * @typedef {{captures: number, shift_step_px: number, min_share_over_1_px: number, rows: Rows | null, details: Details | null, details_per_part: number,
  *   row_files: string[], detail_files: string[]}} FlightFacts The first part of rows and details, and the files of others.
  * @typedef {{column: number, colour: string}} Channel
  * @typedef {"before" | "after"} When
@@ -267,7 +267,7 @@ function bandBadge(pair) {
 function chips(row) {
   const line = el("span");
   for (const [name, status] of row.bands) line.append(el("span", { class: `chip ${status}`, title: `${name}: ${inWords(status)}` }, name), " ");
-  for (const name of row.missing) line.append(el("span", { class: "chip missing", title: `${name}: missing` }, name), " ");
+  for (const [name, reason] of row.missing) line.append(el("span", { class: "chip missing", title: `${name}: ${reason}` }, name), " ");
   return line;
 }
 
@@ -1084,7 +1084,7 @@ function edges(places) {
 }
 
 /**
- * The relief in its colours, in the last row of the sheet; null where there is none.
+ * The relief in its colours; null where there is none.
  * @param {Capture} capture
  */
 function relief(capture) {
@@ -1204,11 +1204,9 @@ function words(capture) {
   const list = el("ul", { class: "words" });
   for (const pair of moving(capture)) list.append(el("li", {}, el("b", {}, pair.band), ` ${sentence(pair, capture)}`));
   for (const band of capture.bands.filter((b) => b.check.length)) list.append(el("li", {}, "Check ", el("b", {}, band.band), `: ${band.check.join("; ")}.`));
-  for (const name of capture.missing) list.append(el("li", {}, el("b", {}, name), " is missing: this camera records it."));
+  for (const [name, reason] of capture.missing) list.append(el("li", {}, el("b", {}, name), `: ${reason}.`));
   return list;
 }
-
-const MIN_OVER_1_PX = 0.005; // smaller shares are at the edges
 
 /**
  * What became of a band, for the user of the map.
@@ -1216,7 +1214,7 @@ const MIN_OVER_1_PX = 0.005; // smaller shares are at the edges
  */
 function sentence(pair, capture) {
   const offset = pair.offset_length_px === null || pair.offset_length_px < 0.05 ? "" : `had an offset of ${fixed(pair.offset_length_px, pair.offset_length_px < 10 ? 1 : 0)} px from ${capture.reference} and `;
-  const over = pair.over_1_px === null || pair.over_1_px < MIN_OVER_1_PX ? "" : ` ${percent(pair.over_1_px)} of its pixels may be off by more than 1 px.`;
+  const over = pair.over_1_px === null || pair.over_1_px <= facts.min_share_over_1_px ? "" : ` ${percent(pair.over_1_px)} of its pixels may be off by more than 1 px.`;
   if (pair.status === "aligned") {
     const left = pair.residual_px;
     if (left === null) return `${offset}is aligned; no window could measure a residual.`;

@@ -15,7 +15,7 @@ from synthetic_flights.aligned import make_aligned
 import agalign
 from agalign.exports.programs import export
 from agalign.rasters.geotiff import to_cog
-from agalign.records.captures import exceptions
+from agalign.records.captures import differing_from_most
 from agalign.records.sidecar_file import find_sidecars
 
 from ..conftest import Shared, read_json
@@ -76,7 +76,7 @@ def test_the_exception_is_what_differs_from_most(run: Path, tmp_path: Path) -> N
         flight = agalign.open_flight(out)
     assert f"{FIRST}.tif: does not exist" in str(warned[0].message)
     assert (flight.sizes["capture"], "NIR" in flight) == (7, True)
-    assert exceptions({}) == []
+    assert differing_from_most({}) == []
 
 
 def test_a_killed_export_does_not_block_its_repeat(run: Path, tmp_path: Path) -> None:

@@ -115,7 +115,8 @@ def test_headline_and_summary_count_what_was_to_be_aligned(out: Path) -> None:
     change(record, state="running")
     assert f"The run did not end: it was killed, or is still running; {without}" in headline(out)
     change(record, state="finished", labels=labels[:2])
-    change(sidecar, status="degraded", missing_bands=["Thermal", "Pan"])
+    cause = "its file cannot be read"
+    change(sidecar, status="degraded", missing_bands=["Thermal", "Pan"], unreadable_bands={"Thermal": cause})
     assert headline(out).startswith("8 of 10 band pairs are aligned; indices cannot use the rest (2 missing). Expected")
     rows = table_in(out / "summary.csv")
     assert [r["status"] for r in rows] == ["aligned"] * 8 + ["missing"] * 2
@@ -123,7 +124,10 @@ def test_headline_and_summary_count_what_was_to_be_aligned(out: Path) -> None:
     assert [(r["folder"], r["capture"], r["band"]) for r in rows[8:]] == [
         ("0000SET/000", "IMG_0002", name) for name in ("Thermal", "Pan")
     ]
+    assert rows[-2]["reason"] == cause
     assert "a band of this camera is missing" in rows[-1]["reason"]
+    record = facts_of(out)["details"]["records"][1]
+    assert record["missing"] == [["Thermal", cause], ["Pan", rows[-1]["reason"]]]
 
 
 def with_band(bands: list[dict[str, Any]], name: str, **facts: Any) -> list[dict[str, Any]]:
