@@ -49,9 +49,8 @@ def is_same(earlier: Sidecar, capture: Capture) -> bool | None:
     contents of a file must be equal; others may have been repaired.
     """
     one, other = earlier.camera, capture.camera
-    serials = [set(camera.serial.split("+")) - {""} for camera in (one, other)]
     pairs = (one.make, other.make), (one.model, other.model), (earlier.capture_id, capture.capture_id)
-    if any(a and b and a != b for a, b in pairs) or (all(serials) and not serials[0] & serials[1]):
+    if any(a and b and a != b for a, b in pairs) or (one.serials and other.serials and not one.serials & other.serials):
         return False
     if earlier.captured_at and capture.captured_at and earlier.captured_at != capture.captured_at:
         before, now = CaptureTime.of(earlier.captured_at), CaptureTime.of(capture.captured_at)

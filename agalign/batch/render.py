@@ -40,13 +40,7 @@ from agalign.values.alignment import Alignment
 from agalign.values.capture import Capture
 from agalign.values.image import OutputGrid
 
-_ADDED = {
-    "pan_sharpen": "pan_sharpened",
-    "error_map": "error_map",
-    "qa": "qa",
-    "tie_points": "tie_points",
-    "relief_map": "relief",
-}
+_ADDED = {product.option: product.kind for product in PRODUCTS if product.option} | {"relief_map": "relief"}
 """Settings that add files or layers, and the kind of product that shows that these exist."""
 _FOOTPRINT_DECIMALS = 7
 """Of degrees: a centimetre."""

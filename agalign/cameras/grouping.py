@@ -35,8 +35,6 @@ _MAX_HALVES_APART = timedelta(seconds=1)
 """Between the exposures of a dual camera, which are simultaneous; an id may occur again in another flight."""
 _BEFORE_SUFFIX = "-.~@+_"
 """Characters before what synchronisation and users add to the names of copies, besides spaces and brackets."""
-_SERIAL_SEPARATOR = "+"
-"""Between the serial numbers of the two halves of a dual camera."""
 
 
 def without_copies(files: Sequence[ImageFile]) -> tuple[list[ImageFile], list[Problem]]:
@@ -361,7 +359,7 @@ def capture_of(files: Sequence[ImageFile], folder: Path, options: DiscoverOption
         folder=own_folder.relative_to(folder) if own_folder.is_relative_to(folder) else Path(),
         bands=tuple(bands),
         reference_index=next(i for i, b in enumerate(bands) if b is reference),
-        camera=CameraIdentity(tags.make, tags.model, _SERIAL_SEPARATOR.join(serials)),
+        camera=CameraIdentity.of(tags.make, tags.model, serials),
         capture_id=shortened(tags.first_text(camera.capture_ids)),
         flight_id=shortened(tags.first_text(camera.flight_ids)),
         captured_at=camera.captured_at(tags),
@@ -428,14 +426,14 @@ def with_missing_bands(captures: Sequence[Capture]) -> list[Capture]:
     for capture, camera in zip(captures, cameras, strict=True):
         members[camera].append(capture)
     bands = {camera: _camera_bands([c for c in some if c.has_several_files]) for camera, some in members.items()}
-    serials = {camera: {c.camera.serial for c in of_camera} for camera, of_camera in members.items()}
+    identities = {camera: {c.camera for c in of_camera} for camera, of_camera in members.items()}
     result = []
     for capture, camera in zip(captures, cameras, strict=True):
         own = {band_key(b.name) for b in capture.bands}
         of_camera = bands[camera] if capture.has_several_files else ()
         of_flight = [b.name for b in of_camera if band_key(b.name) not in own]
         missing = tuple({band_key(name): name for name in (*capture.missing_bands, *of_flight)}.values())
-        identity = replace(capture.camera, serial=_complete_serial(capture.camera.serial, serials[camera]))
+        identity = _complete(capture.camera, identities[camera])
         result.append(replace(capture, missing_bands=missing, camera_bands=of_camera, camera=identity))
     return result
 
@@ -511,31 +509,28 @@ def _cameras(captures: Sequence[Capture]) -> list[_CameraKey]:
     capture without files of one half has one of them. A capture without a serial number belongs to the only camera of
     its model.
     """
-    cameras: dict[tuple[str, str], list[set[str]]] = defaultdict(list)
+    cameras: dict[tuple[str, str], list[frozenset[str]]] = defaultdict(list)
     for capture in captures:
-        own = _serials(capture.camera)
+        own = capture.camera.serials
         same_model = cameras[capture.camera.make, capture.camera.model]
         sharing = [known for known in same_model if known & own]
         if own:
             same_model[:] = [known for known in same_model if not known & own] + [own.union(*sharing)]
     keys: list[_CameraKey] = []
     for capture in captures:
-        make, model, own = capture.camera.make, capture.camera.model, _serials(capture.camera)
+        make, model, own = capture.camera.make, capture.camera.model, capture.camera.serials
         same_model = cameras[make, model]
         known = [serials for serials in same_model if serials & own or (not own and len(same_model) == 1)]
         keys.append((make, model, *sorted(known[0] if known else own)) if model else (capture.folder.as_posix(),))
     return keys
 
 
-def _serials(camera: CameraIdentity) -> set[str]:
-    return set(camera.serial.split(_SERIAL_SEPARATOR)) - {""}
-
-
-def _complete_serial(serial: str, of_camera: set[str]) -> str:
-    """The only one of a camera's texts that has the numbers in `serial` and more; `serial` if there is none."""
-    own = set(serial.split(_SERIAL_SEPARATOR))
-    larger = [text for text in of_camera if own < set(text.split(_SERIAL_SEPARATOR))]
-    return larger[0] if len(larger) == 1 else serial
+def _complete(camera: CameraIdentity, same: set[CameraIdentity]) -> CameraIdentity:
+    """The camera with the serial numbers of both halves, if a capture has one of them, and the others of the camera
+    have the same pair.
+    """
+    larger = {one.serial for one in same if camera.serials and camera.serials < one.serials}
+    return replace(camera, serial=larger.pop()) if len(larger) == 1 else camera
 
 
 def with_unique_band_names(bands: Sequence[Band]) -> list[Band]:

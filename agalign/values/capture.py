@@ -1,7 +1,7 @@
 """Captures and their bands, with the metadata from the tags of the files."""
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
@@ -309,10 +309,20 @@ class CameraIdentity:
     serial: Name = ""
     """Serial numbers, joined by `+`."""
 
+    @classmethod
+    def of(cls, make: str, model: str, serials: Iterable[str]) -> "CameraIdentity":
+        """Return the camera with these serial numbers."""
+        return cls(make, model, "+".join(serials))
+
     @property
     def name(self) -> str:
         """Manufacturer and model; empty if both are unknown."""
         return f"{self.make} {self.model}".strip()
+
+    @property
+    def serials(self) -> frozenset[str]:
+        """The serial numbers: two of a dual camera."""
+        return frozenset(self.serial.split("+")) - {""}
 
 
 @dataclass(frozen=True)
