@@ -1,7 +1,11 @@
 #!/usr/bin/env bash
-# Many flights on a SLURM cluster: a task for each folder below FLIGHTS, results below OUT.
+# Many flights on a SLURM cluster: a task for each folder below FLIGHTS. OUT gets a folder of the same name for each, and
+# incomplete.txt, which lists the flights with exit code 3. OPTIONS replaces the options '--radiometry auto --qa'.
 #
+#     export FLIGHTS=season OUT=aligned
 #     sbatch --array=1-"$(ls -d "$FLIGHTS"/*/ | wc -l)" examples/slurm.sh
+#
+# A task that SLURM kills leaves no lock: submit it again, and it resumes.
 #
 #SBATCH --cpus-per-task=4
 #SBATCH --mem=12G
@@ -13,7 +17,8 @@ set -uo pipefail
 trap : TERM  # at the time limit, SLURM signals this script too: wait for agalign, and requeue
 flight=$(ls -d "$FLIGHTS"/*/ | sed -n "${SLURM_ARRAY_TASK_ID:?start it with sbatch --array}p")
 name=$(basename "$flight")
-agalign "$flight" -o "$OUT/$name" --jobs "${SLURM_CPUS_PER_TASK:-1}" --radiometry auto --qa
+# shellcheck disable=SC2086  # OPTIONS are several words
+agalign "$flight" -o "$OUT/$name" --jobs "${SLURM_CPUS_PER_TASK:-1}" ${OPTIONS:---radiometry auto --qa}
 code=$?
 case $code in 0 | 3) agalign indices "$OUT/$name" --index ndvi --mask-qa ;; esac
 

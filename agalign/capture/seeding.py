@@ -60,10 +60,10 @@ def find_seed(pair: BandPair, settings: SeedSettings, model: FlightModel | None 
     has_scale = bool(pair.seed_matrices.keys() & {"rig", "centre", "geo", "model", "user"})
     if not best.trusted and not has_scale:
         best = max((best, *_at_other_scales(pair)), key=lambda seed: seed.score)
-    return _best_match(pair, model, best)
+    return _best_match(pair, best)
 
 
-def _best_match(pair: BandPair, model: FlightModel | None, best: Seed) -> Seed:
+def _best_match(pair: BandPair, best: Seed) -> Seed:
     """Return a match with a smaller residual than the best seed, or that seed.
 
     No match is needed if images, tags and windows confirm the seed. If tags and windows confirm it, a match also needs
@@ -75,7 +75,7 @@ def _best_match(pair: BandPair, model: FlightModel | None, best: Seed) -> Seed:
     is_confirmed = pair.is_expected(best.fixed_to_moving) and seed_fits(given.residual)
     if best.trusted and is_confirmed:
         return best
-    for mapping in _matches(pair, model, by_learned_descriptors=not best.trusted):
+    for mapping in _matches(pair):
         for match in _with_corrected(pair, mapping):
             if not seed_fits(match.residual) or not match.is_better_than(given):
                 continue
@@ -120,7 +120,7 @@ def find_rotated(given: WarpedPair) -> Matrix | None:
     pair = given.pair
     if seed_fits(given.residual):
         return None
-    for result in _matches(pair, None, by_learned_descriptors=False):
+    for result in _matches(pair):
         match = WarpedPair.of(pair, pair.mapping(result))
         change = geometry.compose(geometry.invert(given.mapping.fixed_to_moving), result)
         is_moved = _is_rotated_or_scaled(change, pair.fixed.size_px)
@@ -139,17 +139,12 @@ def _is_rotated_or_scaled(matrix: Matrix, size_px: tuple[int, int]) -> bool:
     return bool(abs(angle) > max_rotation_degrees or abs(scale - 1) > max_scale_change)
 
 
-def _matches(pair: BandPair, model: FlightModel | None, *, by_learned_descriptors: bool) -> Iterator[Matrix]:
-    """Yield mappings from landmarks, then from learned descriptors; any rotation, scale and shift is possible."""
+def _matches(pair: BandPair) -> Iterator[Matrix]:
+    """Yield mappings from landmarks; any rotation, scale and shift is possible."""
     for source in LANDMARK_INPUTS:
         fixed = pair.reference.landmarks(source).undistorted(pair.fixed.lens)
         moving = landmarks(pair.moving, source).undistorted(pair.moving.lens)
         result = matched_homography(fixed, moving, pair.fixed.size_px)
-        if result is not None:
-            yield result
-    if by_learned_descriptors:
-        max_keypoints = 1000  # limits the time
-        result = match_seed(_network(pair, model), pair.fixed, pair.moving, max_keypoints)
         if result is not None:
             yield result
 

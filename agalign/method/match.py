@@ -22,7 +22,7 @@ from agalign.values.choices import Sharing
 from agalign.values.geometry import Matrix
 from agalign.values.image import Raster
 
-MAX_KEYPOINTS = 2000
+_MAX_KEYPOINTS = 2000
 """Default number of keypoints per image; matching takes time proportional to its square."""
 
 
@@ -31,7 +31,7 @@ def to_8_bit(raster: Raster) -> NDArray[np.uint8]:
     return eight_bit(luma(raster.pixels), raster.valid)
 
 
-def sift_keypoints(raster: Raster, maximum: int = MAX_KEYPOINTS) -> Keypoints:
+def sift_keypoints(raster: Raster, maximum: int = _MAX_KEYPOINTS) -> Keypoints:
     """Return the `maximum` strongest SIFT keypoints of an image, raw px."""
     detected = cv2.SIFT.create(nfeatures=maximum).detect(to_8_bit(raster), raster.valid.astype(np.uint8))
     strongest = sorted(detected, key=lambda k: -k.response)[:maximum]
@@ -77,14 +77,14 @@ def starter_for_matching(channels: tuple[int, int]) -> Descriptor:
 
 
 @torch.no_grad()
-def match_seed(net: Descriptor, fixed: Raster, moving: Raster, maximum: int = MAX_KEYPOINTS) -> Matrix | None:
-    """Return fixed_to_moving (3, 3) between undistorted px from at most `maximum` keypoints per image.
+def match_seed(net: Descriptor, fixed: Raster, moving: Raster) -> Matrix | None:
+    """Return fixed_to_moving (3, 3) between undistorted px from at most _MAX_KEYPOINTS keypoints per image.
 
     `net` is a `matching_network`. Mutual nearest descriptors, then a robust homography: None if it has fewer than
     _MIN_MATCHES inliers.
     """
     device = next(net.parameters()).device
-    (image, keypoints), (image_prime, keypoints_prime) = (_keypoints(r, device, maximum) for r in (fixed, moving))
+    (image, keypoints), (image_prime, keypoints_prime) = (_keypoints(r, device) for r in (fixed, moving))
     if min(len(keypoints), len(keypoints_prime)) < _MIN_MATCHES:
         return None
     f = image.describe(net, keypoints)
@@ -106,11 +106,11 @@ def match_seed(net: Descriptor, fixed: Raster, moving: Raster, maximum: int = MA
         return None
 
 
-def _keypoints(raster: Raster, device: torch.device, maximum: int) -> tuple[LevelImage, Keypoints]:
+def _keypoints(raster: Raster, device: torch.device) -> tuple[LevelImage, Keypoints]:
     """Return the image at the resolution of matching and its keypoints, undistorted px of that resolution."""
     scale = min(1.0, _LONGEST_SIDE_PX / max(raster.size_px))
     image = make_level_image(raster, scale, device)
-    raw = sift_keypoints(shrink(raster, image.size_px), maximum)
+    raw = sift_keypoints(shrink(raster, image.size_px))
     xy = torch.from_numpy(lens.undistort(image.lens, raw.xy.numpy()).astype(np.float32))
     undistorted = Keypoints(xy, raw.angle, raw.scale).to(device)
     rows = (image.clearance_at(undistorted.xy) > footprint_radius(undistorted.scale)).nonzero()[:, 0]

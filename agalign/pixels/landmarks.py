@@ -49,9 +49,7 @@ class Landmarks:
         return Landmarks(lens.undistort(model, self.xy), self.descriptors)
 
 
-def landmarks(
-    raster: Raster, view: LandmarkInput, max_keypoints: int = _MAX_KEYPOINTS, longest_side_px: int = _LONGEST_SIDE_PX
-) -> Landmarks:
+def landmarks(raster: Raster, view: LandmarkInput, longest_side_px: int = _LONGEST_SIDE_PX) -> Landmarks:
     """Detect the strongest landmarks in the mean of an image's channels; larger images are reduced."""
     width, height = raster.size_px
     scale = min(1.0, longest_side_px / max(width, height))
@@ -62,7 +60,7 @@ def landmarks(
         image = np.sqrt(gradient_magnitude(*(cv2.Sobel(smooth, cv2.CV_32F, *order) for order in ((1, 0), (0, 1)))))
         without_edges = np.ones((7, 7), np.uint8)  # of invalid areas, in the smoothed gradient
         valid = cv2.erode(valid.astype(np.uint8), without_edges, borderValue=1) > 0
-    sift = cv2.SIFT.create(nfeatures=max_keypoints)
+    sift = cv2.SIFT.create(nfeatures=_MAX_KEYPOINTS)
     keypoints, descriptors = sift.detectAndCompute(eight_bit(image, valid), valid.view("u1"))
     if descriptors is None:
         return Landmarks(np.empty((0, 2)), np.empty((0, 128), np.float32))

@@ -177,7 +177,7 @@ def test_a_match_with_a_lower_peak_does_not_replace_a_seed_that_the_tags_and_win
     image = texture()
     pair = pair_of(image, image, {"rig": np.eye(3)}, **({"rig": 5.0} if is_confirmed else {}))
     turned = geometry.compose(geometry.translation(40.0, 310.0), np.array([[0.0, 1, 0], [-1, 0, 0], [0, 0, 1]]))
-    monkeypatch.setattr(seeding, "_matches", lambda *_, **__: iter([turned]))
+    monkeypatch.setattr(seeding, "_matches", lambda _: iter([turned]))
     seed = Seed("structure", np.eye(3), 33.0, 33.0, 25.0)
 
     def measured(pair: BandPair, mapping: PixelMapping, windows: FixedWindows | None = None) -> WarpedPair:
@@ -186,7 +186,7 @@ def test_a_match_with_a_lower_peak_does_not_replace_a_seed_that_the_tags_and_win
         return WarpedPair(pair, mapping, image, windows, residual_of(windows.centres_px, np.array([shift_px, 0.0])))
 
     monkeypatch.setattr(WarpedPair, "of", measured)
-    chosen = seeding._best_match(pair, None, seed)
+    chosen = seeding._best_match(pair, seed)
     assert (chosen is seed) == is_confirmed
 
 
@@ -195,7 +195,7 @@ def test_an_inaccurate_match_is_corrected_by_windows(monkeypatch: pytest.MonkeyP
     image, to_rotated = rotated(moving, 45)
     truth = geometry.compose(to_rotated, SHIFTED)
     off = geometry.compose(truth, geometry.moving_corners([3.0, -2.0, -2.0, 2.0, 3.0, 2.0, -2.0, -3.0], 400, 320))
-    monkeypatch.setattr("agalign.capture.seeding._matches", lambda *_, **__: iter([off]))
+    monkeypatch.setattr("agalign.capture.seeding._matches", lambda _: iter([off]))
     seed = find_seed(pair_of(fixed, image), SeedSettings())
     assert mean_error_px(off, truth, 400, 320) > 1.0
     assert mean_error_px(seed.fixed_to_moving, truth, 400, 320) < 0.5
