@@ -32,7 +32,13 @@ from agalign.pixels.raster import read_tile
 from agalign.rasters.product import CapturePaths
 from agalign.records.run_record import NotInInputPart, RunPart
 from agalign.records.sidecar import FilePart, Sidecar, capture_status
-from agalign.records.sidecar_file import find_sidecars, label_of, read_with_change, read_without_tables
+from agalign.records.sidecar_file import (
+    OtherSchemaError,
+    find_sidecars,
+    label_of,
+    read_with_change,
+    read_without_tables,
+)
 from agalign.values.capture import Band, Capture, CaptureTime
 from agalign.values.image import Tile
 from agalign.values.resampling import tiles
@@ -96,8 +102,9 @@ class EarlierResults:
 def refuse_other_captures(
     captures: Sequence[Capture], out: Path, results: EarlierResults | None = None, *, is_same_input: bool = False
 ) -> None:
-    """Raise ConfigurationError if the place of a capture has the result of another one, or if another place has its
-    result, as of a run on the folder above. With the input folder of the last run, the images were moved in it instead.
+    """Raise ConfigurationError if the place of a capture has the result of another one or of a version with another
+    schema, or if another place has its result, as of a run on the folder above. With the input folder of the last run,
+    the images were moved in it instead.
     """
     results = results or EarlierResults()
     places = {CapturePaths.of(c, out).sidecar: c for c in captures}
@@ -106,15 +113,19 @@ def refuse_other_captures(
         by_name.setdefault(capture.name, []).append(capture)
     elsewhere = [] if is_same_input else [p for p in out.rglob("*.json") if p.stem in by_name and p not in places]
     for path, here in chain(places.items(), ((p, c) for p in elsewhere for c in by_name[p.stem])):
-        with suppress(SidecarError):
+        try:
             earlier, _ = results(path)
-            if is_same(earlier, here) is not (path not in places):
-                continue
-            facts = f"({_described(earlier)}; here {_described(here)})"
-            what = f"belongs to a different capture from {here.label} here {facts}"
-            if path not in places:
-                what = f"is of the same capture as {here.label} here, by a run on a folder above or below the one here"
-            raise ConfigurationError(f"{path}: {what}; choose another output folder with -o")
+        except OtherSchemaError as error:
+            raise ConfigurationError(str(error)) from None
+        except SidecarError:
+            continue
+        if is_same(earlier, here) is not (path not in places):
+            continue
+        facts = f"({_described(earlier)}; here {_described(here)})"
+        what = f"belongs to a different capture from {here.label} here {facts}"
+        if path not in places:
+            what = f"is of the same capture as {here.label} here, by a run on a folder above or below the one here"
+        raise ConfigurationError(f"{path}: {what}; choose another output folder with -o")
 
 
 def _described(capture: Capture | Sidecar) -> str:

@@ -73,7 +73,7 @@ class Listener:
     """A capture that this process aligns, then as `PairProgress`."""
     on_learning: Callable[[str, float], None] = quiet
     """Camera of the network that is being learned, and the share that is done."""
-    on_learnt: Callable[[str, float], None] = quiet
+    on_learned: Callable[[str, float], None] = quiet
     """Camera of the network that was learned, and the seconds that it took."""
     on_again: Callable[[str], object] = quiet
     """How many finished captures are estimated or rendered again, and why; called before any is replaced."""
@@ -377,7 +377,7 @@ class _FlightRun:
         model = learn(captures, settings, lambda _stage, share: self.listener.on_learning(path.stem, share), start)
         seconds = time.monotonic() - began
         record.stage_seconds["learning a flight"] += seconds
-        self.listener.on_learnt(path.stem, seconds)
+        self.listener.on_learned(path.stem, seconds)
         if model is None:
             return None
         with written_below(self.out):

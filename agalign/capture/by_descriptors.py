@@ -14,7 +14,8 @@ from agalign.verify.checks import BY_PARALLAX, is_unchanged
 
 
 def by_descriptors(band: RefinedBand, by_halves: tuple[Matrix, Matrix] | None, use: ReliefUse) -> Iterator[Candidate]:
-    """Yield the homography of a band, then the same with a displacement field.
+    """Yield the homography of a band, then the same with a displacement field, or with the p95 of both if the field is
+    rejected.
 
     `by_halves` are the homographies from each half of the windows (`WarpedPair.cross_validated`). A field is fitted if
     parallax may cause all issues of the homography, or if there are none and no rig contains the distortion of the

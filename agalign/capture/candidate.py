@@ -112,7 +112,7 @@ class Candidate:
         return points_in_frame(self.mapping, *self.pair.sizes_px) if self.images is None else self.images.common_px()
 
     @property
-    def textured_px(self) -> Points:
+    def checked_px(self) -> Points:
         """Points (n, 2) whose errors are limited: those of the windows under a relief, whose error at a pixel without
         texture no image shows; without one, the error is smooth, and the whole common area counts.
         """

@@ -36,7 +36,10 @@ thermal and a blue image to three quarters."""
 
 
 def find_seed(pair: BandPair, settings: SeedSettings, model: FlightModel | None = None) -> Seed | Issue:
-    """Return the best seed of a pair, or the issue that prevents one. A `match` uses the network of `model`."""
+    """Return the best seed of a pair, or the issue that prevents one.
+
+    With `force` "match", descriptors of the network of `model` are matched.
+    """
     if not pair.reference.is_textured:
         return blank_issue(pair.reference.image, BLANK_REFERENCE)
     if not textured(pair.moving):

@@ -199,7 +199,7 @@ def run(
 
 
 def _listener(terminal: Terminal, show: Callable[[float, str], None]) -> "Listener":
-    """Return what hears of the progress of a run, and shows it as a share of a capture and a text."""
+    """Return a listener that shows the progress of a run as a share of a capture and a text."""
     from agalign.batch.run import Listener
 
     def on_learning(camera: str, share: float) -> None:
@@ -215,7 +215,7 @@ def _listener(terminal: Terminal, show: Callable[[float, str], None]) -> "Listen
     return Listener(
         on_pair,
         on_learning,
-        on_learnt=lambda camera, seconds: terminal.event("learnt", camera=camera, seconds=round(seconds, 2)),
+        on_learned=lambda camera, seconds: terminal.event("learned", camera=camera, seconds=round(seconds, 2)),
         on_again=lambda text: terminal.event("again", text, message=text),
     )
 

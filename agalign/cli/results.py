@@ -241,7 +241,9 @@ def _print_capture(reports: "Sequence[IndexReport]", earlier: "Sequence[IndexRep
         terminal.problem(RAW_NUMBERS)
     for report in reports:
         if report.path is None:
-            terminal.problem(f"{report.capture}: {report.problem}", capture=report.capture, index=report.index)
+            terminal.problem(
+                f"{report.capture} {report.index}: {report.problem}", capture=report.capture, index=report.index
+            )
             continue
         kept = ", kept" if report.kept else ""
         text = f"{report.capture} {report.index}: median {report.median:.3f}{kept}"

@@ -147,5 +147,7 @@ def _of_raw_numbers(files: Sequence[Path]) -> dict[str, str]:
     tags = (read_tags(path) for path in files)
     if all(t.number(*name) for t in tags for name in names if t.text(pix4d.NAMESPACE, "BandName") != "LWIR"):
         return {"calibration": "camera+sun", "contents": "raw numbers, and the irradiance of the light sensor."}
-    contents = "raw numbers, not all with an irradiance that OpenDroneMap reads; for reflectance add --radiometry."
+    contents = (
+        "raw numbers, not all with an irradiance that OpenDroneMap reads; align with --radiometry for reflectance."
+    )
     return {"calibration": "camera", "contents": contents}

@@ -52,8 +52,10 @@ def bands_of(sidecar: Sidecar, folder: Path, *, mask_qa: bool = False) -> list[A
             problem = f"the pixels of {part.band} were not written; run again"
         elif not part.is_usable(sidecar.accept_predicted_px):
             limit_px, prediction = sidecar.accept_predicted_px, part.prediction
-            error = "" if prediction is None else f" to {prediction.std_px:.1f} px, not {limit_px:g}"
-            problem = f"{part.band} is {part.status}{error} ({part.reason})"
+            error = ""
+            if part.status == "predicted" and prediction is not None:
+                error = f" with a standard error of {prediction.std_px:.1f} px, above {limit_px:g}"
+            problem = f"{part.band} is {part.status.replace('_', ' ')}{error} ({part.reason})"
         result.append(AlignedBand(part.band, part.wavelength_nm, folder / file, index, checksum, problem, quality))
     return result
 

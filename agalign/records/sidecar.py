@@ -303,7 +303,7 @@ class BandResult(_Part):
     missing_rows: int = 0
     """Rows at the end of the file without pixels, as an incomplete transfer leaves them; they are nodata."""
     share_over_1_px: Number4 | None = None
-    """Share of the written pixels whose expected error exceeds 1 px of the reference or is unknown."""
+    """Share of the pixels of the output whose expected error exceeds 1 px of the reference or is unknown."""
     seconds: Number3
     """Share of the capture's processing time."""
 

@@ -57,6 +57,10 @@ def content_checksum(text: str | bytes) -> str:
     return hashlib.sha256(json.dumps(content, sort_keys=True, separators=(",", ":")).encode()).hexdigest()
 
 
+class OtherSchemaError(SidecarError):
+    """A sidecar is that of a version of agalign with another schema."""
+
+
 def _without_seconds(part: dict[str, Any]) -> dict[str, Any]:
     part.pop("seconds", None)
     return part
@@ -102,7 +106,9 @@ def _parsed(path: Path, text: bytes) -> Sidecar:
     try:
         return Sidecar.model_validate_json(text)
     except ValidationError as error:
-        raise SidecarError(f"{path}: {_problem(error, text)}") from None
+        known = {e["loc"] for e in error.errors(include_url=False)}
+        kind = OtherSchemaError if ("schema",) in known else SidecarError
+        raise kind(f"{path}: {_problem(error, text)}") from None
 
 
 def read_without_tables(path: Path) -> Sidecar:

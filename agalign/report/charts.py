@@ -123,7 +123,7 @@ def drifts_of(cameras: Mapping[str, CameraOffsets]) -> list[DriftChart]:
         min_full_px = 0.2  # smaller drifts are noise
         full_px = float(np.nanmax(np.abs(aligned), initial=min_full_px))
         step = max(1, math.ceil(len(order) / 400))  # more points than that are not distinguishable
-        hues = hues_of(names)
+        hues = hues_of([known.reference, *names])  # as in the plan of the rig
         lines = (
             Line(name, hues[name], _polylines(of_band, full_px, step))
             for name, of_band in zip(names, aligned, strict=True)

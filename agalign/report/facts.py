@@ -139,10 +139,6 @@ class PairTotals:
         """Labels of the captures."""
         return {label for label, *_ in self._references}
 
-    def residuals_px(self) -> list[float]:
-        """Return the residuals of all aligned pairs, sorted."""
-        return sorted(px for band in self.bands.values() for px in band.residuals_px)
-
     def groups(self, without_result: Sequence[str] = ()) -> list[CautionGroup]:
         """Return what to check, by cause, the largest effect first: the cautions about bands, the captures with another
         reference than most of their flight, and those without a result, given by label.
@@ -181,6 +177,8 @@ class CameraOffsets:
     """(time, label) of each capture."""
     offsets_px: list[dict[str, tuple[float, float]]] = field(default_factory=list)
     """(x, y) by aligned or predicted band, of each capture."""
+    reference: str = ""
+    """The reference band of the last capture."""
 
 
 class FlightFacts:
@@ -241,6 +239,7 @@ class FlightFacts:
         self.placed += facts["position"] is not None
         usable = [b for b in facts["bands"] if b["status"] in ("aligned", "predicted") and b["offset_px"]]
         camera.labels.append((facts["captured_at"], label))
+        camera.reference = facts["reference"]
         camera.offsets_px.append({b["band"]: b["offset_px"] for b in usable})
 
     def _index(self, row: IndexReport) -> dict[str, Any]:

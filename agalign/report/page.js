@@ -559,7 +559,7 @@ function showDetails(row, capture, part) {
   look.sheet = null;
   look.composed = {};
   look.indices = {};
-  if (look.overlay.startsWith("index:") && !indexOf(capture)) look.overlay = "none";
+  if (!overlaysOf(capture).some(([value]) => value === look.overlay)) look.overlay = "none";
   const names = capture.bands.map((b) => b.band);
   look.wanted ??= presets(facts.details?.records.find((c) => c.missing.length === 0) ?? capture)[0].bands;
   look.bands = look.wanted.every((b) => names.includes(b)) ? look.wanted : presets(capture)[0].bands;
@@ -679,17 +679,26 @@ function viewTools() {
   );
 }
 
-/** @param {Capture} capture */
-function overlayTools(capture) {
-  const line = el("div", { class: "tools" });
+/**
+ * Value and name of the overlays that a capture has.
+ * @param {Capture} capture @returns {[string, string][]}
+ */
+function overlaysOf(capture) {
+  /** @type {[string, string][]} */
   const overlays = [["none", "none"], ["vectors", "residual vectors"], ["heat", "residual heat map"]];
   if (capture.preview?.error_full_px) overlays.push(["error", "expected error"]);
   if (capture.preview?.relief) overlays.push(["relief", "parallax of the capture"]);
   for (const index of capture.indices) overlays.push([`index:${index.name}`, index.name.toUpperCase()]);
+  return overlays;
+}
+
+/** @param {Capture} capture */
+function overlayTools(capture) {
+  const line = el("div", { class: "tools" });
   const band = choice("for band", moving(capture).map((b) => [b.band, b.band]), look.overlayBand, (value) => { look.overlayBand = value; paint(); }, "Band of the overlay");
   /** The other overlays are of all bands. */
   const showBand = () => { band.hidden = !["vectors", "heat", "error"].includes(look.overlay); };
-  line.append(choice("Overlay", overlays, look.overlay, (value) => { look.overlay = value; showBand(); paint(); }, "Overlay"), band);
+  line.append(choice("Overlay", overlaysOf(capture), look.overlay, (value) => { look.overlay = value; showBand(); paint(); }, "Overlay"), band);
   showBand();
   return line;
 }
@@ -1221,7 +1230,7 @@ function sentence(pair, capture) {
     const most = pair.residual_p95_px === null ? "" : `, 95 % ${fixed(pair.residual_p95_px)} px`;
     const seen = pair.occluded === null ? "" : ` The relief of the capture is corrected; ${percent(pair.occluded)} of its image is occluded.`;
     const error = pair.error_px === null ? "" : `expected error ${fixed(pair.error_px)} px (RMS), and `;
-    return `${offset}is aligned: ${error}at most 0.5 px in 90 % of the area with texture, suitable for indices of single plants. Median residual ${fixed(left)} px${most}.${over}${seen}`;
+    return `${offset}is aligned: ${error}at most 0.5 px in 90 % of ${pair.occluded === null ? "the area that both images show" : "its windows"}, suitable for indices of single plants. Median residual ${fixed(left)} px${most}.${over}${seen}`;
   }
   if (pair.status === "predicted") {
     const std = pair.prediction?.std_px ?? Infinity;

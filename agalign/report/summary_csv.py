@@ -27,6 +27,8 @@ BAND_COLUMNS = {
     "prediction_std_px": "prediction.std_px",
     "prediction_off_px": "prediction.off_px",
     **{f"{name}_{when}": f"metrics.{when}.{name}" for name in SIMILARITY for when in ("before", "after")},
+    "expected_error_px": "error.std_px",
+    "share_over_1_px": "share_over_1_px",
     "seconds": "seconds",
 }
 """Field of a band in the sidecar by column of OUT/summary.csv."""

@@ -39,7 +39,9 @@ TERMS: dict[str, Term] = {
         "reference: root mean square over the area that both images show. It is an estimate and not a limit: errors of "
         "single pixels may be larger (heat map of expected errors, option --error-map)",
     ),
-    "over_1_px": Term("over 1 px", "share of the written pixels whose expected error is larger than 1 px or unknown"),
+    "over_1_px": Term(
+        "over 1 px", "share of the pixels of the output whose expected error is larger than 1 px or unknown"
+    ),
     "offset": Term(
         "offset before",
         "distance between the pixels of the raw files that show the same place: median over the image, px",

@@ -26,7 +26,7 @@ class ExpectedError(NamedTuple):
     capture: str
     band: str
     share_over_1_px: float | None
-    """Share of the written pixels whose expected error is larger than 1 px or unknown; None if none was written."""
+    """Share of the pixels of the output with an expected error above 1 px or unknown; None if none was written."""
 
 
 @dataclass
@@ -39,13 +39,13 @@ class Verdict:
     """Expected errors of the usable moving bands, by name of the band."""
     largest: ExpectedError | None = None
     """The largest of them."""
-    unwritten: dict[tuple[str, str], list[str]] = field(default_factory=lambda: defaultdict(list))
-    """Labels of the captures by requested index that was not written, and the reason."""
+    unwritten: dict[str, list[tuple[str, str]]] = field(default_factory=lambda: defaultdict(list))
+    """(label, reason) of the captures by requested index that was not written."""
 
     def add(self, label: str, sidecar: Sidecar, unwritten: Iterable[tuple[str, str]] = ()) -> None:
         """Add the bands of a capture, and the (name, reason) of its indices that were not written."""
         for index, reason in unwritten:
-            self.unwritten[index, reason].append(label)
+            self.unwritten[index].append((label, reason))
         for band in _usable_bands(sidecar):
             self.usable[str(band.status)] += 1
             if band.error is None:
@@ -73,14 +73,6 @@ class Verdict:
         counts |= {status.replace("_", " "): statuses[status] for status in ("seed_only", "failed", "missing")}
         return [f"{count} {word}" for word, count in counts.items() if count]
 
-    @property
-    def unwritten_captures(self) -> dict[str, int]:
-        """Number of captures by index that was not written."""
-        counts: Counter[str] = Counter()
-        for (index, _), labels in self.unwritten.items():
-            counts[index] += len(labels)
-        return dict(counts)
-
 
 def largest_error_px(sidecar: Sidecar) -> float | None:
     """Return the largest expected error of the moving bands of a capture that indices can use, px; None if none is
@@ -104,19 +96,19 @@ def unwritten_indices(sidecar: Sidecar, folder: Path, reports: Sequence[IndexRep
     """Yield (name, reason) of the indices without a raster: those that the last rendering of the capture requested, and
     those that `agalign indices` could not write, given the folder of the sidecar and the reports of the capture.
     """
-    by_name = {report.index: report for report in reports}
+    problems = {report.index: report.problem for report in reports if report.path is None}
+    written = {report.index for report in reports} - problems.keys()
     requested = (sidecar.options or {}).get("write", {}).get("indices", [])
-    for name in dict.fromkeys([*(str(one).strip().lower() for one in requested), *by_name]):
-        report = by_name.get(name)
-        if report is None:
-            yield name, _reason(name, sidecar, folder)
-        elif report.path is None:
-            yield name, report.problem
+    for name in dict.fromkeys([*(str(one).strip().lower() for one in requested), *problems]):
+        if name not in written:
+            before = f"when it was last calculated: {problems[name]}" if name in problems else _NO_RASTER
+            yield name, _reason(name, sidecar, folder) or before
 
 
 def _reason(name: str, sidecar: Sidecar, folder: Path) -> str:
+    """Why an index cannot be calculated now; empty if it can, or if its formula is not known."""
     try:
         # The page may be opened elsewhere: files are relative to their capture.
-        return reason_not_written(index_named(name), sidecar, folder).replace(f"{folder}{os.sep}", "") or _NO_RASTER
-    except ConfigurationError:  # an index of another version
-        return _NO_RASTER
+        return reason_not_written(index_named(name), sidecar, folder).replace(f"{folder}{os.sep}", "")
+    except ConfigurationError:  # a formula, or an index of another version
+        return ""

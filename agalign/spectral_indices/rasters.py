@@ -188,7 +188,7 @@ class IndexRasters(Product):
                 self._add_before(context, index, report)
                 yield from self._files(report.path)
             elif all(not b.problem for b in bands) and _has_bands(context.capture.bands, index):
-                problems.append(report.problem)
+                problems.append(f"{index.name}: {report.problem}")
         masked = list(_masked(bands, context))
         for raster in earlier:
             problem = "its formula is unknown"
@@ -337,7 +337,7 @@ def _bands_of_index(bands: Sequence[AlignedBand], index: Index) -> list[AlignedB
     chosen = [bands[i] for i in bands_for(index, [b.name for b in bands], [b.wavelength_nm for b in bands])]
     for band in chosen:
         if band.problem:
-            raise InputError(f"{index.name} is left out: {band.problem}")
+            raise InputError(band.problem)
     return chosen
 
 
@@ -384,10 +384,10 @@ def _common_unit(index: Index, bands: Sequence[AlignedBand], reader: BandReader)
             raise InputError(f"{path}: differs in size from {files[0][0].name}; run again")
     units = {unit for band in bands for unit in reader.units(band)}
     if len(units) > 1:
-        raise InputError(f"{index.name} is left out: its bands are in different units ({', '.join(sorted(units))})")
+        raise InputError(f"its bands are in different units ({', '.join(sorted(units))})")
     (unit,) = units
     if not index.any_unit and unit != "reflectance":
-        raise InputError(f"{index.name} needs reflectance, and the bands are {unit}; align with --radiometry")
+        raise InputError(f"needs reflectance, and the bands are {unit}; align with --radiometry")
     return unit
 
 

@@ -118,6 +118,11 @@ INACCURATE = IssueKind(
         "look at --error-map; give --model OUT/models/… of a flight that shows the whole image",
     ),
 )
+UNMEASURED = IssueKind(
+    "unmeasured",
+    "no shift can be measured in {value:.0%} of the windows under the relief of the other bands",
+    _PARALLAX,
+)
 OTHER_CONTENT = IssueKind(
     "other_content",
     "an area with {value:.0%} of the windows shows a different scene in this band",
@@ -168,6 +173,7 @@ KINDS: Mapping[str, IssueKind] = {
         CLOSE_WINDOWS,
         CLUSTER,
         INACCURATE,
+        UNMEASURED,
         UNEXPECTED_PX,
         OTHER_CONTENT,
         REPEATS,

@@ -27,6 +27,7 @@ from agalign.values.issues import (
     REPEATS,
     RETRIEVAL,
     UNEXPECTED_PX,
+    UNMEASURED,
     Issue,
 )
 from agalign.values.mapping import PixelMapping
@@ -58,7 +59,7 @@ an issue; both must be reached. Wrong peaks are scattered, windows with parallax
 _MAX_UNEXPECTED_STD = 5.0
 """Distances from the prediction above MAX_UNEXPECTED_PX are accepted up to this multiple of its standard error."""
 
-BY_PARALLAX = frozenset({CLOSE_WINDOWS, CLUSTER, INACCURATE})
+BY_PARALLAX = frozenset({CLOSE_WINDOWS, CLUSTER, INACCURATE, UNMEASURED})
 """Issues that parallax may cause, which a relief or a displacement field removes."""
 PREDICTED_WITH = frozenset({*BY_PARALLAX, OTHER_CONTENT})
 """Issues of a mapping that the images confirm, but not everywhere: it is a prediction with its standard error."""
@@ -97,7 +98,7 @@ class Verifiable(Protocol):
         """The expected error."""
 
     @property
-    def textured_px(self) -> Points:
+    def checked_px(self) -> Points:
         """Points (n, 2) of the reference whose errors are limited."""
 
     @property
@@ -167,13 +168,14 @@ def _error_issues(candidate: Verifiable) -> Iterator[Issue]:
     A relief comes from other bands, so its error is small even where this band shows a different scene. Under a relief,
     the error is therefore checked at the windows, and the band must have a measured shift in them.
     """
-    if len(candidate.textured_px):
-        max_px = _MAX_ERROR_PX * candidate.file_pixel_size_px
-        share = float((candidate.error.error_px(candidate.textured_px) <= max_px).mean())
-        if candidate.mapping.parallax is not None:
-            share = min(share, candidate.windows.coverage)
-        if not share >= _MIN_ACCURATE_SHARE:
-            yield Issue(INACCURATE, 1 - share, 1 - _MIN_ACCURATE_SHARE, f"{_MAX_ERROR_PX:g} px")
+    if not len(candidate.checked_px):
+        return
+    max_px = _MAX_ERROR_PX * candidate.file_pixel_size_px
+    share = float((candidate.error.error_px(candidate.checked_px) <= max_px).mean())
+    if not share >= _MIN_ACCURATE_SHARE:
+        yield Issue(INACCURATE, 1 - share, 1 - _MIN_ACCURATE_SHARE, f"{_MAX_ERROR_PX:g} px")
+    if candidate.mapping.parallax is not None and not candidate.windows.coverage >= _MIN_ACCURATE_SHARE:
+        yield Issue(UNMEASURED, 1 - candidate.windows.coverage, 1 - _MIN_ACCURATE_SHARE)
 
 
 def _content_issues(candidate: Verifiable) -> Iterator[Issue]:

@@ -139,13 +139,18 @@ def test_captures_with_other_options_are_done_again_and_this_is_printed_before(f
     assert "1 finished capture to be estimated again; changed since: version (agalign 0.0.9 before)" in done.stderr
 
 
-def test_a_result_of_another_schema_is_estimated_again(flight: Path, out: Path) -> None:
-    first, second = find_sidecars(out)
+def test_a_result_of_another_schema_is_refused_before_anything_is_written(flight: Path, out: Path) -> None:
+    """Whether it is of the same capture is not known."""
+    first, _ = find_sidecars(out)
     first.write_text(json.dumps({**read_json(first), "schema": "agalign/2"}))
-    left = {path: remaining_of(flight, path, out) for path in (first, second)}
-    assert [one.step for one in left.values()] == ["estimate", "nothing"]
-    agalign.align_folder(flight, out, settings=SEEDS)
-    assert read_json(first)["schema"] == "agalign/3"
+    unchanged = contents(out)
+    for options in ((), ("--overwrite",)):
+        done = agalign_here(flight, "-o", out, "--only-seed", *options)
+        assert done.returncode == ExitCode.USAGE
+        line = f"agalign: {first}: schema is 'agalign/2' of agalign "
+        assert done.stderr.count(line) == done.stderr.count("agalign: ") == 1
+        assert "run again into a new folder" in done.stderr
+    assert contents(out) == unchanged
 
 
 def remaining_of(flight: Path, sidecar: Path, out: Path) -> Remaining:

@@ -294,7 +294,7 @@ def test_indices_of_a_later_command_are_calculated_of_the_new_pixels(
     assert len(rows("savi")) == 2
     said = align("--radiometry", "off")
     assert "agalign: 2 files of an earlier command removed, such as" in said
-    assert "_savi.tif: savi needs reflectance, and the bands are raw numbers; align with --radiometry" in said
+    assert "_savi.tif: needs reflectance, and the bands are raw numbers; align with --radiometry" in said
     assert not list(savi.parent.glob("*_savi.*"))
     assert rows("savi") == []
     np.testing.assert_array_equal(values_of(ndvi), of_raw)

@@ -128,7 +128,7 @@ def test_what_failed_is_shown_first_in_words_and_in_numbers(page: Any) -> None:
     assert "suitable for indices of single plants" in words
     assert "NIR failed" in words
     assert "NIR was not written" in page.locator("#over-note").inner_text()
-    assert "NDVI was not written: ndvi is left out: NIR is failed" in page.locator("#capture .unwritten").inner_text()
+    assert "NDVI was not written: NIR is failed" in page.locator("#capture .unwritten").inner_text()
     assert "NDVI was not written for 2 of 3 captures" in page.locator(".verdict").inner_text()
     page.locator("details.more summary").click()
     assert "→" in page.locator("details.more table").inner_text()

@@ -52,10 +52,17 @@ def test_the_index_before_alignment_is_that_of_the_files(tmp_path: Path) -> None
     red, nir = (raw[name][5:25, 4:36].astype(float) for name in ("Red", "NIR"))
     expected = ((nir - red) / (nir + red) + 1) / 2 * 255
     np.testing.assert_allclose(index_before(context, ndvi, (-1.0, 1.0)), expected, atol=0.51)
+    # The files declare what their numbers mean, which the aligned index applies too.
+    scaled = [replace(layer, band=replace(layer.band, scale_offset=(1e-4, 0.02))) for layer in layers]
+    red, nir = (1e-4 * band + 0.02 for band in (red, nir))
+    expected = ((nir - red) / (nir + red) + 1) / 2 * 255
+    np.testing.assert_allclose(index_before(replace(context, layers=scaled), ndvi, (-1.0, 1.0)), expected, atol=0.51)
     # Bands of another size have no pixels at the same places.
     small = replace(capture, bands=(bands[0], replace(bands[1], width_px=20, height_px=15)))
     layers = [layers[0], replace(layers[1], band=small.bands[1])]
     assert index_before(replace(context, capture=small, layers=layers), ndvi, (-1.0, 1.0)) is None
+    undistorted = replace(context, grid=OutputGrid(4, 5, 32, 20, undistorted=True))
+    assert index_before(undistorted, ndvi, (-1.0, 1.0)) is None
     outside = replace(context, grid=OutputGrid(-1, 0, 32, 20))
     assert index_before(outside, ndvi, (-1.0, 1.0)) is None
 

@@ -51,7 +51,7 @@ class Checked:
         return MappingError(SIZE, None if self.joint is None else self.joint.covariance_px2, self.windows)
 
     @property
-    def textured_px(self) -> np.ndarray:
+    def checked_px(self) -> np.ndarray:
         return self.windows.centres_px
 
 
@@ -99,7 +99,7 @@ def test_values_that_are_not_finite_and_mirrored_mappings_are_issues(
 
 def test_a_part_of_the_image_that_the_relief_of_other_bands_does_not_align_is_an_issue() -> None:
     assert codes(UnderRelief(), measured_in(0.9)) == []
-    assert codes(UnderRelief(), measured_in(0.89)) == ["inaccurate"]
+    assert codes(UnderRelief(), measured_in(0.89)) == ["unmeasured"]
     assert codes(GOOD, measured_in(0.89)) == []
 
 
