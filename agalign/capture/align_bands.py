@@ -9,7 +9,7 @@ from agalign.capture.band_pair import BandPair, read_pairs
 from agalign.capture.by_descriptors import by_descriptors
 from agalign.capture.by_relief import ReliefCandidates, by_relief
 from agalign.capture.by_rig import RigPrediction, bands_to_learn, observed, rig_predictions
-from agalign.capture.by_windows import agreeing_with_seed, extrapolated, fitted_to_windows, spreads_of_relief_px
+from agalign.capture.by_windows import agreeing_with_seed, fitted_to_windows, is_extrapolated, spreads_of_relief_px
 from agalign.capture.candidate import BandCandidates, RefinedBand
 from agalign.capture.decision import decide
 from agalign.capture.full_resolution import at_full_resolution
@@ -205,7 +205,7 @@ class CaptureEstimation:
             self.add(remaining, results)
 
     def _fit_windows(self) -> None:
-        """Fit windows alone where the descriptors have no result, and lens shapes where a part has no windows."""
+        """Fit windows alone where the descriptors have no result; add the error by relief where no window is near."""
         if not self._may_be_homography:
             return
         for name, alignment in self.decided().items():
@@ -218,12 +218,10 @@ class CaptureEstimation:
             band.candidates += [] if by_windows is None else [by_windows]
         if not self.is_observation:
             spreads_px = self._spreads_of_relief_px()
-            for band in self.bands.values():
-                accepted = [c for c in band.candidates if not c.issues]
-                spread_px = spreads_px[band.pair.name]
-                for shaped in [extrapolated(c, spread_px) for c in band.candidates[-1:] if not accepted]:
-                    if shaped is not None:
-                        band.candidates = [*(c.with_relief_std_px(spread_px) for c in band.candidates), shaped]
+            for name, band in self.bands.items():
+                is_accepted = any(not candidate.issues for candidate in band.candidates)
+                if band.candidates and not is_accepted and is_extrapolated(band.candidates[-1]):
+                    band.candidates = [c.with_relief_std_px(spreads_px[name]) for c in band.candidates]
 
     def _spreads_of_relief_px(self) -> dict[str, float]:
         """Return the relief that homographies lack, by band."""

@@ -3,11 +3,10 @@
 * Blurred, noisy or saturated images: the homography is fitted to half of the windows and verified with the others.
 * Bands with few pixels, such as thermal ones: often only a third of the windows have structure in common with another
   band. If nearly all of these agree with a trusted seed, they predict the mapping.
-* Images without common structure in one part: differences of lens distortion cause errors of the homography there that
-  no residual contains. The lens shapes are estimated too, and the mapping is a prediction.
+* Images without common structure in one part: no residual contains the relief there, which a homography lacks.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -17,11 +16,8 @@ from agalign.capture.candidate import BandCandidates, Candidate, mapping_error, 
 from agalign.capture.warped_pair import WarpedPair
 from agalign.fit.window_fit import WindowFit, fit_in_rounds
 from agalign.values import geometry
-from agalign.values.alignment import JointResult
 from agalign.values.geometry import Matrix
-from agalign.values.issues import CORNERS_UNKNOWN, FEW_KEYPOINTS, INACCURATE, NO_CONTRAST, RETRIEVAL, Issue
-from agalign.values.mapping import PixelMapping
-from agalign.values.residual import Residual
+from agalign.values.issues import CORNERS_UNKNOWN, FEW_KEYPOINTS, INACCURATE, NO_CONTRAST, RETRIEVAL
 from agalign.verify.checks import MAX_ALIAS_PEAK
 from agalign.verify.coverage import points_in_frame, unobserved_quarters
 
@@ -70,10 +66,21 @@ def agreeing_with_seed(band: BandCandidates) -> Candidate | None:
     if not (pair.is_coarse and band.is_start_trusted):
         return None
     start = pair.mapping(band.start.fixed_to_moving)
-    result = _with_lens_shapes(pair, start, band.joint, band.rejected, is_accepted=_is_consistent)
-    if result is not None and WarpedPair.of(pair, result.mapping).alias_peak().ratio > MAX_ALIAS_PEAK:
+    windows = pair.reference.overlapping_windows
+    fitted = fit_in_rounds(
+        replace(start, field=None),
+        lambda mapping: windows.residuals(pair.warped_moving(mapping)),
+        pair.fixed.size_px,
+        _is_consistent,
+        pair.lens_std_px,
+    )
+    if fitted is None or WarpedPair.of(pair, fitted[0]).alias_peak().ratio > MAX_ALIAS_PEAK:
         return None
-    return result
+    mapping, fit = fitted
+    residual = windows.residuals(pair.warped_moving(mapping))
+    error = mapping_error(pair, mapping, fit.covariance_px2, residual, relief_std_px=0.0)
+    error = replace(error, field_std_px=0.0)  # its shapes are in the covariance
+    return Candidate("lens shapes", pair, mapping, error, residual, band.joint, replaces=tuple(band.rejected))
 
 
 def _is_consistent(fit: WindowFit) -> bool:
@@ -85,21 +92,14 @@ def _is_consistent(fit: WindowFit) -> bool:
     return count >= min_windows and bool((fit.residuals_px <= max_close_px).sum() >= min_close_share * count)
 
 
-def extrapolated(plane: Candidate, relief_std_px: float) -> Candidate | None:
-    """Return a candidate with lens shapes instead of one that is only inaccurate, without windows in a quarter of the
-    image; None for others.
-
-    A homography does not extrapolate relief: `relief_std_px`, px of the fixed image, is the spread of it.
-    """
+def is_extrapolated(plane: Candidate) -> bool:
+    """Return True for a homography that is only inaccurate, without windows in a quarter of the image."""
     pair = plane.pair
     if [issue.kind for issue in plane.issues] != [INACCURATE] or plane.mapping.parallax is not None:
-        return None
+        return False
     in_frame_px = points_in_frame(plane.mapping, *pair.sizes_px)
-    if "geo" in pair.seed_matrices or not unobserved_quarters(
-        plane.windows.measured_px, pair.fixed.size_px, in_frame_px
-    ):
-        return None
-    return _with_lens_shapes(pair, plane.mapping, plane.joint, plane.issues, relief_std_px=relief_std_px)
+    unobserved = unobserved_quarters(plane.windows.measured_px, pair.fixed.size_px, in_frame_px)
+    return "geo" not in pair.seed_matrices and bool(unobserved)
 
 
 def spreads_of_relief_px(pairs: Sequence[BandPair], homographies: Mapping[str, Matrix]) -> dict[str, float]:
@@ -130,35 +130,3 @@ def spreads_of_relief_px(pairs: Sequence[BandPair], homographies: Mapping[str, M
         return max(pair.relief_std_px, _RELIEF_SHARE * shift_px)
 
     return {pair.name: spread_px(pair) for pair in pairs}
-
-
-def _with_lens_shapes(
-    pair: BandPair,
-    start: PixelMapping,
-    joint: JointResult | None,
-    issues: Sequence[Issue],
-    *,
-    is_accepted: Callable[[WindowFit], bool] = lambda _: True,
-    relief_std_px: float = 0.0,
-) -> Candidate | None:
-    """Return the candidate with a homography and lens shapes instead of `start` and its field, for these issues."""
-    fitted = fit_in_rounds(
-        replace(start, field=None),
-        lambda mapping: _measured(pair, mapping),
-        pair.fixed.size_px,
-        is_accepted,
-        pair.lens_std_px,
-    )
-    if fitted is None:
-        return None
-    mapping, fit = fitted
-    windows = _measured(pair, mapping)
-    error = mapping_error(pair, mapping, fit.covariance_px2, windows, relief_std_px=relief_std_px)
-    error = replace(error, field_std_px=0.0)  # its shapes are in the covariance
-    return Candidate("lens shapes", pair, mapping, error, windows, joint, replaces=tuple(issues))
-
-
-def _measured(pair: BandPair, mapping: PixelMapping) -> Residual:
-    if pair.is_coarse:
-        return pair.reference.overlapping_windows.residuals(pair.warped_moving(mapping))
-    return WarpedPair.of(pair, mapping).residual

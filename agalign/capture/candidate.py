@@ -53,7 +53,7 @@ class Candidate:
     ignored: frozenset[IssueKind] = frozenset()
     """Kinds of issues that do not matter: those by parallax, in an observation of the rig."""
     replaces: tuple[Issue, ...] = ()
-    """Issues of the candidate that it extrapolates: it is a prediction, as windows see a part of the image only."""
+    """Issues of the candidate that it replaces: it is a prediction, as windows see a part of the image only."""
 
     @classmethod
     def of(
