@@ -20,6 +20,7 @@ from agalign.batch.learning_tasks import (
     observe_rig,
     portable,
 )
+from agalign.capture.by_rig import DELIVERED_STD_PX
 from agalign.config import Settings
 from agalign.fit.displacement_field import common_field
 from agalign.flight.fingerprint import learning_fingerprint
@@ -96,10 +97,12 @@ class _FlightLearner:
         """Return the model, without a fingerprint."""
         if self.start is not None and self._holds(self.start):
             return self.start
-        if len(self.captures) >= MIN_CAPTURES:
-            return self._from_captures()
-        if self.start is None and self.settings.joint.recipe == "scratch":
-            return None  # a network is learned for each of the few captures
+        are_enough = len(self.captures) >= MIN_CAPTURES
+        if are_enough and (learned := self._from_captures()) is not None:
+            return learned
+        if self.start is None and (are_enough or self.settings.joint.recipe == "scratch"):
+            return None  # a network is learned for each capture that needs it
+        # The rig of an earlier model predicts the bands of captures that nothing can be learned from, as over water.
         # Learning takes as long as aligning one or two captures, and those that need it are learned from alone.
         net, rig = initial_network(self._bands, self.settings, self.start), self._start_rig
         known_mappings = {} if rig is None else rig.mean
@@ -107,7 +110,7 @@ class _FlightLearner:
         return FlightModel(net, camera, self._bands, known_mappings, "", rig)
 
     def _from_captures(self) -> FlightModel | None:
-        """Learn the network and the rig, from at least MIN_CAPTURES captures."""
+        """Learn network and rig from MIN_CAPTURES captures or more; None if no band of them can be aligned."""
         network = self._network()
         if network is None:
             return None
@@ -142,15 +145,14 @@ class _FlightLearner:
         """Return True if an earlier model fits this flight, so that none must be learned.
 
         It does if two captures, or the only one, can be aligned, and its rig predicts each aligned band from the others
-        with a standard error of at most `accept_predicted_px`.
+        with a standard error of at most DELIVERED_STD_PX.
         """
         if model.rig is None or not set(self._bands) <= set(model.bands):
             return False
         some = [self.captures[k] for k in dict.fromkeys(len(self.captures) * third // 3 for third in (1, 2))]
         tests = list(filter(None, self.apply(partial(observe_rig, portable(model), self.settings), some)))
         known = [(band, one.observation) for one in tests for band in one.residuals]
-        limit_px = self.settings.check.accept_predicted_px
-        is_accurate = all(predict_band(model.rig, band, o).std_px <= limit_px for band, o in known)
+        is_accurate = all(predict_band(model.rig, band, o).std_px <= DELIVERED_STD_PX for band, o in known)
         return len(tests) == len(some) and 2 * len(known) >= len(some) * len(self._bands) and is_accurate
 
     def _network(self) -> tuple[Descriptor, list[LearningCapture]] | None:

@@ -8,7 +8,7 @@ from functools import partial
 from agalign.capture.band_pair import BandPair, read_pairs
 from agalign.capture.by_descriptors import by_descriptors
 from agalign.capture.by_relief import ReliefCandidates, by_relief
-from agalign.capture.by_rig import RigPrediction, bands_to_learn, observed, rig_predictions
+from agalign.capture.by_rig import DELIVERED_STD_PX, RigPrediction, bands_to_learn, observed, rig_predictions
 from agalign.capture.by_windows import agreeing_with_seed, fitted_to_windows, is_extrapolated, spreads_of_relief_px
 from agalign.capture.candidate import BandCandidates, RefinedBand
 from agalign.capture.decision import decide
@@ -151,8 +151,7 @@ class CaptureEstimation:
 
     def decided(self, predictions: Mapping[str, RigPrediction] | None = None) -> Alignments:
         """Return the alignments by what has been found."""
-        limit_px = self.settings.check.accept_predicted_px
-        return decide(list(self.bands.values()), self.reliefs, predictions, limit_px)
+        return decide(list(self.bands.values()), self.reliefs, predictions)
 
     def _seeded(self, pairs: Sequence[BandPair]) -> list[SeededPair]:
         """Find the seeds; return the pairs that have one."""
@@ -191,12 +190,12 @@ class CaptureEstimation:
 
     def _learn(self, starts: Sequence[SeededPair], capture: Capture | None, *, scratch: bool) -> None:
         """Align pairs with networks that are learned from scratch."""
-        result, limit_px = self.decided(), self.settings.check.accept_predicted_px
-        done = {name for name in self.refined if not scratch or result[name].is_usable(limit_px)}
+        result = self.decided()
+        done = {name for name in self.refined if not scratch or result[name].is_usable(DELIVERED_STD_PX)}
         remaining = [s for s in starts if s[0].name not in done]
         rig = None if self.model is None else self.model.rig
         if remaining and capture is not None and rig is not None:
-            names = bands_to_learn([pair for pair, _ in starts], result, rig, capture, limit_px)
+            names = bands_to_learn([pair for pair, _ in starts], result, rig, capture)
             remaining = [s for s in remaining if s[0].name in names]
         if remaining:
             results = self._optimised(

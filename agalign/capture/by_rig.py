@@ -11,6 +11,7 @@ from agalign.capture.band_pair import BandPair
 from agalign.capture.candidate import Candidate
 from agalign.capture.seeding import find_rotated
 from agalign.capture.warped_pair import WarpedPair
+from agalign.config import CheckSettings
 from agalign.flight.rig import Observation, Rig, distance_px
 from agalign.flight.rig_prediction import predict_band
 from agalign.values.alignment import MIN_TIMES_CHANCE, Alignments, JointResult, Prediction
@@ -19,6 +20,10 @@ from agalign.values.geometry import Matrix
 from agalign.values.mapping import PixelMapping
 from agalign.values.mapping_error import MappingError
 from agalign.values.parallax import Parallax
+
+DELIVERED_STD_PX = CheckSettings().accept_predicted_px
+"""Standard error of a prediction, px of the band, up to which the estimation counts a band as delivered: the default,
+because an estimate must not depend on a setting that later commands may change."""
 
 
 @dataclass(frozen=True)
@@ -162,12 +167,10 @@ def _with_added_error(prediction: Prediction, error_px: float) -> Prediction:
     return replace(prediction, std_px=math.hypot(prediction.std_px, error_px))
 
 
-def bands_to_learn(
-    pairs: Sequence[BandPair], result: Alignments, rig: Rig, capture: Capture, accept_predicted_px: float
-) -> set[str]:
+def bands_to_learn(pairs: Sequence[BandPair], result: Alignments, rig: Rig, capture: Capture) -> set[str]:
     """Return the bands to learn from scratch if the flight's network did not align them.
 
-    Bands are skipped if the rig predicts them with a standard error of at most `accept_predicted_px`, or if they have
+    Bands are skipped if the rig predicts them with a standard error of at most DELIVERED_STD_PX, or if they have
     no structure in common with the reference, as over water. Learning helps, for example, in captures from a lower
     height than those of the flight's network.
     """
@@ -184,6 +187,6 @@ def bands_to_learn(
         prediction = predict_band(rig, pair.name, known)
         if not has_relief:
             prediction = _with_added_error(prediction, rig.parallax_px.get(pair.name, 0.0))
-        return not has_common_structure or prediction.std_px <= accept_predicted_px
+        return not has_common_structure or prediction.std_px <= DELIVERED_STD_PX
 
     return {pair.name for pair in pairs if not is_skipped(pair)}

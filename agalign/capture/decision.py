@@ -21,12 +21,11 @@ less certain or show another scene in a part of the image. An image that is rota
 not fit it: it has `failed`, and the rig does not replace it.
 """
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 from agalign.capture.by_relief import ReliefCandidates
-from agalign.capture.by_rig import RigPrediction
+from agalign.capture.by_rig import DELIVERED_STD_PX, RigPrediction
 from agalign.capture.candidate import BandCandidates, Candidate
 from agalign.values.alignment import STD_DECIMALS, Alignment, Alignments, Prediction
 from agalign.values.issues import OTHER_CONTENT, OTHER_GEOMETRY, SEED_DOES_NOT_FIT, UNEXPECTED_PX, UNREADABLE, Issue
@@ -37,28 +36,28 @@ def decide(
     bands: Sequence[BandCandidates],
     reliefs: Sequence[ReliefCandidates] = (),
     predictions: Mapping[str, RigPrediction] | None = None,
-    accept_predicted_px: float = math.inf,
+    delivered_std_px: float = DELIVERED_STD_PX,
 ) -> Alignments:
     """Return the alignments of the bands of a capture by name, px of the images.
 
     `predictions` are those of the rig by band; a predicted band is delivered with a standard error of at most
-    `accept_predicted_px`, px of the band.
+    `delivered_std_px`, px of the band.
     """
     predictions = predictions or {}
-    return _aligned(bands, _chosen_relief(bands, reliefs, predictions, accept_predicted_px), predictions)
+    return _aligned(bands, _chosen_relief(bands, reliefs, predictions, delivered_std_px), predictions)
 
 
 def _chosen_relief(
     bands: Sequence[BandCandidates],
     reliefs: Sequence[ReliefCandidates],
     predictions: Mapping[str, RigPrediction],
-    accept_predicted_px: float,
+    delivered_std_px: float,
 ) -> ReliefCandidates | None:
     """The relief of the capture; None if no relief fits half of the bands."""
     fitting = [relief for relief in reliefs if relief.fits_better]
 
     def delivered(relief: ReliefCandidates) -> int:
-        return sum(a.is_usable(accept_predicted_px) for a in _aligned(bands, relief, predictions).values())
+        return sum(a.is_usable(delivered_std_px) for a in _aligned(bands, relief, predictions).values())
 
     return max(fitting, key=delivered) if len(fitting) > 1 else next(iter(fitting), None)
 

@@ -222,7 +222,21 @@ def test_a_band_is_learned_from_scratch_if_its_prediction_is_not_usable(first: E
     lost = first.with_nir(issue=Issue(RETRIEVAL, 0.1, 0.2), seed=seed).estimation.decided()
     for parallax_px, names in ({}, set()), ({"NIR": 10.0}, {"NIR"}):
         rig = replace(model.rig, parallax_px=parallax_px)
-        assert bands_to_learn(first.pairs, lost, rig, first.capture, 1.0) == names
+        assert bands_to_learn(first.pairs, lost, rig, first.capture) == names
+
+
+def test_a_flight_that_nothing_can_be_learned_from_has_the_rig_of_the_given_model(
+    captures: Captures, model: FlightModel, tmp_path: Path
+) -> None:
+    water = captures[4]
+    copies = []
+    for number in range(3):
+        bands = tuple(
+            replace(b, path=Path(shutil.copy(b.path, tmp_path / f"{number}_{b.path.name}"))) for b in water.bands
+        )
+        copies.append(replace(water, bands=bands, name=f"{water.name}{number}", root=tmp_path, folder=Path()))
+    assert learned(copies) is None
+    assert learned(copies, model).rig is model.rig
 
 
 def test_a_rotated_band_is_not_predicted_by_the_rig(five: Path, model: FlightModel, tmp_path: Path) -> None:

@@ -219,8 +219,8 @@ class Together:
         default_factory=lambda: {n: BandCandidates(pair(n), SEED, None, [candidate(n)]) for n in ("Blue", "Red", "NIR")}
     )
 
-    def decided(self, *reliefs: ReliefCandidates, accept_predicted_px: float = np.inf) -> dict[str, Alignment]:
-        return decide(list(self.bands.values()), reliefs, None, accept_predicted_px)
+    def decided(self, *reliefs: ReliefCandidates, delivered_std_px: float = np.inf) -> dict[str, Alignment]:
+        return decide(list(self.bands.values()), reliefs, None, delivered_std_px)
 
 
 def relief_of(*names: str, gain_px: float = 0.0, predicted: Mapping[str, float] | None = None) -> ReliefCandidates:
@@ -263,7 +263,7 @@ def test_a_band_under_the_relief_is_predicted_with_the_error_of_the_relief() -> 
 
 
 @pytest.mark.parametrize(
-    ("first", "second", "accept_predicted_px", "chosen"),
+    ("first", "second", "delivered_std_px", "chosen"),
     [
         (("Blue",), ("Blue", "Red"), 0.0, 1),
         (("Blue", "Red"), ("Blue",), 0.0, 0),
@@ -274,17 +274,17 @@ def test_a_band_under_the_relief_is_predicted_with_the_error_of_the_relief() -> 
     ],
 )
 def test_of_two_reliefs_the_one_that_delivers_more_bands_is_that_of_all(
-    first: tuple[str, ...], second: tuple[str, ...], accept_predicted_px: float, chosen: int
+    first: tuple[str, ...], second: tuple[str, ...], delivered_std_px: float, chosen: int
 ) -> None:
     reliefs = [relief_of(*names) for names in (first, second)]
-    result = Together().decided(*reliefs, accept_predicted_px=accept_predicted_px)
+    result = Together().decided(*reliefs, delivered_std_px=delivered_std_px)
     used = {id(a.mapping.parallax.relief) for a in result.values() if a.mapping.parallax is not None}
     assert used == {id(c.mapping.parallax.relief) for c in reliefs[chosen].candidates.values()}
 
 
 def test_a_relief_that_fits_worse_is_no_option() -> None:
     """Even if it would deliver more bands."""
-    result = Together().decided(relief_of("Blue", "Red", "NIR", gain_px=-0.1), relief_of("Blue"), accept_predicted_px=0)
+    result = Together().decided(relief_of("Blue", "Red", "NIR", gain_px=-0.1), relief_of("Blue"), delivered_std_px=0)
     assert {name: a.geometry for name, a in result.items()} == {
         "Blue": "relief",
         "Red": "homography",
