@@ -127,10 +127,11 @@ class RunTotals:
             self.removed[reason].append(path)
         if report.state in ("panel", "sky"):
             self.asked.pop(report.label, None)
-        if report.result is None or report.path is None:
+        if report.result is None:
             return
         self.pairs.add(report.label, report.result)
-        self.written[report.label] = report.state, report.path, existing_files(report.path, report.result)
+        if report.path is not None:
+            self.written[report.label] = report.state, report.path, existing_files(report.path, report.result)
         output = report.result.output
         if output is not None and output.radiometry is not None:
             self.panel_ages_s[output.radiometry].append(output.panel_age_s)

@@ -300,6 +300,9 @@ class CameraIdentity:
     >>> camera = agalign.discover("flight").captures[0].camera
     >>> camera.name, camera.serial
     ('MicaSense RedEdge-M', 'SY01-0000001-AG')
+    >>> dual = type(camera).of("MicaSense", "RedEdge-MX", ["RX01", "RX02"])
+    >>> dual.serial, len(dual.serials)
+    ('RX01+RX02', 2)
     """
 
     make: Name = ""
