@@ -46,7 +46,7 @@ def title_of(folder: Path) -> str:
 
 ESTIMATOR = "config.py", "values", "pixels", "cameras", "fit", "method", "flight", "verify", "capture"
 """Modules and packages of agalign on which every figure depends."""
-RENDERING = "rasters", "indices"
+RENDERING = "rasters", "spectral_indices"
 """What figures of runs depend on as well."""
 DEPENDS_ON = {"runs": RENDERING, "captures with depth": RENDERING, "reliability": ("host", "batch", *RENDERING)}
 """Other packages on which the figures of a table depend."""
@@ -81,6 +81,7 @@ def digest_of(packages: Sequence[str]) -> str:
     found = hashlib.sha256()
     for top in packages:
         path = ROOT / "agalign" / top
+        assert path.exists(), f"{path}: a table depends on it"
         for file in sorted(path.rglob("*"), key=Path.as_posix) if path.is_dir() else [path]:
             if file.is_file() and file.suffix != ".pyc":
                 found.update(file.relative_to(ROOT).as_posix().encode() + b"\0")

@@ -48,7 +48,7 @@ TABLES = {
     "failures": ("synthetic pairs", "planted grids", "starts", "difficult captures", "predicted bands"),
     "comparison": (
         *("comparison, originals", "comparison, originals with tags", "comparison, degraded copies"),
-        *("public sets, originals", "public sets, degraded copies"),
+        "public sets, originals",
     ),
     "verification": ("reliability",),
 }
