@@ -54,7 +54,7 @@ def main() -> None:
             model = next((demo / "aligned" / "models").glob("*.safetensors"))
             options = "--relief", "never", "--radiometry", "auto", "--index", "ndvi", "--error-map"
             agalign("align", flight, "-o", damaged, "--model", model, *options, code=3)
-            save(screenshot(damaged, Path(folder) / "report.png"), "report.jpg", 42)
+            save(screenshot(damaged, Path(folder) / "report.png"), "report.jpg", 40)
 
 
 def agalign(*arguments: str | Path, code: int = 0) -> None:

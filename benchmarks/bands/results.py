@@ -27,7 +27,7 @@ class Result(Scored):
 
 
 def read_results(path: Path) -> list[Result]:
-    """Return the results of earlier runs; none if there is no such file."""
+    """Return the results of earlier runs, an empty list without a file."""
     if not path.is_file():
         return []
     kinds = {f.name: {"True": True, "False": False}.__getitem__ if f.type is bool else f.type for f in fields(Result)}
