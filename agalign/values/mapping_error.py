@@ -197,9 +197,9 @@ class MappingError:
     def _unmodelled_px2(self, points_px: Points, far: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return u^2 (n,): the expected squared shift at points that the mapping does not contain.
 
-        It is the median of the nearest windows, minus their noise, with the value of all windows as one more, so that a
-        single wrong peak does not count, even far from the others. It is shrunk towards the value of all windows, which
-        is used alone far from them.
+        It is the median of the nearest windows, minus their noise, so that a single wrong peak does not count. Where
+        one window has more weight than the others together, the value of all windows has the weight that they lack. It
+        is shrunk towards the value of all windows, which is used alone far from them.
         """
         measured = self._measured
         if measured is None:
@@ -214,8 +214,8 @@ class MappingError:
         of_all_px2 = math.log(2) * (all_px2 + np.median(noise_px2))
         near_squares = np.column_stack([squares[index], np.full(len(index), of_all_px2)])
         order = np.argsort(near_squares, axis=1)
-        weights = np.column_stack([weight, np.ones(len(index))])
-        cumulative = np.cumsum(np.take_along_axis(weights, order, axis=1), axis=1)
+        lacking = np.maximum(2.001 * weight.max(axis=1) - total, 0.0)  # a little more, so that it decides
+        cumulative = np.cumsum(np.take_along_axis(np.column_stack([weight, lacking]), order, axis=1), axis=1)
         middle = (cumulative >= cumulative[:, -1:] / 2).argmax(axis=1)[:, None]
         median_px2 = np.take_along_axis(near_squares, np.take_along_axis(order, middle, axis=1), axis=1)[:, 0]
         mean_noise_px2 = (weight * noise_px2[index]).sum(axis=1) / total
