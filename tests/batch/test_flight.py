@@ -126,6 +126,7 @@ def test_a_model_of_another_camera_or_of_no_use_is_refused(flight: Path, model: 
         run(flight, tmp_path / "out", alone, model=path)
 
 
+@pytest.mark.full
 def test_two_captures_at_a_time_give_the_same_numbers(flight: Path, aligned_flight: Path, tmp_path: Path) -> None:
     agalign.align_folder(flight, tmp_path, settings=SETTINGS, run=RunOptions(jobs=2))
     serial, parallel = (

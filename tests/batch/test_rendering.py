@@ -135,7 +135,10 @@ def alignments_of(run: Run, kind: str) -> dict[str, Alignment]:
 
 @pytest.mark.parametrize(
     ("kind", "crop"),
-    [("field", "none"), ("relief", "common"), in_full_run("field", "common"), in_full_run("relief", "none")],
+    [
+        ("relief", "common"),
+        *(in_full_run(*pair) for pair in (("field", "none"), ("field", "common"), ("relief", "none"))),
+    ],
 )
 def test_relief_and_field_are_rendered_on_another_grid(
     run: Run,

@@ -221,6 +221,7 @@ def test_occluded_pixels_are_detected(boxes: Rendered, aligned: Mapping[str, Ali
     assert (known & near_hidden).sum() > 0.7 * known.sum()
 
 
+@pytest.mark.full
 def test_parallax_along_a_line_needs_a_layout() -> None:
     """Edges of shadows and leaves move along a line too; with a layout it is that of the lenses."""
     x_m, size_px = {"Green": 0.0, "Blue": -0.03, "Red": 0.02, "NIR": -0.015}, (448, 336)
@@ -278,6 +279,7 @@ def test_bands_that_are_aligned_together_or_one_after_another_have_one_geometry(
     assert result["NIR"].prediction.source == "windows"
 
 
+@pytest.mark.full
 def test_the_relief_is_estimated_once_if_nothing_is_learned(
     candidates: Sequence[RefinedBand], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -383,7 +385,7 @@ def test_a_relief_does_not_verify_a_band_that_it_is_estimated_from(
     np.testing.assert_array_equal(result["NIR"].residual.shifts_px, aligned["NIR"].residual.shifts_px)
 
 
-@pytest.mark.parametrize(("uncertain_share", "status"), [(0.05, "aligned"), (0.3, "predicted")])
+@pytest.mark.parametrize(("uncertain_share", "status"), [in_full_run(0.05, "aligned"), (0.3, "predicted")])
 def test_no_band_is_aligned_whose_relief_is_uncertain_in_more_than_a_tenth_of_the_image(
     candidates: Sequence[RefinedBand], monkeypatch: pytest.MonkeyPatch, uncertain_share: float, status: str
 ) -> None:
@@ -440,6 +442,7 @@ def test_the_relief_follows_planes_that_its_windows_move() -> None:
     assert max(np.percentile(scene.error_px(name, a.mapping), 90) for name, a in result.items()) < 0.8
 
 
+@pytest.mark.full
 def test_the_sign_is_found_without_a_layout(boxes: Rendered, candidates: Sequence[RefinedBand]) -> None:
     """The sign follows from occlusions. The reference plane may differ from the one with a layout."""
     result = aligned_by_relief(without_layout(candidates), "auto")[0]
@@ -569,7 +572,7 @@ def test_a_band_of_another_time_is_predicted_under_the_relief_of_the_others(boxe
     assert all(np.median(boxes.error_px(name, result[name].mapping)) < 0.12 for name in ("Blue", "Red"))
 
 
-@pytest.mark.parametrize("kind", ["unrelated", "scrambled", in_full_run("noise")])
+@pytest.mark.parametrize("kind", ["unrelated", in_full_run("scrambled"), in_full_run("noise")])
 def test_unrelated_bands_are_not_aligned(boxes: Rendered, kind: str) -> None:
     images = {b.name: foreign(boxes.images[b.name], kind, n) for n, b in enumerate(MOVING)}
     assert aligned_by_relief(boxes.refined(images), "always")[0] == {}

@@ -225,6 +225,7 @@ def test_a_band_is_learned_from_scratch_if_its_prediction_is_not_usable(first: E
         assert bands_to_learn(first.pairs, lost, rig, first.capture) == names
 
 
+@pytest.mark.full
 def test_a_flight_that_nothing_can_be_learned_from_has_the_rig_of_the_given_model(
     captures: Captures, model: FlightModel, tmp_path: Path
 ) -> None:

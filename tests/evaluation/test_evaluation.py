@@ -237,6 +237,7 @@ def test_a_descriptor_learned_on_a_pair_beats_sift_with_reversed_contrast(tmp_pa
         assert agalign_here(command, table, *options).returncode == 2
 
 
+@pytest.mark.full
 def test_learn_writes_a_network_and_reports_its_pairs(tmp_path: Path) -> None:
     write_pair(tmp_path, TRUTH, 3)
     write_pair(tmp_path, turned(25.0), 4)

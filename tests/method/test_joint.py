@@ -41,7 +41,7 @@ def error_px(result: JointResult, truth: np.ndarray = TRUTH) -> float:
     return mean_error_px(result.fixed_to_moving, truth, 400, 320)
 
 
-@pytest.mark.parametrize("recipe", ["scratch", "fast"])
+@pytest.mark.parametrize("recipe", [in_full_run("scratch"), "fast"])
 def test_a_homography_is_recovered_through_reversed_contrast(recipe: Recipe) -> None:
     result = scratch(*two_views(TRUTH), NEAR, recipe=recipe)
     assert result.recipe == recipe

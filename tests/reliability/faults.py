@@ -626,7 +626,6 @@ USUAL = (
     Fault("an output inside the input", lambda s: setattr(s, "out", s.folder / "out")),
     Fault("overviews that describe other files", overviews_elsewhere),
     Fault("a sidecar that names files elsewhere", with_sidecar('"band_files": \\[\\]', _FILES_ELSEWHERE)),
-    Fault("a model of an earlier run, damaged", damaged_model),
     Fault("the lock of a killed run", held_by_a_killed_one),
     Fault("a pipe where a sidecar belongs", sidecar_is_a_pipe),
     Fault("a file system without locks", no_locks),
@@ -639,7 +638,6 @@ USUAL = (
         both(with_sidecar(_SECOND, _SECOND.replace("2", "99")), commanding("ndvi {out} --index gndvi")),
         "b.tif: has no band 99",
     ),
-    names_another("standard output full", standard_output_full, "standard output|output: No space left", code=1),
     loses_b("a TIFF cut short", edited(lambda data: data[: len(data) // 2]), r"b_nir\.tif: .*copy it from the card"),
     loses_b("half of a TIFF zeros", edited(lambda data: data[:2000] + bytes(len(data) - 2000)), "^b nir: "),
     loses_b("wrong magic", edited(lambda data: b"XX" + data[2:]), "b_nir.tif: is not a TIFF, JPEG or PNG"),
@@ -673,7 +671,6 @@ USUAL = (
     refused("a pipe for a model", given_model(os.mkfifo), r"m\.safetensors: .*not a regular file"),
     refused("one of GDAL's virtual paths", commanding("/vsizip/flight.zip -o {out}"), "virtual paths"),
     wrong_use("a random seed beyond 64 bits", asking("--rng-seed", "9" * 30), "--rng-seed: give"),
-    wrong_use("a torch device without data", asking("--device", "meta"), "device 'meta' cannot be used"),
     wrong_use("an empty name for the folder", commanding(" -o {out}"), "the name of the folder is empty"),
 )
 LONG = (
@@ -741,6 +738,9 @@ LONG = (
         both(many_files, when(lambda s: s.children()[1:], signalled(signal.SIGTERM, 0.3), "-j", "2")),
         code=143,
     ),
+    names_another("standard output full", standard_output_full, "standard output|output: No space left", code=1),
+    wrong_use("a torch device without data", asking("--device", "meta"), "device 'meta' cannot be used"),
+    Fault("a model of an earlier run, damaged", damaged_model),
 )
 """Only in the full tests, because they take long and others are like them."""
 FAULTS = USUAL + LONG

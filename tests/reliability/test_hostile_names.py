@@ -27,6 +27,7 @@ from agalign.records.sidecar_file import find_sidecars
 from agalign.spectral_indices.formulas import index_named
 from agalign.values.capture import Band, CameraIdentity, Capture
 
+from ..builders import in_full_run
 from ..conftest import Shared, read_json, seeded, write_signed
 from ..program import agalign_here
 
@@ -84,9 +85,9 @@ def files_in(folder: Path) -> set[Path]:
         "report {out}",
         "verify {out}",
         "indices {out} --index ndvi --formula con=(N-R)/(N+R)",
-        "indices {out} --index ndvi -o {new}",
+        in_full_run("indices {out} --index ndvi -o {new}"),
         "info {in} --json",
-        "evaluate {pairs} -m sift -o {new}.csv",
+        in_full_run("evaluate {pairs} -m sift -o {new}.csv"),
     ],
 )
 def test_every_writer_stays_in_its_folder(hostile_run: Path, tmp_path: Path, command: str) -> None:
