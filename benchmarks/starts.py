@@ -138,16 +138,16 @@ def main(
 def draw(shares: Shares, path: Path) -> None:
     """Draw a heat map per method: share of successes by rotation, shift and scale."""
     across = [(s, 1.0) for s in SHIFTS] + [(0.0, s) for s in SCALES]
-    labels = [f"{shift:.0%}" for shift in SHIFTS] + [f"x{scale:g}" for scale in SCALES]
+    labels = [f"{100 * shift:g}" for shift in SHIFTS] + [f"x{scale:g}" for scale in SCALES]
     size = 5.4 * len(shares), 3.6
     figure, axes = pyplot().subplots(1, len(shares), figsize=size, sharey=True, squeeze=False)
     for axis, (name, result) in zip(axes[0], shares.items(), strict=True):
         table = np.array([[result[shift, turn, scale] for shift, scale in across] for turn in TURNS])
         image = heat_map(axis, table, [f"{turn:g}°" for turn in TURNS], labels, cmap="RdYlGn")
         axis.axvline(len(SHIFTS) - 0.5, color="white", linewidth=3)
-        axis.set(title=name, xlabel="shift of the width        scale")
-    axes[0, 0].set_ylabel("turn")
-    figure.colorbar(image, ax=axes[0].tolist(), label="found within 0.3 px")
+        axis.set(title=name, xlabel="shift, % of the width        size, x")
+    axes[0, 0].set_ylabel("rotation of the moving band")
+    figure.colorbar(image, ax=axes[0].tolist(), label=f"share of pairs with a\nmedian error up to {FOUND_PX:g} px")
     figure.savefig(path, dpi=110, bbox_inches="tight")
 
 
