@@ -69,7 +69,7 @@ def main(picture: Annotated[Path, typer.Argument()] = Path("docs/figures/relief.
     for name in ("reference", "relief"):
         axes[name].add_patch(plt.Rectangle(corner, *size, fill=False, edgecolor="#ff4d4d", linewidth=1.6))
     figure.savefig(picture, dpi=100)
-    Image.open(picture).convert("RGB").quantize(128).save(picture, optimize=True)  # a third of the size
+    Image.open(picture).convert("RGB").quantize(256).save(picture, optimize=True)  # a third of the size
 
 
 if __name__ == "__main__":
