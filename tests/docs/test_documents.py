@@ -82,6 +82,11 @@ def originals(shared: Shared, flight: Path) -> Path:
             np.savetxt(folder / f"{number}.txt", MOVEMENT)
         (folder / "pairs.csv").write_text("fixed,moving,homography\n1a.png,1b.png,1.txt\n2a.png,2b.png,2.txt\n")
         write_ndvi_and_plots(folder)
+        for side, name in zip("ab", ("green", "nir"), strict=True):
+            cv2.imwrite(str(folder / f"{name}.tif"), cv2.imread(str(folder / f"1{side}.png"), cv2.IMREAD_UNCHANGED))
+        points = geometry.lattice(240, 200, 9, 7)
+        ties = np.hstack([points, geometry.apply(MOVEMENT, points)])
+        np.savetxt(folder / "ties.csv", ties, delimiter=",", header="fixed_x,fixed_y,moving_x,moving_y", comments="")
         for name in ("examples", "benchmarks"):
             (folder / name).symlink_to(ROOT / name)
         if REAL_DATA.is_dir():
@@ -190,6 +195,8 @@ EXAMPLES = {
     "ndvi_over_a_flight.py": ("aligned", " at 52.", 2),
     "next_flight.py": ("flight flight next", "4 of 4 aligned", 2),
     "on_dask.py": ("flight dask", " done ", 2),
+    "plots.py": ("plots.gpkg ndvi.tif", "", 1),
+    "compare_pair.py": ("green.tif nir.tif ties.csv", "agalign, aligned: median error 0.", 1),
     "two_dates.py": ("spring.tif summer.tif change.tif", "offset before alignment: ", 1),
     "warp_matrices.py": ("aligned/0000SET/000/IMG_0001.json", "_warp_matrices_opencv.npy: 5 bands", 1),
 }
@@ -253,13 +260,32 @@ def test_the_recipe_for_plots_has_a_row_of_any_outline(
     """Rasters of single captures are rotated: resampled, their plots have the same values, up to pixels at an edge."""
     monkeypatch.chdir(tmp_path)
     write_ndvi_and_plots(tmp_path, rotation_deg)
-    text = next(b.text for b in blocks_of(ROOT / "docs" / "how-to" / "plots.md") if "# plots.py" in b.text)
-    run_python(text)
+    monkeypatch.setattr(sys, "argv", ["plots.py", "plots.gpkg", "ndvi.tif"])
+    runpy.run_path(str(ROOT / "examples" / "plots.py"))
     rows = list(csv.DictReader(Path("plots.csv").read_text(encoding="utf-8").splitlines()))
     assert [row["plot"] for row in rows] == ["A1", "", "edge", "bow tie"]
     tolerance = 0.1 if rotation_deg == 0 else 1
     assert [float(row["count"]) for row in rows] == pytest.approx([400, 400, 200, 150], abs=tolerance)
     assert [float(row["mean"]) for row in rows] == pytest.approx([0.5, 0.8, 0.5, 0.8], abs=1e-6)
+    shares = [float(row["valid_share"]) for row in rows]
+    assert shares == pytest.approx([1, 1, 0.5, 1], abs=0.01 if rotation_deg == 0 else 0.03)
+
+
+def test_the_recipe_for_plots_uses_the_raster_that_shows_most_then_the_nearest(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Three overlapping rasters: the first shows half of the plot, the second all, the third all and in its middle."""
+    monkeypatch.chdir(tmp_path)
+    write_ndvi_and_plots(tmp_path)
+    for number, first_column in enumerate((-70, 10, -25), start=1):
+        ndvi = np.full((60, 100), number / 10, np.float32)
+        transform = Affine.translation(500_000 + first_column / 10, 4_000_000) @ Affine.scale(0.1, -0.1)
+        write_band(tmp_path / f"{number}.tif", ndvi, nodata=np.nan, crs="EPSG:32633", transform=transform)
+    monkeypatch.setattr(sys, "argv", ["plots.py", "plots.gpkg", "1.tif", "2.tif", "3.tif"])
+    runpy.run_path(str(ROOT / "examples" / "plots.py"))
+    row = next(csv.DictReader(Path("plots.csv").read_text(encoding="utf-8").splitlines()))
+    assert (row["raster"], row["captures"], row["plot"]) == ("3.tif", "3", "A1")
+    assert float(row["mean"]) == pytest.approx(0.3)
 
 
 def test_the_line_that_chooses_a_day(flight: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
