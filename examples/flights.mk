@@ -4,6 +4,7 @@
 #
 #     make -f examples/flights.mk FLIGHTS=season OUT=aligned
 #
+# On a Dask cluster: OPTIONS='--radiometry auto --qa --dask tcp://SCHEDULER:8786'.
 FLIGHTS ?= flights
 OUT ?= aligned
 OPTIONS ?= --radiometry auto --qa

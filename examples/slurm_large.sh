@@ -4,12 +4,16 @@
 #
 #     FLIGHT=/data/flight OUT=/data/aligned sbatch examples/slurm_large.sh
 #
+# OPTIONS replaces the options '--radiometry auto --qa'.
+#
 #SBATCH --ntasks=64 --cpus-per-task=1 --mem-per-cpu=3G --time=12:00:00
 . /data/agalign/env/bin/activate    # with '.[dask]', on a file system that all nodes have
 address=tcp://$(hostname):8786
 dask scheduler --port 8786 &
 srun dask worker "$address" --nthreads 1 --no-dashboard &
-agalign "$FLIGHT" -o "$OUT" --dask "$address"
+# shellcheck disable=SC2086  # OPTIONS are several words
+agalign "$FLIGHT" -o "$OUT" --dask "$address" ${OPTIONS:---radiometry auto --qa}
 code=$?
+case $code in 0 | 3) agalign indices "$OUT" --index ndvi --mask-qa --dask "$address" ;; esac
 kill %1 %2
 exit $code
