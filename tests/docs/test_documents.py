@@ -9,7 +9,6 @@ import subprocess
 import sys
 import warnings
 from collections.abc import Sequence
-from datetime import datetime
 from pathlib import Path
 from typing import Any
 
@@ -195,6 +194,8 @@ EXAMPLES = {
     "ndvi_over_a_flight.py": ("aligned", " at 52.", 2),
     "next_flight.py": ("flight flight next", "4 of 4 aligned", 2),
     "on_dask.py": ("flight dask", " done ", 2),
+    "map_pixels.py": ("aligned/0000SET/000/IMG_0001.json NIR 100 80", "NIR: [", 1),
+    "water.py": ("aligned/0000SET/000/IMG_0001.tif water.tif 0.05", " are water", 1),
     "plots.py": ("plots.gpkg ndvi.tif", "", 1),
     "compare_pair.py": ("green.tif nir.tif ties.csv", "agalign, aligned: median error 0.", 1),
     "two_dates.py": ("spring.tif summer.tif change.tif", "offset before alignment: ", 1),
@@ -288,18 +289,6 @@ def test_the_recipe_for_plots_uses_the_raster_that_shows_most_then_the_nearest(
     assert float(row["mean"]) == pytest.approx(0.3)
 
 
-def test_the_line_that_chooses_a_day(flight: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
-    for path in Path(shutil.copytree(flight, "flight")).rglob("*.tif"):
-        day = "2026-06-21" if "IMG_0001" in path.name else "2026-06-22"
-        seconds = datetime.fromisoformat(f"{day}T10:00").timestamp()
-        os.utime(path, (seconds, seconds))
-    blocks = blocks_of(ROOT / "docs" / "how-to" / "choose-captures.md")
-    run_command(next(b.text for b in blocks if "-newermt" in b.text), "choose-captures.md")
-    chosen = [path.relative_to("day").as_posix() for path in sorted(Path("day").rglob("*.tif"))]
-    assert chosen == [f"0000SET/000/IMG_0001_{number}.tif" for number in range(1, 6)]
-
-
 def test_the_recipe_for_water_masks_sun_glint_and_the_shore(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     bands = np.full((2, 20, 30), 0.02, np.float32)  # water
@@ -309,7 +298,8 @@ def test_the_recipe_for_water_masks_sun_glint_and_the_shore(tmp_path: Path, monk
     write_band(stack, bands, nodata=np.nan)
     with rasterio.open(stack, "r+") as raster:
         raster.descriptions = "Green", "NIR"
-    run_python(next(b.text for b in blocks_of(ROOT / "docs" / "how-to" / "reflectance.md") if "# water.py" in b.text))
+    monkeypatch.setattr(sys, "argv", ["water.py", str(stack), "water.tif", "0.05"])
+    runpy.run_path(str(ROOT / "examples" / "water.py"))
     with rasterio.open("water.tif") as water:
         result = water.read()
     expected = np.where(bands[1] < 0.05, bands, np.nan)

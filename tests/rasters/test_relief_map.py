@@ -1,5 +1,6 @@
 """What is written of a capture with a relief: the rasters, the sidecar and the dataset, from the true geometry."""
 
+import runpy
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -35,7 +36,7 @@ from agalign.values.pixel_units import PixelScale
 
 from ..builders import residual_of
 from ..conftest import read_json
-from ..docs.blocks import ROOT, blocks_of
+from ..docs.blocks import ROOT
 from ..run_outputs import aligned
 
 SIZE = 240, 180
@@ -170,11 +171,8 @@ def test_without_a_relief_nothing_is_written(run: Run, tmp_path: Path) -> None:
 
 
 def documented_reader() -> Callable[..., np.ndarray]:
-    """`mapped` in docs/how-to/python.md."""
-    (block,) = (b for b in blocks_of(ROOT / "docs" / "how-to" / "python.md") if "def mapped(" in b.text)
-    names: dict[str, Any] = {}
-    exec(block.text, names)
-    reader: Callable[..., np.ndarray] = names["mapped"]
+    """`mapped` in examples/map_pixels.py."""
+    reader: Callable[..., np.ndarray] = runpy.run_path(str(ROOT / "examples" / "map_pixels.py"))["mapped"]
     return reader
 
 
