@@ -299,7 +299,8 @@ def test_the_recipe_for_water_masks_sun_glint_and_the_shore(tmp_path: Path, monk
     with rasterio.open(stack, "r+") as raster:
         raster.descriptions = "Green", "NIR"
     monkeypatch.setattr(sys, "argv", ["water.py", str(stack), "water.tif", "0.05"])
-    runpy.run_path(str(ROOT / "examples" / "water.py"))
+    with warnings.catch_warnings(action="ignore"):
+        runpy.run_path(str(ROOT / "examples" / "water.py"))
     with rasterio.open("water.tif") as water:
         result = water.read()
     expected = np.where(bands[1] < 0.05, bands, np.nan)
