@@ -38,6 +38,8 @@ html_title = f"agalign {__version__}"
 
 ROOT_PAGES = {"../CONTRIBUTING.md": "project/contributing.md", "../CHANGELOG.md": "project/changelog.md"}
 """Pages that are outside of docs/, and the pages that include them on the site and link to them on GitHub."""
+OUTSIDE_PAGE = re.compile(r"\[([^\]]+)\]\((?:\.\./)+(benchmarks/[\w/]+\.md)(?:#[\w-]+)?\)")
+"""Link to a page of the repository that is not on the site, which then names its file."""
 
 
 def add_navigation(_app: Sphinx, page: str, source: list[str]) -> None:
@@ -45,6 +47,7 @@ def add_navigation(_app: Sphinx, page: str, source: list[str]) -> None:
 
     GitHub would show a toctree or include as a raw block.
     """
+    source[0] = OUTSIDE_PAGE.sub(r"\1 (`\2`)", source[0])
     for path, included_by in ROOT_PAGES.items():
         if included_by == f"{page}.md":
             source[0] = f"```{{include}} ../{path}\n:relative-docs: docs/\n:relative-images:\n```\n"
