@@ -138,13 +138,21 @@ def _run_selected(run: "_FlightRun", selection: Selection) -> Iterator[CaptureRe
             raise OutputError(f"{out}: {what}; the same command writes them again")
 
 
-def plan_run(flight: FolderScan, out: Path, settings: Settings, options: RunOptions | None = None) -> dict[str, str]:
+def plan_run(
+    flight: FolderScan,
+    out: Path,
+    settings: Settings,
+    options: RunOptions | None = None,
+    model: Path | None = None,
+) -> dict[str, str]:
     """Return what `run_flight` would do with each capture, by label. Writes nothing.
 
-    Raises ConfigurationError like `run_flight` does.
+    Raises InputError and ConfigurationError like `run_flight` does.
     """
     run = _FlightRun(flight, out, settings, options or RunOptions())
     run.check()
+    if model is not None:
+        run = run.starting_from(model)
     selection = select_captures(run.flight, run.settings.write, run.options)
     states = dict(selection.abandoned) | {s.capture.label: "left out as sky" for s in selection.sky}
     states |= {p.capture.label: "read as calibration panels" for p in selection.panels if p.capture.is_of_a_panel}

@@ -66,7 +66,7 @@ def _align(
     if settings.write.indices and settings.write.radiometry == "off" and raw_numbers:
         terminal.problem(RAW_NUMBERS)
     if dry_run:
-        return print_plan(flight, target, settings, options, terminal)
+        return print_plan(flight, target, settings, options, terminal, model)
     return conclude(run(flight, target, settings, terminal, options, dask=dask, model=model), target, terminal)
 
 

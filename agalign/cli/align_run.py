@@ -83,11 +83,13 @@ def print_problems(flight: FolderScan, terminal: Terminal) -> None:
             terminal.problem(f"{flight.folder}: {same}; 'agalign info --json' lists all")
 
 
-def print_plan(flight: FolderScan, out: Path, settings: Settings, options: RunOptions, terminal: Terminal) -> int:
+def print_plan(
+    flight: FolderScan, out: Path, settings: Settings, options: RunOptions, terminal: Terminal, model: Path | None
+) -> int:
     """Print what a run would do with each capture; return the exit code."""
     from agalign.batch.run import plan_run
 
-    states = plan_run(flight, out, settings, options)
+    states = plan_run(flight, out, settings, options, model)
     for camera in camera_overviews(flight.captures):
         terminal.result(camera.text)
     counts = Counter(states.values())

@@ -269,3 +269,12 @@ def test_a_run_fails_if_its_output_folder_is_removed(
     assert totals.states == {"error": 2}
     record = read_json(out / "agalign-run.json")
     assert (record["captures"], record["pairs"], record["refused"]) == ({"found": 2, "error": 2}, {}, [])
+
+
+def test_a_plan_knows_that_a_given_model_estimates_everything_again(
+    flight: Path, aligned_flight: Path, model_path: Path
+) -> None:
+    scan = agalign.discover(flight)
+    assert {*plan_run(scan, aligned_flight, agalign.Settings()).values()} == {"kept from an earlier run"}
+    plan = plan_run(scan, aligned_flight, agalign.Settings(), model=model_path)
+    assert {*plan.values()} == {"to be estimated again; changed since: --model"}
