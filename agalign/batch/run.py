@@ -139,11 +139,7 @@ def _run_selected(run: "_FlightRun", selection: Selection) -> Iterator[CaptureRe
 
 
 def plan_run(
-    flight: FolderScan,
-    out: Path,
-    settings: Settings,
-    options: RunOptions | None = None,
-    model: Path | None = None,
+    flight: FolderScan, out: Path, settings: Settings, options: RunOptions | None = None, model: Path | None = None
 ) -> dict[str, str]:
     """Return what `run_flight` would do with each capture, by label. Writes nothing.
 
