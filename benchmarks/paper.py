@@ -1,14 +1,13 @@
 """The paper's experiments on a folder of aerial RGB/NIR pairs (VIS_1.png, NIR_TF_1.png, GT_1.txt ...): files for
-`agalign evaluate` and `agalign learn`, long evaluations in pieces, and a plot of their results.
+`agalign evaluate` and `agalign learn`, and long evaluations in pieces.
 
     python benchmarks/paper.py NIR-VIS-RS/Dataset/Aerial
     python benchmarks/paper.py pairs.csv --pieces FOLDER --jobs 2 -m paper:pseudo-siamese --shift 5
-    python benchmarks/paper.py RESULTS.csv... --plot robustness.png
 
 The first writes to the current folder: pairs.csv with the pairs, learn.csv with 20 of them and homographies 5 %
 off, and test.csv with the others. The second runs `agalign evaluate` with the options given for each pair alone, in
 --jobs processes, and prints its table for all pairs; results are files in FOLDER, and those which are there are not
-computed again. The third draws results: a line for each method of each file or folder.
+computed again.
 
 The tables of docs/explanation/paper.md:
 
@@ -20,7 +19,6 @@ The tables of docs/explanation/paper.md:
     agalign evaluate pairs.csv -m fast:pseudo-siamese $S -o alone.csv     # convergence; also with --seeding
     agalign evaluate pairs.csv -m elastix $S -o elastix.csv
     python benchmarks/paper.py pairs.csv --pieces paper-5 --jobs 2 -m paper:pseudo-siamese --shift 5   # 42 minutes
-    python benchmarks/paper.py alone.csv elastix.csv paper-5 --plot robustness.png
     agalign learn learn.csv -o net.safetensors                            # without labels; also --sharing siamese
     agalign evaluate test.csv -m net.safetensors -m sift
 """
@@ -29,14 +27,13 @@ import csv
 import random
 import subprocess
 import sys
-from collections import defaultdict
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import fields
 from pathlib import Path
 
 import numpy as np
 from bands.score import table
-from common import pyplot, run
+from common import run
 
 from agalign.evaluation.evaluate import Result, Starts, error_table
 from agalign.evaluation.image_pairs import read_image
@@ -80,39 +77,13 @@ def evaluate(pairs: Path, pieces: Path, jobs: int, options: list[str]) -> None:
 
     with ThreadPoolExecutor(jobs) as executor:
         list(executor.map(one, csv.DictReader(pairs.read_text(encoding="utf-8").splitlines())))
-    results = [Result(**{f.name: f.type(row[f.name]) for f in fields(Result)}) for row in rows_of(pieces)]
+    rows = [row for file in sorted(pieces.glob("*.csv")) for row in csv.DictReader(file.open(encoding="utf-8"))]
+    results = [Result(**{f.name: f.type(row[f.name]) for f in fields(Result)}) for row in rows]
     print(table(error_table(results)))
 
 
-def rows_of(results: Path) -> list[dict[str, str]]:
-    """Read the results of a file or folder."""
-    files = sorted(results.glob("*.csv")) if results.is_dir() else [results]
-    return [row for file in files for row in csv.DictReader(file.read_text(encoding="utf-8").splitlines())]
-
-
-def draw(results: list[Path], path: Path) -> None:
-    """Draw mean homography error and mAP over the start's error."""
-    figure, axes = pyplot().subplots(1, 2, figsize=(9, 3.6), layout="constrained")
-    lines = defaultdict[str, list[dict[str, str]]](list)
-    for result in results:
-        for row in rows_of(result):
-            lines[f"{row['method']}, {result.stem}"].append(row)
-    for name, rows in lines.items():
-        names = "shift", "error_share", "average_precision"
-        shift, error, precision = np.array([[float(row[field]) for field in names] for row in rows]).T
-        shifts = np.unique(shift)
-        for axis, values in zip(axes, (100 * error, precision), strict=True):
-            axis.plot(100 * shifts, [values[shift == s].mean() for s in shifts], marker="o", label=name)
-    axes[0].set(xlabel="start off by, % of the side", ylabel="mean homography error, % of the side")
-    axes[1].set(xlabel="start off by, % of the side", ylabel="mAP", ylim=(0, 1))
-    axes[0].legend(frameon=False)
-    figure.savefig(path, dpi=110)
-
-
-def main(paths: list[str], plot: Path | None = None, pieces: Path | None = None, jobs: int = 1) -> None:
-    if plot:
-        draw([Path(path) for path in paths], plot)
-    elif pieces:
+def main(paths: list[str], pieces: Path | None = None, jobs: int = 1) -> None:
+    if pieces:
         evaluate(Path(paths[0]), pieces, jobs, paths[1:])
     else:
         write_pairs(Path(paths[0]))

@@ -1,11 +1,11 @@
 """Success of methods by initial shift, rotation and scale of the moving band, without tags.
 
-    pip install -e '.[bench]' && python benchmarks/starts.py DATA... [--pairs 3] [--plot FILE] [--figures]
+    pip install -e '.[bench]' && python benchmarks/starts.py DATA... [--pairs 3] [--figures]
 
 DATA holds flights with `ties.json` or `truth.json` (benchmarks/accuracy.py says how); of each, and of a synthetic
 flight, so many pairs are taken. The moving band is shifted within its frame by a share of its width, then turned and
 scaled about its centre on a canvas that holds all of it. A pair is found where the median error is at most 0.3 px of
-the moving file. Prints a table, and draws a heat map.
+the moving file.
 """
 
 import tempfile
@@ -16,7 +16,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 from bands import images
-from common import WRONG_PX, cell, heat_map, print_head, print_row, pyplot, read_ties, run, timed
+from common import WRONG_PX, cell, print_head, print_row, read_ties, run, timed
 from figures_csv import FiguresOption, TableRow, write_figures
 from numpy.typing import NDArray
 from peers import elastix, sift
@@ -33,8 +33,6 @@ from agalign.values.image import Raster
 FOUND_PX = 0.3
 SHIFTS, TURNS, SCALES = (0.0, 0.1, 0.2, 0.25), (0.0, 3.0, 10.0, 45.0, 90.0, 180.0), (0.5, 0.8, 1.25, 2.0)
 STARTS = [(shift, turn, 1.0) for turn in TURNS for shift in SHIFTS] + [(0.0, turn, s) for s in SCALES for turn in TURNS]
-Shares = dict[str, dict[tuple[float, float, float], float]]
-"""Share of successes by method and start."""
 Aligner = Callable[[Raster, Raster], tuple[Matrix | None, bool]]
 """Maps a pair to (fixed_to_moving, whether the method accepts its result)."""
 
@@ -96,22 +94,14 @@ def chosen(folder: Path, count: int) -> Iterator[tuple[Raster, Raster, NDArray[n
         yield fixed, moving, np.hstack(ties)
 
 
-def main(
-    data: list[Path],
-    pairs: int = 3,
-    methods: str = ";".join(METHODS),
-    plot: Path | None = None,
-    *,
-    figures: FiguresOption = False,
-) -> None:
-    shares: Shares = {name: {} for name in methods.split(";")}
-    counts = {name: np.zeros(3, int) for name in shares}
+def main(data: list[Path], pairs: int = 3, methods: str = ";".join(METHODS), *, figures: FiguresOption = False) -> None:
+    counts = {name: np.zeros(3, int) for name in methods.split(";")}
     kind = "method", "shift", "turn", "scale"
     print_head(*kind, "found", "median, px", "worst sure, px", "wrong though sure", "s")
     with tempfile.TemporaryDirectory() as folder:
         synthetic.make_flight(Path(folder), captures=2, rng_seed=11)
         tried = [pair for flight in (*data, Path(folder)) for pair in chosen(flight, pairs)]
-    for start, (name, of_method) in product(STARTS, shares.items()):
+    for start, name in product(STARTS, counts):
         rows = []
         for fixed, moving, ties in tried:
             image, to_moved = moved(moving, *start)
@@ -119,13 +109,10 @@ def main(
             rows.append((error_px(ties, to_moved, result), is_sure, seconds))
         off, sure, seconds = map(np.array, zip(*rows, strict=True))
         hit = off <= FOUND_PX
-        of_method[start] = float(hit.mean())
         counts[name] += len(hit), hit.sum(), (sure & (off > WRONG_PX)).sum()
         errors = cell(off, ".3f"), cell(off[sure], ".2f", np.max), (sure & (off > WRONG_PX)).sum(), cell(seconds, ".1f")
         moved_by = f"{start[0]:.0%}", f"{start[1]:g}°", f"{start[2]:g}"
         print_row(name, *moved_by, f"{hit.sum()} of {len(hit)}", *errors)
-    if plot is not None:
-        draw(shares, plot)
     if figures:
         heads = f"median error up to {FOUND_PX:g} px", f"wrong by more than {WRONG_PX:g} px"
         rows = [
@@ -133,22 +120,6 @@ def main(
             for name, (n, *found_and_wrong) in counts.items()
         ]
         write_figures(rows, "DATA/", data)
-
-
-def draw(shares: Shares, path: Path) -> None:
-    """Draw a heat map per method: share of successes by rotation, shift and scale."""
-    across = [(s, 1.0) for s in SHIFTS] + [(0.0, s) for s in SCALES]
-    labels = [f"{100 * shift:g}" for shift in SHIFTS] + [f"x{scale:g}" for scale in SCALES]
-    size = 5.4 * len(shares), 3.6
-    figure, axes = pyplot().subplots(1, len(shares), figsize=size, sharey=True, squeeze=False)
-    for axis, (name, result) in zip(axes[0], shares.items(), strict=True):
-        table = np.array([[result[shift, turn, scale] for shift, scale in across] for turn in TURNS])
-        image = heat_map(axis, table, [f"{turn:g}°" for turn in TURNS], labels, cmap="RdYlGn")
-        axis.axvline(len(SHIFTS) - 0.5, color="white", linewidth=3)
-        axis.set(title=name, xlabel="shift, % of the width        size, x")
-    axes[0, 0].set_ylabel("rotation of the moving band")
-    figure.colorbar(image, ax=axes[0].tolist(), label=f"share of pairs with a\nmedian error up to {FOUND_PX:g} px")
-    figure.savefig(path, dpi=110, bbox_inches="tight")
 
 
 if __name__ == "__main__":
