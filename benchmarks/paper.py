@@ -77,7 +77,9 @@ def evaluate(pairs: Path, pieces: Path, jobs: int, options: list[str]) -> None:
 
     with ThreadPoolExecutor(jobs) as executor:
         list(executor.map(one, csv.DictReader(pairs.read_text(encoding="utf-8").splitlines())))
-    rows = [row for file in sorted(pieces.glob("*.csv")) for row in csv.DictReader(file.open(encoding="utf-8"))]
+    rows = [
+        row for file in sorted(pieces.glob("*.csv")) for row in csv.DictReader(file.read_text("utf-8").splitlines())
+    ]
     results = [Result(**{f.name: f.type(row[f.name]) for f in fields(Result)}) for row in rows]
     print(table(error_table(results)))
 
