@@ -35,7 +35,7 @@ class CaptureReport:
     """Folder and number of the capture, as 0000SET/000/IMG_0001."""
     state: Literal["done", "kept", "error", "panel", "sky"]
     """`done`: processed in this run. `kept`: an earlier run with the same settings has finished the capture. `error`:
-    there is no result. `panel`, `sky`: not aligned, as it shows a calibration panel or the sky.
+    there is no result. `panel`, `sky`: the capture shows a calibration panel or the sky, and is not aligned.
     """
     result: Sidecar | None = field(default=None, repr=False)
     """Content of the sidecar without its long tables; None for a capture with an `error`."""

@@ -93,7 +93,7 @@ def _arrows(rig: Rig, band: str) -> tuple[tuple[float, float, float, float], ...
 
 def hues_of(bands: Sequence[str]) -> dict[str, float]:
     """Return the hue of each band, degrees: that of its colour by its name; each of the others, and each further band
-    of the same colour, gets one that is still free.
+    of the same colour, gets an unused colour.
     """
     hues: dict[str, float] = {}
     free = cycle(_FREE_HUES)

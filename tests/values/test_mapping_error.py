@@ -76,6 +76,13 @@ def test_a_single_wrong_peak_is_no_error_and_noise_is_subtracted() -> None:
     assert np.median(known.error_px(centres_px)) < 0.6
 
 
+def test_the_other_windows_do_not_lower_the_error_where_most_of_the_near_ones_agree() -> None:
+    centres_px = grid_px(50 + 100 * np.arange(7), 50 + 100 * np.arange(4))
+    shifts_px = np.zeros_like(centres_px)
+    shifts_px[[12, 13, 19, 20]] = 3.0, 0.0  # a square: windows in columns 5 and 6 of rows 1 and 2
+    assert expected_px(error_of([0.01] * 4, residual_of(centres_px, shifts_px)), 560.0, 160.0) > 2.0
+
+
 def test_a_prediction_by_others_has_its_standard_error_everywhere() -> None:
     predicted = MappingError(SIZE, rig_std_px=0.4)
     np.testing.assert_allclose(predicted.error_px(PIXELS[::997]), 0.4)
