@@ -165,7 +165,8 @@ def main(flights: list[str], captures: int = 0, rng_seed: int = 0, *, figures: F
             truth = common.read_ties(make(flight, captures=count, rng_seed=rng_seed))
             seconds = common.align(flight, out, "--with-rgb")
             bands = common.band_errors(out, truth)
-            print(f"\n{name}: {len(bands)} of {len(truth)} bands written, {seconds / count:.1f} s a capture\n")
+            mapped = len({band.part.file for band in bands})
+            print(f"\n{name}: {mapped} of {len(truth)} files have a mapping, {seconds / count:.1f} s a capture\n")
             has_faults = any(entry["trouble"] for entry in truth.values())
             common.print_errors(by_fault(bands, truth) if has_faults else by_band(bands, camera))
             if name == "plain":

@@ -33,12 +33,12 @@ _KNOWN: Sequence[tuple[str, KnownBands]] = (
 """(regular expression of the beginning of EXIF's model, bands) of the cameras with a file for each band."""
 
 _SIZES_PX = (
-    *(("M3M", ((2592, 1944),)), ("FC6360", ((1600, 1300),)), ("Sequoia", ((1280, 960),))),
+    *(("M3M", ((2592, 1944), (5280, 3956))), ("FC6360", ((1600, 1300),)), ("Sequoia", ((1280, 960),))),
     *(("RedEdge-P", ((1456, 1088), (2464, 2056))), ("RedEdge(?!-P)", ((1280, 960),))),
     *(("Altum$", ((2064, 1544), (160, 120))), ("Altum-PT", ((2064, 1544), (4112, 3008), (320, 256)))),
 )
 """(regular expression of the beginning of EXIF's model, (width, height) of its images): those of the bands, then of the
-panchromatic and the thermal one.
+panchromatic, the thermal one, and the photograph.
 """
 _RAW_STEPS = (("RedEdge(?!-P)", 16), ("FC6360", 64), ("Sequoia", 64))
 """(regular expression of the beginning of EXIF's model, common divisor of the raw numbers in 16 bits): sensors of 12

@@ -93,7 +93,7 @@ def missing_for_footprint(capture: Capture) -> str:
 
 
 def above_elevation(capture: Capture, ground_elevation_m: float) -> Capture:
-    """Return the capture with the height above ground of this elevation, if neither tags nor a panel give a height."""
+    """Return the capture with the height above ground of this elevation, if its tags give none."""
     return _with_height(capture, ground_elevation_m, math.inf, "ground elevation")
 
 

@@ -510,8 +510,8 @@ class Sidecar(_Part):
     camera: CameraIdentity
     """The camera."""
     status: CaptureStatus
-    """`ok`: all bands exist, `aligned`, or `predicted` within `accept_predicted_px`. `failed`: all moving bands are.
-    Else `degraded`."""
+    """`ok`: all bands exist, from complete files, and are `aligned`, or `predicted` within `accept_predicted_px`.
+    `failed`: all moving bands are. Else `degraded`."""
     missing_bands: list[Name]
     """Bands that the capture lacks."""
     unreadable_bands: dict[Name, Message] = {}

@@ -237,6 +237,9 @@ def write_tiff(
     tags = {271: text(camera.maker), 272: text(camera.model), 306: moment, 700: byte_string(xmp.encode())}
     of_exif = {0x9003: moment, 0x920A: rational(band.focal_length_mm), 0xA20E: density, 0xA20F: density}
     of_exif |= {0xA210: short(4), 0xA431: text(serial)}
+    if band.size_ratio != (1.0, 1.0):  # half of the pixels of the Altum-PT's Pan are about those of its other bands
+        height, width = pixels.shape
+        of_exif |= {0xA002: short(width), 0xA003: short(height)}
     place = {1: text("N"), 2: _degrees(52.0 + pose.north_m / 111_320), 3: text("E")}
     place |= {4: _degrees(5.0 + pose.east_m / 68_500), 5: byte_string(b"\0"), 6: rational(pose.altitude_m)}
     add_directories(path, tags | first, of_exif | exif, place)

@@ -56,8 +56,9 @@ class Seed:
     __eq__ = equal
 
     kind: SeedKind
-    """`user`; `match` (learned descriptors matched); `model` (median mapping of the flight); `rig` (camera tags);
-    `centre` (optical centres of DJI); `geo` (geotransforms); `structure` (phase correlation); `identity`."""
+    """`user`; `match` (SIFT keypoints; with `--seed match` learned descriptors); `model` (median mapping of the
+    flight); `rig` (camera tags); `centre` (optical centres of DJI); `geo` (geotransforms); `structure` (phase
+    correlation); `identity`."""
     fixed_to_moving: Matrix3x3
     """Homography (3, 3) from the reference to the moving image: between undistorted px if both lenses are known, else
     between raw px."""

@@ -82,7 +82,9 @@ class DjiCamera(CameraSpec):
         size_px = round(pixels.shape[1] / band.size_ratio[0]), round(pixels.shape[0] / band.size_ratio[1])
         exif = Image.Exif()
         exif.update({271: self.maker, 272: self.model, 306: exposure.moment})
-        exif.get_ifd(0x8769).update({0x9003: exposure.moment, 0x920A: band.focal_length_mm, 0xA431: _SERIAL})
+        height, width = pixels.shape
+        of_exif = {0x9003: exposure.moment, 0x920A: band.focal_length_mm, 0xA431: _SERIAL}
+        exif.get_ifd(0x8769).update(of_exif | {0xA002: width, 0xA003: height})
         xmp = _dji_xmp(band, exposure, size_px, ">").encode()
         Image.fromarray(before).save(path, quality=95, subsampling=0, exif=exif, xmp=xmp)
 

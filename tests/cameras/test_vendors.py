@@ -12,6 +12,7 @@ import pytest
 import tifffile
 from PIL import Image
 
+from agalign.cameras.consistency import pixel_scale
 from agalign.cameras.discover import DiscoverOptions, discover
 from agalign.cameras.dji import Dji
 from agalign.cameras.metadata import Tags, read_tags
@@ -390,6 +391,18 @@ def test_the_mavic_s_colour_photograph_goes_through_the_designed_frame(tmp_path:
     # The Phantom's matrix of that name is none such.
     phantom = replace(mavic_tags(), model="FC6360")
     assert Dji().with_shared_rig([nir, *rgb], [phantom, colour])[1].to_rig is None
+
+
+@pytest.mark.parametrize("share", [1.0, 0.5])
+def test_the_mavic_s_colour_photograph_may_be_reduced(tmp_path: Path, share: float) -> None:
+    """Its size is not that of the bands: at half of it, the centre of its lens is not near the middle of theirs."""
+    lens = {"CalibratedOpticalCenterX": "2640", "CalibratedOpticalCenterY": "1978"}
+    lens |= {"DewarpData": "2022-09-08;3713,3713,0,0,0,0,0,0,0"}
+    colour = Tags(make="DJI", model="M3M", xmp={(DJI, name): (value,) for name, value in lens.items()})
+    photo = tmp_path / "DJI_20230607112233_0001_D.JPG"
+    cv2.imwrite(str(photo), np.zeros((round(3956 * share), round(5280 * share), 3), np.uint8))
+    for band in Dji().bands(photo, colour, probe(photo)):
+        assert pixel_scale(colour, band, lambda: False) == (share, share)
 
 
 @pytest.mark.parametrize(("roll", "yaw"), [("0.00", "30"), ("+180.00", "-150")])
