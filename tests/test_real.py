@@ -39,8 +39,8 @@ DOCUMENTED = {
     "captures/rededge_orchard_no_rig": (4, 0.06, 0.07, 0, ("Green", "NIR", "Red")),
     "captures/p4m_forest": (4, 0.068, 0.09, 0, ("Green", "NIR", "Red")),
 }
-"""Pairs, all aligned, and their median and worst error in px: the README's table. The capture and the bands that the
-default run aligns.
+"""Pairs, all aligned, and their median and worst error in px: the README's table. The capture and the bands that are
+aligned without the flight.
 """
 TOLERANCE = 1.5
 """Errors may exceed the documented figures by this factor, on another machine or with other versions of libraries."""
@@ -53,7 +53,8 @@ def assert_documented(medians: dict[str, float], folder: str, pairs: int) -> Non
     assert max(medians.values()) < TOLERANCE * worst
 
 
-@pytest.mark.parametrize("folder", [*list(DOCUMENTED)[:1], *map(in_full_run, list(DOCUMENTED)[1:])])
+@pytest.mark.full
+@pytest.mark.parametrize("folder", DOCUMENTED)
 def test_a_capture_without_its_flight(real_data: Path, tmp_path: Path, folder: str) -> None:
     *_, number, bands = DOCUMENTED[folder]
     captures = discover(real_data / folder, DiscoverOptions(bands=bands)).captures

@@ -236,7 +236,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Run:
     return Run(tmp_path_factory.mktemp("relief"))
 
 
-@pytest.mark.parametrize("harm", ["another of equal size", "cut short", "empty"])
+@pytest.mark.parametrize("harm", ["another of equal size", in_full_run("cut short"), in_full_run("empty")])
 def test_a_parallax_that_is_not_the_listed_one_is_estimated_again(
     run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, harm: str
 ) -> None:

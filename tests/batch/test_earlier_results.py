@@ -23,6 +23,7 @@ from agalign.flight.groups import flights_of, model_names
 from agalign.records.sidecar_file import find_sidecars, read_sidecar, read_without_tables, write_sidecar
 from agalign.values.image import OutputGrid
 
+from ..builders import in_full_run
 from ..conftest import Shared, read_json, save_known_model, seeded, textured_image, write_band, write_capture
 from ..program import agalign_here
 
@@ -70,7 +71,7 @@ def test_another_capture_of_the_same_name_is_refused_before_anything_is_written(
     assert contents(out) == unchanged
 
 
-@pytest.mark.parametrize("first", ["0000SET", "."])
+@pytest.mark.parametrize("first", ["0000SET", in_full_run(".")])
 def test_a_run_on_a_folder_of_another_depth_is_refused(flight: Path, tmp_path: Path, first: str) -> None:
     out, second = tmp_path / "out", "." if first == "0000SET" else "0000SET"
     agalign.align_folder(flight / first, out, settings=SEEDS)

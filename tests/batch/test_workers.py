@@ -95,6 +95,7 @@ def deadly(task: Task, folder: Path, times: int) -> Task:
     return replace(task, settings=WhenUnpickled(folder / "mark", signal.SIGKILL, times))
 
 
+@pytest.mark.full
 def test_a_process_that_is_killed_twice_costs_its_capture(flight: Path, tmp_path: Path) -> None:
     one, other = seeds_only(flight, tmp_path)
     with open_workers(None, 1, limit_threads, has_timeout=True) as run:

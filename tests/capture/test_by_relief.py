@@ -359,6 +359,7 @@ def test_a_band_that_shows_nothing_in_a_part_claims_the_error_there(four_lenses:
     assert 0.5 * p68_px < prediction.std_px < 4 * p68_px
 
 
+@pytest.mark.full
 def test_a_blurred_band_leaves_the_relief_to_the_sharp_ones_and_follows_it(four_lenses: Rendered) -> None:
     blurred = cv2.GaussianBlur(four_lenses.images["Blue"], (0, 0), 3)
     candidates = four_lenses.refined({"Blue": blurred})
@@ -558,6 +559,7 @@ def test_the_others_are_aligned_without_a_foreign_band(
         assert np.percentile(errors, 90) < np.percentile(intact, 90) + 0.2
 
 
+@pytest.mark.full
 def test_a_band_of_another_time_is_predicted_under_the_relief_of_the_others(boxes: Rendered) -> None:
     """Its pixels moved smoothly by 1 px, which no common parallax and no lens explains."""
     x, y = np.moveaxis(boxes.pixels.astype(np.float32), -1, 0)

@@ -14,6 +14,7 @@ from agalign.errors import ConfigurationError, GeometryError
 from agalign.pixels import coordinates
 from agalign.pixels.coordinates import transformed
 
+from ..builders import in_full_run
 from ..cli.test_onto import write_mosaic
 from ..conftest import read_json
 from ..program import agalign
@@ -53,7 +54,9 @@ print(crs_wkt("EPSG:32631")[:28])
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("variable", "kind"), [("PROJ_LIB", "empty"), ("PROJ_DATA", "old"), ("GDAL_DATA", "empty")])
+@pytest.mark.parametrize(
+    ("variable", "kind"), [("PROJ_LIB", "empty"), in_full_run("PROJ_DATA", "old"), in_full_run("GDAL_DATA", "empty")]
+)
 def test_data_of_another_installation_are_not_used(variable: str, kind: str, tmp_path: Path) -> None:
     """rasterio reads the variable when it is imported, so that a process of its own is needed."""
     write_mosaic(tmp_path / "mosaic.tif", np.ones((60, 60), np.float32), (0, 0))

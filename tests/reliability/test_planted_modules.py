@@ -12,10 +12,9 @@ import pytest
 from agalign.cameras.read_files import _MIN_FILES_FOR_PROCESSES
 from agalign.synthetic import flight as synthetic
 
-from ..builders import in_full_run
 from ..conftest import Shared
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.full]
 
 CONSOLE_SCRIPT = [str(Path(sys.executable).with_name("agalign"))]
 MODULE = [sys.executable, "-m", "agalign"]
@@ -79,9 +78,7 @@ def plant(names: set[str], folder: Path) -> Path:
     return log
 
 
-@pytest.mark.parametrize(
-    ("command", "arguments"), [(MODULE, INFO), in_full_run(CONSOLE_SCRIPT, RUN), in_full_run(MODULE, RUN)]
-)
+@pytest.mark.parametrize(("command", "arguments"), [(MODULE, INFO), (CONSOLE_SCRIPT, RUN), (MODULE, RUN)])
 def test_no_module_is_imported_from_the_working_folder(
     command: list[str], arguments: tuple[str, ...], names: Names, four_captures: Path, tmp_path: Path
 ) -> None:
@@ -97,7 +94,6 @@ def test_no_module_is_imported_from_the_working_folder(
     assert not log.exists(), log.read_text()
 
 
-@pytest.mark.full
 def test_workers_of_a_script_import_what_the_script_imports(names: Names, four_captures: Path, tmp_path: Path) -> None:
     """From the folder of the script, but nothing from the working folder."""
     log, script = plant(names(RUN), tmp_path / "working folder"), tmp_path / "script" / "script.py"
