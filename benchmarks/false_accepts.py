@@ -162,8 +162,8 @@ def seeded_pair(kind: str, rng: np.random.Generator) -> Pair:
 
 SYNTHETIC, PLANTED = "synthetic pairs", "planted grids"
 GROUPS = {
-    "unchanged, or blur, noise, saturation, shift of 5 %": GOOD,
-    "another field or place, water, 8 % overlap, saturated, a third displaced": BAD,
+    "unchanged, or blur 1.5 px, noise 2 %, 30 % saturated, shift of 5 %": GOOD,
+    "another field or place, water, 8 % overlap, 99 % saturated, a third displaced": BAD,
 }
 GROUPS_OF_GRIDS = {
     "no initial alignment": ("none",),
