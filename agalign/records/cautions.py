@@ -154,14 +154,14 @@ class RunFacts:
     def _of_light(self, sidecar: Sidecar) -> Iterator[Caution]:
         """The cautions about the reflectance of all bands."""
         output = sidecar.output
-        if output is None or "reflectance" not in (output.radiometry or ""):
+        if output is None or output.light_from is None:
             return
         scales = self._sensor_scales(sidecar.captured_at)
         age_s = output.panel_age_s or 0.0
         choice = (sidecar.options or {}).get("write", {}).get("radiometry", "auto")
         remedy = Remedy(_CONTRADICTION, _PANEL_ADVICE.get(choice, _PANEL_ADVICE["auto"]))
-        is_old = age_s > _MAX_PANEL_AGE_S and "light sensor" not in (output.radiometry or "")
-        is_by_panel = "panel" in (output.radiometry or "")
+        is_by_panel, is_by_sensor = (name in output.light_from for name in ("panel", "light sensor"))
+        is_old = age_s > _MAX_PANEL_AGE_S and not is_by_sensor
         for band in sidecar.bands:
             if is_by_panel and output.panel_age_s is None:
                 yield Caution(band.band, "check", _PANEL_WITHOUT_TIME, _PANEL_WITHOUT_TIME.cause, 0.0)
@@ -170,7 +170,7 @@ class RunFacts:
                 error = max(scale, 1 / scale) - 1
                 reason = f"the irradiance on the panel is {scale:.2f} times that of the light sensor"
                 text = "reflectance is uncertain by up to {:.0%}"
-                is_unusable = error > _MAX_REFLECTANCE_ERROR and "light sensor" in (output.radiometry or "")
+                is_unusable = error > _MAX_REFLECTANCE_ERROR and is_by_sensor
                 yield Caution(band.band, "check", remedy, reason, min(1.0, error), error, text, is_unusable)
             if is_old:
                 lost = min(1.0, _CHANGE_OF_LIGHT * age_s / _MAX_PANEL_AGE_S)

@@ -435,6 +435,12 @@ class OutputPart(_Part):
     """Nodata value (`"nan"` for NaN); null if it differs between single bands."""
 
     @property
+    def light_from(self) -> str | None:
+        """The `RadiometrySource` of the light, if the rasters are reflectance or relative reflectance."""
+        quantity, _, source = (self.radiometry or "").partition(" by ")
+        return source if "reflectance" in quantity else None
+
+    @property
     def grid(self) -> OutputGrid:
         """The grid of the rasters."""
         return OutputGrid(*self.crop, PixelScale(*self.scale), self.undistorted)
