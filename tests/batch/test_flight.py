@@ -92,6 +92,7 @@ def test_networks_are_learned_from_random_weights(
     assert recipe == "flight" or all(b.joint.iterations > 0 for b in bands)
 
 
+@pytest.mark.full
 def test_a_model_is_used_again(
     flight: Path, model_path: Path, aligned_copy: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -41,7 +41,7 @@ RUN_BY = {"docker": "tools/container.sh", "dask": "tools/dask_cluster.sh", "pip"
 KINDS = {"sh", "python", "text"}
 RUNNABLE = [page for page in PAGES if any(b.kind in ("sh", "python") for b in blocks_of(page))]
 LONG = re.compile(
-    "altum|bad-flight|close-range|comparison|first-flight|large-flights|mavic-3m|paper|phantom-4|photogrammetry|python|qgis|rededge|"
+    "altum|bad-flight|choose-captures|close-range|comparison|first-flight|large-flights|mavic-3m|paper|phantom-4|photogrammetry|python|qgis|rededge|"
     "reflectance|sentera|sequoia|thermal"
 )
 """Pages with blocks that take seconds, and of commands that other tests run: only the full run has them."""

@@ -630,9 +630,7 @@ USUAL = (
     Fault("a pipe where a sidecar belongs", sidecar_is_a_pipe),
     Fault("a file system without locks", no_locks),
     names_another("a text named .tif", extra("c_nir.tif", b"hello"), "c_nir.tif: is not a TIFF"),
-    names_another("a pipe named .tif", lambda s: os.mkfifo(s.file("c_nir.tif")), "c_nir.tif: is not a regular file"),
     names_another("a sparse image of 100,000 x 100,000", enormous, r"declares 100000 x 100000 pixels.*--max-pixels"),
-    names_another("an image of 65,535 bands", extra("c.tif", declared(64, 64, 65535)), "c.tif: "),
     names_another(
         "a band index of 99 in a sidecar, for indices",
         both(with_sidecar(_SECOND, _SECOND.replace("2", "99")), commanding("ndvi {out} --index gndvi")),
@@ -650,12 +648,6 @@ USUAL = (
     loses_b(
         "a TIFF that describes other files (VRT)", lambda s: s.file().write_text(vrt(s)), "b_nir.tif: is not a TIFF"
     ),
-    loses_b(
-        "a sidecar of width 0, for the report",
-        both(with_sidecar(r'"width": \d+', '"width": 0'), commanding("report {out}")),
-        "b.json: reference.width",
-    ),
-    loses_b("an infinite number in a sidecar, for the report", endless_number, r"b\.json: .*finite"),
     loses_b("a folder where a stack belongs", output_is_a_folder("b.tif"), "b.tif: cannot be written"),
     loses_b(
         "a folder where a band's file belongs",
@@ -674,6 +666,14 @@ USUAL = (
     wrong_use("an empty name for the folder", commanding(" -o {out}"), "the name of the folder is empty"),
 )
 LONG = (
+    names_another("an image of 65,535 bands", extra("c.tif", declared(64, 64, 65535)), "c.tif: "),
+    loses_b(
+        "a sidecar of width 0, for the report",
+        both(with_sidecar(r'"width": \d+', '"width": 0'), commanding("report {out}")),
+        "b.json: reference.width",
+    ),
+    loses_b("an infinite number in a sidecar, for the report", endless_number, r"b\.json: .*finite"),
+    names_another("a pipe named .tif", lambda s: os.mkfifo(s.file("c_nir.tif")), "c_nir.tif: is not a regular file"),
     Fault("a worker killed by SIGKILL", when_begun(to_busiest(psutil.Process.kill), *_IN_TIME), finished=ALL),
     interrupted("the interrupt key", when_begun(signalled(signal.SIGINT), "-j", "2")),
     Fault("the system's folder on a card", forbidden("flight/lost+found")),
