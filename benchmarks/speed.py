@@ -83,7 +83,7 @@ def print_flight(folder: Path, captures: list[Capture]) -> TableRow:
     (_, without), (_, with_model) = runs(folder)
     first_s, again_s = (median(e["seconds"] for e in events["capture"]) for events in (without, with_model))
     sift_s = median(sift_seconds(c, len(c.moving)) for c in captures)
-    times_s = total_s(without["learnt"]) / len(captures) + first_s, again_s, sift_s
+    times_s = total_s(without["learned"]) / len(captures) + first_s, again_s, sift_s
     aligned = "{aligned} of {pairs}".format(**with_model["capture"][0])
     cells = [f"{s:.1f}" for s in times_s] + [f"{s / sift_s:.2f}" for s in times_s[:2]]
     print_row(folder.name, len(captures), aligned, *cells)
@@ -110,7 +110,7 @@ def print_degraded(captures: list[Capture]) -> None:
                 write_band(flight / band.path.name, pixels, band.band_index)
             _, events = run_alone(*command(flight, out, *LOGGED))
         (capture,) = events["capture"]
-        seconds = total_s(events["learnt"]) + capture["seconds"]
+        seconds = total_s(events["learned"]) + capture["seconds"]
         unchanged_s = unchanged_s or seconds
         print_row(name, "{aligned} of {pairs}".format(**capture), f"{seconds:.1f}", f"{seconds / unchanged_s:.2f}")
 
