@@ -165,9 +165,10 @@ LIMITS = {
         f"| at most the larger of {checks.MAX_UNEXPECTED_PX:g} px and {checks._MAX_UNEXPECTED_STD:g} standard errors",
         f"{raster._MAX_BANDS} bands per file",
     ),
-    "explanation/accuracy.md": (
-        f"The largest parallax is {dense._SEARCH_NEARER:.0%} of",
+    "how-to/close-range.md": (
+        f"parallax of up to {dense._SEARCH_NEARER:.0%} of",
         f"and {dense._SEARCH_FARTHER:.0%} behind it",
+        f"1 / (1 / d + {dense._SEARCH_NEARER:g} W / (f b))",
     ),
     "how-to/reflectance.md": (
         f"calibration panels at most {panel_readings.MAX_TIME_DIFFERENCE_S / 3600:g} hours away",
