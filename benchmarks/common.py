@@ -83,15 +83,6 @@ def with_section(document: Path, name: str, content: str) -> str:
     return before + begin + content + end + rest.partition(end)[2]
 
 
-def report(name: str, document: Path | None, *parts: str | Sequence[Sequence[object]]) -> None:
-    """Print paragraphs and tables, which are rows with the head first, and put them into the section of a document."""
-    texts = [part if isinstance(part, str) else table(part) for part in parts]
-    content = "\n" + "".join(f"{text}\n\n" for text in texts)
-    print(content, flush=True)
-    if document is not None:
-        document.write_text(with_section(document, name, content), encoding="utf-8")
-
-
 def cell(values: Sequence[float] | NDArray[Any], style: str, statistic: Callable[..., Any] = np.median) -> str:
     """Return a statistic of the values that are not nan, "-" without any."""
     known = np.asarray(values)[~np.isnan(values)]

@@ -30,7 +30,7 @@ TITLES = {
     "rededge_mx_dual": "RedEdge-MX dual",
     "rededge_orchard_no_rig": "RedEdge, orchard, no rig tags",
     "p4m_forest": "Phantom 4 Multispectral, forest",
-    "p4m_forest_next": "Phantom 4 Multispectral, forest, second exposure",
+    "p4m_forest_next": "Phantom 4 Multispectral, forest, next capture",
     "p4m_bananas": "Phantom 4 Multispectral, bananas from 19 m",
     "blurred_flat": "RedEdge, blurred by 3 px, no tags",
     "boom_two_depths": "RedEdge-M, plants from 1-2 m",

@@ -19,7 +19,7 @@ all: $(DONE)
 $(OUT)/%.done: $(FLIGHTS)/%/
 	@mkdir -p $(OUT)
 	agalign $< -o $(OUT)/$* $(OPTIONS); code=$$?; \
-	case $$code in 0|3) agalign indices $(OUT)/$* --index ndvi --mask-qa;; esac; \
+	case $$code in 0|3) agalign indices $(OUT)/$* --index ndvi --mask-qa || code=$$?;; esac; \
 	if [ $$code -eq 3 ]; then echo $* >> $(OUT)/incomplete.txt; elif [ $$code -ne 0 ]; then exit $$code; fi
 	@touch $@
 

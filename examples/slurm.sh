@@ -20,7 +20,7 @@ name=$(basename "$flight")
 # shellcheck disable=SC2086  # OPTIONS are several words
 agalign "$flight" -o "$OUT/$name" --jobs "${SLURM_CPUS_PER_TASK:-1}" ${OPTIONS:---radiometry auto --qa}
 code=$?
-case $code in 0 | 3) agalign indices "$OUT/$name" --index ndvi --mask-qa ;; esac
+case $code in 0 | 3) agalign indices "$OUT/$name" --index ndvi --mask-qa || code=$? ;; esac
 
 case $code in
     0) ;;

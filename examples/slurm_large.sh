@@ -14,6 +14,6 @@ srun dask worker "$address" --nthreads 1 --no-dashboard &
 # shellcheck disable=SC2086  # OPTIONS are several words
 agalign "$FLIGHT" -o "$OUT" --dask "$address" ${OPTIONS:---radiometry auto --qa}
 code=$?
-case $code in 0 | 3) agalign indices "$OUT" --index ndvi --mask-qa --dask "$address" ;; esac
+case $code in 0 | 3) agalign indices "$OUT" --index ndvi --mask-qa --dask "$address" || code=$? ;; esac
 kill %1 %2
 exit $code

@@ -1,4 +1,4 @@
-"""A file as OpenDroneMap 3.5 reads it, written from its rules: `ODM_Photo` in opendm/photo.py for the tags, and
+"""A file as OpenDroneMap 3.6 reads it, written from its rules: `ODM_Photo` in opendm/photo.py for the tags, and
 `dn_to_radiance`, `vignette_map` and `compute_irradiance` in opendm/multispectral.py for the numbers, and
 `ODM_Reconstruction.detect_multi_camera` in opendm/types.py for the order of the bands.
 
@@ -17,6 +17,12 @@ import numpy as np
 import rasterio
 import xmltodict
 
+_PLACES = {
+    **dict.fromkeys(("RGB", "REDGREENBLUE"), "0"),
+    **{"RED": "1", "R": "1", "GREEN": "2", "G": "2", "BLUE": "3", "B": "3", "NIR": "4", "N": "4"},
+    **{"REDEDGE": "5", "RE": "5", "PANCHRO": "6", "LWIR": "7", "L": "7"},
+}
+"""Places of bands in an orthophoto, since version 3.3."""
 _UUIDS = "@drone-dji:CaptureUUID", "MicaSense:CaptureId", "@Camera:ImageUniqueID", "@Camera:CaptureUUID"
 
 
@@ -127,8 +133,11 @@ class OdmPhoto:
 
 
 def bands_of_orthophoto(photos: Iterable[OdmPhoto]) -> list[str]:
-    """The names of the bands in the order in which the orthophoto has them; an alpha band follows."""
+    """The names of the bands in the order in which the orthophoto has them; an alpha band follows.
+
+    Bands with other names are last, in the order of their index.
+    """
     indices: dict[str, str] = {}
     for photo in photos:
         indices.setdefault(photo.band_name, photo.band_index)
-    return sorted(indices, key=lambda name: indices[name])
+    return sorted(indices, key=lambda name: _PLACES.get(name.upper(), f"9{indices[name]}"))

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from common import band_errors, read_ties, report, watched
+from common import band_errors, read_ties, table, watched, with_section
 
 from agalign import read_alignment
 from agalign.records.sidecar_file import find_sidecars, read_sidecar, write_sidecar
@@ -32,8 +32,10 @@ def test_the_error_is_that_of_the_mapping_at_the_ties(aligned_flight: Path, tmp_
     here = at if reference == "Green" else read_alignment(path, reference).map(at)
     for name in ("NIR", "Red edge", "Red"):
         there = np.add(read_alignment(path, name).map(at), (0.3, 0.4))
-        entries[bands[name].file] = {"ties": np.hstack([here, there]).tolist()}
-    (tmp_path / "ties.json").write_text(json.dumps({"a": {"reference": bands[reference].file, "bands": entries}}))
+        entries[Path(bands[name].file).name] = {"ties": np.hstack([here, there]).tolist()}
+    (tmp_path / "ties.json").write_text(
+        json.dumps({"a": {"reference": Path(bands[reference].file).name, "bands": entries}})
+    )
     errors = band_errors(tmp_path, read_ties(tmp_path / "ties.json"))
     known_std_px = {"NIR": 0.7, "Red edge": bands["Red edge"].joint.corner_std_px}
     assert {b.part.band: b.std_px for b in errors} == known_std_px
@@ -44,11 +46,11 @@ def test_the_error_is_that_of_the_mapping_at_the_ties(aligned_flight: Path, tmp_
 def test_a_section_replaces_what_is_between_its_marks(tmp_path: Path) -> None:
     page = tmp_path / "page.md"
     page.write_text("before\n<!-- kills -->\nold\n<!-- end of kills -->\nafter\n")
-    report("kills", page, "New.", [("a", "b"), ("1|2", "3")])
-    table = "| a | b |\n|---|---|\n| 1\\|2 | 3 |"
-    assert page.read_text() == f"before\n<!-- kills -->\n\nNew.\n\n{table}\n\n<!-- end of kills -->\nafter\n"
+    new = table([("a", "b"), ("1|2", "3")])
+    assert new == "| a | b |\n|---|---|\n| 1\\|2 | 3 |"
+    assert with_section(page, "kills", new) == f"before\n<!-- kills -->\n{new}<!-- end of kills -->\nafter\n"
     with pytest.raises(SystemExit, match="has no section"):
-        report("soak", page, "text")
+        with_section(page, "soak", new)
 
 
 def test_a_watched_process_has_its_children() -> None:

@@ -27,14 +27,15 @@ def test_an_example_without_arguments_prints_its_usage(path: Path) -> None:
 def test_a_season_continues_after_a_flight_that_fails(tmp_path: Path) -> None:
     program = tmp_path / "bin" / "agalign"
     program.parent.mkdir()
-    program.write_text("#!/bin/sh\ncase $1 in *a/) exit 1;; *b/) exit 3;; esac\n")
+    codes = '*a/*) exit 1;; *b/*) exit 3;; "indices aligned/d") exit 143;;'
+    program.write_text(f'#!/bin/sh\ncase "$1 $2" in {codes} esac\n')
     program.chmod(0o755)
-    for name in "abc":
+    for name in "abcd":
         (tmp_path / "season" / name).mkdir(parents=True)
     command = ["make", "-f", ROOT / "examples" / "flights.mk", "FLIGHTS=season", "OUT=aligned"]
     environment = os.environ | {"PATH": f"{program.parent}{os.pathsep}{os.environ['PATH']}"}
     done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, check=False)
-    assert (done.returncode, "a.done" in done.stderr) == (2, True)
+    assert (done.returncode, "a.done" in done.stderr, "d.done" in done.stderr) == (2, True, True)
     assert sorted(p.name for p in (tmp_path / "aligned").iterdir()) == ["b.done", "c.done", "incomplete.txt"]
 
 

@@ -1,8 +1,7 @@
 """Faults of cards, disks, machines and files, and the results that the program must have.
 
 Each fault is done to a small flight of two good captures, `a` and `b`, and the program is run on it. `python -m
-tests.reliability.faults` prints the result of each fault, and with `--markdown docs/explanation/verification.md`
-updates the table of that page. test_faults.py compares the result of each fault with the expected one.
+tests.reliability.faults` prints the result of each fault. test_faults.py compares it with the expected one.
 """
 
 import contextlib
@@ -38,7 +37,6 @@ from agalign.records.sidecar_file import find_sidecars, read_sidecar
 from ..conftest import raising, textured_pair, write_signed
 from ..program import agalign_here
 
-DOCUMENT = Path(__file__).resolve().parents[2] / "docs" / "explanation" / "verification.md"
 SHIFT = np.array([[1, 0, 6.0], [0, 1, -4.0], [0, 0, 1]])
 SIZE_PX = 320, 240
 ALL = "abcdefghijkl"
@@ -746,33 +744,16 @@ LONG = (
 FAULTS = USUAL + LONG
 
 
-def documented() -> dict[str, str]:
-    """{fault: exit code} in the table of the most common faults."""
-    section = (
-        DOCUMENT.read_text(encoding="utf-8").partition("<!-- faults -->")[2].partition("<!-- end of faults -->")[0]
-    )
-    rows = [line.removeprefix("| ").split(" | ") for line in section.splitlines() if line.startswith("| ")][2:]
-    return {name: code for name, code, *_ in rows}
-
-
 def main() -> None:
-    """Print the result of each fault, and write the table of docs/explanation/verification.md."""
-    sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "benchmarks"))
-    from common import report
-
-    document = Path(sys.argv[2]) if sys.argv[1:2] == ["--markdown"] else None
-    rows, reported = [("fault", "exit code", "first message, without the remedy")], documented()
+    """Print the result of each fault."""
     failed = []
     for fault in FAULTS:
         with tempfile.TemporaryDirectory() as folder:
             seen = run_fault(fault, Path(folder))
             row = (fault.name, str(seen.code), first_complaint(seen, Path(folder)))
-        if fault.name in reported:
-            rows.append(row)
         wrong = what_is_wrong(fault, seen)
         failed += [f"{fault.name}: {wrong}"] if wrong else []
         print(f"{seen.seconds:5.1f} s  {' | '.join(row)}  {wrong}", flush=True)
-    report("faults", document, rows)
     if failed:
         raise SystemExit("\n".join(failed))
 

@@ -1,11 +1,11 @@
-"""Each fault of the list has the expected result, and docs/explanation/verification.md reports it."""
+"""Each fault of the list has the expected result."""
 
 from pathlib import Path
 
 import pytest
 
 from ..conftest import Shared
-from .faults import DOCUMENT, FAULTS, LONG, Fault, documented, make_model, run_fault, what_is_wrong
+from .faults import FAULTS, LONG, Fault, make_model, run_fault, what_is_wrong
 
 pytestmark = pytest.mark.slow
 
@@ -23,9 +23,3 @@ def test_fault(fault: Fault, model: Path, tmp_path: Path) -> None:
     seen = run_fault(fault, tmp_path, model)
     assert not what_is_wrong(fault, seen), seen.output
     assert not list(tmp_path.rglob(".agalign-part-*"))
-
-
-def test_the_document_has_the_exit_codes_of_the_most_common_faults() -> None:
-    assert f"injects {len(FAULTS)} faults" in DOCUMENT.read_text()
-    assert documented()
-    assert documented().items() <= {(f.name, str(f.code)) for f in FAULTS}
