@@ -1,4 +1,4 @@
-"""Reuse the network and rig of one flight for the next flight of the same camera, without learning again.
+"""Reuse the network and rig of one flight for the next flight of the same camera.
 
 python examples/next_flight.py FIRST SECOND OUT
 """

@@ -26,7 +26,8 @@ for name in sys.argv[2:]:
     # exactextract ignores the rotation of a geotransform; WarpedVRT resamples rotated rasters to a north-up grid.
     with rasterio.open(name) as raster:
         if raster.crs is None:
-            sys.exit(f"{name}: has no CRS; align with --georeference")
+            print(f"{name}: skipped, has no CRS; align with --georeference", file=sys.stderr)
+            continue
         with WarpedVRT(raster, nodata=np.nan) as index:
             here = plots.to_crs(index.crs)
             here.geometry = here.make_valid()
@@ -36,6 +37,8 @@ for name in sys.argv[2:]:
     table["valid_share"] = table["count"] * pixel_area / here.area
     table["distance"] = here.centroid.distance(geopandas.points_from_xy([centre[0]], [centre[1]])[0])
     tables.append(table.assign(raster=name, plot_row=range(len(plots))))
+if not tables:
+    sys.exit("no raster has a CRS")
 every = pandas.concat(tables)
 every["share"] = every.valid_share.round(1)  # rasters that show a plot equally well differ by a few pixels
 best = every.sort_values(["share", "distance"], ascending=[False, True]).groupby("plot_row").head(1)

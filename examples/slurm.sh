@@ -24,7 +24,7 @@ case $code in 0 | 3) agalign indices "$OUT/$name" --index ndvi --mask-qa || code
 
 case $code in
     0) ;;
-    3) echo "$name" >> "$OUT/incomplete.txt" ;;  # finished; some bands are not aligned: see OUT/<flight>/index.html
+    3) echo "$name" >> "$OUT/incomplete.txt" ;;  # finished: check OUT/<flight>/index.html
     143) exec scontrol requeue "$SLURM_JOB_ID" ;;  # stopped at the time limit: the same command resumes the run
     *) exit "$code" ;;  # 1: nothing could be processed, 2: wrong options
 esac

@@ -37,7 +37,7 @@ for algorithm in alignflight indices onto inspect; do
     grep -q "agalign:$algorithm" "$folder/list.log" || { echo "agalign:$algorithm is not listed" >&2; exit 1; }
 done
 
-# Paths are relative to the folder of qgis_process, as in docs/how-to/qgis.md.
+# Paths are relative to the folder of qgis_process.
 cd "$folder"
 [ -d demo/flight ] || agalign demo demo > /dev/null
 flight=demo/flight out=aligned
