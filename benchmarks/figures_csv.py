@@ -48,7 +48,11 @@ ESTIMATOR = "config.py", "values", "pixels", "cameras", "fit", "method", "flight
 """Modules and packages of agalign on which every figure depends."""
 RENDERING = "rasters", "spectral_indices"
 """What figures of runs depend on as well."""
-DEPENDS_ON = {"runs": RENDERING, "captures with depth": RENDERING, "reliability": ("host", "batch", *RENDERING)}
+DEPENDS_ON = {
+    **dict.fromkeys(("runs", "captures with depth"), RENDERING),
+    "reliability": ("host", "batch", *RENDERING),
+    "published experiments": ("evaluation",),
+}
 """Other packages on which the figures of a table depend."""
 
 

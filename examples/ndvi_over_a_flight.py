@@ -14,7 +14,8 @@ flight = agalign.open_flight(sys.argv[1])
 print(flight)
 
 red, nir = flight["Red"], flight["NIR"]
-ndvi = ((nir - red) / (nir + red)).where(nir + red > 0)
+usable = flight.status.isin(["reference", "aligned"]).sel(band=["Red", "NIR"]).all("band")
+ndvi = ((nir - red) / (nir + red)).where(usable & (nir + red > 0))
 median = ndvi.median(("y", "x"), skipna=True).compute()
 for capture in median.capture:
     here = median.sel(capture=capture)

@@ -5,7 +5,7 @@
 #     export FLIGHTS=season OUT=aligned
 #     sbatch --array=1-"$(ls -d "$FLIGHTS"/*/ | wc -l)" examples/slurm.sh
 #
-# A task that SLURM kills leaves no lock: submit it again, and it resumes.
+# Activate the environment of agalign first. A task that SLURM kills leaves no lock: submit it again, and it resumes.
 #
 #SBATCH --cpus-per-task=4
 #SBATCH --mem=12G

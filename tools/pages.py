@@ -51,6 +51,7 @@ TABLES = {
         "public sets, originals",
     ),
     "verification": ("reliability",),
+    "paper": ("published experiments",),
 }
 """Tables of `figures.csv` by page of docs/explanation."""
 
