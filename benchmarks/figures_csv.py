@@ -51,7 +51,7 @@ RENDERING = "rasters", "spectral_indices"
 DEPENDS_ON = {
     **dict.fromkeys(("runs", "captures with depth"), RENDERING),
     "reliability": ("host", "batch", *RENDERING),
-    "published experiments": ("evaluation",),
+    **dict.fromkeys(("experiments, recipe fast", "experiments, recipe paper"), ("evaluation",)),
 }
 """Other packages on which the figures of a table depend."""
 

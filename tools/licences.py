@@ -22,8 +22,6 @@ from common import with_section
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGE = ROOT / "docs" / "project" / "licences.md"
-READ = {"atheris": "Apache-2.0", "exifread": "BSD-3-Clause"}
-"""Licences, from the licence file, of packages with missing or inexact metadata."""
 SPELT = {
     "Apache Software License": "Apache-2.0",
     "BSD License": "BSD",
@@ -31,6 +29,8 @@ SPELT = {
     "Python Software Foundation License": "PSF-2.0",
 }
 """Names of licences in classifiers, in short."""
+DEVELOPMENT = {"bench", "dev", "docs", "fuzz"}
+"""Extras that nobody needs who uses or redistributes agalign."""
 NOT_PERMISSIVE = re.compile(r"GPL|General Public|MPL|Mozilla|EUPL|Proprietary|Commercial")
 
 
@@ -51,17 +51,16 @@ def main() -> None:
 
 
 def requirements() -> tuple[set[str], set[str]]:
-    """Return the libraries in pyproject.toml that every run needs, and those that only extras need."""
+    """Return the libraries in pyproject.toml that every run needs, and those that only extras for users need."""
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
-    of_extras = [text for texts in project["optional-dependencies"].values() for text in texts]
+    by_extra = project["optional-dependencies"].items()
+    of_extras = [text for extra, texts in by_extra if extra not in DEVELOPMENT for text in texts]
     every_run, extras = ({Requirement(text).name.lower() for text in t} for t in (project["dependencies"], of_extras))
     return every_run, extras - every_run
 
 
 def licence(name: str) -> str:
     """Return the short licence of an installed library. Raises PackageNotFoundError."""
-    if name in READ:
-        return READ[name]
     facts = distribution(name).metadata
     classifiers = [c.rpartition(" :: ")[2] for c in facts.get_all("Classifier", []) if c.startswith("License ::")]
     short = " and ".join(SPELT.get(c, c) for c in classifiers)

@@ -51,7 +51,7 @@ TABLES = {
         "public sets, originals",
     ),
     "verification": ("reliability",),
-    "paper": ("published experiments",),
+    "paper": ("experiments, recipe fast", "experiments, recipe paper"),
 }
 """Tables of `figures.csv` by page of docs/explanation."""
 
