@@ -17,7 +17,8 @@ from agalign.values import geometry
 pytestmark = pytest.mark.full
 
 CAMERAS = REDEDGE, MAVIC, MAVIC_3M, ALTUM, ALTUM_PT, SENTERA_6X
-SIZE = 324, 243
+SIZE = 400, 300
+"""Unlike that of a thermal image (320 x 256 px), whose lens it would be taken for."""
 
 
 @pytest.mark.parametrize("camera", CAMERAS, ids=["RedEdge", "M3M calibrated", "M3M", "Altum", "Altum-PT", "6X"])
@@ -35,6 +36,6 @@ def test_rig_tags_are_the_truth_from_far_above(tmp_path: Path, camera: CameraSpe
         seed = rig_seed(capture.reference, band)
         assert seed is not None
         # Tags of optical centres contain no angles, and those of the thermal lens are not its true ones.
-        tolerance = 0.7 if not getattr(camera, "calibrated", True) else 3.0 if spec.sees == "heat" else 0.05
+        tolerance = 0.8 if not getattr(camera, "calibrated", True) else 3.0 if spec.sees == "heat" else 0.05
         assert geometry.corner_error_px(seed, truth, *SIZE) < tolerance
     assert set(json.loads(path.read_text())[capture.name]["bands"]) == {b.path.name for b in capture.moving}

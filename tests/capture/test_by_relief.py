@@ -330,7 +330,7 @@ def test_bands_with_and_without_a_lens_model_have_one_relief(four_lenses: Render
 def test_a_noisy_band_follows_the_relief_of_the_others(
     four_lenses: Rendered, noise: float, status: str, has_result: bool
 ) -> None:
-    """With a result of the joint optimisation or only a seed; its claim is at least half of its error."""
+    """With a result of the joint optimisation or only a seed; its claim is half to three times its error."""
     scene, name = four_lenses, "Red edge"
     image = scene.images[name]
     noisy = image + np.random.default_rng(3).normal(0, noise * float(image.mean()), image.shape)
@@ -344,7 +344,8 @@ def test_a_noisy_band_follows_the_relief_of_the_others(
     assert np.percentile(errors, 90) < 1.2
     assert np.percentile(plane, 90) > 2
     if status == "predicted":
-        assert 0.5 * np.percentile(errors, 68) < alignment.prediction.std_px <= 1
+        rms_px = np.sqrt(np.mean(errors**2))
+        assert 0.5 * np.percentile(errors, 68) < alignment.prediction.std_px < 3 * rms_px
 
 
 @pytest.mark.full
