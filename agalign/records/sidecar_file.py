@@ -120,8 +120,11 @@ def read_without_tables(path: Path) -> Sidecar:
 
 
 def find_sidecars(folder: Path) -> list[Path]:
-    """Return the sidecars below an output folder, sorted; unreadable files are included, other JSON files are not."""
-    return [path for path in sorted(folder.rglob("*.json")) if not path.is_dir() and is_sidecar(path)]
+    """Return the sidecars below an output folder, sorted; unreadable files are included, other JSON files and hidden
+    ones, such as partial files of another command, are not.
+    """
+    named = (path for path in sorted(folder.rglob("*.json")) if not path.name.startswith("."))
+    return [path for path in named if not path.is_dir() and is_sidecar(path)]
 
 
 def is_sidecar(path: Path) -> bool:

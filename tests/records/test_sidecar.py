@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+import shutil
 import math
 import os
 from dataclasses import replace
@@ -121,6 +122,7 @@ def test_other_json_files_are_passed_over(tmp_path: Path) -> None:
     write_sidecar(tmp_path / "a" / "IMG_1.json", example())
     (tmp_path / "other.json").write_text("{}")
     (tmp_path / "binary.json").write_bytes(b"\xff\xfe\x00")
+    shutil.copy(tmp_path / "a" / "IMG_1.json", tmp_path / "a" / ".agalign-part-host-1-0123.json")  # of another command
     assert find_sidecars(tmp_path) == [tmp_path / "a" / "IMG_1.json"]
 
 
