@@ -2,9 +2,9 @@
 
 import hashlib
 import json
-import shutil
 import math
 import os
+import shutil
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
