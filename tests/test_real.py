@@ -159,7 +159,8 @@ def test_bananas_from_close_by(real_data: Path, tmp_path: Path) -> None:
     moving = [b for b in report.sidecar.bands if b.metrics]
     photograph, multispectral = ([b for b in moving if b.band.startswith("RGB") == is_rgb] for is_rgb in (True, False))
     assert (len(multispectral), len(photograph)) == (4, 3)
-    assert all(b.status == "aligned" and b.metrics.after.residual_px < 0.5 for b in multispectral)
+    # Leaves at different heights: some bands are only predicted, by their windows.
+    assert all(b.is_usable(1.0) and b.metrics.after.residual_px < 0.5 for b in multispectral)
     # Leaves moved between the exposures: a third of its windows are off by more than a px, in all directions.
     assert all(b.status == "predicted" and b.prediction.std_px > 1 for b in photograph)
 

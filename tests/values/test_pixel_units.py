@@ -1,47 +1,12 @@
-"""The types of pixel grids, and the scale between two of them."""
-
-import re
-import sys
-from pathlib import Path
+"""The scale between two pixel grids."""
 
 import cv2
 import numpy as np
 import pytest
-from mypy import api
 from numpy.testing import assert_allclose
 
 from agalign.values import geometry
 from agalign.values.pixel_units import SAME_PIXELS, PixelScale
-
-REJECTED = {
-    "a limit in fixed px and a distance in moving px": "1.0 >= 0.5",
-    "pixels of an image and of its file": "1.0 >= 0.5",
-    "a sum over two grids": "1.0 + 0.5",
-    "an alignment between images where one between files is written": "tie_points(between_images)",
-}
-ACCEPTED = "1.0 * 3.0 >= 0.5"
-PREAMBLE = """
-from agalign.exports.tie_points import tie_points
-from agalign.values.alignment import Alignment
-def check(between_images: Alignment) -> None:
-"""
-
-
-@pytest.mark.full
-def test_mypy_rejects_units_that_do_not_match(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    lines = [ACCEPTED, *REJECTED.values()]
-    snippet = tmp_path / "snippet.py"
-    snippet.write_text(PREAMBLE + "".join(f"    {line}\n" for line in lines), encoding="utf-8")
-    root = Path(geometry.__file__).parents[2]
-    monkeypatch.setenv("MYPYPATH", str(root))
-    cache = str(root / ".mypy_cache")
-    options = ["--config-file", str(root / "pyproject.toml"), "--no-error-summary", "--cache-dir", cache]
-    printed, problem, _ = api.run([*options, "--python-executable", sys.executable, str(snippet)])
-    first = PREAMBLE.count("\n") + 1
-    # From its cache, mypy repeats errors with the path of an earlier run.
-    found = {int(number) for number in re.findall(r"snippet\.py:(\d+): error", printed)}
-    assert not problem
-    assert found == {first + number for number in range(1, len(lines))}, printed
 
 
 def test_a_scale_maps_outer_edges_onto_outer_edges() -> None:
