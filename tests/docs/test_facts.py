@@ -36,7 +36,8 @@ from .blocks import PAGES, ROOT, each_page, text_of
 PACKAGE = ROOT / "agalign"
 OPTIONS_OF_OTHERS = {
     *("--cpus", "--gpus", "--read-only", "--tmpfs", "--user"),  # docker run
-    *("--faults", "--floor", "--grids", "--kinds", "--pairs", "--plot", "--ranges", "--scenes", "--size"),  # benchmarks
+    *("--data", "--faults", "--floor", "--grids", "--kills", "--kinds", "--pairs", "--plot"),  # benchmarks
+    *("--ranges", "--scenes", "--size"),
     *("--extra-index-url", "--index-url", "--strict"),  # pip, mypy
 }
 """Options in the text of pages that are not those of agalign."""

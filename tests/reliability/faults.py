@@ -34,7 +34,7 @@ from agalign.errors import SidecarError
 from agalign.host.files import RUN_FILE
 from agalign.records.sidecar_file import find_sidecars, read_sidecar
 
-from ..conftest import raising, textured_pair, write_signed
+from ..conftest import raising, read_json, textured_pair, write_signed
 from ..program import agalign_here
 
 SHIFT = np.array([[1, 0, 6.0], [0, 1, -4.0], [0, 0, 1]])
@@ -484,7 +484,11 @@ def starve_workers(scene: Scene) -> None:
 
 def wait_for_reports(scene: Scene, captures: int = 3) -> None:
     """Wait until captures are reported: of three by two workers, one has begun its second."""
-    wait_until(scene, lambda: len(list(scene.out.glob("?.json"))) >= captures)
+
+    def count() -> int:  # a sidecar without `output` is that of a capture that is being rendered
+        return sum(read_json(path)["output"] is not None for path in scene.out.glob("?.json"))
+
+    wait_until(scene, lambda: count() >= captures)
 
 
 def larger(scene: Scene) -> None:
