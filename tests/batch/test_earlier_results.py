@@ -240,6 +240,7 @@ def when_the_second_is_reported(monkeypatch: pytest.MonkeyPatch, remove: Callabl
     monkeypatch.setattr(RunTotals, "add", added)
 
 
+@pytest.mark.full
 def test_outputs_removed_during_the_run_are_reported_and_not_counted(
     flight: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:

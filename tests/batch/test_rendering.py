@@ -73,6 +73,7 @@ def assert_same_files(out: Path, expected: Path) -> None:
     assert all(problems == [] for _, problems in verify_outputs(out))
 
 
+@pytest.mark.full
 def test_other_options_render_the_bytes_of_a_direct_run(
     flight: Path, tmp_path: Path, without_estimating: Callable[[], None]
 ) -> None:
