@@ -163,7 +163,7 @@ def differences(a: Band, b: Band) -> Image:
         radiance = cv2.blur(calibrated(pixels(band), band.radiometry, 0, 0), (PATCH_PX, PATCH_PX))[y, x]
         tags = read_tags(band.path)
         measured = tags.number(DLS, "HorizontalIrradiance") or tags.number(DLS, "SpectralIrradiance")
-        both.append(np.log([radiance, radiance / measured, radiance * band.radiometry.by_sun[0]]).T)
+        both.append(np.log([radiance, radiance / measured, radiance * band.radiometry.by_sun.value]).T)
     return both[1] - both[0]
 
 

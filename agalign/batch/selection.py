@@ -20,6 +20,7 @@ from agalign.flight.footprint import (
 from agalign.flight.panel_readings import (
     READERS,
     PanelReading,
+    compared,
     missing_panel,
     read_panel,
     reflectance_factors,
@@ -76,7 +77,7 @@ def _selected(flight: FolderScan, write: WriteSettings, options: RunOptions, exa
         sky, captures = sky_captures(captures, examine)
         captures = list(with_panels(captures, without_code=bool(albedos), examine=examine))
         readings = [examine(read_panel, c, albedos) for c in captures if c.panel is not None]
-        panels = [reading for reading in readings if reading is not None]
+        panels = compared([reading for reading in readings if reading is not None])
         captures = [c for c in captures if not c.is_of_a_panel and c.label not in examine.abandoned]
     captures = [_calibrated(capture, panels, write) for capture in captures]
     if write.georeference:

@@ -15,12 +15,13 @@ import numpy as np
 
 from agalign.cameras.metadata import Tags
 from agalign.cameras.sun import Sun
+from agalign.cameras.tag_text import iso_time
 from agalign.cameras.xmp import Name
 from agalign.errors import GeometryError, NoSuchBandError
 from agalign.host.text import did_you_mean
 from agalign.values import geometry
 from agalign.values.band_names import own_stem
-from agalign.values.capture import Band, CaptureTime, Pose
+from agalign.values.capture import Band, CaptureTime, Pose, Position
 from agalign.values.geometry import Matrix
 from agalign.values.lens import Lens
 from agalign.values.spectrum import band_key
@@ -74,7 +75,9 @@ class Camera(ABC):
 
     def captured_at(self, tags: Tags) -> str:
         """Return the time as `Capture.captured_at`, in UTC if the camera writes that; empty if the tags lack it."""
-        utc = CaptureTime.of(tags.first_text(self.utc_times) or (tags.captured_at if self.clock_is_utc else ""))
+        utc = CaptureTime.of(
+            iso_time(tags.first_text(self.utc_times)) or (tags.captured_at if self.clock_is_utc else "")
+        )
         return tags.captured_at if utc is None else utc.utc.isoformat()
 
     def elevation_deg(self, tags: Tags) -> float | None:
@@ -82,6 +85,10 @@ class Camera(ABC):
         if (pose := self.pose(tags)) is None:
             return None
         return -math.degrees(math.asin(math.cos(math.radians(pose.pitch_deg)) * math.cos(math.radians(pose.roll_deg))))
+
+    def other_position(self, tags: Tags) -> Position | None:
+        """Return the position by other tags than those of Exif; None if the tags lack it."""
+        return None
 
     def sun(self, tags: Tags) -> Sun | None:
         """Return the position of the sun by its light sensor; None if the tags lack it."""

@@ -8,8 +8,9 @@ are compared with the tags by `pixels.radiometry.check_pixels`.
 import math
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Sequence
+from dataclasses import replace
 from datetime import timedelta
-from itertools import pairwise
+from itertools import pairwise, product
 from pathlib import Path
 from statistics import median_low
 
@@ -32,6 +33,8 @@ _MAX_SUN_ERROR = 0.02
 """Radians between the sun by the tags and by the clock: they agree within 0.001 on four cameras, and the sun moves by
 this in five minutes.
 """
+_MAX_POSITION_ERROR_KM = 1.0
+"""Between two tags with the position of a file: receivers without corrections are within 10 m."""
 _GPS_ROLLOVER_H = 1024 * 7 * 24.0
 """Hours after which the week number of GPS repeats."""
 _MAX_OFF_CENTRE = 0.1
@@ -74,6 +77,53 @@ def clock_doubt(error: str) -> Doubt:
     """Return the doubt of a `clock_error`."""
     text = f"its clock {error}, by the position of the sun in the tags of the light sensor"
     return Doubt(text, "the irradiance is used as measured; correct the time for what depends on it")
+
+
+# ---- position
+
+
+def with_position(tags: Tags, other: Position | None, by_tags: Sun | None) -> tuple[Tags, Doubt | None]:
+    """Return the tags with the position that is known twice, and what is doubtful about it.
+
+    `other` is the position by other tags than those of Exif, `by_tags` the position of the sun in the tags: it tells
+    the hemispheres if the letters of a coordinate are missing.
+    """
+    advice = "--georeference and the map do not use the position: correct the tags"
+    if tags.position is not None:
+        if other is None or _apart_km(tags.position, other) < _MAX_POSITION_ERROR_KM:
+            return tags, None
+        text = f"the positions in its Exif and XMP tags are {_apart_km(tags.position, other):.0f} km apart"
+        return replace(tags, position=None), Doubt(text, advice)
+    if other is not None:
+        return replace(tags, position=other), None
+    if tags.without_signs is not None:
+        fitting = [one for one in _in_hemispheres(tags.without_signs) if _fits_sun(one, tags.captured_at, by_tags)]
+        if len(fitting) == 1:
+            text = f"its GPS tags lack N or S, or E or W: by the sun it is at {fitting[0].text}"
+            return replace(tags, position=fitting[0]), Doubt(text, "the position is used: check it")
+        return tags, Doubt("its GPS tags lack N or S, or E or W", advice)
+    if tags.position_to_a_minute is not None:
+        return tags, Doubt("the seconds of its GPS position are not numbers", advice)
+    return tags, None
+
+
+def _in_hemispheres(position: Position) -> list[Position]:
+    signs = product((1, -1), repeat=2)
+    return [replace(position, latitude=position.latitude * a, longitude=position.longitude * b) for a, b in signs]
+
+
+def _fits_sun(position: Position, captured_at: str, by_tags: Sun | None) -> bool:
+    """True if the sun of the tags is that of a position and time; False if one of them is unknown."""
+    is_known = by_tags is not None and CaptureTime.of(captured_at) is not None and is_clock_set(captured_at)
+    return is_known and not clock_error(position, captured_at, by_tags)
+
+
+def _apart_km(one: Position, other: Position) -> float:
+    """Distance of two positions, km: accurate to 1 % up to 100 km."""
+    km_per_degree = 111.2
+    east = (one.longitude - other.longitude + 180) % 360 - 180
+    east *= math.cos(math.radians((one.latitude + other.latitude) / 2))
+    return km_per_degree * math.hypot(one.latitude - other.latitude, east)
 
 
 # ---- size of the image and of the camera

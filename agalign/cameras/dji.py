@@ -12,24 +12,35 @@ colour photograph. The bands are exposed one after another, so in motion a seed 
 
 import math
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
+from typing import NamedTuple, Self
 
 import numpy as np
 
 from agalign.cameras import pix4d
 from agalign.cameras.base import Camera, colour_bands
 from agalign.cameras.consistency import full_scale, raw_step_of
-from agalign.cameras.metadata import Tags
+from agalign.cameras.metadata import Tags, finite
 from agalign.cameras.model_tables import MAVIC_3_PART, PHANTOM_4, named_by_camera
+from agalign.cameras.tag_text import numbers_in
 from agalign.errors import GeometryError
+from agalign.pixels.radiometric_errors import (
+    FACTORY_CALIBRATION,
+    LIGHT_SENSOR,
+    NO_GAIN_ADJUSTMENT,
+    NO_VIGNETTING,
+    agreed,
+)
 from agalign.values import geometry
 from agalign.values.band_names import own_stem
-from agalign.values.capture import Band, Pose, Radiometry
+from agalign.values.capture import Band, Pose, Position
 from agalign.values.geometry import Matrix
 from agalign.values.lens import Lens
+from agalign.values.radiometry import Radiometry, ReflectanceFactor
 
 _MAVIC_3_BAND = rf"{MAVIC_3_PART}|(?<=_\d{{4}})_D(?![a-z0-9])|_D$"
 NAMESPACE = "dji.com/drone-dji"
@@ -55,7 +66,14 @@ class Dji(Camera):
         if len(stored) > 1:
             return colour_bands(stored, lens, None if is_mavic else by_centres)
         band = pix4d.described(stored[0], tags, tags.text(NAMESPACE, "BandName") or _band_in_name(path))
-        band = replace(band, lens=lens, radiometry=_radiometry(tags, stored[0]))
+        factors = _Factors.of(tags)
+        band = replace(
+            band,
+            lens=lens,
+            radiometry=_radiometry(factors, tags, stored[0]),
+            missing_calibration=factors.problem,
+            implausible=factors.problem_of_sun,
+        )
         if calibrated is None or lens is None:
             return (replace(band, to_rig=by_centres),)
         return (replace(band, to_rig=calibrated, other_to_rig=by_centres),)
@@ -74,6 +92,16 @@ class Dji(Camera):
             return None
         focal_length_px = tags.number(NAMESPACE, "CalibratedFocalLength")
         return Pose(heading_deg, pitch_deg + 90, 0.0, _height_m(tags), focal_length_px)
+
+    def other_position(self, tags: Tags) -> Position | None:
+        latitude_deg = tags.number(NAMESPACE, "GpsLatitude")
+        names = "GpsLongitude", "GpsLongtitude"  # the second is a mistake of the firmware of the Phantom 4
+        longitude_deg = next((v for name in names if (v := tags.number(NAMESPACE, name)) is not None), None)
+        if latitude_deg is None or longitude_deg is None or latitude_deg == longitude_deg == 0:
+            return None
+        is_on_earth = abs(latitude_deg) <= 90 and abs(longitude_deg) <= 180
+        altitude_m = tags.number(NAMESPACE, "AbsoluteAltitude")
+        return Position(latitude_deg, longitude_deg, altitude_m) if is_on_earth else None
 
     def motion(self, tags: Tags) -> tuple[float, float] | None:
         """Calculate the motion from the speed over ground (north, east, m/s), the heading of the image's upper edge and
@@ -105,30 +133,91 @@ def _height_m(tags: Tags) -> float | None:
     return height_m if height_m and height_m > 0 else None
 
 
-def _radiometry(tags: Tags, stored: Band) -> Radiometry | None:
+class _Factors(NamedTuple):
+    """What the radiometry of a file depends on; firmware writes most of it in two tags."""
+
+    of_tags: Mapping[str, float]
+    """By the name of DJI's tag, in its unit; only those that are known."""
+    centre_px: tuple[float, float]
+    vignetting: tuple[float, ...]
+    """k1 ... k6; empty if it is missing."""
+    contradicted: tuple[str, ...]
+    """Names of the tags that others contradict."""
+
+    @classmethod
+    def of(cls, tags: Tags) -> Self:
+        """Read the tags of a file; a value of 0 is missing, except the black level."""
+        of_dji, of_pix4d = partial(tags.number, NAMESPACE), partial(tags.number, pix4d.NAMESPACE)
+        exif_s = finite(tags.exif.get("ExposureTime"))
+        sources = {
+            "SensorGain": (of_dji("SensorGain"),),
+            "ExposureTime": (of_dji("ExposureTime"), None if exif_s is None else exif_s * 1e6),  # microseconds
+            "BlackLevel": (of_dji("BlackLevel"), of_pix4d("BlackCurrent"), tags.black_level),
+            "SensorGainAdjustment": (of_dji("SensorGainAdjustment"), of_pix4d("RadiometricCalibration")),
+            "Irradiance": (of_dji("Irradiance"), of_pix4d("Irradiance"), of_pix4d("SunSensor")),
+        }
+        found = {k: agreed(v if v or k == "BlackLevel" else None for v in values) for k, values in sources.items()}
+        centre_px, coefficients = pair(tags, "CalibratedOpticalCenter"), tags.numbers(NAMESPACE, "VignettingData", 6)
+        other_px, others = pix4d.vignetting(tags)
+        is_own = centre_px is not None and any(coefficients)
+        contradicted = [name for name, (_, is_agreed) in found.items() if not is_agreed]
+        if is_own and others and not _agree(coefficients, others):
+            contradicted.append("VignettingData")
+        return cls(
+            {name: value for name, (value, _) in found.items() if value is not None},
+            centre_px if centre_px is not None and is_own else other_px,
+            coefficients if is_own else others,
+            tuple(contradicted),
+        )
+
+    @property
+    def problem(self) -> str:
+        """Why the file has no radiance, in words; empty if it has one."""
+        missing = [name for name in ("SensorGain", "ExposureTime", "BlackLevel") if name not in self.of_tags]
+        wrong = [name for name in self.contradicted if name != "Irradiance"]
+        if missing:
+            return f"no tag {', '.join(missing)} for radiance"
+        contradiction = f"other tags contradict {', '.join(wrong)}"
+        return f"no usable tags for radiance ({contradiction})" if wrong else ""
+
+    @property
+    def problem_of_sun(self) -> str:
+        """Why the irradiance is not used although the file has one; empty if it is, or the file has none."""
+        return "other tags contradict Irradiance" if "Irradiance" in self.contradicted else ""
+
+
+def _agree(one: Sequence[float], other: Sequence[float]) -> bool:
+    """True if two lists of coefficients agree; firmware rounds them differently."""
+    return len(one) == len(other) and all(agreed(two)[1] for two in zip(one, other, strict=True))
+
+
+def _radiometry(factors: _Factors, tags: Tags, stored: Band) -> Radiometry | None:
     """The signal is (raw - black) / 2^bits (1 + k1 r + ... + k6 r^6) / (gain exposure). By DJI's guide, signal *
     SensorGainAdjustment / Irradiance is proportional to reflectance, with the same factor for all bands.
     """
-    gain, exposure_us = tags.number(NAMESPACE, "SensorGain"), tags.number(NAMESPACE, "ExposureTime")
-    levels = tags.number(NAMESPACE, "BlackLevel"), tags.number(pix4d.NAMESPACE, "BlackCurrent"), tags.black_level
-    black = next((level for level in levels if level is not None), None)  # it may be 0
-    if not gain or not exposure_us or black is None:
+    if factors.problem:
         return None
-    irradiance = tags.number(NAMESPACE, "Irradiance") or 0.0
-    adjusted = tags.number(NAMESPACE, "SensorGainAdjustment") or 1.0
-    centre, k = pair(tags, "CalibratedOpticalCenter"), tags.numbers(NAMESPACE, "VignettingData")
+    known = factors.of_tags
+    gain, exposure_s, adjusted = known["SensorGain"], known["ExposureTime"] / 1e6, known.get("SensorGainAdjustment")
+    irradiance = known.get("Irradiance", 0.0)  # 0 without a reading
+    by_sun = None
+    if irradiance > 0 and not factors.problem_of_sun:
+        by_sun = ReflectanceFactor(1 / irradiance, "relative reflectance", errors=(LIGHT_SENSOR[2],))
+    missing = [] if factors.vignetting else [NO_VIGNETTING["DJI"]]
+    missing += [] if adjusted else [NO_GAIN_ADJUSTMENT]
     return Radiometry(
         "relative radiance",
-        black,
+        known["BlackLevel"],
         full_scale(stored),
-        adjusted / (gain * exposure_us / 1e6),
-        centre or (0.0, 0.0),
-        k if centre else (),
+        (adjusted or 1.0) / (gain * exposure_s),
+        factors.centre_px,
+        factors.vignetting,
         vignetting_divides=False,
-        by_sun=(1 / irradiance, "relative reflectance") if irradiance > 0 else None,
+        by_sun=by_sun,
         raw_step=raw_step_of(tags, stored),
-        tags={"sensor gain": gain, "gain adjustment": adjusted, "exposure time (s)": exposure_us / 1e6}
-        | ({"relative irradiance": irradiance} if irradiance else {}),  # 0 without a reading
+        tags={"sensor gain": gain, "gain adjustment": adjusted or 1.0, "exposure time (s)": exposure_s}
+        | ({"relative irradiance": irradiance} if irradiance else {}),
+        errors=(FACTORY_CALIBRATION, *missing),
     )
 
 
@@ -153,7 +242,7 @@ def pair(tags: Tags, name: str) -> tuple[float, float] | None:
 def _matrix(tags: Tags, name: str) -> Matrix | None:
     """A tag as a matrix (3, 3); None if it is missing or singular."""
     with suppress(GeometryError, ValueError):
-        matrix = np.reshape(tags.numbers(NAMESPACE, name), (3, 3))
+        matrix = np.reshape(tags.numbers(NAMESPACE, name, 9), (3, 3))
         geometry.invert(matrix)
         return matrix
     return None
@@ -176,7 +265,5 @@ def dewarp_data(tags: Tags) -> tuple[str, list[float]]:
     if the tag has another form.
     """
     date, _, text = tags.text(NAMESPACE, "DewarpData").rpartition(";")
-    with suppress(ValueError):
-        terms = [float(part) for part in text.split(",")]
-        return date, terms if len(terms) == 9 else []
-    return date, []
+    terms = list(numbers_in([text], 9))
+    return date, terms if len(terms) == 9 else []

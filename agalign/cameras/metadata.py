@@ -1,7 +1,6 @@
 """Tags of a TIFF or JPEG as typed fields: the standard ones, EXIF, GPS, and XMP read by namespace."""
 
 import math
-import re
 from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
@@ -10,6 +9,7 @@ from typing import Any
 
 from PIL import ExifTags
 
+from agalign.cameras.tag_text import iso_time, numbers_in
 from agalign.cameras.tiff_directory import EXIF, GPS, read_directories, values
 from agalign.cameras.xmp import Name, Packet
 from agalign.errors import UnreadableFileError
@@ -26,6 +26,10 @@ class Tags:
     model: str = ""
     serial: str = ""
     position: Position | None = None
+    position_to_a_minute: Position | None = None
+    """The position to a minute of arc, 1.9 km, if the seconds are not numbers: enough for the direction of the sun."""
+    without_signs: Position | None = None
+    """The position without the references N or S and E or W, if one is missing: both coordinates are positive."""
     captured_at: str = ""
     """ISO 8601; by the camera's clock without an offset from UTC if the camera writes none."""
     orientation: int = 1
@@ -50,16 +54,18 @@ class Tags:
         """Return the text of the first of these XMP values that is not empty."""
         return next((text for name in names if (text := self.text(*name))), "")
 
-    def numbers(self, namespace: str, name: str) -> tuple[float, ...]:
-        """Return the numbers in an XMP value, a text or a sequence, without impossibly large ones."""
-        texts = re.findall(r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?", self.text(namespace, name))
-        numbers = map(float, texts)
-        max_number = 1e15  # larger than times in microseconds; the squares of damaged values would overflow
-        return tuple(n for n in numbers if abs(n) < max_number)
+    def numbers(self, namespace: str, name: str, count: int | None = None) -> tuple[float, ...]:
+        """Return the numbers in an XMP value, a text or a sequence, as `numbers_in`; `count` is their usual number."""
+        return numbers_in(self.xmp.get((namespace, name), ()), count)
 
     def number(self, namespace: str, name: str) -> float | None:
         """Return the first number in an XMP value; None if there is none."""
-        return next(iter(self.numbers(namespace, name)), None)
+        return next(iter(self.numbers(namespace, name, 1)), None)
+
+    @property
+    def near(self) -> Position | None:
+        """The position, at least to a minute of arc."""
+        return self.position or self.position_to_a_minute
 
     @property
     def camera_size_px(self) -> tuple[int, int] | None:
@@ -99,7 +105,7 @@ def read_tags(path: Path, page: int = 0) -> Tags:
         make=_text(first.get("Make")),
         model=_text(first.get("Model")),
         serial=_text(exif.get("BodySerialNumber")),
-        position=_position(gps),
+        **_positions(gps),
         captured_at=_iso_time(exif, "DateTimeOriginal", "OffsetTimeOriginal")
         or _iso_time({**exif, **first}, "DateTime", "OffsetTime"),
         orientation=int(orientation) if orientation in range(1, 9) else 1,
@@ -125,24 +131,38 @@ def _size(directory: Mapping[str, Any], *sides: str) -> tuple[int, int] | None:
     return (width, height) if isinstance(width, int) and isinstance(height, int) and width > 0 < height else None
 
 
-def _position(gps: Mapping[str, Any]) -> Position | None:
-    """The position in a GPS directory; None without a fix, for which cameras write no coordinates or zeros."""
-    latitude_deg = _signed_degrees(gps, "Latitude", "S", 90.0)
-    longitude_deg = _signed_degrees(gps, "Longitude", "W", 180.0)
+def _positions(gps: Mapping[str, Any]) -> dict[str, Position]:
+    """The fields of `Tags` that a GPS directory determines; none without a fix, for which cameras write no coordinates
+    or zeros.
+    """
+    (latitude_deg, is_exact), (longitude_deg, is_exact_too) = _degrees(gps, "Latitude"), _degrees(gps, "Longitude")
     if latitude_deg is None or longitude_deg is None or latitude_deg == longitude_deg == 0:
-        return None
-    return Position(latitude_deg, longitude_deg, _altitude_m(gps))
+        return {}
+    if latitude_deg > 90.0 or longitude_deg > 180.0:
+        return {}
+    absolute = Position(latitude_deg, longitude_deg, _altitude_m(gps))
+    sign, other = _sign(gps, "Latitude", "NS"), _sign(gps, "Longitude", "EW")
+    if sign is None or other is None:
+        return {"without_signs": absolute} if is_exact and is_exact_too else {}
+    signed = Position(sign * latitude_deg, other * longitude_deg, absolute.altitude_m)
+    return {"position" if is_exact and is_exact_too else "position_to_a_minute": signed}
 
 
-def _signed_degrees(gps: Mapping[str, Any], axis: str, negative: str, max_deg: float) -> float | None:
-    """A coordinate, negative if its reference (N, S, E, W) is `negative`; None if it is missing or beyond `max_deg`."""
+def _degrees(gps: Mapping[str, Any], axis: str) -> tuple[float | None, bool]:
+    """(a coordinate without its sign, False if it is known to a minute only); None if it is missing or negative."""
     value = gps.get(f"GPS{axis}")  # degrees, minutes and seconds
-    if not isinstance(value, tuple) or len(value) != 3 or any(finite(part) is None for part in value):
-        return None
-    degrees = float(sum(part / 60**k for k, part in enumerate(value)))
-    if abs(degrees) > max_deg:
-        return None
-    return -degrees if _text(gps.get(f"GPS{axis}Ref")).upper() == negative else degrees
+    parts = [finite(part) for part in value] if isinstance(value, tuple) and len(value) == 3 else []
+    if not parts or parts[0] is None or parts[1] is None:
+        return None, False
+    degrees = parts[0] + parts[1] / 60 + (parts[2] or 0.0) / 3600
+    is_exact = parts[2] is not None or parts[1] % 1 != 0  # some programs write minutes with a fraction
+    return (degrees if degrees >= 0 else None), is_exact
+
+
+def _sign(gps: Mapping[str, Any], axis: str, letters: str) -> int | None:
+    """1 for the first letter of a reference, N or E, -1 for the second; None for another text."""
+    letter = _text(gps.get(f"GPS{axis}Ref")).strip().upper()[:1]
+    return {letters[0]: 1, letters[1]: -1}.get(letter)
 
 
 def _altitude_m(gps: Mapping[str, Any]) -> float | None:
@@ -170,10 +190,5 @@ def _text(value: Any) -> str:
 
 def _iso_time(exif: Mapping[str, Any], time: str, offset: str) -> str:
     """The time in a tag, with the offset from UTC in another tag if it is plausible; empty without a time."""
-    match = re.fullmatch(r"(\d{4}):(\d\d):(\d\d) (\d\d:\d\d:\d\d)", _text(exif.get(time)))
-    if not match:
-        return ""
-    year, month, day, clock = match.groups()
     fraction = _text(exif.get("SubsecTimeOriginal") or exif.get("SubsecTime"))
-    zone = re.fullmatch(r"[+-](0\d|1[0-4]):[0-5]\d", _text(exif.get(offset)))
-    return f"{year}-{month}-{day}T{clock}{f'.{fraction}' if fraction.isdigit() else ''}{zone[0] if zone else ''}"
+    return iso_time(_text(exif.get(time)), fraction, _text(exif.get(offset)))

@@ -20,6 +20,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,10 +30,24 @@ from agalign.cameras.base import Camera, is_thermal, rays_to_rig, rotation
 from agalign.cameras.consistency import clock_error, full_scale, raw_step_of
 from agalign.cameras.metadata import Tags, finite
 from agalign.cameras.sun import Sun, sun_position
+from agalign.pixels.radiometric_errors import (
+    FACTORY_CALIBRATION,
+    LIGHT_SENSOR,
+    NO_TILT,
+    NO_VIGNETTING,
+    agreed,
+    contradiction,
+    tilt_error,
+)
 from agalign.values.band_names import own_stem
-from agalign.values.capture import Band, CaptureTime, Pose, Radiometry, is_clock_set
+from agalign.values.capture import Band, CaptureTime, Pose, is_clock_set
+from agalign.values.radiometry import Errors, Radiometry, ReflectanceFactor
 
 NAMESPACE, _DLS = "micasense.com/MicaSense", "micasense.com/DLS"
+_SCALE_OF_DLS_2 = 0.01
+"""W / m^2 / nm per unit of the irradiance of a DLS 2, whose firmware does not always state it."""
+_MAX_CORRECTION = 2.0
+"""For the tilt of a light sensor: one that points further from the sun measures too little direct light."""
 _REDEDGE_M_PARALLAX = {
     "Blue": (-0.9, 0.0),
     "Green": (0.0, 0.0),
@@ -73,14 +88,18 @@ class MicaSense(Camera):
             parallax_direction=known_parallax if offset is None else (-offset[0], -offset[1]),
             radiometry=centikelvin if is_thermal(band) else _radiometry(tags, stored[0]),
             missing_calibration="" if is_thermal(band) else _without_calibration(tags),
+            implausible="" if is_thermal(band) else irradiance(tags).problem,
             lens_offset=offset,
         )
         return (band,)
 
     def pose(self, tags: Tags) -> Pose | None:
         """Return the pose in the camera's tags, else the attitude of the light sensor on the same aircraft."""
-        by_sensor = Pose(*_sensor_attitude_deg(tags), focal_length_px=pix4d.focal_length_px(tags))
-        return pix4d.pose_of(tags) or (None if tags.number(_DLS, "Yaw") is None else by_sensor)
+        yaw, pitch, roll = (tags.number(_DLS, name) for name in ("Yaw", "Pitch", "Roll"))
+        if (by_camera := pix4d.pose_of(tags)) is not None or yaw is None:
+            return by_camera
+        yaw_deg, pitch_deg, roll_deg = (math.degrees(angle or 0.0) for angle in (yaw, pitch, roll))
+        return Pose(yaw_deg, pitch_deg, roll_deg, focal_length_px=pix4d.focal_length_px(tags))
 
     def sun(self, tags: Tags) -> Sun | None:
         return _sun_by_sensor(tags)
@@ -90,87 +109,138 @@ def _radiometry(tags: Tags, stored: Band) -> Radiometry | None:
     """L = V a1 / g (p - p_black) / (t + a2 y - a3 t y) with p = raw / 2^bits, vignetting V, gain g = ISO / 100,
     exposure time t and row y; reflectance = pi L / E with the irradiance E of the light sensor on a horizontal plane.
     """
-    a = tags.numbers(NAMESPACE, "RadiometricCalibration")
+    a = tags.numbers(NAMESPACE, "RadiometricCalibration", 3)
     exposure_s = finite(tags.exif.get("ExposureTime"))
     iso = finite(tags.exif.get("ISOSpeed", tags.exif.get("ISOSpeedRatings")))
     if len(a) != 3 or not exposure_s or tags.black_level is None or not iso:
         return None
-    measured, by_sensor = math.prod(_measured_irradiance(tags) or (0.0,)), irradiance(tags)
-    of_sensor = {"irradiance (W / m^2 / nm)": measured} if measured else {}  # 0 without a reading
-    centre, k = tags.numbers(pix4d.NAMESPACE, "VignettingCenter"), tags.numbers(pix4d.NAMESPACE, "VignettingPolynomial")
-    has_vignetting = len(centre) == 2
+    light = irradiance(tags)
+    of_sensor = {"irradiance (W / m^2 / nm)": light.value} if light.value else {}  # 0 without a reading
+    centre, k = pix4d.vignetting(tags)
     return Radiometry(
         "radiance",
         tags.black_level,
         full_scale(stored),
         a[0] / (iso / 100) / exposure_s,
-        (centre[0], centre[1]) if has_vignetting else (0.0, 0.0),
-        k if has_vignetting else (),
+        centre,
+        k,
         True,
         a[1] / exposure_s - a[2],
-        (math.pi / math.prod(by_sensor), "reflectance") if by_sensor else None,
+        ReflectanceFactor(math.pi / light.value, errors=light.errors) if light.value > 0 else None,
         raw_step=raw_step_of(tags, stored),
         tags={"calibration coefficient": a[0], "sensor gain": iso / 100, "exposure time (s)": exposure_s} | of_sensor,
+        errors=(FACTORY_CALIBRATION,) if k else (FACTORY_CALIBRATION, NO_VIGNETTING["MicaSense"]),
     )
 
 
 def _without_calibration(tags: Tags) -> str:
     """The tags that radiance needs and the file lacks, in words; empty if it lacks none."""
     has = {
-        "RadiometricCalibration": tags.text(NAMESPACE, "RadiometricCalibration"),
-        "ExposureTime": tags.exif.get("ExposureTime"),
-        "ISOSpeed": tags.exif.get("ISOSpeed", tags.exif.get("ISOSpeedRatings")),
+        "RadiometricCalibration": tags.numbers(NAMESPACE, "RadiometricCalibration", 3),
+        "ExposureTime": finite(tags.exif.get("ExposureTime")),
+        "ISOSpeed": finite(tags.exif.get("ISOSpeed", tags.exif.get("ISOSpeedRatings"))),
         "BlackLevel": tags.black_level is not None,
     }
     missing = [name for name, value in has.items() if not value]
     return f"no tag {', '.join(missing)} for radiance" if missing else ""
 
 
-def irradiance(tags: Tags) -> tuple[float, float] | None:
-    """Return (irradiance on a horizontal plane in the unit of the tags, this unit in W / m^2 / nm); None if there is no
-    positive one.
+# ---- the light sensor
+
+
+class Irradiance(NamedTuple):
+    """Irradiance on a horizontal plane by the light sensor."""
+
+    value: float = 0.0
+    """W / m^2 / nm; 0 without a usable reading."""
+    errors: Errors = ()
+    problem: str = ""
+    """Why no reading is used although the tags have one; empty if one is, or they have none."""
+
+
+def irradiance(tags: Tags) -> Irradiance:
+    """Return the irradiance on a horizontal plane by the tags of a light sensor.
+
+    The DLS 2 measures direct and diffuse light, so that its value does not depend on its tilt. The DLS 1 measures in
+    its own plane: the time, the place and the attitude give the horizontal irradiance.
     """
-    measured = _measured_irradiance(tags)
-    # Products of damaged tags underflow.
-    return None if measured is None or not math.prod(measured) > 0 else measured
+    by_sensor = _sun_by_sensor(tags)
+    is_clock_wrong = bool(clock_error(tags.near, tags.captured_at, by_sensor))
+    sun = None if is_clock_wrong else _sun_by_clock(tags)
+    if is_clock_wrong and by_sensor is not None and by_sensor.azimuth is not None:
+        sun = by_sensor.elevation, by_sensor.azimuth
+    elevation = sun[0] if sun is not None else None if by_sensor is None else by_sensor.elevation
+    horizontal = _horizontal(tags, elevation)
+    return _in_plane_of_sensor(tags, sun) if horizontal is None else horizontal
 
 
-def _measured_irradiance(tags: Tags) -> tuple[float, float] | None:
-    """The irradiance as `irradiance`, also one that is not positive; None if there is none.
+def _sun_by_clock(tags: Tags) -> tuple[float, float] | None:
+    """(elevation, azimuth) of the sun at the time and place of a file; None if one of them is unknown."""
+    time = CaptureTime.of(tags.captured_at)
+    if tags.near is None or time is None or not is_clock_set(tags.captured_at):
+        return None
+    return sun_position(tags.near, time.utc.timestamp())
 
-    Older sensors measure only in their own plane: the time, the place and the attitude then give the horizontal one.
+
+def _horizontal(tags: Tags, elevation: float | None) -> Irradiance | None:
+    """The irradiance by a DLS 2, given the elevation of the sun; None without one.
+
+    HorizontalIrradiance is direct light on a horizontal plane plus diffuse light. Early firmware does not write it, or
+    calculates only the components correctly: these are used where they contradict it.
     """
-    time, by_sensor = CaptureTime.of(tags.captured_at), _sun_by_sensor(tags)
-    is_known = tags.position is not None and time is not None and is_clock_set(tags.captured_at)
-    sun = sun_position(tags.position, time.utc.timestamp()) if tags.position and time and is_known else None
-    is_clock_wrong = bool(clock_error(tags.position, tags.captured_at, by_sensor))
-    scale = tags.number(_DLS, "IrradianceScaleToSIUnits")
-    horizontal = _measured_horizontal(tags, None if is_clock_wrong else sun)
-    if horizontal is not None and horizontal > 0:
-        return horizontal, scale or 0.01  # the unit without a tag
-    value = tags.number(_DLS, "SpectralIrradiance")
-    value = tags.number(pix4d.NAMESPACE, "Irradiance") if value is None else value
-    if value is None:
-        return None if horizontal is None else (horizontal, scale or 0.01)
-    if is_clock_wrong and by_sensor is not None:
-        sun = None if by_sensor.azimuth is None else (by_sensor.elevation, by_sensor.azimuth)
-    if sun is not None:
-        value = horizontal_irradiance(value, _sensor_attitude_deg(tags), sun)
-    return None if math.isnan(value) else (value, scale or 1.0)
-
-
-def _measured_horizontal(tags: Tags, sun: tuple[float, float] | None) -> float | None:
-    """HorizontalIrradiance, in the unit of the tag; from its direct and diffuse components where it contradicts them,
-    because early firmware of the DLS 2 calculates only them correctly.
-    """
-    names = "HorizontalIrradiance", "DirectIrradiance", "ScatteredIrradiance"
-    horizontal, direct, diffuse = (tags.number(_DLS, name) for name in names)
-    if sun is None or horizontal is None or not direct or not diffuse:
-        return horizontal
-    calculated = direct * math.sin(sun[0]) + diffuse
+    tag, direct, diffuse = (_positive(tags, f"{name}Irradiance") for name in ("Horizontal", "Direct", "Scattered"))
+    has_components = elevation is not None and direct is not None and diffuse is not None
+    calculated = direct * math.sin(elevation) + diffuse if has_components and elevation and direct and diffuse else None
+    scale = _positive(tags, "IrradianceScaleToSIUnits") or _SCALE_OF_DLS_2
+    known = [v for v in (tag, calculated) if v is not None]
+    if not known:
+        return None
+    value, errors = known[-1], [LIGHT_SENSOR[2]]
     # Of HorizontalIrradiance: correct firmware differs from its own components by 0.03 %, from refraction.
     max_horizontal_error = 0.01
-    return horizontal if abs(horizontal - calculated) < max_horizontal_error * horizontal else calculated
+    if tag is not None and calculated is not None and abs(tag - calculated) < max_horizontal_error * tag:
+        value = tag
+    elif tag is not None and calculated is not None:
+        # The sum of the light on a tilted sensor cannot be far from that on a horizontal plane.
+        measured = _spectral(tags)[0] or calculated
+        near = [v for v in (calculated, tag) if 1 / _MAX_CORRECTION < v / measured < _MAX_CORRECTION]
+        if not near:
+            names = f"HorizontalIrradiance {tag:g}, SpectralIrradiance {measured:g}"
+            return Irradiance(problem=f"{names} and the components ({calculated:.4g}) contradict each other")
+        value = near[0]
+        errors.append(contradiction("components of the irradiance", tag, calculated))
+    return Irradiance(value * scale, tuple(errors))
+
+
+def _in_plane_of_sensor(tags: Tags, sun: tuple[float, float] | None) -> Irradiance:
+    """The irradiance by a DLS 1, corrected for the tilt of the sensor if the sun and the attitude are known."""
+    value, is_agreed = _spectral(tags)
+    if not value:
+        negative = (tags.number(_DLS, "SpectralIrradiance") or 0.0) < 0
+        return Irradiance(problem="SpectralIrradiance is negative" if negative else "")
+    if not is_agreed:
+        return Irradiance(problem="SpectralIrradiance and Irradiance contradict each other")
+    max_si = 3.0  # W / m^2 / nm, twice that of a clear noon: larger numbers have the unit of the DLS 2
+    scale = _positive(tags, "IrradianceScaleToSIUnits") or (1.0 if value <= max_si else _SCALE_OF_DLS_2)
+    attitude_deg = _sensor_attitude_deg(tags)
+    if sun is None or attitude_deg is None:
+        return Irradiance(value * scale, (LIGHT_SENSOR[1], NO_TILT))
+    horizontal = horizontal_irradiance(value, attitude_deg, sun)
+    if math.isnan(horizontal):
+        return Irradiance()
+    return Irradiance(horizontal * scale, (LIGHT_SENSOR[1], tilt_error(horizontal / value)))
+
+
+def _spectral(tags: Tags) -> tuple[float | None, bool]:
+    """(irradiance in the plane of the sensor, in the unit of the tag; False if its two tags contradict each other)."""
+    spectral, same = _positive(tags, "SpectralIrradiance"), tags.number(pix4d.NAMESPACE, "Irradiance")
+    return agreed((spectral, same if same and same > 0 else None))
+
+
+def _positive(tags: Tags, name: str) -> float | None:
+    """A number of the light sensor; None if it is missing or not positive."""
+    number = tags.number(_DLS, name)
+    return number if number is not None and number > 0 else None
 
 
 def _sun_by_sensor(tags: Tags) -> Sun | None:
@@ -179,13 +249,21 @@ def _sun_by_sensor(tags: Tags) -> Sun | None:
     return Sun(elevation, azimuth) if elevation and elevation > 0 else None
 
 
-def _sensor_attitude_deg(tags: Tags) -> tuple[float, float, float]:
-    """(yaw, pitch, roll) of the light sensor; zeros if they are missing, as in MicaSense's library."""
-    yaw, pitch, roll = (math.degrees(tags.number(_DLS, name) or 0.0) for name in ("Yaw", "Pitch", "Roll"))
-    return yaw, pitch, roll
+def _sensor_attitude_deg(tags: Tags) -> tuple[float, float, float] | None:
+    """(yaw, pitch, roll) of the light sensor; None if an angle is missing."""
+    names = "Yaw", "Pitch", "Roll"
+    angles = [_degrees(tags.number(_DLS, name), tags.number(pix4d.NAMESPACE, f"Irradiance{name}")) for name in names]
+    yaw, pitch, roll = angles
+    return None if yaw is None or pitch is None or roll is None else (yaw, pitch, roll)
 
 
-# ---- the light sensor
+def _degrees(angle: float | None, other_deg: float | None) -> float | None:
+    """An angle, radians, in degrees; by another tag if it is missing, and None if the two contradict each other."""
+    if angle is None:
+        return other_deg
+    angle_deg, max_difference_deg = math.degrees(angle), 1.0  # firmware writes both of one number
+    is_other = other_deg is not None and abs((angle_deg - other_deg + 180) % 360 - 180) > max_difference_deg
+    return None if is_other else angle_deg
 
 
 def horizontal_irradiance(measured: float, attitude_deg: tuple[float, float, float], sun: tuple[float, float]) -> float:
@@ -203,8 +281,7 @@ def horizontal_irradiance(measured: float, attitude_deg: tuple[float, float, flo
     if elevation <= 0 or cos_angle <= 0:
         return math.nan
     correction = (math.sin(elevation) + diffuse) / (cos_angle + diffuse)
-    max_correction = 2.0  # a sensor that points further from the sun measures too little direct light
-    if not 1 / max_correction < correction < max_correction:
+    if not 1 / _MAX_CORRECTION < correction < _MAX_CORRECTION:
         return math.nan
     return measured / transmission(math.acos(cos_angle)) * correction
 

@@ -58,7 +58,7 @@ class Sequoia(Camera):
 
 
 def _fisheye_lens(tags: Tags, size_px: Size) -> Lens | None:
-    polynomial, affine = (tags.numbers(pix4d.NAMESPACE, f"Fisheye{name}") for name in ("Polynomial", "AffineMatrix"))
+    polynomial, affine = (tags.numbers(pix4d.NAMESPACE, f"Fisheye{name}", 4) for name in ("Polynomial", "AffineMatrix"))
     centre_px = pix4d.principal_point_px(tags)
     if len(polynomial) != 4 or len(affine) != 4 or centre_px is None:
         return None

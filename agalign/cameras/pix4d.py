@@ -8,9 +8,10 @@ import numpy as np
 from agalign.cameras.metadata import Tags, finite
 from agalign.cameras.model_tables import named_by_camera
 from agalign.pixels.radiometry import plausible
-from agalign.values.capture import Band, Panel, Pose, Radiometry
+from agalign.values.capture import Band, Panel, Pose
 from agalign.values.geometry import Points
 from agalign.values.lens import Lens
+from agalign.values.radiometry import Radiometry
 
 NAMESPACE = "pix4d.com"
 """Contains `pix4d.com/camera/1.0`, and `pix4d.com/1.0` of older firmware."""
@@ -24,14 +25,14 @@ def perspective_lens(tags: Tags) -> Lens | None:
     focal_px, centre_px = focal_length_px(tags), principal_point_px(tags)
     if focal_px is None or centre_px is None:
         return None
-    k = tags.numbers(NAMESPACE, "PerspectiveDistortion")
+    k = tags.numbers(NAMESPACE, "PerspectiveDistortion", 5)
     distortion = (k[0], k[1], k[3], k[4], k[2]) if len(k) == 5 else ()
     return Lens(focal_px, focal_px, *centre_px, distortion)
 
 
 def principal_point_px(tags: Tags) -> tuple[float, float] | None:
     """Return (x, y), with the centre of the top-left pixel at (0, 0): the vendors' libraries multiply mm by px/mm."""
-    density, point_mm = pixels_per_mm(tags), tags.numbers(NAMESPACE, "PrincipalPoint")
+    density, point_mm = pixels_per_mm(tags), tags.numbers(NAMESPACE, "PrincipalPoint", 2)
     return (point_mm[0] * density, point_mm[1] * density) if density and len(point_mm) == 2 else None
 
 
@@ -47,7 +48,7 @@ def pixels_per_mm(tags: Tags) -> float | None:
     if focal_px and tags.focal_length_mm:
         return focal_px / tags.focal_length_mm
     max_ratio = 1.1  # of both axes: principal points are within 0.02 of the longer side of the middle
-    point_mm = tags.numbers(NAMESPACE, "PrincipalPoint")
+    point_mm = tags.numbers(NAMESPACE, "PrincipalPoint", 2)
     if focal_px or tags.size_px is None or len(point_mm) != 2 or min(point_mm) <= 0:
         return None
     low, high = sorted(side_px / 2 / mm for side_px, mm in zip(tags.size_px, point_mm, strict=True))
@@ -74,7 +75,7 @@ def focal_length_px(tags: Tags) -> float | None:
 
 def rig_degrees(tags: Tags) -> tuple[float, ...]:
     """Return the three angles of Camera:RigRelatives; zeros if they are missing."""
-    angles = tags.numbers(NAMESPACE, "RigRelatives")
+    angles = tags.numbers(NAMESPACE, "RigRelatives", 3)
     return angles if len(angles) == 3 else (0.0, 0.0, 0.0)
 
 
@@ -82,7 +83,7 @@ def lens_offset(tags: Tags) -> tuple[float, float] | None:
     """Return the position (right, down) of a band's lens in the rig from Camera:RigTranslations, in the unit of
     `rig_unit_m`; None if that is missing.
     """
-    position = tags.numbers(NAMESPACE, "RigTranslations")
+    position = tags.numbers(NAMESPACE, "RigTranslations", 3)
     return (position[0], position[1]) if len(position) == 3 else None
 
 
@@ -153,7 +154,7 @@ def panel_in(tags: Tags, size_px: tuple[int, int]) -> Panel | None:
 
 def _panel_corners(tags: Tags, size_px: tuple[int, int]) -> tuple[tuple[float, float], ...]:
     """(x, y) of the corners of ReflectArea; empty if they are not four different points of the image."""
-    area = tags.numbers(NAMESPACE, "ReflectArea")
+    area = tags.numbers(NAMESPACE, "ReflectArea", 8)
     if len(area) != 8:
         return ()
     corners = tuple(zip(area[::2], area[1::2], strict=True))
@@ -175,14 +176,20 @@ class GridVignetting:
     """p95 of its relative error."""
 
 
+def vignetting(tags: Tags) -> tuple[tuple[float, float], tuple[float, ...]]:
+    """Return ((x, y), (k1, k2 ...)) of Camera:VignettingCenter and VignettingPolynomial; no k if one is missing."""
+    centre, k = tags.numbers(NAMESPACE, "VignettingCenter", 2), tags.numbers(NAMESPACE, "VignettingPolynomial", 6)
+    return ((centre[0], centre[1]), k) if len(centre) == 2 and any(k) else ((0.0, 0.0), ())
+
+
 def vignetting_of(tags: Tags, size_px: tuple[int, int]) -> Radiometry | None:
     """Return the correction of the vignetting alone, of values above the black level, by Camera:VignettingCenter and
     VignettingPolynomial of a band of (width, height); None if they are missing or damaged.
     """
-    centre, k = tags.numbers(NAMESPACE, "VignettingCenter"), tags.numbers(NAMESPACE, "VignettingPolynomial")
-    if len(centre) != 2 or not k or not all(0 <= c <= size for c, size in zip(centre, size_px, strict=True)):
+    centre, k = vignetting(tags)
+    if not k or not all(0 <= c <= size for c, size in zip(centre, size_px, strict=True)):
         return None
-    result = Radiometry("relative radiance", tags.black_level or 0.0, 1.0, 1.0, (centre[0], centre[1]), k)
+    result = Radiometry("relative radiance", tags.black_level or 0.0, 1.0, 1.0, centre, k)
     return plausible(result, size_px)[0]
 
 

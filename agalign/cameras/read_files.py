@@ -16,6 +16,7 @@ from agalign.cameras.consistency import (
     normalized,
     part_of_image,
     pixel_scale,
+    with_position,
 )
 from agalign.cameras.image_file import Doubt, ImageFile, Problem
 from agalign.cameras.makers import known_cameras
@@ -56,6 +57,7 @@ def read_file(path: Path, cameras: Iterable[Camera], options: DiscoverOptions) -
     # A stack was made by software, even if its tags name a camera: cameras write single bands and photographs.
     *_, generic = cameras
     camera = next(c for c in cameras if c.recognises(tags))
+    tags, of_position = with_position(tags, camera.other_position(tags), camera.sun(tags))
     is_photograph = (stored[0].dtype == "uint8" or camera.has_one_lens(tags)) and len(stored) in (3, 4)
     if suffix_format(path) == "TIFF" and len(stored) > 1 and not is_photograph:
         camera = generic
@@ -74,16 +76,15 @@ def read_file(path: Path, cameras: Iterable[Camera], options: DiscoverOptions) -
     bands = tuple(_with_plausible_tags(band, tags) for band, _, _ in checked)
     scale = checked[0][1] if checked else SAME_PIXELS
     other_lens = next((why for *_, why in checked if why), "")
-    return ImageFile(
-        path, camera, tags, bands, scale, bool(other_lens), tuple(_doubts(camera, tags, bands, other_lens))
-    )
+    doubts = [*([] if of_position is None else [of_position]), *_doubts(camera, tags, bands, other_lens)]
+    return ImageFile(path, camera, tags, bands, scale, bool(other_lens), tuple(doubts))
 
 
 def _doubts(camera: Camera, tags: Tags, bands: Sequence[Band], other_lens: str) -> Iterator[Doubt]:
     """What two sources in a file give differently."""
     if other_lens:
         yield Doubt(other_lens, "lens, rig and radiometry are not used: give the original images")
-    if error := clock_error(tags.position, tags.captured_at, camera.sun(tags)):
+    if error := clock_error(tags.near, tags.captured_at, camera.sun(tags)):
         yield clock_doubt(error)
     if (text := normalized(tags)) and any(text in band.missing_calibration for band in bands):
         yield Doubt(text, "radiometry is not used: give the original images")
@@ -131,7 +132,7 @@ def _with_plausible_tags(band: Band, tags: Tags) -> Band:
         return replace(band, radiometry=None, missing_calibration=f"no usable tags for radiance ({problem})")
     radiometry, problem = plausible(band.radiometry, band.size_px)
     reason = f"no usable tags for radiance ({problem})" if radiometry is None else ""
-    return replace(band, radiometry=radiometry, implausible=problem, missing_calibration=reason)
+    return replace(band, radiometry=radiometry, implausible=problem or band.implausible, missing_calibration=reason)
 
 
 def _stored_pages(path: Path, max_pixels: int) -> list[tuple[Band, ...]]:

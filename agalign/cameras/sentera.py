@@ -36,7 +36,7 @@ class Sentera(Camera):
     def bands(self, path: Path, tags: Tags, stored: Sequence[Band]) -> tuple[Band, ...]:
         if len(stored) > 1:
             return _listed_bands(tags, stored) or _channel_bands(path, tags, stored)
-        matrix = tags.numbers(_SENTERA, "AlignMatrix")
+        matrix = tags.numbers(_SENTERA, "AlignMatrix", 9)
         to_rig = np.array(matrix).reshape(3, 3) if len(matrix) == 9 else None
         folder = _BAND_FOLDER.match(path.parent.name)
         band = pix4d.described(stored[0], tags, folder["name"] if folder else path.stem)

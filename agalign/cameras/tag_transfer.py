@@ -136,7 +136,7 @@ def _put_pinhole(packet: Packet, reference: Band, tags: Tags) -> None:
     packet.put(distortion, ["0"] * len(tags.numbers(*distortion)))
     packet.put((dji.NAMESPACE, "DewarpFlag"), ["1"])
     density = pix4d.pixels_per_mm(tags)
-    if tags.numbers(pix4d.NAMESPACE, "FisheyeAffineMatrix") and density and reference.lens is not None:
+    if tags.numbers(pix4d.NAMESPACE, "FisheyeAffineMatrix", 4) and density and reference.lens is not None:
         packet.remove(_FISHEYE)
         packet.put((pix4d.NAMESPACE, "ModelType"), ["perspective"])
         packet.add((pix4d.NAMESPACE, "PerspectiveFocalLength"), *_texts([reference.lens.fx_px / density]))
@@ -169,10 +169,10 @@ def _put_radiometry(packet: Packet, tags: Tags, vignetting: GridVignetting | Non
     else:
         packet.put((pix4d.NAMESPACE, "VignettingCenter"), _texts(vignetting.centre_px))
         packet.put((pix4d.NAMESPACE, "VignettingPolynomial"), [f"{v:.9e}" for v in vignetting.coefficients])
-    irradiance = micasense.irradiance(tags) if isinstance(camera_of(tags), micasense.MicaSense) else None
-    names = "HorizontalIrradiance", "IrradianceScaleToSIUnits"
-    for name, text in zip(names, _texts(irradiance or ()), strict=False):
-        packet.add((pix4d.NAMESPACE, name), text)
+    irradiance = micasense.irradiance(tags).value if isinstance(camera_of(tags), micasense.MicaSense) else 0.0
+    if irradiance > 0:
+        for name, value in (("HorizontalIrradiance", irradiance), ("IrradianceScaleToSIUnits", 1.0)):
+            packet.add((pix4d.NAMESPACE, name), _texts([value])[0])
 
 
 def _texts(numbers: Iterable[float]) -> list[str]:

@@ -9,14 +9,17 @@ from typing import Protocol, TypeVar
 
 import numpy as np
 
+from agalign.cameras.sun import sun_position
 from agalign.errors import AgalignError
 from agalign.flight.groups import camera_key, flights_of
 from agalign.pixels.panel_detection import DetectedPanel, albedo_of, evenly_lit, find_panel, inside, is_homogeneous
+from agalign.pixels.radiometric_errors import LIGHT_SENSOR, PANEL_AND_SENSOR, contradiction, panel_errors
 from agalign.pixels.radiometry import calibrated
 from agalign.pixels.raster import read_for_alignment, read_tile, without_warnings
-from agalign.values.capture import Band, Capture, Panel, PanelFactor, PanelSource
+from agalign.values.capture import Band, Capture, Panel, PanelSource
 from agalign.values.image import Tile
 from agalign.values.pixel_units import PixelScale
+from agalign.values.radiometry import RadiometricError, RadiometrySource, ReflectanceFactor
 
 R = TypeVar("R")
 Albedos = Mapping[str, float]
@@ -25,6 +28,12 @@ MAX_TIME_DIFFERENCE_S = 6 * 3600.0
 """A panel does not represent the illumination many hours later."""
 READERS = 4
 """Number of captures whose images are read at a time: more would wait for the disk."""
+_SAME_LIGHT_S = 3600.0
+"""Two panels within this time are compared: the sun's height, or a light sensor, tells how the light changed."""
+_MAX_SCALE = 1.3
+"""Between the light on a panel and that by a light sensor or another panel."""
+_SAME_ALBEDO = 0.01
+"""Relative difference of the reflectance of one panel by two captures: files round it to 0.1 %."""
 _MIN_HEIGHT_M = 3.0
 """Lower heights are within the error of the altitudes."""
 
@@ -39,6 +48,10 @@ class BandReading:
     """Mean over the evenly lit part of the panel, in the unit of the camera's calibration."""
     problem: str = ""
     """Why it cannot be used; empty if it can."""
+    spread: float = 0.0
+    """Standard deviation over this part, relative to the mean."""
+    other_albedo: float | None = None
+    """Reflectance of the panel of this serial number by another capture that contradicts `albedo`; None without one."""
 
     @property
     def factor(self) -> float | None:
@@ -51,7 +64,7 @@ class BandReading:
     def sensor_scale(self) -> float | None:
         """Irradiance on the panel divided by that of the light sensor, in any unit; None if either is unknown."""
         sun = None if self.band.radiometry is None else self.band.radiometry.by_sun
-        return sun[0] / self.factor if sun and self.factor else None
+        return sun.value / self.factor if sun and self.factor else None
 
 
 @dataclass(frozen=True)
@@ -60,12 +73,18 @@ class PanelReading:
 
     capture: Capture
     bands: tuple[BandReading, ...]
+    brighter: str = ""
+    """Label of a capture of a panel within the hour on which the light was stronger than it can have changed: this
+    panel was in shade, wet or soiled, and is not used. Empty if there is none."""
+    light_ratio: float = 1.0
+    """Light on this panel relative to that on the brighter one, after the change of the light; the median of the bands.
+    """
 
     @property
     def sensor_scales(self) -> dict[str, float]:
         """Irradiance on the panel divided by that of the light sensor by band, if both are known and not relative."""
         known = [b.band.radiometry for b in self.bands if b.band.radiometry is not None]
-        if any(r.by_sun is not None and r.by_sun[1] != "reflectance" for r in known):
+        if any(r.by_sun is not None and r.by_sun.quantity != "reflectance" for r in known):
             return {}
         return {b.band.name: b.sensor_scale for b in self.bands if b.sensor_scale}
 
@@ -74,9 +93,9 @@ class PanelReading:
         """False if the panel and the light sensor cannot have been in the same light, or one is wrong in some bands."""
         # Calibrated sensors agree with panels within 20 %, except if a person, an aircraft or a cloud shades one. Bands
         # of one panel and one sensor that is not calibrated differ by up to 18 % (RedEdge-M, DLS 1).
-        max_scale, scales = 1.3, [*self.sensor_scales.values()] or [1.0]
+        scales = [*self.sensor_scales.values()] or [1.0]
         median = float(np.median(scales))
-        return 1 / max_scale < median < max_scale and max(scales) < max_scale * min(scales)
+        return 1 / _MAX_SCALE < median < _MAX_SCALE and max(scales) < _MAX_SCALE * min(scales)
 
     @property
     def panel(self) -> Panel:
@@ -169,8 +188,59 @@ def read_panel(capture: Capture, albedos: Albedos) -> PanelReading:
     return PanelReading(capture, tuple(_read(b, albedos) for b in capture.bands))
 
 
-def reflectance_factors(capture: Capture, readings: Iterable[PanelReading]) -> dict[str, PanelFactor]:
-    """Return the factor from radiance to reflectance of a capture by band.
+def compared(readings: Sequence[PanelReading]) -> list[PanelReading]:
+    """Return the readings with what others contradict: panels that are darker than another one of the hour, and panels
+    of one serial number with two reflectances.
+    """
+    return [_with_other_albedos(_with_brighter(one, readings), readings) for one in readings]
+
+
+def _with_brighter(reading: PanelReading, others: Sequence[PanelReading]) -> PanelReading:
+    ratios = [(ratio, o.capture.label) for o in others if (ratio := _light_ratio(reading, o)) is not None]
+    ratio, label = min(ratios, default=(1.0, ""))
+    return replace(reading, brighter=label, light_ratio=ratio) if ratio < 1 / _MAX_SCALE else reading
+
+
+def _light_ratio(one: PanelReading, other: PanelReading) -> float | None:
+    """The light on a panel relative to that on another one of the camera within the hour, divided by the change of the
+    light by the light sensor, else by the height of the sun; the median of the bands. None if it is unknown.
+    """
+    times_s = one.capture.time_s, other.capture.time_s
+    is_one_camera = camera_key(one.capture) == camera_key(other.capture) and one.capture is not other.capture
+    if not is_one_camera or times_s[0] is None or times_s[1] is None or abs(times_s[0] - times_s[1]) > _SAME_LIGHT_S:
+        return None
+    by_name = {b.band.name: b for b in other.bands}
+    pairs = [(b, by_name[b.band.name]) for b in one.bands if b.band.name in by_name]
+    of_sun, ratios = _sun_height(one.capture) / _sun_height(other.capture), []
+    for own, others in pairs:
+        if own.sensor_scale and others.sensor_scale:
+            ratios.append(own.sensor_scale / others.sensor_scale)
+        elif own.factor and others.factor:
+            ratios.append(others.factor / own.factor / of_sun)
+    return float(np.median(ratios)) if ratios else None
+
+
+def _sun_height(capture: Capture) -> float:
+    """Sine of the elevation of the sun, at least 0.1; 1 if the position or the time is unknown."""
+    if capture.position is None or capture.time_s is None or not capture.known_time:
+        return 1.0
+    min_sine = 0.1  # near the horizon, the light is not proportional to it
+    return max(min_sine, math.sin(sun_position(capture.position, capture.time_s)[0]))
+
+
+def _with_other_albedos(reading: PanelReading, others: Sequence[PanelReading]) -> PanelReading:
+    same = [b for o in others if o.panel.serial and o.panel.serial == reading.panel.serial for b in o.bands]
+    bands = []
+    for band in reading.bands:
+        known = [b.albedo for b in same if b.band.name == band.band.name and b.albedo]
+        own = band.albedo or 0.0
+        differing = [v for v in known if abs(v - own) > _SAME_ALBEDO * max(v, own)]
+        bands.append(replace(band, other_albedo=differing[0]) if own and differing else band)
+    return replace(reading, bands=tuple(bands))
+
+
+def reflectance_factors(capture: Capture, readings: Iterable[PanelReading]) -> dict[str, ReflectanceFactor]:
+    """Return the factor from radiance to reflectance of a capture by band, given the `compared` readings.
 
     The panel gives the scale of the light sensor, with the irradiances E of the capture and E_p of the panel's capture:
 
@@ -179,23 +249,51 @@ def reflectance_factors(capture: Capture, readings: Iterable[PanelReading]) -> d
     E_p / E is 1 without a sensor, and if the sensor was not in the same light as one of the panels. Between the
     panels of the camera, the reciprocals are interpolated linearly in time; before the first and after the last, they
     are constant. If the time of the capture or of the panels is unknown, `_without_clock` chooses the panel; without
-    one the result is empty.
+    one the result is empty. A panel that is darker than another one of the hour is not used.
     """
     of_camera = [r for r in readings if camera_key(r.capture) == camera_key(capture)]
     timed = _within_hours(of_camera, capture)
     near = timed or _without_clock(of_camera, capture)
-    age_s = min((abs(later_s) for later_s, _ in timed), default=None)
-    fits_sensor, result = all(r.fits_sensor for _, r in near), {}
+    used = [(s, r) for s, r in near if not r.brighter]
+    age_s = min((abs(later_s) for later_s, r in timed if not r.brighter), default=None)
+    fits_sensor, result = all(r.fits_sensor for _, r in used), {}
     for band in capture.bands:
-        samples = [(s, b) for s, r in near for b in r.bands if b.band.name == band.name]
+        samples = [(s, b) for s, r in used for b in r.bands if b.band.name == band.name]
         scales = [(s, b.sensor_scale) for s, b in samples if b.sensor_scale]
         light = [(s, 1 / b.factor) for s, b in samples if b.factor]
         sun = None if band.radiometry is None else band.radiometry.by_sun
+        contradictions = _contradictions([r for _, r in near], band.name)
+        measured = [b for _, b in samples if b.factor]
         if sun and scales and fits_sensor:
-            result[band.name] = PanelFactor(sun[0] / _interpolated(scales), "panel and light sensor", age_s)
+            source: RadiometrySource = "panel and light sensor"
+            value = sun.value / _interpolated(scales)
+            tilt = [e for e in sun.errors if e not in LIGHT_SENSOR.values()]  # its scale is that of the panel
+            errors = (*panel_errors(measured[0].spread, None), *_difference(scales), *tilt)
         elif light:
-            result[band.name] = PanelFactor(1 / _interpolated(light), "panel", age_s)
+            value, source = 1 / _interpolated(light), "panel"
+            errors = (*panel_errors(measured[0].spread, age_s), *_difference(light))
+        else:
+            continue
+        result[band.name] = ReflectanceFactor(value, "reflectance", source, age_s, (*errors, *contradictions))
     return result
+
+
+def _difference(samples: Sequence[tuple[float, float]]) -> list[RadiometricError]:
+    """The error by the difference of several panels, given their (time, value)."""
+    values = [value for _, value in samples]
+    percent = 100 * (math.sqrt(max(values) / min(values)) - 1)
+    return [RadiometricError("difference of the panels", percent)] if len(values) > 1 else []
+
+
+def _contradictions(near: Sequence[PanelReading], band: str) -> list[RadiometricError]:
+    """What contradicts the panels near a capture in a band."""
+    dark = [r.light_ratio for r in near if r.brighter]
+    bands = [b for r in near for b in r.bands if b.band.name == band]
+    albedos = [v for b in bands if b.other_albedo for v in (b.albedo, b.other_albedo) if v]
+    scales = [b.sensor_scale for r in near if not r.brighter and not r.fits_sensor for b in r.bands if b in bands]
+    found = [contradiction("two calibration panels", 1.0, min(dark))] if dark else []
+    found += [contradiction("reflectance of the panel", *albedos)] if albedos else []
+    return found + [contradiction(PANEL_AND_SENSOR, 1.0, scale) for scale in scales[:1] if scale]
 
 
 def missing_panel(capture: Capture, readings: Sequence[PanelReading]) -> str:
@@ -361,29 +459,32 @@ def _read(band: Band, albedos: Albedos) -> BandReading:
     if panel is None or not panel.corners_px:
         return BandReading(band, albedo, problem=problem)
     try:
-        return BandReading(band, albedo, *_radiance(band, panel))
+        radiance, problem, spread = _radiance(band, panel)
+        return BandReading(band, albedo, radiance, problem, spread)
     except AgalignError as error:
         return BandReading(band, albedo, problem=str(error))
 
 
-def _radiance(band: Band, panel: Panel) -> tuple[float | None, str]:
-    """Return the mean radiance over the evenly lit part of the panel, and why it cannot be used, empty if it can. None
-    without calibration.
+def _radiance(band: Band, panel: Panel) -> tuple[float | None, str, float]:
+    """Return the mean radiance over the evenly lit part of the panel, why it cannot be used, empty if it can, and the
+    standard deviation relative to the mean. None without calibration.
     """
     pixels, valid = read_tile(band, Tile(0, 0, *band.size_px))
     within = inside(panel.corners_px, pixels.shape) & valid
     if not within.any() or band.radiometry is None or not band.radiometry.is_of_light:
-        return None, ""
+        return None, "", 0.0
     saturation = np.inf if band.saturation_value is None else band.saturation_value
     saturated = float((pixels[within].astype(np.float64) >= saturation).mean())
     image, max_saturated = calibrated(pixels, band.radiometry, 0, 0), 0.01  # share; they bias the mean radiance
     values = image[within].astype(np.float64)
+    spread = float(values.std() / max(abs(float(np.median(values))), 1e-30))
     if saturated > max_saturated:
-        return float(values.mean()), f"{saturated:.0%} of it is saturated"
+        return float(values.mean()), f"{saturated:.0%} of it is saturated", spread
     if not np.median(values) > 0:
-        return float(values.mean()), "it is black"
+        return float(values.mean()), "it is black", spread
     lit = evenly_lit(image, within)
     if not lit.any():
-        spread = values.std() / np.median(values)
-        return float(values.mean()), f"its pixels vary by {spread:.0%}: it is shaded, soiled or not in the area"
-    return float(image[lit].mean(dtype=np.float64)), ""
+        problem = f"its pixels vary by {spread:.0%}: it is shaded, soiled or not in the area"
+        return float(values.mean()), problem, spread
+    mean = float(image[lit].mean(dtype=np.float64))
+    return mean, "", float(image[lit].std(dtype=np.float64)) / mean

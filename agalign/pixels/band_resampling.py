@@ -11,11 +11,12 @@ from numpy.typing import NDArray
 from agalign.pixels.radiometry import calibrated
 from agalign.pixels.raster import ReadTile, read_tile
 from agalign.values import geometry, lens
-from agalign.values.capture import Band, Radiometry
+from agalign.values.capture import Band
 from agalign.values.choices import Interpolation
 from agalign.values.image import FloatImage, Mask, Raster, Tile
 from agalign.values.mapping import PixelMapping
 from agalign.values.pixel_units import SAME_PIXELS, PixelScale, Size
+from agalign.values.radiometry import Radiometry
 from agalign.values.resampling import MIN_VALID_WEIGHT, between, resample, source_positions
 
 _MIN_SIDE_PX = 8

@@ -15,10 +15,12 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from agalign.errors import InputError
+from agalign.pixels.radiometric_errors import FACTORY_CALIBRATION, PANEL_AND_SENSOR
 from agalign.pixels.raster import ReadTile, read_for_alignment
-from agalign.values.capture import Band, Capture, PanelFactor, Quantity, Radiometry, RadiometrySource
+from agalign.values.capture import Band, Capture
 from agalign.values.choices import RadiometryChoice
 from agalign.values.image import FloatImage, Tile
+from agalign.values.radiometry import Radiometry, ReflectanceFactor
 
 _PLAUSIBLE: Mapping[str, tuple[float, float]] = {
     "exposure time (s)": (1e-6, 1.0),  # images of a moving camera are blurred from 0.01 s
@@ -66,7 +68,7 @@ def plausible(radiometry: Radiometry, size_px: tuple[int, int]) -> tuple[Radiome
         values["vignetting centre (share of the image)"] = np.divide((cx, cy), size_px)
     values["row gradient"] = 1.0 + radiometry.row_gradient * np.array([0.0, height])
     if radiometry.by_sun is not None:
-        kind = "irradiance (W / m^2 / nm)" if radiometry.by_sun[1] == "reflectance" else "relative irradiance"
+        kind = "irradiance (W / m^2 / nm)" if radiometry.by_sun.quantity == "reflectance" else "relative irradiance"
         values.setdefault(kind, radiometry.irradiance or 0.0)
     for name, value in values.items() if radiometry.is_of_light else ():
         low, high = _PLAUSIBLE[name]
@@ -119,7 +121,7 @@ def _processed(band: Band, read: ReadTile) -> str:
     return ""
 
 
-def with_radiometry(capture: Capture, choice: RadiometryChoice, by_panel: Mapping[str, PanelFactor]) -> Capture:
+def with_radiometry(capture: Capture, choice: RadiometryChoice, by_panel: Mapping[str, ReflectanceFactor]) -> Capture:
     """Return the capture with the conversion of each band to the chosen quantity; None if it is not available.
 
     `by_panel` has the factors of the bands that were measured on a panel. `auto` is by panel if available for all
@@ -143,16 +145,15 @@ def with_radiometry(capture: Capture, choice: RadiometryChoice, by_panel: Mappin
 
 
 def _converted(
-    of_camera: Radiometry | None, choice: RadiometryChoice, by_panel: PanelFactor | None
+    of_camera: Radiometry | None, choice: RadiometryChoice, by_panel: ReflectanceFactor | None
 ) -> Radiometry | None:
     if of_camera is None or not of_camera.is_of_light or choice == "camera":
         return of_camera
     if choice == "sun":
-        return _to_reflectance(of_camera)
-    if by_panel is None:
-        return None
-    result = _reflectance(of_camera, by_panel.value, "reflectance", by_panel.source)
-    return replace(result, panel_age_s=by_panel.age_s)
+        of_panel = () if by_panel is None else tuple(e for e in by_panel.errors if e.name == PANEL_AND_SENSOR)
+        result = _to_reflectance(of_camera)
+        return None if result is None else replace(result, errors=(*result.errors, *of_panel))
+    return None if by_panel is None else _reflectance(of_camera, by_panel)
 
 
 def _to_reflectance(radiometry: Radiometry) -> Radiometry | None:
@@ -161,11 +162,21 @@ def _to_reflectance(radiometry: Radiometry) -> Radiometry | None:
         return radiometry
     if not radiometry.is_of_light or radiometry.by_sun is None:
         return None
-    return _reflectance(radiometry, *radiometry.by_sun, "light sensor")
+    return _reflectance(radiometry, radiometry.by_sun)
 
 
-def _reflectance(radiance: Radiometry, factor: float, quantity: Quantity, source: RadiometrySource) -> Radiometry:
-    return replace(radiance, gain=radiance.gain * factor, quantity=quantity, source=source, factor=factor)
+def _reflectance(radiance: Radiometry, factor: ReflectanceFactor) -> Radiometry:
+    is_by_panel = factor.source != "light sensor"
+    of_radiance = (e for e in radiance.errors if not (is_by_panel and e == FACTORY_CALIBRATION))  # it is calibrated
+    return replace(
+        radiance,
+        gain=radiance.gain * factor.value,
+        quantity=factor.quantity,
+        source=factor.source,
+        factor=factor.value,
+        panel_age_s=factor.panel_age_s,
+        errors=(*of_radiance, *factor.errors),
+    )
 
 
 def _polynomial(x: NDArray[np.float64], coefficients: Sequence[float]) -> NDArray[np.float64]:

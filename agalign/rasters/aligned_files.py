@@ -34,10 +34,11 @@ from agalign.rasters.geotiff import Block, LayerDescription, compressed, compres
 from agalign.rasters.output_grid import Layer, is_inside
 from agalign.rasters.product import CapturePaths, Product, ProductContext, WrittenFile
 from agalign.values import geometry
-from agalign.values.capture import Band, Capture, Quantity, Radiometry
+from agalign.values.capture import Band, Capture
 from agalign.values.choices import Interpolation
 from agalign.values.image import Mask, OutputGrid, Tile
 from agalign.values.issues import MISSING_BAND
+from agalign.values.radiometry import Quantity, Radiometry
 from agalign.values.resampling import as_type, can_hold, tiles
 from agalign.values.spectrum import Role, role_of_band
 

@@ -14,11 +14,12 @@ from agalign.flight.rig_prediction import extreme_mappings
 from agalign.pixels.raster import ReadTile, read_tile
 from agalign.values import geometry
 from agalign.values.alignment import Alignment
-from agalign.values.capture import Band, Capture, Radiometry
+from agalign.values.capture import Band, Capture
 from agalign.values.geometry import Matrix, Points
 from agalign.values.image import Mask, OutputGrid, Tile
 from agalign.values.mapping import PixelMapping
 from agalign.values.pixel_units import SAME_PIXELS, PixelScale, Size
+from agalign.values.radiometry import Radiometry
 
 _MAX_CELL_PX, _MIN_CELLS = 8, 64
 """The common area is found in cells of at most 8 px, and at least 64 cells along each axis if the image has as many."""

@@ -1,6 +1,5 @@
 """Captures and their bands, with the metadata from the tags of the files."""
 
-import math
 from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
@@ -15,7 +14,7 @@ from agalign.values.fields import RECORD, Name, Number
 from agalign.values.geometry import Matrix
 from agalign.values.image import Tile
 from agalign.values.lens import Lens
-from agalign.values.pixel_units import PixelScale
+from agalign.values.radiometry import Radiometry
 
 
 @dataclass(frozen=True)
@@ -28,64 +27,6 @@ class Georeference:
     crs_wkt: str
     accuracy_m: float | None = None
     """Expected error (1 sigma, metres) if it was calculated from the camera's pose; None if it is from the file."""
-
-
-Quantity = Literal["radiance", "relative radiance", "reflectance", "relative reflectance", "temperature"]
-"""Radiance in W / m^2 / sr / nm, reflectance 0 to 1, temperature in degrees Celsius; `relative` is up to a factor that
-all bands share.
-"""
-
-
-RadiometrySource = Literal["camera calibration", "light sensor", "panel", "panel and light sensor"]
-
-
-@dataclass(frozen=True)
-class Radiometry:
-    """Radiometric calibration of a band's raw values; `pixels.radiometry` has the equation."""
-
-    quantity: Quantity
-    black_level: float
-    full_scale: float
-    gain: float
-    vignetting_centre_px: tuple[float, float] = (0.0, 0.0)
-    vignetting: tuple[float, ...] = ()
-    """k1 ... k6, per px, px^2 ..."""
-    vignetting_divides: bool = True
-    row_gradient: float = 0.0
-    """Relative increase of the signal from each row to the next."""
-    by_sun: tuple[float, Quantity] | None = None
-    """Factor from radiance to reflectance by the light sensor, and the resulting quantity."""
-    source: RadiometrySource = "camera calibration"
-    """Source of the factor from radiance to reflectance."""
-    factor: float = 1.0
-    """The factor from radiance to reflectance, which `gain` includes."""
-    panel_age_s: float | None = None
-    """Time between the capture and the nearest panel, if `source` includes a panel and it is known."""
-    raw_step: int = 1
-    """Common divisor of all raw numbers of the camera, such as 16 for 12 bits in the upper bits of 16; 1 if none is
-    known."""
-    tags: Mapping[str, float] = field(default_factory=dict)
-    """The values of tags that `gain` is calculated from, with the names of `pixels.radiometry`."""
-
-    def rescaled(self, scale: PixelScale) -> "Radiometry":
-        """Return the calibration of the image resized by `scale`, which is nearly the same along both axes."""
-        x, y = scale.positions(self.vignetting_centre_px).tolist()
-        vignetting = tuple(k / scale.mean**power for power, k in enumerate(self.vignetting, start=1))
-        gradient = self.row_gradient / scale.y
-        return replace(self, vignetting_centre_px=(x, y), vignetting=vignetting, row_gradient=gradient)
-
-    @property
-    def irradiance(self) -> float | None:
-        """Irradiance by the light sensor, W / m^2 / nm, or relative."""
-        if self.by_sun is None:
-            return None
-        factor, quantity = self.by_sun
-        return (math.pi if quantity == "reflectance" else 1.0) / factor
-
-    @property
-    def is_of_light(self) -> bool:
-        """True for radiance, which can be converted to reflectance."""
-        return self.quantity in ("radiance", "relative radiance")
 
 
 class CaptureTime(NamedTuple):
@@ -115,15 +56,6 @@ capture differ by less.
 def is_clock_set(time: str) -> bool:
     """Return False for a time, which begins with the year, of a clock that was not set: cameras count from 1970."""
     return time >= "1971"
-
-
-class PanelFactor(NamedTuple):
-    """Reflectance per radiance of a band by panels."""
-
-    value: float
-    source: RadiometrySource
-    age_s: float | None
-    """Time between the capture and the nearest panel; None if one of their clocks was not set."""
 
 
 PanelSource = Literal["tags", "QR code", "look"]
@@ -259,6 +191,12 @@ class Position:
     """Degrees, WGS 84."""
     altitude_m: Number | None = None
     """Altitude in the tags, m above the camera's datum."""
+
+    @property
+    def text(self) -> str:
+        """Latitude and longitude with the letters of the hemispheres."""
+        north, east = "NS"[self.latitude < 0], "EW"[self.longitude < 0]
+        return f"{abs(self.latitude):.4f} {north}, {abs(self.longitude):.4f} {east}"
 
 
 HeightSource = Literal["tags", "panel", "ground elevation", "assumed"]

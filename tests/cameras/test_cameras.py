@@ -160,7 +160,7 @@ def irradiance(
     xmp = {k: v for k, v in tags["xmp"].items() if k[0] != DLS} | {(DLS, k): (str(v),) for k, v in values.items()}
     changed = Tags(**tags | {"xmp": xmp, "position": position, "captured_at": captured_at})
     (band,) = MicaSense().bands(path, changed, probe(path))
-    return band.radiometry.by_sun and math.pi / band.radiometry.by_sun[0]
+    return band.radiometry.by_sun and math.pi / band.radiometry.by_sun.value
 
 
 def test_irradiance_in_the_plane_of_the_sensor_is_corrected_for_its_tilt(flight: Path) -> None:
@@ -181,9 +181,10 @@ def test_irradiance_in_the_plane_of_the_sensor_is_corrected_for_its_tilt(flight:
         assert irradiance(path, tags, captured_at="1970-01-01T19:30:30") == pytest.approx(measured)
     away, leaning = {"SpectralIrradiance": 0.2, "Pitch": 2.6}, {"SpectralIrradiance": 0.2, "Pitch": 0.5}
     for damaged in (away, leaning, {"HorizontalIrradiance": "1e-300", SCALE: "1e-300"}):
-        assert irradiance(path, {"Yaw": azimuth} | damaged) is None
+        assert irradiance(path, {"Yaw": azimuth, "Roll": 0.0} | damaged) is None
     assert math.isnan(horizontal_irradiance(0.2, (180, -5, 0), (math.radians(-3), math.pi)))  # the sun has set
-    for value, scale in ((120.0, -0.01), (-5, 0.01), (0, 0.01), ("nan", 0.01)):
+    assert irradiance(path, {"HorizontalIrradiance": 120.0, SCALE: -0.01}) == pytest.approx(1.2)  # the usual scale
+    for value, scale in ((-5, 0.01), (0, 0.01), ("nan", 0.01)):
         assert irradiance(path, {"HorizontalIrradiance": value, SCALE: scale}) is None
     assert irradiance(path, {}) is None
 

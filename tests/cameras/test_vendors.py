@@ -317,7 +317,8 @@ def test_dji_radiometry_is_the_guides_formula(tmp_path: Path) -> None:
     values |= {"SensorGainAdjustment": "0.9", "VignettingData": "1e-4,0,0,0,0,0"}
     band = mavic_band(tmp_path, mavic_tags(**values))
     assert band.radiometry.gain == pytest.approx(0.9 / (2 * 1e-3))
-    assert band.radiometry.by_sun == (pytest.approx(1 / 5000), "relative reflectance")
+    assert band.radiometry.by_sun.value == pytest.approx(1 / 5000)
+    assert band.radiometry.by_sun.quantity == "relative reflectance"
     assert not band.radiometry.vignetting_divides
 
 
@@ -422,12 +423,18 @@ def test_pixels_that_are_dewarped_have_no_distortion(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     ("xmp", "of_tiff", "expected"),
-    [({"BlackLevel": "0"}, 3200.0, 0), ({"BlackLevel": "4096"}, 3200.0, 4096), ({}, 0.0, 0), ({}, None, None)],
+    [
+        ({"BlackLevel": "0"}, 0.0, 0),
+        ({"BlackLevel": "4096"}, None, 4096),
+        ({"BlackLevel": "4096"}, 3200.0, None),
+        ({}, 0.0, 0),
+        ({}, None, None),
+    ],
 )
 def test_a_black_level_of_0_is_a_black_level(
     tmp_path: Path, xmp: dict[str, str], of_tiff: float | None, expected: float | None
 ) -> None:
-    """Without any there is no radiometry."""
+    """Without any, or with two that contradict each other, there is no radiometry."""
     tags = replace(mavic_tags(SensorGain="1", ExposureTime="2000", **xmp), black_level=of_tiff)
     radiometry = mavic_band(tmp_path, tags).radiometry
     assert (radiometry and radiometry.black_level) == expected

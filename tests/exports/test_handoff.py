@@ -19,9 +19,10 @@ from agalign.rasters.output_grid import Layer
 from agalign.records.sidecar_file import find_sidecars, read_sidecar
 from agalign.synthetic.cameras import CameraSpec
 from agalign.values import geometry
-from agalign.values.capture import Band, Radiometry
+from agalign.values.capture import Band
 from agalign.values.image import OutputGrid
 from agalign.values.mapping import PixelMapping
+from agalign.values.radiometry import Radiometry
 
 from ..builders import in_full_run
 from ..conftest import Shared, read_json, seeded, write_band, write_signed

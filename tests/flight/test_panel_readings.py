@@ -21,7 +21,8 @@ from agalign.flight.panel_readings import (
 from agalign.pixels.panel_detection import DetectedPanel
 from agalign.pixels.radiometry import with_radiometry
 from agalign.report.panels_and_sky import write_panels
-from agalign.values.capture import Band, CameraIdentity, Capture, Panel, Pose, Position, Quantity, Radiometry
+from agalign.values.capture import Band, CameraIdentity, Capture, Panel, Pose, Position
+from agalign.values.radiometry import Quantity, Radiometry, ReflectanceFactor
 
 from ..program import agalign
 
@@ -96,14 +97,19 @@ def test_illumination_is_interpolated_in_time_and_constant_outside() -> None:
     panels = [reading("2026-06-21T10:00:00", 2.0), reading("2026-06-21T11:00:00", 4.0)]
     for hour, factor, age_s in (("09:00", 2.0, 3600), ("10:30", 1 / 0.375, 1800), ("12:00", 4.0, 3600)):
         result = reflectance_factors(capture(GREEN, f"2026-06-21T{hour}:00"), panels)
-        assert result == {"Green": (pytest.approx(factor), "panel", age_s)}
+        assert facts(result) == {"Green": (pytest.approx(factor), "panel", age_s)}
     assert reflectance_factors(capture(GREEN, "2026-06-23T10:30:00"), panels) == {}
     assert reflectance_factors(replace(capture(GREEN), camera=CameraIdentity("a", "b", "2")), panels) == {}
 
 
+def facts(factors: dict[str, ReflectanceFactor]) -> dict[str, tuple[float, str, float | None]]:
+    """(value, source, age of the panel in s) by band."""
+    return {name: (f.value, f.source, f.panel_age_s) for name, f in factors.items()}
+
+
 def lit(irradiance: float, quantity: Quantity = "reflectance", name: str = "Green") -> Band:
     """A band with a light sensor that measures an irradiance."""
-    return replace(GREEN, name=name, radiometry=replace(PLAIN, by_sun=(np.pi / irradiance, quantity)))
+    return replace(GREEN, name=name, radiometry=replace(PLAIN, by_sun=ReflectanceFactor(np.pi / irradiance, quantity)))
 
 
 def lit_panel(moment: str, *measured: float, quantity: Quantity = "reflectance") -> PanelReading:
@@ -117,7 +123,7 @@ def test_the_panel_scales_the_light_sensor_which_follows_the_light() -> None:
     """53 minutes after the panel, the sensor measures 15 % more light; it shows 0.9 of the light on the panel."""
     panel, later = lit_panel("2026-06-21T15:04:00", 0.9), capture(lit(0.9 * 1.15), "2026-06-21T15:57:00")
     result = reflectance_factors(later, [panel])
-    assert result == {"Green": (pytest.approx(np.pi / 1.15), "panel and light sensor", 53 * 60)}
+    assert facts(result) == {"Green": (pytest.approx(np.pi / 1.15), "panel and light sensor", 53 * 60)}
     # Between two panels, the scale of the sensor is interpolated.
     two = [panel, lit_panel("2026-06-21T16:50:00", 1.0)]
     scale = (1 / 0.9 + 1.0) / 2
@@ -131,7 +137,7 @@ def test_a_light_sensor_that_was_shaded_at_the_panel_is_not_combined_with_it() -
     assert [r.fits_sensor for r in (shaded, good)] == [False, True]
     for panels in ([shaded], [shaded, good]):
         factors = reflectance_factors(later, panels)
-        assert factors == {"Green": (pytest.approx(np.pi), "panel", 1800)}
+        assert facts(factors) == {"Green": (pytest.approx(np.pi), "panel", 1800)}
         sources = [with_radiometry(later, c, factors).bands[0].radiometry.source for c in ("auto", "panel", "sun")]
         assert sources == ["light sensor", "panel", "light sensor"]
     # A sensor with an unknown unit has any scale.
@@ -189,7 +195,7 @@ def test_without_a_time_no_panel_is_of_the_same_hours() -> None:
     assert reflectance_factors(capture(GREEN, ""), [of_1970]) == {}
     assert reflectance_factors(of_1970.capture, [undated]) == {}
     assert reflectance_factors(undated.capture, [undated]) == {}
-    assert reflectance_factors(of_1970.capture, [undated, of_1970]) == {"Green": (2.0, "panel", 0.0)}
+    assert facts(reflectance_factors(of_1970.capture, [undated, of_1970])) == {"Green": (2.0, "panel", 0.0)}
     # Nor is one at the height of the ground.
     ground = PanelReading(capture(HELD, "1970-01-01T01:00:00", position=GROUND), ())
     high = capture(GREEN, "", position=HIGH, pose=Pose(30.0))
@@ -262,7 +268,7 @@ def before_fix(name: str, factor: float = 2.0, folder: str = "000") -> PanelRead
 @pytest.mark.parametrize(("panel", "name"), [("IMG_0000", "IMG_0007"), ("DJI_001", "DJI_250"), ("panel", "f_3")])
 def test_the_only_panel_is_used_if_its_clock_was_not_set(panel: str, name: str) -> None:
     later = numbered(name, "2026-06-21T10:00:00", "001")
-    assert reflectance_factors(later, [before_fix(panel)]) == {"Green": (pytest.approx(2.0), "panel", None)}
+    assert facts(reflectance_factors(later, [before_fix(panel)])) == {"Green": (pytest.approx(2.0), "panel", None)}
     assert missing_panel(later, [before_fix(panel)]) == ""
 
 
@@ -279,6 +285,8 @@ def test_of_several_panels_the_next_by_number_is_used(name: str, factor: float) 
 def test_a_panel_with_a_time_is_preferred(tmp_path: Path) -> None:
     flown = numbered("IMG_0003", "2026-06-21T10:00:00")
     timed = replace(reading("2026-06-21T09:50:00", 3.0), capture=numbered("IMG_0500", "2026-06-21T09:50:00"))
-    assert reflectance_factors(flown, [before_fix("IMG_0001"), timed]) == {"Green": (pytest.approx(3.0), "panel", 600)}
+    assert facts(reflectance_factors(flown, [before_fix("IMG_0001"), timed])) == {
+        "Green": (pytest.approx(3.0), "panel", 600)
+    }
     far = numbered("IMG_0003", "2026-06-28T10:00:00")
     assert "is 7 days older" in missing_panel(far, [timed])

@@ -11,10 +11,11 @@ from agalign.pixels.band_resampling import resample_tile, warped
 from agalign.pixels.raster import probe
 from agalign.rasters.output_grid import _largest_rectangle, common_area
 from agalign.values import geometry
-from agalign.values.capture import Band, Radiometry
+from agalign.values.capture import Band
 from agalign.values.image import Tile
 from agalign.values.mapping import PixelMapping
 from agalign.values.pixel_units import PixelScale
+from agalign.values.radiometry import Radiometry
 from agalign.values.resampling import resample
 
 from ..builders import texture, two_views

@@ -16,8 +16,9 @@ from agalign.config import WriteSettings
 from agalign.errors import InputError
 from agalign.pixels.radiometry import calibrated, check_pixels, plausible, with_radiometry
 from agalign.pixels.raster import probe, read_tile
-from agalign.values.capture import Band, Capture, PanelFactor, Radiometry
+from agalign.values.capture import Band, Capture
 from agalign.values.choices import RadiometryChoice
+from agalign.values.radiometry import Radiometry, ReflectanceFactor
 
 from ..builders import in_full_run
 from ..conftest import seeded
@@ -71,7 +72,10 @@ def test_without_its_tags_there_is_no_radiometry(blue: Path, missing: str) -> No
 
 def by(path: Path, choice: RadiometryChoice, factors: dict[str, float] | None = None) -> Band:
     """Return the band of a file with the chosen radiometry, by these factors of a panel and the light sensor."""
-    by_panel = {name: PanelFactor(value, "panel and light sensor", 60.0) for name, value in (factors or {}).items()}
+    by_panel = {
+        name: ReflectanceFactor(value, source="panel and light sensor", panel_age_s=60.0)
+        for name, value in (factors or {}).items()
+    }
     bands = MicaSense().bands(path, read_tags(path), probe(path))
     return with_radiometry(Capture("IMG_0001", Path(), bands, 0), choice, by_panel).bands[0]
 
@@ -96,7 +100,7 @@ def test_photographs_and_thermal_bands_do_not_prevent_reflectance() -> None:
     kelvin = Radiometry("temperature", 27315.0, 1.0, 0.01)
     thermal = Band("LWIR", Path("t.tif"), 1, 160, 120, "uint16", radiometry=kelvin)
     for choice in ("auto", "panel"):
-        by_panel = {"Green": PanelFactor(3.0, "panel", 0.0)}
+        by_panel = {"Green": ReflectanceFactor(3.0, source="panel", panel_age_s=0.0)}
         capture = with_radiometry(Capture("a", Path(), (green, colour, thermal), 0), choice, by_panel)
         assert [b.radiometry and b.radiometry.gain for b in capture.bands] == [6.0, None, 0.01]
     assert calibrated(np.full((2, 2), 30115, np.uint16), kelvin, 0, 0) == pytest.approx(28.0)
@@ -110,7 +114,7 @@ GOOD = Radiometry(
     0.02,
     (640.0, 480.0),
     (1e-5, -2e-7),
-    by_sun=(math.pi, "reflectance"),
+    by_sun=ReflectanceFactor(math.pi, "reflectance"),
     tags={"exposure time (s)": 0.001, "sensor gain": 1.0, "calibration coefficient": 1.5e-4},
 )
 
@@ -128,15 +132,16 @@ GOOD = Radiometry(
         ({"vignetting_centre_px": (math.nan, 0.0)}, "vignetting"),
         ({"vignetting_centre_px": (320.0, 240.0)}, "vignetting centre (share of the image) of 0.25"),
         ({"row_gradient": -0.01}, "row gradient of -8.6"),
-        ({"by_sun": (math.pi / 1e-3, "reflectance")}, "irradiance (W / m^2 / nm) of 0.001"),
-        ({"by_sun": (math.pi / 1e4, "reflectance")}, "irradiance (W / m^2 / nm) of 10000"),
-        ({"by_sun": (1e3, "relative reflectance")}, "relative irradiance of 0.001"),
-        ({"by_sun": (1e-7, "relative reflectance")}, "relative irradiance of 1e+07"),
+        ({"by_sun": ReflectanceFactor(math.pi / 1e-3, "reflectance")}, "irradiance (W / m^2 / nm) of 0.001"),
+        ({"by_sun": ReflectanceFactor(math.pi / 1e4, "reflectance")}, "irradiance (W / m^2 / nm) of 10000"),
+        ({"by_sun": ReflectanceFactor(1e3, "relative reflectance")}, "relative irradiance of 0.001"),
+        ({"by_sun": ReflectanceFactor(1e-7, "relative reflectance")}, "relative irradiance of 1e+07"),
     ],
 )
 def test_a_calibration_with_an_implausible_tag_is_not_used(change: dict[str, object], named: str) -> None:
     """Without a plausible irradiance it is radiance."""
-    for by_sun in ((math.pi / 0.02, "reflectance"), (math.pi / 1.9, "reflectance"), (1 / 500, "relative reflectance")):
+    known = (math.pi / 0.02, "reflectance"), (math.pi / 1.9, "reflectance"), (1 / 500, "relative reflectance")
+    for by_sun in (ReflectanceFactor(*one) for one in known):
         assert plausible(replace(GOOD, by_sun=by_sun), (1280, 960)) == (replace(GOOD, by_sun=by_sun), "")
     result, problem = plausible(replace(GOOD, **change), (1280, 960))
     assert result == (replace(GOOD, by_sun=None) if "irradiance" in named else None)
