@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from agalign.cameras.band_identity import with_one_spelling
 from agalign.cameras.base import reference_index
+from agalign.cameras.camera_calibration import different_calibrations, with_complete_calibrations
 from agalign.cameras.consistency import contradictions, doubtful_files, exposed_apart, files_of_one_band, list_problems
 from agalign.cameras.generic import Generic
 from agalign.cameras.grouping import (
@@ -20,6 +21,7 @@ from agalign.cameras.grouping import (
     join_folders,
     pattern_clashes,
     with_bands_of_names,
+    with_cameras_apart,
     with_missing_bands,
     with_tags_of_flight,
     with_unique_band_names,
@@ -124,11 +126,11 @@ def discover(folder: str | Path, options: DiscoverOptions | None = None) -> Fold
     paths, problems = _chosen_images(folder, options)
     files, copies = without_copies(_read(paths, options, problems))
     files, damaged = with_tags_of_flight(files)
-    files = with_one_spelling(with_bands_of_names(files))
+    files = with_complete_calibrations(with_one_spelling(with_bands_of_names(files)))
     captures: list[Capture] = []
     groups, copied = join_folders(group_files(files, with_rgb=options.with_rgb))
     problems += copies + copied + damaged + list_problems(files) + doubtful_files(files)
-    problems += contradictions(groups) + exposed_apart(groups)
+    problems += contradictions(groups) + exposed_apart(groups) + different_calibrations(files)
     problems += files_of_one_band(groups) if options.pattern is None else []
     _check_bands(groups, options.bands, folder)
     for group in groups:
@@ -142,6 +144,7 @@ def discover(folder: str | Path, options: DiscoverOptions | None = None) -> Fold
         _check_pattern(options.pattern, paths, folder)
         for unknown_band in (p.error for p in problems if isinstance(p.error, NoSuchBandError)):
             raise unknown_band
+    captures = with_cameras_apart(captures, groups)
     captures.sort(key=lambda c: (c.folder.as_posix(), c.name))
     captures = with_missing_bands(with_unique_capture_names(captures, band_file_owners(captures)))
     captures = with_unreadable_bands(captures, files, problems)

@@ -1,5 +1,6 @@
 """Grouping of image files into captures: its files, reference band, missing bands and unique names."""
 
+import hashlib
 import math
 import os
 import re
@@ -12,6 +13,7 @@ from itertools import count
 from pathlib import Path
 from types import MappingProxyType
 
+from agalign.cameras import dji, pix4d
 from agalign.cameras.band_identity import end_of, name_end
 from agalign.cameras.base import Camera, colour_bands, listed, reference_index
 from agalign.cameras.generic import Generic, split_elsewhere, split_stem
@@ -31,6 +33,13 @@ from agalign.values.spectrum import band_key
 _GroupKey = tuple[str, str, str]
 """(camera, folder of the capture, the camera's capture key)."""
 _CameraKey = tuple[str, ...]
+_LENS_CALIBRATION = (
+    *((pix4d.NAMESPACE, name) for name in ("PrincipalPoint", "PerspectiveDistortion", "RigRelatives")),
+    (pix4d.NAMESPACE, "FisheyePolynomial"),
+    *((dji.NAMESPACE, name) for name in ("DewarpData", "CalibratedHMatrix")),
+    *((dji.NAMESPACE, f"RelativeOpticalCenter{axis}") for axis in "XY"),
+)
+"""XMP values that a maker measures on each camera."""
 _MAX_HALVES_APART = timedelta(seconds=1)
 """Between the exposures of a dual camera, which are simultaneous; an id may occur again in another flight."""
 _BEFORE_SUFFIX = "-.~@+_"
@@ -523,6 +532,34 @@ def _cameras(captures: Sequence[Capture]) -> list[_CameraKey]:
         known = [serials for serials in same_model if serials & own or (not own and len(same_model) == 1)]
         keys.append((make, model, *sorted(known[0] if known else own)) if model else (capture.folder.as_posix(),))
     return keys
+
+
+def with_cameras_apart(captures: Sequence[Capture], groups: Sequence[Sequence[ImageFile]]) -> list[Capture]:
+    """Return the captures, those of a model without serial numbers with their lens calibration in the camera's identity
+    if it differs between captures: two cameras of one model. `groups` are the files of captures.
+    """
+    tags_of = {file.path: file.tags for group in groups for file in group}
+    calibrations = [_lens_calibration(tags_of[c.reference.path]) for c in captures]
+    by_model: dict[tuple[object, ...], set[str]] = defaultdict(set)
+    models = [(c.camera.make, c.camera.model, c.reference.name, c.reference.size_px) for c in captures]
+    for model, calibration in zip(models, calibrations, strict=True):
+        by_model[model] |= {calibration} - {""}
+    return [
+        replace(c, camera=replace(c.camera, lens_calibration=calibration))
+        if c.camera.model and not c.camera.serial and len(by_model[model]) > 1
+        else c
+        for c, model, calibration in zip(captures, models, calibrations, strict=True)
+    ]
+
+
+def _lens_calibration(tags: Tags) -> str:
+    """A checksum of the tags of the lens and the rig, which the maker calibrates; empty without any, or if some may be
+    lost in a damaged packet.
+    """
+    if tags.unread is not None:
+        return ""
+    values = [text for name in _LENS_CALIBRATION if (text := tags.text(*name))]
+    return hashlib.sha256("\n".join(values).encode()).hexdigest()[:8] if values else ""
 
 
 def _complete(camera: CameraIdentity, same: set[CameraIdentity]) -> CameraIdentity:

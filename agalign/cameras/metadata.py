@@ -1,9 +1,9 @@
 """Tags of a TIFF or JPEG as typed fields: the standard ones, EXIF, GPS, and XMP read by namespace."""
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +16,16 @@ from agalign.errors import UnreadableFileError
 from agalign.host.text import shortened, without_controls
 from agalign.pixels.raster import suffix_format
 from agalign.values.capture import Band, CaptureTime, Position
+
+_SERIAL_NUMBERS: Sequence[Name] = (
+    ("cipa.jp/exif", "BodySerialNumber"),
+    ("ns.adobe.com/exif/1.0/aux", "SerialNumber"),
+    ("dji.com/drone-dji", "CameraSerialNumber"),
+    ("dji.com/drone-dji", "DroneSerialNumber"),
+    ("dji.com/drone-dji", "DroneID"),
+    ("pix4d.com/camera", "SerialNumber"),
+)
+"""XMP values of the serial number of a camera or its aircraft, for files without that of Exif."""
 
 
 @dataclass(frozen=True)
@@ -101,17 +111,20 @@ def read_tags(path: Path, page: int = 0) -> Tags:
         for key, names in ((0, ExifTags.TAGS), (EXIF, ExifTags.TAGS), (GPS, ExifTags.GPSTAGS))
     )
     orientation, packet = first.get("Orientation", 1), Packet.parse(first.get("XMLPacket", b""))
-    return Tags(
+    by_xmp, (position, to_a_minute, without_signs) = Tags(xmp=packet.values()), _positions(gps)
+    return replace(
+        by_xmp,
         make=_text(first.get("Make")),
         model=_text(first.get("Model")),
-        serial=_text(exif.get("BodySerialNumber")),
-        **_positions(gps),
+        serial=_text(exif.get("BodySerialNumber")) or by_xmp.first_text(_SERIAL_NUMBERS),
+        position=position,
+        position_to_a_minute=to_a_minute,
+        without_signs=without_signs,
         captured_at=_iso_time(exif, "DateTimeOriginal", "OffsetTimeOriginal")
         or _iso_time({**exif, **first}, "DateTime", "OffsetTime"),
         orientation=int(orientation) if orientation in range(1, 9) else 1,
         size_px=_size(first, "ImageWidth", "ImageLength"),
         black_level=_mean(first.get("BlackLevel")),
-        xmp=packet.values(),
         exif=exif,
         unread=packet.unread,
     )
@@ -131,21 +144,22 @@ def _size(directory: Mapping[str, Any], *sides: str) -> tuple[int, int] | None:
     return (width, height) if isinstance(width, int) and isinstance(height, int) and width > 0 < height else None
 
 
-def _positions(gps: Mapping[str, Any]) -> dict[str, Position]:
-    """The fields of `Tags` that a GPS directory determines; none without a fix, for which cameras write no coordinates
-    or zeros.
+def _positions(gps: Mapping[str, Any]) -> tuple[Position | None, Position | None, Position | None]:
+    """(position, position to a minute, position without signs) of `Tags`, at most one of which is known; none without a
+    fix, for which cameras write no coordinates or zeros.
     """
     (latitude_deg, is_exact), (longitude_deg, is_exact_too) = _degrees(gps, "Latitude"), _degrees(gps, "Longitude")
     if latitude_deg is None or longitude_deg is None or latitude_deg == longitude_deg == 0:
-        return {}
+        return None, None, None
     if latitude_deg > 90.0 or longitude_deg > 180.0:
-        return {}
+        return None, None, None
+    is_exact &= is_exact_too
     absolute = Position(latitude_deg, longitude_deg, _altitude_m(gps))
     sign, other = _sign(gps, "Latitude", "NS"), _sign(gps, "Longitude", "EW")
     if sign is None or other is None:
-        return {"without_signs": absolute} if is_exact and is_exact_too else {}
+        return None, None, absolute if is_exact else None
     signed = Position(sign * latitude_deg, other * longitude_deg, absolute.altitude_m)
-    return {"position" if is_exact and is_exact_too else "position_to_a_minute": signed}
+    return (signed, None, None) if is_exact else (None, signed, None)
 
 
 def _degrees(gps: Mapping[str, Any], axis: str) -> tuple[float | None, bool]:

@@ -29,9 +29,10 @@ from agalign.host.process_pool import ProcessPool, WorkerDiedError
 from agalign.host.processes import environment_of_children, silence_libraries
 from agalign.host.text import shortened
 from agalign.pixels.radiometry import plausible
-from agalign.pixels.raster import probe, suffix_format, value_step
+from agalign.pixels.raster import probe, read_tile, suffix_format, value_step
 from agalign.values import geometry
 from agalign.values.capture import Band
+from agalign.values.image import Tile
 from agalign.values.lens import rescaled
 from agalign.values.pixel_units import SAME_PIXELS, PixelScale
 
@@ -52,16 +53,35 @@ def read_files(paths: Sequence[Path], options: DiscoverOptions) -> Iterator[Imag
 def read_file(path: Path, cameras: Iterable[Camera], options: DiscoverOptions) -> ImageFile:
     """Return a file with its bands. Raises UnreadableFileError."""
     pages = _stored_pages(path, options.max_pixels)
-    stored, size_px = pages[0], pages[0][0].size_px
-    tags = read_tags(path, stored[0].page)
-    # A stack was made by software, even if its tags name a camera: cameras write single bands and photographs.
+    tags = read_tags(path, pages[0][0].page)
     *_, generic = cameras
     camera = next(c for c in cameras if c.recognises(tags))
     tags, of_position = with_position(tags, camera.other_position(tags), camera.sun(tags))
-    is_photograph = (stored[0].dtype == "uint8" or camera.has_one_lens(tags)) and len(stored) in (3, 4)
-    if suffix_format(path) == "TIFF" and len(stored) > 1 and not is_photograph:
+    pages[0], of_samples = _without_constant_sample(pages[0], is_of_camera=camera is not generic)
+    is_photograph = (pages[0][0].dtype == "uint8" or camera.has_one_lens(tags)) and len(pages[0]) in (3, 4)
+    # A stack was made by software, even if its tags name a camera: cameras write single bands and photographs.
+    if suffix_format(path) == "TIFF" and len(pages[0]) > 1 and not is_photograph:
         camera = generic
-    named = list(camera.bands(path, tags, stored))
+    if camera is not generic:
+        _check_sign(pages[0][0])
+    panel, stored = panel_in(tags, pages[0][0].size_px), pages[0][0]
+    named = [replace(b, panel=panel) for b in _named_bands(path, tags, camera, pages)]
+    used = (b for b in named if options.with_rgb or not b.is_from_photograph)
+    checked = [_of_image(band, tags, min_raw_step(tags, stored)) for band in used]
+    bands = tuple(_with_plausible_tags(band, tags) for band, _, _ in checked)
+    scale = checked[0][1] if checked else SAME_PIXELS
+    other_lens = next((why for *_, why in checked if why), "")
+    found = [doubt for doubt in (of_position, of_samples) if doubt is not None]
+    doubts = *found, *_doubts(camera, tags, bands, other_lens)
+    return ImageFile(path, camera, tags, bands, scale, bool(other_lens), doubts)
+
+
+def _named_bands(path: Path, tags: Tags, camera: Camera, pages: Sequence[tuple[Band, ...]]) -> list[Band]:
+    """The bands of all pages of a file, with their names; `tags` are those of the first page.
+
+    Raises UnreadableFileError for pages without names.
+    """
+    named = list(camera.bands(path, tags, pages[0]))
     for page in pages[1:]:
         named += camera.bands(path, read_tags(path, page[0].page), page)
     if len(pages) > 1 and len({b.name for b in named}) < len(pages):
@@ -69,15 +89,37 @@ def read_file(path: Path, cameras: Iterable[Camera], options: DiscoverOptions) -
         raise UnreadableFileError(f"{path}: {what}; write each page to a file of its own (tiffsplit)")
     if len(pages) > 1:
         named = [replace(band, band_index=band.page) for band in named]
-    named = [replace(band, name=shortened(band.name)) for band in named]
-    panel = panel_in(tags, size_px)
-    used = (replace(b, panel=panel) for b in named if options.with_rgb or not b.is_from_photograph)
-    checked = [_of_image(band, tags, min_raw_step(tags, stored[0])) for band in used]
-    bands = tuple(_with_plausible_tags(band, tags) for band, _, _ in checked)
-    scale = checked[0][1] if checked else SAME_PIXELS
-    other_lens = next((why for *_, why in checked if why), "")
-    doubts = [*([] if of_position is None else [of_position]), *_doubts(camera, tags, bands, other_lens)]
-    return ImageFile(path, camera, tags, bands, scale, bool(other_lens), tuple(doubts))
+    return [replace(band, name=shortened(band.name)) for band in named]
+
+
+def _without_constant_sample(stored: tuple[Band, ...], *, is_of_camera: bool) -> tuple[tuple[Band, ...], Doubt | None]:
+    """Return the bands of a camera's file without a second sample that a program added, such as an undeclared alpha
+    channel: one of the two is constant.
+    """
+    if not is_of_camera or len(stored) != 2 or suffix_format(stored[0].path) != "TIFF":
+        return stored, None
+    is_constant = []
+    for band in stored:
+        pixels, _ = read_tile(band, Tile(0, 0, *band.size_px))
+        is_constant.append(bool((pixels == pixels[0, 0]).all()))
+    if is_constant.count(True) != 1:
+        return stored, None
+    constant, image = sorted(stored, key=lambda band: not is_constant[stored.index(band)])
+    text = f"sample {constant.band_index} of its pixels is constant"
+    return (image,), Doubt(text, "it is not used, as a camera writes one sample: a program added it")
+
+
+def _check_sign(band: Band) -> None:
+    """Raise UnreadableFileError for a camera's file whose raw numbers were stored as signed ones."""
+    max_wrapped = -4096  # processed values are a little below 0, raw numbers above 32767 become -32768 and more
+    if band.dtype != "int16" or band.nodata is not None:
+        return
+    pixels, valid = read_tile(band, Tile(0, 0, *band.size_px))
+    if pixels[valid].min(initial=0) < max_wrapped:
+        what = "some of its pixels are negative: raw numbers above 32767 were stored as signed ones"
+        raise UnreadableFileError(
+            f"{band.path}: {what}; copy it from the card again, or store them as unsigned 16 bits"
+        )
 
 
 def _doubts(camera: Camera, tags: Tags, bands: Sequence[Band], other_lens: str) -> Iterator[Doubt]:

@@ -26,7 +26,7 @@ class FlightCamera:
     def of(cls, capture: Capture, bands: Iterable[Band]) -> Self:
         """Return the camera of a capture, with these bands."""
         camera = capture.camera
-        name = f"{camera.make} {camera.model} {camera.serial}".strip()
+        name = f"{camera.make} {camera.model} {camera.serial or camera.lens_calibration}".strip()
         return cls(name, tuple((b.name, *b.size_px) for b in bands))
 
     @property
@@ -110,7 +110,7 @@ def model_names(groups: Sequence[Sequence[Capture]]) -> list[str]:
     used: set[str] = set()
     for group in groups:
         camera = group[0].camera
-        stem = file_name(f"{camera.model} {camera.serial}".strip() or "camera")
+        stem = file_name(f"{camera.model} {camera.serial or camera.lens_calibration}".strip() or "camera")
         numbered = (stem if k == 1 else f"{stem}-{k}" for k in count(1))
         name = next(n for n in numbered if n.lower() not in used)
         used.add(name.lower())
@@ -172,7 +172,8 @@ def camera_overviews(captures: Sequence[Capture]) -> list[CameraOverview]:
     groups: dict[tuple[str, str], list[Capture]] = {}
     for capture in captures:
         name = f"{capture.camera.make} {capture.camera.model}".strip() or "unknown camera"
-        groups.setdefault((name, capture.camera.serial), []).append(capture)
+        serial = capture.camera.serial or capture.camera.lens_calibration
+        groups.setdefault((name, serial), []).append(capture)
     return [_overview(name, serial, group) for (name, serial), group in groups.items()]
 
 

@@ -249,6 +249,8 @@ class CameraIdentity:
     """From the tags."""
     serial: Name = ""
     """Serial numbers, joined by `+`."""
+    lens_calibration: Name = ""
+    """Checksum of the lens calibration in the tags, where it alone tells two cameras without serial numbers apart."""
 
     @classmethod
     def of(cls, make: str, model: str, serials: Iterable[str]) -> "CameraIdentity":
