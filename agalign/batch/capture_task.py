@@ -17,7 +17,7 @@ from agalign.batch.products import PRODUCTS
 from agalign.batch.render import RenderOptions, render
 from agalign.batch.workers import failure_text
 from agalign.capture.align_bands import PairProgress
-from agalign.config import Settings
+from agalign.config import Settings, WriteSettings
 from agalign.errors import InputError, SidecarError, UnreadableFileError
 from agalign.flight.model import FlightModel, load_model
 from agalign.host.files import written_below
@@ -25,13 +25,13 @@ from agalign.host.own_files import is_own_file
 from agalign.host.process_pool import A, R
 from agalign.method.device import choose_device, keep_freed_memory, one_memory_error, one_thread
 from agalign.pixels.capture_pixels import CapturePixels
-from agalign.pixels.radiometry import check_pixels
-from agalign.pixels.raster import with_missing_parts, with_saturation_values
+from agalign.pixels.radiometry import with_checked_pixels
+from agalign.pixels.raster import ReadTile, with_missing_parts, with_saturation_values
 from agalign.rasters.product import CapturePaths
 from agalign.records.sidecar import Sidecar
 from agalign.records.sidecar_file import read_with_change
 from agalign.values.alignment import Alignment
-from agalign.values.capture import Capture
+from agalign.values.capture import Band, Capture
 from agalign.values.choices import RadiometryChoice
 
 
@@ -102,11 +102,10 @@ def process_capture(task: Task, progress: PairProgress = quiet) -> CaptureReport
     earlier, is_intact = _earlier(path)
     listed = [] if earlier is None else earlier.files
     refuse_to_overwrite([capture], out, settings.write, {path: listed})
-    if missing := missing_radiometry(capture, settings.write.radiometry):
+    if missing := missing_lens(capture, settings.write) or missing_radiometry(capture, settings.write.radiometry):
         raise InputError(f"{capture.reference.path}: {missing}")
-    for band in capture.bands if settings.write.radiometry != "off" else ():
-        with suppress(UnreadableFileError):  # the band pair fails with this reason
-            check_pixels(band, read)
+    if settings.write.radiometry != "off":
+        capture = replace(capture, bands=tuple(_checked(band, read) for band in capture.bands))
     for product in PRODUCTS:
         if product.is_enabled(settings.write):
             product.check(capture)
@@ -128,6 +127,16 @@ def process_capture(task: Task, progress: PairProgress = quiet) -> CaptureReport
     )
 
 
+def _checked(band: Band, read: ReadTile) -> Band:
+    """Return a band as `with_checked_pixels`; one that cannot be read is unchanged, and its pair fails with the reason.
+
+    Raises InputError.
+    """
+    with suppress(UnreadableFileError):
+        return with_checked_pixels(band, read)
+    return band
+
+
 def _earlier(path: Path) -> tuple[Sidecar | None, bool]:
     """Return the sidecar of an earlier run, None if it cannot be read, and whether it is as it was written.
 
@@ -138,6 +147,12 @@ def _earlier(path: Path) -> tuple[Sidecar | None, bool]:
         own = [part for part in sidecar.products if not change or is_own_file(path.parent / part.file)]
         return sidecar.model_copy(update={"products": own}), not change
     return None, False
+
+
+def missing_lens(capture: Capture, settings: WriteSettings) -> str:
+    """Return that the lens of the reference is not known, if its grid is to be lens-corrected; empty otherwise."""
+    is_lacking = settings.undistort and capture.reference.lens is None
+    return "the lens is not known: its tags lack a lens model that is used; leave --undistort out" if is_lacking else ""
 
 
 def missing_radiometry(capture: Capture, choice: RadiometryChoice) -> str:

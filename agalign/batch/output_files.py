@@ -13,7 +13,7 @@ from pathlib import Path
 from agalign.batch.products import PRODUCTS
 from agalign.config import WriteSettings
 from agalign.errors import ConfigurationError, OutputError, SidecarError
-from agalign.host.files import check_inside, max_name_bytes
+from agalign.host.files import check_inside, max_name_bytes, remove_companions
 from agalign.host.own_files import is_own_file
 from agalign.rasters.aligned_files import band_file_names, is_aligned_raster
 from agalign.rasters.parallax_file import PARALLAX_SUFFIX
@@ -120,6 +120,7 @@ def remove_files(files: Iterable[Path], out: Path) -> None:
         with suppress(OSError, OutputError):
             check_inside(path.parent, out)  # a link may have taken the place of the folder meanwhile
             path.unlink(missing_ok=True)
+            remove_companions(path)
 
 
 def remove_outputs(capture: Capture, out: Path, settings: WriteSettings) -> list[Path]:

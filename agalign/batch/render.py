@@ -26,6 +26,7 @@ from agalign.rasters.parallax_file import read_relief
 from agalign.rasters.preview import preview_bytes
 from agalign.rasters.product import CapturePaths, ProductContext
 from agalign.records.sidecar import (
+    BandRadiometryPart,
     BandResult,
     FilePart,
     IlluminationPart,
@@ -39,6 +40,8 @@ from agalign.spectral_indices.rasters import index_rasters
 from agalign.values.alignment import Alignment
 from agalign.values.capture import Capture
 from agalign.values.image import OutputGrid
+from agalign.values.radiometric_errors import saturation_error
+from agalign.values.radiometry import Radiometry, total_percent
 
 _ADDED = {product.option: product.kind for product in PRODUCTS if product.option} | {"relief_map": "relief"}
 """Settings that add files or layers, and the kind of product that shows that these exist."""
@@ -180,7 +183,7 @@ def rendered_sidecar(
             "unreadable_bands": dict(capture.unreadable_bands),
             "accept_predicted_px": accept_predicted_px,
             "pose": shown.pose,
-            "output": _output(context) if context.layers else None,
+            "output": _output(context, {b.band: b.saturated or 0.0 for b in bands}) if context.layers else None,
             # RFC 7946: outer rings are counter-clockwise.
             "footprint": None if ring is None else [(x, y) for x, y in ring[::-1].round(_FOOTPRINT_DECIMALS).tolist()],
             "footprint_accuracy_m": None if ring is None else accuracy_of_footprint_m(shown),
@@ -226,7 +229,8 @@ def _file(context: ProductContext, kind: str, file: Any) -> FilePart:
     return FilePart(kind=kind, file=name, bytes=file.path.stat().st_size, sha256=file.sha256)
 
 
-def _output(context: ProductContext) -> OutputPart:
+def _output(context: ProductContext, saturated: Mapping[str, float]) -> OutputPart:
+    """The part about the rasters, given the share of saturated pixels by band."""
     stack = [f for f in context.written if f.kind == Stack.kind]
     values = {f.nodata_in_json for f in stack or [f for f in context.written if f.kind == BandFiles.kind]}
     grid, capture = context.grid, context.capture
@@ -242,9 +246,20 @@ def _output(context: ProductContext) -> OutputPart:
             for name, r in radiometry.items()
             if "reflectance" in r.quantity
         ],
+        band_radiometry=[
+            _band_radiometry(name, r, saturated.get(name, 0.0))
+            for name, r in radiometry.items()
+            if r.quantity != "temperature"
+        ],
         crop=(grid.x0, grid.y0, grid.width, grid.height),
         scale=(grid.scale.x, grid.scale.y),
         undistorted=grid.undistorted,
         vignetting_corrected=any(file.is_flat for file in context.written),
         nodata=values.pop() if len(values) == 1 else None,
     )
+
+
+def _band_radiometry(band: str, radiometry: Radiometry, saturated: float) -> BandRadiometryPart:
+    """The part about the values of a band, given the share of its pixels that are saturated."""
+    errors = [*radiometry.errors, *([saturation_error(saturated)] if saturated else [])]
+    return BandRadiometryPart(band=band, std_percent=total_percent(errors), errors=errors)

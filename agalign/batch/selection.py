@@ -5,7 +5,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from multiprocessing import get_context
 
-from agalign.batch.capture_task import missing_radiometry
+from agalign.batch.capture_task import missing_lens, missing_radiometry
 from agalign.batch.products import PRODUCTS
 from agalign.batch.workers import failure_text
 from agalign.cameras.discover import FolderScan
@@ -57,6 +57,9 @@ def select_captures(flight: FolderScan, write: WriteSettings, options: RunOption
     with _examining(options.timeout_s) as examine:
         result = _selected(flight, write, options, examine)
     captures = result.captures
+    without_lens = [missing_lens(capture, write) for capture in captures]
+    if captures and all(without_lens):
+        raise ConfigurationError(f"{captures[0].reference.path}: {without_lens[0]}")
     missing = [missing_radiometry(capture, write.radiometry) for capture in captures]
     if captures and all(missing):
         raise ConfigurationError(f"--radiometry {write.radiometry}: {missing[0]}")

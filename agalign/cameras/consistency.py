@@ -2,7 +2,7 @@
 band, number and time. Each comparison says what contradicts what; the more reliable source is used.
 
 Contradictions within a file are its `doubts`, which `doubtful_files` reports; those between files are problems. Pixels
-are compared with the tags by `pixels.radiometry.check_pixels`.
+are compared with the tags by `pixels.radiometry.with_checked_pixels`.
 """
 
 import math

@@ -28,18 +28,18 @@ from agalign.cameras.metadata import Tags, finite
 from agalign.cameras.model_tables import MAVIC_3_PART, PHANTOM_4, named_by_camera
 from agalign.cameras.tag_text import numbers_in
 from agalign.errors import GeometryError
-from agalign.pixels.radiometric_errors import (
+from agalign.values import geometry
+from agalign.values.band_names import own_stem
+from agalign.values.capture import Band, Pose, Position
+from agalign.values.geometry import Matrix
+from agalign.values.lens import Lens
+from agalign.values.radiometric_errors import (
     FACTORY_CALIBRATION,
     LIGHT_SENSOR,
     NO_GAIN_ADJUSTMENT,
     NO_VIGNETTING,
     agreed,
 )
-from agalign.values import geometry
-from agalign.values.band_names import own_stem
-from agalign.values.capture import Band, Pose, Position
-from agalign.values.geometry import Matrix
-from agalign.values.lens import Lens
 from agalign.values.radiometry import Radiometry, ReflectanceFactor
 
 _MAVIC_3_BAND = rf"{MAVIC_3_PART}|(?<=_\d{{4}})_D(?![a-z0-9])|_D$"

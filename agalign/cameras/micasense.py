@@ -30,7 +30,9 @@ from agalign.cameras.base import Camera, is_thermal, rays_to_rig, rotation
 from agalign.cameras.consistency import clock_error, full_scale, raw_step_of
 from agalign.cameras.metadata import Tags, finite
 from agalign.cameras.sun import Sun, sun_position
-from agalign.pixels.radiometric_errors import (
+from agalign.values.band_names import own_stem
+from agalign.values.capture import Band, CaptureTime, Pose, is_clock_set
+from agalign.values.radiometric_errors import (
     FACTORY_CALIBRATION,
     LIGHT_SENSOR,
     NO_TILT,
@@ -39,8 +41,6 @@ from agalign.pixels.radiometric_errors import (
     contradiction,
     tilt_error,
 )
-from agalign.values.band_names import own_stem
-from agalign.values.capture import Band, CaptureTime, Pose, is_clock_set
 from agalign.values.radiometry import Errors, Radiometry, ReflectanceFactor
 
 NAMESPACE, _DLS = "micasense.com/MicaSense", "micasense.com/DLS"
@@ -216,8 +216,9 @@ def _in_plane_of_sensor(tags: Tags, sun: tuple[float, float] | None) -> Irradian
     """The irradiance by a DLS 1, corrected for the tilt of the sensor if the sun and the attitude are known."""
     value, is_agreed = _spectral(tags)
     if not value:
-        negative = (tags.number(_DLS, "SpectralIrradiance") or 0.0) < 0
-        return Irradiance(problem="SpectralIrradiance is negative" if negative else "")
+        names = "HorizontalIrradiance", "SpectralIrradiance"
+        negative = [name for name in names if (tags.number(_DLS, name) or 0.0) < 0]
+        return Irradiance(problem=f"{negative[0]} is negative" if negative else "")
     if not is_agreed:
         return Irradiance(problem="SpectralIrradiance and Irradiance contradict each other")
     max_si = 3.0  # W / m^2 / nm, twice that of a clear noon: larger numbers have the unit of the DLS 2

@@ -24,7 +24,9 @@ def numbers_in(items: Sequence[str], count: int | None = None) -> tuple[float, .
     chunks = [chunk for chunk in chunks if chunk]
     chunks = [chunk for k, chunk in enumerate(chunks) if k == 0 or not _UNIT.fullmatch(chunk)]
     parts = [part for chunk in chunks for part in chunk.split(",") if part]
-    has_decimal_commas = not any("." in chunk for chunk in chunks) and _has_decimal_commas(chunks, len(parts), count)
+    if any(mark in item for item in items for mark in ".("):  # a point, or pairs in brackets
+        return _all_of(parts)
+    has_decimal_commas = len(items) > 1 or _has_decimal_commas(chunks, len(parts), count)
     return _all_of(_with_points(chunks) if has_decimal_commas else parts)
 
 

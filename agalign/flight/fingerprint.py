@@ -49,7 +49,10 @@ def render_fingerprint(capture: Capture, write: WriteSettings, check: CheckSetti
     """
     facts: list[HashInput] = []
     for b in capture.stack_bands:
-        calibration = None if b.radiometry is None else (b.radiometry.quantity, b.radiometry.gain)
+        calibration: HashInput = None
+        if b.radiometry is not None:
+            errors = [(e.name, e.std_percent, e.state) for e in b.radiometry.errors]
+            calibration = b.radiometry.quantity, b.radiometry.gain, errors
         georeference = None if b.georeference is None else b.georeference.transform
         facts.append((b.name, calibration, georeference))
     options = write.model_dump_json(exclude={"indices"}), check.model_dump_json()

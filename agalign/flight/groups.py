@@ -139,6 +139,10 @@ class CameraOverview:
     radiometry: tuple[RadiometryChoice, ...]
     """Values of `--radiometry` that the tags of all captures support, except those of a panel; `panel` if a capture
     shows one, whose reflectance may have to be given."""
+    radiometry_std_percent: tuple[float, ...] = ()
+    """Expected error of the values by each of `radiometry` but the panel, percent: the largest of all bands."""
+    uncorrected: tuple[str, ...] = ()
+    """What the values are not corrected for, because the tags lack it."""
     missing_calibration: str = ""
     """Missing or unused tags that prevent a calibration, in words."""
     gsd_per_height: float | None = None
@@ -163,7 +167,10 @@ class CameraOverview:
             "panel": "reflectance by calibration panel",
         }
         none = self.missing_calibration or "none in the tags"
-        parts.append(f"radiometry: {', '.join(kinds[r] for r in self.radiometry) or none}")
+        errors = dict(zip(self.radiometry, self.radiometry_std_percent, strict=False))
+        named = [f"{kinds[r]} (± {errors[r]:.0f} %)" if errors.get(r) else kinds[r] for r in self.radiometry]
+        parts.append(f"radiometry: {', '.join(named) or none}")
+        parts += [f"not corrected for {' and '.join(self.uncorrected)}"] if self.uncorrected else []
         return ", ".join(parts)
 
 
@@ -184,6 +191,9 @@ def _overview(name: str, serial: str, captures: Sequence[Capture]) -> CameraOver
     to_align = [c for c in captures if not c.is_of_a_panel] or captures
     choices: tuple[RadiometryChoice, ...] = ("camera", "sun")
     supported = [choice for choice in choices if all(_supports(c, choice) for c in to_align)]
+    by_choice = [[b.radiometry for c in to_align for b in with_radiometry(c, one, {}).bands] for one in supported]
+    std_percent = tuple(max((r.std_percent for r in of if r is not None), default=0.0) for of in by_choice)
+    uncorrected = dict.fromkeys(name for of in by_choice for r in of if r is not None for name in r.uncorrected)
     if "camera" in supported and any(c.panel is not None for c in captures):
         supported.append("panel")
     reference = mode(c.reference.name for c in captures)
@@ -204,6 +214,8 @@ def _overview(name: str, serial: str, captures: Sequence[Capture]) -> CameraOver
             (b.missing_calibration for c in captures for b in c.bands if b.missing_calibration), ""
         ),
         radiometry=tuple(supported),
+        radiometry_std_percent=std_percent,
+        uncorrected=tuple(uncorrected),
     )
 
 

@@ -13,12 +13,12 @@ from agalign.cameras.sun import sun_position
 from agalign.errors import AgalignError
 from agalign.flight.groups import camera_key, flights_of
 from agalign.pixels.panel_detection import DetectedPanel, albedo_of, evenly_lit, find_panel, inside, is_homogeneous
-from agalign.pixels.radiometric_errors import LIGHT_SENSOR, PANEL_AND_SENSOR, contradiction, panel_errors
 from agalign.pixels.radiometry import calibrated
 from agalign.pixels.raster import read_for_alignment, read_tile, without_warnings
 from agalign.values.capture import Band, Capture, Panel, PanelSource
 from agalign.values.image import Tile
 from agalign.values.pixel_units import PixelScale
+from agalign.values.radiometric_errors import LIGHT_SENSOR, PANEL_AND_SENSOR, contradiction, panel_errors
 from agalign.values.radiometry import RadiometricError, RadiometrySource, ReflectanceFactor
 
 R = TypeVar("R")

@@ -64,6 +64,7 @@ def complete_file(path: Path) -> Iterator[Path]:
         yield partial
         _flush_to_disk(partial)
         partial.replace(path)
+        remove_companions(path)
         _flush_to_disk(path.parent)
 
 
@@ -86,6 +87,14 @@ def scratch_file(neighbour: Path) -> Iterator[Path]:
         raise OutputError(f"{neighbour}: cannot be written ({error.strerror or error})") from None
     finally:
         _remove(scratch)
+
+
+def remove_companions(path: Path) -> None:
+    """Remove the files that GDAL has put beside a raster which is replaced or removed: they describe its pixels."""
+    if path.suffix.lower() in (".tif", ".tiff", ".png"):
+        for suffix in (".ovr", ".aux.xml", ".msk"):  # overviews, statistics, mask
+            with suppress(OSError):
+                path.with_name(path.name + suffix).unlink(missing_ok=True)
 
 
 def write_text(path: Path, text: str) -> None:

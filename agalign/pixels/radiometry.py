@@ -15,11 +15,11 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from agalign.errors import InputError
-from agalign.pixels.radiometric_errors import FACTORY_CALIBRATION, PANEL_AND_SENSOR
 from agalign.pixels.raster import ReadTile, read_for_alignment
 from agalign.values.capture import Band, Capture
 from agalign.values.choices import RadiometryChoice
 from agalign.values.image import FloatImage, Tile
+from agalign.values.radiometric_errors import FACTORY_CALIBRATION, PANEL_AND_SENSOR, too_bright
 from agalign.values.radiometry import Radiometry, ReflectanceFactor
 
 _PLAUSIBLE: Mapping[str, tuple[float, float]] = {
@@ -36,8 +36,8 @@ _PLAUSIBLE: Mapping[str, tuple[float, float]] = {
 }
 """Ranges of the values that radiance and reflectance are calculated from; others are of damaged tags."""
 _MAX_REFLECTANCE = 2.0
-"""Maximum median of a band: fresh snow and panels are below 1, and a tilted sensor measures as little as half of the
-light. Single pixels, as of sun glint, are brighter.
+"""Maximum median of a band that is written: fresh snow and panels are below 1, so that a median above 1 is named, and a
+tilted sensor measures as little as half of the light. Single pixels, as of sun glint, are brighter.
 """
 _MAX_BELOW_BLACK = 0.01
 """Minimum median of a band above the black level, negative, relative to the full scale. Water in the near infrared is
@@ -78,13 +78,14 @@ def plausible(radiometry: Radiometry, size_px: tuple[int, int]) -> tuple[Radiome
     return radiometry, ""
 
 
-def check_pixels(band: Band, read: ReadTile) -> None:
-    """Raise InputError if the pixels of a band do not fit its calibration, UnreadableFileError if they cannot be read.
+def with_checked_pixels(band: Band, read: ReadTile) -> Band:
+    """Return the band, with the doubt about its calibration if half of its pixels have a reflectance above 1.
 
-    The corrections by position are left out, which are within a factor of 2. `read` reads the pixels of the file.
+    Raises InputError if the pixels do not fit the calibration, UnreadableFileError if they cannot be read. The
+    corrections by position are left out, which are within a factor of 2. `read` reads the pixels of the file.
     """
     if band.radiometry is None or band.radiometry.quantity == "temperature":
-        return
+        return band
     longest_side_px, radiometry = 256, band.radiometry
     if problem := _processed(band, read):
         raise InputError(f"{band.path}: {problem}; give the original image, or leave --radiometry out")
@@ -95,8 +96,11 @@ def check_pixels(band: Band, read: ReadTile) -> None:
         problem = f"its black level of {radiometry.black_level:g} is above its pixels (median {raw:.0f})"
     elif radiometry.quantity == "reflectance" and signal * radiometry.gain > _MAX_REFLECTANCE:
         problem = f"its median reflectance of {signal * radiometry.gain:.3g} is above {_MAX_REFLECTANCE:g}"
+    elif radiometry.quantity == "reflectance" and signal * radiometry.gain > 1.0:
+        errors = *radiometry.errors, too_bright(signal * radiometry.gain)
+        return replace(band, radiometry=replace(radiometry, errors=errors))
     else:
-        return
+        return band
     raise InputError(f"{band.path}: {problem}; take the capture out, or leave --radiometry out")
 
 

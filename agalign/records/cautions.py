@@ -15,9 +15,10 @@ from agalign.flight.panel_readings import MAX_TIME_DIFFERENCE_S
 from agalign.flight.rig_file import model_fingerprint
 from agalign.records.excluded import PanelPart, read_excluded
 from agalign.records.run_record import last_record
-from agalign.records.sidecar import BandResult, Sidecar
+from agalign.records.sidecar import BandRadiometryPart, BandResult, Sidecar
 from agalign.values.capture import MIN_APART_S, CaptureTime
 from agalign.values.issues import MISSING_BAND, MOSAICS, OF_FILES, TEXTURELESS, UNEXPECTED_PX, UNREADABLE_BAND, Remedy
+from agalign.values.radiometric_errors import PANEL_AND_SENSOR
 
 MAX_PIXEL_ERROR_PX = 1.0
 """Beyond it, a spectral index mixes neighbouring plants."""
@@ -54,6 +55,17 @@ _PANEL_ADVICE = {
     "of the flight",
 }
 """By the `--radiometry` of the run."""
+_UNCORRECTED = Remedy(
+    "radiance and reflectance lack a correction: the tags do not have its factor",
+    "update the firmware of the camera, or give files with all its tags; a calibration panel corrects what is the same "
+    "in the whole image",
+)
+_CONTRADICTED = Remedy(
+    "two values of what the reflectance depends on contradict each other",
+    "look at the panels (panels.json and their pictures) and at the tags; --exclude leaves out the captures of a panel "
+    "that was shaded, wet or soiled",
+)
+_ABOUT = "by about {:.0%}"
 _MAX_REFLECTANCE_ERROR = 1.0
 """Of a usable reflectance: a factor of 2 changes every index."""
 _OLD_PANEL = Remedy(
@@ -154,7 +166,11 @@ class RunFacts:
     def _of_light(self, sidecar: Sidecar) -> Iterator[Caution]:
         """The cautions about the reflectance of all bands."""
         output = sidecar.output
-        if output is None or output.light_from is None:
+        if output is None:
+            return
+        for band_part in output.band_radiometry:
+            yield from _of_factors(band_part)
+        if output.light_from is None:
             return
         scales = self._sensor_scales(sidecar.captured_at)
         age_s = output.panel_age_s or 0.0
@@ -190,6 +206,18 @@ class RunFacts:
                 if band.sensor_scale:
                     scales[band.band] = max(scales.get(band.band, 1.0), band.sensor_scale, key=lambda s: abs(np.log(s)))
         return scales
+
+
+def _of_factors(radiometry: BandRadiometryPart) -> Iterator[Caution]:
+    """The cautions about factors of the calibration of a band that are missing or contradicted."""
+    for error in radiometry.errors:
+        share = error.std_percent / 100
+        if error.state == "missing":
+            reason = f"not corrected for the {error.name}, which its tags lack: off by about {share:.0%}"
+            yield Caution(radiometry.band, "check", _UNCORRECTED, reason, min(1.0, share), share, _ABOUT)
+        elif error.state == "contradicted" and error.name != PANEL_AND_SENSOR:
+            reason = f"{error.name}: two values differ, so that the reflectance may be off by {share:.0%}"
+            yield Caution(radiometry.band, "check", _CONTRADICTED, reason, min(1.0, share), share, _ABOUT)
 
 
 def _of_alignment(band: BandResult, sidecar: Sidecar) -> Iterator[Caution]:

@@ -33,6 +33,8 @@ class PanelBandPart(_Part):
     """Irradiance on the panel divided by that of the light sensor."""
     problem: Message | None
     """Reason why the band cannot be used."""
+    other_albedo: float | None = None
+    """Reflectance of the panel of this serial number by another capture, if it contradicts `albedo`."""
 
 
 class SkyBandPart(_Part):
@@ -70,6 +72,10 @@ class PanelPart(_CapturePart):
     """Irradiance on the panel divided by that of the light sensor, the median of the bands."""
     fits_sensor: bool = True
     """False if the scale or its range over the bands is implausible; panels are then not combined with the sensor."""
+    brighter: Name = ""
+    """Capture of a panel within the hour with more light than can have changed; this panel is not used."""
+    light_ratio: float = 1.0
+    """Light on this panel relative to that on the brighter one."""
     bands: list[PanelBandPart]
 
     @property
@@ -93,9 +99,25 @@ class PanelPart(_CapturePart):
             extremes = " to ".join(f"{value:.2f} in {band}" for value, band in by_band[:: max(1, len(by_band) - 1)])
             sensor += f"{extremes and f' ({extremes})'}, which was in other light or is wrong in a band: "
             sensor += "--radiometry auto uses the sensor alone, panel the panels alone"
+        sensor += self._contradictions
         refused = {b.problem: [o.band for o in self.bands if o.problem == b.problem] for b in self.bands if b.problem}
         unused = "".join(f"; not used in {', '.join(bands)}: {why}" for why, bands in refused.items() if albedos)
         return f"{name} (reflectance {reflectance}; recognised by {recognised}): {use}{sensor}{unused}"
+
+    @property
+    def _contradictions(self) -> str:
+        """What other captures of panels contradict."""
+        text = ""
+        if self.brighter:
+            text = (
+                f"; the light on it is {self.light_ratio:.2f} times that on the panel in {self.brighter}, within the "
+            )
+            text += "hour: it was in shade, wet or soiled, and is not used; with it alone, reflectance would be "
+            text += f"{1 / self.light_ratio:.2f} times as large"
+        for band in [b for b in self.bands if b.other_albedo is not None][:1]:
+            text += f"; the reflectance of the panel in {band.band} is {band.albedo:.3f} here and "
+            text += f"{band.other_albedo:.3f} by another capture of this serial number"
+        return text
 
 
 class SkyPart(_CapturePart):

@@ -48,6 +48,7 @@ from agalign.values.mapping import DisplacementField, PixelMapping
 from agalign.values.mapping_error import MappingError
 from agalign.values.parallax import Parallax, Relief
 from agalign.values.pixel_units import PixelScale, Size
+from agalign.values.radiometry import RadiometricError
 from agalign.values.residual import Residual, Similarity
 
 SCHEMA = "agalign/3"
@@ -410,6 +411,17 @@ class IlluminationPart(_Part):
     """Factor by which radiance was multiplied."""
 
 
+class BandRadiometryPart(_Part):
+    """How far the radiance or reflectance of a band can be trusted."""
+
+    band: Name
+    """Its name."""
+    std_percent: Number3
+    """Expected error (1 sigma) of its values, percent: the root of the sum of the squares of `errors`."""
+    errors: list[RadiometricError]
+    """What its values depend on, with the error by each."""
+
+
 class OutputPart(_Part):
     """Written rasters."""
 
@@ -423,6 +435,8 @@ class OutputPart(_Part):
     """Time to the nearest panel."""
     illumination: list[IlluminationPart] = []
     """Bands that were converted to reflectance."""
+    band_radiometry: list[BandRadiometryPart] = []
+    """Bands that were converted to radiance or reflectance."""
     crop: tuple[int, int, Count, Count]
     """x0, y0, width, height on the reference grid times `scale`."""
     scale: tuple[Positive, Positive] = (1.0, 1.0)
@@ -439,6 +453,10 @@ class OutputPart(_Part):
         """The `RadiometrySource` of the light, if the rasters are reflectance or relative reflectance."""
         quantity, _, source = (self.radiometry or "").partition(" by ")
         return source if "reflectance" in quantity else None
+
+    def std_percent(self, band: str) -> float | None:
+        """Return the expected error of a band's radiance or reflectance, percent; None for another band."""
+        return next((part.std_percent for part in self.band_radiometry if part.band == band), None)
 
     @property
     def grid(self) -> OutputGrid:

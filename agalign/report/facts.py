@@ -329,7 +329,8 @@ class FlightFacts:
         """
         row = row_of(band)
         if band.status != "reference" or checks:
-            self._summary.add(keys | row | {"check": "; ".join(checks)})
+            std_percent = None if sidecar.output is None else rounded(sidecar.output.std_percent(band.band))
+            self._summary.add(keys | row | {"radiometry_std_percent": std_percent, "check": "; ".join(checks)})
         metrics, windows = band.metrics, None if band.metrics is None else band.metrics.windows
         similarity = {name: (row[f"{name}_before"], row[f"{name}_after"]) for name in SIMILARITY}
         centres_px = np.empty((0, 2)) if windows is None else windows.centres_px
@@ -382,7 +383,7 @@ def _of_capture(folder: Path, label: str, sidecar: Sidecar) -> dict[str, Any]:
         "accept_predicted_px": sidecar.accept_predicted_px,
         "crop": grid.crop,
         "scale": grid.scale,
-        "radiometry": grid.radiometry,
+        "radiometry": _radiometry(grid),
         "stack": _link(folder, files.get("stack")),
         "relief": _link(folder, relief),
         "sidecar": _link(folder, f"{sidecar.capture}.json"),
@@ -391,6 +392,12 @@ def _of_capture(folder: Path, label: str, sidecar: Sidecar) -> dict[str, Any]:
         "residual_px": rounded(sidecar.largest_residual("residual_px")),
         "error_px": rounded(largest_error_px(sidecar)),
     }
+
+
+def _radiometry(output: OutputPart) -> str | None:
+    """The conversion of the raw numbers, with the largest expected error of a band."""
+    errors = [part.std_percent for part in output.band_radiometry]
+    return f"{output.radiometry}, expected error up to {max(errors):.0f} %" if errors else output.radiometry
 
 
 def _map_row(facts: dict[str, Any]) -> dict[str, Any]:

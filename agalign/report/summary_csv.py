@@ -33,7 +33,7 @@ BAND_COLUMNS = {
 }
 """Field of a band in the sidecar by column of OUT/summary.csv."""
 SUMMARY_FILE = "summary.csv"
-SUMMARY_COLUMNS = ("folder", "capture", *BAND_COLUMNS, "reference", "check")
+SUMMARY_COLUMNS = ("folder", "capture", *BAND_COLUMNS, "radiometry_std_percent", "reference", "check")
 
 
 class SummaryTable:

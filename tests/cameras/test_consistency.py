@@ -18,7 +18,7 @@ from agalign.cameras.model_tables import filter_channels, sizes_px
 from agalign.cameras.sun import Sun, sun_position
 from agalign.cameras.tiff_directory import EXIF, GPS, XMP, Entry, add_directories, byte_string, read_directories, text
 from agalign.errors import InputError
-from agalign.pixels.radiometry import check_pixels
+from agalign.pixels.radiometry import with_checked_pixels
 from agalign.pixels.raster import read_tile
 from agalign.values.capture import Capture, CaptureTime, Position
 
@@ -239,7 +239,7 @@ def test_calibrated_images_under_the_tags_of_raw_ones_are_refused(
         with pytest.raises(
             InputError, match="of its pixels are not multiples of 16, as raw numbers of this camera are"
         ):
-            check_pixels(band, read_tile)
+            with_checked_pixels(band, read_tile)
 
 
 def test_raw_images_and_retouched_pixels_are_accepted(flight: Path, tmp_path: Path) -> None:
@@ -250,7 +250,7 @@ def test_raw_images_and_retouched_pixels_are_accepted(flight: Path, tmp_path: Pa
 
     for folder, pixels in (("raw", lambda x: x), ("retouched", retouched)):
         for band in only(one_capture(flight, tmp_path / folder, pixels=pixels)).bands:
-            check_pixels(band, read_tile)
+            with_checked_pixels(band, read_tile)
 
 
 def test_dark_pixels_far_above_a_black_level_of_zero_are_refused(flight: Path, tmp_path: Path) -> None:
@@ -259,7 +259,7 @@ def test_dark_pixels_far_above_a_black_level_of_zero_are_refused(flight: Path, t
     band = replace(capture.bands[0], radiometry=replace(capture.bands[0].radiometry, raw_step=1))
     lifted = lambda *arguments: (read_tile(*arguments)[0] // 2 + np.uint16(20000), read_tile(*arguments)[1])  # noqa: E731
     with pytest.raises(InputError, match="far above its black level of 0"):
-        check_pixels(band, lifted)
+        with_checked_pixels(band, lifted)
 
 
 @pytest.mark.parametrize(("value", "is_used"), [("0", True), ("1", False)])

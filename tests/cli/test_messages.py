@@ -163,7 +163,7 @@ def test_info_begins_with_the_cameras(flight: Path) -> None:
     assert text.startswith("MicaSense RedEdge-M (SY01-0000001-AG")
     assert "2 captures of 5 bands, 480 x 360 px" in text
     lens = discover(flight).captures[0].reference.lens
-    radiometry = "radiometry: radiance by calibration, reflectance by light sensor"
+    radiometry = "radiometry: radiance by calibration (± 17 %), reflectance by light sensor (± 20 %)"
     assert f"GSD {1e4 / lens.fx_px:.1f} cm at a height of 100 m, {radiometry}" in text
     assert "[Green]" in done.stdout
     facts = json.loads(agalign_here("info", flight, "--json").stdout)

@@ -1,3 +1,4 @@
+import math
 import os
 import sys
 from collections.abc import Iterable, Sequence
@@ -11,6 +12,7 @@ import tifffile
 from agalign.flight.panel_readings import (
     BandReading,
     PanelReading,
+    compared,
     missing_panel,
     read_panel,
     reflectance_factors,
@@ -290,3 +292,54 @@ def test_a_panel_with_a_time_is_preferred(tmp_path: Path) -> None:
     }
     far = numbered("IMG_0003", "2026-06-28T10:00:00")
     assert "is 7 days older" in missing_panel(far, [timed])
+
+
+# ---- panels that contradict each other
+
+
+def panels_of(light: float, minutes: int = 20, albedo: float = 0.5, serial: str = "") -> list[PanelReading]:
+    """A panel, and later another one with a share of the light."""
+    moments = "2026-06-21T10:00:00", f"2026-06-21T10:{minutes:02d}:00"
+    panels = [reading(moment, 2.0 / k) for moment, k in zip(moments, (1.0, light), strict=True)]
+    result = []
+    for k, one in enumerate(panels):
+        own = replace(one.bands[0], albedo=(0.5, albedo)[k], radiance=one.bands[0].radiance)
+        shown = replace(GREEN, panel=Panel("tags", serial))
+        result.append(replace(one, capture=replace(one.capture, name=f"panel{k}", bands=(shown,)), bands=(own,)))
+    return result
+
+
+def test_a_panel_that_is_darker_than_another_of_the_hour_is_not_used() -> None:
+    """Shade, water and dirt darken a panel; nothing brightens one."""
+    flown = capture(GREEN, "2026-06-21T10:10:00")
+    bright, dark = compared(panels_of(0.3))
+    assert (bright.brighter, dark.brighter) == ("", "panel0")
+    assert dark.light_ratio == pytest.approx(0.3)
+    factor = reflectance_factors(flown, [bright, dark])["Green"]
+    assert factor.value == pytest.approx(2.0)
+    (doubt,) = [e for e in factor.errors if e.state == "contradicted"]
+    assert doubt.name == "two calibration panels"
+    assert doubt.std_percent == pytest.approx(100 * (math.sqrt(1 / 0.3) - 1))
+
+
+def test_panels_that_agree_are_interpolated_and_their_difference_is_an_error() -> None:
+    flown = capture(GREEN, "2026-06-21T10:10:00")
+    factor = reflectance_factors(flown, compared(panels_of(0.9)))["Green"]
+    assert factor.value == pytest.approx(2.0 / 0.95)
+    by_name = {e.name: e.std_percent for e in factor.errors}
+    assert by_name["difference of the panels"] == pytest.approx(100 * (math.sqrt(1 / 0.9) - 1))
+
+
+def test_panels_hours_apart_are_not_compared() -> None:
+    one, other = panels_of(0.3)
+    later = replace(other, capture=replace(other.capture, captured_at="2026-06-21T12:00:00"))
+    assert [r.brighter for r in compared([one, later])] == ["", ""]
+
+
+def test_two_reflectances_of_one_panel_are_named(tmp_path: Path) -> None:
+    flown = capture(GREEN, "2026-06-21T10:10:00")
+    readings = compared(panels_of(1.0, albedo=0.45, serial="RP04-1"))
+    assert [r.bands[0].other_albedo for r in readings] == [0.45, 0.5]
+    errors = reflectance_factors(flown, readings)["Green"].errors
+    assert "reflectance of the panel" in [e.name for e in errors if e.state == "contradicted"]
+    assert compared(panels_of(1.0, albedo=0.45, serial=""))[0].bands[0].other_albedo is None

@@ -54,6 +54,12 @@ def contradiction(name: str, *values: float) -> RadiometricError:
     return RadiometricError(name, 100 * (math.sqrt(max(values) / min(values)) - 1), "contradicted")
 
 
+def too_bright(median: float) -> RadiometricError:
+    """Return the error of a band whose median reflectance is above 1, which only a wrong panel or sensor explains."""
+    max_usual = 0.5  # of vegetation, soil, water and roofs
+    return contradiction("reflectance above 1", max_usual, median)
+
+
 def panel_errors(spread: float, age_s: float | None) -> tuple[RadiometricError, ...]:
     """Return the errors of a factor by a panel, given the standard deviation of its pixels relative to their mean, and
     the time to the capture if the light since then is not known.
