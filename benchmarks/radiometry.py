@@ -5,11 +5,13 @@ python benchmarks/radiometry.py FOLDER
 The formulas of github.com/micasense/imageprocessing are written here again: image.py, dls.py, and the tutorials on
 panels and the light sensor. The position of the sun is that of agalign, which a test compares with NREL's example.
 Every capture of a MicaSense camera below FOLDER is used. A panel is compared with the captures of its camera, also
-where agalign does not combine it with the light sensor.
+where agalign does not combine it with the light sensor. The last table compares the expected error with the difference
+of two sources: overlapping captures, also of a Phantom 4, and a panel and the light sensor beside it.
 """
 
 import itertools
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from unittest.mock import patch
@@ -25,14 +27,13 @@ from agalign.cameras.micasense import horizontal_irradiance
 from agalign.cameras.sun import sun_position
 from agalign.flight import panel_readings
 from agalign.flight.groups import camera_key
-from agalign.pixels.landmarks import landmarks, matched_homography, matches
 from agalign.pixels.radiometry import calibrated, with_radiometry
-from agalign.pixels.raster import read_for_alignment
-from agalign.values import geometry
 from agalign.values.capture import Band, Capture, CaptureTime
+from agalign.values.radiometric_errors import panel_errors
+from agalign.values.radiometry import total_percent
 
 CAMERA, DLS, PIX4D = "micasense.com/MicaSense", "micasense.com/DLS", "pix4d.com"
-MIN_TIES, MAX_ERROR_PX = 30, 4.0
+MIN_TIES, MAX_RATIO, MAX_ERROR_PX = 20, 0.8, 3.0
 PATCH_PX = 31
 """Radiance is averaged over squares, because ties are accurate to a pixel."""
 Image = np.ndarray
@@ -91,24 +92,26 @@ def main(folder: Path) -> None:
     readings = [panel_readings.read_panel(c, {}) for c in captures if c.panel is not None]
     print("Largest difference from the published formulas, relative to the median of the band:\n")
     print_head("captures", "camera", "radiance", "light sensor", "panel", "panel and light sensor")
-    for folder, group in itertools.groupby(captures, lambda c: c.reference.path.parent):
+    for one, group in itertools.groupby(captures, lambda c: c.reference.path.parent):
         first, *others = group
         errors = np.max([largest_differences(c, readings) for c in (first, *others)], axis=0)
-        print_row(folder.name, f"{first.camera.make} {first.camera.model}", *(cell([e], ".1e") for e in errors))
+        print_row(one.name, f"{first.camera.make} {first.camera.model}", *(cell([e], ".1e") for e in errors))
     print("\nLight in the plane of the sensor and after correction of its tilt, divided by the sensor's horizontal:\n")
     print_head("capture", "sensor to sun, degrees", "zenith angle of the sun", "measured", "corrected")
     for capture in captures:
         tags = read_tags(capture.reference.path)
         if tags.number(DLS, "HorizontalIrradiance") and attitude(tags)[0]:
             print_row(f"{capture.reference.path.parent.name} {capture.name}", *tilt_facts(tags))
-    print("\nDifference of reflectance between overlapping captures, median of tie points:\n")
-    print_head("captures", "ties", "constant light (one panel)", "light sensor as measured", "light sensor")
-    scenes = [c for c in captures if not c.is_of_a_panel]
-    for a, b in itertools.combinations(scenes, 2):
-        if a.reference.path.parent == b.reference.path.parent:
-            rows = np.concatenate([differences(x, y) for x, y in zip(a.bands, b.bands, strict=True)])
-            if len(rows) >= MIN_TIES:
-                print_row(f"{a.name} {b.name}", len(rows), *(f"{v:.1%}" for v in np.median(np.abs(rows), axis=0)))
+    print("\nDifference of the reflectance by two sources, and its expected error (1 sigma), median of the bands:\n")
+    print_head("sources", "bands", "difference", "expected", "within 1", "within 2")
+    pairs = [*overlaps(folder), *((f"panel and sensor {r.capture.name}", panel_and_sensor(r)) for r in readings)]
+    for name, (differences, expected) in pairs:
+        ratios = np.abs(differences) / expected
+        shares = (f"{(ratios <= limit).mean():.0%}" for limit in (1, 2))
+        print_row(name, len(ratios), *(f"{np.median(np.abs(v)):.1%}" for v in (differences, expected)), *shares)
+    every = np.concatenate([np.abs(d) / e for _, (d, e) in pairs])
+    shares = " and ".join(f"{(every <= limit).mean():.0%} within {limit}" for limit in (1, 2))
+    print(f"\n{len(every)} bands of {len(pairs)} pairs: {shares} expected errors")
 
 
 def largest_differences(capture: Capture, readings: list[panel_readings.PanelReading]) -> Image:
@@ -149,22 +152,57 @@ def tilt_facts(tags: Tags) -> tuple[str, ...]:
     return *(f"{v:.1f}" for v in angles), *(f"{v / horizontal:.2f}" for v in (measured, corrected))
 
 
-def differences(a: Band, b: Band) -> Image:
-    """(ties, 3) logarithmic differences of radiance, and of reflectance by the light sensor before and after."""
-    marks = [landmarks(read_for_alignment(band, max(band.size_px)), "image") for band in (a, b)]
-    homography = matched_homography(*marks, a.size_px)
-    if homography is None:
-        return np.zeros((0, 3))
-    at_a, at_b = (mark.xy[chosen] for mark, chosen in zip(marks, matches(*marks), strict=True))
-    inliers = np.hypot(*(geometry.apply(homography, at_a) - at_b).T) < MAX_ERROR_PX
-    both = []
-    for band, at in ((a, at_a), (b, at_b)):
-        x, y = at[inliers].round().astype(int).T
-        radiance = cv2.blur(calibrated(pixels(band), band.radiometry, 0, 0), (PATCH_PX, PATCH_PX))[y, x]
-        tags = read_tags(band.path)
-        measured = tags.number(DLS, "HorizontalIrradiance") or tags.number(DLS, "SpectralIrradiance")
-        both.append(np.log([radiance, radiance / measured, radiance * band.radiometry.by_sun.value]).T)
-    return both[1] - both[0]
+Compared = tuple[Image, Image]
+"""Logarithmic differences (bands,) and their expected errors."""
+SHARED = {"factory calibration", "light sensor", "vignetting"}
+"""Errors that captures of one camera have in common."""
+
+
+def overlaps(folder: Path) -> list[tuple[str, Compared]]:
+    """Each pair of captures of a camera that show the same ground: reflectance by the light sensor."""
+    found = [c for c in discover(folder).captures if all(b.radiometry and b.radiometry.by_sun for b in c.bands)]
+    result = []
+    for a, b in itertools.combinations([c for c in found if c.panel is None], 2):
+        if camera_key(a) == camera_key(b):
+            facts = [f for x, y in zip(a.bands, b.bands, strict=True) if (f := difference(x, y)) is not None]
+            result += [(f"{a.label} {b.label}", tuple(np.array(facts).T))] if facts else []
+    return result
+
+
+def difference(a: Band, b: Band) -> tuple[float, float] | None:
+    """(median logarithmic difference of two bands over the ground that both show, expected error); None without any."""
+    images = [calibrated(pixels(x), x.radiometry, 0, 0) * x.radiometry.by_sun.value for x in (a, b)]
+    keypoints = [keypoints_of(image) for image in images]
+    pairs = cv2.BFMatcher().knnMatch(keypoints[0][1], keypoints[1][1], 2)
+    ties = [m for m, other in pairs if m.distance < MAX_RATIO * other.distance]
+    if len(ties) < MIN_TIES:
+        return None
+    sides = zip(keypoints, ("queryIdx", "trainIdx"), strict=True)
+    at = [np.float32([points[getattr(m, index)].pt for m in ties]) for (points, _), index in sides]
+    homography, inliers = cv2.findHomography(*at, cv2.USAC_MAGSAC, MAX_ERROR_PX)
+    if homography is None or inliers.sum() < MIN_TIES:
+        return None
+    smooth, size_px = [cv2.blur(image, (PATCH_PX, PATCH_PX)) for image in images], b.size_px
+    lit = [(pixels(x) < 0.99 * pixels(x).max()).astype(np.float32) for x in (a, b)]
+    on_b, lit_on_b = (cv2.warpPerspective(x, homography, size_px, borderValue=math.nan) for x in (smooth[0], lit[0]))
+    common = (on_b > 0) & (smooth[1] > 0) & (lit_on_b > 0.99) & (lit[1] > 0)
+    own = [e for x in (a, b) for e in x.radiometry.by_sun.errors if e.name not in SHARED]
+    return float(np.median(np.log(on_b[common] / smooth[1][common]))), total_percent(own) / 100
+
+
+def keypoints_of(image: Image) -> tuple[Sequence[cv2.KeyPoint], Image]:
+    low, high = np.percentile(image, (1, 99))
+    grey = np.clip((image - low) / (high - low) * 255, 0, 255).astype(np.uint8)
+    return cv2.SIFT_create(4000).detectAndCompute(grey, None)
+
+
+def panel_and_sensor(reading: panel_readings.PanelReading) -> Compared:
+    """The scale of the light sensor by a panel, and the expected error of the reflectance by each."""
+    bands = [b for b in reading.bands if b.sensor_scale]
+    of_panel = [panel_errors(b.spread, None) for b in bands]
+    of_sensor = [(*b.band.radiometry.errors, *b.band.radiometry.by_sun.errors) for b in bands]
+    expected = [total_percent((*a, *b)) / 100 for a, b in zip(of_panel, of_sensor, strict=True)]
+    return np.log([b.sensor_scale for b in bands]), np.array(expected)
 
 
 def pixels(band: Band) -> Image:

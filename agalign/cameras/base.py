@@ -7,7 +7,7 @@ A new camera is one module with one subclass of `Camera`, listed in `known_camer
 import math
 import re
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -89,6 +89,10 @@ class Camera(ABC):
     def other_position(self, tags: Tags) -> Position | None:
         """Return the position by other tags than those of Exif; None if the tags lack it."""
         return None
+
+    def contradictions(self, tags: Tags) -> Iterator[str]:
+        """Yield, in words, which tags of a file contradict each other."""
+        yield from ()
 
     def sun(self, tags: Tags) -> Sun | None:
         """Return the position of the sun by its light sensor; None if the tags lack it."""

@@ -6,7 +6,7 @@ are compared with the tags by `pixels.radiometry.with_checked_pixels`.
 """
 
 import math
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from datetime import timedelta
@@ -160,6 +160,19 @@ def lens_of_other_image(band: Band) -> str:
     focal = "" if band.lens is None else f"focal length {band.lens.fx_px:.0f} px, "
     at = f"{focal}optical centre {x:.0f}, {y:.0f} px"
     return f"the lens in the tags ({at}) is not that of an image of {width} x {height} px"
+
+
+def vignetting_of_other_lens(band: Band) -> str:
+    """Return in words that the centre of the vignetting is far from the optical centre of the lens; empty if it is not,
+    or if one of them is unknown.
+    """
+    if band.lens is None or band.radiometry is None or not any(band.radiometry.vignetting):
+        return ""
+    (x, y), lens = band.radiometry.vignetting_centre_px, band.lens
+    max_apart = 0.08  # of the longer side of the image; 0.03 in the files of eight cameras
+    apart_px = math.hypot(x - lens.cx_px, y - lens.cy_px)
+    is_apart = apart_px > max_apart * max(band.size_px)
+    return f"the vignetting has its centre {apart_px:.0f} px from the optical centre of the lens" if is_apart else ""
 
 
 def part_of_image(tags: Tags, band: Band) -> str:
@@ -317,6 +330,26 @@ def _doubtful(bands: Sequence[Band]) -> list[tuple[str, Path]]:
 
 def _label(band: Band) -> str:
     return band.name if band.wavelength_nm is None else f"{band.name} ({band.wavelength_nm:g} nm)"
+
+
+def of_other_captures(groups: Iterable[Sequence[ImageFile]]) -> list[Problem]:
+    """Return a problem for each file whose tags are of another capture than those of the other files of its capture: it
+    was elsewhere, or it alone has another serial number. `groups` are the files of each capture.
+    """
+    found: list[tuple[ImageFile, str]] = []
+    for group in (g for g in groups if len(g) > 2):
+        places = [(f, f.tags.position) for f in group if f.tags.position is not None]
+        if places:
+            latitude, longitude = (
+                median_low(getattr(p, axis) for _, p in places) for axis in ("latitude", "longitude")
+            )
+            usual = Position(latitude, longitude)
+            far = [(f, km) for f, p in places if (km := _apart_km(p, usual)) > _MAX_POSITION_ERROR_KM]
+            found += [(f, f"its position is {km:.0f} km from that of the other files of its capture") for f, km in far]
+        serials = Counter(f.tags.serial for f in group if f.tags.serial)
+        alone = [f for f in group if serials[f.tags.serial] == 1 < len(serials)]
+        found += [(f, f"its serial number {f.tags.serial} is not that of the other files") for f in alone]
+    return [Problem(f.path, InputError(f"{f.path}: {text}; correct the tags"), is_harmless=True) for f, text in found]
 
 
 # ---- number and time

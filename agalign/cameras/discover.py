@@ -12,7 +12,14 @@ from numpy.typing import NDArray
 from agalign.cameras.band_identity import with_one_spelling
 from agalign.cameras.base import reference_index
 from agalign.cameras.camera_calibration import different_calibrations, with_complete_calibrations
-from agalign.cameras.consistency import contradictions, doubtful_files, exposed_apart, files_of_one_band, list_problems
+from agalign.cameras.consistency import (
+    contradictions,
+    doubtful_files,
+    exposed_apart,
+    files_of_one_band,
+    list_problems,
+    of_other_captures,
+)
 from agalign.cameras.generic import Generic
 from agalign.cameras.grouping import (
     band_file_owners,
@@ -130,7 +137,8 @@ def discover(folder: str | Path, options: DiscoverOptions | None = None) -> Fold
     captures: list[Capture] = []
     groups, copied = join_folders(group_files(files, with_rgb=options.with_rgb))
     problems += copies + copied + damaged + list_problems(files) + doubtful_files(files)
-    problems += contradictions(groups) + exposed_apart(groups) + different_calibrations(files)
+    problems += contradictions(groups) + exposed_apart(groups)
+    problems += different_calibrations(files) + of_other_captures(groups)
     problems += files_of_one_band(groups) if options.pattern is None else []
     _check_bands(groups, options.bands, folder)
     for group in groups:

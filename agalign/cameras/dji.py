@@ -38,6 +38,7 @@ from agalign.values.radiometric_errors import (
     LIGHT_SENSOR,
     NO_GAIN_ADJUSTMENT,
     NO_VIGNETTING,
+    REPEATABILITY,
     agreed,
 )
 from agalign.values.radiometry import Radiometry, ReflectanceFactor
@@ -202,7 +203,7 @@ def _radiometry(factors: _Factors, tags: Tags, stored: Band) -> Radiometry | Non
     irradiance = known.get("Irradiance", 0.0)  # 0 without a reading
     by_sun = None
     if irradiance > 0 and not factors.problem_of_sun:
-        by_sun = ReflectanceFactor(1 / irradiance, "relative reflectance", errors=(LIGHT_SENSOR[2],))
+        by_sun = ReflectanceFactor(1 / irradiance, "relative reflectance", errors=(LIGHT_SENSOR[2], REPEATABILITY))
     missing = [] if factors.vignetting else [NO_VIGNETTING["DJI"]]
     missing += [] if adjusted else [NO_GAIN_ADJUSTMENT]
     return Radiometry(

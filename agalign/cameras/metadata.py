@@ -149,7 +149,8 @@ def _positions(gps: Mapping[str, Any]) -> tuple[Position | None, Position | None
     fix, for which cameras write no coordinates or zeros.
     """
     (latitude_deg, is_exact), (longitude_deg, is_exact_too) = _degrees(gps, "Latitude"), _degrees(gps, "Longitude")
-    if latitude_deg is None or longitude_deg is None or latitude_deg == longitude_deg == 0:
+    # A coordinate of exactly 0 is a missing one: receivers resolve 0.01 m.
+    if not latitude_deg or not longitude_deg:
         return None, None, None
     if latitude_deg > 90.0 or longitude_deg > 180.0:
         return None, None, None
@@ -166,7 +167,7 @@ def _degrees(gps: Mapping[str, Any], axis: str) -> tuple[float | None, bool]:
     """(a coordinate without its sign, False if it is known to a minute only); None if it is missing or negative."""
     value = gps.get(f"GPS{axis}")  # degrees, minutes and seconds
     parts = [finite(part) for part in value] if isinstance(value, tuple) and len(value) == 3 else []
-    if not parts or parts[0] is None or parts[1] is None:
+    if not parts or parts[0] is None or parts[1] is None or any(not 0 <= part < 60 for part in parts[1:] if part):
         return None, False
     degrees = parts[0] + parts[1] / 60 + (parts[2] or 0.0) / 3600
     is_exact = parts[2] is not None or parts[1] % 1 != 0  # some programs write minutes with a fraction

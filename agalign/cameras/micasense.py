@@ -16,7 +16,7 @@ Axes are north, east, down; angles are radians.
 
 import math
 import re
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
@@ -37,6 +37,7 @@ from agalign.values.radiometric_errors import (
     LIGHT_SENSOR,
     NO_TILT,
     NO_VIGNETTING,
+    REPEATABILITY,
     agreed,
     contradiction,
     tilt_error,
@@ -46,6 +47,11 @@ from agalign.values.radiometry import Errors, Radiometry, ReflectanceFactor
 NAMESPACE, _DLS = "micasense.com/MicaSense", "micasense.com/DLS"
 _SCALE_OF_DLS_2 = 0.01
 """W / m^2 / nm per unit of the irradiance of a DLS 2, whose firmware does not always state it."""
+_SENSITIVITY = pix4d.NAMESPACE, "BandSensitivity"
+_COEFFICIENT_BY_SENSITIVITY = 3.8079e-5
+"""Product of the first coefficient of RadiometricCalibration and BandSensitivity, in 60 files of five RedEdge."""
+_MAX_ABOVE_DARK_ROWS = 100.0
+"""Of the black level, 4,800: dark rows have 4,870 to 6,500, the more the larger the gain is."""
 _MAX_CORRECTION = 2.0
 """For the tilt of a light sensor: one that points further from the sun measures too little direct light."""
 _REDEDGE_M_PARALLAX = {
@@ -100,6 +106,25 @@ class MicaSense(Camera):
             return by_camera
         yaw_deg, pitch_deg, roll_deg = (math.degrees(angle or 0.0) for angle in (yaw, pitch, roll))
         return Pose(yaw_deg, pitch_deg, roll_deg, focal_length_px=pix4d.focal_length_px(tags))
+
+    def contradictions(self, tags: Tags) -> Iterator[str]:
+        """Compare what firmware writes twice: coefficient and sensitivity, black level and dark rows, wavelengths."""
+        a, sensitivity = tags.numbers(NAMESPACE, "RadiometricCalibration", 3), tags.number(*_SENSITIVITY)
+        is_known = bool(re.fullmatch(r"RedEdge(?!-P).*", tags.model)) and len(a) == 3 and bool(sensitivity)
+        if is_known and not agreed((a[0] * (sensitivity or 0.0), _COEFFICIENT_BY_SENSITIVITY))[1]:
+            yield f"its RadiometricCalibration {a[0]:g} and BandSensitivity {sensitivity:g} contradict each other"
+        iso = finite(tags.exif.get("ISOSpeed", tags.exif.get("ISOSpeedRatings")))
+        if iso and not any(abs(iso - 100 * 2**k) < 1 for k in range(6)):
+            yield f"its sensor gain of {iso / 100:g} is not one of 1, 2, 4, 8 …"
+        dark = tags.numbers(NAMESPACE, "DarkRowValue", 4)
+        if dark and tags.black_level is not None and tags.black_level > min(dark) + _MAX_ABOVE_DARK_ROWS:
+            yield f"its BlackLevel {tags.black_level:g} is above its DarkRowValue {min(dark):g}"
+        nm, of_sensor_nm = tags.number(pix4d.NAMESPACE, "CentralWavelength"), tags.number(_DLS, "CenterWavelength")
+        if not agreed((nm, of_sensor_nm))[1]:
+            yield f"its CentralWavelength {nm:g} and the CenterWavelength {of_sensor_nm:g} of the light sensor differ"
+        model, rig = tags.model.lower(), tags.text(pix4d.NAMESPACE, "RigName").lower()
+        if rig.startswith(("rededge", "altum")) and model and not (model.startswith(rig) or rig.startswith(model)):
+            yield f"its Model {tags.model} and RigName {tags.text(pix4d.NAMESPACE, 'RigName')} contradict each other"
 
     def sun(self, tags: Tags) -> Sun | None:
         return _sun_by_sensor(tags)
@@ -171,7 +196,14 @@ def irradiance(tags: Tags) -> Irradiance:
         sun = by_sensor.elevation, by_sensor.azimuth
     elevation = sun[0] if sun is not None else None if by_sensor is None else by_sensor.elevation
     horizontal = _horizontal(tags, elevation)
-    return _in_plane_of_sensor(tags, sun) if horizontal is None else horizontal
+    if horizontal is None:
+        return _in_plane_of_sensor(tags, sun)
+    measured, attitude_deg = _spectral(tags)[0], _sensor_attitude_deg(tags)
+    if measured is None or attitude_deg is None or sun is None or not horizontal.value:
+        return horizontal
+    by_model = horizontal_irradiance(measured, attitude_deg, sun) * _scale_of_dls_2(tags)
+    tilt = [] if math.isnan(by_model) else [tilt_error(by_model / horizontal.value)]
+    return horizontal._replace(errors=(*horizontal.errors, *tilt))
 
 
 def _sun_by_clock(tags: Tags) -> tuple[float, float] | None:
@@ -191,11 +223,10 @@ def _horizontal(tags: Tags, elevation: float | None) -> Irradiance | None:
     tag, direct, diffuse = (_positive(tags, f"{name}Irradiance") for name in ("Horizontal", "Direct", "Scattered"))
     has_components = elevation is not None and direct is not None and diffuse is not None
     calculated = direct * math.sin(elevation) + diffuse if has_components and elevation and direct and diffuse else None
-    scale = _positive(tags, "IrradianceScaleToSIUnits") or _SCALE_OF_DLS_2
     known = [v for v in (tag, calculated) if v is not None]
     if not known:
         return None
-    value, errors = known[-1], [LIGHT_SENSOR[2]]
+    value, errors = known[-1], [LIGHT_SENSOR[2], REPEATABILITY]
     # Of HorizontalIrradiance: correct firmware differs from its own components by 0.03 %, from refraction.
     max_horizontal_error = 0.01
     if tag is not None and calculated is not None and abs(tag - calculated) < max_horizontal_error * tag:
@@ -209,7 +240,12 @@ def _horizontal(tags: Tags, elevation: float | None) -> Irradiance | None:
             return Irradiance(problem=f"{names} and the components ({calculated:.4g}) contradict each other")
         value = near[0]
         errors.append(contradiction("components of the irradiance", tag, calculated))
-    return Irradiance(value * scale, tuple(errors))
+    return Irradiance(value * _scale_of_dls_2(tags), tuple(errors))
+
+
+def _scale_of_dls_2(tags: Tags) -> float:
+    """W / m^2 / nm per unit of the tags of a DLS 2."""
+    return _positive(tags, "IrradianceScaleToSIUnits") or _SCALE_OF_DLS_2
 
 
 def _in_plane_of_sensor(tags: Tags, sun: tuple[float, float] | None) -> Irradiance:
@@ -225,11 +261,11 @@ def _in_plane_of_sensor(tags: Tags, sun: tuple[float, float] | None) -> Irradian
     scale = _positive(tags, "IrradianceScaleToSIUnits") or (1.0 if value <= max_si else _SCALE_OF_DLS_2)
     attitude_deg = _sensor_attitude_deg(tags)
     if sun is None or attitude_deg is None:
-        return Irradiance(value * scale, (LIGHT_SENSOR[1], NO_TILT))
+        return Irradiance(value * scale, (LIGHT_SENSOR[1], REPEATABILITY, NO_TILT))
     horizontal = horizontal_irradiance(value, attitude_deg, sun)
     if math.isnan(horizontal):
         return Irradiance()
-    return Irradiance(horizontal * scale, (LIGHT_SENSOR[1], tilt_error(horizontal / value)))
+    return Irradiance(horizontal * scale, (LIGHT_SENSOR[1], REPEATABILITY, tilt_error(horizontal / value)))
 
 
 def _spectral(tags: Tags) -> tuple[float | None, bool]:

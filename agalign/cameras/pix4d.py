@@ -101,9 +101,16 @@ def described(band: Band, tags: Tags, name: str) -> Band:
     return replace(
         band,
         name=tags.text(NAMESPACE, "BandName") or named_by_camera(band.name)[1] or name,
-        wavelength_nm=tags.number(NAMESPACE, "CentralWavelength"),
+        wavelength_nm=wavelength_nm(tags),
         bandwidth_nm=tags.number(NAMESPACE, "WavelengthFWHM"),
     )
+
+
+def wavelength_nm(tags: Tags) -> float | None:
+    """Return Camera:CentralWavelength, nm; None if it is missing or of no camera."""
+    min_nm, max_nm = 200.0, 20_000.0  # ultraviolet to thermal infrared
+    nm = tags.number(NAMESPACE, "CentralWavelength")
+    return nm if nm is not None and min_nm <= nm <= max_nm else None
 
 
 def listed_names(tags: Tags) -> list[str]:

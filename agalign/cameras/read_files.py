@@ -16,6 +16,7 @@ from agalign.cameras.consistency import (
     normalized,
     part_of_image,
     pixel_scale,
+    vignetting_of_other_lens,
     with_position,
 )
 from agalign.cameras.image_file import Doubt, ImageFile, Problem
@@ -128,6 +129,8 @@ def _doubts(camera: Camera, tags: Tags, bands: Sequence[Band], other_lens: str) 
         yield Doubt(other_lens, "lens, rig and radiometry are not used: give the original images")
     if error := clock_error(tags.near, tags.captured_at, camera.sun(tags)):
         yield clock_doubt(error)
+    for text in camera.contradictions(tags):
+        yield Doubt(text, "correct the tags, or leave --radiometry out")
     if (text := normalized(tags)) and any(text in band.missing_calibration for band in bands):
         yield Doubt(text, "radiometry is not used: give the original images")
 
@@ -173,6 +176,9 @@ def _with_plausible_tags(band: Band, tags: Tags) -> Band:
     if band.radiometry.is_of_light and (problem := normalized(tags)):
         return replace(band, radiometry=None, missing_calibration=f"no usable tags for radiance ({problem})")
     radiometry, problem = plausible(band.radiometry, band.size_px)
+    problem = problem or vignetting_of_other_lens(band)
+    if problem and "vignetting" in problem:
+        radiometry = None
     reason = f"no usable tags for radiance ({problem})" if radiometry is None else ""
     return replace(band, radiometry=radiometry, implausible=problem or band.implausible, missing_calibration=reason)
 

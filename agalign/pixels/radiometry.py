@@ -24,7 +24,7 @@ from agalign.values.radiometry import Radiometry, ReflectanceFactor
 
 _PLAUSIBLE: Mapping[str, tuple[float, float]] = {
     "exposure time (s)": (1e-6, 1.0),  # images of a moving camera are blurred from 0.01 s
-    "sensor gain": (0.1, 1e3),  # ISO / 100
+    "sensor gain": (0.1, 100.0),  # ISO / 100; cameras have 1 to 16
     "gain adjustment": (0.1, 10.0),  # between the bands of a camera: 0.8 to 2.2 on two Phantom 4
     "calibration coefficient": (1e-6, 1e-2),  # 0.9e-4 to 3.7e-4 on six RedEdge
     "black level": (0.0, 2.0**14),  # a quarter of 16 bits; cameras write 4,096 to 5,800
