@@ -32,6 +32,8 @@ _SAME_LIGHT_S = 3600.0
 """Two panels within this time are compared: the sun's height, or a light sensor, tells how the light changed."""
 _MAX_SCALE = 1.3
 """Between the light on a panel and that by a light sensor or another panel."""
+MIN_LIGHT_RATIO = 0.5
+"""Of the light on a panel relative to that on another one of the hour: in the shade it is 0.1 to 0.4."""
 _SAME_ALBEDO = 0.01
 """Relative difference of the reflectance of one panel by two captures: files round it to 0.1 %."""
 _MIN_HEIGHT_M = 3.0
@@ -74,11 +76,16 @@ class PanelReading:
     capture: Capture
     bands: tuple[BandReading, ...]
     brighter: str = ""
-    """Label of a capture of a panel within the hour on which the light was stronger than it can have changed: this
-    panel was in shade, wet or soiled, and is not used. Empty if there is none."""
+    """Label of a capture of a panel within the hour on which the light was stronger than it can have changed; empty if
+    there is none."""
     light_ratio: float = 1.0
     """Light on this panel relative to that on the brighter one, after the change of the light; the median of the bands.
     """
+
+    @property
+    def is_used(self) -> bool:
+        """False for a panel with less than half of the light on a brighter one: shade leaves less, most clouds more."""
+        return self.light_ratio >= MIN_LIGHT_RATIO
 
     @property
     def sensor_scales(self) -> dict[str, float]:
@@ -249,13 +256,13 @@ def reflectance_factors(capture: Capture, readings: Iterable[PanelReading]) -> d
     E_p / E is 1 without a sensor, and if the sensor was not in the same light as one of the panels. Between the
     panels of the camera, the reciprocals are interpolated linearly in time; before the first and after the last, they
     are constant. If the time of the capture or of the panels is unknown, `_without_clock` chooses the panel; without
-    one the result is empty. A panel that is darker than another one of the hour is not used.
+    one the result is empty. A panel with less than half of the light on another one of the hour is not used.
     """
     of_camera = [r for r in readings if camera_key(r.capture) == camera_key(capture)]
     timed = _within_hours(of_camera, capture)
     near = timed or _without_clock(of_camera, capture)
-    used = [(s, r) for s, r in near if not r.brighter]
-    age_s = min((abs(later_s) for later_s, r in timed if not r.brighter), default=None)
+    used = [(s, r) for s, r in near if r.is_used]
+    age_s = min((abs(later_s) for later_s, r in timed if r.is_used), default=None)
     fits_sensor, result = all(r.fits_sensor for _, r in used), {}
     for band in capture.bands:
         samples = [(s, b) for s, r in used for b in r.bands if b.band.name == band.name]
@@ -290,7 +297,7 @@ def _contradictions(near: Sequence[PanelReading], band: str) -> list[Radiometric
     dark = [r.light_ratio for r in near if r.brighter]
     bands = [b for r in near for b in r.bands if b.band.name == band]
     albedos = [v for b in bands if b.other_albedo for v in (b.albedo, b.other_albedo) if v]
-    scales = [b.sensor_scale for r in near if not r.brighter and not r.fits_sensor for b in r.bands if b in bands]
+    scales = [b.sensor_scale for r in near if r.is_used and not r.fits_sensor for b in r.bands if b in bands]
     found = [contradiction("two calibration panels", 1.0, min(dark))] if dark else []
     found += [contradiction("reflectance of the panel", *albedos)] if albedos else []
     return found + [contradiction(PANEL_AND_SENSOR, 1.0, scale) for scale in scales[:1] if scale]

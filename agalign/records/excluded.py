@@ -73,9 +73,11 @@ class PanelPart(_CapturePart):
     fits_sensor: bool = True
     """False if the scale or its range over the bands is implausible; panels are then not combined with the sensor."""
     brighter: Name = ""
-    """Capture of a panel within the hour with more light than can have changed; this panel is not used."""
+    """Capture of a panel within the hour with more light than the light can have changed."""
     light_ratio: float = 1.0
     """Light on this panel relative to that on the brighter one."""
+    is_used: bool = True
+    """False for a panel in shade."""
     bands: list[PanelBandPart]
 
     @property
@@ -112,8 +114,10 @@ class PanelPart(_CapturePart):
             text = (
                 f"; the light on it is {self.light_ratio:.2f} times that on the panel in {self.brighter}, within the "
             )
-            text += "hour: it was in shade, wet or soiled, and is not used; with it alone, reflectance would be "
-            text += f"{1 / self.light_ratio:.2f} times as large"
+            text += "hour: " + (
+                "it was wet, soiled or below a cloud" if self.is_used else "it was in shade, and is not used"
+            )
+            text += f"; with it alone, reflectance would be {1 / self.light_ratio:.2f} times as large"
         for band in [b for b in self.bands if b.other_albedo is not None][:1]:
             text += f"; the reflectance of the panel in {band.band} is {band.albedo:.3f} here and "
             text += f"{band.other_albedo:.3f} by another capture of this serial number"

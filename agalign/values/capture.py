@@ -183,6 +183,8 @@ class Position:
     >>> position = agalign.discover("flight").captures[0].position
     >>> position.latitude, position.longitude, round(position.altitude_m, 1)
     (52.0, 5.0, 23.0)
+    >>> position.text
+    '52.0000 N, 5.0000 E'
     """
 
     latitude: Number

@@ -309,8 +309,7 @@ def panels_of(light: float, minutes: int = 20, albedo: float = 0.5, serial: str 
     return result
 
 
-def test_a_panel_that_is_darker_than_another_of_the_hour_is_not_used() -> None:
-    """Shade, water and dirt darken a panel; nothing brightens one."""
+def test_a_panel_in_shade_is_not_used() -> None:
     flown = capture(GREEN, "2026-06-21T10:10:00")
     bright, dark = compared(panels_of(0.3))
     assert (bright.brighter, dark.brighter) == ("", "panel0")
@@ -328,6 +327,13 @@ def test_panels_that_agree_are_interpolated_and_their_difference_is_an_error() -
     assert factor.value == pytest.approx(2.0 / 0.95)
     by_name = {e.name: e.std_percent for e in factor.errors}
     assert by_name["difference of the panels"] == pytest.approx(100 * (math.sqrt(1 / 0.9) - 1))
+
+
+def test_a_panel_below_a_cloud_is_used_and_named() -> None:
+    flown = capture(GREEN, "2026-06-21T10:10:00")
+    factor = reflectance_factors(flown, compared(panels_of(0.7)))["Green"]
+    assert factor.value == pytest.approx(2.0 / 0.85)
+    assert [e.name for e in factor.errors if e.state == "contradicted"] == ["two calibration panels"]
 
 
 def test_panels_hours_apart_are_not_compared() -> None:
