@@ -8,6 +8,7 @@ y is the row and r the distance from the vignetting centre, px of the band's own
 from the light sensor or from a panel of known reflectance. Thermal bands are not converted.
 """
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
@@ -18,7 +19,8 @@ from agalign.errors import InputError
 from agalign.pixels.raster import ReadTile, read_for_alignment
 from agalign.values.capture import Band, Capture
 from agalign.values.choices import RadiometryChoice
-from agalign.values.image import FloatImage, Tile
+from agalign.values.image import FloatImage, Raster, Tile
+from agalign.values.pixel_units import PixelScale
 from agalign.values.radiometric_errors import FACTORY_CALIBRATION, PANEL_AND_SENSOR, too_bright
 from agalign.values.radiometry import Radiometry, ReflectanceFactor
 
@@ -79,7 +81,8 @@ def plausible(radiometry: Radiometry, size_px: tuple[int, int]) -> tuple[Radiome
 
 
 def with_checked_pixels(band: Band, read: ReadTile) -> Band:
-    """Return the band, with the doubt about its calibration if half of its pixels have a reflectance above 1.
+    """Return the band with the ratio of its corners to its middle, and with the doubt about its calibration if half of
+    its pixels have a reflectance above 1.
 
     Raises InputError if the pixels do not fit the calibration, UnreadableFileError if they cannot be read. The
     corrections by position are left out, which are within a factor of 2. `read` reads the pixels of the file.
@@ -97,11 +100,23 @@ def with_checked_pixels(band: Band, read: ReadTile) -> Band:
     elif radiometry.quantity == "reflectance" and signal * radiometry.gain > _MAX_REFLECTANCE:
         problem = f"its median reflectance of {signal * radiometry.gain:.3g} is above {_MAX_REFLECTANCE:g}"
     elif radiometry.quantity == "reflectance" and signal * radiometry.gain > 1.0:
-        errors = *radiometry.errors, too_bright(signal * radiometry.gain)
-        return replace(band, radiometry=replace(radiometry, errors=errors))
-    else:
-        return band
+        radiometry = replace(radiometry, errors=(*radiometry.errors, too_bright(signal * radiometry.gain)))
+    if not problem:
+        return replace(band, radiometry=replace(radiometry, corner_ratio=_corner_ratio(band, image)))
     raise InputError(f"{band.path}: {problem}; take the capture out, or leave --radiometry out")
+
+
+def _corner_ratio(band: Band, image: Raster) -> float | None:
+    """The ratio of the corners to the middle of a reduced raw image, calibrated: the mean of many scenes is flat."""
+    assert band.radiometry is not None
+    reduced = band.radiometry.rescaled(PixelScale.between(band.size_px, image.size_px))
+    values, (width, height) = calibrated(image.pixels, reduced, 0, 0), image.size_px
+    y, x = np.ogrid[:height, :width]
+    r = np.hypot(x - width / 2, y - height / 2) / math.hypot(width / 2, height / 2)
+    corners, middle = (values[area & image.valid] for area in (r > 0.75, r < 0.4))
+    if not corners.size or not middle.size or np.median(corners) <= 0 or np.median(middle) <= 0:
+        return None
+    return float(np.median(corners) / np.median(middle))
 
 
 def _processed(band: Band, read: ReadTile) -> str:

@@ -65,6 +65,10 @@ _CONTRADICTED = Remedy(
     "look at the panels (panels.json and their pictures) and at the tags; --exclude leaves out the captures of a panel "
     "that was shaded, wet or soiled",
 )
+NOT_FLAT = Remedy(
+    "the mean of the captures is darker or brighter in the corners: the vignetting is not corrected as it is",
+    "compare the lens and its tags with those of the camera; use the middle of the images",
+)
 _ABOUT = "by about {:.0%}"
 _MAX_REFLECTANCE_ERROR = 1.0
 """Of a usable reflectance: a factor of 2 changes every index."""

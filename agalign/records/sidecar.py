@@ -420,6 +420,8 @@ class BandRadiometryPart(_Part):
     """Expected error (1 sigma) of its values, percent: the root of the sum of the squares of `errors`."""
     errors: list[RadiometricError]
     """What its values depend on, with the error by each."""
+    corner_ratio: Number4 | None = None
+    """Median in the corners of the image relative to that in its middle: over many captures it is near 1."""
 
 
 class OutputPart(_Part):

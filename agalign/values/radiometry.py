@@ -93,6 +93,8 @@ class Radiometry:
     """The values of tags that `gain` is calculated from, with the names of `pixels.radiometry`."""
     errors: Errors = ()
     """Parts of the expected error of the values."""
+    corner_ratio: float | None = None
+    """Median of the values in the corners of the image relative to that in its middle; None if it was not measured."""
 
     def rescaled(self, scale: PixelScale) -> "Radiometry":
         """Return the calibration of the image resized by `scale`, which is nearly the same along both axes."""
