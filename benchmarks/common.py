@@ -22,7 +22,7 @@ from bands.score import WRONG_PX, table
 from numpy.typing import NDArray
 from scipy.interpolate import RegularGridInterpolator
 
-from agalign.pixels.raster import without_warnings
+from agalign.pixels.gdal import without_warnings
 from agalign.rasters.read_alignment import read_alignment
 from agalign.records.sidecar import BandResult, Sidecar
 from agalign.records.sidecar_file import find_sidecars, read_sidecar

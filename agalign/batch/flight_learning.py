@@ -34,7 +34,7 @@ from agalign.method.descriptor import Descriptor
 from agalign.method.device import keep_freed_memory, one_memory_error, one_thread
 from agalign.method.fast import learn
 from agalign.method.state import JointState, Progress
-from agalign.pixels.raster import without_warnings
+from agalign.pixels.gdal import without_warnings
 from agalign.values import geometry
 from agalign.values.capture import Capture
 from agalign.values.geometry import Matrix

@@ -32,7 +32,7 @@ from agalign.host.processes import (
     without_interrupt_key,
     worker_context,
 )
-from agalign.pixels.raster import without_warnings
+from agalign.pixels.gdal import without_warnings
 from agalign.values.arguments import checked
 from agalign.values.choices import MAX_JOBS
 

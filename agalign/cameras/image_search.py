@@ -9,7 +9,7 @@ from pathlib import Path
 
 from agalign.cameras.image_file import Problem, natural_order
 from agalign.errors import InputError
-from agalign.host.files import RUN_FILE
+from agalign.host.files import RUN_FILE, path_problem
 from agalign.host.text import counted
 from agalign.pixels.raster import suffix_format
 
@@ -18,12 +18,8 @@ IMAGE_KINDS = ".tif, .tiff, .jpg, .jpeg or .png"
 
 def check_folder(folder: Path) -> None:
     """Raise InputError if `folder` is not a folder that can be listed."""
-    if folder.as_posix().startswith("/vsi"):
-        raise InputError(f"{folder}: is one of GDAL's virtual paths; mount or unpack it, and give the folder")
-    # A Path writes s3://bucket or https://host with one slash; a drive has one letter.
-    if re.match(r"[A-Za-z][A-Za-z0-9+.-]+:/", folder.as_posix()):
-        address = folder.as_posix().replace(":/", "://", 1)
-        raise InputError(f"{address}: only local folders can be read; mount it or copy the images, and give the folder")
+    if problem := path_problem(folder):
+        raise InputError(problem)
     try:
         if folder.is_dir():
             return

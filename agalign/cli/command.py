@@ -8,8 +8,9 @@ command lines, two spaces, and what they do.
 import copy
 import inspect
 import json
+import os
 import re
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cache
 from itertools import pairwise
@@ -22,7 +23,8 @@ from typer.core import TyperCommand
 from typer.models import OptionInfo
 
 from agalign.cli.terminal import Terminal, exits
-from agalign.host.files import read_regular
+from agalign.errors import ConfigurationError
+from agalign.host.files import path_problem, read_regular
 from agalign.host.text import did_you_mean
 
 if TYPE_CHECKING:
@@ -160,6 +162,7 @@ class Command:
         def call(**values: Any) -> None:
             terminal = Terminal(**{name: values.pop(name, False) for name in _TERMINAL})
             with exits(terminal, self.on_interrupt, values.get("config")):
+                _check_paths(values.values())
                 given: Given = {}
                 for name in fields:
                     _store(field_options()[name], values.pop(name), given)
@@ -175,6 +178,14 @@ class Command:
         epilog = "\n\n".join(["Examples:", *map(_highlighted, examples)]) if examples else None
         app.command(self.name, cls=cls, epilog=epilog, hidden=bool(self.alias))(call)
         return typer.main.get_command(app)
+
+
+def _check_paths(values: Iterable[Any]) -> None:
+    """Raise ConfigurationError for a path among the values of a command that cannot be that of a local file."""
+    for value in values:
+        for path in value if isinstance(value, list) else [value]:
+            if isinstance(path, Path) and (problem := path_problem(path)):
+                raise ConfigurationError(problem)
 
 
 def _highlighted(example: str) -> str:
@@ -223,7 +234,7 @@ def _completed(args: list[str], option: "Option") -> list[str]:
             name = option.flag
         result.append(f"{name}{equals}{value}")
         # A word that is neither an option nor a path is a misspelt choice.
-        is_value = following in get_args(option.type) or (following.isalnum() and not Path(following).exists())
+        is_value = following in get_args(option.type) or (following.isalnum() and not os.path.exists(following))  # noqa: PTH110 - Path raises OSError for a long name
         if name == option.flag and not equals and not is_value:
             result.append(option.alone)
     return result
@@ -237,6 +248,8 @@ def load_config(ctx: typer.Context, path: Path | None) -> Path | None:
     """
     if path is None:
         return None
+    if problem := path_problem(path):
+        raise typer.BadParameter(problem)
     options = _file_options(ctx.command)
     defaults: dict[str, Any] = {}
     for key, value in _read_toml(path).items():

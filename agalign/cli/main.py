@@ -150,11 +150,11 @@ def _problem_of_folder(arguments: Sequence[str]) -> str:
     first = arguments[0]
     if not first:
         return "the name of the folder is empty"
-    files = [Path(a) for a in arguments if not a.startswith("-") and Path(a).is_file()]
+    files = [Path(a) for a in arguments if not a.startswith("-") and os.path.isfile(a)]  # noqa: PTH113 - as below
     if len(files) > 1 and Path(first) == files[0]:
         return f"{files[0]}, …: give the folder of the images, not the files: agalign {files[0].parent}"
     similar = did_you_mean(first, COMMANDS)
-    if similar and not Path(first).exists():
+    if similar and not os.path.exists(first):  # noqa: PTH110 - Path raises OSError for a long name
         return f"'{first}' is neither a command nor a folder{similar}"
     return ""
 

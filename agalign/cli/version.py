@@ -33,7 +33,7 @@ def _memory() -> str:
 def _lines_of_compiled_libraries() -> Iterator[str]:
     """The version of GDAL, and the devices; or why a library cannot be loaded."""
     try:
-        from agalign.pixels.raster import gdal_version
+        from agalign.pixels.gdal import gdal_version
 
         yield f"gdal {gdal_version()}"
         from agalign.method.device import devices

@@ -10,7 +10,7 @@ import numpy as np
 
 from agalign.errors import ConfigurationError, InputError, UnreadableFileError
 from agalign.pixels.coordinates import ensure_proj_data
-from agalign.pixels.raster import without_warnings
+from agalign.pixels.gdal import gdal_name, without_warnings
 from agalign.rasters.alignment_maps import RELIEF_UNITS
 from agalign.rasters.band_reader import like_most
 from agalign.records.captures import RunCapture, captures_of_run, differing_from_most
@@ -196,7 +196,7 @@ def _opened(path: Path, *, masked: bool) -> Any:
             # Some of GDAL's other drivers open files or addresses that the contents of a file name.
             # Chunks of four blocks of the stacks along each axis: dask reads 2 MB of 16 bits at a time.
             chunks = {"x": 1024, "y": 1024}
-            return rioxarray.open_rasterio(path, chunks=chunks, masked=masked, driver="GTiff")
+            return rioxarray.open_rasterio(gdal_name(path), chunks=chunks, masked=masked, driver="GTiff")
     except OSError as error:
         raise UnreadableFileError(f"{path}: cannot be read ({error}); run again") from None
 

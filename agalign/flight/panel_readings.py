@@ -12,9 +12,10 @@ import numpy as np
 from agalign.cameras.sun import sun_position
 from agalign.errors import AgalignError
 from agalign.flight.groups import camera_key, flights_of
+from agalign.pixels.gdal import without_warnings
 from agalign.pixels.panel_detection import DetectedPanel, albedo_of, evenly_lit, find_panel, inside, is_homogeneous
 from agalign.pixels.radiometry import calibrated
-from agalign.pixels.raster import read_for_alignment, read_tile, without_warnings
+from agalign.pixels.raster import read_for_alignment, read_tile
 from agalign.values.capture import Band, Capture, Panel, PanelSource
 from agalign.values.image import Tile
 from agalign.values.pixel_units import PixelScale

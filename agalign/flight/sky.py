@@ -9,8 +9,9 @@ import numpy as np
 from agalign.cameras.base import is_thermal
 from agalign.errors import AgalignError
 from agalign.flight.panel_readings import Examine, examined_here
+from agalign.pixels.gdal import without_warnings
 from agalign.pixels.radiometry import calibrated
-from agalign.pixels.raster import read_for_alignment, read_tile, without_warnings
+from agalign.pixels.raster import read_for_alignment, read_tile
 from agalign.values.capture import Band, Capture
 from agalign.values.image import Raster, Tile
 

@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, TypeVar
 
 from agalign.errors import OutputError, SidecarError
 from agalign.host.processes import is_running
-from agalign.host.text import without_formula
+from agalign.host.text import name_problem, shortened, without_formula
 
 if TYPE_CHECKING:  # `agalign --help` does without pydantic
     from pydantic import BaseModel
@@ -37,6 +37,8 @@ _WRITTEN_BELOW: ContextVar[Path | None] = ContextVar("written_below", default=No
 """Folder that links must not lead out of when a file is written; None where any file may be written."""
 _MAX_PATH_BYTES, _MAX_PART_BYTES = 1024, 255
 """Of a relative path in a file that is read: file systems allow parts of 255 bytes, and systems paths of 4,096."""
+_MAX_ARGUMENT_BYTES = 4095
+"""Of a path that a user gives: the limit of Linux."""
 _RESERVED = re.compile(r"(con|prn|aux|nul|(com|lpt)[0-9])(\..*)?", re.IGNORECASE)
 """Names of devices on Windows."""
 
@@ -196,6 +198,24 @@ def file_name(text: str, taken: MutableMapping[str, str] | None = None) -> str:
     while taken is not None and taken.setdefault(f"{stem}{suffix}".lower(), text) != text:
         stem += f"-{hashlib.sha256(text.encode(errors='surrogatepass')).hexdigest()[:8]}"
     return stem + suffix
+
+
+def path_problem(path: Path) -> str:
+    """Return why a path that a user gives cannot be that of a local file or folder, and the remedy; empty if it can."""
+    if problem := name_problem(path):
+        return problem
+    text, longest = path.as_posix(), max((len(os.fsencode(part)) for part in path.parts), default=0)
+    if longest > _MAX_PART_BYTES or len(os.fsencode(path)) > _MAX_ARGUMENT_BYTES:
+        what = f"a name of {longest} bytes" if longest > _MAX_PART_BYTES else "too many folders"
+        limits = f"file systems take {_MAX_PART_BYTES} bytes a name and {_MAX_ARGUMENT_BYTES:,} a path"
+        return f"{shortened(text)}: has {what}, and {limits}; give a shorter path"
+    if text.startswith("/vsi"):
+        return f"{text}: is one of GDAL's virtual paths; mount or unpack it, and give the local path"
+    # A Path writes s3://bucket or https://host with one slash; a drive has one letter.
+    if re.match(r"[A-Za-z][A-Za-z0-9+.-]+:/", text):
+        address = text.replace(":/", "://", 1)
+        return f"{address}: only local files and folders are used; mount it or copy the files, and give the local path"
+    return ""
 
 
 def max_name_bytes(folder: Path) -> int:

@@ -12,13 +12,13 @@ from pathlib import Path
 from filelock import FileLock, Timeout
 
 from agalign.errors import ConfigurationError, OutputError
-from agalign.host.files import remove_partial_files, scratch_file
+from agalign.host.files import path_problem, remove_partial_files, scratch_file
 from agalign.host.text import name_problem
 
 
 def prepare_output(out: Path) -> None:
     """Create the output folder. Raises OutputError if it cannot be created or written to."""
-    if problem := name_problem(out.absolute()):
+    if problem := path_problem(out) or name_problem(out.absolute()):
         raise OutputError(problem)
     try:
         out.mkdir(parents=True, exist_ok=True)

@@ -1,12 +1,10 @@
 """Reading of rasters: metadata, pixels at any resolution, and validity masks."""
 
-import ctypes
 import math
 import stat
-import warnings
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
@@ -15,17 +13,16 @@ import cv2
 import numpy as np
 import rasterio
 from numpy.typing import NDArray
-from rasterio import crs
 from rasterio.enums import ColorInterp, MaskFlags, Resampling
-from rasterio.errors import NotGeoreferencedWarning
 from rasterio.transform import Affine
 from rasterio.vrt import WarpedVRT
 from rasterio.windows import Window
 
 from agalign.errors import UnreadableFileError
-from agalign.host.memory_limits import GDAL_CACHE_BYTES, MAX_DECODED_PX
+from agalign.host.memory_limits import MAX_DECODED_PX
 from agalign.host.text import name_problem
 from agalign.pixels.coordinates import ensure_proj_data
+from agalign.pixels.gdal import gdal_name, innermost_cause, is_gdal_error, open_local
 from agalign.pixels.masks import data_mask, learnable, missing_end, undeclared_fill, without_parts
 from agalign.values import lens
 from agalign.values.capture import Band, Capture, Georeference
@@ -33,19 +30,6 @@ from agalign.values.choices import MAX_PIXELS
 from agalign.values.image import Mask, Raster, Tile, reduced_size_px
 from agalign.values.pixel_units import PixelScale
 
-GDAL_ENVIRONMENT = {
-    "GDAL_PAM_ENABLED": "NO",
-    "GDAL_DISABLE_READDIR_ON_OPEN": "EMPTY_DIR",
-    "GDAL_NUM_THREADS": "ALL_CPUS",
-    "GDAL_CACHEMAX": GDAL_CACHE_BYTES,
-}
-"""GDAL neither writes auxiliary files next to the images nor reads them: x.tif.ovr may contain anything, such as a
-description that refers to other files or to a server.
-"""
-with suppress(AttributeError, OSError):  # builds of GDAL with a libtiff of their own may hide it
-    # libtiff prints failed reads and writes of files to standard error, past GDAL's and rasterio's handlers. The caller
-    # gets an exception or an incomplete file.
-    ctypes.CDLL(crs.__file__).TIFFSetErrorHandler(None)
 _MAXIMA = {"uint8": 255.0, "uint16": 65535.0, "int16": 32767.0}
 """Of the types that sensors deliver."""
 _MAX_BANDS = 512
@@ -63,18 +47,6 @@ def suffix_format(path: Path) -> Format | None:
     return _FORMATS.get(path.suffix.lower())
 
 
-@contextmanager
-def without_warnings() -> Iterator[None]:
-    """Suppress rasterio's warning about images without a georeference, which drone images do not have.
-
-    Warning filters apply to the whole process. Code that reads in several threads needs this context around all of
-    them, so that no thread restores the filter while another one reads.
-    """
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", NotGeoreferencedWarning)
-        yield
-
-
 ReadTile = Callable[[Band, Tile], tuple[NDArray[np.generic], Mask]]
 """Reads a tile inside a band, as `read_tile`; the arrays must not be changed."""
 OpenRaster = rasterio.DatasetReader
@@ -89,9 +61,9 @@ def open_raster(path: Path, page: int = 0) -> Iterator[rasterio.DatasetReader]:
     of PROJ.
     """
     ensure_proj_data()
-    driver, name = _driver_of(path), f"GTIFF_DIR:{page}:{path}" if page else path
+    driver = _driver_of(path)
     try:
-        with without_warnings(), rasterio.Env(**GDAL_ENVIRONMENT), rasterio.open(name, driver=driver) as dataset:
+        with open_local(path, page=page, driver=driver) as dataset:
             if not _is_south_up(dataset):
                 yield dataset
                 return
@@ -103,7 +75,7 @@ def open_raster(path: Path, page: int = 0) -> Iterator[rasterio.DatasetReader]:
     except Exception as error:
         if not isinstance(error, UnicodeDecodeError) and not is_gdal_error(error):
             raise
-        text = innermost_cause(error).replace(str(path), "").strip(" :'")
+        text = innermost_cause(error).replace(gdal_name(path), "").strip(" :'")
         raise UnreadableFileError(f"{path}: cannot be read ({text}); copy it from the card again") from None
 
 
@@ -111,18 +83,6 @@ def _is_south_up(dataset: rasterio.DatasetReader) -> bool:
     """Return True if rows of a map run from south to north: a mirror image, which cannot be aligned as it is."""
     transform = dataset.transform
     return dataset.crs is not None and not transform.is_identity and transform.determinant > 0
-
-
-def is_gdal_error(error: BaseException) -> bool:
-    """Return True for an error of rasterio or GDAL: some of their classes are not public."""
-    return type(error).__module__.startswith("rasterio.")
-
-
-def innermost_cause(error: BaseException) -> str:
-    """Return the first line of the innermost cause, GDAL's message; rasterio's own message is generic."""
-    while error.__cause__ is not None:
-        error = error.__cause__
-    return next(iter(str(error).splitlines()), type(error).__name__)
 
 
 def _driver_of(path: Path) -> str:
@@ -360,11 +320,6 @@ def with_nan(pixels: NDArray[np.generic], nodata: float | None) -> NDArray[np.fl
     """Return pixels (height, width) as float32 with NaN for nodata."""
     values = pixels.astype(np.float32)
     return values if nodata is None else np.where(data_mask(pixels, nodata), values, np.float32(np.nan))
-
-
-def gdal_version() -> str:
-    """Return the version of rasterio's GDAL."""
-    return str(rasterio.__gdal_version__)
 
 
 def _dataset_mask(dataset: rasterio.DatasetReader, index: int, **reading: Any) -> Mask | np.bool_:

@@ -13,7 +13,6 @@ from typing import Any
 
 import cv2
 import numpy as np
-import rasterio
 from numpy.typing import NDArray
 from rasterio.enums import ColorInterp, Resampling
 from rasterio.fill import fillnodata
@@ -27,8 +26,9 @@ from agalign.errors import AgalignError, UnreadableFileError
 from agalign.host.files import file_name
 from agalign.host.memory_limits import WORK_TILE_PX
 from agalign.pixels.band_resampling import resample_tile
+from agalign.pixels.gdal import open_local
 from agalign.pixels.radiometry import calibrated
-from agalign.pixels.raster import GDAL_ENVIRONMENT, open_raster, suffix_format, with_nan, without_warnings
+from agalign.pixels.raster import open_raster, suffix_format, with_nan
 from agalign.rasters.drawing import MAX_REDUCED_PX, grey
 from agalign.rasters.geotiff import Block, LayerDescription, compressed, compression_of, to_cog, write_on_grid
 from agalign.rasters.output_grid import Layer, is_inside
@@ -191,7 +191,7 @@ def write_raster(
 
     def finish(partial: Path) -> None:
         if overviews or settings.statistics:
-            with without_warnings(), rasterio.Env(**GDAL_ENVIRONMENT), rasterio.open(partial, "r+") as dataset:
+            with open_local(partial, "r+") as dataset:
                 if settings.statistics:
                     dataset.stats(approx=False)  # GDAL stores in the file what it computes
                 if overviews:

@@ -12,7 +12,8 @@ from rasterio.windows import Window
 
 from agalign.errors import InputError
 from agalign.host.text import shortened
-from agalign.pixels.raster import OpenRaster, innermost_cause, open_raster
+from agalign.pixels.gdal import innermost_cause
+from agalign.pixels.raster import OpenRaster, open_raster
 from agalign.records.captures import AlignedBand, LeftOut, RunCapture, differing_from_most
 from agalign.values.choices import UNUSABLE_QUALITY
 from agalign.values.image import FloatImage, Tile, reduced_size_px

@@ -25,7 +25,7 @@ from rasterio.windows import Window
 from agalign.errors import OutputError
 from agalign.host.files import complete_file
 from agalign.host.own_files import SOFTWARE
-from agalign.pixels.raster import GDAL_ENVIRONMENT, innermost_cause, is_gdal_error, without_warnings
+from agalign.pixels.gdal import gdal_name, innermost_cause, is_gdal_error, open_local
 from agalign.values import geometry
 from agalign.values.capture import Georeference
 from agalign.values.choices import Compression
@@ -74,7 +74,7 @@ def checked_raster(
     written: list[tuple[int, Window, int]] = []
     with complete_file(path) as partial:
         try:
-            with without_warnings(), rasterio.Env(**GDAL_ENVIRONMENT), rasterio.open(partial, "w", **profile) as file:
+            with open_local(partial, "w", **profile) as file:
                 _describe(file, layers, tags)
 
                 def write(pixels: NDArray[Any], index: int, x0: int, y0: int) -> None:
@@ -87,7 +87,7 @@ def checked_raster(
             if finish is not None:
                 finish(partial)
                 check_complete(partial)
-            with without_warnings(), rasterio.Env(**GDAL_ENVIRONMENT), rasterio.open(partial) as file:
+            with open_local(partial) as file:
                 if any(_checksum(file.read(index, window=window)) != known for index, window, known in written):
                     raise OSError(errno.EIO, _INCOMPLETE)
         except Exception as error:  # before `complete_file`: some errors of rasterio are OSErrors, without GDAL's cause
@@ -206,7 +206,7 @@ def to_cog(path: Path, compression: str = "deflate") -> None:
     if compression == "zstd":
         options["level"] = _ZSTD_LEVEL
     try:
-        copy_dataset(path, cog, driver="COG", **options)
+        copy_dataset(gdal_name(path), gdal_name(cog), driver="COG", **options)
         cog.replace(path)
     finally:
         cog.unlink(missing_ok=True)

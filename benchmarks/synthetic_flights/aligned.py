@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import rasterio
 
-from agalign.pixels.raster import without_warnings
+from agalign.pixels.gdal import without_warnings
 from agalign.records.sidecar import Sidecar
 from agalign.records.sidecar_file import write_sidecar
 

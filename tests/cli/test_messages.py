@@ -81,7 +81,7 @@ GREEN = "(did you mean 'Green'?); choose from Blue, Green, Red, NIR, Red edge"
         ("verify {tmp}", 1, "no sidecars there; give the output folder of a run"),
         ("align {flight} -o {tmp}/file", 1, "file"),
         ("info {tmp}/broken.safetensors", 1, "broken.safetensors"),
-        ("info https://example.org/flight", 1, "only local folders can be read; mount it or copy the images"),
+        ("info https://example.org/flight", 2, "only local files and folders are used; mount it or copy the files"),
     ],
 )
 def test_wrong_arguments_are_one_line(flight: Path, tmp_path: Path, command: str, code: int, line: str) -> None:
@@ -98,6 +98,33 @@ def test_wrong_arguments_are_one_line(flight: Path, tmp_path: Path, command: str
     assert "nput should" not in only
     assert "Value error" not in only
     assert not (tmp_path / "o").exists()
+
+
+NOT_LOCAL = (
+    *("s3://bucket/x", "s3:/bucket", "http://localhost:9/x", "https://x/y", "file:///x", "FILE:/x", "gs://b", "az://b"),
+    *("/vsizip/a.zip", "/vsimem/x", "/vsicurl/http://x/y", "zip+https://x/y.zip"),
+)
+
+
+@pytest.mark.parametrize("path", [*NOT_LOCAL, "x" * 256, f"a/{'é' * 128}", "y/" * 2500], ids=lambda path: path[:16])
+@pytest.mark.parametrize(
+    "command",
+    [
+        *("{}", "{} -o o", "align f -o {}", "align f --config {}", "align f --model {}", "info {}", "demo {}"),
+        *("onto {} b.tif", "onto a.tif b.tif {}", "onto a.tif b.tif -o {}", "report {}", "verify {}", "indices {}"),
+        *("indices o -o {}", "export {} --for odm", "export o --for odm -o {}", "evaluate {}", "learn a.csv -o {}"),
+    ],
+)
+def test_a_path_that_is_not_local_or_too_long_is_one_line(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, command: str, path: str
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    done = agalign_here(*(path if argument == "{}" else argument for argument in command.split()))
+    assert (done.returncode, done.stdout) == (2, "")
+    said = "only local files and folders|one of GDAL's virtual paths" if path in NOT_LOCAL else "; give a shorter path"
+    assert re.search(rf"^agalign: .*({said}).*\n$", done.stderr), done.stderr
+    assert len(done.stderr) < 500
+    assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.parametrize("command", ["align x --nope", "x --jobs y", "align", "exprot"])

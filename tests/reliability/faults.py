@@ -667,7 +667,7 @@ USUAL = (
     refused("a malformed model file", given_model(malformed), "m.safetensors: cannot be read"),
     refused("another run in the same output", held_by_another, r"out: another run writes there \(process \d+ on "),
     refused("a pipe for a model", given_model(os.mkfifo), r"m\.safetensors: .*not a regular file"),
-    refused("one of GDAL's virtual paths", commanding("/vsizip/flight.zip -o {out}"), "virtual paths"),
+    wrong_use("one of GDAL's virtual paths", commanding("/vsizip/flight.zip -o {out}"), "virtual paths"),
     wrong_use("a random seed beyond 64 bits", asking("--rng-seed", "9" * 30), "--rng-seed: give"),
     wrong_use("an empty name for the folder", commanding(" -o {out}"), "the name of the folder is empty"),
 )
