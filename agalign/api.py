@@ -31,6 +31,7 @@ from agalign.host.output_folder import locked, prepare_output
 from agalign.host.processes import end_if_reimported
 from agalign.pixels.masks import raster_of
 from agalign.pixels.radiometry import with_radiometry
+from agalign.records.sidecar_file import check_products
 from agalign.spectral_indices.formulas import chosen_indices
 from agalign.spectral_indices.rasters import IndexReport
 from agalign.values import geometry
@@ -351,7 +352,7 @@ def onto(
     UnreadableFileError
         A mosaic does not exist or cannot be read.
     InputError
-        A mosaic has no georeference, or is the reference itself.
+        A mosaic has no georeference, is the reference itself, or is a changed file of an earlier run.
     NoSuchBandError
         `reference` has no band `band`.
     ConfigurationError
@@ -369,6 +370,7 @@ def onto(
     """
     end_if_reimported()
     flight = mosaics_onto(Path(reference), [Path(path) for path in moving], band)
+    check_products([Path(reference), *map(Path, moving)])
     options = replace(run or RunOptions(), align_panels=True)  # a mosaic is not a panel
     return _run(flight, Path(out), (settings or Settings()).for_mosaics, options)
 

@@ -17,7 +17,7 @@ from agalign._version import __version__
 from agalign.batch.render import with_earlier_products
 from agalign.cameras.discover import FolderScan
 from agalign.config import RunOptions, Settings, SettingsModel
-from agalign.errors import ConfigurationError, OutputError, SidecarError, UnreadableFileError
+from agalign.errors import ConfigurationError, SidecarError, UnreadableFileError
 from agalign.flight.fingerprint import (
     RENDER_STAGES,
     estimation_fingerprint,
@@ -26,10 +26,10 @@ from agalign.flight.fingerprint import (
     input_states,
     render_fingerprint,
 )
-from agalign.host.files import file_checksum
 from agalign.host.memory_limits import WORK_TILE_PX
 from agalign.pixels.raster import read_tile
 from agalign.rasters.product import CapturePaths
+from agalign.records.listed_files import file_problem, states_of
 from agalign.records.run_record import NotInInputPart, RunPart
 from agalign.records.sidecar import FilePart, Sidecar, capture_status
 from agalign.records.sidecar_file import (
@@ -39,6 +39,7 @@ from agalign.records.sidecar_file import (
     read_with_change,
     read_without_tables,
 )
+from agalign.spectral_indices.rasters import index_rasters
 from agalign.values.capture import Band, Capture, CaptureTime
 from agalign.values.image import Tile
 from agalign.values.resampling import tiles
@@ -74,6 +75,8 @@ class EarlierResults:
     def __init__(self) -> None:
         self._read: dict[Path, tuple[tuple[int, int, int], bytes]] = {}
         """State of the file, and the compressed result, 4 kB: those of a season fit into memory."""
+        self.states: dict[str, str] = {}
+        """States in which runs left the files of each capture, by label (`records.listed_files`)."""
 
     def __call__(self, path: Path) -> tuple[Sidecar, str]:
         """Return a sidecar without its long tables, and why it is not as it was written (`read_with_change`).
@@ -97,6 +100,16 @@ class EarlierResults:
         with suppress(SidecarError):
             return self(path)[0].files
         return []
+
+    def changed_files(self, label: str, folder: Path, parts: Sequence[FilePart]) -> list[FilePart]:
+        """Return the files of a capture that are not as they were written, given the folder of its sidecar.
+
+        The states of the others are added to `states`, so that no file is read twice.
+        """
+        known = set(self.states.get(label, "").split())
+        changed = [part for part in parts if file_problem(folder / part.file, part, known)]
+        self.states[label] = " ".join(known.union(states_of(folder, [part for part in parts if part not in changed])))
+        return changed
 
 
 def refuse_other_captures(
@@ -181,7 +194,7 @@ def remaining(
     status = capture_status(earlier.bands, capture.missing_bands, settings.check.accept_predicted_px)
     if options.overwrite or (options.retry_failed and {earlier.status, status} != {"ok"}):
         return Remaining("estimate")
-    return _to_render(capture, path, settings, earlier)
+    return _to_render(capture, path, settings, earlier, results)
 
 
 def _after_damage(path: Path, capture: Capture, options: RunOptions) -> Remaining:
@@ -201,7 +214,9 @@ def _kept(lost: Sequence[str], damage: str, earlier: Sidecar | None) -> Remainin
     return Remaining("keep", (), earlier, f"{state}, and now {'; '.join(lost)}; {remedy}")
 
 
-def _to_render(capture: Capture, path: Path, settings: Settings, earlier: Sidecar) -> Remaining:
+def _to_render(
+    capture: Capture, path: Path, settings: Settings, earlier: Sidecar, results: EarlierResults
+) -> Remaining:
     """Return what remains to be done for a capture whose mappings are kept."""
     parallax = [] if earlier.parallax is None else [earlier.parallax]
     if not outputs_exist(path, parallax):
@@ -215,13 +230,20 @@ def _to_render(capture: Capture, path: Path, settings: Settings, earlier: Sideca
     requested = {f"{capture.name}_{name}.tif" for name in write.indices}
     if not outputs_exist(path, [part for part in earlier.products if part.kind != "index" or part.file in requested]):
         changed = (*changed, "files that are missing")
-    if not (changed or earlier.not_written or not earlier.rendered_with):
-        return Remaining("nothing", (), earlier)
-    # A checksum takes milliseconds, and a parallax of another capture may have the same size.
-    with suppress(OutputError):
-        if all(file_checksum(path.parent / part.file) == part.sha256 for part in parallax):
-            return Remaining("render", changed, earlier)
-    return Remaining("estimate", ("the parallax file",))
+    is_finished = not changed and not earlier.not_written and earlier.rendered_with
+    differing = results.changed_files(capture.label, path.parent, earlier.files if is_finished else parallax)
+    if parallax and parallax[0] in differing:
+        return Remaining("estimate", ("the parallax file",))
+    if any(part.kind != "index" or _is_index_raster(part, path) for part in differing):
+        return Remaining("render", ("files that are not as they were written",), earlier)
+    return Remaining("nothing" if is_finished else "render", changed, earlier)
+
+
+def _is_index_raster(part: FilePart, sidecar: Path) -> bool:
+    """Return True for an index raster, or its picture, that rendering writes again: only `agalign indices` restores one
+    that is missing or unreadable.
+    """
+    return Path(part.file).stem in {raster.path.stem for raster in index_rasters(sidecar.with_suffix(""))}
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,8 @@ from agalign.host.files import written_below
 from agalign.host.processes import usable_cores
 from agalign.records.captures import bands_of
 from agalign.records.cautions import RunFacts
-from agalign.records.run_record import counted_sidecars
+from agalign.records.listed_files import ListedFiles
+from agalign.records.run_record import counted_sidecars, file_states
 from agalign.records.sidecar_file import add_products, label_of, read_without_tables, run_sidecars
 from agalign.spectral_indices.formulas import Index
 from agalign.spectral_indices.indices_csv import to_check, update_table
@@ -35,6 +36,8 @@ class IndexTask:
     """Mask pixels that the quality raster flags as unusable."""
     run: RunFacts = field(default_factory=RunFacts)
     """Facts of the run, which are read once for all captures."""
+    states: str = ""
+    """States of the files of the capture in the run record."""
 
     def absolute(self) -> "IndexTask":
         """Return the task with absolute paths: workers may have another working folder."""
@@ -51,8 +54,9 @@ def index_tasks(
 ) -> list[IndexTask]:
     """Return a task for each capture of a run. Raises InputError if the folder contains no run."""
     paths = counted_sidecars(run_sidecars(out), out)
-    run = RunFacts.of(out)
-    return [IndexTask(out, path, target, tuple(indices), overwrite, mask_qa, run) for path in paths]
+    run, states = RunFacts.of(out), file_states(out)
+    task = IndexTask(out, Path(), target, tuple(indices), overwrite, mask_qa, run)
+    return [replace(task, sidecar=path, states=states.get(label_of(path, out), "")) for path in paths]
 
 
 def run_indices(
@@ -90,13 +94,16 @@ def do_indices(task: IndexTask) -> list[IndexReport]:
     try:
         with written_below(task.target):
             bands = bands_of(sidecar, task.sidecar.parent, mask_qa=task.mask_qa)
-            reports = [*write_rasters(bands, task.indices, base, task.label, overwrite=task.overwrite)]
+            files = ListedFiles.of(sidecar, task.sidecar.parent, task.states)
+            written = write_rasters(bands, task.indices, base, task.label, overwrite=task.overwrite, listed=files)
+            reports = [*written]
             if task.target == task.out:
                 listed = {part.file for part in sidecar.products}
                 # A command that was killed may have written a raster that the sidecar does not list.
                 rasters = [r.path for r in reports if r.path is not None and not (r.kept and r.path.name in listed)]
-                files = [p for path in rasters for p in (path, path.with_suffix(".png"))]
-                add_products(task.sidecar, IndexRasters.kind, files)
+                add_products(
+                    task.sidecar, IndexRasters.kind, [p for path in rasters for p in (path, path.with_suffix(".png"))]
+                )
         by_name = {index.name: index for index in task.indices}
         checks = [to_check(by_name[r.index], sidecar, task.run, task.label) for r in reports]
         reports = [r if r.problem else replace(r, problem=check) for r, check in zip(reports, checks, strict=True)]

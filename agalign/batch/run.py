@@ -45,6 +45,7 @@ from agalign.method.device import choose_device, limit_threads
 from agalign.rasters.output_grid import FlightLimits, common_grid, flight_limits
 from agalign.rasters.preview import preview_bytes
 from agalign.rasters.product import CapturePaths
+from agalign.records.listed_files import states_of
 from agalign.records.run_record import RunPart, begun, excluded_part, input_name, last_record, refuse_foreign_pages
 from agalign.records.sidecar import FilePart, Sidecar
 from agalign.report.pages import outdate_pages
@@ -59,6 +60,8 @@ _PLANNED = {
     "render": "to be rendered",
     "estimate": "to be aligned",
 }
+_SAVED_EVERY_S = 60.0
+"""Time between two writings of the run record during a run."""
 _AGAIN = {"render": "rendered", "estimate": "estimated"}
 """What is done, by step of `Remaining`."""
 _Flight = tuple[list[Capture], Path | None]
@@ -113,6 +116,7 @@ def _run_selected(run: "_FlightRun", selection: Selection) -> Iterator[CaptureRe
     # (path of the sidecar, its files, state, statuses of the pairs) by label; sidecars would not fit into memory.
     written: dict[str, tuple[Path, Sequence[FilePart], str, list[str]]] = {}
     gone: list[str] = []
+    began = saved = time.monotonic()
     with _recorded(run) as record:
         try:
             for report in run.reports(selection, record):
@@ -125,6 +129,10 @@ def _run_selected(run: "_FlightRun", selection: Selection) -> Iterator[CaptureRe
                     statuses = [status for _, status, _ in report.result.pairs]
                     here = existing_files(report.path, report.result)
                     written[report.label] = report.path, here, report.state, statuses
+                    record.file_states[report.label] = run.states(report, report.path.parent, here)
+                if time.monotonic() - saved > _SAVED_EVERY_S:  # for the case that the run is killed
+                    saved = time.monotonic()
+                    record.write(out, "running", saved - began)
                 yield report
                 if report.problems and is_full(out):
                     raise OutputError(f"{out}: the disk is full; free space, then the same command resumes the run")
@@ -165,6 +173,7 @@ def _recorded(run: "_FlightRun") -> Iterator[RunPart]:
     """Write the run record at the beginning and at the end of a run, also after an interruption."""
     began, earlier = time.monotonic(), last_record(run.out)
     record = begun(run.flight.folder, run.settings, run.flight.captures, run.options.command)
+    record.file_states = {} if earlier is None else dict(earlier.file_states)
     record.other_inputs = labels_of_other_inputs(earlier, record)
     record.not_in_input = list(results_not_in_input(run.flight, run.out, record.other_inputs))
     for problem in run.flight.problems:
@@ -227,6 +236,7 @@ class _FlightRun:
         if self.out.resolve() == self.flight.folder.resolve():
             raise ConfigurationError(f"{self.out}: is the folder of the images; choose another output folder with -o")
         earlier = last_record(self.out)
+        self.results.states.update({} if earlier is None else earlier.file_states)
         is_same_input = earlier is not None and earlier.input == input_name(self.flight.folder)
         refuse_other_captures(self.flight.captures, self.out, self.results, is_same_input=is_same_input)
         sidecars = [CapturePaths.of(capture, self.out).sidecar for capture in self.flight.captures]
@@ -259,6 +269,15 @@ class _FlightRun:
     def remaining(self, capture: Capture) -> Remaining:
         """Return what remains to be done for a capture."""
         return remaining(capture, self.out, self.settings, self.options, self.results)
+
+    def states(self, report: CaptureReport, folder: Path, files: Sequence[FilePart]) -> str:
+        """Return the states of those files of a report that are as they were written, given the folder of its sidecar,
+        for the record. A rendering may keep index rasters of an earlier command.
+        """
+        self.results.changed_files(report.label, folder, [part for part in files if part.kind == "index"])
+        written = [part for part in files if report.state == "done" and part.kind != "index"]
+        compared = {*self.results.states[report.label].split(), *states_of(folder, written)}
+        return " ".join(state for state in states_of(folder, files) if state in compared)
 
     def reports(self, selection: Selection, record: RunPart) -> Iterator[CaptureReport]:
         """Yield the report of each capture; add the time of learning to the record."""

@@ -158,10 +158,12 @@ def _onto(
     from agalign.cameras.discover import distance_km, mosaics_onto
     from agalign.cli.align_run import conclude, run
     from agalign.config import RunOptions, Settings
+    from agalign.records.sidecar_file import check_products
 
     target = out or reference.absolute().parent / f"{reference.stem}-aligned"
     settings = Settings.model_validate(given["settings"]).for_mosaics
     flight = mosaics_onto(reference, moving, band, given["discover"]["max_pixels"])
+    check_products([reference, *moving])
     for capture in flight.captures:
         offset_km = distance_km(capture.reference, capture.moving[0])
         if offset_km:

@@ -14,6 +14,7 @@ from agalign.pixels.gdal import gdal_name, without_warnings
 from agalign.rasters.alignment_maps import RELIEF_UNITS
 from agalign.rasters.band_reader import like_most
 from agalign.records.captures import RunCapture, captures_of_run, differing_from_most
+from agalign.records.listed_files import ListedFiles
 from agalign.records.sidecar import BandResult
 from agalign.records.sidecar_file import read_sidecar
 from agalign.values.arguments import checked
@@ -50,7 +51,7 @@ def open_capture(path: str | Path, *, masked: bool = True) -> "xarray.Dataset":
     SidecarError
         The sidecar is missing or malformed.
     UnreadableFileError
-        A raster cannot be read.
+        A raster cannot be read, or is not as it was written.
     InputError
         `path` is a folder.
     ConfigurationError
@@ -68,7 +69,8 @@ def open_capture(path: str | Path, *, masked: bool = True) -> "xarray.Dataset":
     if given.is_dir():
         raise InputError(f"{given}: is a folder; give the sidecar of a capture, or use open_flight")
     name = re.sub(r"\.json$|\.tiff?$", "", given.name, flags=re.IGNORECASE)
-    return _dataset(given.with_name(f"{name}.json"), masked=masked)
+    sidecar = given.with_name(f"{name}.json")
+    return _dataset(sidecar, ListedFiles.of(read_sidecar(sidecar), sidecar.parent), masked=masked)
 
 
 @checked
@@ -109,7 +111,7 @@ def open_flight(out: str | Path, *, masked: bool = True) -> "xarray.Dataset":
     """
     xr = import_xarray()
     captures = _captures_with_output(Path(out))
-    opened = [_dataset(c.path, masked=masked) for c in captures]
+    opened = [_dataset(c.path, c.listed, masked=masked) for c in captures]
     common = [name for name in opened[0].data_vars if all(name in one for one in opened)]
     # In pixels: the map coordinates of the captures differ.
     in_pixels = [_in_pixels(one[common]) for one in opened]
@@ -162,8 +164,8 @@ def import_xarray() -> Any:
     return xr
 
 
-def _dataset(path: Path, *, masked: bool) -> "xarray.Dataset":
-    """The dataset of the capture with the sidecar at `path`."""
+def _dataset(path: Path, listed: ListedFiles, *, masked: bool) -> "xarray.Dataset":
+    """The dataset of the capture with the sidecar at `path`, and its files as they are listed there."""
     xr, sidecar, folder = import_xarray(), read_sidecar(path), path.parent
     files: dict[str, xarray.DataArray] = {}
     result = {}
@@ -172,11 +174,11 @@ def _dataset(path: Path, *, masked: bool) -> "xarray.Dataset":
             continue
         name = band.place.file
         if name not in files:
-            files[name] = _opened(folder / name, masked=masked)
+            files[name] = _opened(folder / name, listed, masked=masked)
         result[band.band] = _variable(files[name], band, band.place.band_index, name, masked=masked)
     relief = next((b.relief.file for b in sidecar.bands if b.relief is not None and b.relief.file), None)
     if relief is not None:
-        layers = _opened(folder / relief, masked=True)
+        layers = _opened(folder / relief, listed, masked=True)
         for index, name in enumerate(np.atleast_1d(layers.attrs.get("long_name", "parallax"))):
             one = layers.isel(band=index, drop=True)
             result[str(name)] = one.assign_attrs(long_name=str(name), units=RELIEF_UNITS[name])
@@ -186,11 +188,13 @@ def _dataset(path: Path, *, masked: bool) -> "xarray.Dataset":
     return dataset if dataset.rio.crs is not None else _in_pixels(dataset)
 
 
-def _opened(path: Path, *, masked: bool) -> Any:
-    """The array of a file."""
+def _opened(path: Path, listed: ListedFiles, *, masked: bool) -> Any:
+    """The array of a file. Raises UnreadableFileError for a file that is not as it was written."""
     import rioxarray
 
     ensure_proj_data()
+    if problem := listed.problem(path):
+        raise UnreadableFileError(problem)
     try:
         with without_warnings():
             # Some of GDAL's other drivers open files or addresses that the contents of a file name.

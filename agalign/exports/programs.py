@@ -74,7 +74,9 @@ def export(out: Path, target: Path, program: ExportProgram, *, copy: bool = Fals
     # A misaligned band harms a reconstruction more than a missing capture.
     left_out += [(c.label, f"its status is {c.result.status}") for c in captures if c not in good]
     good, differing = like_most(good)
-    left_out += differing
+    changed = [(c.label, problem) for c in good if (problem := _changed_band_file(c, out))]
+    good = [c for c in good if c.label not in dict(changed)]
+    left_out += differing + changed
     if not good:
         reason = ": ".join(left_out[0])
         raise InputError(f"{out}: no capture to export ({reason}); 'agalign report {out}' shows what failed")
@@ -84,6 +86,19 @@ def export(out: Path, target: Path, program: ExportProgram, *, copy: bool = Fals
         notes = _notes(program, good, files)
         write_text(folder / "README.txt", "\n".join(notes) + "\n")
     return ExportReport(len(good), [target / path.relative_to(folder) for path in files], left_out, notes)
+
+
+def _band_files(capture: RunCapture) -> list[Path]:
+    return [path for path, part in capture.listed.parts.items() if part.kind == BandFiles.kind]
+
+
+def _changed_band_file(capture: RunCapture, out: Path) -> str:
+    """Return which band file of a capture is not as it was written, with the remedy; empty if all are.
+
+    Raises OutputError if a link leads out of the output folder.
+    """
+    files = (check_inside(path, out) for path in _band_files(capture))
+    return next(filter(None, map(capture.listed.problem, files)), "")
 
 
 @contextmanager
@@ -109,14 +124,14 @@ def _write_band_files(captures: Sequence[RunCapture], out: Path, images: Path, *
     """Link or copy the band files. Raises ConfigurationError and OutputError."""
     taken: dict[str, str] = {}
     for capture in captures:
-        files = [part for part in capture.result.products if part.kind == BandFiles.kind]
+        files = _band_files(capture)
         if not files:
             raise ConfigurationError(
                 f"{out}: has stacks only; run 'agalign' with --layout bands or both into it, and export again"
             )
-        for part in files:
-            source = check_inside(capture.path.parent / part.file, out)
-            target = images / file_name((Path(capture.label).parent / part.file).as_posix(), taken)
+        for file in files:
+            source = check_inside(file, out)
+            target = images / file_name(file.relative_to(out).as_posix(), taken)
             target.parent.mkdir(parents=True, exist_ok=True)
             if not copy:
                 with suppress(OSError):  # another disk, or a file system without hard links

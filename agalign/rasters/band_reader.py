@@ -15,6 +15,7 @@ from agalign.host.text import shortened
 from agalign.pixels.gdal import innermost_cause
 from agalign.pixels.raster import OpenRaster, open_raster
 from agalign.records.captures import AlignedBand, LeftOut, RunCapture, differing_from_most
+from agalign.records.listed_files import ListedFiles
 from agalign.values.choices import UNUSABLE_QUALITY
 from agalign.values.image import FloatImage, Tile, reduced_size_px
 
@@ -27,15 +28,22 @@ _SAMPLE_PX = 512
 
 
 class BandReader(ExitStack):
-    """Reads bands; opens each file once, and closes all of them at the end of the `with` block."""
+    """Reads bands; compares each file with its sidecar, if it is `listed` there, opens it once, and closes all of them
+    at the end of the `with` block.
+    """
 
-    def __init__(self) -> None:
+    def __init__(self, listed: ListedFiles | None = None) -> None:
         super().__init__()
+        self._listed = listed or ListedFiles()
         self._files: dict[Path, OpenRaster] = {}
 
     def file(self, path: Path, index: int) -> OpenRaster:
-        """Return the open file. Raises InputError if it cannot be read or has no band `index`, counted from 1."""
+        """Return the open file.
+
+        Raises InputError if it is not as it was written, cannot be read, or has no band `index`, counted from 1.
+        """
         if path not in self._files:
+            self._listed.check(path)
             try:
                 self._files[path] = self.enter_context(open_raster(path))
             except InputError as error:  # whose remedy is that of an image of the camera
@@ -104,7 +112,7 @@ def contents_of(capture: RunCapture) -> tuple[str, str]:
     pairs = zip(capture.bands, capture.result.bands, strict=True)
     bands = [band for band, part in pairs if part.place is not None]
     names: dict[str, list[str]] = defaultdict(list)
-    with BandReader() as reader:
+    with BandReader(capture.listed) as reader:
         for band in bands:
             names[reader.quantity(band) or RAW].append(band.name)
     quantities = [q if len(names) == 1 else f"{q} in {', '.join(names[q])}" for q in names]

@@ -7,10 +7,10 @@ from pathlib import Path
 
 import numpy as np
 
-from agalign.errors import OutputError, SidecarError
-from agalign.host.files import file_checksum
+from agalign.errors import SidecarError
 from agalign.pixels.raster import open_raster
 from agalign.rasters.geotiff import LayerDescription, compressed, write_on_grid
+from agalign.records.listed_files import file_problem
 from agalign.records.sidecar import Sidecar
 from agalign.values.capture import Georeference
 from agalign.values.image import OutputGrid
@@ -43,12 +43,8 @@ def read_relief(sidecar: Sidecar, folder: Path) -> Relief | None:
     if sidecar.parallax is None:
         return None
     path = folder / sidecar.parallax.file
-    try:
-        is_listed = file_checksum(path) == sidecar.parallax.sha256
-    except OutputError:
-        raise SidecarError(f"{path}: cannot be read; run again") from None
-    if not is_listed:
-        raise SidecarError(f"{path}: is not what was written; delete it and run again")
+    if problem := file_problem(path, sidecar.parallax):
+        raise SidecarError(problem)
     with open_raster(path) as file:
         if (file.width, file.height) != sidecar.reference.size_px or file.count < len(_LAYERS) - 1:
             raise SidecarError(f"{path}: is not the parallax of {sidecar.capture}; run again with --overwrite")

@@ -114,6 +114,8 @@ class RunPart(_Part):
     other_inputs: dict[str, list[str]] = {}
     """Labels of captures that earlier runs found in other input folders, by folder."""
     not_in_input: list[NotInInputPart] = []
+    file_states: dict[str, str] = {}
+    """States in which runs left the files of each capture, by label (`records.listed_files`)."""
 
     def add(self, label: str, state: str, result: Sidecar | None, problems: Iterable[str]) -> None:
         """Add the result of a capture."""
@@ -266,6 +268,12 @@ def last_record(out: Path) -> RunPart | None:
     with suppress(SidecarError):
         return read_run_record(out)
     return None
+
+
+def file_states(out: Path) -> dict[str, str]:
+    """Return the states in which runs left the files below an output folder, by label of the capture."""
+    record = last_record(out)
+    return {} if record is None else record.file_states
 
 
 def renamed_captures(out: Path) -> frozenset[str]:

@@ -2,7 +2,7 @@
 
 import hashlib
 import json
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -12,6 +12,7 @@ from pydantic import ValidationError
 from agalign.errors import InputError, SidecarError
 from agalign.host.files import RUN_FILE, compact_lists, file_checksum, open_regular, read_regular, write_text
 from agalign.host.text import shortened
+from agalign.records.listed_files import ListedFiles, file_problem
 from agalign.records.sidecar import SCHEMA, FilePart, Sidecar
 
 _MAX_BYTES = 1 << 26
@@ -119,6 +120,14 @@ def read_without_tables(path: Path) -> Sidecar:
     return read_checked(path).without_tables()
 
 
+def check_products(paths: Iterable[Path]) -> None:
+    """Raise InputError for a file that a sidecar beside it lists, and that is not as it was written."""
+    for path in paths:
+        for sidecar in (p for p in path.parent.glob("*.json") if path.name.startswith(p.stem) and is_sidecar(p)):
+            with suppress(SidecarError):  # that of another version, for example
+                ListedFiles.of(read_checked(sidecar), path.parent).check(path)
+
+
 def find_sidecars(folder: Path) -> list[Path]:
     """Return the sidecars below an output folder, sorted; unreadable files are included, other JSON files and hidden
     ones, such as partial files of another command, are not.
@@ -198,13 +207,5 @@ def _problems_of_outputs(path: Path) -> Iterator[str]:
     for kind in sidecar.not_written:
         yield f"{path}: its {kind} could not be written; run again"
     for part in sidecar.files:
-        target = path.parent / part.file
-        try:
-            with open_regular(target) as file:
-                digest = hashlib.file_digest(file, "sha256").hexdigest()
-        except OSError as error:
-            again = "run 'agalign indices' again" if part.kind == "index" else "run again"
-            yield f"{target}: cannot be read ({error.strerror or error}); {again}"
-        else:
-            if digest != part.sha256:
-                yield f"{target}: is not what was written; delete it and run again"
+        if problem := file_problem(path.parent / part.file, part):
+            yield problem

@@ -5,7 +5,7 @@ import hashlib
 import json
 import os
 from collections import defaultdict
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from contextlib import suppress
 from importlib import resources
 from pathlib import Path
@@ -20,8 +20,10 @@ from agalign.config import Settings
 from agalign.errors import SidecarError
 from agalign.host.files import write_text
 from agalign.records.excluded import PANELS_FILE, SKY_FILE, PanelPart, SkyPart, read_excluded
-from agalign.records.run_record import RunPart, counted_sidecars, read_run_record, unfinished_run
-from agalign.records.sidecar_file import find_sidecars, read_sidecar
+from agalign.records.listed_files import ListedFiles
+from agalign.records.run_record import RunPart, counted_sidecars, file_states, read_run_record, unfinished_run
+from agalign.records.sidecar import Sidecar
+from agalign.records.sidecar_file import find_sidecars, label_of, read_checked
 from agalign.report.charts import drifts_of, rig_views
 from agalign.report.facts import FlightFacts
 from agalign.report.flight_map import FlightMap
@@ -88,24 +90,41 @@ def _add_captures(
     out: Path, facts: FlightFacts, flight_map: FlightMap, on_problem: Callable[[str], None]
 ) -> list[IndexReport]:
     """Add all captures with a sidecar below OUT, and write OUT/indices.csv; return its rows."""
-    earlier = current_rows(out)
+    earlier, states = current_rows(out), file_states(out)
     rows_of: dict[str, list[IndexReport]] = defaultdict(list)
     for row in earlier:
         rows_of[row.capture].append(row)
     indices: list[IndexReport] = []
+    changed: set[Path] = set()
     for path in counted_sidecars(find_sidecars(out), out):
         folder = path.parent.relative_to(out).as_posix()
         try:
-            sidecar = read_sidecar(path)
+            sidecar = read_checked(path)
         except SidecarError as error:
             on_problem(str(error))
             continue
+        label = label_of(path, out)
+        listed = ListedFiles.of(sidecar, path.parent, states.get(label, ""))
+        # The report needs no stacks: these may be deleted.
+        problems = {file: problem for file in listed.parts if file.exists() and (problem := listed.problem(file))}
+        for problem in problems.values():
+            on_problem(problem)
+        changed |= problems.keys()
+        sidecar = _without(sidecar, path.parent, problems)
         of_capture = reports_of(sidecar, folder, out, facts.pairs.run)
         indices += of_capture
-        label = Path(folder, sidecar.capture).as_posix()
-        facts.add(folder, sidecar, merged(rows_of.get(label, []), of_capture))
+        rows = [row for row in rows_of.get(label, []) if row.path not in changed]
+        facts.add(folder, sidecar, merged(rows, of_capture))
         flight_map.add(folder, sidecar)
-    return update_table(out, indices, earlier)
+    return update_table(out, indices, [row for row in earlier if row.path not in changed])
+
+
+def _without(sidecar: Sidecar, folder: Path, changed: Collection[Path]) -> Sidecar:
+    """Return a sidecar without files that are not as they were written, given its folder."""
+    products = [part for part in sidecar.products if folder / part.file not in changed]
+    preview = sidecar.preview
+    is_changed = preview is not None and folder / preview.file in changed
+    return sidecar.model_copy(update={"products": products, "preview": None if is_changed else preview})
 
 
 def outdate_pages(out: Path) -> None:

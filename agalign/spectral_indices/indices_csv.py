@@ -36,7 +36,9 @@ def to_check(index: Index | None, sidecar: Sidecar, run: RunFacts, label: str) -
 
 
 def reports_of(sidecar: Sidecar, folder: str, out: Path, run: RunFacts) -> list[IndexReport]:
-    """Return the indices of a capture that its sidecar lists, from the tags of the rasters."""
+    """Return the indices of a capture that its sidecar lists, from the tags of the rasters, which are as they were
+    written.
+    """
     result = []
     for part in sidecar.products:
         path = out / folder / part.file

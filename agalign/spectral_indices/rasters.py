@@ -36,6 +36,7 @@ from agalign.rasters.geotiff import (
 )
 from agalign.rasters.product import CapturePaths, Product, ProductContext, WrittenFile
 from agalign.records.captures import AlignedBand, bands_of
+from agalign.records.listed_files import ListedFiles
 from agalign.records.sidecar import Sidecar
 from agalign.spectral_indices.before_alignment import index_before
 from agalign.spectral_indices.formulas import Index, bands_for, compute, index_named, index_of_formula
@@ -256,22 +257,30 @@ def _masked(bands: Sequence[AlignedBand], context: ProductContext) -> Iterator[A
 
 
 def write_rasters(
-    bands: Sequence[AlignedBand], indices: Sequence[Index], base: Path, label: str, *, overwrite: bool = True
+    bands: Sequence[AlignedBand],
+    indices: Sequence[Index],
+    base: Path,
+    label: str,
+    *,
+    overwrite: bool = True,
+    listed: ListedFiles | None = None,
 ) -> Iterator[IndexReport]:
     """Write `base`_<index>.tif and .png of a capture's bands, each atomically.
 
     Without `overwrite`, rasters that an earlier command wrote from the same bands with the same formula are kept. If a
-    band of an index is missing, not usable or not in the unit that the index needs, the report has the problem.
+    band of an index is missing, not usable, not in the unit that the index needs, or not as the sidecar has `listed`
+    its file, the report has the problem.
     Raises OutputError, or InputError for a file that cannot be read.
     """
-    with BandReader() as reader:
+    listed = listed or ListedFiles()
+    with BandReader(listed) as reader:
         for index in indices:
             target = base.with_name(f"{base.name}_{index.name}.tif")
             try:
                 chosen = _bands_of_index(bands, index)
                 source = _fingerprint(index, chosen)
                 may_be_kept = not overwrite and all(band.sha256 for band in chosen)
-                earlier = _finished_before(target, source) if may_be_kept else None
+                earlier = _finished_before(target, source, listed) if may_be_kept else None
                 if earlier is None and target.resolve() in {band.file.resolve() for band in bands}:
                     raise InputError(f"{target}: is the file of a band; give the formula '{index.name}' another name")
                 if earlier is None and _is_foreign(target):
@@ -361,12 +370,17 @@ def _fingerprint(index: Index, bands: Sequence[AlignedBand]) -> str:
     return hashlib.sha256(facts.encode()).hexdigest()[:16]
 
 
-def _finished_before(target: Path, source: str) -> IndexStatistics | None:
-    """The statistics of a complete raster with its picture and this fingerprint; None if there is none."""
+def _finished_before(target: Path, source: str, listed: ListedFiles) -> IndexStatistics | None:
+    """The statistics of a complete raster with its picture and this fingerprint; None if there is none, or if one is
+    not as the sidecar has listed it.
+    """
+    picture = target.with_suffix(".png")
+    if not picture.is_file() or any(map(listed.problem, (target, picture))):
+        return None
     with suppress(OSError):
         check_complete(target)
         tags = tags_of(target)
-        if tags.get("INDEX_MADE_FROM") == source and target.with_suffix(".png").is_file():
+        if tags.get("INDEX_MADE_FROM") == source:
             return statistics_in(tags)
     return None
 

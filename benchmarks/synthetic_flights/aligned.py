@@ -8,7 +8,7 @@ import rasterio
 
 from agalign.pixels.gdal import without_warnings
 from agalign.records.sidecar import Sidecar
-from agalign.records.sidecar_file import write_sidecar
+from agalign.records.sidecar_file import file_part, read_sidecar, write_sidecar
 
 BANDS = {"Green": (560, 0.12, 0.1), "Red": (668, 0.2, 0.05), "NIR": (842, 0.3, 0.52), "Red edge": (717, 0.24, 0.3)}
 """Wavelength in nm, and reflectance of soil and of vegetation."""
@@ -26,7 +26,13 @@ def make_aligned(folder: Path, captures: int, size_px: tuple[int, int] = (160, 1
         name = f"IMG_{number:04d}"
         cover = (crop + rng.normal(0, 0.05, crop.shape)).clip(0, 1)
         write_stack(target / f"{name}.tif", reflectances(cover), raw=raw)
-        write_sidecar(target / f"{name}.json", sidecar_of(name, number, size_px, raw=raw))
+        list_stack(target / f"{name}.json", sidecar_of(name, number, size_px, raw=raw))
+
+
+def list_stack(path: Path, sidecar: Sidecar | None = None) -> None:
+    """Write a sidecar, by default the one at `path`, with size and checksum of the stack beside it."""
+    products = [file_part("stack", path.with_suffix(".tif"), path.parent)]
+    write_sidecar(path, (sidecar or read_sidecar(path)).model_copy(update={"products": products}))
 
 
 def reflectances(cover: np.ndarray) -> np.ndarray:
@@ -58,5 +64,4 @@ def sidecar_of(name: str, number: int, size_px: tuple[int, int], *, raw: bool) -
     content["output"]["crop"] = 0, 0, width, height
     if raw:
         content["output"] |= {"radiometry": None, "nodata": None}
-    content["products"][0]["sha256"] = f"{number:064x}"
     return Sidecar.model_validate_json(json.dumps(content))

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import rasterio
-from synthetic_flights.aligned import make_aligned
+from synthetic_flights.aligned import list_stack, make_aligned
 
 import agalign
 from agalign.exports.programs import export
@@ -37,6 +37,7 @@ def run(shared: Shared) -> Path:
             for index in stack.indexes:
                 stack.update_tags(index, QUANTITY="radiance")
         for path in find_sidecars(folder):
+            list_stack(path)
             (stack,) = read_json(path)["products"]
             change(path, products=[stack, stack | {"kind": "band"}])
 
@@ -74,7 +75,7 @@ def test_the_exception_is_what_differs_from_most(run: Path, tmp_path: Path) -> N
     )
     with pytest.warns(UserWarning, match="IMG_0002: left out: it has bands Green") as warned:
         flight = agalign.open_flight(out)
-    assert f"{FIRST}.tif: does not exist" in str(warned[0].message)
+    assert f"{FIRST}.tif: cannot be read (No such file or directory); run again" in str(warned[0].message)
     assert (flight.sizes["capture"], "NIR" in flight) == (7, True)
     assert differing_from_most({}) == []
 
@@ -101,6 +102,7 @@ def test_indices_of_cogs_are_cogs(tmp_path: Path) -> None:
     make_aligned(tmp_path, 1)
     path = tmp_path / "0000SET" / "IMG_0001.tif"
     to_cog(path)
+    list_stack(path.with_suffix(".json"))
     assert agalign_here("indices", tmp_path).returncode == 0
     with rasterio.open(path.with_name("IMG_0001_ndvi.tif")) as index:
         assert index.tags(ns="IMAGE_STRUCTURE")["LAYOUT"] == "COG"

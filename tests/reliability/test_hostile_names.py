@@ -23,7 +23,7 @@ from agalign.exports.programs import export
 from agalign.flight.groups import model_names
 from agalign.host.files import file_name
 from agalign.host.text import without_controls
-from agalign.records.sidecar_file import find_sidecars
+from agalign.records.sidecar_file import file_part, find_sidecars
 from agalign.spectral_indices.formulas import index_named
 from agalign.values.capture import Band, CameraIdentity, Capture
 
@@ -133,9 +133,10 @@ def test_equal_names_do_not_overwrite_each_other(tmp_path: Path) -> None:
         band["place"] = None
     for folder, name in (("0000SET/x", "y"), ("0000SET", "x_y"), ("0000SET_x", "y")):
         content["capture"] = name
-        content["products"] = [{"kind": "band", "file": f"{name}.tif", "bytes": 1, "sha256": ""}]
         (out / folder).mkdir(exist_ok=True)
-        (out / folder / f"{name}.tif").write_text(folder)
+        file = out / folder / f"{name}.tif"
+        file.write_text(folder)
+        content["products"] = [file_part("band", file, out / folder).model_dump()]
         write_signed(out / folder / f"{name}.json", json.dumps(content))
     (out / "0000SET" / "IMG_0001.json").unlink()
     report = export(out, tmp_path / "images", "odm")
