@@ -23,7 +23,7 @@ from agalign.records.excluded import PANELS_FILE, SKY_FILE, PanelPart, SkyPart, 
 from agalign.records.listed_files import ListedFiles
 from agalign.records.run_record import RunPart, counted_sidecars, file_states, read_run_record, unfinished_run
 from agalign.records.sidecar import Sidecar
-from agalign.records.sidecar_file import find_sidecars, label_of, read_checked
+from agalign.records.sidecar_file import find_sidecars, label_of, read_with_change
 from agalign.report.charts import drifts_of, rig_views
 from agalign.report.facts import FlightFacts
 from agalign.report.flight_map import FlightMap
@@ -99,11 +99,14 @@ def _add_captures(
     for path in counted_sidecars(find_sidecars(out), out):
         folder = path.parent.relative_to(out).as_posix()
         try:
-            sidecar = read_checked(path)
+            sidecar, change = read_with_change(path)
         except SidecarError as error:
             on_problem(str(error))
             continue
         label = label_of(path, out)
+        if label != Path(folder, sidecar.capture).as_posix():
+            on_problem(f"{path}: {change}")
+            continue
         listed = ListedFiles.of(sidecar, path.parent, states.get(label, ""))
         # The report needs no stacks: these may be deleted.
         problems = {file: problem for file in listed.parts if file.exists() and (problem := listed.problem(file))}

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import rasterio
 import tifffile
-from synthetic_flights.aligned import make_aligned
+from synthetic_flights.aligned import list_stack, make_aligned
 from synthetic_flights.troubles import make_terraces
 
 import agalign
@@ -124,6 +124,7 @@ def test_bands_in_different_units_make_no_index(tmp_path: Path) -> None:
     ):
         with rasterio.open(tmp_path / "0000SET" / "IMG_0001.tif", "r+") as dataset:
             dataset.update_tags(dataset.descriptions.index(band) + 1, QUANTITY="radiance")
+        list_stack(tmp_path / "0000SET" / "IMG_0001.json")
         assert problem in indices_of(tmp_path, index)[0].problem
 
 

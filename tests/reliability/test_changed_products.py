@@ -145,3 +145,26 @@ def test_a_run_reads_only_files_that_changed_since_the_last_one(
     stack.with_name("copy").replace(stack)
     assert agalign_here(flight, "-o", run, *OPTIONS).returncode == 0
     assert len(read) == 1
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("copied", [False, True], ids=["exchanged", "copied"])
+def test_no_command_uses_the_sidecar_of_another_capture(
+    flight: Path, run: Path, tmp_path: Path, *, copied: bool
+) -> None:
+    folder = run / "0000SET" / "000"
+    first, second = folder / "IMG_0001.json", folder / "IMG_0002.json"
+    if copied:
+        shutil.copy(second, first)
+    else:
+        exchanged(first, second)
+    for command in (
+        ["verify", run],
+        ["report", run],
+        ["indices", run, "-o", tmp_path / "indices"],
+        ["export", run, "--for", "pix4d", "-o", tmp_path / "export"],
+    ):
+        done = agalign_here(*command)
+        assert f"{first}: belongs to IMG_0002; delete it and run again" in done.stderr, command
+        assert done.returncode == (3 if copied or command[0] in ("verify", "report") else 1), command
+    assert agalign_here(flight, "-o", run, *OPTIONS).returncode == 2
