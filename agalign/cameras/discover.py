@@ -36,7 +36,7 @@ from agalign.cameras.grouping import (
     with_unreadable_bands,
     without_copies,
 )
-from agalign.cameras.image_file import ImageFile, Problem
+from agalign.cameras.image_file import ImageFile, OwnFile, Problem
 from agalign.cameras.image_search import (
     IMAGE_KINDS,
     check_folder,
@@ -49,7 +49,7 @@ from agalign.cameras.metadata import read_tags
 from agalign.cameras.read_files import read_files
 from agalign.config import DiscoverOptions
 from agalign.errors import ConfigurationError, InputError, NoSuchBandError
-from agalign.host.text import did_you_mean
+from agalign.host.text import counted, did_you_mean
 from agalign.pixels.coordinates import transformed
 from agalign.pixels.raster import probe, suffix_format
 from agalign.values import geometry
@@ -98,7 +98,7 @@ class FolderScan:
 def discover(folder: str | Path, options: DiscoverOptions | None = None) -> FolderScan:
     """Find the captures below a folder: the bands, the camera, and the metadata from the tags of the files.
 
-    Output folders of earlier runs are skipped. Pixels are not read.
+    Output folders of earlier runs are skipped, and files that agalign wrote. Pixels are not read.
 
     Parameters
     ----------
@@ -180,15 +180,20 @@ def _chosen_images(folder: Path, options: DiscoverOptions) -> tuple[list[Path], 
 
 def _read(paths: Sequence[Path], options: DiscoverOptions, problems: list[Problem]) -> list[ImageFile]:
     """The files that contain a band; files that cannot be read are added to `problems`."""
-    files: list[ImageFile] = []
+    files, own = list[ImageFile](), list[Path]()
     generic = Generic(options.pattern)
     for result in read_files(paths, options):
         is_photograph = suffix_format(result.path) in ("JPEG", "PNG") and not generic.is_named_as_band(result.path)
         if isinstance(result, ImageFile):
             files += [result] if result.bands else []
+        elif isinstance(result, OwnFile):
+            own.append(result.path)
         # An unreadable colour photograph is a problem only if photographs take part.
         elif options.with_rgb or not is_photograph:
             problems.append(result)
+    if own:
+        what = f"{own[0]}: results of agalign among the images are skipped, {counted(len(own), 'file')} in all"
+        problems.append(Problem(own[0], InputError(what), is_harmless=True))
     return files
 
 

@@ -39,6 +39,10 @@ class Problem:
         return str(self.error)
 
 
+class OwnFile(Problem):
+    """A file that agalign wrote: a result, not an image of a camera."""
+
+
 class Doubt(NamedTuple):
     """A fact that two sources in a file give differently."""
 

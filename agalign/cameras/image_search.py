@@ -42,17 +42,20 @@ def image_files(folder: Path, skip: Sequence[Path]) -> tuple[list[Path], list[Pr
         path = Path(error.filename)
         problems.append(Problem(path, InputError(f"{path}: cannot be looked into ({error.strerror}); left out")))
 
-    listed, starts = set[tuple[int, int]](), [folder]
+    outputs, listed, starts = list[Path](), set[tuple[int, int]](), [folder]
     for start in starts:  # links add to it
         for parent, folders, names in os.walk(start, onerror=refuse):
             here = Path(parent)
             if not _is_first_time(here, listed):
                 folders.clear()
                 continue
-            folders[:] = sorted(d for d in folders if _is_input_folder(here / d, skipped))
+            folders[:] = [d for d in sorted(folders) if _is_input_folder(here / d, skipped, outputs)]
             starts += [here / d for d in folders if (here / d).is_symlink()]
             images = [n for n in names if suffix_format(Path(n)) and not n.startswith(".")]
             result.extend(here / n for n in sorted(images, key=natural_order))
+    if outputs:
+        what = f"{outputs[0]}: output folders of earlier runs are skipped, {counted(len(outputs), 'folder')} in all"
+        problems.append(Problem(outputs[0], InputError(what), is_harmless=True))
     return result, problems
 
 
@@ -124,8 +127,9 @@ def other_files(folder: Path) -> Counter[str]:
     return suffixes
 
 
-def _is_input_folder(folder: Path, skipped: set[Path]) -> bool:
-    """False for hidden folders, those of operating systems on memory cards, and the output folder of a run.
+def _is_input_folder(folder: Path, skipped: set[Path], outputs: list[Path]) -> bool:
+    """False for hidden folders, those of operating systems on memory cards, and the output folder of a run, which is
+    added to `outputs`.
 
     A run writes RUN_FILE first, so the output of a killed run is recognised too.
     """
@@ -136,4 +140,6 @@ def _is_input_folder(folder: Path, skipped: set[Path]) -> bool:
         entries = {entry.name for entry in os.scandir(folder)}
     except OSError:
         return True
-    return RUN_FILE not in entries and not {"summary.csv", "index.html"} <= entries
+    is_output = RUN_FILE in entries or {"summary.csv", "index.html"} <= entries
+    outputs += [folder] if is_output else []
+    return not is_output

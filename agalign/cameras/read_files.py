@@ -19,13 +19,14 @@ from agalign.cameras.consistency import (
     vignetting_of_other_lens,
     with_position,
 )
-from agalign.cameras.image_file import Doubt, ImageFile, Problem
+from agalign.cameras.image_file import Doubt, ImageFile, OwnFile, Problem
 from agalign.cameras.makers import known_cameras
 from agalign.cameras.metadata import Tags, read_tags
 from agalign.cameras.pix4d import panel_in
 from agalign.cameras.tiff_directory import image_pages
 from agalign.config import DiscoverOptions
-from agalign.errors import UnreadableFileError
+from agalign.errors import InputError, UnreadableFileError
+from agalign.host.own_files import has_mark
 from agalign.host.process_pool import ProcessPool, WorkerDiedError
 from agalign.host.processes import environment_of_children, silence_libraries
 from agalign.host.text import shortened
@@ -232,6 +233,9 @@ def _read_task(paths: Iterable[Path], options: DiscoverOptions) -> list[ImageFil
     cameras = known_cameras(options.pattern)
     result: list[ImageFile | Problem] = []
     for path in paths:
+        if has_mark(path):
+            result.append(OwnFile(path, InputError(f"{path}: was written by agalign")))
+            continue
         try:
             result.append(read_file(path, cameras, options))
         except UnreadableFileError as error:

@@ -1,15 +1,19 @@
 """Which files below a folder are images to align: links, and files that programs keep beside the images."""
 
+import shutil
 from pathlib import Path
 
 import numpy as np
 import pytest
+import rasterio
 from PIL import Image
 
+from agalign import align_folder
 from agalign.cameras.discover import DiscoverOptions, FolderScan, discover
 from agalign.cameras.image_search import image_files
+from agalign.host.files import RUN_FILE
 
-from ..conftest import write_band
+from ..conftest import Shared, seeded, write_band
 
 pytestmark = pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
 BANDS = "f_green", "f_nir", "f_red"
@@ -90,3 +94,51 @@ def test_names_with_such_words_are_images_without_the_image_they_belong_to(
 ) -> None:
     write(tmp_path / "masks", *names)
     assert not [p.text for p in discover(tmp_path).problems if "masks and thumbnails" in p.text]
+
+
+def own_results(flight: Path, shared: Shared) -> Path:
+    """The output folder of a run of `flight` with stacks, single bands, quality flags, pictures and indices."""
+
+    def fill(folder: Path) -> None:
+        settings = seeded("rig", layout="both", qa=True, error_map=True, georeference=True, ground_elevation_m=0.0)
+        align_folder(flight, folder, settings=settings)
+
+    return shared("own results", fill)
+
+
+@pytest.mark.parametrize("record", [True, False], ids=["with the run record", "without"])
+def test_results_of_agalign_among_the_images_are_one_line(
+    flight: Path, shared: Shared, tmp_path: Path, *, record: bool
+) -> None:
+    shutil.copytree(own_results(flight, shared), tmp_path / "in")
+    images = sorted(path.name for path in (flight / "0000SET" / "000").glob("*.tif"))
+    for path in (flight / "0000SET" / "000").glob("*.tif"):
+        shutil.copy(path, tmp_path / "in" / f"raw_{path.name}")
+    if not record:
+        (tmp_path / "in" / RUN_FILE).unlink()
+    scan = discover(tmp_path / "in", DiscoverOptions(with_rgb=True))
+    assert sorted(b.path.name for c in scan.captures for b in c.bands) == [f"raw_{name}" for name in images]
+    (problem,) = scan.problems
+    number = sum(path.suffix in (".tif", ".png", ".jpg") for path in (tmp_path / "in").rglob("*")) - len(images)
+    assert problem.text.endswith(f"results of agalign among the images are skipped, {number} files in all")
+    assert problem.is_harmless
+
+
+def test_output_folders_below_the_input_are_one_line(flight: Path, shared: Shared, tmp_path: Path) -> None:
+    shutil.copytree(flight, tmp_path / "in")
+    for name in ("a", "b"):
+        shutil.copytree(own_results(flight, shared), tmp_path / "in" / name)
+    scan = discover(tmp_path / "in")
+    assert len(scan.captures) == 2
+    assert [p.text for p in scan.problems] == [
+        f"{tmp_path / 'in' / 'a'}: output folders of earlier runs are skipped, 2 folders in all"
+    ]
+    scan = discover(tmp_path / "in", DiscoverOptions(skip=(tmp_path / "in" / "a", tmp_path / "in" / "b")))
+    assert not scan.problems
+
+
+def test_an_image_whose_tags_name_the_program_elsewhere_is_an_image(tmp_path: Path) -> None:
+    write(tmp_path, *BANDS)
+    with rasterio.open(tmp_path / "f_nir.tif", "r+") as dataset:
+        dataset.update_tags(TIFFTAG_SOFTWARE="Pix4D", TIFFTAG_IMAGEDESCRIPTION="for agalign")
+    assert len(discover(tmp_path).captures[0].bands) == len(BANDS)
