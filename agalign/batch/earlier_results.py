@@ -66,7 +66,7 @@ def is_same(earlier: Sidecar, capture: Capture) -> bool | None:
         return True
     if not earlier.input_samples:
         return None
-    return bool(earlier.input_samples.items() & input_samples(capture).items())
+    return not {*earlier.input_samples.values()}.isdisjoint(input_samples(capture).values())
 
 
 class EarlierResults:
@@ -384,7 +384,8 @@ class _Exposures:
 
     def __init__(self, captures: Sequence[Capture]) -> None:
         self._captures = captures
-        self._by_sample: dict[tuple[str, str], str] | None = None
+        self._by_sample: dict[str, str] | None = None
+        """Labels; a renamed file may have another spelling of its band."""
 
     def same_as(self, result: Sidecar) -> str:
         """Return the label of the capture that is the same exposure as a result; empty if there is none."""
@@ -393,6 +394,6 @@ class _Exposures:
             return next((c.label for c in of_id), "")
         if self._by_sample is None:
             without_id = [c for c in self._captures if not c.capture_id]
-            self._by_sample = {sample: c.label for c in without_id for sample in input_samples(c).items()}
+            self._by_sample = {sample: c.label for c in without_id for sample in input_samples(c).values()}
         by_sample = self._by_sample
-        return next((by_sample[sample] for sample in result.input_samples.items() if sample in by_sample), "")
+        return next((by_sample[sample] for sample in result.input_samples.values() if sample in by_sample), "")

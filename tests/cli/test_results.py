@@ -15,7 +15,7 @@ from agalign.records.run_record import read_run_record, unfinished_run
 from agalign.records.sidecar_file import find_sidecars, read_sidecar, write_sidecar
 
 from ..builders import in_full_run
-from ..conftest import Shared, raising, seeded, write_band
+from ..conftest import Shared, raising, seeded, write_band, write_capture
 from ..program import agalign_here
 from ..run_outputs import change, table_in
 
@@ -120,6 +120,24 @@ def test_a_renamed_exposure_counts_once(flight: Path, tmp_path: Path, has_id: bo
     # Without a result under its new name, the exposure has its earlier one.
     (out / f"{renamed}.json").unlink()
     assert {c.label for c in captures_of_run(out)[0]} == {FIRST, SECOND}
+
+
+def test_an_exposure_counts_once_after_its_bands_are_spelled_otherwise(tmp_path: Path) -> None:
+    images, out = tmp_path / "in", tmp_path / "out"
+    for number, width in ((1, 300), (2, 320)):
+        write_capture(images, "green", "nir", "red", name=f"cap{number}", size_px=(width, 240))
+    agalign.align_folder(images, out, settings=seeded())
+    for path in [*images.iterdir()]:
+        path.rename(images / "renamed").rename(images / path.name.upper())
+    agalign.align_folder(images, out, settings=seeded())
+    if not (out / "cap1.json").samefile(out / "CAP1.json"):
+        moved = [("cap1", "CAP1"), ("cap2", "CAP2")]
+        assert [(part.capture, part.same_as) for part in read_run_record(out).not_in_input] == moved
+        assert {c.label for c in captures_of_run(out)[0]} == {"CAP1", "CAP2"}
+        accept_seeds(out)
+        assert {r.capture for r in agalign.indices(out)} == {"CAP1", "CAP2"}
+        assert captures_in(out / "indices.csv") == {"CAP1", "CAP2"}
+        assert "2 of 2 captures match their checksums" in agalign_here("verify", out).stdout
 
 
 @pytest.mark.full
