@@ -41,7 +41,7 @@ from agalign.values.capture import Capture
 from agalign.values.choices import MAX_PIXELS, ExportProgram, Interpolation, SeedKind
 from agalign.values.image import Mask
 from agalign.values.mapping import PixelMapping
-from agalign.values.resampling import array_of
+from agalign.values.resampling import homography_of
 
 Progress = Callable[[CaptureReport, int, int], object]
 """Called with the report of a capture, how many captures are finished, and how many there are."""
@@ -79,9 +79,9 @@ def align(
         Standard error of `seed`, px of `fixed`. It selects one of several matches in a repetitive scene, which is
         otherwise not aligned.
     fixed_valid
-        (H, W), False for pixels of `fixed` that must not be used.
+        (H, W), False, 0 or NaN for pixels of `fixed` that must not be used.
     moving_valid
-        (H, W), False for pixels of `moving` that must not be used.
+        (H, W), False, 0 or NaN for pixels of `moving` that must not be used.
     settings
         By default `Settings()`. `settings.write` has no effect.
 
@@ -96,8 +96,8 @@ def align(
     Raises
     ------
     InputError
-        An array is not an image, a mask has a different size from its image, or `seed_std_px` is not a positive number
-        or has no `seed`.
+        An array is not an image, a mask has a different size from its image, `seed` has complex numbers, or
+        `seed_std_px` is not a positive number or has no `seed`.
     GeometryError
         `seed` is not an invertible homography.
 
@@ -121,7 +121,7 @@ def align(
     moving_raster = raster_of(moving, moving_valid, "moving")
     matrices: SeedMatrices = {"identity": geometry.overlay(fixed_raster.size_px, moving_raster.size_px)}
     if seed is not None:
-        matrices = {"user": geometry.normalised(array_of(seed, "seed"))}
+        matrices = {"user": homography_of(seed, "seed")}
     seed_std: dict[SeedKind, float] = {} if seed_std_px is None else {"user": float(seed_std_px)}
     pair = BandPair("moving", Reference(fixed_raster), moving_raster, matrices, seed_std_px=seed_std)
     result = align_pairs([pair], settings, quiet)
@@ -151,7 +151,7 @@ def warp_onto(
     fixed_size_px
         (width, height) of the output, px.
     valid
-        (H, W), False for pixels of `moving` that must not be used.
+        (H, W), False, 0 or NaN for pixels of `moving` that must not be used.
     interpolation
         `nearest`, `bilinear`, `cubic` or `lanczos`.
 
@@ -166,7 +166,7 @@ def warp_onto(
     ------
     InputError
         `moving` is not an image, `valid` has a different size, `fixed_size_px` is not a size, or `fixed_to_moving` is
-        an Alignment.
+        an Alignment or has complex numbers.
     GeometryError
         `fixed_to_moving` is not an invertible homography.
 
@@ -179,7 +179,7 @@ def warp_onto(
     """
     if isinstance(fixed_to_moving, Alignment):
         raise InputError("an alignment is more than a homography; use its method warp(moving)")
-    mapping = PixelMapping(geometry.normalised(array_of(fixed_to_moving, "fixed_to_moving")))
+    mapping = PixelMapping(homography_of(fixed_to_moving, "fixed_to_moving"))
     by_homography = Alignment(mapping, _size_px(fixed_size_px), (), Seed("user", mapping.fixed_to_moving, 0.0))
     return by_homography.warp(moving, valid=valid, interpolation=interpolation)
 

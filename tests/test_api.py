@@ -144,6 +144,8 @@ RAGGED = [[1, 2], [3]]
         ({"seed": np.eye(3), "seed_std_px": -1}, "seed_std_px is -1, not a positive number"),
         ({"seed": np.eye(3), "seed_std_px": math.nan}, "seed_std_px is nan, not a positive number"),
         ({"seed_std_px": 3.0}, "give the seed too"),
+        ({"seed": np.eye(3) + 0j}, "seed has complex numbers; a homography has real ones"),
+        ({"seed": [[1, 0, 20j], [0, 1, 0], [0, 0, 1]]}, "seed has complex numbers"),
         ({"fixed": RAGGED}, "fixed is not an array: its rows have different lengths"),
         ({"fixed_valid": RAGGED}, "fixed_valid is not an array"),
         ({"fixed": IMAGE.astype(np.float64) * 1e300}, "fixed has only values beyond 1e"),
@@ -152,6 +154,20 @@ RAGGED = [[1, 2], [3]]
 def test_arguments_that_cannot_be_aligned_are_named(arguments: dict[str, Any], said: str) -> None:
     with pytest.raises(agalign.InputError, match=re.escape(said)):
         agalign.align(**{"fixed": IMAGE, "moving": IMAGE} | arguments)
+
+
+def test_a_complex_homography_is_refused() -> None:
+    with pytest.raises(agalign.InputError, match="fixed_to_moving has complex numbers"):
+        agalign.warp_onto(IMAGE, np.eye(3) + 0j, (64, 64))
+
+
+@pytest.mark.parametrize("dtype", [np.float16, np.float32, np.float64])
+def test_nan_in_a_mask_is_not_valid(dtype: type) -> None:
+    mask, expected = np.ones((64, 64), dtype), np.ones((64, 64), bool)
+    mask[:, :20], expected[:, :20] = np.nan, False
+    np.testing.assert_array_equal(raster_of(IMAGE, mask, "fixed").valid, expected)
+    _, known = agalign.warp_onto(IMAGE, np.eye(3), (64, 64), valid=mask, interpolation="nearest")
+    np.testing.assert_array_equal(known, expected)
 
 
 def test_half_precision_is_an_image_like_any_other() -> None:

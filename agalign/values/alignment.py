@@ -344,7 +344,7 @@ class Alignment:
         moving
             Image, (H, W), (H, W, C) or (C, H, W), of any numeric type and the size of the aligned moving image.
         valid
-            (H, W), False for pixels that must not be used. NaN, `nodata` and masked pixels are never used.
+            (H, W), False, 0 or NaN for pixels that must not be used. NaN, `nodata` and masked pixels are never used.
         nodata
             Value of unknown pixels in the input and the output. By default NaN or, for integers, 0 in the output.
         interpolation

@@ -9,6 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from agalign.errors import InputError
 from agalign.host.memory_limits import RESAMPLED_TILE_PX
+from agalign.values import geometry
 from agalign.values.choices import Interpolation
 from agalign.values.geometry import Points
 from agalign.values.image import FloatImage, Mask, Tile
@@ -86,6 +87,18 @@ def array_of(values: ArrayLike, name: str) -> NDArray[np.generic]:
         raise InputError(f"{name} cannot be converted to an array ({str(error).partition(chr(10))[0]})") from None
 
 
+def homography_of(values: ArrayLike, name: str) -> NDArray[np.float64]:
+    """Return a homography (3, 3) with its bottom-right element equal to 1.
+
+    Raises InputError, with `name`, for what is not an array of real numbers, and GeometryError for other arrays that
+    are not homographies.
+    """
+    array = array_of(values, name)
+    if array.dtype.kind == "c":
+        raise InputError(f"{name} has complex numbers; a homography has real ones")
+    return geometry.normalised(array)
+
+
 def positions_of(values: ArrayLike, name: str) -> NDArray[np.float64]:
     """Return positions (..., 2), px. Raises InputError, with `name`, for anything else."""
     array = array_of(values, name)
@@ -95,7 +108,8 @@ def positions_of(values: ArrayLike, name: str) -> NDArray[np.float64]:
 
 
 def valid_of(image: ArrayLike, valid: ArrayLike | None, size: tuple[int, int], name: str = "") -> Mask:
-    """Return the mask (height, width) `size` of an image: True where `valid` is, and a masked array is not masked.
+    """Return the mask (height, width) `size` of an image: True where `valid` is neither 0 nor NaN, and a masked array
+    is not masked.
 
     Raises InputError, with the `name` of the image, for a mask that has another size.
     """
@@ -105,7 +119,7 @@ def valid_of(image: ArrayLike, valid: ArrayLike | None, size: tuple[int, int], n
         given = array_of(np.ma.filled(valid, False) if isinstance(valid, np.ma.MaskedArray) else valid, mask_name)
         if given.dtype.kind not in "uifb":
             raise InputError(f"{mask_name} must be a mask (H, W), not {given.dtype} {given.shape}")
-        mask = given.astype(bool)
+        mask = given.astype(bool) & ~np.isnan(given)
     if mask.shape != size:
         raise InputError(f"{mask_name} is {mask.shape}, the image {size}")
     if isinstance(image, np.ma.MaskedArray):
