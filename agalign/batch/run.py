@@ -37,7 +37,7 @@ from agalign.flight.panel_readings import PanelReading
 from agalign.flight.rig import MIN_CAPTURES, Rig
 from agalign.flight.rig_file import read_rig
 from agalign.flight.sky import SkyCapture
-from agalign.host.files import check_inside, written_below
+from agalign.host.files import check_inside, path_problem, written_below
 from agalign.host.output_folder import is_full, locked
 from agalign.host.processes import usable_cores
 from agalign.host.text import counted
@@ -231,6 +231,8 @@ class _FlightRun:
 
     def check(self) -> None:
         """Raise ConfigurationError for a device, an index or an output folder that cannot be used."""
+        if problem := path_problem(self.out):
+            raise ConfigurationError(f"{problem}, or choose another output folder with -o")
         choose_device(self.settings.joint.device)
         check_indices(self.flight.captures, self.settings.write)
         if self.out.resolve() == self.flight.folder.resolve():

@@ -4,6 +4,7 @@ import io
 import json
 import os
 import re
+import shutil
 import signal
 from datetime import UTC, datetime
 from pathlib import Path
@@ -125,6 +126,14 @@ def test_a_path_that_is_not_local_or_too_long_is_one_line(
     assert re.search(rf"^agalign: .*({said}).*\n$", done.stderr), done.stderr
     assert len(done.stderr) < 500
     assert not list(tmp_path.iterdir())
+
+
+def test_a_folder_whose_default_output_has_too_long_a_name_is_one_line(flight: Path, tmp_path: Path) -> None:
+    folder = shutil.copytree(flight, tmp_path / ("x" * 250))
+    done = agalign_here(folder)
+    assert done.returncode == 2
+    assert done.stderr.endswith("give a shorter path, or choose another output folder with -o\n")
+    assert [path.name for path in tmp_path.iterdir()] == [folder.name]
 
 
 @pytest.mark.parametrize("command", ["align x --nope", "x --jobs y", "align", "exprot"])
