@@ -4,6 +4,7 @@ import errno
 import logging
 import os
 import platform
+import re
 import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -12,8 +13,11 @@ from pathlib import Path
 from filelock import FileLock, Timeout
 
 from agalign.errors import ConfigurationError, OutputError
-from agalign.host.files import path_problem, remove_partial_files, scratch_file
+from agalign.host.files import path_problem, read_regular, remove_partial_files, scratch_file
 from agalign.host.text import name_problem
+
+_LOCK = re.compile(rb"(process \d+ on .*)?")
+"""Contents of the file of the lock, which a killed process leaves."""
 
 
 def prepare_output(out: Path) -> None:
@@ -47,12 +51,15 @@ def refuse_to_replace(path: Path, mark: bytes | None) -> None:
 def locked(out: Path) -> Iterator[None]:
     """Create the output folder and lock it for this run. Raises OutputError, also if another run has locked it.
 
+    Raises ConfigurationError if a file of the user has the name of the lock, which would be emptied.
+
     Partial files of killed processes are removed, also in the folders below it. The system releases the lock when the
     process ends, also when it is killed.
     """
     prepare_output(out)
     _check_file_system(out)
     path = out / ".agalign.lock"
+    _refuse_foreign_lock(path)
     # The existence of a file as lock (`SoftFileLock`) would outlast a killed process.
     lock = FileLock(path, thread_local=False, fallback_to_soft=False)
     try:
@@ -76,6 +83,12 @@ def locked(out: Path) -> Iterator[None]:
         with suppress(OSError):
             path.unlink(missing_ok=True)
         lock.release()
+
+
+def _refuse_foreign_lock(path: Path) -> None:
+    with suppress(OSError):
+        if path.is_file() and not path.is_symlink() and not _LOCK.fullmatch(read_regular(path)):
+            raise ConfigurationError(f"{path}: was not written by agalign; choose another output folder with -o")
 
 
 def _check_file_system(out: Path) -> None:

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from agalign.errors import OutputError
+from agalign.errors import ConfigurationError, OutputError
 from agalign.host.output_folder import locked
 
 from ..conftest import raising
@@ -37,3 +37,16 @@ def test_other_errors_are_reported_where_a_file_is_written(
     with locked(tmp_path / "out"):
         pass
     assert not list((tmp_path / "out").iterdir())
+
+
+def test_a_file_of_the_user_with_the_name_of_the_lock_is_kept(tmp_path: Path) -> None:
+    lock = tmp_path / ".agalign.lock"
+    lock.write_text("notes of the user")
+    with pytest.raises(ConfigurationError, match="lock: was not written by agalign; choose"), locked(tmp_path):
+        pass
+    assert lock.read_text() == "notes of the user"
+    for left in ("", "process 4194304 on some host"):  # by a killed run
+        lock.write_text(left)
+        with locked(tmp_path):
+            assert lock.read_text().startswith(f"process {os.getpid()} on ")
+        assert not lock.exists()
