@@ -133,6 +133,9 @@ def _bands(path: Path, dataset: rasterio.DatasetReader, max_pixels: int) -> tupl
     if width * height > max_pixels:
         what = f"declares {width} x {height} pixels, more than the {max_pixels:,} that --max-pixels allows"
         raise UnreadableFileError(f"{path}: {what}")
+    if dataset.driver == "PNG" and width * height > MAX_DECODED_PX:
+        what = f"declares {width} x {height} pixels, and a PNG of more than {MAX_DECODED_PX:,} is not decoded"
+        raise UnreadableFileError(f"{path}: {what}; convert it to TIFF (gdal_translate)")
     if count > _MAX_BANDS:
         raise UnreadableFileError(f"{path}: declares {count} bands; at most {_MAX_BANDS} can take part")
     if not all(np.dtype(t).kind in "uif" for t in dataset.dtypes):

@@ -1,3 +1,5 @@
+import struct
+import zlib
 from dataclasses import replace
 from pathlib import Path
 
@@ -7,6 +9,7 @@ import pytest
 import rasterio
 from rasterio._env import get_gdal_config
 
+from agalign.errors import UnreadableFileError
 from agalign.pixels.raster import open_raster, probe, read_for_alignment
 from agalign.values.capture import Band
 
@@ -59,3 +62,18 @@ def test_gdal_caches_megabytes_of_blocks_while_a_raster_is_open(tmp_path: Path) 
         pass
     with open_raster(tmp_path / "a.tif"):
         assert get_gdal_config("GDAL_CACHEMAX") == 256 * 2**20
+
+
+def test_a_decompression_bomb_is_refused_by_its_declared_size(tmp_path: Path) -> None:
+    """GDAL decodes all pixels of a PNG before the last ones."""
+
+    def chunk(kind: bytes, data: bytes) -> bytes:
+        return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+
+    path, side_px = tmp_path / "a_nir.png", 9000
+    header = struct.pack(">IIBBBBB", side_px, side_px, 16, 0, 0, 0, 0)
+    chunks = chunk(b"IHDR", header), chunk(b"IDAT", zlib.compress(bytes(1000))), chunk(b"IEND", b"")
+    path.write_bytes(b"\x89PNG\r\n\x1a\n" + b"".join(chunks))
+    said = "declares 9000 x 9000 pixels, and a PNG of more than 67,108,864 is not decoded; convert it to TIFF"
+    with pytest.raises(UnreadableFileError, match=said):
+        probe(path)
