@@ -76,8 +76,7 @@ def read_rig(path: Path) -> tuple[FlightCamera | None, Rig | None]:
         rig = rig_from_json(facts["rig"], fields) if facts.get("rig") else None
         return camera_in(facts), rig
     except Exception as error:  # damaged files raise errors of many classes
-        reason = shortened(next(iter(str(error).splitlines()), type(error).__name__))
-        raise InputError(f"{path}: its rig cannot be read ({reason})") from None
+        raise InputError(f"{path}: its rig cannot be read ({_reason(error)}); delete it and run again") from None
 
 
 def model_fingerprint(path: Path) -> str:
@@ -89,8 +88,13 @@ def model_fingerprint(path: Path) -> str:
         with safe_open(path, framework="np") as file:
             return str((file.metadata() or {})["fingerprint"])
     except Exception as error:  # damaged files raise errors of many classes
-        reason = shortened(next(iter(str(error).splitlines()), type(error).__name__))
-        raise InputError(f"{path}: cannot be read as a model ({reason})") from None
+        raise InputError(f"{path}: cannot be read as a model ({_reason(error)})") from None
+
+
+def _reason(error: Exception) -> str:
+    """Return the first line of an error, without the number and the file of an error of the system."""
+    text = getattr(error, "strerror", None) or str(error)
+    return shortened(next(iter(text.splitlines()), type(error).__name__))
 
 
 def _bounded(text: str) -> float:

@@ -144,7 +144,7 @@ def remove_partial_files(folder: Path, *, below: bool = True) -> None:
         for name in (*folders, *names):
             if name.startswith(_PARTIAL) and _is_left_over(name):
                 _remove(Path(parent, name))
-        folders[:] = [f for f in folders if below and not Path(parent, f, RUN_FILE).exists()]
+        folders[:] = [f for f in folders if below and not os.path.exists(Path(parent, f, RUN_FILE))]  # noqa: PTH110 - it may not be readable
 
 
 def _remove(path: Path) -> None:
