@@ -18,6 +18,7 @@ from agalign.host.own_files import is_own_file
 from agalign.rasters.aligned_files import band_file_names, is_aligned_raster
 from agalign.rasters.parallax_file import PARALLAX_SUFFIX
 from agalign.rasters.product import CapturePaths
+from agalign.records.run_record import file_states
 from agalign.records.sidecar import FilePart
 from agalign.records.sidecar_file import is_sidecar, read_checked
 from agalign.spectral_indices.rasters import index_rasters
@@ -63,7 +64,8 @@ def refuse_to_overwrite(
 def _foreign_file(capture: Capture, out: Path, settings: WriteSettings, listed: Sequence[FilePart]) -> Path | None:
     """Return a file in the place of an output that no run has written; None if there is none."""
     paths = CapturePaths.of(capture, out)
-    if paths.sidecar.is_file() and not (is_sidecar(paths.sidecar) or is_own_file(paths.sidecar)):
+    is_foreign = paths.sidecar.is_file() and not (is_sidecar(paths.sidecar) or is_own_file(paths.sidecar))
+    if is_foreign and capture.label not in file_states(out):  # else it was a sidecar
         return paths.sidecar
     known = {paths.folder / part.file for part in listed}
     enabled = [product for product in PRODUCTS if product.is_enabled(settings)]
