@@ -23,8 +23,9 @@ from typer.core import TyperCommand
 from typer.models import OptionInfo
 
 from agalign.cli.terminal import Terminal, exits
-from agalign.errors import ConfigurationError
+from agalign.errors import ConfigurationError, WorkerError
 from agalign.host.files import path_problem, read_regular
+from agalign.host.processes import address_space_problem
 from agalign.host.text import did_you_mean
 
 if TYPE_CHECKING:
@@ -163,6 +164,8 @@ class Command:
             terminal = Terminal(**{name: values.pop(name, False) for name in _TERMINAL})
             with exits(terminal, self.on_interrupt, values.get("config")):
                 _check_paths(values.values())
+                if "device" in fields and (problem := address_space_problem()):
+                    raise WorkerError(problem)
                 given: Given = {}
                 for name in fields:
                     _store(field_options()[name], values.pop(name), given)

@@ -87,6 +87,25 @@ def memory_limit_bytes(root: Path = _CGROUPS, own: Path = _OWN_CGROUP) -> float:
     return min((float(text) for text in texts if text.isdecimal()), default=math.inf)
 
 
+_MIN_ADDRESS_SPACE = 2_000_000_000
+"""Bytes that the libraries of a run need for their code, threads and arrays. With less, some of them end the process
+or wait for ever."""
+
+
+def address_space_problem() -> str:
+    """Return why a run cannot start if its address space is limited too much, and the remedy; empty if it can."""
+    try:
+        import resource
+    except ImportError:  # other systems have no such limit
+        return ""
+    limit, _ = resource.getrlimit(resource.RLIMIT_AS)
+    if limit == resource.RLIM_INFINITY or limit >= _MIN_ADDRESS_SPACE:
+        return ""
+    needed = _MIN_ADDRESS_SPACE / 1e9
+    what = f"the address space is limited to {limit / 1e9:.1f} GB, and aligning needs {needed:g} GB"
+    return f"out of memory: {what}; raise the limit (ulimit -v unlimited)"
+
+
 # ---- workers
 
 

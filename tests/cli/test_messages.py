@@ -6,6 +6,8 @@ import os
 import re
 import shutil
 import signal
+import subprocess
+import sys
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import get_args
@@ -126,6 +128,18 @@ def test_a_path_that_is_not_local_or_too_long_is_one_line(
     assert re.search(rf"^agalign: .*({said}).*\n$", done.stderr), done.stderr
     assert len(done.stderr) < 500
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="other systems do not limit the address space")
+def test_a_limited_address_space_is_one_line(flight: Path, tmp_path: Path) -> None:
+    """With 1.2 GB, the libraries of a run print many lines and end the process."""
+    command = 'ulimit -v 1200000; exec "$0" -m agalign "$1" -o "$2"'
+    arguments = ["sh", "-c", command, sys.executable, str(flight), str(tmp_path / "out")]
+    done = subprocess.run(arguments, capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stdout) == (1, "")
+    said = "out of memory: the address space is limited to 1.2 GB, and aligning needs 2 GB; raise the limit"
+    assert done.stderr == f"agalign: {said} (ulimit -v unlimited)\n"
+    assert not (tmp_path / "out").exists()
 
 
 def test_a_folder_whose_default_output_has_too_long_a_name_is_one_line(flight: Path, tmp_path: Path) -> None:
