@@ -56,6 +56,7 @@ if TYPE_CHECKING:
     from agalign.values.alignment import Seed as Seed
     from agalign.values.capture import Capture as Capture
     from agalign.values.mapping_error import MappingError as MappingError
+    from agalign.values.moved_area import MovedArea as MovedArea
     from agalign.values.residual import Residual as Residual
 
 _NAMES = {
@@ -74,6 +75,7 @@ _NAMES = {
     "values.alignment": "Alignment Prediction Seed",
     "values.capture": "Capture",
     "values.mapping_error": "MappingError",
+    "values.moved_area": "MovedArea",
     "values.residual": "Residual",
 }
 """Public names by module. A module is imported at the first use of one of its names (PEP 562): torch takes seconds."""

@@ -21,8 +21,8 @@ from .builders import joint_result, residual_of
 FUNCTIONS = "align align_capture align_folder dask_executor discover export indices onto open_capture open_flight"
 FUNCTIONS += " read_alignment warp_onto"
 SETTINGS = "CheckSettings FlightSettings JointSettings ReliefSettings SeedSettings Settings WriteSettings"
-RESULTS = "Alignment Capture CaptureReport ExportReport FlightReports FolderScan IndexReport MappingError Prediction"
-RESULTS += " Residual Seed"
+RESULTS = "Alignment Capture CaptureReport ExportReport FlightReports FolderScan IndexReport MappingError MovedArea"
+RESULTS += " Prediction Residual Seed"
 OPTIONS = "DiscoverOptions RunOptions"
 ERRORS = """AgalignError ConfigurationError GeometryError InputError NoContrastError NoSuchBandError
 NotEnoughTextureError OutputError SidecarError UnreadableFileError WorkerError"""
