@@ -20,7 +20,7 @@ from agalign.flight.fingerprint import RENDER_STAGES, render_fingerprint
 from agalign.flight.footprint import accuracy_of_footprint_m, footprint, with_assumed_height
 from agalign.pixels.raster import ReadTile, read_tile
 from agalign.rasters.aligned_files import BandFiles, Stack
-from agalign.rasters.alignment_maps import ReliefMap, share_over_1_px
+from agalign.rasters.alignment_maps import ReliefMap, moved_share, share_over_1_px
 from agalign.rasters.output_grid import FlightLimits, output_layers
 from agalign.rasters.parallax_file import read_relief
 from agalign.rasters.preview import preview_bytes
@@ -205,12 +205,13 @@ def _bands(context: ProductContext) -> list[BandResult]:
     relief = next((context.paths.relative(f.path) for f in context.written if f.kind == ReliefMap.kind), None)
     result = []
     for band in context.sidecar.bands:
-        facts: dict[str, Any] = {"place": None, "saturated": saturated.get(band.band), "share_over_1_px": None}
+        facts: dict[str, Any] = {"place": None, "saturated": saturated.get(band.band)}
+        facts |= {"share_over_1_px": None, "moved_share": None}
         if (place := context.places.get(band.band)) is not None:  # None if all pixels are nodata
             facts["place"] = PlacePart(file=context.paths.relative(place[0].path), band_index=place[1])
             if band.band in context.with_pixels:
-                alignment = context.with_pixels[band.band]
-                facts["share_over_1_px"] = share_over_1_px(alignment, context.capture.reference, context.grid)
+                of_band = context.with_pixels[band.band], context.capture.reference, context.grid
+                facts |= {"share_over_1_px": share_over_1_px(*of_band), "moved_share": moved_share(*of_band)}
         if band.relief is not None:
             facts["relief"] = band.relief.model_copy(update={"file": relief})
         result.append(band.model_copy(update=facts))

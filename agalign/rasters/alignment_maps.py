@@ -76,7 +76,18 @@ def error_lattice_px(alignment: Alignment, reference: Band, grid: OutputGrid, st
 
 def share_over_1_px(alignment: Alignment, reference: Band, grid: OutputGrid) -> float:
     """Return the share of a grid where the expected error exceeds 1 px, or is unknown, as the quality raster flags."""
+    error = error_map(alignment, reference, grid)
+    if error is not None and error.error.moved:  # a lattice would miss most of a small area
+        return float((error.on_tile(Tile(0, 0, grid.width, grid.height)) > 1.0).mean())
     return float((~(error_lattice_px(alignment, reference, grid, _SHARE_LATTICE_PX) <= 1.0)).mean())
+
+
+def moved_share(alignment: Alignment, reference: Band, grid: OutputGrid) -> float:
+    """Return the share of a grid in areas that moved, as the quality raster flags them."""
+    error = error_map(alignment, reference, grid)
+    if error is None or not error.error.moved:
+        return 0.0
+    return float((error.moved_px(Tile(0, 0, grid.width, grid.height)) > 0).mean())
 
 
 def _error_px(alignment: Alignment, reference: Band, grid: OutputGrid) -> NDArray[np.float32]:
@@ -134,6 +145,7 @@ def _flags(
         error_px = np.full((tile.height, tile.width), np.inf) if error is None else error.on_tile(on_grid)
         masks[Quality.ERROR_OVER_HALF_PX] = error_px > 0.5
         masks[Quality.ERROR_OVER_1_PX] = error_px > 1.0
+        masks[Quality.MOVED] = np.zeros_like(error_px, bool) if error is None else error.moved_px(on_grid) > 0
     for flag, mask in masks.items():
         result[mask] |= flag.value
     return result

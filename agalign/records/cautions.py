@@ -24,6 +24,9 @@ MAX_PIXEL_ERROR_PX = 1.0
 """Beyond it, a spectral index mixes neighbouring plants."""
 MIN_SHARE_OVER_1_PX = 0.01
 """Share of the pixels of a band that may be off by more; smaller shares are at its edges."""
+_MIN_MOVED_SHARE = 0.001
+"""Share of the pixels of a band in areas that moved: one object of 35 px in a RedEdge. In ten real flights without a
+moving object, no band has any."""
 _MIN_OFF_STD = 3.0
 """Distance from the prediction relative to its standard error: normal errors are larger in 1 % of the bands."""
 _MAX_SATURATED_SHARE = 0.005
@@ -43,6 +46,10 @@ BLURRED = Remedy(
 _INACCURATE = Remedy(
     "a part of the image may be off by more than 1 px",
     "look at the error map (--error-map); --qa and then 'agalign indices --mask-qa' leave these pixels out",
+)
+_MOVED = Remedy(
+    "a part of the image shows something that moved between the exposures or is near the camera, and is displaced",
+    "--qa and then 'agalign indices --mask-qa' leave these pixels out; --error-map shows by how much it is displaced",
 )
 _CONTRADICTION = (
     "calibration panel and light sensor contradict each other: one was in other light, or is wrong in a band"
@@ -226,7 +233,11 @@ def _of_factors(radiometry: BandRadiometryPart) -> Iterator[Caution]:
 
 def _of_alignment(band: BandResult, sidecar: Sidecar) -> Iterator[Caution]:
     """The cautions about the position of a band."""
-    over_1_px = band.share_over_1_px or 0.0
+    moved = band.moved_share or 0.0
+    over_1_px = max(0.0, (band.share_over_1_px or 0.0) - moved)
+    if moved > _MIN_MOVED_SHARE:
+        reason = f"{moved:.1%} of it shows something that moved or is near"
+        yield Caution(band.band, "check", _MOVED, reason, moved, moved, "up to {:.1%} of a band")
     if band.status != "aligned":
         lost, size, size_text = 1.0, math.nan, ""
         remedy = remedy_of(band, is_mosaic=sidecar.reference.georeferenced)

@@ -46,6 +46,7 @@ from agalign.values.issues import MISSING_BAND, Issue
 from agalign.values.lens import Lens
 from agalign.values.mapping import DisplacementField, PixelMapping
 from agalign.values.mapping_error import MappingError
+from agalign.values.moved_area import MovedArea
 from agalign.values.parallax import Parallax, Relief
 from agalign.values.pixel_units import PixelScale, Size
 from agalign.values.radiometry import RadiometricError
@@ -195,7 +196,7 @@ class ErrorPart(_Part):
     """
 
     std_px: Number4
-    """Standard error: RMS of the expected error over the area that both images show."""
+    """Standard error: RMS of the expected error over the area that both images show, without the shifts of `moved`."""
     covariance_px2: Annotated[NDArray[np.float64], Array((None, None), COVARIANCE_DECIMALS)] | None = None
     """Covariance of the corners (8 x 8), clockwise from the top left, x and y in turn, or with lens shapes (12 x 12);
     null for a prediction by other bands or captures, whose windows are no part of the error."""
@@ -207,6 +208,8 @@ class ErrorPart(_Part):
     """Spread of the displacement field."""
     relief_std_px: Number4 = 0.0
     """Spread of the parallax that a mapping without it lacks, where no window is near."""
+    moved: tuple[MovedArea, ...] = ()
+    """Areas that contradict the mapping: what they show moved between the exposures, or is near the camera."""
 
     @field_validator("covariance_px2")
     @classmethod
@@ -228,6 +231,7 @@ class ErrorPart(_Part):
             lens_std_px=error.lens_std_px,
             field_std_px=error.field_std_px,
             relief_std_px=error.relief_std_px,
+            moved=error.moved,
         )
 
     def mapping_error(self, size_px: Size, windows: Residual | None, parallax: Parallax | None) -> MappingError:
@@ -241,6 +245,7 @@ class ErrorPart(_Part):
             self.field_std_px,
             self.relief_std_px,
             parallax,
+            self.moved,
         )
 
 
@@ -305,6 +310,8 @@ class BandResult(_Part):
     """Rows at the end of the file without pixels, as an incomplete transfer leaves them; they are nodata."""
     share_over_1_px: Number4 | None = None
     """Share of the pixels of the output whose expected error exceeds 1 px of the reference or is unknown."""
+    moved_share: Number4 | None = None
+    """Share of the pixels of the output in areas that moved."""
     seconds: Number3
     """Share of the capture's processing time."""
 

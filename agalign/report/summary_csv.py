@@ -29,6 +29,7 @@ BAND_COLUMNS = {
     **{f"{name}_{when}": f"metrics.{when}.{name}" for name in SIMILARITY for when in ("before", "after")},
     "expected_error_px": "error.std_px",
     "share_over_1_px": "share_over_1_px",
+    "moved_share": "moved_share",
     "seconds": "seconds",
 }
 """Field of a band in the sidecar by column of OUT/summary.csv."""

@@ -251,7 +251,7 @@ class Alignment:
     """What the error of the mapping is made of; None for `seed_only` and `failed`, whose error is unknown."""
     std_px: float = math.inf
     """Standard error: the RMS of `error_px` over the area that both images show, px of the reference; infinite if it is
-    unknown."""
+    unknown. The shifts of areas that moved (`error.moved`) are no part of it."""
     moving_size_px: Size | None = None
     """(width, height) of the moving image; None if it is not known, as in sidecars of earlier versions."""
 
@@ -411,8 +411,8 @@ class Alignment:
     def error_px(self, reference_px: "ArrayLike") -> NDArray[np.float64]:
         """Return the expected error at positions in the reference.
 
-        `std_px` is its RMS over the area that both images show; the limits of `aligned`, the error map and the quality
-        flags are limits of it.
+        `std_px` is its RMS over the area that both images show, without the shifts of areas that moved (`error.moved`);
+        the limits of `aligned`, the error map and the quality flags are limits of it.
 
         Parameters
         ----------
@@ -447,7 +447,8 @@ class Alignment:
     def error_map_px(self) -> FloatImage:
         """The expected error at every pixel of the reference: (height, width), float32.
 
-        It is `error_px`, but for the part of the parallax at nodes every 16 px, between which it is linear.
+        It is `error_px`, but for the parts of the parallax and of what moved at nodes every 16 px, between which it is
+        linear.
 
         Examples
         --------

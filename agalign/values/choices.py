@@ -54,6 +54,8 @@ class Quality(IntFlag):
     """The expected error exceeds 1 px of the reference, or is unknown."""
     MISSING = 256  # 128 is not used: other programs read these values
     """The band could not be aligned and has no pixels."""
+    MOVED = 512
+    """The band shows something that moved between the exposures, or is near the camera: it contradicts the mapping."""
 
 
 QUALITY_MEANINGS = " ".join(str(flag.name).lower() for flag in Quality)

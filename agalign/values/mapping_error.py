@@ -16,6 +16,7 @@ from agalign.values import geometry
 from agalign.values.geometry import PairScales, Points
 from agalign.values.image import FloatImage, Tile
 from agalign.values.lens_shapes import lens_shapes, shift_variance_px2, variance_px2
+from agalign.values.moved_area import MovedArea, moved_px
 from agalign.values.parallax import Parallax
 from agalign.values.pixel_units import Size
 from agalign.values.resampling import between_nodes, nodes_along
@@ -32,11 +33,12 @@ _FAR_SPACINGS = 3.0
 class MappingError:
     """What the error of one mapping is made of, px of the reference.
 
-        error(x)^2 = rig^2 + trace(D(x) C D(x)^T) (1 + 11 far(x)) + far(x) (field^2 + relief^2) + max(u(x)^2, z(x)^2)
+        error(x)^2 = rig^2 + trace(D(x) C D(x)^T) (1 + 11 far(x)) + far(x) (field^2 + relief^2)
+                     + max(u(x)^2, z(x)^2, m(x)^2)
 
     D is the Jacobian `lens_shapes.jacobian`, far(x) rises from 0 within one spacing of the measured windows to 1, u is
     the displacement that the mapping does not contain, by the residual shifts of the nearest windows beyond their
-    noise, and z the standard error of the parallax times the baseline.
+    noise, z the standard error of the parallax times the baseline, and m the shift of an area that moved.
 
     Examples
     --------
@@ -66,6 +68,8 @@ class MappingError:
     """Spread of the relief, which a mapping without one lacks where no window is near."""
     parallax: Parallax | None = None
     """Parallax of the mapping, with its standard error."""
+    moved: tuple[MovedArea, ...] = ()
+    """Areas that contradict the mapping: what they show moved between the exposures, or is near the camera."""
 
     def error_px(self, points_px: Points) -> NDArray[np.float64]:
         """Return the expected RMS error at points of the reference.
@@ -88,11 +92,12 @@ class MappingError:
         (1,)
         """
         z_px2 = np.zeros(len(points_px)) if self.parallax is None else self.parallax.variance_px2(points_px)
+        local_px2 = np.maximum(z_px2, np.square(moved_px(self.moved, *points_px.T)))
         modelled_px2, unmodelled_px2 = self.smooth_px2(points_px)
-        return np.asarray(np.sqrt(modelled_px2 + np.maximum(unmodelled_px2, z_px2)))
+        return np.asarray(np.sqrt(modelled_px2 + np.maximum(unmodelled_px2, local_px2)))
 
     def smooth_px2(self, points_px: Points) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return the parts (n,) of the square that vary smoothly: all but u and z, and u, at points (n, 2)."""
+        """Return the parts (n,) of the square that vary smoothly: all but u, z and m, and u, at points (n, 2)."""
         far = self._far(points_px)
         modelled_px2 = self.rig_std_px**2 + self._covariance_px2(points_px) * (1 + far * (_COMMON_ERROR_FACTOR - 1))
         modelled_px2 = modelled_px2 + far * (self.field_std_px**2 + self.relief_std_px**2)
@@ -100,7 +105,7 @@ class MappingError:
         return modelled_px2, self._unmodelled_px2(points_px, far)
 
     def rms_px(self, points_px: Points) -> float:
-        """Return the RMS of the expected error over points: the standard error of the mapping there.
+        """Return the RMS of the expected error over points, without the shifts of `moved`: the standard error there.
 
         Parameters
         ----------
@@ -119,7 +124,8 @@ class MappingError:
         >>> result.error.rms_px(np.array([[20.0, 20.0], [180.0, 180.0]])) < 0.2
         True
         """
-        return float(np.sqrt(np.square(self.error_px(points_px)).mean())) if len(points_px) else math.inf
+        still = replace(self, moved=()) if self.moved else self
+        return float(np.sqrt(np.square(still.error_px(points_px)).mean())) if len(points_px) else math.inf
 
     def distortion_px(self, points_px: Points) -> float:
         """Return the RMS over points (n, 2) of the error by corners and lenses alone, as if no window were far."""
@@ -141,6 +147,7 @@ class MappingError:
             field_std_px=self.field_std_px * up.mean,
             relief_std_px=self.relief_std_px * up.mean,
             parallax=parallax,
+            moved=tuple(area.rescaled(up) for area in self.moved),
         )
 
     @cached_property
@@ -227,7 +234,9 @@ class MappingError:
 
 @dataclass(frozen=True)
 class ErrorOnGrid:
-    """The expected error at the pixels of a grid: its smooth parts at nodes, that of the parallax at each pixel."""
+    """The expected error at the pixels of a grid: its smooth parts at nodes, those of the parallax and of areas that
+    moved at each pixel.
+    """
 
     error: MappingError
     size_px: Size
@@ -259,16 +268,36 @@ class ErrorOnGrid:
         modelled_px2, unmodelled_px2 = (between_nodes(plane, self.size_px, tile) for plane in self.nodes_px2)
         if self.error.parallax is not None:
             unmodelled_px2 = np.maximum(unmodelled_px2, self._z_px2(self.error.parallax, tile))
+        if self.error.moved:
+            unmodelled_px2 = np.maximum(unmodelled_px2, np.square(self.moved_px(tile)))
         return np.asarray(np.sqrt(modelled_px2 + unmodelled_px2), np.float32)
 
-    def _z_px2(self, parallax: Parallax, tile: Tile) -> FloatImage:
-        x_px, y_px = np.arange(tile.x0, tile.x0 + tile.width), np.arange(tile.y0, tile.y0 + tile.height)
+    def moved_px(self, tile: Tile) -> FloatImage:
+        """Return the shift (height, width) of the areas that moved on a tile of the grid, px of the reference; 0
+        elsewhere.
+        """
+        if not self.error.moved:
+            return np.zeros((tile.height, tile.width), np.float32)
         if self.is_along_axes:
-            columns = self.to_reference(np.stack([x_px, np.zeros(tile.width)], axis=-1))[:, 0]
-            rows = self.to_reference(np.stack([np.zeros(tile.height), y_px], axis=-1))[:, 1]
-            return parallax.variance_at_crossings(columns, rows)
-        points_px = self.to_reference(np.stack(np.meshgrid(x_px, y_px), axis=-1).reshape(-1, 2).astype(np.float64))
-        return np.asarray(parallax.variance_px2(points_px).reshape(tile.height, tile.width), np.float32)
+            columns, rows = self._crossings(tile)
+            return moved_px(self.error.moved, columns, rows[:, None])
+        return moved_px(self.error.moved, *self._points(tile).T).reshape(tile.height, tile.width)
+
+    def _z_px2(self, parallax: Parallax, tile: Tile) -> FloatImage:
+        if self.is_along_axes:
+            return parallax.variance_at_crossings(*self._crossings(tile))
+        return np.asarray(parallax.variance_px2(self._points(tile)).reshape(tile.height, tile.width), np.float32)
+
+    def _crossings(self, tile: Tile) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return x of the columns and y of the rows of a tile in the reference, for a grid along its axes."""
+        x_px, y_px = (np.arange(first, first + n) for first, n in ((tile.x0, tile.width), (tile.y0, tile.height)))
+        columns = self.to_reference(np.stack([x_px, np.zeros(tile.width)], axis=-1))[:, 0]
+        return columns, self.to_reference(np.stack([np.zeros(tile.height), y_px], axis=-1))[:, 1]
+
+    def _points(self, tile: Tile) -> Points:
+        """Return the positions (n, 2) of the pixels of a tile in the reference, row by row."""
+        x_px, y_px = (np.arange(first, first + n) for first, n in ((tile.x0, tile.width), (tile.y0, tile.height)))
+        return self.to_reference(np.stack(np.meshgrid(x_px, y_px), axis=-1).reshape(-1, 2).astype(np.float64))
 
 
 def _scaled(covariance: NDArray[np.float64] | None, per_parameter: NDArray[np.float64]) -> NDArray[np.float64] | None:

@@ -10,7 +10,7 @@ import pytest
 import rasterio
 
 import agalign
-from agalign.rasters.alignment_maps import _flags, error_map
+from agalign.rasters.alignment_maps import _flags, error_map, moved_share, share_over_1_px
 from agalign.rasters.output_grid import Layer
 from agalign.records.captures import bands_of
 from agalign.records.sidecar_file import read_without_tables
@@ -19,10 +19,12 @@ from agalign.spectral_indices.rasters import write_rasters
 from agalign.values import geometry, lens
 from agalign.values.capture import Band
 from agalign.values.choices import UNUSABLE_QUALITY, Quality
-from agalign.values.image import OutputGrid
+from agalign.values.image import OutputGrid, Tile
 from agalign.values.lens import Lens
 from agalign.values.mapping import PixelMapping
 from agalign.values.mapping_error import ErrorOnGrid, MappingError
+from agalign.values.moved_area import MovedArea
+from agalign.values.pixel_units import PixelScale
 
 from ..builders import residual_of
 from ..conftest import Shared, seeded, write_band
@@ -84,6 +86,49 @@ def test_expected_errors_and_predictions_are_flagged_and_an_unknown_error_is_a_l
     assert UNUSABLE_QUALITY & Quality.MISSING
 
 
+def area(left: int, top: int, right: int, bottom: int, shift_px: tuple[float, float]) -> MovedArea:
+    """A rectangle up to and with the last column and row."""
+    return MovedArea(np.array([[left, top], [right, top], [right, bottom], [left, bottom]], float), shift_px)
+
+
+def test_areas_that_moved_are_flagged_and_have_their_shift_as_error_on_every_grid(tmp_path: Path) -> None:
+    size_px = 80, 60
+    reference = band(tmp_path / "a.tif")
+    moved = area(10, 20, 29, 39, (3.0, 4.0))
+    alignment = aligned(
+        PixelMapping(geometry.identity()), size_px, error=MappingError(size_px, rig_std_px=0.1, moved=(moved,))
+    )
+    error = error_map(alignment, reference, GRID)
+    flags = flags_of(Layer(reference, PixelMapping(geometry.identity())), {"NIR": error})
+    expected = np.zeros((40, 60), bool)
+    expected[18:38, 6:26] = True  # the grid begins at (4, 2)
+    assert np.array_equal(flags & Quality.MOVED > 0, expected)
+    assert np.array_equal(flags & Quality.ERROR_OVER_1_PX > 0, expected)
+    np.testing.assert_allclose(error.on_tile(Tile(0, 0, 60, 40)), np.where(expected, np.hypot(5, 0.1), 0.1), rtol=1e-5)
+    assert UNUSABLE_QUALITY & Quality.MOVED
+    for share in (moved_share, share_over_1_px):
+        assert share(alignment, reference, GRID) == expected.mean()
+    double = OutputGrid(0, 0, 160, 120, PixelScale(2.0, 2.0))
+    assert moved_share(alignment, reference, double) == pytest.approx(400 / 4800)
+    still = aligned(PixelMapping(geometry.identity()), size_px, error=MappingError(size_px))
+    assert moved_share(still, reference, GRID) == 0.0
+
+
+def test_an_area_that_moved_is_where_an_undistorted_grid_shows_it() -> None:
+    size_px = 640, 480
+    lens_of_reference = Lens(600, 600, 320, 240, (-0.1, 0.0, 0.0, 0.0, 0.0))
+    reference = Band("Green", Path(), 1, *size_px, "uint16", lens=lens_of_reference)
+    moved = area(40, 30, 99, 89, (9.0, 0.0))
+    error = MappingError(size_px, moved=(moved,))
+    mapping = PixelMapping(geometry.identity(), lens_of_reference, lens_of_reference)
+    grid = OutputGrid(0, 0, *size_px, undistorted=True)
+    flagged = error_map(aligned(mapping, size_px, error=error), reference, grid).moved_px(Tile(0, 0, *size_px)) > 0
+    rows, columns = np.nonzero(flagged)
+    centre_px = lens.distort(lens_of_reference, np.array([columns.mean(), rows.mean()]))
+    np.testing.assert_allclose(centre_px, [69.5, 59.5], atol=0.5)
+    assert np.hypot(columns.mean() - 69.5, rows.mean() - 59.5) > 5
+
+
 def test_the_error_of_an_undistorted_pixel_is_that_of_its_raw_one() -> None:
     """At the corner, 12 px from it."""
     size_px = 640, 480
@@ -121,7 +166,7 @@ def test_a_run_writes_flags_with_their_meaning_for_every_band_of_the_stack(sidec
         assert raster.shape == stack.shape
         tags, flags, pixels = raster.tags(), raster.read(), stack.read()
     masks = [int(m) for m in tags["flag_masks"].split(", ")]
-    assert masks == [1, 2, 4, 8, 16, 32, 64, 256]
+    assert masks == [1, 2, 4, 8, 16, 32, 64, 256, 512]
     assert tags["flag_meanings"].split() == [str(Quality(m).name).lower() for m in masks]
     assert np.array_equal(flags[0], np.bitwise_or.reduce(flags[1:]))
     # Whatever is outside is nodata in the stack, and the reverse.

@@ -64,7 +64,7 @@ OUTPUT = {"file": "a.tif", "crop": (0, 0, 10, 8), "nodata": None}
 
 
 def test_a_good_band_needs_no_check() -> None:
-    good = {"prediction": prediction(0.1, 0.2), "share_over_1_px": 0.005, "saturated": 0.001}
+    good = {"prediction": prediction(0.1, 0.2), "share_over_1_px": 0.005, "saturated": 0.001, "moved_share": 0.0005}
     output = OUTPUT | {"radiometry": "reflectance by panel", "panel_age_s": 600.0}
     assert cautions(good, output=output) == []
 
@@ -73,6 +73,9 @@ def test_a_good_band_needs_no_check() -> None:
     ("band", "reason", "lost", "size"),
     [
         ({"share_over_1_px": 0.25}, "25% of the pixels may be off by more than 1 px", 0.25, "up to 25% of a band"),
+        ({"moved_share": 0.007}, "0.7% of it shows something that moved or is near", 0.007, "up to 0.7% of a band"),
+        # What moved is not said again as a large error.
+        ({"moved_share": 0.04, "share_over_1_px": 0.045}, "4.0% of it shows", 0.04, "up to 4.0% of a band"),
         ({"saturated": 0.125}, "12.5% of the pixels are saturated", 0.125, "up to 12.5% of a band"),
         ({"prediction": prediction(0.1, 7.42)}, "its own image is aligned 7.4 px from", 0.5, "up to 7.4 px"),
         ({"status": "failed", "reason": "it is blank", "issues": issue("coverage")}, "it is blank", 1.0, ""),

@@ -24,7 +24,10 @@ from agalign.values.capture import Band, Capture
 from agalign.values.choices import ReliefUse
 from agalign.values.geometry import Matrix
 from agalign.values.issues import CLOSE_WINDOWS, Issue
+from agalign.values.mapping import PixelMapping
 from agalign.values.mapping_error import MappingError
+from agalign.values.moved_area import MovedArea
+from agalign.values.pixel_units import PixelScale
 
 from ..builders import decided, in_full_run, joint_result, pair_of, residual_of, texture
 from ..capture.test_by_relief import REFERENCE, Rendered
@@ -167,3 +170,18 @@ def test_a_band_is_delivered_by_the_standard_error_that_is_written(
     assert again.prediction.std_px == estimated.prediction.std_px
     assert again.status == estimated.status == written.status == "predicted"
     assert [known.is_usable(accept_px) for known in (estimated, written, again)] == [is_usable] * 3
+
+
+def test_areas_that_moved_are_equal_in_the_run_and_in_its_sidecar() -> None:
+    outline_px = np.array([[3.0, 4.0], [27.0, 4.0], [27.0, 31.0]])
+    area = MovedArea(outline_px, (8.123456, -1.0)).rescaled(PixelScale(1.7, 1.7))
+    error = MappingError((64, 48), np.zeros((8, 8)), moved=(area,))
+    seed = Seed("rig", np.eye(3), 30.0)
+    estimated = agalign.Alignment(PixelMapping(np.eye(3)), (64, 48), (), seed, error=error, std_px=0.1)
+    reference, nir = (Band(name, Path(f"{name}.tif"), 1, 64, 48, "uint16") for name in ("Green", "NIR"))
+    capture = Capture("a", Path(), (reference, nir), 0)
+    written = BandResult.model_validate_json(BandResult.of(nir, estimated, capture).model_dump_json(by_alias=True))
+    again = written.alignment((64, 48), None)
+    assert again.error.moved == (area,)
+    assert np.array_equal(again.error_map_px, estimated.error_map_px)
+    assert again.error_map_px.max() == pytest.approx(1.7 * np.hypot(8.123456, 1.0), abs=1e-3)

@@ -10,6 +10,7 @@ from agalign.values.geometry import PairScales
 from agalign.values.image import Tile
 from agalign.values.lens_shapes import lens_std_px
 from agalign.values.mapping_error import ErrorOnGrid, MappingError
+from agalign.values.moved_area import MovedArea
 from agalign.values.parallax import Parallax, Relief
 from agalign.values.pixel_units import PixelScale
 from agalign.values.residual import Residual
@@ -58,6 +59,24 @@ def test_the_error_far_from_windows_is_that_of_unknown_lenses_of_the_field_and_o
     for point, expected in ((far, added_px or 0.4), (near, 0.0 if added_px else 0.4)):
         added_px2 = expected_px(with_facts, *point) ** 2 - expected_px(half, *point) ** 2
         assert added_px2 == pytest.approx(expected**2, abs=1e-9)
+
+
+def test_what_moved_raises_the_error_there_and_no_standard_error() -> None:
+    still = error_of([0.1] * 4, None)
+    small, large = (
+        MovedArea(np.array([[100.0, 80], [n, 80], [n, 180], [100, 180]]), (m, 0.0))
+        for n, m in ((200.0, 9.0), (140.0, -20.0))
+    )
+    moved = replace(still, moved=(large, small))  # where areas overlap, the longest shift counts
+    for point, shift_px in (((150.0, 100.0), 9.0), ((120.0, 100.0), 20.0), ((99.0, 100.0), 0.0)):
+        added_px2 = expected_px(moved, *point) ** 2 - expected_px(still, *point) ** 2
+        assert added_px2 == pytest.approx(shift_px**2)
+    assert moved.rms_px(PIXELS) == still.rms_px(PIXELS)
+    on_grid = ErrorOnGrid.of(moved, SIZE).on_tile(Tile(90, 70, 120, 50))
+    points_px = geometry.lattice(120, 50, 120, 50) + np.array([90, 70])
+    np.testing.assert_allclose(on_grid.ravel(), moved.error_px(points_px), atol=0.01)
+    at_double = moved.in_file_px(PairScales(HALF, SAME), (1280, 960), None)
+    assert expected_px(at_double, 300.5, 200.5) == pytest.approx(2 * expected_px(moved, 150.0, 100.0), rel=1e-3)
 
 
 def test_a_single_wrong_peak_is_no_error_and_noise_is_subtracted() -> None:
