@@ -7,6 +7,9 @@ and workers do not copy the memory pages of these objects.
 import gc
 from importlib import import_module
 
+from agalign.host.processes import leave_out_network_clients
+
+leave_out_network_clients()
 gc.disable()
 try:
     import_module("agalign.batch.run")

@@ -40,7 +40,7 @@ from agalign.flight.sky import SkyCapture
 from agalign.host.files import check_inside, path_problem, written_below
 from agalign.host.output_folder import is_full, locked
 from agalign.host.processes import usable_cores
-from agalign.host.text import counted
+from agalign.host.text import counted, name_problem
 from agalign.method.device import choose_device, limit_threads
 from agalign.rasters.output_grid import FlightLimits, common_grid, flight_limits
 from agalign.rasters.preview import preview_bytes
@@ -231,7 +231,7 @@ class _FlightRun:
 
     def check(self) -> None:
         """Raise ConfigurationError for a device, an index or an output folder that cannot be used."""
-        if problem := path_problem(self.out):
+        if not name_problem(self.out) and (problem := path_problem(self.out)):
             raise ConfigurationError(f"{problem}, or choose another output folder with -o")
         choose_device(self.settings.joint.device)
         check_indices(self.flight.captures, self.settings.write)

@@ -18,7 +18,7 @@ from agalign.cli.exit_codes import ExitCode
 from agalign.cli.info import info
 from agalign.cli.results import export, indices, report, verify
 from agalign.cli.terminal import Terminal, options_from, printed
-from agalign.host.processes import limit_default_threads, silence_libraries
+from agalign.host.processes import leave_out_network_clients, limit_default_threads, silence_libraries
 from agalign.host.text import did_you_mean, name_problem
 
 ndvi = replace(indices, alias="ndvi")
@@ -127,6 +127,7 @@ def main() -> None:
     # The matrices here are small: a second BLAS thread only spins.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     limit_default_threads()
+    leave_out_network_clients()
     silence_libraries()
     with printed():
         try:

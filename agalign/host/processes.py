@@ -109,6 +109,14 @@ def address_space_problem() -> str:
 # ---- workers
 
 
+def leave_out_network_clients() -> None:
+    """Make rasterio do without the client for buckets, if that is installed: its import opens a socket.
+
+    Call it before rasterio is imported, in processes of the command line only.
+    """
+    sys.modules.setdefault("boto3", None)  # type: ignore[arg-type]
+
+
 def silence_libraries() -> None:
     """Drop what libraries log about damaged files: it is raised as an error too, or the file can be used."""
     for name in ("rasterio", "tifffile"):

@@ -1,6 +1,9 @@
 """Limits of the system and of containers: cores and memory."""
 
 import math
+import subprocess
+import sys
+from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
@@ -66,3 +69,17 @@ def test_a_part_of_a_core_counts_as_one(monkeypatch: pytest.MonkeyPatch, quota: 
 @pytest.mark.parametrize("text", ["can't start new thread", "could not create a primitive"])
 def test_what_libraries_raise_when_memory_is_short(text: str) -> None:
     assert is_out_of_memory(RuntimeError(text))
+
+
+@pytest.mark.skipif(find_spec("boto3") is None, reason="boto3 is not installed")
+@pytest.mark.parametrize("module", ["agalign.batch.preload", "agalign.cli.main"])
+def test_no_command_opens_a_socket(module: str) -> None:
+    code = (
+        "import importlib, os, socket, sys\n"
+        "socket.socket.__init__ = lambda *_, **__: os._exit(9)\n"
+        "sys.argv = ['agalign', 'report', 'nowhere']\n"
+        f"module = importlib.import_module('{module}')\n"
+        "if hasattr(module, 'main'): module.main()\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert done.returncode == ("main" in module), done.stderr
