@@ -81,8 +81,10 @@ class _Pair:
     def of(cls, fixed: Field, moving: Field, valid: Mask) -> "_Pair | None":
         """Measure the agreement of two fields (height, width); None if that of the whole pair is low."""
         height, width = (n - n % _CELL_PX for n in valid.shape)
-        planes = _planes(fixed[:height, :width]), _planes(moving[:height, :width])
-        is_known = _cells(valid[:height, :width].astype(np.float32))
+        inside = cv2.erode(valid[:height, :width].astype(np.uint8), np.ones((3, 3), np.uint8))
+        known = cv2.copyTo(moving[:height, :width].view(np.float64), inside)  # 64 bits: both parts of a pixel
+        planes = _planes(fixed[:height, :width]), known.view(np.float32).reshape(height, width, 2)
+        is_known = _cells(inside.astype(np.float32))
         energy, of_moving = (_box(_product(one, one) * is_known) for one in planes)
         agreement = _relative(_box(_product(planes[0], planes[1])), energy, of_moving)
         has_texture = (np.minimum(energy, of_moving) > _MIN_ENERGY) & (_box(is_known) > 0.5)
@@ -117,7 +119,8 @@ def moved_areas(fixed: Field, moving: Field, valid: Mask) -> tuple[MovedArea, ..
     Parameters
     ----------
     fixed, moving
-        (height, width): structure fields of the reference, and of the moving image under the mapping.
+        (height, width): structure fields of the reference, and of the moving image under the mapping, in which invalid
+        pixels may have any value.
     valid
         (height, width): True where both images have pixels that are not saturated.
 
@@ -154,13 +157,13 @@ def _shifted_windows(pair: _Pair, origins_px: NDArray[np.int64]) -> _Windows:
         return _Windows(origins_px, origins_px)
     fixed = _half(pair.fixed)
     moving = cv2.copyMakeBorder(_half(pair.moving), reach, reach, reach, reach, cv2.BORDER_CONSTANT)
-    of_fixed, of_moving = (cv2.blur(_squares(one), (side, side), anchor=(0, 0)) for one in (fixed, moving))
+    of_moving = cv2.blur(_squares(moving), (side, side), anchor=(0, 0))
     shifts_px, is_found = np.empty_like(origins_px), np.zeros(len(origins_px), bool)
     placements = np.s_[: 2 * reach + 1, : 2 * reach + 1]
     for i, (x, y) in enumerate((origins_px // 2).tolist()):
-        searched = moving[y : y + side + 2 * reach, x : x + side + 2 * reach]
-        surface = _correlation(fixed[y : y + side, x : x + side], searched)[placements] / np.float32(side**2)
-        surface = _relative(surface, of_fixed[y, x], of_moving[y:, x:][placements])
+        window, searched = fixed[y : y + side, x : x + side], moving[y : y + side + 2 * reach, x : x + side + 2 * reach]
+        surface = _correlation(window, searched)[placements] / np.float32(side**2)
+        surface = _relative(surface, _squares(window).mean(), of_moving[y:, x:][placements])
         row, column = divmod(int(surface.argmax()), 2 * reach + 1)
         peak = float(surface[row, column])
         near = 3  # px in which the structure of a sharp image still agrees with itself
