@@ -6,7 +6,8 @@ The first capture of the folder TARGET is aligned alone as it is, and with objec
 displaced by 2 to 36 px between the reference and the bands, at random places and in random directions, with random
 brightness, and with a contrast that may be reversed in a band. Their texture is cut from the aligned bands of the first
 capture of SOURCE, which has as many bands, or is noise, equal in all bands. An object counts as found if 70 % of its
-pixels, where the reference or the band shows it, are flagged in three of four bands.
+pixels, where the reference or the band shows it, are flagged in three of four bands. The displacement field of a
+capture without its flight may follow a large object, which is then aligned and not flagged.
 """
 
 from collections.abc import Iterator, Mapping
@@ -35,8 +36,8 @@ MIN_FOUND, MIN_BANDS = 0.7, 0.75
 """Share of the pixels of an object that must be flagged, in this share of the bands."""
 MARGIN_PX = 70
 """Between objects, and to the edges of the image."""
-ROUNDS_OF_SIZE = {220: 2}
-"""Images over which the shifts are distributed: large objects must not cover most of the image. By default 1."""
+ROUNDS_OF_SIZE = {220: 4}
+"""Images over which the shifts are distributed, by default 1: with two large objects, a band is `predicted`."""
 
 
 @dataclass(frozen=True)
@@ -165,7 +166,8 @@ def main(target: Path, source: Path, repeats: Annotated[int, typer.Option()] = 2
         elsewhere: list[float] = []
         for repeat in range(repeats * ROUNDS_OF_SIZE.get(size_px, 1)):
             rng = np.random.default_rng((size_px, repeat))
-            shifts_px = SHIFTS_PX[repeat % 2 :: 2] if size_px in ROUNDS_OF_SIZE else SHIFTS_PX
+            rounds = ROUNDS_OF_SIZE.get(size_px, 1)
+            shifts_px = SHIFTS_PX[repeat % rounds :: rounds]
             objects = objects_of(aligned, texture, size_px, shifts_px, rng)
             read = aligned.with_objects(objects, rng)
             masks = list(flagged(aligned, align_capture_bands(aligned.capture, Settings(), None, quiet, read)))
