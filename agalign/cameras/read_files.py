@@ -26,6 +26,7 @@ from agalign.cameras.pix4d import panel_in
 from agalign.cameras.tiff_directory import image_pages
 from agalign.config import DiscoverOptions
 from agalign.errors import InputError, UnreadableFileError
+from agalign.host.files import is_inside
 from agalign.host.own_files import has_mark
 from agalign.host.process_pool import ProcessPool, WorkerDiedError
 from agalign.host.processes import environment_of_children, silence_libraries
@@ -54,6 +55,8 @@ def read_files(paths: Sequence[Path], options: DiscoverOptions) -> Iterator[Imag
 
 def read_file(path: Path, cameras: Iterable[Camera], options: DiscoverOptions) -> ImageFile:
     """Return a file with its bands. Raises UnreadableFileError."""
+    if not is_inside(path.name):  # outputs are named after it, and a sidecar with such names is not read
+        raise UnreadableFileError(f"{path}: its name is an absolute path on Windows; rename it")
     pages = _stored_pages(path, options.max_pixels)
     tags = read_tags(path, pages[0][0].page)
     *_, generic = cameras

@@ -1,5 +1,6 @@
 """Which files below a folder are images to align: links, and files that programs keep beside the images."""
 
+import os
 import shutil
 from pathlib import Path
 
@@ -142,3 +143,15 @@ def test_an_image_whose_tags_name_the_program_elsewhere_is_an_image(tmp_path: Pa
     with rasterio.open(tmp_path / "f_nir.tif", "r+") as dataset:
         dataset.update_tags(TIFFTAG_SOFTWARE="Pix4D", TIFFTAG_IMAGEDESCRIPTION="for agalign")
     assert len(discover(tmp_path).captures[0].bands) == len(BANDS)
+
+
+@pytest.mark.skipif(os.name == "nt", reason="Windows has no such names")
+@pytest.mark.parametrize("name", ["C:\\f", "C:f", "\\\\host\\share\\f"])
+def test_a_file_whose_name_is_a_path_on_windows_is_named(tmp_path: Path, name: str) -> None:
+    write(tmp_path, *BANDS, *(f"{name}_{band}" for band in ("green", "nir")))
+    scan = discover(tmp_path)
+    assert labels(scan) == ["f"]
+    texts = [
+        f"{tmp_path / name}_{band}.tif: its name is an absolute path on Windows; rename it" for band in ("green", "nir")
+    ]
+    assert [p.text for p in scan.problems] == texts
