@@ -12,7 +12,7 @@ colour photograph. The bands are exposed one after another, so in motion a seed 
 
 import math
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from functools import partial
@@ -45,6 +45,8 @@ from agalign.values.radiometry import Radiometry, ReflectanceFactor
 
 _MAVIC_3_BAND = rf"{MAVIC_3_PART}|(?<=_\d{{4}})_D(?![a-z0-9])|_D$"
 NAMESPACE = "dji.com/drone-dji"
+_MAX_CENTRES_APART_PX = 5.0
+"""Between the two tags of the centre of the vignetting, which firmware writes of one number."""
 
 
 class Dji(Camera):
@@ -103,6 +105,16 @@ class Dji(Camera):
         is_on_earth = abs(latitude_deg) <= 90 and abs(longitude_deg) <= 180
         altitude_m = tags.number(NAMESPACE, "AbsoluteAltitude")
         return Position(latitude_deg, longitude_deg, altitude_m) if is_on_earth else None
+
+    def contradictions(self, tags: Tags) -> Iterator[str]:
+        """Compare what firmware writes twice: the wavelength and the model."""
+        nm, frequency = tags.number(pix4d.NAMESPACE, "CentralWavelength"), tags.text(NAMESPACE, "BandFreq")
+        of_dji = re.match(r"\d+", frequency)
+        if nm is not None and of_dji and not agreed((nm, float(of_dji[0])))[1]:
+            yield f"its CentralWavelength {nm:g} and BandFreq {frequency} contradict each other"
+        rig = tags.text(pix4d.NAMESPACE, "RigName")
+        if tags.model and rig.startswith(("FC", "M3M")) and rig != tags.model:
+            yield f"its Model {tags.model} and RigName {rig} contradict each other"
 
     def motion(self, tags: Tags) -> tuple[float, float] | None:
         """Calculate the motion from the speed over ground (north, east, m/s), the heading of the image's upper edge and
@@ -164,6 +176,8 @@ class _Factors(NamedTuple):
         contradicted = [name for name, (_, is_agreed) in found.items() if not is_agreed]
         if is_own and others and not _agree(coefficients, others):
             contradicted.append("VignettingData")
+        if is_own and others and centre_px is not None and math.dist(centre_px, other_px) > _MAX_CENTRES_APART_PX:
+            contradicted.append("CalibratedOpticalCenter")
         return cls(
             {name: value for name, (value, _) in found.items() if value is not None},
             centre_px if centre_px is not None and is_own else other_px,

@@ -230,7 +230,14 @@ def test_a_black_level_that_differs_between_bands_is_named(images: Path) -> None
     assert [t for t in texts if "IMG_0001_4.tif: the black level in its tags is 8192" in t]
 
 
-def phantom(folder: Path, number: int, tags: Mapping[str, str], serial: str = "", of_pix4d: bool = True) -> None:
+def phantom(
+    folder: Path,
+    number: int,
+    tags: Mapping[str, str],
+    serial: str = "",
+    of_pix4d: bool = True,
+    more: Mapping[str, str] | None = None,
+) -> None:
     """Write the five bands of a capture of a Phantom 4, without a serial number in Exif."""
     folder.mkdir(parents=True, exist_ok=True)
     values = {"SensorGain": "1", "ExposureTime": "1000", "BlackLevel": "4096", "Irradiance": "5000"}
@@ -239,6 +246,7 @@ def phantom(folder: Path, number: int, tags: Mapping[str, str], serial: str = ""
         {"DroneID": serial} if serial else {}
     )
     twice = {"SunSensor": "5000", "BlackCurrent": "4096", "RadiometricCalibration": "1.2, 0, 0"} if of_pix4d else {}
+    twice |= dict(more or {})
     for k in range(1, 6):
         own = {(DJI, name): (value,) for name, value in (values | dict(tags)).items() if value}
         own |= {(NAMESPACE, name): (value,) for name, value in twice.items()}
@@ -371,3 +379,26 @@ def test_a_coordinate_of_zero_is_missing(images: Path, axis: int) -> None:
         zero = (bytes(4) + (1).to_bytes(4, "little")) * 3
         changed(path, gps={axis: replace(entry, data=zero)})
     assert only(discover(images)).position is None
+
+
+@pytest.mark.parametrize(
+    ("tags", "of_pix4d", "named"),
+    [
+        ({"BandFreq": "840(+/-26)nm"}, {"CentralWavelength": "717"}, "CentralWavelength 717 and BandFreq 840"),
+        ({}, {"RigName": "FC9999"}, "its Model FC6360 and RigName FC9999 contradict each other"),
+        ({"BandFreq": "840(+/-26)nm"}, {"CentralWavelength": "840", "RigName": "FC6360"}, ""),
+    ],
+)
+def test_facts_that_dji_writes_twice_are_compared(
+    tmp_path: Path, tags: dict[str, str], of_pix4d: dict[str, str], named: str
+) -> None:
+    phantom(tmp_path, 1, tags, more=of_pix4d)
+    texts = [p.text for p in discover(tmp_path).problems]
+    found = [text for text in texts if "BandFreq" in text or "RigName" in text]
+    assert [named in text for text in found] == ([True] if named else [])
+
+
+def test_two_centres_of_the_vignetting_are_compared(tmp_path: Path) -> None:
+    vignetting = {"VignettingCenter": "700, 650", "VignettingPolynomial": "1e-5, 0, 0, 0, 0, 0"}
+    phantom(tmp_path, 1, {}, more=vignetting)
+    assert "other tags contradict CalibratedOpticalCenter" in only(discover(tmp_path)).bands[0].missing_calibration
