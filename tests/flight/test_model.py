@@ -114,6 +114,8 @@ def test_files_that_are_no_models_are_an_error(tmp_path: Path) -> None:
         InputError, match=r"text\.safetensors: its rig cannot be read \([^\[]*\); delete it and run again"
     ):
         read_rig(text)
+    with pytest.raises(InputError, match=r"its rig cannot be read \(No such file or directory\); delete it and run"):
+        read_rig(text.with_name("missing.safetensors"))
 
 
 @pytest.mark.parametrize(
