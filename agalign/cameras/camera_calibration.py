@@ -86,7 +86,8 @@ def different_calibrations(files: Sequence[ImageFile]) -> list[Problem]:
             value, file = others[0]
             rest = f", and in {counted(len(others) - 1, 'other file')}" if len(others) > 1 else ""
             text = f"the {what} in its tags is {value:g}{rest}; {counted(count, 'file')} of the camera have {usual:g}"
-            problems.append(Problem(file.path, InputError(f"{file.path}: {text}; correct the tags")))
+            error = InputError(f"{file.path}: {text}; correct the tags")
+            problems.append(Problem(file.path, error, is_harmless=True))
     return problems
 
 
