@@ -20,8 +20,11 @@ with tempfile.TemporaryDirectory() as folder:
     moving = report.sidecar.bands[1]
     if moving.status != "aligned":
         sys.exit(f"{later} cannot be aligned to {earlier}: {moving.reason}")
-    offsets_px = np.subtract(moving.grid.moving_px, moving.grid.reference_px)
-    print(f"offset before alignment: {np.hypot(*np.median(offsets_px, axis=0)):.1f} px")
+    with rasterio.open(earlier) as one, rasterio.open(later) as other:
+        by_coordinates = ~other.transform * one.transform  # the mosaics have the same CRS
+    x_px, y_px = by_coordinates * (moving.grid.reference_px.T + 0.5)
+    offsets_px = moving.grid.moving_px + 0.5 - np.stack([x_px, y_px], axis=1)
+    print(f"offset before alignment: {np.hypot(*np.median(offsets_px, axis=0)):.1f} px of {later.name}")
     with rasterio.open(report.path.with_suffix(".tif")) as both:
         change = both.read(moving.place.band_index, masked=True).astype("float32") - both.read(1, masked=True)
         profile = both.profile | {"count": 1, "dtype": "float32", "nodata": np.nan}
