@@ -22,8 +22,8 @@ from common import cell, print_head, print_row, read_band, run
 from scipy.spatial.transform import Rotation
 
 from agalign.cameras.discover import discover
+from agalign.cameras.dls import horizontal_irradiance
 from agalign.cameras.metadata import Tags, read_tags
-from agalign.cameras.micasense import horizontal_irradiance
 from agalign.cameras.sun import sun_position
 from agalign.flight import panel_readings
 from agalign.flight.groups import camera_key

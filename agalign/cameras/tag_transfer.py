@@ -7,7 +7,7 @@ from contextlib import suppress
 
 from PIL.ExifTags import Base
 
-from agalign.cameras import dji, micasense, pix4d
+from agalign.cameras import dji, dls, micasense, pix4d
 from agalign.cameras.makers import camera_of
 from agalign.cameras.metadata import Tags, finite, read_tags
 from agalign.cameras.parrot import Sequoia
@@ -169,7 +169,7 @@ def _put_radiometry(packet: Packet, tags: Tags, vignetting: GridVignetting | Non
     else:
         packet.put((pix4d.NAMESPACE, "VignettingCenter"), _texts(vignetting.centre_px))
         packet.put((pix4d.NAMESPACE, "VignettingPolynomial"), [f"{v:.9e}" for v in vignetting.coefficients])
-    irradiance = micasense.irradiance(tags).value if isinstance(camera_of(tags), micasense.MicaSense) else 0.0
+    irradiance = dls.irradiance(tags).value if isinstance(camera_of(tags), micasense.MicaSense) else 0.0
     if irradiance > 0:
         for name, value in (("HorizontalIrradiance", irradiance), ("IrradianceScaleToSIUnits", 1.0)):
             packet.add((pix4d.NAMESPACE, name), _texts([value])[0])

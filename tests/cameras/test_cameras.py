@@ -9,11 +9,12 @@ import rasterio
 from rasterio.enums import ColorInterp
 
 from agalign.cameras.base import default_reference
+from agalign.cameras.dls import horizontal_irradiance, transmission
 from agalign.cameras.generic import Generic
 from agalign.cameras.makers import known_cameras
 from agalign.cameras.mapir import Mapir
 from agalign.cameras.metadata import Tags, read_tags
-from agalign.cameras.micasense import MicaSense, horizontal_irradiance, transmission
+from agalign.cameras.micasense import MicaSense
 from agalign.cameras.pix4d import NAMESPACE, panel_in
 from agalign.cameras.sun import sun_position
 from agalign.cameras.tag_seeds import rig_seed
