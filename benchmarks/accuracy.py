@@ -8,6 +8,7 @@ The claim at a point is the value of the error map (`--error-map`). A usable ban
 --accept-predicted; it is overconfident if more than a tenth of its points are off by more than 1 px and by two claims.
 """
 
+import os
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -131,7 +132,12 @@ def main(
     bands: bool = False,
     figures: FiguresOption = False,
 ) -> None:
-    folders = sorted({p.parent for p in data.rglob("*") if p.suffix.lower() in (".tif", ".jpg", ".jpeg")})
+    suffixes = ".tif", ".jpg", ".jpeg"
+    folders = sorted(  # a set may be a link, which Path.rglob does not follow
+        Path(root)
+        for root, _, names in os.walk(data, followlinks=True)
+        if any(name.lower().endswith(suffixes) for name in names)
+    )
     folders = [f for f in folders if (f.name in sets if sets else (f / "ties.json").exists())]
     lines, undamaged = [], []
     if bands:
