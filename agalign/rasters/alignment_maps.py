@@ -84,10 +84,9 @@ def share_over_1_px(alignment: Alignment, reference: Band, grid: OutputGrid) -> 
 
 def moved_share(alignment: Alignment, reference: Band, grid: OutputGrid) -> float:
     """Return the share of a grid in areas that moved, as the quality raster flags them."""
-    error = error_map(alignment, reference, grid)
-    if error is None or not error.error.moved:
-        return 0.0
-    return float((error.moved_px(Tile(0, 0, grid.width, grid.height)) > 0).mean())
+    has_areas = alignment.error is not None and alignment.error.moved  # a map takes 10 ms
+    error = error_map(alignment, reference, grid) if has_areas else None
+    return 0.0 if error is None else float((error.moved_px(Tile(0, 0, grid.width, grid.height)) > 0).mean())
 
 
 def _error_px(alignment: Alignment, reference: Band, grid: OutputGrid) -> NDArray[np.float32]:

@@ -132,8 +132,7 @@ def moved_areas(fixed: Field, moving: Field, valid: Mask) -> tuple[MovedArea, ..
     pair = _Pair.of(fixed, moving, valid)
     if pair is None:
         return ()
-    found = _shifted_windows(pair, _candidates(pair))
-    return tuple(area for group in _groups(found) for area in _areas(pair, group))
+    return tuple(area for group in _groups(_found(pair, _candidates(pair))) for area in _areas(pair, group))
 
 
 def _candidates(pair: _Pair) -> NDArray[np.int64]:
@@ -148,6 +147,22 @@ def _candidates(pair: _Pair) -> NDArray[np.int64]:
     inner[::2, ::2] = False
     y, x = np.nonzero(wanted & ~inner)
     return np.stack([x, y], axis=1) * _STEP_PX
+
+
+def _found(pair: _Pair, origins_px: NDArray[np.int64]) -> _Windows:
+    """Return the shifted windows: first those on the black fields of a chessboard, and the white ones without a black
+    neighbour; then the neighbours of those that are found. Areas have several windows, so that none is lost.
+    """
+    if not len(origins_px):
+        return _Windows(origins_px, origins_px)
+    cells = origins_px // _STEP_PX
+    is_black = cells.sum(axis=1) % 2 == 0
+    apart = np.abs(cells[:, None] - cells[None]).max(axis=-1)
+    is_first = is_black | ~((apart == 1) & is_black[None]).any(axis=1)
+    first = _shifted_windows(pair, origins_px[is_first])
+    near = np.abs(cells[:, None] - (first.origins_px // _STEP_PX)[None]).max(axis=-1) <= _WINDOW_PX // _STEP_PX
+    second = _shifted_windows(pair, origins_px[~is_first & near.any(axis=1)])
+    return _Windows(*(np.concatenate(both) for both in zip(first, second, strict=True)))
 
 
 def _shifted_windows(pair: _Pair, origins_px: NDArray[np.int64]) -> _Windows:
