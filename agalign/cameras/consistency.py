@@ -333,8 +333,8 @@ def _label(band: Band) -> str:
 
 
 def of_other_captures(groups: Iterable[Sequence[ImageFile]]) -> list[Problem]:
-    """Return a problem for each file whose tags are of another capture than those of the other files of its capture: it
-    was elsewhere, or it alone has another serial number. `groups` are the files of each capture.
+    """Return a problem for each file with the tags of a different capture: its position is far from that of the other
+    files of its capture, or only its serial number differs. `groups` are the files of each capture.
     """
     found: list[tuple[ImageFile, str]] = []
     for group in (g for g in groups if len(g) > 2):

@@ -26,7 +26,7 @@ class FlightCamera:
     def of(cls, capture: Capture, bands: Iterable[Band]) -> Self:
         """Return the camera of a capture, with these bands."""
         camera = capture.camera
-        name = f"{camera.make} {camera.model} {camera.serial or camera.lens_calibration}".strip()
+        name = f"{camera.make} {camera.model} {camera.unit}".strip()
         return cls(name, tuple((b.name, *b.size_px) for b in bands))
 
     @property
@@ -110,7 +110,7 @@ def model_names(groups: Sequence[Sequence[Capture]]) -> list[str]:
     used: set[str] = set()
     for group in groups:
         camera = group[0].camera
-        stem = file_name(f"{camera.model} {camera.serial or camera.lens_calibration}".strip() or "camera")
+        stem = file_name(f"{camera.model} {camera.unit}".strip() or "camera")
         numbered = (stem if k == 1 else f"{stem}-{k}" for k in count(1))
         name = next(n for n in numbered if n.lower() not in used)
         used.add(name.lower())
@@ -179,8 +179,7 @@ def camera_overviews(captures: Sequence[Capture]) -> list[CameraOverview]:
     groups: dict[tuple[str, str], list[Capture]] = {}
     for capture in captures:
         name = f"{capture.camera.make} {capture.camera.model}".strip() or "unknown camera"
-        serial = capture.camera.serial or capture.camera.lens_calibration
-        groups.setdefault((name, serial), []).append(capture)
+        groups.setdefault((name, capture.camera.unit), []).append(capture)
     return [_overview(name, serial, group) for (name, serial), group in groups.items()]
 
 
@@ -191,9 +190,10 @@ def _overview(name: str, serial: str, captures: Sequence[Capture]) -> CameraOver
     to_align = [c for c in captures if not c.is_of_a_panel] or captures
     choices: tuple[RadiometryChoice, ...] = ("camera", "sun")
     supported = [choice for choice in choices if all(_supports(c, choice) for c in to_align)]
-    by_choice = [[b.radiometry for c in to_align for b in with_radiometry(c, one, {}).bands] for one in supported]
-    std_percent = tuple(max((r.std_percent for r in of if r is not None), default=0.0) for of in by_choice)
-    uncorrected = dict.fromkeys(name for of in by_choice for r in of if r is not None for name in r.uncorrected)
+    converted = [[b for c in to_align for b in with_radiometry(c, choice, {}).bands] for choice in supported]
+    of_choice = [[b.radiometry for b in bands if b.radiometry is not None] for bands in converted]
+    std_percent = tuple(max((r.std_percent for r in of), default=0.0) for of in of_choice)
+    uncorrected = dict.fromkeys(name for of in of_choice for r in of for name in r.uncorrected)
     if "camera" in supported and any(c.panel is not None for c in captures):
         supported.append("panel")
     reference = mode(c.reference.name for c in captures)

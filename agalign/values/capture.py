@@ -241,8 +241,8 @@ class CameraIdentity:
     >>> camera.name, camera.serial
     ('MicaSense RedEdge-M', 'SY01-0000001-AG')
     >>> dual = type(camera).of("MicaSense", "RedEdge-MX", ["RX01", "RX02"])
-    >>> dual.serial, len(dual.serials)
-    ('RX01+RX02', 2)
+    >>> dual.serial, len(dual.serials), dual.unit
+    ('RX01+RX02', 2, 'RX01+RX02')
     """
 
     make: Name = ""
@@ -263,6 +263,11 @@ class CameraIdentity:
     def name(self) -> str:
         """Manufacturer and model; empty if both are unknown."""
         return f"{self.make} {self.model}".strip()
+
+    @property
+    def unit(self) -> str:
+        """Which camera of its model it is: the serial numbers, else the lens calibration; empty if both are unknown."""
+        return self.serial or self.lens_calibration
 
     @property
     def serials(self) -> frozenset[str]:

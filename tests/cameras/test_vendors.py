@@ -434,7 +434,7 @@ def test_pixels_that_are_dewarped_have_no_distortion(tmp_path: Path) -> None:
 def test_a_black_level_of_0_is_a_black_level(
     tmp_path: Path, xmp: dict[str, str], of_tiff: float | None, expected: float | None
 ) -> None:
-    """Without any, or with two that contradict each other, there is no radiometry."""
+    """A band has no radiometry if both tags are missing, or if they contradict each other."""
     tags = replace(mavic_tags(SensorGain="1", ExposureTime="2000", **xmp), black_level=of_tiff)
     radiometry = mavic_band(tmp_path, tags).radiometry
     assert (radiometry and radiometry.black_level) == expected
