@@ -189,9 +189,12 @@ def _overview(name: str, serial: str, captures: Sequence[Capture]) -> CameraOver
     times = sorted({c.known_time for c in captures} - {""}) or [""]
     to_align = [c for c in captures if not c.is_of_a_panel] or captures
     choices: tuple[RadiometryChoice, ...] = ("camera", "sun")
-    supported = [choice for choice in choices if all(_supports(c, choice) for c in to_align)]
-    converted = [[b for c in to_align for b in with_radiometry(c, choice, {}).bands] for choice in supported]
-    of_choice = [[b.radiometry for b in bands if b.radiometry is not None] for bands in converted]
+    converted = {
+        choice: [b for c in to_align for b in with_radiometry(c, choice, {}).bands if not b.is_from_photograph]
+        for choice in choices
+    }
+    supported = [choice for choice, bands in converted.items() if all(b.radiometry is not None for b in bands)]
+    of_choice = [[b.radiometry for b in converted[choice] if b.radiometry is not None] for choice in supported]
     std_percent = tuple(max((r.std_percent for r in of), default=0.0) for of in of_choice)
     uncorrected = dict.fromkeys(name for of in of_choice for r in of for name in r.uncorrected)
     if "camera" in supported and any(c.panel is not None for c in captures):
@@ -231,11 +234,6 @@ def _gsd_per_height(capture: Capture) -> float | None:
     lens, pose = capture.reference.lens, capture.pose
     focal_px = lens.fx_px if lens is not None else None if pose is None else pose.focal_length_px
     return 1 / focal_px if focal_px else None
-
-
-def _supports(capture: Capture, choice: RadiometryChoice) -> bool:
-    bands = with_radiometry(capture, choice, {}).bands
-    return all(b.radiometry is not None for b in bands if not b.is_from_photograph)
 
 
 def _by_completeness(captures: Sequence[Capture]) -> list[Capture]:

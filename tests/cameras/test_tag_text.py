@@ -1,7 +1,5 @@
 """Numbers and times in tags, as programs of any locale write them."""
 
-from pathlib import Path
-
 import pytest
 
 from agalign.cameras.tag_text import iso_time, numbers_in
@@ -56,9 +54,3 @@ def test_numbers(items: tuple[str, ...], count: int | None, expected: tuple[floa
 )
 def test_times(given: tuple[str, ...], expected: str) -> None:
     assert iso_time(*given) == expected
-
-
-def test_no_other_module_parses_numbers_of_tags() -> None:
-    cameras = Path(__file__).parents[2] / "agalign" / "cameras"
-    others = [p.name for p in cameras.glob("*.py") if "float(part)" in p.read_text() or "strptime" in p.read_text()]
-    assert others == []
