@@ -263,6 +263,5 @@ def _output(context: ProductContext, saturated: Mapping[str, float]) -> OutputPa
 def _band_radiometry(band: str, radiometry: Radiometry, saturated: float) -> BandRadiometryPart:
     """The part about the values of a band, given the share of its pixels that are saturated."""
     errors = [*radiometry.errors, *([saturation_error(saturated)] if saturated else [])]
-    return BandRadiometryPart(
-        band=band, std_percent=total_percent(errors), errors=errors, corner_ratio=radiometry.corner_ratio
-    )
+    means = [list(row) for row in radiometry.cell_means]
+    return BandRadiometryPart(band=band, std_percent=total_percent(errors), errors=errors, cell_means=means)

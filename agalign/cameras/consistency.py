@@ -23,7 +23,7 @@ from agalign.cameras.pix4d import NAMESPACE, listed_names
 from agalign.cameras.sun import Sun, sun_position
 from agalign.errors import InputError
 from agalign.host.text import counted, some_of
-from agalign.values.capture import MIN_APART_S, Band, CaptureTime, Position, is_clock_set
+from agalign.values.capture import MIN_APART_S, Band, Capture, CaptureTime, Position, is_clock_set
 from agalign.values.pixel_units import SAME_PIXELS, PixelScale, Size
 from agalign.values.spectrum import band_key, contradicts
 
@@ -35,6 +35,8 @@ this in five minutes.
 """
 _MAX_POSITION_ERROR_KM = 1.0
 """Between two tags with the position of a file: receivers without corrections are within 10 m."""
+_AROUND, _MAX_SPEED_KM_S = 2, 0.1
+"""Captures before and after one, and the speed of a light aircraft."""
 _GPS_ROLLOVER_H = 1024 * 7 * 24.0
 """Hours after which the week number of GPS repeats."""
 _MAX_OFF_CENTRE = 0.1
@@ -350,6 +352,37 @@ def of_other_captures(groups: Iterable[Sequence[ImageFile]]) -> list[Problem]:
         alone = [f for f in group if serials[f.tags.serial] == 1 < len(serials)]
         found += [(f, f"its serial number {f.tags.serial} is not that of the other files") for f in alone]
     return [Problem(f.path, InputError(f"{f.path}: {text}; correct the tags"), is_harmless=True) for f, text in found]
+
+
+def far_from_flight(captures: Iterable[Capture]) -> list[Problem]:
+    """Return a problem for the first capture of each camera whose position is too far from those of the captures around
+    it in time for any aircraft.
+    """
+    by_camera: dict[object, list[tuple[float, Position, Capture]]] = defaultdict(list)
+    for capture in captures:
+        time = CaptureTime.of(capture.known_time)
+        if capture.position is not None and time is not None and capture.camera.unit:
+            by_camera[capture.camera].append((time.utc.timestamp(), capture.position, capture))
+    problems = []
+    for flight in by_camera.values():
+        flight.sort(key=lambda one: one[0])
+        found: list[tuple[Capture, float]] = []
+        for k, (time_s, place, capture) in enumerate(flight):
+            around = [*flight[max(0, k - _AROUND) : k], *flight[k + 1 : k + 1 + _AROUND]]
+            far_km = [
+                km
+                for other_s, other, _ in around
+                if (km := _apart_km(place, other)) > _MAX_POSITION_ERROR_KM + _MAX_SPEED_KM_S * abs(other_s - time_s)
+            ]
+            if len(far_km) > len(around) / 2:
+                found.append((capture, min(far_km)))
+        if found:
+            (capture, km), *rest = found
+            others = f", and so are {counted(len(rest), 'other capture')}" if rest else ""
+            path = capture.reference.path
+            text = f"its position is {km:.0f} km from those of the captures around it{others}; correct the tags"
+            problems.append(Problem(path, InputError(f"{path}: {text}"), is_harmless=True))
+    return problems
 
 
 # ---- number and time

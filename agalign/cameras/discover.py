@@ -16,6 +16,7 @@ from agalign.cameras.consistency import (
     contradictions,
     doubtful_files,
     exposed_apart,
+    far_from_flight,
     files_of_one_band,
     list_problems,
     of_other_captures,
@@ -156,6 +157,7 @@ def discover(folder: str | Path, options: DiscoverOptions | None = None) -> Fold
     captures.sort(key=lambda c: (c.folder.as_posix(), c.name))
     captures = with_missing_bands(with_unique_capture_names(captures, band_file_owners(captures)))
     captures = with_unreadable_bands(captures, files, problems)
+    problems += far_from_flight(captures)
     return FolderScan(folder, tuple(captures), tuple(problems))
 
 

@@ -31,6 +31,7 @@ from agalign.values.fields import (
     Count,
     Matrix3x3,
     Measured,
+    Measurement,
     Message,
     Name,
     Number,
@@ -427,8 +428,9 @@ class BandRadiometryPart(_Part):
     """Expected error (1 sigma) of its values, percent: the root of the sum of the squares of `errors`."""
     errors: list[RadiometricError]
     """What its values depend on, with the error by each."""
-    corner_ratio: Number4 | None = None
-    """Median in the corners of the image relative to that in its middle: over many captures it is near 1."""
+    cell_means: list[list[Measurement]] = []
+    """Mean of the values in each of 12 x 16 equal cells of the band's own image, row by row: over many captures the
+    mean is flat, and captures of the same ground agree."""
 
 
 class OutputPart(_Part):

@@ -17,6 +17,7 @@ from agalign.host.text import escape_controls
 from agalign.records.cautions import MIN_SHARE_OVER_1_PX, NO_RESULT, NOT_FLAT, Caution, RunFacts
 from agalign.records.excluded import PanelPart, SkyPart
 from agalign.records.sidecar import BandResult, GeometryPart, GridPart, OutputPart, Sidecar
+from agalign.report.light_over_captures import LightOverCaptures
 from agalign.report.page_data import DataParts
 from agalign.report.summary_csv import BAND_COLUMNS, SIMILARITY, SummaryTable, rounded, row_of, value_at
 from agalign.report.verdict import Verdict, is_by_prediction, largest_error_px, unwritten_indices
@@ -24,11 +25,6 @@ from agalign.spectral_indices.rasters import IndexReport
 from agalign.values.alignment import Prediction
 from agalign.values.issues import OTHER_REFERENCE, Remedy
 
-_MIN_CAPTURES_FOR_FLATNESS = 20
-"""The ratio of corners to middle varies by 15 % between captures (eight sets of real captures)."""
-_MAX_UNEVEN, _MIN_UNEVEN_STD = 0.1, 4.0
-"""Logarithm of the mean ratio, and the same relative to its standard error: vignetting that is not corrected makes 0.15
-to 0.5, a direction of the sun up to 0.1."""
 _SHIFT_STEP_PX = 0.01
 """Shifts of windows are written as integer multiples of this."""
 
@@ -111,8 +107,7 @@ class PairTotals:
     """(capture, flight, reference band, its other bands with the missing ones)."""
     _votes: dict[tuple[str, ...], Counter[str]] = field(default_factory=lambda: defaultdict(Counter))
     """By flight, the number of captures that have a band as the reference, or lack it."""
-    _corners: dict[tuple[str, str], list[float]] = field(default_factory=lambda: defaultdict(list))
-    """Logarithms of the ratios of corners to middle, by camera and band."""
+    _light: LightOverCaptures = field(default_factory=LightOverCaptures)
 
     def add(self, label: str, result: Sidecar) -> list[Caution]:
         """Add the bands of a capture, and return the cautions about them."""
@@ -123,11 +118,7 @@ class PairTotals:
             band.seconds += [] if part is None else [part.seconds]
             if status == "aligned" and part and part.metrics and math.isfinite(part.metrics.after.residual_px):
                 band.residuals_px.append(part.metrics.after.residual_px)
-        for radiometry in [] if result.output is None else result.output.band_radiometry:
-            if radiometry.corner_ratio:
-                of_band = self._corners[f"{result.camera.name} {result.camera.serial}", radiometry.band]
-                of_band.append(math.log(radiometry.corner_ratio))
-        cautions = list(self.run.cautions(result, label))
+        cautions = [*self.run.cautions(result, label), *self._light.add(label, result)]
         for caution in cautions:
             self._add_caution(label, caution)
         camera, reference = result.camera, result.reference.band
@@ -164,7 +155,9 @@ class PairTotals:
                 reason = f"on the grid of {band}; most captures of the flight are on that of {usual}"
                 # All its values are displaced from those of the other captures.
                 other.add(label, Caution(band, other.status, OTHER_REFERENCE, reason, pairs_per_capture))
-        uneven = self._uneven()
+        uneven = CautionGroup("check", NOT_FLAT)
+        for label, caution in self._light.uneven():
+            uneven.add(label, caution)
         lost = CautionGroup("no_result", NO_RESULT)
         for label in without_result:
             lost.add(label, Caution("", lost.status, NO_RESULT, NO_RESULT.cause, max(1.0, pairs_per_capture)))
@@ -173,21 +166,6 @@ class PairTotals:
             group.effect /= max(1.0, pairs + max(1.0, pairs_per_capture) * len(without_result))
         severity = "no_result", "failed", "seed_only", "missing", "other_reference", "predicted", "check"
         return sorted(groups, key=lambda g: (-g.effect, severity.index(g.status), -len(g.bands), g.remedy.cause))
-
-    def _uneven(self) -> CautionGroup:
-        """The bands whose mean over many captures is not flat: scenes differ, the lens does not."""
-        group = CautionGroup("check", NOT_FLAT)
-        for (_, band), logarithms in self._corners.items():
-            count, mean = len(logarithms), float(np.mean(logarithms))
-            std = float(np.std(logarithms)) / math.sqrt(count)
-            if count >= _MIN_CAPTURES_FOR_FLATNESS and abs(mean) > max(_MAX_UNEVEN, _MIN_UNEVEN_STD * std):
-                share = math.expm1(mean)
-                reason = f"in {count} captures, the corners are {share:+.0%} from the middle (± {std:.0%})"
-                caution = Caution(
-                    band, "check", NOT_FLAT, reason, min(1.0, abs(share)) * count, abs(share), "up to {:.0%}"
-                )
-                group.add(self._references[-1][0], caution)
-        return group
 
 
 _DETAILS_PER_PART = 50

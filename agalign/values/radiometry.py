@@ -93,8 +93,9 @@ class Radiometry:
     """The values of tags that `gain` is calculated from, with the names of `pixels.radiometry`."""
     errors: Errors = ()
     """Parts of the expected error of the values."""
-    corner_ratio: float | None = None
-    """Median of the values in the corners of the image relative to that in its middle; None if it was not measured."""
+    cell_means: tuple[tuple[float, ...], ...] = ()
+    """Mean of the values in each of 12 x 16 equal cells of the band's own image, row by row; NaN where all are invalid,
+    empty if they were not measured."""
 
     def rescaled(self, scale: PixelScale) -> "Radiometry":
         """Return the calibration of the image resized by `scale`, which is nearly the same along both axes."""

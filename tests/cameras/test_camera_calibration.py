@@ -12,6 +12,7 @@ import pytest
 import tifffile
 from PIL.ExifTags import GPS as GPS_TAG
 
+from agalign.cameras.consistency import far_from_flight
 from agalign.cameras.discover import FolderScan, discover
 from agalign.cameras.sun import sun_position
 from agalign.cameras.tiff_directory import EXIF, GPS, XMP, Entry, add_directories, byte_string, read_directories, text
@@ -370,6 +371,25 @@ def test_files_of_one_capture_share_position_and_serial_number(images: Path) -> 
     texts = [p.text for p in discover(images).problems]
     assert [t for t in texts if "IMG_0001_4.tif: its position is 111 km from that of the other files" in t]
     assert [t for t in texts if "IMG_0001_3.tif: its serial number OTHER is not that of the other files" in t]
+
+
+@pytest.mark.parametrize(
+    ("apart_s", "degrees", "found"),
+    [(1, 60.0, [3]), (1, 0.002, []), (7200, 0.5, []), (1, math.nan, [])],
+    ids=["another drone's", "next line", "next field", "unknown"],
+)
+def test_a_capture_far_from_its_flight_is_named(flight: Path, apart_s: float, degrees: float, found: list[int]) -> None:
+    first, captures = discover(flight).captures[0], []
+    assert first.position is not None
+    for k in range(6):
+        bands = tuple(replace(b, path=Path(f"{k}.tif")) for b in first.bands)
+        here = replace(first.position, latitude=10 + 0.0001 * k + (degrees if k == 3 else 0.0))
+        at = f"{np.datetime64('2024-06-01T12:00:00') + np.timedelta64(int(apart_s * k), 's')}+00:00"
+        place = here if math.isfinite(here.latitude) else None
+        captures.append(replace(first, bands=bands, position=place, captured_at=at))
+    problems = far_from_flight(captures)
+    assert [int(p.path.stem) for p in problems] == found
+    assert all("km from those of the captures around it; correct the tags" in p.text for p in problems)
 
 
 @pytest.mark.parametrize("axis", [GPS_TAG.GPSLatitude, GPS_TAG.GPSLongitude])

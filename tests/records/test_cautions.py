@@ -286,9 +286,9 @@ def test_the_share_of_a_band_is_that_of_the_quality_raster() -> None:
 # ---- radiance and reflectance
 
 
-def calibrated_output(corner_ratio: float | None = None, **errors: tuple[float, str]) -> dict[str, Any]:
+def calibrated_output(**errors: tuple[float, str]) -> dict[str, Any]:
     parts = [{"name": name, "std_percent": size, "state": state} for name, (size, state) in errors.items()]
-    band = {"band": "NIR", "std_percent": 20.0, "errors": parts, "corner_ratio": corner_ratio}
+    band = {"band": "NIR", "std_percent": 20.0, "errors": parts}
     crop = {"file": None, "crop": (0, 0, 10, 10), "nodata": "nan"}
     return crop | {"radiometry": "reflectance by light sensor", "band_radiometry": [band]}
 
@@ -300,20 +300,3 @@ def test_what_values_are_not_corrected_for_is_a_caution(state: str, cause: str) 
     found = cautions(output=calibrated_output(vignetting=(12.0, state)))
     assert [cause in c.remedy.cause for c in found] == ([True] if cause else [])
     assert [round(c.lost, 2) for c in found] == ([0.12] if cause else [])
-
-
-@pytest.mark.parametrize(
-    ("mean", "captures", "is_named"), [(0.75, 25, True), (0.75, 10, False), (0.97, 25, False), (1.4, 25, True)]
-)
-def test_the_mean_of_many_captures_shows_whether_the_vignetting_is_corrected(
-    mean: float, captures: int, is_named: bool
-) -> None:
-    totals, rng = PairTotals(), np.random.default_rng(0)
-    for k in range(captures):
-        ratio = mean * float(np.exp(rng.normal(0.0, 0.15)))
-        totals.add(f"IMG_{k}", example(bands=[ALIGNED], output=calibrated_output(ratio)))
-    groups = [g for g in totals.groups() if "mean of the captures" in g.remedy.cause]
-    assert bool(groups) == is_named
-    if is_named:
-        assert f"in {captures} captures, the corners are" in groups[0].bands[0].reason
-        assert groups[0].effect == pytest.approx(abs(mean - 1), abs=0.1)

@@ -1,0 +1,119 @@
+"""What several captures tell about reflectance: vignetting in their mean, jumps over the same ground."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy.ndimage import gaussian_filter
+
+from agalign.records.cautions import NOT_FLAT, Caution
+from agalign.report.facts import PairTotals
+from agalign.report.light_over_captures import JUMP
+
+from ..records.test_sidecar import example
+
+BANDS = "Green", "Red", "NIR"
+ROWS, COLUMNS = 12, 16
+Image = NDArray[np.float64]
+
+
+@pytest.fixture
+def ground() -> Image:
+    """Reflectance of three bands of a field (3, 60, 20), in cells."""
+    rng = np.random.default_rng(1)
+    texture = gaussian_filter(rng.normal(0.0, 1.0, (3, 60, 20)), (0, 0.7, 0.7))
+    return np.reshape((0.08, 0.05, 0.4), (3, 1, 1)) * np.exp(0.5 * texture)
+
+
+def seen(ground: Image, row: float, rng: np.random.Generator) -> Image:
+    """The cells of a capture from a row of the ground on, which is no whole number."""
+    top = int(row)
+    between = (1 - row % 1) * ground[:, top : top + ROWS] + row % 1 * ground[:, top + 1 : top + 1 + ROWS]
+    return between[:, :, :COLUMNS] * np.exp(rng.normal(0.0, 0.02, (3, ROWS, COLUMNS)))
+
+
+def add(
+    totals: PairTotals, number: int, cells: Image, *, seconds: float = 2.0, radiometry: str = "reflectance by panel"
+) -> list[Caution]:
+    """The cautions about the light of a capture, one each `seconds`."""
+    at = np.datetime64("2024-06-01T12:00:00.000") + np.timedelta64(int(1000 * seconds * number), "ms")
+    bands = [
+        {"band": name, "std_percent": 3.0, "errors": [], "cell_means": means.tolist()}
+        for name, means in zip(BANDS, cells, strict=True)
+    ]
+    output = {"file": None, "crop": (0, 0, 10, 10), "nodata": "nan", "radiometry": radiometry, "band_radiometry": bands}
+    found = totals.add(f"IMG_{number:04d}", example(output=output, captured_at=f"{at}+00:00"))
+    return [caution for caution in found if caution.remedy is JUMP]
+
+
+def jumps(ground: Image, factors: dict[int, Any], step: float = 3.3, **options: Any) -> list[tuple[int, str, float]]:
+    """(capture, band, size) of each jump in ten captures along a line, some of which have factors for their bands."""
+    totals, rng, found = PairTotals(), np.random.default_rng(0), []
+    for number in range(10):
+        cells = seen(ground, step * number, rng) * np.reshape(factors.get(number, (1, 1, 1)), (3, 1, 1))
+        found += [(number, c.band, c.size) for c in add(totals, number, cells, **options)]
+    return found
+
+
+def test_captures_of_one_ground_agree(ground: Image) -> None:
+    assert jumps(ground, {}) == []
+
+
+def test_an_exposure_time_of_another_camera_is_named_in_its_capture_and_the_next(ground: Image) -> None:
+    found = jumps(ground, {4: (1, 1.4, 1)})
+    assert [(number, band) for number, band, _ in found] == [(4, "Red"), (5, "Red")]
+    assert [size for *_, size in found] == pytest.approx([0.4, 1 - 1 / 1.4], abs=0.05)
+
+
+def test_a_cloud_that_stays_is_named_once(ground: Image) -> None:
+    found = jumps(ground, dict.fromkeys(range(6, 10), (0.6, 0.6, 0.6)))
+    assert [(number, band) for number, band, _ in found] == [(6, band) for band in BANDS]
+    assert [size for *_, size in found] == pytest.approx([0.4] * 3, abs=0.05)
+
+
+@pytest.mark.parametrize("options", [{"seconds": 100.0}, {"radiometry": "radiance by camera calibration"}])
+def test_a_difference_after_a_long_time_or_of_radiance_is_no_jump(ground: Image, options: dict[str, Any]) -> None:
+    assert jumps(ground, {4: (1, 1.4, 1)}, **options) == []
+
+
+def test_a_difference_of_other_ground_is_no_jump() -> None:
+    totals, rng = PairTotals(), np.random.default_rng(2)
+    fields = [0.1 * np.exp(gaussian_filter(rng.normal(0.0, 1.0, (3, ROWS, COLUMNS)), (0, 1, 1))) for _ in range(10)]
+    assert [add(totals, k, field * (1 + k % 2), seconds=40.0) for k, field in enumerate(fields)] == [[]] * 10
+
+
+def test_a_jump_at_the_black_level_is_none(ground: Image) -> None:
+    """The near infrared of water is 0.02."""
+    assert jumps(ground * np.reshape((1, 0.3, 1), (3, 1, 1)), {4: (1, 1.4, 1)}) == []
+
+
+def test_captures_that_end_in_another_order_are_compared_with_the_nearest_in_time(ground: Image) -> None:
+    totals, rng = PairTotals(), np.random.default_rng(0)
+    found = [
+        (number, c.band)
+        for number in (0, 1, 3, 2, 5, 4)
+        for c in add(totals, number, seen(ground, 3.3 * number, rng) * (1.4 if number == 4 else 1.0))
+    ]
+    assert found == [(4, band) for band in BANDS]
+
+
+@pytest.mark.parametrize(
+    ("mean", "captures", "is_named"), [(0.75, 25, True), (0.75, 10, False), (0.97, 25, False), (1.4, 25, True)]
+)
+@pytest.mark.parametrize("radiometry", ["reflectance by panel", "radiance by camera calibration"])
+def test_the_mean_of_many_captures_shows_whether_the_vignetting_is_corrected(
+    radiometry: str, mean: float, captures: int, is_named: bool
+) -> None:
+    totals, rng = PairTotals(), np.random.default_rng(0)
+    y, x = np.mgrid[-1 : 1 : ROWS * 1j, -1 : 1 : COLUMNS * 1j]
+    r = np.hypot(3 * y, 4 * x) / 5
+    for k in range(captures):
+        falloff = 1 + (mean * np.exp(rng.normal(0.0, 0.15)) - 1) * np.clip((r - 0.4) / 0.35, 0, 1)
+        add(totals, k, 0.2 * np.stack([np.ones_like(r), np.ones_like(r), falloff]), radiometry=radiometry)
+    groups = [g for g in totals.groups() if g.remedy is NOT_FLAT]
+    assert bool(groups) == is_named
+    if is_named:
+        assert [b.band for b in groups[0].bands] == ["NIR"]
+        assert f"in {captures} captures, the corners are" in groups[0].bands[0].reason
+        assert groups[0].effect == pytest.approx(abs(mean - 1), abs=0.1)
