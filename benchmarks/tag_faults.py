@@ -2,11 +2,12 @@
 
 python benchmarks/tag_faults.py FOLDER...
 
-Each FOLDER has one capture of a camera with a file per band. One tag at a time is missing, 0, not a number, a text, a
-number with a decimal comma, in another unit (times 1,000) or another camera's (times 1.3), in one band or in all. The
-radiance or reflectance of two raw numbers, at the centre and in a corner, is compared with that of the files as they
-are: within 2 % it is equal. A fault is named if a problem, a missing or contradicted part of the expected error, or the
-reason for the lack of a calibration mentions something that the files as they are do not have.
+Each FOLDER has one or more captures of a camera with a file per band. One tag at a time is missing, 0, not a number, a
+text, a number with a decimal comma, in another unit (times 1,000) or another camera's (times 1.3), in one band or in
+all of the last capture. The radiance or reflectance of two raw numbers, at the centre and in a corner, is compared with
+that of the files as they are: within 2 % it is equal. A fault is named if a problem, a missing or contradicted part of
+the expected error, the reason for the lack of a calibration, or a band that jumps between captures of the same ground
+mentions something that the files as they are do not have.
 """
 
 import re
@@ -15,6 +16,7 @@ import struct
 import tempfile
 from collections import Counter
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -26,7 +28,9 @@ from agalign.cameras.discover import discover
 from agalign.cameras.tiff_directory import EXIF, GPS, XMP, Directory, Entry, add_directories, read_directories, text
 from agalign.pixels.radiometry import calibrated, with_checked_pixels, with_radiometry
 from agalign.pixels.raster import read_tile
-from agalign.values.capture import Capture
+from agalign.records.sidecar import BandRadiometryPart, OutputPart
+from agalign.report.light_over_captures import LightOverCaptures
+from agalign.values.capture import Band, Capture
 
 XMP_TAGS = (
     *("RadiometricCalibration", "VignettingCenter", "VignettingPolynomial", "CentralWavelength", "BandName"),
@@ -86,10 +90,9 @@ def main(folders: list[Path]) -> None:
     silent = []
     with tempfile.TemporaryDirectory() as scratch:
         for folder in folders:
-            files = sorted(p for p in folder.iterdir() if p.suffix.lower() == ".tif")
             control = outcome(folder)
             counts: dict[str, Counter[str]] = {}
-            for name, what, where, result in results(files, Path(scratch)):
+            for name, what, where, result in results(folder, Path(scratch)):
                 verdict = judged(result, control)
                 counts.setdefault(what, Counter())[verdict] += 1
                 silent += [f"{folder.name}: {name} {what} {where}"] if verdict == "silent" else []
@@ -98,18 +101,18 @@ def main(folders: list[Path]) -> None:
     print("\nsilent:", *silent, sep="\n  ") if silent else print("\nsilent: none")
 
 
-def results(files: list[Path], scratch: Path) -> Iterator[tuple[str, str, str, Outcome]]:
+def results(folder: Path, scratch: Path) -> Iterator[tuple[str, str, str, Outcome]]:
     """Yield (tag, fault, where, outcome) of each fault that changes a file."""
+    last = max(discover(folder).captures, key=lambda c: c.captured_at)
+    files = sorted({band.path for band in last.bands})
     one = files[min(3, len(files) - 1)]
     for name in (*XMP_TAGS, *NAMED_ENTRIES):
         for what, fault in FAULTS.items():
             for where, damaged in (("in one band", [one]), ("in all", files)):
                 target = scratch / "in"
                 shutil.rmtree(target, ignore_errors=True)
-                target.mkdir()
-                for path in files:
-                    shutil.copy(path, target)
-                is_changed = [put_fault(target / path.name, name, fault) for path in damaged]
+                shutil.copytree(folder, target)
+                is_changed = [put_fault(target / path.relative_to(folder), name, fault) for path in damaged]
                 if any(is_changed):
                     yield name, what, where, outcome(target)
 
@@ -197,26 +200,44 @@ def outcome(folder: Path) -> Outcome:
         return Outcome({}, (0,), frozenset({without_numbers(str(error))}))
     said = {without_numbers(p.text) for p in scan.problems}
     values: dict[str, np.ndarray] = {}
+    light = LightOverCaptures()
     for capture in scan.captures:
         one = with_radiometry(capture, "auto", {})
         said |= {without_numbers(t) for t in (missing_radiometry(one, "auto"), *lost_reflectance(one, "auto")) if t}
+        try:
+            one = replace(one, bands=tuple(with_checked_pixels(band, read_tile) for band in one.bands))
+        except Exception as error:  # a refusal of the capture
+            said.add(without_numbers(str(error)))
+            one = replace(one, bands=tuple(replace(band, radiometry=None) for band in one.bands))
         for band in one.bands:
-            values[band.path.name] = np.full(2, np.nan)
-            try:
-                checked = with_checked_pixels(band, read_tile)
-            except Exception as error:  # a refusal of the capture
-                said.add(without_numbers(str(error)))
-                continue
-            if checked.radiometry is not None:
-                values[band.path.name] = sample(checked.size_px, checked.radiometry)
-                errors = checked.radiometry.errors
-                said |= {f"{e.name}: {e.state}" for e in errors if e.state != "expected"}
+            values[band.path.relative_to(folder).as_posix()] = sample(band)
+            errors = band.radiometry.errors if band.radiometry else ()
+            said |= {f"{e.name}: {e.state}" for e in errors if e.state != "expected"}
+        said |= {
+            f"{c.band}: {c.remedy.cause}"
+            for c in light.add(one.label, one.camera.name, one.captured_at, output_of(one))
+        }
     return Outcome(values, (len(scan.captures), *identity(scan.captures)), frozenset(said))
 
 
-def sample(size_px: tuple[int, int], radiometry: object) -> np.ndarray:
-    raw = np.full((1, 1), 20000)
-    return np.ravel([calibrated(raw, radiometry, x, y) for x, y in ((size_px[0] // 2, size_px[1] // 2), (8, 8))])
+def output_of(capture: Capture) -> OutputPart:
+    """The part of a sidecar about the reflectance of a capture."""
+    converted = {b.name: b.radiometry for b in capture.bands if b.radiometry is not None}
+    parts = [
+        BandRadiometryPart(band=name, std_percent=0, errors=[], cell_means=r.cell_means)
+        for name, r in converted.items()
+    ]
+    quantity = next((r.quantity for r in converted.values()), None)
+    crop = (0, 0, *capture.reference.size_px)
+    return OutputPart(file=None, radiometry=quantity, band_radiometry=parts, crop=crop, nodata=None)
+
+
+def sample(band: Band) -> np.ndarray:
+    """(2,) values of one raw number, in the middle and near a corner; nan without a calibration."""
+    raw, (width, height) = np.full((1, 1), 20000), band.size_px
+    if band.radiometry is None:
+        return np.full(2, np.nan)
+    return np.ravel([calibrated(raw, band.radiometry, x, y) for x, y in ((width // 2, height // 2), (8, 8))])
 
 
 def identity(captures: tuple[Capture, ...]) -> tuple[object, ...]:

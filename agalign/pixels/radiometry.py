@@ -51,6 +51,10 @@ _MIN_FLOOR, _MIN_FLOOR_SHARE = 0.04, 0.25
 """Of the darkest pixels without a black level, relative to the full scale and the median: sensors have a black level of
 0.06 of the full scale, and scenes have shadows.
 """
+_MIN_SIGNAL = 0.1
+"""Median of a band above the black level, relative to the full scale: 0.12 to 0.5 in captures of land. Darker ones,
+such as of water, differ by what the surface reflects of the sky.
+"""
 _CELLS = 16, 12
 """Columns and rows. Two captures of the same ground, shifted by whole cells, differ by 1 to 3 % in each band; twice as
 many cells do not change that.
@@ -106,7 +110,8 @@ def with_checked_pixels(band: Band, read: ReadTile) -> Band:
     elif radiometry.quantity == "reflectance" and signal * radiometry.gain > 1.0:
         radiometry = replace(radiometry, errors=(*radiometry.errors, too_bright(signal * radiometry.gain)))
     if not problem:
-        return replace(band, radiometry=replace(radiometry, cell_means=_cell_means(radiometry, band.size_px, image)))
+        means = _cell_means(radiometry, band.size_px, image) if signal > _MIN_SIGNAL else ()
+        return replace(band, radiometry=replace(radiometry, cell_means=means))
     raise InputError(f"{band.path}: {problem}; take the capture out, or leave --radiometry out")
 
 

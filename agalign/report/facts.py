@@ -118,10 +118,11 @@ class PairTotals:
             band.seconds += [] if part is None else [part.seconds]
             if status == "aligned" and part and part.metrics and math.isfinite(part.metrics.after.residual_px):
                 band.residuals_px.append(part.metrics.after.residual_px)
-        cautions = [*self.run.cautions(result, label), *self._light.add(label, result)]
+        camera, reference = result.camera, result.reference.band
+        of_light = self._light.add(label, f"{camera.name} {camera.serial}", result.captured_at, result.output)
+        cautions = [*self.run.cautions(result, label), *of_light]
         for caution in cautions:
             self._add_caution(label, caution)
-        camera, reference = result.camera, result.reference.band
         flight = (camera.name, camera.serial, result.flight_id, "" if camera.model else Path(label).parent.as_posix())
         self._references.append((label, flight, reference, {name for name, _, _ in result.pairs}))
         self._votes[flight].update((reference, *result.missing_bands))

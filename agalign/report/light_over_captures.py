@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agalign.records.cautions import NOT_FLAT, Caution
-from agalign.records.sidecar import Sidecar
+from agalign.records.sidecar import OutputPart
 from agalign.values.capture import CaptureTime, is_clock_set
 from agalign.values.issues import Remedy
 
@@ -38,10 +38,8 @@ other shifts: 0.02 to 0.09 and 8 to 55 % in captures that overlap, 0.06 to 0.11 
 """
 _SUCCESSIVE_S = 5.0
 """Between captures that overlap in any flight, so that the shift need not be clear."""
-_MAX_JUMP, _MIN_DIFFERENCE = math.log(1.2), 0.01
-"""Of the logarithm of a band, and of its reflectance: eight pairs of overlapping captures differ by up to 8 %, and the
-near infrared of water, at the black level, by 0.008.
-"""
+_MAX_JUMP = math.log(1.2)
+"""Of the logarithm of a band: eight pairs of overlapping captures differ by up to 8 %."""
 JUMP = Remedy(
     "a band is darker or brighter than in the capture before over the same ground: its tags are wrong, or the light "
     "changed and the reflectance does not follow it",
@@ -65,17 +63,15 @@ class _CaptureCells:
     cells: Cells
 
     @classmethod
-    def of(cls, label: str, sidecar: Sidecar) -> Self | None:
-        """Return the cells in a sidecar; None without any."""
-        time = CaptureTime.of(sidecar.captured_at) if is_clock_set(sidecar.captured_at) else None
-        if sidecar.output is None:
-            return None
-        means = {part.band: np.array(part.cell_means) for part in sidecar.output.band_radiometry}
+    def of(cls, label: str, captured_at: str, output: OutputPart) -> Self | None:
+        """Return the cells of the bands of a capture; None without any."""
+        time = CaptureTime.of(captured_at) if is_clock_set(captured_at) else None
+        means = {part.band: np.array(part.cell_means) for part in output.band_radiometry}
         usable = {band: cells for band, cells in means.items() if np.mean(cells > 0) > _MIN_VALID}
         if not usable:
             return None
         cells = np.array([np.log(c, out=np.full_like(c, np.nan), where=c > 0) for c in usable.values()])
-        quantity, _, _ = (sidecar.output.radiometry or "").partition(" by ")
+        quantity, _, _ = (output.radiometry or "").partition(" by ")
         return cls(label, math.nan if time is None else time.utc.timestamp(), quantity, tuple(usable), cells)
 
     def apart_s(self, other: Self) -> float:
@@ -95,10 +91,11 @@ class _CaptureCells:
         jumps = same_ground(other.cells, self.cells, is_certain=self.apart_s(other) <= _SUCCESSIVE_S)
         if jumps is None:
             return
-        for band, level, jump in zip(self.bands, np.exp(own).tolist(), jumps.tolist(), strict=True):
-            share = math.expm1(jump)
-            if abs(jump) > _MAX_JUMP and abs(level - level / (1 + share)) > _MIN_DIFFERENCE:
-                reason = f"{share:+.0%} relative to {other.label} over the same ground"
+        for band, jump in zip(self.bands, jumps.tolist(), strict=True):
+            if abs(jump) > _MAX_JUMP:
+                share = math.expm1(jump)
+                way = "brighter" if share > 0 else "darker"
+                reason = f"{abs(share):.0%} {way} than in {other.label} over the same ground"
                 yield Caution(band, "check", JUMP, reason, min(1.0, abs(share)), abs(share), "up to {:.0%}")
 
 
@@ -112,12 +109,11 @@ class LightOverCaptures:
     _last: str = ""
     """Label of the last capture."""
 
-    def add(self, label: str, sidecar: Sidecar) -> Iterator[Caution]:
+    def add(self, label: str, camera: str, captured_at: str, output: OutputPart | None) -> Iterator[Caution]:
         """Add a capture, and yield the bands that differ from the capture nearest in time over the same ground."""
-        own = _CaptureCells.of(label, sidecar)
+        own = None if output is None else _CaptureCells.of(label, captured_at, output)
         if own is None:
             return
-        camera = f"{sidecar.camera.name} {sidecar.camera.serial}"
         for band, cells in zip(own.bands, own.cells, strict=True):
             if math.isfinite(ratio := _corner_ratio(cells)):
                 self._corners[camera, band].append(ratio)

@@ -94,8 +94,8 @@ class Radiometry:
     errors: Errors = ()
     """Parts of the expected error of the values."""
     cell_means: tuple[tuple[float, ...], ...] = ()
-    """Mean of the values in each of 12 x 16 equal cells of the band's own image, row by row; NaN where all are invalid,
-    empty if they were not measured."""
+    """Mean of the values in each of 12 x 16 equal cells of the band's own image, row by row; NaN where all are invalid.
+    Empty if they were not measured, or if the image is too dark for a comparison."""
 
     def rescaled(self, scale: PixelScale) -> "Radiometry":
         """Return the calibration of the image resized by `scale`, which is nearly the same along both axes."""

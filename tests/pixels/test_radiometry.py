@@ -148,6 +148,24 @@ def test_a_calibration_with_an_implausible_tag_is_not_used(change: dict[str, obj
     assert problem.startswith(f"the {named}")
 
 
+def test_the_means_of_cells_are_calibrated_and_corrected_for_vignetting(tmp_path: Path) -> None:
+    y, x = np.mgrid[:480, :640]
+    ground = np.where(x < 320, 0.1, 0.4)
+    falloff = 1.0 + 1e-3 * np.hypot(x - 320, y - 240)
+    for name, exposure, is_bright in (("bright", 1.0, True), ("dark", 0.1, False)):
+        path = tmp_path / f"{name}.tif"
+        tifffile.imwrite(path, np.round(4800 + 65536 * exposure * ground / falloff).astype(np.uint16))
+        model = Radiometry(
+            "reflectance", 4800.0, 65536.0, 1 / exposure, (320.0, 240.0), (1e-3,), vignetting_divides=False
+        )
+        means = np.array(
+            with_checked_pixels(replace(probe(path)[0], radiometry=model), read_tile).radiometry.cell_means
+        )
+        assert means.shape == ((12, 16) if is_bright else (0,))
+        if is_bright:
+            np.testing.assert_allclose(means, np.broadcast_to(np.repeat((0.1, 0.4), 8), (12, 16)), rtol=0.02)
+
+
 def test_pixels_that_do_not_fit_the_calibration_are_refused(tmp_path: Path) -> None:
     def check(raw: int, black: float, gain: float) -> list[str]:
         path = tmp_path / "a.tif"

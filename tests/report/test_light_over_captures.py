@@ -83,11 +83,6 @@ def test_a_difference_of_other_ground_is_no_jump() -> None:
     assert [add(totals, k, field * (1 + k % 2), seconds=40.0) for k, field in enumerate(fields)] == [[]] * 10
 
 
-def test_a_jump_at_the_black_level_is_none(ground: Image) -> None:
-    """The near infrared of water is 0.02."""
-    assert jumps(ground * np.reshape((1, 0.3, 1), (3, 1, 1)), {4: (1, 1.4, 1)}) == []
-
-
 def test_captures_that_end_in_another_order_are_compared_with_the_nearest_in_time(ground: Image) -> None:
     totals, rng = PairTotals(), np.random.default_rng(0)
     found = [
