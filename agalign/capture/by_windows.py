@@ -1,6 +1,6 @@
 """Candidates that are fitted to windows, where descriptors do not suffice.
 
-* Blurred, noisy or saturated images: the homography is fitted to half of the windows and verified with the others.
+* Blurred, noisy or saturated images: the homography is fitted to windows, and each half verifies a fit to the other.
 * Bands with few pixels, such as thermal ones: often only a third of the windows have structure in common with another
   band. If nearly all of these agree with a trusted seed, they predict the mapping.
 * Images without common structure in one part: no residual contains the relief there, which a homography lacks.
@@ -14,7 +14,7 @@ import numpy as np
 from agalign.capture.band_pair import BandPair
 from agalign.capture.candidate import BandCandidates, Candidate, mapping_error, result_of_windows
 from agalign.capture.warped_pair import WarpedPair
-from agalign.fit.window_fit import WindowFit, fit_in_rounds
+from agalign.fit.window_fit import WindowFit, cross_fitted, fit_in_rounds
 from agalign.values import geometry
 from agalign.values.geometry import Matrix
 from agalign.values.issues import CORNERS_UNKNOWN, FEW_KEYPOINTS, INACCURATE, NO_CONTRAST, RETRIEVAL
@@ -29,9 +29,7 @@ altitude, plants and booms at a metre."""
 
 
 def fitted_to_windows(band: BandCandidates) -> Candidate | None:
-    """Return the candidate that is fitted to half of the windows, the others verify it; None if the descriptors have a
-    result, or if the windows determine none.
-    """
+    """Return the candidate by windows alone; None if the descriptors have a result, or if windows determine none."""
     pair = band.pair
     # With other issues, the descriptors of sharp images have a result that may contradict the windows.
     of_descriptors = {RETRIEVAL, FEW_KEYPOINTS, NO_CONTRAST, CORNERS_UNKNOWN}
@@ -40,22 +38,20 @@ def fitted_to_windows(band: BandCandidates) -> Candidate | None:
         return None
     max_step_px = min(_MAX_STEP_PX, pair.max_shift_px)
     start = WarpedPair.of(pair, pair.mapping(band.start.fixed_to_moving))
-    fitted = fit_in_rounds(
+    fitted = cross_fitted(
         start.mapping,
-        lambda mapping: WarpedPair.of(pair, mapping, start.windows).residual.chessboard_half(even=True),
+        lambda mapping: WarpedPair.of(pair, mapping, start.windows).residual,
         pair.fixed.size_px,
         lambda fit: fit.max_px <= max_step_px,
     )
     if fitted is None:
         return None
-    mapping, fit = fitted
-    warped = WarpedPair.of(pair, mapping, start.windows)
-    held_out = warped.residual.chessboard_half(even=False)
+    mapping, fit = fitted.mapping, fitted.fit
     known = band.joint
     retrieval, chance = (0.0, 0.0) if known is None else (known.retrieval, known.chance)
     joint = result_of_windows(mapping.fixed_to_moving).with_homography(mapping.fixed_to_moving, fit.covariance_px2)
     joint = replace(joint, retrieval=retrieval, chance=chance, last_step_px=fit.max_px)
-    return Candidate.of("windows", replace(warped, residual=held_out), joint)
+    return Candidate.of("windows", WarpedPair.of(pair, mapping, start.windows), joint, fitted.held_out)
 
 
 def agreeing_with_seed(band: BandCandidates) -> Candidate | None:

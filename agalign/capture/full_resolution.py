@@ -1,8 +1,7 @@
 """Refinement of an alignment of reduced images on tiles of the files at full resolution.
 
-Tiles are read around windows of the reduced images with a measured shift. They form a chessboard: the homography is
-fitted to the windows in the tiles of one colour and verified with those of the other. Memory is limited by the maximum
-number of tiles, independent of the size of the files.
+Tiles are read around windows of the reduced images with a measured shift. The homography is fitted to the windows in
+them. Memory is limited by the maximum number of tiles, independent of the size of the files.
 """
 
 import math
@@ -14,7 +13,7 @@ import numpy as np
 
 from agalign.capture.candidate import BandCandidates, Candidate, mapping_error
 from agalign.errors import UnreadableFileError
-from agalign.fit.window_fit import WindowFit, fit_in_rounds
+from agalign.fit.window_fit import cross_fitted
 from agalign.fit.windows import FixedWindows
 from agalign.pixels.band_resampling import resample_tile
 from agalign.pixels.masks import learnable
@@ -38,7 +37,7 @@ _Tiles = Sequence[tuple[Tile, FixedWindows]]
 def at_full_resolution(reference: Band, band: BandCandidates, start: Candidate) -> Candidate | Issue | None:
     """Return the candidate of a band that is fitted to tiles of the files, from one by the reduced images.
 
-    None if the tiles have too little structure, or if the shifts of the other tiles do not decrease. The issue
+    None if the tiles have too little structure, or if the shifts of held-out windows do not decrease. The issue
     UNREADABLE if a tile of the moving file cannot be read, because its pixels could not be written either. Raises
     UnreadableFileError for the reference.
     """
@@ -46,21 +45,23 @@ def at_full_resolution(reference: Band, band: BandCandidates, start: Candidate) 
     up = pair.scales.fixed.inverse, pair.scales.moving.inverse
     residual, mapping = start.windows.in_file_px(pair.scales), start.mapping.rescaled(*up)
     with open_raster(reference.path, reference.page) as source:
-        for_fit, held_out = (
-            [(tile, _windows(source, reference, tile)) for tile in of_colour]
-            for of_colour in _tiles(residual, reference.size_px)
-        )
+        chosen = [(tile, _windows(source, reference, tile)) for tile in _tiles(residual, reference.size_px)]
+    max_step_px = 40.0  # a larger displacement of a corner contradicts the alignment of the reduced images
     try:
-        refined = _refined(mapping, pair.bands[0], for_fit, held_out, reference.size_px)
+        fitted = cross_fitted(
+            mapping,
+            lambda at: _residual(pair.bands[0], at, chosen),
+            reference.size_px,
+            lambda fit: fit.max_px <= max_step_px,
+        )
     except UnreadableFileError as unreadable:
         return Issue(UNREADABLE, detail=str(unreadable))
-    if refined is None or start.joint is None:
+    if fitted is None or start.joint is None or fitted.held_out.median_px >= fitted.at_start.median_px:
         return None
-    fitted, fit, after = refined
-    down, scale = fitted.rescaled(pair.scales.fixed, pair.scales.moving), pair.scales.fixed
+    down, scale = fitted.mapping.rescaled(pair.scales.fixed, pair.scales.moving), pair.scales.fixed
     factors = np.tile(scale, 4)
-    joint = start.joint.with_homography(down.fixed_to_moving, fit.covariance_px2 * np.outer(factors, factors))
-    windows = after.rescaled(scale)
+    joint = start.joint.with_homography(down.fixed_to_moving, fitted.fit.covariance_px2 * np.outer(factors, factors))
+    windows = fitted.held_out.rescaled(scale)
     error = mapping_error(pair, down, joint.covariance_px2, windows)
     return Candidate("full resolution", pair, down, error, windows, joint, replaced=start)
 
@@ -70,28 +71,11 @@ def _windows(source: OpenRaster, reference: Band, tile: Tile) -> FixedWindows:
     return FixedWindows(fixed.valid, structure_field(fixed))
 
 
-def _refined(
-    start: PixelMapping, moving: Band, for_fit: _Tiles, held_out: _Tiles, size_px: Size
-) -> tuple[PixelMapping, WindowFit, Residual] | None:
-    """Return the mapping between the files that is fitted to half of the tiles, the fit, and the residual of the other
-    half; None if the median shift of that half does not decrease. Raises UnreadableFileError.
-    """
-    max_step_px = 40.0  # a larger displacement of a corner contradicts the alignment of the reduced images
-    fitted = fit_in_rounds(
-        start, lambda mapping: _residual(moving, mapping, for_fit), size_px, lambda fit: fit.max_px <= max_step_px
-    )
-    if fitted is None:
-        return None
-    mapping, fit = fitted
-    before, after = (_residual(moving, m, held_out) for m in (start, mapping))
-    return (mapping, fit, after) if after.median_px < before.median_px else None
-
-
-def _tiles(residual: Residual, size_px: Size) -> tuple[list[Tile], list[Tile]]:
+def _tiles(residual: Residual, size_px: Size) -> list[Tile]:
     """Return, for each cell of the reference (width, height), a tile around the window with the highest peak in the
-    reduced images, by colour.
+    reduced images.
     """
-    # (columns, rows) of cells with one tile each: half of them determine eight parameters, all of them fit into memory.
+    # (columns, rows) of cells with one tile each: a few determine eight parameters, all of them fit into memory.
     min_cells, max_cells = (4, 3), (8, 6)
     counts = [min(max(n // _TILE_PX, low), high) for n, low, high in zip(size_px, min_cells, max_cells, strict=True)]
     best: dict[tuple[int, int], Tile] = {}
@@ -99,8 +83,7 @@ def _tiles(residual: Residual, size_px: Size) -> tuple[list[Tile], list[Tile]]:
         if math.isfinite(residual.shifts_px[index, 0]):
             (column, x0, width), (row, y0, height) = map(_side, residual.centres_px[index], size_px, counts)
             best[column, row] = Tile(x0, y0, width, height)
-    black, white = ([tile for cell, tile in best.items() if sum(cell) % 2 == colour] for colour in (0, 1))
-    return black, white
+    return list(best.values())
 
 
 def _side(centre_px: float, length_px: int, cells: int) -> tuple[int, int, int]:

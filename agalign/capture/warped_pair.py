@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from agalign.capture.band_pair import BandPair
-from agalign.fit.windows import FixedWindows, residual_under
+from agalign.fit.windows import FixedWindows, held_out_residual, residual_under
 from agalign.pixels.band_resampling import shrink
 from agalign.pixels.structure import structure_field, windowed_spectra
 from agalign.values import geometry
@@ -76,12 +76,8 @@ class WarpedPair:
 
         `by_halves` are homographies estimated from the black and from the white windows of a chessboard.
         """
-        by_black_px, by_white_px = (
-            residual_under(self.residual, self.mapping, replace(self.mapping, fixed_to_moving=matrix)).shifts_px
-            for matrix in by_halves
-        )
-        shifts_px = np.where(self.residual.is_even_cell[:, None], by_white_px, by_black_px)
-        return replace(self, residual=self.residual.with_shifts(shifts_px))
+        halves = (replace(self.mapping, fixed_to_moving=matrix) for matrix in by_halves)
+        return replace(self, residual=held_out_residual(self.residual, self.mapping, *halves))
 
     def alias_peak(self) -> AliasPeak:
         """Return the highest correlation peak of the reduced images after that of the mapping."""
@@ -95,9 +91,8 @@ class WarpedPair:
 
     def separate_windows(self) -> Residual:
         """Return the residual of windows that cover the image once."""
-        usual, is_even_cell = self.pair.windows, self.residual.is_even_cell
-        is_complete = self.windows is usual and is_even_cell.any() and not is_even_cell.all()  # not one half of them
-        return self.residual if is_complete else usual.residuals(self.warped)
+        usual = self.pair.windows
+        return self.residual if self.windows is usual else usual.residuals(self.warped)
 
     def common_px(self) -> Points:
         """Return the points (n, 2) of a grid over the reference that the moving image covers.

@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from agalign.errors import GeometryError
-from agalign.fit.windows import Shifts, peak_weights
+from agalign.fit.windows import Shifts, held_out_residual, peak_weights
 from agalign.values import geometry
 from agalign.values.geometry import Points
 from agalign.values.least_squares import MIN_SHIFT_SCALE_PX, Robust, cauchy_weights, least_squares, shift_scale_px
@@ -190,6 +190,46 @@ def fit_in_rounds(
             break
         mapping = replace(result[0], field=mapping.field)
     return result
+
+
+class CrossFit(NamedTuple):
+    """A mapping that is fitted to all windows, and what verifies it."""
+
+    mapping: PixelMapping
+    fit: WindowFit
+    """The last correction."""
+    at_start: Residual
+    """The windows under the first mapping."""
+    held_out: Residual
+    """Each window under the mapping that is fitted to the windows of the other colour of a chessboard."""
+
+
+def cross_fitted(
+    mapping: PixelMapping,
+    measure: Callable[[PixelMapping], Residual],
+    size_px: tuple[int, int],
+    is_accepted: Callable[[WindowFit], bool],
+) -> CrossFit | None:
+    """Correct a homography by `fit_in_rounds`, and the last measurement again by half of its windows at a time.
+
+    None if all windows, or those of one colour, do not determine it.
+    """
+    measured: list[tuple[PixelMapping, Residual]] = []
+
+    def measured_at(at: PixelMapping) -> Residual:
+        measured.append((at, measure(at)))
+        return measured[-1][1]
+
+    fitted = fit_in_rounds(mapping, measured_at, size_px, is_accepted)
+    if fitted is None:
+        return None
+    last, residual = measured[-1]
+    halves = [fit_windows(last, residual.chessboard_half(even=even), size_px) for even in (True, False)]
+    try:
+        by_black, by_white = (half.applied_to(last) for half in halves if half is not None)
+    except (GeometryError, ValueError):  # a degenerate half, or too few windows in it
+        return None
+    return CrossFit(*fitted, measured[0][1], held_out_residual(residual, last, by_black, by_white))
 
 
 # ---- all bands of a capture

@@ -116,22 +116,27 @@ def test_a_refinement_that_fails_verification_leaves_the_earlier_result(capture:
     np.testing.assert_allclose(kept.fixed_to_moving, in_files(good).fixed_to_moving)
 
 
-def test_the_windows_that_verify_share_no_pixel_with_those_of_the_fit(
+def test_each_window_is_verified_by_a_fit_that_shares_no_pixel_with_it(
     capture: Capture, pair: BandPair, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    fitted: list[np.ndarray] = []
+    fitted: list[Residual] = []
     fit_windows = window_fit.fit_windows
 
     def recorded(mapping: PixelMapping, residual: Residual, *rest: Any, **named: Any) -> Any:
-        fitted.append(residual.centres_px)
+        fitted.append(residual)
         return fit_windows(mapping, residual, *rest, **named)
 
     monkeypatch.setattr(window_fit, "fit_windows", recorded)
     residual = in_files(refined(capture, on_reduced_images(pair))).residual
-    assert len(residual.centres_px) > 50
-    apart = np.abs(residual.centres_px[:, None] - np.concatenate(fitted)[None]).max(axis=-1)
+    assert len(residual.centres_px) > 100
     assert len(np.unique(residual.cells, axis=0)) == len(residual.cells)  # windows of several tiles have own cells
-    assert apart.min() >= 50  # the side of the windows: five in each of four tiles
+    black, white = fitted[-2:]
+    for verified, of_fit in (
+        (residual.chessboard_half(even=True), white),
+        (residual.chessboard_half(even=False), black),
+    ):
+        apart = np.abs(verified.centres_px[:, None] - of_fit.centres_px[None]).max(axis=-1)
+        assert apart.min() >= 50  # the side of the windows: five in each of four tiles
 
 
 def test_a_refinement_is_compared_with_the_prediction_of_the_rig(capture: Capture, pair: BandPair) -> None:

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from agalign.fit.window_fit import WindowFit, fit_windows
+from agalign.fit.window_fit import WindowFit, cross_fitted, fit_windows
 from agalign.values import geometry
 from agalign.values.lens_shapes import CALIBRATED, LENS_STD, jacobian, lens_shapes, lens_std_px, variance_px2
 from agalign.values.mapping import DisplacementField, PixelMapping
@@ -66,6 +66,34 @@ def test_eight_parameters_without_a_prior_need_twelve_windows_not_on_a_line() ->
     assert fitted(windows(CORNERS_PX, CENTRES[::8][:12])) is not None
     on_a_line = fitted(windows(CORNERS_PX, CENTRES[:12]))
     assert np.sqrt(np.diag(on_a_line.covariance_px2)).max() > 100
+
+
+def test_all_windows_are_fitted_and_each_is_verified_by_the_other_half() -> None:
+    """The black windows of the right half contradict the others by 1 px: those that verify them do not follow."""
+    truth = PixelMapping(geometry.moving_corners(CORNERS_PX * 4, *SIZE))
+    wrong = (np.rint((CENTRES - 56) / 112).sum(axis=1) % 2 == 0) & (CENTRES[:, 0] > 640)
+
+    def measure(mapping: PixelMapping) -> Residual:
+        shifts_px = geometry.apply(geometry.invert(mapping.fixed_to_moving), truth(CENTRES)) - CENTRES
+        return residual_of(CENTRES, shifts_px + wrong[:, None] * np.array((1.0, 0.0)))
+
+    found = cross_fitted(IDENTITY, measure, SIZE, lambda fit: fit.max_px < 5)
+    assert rms(found.mapping(EVERYWHERE) - truth(EVERYWHERE)) < 0.25
+    assert found.at_start.median_px > 1.0
+    np.testing.assert_allclose(found.held_out.shifts_px[wrong].mean(axis=0), (1.0, 0.0), atol=0.1)
+    assert cross_fitted(IDENTITY, measure, SIZE, lambda fit: fit.max_px < 1) is None
+    black = CENTRES[found.held_out.is_even_cell]
+    assert cross_fitted(IDENTITY, lambda _: windows(CORNERS_PX, black), SIZE, lambda _: True) is None
+
+
+def test_unrelated_windows_do_not_verify_a_fit_to_others() -> None:
+    rng, medians = np.random.default_rng(0), []
+    for _ in range(20):
+        shifts_px = rng.normal(0.0, 2.0, CENTRES[::3].shape)
+        found = cross_fitted(IDENTITY, lambda _, s=shifts_px: residual_of(CENTRES[::3], s), SIZE, lambda _: True)
+        medians += [] if found is None else [found.held_out.median_px]
+    assert len(medians) > 10
+    assert min(medians) > 1.5
 
 
 @pytest.mark.parametrize("lens", [False, True])
