@@ -52,10 +52,10 @@ def bands_of(sidecar: Sidecar, folder: Path, *, mask_qa: bool = False) -> list[A
         if part.place is None and part.is_usable(sidecar.accept_predicted_px):
             problem = f"the pixels of {part.band} were not written; run again"
         elif not part.is_usable(sidecar.accept_predicted_px):
-            limit_px, prediction = sidecar.accept_predicted_px, part.prediction
             error = ""
-            if part.status == "predicted" and prediction is not None:
-                error = f" with a standard error of {prediction.std_px:.1f} px, above {limit_px:g}"
+            if part.status == "predicted" and part.error is not None:
+                limit_px = sidecar.accept_predicted_px
+                error = f" with a standard error of {part.error.in_words}, above {limit_px:g} px of the band"
             problem = f"{part.band} is {part.status.replace('_', ' ')}{error} ({part.reason})"
         result.append(AlignedBand(part.band, part.wavelength_nm, folder / file, index, checksum, problem, quality))
     return result

@@ -44,7 +44,7 @@ BLURRED = Remedy(
 )
 """For a band that is predicted already: its position is known, its pixels are not verified."""
 _INACCURATE = Remedy(
-    "a part of the image may be off by more than 1 px",
+    "a part of the image may be off by more than 1 px of the reference",
     "look at the error map (--error-map); --qa and then 'agalign indices --mask-qa' leave these pixels out",
 )
 _MOVED = Remedy(
@@ -121,7 +121,7 @@ class Caution:
     """
     size: float = math.nan
     size_text: str = ""
-    """Template of how large it is, for the largest `size` of many bands; empty without a size."""
+    """How large it is, or a template of it, for the largest `size` of many bands; empty without a size."""
     is_unusable: bool = False
     """The values are too uncertain for any use: the run returns exit code 3."""
 
@@ -242,7 +242,8 @@ def _of_alignment(band: BandResult, sidecar: Sidecar) -> Iterator[Caution]:
         lost, size, size_text = 1.0, math.nan, ""
         remedy = remedy_of(band, is_mosaic=sidecar.reference.georeferenced)
         if band.status == "predicted" and band.prediction is not None:
-            size, size_text = band.prediction.std_px, "standard error up to {:.2f} px"
+            if band.error is not None:
+                size, size_text = band.error.std_px, f"standard error up to {band.error.in_words}"
             if band.is_usable(sidecar.accept_predicted_px):
                 lost = max(over_1_px, _UNVERIFIED_PIXELS if remedy is BLURRED else 0.0)
         reason = band.reason or ""
@@ -251,16 +252,18 @@ def _of_alignment(band: BandResult, sidecar: Sidecar) -> Iterator[Caution]:
             reason = f"exposed {abs(band.exposed_after_s):.0f} s {way} the reference; {reason}"
         yield Caution(band.band, band.status, remedy, reason, lost, size, size_text)
     elif over_1_px > MIN_SHARE_OVER_1_PX:
-        reason = f"{over_1_px:.0%} of the pixels may be off by more than {MAX_PIXEL_ERROR_PX:g} px"
+        reason = f"{over_1_px:.0%} of the pixels may be off by more than {MAX_PIXEL_ERROR_PX:g} px of the reference"
         yield Caution(band.band, "check", _INACCURATE, reason, over_1_px, over_1_px, "up to {:.0%} of a band")
     prediction = band.prediction
     if prediction is None or prediction.off_px is None:
         return
     if prediction.off_px > max(MAX_PIXEL_ERROR_PX, _MIN_OFF_STD * prediction.std_px):
         status = "check" if band.status == "aligned" else band.status
-        reason = f"its own image is aligned {prediction.off_px:.1f} px from the position that the rig predicts"
+        reason = (
+            f"its own image is aligned {prediction.off_px:.1f} px of the band from the position that the rig predicts"
+        )
         # Which of the two is right is unknown.
-        text, lost = "up to {:.1f} px", 0.5 if band.status == "aligned" else 0.0
+        text, lost = "up to {:.1f} px of the band", 0.5 if band.status == "aligned" else 0.0
         yield Caution(band.band, status, UNEXPECTED_PX.remedy, reason, lost, prediction.off_px, text)
 
 

@@ -21,7 +21,16 @@ from agalign._version import __version__
 from agalign.config import Settings
 from agalign.flight.fingerprint import estimation_fingerprint
 from agalign.records.sidecar_samples import sampled_mapping, sampled_parallax
-from agalign.values.alignment import COVARIANCE_DECIMALS, Alignment, JointResult, Prediction, Seed, is_usable
+from agalign.values.alignment import (
+    COVARIANCE_DECIMALS,
+    Alignment,
+    JointResult,
+    Prediction,
+    Seed,
+    has_same_pixel_size,
+    in_both_px,
+    is_usable,
+)
 from agalign.values.capture import Band, CameraIdentity, Capture, Pose, Position, source_file
 from agalign.values.choices import CaptureStatus, Geometry, PairStatus, Space
 from agalign.values.equality import equal
@@ -198,6 +207,8 @@ class ErrorPart(_Part):
 
     std_px: Number4
     """Standard error: RMS of the expected error over the area that both images show, without the shifts of `moved`."""
+    std_band_px: Number4 | None = None
+    """The same in px of the band."""
     covariance_px2: Annotated[NDArray[np.float64], Array((None, None), COVARIANCE_DECIMALS)] | None = None
     """Covariance of the corners (8 x 8), clockwise from the top left, x and y in turn, or with lens shapes (12 x 12);
     null for a prediction by other bands or captures, whose windows are no part of the error."""
@@ -211,6 +222,20 @@ class ErrorPart(_Part):
     """Spread of the parallax that a mapping without it lacks, where no window is near."""
     moved: tuple[MovedArea, ...] = ()
     """Areas that contradict the mapping: what they show moved between the exposures, or is near the camera."""
+
+    @property
+    def in_words(self) -> str:
+        """The standard error, in px of the band too if its pixels differ from those of the reference."""
+        if self.std_band_px is None:
+            return f"{self.std_px:.2f} px of the reference"
+        return in_both_px(self.std_px, self.std_band_px)
+
+    @property
+    def other_px(self) -> float | None:
+        """The standard error in px of the band, if these differ from those of the reference; else None."""
+        if self.std_band_px is None or has_same_pixel_size(self.std_px, self.std_band_px):
+            return None
+        return self.std_band_px
 
     @field_validator("covariance_px2")
     @classmethod
@@ -227,6 +252,7 @@ class ErrorPart(_Part):
             return None
         return cls(
             std_px=alignment.std_px,
+            std_band_px=alignment.std_band_px,
             covariance_px2=error.covariance_px2,
             rig_std_px=error.rig_std_px,
             lens_std_px=error.lens_std_px,
@@ -558,7 +584,7 @@ class Sidecar(_Part):
     parallax: FilePart | None = None
     """Parallax raster on the pixels of the reference."""
     accept_predicted_px: Number
-    """Largest standard error of a predicted band for indices, px."""
+    """Largest standard error of a predicted band for indices, px of the band."""
     estimated_with: str
     """Fingerprint of everything that the estimation depends on, apart from the contents of the files."""
     model: str = ""

@@ -15,7 +15,7 @@ from agalign.values.arguments import checked
 from agalign.values.choices import Geometry, Interpolation, ModelFamily, PairStatus, PredictionSource, SeedKind, Space
 from agalign.values.equality import equal
 from agalign.values.fields import RECORD, Matrix3x3, Measured, Number, Number4, UpToInfinity
-from agalign.values.geometry import Matrix, PairScales, Points
+from agalign.values.geometry import Matrix, PairScales, Points, magnification
 from agalign.values.image import FloatImage, Mask, Tile
 from agalign.values.issues import SEED_DOES_NOT_FIT, Issue, sentence
 from agalign.values.mapping import PixelMapping
@@ -29,6 +29,9 @@ COVARIANCE_DECIMALS = 9
 """Of covariances in a sidecar, px squared: a millionth of those of accurate mappings."""
 STD_DECIMALS = 4
 """Of standard errors: a limit of them holds for what is written."""
+_SAME_PIXEL_SIZE = 0.1
+"""Relative difference between the pixels of band and reference up to which an error in words is one number: bands of
+one resolution differ by less, thermal and panchromatic bands by more."""
 MIN_RETRIEVAL = 0.2
 """Minimum held-out retrieval: below it psi is not updated, and only windows that no fit used confirm a result. Chance
 is below 0.01; unrelated images reach 0.05."""
@@ -212,8 +215,8 @@ class Alignment:
     (True, True)
     >>> result.geometry, result.space, result.fixed_to_moving.shape
     ('field', 'pixel', (3, 3))
-    >>> result.std_px < 0.2, result.error_map_px.shape  # expected error, px
-    (True, (200, 200))
+    >>> result.std_px < 0.2, result.std_band_px < 0.2, result.error_map_px.shape  # px of the reference, of the band
+    (True, True, (200, 200))
     >>> unknown = agalign.align(np.ones_like(green), nir)  # raises no error
     >>> unknown.status, unknown.reason
     ('failed', 'the reference band is constant or all invalid')
@@ -271,6 +274,15 @@ class Alignment:
         if self.prediction is not None:
             return "predicted"
         return "seed_only" if self.is_seed_usable else "failed"
+
+    @property
+    def std_band_px(self) -> float:
+        """The standard error in px of the moving image: for a thermal band, whose pixels are larger than those of the
+        reference, a smaller number than `std_px`. `prediction.std_px` of a predicted band.
+        """
+        if self.status == "predicted" and self.prediction is not None:
+            return self.prediction.std_px
+        return self.std_px * magnification(self.fixed_to_moving, *self.size_px)
 
     def map(self, reference_px: "ArrayLike") -> Points:
         """Map positions in the reference to positions in the moving image.
@@ -518,8 +530,8 @@ class Alignment:
                 "flight": "the flight's mean",
                 "windows": "windows in the image",
             }
-            source, std_px = sources[self.prediction.source], self.prediction.std_px
-            return f"{text}; predicted from {source}, standard error {std_px:.2f} px"
+            error = in_both_px(self.std_px, self.std_band_px)
+            return f"{text}; predicted from {sources[self.prediction.source]}, standard error {error}"
         if self.status == "seed_only":
             return f"{text}; the {self.seed.kind} seed is used unchanged"
         if self.issues[-1].kind == SEED_DOES_NOT_FIT:
@@ -537,10 +549,25 @@ class Alignment:
 def is_usable(status: PairStatus, prediction: Prediction | None, accept_predicted_px: float) -> bool:
     """Return True for the reference, an aligned band, or a predicted one with a standard error of at most
     `accept_predicted_px`, px of the band: the one definition of a delivered band.
+
+    The limit also holds in px of the coarser of band and reference, which is what their combination resolves: a band
+    with larger pixels than the reference is itself the coarser; in a band with smaller ones, a px is less.
     """
     if status == "predicted":
         return prediction is not None and prediction.std_px <= accept_predicted_px
     return status in ("reference", "aligned")
+
+
+def has_same_pixel_size(std_px: float, std_band_px: float) -> bool:
+    """Return True if the pixels of the reference and of a band have the same size to 10 %, given an error in both."""
+    return abs(std_band_px - std_px) <= _SAME_PIXEL_SIZE * std_px
+
+
+def in_both_px(std_px: float, std_band_px: float) -> str:
+    """Return an error in words, given in px of the reference and of the band: one number if their pixels are equal."""
+    if has_same_pixel_size(std_px, std_band_px):
+        return f"{std_band_px:.2f} px"
+    return f"{std_px:.2f} px of the reference ({std_band_px:.2f} px of the band)"
 
 
 Alignments = dict[str, Alignment]

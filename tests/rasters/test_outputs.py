@@ -285,7 +285,7 @@ def test_floats_without_a_unit_may_be_reflectance(tmp_path: Path, factor: float,
     ("status", "accepted_px", "std_px", "problem"),
     [
         ("predicted", 2.0, 1.5, ""),
-        ("predicted", 0.5, 0.8, "NIR is predicted with a standard error of 0.8 px, above 0.5"),
+        ("predicted", 0.5, 0.8, "NIR is predicted with a standard error of 0.80 px, above 0.5 px of the band"),
         ("predicted", 0.5, 0.4, ""),
         ("seed_only", 0.5, 0.4, "NIR is seed only"),
     ],
@@ -297,7 +297,7 @@ def test_indices_of_delivered_bands(
     make_aligned(tmp_path, 1)
     path = tmp_path / "0000SET" / "IMG_0001.json"
     prediction = {"from": "flight", "std_px": std_px, "fixed_to_moving": np.eye(3).tolist()}
-    of_nir = {"status": status, "prediction": prediction}
+    of_nir = {"status": status, "prediction": prediction, "error": {"std_px": std_px, "std_band_px": std_px}}
     bands = [part | (of_nir if part["band"] == "NIR" else {}) for part in read_json(path)["bands"]]
     change(path, bands=bands, accept_predicted_px=accepted_px)
     (result,) = indices_of(tmp_path)

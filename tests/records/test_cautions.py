@@ -60,6 +60,12 @@ def issue(kind: str) -> list[dict[str, Any]]:
     return [{"kind": kind, "value": 0.02, "limit": 0.5}]
 
 
+def predicted(std_px: float, kind: str, **facts: Any) -> dict[str, Any]:
+    """The facts about a band that is predicted with this error."""
+    known = {"status": "predicted", "reason": "", "issues": issue(kind), "prediction": prediction(std_px)}
+    return known | {"error": {"std_px": std_px, "std_band_px": std_px}} | facts
+
+
 OUTPUT = {"file": "a.tif", "crop": (0, 0, 10, 8), "nodata": None}
 
 
@@ -77,26 +83,16 @@ def test_a_good_band_needs_no_check() -> None:
         # What moved is not said again as a large error.
         ({"moved_share": 0.04, "share_over_1_px": 0.045}, "4.0% of it shows", 0.04, "up to 4.0% of a band"),
         ({"saturated": 0.125}, "12.5% of the pixels are saturated", 0.125, "up to 12.5% of a band"),
-        ({"prediction": prediction(0.1, 7.42)}, "its own image is aligned 7.4 px from", 0.5, "up to 7.4 px"),
+        ({"prediction": prediction(0.1, 7.42)}, "its own image is aligned 7.4 px of", 0.5, "up to 7.4 px of the band"),
         ({"status": "failed", "reason": "it is blank", "issues": issue("coverage")}, "it is blank", 1.0, ""),
+        (predicted(0.02, "retrieval", reason="dim"), "dim", 0.5, "standard error up to 0.02 px"),
+        (predicted(0.4, "cluster", share_over_1_px=0.125), "", 0.125, "standard error up to 0.40 px"),
+        (predicted(4.0, "cluster"), "", 1.0, "standard error up to 4.00 px"),
         (
-            {"status": "predicted", "reason": "dim", "issues": issue("retrieval"), "prediction": prediction(0.02)},
-            "dim",
-            0.5,
-            "standard error up to 0.02 px",
-        ),
-        (
-            {"status": "predicted", "reason": "so", "issues": issue("cluster"), "prediction": prediction(0.4)}
-            | {"share_over_1_px": 0.125},
-            "so",
-            0.125,
-            "standard error up to 0.40 px",
-        ),
-        (
-            {"status": "predicted", "reason": "so", "issues": issue("cluster"), "prediction": prediction(4.0)},
-            "so",
-            1.0,
-            "standard error up to 4.00 px",
+            predicted(0.88, "coverage", error={"std_px": 12.55, "std_band_px": 0.88}),
+            "",
+            0.0,
+            "standard error up to 12.55 px of the reference (0.88 px of the band)",
         ),
     ],
 )
@@ -207,7 +203,7 @@ def groups() -> Any:
     """A run with a failed band, three blurred ones, and a panel that contradicts the sensor by 10 %."""
     totals = PairTotals(RunFacts((panel(Red=1.1),)))
     output = OUTPUT | {"radiometry": "reflectance by panel", "panel_age_s": 60.0}
-    blurred = {"status": "predicted", "reason": "blurred", "issues": issue("retrieval"), "prediction": prediction(0.02)}
+    blurred = predicted(0.02, "retrieval", reason="blurred")
     for number in range(3):
         red = ALIGNED | {"band": "Red"} | ({"status": "failed", "reason": "blank"} if number == 0 else {})
         totals.add(f"IMG_{number}", example(bands=[ALIGNED | blurred, red], output=output))
@@ -250,8 +246,7 @@ def test_report_and_tables_have_what_to_check(tmp_path: Path) -> None:
     reason = "the descriptors do not distinguish held-out patches (retrieval 0.02)"
     for band in sidecar["bands"]:
         if band["band"] == "Red edge":
-            blurred = {"status": "predicted", "issues": issue("retrieval"), "prediction": prediction(0.02)}
-            band |= blurred | {"reason": reason}
+            band |= predicted(0.02, "retrieval", reason=reason)
     write_sidecar(path, Sidecar.model_validate_json(json.dumps(sidecar)))
     reports = {(r.capture, r.index): r for r in indices_of(tmp_path, "ndvi", "ndre")}
     ndre = reports["0000SET/IMG_0001", "ndre"]

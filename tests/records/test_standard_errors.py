@@ -16,7 +16,9 @@ from agalign.batch import capture_task as batch
 from agalign.capture.align_bands import CaptureEstimation
 from agalign.capture.by_rig import RigPrediction
 from agalign.capture.candidate import Candidate
-from agalign.records.sidecar import BandResult
+from agalign.config import Settings
+from agalign.records.captures import bands_of
+from agalign.records.sidecar import BandResult, Sidecar
 from agalign.records.sidecar_file import find_sidecars, read_sidecar
 from agalign.values import geometry
 from agalign.values.alignment import JointResult, Prediction, Seed
@@ -33,6 +35,7 @@ from ..builders import decided, in_full_run, joint_result, pair_of, residual_of,
 from ..capture.test_by_relief import REFERENCE, Rendered
 from ..conftest import Shared
 from ..rasters.test_relief_map import scene_in
+from ..run_outputs import aligned
 
 SIZE = 640, 480
 
@@ -170,6 +173,47 @@ def test_a_band_is_delivered_by_the_standard_error_that_is_written(
     assert again.prediction.std_px == estimated.prediction.std_px
     assert again.status == estimated.status == written.status == "predicted"
     assert [known.is_usable(accept_px) for known in (estimated, written, again)] == [is_usable] * 3
+
+
+@pytest.mark.parametrize(
+    ("magnification", "std_band_px", "status", "words"),
+    [
+        (0.07, 0.88, "ok", "12.57 px of the reference (0.88 px of the band)"),
+        (0.07, 1.2, "degraded", "17.14 px of the reference (1.20 px of the band)"),
+        (2.0, 0.9, "ok", "0.45 px of the reference (0.90 px of the band)"),
+        # Less than 1 px of the reference, the coarser of the two: the limit in px of the band is stricter.
+        (2.0, 1.2, "degraded", "0.60 px of the reference (1.20 px of the band)"),
+        (1.05, 0.5, "ok", "0.50 px"),
+    ],
+)
+def test_an_error_has_its_value_in_both_pixels_and_the_limit_holds_in_the_coarser(
+    magnification: float, std_band_px: float, status: str, words: str
+) -> None:
+    """A thermal, a panchromatic, and a narrow band."""
+    size_px, std_px = (640, 480), std_band_px / magnification
+    mapping = PixelMapping(np.diag([magnification, magnification, 1.0]))
+    moving_px = tuple(round(side * magnification) for side in size_px)
+    reference = Band("Green", Path("g.tif"), 1, *size_px, "uint16")
+    band = Band("Other", Path("o.tif"), 1, *moving_px, "uint16")
+    prediction = Prediction(mapping.fixed_to_moving, "windows", std_band_px)
+    error = MappingError(size_px, rig_std_px=std_px)
+    alignment = aligned(mapping, size_px, "predicted", prediction=prediction, error=error, std_px=std_px)
+    sidecar = Sidecar.estimated(Capture("a", Path(), (reference, band), 0), {"Other": alignment}, Settings())
+    part = sidecar.bands[1]
+    assert sidecar.status == status
+    assert part.is_usable(1.0) == alignment.is_usable(1.0) == (status == "ok")
+    if status == "ok":
+        assert min(part.error.std_px, part.error.std_band_px) <= 1
+    assert (part.error.std_px, part.error.std_band_px) == pytest.approx((std_px, std_band_px))
+    assert part.reason.endswith(f"standard error {words}")
+    problem = bands_of(sidecar, Path())[1].problem
+    stated = f"Other is predicted with a standard error of {words}, above 1 px of the band ("
+    assert problem.startswith(stated if status == "degraded" else "the pixels of Other were not written")
+    assert (part.error.other_px is None) == ("reference" not in words)
+    earlier = part.error.model_copy(update={"std_band_px": None})
+    assert (earlier.other_px, earlier.in_words) == (None, f"{std_px:.2f} px of the reference")
+    confirmed = aligned(mapping, size_px, std_px=std_px)
+    assert confirmed.std_band_px == pytest.approx(std_band_px)
 
 
 def test_areas_that_moved_are_equal_in_the_run_and_in_its_sidecar() -> None:
