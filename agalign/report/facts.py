@@ -16,11 +16,11 @@ from numpy.typing import NDArray
 from agalign.host.text import escape_controls
 from agalign.records.cautions import MIN_SHARE_OVER_1_PX, NO_RESULT, NOT_FLAT, Caution, RunFacts
 from agalign.records.excluded import PanelPart, SkyPart
-from agalign.records.sidecar import BandResult, GeometryPart, GridPart, OutputPart, Sidecar
+from agalign.records.sidecar import BandResult, ErrorPart, GeometryPart, GridPart, OutputPart, Sidecar
 from agalign.report.light_over_captures import LightOverCaptures
 from agalign.report.page_data import DataParts
 from agalign.report.summary_csv import BAND_COLUMNS, SIMILARITY, SummaryTable, rounded, row_of, value_at
-from agalign.report.verdict import Verdict, is_by_prediction, largest_error_px, unwritten_indices
+from agalign.report.verdict import Verdict, is_by_prediction, largest_error, unwritten_indices
 from agalign.spectral_indices.rasters import IndexReport
 from agalign.values.alignment import Prediction
 from agalign.values.issues import OTHER_REFERENCE, Remedy
@@ -71,7 +71,7 @@ class CautionGroup:
         """The remedy; for predicted bands, also when they may be used as they are."""
         if self.status != "predicted":
             return self.remedy.advice
-        usable = "indices use those with a standard error (prediction.std_px) within --accept-predicted"
+        usable = "indices use those with a standard error (prediction.std_px, px of the band) within --accept-predicted"
         return f"{usable}; {self.remedy.advice}"
 
     @property
@@ -349,14 +349,14 @@ class FlightFacts:
         known_px = np.where(is_measured, shifts_px, 0.0)
         steps = np.rint(known_px / _SHIFT_STEP_PX).astype(int).ravel().tolist()
         shifts = zip(steps, is_measured.ravel().tolist(), strict=True)
-        error_px = None if band.error is None else rounded(band.error.std_px)
         # The first nine columns of the table have the same names here.
         return {name: row[name] for name in tuple(BAND_COLUMNS)[:9]} | {
             "seconds": round(band.seconds, 2),
             "written": band.place is not None,
             "offset_px": offset_px,
             "offset_length_px": offset_length_px,
-            "error_px": error_px,
+            **_errors(band.error),
+            "usable": band.is_usable(sidecar.accept_predicted_px),
             "over_1_px": band.share_over_1_px,
             "coverage": row["residual_coverage"],
             "similarity": None if metrics is None else similarity,
@@ -386,7 +386,6 @@ def _of_capture(folder: Path, label: str, sidecar: Sidecar) -> dict[str, Any]:
         "missing": [(name, reason) for name, status, reason in sidecar.pairs if status == "missing"],
         "reference": sidecar.reference.band,
         "seconds": sidecar.seconds,
-        "accept_predicted_px": sidecar.accept_predicted_px,
         "crop": grid.crop,
         "scale": grid.scale,
         "radiometry": _radiometry(grid),
@@ -396,8 +395,14 @@ def _of_capture(folder: Path, label: str, sidecar: Sidecar) -> dict[str, Any]:
         "picture": _link(folder, files.get("picture")),
         "preview": _preview(sidecar, folder),
         "residual_px": rounded(sidecar.largest_residual("residual_px")),
-        "error_px": rounded(largest_error_px(sidecar)),
+        **_errors(largest_error(sidecar)),
     }
+
+
+def _errors(error: ErrorPart | None) -> dict[str, Any]:
+    """An expected error in px of the reference, and in px of the band if these differ."""
+    std_px, other_px = (None, None) if error is None else (error.std_px, error.other_px)
+    return {"error_px": rounded(std_px), "error_band_px": rounded(other_px)}
 
 
 def _radiometry(output: OutputPart) -> str | None:
@@ -410,7 +415,7 @@ def _map_row(facts: dict[str, Any]) -> dict[str, Any]:
     """The row of a capture in the table of the page, and its dot on the map."""
     moving = [b for b in facts["bands"] if b["status"] != "reference"]
     same = "label", "captured_at", "camera", "status", "shown", "position", "altitude_m", "missing", "seconds", "stack"
-    return {name: facts[name] for name in (*same, "error_px")} | {
+    return {name: facts[name] for name in (*same, "error_px", "error_band_px")} | {
         "bands": [(b["band"], b["status"]) for b in moving],
         "residual_px": facts["residual_px"],
         "indices": {i["name"]: i["median"] for i in facts["indices"]},

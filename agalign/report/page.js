@@ -12,7 +12,7 @@
  * @typedef {{kind: string, held_out_p95_px: Record<string, number | null>}} Geometry
  * @typedef {{band: string, wavelength_nm: number | null, status: string, reason: string | null, seed: string | null,
  *   seconds: number, written: boolean, offset_px: [number, number] | null, offset_length_px: number | null,
- *   residual_px: number | null, residual_p95_px: number | null, error_px: number | null, over_1_px: number | null,
+ *   residual_px: number | null, residual_p95_px: number | null, error_px: number | null, error_band_px: number | null, usable: boolean, over_1_px: number | null,
  *   coverage: number | null, retrieval: number | null, corner_std_px: number | null, similarity: Record<string, [number | null, number | null]> | null,
  *   prediction: Prediction | null, geometry: Geometry | null, occluded: number | null, check: string[], lattice: number,
  *   shifts: (number | null)[]}} Pair
@@ -23,7 +23,6 @@
  *   relief: {parallax_px: [number, number], range_m: [number, number] | null} | null,
  *   indices: string[]}} Preview
  * @typedef {{label: string, captured_at: string, camera: string, status: string, shown: string, position: [number, number] | null,
- *   accept_predicted_px: number,
  *   radiometry: string | null, altitude_m: number | null, missing: [string, string][], reference: string, seconds: number,
  *   crop: [number, number, number, number], scale: [number, number], stack: string | null, sidecar: string,
  *   relief: string | null,
@@ -31,10 +30,11 @@
  *   unwritten: [string, string][]}} Capture `shown` is its status, or "ok_by_prediction"; `unwritten` has index and reason.
  * @typedef {{label: string, captured_at: string, camera: string, status: string, shown: string, position: [number, number] | null,
  *   altitude_m: number | null, missing: [string, string][], seconds: number, stack: string | null, bands: [string, string][],
- *   residual_px: number | null, error_px: number | null, indices: Record<string, number | null>, raw: boolean,
+ *   residual_px: number | null, error_px: number | null, error_band_px: number | null, indices: Record<string, number | null>, raw: boolean,
  *   check: boolean}} Row
  *   The row of a capture in the table, with name and status of each moving band, the largest residual of
  *   the aligned ones, and the largest expected error of those that indices can use.
+ *   `error_px` is in px of the reference; `error_band_px` is null if the pixels of the band have the same size.
  * @typedef {{from: number, records: Row[]}} Rows
  * @typedef {{from: number, records: Capture[], first_lattice: number, lattices: number[][]}} Details
  *   `from` is the number of captures before the part, `first_lattice` the number of lattices.
@@ -205,6 +205,11 @@ function fixed(value, digits = 2) {
   return value === null || value === undefined ? "–" : value.toFixed(digits);
 }
 
+/** What follows an expected error in px of the reference. @param {{error_band_px: number | null}} of */
+function inBandPx(of) {
+  return of.error_band_px === null ? "" : ` (${fixed(of.error_band_px)} px of the band)`;
+}
+
 /** @param {number} share */
 function percent(share) {
   return `${(100 * share).toFixed(1)} %`;
@@ -239,7 +244,7 @@ const columns = [
   { title: "Capture", numeric: false, value: (c) => c.label, cell: (c) => el("a", { href: address(c) }, c.label) },
   { title: "Status", numeric: false, value: (c) => Object.keys(STATUS_COLOURS).indexOf(c.shown), cell: captureBadge },
   { title: "Bands", numeric: false, value: (c) => c.bands.filter(([, status]) => status === "aligned").length / Math.max(1, c.bands.length + c.missing.length), cell: chips },
-  { title: "Expected error, px", term: "expected_error", numeric: true, value: (c) => c.error_px, cell: (c) => fixed(c.error_px, 3) },
+  { title: "Expected error, px", term: "expected_error", numeric: true, value: (c) => c.error_px, cell: (c) => `${fixed(c.error_px, 3)}${inBandPx(c)}` },
   { title: "Largest residual, px", term: "residual", numeric: true, wide: true, value: (c) => c.residual_px, cell: (c) => fixed(c.residual_px, 3) },
   { title: "Taken", numeric: false, wide: true, value: (c) => c.captured_at, cell: (c) => taken(c.captured_at) },
   { title: "Seconds", numeric: true, wide: true, value: (c) => c.seconds, cell: (c) => c.seconds.toFixed(1) },
@@ -1223,20 +1228,19 @@ function words(capture) {
  */
 function sentence(pair, capture) {
   const offset = pair.offset_length_px === null || pair.offset_length_px < 0.05 ? "" : `had an offset of ${fixed(pair.offset_length_px, pair.offset_length_px < 10 ? 1 : 0)} px from ${capture.reference} and `;
-  const over = pair.over_1_px === null || pair.over_1_px <= facts.min_share_over_1_px ? "" : ` ${percent(pair.over_1_px)} of its pixels may be off by more than 1 px.`;
+  const over = pair.over_1_px === null || pair.over_1_px <= facts.min_share_over_1_px ? "" : ` ${percent(pair.over_1_px)} of its pixels may be off by more than 1 px of the reference.`;
   if (pair.status === "aligned") {
     const left = pair.residual_px;
     if (left === null) return `${offset}is aligned; no window could measure a residual.`;
     const most = pair.residual_p95_px === null ? "" : `, 95 % ${fixed(pair.residual_p95_px)} px`;
     const seen = pair.occluded === null ? "" : ` The relief of the capture is corrected; ${percent(pair.occluded)} of its image is occluded.`;
-    const error = pair.error_px === null ? "" : `expected error ${fixed(pair.error_px)} px (RMS), and `;
+    const error = pair.error_px === null ? "" : `expected error ${fixed(pair.error_px)} px of the reference${inBandPx(pair)} (RMS), and `;
     return `${offset}is aligned: ${error}at most 0.5 px in 90 % of ${pair.occluded === null ? "the area that both images show" : "its windows"}, suitable for indices of single plants. Median residual ${fixed(left)} px${most}.${over}${seen}`;
   }
   if (pair.status === "predicted") {
-    const std = pair.prediction?.std_px ?? Infinity;
-    const use = std <= capture.accept_predicted_px ? "indices can use it, but its own image does not confirm it" : "not suitable for indices";
+    const use = pair.usable ? "indices can use it, but its own image does not confirm it" : "not suitable for indices";
     const how = pair.prediction?.from === "windows" ? "is predicted by its windows" : "is predicted by the rig of the flight";
-    return `${offset}${how}, standard error ${fixed(std)} px (${use}): ${pair.reason ?? "no reason was recorded"}.${over}`;
+    return `${offset}${how}, standard error ${fixed(pair.error_px)} px of the reference${inBandPx(pair)}; ${use}: ${pair.reason ?? "no reason was recorded"}.${over}`;
   }
   if (pair.status === "seed_only") return `is not aligned: ${pair.reason ?? "no reason was recorded"}. Only its seed is applied; exclude it from indices.`;
   return `failed: ${pair.reason ?? "no reason was recorded"}. It is nodata in the output.`;
@@ -1246,14 +1250,14 @@ function sentence(pair, capture) {
 function numbers(capture) {
   /** @type {Head[]} */
   const heads = [
-    ["Band"], ["Status"], ["Start", "seed"], ["Expected error, px", "expected_error"], ["Over 1 px", "over_1_px"], ["Residual, median, px", "residual"],
+    ["Band"], ["Status"], ["Start", "seed"], ["Expected error, px of the reference", "expected_error"], ["Over 1 px", "over_1_px"], ["Residual, median, px", "residual"],
     ["Residual, p95, px", "residual"], ["Windows measured", "coverage"], ["Retrieval", "retrieval"], ["Geometry, p95, px", "geometry"], ["Occluded", "occluded"], ["Seconds"],
   ];
   const rows = moving(capture).map((pair) => {
     const heldOut = pair.geometry === null ? {} : pair.geometry.held_out_p95_px;
     const geometry = pair.geometry === null ? "–" : `${pair.geometry.kind}${Object.keys(heldOut).length > 1 ? ` (${Object.entries(heldOut).map(([kind, px]) => `${kind} ${fixed(px)}`).join(", ")})` : ""}`;
     return [
-      pair.band, bandBadge(pair), pair.seed ?? "–", fixed(pair.error_px, 3), pair.over_1_px === null ? "–" : percent(pair.over_1_px),
+      pair.band, bandBadge(pair), pair.seed ?? "–", `${fixed(pair.error_px, 3)}${inBandPx(pair)}`, pair.over_1_px === null ? "–" : percent(pair.over_1_px),
       fixed(pair.residual_px, 3), fixed(pair.residual_p95_px, 3), pair.coverage === null ? "–" : `${Math.round(pair.coverage * 100)} %`, fixed(pair.retrieval), geometry,
       pair.occluded === null ? "–" : percent(pair.occluded), pair.seconds.toFixed(1),
     ];

@@ -28,6 +28,7 @@ BAND_COLUMNS = {
     "prediction_off_px": "prediction.off_px",
     **{f"{name}_{when}": f"metrics.{when}.{name}" for name in SIMILARITY for when in ("before", "after")},
     "expected_error_px": "error.std_px",
+    "expected_error_band_px": "error.std_band_px",
     "share_over_1_px": "share_over_1_px",
     "moved_share": "moved_share",
     "seconds": "seconds",

@@ -25,7 +25,7 @@ TERMS: dict[str, Term] = {
         "predicted",
         "band: its image does not determine the whole mapping (water, blur, parallax seen by only two lenses). Other "
         "bands and captures predict it, or windows in a part of the image, with a standard error. Indices use it up to "
-        "--accept-predicted",
+        "--accept-predicted, px of the band",
     ),
     "seed_only": Term(
         "seed only, failed, missing",
@@ -37,10 +37,12 @@ TERMS: dict[str, Term] = {
         "expected error",
         "distance between a pixel of the band and the same place in the reference that is to be expected, px of the "
         "reference: root mean square over the area that both images show. It is an estimate and not a limit: errors of "
-        "single pixels may be larger (heat map of expected errors, option --error-map)",
+        "single pixels may be larger (heat map of expected errors, option --error-map). For a band with larger or "
+        "smaller pixels, such as a thermal one, it is also given in px of the band",
     ),
     "over_1_px": Term(
-        "over 1 px", "share of the pixels of the output whose expected error is larger than 1 px or unknown"
+        "over 1 px",
+        "share of the pixels of the output whose expected error is unknown or larger than 1 px of the reference",
     ),
     "offset": Term(
         "offset before",
@@ -77,9 +79,11 @@ TERMS: dict[str, Term] = {
         "better; for the others, higher is better",
     ),
     "rig_from_bands": Term(
-        "error from bands", "RMS error of the band if the other bands of the same capture predict it, px"
+        "error from bands", "RMS error of the band if the other bands of the same capture predict it, px of the band"
     ),
-    "rig_from_flight": Term("error from flight", "RMS error of the band if only the other captures predict it, px"),
+    "rig_from_flight": Term(
+        "error from flight", "RMS error of the band if only the other captures predict it, px of the band"
+    ),
 }
 PAGES = (
     ("Read the report", "docs/how-to/report.md", "what to do, and limits for use"),

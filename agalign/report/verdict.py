@@ -6,12 +6,13 @@ import os
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from operator import attrgetter
 from pathlib import Path
 from statistics import median
 from typing import NamedTuple
 
 from agalign.errors import ConfigurationError
-from agalign.records.sidecar import BandResult, Sidecar
+from agalign.records.sidecar import BandResult, ErrorPart, Sidecar
 from agalign.spectral_indices.formulas import index_named
 from agalign.spectral_indices.rasters import IndexReport, reason_not_written
 
@@ -23,6 +24,8 @@ class ExpectedError(NamedTuple):
 
     std_px: float
     """RMS over the area that both images show, px of the reference."""
+    other_px: float | None
+    """The same in px of the band, if these differ from those of the reference."""
     capture: str
     band: str
     share_over_1_px: float | None
@@ -36,9 +39,9 @@ class Verdict:
     usable: Counter[str] = field(default_factory=Counter)
     """Number of usable moving bands by status: aligned, or predicted within the accepted standard error."""
     errors_px: dict[str, list[float]] = field(default_factory=lambda: defaultdict(list))
-    """Expected errors of the usable moving bands, by name of the band."""
-    largest: ExpectedError | None = None
-    """The largest of them."""
+    """Expected errors of the usable moving bands, by name of the band, px of the reference."""
+    largest_of: dict[str, ExpectedError] = field(default_factory=dict)
+    """The largest of them, by name of the band."""
     unwritten: dict[str, list[tuple[str, str]]] = field(default_factory=lambda: defaultdict(list))
     """(label, reason) of the captures by requested index that was not written."""
 
@@ -50,14 +53,19 @@ class Verdict:
             self.usable[str(band.status)] += 1
             if band.error is None:
                 continue
-            error = ExpectedError(band.error.std_px, label, band.band, band.share_over_1_px)
+            error = ExpectedError(band.error.std_px, band.error.other_px, label, band.band, band.share_over_1_px)
             self.errors_px[band.band].append(error.std_px)
-            if self.largest is None or error.std_px > self.largest.std_px:
-                self.largest = error
+            if band.band not in self.largest_of or error.std_px > self.largest_of[band.band].std_px:
+                self.largest_of[band.band] = error
+
+    @property
+    def largest(self) -> ExpectedError | None:
+        """The largest expected error, px of the reference; None if none is known."""
+        return max(self.largest_of.values(), key=attrgetter("std_px"), default=None)
 
     @property
     def median_px(self) -> float | None:
-        """Median of the expected errors; None if none is known."""
+        """Median of the expected errors, px of the reference; None if none is known."""
         errors_px = [px for of_band in self.errors_px.values() for px in of_band]
         return median(errors_px) if errors_px else None
 
@@ -74,11 +82,12 @@ class Verdict:
         return [f"{count} {word}" for word, count in counts.items() if count]
 
 
-def largest_error_px(sidecar: Sidecar) -> float | None:
-    """Return the largest expected error of the moving bands of a capture that indices can use, px; None if none is
-    known.
+def largest_error(sidecar: Sidecar) -> ErrorPart | None:
+    """Return the largest expected error of the moving bands of a capture that indices can use, by px of the reference;
+    None if none is known.
     """
-    return max((b.error.std_px for b in _usable_bands(sidecar) if b.error is not None), default=None)
+    errors = (b.error for b in _usable_bands(sidecar) if b.error is not None)
+    return max(errors, key=attrgetter("std_px"), default=None)
 
 
 def _usable_bands(sidecar: Sidecar) -> list[BandResult]:

@@ -300,7 +300,8 @@ def test_captures_that_are_ok_by_prediction_have_their_own_colour(browser: Any, 
         position = sidecar["position"] | {"latitude": 52 + 1e-4 * number}
         changed = sidecar | {"capture": name, "position": position}
         (tmp_path / f"{name}.json").write_text(json.dumps(changed))
-        sidecar["bands"][-1] |= {"status": "predicted", "reason": "blur", "prediction": prediction}
+        error = {"std_px": 13.29, "std_band_px": 0.93}
+        sidecar["bands"][-1] |= {"status": "predicted", "reason": "blur", "prediction": prediction, "error": error}
     write_pages(tmp_path, pytest.fail)
     page = opened(browser, tmp_path)
     fills = [page.locator("#map circle", has_text=name).get_attribute("fill") for name in ("a", "b")]
@@ -308,6 +309,10 @@ def test_captures_that_are_ok_by_prediction_have_their_own_colour(browser: Any, 
     assert page.locator("#map-legend .key").all_inner_texts() == ["ok", "ok by prediction"]
     badges = page.locator("#table .badge")
     assert badges.all_inner_texts() == ["ok", "ok by prediction"]
+    assert page.locator("#table tbody tr").last.locator("td").nth(2).inner_text() == "13.290 (0.93 px of the band)"
+    look_at(page, "b")
+    text = page.locator("#capture").inner_text()
+    assert "standard error 13.29 px of the reference (0.93 px of the band); indices can use it" in text
     for width in (375, 1000):
         page.set_viewport_size({"width": width, "height": 800})
         assert page.locator(".scroll:has(#table)").evaluate("e => e.scrollWidth <= e.clientWidth"), "it is not cut off"

@@ -33,7 +33,7 @@ from agalign.values.capture import Band, Capture
 from agalign.values.image import OutputGrid
 
 from ..conftest import read_json, save_known_model, textured_image
-from ..records.test_sidecar import NIR, example
+from ..records.test_sidecar import ALIGNED, NIR, example
 from ..run_outputs import change, table_in
 
 PAGE = Path(agalign.__file__).parent / "report"
@@ -153,13 +153,16 @@ def test_the_verdict_is_the_expected_error_of_the_bands_that_indices_use(out: Pa
     }
     typical_px = np.median([px for px, *_ in known])
     largest_px, capture, band = max(known)
-    assert f"Expected error: {typical_px:.2f} px for the median band pair, {largest_px:.2f} px" in headline(out)
+    assert (
+        f"Expected error: {typical_px:.2f} px of the reference for the median band pair, {largest_px:.2f} px"
+        in headline(out)
+    )
     assert f"({band} of 0000SET/000/{capture})." in headline(out)
     bands = read_json(sidecar)["bands"]
     change(sidecar, bands=with_band(bands, "NIR", **prediction(0.934, share_over_1_px=0.14)))
     text = headline(out)
     assert text.startswith("7 of 8 band pairs are aligned, 1 is predicted accurately enough for indices. Expected")
-    over = "where 14 % of the pixels may be off by more than 1 px"
+    over = "where 14 % of the pixels may be off by more than 1 px of the reference"
     assert f"0.93 px for the worst of those that indices can use (NIR of 0000SET/000/IMG_0002, {over})." in text
     change(sidecar, bands=with_band(bands, "NIR", **prediction(1.01)), status="degraded")
     text = headline(out)
@@ -167,6 +170,34 @@ def test_the_verdict_is_the_expected_error_of_the_bands_that_indices_use(out: Pa
     assert "1.01" not in text
     change(sidecar, bands=with_band(bands, "NIR", error=None))
     assert headline(out).endswith("; unknown for 1.")
+
+
+def test_the_error_of_a_band_with_larger_pixels_is_shown_in_px_of_both(tmp_path: Path) -> None:
+    """A thermal band is usable with an error of 12.55 px of the reference, which is 0.88 px of its own."""
+    error = {"std_px": 12.55, "std_band_px": 0.88}
+    thermal = NIR | prediction(0.88, error=error) | {"band": "LWIR"}
+    narrow = NIR | ALIGNED | {"error": {"std_px": 0.0712, "std_band_px": 0.0704}}
+    write_sidecar(tmp_path / "IMG_1.json", example(bands=[narrow, thermal]))
+    assert headline(tmp_path).endswith(
+        "Expected error: 6.31 px of the reference for the median band pair, 12.55 px (0.88 px of the band) for the "
+        "worst of those that indices can use (LWIR of IMG_1)."
+    )
+    page = (tmp_path / "index.html").read_text(encoding="utf-8")
+    assert re.findall(r'<td class="n">(0\.071|12\.550)([^<]*)</td>', page) == [
+        *[("0.071", ""), ("0.071", "")],
+        *[("12.550", ""), ("12.550", " (0.88 px of the band)")],
+    ]
+    rows = {row["band"]: row for row in table_in(tmp_path / "summary.csv")}
+    names = "expected_error_px", "expected_error_band_px"
+    assert [[rows[band][name] for name in names] for band in ("NIR", "LWIR")] == [
+        ["0.0712", "0.0704"],
+        ["12.55", "0.88"],
+    ]
+    facts = facts_of(tmp_path)
+    (row,), (details,) = (facts[part]["records"] for part in ("rows", "details"))
+    assert (row["error_px"], row["error_band_px"]) == (12.55, 0.88)
+    shown = {b["band"]: (b["error_px"], b["error_band_px"], b["usable"]) for b in details["bands"]}
+    assert (shown["NIR"], shown["LWIR"]) == ((0.0712, None, True), (12.55, 0.88, True))
 
 
 @pytest.mark.slow
@@ -532,7 +563,8 @@ def capture(*bands: tuple[str, str, str | None], missing: tuple[str, ...] = (), 
         issues = [] if kind is None else [{"kind": kind, "value": None, "limit": None}]
         prediction = {"fixed_to_moving": np.eye(3).tolist(), "from": "bands", "std_px": 0.1}
         facts = {"band": name, "status": status, "reason": kind, "issues": issues}
-        parts.append(NIR | facts | {"prediction": prediction if status == "predicted" else None})
+        known = {"prediction": prediction, "error": {"std_px": 0.1, "std_band_px": 0.1}}
+        parts.append(NIR | facts | (known if status == "predicted" else {}))
     return example(bands=parts, missing_bands=missing, **changes)
 
 
@@ -549,7 +581,7 @@ def test_bands_are_grouped_by_cause_and_status_most_severe_first() -> None:
     assert [b.capture for b in groups[-1].bands] == ["one", "two"]
     assert groups[-1].captures == 2
     assert groups[-1].advice.startswith(
-        "indices use those with a standard error (prediction.std_px) within --accept-predicted"
+        "indices use those with a standard error (prediction.std_px, px of the band) within --accept-predicted"
     )
     assert groups[-1].size == "standard error up to 0.10 px"
     assert "card" in groups[0].advice
