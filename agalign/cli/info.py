@@ -154,9 +154,13 @@ def _show_model(path: Path, terminal: Terminal, *, as_json: bool) -> None:
     from agalign.flight.model import load_model
     from agalign.flight.rig_prediction import band_summaries
     from agalign.method.device import choose_device
+    from agalign.values.geometry import magnification
 
     model = load_model(path, lambda: choose_device("cpu"))
     rows = [] if model.rig is None else band_summaries(model.rig)
+    for row in rows:
+        assert model.rig is not None
+        row["pixel_size_px"] = 1 / magnification(model.rig.mean[row["band"]], *model.rig.size_px)
     captures, factors = (0, ()) if model.rig is None else (len(model.rig.captures), model.rig.factors)
     if as_json:
         rig = {"captures": captures, "factors": factors, "bands": rows} if rows else None
@@ -171,15 +175,17 @@ def _show_model(path: Path, terminal: Terminal, *, as_json: bool) -> None:
     if not rows:
         terminal.result("no rig: too few captures were aligned")
         return
-    headers = "Band", "Offset at the centre", "Baseline", "By bands", "By neighbours", "By the flight"
+    headers = "Band", "Pixel, px of the reference", "Offset at the centre", "Baseline"
+    of_errors = "By bands", "By neighbours", "By the flight"
     table = []
     for row in rows:
         (dx, dy), (bx, by) = row["offset_px"], row["baseline"]
-        errors = (f"{row[k]:.2f}" for k in ("from_bands_px", "from_neighbours_px", "from_flight_px"))
+        lengths = ("pixel_size_px", "from_bands_px", "from_neighbours_px", "from_flight_px")
+        pixel, *errors = (f"{row[k]:.2f}" for k in lengths)
         field = "none" if row["field_px"] is None else f"{row['field_px']:.2f}"
-        table.append((row["band"], f"{dx:+.1f}, {dy:+.1f}", f"{bx:+.2f}, {by:+.2f}", *errors, field))
-    title = "The rig: offset of each band, and error of its prediction (RMS, px)"
-    terminal.table((*headers, "Largest lens displacement"), table, title, texts=1)
+        table.append((row["band"], pixel, f"{dx:+.1f}, {dy:+.1f}", f"{bx:+.2f}, {by:+.2f}", *errors, field))
+    title = "The rig: offset of each band, and error of its prediction (RMS, px of the band)"
+    terminal.table((*headers, *of_errors, "Largest lens displacement"), table, title, texts=1)
     shared = ", ".join(factors) or "nothing"
     terminal.result(f"rig learned from {captures} captures; variations that the bands of a capture share: {shared}")
 

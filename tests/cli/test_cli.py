@@ -102,9 +102,11 @@ def test_info_shows_the_rig_of_a_model(tmp_path: Path) -> None:
     assert np.abs([*nir["baseline"], *red["baseline"]]) == pytest.approx([0.8, 0, 0, 0.6], abs=0.02)
     assert nir["from_bands_px"] < 0.5 < nir["from_flight_px"]
     assert nir["field_px"] is None
+    assert nir["pixel_size_px"] == pytest.approx(1, abs=0.01)
     table = agalign_here("info", path).stdout
     assert "[Red]" in table
     assert "+9.4, +6.0" in table
+    assert "error of its prediction (RMS, px of the band)" in table
     save_known_model(path, has_rig=False)
     assert "no rig" in agalign_here("info", path).stdout
 
