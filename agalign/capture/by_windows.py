@@ -76,7 +76,7 @@ def agreeing_with_seed(band: BandCandidates) -> Candidate | None:
     residual = windows.residuals(pair.warped_moving(mapping))
     error = mapping_error(pair, mapping, fit.covariance_px2, residual, relief_std_px=0.0)
     error = replace(error, field_std_px=0.0)  # its shapes are in the covariance
-    return Candidate("lens shapes", pair, mapping, error, residual, band.joint, replaces=tuple(band.rejected))
+    return Candidate("lens shapes", pair, mapping, error, residual, band.joint, inherited_issues=tuple(band.rejected))
 
 
 def _is_consistent(fit: WindowFit) -> bool:

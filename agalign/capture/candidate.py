@@ -48,12 +48,12 @@ class Candidate:
     """p95 of the shifts of held-out windows by each geometry that was fitted; empty if only a homography was."""
     is_confirmed: bool = False
     """Windows confirm it in half of the image: it may be a prediction, whatever the checks find."""
-    replaced: "Candidate | None" = None
+    refined_from: "Candidate | None" = None
     """The candidate that it refines."""
     ignored: frozenset[IssueKind] = frozenset()
     """Kinds of issues that do not matter: those by parallax, in an observation of the rig."""
-    replaces: tuple[Issue, ...] = ()
-    """Issues of the candidate that it replaces: it is a prediction, as windows see a part of the image only."""
+    inherited_issues: tuple[Issue, ...] = ()
+    """Issues of an earlier candidate that remain: it is a prediction, as windows see a part of the image only."""
 
     @classmethod
     def of(
@@ -69,8 +69,8 @@ class Candidate:
     @cached_property
     def issues(self) -> tuple[Issue, ...]:
         """What the checks find; empty if it passes verification."""
-        if self.replaces:
-            return self.replaces
+        if self.inherited_issues:
+            return self.inherited_issues
         issues = tuple(issue for issue in issues_of(self) if issue.kind not in self.ignored)
         if issues or self.other_windows is None:
             return issues
@@ -80,7 +80,7 @@ class Candidate:
     @property
     def may_predict(self) -> bool:
         """True if the images confirm the mapping, though not everywhere: it predicts the others."""
-        is_confirmed = self.is_confirmed or bool(self.replaces)
+        is_confirmed = self.is_confirmed or bool(self.inherited_issues)
         is_confirmed = is_confirmed or all(issue.kind in PREDICTED_WITH for issue in self.issues)
         return is_confirmed and math.isfinite(self.std_px)
 
@@ -182,8 +182,18 @@ class RefinedBand:
 
 def result_of_windows(fixed_to_moving: Matrix) -> JointResult:
     """Return a result without evidence of descriptors, with an infinite standard error."""
-    std = ((math.inf, math.inf),) * 4
-    return JointResult(fixed_to_moving, math.nan, 0.0, 0.0, 0, (1.0,), BY_WINDOWS, "homography", 0.0, std)
+    return JointResult(
+        fixed_to_moving,
+        loss=math.nan,
+        retrieval=0.0,
+        chance=0.0,
+        iterations=0,
+        levels=(1.0,),
+        recipe=BY_WINDOWS,
+        model_family="homography",
+        last_step_px=0.0,
+        corner_std_xy_px=((math.inf, math.inf),) * 4,
+    )
 
 
 @dataclass

@@ -103,7 +103,7 @@ class _Choice:
                 band.start,
                 joint=band.joint,
                 residual=None if self.is_seed_refused else band.start_residual,
-                candidates=p95_px,
+                held_out_p95_px=p95_px,
                 is_seed_usable=is_usable,
             )
         return Alignment(
@@ -113,7 +113,7 @@ class _Choice:
             band.start,
             joint=band.joint if chosen.joint is None else chosen.joint,
             residual=chosen.windows,
-            candidates={**p95_px, **chosen.p95_px},
+            held_out_p95_px={**p95_px, **chosen.p95_px},
             prediction=_prediction(chosen, self.compared) if self.issues else self.compared,
             error=chosen.error,
             std_px=chosen.std_px,
@@ -156,8 +156,8 @@ def _against_rig(choice: _Choice, of_rig: RigPrediction) -> _Choice:
         issues = tuple(rig_issues(compared))
         if not issues:
             return replace(choice, compared=compared)
-        if own.replaced is not None:  # the refinement on the files contradicts the rig
-            return _against_rig(replace(choice, candidate=own.replaced), of_rig)
+        if own.refined_from is not None:  # the refinement on the files contradicts the rig
+            return _against_rig(replace(choice, candidate=own.refined_from), of_rig)
         choice, own = replace(choice, issues=issues), None
     # Windows of another scene contribute to the mapping of the band, but not to the rig's.
     is_mixed = any(issue.kind == OTHER_CONTENT for issue in choice.issues)

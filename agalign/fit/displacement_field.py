@@ -39,8 +39,7 @@ _NOISE_PX, _MAX_WEIGHT = 0.12, 4.0
 determine the field of the others."""
 _SMOOTHNESS = 0.4
 """Weight of the second differences of a field, relative to such a window: their prior has a standard deviation of
-_NOISE_PX / sqrt(_SMOOTHNESS) = 0.19 px. Ties of single captures, px, by 0.4 / 2 / 10 / 50: forest 0.055 / 0.062 / 0.065
-/ 0.071, a third of it 0.061 / 0.070 / 0.078 / 0.081, ten-band camera 0.046 / 0.054 / 0.055 / 0.058."""
+_NOISE_PX / sqrt(_SMOOTHNESS) = 0.19 px. With 2, errors at ties are a sixth larger on three scenes."""
 _FOLDS = 4
 """Every fourth window along both axes is a fold. Without the windows that overlap it, most windows remain."""
 

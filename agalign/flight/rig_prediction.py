@@ -27,7 +27,8 @@ from agalign.values.geometry import Matrix
 
 Array = NDArray[np.float64]
 Captures = Sequence[CaptureFactors]
-Estimator = Literal["flight", "seconds", "altitude_m"]
+Basis = Literal["flight", "seconds", "altitude_m"]
+"""What a band is predicted from: the mean of the flight, or its variation over time or altitude."""
 
 
 def predict_band(rig: Rig, band: str, known: Observation) -> Prediction:
@@ -110,7 +111,7 @@ def _from_bands(rig: Rig, band: str, known: Observation) -> Prediction:
 
 
 def estimated_factors(
-    capture: CaptureFactors | Observation, others: Captures, estimator: Estimator
+    capture: CaptureFactors | Observation, others: Captures, basis: Basis
 ) -> tuple[Array, Array, float] | None:
     """Return factors (5,), their standard error (5,), and the gap to the nearest capture used; None if unknown.
 
@@ -118,17 +119,17 @@ def estimated_factors(
     weighted by their shares. With `altitude_m` the distance is interpolated over the altitude, the others in time.
     """
     moved, mean = _at_motion(others, capture.motion)
-    if estimator == "flight":
+    if basis == "flight":
         return mean, np.zeros(FACTORS), 0.0
-    known = sorted((c for c in moved if getattr(c, estimator) is not None), key=attrgetter(estimator))
-    position = getattr(capture, estimator)
+    known = sorted((c for c in moved if getattr(c, basis) is not None), key=attrgetter(basis))
+    position = getattr(capture, basis)
     if position is None or not known:
         return None
-    x, factors = np.array([getattr(c, estimator) for c in known]), np.array([c.factors for c in known])
+    x, factors = np.array([getattr(c, basis) for c in known]), np.array([c.factors for c in known])
     place = float(np.interp(position, x, np.arange(len(x))))
     start, end, share = factors[int(place)], factors[min(int(place) + 1, len(x) - 1)], place % 1
     result, std = start + share * (end - start), np.abs(end - start) * np.sqrt(share * (1 - share))
-    if estimator == "altitude_m" and (in_time := estimated_factors(capture, others, "seconds")):
+    if basis == "altitude_m" and (in_time := estimated_factors(capture, others, "seconds")):
         result[1:], std[1:] = in_time[0][1:], in_time[1][1:]
     return result, std, float(np.abs(x - position).min())
 
@@ -154,14 +155,14 @@ def _at_motion(captures: Captures, motion: tuple[float, float] | None) -> tuple[
 def _from_captures(rig: Rig, band: str, known: Observation) -> Prediction:
     """Predict a band from the estimate of the capture's factors with the smallest standard error.
 
-    That is the leave-one-out error of the estimator for learned captures with similar gaps, or the difference between
+    That is the leave-one-out error of the basis for learned captures with similar gaps, or the difference between
     the captures used if that is larger.
     """
-    min_for_altitude = 6  # with fewer captures, the estimator with the smallest error would be selected by chance
+    min_for_altitude = 6  # with fewer captures, the basis with the smallest error would be selected by chance
     max_gap_ratio = 2.0  # an estimate is validated on captures with at most this ratio to its gap
     design, results = rig.design(band), []
-    for estimator in get_args(Estimator)[: 3 if len(rig.captures) >= min_for_altitude else 2]:
-        estimate, tests = estimated_factors(known, rig.captures, estimator), _leave_one_out(rig, band, estimator)
+    for basis in get_args(Basis)[: 3 if len(rig.captures) >= min_for_altitude else 2]:
+        estimate, tests = estimated_factors(known, rig.captures, basis), _leave_one_out(rig, band, basis)
         if estimate is not None and tests:
             factors, std, gap = estimate
             similar = [square for other_gap, square in tests if other_gap <= max_gap_ratio * gap]
@@ -174,11 +175,11 @@ def _from_captures(rig: Rig, band: str, known: Observation) -> Prediction:
     return Prediction(rig.mapping(band, factors), "neighbours" if (design @ factors).any() else "flight", error_px)
 
 
-def _leave_one_out(rig: Rig, band: str, estimator: Estimator) -> list[tuple[float, float]]:
+def _leave_one_out(rig: Rig, band: str, basis: Basis) -> list[tuple[float, float]]:
     """Return (gap, squared error of the band, px^2) of estimates of each learned capture from the others, sorted."""
     design, result = rig.design(band), []
     for i, capture in enumerate(rig.captures):
-        estimate = estimated_factors(capture, [*rig.captures[:i], *rig.captures[i + 1 :]], estimator)
+        estimate = estimated_factors(capture, [*rig.captures[:i], *rig.captures[i + 1 :]], basis)
         if estimate is not None:
             result.append((estimate[2], float(((design @ (capture.factors - estimate[0])) ** 2).sum())))
     return sorted(result)

@@ -243,7 +243,7 @@ class Alignment:
     """Measures of similarity of the images as they are, their borders overlaid."""
     after: Similarity = field(default_factory=Similarity)
     """The same under the mapping."""
-    candidates: Mapping[Geometry, float] = field(default_factory=dict)
+    held_out_p95_px: Mapping[Geometry, float] = field(default_factory=dict)
     """p95 of the shifts of held-out windows by each geometry that was fitted; empty if only a homography was."""
     prediction: Prediction | None = None
     """Prediction of the mapping, by the rig of the flight or by windows. With `issues` it is the mapping; without, the
@@ -514,7 +514,7 @@ class Alignment:
             residual=None if self.residual is None else self.residual.in_file_px(scales),
             error=None if self.error is None else self.error.in_file_px(scales, size_px, mapping.parallax),
             std_px=self.std_px * up.mean,
-            candidates={kind: float(p95_px * up.mean) for kind, p95_px in self.candidates.items()},
+            held_out_p95_px={kind: float(p95_px * up.mean) for kind, p95_px in self.held_out_p95_px.items()},
         )
 
     @property

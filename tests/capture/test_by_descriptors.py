@@ -72,7 +72,7 @@ def test_verification_is_repeated_with_a_displacement_field(pair: BandPair, monk
     monkeypatch.setattr(pair.reference.displacement_field, "refine", lambda *_, **__: result)
     results = aligned(pair, GOOD, "always")
     assert (results.status, results.geometry) == ("aligned", "homography")
-    assert results.candidates == {"homography": 1.0, "field": 0.5}
+    assert results.held_out_p95_px == {"homography": 1.0, "field": 0.5}
     assert results.residual.median_px < 0.1
     monkeypatch.setattr(module, "issues_of", lambda *_: ())
     assert aligned(pair, GOOD, "always").geometry == "field"

@@ -233,7 +233,7 @@ def test_parallax_along_a_line_needs_a_layout() -> None:
     assert aligned_by_relief(without, "auto") == ({}, names)
     # No displacement field follows them either.
     for alignment in verified_together(without, Settings()).values():
-        assert set(alignment.candidates) <= {"homography"}
+        assert set(alignment.held_out_p95_px) <= {"homography"}
 
 
 def verified_together(bands: Sequence[RefinedBand], settings: Settings) -> dict[str, Alignment]:
@@ -256,7 +256,7 @@ def test_neither_relief_nor_field_replaces_another_model_family(
     settings = Settings(joint=JointSettings(model_family=family), relief=ReliefSettings(use=use))
     for alignment in verified_together(candidates, settings).values():
         assert (alignment.geometry != "homography") == is_allowed
-        assert (len(alignment.candidates) > 1) == is_allowed
+        assert (len(alignment.held_out_p95_px) > 1) == is_allowed
 
 
 @pytest.mark.parametrize("is_together", [True, False])

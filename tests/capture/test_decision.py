@@ -69,7 +69,7 @@ def candidate(
 
 def in_part(std_px: float = 0.05, issue: Issue = IN_PART, **facts: object) -> Candidate:
     """A mapping that the images confirm in a part of the image."""
-    return candidate(std_px=std_px, replaces=(issue,), **facts)
+    return candidate(std_px=std_px, inherited_issues=(issue,), **facts)
 
 
 def unconfirmed(**facts: object) -> Candidate:
@@ -227,7 +227,9 @@ def relief_of(*names: str, gain_px: float = 0.0, predicted: Mapping[str, float] 
     """One relief under which some bands are aligned, and others predicted with a standard error."""
     relief = flat_relief()
     found = {n: candidate(n, relief=relief) for n in names}
-    found |= {n: candidate(n, relief=relief, std_px=s, replaces=(IN_PART,)) for n, s in (predicted or {}).items()}
+    found |= {
+        n: candidate(n, relief=relief, std_px=s, inherited_issues=(IN_PART,)) for n, s in (predicted or {}).items()
+    }
     return ReliefCandidates(pair().reference, found, gain_px)
 
 

@@ -52,7 +52,7 @@ def test_an_alignment_between_images_is_the_same_between_files() -> None:
     assert_allclose(between_files.residual.shifts_px, [[0.2, 0.4]] * 3)
     assert_allclose(between_files.fixed_to_moving, SCALES.between_files(H))
     assert_allclose(between_files.seed.fixed_to_moving, SCALES.between_files(seed.fixed_to_moving))
-    assert between_files.candidates == pytest.approx({"homography": 0.5 * np.sqrt(8), "field": 0.25 * np.sqrt(8)})
+    assert between_files.held_out_p95_px == pytest.approx({"homography": 0.5 * np.sqrt(8), "field": 0.25 * np.sqrt(8)})
     assert between_files.size_px == (300, 400)
     kept = ("space", "geometry", "status", "issues", "seconds", "before", "after", "prediction")
     assert [getattr(between_files, k) for k in kept] == [getattr(between_images, k) for k in kept]
