@@ -11,6 +11,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from agalign.batch.output_files import outdated_files, remove_files
 from agalign.batch.products import PRODUCTS
 from agalign.capture.align_bands import tie_windows
@@ -263,5 +265,5 @@ def _output(context: ProductContext, saturated: Mapping[str, float]) -> OutputPa
 def _band_radiometry(band: str, radiometry: Radiometry, saturated: float) -> BandRadiometryPart:
     """The part about the values of a band, given the share of its pixels that are saturated."""
     errors = [*radiometry.errors, *([saturation_error(saturated)] if saturated else [])]
-    means = [list(row) for row in radiometry.cell_means]
+    means = np.array(radiometry.cell_means) if radiometry.cell_means else None
     return BandRadiometryPart(band=band, std_percent=total_percent(errors), errors=errors, cell_means=means)

@@ -40,7 +40,6 @@ from agalign.values.fields import (
     Count,
     Matrix3x3,
     Measured,
-    Measurement,
     Message,
     Name,
     Number,
@@ -454,9 +453,9 @@ class BandRadiometryPart(_Part):
     """Expected error (1 sigma) of its values, percent: the root of the sum of the squares of `errors`."""
     errors: list[RadiometricError]
     """What its values depend on, with the error by each."""
-    cell_means: list[list[Measurement]] = []
+    cell_means: Annotated[NDArray[np.float64], Array((12, 16), nullable=True)] | None = None
     """Mean of the values in each of 12 x 16 equal cells of the band's own image, row by row: over many captures the
-    mean is flat, and captures of the same ground agree."""
+    mean is flat, and captures of the same ground agree. Null for a dark image."""
 
 
 class OutputPart(_Part):

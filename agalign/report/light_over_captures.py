@@ -66,7 +66,7 @@ class _CaptureCells:
     def of(cls, label: str, captured_at: str, output: OutputPart) -> Self | None:
         """Return the cells of the bands of a capture; None without any."""
         time = CaptureTime.of(captured_at) if is_clock_set(captured_at) else None
-        means = {part.band: np.array(part.cell_means) for part in output.band_radiometry}
+        means = {part.band: part.cell_means for part in output.band_radiometry if part.cell_means is not None}
         usable = {band: cells for band, cells in means.items() if np.mean(cells > 0) > _MIN_VALID}
         if not usable:
             return None

@@ -131,8 +131,6 @@ Message = Annotated[str, AfterValidator(shortened_message)]
 Number = Annotated[float, _Limited()]
 Count = Annotated[int, Field(gt=0)]
 Positive = Annotated[float, _Limited(is_positive=True)]
-Measurement = Annotated[float, Measured()]
-"""A number as it is; null if it is not known."""
 Number3 = Annotated[float, Measured(3)]
 Number4 = Annotated[float, Measured(4)]
 Number6 = Annotated[float, Measured(6)]

@@ -34,12 +34,18 @@ def seen(ground: Image, row: float, rng: np.random.Generator) -> Image:
 
 
 def add(
-    totals: PairTotals, number: int, cells: Image, *, seconds: float = 2.0, radiometry: str = "reflectance by panel"
+    totals: PairTotals,
+    number: int,
+    cells: Image,
+    *,
+    seconds: float = 2.0,
+    radiometry: str = "reflectance by panel",
+    dark: tuple[str, ...] = (),
 ) -> list[Caution]:
     """The cautions about the light of a capture, one each `seconds`."""
     at = np.datetime64("2024-06-01T12:00:00.000") + np.timedelta64(int(1000 * seconds * number), "ms")
     bands = [
-        {"band": name, "std_percent": 3.0, "errors": [], "cell_means": means.tolist()}
+        {"band": name, "std_percent": 3.0, "errors": [], "cell_means": None if name in dark else means.tolist()}
         for name, means in zip(BANDS, cells, strict=True)
     ]
     output = {"file": None, "crop": (0, 0, 10, 10), "nodata": "nan", "radiometry": radiometry, "band_radiometry": bands}
@@ -112,3 +118,12 @@ def test_the_mean_of_many_captures_shows_whether_the_vignetting_is_corrected(
         assert [b.band for b in groups[0].bands] == ["NIR"]
         assert f"in {captures} captures, the corners are" in groups[0].bands[0].reason
         assert groups[0].effect == pytest.approx(abs(mean - 1), abs=0.1)
+
+
+def test_a_dark_band_is_not_compared(ground: Image) -> None:
+    """The near infrared of water: its sidecar has no cells."""
+    totals, rng = PairTotals(), np.random.default_rng(0)
+    for number in range(4):
+        cells = seen(ground, 3.3 * number, rng) * (1.0, 1.4)[number == 2]
+        found = add(totals, number, cells, dark=("NIR",))
+        assert [c.band for c in found] == ([] if number < 2 else ["Green", "Red"])
