@@ -74,6 +74,7 @@ def fitted_to_windows(band: BandCandidates, refined: RefinedBand | None = None) 
     """The alignment of a band after the estimators that are fitted to windows."""
     estimation = estimation_of(band, refined)
     estimation._fit_windows()
+    estimation._add_errors_of_relief()
     return estimation.decided()[band.pair.name]
 
 

@@ -26,7 +26,6 @@ from agalign.pixels.raster import ReadTile
 from agalign.values import geometry
 from agalign.values.alignment import Alignment, Alignments, JointResult, Seed
 from agalign.values.capture import Capture
-from agalign.values.geometry import Matrix
 from agalign.values.issues import SEED_ASKED_FOR, Issue
 from agalign.values.mapping import PixelMapping
 from agalign.values.mapping_error import MappingError
@@ -144,7 +143,10 @@ class CaptureEstimation:
         self.refine(starts)
         self._learn(starts, capture, scratch=scratch)
         self._fit_windows()
-        if self.is_observation or capture is None:
+        if self.is_observation:
+            return self.decided()
+        self._add_errors_of_relief()
+        if capture is None:
             return self.decided()
         self._refine_on_files(capture)
         return self.decided(self._predictions(pairs, capture))
@@ -204,7 +206,7 @@ class CaptureEstimation:
             self.add(remaining, results)
 
     def _fit_windows(self) -> None:
-        """Fit windows alone where the descriptors have no result; add the error by relief where no window is near."""
+        """Fit windows alone where the descriptors have no result."""
         if not self._may_be_homography:
             return
         for name, alignment in self.decided().items():
@@ -215,17 +217,16 @@ class CaptureEstimation:
             if by_windows is None or not by_windows.may_predict:
                 by_windows = agreeing_with_seed(band)
             band.candidates += [] if by_windows is None else [by_windows]
-        if not self.is_observation:
-            spreads_px = self._spreads_of_relief_px()
-            for name, band in self.bands.items():
-                is_accepted = any(not candidate.issues for candidate in band.candidates)
-                if band.candidates and not is_accepted and is_extrapolated(band.candidates[-1]):
-                    band.candidates = [c.with_relief_std_px(spreads_px[name]) for c in band.candidates]
 
-    def _spreads_of_relief_px(self) -> dict[str, float]:
-        """Return the relief that homographies lack, by band."""
+    def _add_errors_of_relief(self) -> None:
+        """Add the relief that homographies lack to their errors, where no window is near."""
+        if not self._may_be_homography:
+            return
         known = {name: r.joint.fixed_to_moving for name, r in self.refined.items() if is_retrieved(r.joint)}
-        return spreads_of_relief_px([band.pair for band in self.bands.values()], known)
+        spreads_px = spreads_of_relief_px([band.pair for band in self.bands.values()], known)
+        for name, band in self.bands.items():
+            if band.candidates and not band.accepted and is_extrapolated(band.candidates[-1]):
+                band.candidates = [c.with_relief_std_px(spreads_px[name]) for c in band.candidates]
 
     def _predictions(self, pairs: Sequence[BandPair], capture: Capture) -> dict[str, RigPrediction]:
         """Return the predictions of the rig of the flight from the aligned bands of the capture."""
@@ -239,11 +240,10 @@ class CaptureEstimation:
         """Refine aligned bands on tiles of the files, if these have more pixels than the images."""
         result = self.decided()
         for name, band in self.bands.items():
-            accepted = [c for c in band.candidates if not c.issues]
-            is_wanted = band.pair.is_reduced and accepted and result[name].mapping.parallax is None
+            is_wanted = band.pair.is_reduced and band.accepted and result[name].mapping.parallax is None
             if not is_wanted or result[name].status != "aligned":
                 continue
-            refined = at_full_resolution(capture.reference, band, accepted[-1])
+            refined = at_full_resolution(capture.reference, band, band.accepted[-1])
             if isinstance(refined, Issue):
                 band.issue, band.candidates = refined, []
             elif refined is not None:
@@ -270,7 +270,7 @@ class CaptureEstimation:
             found.issue = result if isinstance(result, Issue) else None
             self.refined[pair.name] = RefinedBand.of(pair, seed, result)
         use = self.settings.relief.use if self._may_be_homography else "never"
-        bands, by_halves = self._combined()
+        bands = self._combined()
         self.progress(starts[0][0].name if starts else "", "relief", 0.0)
         reliefs, along_a_line = by_relief(bands, use, is_observation=self.is_observation)
         self.reliefs += reliefs
@@ -281,15 +281,15 @@ class CaptureEstimation:
             name = band.pair.name
             self.progress(name, "checking", 0.0)
             field_use = "never" if self.is_observation or name in along_a_line else use
-            self.bands[name].candidates += by_descriptors(band, by_halves.get(name), field_use)
+            self.bands[name].candidates += by_descriptors(band, field_use)
 
-    def _combined(self) -> tuple[list[RefinedBand], dict[str, tuple[Matrix, Matrix]]]:
-        """Return the refined bands after the MAP estimation of all bands of the capture, and the homographies by each
-        half of the windows.
+    def _combined(self) -> list[RefinedBand]:
+        """Return the refined bands after the MAP estimation of all bands of the capture, with all windows and with each
+        half of them.
         """
         bands = self.refined
         if not self._may_be_homography:  # as the MAP estimate is
-            return list(bands.values()), {}
+            return list(bands.values())
         pairs, joint = [b.pair for b in bands.values()], {name: b.joint for name, b in bands.items()}
         residuals = {name: b.warped.residual for name, b in bands.items()}
         halves = (
@@ -298,8 +298,10 @@ class CaptureEstimation:
         )
         rig = None if self.model is None else self.model.rig
         estimates, black, white = (map_estimate(pairs, joint, some, rig) for some in (residuals, *halves))
-        by_halves = {n: (black[n].fixed_to_moving, white[n].fixed_to_moving) for n in bands}
-        return [replace(b, joint=estimates[name]) for name, b in bands.items()], by_halves
+        return [
+            replace(b, joint=estimates[n], by_halves=(black[n].fixed_to_moving, white[n].fixed_to_moving))
+            for n, b in bands.items()
+        ]
 
     @property
     def _may_be_homography(self) -> bool:

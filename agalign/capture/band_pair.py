@@ -113,6 +113,11 @@ class BandPair:
         return max(self.reference.blur_px, blur_px(channel_mean(self.moving_image))) > max_sharp_px
 
     @property
+    def is_georeferenced(self) -> bool:
+        """True if georeferences align the two rasters."""
+        return "geo" in self.seed_matrices
+
+    @property
     def lens_std_px(self) -> NDArray[np.float64]:
         """(4,) standard deviations of the lens shapes that the lenses of the two images do not contain."""
         return lens_std_px(self.fixed.size_px, calibrated=self.space == "undistorted")
@@ -120,7 +125,7 @@ class BandPair:
     @property
     def unknown_lens_std_px(self) -> NDArray[np.float64] | None:
         """(4,) standard deviations of lens shapes that nothing determines; None if a rig does, or without lenses."""
-        return None if self.is_lens_known or "geo" in self.seed_matrices else self.lens_std_px
+        return None if self.is_lens_known or self.is_georeferenced else self.lens_std_px
 
     @property
     def windows(self) -> FixedWindows:

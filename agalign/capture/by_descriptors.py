@@ -9,23 +9,21 @@ from agalign.capture.warped_pair import WarpedPair
 from agalign.pixels.band_resampling import channel_mean
 from agalign.values.alignment import JointResult
 from agalign.values.choices import Geometry, ReliefUse, SeedKind
-from agalign.values.geometry import Matrix
 from agalign.verify.checks import BY_PARALLAX, is_unchanged
 
 
-def by_descriptors(band: RefinedBand, by_halves: tuple[Matrix, Matrix] | None, use: ReliefUse) -> Iterator[Candidate]:
+def by_descriptors(band: RefinedBand, use: ReliefUse) -> Iterator[Candidate]:
     """Yield the homography of a band, then the same with a displacement field, or with the p95 of both if the field is
     rejected.
 
-    `by_halves` are the homographies from each half of the windows (`WarpedPair.cross_validated`). A field is fitted if
-    parallax may cause all issues of the homography, or if there are none and no rig contains the distortion of the
-    lenses; always with `use` "always", not with "never".
+    A field is fitted if parallax may cause all issues of the homography, or if there are none and no rig contains the
+    distortion of the lenses; always with `use` "always", not with "never".
     """
     pair = band.pair
     joint = _unchanged_if_aligned(band.joint, pair)
     warped = band.warped.with_mapping(pair.mapping(joint.fixed_to_moving))
-    if by_halves is not None and joint is band.joint:
-        warped = warped.cross_validated(by_halves)
+    if band.by_halves is not None and joint is band.joint:
+        warped = warped.cross_validated(band.by_halves)
     plane = Candidate.of("descriptors", warped, joint)
     yield plane
     is_wanted = use == "always" or (use == "auto" and (bool(plane.issues) or not pair.has_rig))
@@ -43,15 +41,15 @@ def _with_field(plane: Candidate, warped: WarpedPair, joint: JointResult) -> Ite
     displacement = pair.reference.displacement_field.refine(channel_mean(pair.moving_image), plane.mapping)
     p95_px: dict[Geometry, float] = {"homography": displacement.before_p95_px, "field": displacement.after_p95_px}
     if displacement.field is None:
-        yield replace(plane, p95_px=p95_px)
+        yield replace(plane, held_out_p95_px=p95_px)
         return
     displaced = WarpedPair.of(pair, replace(plane.mapping, field=displacement.field), warped.windows)
     held_out = Candidate.of("field", displaced, joint, displacement.held_out)
-    in_all = replace(held_out, other_windows=displaced.residual, p95_px=p95_px)
+    in_all = replace(held_out, other_windows=displaced.residual, held_out_p95_px=p95_px)
     if in_all.issues and not plane.issues:
         # The homography is verified, and the field reduces the shifts of held-out windows.
         by_homography = Candidate.of("field", displaced, joint, plane.windows)
-        yield replace(by_homography, other_windows=displaced.residual, p95_px=p95_px)
+        yield replace(by_homography, other_windows=displaced.residual, held_out_p95_px=p95_px)
     else:
         yield in_all
 

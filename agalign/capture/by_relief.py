@@ -97,7 +97,7 @@ def by_relief(
             continue
         parallax_px, on_a_line = common_parallax_px(group)
         if on_a_line and parallax_px > max_line_px:
-            along_a_line |= {c.pair.name for c in group}
+            along_a_line |= {band.pair.name for band in group}
         elif use == "always" or parallax_px >= MIN_PARALLAX_PX:
             with suppress(GeometryError):
                 relief = _observed(group) if is_observation else _of_group(group, bands)
@@ -142,12 +142,12 @@ class _Band:
     @cached_property
     def by_homography(self) -> Residual:
         """The residual of the held-out windows under the homography of the descriptors."""
-        return self.refined.held_out_residual(self.refined.warped.mapping)
+        return self.refined.relief_check_residual(self.refined.warped.mapping)
 
     def held_out(self, relief: Relief) -> WarpedPair:
         """Measure the windows that take no part in the fit, with a relief of other bands."""
         pair = self.refined.pair
-        return WarpedPair.of(pair, self.mapping(relief, with_occlusions=True), pair.reference.white_windows)
+        return WarpedPair.of(pair, self.mapping(relief, with_occlusions=True), pair.reference.relief_check_windows)
 
     def candidate(self, mapping: PixelMapping, held_out: WarpedPair) -> Candidate:
         """Return the candidate by a mapping with a relief; its windows are held out, under a relief of other bands."""
@@ -155,7 +155,7 @@ class _Band:
         p95_px: dict[Geometry, float] = {"homography": self.by_homography.p95_px, kind: held_out.residual.p95_px}
         pair, windows = self.refined.pair, held_out.residual
         error = mapping_error(pair, mapping, self.joint.covariance_px2, windows)
-        return Candidate("relief", pair, mapping, error, windows, self.joint, held_out, p95_px=p95_px)
+        return Candidate("relief", pair, mapping, error, windows, self.joint, held_out, held_out_p95_px=p95_px)
 
 
 def _observed(group: Sequence[RefinedBand]) -> ReliefCandidates | None:
@@ -163,7 +163,7 @@ def _observed(group: Sequence[RefinedBand]) -> ReliefCandidates | None:
 
     The parallax of a held-out window is that by the other bands. None without parallax. Raises GeometryError.
     """
-    bands, reference = [_Band(c, c.warped.mapping) for c in group], group[0].pair.reference
+    bands, reference = [_Band(b, b.warped.mapping) for b in group], group[0].pair.reference
     rounds, model = 2, None  # large shifts are measured in steps
     for _ in range(rounds):
         consistent = consistent_bands(_window_shifts(bands), [b.refined for b in bands])
@@ -175,7 +175,7 @@ def _observed(group: Sequence[RefinedBand]) -> ReliefCandidates | None:
     if layout_of([b.refined for b in bands]) is None and are_on_a_line(model.baselines):
         return None
     warped = [band.refined.pair.warped_moving(band.plane) for band in bands]
-    residuals = [reference.white_windows.residuals(image) for image in warped]
+    residuals = [reference.relief_check_windows.residuals(image) for image in warped]
     windows, result = WindowShifts.of(residuals, [band.plane for band in bands]), dict[str, Candidate]()
     if not windows.are_enough(MIN_WINDOWS):
         return None
@@ -187,7 +187,7 @@ def _observed(group: Sequence[RefinedBand]) -> ReliefCandidates | None:
         held_out = residuals[number].with_shifts(residuals[number].shifts_px - shifts_px)
         pair, mapping = band.refined.pair, band.mapping(relief)
         # Planes of different depth resemble a repetition in images without relief.
-        verified = WarpedPair(pair, mapping, pair.warped_moving(mapping), reference.white_windows, held_out)
+        verified = WarpedPair(pair, mapping, pair.warped_moving(mapping), reference.relief_check_windows, held_out)
         candidate = band.candidate(mapping, verified)
         # A window across a depth edge contains the parallax of neither side.
         issues = [issue for issue in candidate.issues if issue.kind not in BY_PARALLAX]
@@ -216,7 +216,7 @@ def _of_group(group: Sequence[RefinedBand], others: Sequence[RefinedBand]) -> Re
     gain_px = _gain_px(estimate.bands, result)
     if gain_px >= 0:
         result |= estimate.of_other_bands(others)
-        if not any(c.pair.has_rig for c in group):
+        if not any(band.pair.has_rig for band in group):
             result = {name: _with_field(candidate) for name, candidate in result.items()}
     return ReliefCandidates(group[0].pair.reference, result, gain_px)
 
@@ -236,8 +236,8 @@ class _Estimate:
 
         Raises GeometryError.
         """
-        planes, size_px = [_Band(c, c.warped.mapping) for c in group], group[0].pair.fixed.size_px
-        lens_std = None if any(c.pair.has_rig for c in group) else group[0].pair.lens_std_px
+        planes, size_px = [_Band(b, b.warped.mapping) for b in group], group[0].pair.fixed.size_px
+        lens_std = None if any(b.pair.has_rig for b in group) else group[0].pair.lens_std_px
         consistent = consistent_bands(_window_shifts(planes), group, lens_std)
         if consistent is None:
             return None
@@ -286,27 +286,27 @@ class _Estimate:
         max_std_px = max(RELIEF_STEP, float(np.median(p95_px / np.maximum(lengths, 1e-6))))
         return replace(self, relief=replace(self.relief, std_px=_std_px(self.verifying_reliefs, max_std_px)))
 
-    def fitted(self, candidate: RefinedBand) -> _Band | None:
+    def band_under_relief(self, band: RefinedBand) -> _Band | None:
         """Fit homography and baseline of a band under the relief of the others; None if its windows determine none.
 
         The layout of the lenses, scaled to the baselines of the others, is the prior of the baseline. Raises
         GeometryError.
         """
-        prior, layout = BaselinePrior(), layout_of([candidate, *(b.refined for b in self.bands)])
+        prior, layout = BaselinePrior(), layout_of([band, *(b.refined for b in self.bands)])
         if layout is not None:
             own, others, baselines = layout[0], layout[1:], _baselines(self.bands)
             layout_std = 0.3  # of lens positions without tags, which deviate by up to 0.1 of the longest baseline
             x, y = own * float((others * baselines).sum() / max((others**2).sum(), 1e-12))
             prior = BaselinePrior((x, y), layout_std)
-        start = _Band(candidate, candidate.warped.mapping, prior.mean).mapping(self.relief)
-        if len(candidate.fit_residual(start).measured_px) < MIN_WINDOWS:
+        start = _Band(band, band.warped.mapping, prior.mean).mapping(self.relief)
+        if len(band.relief_fit_residual(start).measured_px) < MIN_WINDOWS:
             return None
-        size_px, lens_std = candidate.pair.fixed.size_px, None if candidate.pair.has_rig else candidate.pair.lens_std_px
-        fitted = fit_in_rounds(start, candidate.fit_residual, size_px, lens_std_px=lens_std, baseline=prior)
+        size_px, lens_std = band.pair.fixed.size_px, None if band.pair.has_rig else band.pair.lens_std_px
+        fitted = fit_in_rounds(start, band.relief_fit_residual, size_px, lens_std_px=lens_std, baseline=prior)
         if fitted is None or fitted[0].parallax is None:
             return None
         baseline, covariance_px2 = fitted[0].parallax.baseline, fitted[1].covariance_px2[:8, :8]
-        return _Band(candidate, fitted[0].without_parallax, baseline, covariance_px2)
+        return _Band(band, fitted[0].without_parallax, baseline, covariance_px2)
 
     def of_other_bands(self, others: Sequence[RefinedBand]) -> dict[str, Candidate]:
         """Return the candidates of bands of the same reference where windows allow it, except those of the estimate: a
@@ -319,7 +319,7 @@ class _Estimate:
             if pair.name in names or pair.is_coarse or pair.reference is not reference:
                 continue
             with suppress(GeometryError):
-                band = self.fitted(other)
+                band = self.band_under_relief(other)
                 result |= {} if band is None else self.candidate(band, band.held_out(self.relief))
         return result
 
@@ -335,7 +335,7 @@ class _Estimate:
         is_known = len(windows.measured_px) >= MIN_WINDOWS
         is_known &= windows.median_px <= MAX_SHIFT_PX * pair.file_pixel_size_px
         if not candidate.issues or (is_known and held_out.alias_peak().ratio <= MAX_ALIAS_PEAK):
-            return {band.name: replace(candidate, is_confirmed=True)}
+            return {band.name: candidate}
         return {}
 
 
@@ -348,8 +348,8 @@ def _with_field(candidate: Candidate) -> Candidate:
     assert candidate.error.covariance_px2 is not None
     mapping = replace(mapping, field=displacement.field)
     error = mapping_error(pair, mapping, candidate.error.covariance_px2, candidate.windows)
-    p95_px = {**candidate.p95_px, "relief and field": displacement.after_p95_px}
-    return replace(candidate, mapping=mapping, error=error, p95_px=p95_px)
+    p95_px = {**candidate.held_out_p95_px, "relief and field": displacement.after_p95_px}
+    return replace(candidate, mapping=mapping, error=error, held_out_p95_px=p95_px)
 
 
 def _gain_px(bands: Sequence[_Band], result: Mapping[str, Candidate]) -> float:
@@ -409,7 +409,7 @@ def _window_shifts(
 ) -> WindowShifts:
     """Measure the windows of the fit with the planes of the bands, or with a relief."""
     mappings = [b.plane if relief is None else b.mapping(relief) for b in bands]
-    residuals = [b.refined.fit_residual(m) for b, m in zip(bands, mappings, strict=True)]
+    residuals = [b.refined.relief_fit_residual(m) for b, m in zip(bands, mappings, strict=True)]
     return WindowShifts.of(residuals, mappings, with_lens_shapes=with_lens_shapes)
 
 

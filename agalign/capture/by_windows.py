@@ -95,7 +95,7 @@ def is_extrapolated(plane: Candidate) -> bool:
         return False
     in_frame_px = points_in_frame(plane.mapping, *pair.sizes_px)
     unobserved = unobserved_quarters(plane.windows.measured_px, pair.fixed.size_px, in_frame_px)
-    return "geo" not in pair.seed_matrices and bool(unobserved)
+    return not pair.is_georeferenced and bool(unobserved)
 
 
 def spreads_of_relief_px(pairs: Sequence[BandPair], homographies: Mapping[str, Matrix]) -> dict[str, float]:

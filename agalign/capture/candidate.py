@@ -15,7 +15,7 @@ from agalign.values.alignment import JointResult, Seed
 from agalign.values.choices import Geometry
 from agalign.values.geometry import Matrix, Points
 from agalign.values.image import Raster, Tile
-from agalign.values.issues import SEED_ASKED_FOR, Issue, IssueKind
+from agalign.values.issues import SEED_ASKED_FOR, UNREADABLE, Issue, IssueKind
 from agalign.values.mapping import PixelMapping
 from agalign.values.mapping_error import ErrorOnGrid, MappingError
 from agalign.values.residual import Residual
@@ -35,19 +35,18 @@ class Candidate:
     mapping: PixelMapping
     error: MappingError
     windows: Residual
-    """Windows that the fit of the homography did not use, under the mapping without a displacement field, which other
-    held-out windows verify. Lens shapes are fitted to them: such a candidate only predicts.
+    """Windows without their own part in the fit, under the mapping without a displacement field, which other held-out
+    windows verify: descriptors and rig contribute to each half. Lens shapes are fitted to them: such a candidate only
+    predicts.
     """
     joint: JointResult | None = None
     """Evidence of descriptors or windows; None for a prediction by the rig."""
     images: WarpedPair | None = None
-    """The images under the mapping; None omits the checks that use pixels."""
+    """The images under the mapping, with the relief of other bands if it has one; None omits checks that use pixels."""
     other_windows: Residual | None = None
     """More windows, which also have to pass the checks: those of another size, in which the mapping was not chosen."""
-    p95_px: Mapping[Geometry, float] = field(default_factory=dict)
+    held_out_p95_px: Mapping[Geometry, float] = field(default_factory=dict)
     """p95 of the shifts of held-out windows by each geometry that was fitted; empty if only a homography was."""
-    is_confirmed: bool = False
-    """Windows confirm it in half of the image: it may be a prediction, whatever the checks find."""
     refined_from: "Candidate | None" = None
     """The candidate that it refines."""
     ignored: frozenset[IssueKind] = frozenset()
@@ -80,8 +79,7 @@ class Candidate:
     @property
     def may_predict(self) -> bool:
         """True if the images confirm the mapping, though not everywhere: it predicts the others."""
-        is_confirmed = self.is_confirmed or bool(self.inherited_issues)
-        is_confirmed = is_confirmed or all(issue.kind in PREDICTED_WITH for issue in self.issues)
+        is_confirmed = bool(self.inherited_issues) or all(issue.kind in PREDICTED_WITH for issue in self.issues)
         return is_confirmed and math.isfinite(self.std_px)
 
     @property
@@ -92,7 +90,7 @@ class Candidate:
     @cached_property
     def std_px(self) -> float:
         """Standard error: the RMS of the expected error over the common area, px of the fixed image."""
-        if "geo" in self.pair.seed_matrices:
+        if self.pair.is_georeferenced:
             return self.error.rms_px(self.common_px if len(self.common_px) else self.windows.centres_px)
         size_px = self.pair.fixed.size_px
         is_common = pixels_in_frame(self.mapping, *self.pair.sizes_px)
@@ -151,7 +149,10 @@ def mapping_error(
 
 @dataclass(frozen=True)
 class RefinedBand:
-    """A band with its windows under the result of the joint optimisation, or under its seed."""
+    """A band with its windows under the result of the joint optimisation, or under its seed.
+
+    After the MAP estimation, `joint` is its result, and the windows are still those under the mapping before it.
+    """
 
     pair: BandPair
     seed: Seed
@@ -160,6 +161,10 @@ class RefinedBand:
     warped: WarpedPair
     issue: Issue | None = None
     """Why the optimisation has no result."""
+    by_halves: tuple[Matrix, Matrix] | None = None
+    """The homographies with the black and with the white windows of a chessboard alone, beside the descriptors and the
+    rig; None before the MAP estimation.
+    """
 
     @classmethod
     def of(cls, pair: BandPair, seed: Seed, result: JointResult | Issue) -> "RefinedBand":
@@ -168,13 +173,13 @@ class RefinedBand:
         joint = result_of_windows(seed.fixed_to_moving) if isinstance(result, Issue) else result
         return cls(pair, seed, joint, WarpedPair.of(pair, pair.mapping(joint.fixed_to_moving)), issue)
 
-    def fit_residual(self, mapping: PixelMapping) -> Residual:
+    def relief_fit_residual(self, mapping: PixelMapping) -> Residual:
         """Measure the windows of the fit with a mapping."""
-        return self.pair.reference.black_windows.residuals(self._warped(mapping))
+        return self.pair.reference.relief_fit_windows.residuals(self._warped(mapping))
 
-    def held_out_residual(self, mapping: PixelMapping) -> Residual:
+    def relief_check_residual(self, mapping: PixelMapping) -> Residual:
         """Measure the windows that take no part in the fit."""
-        return self.pair.reference.white_windows.residuals(self._warped(mapping))
+        return self.pair.reference.relief_check_windows.residuals(self._warped(mapping))
 
     def _warped(self, mapping: PixelMapping) -> Raster:
         return self.warped.warped if mapping is self.warped.mapping else self.pair.warped_moving(mapping)
@@ -204,7 +209,7 @@ class BandCandidates:
     seed: Seed | Issue
     """The initial alignment, or why there is none."""
     issue: Issue | None = None
-    """Why the last optimisation has no result, or that the user asked for the seed only."""
+    """Why the last optimisation has no result, that the user asked for the seed only, or that pixels are unreadable."""
     candidates: list[Candidate] = field(default_factory=list)
     """Without those under a relief, in the order in which they were made."""
 
@@ -236,6 +241,16 @@ class BandCandidates:
     def does_start_fit(self) -> bool:
         """True if the windows agree with the seed."""
         return self.start_residual is not None and seed_fits(self.start_residual)
+
+    @property
+    def is_unreadable(self) -> bool:
+        """True if pixels of the band cannot be read, as `issue` says."""
+        return self.issue is not None and self.issue.kind == UNREADABLE
+
+    @property
+    def accepted(self) -> list[Candidate]:
+        """The candidates without issues."""
+        return [candidate for candidate in self.candidates if not candidate.issues]
 
     @property
     def rejected(self) -> Sequence[Issue]:

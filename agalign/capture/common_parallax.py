@@ -29,7 +29,7 @@ def parallax_groups(bands: Sequence[RefinedBand]) -> list[list[RefinedBand]]:
         is_reliable = band.joint.retrieval >= MIN_RETRIEVAL and len(residual.measured_px) >= MIN_WINDOWS
         if is_reliable and not pair.is_coarse:
             groups.setdefault((id(pair.reference), pair.space), []).append(band)
-    sharp = [[c for c in group if not c.pair.is_blurred] for group in groups.values()]
+    sharp = [[b for b in group if not b.pair.is_blurred] for group in groups.values()]
     return [some if len(some) >= MIN_BANDS else group for some, group in zip(sharp, groups.values(), strict=True)]
 
 
@@ -41,7 +41,7 @@ def common_parallax_px(group: Sequence[RefinedBand]) -> tuple[float, bool]:
     # The p95 is robust, as a wrong peak is no parallax.
     if max((r.p95_px for r in residuals if len(r.lengths_px)), default=0.0) < MIN_PARALLAX_PX:
         return 0.0, False
-    windows = WindowShifts.of(residuals, [c.warped.mapping for c in group])
+    windows = WindowShifts.of(residuals, [band.warped.mapping for band in group])
     consistent = consistent_bands(windows, group)
     if consistent is None:
         return 0.0, False
@@ -54,14 +54,14 @@ def _common_residuals(group: Sequence[RefinedBand]) -> list[Residual]:
     """Return the residuals of all bands in the same windows: large ones if any band is blurred, else the smallest that
     the residual of any band uses.
     """
-    smallest = min((c.warped.windows for c in group), key=lambda windows: windows.side)
-    common = group[0].pair.reference.large_windows if any(c.pair.is_blurred for c in group) else smallest
-    return [c.warped.residual if c.warped.windows is common else common.residuals(c.warped.warped) for c in group]
+    smallest = min((band.warped.windows for band in group), key=lambda windows: windows.side)
+    common = group[0].pair.reference.large_windows if any(band.pair.is_blurred for band in group) else smallest
+    return [b.warped.residual if b.warped.windows is common else common.residuals(b.warped.warped) for b in group]
 
 
 def layout_of(group: Sequence[RefinedBand]) -> NDArray[np.float64] | None:
     """Return the layouts (bands, 2) of bands; None if the tags lack one."""
-    layouts = [candidate.pair.layout for candidate in group]
+    layouts = [band.pair.layout for band in group]
     return None if any(layout is None for layout in layouts) else np.array(layouts, float)
 
 

@@ -28,7 +28,7 @@ from agalign.capture.by_relief import ReliefCandidates
 from agalign.capture.by_rig import DELIVERED_STD_PX, RigPrediction
 from agalign.capture.candidate import BandCandidates, Candidate
 from agalign.values.alignment import STD_DECIMALS, Alignment, Alignments, Prediction
-from agalign.values.issues import OTHER_CONTENT, OTHER_GEOMETRY, SEED_DOES_NOT_FIT, UNEXPECTED_PX, UNREADABLE, Issue
+from agalign.values.issues import OTHER_CONTENT, OTHER_GEOMETRY, SEED_DOES_NOT_FIT, UNEXPECTED_PX, Issue
 from agalign.verify.checks import MAX_UNEXPECTED_PX, rig_issues
 
 
@@ -92,7 +92,7 @@ class _Choice:
     def alignment(self) -> Alignment:
         """The alignment: this is the only place that makes those of pairs of images."""
         band, chosen = self.band, self.candidate
-        pair, p95_px = band.pair, {kind: p95 for c in band.candidates for kind, p95 in c.p95_px.items()}
+        pair, p95_px = band.pair, {kind: p95 for c in band.candidates for kind, p95 in c.held_out_p95_px.items()}
         if chosen is None:
             is_usable = band.is_start_trusted and band.does_start_fit and not self.is_seed_refused
             is_misfit = band.is_start_trusted and not band.does_start_fit and not self.is_seed_refused
@@ -113,7 +113,7 @@ class _Choice:
             band.start,
             joint=band.joint if chosen.joint is None else chosen.joint,
             residual=chosen.windows,
-            held_out_p95_px={**p95_px, **chosen.p95_px},
+            held_out_p95_px={**p95_px, **chosen.held_out_p95_px},
             prediction=_prediction(chosen, self.compared) if self.issues else self.compared,
             error=chosen.error,
             std_px=chosen.std_px,
@@ -131,13 +131,12 @@ def _prediction(chosen: Candidate, compared: Prediction | None) -> Prediction:
 
 def _of_images(band: BandCandidates, relief: ReliefCandidates | None) -> _Choice:
     """Choose from what the images of the capture show; nothing if the pixels of the band cannot be read."""
-    if band.issue is not None and band.issue.kind == UNREADABLE:
-        return _Choice(band, None, (band.issue,), is_seed_refused=True)
+    if band.is_unreadable:
+        return _Choice(band, None, tuple(band.rejected), is_seed_refused=True)
     under = None if relief is None else relief.candidates.get(band.pair.name)
     if under is not None:
         return _Choice(band, under, (Issue(OTHER_GEOMETRY), *under.issues) if under.issues else ())
-    accepted = [candidate for candidate in band.candidates if not candidate.issues]
-    if accepted:
+    if accepted := band.accepted:
         is_beside = relief is not None and relief.reference is band.pair.reference
         return _Choice(band, accepted[-1], (Issue(OTHER_GEOMETRY),) if is_beside else ())
     predicting = [candidate for candidate in band.candidates if candidate.may_predict]

@@ -4,7 +4,13 @@ from dataclasses import replace
 from functools import cached_property
 
 from agalign.fit.displacement_field import DisplacementEstimator
-from agalign.fit.windows import FIT_WINDOW_PX, HELD_OUT_WINDOW_PX, LARGE_WINDOW_PX, MIN_WINDOW_PX, FixedWindows
+from agalign.fit.windows import (
+    LARGE_WINDOW_PX,
+    MIN_WINDOW_PX,
+    RELIEF_CHECK_WINDOW_PX,
+    RELIEF_FIT_WINDOW_PX,
+    FixedWindows,
+)
 from agalign.pixels.band_resampling import channel_mean, shrink, textured
 from agalign.pixels.landmarks import LandmarkInput, Landmarks, landmarks
 from agalign.pixels.structure import Field, blur_px, structure_field, windowed_spectra
@@ -96,7 +102,7 @@ class Reference:
     @cached_property
     def tie_windows(self) -> FixedWindows:
         """Windows of the size of those that verify a relief, over the whole image."""
-        return FixedWindows(self.grey.valid, self.structure, HELD_OUT_WINDOW_PX)
+        return FixedWindows(self.grey.valid, self.structure, RELIEF_CHECK_WINDOW_PX)
 
     @cached_property
     def displacement_field(self) -> DisplacementEstimator:
@@ -104,15 +110,15 @@ class Reference:
         return DisplacementEstimator(self.grey.valid, self.structure)
 
     @cached_property
-    def black_windows(self) -> FixedWindows:
+    def relief_fit_windows(self) -> FixedWindows:
         """Windows in the black fields of a chessboard, for the fit of planes and baselines."""
-        return FixedWindows.on_chessboard(self.grey.valid, self.structure, FIT_WINDOW_PX, white=False)
+        return FixedWindows.on_chessboard(self.grey.valid, self.structure, RELIEF_FIT_WINDOW_PX, white=False)
 
     @cached_property
-    def white_windows(self) -> FixedWindows:
+    def relief_check_windows(self) -> FixedWindows:
         """Windows in the white fields, for the verification of a fit to the black ones."""
         return FixedWindows.on_chessboard(
-            self.grey.valid, self.structure, HELD_OUT_WINDOW_PX, white=True, min_valid_share=0.9
+            self.grey.valid, self.structure, RELIEF_CHECK_WINDOW_PX, white=True, min_valid_share=0.9
         )
 
     @cached_property

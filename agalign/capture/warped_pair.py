@@ -29,7 +29,7 @@ class WarpedPair:
     """The moving image, one channel, on the grid of the reference."""
     windows: FixedWindows
     residual: Residual
-    """Of these windows."""
+    """Of these windows, under the mapping or, if it is cross-validated, under the estimates without each of them."""
 
     @classmethod
     def of(cls, pair: BandPair, mapping: PixelMapping, windows: FixedWindows | None = None) -> "WarpedPair":
@@ -99,7 +99,7 @@ class WarpedPair:
 
         Georeferenced rasters have areas without data, which do not count; the image of a camera is complete.
         """
-        if "geo" in self.pair.seed_matrices:
+        if self.pair.is_georeferenced:
             return self.windows.visible_px(self.warped)
         return points_in_frame(self.mapping, *self.pair.sizes_px)
 

@@ -96,7 +96,7 @@ class DisplacementEstimator:
     def _measure(self, moving: Raster, mapping: PixelMapping) -> Shifts:
         """Measure the windows; their weights are relative to one with a noise of _NOISE_PX."""
         residual = self.windows.residuals(warped(moving, mapping, self.size_px))
-        peaks_sigma = residual.peaks_sigma[np.isfinite(residual.shifts_px[:, 0])]
+        peaks_sigma = residual.peaks_sigma[residual.is_measured]
         return Shifts.of(residual)._replace(weights=np.minimum((_NOISE_PX / noise_px(peaks_sigma)) ** 2, _MAX_WEIGHT))
 
     def _held_out(

@@ -263,7 +263,7 @@ class WindowShifts:
         index_of_band = np.split(index.reshape(-1), np.cumsum([len(r.cells) for r in residuals])[:-1])
         shifts, peaks = np.full((len(first), len(residuals), 2), np.nan), np.zeros((len(first), len(residuals)))
         for band, (residual, mapping) in enumerate(zip(residuals, mappings, strict=True)):
-            measured = np.isfinite(residual.shifts_px[:, 0])
+            measured = residual.is_measured
             if not measured.any():
                 continue
             xy, rows = residual.centres_px[measured], index_of_band[band][measured]

@@ -30,9 +30,9 @@ _WINDOW_PX = 112
 misalignment."""
 LARGE_WINDOW_PX = 168
 """Side of those in blurred images: 15 x 10 blurs of 3 px."""
-FIT_WINDOW_PX = 48
+RELIEF_FIT_WINDOW_PX = 48
 """Side of the windows that planes and baselines are fitted to: small, so that most contain a single surface."""
-HELD_OUT_WINDOW_PX = 64
+RELIEF_CHECK_WINDOW_PX = 64
 """Side of the windows that verify a relief; larger, because their shifts have less noise."""
 MIN_WINDOW_PX = 32
 """Side of windows between saturated areas, and minimum in small images; smaller windows have no reliable peak."""
@@ -190,7 +190,7 @@ class Shifts(NamedTuple):
     @classmethod
     def of(cls, residual: Residual) -> "Shifts":
         """Select the measured shifts of a residual."""
-        measured = np.isfinite(residual.shifts_px[:, 0])
+        measured = residual.is_measured
         weights = peak_weights(residual.peaks_sigma[measured])
         return cls(residual.centres_px[measured], residual.shifts_px[measured], weights, residual.cells[measured])
 

@@ -132,7 +132,7 @@ def _descriptor_issues(candidate: Verifiable) -> Iterator[Issue]:
 
 
 def _window_issues(candidate: Verifiable) -> Iterator[Issue]:
-    """Residual shifts of windows, which are independent of the estimation."""
+    """Residual shifts of windows, each without its own part in the estimation."""
     residual = candidate.windows
     min_windows = 4  # with structure; fewer cannot cover all corners of the image
     if len(residual.centres_px) < min_windows:
@@ -183,7 +183,7 @@ def _content_issues(candidate: Verifiable) -> Iterator[Issue]:
     if candidate.images is None:
         return
     residual = candidate.images.separate_windows()
-    is_lost = ~np.isfinite(residual.shifts_px[:, 0]) | is_misaligned(residual, candidate.file_pixel_size_px)
+    is_lost = ~residual.is_measured | is_misaligned(residual, candidate.file_pixel_size_px)
     area = _solid_area(residual.cells, is_lost)
     if area:
         yield Issue(OTHER_CONTENT, area / len(is_lost), 0.0)

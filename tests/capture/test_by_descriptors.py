@@ -40,7 +40,7 @@ def aligned(
     by_halves: tuple[Matrix, Matrix] | None = None,
 ) -> Alignment:
     """The alignment of a band by the result of the joint optimisation."""
-    return decided(pair, seed, by_descriptors(RefinedBand.of(pair, seed, joint), by_halves, use))
+    return decided(pair, seed, by_descriptors(replace(RefinedBand.of(pair, seed, joint), by_halves=by_halves), use))
 
 
 def test_each_colour_is_verified_by_the_estimate_from_the_other(pair: BandPair) -> None:

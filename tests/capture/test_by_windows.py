@@ -119,7 +119,7 @@ def refined(pair: BandPair) -> RefinedBand:
 
 
 def by_homography(band: RefinedBand) -> Candidate:
-    (plane,) = by_descriptors(band, None, "never")
+    (plane,) = by_descriptors(band, "never")
     return plane
 
 

@@ -80,7 +80,7 @@ def test_the_map_estimate_without_a_colour_ignores_its_windows(border_px: int) -
     def halves(image: np.ndarray) -> tuple[np.ndarray, ...]:
         pair = pair_of(whole(fixed), with_border(image, border_px))
         estimation = estimation_of(BandCandidates(pair, SEED), RefinedBand.of(pair, SEED, result))
-        return estimation._combined()[1]["moving"]
+        return estimation._combined()[0].by_halves
 
     def change_px(one: np.ndarray, other: np.ndarray) -> float:
         return geometry.corner_error_px(one, other, *fixed.shape[::-1])
@@ -129,7 +129,7 @@ def test_windows_of_a_relief_share_no_pixels_with_those_that_verify_it(
             result[y : y + windows.side, x : x + windows.side] = True
         return result
 
-    fit, held_out = (covered(windows) for windows in (reference.black_windows, reference.white_windows))
+    fit, held_out = (covered(windows) for windows in (reference.relief_fit_windows, reference.relief_check_windows))
     assert not (fit & held_out).any()
     # Both are all over the image.
     assert min(fit.mean(), held_out.mean()) > 0.3
