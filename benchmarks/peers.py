@@ -1,5 +1,5 @@
 """Other methods, to compare with: each pair method is `align(fixed, moving)`, which returns fixed_to_moving (3x3), or
-that with the method's own rating, or None for no result.
+that with the method's own rating, or another mapping, or None for no result.
 
 Images are arrays (H, W) or (H, W, 3) of the file's type; matrices map a pixel of `fixed` to a pixel of `moving`: x
 right, y down, (0, 0) the centre of the top-left pixel. A method claims each mapping that it returns. Only methods in
@@ -19,6 +19,7 @@ import cv2
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from opendronemap import MODULE, SOURCE, matrix_of_pair
 from skimage.filters import rank
 from skimage.morphology import disk
 
@@ -35,7 +36,7 @@ from agalign.pixels.band_resampling import luma, warped
 from agalign.pixels.masks import raster_of
 from agalign.pixels.structure import structure_field
 from agalign.values import geometry
-from agalign.values.geometry import Matrix
+from agalign.values.geometry import Matrix, Points
 from agalign.values.image import Raster
 from agalign.values.issues import Issue
 from agalign.values.mapping import PixelMapping
@@ -52,7 +53,17 @@ class Rated(NamedTuple):
     """Number of inliers, or ECC's correlation coefficient: high is good."""
 
 
-Align = Callable[..., Matrix | Rated | None]
+class Mapped(NamedTuple):
+    """A mapping that is not a homography."""
+
+    fixed_to_moving: Callable[[Points], Points]
+    """Maps pixels (n, 2) of `fixed`."""
+    claimed: bool
+    std_px: float
+    """The method's standard error of a mapping that it does not claim; nan if it claims it."""
+
+
+Align = Callable[..., Matrix | Rated | Mapped | None]
 WEIGHTS = "ALIKED_WEIGHTS"
 """Environment variable with the path of `aliked-n16rot.pth`, from `models` in the repository Shiaoming/ALIKED."""
 
@@ -76,7 +87,15 @@ def method_named(name: str) -> Align:
             raise UnavailableError(f"needs {module_name}: pip install {package}")
     if METHODS[name] is aliked and not Path(os.environ.get(WEIGHTS, "")).is_file():
         raise UnavailableError(f"set {WEIGHTS} to the path of aliked-n16rot.pth (github.com/Shiaoming/ALIKED, models/)")
+    if METHODS[name] is matrix_of_pair:
+        check_opendronemap()
     return METHODS[name]
+
+
+def check_opendronemap() -> None:
+    """Raise UnavailableError without the source of OpenDroneMap."""
+    if not Path(os.environ.get(SOURCE, ""), MODULE).is_file():
+        raise UnavailableError(f"set {SOURCE} to the path of a checkout of github.com/OpenDroneMap/ODM")
 
 
 def grey_raster(image: Image) -> Raster:
@@ -229,13 +248,15 @@ def elastix_seeded(fixed: Image, moving: Image) -> Matrix | None:
     return None if result is None else geometry.compose(seed, result)
 
 
-def agalign_pair(fixed: Image, moving: Image) -> Matrix | None:
-    """`agalign.align` with its defaults; it claims what it calls aligned."""
+def agalign_pair(fixed: Image, moving: Image) -> Mapped | None:
+    """`agalign.align` with its defaults: the complete mapping. It claims what it calls aligned, and not predicted."""
     try:
         result = agalign.align(fixed, moving)
     except AgalignError:
         return None
-    return result.fixed_to_moving if result.status == "aligned" else None
+    if result.status == "aligned":
+        return Mapped(result.map, True, np.nan)
+    return Mapped(result.map, False, result.prediction.std_px) if result.status == "predicted" else None
 
 
 METHODS: dict[str, Align] = {
@@ -245,6 +266,7 @@ METHODS: dict[str, Align] = {
     "ECC, agalign's start": ecc_started,
     "ECC, identity": ecc,
     "MicaSense": micasense,
+    "OpenDroneMap, capture": matrix_of_pair,
     "structure ties + MAGSAC": structure_ties,
     "elastix affine": elastix,
     "elastix, structure seed": elastix_seeded,

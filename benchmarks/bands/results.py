@@ -1,21 +1,33 @@
 """The results of the benchmark by pair, in results.csv, and the tables of the comparison that are counted from it."""
 
 import csv
-from collections.abc import Iterable, Mapping, Sequence
+import re
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from common import cell
-from figures_csv import Provenance, TableRow
+from figures_csv import TITLES, Provenance, TableRow
 
+from agalign.config import CheckSettings
 from bands import score
 from bands.images import LENS_CORRECTED
 from bands.score import AS_IT_IS, Scored
 
 WHOLE = {"agalign, capture": (), "agalign, capture, no tags": ("--ignore-metadata",)}
 """Runs of the command line on a whole flight, with its files and tags: options by name."""
+VOTED = "OpenDroneMap, flight"
+"""One matrix per band for all captures of a flight, as OpenDroneMap uses it."""
+REPEATED = "OpenDroneMap, capture", VOTED
+"""Methods whose results differ between runs."""
+RUNS = 5
+"""Of each method that is repeated: a median, and a range that hardly grows with more."""
+OF_RAW_FILES = (*WHOLE, *REPEATED)
+"""Methods that are not given corrected images."""
+USABLE_PX = CheckSettings().accept_predicted_px
+"""Largest standard error of a predicted band that agalign uses by default."""
 
 
 @dataclass(frozen=True)
@@ -52,9 +64,14 @@ def add_results(path: Path, scored: Sequence[Scored], order: Sequence[tuple[str,
         if (r.method, r.set, r.variant) not in done and (r.method not in stale or r.digest == now.digest)
     ]
     places = {place: index for index, place in enumerate(order)}
-    result = sorted([*kept, *new], key=lambda r: (places.get((r.method, r.variant), len(places)), r.set))
+    result = sorted([*kept, *new], key=lambda r: (places.get((without_run(r.method), r.variant), len(places)), r.set))
     score.write_csv(result, path)
     return result
+
+
+def without_run(method: str) -> str:
+    """Return the name of a method without the number of its run."""
+    return re.sub(r", run \d+$", "", method)
 
 
 ORIGINALS, WITH_LENSES, COPIES = "originals", "originals with tags", "degraded copies"
@@ -66,36 +83,93 @@ def table_of(result: Result) -> str:
 
 
 def comparison(results: Sequence[Result], sets: Mapping[str, Any]) -> Iterable[TableRow]:
-    """Yield the rows of methods in each table, with all sets and with the published ones.
+    """Yield the rows of methods in each table: of all sets, of unchanged images of drone cameras, and by set for
+    OpenDroneMap.
 
-    The program corrects the lenses of a capture by itself: what it makes of the original files is compared with what
-    other methods make of corrected images.
+    The program corrects the lenses of a capture by itself, and OpenDroneMap aligns raw files: what they make of the
+    original files is compared with what other methods make of corrected images.
     """
     corrected = {r.key for r in results if r.variant == LENS_CORRECTED}
     pairwise = [r for r in results if r.method not in WHOLE or r.variant != AS_IT_IS]
-    whole = [r for r in results if r.method in WHOLE and r.variant == AS_IT_IS and r.key in corrected]
-    used = [*pairwise, *(replace(r, variant=LENS_CORRECTED) for r in whole)]
-    rated = [*used, *(r for r in score.limited(used, sets) if table_of(r) != WITH_LENSES)]
-    public = [r for r in used if "repository" in sets[r.set]["published"]]
-    for prefix, some in (("comparison", rated), ("public sets", public)):
+    raw = [r for r in results if without_run(r.method) in OF_RAW_FILES and r.variant == AS_IT_IS]
+    used = [*pairwise, *(replace(r, variant=LENS_CORRECTED) for r in raw if r.key in corrected)]
+    rated = [*used, *(r for r in score.limited(used, sets) if table_of(r) != WITH_LENSES), *with_predicted(used)]
+    drone_cameras = {name for name, description in sets.items() if "ties" in _first_pair(description)}
+    of_drones = [r for r in results if r.variant == AS_IT_IS and r.set in drone_cameras]
+    for prefix, some in (("comparison", rated), ("drone cameras", of_drones)):
         groups: dict[tuple[str, str], list[Result]] = {}
         for r in some:
-            groups.setdefault((table_of(r), r.method), []).append(r)
+            groups.setdefault((table_of(r), without_run(r.method)), []).append(r)
         for kind in (ORIGINALS, WITH_LENSES, COPIES):
             own = {method: group for (name, method), group in groups.items() if name == kind}
-            yield from (table_row(f"{prefix}, {kind}", *group) for group in own.items())
+            yield from (table_row(f"{prefix}, {kind}", *group, counts) for group in own.items())
+    of_set: dict[tuple[str, str], list[Result]] = {}
+    for r in of_drones:
+        if without_run(r.method) in ("agalign, capture", *REPEATED):
+            of_set.setdefault((r.set, without_run(r.method)), []).append(r)
+    for (name, method), group in sorted(of_set.items()):
+        yield table_row("OpenDroneMap", f"{TITLES.get(name, name)}: {method}", group, errors)
 
 
-def table_row(name: str, method: str, results: Sequence[Result]) -> TableRow:
+def _first_pair(description: Mapping[str, Any]) -> Mapping[str, Any]:
+    first: Mapping[str, Any] = next(iter(next(iter(description["captures"].values()))["pairs"].values()))
+    return first
+
+
+def with_predicted(results: Iterable[Result]) -> list[Result]:
+    """Return the results of degraded copies by methods that predict, which claim predictions with a small standard
+    error as well.
+    """
+    copies = [r for r in results if table_of(r) == COPIES]
+    predict = {r.method for r in copies if not np.isnan(r.std_px)}
+    return [
+        replace(r, method=f"{r.method}, with predicted", claimed=r.claimed or r.std_px <= USABLE_PX)
+        for r in copies
+        if r.method in predict
+    ]
+
+
+def table_row(
+    name: str, method: str, results: Sequence[Result], cells_of: Callable[[Sequence[Result]], dict[str, object]]
+) -> TableRow:
+    """Return the cells of a method; for one that was repeated, the medians of its runs with their range."""
+    runs: dict[str, list[Result]] = {}
+    for r in results:
+        runs.setdefault(r.method, []).append(r)
+    of_runs = [cells_of(run) for run in runs.values()]
+    cells = {head: with_range([str(of_run[head]) for of_run in of_runs]) for head in of_runs[0]}
+    measured = Provenance(results[0].commit, results[0].digest)
+    return TableRow(name, method, f"{len(next(iter(runs.values())))} pairs", cells, measured)
+
+
+def with_range(values: Sequence[str]) -> str:
+    """Return the median of numbers, with their range if they differ."""
+    ordered = sorted((v for v in values if v != "-"), key=float)
+    if not ordered:
+        return "-"
+    median, low, high = ordered[len(ordered) // 2], ordered[0], ordered[-1]
+    return median if low == high else f"{median} ({low} to {high})"
+
+
+def counts(results: Sequence[Result]) -> dict[str, object]:
     """Return the counts and medians of a method."""
     accepted_px = np.array([r.median_px for r in results if r.claimed])
-    seconds = np.array([r.seconds for r in results])
-    cells = {
+    return {
         "accepted": len(accepted_px),
         "wrong": sum(r.is_wrong for r in results),
         "accepted within 0.5 px": int((accepted_px <= score.GOOD_PX).sum()),
+        "accepted within 1 px": int((accepted_px <= score.WRONG_PX).sum()),
         "median error, px": cell(accepted_px, ".3f"),
-        "CPU time, s": cell(seconds, ".1f"),
+        "CPU time, s": cell(np.array([r.seconds for r in results]), ".1f"),
     }
-    measured = Provenance(results[0].commit, results[0].digest)
-    return TableRow(name, method, f"{len(results)} pairs", cells, measured)
+
+
+def errors(results: Sequence[Result]) -> dict[str, object]:
+    """Return the errors of a method."""
+    median_px, p95_px = (np.array([getattr(r, name) for r in results if r.claimed]) for name in ("median_px", "p95_px"))
+    return {
+        "median error, px": cell(median_px, ".3f"),
+        "worst pair, px": cell(median_px, ".2f", np.max),
+        "worst 95 %, px": cell(p95_px, ".2f", np.max),
+        "pairs beyond 1 px": int((median_px > score.WRONG_PX).sum()),
+    }

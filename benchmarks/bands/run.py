@@ -5,7 +5,8 @@
 
 DATA is any folder: images are recognised by their checksums, and missing sets are listed with their publisher. Each
 method runs in a process of its own with one thread; one that raises has refused the pair. ALIKED needs its weights: the
-path of aliked-n16rot.pth (github.com/Shiaoming/ALIKED, models/) in the environment variable ALIKED_WEIGHTS.
+path of aliked-n16rot.pth (github.com/Shiaoming/ALIKED, models/) in the environment variable ALIKED_WEIGHTS. The code of
+OpenDroneMap is loaded from the checkout in ODM_SOURCE; as its matches are random, it runs several times.
 
 The result of each pair is written to -o after each method and variant, and tables of all results in the file next to it
 (.md): a run can be continued with other methods and variants. Results of the same method by another version of the
@@ -20,7 +21,7 @@ import resource
 import shutil
 import sys
 import tempfile
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
 from functools import partial
@@ -37,7 +38,8 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # run as a file, i
 
 from common import align, cpu_timed, flight_and_out, heat_map, pyplot, run, write_band
 from figures_csv import FiguresOption, write_figures
-from peers import METHODS, WITH_TAGS, Align, Rated, grey_raster, method_named
+from opendronemap import voted_matrices
+from peers import METHODS, WITH_TAGS, Align, Mapped, Rated, check_opendronemap, grey_raster, method_named
 
 from agalign.cameras.discover import discover
 from agalign.cameras.tag_seeds import tag_seeds
@@ -48,18 +50,35 @@ from agalign.records.sidecar import BandResult
 from agalign.records.sidecar_file import find_sidecars, read_sidecar
 from agalign.values import geometry, lens
 from agalign.values.capture import Band
+from agalign.values.geometry import Matrix, Points
 from agalign.values.mapping import PixelMapping
 from bands import score
 from bands.images import LENS_CORRECTED, VARIANTS, Image, Paths, degraded, locate, read, straightened
-from bands.results import WHOLE, Result, add_results, comparison
+from bands.results import OF_RAW_FILES, REPEATED, RUNS, VOTED, WHOLE, Result, add_results, comparison
 from bands.score import AS_IT_IS, Pair, Score, Scored, summary, table
 
-ALL_METHODS = (*METHODS, *WHOLE)
+ALL_METHODS = (*METHODS, VOTED, *WHOLE)
 RESULTS = Path(__file__).with_name("results.csv")
 COMMAND = "python benchmarks/bands/run.py DATA"
 """Runs of some methods add up to this one."""
 Row = dict[str, Any]
-_FIELDS = ("method", "set", "capture", "file", "variant", "claimed", "rating", "seconds", "homography", "grid")
+AnyMapping = Matrix | Callable[[Points], Points]
+"""From pixels of the reference to those of the moving image."""
+_FIELDS = (
+    "method",
+    "set",
+    "capture",
+    "file",
+    "variant",
+    "claimed",
+    "rating",
+    "std_px",
+    "seconds",
+    "homography",
+    "grid",
+)
+_GRID_PX = 16
+"""Distance of the points at which a mapping is sampled: the scorer interpolates between them to 0.001 px."""
 
 
 def _grid(reference_px: Any, moving_px: Any) -> Row:
@@ -84,6 +103,21 @@ def by_command_line(method: str, paths: Paths, pairs: Sequence[Pair], variant: s
         seconds = (_seconds_of_children() - before_s) / (len(paths) - len({p.reference for p in pairs}))
         bands = {band.file: band for path in find_sidecars(out) for band in read_sidecar(path).bands}
     return [{**claim(bands.get(pair.file)), "seconds": seconds} for pair in pairs]
+
+
+def by_vote(paths: Paths, description: Mapping[str, Any], pairs: Sequence[Pair], variant: str) -> list[Row]:
+    """OpenDroneMap's matrix of each band, for which all captures of a set vote. Moving bands of the pairs are degraded,
+    the rest is unchanged. Raises UnavailableError.
+    """
+    check_opendronemap()
+    images = {name: read(path) for name, path in paths.items()}
+    images |= {pair.file: degraded(images[pair.file], pair, variant) for pair in pairs}
+    bands = {file: entry["band"] for file, entry in description["files"].items()}
+    references = {pair.file: pair.reference for pair in score.pairs_of(description)}
+    seconds, matrices = cpu_timed(voted_matrices, images, bands, references)
+    found = [matrices.get(bands[pair.file]) for pair in pairs]
+    given = [{} if matrix is None else {"homography": matrix.tolist()} for matrix in found]
+    return [{"seconds": seconds / len(references), **row} for row in given]
 
 
 def _seconds_of_children() -> float:
@@ -122,21 +156,42 @@ def lens_corrected(method: Align, fixed: tuple[Image, Band], moving: tuple[Image
     The correction is not included in its seconds.
     """
     images = [straightened(replace(grey_raster(image), lens=band.lens)) for image, band in (fixed, moving)]
-    row = mapped_by(method, images[0].pixels, images[1].pixels)
-    if "homography" not in row:
+    row, mapping = estimated(method, images[0].pixels, images[1].pixels)
+    if mapping is None:
         return row
-    here = geometry.lattice(*images[0].size_px, 33, 25)
-    matrix = geometry.normalised(np.array(row.pop("homography")))
-    return row | {"grid": _grid(here, PixelMapping(matrix, fixed[1].lens, moving[1].lens)(here))}
+    to_straight, to_raw = PixelMapping(np.eye(3), fixed[1].lens), PixelMapping(np.eye(3), None, moving[1].lens)
+    return row | {"grid": sampled(lambda raw_px: to_raw(applied(mapping, to_straight(raw_px))), fixed[0])}
 
 
 def mapped_by(method: Align, fixed: Image, moving: Image) -> Row:
-    """Return the homography of two images by a method, its rating and CPU seconds."""
+    """Return the mapping of two images by a method, what it says about it, and CPU seconds."""
+    row, mapping = estimated(method, fixed, moving)
+    if mapping is None:
+        return row
+    return row | ({"grid": sampled(mapping, fixed)} if callable(mapping) else {"homography": mapping.tolist()})
+
+
+def estimated(method: Align, fixed: Image, moving: Image) -> tuple[Row, AnyMapping | None]:
+    """Return CPU seconds of a method and what it says about its mapping; and the mapping, if it has one."""
     seconds, result = cpu_timed(method, fixed, moving)
-    rating = {"rating": result.rating} if isinstance(result, Rated) else {}
-    matrix = result.fixed_to_moving if isinstance(result, Rated) else result
-    found = {} if matrix is None else {"homography": np.asarray(matrix, float).tolist()}
-    return {"seconds": seconds, **rating, **found}
+    row = {"seconds": seconds}
+    if isinstance(result, Mapped):
+        return row | {"claimed": "yes" if result.claimed else "no", "std_px": result.std_px}, result.fixed_to_moving
+    if isinstance(result, Rated):
+        row["rating"], result = result.rating, result.fixed_to_moving
+    return row, None if result is None else np.asarray(result, float)
+
+
+def applied(mapping: AnyMapping, points_px: Points) -> Points:
+    """Return points (n, 2) under a homography or another mapping."""
+    return mapping(points_px) if callable(mapping) else geometry.apply(geometry.normalised(mapping), points_px)
+
+
+def sampled(mapping: Callable[[Points], Points], fixed: Image) -> Row:
+    """Return where a mapping sends a lattice of pixels of the reference."""
+    height, width = fixed.shape[:2]
+    here = geometry.lattice(width, height, width // _GRID_PX + 1, height // _GRID_PX + 1)
+    return _grid(here, mapping(here))
 
 
 def asked(method: Align, pair: Pair, variant: str, paths: Paths, bands: Mapping[str, Band]) -> Row:
@@ -219,31 +274,49 @@ def draw(scored: Sequence[Scored], path: Path) -> None:
 
 
 def applies(name: str, variant: str, pairs: Sequence[Pair], bands: Mapping[str, Band], paths: Paths) -> bool:
-    """Return False for images without a lens to correct, and for the program on corrected images or without tags."""
+    """Return False for corrected images without a lens, or if the method takes raw files; and for whole flights without
+    tags.
+    """
     if variant == LENS_CORRECTED:
         used = [bands.get(file) for p in pairs for file in (p.reference, p.file)]
-        return name not in WHOLE and all(b is not None and lens.is_distorting(b.lens) for b in used)
-    return name not in WHOLE or has_tags(paths)
+        return name not in OF_RAW_FILES and all(b is not None and lens.is_distorting(b.lens) for b in used)
+    return name not in (*WHOLE, VOTED) or has_tags(paths)
 
 
 def run_method(located: Mapping[str, Paths], sets: dict[str, Any], variant: str, name: str) -> list[Row]:
     """Return the rows of a method for all pairs of a variant. Raises UnavailableError."""
     cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_ERROR)  # it warns of every unknown tag
     limit_threads(1)
-    method = None if name in WHOLE else method_named(name)
+    names = [f"{name}, run {number}" for number in range(1, RUNS + 1)] if name in REPEATED else [name]
     rows: list[Row] = []
     for set_name, paths in located.items():
         bands, pairs = bands_of(paths), score.pairs_of(sets[set_name], variant)
         if not applies(name, variant, pairs, bands, paths):
             continue
-        if method is None:
-            mapped = by_command_line(name, paths, pairs, variant)
-        else:
-            mapped = [asked(method, pair, variant, paths, bands) for pair in pairs]
-        for pair, row in zip(pairs, mapped, strict=True):
-            key = dict(zip(("set", "capture", "file"), pair.key, strict=True))
-            rows.append({"method": name, "variant": variant, **key, **row})
+        for run_name in names:
+            for pair, row in zip(pairs, mapped(name, sets[set_name], pairs, variant, paths, bands), strict=True):
+                key = dict(zip(("set", "capture", "file"), pair.key, strict=True))
+                rows.append({"method": run_name, "variant": variant, **key, **row})
     return rows
+
+
+def mapped(
+    name: str,
+    description: Mapping[str, Any],
+    pairs: Sequence[Pair],
+    variant: str,
+    paths: Paths,
+    bands: Mapping[str, Band],
+) -> Iterator[Row]:
+    """Yield the mappings of pairs of a set by a method. Raises UnavailableError."""
+    if name in WHOLE:
+        yield from by_command_line(name, paths, pairs, variant)
+    elif name == VOTED:
+        yield from by_vote(paths, description, pairs, variant)
+    else:
+        method = method_named(name)
+        for pair in pairs:
+            yield asked(method, pair, variant, paths, bands)
 
 
 def in_its_process(function: Callable[..., list[Row]], *arguments: Any) -> list[Row]:

@@ -6,8 +6,8 @@ RESULTS is CSV with a header, or JSON with a list of objects. A row is a band pa
 one), and `homography` (nine numbers, row by row) or `grid` (JSON {"reference_px": [[x, y], ...], "moving_px": ...}:
 where the mapping sends some pixels of the reference). Both map a raw pixel of the reference file to a raw pixel of the
 moving file: x right, y down, (0, 0) the centre of the top-left pixel. A row with neither is a refusal. Optional are
-`method`, `variant`, `seconds`, `rating` (what the method says about the pair, high is good), and `claimed`: "no" for an
-estimate that the method itself does not accept.
+`method`, `variant`, `seconds`, `rating` (what the method says about the pair, high is good), `claimed`: "no" for an
+estimate that the method itself does not accept, and `std_px`, its standard error of such an estimate.
 """
 
 import argparse
@@ -91,6 +91,8 @@ class Scored:
     p95_px: float
     rating: float
     """What the method says about the pair: number of inliers, or ECC's coefficient; nan without one."""
+    std_px: float
+    """The method's standard error of an estimate that is not claimed; nan without one."""
     seconds: float
 
     @property
@@ -215,17 +217,26 @@ def _decoded(value: Any) -> Any:
     return json.loads(value) if value.lstrip().startswith(("[", "{")) else [float(v) for v in value.split()]
 
 
+def mapped_px(row: Mapping[str, Any], reference_px: Points) -> Points | None:
+    """Points (n, 2) of the reference in the moving file; None where the row has no mapping.
+
+    Raises ValueError for what is no mapping.
+    """
+    if row.get("homography") is not None:
+        return apply(np.array(_decoded(row["homography"]), float).reshape(3, 3), reference_px)
+    if row.get("grid") is None:
+        return None
+    grid = _decoded(row["grid"])
+    return np.asarray(CloughTocher2DInterpolator(grid["reference_px"], grid["moving_px"])(reference_px))
+
+
 def errors_px(row: Mapping[str, Any], pair: Pair) -> Points | None:
     """(n,) distances from the truth, inf where a mapping says nothing; None where the row has no mapping.
 
     Raises ValueError for what is no mapping.
     """
-    if row.get("homography") is not None:
-        there = apply(np.array(_decoded(row["homography"]), float).reshape(3, 3), pair.reference_px)
-    elif row.get("grid") is not None:
-        grid = _decoded(row["grid"])
-        there = CloughTocher2DInterpolator(grid["reference_px"], grid["moving_px"])(pair.reference_px)
-    else:
+    there = mapped_px(row, pair.reference_px)
+    if there is None:
         return None
     return np.asarray(np.nan_to_num(np.linalg.norm(there - pair.moving_px, axis=1), nan=np.inf))
 
@@ -259,11 +270,11 @@ def _scored(row: Mapping[str, Any], pair: Pair, variant: str, method: str) -> Sc
     except (ValueError, KeyError, TypeError) as problem:
         raise ValueError(f"{method}: {pair.key}: no mapping ({problem})") from None
     given = error is not None
-    rating, seconds = (float(row.get(name, "nan")) for name in ("rating", "seconds"))
+    rating, std_px, seconds = (float(row.get(name, "nan")) for name in ("rating", "std_px", "seconds"))
     # Of the order statistics the upper one, for between a number and inf nothing can be interpolated.
     quantiles_px = np.percentile(error, (50, 95), method="higher").tolist() if given else (np.nan, np.nan)
     claimed = given and str(row.get("claimed", "yes")).lower() not in ("no", "false", "0")
-    return Scored(method, pair.set, variant, *pair.key[1:], claimed, given, *quantiles_px, rating, seconds)
+    return Scored(method, pair.set, variant, *pair.key[1:], claimed, given, *quantiles_px, rating, std_px, seconds)
 
 
 def limited(scored: Sequence[Scored], sets: Mapping[str, Mapping[str, Any]]) -> list[Scored]:

@@ -1,6 +1,7 @@
 """The benchmark of band pairs: its scorer on known homographies, its sets, and how it treats methods."""
 
 import json
+import os
 import re
 import subprocess
 import sys
@@ -12,11 +13,12 @@ import numpy as np
 import pytest
 from bands import score
 from bands.images import VARIANTS, degraded, locate, read
-from bands.results import add_results, comparison, read_results
-from bands.run import asked, claim, lens_corrected, write_mappings
+from bands.results import VOTED, add_results, comparison, read_results, with_predicted, with_range
+from bands.run import asked, by_vote, claim, lens_corrected, mapped_by, write_mappings
 from common import read_ties
 from figures_csv import Provenance
-from peers import METHODS, WEIGHTS, Rated, UnavailableError, method_named, sift
+from opendronemap import SOURCE, matrix_of_pair, voted_matrices
+from peers import METHODS, WEIGHTS, Mapped, Rated, UnavailableError, method_named, sift
 from synthetic_flights.aligned import sidecar_of
 
 from agalign.cameras.discover import discover
@@ -225,9 +227,10 @@ def test_results_are_added_and_those_of_another_version_removed(
     (first, *_) = comparison(read_results(path), {"field": {**sets["field"], "published": {}}})
     assert (first.table, first.name, first.n) == ("comparison, originals", "m", "4 pairs")
     assert first.cells == {
-        "accepted": 1,
-        "wrong": 0,
-        "accepted within 0.5 px": 1,
+        "accepted": "1",
+        "wrong": "0",
+        "accepted within 0.5 px": "1",
+        "accepted within 1 px": "1",
         "median error, px": "0.000",
         "CPU time, s": "0.5",
     }
@@ -278,3 +281,103 @@ def test_lens_corrected_images_are_scored_between_raw_pixels(flight: Path) -> No
     here, there = np.hsplit(np.array(truth["ties"]), 2)
     pair = score.Pair("synthetic", "1", truth["reference"], "IMG_0001_4.tif", here, there, both[1][1].size_px)
     assert np.median(score.errors_px(result, pair)) < 0.02
+
+
+def test_a_mapping_that_is_no_homography_is_scored_as_it_is(pair: score.Pair) -> None:
+    """Its displacement varies along x with a period of 640 px, which no homography has."""
+
+    def bent(points_px: np.ndarray) -> np.ndarray:
+        return score.apply(TRUE, points_px) + 2 * np.sin(points_px[:, :1] / 100) * [0.6, 0.8]
+
+    image = np.zeros((480, 640), np.uint8)
+    row = mapped_by(lambda _f, _m: Mapped(bent, False, 0.4), image, image)
+    assert (row["claimed"], row["std_px"]) == ("no", 0.4)
+    assert score.errors_px(row, pair) == pytest.approx(2 * np.abs(np.sin(pair.reference_px[:, 0] / 100)), abs=2e-3)
+
+
+def test_predictions_with_a_small_standard_error_are_counted_apart(sets: dict[str, Any], tmp_path: Path) -> None:
+    rows = [
+        row("1_r.png", homography=TRUE.tolist(), variant="blur 3 px", claimed="no", std_px=0.9),
+        row("1_n.png", homography=shifted(3, 0).tolist(), variant="blur 3 px", claimed="no", std_px=1.1),
+    ]
+    results = add_results(tmp_path / "results.csv", score.score_pairs(rows, sets), [])
+    assert [(r.claimed, r.std_px) for r in results] == [(False, 0.9), (False, 1.1)]
+    assert [(r.method, r.claimed) for r in with_predicted(results)] == [
+        ("m, with predicted", True),
+        ("m, with predicted", False),
+    ]
+
+
+def test_runs_of_a_method_are_one_row_with_their_range(sets: dict[str, Any], tmp_path: Path) -> None:
+    rows = [
+        row(file, homography=shifted(error_px, 0).tolist(), method=f"{VOTED}, run {number}")
+        for number, error_px in enumerate((0.1, 0.3, 1.2), 1)
+        for file in ("1_r.png", "1_n.png", "2_r.png", "2_n.png")
+    ]
+    results = add_results(tmp_path / "results.csv", score.score_pairs(rows, sets), [])
+    *_, by_set = comparison(results, {"field": {**sets["field"], "published": {}}})
+    assert (by_set.table, by_set.name, by_set.n) == ("OpenDroneMap", f"field: {VOTED}", "4 pairs")
+    assert by_set.cells["median error, px"] == "0.300 (0.100 to 1.200)"
+    assert by_set.cells["pairs beyond 1 px"] == "0 (0 to 4)"
+    assert with_range(["-", "-"]) == "-"
+
+
+# ---- OpenDroneMap
+
+needs_opendronemap = pytest.mark.skipif(SOURCE not in os.environ, reason=f"needs {SOURCE}")
+
+
+def shifted_pair(dx: float, dy: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return an image, and another one in which its content is at another place, by (dx, dy) px."""
+    noise = np.random.default_rng(3).normal(size=(6, 480, 640)).astype(np.float32)
+    scene = sum(
+        sigma**2 * cv2.GaussianBlur(n, (0, 0), sigma) for n, sigma in zip(noise, (1, 2, 3, 4, 6, 9), strict=True)
+    )
+    fixed = (60000 * (scene - scene.min()) / np.ptp(scene)).astype(np.uint16)
+    moving = cv2.warpAffine(fixed, np.float64([[1, 0, dx], [0, 1, dy]]), (640, 480), borderMode=cv2.BORDER_REFLECT)
+    return fixed, moving
+
+
+def test_a_matrix_of_opendronemap_is_inverted(monkeypatch: pytest.MonkeyPatch) -> None:
+    """OpenDroneMap warps the moving image by it, so that it maps pixels of the moving image."""
+    to_fixed = np.array([[1, 0, -5], [0, 1, 3], [0, 0, 1.0]])
+    fixed, moving = shifted_pair(5, -3)
+    difference = cv2.absdiff(cv2.warpPerspective(moving, to_fixed, (640, 480)), fixed)
+    assert not difference[10:-10, 10:-10].any()
+    fake = type("multispectral", (), {"compute_homography": staticmethod(lambda *_: (to_fixed, None, "feat"))})
+    monkeypatch.setattr("opendronemap._multispectral", lambda: fake)
+    there = score.apply(matrix_of_pair(fixed, moving), np.array([[100.0, 100.0]]))
+    assert there == pytest.approx(np.array([[105.0, 97.0]]))
+    with pytest.raises(ValueError, match="not implemented"):
+        matrix_of_pair(fixed, moving[::2, ::2])
+
+
+def test_the_source_of_opendronemap_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv(SOURCE, raising=False)
+    with pytest.raises(UnavailableError, match="set ODM_SOURCE to the path of a checkout"):
+        method_named("OpenDroneMap, capture")
+    with pytest.raises(UnavailableError):
+        by_vote({}, {}, [], score.AS_IT_IS)
+
+
+@needs_opendronemap
+def test_opendronemap_finds_a_known_shift() -> None:
+    fixed, moving = shifted_pair(7, -4)
+    there = score.apply(matrix_of_pair(fixed, moving), TIES_PX)
+    assert there == pytest.approx(TIES_PX + np.array([7, -4]), abs=0.3)
+
+
+@needs_opendronemap
+def test_captures_vote_for_the_matrix_of_opendronemap() -> None:
+    """The third capture has another shift and scale, which no other has."""
+    fixed, moving = shifted_pair(7, -4)
+    other = cv2.warpAffine(moving, np.array([[1.05, 0, 9], [0, 1.05, 9.0]]), (640, 480))
+    images = {f"{n}_{band}.tif": image for n in "123" for band, image in (("g", fixed), ("n", moving))}
+    images["3_n.tif"] = other
+    bands = {file: {"g": "Green", "n": "NIR"}[file[2]] for file in images}
+    references = {file: file.replace("n", "g", 1) for file in images if "n" in file}
+    matrices = voted_matrices(images, bands, references)
+    assert list(matrices) == ["NIR"]
+    assert score.apply(matrices["NIR"], TIES_PX) == pytest.approx(TIES_PX + np.array([7, -4]), abs=0.3)
+    with pytest.raises(ValueError, match="aligns to Green, and not to NIR"):
+        voted_matrices(images, bands, {reference: file for file, reference in references.items()})
