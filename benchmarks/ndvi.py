@@ -1,25 +1,26 @@
 """NDVI before and after alignment, against the truth. Prints a table.
 
-    pip install -e '.[bench]' && python benchmarks/ndvi.py [CAPTURES] [--real DATA] [--figures]
+    pip install -e '.[bench]' && python benchmarks/ndvi.py [DATA] [--captures 3] [--figures]
 
-The truth of the synthetic flight is the reflectance that it was painted with. --real compares methods on the four
-captures of the row crop below DATA instead (benchmarks/bands/README.md). There the truth is the NDVI of the same files
-when red and near infrared are resampled by a mapping that is fitted to the tie points, a cubic polynomial. Edges are
-the 10 % of the pixels where this NDVI changes most; only pixels between tie points count. OpenDroneMap is repeated: the
-median of its runs, and their range.
+Without DATA: the synthetic flight, whose truth is the reflectance that it was painted with. With DATA, methods are
+compared on the four captures of the row crop below it (benchmarks/bands/README.md). There the truth is the NDVI of the
+same files when red and near infrared are resampled by a mapping that is fitted to the tie points, a cubic polynomial.
+Edges are the 10 % of the pixels where this NDVI changes most; only pixels between tie points count. OpenDroneMap is
+repeated: the median of its runs, and their range.
 """
 
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import cv2
 import numpy as np
+import typer
 from bands.images import locate
 from bands.results import REPEATED, RUNS, with_range
 from bands.run import bands_of, mapped
 from bands.score import AS_IT_IS, Pair, mapped_px, pairs_of, read_sets
-from common import Number, flight_and_out, print_head, print_row, read_band, run, window_of
+from common import flight_and_out, print_head, print_row, read_band, run, window_of
 from figures_csv import FiguresOption, TableRow, write_figures
 from numpy.typing import NDArray
 from scipy.spatial import Delaunay
@@ -50,16 +51,18 @@ _GRID_PX = 16
 Errors = NDArray[np.float64]
 
 
-def main(captures: Number = 3, real: Path | None = None, *, figures: FiguresOption = False) -> None:
-    if real is None:
+def main(
+    data: Annotated[Path | None, typer.Argument()] = None, captures: int = 3, *, figures: FiguresOption = False
+) -> None:
+    if data is None:
         print_synthetic(captures)
         return
-    rows = [*real_rows(real)]
+    rows = [*real_rows(data)]
     print_head("NDVI", *rows[0].cells)
     for row in rows:
         print_row(row.name, *row.cells.values())
     if figures:
-        write_figures(rows, "DATA", [real])
+        write_figures(rows, "DATA", [data])
 
 
 # ---- the synthetic flight

@@ -47,8 +47,8 @@ TABLES = {
     ),
     "failures": ("synthetic pairs", "planted grids", "starts", "difficult captures", "predicted bands"),
     "comparison": (
-        *("comparison, originals", "comparison, originals with tags", "comparison, degraded copies"),
-        "public sets, originals",
+        *("OpenDroneMap", "NDVI", "comparison, originals with tags", "drone cameras, originals"),
+        "comparison, degraded copies",
     ),
     "verification": ("reliability",),
     "paper": ("experiments, recipe fast", "experiments, recipe paper"),

@@ -230,7 +230,6 @@ def test_results_are_added_and_those_of_another_version_removed(
         "accepted": "1",
         "wrong": "0",
         "accepted within 0.5 px": "1",
-        "accepted within 1 px": "1",
         "median error, px": "0.000",
         "CPU time, s": "0.5",
     }
@@ -316,9 +315,9 @@ def test_runs_of_a_method_are_one_row_with_their_range(sets: dict[str, Any], tmp
     ]
     results = add_results(tmp_path / "results.csv", score.score_pairs(rows, sets), [])
     *_, by_set = comparison(results, {"field": {**sets["field"], "published": {}}})
-    assert (by_set.table, by_set.name, by_set.n) == ("OpenDroneMap", f"field: {VOTED}", "4 pairs")
-    assert by_set.cells["median error, px"] == "0.300 (0.100 to 1.200)"
-    assert by_set.cells["pairs beyond 1 px"] == "0 (0 to 4)"
+    assert (by_set.table, by_set.name, by_set.n) == ("OpenDroneMap", "field", "4 pairs")
+    assert by_set.cells["flight: median, px"] == "0.300 (0.100-1.200)"
+    assert by_set.cells["flight: beyond 1 px"] == "0 (0-4)"
     assert with_range(["-", "-"]) == "-"
 
 
