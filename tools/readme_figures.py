@@ -1,5 +1,5 @@
-"""Make the pictures of the pages: NDVI of a real capture before and after alignment, the capture, one of the demo, and,
-in a browser, the report of a demo flight with two damaged files.
+"""Make the pictures of the pages: NDVI of a real capture and a part of it before and after alignment, the capture, one
+of the demo, and, in a browser, the report of a demo flight with two damaged files.
 
     python tools/readme_figures.py [DEMO [FLIGHT ALIGNED]]
 
@@ -33,8 +33,10 @@ from agalign.values.capture import Band
 FIGURES = Path(__file__).resolve().parents[1] / "docs" / "figures"
 WIDTH_PX, SCREEN_PX = 880, (1000, 900)
 CAPTURE = Path("0000SET/000/IMG_0001")
-ROW_CROP, PART_PX, ENLARGED = "IMG_0009", (330, 590, 260, 220), 3
+ROW_CROP, PART_PX, ENLARGED = "IMG_0009", (338, 665, 100, 100), 3
 """Capture, the part of its stack (left, top, width, height), and the side of its pixels in the picture."""
+FALSE_COLOUR = "NIR", "Red", "Green"
+"""Bands that are shown red, green and blue."""
 _RAMP = np.array([(140, 81, 10), (223, 194, 125), (245, 245, 220), (120, 190, 90), (0, 90, 50)], float)
 """Colours of NDVI from 0 to 1."""
 
@@ -65,20 +67,44 @@ def agalign(*arguments: str | Path, code: int = 0) -> None:
 
 
 def ndvi_before_and_after(flight: Path, aligned: Path) -> Image.Image:
-    """Return NDVI of a part of the row crop: by pixels of the raw files, and of the index raster."""
+    """Return NDVI of the row crop, and a part of it in false colour and NDVI: above by raw files, below by stack and
+    index raster.
+    """
     bands = {b.name: b for c in discover(flight).captures if c.name == ROW_CROP for b in c.bands}
-    reflectances = [reflectance(bands[name]) for name in ("NIR", "Red")]
-    with rasterio.open(aligned / f"{ROW_CROP}_ndvi.tif") as raster:
-        after = raster.read(1)
     x0, y0, width, height = read_sidecar(aligned / f"{ROW_CROP}.json").output.crop
-    before = compute(INDICES["ndvi"], reflectances)[y0 : y0 + height, x0 : x0 + width]
+    before = [reflectance(bands[name])[y0 : y0 + height, x0 : x0 + width] for name in FALSE_COLOUR]
+    with rasterio.open(aligned / f"{ROW_CROP}.tif") as stack, rasterio.open(aligned / f"{ROW_CROP}_ndvi.tif") as index:
+        after = [stack.read(stack.descriptions.index(name) + 1) for name in FALSE_COLOUR]
+        ndvi_after = index.read(1)
+    limits = [np.nanpercentile(band, (1, 99)) for band in after]
+    rows = [
+        row_of_pictures("before", compute(INDICES["ndvi"], before[:2]), false_colour(before, limits)),
+        row_of_pictures("after", ndvi_after, false_colour(after, limits)),
+    ]
+    return Image.fromarray(np.vstack(rows))
+
+
+def row_of_pictures(when: str, ndvi: NDArray[np.float32], colours: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """Return NDVI of a capture, its part in false colour and in NDVI, and the scale of NDVI, side by side."""
     left, top, columns, rows = PART_PX
+    part, height_px = np.s_[top : top + rows, left : left + columns], rows * ENLARGED
+    scale = height_px / len(ndvi)
+    whole = cv2.resize(coloured(ndvi), None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+    corners = [(round(x * scale), round(y * scale)) for x, y in ((left, top), (left + columns, top + rows))]
+    cv2.rectangle(whole, *corners, (0, 0, 0), 3)
+    pictures = {f"NDVI {when} alignment": whole, "NIR, red, green": colours[part], "NDVI": coloured(ndvi[part])}
+    gap = np.full((height_px + 48, 12, 3), 255, np.uint8)
     sides = []
-    for title, values in (("NDVI before alignment", before), ("NDVI after alignment", after)):
-        part = coloured(values[top : top + rows, left : left + columns])
-        large = cv2.resize(part, None, fx=ENLARGED, fy=ENLARGED, interpolation=cv2.INTER_NEAREST)
-        sides += [with_title(large, title), np.full((large.shape[0] + 48, 16, 3), 255, np.uint8)]
-    return Image.fromarray(np.hstack([*sides, colour_bar(ENLARGED * rows)]))
+    for title, picture in pictures.items():
+        large = picture if picture is whole else picture.repeat(ENLARGED, axis=0).repeat(ENLARGED, axis=1)
+        sides += [with_title(large, title), gap]
+    return np.hstack([*sides, colour_bar(height_px)])
+
+
+def false_colour(bands: list[NDArray[np.float32]], limits: list[NDArray[np.float64]]) -> NDArray[np.uint8]:
+    """Return three bands as RGB, each from its lower limit (0) to its upper limit (255)."""
+    scaled = [(band - low) / (high - low) for band, (low, high) in zip(bands, limits, strict=True)]
+    return (np.clip(np.nan_to_num(np.dstack(scaled)), 0, 1) * 255).round().astype(np.uint8)
 
 
 def with_title(image: NDArray[np.uint8], title: str) -> NDArray[np.uint8]:
@@ -101,7 +127,7 @@ def colour_bar(height_px: int) -> NDArray[np.uint8]:
 def reflectance(band: Band) -> NDArray[np.float32]:
     """Return the reflectance of a band's raw pixels by the light sensor."""
     with rasterio.open(band.path) as raster:
-        return calibrated(raster.read(1), band.radiometry, 0, 0) * band.radiometry.by_sun[0]
+        return calibrated(raster.read(1), band.radiometry, 0, 0) * band.radiometry.by_sun.value
 
 
 def coloured(ndvi: NDArray[np.float32]) -> NDArray[np.uint8]:
