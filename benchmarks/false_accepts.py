@@ -167,7 +167,7 @@ GROUPS = {
 }
 GROUPS_OF_GRIDS = {
     "no initial alignment": ("none",),
-    "initial alignment accurate to a sixth of a period": ("good",),
+    "initial alignment off by up to a quarter of a period": ("good",),
     "initial alignment wrong by whole periods": ("bad",),
 }
 """Kinds of pairs by the rows of docs/figures/figures.csv."""
