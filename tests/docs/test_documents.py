@@ -86,6 +86,7 @@ def originals(shared: Shared, flight: Path) -> Path:
         points = geometry.lattice(240, 200, 9, 7)
         ties = np.hstack([points, geometry.apply(MOVEMENT, points)])
         np.savetxt(folder / "ties.csv", ties, delimiter=",", header="fixed_x,fixed_y,moving_x,moving_y", comments="")
+        np.savetxt(folder / "homography.txt", MOVEMENT)
         for name in ("examples", "benchmarks"):
             (folder / name).symlink_to(ROOT / name)
         if REAL_DATA.is_dir():
