@@ -291,7 +291,7 @@ def test_a_field_of_reduced_images_is_rebuilt(tmp_path: Path) -> None:
 
 def test_status_seed_and_measurements_are_rebuilt(tmp_path: Path) -> None:
     residual = residual_of(np.array([[9.0, 8.0], [50.0, 8.0]]), np.array([[0.25, -0.5], [np.nan] * 2]))
-    facts = {"issues": (Issue(RETRIEVAL, 0.1, 0.2),), "candidates": {"homography": 0.5, "field": np.inf}}
+    facts = {"issues": (Issue(RETRIEVAL, 0.1, 0.2),), "held_out_p95_px": {"homography": 0.5, "field": np.inf}}
     alignment = aligned(PixelMapping(H), FILE_PX, "seed_only", residual=residual, **facts)
     result = rebuilt(alignment, tmp_path)
     for name in ("status", "issues", "reason", "candidates"):
