@@ -294,7 +294,7 @@ def test_status_seed_and_measurements_are_rebuilt(tmp_path: Path) -> None:
     facts = {"issues": (Issue(RETRIEVAL, 0.1, 0.2),), "held_out_p95_px": {"homography": 0.5, "field": np.inf}}
     alignment = aligned(PixelMapping(H), FILE_PX, "seed_only", residual=residual, **facts)
     result = rebuilt(alignment, tmp_path)
-    for name in ("status", "issues", "reason", "candidates"):
+    for name in ("status", "issues", "reason", "held_out_p95_px"):
         assert getattr(result, name) == getattr(alignment, name)
     assert (result.seed.kind, result.seed.peak_sigma, result.seed.runner_up_sigma) == ("rig", 30.0, 5.0)
     np.testing.assert_array_equal(result.seed.fixed_to_moving, H)
