@@ -220,7 +220,7 @@ def _decoded(value: Any) -> Any:
 def mapped_px(row: Mapping[str, Any], reference_px: Points) -> Points | None:
     """Points (n, 2) of the reference in the moving file; None where the row has no mapping.
 
-    Raises ValueError for what is no mapping.
+    Raises ValueError for a file that does not contain a mapping.
     """
     if row.get("homography") is not None:
         return apply(np.array(_decoded(row["homography"]), float).reshape(3, 3), reference_px)
@@ -233,7 +233,7 @@ def mapped_px(row: Mapping[str, Any], reference_px: Points) -> Points | None:
 def errors_px(row: Mapping[str, Any], pair: Pair) -> Points | None:
     """(n,) distances from the truth, inf where a mapping says nothing; None where the row has no mapping.
 
-    Raises ValueError for what is no mapping.
+    Raises ValueError for a file that does not contain a mapping.
     """
     there = mapped_px(row, pair.reference_px)
     if there is None:

@@ -27,7 +27,7 @@ def ground() -> Image:
 
 
 def seen(ground: Image, row: float, rng: np.random.Generator) -> Image:
-    """The cells of a capture from a row of the ground on, which is no whole number."""
+    """The cells of a capture whose first row is at a fractional row of the ground."""
     top = int(row)
     between = (1 - row % 1) * ground[:, top : top + ROWS] + row % 1 * ground[:, top + 1 : top + 1 + ROWS]
     return between[:, :, :COLUMNS] * np.exp(rng.normal(0.0, 0.02, (3, ROWS, COLUMNS)))
