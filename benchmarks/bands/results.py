@@ -22,7 +22,7 @@ VOTED = "OpenDroneMap, flight"
 """One matrix per band for all captures of a flight, as OpenDroneMap uses it."""
 REPEATED = "OpenDroneMap, capture", VOTED
 """Methods whose results differ between runs."""
-RUNS = 5
+RUNS = 3
 """Of each method that is repeated: a median, and a range that hardly grows with more."""
 OF_RAW_FILES = (*WHOLE, *REPEATED)
 """Methods that are not given corrected images."""
