@@ -134,13 +134,13 @@ def _descriptor_issues(candidate: Verifiable) -> Iterator[Issue]:
 def _window_issues(candidate: Verifiable) -> Iterator[Issue]:
     """Residual shifts of windows, each without its own part in the estimation."""
     residual = candidate.windows
-    min_windows = 4  # with structure; fewer cannot cover all corners of the image
-    if len(residual.centres_px) < min_windows:
-        yield Issue(FEW_WINDOWS, len(residual.centres_px), min_windows)
+    measured, min_windows = len(residual.measured_px), 5  # some homography fits the two coordinates of any four
+    is_covered = residual.coverage >= MIN_COMMON_COVERAGE
+    if measured < min_windows and (is_covered or len(residual.centres_px) < min_windows):
+        yield Issue(FEW_WINDOWS, measured, min_windows)
         return
-    if not residual.coverage >= MIN_COMMON_COVERAGE:
+    if not is_covered:
         yield Issue(COVERAGE, residual.coverage, MIN_COMMON_COVERAGE)
-    measured = len(residual.measured_px)
     count = max(measured, 1)
     is_far = is_misaligned(residual, candidate.file_pixel_size_px)
     close = 1 - float(is_far.sum()) / count

@@ -115,7 +115,8 @@ def shifted(count_off: int, off_px: float, total: int = 100) -> Residual:
     ("within", "beyond", "code", "value", "limit"),
     [
         (measured_in(0.3), measured_in(0.29), "coverage", 0.29, 0.3),
-        (shifted(0, 0.0, 4), shifted(0, 0.0, 3), "few_windows", 3, 4),
+        (shifted(0, 0.0, 5), shifted(0, 0.0, 4), "few_windows", 4, 5),
+        (shifted(1, NAN, 6), shifted(1, NAN, 5), "few_windows", 4, 5),
         (shifted(10, 1.5), shifted(11, 1.5), "close_windows", 0.89, 0.9),
         (shifted(11, 1.0), shifted(11, 1.04), "close_windows", 0.89, 0.9),
         (joint_result(retrieval=0.2), joint_result(retrieval=0.19), "retrieval", 0.19, 0.2),
