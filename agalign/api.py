@@ -19,8 +19,8 @@ from agalign.batch.run import Listener, run_flight
 from agalign.cameras.discover import FolderScan, discover, mosaics_onto
 from agalign.capture.align_bands import align_pairs
 from agalign.capture.band_pair import BandPair, SeedMatrices
+from agalign.capture.metrics import with_metrics
 from agalign.capture.reference import Reference
-from agalign.capture.warped_pair import with_metrics
 from agalign.config import DiscoverOptions, RunOptions, Settings
 from agalign.errors import InputError
 from agalign.exports.programs import ExportReport

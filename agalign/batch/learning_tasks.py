@@ -24,7 +24,7 @@ from agalign.method.refine import FLIGHT_PATCHES
 from agalign.method.state import ImageGroup, JointState
 from agalign.pixels.capture_pixels import CapturePixels
 from agalign.pixels.raster import with_missing_parts, with_saturation_values
-from agalign.values.alignment import MIN_RETRIEVAL, RefinedPair, Seed
+from agalign.values.alignment import MIN_RETRIEVAL, JointResult, Seed
 from agalign.values.capture import Capture
 from agalign.values.geometry import Matrix, PairScales
 from agalign.values.residual import Residual
@@ -52,6 +52,16 @@ def portable(model: FlightModel) -> FlightModel:
 
 def _on_device(model: FlightModel, settings: Settings) -> FlightModel:
     return replace(model, net=model.net.to(choose_device(settings.joint.device)))
+
+
+@dataclass(frozen=True)
+class RefinedPair:
+    """The seed of a pair and its mapping refined by a flight's network, from the images of this pair alone."""
+
+    seed: Seed
+    result: JointResult
+    sizes_px: tuple[tuple[int, int], tuple[int, int]]
+    """(width, height) of the fixed and the moving image."""
 
 
 @dataclass(frozen=True)

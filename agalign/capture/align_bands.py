@@ -14,8 +14,8 @@ from agalign.capture.candidate import BandCandidates, RefinedBand
 from agalign.capture.decision import decide
 from agalign.capture.full_resolution import at_full_resolution
 from agalign.capture.map_estimate import map_estimate
+from agalign.capture.metrics import with_metrics
 from agalign.capture.seeding import SeededPair, corrected, find_seed, image_groups
-from agalign.capture.warped_pair import with_metrics
 from agalign.config import SeedSettings, Settings
 from agalign.flight.model import FlightModel
 from agalign.method.device import one_thread
@@ -24,7 +24,7 @@ from agalign.method.refine import FLIGHT_PATCHES, PATCHES
 from agalign.method.state import ImageGroup, Progress
 from agalign.pixels.raster import ReadTile
 from agalign.values import geometry
-from agalign.values.alignment import Alignment, Alignments, JointResult, Seed
+from agalign.values.alignment import Alignment, Alignments, JointResult, Seed, relief_of
 from agalign.values.capture import Capture
 from agalign.values.issues import SEED_ASKED_FOR, Issue
 from agalign.values.mapping import PixelMapping
@@ -53,8 +53,8 @@ def align_capture_bands(
     pairs, unusable = read_pairs(capture, settings.seed, model, read)
     aligned = align_pairs(pairs, settings, progress, model, capture)
     between_files = {pair.name: aligned[pair.name].in_file_px(pair.scales, size_px) for pair in pairs}
-    reliefs = (a.mapping.parallax.relief for a in between_files.values() if a.mapping.parallax is not None)
-    relief = next((relief.on_pixels(size_px) for relief in reliefs), None)  # the same in all bands
+    relief = relief_of(between_files)
+    relief = None if relief is None else relief.on_pixels(size_px)
     result: dict[str, Alignment] = {}
     for pair in pairs:
         progress(pair.name, "measuring", 0.0)

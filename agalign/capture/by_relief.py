@@ -44,13 +44,13 @@ from agalign.fit.window_fit import (
     parallax_of,
 )
 from agalign.pixels.band_resampling import channel_mean
-from agalign.values.alignment import JointResult
+from agalign.values.alignment import BY_WINDOWS, JointResult
 from agalign.values.choices import Geometry, ReliefUse
 from agalign.values.image import FloatImage
 from agalign.values.mapping import PixelMapping
 from agalign.values.parallax import RELIEF_STEP, Parallax, Relief
 from agalign.values.residual import Residual
-from agalign.verify.checks import BY_PARALLAX, BY_WINDOWS, MAX_ALIAS_PEAK, MAX_SHIFT_PX
+from agalign.verify.checks import BY_PARALLAX, MAX_ALIAS_PEAK, MAX_SHIFT_PX
 
 _MIN_OBSERVED_SHARE = 0.75
 """Minimum share of aligned windows for an observation of a rig, which contains no depth edges: 0.79 or more in scenes
@@ -360,7 +360,8 @@ def _gain_px(bands: Sequence[_Band], result: Mapping[str, Candidate]) -> float:
     gains = []
     for band in bands:
         candidate, plane = result.get(band.name), band.by_homography
-        is_fitted = candidate is not None and (not candidate.issues or plane.p95_px > MAX_SHIFT_PX)
+        max_shift_px = MAX_SHIFT_PX * band.refined.pair.file_pixel_size_px
+        is_fitted = candidate is not None and (not candidate.issues or plane.p95_px > max_shift_px)
         known = candidate.windows if candidate is not None and is_fitted else None
         gains.append(-math.inf if known is None else _decrease_px(plane, known))
     return median_high(gains)

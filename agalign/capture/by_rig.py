@@ -182,8 +182,8 @@ def bands_to_learn(pairs: Sequence[BandPair], result: Alignments, rig: Rig, capt
         if alignment is None or pair.name not in rig.mean or not pair.has_rig_pixels:
             return False
         joint = alignment.joint
-        is_retrieved = joint is not None and joint.retrieval >= MIN_TIMES_CHANCE * joint.chance
-        has_common_structure = alignment.seed.trusted or is_retrieved
+        is_above_chance = joint is not None and joint.retrieval >= MIN_TIMES_CHANCE * joint.chance
+        has_common_structure = alignment.seed.trusted or is_above_chance
         prediction = predict_band(rig, pair.name, known)
         if not has_relief:
             prediction = _with_added_error(prediction, rig.parallax_px.get(pair.name, 0.0))

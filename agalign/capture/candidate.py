@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from agalign.capture.band_pair import BandPair
 from agalign.capture.warped_pair import WarpedPair
-from agalign.values.alignment import JointResult, Seed
+from agalign.values.alignment import BY_WINDOWS, JointResult, Seed
 from agalign.values.choices import Geometry
 from agalign.values.geometry import Matrix, Points
 from agalign.values.image import Raster, Tile
@@ -19,7 +19,7 @@ from agalign.values.issues import SEED_ASKED_FOR, UNREADABLE, Issue, IssueKind
 from agalign.values.mapping import PixelMapping
 from agalign.values.mapping_error import ErrorOnGrid, MappingError
 from agalign.values.residual import Residual
-from agalign.verify.checks import BY_WINDOWS, PREDICTED_WITH, issues_of, seed_fits
+from agalign.verify.checks import PREDICTED_WITH, issues_of, seed_fits
 from agalign.verify.coverage import pixels_in_frame, points_in_frame
 
 Estimator = Literal["descriptors", "field", "relief", "windows", "lens shapes", "full resolution", "rig"]

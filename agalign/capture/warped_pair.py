@@ -9,14 +9,12 @@ from agalign.fit.windows import FixedWindows, held_out_residual, residual_under
 from agalign.pixels.band_resampling import shrink
 from agalign.pixels.structure import structure_field, windowed_spectra
 from agalign.values import geometry
-from agalign.values.alignment import Alignment
 from agalign.values.geometry import Matrix, Points
 from agalign.values.image import Raster
 from agalign.values.mapping import PixelMapping
 from agalign.values.residual import Residual
 from agalign.verify.checks import AliasPeak, alias_peak
 from agalign.verify.coverage import points_in_frame, unobserved_quarters
-from agalign.verify.moved import moved_areas
 
 
 @dataclass(frozen=True)
@@ -102,34 +100,3 @@ class WarpedPair:
         if self.pair.is_georeferenced:
             return self.windows.visible_px(self.warped)
         return points_in_frame(self.mapping, *self.pair.sizes_px)
-
-
-def with_metrics(alignment: Alignment, pair: BandPair) -> Alignment:
-    """Return an alignment between the files with similarity metrics of the images before (borders overlaid) and after
-    alignment, and with the areas that moved in its error.
-    """
-    similarity = pair.reference.similarity
-    before = pair.warped_moving(PixelMapping(geometry.overlay(pair.fixed.size_px, pair.moving_image.size_px)))
-    mapping = alignment.mapping.rescaled(pair.scales.fixed, pair.scales.moving)
-    mapping.hold_positions(pair.fixed.size_px)
-    after = pair.warped_moving(mapping)
-    measured = replace(alignment, before=similarity.to(before), after=similarity.to(after))
-    return _with_moved_areas(measured, pair, after)
-
-
-def _with_moved_areas(alignment: Alignment, pair: BandPair, warped: Raster) -> Alignment:
-    """Return an alignment between the files with the areas that moved in its error; `warped` is the moving image under
-    its mapping.
-
-    They contradict a mapping that the rest of the image confirms: that of an aligned band.
-    """
-    if alignment.status != "aligned" or alignment.error is None or alignment.residual is None:
-        return alignment
-    both = pair.reference.grey.valid & warped.valid
-    whole = replace(warped, valid=np.ones_like(warped.valid))  # a third faster; invalid pixels are not used
-    areas = moved_areas(pair.reference.structure, structure_field(whole), both)
-    in_file_px = [area.rescaled(pair.scales.fixed.inverse) for area in areas]
-    # Shifts of the size of those elsewhere are errors of the mapping. The expected error contains windows in the areas.
-    min_ratio = 4.0
-    moved = tuple(area for area in in_file_px if area.length_px >= min_ratio * alignment.residual.median_px)
-    return replace(alignment, error=replace(alignment.error, moved=moved)) if moved else alignment

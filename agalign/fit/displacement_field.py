@@ -16,7 +16,7 @@ from scipy.sparse import diags, identity, kron, vstack
 from scipy.spatial import cKDTree
 
 from agalign.fit.window_fit import NODE_STEP_PX
-from agalign.fit.windows import FixedWindows, Shifts, in_standard_errors
+from agalign.fit.windows import FixedWindows, Shifts
 from agalign.pixels.band_resampling import warped
 from agalign.pixels.structure import Field
 from agalign.values.geometry import Points
@@ -40,6 +40,8 @@ determine the field of the others."""
 _SMOOTHNESS = 0.4
 """Weight of the second differences of a field, relative to such a window: their prior has a standard deviation of
 _NOISE_PX / sqrt(_SMOOTHNESS) = 0.19 px. With 2, errors at ties are a sixth larger on three scenes."""
+_MAX_P95_GROWTH = 1.05
+"""Maximum ratio of the p95 of held-out windows with a field to that without it, as the p95 is noisy."""
 _FOLDS = 4
 """Every fourth window along both axes is a fold. Without the windows that overlap it, most windows remain."""
 
@@ -89,8 +91,7 @@ class DisplacementEstimator:
                 break
         assert field is not None
         held_out, before_p95_px = self._held_out(moving, mapping, field, total)
-        max_p95_growth = 1.05  # the p95 of held-out windows is noisy
-        is_used = _is_one_to_one(field, self.size_px) and held_out.p95_px <= max_p95_growth * before_p95_px
+        is_used = _is_one_to_one(field, self.size_px) and held_out.p95_px <= _MAX_P95_GROWTH * before_p95_px
         return DisplacementResult(field if is_used else None, before_p95_px, held_out.p95_px, held_out)
 
     def _measure(self, moving: Raster, mapping: PixelMapping) -> Shifts:
@@ -155,18 +156,22 @@ class _Gain(NamedTuple):
         before_p95_px, after_p95_px = (float(np.percentile(v, 95)) for v in (before_px, after_px))
         losses = _losses(after_px)
         loss = float(np.average(losses, weights=shifts.weights))
-        return cls(smoothness, before_p95_px, after_p95_px, loss, in_standard_errors(_losses(before_px) - losses))
+        return cls(smoothness, before_p95_px, after_p95_px, loss, _in_standard_errors(_losses(before_px) - losses))
 
     def is_significant(self, min_sigma: float) -> bool:
         """Return True if a field reduces the shifts significantly without a larger p95."""
-        max_p95_growth = 1.05  # the p95 of held-out windows is noisy
-        return self.sigma >= min_sigma and self.after_p95_px <= max_p95_growth * self.before_p95_px
+        return self.sigma >= min_sigma and self.after_p95_px <= _MAX_P95_GROWTH * self.before_p95_px
 
 
 def _losses(lengths_px: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return log(1 + (length / 0.1 px)^2), which is robust to wrong peaks and depth edges."""
     scale_px = 0.1  # several times the noise of a shift
     return np.asarray(np.log1p((lengths_px / scale_px) ** 2))
+
+
+def _in_standard_errors(decreases: NDArray[np.float64]) -> float:
+    """Return the mean of decreases (n,) relative to its standard error."""
+    return float(decreases.mean() / max(decreases.std() / math.sqrt(len(decreases)), 1e-12))
 
 
 def _near(centres_px: Points, others_px: Points, distance_px: float) -> NDArray[np.bool_]:

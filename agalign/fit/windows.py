@@ -217,11 +217,6 @@ def peak_weights(peaks_sigma: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.minimum((peaks_sigma / np.median(positive)) ** 4, max_weight) if positive.size else peaks_sigma
 
 
-def in_standard_errors(decreases: NDArray[np.float64]) -> float:
-    """Return the mean of decreases (n,) relative to its standard error."""
-    return float(decreases.mean() / max(decreases.std() / math.sqrt(len(decreases)), 1e-12))
-
-
 def residual_under(residual: Residual, before: PixelMapping, after: PixelMapping) -> Residual:
     """Convert the residual of windows measured with the mapping `before` to a mapping `after` that is nearly equal.
 

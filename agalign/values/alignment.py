@@ -37,6 +37,8 @@ MIN_RETRIEVAL = 0.2
 is below 0.01; unrelated images reach 0.05."""
 MIN_TIMES_CHANCE = 5.0
 """`MIN_RETRIEVAL` as a multiple of chance, which is high where few keypoints can be drawn."""
+BY_WINDOWS = "windows"
+"""Recipe of a result that is fitted to windows; its residual contains the windows that were left out of the fit."""
 
 
 @validated.dataclass(frozen=True, config=RECORD)
@@ -159,16 +161,6 @@ class JointResult:
             corner_std_xy_px=tuple((x * up.x, y * up.y) for x, y in self.corner_std_xy_px),
             corner_covariance_px2=None if self.corner_covariance_px2 is None else self.corner_covariance_px2 * per_axis,
         )
-
-
-@dataclass(frozen=True)
-class RefinedPair:
-    """The seed of a pair and its mapping refined by a flight's network, from the images of this pair alone."""
-
-    seed: Seed
-    result: JointResult
-    sizes_px: tuple[tuple[int, int], tuple[int, int]]
-    """(width, height) of the fixed and the moving image."""
 
 
 @validated.dataclass(frozen=True, config=RECORD)

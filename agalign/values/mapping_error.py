@@ -7,6 +7,7 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -93,8 +94,7 @@ class MappingError:
         """
         z_px2 = np.zeros(len(points_px)) if self.parallax is None else self.parallax.variance_px2(points_px)
         local_px2 = np.maximum(z_px2, np.square(moved_px(self.moved, *points_px.T)))
-        modelled_px2, unmodelled_px2 = self.smooth_px2(points_px)
-        return np.asarray(np.sqrt(modelled_px2 + np.maximum(unmodelled_px2, local_px2)))
+        return _error_px(*self.smooth_px2(points_px), local_px2)
 
     def smooth_px2(self, points_px: Points) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return the parts (n,) of the square that vary smoothly: all but u, z and m, and u, at points (n, 2)."""
@@ -266,11 +266,10 @@ class ErrorOnGrid:
     def on_tile(self, tile: Tile) -> FloatImage:
         """Return the expected error (height, width) on a tile of the grid, px of the reference."""
         modelled_px2, unmodelled_px2 = (between_nodes(plane, self.size_px, tile) for plane in self.nodes_px2)
+        local_px2 = np.square(self.moved_px(tile))
         if self.error.parallax is not None:
-            unmodelled_px2 = np.maximum(unmodelled_px2, self._z_px2(self.error.parallax, tile))
-        if self.error.moved:
-            unmodelled_px2 = np.maximum(unmodelled_px2, np.square(self.moved_px(tile)))
-        return np.asarray(np.sqrt(modelled_px2 + unmodelled_px2), np.float32)
+            local_px2 = np.maximum(local_px2, self._z_px2(self.error.parallax, tile))
+        return _error_px(modelled_px2, unmodelled_px2, local_px2).astype(np.float32, copy=False)
 
     def moved_px(self, tile: Tile) -> FloatImage:
         """Return the shift (height, width) of the areas that moved on a tile of the grid, px of the reference; 0
@@ -298,6 +297,11 @@ class ErrorOnGrid:
         """Return the positions (n, 2) of the pixels of a tile in the reference, row by row."""
         x_px, y_px = (np.arange(first, first + n) for first, n in ((tile.x0, tile.width), (tile.y0, tile.height)))
         return self.to_reference(np.stack(np.meshgrid(x_px, y_px), axis=-1).reshape(-1, 2).astype(np.float64))
+
+
+def _error_px(modelled_px2: NDArray[Any], unmodelled_px2: NDArray[Any], local_px2: NDArray[Any]) -> NDArray[Any]:
+    """Return the expected error from the parts of its square: those that the mapping contains, u, and z or m."""
+    return np.asarray(np.sqrt(modelled_px2 + np.maximum(unmodelled_px2, local_px2)))
 
 
 def _scaled(covariance: NDArray[np.float64] | None, per_parameter: NDArray[np.float64]) -> NDArray[np.float64] | None:

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from agalign.pixels.structure import Field, correlation_surfaces
 from agalign.values import geometry
-from agalign.values.alignment import JointResult, Prediction
+from agalign.values.alignment import BY_WINDOWS, JointResult, Prediction
 from agalign.values.geometry import Matrix, Points
 from agalign.values.issues import (
     CLOSE_WINDOWS,
@@ -34,15 +34,14 @@ from agalign.values.mapping import PixelMapping
 from agalign.values.mapping_error import MappingError
 from agalign.values.pixel_units import SAME_PIXELS, PixelScale
 from agalign.values.residual import Residual, noise_px
-from agalign.verify.coverage import MIN_COMMON_COVERAGE
 
-BY_WINDOWS = "windows"
-"""Recipe of a result that is fitted to windows; its residual contains the windows that were left out of the fit."""
 MAX_UNEXPECTED_PX = 3.0
 """Distance from the prediction by the rig, px of the moving file, that is always accepted, as relief may cause it."""
 MAX_ALIAS_PEAK = 0.75
 """Ratio of the heights of the next correlation peak and that of the result, above which the scene is repetitive."""
 
+_MIN_COMMON_COVERAGE = 0.3
+"""Minimum share of the windows with a measured shift; in a band of noise, a tenth has one by chance."""
 _MAX_ERROR_PX, _MIN_ACCURATE_SHARE = 0.5, 0.9
 """`aligned` means an expected error of at most this in this share of the common area; under a relief, at this share of
 the windows. If the RMS error is 0.5 px, 2 % of the pixels are off by more than 1 px."""
@@ -135,12 +134,12 @@ def _window_issues(candidate: Verifiable) -> Iterator[Issue]:
     """Residual shifts of windows, each without its own part in the estimation."""
     residual = candidate.windows
     measured, min_windows = len(residual.measured_px), 5  # some homography fits the two coordinates of any four
-    is_covered = residual.coverage >= MIN_COMMON_COVERAGE
+    is_covered = residual.coverage >= _MIN_COMMON_COVERAGE
     if measured < min_windows and (is_covered or len(residual.centres_px) < min_windows):
         yield Issue(FEW_WINDOWS, measured, min_windows)
         return
     if not is_covered:
-        yield Issue(COVERAGE, residual.coverage, MIN_COMMON_COVERAGE)
+        yield Issue(COVERAGE, residual.coverage, _MIN_COMMON_COVERAGE)
     count = max(measured, 1)
     is_far = is_misaligned(residual, candidate.file_pixel_size_px)
     close = 1 - float(is_far.sum()) / count
@@ -287,7 +286,7 @@ def seed_fits(residual: Residual) -> bool:
     """Return True if the residual of a seed is small enough for the status `seed_only`."""
     # Rig tags have errors of a few px (docs/reference/cameras.md).
     max_median_px = 8.0
-    return residual.coverage >= MIN_COMMON_COVERAGE and residual.median_px <= max_median_px
+    return residual.coverage >= _MIN_COMMON_COVERAGE and residual.median_px <= max_median_px
 
 
 def is_unchanged(joint: JointResult, given: Matrix, size_px: tuple[int, int], scale: float = 1.0) -> bool:

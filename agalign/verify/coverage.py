@@ -12,8 +12,6 @@ from agalign.values.pixel_units import Size
 from agalign.values.resampling import between_nodes, nodes_along
 from agalign.values.residual import Residual
 
-MIN_COMMON_COVERAGE = 0.3
-"""Minimum share of the windows with a measured shift; in a band of noise, a tenth has one by chance."""
 _LATTICE = 24, 18
 """Columns and rows of the points of an image at which its coverage and the lens distortion are evaluated."""
 

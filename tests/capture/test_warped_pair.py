@@ -6,14 +6,11 @@ import numpy as np
 import pytest
 
 from agalign.capture.band_pair import BandPair
-from agalign.capture.warped_pair import WarpedPair, with_metrics
+from agalign.capture.warped_pair import WarpedPair
 from agalign.values import geometry
-from agalign.values.alignment import Alignment, Prediction, Seed
 from agalign.values.image import Raster
-from agalign.values.issues import CLOSE_WINDOWS, Issue
-from agalign.values.mapping_error import MappingError
 
-from ..builders import pair_of, residual_of, texture, two_views
+from ..builders import pair_of, residual_of, two_views
 
 TRUTH = geometry.translation(6, -4)
 
@@ -32,28 +29,6 @@ def test_a_converted_residual_equals_a_new_measurement(pair: BandPair) -> None:
     assert near.residual.median_px == pytest.approx(again.residual.median_px, abs=0.04)
     far = pair.mapping(geometry.translation(9, -4))
     assert warped_pair.with_mapping(far).warped is not warped_pair.warped
-
-
-def test_what_moved_is_in_the_error_of_an_aligned_band_and_changes_nothing_else() -> None:
-    fixed, moving = two_views(TRUTH, 640, 480)
-    body = texture(100, 100, seed=9).pixels
-    for image, x, y in ((fixed, 300, 200), (moving, 315, 196)):  # 9 px beyond the mapping
-        image.pixels[y : y + 100, x : x + 100] = body
-    pair = pair_of(fixed, moving)
-    seed, error = Seed("rig", TRUTH, 30.0), MappingError((640, 480), rig_std_px=0.1)
-    residual = residual_of(np.zeros((10, 2)), (0.1, 0.0))
-    aligned = Alignment(pair.mapping(TRUTH), (640, 480), (), seed, residual=residual, error=error, std_px=0.1)
-    measured = with_metrics(aligned, pair)
-    assert measured.error is not None
-    (area,) = measured.error.moved
-    np.testing.assert_allclose(area.shift_px, (9, 0), atol=0.3)
-    assert (measured.status, measured.std_px, measured.mapping) == ("aligned", 0.1, aligned.mapping)
-    assert measured.error_px([[350, 250], [100, 100]]) == pytest.approx([9, 0.1], abs=0.3)
-    prediction = Prediction(TRUTH, "windows", 0.4)
-    predicted = replace(aligned, issues=(Issue(CLOSE_WINDOWS, 0.8, 0.9),), prediction=prediction)
-    assert with_metrics(predicted, pair).error == error
-    uncertain = replace(aligned, residual=residual_of(np.zeros((10, 2)), (2.5, 0.0)))  # 9 px may be an error like these
-    assert with_metrics(uncertain, pair).error == error
 
 
 def test_of_two_mappings_the_better_has_smaller_shifts_in_more_of_the_same_windows(pair: BandPair) -> None:

@@ -28,7 +28,7 @@ from agalign.report.summary_csv import SUMMARY_COLUMNS
 from agalign.spectral_indices.indices_csv import INDICES_FILE, update_table
 from agalign.spectral_indices.rasters import IndexReport
 from agalign.values.alignment import MIN_RETRIEVAL, MIN_TIMES_CHANCE
-from agalign.verify import checks, coverage
+from agalign.verify import checks
 
 from ..program import agalign_here
 from .blocks import PAGES, ROOT, each_page, text_of
@@ -159,7 +159,7 @@ LIMITS = {
         f"| at least {MIN_RETRIEVAL:g}, and {MIN_TIMES_CHANCE:g} times chance |",
         f"at most {checks._MAX_ERROR_PX:g} px in {checks._MIN_ACCURATE_SHARE:.0%} of the common area",
         f"Their side is at most {windows._WINDOW_PX} px, and {windows.LARGE_WINDOW_PX} px in blurred images",
-        f"| at least {coverage.MIN_COMMON_COVERAGE:.0%} |",
+        f"| at least {checks._MIN_COMMON_COVERAGE:.0%} |",
         f"| at least {checks._MIN_CLOSE_SHARE:.0%} |",
         f"| fewer than {checks._MIN_CLUSTER}, or fewer than {checks._MAX_CLUSTER_SHARE:.0%} of the windows |",
         f"| at most {checks.MAX_ALIAS_PEAK:.0%} of the first",
