@@ -328,12 +328,11 @@ class _Estimate:
 
         Empty if the checks find issues, and the windows are few, half of them are not aligned, or the scene repeats.
         """
-        pair = band.refined.pair
         mapping = band.mapping(self.relief, with_occlusions=True)
         candidate = band.candidate(mapping, held_out)
         windows = candidate.windows
         is_known = len(windows.measured_px) >= MIN_WINDOWS
-        is_known &= windows.median_px <= MAX_SHIFT_PX * pair.file_pixel_size_px
+        is_known &= windows.median_px <= MAX_SHIFT_PX * candidate.file_pixel_size_px
         if not candidate.issues or (is_known and held_out.alias_peak().ratio <= MAX_ALIAS_PEAK):
             return {band.name: candidate}
         return {}
@@ -360,10 +359,10 @@ def _gain_px(bands: Sequence[_Band], result: Mapping[str, Candidate]) -> float:
     gains = []
     for band in bands:
         candidate, plane = result.get(band.name), band.by_homography
-        max_shift_px = MAX_SHIFT_PX * band.refined.pair.file_pixel_size_px
-        is_fitted = candidate is not None and (not candidate.issues or plane.p95_px > max_shift_px)
-        known = candidate.windows if candidate is not None and is_fitted else None
-        gains.append(-math.inf if known is None else _decrease_px(plane, known))
+        if candidate is None or (candidate.issues and plane.p95_px <= MAX_SHIFT_PX * candidate.file_pixel_size_px):
+            gains.append(-math.inf)
+        else:
+            gains.append(_decrease_px(plane, candidate.windows))
     return median_high(gains)
 
 

@@ -519,7 +519,8 @@ def test_a_relief_may_not_be_worse_than_its_plane(
     shifts = (np.array([[median, 0.0]] * 19 + [[p95, 0.0]] * 2) for median, p95 in (plane_px, relief_px))
     plane, relief = (residual_of(np.zeros((21, 2)), one) for one in shifts)
     bands = [SimpleNamespace(name=name, by_homography=plane) for name in ("Blue", "Red", "NIR")]
-    aligned, predicted = (SimpleNamespace(issues=issues, windows=relief) for issues in ((), (Issue(RETRIEVAL),)))
+    aligned = SimpleNamespace(issues=(), windows=relief, file_pixel_size_px=1.0)
+    predicted = SimpleNamespace(**vars(aligned) | {"issues": (Issue(RETRIEVAL),)})
     assert (_gain_px(bands[:1], {"Blue": aligned}) >= 0) == is_chosen
     assert (_gain_px(bands, {"Blue": aligned, "Red": aligned}) >= 0) == is_chosen
     assert _gain_px(bands, {"Blue": aligned}) == -np.inf
