@@ -66,8 +66,8 @@ def decided(pair: BandPair, seed: Seed, candidates: Iterable[Candidate] = (), is
 
 def estimation_of(band: BandCandidates, refined: RefinedBand | None = None) -> CaptureEstimation:
     """The estimation of a capture with one moving band, without model."""
-    known = {} if refined is None else {band.pair.name: refined}
-    return CaptureEstimation(Settings(), None, quiet, bands={band.pair.name: band}, refined=known)
+    band.refined = refined or band.refined
+    return CaptureEstimation(Settings(), None, quiet, bands={band.pair.name: band})
 
 
 def fitted_to_windows(band: BandCandidates, refined: RefinedBand | None = None) -> Alignment:

@@ -86,9 +86,9 @@ class LearningCapture:
         residuals = {b: a.residual for b, a in in_file_px.items() if a.status == "aligned" and a.residual is not None}
         observation = observed(pairs, result, capture)
         refined = {
-            name: RefinedPair(b.seed, b.joint, b.pair.sizes_px)
-            for name, b in estimation.refined.items()
-            if b.issue is None
+            b.pair.name: RefinedPair(b.seed, b.joint, b.pair.sizes_px)
+            for b in estimation.refined
+            if estimation.bands[b.pair.name].issue is None
         }
         return cls(capture, refined, residuals, observation, is_aligned=len(residuals) == len(pairs))
 

@@ -128,8 +128,6 @@ class CaptureEstimation:
     """What was found, by band."""
     reliefs: list[ReliefCandidates] = field(default_factory=list)
     """What was found under the reliefs of the capture."""
-    refined: dict[str, RefinedBand] = field(default_factory=dict)
-    """Results of the last optimisation by band, before they are combined with those of other bands and the rig."""
 
     def align(self, pairs: Sequence[BandPair], capture: Capture | None, *, scratch: bool = True) -> Alignments:
         """Take all steps; return the alignments.
@@ -193,7 +191,7 @@ class CaptureEstimation:
     def _learn(self, starts: Sequence[SeededPair], capture: Capture | None, *, scratch: bool) -> None:
         """Align pairs with networks that are learned from scratch."""
         result = self.decided()
-        done = {name for name in self.refined if not scratch or result[name].is_usable(DELIVERED_STD_PX)}
+        done = {b.pair.name for b in self.refined if not scratch or result[b.pair.name].is_usable(DELIVERED_STD_PX)}
         remaining = [s for s in starts if s[0].name not in done]
         rig = None if self.model is None else self.model.rig
         if remaining and capture is not None and rig is not None:
@@ -222,7 +220,7 @@ class CaptureEstimation:
         """Add the relief that homographies lack to their errors, where no window is near."""
         if not self._may_be_homography:
             return
-        known = {name: r.joint.fixed_to_moving for name, r in self.refined.items() if is_retrieved(r.joint)}
+        known = {b.pair.name: b.joint.fixed_to_moving for b in self.refined if b.joint.is_retrieved}
         spreads_px = spreads_of_relief_px([band.pair for band in self.bands.values()], known)
         for name, band in self.bands.items():
             if band.candidates and not band.accepted and is_extrapolated(band.candidates[-1]):
@@ -268,7 +266,7 @@ class CaptureEstimation:
         for (pair, seed), result in zip(starts, results, strict=True):
             found = self.bands.setdefault(pair.name, BandCandidates(pair, seed))
             found.issue = result if isinstance(result, Issue) else None
-            self.refined[pair.name] = RefinedBand.of(pair, seed, result)
+            found.refined = RefinedBand.of(pair, seed, result)
         use = self.settings.relief.use if self._may_be_homography else "never"
         bands = self._combined()
         self.progress(starts[0][0].name if starts else "", "relief", 0.0)
@@ -277,11 +275,12 @@ class CaptureEstimation:
         fitting = [set(relief.candidates) for relief in reliefs if relief.fits_better]
         under = set.intersection(*fitting) if fitting else set()  # whichever of them is chosen
         new = {pair.name for pair, _ in starts}
-        for band in (b for b in bands if b.pair.name in new and b.pair.name not in under and b.issue is None):
+        for band in bands:
             name = band.pair.name
-            self.progress(name, "checking", 0.0)
-            field_use = "never" if self.is_observation or name in along_a_line else use
-            self.bands[name].candidates += by_descriptors(band, field_use)
+            if name in new - under and self.bands[name].issue is None:
+                self.progress(name, "checking", 0.0)
+                field_use = "never" if self.is_observation or name in along_a_line else use
+                self.bands[name].candidates += by_descriptors(band, field_use)
 
     def _combined(self) -> list[RefinedBand]:
         """Return the refined bands after the MAP estimation of all bands of the capture, with all windows and with each
@@ -289,9 +288,9 @@ class CaptureEstimation:
         """
         bands = self.refined
         if not self._may_be_homography:  # as the MAP estimate is
-            return list(bands.values())
-        pairs, joint = [b.pair for b in bands.values()], {name: b.joint for name, b in bands.items()}
-        residuals = {name: b.warped.residual for name, b in bands.items()}
+            return bands
+        pairs, joint = [b.pair for b in bands], {b.pair.name: b.joint for b in bands}
+        residuals = {b.pair.name: b.warped.residual for b in bands}
         halves = (
             {name: r.chessboard_half(even=is_even_cell) for name, r in residuals.items()}
             for is_even_cell in (True, False)
@@ -300,8 +299,13 @@ class CaptureEstimation:
         estimates, black, white = (map_estimate(pairs, joint, some, rig) for some in (residuals, *halves))
         return [
             replace(b, joint=estimates[n], by_halves=(black[n].fixed_to_moving, white[n].fixed_to_moving))
-            for n, b in bands.items()
+            for n, b in zip(joint, bands, strict=True)
         ]
+
+    @property
+    def refined(self) -> list[RefinedBand]:
+        """The bands that were optimised, with the last result of each."""
+        return [band.refined for band in self.bands.values() if band.refined is not None]
 
     @property
     def _may_be_homography(self) -> bool:

@@ -159,8 +159,6 @@ class RefinedBand:
     joint: JointResult
     """Without evidence of descriptors, at the seed, if the optimisation has no result."""
     warped: WarpedPair
-    issue: Issue | None = None
-    """Why the optimisation has no result."""
     by_halves: tuple[Matrix, Matrix] | None = None
     """The homographies with the black and with the white windows of a chessboard alone, beside the descriptors and the
     rig; None before the MAP estimation.
@@ -169,9 +167,8 @@ class RefinedBand:
     @classmethod
     def of(cls, pair: BandPair, seed: Seed, result: JointResult | Issue) -> "RefinedBand":
         """Measure the windows with the homography of a result."""
-        issue = result if isinstance(result, Issue) else None
         joint = result_of_windows(seed.fixed_to_moving) if isinstance(result, Issue) else result
-        return cls(pair, seed, joint, WarpedPair.of(pair, pair.mapping(joint.fixed_to_moving)), issue)
+        return cls(pair, seed, joint, WarpedPair.of(pair, pair.mapping(joint.fixed_to_moving)))
 
     def relief_fit_residual(self, mapping: PixelMapping) -> Residual:
         """Measure the windows of the fit with a mapping."""
@@ -212,6 +209,10 @@ class BandCandidates:
     """Why the last optimisation has no result, that the user asked for the seed only, or that pixels are unreadable."""
     candidates: list[Candidate] = field(default_factory=list)
     """Without those under a relief, in the order in which they were made."""
+    refined: RefinedBand | None = None
+    """The last result of the optimisation, before it is combined with those of other bands and the rig; None before any
+    optimisation.
+    """
 
     @cached_property
     def start(self) -> Seed:

@@ -124,7 +124,7 @@ def aligned_by_relief(
 
 def unaligned(bands: Sequence[RefinedBand]) -> list[BandCandidates]:
     """The bands without other candidates than those under a relief."""
-    return [BandCandidates(band.pair, band.seed, band.issue or Issue(RETRIEVAL, 0.0, 0.2)) for band in bands]
+    return [BandCandidates(band.pair, band.seed, Issue(RETRIEVAL, 0.0, 0.2)) for band in bands]
 
 
 def without_layout(candidates: Sequence[RefinedBand]) -> list[RefinedBand]:
@@ -244,7 +244,7 @@ def verified_together(bands: Sequence[RefinedBand], settings: Settings) -> dict[
 
 def add(estimation: CaptureEstimation, bands: Sequence[RefinedBand]) -> None:
     """Add the results of bands to those of a capture."""
-    estimation.add([(b.pair, b.seed) for b in bands], [b.issue or b.joint for b in bands])
+    estimation.add([(b.pair, b.seed) for b in bands], [b.joint for b in bands])
 
 
 @pytest.mark.full
