@@ -17,11 +17,11 @@ from concurrent.futures import (
 )
 from contextlib import ExitStack, contextmanager
 from functools import partial
-from importlib import import_module
 from itertools import islice
 from typing import Any, Protocol, TypeAlias
 
 from agalign._version import __version__
+from agalign.batch.preload import preload_libraries
 from agalign.errors import AgalignError, ConfigurationError, WorkerError
 from agalign.host.process_pool import A, ProcessPool, R, WorkerDiedError
 from agalign.host.processes import (
@@ -261,7 +261,7 @@ def dask_executor(address: str, jobs: int = 0) -> Iterator[Executor]:
         _check_versions(stack.enter_context(client))
         # Workers import their libraries while this process learns the flight.
         for worker in client.ncores():
-            fire_and_forget(client.submit(import_module, WORKER_MODULE, workers=[worker], pure=False))
+            fire_and_forget(client.submit(preload_libraries, workers=[worker], pure=False))
         yield DaskExecutor(client)
 
 

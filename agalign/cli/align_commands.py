@@ -3,12 +3,12 @@
 import threading
 from contextlib import suppress
 from functools import partial
-from importlib import import_module
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
+from agalign.batch.preload import preload_libraries
 from agalign.cli.command import Command, Given, load_config
 from agalign.cli.terminal import RAW_NUMBERS, Terminal, command_line
 from agalign.host.processes import usable_cores
@@ -75,7 +75,7 @@ def load_ahead() -> None:
 
     def load() -> None:
         with suppress(Exception):  # reported at the next import
-            import_module("agalign.batch.preload")
+            preload_libraries()
 
     threading.Thread(target=load, daemon=True).start()
 

@@ -187,8 +187,8 @@ def without_interrupt_key() -> Iterator[None]:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
-WORKER_MODULE = "agalign.batch.preload"
-"""Module that imports all that the workers of a run need."""
+WORKER_MODULE = "agalign.batch.fork_server"
+"""Module whose import imports all that the workers of a run need."""
 
 
 def worker_context(preload: str) -> BaseContext:

@@ -72,7 +72,7 @@ def test_what_libraries_raise_when_memory_is_short(text: str) -> None:
 
 
 @pytest.mark.skipif(find_spec("boto3") is None, reason="boto3 is not installed")
-@pytest.mark.parametrize("module", ["agalign.batch.preload", "agalign.cli.main"])
+@pytest.mark.parametrize("module", ["agalign.batch.fork_server", "agalign.cli.main"])
 def test_no_command_opens_a_socket(module: str) -> None:
     code = (
         "import importlib, os, socket, sys\n"
@@ -83,3 +83,15 @@ def test_no_command_opens_a_socket(module: str) -> None:
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert done.returncode == ("main" in module), done.stderr
+
+
+@pytest.mark.slow
+def test_only_the_fork_server_has_everything_after_an_import() -> None:
+    """Workers do not copy the memory pages of what it has imported."""
+    code = (
+        "import gc, sys, agalign.batch.preload\n"
+        "assert gc.get_freeze_count() == 0 and 'agalign.batch.run' not in sys.modules\n"
+        "import agalign.batch.fork_server\n"
+        "assert gc.get_freeze_count() > 100_000 and 'agalign.batch.run' in sys.modules and gc.isenabled()\n"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True)
