@@ -20,6 +20,7 @@ from agalign.batch.learning_tasks import (
     observe_rig,
     portable,
 )
+from agalign.batch.workers import Run, in_order, serially
 from agalign.capture.by_rig import DELIVERED_STD_PX
 from agalign.config import Settings
 from agalign.fit.displacement_field import common_field
@@ -29,7 +30,7 @@ from agalign.flight.learn_rig import learn_rig
 from agalign.flight.model import FlightModel
 from agalign.flight.rig import MIN_CAPTURES, Rig, median_mapping
 from agalign.flight.rig_prediction import predict_band
-from agalign.host.process_pool import A, Apply, R
+from agalign.host.process_pool import A, R
 from agalign.method.descriptor import Descriptor
 from agalign.method.device import keep_freed_memory, one_memory_error, one_thread
 from agalign.method.fast import learn
@@ -54,23 +55,19 @@ def learn_flight(
     settings: Settings,
     progress: Progress,
     start: FlightModel | None = None,
-    apply: Apply = map,
+    run: Run = serially,
     threads: int = 1,
 ) -> FlightModel | None:
     """Return a model learned from a few captures spread over the flight; None if none of them could be aligned.
 
-    `apply` processes single captures, and `threads` train the network; the result does not depend on them. `start` is
+    `run` processes single captures, and `threads` train the network; the result does not depend on them. `start` is
     an earlier model. It is returned if it still aligns captures of this flight as its rig predicts. Otherwise its
     network initialises theta; weights of bands that it lacks start from those of its last band.
     """
     keep_freed_memory()
     captures = [capture.with_absolute_paths() for capture in captures]
 
-    def apply_in_one_thread(function: Callable[[A], R], arguments: Sequence[A]) -> Iterator[R]:
-        task = partial(in_one_thread, function)
-        return apply(task, arguments)
-
-    learned = _FlightLearner(captures, settings, progress, start, apply_in_one_thread, threads).learned()
+    learned = _FlightLearner(captures, settings, progress, start, run, threads).learned()
     if learned is None:
         return None
     times = sorted(c.known_time for c in captures if c.known_time)
@@ -90,7 +87,7 @@ class _FlightLearner:
     settings: Settings
     progress: Progress
     start: FlightModel | None
-    apply: Apply
+    run: Run
     threads: int
 
     def learned(self) -> FlightModel | None:
@@ -129,6 +126,10 @@ class _FlightLearner:
             return model
         return replace(model, rig=rig, mappings={**medians, **rig.mean})
 
+    def _apply(self, function: Callable[[A], R], arguments: Sequence[A]) -> Iterator[R]:
+        """Call a function with each argument, and yield the results in order."""
+        return in_order(self.run, partial(in_one_thread, function), arguments)
+
     @property
     def _bands(self) -> tuple[str, ...]:
         return flight_lenses(self.captures)
@@ -150,7 +151,7 @@ class _FlightLearner:
         if model.rig is None or not set(self._bands) <= set(model.bands):
             return False
         some = [self.captures[k] for k in dict.fromkeys(len(self.captures) * third // 3 for third in (1, 2))]
-        tests = list(filter(None, self.apply(partial(observe_rig, portable(model), self.settings), some)))
+        tests = list(filter(None, self._apply(partial(observe_rig, portable(model), self.settings), some)))
         known = [(band, one.observation) for one in tests for band in one.residuals]
         is_accurate = all(predict_band(model.rig, band, o).std_px <= DELIVERED_STD_PX for band, o in known)
         return len(tests) == len(some) and 2 * len(known) >= len(some) * len(self._bands) and is_accurate
@@ -165,7 +166,7 @@ class _FlightLearner:
         start = None if self.start is None else portable(self.start)
         task = partial(choose_and_refine, self._bands, self.settings, start)
         refined = []
-        for one in self.apply(task, [*stretches, *others]):
+        for one in self._apply(task, [*stretches, *others]):
             refined.append(one)
             self.progress("the network", len(refined) / (len(stretches) + len(others)))
         chosen = [one for one in refined[: len(stretches)] if one is not None]
@@ -210,7 +211,7 @@ class _FlightLearner:
         task = partial(observe_rig, portable(model), self.settings)
         while waiting and (missing := count - _min_observations(result.values())) > 0:
             some, waiting = waiting[:missing], waiting[missing:]
-            for one in self.apply(task, some):
+            for one in self._apply(task, some):
                 if one is not None:
                     earlier = result.get(one.capture.label, one)
                     result[one.capture.label] = max(earlier, one, key=lambda o: len(o.residuals))
@@ -219,12 +220,12 @@ class _FlightLearner:
 
     def _rig(self, observations: Sequence[LearningCapture]) -> Rig | None:
         """Return the rig, with the displacement fields of the lenses; None if the captures do not determine it."""
-        rig = learn_rig([o.observation for o in observations], self._size_px, _layout(self.captures), self.apply)
+        rig = learn_rig([o.observation for o in observations], self._size_px, _layout(self.captures), self._apply)
         if rig is None:
             return None
         residuals = {band: [o.residuals[band] for o in observations if band in o.residuals] for band in rig.mean}
         fit = partial(common_field, size_px=self._size_px)
-        fields = list(self.apply(fit, list(residuals.values())))
+        fields = list(self._apply(fit, list(residuals.values())))
         calibrated = self.captures[0].reference.lens is not None
         extrapolation_px = _extrapolation_px(rig, residuals, calibrated=calibrated)
         known = {

@@ -26,7 +26,7 @@ from agalign.batch.flight_learning import learn_flight
 from agalign.batch.output_files import refuse_to_overwrite, remove_outputs
 from agalign.batch.render import RenderOptions
 from agalign.batch.selection import Selection, select_captures
-from agalign.batch.workers import MAX_THREADS, Run, failure_text, in_order, numbers_of_workers, open_workers, serially
+from agalign.batch.workers import MAX_THREADS, Run, failure_text, numbers_of_workers, open_workers, serially
 from agalign.cameras.discover import FolderScan
 from agalign.config import RunOptions, Settings, WriteSettings
 from agalign.errors import AgalignError, ConfigurationError, InputError, OutputError, SidecarError
@@ -313,7 +313,7 @@ class _FlightRun:
         has_timeout = timeout_s is not None
         processes, threads = numbers_of_workers(plan.number, cores, has_timeout=has_timeout)
         with open_workers(self.options.executor, processes, limit_threads, threads, has_timeout=has_timeout) as run:
-            learn = partial(learn_flight, apply=partial(in_order, run), threads=min(MAX_THREADS, cores))
+            learn = partial(learn_flight, run=run, threads=min(MAX_THREADS, cores))
             tasks = []
             for capture, model, rendering in self._renderings(self._flights(plan, learn, record), plan):
                 one = plan.left[capture.label]

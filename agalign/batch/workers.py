@@ -154,7 +154,7 @@ def _submitted(executor: Executor, function: Callable[[A], R], task: A) -> "Futu
 
 
 def in_order(run: Run, function: Callable[[A], R], tasks: Sequence[A], /) -> Iterator[R]:
-    """Yield the results in the order of the tasks, as `host.process_pool.Apply`."""
+    """Yield the results in the order of the tasks, as `map` does. Raises AgalignError, and MemoryError."""
     waiting: dict[int, Callable[[], R]] = {}
     following = 0
     for number, result in run(function, tasks):

@@ -1,21 +1,24 @@
 """Estimation of a flight's rig from the mappings of some captures, with cross-validated errors."""
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
 from agalign.flight import rig
 from agalign.flight.rig import MIN_CAPTURES, CaptureFactors, Factor, Observation, Rig, capture_factors, design_tensor
-from agalign.host.process_pool import Apply
 from agalign.values.least_squares import least_squares
 
 Array = NDArray[np.float64]
 LensLayout = Mapping[str, tuple[float, float]]
 """Positions of the lenses by band, in any unit."""
 
-_FACTOR_SETS: tuple[tuple[Factor, ...], ...] = (
+Factors = tuple[Factor, ...]
+EachFactors = Callable[[Callable[[Factors], Array], Sequence[Factors]], Iterable[Array]]
+"""Calls a function with each set of factors, and returns the results in order, as `map` does."""
+
+_FACTOR_SETS: tuple[Factors, ...] = (
     (),
     ("distance",),
     ("distance", "tilt"),
@@ -29,7 +32,7 @@ _FACTOR_SETS: tuple[tuple[Factor, ...], ...] = (
 
 
 def learn_rig(
-    captures: Sequence[Observation], size_px: tuple[int, int], layout: LensLayout, apply: Apply = map
+    captures: Sequence[Observation], size_px: tuple[int, int], layout: LensLayout, apply: EachFactors = map
 ) -> Rig | None:
     """Estimate the rig from captures; None if no band has a mapping in at least MIN_CAPTURES of them.
 
@@ -79,7 +82,7 @@ class _Table:
         self.layout = _unit(known) if np.linalg.norm(known) > 0 else None
         """(bands, 2) baselines of the known lens layout, of norm 1 together; None if unknown."""
 
-    def selected_factors(self, apply: Apply) -> tuple[tuple[Factor, ...], Array]:
+    def selected_factors(self, apply: EachFactors) -> tuple[Factors, Array]:
         """Return the factors with the smallest cross-validated errors, and these errors (bands,)."""
         candidates = _FACTOR_SETS if len(self.median) > 1 else _FACTOR_SETS[:1]
         (factors, errors_px), *others = zip(candidates, apply(self.cross_validated_px, candidates), strict=True)

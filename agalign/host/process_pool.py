@@ -11,7 +11,7 @@ import signal
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable
 from concurrent.futures import Future
 from contextlib import suppress
 from dataclasses import dataclass
@@ -20,7 +20,7 @@ from itertools import islice
 from multiprocessing.connection import Connection, wait
 from multiprocessing.context import BaseContext
 from queue import SimpleQueue
-from typing import Any, Protocol, Self, TypeVar
+from typing import Any, Self, TypeVar
 
 from agalign.errors import WorkerError, is_out_of_memory
 from agalign.host.processes import WorkerExit, follow_parent, silence_libraries, without_interrupt_key
@@ -40,15 +40,6 @@ _PROCESS_LOCK = threading.Lock()
 
 A = TypeVar("A")
 R = TypeVar("R")
-
-
-class Apply(Protocol):
-    """Applies a function to each argument and yields the results in order, as `map` does in this process.
-
-    Function, arguments and results can be pickled. Raises the errors of the function, and WorkerError for lost workers.
-    """
-
-    def __call__(self, function: Callable[[A], R], arguments: Sequence[A], /) -> Iterator[R]: ...
 
 
 class WorkerDiedError(Exception):
