@@ -4,7 +4,7 @@ import time
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager, suppress
+from contextlib import AbstractContextManager, ExitStack, contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -311,11 +311,21 @@ class _FlightRun:
         on_cpu = choose_device(self.settings.joint.device).type == "cpu"
         cores = self.options.jobs or (usable_cores() if on_cpu else 1)
         has_timeout = timeout_s is not None
-        processes, threads = numbers_of_workers(plan.number, cores, has_timeout=has_timeout)
-        with open_workers(self.options.executor, processes, limit_threads, threads, has_timeout=has_timeout) as run:
+        numbers = partial(numbers_of_workers, cores=cores, has_timeout=has_timeout)
+
+        def workers(processes: int, threads: int) -> AbstractContextManager[Run]:
+            return open_workers(self.options.executor, processes, limit_threads, threads, has_timeout=has_timeout)
+
+        with ExitStack() as stack:
+            of_plan = numbers(plan.number)
+            run = stack.enter_context(workers(*of_plan))
             learn = partial(learn_flight, run=run, threads=min(MAX_THREADS, cores))
             tasks = []
-            for capture, model, rendering in self._renderings(self._flights(plan, learn, record), plan):
+            renderings = list(self._renderings(self._flights(plan, learn, record), plan))
+            if (of_tasks := numbers(plan.number)) != of_plan:  # finished captures get the crop of the new model
+                stack.close()
+                run = stack.enter_context(workers(*of_tasks))
+            for capture, model, rendering in renderings:
                 one = plan.left[capture.label]
                 if one.step in ("nothing", "keep"):
                     yield self._kept(capture, one)

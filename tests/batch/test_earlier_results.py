@@ -5,6 +5,7 @@ import json
 import re
 import shutil
 from collections.abc import Callable
+from contextlib import AbstractContextManager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -15,6 +16,7 @@ import pytest
 import agalign
 from agalign.batch.earlier_results import Remaining, is_same, remaining
 from agalign.batch.run import Listener, _crops_of_cameras, plan_run, run_flight
+from agalign.batch.workers import Run, open_workers
 from agalign.cli.align_run import RunTotals, conclude
 from agalign.cli.align_run import run as run_command
 from agalign.cli.exit_codes import ExitCode
@@ -198,11 +200,20 @@ def test_most_finished_captures_decide_on_the_crop_of_a_camera(flight: Path, tmp
     assert grid(model, first, first, first, crop="common") is None
 
 
-def test_finished_captures_get_the_crop_of_a_new_rig(flight: Path, out: Path) -> None:
-    scan, said = agalign.discover(flight), []
+def test_finished_captures_get_the_crop_of_a_new_rig(flight: Path, out: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """They are known once the rig is, and are rendered by as many workers as others."""
+    scan, said, opened = agalign.discover(flight), [], []
     (name,) = model_names(flights_of(scan.captures))
     save_known_model(out / "models" / name)
-    reports = list(run_flight(scan, out, SEEDS, listener=Listener(on_again=said.append)))
+
+    def open_counted(*arguments: Any, **options: Any) -> AbstractContextManager[Run]:
+        opened.append(arguments)
+        return open_workers(*arguments, **options)
+
+    monkeypatch.setattr("agalign.batch.run.open_workers", open_counted)
+    reports = list(run_flight(scan, out, SEEDS, agalign.RunOptions(jobs=2), Listener(on_again=said.append)))
+    processes_and_threads = [(processes, threads) for _, processes, _, threads in opened]
+    assert processes_and_threads == [(0, 0), (1, 2)]
     assert said == ["2 finished captures to be rendered again; changed since: crop of the flight"]
     assert [(r.state, r.result.output.crop) for r in reports] == [("done", reports[0].result.output.crop)] * 2
 
