@@ -152,35 +152,8 @@ REPEATS = IssueKind(
     ),
 )
 
-KINDS: Mapping[str, IssueKind] = {
-    kind.code: kind
-    for kind in (
-        UNREADABLE,
-        BLANK_REFERENCE,
-        BLANK_MOVING,
-        FEW_VALID,
-        NO_SUCH_SEED,
-        SEED_ASKED_FOR,
-        NO_CONTRAST,
-        FEW_KEYPOINTS,
-        NOT_INVERTIBLE,
-        CORNERS_UNKNOWN,
-        RETRIEVAL,
-        OTHER_GEOMETRY,
-        FOLDS,
-        FEW_WINDOWS,
-        COVERAGE,
-        CLOSE_WINDOWS,
-        CLUSTER,
-        INACCURATE,
-        UNMEASURED,
-        UNEXPECTED_PX,
-        OTHER_CONTENT,
-        REPEATS,
-        SEED_DOES_NOT_FIT,
-    )
-}
-"""Every kind of issue that a sidecar may contain, by code."""
+KINDS: Mapping[str, IssueKind] = {k.code: k for k in list(globals().values()) if isinstance(k, IssueKind)}
+"""Every kind of issue that a sidecar may contain, by code: all that are defined above."""
 
 
 def _kind_of(code: str) -> IssueKind:
