@@ -1,6 +1,17 @@
 """Exceptions of agalign. Their text is one line with the cause and the remedy."""
 
 import re
+from typing import NamedTuple
+
+
+class Reason(NamedTuple):
+    """What is wrong with a file, and what to do about it; as text, both on one line."""
+
+    what: str
+    remedy: str = ""
+
+    def __str__(self) -> str:
+        return "; ".join(filter(None, self))
 
 
 class AgalignError(Exception):
@@ -37,9 +48,17 @@ class UnreadableFileError(InputError):
     >>> try:
     ...     agalign.onto("june.tif", ["august.tif"], "august_on_june")
     ... except agalign.UnreadableFileError as error:
-    ...     print(error)
+    ...     print(error.reason.what)
     august.tif: does not exist
     """
+
+    @property
+    def reason(self) -> Reason:
+        """What is wrong with the file, and the remedy."""
+        return Reason(*self.args)
+
+    def __str__(self) -> str:
+        return str(self.reason)
 
 
 class ConfigurationError(AgalignError):

@@ -17,7 +17,7 @@ from agalign._version import __version__
 from agalign.batch.render import with_earlier_products
 from agalign.cameras.discover import FolderScan
 from agalign.config import RunOptions, Settings, SettingsModel
-from agalign.errors import ConfigurationError, SidecarError, UnreadableFileError
+from agalign.errors import ConfigurationError, Reason, SidecarError, UnreadableFileError
 from agalign.flight.fingerprint import (
     RENDER_STAGES,
     estimation_fingerprint,
@@ -78,7 +78,7 @@ class EarlierResults:
         self.states: dict[str, str] = {}
         """States in which runs left the files of each capture, by label (`records.listed_files`)."""
 
-    def __call__(self, path: Path) -> tuple[Sidecar, str]:
+    def __call__(self, path: Path) -> tuple[Sidecar, Reason | None]:
         """Return a sidecar without its long tables, and why it is not as it was written (`read_with_change`).
 
         Raises SidecarError.
@@ -92,7 +92,7 @@ class EarlierResults:
             sidecar, change = read_with_change(path)
             packed = zlib.compress(pickle.dumps((sidecar.without_tables(), change)), 1)
             known = self._read[path] = state, packed
-        result: tuple[Sidecar, str] = pickle.loads(zlib.decompress(known[1]))
+        result: tuple[Sidecar, Reason | None] = pickle.loads(zlib.decompress(known[1]))
         return result
 
     def files(self, path: Path) -> list[FilePart]:
@@ -181,7 +181,7 @@ def remaining(
         return _after_damage(path, capture, options)
     files = _compared_files(earlier, capture)
     if files.lost and not options.overwrite:
-        return _kept(files.lost, f"the sidecar {change}" if change else "", None if change else earlier)
+        return _kept(files.lost, f"the sidecar {change.what}" if change else "", None if change else earlier)
     if change:
         return Remaining("estimate", (_DAMAGED,))
     if earlier.estimated_with != estimation_fingerprint(capture, settings):
@@ -201,8 +201,8 @@ def _after_damage(path: Path, capture: Capture, options: RunOptions) -> Remainin
     """Return what remains to be done for a capture whose sidecar is missing or cannot be read."""
     if not path.exists():
         return Remaining("estimate")
-    reasons = {name: reason.partition(";")[0] for name, reason in capture.unreadable_bands.items()}
-    lost = [reasons.get(name, f"{name} is missing") for name in capture.missing_bands]
+    missing = {name: f"{name} is missing" for name in capture.missing_bands}
+    lost = [*(missing | {name: why.what for name, why in capture.unreadable_bands.items()}).values()]
     if lost and not options.overwrite:
         return _kept(lost, "the sidecar cannot be read", None)
     return Remaining("estimate", (_DAMAGED,))
@@ -210,7 +210,7 @@ def _after_damage(path: Path, capture: Capture, options: RunOptions) -> Remainin
 
 def _kept(lost: Sequence[str], damage: str, earlier: Sidecar | None) -> Remaining:
     remedy = "copy such files from the card again, or align without them by --overwrite"
-    state = f"not processed, as {damage.partition(';')[0]}" if damage else "kept as aligned before"
+    state = f"not processed, as {damage}" if damage else "kept as aligned before"
     return Remaining("keep", (), earlier, f"{state}, and now {'; '.join(lost)}; {remedy}")
 
 
@@ -269,7 +269,7 @@ def _compared_files(earlier: Sidecar, capture: Capture) -> _ComparedFiles:
         if name not in here:
             is_found = any((folder / file).exists() for folder in {b.path.parent for b in capture.bands})
             if reason := capture.unreadable_bands.get(name):
-                lost.append(reason.partition(";")[0])
+                lost.append(reason.what)
             elif name in capture.missing_bands or not is_found:
                 lost.append(f"{file} is missing")
         elif name not in states:
@@ -292,7 +292,7 @@ def _unreadable(band: Band) -> str:
         for tile in tiles(Tile(0, 0, *band.size_px), WORK_TILE_PX):
             read_tile(band, tile)
     except UnreadableFileError as error:
-        return str(error).partition(";")[0]
+        return error.reason.what
     return ""
 
 

@@ -182,7 +182,7 @@ def rendered_sidecar(
             "status": capture_status(bands, capture.missing_bands, accept_predicted_px),
             # Captures with further bands may have been added since the estimation.
             "missing_bands": list(capture.missing_bands),
-            "unreadable_bands": dict(capture.unreadable_bands),
+            "unreadable_bands": {name: str(why) for name, why in capture.unreadable_bands.items()},
             "accept_predicted_px": accept_predicted_px,
             "pose": shown.pose,
             "output": _output(context, {b.band: b.saturated or 0.0 for b in bands}) if context.layers else None,

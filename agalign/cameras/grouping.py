@@ -22,7 +22,7 @@ from agalign.cameras.makers import camera_of
 from agalign.cameras.metadata import Tags
 from agalign.cameras.model_tables import band_at, lacking
 from agalign.config import DiscoverOptions
-from agalign.errors import InputError, UnreadableFileError
+from agalign.errors import InputError, Reason, UnreadableFileError
 from agalign.host.files import RUN_FILE
 from agalign.host.text import counted, shortened, some_of
 from agalign.pixels.raster import suffix_format
@@ -453,29 +453,29 @@ def with_unreadable_bands(
     """Return the captures with the reasons why files of their missing bands cannot be read. The name of such a file
     tells its capture and, by the readable `files` or what is known of the camera, its band.
     """
-    if not (unreadable := [p for p in problems if isinstance(p.error, UnreadableFileError)]):
+    if not (unreadable := {p.path: p.error for p in problems if isinstance(p.error, UnreadableFileError)}):
         return list(captures)
     of_path = {file.path: file for file in files}
     names = {_place(f.path, f.camera): f.bands[0].name for f in of_path.values() if len(f.bands) == 1}
-    by_camera: dict[Camera, dict[tuple[Path, str], dict[Path, str]]] = {}
+    by_camera: dict[Camera, dict[tuple[Path, str], list[Path]]] = {}
     result = []
     for capture in captures:
         path = capture.reference.path
         camera = of_path[path].camera
         if camera not in by_camera:
-            by_camera[camera] = defaultdict(dict)
-            for one in unreadable:
-                key = camera.capture_folder(one.path), camera.capture_name(one.path)
-                by_camera[camera][key][one.path] = one.text.removeprefix(f"{one.path}: ")
-        of_capture = by_camera[camera].get((camera.capture_folder(path), camera.capture_name(path)), {})
-        missing, reasons = {band_key(name): name for name in capture.missing_bands}, dict[str, str]()
-        for file, reason in of_capture.items() if capture.has_several_files else ():
+            by_camera[camera] = defaultdict(list)
+            for file in unreadable:
+                by_camera[camera][camera.capture_folder(file), camera.capture_name(file)].append(file)
+        of_capture = by_camera[camera].get((camera.capture_folder(path), camera.capture_name(path)), [])
+        missing, reasons = {band_key(name): name for name in capture.missing_bands}, dict[str, Reason]()
+        for file in of_capture if capture.has_several_files else ():
             without_tags = replace(capture.reference, name="", path=file, wavelength_nm=None)
             found = [names.get(_place(file, camera), ""), band_at(capture.camera.model, end_of(file, camera))]
             found += [band.name for band in camera.bands(file, Tags(), (without_tags,))]
             for own in map(band_key, found):
                 if own in missing:
-                    reasons[missing[own]] = f"{file.name}: {reason}"
+                    what, remedy = unreadable[file].reason
+                    reasons[missing[own]] = Reason(f"{file.name}: {what.removeprefix(f'{file}: ')}", remedy)
                     break
         result.append(replace(capture, unreadable_bands=reasons) if reasons else capture)
     return result

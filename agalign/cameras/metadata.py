@@ -105,7 +105,7 @@ def read_tags(path: Path, page: int = 0) -> Tags:
     except Exception as error:  # damaged files cause struct.error, KeyError, MemoryError … in the libraries
         kind = suffix_format(path) or "TIFF"
         what = f"not a readable {kind} ({error or 'empty'})"
-        raise UnreadableFileError(f"{path}: {what}; copy it from the card again") from None
+        raise UnreadableFileError(f"{path}: {what}", "copy it from the card again") from None
     first, exif, gps = (
         {names.get(tag, str(tag)): values(entry) for tag, entry in directories[key].items()}
         for key, names in ((0, ExifTags.TAGS), (EXIF, ExifTags.TAGS), (GPS, ExifTags.GPSTAGS))

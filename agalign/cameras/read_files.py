@@ -56,7 +56,7 @@ def read_files(paths: Sequence[Path], options: DiscoverOptions) -> Iterator[Imag
 def read_file(path: Path, cameras: Iterable[Camera], options: DiscoverOptions) -> ImageFile:
     """Return a file with its bands. Raises UnreadableFileError."""
     if not is_inside(path.name):  # outputs are named after it, and a sidecar with such names is not read
-        raise UnreadableFileError(f"{path}: its name is an absolute path on Windows; rename it")
+        raise UnreadableFileError(f"{path}: its name is an absolute path on Windows", "rename it")
     pages = _stored_pages(path, options.max_pixels)
     tags = read_tags(path, pages[0][0].page)
     *_, generic = cameras
@@ -91,7 +91,7 @@ def _named_bands(path: Path, tags: Tags, camera: Camera, pages: Sequence[tuple[B
         named += camera.bands(path, read_tags(path, page[0].page), page)
     if len(pages) > 1 and len({b.name for b in named}) < len(pages):
         what = f"has {len(pages)} pages of one size without names of bands"
-        raise UnreadableFileError(f"{path}: {what}; write each page to a file of its own (tiffsplit)")
+        raise UnreadableFileError(f"{path}: {what}", "write each page to a file of its own (tiffsplit)")
     if len(pages) > 1:
         named = [replace(band, band_index=band.page) for band in named]
     return [replace(band, name=shortened(band.name)) for band in named]
@@ -122,9 +122,8 @@ def _check_sign(band: Band) -> None:
     pixels, valid = read_tile(band, Tile(0, 0, *band.size_px))
     if pixels[valid].min(initial=0) < max_wrapped:
         what = "some of its pixels are negative: raw numbers above 32767 were stored as signed ones"
-        raise UnreadableFileError(
-            f"{band.path}: {what}; copy it from the card again, or store them as unsigned 16 bits"
-        )
+        remedy = "copy it from the card again, or store them as unsigned 16 bits"
+        raise UnreadableFileError(f"{band.path}: {what}", remedy)
 
 
 def _doubts(camera: Camera, tags: Tags, bands: Sequence[Band], other_lens: str) -> Iterator[Doubt]:
@@ -229,7 +228,7 @@ def _start_reading() -> None:
 
 
 def _unread(path: Path, what: str) -> Problem:
-    return Problem(path, UnreadableFileError(f"{path}: {what}; take it out of the folder"))
+    return Problem(path, UnreadableFileError(f"{path}: {what}", "take it out of the folder"))
 
 
 def _read_task(paths: Iterable[Path], options: DiscoverOptions) -> list[ImageFile | Problem]:

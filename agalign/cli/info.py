@@ -126,7 +126,7 @@ def _unreadable_files(flight: "FolderScan") -> dict[str, list[str]]:
 
 def _is_of(path: Path, capture: "Capture") -> bool:
     """Return True for the file of a band of a capture that cannot be read."""
-    return any(reason.startswith(f"{path.name}: ") for reason in capture.unreadable_bands.values())
+    return any(reason.what.startswith(f"{path.name}: ") for reason in capture.unreadable_bands.values())
 
 
 def _show_unused(flight: "FolderScan", terminal: Terminal) -> None:

@@ -202,12 +202,12 @@ def _opened(path: Path, listed: ListedFiles, *, masked: bool) -> Any:
             chunks = {"x": 1024, "y": 1024}
             return rioxarray.open_rasterio(gdal_name(path), chunks=chunks, masked=masked, driver="GTiff")
     except OSError as error:
-        raise UnreadableFileError(f"{path}: cannot be read ({error}); run again") from None
+        raise UnreadableFileError(f"{path}: cannot be read ({error})", "run again") from None
 
 
 def _variable(file: "xarray.DataArray", band: BandResult, index: int, name: str, *, masked: bool) -> "xarray.DataArray":
     if index > file.sizes["band"]:
-        raise UnreadableFileError(f"{name}: has no band {index}, as its sidecar says; run again")
+        raise UnreadableFileError(f"{name}: has no band {index}, as its sidecar says", "run again")
     one = file.isel(band=index - 1, drop=True)
     if masked:
         one = one.astype(np.float32)  # rioxarray keeps integers without a nodata value

@@ -34,6 +34,8 @@ _MAXIMA = {"uint8": 255.0, "uint16": 65535.0, "int16": 32767.0}
 """Of the types that sensors deliver."""
 _MAX_BANDS = 512
 """More than any imager has; a damaged file may declare 65,535."""
+_COPY_AGAIN, _CONVERT = "copy it from the card again", "convert it to TIFF (gdal_translate)"
+"""Remedies."""
 
 
 Format = Literal["TIFF", "JPEG", "PNG", "JPEG 2000"]
@@ -76,7 +78,7 @@ def open_raster(path: Path, page: int = 0) -> Iterator[rasterio.DatasetReader]:
         if not isinstance(error, UnicodeDecodeError) and not is_gdal_error(error):
             raise
         text = innermost_cause(error).replace(gdal_name(path), "").strip(" :'")
-        raise UnreadableFileError(f"{path}: cannot be read ({text}); copy it from the card again") from None
+        raise UnreadableFileError(f"{path}: cannot be read ({text})", _COPY_AGAIN) from None
 
 
 def _is_south_up(dataset: rasterio.DatasetReader) -> bool:
@@ -93,23 +95,23 @@ def _driver_of(path: Path) -> str:
     try:
         # Opening a pipe would block.
         if not stat.S_ISREG(path.stat().st_mode):
-            raise UnreadableFileError(f"{path}: is not a regular file; remove it from the folder")
+            raise UnreadableFileError(f"{path}: is not a regular file", "remove it from the folder")
         with path.open("rb") as file:
             magic = file.read(4)
     except FileNotFoundError:
         raise UnreadableFileError(f"{path}: does not exist") from None
     except (OSError, ValueError) as error:
         text = getattr(error, "strerror", None) or error
-        raise UnreadableFileError(f"{path}: cannot be read ({text}); copy it from the card again") from None
+        raise UnreadableFileError(f"{path}: cannot be read ({text})", _COPY_AGAIN) from None
     # Some of GDAL's other drivers execute code or contact servers.
     drivers = {"GTiff": (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+"), "JPEG": (b"\xff\xd8\xff",), "PNG": (b"\x89PNG",)}
     for driver, starts in drivers.items():
         if magic.startswith(starts):
             return driver
     if suffix_format(path) == "JPEG 2000":
-        raise UnreadableFileError(f"{path}: JPEG 2000 is not supported; convert it to TIFF (gdal_translate)")
+        raise UnreadableFileError(f"{path}: JPEG 2000 is not supported", _CONVERT)
     problem = "is empty" if not magic else "is not a TIFF, JPEG or PNG"
-    raise UnreadableFileError(f"{path}: {problem}; copy it from the card again")
+    raise UnreadableFileError(f"{path}: {problem}", _COPY_AGAIN)
 
 
 def probe(path: Path, max_pixels: int = MAX_PIXELS, page: int = 0) -> tuple[Band, ...]:
@@ -125,7 +127,7 @@ def probe(path: Path, max_pixels: int = MAX_PIXELS, page: int = 0) -> tuple[Band
         raise
     except Exception as error:  # damaged files raise errors of many classes
         what = f"cannot be read ({innermost_cause(error)})"
-        raise UnreadableFileError(f"{path}: {what}; copy it from the card again") from None
+        raise UnreadableFileError(f"{path}: {what}", _COPY_AGAIN) from None
 
 
 def _bands(path: Path, dataset: rasterio.DatasetReader, max_pixels: int) -> tuple[Band, ...]:
@@ -135,14 +137,14 @@ def _bands(path: Path, dataset: rasterio.DatasetReader, max_pixels: int) -> tupl
         raise UnreadableFileError(f"{path}: {what}")
     if dataset.driver == "PNG" and width * height > MAX_DECODED_PX:
         what = f"declares {width} x {height} pixels, and a PNG of more than {MAX_DECODED_PX:,} is not decoded"
-        raise UnreadableFileError(f"{path}: {what}; convert it to TIFF (gdal_translate)")
+        raise UnreadableFileError(f"{path}: {what}", _CONVERT)
     if count > _MAX_BANDS:
-        raise UnreadableFileError(f"{path}: declares {count} bands; at most {_MAX_BANDS} can take part")
+        raise UnreadableFileError(f"{path}: declares {count} bands", f"at most {_MAX_BANDS} can take part")
     if not all(np.dtype(t).kind in "uif" for t in dataset.dtypes):
-        raise UnreadableFileError(f"{path}: holds {dataset.dtypes[0]} pixels; bands must be integers or floats")
+        raise UnreadableFileError(f"{path}: holds {dataset.dtypes[0]} pixels", "bands must be integers or floats")
     if dataset.tags(ns="IMAGE_STRUCTURE").get("MINISWHITE") == "YES":
         remedy = "export it with 0 as black (photometric interpretation MinIsBlack)"
-        raise UnreadableFileError(f"{path}: is stored inverted (photometric interpretation MinIsWhite); {remedy}")
+        raise UnreadableFileError(f"{path}: is stored inverted (photometric interpretation MinIsWhite)", remedy)
     alpha = _alpha_index(dataset)
     indices = [i for i in dataset.indexes if i != alpha]
     colours = [dataset.colorinterp[i - 1].name.capitalize() for i in indices]

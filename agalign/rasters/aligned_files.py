@@ -243,7 +243,7 @@ def _descriptions(context: ProductContext, layers: Sequence[Layer]) -> list[Laye
         tags, imagery = {} if quantity is None else {"QUANTITY": str(quantity)}, {}
         if layer.is_gap:
             alignment = context.alignments.get(band.name)
-            why_missing = context.capture.unreadable_bands.get(band.name, MISSING_BAND.cause)
+            why_missing = str(context.capture.unreadable_bands.get(band.name, MISSING_BAND.cause))
             status, reason = ("missing", why_missing) if alignment is None else (alignment.status, alignment.reason)
             tags |= {"STATUS": status, "REASON": reason or why_missing}
         if band.wavelength_nm is not None:

@@ -10,7 +10,7 @@ import numpy as np
 from rasterio.errors import RasterioError
 from rasterio.windows import Window
 
-from agalign.errors import InputError
+from agalign.errors import InputError, UnreadableFileError
 from agalign.host.text import shortened
 from agalign.pixels.gdal import innermost_cause
 from agalign.pixels.raster import OpenRaster, open_raster
@@ -46,8 +46,8 @@ class BandReader(ExitStack):
             self._listed.check(path)
             try:
                 self._files[path] = self.enter_context(open_raster(path))
-            except InputError as error:  # whose remedy is that of an image of the camera
-                raise InputError(f"{str(error).partition(';')[0]}; delete it and run again") from None
+            except UnreadableFileError as error:  # whose remedy is that of an image of the camera
+                raise InputError(f"{error.reason.what}; delete it and run again") from None
         if index > self._files[path].count:
             raise InputError(f"{path}: has no band {index}, as its sidecar says; run again")
         return self._files[path]

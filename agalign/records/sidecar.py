@@ -646,7 +646,7 @@ class Sidecar(_Part):
             camera=capture.camera,
             status=status,
             missing_bands=list(capture.missing_bands),
-            unreadable_bands=dict(capture.unreadable_bands),
+            unreadable_bands={name: str(why) for name, why in capture.unreadable_bands.items()},
             reference=ReferencePart.of(capture),
             bands=bands,
             accept_predicted_px=accept_predicted_px,

@@ -9,7 +9,7 @@ from typing import Any
 
 from pydantic import ValidationError
 
-from agalign.errors import InputError, SidecarError
+from agalign.errors import InputError, Reason, SidecarError
 from agalign.host.files import RUN_FILE, compact_lists, file_checksum, open_regular, read_regular, write_text
 from agalign.host.text import shortened
 from agalign.records.listed_files import ListedFiles, file_problem
@@ -80,20 +80,20 @@ def read_checked(path: Path) -> Sidecar:
     return sidecar
 
 
-def read_with_change(path: Path) -> tuple[Sidecar, str]:
-    """Return a sidecar, and why it is not as a command wrote it at this place, with the remedy; empty if it is.
+def read_with_change(path: Path) -> tuple[Sidecar, Reason | None]:
+    """Return a sidecar, and why it is not as a command wrote it at this place; None if it is.
 
     Raises SidecarError like `read_sidecar`.
     """
     text = _contents(path)
     sidecar = _parsed(path, text)
     if Path(sidecar.capture).name != path.stem:
-        return sidecar, f"belongs to {shortened(sidecar.capture)}; delete it and run again"
+        return sidecar, Reason(f"belongs to {shortened(sidecar.capture)}", "delete it and run again")
     if sidecar.checksum is None:
-        return sidecar, "has no checksum, so that changes cannot be found; run again"
+        return sidecar, Reason("has no checksum, so that changes cannot be found", "run again")
     if sidecar.checksum != content_checksum(text):
-        return sidecar, "was changed after it was written; run again"
-    return sidecar, ""
+        return sidecar, Reason("was changed after it was written", "run again")
+    return sidecar, None
 
 
 def _contents(path: Path) -> bytes:

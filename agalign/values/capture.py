@@ -9,6 +9,7 @@ from typing import Literal, NamedTuple
 
 from pydantic import dataclasses as validated
 
+from agalign.errors import Reason
 from agalign.values.equality import equal
 from agalign.values.fields import RECORD, Name, Number
 from agalign.values.geometry import Matrix
@@ -316,7 +317,7 @@ class Capture:
     """Velocity of the ground in the image (right, down), focal lengths per second; None if unknown."""
     missing_bands: tuple[str, ...] = ()
     """Names of bands that other captures of its camera have."""
-    unreadable_bands: Mapping[str, str] = field(default_factory=dict)
+    unreadable_bands: Mapping[str, Reason] = field(default_factory=dict)
     """Those of `missing_bands` with a file that cannot be read, and why."""
     camera_bands: tuple[Band, ...] = ()
     """Bands of its camera, without files, in the order of the stacks; empty if they are those of the capture."""

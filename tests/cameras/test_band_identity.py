@@ -55,8 +55,8 @@ def test_the_bands_of_a_known_camera_are_missing_even_in_all_captures(
         path.write_text("no image")
     (capture,) = discover(tmp_path).captures
     assert set(capture.missing_bands) == set(capture.unreadable_bands) == expected
-    reasons = sorted(capture.unreadable_bands.values())
-    assert [reason.split(": is not a TIFF")[0] for reason in reasons] == sorted(p.name for p in lost_files)
+    reasons = {f"{path.name}: is not a TIFF, JPEG or PNG" for path in lost_files}
+    assert {reason.what for reason in capture.unreadable_bands.values()} == reasons
     for path in lost_files:
         path.unlink()
     assert [set(names) for names in missing(tmp_path)] == [expected]
@@ -93,7 +93,9 @@ def test_the_bands_of_an_altum_are_missing_as_those_of_other_cameras(
     assert [set(names) for names in missing(tmp_path)] == [expected]
 
 
-@pytest.mark.parametrize("name", ["{capture}_{band}.tif", "{band}/{capture}.tif", "{band}{capture}.tif"])
+@pytest.mark.parametrize(
+    "name", ["{capture}_{band}.tif", "{band}/{capture}.tif", "{band}{capture}.tif", "{capture}; {band}.tif"]
+)
 def test_an_unreadable_file_is_known_by_its_name(tmp_path: Path, name: str) -> None:
     for capture in ("0011", "0012", "0013"):
         for band in ("red", "green", "nir"):
@@ -102,7 +104,8 @@ def test_an_unreadable_file_is_known_by_its_name(tmp_path: Path, name: str) -> N
     lost.write_text("no image")
     (damaged,) = (c for c in discover(tmp_path).captures if c.missing_bands)
     assert damaged.missing_bands == ("nir",)
-    assert damaged.unreadable_bands["nir"].startswith(f"{lost.name}: is not a TIFF")
+    reason = damaged.unreadable_bands["nir"]
+    assert reason == (f"{lost.name}: is not a TIFF, JPEG or PNG", "copy it from the card again")
 
 
 def write_rededge(folder: Path, number: int, bands: Mapping[int, tuple[str, int]], serial: str = "RP01") -> None:

@@ -325,7 +325,7 @@ def test_a_truncated_band_of_a_longer_name_is_unreadable_not_missing(tmp_path: P
     path.write_bytes(path.read_bytes()[:100])
     capture = discover(tmp_path).captures[1]
     assert capture.missing_bands == ("NIR",)
-    assert path.name in capture.unreadable_bands["NIR"]
+    assert path.name in capture.unreadable_bands["NIR"].what
 
 
 # ---- number and time

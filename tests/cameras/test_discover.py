@@ -378,7 +378,7 @@ def test_a_file_that_takes_too_long_is_left_out(tmp_path: Path, monkeypatch: pyt
         f"{folder / 'f1_nir.tif'}: reading it took over 2 s (--timeout); take it out of the folder"
     ]
     assert [c.missing_bands for c in found.captures] == [(), ("nir",)]
-    assert found.captures[1].unreadable_bands["nir"].startswith("f1_nir.tif: reading it took over 2 s")
+    assert found.captures[1].unreadable_bands["nir"].what.startswith("f1_nir.tif: reading it took over 2 s")
 
 
 @pytest.mark.parametrize(
