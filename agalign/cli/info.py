@@ -88,7 +88,7 @@ def _rows(flight: "FolderScan") -> tuple[list[dict[str, Any]], list["Capture"]]:
 
 def _show_captures(rows: Sequence[dict[str, Any]], problems: int, terminal: Terminal) -> None:
     """Print the captures of a folder as a table, the calibration panels and sky captures, and a line of totals."""
-    from agalign.values.issues import MISSING_BAND
+    from agalign.values.remedies import MISSING_BAND
 
     headers = ("Capture", "Camera", "Taken", "Bands (reference in brackets)", "Seeds", "Missing")
     table = []

@@ -37,8 +37,8 @@ from agalign.values import geometry
 from agalign.values.capture import Band, Capture
 from agalign.values.choices import Interpolation
 from agalign.values.image import Mask, OutputGrid, Tile
-from agalign.values.issues import MISSING_BAND
 from agalign.values.radiometry import Quantity, Radiometry
+from agalign.values.remedies import MISSING_BAND
 from agalign.values.resampling import as_type, can_hold, tiles
 from agalign.values.spectrum import Role, role_of_band
 

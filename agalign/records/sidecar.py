@@ -51,7 +51,7 @@ from agalign.values.fields import (
     SourceFile,
 )
 from agalign.values.image import OutputGrid
-from agalign.values.issues import MISSING_BAND, Issue
+from agalign.values.issues import Issue
 from agalign.values.lens import Lens
 from agalign.values.mapping import DisplacementField, PixelMapping
 from agalign.values.mapping_error import MappingError
@@ -59,6 +59,7 @@ from agalign.values.moved_area import MovedArea
 from agalign.values.parallax import Parallax, Relief
 from agalign.values.pixel_units import PixelScale, Size
 from agalign.values.radiometry import RadiometricError
+from agalign.values.remedies import MISSING_BAND
 from agalign.values.residual import Residual, Similarity
 
 SCHEMA = "agalign/3"

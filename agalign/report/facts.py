@@ -5,16 +5,17 @@ import math
 from collections import Counter, defaultdict
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
+from operator import attrgetter
 from pathlib import Path
 from statistics import median
-from typing import Any, NamedTuple
+from typing import Any
 from urllib.parse import quote
 
 import numpy as np
 from numpy.typing import NDArray
 
 from agalign.host.text import escape_controls
-from agalign.records.cautions import MIN_SHARE_OVER_1_PX, NO_RESULT, NOT_FLAT, Caution, RunFacts
+from agalign.records.cautions import MIN_SHARE_OVER_1_PX, Caution, RunFacts
 from agalign.records.excluded import PanelPart, SkyPart
 from agalign.records.sidecar import BandResult, ErrorPart, GeometryPart, GridPart, OutputPart, Sidecar
 from agalign.report.light_over_captures import LightOverCaptures
@@ -23,48 +24,35 @@ from agalign.report.summary_csv import BAND_COLUMNS, SIMILARITY, SummaryTable, r
 from agalign.report.verdict import Verdict, is_by_prediction, largest_error, unwritten_indices
 from agalign.spectral_indices.rasters import IndexReport
 from agalign.values.alignment import Prediction
-from agalign.values.issues import OTHER_REFERENCE, Remedy
+from agalign.values.remedies import NO_RESULT, OTHER_REFERENCE, Remedy
 
 _SHIFT_STEP_PX = 0.01
 """Shifts of windows are written as integer multiples of this."""
 
 
-class BandToCheck(NamedTuple):
-    """A band of a capture, and why to check it."""
-
-    capture: str
-    band: str
-    """Empty for the whole capture."""
-    status: str
-    reason: str
-
-
-@dataclass
+@dataclass(frozen=True)
 class CautionGroup:
     """The bands of a run with the same status and the same cause for a check."""
 
-    status: str
-    remedy: Remedy
-    effect: float = 0.0
+    bands: Sequence[Caution]
+    effect: float
     """Share of the values of all bands of the run that are missing, displaced or wrong, by `Caution.lost`."""
-    bands: list[BandToCheck] = field(default_factory=list)
-    is_unusable: bool = False
-    """The values of a band are too uncertain for any use."""
-    _largest: float = -math.inf
-    _size_text: str = ""
 
-    def add(self, label: str, caution: Caution) -> None:
-        """Add a band of a capture."""
-        self.bands.append(BandToCheck(label, caution.band, self.status, caution.reason))
-        self.effect += caution.lost
-        self.is_unusable |= caution.is_unusable
-        if caution.size > self._largest:
-            self._largest, self._size_text = caution.size, caution.size_text
+    @property
+    def status(self) -> str:
+        """That of each band."""
+        return self.bands[0].status
+
+    @property
+    def remedy(self) -> Remedy:
+        """That of each band."""
+        return self.bands[0].remedy
 
     @property
     def size(self) -> str:
         """How large it is, in words; empty if it has no size."""
-        return self._size_text.format(self._largest)
+        largest = max(self.bands, key=attrgetter("size"))
+        return largest.size_text.format(largest.size)
 
     @property
     def advice(self) -> str:
@@ -78,6 +66,11 @@ class CautionGroup:
     def captures(self) -> int:
         """Number of captures with such a band."""
         return len({b.capture for b in self.bands})
+
+    @property
+    def is_unusable(self) -> bool:
+        """True if the values of a band are too uncertain for any use."""
+        return any(b.is_unusable for b in self.bands)
 
 
 @dataclass
@@ -102,7 +95,7 @@ class PairTotals:
 
     run: RunFacts = field(default_factory=RunFacts)
     bands: dict[str, BandTotals] = field(default_factory=lambda: defaultdict(BandTotals))
-    _by_cause: dict[tuple[str, Remedy], CautionGroup] = field(default_factory=dict)
+    _cautions: list[Caution] = field(default_factory=list)
     _references: list[tuple[str, tuple[str, ...], str, set[str]]] = field(default_factory=list)
     """(capture, flight, reference band, its other bands with the missing ones)."""
     _votes: dict[tuple[str, ...], Counter[str]] = field(default_factory=lambda: defaultdict(Counter))
@@ -120,17 +113,12 @@ class PairTotals:
                 band.residuals_px.append(part.metrics.after.residual_px)
         camera, reference = result.camera, result.reference.band
         of_light = self._light.add(label, f"{camera.name} {camera.serial}", result.captured_at, result.output)
-        cautions = [*self.run.cautions(result, label), *of_light]
-        for caution in cautions:
-            self._add_caution(label, caution)
+        cautions = [replace(c, capture=label) for c in (*self.run.cautions(result, label), *of_light)]
+        self._cautions += cautions
         flight = (camera.name, camera.serial, result.flight_id, "" if camera.model else Path(label).parent.as_posix())
         self._references.append((label, flight, reference, {name for name, _, _ in result.pairs}))
         self._votes[flight].update((reference, *result.missing_bands))
         return cautions
-
-    def _add_caution(self, label: str, caution: Caution) -> None:
-        cause = caution.status, caution.remedy
-        self._by_cause.setdefault(cause, CautionGroup(*cause)).add(label, caution)
 
     @property
     def statuses(self) -> Counter[str]:
@@ -142,29 +130,31 @@ class PairTotals:
         """Labels of the captures."""
         return {label for label, *_ in self._references}
 
-    def groups(self, without_result: Sequence[str] = ()) -> list[CautionGroup]:
-        """Return what to check, by cause, the largest effect first: the cautions about bands, the captures with another
-        reference than most of their flight, and those without a result, given by label.
+    def _other_references(self, lost: float) -> Iterator[Caution]:
+        """Yield the captures with another reference than most of their flight, all values of which are displaced from
+        those of the others; `lost` is the number of bands of a capture.
         """
-        groups = [replace(group) for group in self._by_cause.values()]
-        pairs = self.statuses.total()
-        pairs_per_capture = pairs / max(1, len(self._references))
-        other = CautionGroup("other_reference", OTHER_REFERENCE)
         for label, flight, band, others in self._references:
             usual = self._votes[flight].most_common(1)[0][0]
             if usual in others:
                 reason = f"on the grid of {band}; most captures of the flight are on that of {usual}"
-                # All its values are displaced from those of the other captures.
-                other.add(label, Caution(band, other.status, OTHER_REFERENCE, reason, pairs_per_capture))
-        uneven = CautionGroup("check", NOT_FLAT)
-        for label, caution in self._light.uneven():
-            uneven.add(label, caution)
-        lost = CautionGroup("no_result", NO_RESULT)
+                yield Caution(band, OTHER_REFERENCE, reason, lost, status="other_reference", capture=label)
+
+    def groups(self, without_result: Sequence[str] = ()) -> list[CautionGroup]:
+        """Return what to check, by cause, the largest effect first: the cautions about bands, the captures with another
+        reference than most of their flight, and those without a result, given by label.
+        """
+        pairs = self.statuses.total()
+        pairs_per_capture = pairs / max(1, len(self._references))
+        pairs_without_result = max(1.0, pairs_per_capture)
+        by_cause: dict[tuple[str, Remedy], list[Caution]] = defaultdict(list)
+        for caution in (*self._cautions, *self._other_references(pairs_per_capture), *self._light.uneven()):
+            by_cause[caution.status, caution.remedy].append(caution)
         for label in without_result:
-            lost.add(label, Caution("", lost.status, NO_RESULT, NO_RESULT.cause, max(1.0, pairs_per_capture)))
-        groups += [group for group in (other, uneven, lost) if group.bands]
-        for group in groups:
-            group.effect /= max(1.0, pairs + max(1.0, pairs_per_capture) * len(without_result))
+            lost = Caution("", NO_RESULT, NO_RESULT.cause, pairs_without_result, status="no_result", capture=label)
+            by_cause[lost.status, lost.remedy].append(lost)
+        values = max(1.0, pairs + pairs_without_result * len(without_result))
+        groups = [CautionGroup(bands, sum(b.lost for b in bands) / values) for bands in by_cause.values()]
         severity = "no_result", "failed", "seed_only", "missing", "other_reference", "predicted", "check"
         return sorted(groups, key=lambda g: (-g.effect, severity.index(g.status), -len(g.bands), g.remedy.cause))
 

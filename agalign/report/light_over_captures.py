@@ -11,10 +11,10 @@ from typing import Self
 import numpy as np
 from numpy.typing import NDArray
 
-from agalign.records.cautions import NOT_FLAT, Caution
+from agalign.records.cautions import Caution
 from agalign.records.sidecar import OutputPart
 from agalign.values.capture import CaptureTime, is_clock_set
-from agalign.values.issues import Remedy
+from agalign.values.remedies import JUMP, NOT_FLAT
 
 _MIN_CAPTURES = 20
 """For the flatness of the mean: the ratio of corners to middle varies by 15 % between captures (eight sets of real
@@ -40,11 +40,6 @@ _SUCCESSIVE_S = 5.0
 """Between captures that overlap in any flight, so that the shift need not be clear."""
 _MAX_JUMP = math.log(1.2)
 """Of the logarithm of a band: eight pairs of overlapping captures differ by up to 8 %."""
-JUMP = Remedy(
-    "a band is darker or brighter than in the capture before over the same ground: its tags are wrong, or the light "
-    "changed and the reflectance does not follow it",
-    "compare exposure time and gain in the tags of both; a light sensor (--radiometry sun) follows clouds",
-)
 
 Cells = NDArray[np.float64]
 """Logarithms (bands, 12, 16) of the means of the cells of a capture."""
@@ -96,7 +91,7 @@ class _CaptureCells:
                 share = math.expm1(jump)
                 way = "brighter" if share > 0 else "darker"
                 reason = f"{abs(share):.0%} {way} than in {other.label} over the same ground"
-                yield Caution(band, "check", JUMP, reason, min(1.0, abs(share)), abs(share), "up to {:.0%}")
+                yield Caution(band, JUMP, reason, min(1.0, abs(share)), abs(share), "up to {:.0%}")
 
 
 @dataclass
@@ -123,8 +118,8 @@ class LightOverCaptures:
         self._recent[camera].append(own)
         self._last = label
 
-    def uneven(self) -> Iterator[tuple[str, Caution]]:
-        """Yield the bands whose mean over many captures is not flat, with a label: scenes differ, the lens does not."""
+    def uneven(self) -> Iterator[Caution]:
+        """Yield the bands whose mean over many captures is not flat: scenes differ, the lens does not."""
         for (_, band), logarithms in self._corners.items():
             count, mean = len(logarithms), float(np.mean(logarithms))
             std = float(np.std(logarithms)) / math.sqrt(count)
@@ -132,7 +127,7 @@ class LightOverCaptures:
                 share = math.expm1(mean)
                 reason = f"in {count} captures, the corners are {share:+.0%} from the middle (± {std:.0%})"
                 lost = min(1.0, abs(share)) * count
-                yield self._last, Caution(band, "check", NOT_FLAT, reason, lost, abs(share), "up to {:.0%}")
+                yield Caution(band, NOT_FLAT, reason, lost, abs(share), "up to {:.0%}", capture=self._last)
 
 
 def same_ground(one: Cells, other: Cells, *, is_certain: bool) -> NDArray[np.float64] | None:

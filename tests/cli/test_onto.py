@@ -11,7 +11,7 @@ from rasterio.transform import Affine
 import agalign
 from agalign import ReliefSettings, Settings
 from agalign.values import geometry
-from agalign.values.issues import MOSAICS
+from agalign.values.remedies import MOSAICS
 
 from ..builders import displaced_views
 from ..conftest import read_json, textured_pair, write_band

@@ -15,7 +15,7 @@ from agalign.cli.print_cautions import explain
 from agalign.cli.terminal import Terminal
 from agalign.flight.rig_file import model_fingerprint
 from agalign.rasters.alignment_maps import error_lattice_px, share_over_1_px
-from agalign.records.cautions import BLURRED, Caution, RunFacts
+from agalign.records.cautions import Caution, RunFacts
 from agalign.records.excluded import PanelPart
 from agalign.records.sidecar import Sidecar
 from agalign.records.sidecar_file import read_sidecar, write_sidecar
@@ -24,9 +24,9 @@ from agalign.report.pages import write_pages
 from agalign.values.alignment import Alignment, Seed
 from agalign.values.capture import Band
 from agalign.values.image import OutputGrid
-from agalign.values.issues import TEXTURELESS
 from agalign.values.mapping import PixelMapping
 from agalign.values.mapping_error import MappingError
+from agalign.values.remedies import BLURRED, TEXTURELESS
 from agalign.values.residual import Residual
 
 from ..conftest import read_json, save_known_model

@@ -7,9 +7,9 @@ import pytest
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
-from agalign.records.cautions import NOT_FLAT, Caution
+from agalign.records.cautions import Caution
 from agalign.report.facts import PairTotals
-from agalign.report.light_over_captures import JUMP
+from agalign.values.remedies import JUMP, NOT_FLAT
 
 from ..records.test_sidecar import example
 
