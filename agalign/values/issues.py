@@ -95,19 +95,13 @@ KINDS: Mapping[str, IssueKind] = {k.code: k for k in list(globals().values()) if
 """Every kind of issue that a sidecar may contain, by code: all that are defined above."""
 
 
-def _kind_of(code: str) -> IssueKind:
-    if code not in KINDS:
-        raise ValueError(f"unknown kind of issue {code!r}")
-    return KINDS[code]
-
-
 class _ByCode:
     """A kind of issue, which JSON holds as its code."""
 
     def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
         code = core_schema.literal_schema(list(KINDS))
         return core_schema.json_or_python_schema(
-            core_schema.no_info_after_validator_function(_kind_of, code),
+            core_schema.no_info_after_validator_function(KINDS.__getitem__, code),
             core_schema.is_instance_schema(IssueKind),
             serialization=core_schema.plain_serializer_function_ser_schema(
                 lambda kind: kind.code, return_schema=code, when_used="json"
