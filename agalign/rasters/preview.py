@@ -4,16 +4,19 @@ misalignment shows as colour.
 
 The JPEG has a column for each band of the sidecar, in its order, and these rows:
 
-    0  the raw files, each resized to the reference's file
-    1  the written bands; black for a band that was not written
-    2  a detail of row 0, where there are most edges, at the resolution of the reduced bands
-    3  the same detail of row 1
-    4  if error maps are written: the expected error, white for `ERROR_FULL_PX` and more
-    5  (4 without error maps) in the first column, if the capture has a relief: its parallax, white for the nearest
-    6  or the next row: the indices of the unaligned bands, a column for each, white for the upper end of the colours
+    before         the raw files, each resized to the reference's file
+    after          the written bands; black for a band that was not written
+    before_detail  a detail of the first row, where there are most edges, at the resolution of the reduced bands
+    after_detail   the same detail of the second row
+    error          if error maps are written: the expected error, white for `ERROR_FULL_PX` and more
+    relief         in the first column, if the capture has a relief: its parallax, white for the nearest
+    indices        if any: the indices of the unaligned bands, a column for each, white for the upper end of the colours
+
+`PreviewPart.rows` has their places.
 """
 
 from collections.abc import Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
@@ -144,22 +147,21 @@ def _sheet(
     first = next(images[n] for n in bands for images in (views.after, views.before) if n in images)
     x, y = busiest_window(first, detail_px)
     black = np.zeros(views.size_px[::-1], np.uint8)
-    before, after = ([images.get(n, black) for n in bands] for images in (views.before, views.after))
-    rows = [[_resized(image, tile_px) for image in images] for images in (before, after)]
-    rows += [[image[y : y + detail_px[1], x : x + detail_px[0]] for image in images] for images in (before, after)]
+    pictures: dict[str, list[Grey]] = {}
+    for when, by_band in (("before", views.before), ("after", views.after)):
+        images = [by_band.get(n, black) for n in bands]
+        pictures[when] = [_resized(image, tile_px) for image in images]
+        pictures[f"{when}_detail"] = [image[y : y + detail_px[1], x : x + detail_px[0]] for image in images]
     if errors_px:
-        errors = {name: np.nan_to_num(e / ERROR_FULL_PX, nan=1.0).clip(0, 1) * 255 for name, e in errors_px.items()}
-        rows.append([_resized(np.asarray(errors.get(n, black), np.uint8), tile_px) for n in bands])
+        errors = {n: np.nan_to_num(e / ERROR_FULL_PX, nan=1.0).clip(0, 1) * 255 for n, e in errors_px.items()}
+        pictures["error"] = [_resized(np.asarray(errors.get(n, black), np.uint8), tile_px) for n in bands]
     relief_part = None
     if relief is not None:
         grey, relief_part = _relief_tile(relief)
-        rows.append([_resized(grey, tile_px)])
-    if views.indices_before:
-        # Like the picture of the index of the aligned bands, which is not smoothed either.
-        rows.append([cv2.resize(i, tile_px, interpolation=cv2.INTER_NEAREST) for i in views.indices_before.values()])
-    strips = [np.hstack(row) for row in rows]
-    sheet_width = max(s.shape[1] for s in strips)
-    sheet = np.vstack([np.pad(s, ((0, 0), (0, sheet_width - s.shape[1]))) for s in strips])
+        pictures["relief"] = [_resized(grey, tile_px)]
+    # Like the picture of the index of the aligned bands, which is not smoothed either.
+    nearest = partial(cv2.resize, dsize=tile_px, interpolation=cv2.INTER_NEAREST)
+    pictures["indices"] = [nearest(image) for image in views.indices_before.values()]
     part = PreviewPart(
         file=name,
         tile_px=tile_px,
@@ -169,7 +171,12 @@ def _sheet(
         relief=relief_part,
         indices=list(views.indices_before),
     )
-    return part, np.asarray(sheet, np.uint8)
+    strips = {row: np.hstack(images) for row, images in pictures.items() if images}
+    *_, (last, _, last_height) = part.rows.values()
+    sheet = np.zeros((last + last_height, max(s.shape[1] for s in strips.values())), np.uint8)
+    for row, (top, _, row_height) in part.rows.items():
+        sheet[top : top + row_height, : strips[row].shape[1]] = strips[row]
+    return part, sheet
 
 
 def _relief_tile(relief: ReliefView) -> tuple[Grey, ReliefPreviewPart]:

@@ -11,6 +11,7 @@ the reference to a pixel of the moving band; `grid` samples the complete mapping
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
+from itertools import compress
 from typing import Annotated, Any, Literal, Self
 
 import numpy as np
@@ -543,6 +544,18 @@ class PreviewPart(_Part):
     """Picture of the relief."""
     indices: list[Name] = []
     """Indices of the unaligned bands, a column each; black and white are the ends of their colour scale."""
+
+    @property
+    def rows(self) -> dict[str, tuple[int, int, int]]:
+        """(top, width and height of a picture) of each row, px, by what it shows."""
+        of_file = ("before", "after", "before_detail", "after_detail", "error", "relief", "indices")
+        is_there = (True, True, True, True, self.error_full_px is not None, self.relief is not None, self.indices)
+        result, top = {}, 0
+        for name in compress(of_file, is_there):
+            width, height = self.detail_px if name.endswith("detail") else self.tile_px
+            result[name] = top, width, height
+            top += height
+        return result
 
 
 class Sidecar(_Part):

@@ -417,8 +417,8 @@ def _map_row(facts: dict[str, Any]) -> dict[str, Any]:
 def _preview(sidecar: Sidecar, folder: Path) -> dict[str, Any] | None:
     if sidecar.preview is None:
         return None
-    detail = [round(v, 5) for v in sidecar.preview.detail]
-    return sidecar.preview.model_dump() | {"file": _link(folder, sidecar.preview.file), "detail": detail}
+    detail, rows = [round(v, 5) for v in sidecar.preview.detail], sidecar.preview.rows
+    return sidecar.preview.model_dump() | {"file": _link(folder, sidecar.preview.file), "detail": detail, "rows": rows}
 
 
 def _link(folder: Path, name: str | None) -> str | None:

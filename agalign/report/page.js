@@ -21,7 +21,7 @@
  * @typedef {{file: string, tile_px: [number, number], detail_px: [number, number],
  *   detail: [number, number, number, number], error_full_px: number | null,
  *   relief: {parallax_px: [number, number], range_m: [number, number] | null} | null,
- *   indices: string[]}} Preview
+ *   indices: string[], rows: Record<string, [number, number, number]>}} Preview `rows` has top, width and height by what it shows.
  * @typedef {{label: string, captured_at: string, camera: string, status: string, shown: string, position: [number, number] | null,
  *   radiometry: string | null, altitude_m: number | null, missing: [string, string][], reference: string, seconds: number,
  *   crop: [number, number, number, number], scale: [number, number], stack: string | null, sidecar: string,
@@ -766,15 +766,12 @@ function showDetail() {
 }
 
 /**
- * Place of a picture on the sheet: x, y, width, height. Rows are those of agalign/rasters/preview.py.
- * @param {Preview} preview @param {number} column @param {number} line @returns {[number, number, number, number]}
+ * Place of a picture on the sheet: x, y, width, height.
+ * @param {Preview} preview @param {number} column @param {string} line @returns {[number, number, number, number]}
  */
 function onSheet(preview, column, line) {
-  const [w, h] = preview.tile_px;
-  const [dw, dh] = preview.detail_px;
-  if (line < 2) return [column * w, line * h, w, h];
-  if (line < 4) return [column * dw, 2 * h + (line - 2) * dh, dw, dh];
-  return [column * w, (line - 2) * h + 2 * dh, w, h];
+  const [top, width, height] = preview.rows[line];
+  return [column * width, top, width, height];
 }
 
 /** @param {number} share From far to near. */
@@ -794,7 +791,7 @@ function mixed(from, to, share) {
 
 /**
  * Grey pictures of a row of the sheet as the channels of one: each is dyed in its colour, and they add up.
- * @param {HTMLImageElement} sheet @param {Preview} preview @param {number} line
+ * @param {HTMLImageElement} sheet @param {Preview} preview @param {string} line
  * @param {Channel[]} channels
  */
 function compose(sheet, preview, line, channels) {
@@ -817,7 +814,7 @@ function compose(sheet, preview, line, channels) {
 
 /**
  * The composite of a row, made when it is first needed.
- * @param {number} line @param {Channel[]} channels
+ * @param {string} line @param {Channel[]} channels
  */
 function composed(line, channels) {
   const preview = look.capture?.preview;
@@ -828,11 +825,11 @@ function composed(line, channels) {
 }
 
 /**
- * A picture of the sheet in the colours of stops, made when it is first needed.
- * @param {Preview} preview @param {number} line @param {number} column @param {number[][]} stops
+ * A picture of the sheet in the colours of stops, made when it is first needed; null where the sheet has no such row.
+ * @param {Preview} preview @param {string} line @param {number} column @param {number[][]} stops
  */
 function dyed(preview, line, column, stops) {
-  if (look.sheet === null) return null;
+  if (look.sheet === null || !(line in preview.rows)) return null;
   const key = `stops ${line} ${column}`;
   look.composed[key] ??= inStops(look.sheet, onSheet(preview, column, line), stops);
   return look.composed[key];
@@ -917,15 +914,14 @@ function picture(pen, capture, when, origin, from, width) {
   const preview = /** @type {Preview} */ (capture.preview);
   const [frame, high] = [frameWidth(), stage.height];
   const columns = look.bands.map((name, i) => ({ column: capture.bands.findIndex((b) => b.band === name), colour: CHANNELS[i] }));
-  const line = when === "before" ? 0 : 1;
   /** @param {number} u @param {number} v Shares of the picture's sides. @returns {[number, number]} */
   const at = (u, v) => [origin + (u - look.x) * look.zoom * frame, (v - look.y) * look.zoom * high];
   pen.save();
   pen.beginPath();
   pen.rect(from, 0, width, high);
   pen.clip();
-  const whole = composed(line, columns);
-  const close = composed(line + 2, columns);
+  const whole = composed(when, columns);
+  const close = composed(`${when}_detail`, columns);
   if (whole) pen.drawImage(whole, ...at(0, 0), look.zoom * frame, look.zoom * high);
   const [x, y, w, h] = preview.detail;
   if (close && look.zoom > 1 && (look.zoom * frame) / preview.tile_px[0] > CLOSE_ENOUGH) {
@@ -949,7 +945,7 @@ function over(pen, capture, at) {
   else if (look.overlay === "vectors") overVectors(pen, capture, pair, at);
   else {
     const preview = capture.preview;
-    const made = look.overlay === "relief" ? relief(capture) : preview?.error_full_px ? dyed(preview, 4, column, [SMALL, LARGE]) : null;
+    const made = preview && (look.overlay === "relief" ? dyed(preview, "relief", 0, [FAR, NEAR]) : dyed(preview, "error", column, [SMALL, LARGE]));
     pen.globalAlpha = MAP_OPACITY;
     const [x, y] = at(0, 0);
     const [right, bottom] = at(1, 1);
@@ -1006,15 +1002,14 @@ function overIndex(pen, capture, at) {
 }
 
 /**
- * The index of the unaligned bands, in the last row of the sheet; nothing where there is none.
+ * The index of the unaligned bands; nothing where there is none.
  * @param {CanvasRenderingContext2D} pen @param {Capture} capture @param {(u: number, v: number) => [number, number]} at
  */
 function overIndexBefore(pen, capture, at) {
   const [preview, index] = [capture.preview, indexOf(capture)];
   const column = preview && index ? preview.indices.indexOf(index.name) : -1;
   if (!preview || !index || column < 0) return;
-  const line = 4 + Number(Boolean(preview.error_full_px)) + Number(preview.relief !== null);
-  const made = dyed(preview, line, column, index.raw ? NEUTRAL_STOPS : INDEX_STOPS);
+  const made = dyed(preview, "indices", column, index.raw ? NEUTRAL_STOPS : INDEX_STOPS);
   const [x, y] = at(0, 0);
   const [right, bottom] = at(1, 1);
   pen.globalAlpha = INDEX_OPACITY;
@@ -1095,16 +1090,6 @@ function edges(places) {
   /** @param {number} from @param {number | undefined} to @param {number} sign */
   const edge = (from, to, sign) => (to === undefined || Math.abs(to - from) > 3 * half ? from + sign * half : (from + to) / 2);
   return new Map(sorted.map((v, i) => [v, [edge(v, sorted[i - 1], -1), edge(v, sorted[i + 1], 1)]]));
-}
-
-/**
- * The relief in its colours; null where there is none.
- * @param {Capture} capture
- */
-function relief(capture) {
-  const preview = capture.preview;
-  if (!preview?.relief) return null;
-  return dyed(preview, preview.error_full_px ? 5 : 4, 0, [FAR, NEAR]);
 }
 
 /**
