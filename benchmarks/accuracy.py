@@ -139,6 +139,8 @@ def main(
         if any(name.lower().endswith(suffixes) for name in names)
     )
     folders = [f for f in folders if (f.name in sets if sets else (f / "ties.json").exists())]
+    if not folders:
+        raise SystemExit(f"{data}: no folder with images {'of these names' if sets else 'and ties.json'}")
     lines, undamaged = [], []
     if bands:
         print_head("set", "band", "status", "geometry", "", "p50, px", "p68", "p90", "> 1 px", "claim", "seconds")
