@@ -205,15 +205,13 @@ def _mosaic(patches: Tensor) -> tuple[NDArray[np.float32], int, int]:
     """Return (image, its columns, side of a cell): patches (N, 1, P, P) row by row in one image for OpenCV and
     scikit-image, each padded with its edge values.
     """
+    from skimage.util import montage
+
     margin = patches.shape[-1] // 8  # SIFT's outer cells extend beyond the edge of a patch by an eighth of its side
     padded = functional.pad(patches, [margin] * 4, mode="replicate")
     columns = max(1, math.ceil(math.sqrt(len(patches))))
     rows = max(1, math.ceil(len(patches) / columns))
-    side = padded.shape[-1]
-    sheet = padded.new_zeros((rows * columns, side, side))
-    sheet[: len(patches)] = padded[:, 0]
-    image = sheet.reshape(rows, columns, side, side).swapaxes(1, 2).reshape(rows * side, -1)
-    return np.asarray(image.numpy()), columns, side
+    return montage(padded[:, 0].numpy(), fill=0.0, grid_shape=(rows, columns)), columns, padded.shape[-1]
 
 
 def sift_of_patches(patches: Tensor) -> Tensor:
