@@ -318,7 +318,7 @@ class Capture:
     missing_bands: tuple[str, ...] = ()
     """Names of bands that other captures of its camera have."""
     unreadable_bands: Mapping[str, Reason] = field(default_factory=dict)
-    """Those of `missing_bands` with a file that cannot be read, and why."""
+    """Those of `missing_bands` with a file that cannot be read: `what` is wrong with it, and the `remedy`."""
     camera_bands: tuple[Band, ...] = ()
     """Bands of its camera, without files, in the order of the stacks; empty if they are those of the capture."""
     elevation_deg: float | None = None
