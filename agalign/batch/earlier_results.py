@@ -2,9 +2,7 @@
 which are of captures that the input no longer has.
 """
 
-import pickle
 import stat
-import zlib
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
@@ -36,6 +34,7 @@ from agalign.records.sidecar_file import (
     OtherSchemaError,
     find_sidecars,
     label_of,
+    read_sidecar,
     read_with_change,
     read_without_tables,
 )
@@ -69,12 +68,25 @@ def is_same(earlier: Sidecar, capture: Capture) -> bool | None:
     return not {*earlier.input_samples.values()}.isdisjoint(input_samples(capture).values())
 
 
+@dataclass(frozen=True)
+class _Compared:
+    """What is kept of a sidecar that was compared with its checksum."""
+
+    state: tuple[int, int, int]
+    """Size, time and number of its file."""
+    change: Reason | None
+    """Why it is not as it was written; empty if it is."""
+    files: tuple[FilePart, ...]
+    """The files that it lists."""
+
+
 class EarlierResults:
-    """The sidecars of earlier runs, each of which is read and compared with its checksum once unless it changes."""
+    """The sidecars of earlier runs. Each is compared with its checksum once unless it changes; what is kept of it are
+    facts, as the sidecars of a season would not fit into memory.
+    """
 
     def __init__(self) -> None:
-        self._read: dict[Path, tuple[tuple[int, int, int], bytes]] = {}
-        """State of the file, and the compressed result, 4 kB: those of a season fit into memory."""
+        self._compared: dict[Path, _Compared] = {}
         self.states: dict[str, str] = {}
         """States in which runs left the files of each capture, by label (`records.listed_files`)."""
 
@@ -87,19 +99,17 @@ class EarlierResults:
         with suppress(OSError):
             status = path.stat()
             state = status.st_size, status.st_mtime_ns, status.st_ino
-        known = self._read.get(path)
-        if known is None or known[0] != state:
-            sidecar, change = read_with_change(path)
-            packed = zlib.compress(pickle.dumps((sidecar.without_tables(), change)), 1)
-            known = self._read[path] = state, packed
-        result: tuple[Sidecar, Reason | None] = pickle.loads(zlib.decompress(known[1]))
-        return result
+        known = self._compared.get(path)
+        if known is not None and known.state == state:
+            return read_sidecar(path).without_tables(), known.change
+        sidecar, change = read_with_change(path)
+        self._compared[path] = _Compared(state, change, tuple(sidecar.files))
+        return sidecar.without_tables(), change
 
-    def files(self, path: Path) -> list[FilePart]:
-        """Return the files that a sidecar lists; none if it cannot be read."""
-        with suppress(SidecarError):
-            return self(path)[0].files
-        return []
+    def files(self, path: Path) -> Sequence[FilePart]:
+        """Return the files that a sidecar lists, as this run has read it before; none if it could not be read."""
+        known = self._compared.get(path)
+        return () if known is None else known.files
 
     def changed_files(self, label: str, folder: Path, parts: Sequence[FilePart]) -> list[FilePart]:
         """Return the files of a capture that are not as they were written, given the folder of its sidecar.
