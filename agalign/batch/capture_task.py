@@ -28,9 +28,9 @@ from agalign.pixels.capture_pixels import CapturePixels
 from agalign.pixels.radiometry import with_checked_pixels
 from agalign.pixels.raster import ReadTile, with_missing_parts, with_saturation_values
 from agalign.rasters.product import CapturePaths
+from agalign.rasters.read_alignment import alignments_of
 from agalign.records.sidecar import Sidecar
 from agalign.records.sidecar_file import read_with_change
-from agalign.values.alignment import Alignment
 from agalign.values.capture import Band, Capture
 from agalign.values.choices import RadiometryChoice
 
@@ -109,12 +109,13 @@ def process_capture(task: Task, progress: PairProgress = quiet) -> CaptureReport
     for product in PRODUCTS:
         if product.is_enabled(settings.write):
             product.check(capture)
-    sidecar, alignments = earlier, dict[str, Alignment]()
-    if sidecar is None or not (is_intact and task.is_estimated):
+    if earlier is not None and is_intact and task.is_estimated:
+        sidecar, alignments = earlier, alignments_of(earlier, path.parent)
+    else:
         model = None if task.model is None else loaded_model(task.model, settings.joint.device)
         sidecar, alignments = estimate(capture, out, settings, model, progress, earlier, read)
     progress(capture.reference.name, "writing", 0.0)
-    result = render(capture, out, settings, sidecar, task.rendering, alignments, read)
+    result = render(capture, out, settings, sidecar, alignments, task.rendering, read)
     lost = (*result.failures, *lost_reflectance(capture, settings.write.radiometry))
     return CaptureReport(
         capture.label,

@@ -15,7 +15,7 @@ from agalign.pixels.raster import ReadTile, read_tile
 from agalign.rasters.parallax_file import PARALLAX_KIND, PARALLAX_SUFFIX, write_parallax
 from agalign.rasters.product import CapturePaths
 from agalign.records.sidecar import Sidecar
-from agalign.records.sidecar_file import file_part, read_sidecar, write_sidecar
+from agalign.records.sidecar_file import file_part, write_sidecar
 from agalign.values.alignment import Alignment, relief_of
 from agalign.values.capture import Capture
 
@@ -31,9 +31,9 @@ def estimate(
 ) -> tuple[Sidecar, dict[str, Alignment]]:
     """Align the bands of a capture; write its sidecar, and its parallax if it has a relief.
 
-    Returns the sidecar as it was written, and the alignments.
+    Returns the sidecar and the alignments as a reader of the file has them: a later command renders the same bytes.
 
-    It lists the products of the `earlier` sidecar, which describe another estimate, until they are rendered again.
+    The sidecar lists the products of the `earlier` one, which describe another estimate, until they are rendered again.
     A parallax file without the mark of the program is kept.
     `read` reads the pixels of the files. Raises UnreadableFileError if the reference cannot be read, and OutputError.
     """
@@ -59,9 +59,9 @@ def estimate(
         options = {key: stage for key, stage in (result.options or {}).items() if key not in RENDER_STAGES}
         options |= {key: stage for key, stage in (earlier.options or {}).items() if key in RENDER_STAGES}
         facts |= {"products": earlier.products, "options": options}
-    write_sidecar(paths.sidecar, result.model_copy(update=facts))
+    written = write_sidecar(paths.sidecar, result.model_copy(update=facts))
     if relief is None and is_own_file(path):
         with suppress(OSError):
             path.unlink(missing_ok=True)
-    # With the decimals of the file: a later command renders the same bytes.
-    return read_sidecar(paths.sidecar), alignments
+    # Their mappings have the decimals of the file, and hold the positions of all pixels.
+    return written, written.alignments({name: alignment.mapping for name, alignment in alignments.items()})

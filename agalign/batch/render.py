@@ -24,7 +24,6 @@ from agalign.pixels.raster import ReadTile, read_tile
 from agalign.rasters.aligned_files import BandFiles, Stack
 from agalign.rasters.alignment_maps import ReliefMap, moved_share, share_over_1_px
 from agalign.rasters.output_grid import FlightLimits, output_layers
-from agalign.rasters.parallax_file import read_relief
 from agalign.rasters.preview import preview_bytes
 from agalign.rasters.product import CapturePaths, ProductContext
 from agalign.records.sidecar import (
@@ -88,15 +87,15 @@ def render(
     out: Path,
     settings: Settings,
     sidecar: Sidecar,
+    alignments: Mapping[str, Alignment],
     options: RenderOptions,
-    estimated: Mapping[str, Alignment] | None = None,
     read: ReadTile = read_tile,
 ) -> Rendering:
     """Write the products of an estimated capture, and its sidecar with them.
 
-    `capture` has the radiometry and the saturation values with which it is written. The mappings are those in the
-    sidecar; positions that the `estimated` ones hold are used again. `read` reads the pixels of the files. Raises
-    OutputError, UnreadableFileError for an image of the reference or the parallax, and InputError.
+    `capture` has the radiometry and the saturation values with which it is written, `alignments` are those of the
+    sidecar. `read` reads the pixels of the files. Raises OutputError, UnreadableFileError for an image of the
+    reference, and InputError.
     """
     began_s, paths = time.perf_counter(), CapturePaths.of(capture, out)
     write = with_earlier_products(settings.write, sidecar)
@@ -105,10 +104,6 @@ def render(
     gone = _gone_indices(sidecar, paths)
     if sidecar.rendered_with:  # a run that is killed now must render again
         sidecar = write_sidecar(paths.sidecar, sidecar.model_copy(update={"rendered_with": ""}))
-    alignments = {
-        name: _with_held_positions(alignment, (estimated or {}).get(name))
-        for name, alignment in sidecar.alignments(read_relief(sidecar, paths.folder)).items()
-    }
     whole = OutputGrid(0, 0, *capture.reference.size_px)
     context = ProductContext(
         capture, paths, settings, sidecar, alignments, (), whole, options.max_preview_bytes, options.limits, read=read
@@ -136,12 +131,6 @@ def _gone_indices(sidecar: Sidecar, paths: CapturePaths) -> list[FilePart]:
     parts = [part for part in sidecar.products if part.kind == "index"]
     gone = {part.file.removesuffix(".tif") for part in parts if part.file.endswith(".tif") and part.file not in here}
     return [part for part in parts if part.file.removesuffix(".tif").removesuffix(".png") in gone]
-
-
-def _with_held_positions(alignment: Alignment, estimated: Alignment | None) -> Alignment:
-    if estimated is None or not alignment.mapping.same_as(estimated.mapping):
-        return alignment
-    return replace(alignment, mapping=estimated.mapping)
 
 
 def _write_products(context: ProductContext) -> dict[str, str]:

@@ -4,9 +4,18 @@ from pathlib import Path
 
 from agalign.errors import NoSuchBandError, SidecarError
 from agalign.rasters.parallax_file import read_relief
+from agalign.records.sidecar import Sidecar
 from agalign.records.sidecar_file import read_sidecar
 from agalign.values.alignment import Alignment
 from agalign.values.arguments import checked
+
+
+def alignments_of(sidecar: Sidecar, folder: Path) -> dict[str, Alignment]:
+    """Return the alignments of the moving bands by name, given the folder of the sidecar.
+
+    Raises SidecarError and UnreadableFileError for the parallax map.
+    """
+    return sidecar.alignments(sidecar.mappings(read_relief(sidecar, folder)))
 
 
 @checked
@@ -48,10 +57,9 @@ def read_alignment(sidecar: str | Path, band: str) -> Alignment:
     moving = [b.band for b in content.bands if b.status != "reference"]
     if band not in moving:
         raise NoSuchBandError(f"{path}: no moving band {band!r}; choose from {', '.join(moving)}")
-    relief = read_relief(content, path.parent)
-    if relief is None and any(b.relief is not None for b in content.bands if b.band == band):
+    if content.parallax is None and any(b.relief is not None for b in content.bands if b.band == band):
         raise SidecarError(f"{path}: its parallax was not written; run again with --overwrite")
-    alignments = content.alignments(relief)
+    alignments = alignments_of(content, path.parent)
     if band not in alignments:
         raise SidecarError(f"{path}: has no mapping of the band {band!r}")
     return alignments[band]

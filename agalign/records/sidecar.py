@@ -378,19 +378,21 @@ class BandResult(_Part):
             seconds=alignment.seconds,
         )
 
-    def alignment(self, size_px: tuple[int, int], relief: Relief | None) -> Alignment:
-        """Return the alignment of a moving band with a mapping, given (width, height) of the reference and the relief
-        of the capture.
-        """
+    def mapping(self, relief: Relief | None) -> PixelMapping:
+        """Return the mapping of a moving band that has one, given the relief of the capture."""
         assert self.homography is not None
-        assert self.seed is not None
         fixed, moving = self.lenses or (None, None)
         parallax = None
         if self.relief is not None and relief is not None:
             parallax = Parallax(relief, self.relief.baseline).with_occlusions()
+        return PixelMapping(self.homography.fixed_to_moving, fixed, moving, field=self.field, parallax=parallax)
+
+    def alignment(self, size_px: Size, mapping: PixelMapping) -> Alignment:
+        """Return the alignment of a moving band, given (width, height) of the reference and the mapping of the band."""
+        assert self.seed is not None
         residual = None if self.metrics is None else self.metrics.windows
         return Alignment(
-            PixelMapping(self.homography.fixed_to_moving, fixed, moving, field=self.field, parallax=parallax),
+            mapping,
             size_px,
             self.issues,
             self.seed,
@@ -402,7 +404,7 @@ class BandResult(_Part):
             held_out_p95_px={} if self.geometry is None else self.geometry.held_out_p95_px,
             prediction=self.prediction,
             is_seed_usable=self.status == "seed_only",
-            error=None if self.error is None else self.error.mapping_error(size_px, residual, parallax),
+            error=None if self.error is None else self.error.mapping_error(size_px, residual, mapping.parallax),
             std_px=math.inf if self.error is None else self.error.std_px,
             moving_size_px=self.size_px,
         )
@@ -694,10 +696,14 @@ class Sidecar(_Part):
         """All files of the capture."""
         return [*self.products, *([] if self.parallax is None else [self.parallax])]
 
-    def alignments(self, relief: Relief | None) -> dict[str, Alignment]:
-        """Return the alignments of the moving bands by name, given the relief of the capture."""
-        moving = [b for b in self.bands if b.homography is not None and b.seed is not None]
-        return {b.band: b.alignment(self.reference.size_px, relief) for b in moving}
+    def mappings(self, relief: Relief | None) -> dict[str, PixelMapping]:
+        """Return the mappings of the moving bands by name, given the relief of the capture."""
+        return {b.band: b.mapping(relief) for b in self.bands if b.homography is not None and b.seed is not None}
+
+    def alignments(self, mappings: Mapping[str, PixelMapping]) -> dict[str, Alignment]:
+        """Return the alignments of the moving bands by name, given their mappings."""
+        size_px = self.reference.size_px
+        return {b.band: b.alignment(size_px, mappings[b.band]) for b in self.bands if b.band in mappings}
 
     @classmethod
     def json_schema(cls) -> dict[str, Any]:

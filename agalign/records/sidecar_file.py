@@ -24,11 +24,15 @@ _MAX_QUOTED = 60
 
 
 def write_sidecar(path: Path, sidecar: Sidecar) -> Sidecar:
-    """Write a sidecar atomically, and return it with its checksum. Raises OutputError."""
+    """Write a sidecar atomically, and return it as a reader of the file has it: with its decimals and its checksum.
+
+    Raises OutputError, and SidecarError for values that no sidecar can have.
+    """
     checksum = content_checksum(sidecar.model_dump_json(by_alias=True))
-    complete = sidecar.model_copy(update={"checksum": checksum})
-    write_text(path, compact_lists(complete.model_dump_json(by_alias=True, indent=1)))
-    return complete
+    text = sidecar.model_copy(update={"checksum": checksum}).model_dump_json(by_alias=True, indent=1)
+    in_file = _parsed(path, text.encode())
+    write_text(path, compact_lists(text))
+    return in_file
 
 
 def file_part(kind: str, path: Path, folder: Path) -> FilePart:

@@ -67,11 +67,6 @@ class DisplacementField:
         values = [map_coordinates(plane, at, order=3, mode="nearest") for plane in planes]
         return self.scale.inverse.displacements(np.stack(values, axis=-1).reshape(points.shape))
 
-    def same_as(self, other: "DisplacementField") -> bool:
-        """Return True if two fields are equal in every number."""
-        steps = (self.step_px, self.scale) == (other.step_px, other.scale)
-        return steps and np.array_equal(self.displacements_px, other.displacements_px)
-
     def rescaled(self, scale: PixelScale) -> "DisplacementField":
         """The same on an image that is resized by `scale`."""
         return replace(self, scale=self.scale.over(scale))
@@ -190,19 +185,6 @@ class PixelMapping:
         if size_px[0] * size_px[1] <= MAX_HELD_POSITIONS_PX and self.held is None:
             held = HeldPositions(size_px, self.positions(Tile(0, 0, *size_px), np.float32))
             object.__setattr__(self, "held", held)
-
-    def same_as(self, other: "PixelMapping") -> bool:
-        """Return True if two mappings are equal in every number."""
-        parts = (
-            (m.fixed_lens, m.moving_lens, m.pre_distortion, m.field is None, m.parallax is None) for m in (self, other)
-        )
-        if len({*parts}) > 1 or not np.array_equal(self.fixed_to_moving, other.fixed_to_moving):
-            return False
-        if self.field is not None and other.field is not None and not self.field.same_as(other.field):
-            return False
-        if self.parallax is None or other.parallax is None:
-            return True
-        return self.parallax.same_as(other.parallax)
 
     def is_smooth(self, tile: Tile) -> bool:
         """True without parallax, and if the horizon of the homography does not cross the tile."""

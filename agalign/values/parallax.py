@@ -81,9 +81,12 @@ class Relief:
     def on_pixels(self, size_px: Size) -> "Relief":
         """The same at the pixels of the image on which it is evaluated, of (width, height), as it is written."""
         x_px, y_px = (np.arange(n, dtype=np.float64) for n in size_px)
-        confidence = replace(self, parallax_px=self.confidence, unit=1.0).at_crossings(x_px, y_px)
-        std_px = None if self.std_px is None else replace(self, parallax_px=self.std_px).at_crossings(x_px, y_px)
-        return Relief(rounded(self.at_crossings(x_px, y_px)), confidence, std_px=std_px)
+
+        def written(layer: FloatImage, unit: float) -> FloatImage:
+            return rounded(replace(self, parallax_px=layer, unit=unit).at_crossings(x_px, y_px))
+
+        std_px = None if self.std_px is None else written(self.std_px, self.unit)
+        return Relief(written(self.parallax_px, self.unit), written(self.confidence, 1.0), std_px=std_px)
 
     def rescaled(self, scale: PixelScale) -> "Relief":
         """The same on an image that is resized by `scale`."""
@@ -127,12 +130,6 @@ class Parallax:
         is_large = statistics[:, cv2.CC_STAT_AREA] >= min_area_px
         is_large[0] = False  # the background
         return replace(self, hidden=np.asarray(is_large[labels]))
-
-    def same_as(self, other: "Parallax") -> bool:
-        """Return True if two parallaxes displace the band equally, in every number."""
-        one, two = self.relief, other.relief
-        scales = (self.baseline, one.scale, one.unit) == (other.baseline, two.scale, two.unit)
-        return scales and np.array_equal(one.parallax_px, two.parallax_px)
 
     def hides(self, x_px: NDArray[np.float64], y_px: NDArray[np.float64]) -> Mask:
         """True where raw points of the reference are occluded in the band.

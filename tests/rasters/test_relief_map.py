@@ -27,10 +27,12 @@ from agalign.synthetic import cameras
 from agalign.values import geometry
 from agalign.values.alignment import Alignment
 from agalign.values.capture import Band, Capture
+from agalign.values.equality import equal
 from agalign.values.geometry import PairScales
 from agalign.values.image import OutputGrid, Tile
 from agalign.values.issues import RETRIEVAL, Issue
 from agalign.values.mapping import DisplacementField, PixelMapping
+from agalign.values.mapping_error import MappingError
 from agalign.values.parallax import Parallax, Relief
 from agalign.values.pixel_units import PixelScale
 
@@ -362,6 +364,31 @@ def test_an_alignment_with_relief_warps_to_the_bytes_of_a_stack(run: Run, tmp_pa
     alignments = run.on_hill(decimals=2) if crop == "common" else run.with_relief(box())
     assert (alignments["NIR"].mapping.hidden(Tile(0, 0, *SIZE)).sum() > 500) == (crop == "none")
     assert assert_same_as_stack(run.write(tmp_path, alignments, crop=crop), run.capture.reference.path.parent) == 4
+
+
+def test_the_sidecar_renders_the_same_bytes_again(run: Run, tmp_path: Path) -> None:
+    """Shifts of windows, parallax and its standard error have more decimals in memory than in files."""
+    rng, alignments = np.random.default_rng(1), {}
+    parallax_px, confidence, std_px = rng.random((3, *SIZE[::-1]), np.float32)
+    relief = Relief(parallax_px, confidence, std_px=std_px).on_pixels(SIZE)
+    for name, alignment in run.on_hill().items():
+        parallax = Parallax(relief, alignment.mapping.parallax.baseline).with_occlusions()
+        residual = residual_of(rng.random((9, 2)) * SIZE, rng.standard_normal((9, 2)) / 3)
+        error = MappingError(SIZE, np.eye(8) / 30, residual, parallax=parallax)
+        alignments[name] = replace(
+            alignment, mapping=alignment.mapping.with_parallax(parallax), residual=residual, error=error, std_px=0.3
+        )
+    added = {"relief_map": True, "error_map": True, "qa": True}
+    sidecar = run.write(tmp_path, alignments, **added)
+    for name, alignment in alignments.items():
+        assert equal(agalign.read_alignment(sidecar, name).mapping, alignment.mapping)
+    before = {path: path.read_bytes() for path in tmp_path.rglob("*.tif")}
+    assert len(before) == 5
+    for path in before.keys() - {sidecar.with_suffix(".parallax.tif")}:
+        path.unlink()
+    chosen = agalign.Settings(write=agalign.WriteSettings(crop="none", **added))
+    batch.process_capture(batch.Task(run.capture, tmp_path, chosen, is_estimated=True))
+    assert [path.name for path, data in before.items() if path.read_bytes() != data] == []
 
 
 def test_a_range_on_a_finer_grid(run: Run) -> None:

@@ -169,7 +169,7 @@ def test_a_band_is_delivered_by_the_standard_error_that_is_written(
     reference, nir = (Band(name, Path(f"{name}.tif"), 1, 64, 48, "uint16") for name in ("Green", "NIR"))
     capture = Capture("a", Path(), (reference, nir), 0)
     written = BandResult.model_validate_json(BandResult.of(nir, estimated, capture).model_dump_json(by_alias=True))
-    again = written.alignment((64, 48), None)
+    again = written.alignment((64, 48), written.mapping(None))
     assert again.prediction.std_px == estimated.prediction.std_px
     assert again.status == estimated.status == written.status == "predicted"
     assert [known.is_usable(accept_px) for known in (estimated, written, again)] == [is_usable] * 3
@@ -225,7 +225,7 @@ def test_areas_that_moved_are_equal_in_the_run_and_in_its_sidecar() -> None:
     reference, nir = (Band(name, Path(f"{name}.tif"), 1, 64, 48, "uint16") for name in ("Green", "NIR"))
     capture = Capture("a", Path(), (reference, nir), 0)
     written = BandResult.model_validate_json(BandResult.of(nir, estimated, capture).model_dump_json(by_alias=True))
-    again = written.alignment((64, 48), None)
+    again = written.alignment((64, 48), written.mapping(None))
     assert again.error.moved == (area,)
     assert np.array_equal(again.error_map_px, estimated.error_map_px)
     assert again.error_map_px.max() == pytest.approx(1.7 * np.hypot(8.123456, 1.0), abs=1e-3)
