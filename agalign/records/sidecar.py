@@ -70,6 +70,14 @@ SampledPx = Annotated[NDArray[np.float64], Array((None, 2), 3)]
 Slopes = Annotated[NDArray[np.float64], Array((None, 2), 5)]
 Curvatures = Annotated[NDArray[np.float64], Array((None, 2), 7)]
 """They are multiplied by the parallax and by its square: 0.0005 px of rounding each for 100 px."""
+_SAME_IN_ALIGNMENT = "issues", "seed", "joint", "prediction", "seconds"
+"""What a band has as its alignment has it; the rest has other names in a file, or is divided differently."""
+_SAME_IN_ERROR = "covariance_px2", "rig_std_px", "lens_std_px", "field_std_px", "relief_std_px", "moved"
+"""What the entry of an error has as the error has it."""
+
+
+def _values(record: object, names: Iterable[str]) -> dict[str, Any]:
+    return {name: getattr(record, name) for name in names}
 
 
 class _Part(BaseModel):
@@ -251,30 +259,12 @@ class ErrorPart(_Part):
         error = alignment.error
         if error is None or not math.isfinite(alignment.std_px):
             return None
-        return cls(
-            std_px=alignment.std_px,
-            std_band_px=alignment.std_band_px,
-            covariance_px2=error.covariance_px2,
-            rig_std_px=error.rig_std_px,
-            lens_std_px=error.lens_std_px,
-            field_std_px=error.field_std_px,
-            relief_std_px=error.relief_std_px,
-            moved=error.moved,
-        )
+        return cls(std_px=alignment.std_px, std_band_px=alignment.std_band_px, **_values(error, _SAME_IN_ERROR))
 
     def mapping_error(self, size_px: Size, windows: Residual | None, parallax: Parallax | None) -> MappingError:
         """Return the error of a mapping of a reference (width, height), with the windows and parallax of the band."""
-        return MappingError(
-            size_px,
-            self.covariance_px2,
-            None if self.covariance_px2 is None else windows,
-            self.rig_std_px,
-            self.lens_std_px,
-            self.field_std_px,
-            self.relief_std_px,
-            parallax,
-            self.moved,
-        )
+        windows = None if self.covariance_px2 is None else windows
+        return MappingError(size_px, windows=windows, parallax=parallax, **_values(self, _SAME_IN_ERROR))
 
 
 class PlacePart(_Part):
@@ -363,19 +353,15 @@ class BandResult(_Part):
             **_source(capture, band),
             status=alignment.status,
             reason=alignment.reason,
-            issues=alignment.issues,
             homography=HomographyPart(fixed_to_moving=mapping.fixed_to_moving, space=alignment.space),
             lenses=None if fixed is None or moving is None else (fixed, moving),
             field=mapping.field,
             grid=GridPart(reference_px=grid_px, moving_px=mapping(grid_px)),
             relief=relief,
-            seed=alignment.seed,
-            joint=alignment.joint,
             metrics=MetricsPart(before=alignment.before, after=_after(alignment), windows=alignment.residual),
             geometry=GeometryPart(kind=alignment.geometry, held_out_p95_px=dict(alignment.held_out_p95_px)),
-            prediction=alignment.prediction,
             error=ErrorPart.of(alignment),
-            seconds=alignment.seconds,
+            **_values(alignment, _SAME_IN_ALIGNMENT),
         )
 
     def mapping(self, relief: Relief | None) -> PixelMapping:
@@ -394,19 +380,15 @@ class BandResult(_Part):
         return Alignment(
             mapping,
             size_px,
-            self.issues,
-            self.seed,
-            joint=self.joint,
             residual=residual,
-            seconds=self.seconds,
             before=Similarity() if self.metrics is None else self.metrics.before,
             after=Similarity() if self.metrics is None else self.metrics.after,
             held_out_p95_px={} if self.geometry is None else self.geometry.held_out_p95_px,
-            prediction=self.prediction,
             is_seed_usable=self.status == "seed_only",
             error=None if self.error is None else self.error.mapping_error(size_px, residual, mapping.parallax),
             std_px=math.inf if self.error is None else self.error.std_px,
             moving_size_px=self.size_px,
+            **_values(self, _SAME_IN_ALIGNMENT),
         )
 
     def is_usable(self, accept_predicted_px: float) -> bool:
