@@ -19,6 +19,7 @@ from agalign.records.captures import bands_of
 from agalign.records.cautions import RunFacts
 from agalign.records.sidecar_file import content_checksum, find_sidecars, read_sidecar, verify_outputs
 from agalign.values.alignment import Alignment
+from agalign.values.fields import POSITION_DECIMALS
 from agalign.values.mapping import DisplacementField
 from agalign.values.mapping_error import MappingError
 
@@ -93,11 +94,12 @@ def test_other_options_render_the_bytes_of_a_direct_run(
 
 
 def with_field(run: Run) -> dict[str, Alignment]:
-    """Alignments with a displacement field and numbers of many digits, which a sidecar rounds."""
+    """Alignments with a displacement field, and numbers of many digits, which a sidecar rounds."""
     rng = np.random.default_rng(0)
     result = {}
     for name, alignment in run.alignments.items():
-        mapping = replace(alignment.mapping, parallax=None, field=DisplacementField(48.0, rng.normal(0, 1, (6, 7, 2))))
+        field = DisplacementField(48.0, rng.normal(0, 1, (6, 7, 2)).round(POSITION_DECIMALS))
+        mapping = replace(alignment.mapping, parallax=None, field=field)
         centres_px = rng.uniform((0, 0), SIZE, (30, 2))
         residual = residual_of(centres_px, rng.normal(0, 0.1, (30, 2)), sigma=17.123456)
         joint = joint_result(std_px=0.0512345678, covariance=np.diag(rng.uniform(0, 0.01, 8)))
@@ -122,7 +124,7 @@ def alignments_of(run: Run, kind: str) -> dict[str, Alignment]:
     if kind == "field":
         return with_field(run)
     rng = np.random.default_rng(1)
-    hill = run.on_hill(decimals=6 if kind == "relief" else 2)
+    hill = run.on_hill()
     joint = joint_result(std_px=0.0512345678)
     result = {}
     for name, alignment in hill.items():
