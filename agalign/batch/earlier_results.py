@@ -75,7 +75,7 @@ class _Compared:
     state: tuple[int, int, int]
     """Size, time and number of its file."""
     change: Reason | None
-    """Why it is not as it was written; empty if it is."""
+    """Why it is not as it was written; None if it is."""
     files: tuple[FilePart, ...]
     """The files that it lists."""
 
