@@ -13,8 +13,8 @@ from numpy.typing import ArrayLike, NDArray  # the former in quotes: help() prin
 
 from agalign.batch.capture_report import CaptureReport, FlightReports
 from agalign.batch.capture_task import Task, process_capture, quiet
-from agalign.batch.earlier_results import refuse_other_captures
 from agalign.batch.index_run import index_tasks, run_indices
+from agalign.batch.output_files import refuse_results_elsewhere
 from agalign.batch.run import Listener, run_flight
 from agalign.cameras.discover import FolderScan, discover, mosaics_onto
 from agalign.capture.align_bands import align_pairs
@@ -241,7 +241,7 @@ def align_capture(capture: Capture, out: str | Path, *, settings: Settings | Non
         what = "the sky" if sky else "a calibration panel"
         raise InputError(f"{capture.label}: shows {what}; align another capture, or all with align_panels=True")
     prepare_output(Path(out))
-    refuse_other_captures([capture], Path(out))
+    refuse_results_elsewhere([capture], Path(out))
     return process_capture(Task(with_radiometry(capture, settings.write.radiometry, {}), Path(out), settings))
 
 

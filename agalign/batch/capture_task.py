@@ -6,22 +6,21 @@ from collections import defaultdict
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
-from functools import lru_cache, partial
+from functools import cache, lru_cache, partial
 from itertools import pairwise
 from pathlib import Path
 
 from agalign.batch.capture_report import CaptureReport
 from agalign.batch.estimate import estimate
-from agalign.batch.output_files import refuse_to_overwrite
+from agalign.batch.output_files import earlier_result, refuse_to_overwrite
 from agalign.batch.products import PRODUCTS
 from agalign.batch.render import RenderOptions, render
 from agalign.batch.workers import failure_text
 from agalign.capture.align_bands import PairProgress
 from agalign.config import Settings, WriteSettings
-from agalign.errors import InputError, SidecarError, UnreadableFileError
+from agalign.errors import InputError, UnreadableFileError
 from agalign.flight.model import FlightModel, load_model
 from agalign.host.files import written_below
-from agalign.host.own_files import is_own_file
 from agalign.host.process_pool import A, R
 from agalign.method.device import choose_device, keep_freed_memory, one_memory_error, one_thread
 from agalign.pixels.capture_pixels import CapturePixels
@@ -29,7 +28,6 @@ from agalign.pixels.radiometry import with_checked_pixels
 from agalign.pixels.raster import ReadTile, with_missing_parts, with_saturation_values
 from agalign.rasters.product import CapturePaths
 from agalign.rasters.read_alignment import alignments_of
-from agalign.records.sidecar import Sidecar
 from agalign.records.sidecar_file import read_with_change
 from agalign.values.capture import Band, Capture
 from agalign.values.choices import RadiometryChoice
@@ -96,12 +94,10 @@ def process_capture(task: Task, progress: PairProgress = quiet) -> CaptureReport
     installation lacks what a product needs, and OutputError.
     """
     began_s, settings, out = time.perf_counter(), task.settings, task.out
-    read = CapturePixels().read
+    read, path, once = CapturePixels().read, CapturePaths.of(task.capture, out).sidecar, cache(read_with_change)
+    refuse_to_overwrite([task.capture], out, settings.write, once)
+    earlier, is_intact = earlier_result(path, once)
     capture = with_saturation_values(with_missing_parts(task.capture, read), read)
-    path = CapturePaths.of(capture, out).sidecar
-    earlier, is_intact = _earlier(path)
-    listed = [] if earlier is None else earlier.files
-    refuse_to_overwrite([capture], out, settings.write, {path: listed})
     if missing := missing_lens(capture, settings.write) or missing_radiometry(capture, settings.write.radiometry):
         raise InputError(f"{capture.reference.path}: {missing}")
     if settings.write.radiometry != "off":
@@ -136,18 +132,6 @@ def _checked(band: Band, read: ReadTile) -> Band:
     with suppress(UnreadableFileError):
         return with_checked_pixels(band, read)
     return band
-
-
-def _earlier(path: Path) -> tuple[Sidecar | None, bool]:
-    """Return the sidecar of an earlier run, None if it cannot be read, and whether it is as it was written.
-
-    A changed one lists only files with the mark of the program: the next sidecar confirms no others.
-    """
-    with suppress(SidecarError):
-        sidecar, change = read_with_change(path)
-        own = [part for part in sidecar.products if not change or is_own_file(path.parent / part.file)]
-        return sidecar.model_copy(update={"products": own}), not change
-    return None, False
 
 
 def missing_lens(capture: Capture, settings: WriteSettings) -> str:

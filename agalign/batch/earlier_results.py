@@ -1,21 +1,20 @@
-"""Results of earlier runs in the output folder: whether they are of the same captures, what has changed since, and
-which are of captures that the input no longer has.
+"""Results of earlier runs in the output folder: what has changed since, and which are of captures that the input no
+longer has.
 """
 
 import stat
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
-from datetime import timedelta
-from itertools import chain
 from pathlib import Path
 from typing import Literal
 
 from agalign._version import __version__
+from agalign.batch.output_files import is_same
 from agalign.batch.render import with_earlier_products
 from agalign.cameras.discover import FolderScan
 from agalign.config import RunOptions, Settings, SettingsModel
-from agalign.errors import ConfigurationError, Reason, SidecarError, UnreadableFileError
+from agalign.errors import Reason, SidecarError, UnreadableFileError
 from agalign.flight.fingerprint import (
     RENDER_STAGES,
     estimation_fingerprint,
@@ -30,63 +29,23 @@ from agalign.rasters.product import CapturePaths
 from agalign.records.listed_files import file_problem, states_of
 from agalign.records.run_record import NotInInputPart, RunPart
 from agalign.records.sidecar import FilePart, Sidecar, capture_status
-from agalign.records.sidecar_file import (
-    OtherSchemaError,
-    find_sidecars,
-    label_of,
-    read_sidecar,
-    read_with_change,
-    read_without_tables,
-)
+from agalign.records.sidecar_file import find_sidecars, label_of, read_sidecar, read_with_change, read_without_tables
 from agalign.spectral_indices.rasters import index_rasters
-from agalign.values.capture import Band, Capture, CaptureTime
+from agalign.values.capture import Band, Capture
 from agalign.values.image import Tile
 from agalign.values.resampling import tiles
 
-_MAX_APART = timedelta(seconds=1)
-"""The bands of a capture are exposed within 0.3 s, and its time is that of the reference, which an option chooses."""
 _DAMAGED = "the sidecar (edited or damaged)"
 
 
-def is_same(earlier: Sidecar, capture: Capture) -> bool | None:
-    """Return whether a result is of this capture; None if neither tags nor contents decide.
-
-    Tags that both have are compared: make, model, serial numbers, capture id, time. If there is no id and no time, the
-    contents of a file must be equal; others may have been repaired.
-    """
-    one, other = earlier.camera, capture.camera
-    pairs = (one.make, other.make), (one.model, other.model), (earlier.capture_id, capture.capture_id)
-    if any(a and b and a != b for a, b in pairs) or (one.serials and other.serials and not one.serials & other.serials):
-        return False
-    if earlier.captured_at and capture.captured_at and earlier.captured_at != capture.captured_at:
-        before, now = CaptureTime.of(earlier.captured_at), CaptureTime.of(capture.captured_at)
-        return before is not None and now is not None and abs(before.utc - now.utc) <= _MAX_APART
-    if (earlier.capture_id and capture.capture_id) or (earlier.captured_at and capture.captured_at):
-        return True
-    if not earlier.input_samples:
-        return None
-    return not {*earlier.input_samples.values()}.isdisjoint(input_samples(capture).values())
-
-
-@dataclass(frozen=True)
-class _Compared:
-    """What is kept of a sidecar that was compared with its checksum."""
-
-    state: tuple[int, int, int]
-    """Size, time and number of its file."""
-    change: Reason | None
-    """Why it is not as it was written; None if it is."""
-    files: tuple[FilePart, ...]
-    """The files that it lists."""
-
-
 class EarlierResults:
-    """The sidecars of earlier runs. Each is compared with its checksum once unless it changes; what is kept of it are
-    facts, as the sidecars of a season would not fit into memory.
+    """The sidecars of earlier runs. Each is compared with its checksum once unless it changes; those of a season would
+    not fit into memory.
     """
 
     def __init__(self) -> None:
-        self._compared: dict[Path, _Compared] = {}
+        self._changes: dict[Path, tuple[tuple[int, int, int], Reason | None]] = {}
+        """Size, time and number of each file, and why it is not as it was written; None if it is."""
         self.states: dict[str, str] = {}
         """States in which runs left the files of each capture, by label (`records.listed_files`)."""
 
@@ -99,17 +58,12 @@ class EarlierResults:
         with suppress(OSError):
             status = path.stat()
             state = status.st_size, status.st_mtime_ns, status.st_ino
-        known = self._compared.get(path)
-        if known is not None and known.state == state:
-            return read_sidecar(path).without_tables(), known.change
+        known = self._changes.get(path)
+        if known is not None and known[0] == state:
+            return read_sidecar(path).without_tables(), known[1]
         sidecar, change = read_with_change(path)
-        self._compared[path] = _Compared(state, change, tuple(sidecar.files))
+        self._changes[path] = state, change
         return sidecar.without_tables(), change
-
-    def files(self, path: Path) -> Sequence[FilePart]:
-        """Return the files that a sidecar lists, as this run has read it before; none if it could not be read."""
-        known = self._compared.get(path)
-        return () if known is None else known.files
 
     def changed_files(self, label: str, folder: Path, parts: Sequence[FilePart]) -> list[FilePart]:
         """Return the files of a capture that are not as they were written, given the folder of its sidecar.
@@ -120,44 +74,6 @@ class EarlierResults:
         changed = [part for part in parts if file_problem(folder / part.file, part, known)]
         self.states[label] = " ".join(known.union(states_of(folder, [part for part in parts if part not in changed])))
         return changed
-
-
-def refuse_other_captures(
-    captures: Sequence[Capture], out: Path, results: EarlierResults | None = None, *, is_same_input: bool = False
-) -> None:
-    """Raise ConfigurationError if the place of a capture has the result of another one or of a version with another
-    schema, or if another place has its result, as of a run on the folder above. With the input folder of the last run,
-    the images were moved in it instead.
-    """
-    results = results or EarlierResults()
-    places = {CapturePaths.of(c, out).sidecar: c for c in captures}
-    by_name: dict[str, list[Capture]] = {}
-    for capture in captures:
-        by_name.setdefault(capture.name, []).append(capture)
-    elsewhere = [] if is_same_input else [p for p in out.rglob("*.json") if p.stem in by_name and p not in places]
-    for path, here in chain(places.items(), ((p, c) for p in elsewhere for c in by_name[p.stem])):
-        try:
-            earlier, _ = results(path)
-        except OtherSchemaError as error:
-            raise ConfigurationError(str(error)) from None
-        except SidecarError:
-            continue
-        if is_same(earlier, here) is not (path not in places):
-            continue
-        facts = f"({_described(earlier)}; here {_described(here)})"
-        what = f"belongs to a different capture from {here.label} here {facts}"
-        if path not in places:
-            what = f"is of the same capture as {here.label} here, by a run on a folder above or below the one here"
-        raise ConfigurationError(f"{path}: {what}; choose another output folder with -o")
-
-
-def _described(capture: Capture | Sidecar) -> str:
-    """Camera, time and id, as far as they are known."""
-    camera = capture.camera
-    name = " ".join(filter(None, (camera.make, camera.model, camera.serial)))
-    time = capture.captured_at if isinstance(capture, Sidecar) else capture.known_time
-    known = filter(None, (name, time, capture.capture_id))
-    return ", ".join(known) or "without tags"
 
 
 @dataclass(frozen=True)

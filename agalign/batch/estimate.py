@@ -5,12 +5,12 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
+from agalign.batch.output_files import is_removed
 from agalign.cameras.metadata import exposed_after_s
 from agalign.capture.align_bands import PairProgress, align_capture_bands
 from agalign.config import Settings
 from agalign.flight.fingerprint import RENDER_STAGES, input_digests, input_samples, input_states
 from agalign.flight.model import FlightModel
-from agalign.host.own_files import is_own_file
 from agalign.pixels.raster import ReadTile, read_tile
 from agalign.rasters.parallax_file import PARALLAX_KIND, PARALLAX_SUFFIX, write_parallax
 from agalign.rasters.product import CapturePaths
@@ -60,7 +60,7 @@ def estimate(
         options |= {key: stage for key, stage in (earlier.options or {}).items() if key in RENDER_STAGES}
         facts |= {"products": earlier.products, "options": options}
     written = write_sidecar(paths.sidecar, result.model_copy(update=facts))
-    if relief is None and is_own_file(path):
+    if relief is None and is_removed(path, {}):
         with suppress(OSError):
             path.unlink(missing_ok=True)
     # Their mappings have the decimals of the file, and hold the positions of all pixels.

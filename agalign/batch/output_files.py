@@ -1,76 +1,245 @@
-"""Files of earlier commands in the output folder: which of them a run may replace or remove.
+"""What a run does with the path of an output: write, remove, keep or refuse it, by what is there.
 
-These are files that the sidecar of the capture lists, and files with the mark of the program (`host/own_files.py`).
-Others are kept, whatever their names.
+`State` is the table. It is asked before a run, before each capture, which a worker may process much later, and after a
+capture was rendered or skipped. A run touches no other files of captures. The lock (`host/output_folder.py`) and the
+rasters of an index (`spectral_indices/rasters.py`), which may be in another folder, are checked where they are written.
 """
 
 import os
 import re
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
+from datetime import timedelta
+from enum import Enum
 from pathlib import Path
+from typing import Literal
 
 from agalign.batch.products import PRODUCTS
 from agalign.config import WriteSettings
-from agalign.errors import ConfigurationError, OutputError, SidecarError
-from agalign.host.files import check_inside, max_name_bytes, remove_companions
+from agalign.errors import ConfigurationError, OutputError, Reason, SidecarError
+from agalign.flight.fingerprint import input_samples
+from agalign.host.files import RUN_FILE, check_inside, max_name_bytes, remove_companions
 from agalign.host.own_files import is_own_file
 from agalign.rasters.aligned_files import band_file_names, is_aligned_raster
 from agalign.rasters.parallax_file import PARALLAX_SUFFIX
 from agalign.rasters.product import CapturePaths
 from agalign.records.run_record import file_states
-from agalign.records.sidecar import FilePart
-from agalign.records.sidecar_file import is_sidecar, read_checked
+from agalign.records.sidecar import FilePart, Sidecar
+from agalign.records.sidecar_file import OtherSchemaError, find_sidecars, is_sidecar, read_with_change
 from agalign.spectral_indices.rasters import index_rasters
-from agalign.values.capture import Capture
+from agalign.values.capture import Capture, CaptureTime
+
+_Action = Literal["write", "remove", "keep", "refuse"]
 
 
-def paths_written(capture: Capture, out: Path, settings: WriteSettings) -> list[Path]:
-    """Return the paths of all files that a run with these settings may write or remove for a capture."""
-    paths = CapturePaths.of(capture, out)
-    own = [paths.sidecar, paths.file(PARALLAX_SUFFIX)]
-    return [*own, *(p for product in PRODUCTS for p in product.paths(capture, paths, settings))]
+class State(Enum):
+    """What is at the path of an output; what a run does that writes the output, and one that does not, because of other
+    options or because it does not align the capture. A written file replaces the one there.
+    """
+
+    NO_FILE = "no file", "write", "keep"
+    SIDECAR = "sidecar of the capture, also edited or unreadable", "write", "remove"
+    AS_LISTED = "in a sidecar that was not edited, with this size", "write", "remove"
+    WITH_MARK = "file with the mark of the program, or empty", "write", "remove"
+    CHANGED = "listed with another size, without mark; other JSON where a sidecar was", "write", "keep"
+    OF_USER = "any other file", "refuse", "keep"
+    OTHER_RESULT = "sidecar of another capture, or of a version with another schema", "refuse", "refuse"
+    IMAGE = "image of the input", "refuse", "refuse"
+    TAKEN = "output of another capture of the run, with a name that differs at most in case", "refuse", "refuse"
+    TOO_LONG = "name that the file system does not take", "refuse", "refuse"
+
+    def __init__(self, _what: str, written: _Action, not_written: _Action) -> None:
+        self.written, self.not_written = written, not_written
+
+
+ReadSidecar = Callable[[Path], tuple[Sidecar, Reason | None]]
+"""As `read_with_change`."""
+_Found = tuple[State, str]
+"""State of a path, and the message if it is refused."""
+_MAX_APART = timedelta(seconds=1)
+"""The bands of a capture are exposed within 0.3 s, and its time is that of the reference, which an option chooses."""
+_PAGES = "index.html", "summary.csv", "indices.csv", "flight.geojson"
+"""Files that a run writes for all its captures."""
+
+
+# ---- before a run, and before each capture
 
 
 def refuse_to_overwrite(
-    captures: Sequence[Capture], out: Path, settings: WriteSettings, listed: Mapping[Path, Sequence[FilePart]]
+    captures: Sequence[Capture], out: Path, settings: WriteSettings, read: ReadSidecar = read_with_change
 ) -> None:
-    """Raise ConfigurationError if an output would replace an input image, an output of another capture, or a file that
-    no run has written, or if its name is too long.
-
-    `listed` has the files that a sidecar lists, by its path.
+    """Raise ConfigurationError for the first path of an output that the table refuses, and OutputError for a link that
+    leads out of the output folder.
     """
-    sources, max_bytes = {band.path.resolve() for capture in captures for band in capture.bands}, max_name_bytes(out)
-    resolved: dict[Path, Path] = {}
-    written: dict[str, Capture] = {}
+    names = _Names(captures, out)
     for capture in captures:
-        for path in paths_written(capture, out, settings):
-            if (name_bytes := len(os.fsencode(path.name))) > max_bytes:
-                what = f"{path.name} would have {name_bytes} bytes, and file systems take {max_bytes}"
-                raise ConfigurationError(f"{capture.reference.path}: the name of its output {what}; rename its files")
-            if path.parent not in resolved:
-                resolved[path.parent] = check_inside(path.parent, out).resolve()
-            if resolved[path.parent] / path.name in sources:
-                raise ConfigurationError(f"{path}: is an image to be aligned; choose another output folder")
-            other = written.setdefault(str(path).lower(), capture)
-            if other is not capture:
-                raise ConfigurationError(
-                    f"{path}: would be written of {other.label} and of {capture.label}; rename one's files"
-                )
-        if foreign := _foreign_file(capture, out, settings, listed.get(CapturePaths.of(capture, out).sidecar, ())):
-            raise ConfigurationError(f"{foreign}: was not written by agalign; choose another output folder with -o")
+        sidecar = CapturePaths.of(capture, out).sidecar
+        earlier, _ = earlier_result(sidecar, read)
+        listed = {} if earlier is None else _sizes(earlier.files, sidecar.parent)
+        for path, is_written in _outputs(capture, out, settings):
+            found = names.found(path, capture)
+            if found is None and is_written:
+                found = _sidecar(path, capture, out, read) if path == sidecar else _file(path, listed)
+            state, message = found or (State.NO_FILE, "")
+            if (state.written if is_written else state.not_written) == "refuse":
+                raise ConfigurationError(message)
 
 
-def _foreign_file(capture: Capture, out: Path, settings: WriteSettings, listed: Sequence[FilePart]) -> Path | None:
-    """Return a file in the place of an output that no run has written; None if there is none."""
+def _outputs(capture: Capture, out: Path, settings: WriteSettings) -> Iterator[tuple[Path, bool]]:
+    """Yield the path of every output of a capture, and whether a run with these settings writes it."""
     paths = CapturePaths.of(capture, out)
-    is_foreign = paths.sidecar.is_file() and not (is_sidecar(paths.sidecar) or is_own_file(paths.sidecar))
-    if is_foreign and capture.label not in file_states(out):  # else it was a sidecar
-        return paths.sidecar
-    known = {paths.folder / part.file for part in listed}
-    enabled = [product for product in PRODUCTS if product.is_enabled(settings)]
-    written = [paths.file(PARALLAX_SUFFIX), *(p for one in enabled for p in one.paths(capture, paths, settings))]
-    return next((p for p in written if p not in known and p.is_file() and not is_own_file(p)), None)
+    yield from ((paths.sidecar, True), (paths.file(PARALLAX_SUFFIX), True))
+    for product in PRODUCTS:
+        is_written = product.is_enabled(settings)
+        yield from ((path, is_written) for path in product.paths(capture, paths, settings))
+
+
+class _Names:
+    """The names of the outputs of a run: whether they can be written, without a look at the files there."""
+
+    def __init__(self, captures: Iterable[Capture], out: Path) -> None:
+        self._out, self._max_bytes = out, max_name_bytes(out)
+        images = {band.path for capture in captures for band in capture.bands}
+        folders = {folder: folder.resolve() for folder in {path.parent for path in images}}
+        self._images = {q for p in images for q in (p.resolve(), folders[p.parent] / p.name)}
+        """With links and what they lead to."""
+        self._resolved: dict[Path, Path] = {}
+        """Folders, each of which is resolved once."""
+        self._written: dict[str, Capture] = {}
+
+    def found(self, path: Path, capture: Capture) -> _Found | None:
+        """Return a state that refuses the name of an output; None if it can be written. Raises OutputError."""
+        if (name_bytes := len(os.fsencode(path.name))) > self._max_bytes:
+            what = f"{path.name} would have {name_bytes} bytes, and file systems take {self._max_bytes}"
+            return State.TOO_LONG, f"{capture.reference.path}: the name of its output {what}; rename its files"
+        if path.parent not in self._resolved:
+            self._resolved[path.parent] = check_inside(path.parent, self._out).resolve()
+        if self._resolved[path.parent] / path.name in self._images:
+            return State.IMAGE, f"{path}: is an image to be aligned; choose another output folder"
+        other = self._written.setdefault(str(path).lower(), capture)
+        if other is not capture:
+            message = f"{path}: would be written of {other.label} and of {capture.label}; rename one's files"
+            return State.TAKEN, message
+        return None
+
+
+def _file(path: Path, listed: Mapping[Path, int]) -> _Found:
+    """Return the state of the file of a product, given the sizes of the listed files."""
+    if not path.is_file():
+        return State.NO_FILE, ""
+    if path.stat().st_size == listed.get(path):
+        return State.AS_LISTED, ""
+    if is_own_file(path):
+        return State.WITH_MARK, ""
+    return (State.CHANGED, "") if path in listed else _of_the_user(path)
+
+
+def _sidecar(path: Path, capture: Capture, out: Path, read: ReadSidecar) -> _Found:
+    """Return the state of the path of the sidecar of a capture."""
+    if not path.is_file():
+        return State.NO_FILE, ""
+    try:
+        earlier, _ = read(path)
+    except OtherSchemaError as error:
+        return State.OTHER_RESULT, str(error)
+    except SidecarError:
+        if is_sidecar(path):
+            return State.SIDECAR, ""
+        if is_own_file(path):
+            return State.WITH_MARK, ""
+        return (State.CHANGED, "") if capture.label in file_states(out) else _of_the_user(path)
+    if is_same(earlier, capture) is not False:
+        return State.SIDECAR, ""
+    what = f"belongs to a different capture from {capture.label} here {_described(earlier, capture)}"
+    return State.OTHER_RESULT, f"{path}: {what}; choose another output folder with -o"
+
+
+def _of_the_user(path: Path) -> _Found:
+    return State.OF_USER, f"{path}: was not written by agalign; choose another output folder with -o"
+
+
+def earlier_result(path: Path, read: ReadSidecar = read_with_change) -> tuple[Sidecar | None, bool]:
+    """Return the sidecar of an earlier run, None if it cannot be read, and whether it is as it was written.
+
+    An edited one may list any file. It is returned with the products that have the mark of the program: the next
+    sidecar confirms no others.
+    """
+    with suppress(SidecarError):
+        sidecar, change = read(path)
+        if not change:
+            return sidecar, True
+        own = [part for part in sidecar.products if is_own_file(path.parent / part.file)]
+        return sidecar.model_copy(update={"products": own, "parallax": None}), False
+    return None, False
+
+
+def _sizes(parts: Iterable[FilePart], folder: Path) -> dict[Path, int]:
+    return {folder / part.file: part.bytes for part in parts}
+
+
+def refuse_results_elsewhere(captures: Sequence[Capture], out: Path, read: ReadSidecar = read_with_change) -> None:
+    """Raise ConfigurationError if another place of the output folder has the result of a capture, as of a run on the
+    folder above, or one of the same name by a version with another schema.
+    """
+    places, by_name = {CapturePaths.of(c, out).sidecar for c in captures}, dict[str, list[Capture]]()
+    for capture in captures:
+        by_name.setdefault(capture.name, []).append(capture)
+    for path in (p for p in out.rglob("*.json") if p.stem in by_name and p not in places):
+        try:
+            earlier, _ = read(path)
+        except OtherSchemaError as error:
+            raise ConfigurationError(str(error)) from None
+        except SidecarError:
+            continue
+        if here := next((c for c in by_name[path.stem] if is_same(earlier, c)), None):
+            what = f"is of the same capture as {here.label} here, by a run on a folder above or below the one here"
+            raise ConfigurationError(f"{path}: {what}; choose another output folder with -o")
+
+
+def refuse_foreign_pages(out: Path) -> None:
+    """Raise ConfigurationError if a folder without record and results of a run has files with the names of its
+    pages.
+    """
+    if (out / RUN_FILE).exists() or find_sidecars(out):
+        return
+    for path in (out / name for name in _PAGES):
+        if path.is_file():
+            raise ConfigurationError(_of_the_user(path)[1])
+
+
+# ---- whether a result is of the same capture
+
+
+def is_same(earlier: Sidecar, capture: Capture) -> bool | None:
+    """Return whether a result is of this capture; None if neither tags nor contents decide.
+
+    Tags that both have are compared: make, model, serial numbers, capture id, time. If there is no id and no time, the
+    contents of a file must be equal; others may have been repaired.
+    """
+    one, other = earlier.camera, capture.camera
+    pairs = (one.make, other.make), (one.model, other.model), (earlier.capture_id, capture.capture_id)
+    if any(a and b and a != b for a, b in pairs) or (one.serials and other.serials and not one.serials & other.serials):
+        return False
+    if earlier.captured_at and capture.captured_at and earlier.captured_at != capture.captured_at:
+        before, now = CaptureTime.of(earlier.captured_at), CaptureTime.of(capture.captured_at)
+        return before is not None and now is not None and abs(before.utc - now.utc) <= _MAX_APART
+    if (earlier.capture_id and capture.capture_id) or (earlier.captured_at and capture.captured_at):
+        return True
+    if not earlier.input_samples:
+        return None
+    return not {*earlier.input_samples.values()}.isdisjoint(input_samples(capture).values())
+
+
+def _described(earlier: Sidecar, capture: Capture) -> str:
+    """Return camera, time and id of a result and of a capture, as far as they are known."""
+    texts = []
+    for one, time in ((earlier, earlier.captured_at), (capture, capture.known_time)):
+        name = " ".join(filter(None, (one.camera.make, one.camera.model, one.camera.serial)))
+        texts.append(", ".join(filter(None, (name, time, one.capture_id))) or "without tags")
+    return f"({texts[0]}; here {texts[1]})"
+
+
+# ---- after a capture was rendered or skipped
 
 
 def outdated_files(
@@ -80,19 +249,16 @@ def outdated_files(
 
     Otherwise a sidecar could describe rasters of another run, and bands on an old grid could remain among new ones.
     `listed` has the products in the sidecar, which anyone may have written: a file is returned if it has the name of an
-    output of this capture, and the mark of the program or the size in the list. The reason is empty for files that
-    users do not miss.
+    output of this capture, and the table removes it. The reason is empty for files that users do not miss.
     """
-    paths = CapturePaths.of(capture, out)
-    sizes = {paths.folder / part.file: part.bytes for part in listed}
-    sources = {band.path.resolve() for band in capture.bands}
-    return {
-        path: reason
-        for path, reason in _outdated(capture, out, settings, sizes)
-        if path.is_file()
-        and path.resolve() not in sources
-        and (is_own_file(path) or path.stat().st_size == sizes.get(path))
-    }
+    sizes, names = _sizes(listed, CapturePaths.of(capture, out).folder), _Names([capture], out)
+    found = _outdated(capture, out, settings, sizes)
+    return {path: reason for path, reason in found if names.found(path, capture) is None and is_removed(path, sizes)}
+
+
+def is_removed(path: Path, listed: Mapping[Path, int]) -> bool:
+    """Return True for a product that the table removes if it is not written, given the sizes of the listed files."""
+    return _file(path, listed)[0].not_written == "remove"
 
 
 def _outdated(
@@ -108,7 +274,8 @@ def _outdated(
             yield from ((path, reason) for path in product.paths(capture, paths, settings))
         # Also of a band that this run leaves out; a file with a sidecar is the stack of another capture.
         pattern = re.compile(rf"{re.escape(capture.name)}(\d|[._].+)\.tiff?", re.IGNORECASE)
-        own = [p for p in listed if pattern.fullmatch(p.name) and not p.with_suffix(".json").exists()]
+        own = [p for p in listed if p.parent == paths.folder and pattern.fullmatch(p.name)]
+        own = [p for p in own if not p.with_suffix(".json").exists()]
         own += [paths.folder / name for name in band_file_names(capture).values()]
         yield from ((p, f"--layout {settings.layout}") for p in own if p in listed and is_aligned_raster(p))
         for raster in index_rasters(paths.file("")):
@@ -127,13 +294,12 @@ def remove_files(files: Iterable[Path], out: Path) -> None:
 
 def remove_outputs(capture: Capture, out: Path, settings: WriteSettings) -> list[Path]:
     """Remove and return the outputs of an earlier run for a capture that this one does not align."""
-    paths, listed = CapturePaths.of(capture, out), list[FilePart]()
-    with suppress(SidecarError):
-        listed = read_checked(paths.sidecar).products
-    removed = [*outdated_files(capture, out, settings, listed)]
-    if paths.sidecar.is_file() and is_sidecar(paths.sidecar):
+    paths = CapturePaths.of(capture, out)
+    earlier, _ = earlier_result(paths.sidecar)
+    removed = [*outdated_files(capture, out, settings, [] if earlier is None else earlier.products)]
+    if _sidecar(paths.sidecar, capture, out, read_with_change)[0].not_written == "remove":
         removed.append(paths.sidecar)
-    if is_own_file(paths.file(PARALLAX_SUFFIX)):
-        removed.append(paths.file(PARALLAX_SUFFIX))
+    if is_removed(parallax := paths.file(PARALLAX_SUFFIX), {}):
+        removed.append(parallax)
     remove_files(removed, out)
     return [path for path in removed if not path.exists()]

@@ -18,12 +18,16 @@ from agalign.batch.earlier_results import (
     existing_files,
     labels_of_other_inputs,
     outputs_exist,
-    refuse_other_captures,
     remaining,
     results_not_in_input,
 )
 from agalign.batch.flight_learning import learn_flight
-from agalign.batch.output_files import refuse_to_overwrite, remove_outputs
+from agalign.batch.output_files import (
+    refuse_foreign_pages,
+    refuse_results_elsewhere,
+    refuse_to_overwrite,
+    remove_outputs,
+)
 from agalign.batch.render import RenderOptions
 from agalign.batch.selection import Selection, select_captures
 from agalign.batch.workers import MAX_THREADS, Run, failure_text, numbers_of_workers, open_workers, serially
@@ -46,7 +50,7 @@ from agalign.rasters.output_grid import FlightLimits, common_grid, flight_limits
 from agalign.rasters.preview import preview_bytes
 from agalign.rasters.product import CapturePaths
 from agalign.records.listed_files import states_of
-from agalign.records.run_record import RunPart, begun, excluded_part, input_name, last_record, refuse_foreign_pages
+from agalign.records.run_record import RunPart, begun, excluded_part, input_name, last_record
 from agalign.records.sidecar import FilePart, Sidecar
 from agalign.report.pages import outdate_pages
 from agalign.report.panels_and_sky import write_panels, write_sky
@@ -239,11 +243,9 @@ class _FlightRun:
             raise ConfigurationError(f"{self.out}: is the folder of the images; choose another output folder with -o")
         earlier = last_record(self.out)
         self.results.states.update({} if earlier is None else earlier.file_states)
-        is_same_input = earlier is not None and earlier.input == input_name(self.flight.folder)
-        refuse_other_captures(self.flight.captures, self.out, self.results, is_same_input=is_same_input)
-        sidecars = [CapturePaths.of(capture, self.out).sidecar for capture in self.flight.captures]
-        listed = {path: self.results.files(path) for path in sidecars}
-        refuse_to_overwrite(self.flight.captures, self.out, self.settings.write, listed)
+        refuse_to_overwrite(self.flight.captures, self.out, self.settings.write, self.results)
+        if earlier is None or earlier.input != input_name(self.flight.folder):  # else the images were moved in it
+            refuse_results_elsewhere(self.flight.captures, self.out, self.results)
         refuse_foreign_pages(self.out)
         check_inside(self.out / "models", self.out)
 

@@ -14,7 +14,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from agalign._version import __version__
 from agalign.config import Settings
-from agalign.errors import ConfigurationError, SidecarError
+from agalign.errors import SidecarError
 from agalign.flight.footprint import accuracy_of_footprint_m, footprint
 from agalign.flight.groups import CameraOverview, camera_overviews
 from agalign.host.files import RUN_FILE, read_model, read_regular, write_model
@@ -23,12 +23,10 @@ from agalign.host.processes import usable_cores
 from agalign.host.text import counted, escape_controls, shortened
 from agalign.records.excluded import PanelPart, SkyPart
 from agalign.records.sidecar import Sidecar
-from agalign.records.sidecar_file import find_sidecars, label_of
+from agalign.records.sidecar_file import label_of
 from agalign.values.capture import CameraIdentity, Capture, Pose, Position
 from agalign.values.image import OutputGrid
 
-PAGES = "index.html", "summary.csv", "indices.csv", "flight.geojson"
-"""Files that a run writes for all its captures."""
 _SCHEMA = "agalign-run/2"
 RunState = Literal["running", "interrupted", "finished"]
 
@@ -227,17 +225,6 @@ def begun(folder: Path, settings: Settings, captures: Sequence[Capture] = (), co
         labels=[capture.label for capture in captures],
         captures=Counter(found=len(captures)),
     )
-
-
-def refuse_foreign_pages(out: Path) -> None:
-    """Raise ConfigurationError if a folder without record and results of a run has files with the names of its
-    pages.
-    """
-    if (out / RUN_FILE).exists() or find_sidecars(out):
-        return
-    for path in (out / name for name in PAGES):
-        if path.is_file():
-            raise ConfigurationError(f"{path}: was not written by agalign; choose another output folder with -o")
 
 
 def read_run_record(out: Path) -> RunPart | None:

@@ -14,7 +14,8 @@ import numpy as np
 import pytest
 
 import agalign
-from agalign.batch.earlier_results import Remaining, is_same, remaining
+from agalign.batch.earlier_results import Remaining, remaining
+from agalign.batch.output_files import is_same
 from agalign.batch.run import Listener, _crops_of_cameras, plan_run, run_flight
 from agalign.batch.workers import Run, open_workers
 from agalign.cli.align_run import RunTotals, conclude

@@ -234,9 +234,9 @@ def test_a_name_that_is_too_long_is_refused_at_the_start(tmp_path: Path, length:
     scan = agalign.discover(tmp_path / "in")
     if too_long := len(f"{scan.captures[0].name}.parallax.tif".encode()) > 255:
         with pytest.raises(ConfigurationError, match=r"parallax.tif would have \d+ bytes, and file systems take"):
-            refuse_to_overwrite(scan.captures, tmp_path / "out", agalign.WriteSettings(), {})
+            refuse_to_overwrite(scan.captures, tmp_path / "out", agalign.WriteSettings())
     else:
-        refuse_to_overwrite(scan.captures, tmp_path / "out", agalign.WriteSettings(), {})
+        refuse_to_overwrite(scan.captures, tmp_path / "out", agalign.WriteSettings())
     assert too_long == (length > 243)
 
 

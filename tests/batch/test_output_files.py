@@ -1,0 +1,137 @@
+"""What a run does with the path of an output, by what is there."""
+
+import shutil
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+import agalign
+from agalign.batch.output_files import State, refuse_to_overwrite, remove_outputs
+from agalign.records.sidecar_file import read_sidecar, write_sidecar
+from agalign.values.capture import Capture
+
+from ..conftest import Shared, seeded, write_capture
+
+Case = tuple[Path, Sequence[Capture]]
+"""A path of an output of the first capture, and the captures of a run."""
+WRITING = agalign.WriteSettings(error_map=True)
+NOT_WRITING = agalign.WriteSettings(layout="bands")
+
+
+@pytest.fixture
+def case(shared: Shared, tmp_path: Path) -> Case:
+    """The error map of the first of two captures, which does not exist, beside the results of both."""
+
+    def align(folder: Path) -> None:
+        for name in "fg":
+            write_capture(folder / "in", "green", "red", name=name, size_px=(200, 160))
+        agalign.align_folder(folder / "in", folder / "out", settings=seeded("identity"))
+
+    done = shared("two results", align)
+    shutil.copytree(done / "out", tmp_path / "out")
+    return tmp_path / "out" / "f.error.tif", agalign.discover(done / "in").captures
+
+
+def no_file(case: Case) -> Case:
+    return case
+
+
+def sidecar(case: Case) -> Case:
+    return case[0].with_name("f.json"), case[1]
+
+
+def as_listed(case: Case) -> Case:
+    """Zeros of the size in the sidecar: the next command finds and repairs them."""
+    stack = case[0].with_name("f.tif")
+    stack.write_bytes(bytes(stack.stat().st_size))
+    return stack, case[1]
+
+
+def with_mark(case: Case) -> Case:
+    """A file that a killed run has left, which no sidecar lists."""
+    return Path(shutil.copy(case[0].with_name("f.tif"), case[0])), case[1]
+
+
+def changed(case: Case) -> Case:
+    stack = case[0].with_name("f.tif")
+    stack.write_bytes(bytes(9))
+    return stack, case[1]
+
+
+def of_user(case: Case) -> Case:
+    return Path(shutil.copy(case[1][0].reference.path, case[0])), case[1]
+
+
+def of_user_in_an_edited_sidecar(case: Case) -> Case:
+    path, captures = of_user(case)
+    sidecar = read_sidecar(path.with_name("f.json"))
+    part = sidecar.products[0].model_copy(update={"file": path.name, "bytes": path.stat().st_size})
+    text = sidecar.model_copy(update={"products": [*sidecar.products, part]}).model_dump_json(by_alias=True)
+    path.with_name("f.json").write_text(text)  # the checksum stays
+    return path, captures
+
+
+def other_result(case: Case) -> Case:
+    sidecar = case[0].with_name("f.json")
+    write_sidecar(sidecar, read_sidecar(sidecar).model_copy(update={"input_samples": {"green": "0"}}))
+    return sidecar, case[1]
+
+
+def image(case: Case) -> Case:
+    """The folder of the images is in the output folder, and one has the name of an output."""
+    path, captures = of_user(case)
+    bands = (replace(captures[0].bands[0], path=path), *captures[0].bands[1:])
+    return path, [replace(captures[0], bands=bands)]
+
+
+def taken(case: Case) -> Case:
+    path, (first, _) = case
+    return path, [first, replace(first, name="F")]
+
+
+def too_long(case: Case) -> Case:
+    path, (first, _) = case
+    return path, [replace(first, name="f" * 250)]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("make", "state", "written", "not_written"),
+    [
+        (no_file, State.NO_FILE, "write", "keep"),
+        (sidecar, State.SIDECAR, "write", "remove"),
+        (as_listed, State.AS_LISTED, "write", "remove"),
+        (with_mark, State.WITH_MARK, "write", "remove"),
+        (changed, State.CHANGED, "write", "keep"),
+        (of_user, State.OF_USER, "was not written by agalign", "keep"),
+        (of_user_in_an_edited_sidecar, State.OF_USER, "was not written by agalign", "keep"),
+        (other_result, State.OTHER_RESULT, "belongs to a different capture", "belongs to a different capture"),
+        (image, State.IMAGE, "is an image to be aligned", "is an image to be aligned"),
+        (taken, State.TAKEN, "would be written of f and of F", "would be written of f and of F"),
+        (too_long, State.TOO_LONG, "the name of its output", "the name of its output"),
+    ],
+)
+def test_what_is_there_decides(
+    case: Case, make: Callable[[Case], Case], state: State, written: str, not_written: str
+) -> None:
+    """An action that is none of those of the table is the message of a refusal."""
+    path, captures = make(case)
+    out, existed = path.parent, path.exists()
+    for settings, action in ((WRITING, written), (NOT_WRITING, not_written)):
+        if action not in ("write", "keep", "remove"):
+            with pytest.raises(agalign.ConfigurationError, match=action):
+                refuse_to_overwrite(captures, out, settings)
+        else:
+            refuse_to_overwrite(captures, out, settings)
+    if not_written in ("keep", "remove"):
+        remove_outputs(captures[0], out, NOT_WRITING)
+        assert path.exists() is (existed and not_written == "keep")
+    actions = [a if a in ("write", "keep", "remove") else "refuse" for a in (written, not_written)]
+    assert [state.written, state.not_written] == actions
+
+
+def test_the_cases_cover_every_state() -> None:
+    (mark,) = (m for m in test_what_is_there_decides.pytestmark if m.name == "parametrize")
+    assert {state for _, state, *_ in mark.args[1]} == {*State}
