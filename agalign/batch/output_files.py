@@ -56,6 +56,7 @@ ReadSidecar = Callable[[Path], tuple[Sidecar, Reason | None]]
 """As `read_with_change`."""
 _Found = tuple[State, str]
 """State of a path, and the message if it is refused."""
+_TEXT_STARTS = tuple(start for product in PRODUCTS for start in product.text_starts)
 _MAX_APART = timedelta(seconds=1)
 """The bands of a capture are exposed within 0.3 s, and its time is that of the reference, which an option chooses."""
 _PAGES = "index.html", "summary.csv", "indices.csv", "flight.geojson"
@@ -77,10 +78,9 @@ def refuse_to_overwrite(
         earlier, _ = earlier_result(sidecar, read)
         listed = {} if earlier is None else _sizes(earlier.files, sidecar.parent)
         for path, is_written in _outputs(capture, out, settings):
-            found = names.found(path, capture)
-            if found is None and is_written:
-                found = _sidecar(path, capture, out, read) if path == sidecar else _file(path, listed)
-            state, message = found or (State.NO_FILE, "")
+            state, message = names.found(path, capture) or (
+                _sidecar(path, capture, out, read) if path == sidecar else _file(path, listed)
+            )
             if (state.written if is_written else state.not_written) == "refuse":
                 raise ConfigurationError(message)
 
@@ -129,7 +129,7 @@ def _file(path: Path, listed: Mapping[Path, int]) -> _Found:
         return State.NO_FILE, ""
     if path.stat().st_size == listed.get(path):
         return State.AS_LISTED, ""
-    if is_own_file(path):
+    if is_own(path):
         return State.WITH_MARK, ""
     return (State.CHANGED, "") if path in listed else _of_the_user(path)
 
@@ -145,7 +145,7 @@ def _sidecar(path: Path, capture: Capture, out: Path, read: ReadSidecar) -> _Fou
     except SidecarError:
         if is_sidecar(path):
             return State.SIDECAR, ""
-        if is_own_file(path):
+        if is_own(path):
             return State.WITH_MARK, ""
         return (State.CHANGED, "") if capture.label in file_states(out) else _of_the_user(path)
     if is_same(earlier, capture) is not False:
@@ -158,6 +158,11 @@ def _of_the_user(path: Path) -> _Found:
     return State.OF_USER, f"{path}: was not written by agalign; choose another output folder with -o"
 
 
+def is_own(path: Path) -> bool:
+    """Return True for a file with the mark of the program, or the start of one of its texts, and for an empty file."""
+    return is_own_file(path, _TEXT_STARTS)
+
+
 def earlier_result(path: Path, read: ReadSidecar = read_with_change) -> tuple[Sidecar | None, bool]:
     """Return the sidecar of an earlier run, None if it cannot be read, and whether it is as it was written.
 
@@ -168,7 +173,7 @@ def earlier_result(path: Path, read: ReadSidecar = read_with_change) -> tuple[Si
         sidecar, change = read(path)
         if not change:
             return sidecar, True
-        own = [part for part in sidecar.products if is_own_file(path.parent / part.file)]
+        own = [part for part in sidecar.products if is_own(path.parent / part.file)]
         return sidecar.model_copy(update={"products": own, "parallax": None}), False
     return None, False
 

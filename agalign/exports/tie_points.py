@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 from agalign.config import WriteSettings
 from agalign.errors import GeometryError
 from agalign.host.files import write_csv, write_text
-from agalign.host.own_files import TIES_COLUMNS, TIES_MEMBER
 from agalign.host.text import escape_controls
 from agalign.pixels.coordinates import transformed
 from agalign.rasters.product import CapturePaths, Product, ProductContext, WrittenFile
@@ -25,6 +24,10 @@ from agalign.values.capture import Capture, Georeference
 from agalign.values.choices import PairStatus
 from agalign.values.residual import Residual
 
+_POSITIONS = "reference_x_px", "reference_y_px", "moving_x_px", "moving_y_px"
+_COLUMNS = "band", "status", *_POSITIONS, "residual_px", "weight"
+_MEMBER = "coordinates_in"
+"""The first member of the GeoJSON after its type, which no other program writes."""
 _Row = tuple[str, PairStatus, list[float]]
 """Band, its status, and the six numbers of a tie point."""
 
@@ -35,6 +38,7 @@ class TiePoints(Product):
     kind = "tie_points"
     suffix = ".ties.csv"
     option = "tie_points"
+    text_starts = ",".join(_COLUMNS).encode(), f'{{"type": "FeatureCollection", "{_MEMBER}"'.encode()
 
     def paths(self, capture: Capture, paths: CapturePaths, settings: WriteSettings) -> list[Path]:  # noqa: ARG002
         """Return the CSV and the GeoJSON file."""
@@ -50,7 +54,7 @@ class TiePoints(Product):
             for point in tie_points(alignment, context.ties[name]).tolist()
         ]
         cells = ((band, status, *(f"{n:.4f}" for n in point)) for band, status, point in rows)
-        write_csv(table, TIES_COLUMNS, cells)
+        write_csv(table, _COLUMNS, cells)
         write_text(features, _geojson(rows, context.capture.reference.georeference))
         return [WrittenFile(self.kind, table), WrittenFile(self.kind, features)]
 
@@ -89,4 +93,4 @@ def _geojson(rows: Sequence[_Row], georeference: Georeference | None) -> str:
         properties |= {"moving_px": (moving_x, moving_y), "residual_px": residual_px, "weight": weight}
         shape = {"type": "Point", "coordinates": place}
         features.append({"type": "Feature", "geometry": shape, "properties": properties})
-    return json.dumps({"type": "FeatureCollection", TIES_MEMBER: unit, "features": features}) + "\n"
+    return json.dumps({"type": "FeatureCollection", _MEMBER: unit, "features": features}) + "\n"

@@ -159,6 +159,8 @@ class Product(ABC):
     """False if the product is also written for captures without usable moving bands."""
     option: ClassVar[str | None] = None
     """Name of the setting in `WriteSettings` that requests the product; None if it is always written."""
+    text_starts: ClassVar[tuple[bytes, ...]] = ()
+    """How its text files start; images have a mark instead (`host/own_files.py`)."""
 
     def is_enabled(self, settings: WriteSettings) -> bool:
         """Return True if the settings request the product."""

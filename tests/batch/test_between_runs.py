@@ -11,7 +11,7 @@ import pytest
 
 import agalign
 from agalign.batch import estimate
-from agalign.host.own_files import is_own_file
+from agalign.batch.output_files import is_own
 from agalign.records import sidecar_file
 from agalign.records.sidecar_file import find_sidecars, read_sidecar, verify_outputs
 from agalign.values.alignment import Alignment
@@ -175,8 +175,8 @@ def test_every_output_has_the_mark_of_the_program(flight: Path, tmp_path: Path) 
         settings = seeded("rig", layout="both", qa=True, **options)
         agalign.align_folder(flight, tmp_path / name, settings=settings)
         files = [path for path in (tmp_path / name / FOLDER).iterdir() if path.suffix != ".json"]
-        assert [path.name for path in files if not is_own_file(path)] == []
-    assert not any(is_own_file(path) for path in (flight / FOLDER).iterdir())
+        assert [path.name for path in files if not is_own(path)] == []
+    assert not any(is_own(path) for path in (flight / FOLDER).iterdir())
 
 
 # ---- sidecars and parallax files
