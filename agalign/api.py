@@ -440,7 +440,7 @@ def indices(
     InputError
         `out` is not the output folder of a run.
     ConfigurationError
-        An index is unknown, or a formula is invalid.
+        An index is unknown, a formula is invalid, or `target` has an indices.csv that agalign did not write.
     OutputError
         `target` cannot be written.
     WorkerError

@@ -17,7 +17,7 @@ from agalign.records.listed_files import ListedFiles
 from agalign.records.run_record import counted_sidecars, file_states
 from agalign.records.sidecar_file import add_products, label_of, read_without_tables, run_sidecars
 from agalign.spectral_indices.formulas import Index
-from agalign.spectral_indices.indices_csv import to_check, update_table
+from agalign.spectral_indices.indices_csv import refuse_foreign_table, to_check, update_table
 from agalign.spectral_indices.rasters import IndexRasters, IndexReport, write_rasters
 
 
@@ -52,7 +52,11 @@ class IndexTask:
 def index_tasks(
     out: Path, indices: Sequence[Index], target: Path, *, overwrite: bool = False, mask_qa: bool = False
 ) -> list[IndexTask]:
-    """Return a task for each capture of a run. Raises InputError if the folder contains no run."""
+    """Return a task for each capture of a run. Raises InputError if the folder contains no run, and ConfigurationError
+    if another folder is the target and has a table that no command has written.
+    """
+    if target != out:
+        refuse_foreign_table(target)
     paths = counted_sidecars(run_sidecars(out), out)
     run, states = RunFacts.of(out), file_states(out)
     task = IndexTask(out, Path(), target, tuple(indices), overwrite, mask_qa, run)

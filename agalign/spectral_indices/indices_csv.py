@@ -9,7 +9,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from agalign.errors import InputError
+from agalign.errors import ConfigurationError, InputError
 from agalign.host.files import read_regular, write_csv
 from agalign.host.text import without_formula
 from agalign.rasters.aligned_files import tags_of
@@ -20,6 +20,8 @@ from agalign.spectral_indices.formulas import Index, bands_for
 from agalign.spectral_indices.rasters import IndexReport, IndexStatistics, index_of, statistics_in
 
 INDICES_FILE = "indices.csv"
+_OF_CAPTURE = "folder", "capture", "captured_at", "latitude", "longitude"
+_OF_INDEX = "index", "median", "p5", "p95", "valid_share", "masked_share", "input", "low", "high", "file", "problem"
 
 
 def to_check(index: Index | None, sidecar: Sidecar, run: RunFacts, label: str) -> str:
@@ -64,6 +66,15 @@ def read_table(out: Path) -> list[IndexReport]:
         return []
 
 
+def refuse_foreign_table(folder: Path) -> None:
+    """Raise ConfigurationError if a folder has a file with the name of the table that no command has written."""
+    path = folder / INDICES_FILE
+    with suppress(OSError):
+        text = read_regular(path)
+        if text and not text.startswith(",".join(_OF_CAPTURE).encode()):
+            raise ConfigurationError(f"{path}: was not written by agalign; choose another folder with -o")
+
+
 def current_rows(out: Path) -> list[IndexReport]:
     """Return the rows of OUT/indices.csv that are still true: they have a raster that exists and was not written again
     since, or are of an index that could not be calculated; and they are not of a renamed capture.
@@ -88,9 +99,7 @@ def update_table(
     old = read_table(out)
     result = _masked_alike(merged(current_rows(out) if earlier is None else earlier, rows))
     if (result or old) and (result != old or not (out / INDICES_FILE).is_file()):
-        of_capture = "folder", "capture", "captured_at", "latitude", "longitude"
-        of_index = "index", "median", "p5", "p95", "valid_share", "masked_share", "input", "low", "high", "file"
-        columns = *of_capture, *of_index, "problem"
+        columns = *_OF_CAPTURE, *_OF_INDEX
         cells = (_cells(row, out) for row in sorted(result, key=lambda row: row.key))
         write_csv(out / INDICES_FILE, columns, ([one[name] for name in columns] for one in cells))
     return result

@@ -283,8 +283,8 @@ def write_rasters(
                 earlier = _finished_before(target, source, listed) if may_be_kept else None
                 if earlier is None and target.resolve() in {band.file.resolve() for band in bands}:
                     raise InputError(f"{target}: is the file of a band; give the formula '{index.name}' another name")
-                if earlier is None and _is_foreign(target):
-                    raise InputError(f"{target}: was not written by agalign; choose another folder with -o")
+                if earlier is None and (foreign := _foreign_file(target)):
+                    raise InputError(f"{foreign}: was not written by agalign; choose another folder with -o")
                 unit = earlier.unit if earlier is not None else _common_unit(index, chosen, reader)
             except InputError as error:
                 yield IndexReport(label, index.name, problem=str(error))
@@ -294,14 +294,18 @@ def write_rasters(
             yield IndexReport(label, index.name, target, statistics, kept=earlier is not None, is_masked=is_masked)
 
 
-def _is_foreign(path: Path) -> bool:
-    """Return True for a file that is not an index raster; a damaged one is written again."""
-    if not path.exists():
-        return False
+def _foreign_file(raster: Path) -> Path | None:
+    """Return the file in the place of an index raster, or of its picture, that no command has written; None if there is
+    none. A damaged raster is written again.
+    """
+    picture = raster.with_suffix(".png")
+    is_foreign = raster.exists() and not is_own_file(raster)
     with suppress(OSError):
-        check_complete(path)
-        return statistics_in(tags_of(path)) is None
-    return not is_own_file(path)
+        check_complete(raster)
+        is_foreign = statistics_in(tags_of(raster)) is None
+    if is_foreign:
+        return raster
+    return picture if picture.exists() and not is_own_file(picture) else None
 
 
 @dataclass(frozen=True)

@@ -248,15 +248,27 @@ def test_an_index_neither_replaces_a_band_nor_reads_one_of_another_size(
     assert sorted(p.name for p in tmp_path.iterdir()) == ["a_green.tif", "a_red.tif"]
 
 
-def test_a_raster_that_is_not_of_agalign_is_not_replaced(tmp_path: Path) -> None:
+@pytest.mark.parametrize("suffix", [".tif", ".png"])
+def test_a_file_that_is_not_of_agalign_is_not_replaced(tmp_path: Path, suffix: str) -> None:
     make_aligned(tmp_path / "out", 1)
-    place = tmp_path / "maps" / "0000SET" / "IMG_0001_ndvi.tif"
+    place = tmp_path / "maps" / "0000SET" / f"IMG_0001_ndvi{suffix}"
     place.parent.mkdir(parents=True)
-    shutil.copy(tmp_path / "out" / "0000SET" / "IMG_0001.tif", place)
-    before = place.read_bytes()
+    shutil.copy(tmp_path / "out" / "0000SET" / "IMG_0001.tif", tmp_path / "stack.tif")
+    before = (tmp_path / "stack.tif").read_bytes() if suffix == ".tif" else b"a picture of the user"
+    place.write_bytes(before)
     (report,) = indices_of(tmp_path / "out", target=tmp_path / "maps", overwrite=True)
     assert report.problem == f"{place}: was not written by agalign; choose another folder with -o"
     assert place.read_bytes() == before
+
+
+def test_a_table_that_is_not_of_agalign_is_not_replaced(tmp_path: Path) -> None:
+    make_aligned(tmp_path / "out", 1)
+    table = tmp_path / "maps" / "indices.csv"
+    table.parent.mkdir()
+    table.write_text("plot,ndvi\n1,0.7\n")
+    with pytest.raises(ConfigurationError, match=r"indices\.csv: was not written by agalign; choose another folder"):
+        indices_of(tmp_path / "out", target=tmp_path / "maps")
+    assert table.read_text() == "plot,ndvi\n1,0.7\n"
 
 
 @pytest.mark.slow
