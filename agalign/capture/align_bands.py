@@ -272,9 +272,9 @@ class CaptureEstimation:
         self.progress(starts[0][0].name if starts else "", "relief", 0.0)
         reliefs, along_a_line = by_relief(bands, use, is_observation=self.is_observation)
         self.reliefs += reliefs
-        fitting = [set(relief.candidates) for relief in reliefs if relief.fits_better]
+        fitting = [set(relief.candidates) for relief in self.reliefs if relief.fits_better]
         under = set.intersection(*fitting) if fitting else set()  # whichever of them is chosen
-        new = {pair.name for pair, _ in starts}
+        new = {pair.name for pair, _ in starts} | {name for name, band in self.bands.items() if not band.candidates}
         for band in bands:
             name = band.pair.name
             if name in new - under and self.bands[name].issue is None:

@@ -143,7 +143,8 @@ def _of_images(band: BandCandidates, relief: ReliefCandidates | None) -> _Choice
     if predicting:
         best = min(predicting, key=lambda candidate: candidate.std_px)
         return _Choice(band, best, best.issues)
-    return _Choice(band, None, tuple(band.rejected))
+    # Without any candidate, the band was only under a relief that is not chosen: nothing verifies its seed.
+    return _Choice(band, None, tuple(band.rejected) or (Issue(OTHER_GEOMETRY),))
 
 
 def _against_rig(choice: _Choice, of_rig: RigPrediction) -> _Choice:

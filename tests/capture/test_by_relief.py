@@ -259,16 +259,22 @@ def test_neither_relief_nor_field_replaces_another_model_family(
         assert (len(alignment.held_out_p95_px) > 1) == is_allowed
 
 
+def flat_relief_of(*bands: RefinedBand) -> ReliefCandidates:
+    """The candidates of some bands under a relief without parallax."""
+    relief, result = Relief(np.zeros((4, 4), np.float32), np.ones((4, 4), np.float32)), dict[str, Candidate]()
+    for band in bands:
+        under = band.warped.with_mapping(band.warped.mapping.with_parallax(Parallax(relief, (1, 0))))
+        result[band.pair.name] = Candidate.of("relief", under, band.joint)
+    return ReliefCandidates(bands[0].pair.reference, result, 0.1)
+
+
 @pytest.mark.parametrize("is_together", [True, False])
 def test_bands_that_are_aligned_together_or_one_after_another_have_one_geometry(
     flat: Rendered, monkeypatch: pytest.MonkeyPatch, is_together: bool
 ) -> None:
     """A band that is learned from scratch after the relief of the others, for example."""
     bands = {band.pair.name: band for band in flat.refined()}
-    relief = Relief(np.zeros((4, 4), np.float32), np.ones((4, 4), np.float32))
-    of_blue = bands["Blue"].warped.with_mapping(bands["Blue"].warped.mapping.with_parallax(Parallax(relief, (1, 0))))
-    blue = Candidate.of("relief", of_blue, bands["Blue"].joint)
-    found = [ReliefCandidates(blue.pair.reference, {"Blue": blue}, 0.1)]
+    found = [flat_relief_of(bands["Blue"])]
     monkeypatch.setattr(align_bands, "by_relief", lambda *_, **__: ([found.pop()] if found else [], set()))
     estimation = CaptureEstimation(Settings(), None, quiet)
     for some in (["Blue", "Red", "NIR"],) if is_together else (["Blue"], ["Red", "NIR"]):
@@ -277,6 +283,24 @@ def test_bands_that_are_aligned_together_or_one_after_another_have_one_geometry(
     expected = {"Blue": "aligned", "Red": "predicted", "NIR": "predicted"}
     assert {name: a.status for name, a in result.items()} == expected
     assert result["NIR"].prediction.source == "windows"
+
+
+def test_a_band_under_an_earlier_relief_alone_is_not_at_its_seed(
+    flat: Rendered, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Two bands are learned from scratch after the relief of a third one, and a relief without it delivers more."""
+    bands = {band.pair.name: band for band in flat.refined()}
+    of_blue = flat_relief_of(bands["Blue"])
+    blue = of_blue.candidates["Blue"]
+    uncertain = {"Blue": replace(blue, error=replace(blue.error, rig_std_px=9.0))}
+    found = [flat_relief_of(bands["Red"], bands["NIR"]), replace(of_blue, candidates=uncertain)]
+    monkeypatch.setattr(align_bands, "by_relief", lambda *_, **__: ([found.pop()], set()))
+    estimation = CaptureEstimation(Settings(), None, quiet)
+    for some in (["Blue"], ["Red", "NIR"]):
+        add(estimation, [bands[name] for name in some])
+    result = estimation.decided()
+    assert {name: a.status for name, a in result.items()} == {"Blue": "predicted", "Red": "aligned", "NIR": "aligned"}
+    assert result["Blue"].std_px < 0.5
 
 
 @pytest.mark.full

@@ -126,6 +126,7 @@ CASES = {
     ),
     "the seed": lambda: Case([unconfirmed()], "seed_only", SEED.fixed_to_moving, ("retrieval",)),
     "the seed without a result": lambda: Case([], "seed_only", SEED.fixed_to_moving, ("retrieval",), issue=LOST),
+    "the seed without any candidate": lambda: Case([], "seed_only", SEED.fixed_to_moving, ("other_geometry",)),
     "an untrusted seed": lambda: Case(
         [unconfirmed()], "failed", SEED.fixed_to_moving, ("retrieval",), replace(SEED, trusted=False)
     ),
