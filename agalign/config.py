@@ -84,7 +84,6 @@ def _yes_or_no(yes: str, no: str) -> BeforeValidator:
     return BeforeValidator(lambda value: {True: yes, False: no}[value] if isinstance(value, bool) else value)
 
 
-_RELIEF = Option("relief", alone="always", former="--local")
 _GLOBS = Option(type=list[str] | None, parse=lambda globs: tuple(globs or ()))
 
 

@@ -25,7 +25,6 @@ from agalign.batch.preload import preload_libraries
 from agalign.errors import AgalignError, ConfigurationError, WorkerError
 from agalign.host.process_pool import A, ProcessPool, R, WorkerDiedError
 from agalign.host.processes import (
-    CAPTURES_WORTH_A_PROCESS,
     WORKER_MODULE,
     environment_of_children,
     usable_cores,
@@ -39,6 +38,8 @@ from agalign.values.choices import MAX_JOBS
 _DASK_TIMEOUT_S = 10
 _POLL_INTERVAL_S = 1.0
 """Interval at which the loss of workers is checked while no task completes. On Windows, SIGINT waits as long."""
+_CAPTURES_WORTH_A_PROCESS = 2
+"""Minimum number of captures per process: starting one takes the time of one capture, while a flight is learned."""
 MAX_THREADS = 4
 """Maximum number of threads that train a network or process captures; more wait for the interpreter's lock."""
 _MAX_WAITING_TASKS = 1000
@@ -71,8 +72,22 @@ def numbers_of_workers(captures: int, cores: int, *, has_timeout: bool) -> tuple
     """Return (processes, threads) for `open_workers` that process these captures: with few, a process is not worth its
     start, but only processes can be stopped at a timeout.
     """
-    processes = min(cores, captures if has_timeout else captures // CAPTURES_WORTH_A_PROCESS)
+    processes = min(cores, captures if has_timeout else captures // _CAPTURES_WORTH_A_PROCESS)
     return processes, min(cores, captures, MAX_THREADS)
+
+
+def _threads_of_each(processes: int) -> int:
+    return max(1, usable_cores() // processes)
+
+
+def start_server_ahead(captures: int, cores: int, *, has_timeout: bool) -> None:
+    """Start the fork server early if a run of this many captures will use workers: it imports WORKER_MODULE while this
+    process imports the same.
+    """
+    processes, _ = numbers_of_workers(captures, cores, has_timeout=has_timeout)
+    if processes > 1:
+        with environment_of_children(_threads_of_each(processes)):
+            worker_context(WORKER_MODULE)
 
 
 @contextmanager
@@ -94,7 +109,7 @@ def open_workers(
     if executor is not None:
         yield on_executor(executor)
     elif processes > 1 or (processes and has_timeout):
-        of_each = max(1, usable_cores() // processes)
+        of_each = _threads_of_each(processes)
         with (
             environment_of_children(of_each),
             ProcessPool(processes, worker_context(preload), partial(initializer, of_each)) as pool,

@@ -44,7 +44,6 @@ def _align(
         agalign orchard/ --relief --error-map  correct parallax of trees; map the expected error
     """
     from agalign.config import DiscoverOptions, RunOptions, Settings
-    from agalign.host.processes import start_server_ahead
     from agalign.spectral_indices.formulas import index_named
 
     source = folder.resolve()
@@ -56,12 +55,13 @@ def _align(
     for name in settings.write.indices:
         index_named(name)
     load_ahead()
+    from agalign.batch.workers import start_server_ahead
     from agalign.cli.align_run import conclude, find_captures, print_plan, run
 
     reading = DiscoverOptions(**given["discover"], skip=(target,), jobs=cores, timeout_s=options.timeout_s)
     flight = find_captures(folder, reading, terminal)
     if not dask and not dry_run:
-        start_server_ahead(len(flight.captures), cores)
+        start_server_ahead(len(flight.captures), cores, has_timeout=options.timeout_s is not None)
     raw_numbers = any(b.dtype[0] in "ui" for c in flight.captures for b in c.bands)
     if settings.write.indices and settings.write.radiometry == "off" and raw_numbers:
         terminal.problem(RAW_NUMBERS)

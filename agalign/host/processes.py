@@ -212,20 +212,6 @@ def worker_context(preload: str) -> BaseContext:
     return context
 
 
-CAPTURES_WORTH_A_PROCESS = 2
-"""Minimum number of captures per process: starting one takes the time of one capture, while a flight is learned."""
-
-
-def start_server_ahead(captures: int, cores: int) -> None:
-    """Start the fork server early if a run of this many captures will use workers: it imports WORKER_MODULE while this
-    process imports the same.
-    """
-    processes = min(cores, captures // CAPTURES_WORTH_A_PROCESS)
-    if processes > 1:
-        with environment_of_children(cores // processes):
-            worker_context(WORKER_MODULE)
-
-
 @contextmanager
 def environment_of_children(threads: int) -> Iterator[None]:
     """Set the number of threads that libraries in child processes start, and where these search for modules.

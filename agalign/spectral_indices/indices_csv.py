@@ -17,7 +17,7 @@ from agalign.records.cautions import RunFacts
 from agalign.records.run_record import renamed_captures
 from agalign.records.sidecar import Sidecar
 from agalign.spectral_indices.formulas import Index, bands_for
-from agalign.spectral_indices.rasters import IndexReport, IndexStatistics, index_of, statistics_in
+from agalign.spectral_indices.rasters import IndexReport, IndexStatistics, index_of, statistics_in, was_masked
 
 INDICES_FILE = "indices.csv"
 _OF_CAPTURE = "folder", "capture", "captured_at", "latitude", "longitude"
@@ -51,8 +51,8 @@ def reports_of(sidecar: Sidecar, folder: str, out: Path, run: RunFacts) -> list[
             if statistics is not None:
                 label = Path(folder, sidecar.capture).as_posix()
                 problem = to_check(index_of(tags) if "INDEX" in tags else None, sidecar, run, label)
-                is_masked = bool(tags.get("MASKED_BY"))
-                result.append(IndexReport(label, name, path, statistics, problem, is_masked=is_masked).of(sidecar))
+                report = IndexReport(label, name, path, statistics, problem, is_masked=was_masked(tags))
+                result.append(report.of(sidecar))
     return result
 
 
@@ -114,7 +114,7 @@ def _current(row: IndexReport) -> IndexReport | None:
     if statistics is None or statistics.unit != row.statistics.unit:
         return None
     is_same = f"{statistics.median:g}" == f"{row.statistics.median:g}"
-    return replace(row, is_masked=bool(tags.get("MASKED_BY"))) if is_same else None
+    return replace(row, is_masked=was_masked(tags)) if is_same else None
 
 
 def _masked_alike(rows: Sequence[IndexReport]) -> list[IndexReport]:

@@ -328,9 +328,13 @@ def index_rasters(base: Path) -> list[IndexRaster]:
         tags = {} if path.with_suffix(".json").exists() else tags_of(path)  # else the stack of another capture
         statistics = statistics_in(tags)
         if statistics is not None and path.name == f"{base.name}_{tags.get('INDEX')}.tif":
-            is_masked = bool(tags.get("MASKED_BY")) or statistics.masked_share > 0
-            result.append(IndexRaster(path, tags["INDEX"], index_of(tags), is_masked))
+            result.append(IndexRaster(path, tags["INDEX"], index_of(tags), was_masked(tags)))
     return result
+
+
+def was_masked(tags: Mapping[str, str]) -> bool:
+    """Return True for the tags of a raster whose bands were masked by quality flags."""
+    return bool(tags.get("MASKED_BY"))
 
 
 def index_of(tags: Mapping[str, str]) -> Index | None:
