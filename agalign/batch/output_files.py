@@ -218,8 +218,8 @@ def refuse_foreign_pages(out: Path) -> None:
 def is_same(earlier: Sidecar, capture: Capture) -> bool | None:
     """Return whether a result is of this capture; None if neither tags nor contents decide.
 
-    Tags that both have are compared: make, model, serial numbers, capture id, time. If there is no id and no time, the
-    contents of a file must be equal; others may have been repaired.
+    The comparison uses the tags that both have: make, model, serial numbers, capture id and time. Without id and time,
+    the contents of one file must be equal; the other files may have been repaired.
     """
     one, other = earlier.camera, capture.camera
     pairs = (one.make, other.make), (one.model, other.model), (earlier.capture_id, capture.capture_id)

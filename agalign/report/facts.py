@@ -131,8 +131,8 @@ class PairTotals:
         return {label for label, *_ in self._references}
 
     def _other_references(self, lost: float) -> Iterator[Caution]:
-        """Yield the captures with another reference than most of their flight, all values of which are displaced from
-        those of the others; `lost` is the number of bands of a capture.
+        """Yield the captures whose reference differs from that of most captures of their flight. All their values are
+        displaced from those of the others; `lost` is the number of bands of a capture.
         """
         for label, flight, band, others in self._references:
             usual = self._votes[flight].most_common(1)[0][0]
