@@ -551,6 +551,8 @@ def test_a_relief_may_not_be_worse_than_its_plane(
     # A prediction counts only where homographies align no band.
     of_predicted_px = _gain_px(bands, dict.fromkeys(("Blue", "Red"), predicted))
     assert (of_predicted_px >= 0) == (is_chosen and plane.p95_px > 1)
+    on_larger_pixels = SimpleNamespace(**vars(predicted) | {"file_pixel_size_px": 10.0})  # homographies align these
+    assert _gain_px(bands, dict.fromkeys(("Blue", "Red"), on_larger_pixels)) == -np.inf
 
 
 # ---- what fits noise cannot pass
