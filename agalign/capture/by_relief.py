@@ -332,7 +332,7 @@ class _Estimate:
         candidate = band.candidate(mapping, held_out)
         windows = candidate.windows
         is_known = len(windows.measured_px) >= MIN_WINDOWS
-        is_known &= windows.median_px <= MAX_SHIFT_PX * candidate.file_pixel_size_px
+        is_known &= windows.median_px <= MAX_SHIFT_PX * candidate.pair.file_pixel_size_px
         if not candidate.issues or (is_known and held_out.alias_peak().ratio <= MAX_ALIAS_PEAK):
             return {band.name: candidate}
         return {}
@@ -359,7 +359,7 @@ def _gain_px(bands: Sequence[_Band], result: Mapping[str, Candidate]) -> float:
     gains = []
     for band in bands:
         candidate, plane = result.get(band.name), band.by_homography
-        if candidate is None or (candidate.issues and plane.p95_px <= MAX_SHIFT_PX * candidate.file_pixel_size_px):
+        if candidate is None or (candidate.issues and plane.p95_px <= MAX_SHIFT_PX * candidate.pair.file_pixel_size_px):
             gains.append(-math.inf)
         else:
             gains.append(_decrease_px(plane, candidate.windows))

@@ -70,7 +70,11 @@ class Candidate:
         """What the checks find; empty if it passes verification."""
         if self.inherited_issues:
             return self.inherited_issues
-        issues = tuple(issue for issue in issues_of(self) if issue.kind not in self.ignored)
+        pixel_px = self.pair.file_pixel_size_px
+        found = issues_of(self.mapping, self.error, self.windows, self.joint, self.checked_px, pixel_px)
+        if not found and self.images is not None:  # costly
+            found = self.images.issues()
+        issues = tuple(issue for issue in found if issue.kind not in self.ignored)
         if issues or self.other_windows is None:
             return issues
         error = replace(self.error, windows=self.other_windows)
@@ -81,11 +85,6 @@ class Candidate:
         """True if the images confirm the mapping, though not everywhere: it predicts the others."""
         is_confirmed = bool(self.inherited_issues) or all(issue.kind in PREDICTED_WITH for issue in self.issues)
         return is_confirmed and math.isfinite(self.std_px)
-
-    @property
-    def file_pixel_size_px(self) -> float:
-        """Size of a pixel of the reference's file, px of the fixed image."""
-        return self.pair.file_pixel_size_px
 
     @cached_property
     def std_px(self) -> float:

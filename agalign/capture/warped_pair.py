@@ -1,6 +1,7 @@
 """A band pair on one grid: the moving image under a mapping, and the residual of its windows."""
 
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
@@ -11,9 +12,10 @@ from agalign.pixels.structure import structure_field, windowed_spectra
 from agalign.values import geometry
 from agalign.values.geometry import Matrix, Points
 from agalign.values.image import Raster
+from agalign.values.issues import Issue
 from agalign.values.mapping import PixelMapping
 from agalign.values.residual import Residual
-from agalign.verify.checks import AliasPeak, alias_peak
+from agalign.verify.checks import AliasPeak, alias_peak, content_issues, repetition_issues
 from agalign.verify.coverage import points_in_frame, unobserved_quarters
 
 
@@ -83,14 +85,15 @@ class WarpedPair:
         moving = windowed_spectra(structure_field(shrink(self.warped, reference.seed_size_px)))
         return alias_peak(reference.seed_spectrum, moving, reference.seed_scale)
 
-    def is_expected(self, shift_px: tuple[float, float] = (0.0, 0.0)) -> bool:
-        """Return True if the mapping shifted by (x, y), px of the fixed image, agrees with a candidate of the pair."""
-        return self.pair.is_expected(self.mapping.fixed_to_moving, shift_px)
-
-    def separate_windows(self) -> Residual:
-        """Return the residual of windows that cover the image once."""
-        usual = self.pair.windows
-        return self.residual if self.windows is usual else usual.residuals(self.warped)
+    def issues(self) -> tuple[Issue, ...]:
+        """Return what the checks of the pixels find."""
+        usual = self.pair.windows  # they cover the image once
+        residual = self.residual if self.windows is usual else usual.residuals(self.warped)
+        is_expected = partial(self.pair.is_expected, self.mapping.fixed_to_moving)
+        return (
+            *content_issues(residual, self.pair.file_pixel_size_px),
+            *repetition_issues(self.alias_peak(), is_expected),
+        )
 
     def common_px(self) -> Points:
         """Return the points (n, 2) of a grid over the reference that the moving image covers.

@@ -1,12 +1,12 @@
 """Checks of an alignment, which find its issues (`values.issues` has the kinds of issues).
 
-A new check is one function, which yields issues, and one line in `CHECKS`. The worst error is a wrong alignment called
-`aligned`. Negated comparisons also reject NaN.
+A new check is one function, which yields issues, and one line in `issues_of`, or in `WarpedPair.issues` if it needs the
+pixels of the images. The worst error is a wrong alignment called `aligned`. Negated comparisons also reject NaN.
 """
 
 import math
-from collections.abc import Callable, Iterable, Iterator
-from typing import NamedTuple, Protocol
+from collections.abc import Callable, Iterator
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -32,7 +32,7 @@ from agalign.values.issues import (
 )
 from agalign.values.mapping import PixelMapping
 from agalign.values.mapping_error import MappingError
-from agalign.values.pixel_units import SAME_PIXELS, PixelScale
+from agalign.values.pixel_units import SAME_PIXELS, PixelScale, Size
 from agalign.values.residual import Residual, noise_px
 
 MAX_UNEXPECTED_PX = 3.0
@@ -64,63 +64,37 @@ PREDICTED_WITH = frozenset({*BY_PARALLAX, OTHER_CONTENT})
 """Issues of a mapping that the images confirm, but not everywhere: it is a prediction with its standard error."""
 
 
-class AlignedImages(Protocol):
-    """The two images of a result on one grid, for checks that use pixels."""
+def issues_of(
+    mapping: PixelMapping,
+    error: MappingError,
+    windows: Residual,
+    joint: JointResult | None,
+    checked_px: Points,
+    pixel_px: float = 1.0,
+) -> tuple[Issue, ...]:
+    """Return every reason for not accepting a mapping of a reference, without its pixels; empty if it passes.
 
-    def alias_peak(self) -> "AliasPeak":
-        """Return the highest correlation peak after that of the result."""
-
-    def is_expected(self, shift_px: tuple[float, float] = (0.0, 0.0)) -> bool:
-        """Return True if the mapping shifted by (x, y), px of the fixed image, agrees with tags, flight or user."""
-
-    def separate_windows(self) -> Residual:
-        """Return the residual of windows that cover the image once."""
-
-
-class Verifiable(Protocol):
-    """The mapping that is checked, on the grid of the images or of the files: `capture.candidate.Candidate`."""
-
-    @property
-    def mapping(self) -> PixelMapping:
-        """From the reference to the moving image."""
-
-    @property
-    def joint(self) -> JointResult | None:
-        """The homography, and evidence of descriptors."""
-
-    @property
-    def windows(self) -> Residual:
-        """Shifts of windows after alignment."""
-
-    @property
-    def error(self) -> MappingError:
-        """The expected error."""
-
-    @property
-    def checked_px(self) -> Points:
-        """Points (n, 2) of the reference whose errors are limited."""
-
-    @property
-    def file_pixel_size_px(self) -> float:
-        """Size of a pixel of the reference's file on this grid: limits of shifts and errors are in px of the file, for
-        bands of much lower resolution in px of the reduced reference.
-        """
-
-    @property
-    def images(self) -> AlignedImages | None:
-        """None omits the checks that use pixels."""
+    The first issue is the reason in the sidecar. `windows` are measured with the mapping, `joint` is the evidence of
+    descriptors, and `checked_px` (n, 2) are the points whose errors are limited. `pixel_px` is the size of a pixel of
+    the reference's file on this grid: limits of shifts and errors are in px of the file.
+    """
+    return (
+        *_mapping_issues(mapping.fixed_to_moving, error.size_px),
+        *_descriptor_issues(joint, windows),
+        *_window_issues(windows, pixel_px),
+        *_error_issues(error, windows, checked_px, pixel_px),
+    )
 
 
-def _mapping_issues(candidate: Verifiable) -> Iterator[Issue]:
+def _mapping_issues(fixed_to_moving: Matrix, size_px: Size) -> Iterator[Issue]:
     max_stretch = 4.0  # of the largest magnification relative to the smallest; beyond it, a homography is degenerate
-    scale = geometry.local_scale(candidate.mapping.fixed_to_moving, *candidate.error.size_px)
+    scale = geometry.local_scale(fixed_to_moving, *size_px)
     if not (scale.min() > 0 and scale.max() <= max_stretch * scale.min()):
         yield Issue(FOLDS, float(scale.max() / scale.min()), max_stretch)
 
 
-def _descriptor_issues(candidate: Verifiable) -> Iterator[Issue]:
+def _descriptor_issues(joint: JointResult | None, residual: Residual) -> Iterator[Issue]:
     """Retrieval of held-out patches, or held-out windows of a result that is fitted to windows."""
-    joint, residual = candidate.joint, candidate.windows
     if joint is None:
         return
     # With a measured shift, if they are the only evidence: in unrelated images one in a thousand is aligned.
@@ -130,9 +104,8 @@ def _descriptor_issues(candidate: Verifiable) -> Iterator[Issue]:
         yield Issue(RETRIEVAL, joint.retrieval, joint.min_retrieval)
 
 
-def _window_issues(candidate: Verifiable) -> Iterator[Issue]:
+def _window_issues(residual: Residual, pixel_px: float) -> Iterator[Issue]:
     """Residual shifts of windows, each without its own part in the estimation."""
-    residual = candidate.windows
     measured, min_windows = len(residual.measured_px), 5  # some homography fits the two coordinates of any four
     is_covered = residual.coverage >= _MIN_COMMON_COVERAGE
     if measured < min_windows and (is_covered or len(residual.centres_px) < min_windows):
@@ -141,7 +114,7 @@ def _window_issues(candidate: Verifiable) -> Iterator[Issue]:
     if not is_covered:
         yield Issue(COVERAGE, residual.coverage, _MIN_COMMON_COVERAGE)
     count = max(measured, 1)
-    is_far = is_misaligned(residual, candidate.file_pixel_size_px)
+    is_far = is_misaligned(residual, pixel_px)
     close = 1 - float(is_far.sum()) / count
     if not close >= _MIN_CLOSE_SHARE:
         yield Issue(CLOSE_WINDOWS, close, _MIN_CLOSE_SHARE, f"{MAX_SHIFT_PX:g} px")
@@ -161,28 +134,27 @@ def is_misaligned(residual: Residual, pixel_px: float = 1.0) -> NDArray[np.bool_
     return np.asarray(lengths_px > np.hypot(MAX_SHIFT_PX * pixel_px, _MAX_NOISE_STD * noise))
 
 
-def _error_issues(candidate: Verifiable) -> Iterator[Issue]:
+def _error_issues(error: MappingError, windows: Residual, checked_px: Points, pixel_px: float) -> Iterator[Issue]:
     """Check the expected error over the common area.
 
     A relief comes from other bands, so its error is small even where this band shows a different scene. Under a relief,
     the error is therefore checked at the windows, and the band must have a measured shift in them.
     """
-    if not len(candidate.checked_px):
+    if not len(checked_px):
         return
-    max_px = _MAX_ERROR_PX * candidate.file_pixel_size_px
-    share = float((candidate.error.error_px(candidate.checked_px) <= max_px).mean())
+    share = float((error.error_px(checked_px) <= _MAX_ERROR_PX * pixel_px).mean())
     if not share >= _MIN_ACCURATE_SHARE:
         yield Issue(INACCURATE, 1 - share, 1 - _MIN_ACCURATE_SHARE, f"{_MAX_ERROR_PX:g} px")
-    if candidate.mapping.parallax is not None and not candidate.windows.coverage >= _MIN_ACCURATE_SHARE:
-        yield Issue(UNMEASURED, 1 - candidate.windows.coverage, 1 - _MIN_ACCURATE_SHARE)
+    if error.parallax is not None and not windows.coverage >= _MIN_ACCURATE_SHARE:
+        yield Issue(UNMEASURED, 1 - windows.coverage, 1 - _MIN_ACCURATE_SHARE)
 
 
-def _content_issues(candidate: Verifiable) -> Iterator[Issue]:
-    """An area with texture in both bands and no common peak shows something else. Single windows are normal."""
-    if candidate.images is None:
-        return
-    residual = candidate.images.separate_windows()
-    is_lost = ~residual.is_measured | is_misaligned(residual, candidate.file_pixel_size_px)
+def content_issues(residual: Residual, pixel_px: float) -> Iterator[Issue]:
+    """An area with texture in both bands and no common peak shows something else. Single windows are normal.
+
+    The windows must cover the image once.
+    """
+    is_lost = ~residual.is_measured | is_misaligned(residual, pixel_px)
     area = _solid_area(residual.cells, is_lost)
     if area:
         yield Issue(OTHER_CONTENT, area / len(is_lost), 0.0)
@@ -223,16 +195,6 @@ def rig_issues(prediction: Prediction) -> Iterator[Issue]:
             yield Issue(UNEXPECTED_PX, prediction.off_px, limit_px)
 
 
-def _repetition_issues(candidate: Verifiable) -> Iterator[Issue]:
-    """Another shift fits nearly as well in an orchard or on solar panels, and no prior information excludes it."""
-    images = candidate.images
-    if images is None:
-        return
-    alias = images.alias_peak()
-    if alias.ratio > MAX_ALIAS_PEAK and (not images.is_expected() or images.is_expected(alias.shift_px)):
-        yield Issue(REPEATS, math.hypot(*alias.shift_px))
-
-
 class AliasPeak(NamedTuple):
     """The highest correlation peak after that of the result: (x, y), px of the fixed image, and relative height."""
 
@@ -257,29 +219,14 @@ def alias_peak(fixed: Field, moving: Field, scale: PixelScale = SAME_PIXELS) -> 
     return AliasPeak(((index % width - column) / scale.x, (index // width - row) / scale.y), ratio)
 
 
-class Check(NamedTuple):
-    """One check: the function that returns its issues."""
+def repetition_issues(alias: AliasPeak, is_expected: Callable[[tuple[float, float]], bool]) -> Iterator[Issue]:
+    """Another shift fits nearly as well in an orchard or on solar panels, and no prior information excludes it.
 
-    issues: Callable[[Verifiable], Iterable[Issue]]
-    is_costly: bool = False
-    """Run only if no other check returns an issue."""
-
-
-CHECKS = (
-    Check(_mapping_issues),
-    Check(_descriptor_issues),
-    Check(_window_issues),
-    Check(_error_issues),
-    Check(_content_issues, is_costly=True),
-    Check(_repetition_issues, is_costly=True),
-)
-"""In the order in which their issues are listed; the first issue is the reason in the sidecar."""
-
-
-def issues_of(candidate: Verifiable) -> tuple[Issue, ...]:
-    """Return every reason for not accepting a result; empty if it passes verification."""
-    result = tuple(i for check in CHECKS if not check.is_costly for i in check.issues(candidate))
-    return result or tuple(i for check in CHECKS if check.is_costly for i in check.issues(candidate))
+    `is_expected` returns True if the mapping shifted by (x, y), px of the fixed image, agrees with tags, flight or
+    user.
+    """
+    if alias.ratio > MAX_ALIAS_PEAK and (not is_expected((0.0, 0.0)) or is_expected(alias.shift_px)):
+        yield Issue(REPEATS, math.hypot(*alias.shift_px))
 
 
 def seed_fits(residual: Residual) -> bool:

@@ -16,6 +16,7 @@ from agalign.values import geometry
 from agalign.values.alignment import Alignment, JointResult, Seed
 from agalign.values.choices import ReliefUse
 from agalign.values.geometry import Matrix
+from agalign.values.issues import REPEATS, RETRIEVAL, Issue
 from agalign.values.mapping import DisplacementField
 
 from ..builders import decided, displaced_views, joint_result, pair_of, texture, two_views, whole
@@ -41,6 +42,14 @@ def aligned(
 ) -> Alignment:
     """The alignment of a band by the result of the joint optimisation."""
     return decided(pair, seed, by_descriptors(replace(RefinedBand.of(pair, seed, joint), by_halves=by_halves), use))
+
+
+def test_pixels_are_checked_only_where_the_other_checks_pass(pair: BandPair, monkeypatch: pytest.MonkeyPatch) -> None:
+    """These checks are costly."""
+    monkeypatch.setattr(WarpedPair, "issues", lambda _: (Issue(REPEATS, 16.0),))
+    warped_pair = WarpedPair.of(pair, pair.mapping(TRUTH))
+    for joint, kind in ((GOOD, REPEATS), (replace(GOOD, retrieval=0.0), RETRIEVAL)):
+        assert [issue.kind for issue in module.Candidate.of("descriptors", warped_pair, joint).issues] == [kind]
 
 
 def test_each_colour_is_verified_by_the_estimate_from_the_other(pair: BandPair) -> None:

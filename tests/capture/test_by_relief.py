@@ -15,7 +15,6 @@ from synthetic_flights.relief import make_scene
 
 from agalign.batch.capture_task import quiet
 from agalign.capture import align_bands
-from agalign.capture import candidate as candidate_module
 from agalign.capture.align_bands import CaptureEstimation
 from agalign.capture.band_pair import BandPair
 from agalign.capture.by_relief import ReliefCandidates, _Estimate, _gain_px, _std_px, by_relief
@@ -400,12 +399,12 @@ def test_a_relief_does_not_verify_a_band_that_it_is_estimated_from(
     candidates: Sequence[RefinedBand], aligned: Mapping[str, Alignment], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A band that does not pass with the relief of the others is predicted by it, with the error of those windows."""
-    issues_of = candidate_module.issues_of
+    found = Candidate.issues.func
 
     def with_nir_failed(candidate: Candidate) -> tuple[Issue, ...]:
-        return (Issue(RETRIEVAL),) if candidate.pair.name == "NIR" else issues_of(candidate)
+        return (Issue(RETRIEVAL),) if candidate.pair.name == "NIR" else found(candidate)
 
-    monkeypatch.setattr(candidate_module, "issues_of", with_nir_failed)
+    monkeypatch.setattr(Candidate, "issues", property(with_nir_failed))
     result = aligned_by_relief(candidates, "auto")[0]
     assert {name: a.status for name, a in result.items()} == dict.fromkeys(aligned, "aligned") | {"NIR": "predicted"}
     np.testing.assert_array_equal(result["NIR"].residual.shifts_px, aligned["NIR"].residual.shifts_px)
@@ -543,7 +542,7 @@ def test_a_relief_may_not_be_worse_than_its_plane(
     shifts = (np.array([[median, 0.0]] * 19 + [[p95, 0.0]] * 2) for median, p95 in (plane_px, relief_px))
     plane, relief = (residual_of(np.zeros((21, 2)), one) for one in shifts)
     bands = [SimpleNamespace(name=name, by_homography=plane) for name in ("Blue", "Red", "NIR")]
-    aligned = SimpleNamespace(issues=(), windows=relief, file_pixel_size_px=1.0)
+    aligned = SimpleNamespace(issues=(), windows=relief, pair=SimpleNamespace(file_pixel_size_px=1.0))
     predicted = SimpleNamespace(**vars(aligned) | {"issues": (Issue(RETRIEVAL),)})
     assert (_gain_px(bands[:1], {"Blue": aligned}) >= 0) == is_chosen
     assert (_gain_px(bands, {"Blue": aligned, "Red": aligned}) >= 0) == is_chosen
@@ -551,7 +550,8 @@ def test_a_relief_may_not_be_worse_than_its_plane(
     # A prediction counts only where homographies align no band.
     of_predicted_px = _gain_px(bands, dict.fromkeys(("Blue", "Red"), predicted))
     assert (of_predicted_px >= 0) == (is_chosen and plane.p95_px > 1)
-    on_larger_pixels = SimpleNamespace(**vars(predicted) | {"file_pixel_size_px": 10.0})  # homographies align these
+    larger = SimpleNamespace(file_pixel_size_px=10.0)  # pixels
+    on_larger_pixels = SimpleNamespace(**vars(predicted) | {"pair": larger})  # homographies align these
     assert _gain_px(bands, dict.fromkeys(("Blue", "Red"), on_larger_pixels)) == -np.inf
 
 

@@ -10,13 +10,21 @@ import agalign
 from agalign.pixels.structure import structure_field, windowed_spectra
 from agalign.values import geometry, issues
 from agalign.values.alignment import JointResult, Prediction
-from agalign.values.issues import sentence
+from agalign.values.issues import Issue, sentence
 from agalign.values.mapping import PixelMapping
 from agalign.values.mapping_error import MappingError
 from agalign.values.parallax import Parallax, Relief
 from agalign.values.pixel_units import PixelScale
 from agalign.values.residual import Residual
-from agalign.verify.checks import AliasPeak, AlignedImages, alias_peak, is_unchanged, issues_of, rig_issues, seed_fits
+from agalign.verify.checks import (
+    alias_peak,
+    content_issues,
+    is_unchanged,
+    issues_of,
+    repetition_issues,
+    rig_issues,
+    seed_fits,
+)
 
 from ..builders import grid_px, joint_result, residual_of, texture, whole
 
@@ -35,34 +43,20 @@ RESIDUAL = measured_in(1.0)
 
 @dataclass(frozen=True)
 class Checked:
-    """What the checks need of a candidate whose error is limited at its windows."""
+    """A mapping whose error is limited at its windows, and its evidence."""
 
     joint: JointResult | None = JOINT
     windows: Residual = RESIDUAL
-    images: AlignedImages | None = None
-    file_pixel_size_px: float = 1.0
+    parallax: Parallax | None = None
+    pixel_px: float = 1.0
 
     @property
-    def mapping(self) -> PixelMapping:
-        return PixelMapping(np.eye(3) if self.joint is None else self.joint.fixed_to_moving)
-
-    @property
-    def error(self) -> MappingError:
-        return MappingError(SIZE, None if self.joint is None else self.joint.covariance_px2, self.windows)
-
-    @property
-    def checked_px(self) -> np.ndarray:
-        return self.windows.centres_px
-
-
-@dataclass(frozen=True)
-class UnderRelief(Checked):
-    """A candidate under a flat relief of other bands."""
-
-    @property
-    def mapping(self) -> PixelMapping:
-        relief = Relief(np.zeros((SIZE[1], SIZE[0]), np.float32), np.ones((SIZE[1], SIZE[0]), np.float32))
-        return super().mapping.with_parallax(Parallax(relief, (1.0, 0.0)))
+    def issues(self) -> tuple[Issue, ...]:
+        joint = self.joint
+        mapping = PixelMapping(np.eye(3) if joint is None else joint.fixed_to_moving).with_parallax(self.parallax)
+        covariance_px2 = None if joint is None else joint.covariance_px2
+        error = MappingError(SIZE, covariance_px2, self.windows, parallax=self.parallax)
+        return issues_of(mapping, error, self.windows, joint, self.windows.centres_px, self.pixel_px)
 
 
 GOOD = Checked()
@@ -71,7 +65,7 @@ NAN = float("nan")
 
 
 def codes(checked: Checked = GOOD, residual: Residual | None = None) -> list[str]:
-    return [issue.code for issue in issues_of(replace(checked, windows=residual or checked.windows))]
+    return [issue.code for issue in replace(checked, windows=residual or checked.windows).issues]
 
 
 def test_a_good_result_has_no_issues() -> None:
@@ -92,14 +86,16 @@ def test_a_good_result_has_no_issues() -> None:
 def test_values_that_are_not_finite_and_mirrored_mappings_are_issues(
     joint: dict[str, object], measured: float, expected: str
 ) -> None:
-    issues = issues_of(Checked(replace(JOINT, **joint), measured_in(measured)))
+    issues = Checked(replace(JOINT, **joint), measured_in(measured)).issues
     assert [issue.code for issue in issues] == expected.split()
     assert all(sentence(d) for d in issues)
 
 
 def test_a_part_of_the_image_that_the_relief_of_other_bands_does_not_align_is_an_issue() -> None:
-    assert codes(UnderRelief(), measured_in(0.9)) == []
-    assert codes(UnderRelief(), measured_in(0.89)) == ["unmeasured"]
+    flat = Relief(np.zeros((SIZE[1], SIZE[0]), np.float32), np.ones((SIZE[1], SIZE[0]), np.float32))
+    under_relief = Checked(parallax=Parallax(flat, (1.0, 0.0)))
+    assert codes(under_relief, measured_in(0.9)) == []
+    assert codes(under_relief, measured_in(0.89)) == ["unmeasured"]
     assert codes(GOOD, measured_in(0.89)) == []
 
 
@@ -128,8 +124,8 @@ def test_results_and_windows_pass_at_their_limits(
     within: object, beyond: object, code: str, value: float, limit: float
 ) -> None:
     part = "windows" if isinstance(within, Residual) else "joint"
-    assert issues_of(replace(GOOD, **{part: within})) == ()
-    (issue,) = issues_of(replace(GOOD, **{part: beyond}))
+    assert replace(GOOD, **{part: within}).issues == ()
+    (issue,) = replace(GOOD, **{part: beyond}).issues
     assert (issue.code, issue.limit) == (code, limit)
     assert issue.value == pytest.approx(value, rel=0.01)
     assert f"{value:.2f}" in sentence(issue) or code != "retrieval"
@@ -164,7 +160,7 @@ def test_a_result_far_from_the_rig_is_an_issue(off_px: float | None, std_px: flo
 def test_the_limit_is_a_pixel_of_the_file_where_the_images_are_reduced() -> None:
     within = replace(GOOD, windows=shifted(11, 0.7))
     assert codes(within) == []
-    assert codes(replace(within, file_pixel_size_px=0.65)) == ["close_windows"]
+    assert codes(replace(within, pixel_px=0.65)) == ["close_windows"]
 
 
 def test_every_kind_of_issue_has_a_code_of_its_own() -> None:
@@ -198,25 +194,9 @@ def test_aligned_means_an_error_of_half_a_pixel_in_nine_tenths_of_the_image() ->
     assert codes(nearly_all) == []
     assert codes(replace(nearly_all, joint=joint_result(covariance=np.diag(np.full(8, 0.6))))) == ["inaccurate"]
     residual = residual_of(geometry.lattice(*SIZE, 10, 10), (0.0, 0.0))
-    (issue,) = issues_of(replace(GOOD, joint=joint_result(covariance=covariance), windows=residual))
+    (issue,) = replace(GOOD, joint=joint_result(covariance=covariance), windows=residual).issues
     assert (issue.code, issue.limit) == ("inaccurate", pytest.approx(0.1))
     assert 0.1 < issue.value < 0.6
-
-
-class Images:
-    """Images with these windows, which cover the whole reference."""
-
-    def __init__(self, residual: Residual) -> None:
-        self.residual = residual
-
-    def alias_peak(self) -> AliasPeak:
-        return AliasPeak((0.0, 0.0), 0.1)
-
-    def is_expected(self, shift_px: tuple[float, float] = (0.0, 0.0)) -> bool:
-        return True
-
-    def separate_windows(self) -> Residual:
-        return self.residual
 
 
 def test_an_area_without_common_peaks_shows_something_else_but_scattered_windows_do_not() -> None:
@@ -228,7 +208,7 @@ def test_an_area_without_common_peaks_shows_something_else_but_scattered_windows
     for lost, expected in ((torn, ["other_content"]), (scattered, []), (noisy, []), (corner, ["other_content"])):
         shifts = np.where(lost.reshape(-1, 1), np.nan, 0.0) * np.ones((1, 2))
         residual = residual_of(112 * grid_px(np.arange(12), np.arange(9)) + 56, shifts)
-        assert codes(replace(GOOD, images=Images(residual))) == expected
+        assert [issue.code for issue in content_issues(residual, 1.0)] == expected
 
 
 def test_misaligned_clusters_are_an_issue_but_scattered_and_unmeasured_windows_are_not() -> None:
@@ -259,33 +239,19 @@ def test_the_windows_of_a_cluster_are_counted(total: int, allowed: int) -> None:
 # ---- repetitive scenes
 
 
-class RepetitiveImages:
-    """Images that also match with a shift of 16 px along x: every 8 px of images with half the width."""
-
-    def __init__(self, expected_within_px: float = np.inf) -> None:
-        self.expected_within_px = expected_within_px
-
-    def alias_peak(self) -> AliasPeak:
-        rng = np.random.default_rng(0)
-        spectrum = np.fft.fft2(np.tile(rng.normal(size=(64, 8)), (1, 8))).astype(np.complex64)
-        return alias_peak(spectrum, spectrum, PixelScale(0.5, 0.25))
-
-    def is_expected(self, shift_px: tuple[float, float] = (0.0, 0.0)) -> bool:
-        return float(np.hypot(*shift_px)) <= self.expected_within_px
-
-    def separate_windows(self) -> Residual:
-        return RESIDUAL
-
-
-def test_a_repetitive_scene_is_an_issue_unless_aliases_are_excluded() -> None:
-    x_px, y_px = RepetitiveImages().alias_peak().shift_px
+@pytest.mark.parametrize(("expected_within_px", "codes"), [(np.inf, ["repeats"]), (5.0, []), (-1.0, ["repeats"])])
+def test_a_repetitive_scene_is_an_issue_unless_aliases_are_excluded(
+    expected_within_px: float, codes: list[str]
+) -> None:
+    """The images also match with a shift of 16 px along x: every 8 px of images with half the width."""
+    rng = np.random.default_rng(0)
+    spectrum = np.fft.fft2(np.tile(rng.normal(size=(64, 8)), (1, 8))).astype(np.complex64)
+    alias = alias_peak(spectrum, spectrum, PixelScale(0.5, 0.25))
+    x_px, y_px = alias.shift_px
     assert (abs(x_px) % 16, y_px, x_px == 0) == (0, 0, False)
-    (issue,) = issues_of(replace(GOOD, images=RepetitiveImages()))
-    assert (issue.code, issue.value) == ("repeats", pytest.approx(abs(x_px)))
-    assert codes(replace(GOOD, images=RepetitiveImages(expected_within_px=5.0))) == []
-    assert codes(replace(GOOD, images=RepetitiveImages(expected_within_px=-1.0))) == ["repeats"]
-    # A costly check runs only where the others pass.
-    assert codes(replace(GOOD, joint=replace(JOINT, retrieval=0.0), images=RepetitiveImages())) == ["retrieval"]
+    issues = list(repetition_issues(alias, lambda shift_px: float(np.hypot(*shift_px)) <= expected_within_px))
+    assert [issue.code for issue in issues] == codes
+    assert all(issue.value == pytest.approx(abs(x_px)) for issue in issues)
 
 
 PERIOD = 26.0
