@@ -189,7 +189,8 @@ def test_a_page_on_a_flight_with_panel_two_cameras_and_failed_captures(
 
 
 EXAMPLES = {
-    "two_arrays.py": ("", "aligned: ", 1),
+    "two_arrays.py": ("", "aligned", 2),
+    "training_tiles.py": ("aligned", "1 tiles for training, 1 for validation\n(1, 5, 256, 256): ", 1),
     "one_capture.py": ("flight one", ": aligned, ", 4),
     "whole_flight.py": ("flight whole", " aligned ", 8),
     "ndvi_over_a_flight.py": ("aligned", " at 52.", 2),
@@ -214,7 +215,10 @@ def test_every_example_is_run() -> None:
 def test_an_example(name: str, desk: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     arguments, text, times = EXAMPLES[name]
     monkeypatch.chdir(desk)
+    if name == "training_tiles.py":
+        assert agalign_here("flight", "-o", "aligned", "--qa").returncode == 0
     monkeypatch.setattr(sys, "argv", [name, *arguments.split()])
+    monkeypatch.syspath_prepend(str(ROOT / "examples"))  # as `python examples/NAME` does
     with warnings.catch_warnings(action="ignore"):
         runpy.run_path(str(ROOT / "examples" / name), run_name="__main__")
     assert capsys.readouterr().out.count(text) == times
