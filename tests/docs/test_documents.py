@@ -41,8 +41,8 @@ RUN_BY = {"docker": "tools/container.sh", "dask": "tools/dask_cluster.sh", "pip"
 KINDS = {"sh", "python", "text"}
 RUNNABLE = [page for page in PAGES if any(b.kind in ("sh", "python") for b in blocks_of(page))]
 LONG = re.compile(
-    "altum|bad-flight|choose-captures|close-range|comparison|first-flight|large-flights|mavic-3m|paper|phantom-4|photogrammetry|python|qgis|rededge|"
-    "reflectance|sentera|sequoia|thermal"
+    "bad-flight|choose-captures|close-range|comparison|dji|first-flight|large-flights|micasense|paper|photogrammetry|"
+    "python|qgis|reflectance|sentera|sequoia|thermal"
 )
 """Pages with blocks that take seconds, and of commands that other tests run: only the full run has them."""
 
@@ -183,8 +183,6 @@ def test_a_page_on_a_flight_with_panel_two_cameras_and_failed_captures(
     page: Path, mixed_originals: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(shutil.copytree(mixed_originals, tmp_path / "desk", symlinks=True))
-    if page.stem == "altum":  # its commands write the results of its own flight there
-        shutil.rmtree("aligned")
     run_page(page, codes=(0, 3))
 
 
