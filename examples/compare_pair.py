@@ -1,9 +1,10 @@
 """Compare agalign, SIFT and ECC on one pair of images; with known tie points, print the errors of each.
 
-python examples/compare_pair.py FIXED MOVING [TIES.csv]
+python examples/compare_pair.py FIXED MOVING [TIES.csv [HOMOGRAPHY.txt]]
 
 TIES.csv has the columns fixed_x, fixed_y, moving_x, moving_y: raw pixels, x right, y down, (0, 0) is the centre of the
-top-left pixel. Without it, the script prints how far each method is from agalign. FIXED and MOVING have one band each.
+top-left pixel. Without it, the script prints how far each method is from agalign. HOMOGRAPHY.txt has 3 x 3 numbers: the
+mapping from FIXED to MOVING by another method. FIXED and MOVING have one band each.
 """
 
 import sys
@@ -44,14 +45,16 @@ def by_ecc(fixed, moving):
     return matrix
 
 
-if len(sys.argv) not in (3, 4):
-    sys.exit("usage: python examples/compare_pair.py FIXED MOVING [TIES.csv]")
+if len(sys.argv) not in (3, 4, 5):
+    sys.exit("usage: python examples/compare_pair.py FIXED MOVING [TIES.csv [HOMOGRAPHY.txt]]")
 fixed, moving = (cv2.imread(name, cv2.IMREAD_UNCHANGED) for name in sys.argv[1:3])
 grey = [cv2.normalize(image, None, 0, 255, cv2.NORM_MINMAX, cv2.CV_8U) for image in (fixed, moving)]
 result = agalign.align(fixed, moving)
 matrices = {"SIFT": by_sift(*grey), "ECC": by_ecc(*grey)}
 
-if len(sys.argv) == 4:
+if len(sys.argv) == 5:
+    matrices["the homography"] = np.loadtxt(sys.argv[4])
+if len(sys.argv) >= 4:
     ties = np.loadtxt(sys.argv[3], delimiter=",", skiprows=1)
     points, truth, what = ties[:, :2], ties[:, 2:], "error"
 else:

@@ -47,8 +47,7 @@ TABLES = {
     ),
     "failures": ("synthetic pairs", "planted grids", "starts", "difficult captures", "predicted bands"),
     "comparison": (
-        *("OpenDroneMap", "NDVI", "comparison, originals with tags", "drone cameras, originals"),
-        "comparison, degraded copies",
+        *("OpenDroneMap", "NDVI", "comparison, originals with tags", "comparison, degraded copies"),
     ),
     "verification": ("reliability",),
     "paper": ("experiments, recipe fast", "experiments, recipe paper"),

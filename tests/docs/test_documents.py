@@ -190,6 +190,7 @@ EXAMPLES = {
     "two_arrays.py": ("", "aligned", 2),
     "training_tiles.py": ("aligned", "1 tiles for training, 1 for validation\n(1, 5, 256, 256): ", 1),
     "one_capture.py": ("flight one", ": aligned, ", 4),
+    "one_day.py": ("flight 2026-06-21 day", "2 captures", 1),
     "whole_flight.py": ("flight whole", " aligned ", 8),
     "ndvi_over_a_flight.py": ("aligned", " at 52.", 2),
     "next_flight.py": ("flight flight next", "4 of 4 aligned", 2),
@@ -197,7 +198,7 @@ EXAMPLES = {
     "map_pixels.py": ("aligned/0000SET/000/IMG_0001.json NIR 100 80", "NIR: [", 1),
     "water.py": ("aligned/0000SET/000/IMG_0001.tif water.tif 0.05", " are water", 1),
     "plots.py": ("plots.gpkg ndvi.tif", "", 1),
-    "compare_pair.py": ("green.tif nir.tif ties.csv", "agalign, aligned: median error 0.", 1),
+    "compare_pair.py": ("green.tif nir.tif ties.csv homography.txt", "the homography: median error 0.000 px", 1),
     "two_dates.py": ("spring.tif summer.tif change.tif", "offset before alignment: ", 1),
     "warp_matrices.py": ("aligned/0000SET/000/IMG_0001.json", "_warp_matrices_opencv.npy: 5 bands", 1),
 }
