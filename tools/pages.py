@@ -46,9 +46,7 @@ TABLES = {
         "captures with depth",
     ),
     "failures": ("synthetic pairs", "planted grids", "starts", "difficult captures", "predicted bands"),
-    "comparison": (
-        *("OpenDroneMap", "NDVI", "comparison, originals with tags", "comparison, degraded copies"),
-    ),
+    "comparison": ("OpenDroneMap", "NDVI", "comparison, originals with tags", "comparison, degraded copies"),
     "verification": ("reliability",),
     "paper": ("experiments, recipe fast", "experiments, recipe paper"),
 }
