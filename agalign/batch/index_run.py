@@ -7,7 +7,7 @@ from pathlib import Path
 
 import cv2
 
-from agalign.batch.workers import failure_text, open_workers, serially
+from agalign.batch.workers import failure_text, numbers_of_workers, open_workers, serially
 from agalign.errors import AgalignError
 from agalign.host.files import written_below
 from agalign.host.processes import usable_cores
@@ -73,8 +73,8 @@ def run_indices(
     A failed capture is reported and does not stop the others. Raises WorkerError if no worker process can be started,
     and OutputError if the table cannot be written.
     """
-    captures_worth_a_process = 8  # starting a process takes as long as the indices of this many captures
-    processes = min(jobs or usable_cores(), len(tasks) // captures_worth_a_process)
+    # Starting a process takes as long as the indices of eight captures.
+    processes, _ = numbers_of_workers(len(tasks), jobs or usable_cores(), worth_a_process=8)
     rows: list[IndexReport] = []
     try:
         with open_workers(executor, processes, cv2.setNumThreads, preload=__name__) as run:

@@ -1,9 +1,10 @@
 """Selection of the captures of a run: which are aligned, with their radiometry, and which show a panel or the sky."""
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass, field, replace
-from multiprocessing import get_context
+from functools import partial
+from importlib import import_module
 
 from agalign.batch.capture_task import missing_lens, missing_radiometry
 from agalign.batch.products import PRODUCTS
@@ -28,8 +29,8 @@ from agalign.flight.panel_readings import (
     with_panels,
 )
 from agalign.flight.sky import SkyCapture, sky_captures
-from agalign.host.process_pool import ProcessPool, R, WorkerDiedError
-from agalign.host.processes import environment_of_children, silence_libraries, usable_cores
+from agalign.host.process_pool import ProcessPool, R, WorkerDiedError, open_pool
+from agalign.host.processes import usable_cores
 from agalign.pixels.radiometry import with_radiometry
 from agalign.rasters.product import Product
 from agalign.values.capture import Capture
@@ -54,8 +55,10 @@ def select_captures(flight: FolderScan, write: WriteSettings, options: RunOption
     Raises ConfigurationError if no capture has what the settings ask for: the radiometry, the metadata for a
     georeference, or the bands for a product.
     """
-    with _examining(options.timeout_s) as examine:
-        result = _selected(flight, write, options, examine)
+    start, timeout_s = partial(import_module, __name__), options.timeout_s  # tasks do not wait for the imports
+    readers = nullcontext() if timeout_s is None else open_pool(min(READERS, usable_cores()), 1, start)
+    with readers as pool:
+        result = _selected(flight, write, options, _Examination(pool, timeout_s))
     captures = result.captures
     without_lens = [missing_lens(capture, write) for capture in captures]
     if captures and all(without_lens):
@@ -116,10 +119,12 @@ def _check_product(product: Product, captures: Sequence[Capture]) -> None:
 
 @dataclass(frozen=True)
 class _Examination:
-    """Calls functions that read the images of captures, as `flight.panel_readings.Examine`."""
+    """Calls functions that read the images of captures, as `flight.panel_readings.Examine`: with a time limit, in the
+    processes of a pool.
+    """
 
-    pool: ProcessPool | None = None
-    timeout_s: float | None = None
+    pool: ProcessPool | None
+    timeout_s: float | None
     abandoned: dict[str, str] = field(default_factory=dict)
     """Why a capture was abandoned, by label."""
 
@@ -131,19 +136,3 @@ class _Examination:
         except (TimeoutError, WorkerDiedError, MemoryError) as error:
             self.abandoned[capture.label] = failure_text(error, self.timeout_s)
             return None
-
-
-@contextmanager
-def _examining(timeout_s: float | None) -> Iterator[_Examination]:
-    """Provide how the images of captures are read before the alignment: with a time limit, in worker processes."""
-    processes = min(READERS, usable_cores())
-    if timeout_s is None:
-        yield _Examination()
-        return
-    with environment_of_children(threads=1), ProcessPool(processes, get_context("spawn"), _start_examining) as pool:
-        yield _Examination(pool, timeout_s)
-
-
-def _start_examining() -> None:
-    """Initialise a worker, which imports this module for it: tasks do not wait for that."""
-    silence_libraries()

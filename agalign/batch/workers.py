@@ -23,7 +23,7 @@ from typing import Any, Protocol, TypeAlias
 from agalign._version import __version__
 from agalign.batch.preload import preload_libraries
 from agalign.errors import AgalignError, ConfigurationError, WorkerError
-from agalign.host.process_pool import A, ProcessPool, R, WorkerDiedError
+from agalign.host.process_pool import A, ProcessPool, R, WorkerDiedError, open_pool
 from agalign.host.processes import (
     WORKER_MODULE,
     environment_of_children,
@@ -68,11 +68,13 @@ def serially(function: Callable[[A], R], tasks: Sequence[A], /, **_: object) -> 
         yield number, partial(function, task)
 
 
-def numbers_of_workers(captures: int, cores: int, *, has_timeout: bool) -> tuple[int, int]:
+def numbers_of_workers(
+    captures: int, cores: int, *, has_timeout: bool = False, worth_a_process: int = _CAPTURES_WORTH_A_PROCESS
+) -> tuple[int, int]:
     """Return (processes, threads) for `open_workers` that process these captures: with few, a process is not worth its
     start, but only processes can be stopped at a timeout.
     """
-    processes = min(cores, captures if has_timeout else captures // _CAPTURES_WORTH_A_PROCESS)
+    processes = min(cores, captures if has_timeout else captures // worth_a_process)
     return processes, min(cores, captures, MAX_THREADS)
 
 
@@ -110,10 +112,7 @@ def open_workers(
         yield on_executor(executor)
     elif processes > 1 or (processes and has_timeout):
         of_each = _threads_of_each(processes)
-        with (
-            environment_of_children(of_each),
-            ProcessPool(processes, worker_context(preload), partial(initializer, of_each)) as pool,
-        ):
+        with open_pool(processes, of_each, partial(initializer, of_each), preload) as pool:
             yield on_executor(pool)
     elif threads > 1:
         # Warning filters are global: threads that change and restore them would interfere.

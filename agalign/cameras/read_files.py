@@ -4,7 +4,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from functools import partial
-from multiprocessing import get_context
+from importlib import import_module
 from pathlib import Path
 
 from agalign.cameras.base import Camera
@@ -28,8 +28,7 @@ from agalign.config import DiscoverOptions
 from agalign.errors import InputError, UnreadableFileError
 from agalign.host.files import is_inside
 from agalign.host.own_files import has_mark
-from agalign.host.process_pool import ProcessPool, WorkerDiedError
-from agalign.host.processes import environment_of_children, silence_libraries
+from agalign.host.process_pool import WorkerDiedError, open_pool
 from agalign.host.text import shortened
 from agalign.pixels.radiometry import plausible
 from agalign.pixels.raster import probe, read_tile, suffix_format, value_step
@@ -202,8 +201,8 @@ def _stored_pages(path: Path, max_pixels: int) -> list[tuple[Band, ...]]:
 def _read_in_processes(paths: Sequence[Path], options: DiscoverOptions) -> Iterator[ImageFile | Problem]:
     tasks = [paths[i : i + _FILES_PER_TASK] for i in range(0, len(paths), _FILES_PER_TASK)]
     processes = min(options.jobs, len(tasks))
-    # Not forked: a fork would copy locks that are held by threads of the calling program.
-    with environment_of_children(threads=1), ProcessPool(processes, get_context("spawn"), _start_reading) as pool:
+    # The workers import this module when they start: tasks do not wait for that.
+    with open_pool(processes, 1, partial(import_module, __name__)) as pool:
         submit = partial(pool.submit, _read_task, timeout_s=options.timeout_s)
         futures = [submit(task, options) for task in tasks]
         for task, future in zip(tasks, futures, strict=True):
@@ -220,11 +219,6 @@ def _read_in_processes(paths: Sequence[Path], options: DiscoverOptions) -> Itera
             except WorkerDiedError:
                 what = "reading it, or a file read together with it, killed the process"
                 yield from (_unread(path, what) for path in task)
-
-
-def _start_reading() -> None:
-    """Initialise a worker, which imports this module for it: tasks do not wait for that."""
-    silence_libraries()
 
 
 def _unread(path: Path, what: str) -> Problem:

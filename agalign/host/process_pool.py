@@ -11,9 +11,9 @@ import signal
 import sys
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import Future
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import partial
 from itertools import islice
@@ -23,7 +23,14 @@ from queue import SimpleQueue
 from typing import Any, Self, TypeVar
 
 from agalign.errors import WorkerError, is_out_of_memory
-from agalign.host.processes import WorkerExit, follow_parent, silence_libraries, without_interrupt_key
+from agalign.host.processes import (
+    WorkerExit,
+    environment_of_children,
+    follow_parent,
+    silence_libraries,
+    without_interrupt_key,
+    worker_context,
+)
 
 _MAX_DEATHS = 3
 """Maximum number of workers that end in a row without a finished task between them; then no more are started."""
@@ -145,7 +152,7 @@ def _work(pipe: Connection, initializer: Callable[[], object]) -> None:
     """Main function of a worker process: initialise, then process tasks until the parent closes the pipe."""
     follow_parent()
     try:
-        pipe.send_bytes(_answer(initializer))
+        pipe.send_bytes(_answer(lambda: bool(initializer())))  # its result, such as a module, may not be picklable
         while True:
             pipe.send_bytes(_answer(partial(_call, pipe.recv_bytes())))
     except (EOFError, OSError):
@@ -333,3 +340,12 @@ class ProcessPool:
                     f"{_MAX_DEATHS} worker processes one after another ended before they finished anything (the last "
                     f"by {error}; out of memory?); finished captures are kept; try again with fewer --jobs"
                 )
+
+
+@contextmanager
+def open_pool(
+    processes: int, threads: int, initializer: Callable[[], object], preload: str = ""
+) -> Iterator[ProcessPool]:
+    """Provide worker processes with this number of threads each, as `worker_context` starts them."""
+    with environment_of_children(threads), ProcessPool(processes, worker_context(preload), initializer) as pool:
+        yield pool

@@ -191,17 +191,18 @@ WORKER_MODULE = "agalign.batch.fork_server"
 """Module whose import imports all that the workers of a run need."""
 
 
-def worker_context(preload: str) -> BaseContext:
+def worker_context(preload: str = "") -> BaseContext:
     """Return the start method of worker processes: forked from a fork server, which is started and imports the module
     `preload`, or spawned. Call it within `environment_of_children`.
 
-    Processes are spawned on macOS, where a fork of a process with Apple's libraries may crash or hang, and without a
-    temporary folder, in which the fork server needs a socket.
+    Processes are spawned if there is no module to import, on macOS, where a fork of a process with Apple's libraries
+    may crash or hang, and without a temporary folder, in which the fork server needs a socket.
     """
     temporary_folder = ""
     with suppress(OSError):
         temporary_folder = tempfile.gettempdir()
-    if sys.platform == "darwin" or "forkserver" not in get_all_start_methods() or not temporary_folder:
+    has_server = sys.platform != "darwin" and "forkserver" in get_all_start_methods()
+    if not preload or not has_server or not temporary_folder:
         return get_context("spawn")
     from multiprocessing import forkserver
 
