@@ -18,7 +18,16 @@ from agalign.batch.products import PRODUCTS
 from agalign.config import WriteSettings
 from agalign.errors import ConfigurationError, OutputError, Reason, SidecarError
 from agalign.flight.fingerprint import input_samples
-from agalign.host.files import RUN_FILE, check_inside, max_name_bytes, remove_companions
+from agalign.host.files import (
+    FLIGHT_MAP_FILE,
+    INDICES_FILE,
+    REPORT_FILE,
+    RUN_FILE,
+    SUMMARY_FILE,
+    check_inside,
+    max_name_bytes,
+    remove_companions,
+)
 from agalign.host.own_files import is_own_file
 from agalign.rasters.aligned_files import band_file_names, is_aligned_raster
 from agalign.rasters.parallax_file import PARALLAX_SUFFIX
@@ -59,8 +68,6 @@ _Found = tuple[State, str]
 _TEXT_STARTS = tuple(start for product in PRODUCTS for start in product.text_starts)
 _MAX_APART = timedelta(seconds=1)
 """The bands of a capture are exposed within 0.3 s, and its time is that of the reference, which an option chooses."""
-_PAGES = "index.html", "summary.csv", "indices.csv", "flight.geojson"
-"""Files that a run writes for all its captures."""
 
 
 # ---- before a run, and before each capture
@@ -207,7 +214,7 @@ def refuse_foreign_pages(out: Path) -> None:
     """
     if (out / RUN_FILE).exists() or find_sidecars(out):
         return
-    for path in (out / name for name in _PAGES):
+    for path in (out / name for name in (REPORT_FILE, SUMMARY_FILE, INDICES_FILE, FLIGHT_MAP_FILE)):
         if path.is_file():
             raise ConfigurationError(_of_the_user(path)[1])
 

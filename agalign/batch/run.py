@@ -41,7 +41,7 @@ from agalign.flight.panel_readings import PanelReading
 from agalign.flight.rig import MIN_CAPTURES, Rig
 from agalign.flight.rig_file import read_rig
 from agalign.flight.sky import SkyCapture
-from agalign.host.files import check_inside, path_problem, written_below
+from agalign.host.files import MODELS_FOLDER, check_inside, path_problem, written_below
 from agalign.host.output_folder import is_full, locked
 from agalign.host.processes import usable_cores
 from agalign.host.text import counted, name_problem
@@ -247,7 +247,7 @@ class _FlightRun:
         if earlier is None or earlier.input != input_name(self.flight.folder):  # else the images were moved in it
             refuse_results_elsewhere(self.flight.captures, self.out, self.results)
         refuse_foreign_pages(self.out)
-        check_inside(self.out / "models", self.out)
+        check_inside(self.out / MODELS_FOLDER, self.out)
 
     def starting_from(self, path: Path) -> Self:
         """Return the run with a model. Raises ConfigurationError if it does not fit the settings or the cameras."""
@@ -354,7 +354,7 @@ class _FlightRun:
         """Yield the flights with the files of their models, which are learned where something needs them."""
         groups = flights_of(plan.captures)
         for group, name in zip(groups, model_names(groups), strict=True):
-            path = self.out / "models" / name
+            path = self.out / MODELS_FOLDER / name
             model = path if _is_model(path) else None
             steps = {plan.left[c.label].step for c in group}
             # Without the model, which may be damaged or deleted, captures that are rendered get another crop.

@@ -23,7 +23,7 @@ from agalign.cameras.metadata import Tags
 from agalign.cameras.model_tables import band_at, lacking
 from agalign.config import DiscoverOptions
 from agalign.errors import InputError, Reason, UnreadableFileError
-from agalign.host.files import RUN_FILE
+from agalign.host.files import PANELS_FILE, REPORT_FILE, RUN_FILE, SKY_FILE, SUMMARY_FILE
 from agalign.host.text import counted, shortened, some_of
 from agalign.pixels.raster import suffix_format
 from agalign.values.band_names import is_band_name, own_stem
@@ -598,7 +598,7 @@ def with_unique_capture_names(
     """Return the captures with a number added to names that are those of an earlier capture, of a file of the run, or
     of another capture's band file. `file_owners` is from `band_file_owners`.
     """
-    taken = {"panels", "sky", Path(RUN_FILE).stem, "summary", "index"}  # files of a run, without suffix
+    taken = {Path(file).stem for file in (RUN_FILE, PANELS_FILE, SKY_FILE, SUMMARY_FILE, REPORT_FILE)}
     counts: Counter[str] = Counter()
     unique = []
     for capture in captures:

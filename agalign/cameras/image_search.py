@@ -9,7 +9,7 @@ from pathlib import Path
 
 from agalign.cameras.image_file import Problem, natural_order
 from agalign.errors import InputError
-from agalign.host.files import RUN_FILE, path_problem
+from agalign.host.files import REPORT_FILE, RUN_FILE, SUMMARY_FILE, path_problem
 from agalign.host.text import counted
 from agalign.pixels.raster import suffix_format
 
@@ -140,6 +140,6 @@ def _is_input_folder(folder: Path, skipped: set[Path], outputs: list[Path]) -> b
         entries = {entry.name for entry in os.scandir(folder)}
     except OSError:
         return True
-    is_output = RUN_FILE in entries or {"summary.csv", "index.html"} <= entries
+    is_output = RUN_FILE in entries or {SUMMARY_FILE, REPORT_FILE} <= entries
     outputs += [folder] if is_output else []
     return not is_output

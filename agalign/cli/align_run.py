@@ -23,13 +23,14 @@ from agalign.cli.terminal import MAX_LISTED, Terminal
 from agalign.config import DiscoverOptions, RunOptions, Settings
 from agalign.errors import InputError, OutputError, SidecarError, WorkerError
 from agalign.flight.groups import camera_overviews
+from agalign.host.files import REPORT_FILE
 from agalign.host.text import counted, escape_controls
 from agalign.records.cautions import RunFacts
 from agalign.records.run_record import read_run_record
 from agalign.records.sidecar import BandResult, FilePart
 from agalign.records.sidecar_file import read_without_tables
 from agalign.report.facts import PairTotals
-from agalign.report.pages import REPORT_FILE, pages_exist, write_pages
+from agalign.report.pages import pages_exist, write_pages
 from agalign.report.summary_csv import rounded
 from agalign.values.capture import Capture
 

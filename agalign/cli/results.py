@@ -12,6 +12,7 @@ import typer
 from agalign.cli.command import Command, Given
 from agalign.cli.exit_codes import ExitCode
 from agalign.cli.terminal import MAX_LISTED, RAW_NUMBERS, Terminal
+from agalign.host.files import INDICES_FILE, REPORT_FILE, SUMMARY_FILE
 from agalign.host.text import counted
 from agalign.values.choices import ExportProgram
 
@@ -32,8 +33,7 @@ def _report(terminal: Terminal, out: Annotated[Path, typer.Argument()], as_json:
     from agalign.cli.print_cautions import explain
     from agalign.host.output_folder import locked
     from agalign.records.sidecar_file import run_sidecars
-    from agalign.report.pages import REPORT_FILE, write_pages
-    from agalign.report.summary_csv import SUMMARY_FILE
+    from agalign.report.pages import write_pages
 
     run_sidecars(out)
     unreadable: list[str] = []
@@ -168,7 +168,7 @@ def _indices(
     from agalign.cli.align_run import cluster, progress
     from agalign.errors import OutputError
     from agalign.host.output_folder import locked
-    from agalign.report.pages import REPORT_FILE, write_pages
+    from agalign.report.pages import write_pages
     from agalign.spectral_indices.formulas import chosen_indices
 
     names = (index or ("" if formula else "ndvi")).split(",")
@@ -205,8 +205,6 @@ def _conclude(
     """Print the statistics of all indices, and return the exit code; `unwritten` says why the table or the report could
     not be written.
     """
-    from agalign.spectral_indices.indices_csv import INDICES_FILE
-
     written = [r for r in reports if r.path is not None]
     if unwritten:
         terminal.problem(unwritten)

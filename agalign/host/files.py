@@ -29,6 +29,9 @@ _Model = TypeVar("_Model", bound="BaseModel")
 
 RUN_FILE = "agalign-run.json"
 """Name of the run record. It is written first, and identifies an output folder."""
+PANELS_FILE, SKY_FILE, MODELS_FOLDER = "panels.json", "sky.json", "models"
+REPORT_FILE, SUMMARY_FILE, INDICES_FILE, FLIGHT_MAP_FILE = "index.html", "summary.csv", "indices.csv", "flight.geojson"
+"""Pages and tables of a run in its output folder."""
 _PARTIAL = ".agalign-part-"
 """Prefix of partial files; host, process id and a random part follow."""
 _MAX_NAME_BYTES, _MAX_SUFFIX = 120, 12

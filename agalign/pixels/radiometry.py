@@ -22,7 +22,7 @@ from agalign.values.choices import RadiometryChoice
 from agalign.values.image import FloatImage, Raster, Tile
 from agalign.values.pixel_units import PixelScale, Size
 from agalign.values.radiometric_errors import FACTORY_CALIBRATION, PANEL_AND_SENSOR, too_bright
-from agalign.values.radiometry import Radiometry, ReflectanceFactor
+from agalign.values.radiometry import MAX_REFLECTANCE, Radiometry, ReflectanceFactor
 
 _PLAUSIBLE: Mapping[str, tuple[float, float]] = {
     "exposure time (s)": (1e-6, 1.0),  # images of a moving camera are blurred from 0.01 s
@@ -37,10 +37,6 @@ _PLAUSIBLE: Mapping[str, tuple[float, float]] = {
     "relative irradiance": (10.0, 1e6),  # 7,000 to 17,000 in the sun
 }
 """Ranges of the values that radiance and reflectance are calculated from; others are of damaged tags."""
-_MAX_REFLECTANCE = 2.0
-"""Maximum median of a band that is written: fresh snow and panels are below 1, so that a median above 1 is named, and a
-tilted sensor measures as little as half of the light. Single pixels, as of sun glint, are brighter.
-"""
 _MAX_BELOW_BLACK = 0.01
 """Minimum median of a band above the black level, negative, relative to the full scale. Water in the near infrared is
 at the black level, which drifts by 0.5 % of the full scale.
@@ -105,8 +101,8 @@ def with_checked_pixels(band: Band, read: ReadTile) -> Band:
     signal = (raw - radiometry.black_level) / radiometry.full_scale
     if signal < -_MAX_BELOW_BLACK:
         problem = f"its black level of {radiometry.black_level:g} is above its pixels (median {raw:.0f})"
-    elif radiometry.quantity == "reflectance" and signal * radiometry.gain > _MAX_REFLECTANCE:
-        problem = f"its median reflectance of {signal * radiometry.gain:.3g} is above {_MAX_REFLECTANCE:g}"
+    elif radiometry.quantity == "reflectance" and signal * radiometry.gain > MAX_REFLECTANCE:
+        problem = f"its median reflectance of {signal * radiometry.gain:.3g} is above {MAX_REFLECTANCE:g}"
     elif radiometry.quantity == "reflectance" and signal * radiometry.gain > 1.0:
         radiometry = replace(radiometry, errors=(*radiometry.errors, too_bright(signal * radiometry.gain)))
     if not problem:

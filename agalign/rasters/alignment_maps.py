@@ -23,7 +23,7 @@ from agalign.values.geometry import Matrix, Points
 from agalign.values.image import Mask, OutputGrid, Tile
 from agalign.values.lens import Lens
 from agalign.values.mapping import PixelMapping
-from agalign.values.mapping_error import ErrorOnGrid
+from agalign.values.mapping_error import MAX_PIXEL_ERROR_PX, ErrorOnGrid
 from agalign.values.parallax import Relief, rounded
 from agalign.values.resampling import source_positions, tiles
 
@@ -78,8 +78,9 @@ def share_over_1_px(alignment: Alignment, reference: Band, grid: OutputGrid) -> 
     """Return the share of a grid where the expected error exceeds 1 px, or is unknown, as the quality raster flags."""
     error = error_map(alignment, reference, grid)
     if error is not None and error.error.moved:  # a lattice would miss most of a small area
-        return float((error.on_tile(Tile(0, 0, grid.width, grid.height)) > 1.0).mean())
-    return float((~(error_lattice_px(alignment, reference, grid, _SHARE_LATTICE_PX) <= 1.0)).mean())
+        return float((error.on_tile(Tile(0, 0, grid.width, grid.height)) > MAX_PIXEL_ERROR_PX).mean())
+    error_px = error_lattice_px(alignment, reference, grid, _SHARE_LATTICE_PX)
+    return float((~(error_px <= MAX_PIXEL_ERROR_PX)).mean())
 
 
 def moved_share(alignment: Alignment, reference: Band, grid: OutputGrid) -> float:
@@ -143,7 +144,7 @@ def _flags(
         on_grid = Tile(tile.x0 - grid.x0, tile.y0 - grid.y0, tile.width, tile.height)
         error_px = np.full((tile.height, tile.width), np.inf) if error is None else error.on_tile(on_grid)
         masks[Quality.ERROR_OVER_HALF_PX] = error_px > 0.5
-        masks[Quality.ERROR_OVER_1_PX] = error_px > 1.0
+        masks[Quality.ERROR_OVER_1_PX] = error_px > MAX_PIXEL_ERROR_PX
         masks[Quality.MOVED] = np.zeros_like(error_px, bool) if error is None else error.moved_px(on_grid) > 0
     for flag, mask in masks.items():
         result[mask] |= flag.value

@@ -18,11 +18,10 @@ from agalign.records.captures import AlignedBand, LeftOut, RunCapture, differing
 from agalign.records.listed_files import ListedFiles
 from agalign.values.choices import UNUSABLE_QUALITY
 from agalign.values.image import FloatImage, Tile, reduced_size_px
+from agalign.values.radiometry import MAX_REFLECTANCE
 
 RAW = "raw numbers"
 """Unit of bands that are neither reflectance nor radiance."""
-_MAX_REFLECTANCE = 2.0
-"""Sun glint and specular leaves exceed 1; raw numbers of any sensor exceed this."""
 _SAMPLE_PX = 512
 """Longer side of the reduced band from which the unit is inferred if no tag states it."""
 
@@ -74,7 +73,7 @@ class BandReader(ExitStack):
         values = _scaled(source, band.band_index, Window(0, 0, *size_px), sample_px[::-1])
         known = values[np.isfinite(values)]
         low, high = np.percentile(known, (1, 99)) if known.size else (0.0, 0.0)
-        return ["reflectance"] if low >= -_MAX_REFLECTANCE and high <= _MAX_REFLECTANCE else [RAW]
+        return ["reflectance"] if low >= -MAX_REFLECTANCE and high <= MAX_REFLECTANCE else [RAW]
 
     def values(self, band: AlignedBand, tile: Tile) -> FloatImage:
         """Return (height, width) of a tile, scaled as the file states; nan where nodata or flagged as unusable.

@@ -13,17 +13,17 @@ import numpy as np
 from agalign.errors import InputError, SidecarError
 from agalign.flight.panel_readings import MAX_TIME_DIFFERENCE_S
 from agalign.flight.rig_file import model_fingerprint
+from agalign.host.files import MODELS_FOLDER
 from agalign.records.excluded import PanelPart, read_excluded
 from agalign.records.run_record import last_record
 from agalign.records.sidecar import BandRadiometryPart, BandResult, Sidecar
 from agalign.values import remedies
 from agalign.values.capture import MIN_APART_S, CaptureTime
 from agalign.values.issues import OF_FILES
+from agalign.values.mapping_error import MAX_PIXEL_ERROR_PX
 from agalign.values.radiometric_errors import PANEL_AND_SENSOR
 from agalign.values.remedies import Remedy
 
-MAX_PIXEL_ERROR_PX = 1.0
-"""Beyond it, a spectral index mixes neighbouring plants."""
 MIN_SHARE_OVER_1_PX = 0.01
 """Share of the pixels of a band that may be off by more; smaller shares are at its edges."""
 _MIN_MOVED_SHARE = 0.001
@@ -87,7 +87,7 @@ class RunFacts:
         models, record = set(), last_record(out)
         with suppress(SidecarError):
             panels = read_excluded(out)[0]
-        for path in (out / "models").glob("*.safetensors"):
+        for path in (out / MODELS_FOLDER).glob("*.safetensors"):
             with suppress(InputError):
                 models.add(model_fingerprint(path))
         gone = frozenset[str]() if record is None else frozenset(part.capture for part in record.not_in_input)

@@ -5,11 +5,9 @@ from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from agalign.host.files import read_model
+from agalign.host.files import PANELS_FILE, SKY_FILE, read_model
 from agalign.values.capture import PanelSource
 from agalign.values.fields import Message, Name, SourceFile
-
-PANELS_FILE, SKY_FILE = "panels.json", "sky.json"
 
 
 class _Part(BaseModel):

@@ -14,6 +14,7 @@ from agalign.errors import GeometryError, InputError
 from agalign.flight.rig import Rig
 from agalign.flight.rig_file import read_rig
 from agalign.flight.rig_prediction import band_summaries
+from agalign.host.files import MODELS_FOLDER
 from agalign.report.facts import CameraOffsets
 from agalign.values import geometry
 from agalign.values.spectrum import Role, role_of
@@ -56,7 +57,7 @@ def rig_views(out: Path, on_problem: Callable[[str], None]) -> list[dict[str, An
     `y` of the lens in the plan of the rig, and `arrows` (x1, y1, x2, y2) of its displacement field.
     """
     views = []
-    for path in sorted((out / "models").glob("*.safetensors")):
+    for path in sorted((out / MODELS_FOLDER).glob("*.safetensors")):
         try:
             camera, rig = read_rig(path)
             rows = [] if rig is None else band_summaries(rig)

@@ -13,14 +13,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from agalign.host.files import write_text
+from agalign.host.files import FLIGHT_MAP_FILE, write_text
 from agalign.records.run_record import ExclusionPart
 from agalign.records.sidecar import Sidecar
 from agalign.report.summary_csv import rounded
 from agalign.spectral_indices.rasters import IndexReport
 from agalign.values.capture import CameraIdentity, Pose, Position
-
-FLIGHT_MAP_FILE = "flight.geojson"
 
 
 class FlightMap:

@@ -18,8 +18,8 @@ from markupsafe import Markup
 from agalign._version import __version__
 from agalign.config import Settings
 from agalign.errors import SidecarError
-from agalign.host.files import write_text
-from agalign.records.excluded import PANELS_FILE, SKY_FILE, PanelPart, SkyPart, read_excluded
+from agalign.host.files import PANELS_FILE, REPORT_FILE, SKY_FILE, SUMMARY_FILE, write_text
+from agalign.records.excluded import PanelPart, SkyPart, read_excluded
 from agalign.records.listed_files import ListedFiles
 from agalign.records.run_record import RunPart, counted_sidecars, file_states, read_run_record, unfinished_run
 from agalign.records.sidecar import Sidecar
@@ -28,12 +28,10 @@ from agalign.report.charts import drifts_of, rig_views
 from agalign.report.facts import FlightFacts
 from agalign.report.flight_map import FlightMap
 from agalign.report.page_data import data_files_exist, printable, remove_other_data_files
-from agalign.report.summary_csv import SUMMARY_FILE
 from agalign.report.terms import PAGES, TERMS
 from agalign.spectral_indices.indices_csv import current_rows, merged, reports_of, update_table
 from agalign.spectral_indices.rasters import IndexReport
 
-REPORT_FILE = "index.html"
 _MAX_LISTED = 100
 """Entries of a list in the page; OUT/summary.csv and OUT/agalign-run.json have all."""
 _MAX_EXCLUDED = 20

@@ -11,10 +11,10 @@ import numpy as np
 from agalign.errors import AgalignError
 from agalign.flight.panel_readings import BandReading, PanelReading
 from agalign.flight.sky import SkyCapture, sky_radiance
-from agalign.host.files import check_inside, write_model
+from agalign.host.files import PANELS_FILE, SKY_FILE, check_inside, write_model
 from agalign.pixels.raster import read_preview
 from agalign.rasters.drawing import Picture, side_by_side, titled, write_png
-from agalign.records.excluded import PANELS_FILE, SKY_FILE, PanelPart, PanelsFile, SkyFile, SkyPart
+from agalign.records.excluded import PanelPart, PanelsFile, SkyFile, SkyPart
 from agalign.values.capture import Band, Capture, source_file
 from agalign.values.pixel_units import PixelScale
 

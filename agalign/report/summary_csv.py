@@ -5,7 +5,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from agalign.host.files import CsvTable
+from agalign.host.files import SUMMARY_FILE, CsvTable
 from agalign.records.sidecar import BandResult
 
 SIMILARITY = ("mattes_mi", "nmi", "ncc", "gradient_correlation", "structure_ssim")
@@ -34,7 +34,6 @@ BAND_COLUMNS = {
     "seconds": "seconds",
 }
 """Field of a band in the sidecar by column of OUT/summary.csv."""
-SUMMARY_FILE = "summary.csv"
 SUMMARY_COLUMNS = ("folder", "capture", *BAND_COLUMNS, "radiometry_std_percent", "reference", "check")
 
 

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from agalign.errors import ConfigurationError, InputError
-from agalign.host.files import read_regular, write_csv
+from agalign.host.files import INDICES_FILE, read_regular, write_csv
 from agalign.host.text import without_formula
 from agalign.rasters.aligned_files import tags_of
 from agalign.records.cautions import RunFacts
@@ -19,7 +19,6 @@ from agalign.records.sidecar import Sidecar
 from agalign.spectral_indices.formulas import Index, bands_for
 from agalign.spectral_indices.rasters import IndexReport, IndexStatistics, index_of, statistics_in, was_masked
 
-INDICES_FILE = "indices.csv"
 _OF_CAPTURE = "folder", "capture", "captured_at", "latitude", "longitude"
 _OF_INDEX = "index", "median", "p5", "p95", "valid_share", "masked_share", "input", "low", "high", "file", "problem"
 

@@ -23,6 +23,8 @@ from agalign.values.pixel_units import Size
 from agalign.values.resampling import between_nodes, nodes_along
 from agalign.values.residual import Residual, noise_px
 
+MAX_PIXEL_ERROR_PX = 1.0
+"""Beyond it, px of the reference, a spectral index mixes neighbouring plants."""
 _COMMON_ERROR_FACTOR = 12.0
 """Factor on the variance of a mapping where it is extrapolated: the errors that neighbouring windows and patches have
 in common average out between them only."""

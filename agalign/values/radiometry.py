@@ -14,8 +14,11 @@ Quantity = Literal["radiance", "relative radiance", "reflectance", "relative ref
 """Radiance in W / m^2 / sr / nm, reflectance 0 to 1, temperature in degrees Celsius; `relative` is up to a factor that
 all bands share.
 """
-
-
+MAX_REFLECTANCE = 2.0
+"""Maximum median of a band: fresh snow and panels are below 1, so that a median above 1 is named, and a tilted sensor
+measures as little as half of the light. Single pixels, as of sun glint, are brighter. The raw numbers of any sensor
+exceed it.
+"""
 RadiometrySource = Literal["camera calibration", "light sensor", "panel", "panel and light sensor"]
 
 

@@ -25,7 +25,7 @@ from common import Ending, ended, run, table
 from figures_csv import FiguresOption, TableRow, write_figures
 from kills import differences, snapshot, torn
 
-from agalign.report.pages import SUMMARY_FILE
+from agalign.host.files import SUMMARY_FILE
 from agalign.synthetic import flight as synthetic
 
 CAPTURES, SIZE_PX = 2, (240, 180)

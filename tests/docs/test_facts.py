@@ -20,12 +20,13 @@ from agalign.cli.exit_codes import ExitCode
 from agalign.cli.main import COMMANDS
 from agalign.fit import dense, displacement_field, windows
 from agalign.flight import panel_readings
+from agalign.host.files import INDICES_FILE
 from agalign.method import refine
 from agalign.pixels import masks, raster
 from agalign.rasters.parallax_file import PARALLAX_KIND
 from agalign.records.sidecar import FilePart
 from agalign.report.summary_csv import SUMMARY_COLUMNS
-from agalign.spectral_indices.indices_csv import INDICES_FILE, update_table
+from agalign.spectral_indices.indices_csv import update_table
 from agalign.spectral_indices.rasters import IndexReport
 from agalign.values.alignment import MIN_RETRIEVAL, MIN_TIMES_CHANCE
 from agalign.verify import checks

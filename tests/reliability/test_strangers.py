@@ -23,12 +23,12 @@ from agalign.cameras.pix4d import NAMESPACE, focal_length_px
 from agalign.cameras.read_files import _with_lens_of_image
 from agalign.errors import SidecarError
 from agalign.flight.model import FlightModel, load_model, save_model
-from agalign.host.files import RUN_FILE, write_csv
+from agalign.host.files import INDICES_FILE, PANELS_FILE, RUN_FILE, SKY_FILE, write_csv
 from agalign.host.text import without_controls
-from agalign.records.excluded import PANELS_FILE, SKY_FILE, read_excluded
+from agalign.records.excluded import read_excluded
 from agalign.records.run_record import read_run_record
 from agalign.records.sidecar_file import find_sidecars
-from agalign.spectral_indices.indices_csv import INDICES_FILE, read_table
+from agalign.spectral_indices.indices_csv import read_table
 from agalign.synthetic import flight as synthetic
 from agalign.values import geometry
 from agalign.values.pixel_units import SAME_PIXELS

@@ -20,8 +20,9 @@ import agalign
 from agalign.config import RunOptions, WriteSettings
 from agalign.errors import SidecarError
 from agalign.flight.panel_readings import PanelReading, missing_panel, read_panel, with_panels
+from agalign.host.files import PANELS_FILE, SKY_FILE
 from agalign.records import cautions as run_cautions
-from agalign.records.excluded import PANELS_FILE, SKY_FILE, read_excluded
+from agalign.records.excluded import read_excluded
 from agalign.report.pages import write_pages
 
 from ..conftest import SUN, Shared, read_json, seeded
