@@ -21,6 +21,7 @@ from agalign.cameras.image_file import ImageFile, Problem, natural_order
 from agalign.cameras.makers import camera_of
 from agalign.cameras.metadata import Tags
 from agalign.cameras.model_tables import band_at, lacking
+from agalign.cameras.xmp import names_in
 from agalign.config import DiscoverOptions
 from agalign.errors import InputError, Reason, UnreadableFileError
 from agalign.host.files import PANELS_FILE, REPORT_FILE, RUN_FILE, SKY_FILE, SUMMARY_FILE
@@ -34,10 +35,8 @@ _GroupKey = tuple[str, str, str]
 """(camera, folder of the capture, the camera's capture key)."""
 _CameraKey = tuple[str, ...]
 _LENS_CALIBRATION = (
-    *((pix4d.NAMESPACE, name) for name in ("PrincipalPoint", "PerspectiveDistortion", "RigRelatives")),
-    (pix4d.NAMESPACE, "FisheyePolynomial"),
-    *((dji.NAMESPACE, name) for name in ("DewarpData", "CalibratedHMatrix")),
-    *((dji.NAMESPACE, f"RelativeOpticalCenter{axis}") for axis in "XY"),
+    *names_in(pix4d.NAMESPACE, "PrincipalPoint PerspectiveDistortion RigRelatives FisheyePolynomial"),
+    *names_in(dji.NAMESPACE, "DewarpData CalibratedHMatrix RelativeOpticalCenterX RelativeOpticalCenterY"),
 )
 """XMP values that a maker measures on each camera."""
 _MAX_HALVES_APART = timedelta(seconds=1)

@@ -4,6 +4,7 @@ input file, with the lens and rig of the reference instead of the band's own.
 
 from collections.abc import Iterable
 from contextlib import suppress
+from functools import partial
 
 from PIL.ExifTags import Base
 
@@ -23,7 +24,7 @@ from agalign.cameras.tiff_directory import (
     read_directories,
     values,
 )
-from agalign.cameras.xmp import Name, Packet
+from agalign.cameras.xmp import Packet, names_in
 from agalign.errors import UnreadableFileError
 from agalign.values.capture import Band, is_clock_set
 from agalign.values.image import OutputGrid
@@ -39,27 +40,25 @@ _GEOMETRIC_EXIF: set[int] = {
 }
 
 
-def _names(of_pix4d: str, of_dji: str = "", of_micasense: str = "") -> frozenset[Name]:
-    """Return the names, separated by spaces, in the namespaces of Pix4D, DJI and MicaSense."""
-    texts = {pix4d.NAMESPACE: of_pix4d, dji.NAMESPACE: of_dji, micasense.NAMESPACE: of_micasense}
-    return frozenset((namespace, name) for namespace, text in texts.items() for name in text.split())
-
-
-_IN_PX = _names("FisheyeAffineMatrix", "CalibratedFocalLength RelativeOpticalCenterX RelativeOpticalCenterY")
+_of_pix4d, _of_dji = partial(names_in, pix4d.NAMESPACE), partial(names_in, dji.NAMESPACE)
+_IN_PX = _of_pix4d("FisheyeAffineMatrix") + _of_dji(
+    "CalibratedFocalLength RelativeOpticalCenterX RelativeOpticalCenterY"
+)
 """Lengths in px, which are multiplied by the scale of the output."""
-_FISHEYE = _names("FisheyePolynomial FisheyeAffineMatrix FisheyeAffineSymmetric")
+_FISHEYE = _of_pix4d("FisheyePolynomial FisheyeAffineMatrix FisheyeAffineSymmetric")
 _GEOMETRY = (
     _IN_PX
-    | _FISHEYE
-    | _names("PrincipalPoint PerspectiveFocalLength PerspectiveFocalLengthUnits PerspectiveDistortion ModelType")
-    | _names("RigRelatives RigRelativesReferenceRigCameraIndex RigTranslations", "DewarpData DewarpFlag DewarpHMatrix")
-    | _names("", "CalibratedOpticalCenterX CalibratedOpticalCenterY CalibratedHMatrix")
+    + _FISHEYE
+    + _of_pix4d("PrincipalPoint PerspectiveFocalLength PerspectiveFocalLengthUnits PerspectiveDistortion ModelType")
+    + _of_pix4d("RigRelatives RigRelativesReferenceRigCameraIndex RigTranslations")
+    + _of_dji("DewarpData DewarpFlag DewarpHMatrix CalibratedOpticalCenterX CalibratedOpticalCenterY CalibratedHMatrix")
 )
 """Values of lens and rig, which are replaced by those of the reference."""
-_SENSOR_ONLY = _names("InvalidPixel VignettingPolynomial2D VignettingPolynomial2DName", "VignettingData")
+_SENSOR_ONLY = _of_pix4d("InvalidPixel VignettingPolynomial2D VignettingPolynomial2DName") + _of_dji("VignettingData")
 """Values that refer to the sensor's own pixels and are removed."""
-_VIGNETTING = _names("VignettingCenter VignettingPolynomial")
-_RADIOMETRY = _VIGNETTING | _names("BlackCurrent", "BlackLevel", "RadiometricCalibration DarkRowValue")
+_VIGNETTING = _of_pix4d("VignettingCenter VignettingPolynomial")
+_RADIOMETRY = _VIGNETTING + _of_pix4d("BlackCurrent") + _of_dji("BlackLevel")
+_RADIOMETRY += names_in(micasense.NAMESPACE, "RadiometricCalibration DarkRowValue")
 """Values of corrections that have been applied to the pixels if radiance or reflectance is written."""
 TransferredTags = tuple[Directory, Directory, Directory]
 """Entries for the first, the Exif and the GPS directory of an aligned file."""
@@ -115,8 +114,8 @@ def _put_geometry(packet: Packet, reference: Band, tags: Tags, grid: OutputGrid)
     for name in ("RigRelatives", "RigTranslations"):
         packet.put((pix4d.NAMESPACE, name), ["0", "0", "0"])
     _put_principal_point(packet, reference, tags, grid)
-    focal_length = _names("PerspectiveFocalLength" if pix4d.focal_length_is_in_px(tags) else "")
-    for length in _IN_PX | focal_length if grid.scale.mean != 1 else ():
+    focal_length = _of_pix4d("PerspectiveFocalLength" if pix4d.focal_length_is_in_px(tags) else "")
+    for length in _IN_PX + focal_length if grid.scale.mean != 1 else ():
         if numbers := tags.numbers(*length):
             packet.put(length, _texts(v * grid.scale.mean for v in numbers))
     centre = dji.pair(tags, "CalibratedOpticalCenter")

@@ -18,6 +18,13 @@ Name = tuple[str, str]
 """(namespace, name). A namespace is its URI without scheme, `www.`, version and final slash, which differ between
 versions of firmware: `micasense.com/DLS`, or only the start of its path, `micasense.com`.
 """
+
+
+def names_in(namespace: str, names: str) -> tuple[Name, ...]:
+    """Return names, separated by spaces, in a namespace."""
+    return tuple((namespace, name) for name in names.split())
+
+
 _RDF = "{http://www.w3.org/1999/02/22-rdf-syntax-ns#}"
 _MAX_PARTS = 50
 """Limit of the parts of a namespace; cameras write three."""

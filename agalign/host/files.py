@@ -11,7 +11,7 @@ import secrets
 import shutil
 import stat
 import unicodedata
-from collections.abc import Iterable, Iterator, MutableMapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, MutableMapping, Sequence
 from contextlib import contextmanager, suppress
 from contextvars import ContextVar
 from io import BufferedReader
@@ -291,21 +291,22 @@ class CsvTable:
     """A table that is collected row by row as text, which takes little memory, and then written as CSV."""
 
     def __init__(self, columns: Sequence[str]) -> None:
-        self._text = io.StringIO()
+        self._columns, self._text = columns, io.StringIO()
         self._writer = csv.writer(self._text, lineterminator="\n")
         self._writer.writerow(columns)
 
-    def add(self, row: Sequence[object]) -> None:
-        """Add a row; None becomes an empty cell, and formulas are quoted."""
-        self._writer.writerow(map(without_formula, row))
+    def add(self, row: Sequence[object] | Mapping[str, object]) -> None:
+        """Add a row, or cells by column; None and a missing one become an empty cell, and formulas are quoted."""
+        cells = [row.get(name) for name in self._columns] if isinstance(row, Mapping) else row
+        self._writer.writerow(map(without_formula, cells))
 
     def write(self, path: Path) -> None:
         """Write the table atomically. Raises OutputError."""
         write_text(path, self._text.getvalue())
 
 
-def write_csv(path: Path, columns: Sequence[str], rows: Iterable[Sequence[object]]) -> None:
-    """Write a table atomically; None becomes an empty cell, and formulas are quoted. Raises OutputError."""
+def write_csv(path: Path, columns: Sequence[str], rows: Iterable[Sequence[object] | Mapping[str, object]]) -> None:
+    """Write a table atomically, with rows as `CsvTable.add`. Raises OutputError."""
     table = CsvTable(columns)
     for row in rows:
         table.add(row)

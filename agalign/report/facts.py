@@ -14,13 +14,14 @@ from urllib.parse import quote
 import numpy as np
 from numpy.typing import NDArray
 
+from agalign.host.files import SUMMARY_FILE, CsvTable
 from agalign.host.text import escape_controls
 from agalign.records.cautions import MIN_SHARE_OVER_1_PX, Caution, RunFacts
 from agalign.records.excluded import PanelPart, SkyPart
 from agalign.records.sidecar import BandResult, ErrorPart, GeometryPart, GridPart, OutputPart, Sidecar
 from agalign.report.light_over_captures import LightOverCaptures
 from agalign.report.page_data import DataParts
-from agalign.report.summary_csv import BAND_COLUMNS, SIMILARITY, SummaryTable, rounded, row_of, value_at
+from agalign.report.summary_csv import SHOWN_COLUMNS, SIMILARITY, SUMMARY_COLUMNS, rounded, row_of, value_at
 from agalign.report.verdict import Verdict, is_by_prediction, largest_error, unwritten_indices
 from agalign.spectral_indices.rasters import IndexReport
 from agalign.values.alignment import Prediction
@@ -196,7 +197,7 @@ class FlightFacts:
         """Number of captures with a position."""
         self.without_result: Sequence[str] = ()
         """Labels of the captures of the run that have no sidecar."""
-        self._summary = SummaryTable()
+        self._summary = CsvTable(SUMMARY_COLUMNS)
         self._rows = DataParts(out, "rows", _ROWS_PER_PART)
         self._details = DataParts(out, "details", _DETAILS_PER_PART)
         self._masked: dict[str, list[float]] = defaultdict(list)
@@ -284,7 +285,7 @@ class FlightFacts:
         """Write OUT/summary.csv, and the last parts of the data of the page. Raises OutputError."""
         self._rows.flush()
         self._flush_details()
-        self._summary.write(self.out)
+        self._summary.write(self.out / SUMMARY_FILE)
 
     @property
     def files(self) -> list[str]:
@@ -339,8 +340,7 @@ class FlightFacts:
         known_px = np.where(is_measured, shifts_px, 0.0)
         steps = np.rint(known_px / _SHIFT_STEP_PX).astype(int).ravel().tolist()
         shifts = zip(steps, is_measured.ravel().tolist(), strict=True)
-        # The first nine columns of the table have the same names here.
-        return {name: row[name] for name in tuple(BAND_COLUMNS)[:9]} | {
+        return {name: row[name] for name in SHOWN_COLUMNS} | {
             "seconds": round(band.seconds, 2),
             "written": band.place is not None,
             "offset_px": offset_px,

@@ -1,15 +1,12 @@
 """OUT/summary.csv: a row for each band of each capture."""
 
 import math
-from collections.abc import Mapping
-from pathlib import Path
 from typing import Any
 
-from agalign.host.files import SUMMARY_FILE, CsvTable
 from agalign.records.sidecar import BandResult
 
 SIMILARITY = ("mattes_mi", "nmi", "ncc", "gradient_correlation", "structure_ssim")
-BAND_COLUMNS = {
+SHOWN_COLUMNS = {
     "band": "band",
     "wavelength_nm": "wavelength_nm",
     "status": "status",
@@ -19,6 +16,9 @@ BAND_COLUMNS = {
     "corner_std_px": "joint.corner_std_px",
     "residual_px": "metrics.after.residual_px",
     "residual_p95_px": "metrics.after.residual_p95_px",
+}
+"""Field of a band in the sidecar by column of OUT/summary.csv, for columns that the report shows by the same names."""
+BAND_COLUMNS = SHOWN_COLUMNS | {
     "residual_coverage": "metrics.after.residual_coverage",
     "geometry": "geometry.kind",
     "homography_p95_px": "geometry.homography_p95_px",
@@ -35,21 +35,6 @@ BAND_COLUMNS = {
 }
 """Field of a band in the sidecar by column of OUT/summary.csv."""
 SUMMARY_COLUMNS = ("folder", "capture", *BAND_COLUMNS, "radiometry_std_percent", "reference", "check")
-
-
-class SummaryTable:
-    """The rows of OUT/summary.csv."""
-
-    def __init__(self) -> None:
-        self._table = CsvTable(SUMMARY_COLUMNS)
-
-    def add(self, row: Mapping[str, Any]) -> None:
-        """Add a row, given by column."""
-        self._table.add([row.get(name) for name in SUMMARY_COLUMNS])
-
-    def write(self, out: Path) -> None:
-        """Write OUT/summary.csv. Raises OutputError."""
-        self._table.write(out / SUMMARY_FILE)
 
 
 def row_of(band: BandResult) -> dict[str, Any]:

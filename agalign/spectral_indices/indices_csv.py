@@ -98,9 +98,8 @@ def update_table(
     old = read_table(out)
     result = _masked_alike(merged(current_rows(out) if earlier is None else earlier, rows))
     if (result or old) and (result != old or not (out / INDICES_FILE).is_file()):
-        columns = *_OF_CAPTURE, *_OF_INDEX
         cells = (_cells(row, out) for row in sorted(result, key=lambda row: row.key))
-        write_csv(out / INDICES_FILE, columns, ([one[name] for name in columns] for one in cells))
+        write_csv(out / INDICES_FILE, (*_OF_CAPTURE, *_OF_INDEX), cells)
     return result
 
 
