@@ -46,7 +46,7 @@ class EarlierResults:
     def __init__(self) -> None:
         self._changes: dict[Path, tuple[tuple[int, int, int], Reason | None]] = {}
         """Size, time and number of each file, and why it is not as it was written; None if it is."""
-        self.states: dict[str, str] = {}
+        self.file_states: dict[str, str] = {}
         """States in which runs left the files of each capture, by label (`records.listed_files`)."""
 
     def __call__(self, path: Path) -> tuple[Sidecar, Reason | None]:
@@ -68,11 +68,12 @@ class EarlierResults:
     def changed_files(self, label: str, folder: Path, parts: Sequence[FilePart]) -> list[FilePart]:
         """Return the files of a capture that are not as they were written, given the folder of its sidecar.
 
-        The states of the others are added to `states`, so that no file is read twice.
+        The states of the others are added to `file_states`, so that no file is read twice.
         """
-        known = set(self.states.get(label, "").split())
+        known = set(self.file_states.get(label, "").split())
         changed = [part for part in parts if file_problem(folder / part.file, part, known)]
-        self.states[label] = " ".join(known.union(states_of(folder, [part for part in parts if part not in changed])))
+        unchanged = [part for part in parts if part not in changed]
+        self.file_states[label] = " ".join(known.union(states_of(folder, unchanged)))
         return changed
 
 

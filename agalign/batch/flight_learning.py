@@ -20,7 +20,7 @@ from agalign.batch.learning_tasks import (
     observe_rig,
     portable,
 )
-from agalign.batch.workers import Run, in_order, serially
+from agalign.batch.workers import RunTasks, in_order, serially
 from agalign.capture.by_rig import DELIVERED_STD_PX
 from agalign.config import Settings
 from agalign.fit.displacement_field import common_field
@@ -55,19 +55,19 @@ def learn_flight(
     settings: Settings,
     progress: Progress,
     start: FlightModel | None = None,
-    run: Run = serially,
+    run_tasks: RunTasks = serially,
     threads: int = 1,
 ) -> FlightModel | None:
     """Return a model learned from a few captures spread over the flight; None if none of them could be aligned.
 
-    `run` processes single captures, and `threads` train the network; the result does not depend on them. `start` is
-    an earlier model. It is returned if it still aligns captures of this flight as its rig predicts. Otherwise its
-    network initialises theta; weights of bands that it lacks start from those of its last band.
+    `run_tasks` processes single captures, and `threads` train the network; the result does not depend on them.
+    `start` is an earlier model. It is returned if it still aligns captures of this flight as its rig predicts.
+    Otherwise its network initialises theta; weights of bands that it lacks start from those of its last band.
     """
     keep_freed_memory()
     captures = [capture.with_absolute_paths() for capture in captures]
 
-    learned = _FlightLearner(captures, settings, progress, start, run, threads).learned()
+    learned = _FlightLearner(captures, settings, progress, start, run_tasks, threads).learned()
     if learned is None:
         return None
     times = sorted(c.known_time for c in captures if c.known_time)
@@ -87,7 +87,7 @@ class _FlightLearner:
     settings: Settings
     progress: Progress
     start: FlightModel | None
-    run: Run
+    run_tasks: RunTasks
     threads: int
 
     def learned(self) -> FlightModel | None:
@@ -128,7 +128,7 @@ class _FlightLearner:
 
     def _apply(self, function: Callable[[A], R], arguments: Sequence[A]) -> Iterator[R]:
         """Call a function with each argument, and yield the results in order."""
-        return in_order(self.run, partial(in_one_thread, function), arguments)
+        return in_order(self.run_tasks, partial(in_one_thread, function), arguments)
 
     @property
     def _bands(self) -> tuple[str, ...]:

@@ -14,7 +14,7 @@ from agalign.host.processes import usable_cores
 from agalign.records.captures import bands_of
 from agalign.records.cautions import RunFacts
 from agalign.records.listed_files import ListedFiles
-from agalign.records.run_record import counted_sidecars, file_states
+from agalign.records.run_record import counted_sidecars
 from agalign.records.sidecar_file import add_products, label_of, read_without_tables, run_sidecars
 from agalign.spectral_indices.formulas import Index
 from agalign.spectral_indices.indices_csv import refuse_foreign_table, to_check, update_table
@@ -34,9 +34,9 @@ class IndexTask:
     overwrite: bool
     mask_qa: bool = False
     """Mask pixels that the quality raster flags as unusable."""
-    run: RunFacts = field(default_factory=RunFacts)
+    facts: RunFacts = field(default_factory=RunFacts)
     """Facts of the run, which are read once for all captures."""
-    states: str = ""
+    file_states: str = ""
     """States of the files of the capture in the run record."""
 
     def absolute(self) -> "IndexTask":
@@ -57,10 +57,9 @@ def index_tasks(
     """
     if target != out:
         refuse_foreign_table(target)
-    paths = counted_sidecars(run_sidecars(out), out)
-    run, states = RunFacts.of(out), file_states(out)
-    task = IndexTask(out, Path(), target, tuple(indices), overwrite, mask_qa, run)
-    return [replace(task, sidecar=path, states=states.get(label_of(path, out), "")) for path in paths]
+    sidecars = counted_sidecars(run_sidecars(out), out)
+    task = IndexTask(out, Path(), target, tuple(indices), overwrite, mask_qa, RunFacts.of(out))
+    return [replace(task, sidecar=path, file_states=states) for path, states in sidecars.items()]
 
 
 def run_indices(
@@ -77,10 +76,10 @@ def run_indices(
     processes, _ = numbers_of_workers(len(tasks), jobs or usable_cores(), worth_a_process=8)
     rows: list[IndexReport] = []
     try:
-        with open_workers(executor, processes, cv2.setNumThreads, preload=__name__) as run:
-            if run is not serially:
+        with open_workers(executor, processes, cv2.setNumThreads, preload=__name__) as run_tasks:
+            if run_tasks is not serially:
                 tasks = [task.absolute() for task in tasks]
-            for number, result in run(do_indices, tasks):
+            for number, result in run_tasks(do_indices, tasks):
                 try:
                     reports = result()
                     rows += reports
@@ -98,7 +97,7 @@ def do_indices(task: IndexTask) -> list[IndexReport]:
     try:
         with written_below(task.target):
             bands = bands_of(sidecar, task.sidecar.parent, mask_qa=task.mask_qa)
-            files = ListedFiles.of(sidecar, task.sidecar.parent, task.states)
+            files = ListedFiles.of(sidecar, task.sidecar.parent, task.file_states)
             written = write_rasters(bands, task.indices, base, task.label, overwrite=task.overwrite, listed=files)
             reports = [*written]
             if task.target == task.out:
@@ -109,7 +108,7 @@ def do_indices(task: IndexTask) -> list[IndexReport]:
                     task.sidecar, IndexRasters.kind, [p for path in rasters for p in (path, path.with_suffix(".png"))]
                 )
         by_name = {index.name: index for index in task.indices}
-        checks = [to_check(by_name[r.index], sidecar, task.run, task.label) for r in reports]
+        checks = [to_check(by_name[r.index], sidecar, task.facts, task.label) for r in reports]
         reports = [r if r.problem else replace(r, problem=check) for r, check in zip(reports, checks, strict=True)]
     except AgalignError as error:
         reports = _failed(task, str(error))

@@ -2,7 +2,8 @@
 
 `State` is the table. It is asked before a run, before each capture, which a worker may process much later, and after a
 capture was rendered or skipped. A run touches no other files of captures. The lock (`host/output_folder.py`) and the
-rasters of an index (`spectral_indices/rasters.py`), which may be in another folder, are checked where they are written.
+rasters of an index (`spectral_indices/rasters.py`), which may be in another folder, are checked where they are written;
+all by the mark of `host/own_files.py`.
 """
 
 import os
@@ -28,7 +29,7 @@ from agalign.host.files import (
     max_name_bytes,
     remove_companions,
 )
-from agalign.host.own_files import is_own_file
+from agalign.host.own_files import foreign, is_own_file
 from agalign.rasters.aligned_files import band_file_names, is_aligned_raster
 from agalign.rasters.parallax_file import PARALLAX_SUFFIX
 from agalign.rasters.product import CapturePaths
@@ -46,7 +47,7 @@ class State(Enum):
     options or because it does not align the capture. A written file replaces the one there.
     """
 
-    NO_FILE = "no file", "write", "keep"
+    NO_FILE = "no file, or a link to none", "write", "keep"
     SIDECAR = "sidecar of the capture, also edited or unreadable", "write", "remove"
     AS_LISTED = "in a sidecar that was not edited, with this size", "write", "remove"
     WITH_MARK = "file with the mark of the program, or empty", "write", "remove"
@@ -138,7 +139,7 @@ def _file(path: Path, listed: Mapping[Path, int]) -> _Found:
         return State.AS_LISTED, ""
     if is_own(path):
         return State.WITH_MARK, ""
-    return (State.CHANGED, "") if path in listed else _of_the_user(path)
+    return (State.CHANGED, "") if path in listed else (State.OF_USER, foreign(path))
 
 
 def _sidecar(path: Path, capture: Capture, out: Path, read: ReadSidecar) -> _Found:
@@ -154,15 +155,11 @@ def _sidecar(path: Path, capture: Capture, out: Path, read: ReadSidecar) -> _Fou
             return State.SIDECAR, ""
         if is_own(path):
             return State.WITH_MARK, ""
-        return (State.CHANGED, "") if capture.label in file_states(out) else _of_the_user(path)
+        return (State.CHANGED, "") if capture.label in file_states(out) else (State.OF_USER, foreign(path))
     if is_same(earlier, capture) is not False:
         return State.SIDECAR, ""
     what = f"belongs to a different capture from {capture.label} here {_described(earlier, capture)}"
     return State.OTHER_RESULT, f"{path}: {what}; choose another output folder with -o"
-
-
-def _of_the_user(path: Path) -> _Found:
-    return State.OF_USER, f"{path}: was not written by agalign; choose another output folder with -o"
 
 
 def is_own(path: Path) -> bool:
@@ -216,7 +213,7 @@ def refuse_foreign_pages(out: Path) -> None:
         return
     for path in (out / name for name in (REPORT_FILE, SUMMARY_FILE, INDICES_FILE, FLIGHT_MAP_FILE)):
         if path.is_file():
-            raise ConfigurationError(_of_the_user(path)[1])
+            raise ConfigurationError(foreign(path))
 
 
 # ---- whether a result is of the same capture

@@ -30,7 +30,7 @@ from agalign.batch.output_files import (
 )
 from agalign.batch.render import RenderOptions
 from agalign.batch.selection import Selection, select_captures
-from agalign.batch.workers import MAX_THREADS, Run, failure_text, numbers_of_workers, open_workers, serially
+from agalign.batch.workers import MAX_THREADS, RunTasks, failure_text, numbers_of_workers, open_workers, serially
 from agalign.cameras.discover import FolderScan
 from agalign.config import RunOptions, Settings, WriteSettings
 from agalign.errors import AgalignError, ConfigurationError, InputError, OutputError, SidecarError
@@ -133,7 +133,7 @@ def _run_selected(run: "_FlightRun", selection: Selection) -> Iterator[CaptureRe
                     statuses = [status for _, status, _ in report.result.pairs]
                     here = existing_files(report.path, report.result)
                     written[report.label] = report.path, here, report.state, statuses
-                    record.file_states[report.label] = run.states(report, report.path.parent, here)
+                    record.file_states[report.label] = run.file_states(report, report.path.parent, here)
                 if time.monotonic() - saved > _SAVED_EVERY_S:  # for the case that the run is killed
                     saved = time.monotonic()
                     record.write(out, "running", saved - began)
@@ -242,7 +242,7 @@ class _FlightRun:
         if self.out.resolve() == self.flight.folder.resolve():
             raise ConfigurationError(f"{self.out}: is the folder of the images; choose another output folder with -o")
         earlier = last_record(self.out)
-        self.results.states.update({} if earlier is None else earlier.file_states)
+        self.results.file_states.update({} if earlier is None else earlier.file_states)
         refuse_to_overwrite(self.flight.captures, self.out, self.settings.write, self.results)
         if earlier is None or earlier.input != input_name(self.flight.folder):  # else the images were moved in it
             refuse_results_elsewhere(self.flight.captures, self.out, self.results)
@@ -274,13 +274,13 @@ class _FlightRun:
         """Return what remains to be done for a capture."""
         return remaining(capture, self.out, self.settings, self.options, self.results)
 
-    def states(self, report: CaptureReport, folder: Path, files: Sequence[FilePart]) -> str:
+    def file_states(self, report: CaptureReport, folder: Path, files: Sequence[FilePart]) -> str:
         """Return the states of those files of a report that are as they were written, given the folder of its sidecar,
         for the record. A rendering may keep index rasters of an earlier command.
         """
         self.results.changed_files(report.label, folder, [part for part in files if part.kind == "index"])
         written = [part for part in files if report.state == "done" and part.kind != "index"]
-        compared = {*self.results.states[report.label].split(), *states_of(folder, written)}
+        compared = {*self.results.file_states[report.label].split(), *states_of(folder, written)}
         return " ".join(state for state in states_of(folder, files) if state in compared)
 
     def reports(self, selection: Selection, record: RunPart) -> Iterator[CaptureReport]:
@@ -315,18 +315,18 @@ class _FlightRun:
         has_timeout = timeout_s is not None
         numbers = partial(numbers_of_workers, cores=cores, has_timeout=has_timeout)
 
-        def workers(processes: int, threads: int) -> AbstractContextManager[Run]:
+        def workers(processes: int, threads: int) -> AbstractContextManager[RunTasks]:
             return open_workers(self.options.executor, processes, limit_threads, threads, has_timeout=has_timeout)
 
         with ExitStack() as stack:
             of_plan = numbers(plan.number)
-            run = stack.enter_context(workers(*of_plan))
-            learn = partial(learn_flight, run=run, threads=min(MAX_THREADS, cores))
+            run_tasks = stack.enter_context(workers(*of_plan))
+            learn = partial(learn_flight, run_tasks=run_tasks, threads=min(MAX_THREADS, cores))
             tasks = []
             renderings = list(self._renderings(self._flights(plan, learn, record), plan))
             if (of_tasks := numbers(plan.number)) != of_plan:  # finished captures get the crop of the new model
                 stack.close()
-                run = stack.enter_context(workers(*of_tasks))
+                run_tasks = stack.enter_context(workers(*of_tasks))
             for capture, model, rendering in renderings:
                 one = plan.left[capture.label]
                 if one.step in ("nothing", "keep"):
@@ -336,7 +336,7 @@ class _FlightRun:
                 tasks.append(Task(capture, self.out, self.settings, model, rendering, is_estimated=is_estimated))
             for message in plan.changes():
                 self.listener.on_again(message)
-            yield from capture_reports(run, tasks, self.listener, timeout_s)
+            yield from capture_reports(run_tasks, tasks, self.listener, timeout_s)
 
     def _plan(self, captures: Sequence[Capture]) -> "_Plan":
         """Compare the captures with the results of earlier runs."""
@@ -466,13 +466,13 @@ def _crops_of_cameras(
 
 
 def capture_reports(
-    run: Run, tasks: Sequence[Task], listener: Listener, timeout_s: float | None
+    run_tasks: RunTasks, tasks: Sequence[Task], listener: Listener, timeout_s: float | None
 ) -> Iterator[CaptureReport]:
     """Yield the report of each task as it completes. In this process, the listener is called, and the files of the next
     capture are read into the page cache meanwhile.
     """
-    if run is not serially:
-        for number, result in run(do_capture, [task.absolute() for task in tasks], timeout_s=timeout_s):
+    if run_tasks is not serially:
+        for number, result in run_tasks(do_capture, [task.absolute() for task in tasks], timeout_s=timeout_s):
             try:
                 report = result()
             except Exception as error:

@@ -50,7 +50,7 @@ Completed: TypeAlias = Iterator[tuple[int, Callable[[], R]]]
 """The tasks as they complete: the index of each, and a function that returns or raises its result."""
 
 
-class Run(Protocol):
+class RunTasks(Protocol):
     """Calls a function with each task, and yields the tasks as they complete.
 
     Function, tasks and results can be pickled, except in this process. The time limit applies to each call in worker
@@ -101,7 +101,7 @@ def open_workers(
     *,
     preload: str = WORKER_MODULE,
     has_timeout: bool = False,
-) -> Iterator[Run]:
+) -> Iterator[RunTasks]:
     """Run tasks on the executor if there is one; else in processes of this machine if there are several or there is a
     timeout (threads cannot be killed); else in threads, or serially.
 
@@ -122,15 +122,15 @@ def open_workers(
         yield serially
 
 
-def on_executor(executor: "Executor | ProcessPool") -> Run:
+def on_executor(executor: "Executor | ProcessPool") -> RunTasks:
     """Run tasks on an executor, which is not shut down; only those of this package have a time limit."""
 
-    def run(function: Callable[[A], R], tasks: Sequence[A], /, *, timeout_s: float | None = None) -> Completed[R]:
+    def run_tasks(function: Callable[[A], R], tasks: Sequence[A], /, *, timeout_s: float | None = None) -> Completed[R]:
         if isinstance(executor, (ProcessPool, DaskExecutor)):
             return _completed(partial(executor.submit, function, timeout_s=timeout_s), tasks, lambda: executor.loss)
         return _completed(partial(_submitted, executor, function), tasks, str)
 
-    return run
+    return run_tasks
 
 
 def _completed(submit: Callable[[A], "Future[R]"], tasks: Sequence[A], loss: Callable[[], str]) -> Completed[R]:
@@ -167,11 +167,11 @@ def _submitted(executor: Executor, function: Callable[[A], R], task: A) -> "Futu
         return failed
 
 
-def in_order(run: Run, function: Callable[[A], R], tasks: Sequence[A], /) -> Iterator[R]:
+def in_order(run_tasks: RunTasks, function: Callable[[A], R], tasks: Sequence[A], /) -> Iterator[R]:
     """Yield the results in the order of the tasks, as `map` does. Raises AgalignError, and MemoryError."""
     waiting: dict[int, Callable[[], R]] = {}
     following = 0
-    for number, result in run(function, tasks):
+    for number, result in run_tasks(function, tasks):
         waiting[number] = result
         while following in waiting:
             try:

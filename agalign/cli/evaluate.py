@@ -9,7 +9,7 @@ import typer
 from agalign.cli.command import Command, Given
 from agalign.cli.terminal import Terminal
 from agalign.errors import ConfigurationError
-from agalign.host.output_folder import refuse_to_replace
+from agalign.host.own_files import refuse_to_replace
 from agalign.host.text import counted
 from agalign.values.choices import Sharing
 

@@ -4,7 +4,6 @@ import errno
 import logging
 import os
 import platform
-import re
 import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -12,12 +11,10 @@ from pathlib import Path
 
 from filelock import FileLock, Timeout
 
-from agalign.errors import ConfigurationError, OutputError
-from agalign.host.files import path_problem, read_regular, remove_partial_files, scratch_file
+from agalign.errors import OutputError
+from agalign.host.files import path_problem, remove_partial_files, scratch_file
+from agalign.host.own_files import refuse_foreign
 from agalign.host.text import name_problem
-
-_LOCK = re.compile(rb"(process \d+ on .*)?")
-"""Contents of the file of the lock, which a killed process leaves."""
 
 
 def prepare_output(out: Path) -> None:
@@ -34,19 +31,6 @@ def prepare_output(out: Path) -> None:
         raise OutputError(f"{out}: cannot be made ({error.strerror or error}); choose another folder with -o") from None
 
 
-def refuse_to_replace(path: Path, mark: bytes | None) -> None:
-    """Raise ConfigurationError if a file exists that a command would replace, unless it is one of an earlier command:
-    that has a `mark` near its start. None refuses every file.
-    """
-    with suppress(OSError):
-        start = b""
-        if path.is_file():
-            with path.open("rb") as file:
-                start = file.read(256)
-        if path.exists() and (mark is None or mark not in start):
-            raise ConfigurationError(f"{path}: exists already; choose another name with -o, or delete it")
-
-
 @contextmanager
 def locked(out: Path) -> Iterator[None]:
     """Create the output folder and lock it for this run. Raises OutputError, also if another run has locked it.
@@ -59,7 +43,8 @@ def locked(out: Path) -> Iterator[None]:
     prepare_output(out)
     _check_file_system(out)
     path = out / ".agalign.lock"
-    _refuse_foreign_lock(path)
+    if not path.is_symlink():
+        refuse_foreign(path, (b"process ",))  # as a killed process leaves it
     # The existence of a file as lock (`SoftFileLock`) would outlast a killed process.
     lock = FileLock(path, thread_local=False, fallback_to_soft=False)
     try:
@@ -83,12 +68,6 @@ def locked(out: Path) -> Iterator[None]:
         with suppress(OSError):
             path.unlink(missing_ok=True)
         lock.release()
-
-
-def _refuse_foreign_lock(path: Path) -> None:
-    with suppress(OSError):
-        if path.is_file() and not path.is_symlink() and not _LOCK.fullmatch(read_regular(path)):
-            raise ConfigurationError(f"{path}: was not written by agalign; choose another output folder with -o")
 
 
 def _check_file_system(out: Path) -> None:

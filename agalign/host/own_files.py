@@ -1,10 +1,13 @@
-"""The mark by which a command recognises the images that an earlier one wrote, whatever their names."""
+"""The mark by which a command recognises the images that an earlier one wrote, whatever their names, and what is not
+replaced.
+"""
 
 import os
 import re
 from contextlib import suppress
 from pathlib import Path
 
+from agalign.errors import ConfigurationError
 from agalign.host.files import open_regular
 
 SOFTWARE = "agalign"
@@ -42,3 +45,27 @@ def has_mark(path: Path, text_starts: tuple[bytes, ...] = ()) -> bool:
         is_image = mark is not None and any(re.search(mark, part) for part in (start, end))
         return is_image or start.startswith(text_starts)
     return False
+
+
+def foreign(path: Path, folder: str = "output folder") -> str:
+    """Return the message about a file at the path of an output that no command has written."""
+    return f"{path}: was not written by agalign; choose another {folder} with -o"
+
+
+def refuse_foreign(path: Path, text_starts: tuple[bytes, ...], folder: str = "output folder") -> None:
+    """Raise ConfigurationError for a file that is not one as `is_own_file`."""
+    if path.is_file() and not is_own_file(path, text_starts):
+        raise ConfigurationError(foreign(path, folder))
+
+
+def refuse_to_replace(path: Path, mark: bytes | None) -> None:
+    """Raise ConfigurationError if a file exists that a command would replace, unless it is one of an earlier command:
+    that has a `mark` near its start. None refuses every file.
+    """
+    with suppress(OSError):
+        start = b""
+        if path.is_file():
+            with path.open("rb") as file:
+                start = file.read(256)
+        if path.exists() and (mark is None or mark not in start):
+            raise ConfigurationError(f"{path}: exists already; choose another name with -o, or delete it")

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from agalign.errors import InputError, SidecarError
 from agalign.records.listed_files import ListedFiles
-from agalign.records.run_record import counted_sidecars, file_states
+from agalign.records.run_record import counted_sidecars
 from agalign.records.sidecar import Sidecar
 from agalign.records.sidecar_file import label_of, read_without_tables, run_sidecars
 
@@ -72,13 +72,13 @@ class RunCapture:
     result: Sidecar
     """The sidecar without its long tables: all of them, of a long flight, would not fit in memory."""
 
-    states: str = ""
+    file_states: str = ""
     """States of its files in the run record."""
 
     @cached_property
     def listed(self) -> ListedFiles:
         """Its files as the sidecar lists them."""
-        return ListedFiles.of(self.result, self.path.parent, self.states)
+        return ListedFiles.of(self.result, self.path.parent, self.file_states)
 
     @cached_property
     def bands(self) -> list[AlignedBand]:
@@ -91,11 +91,11 @@ def captures_of_run(out: Path) -> tuple[list[RunCapture], LeftOut]:
 
     Raises InputError if `out` has no sidecars.
     """
-    captures, left_out, states = [], [], file_states(out)
-    for path in counted_sidecars(run_sidecars(out), out):
+    captures, left_out = [], []
+    for path, states in counted_sidecars(run_sidecars(out), out).items():
         label = label_of(path, out)
         try:
-            captures.append(RunCapture(label, path, read_without_tables(path), states.get(label, "")))
+            captures.append(RunCapture(label, path, read_without_tables(path), states))
         except SidecarError as error:
             left_out.append((label, str(error)))
     return captures, left_out

@@ -272,10 +272,13 @@ def renamed_captures(out: Path) -> frozenset[str]:
     return frozenset(part.capture for part in renamed if (out / f"{part.same_as}.json").is_file())
 
 
-def counted_sidecars(sidecars: Iterable[Path], out: Path) -> list[Path]:
-    """Return the sidecars below an output folder without those of renamed captures."""
-    renamed = renamed_captures(out)
-    return [path for path in sidecars if label_of(path, out) not in renamed]
+def counted_sidecars(sidecars: Iterable[Path], out: Path) -> dict[Path, str]:
+    """Return the sidecars below an output folder, without those of renamed captures, and the states in which runs left
+    the files of each.
+    """
+    states, renamed = file_states(out), renamed_captures(out)
+    labels = {path: label_of(path, out) for path in sidecars}
+    return {path: states.get(label, "") for path, label in labels.items() if label not in renamed}
 
 
 @dataclass(frozen=True)

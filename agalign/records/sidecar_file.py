@@ -189,7 +189,7 @@ def _maker(text: bytes) -> str:
     return ""
 
 
-def verify_outputs(out: Path, sidecars: Sequence[Path] | None = None) -> Iterator[tuple[Path, list[str]]]:
+def verify_outputs(out: Path, sidecars: Iterable[Path] | None = None) -> Iterator[tuple[Path, list[str]]]:
     """Yield (sidecar, problems of the sidecar and the files that it lists) for these captures, by default all below
     `out`.
 

@@ -21,7 +21,7 @@ from agalign.errors import SidecarError
 from agalign.host.files import PANELS_FILE, REPORT_FILE, SKY_FILE, SUMMARY_FILE, write_text
 from agalign.records.excluded import PanelPart, SkyPart, read_excluded
 from agalign.records.listed_files import ListedFiles
-from agalign.records.run_record import RunPart, counted_sidecars, file_states, read_run_record, unfinished_run
+from agalign.records.run_record import RunPart, counted_sidecars, read_run_record, unfinished_run
 from agalign.records.sidecar import Sidecar
 from agalign.records.sidecar_file import find_sidecars, label_of, read_with_change
 from agalign.report.charts import drifts_of, rig_views
@@ -88,13 +88,13 @@ def _add_captures(
     out: Path, facts: FlightFacts, flight_map: FlightMap, on_problem: Callable[[str], None]
 ) -> list[IndexReport]:
     """Add all captures with a sidecar below OUT, and write OUT/indices.csv; return its rows."""
-    earlier, states = current_rows(out), file_states(out)
+    earlier = current_rows(out)
     rows_of: dict[str, list[IndexReport]] = defaultdict(list)
     for row in earlier:
         rows_of[row.capture].append(row)
     indices: list[IndexReport] = []
     changed: set[Path] = set()
-    for path in counted_sidecars(find_sidecars(out), out):
+    for path, states in counted_sidecars(find_sidecars(out), out).items():
         folder = path.parent.relative_to(out).as_posix()
         try:
             sidecar, change = read_with_change(path)
@@ -105,7 +105,7 @@ def _add_captures(
         if label != Path(folder, sidecar.capture).as_posix():
             on_problem(f"{path}: {change}")
             continue
-        listed = ListedFiles.of(sidecar, path.parent, states.get(label, ""))
+        listed = ListedFiles.of(sidecar, path.parent, states)
         # The report needs no stacks: these may be deleted.
         problems = {file: problem for file in listed.parts if file.exists() and (problem := listed.problem(file))}
         for problem in problems.values():

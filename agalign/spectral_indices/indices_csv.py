@@ -9,8 +9,9 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from agalign.errors import ConfigurationError, InputError
+from agalign.errors import InputError
 from agalign.host.files import INDICES_FILE, read_regular, write_csv
+from agalign.host.own_files import refuse_foreign
 from agalign.host.text import without_formula
 from agalign.rasters.aligned_files import tags_of
 from agalign.records.cautions import RunFacts
@@ -67,11 +68,7 @@ def read_table(out: Path) -> list[IndexReport]:
 
 def refuse_foreign_table(folder: Path) -> None:
     """Raise ConfigurationError if a folder has a file with the name of the table that no command has written."""
-    path = folder / INDICES_FILE
-    with suppress(OSError):
-        text = read_regular(path)
-        if text and not text.startswith(",".join(_OF_CAPTURE).encode()):
-            raise ConfigurationError(f"{path}: was not written by agalign; choose another folder with -o")
+    refuse_foreign(folder / INDICES_FILE, (",".join(_OF_CAPTURE).encode(),), "folder")
 
 
 def current_rows(out: Path) -> list[IndexReport]:

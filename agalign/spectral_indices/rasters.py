@@ -20,7 +20,7 @@ from agalign._version import __version__
 from agalign.config import WriteSettings
 from agalign.errors import ConfigurationError, InputError
 from agalign.host.memory_limits import WORK_TILE_PX
-from agalign.host.own_files import SOFTWARE, is_own_file
+from agalign.host.own_files import SOFTWARE, foreign, is_own_file
 from agalign.host.text import shortened
 from agalign.pixels.raster import OpenRaster, open_raster
 from agalign.rasters.aligned_files import tags_of
@@ -283,8 +283,8 @@ def write_rasters(
                 earlier = _finished_before(target, source, listed) if may_be_kept else None
                 if earlier is None and target.resolve() in {band.file.resolve() for band in bands}:
                     raise InputError(f"{target}: is the file of a band; give the formula '{index.name}' another name")
-                if earlier is None and (foreign := _foreign_file(target)):
-                    raise InputError(f"{foreign}: was not written by agalign; choose another folder with -o")
+                if earlier is None and (file := _foreign_file(target)):
+                    raise InputError(foreign(file, "folder"))
                 unit = earlier.unit if earlier is not None else _common_unit(index, chosen, reader)
             except InputError as error:
                 yield IndexReport(label, index.name, problem=str(error))

@@ -17,7 +17,7 @@ import agalign
 from agalign.batch.earlier_results import Remaining, remaining
 from agalign.batch.output_files import is_same
 from agalign.batch.run import Listener, _crops_of_cameras, plan_run, run_flight
-from agalign.batch.workers import Run, open_workers
+from agalign.batch.workers import RunTasks, open_workers
 from agalign.cli.align_run import RunTotals, conclude
 from agalign.cli.align_run import run as run_command
 from agalign.cli.exit_codes import ExitCode
@@ -208,7 +208,7 @@ def test_finished_captures_get_the_crop_of_a_new_rig(flight: Path, out: Path, mo
     (name,) = model_names(flights_of(scan.captures))
     save_known_model(out / "models" / name)
 
-    def open_counted(*arguments: Any, **options: Any) -> AbstractContextManager[Run]:
+    def open_counted(*arguments: Any, **options: Any) -> AbstractContextManager[RunTasks]:
         opened.append(arguments)
         return open_workers(*arguments, **options)
 

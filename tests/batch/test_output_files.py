@@ -1,5 +1,6 @@
 """What a run does with the path of an output, by what is there."""
 
+import os
 import shutil
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -35,6 +36,11 @@ def case(shared: Shared, tmp_path: Path) -> Case:
 
 
 def no_file(case: Case) -> Case:
+    return case
+
+
+def link_to_none(case: Case) -> Case:
+    case[0].symlink_to("none.tif")
     return case
 
 
@@ -101,6 +107,7 @@ def too_long(case: Case) -> Case:
     ("make", "state", "written", "not_written"),
     [
         (no_file, State.NO_FILE, "write", "keep"),
+        (link_to_none, State.NO_FILE, "write", "keep"),
         (sidecar, State.SIDECAR, "write", "remove"),
         (as_listed, State.AS_LISTED, "write", "remove"),
         (with_mark, State.WITH_MARK, "write", "remove"),
@@ -118,7 +125,7 @@ def test_what_is_there_decides(
 ) -> None:
     """An action that is none of those of the table is the message of a refusal."""
     path, captures = make(case)
-    out, existed = path.parent, path.exists()
+    out, existed = path.parent, os.path.lexists(path)
     for settings, action in ((WRITING, written), (NOT_WRITING, not_written)):
         if action not in ("write", "keep", "remove"):
             with pytest.raises(agalign.ConfigurationError, match=action):
@@ -127,7 +134,7 @@ def test_what_is_there_decides(
             refuse_to_overwrite(captures, out, settings)
     if not_written in ("keep", "remove"):
         remove_outputs(captures[0], out, NOT_WRITING)
-        assert path.exists() is (existed and not_written == "keep")
+        assert os.path.lexists(path) is (existed and not_written == "keep")
     actions = [a if a in ("write", "keep", "remove") else "refuse" for a in (written, not_written)]
     assert [state.written, state.not_written] == actions
 

@@ -22,7 +22,7 @@ from agalign.batch import workers
 from agalign.batch.capture_report import CaptureReport
 from agalign.batch.capture_task import Task
 from agalign.batch.run import Listener, capture_reports, run_flight
-from agalign.batch.workers import DaskExecutor, Run, dask_executor, in_order, on_executor, open_workers
+from agalign.batch.workers import DaskExecutor, RunTasks, dask_executor, in_order, on_executor, open_workers
 from agalign.cameras.discover import discover
 from agalign.config import RunOptions, Settings
 from agalign.errors import ConfigurationError, WorkerError
@@ -86,7 +86,7 @@ def seeds_only(flight: Path, out: Path) -> list[Task]:
     return [Task(c, out, seeded()) for c in discover(flight).captures]
 
 
-def reports_of(run: Run, tasks: list[Task]) -> Iterator[CaptureReport]:
+def reports_of(run: RunTasks, tasks: list[Task]) -> Iterator[CaptureReport]:
     return capture_reports(run, tasks, Listener(), timeout_s=600)
 
 
