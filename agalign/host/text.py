@@ -60,26 +60,9 @@ def without_controls(text: str) -> str:
     return text if text.isprintable() else "".join(c for c in text if unicodedata.category(c) not in dropped)
 
 
-_MAX_NAME = 250
-"""Characters of a name in a record: those of bands with a number are longer than those of tags, which `shortened` cuts.
-"""
-_MAX_MESSAGE = 1000
-"""Characters of a sentence in a record, which may name a file with its folders."""
-
-
 def shortened(text: str, max_length: int = 200) -> str:
     """Return a name from a file with at most 200 characters: a damaged tag or file may contain megabytes."""
     return text if len(text) <= max_length else f"{text[: max_length - 1]}…"
-
-
-def shortened_name(text: str) -> str:
-    """Return a name from a record with at most 250 characters."""
-    return shortened(text, _MAX_NAME)
-
-
-def shortened_message(text: str) -> str:
-    """Return a sentence from a record with at most 1000 characters."""
-    return shortened(text, _MAX_MESSAGE)
 
 
 def without_formula(value: object) -> object:

@@ -6,8 +6,9 @@ not be measured.
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from itertools import chain
 from typing import Annotated, Any
 
@@ -17,11 +18,21 @@ from pydantic import AfterValidator, ConfigDict, Field, GetCoreSchemaHandler
 from pydantic_core import CoreSchema, core_schema
 
 from agalign.host.files import is_inside
-from agalign.host.text import shortened_message, shortened_name
+from agalign.host.text import shortened
 
 RECORD = ConfigDict(extra="forbid", use_attribute_docstrings=True, arbitrary_types_allowed=True, validate_by_name=True)
 _MAX = 1e30
 """Largest number in a file: sums and squares of such numbers are finite."""
+_LIMITED = core_schema.float_schema(ge=-_MAX, le=_MAX)
+
+
+def in_file_schema(
+    in_file: CoreSchema, to_json: Callable[[Any], Any], read: CoreSchema | None = None, python: CoreSchema | None = None
+) -> CoreSchema:
+    """Return the schema of a value that is as `in_file` in JSON, where `read` parses it, and any in the program."""
+    serialization = core_schema.plain_serializer_function_ser_schema(to_json, return_schema=in_file, when_used="json")
+    python = python or core_schema.any_schema()
+    return core_schema.json_or_python_schema(read or in_file, python, serialization=serialization)
 
 
 @dataclass(frozen=True)
@@ -31,16 +42,7 @@ class _Limited:
     is_positive: bool = False
 
     def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
-        in_file = (
-            core_schema.float_schema(le=_MAX, gt=0) if self.is_positive else core_schema.float_schema(ge=-_MAX, le=_MAX)
-        )
-        return core_schema.json_or_python_schema(
-            in_file,
-            core_schema.any_schema(),
-            serialization=core_schema.plain_serializer_function_ser_schema(
-                float, return_schema=in_file, when_used="json"
-            ),
-        )
+        return in_file_schema(core_schema.float_schema(le=_MAX, gt=0) if self.is_positive else _LIMITED, float)
 
 
 @dataclass(frozen=True)
@@ -51,16 +53,9 @@ class Measured:
     missing: float = math.nan
 
     def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
-        in_file = core_schema.nullable_schema(core_schema.float_schema(ge=-_MAX, le=_MAX))
-        return core_schema.json_or_python_schema(
-            core_schema.no_info_after_validator_function(
-                lambda value: self.missing if value is None else value, in_file
-            ),
-            core_schema.any_schema(),
-            serialization=core_schema.plain_serializer_function_ser_schema(
-                self._to_json, return_schema=in_file, when_used="json"
-            ),
-        )
+        in_file = core_schema.nullable_schema(_LIMITED)
+        read = core_schema.no_info_after_validator_function(lambda v: self.missing if v is None else v, in_file)
+        return in_file_schema(in_file, self._to_json, read)
 
     def _to_json(self, value: float) -> float | None:
         if not math.isfinite(value):
@@ -79,9 +74,7 @@ class Array:
     """In JSON, null is nan."""
 
     def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
-        number = (
-            core_schema.int_schema(ge=0, le=1 << 31) if self.integers else core_schema.float_schema(ge=-_MAX, le=_MAX)
-        )
+        number = core_schema.int_schema(ge=0, le=1 << 31) if self.integers else _LIMITED
         in_file: CoreSchema = core_schema.nullable_schema(number) if self.nullable else number
         for length in reversed(self.shape):
             in_file = core_schema.list_schema(in_file, min_length=length, max_length=length)
@@ -89,13 +82,8 @@ class Array:
         if self._is_table:
             row = core_schema.tuple_positional_schema([core_schema.float_schema()] * (self.shape[1] or 0))
             read = core_schema.list_schema(row, min_length=self.shape[0], max_length=self.shape[0])
-        return core_schema.json_or_python_schema(
-            core_schema.no_info_after_validator_function(self._from_json, read),
-            core_schema.any_schema(),
-            serialization=core_schema.plain_serializer_function_ser_schema(
-                self._to_json, return_schema=in_file, when_used="json"
-            ),
-        )
+        read = core_schema.no_info_after_validator_function(self._from_json, read)
+        return in_file_schema(in_file, self._to_json, read)
 
     @property
     def _is_table(self) -> bool:
@@ -124,10 +112,12 @@ class Array:
         return with_null.tolist()
 
 
-Name = Annotated[str, AfterValidator(shortened_name)]
-"""A name, or another short text, of which a file may have any length."""
-Message = Annotated[str, AfterValidator(shortened_message)]
-"""A sentence, of which a file may have any length."""
+Name = Annotated[str, AfterValidator(partial(shortened, max_length=250))]
+"""A name, or another short text, of which a file may have any length: names of bands with a number are longer than those
+of tags, which `shortened` cuts.
+"""
+Message = Annotated[str, AfterValidator(partial(shortened, max_length=1000))]
+"""A sentence, of which a file may have any length. It may name a file with its folders."""
 Number = Annotated[float, _Limited()]
 Count = Annotated[int, Field(gt=0)]
 Positive = Annotated[float, _Limited(is_positive=True)]

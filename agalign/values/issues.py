@@ -9,7 +9,7 @@ from pydantic import dataclasses as validated
 from pydantic_core import CoreSchema, core_schema
 
 from agalign.values import remedies
-from agalign.values.fields import RECORD, Measured, Message
+from agalign.values.fields import RECORD, Measured, Message, in_file_schema
 
 
 @dataclass(frozen=True)
@@ -100,13 +100,8 @@ class _ByCode:
 
     def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
         code = core_schema.literal_schema(list(KINDS))
-        return core_schema.json_or_python_schema(
-            core_schema.no_info_after_validator_function(KINDS.__getitem__, code),
-            core_schema.is_instance_schema(IssueKind),
-            serialization=core_schema.plain_serializer_function_ser_schema(
-                lambda kind: kind.code, return_schema=code, when_used="json"
-            ),
-        )
+        read = core_schema.no_info_after_validator_function(KINDS.__getitem__, code)
+        return in_file_schema(code, lambda kind: kind.code, read, core_schema.is_instance_schema(IssueKind))
 
 
 @validated.dataclass(frozen=True, config=RECORD)

@@ -52,10 +52,7 @@ class DisplacementField:
     ) -> "DisplacementField":
         """Sample a function from points (n, 2) to displacements (n, 2) on a lattice over an image (width, height)."""
         columns, rows = (math.ceil(n / step_px) + 1 for n in size_px)
-        nodes = (
-            np.stack(np.meshgrid(np.arange(columns), np.arange(rows)), axis=-1).reshape(-1, 2).astype(np.float64)
-            * step_px
-        )
+        nodes = geometry.lattice(columns, rows, columns, rows) * step_px
         return cls(float(step_px), function(nodes).reshape(rows, columns, 2))
 
     def __call__(self, points_px: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -77,11 +77,8 @@ def saturation_error(share: float) -> RadiometricError:
     return RadiometricError("saturation", 100 * _SATURATED_SHARE * share)
 
 
-def agreed(values: Iterable[float | None], tolerance: float = 0.02) -> tuple[float | None, bool]:
-    """Return the first known value of a tag that has several sources, and whether the others agree with it.
-
-    `tolerance` is relative; sources round differently.
-    """
+def agreed(values: Iterable[float | None]) -> tuple[float | None, bool]:
+    """Return the first known value of a tag that has several sources, and whether the others agree with it."""
+    tolerance = 0.02  # sources round differently
     known = [v for v in values if v is not None and math.isfinite(v)]
-    first = next(iter(known), None)
-    return first, all(abs(v - known[0]) <= tolerance * abs(known[0]) for v in known)
+    return next(iter(known), None), all(abs(v - known[0]) <= tolerance * abs(known[0]) for v in known)

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import fields, replace
 from functools import cached_property
 from typing import Annotated
 
@@ -63,12 +63,7 @@ class Residual:
     @classmethod
     def joined(cls, several: Sequence["Residual"]) -> "Residual":
         """Return the windows of several residuals as one."""
-        return cls(
-            np.concatenate([one.centres_px for one in several]),
-            np.concatenate([one.shifts_px for one in several]),
-            np.concatenate([one.peaks_sigma for one in several]),
-            np.concatenate([one.cells for one in several]),
-        )
+        return cls(*(np.concatenate([getattr(one, f.name) for one in several]) for f in fields(cls)))
 
     def with_shifts(self, shifts_px: NDArray[np.float64]) -> "Residual":
         """Return the same windows with other shifts (n, 2)."""
