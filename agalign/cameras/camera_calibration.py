@@ -4,11 +4,10 @@ from collections import Counter, defaultdict
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 
-from agalign.cameras.image_file import ImageFile, Problem
-from agalign.errors import InputError
+from agalign.cameras.image_file import ImageFile, Problem, problem_of
 from agalign.host.text import counted
 from agalign.values.capture import Band
-from agalign.values.radiometry import RadiometricError, Radiometry
+from agalign.values.radiometry import RadiometricError
 from agalign.values.spectrum import band_key
 
 _SAME = 0.01
@@ -24,34 +23,24 @@ def with_complete_calibrations(files: Sequence[ImageFile]) -> list[ImageFile]:
     by_camera: dict[object, list[ImageFile]] = defaultdict(list)
     for file in files:
         by_camera[_camera(file)].append(file)
-    has_all = {
-        key: [
-            _known(errors(b.radiometry) for file in of_camera for b in file.bands if b.radiometry)
-            for errors in (_of_radiance, _of_sun)
-        ]
-        for key, of_camera in by_camera.items()
-    }
+    has_all = {}
+    for key, of_camera in by_camera.items():
+        known = [b.radiometry for file in of_camera for b in file.bands if b.radiometry]
+        of_sun = (radiometry.by_sun.errors for radiometry in known if radiometry.by_sun)
+        has_all[key] = _known(radiometry.errors for radiometry in known), _known(of_sun)
     return [
         replace(file, bands=tuple(_without_incomplete(b, *has_all[_camera(file)]) for b in file.bands))
         for file in files
     ]
 
 
-def _of_radiance(radiometry: Radiometry) -> Sequence[RadiometricError]:
-    return radiometry.errors
-
-
-def _of_sun(radiometry: Radiometry) -> Sequence[RadiometricError] | None:
-    return None if radiometry.by_sun is None else radiometry.by_sun.errors
-
-
 def _missing(errors: Iterable[RadiometricError]) -> frozenset[str]:
     return frozenset(error.name for error in errors if error.state == "missing")
 
 
-def _known(of_files: Iterable[Sequence[RadiometricError] | None]) -> frozenset[str]:
+def _known(of_files: Iterable[Sequence[RadiometricError]]) -> frozenset[str]:
     """The factors that some of several calibrations lack and others have."""
-    lacking = [_missing(errors) for errors in of_files if errors is not None]
+    lacking = [_missing(errors) for errors in of_files]
     return frozenset[str]().union(*lacking) - frozenset.intersection(*lacking) if lacking else frozenset()
 
 
@@ -86,8 +75,7 @@ def different_calibrations(files: Sequence[ImageFile]) -> list[Problem]:
             value, file = others[0]
             rest = f", and in {counted(len(others) - 1, 'other file')}" if len(others) > 1 else ""
             text = f"the {what} in its tags is {value:g}{rest}; {counted(count, 'file')} of the camera have {usual:g}"
-            error = InputError(f"{file.path}: {text}; correct the tags")
-            problems.append(Problem(file.path, error, is_harmless=True))
+            problems.append(problem_of(file.path, f"{text}; correct the tags", is_harmless=True))
     return problems
 
 

@@ -16,14 +16,13 @@ from statistics import median_low
 
 from agalign.cameras.band_identity import name_end
 from agalign.cameras.generic import Generic
-from agalign.cameras.image_file import Doubt, ImageFile, Problem
+from agalign.cameras.image_file import Doubt, ImageFile, Problem, problem_of
 from agalign.cameras.metadata import Tags
 from agalign.cameras.model_tables import SAME_BAND_NM, raw_step, sizes_px
 from agalign.cameras.pix4d import NAMESPACE, listed_names
 from agalign.cameras.sun import Sun, sun_position
-from agalign.errors import InputError
 from agalign.host.text import counted, some_of
-from agalign.values.capture import MIN_APART_S, Band, Capture, CaptureTime, Position, is_clock_set
+from agalign.values.capture import MIN_APART_S, Band, Capture, Position, distance_km, known_time_s
 from agalign.values.pixel_units import SAME_PIXELS, PixelScale, Size
 from agalign.values.spectrum import band_key, contradicts
 
@@ -52,10 +51,9 @@ def clock_error(position: Position | None, captured_at: str, by_tags: Sun | None
     """Return in words how wrong a clock is that contradicts the position of the sun in the tags; empty if it does not,
     or if one of them is unknown. `captured_at` is as in `Capture`.
     """
-    time = CaptureTime.of(captured_at)
-    if position is None or time is None or by_tags is None or not is_clock_set(captured_at):
+    time_s = known_time_s(captured_at)
+    if position is None or time_s is None or by_tags is None:
         return ""
-    time_s = time.utc.timestamp()
 
     def error(later_h: float) -> float:
         return by_tags.angle_to(sun_position(position, time_s + 3600 * later_h))
@@ -92,9 +90,9 @@ def with_position(tags: Tags, other: Position | None, by_tags: Sun | None) -> tu
     """
     advice = "--georeference and the map do not use the position: correct the tags"
     if tags.position is not None:
-        if other is None or _apart_km(tags.position, other) < _MAX_POSITION_ERROR_KM:
+        if other is None or distance_km(tags.position, other) < _MAX_POSITION_ERROR_KM:
             return tags, None
-        text = f"the positions in its Exif and XMP tags are {_apart_km(tags.position, other):.0f} km apart"
+        text = f"the positions in its Exif and XMP tags are {distance_km(tags.position, other):.0f} km apart"
         return replace(tags, position=None), Doubt(text, advice)
     if other is not None:
         return replace(tags, position=other), None
@@ -116,16 +114,8 @@ def _in_hemispheres(position: Position) -> list[Position]:
 
 def _fits_sun(position: Position, captured_at: str, by_tags: Sun | None) -> bool:
     """True if the sun of the tags is that of a position and time; False if one of them is unknown."""
-    is_known = by_tags is not None and CaptureTime.of(captured_at) is not None and is_clock_set(captured_at)
+    is_known = by_tags is not None and known_time_s(captured_at) is not None
     return is_known and not clock_error(position, captured_at, by_tags)
-
-
-def _apart_km(one: Position, other: Position) -> float:
-    """Distance of two positions, km: accurate to 1 % up to 100 km."""
-    km_per_degree = 111.2
-    east = (one.longitude - other.longitude + 180) % 360 - 180
-    east *= math.cos(math.radians((one.latitude + other.latitude) / 2))
-    return km_per_degree * math.hypot(one.latitude - other.latitude, east)
 
 
 # ---- size of the image and of the camera
@@ -244,8 +234,7 @@ def doubtful_files(files: Sequence[ImageFile]) -> list[Problem]:
     for advice, found in by_advice.items():
         (file, text), *rest = found
         others = f", and so in {counted(len(rest), 'other file')}" if rest else ""
-        error = InputError(f"{file.path}: {text}{others}; {advice}")
-        problems.append(Problem(file.path, error, is_harmless=True))
+        problems.append(problem_of(file.path, f"{text}{others}; {advice}", is_harmless=True))
     return problems
 
 
@@ -258,7 +247,7 @@ def list_problems(files: Sequence[ImageFile]) -> list[Problem]:
         if file.is_whole_capture and isinstance(file.camera, Generic) and not {names, wavelengths} <= {0, bands}:
             counts = f"{counted(names, 'name')} and {counted(wavelengths, 'wavelength')} of bands"
             text = f"has {bands} bands, and its tags list {counts}; lists of other lengths are not used"
-            problems.append(Problem(file.path, InputError(f"{file.path}: {text}"), is_harmless=True))
+            problems.append(problem_of(file.path, text, is_harmless=True))
     return problems
 
 
@@ -292,7 +281,7 @@ def contradictions(groups: Iterable[Sequence[ImageFile]]) -> list[Problem]:
             advice = "one of the names is wrong: compare the images and correct the tags"
             path = [*by_label.values()][-1][0].path
             texts.append((path, f"files with {position} of one camera are {what}; {advice}"))
-    return [Problem(path, InputError(f"{path}: {text}")) for path, text in texts]
+    return [problem_of(path, text) for path, text in texts]
 
 
 def files_of_one_band(groups: Iterable[Sequence[ImageFile]]) -> list[Problem]:
@@ -313,7 +302,7 @@ def files_of_one_band(groups: Iterable[Sequence[ImageFile]]) -> list[Problem]:
         others = f", and so in {counted(len(pairs) - 1, 'other file')}" if len(pairs) > 1 else ""
         twin = other_path.name if other_path.name != path.name else other_path
         text = f"is band '{name}' of one capture as {twin} is{others}; both are aligned: move one of them elsewhere"
-        problems.append(Problem(path, InputError(f"{path}: {text}")))
+        problems.append(problem_of(path, text))
     return problems
 
 
@@ -346,12 +335,12 @@ def of_other_captures(groups: Iterable[Sequence[ImageFile]]) -> list[Problem]:
                 median_low(getattr(p, axis) for _, p in places) for axis in ("latitude", "longitude")
             )
             usual = Position(latitude, longitude)
-            far = [(f, km) for f, p in places if (km := _apart_km(p, usual)) > _MAX_POSITION_ERROR_KM]
+            far = [(f, km) for f, p in places if (km := distance_km(p, usual)) > _MAX_POSITION_ERROR_KM]
             found += [(f, f"its position is {km:.0f} km from that of the other files of its capture") for f, km in far]
         serials = Counter(f.tags.serial for f in group if f.tags.serial)
         alone = [f for f in group if serials[f.tags.serial] == 1 < len(serials)]
         found += [(f, f"its serial number {f.tags.serial} is not that of the other files") for f in alone]
-    return [Problem(f.path, InputError(f"{f.path}: {text}; correct the tags"), is_harmless=True) for f, text in found]
+    return [problem_of(f.path, f"{text}; correct the tags", is_harmless=True) for f, text in found]
 
 
 def far_from_flight(captures: Iterable[Capture]) -> list[Problem]:
@@ -360,9 +349,9 @@ def far_from_flight(captures: Iterable[Capture]) -> list[Problem]:
     """
     by_camera: dict[object, list[tuple[float, Position, Capture]]] = defaultdict(list)
     for capture in captures:
-        time = CaptureTime.of(capture.known_time)
-        if capture.position is not None and time is not None and capture.camera.unit:
-            by_camera[capture.camera].append((time.utc.timestamp(), capture.position, capture))
+        time_s = known_time_s(capture.captured_at)
+        if capture.position is not None and time_s is not None and capture.camera.unit:
+            by_camera[capture.camera].append((time_s, capture.position, capture))
     problems = []
     for flight in by_camera.values():
         flight.sort(key=lambda one: one[0])
@@ -372,7 +361,7 @@ def far_from_flight(captures: Iterable[Capture]) -> list[Problem]:
             far_km = [
                 km
                 for other_s, other, _ in around
-                if (km := _apart_km(place, other)) > _MAX_POSITION_ERROR_KM + _MAX_SPEED_KM_S * abs(other_s - time_s)
+                if (km := distance_km(place, other)) > _MAX_POSITION_ERROR_KM + _MAX_SPEED_KM_S * abs(other_s - time_s)
             ]
             if len(far_km) > len(around) / 2:
                 found.append((capture, min(far_km)))
@@ -381,7 +370,7 @@ def far_from_flight(captures: Iterable[Capture]) -> list[Problem]:
             others = f", and so are {counted(len(rest), 'other capture')}" if rest else ""
             path = capture.reference.path
             text = f"its position is {km:.0f} km from those of the captures around it{others}; correct the tags"
-            problems.append(Problem(path, InputError(f"{path}: {text}"), is_harmless=True))
+            problems.append(problem_of(path, text, is_harmless=True))
     return problems
 
 
@@ -397,7 +386,7 @@ def exposed_apart(groups: Sequence[Sequence[ImageFile]]) -> list[Problem]:
     apart: dict[str, list[tuple[ImageFile, float]]] = defaultdict(list)
     others: dict[str, list[float]] = defaultdict(list)
     for group in (g for g in groups if len(g) > 1 and not g[0].tags.first_text(g[0].camera.capture_ids)):
-        times = {f.path: time_s for f in group if (time_s := _time_s(f)) is not None}
+        times = {f.path: time_s for f in group if (time_s := known_time_s(f.tags.captured_at)) is not None}
         usual_s = median_low(times.values()) if times else 0.0
         for file in (f for f in group if f.path in times):
             later_s = times[file.path] - usual_s
@@ -415,16 +404,10 @@ def _of_other_time(found: Sequence[tuple[ImageFile, float]], others: dict[str, l
     text = f"was exposed {length} {'after' if later_s > 0 else 'before'} the other bands of its number"
     text += f", and so {counted(len(rest), 'other file')} of its band" if rest else ""
     for one, _ in found:
-        own, time_s = one.camera.capture_name(one.path), _time_s(one) or 0.0
+        own, time_s = one.camera.capture_name(one.path), known_time_s(one.tags.captured_at) or 0.0
         near = ((abs(other_s - time_s), name) for name, of in others.items() for other_s in of if name != own)
         off_s, fitting = min(near, default=(math.inf, ""))
         if off_s < MIN_APART_S:
             text += f"; by its time {one.path.name} belongs to {fitting}: the numbers of the band are shifted"
             break
-    return Problem(file.path, InputError(f"{file.path}: {text}; rename the files, or give --bands without the band"))
-
-
-def _time_s(file: ImageFile) -> float | None:
-    """The Unix time of a file; None if it is unknown or its clock was not set."""
-    time = CaptureTime.of(file.tags.captured_at) if is_clock_set(file.tags.captured_at) else None
-    return None if time is None else time.utc.timestamp()
+    return problem_of(file.path, f"{text}; rename the files, or give --bands without the band")

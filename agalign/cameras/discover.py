@@ -7,7 +7,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from agalign.cameras.band_identity import with_one_spelling
 from agalign.cameras.base import reference_index
@@ -37,7 +36,7 @@ from agalign.cameras.grouping import (
     with_unreadable_bands,
     without_copies,
 )
-from agalign.cameras.image_file import ImageFile, OwnFile, Problem
+from agalign.cameras.image_file import ImageFile, OwnFile, Problem, problem_of
 from agalign.cameras.image_search import (
     IMAGE_KINDS,
     check_folder,
@@ -55,7 +54,7 @@ from agalign.pixels.coordinates import transformed
 from agalign.pixels.raster import probe, suffix_format
 from agalign.values import geometry
 from agalign.values.arguments import checked
-from agalign.values.capture import Band, Capture
+from agalign.values.capture import Band, Capture, Position, distance_km
 from agalign.values.choices import MAX_MOSAIC_PIXELS
 from agalign.values.spectrum import band_key
 
@@ -194,8 +193,8 @@ def _read(paths: Sequence[Path], options: DiscoverOptions, problems: list[Proble
         elif options.with_rgb or not is_photograph:
             problems.append(result)
     if own:
-        what = f"{own[0]}: results of agalign among the images are skipped, {counted(len(own), 'file')} in all"
-        problems.append(Problem(own[0], InputError(what), is_harmless=True))
+        what = f"results of agalign among the images are skipped, {counted(len(own), 'file')} in all"
+        problems.append(problem_of(own[0], what, is_harmless=True))
     return files
 
 
@@ -253,29 +252,22 @@ def mosaics_onto(
     return FolderScan(reference.parent, tuple(with_unique_capture_names(captures)), ())
 
 
-def distance_km(fixed: Band, moving: Band) -> float:
+def mosaics_apart_km(fixed: Band, moving: Band) -> float:
     """Return the distance between the centres of two georeferenced rasters on the ground; 0 if they may overlap.
 
     Raises GeometryError if their coordinates cannot be transformed.
     """
-    centres_and_corners = []
+    centres, half_diagonals_km = [], 0.0
     for band in (fixed, moving):
         assert band.georeference is not None
         width, height = band.size_px
         on_map = geometry.apply(band.georeference.transform, np.array([[width / 2, height / 2], [0.0, 0.0]]))
-        centres_and_corners.append(np.radians(transformed(on_map, band.georeference.crs_wkt, "EPSG:4326")))
-    half_diagonals_km = sum(_great_circle_km(centre, corner) for centre, corner in centres_and_corners)
-    result_km = _great_circle_km(centres_and_corners[0][0], centres_and_corners[1][0])
+        on_earth = transformed(on_map, band.georeference.crs_wkt, "EPSG:4326").tolist()
+        centre, corner = (Position(latitude, longitude) for longitude, latitude in on_earth)
+        centres.append(centre)
+        half_diagonals_km += distance_km(centre, corner)
+    result_km = distance_km(*centres)
     return result_km if result_km > half_diagonals_km else 0.0
-
-
-def _great_circle_km(one: NDArray[np.float64], other: NDArray[np.float64]) -> float:
-    """Distance of two points (longitude, latitude), radians, by the haversine formula with the mean radius: accurate to
-    0.5 %, which is sufficient for comparing the extents of maps.
-    """
-    haversine = np.sin((other - one) / 2) ** 2
-    result = haversine[1] + np.cos(one[1]) * np.cos(other[1]) * haversine[0]
-    return float(2 * 6371.0 * np.arcsin(np.sqrt(min(1.0, result))))
 
 
 def _georeferenced_bands(path: Path, max_pixels: int) -> tuple[Band, ...]:

@@ -22,7 +22,7 @@ from agalign.cameras.base import rotation
 from agalign.cameras.consistency import clock_error
 from agalign.cameras.metadata import Tags
 from agalign.cameras.sun import Sun, sun_position
-from agalign.values.capture import CaptureTime, is_clock_set
+from agalign.values.capture import known_time_s
 from agalign.values.radiometric_errors import LIGHT_SENSOR, NO_TILT, REPEATABILITY, agreed, contradiction, tilt_error
 from agalign.values.radiometry import Errors
 
@@ -68,10 +68,8 @@ def irradiance(tags: Tags) -> Irradiance:
 
 def _sun_by_clock(tags: Tags) -> tuple[float, float] | None:
     """(elevation, azimuth) of the sun at the time and place of a file; None if one of them is unknown."""
-    time = CaptureTime.of(tags.captured_at)
-    if tags.near is None or time is None or not is_clock_set(tags.captured_at):
-        return None
-    return sun_position(tags.near, time.utc.timestamp())
+    time_s = known_time_s(tags.captured_at)
+    return None if tags.near is None or time_s is None else sun_position(tags.near, time_s)
 
 
 def _horizontal(tags: Tags, elevation: float | None) -> Irradiance | None:

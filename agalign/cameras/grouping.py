@@ -17,7 +17,7 @@ from agalign.cameras import dji, pix4d
 from agalign.cameras.band_identity import end_of, name_end
 from agalign.cameras.base import Camera, colour_bands, listed, reference_index
 from agalign.cameras.generic import Generic, split_elsewhere, split_stem
-from agalign.cameras.image_file import ImageFile, Problem, natural_order
+from agalign.cameras.image_file import ImageFile, Problem, natural_order, problem_of
 from agalign.cameras.makers import camera_of
 from agalign.cameras.metadata import Tags
 from agalign.cameras.model_tables import band_at, lacking
@@ -72,7 +72,7 @@ def without_copies(files: Sequence[ImageFile]) -> tuple[list[ImageFile], list[Pr
                 text = f"is left out as a changed copy of {original.path.name}: same band and capture; keep one of them"
             else:
                 continue
-            copies[file.path] = Problem(file.path, InputError(f"{file.path}: {text}"), is_harmless=is_exact)
+            copies[file.path] = problem_of(file.path, text, is_harmless=is_exact)
             break
         else:
             kept.setdefault(by_tags, file)
@@ -111,8 +111,7 @@ def join_folders(groups: Sequence[list[ImageFile]]) -> tuple[list[list[ImageFile
         original[:] = sorted((*original, *new), key=lambda f: natural_order(f.path.name))
         group.clear()
     problems = [
-        Problem(here, InputError(f"{here}: {copy.sentence(there)}"), is_harmless=not copy.different)
-        for (here, there), copy in copies.items()
+        problem_of(here, copy.sentence(there), is_harmless=not copy.different) for (here, there), copy in copies.items()
     ]
     # Colour photographs come last.
     return [sorted(group, key=lambda f: f.bands[0].is_from_photograph) for group in groups if group], problems
@@ -203,7 +202,7 @@ def with_tags_of_flight(files: Sequence[ImageFile]) -> tuple[list[ImageFile], li
             lacking |= dict.fromkeys(name for key, name in similar.tags.xmp if (key, name) not in file.tags.xmp)
         if lacking:
             text = f"its XMP packet is damaged and lacks {some_of(lacking)}; copy the file from the card again"
-            problems.append(Problem(file.path, InputError(f"{file.path}: {text}"), is_harmless=True))
+            problems.append(problem_of(file.path, text, is_harmless=True))
         if "BandName" in lacking and of_band is not None and len(file.bands) == len(of_band.bands) == 1:
             (own,), (band,) = file.bands, of_band.bands
             own = replace(own, name=band.name, wavelength_nm=band.wavelength_nm, bandwidth_nm=band.bandwidth_nm)
@@ -334,7 +333,7 @@ def pattern_clashes(files: Sequence[ImageFile], pattern: str) -> list[Problem]:
         for name in {b.name for b in file.bands}:
             if first.setdefault(name, file.path) != file.path:
                 what = f"is band '{name}' of one capture with {first[name].name} by the pattern '{pattern}'"
-                result.append(Problem(file.path, InputError(f"{file.path}: {what}; give one that distinguishes them")))
+                result.append(problem_of(file.path, f"{what}; give one that distinguishes them"))
     return result
 
 

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 from agalign.cameras.base import Camera
 from agalign.cameras.metadata import Tags
-from agalign.errors import AgalignError
+from agalign.errors import AgalignError, InputError
 from agalign.values.capture import Band
 from agalign.values.pixel_units import SAME_PIXELS, PixelScale
 
@@ -37,6 +37,11 @@ class Problem:
     def text(self) -> str:
         """The message, one line with the file and the remedy."""
         return str(self.error)
+
+
+def problem_of(path: Path, text: str, *, is_harmless: bool = False) -> Problem:
+    """Return the problem of a file or folder with this text after its path."""
+    return Problem(path, InputError(f"{path}: {text}"), is_harmless)
 
 
 class OwnFile(Problem):

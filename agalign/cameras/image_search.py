@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from fnmatch import fnmatchcase
 from pathlib import Path
 
-from agalign.cameras.image_file import Problem, natural_order
+from agalign.cameras.image_file import Problem, natural_order, problem_of
 from agalign.errors import InputError
 from agalign.host.files import REPORT_FILE, RUN_FILE, SUMMARY_FILE, path_problem
 from agalign.host.text import counted
@@ -40,7 +40,7 @@ def image_files(folder: Path, skip: Sequence[Path]) -> tuple[list[Path], list[Pr
 
     def refuse(error: OSError) -> None:
         path = Path(error.filename)
-        problems.append(Problem(path, InputError(f"{path}: cannot be looked into ({error.strerror}); left out")))
+        problems.append(problem_of(path, f"cannot be looked into ({error.strerror}); left out"))
 
     outputs, listed, starts = list[Path](), set[tuple[int, int]](), [folder]
     for start in starts:  # links add to it
@@ -54,8 +54,8 @@ def image_files(folder: Path, skip: Sequence[Path]) -> tuple[list[Path], list[Pr
             images = [n for n in names if suffix_format(Path(n)) and not n.startswith(".")]
             result.extend(here / n for n in sorted(images, key=natural_order))
     if outputs:
-        what = f"{outputs[0]}: output folders of earlier runs are skipped, {counted(len(outputs), 'folder')} in all"
-        problems.append(Problem(outputs[0], InputError(what), is_harmless=True))
+        what = f"output folders of earlier runs are skipped, {counted(len(outputs), 'folder')} in all"
+        problems.append(problem_of(outputs[0], what, is_harmless=True))
     return result, problems
 
 
@@ -95,7 +95,7 @@ def without_companions(images: Sequence[Path], folder: Path) -> tuple[list[Path]
         return list(images), []
     skipped = set(known)
     text = f"masks and thumbnails beside the images are skipped, {counted(len(known), 'file')} in all"
-    problem = Problem(known[0], InputError(f"{known[0]}: {text}"), is_harmless=True)
+    problem = problem_of(known[0], text, is_harmless=True)
     return [path for path in images if path not in skipped], [problem]
 
 

@@ -155,7 +155,7 @@ def _onto(
         overwrite: Process finished mosaics again.
         max_pixels: Refuse mosaics with more pixels, without reading them.
     """
-    from agalign.cameras.discover import distance_km, mosaics_onto
+    from agalign.cameras.discover import mosaics_apart_km, mosaics_onto
     from agalign.cli.align_run import conclude, run
     from agalign.config import RunOptions, Settings
     from agalign.records.sidecar_file import check_products
@@ -165,7 +165,7 @@ def _onto(
     flight = mosaics_onto(reference, moving, band, given["discover"]["max_pixels"])
     check_products([reference, *moving])
     for capture in flight.captures:
-        offset_km = distance_km(capture.reference, capture.moving[0])
+        offset_km = mosaics_apart_km(capture.reference, capture.moving[0])
         if offset_km:
             path = capture.moving[0].path
             terminal.problem(f"{path}: is {offset_km:,.1f} km away from the reference, by its coordinates", file=path)

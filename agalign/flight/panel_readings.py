@@ -16,7 +16,7 @@ from agalign.pixels.gdal import without_warnings
 from agalign.pixels.panel_detection import DetectedPanel, albedo_of, evenly_lit, find_panel, inside, is_homogeneous
 from agalign.pixels.radiometry import calibrated
 from agalign.pixels.raster import read_for_alignment, read_tile
-from agalign.values.capture import Band, Capture, Panel, PanelSource
+from agalign.values.capture import Band, Capture, Panel, PanelSource, known_time_s
 from agalign.values.image import Tile
 from agalign.values.pixel_units import PixelScale
 from agalign.values.radiometric_errors import LIGHT_SENSOR, PANEL_AND_SENSOR, contradiction, panel_errors
@@ -230,10 +230,10 @@ def _light_ratio(one: PanelReading, other: PanelReading) -> float | None:
 
 def _sun_height(capture: Capture) -> float:
     """Sine of the elevation of the sun, at least 0.1; 1 if the position or the time is unknown."""
-    if capture.position is None or capture.time_s is None or not capture.known_time:
+    if capture.position is None or (time_s := known_time_s(capture.captured_at)) is None:
         return 1.0
     min_sine = 0.1  # near the horizon, the light is not proportional to it
-    return max(min_sine, math.sin(sun_position(capture.position, capture.time_s)[0]))
+    return max(min_sine, math.sin(sun_position(capture.position, time_s)[0]))
 
 
 def _with_other_albedos(reading: PanelReading, others: Sequence[PanelReading]) -> PanelReading:

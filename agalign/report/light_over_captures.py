@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from agalign.records.cautions import Caution
 from agalign.records.sidecar import OutputPart
-from agalign.values.capture import CaptureTime, is_clock_set
+from agalign.values.capture import known_time_s
 from agalign.values.remedies import JUMP, NOT_FLAT
 
 _MIN_CAPTURES = 20
@@ -60,14 +60,14 @@ class _CaptureCells:
     @classmethod
     def of(cls, label: str, captured_at: str, output: OutputPart) -> Self | None:
         """Return the cells of the bands of a capture; None without any."""
-        time = CaptureTime.of(captured_at) if is_clock_set(captured_at) else None
         means = {part.band: part.cell_means for part in output.band_radiometry if part.cell_means is not None}
         usable = {band: cells for band, cells in means.items() if np.mean(cells > 0) > _MIN_VALID}
         if not usable:
             return None
         cells = np.array([np.log(c, out=np.full_like(c, np.nan), where=c > 0) for c in usable.values()])
+        time_s = known_time_s(captured_at)
         quantity, _, _ = (output.radiometry or "").partition(" by ")
-        return cls(label, math.nan if time is None else time.utc.timestamp(), quantity, tuple(usable), cells)
+        return cls(label, math.nan if time_s is None else time_s, quantity, tuple(usable), cells)
 
     def apart_s(self, other: Self) -> float:
         """Return the time between two captures."""

@@ -7,6 +7,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Literal, NamedTuple
 
+import numpy as np
 from pydantic import dataclasses as validated
 
 from agalign.errors import Reason
@@ -57,6 +58,12 @@ capture differ by less.
 def is_clock_set(time: str) -> bool:
     """Return False for a time, which begins with the year, of a clock that was not set: cameras count from 1970."""
     return time >= "1971"
+
+
+def known_time_s(captured_at: str) -> float | None:
+    """Return the Unix time of `Capture.captured_at`; None if it is unknown or the clock was not set."""
+    time = CaptureTime.of(captured_at) if is_clock_set(captured_at) else None
+    return None if time is None else time.utc.timestamp()
 
 
 PanelSource = Literal["tags", "QR code", "look"]
@@ -200,6 +207,13 @@ class Position:
         """Latitude and longitude with the letters of the hemispheres."""
         north, east = "NS"[self.latitude < 0], "EW"[self.longitude < 0]
         return f"{abs(self.latitude):.4f} {north}, {abs(self.longitude):.4f} {east}"
+
+
+def distance_km(one: Position, other: Position) -> float:
+    """Return the distance on the ground by the haversine formula with the mean radius, which is accurate to 0.5 %."""
+    at = np.radians([[place.longitude, place.latitude] for place in (one, other)])
+    x, y = np.sin((at[1] - at[0]) / 2) ** 2
+    return float(2 * 6371.0 * np.arcsin(np.sqrt(min(1.0, y + np.cos(at[:, 1]).prod() * x))))
 
 
 HeightSource = Literal["tags", "panel", "ground elevation", "assumed"]

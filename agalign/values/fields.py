@@ -113,8 +113,8 @@ class Array:
 
 
 Name = Annotated[str, AfterValidator(partial(shortened, max_length=250))]
-"""A name, or another short text, of which a file may have any length: names of bands with a number are longer than those
-of tags, which `shortened` cuts.
+"""A name, or another short text, of which a file may have any length: bands with a number have longer names than tags,
+which `shortened` cuts.
 """
 Message = Annotated[str, AfterValidator(partial(shortened, max_length=1000))]
 """A sentence, of which a file may have any length. It may name a file with its folders."""
