@@ -17,9 +17,7 @@ from typing import TYPE_CHECKING
 from agalign.batch.earlier_results import existing_files, outputs_exist
 from agalign.batch.workers import dask_executor
 from agalign.cameras.discover import FolderScan, discover
-from agalign.cli.exit_codes import ExitCode
-from agalign.cli.print_cautions import explain
-from agalign.cli.terminal import MAX_LISTED, Terminal
+from agalign.cli.terminal import MAX_LISTED, ExitCode, Terminal, explain
 from agalign.config import DiscoverOptions, RunOptions, Settings
 from agalign.errors import InputError, OutputError, SidecarError, WorkerError
 from agalign.flight.groups import camera_overviews

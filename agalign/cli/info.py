@@ -9,8 +9,7 @@ import typer
 
 from agalign.cli.align_commands import align
 from agalign.cli.command import Command, Given, config_text
-from agalign.cli.exit_codes import ExitCode
-from agalign.cli.terminal import MAX_LISTED, Terminal, in_json
+from agalign.cli.terminal import MAX_LISTED, ExitCode, Terminal, in_json
 from agalign.errors import ConfigurationError, UnreadableFileError
 from agalign.host.text import counted
 

@@ -14,10 +14,9 @@ from typer.core import TyperGroup
 from agalign.cli.align_commands import align, demo, onto
 from agalign.cli.command import help_of
 from agalign.cli.evaluate import evaluate, learn, surface
-from agalign.cli.exit_codes import ExitCode
 from agalign.cli.info import info
 from agalign.cli.results import export, indices, report, verify
-from agalign.cli.terminal import Terminal, options_from, printed
+from agalign.cli.terminal import ExitCode, Terminal, options_from, printed
 from agalign.host.processes import leave_out_network_clients, limit_default_threads, silence_libraries
 from agalign.host.text import did_you_mean, name_problem
 

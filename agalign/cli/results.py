@@ -10,8 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from agalign.cli.command import Command, Given
-from agalign.cli.exit_codes import ExitCode
-from agalign.cli.terminal import MAX_LISTED, RAW_NUMBERS, Terminal
+from agalign.cli.terminal import MAX_LISTED, RAW_NUMBERS, ExitCode, Terminal, explain
 from agalign.host.files import INDICES_FILE, REPORT_FILE, SUMMARY_FILE
 from agalign.host.text import counted
 from agalign.values.choices import ExportProgram
@@ -30,7 +29,6 @@ def _report(terminal: Terminal, out: Annotated[Path, typer.Argument()], as_json:
         out: Output folder of an earlier run.
         as_json: Print the content of the report as JSON.
     """
-    from agalign.cli.print_cautions import explain
     from agalign.host.output_folder import locked
     from agalign.records.sidecar_file import run_sidecars
     from agalign.report.pages import write_pages

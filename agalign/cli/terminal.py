@@ -1,5 +1,4 @@
-"""Output of the commands: results, progress and problems; signals."""
-
+"""Output of the commands: results, progress, problems, and what to check in the results of a run; exit codes; signals."""
 import io
 import json
 import math
@@ -12,17 +11,19 @@ import traceback
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from datetime import UTC, datetime
+from enum import IntEnum
 from types import FrameType
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from agalign.cli.exit_codes import ExitCode
 from agalign.errors import AgalignError, ConfigurationError, is_out_of_memory
-from agalign.host.text import escape_controls
+from agalign.host.text import counted, escape_controls
 
 if TYPE_CHECKING:
     from rich.console import Console
+
+    from agalign.report.facts import CautionGroup
 
 MAX_LISTED = 10
 """Maximum number of listed problems of one kind."""
@@ -30,6 +31,17 @@ RAW_NUMBERS = (
     "the bands are raw numbers, not reflectance: their indices are not comparable between captures or cameras, and are "
     "far from the indices of reflectance; align with --radiometry auto where the camera's tags allow it"
 )
+
+
+class ExitCode(IntEnum):
+    """What a command returns to the shell."""
+
+    OK = 0
+    NOTHING = 1
+    USAGE = 2
+    PARTIAL = 3
+    SIGNAL = 128
+    """Added to the number of the signal that ended the program, as shells do: 130 for SIGINT, 143 for SIGTERM."""
 
 
 def command_line() -> str:
@@ -154,6 +166,29 @@ class Terminal:
             for number, handler in before.items():
                 signal.signal(number, handler)
             self.check()
+
+
+def explain(groups: "Sequence[CautionGroup]", terminal: Terminal) -> None:
+    """Print what to check, the largest effect first: number of bands, cause, size, captures, and remedy."""
+    max_named = 3
+    if groups:
+        terminal.event("check", "Check these, the largest effect first:", causes=len(groups))
+    for group in groups:
+        status, first = group.status.replace("_", " "), group.bands[0]
+        if len(group.bands) == 1:
+            name = f"{first.capture} {first.band}".rstrip()
+            text, named = f"{name}: {status}: {first.reason}", []
+        else:
+            bands, captures = counted(len(group.bands), "band"), counted(group.captures, "capture")
+            what = captures if group.status == "no_result" else f"{bands} of {captures}"
+            size = f" ({group.size})" if group.size else ""
+            text = f"{status}: {what}: {group.remedy.cause}{size}"
+            names = [f"{b.capture} {b.band}".rstrip() for b in group.bands]
+            more = f" and {len(names) - max_named} more" if len(names) > max_named else ""
+            named = [f"{', '.join(names[:max_named])}{more}: {first.reason}"]
+        facts = {"bands": len(group.bands), "captures": group.captures, "advice": group.advice}
+        facts |= {"cause": group.remedy.cause, "size": group.size, "effect": round(group.effect, 4)}
+        terminal.problem(text, (*named, f"try: {group.advice}"), status=group.status, **facts)
 
 
 @contextmanager

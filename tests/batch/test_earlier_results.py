@@ -20,8 +20,7 @@ from agalign.batch.run import Listener, _crops_of_cameras, plan_run, run_flight
 from agalign.batch.workers import RunTasks, open_workers
 from agalign.cli.align_run import RunTotals, conclude
 from agalign.cli.align_run import run as run_command
-from agalign.cli.exit_codes import ExitCode
-from agalign.cli.terminal import Terminal
+from agalign.cli.terminal import ExitCode, Terminal
 from agalign.flight.groups import flights_of, model_names
 from agalign.records.sidecar_file import find_sidecars, read_sidecar, read_without_tables, write_sidecar
 from agalign.values.image import OutputGrid

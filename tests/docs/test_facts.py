@@ -16,8 +16,8 @@ import pytest
 
 from agalign.batch.products import PRODUCTS
 from agalign.capture import band_pair, common_parallax
-from agalign.cli.exit_codes import ExitCode
 from agalign.cli.main import COMMANDS
+from agalign.cli.terminal import ExitCode
 from agalign.fit import dense, displacement_field, windows
 from agalign.flight import panel_readings
 from agalign.host.files import INDICES_FILE
@@ -123,7 +123,7 @@ def calls(module: str, function: str) -> Iterator[ast.Call]:
 
 def test_events_of_a_run_and_their_fields() -> None:
     fields: dict[str, set[str]] = {}
-    for call in chain(calls("cli/align_run.py", "event"), calls("cli/print_cautions.py", "event")):
+    for call in chain(calls("cli/align_run.py", "event"), calls("cli/terminal.py", "event")):
         if isinstance(call.args[0], ast.Constant):
             names = {k.arg for k in call.keywords if k.arg is not None}
             fields.setdefault(str(call.args[0].value), set()).update(names)

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 import agalign
-from agalign.cli.exit_codes import ExitCode
+from agalign.cli.terminal import ExitCode
 from agalign.exports.programs import export
 from agalign.records.sidecar_file import find_sidecars
 from agalign.values.choices import ExportProgram

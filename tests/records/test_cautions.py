@@ -11,8 +11,7 @@ from synthetic_flights.aligned import make_aligned
 
 from agalign.cameras.discover import discover
 from agalign.cameras.metadata import exposed_after_s
-from agalign.cli.print_cautions import explain
-from agalign.cli.terminal import Terminal
+from agalign.cli.terminal import Terminal, explain
 from agalign.flight.rig_file import model_fingerprint
 from agalign.rasters.alignment_maps import error_lattice_px, share_over_1_px
 from agalign.records.cautions import Caution, RunFacts
