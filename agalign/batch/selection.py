@@ -12,22 +12,8 @@ from agalign.batch.workers import failure_text
 from agalign.cameras.discover import FolderScan
 from agalign.config import RunOptions, WriteSettings
 from agalign.errors import AgalignError, ConfigurationError
-from agalign.flight.footprint import (
-    above_elevation,
-    missing_for_footprint,
-    utm_of_flights,
-    with_approximate_georeference,
-)
-from agalign.flight.panel_readings import (
-    READERS,
-    PanelReading,
-    compared,
-    missing_panel,
-    read_panel,
-    reflectance_factors,
-    with_height,
-    with_panels,
-)
+from agalign.flight import footprint, panel_readings
+from agalign.flight.panel_readings import PanelReading
 from agalign.flight.sky import SkyCapture, sky_captures
 from agalign.host.process_pool import ProcessPool, R, WorkerDiedError, open_pool
 from agalign.host.processes import usable_cores
@@ -56,7 +42,7 @@ def select_captures(flight: FolderScan, write: WriteSettings, options: RunOption
     georeference, or the bands for a product.
     """
     start, timeout_s = partial(import_module, __name__), options.timeout_s  # tasks do not wait for the imports
-    readers = nullcontext() if timeout_s is None else open_pool(min(READERS, usable_cores()), 1, start)
+    readers = nullcontext() if timeout_s is None else open_pool(min(panel_readings.READERS, usable_cores()), 1, start)
     with readers as pool:
         result = _selected(flight, write, options, _Examination(pool, timeout_s))
     captures = result.captures
@@ -67,7 +53,7 @@ def select_captures(flight: FolderScan, write: WriteSettings, options: RunOption
     if captures and all(missing):
         raise ConfigurationError(f"--radiometry {write.radiometry}: {missing[0]}")
     if write.georeference and captures and all(c.reference.georeference is None for c in captures):
-        raise ConfigurationError(f"--georeference: no capture has {missing_for_footprint(captures[0])}")
+        raise ConfigurationError(f"--georeference: no capture has {footprint.missing_for_footprint(captures[0])}")
     for product in (one for one in PRODUCTS if one.is_enabled(write)):
         _check_product(product, captures)
     return result
@@ -81,14 +67,14 @@ def _selected(flight: FolderScan, write: WriteSettings, options: RunOptions, exa
     captures = list(flight.captures)
     if not options.align_panels:
         sky, captures = sky_captures(captures, examine)
-        captures = list(with_panels(captures, without_code=bool(albedos), examine=examine))
-        readings = [examine(read_panel, c, albedos) for c in captures if c.panel is not None]
-        panels = compared([reading for reading in readings if reading is not None])
+        captures = list(panel_readings.with_panels(captures, without_code=bool(albedos), examine=examine))
+        readings = [examine(panel_readings.read_panel, c, albedos) for c in captures if c.panel is not None]
+        panels = panel_readings.compared([reading for reading in readings if reading is not None])
         captures = [c for c in captures if not c.is_of_a_panel and c.label not in examine.abandoned]
     captures = [_calibrated(capture, panels, write) for capture in captures]
     if write.georeference:
-        crs = utm_of_flights(captures)
-        captures = [with_approximate_georeference(c, crs[c.label]) if c.label in crs else c for c in captures]
+        crs = footprint.utm_of_flights(captures)
+        captures = [footprint.with_approximate_georeference(c, crs[c.label]) if c.label in crs else c for c in captures]
     return Selection(sky, panels, captures, examine.abandoned)
 
 
@@ -96,12 +82,12 @@ def _calibrated(capture: Capture, panels: Sequence[PanelReading], settings: Writ
     """Return the capture with its radiometry, and its height above the ground if the elevation of the ground or a panel
     determines it.
     """
-    capture = with_radiometry(capture, settings.radiometry, reflectance_factors(capture, panels))
+    capture = with_radiometry(capture, settings.radiometry, panel_readings.reflectance_factors(capture, panels))
     if settings.radiometry == "panel":
-        capture = replace(capture, without_panel=missing_panel(capture, panels))
+        capture = replace(capture, without_panel=panel_readings.missing_panel(capture, panels))
     if settings.ground_elevation_m is not None:
-        capture = above_elevation(capture, settings.ground_elevation_m)
-    return with_height(capture, panels)
+        capture = footprint.above_elevation(capture, settings.ground_elevation_m)
+    return panel_readings.with_height(capture, panels)
 
 
 def _check_product(product: Product, captures: Sequence[Capture]) -> None:

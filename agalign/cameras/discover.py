@@ -8,43 +8,12 @@ from pathlib import Path
 
 import numpy as np
 
+from agalign.cameras import consistency, grouping, image_search
 from agalign.cameras.band_identity import with_one_spelling
 from agalign.cameras.base import reference_index
 from agalign.cameras.camera_calibration import different_calibrations, with_complete_calibrations
-from agalign.cameras.consistency import (
-    contradictions,
-    doubtful_files,
-    exposed_apart,
-    far_from_flight,
-    files_of_one_band,
-    list_problems,
-    of_other_captures,
-)
 from agalign.cameras.generic import Generic
-from agalign.cameras.grouping import (
-    band_file_owners,
-    capture_of,
-    group_files,
-    join_folders,
-    pattern_clashes,
-    with_bands_of_names,
-    with_cameras_apart,
-    with_missing_bands,
-    with_tags_of_flight,
-    with_unique_band_names,
-    with_unique_capture_names,
-    with_unreadable_bands,
-    without_copies,
-)
 from agalign.cameras.image_file import ImageFile, OwnFile, Problem, problem_of
-from agalign.cameras.image_search import (
-    IMAGE_KINDS,
-    check_folder,
-    image_files,
-    is_chosen,
-    other_files,
-    without_companions,
-)
 from agalign.cameras.metadata import read_tags
 from agalign.cameras.read_files import read_files
 from agalign.config import DiscoverOptions
@@ -129,43 +98,45 @@ def discover(folder: str | Path, options: DiscoverOptions | None = None) -> Fold
     (2, '0000SET/000/IMG_0001', ['Blue', 'Green', 'Red', 'NIR', 'Red edge'])
     """
     folder, options = Path(folder), options or DiscoverOptions()
-    check_folder(folder)
+    image_search.check_folder(folder)
     paths, problems = _chosen_images(folder, options)
-    files, copies = without_copies(_read(paths, options, problems))
-    files, damaged = with_tags_of_flight(files)
-    files = with_complete_calibrations(with_one_spelling(with_bands_of_names(files)))
+    files, copies = grouping.without_copies(_read(paths, options, problems))
+    files, damaged = grouping.with_tags_of_flight(files)
+    files = with_complete_calibrations(with_one_spelling(grouping.with_bands_of_names(files)))
     captures: list[Capture] = []
-    groups, copied = join_folders(group_files(files, with_rgb=options.with_rgb))
-    problems += copies + copied + damaged + list_problems(files) + doubtful_files(files)
-    problems += contradictions(groups) + exposed_apart(groups)
-    problems += different_calibrations(files) + of_other_captures(groups)
-    problems += files_of_one_band(groups) if options.pattern is None else []
+    groups, copied = grouping.join_folders(grouping.group_files(files, with_rgb=options.with_rgb))
+    problems += copies + copied + damaged + consistency.list_problems(files) + consistency.doubtful_files(files)
+    problems += consistency.contradictions(groups) + consistency.exposed_apart(groups)
+    problems += different_calibrations(files) + consistency.of_other_captures(groups)
+    problems += consistency.files_of_one_band(groups) if options.pattern is None else []
     _check_bands(groups, options.bands, folder)
     for group in groups:
         if options.pattern is not None:
-            problems += pattern_clashes(group, options.pattern)
+            problems += grouping.pattern_clashes(group, options.pattern)
         try:
-            captures.append(capture_of(group, folder, options))
+            captures.append(grouping.capture_of(group, folder, options))
         except (InputError, NoSuchBandError) as error:
             problems.append(Problem(group[0].path, error))
     if not captures:
         _check_pattern(options.pattern, paths, folder)
         for unknown_band in (p.error for p in problems if isinstance(p.error, NoSuchBandError)):
             raise unknown_band
-    captures = with_cameras_apart(captures, groups)
+    captures = grouping.with_cameras_apart(captures, groups)
     captures.sort(key=lambda c: (c.folder.as_posix(), c.name))
-    captures = with_missing_bands(with_unique_capture_names(captures, band_file_owners(captures)))
-    captures = with_unreadable_bands(captures, files, problems)
-    problems += far_from_flight(captures)
+    captures = grouping.with_missing_bands(
+        grouping.with_unique_capture_names(captures, grouping.band_file_owners(captures))
+    )
+    captures = grouping.with_unreadable_bands(captures, files, problems)
+    problems += consistency.far_from_flight(captures)
     return FolderScan(folder, tuple(captures), tuple(problems))
 
 
 def _chosen_images(folder: Path, options: DiscoverOptions) -> tuple[list[Path], list[Problem]]:
     """(the images to read, problems of folders that cannot be listed). Raises InputError without images."""
-    images, problems = image_files(folder, options.skip)
-    images, companions = without_companions(images, folder)
+    images, problems = image_search.image_files(folder, options.skip)
+    images, companions = image_search.without_companions(images, folder)
     problems += companions
-    paths = [p for p in images if is_chosen(p.relative_to(folder), options.include, options.exclude)]
+    paths = [p for p in images if image_search.is_chosen(p.relative_to(folder), options.include, options.exclude)]
     if not paths and problems:
         raise problems[0].error
     if images and not paths:
@@ -173,9 +144,9 @@ def _chosen_images(folder: Path, options: DiscoverOptions) -> tuple[list[Path], 
         such_as = images[0].relative_to(folder).as_posix()
         raise InputError(f"{folder}: none of {len(images)} images, such as {such_as}, passes {globs}")
     if not paths:
-        others = ", ".join(f"{count} {suffix}" for suffix, count in other_files(folder).most_common(5))
+        others = ", ".join(f"{count} {suffix}" for suffix, count in image_search.other_files(folder).most_common(5))
         only = f"; there are only {others}" if others else ""
-        raise InputError(f"{folder}: no {IMAGE_KINDS} file in it or below it{only}")
+        raise InputError(f"{folder}: no {image_search.IMAGE_KINDS} file in it or below it{only}")
     return paths, problems
 
 
@@ -247,9 +218,9 @@ def mosaics_onto(
             *(replace(b, one_lens=True, is_from_photograph=False) for b in _georeferenced_bands(path, max_pixels)),
         ]
         captured_at = read_tags(path).captured_at
-        unique, root = tuple(with_unique_band_names(bands)), reference.parent
+        unique, root = tuple(grouping.with_unique_band_names(bands)), reference.parent
         captures.append(Capture(path.stem, Path(), unique, 0, captured_at=captured_at, root=root))
-    return FolderScan(reference.parent, tuple(with_unique_capture_names(captures)), ())
+    return FolderScan(reference.parent, tuple(grouping.with_unique_capture_names(captures)), ())
 
 
 def mosaics_apart_km(fixed: Band, moving: Band) -> float:

@@ -7,18 +7,8 @@ from functools import partial
 from importlib import import_module
 from pathlib import Path
 
+from agalign.cameras import consistency
 from agalign.cameras.base import Camera
-from agalign.cameras.consistency import (
-    clock_doubt,
-    clock_error,
-    lens_of_other_image,
-    min_raw_step,
-    normalized,
-    part_of_image,
-    pixel_scale,
-    vignetting_of_other_lens,
-    with_position,
-)
 from agalign.cameras.image_file import Doubt, ImageFile, OwnFile, Problem
 from agalign.cameras.makers import known_cameras
 from agalign.cameras.metadata import Tags, read_tags
@@ -60,7 +50,7 @@ def read_file(path: Path, cameras: Iterable[Camera], options: DiscoverOptions) -
     tags = read_tags(path, pages[0][0].page)
     *_, generic = cameras
     camera = next(c for c in cameras if c.recognises(tags))
-    tags, of_position = with_position(tags, camera.other_position(tags), camera.sun(tags))
+    tags, of_position = consistency.with_position(tags, camera.other_position(tags), camera.sun(tags))
     pages[0], of_samples = _without_constant_sample(pages[0], is_of_camera=camera is not generic)
     is_photograph = (pages[0][0].dtype == "uint8" or camera.has_one_lens(tags)) and len(pages[0]) in (3, 4)
     # A stack was made by software, even if its tags name a camera: cameras write single bands and photographs.
@@ -71,7 +61,7 @@ def read_file(path: Path, cameras: Iterable[Camera], options: DiscoverOptions) -
     panel, stored = panel_in(tags, pages[0][0].size_px), pages[0][0]
     named = [replace(b, panel=panel) for b in _named_bands(path, tags, camera, pages)]
     used = (b for b in named if options.with_rgb or not b.is_from_photograph)
-    checked = [_of_image(band, tags, min_raw_step(tags, stored)) for band in used]
+    checked = [_of_image(band, tags, consistency.min_raw_step(tags, stored)) for band in used]
     bands = tuple(_with_plausible_tags(band, tags) for band, _, _ in checked)
     scale = checked[0][1] if checked else SAME_PIXELS
     other_lens = next((why for *_, why in checked if why), "")
@@ -129,11 +119,11 @@ def _doubts(camera: Camera, tags: Tags, bands: Sequence[Band], other_lens: str) 
     """What two sources in a file give differently."""
     if other_lens:
         yield Doubt(other_lens, "lens, rig and radiometry are not used: give the original images")
-    if error := clock_error(tags.near, tags.captured_at, camera.sun(tags)):
-        yield clock_doubt(error)
+    if error := consistency.clock_error(tags.near, tags.captured_at, camera.sun(tags)):
+        yield consistency.clock_doubt(error)
     for text in camera.contradictions(tags):
         yield Doubt(text, "correct the tags, or leave --radiometry out")
-    if (text := normalized(tags)) and any(text in band.missing_calibration for band in bands):
+    if (text := consistency.normalized(tags)) and any(text in band.missing_calibration for band in bands):
         yield Doubt(text, "radiometry is not used: give the original images")
 
 
@@ -141,9 +131,9 @@ def _of_image(band: Band, tags: Tags, raw_step: int) -> tuple[Band, PixelScale, 
     """Return the band with what its tags give in pixels as it is for its image, the size of this relative to the
     camera's, and why these tags are not used; empty if they are. Raw numbers are multiples of `raw_step`.
     """
-    scale = pixel_scale(tags, band, lambda: band.dtype == "uint16" and value_step(band) % raw_step == 0)
+    scale = consistency.pixel_scale(tags, band, lambda: band.dtype == "uint16" and value_step(band) % raw_step == 0)
     if scale is None:
-        why = part_of_image(tags, band)
+        why = consistency.part_of_image(tags, band)
         return _without_lens(band, why), SAME_PIXELS, why
     result, why = _with_lens_of_image(band, scale)
     return result, scale, why
@@ -160,7 +150,7 @@ def _with_lens_of_image(band: Band, scale: PixelScale) -> tuple[Band, str]:
         band = replace(band, lens=rescaled(band.lens, scale), to_rig=to_rig, other_to_rig=other, radiometry=radiometry)
     if band.lens is None or band.lens.is_plausible(band.size_px):
         return band, ""
-    why = lens_of_other_image(band)
+    why = consistency.lens_of_other_image(band)
     return _without_lens(band, why), why
 
 
@@ -175,10 +165,10 @@ def _with_plausible_tags(band: Band, tags: Tags) -> Band:
     """The band without a calibration, or its factor to reflectance, by implausible tags."""
     if band.radiometry is None:
         return band
-    if band.radiometry.is_of_light and (problem := normalized(tags)):
+    if band.radiometry.is_of_light and (problem := consistency.normalized(tags)):
         return replace(band, radiometry=None, missing_calibration=f"no usable tags for radiance ({problem})")
     radiometry, problem = plausible(band.radiometry, band.size_px)
-    problem = problem or vignetting_of_other_lens(band)
+    problem = problem or consistency.vignetting_of_other_lens(band)
     if problem and "vignetting" in problem:
         radiometry = None
     reason = f"no usable tags for radiance ({problem})" if radiometry is None else ""

@@ -1,4 +1,5 @@
-"""Output of the commands: results, progress, problems, and what to check in the results of a run; exit codes; signals."""
+"""Output of the commands: results, progress, problems, what to check in the results of a run; exit codes; signals."""
+
 import io
 import json
 import math
