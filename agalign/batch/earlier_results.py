@@ -106,17 +106,19 @@ def remaining(
         earlier, change = results(path)
     except SidecarError:
         return _after_damage(path, capture, options)
-    files = _compared_files(earlier, capture)
-    if files.lost and not options.overwrite:
-        return _kept(files.lost, f"the sidecar {change.what}" if change else "", None if change else earlier)
+    has_other_files, lost = _compared_files(earlier, capture)
+    if lost and not options.overwrite:
+        return _kept(lost, f"the sidecar {change.what}" if change else "", None if change else earlier)
     if change:
         return Remaining("estimate", (_DAMAGED,))
     if earlier.estimated_with != estimation_fingerprint(capture, settings):
         stages = [(key, stage) for key, stage in settings if key not in RENDER_STAGES]
-        changed = _changed_options(earlier, settings, stages) + _changed_version(earlier)
-        other = ("input files",) if files.changed else _changed_selection(earlier, capture)
+        changed = _changed_options(earlier, settings, stages)
+        if earlier.agalign != __version__:
+            changed = *changed, f"version (agalign {earlier.agalign} before)"
+        other = ("input files",) if has_other_files else _changed_selection(earlier, capture)
         return Remaining("estimate", changed or other)
-    if files.changed:
+    if has_other_files:
         return Remaining("estimate", ("input files",))
     status = capture_status(earlier.bands, capture.missing_bands, settings.check.accept_predicted_px)
     if options.overwrite or (options.retry_failed and {earlier.status, status} != {"ok"}):
@@ -173,18 +175,8 @@ def _is_index_raster(part: FilePart, sidecar: Path) -> bool:
     return Path(part.file).stem in {raster.path.stem for raster in index_rasters(sidecar.with_suffix(""))}
 
 
-@dataclass(frozen=True)
-class _ComparedFiles:
-    """The input files of a capture, compared with those of an earlier result."""
-
-    changed: bool
-    """Some have other contents."""
-    lost: list[str]
-    """Those that are missing or cannot be read, and why."""
-
-
-def _compared_files(earlier: Sidecar, capture: Capture) -> _ComparedFiles:
-    """Compare the contents of the input files with those of an earlier result.
+def _compared_files(earlier: Sidecar, capture: Capture) -> tuple[bool, list[str]]:
+    """Return (True if input files have other contents than those of an earlier result, why files of it are lost).
 
     Of each file, size, times and samples are compared, and if the times differ, the checksum. A band that the options
     leave out, whose file exists, is not lost.
@@ -210,7 +202,7 @@ def _compared_files(earlier: Sidecar, capture: Capture) -> _ComparedFiles:
     for name in changed:
         if problem := _unreadable(here[name]):
             lost.append(problem)
-    return _ComparedFiles(bool(changed), lost)
+    return bool(changed), lost
 
 
 def _unreadable(band: Band) -> str:
@@ -250,10 +242,6 @@ def _has_indices(earlier: Sidecar, names: Sequence[str]) -> bool:
     files = {part.file for part in earlier.products if part.kind == "index"}
     requested = (earlier.options or {}).get("write", {}).get("indices", [])
     return all(name in requested or f"{earlier.capture}_{name}.tif" in files for name in names)
-
-
-def _changed_version(earlier: Sidecar) -> tuple[str, ...]:
-    return () if earlier.agalign == __version__ else (f"version (agalign {earlier.agalign} before)",)
 
 
 def existing_files(sidecar: Path, result: Sidecar) -> list[FilePart]:

@@ -73,12 +73,6 @@ def clock_error(position: Position | None, captured_at: str, by_tags: Sun | None
     return "is wrong by hours or months"
 
 
-def clock_doubt(error: str) -> Doubt:
-    """Return the doubt of a `clock_error`."""
-    text = f"its clock {error}, by the position of the sun in the tags of the light sensor"
-    return Doubt(text, "the irradiance is used as measured; correct the time for what depends on it")
-
-
 # ---- position
 
 

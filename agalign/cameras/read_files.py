@@ -120,7 +120,8 @@ def _doubts(camera: Camera, tags: Tags, bands: Sequence[Band], other_lens: str) 
     if other_lens:
         yield Doubt(other_lens, "lens, rig and radiometry are not used: give the original images")
     if error := consistency.clock_error(tags.near, tags.captured_at, camera.sun(tags)):
-        yield consistency.clock_doubt(error)
+        text = f"its clock {error}, by the position of the sun in the tags of the light sensor"
+        yield Doubt(text, "the irradiance is used as measured; correct the time for what depends on it")
     for text in camera.contradictions(tags):
         yield Doubt(text, "correct the tags, or leave --radiometry out")
     if (text := consistency.normalized(tags)) and any(text in band.missing_calibration for band in bands):

@@ -296,28 +296,18 @@ class UnfinishedRun:
     @property
     def sentence(self) -> str:
         """Describe what is missing, without a full stop; empty if there is none."""
-        states = {
+        states: dict[RunState, str] = {
             "running": "the run did not end: it was killed, or is still running",
             "interrupted": "the run was stopped before its end",
-            "finished": "",
         }
-        parts = [text for text in (states[self.state], self._without_result, self._with_error) if text]
+        parts, of_all = [states[self.state]] if self.state in states else [], f"of {counted(self.found, 'capture')}"
+        if self.missing:
+            verb = "has" if len(self.missing) == 1 else "have"
+            parts.append(f"{len(self.missing)} {of_all} {verb} no result: {_named(self.missing)}")
+        if self.erroneous:
+            what = f"errors in {len(self.erroneous)} {of_all}, whose files may be of an earlier run"
+            parts.append(f"{what}: {_named(self.erroneous)}")
         return "; ".join([*parts, "the same command resumes it"]) if parts else ""
-
-    @property
-    def _without_result(self) -> str:
-        if not self.missing:
-            return ""
-        verb = "has" if len(self.missing) == 1 else "have"
-        of_all = f"{len(self.missing)} of {counted(self.found, 'capture')}"
-        return f"{of_all} {verb} no result: {_named(self.missing)}"
-
-    @property
-    def _with_error(self) -> str:
-        if not self.erroneous:
-            return ""
-        of_all = f"{len(self.erroneous)} of {counted(self.found, 'capture')}"
-        return f"errors in {of_all}, whose files may be of an earlier run: {_named(self.erroneous)}"
 
 
 def _named(labels: Sequence[str]) -> str:

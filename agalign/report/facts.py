@@ -12,7 +12,6 @@ from typing import Any
 from urllib.parse import quote
 
 import numpy as np
-from numpy.typing import NDArray
 
 from agalign.host.files import SUMMARY_FILE, CsvTable
 from agalign.host.text import escape_controls
@@ -451,9 +450,5 @@ def _band_offset(grid: GridPart | None, sidecar: Sidecar) -> tuple[tuple[float, 
     if not (np.abs(moving_px.max(axis=0) - moving_px.min(axis=0) - span_px) < 0.1 * span_px).all():
         return None, None
     centre = (np.array(sidecar.reference.size_px) - 1) / 2
-    dx, dy = offsets[_lengths(reference_px - centre).argmin()].tolist()
-    return (round(dx, 3), round(dy, 3)), round(median(_lengths(offsets).tolist()), 3)
-
-
-def _lengths(vectors: NDArray[np.float64]) -> NDArray[np.float64]:
-    return np.asarray(np.sqrt((vectors * vectors).sum(axis=1)))
+    dx, dy = offsets[np.linalg.norm(reference_px - centre, axis=1).argmin()].tolist()
+    return (round(dx, 3), round(dy, 3)), round(median(np.linalg.norm(offsets, axis=1).tolist()), 3)
