@@ -51,7 +51,7 @@ from agalign.rasters.preview import preview_bytes
 from agalign.rasters.product import CapturePaths
 from agalign.records.listed_files import states_of
 from agalign.records.run_record import RunPart, begun, excluded_part, input_name, last_record
-from agalign.records.sidecar import FilePart, Sidecar
+from agalign.records.sidecar import FilePart
 from agalign.report.pages import outdate_pages
 from agalign.report.panels_and_sky import write_panels, write_sky
 from agalign.spectral_indices.rasters import check_indices
@@ -346,7 +346,8 @@ class _FlightRun:
             plan.left[capture.label] = replace(one, earlier=None)
             if (grid := self._earlier_grid(one)) is not None:
                 plan.grids[capture.label] = grid
-            if one.earlier is not None and _used_network_of_flight(one.earlier):
+            joints = [band.joint for band in one.earlier.bands if band.joint] if one.earlier else []
+            if any(joint.recipe == "flight" for joint in joints):
                 plan.modelled.add(capture.label)
         return plan
 
@@ -420,10 +421,6 @@ class _FlightRun:
         with written_below(self.out):
             save_model(model, path)
         return path
-
-
-def _used_network_of_flight(sidecar: Sidecar) -> bool:
-    return any(band.joint is not None and band.joint.recipe == "flight" for band in sidecar.bands)
 
 
 def _is_model(path: Path) -> bool:

@@ -41,6 +41,7 @@ _LENS_CALIBRATION = (
 """XMP values that a maker measures on each camera."""
 _MAX_HALVES_APART = timedelta(seconds=1)
 """Between the exposures of a dual camera, which are simultaneous; an id may occur again in another flight."""
+_NUMBER_OF_BAND = re.compile(r"[a-z]?\d{1,2}", re.IGNORECASE)
 _BEFORE_SUFFIX = "-.~@+_"
 """Characters before what synchronisation and users add to the names of copies, besides spaces and brackets."""
 
@@ -176,13 +177,9 @@ def _paths_in_name(path: Path) -> list[Path]:
     stem = path.stem
     is_band = is_band_name(split_stem(stem)[1])  # f_red-edge is a band, not a copy of f_red
     places = [] if is_band else [i for i, c in enumerate(stem) if c in _BEFORE_SUFFIX]
-    parts = [stem[:i] for i in places if not _is_number_of_band(stem[i + 1 :])]
+    parts = [stem[:i] for i in places if not _NUMBER_OF_BAND.fullmatch(stem[i + 1 :])]
     parts += [part for i, c in enumerate(stem) if c in " (" for part in (stem[:i], stem[i + 1 :])]
     return [path.with_name(part + path.suffix) for part in parts if part]
-
-
-def _is_number_of_band(text: str) -> bool:
-    return bool(re.fullmatch(r"[a-z]?\d{1,2}", text, re.IGNORECASE))
 
 
 def with_tags_of_flight(files: Sequence[ImageFile]) -> tuple[list[ImageFile], list[Problem]]:

@@ -1,7 +1,7 @@
 """Numbers and times in the texts of tags, as cameras and programs of any locale write them."""
 
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 
 _NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
 _WITH_UNIT = re.compile(rf"({_NUMBER})(?:/({_NUMBER}))?[A-Za-z%°µ²^/]*")
@@ -27,7 +27,9 @@ def numbers_in(items: Sequence[str], count: int | None = None) -> tuple[float, .
     if any(mark in item for item in items for mark in ".("):  # a point, or pairs in brackets
         return _all_of(parts)
     has_decimal_commas = len(items) > 1 or _has_decimal_commas(chunks, len(parts), count)
-    return _all_of(_with_points(chunks) if has_decimal_commas else parts)
+    if has_decimal_commas:  # every second comma, beginning with the first
+        parts = [part.replace(",", ".") for chunk in chunks for part in re.findall(r"[^,]+(?:,[^,]+)?", chunk)]
+    return _all_of(parts)
 
 
 def _has_decimal_commas(chunks: Sequence[str], parts: int, count: int | None) -> bool:
@@ -39,11 +41,6 @@ def _has_decimal_commas(chunks: Sequence[str], parts: int, count: int | None) ->
     if count is not None:
         return parts == 2 * count or (is_one_each and len(chunks) == count)
     return is_one_each and len(chunks) > 1
-
-
-def _with_points(chunks: Iterable[str]) -> list[str]:
-    """The numbers in chunks, with points: every second comma, beginning with the first, is a decimal comma."""
-    return [number.replace(",", ".") for chunk in chunks for number in re.findall(r"[^,]+(?:,[^,]+)?", chunk)]
 
 
 def _all_of(texts: Sequence[str]) -> tuple[float, ...]:

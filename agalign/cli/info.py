@@ -212,7 +212,7 @@ def _facts(capture: "Capture") -> dict[str, Any]:
     ]
     return {
         "label": capture.label,
-        "camera": f"{capture.camera.make} {capture.camera.model}".strip() or "unknown",
+        "camera": capture.camera.name or "unknown",
         "serial": capture.camera.serial,
         "captured_at": capture.known_time,
         "capture_id": capture.capture_id,

@@ -43,11 +43,6 @@ def camera_key(capture: Capture) -> str:
     return str(FlightCamera.of(capture, [capture.reference]))
 
 
-def flight_key(capture: Capture) -> tuple[str, str]:
-    """Return (camera, flight id); captures of one flight have equal keys."""
-    return camera_key(capture), capture.flight_id
-
-
 def flight_camera(captures: Sequence[Capture]) -> FlightCamera:
     """Return the camera of a flight and all bands in its captures, the reference first."""
     bands = {captures[0].reference.name: captures[0].reference}
@@ -93,7 +88,7 @@ def flights_of(captures: Iterable[Capture]) -> list[list[Capture]]:
     by_key: dict[tuple[str, str], list[tuple[dict[str, tuple[int, int]], list[Capture]]]] = {}
     for capture in captures:
         sizes = {b.name: b.size_px for b in capture.bands}
-        same_key = by_key.setdefault(flight_key(capture), [])
+        same_key = by_key.setdefault((camera_key(capture), capture.flight_id), [])
         fitting = (f for f in same_key if all(f[0].get(name, size) == size for name, size in sizes.items()))
         flight_sizes, flight = next(fitting, ({}, []))
         if not flight:
@@ -178,8 +173,7 @@ def camera_overviews(captures: Sequence[Capture]) -> list[CameraOverview]:
     """Return an overview for each camera, in the order of their first captures."""
     groups: dict[tuple[str, str], list[Capture]] = {}
     for capture in captures:
-        name = f"{capture.camera.make} {capture.camera.model}".strip() or "unknown camera"
-        groups.setdefault((name, capture.camera.unit), []).append(capture)
+        groups.setdefault((capture.camera.name or "unknown camera", capture.camera.unit), []).append(capture)
     return [_overview(name, serial, group) for (name, serial), group in groups.items()]
 
 

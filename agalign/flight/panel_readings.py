@@ -133,7 +133,10 @@ def with_panels(
     """
     flights = flights_of(captures)
     ends = [end for flight in flights for end in _from_both_ends(flight)]
-    medians_m = {c.label: median_m for flight in flights for median_m in [_median_altitude_m(flight)] for c in flight}
+    medians_m: dict[str, float] = {}
+    for flight in flights:
+        altitudes_m = [c.altitude_m for c in flight if c.altitude_m is not None] or [math.nan]
+        medians_m |= dict.fromkeys((c.label for c in flight), float(np.median(altitudes_m)))
     with without_warnings(), ThreadPoolExecutor(READERS) as pool:
         results = pool.map(lambda end: _captures_of_panels(end, without_code, examine), ends)
         of_panels = [c for result in results for c in result]
@@ -183,12 +186,6 @@ def _shows_square(band: Band) -> bool:
     except AgalignError:
         return False
     return is_homogeneous(pixels[inside(panel.corners_px, pixels.shape) & valid].astype(np.float64))
-
-
-def _median_altitude_m(flight: Sequence[Capture]) -> float:
-    """Return the median altitude of the captures; nan if none is known."""
-    altitudes_m = [c.altitude_m for c in flight if c.altitude_m is not None]
-    return float(np.median(altitudes_m)) if altitudes_m else math.nan
 
 
 def read_panel(capture: Capture, albedos: Albedos) -> PanelReading:

@@ -227,7 +227,7 @@ def _tags(capture: Capture, layers: Sequence[Layer], *, raw: bool) -> dict[str, 
     return {
         "TIFFTAG_DATETIME": capture.known_time[:19].replace("-", ":").replace("T", " "),
         "CAPTURE_ID": capture.capture_id,
-        "CAMERA": f"{capture.camera.make} {capture.camera.model}".strip(),
+        "CAMERA": capture.camera.name,
         "REFERENCE_BAND": capture.reference.name,
         "RADIOMETRY": " and ".join(dict.fromkeys(r.quantity for r in known)),
         "RADIOMETRY_SOURCE": " and ".join(dict.fromkeys(r.source for r in known)),

@@ -218,10 +218,6 @@ def remedy_of(band: BandResult, *, is_mosaic: bool) -> Remedy:
     kind = band.issues[0].kind
     if is_mosaic and kind not in OF_FILES:
         return remedies.MOSAICS
-    if _is_exposed_apart(band) and kind not in OF_FILES:
+    if abs(band.exposed_after_s or 0.0) >= MIN_APART_S and kind not in OF_FILES:
         return remedies.APART
     return remedies.BLURRED if band.status == "predicted" and kind.remedy is remedies.TEXTURELESS else kind.remedy
-
-
-def _is_exposed_apart(band: BandResult) -> bool:
-    return abs(band.exposed_after_s or 0.0) >= MIN_APART_S
