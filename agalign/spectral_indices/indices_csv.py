@@ -13,12 +13,11 @@ from agalign.errors import InputError
 from agalign.host.files import INDICES_FILE, read_regular, write_csv
 from agalign.host.own_files import refuse_foreign
 from agalign.host.text import without_formula
-from agalign.rasters.aligned_files import tags_of
 from agalign.records.cautions import RunFacts
 from agalign.records.run_record import renamed_captures
 from agalign.records.sidecar import Sidecar
 from agalign.spectral_indices.formulas import Index, bands_for
-from agalign.spectral_indices.rasters import IndexReport, IndexStatistics, index_of, statistics_in, was_masked
+from agalign.spectral_indices.rasters import IndexRaster, IndexReport, IndexStatistics
 
 _OF_CAPTURE = "folder", "capture", "captured_at", "latitude", "longitude"
 _OF_INDEX = "index", "median", "p5", "p95", "valid_share", "masked_share", "input", "low", "high", "file", "problem"
@@ -46,12 +45,10 @@ def reports_of(sidecar: Sidecar, folder: str, out: Path, run: RunFacts) -> list[
         path = out / folder / part.file
         if part.kind == "index" and path.suffix == ".tif":
             name = path.stem.removeprefix(f"{Path(sidecar.capture).name}_")
-            tags = tags_of(path)
-            statistics = statistics_in(tags)
-            if statistics is not None:
+            if (raster := IndexRaster.read(path)) is not None:
                 label = Path(folder, sidecar.capture).as_posix()
-                problem = to_check(index_of(tags) if "INDEX" in tags else None, sidecar, run, label)
-                report = IndexReport(label, name, path, statistics, problem, is_masked=was_masked(tags))
+                problem = to_check(raster.index, sidecar, run, label)
+                report = IndexReport(label, name, path, raster.statistics, problem, is_masked=raster.is_masked)
                 result.append(report.of(sidecar))
     return result
 
@@ -104,12 +101,11 @@ def _current(row: IndexReport) -> IndexReport | None:
     """Return a row if its raster has the statistics of the row, or if it has a problem instead; else None."""
     if row.path is None:
         return row if row.problem else None
-    tags = tags_of(row.path)
-    statistics = statistics_in(tags)
-    if statistics is None or statistics.unit != row.statistics.unit:
+    raster = IndexRaster.read(row.path)
+    if raster is None or raster.statistics.unit != row.statistics.unit:
         return None
-    is_same = f"{statistics.median:g}" == f"{row.statistics.median:g}"
-    return replace(row, is_masked=was_masked(tags)) if is_same else None
+    is_same = f"{raster.statistics.median:g}" == f"{row.statistics.median:g}"
+    return replace(row, is_masked=raster.is_masked) if is_same else None
 
 
 def _masked_alike(rows: Sequence[IndexReport]) -> list[IndexReport]:

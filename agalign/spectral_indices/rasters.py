@@ -10,7 +10,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path, PurePosixPath
-from typing import Any
+from typing import Any, Self
 
 import cv2
 import numpy as np
@@ -147,7 +147,7 @@ class IndexReport:
         return replace(self, captured_at=sidecar.captured_at, latitude=latitude, longitude=longitude)
 
 
-def statistics_in(tags: Mapping[str, str]) -> IndexStatistics | None:
+def _statistics_in(tags: Mapping[str, str]) -> IndexStatistics | None:
     """Return the statistics in the tags of a raster; None if there are none."""
     try:
         fields: dict[str, Any] = json.loads(tags[_STATISTICS_TAG])
@@ -302,7 +302,7 @@ def _foreign_file(raster: Path) -> Path | None:
     is_foreign = raster.exists() and not is_own_file(raster)
     with suppress(OSError):
         check_complete(raster)
-        is_foreign = statistics_in(tags_of(raster)) is None
+        is_foreign = IndexRaster.read(raster) is None
     if is_foreign:
         return raster
     return picture if picture.exists() and not is_own_file(picture) else None
@@ -313,40 +313,45 @@ class IndexRaster:
     """An index raster that an earlier command wrote."""
 
     path: Path
-    name: str
-    """Name of the index."""
-    index: Index | None
-    """None if the formula in its tags cannot be evaluated."""
-    is_masked: bool
-    """Its bands were masked by quality flags."""
+    statistics: IndexStatistics
+    tags: Mapping[str, str]
+
+    @classmethod
+    def read(cls, path: Path) -> Self | None:
+        """Return the index raster in a file; None for any other file."""
+        tags = tags_of(path)
+        statistics = _statistics_in(tags)
+        return None if statistics is None else cls(path, statistics, tags)
+
+    @property
+    def name(self) -> str:
+        """Name of the index."""
+        return self.tags.get("INDEX", "")
+
+    @property
+    def index(self) -> Index | None:
+        """The index with the name and the formula in its tags; None if the formula cannot be evaluated."""
+        formula = self.tags.get("INDEX_FORMULA", "")
+        with suppress(ConfigurationError):
+            known = index_named(self.name)
+            if _formula_text(known) == formula:
+                return known
+        with suppress(ConfigurationError):
+            return index_of_formula(f"{self.name}={formula}")
+        return None
+
+    @property
+    def is_masked(self) -> bool:
+        """True if its bands were masked by quality flags."""
+        return bool(self.tags.get("MASKED_BY"))
 
 
 def index_rasters(base: Path) -> list[IndexRaster]:
     """Return the index rasters of a capture, `base`_<index>.tif."""
-    result = []
-    for path in sorted(base.parent.glob(f"{glob.escape(base.name)}_*.tif")):
-        tags = {} if path.with_suffix(".json").exists() else tags_of(path)  # else the stack of another capture
-        statistics = statistics_in(tags)
-        if statistics is not None and path.name == f"{base.name}_{tags.get('INDEX')}.tif":
-            result.append(IndexRaster(path, tags["INDEX"], index_of(tags), was_masked(tags)))
-    return result
-
-
-def was_masked(tags: Mapping[str, str]) -> bool:
-    """Return True for the tags of a raster whose bands were masked by quality flags."""
-    return bool(tags.get("MASKED_BY"))
-
-
-def index_of(tags: Mapping[str, str]) -> Index | None:
-    """Return the index with the name and the formula in the tags of a raster."""
-    name, formula = tags["INDEX"], tags.get("INDEX_FORMULA", "")
-    with suppress(ConfigurationError):
-        known = index_named(name)
-        if _formula_text(known) == formula:
-            return known
-    with suppress(ConfigurationError):
-        return index_of_formula(f"{name}={formula}")
-    return None
+    paths = sorted(base.parent.glob(f"{glob.escape(base.name)}_*.tif"))
+    # A file with a sidecar is the stack of another capture.
+    found = (IndexRaster.read(path) for path in paths if not path.with_suffix(".json").exists())
+    return [raster for raster in found if raster is not None and raster.path.name == f"{base.name}_{raster.name}.tif"]
 
 
 def _bands_of_index(bands: Sequence[AlignedBand], index: Index) -> list[AlignedBand]:
@@ -387,9 +392,8 @@ def _finished_before(target: Path, source: str, listed: ListedFiles) -> IndexSta
         return None
     with suppress(OSError):
         check_complete(target)
-        tags = tags_of(target)
-        if tags.get("INDEX_MADE_FROM") == source:
-            return statistics_in(tags)
+        raster = IndexRaster.read(target)
+        return raster.statistics if raster is not None and raster.tags.get("INDEX_MADE_FROM") == source else None
     return None
 
 
