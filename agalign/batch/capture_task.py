@@ -9,16 +9,18 @@ from dataclasses import dataclass, field, replace
 from functools import cache, lru_cache, partial
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 from agalign.batch.capture_report import CaptureReport
-from agalign.batch.estimate import estimate
-from agalign.batch.output_files import earlier_result, refuse_to_overwrite
+from agalign.batch.output_files import earlier_result, is_removed, refuse_to_overwrite
 from agalign.batch.products import PRODUCTS
 from agalign.batch.render import RenderOptions, render
 from agalign.batch.workers import failure_text
-from agalign.capture.align_bands import PairProgress
+from agalign.cameras.metadata import exposed_after_s
+from agalign.capture.align_bands import PairProgress, align_capture_bands
 from agalign.config import Settings, WriteSettings
 from agalign.errors import InputError, UnreadableFileError
+from agalign.flight.fingerprint import RENDER_STAGES, input_digests, input_samples, input_states
 from agalign.flight.model import FlightModel, load_model
 from agalign.host.files import written_below
 from agalign.host.process_pool import A, R
@@ -26,9 +28,12 @@ from agalign.method.device import choose_device, keep_freed_memory, one_memory_e
 from agalign.pixels.capture_pixels import CapturePixels
 from agalign.pixels.radiometry import with_checked_pixels
 from agalign.pixels.raster import ReadTile, with_missing_parts, with_saturation_values
+from agalign.rasters.parallax_file import PARALLAX_KIND, PARALLAX_SUFFIX, write_parallax
 from agalign.rasters.product import CapturePaths
 from agalign.rasters.read_alignment import alignments_of
-from agalign.records.sidecar_file import read_with_change
+from agalign.records.sidecar import Sidecar
+from agalign.records.sidecar_file import file_part, read_with_change, write_sidecar
+from agalign.values.alignment import Alignment, relief_of
 from agalign.values.capture import Band, Capture
 from agalign.values.choices import RadiometryChoice
 
@@ -122,6 +127,53 @@ def process_capture(task: Task, progress: PairProgress = quiet) -> CaptureReport
         removed=result.removed,
         seconds=time.perf_counter() - began_s,
     )
+
+
+def estimate(
+    capture: Capture,
+    out: Path,
+    settings: Settings,
+    model: FlightModel | None,
+    progress: PairProgress,
+    earlier: Sidecar | None,
+    read: ReadTile,
+) -> tuple[Sidecar, dict[str, Alignment]]:
+    """Align the bands of a capture; write its sidecar, and its parallax if it has a relief.
+
+    Returns the sidecar and the alignments as a reader of the file has them: a later command renders the same bytes.
+
+    The sidecar lists the products of the `earlier` one, which describe another estimate, until they are rendered again.
+    A parallax file without the mark of the program is kept.
+    `read` reads the pixels of the files. Raises UnreadableFileError if the reference cannot be read, and OutputError.
+    """
+    began_s, paths = time.perf_counter(), CapturePaths.of(capture, out)
+    alignments = align_capture_bands(capture, settings, model, progress, read)
+    progress(capture.reference.name, "writing", 0.0)
+    relief, path, parallax = relief_of(alignments), paths.file(PARALLAX_SUFFIX), None
+    if relief is not None:
+        write_parallax(path, relief, capture.reference.georeference)
+        parallax = file_part(PARALLAX_KIND, path, paths.folder)
+    delayed = [b for b in capture.moving if alignments[b.name].status != "aligned"]
+    delays_s = {b.name: s for b in delayed if (s := exposed_after_s(b, capture.reference)) is not None}
+    result = Sidecar.estimated(capture, alignments, settings, delays_s)
+    facts: dict[str, Any] = {
+        "parallax": parallax,
+        "model": "" if model is None else model.fingerprint,
+        "input_samples": input_samples(capture),
+        "input_digests": input_digests(capture),
+        "input_states": input_states(capture),
+        "seconds": time.perf_counter() - began_s,
+    }
+    if earlier is not None:
+        options = {key: stage for key, stage in (result.options or {}).items() if key not in RENDER_STAGES}
+        options |= {key: stage for key, stage in (earlier.options or {}).items() if key in RENDER_STAGES}
+        facts |= {"products": earlier.products, "options": options}
+    written = write_sidecar(paths.sidecar, result.model_copy(update=facts))
+    if relief is None and is_removed(path, {}):
+        with suppress(OSError):
+            path.unlink(missing_ok=True)
+    # Their mappings have the decimals of the file, and hold the positions of all pixels.
+    return written, written.alignments({name: alignment.mapping for name, alignment in alignments.items()})
 
 
 def _checked(band: Band, read: ReadTile) -> Band:

@@ -9,6 +9,7 @@ import re
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from itertools import takewhile
 from pathlib import Path
 
 import numpy as np
@@ -60,6 +61,15 @@ class Camera(ABC):
     def capture_name(self, path: Path) -> str:
         """Return the part of a file name that all bands of a capture share."""
         return self.band_in_name.sub("", own_stem(path), count=1)
+
+    def name_end(self, path: Path) -> str:
+        """Return the end of a file's name that differs between the bands of a capture, without separators."""
+        stem, capture = own_stem(path), self.capture_name(path)
+        shared = sum(1 for _ in takewhile(lambda pair: pair[0] == pair[1], zip(stem, capture, strict=False)))
+        rest = capture[shared:]  # what follows the band in the name
+        if rest and len(stem) > len(capture) and stem.endswith(rest):
+            return stem[shared : len(stem) - len(rest)].strip("_- ")
+        return stem.removeprefix(capture).strip("_- ")
 
     def capture_key(self, path: Path, tags: Tags) -> str:
         """Return a text that is the same for all files of a capture, and unique for a camera and folder."""

@@ -14,7 +14,6 @@ from itertools import pairwise, product
 from pathlib import Path
 from statistics import median_low
 
-from agalign.cameras.band_identity import name_end
 from agalign.cameras.generic import Generic
 from agalign.cameras.image_file import Doubt, ImageFile, Problem, problem_of
 from agalign.cameras.metadata import Tags
@@ -247,7 +246,7 @@ def list_problems(files: Sequence[ImageFile]) -> list[Problem]:
 
 def _position(file: ImageFile) -> str:
     """The evidence of a band's position in the rig, in words; empty if there is none."""
-    index, end = file.tags.text(NAMESPACE, "RigCameraIndex"), name_end(file)
+    index, end = file.tags.text(NAMESPACE, "RigCameraIndex"), file.name_end
     return f"RigCameraIndex {index}" if index else f"'{end}' at the end of the name" if end else ""
 
 
@@ -385,7 +384,7 @@ def exposed_apart(groups: Sequence[Sequence[ImageFile]]) -> list[Problem]:
         for file in (f for f in group if f.path in times):
             later_s = times[file.path] - usual_s
             if abs(later_s) >= MIN_APART_S:
-                apart[name_end(file)].append((file, later_s))
+                apart[file.name_end].append((file, later_s))
             else:
                 others[file.camera.capture_name(file.path)].append(times[file.path])
     return [_of_other_time(found, others) for found in apart.values()]

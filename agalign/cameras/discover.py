@@ -9,11 +9,10 @@ from pathlib import Path
 import numpy as np
 
 from agalign.cameras import consistency, grouping, image_search
-from agalign.cameras.band_identity import with_one_spelling
 from agalign.cameras.base import reference_index
 from agalign.cameras.camera_calibration import different_calibrations, with_complete_calibrations
 from agalign.cameras.generic import Generic
-from agalign.cameras.image_file import ImageFile, OwnFile, Problem, problem_of
+from agalign.cameras.image_file import ImageFile, OwnFile, Problem, problem_of, with_one_spelling
 from agalign.cameras.metadata import read_tags
 from agalign.cameras.read_files import read_files
 from agalign.config import DiscoverOptions

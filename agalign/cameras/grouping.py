@@ -14,7 +14,6 @@ from pathlib import Path
 from types import MappingProxyType
 
 from agalign.cameras import dji, pix4d
-from agalign.cameras.band_identity import end_of, name_end
 from agalign.cameras.base import Camera, colour_bands, listed, reference_index
 from agalign.cameras.generic import Generic, split_elsewhere, split_stem
 from agalign.cameras.image_file import ImageFile, Problem, natural_order, problem_of
@@ -210,7 +209,7 @@ def with_tags_of_flight(files: Sequence[ImageFile]) -> tuple[list[ImageFile], li
 def _similar(file: ImageFile) -> tuple[object, object]:
     """Keys that files of the same camera and band, and of the same camera, share."""
     camera = file.camera.name, file.tags.make, file.tags.model, suffix_format(file.path)
-    return (*camera, name_end(file)), camera
+    return (*camera, file.name_end), camera
 
 
 def group_files(files: Iterable[ImageFile], *, with_rgb: bool = False) -> list[list[ImageFile]]:
@@ -356,7 +355,7 @@ def capture_of(files: Sequence[ImageFile], folder: Path, options: DiscoverOption
     if len(folders) > 1 and all(is_band_name(p.name) for p in folders):
         own_folder = first.path.parent.parent  # above the input if that is the folder of one band
     wanted = {band_key(name) for name in options.bands}
-    missing = lacking(tags.model, [(name_end(f), f.bands[0]) for f in files if tags.model and len(files) > 1])
+    missing = lacking(tags.model, [(f.name_end, f.bands[0]) for f in files if tags.model and len(files) > 1])
     return Capture(
         name=(first.path.stem if len(files) == 1 else first.camera.capture_name(first.path)) or "capture",
         root=folder,
@@ -465,7 +464,7 @@ def with_unreadable_bands(
         missing, reasons = {band_key(name): name for name in capture.missing_bands}, dict[str, Reason]()
         for file in of_capture if capture.has_several_files else ():
             without_tags = replace(capture.reference, name="", path=file, wavelength_nm=None)
-            found = [names.get(_place(file, camera), ""), band_at(capture.camera.model, end_of(file, camera))]
+            found = [names.get(_place(file, camera), ""), band_at(capture.camera.model, camera.name_end(file))]
             found += [band.name for band in camera.bands(file, Tags(), (without_tags,))]
             for own in map(band_key, found):
                 if own in missing:
@@ -478,7 +477,7 @@ def with_unreadable_bands(
 
 def _place(path: Path, camera: Camera) -> tuple[str, Path, str]:
     """What distinguishes the file of a band from those of the other bands of a capture."""
-    return camera.name, path.parent.relative_to(camera.capture_folder(path)), end_of(path, camera)
+    return camera.name, path.parent.relative_to(camera.capture_folder(path)), camera.name_end(path)
 
 
 def _camera_bands(captures: Sequence[Capture]) -> tuple[Band, ...]:

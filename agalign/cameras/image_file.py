@@ -1,7 +1,8 @@
 """An image file with its tags and bands, and problems of files."""
 
 import re
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -10,6 +11,7 @@ from agalign.cameras.metadata import Tags
 from agalign.errors import AgalignError, InputError
 from agalign.values.capture import Band
 from agalign.values.pixel_units import SAME_PIXELS, PixelScale
+from agalign.values.spectrum import band_key
 
 
 @dataclass(frozen=True)
@@ -74,9 +76,29 @@ class ImageFile:
     """Facts that two sources in the file give differently."""
 
     @property
+    def name_end(self) -> str:
+        """The end of its name that differs between the bands of a capture, without separators."""
+        return self.camera.name_end(self.path)
+
+    @property
     def is_whole_capture(self) -> bool:
         """True for a file of several bands with a lens each."""
         return len(self.bands) > 1 and not self.bands[0].one_lens
+
+
+def with_one_spelling(files: Sequence[ImageFile]) -> list[ImageFile]:
+    """Return the files with one spelling of each band's name in the files of a camera, or of a folder without tags: the
+    first. Multiband files are apart from those of single bands.
+    """
+    spellings: dict[tuple[object, ...], str] = {}
+    result = []
+    for file in files:
+        camera = file.tags.make, file.tags.model or file.camera.capture_folder(file.path), len(file.bands) > 1
+        names = [spellings.setdefault((*camera, band_key(b.name)), b.name.strip()) for b in file.bands]
+        is_unique = len(set(names)) == len({b.name for b in file.bands})
+        bands = tuple(replace(b, name=name) for b, name in zip(file.bands, names, strict=True))
+        result.append(replace(file, bands=bands) if is_unique else file)
+    return result
 
 
 def natural_order(name: str) -> list[tuple[bool, int, str]]:

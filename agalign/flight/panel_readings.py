@@ -5,6 +5,7 @@ import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from operator import call
 from typing import Protocol, TypeVar
 
 import numpy as np
@@ -118,14 +119,7 @@ class Examine(Protocol):
     def __call__(self, function: Callable[..., R], capture: Capture, /, *arguments: object) -> R | None: ...
 
 
-def examined_here(function: Callable[..., R], capture: Capture, /, *arguments: object) -> R | None:
-    """Call a function in this process, which has no time limit."""
-    return function(capture, *arguments)
-
-
-def with_panels(
-    captures: Sequence[Capture], *, without_code: bool = False, examine: Examine = examined_here
-) -> list[Capture]:
+def with_panels(captures: Sequence[Capture], *, without_code: bool = False, examine: Examine = call) -> list[Capture]:
     """Return the captures with their panels.
 
     Panels are known from the tags or detected in the first and last captures of each flight by their QR code; with

@@ -3,12 +3,13 @@
 import re
 from collections.abc import Iterable
 from dataclasses import dataclass
+from operator import call
 
 import numpy as np
 
 from agalign.cameras.base import is_thermal
 from agalign.errors import AgalignError
-from agalign.flight.panel_readings import Examine, examined_here
+from agalign.flight.panel_readings import Examine
 from agalign.pixels.gdal import without_warnings
 from agalign.pixels.radiometry import calibrated
 from agalign.pixels.raster import read_for_alignment, read_tile
@@ -55,7 +56,7 @@ class SkyCapture:
     cues: tuple[str, ...]
 
 
-def sky_cues(capture: Capture, examine: Examine = examined_here) -> tuple[str, ...]:
+def sky_cues(capture: Capture, examine: Examine = call) -> tuple[str, ...]:
     """Return the reasons to classify a capture as one of the sky; empty if fewer than two of three hold.
 
     The camera points above the horizon according to the tags; the name of a folder or the file contains `sky`; no band
@@ -74,9 +75,7 @@ def sky_cues(capture: Capture, examine: Examine = examined_here) -> tuple[str, .
     return tuple(cues) if len(cues) >= 2 else ()
 
 
-def sky_captures(
-    captures: Iterable[Capture], examine: Examine = examined_here
-) -> tuple[list[SkyCapture], list[Capture]]:
+def sky_captures(captures: Iterable[Capture], examine: Examine = call) -> tuple[list[SkyCapture], list[Capture]]:
     """Separate captures into (captures of the sky, other captures), both in their order."""
     with without_warnings():
         classified = [SkyCapture(capture, sky_cues(capture, examine)) for capture in captures]

@@ -34,7 +34,6 @@ from agalign.values.alignment import (
 )
 from agalign.values.capture import Band, CameraIdentity, Capture, Pose, Position, source_file
 from agalign.values.choices import CaptureStatus, Geometry, PairStatus, Space
-from agalign.values.equality import equal
 from agalign.values.fields import (
     RECORD,
     Array,
@@ -50,6 +49,7 @@ from agalign.values.fields import (
     Positive,
     RelativeFile,
     SourceFile,
+    equal,
 )
 from agalign.values.image import OutputGrid
 from agalign.values.issues import Issue

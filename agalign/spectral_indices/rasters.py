@@ -41,7 +41,7 @@ from agalign.records.sidecar import Sidecar
 from agalign.spectral_indices.before_alignment import index_before
 from agalign.spectral_indices.formulas import Index, bands_for, compute, index_named, index_of_formula
 from agalign.values.capture import Band, Capture
-from agalign.values.equality import equal
+from agalign.values.fields import equal
 from agalign.values.image import Tile, reduced_size_px
 from agalign.values.resampling import tiles
 from agalign.values.spectrum import role_of_band

@@ -13,8 +13,7 @@ from pydantic import dataclasses as validated
 from agalign.errors import InputError
 from agalign.values.arguments import checked
 from agalign.values.choices import Geometry, Interpolation, ModelFamily, PairStatus, PredictionSource, SeedKind, Space
-from agalign.values.equality import equal
-from agalign.values.fields import RECORD, Matrix3x3, Measured, Number, Number4, UpToInfinity
+from agalign.values.fields import RECORD, Matrix3x3, Measured, Number, Number4, UpToInfinity, equal
 from agalign.values.geometry import Matrix, PairScales, Points, magnification
 from agalign.values.image import FloatImage, Mask, Tile
 from agalign.values.issues import SEED_DOES_NOT_FIT, Issue, sentence

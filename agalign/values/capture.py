@@ -11,8 +11,7 @@ import numpy as np
 from pydantic import dataclasses as validated
 
 from agalign.errors import Reason
-from agalign.values.equality import equal
-from agalign.values.fields import RECORD, Name, Number
+from agalign.values.fields import RECORD, Name, Number, equal
 from agalign.values.geometry import Matrix
 from agalign.values.image import Tile
 from agalign.values.lens import Lens

@@ -1,4 +1,5 @@
-"""Types of the fields of records that are written to JSON: numbers and arrays with their precision in a file.
+"""Types of the fields of records that are written to JSON: numbers and arrays with their precision in a file, and
+their equality.
 
 A record is a frozen dataclass of pydantic with `RECORD`. The program makes it of any floats and arrays; JSON is
 validated when it is read: numbers are finite and limited, arrays have their shape, and null is a number that could
@@ -6,15 +7,15 @@ not be measured.
 """
 
 import math
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, fields, is_dataclass
 from functools import partial
 from itertools import chain
 from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import AfterValidator, ConfigDict, Field, GetCoreSchemaHandler
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, GetCoreSchemaHandler
 from pydantic_core import CoreSchema, core_schema
 
 from agalign.host.files import is_inside
@@ -110,6 +111,32 @@ class Array:
         with_null = rounded.astype(object)
         with_null[~np.isfinite(rounded)] = None
         return with_null.tolist()
+
+
+def equal(one: Any, other: Any) -> bool:
+    """Return True for equal values: records field by field, arrays element by element, and nan equals nan.
+
+    It is the `__eq__` of records, so that a copy, such as one that was pickled, equals its original.
+    """
+    if one is other:
+        return True
+    if isinstance(one, np.ndarray) and isinstance(other, np.ndarray):
+        return one.dtype == other.dtype and np.array_equal(one, other, equal_nan=one.dtype.kind in "fc")
+    if isinstance(one, np.ndarray) or isinstance(other, np.ndarray):
+        return False
+    if is_dataclass(one) or isinstance(one, BaseModel):
+        return type(one) is type(other) and all(equal(getattr(one, k), getattr(other, k)) for k in _compared(one))
+    if isinstance(one, tuple | list) and isinstance(other, tuple | list):
+        return type(one) is type(other) and len(one) == len(other) and all(map(equal, one, other))
+    if isinstance(one, Mapping) and isinstance(other, Mapping):
+        return one.keys() == other.keys() and all(equal(one[key], other[key]) for key in one)
+    return bool(one == other) or (one != one and other != other)
+
+
+def _compared(record: Any) -> list[str]:
+    if isinstance(record, BaseModel):
+        return [*type(record).model_fields]
+    return [field.name for field in fields(record) if field.compare]
 
 
 Name = Annotated[str, AfterValidator(partial(shortened, max_length=250))]

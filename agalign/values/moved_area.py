@@ -11,8 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray  # the former in quotes: help() prints its name, not 1,000 characters
 from pydantic import dataclasses as validated
 
-from agalign.values.equality import equal
-from agalign.values.fields import RECORD, Array, Number
+from agalign.values.fields import RECORD, Array, Number, equal
 from agalign.values.image import FloatImage, Mask
 from agalign.values.pixel_units import PixelScale
 

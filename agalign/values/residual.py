@@ -11,8 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from pydantic import dataclasses as validated
 from scipy.spatial import cKDTree
 
-from agalign.values.equality import equal
-from agalign.values.fields import RECORD, Array, Number6
+from agalign.values.fields import RECORD, Array, Number6, equal
 from agalign.values.geometry import PairScales
 from agalign.values.pixel_units import PixelScale
 

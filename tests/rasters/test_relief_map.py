@@ -27,7 +27,7 @@ from agalign.synthetic import cameras
 from agalign.values import geometry
 from agalign.values.alignment import Alignment
 from agalign.values.capture import Band, Capture
-from agalign.values.equality import equal
+from agalign.values.fields import equal
 from agalign.values.geometry import PairScales
 from agalign.values.image import OutputGrid, Tile
 from agalign.values.issues import RETRIEVAL, Issue
