@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from agalign.host.files import FLIGHT_MAP_FILE, write_text
 from agalign.records.run_record import ExclusionPart
@@ -40,7 +40,7 @@ class FlightMap:
         facts = _place(sidecar.camera, sidecar.captured_at, sidecar.position, sidecar.pose)
         self._features[label] = _feature(
             label,
-            _shape(sidecar.footprint, sidecar.position),
+            geojson_geometry(sidecar.footprint, sidecar.position),
             {
                 "status": sidecar.status,
                 **facts,
@@ -62,7 +62,7 @@ class FlightMap:
     def add_excluded(self, part: ExclusionPart) -> None:
         """Add a capture that is not aligned, as it shows a panel or the sky."""
         facts = _place(part.camera, part.captured_at, part.position, part.pose)
-        shape = _shape(part.footprint, part.position)
+        shape = geojson_geometry(part.footprint, part.position)
         accuracy_m = part.footprint_accuracy_m
         self._features[part.capture] = _feature(
             part.capture, shape, {"status": part.kind, **facts, "accuracy_m": accuracy_m, "indices": []}
@@ -104,16 +104,12 @@ def _place(camera: CameraIdentity, captured_at: str, position: Position | None, 
     }
 
 
-def _shape(footprint: list[tuple[float, float]] | None, position: Position | None) -> dict[str, Any] | None:
-    return geojson_geometry(None if footprint is None else np.array(footprint), position)
-
-
-def geojson_geometry(ring: NDArray[np.float64] | None, position: Position | None) -> dict[str, Any] | None:
+def geojson_geometry(footprint: ArrayLike | None, position: Position | None) -> dict[str, Any] | None:
     """Return the GeoJSON geometry of a footprint (n, 2), else of the camera's position, or None.
 
     A footprint across the 180th meridian is cut there (RFC 7946, 3.1.9).
     """
-    decimals = 7  # of a degree: 1 cm
+    decimals, ring = 7, None if footprint is None else np.asarray(footprint)  # of a degree: 1 cm
     if ring is not None and np.ptp(ring[:, 0]) > 180:
         beyond = np.column_stack([ring[:, 0] % 360 - 180, ring[:, 1]])  # degrees east of the meridian
         parts = [_clipped(beyond, side) - np.array([side * 180.0, 0.0]) for side in (-1, 1)]

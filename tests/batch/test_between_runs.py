@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 import agalign
-from agalign.batch import estimate
+from agalign.batch import capture_task
 from agalign.batch.output_files import is_own
 from agalign.records import sidecar_file
 from agalign.records.sidecar_file import find_sidecars, read_sidecar, verify_outputs
@@ -245,7 +245,7 @@ def test_a_parallax_that_is_not_the_listed_one_is_estimated_again(
         calls.append(1)
         return run.on_hill()
 
-    monkeypatch.setattr(estimate, "align_capture_bands", align)
+    monkeypatch.setattr(capture_task, "align_capture_bands", align)
     (report,) = agalign.align_folder(folder, tmp_path, settings=seeded())
     parallax = report.path.with_suffix(".parallax.tif")
     data = parallax.read_bytes()
@@ -282,7 +282,7 @@ def test_another_limit_of_predicted_bands_renders_and_changes_the_status(
     def fail(*_: object) -> None:
         raise AssertionError("estimated again")
 
-    monkeypatch.setattr(estimate, "align_capture_bands", fail)
+    monkeypatch.setattr(capture_task, "align_capture_bands", fail)
     done = agalign_here(flight, "-o", out, *COMMAND, "--accept-predicted", "0.8")
     assert "2 finished captures to be rendered again; changed since: --accept-predicted\n" in done.stderr
     sidecars = [read_sidecar(path) for path in find_sidecars(out)]

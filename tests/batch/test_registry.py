@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 import agalign
-from agalign.batch import capture_task, estimate, render
+from agalign.batch import capture_task, render
 from agalign.batch.earlier_results import outputs_exist
 from agalign.batch.products import PRODUCTS
 from agalign.host.files import write_text
@@ -109,5 +109,5 @@ def test_a_required_product_that_fails_costs_the_capture(align: Align, monkeypat
 def test_products_are_checked_before_the_alignment(align: Align, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(Histogram, "check", raising(agalign.InputError("f_green.tif: has no histogram")))
     use_products(monkeypatch, *PRODUCTS, Histogram())
-    monkeypatch.setattr(estimate, "align_capture_bands", raising(AssertionError("aligned in vain")))
+    monkeypatch.setattr(capture_task, "align_capture_bands", raising(AssertionError("aligned in vain")))
     assert "has no histogram" in (align().error or "")

@@ -13,7 +13,7 @@ import pytest
 import rasterio
 
 import agalign
-from agalign.batch import capture_task, estimate
+from agalign.batch import capture_task
 from agalign.batch.run import plan_run
 from agalign.records.captures import bands_of
 from agalign.records.cautions import RunFacts
@@ -49,7 +49,7 @@ OTHER = {
 def without_estimating(monkeypatch: pytest.MonkeyPatch) -> Callable[[], None]:
     """From its call on, a capture that is estimated is an error."""
     error = raising(AssertionError("estimated again"))
-    return lambda: monkeypatch.setattr(estimate, "align_capture_bands", error)
+    return lambda: monkeypatch.setattr(capture_task, "align_capture_bands", error)
 
 
 def files_of(out: Path) -> dict[str, bytes | str]:
@@ -154,7 +154,7 @@ def test_relief_and_field_are_rendered_on_another_grid(
     """The parallax is known outside of the rasters that the first run wrote."""
     folder, out, direct = run.capture.reference.path.parents[2], tmp_path / "out", tmp_path / "direct"
     alignments = alignments_of(run, kind)
-    monkeypatch.setattr(estimate, "align_capture_bands", lambda *_: alignments)
+    monkeypatch.setattr(capture_task, "align_capture_bands", lambda *_: alignments)
     settings = seeded(crop="none" if crop == "common" else "common")
     others = seeded(**(OTHER | {"crop": crop, "relief_map": True, "fill_occluded": True, "undistort": True}))
     (first,) = agalign.align_folder(folder, out, settings=settings)
@@ -200,7 +200,7 @@ def test_a_deleted_parallax_is_estimated_again(run: Run, tmp_path: Path, monkeyp
         calls.append(1)
         return run.on_hill()
 
-    monkeypatch.setattr(estimate, "align_capture_bands", align)
+    monkeypatch.setattr(capture_task, "align_capture_bands", align)
     for _ in range(2):
         (report,) = agalign.align_folder(folder, tmp_path, settings=seeded())
         before = files_of(tmp_path)

@@ -16,7 +16,6 @@ from synthetic_flights.relief import make_scene
 
 import agalign
 from agalign.batch import capture_task as batch
-from agalign.batch import estimate
 from agalign.cameras import pix4d
 from agalign.cameras.metadata import Tags
 from agalign.cameras.tag_seeds import rig_seed
@@ -88,7 +87,7 @@ class Run:
         """Return the sidecar, by default of the true alignments of the capture."""
         chosen = agalign.Settings(write=agalign.WriteSettings.model_validate({"crop": "none", **settings}))
         with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(estimate, "align_capture_bands", lambda *_: alignments or self.alignments)
+            patch.setattr(batch, "align_capture_bands", lambda *_: alignments or self.alignments)
             outcome = batch.process_capture(batch.Task(self.capture, out, chosen))
         assert outcome.failed_products == ()
         assert read_without_tables(outcome.path).model_dump_json() == outcome.result.model_dump_json()
