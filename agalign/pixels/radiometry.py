@@ -169,33 +169,20 @@ def _converted(
 ) -> Radiometry | None:
     if of_camera is None or not of_camera.is_of_light or choice == "camera":
         return of_camera
-    if choice == "sun":
-        of_panel = () if by_panel is None else tuple(e for e in by_panel.errors if e.name == PANEL_AND_SENSOR)
-        result = _to_reflectance(of_camera)
-        return None if result is None else replace(result, errors=(*result.errors, *of_panel))
-    return None if by_panel is None else _reflectance(of_camera, by_panel)
-
-
-def _to_reflectance(radiometry: Radiometry) -> Radiometry | None:
-    """Return the conversion to reflectance: `radiometry` if it is one, else with the light sensor, else None."""
-    if radiometry.quantity in ("reflectance", "relative reflectance"):
-        return radiometry
-    if not radiometry.is_of_light or radiometry.by_sun is None:
+    factor = of_camera.by_sun if choice == "sun" else by_panel
+    if factor is None:
         return None
-    return _reflectance(radiometry, radiometry.by_sun)
-
-
-def _reflectance(radiance: Radiometry, factor: ReflectanceFactor) -> Radiometry:
     is_by_panel = factor.source != "light sensor"
-    of_radiance = (e for e in radiance.errors if not (is_by_panel and e == FACTORY_CALIBRATION))  # it is calibrated
+    of_radiance = [e for e in of_camera.errors if not (is_by_panel and e == FACTORY_CALIBRATION)]  # it is calibrated
+    of_panel = [e for e in by_panel.errors if e.name == PANEL_AND_SENSOR] if by_panel and factor is not by_panel else []
     return replace(
-        radiance,
-        gain=radiance.gain * factor.value,
+        of_camera,
+        gain=of_camera.gain * factor.value,
         quantity=factor.quantity,
         source=factor.source,
         factor=factor.value,
         panel_age_s=factor.panel_age_s,
-        errors=(*of_radiance, *factor.errors),
+        errors=(*of_radiance, *factor.errors, *of_panel),
     )
 
 

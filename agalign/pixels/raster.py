@@ -251,10 +251,8 @@ def _with_missing_parts(band: Band, read: ReadTile) -> Band:
 
 def value_step(band: Band) -> int:
     """Return the greatest common divisor of all pixels of a band, such as 16 if 12 bits are stored as the upper bits of
-    16. It is 1 for floats. Raises UnreadableFileError.
+    16, of a band of integers. Raises UnreadableFileError.
     """
-    if np.dtype(band.dtype).kind not in "ui":
-        return 1
     pixels, valid = read_tile(band, Tile(0, 0, *band.size_px))
     return max(1, int(np.gcd.reduce(np.unique(pixels[valid]).astype(np.int64), initial=0)))
 

@@ -256,8 +256,6 @@ class PixelMapping:
 
     def _raw_crossings(self, x_px: Points, y_px: Points) -> Points:
         """(m, n, 2) raw reference px of the pixels of columns x (n,) and rows y (m,)."""
-        if self.pre_distortion is None:
-            return np.stack(np.meshgrid(x_px, y_px), axis=-1)
         return splined(lambda points: lens.distort(self.pre_distortion, points), x_px, y_px)
 
     @property
