@@ -19,16 +19,7 @@ from agalign.batch.products import PRODUCTS
 from agalign.config import WriteSettings
 from agalign.errors import ConfigurationError, OutputError, Reason, SidecarError
 from agalign.flight.fingerprint import input_samples
-from agalign.host.files import (
-    FLIGHT_MAP_FILE,
-    INDICES_FILE,
-    REPORT_FILE,
-    RUN_FILE,
-    SUMMARY_FILE,
-    check_inside,
-    max_name_bytes,
-    remove_companions,
-)
+from agalign.host.files import PAGES, RUN_FILE, check_inside, max_name_bytes, remove_companions
 from agalign.host.own_files import foreign, is_own_file
 from agalign.rasters.aligned_files import band_file_names, is_aligned_raster
 from agalign.rasters.parallax_file import PARALLAX_SUFFIX
@@ -211,7 +202,7 @@ def refuse_foreign_pages(out: Path) -> None:
     """
     if (out / RUN_FILE).exists() or find_sidecars(out):
         return
-    for path in (out / name for name in (REPORT_FILE, SUMMARY_FILE, INDICES_FILE, FLIGHT_MAP_FILE)):
+    for path in (out / name for name in PAGES):
         if path.is_file():
             raise ConfigurationError(foreign(path))
 

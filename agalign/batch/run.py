@@ -10,24 +10,11 @@ from functools import partial
 from pathlib import Path
 from typing import Self
 
+from agalign.batch import earlier_results, output_files
 from agalign.batch.capture_report import CaptureReport
 from agalign.batch.capture_task import Task, do_capture, loaded_model, quiet
-from agalign.batch.earlier_results import (
-    EarlierResults,
-    Remaining,
-    existing_files,
-    labels_of_other_inputs,
-    outputs_exist,
-    remaining,
-    results_not_in_input,
-)
+from agalign.batch.earlier_results import EarlierResults, Remaining
 from agalign.batch.flight_learning import learn_flight
-from agalign.batch.output_files import (
-    refuse_foreign_pages,
-    refuse_results_elsewhere,
-    refuse_to_overwrite,
-    remove_outputs,
-)
 from agalign.batch.render import RenderOptions
 from agalign.batch.selection import Selection, select_captures
 from agalign.batch.workers import MAX_THREADS, RunTasks, failure_text, numbers_of_workers, open_workers, serially
@@ -131,7 +118,7 @@ def _run_selected(run: "_FlightRun", selection: Selection) -> Iterator[CaptureRe
                     record.stage_seconds[stage] += seconds
                 if report.result is not None and report.path is not None:
                     statuses = [status for _, status, _ in report.result.pairs]
-                    here = existing_files(report.path, report.result)
+                    here = earlier_results.existing_files(report.path, report.result)
                     written[report.label] = report.path, here, report.state, statuses
                     record.file_states[report.label] = run.file_states(report, report.path.parent, here)
                 if time.monotonic() - saved > _SAVED_EVERY_S:  # for the case that the run is killed
@@ -142,7 +129,7 @@ def _run_selected(run: "_FlightRun", selection: Selection) -> Iterator[CaptureRe
                     raise OutputError(f"{out}: the disk is full; free space, then the same command resumes the run")
         finally:
             for label, (path, files, state, statuses) in written.items():
-                if not outputs_exist(path, files):
+                if not earlier_results.outputs_exist(path, files):
                     gone.append(label)
                     record.retract(label, state, statuses)
         if gone:
@@ -178,8 +165,8 @@ def _recorded(run: "_FlightRun") -> Iterator[RunPart]:
     began, earlier = time.monotonic(), last_record(run.out)
     record = begun(run.flight.folder, run.settings, run.flight.captures, run.options.command)
     record.file_states = {} if earlier is None else dict(earlier.file_states)
-    record.other_inputs = labels_of_other_inputs(earlier, record)
-    record.not_in_input = list(results_not_in_input(run.flight, run.out, record.other_inputs))
+    record.other_inputs = earlier_results.labels_of_other_inputs(earlier, record)
+    record.not_in_input = list(earlier_results.results_not_in_input(run.flight, run.out, record.other_inputs))
     for problem in run.flight.problems:
         record.add_problem(str(problem.path), problem.text)
     record.write(run.out, "running", 0.0)
@@ -243,10 +230,10 @@ class _FlightRun:
             raise ConfigurationError(f"{self.out}: is the folder of the images; choose another output folder with -o")
         earlier = last_record(self.out)
         self.results.file_states.update({} if earlier is None else earlier.file_states)
-        refuse_to_overwrite(self.flight.captures, self.out, self.settings.write, self.results)
+        output_files.refuse_to_overwrite(self.flight.captures, self.out, self.settings.write, self.results)
         if earlier is None or earlier.input != input_name(self.flight.folder):  # else the images were moved in it
-            refuse_results_elsewhere(self.flight.captures, self.out, self.results)
-        refuse_foreign_pages(self.out)
+            output_files.refuse_results_elsewhere(self.flight.captures, self.out, self.results)
+        output_files.refuse_foreign_pages(self.out)
         check_inside(self.out / MODELS_FOLDER, self.out)
 
     def starting_from(self, path: Path) -> Self:
@@ -272,7 +259,7 @@ class _FlightRun:
 
     def remaining(self, capture: Capture) -> Remaining:
         """Return what remains to be done for a capture."""
-        return remaining(capture, self.out, self.settings, self.options, self.results)
+        return earlier_results.remaining(capture, self.out, self.settings, self.options, self.results)
 
     def file_states(self, report: CaptureReport, folder: Path, files: Sequence[FilePart]) -> str:
         """Return the states of those files of a report that are as they were written, given the folder of its sidecar,
@@ -288,7 +275,7 @@ class _FlightRun:
         for label, reason in selection.abandoned.items():
             yield CaptureReport(label, "error", error=reason)
         for report, capture in self._excluded(selection.sky, selection.panels, record):
-            removed = remove_outputs(capture, self.out, self.settings.write)
+            removed = output_files.remove_outputs(capture, self.out, self.settings.write)
             reason = f"captures of a calibration panel or the sky are not aligned, as {capture.label}"
             yield replace(report, removed=tuple((path, reason) for path in removed))
         yield from self._aligned(selection.captures, record)

@@ -8,22 +8,12 @@ from functools import partial
 
 from PIL.ExifTags import Base
 
-from agalign.cameras import dji, dls, micasense, pix4d
+from agalign.cameras import dji, dls, micasense, pix4d, tiff_directory
 from agalign.cameras.makers import camera_of
 from agalign.cameras.metadata import Tags, finite, read_tags
 from agalign.cameras.parrot import Sequoia
 from agalign.cameras.pix4d import GridVignetting
-from agalign.cameras.tiff_directory import (
-    EXIF,
-    GPS,
-    XMP,
-    Directory,
-    byte_string,
-    long,
-    rational,
-    read_directories,
-    values,
-)
+from agalign.cameras.tiff_directory import EXIF, GPS, XMP, Directory
 from agalign.cameras.xmp import Packet, names_in
 from agalign.errors import UnreadableFileError
 from agalign.values.capture import Band, is_clock_set
@@ -94,7 +84,7 @@ def band_tags(
         _put_geometry(packet, reference, reference_tags, grid)
         _put_radiometry(packet, own_tags, vignetting, radiometry=radiometry)
         if serialised := packet.serialised():
-            first[XMP] = byte_string(serialised)
+            first[XMP] = tiff_directory.byte_string(serialised)
     return _without_unset_clock(first), _on_grid(exif, of_reference[EXIF], grid), own[GPS]
 
 
@@ -181,7 +171,7 @@ def _texts(numbers: Iterable[float]) -> list[str]:
 def _directories(band: Band) -> dict[int, Directory]:
     """The directories of a file; empty if they are damaged, because the pixels may still be good."""
     try:
-        return read_directories(band.path, band.page)
+        return tiff_directory.read_directories(band.path, band.page)
     except Exception:  # a damaged file causes any exception
         return {0: {}, EXIF: {}, GPS: {}}
 
@@ -195,9 +185,9 @@ def _on_grid(exif: Directory, reference: Directory, grid: OutputGrid) -> Directo
     result = exif | _some(reference, _GEOMETRIC_EXIF)
     densities: set[int] = {Base.FocalPlaneXResolution, Base.FocalPlaneYResolution}
     for tag in densities & result.keys() if grid.scale.mean != 1 else ():
-        density = finite(values(result[tag]))
+        density = finite(tiff_directory.values(result[tag]))
         if density is not None and density > 0:
             with suppress(ValueError):  # too large for a fraction: a damaged tag
-                result[tag] = rational(grid.scale.mean * density)
+                result[tag] = tiff_directory.rational(grid.scale.mean * density)
     sizes = {Base.ExifImageWidth: grid.width, Base.ExifImageHeight: grid.height}
-    return result | {tag: long(size) for tag, size in sizes.items() if tag in result}
+    return result | {tag: tiff_directory.long(size) for tag, size in sizes.items() if tag in result}

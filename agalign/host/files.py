@@ -32,6 +32,7 @@ RUN_FILE = "agalign-run.json"
 PANELS_FILE, SKY_FILE, MODELS_FOLDER = "panels.json", "sky.json", "models"
 REPORT_FILE, SUMMARY_FILE, INDICES_FILE, FLIGHT_MAP_FILE = "index.html", "summary.csv", "indices.csv", "flight.geojson"
 """Pages and tables of a run in its output folder."""
+PAGES = REPORT_FILE, SUMMARY_FILE, INDICES_FILE, FLIGHT_MAP_FILE
 _PARTIAL = ".agalign-part-"
 """Prefix of partial files; host, process id and a random part follow."""
 _MAX_NAME_BYTES, _MAX_SUFFIX = 120, 12

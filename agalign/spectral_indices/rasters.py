@@ -23,17 +23,10 @@ from agalign.host.memory_limits import WORK_TILE_PX
 from agalign.host.own_files import SOFTWARE, foreign, is_own_file
 from agalign.host.text import shortened
 from agalign.pixels.raster import OpenRaster, open_raster
+from agalign.rasters import geotiff
 from agalign.rasters.aligned_files import tags_of
 from agalign.rasters.band_reader import RAW, BandReader
 from agalign.rasters.drawing import with_text, write_png
-from agalign.rasters.geotiff import (
-    FLOAT_OPTIONS,
-    LayerDescription,
-    check_complete,
-    checked_raster,
-    tiled_profile,
-    to_cog,
-)
 from agalign.rasters.product import CapturePaths, Product, ProductContext, WrittenFile
 from agalign.records.captures import AlignedBand, bands_of
 from agalign.records.listed_files import ListedFiles
@@ -301,7 +294,7 @@ def _foreign_file(raster: Path) -> Path | None:
     picture = raster.with_suffix(".png")
     is_foreign = raster.exists() and not is_own_file(raster)
     with suppress(OSError):
-        check_complete(raster)
+        geotiff.check_complete(raster)
         is_foreign = IndexRaster.read(raster) is None
     if is_foreign:
         return raster
@@ -391,7 +384,7 @@ def _finished_before(target: Path, source: str, listed: ListedFiles) -> IndexSta
     if not picture.is_file() or any(map(listed.problem, (target, picture))):
         return None
     with suppress(OSError):
-        check_complete(target)
+        geotiff.check_complete(target)
         raster = IndexRaster.read(target)
         return raster.statistics if raster is not None and raster.tags.get("INDEX_MADE_FROM") == source else None
     return None
@@ -422,7 +415,7 @@ def _write(
 ) -> IndexStatistics:
     """Write the raster tile by tile, and its picture. Raises OutputError, InputError for a band."""
     like = reader.file(bands[0].file, bands[0].band_index)
-    profile = tiled_profile(like.width, like.height, 1, "float32", **FLOAT_OPTIONS)
+    profile = geotiff.tiled_profile(like.width, like.height, 1, "float32", **geotiff.FLOAT_OPTIONS)
     if like.crs is not None and not like.transform.is_identity:
         profile |= {"crs": like.crs, "transform": like.transform}
     # Percentiles of larger rasters are calculated from every second, third … row and column.
@@ -432,8 +425,8 @@ def _write(
     unmasked = [replace(band, quality=None) for band in bands]
     is_cog = like.tags(ns="IMAGE_STRUCTURE").get("LAYOUT") == "COG"
     is_masked = list(bands) != unmasked
-    layers, tags = [LayerDescription(index.name)], _tags(index, like, unit, source, is_masked=is_masked)
-    with checked_raster(target, profile, layers, tags, to_cog if is_cog else None) as (dataset, write):
+    layers, tags = [geotiff.LayerDescription(index.name)], _tags(index, like, unit, source, is_masked=is_masked)
+    with geotiff.checked_raster(target, profile, layers, tags, geotiff.to_cog if is_cog else None) as (dataset, write):
         for tile in tiles(Tile(0, 0, like.width, like.height), WORK_TILE_PX):
             values = compute(index, [reader.values(band, tile) for band in bands])
             write(values, 1, tile.x0, tile.y0)
