@@ -20,7 +20,7 @@ from agalign.cameras.metadata import exposed_after_s
 from agalign.capture.align_bands import PairProgress, align_capture_bands
 from agalign.config import Settings, WriteSettings
 from agalign.errors import InputError, UnreadableFileError
-from agalign.flight.fingerprint import RENDER_STAGES, input_digests, input_samples, input_states
+from agalign.flight.fingerprint import input_digests, input_samples, input_states, joined_options
 from agalign.flight.model import FlightModel, load_model
 from agalign.host.files import written_below
 from agalign.host.process_pool import A, R
@@ -165,9 +165,7 @@ def estimate(
         "seconds": time.perf_counter() - began_s,
     }
     if earlier is not None:
-        options = {key: stage for key, stage in (result.options or {}).items() if key not in RENDER_STAGES}
-        options |= {key: stage for key, stage in (earlier.options or {}).items() if key in RENDER_STAGES}
-        facts |= {"products": earlier.products, "options": options}
+        facts |= {"products": earlier.products, "options": joined_options(result.options, earlier.options)}
     written = write_sidecar(paths.sidecar, result.model_copy(update=facts))
     if relief is None and is_removed(path, {}):
         with suppress(OSError):

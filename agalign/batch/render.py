@@ -18,7 +18,7 @@ from agalign.batch.products import PRODUCTS
 from agalign.capture.align_bands import tie_windows
 from agalign.config import Settings, WriteSettings
 from agalign.errors import AgalignError, UnreadableFileError
-from agalign.flight.fingerprint import RENDER_STAGES, render_fingerprint
+from agalign.flight.fingerprint import joined_options, render_fingerprint
 from agalign.flight.footprint import accuracy_of_footprint_m, footprint, with_assumed_height
 from agalign.pixels.raster import ReadTile, read_tile
 from agalign.rasters.aligned_files import BandFiles, Stack
@@ -36,7 +36,7 @@ from agalign.records.sidecar import (
     Sidecar,
     capture_status,
 )
-from agalign.records.sidecar_file import write_sidecar
+from agalign.records.sidecar_file import file_part, write_sidecar
 from agalign.spectral_indices.rasters import index_rasters
 from agalign.values.alignment import Alignment
 from agalign.values.capture import Capture
@@ -179,10 +179,10 @@ def rendered_sidecar(
             "footprint": None if ring is None else [(x, y) for x, y in ring[::-1].round(_FOOTPRINT_DECIMALS).tolist()],
             "footprint_accuracy_m": None if ring is None else accuracy_of_footprint_m(shown),
             "preview": next((f.preview for f in context.written if f.preview is not None), None),
-            "products": [*(_file(context, file.kind, file) for file in context.written), *gone],
+            "products": [*(file_part(f.kind, f.path, context.paths.folder, f.sha256) for f in context.written), *gone],
             "not_written": list(not_written),
             "rendered_with": render_fingerprint(capture, context.settings.write, context.settings.check),
-            "options": _options(context),
+            "options": joined_options(sidecar.options, context.settings.model_dump(mode="json", exclude_defaults=True)),
             "seconds": round(sum(band.seconds for band in sidecar.bands) + seconds, 3),
         }
     )
@@ -207,18 +207,6 @@ def _bands(context: ProductContext) -> list[BandResult]:
             facts["relief"] = band.relief.model_copy(update={"file": relief})
         result.append(band.model_copy(update=facts))
     return result
-
-
-def _options(context: ProductContext) -> dict[str, Any]:
-    """The settings that differ from the defaults: of the estimation, and of this rendering."""
-    now = context.settings.model_dump(mode="json", exclude_defaults=True)
-    estimated = {k: v for k, v in (context.sidecar.options or {}).items() if k not in RENDER_STAGES}
-    return estimated | {k: v for k, v in now.items() if k in RENDER_STAGES}
-
-
-def _file(context: ProductContext, kind: str, file: Any) -> FilePart:
-    name = context.paths.relative(file.path)
-    return FilePart(kind=kind, file=name, bytes=file.path.stat().st_size, sha256=file.sha256)
 
 
 def _output(context: ProductContext, saturated: Mapping[str, float]) -> OutputPart:

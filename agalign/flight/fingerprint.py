@@ -3,10 +3,11 @@
 import hashlib
 import json
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from io import BufferedReader
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -22,6 +23,12 @@ HashInput = str | int | float | bool | None | np.ndarray | Lens | Sequence["Hash
 
 RENDER_STAGES = "write", "check"
 """Stages of the settings that change no mapping: a result with other ones is rendered again."""
+
+
+def joined_options(estimated: Mapping[str, Any] | None, rendered: Mapping[str, Any] | None) -> dict[str, Any]:
+    """Return the options of an estimation, and of a rendering of its result, by stage."""
+    options = {key: stage for key, stage in (estimated or {}).items() if key not in RENDER_STAGES}
+    return options | {key: stage for key, stage in (rendered or {}).items() if key in RENDER_STAGES}
 
 
 def estimation_fingerprint(capture: Capture, settings: Settings) -> str:

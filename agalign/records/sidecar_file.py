@@ -35,10 +35,10 @@ def write_sidecar(path: Path, sidecar: Sidecar) -> Sidecar:
     return in_file
 
 
-def file_part(kind: str, path: Path, folder: Path) -> FilePart:
-    """Return the entry of a file below the folder of its sidecar. Raises OutputError."""
+def file_part(kind: str, path: Path, folder: Path, sha256: str = "") -> FilePart:
+    """Return the entry of a file below the folder of its sidecar, whose checksum may be known. Raises OutputError."""
     file = path.relative_to(folder).as_posix()
-    return FilePart(kind=kind, file=file, bytes=path.stat().st_size, sha256=file_checksum(path))
+    return FilePart(kind=kind, file=file, bytes=path.stat().st_size, sha256=sha256 or file_checksum(path))
 
 
 def add_products(path: Path, kind: str, files: Sequence[Path]) -> None:
