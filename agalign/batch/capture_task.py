@@ -116,17 +116,9 @@ def process_capture(task: Task, progress: PairProgress = quiet) -> CaptureReport
         model = None if task.model is None else loaded_model(task.model, settings.joint.device)
         sidecar, alignments = estimate(capture, out, settings, model, progress, earlier, read)
     progress(capture.reference.name, "writing", 0.0)
-    result = render(capture, out, settings, sidecar, alignments, task.rendering, read)
-    lost = (*result.failures, *lost_reflectance(capture, settings.write.radiometry))
-    return CaptureReport(
-        capture.label,
-        "done",
-        result.sidecar.without_tables(),
-        path,
-        failed_products=lost,
-        removed=result.removed,
-        seconds=time.perf_counter() - began_s,
-    )
+    report = render(capture, out, settings, sidecar, alignments, task.rendering, read)
+    failed = (*report.failed_products, *lost_reflectance(capture, settings.write.radiometry))
+    return replace(report, failed_products=failed, seconds=time.perf_counter() - began_s)
 
 
 def estimate(

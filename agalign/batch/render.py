@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from agalign.batch.capture_report import CaptureReport
 from agalign.batch.output_files import outdated_files, remove_files
 from agalign.batch.products import PRODUCTS
 from agalign.capture.align_bands import tie_windows
@@ -62,17 +63,6 @@ class RenderOptions:
     """Grid of the captures of the camera, if they share one."""
 
 
-@dataclass(frozen=True)
-class Rendering:
-    """The result of rendering a capture."""
-
-    sidecar: Sidecar
-    failures: tuple[str, ...]
-    """Products that could not be written, and why."""
-    removed: tuple[tuple[Path, str], ...]
-    """Files of an earlier command that were removed, and why."""
-
-
 def with_earlier_products(settings: WriteSettings, sidecar: Sidecar) -> WriteSettings:
     """Return the settings with the products that an earlier command has added; deleted ones are restored."""
     kinds = {part.kind for part in sidecar.products}
@@ -90,8 +80,8 @@ def render(
     alignments: Mapping[str, Alignment],
     options: RenderOptions,
     read: ReadTile = read_tile,
-) -> Rendering:
-    """Write the products of an estimated capture, and its sidecar with them.
+) -> CaptureReport:
+    """Write the products of an estimated capture, and its sidecar with them; return its report, without its time.
 
     `capture` has the radiometry and the saturation values with which it is written, `alignments` are those of the
     sidecar. `read` reads the pixels of the files. Raises OutputError, UnreadableFileError for an image of the
@@ -119,8 +109,9 @@ def render(
     reasons = tuple((path, context.lost.get(path, reason)) for path, reason in removed if reason)
     gone = [part for part in gone if paths.folder / part.file not in written]
     result = rendered_sidecar(context, list(failures), time.perf_counter() - began_s, gone)
-    # Products that need the same file fail with the same message.
-    return Rendering(write_sidecar(paths.sidecar, result), tuple(dict.fromkeys(failures.values())), reasons)
+    written_sidecar = write_sidecar(paths.sidecar, result).without_tables()
+    failed = tuple(dict.fromkeys(failures.values()))  # products that need the same file fail with the same message
+    return CaptureReport(capture.label, "done", written_sidecar, paths.sidecar, failed_products=failed, removed=reasons)
 
 
 def _gone_indices(sidecar: Sidecar, paths: CapturePaths) -> list[FilePart]:

@@ -5,7 +5,7 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from typing import Annotated, NamedTuple
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
@@ -76,15 +76,6 @@ class DisplacementField:
         return DisplacementField.sampled(lambda points: self(points).round(POSITION_DECIMALS), step_px, size_px)
 
 
-class HeldPositions(NamedTuple):
-    """The positions of all pixels of a reference in the moving image."""
-
-    size_px: Size
-    """(width, height) of the reference."""
-    positions: Points
-    """(height, width, 2) raw px, float32."""
-
-
 @dataclass(frozen=True)
 class PixelMapping:
     """raw reference px -> undistorted (-> moved by parallax) -> homography -> undistorted -> raw moving px."""
@@ -98,7 +89,7 @@ class PixelMapping:
     """Displacements of raw reference px, applied first."""
     parallax: Parallax | None = None
     """Displacements of undistorted reference px, by the parallax at the raw ones."""
-    held: "HeldPositions | None" = dataclasses.field(default=None, init=False, repr=False, compare=False)
+    held: Points | None = dataclasses.field(default=None, init=False, repr=False, compare=False)
     """Positions of all pixels, once they are computed (`hold_positions`); a changed mapping does not have them."""
 
     def __call__(self, reference_px: ArrayLike) -> Points:
@@ -180,8 +171,7 @@ class PixelMapping:
         Nothing is done for large images, which are resampled in tiles.
         """
         if size_px[0] * size_px[1] <= MAX_HELD_POSITIONS_PX and self.held is None:
-            held = HeldPositions(size_px, self.positions(Tile(0, 0, *size_px), np.float32))
-            object.__setattr__(self, "held", held)
+            object.__setattr__(self, "held", self.positions(Tile(0, 0, *size_px), np.float32))
 
     def is_smooth(self, tile: Tile) -> bool:
         """True without parallax, and if the horizon of the homography does not cross the tile."""
@@ -196,8 +186,8 @@ class PixelMapping:
         tile: with it, a pixel has the same position, to the last bit, in any tile.
         """
         width, height = size_px or (tile.x0 + tile.width, tile.y0 + tile.height)
-        if self.held is not None and self.held.size_px == (width, height) and dtype == np.float32:
-            return self.held.positions[tile.y0 : tile.y0 + tile.height, tile.x0 : tile.x0 + tile.width]
+        if self.held is not None and self.held.shape[1::-1] == (width, height) and dtype == np.float32:
+            return self.held[tile.y0 : tile.y0 + tile.height, tile.x0 : tile.x0 + tile.width]
         (left, columns), (top, rows) = _blocks(tile.x0, tile.width, width), _blocks(tile.y0, tile.height, height)
         result = np.empty((sum(map(len, rows)), sum(map(len, columns)), 2), dtype)
         for y_px in rows:
