@@ -167,7 +167,7 @@ def _solid_area(cells: NDArray[np.int64], is_lost: NDArray[np.bool_]) -> int:
     """
     max_chance = 0.01  # that scattered windows fill a square somewhere
     share = float(is_lost.mean()) if len(is_lost) else 0.0
-    sides = (3, 4, 5)
+    sides = (3, 4, 5, 6)  # the last for two thirds of lost windows, above which the coverage is too small
     side = next((k for k in sides if len(cells) * share ** (k * k) <= max_chance), None)
     if share == 0 or side is None:
         return 0

@@ -211,6 +211,18 @@ def test_an_area_without_common_peaks_shows_something_else_but_scattered_windows
         assert [issue.code for issue in content_issues(residual, 1.0)] == expected
 
 
+@pytest.mark.parametrize("share", [0.5, 0.625, 0.67, 0.7])
+def test_an_area_of_another_place_is_found_in_many_windows(share: float) -> None:
+    """384 windows: scattered lost ones are normal at each share, and a block of them at none."""
+    lost = np.zeros((16, 24), bool)
+    lost[:, : round(share * 24)] = True
+    scattered = np.random.default_rng(0).permutation(lost.ravel()).reshape(lost.shape)
+    for is_lost, codes in ((lost, ["other_content"]), (scattered, [])):
+        shifts = np.where(is_lost.reshape(-1, 1), np.nan, 0.0) * np.ones((1, 2))
+        residual = residual_of(112 * grid_px(np.arange(24), np.arange(16)) + 56, shifts)
+        assert [issue.code for issue in content_issues(residual, 1.0)] == codes
+
+
 def test_misaligned_clusters_are_an_issue_but_scattered_and_unmeasured_windows_are_not() -> None:
     scattered, corner, third, none = (np.zeros((9, 12), bool) for _ in range(4))
     scattered[::4, ::3] = True
