@@ -32,26 +32,20 @@ def by_descriptors(band: RefinedBand, use: ReliefUse) -> Iterator[Candidate]:
 
 
 def _with_field(plane: Candidate, warped: WarpedPair, joint: JointResult) -> Iterator[Candidate]:
-    """Yield the candidate with a displacement field, if it reduces the shifts of windows that it is not fitted to; else
-    the same without one.
-
-    These windows, which are smaller, verify it, or those of the homography if it passes in these.
+    """Yield the candidate with a displacement field, verified by windows that it is not fitted to; the same without one
+    if the field does not reduce their shifts, or if only the homography passes.
     """
     pair = plane.pair
     displacement = pair.reference.displacement_field.refine(channel_mean(pair.moving_image), plane.mapping)
     p95_px: dict[Geometry, float] = {"homography": displacement.before_p95_px, "field": displacement.after_p95_px}
+    without = replace(plane, held_out_p95_px=p95_px)
     if displacement.field is None:
-        yield replace(plane, held_out_p95_px=p95_px)
+        yield without
         return
     displaced = WarpedPair.of(pair, replace(plane.mapping, field=displacement.field), warped.windows)
     held_out = Candidate.of("field", displaced, joint, displacement.held_out)
-    in_all = replace(held_out, other_windows=displaced.residual, held_out_p95_px=p95_px)
-    if in_all.issues and not plane.issues:
-        # The homography is verified, and the field reduces the shifts of held-out windows.
-        by_homography = Candidate.of("field", displaced, joint, plane.windows)
-        yield replace(by_homography, other_windows=displaced.residual, held_out_p95_px=p95_px)
-    else:
-        yield in_all
+    with_field = replace(held_out, other_windows=displaced.residual, held_out_p95_px=p95_px)
+    yield without if with_field.issues and not plane.issues else with_field
 
 
 def _unchanged_if_aligned(joint: JointResult, pair: BandPair) -> JointResult:

@@ -90,6 +90,19 @@ def test_verification_is_repeated_with_a_displacement_field(pair: BandPair, monk
     assert aligned(pair, GOOD, "always").geometry == "field"
 
 
+def test_a_field_that_its_held_out_windows_reject_does_not_replace_a_verified_homography(
+    pair: BandPair, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The windows of the homography say nothing about it."""
+    windows = WarpedPair.of(pair, pair.mapping(TRUTH)).residual
+    rejected = windows.with_shifts(windows.shifts_px + 1.5)
+    result = DisplacementResult(DisplacementField(32.0, np.full((11, 14, 2), 0.2)), 1.0, 0.5, rejected)
+    monkeypatch.setattr(pair.reference.displacement_field, "refine", lambda *_: result)
+    results = aligned(pair, GOOD, "always")
+    assert (results.status, results.geometry) == ("aligned", "homography")
+    np.testing.assert_array_equal(results.fixed_to_moving, TRUTH)
+
+
 def displaced_pair(height_px: float, wavelength_px: float | None = None) -> BandPair:
     """A pair with a smooth bump in the centre or waves everywhere, which no homography represents."""
 
