@@ -195,8 +195,8 @@ def worker_context(preload: str = "") -> BaseContext:
     """Return the start method of worker processes: forked from a fork server, which is started and imports the module
     `preload`, or spawned. Call it within `environment_of_children`.
 
-    Processes are spawned if there is no module to import, on macOS, where a fork of a process with Apple's libraries
-    may crash or hang, and without a temporary folder, in which the fork server needs a socket.
+    Processes are spawned if there is no module to import, on macOS (Apple's libraries may crash or hang after a fork),
+    and without a temporary folder, in which the fork server needs a socket.
     """
     temporary_folder = ""
     with suppress(OSError):
