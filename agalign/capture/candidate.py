@@ -72,9 +72,9 @@ class Candidate:
             return self.inherited_issues
         pixel_px = self.pair.file_pixel_size_px
         found = issues_of(self.mapping, self.error, self.windows, self.joint, self.checked_px, pixel_px)
+        if not found and self.images is not None:  # costly
+            found = self.images.issues()
         issues = tuple(issue for issue in found if issue.kind not in self.ignored)
-        if not issues and self.images is not None:  # costly
-            issues = self.images.issues()
         if issues or self.other_windows is None:
             return issues
         error = replace(self.error, windows=self.other_windows)
