@@ -12,6 +12,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from datetime import timedelta
 from enum import Enum
+from functools import cache
 from pathlib import Path
 from typing import Literal
 
@@ -73,12 +74,12 @@ def refuse_to_overwrite(
     """
     names = _Names(captures, out)
     for capture in captures:
-        sidecar = CapturePaths.of(capture, out).sidecar
-        earlier, _ = earlier_result(sidecar, read)
+        sidecar, once = CapturePaths.of(capture, out).sidecar, cache(read)
+        earlier, _ = earlier_result(sidecar, once)
         listed = {} if earlier is None else _sizes(earlier.files, sidecar.parent)
         for path, is_written in _outputs(capture, out, settings):
             state, message = names.found(path, capture) or (
-                _sidecar(path, capture, out, read) if path == sidecar else _file(path, listed)
+                _sidecar(path, capture, out, once) if path == sidecar else _file(path, listed)
             )
             if (state.written if is_written else state.not_written) == "refuse":
                 raise ConfigurationError(message)
