@@ -333,8 +333,7 @@ class _FlightRun:
             plan.left[capture.label] = replace(one, earlier=None)
             if (grid := self._earlier_grid(one)) is not None:
                 plan.grids[capture.label] = grid
-            joints = [band.joint for band in one.earlier.bands if band.joint] if one.earlier else []
-            if any(joint.recipe == "flight" for joint in joints):
+            if one.earlier and any(band.joint and band.joint.recipe == "flight" for band in one.earlier.bands):
                 plan.modelled.add(capture.label)
         return plan
 

@@ -39,7 +39,6 @@ _UNVERIFIED_PIXELS = 0.5
 """Share of the values of a predicted band that count as wrong if its image shows too little: the values of blur and
 noise are wrong at edges, those of water and fog are not."""
 
-_ABOUT = "by about {:.0%}"
 _MAX_REFLECTANCE_ERROR = 1.0
 """Of a usable reflectance: a factor of 2 changes every index."""
 
@@ -60,7 +59,7 @@ class Caution:
     """
     size: float = -math.inf
     size_text: str = ""
-    """How large it is, or a template of it, for the largest `size` of many bands; empty without a size."""
+    """How large it is, in words; of many bands, that of the largest `size` is shown. Empty without a size."""
     status: str = "check"
     """That of the band; `check` for an accepted one, and for a missing one `missing`."""
     is_unusable: bool = False
@@ -99,14 +98,13 @@ class RunFacts:
             if band.status != "reference":
                 yield from _of_alignment(band, sidecar)
             if (band.saturated or 0.0) > _MAX_SATURATED_SHARE and band.saturated is not None:
-                reason = f"{band.saturated:.1%} of the pixels are saturated"
-                size_text = "up to {:.1%} of a band"
-                yield Caution(band.band, remedies.SATURATED, reason, band.saturated, band.saturated, size_text)
+                share, reason = band.saturated, f"{band.saturated:.1%} of the pixels are saturated"
+                yield Caution(band.band, remedies.SATURATED, reason, share, share, f"up to {share:.1%} of a band")
             if band.missing_rows and band.size_px is not None:
                 lost = band.missing_rows / band.size_px[1]
                 rows = f"the last {band.missing_rows} rows of {Path(band.file).name}"
                 reason = f"{rows} are empty, all of one value: copy it again"
-                yield Caution(band.band, remedies.INCOMPLETE_FILE, reason, lost, lost, "up to {:.0%} of a band")
+                yield Caution(band.band, remedies.INCOMPLETE_FILE, reason, lost, lost, f"up to {lost:.0%} of a band")
         for name in sidecar.missing_bands:
             remedy = remedies.UNREADABLE_BAND if name in sidecar.unreadable_bands else remedies.MISSING_BAND
             reason = sidecar.unreadable_bands.get(name, remedy.cause)
@@ -140,13 +138,13 @@ class RunFacts:
                 scale = scales[band.band]
                 error = max(scale, 1 / scale) - 1
                 reason = f"the irradiance on the panel is {scale:.2f} times that of the light sensor"
-                text = "reflectance is uncertain by up to {:.0%}"
+                text = f"reflectance is uncertain by up to {error:.0%}"
                 is_unusable = error > _MAX_REFLECTANCE_ERROR and is_by_sensor
                 yield Caution(band.band, remedy, reason, min(1.0, error), error, text, is_unusable=is_unusable)
             if is_old:
                 lost = min(1.0, _CHANGE_OF_LIGHT * age_s / _MAX_PANEL_AGE_S)
                 reason = f"the nearest panel is {age_s / 60:.0f} min away"
-                yield Caution(band.band, remedies.OLD_PANEL, reason, lost, age_s / 60, "up to {:.0f} min")
+                yield Caution(band.band, remedies.OLD_PANEL, reason, lost, age_s, f"up to {age_s / 60:.0f} min")
 
     def _sensor_scales(self, captured_at: str) -> dict[str, float]:
         """Irradiance on contradicting panels divided by that of the sensor, by band; the largest difference counts."""
@@ -167,12 +165,13 @@ def _of_factors(radiometry: BandRadiometryPart) -> Iterator[Caution]:
     """The cautions about factors of the calibration of a band that are missing or contradicted."""
     for error in radiometry.errors:
         share = error.std_percent / 100
+        lost, text = min(1.0, share), f"by about {share:.0%}"
         if error.state == "missing":
             reason = f"not corrected for the {error.name}, which its tags lack: off by about {share:.0%}"
-            yield Caution(radiometry.band, remedies.UNCORRECTED, reason, min(1.0, share), share, _ABOUT)
+            yield Caution(radiometry.band, remedies.UNCORRECTED, reason, lost, share, text)
         elif error.state == "contradicted" and error.name != PANEL_AND_SENSOR:
             reason = f"{error.name}: two values differ, so that the reflectance may be off by {share:.0%}"
-            yield Caution(radiometry.band, remedies.CONTRADICTED, reason, min(1.0, share), share, _ABOUT)
+            yield Caution(radiometry.band, remedies.CONTRADICTED, reason, lost, share, text)
 
 
 def _of_alignment(band: BandResult, sidecar: Sidecar) -> Iterator[Caution]:
@@ -181,7 +180,7 @@ def _of_alignment(band: BandResult, sidecar: Sidecar) -> Iterator[Caution]:
     over_1_px = max(0.0, (band.share_over_1_px or 0.0) - moved)
     if moved > _MIN_MOVED_SHARE:
         reason = f"{moved:.1%} of it shows something that moved or is near"
-        yield Caution(band.band, remedies.MOVED, reason, moved, moved, "up to {:.1%} of a band")
+        yield Caution(band.band, remedies.MOVED, reason, moved, moved, f"up to {moved:.1%} of a band")
     if band.status != "aligned":
         lost, size, size_text = 1.0, -math.inf, ""
         remedy = remedy_of(band, is_mosaic=sidecar.reference.georeferenced)
@@ -197,7 +196,7 @@ def _of_alignment(band: BandResult, sidecar: Sidecar) -> Iterator[Caution]:
         yield Caution(band.band, remedy, reason, lost, size, size_text, band.status)
     elif over_1_px > MIN_SHARE_OVER_1_PX:
         reason = f"{over_1_px:.0%} of the pixels may be off by more than {MAX_PIXEL_ERROR_PX:g} px of the reference"
-        yield Caution(band.band, remedies.INACCURATE, reason, over_1_px, over_1_px, "up to {:.0%} of a band")
+        yield Caution(band.band, remedies.INACCURATE, reason, over_1_px, over_1_px, f"up to {over_1_px:.0%} of a band")
     prediction = band.prediction
     if prediction is None or prediction.off_px is None:
         return
@@ -207,7 +206,7 @@ def _of_alignment(band: BandResult, sidecar: Sidecar) -> Iterator[Caution]:
             f"its own image is aligned {prediction.off_px:.1f} px of the band from the position that the rig predicts"
         )
         # Which of the two is right is unknown.
-        text, lost = "up to {:.1f} px of the band", 0.5 if band.status == "aligned" else 0.0
+        text, lost = f"up to {prediction.off_px:.1f} px of the band", 0.5 if band.status == "aligned" else 0.0
         yield Caution(band.band, remedies.CONTRADICTS_RIG, reason, lost, prediction.off_px, text, status)
 
 

@@ -34,25 +34,16 @@ _SHIFT_STEP_PX = 0.01
 class CautionGroup:
     """The bands of a run with the same status and the same cause for a check."""
 
+    status: str
+    remedy: Remedy
     bands: Sequence[Caution]
     effect: float
     """Share of the values of all bands of the run that are missing, displaced or wrong, by `Caution.lost`."""
 
     @property
-    def status(self) -> str:
-        """That of each band."""
-        return self.bands[0].status
-
-    @property
-    def remedy(self) -> Remedy:
-        """That of each band."""
-        return self.bands[0].remedy
-
-    @property
     def size(self) -> str:
         """How large it is, in words; empty if it has no size."""
-        largest = max(self.bands, key=attrgetter("size"))
-        return largest.size_text.format(largest.size)
+        return max(self.bands, key=attrgetter("size")).size_text
 
     @property
     def advice(self) -> str:
@@ -154,7 +145,7 @@ class PairTotals:
             lost = Caution("", NO_RESULT, NO_RESULT.cause, pairs_without_result, status="no_result", capture=label)
             by_cause[lost.status, lost.remedy].append(lost)
         values = max(1.0, pairs + pairs_without_result * len(without_result))
-        groups = [CautionGroup(bands, sum(b.lost for b in bands) / values) for bands in by_cause.values()]
+        groups = [CautionGroup(*cause, bands, sum(b.lost for b in bands) / values) for cause, bands in by_cause.items()]
         severity = "no_result", "failed", "seed_only", "missing", "other_reference", "predicted", "check"
         return sorted(groups, key=lambda g: (-g.effect, severity.index(g.status), -len(g.bands), g.remedy.cause))
 

@@ -91,7 +91,7 @@ class _CaptureCells:
                 share = math.expm1(jump)
                 way = "brighter" if share > 0 else "darker"
                 reason = f"{abs(share):.0%} {way} than in {other.label} over the same ground"
-                yield Caution(band, JUMP, reason, min(1.0, abs(share)), abs(share), "up to {:.0%}")
+                yield Caution(band, JUMP, reason, min(1.0, abs(share)), abs(share), f"up to {abs(share):.0%}")
 
 
 @dataclass
@@ -127,7 +127,7 @@ class LightOverCaptures:
                 share = math.expm1(mean)
                 reason = f"in {count} captures, the corners are {share:+.0%} from the middle (± {std:.0%})"
                 lost = min(1.0, abs(share)) * count
-                yield Caution(band, NOT_FLAT, reason, lost, abs(share), "up to {:.0%}", capture=self._last)
+                yield Caution(band, NOT_FLAT, reason, lost, abs(share), f"up to {abs(share):.0%}", capture=self._last)
 
 
 def same_ground(one: Cells, other: Cells, *, is_certain: bool) -> NDArray[np.float64] | None:
