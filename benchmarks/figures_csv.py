@@ -107,6 +107,14 @@ class TableRow:
     """By this version; by default, by that of this checkout."""
 
 
+def end_check(name: str, cases: str, failures: int, *, figures: bool) -> None:
+    """End a check of the reliability: write its row if asked to, and exit with code 1 if something failed."""
+    if figures:
+        write_figures([TableRow("reliability", name, cases, {"failures": failures})])
+    if failures:
+        raise SystemExit(f"{failures} failures: {name}")
+
+
 def write_figures(
     rows: Iterable[TableRow],
     placeholder: str = "",

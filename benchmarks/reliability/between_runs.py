@@ -25,7 +25,7 @@ from pathlib import Path
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from common import Ending, print_head, print_row, run, table
-from figures_csv import FiguresOption, TableRow, write_figures
+from figures_csv import FiguresOption, end_check
 
 from agalign.cli import main as cli
 from agalign.cli.terminal import ExitCode
@@ -284,11 +284,7 @@ def main(
     kinds = "tries", "laundered", "lost", "traceback"
     print(table([kinds, tuple(counts[kind] for kind in kinds)]))
     failures = sum(counts[kind] for kind in kinds[1:])
-    if figures:
-        name, tries = "one damaged file between two commands", f"{counts['tries']} tries"
-        write_figures([TableRow("reliability", name, tries, {"failures": failures})])
-    if failures:
-        raise SystemExit("something is wrong")
+    end_check("one damaged file between two commands", f"{counts['tries']} tries", failures, figures=figures)
 
 
 if __name__ == "__main__":

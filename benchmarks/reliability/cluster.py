@@ -15,7 +15,7 @@ import psutil
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from common import align, command, ended, flight_and_out, run
-from figures_csv import FiguresOption, TableRow, write_figures
+from figures_csv import FiguresOption, end_check
 from kills import differences, snapshot
 
 from agalign.records.sidecar_file import find_sidecars
@@ -67,11 +67,10 @@ def main(captures: int = 40, *, figures: FiguresOption = False) -> None:
             f"without a cluster: {alone_s:.0f} s). Files compared with that run: {result['missing']} missing, "
             f"{result['left over']} left over, {result['corrupt']} corrupt, {result['different']} different."
         )
-    if figures:
-        # A capture that is not done has missing files.
-        failures = result.total() + (ending.code != 0)
-        name = "Dask cluster that loses one of two workers"
-        write_figures([TableRow("reliability", name, f"{captures} captures", {"failures": failures})])
+    # A capture that is not done has missing files.
+    failures = result.total() + (ending.code != 0)
+    name = "Dask cluster that loses one of two workers"
+    end_check(name, f"{captures} captures", failures, figures=figures)
 
 
 if __name__ == "__main__":

@@ -29,7 +29,7 @@ import psutil
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from common import command, ended, run, table
-from figures_csv import FiguresOption, TableRow, write_figures
+from figures_csv import FiguresOption, end_check
 from synthetic_flights.aligned import make_aligned
 
 from agalign.host.files import RUN_FILE
@@ -172,11 +172,8 @@ def main(
                 rows.append((mode, target, n["strikes"], n["hit"], f"{whole.seconds:.0f}", n["faults"]))
     print(table(rows))
     sent, failures = (sum(row[column] for row in rows[1:]) for column in (2, -1))
-    if figures:
-        name = "signals at random moments of a run, then the same command again"
-        write_figures([TableRow("reliability", name, f"{sent} signals", {"failures": failures})])
-    if failures:
-        raise SystemExit("something is wrong")
+    name = "signals at random moments of a run, then the same command again"
+    end_check(name, f"{sent} signals", failures, figures=figures)
 
 
 if __name__ == "__main__":

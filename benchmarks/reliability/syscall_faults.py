@@ -22,7 +22,7 @@ from pathlib import Path
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from common import Ending, ended, run, table
-from figures_csv import FiguresOption, TableRow, write_figures
+from figures_csv import FiguresOption, end_check
 from kills import differences, snapshot, torn
 
 from agalign.host.files import SUMMARY_FILE
@@ -156,9 +156,8 @@ def main(faults: int = 200, rng_seed: int = 0, *, figures: FiguresOption = False
     head = "call", "runs", "error reported", "finished", "violations"
     print(table([head, *((call, *(row[kind] for kind in kinds)) for call, row in rows.items())]))
     print(f"\n{runs} runs over {CAPTURES} captures of {SIZE_PX[0]} x {SIZE_PX[1]}, one failed call each")
-    if figures:
-        name = "one failing system call on an output file, then the same command again"
-        write_figures([TableRow("reliability", name, f"{runs} runs", {"failures": violations})])
+    name = "one failing system call on an output file, then the same command again"
+    end_check(name, f"{runs} runs", violations, figures=figures)
 
 
 if __name__ == "__main__":

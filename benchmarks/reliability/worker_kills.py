@@ -22,7 +22,7 @@ import psutil
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from figures_csv import FiguresOption, TableRow, write_figures
+from figures_csv import FiguresOption, end_check
 
 from agalign.errors import WorkerError
 from agalign.host.process_pool import ProcessPool, WorkerDiedError
@@ -108,11 +108,7 @@ def main(kills: int = 1000, rng_seed: int = 0, *, figures: FiguresOption = False
     heads = (name.replace("runs ended", "ended") for name in counted)
     print(table([[*heads], [result[name] for name in counted]]))
     failures = sum(result[kind] for kind in KINDS)
-    if figures:
-        name = "SIGKILL to workers of a pool of eight"
-        write_figures([TableRow("reliability", name, f"{result['kills']} kills", {"failures": failures})])
-    if failures:
-        raise SystemExit("something was lost, hung, wrong or left over")
+    end_check("SIGKILL to workers of a pool of eight", f"{result['kills']} kills", failures, figures=figures)
 
 
 if __name__ == "__main__":

@@ -103,4 +103,4 @@ def test_each_command_of_the_table_is_a_script_with_the_option() -> None:
         options = {one.arg: ast.unparse(one.annotation) for one in main.args.kwonlyargs if one.annotation}
         assert options.get("figures") == "FiguresOption", script
         calls = [ast.unparse(node.func) for node in ast.walk(main) if isinstance(node, ast.Call)]
-        assert "write_figures" in calls, script
+        assert {"write_figures", "end_check"} & set(calls), script
