@@ -115,9 +115,9 @@ FEATURES = 5000
 """Maximum number of key points of an image, for all methods."""
 
 
-def sift(fixed: Image, moving: Image, features: int = FEATURES) -> Rated | None:
+def sift(fixed: Image, moving: Image) -> Rated | None:
     """SIFT without OpenCV's bias of a quarter of a pixel, ratio test 0.8, MAGSAC++."""
-    detector = cv2.SIFT.create(features, enable_precise_upscale=True)
+    detector = cv2.SIFT.create(FEATURES, enable_precise_upscale=True)
     (k1, d1), (k2, d2) = (detector.detectAndCompute(grey_8_bit(image), None) for image in (fixed, moving))
     if d1 is None or d2 is None or min(len(d1), len(d2)) < 4:
         return None
@@ -166,14 +166,14 @@ def ecc(fixed: Image, moving: Image, start: Matrix | None = None) -> Rated | Non
     for image in (fixed, moving):
         smooth = cv2.GaussianBlur(grey_8_bit(image).astype(np.float32), (0, 0), 1.0)
         edges.append(cv2.magnitude(cv2.Sobel(smooth, cv2.CV_32F, 1, 0), cv2.Sobel(smooth, cv2.CV_32F, 0, 1)))
-    return over_pyramid(edges, np.eye(3) if start is None else start, levels=3, iterations=100, epsilon=1e-6)
+    return over_pyramid(edges, np.eye(3) if start is None else start, iterations=100, epsilon=1e-6)
 
 
-def over_pyramid(edges: list[Any], start: Matrix, levels: int, iterations: int, epsilon: float) -> Rated | None:
+def over_pyramid(edges: list[Any], start: Matrix, iterations: int, epsilon: float) -> Rated | None:
     """The homography with the highest coefficient of two images, from coarse to fine; None if ECC fails."""
     matrix, coefficient = start, np.nan
     criteria = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, iterations, epsilon)
-    for halvings in range(levels, -1, -1):
+    for halvings in (3, 2, 1, 0):
         scale = PixelScale(0.5**halvings, 0.5**halvings)
         small = [cv2.resize(e, None, fx=scale.x, fy=scale.y, interpolation=cv2.INTER_AREA) for e in edges]
         at = geometry.rescale(matrix, scale, scale).astype(np.float32)
@@ -207,7 +207,7 @@ def micasense(fixed: Image, moving: Image, tags: SeedMatrices) -> Rated | None:
         along = [np.abs(cv2.Sobel(even, cv2.CV_32F, *order, ksize=5)) for order in ((1, 0), (0, 1))]
         edges.append(cv2.addWeighted(along[0], 0.5, along[1], 0.5, 0))
     start = tags.get("rig", tags["identity"])
-    return over_pyramid(edges, start, levels=3, iterations=20, epsilon=1e-9)
+    return over_pyramid(edges, start, iterations=20, epsilon=1e-9)
 
 
 # ---- elastix

@@ -18,9 +18,9 @@ from agalign.values.image import FloatImage, Raster
 Field = NDArray[np.complex64]
 
 
-def structure_field(raster: Raster, smoothing_px: float = 1.0) -> Field:
+def structure_field(raster: Raster) -> Field:
     """Return z of a raster of one channel, (height, width) complex64, |z| <= 1; 0 at and next to invalid pixels."""
-    complete = bool(raster.valid.all())
+    complete, smoothing_px = bool(raster.valid.all()), 1.0
     pixels = raster.pixels if complete else np.where(raster.valid, raster.pixels, np.float32(0))
     smooth = cv2.GaussianBlur(np.asarray(pixels, np.float32), (0, 0), smoothing_px)
     if not complete:
