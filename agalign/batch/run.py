@@ -71,6 +71,8 @@ class Listener:
     """Camera of the network that was learned, and the seconds that it took."""
     on_again: Callable[[str], object] = quiet
     """How many finished captures are estimated or rendered again, and why; called before any is replaced."""
+    on_lost: Callable[[str], object] = quiet
+    """Label of a capture whose files were removed after it was reported; called at the end of the run."""
 
 
 def run_flight(
@@ -132,6 +134,7 @@ def _run_selected(run: "_FlightRun", selection: Selection) -> Iterator[CaptureRe
                 if not earlier_results.outputs_exist(path, files):
                     gone.append(label)
                     record.retract(label, state, statuses)
+                    run.listener.on_lost(label)
         if gone:
             what = f"outputs of {counted(len(gone), 'capture')} were removed during the run, such as of {gone[0]}"
             raise OutputError(f"{out}: {what}; the same command writes them again")

@@ -6,7 +6,7 @@ The commands import this module when they run, because the libraries that it nee
 import re
 import time
 from collections import Counter, defaultdict
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from concurrent.futures import Executor
 from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
 from dataclasses import dataclass, field, replace
@@ -14,7 +14,6 @@ from pathlib import Path
 from statistics import median
 from typing import TYPE_CHECKING
 
-from agalign.batch.earlier_results import existing_files, outputs_exist
 from agalign.batch.workers import dask_executor
 from agalign.cameras.discover import FolderScan, discover
 from agalign.cli.terminal import MAX_LISTED, ExitCode, Terminal, explain
@@ -25,7 +24,7 @@ from agalign.host.files import REPORT_FILE
 from agalign.host.text import counted, escape_controls
 from agalign.records.cautions import RunFacts
 from agalign.records.run_record import read_run_record
-from agalign.records.sidecar import BandResult, FilePart
+from agalign.records.sidecar import BandResult
 from agalign.records.sidecar_file import read_without_tables
 from agalign.report.facts import PairTotals
 from agalign.report.pages import pages_exist, write_pages
@@ -109,8 +108,10 @@ class RunTotals:
     """Number of band pairs of each capture that is to be aligned."""
     states: Counter[str] = field(default_factory=Counter)
     """Number of captures by state."""
-    written: dict[str, tuple[str, Path, Sequence[FilePart]]] = field(default_factory=dict)
-    """State, sidecar and files of each capture with a result, by label."""
+    written: dict[str, tuple[str, Path]] = field(default_factory=dict)
+    """State and sidecar of each capture with a result, by label."""
+    lost: list[str] = field(default_factory=list)
+    """Labels of captures whose files were removed during the run."""
     pairs: PairTotals = field(default_factory=PairTotals)
     """The pairs of captures with a result."""
     has_report: bool = False
@@ -132,23 +133,21 @@ class RunTotals:
             return
         self.pairs.add(report.label, report.result)
         if report.path is not None:
-            self.written[report.label] = report.state, report.path, existing_files(report.path, report.result)
+            self.written[report.label] = report.state, report.path
         output = report.result.output
         if output is not None and output.radiometry is not None:
             self.panel_ages_s[output.radiometry].append(output.panel_age_s)
 
     def recount(self) -> None:
-        """Count only captures that still have their files, and the others as errors, as the record of the run does."""
-        self.pairs = PairTotals(self.pairs.run)
-        for label, (state, path, files) in list(self.written.items()):
-            with suppress(SidecarError):
-                if outputs_exist(path, files):
-                    self.pairs.add(label, read_without_tables(path))
-                    continue
-            del self.written[label]
+        """Count captures whose files were removed as errors, without their pairs, as the record of the run does."""
+        for label in (one for one in self.lost if one in self.written):
+            state, _ = self.written.pop(label)
             self.states.subtract([state])
             self.states["error"] += 1
-        self.states = +self.states  # without zeros
+        self.states, self.pairs = +self.states, PairTotals(self.pairs.run)  # without zeros
+        for label, (_, path) in self.written.items():
+            with suppress(SidecarError):  # the report names it
+                self.pairs.add(label, read_without_tables(path))
 
 
 def run(
@@ -176,7 +175,7 @@ def run(
             skipped = totals.states["kept"] + totals.states["panel"] + totals.states["sky"]
             show_line(totals.states.total() + share, text, skipped)
 
-        listener = _listener(terminal, show)
+        listener = replace(_listener(terminal, show), on_lost=totals.lost.append)
         try:
             for report in run_flight(flight, out, settings, options, listener, model):
                 terminal.check()
