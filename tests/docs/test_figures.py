@@ -113,17 +113,12 @@ def test_status_by_damage_is_that_of_the_benchmarks() -> None:
         predicted = [r for r in own if not r.claimed and r.std_px <= USABLE_PX]
         good = [r for r in own if r.claimed] + predicted
         counts = len(good) - len(predicted), len(predicted), len(own) - len(good)
-        return [" / ".join(map(str, counts)), f"{max(r.median_px for r in good):.2f}"] if own else ["-", "-"]
+        return [" / ".join(map(str, counts)), f"{max(r.median_px for r in good):.2f}"]
 
     rows = re.findall(r"^\| (.+) \|$", section, re.MULTILINE)[1:]
-    assert len(rows) == 5
+    assert len(rows) == 4
     for name, *cells in (row.split(" | ") for row in rows):
-        fact = f"difficult captures / {'not degraded' if name == 'none' else name} / "
-        aligned, predicted = (int(figures()[fact + status]["value"]) for status in ("aligned", "predicted"))
-        neither = int(figures()[fact + "aligned"]["n"].split()[0]) - aligned - predicted
-        pairs = of_pairs("as it is" if name == "none" else name)
-        assert cells[:3] == [*pairs, f"{aligned} / {predicted} / {neither}"]
-        assert is_quoted(cells[3], figures()[fact + "worst band"]["value"])
+        assert cells == of_pairs("as it is" if name == "none" else name)
     counts, worst = of_pairs("as it is", "agalign, capture, no tags")
     assert f"{counts}, worst {worst} px" in " ".join(section.split())
     lost = [f for f in figures() if ": one band each / " in f]
