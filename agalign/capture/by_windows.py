@@ -21,8 +21,8 @@ from agalign.values.issues import CORNERS_UNKNOWN, FEW_KEYPOINTS, INACCURATE, NO
 from agalign.verify.checks import MAX_ALIAS_PEAK
 from agalign.verify.coverage import points_in_frame, unobserved_quarters
 
-_MAX_STEP_PX = 16.0
-"""Maximum displacement of a corner; larger ones contradict the seed."""
+_MAX_MOVED_PX = 16.0
+"""Maximum distance of a corner from that of the seed; larger ones contradict it."""
 _RELIEF_SHARE = 0.15
 """Standard deviation of the relief of ground without common structure, as a share of its range: crops and trees at low
 altitude, plants and booms at a metre."""
@@ -36,13 +36,13 @@ def fitted_to_windows(band: BandCandidates) -> Candidate | None:
     descriptors_failed = pair.is_blurred or any(issue.kind in of_descriptors for issue in band.rejected)
     if not descriptors_failed or not band.does_start_fit:
         return None
-    max_step_px = min(_MAX_STEP_PX, pair.max_shift_px)
+    max_moved_px = min(_MAX_MOVED_PX, pair.max_shift_px)
     start = WarpedPair.of(pair, pair.mapping(band.start.fixed_to_moving))
     fitted = cross_fitted(
         start.mapping,
         lambda mapping: WarpedPair.of(pair, mapping, start.windows).residual,
         pair.fixed.size_px,
-        lambda fit: fit.max_px <= max_step_px,
+        max_moved_px,
     )
     if fitted is None:
         return None
@@ -76,7 +76,7 @@ def agreeing_with_seed(band: BandCandidates) -> Candidate | None:
     residual = windows.residuals(pair.warped_moving(mapping))
     error = mapping_error(pair, mapping, fit.covariance_px2, residual, relief_std_px=0.0)
     error = replace(error, field_std_px=0.0)  # its shapes are in the covariance
-    return Candidate("lens shapes", pair, mapping, error, residual, band.joint, inherited_issues=tuple(band.rejected))
+    return Candidate("lens shapes", pair, mapping, error, residual, band.joint, inherited_issues=band.rejected)
 
 
 def _is_consistent(fit: WindowFit) -> bool:

@@ -1,7 +1,7 @@
 """Candidates: the mappings that a band may get, each with its error and the windows that verify it."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Literal
@@ -15,7 +15,7 @@ from agalign.values.alignment import BY_WINDOWS, JointResult, Seed
 from agalign.values.choices import Geometry
 from agalign.values.geometry import Matrix, Points
 from agalign.values.image import Raster, Tile
-from agalign.values.issues import SEED_ASKED_FOR, UNREADABLE, Issue, IssueKind
+from agalign.values.issues import OTHER_GEOMETRY, SEED_ASKED_FOR, UNREADABLE, Issue, IssueKind
 from agalign.values.mapping import PixelMapping
 from agalign.values.mapping_error import ErrorOnGrid, MappingError
 from agalign.values.residual import Residual
@@ -253,13 +253,14 @@ class BandCandidates:
         return [candidate for candidate in self.candidates if not candidate.issues]
 
     @property
-    def rejected(self) -> Sequence[Issue]:
-        """Why the last estimate of the images was not accepted."""
+    def rejected(self) -> tuple[Issue, ...]:
+        """Why the last estimate of the images was not accepted; not empty for a band without an accepted one."""
         if isinstance(self.seed, Issue):
             return (self.seed,)
         if self.issue is not None:
             return (self.issue,)
-        return self.candidates[-1].issues if self.candidates else ()
+        # Without any candidate, the band was only under a relief that is not chosen: nothing verifies its seed.
+        return self.candidates[-1].issues if self.candidates else (Issue(OTHER_GEOMETRY),)
 
     @property
     def joint(self) -> JointResult | None:

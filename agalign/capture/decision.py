@@ -132,7 +132,7 @@ def _prediction(chosen: Candidate, compared: Prediction | None) -> Prediction:
 def _of_images(band: BandCandidates, relief: ReliefCandidates | None) -> _Choice:
     """Choose from what the images of the capture show; nothing if the pixels of the band cannot be read."""
     if band.is_unreadable:
-        return _Choice(band, None, tuple(band.rejected), is_seed_refused=True)
+        return _Choice(band, None, band.rejected, is_seed_refused=True)
     under = None if relief is None else relief.candidates.get(band.pair.name)
     if under is not None:
         return _Choice(band, under, (Issue(OTHER_GEOMETRY), *under.issues) if under.issues else ())
@@ -143,8 +143,7 @@ def _of_images(band: BandCandidates, relief: ReliefCandidates | None) -> _Choice
     if predicting:
         best = min(predicting, key=lambda candidate: candidate.std_px)
         return _Choice(band, best, best.issues)
-    # Without any candidate, the band was only under a relief that is not chosen: nothing verifies its seed.
-    return _Choice(band, None, tuple(band.rejected) or (Issue(OTHER_GEOMETRY),))
+    return _Choice(band, None, band.rejected)
 
 
 def _against_rig(choice: _Choice, of_rig: RigPrediction) -> _Choice:

@@ -17,7 +17,7 @@ from agalign.config import SeedSettings
 from agalign.pixels.masks import raster_of
 from agalign.values import geometry
 from agalign.values.alignment import Alignment, Seed
-from agalign.values.issues import FOLDS, RETRIEVAL, UNREADABLE, Issue
+from agalign.values.issues import FOLDS, OTHER_GEOMETRY, RETRIEVAL, UNREADABLE, Issue
 from agalign.values.lens_shapes import lens_shapes
 
 from ..builders import decided, fitted_to_windows, joint_result, pair_of, rms, two_views, whole
@@ -64,7 +64,7 @@ def test_windows_do_not_override_descriptors_or_other_failures(pair: BandPair, m
     aligned_already.candidates = [Candidate.of("descriptors", RefinedBand.of(pair, SEED, GOOD).warped, GOOD)]
     assert fitted_to_windows(aligned_already).joint.recipe == "fast"
     assert len(aligned_already.candidates) == 1
-    monkeypatch.setattr(module, "_MAX_STEP_PX", 0.5)  # less than the error of the seed
+    monkeypatch.setattr(module, "_MAX_MOVED_PX", 0.5)  # less than the error of the seed
     assert fitted_to_windows(lost(pair)).status == "seed_only"
 
 
@@ -255,6 +255,12 @@ def test_a_coarse_band_with_another_field_of_view_is_predicted_with_its_error(
     untrusted = replace(band.seed, trusted=False)
     for pair, seed in ((of_full_resolution, band.seed), (band.pair, untrusted)):
         assert fitted_to_windows(BandCandidates(pair, seed, band.issue)).prediction is None
+
+
+def test_a_coarse_band_without_any_candidate_is_not_verified_by_the_windows_of_its_fit(scene: np.ndarray) -> None:
+    band = coarse_band(scene[100:340, 100:420], thermal(scene, 0.2))
+    by_windows = module.agreeing_with_seed(BandCandidates(band.pair, band.seed))
+    assert by_windows.issues == (Issue(OTHER_GEOMETRY),)
 
 
 @pytest.mark.parametrize("kind", ["unrelated", "repetitive"])
