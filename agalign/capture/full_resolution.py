@@ -46,14 +46,9 @@ def at_full_resolution(reference: Band, band: BandCandidates, start: Candidate) 
     residual, mapping = start.windows.in_file_px(pair.scales), start.mapping.rescaled(*up)
     with open_raster(reference.path, reference.page) as source:
         chosen = [(tile, _windows(source, reference, tile)) for tile in _tiles(residual, reference.size_px)]
-    max_step_px = 40.0  # a larger displacement of a corner contradicts the alignment of the reduced images
+    max_moved_px = 40.0  # a larger displacement of a corner contradicts the alignment of the reduced images
     try:
-        fitted = cross_fitted(
-            mapping,
-            lambda at: _residual(pair.bands[0], at, chosen),
-            reference.size_px,
-            lambda fit: fit.max_px <= max_step_px,
-        )
+        fitted = cross_fitted(mapping, lambda at: _residual(pair.bands[0], at, chosen), reference.size_px, max_moved_px)
     except UnreadableFileError as unreadable:
         return Issue(UNREADABLE, detail=str(unreadable))
     if fitted is None or start.joint is None or fitted.held_out.median_px >= fitted.at_start.median_px:

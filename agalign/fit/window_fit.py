@@ -18,6 +18,7 @@ on the plane that contains most windows. The scale of z is free: the longest bas
 is known, positive parallax is nearer to the camera.
 """
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -166,14 +167,16 @@ def fit_in_rounds(
     rounds: int = 4,
     *,
     baseline: BaselinePrior | None = None,
+    max_moved_px: float = math.inf,
 ) -> tuple[PixelMapping, WindowFit] | None:
     """Correct a mapping repeatedly by the residual that `measure` returns for it; return it and the last correction.
 
     Peaks are sharper when windows overlap better, and a correction is accurate to first order.
-    Other arguments are those of `fit_windows`. None if a correction does not exist or is not accepted. Lens shapes are
-    always fitted to a mapping with the given displacement field, and replace it in the result.
+    Other arguments are those of `fit_windows`. None if a correction does not exist or is not accepted, or if all
+    together move a corner by more than `max_moved_px`, px of the moving image. Lens shapes are always fitted to a
+    mapping with the given displacement field, and replace it in the result.
     """
-    result: tuple[PixelMapping, WindowFit] | None = None
+    first, result = mapping.fixed_to_moving, None
     for _ in range(rounds):
         fit = fit_windows(mapping, measure(mapping), size_px, lens_std_px, baseline=baseline)
         if fit is None or not is_accepted(fit):
@@ -181,6 +184,8 @@ def fit_in_rounds(
         try:
             result = fit.applied_to(mapping), fit
         except GeometryError:
+            return None
+        if not geometry.corner_error_px(result[0].fixed_to_moving, first, *size_px) <= max_moved_px:
             return None
         converged_px, change_px = 0.02, fit.max_px  # noise of the windows
         if fit.baseline is not None and mapping.parallax is not None:
@@ -208,11 +213,12 @@ def cross_fitted(
     mapping: PixelMapping,
     measure: Callable[[PixelMapping], Residual],
     size_px: tuple[int, int],
-    is_accepted: Callable[[WindowFit], bool],
+    max_moved_px: float = math.inf,
 ) -> CrossFit | None:
     """Correct a homography by `fit_in_rounds`, and the last measurement again by half of its windows at a time.
 
-    None if all windows, or those of one colour, do not determine it.
+    None if all windows, or those of one colour, do not determine it, or if it moves a corner by more than
+    `max_moved_px`.
     """
     measured: list[tuple[PixelMapping, Residual]] = []
 
@@ -220,7 +226,7 @@ def cross_fitted(
         measured.append((at, measure(at)))
         return measured[-1][1]
 
-    fitted = fit_in_rounds(mapping, measured_at, size_px, is_accepted)
+    fitted = fit_in_rounds(mapping, measured_at, size_px, max_moved_px=max_moved_px)
     if fitted is None:
         return None
     last, residual = measured[-1]
