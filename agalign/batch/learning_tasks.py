@@ -24,7 +24,7 @@ from agalign.method.refine import FLIGHT_PATCHES
 from agalign.method.state import ImageGroup, JointState
 from agalign.pixels.capture_pixels import CapturePixels
 from agalign.pixels.raster import with_missing_parts, with_saturation_values
-from agalign.values.alignment import MIN_RETRIEVAL, JointResult, Seed
+from agalign.values.alignment import JointResult, Seed
 from agalign.values.capture import Capture
 from agalign.values.geometry import Matrix, PairScales
 from agalign.values.residual import Residual
@@ -97,7 +97,7 @@ class LearningCapture:
         """Refined mappings of the bands with distinguishable held-out patches, px of the files."""
         result, files_px = {}, {band.name: band.size_px for band in self.capture.bands}
         for band, pair in self.refined.items():
-            if pair.result.retrieval >= MIN_RETRIEVAL:
+            if pair.result.is_retrieved:
                 scales = PairScales.of((self.capture.reference.size_px, files_px[band]), pair.sizes_px)
                 result[band] = scales.between_files(pair.result.fixed_to_moving)
         return result
@@ -151,7 +151,7 @@ def load_capture(
             for places, group in groups:
                 for k, place in enumerate(places):
                     pair = known.get(result[place][0].name)
-                    if pair is not None and pair.result.retrieval >= MIN_RETRIEVAL:
+                    if pair is not None and pair.result.is_retrieved:
                         group.moving[k].fixed_to_moving = pair.result.fixed_to_moving
             return LoadedCapture(capture, groups, result)
     return None

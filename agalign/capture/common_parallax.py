@@ -9,7 +9,6 @@ from numpy.typing import NDArray
 from agalign.capture.candidate import RefinedBand
 from agalign.fit.displacement_field import MIN_WINDOWS
 from agalign.fit.window_fit import Adjustment, WindowShifts, adjust, are_of_lenses, are_on_a_line
-from agalign.values.alignment import MIN_RETRIEVAL
 from agalign.values.residual import Residual
 
 MIN_BANDS = 2
@@ -26,7 +25,7 @@ def parallax_groups(bands: Sequence[RefinedBand]) -> list[list[RefinedBand]]:
     groups: dict[tuple[int, str], list[RefinedBand]] = {}
     for band in bands:
         pair, residual = band.pair, band.warped.residual
-        is_reliable = band.joint.retrieval >= MIN_RETRIEVAL and len(residual.measured_px) >= MIN_WINDOWS
+        is_reliable = band.joint.is_retrieved and len(residual.measured_px) >= MIN_WINDOWS
         if is_reliable and not pair.is_coarse:
             groups.setdefault((id(pair.reference), pair.space), []).append(band)
     sharp = [[b for b in group if not b.pair.is_blurred] for group in groups.values()]

@@ -178,21 +178,18 @@ def _relative_to_overlap(cross: Field, fixed: Mask, moving: Mask) -> Field:
 
 
 class Shifts(NamedTuple):
-    """The measured shifts of windows, (n, 2), with the windows' column and row (n, 2), and the relative weights (n,) of
-    the shifts, by peak heights with median 1.
-    """
+    """The measured shifts of windows, (n, 2), with relative weights (n,) by heights of peaks; their median is 1."""
 
     centres_px: Points
     shifts_px: Points
     weights: NDArray[np.float64]
-    cells: NDArray[np.int64]
 
     @classmethod
     def of(cls, residual: Residual) -> "Shifts":
         """Select the measured shifts of a residual."""
         measured = residual.is_measured
         weights = peak_weights(residual.peaks_sigma[measured])
-        return cls(residual.centres_px[measured], residual.shifts_px[measured], weights, residual.cells[measured])
+        return cls(residual.centres_px[measured], residual.shifts_px[measured], weights)
 
     @classmethod
     def joined(cls, several: Sequence["Shifts"]) -> "Shifts":
@@ -200,7 +197,7 @@ class Shifts(NamedTuple):
 
     def subset(self, mask: NDArray[np.bool_]) -> "Shifts":
         """Return the shifts where a mask (n,) is True."""
-        return Shifts(self.centres_px[mask], self.shifts_px[mask], self.weights[mask], self.cells[mask])
+        return Shifts(self.centres_px[mask], self.shifts_px[mask], self.weights[mask])
 
     def distances_px(self, predicted_px: Points | float = 0.0) -> NDArray[np.float64]:
         """Return (n,) the lengths of the shifts, minus predicted ones (n, 2)."""
