@@ -199,7 +199,7 @@ def _read_in_processes(paths: Sequence[Path], options: DiscoverOptions) -> Itera
         for task, future in zip(tasks, futures, strict=True):
             try:
                 yield from future.result()
-            except TimeoutError:  # one at a time, to find the file
+            except (TimeoutError, WorkerDiedError):  # one at a time, to find the file
                 for path, one in [(path, submit([path], options)) for path in task]:
                     try:
                         yield from one.result()
@@ -207,9 +207,6 @@ def _read_in_processes(paths: Sequence[Path], options: DiscoverOptions) -> Itera
                         yield _unread(path, f"reading it took over {options.timeout_s:g} s (--timeout)")
                     except WorkerDiedError:
                         yield _unread(path, "reading it killed the process")
-            except WorkerDiedError:
-                what = "reading it, or a file read together with it, killed the process"
-                yield from (_unread(path, what) for path in task)
 
 
 def _unread(path: Path, what: str) -> Problem:

@@ -359,26 +359,30 @@ def test_several_processes_find_what_one_finds(tmp_path: Path, monkeypatch: pyte
 
 
 @pytest.mark.full
-def test_a_file_that_takes_too_long_is_left_out(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize(
+    ("action", "what"),
+    [("time.sleep(60)", "reading it took over 2 s (--timeout)"), ("os._exit(9)", "reading it killed the process")],
+)
+def test_only_the_file_that_takes_too_long_or_kills_its_reader_is_left_out(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, action: str, what: str
+) -> None:
     folder, modules = tmp_path / "flight", tmp_path / "modules"
     write_all(folder, *(f"f{number}_{band}" for number in range(2) for band in ("green", "red", "nir")))
     modules.mkdir()
     # A process imports it at its start.
     (modules / "sitecustomize.py").write_text(
-        "import io, time\n"
+        "import io, os, time\n"
         "now = io.open\n"
         "def late(path, *given, **named):\n"
-        "    time.sleep(60 if str(path).endswith('f1_nir.tif') else 0)\n"
+        f"    str(path).endswith('f1_nir.tif') and {action}\n"
         "    return now(path, *given, **named)\n"
         "io.open = late\n"
     )
     monkeypatch.syspath_prepend(str(modules))
     found = discover(folder, DiscoverOptions(timeout_s=2))
-    assert [p.text for p in found.problems] == [
-        f"{folder / 'f1_nir.tif'}: reading it took over 2 s (--timeout); take it out of the folder"
-    ]
+    assert [p.text for p in found.problems] == [f"{folder / 'f1_nir.tif'}: {what}; take it out of the folder"]
     assert [c.missing_bands for c in found.captures] == [(), ("nir",)]
-    assert found.captures[1].unreadable_bands["nir"].what.startswith("f1_nir.tif: reading it took over 2 s")
+    assert found.captures[1].unreadable_bands["nir"].what.startswith(f"f1_nir.tif: {what}")
 
 
 @pytest.mark.parametrize(
