@@ -12,7 +12,7 @@ from operator import not_
 from pathlib import Path
 from typing import Annotated, Any
 
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
+from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field
 from pydantic import dataclasses as validated
 from pydantic.fields import FieldInfo
 
@@ -310,7 +310,9 @@ class WriteSettings(SettingsModel):
     qa: bool = False
     """Write quality flags (saturated, occluded, predicted …): <capture>.qa.tif."""
     indices: Annotated[
-        tuple[str, ...], Option("index", type=str | None, parse=lambda text: names_in((text or "").lower()))
+        tuple[str, ...],
+        Option("index", type=str | None, parse=names_in),
+        AfterValidator(lambda names: tuple(name.strip().lower() for name in names)),
     ] = ()
     """Spectral indices, separated by commas: ndvi, ndre …; 'agalign indices' computes others later."""
     pan_sharpen: bool = False

@@ -179,3 +179,7 @@ def test_a_copy_of_a_result_equals_it(aligned_flight: Path, flight: Path) -> Non
     assert agalign.Seed("user", np.eye(3), 0.0) != agalign.Seed("user", np.eye(4), 0.0)
     other = agalign.read_alignment(path.with_name("IMG_0002.json"), "NIR")
     assert other != agalign.read_alignment(path, "NIR")
+
+
+def test_names_of_indices_are_in_lower_case_as_those_of_their_files() -> None:
+    assert agalign.WriteSettings(indices=(" NDVI", "ndre")).indices == ("ndvi", "ndre")

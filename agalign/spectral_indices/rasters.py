@@ -158,8 +158,7 @@ class IndexRasters(Product):
 
     def paths(self, capture: Capture, paths: CapturePaths, settings: WriteSettings) -> list[Path]:  # noqa: ARG002
         """Return <capture>_<index>.tif and .png."""
-        names = [name.strip().lower() for name in settings.indices]
-        return [paths.file(f"_{name}{suffix}") for name in names for suffix in (".tif", ".png")]
+        return [paths.file(f"_{name}{suffix}") for name in settings.indices for suffix in (".tif", ".png")]
 
     def is_enabled(self, settings: WriteSettings) -> bool:  # noqa: ARG002
         """Return True: rasters that an earlier command wrote are written again."""
