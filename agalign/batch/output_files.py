@@ -21,10 +21,11 @@ from agalign.config import WriteSettings
 from agalign.errors import ConfigurationError, OutputError, Reason, SidecarError
 from agalign.flight.fingerprint import input_samples
 from agalign.host.files import PAGES, RUN_FILE, check_inside, max_name_bytes, remove_companions
-from agalign.host.own_files import foreign, is_own_file
+from agalign.host.own_files import foreign, is_own_file, refuse_foreign
 from agalign.rasters.aligned_files import band_file_names, is_aligned_raster
 from agalign.rasters.parallax_file import PARALLAX_SUFFIX
 from agalign.rasters.product import CapturePaths
+from agalign.records.excluded import EXCLUDED_FILES
 from agalign.records.run_record import file_states
 from agalign.records.sidecar import FilePart, Sidecar
 from agalign.records.sidecar_file import OtherSchemaError, find_sidecars, is_sidecar, read_with_change
@@ -198,9 +199,11 @@ def refuse_results_elsewhere(captures: Sequence[Capture], out: Path, read: ReadS
 
 
 def refuse_foreign_pages(out: Path) -> None:
-    """Raise ConfigurationError if a folder without record and results of a run has files with the names of its
-    pages.
+    """Raise ConfigurationError for a file with the name of that of panels or sky that no run wrote, and if a folder
+    without record and results of a run has files with the names of its pages.
     """
+    for name, start in EXCLUDED_FILES.items():
+        refuse_foreign(out / name, (start,))
     if (out / RUN_FILE).exists() or find_sidecars(out):
         return
     for path in (out / name for name in PAGES):

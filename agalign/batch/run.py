@@ -30,6 +30,7 @@ from agalign.flight.rig_file import read_rig
 from agalign.flight.sky import SkyCapture
 from agalign.host.files import MODELS_FOLDER, check_inside, path_problem, written_below
 from agalign.host.output_folder import is_full, locked
+from agalign.host.own_files import refuse_foreign
 from agalign.host.processes import usable_cores
 from agalign.host.text import counted, name_problem
 from agalign.method.device import choose_device, limit_threads
@@ -40,7 +41,7 @@ from agalign.records.listed_files import states_of
 from agalign.records.run_record import RunPart, begun, excluded_part, input_name, last_record
 from agalign.records.sidecar import FilePart
 from agalign.report.pages import outdate_pages
-from agalign.report.panels_and_sky import write_panels, write_sky
+from agalign.report.panels_and_sky import panel_picture, write_panels, write_sky
 from agalign.spectral_indices.rasters import check_indices
 from agalign.values.capture import Capture
 from agalign.values.image import OutputGrid
@@ -100,7 +101,10 @@ def run_flight(
         run = run.starting_from(model)
     with locked(out):
         # What can be refused is refused before the record and the pages of an earlier run are touched.
-        yield from _run_selected(run, select_captures(run.flight, run.settings.write, run.options))
+        selection = select_captures(run.flight, run.settings.write, run.options)
+        for reading in selection.panels:
+            refuse_foreign(panel_picture(reading.capture, out))
+        yield from _run_selected(run, selection)
 
 
 def _run_selected(run: "_FlightRun", selection: Selection) -> Iterator[CaptureReport]:

@@ -52,7 +52,7 @@ def foreign(path: Path, folder: str = "output folder") -> str:
     return f"{path}: was not written by agalign; choose another {folder} with -o"
 
 
-def refuse_foreign(path: Path, text_starts: tuple[bytes, ...], folder: str = "output folder") -> None:
+def refuse_foreign(path: Path, text_starts: tuple[bytes, ...] = (), folder: str = "output folder") -> None:
     """Raise ConfigurationError for a file that is not one as `is_own_file`."""
     if path.is_file() and not is_own_file(path, text_starts):
         raise ConfigurationError(foreign(path, folder))

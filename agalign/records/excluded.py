@@ -149,6 +149,10 @@ class SkyFile(_Part):
     captures: list[SkyPart]
 
 
+EXCLUDED_FILES = {PANELS_FILE: b'{\n "schema": "agalign-panels/', SKY_FILE: b'{\n "schema": "agalign-sky/'}
+"""How each of the two files starts, by name."""
+
+
 def read_excluded(out: Path) -> tuple[list[PanelPart], list[SkyPart]]:
     """Return the captures of panels and those of the sky of an earlier run.
 

@@ -19,6 +19,11 @@ from agalign.values.capture import Band, Capture, source_file
 from agalign.values.pixel_units import PixelScale
 
 
+def panel_picture(capture: Capture, out: Path) -> Path:
+    """Return the path of the picture of a panel. Raises OutputError for a link that leads out of the folder."""
+    return check_inside(out / capture.folder, out) / f"{capture.name}.panel.png"
+
+
 def write_panels(readings: Sequence[PanelReading], out: Path) -> list[PanelPart]:
     """Write OUT/panels.json and <capture>.panel.png, and return the captures; without any, remove an earlier file.
 
@@ -26,7 +31,7 @@ def write_panels(readings: Sequence[PanelReading], out: Path) -> list[PanelPart]
     """
     parts = []
     for reading in readings:
-        picture = check_inside(out / reading.capture.folder, out) / f"{reading.capture.name}.panel.png"
+        picture = panel_picture(reading.capture, out)
         write_png(side_by_side([_tile(b) for b in reading.bands], gap_px=6), picture)
         panel, scales = reading.panel, reading.sensor_scales
         bands = [_panel_band(b, reading.capture) | {"sensor_scale": scales.get(b.band.name)} for b in reading.bands]

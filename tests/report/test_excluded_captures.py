@@ -18,11 +18,12 @@ from pydantic import ValidationError
 
 import agalign
 from agalign.config import RunOptions, WriteSettings
-from agalign.errors import SidecarError
+from agalign.errors import ConfigurationError, SidecarError
 from agalign.flight.panel_readings import PanelReading, missing_panel, read_panel, with_panels
 from agalign.host.files import PANELS_FILE, SKY_FILE
+from agalign.host.own_files import is_own_file
 from agalign.records import cautions as run_cautions
-from agalign.records.excluded import read_excluded
+from agalign.records.excluded import EXCLUDED_FILES, read_excluded
 from agalign.report.pages import write_pages
 
 from ..conftest import SUN, Shared, read_json, seeded
@@ -56,12 +57,24 @@ def test_reflectance_by_panel_is_the_truth(by_panel: Path, by_sun: Path) -> None
         assert set(stack.units) == {"1"}
 
 
+@pytest.mark.parametrize("name", [PANELS_FILE, SKY_FILE, "0000SET/000/IMG_0001.panel.png"])
+def test_files_of_the_user_are_neither_replaced_nor_removed(between_panels: Path, tmp_path: Path, name: str) -> None:
+    of_user = tmp_path / name
+    of_user.parent.mkdir(parents=True, exist_ok=True)
+    of_user.write_text('{"mine": 1}')
+    with pytest.raises(ConfigurationError, match=f"{name}: was not written by agalign"):
+        agalign.align_folder(between_panels, tmp_path, settings=seeded(radiometry="panel"))
+    assert of_user.read_text() == '{"mine": 1}'
+    assert not (tmp_path / "agalign-run.json").exists()
+
+
 @pytest.mark.slow
 def test_panels_are_named_and_drawn_and_kept_out(by_panel: Path) -> None:
     folder = by_panel / "0000SET" / "000"
     assert not (folder / "IMG_0001.tif").exists()
     with Image.open(folder / "IMG_0001.panel.png") as picture:
         assert (np.asarray(picture) == (255, 64, 32)).all(axis=-1).sum() > 5 * 50
+    assert is_own_file(by_panel / PANELS_FILE, (EXCLUDED_FILES[PANELS_FILE],))
     (first, last), _ = read_excluded(by_panel)
     assert (first.capture, last.capture) == ("IMG_0001", "IMG_0004")
     assert [b.albedo for p in (first, last) for b in p.bands] == pytest.approx([0.51] * 10)
