@@ -219,7 +219,7 @@ def test_a_capture_that_is_ok_by_prediction_is_not_shown_as_ok(out: Path) -> Non
 def test_indices_that_were_not_written_are_named_with_the_reason(out: Path) -> None:
     sidecar = out / "0000SET" / "000" / "IMG_0002.json"
     contents = read_json(sidecar)
-    options = {"options": {"write": {"indices": ["NDVI "]}}}
+    options = {"options": {"write": {"indices": ["ndvi"]}}}
     failed = {"status": "failed", "reason": "the file is black", "issues": [], "place": None}
     change(sidecar, bands=with_band(contents["bands"], "Red", **failed), status="degraded", **options)
     table = (out / "indices.csv").is_file()
