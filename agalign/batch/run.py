@@ -37,6 +37,7 @@ from agalign.method.device import choose_device, limit_threads
 from agalign.rasters.output_grid import FlightLimits, common_grid, flight_limits
 from agalign.rasters.preview import preview_bytes
 from agalign.rasters.product import CapturePaths
+from agalign.records.excluded import others_excluded
 from agalign.records.listed_files import states_of
 from agalign.records.run_record import RunPart, begun, excluded_part, input_name, last_record
 from agalign.records.sidecar import FilePart
@@ -290,11 +291,14 @@ class _FlightRun:
     def _excluded(
         self, sky: Sequence[SkyCapture], panels: Sequence[PanelReading], record: RunPart
     ) -> Iterator[tuple[CaptureReport, Capture]]:
-        """Write the records of the sky and of the panels; yield the captures that are not aligned, with reports."""
-        for excluded, facts in zip(sky, write_sky(sky, self.out), strict=True):
+        """Write the records of the sky and of the panels, and keep those of other inputs; yield the captures that are
+        not aligned, with reports.
+        """
+        earlier_panels, earlier_sky = others_excluded(self.out, record.other_inputs)
+        for excluded, facts in zip(sky, write_sky(sky, self.out, earlier_sky), strict=True):
             record.excluded.append(excluded_part(excluded.capture, "sky", facts.cues))
             yield CaptureReport(excluded.capture.label, "sky", sky=facts.sentence), excluded.capture
-        for reading, part in zip(panels, write_panels(panels, self.out), strict=True):
+        for reading, part in zip(panels, write_panels(panels, self.out, earlier_panels), strict=True):
             if reading.capture.is_of_a_panel:
                 record.excluded.append(excluded_part(reading.capture, "panel", part.cues))
                 yield CaptureReport(reading.capture.label, "panel", panel=part.sentence), reading.capture

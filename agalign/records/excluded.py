@@ -1,10 +1,12 @@
 """Captures of calibration panels and of the sky: OUT/panels.json and OUT/sky.json."""
 
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
+from agalign.errors import SidecarError
 from agalign.host.files import PANELS_FILE, SKY_FILE, read_model
 from agalign.values.capture import PanelSource
 from agalign.values.fields import Message, Name, SourceFile
@@ -49,6 +51,11 @@ class _CapturePart(_Part):
     folder: str
     capture: str
     captured_at: Name
+
+    @property
+    def label(self) -> str:
+        """Folder and name of the capture, relative to the input."""
+        return Path(self.folder, self.capture).as_posix()
 
     @property
     def is_left_out(self) -> bool:
@@ -160,3 +167,15 @@ def read_excluded(out: Path) -> tuple[list[PanelPart], list[SkyPart]]:
     """
     panels, sky = read_model(out / PANELS_FILE, PanelsFile), read_model(out / SKY_FILE, SkyFile)
     return ([] if panels is None else panels.panels), ([] if sky is None else sky.captures)
+
+
+def others_excluded(out: Path, other_inputs: Mapping[str, Sequence[str]]) -> tuple[list[PanelPart], list[SkyPart]]:
+    """Return the captures of panels and of the sky that earlier runs found in other input folders, given the labels of
+    the captures there; none if the files cannot be read.
+    """
+    labels = {label for several in other_inputs.values() for label in several}
+    try:
+        panels, sky = read_excluded(out)
+    except SidecarError:
+        return [], []
+    return [one for one in panels if one.label in labels], [one for one in sky if one.label in labels]

@@ -326,7 +326,7 @@ def unfinished_run(
         return None
     excluded = {part.capture for part in record.excluded}
     # A killed run has written these files, and not the end of its record.
-    excluded |= {Path(part.folder, part.capture).as_posix() for part in not_aligned if part.is_left_out}
+    excluded |= {part.label for part in not_aligned if part.is_left_out}
     wanted = [label for label in record.labels if label not in excluded]
     with_problem = {part.of for part in record.problems}
     missing = [label for label in wanted if label not in labels]

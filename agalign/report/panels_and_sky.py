@@ -24,10 +24,10 @@ def panel_picture(capture: Capture, out: Path) -> Path:
     return check_inside(out / capture.folder, out) / f"{capture.name}.panel.png"
 
 
-def write_panels(readings: Sequence[PanelReading], out: Path) -> list[PanelPart]:
+def write_panels(readings: Sequence[PanelReading], out: Path, others: Sequence[PanelPart] = ()) -> list[PanelPart]:
     """Write OUT/panels.json and <capture>.panel.png, and return the captures; without any, remove an earlier file.
 
-    Raises OutputError.
+    The file also has `others`, those of other input folders. Raises OutputError.
     """
     parts = []
     for reading in readings:
@@ -41,19 +41,22 @@ def write_panels(readings: Sequence[PanelReading], out: Path) -> list[PanelPart]
         facts |= {"brighter": reading.brighter, "light_ratio": reading.light_ratio, "is_used": reading.is_used}
         facts |= _identity(reading.capture) | {"picture": picture.relative_to(out).as_posix()}
         parts.append(PanelPart.model_validate(facts))
-    write_model(out / PANELS_FILE, PanelsFile(panels=parts) if parts else None)
+    write_model(out / PANELS_FILE, PanelsFile(panels=[*others, *parts]) if others or parts else None)
     return parts
 
 
-def write_sky(sky: Sequence[SkyCapture], out: Path) -> list[SkyPart]:
-    """Write OUT/sky.json and return its captures; without any, remove that of an earlier run. Raises OutputError."""
+def write_sky(sky: Sequence[SkyCapture], out: Path, others: Sequence[SkyPart] = ()) -> list[SkyPart]:
+    """Write OUT/sky.json and return the captures; without any, remove that of an earlier run.
+
+    The file also has `others`, those of other input folders. Raises OutputError.
+    """
     parts = []
     for one in sky:
         bands = [
             {"band": b.name, "file": source_file(one.capture, b), "radiance": _radiance(b)} for b in one.capture.bands
         ]
         parts.append(SkyPart.model_validate(_identity(one.capture) | {"cues": one.cues, "bands": bands}))
-    write_model(out / SKY_FILE, SkyFile(captures=parts) if parts else None)
+    write_model(out / SKY_FILE, SkyFile(captures=[*others, *parts]) if others or parts else None)
     return parts
 
 

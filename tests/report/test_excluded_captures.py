@@ -68,6 +68,19 @@ def test_files_of_the_user_are_neither_replaced_nor_removed(between_panels: Path
     assert not (tmp_path / "agalign-run.json").exists()
 
 
+def test_a_run_on_another_folder_keeps_the_panels_of_the_first(between_panels: Path, tmp_path: Path) -> None:
+    out, days = tmp_path / "out", {"day 1": (1, 2), "day 2": (3,), "day 1 again": (2,)}
+    for day, numbers in days.items():
+        folder = tmp_path / day.removesuffix(" again")
+        shutil.rmtree(folder, ignore_errors=True)
+        folder.mkdir()
+        for path in (p for n in numbers for p in between_panels.rglob(f"IMG_000{n}_*.tif")):
+            shutil.copyfile(path, folder / path.name)
+        agalign.align_folder(folder, out, settings=seeded("rig"))
+        panels, _ = read_excluded(out)
+        assert [panel.label for panel in panels] == ([] if day == "day 1 again" else ["IMG_0001"])
+
+
 @pytest.mark.slow
 def test_panels_are_named_and_drawn_and_kept_out(by_panel: Path) -> None:
     folder = by_panel / "0000SET" / "000"
