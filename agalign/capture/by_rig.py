@@ -30,8 +30,8 @@ because an estimate must not depend on a setting that later commands may change.
 class RigPrediction:
     """The prediction of a band by the rig of the flight.
 
-    A rig is between px of the files, and the bands of a capture are aligned between px of the images: `observation` and
-    this class are the only places that convert between them.
+    A rig is between px of the files, and the bands of a capture are aligned between px of the images: this module
+    converts between them.
     """
 
     pair: BandPair

@@ -26,7 +26,7 @@ class WarpedPair:
     pair: BandPair
     mapping: PixelMapping
     warped: Raster
-    """The moving image, one channel, on the grid of the reference."""
+    """The moving image, one channel, on the grid of the reference; of a nearly equal mapping after `with_mapping`."""
     windows: FixedWindows
     residual: Residual
     """Of these windows, under the mapping or, if it is cross-validated, under the estimates without each of them."""
