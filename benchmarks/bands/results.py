@@ -42,7 +42,7 @@ def read_results(path: Path) -> list[Result]:
     """Return the results of earlier runs, an empty list without a file."""
     if not path.is_file():
         return []
-    kinds = {f.name: {"True": True, "False": False}.__getitem__ if f.type is bool else f.type for f in fields(Result)}
+    kinds = {f.name: {"1": True, "0": False}.__getitem__ if f.type is bool else f.type for f in fields(Result)}
     with path.open(encoding="utf-8", newline="") as file:
         rows = list(csv.DictReader(file))
     return [Result(**{k: kinds[k](v or ("nan" if kinds[k] is float else "")) for k, v in row.items()}) for row in rows]

@@ -322,11 +322,20 @@ def _median(values: Iterable[float]) -> float:
 
 
 def write_csv(scores: Sequence[Score] | Sequence[Scored], path: Path) -> None:
-    """Write scores as CSV; unknown values are empty."""
+    """Write scores as CSV, in few bytes: unknown values are empty, and True is 1."""
     with path.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file, lineterminator="\n")
         writer.writerow([f.name for f in fields(scores[0])] if scores else [])
-        writer.writerows([_cell(v, 4) for v in astuple(s)] for s in scores)
+        writer.writerows([_stored(v) for v in astuple(s)] for s in scores)
+
+
+def _stored(value: object) -> object:
+    """A value in a cell of a file: a number with at most four decimals and five digits."""
+    if isinstance(value, bool):
+        return int(value)
+    if isinstance(value, float):
+        return "" if np.isnan(value) else f"{round(value, 4):.5g}"
+    return value
 
 
 def table(rows: Sequence[Sequence[object]]) -> str:
