@@ -195,8 +195,8 @@ def worker_context(preload: str = "") -> BaseContext:
     """Return the start method of worker processes: forked from a fork server, which is started and imports the module
     `preload`, or spawned. Call it within `environment_of_children`.
 
-    Processes are spawned if there is no module to import, on macOS (Apple's libraries may crash or hang after a fork),
-    and without a temporary folder, in which the fork server needs a socket.
+    Without a module to import, the processes are spawned. They are also spawned on macOS, as Apple's libraries may
+    crash or hang after a fork, and without a temporary folder, where the fork server puts its socket.
     """
     temporary_folder = ""
     with suppress(OSError):
