@@ -173,10 +173,10 @@ def fit_in_rounds(
 
     Peaks are sharper when windows overlap better, and a correction is accurate to first order.
     Other arguments are those of `fit_windows`. None if a correction does not exist or is not accepted, or if all
-    together move a corner by more than `max_moved_px`, px of the moving image. Lens shapes are always fitted to a
+    together move a corner by more than `max_moved_px`, px of the reference. Lens shapes are always fitted to a
     mapping with the given displacement field, and replace it in the result.
     """
-    first, result = mapping.fixed_to_moving, None
+    to_start, result = geometry.invert(mapping.fixed_to_moving), None
     for _ in range(rounds):
         fit = fit_windows(mapping, measure(mapping), size_px, lens_std_px, baseline=baseline)
         if fit is None or not is_accepted(fit):
@@ -185,7 +185,8 @@ def fit_in_rounds(
             result = fit.applied_to(mapping), fit
         except GeometryError:
             return None
-        if not geometry.corner_error_px(result[0].fixed_to_moving, first, *size_px) <= max_moved_px:
+        moved = geometry.compose(to_start, result[0].fixed_to_moving)
+        if not geometry.corner_error_px(moved, geometry.identity(), *size_px) <= max_moved_px:
             return None
         converged_px, change_px = 0.02, fit.max_px  # noise of the windows
         if fit.baseline is not None and mapping.parallax is not None:

@@ -86,14 +86,16 @@ def test_all_windows_are_fitted_and_each_is_verified_by_the_other_half() -> None
     assert cross_fitted(IDENTITY, lambda _: windows(CORNERS_PX, black), SIZE) is None
 
 
-def test_the_limit_of_a_correction_is_for_all_rounds_together() -> None:
+@pytest.mark.parametrize("magnification", [1.0, 0.1])
+def test_the_limit_of_a_correction_is_for_all_rounds_together(magnification: float) -> None:
     """Windows that are shifted by 2 px again after each correction lead away from the seed."""
+    start = PixelMapping(np.diag([magnification, magnification, 1.0]))
 
     def measure(_: PixelMapping) -> Residual:
         return residual_of(CENTRES, np.full(CENTRES.shape, (2.0, 0.0)))
 
-    assert cross_fitted(IDENTITY, measure, SIZE, 10.0) is not None
-    assert cross_fitted(IDENTITY, measure, SIZE, 5.0) is None
+    assert cross_fitted(start, measure, SIZE, 10.0) is not None
+    assert cross_fitted(start, measure, SIZE, 5.0) is None
 
 
 def test_unrelated_windows_do_not_verify_a_fit_to_others() -> None:
