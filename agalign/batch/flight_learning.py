@@ -36,7 +36,6 @@ from agalign.method.device import keep_freed_memory, one_memory_error, one_threa
 from agalign.method.fast import learn
 from agalign.method.state import JointState, Progress
 from agalign.pixels.gdal import without_warnings
-from agalign.values import geometry
 from agalign.values.capture import Capture
 from agalign.values.geometry import Matrix
 from agalign.values.lens_shapes import lens_std_px
@@ -243,7 +242,7 @@ def _min_observations(observations: Iterable[LearningCapture]) -> int:
 
 
 def _extrapolation_px(rig: Rig, residuals: Mapping[str, Sequence[Residual]], *, calibrated: bool) -> dict[str, float]:
-    """Return the standard error (px of the band's file) from the lens in parts of the image without measurements.
+    """Return the standard error (px of the reference's file) from the lens in parts of the image without measurements.
 
     Only bands with such parts are in the result.
     """
@@ -254,7 +253,7 @@ def _extrapolation_px(rig: Rig, residuals: Mapping[str, Sequence[Residual]], *, 
             Residual.joined(of_band), rig.size_px, lens_std_px(rig.size_px, calibrated=calibrated)
         )
         if std_px > max_covered_px:
-            result[band] = float(std_px * geometry.magnification(rig.mean[band], *rig.size_px))
+            result[band] = std_px
     return result
 
 

@@ -177,11 +177,14 @@ class BandPair:
         width, height = (round(n / s) for n, s in zip(self.fixed.size_px, self.scales.fixed, strict=True))
         return width, height
 
+    def in_reference_file_px(self, distance_px: float) -> float:
+        """Convert a distance in the fixed image to the reference's file."""
+        return float(distance_px / min(self.scales.fixed))
+
     def in_moving_file_px(self, distance_px: float, fixed_to_moving: Matrix) -> float:
         """Convert a distance in the fixed image to the moving file, for a homography between the images."""
         between_files = self.scales.between_files(fixed_to_moving)
-        magnification = geometry.magnification(between_files, *self.reference_file_px)
-        return float(distance_px / min(self.scales.fixed) * magnification)
+        return self.in_reference_file_px(distance_px) * geometry.magnification(between_files, *self.reference_file_px)
 
 
 def read_pairs(
@@ -252,8 +255,8 @@ def _pair(
     pair = BandPair(name, reference, moving, reduced, tuple(bands), scales, std_px, is_coarse, field)
     rig = None if model is None else model.rig
     if rig is not None and name in rig.mean:
-        relief_px = rig.parallax_px.get(name, 0.0) / geometry.magnification(rig.mean[name], *rig.size_px)
-        pair = replace(pair, is_lens_known=rig.covers(name), relief_std_px=relief_px * scales.fixed.mean)
+        relief_px = rig.parallax_px.get(name, 0.0) * scales.fixed.mean
+        pair = replace(pair, is_lens_known=rig.covers(name), relief_std_px=relief_px)
     return replace(pair, layout=_layout(band, bands[0]))
 
 
@@ -284,12 +287,8 @@ def _seed_std_px(band: str, model: FlightModel | None, scale: PixelScale) -> dic
     tags_std_px = 5.0  # errors on five cameras have a median of 2 px and a maximum of 12 px (docs/reference/cameras.md)
     result: dict[SeedKind, float] = dict.fromkeys(("rig", "centre"), tags_std_px * scale.x)
     if model is not None and model.rig is not None and band in model.rig.mean:
-        mean, rig = model.rig.mean[band], model.rig
-        # The errors of a rig are in px of the band's own file.
-        ratio = geometry.magnification(mean, *rig.size_px)
-        error_px = float(unobserved_error_px(rig, band, by_neighbours=False) / ratio)
         min_std_px = 1.0  # of the mean: captures differ by this in height and tilt
-        result["model"] = float(max(error_px, min_std_px) * scale.x)
+        result["model"] = max(unobserved_error_px(model.rig, band, by_neighbours=False), min_std_px) * scale.x
     return result
 
 

@@ -91,7 +91,7 @@ def observation(
         if pair.has_rig_pixels and pair.name in joints:
             joint = joints[pair.name]
             mappings[pair.name] = pair.scales.between_files(joint.fixed_to_moving)
-            std_px[pair.name] = pair.in_moving_file_px(joint.corner_std_px, joint.fixed_to_moving)
+            std_px[pair.name] = pair.in_reference_file_px(joint.corner_std_px)
     if capture is None:
         return Observation(None, mappings, std_px)
     return Observation(capture.time_s, mappings, std_px, capture.altitude_m, capture.motion)
@@ -109,7 +109,7 @@ def observed(pairs: Sequence[BandPair], result: Alignments, capture: Capture) ->
         parallax = result[pair.name].mapping.parallax if pair.name in known else None
         if parallax is not None:
             rms_px = parallax.relief.rms_px * math.hypot(*parallax.baseline)
-            parallax_px[pair.name] = pair.in_moving_file_px(rms_px, known[pair.name].fixed_to_moving)
+            parallax_px[pair.name] = pair.in_reference_file_px(rms_px)
     return replace(observation(pairs, known, capture), parallax_px=parallax_px)
 
 
@@ -127,16 +127,13 @@ def rig_predictions(
     parallaxes = [(p, result[p.name].mapping.parallax) for p in covered if p.name in known.mappings]
     predictions: dict[str, RigPrediction] = {}
     for pair in covered:
-        of_plane, (parallax, parallax_std_px) = (
-            rig_prediction(pair, rig, known),
-            _parallax_by_rig(pair, parallaxes, rig),
-        )
+        of_plane = rig_prediction(pair, rig, known)
+        parallax, parallax_std_px = _parallax_by_rig(pair, parallaxes, rig)
         error_px = pair.in_moving_file_px(parallax_std_px, of_plane.fixed_to_moving)
         prediction = _with_added_error(of_plane.of_plane, error_px)
         # A homography does not follow the relief that captures of the flight have. The plane of a result, which is
         # compared with the prediction, is not displaced by it.
-        relief_px = rig.parallax_px.get(pair.name, 0.0) if parallax is None else 0.0
-        of_scene = _with_added_error(prediction, relief_px)
+        of_scene = prediction if parallax is not None else _with_relief_of_flight(prediction, rig, pair.name)
         predictions[pair.name] = RigPrediction(pair, prediction, of_scene, parallax)
     return predictions
 
@@ -144,8 +141,11 @@ def rig_predictions(
 def _parallax_by_rig(
     pair: BandPair, parallaxes: Sequence[tuple[BandPair, Parallax | None]], rig: Rig
 ) -> tuple[Parallax | None, float]:
-    """Return the relief of the other bands with the baseline of the rig, scaled to theirs, and the standard error that
-    the baseline causes; that of the relief is in the relief. None and 0 without a relief.
+    """Return the relief of the other bands with the baseline of the rig, and the standard error that the baseline
+    causes; that of the relief is in the relief. None and 0 without a relief, or if its bands do not determine it.
+
+    t_b and d_b of a rig with delays are orthogonal (`learn_rig`), and the baselines of its lenses are s t_b + d_b k, in
+    which s and k (2,) are equal for all bands.
     """
     others = {
         other.name: parallax
@@ -155,16 +155,24 @@ def _parallax_by_rig(
     if not others:
         return None, 0.0
     relief = next(iter(others.values())).relief
-    seen = np.array([parallax.baseline for parallax in others.values()])
-    of_rig = np.array([rig.baselines[name] for name in others])
-    scale = float((seen * of_rig).sum() / max((of_rig**2).sum(), 1e-12))
-    error = float(np.sqrt(((seen - scale * of_rig) ** 2).sum(axis=1).mean()))
-    x, y = (scale * np.array(rig.baselines[pair.name])).tolist()
+    seen = np.ravel([parallax.baseline for parallax in others.values()])
+    design = np.concatenate([rig.baseline_design(name) for name in others])
+    solution, _, rank, _ = np.linalg.lstsq(design, seen, rcond=None)
+    if rank < len(solution):
+        return None, 0.0
+    variance = float(np.square(seen - design @ solution).sum()) / (len(seen) - rank)
+    own = rig.baseline_design(pair.name)
+    error = math.sqrt(variance * (2 + float(np.trace(own @ np.linalg.inv(design.T @ design) @ own.T))))
+    x, y = (own @ solution).tolist()
     return Parallax(relief, (x, y)).with_occlusions(), error * relief.rms_px
 
 
 def _with_added_error(prediction: Prediction, error_px: float) -> Prediction:
     return replace(prediction, std_px=math.hypot(prediction.std_px, error_px))
+
+
+def _with_relief_of_flight(prediction: Prediction, rig: Rig, band: str) -> Prediction:
+    return _with_added_error(prediction, rig.parallax_px.get(band, 0.0) * rig.magnification(band))
 
 
 def bands_to_learn(pairs: Sequence[BandPair], result: Alignments, rig: Rig, capture: Capture) -> set[str]:
@@ -186,7 +194,7 @@ def bands_to_learn(pairs: Sequence[BandPair], result: Alignments, rig: Rig, capt
         has_common_structure = alignment.seed.trusted or is_above_chance
         prediction = predict_band(rig, pair.name, known)
         if not has_relief:
-            prediction = _with_added_error(prediction, rig.parallax_px.get(pair.name, 0.0))
+            prediction = _with_relief_of_flight(prediction, rig, pair.name)
         return not has_common_structure or prediction.std_px <= DELIVERED_STD_PX
 
     return {pair.name for pair in pairs if not is_skipped(pair)}

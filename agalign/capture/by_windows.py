@@ -109,20 +109,17 @@ def spreads_of_relief_px(pairs: Sequence[BandPair], homographies: Mapping[str, M
     for pair in pairs:
         if pair.layout is None or "rig" not in pair.seed_matrices or pair.name not in homographies:
             continue
-        centre = (np.array(pair.reference_file_px) - 1) / 2
-        found, at_infinity = homographies[pair.name], pair.seed_matrices["rig"]
-        at_centre = [geometry.apply(pair.scales.between_files(m), centre) for m in (found, at_infinity)]
+        centre = (np.array(pair.fixed.size_px) - 1) / 2
+        from_infinity = geometry.compose(geometry.invert(pair.seed_matrices["rig"]), homographies[pair.name])
         layouts[pair.name] = np.array(pair.layout)
-        offsets_px.append(at_centre[0] - at_centre[1])
+        offsets_px.append((geometry.apply(from_infinity, centre) - centre) / pair.scales.fixed.mean)
     along, known = np.ravel(offsets_px), np.ravel(list(layouts.values()))
     common_px = max(0.0, float(along @ known)) / max(float(known @ known), 1e-12)
 
     def spread_px(pair: BandPair) -> float:
         if pair.name not in layouts:
             return pair.relief_std_px
-        shift_px = (
-            common_px * float(np.linalg.norm(layouts[pair.name])) / pair.in_moving_file_px(1.0, homographies[pair.name])
-        )
+        shift_px = common_px * float(np.linalg.norm(layouts[pair.name])) * pair.scales.fixed.mean
         return max(pair.relief_std_px, _RELIEF_SHARE * shift_px)
 
     return {pair.name: spread_px(pair) for pair in pairs}

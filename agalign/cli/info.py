@@ -153,13 +153,9 @@ def _show_model(path: Path, terminal: Terminal, *, as_json: bool) -> None:
     from agalign.flight.model import load_model
     from agalign.flight.rig_prediction import band_summaries
     from agalign.method.device import choose_device
-    from agalign.values.geometry import magnification
 
     model = load_model(path, lambda: choose_device("cpu"))
     rows = [] if model.rig is None else band_summaries(model.rig)
-    for row in rows:
-        assert model.rig is not None
-        row["pixel_size_px"] = 1 / magnification(model.rig.mean[row["band"]], *model.rig.size_px)
     captures, factors = (0, ()) if model.rig is None else (len(model.rig.captures), model.rig.factors)
     if as_json:
         rig = {"captures": captures, "factors": factors, "bands": rows} if rows else None

@@ -168,8 +168,7 @@ def _normalised(lens: Array, factors: Sequence[Factor]) -> Array:
     their delays could be distance or motion.
     """
     t, delay = lens[:, :2], _unit(np.ones(len(lens)) if "reference" in factors else lens[:, 2])
-    has_delays = "motion" in factors or "reference" in factors
-    return np.column_stack([_unit(t - np.outer(delay, delay @ t) if has_delays else t), delay])
+    return np.column_stack([_unit(t - np.outer(delay, delay @ t) if rig.has_delays(factors) else t), delay])
 
 
 def _unit(vectors: Array) -> Array:

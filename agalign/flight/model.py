@@ -27,7 +27,8 @@ from agalign.host.text import shortened
 from agalign.method.descriptor import Descriptor
 from agalign.values.geometry import Matrix, normalised
 
-_FORMAT = "agalign-model/1"
+_FORMAT, _FORMER_FORMAT = "agalign-model/2", "agalign-model/1"
+"""The former one had the lengths of a rig in px of each band."""
 
 
 @dataclass(frozen=True)
@@ -126,6 +127,8 @@ def _read_contents(path: Path) -> tuple[dict[str, Any], dict[str, torch.Tensor]]
             raise ValueError(f"it is larger than {max_mib} MiB")
     with safe_open(path, framework="pt") as file:
         facts = dict(file.metadata() or {})
+        if facts.get("format") == _FORMER_FORMAT:
+            raise ValueError("an earlier version wrote it; learn it again")
         if facts.get("format") != _FORMAT:
             raise InputError(f"{path}: is not a model of agalign; give a file of an earlier run's models folder")
         tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118

@@ -5,12 +5,13 @@ and e_b are constants of the rig; nu = n / d, the plane's normal over its distan
 rig exposes its bands one after another, the image motion between exposures adds w times the delay of the band.
 Linearised around the mean m_b of a flight, the mapping of band b in capture c at pixel x of the reference is
 
-    H_b(c) x = m_b(x) + t_b (nu_c . g(x)) + d_b w_c + residual
+    H_b(c) x = m_b(x + t_b (nu_c . g(x)) + d_b w_c + residual)
 
 t_b (2,) is the baseline direction of the band's lens and d_b its delay. The factors nu_c (3,) and w_c (2,) are common
 to all bands of a capture. g = (1, u, v) are image coordinates, normalised to mean 0 and variance 1 over the image: a
 change of distance shifts each band along its baseline, a tilt does so in proportion to the position in the image. All
-t_b together have norm 1, as have all d_b, so the factors are in px.
+t_b together have norm 1, as have all d_b, so the factors are in px. All lengths are px of the reference's file, so that
+they do not depend on the size of a band's pixels.
 
 The difference between two mappings of a band is expressed as coefficients (2, 3) of g, in px; their norm is the RMS
 distance over the image. The model is bilinear: least squares alternate between the factors of captures and the
@@ -53,13 +54,13 @@ class Observation:
     mappings: Mapping[str, Matrix]
     """fixed_to_moving by band, undistorted px of the files."""
     std_px: Mapping[str, float]
-    """Standard error of each mapping."""
+    """Standard error of each mapping, px of the reference's file."""
     altitude_m: float | None = None
     """Altitude in the tags, above any datum; None if unknown."""
     motion: tuple[float, float] | None = None
     """Velocity of the ground in the image (right, down), in any unit; None if unknown."""
     parallax_px: Mapping[str, float] = field(default_factory=dict)
-    """RMS displacement by the relief of the capture, for bands that have one."""
+    """RMS displacement by the relief of the capture, for bands that have one, px of the reference's file."""
 
 
 @dataclass(frozen=True)
@@ -75,7 +76,7 @@ class CaptureFactors:
 
 @dataclass(frozen=True)
 class Rig:
-    """The geometry of a flight's camera; lengths of a band are in px of its own file."""
+    """The geometry of a flight's camera; lengths are in px of the reference's file."""
 
     size_px: tuple[int, int]
     """(width, height) of the reference's file."""
@@ -106,13 +107,29 @@ class Rig:
         """Return (2, 3, 5) the derivative of a band's coefficients by the factors; 0 for unused factors."""
         return np.tensordot([*self.baselines[band], self.delays[band]], design_tensor(self.factors), 1)
 
+    def baseline_design(self, band: str) -> Array:
+        """Return (2, 1) or (2, 3) the derivative of the baseline of a band's lens by the length of all baselines, and
+        with delays by the vector along which they are orthogonal to the delays.
+        """
+        baseline = np.array(self.baselines[band])[:, None]
+        return np.hstack([baseline, self.delays[band] * np.eye(2)]) if has_delays(self.factors) else baseline
+
     def mapping(self, band: str, factors: Array) -> Matrix:
         """Return the mapping of a band for the factors (5,) of a capture."""
         return displaced(self.mean[band], self.design(band) @ factors, self.size_px)
 
+    def magnification(self, band: str) -> float:
+        """Return the pixels of a band per pixel of the reference."""
+        return geometry.magnification(self.mean[band], *self.size_px)
+
     def covers(self, band: str) -> bool:
         """Return True if the mapping of the band was observed in all parts of the image."""
         return band in self.mean and band not in self.extrapolation_px
+
+
+def has_delays(factors: Sequence[Factor]) -> bool:
+    """Return True if the delays are part of the model."""
+    return "motion" in factors or "reference" in factors
 
 
 def design_tensor(factors: Sequence[Factor]) -> Array:
@@ -161,16 +178,16 @@ def lattice(size_px: tuple[int, int]) -> tuple[Points, Array]:
 
 
 def affine_difference(mean: Matrix, mapping: Matrix, size_px: tuple[int, int]) -> Array:
-    """Return (2, 3) coefficients of the affine part of the second mapping minus the first, px."""
+    """Return (2, 3) coefficients of the affine part of the displacement that precedes the mean in a mapping, px."""
     points, g = lattice(size_px)
-    difference_px = geometry.apply(mapping, points) - geometry.apply(mean, points)
+    difference_px = geometry.apply(geometry.compose(geometry.invert(mean), mapping), points) - points
     return np.asarray(np.linalg.lstsq(g, difference_px, rcond=None)[0].T)
 
 
 def displaced(mean: Matrix, coefficients: Array, size_px: tuple[int, int]) -> Matrix:
-    """Add a difference with coefficients (2, 3) to a mapping; the inverse of `affine_difference`."""
+    """Return the mapping with a displacement of coefficients (2, 3); the inverse of `affine_difference`."""
     points, g = lattice(size_px)
-    return geometry.fit_homography(points, geometry.apply(mean, points) + g @ coefficients.T)
+    return geometry.fit_homography(points, geometry.apply(mean, points + g @ coefficients.T))
 
 
 def distance_px(one: Matrix, other: Matrix, size_px: tuple[int, int]) -> float:

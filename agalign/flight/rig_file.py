@@ -33,8 +33,6 @@ def rig_from_json(text: str, fields: Mapping[str, NDArray[np.float64]]) -> Rig:
     Raises KeyError, TypeError, ValueError or GeometryError for damaged text, and for values that no rig has.
     """
     facts = json.loads(text, parse_float=_bounded, parse_int=_bounded, parse_constant=_bounded)
-    if "seen" in facts:  # the name in files of earlier versions
-        facts["captures"] = facts.pop("seen")
     steps = facts.pop("field_steps_px")
     width, height = facts.pop("size_px")
     if not all(float(n).is_integer() and 0 < n <= _MAX_SIDE_PX for n in (width, height)):
@@ -55,11 +53,9 @@ def rig_from_json(text: str, fields: Mapping[str, NDArray[np.float64]]) -> Rig:
 def camera_in(facts: Mapping[str, str]) -> FlightCamera | None:
     """Return the camera in the metadata of a model file; None if it was learned for no camera in particular.
 
-    Raises ValueError or TypeError for damaged text, and for the metadata of an earlier version.
+    Raises ValueError or TypeError for damaged text.
     """
-    if not facts.get("camera_bands"):
-        if facts["camera"]:
-            raise ValueError("an earlier version wrote it; learn it again")
+    if not facts["camera"]:
         return None
     bands = json.loads(facts["camera_bands"])
     return FlightCamera(facts["camera"], tuple((str(name), int(width), int(height)) for name, width, height in bands))

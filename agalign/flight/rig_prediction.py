@@ -23,6 +23,7 @@ from agalign.flight.rig import (
 )
 from agalign.values import geometry
 from agalign.values.alignment import Prediction
+from agalign.values.choices import PredictionSource
 from agalign.values.geometry import Matrix
 
 Array = NDArray[np.float64]
@@ -34,8 +35,9 @@ Basis = Literal["flight", "seconds", "altitude_m"]
 def predict_band(rig: Rig, band: str, known: Observation) -> Prediction:
     """Predict the mapping of a band of the rig from the other bands of the capture, or if none is known from others."""
     has_others = any(b != band and b in rig.mean for b in known.mappings)
-    prediction = (_from_bands if has_others else _from_captures)(rig, band, known)
-    return replace(prediction, std_px=float(np.hypot(prediction.std_px, rig.extrapolation_px.get(band, 0.0))))
+    mapping, source, error_px = (_from_bands if has_others else _from_captures)(rig, band, known)
+    std_px = np.hypot(error_px, rig.extrapolation_px.get(band, 0.0)) * rig.magnification(band)
+    return Prediction(mapping, source, float(std_px))
 
 
 def unobserved_error_px(rig: Rig, band: str, *, by_neighbours: bool) -> float:
@@ -65,7 +67,9 @@ def extreme_mappings(rig: Rig, band: str) -> list[Matrix]:
 
 
 def band_summaries(rig: Rig) -> list[dict[str, Any]]:
-    """Return for each band the offset of the image centre, the baseline and the errors of predictions, px."""
+    """Return for each band the offset of the image centre, the baseline and the largest displacement by its field, px
+    of the reference, and the errors of predictions, px of the band.
+    """
     centre = (np.array(rig.size_px, float) - 1) / 2
     field_px = {b: float(np.linalg.norm(f.displacements_px, axis=-1).max()) for b, f in rig.fields.items()}
     return [
@@ -73,17 +77,18 @@ def band_summaries(rig: Rig) -> list[dict[str, Any]]:
             "band": band,
             "offset_px": (geometry.apply(mean, centre[None])[0] - centre).tolist(),
             "baseline": rig.baselines[band],
-            "from_bands_px": rig.from_bands_px[band],
-            "from_neighbours_px": unobserved_error_px(rig, band, by_neighbours=True),
-            "from_flight_px": unobserved_error_px(rig, band, by_neighbours=False),
+            "pixel_size_px": 1 / rig.magnification(band),
+            "from_bands_px": rig.from_bands_px[band] * rig.magnification(band),
+            "from_neighbours_px": unobserved_error_px(rig, band, by_neighbours=True) * rig.magnification(band),
+            "from_flight_px": unobserved_error_px(rig, band, by_neighbours=False) * rig.magnification(band),
             "field_px": field_px.get(band),
         }
         for band, mean in rig.mean.items()
     ]
 
 
-def _from_bands(rig: Rig, band: str, known: Observation) -> Prediction:
-    """Predict a band from the mappings of the other bands of the capture.
+def _from_bands(rig: Rig, band: str, known: Observation) -> tuple[Matrix, PredictionSource, float]:
+    """Predict a band from the mappings of the other bands of the capture; return it and its standard error, px.
 
     The variance is the sum of the cross-validated one, the additional variance of the factors compared with captures in
     which all other bands are known accurately, that by the baseline's error for factors outside the learned range, and
@@ -107,7 +112,7 @@ def _from_bands(rig: Rig, band: str, known: Observation) -> Prediction:
     variances_px2 = (np.median(excess_px2[weights[0] > 0]), of_factors_px2, baseline_px2)
     error_px = np.sqrt(rig.from_bands_px[band] ** 2 + sum(max(0.0, v) for v in variances_px2))
     mapping = rig.mapping(band, solutions[0])
-    return Prediction(mapping, "bands" if rig.factors else "flight", float(error_px))
+    return mapping, "bands" if rig.factors else "flight", float(error_px)
 
 
 def estimated_factors(
@@ -152,8 +157,8 @@ def _at_motion(captures: Captures, motion: tuple[float, float] | None) -> tuple[
     return moved, np.array([1.0, *motion]) / scale @ slope
 
 
-def _from_captures(rig: Rig, band: str, known: Observation) -> Prediction:
-    """Predict a band from the estimate of the capture's factors with the smallest standard error.
+def _from_captures(rig: Rig, band: str, known: Observation) -> tuple[Matrix, PredictionSource, float]:
+    """Predict a band from the estimate of the capture's factors with the smallest standard error, px.
 
     That is the leave-one-out error of the basis for learned captures with similar gaps, or the difference between
     the captures used if that is larger.
@@ -168,11 +173,13 @@ def _from_captures(rig: Rig, band: str, known: Observation) -> Prediction:
             similar = [square for other_gap, square in tests if other_gap <= max_gap_ratio * gap]
             squares = similar if len(similar) >= MIN_CAPTURES else [square for _, square in tests[:MIN_CAPTURES]]
             mean_px2 = float(expected_square(np.mean(squares), len(squares)))
-            results.append((max(mean_px2, float(((design @ std) ** 2).sum())), factors))
-    variance_px2, factors = min(results, key=itemgetter(0), default=(0.0, np.zeros(FACTORS)))
+            source: PredictionSource = "neighbours" if basis != "flight" and (design @ factors).any() else "flight"
+            results.append((max(mean_px2, float(((design @ std) ** 2).sum())), factors, source))
+    of_mean: tuple[float, Array, PredictionSource] = 0.0, np.zeros(FACTORS), "flight"
+    variance_px2, factors, source = min(results, key=itemgetter(0), default=of_mean)
     altitude_px = _altitude_error_px(rig, known.altitude_m) * float(np.linalg.norm(rig.baselines[band]))
     error_px = float(np.sqrt(variance_px2 + rig.from_bands_px[band] ** 2 + altitude_px**2))
-    return Prediction(rig.mapping(band, factors), "neighbours" if (design @ factors).any() else "flight", error_px)
+    return rig.mapping(band, factors), source, error_px
 
 
 def _leave_one_out(rig: Rig, band: str, basis: Basis) -> list[tuple[float, float]]:

@@ -21,8 +21,9 @@ from agalign.synthetic.flight import score_against_truth
 from agalign.values import geometry
 from agalign.values.alignment import Alignment, Seed
 from agalign.values.capture import Band, Capture
+from agalign.values.geometry import PairScales
 from agalign.values.issues import Issue, sentence
-from agalign.values.pixel_units import PixelScale
+from agalign.values.pixel_units import SAME_PIXELS, PixelScale
 
 from ..builders import joint_result, pair_of, whole
 from ..conftest import textured_image, write_band
@@ -130,24 +131,24 @@ def test_a_thermal_band_is_aligned_to_a_fraction_of_its_own_pixel(tmp_path: Path
     assert pairs[1].reference_file_px == (800, 600)
 
 
-def test_errors_of_a_rig_are_in_px_of_each_band_s_file(flight: Path) -> None:
-    """A standard error of 0.2 px of the reference is 0.02 px of a band with pixels ten times as large."""
+@pytest.mark.parametrize("pixels", [1.0, 0.1])
+def test_a_rig_is_learned_from_errors_in_px_of_the_reference_s_file(flight: Path, pixels: float) -> None:
+    """Whatever the size of the band's pixels; the image has half the size of the file."""
     pairs, _ = read_pairs(discover(flight).captures[0], SeedSettings())
-    pair = pairs[0]
+    pair = replace(pairs[0], scales=PairScales(PixelScale(0.5, 0.5), SAME_PIXELS))
     joint, seed = joint_result(std_px=0.2 / 2**0.5), Seed("rig", np.eye(3), 30.0)
-    for pixels, std_px in ((1.0, 0.2), (0.1, 0.02)):
-        mapping = pair.mapping(np.diag([pixels, pixels, 1.0]))
-        alignment = Alignment(mapping, pair.fixed.size_px, (), seed, joint)
-        known = observed([pair], {pair.name: alignment}, discover(flight).captures[0])
-        assert known.std_px[pair.name] == pytest.approx(std_px)
+    mapping = pair.mapping(np.diag([pixels, pixels, 1.0]))
+    alignment = Alignment(mapping, pair.fixed.size_px, (), seed, joint)
+    known = observed([pair], {pair.name: alignment}, discover(flight).captures[0])
+    assert known.std_px[pair.name] == pytest.approx(0.4)
 
 
-def test_the_error_of_a_rig_is_converted_to_px_of_the_reference() -> None:
+def test_the_error_of_a_rig_is_converted_to_px_of_the_fixed_image() -> None:
     rig = Rig(
-        (800, 600), {"LWIR": np.diag([0.1, 0.1, 1.0])}, {"LWIR": (1.0, 0.0)}, {"LWIR": 0.0}, {}, (), (), {"LWIR": 0.5}
+        (800, 600), {"LWIR": np.diag([0.1, 0.1, 1.0])}, {"LWIR": (1.0, 0.0)}, {"LWIR": 0.0}, {}, (), (), {"LWIR": 5.0}
     )
     model = FlightModel(None, None, ("LWIR",), {}, "", rig)
-    assert _seed_std_px("LWIR", model, PixelScale(0.5, 0.5))["model"] == pytest.approx(0.5 / 0.1 * 0.5)
+    assert _seed_std_px("LWIR", model, PixelScale(0.5, 0.5))["model"] == pytest.approx(5.0 * 0.5)
 
 
 @pytest.mark.parametrize("scale", [0.5, 1.0, 3.0])

@@ -31,11 +31,12 @@ from agalign.values import geometry, lens
 from agalign.values.alignment import Alignment, Seed
 from agalign.values.capture import Capture
 from agalign.values.choices import FamilyChoice, ReliefUse
-from agalign.values.geometry import Matrix
+from agalign.values.geometry import Matrix, PairScales
 from agalign.values.image import Raster
 from agalign.values.issues import NO_CONTRAST, RETRIEVAL, Issue
 from agalign.values.mapping import PixelMapping
 from agalign.values.parallax import Parallax, Relief
+from agalign.values.pixel_units import PixelScale
 
 from ..builders import in_full_run, joint_result, residual_of, whole
 from ..conftest import Shared, textured_image
@@ -433,15 +434,21 @@ def test_no_band_is_aligned_whose_relief_is_uncertain_in_more_than_a_tenth_of_th
             assert alignment.prediction.std_px > 1
 
 
+@pytest.mark.parametrize("magnification", [1.0, 2.0])
 def test_a_lost_band_is_predicted_with_the_relief(
-    boxes: Rendered, candidates: Sequence[RefinedBand], aligned: Mapping[str, Alignment]
+    boxes: Rendered, candidates: Sequence[RefinedBand], aligned: Mapping[str, Alignment], magnification: float
 ) -> None:
-    """The rig knows planes and baselines, the relief is that of the other bands."""
+    """The rig knows planes and baselines, the relief is that of the other bands. The file of the lost band has more
+    pixels.
+    """
     norm = np.linalg.norm([b.baseline_m for b in MOVING])
     mean = {name: a.fixed_to_moving for name, a in aligned.items()}
+    mean["Blue"] = geometry.compose(np.diag([magnification, magnification, 1.0]), mean["Blue"])
     baselines = {b.name: (-b.baseline_m[0] / norm, -b.baseline_m[1] / norm) for b in MOVING}
     none, from_bands_px = (dict.fromkeys(mean, float(value)) for value in (0.0, 0.05))
     rig = Rig(boxes.size_px, mean, baselines, none, none, ("distance",), (), from_bands_px)
+    reduced = PairScales(moving=PixelScale(1 / magnification, 1 / magnification))
+    candidates = [replace(c, pair=replace(c.pair, scales=reduced)) if c.pair.name == "Blue" else c for c in candidates]
     pairs, bands = [c.pair for c in candidates], unaligned(candidates)
     without_blue = {
         name: Candidate("relief", pair, a.mapping, a.error, a.residual, a.joint)
@@ -455,6 +462,9 @@ def test_a_lost_band_is_predicted_with_the_relief(
     # The other bands are verified by the rig as before.
     assert {name: a.status for name, a in result.items()} == {"Blue": "predicted", "Red": "aligned", "NIR": "aligned"}
     assert result["Blue"].geometry == "relief"
+    np.testing.assert_allclose(
+        predictions["Blue"].mapping.parallax.baseline, aligned["Blue"].mapping.parallax.baseline, atol=0.05
+    )
 
 
 @pytest.mark.full

@@ -77,12 +77,38 @@ def test_without_common_variation_no_factor_is_selected() -> None:
     assert distance_px(prediction.fixed_to_moving, rig.mean["Red"], SIZE) < 1e-4
 
 
-def test_a_known_layout_predicts_captures_at_an_unseen_height() -> None:
+def enlarged(observation: Observation, magnification: float) -> Observation:
+    """The same with an NIR that has more pixels."""
+    to_file = np.diag([magnification, magnification, 1.0])
+    own = {b: geometry.normalised(to_file @ m) if b == "NIR" else m for b, m in observation.mappings.items()}
+    return replace(observation, mappings=own)
+
+
+@pytest.mark.parametrize("magnification", [0.1, 1.0, 2.0])
+def test_a_known_layout_predicts_captures_at_an_unseen_height(magnification: float) -> None:
     # Without the layout, the error and its standard error may be several pixels.
     for layout, max_px, max_std in ((BASELINES, 1.0, 2.0), ({}, np.inf, 2.5)):
-        rig = learn_rig(level_flight(4), SIZE, layout)
-        error, std = error_px(rig, "NIR", observation(9.0, 9.0, without="NIR"), mappings(9.0)["NIR"])
-        assert error < min(max_px, max_std * std)
+        rig = learn_rig([enlarged(o, magnification) for o in level_flight(4)], SIZE, layout)
+        truth = enlarged(observation(9.0, 9.0), magnification).mappings["NIR"]
+        error, std = error_px(rig, "NIR", observation(9.0, 9.0, without="NIR"), truth)
+        assert error < min(magnification * max_px, max_std * std)
+
+
+@pytest.mark.parametrize("magnification", [1.0, 2.0])
+def test_the_baselines_of_the_lenses_follow_from_two_bands_if_the_reference_moves(magnification: float) -> None:
+    """Those of the rig are orthogonal to its delays: they lack what all bands have in common."""
+    rng = np.random.default_rng(5)
+    captures = []
+    for k in range(12):
+        still = enlarged(observation(float(k), rng.normal(), noise=0.01, seed=k), magnification)
+        step = geometry.translation(*(4 * rng.normal(size=2)))
+        captures.append(replace(still, mappings={b: geometry.compose(m, step) for b, m in still.mappings.items()}))
+    rig = learn_rig(captures, SIZE, {})
+    assert "reference" in rig.factors
+    design = np.concatenate([rig.baseline_design(b) for b in ("Blue", "Red")])
+    solution = np.linalg.lstsq(design, np.ravel([BASELINES[b] for b in ("Blue", "Red")]), rcond=None)[0]
+    for band in ("NIR", "Red edge"):
+        np.testing.assert_allclose(rig.baseline_design(band) @ solution, BASELINES[band], atol=0.05)
 
 
 def test_the_parallax_of_a_flight_is_the_rms_over_its_captures() -> None:
