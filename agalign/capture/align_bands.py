@@ -266,7 +266,8 @@ class CaptureEstimation:
         for (pair, seed), result in zip(starts, results, strict=True):
             found = self.bands.setdefault(pair.name, BandCandidates(pair, seed))
             found.issue = result if isinstance(result, Issue) else None
-            found.refined = RefinedBand.of(pair, seed, result)
+            if found.refined is None or found.issue is None:
+                found.refined = RefinedBand.of(pair, seed, result)
         use = self.settings.relief.use if self._may_be_homography else "never"
         bands = self._combined()
         self.progress(starts[0][0].name if starts else "", "relief", 0.0)

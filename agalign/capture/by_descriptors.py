@@ -37,6 +37,8 @@ def _with_field(plane: Candidate, warped: WarpedPair, joint: JointResult) -> Ite
     """
     pair = plane.pair
     displacement = pair.reference.displacement_field.refine(channel_mean(pair.moving_image), plane.mapping)
+    if displacement is None:
+        return
     p95_px: dict[Geometry, float] = {"homography": displacement.before_p95_px, "field": displacement.after_p95_px}
     without = replace(plane, held_out_p95_px=p95_px)
     if displacement.field is None:

@@ -342,7 +342,7 @@ def _with_field(candidate: Candidate) -> Candidate:
     """Add the displacement field that its relief and lens shapes leave, if held-out windows confirm it."""
     pair, mapping = candidate.pair, candidate.mapping
     displacement = pair.reference.displacement_field.refine(channel_mean(pair.moving_image), mapping)
-    if displacement.field is None:
+    if displacement is None or displacement.field is None:
         return candidate
     assert candidate.error.covariance_px2 is not None
     mapping = replace(mapping, field=displacement.field)

@@ -65,18 +65,21 @@ def agreeing_with_seed(band: BandCandidates) -> Candidate | None:
     windows = pair.reference.overlapping_windows
     fitted = fit_in_rounds(
         replace(start, field=None),
-        lambda mapping: windows.residuals(pair.warped_moving(mapping)),
+        lambda mapping: WarpedPair.of(pair, mapping, windows).residual,
         pair.fixed.size_px,
         _is_consistent,
         pair.lens_std_px,
     )
-    if fitted is None or WarpedPair.of(pair, fitted[0]).alias_peak().ratio > MAX_ALIAS_PEAK:
+    if fitted is None:
         return None
     mapping, fit = fitted
-    residual = windows.residuals(pair.warped_moving(mapping))
-    error = mapping_error(pair, mapping, fit.covariance_px2, residual, relief_std_px=0.0)
+    warped = WarpedPair.of(pair, mapping, windows)
+    if warped.alias_peak().ratio > MAX_ALIAS_PEAK:
+        return None
+    error = mapping_error(pair, mapping, fit.covariance_px2, warped.residual, relief_std_px=0.0)
     error = replace(error, field_std_px=0.0)  # its shapes are in the covariance
-    return Candidate("lens shapes", pair, mapping, error, residual, band.joint, inherited_issues=band.rejected)
+    evidence = warped.residual, band.joint, warped
+    return Candidate("lens shapes", pair, mapping, error, *evidence, inherited_issues=band.rejected)
 
 
 def _is_consistent(fit: WindowFit) -> bool:

@@ -106,7 +106,11 @@ class Candidate:
     @cached_property
     def common_px(self) -> Points:
         """Points (n, 2) of a grid over the reference that the moving image covers."""
-        return points_in_frame(self.mapping, *self.pair.sizes_px) if self.images is None else self.images.common_px()
+        if self.images is not None:
+            return self.images.common_px()
+        if self.refined_from is not None:
+            return self.refined_from.common_px
+        return points_in_frame(self.mapping, *self.pair.sizes_px)
 
     @property
     def checked_px(self) -> Points:

@@ -71,12 +71,12 @@ class DisplacementEstimator:
         verification_px = 48  # side of windows without overlap; larger ones are farther from those of the fit
         self.verification = FixedWindows(valid, structure, verification_px)
 
-    def refine(self, moving: Raster, mapping: PixelMapping) -> DisplacementResult:
+    def refine(self, moving: Raster, mapping: PixelMapping) -> DisplacementResult | None:
         """Fit the displacement field of a mapping, including the field that the mapping already has.
 
         The shifts are measured again with the field of each round until their median is at most 0.2 px, as correlation
         is sharper and large shifts are measured in steps. Returns no field if it folds the image or increases the p95
-        of held-out windows.
+        of held-out windows; None if too few windows are measured.
         """
         field = None if mapping.field is None else mapping.field.on_lattice(self.lattice_px, self.size_px)
         max_rounds, converged_px = 4, 0.2
@@ -85,7 +85,7 @@ class DisplacementEstimator:
             before_px = 0.0 if field is None else field(shifts.centres_px)
             total = shifts._replace(shifts_px=shifts.shifts_px + before_px)
             if len(total.weights) < MIN_WINDOWS:
-                return DisplacementResult(None, math.nan, math.nan)
+                return None
             field = fitted_field(total, _SMOOTHNESS, self.lattice_px, self.size_px)
             if np.median(shifts.distances_px()) <= converged_px:
                 break
@@ -113,7 +113,8 @@ class DisplacementEstimator:
         predicted_px = self._cross_predicted(total, residual, min_distance_px)
         shifts_px = residual.shifts_px + field(residual.centres_px)
         given_px = 0.0 if mapping.field is None else mapping.field(residual.centres_px)
-        return residual.with_shifts(shifts_px - predicted_px), residual.with_shifts(shifts_px - given_px).p95_px
+        before_px = np.where(np.isfinite(predicted_px), shifts_px - given_px, np.nan)  # in the same windows
+        return residual.with_shifts(shifts_px - predicted_px), residual.with_shifts(before_px).p95_px
 
     def _cross_predicted(self, shifts: Shifts, windows: Residual, min_distance_px: float) -> Points:
         """Predict the shifts (n, 2) of windows by fields fitted to the shifts of others at a minimum distance.

@@ -6,11 +6,14 @@ from typing import Any
 import numpy as np
 import pytest
 
+from agalign.batch.capture_task import quiet
 from agalign.capture import candidate as module
+from agalign.capture.align_bands import CaptureEstimation
 from agalign.capture.band_pair import BandPair
 from agalign.capture.by_descriptors import by_descriptors
 from agalign.capture.candidate import RefinedBand
 from agalign.capture.warped_pair import WarpedPair
+from agalign.config import Settings
 from agalign.fit.displacement_field import DisplacementResult
 from agalign.values import geometry
 from agalign.values.alignment import Alignment, JointResult, Seed
@@ -110,6 +113,16 @@ def displaced_pair(height_px: float, wavelength_px: float | None = None) -> Band
         return height_px * form[..., None] * np.array([1.0, -0.6])
 
     return pair_of(*displaced_views(displacement), {"rig": np.eye(3)})
+
+
+def test_a_later_optimisation_without_a_result_does_not_replace_an_earlier_one() -> None:
+    """The band still takes part in the estimation of the others."""
+    estimation, start = CaptureEstimation(Settings(), None, quiet), (displaced_pair(0.0), CENTRED)
+    for result in (joint_result(), Issue(RETRIEVAL, 0.0, 0.2)):
+        estimation.add([start], [result])
+    (band,) = estimation.refined
+    assert band.joint.retrieval == joint_result().retrieval
+    assert estimation.bands["moving"].issue is not None
 
 
 @pytest.mark.parametrize(

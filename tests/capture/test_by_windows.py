@@ -12,6 +12,7 @@ from agalign.capture.band_pair import BandPair
 from agalign.capture.by_descriptors import by_descriptors
 from agalign.capture.by_windows import is_extrapolated
 from agalign.capture.candidate import BandCandidates, Candidate, RefinedBand
+from agalign.capture.reference import Reference
 from agalign.capture.seeding import find_seed
 from agalign.config import SeedSettings
 from agalign.pixels.masks import raster_of
@@ -261,6 +262,16 @@ def test_a_coarse_band_without_any_candidate_is_not_verified_by_the_windows_of_i
     band = coarse_band(scene[100:340, 100:420], thermal(scene, 0.2))
     by_windows = module.agreeing_with_seed(BandCandidates(band.pair, band.seed))
     assert by_windows.issues == (Issue(OTHER_GEOMETRY),)
+
+
+def test_areas_without_data_do_not_count_in_a_georeferenced_coarse_band(scene: np.ndarray) -> None:
+    band = coarse_band(scene[100:340, 100:420], thermal(scene, 0.2))
+    reference = band.pair.reference.image
+    valid = reference.valid & (np.arange(FIXED_PX[0]) >= 100)
+    matrices = {"geo": band.seed.fixed_to_moving, **band.pair.seed_matrices}
+    pair = replace(band.pair, reference=Reference(replace(reference, valid=valid)), seed_matrices=matrices)
+    by_windows = module.agreeing_with_seed(BandCandidates(pair, band.seed, band.issue))
+    assert by_windows.common_px[:, 0].min() > 90
 
 
 @pytest.mark.parametrize("kind", ["unrelated", "repetitive"])

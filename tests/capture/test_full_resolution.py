@@ -20,6 +20,7 @@ from agalign.capture.candidate import BandCandidates, Candidate, mapping_error
 from agalign.capture.decision import decide
 from agalign.capture.full_resolution import at_full_resolution
 from agalign.capture.reference import Reference
+from agalign.capture.warped_pair import WarpedPair
 from agalign.config import JointSettings, Settings
 from agalign.errors import UnreadableFileError
 from agalign.fit import window_fit
@@ -114,6 +115,14 @@ def test_a_refinement_that_fails_verification_leaves_the_earlier_result(capture:
     kept = in_files(good, unsure)
     assert kept.status == "aligned"
     np.testing.assert_allclose(kept.fixed_to_moving, in_files(good).fixed_to_moving)
+
+
+def test_areas_without_data_do_not_count_in_georeferenced_files(capture: Capture, pair: BandPair) -> None:
+    image = pair.reference.image
+    left = Reference(replace(image, valid=image.valid & (np.arange(HALF_PX[0]) < HALF_PX[0] // 2)))
+    known = on_reduced_images(replace(pair, reference=left, seed_matrices={"geo": np.eye(3)}))
+    start = Candidate.of("descriptors", WarpedPair.of(known.pair, known.mapping), known.joint)
+    assert refined(capture, start).common_px[:, 0].max() < HALF_PX[0] // 2
 
 
 def test_each_window_is_verified_by_a_fit_that_shares_no_pixel_with_it(

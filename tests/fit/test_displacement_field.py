@@ -9,7 +9,7 @@ from agalign.values import geometry
 from agalign.values.mapping import DisplacementField, PixelMapping
 from agalign.values.residual import Residual
 
-from ..builders import displaced_views, grid_px, residual_of, rms, texture
+from ..builders import displaced_views, grid_px, residual_of, rms, texture, whole
 
 SIZE = 640, 480
 CENTRES = grid_px(np.arange(32, 640, 32), np.arange(32, 480, 32))
@@ -45,6 +45,26 @@ def test_a_field_that_folds_the_image_is_rejected(monkeypatch: pytest.MonkeyPatc
     steep[:, 10, 0] = -60
     monkeypatch.setattr(displacement_field, "fitted_field", lambda *_: DisplacementField(24.0, steep))
     assert estimator.refine(moving, mapping).field is None
+
+
+def test_the_p95_before_and_after_a_field_are_over_the_same_windows(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Those near the bump lack a prediction, as by too few neighbours."""
+    fixed, moving = displaced_views(bump)
+    estimator = DisplacementEstimator(fixed.valid, structure_field(fixed))
+    assert estimator.refine(moving, PixelMapping(np.eye(3))).before_p95_px > 0.9
+
+    def far_from_bump(_shifts: Shifts, windows: Residual, _distance_px: float) -> np.ndarray:
+        near = np.linalg.norm(windows.centres_px - (300, 220), axis=1, keepdims=True) < 200
+        return np.where(near, np.nan, np.zeros(2))
+
+    monkeypatch.setattr(estimator, "_cross_predicted", far_from_bump)
+    assert estimator.refine(moving, PixelMapping(np.eye(3))).before_p95_px < 0.3
+
+
+def test_without_windows_there_is_no_p95() -> None:
+    fixed, moving = displaced_views(bump)
+    estimator = DisplacementEstimator(fixed.valid, structure_field(fixed))
+    assert estimator.refine(whole(np.zeros_like(moving.pixels)), PixelMapping(np.eye(3))) is None
 
 
 def of_captures(count: int, height: float, seed: int) -> list[Residual]:
