@@ -36,7 +36,7 @@ from agalign.method.device import keep_freed_memory, one_memory_error, one_threa
 from agalign.method.fast import learn
 from agalign.method.state import JointState, Progress
 from agalign.pixels.gdal import without_warnings
-from agalign.values.capture import Capture
+from agalign.values.capture import Capture, relative_parallax
 from agalign.values.geometry import Matrix
 from agalign.values.lens_shapes import lens_std_px
 from agalign.values.residual import Residual
@@ -279,12 +279,6 @@ def _spread(captures: Sequence[Capture], count: int) -> list[Capture]:
 
 
 def _layout(captures: Iterable[Capture]) -> dict[str, tuple[float, float]]:
-    """Return the positions of the lenses relative to the reference's, where the metadata contains them."""
-    result: dict[str, tuple[float, float]] = {}
-    for capture in captures:
-        reference = capture.reference.parallax_direction
-        for band in capture.moving:
-            if reference is not None and band.parallax_direction is not None:
-                x, y = band.parallax_direction
-                result.setdefault(band.name, (x - reference[0], y - reference[1]))
-    return result
+    """Return the directions of parallax relative to the reference, where the metadata contains them."""
+    known = [(band.name, relative_parallax(capture.reference, band)) for capture in captures for band in capture.moving]
+    return {name: direction for name, direction in reversed(known) if direction is not None}

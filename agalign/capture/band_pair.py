@@ -21,7 +21,7 @@ from agalign.pixels.raster import ReadTile, read_for_alignment
 from agalign.pixels.stripes import without_common_stripes
 from agalign.pixels.structure import blur_px
 from agalign.values import geometry
-from agalign.values.capture import Band, Capture
+from agalign.values.capture import Band, Capture, relative_parallax
 from agalign.values.choices import SeedKind, Space
 from agalign.values.geometry import SAME_SCALES, Matrix, PairScales
 from agalign.values.image import Raster
@@ -257,15 +257,7 @@ def _pair(
     if rig is not None and name in rig.mean:
         relief_px = rig.parallax_px.get(name, 0.0) * scales.fixed.mean
         pair = replace(pair, is_lens_known=rig.covers(name), relief_std_px=relief_px)
-    return replace(pair, layout=_layout(band, bands[0]))
-
-
-def _layout(reference: Band, moving: Band) -> tuple[float, float] | None:
-    """Return the difference of the directions of parallax of two bands; None if unknown."""
-    if reference.parallax_direction is None or moving.parallax_direction is None:
-        return None
-    (x, y), (reference_x, reference_y) = moving.parallax_direction, reference.parallax_direction
-    return x - reference_x, y - reference_y
+    return replace(pair, layout=relative_parallax(band, bands[0]))
 
 
 def longest_for(reference: Band, fixed_to_moving: Matrix) -> int:

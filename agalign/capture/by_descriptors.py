@@ -24,7 +24,7 @@ def by_descriptors(band: RefinedBand, use: ReliefUse) -> Iterator[Candidate]:
     warped = band.warped.with_mapping(pair.mapping(joint.fixed_to_moving))
     if band.by_halves is not None and joint is band.joint:
         warped = warped.cross_validated(band.by_halves)
-    plane = Candidate.of("descriptors", warped, joint)
+    plane = Candidate.of(warped, joint)
     yield plane
     is_wanted = use == "always" or (use == "auto" and (bool(plane.issues) or not pair.has_rig))
     if is_wanted and all(issue.kind in BY_PARALLAX for issue in plane.issues):
@@ -45,7 +45,7 @@ def _with_field(plane: Candidate, warped: WarpedPair, joint: JointResult) -> Ite
         yield without
         return
     displaced = WarpedPair.of(pair, replace(plane.mapping, field=displacement.field), warped.windows)
-    held_out = Candidate.of("field", displaced, joint, displacement.held_out)
+    held_out = Candidate.of(displaced, joint, displacement.held_out)
     with_field = replace(held_out, other_windows=displaced.residual, held_out_p95_px=p95_px)
     yield without if with_field.issues and not plane.issues else with_field
 

@@ -155,7 +155,7 @@ class _Band:
         p95_px: dict[Geometry, float] = {"homography": self.by_homography.p95_px, kind: held_out.residual.p95_px}
         pair, windows = self.refined.pair, held_out.residual
         error = mapping_error(pair, mapping, self.joint.covariance_px2, windows)
-        return Candidate("relief", pair, mapping, error, windows, self.joint, held_out, held_out_p95_px=p95_px)
+        return Candidate(pair, mapping, error, windows, self.joint, held_out, held_out_p95_px=p95_px)
 
 
 def _observed(group: Sequence[RefinedBand]) -> ReliefCandidates | None:

@@ -58,7 +58,7 @@ class RigPrediction:
         std_px = self.of_scene.std_px / self.pair.in_moving_file_px(1.0, self.fixed_to_moving)
         mapping = self._warped.mapping
         error = MappingError(self.pair.fixed.size_px, rig_std_px=std_px, parallax=mapping.parallax)
-        return Candidate("rig", self.pair, mapping, error, self._warped.residual)
+        return Candidate(self.pair, mapping, error, self._warped.residual)
 
     @cached_property
     def rotated(self) -> Matrix | None:

@@ -18,6 +18,8 @@ from agalign.fit.window_fit import WindowFit, cross_fitted, fit_in_rounds
 from agalign.values import geometry
 from agalign.values.geometry import Matrix
 from agalign.values.issues import CORNERS_UNKNOWN, FEW_KEYPOINTS, INACCURATE, NO_CONTRAST, RETRIEVAL
+from agalign.values.mapping import PixelMapping
+from agalign.values.residual import Residual
 from agalign.verify.checks import MAX_ALIAS_PEAK
 from agalign.verify.coverage import points_in_frame, unobserved_quarters
 
@@ -34,16 +36,15 @@ def fitted_to_windows(band: BandCandidates) -> Candidate | None:
     # With other issues, the descriptors of sharp images have a result that may contradict the windows.
     of_descriptors = {RETRIEVAL, FEW_KEYPOINTS, NO_CONTRAST, CORNERS_UNKNOWN}
     descriptors_failed = pair.is_blurred or any(issue.kind in of_descriptors for issue in band.rejected)
-    if not descriptors_failed or not band.does_start_fit:
+    start = band.at_start
+    if not descriptors_failed or start is None or not band.does_start_fit:
         return None
     max_moved_px = min(_MAX_MOVED_PX, pair.max_shift_px)
-    start = WarpedPair.of(pair, pair.mapping(band.start.fixed_to_moving))
-    fitted = cross_fitted(
-        start.mapping,
-        lambda mapping: WarpedPair.of(pair, mapping, start.windows).residual,
-        pair.fixed.size_px,
-        max_moved_px,
-    )
+
+    def measured(mapping: PixelMapping) -> Residual:
+        return start.residual if mapping is start.mapping else WarpedPair.of(pair, mapping, start.windows).residual
+
+    fitted = cross_fitted(start.mapping, measured, pair.fixed.size_px, max_moved_px)
     if fitted is None:
         return None
     mapping, fit = fitted.mapping, fitted.fit
@@ -51,7 +52,7 @@ def fitted_to_windows(band: BandCandidates) -> Candidate | None:
     retrieval, chance = (0.0, 0.0) if known is None else (known.retrieval, known.chance)
     joint = result_of_windows(mapping.fixed_to_moving).with_homography(mapping.fixed_to_moving, fit.covariance_px2)
     joint = replace(joint, retrieval=retrieval, chance=chance, last_step_px=fit.max_px)
-    return Candidate.of("windows", WarpedPair.of(pair, mapping, start.windows), joint, fitted.held_out)
+    return Candidate.of(WarpedPair.of(pair, mapping, start.windows), joint, fitted.held_out)
 
 
 def agreeing_with_seed(band: BandCandidates) -> Candidate | None:
@@ -79,7 +80,7 @@ def agreeing_with_seed(band: BandCandidates) -> Candidate | None:
     error = mapping_error(pair, mapping, fit.covariance_px2, warped.residual, relief_std_px=0.0)
     error = replace(error, field_std_px=0.0)  # its shapes are in the covariance
     evidence = warped.residual, band.joint, warped
-    return Candidate("lens shapes", pair, mapping, error, *evidence, inherited_issues=band.rejected)
+    return Candidate(pair, mapping, error, *evidence, inherited_issues=band.rejected)
 
 
 def _is_consistent(fit: WindowFit) -> bool:

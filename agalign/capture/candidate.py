@@ -4,7 +4,6 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,15 +21,11 @@ from agalign.values.residual import Residual
 from agalign.verify.checks import PREDICTED_WITH, issues_of, seed_fits
 from agalign.verify.coverage import pixels_in_frame, points_in_frame
 
-Estimator = Literal["descriptors", "field", "relief", "windows", "lens shapes", "full resolution", "rig"]
-"""What a mapping was estimated by."""
-
 
 @dataclass(frozen=True)
 class Candidate:
     """A mapping that a band may get, px of the images. `decision.decide` chooses one for each band."""
 
-    estimator: Estimator
     pair: BandPair
     mapping: PixelMapping
     error: MappingError
@@ -55,15 +50,13 @@ class Candidate:
     """Issues of an earlier candidate that remain: it is a prediction, as windows see a part of the image only."""
 
     @classmethod
-    def of(
-        cls, estimator: Estimator, warped: WarpedPair, joint: JointResult, windows: Residual | None = None
-    ) -> "Candidate":
+    def of(cls, warped: WarpedPair, joint: JointResult, windows: Residual | None = None) -> "Candidate":
         """Return the candidate with the homography and covariance of a result, and with the mapping of `warped`, whose
         windows verify it unless others are given.
         """
         windows = warped.residual if windows is None else windows
         error = mapping_error(warped.pair, warped.mapping, joint.covariance_px2, windows)
-        return cls(estimator, warped.pair, warped.mapping, error, windows, joint, warped)
+        return cls(warped.pair, warped.mapping, error, windows, joint, warped)
 
     @cached_property
     def issues(self) -> tuple[Issue, ...]:
@@ -230,11 +223,11 @@ class BandCandidates:
         return Seed(known[1], matrices[known[1]], 0.0, trusted=True)
 
     @cached_property
-    def start_residual(self) -> Residual | None:
-        """The windows under the seed; None if there is none."""
+    def at_start(self) -> WarpedPair | None:
+        """The images and windows under the seed; None if there is none."""
         if isinstance(self.seed, Issue):
             return None
-        return WarpedPair.of(self.pair, self.pair.mapping(self.start.fixed_to_moving)).residual
+        return WarpedPair.of(self.pair, self.pair.mapping(self.start.fixed_to_moving))
 
     @property
     def is_start_trusted(self) -> bool:
@@ -244,7 +237,7 @@ class BandCandidates:
     @property
     def does_start_fit(self) -> bool:
         """True if the windows agree with the seed."""
-        return self.start_residual is not None and seed_fits(self.start_residual)
+        return self.at_start is not None and seed_fits(self.at_start.residual)
 
     @property
     def is_unreadable(self) -> bool:

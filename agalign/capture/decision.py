@@ -102,7 +102,7 @@ class _Choice:
                 (*self.issues, Issue(SEED_DOES_NOT_FIT)) if is_misfit else self.issues,
                 band.start,
                 joint=band.joint,
-                residual=None if self.is_seed_refused else band.start_residual,
+                residual=None if self.is_seed_refused or band.at_start is None else band.at_start.residual,
                 held_out_p95_px=p95_px,
                 is_seed_usable=is_usable,
             )
@@ -121,10 +121,10 @@ class _Choice:
 
 
 def _prediction(chosen: Candidate, compared: Prediction | None) -> Prediction:
-    """Return a candidate as a prediction, with its standard error and with its distance from that of the rig."""
+    """Return a candidate as a prediction with its standard error: that of the rig, or if there is none, of windows."""
     fixed_to_moving = chosen.mapping.fixed_to_moving
     std_px = round(chosen.pair.in_moving_file_px(chosen.std_px, fixed_to_moving), STD_DECIMALS)
-    if chosen.estimator == "rig" and compared is not None:
+    if compared is not None:
         return replace(compared, std_px=std_px)
     return Prediction(chosen.pair.scales.between_files(fixed_to_moving), "windows", std_px)
 

@@ -58,7 +58,7 @@ def at_full_resolution(reference: Band, band: BandCandidates, start: Candidate) 
     joint = start.joint.with_homography(down.fixed_to_moving, fitted.fit.covariance_px2 * np.outer(factors, factors))
     windows = fitted.held_out.rescaled(scale)
     error = mapping_error(pair, down, joint.covariance_px2, windows)
-    return Candidate("full resolution", pair, down, error, windows, joint, refined_from=start)
+    return Candidate(pair, down, error, windows, joint, refined_from=start)
 
 
 def _windows(source: OpenRaster, reference: Band, tile: Tile) -> FixedWindows:

@@ -208,6 +208,14 @@ class Position:
         return f"{abs(self.latitude):.4f} {north}, {abs(self.longitude):.4f} {east}"
 
 
+def relative_parallax(reference: Band, moving: Band) -> tuple[float, float] | None:
+    """Return the difference of the directions of parallax of two bands of a rig; None if unknown."""
+    if reference.parallax_direction is None or moving.parallax_direction is None:
+        return None
+    (x, y), (reference_x, reference_y) = moving.parallax_direction, reference.parallax_direction
+    return x - reference_x, y - reference_y
+
+
 def distance_km(one: Position, other: Position) -> float:
     """Return the distance on the ground by the haversine formula with the mean radius, which is accurate to 0.5 %."""
     at = np.radians([[place.longitude, place.latitude] for place in (one, other)])

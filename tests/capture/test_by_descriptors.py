@@ -51,9 +51,9 @@ def test_pixels_are_checked_only_where_the_other_checks_pass(pair: BandPair, mon
     """These checks are costly."""
     monkeypatch.setattr(WarpedPair, "issues", lambda _: (Issue(REPEATS, 16.0),))
     warped_pair = WarpedPair.of(pair, pair.mapping(TRUTH))
-    unretrieved = module.Candidate.of("descriptors", warped_pair, replace(GOOD, retrieval=0.0))
+    unretrieved = module.Candidate.of(warped_pair, replace(GOOD, retrieval=0.0))
     assert [issue.kind for issue in unretrieved.issues] == [RETRIEVAL]
-    assert [issue.kind for issue in module.Candidate.of("descriptors", warped_pair, GOOD).issues] == [REPEATS]
+    assert [issue.kind for issue in module.Candidate.of(warped_pair, GOOD).issues] == [REPEATS]
 
 
 def test_each_colour_is_verified_by_the_estimate_from_the_other(pair: BandPair) -> None:

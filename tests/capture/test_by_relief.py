@@ -264,7 +264,7 @@ def flat_relief_of(*bands: RefinedBand) -> ReliefCandidates:
     relief, result = Relief(np.zeros((4, 4), np.float32), np.ones((4, 4), np.float32)), dict[str, Candidate]()
     for band in bands:
         under = band.warped.with_mapping(band.warped.mapping.with_parallax(Parallax(relief, (1, 0))))
-        result[band.pair.name] = Candidate.of("relief", under, band.joint)
+        result[band.pair.name] = Candidate.of(under, band.joint)
     return ReliefCandidates(bands[0].pair.reference, result, 0.1)
 
 
@@ -451,7 +451,7 @@ def test_a_lost_band_is_predicted_with_the_relief(
     candidates = [replace(c, pair=replace(c.pair, scales=reduced)) if c.pair.name == "Blue" else c for c in candidates]
     pairs, bands = [c.pair for c in candidates], unaligned(candidates)
     without_blue = {
-        name: Candidate("relief", pair, a.mapping, a.error, a.residual, a.joint)
+        name: Candidate(pair, a.mapping, a.error, a.residual, a.joint)
         for (name, a), pair in zip(aligned.items(), pairs, strict=True)
         if name != "Blue"
     }

@@ -63,8 +63,7 @@ def candidate(
     parallax = None if relief is None else Parallax(relief, (1.0, 0.0))
     mapping, joint = pair().mapping(matrix).with_parallax(parallax), joint_result(matrix, std_px=std_px)
     error = mapping_error(pair(name), mapping, joint.covariance_px2, windows(shift_px))
-    estimator = "descriptors" if relief is None else "relief"
-    return replace(Candidate(estimator, pair(name), mapping, error, windows(shift_px), joint), **facts)
+    return replace(Candidate(pair(name), mapping, error, windows(shift_px), joint), **facts)
 
 
 def in_part(std_px: float = 0.05, issue: Issue = IN_PART, **facts: object) -> Candidate:

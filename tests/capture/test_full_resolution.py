@@ -67,7 +67,7 @@ def on_reduced_images(pair: BandPair, **joint: Any) -> Candidate:
     result = joint_result(pair.scales.between_images(off), std_px=1.0, covariance=0.001 * np.eye(8), **joint)
     mapping = pair.mapping(result.fixed_to_moving)
     error = mapping_error(pair, mapping, result.covariance_px2, windows)
-    return Candidate("descriptors", pair, mapping, error, windows, result)
+    return Candidate(pair, mapping, error, windows, result)
 
 
 def refined(capture: Capture, start: Candidate) -> Candidate:
@@ -121,7 +121,7 @@ def test_areas_without_data_do_not_count_in_georeferenced_files(capture: Capture
     image = pair.reference.image
     left = Reference(replace(image, valid=image.valid & (np.arange(HALF_PX[0]) < HALF_PX[0] // 2)))
     known = on_reduced_images(replace(pair, reference=left, seed_matrices={"geo": np.eye(3)}))
-    start = Candidate.of("descriptors", WarpedPair.of(known.pair, known.mapping), known.joint)
+    start = Candidate.of(WarpedPair.of(known.pair, known.mapping), known.joint)
     assert refined(capture, start).common_px[:, 0].max() < HALF_PX[0] // 2
 
 
