@@ -74,7 +74,7 @@ def originals(shared: Shared, flight: Path) -> Path:
         synthetic.make_flight(folder / "altum", captures=2, size_px=(640, 480), rng_seed=4, camera=ALTUM)
         dates = textured_pair(MOVEMENT, 640, 520)
         for name, image, off_m in zip(("spring", "summer"), dates, ((0, 0), (3, -4)), strict=True):
-            write_mosaic(folder / f"{name}.tif", image, off_m, bands=2)
+            write_mosaic(folder / f"{name}.tif", image, off_m, bands=4)
         for number, seed in enumerate((1, 2), start=1):
             for side, image in zip("ab", textured_pair(MOVEMENT, 240, 200, seed), strict=True):
                 cv2.imwrite(str(folder / f"{number}{side}.png"), (image * 40 + 128).clip(1, 254).astype(np.uint8))
