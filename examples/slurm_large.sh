@@ -4,10 +4,13 @@
 #
 #     FLIGHT=/data/flight OUT=/data/aligned sbatch examples/slurm_large.sh
 #
-# OPTIONS replaces the options '--radiometry auto --qa'.
+# Activate the environment of agalign with '.[dask]' first; all nodes must have it under the same path. OPTIONS replaces
+# the options '--radiometry auto --qa'.
 #
 #SBATCH --ntasks=64 --cpus-per-task=1 --mem-per-cpu=3G --time=12:00:00
-. /data/agalign/env/bin/activate    # with '.[dask]', on a file system that all nodes have
+set -u
+: "${FLIGHT:?folder of the flight}" "${OUT:?folder for the results}"
+
 address=tcp://$(hostname):8786
 dask scheduler --port 8786 &
 srun dask worker "$address" --nthreads 1 --no-dashboard &

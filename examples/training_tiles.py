@@ -3,7 +3,7 @@
 python examples/training_tiles.py OUT
 
 All bands have the pixels of the reference, so one label raster fits all of them. Neighbouring captures overlap: split
-by flight, or by position with a gap between the parts as here, not by tile.
+by flight, or by position with a gap between the parts as here, not by tile. The gap must be wider than an image.
 """
 
 import json
@@ -20,7 +20,9 @@ MASKED = 847
 
 
 class Tiles(torch.utils.data.Dataset):
-    """Tiles of stacks: pixels and usable pixels, each (bands, side, side)."""
+    """Tiles of stacks: pixels (float32) and usable pixels (bool), each (bands, side, side), in the order of the bands of
+    the stack. Captures of one camera have the same bands; narrower rests at the right and lower edges are dropped.
+    """
 
     def __init__(self, stacks, side_px=256):
         self.tiles = []
@@ -43,7 +45,10 @@ class Tiles(torch.utils.data.Dataset):
 
 def longitude(stack):
     """Return the position of a capture from its sidecar."""
-    return json.loads(stack.with_suffix(".json").read_text(encoding="utf-8"))["position"]["longitude"]
+    position = json.loads(stack.with_suffix(".json").read_text(encoding="utf-8"))["position"]
+    if position is None:
+        sys.exit(f"{stack}: has no GPS position; split by flight")
+    return position["longitude"]
 
 
 if __name__ == "__main__":
