@@ -20,8 +20,9 @@ MASKED = 847
 
 
 class Tiles(torch.utils.data.Dataset):
-    """Tiles of stacks: pixels (float32) and usable pixels (bool), each (bands, side, side), in the order of the bands of
-    the stack. Captures of one camera have the same bands; narrower rests at the right and lower edges are dropped.
+    """Tiles of stacks: pixels (float32) and usable pixels (bool), each (bands, side, side), in the order of the bands.
+
+    All stacks of a camera have the same bands. Narrower rests at the right and lower edges are dropped.
     """
 
     def __init__(self, stacks, side_px=256):

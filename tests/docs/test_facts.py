@@ -40,11 +40,12 @@ OPTIONS_OF_OTHERS = {
     *("--data", "--faults", "--floor", "--grids", "--kills", "--kinds", "--pairs", "--plot"),  # benchmarks
     *("--ranges", "--scenes", "--size"),
     *("--extra-index-url", "--index-url", "--strict"),  # pip, mypy
+    *("--radiometric-calibration", "--tags"),  # OpenDroneMap, rio info
 }
 """Options in the text of pages that are not those of agalign."""
 WORDS_OF_A_MESSAGE = 4
 """Code of as many words is a quoted message, if it is none of these."""
-NOT_A_MESSAGE = re.compile(r"(agalign|python3?|pip|docker|sphinx-build|if __name__) |--|x ↦")
+NOT_A_MESSAGE = re.compile(r"(agalign|python3?|pip|rio|docker|sphinx-build|if __name__) |--|x ↦")
 
 
 def code_in(page: Path) -> list[str]:
