@@ -7,13 +7,11 @@ relief. Either all bands with the same reference image use the relief, or none: 
 another one.
 """
 
-import math
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import cycle
-from statistics import median_high
 
 import cv2
 import numpy as np
@@ -32,7 +30,7 @@ from agalign.capture.reference import Reference
 from agalign.capture.warped_pair import WarpedPair
 from agalign.errors import GeometryError
 from agalign.fit.dense import DenseMatching, View, nearer_sign
-from agalign.fit.displacement_field import MIN_WINDOWS
+from agalign.fit.displacement_field import MIN_WINDOWS, mean_in_standard_errors
 from agalign.fit.window_fit import (
     BaselinePrior,
     WindowFit,
@@ -65,13 +63,8 @@ class ReliefCandidates:
     """The reference image that they have in common."""
     candidates: Mapping[str, Candidate]
     """By band."""
-    gain_px: float
-    """Decrease of the shifts of held-out windows relative to the homographies, in half of the bands or more."""
-
-    @property
-    def fits_better(self) -> bool:
-        """True if the relief fits half of the bands at least as well as their homographies."""
-        return self.gain_px >= 0
+    fits_better: bool
+    """The relief fits half of the bands better than their homographies, by held-out windows."""
 
 
 def by_relief(
@@ -194,7 +187,7 @@ def _observed(group: Sequence[RefinedBand]) -> ReliefCandidates | None:
         aligned_share = float((held_out.lengths_px <= MAX_SHIFT_PX * pair.file_pixel_size_px).mean())
         if not issues and aligned_share >= _MIN_OBSERVED_SHARE:
             result[band.name] = replace(candidate, ignored=BY_PARALLAX)
-    return ReliefCandidates(reference, result, _gain_px(bands, result))
+    return ReliefCandidates(reference, result, _fits_better(bands, result))
 
 
 def _of_group(group: Sequence[RefinedBand], others: Sequence[RefinedBand]) -> ReliefCandidates | None:
@@ -213,12 +206,12 @@ def _of_group(group: Sequence[RefinedBand], others: Sequence[RefinedBand]) -> Re
     result: dict[str, Candidate] = {}
     for band, warped in zip(estimate.bands, held_out, strict=True):
         result |= estimate.candidate(band, warped)
-    gain_px = _gain_px(estimate.bands, result)
-    if gain_px >= 0:
+    fits_better = _fits_better(estimate.bands, result)
+    if fits_better:
         result |= estimate.of_other_bands(others)
         if not any(band.pair.has_rig for band in group):
             result = {name: _with_field(candidate) for name, candidate in result.items()}
-    return ReliefCandidates(group[0].pair.reference, result, gain_px)
+    return ReliefCandidates(group[0].pair.reference, result, fits_better)
 
 
 @dataclass(frozen=True)
@@ -351,27 +344,35 @@ def _with_field(candidate: Candidate) -> Candidate:
     return replace(candidate, mapping=mapping, error=error, held_out_p95_px=p95_px)
 
 
-def _gain_px(bands: Sequence[_Band], result: Mapping[str, Candidate]) -> float:
-    """Return the decrease of the shifts of held-out windows by a relief, in half of the bands or more.
+def _fits_better(bands: Sequence[_Band], result: Mapping[str, Candidate]) -> bool:
+    """Return True if held-out windows of half of the bands fit a relief better than a homography.
 
     A band that it predicts counts only if a homography cannot align it: fields follow small parallax better.
     """
-    gains = []
-    for band in bands:
+
+    def is_better(band: _Band) -> bool:
         candidate, plane = result.get(band.name), band.by_homography
         if candidate is None or (candidate.issues and plane.p95_px <= MAX_SHIFT_PX * candidate.pair.file_pixel_size_px):
-            gains.append(-math.inf)
-        else:
-            gains.append(_decrease_px(plane, candidate.windows))
-    return median_high(gains)
+            return False
+        return _decreases_shifts(plane, candidate.windows)
+
+    return 2 * sum(map(is_better, bands)) >= len(bands)
 
 
-def _decrease_px(plane: Residual, relief: Residual) -> float:
-    """Return the decrease of the p95 of held-out windows by a relief, minus the increase of their median.
+def _decreases_shifts(plane: Residual, relief: Residual) -> bool:
+    """Return True if a relief decreases the p95 of held-out windows by more than it increases their median, and their
+    robust loss by more than by chance.
 
     If most windows are on the reference plane, the noise of the relief increases the median by some hundredths of a px.
+    The p95 alone is that of wrong peaks where images are noisy.
     """
-    return float(plane.p95_px - relief.p95_px) - max(0.0, float(relief.median_px - plane.median_px))
+    if plane.p95_px - relief.p95_px < max(0.0, relief.median_px - plane.median_px):
+        return False
+    # Standard errors of the mean decrease: at most 3.0 in flat scenes with noise, and at least 5.4 with boxes, booms,
+    # trees and leaves.
+    min_sigma = 4.0
+    before, after = (np.log1p(np.square(px / MIN_PARALLAX_PX)) for px in plane.lengths_px_with(relief))
+    return len(before) > 1 and mean_in_standard_errors(before - after) >= min_sigma
 
 
 def _verifying(bands: Sequence[int]) -> list[list[int]]:

@@ -157,7 +157,7 @@ class _Gain(NamedTuple):
         before_p95_px, after_p95_px = (float(np.percentile(v, 95)) for v in (before_px, after_px))
         losses = _losses(after_px)
         loss = float(np.average(losses, weights=shifts.weights))
-        return cls(smoothness, before_p95_px, after_p95_px, loss, _in_standard_errors(_losses(before_px) - losses))
+        return cls(smoothness, before_p95_px, after_p95_px, loss, mean_in_standard_errors(_losses(before_px) - losses))
 
     def is_significant(self, min_sigma: float) -> bool:
         """Return True if a field reduces the shifts significantly without a larger p95."""
@@ -170,7 +170,7 @@ def _losses(lengths_px: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.asarray(np.log1p((lengths_px / scale_px) ** 2))
 
 
-def _in_standard_errors(decreases: NDArray[np.float64]) -> float:
+def mean_in_standard_errors(decreases: NDArray[np.float64]) -> float:
     """Return the mean of decreases (n,) relative to its standard error."""
     return float(decreases.mean() / max(decreases.std() / math.sqrt(len(decreases)), 1e-12))
 

@@ -93,6 +93,17 @@ class Residual:
         median, p95 = np.percentile(self.lengths_px, (50, 95)).tolist() if len(self.lengths_px) else (np.inf, np.inf)
         return median, p95
 
+    def lengths_px_with(self, other: "Residual") -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return the lengths (m,) of the shifts of this and of another residual in the windows of one grid that both
+        have measured, px of the reference.
+        """
+        both = (residual.where(residual.is_measured) for residual in (self, other))
+        keys, lengths_px = zip(*(([*map(tuple, r.cells.tolist())], r.lengths_px) for r in both), strict=True)
+        places = {key: place for place, key in enumerate(keys[1])}
+        pairs = [(place, places[key]) for place, key in enumerate(keys[0]) if key in places]
+        own, others = np.array(pairs, np.int64).reshape(-1, 2).T
+        return lengths_px[0][own], lengths_px[1][others]
+
     @property
     def coverage(self) -> float:
         """Share of the textured windows in which a shift could be measured."""

@@ -17,7 +17,7 @@ from agalign.batch.capture_task import quiet
 from agalign.capture import align_bands
 from agalign.capture.align_bands import CaptureEstimation
 from agalign.capture.band_pair import BandPair
-from agalign.capture.by_relief import ReliefCandidates, _Estimate, _gain_px, _std_px, by_relief
+from agalign.capture.by_relief import ReliefCandidates, _decreases_shifts, _Estimate, _fits_better, _std_px, by_relief
 from agalign.capture.by_rig import observed, rig_predictions
 from agalign.capture.candidate import BandCandidates, Candidate, RefinedBand
 from agalign.capture.common_parallax import MIN_PARALLAX_PX, common_parallax_px
@@ -37,8 +37,9 @@ from agalign.values.issues import NO_CONTRAST, RETRIEVAL, Issue
 from agalign.values.mapping import PixelMapping
 from agalign.values.parallax import Parallax, Relief
 from agalign.values.pixel_units import PixelScale
+from agalign.values.residual import Residual
 
-from ..builders import in_full_run, joint_result, residual_of, whole
+from ..builders import grid_px, in_full_run, joint_result, residual_of, whole
 from ..conftest import Shared, textured_image
 
 CAMERA = replace(
@@ -265,7 +266,7 @@ def flat_relief_of(*bands: RefinedBand) -> ReliefCandidates:
     for band in bands:
         under = band.warped.with_mapping(band.warped.mapping.with_parallax(Parallax(relief, (1, 0))))
         result[band.pair.name] = Candidate.of(under, band.joint)
-    return ReliefCandidates(bands[0].pair.reference, result, 0.1)
+    return ReliefCandidates(bands[0].pair.reference, result, True)
 
 
 @pytest.mark.parametrize("is_together", [True, False])
@@ -455,7 +456,7 @@ def test_a_lost_band_is_predicted_with_the_relief(
         for (name, a), pair in zip(aligned.items(), pairs, strict=True)
         if name != "Blue"
     }
-    reliefs = [ReliefCandidates(pairs[0].reference, without_blue, 1.0)]
+    reliefs = [ReliefCandidates(pairs[0].reference, without_blue, True)]
     known = decide(bands, reliefs)
     predictions = rig_predictions(pairs, known, rig, observed(pairs, known, Capture("a", Path(), (), 0)))
     result = decide(bands, reliefs, predictions)
@@ -547,22 +548,49 @@ def test_parallax_below_the_noise_is_not_relief(flat: Rendered, height_px: float
 def test_a_relief_may_not_be_worse_than_its_plane(
     relief_px: tuple[float, float], plane_px: tuple[float, float], is_chosen: bool
 ) -> None:
-    """The median of the bands decides; a band that no relief explains counts as one without a gain."""
-    # Of 21 windows, the 95th percentile is that of the second largest shift.
-    shifts = (np.array([[median, 0.0]] * 19 + [[p95, 0.0]] * 2) for median, p95 in (plane_px, relief_px))
-    plane, relief = (residual_of(np.zeros((21, 2)), one) for one in shifts)
+    """Half of the bands decide; a band that no relief explains counts as one that it does not fit."""
+    plane, relief = (windows_with(*px) for px in (plane_px, relief_px))
     bands = [SimpleNamespace(name=name, by_homography=plane) for name in ("Blue", "Red", "NIR")]
     aligned = SimpleNamespace(issues=(), windows=relief, pair=SimpleNamespace(file_pixel_size_px=1.0))
     predicted = SimpleNamespace(**vars(aligned) | {"issues": (Issue(RETRIEVAL),)})
-    assert (_gain_px(bands[:1], {"Blue": aligned}) >= 0) == is_chosen
-    assert (_gain_px(bands, {"Blue": aligned, "Red": aligned}) >= 0) == is_chosen
-    assert _gain_px(bands, {"Blue": aligned}) == -np.inf
+    assert _fits_better(bands[:1], {"Blue": aligned}) == is_chosen
+    assert _fits_better(bands, {"Blue": aligned, "Red": aligned}) == is_chosen
+    assert not _fits_better(bands, {"Blue": aligned})
     # A prediction counts only where homographies align no band.
-    of_predicted_px = _gain_px(bands, dict.fromkeys(("Blue", "Red"), predicted))
-    assert (of_predicted_px >= 0) == (is_chosen and plane.p95_px > 1)
+    assert _fits_better(bands, dict.fromkeys(("Blue", "Red"), predicted)) == (is_chosen and plane.p95_px > 1)
     larger = SimpleNamespace(file_pixel_size_px=10.0)  # pixels
     on_larger_pixels = SimpleNamespace(**vars(predicted) | {"pair": larger})  # homographies align these
-    assert _gain_px(bands, dict.fromkeys(("Blue", "Red"), on_larger_pixels)) == -np.inf
+    assert not _fits_better(bands, dict.fromkeys(("Blue", "Red"), on_larger_pixels))
+
+
+def windows_with(median_px: float, p95_px: float) -> Residual:
+    """270 windows, a tenth of which have the larger shift."""
+    shifts_px = np.where(np.arange(270)[:, None] % 10 == 0, (p95_px, 0.0), (median_px, 0.0))
+    return residual_of(grid_px(np.arange(18.0), np.arange(15.0)), shifts_px)
+
+
+@pytest.mark.parametrize("seed", range(10))
+def test_a_relief_that_only_moves_wrong_peaks_is_not_chosen(seed: int) -> None:
+    """In noisy images a tenth of the windows have wrong peaks, whose p95 decreases by chance."""
+    rng = np.random.default_rng(seed)
+
+    def noisy(scale_px: float) -> Residual:
+        wrong_px = scale_px * rng.normal(size=(270, 2))
+        shifts_px = np.where(rng.random((270, 1)) < 0.1, wrong_px, 0.2 * rng.normal(size=(270, 2)))
+        return residual_of(grid_px(np.arange(18.0), np.arange(15.0)), shifts_px)
+
+    plane, relief = noisy(6.0), noisy(4.0)
+    assert not _decreases_shifts(plane, relief)
+
+
+def test_shifts_are_compared_in_the_windows_that_both_residuals_have_measured() -> None:
+    plane = windows_with(1.0, 5.0)
+    measured = plane.cells[:, 0] > 2
+    relief = plane.with_shifts(np.where(measured[:, None], plane.shifts_px / 2, np.nan))
+    shuffled = relief.where(np.random.default_rng(0).permutation(len(relief.cells))[:200])
+    before, after = plane.lengths_px_with(shuffled)
+    assert len(before) == np.isfinite(shuffled.shifts_px[:, 0]).sum() < 200
+    np.testing.assert_allclose(after, before / 2)
 
 
 # ---- what fits noise cannot pass
