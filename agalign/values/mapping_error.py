@@ -206,21 +206,22 @@ class MappingError:
     def _unmodelled_px2(self, points_px: Points, far: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return u^2 (n,): the expected squared shift at points that the mapping does not contain.
 
-        It is the median of the nearest windows, minus their noise, so that a single wrong peak does not count. Where
+        It is the median of the nearest windows, by distance and noise, minus their noise, so that a single wrong peak
+        does not count. Where
         one window has more weight than the others together, the value of all windows has the weight that they lack. It
         is shrunk towards the value of all windows, which is used alone far from them.
         """
         measured = self._measured
         if measured is None:
             return np.zeros(len(points_px))
-        noise_px2 = np.square(noise_px(measured.peaks_sigma))
+        noise_px2, precision = np.square(noise_px(measured.peaks_sigma)), measured.square_weights
         squares = np.square(measured.shifts_px).sum(axis=1)
-        count = min(8, len(squares))  # nearest windows, weighted by their distance
+        count = min(8, len(squares))  # nearest windows
         distance, index = (values.reshape(-1, count) for values in self._tree.query(points_px, k=count))
-        weight = np.exp(-0.5 * (distance / self._spacing_px) ** 2) + 1e-12
+        weight = np.exp(-0.5 * (distance / self._spacing_px) ** 2) * precision[index] + 1e-12
         # The median square of a shift with two normally distributed components is log(2) times its mean square.
         all_px2, total = measured.std_px**2, weight.sum(axis=1)
-        of_all_px2 = math.log(2) * (all_px2 + np.median(noise_px2))
+        of_all_px2 = math.log(2) * (all_px2 + np.quantile(noise_px2, 0.5, weights=precision, method="inverted_cdf"))
         near_squares = np.column_stack([squares[index], np.full(len(index), of_all_px2)])
         order = np.argsort(near_squares, axis=1)
         lacking = np.maximum(2.001 * weight.max(axis=1) - total, 0.0)  # a little more, so that it decides

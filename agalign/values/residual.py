@@ -20,6 +20,12 @@ _NOISE_PX_SIGMA2 = 48.0
 of aligned windows is 0.7 to 1.35 of that noise in sharp, noisy and blurred scenes, with peaks of 8 sigma to 30."""
 
 
+_TOLERATED_NOISE = 1 / 150
+"""Noise of a shift from which its weight decreases, relative to the spacing of the windows: 0.75 px for windows of 112
+px, 0.4 px for those of 64 px. In images with 30 % of noise, the error by windows without weights is up to five times
+that at tie points; with a value from 1/100 to 1/300, errors of sharp images differ by less than a tenth."""
+
+
 def noise_px(peaks_sigma: ArrayLike) -> NDArray[np.float64]:
     """Return the RMS noise (n,) of the length of measured shifts from the heights (n,) of their correlation peaks."""
     return np.asarray(_NOISE_PX_SIGMA2 / np.square(peaks_sigma))
@@ -110,20 +116,30 @@ class Residual:
         return float(self.is_measured.mean()) if len(self.shifts_px) else 0.0
 
     @property
+    def square_weights(self) -> NDArray[np.float64]:
+        """(m,) weights of the squares of the measured shifts, up to 1: inversely proportional to their variances."""
+        noise = noise_px(self.peaks_sigma[self.is_measured])
+        return np.asarray((1 + np.square(noise / (_TOLERATED_NOISE * self.spacing_px))) ** -2)
+
+    @property
     def std_px(self) -> float:
         """Standard error estimated from the windows, px: their RMS shift beyond the noise of their peaks; infinite
         without any.
 
         A fifth of the windows may be wrong peaks or at depth edges: the RMS is the larger of those of a normal
-        distribution with the same median, and with the same 80th percentile. At least half of it is kept, because the
-        noise is known only to a factor.
+        distribution with the same median, and with the same 80th percentile. Windows have `square_weights`. At least
+        half of the RMS is kept, because the noise is known only to a factor.
         """
         if not len(self.lengths_px):
             return math.inf
-        noise = float(np.median(noise_px(self.peaks_sigma[self.is_measured])))
+        noise, weights = noise_px(self.peaks_sigma[self.is_measured]), self.square_weights
+
+        def quantile(values: NDArray[np.float64], p: float) -> float:
+            return float(np.quantile(values, p, weights=weights, method="inverted_cdf"))
+
         # Of a Rayleigh distribution: sqrt(-2 log(1 - p)) for the quantile p, and sqrt(2) for the RMS.
-        rms_px = max(float(np.quantile(self.lengths_px, p)) / math.sqrt(-math.log(1 - p)) for p in (0.5, 0.8))
-        return math.sqrt(max(rms_px**2 - noise**2, (rms_px / 2) ** 2))
+        rms_px = max(quantile(self.lengths_px, p) / math.sqrt(-math.log(1 - p)) for p in (0.5, 0.8))
+        return math.sqrt(max(rms_px**2 - quantile(noise, 0.5) ** 2, (rms_px / 2) ** 2))
 
     @property
     def is_even_cell(self) -> NDArray[np.bool_]:

@@ -13,7 +13,7 @@ from agalign.values.mapping_error import ErrorOnGrid, MappingError
 from agalign.values.moved_area import MovedArea
 from agalign.values.parallax import Parallax, Relief
 from agalign.values.pixel_units import PixelScale
-from agalign.values.residual import Residual
+from agalign.values.residual import Residual, noise_px
 
 from ..builders import grid_px, residual_of
 
@@ -173,3 +173,16 @@ def test_the_error_between_images_is_that_between_files(sigma: float) -> None:
     points = np.random.default_rng(2).uniform(1, (638, 478), (200, 2))
     expected = 2 * between_images.error_px(points)
     np.testing.assert_allclose(between_files.error_px(2 * points + 0.5), expected, rtol=0.01)
+
+
+def test_windows_with_much_noise_say_little_of_the_error() -> None:
+    """Their noise is known only to a factor: here it is 1.4 times that of their peaks."""
+    rng = np.random.default_rng(0)
+    centres_px = geometry.lattice(1680, 1120, 15, 10)
+    peaks_sigma = np.where(np.arange(150) % 2 == 0, 30.0, 7.5)
+    noise = 1.4 * noise_px(peaks_sigma)
+    shifts_px = rng.normal(size=(150, 2)) * np.sqrt((0.1**2 + noise**2) / 2)[:, None]
+    residual = replace(residual_of(centres_px, shifts_px), peaks_sigma=peaks_sigma)
+    assert 0.08 < residual.where(peaks_sigma > 10).std_px < residual.std_px < 0.2
+    error = MappingError((1680, 1120), np.zeros((8, 8)), residual).error_px(centres_px)
+    assert np.sqrt(np.square(error).mean()) < 0.25
