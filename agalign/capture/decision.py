@@ -10,7 +10,7 @@ The estimators propose; `decide` chooses. For each band, the first row that appl
 | the seed                                  | it is trusted or requested, and fits the windows | `seed_only` |
 | the seed                                  | otherwise                                        | `failed`    |
 
-A capture has a relief if one fits half of its bands at least as well as their homographies, and of several the one that
+A capture has a relief if one fits half of its bands better than their homographies, and of several the one that
 delivers most bands: all bands of its reference image then have this geometry. (1) The candidate under it is `aligned`
 without issues, else `predicted`. (2) A candidate without issues is `aligned`, but beside a relief it is `predicted`, as
 indices would mix two geometries. Every standard error is the RMS of `Candidate.error`. `Alignment.status` follows from

@@ -155,14 +155,12 @@ def _notes(program: ExportProgram, captures: Sequence[RunCapture], files: Sequen
 
 
 def _of_raw_numbers(files: Sequence[Path]) -> dict[str, str]:
-    """The option of OpenDroneMap for files with raw numbers. It reads the irradiance of a light sensor under this name
-    only, and without its unit as W / m^2 / nm.
+    """The option of OpenDroneMap for files with raw numbers. It reads the horizontal irradiance of a light sensor under
+    this name, and without its unit as W / m^2 / nm; other irradiances are not in the unit of its radiance.
     """
     names = (pix4d.NAMESPACE, "HorizontalIrradiance"), (pix4d.NAMESPACE, "IrradianceScaleToSIUnits")
     tags = (read_tags(path) for path in files)
     if all(t.number(*name) for t in tags for name in names if t.text(pix4d.NAMESPACE, "BandName") != "LWIR"):
         return {"calibration": "camera+sun", "contents": "raw numbers, and the irradiance of the light sensor."}
-    contents = (
-        "raw numbers, not all with an irradiance that OpenDroneMap reads; align with --radiometry for reflectance."
-    )
+    contents = "raw numbers, not all with a horizontal irradiance; align with --radiometry for reflectance."
     return {"calibration": "camera", "contents": contents}
