@@ -13,7 +13,7 @@ from agalign.capture.by_windows import agreeing_with_seed, fitted_to_windows, is
 from agalign.capture.candidate import BandCandidates, RefinedBand
 from agalign.capture.decision import decide
 from agalign.capture.full_resolution import at_full_resolution
-from agalign.capture.map_estimate import map_estimate
+from agalign.capture.map_estimate import with_map_estimates
 from agalign.capture.metrics import with_metrics
 from agalign.capture.seeding import SeededPair, corrected, find_seed, image_groups
 from agalign.config import SeedSettings, Settings
@@ -284,24 +284,10 @@ class CaptureEstimation:
                 self.bands[name].candidates += by_descriptors(band, field_use)
 
     def _combined(self) -> list[RefinedBand]:
-        """Return the refined bands after the MAP estimation of all bands of the capture, with all windows and with each
-        half of them.
-        """
-        bands = self.refined
+        """Return the refined bands after the MAP estimation of all bands of the capture."""
         if not self._may_be_homography:  # as the MAP estimate is
-            return bands
-        pairs, joint = [b.pair for b in bands], {b.pair.name: b.joint for b in bands}
-        residuals = {b.pair.name: b.warped.residual for b in bands}
-        halves = (
-            {name: r.chessboard_half(even=is_even_cell) for name, r in residuals.items()}
-            for is_even_cell in (True, False)
-        )
-        rig = None if self.model is None else self.model.rig
-        estimates, black, white = (map_estimate(pairs, joint, some, rig) for some in (residuals, *halves))
-        return [
-            replace(b, joint=estimates[n], by_halves=(black[n].fixed_to_moving, white[n].fixed_to_moving))
-            for n, b in zip(joint, bands, strict=True)
-        ]
+            return self.refined
+        return with_map_estimates(self.refined, None if self.model is None else self.model.rig)
 
     @property
     def refined(self) -> list[RefinedBand]:

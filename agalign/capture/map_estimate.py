@@ -11,14 +11,16 @@ Bands with little texture depend on the other bands and the rig. The residuals o
 distribution, so a band that contradicts it by many standard deviations is not biased by it.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from agalign.capture.band_pair import BandPair
 from agalign.capture.by_rig import RigPrediction, observation, rig_prediction
-from agalign.fit.window_fit import fit_windows
+from agalign.capture.candidate import RefinedBand
+from agalign.fit.window_fit import WindowFit, fit_windows
 from agalign.flight.rig import Rig, lattice
 from agalign.values import geometry
 from agalign.values.alignment import JointResult
@@ -26,34 +28,53 @@ from agalign.values.least_squares import Robust, least_squares
 from agalign.values.residual import Residual
 
 
-def map_estimate(
-    pairs: Sequence[BandPair], results: Mapping[str, JointResult], residuals: Mapping[str, Residual], rig: Rig | None
-) -> dict[str, JointResult]:
-    """Return the results by band with the MAP estimates of the homographies and their covariances.
+def with_map_estimates(bands: Sequence[RefinedBand], rig: Rig | None) -> list[RefinedBand]:
+    """Return the bands of a capture with the MAP estimates of all windows, and with those of each half of them.
 
-    `residuals` are those of the results. Results without a covariance are returned unchanged.
+    The windows of a band are ignored, also in its halves, if all together are too few or their correction is too large.
+    Bands without a covariance are only estimated by the others.
     """
-    by_images = {
-        pair.name: _by_images(pair, results[pair.name], residuals[pair.name])
-        for pair in pairs
-        if pair.name in results and results[pair.name].corner_covariance_px2 is not None
+    max_correction_px = 1.0  # of a corner; larger ones contradict the mapping
+    residuals = [band.warped.residual for band in bands]
+    halves = ([r.chessboard_half(even=even) for r in residuals] for even in (True, False))
+    fits, *of_halves = ([_fit(b, r) for b, r in zip(bands, some, strict=True)] for some in (residuals, *halves))
+    is_used = [fit is not None and fit.max_px <= max_correction_px for fit in fits]
+    estimates, black, white = (
+        _estimates(bands, [fit if used else None for fit, used in zip(some, is_used, strict=True)], rig)
+        for some in (fits, *of_halves)
+    )
+    return [
+        replace(band, joint=joint, by_halves=(one.fixed_to_moving, other.fixed_to_moving))
+        for band, joint, one, other in zip(bands, estimates, black, white, strict=True)
+    ]
+
+
+def _fit(band: RefinedBand, residual: Residual) -> WindowFit | None:
+    """Fit windows of a band, measured under its result; None if they determine nothing, or without a covariance."""
+    if band.joint.corner_covariance_px2 is None:
+        return None
+    return fit_windows(band.pair.mapping(band.joint.fixed_to_moving), residual, band.pair.fixed.size_px)
+
+
+def _estimates(bands: Sequence[RefinedBand], fits: Sequence[WindowFit | None], rig: Rig | None) -> list[JointResult]:
+    """Return the estimates of bands with fits to their windows, or without them."""
+    pairs = [band.pair for band in bands]
+    estimates = {
+        band.pair.name: band.joint if fit is None else _with_windows(band.pair, band.joint, fit)
+        for band, fit in zip(bands, fits, strict=True)
     }
-    estimates = {**results, **by_images}
     if rig is not None:
+        by_images = {name: joint for name, joint in estimates.items() if joint.corner_covariance_px2 is not None}
         known = observation(pairs, by_images)
         for pair in pairs:
             if pair.name in known.mappings and pair.name in rig.mean:
                 estimates[pair.name] = _with_prior(pair, by_images[pair.name], rig_prediction(pair, rig, known))
-    return estimates
+    return list(estimates.values())
 
 
-def _by_images(pair: BandPair, result: JointResult, residual: Residual) -> JointResult:
-    """Combine descriptors and windows. The windows are ignored if they are too few or their correction is too large."""
+def _with_windows(pair: BandPair, result: JointResult, fit: WindowFit) -> JointResult:
+    """Combine the result of the descriptors with a fit to windows under it."""
     assert result.corner_covariance_px2 is not None
-    fit = fit_windows(pair.mapping(result.fixed_to_moving), residual, pair.fixed.size_px)
-    max_correction_px = 1.0  # of a corner; larger ones contradict the mapping
-    if fit is None or not fit.max_px <= max_correction_px:
-        return result
     information, of_windows = np.linalg.inv(result.corner_covariance_px2), np.linalg.inv(fit.covariance_px2)
     covariance = np.linalg.inv(information + of_windows)
     return _displaced(pair, result, covariance @ of_windows @ fit.corners_px, covariance)

@@ -7,16 +7,19 @@ import pytest
 from numpy.typing import ArrayLike
 
 from agalign.capture.band_pair import BandPair
-from agalign.capture.map_estimate import map_estimate
+from agalign.capture.candidate import RefinedBand
+from agalign.capture.map_estimate import with_map_estimates
 from agalign.capture.warped_pair import WarpedPair
 from agalign.flight.rig import Rig
 from agalign.values import geometry
-from agalign.values.alignment import JointResult
+from agalign.values.alignment import JointResult, Seed
+from agalign.values.residual import Residual
 
 from ..builders import joint_result, pair_of, residual_of, two_views, whole
 
 SIZE = 640, 480
 MEAN = geometry.translation(30.0, -12.0)
+SEED = Seed("rig", MEAN, 30.0)
 NOTHING = residual_of(np.empty((0, 2)), np.empty((0, 2)))
 
 
@@ -44,9 +47,14 @@ def corners_near_the_mean(result: JointResult) -> np.ndarray:
     return np.asarray(geometry.apply(result.fixed_to_moving, points) - geometry.apply(MEAN, points))
 
 
+def band(pair: BandPair, joint: JointResult, windows: Residual = NOTHING) -> RefinedBand:
+    mapping = pair.mapping(joint.fixed_to_moving)
+    return RefinedBand(pair, SEED, joint, WarpedPair(pair, mapping, pair.moving_image, pair.windows, windows))
+
+
 def found_together(red: JointResult, nir: JointResult, the_rig: Rig | None) -> dict[str, JointResult]:
-    result = {"red": red, "nir": nir}
-    return map_estimate(pairs(), result, dict.fromkeys(result, NOTHING), the_rig)
+    bands = [band(pair, joint) for pair, joint in zip(pairs(), (red, nir), strict=True)]
+    return {b.pair.name: b.joint for b in with_map_estimates(bands, the_rig)}
 
 
 def test_corners_without_texture_follow_the_rig_with_its_error() -> None:
@@ -91,7 +99,7 @@ def test_windows_correct_the_result_of_the_descriptors() -> None:
     off = geometry.compose(truth, geometry.moving_corners(left_px, *SIZE))
     before = replace(result(0, 0.2), fixed_to_moving=off)
     residual = WarpedPair.of(pair, pair.mapping(off)).residual
-    after = map_estimate([pair], {"moving": before}, {"moving": residual}, None)["moving"]
+    (after,) = (b.joint for b in with_map_estimates([band(pair, before, residual)], None))
     assert geometry.corner_error_px(off, truth, *SIZE) > 0.2
     assert geometry.corner_error_px(after.fixed_to_moving, truth, *SIZE) < 0.08
     assert after.corner_std_px < 0.1
@@ -103,7 +111,7 @@ def test_collinear_windows_do_not_determine_corners_away_from_the_line() -> None
     rng = np.random.default_rng(0)
     shifts = np.array([0.3, 0.0]) + 0.02 * rng.normal(size=(20, 2))
     shown = residual_of(centres, shifts)
-    results = map_estimate(pairs()[:1], {"red": result(0, 2.0)}, {"red": shown}, None)["red"]
+    (results,) = (b.joint for b in with_map_estimates([band(pairs()[0], result(0, 2.0), shown)], None))
     middle = geometry.apply(results.fixed_to_moving, [320.0, 240.0]) - geometry.apply(MEAN, [320.0, 240.0])
     np.testing.assert_allclose(middle, [0.3, 0.0], atol=0.05)
     assert results.corner_std_px > 0.5
@@ -118,3 +126,16 @@ def test_the_error_of_a_prediction_is_in_px_of_the_reference(magnification: floa
     over = geometry.over_corners(geometry.lattice(*SIZE, 7, 5), *SIZE)
     squares = np.einsum("nki,ij,nkj->n", over, both["nir"].corner_covariance_px2, over)
     assert squares.mean() == pytest.approx(0.1**2 / 3, rel=0.01)
+
+
+@pytest.mark.parametrize(("shift_px", "is_used"), [(0.6, True), (1.4, False)])
+def test_windows_are_ignored_in_both_halves_or_in_none(shift_px: float, is_used: bool) -> None:
+    """The correction by one half may be within the limit of 1 px where that by all windows is not."""
+    at = np.stack(np.meshgrid(np.arange(30.0, 640.0, 60.0), np.arange(30.0, 480.0, 60.0)), -1).reshape(-1, 2)
+    windows = residual_of(at, (shift_px, 0.0))
+    own_px = np.where(windows.is_even_cell, shift_px + 0.5, shift_px - 0.5)  # 0.9 px of the second half
+    windows = windows.with_shifts(np.column_stack([own_px, np.zeros(len(at))]))
+    before = result(0, 2.0)
+    (after,) = with_map_estimates([band(pairs()[0], before, windows)], None)
+    used = [abs(matrix[0, 2] - MEAN[0, 2]) > 0.05 for matrix in (after.joint.fixed_to_moving, *after.by_halves)]
+    assert used == [is_used] * 3
