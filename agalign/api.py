@@ -16,6 +16,7 @@ from agalign.batch.capture_task import Task, process_capture, quiet
 from agalign.batch.index_run import index_tasks, run_indices
 from agalign.batch.output_files import refuse_results_elsewhere
 from agalign.batch.run import Listener, run_flight
+from agalign.batch.selection import select_captures
 from agalign.cameras.discover import FolderScan, discover, mosaics_onto
 from agalign.capture.align_bands import align_pairs
 from agalign.capture.band_pair import BandPair, SeedMatrices
@@ -25,15 +26,12 @@ from agalign.config import DiscoverOptions, RunOptions, Settings
 from agalign.errors import InputError
 from agalign.exports.programs import ExportReport
 from agalign.exports.programs import export as export_run
-from agalign.flight.panel_readings import with_panels
-from agalign.flight.sky import sky_captures
 from agalign.host.output_folder import locked, prepare_output
 from agalign.host.processes import end_if_reimported
 from agalign.pixels.masks import raster_of
-from agalign.pixels.radiometry import with_radiometry
 from agalign.records.sidecar_file import check_products
 from agalign.spectral_indices.formulas import chosen_indices
-from agalign.spectral_indices.rasters import IndexReport
+from agalign.spectral_indices.rasters import IndexReport, check_indices
 from agalign.values import geometry
 from agalign.values.alignment import Alignment, Seed
 from agalign.values.arguments import checked
@@ -221,9 +219,10 @@ def align_capture(capture: Capture, out: str | Path, *, settings: Settings | Non
     UnreadableFileError
         The reference band cannot be read.
     InputError
-        The capture lacks the tags that a setting needs (such as those for radiance), or shows a panel or the sky.
+        The capture shows a panel or the sky.
     ConfigurationError
-        `out` contains the result of a different capture with the same name.
+        The capture lacks the tags or bands that a setting needs (such as those for radiance), or `out` contains the
+        result of a different capture with the same name.
     OutputError
         A file cannot be written.
 
@@ -235,14 +234,14 @@ def align_capture(capture: Capture, out: str | Path, *, settings: Settings | Non
     [('Green', 'reference'), ('NIR', 'aligned')]
     """
     settings = settings or Settings()
-    (judged,) = with_panels([capture])
-    sky, _ = sky_captures([judged])
-    if sky or judged.is_of_a_panel:
-        what = "the sky" if sky else "a calibration panel"
+    check_indices([capture], settings.write)
+    selection = select_captures([capture], settings.write, RunOptions())
+    if not selection.captures:
+        what = "the sky" if selection.sky else "a calibration panel"
         raise InputError(f"{capture.label}: shows {what}; align another capture, or all with align_panels=True")
     prepare_output(Path(out))
-    refuse_results_elsewhere([capture], Path(out))
-    return process_capture(Task(with_radiometry(capture, settings.write.radiometry, {}), Path(out), settings))
+    refuse_results_elsewhere(selection.captures, Path(out))
+    return process_capture(Task(selection.captures[0], Path(out), settings))
 
 
 @checked

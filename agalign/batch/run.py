@@ -102,7 +102,7 @@ def run_flight(
         run = run.starting_from(model)
     with locked(out):
         # What can be refused is refused before the record and the pages of an earlier run are touched.
-        selection = select_captures(run.flight, run.settings.write, run.options)
+        selection = select_captures(run.flight.captures, run.settings.write, run.options)
         for reading in selection.panels:
             refuse_foreign(panel_picture(reading.capture, out))
         yield from _run_selected(run, selection)
@@ -156,7 +156,7 @@ def plan_run(
     run.check()
     if model is not None:
         run = run.starting_from(model)
-    selection = select_captures(run.flight, run.settings.write, run.options)
+    selection = select_captures(run.flight.captures, run.settings.write, run.options)
     states = dict(selection.abandoned) | {s.capture.label: "left out as sky" for s in selection.sky}
     states |= {p.capture.label: "read as calibration panels" for p in selection.panels if p.capture.is_of_a_panel}
     for capture in selection.captures:

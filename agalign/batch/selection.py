@@ -9,7 +9,6 @@ from importlib import import_module
 from agalign.batch.capture_task import missing_lens, missing_radiometry
 from agalign.batch.products import PRODUCTS
 from agalign.batch.workers import failure_text
-from agalign.cameras.discover import FolderScan
 from agalign.config import RunOptions, WriteSettings
 from agalign.errors import AgalignError, ConfigurationError
 from agalign.flight import footprint, panel_readings
@@ -35,8 +34,8 @@ class Selection:
     """Why the search for sky and panels was abandoned, by label; these captures are in no other list."""
 
 
-def select_captures(flight: FolderScan, write: WriteSettings, options: RunOptions) -> Selection:
-    """Return what the run does with each capture.
+def select_captures(found: Sequence[Capture], write: WriteSettings, options: RunOptions) -> Selection:
+    """Return what a run does with each of the captures that were found.
 
     Raises ConfigurationError if no capture has what the settings ask for: the radiometry, the metadata for a
     georeference, or the bands for a product.
@@ -44,7 +43,7 @@ def select_captures(flight: FolderScan, write: WriteSettings, options: RunOption
     start, timeout_s = partial(import_module, __name__), options.timeout_s  # tasks do not wait for the imports
     readers = nullcontext() if timeout_s is None else open_pool(min(panel_readings.READERS, usable_cores()), 1, start)
     with readers as pool:
-        result = _selected(flight, write, options, _Examination(pool, timeout_s))
+        result = _selected(found, write, options, _Examination(pool, timeout_s))
     captures = result.captures
     without_lens = [missing_lens(capture, write) for capture in captures]
     if captures and all(without_lens):
@@ -59,12 +58,14 @@ def select_captures(flight: FolderScan, write: WriteSettings, options: RunOption
     return result
 
 
-def _selected(flight: FolderScan, write: WriteSettings, options: RunOptions, examine: "_Examination") -> Selection:
+def _selected(
+    found: Sequence[Capture], write: WriteSettings, options: RunOptions, examine: "_Examination"
+) -> Selection:
     """Return the captures by what they show, those to align with their radiometry and georeference."""
     albedos = dict(write.panel_albedo)
     sky: list[SkyCapture] = []
     panels: list[PanelReading] = []
-    captures = list(flight.captures)
+    captures = list(found)
     if not options.align_panels:
         sky, captures = sky_captures(captures, examine)
         captures = list(panel_readings.with_panels(captures, without_code=bool(albedos), examine=examine))

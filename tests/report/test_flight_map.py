@@ -240,3 +240,13 @@ def test_an_impossible_georeference_is_refused_first(flight: Path, tmp_path: Pat
     agalign.align_folder(flight, tmp_path, settings=seeded(georeference=True, ground_elevation_m=0.0))
     features = features_of(tmp_path)
     assert {f["properties"]["height_from"] for f in features} == {"ground elevation"}
+
+
+def test_a_single_capture_is_georeferenced_as_in_a_run(flight: Path, tmp_path: Path) -> None:
+    capture = agalign.discover(flight).captures[0]
+    with pytest.raises(agalign.ConfigurationError, match="--ground-elevation"):
+        agalign.align_capture(capture, tmp_path, settings=seeded("rig", georeference=True))
+    settings = seeded("rig", georeference=True, ground_elevation_m=0.0)
+    path = agalign.align_capture(capture, tmp_path, settings=settings).path
+    with rasterio.open(path.with_suffix(".tif")) as stack:
+        assert stack.crs.is_projected
