@@ -102,10 +102,7 @@ def run_flight(
         run = run.starting_from(model)
     with locked(out):
         # What can be refused is refused before the record and the pages of an earlier run are touched.
-        selection = select_captures(run.flight.captures, run.settings.write, run.options)
-        for reading in selection.panels:
-            refuse_foreign(panel_picture(reading.capture, out))
-        yield from _run_selected(run, selection)
+        yield from _run_selected(run, run.selected())
 
 
 def _run_selected(run: "_FlightRun", selection: Selection) -> Iterator[CaptureReport]:
@@ -156,7 +153,7 @@ def plan_run(
     run.check()
     if model is not None:
         run = run.starting_from(model)
-    selection = select_captures(run.flight.captures, run.settings.write, run.options)
+    selection = run.selected()
     states = dict(selection.abandoned) | {s.capture.label: "left out as sky" for s in selection.sky}
     states |= {p.capture.label: "read as calibration panels" for p in selection.panels if p.capture.is_of_a_panel}
     for capture in selection.captures:
@@ -264,6 +261,17 @@ class _FlightRun:
             raise ConfigurationError(f"{path}: {what}; leave --model out")
         flight_settings = settings.flight.model_copy(update={"start_model": model.fingerprint})
         return replace(self, given=model, settings=settings.model_copy(update={"flight": flight_settings}))
+
+    def selected(self) -> Selection:
+        """Return what the run does with each capture. Raises ConfigurationError as `select_captures`, and for a file of
+        the user at the path of a model or of the picture of a panel.
+        """
+        selection = select_captures(self.flight.captures, self.settings.write, self.options)
+        for reading in selection.panels:
+            refuse_foreign(panel_picture(reading.capture, self.out))
+        for name in model_names(flights_of(selection.captures)) if self.settings.learns_flights else ():
+            refuse_foreign(self.out / MODELS_FOLDER / name)
+        return selection
 
     def remaining(self, capture: Capture) -> Remaining:
         """Return what remains to be done for a capture."""

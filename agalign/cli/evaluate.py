@@ -9,7 +9,7 @@ import typer
 from agalign.cli.command import Command, Given
 from agalign.cli.terminal import Terminal
 from agalign.errors import ConfigurationError
-from agalign.host.own_files import refuse_to_replace
+from agalign.host.own_files import MODEL_MARK, refuse_to_replace
 from agalign.host.text import counted
 from agalign.values.choices import Sharing
 
@@ -140,7 +140,7 @@ def _learn(
     from agalign.flight.model import save_model
     from agalign.values.alignment import Alignment
 
-    refuse_to_replace(out, b'{"__metadata__":{"agalign":')
+    refuse_to_replace(out, MODEL_MARK)
     aligned = 0
 
     def on_pair(name: str, result: Alignment) -> None:

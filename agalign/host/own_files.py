@@ -1,4 +1,4 @@
-"""The mark by which a command recognises the images that an earlier one wrote, whatever their names, and what is not
+"""The mark by which a command recognises the files that an earlier one wrote, whatever their names, and what is not
 replaced.
 """
 
@@ -16,6 +16,8 @@ PNG_MARK = b"Software\0" + SOFTWARE.encode()
 """Text chunk of every PNG file: keyword and text."""
 JPEG_MARK = b"\xff\xfe" + (2 + len(SOFTWARE)).to_bytes(2) + SOFTWARE.encode()
 """Comment of every JPEG file, with its marker and length."""
+MODEL_MARK = b'{"__metadata__":{"agalign":'
+"""Start of every model, after the length of its header in eight bytes."""
 _TIFF_MARK = rb'%b(?<![ -~]%b)\0|<Item name="REFERENCE_BAND">' % (SOFTWARE.encode(), SOFTWARE.encode())
 """The tag Software, not the end of a longer text; that of GDAL's metadata in files of single bands, which keep the
 camera's software. A search is three times faster with the name before the condition."""
@@ -26,7 +28,8 @@ _SEARCHED_BYTES = 1 << 16
 
 
 def is_own_file(path: Path, text_starts: tuple[bytes, ...] = ()) -> bool:
-    """Return True for an image with the mark, a text with one of these starts, and an empty file, which holds nothing.
+    """Return True for an image or a model with the mark, a text with one of these starts, and an empty file, which has
+    no contents.
 
     Texts have no place for a mark; their writers know how they start (`Product.text_starts`).
     """
@@ -43,7 +46,7 @@ def has_mark(path: Path, text_starts: tuple[bytes, ...] = ()) -> bool:
         end = file.read()
         mark = _MARKS.get(start[:2])
         is_image = mark is not None and any(re.search(mark, part) for part in (start, end))
-        return is_image or start.startswith(text_starts)
+        return is_image or start.startswith(MODEL_MARK, 8) or start.startswith(text_starts)
     return False
 
 
